@@ -1,0 +1,122 @@
+//! What supervisor and roles say to each other: one JSON object a line, on the child's standard
+//! input and output. A child's standard error is its log file.
+//!
+//! End of input means that the supervisor is gone: the child ends itself (the learner after a
+//! checkpoint), so no SIGKILL of the supervisor leaves an orphan.
+
+use std::path::PathBuf;
+
+use dmprl_shared::spec::EnvSpec;
+use serde::{Deserialize, Serialize};
+
+/// From the supervisor to a role.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case", deny_unknown_fields)]
+pub enum Command {
+    /// To a worker: the learner is up, its services lie in this shared-memory directory.
+    Attach {
+        /// The run's private shared-memory directory.
+        domain: PathBuf,
+    },
+    /// To the evaluator: evaluate this policy.
+    Evaluate(EvaluationRequest),
+    /// To any role: finish what must be finished and exit.
+    Stop,
+}
+
+/// From a role to the supervisor.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case", deny_unknown_fields)]
+pub enum Report {
+    /// A worker or the evaluator has its environments.
+    EnvironmentReady {
+        /// What they are.
+        spec: EnvSpec,
+    },
+    /// The learner's services exist: workers may attach.
+    LearnerReady,
+    /// The first environment step of this run has reached the learner.
+    FirstSegment,
+    /// Where the learner stands; a few times a second.
+    Progress(Progress),
+    /// The learner asks for an evaluation.
+    Evaluate(EvaluationRequest),
+    /// The evaluator's answer: the row it appended to `evaluations.jsonl`.
+    Evaluated(EvaluationRow),
+    /// The learner wrote a checkpoint.
+    Checkpoint {
+        /// Its directory's name below `checkpoints/`.
+        name: String,
+    },
+    /// The learner has come to its end and written its last checkpoint.
+    Finished,
+    /// A role noticed something the user should read.
+    Warning {
+        /// The sentence.
+        message: String,
+    },
+}
+
+/// Where the learner stands.
+#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Progress {
+    /// Environment steps inserted.
+    pub env_steps: u64,
+    /// Updates done.
+    pub updates: u64,
+    /// Segments inserted.
+    pub segments: u64,
+    /// Environment steps per second, lately.
+    pub env_steps_per_s: f64,
+    /// Updates per second, lately.
+    pub updates_per_s: f64,
+    /// Mean return of the last training episodes (with noise); NaN is sent as null.
+    pub return_mean: Option<f64>,
+    /// Updates times batch size over environment steps inserted.
+    pub samples_per_insert: f64,
+    /// Median over recent segments: policy versions between acting and insertion.
+    pub policy_lag_p50: u64,
+    /// Segments refused.
+    pub rejected: u64,
+}
+
+/// One evaluation to be done.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct EvaluationRequest {
+    /// Environment steps inserted when the policy was saved.
+    pub env_steps: u64,
+    /// Updates done by then.
+    pub updates: u64,
+    /// Segments inserted by then.
+    pub segments: u64,
+    /// Seconds of training by then, over all sessions of the run.
+    pub wall_s: f64,
+    /// Version of the policy, saved as `policies/<version>.safetensors`.
+    pub policy_version: u64,
+}
+
+/// One line of `evaluations.jsonl`.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct EvaluationRow {
+    /// Environment steps inserted when the policy was saved.
+    pub env_steps: u64,
+    /// Updates done by then.
+    pub updates: u64,
+    /// Segments inserted by then.
+    pub segments: u64,
+    /// Seconds of training by then, over all sessions of the run.
+    pub wall_s: f64,
+    /// Version of the policy.
+    pub policy_version: u64,
+    /// Return of each episode.
+    pub returns: Vec<f64>,
+    /// Their mean.
+    pub return_mean: f64,
+    /// Share of episodes that ended in success; null where the task does not report it.
+    pub success_rate: Option<f64>,
+    /// Mean |u_t - u_{t-1}| over all steps and action dimensions.
+    pub smoothness: f64,
+}

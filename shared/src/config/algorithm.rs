@@ -1,0 +1,136 @@
+//! Configuration of the learning algorithm and of exploration.
+
+use serde::{Deserialize, Serialize};
+
+/// Which algorithm updates the networks.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum AlgorithmName {
+    /// Deep deterministic policy gradient (Lillicrap et al. 2016), with segments DDPG-DMP.
+    Ddpg,
+}
+
+/// Which actions the critic sees.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum CriticInput {
+    /// Q(s_t, u_t .. u_{t+K-1}).
+    Segment,
+    /// Q(s_t, u_t), as the paper; only with `windows = "segment"`.
+    First,
+}
+
+/// Which K-step windows of the replay are samples.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Windows {
+    /// Any window of K steps inside an episode.
+    Sliding,
+    /// Only windows that start where a segment started.
+    Segment,
+}
+
+/// The critic's regression target.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Target {
+    /// sum_{k<n} discount^k r_{t+k} + discount^n (1 - terminated) Q'(s_{t+n}, pi'(s_{t+n})).
+    NStep,
+    /// sum of the K rewards + discount (1 - terminated) Q'(s_{t+1}, pi'(s_{t+1})), as the paper.
+    Literal,
+}
+
+/// The learning algorithm.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct AlgorithmConfig {
+    /// Which algorithm.
+    pub name: AlgorithmName,
+    /// Which actions the critic sees.
+    pub critic: CriticInput,
+    /// Which windows are samples.
+    pub windows: Windows,
+    /// The critic's regression target.
+    pub target: Target,
+    /// Discount per environment step.
+    pub discount: f64,
+    /// Target smoothing: target <- polyak * network + (1 - polyak) * target.
+    pub polyak: f64,
+    /// Adam step size of the critic.
+    pub critic_learning_rate: f64,
+    /// Adam step size of the actor.
+    pub actor_learning_rate: f64,
+    /// Windows in one update.
+    pub batch_size: usize,
+    /// Widths of the critic's hidden layers.
+    pub critic_hidden: Vec<usize>,
+}
+
+impl Default for AlgorithmConfig {
+    fn default() -> Self {
+        Self {
+            name: AlgorithmName::Ddpg,
+            critic: CriticInput::Segment,
+            windows: Windows::Sliding,
+            target: Target::NStep,
+            discount: 0.99,
+            polyak: 5e-3,
+            critic_learning_rate: 3e-4,
+            actor_learning_rate: 5e-4,
+            batch_size: 256,
+            critic_hidden: vec![256, 256],
+        }
+    }
+}
+
+/// What exploration adds, and where.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum ExplorationKind {
+    /// Independent Gaussian noise on every action.
+    Gaussian,
+    /// One Gaussian draw per segment and dimension, held over its steps.
+    Segment,
+    /// Pink (1/f) noise over the episode.
+    Pink,
+    /// Gaussian noise on the network's pre-tanh outputs: goal, weights and rho.
+    DmpParameters,
+}
+
+/// What the warm-up draws.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum WarmUpKind {
+    /// Uniform actions within `warm_up_range` of the range.
+    Uniform,
+    /// Uniform DMP parameters within their ranges, so that y is defined.
+    DmpParameters,
+}
+
+/// How the rollout departs from the policy.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct ExplorationConfig {
+    /// What is added.
+    pub kind: ExplorationKind,
+    /// Standard deviation, in units of u (actions scaled to [-1, 1]).
+    pub std: f64,
+    /// Environment steps, all workers together, before the policy acts.
+    pub warm_up_steps: u64,
+    /// What the warm-up draws.
+    pub warm_up_kind: WarmUpKind,
+    /// Half-width of the warm-up's draw, as a share of the full range.
+    pub warm_up_range: f64,
+}
+
+impl Default for ExplorationConfig {
+    fn default() -> Self {
+        Self {
+            kind: ExplorationKind::Gaussian,
+            std: 0.1,
+            warm_up_steps: 3_000,
+            warm_up_kind: WarmUpKind::Uniform,
+            warm_up_range: 0.3,
+        }
+    }
+}

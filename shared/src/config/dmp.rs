@@ -1,0 +1,219 @@
+//! Configuration of the policy: its kind, its DMP and its inverse controller.
+
+use serde::{Deserialize, Serialize};
+
+/// How the phase x of the canonical system advances.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum CanonicalIntegration {
+    /// Explicit Euler, advanced before the basis is evaluated (x_1 = 0.975).
+    Euler,
+    /// The exact exponential exp(-alpha_x t / tau).
+    Exact,
+}
+
+/// Widths h_i of the Gaussian basis functions.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum BasisWidths {
+    /// h_i = N^1.5 / (c_i alpha_x), as in Neural Dynamic Policies.
+    Ndp,
+    /// Neighbours overlap at 0.8: h_i = -ln(0.8) / (c_{i+1} - c_i)^2, the last as the one before.
+    Overlap,
+}
+
+/// What multiplies the forcing term.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum ForcingScaling {
+    /// Nothing (the paper's equation 9).
+    None,
+    /// g - y0, as in Neural Dynamic Policies.
+    Goal,
+}
+
+/// How the transformation system is integrated over a segment.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Integrator {
+    /// yd first, then y with the new yd.
+    SemiImplicit,
+    /// y with the old yd, then yd (Neural Dynamic Policies).
+    Explicit,
+    /// The paper's equation 14 to the letter: the acceleration acts one step late, ydd_0 = 0.
+    Paper,
+}
+
+impl Integrator {
+    /// Largest stable `alpha_y` at the step `dt` = tau / integration_steps, with tau = 1.
+    ///
+    /// Spectral radius of the unforced system; at dt = 0.025: `paper` about 37, `semi_implicit`
+    /// about 67, `explicit` 160.
+    #[must_use]
+    pub fn alpha_y_max(self, dt: f64) -> f64 {
+        match self {
+            Self::Paper => 37.0 * 0.025 / dt,
+            Self::SemiImplicit => 67.0 * 0.025 / dt,
+            Self::Explicit => 160.0 * 0.025 / dt,
+        }
+    }
+}
+
+/// The dynamic movement primitive, one per action dimension.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct DmpConfig {
+    /// Number of basis functions N.
+    pub basis_count: usize,
+    /// Decay of the phase, alpha_x.
+    pub alpha_x: f64,
+    /// Stiffness of the transformation system; beta_y = alpha_y / 4 (critically damped).
+    pub alpha_y: f64,
+    /// Integration steps m over one segment; a multiple of `policy.segment_steps`.
+    pub integration_steps: usize,
+    /// How the transformation system is integrated.
+    pub integrator: Integrator,
+    /// How the phase is integrated.
+    pub canonical: CanonicalIntegration,
+    /// Widths of the basis functions.
+    pub widths: BasisWidths,
+    /// What multiplies the forcing term.
+    pub forcing_scaling: ForcingScaling,
+}
+
+impl Default for DmpConfig {
+    fn default() -> Self {
+        Self {
+            basis_count: 5,
+            alpha_x: 1.0,
+            alpha_y: 10.0,
+            integration_steps: 40,
+            integrator: Integrator::SemiImplicit,
+            canonical: CanonicalIntegration::Euler,
+            widths: BasisWidths::Ndp,
+            forcing_scaling: ForcingScaling::None,
+        }
+    }
+}
+
+/// What decides the actions.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum PolicyKind {
+    /// A network that outputs DMP and inverse-controller parameters for a segment.
+    Dmp,
+    /// A network that outputs one action; decides every environment step.
+    Mlp,
+}
+
+/// Bounds of the inverse controller's parameters rho.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum RhoKind {
+    /// rho = (1, 0, 0, 0) + rho_range * tanh(.).
+    Bounded,
+    /// rho = (1, 0, 0, 0) + the network's raw output; saturates and learns worse.
+    Free,
+}
+
+/// Where a segment's DMP starts.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Start {
+    /// y = yd = 0 at every segment.
+    Zero,
+    /// y0, yd0 measured: read from the observation by `task.start_sources`.
+    Observed,
+    /// y, yd continue from the end of the previous segment, zero at reset.
+    Carry,
+}
+
+/// Where yd0 comes from when `start = "observed"`.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum StartVelocity {
+    /// Measured velocity, converted to DMP time.
+    Measured,
+    /// Zero, as the paper.
+    Zero,
+}
+
+/// How one action dimension's y0 and yd0 are read from an observation.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(untagged, deny_unknown_fields)]
+pub enum StartSource {
+    /// y0 = atan2(observation[sin], observation[cos]).
+    Angle {
+        /// Index of the cosine.
+        cos: usize,
+        /// Index of the sine.
+        sin: usize,
+        /// Index of the angular velocity [rad/s].
+        velocity: usize,
+    },
+    /// y0 = scale * observation[index], yd0 likewise.
+    Value {
+        /// Index of the position.
+        index: usize,
+        /// Index of the velocity.
+        velocity: usize,
+        /// Factor on both; -1 where the observation holds goal minus position.
+        #[serde(default = "unit_scale")]
+        scale: f32,
+    },
+}
+
+fn unit_scale() -> f32 {
+    1.0
+}
+
+/// The policy: from observation to the actions of a segment.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct PolicyConfig {
+    /// What decides the actions.
+    pub kind: PolicyKind,
+    /// Environment steps K of one decision; `mlp` decides every step whatever stands here.
+    pub segment_steps: usize,
+    /// Widths of the actor's hidden layers.
+    pub hidden: Vec<usize>,
+    /// g = goal_range * tanh(.).
+    pub goal_range: f64,
+    /// w = weight_range * omega^2 * tanh(.), omega = alpha_y / 2.
+    pub weight_range: f64,
+    /// Whether rho is bounded.
+    pub rho: RhoKind,
+    /// Half-width of rho around (1, 0, 0, 0) when bounded.
+    pub rho_range: f64,
+    /// Where a segment's DMP starts.
+    pub start: Start,
+    /// Where yd0 comes from when `start = "observed"`.
+    pub start_velocity: StartVelocity,
+}
+
+impl Default for PolicyConfig {
+    fn default() -> Self {
+        Self {
+            kind: PolicyKind::Dmp,
+            segment_steps: 5,
+            hidden: vec![256, 256],
+            goal_range: 1.0,
+            weight_range: 1.0,
+            rho: RhoKind::Bounded,
+            rho_range: 2.0,
+            start: Start::Zero,
+            start_velocity: StartVelocity::Measured,
+        }
+    }
+}
+
+impl PolicyConfig {
+    /// Environment steps of one decision: K for `dmp`, 1 for `mlp`.
+    #[must_use]
+    pub fn decision_steps(&self) -> usize {
+        match self.kind {
+            PolicyKind::Dmp => self.segment_steps,
+            PolicyKind::Mlp => 1,
+        }
+    }
+}

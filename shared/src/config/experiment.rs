@@ -1,0 +1,227 @@
+//! The root of the configuration tree and the sections that are neither policy nor algorithm.
+
+use serde::{Deserialize, Serialize};
+
+use super::{AlgorithmConfig, DmpConfig, ExplorationConfig, PolicyConfig, StartSource};
+
+/// One experiment: everything that decides what a run does.
+#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct ExperimentConfig {
+    /// Length, seed and stopping rules.
+    pub run: RunConfig,
+    /// The environment.
+    pub task: TaskConfig,
+    /// From observation to actions.
+    pub policy: PolicyConfig,
+    /// The dynamic movement primitive.
+    pub dmp: DmpConfig,
+    /// The learning algorithm.
+    pub algorithm: AlgorithmConfig,
+    /// Departure from the policy in the rollout.
+    pub exploration: ExplorationConfig,
+    /// Storage of experience.
+    pub replay: ReplayConfig,
+    /// Updates per inserted segment.
+    pub pacing: PacingConfig,
+    /// The rollout workers.
+    pub actors: ActorsConfig,
+    /// The learner process.
+    pub learner: LearnerConfig,
+    /// Noise-free evaluation.
+    pub evaluation: EvaluationConfig,
+    /// What is kept on disk to go on from.
+    pub checkpoint: CheckpointConfig,
+    /// What is written about the run.
+    pub metrics: MetricsConfig,
+}
+
+/// Length, seed and stopping rules. An infinite bound never stops a run.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct RunConfig {
+    /// Master seed; every random stream of the run derives from it.
+    pub seed: u64,
+    /// Environment steps, all workers together.
+    pub steps: u64,
+    /// One process in lock-step; the same seed gives the same bytes.
+    pub deterministic: bool,
+    /// Stop at this mean evaluation return.
+    pub until_return: f64,
+    /// Stop at this evaluation success rate.
+    pub until_success: f64,
+    /// Stop after so many minutes of wall clock.
+    pub max_minutes: f64,
+}
+
+impl Default for RunConfig {
+    fn default() -> Self {
+        Self {
+            seed: 1,
+            steps: 60_000,
+            deterministic: false,
+            until_return: f64::INFINITY,
+            until_success: f64::INFINITY,
+            max_minutes: f64::INFINITY,
+        }
+    }
+}
+
+/// The environment.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct TaskConfig {
+    /// The name typed on the command line.
+    pub name: String,
+    /// Gymnasium id: `Name-vN` or `module:Name-vN`.
+    pub id: String,
+    /// Directories searched for the user's own environment modules.
+    pub python_path: Vec<String>,
+    /// Per action dimension, where y0 and yd0 stand in the observation; empty: not known.
+    pub start_sources: Vec<StartSource>,
+}
+
+impl Default for TaskConfig {
+    fn default() -> Self {
+        Self {
+            name: "reacher".into(),
+            id: "Reacher-v5".into(),
+            python_path: Vec::new(),
+            start_sources: Vec::new(),
+        }
+    }
+}
+
+/// Storage of experience.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct ReplayConfig {
+    /// Environment steps held; the oldest are replaced.
+    pub capacity_steps: usize,
+}
+
+impl Default for ReplayConfig {
+    fn default() -> Self {
+        Self { capacity_steps: 1_000_000 }
+    }
+}
+
+/// Updates per inserted segment, and how far either side may run ahead.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct PacingConfig {
+    /// Updates per segment inserted after the warm-up.
+    pub updates_per_segment: f64,
+    /// Segments the learner may hold un-updated before it stops taking more, so that workers wait.
+    pub tolerance_segments: u64,
+}
+
+impl Default for PacingConfig {
+    fn default() -> Self {
+        Self { updates_per_segment: 2.0, tolerance_segments: 16 }
+    }
+}
+
+/// The rollout workers.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct ActorsConfig {
+    /// Worker processes; 0 stands for cores - 1, at least 1.
+    pub workers: usize,
+    /// Environments in each worker.
+    pub envs_per_worker: usize,
+    /// Segments a worker's queue to the learner holds; full: the worker waits.
+    pub queue_segments: usize,
+    /// A worker that waited so long on a full queue reports it, naming the learner [s].
+    pub send_deadline_s: f64,
+    /// Restarts of one worker before the run gives up on it.
+    pub restarts_max: u32,
+}
+
+impl Default for ActorsConfig {
+    fn default() -> Self {
+        Self {
+            workers: 0,
+            envs_per_worker: 8,
+            queue_segments: 8,
+            send_deadline_s: 30.0,
+            restarts_max: 5,
+        }
+    }
+}
+
+/// Where the update runs.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Device {
+    /// The processor.
+    Cpu,
+}
+
+/// The learner process.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct LearnerConfig {
+    /// Where the update runs.
+    pub device: Device,
+    /// Threads of the update.
+    pub threads: usize,
+    /// Updates between two published parameter snapshots.
+    pub publish_every_updates: u64,
+}
+
+impl Default for LearnerConfig {
+    fn default() -> Self {
+        Self { device: Device::Cpu, threads: 1, publish_every_updates: 4 }
+    }
+}
+
+/// Noise-free evaluation in its own process.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct EvaluationConfig {
+    /// Environment steps between evaluations; one more always follows the last step.
+    pub interval_steps: u64,
+    /// Episodes of one evaluation.
+    pub episodes: usize,
+    /// Episode i is reset with seed first_seed + i.
+    pub first_seed: u64,
+}
+
+impl Default for EvaluationConfig {
+    fn default() -> Self {
+        Self { interval_steps: 5_000, episodes: 20, first_seed: 1_000 }
+    }
+}
+
+/// What is kept on disk to go on from.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct CheckpointConfig {
+    /// Environment steps between checkpoints; one more always ends a run.
+    pub interval_steps: u64,
+    /// Checkpoints kept.
+    pub keep: usize,
+    /// Disk space all checkpoints of a run may take together [bytes]; at least one is kept.
+    pub disk_bytes_max: u64,
+}
+
+impl Default for CheckpointConfig {
+    fn default() -> Self {
+        Self { interval_steps: 10_000, keep: 3, disk_bytes_max: 8 << 30 }
+    }
+}
+
+/// What is written about the run.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct MetricsConfig {
+    /// Environment steps between two lines of `metrics.jsonl`.
+    pub interval_steps: u64,
+}
+
+impl Default for MetricsConfig {
+    fn default() -> Self {
+        Self { interval_steps: 1_000 }
+    }
+}

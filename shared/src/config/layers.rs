@@ -1,0 +1,262 @@
+//! Merges the layers of configuration and refuses unknown keys with the nearest known name.
+
+use thiserror::Error;
+use toml::{Table, Value};
+
+use super::ExperimentConfig;
+
+/// Why a configuration was refused.
+#[derive(Debug, Error, PartialEq)]
+pub enum ConfigError {
+    /// A key that does not exist.
+    #[error("{origin}: unknown key `{key}`{hint}")]
+    UnknownKey {
+        /// Which layer it came from: a file name, `--set`, an environment variable.
+        origin: String,
+        /// The dotted key.
+        key: String,
+        /// `, did you mean ...?` or empty.
+        hint: String,
+    },
+    /// A value of the wrong type or not among the allowed ones.
+    #[error("{origin}: {message}")]
+    Value {
+        /// Which layer it came from.
+        origin: String,
+        /// What is wrong, naming key, expected and got.
+        message: String,
+    },
+    /// A value out of its range, or values that exclude each other.
+    #[error("`{key}` = {got}: {expected}")]
+    Range {
+        /// The dotted key.
+        key: &'static str,
+        /// What must hold.
+        expected: String,
+        /// The refused value.
+        got: String,
+    },
+}
+
+/// Layers merged so far, lowest precedence first.
+#[derive(Debug, Clone)]
+pub struct Layers {
+    known: Table,
+    merged: Table,
+}
+
+impl Default for Layers {
+    fn default() -> Self {
+        Self::new()
+    }
+}
+
+impl Layers {
+    /// Starts from the defaults of the configuration tree.
+    ///
+    /// # Panics
+    /// Never: the default tree serialises, which a test shows.
+    #[must_use]
+    pub fn new() -> Self {
+        let known = Table::try_from(ExperimentConfig::default()).expect("defaults serialise");
+        Self { merged: known.clone(), known }
+    }
+
+    /// Lays `table` over what is there.
+    ///
+    /// # Errors
+    /// `UnknownKey` for a key the tree does not have, `Value` for one of the wrong type; the
+    /// layers are then unchanged.
+    pub fn add(&mut self, origin: &str, table: Table) -> Result<(), ConfigError> {
+        check_keys(origin, &self.known, &table, "")?;
+        let mut merged = self.merged.clone();
+        merge(&mut merged, table);
+        typed(origin, merged.clone())?;
+        self.merged = merged;
+        Ok(())
+    }
+
+    /// Lays one dotted key over what is there, as `--set key=value` and `DMPRL_KEY` do.
+    ///
+    /// # Errors
+    /// As [`Layers::add`]. A value that is no TOML literal is taken as a string.
+    pub fn set(&mut self, origin: &str, key: &str, text: &str) -> Result<(), ConfigError> {
+        let value = format!("value = {text}")
+            .parse::<Table>()
+            .ok()
+            .and_then(|mut table| table.remove("value"))
+            .unwrap_or_else(|| Value::String(text.to_owned()));
+        let value = self.widen(key, value);
+        let mut table = Table::new();
+        let mut path: Vec<&str> = key.split('.').collect();
+        let last = path.pop().unwrap_or_default();
+        let mut inner = Table::new();
+        inner.insert(last.to_owned(), value);
+        for name in path.into_iter().rev() {
+            let mut outer = Table::new();
+            outer.insert(name.to_owned(), Value::Table(inner));
+            inner = outer;
+        }
+        table.extend(inner);
+        self.add(origin, table)
+    }
+
+    /// The dotted keys a user may set, sorted.
+    #[must_use]
+    pub fn keys(&self) -> Vec<String> {
+        let mut keys = Vec::new();
+        collect_keys(&self.known, "", &mut keys);
+        keys
+    }
+
+    /// The merged tree.
+    ///
+    /// # Errors
+    /// `Value` if a value does not fit its type, which `add` has already refused.
+    pub fn finish(self) -> Result<ExperimentConfig, ConfigError> {
+        typed("configuration", self.merged)
+    }
+
+    /// `0.1 -> 0.1`, `1 -> 1.0` where the key holds a float: people type `--set x=1`.
+    fn widen(&self, key: &str, value: Value) -> Value {
+        let default = key.split('.').try_fold(None::<&Value>, |at, name| match at {
+            None => self.known.get(name).map(Some),
+            Some(value) => value.get(name).map(Some),
+        });
+        match (default.flatten(), &value) {
+            (Some(Value::Float(_)), Value::Integer(integer)) => Value::Float(*integer as f64),
+            _ => value,
+        }
+    }
+}
+
+/// The candidate nearest to `name` when it is near enough to be a slip.
+#[must_use]
+pub fn nearest<'a>(name: &str, candidates: impl IntoIterator<Item = &'a str>) -> Option<&'a str> {
+    candidates
+        .into_iter()
+        .map(|candidate| (strsim::jaro_winkler(name, candidate), candidate))
+        .filter(|(similarity, _)| *similarity > 0.75)
+        .max_by(|a, b| a.0.total_cmp(&b.0))
+        .map(|(_, candidate)| candidate)
+}
+
+fn typed(origin: &str, table: Table) -> Result<ExperimentConfig, ConfigError> {
+    table.try_into().map_err(|error: toml::de::Error| ConfigError::Value {
+        origin: origin.to_owned(),
+        message: error.to_string().trim().replace('\n', ", "),
+    })
+}
+
+fn check_keys(origin: &str, known: &Table, given: &Table, path: &str) -> Result<(), ConfigError> {
+    for (name, value) in given {
+        let key = if path.is_empty() { name.clone() } else { format!("{path}.{name}") };
+        match (known.get(name), value) {
+            (None, _) => return Err(unknown(origin, key, name, known, path)),
+            (Some(Value::Table(known)), Value::Table(given)) => {
+                check_keys(origin, known, given, &key)?;
+            }
+            (Some(Value::Table(_)), _) => {
+                return Err(ConfigError::Value {
+                    origin: origin.to_owned(),
+                    message: format!("`{key}` is a table of keys, got {value}"),
+                });
+            }
+            _ => {}
+        }
+    }
+    Ok(())
+}
+
+/// Looks first among the siblings, then over the whole tree: `--set batch_size=64` means
+/// `algorithm.batch_size`.
+fn unknown(origin: &str, key: String, name: &str, siblings: &Table, path: &str) -> ConfigError {
+    let sibling = nearest(name, siblings.keys().map(String::as_str))
+        .map(|near| if path.is_empty() { near.to_owned() } else { format!("{path}.{near}") });
+    let anywhere = || {
+        let keys = Layers::new().keys();
+        let leaf = |key: &str| key.rsplit('.').next().unwrap_or_default().to_owned();
+        keys.iter().find(|key| leaf(key) == name).cloned().or_else(|| {
+            nearest(&key, keys.iter().map(String::as_str)).map(str::to_owned)
+        })
+    };
+    let hint = sibling.or_else(anywhere).map(|near| format!(", did you mean `{near}`?"));
+    ConfigError::UnknownKey { origin: origin.to_owned(), key, hint: hint.unwrap_or_default() }
+}
+
+fn merge(under: &mut Table, over: Table) {
+    for (key, value) in over {
+        match (under.get_mut(&key), value) {
+            (Some(Value::Table(under)), Value::Table(over)) => merge(under, over),
+            (_, value) => {
+                under.insert(key, value);
+            }
+        }
+    }
+}
+
+fn collect_keys(table: &Table, path: &str, keys: &mut Vec<String>) {
+    for (name, value) in table {
+        let key = if path.is_empty() { name.clone() } else { format!("{path}.{name}") };
+        match value {
+            Value::Table(inner) => collect_keys(inner, &key, keys),
+            _ => keys.push(key),
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::{PRESETS, TASKS};
+    use super::*;
+
+    #[test]
+    fn every_preset_and_task_is_a_valid_layer() {
+        for (name, table) in PRESETS
+            .iter()
+            .map(|preset| (preset.name, preset.table()))
+            .chain(TASKS.iter().map(|task| (task.name, task.table())))
+        {
+            Layers::new().add(name, table).unwrap();
+        }
+    }
+
+    #[test]
+    fn a_later_layer_wins_and_leaves_the_rest() {
+        let mut layers = Layers::new();
+        layers.add("file", "[dmp]\nalpha_y = 7.0".parse().unwrap()).unwrap();
+        layers.set("--set", "dmp.basis_count", "3").unwrap();
+        layers.set("--set", "dmp.alpha_y", "8").unwrap();
+        let config = layers.finish().unwrap();
+        assert_eq!((config.dmp.alpha_y, config.dmp.basis_count), (8.0, 3));
+        assert_eq!(config.algorithm.batch_size, 256);
+    }
+
+    #[test]
+    fn an_unknown_key_is_refused_with_the_nearest_name() {
+        let mut layers = Layers::new();
+        for (given, near) in [
+            ("algorithm.bach_size", "algorithm.batch_size"),
+            ("batch_size", "algorithm.batch_size"),
+            ("algoritm.batch_size", "algorithm"),
+        ] {
+            let message = layers.set("--set", given, "64").unwrap_err().to_string();
+            assert!(message.contains(&format!("did you mean `{near}`")), "{given}: {message}");
+        }
+    }
+
+    #[test]
+    fn a_value_of_the_wrong_type_names_its_key_and_changes_nothing() {
+        let mut layers = Layers::new();
+        let error = layers.set("--set", "algorithm.critic", "third").unwrap_err().to_string();
+        assert!(error.contains("third") && error.contains("segment"), "{error}");
+        assert_eq!(layers.finish().unwrap(), ExperimentConfig::default());
+    }
+
+    #[test]
+    fn the_tree_survives_a_round_trip_through_toml() {
+        let config = ExperimentConfig::default();
+        let text = toml::to_string(&config).unwrap();
+        assert_eq!(toml::from_str::<ExperimentConfig>(&text).unwrap(), config);
+    }
+}

@@ -1,0 +1,31 @@
+//! Stage 1 of 8: the typed experiment tree, its defaults, and how a user's values reach it.
+//!
+//! Precedence, lowest first: task defaults, preset, file, environment variables, `--set` and flags.
+//! `layers` merges them as TOML tables and refuses unknown keys with the nearest known name;
+//! `resolve` turns the merged tree into checked values. Every default of the system stands in the
+//! files of this folder and nowhere else.
+
+mod algorithm;
+mod dmp;
+mod experiment;
+mod layers;
+mod presets;
+mod resolve;
+mod tasks;
+
+pub use algorithm::{
+    AlgorithmConfig, AlgorithmName, CriticInput, ExplorationConfig, ExplorationKind, Target,
+    WarmUpKind, Windows,
+};
+pub use dmp::{
+    BasisWidths, CanonicalIntegration, DmpConfig, ForcingScaling, Integrator, PolicyConfig,
+    PolicyKind, RhoKind, Start, StartSource, StartVelocity,
+};
+pub use experiment::{
+    ActorsConfig, CheckpointConfig, Device, EvaluationConfig, ExperimentConfig, LearnerConfig,
+    MetricsConfig, PacingConfig, ReplayConfig, RunConfig, TaskConfig,
+};
+pub use layers::{ConfigError, Layers, nearest};
+pub use presets::{PRESETS, Preset};
+pub use resolve::Limits;
+pub use tasks::{TASKS, TaskDefaults, task_defaults};

@@ -1,0 +1,222 @@
+//! Checks the merged tree: ranges, combinations, caps.
+
+use super::{
+    ConfigError, CriticInput, ExperimentConfig, PolicyKind, Start, WarmUpKind, Windows,
+};
+
+/// What the machine sets: passed in, never read here.
+#[derive(Debug, Clone, Copy)]
+pub struct Limits {
+    /// Processor cores at hand.
+    pub cores: usize,
+}
+
+/// Caps that no experiment needs to pass; beyond them a slip of the keyboard is likelier.
+const WORKERS_MAX: usize = 1_024;
+const ENVS_PER_WORKER_MAX: usize = 4_096;
+const SEGMENT_STEPS_MAX: usize = 256;
+const HIDDEN_MAX: usize = 65_536;
+
+impl ExperimentConfig {
+    /// Fills in what depends on the machine or the policy's kind and checks every value.
+    ///
+    /// # Errors
+    /// `Range` for the first value out of range or pair of values that exclude each other.
+    pub fn resolve(mut self, limits: Limits) -> Result<Self, ConfigError> {
+        if self.actors.workers == 0 {
+            self.actors.workers = limits.cores.saturating_sub(1).max(1);
+        }
+        if self.run.deterministic {
+            self.actors.workers = 1;
+        }
+        self.check_counts()?;
+        self.check_numbers()?;
+        self.check_dmp()?;
+        self.check_combinations()?;
+        Ok(self)
+    }
+
+    fn check_counts(&self) -> Result<(), ConfigError> {
+        let counts = [
+            ("actors.workers", self.actors.workers, 1, WORKERS_MAX),
+            ("actors.envs_per_worker", self.actors.envs_per_worker, 1, ENVS_PER_WORKER_MAX),
+            ("actors.queue_segments", self.actors.queue_segments, 1, 65_536),
+            ("policy.segment_steps", self.policy.segment_steps, 1, SEGMENT_STEPS_MAX),
+            ("dmp.basis_count", self.dmp.basis_count, 1, 256),
+            ("dmp.integration_steps", self.dmp.integration_steps, 1, 100_000),
+            ("algorithm.batch_size", self.algorithm.batch_size, 1, 1 << 20),
+            ("replay.capacity_steps", self.replay.capacity_steps, 1_000, 1 << 31),
+            ("learner.threads", self.learner.threads, 1, 1_024),
+            ("evaluation.episodes", self.evaluation.episodes, 1, 1_000_000),
+            ("checkpoint.keep", self.checkpoint.keep, 1, 10_000),
+        ];
+        for (key, got, low, high) in counts {
+            range(key, got, (low..=high).contains(&got), || format!("from {low} to {high}"))?;
+        }
+        let layers = [
+            ("policy.hidden", &self.policy.hidden),
+            ("algorithm.critic_hidden", &self.algorithm.critic_hidden),
+        ];
+        for (key, hidden) in layers {
+            let fits = !hidden.is_empty()
+                && hidden.len() <= 16
+                && hidden.iter().all(|&width| (1..=HIDDEN_MAX).contains(&width));
+            let got = format!("{hidden:?}");
+            range(key, got, fits, || format!("1 to 16 widths from 1 to {HIDDEN_MAX}"))?;
+        }
+        let intervals = [
+            ("run.steps", self.run.steps),
+            ("evaluation.interval_steps", self.evaluation.interval_steps),
+            ("checkpoint.interval_steps", self.checkpoint.interval_steps),
+            ("metrics.interval_steps", self.metrics.interval_steps),
+            ("learner.publish_every_updates", self.learner.publish_every_updates),
+            ("pacing.tolerance_segments", self.pacing.tolerance_segments),
+        ];
+        intervals.iter().try_for_each(|&(key, got)| range(key, got, got > 0, || "at least 1".into()))
+    }
+
+    fn check_numbers(&self) -> Result<(), ConfigError> {
+        let positive = [
+            ("algorithm.critic_learning_rate", self.algorithm.critic_learning_rate),
+            ("algorithm.actor_learning_rate", self.algorithm.actor_learning_rate),
+            ("policy.goal_range", self.policy.goal_range),
+            ("policy.weight_range", self.policy.weight_range),
+            ("policy.rho_range", self.policy.rho_range),
+            ("dmp.alpha_x", self.dmp.alpha_x),
+            ("dmp.alpha_y", self.dmp.alpha_y),
+            ("pacing.updates_per_segment", self.pacing.updates_per_segment),
+            ("actors.send_deadline_s", self.actors.send_deadline_s),
+        ];
+        for (key, got) in positive {
+            range(key, got, got.is_finite() && got > 0.0, || "a positive number".into())?;
+        }
+        let unit = [
+            ("algorithm.discount", self.algorithm.discount),
+            ("algorithm.polyak", self.algorithm.polyak),
+            ("exploration.warm_up_range", self.exploration.warm_up_range),
+        ];
+        for (key, got) in unit {
+            range(key, got, got > 0.0 && got <= 1.0, || "above 0, at most 1".into())?;
+        }
+        let std = self.exploration.std;
+        range("exploration.std", std, std.is_finite() && std >= 0.0, || "0 or more".into())?;
+        let minutes = self.run.max_minutes;
+        range("run.max_minutes", minutes, minutes > 0.0, || "above 0 (inf: no limit)".into())
+    }
+
+    fn check_dmp(&self) -> Result<(), ConfigError> {
+        let (dmp, steps) = (&self.dmp, self.policy.segment_steps);
+        range(
+            "dmp.integration_steps",
+            dmp.integration_steps,
+            dmp.integration_steps.is_multiple_of(steps),
+            || format!("a multiple of policy.segment_steps = {steps}"),
+        )?;
+        let max = dmp.integrator.alpha_y_max(1.0 / dmp.integration_steps as f64);
+        range("dmp.alpha_y", dmp.alpha_y, dmp.alpha_y < max, || {
+            format!("below {max:.0}, where the {:?} integrator is stable with {} steps; \
+                     lower alpha_y or raise dmp.integration_steps", dmp.integrator, dmp.integration_steps)
+        })
+    }
+
+    fn check_combinations(&self) -> Result<(), ConfigError> {
+        let first = self.algorithm.critic == CriticInput::First;
+        let sliding = self.algorithm.windows == Windows::Sliding;
+        let several = self.policy.decision_steps() > 1;
+        range("algorithm.windows", "sliding", !(first && sliding && several), || {
+            "algorithm.critic = \"first\" needs windows = \"segment\": the later actions of a \
+             sliding window come from two decisions"
+                .into()
+        })?;
+        let literal = self.algorithm.target == super::Target::Literal;
+        range("algorithm.target", "literal", !(literal && sliding && several), || {
+            "the literal target needs algorithm.windows = \"segment\"".into()
+        })?;
+        let dmp = self.policy.kind == PolicyKind::Dmp;
+        let drawn = self.exploration.warm_up_kind == WarmUpKind::DmpParameters;
+        range("exploration.warm_up_kind", "dmp_parameters", dmp || !drawn, || {
+            "policy.kind = \"mlp\" has no DMP parameters to draw".into()
+        })?;
+        let explored = self.exploration.kind == super::ExplorationKind::DmpParameters;
+        range("exploration.kind", "dmp_parameters", dmp || !explored, || {
+            "policy.kind = \"mlp\" has no DMP parameters to disturb".into()
+        })?;
+        let carry = dmp && self.policy.start == Start::Carry;
+        range("exploration.warm_up_kind", "uniform", drawn || !carry, || {
+            "policy.start = \"carry\" needs warm_up_kind = \"dmp_parameters\", so that y is \
+             defined during the warm-up"
+                .into()
+        })?;
+        let observed = dmp && self.policy.start == Start::Observed;
+        let sources = self.task.start_sources.len();
+        range("policy.start", "observed", !observed || sources > 0, || {
+            format!("task `{}` has no task.start_sources to read y0 from", self.task.name)
+        })
+    }
+}
+
+fn range(
+    key: &'static str,
+    got: impl std::fmt::Display,
+    fits: bool,
+    expected: impl FnOnce() -> String,
+) -> Result<(), ConfigError> {
+    if fits {
+        return Ok(());
+    }
+    let expected = expected();
+    Err(ConfigError::Range { key, expected: format!("expected {expected}"), got: got.to_string() })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::{Layers, PRESETS, TASKS};
+    use super::*;
+
+    const LIMITS: Limits = Limits { cores: 2 };
+
+    fn resolved(keys: &[(&str, &str)]) -> Result<ExperimentConfig, ConfigError> {
+        let mut layers = Layers::new();
+        for (key, value) in keys {
+            layers.set("--set", key, value)?;
+        }
+        layers.finish()?.resolve(LIMITS)
+    }
+
+    #[test]
+    fn every_task_resolves_with_every_preset() {
+        for task in &TASKS {
+            for preset in &PRESETS {
+                let mut layers = Layers::new();
+                layers.add(task.name, task.table()).unwrap();
+                layers.add(preset.name, preset.table()).unwrap();
+                layers.finish().unwrap().resolve(LIMITS).unwrap();
+            }
+        }
+    }
+
+    #[test]
+    fn workers_default_to_the_cores_but_one() {
+        assert_eq!(resolved(&[]).unwrap().actors.workers, 1);
+        assert_eq!(ExperimentConfig::default().resolve(Limits { cores: 8 }).unwrap().actors.workers, 7);
+    }
+
+    #[test]
+    fn values_out_of_range_are_refused_by_name() {
+        for (key, value) in [
+            ("dmp.alpha_y", "70"),
+            ("dmp.integration_steps", "41"),
+            ("algorithm.discount", "1.5"),
+            ("algorithm.polyak", "nan"),
+            ("actors.workers", "1000000"),
+            ("policy.hidden", "[]"),
+            ("algorithm.critic", "first"),
+            ("algorithm.target", "literal"),
+            ("policy.start", "carry"),
+            ("policy.start", "observed"),
+        ] {
+            let message = resolved(&[(key, value)]).unwrap_err().to_string();
+            assert!(message.contains("expected"), "{key} = {value}: {message}");
+        }
+    }
+}

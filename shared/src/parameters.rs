@@ -1,0 +1,60 @@
+//! A policy snapshot: what the learner publishes and the workers act with.
+
+use thiserror::Error;
+
+/// The actor's parameters at one version, used whole or not at all.
+#[derive(Debug, Clone, PartialEq, Default)]
+pub struct ParameterSnapshot {
+    /// Counts published snapshots of a run; never decreases, survives a resume.
+    pub version: u64,
+    /// Environment steps inserted when it was published: workers read the warm-up's end from it.
+    pub env_steps: u64,
+    /// Hash of the architecture that `values` belong to.
+    pub architecture_hash: u64,
+    /// All parameters, flat.
+    pub values: Vec<f32>,
+}
+
+/// Why a snapshot was refused.
+#[derive(Debug, Error, PartialEq, Eq)]
+pub enum SnapshotError {
+    /// Torn or damaged in transit.
+    #[error("policy version {version}: checksum {got:#010x}, expected {expected:#010x}")]
+    Checksum {
+        /// The snapshot's version.
+        version: u64,
+        /// Checksum its header states.
+        expected: u32,
+        /// Checksum of its values.
+        got: u32,
+    },
+    /// From another architecture.
+    #[error("policy version {version}: architecture {got:#018x}, expected {expected:#018x}")]
+    Architecture {
+        /// The snapshot's version.
+        version: u64,
+        /// The receiver's architecture.
+        expected: u64,
+        /// The snapshot's architecture.
+        got: u64,
+    },
+}
+
+impl ParameterSnapshot {
+    /// CRC-32 over version, steps, architecture and values.
+    #[must_use]
+    pub fn checksum(&self) -> u32 {
+        checksum(self.version, self.env_steps, self.architecture_hash, &self.values)
+    }
+}
+
+/// CRC-32 over the parts of a snapshot, for values that are not in a `Vec` yet.
+#[must_use]
+pub fn checksum(version: u64, env_steps: u64, architecture_hash: u64, values: &[f32]) -> u32 {
+    let mut hasher = crc32fast::Hasher::new();
+    for word in [version, env_steps, architecture_hash] {
+        hasher.update(&word.to_le_bytes());
+    }
+    hasher.update(bytemuck::cast_slice(values));
+    hasher.finalize()
+}

@@ -1,0 +1,105 @@
+//! Stages 4 and 7 of 8: segments from workers to the learner, policy snapshots back.
+//!
+//! Two implementations of the same four traits: `in_process` (one-process runs and tests) and
+//! `shared_memory` (iceoryx2, between processes). No call here waits: a full queue is reported,
+//! and who waits, how long and on whom to blame it is the caller's business.
+
+pub mod in_process;
+pub mod shared_memory;
+
+use thiserror::Error;
+
+use crate::parameters::{ParameterSnapshot, SnapshotError};
+use crate::segment::{Segment, SegmentHeader};
+
+/// What became of a segment that was offered.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum SendOutcome {
+    /// It lies in the learner's queue.
+    Delivered,
+    /// The queue is full: offer it again later.
+    Full,
+    /// No learner is attached (not yet, or no longer): offer it again later.
+    Detached,
+}
+
+/// Why the transport failed.
+#[derive(Debug, Error)]
+pub enum TransportError {
+    /// The middleware refused an operation.
+    #[error("{operation} on {name}: {cause}")]
+    Middleware {
+        /// What was attempted.
+        operation: &'static str,
+        /// Service or directory.
+        name: String,
+        /// The middleware's own words.
+        cause: String,
+    },
+    /// The peer was built from another version or runs another configuration.
+    #[error("{name}: peers disagree, {cause}; start both from the same build and configuration")]
+    Incompatible {
+        /// Service.
+        name: String,
+        /// What differs.
+        cause: String,
+    },
+    /// A segment of the wrong length was offered.
+    #[error("segment block has {got} numbers, this queue carries {expected}")]
+    Length {
+        /// Length the queue was made for.
+        expected: usize,
+        /// Length offered.
+        got: usize,
+    },
+    /// A damaged or foreign snapshot.
+    #[error(transparent)]
+    Snapshot(#[from] SnapshotError),
+}
+
+/// The worker's end of its segment queue.
+pub trait SegmentSender {
+    /// Offers one segment without waiting. Only `Delivered` means that it was taken.
+    ///
+    /// # Errors
+    /// `Length` if the block does not fit, `Middleware` if the queue is broken.
+    fn try_send(
+        &mut self,
+        header: &SegmentHeader,
+        block: &[f32],
+    ) -> Result<SendOutcome, TransportError>;
+}
+
+/// The learner's end of all segment queues, taken from in turn so that none starves.
+pub trait SegmentReceiver {
+    /// Copies the next segment into `segment`; `false` if every queue is empty.
+    ///
+    /// # Errors
+    /// `Middleware` if a queue is broken.
+    fn try_receive(&mut self, segment: &mut Segment) -> Result<bool, TransportError>;
+
+    /// Frees what dead workers left behind; to be called a few times a second.
+    ///
+    /// # Errors
+    /// `Middleware` if the cleaning itself failed.
+    fn maintain(&mut self) -> Result<(), TransportError>;
+}
+
+/// The learner's end of the parameter channel: the newest snapshot replaces the one before.
+pub trait ParameterPublisher {
+    /// Publishes a snapshot to all workers, and to those that join later.
+    ///
+    /// # Errors
+    /// `Middleware` if publishing failed.
+    fn publish(&mut self, snapshot: &ParameterSnapshot) -> Result<(), TransportError>;
+}
+
+/// A worker's end of the parameter channel.
+pub trait ParameterSubscriber {
+    /// Copies the newest snapshot into `snapshot` if there is one newer than the last taken.
+    ///
+    /// # Errors
+    /// `Snapshot` if it is damaged or foreign (then `snapshot` is unchanged), `Middleware` if the
+    /// channel is broken.
+    fn newest(&mut self, snapshot: &mut ParameterSnapshot) -> Result<bool, TransportError>;
+}
