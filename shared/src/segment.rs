@@ -207,7 +207,8 @@ pub fn check(header: &SegmentHeader, block: &[f32], expected: &Expected) -> Resu
         && header.sequence > 0
         && (1..=header.segment_steps).contains(&header.steps_len)
         && header.flags & !(TERMINATED | TRUNCATED | SUCCESS) == 0
-        && (header.steps_len == header.segment_steps || header.flags & (TERMINATED | TRUNCATED) != 0);
+        && (header.steps_len == header.segment_steps
+            || header.flags & (TERMINATED | TRUNCATED) != 0);
     refuse(!in_range, Rejection::Field)?;
     refuse(block_checksum(block) != header.checksum, Rejection::Checksum)?;
     let (_, actions, _) = layout.split(block);
@@ -228,13 +229,8 @@ mod tests {
 
     const LAYOUT: SegmentLayout =
         SegmentLayout { segment_steps: 5, observation_len: 3, action_len: 2 };
-    const EXPECTED: Expected = Expected {
-        run_id: 7,
-        architecture_hash: 9,
-        layout: LAYOUT,
-        worker_count: 2,
-        env_count: 4,
-    };
+    const EXPECTED: Expected =
+        Expected { run_id: 7, architecture_hash: 9, layout: LAYOUT, worker_count: 2, env_count: 4 };
 
     fn sound() -> Segment {
         let mut segment = Segment::zeroed(LAYOUT);

@@ -39,7 +39,9 @@ pub enum SpecError {
         got: usize,
     },
     /// A bound that is infinite, NaN or empty.
-    #[error("{id}: action dimension {dimension} is bounded by [{low}, {high}]; expected finite, low < high")]
+    #[error(
+        "{id}: action dimension {dimension} is bounded by [{low}, {high}]; expected finite, low < high"
+    )]
     Bounds {
         /// Gymnasium id.
         id: String,
@@ -69,7 +71,8 @@ impl EnvSpec {
                 return Err(SpecError::Length { id: self.id.clone(), name, expected, got });
             }
         }
-        for (dimension, (&low, &high)) in self.action_low.iter().zip(&self.action_high).enumerate() {
+        for (dimension, (&low, &high)) in self.action_low.iter().zip(&self.action_high).enumerate()
+        {
             if !(low.is_finite() && high.is_finite() && low < high) {
                 return Err(SpecError::Bounds { id: self.id.clone(), dimension, low, high });
             }

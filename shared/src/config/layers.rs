@@ -176,9 +176,10 @@ fn unknown(origin: &str, key: String, name: &str, siblings: &Table, path: &str) 
     let anywhere = || {
         let keys = Layers::new().keys();
         let leaf = |key: &str| key.rsplit('.').next().unwrap_or_default().to_owned();
-        keys.iter().find(|key| leaf(key) == name).cloned().or_else(|| {
-            nearest(&key, keys.iter().map(String::as_str)).map(str::to_owned)
-        })
+        keys.iter()
+            .find(|key| leaf(key) == name)
+            .cloned()
+            .or_else(|| nearest(&key, keys.iter().map(String::as_str)).map(str::to_owned))
     };
     let hint = sibling.or_else(anywhere).map(|near| format!(", did you mean `{near}`?"));
     ConfigError::UnknownKey { origin: origin.to_owned(), key, hint: hint.unwrap_or_default() }

@@ -1,8 +1,6 @@
 //! Checks the merged tree: ranges, combinations, caps.
 
-use super::{
-    ConfigError, CriticInput, ExperimentConfig, PolicyKind, Start, WarmUpKind, Windows,
-};
+use super::{ConfigError, CriticInput, ExperimentConfig, PolicyKind, Start, WarmUpKind, Windows};
 
 /// What the machine sets: passed in, never read here.
 #[derive(Debug, Clone, Copy)]
@@ -72,7 +70,9 @@ impl ExperimentConfig {
             ("learner.publish_every_updates", self.learner.publish_every_updates),
             ("pacing.tolerance_segments", self.pacing.tolerance_segments),
         ];
-        intervals.iter().try_for_each(|&(key, got)| range(key, got, got > 0, || "at least 1".into()))
+        intervals
+            .iter()
+            .try_for_each(|&(key, got)| range(key, got, got > 0, || "at least 1".into()))
     }
 
     fn check_numbers(&self) -> Result<(), ConfigError> {
@@ -114,8 +114,11 @@ impl ExperimentConfig {
         )?;
         let max = dmp.integrator.alpha_y_max(1.0 / dmp.integration_steps as f64);
         range("dmp.alpha_y", dmp.alpha_y, dmp.alpha_y < max, || {
-            format!("below {max:.0}, where the {:?} integrator is stable with {} steps; \
-                     lower alpha_y or raise dmp.integration_steps", dmp.integrator, dmp.integration_steps)
+            format!(
+                "below {max:.0}, where the {:?} integrator is stable with {} steps; \
+                     lower alpha_y or raise dmp.integration_steps",
+                dmp.integrator, dmp.integration_steps
+            )
         })
     }
 
@@ -198,7 +201,10 @@ mod tests {
     #[test]
     fn workers_default_to_the_cores_but_one() {
         assert_eq!(resolved(&[]).unwrap().actors.workers, 1);
-        assert_eq!(ExperimentConfig::default().resolve(Limits { cores: 8 }).unwrap().actors.workers, 7);
+        assert_eq!(
+            ExperimentConfig::default().resolve(Limits { cores: 8 }).unwrap().actors.workers,
+            7
+        );
     }
 
     #[test]

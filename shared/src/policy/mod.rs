@@ -1,1 +1,215 @@
-//! Policy.
+//! From observation to the actions of a segment: the forward pass that rollout, evaluation and
+//! update share.
+//!
+//! ```text
+//!   observation ── network ──► outputs ── tanh, ranges ──► goal, weights, rho   (per dimension)
+//!                                                            │ DMP: one affine map
+//!                                                            ▼
+//!                              actions u in [-1, 1] ◄── inverse controller ◄── y, yd, ydd
+//! ```
+//! `network` is the multilayer perceptron, `dmp_head` the rest of the `dmp` policy; the `mlp`
+//! policy is the network and a tanh. Everything works on flat `f32` slices and buffers made once.
+
+mod action_scaling;
+mod dmp_head;
+mod matrix;
+mod network;
+mod start;
+
+use rand_xoshiro::Xoshiro256PlusPlus;
+use thiserror::Error;
+
+pub use action_scaling::ActionScaling;
+pub use dmp_head::{DmpHead, DmpWorkspace, HeadGradient};
+pub use matrix::{Keep, Matrix, Threads, product};
+pub use network::{Activations, Layer, MlpShape, forward, initial_parameters};
+
+use crate::config::{ExperimentConfig, PolicyKind};
+use crate::dmp::DmpError;
+use crate::segment::SegmentLayout;
+use crate::spec::{EnvSpec, SpecError};
+
+/// Why a policy cannot be built.
+#[derive(Debug, Error)]
+pub enum PolicyError {
+    /// The environment does not fit.
+    #[error(transparent)]
+    Spec(#[from] SpecError),
+    /// The DMP's configuration does not fit.
+    #[error(transparent)]
+    Dmp(#[from] DmpError),
+    /// `task.start_sources` does not fit the environment.
+    #[error("task.start_sources: {0}")]
+    StartSources(String),
+    /// Parameters of another length.
+    #[error("policy takes {expected} parameters, got {got}")]
+    Length {
+        /// Length the architecture has.
+        expected: usize,
+        /// Length offered.
+        got: usize,
+    },
+}
+
+/// What turns the network's outputs into actions.
+#[derive(Debug)]
+pub enum Head {
+    /// One action: u = tanh(output).
+    Mlp,
+    /// A segment of actions from DMP and inverse-controller parameters.
+    Dmp(Box<DmpHead>),
+}
+
+/// A policy's architecture: everything but its parameters.
+#[derive(Debug)]
+pub struct Policy {
+    shape: MlpShape,
+    head: Head,
+    layout: SegmentLayout,
+    scaling: ActionScaling,
+    env_observation_len: usize,
+    architecture_hash: u64,
+}
+
+/// Buffers of one forward pass over up to `rows_max` observations.
+#[derive(Debug)]
+pub struct PolicyWorkspace {
+    /// The network's activations, kept for the backward pass.
+    pub activations: Activations,
+    /// u, (rows, K, A).
+    pub actions: Vec<f32>,
+    /// What the head keeps for the backward pass.
+    pub dmp: Option<DmpWorkspace>,
+}
+
+impl Policy {
+    /// Builds the architecture that `config` describes for an environment.
+    ///
+    /// # Errors
+    /// If the environment's spec is unsound or does not fit the configuration.
+    pub fn new(config: &ExperimentConfig, spec: &EnvSpec) -> Result<Self, PolicyError> {
+        spec.check()?;
+        let steps = config.policy.decision_steps();
+        let layout = SegmentLayout {
+            segment_steps: steps,
+            observation_len: spec.observation_len + dmp_head::carried_len(config, spec),
+            action_len: spec.action_len,
+        };
+        let head = match config.policy.kind {
+            PolicyKind::Mlp => Head::Mlp,
+            PolicyKind::Dmp => Head::Dmp(Box::new(DmpHead::new(config, spec)?)),
+        };
+        let outputs = match &head {
+            Head::Mlp => spec.action_len,
+            Head::Dmp(head) => head.outputs_len(),
+        };
+        let mut widths = vec![layout.observation_len];
+        widths.extend(&config.policy.hidden);
+        widths.push(outputs);
+        let described = format!("{:?} {:?} {spec:?} {:?}", config.policy, config.dmp, config.task);
+        Ok(Self {
+            shape: MlpShape::new(widths),
+            head,
+            layout,
+            scaling: ActionScaling::new(spec),
+            env_observation_len: spec.observation_len,
+            architecture_hash: crate::seeds::derive(0, &described, 0),
+        })
+    }
+
+    /// Identifies the architecture: configuration of policy, DMP and task, and the spec.
+    #[must_use]
+    pub fn architecture_hash(&self) -> u64 {
+        self.architecture_hash
+    }
+
+    /// Sizes of the segments that this policy makes.
+    #[must_use]
+    pub fn layout(&self) -> SegmentLayout {
+        self.layout
+    }
+
+    /// The network's layers.
+    #[must_use]
+    pub fn shape(&self) -> &MlpShape {
+        &self.shape
+    }
+
+    /// What follows the network.
+    #[must_use]
+    pub fn head(&self) -> &Head {
+        &self.head
+    }
+
+    /// From u to the environment's own units.
+    #[must_use]
+    pub fn scaling(&self) -> &ActionScaling {
+        &self.scaling
+    }
+
+    /// Length of the environment's part of an observation; a carried DMP state follows it.
+    #[must_use]
+    pub fn env_observation_len(&self) -> usize {
+        self.env_observation_len
+    }
+
+    /// Whether (y, yd) continue from segment to segment and are part of the observation.
+    #[must_use]
+    pub fn carries_state(&self) -> bool {
+        self.layout.observation_len > self.env_observation_len
+    }
+
+    /// Freshly drawn parameters.
+    #[must_use]
+    pub fn initial_parameters(&self, random: &mut Xoshiro256PlusPlus) -> Vec<f32> {
+        initial_parameters(&self.shape, random)
+    }
+
+    /// Buffers for up to `rows_max` observations at a time.
+    #[must_use]
+    pub fn workspace(&self, rows_max: usize) -> PolicyWorkspace {
+        PolicyWorkspace {
+            activations: Activations::new(&self.shape, rows_max),
+            actions: vec![0.0; rows_max * self.layout.segment_steps * self.layout.action_len],
+            dmp: match &self.head {
+                Head::Mlp => None,
+                Head::Dmp(head) => Some(head.workspace(rows_max)),
+            },
+        }
+    }
+
+    /// Computes u for every observation into `work.actions`.
+    ///
+    /// - `parameters`: (P,). `observations`: (rows, O).
+    ///
+    /// # Panics
+    /// If a length does not fit or there are more rows than the workspace holds.
+    pub fn act(
+        &self,
+        parameters: &[f32],
+        observations: &[f32],
+        work: &mut PolicyWorkspace,
+        threads: Threads,
+    ) {
+        forward(&self.shape, parameters, observations, &mut work.activations, threads);
+        self.decode(observations, work);
+    }
+
+    /// The second half of [`Policy::act`]: from the network's outputs, which exploration may have
+    /// disturbed in `work.activations`, to u.
+    pub fn decode(&self, observations: &[f32], work: &mut PolicyWorkspace) {
+        let rows = observations.len() / self.layout.observation_len;
+        let outputs = work.activations.output(&self.shape, rows);
+        match (&self.head, &mut work.dmp) {
+            (Head::Dmp(head), Some(dmp)) => {
+                head.squash(outputs, dmp);
+                head.segment(observations, dmp, &mut work.actions);
+            }
+            _ => {
+                for (action, output) in work.actions.iter_mut().zip(outputs) {
+                    *action = output.tanh();
+                }
+            }
+        }
+    }
+}

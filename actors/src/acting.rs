@@ -1,0 +1,110 @@
+//! A policy acting on a set of environments: what rollout and evaluation have in common.
+
+use dmprl_shared::policy::{Head, Policy, PolicyWorkspace, Threads, forward};
+
+use crate::python_env::PythonEnvironments;
+
+/// The policy's side of E environments, with buffers made once.
+#[derive(Debug)]
+pub struct Acting {
+    /// The architecture.
+    pub policy: Policy,
+    /// Buffers of the forward pass.
+    pub work: PolicyWorkspace,
+    /// What the policy sees now, (E, O).
+    pub observations: Vec<f32>,
+    /// u of the segment, (E, K, A), exploration included.
+    pub u: Vec<f32>,
+    /// (y, yd) that each environment's DMP continues from, (E, 2A); empty if not carried.
+    carried: Vec<f32>,
+    /// The segment's actions in the environments' units, (E, K, A).
+    actions: Vec<f64>,
+}
+
+impl Acting {
+    /// For `envs` environments.
+    #[must_use]
+    pub fn new(policy: Policy, envs: usize) -> Self {
+        let layout = policy.layout();
+        let actions_len = envs * layout.segment_steps * layout.action_len;
+        let carried_len = layout.observation_len - policy.env_observation_len();
+        Self {
+            work: policy.workspace(envs),
+            observations: vec![0.0; envs * layout.observation_len],
+            u: vec![0.0; actions_len],
+            carried: vec![0.0; envs * carried_len],
+            actions: vec![0.0; actions_len],
+            policy,
+        }
+    }
+
+    /// Takes the observations to act on from the environments.
+    pub fn observe(&mut self, environments: &PythonEnvironments) {
+        let env_len = self.policy.env_observation_len();
+        let len = self.policy.layout().observation_len;
+        let rows = environments.next_observations().chunks_exact(env_len);
+        for (env, (row, seen)) in rows.zip(self.observations.chunks_exact_mut(len)).enumerate() {
+            for (seen, value) in seen.iter_mut().zip(row) {
+                *seen = *value as f32;
+            }
+            let carried = len - env_len;
+            seen[env_len..].copy_from_slice(&self.carried[env * carried..(env + 1) * carried]);
+        }
+    }
+
+    /// Runs the network; the outputs lie in `work.activations`.
+    pub fn run_network(&mut self, parameters: &[f32]) {
+        let shape = self.policy.shape();
+        let activations = &mut self.work.activations;
+        forward(shape, parameters, &self.observations, activations, Threads::ONE);
+    }
+
+    /// From the network's outputs to `u`, without exploration.
+    pub fn decode(&mut self) {
+        self.policy.decode(&self.observations, &mut self.work);
+        self.u.copy_from_slice(&self.work.actions);
+    }
+
+    /// From squashed DMP parameters that `draw` fills, (A (1+N+4)) a row, to `u`.
+    pub fn decode_drawn(&mut self, draw: &mut dyn FnMut(&mut [f32])) {
+        if let (Head::Dmp(head), Some(dmp)) = (self.policy.head(), &mut self.work.dmp) {
+            let rows = self.observations.len() / self.policy.layout().observation_len;
+            (0..rows).for_each(|row| draw(head.squashed_mut(dmp, row)));
+            head.segment(&self.observations, dmp, &mut self.work.actions);
+            self.u.copy_from_slice(&self.work.actions);
+        }
+    }
+
+    /// `u` in the environments' units, (E, K, A).
+    pub fn actions(&mut self) -> &[f64] {
+        self.policy.scaling().apply(&self.u, &mut self.actions);
+        &self.actions
+    }
+
+    /// (y, yd) of environment `env` after step `k` of the segment, into `state`; nothing if it is
+    /// not carried.
+    pub fn state_at(&self, env: usize, k: usize, state: &mut [f32]) {
+        if self.policy.carries_state()
+            && let (Head::Dmp(head), Some(dmp)) = (self.policy.head(), &self.work.dmp)
+        {
+            head.state_at(dmp, env, k, state);
+        }
+    }
+
+    /// Lets environment `env`'s DMP continue from the segment's end, or from rest if its episode
+    /// has ended.
+    pub fn carry_on(&mut self, env: usize, ended: bool) {
+        let len = self.policy.layout().observation_len - self.policy.env_observation_len();
+        if len == 0 {
+            return;
+        }
+        let mut carried = std::mem::take(&mut self.carried);
+        let state = &mut carried[env * len..(env + 1) * len];
+        if ended {
+            state.fill(0.0);
+        } else {
+            self.state_at(env, self.policy.layout().segment_steps, state);
+        }
+        self.carried = carried;
+    }
+}

@@ -1,0 +1,165 @@
+//! Stage 8 of 8, its first half: noise-free episodes on fixed seeds, in environments of their own.
+
+use dmprl_shared::config::ExperimentConfig;
+use dmprl_shared::policy::{Policy, PolicyError};
+
+use crate::acting::Acting;
+use crate::python_env::PythonEnvironments;
+use crate::rollout::RolloutError;
+
+/// Steps after which an episode of an environment without a time limit is cut off.
+const EPISODE_STEPS_MAX: u32 = 10_000;
+
+/// Environments that an evaluation runs side by side. Each episode begins with a reset of its own
+/// seed, so the number does not change a result.
+pub const ENVIRONMENTS_MAX: usize = 10;
+
+/// What a set of episodes showed.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Evaluation {
+    /// Sum of rewards of each episode, in the order of the seeds.
+    pub returns: Vec<f64>,
+    /// Share of episodes that reported success at their last step; none if the task reports none.
+    pub success_rate: Option<f64>,
+    /// Mean |u_t - u_{t-1}| over all steps and action dimensions.
+    pub smoothness: f64,
+}
+
+impl Evaluation {
+    /// Mean of the returns.
+    #[must_use]
+    pub fn return_mean(&self) -> f64 {
+        self.returns.iter().sum::<f64>() / self.returns.len().max(1) as f64
+    }
+}
+
+/// Evaluates policies of one architecture.
+#[derive(Debug)]
+pub struct Evaluator {
+    environments: PythonEnvironments,
+    acting: Acting,
+    envs: usize,
+}
+
+/// What accumulates over one wave of episodes.
+struct Wave {
+    returns: Vec<f64>,
+    success: Vec<u8>,
+    steps: Vec<u32>,
+    running: Vec<bool>,
+    /// Last u of each environment, (E, A); NaN before the first step.
+    last_u: Vec<f32>,
+    jumps: f64,
+    jump_count: u64,
+}
+
+impl Evaluator {
+    /// An evaluator on `envs` environments.
+    ///
+    /// # Errors
+    /// If the policy does not fit them.
+    pub fn new(
+        config: &ExperimentConfig,
+        environments: PythonEnvironments,
+        envs: usize,
+    ) -> Result<Self, PolicyError> {
+        let policy = Policy::new(config, environments.spec())?;
+        Ok(Self { environments, acting: Acting::new(policy, envs), envs })
+    }
+
+    /// The policy's architecture.
+    #[must_use]
+    pub fn policy(&self) -> &Policy {
+        &self.acting.policy
+    }
+
+    /// Runs `episodes` episodes; episode i is reset with seed `first_seed + i`.
+    ///
+    /// # Errors
+    /// If an environment fails.
+    pub fn evaluate(
+        &mut self,
+        parameters: &[f32],
+        episodes: usize,
+        first_seed: u64,
+    ) -> Result<Evaluation, RolloutError> {
+        let mut returns = Vec::with_capacity(episodes);
+        let mut success = Vec::with_capacity(episodes);
+        let (mut jumps, mut jump_count) = (0.0, 0);
+        while returns.len() < episodes {
+            let count = (episodes - returns.len()).min(self.envs);
+            let wave = self.wave(parameters, count, first_seed + returns.len() as u64)?;
+            returns.extend(&wave.returns[..count]);
+            success.extend(&wave.success[..count]);
+            jumps += wave.jumps;
+            jump_count += wave.jump_count;
+        }
+        // 2: the environment's info holds no success.
+        let reported = success.iter().all(|&flag| flag != 2);
+        let successes = success.iter().filter(|&&flag| flag == 1).count();
+        Ok(Evaluation {
+            success_rate: reported.then(|| successes as f64 / success.len() as f64),
+            smoothness: jumps / (jump_count.max(1) as f64),
+            returns,
+        })
+    }
+
+    fn wave(
+        &mut self,
+        parameters: &[f32],
+        count: usize,
+        first_seed: u64,
+    ) -> Result<Wave, RolloutError> {
+        let dims = self.acting.policy.layout().action_len;
+        let mut wave = Wave {
+            returns: vec![0.0; self.envs],
+            success: vec![2; self.envs],
+            steps: vec![0; self.envs],
+            running: (0..self.envs).map(|env| env < count).collect(),
+            last_u: vec![f32::NAN; self.envs * dims],
+            jumps: 0.0,
+            jump_count: 0,
+        };
+        let seeds: Vec<u64> = (0..self.envs as u64).map(|env| first_seed + env).collect();
+        self.environments.reset(&vec![true; self.envs], &seeds)?;
+        (0..self.envs).for_each(|env| self.acting.carry_on(env, true));
+        while wave.running.iter().any(|&running| running) {
+            self.acting.observe(&self.environments);
+            self.acting.run_network(parameters);
+            self.acting.decode();
+            self.environments.step_segment(self.acting.actions())?;
+            for env in 0..self.envs {
+                if wave.running[env] {
+                    self.book(&mut wave, env);
+                }
+            }
+        }
+        Ok(wave)
+    }
+
+    /// Adds environment `env`'s segment to the wave.
+    fn book(&mut self, wave: &mut Wave, env: usize) {
+        let layout = self.acting.policy.layout();
+        let (k_max, dims) = (layout.segment_steps, layout.action_len);
+        let steps = self.environments.steps()[env] as usize;
+        wave.returns[env] +=
+            self.environments.rewards()[env * k_max..][..steps].iter().sum::<f64>();
+        let u = &self.acting.u[env * k_max * dims..][..steps * dims];
+        let last = &mut wave.last_u[env * dims..(env + 1) * dims];
+        for step in u.chunks_exact(dims) {
+            for (u, last) in step.iter().zip(last.iter_mut()) {
+                if last.is_finite() {
+                    wave.jumps += f64::from((u - *last).abs());
+                    wave.jump_count += 1;
+                }
+                *last = *u;
+            }
+        }
+        wave.steps[env] += steps as u32;
+        wave.success[env] = self.environments.success()[env];
+        let ended = self.environments.terminated()[env] == 1
+            || self.environments.truncated()[env] == 1;
+        self.acting.carry_on(env, ended);
+        wave.running[env] = !ended && wave.steps[env] < EPISODE_STEPS_MAX;
+    }
+}

@@ -1,0 +1,229 @@
+//! Stage 3 of 8: newest policy, observe, decide a segment, step the environments, send.
+//!
+//! One call into Python a segment for all E environments; between two calls everything is Rust on
+//! buffers made once.
+
+use dmprl_shared::config::ExperimentConfig;
+use dmprl_shared::parameters::ParameterSnapshot;
+use dmprl_shared::policy::{Policy, PolicyError};
+use dmprl_shared::seeds;
+use dmprl_shared::segment::{
+    LAYOUT_VERSION, SUCCESS, Segment, SegmentHeader, TERMINATED, TRUNCATED, block_checksum,
+};
+use thiserror::Error;
+
+use crate::acting::Acting;
+use crate::exploration::Exploration;
+use crate::python_env::{PythonEnvironments, PythonError};
+
+/// Why a rollout stopped.
+#[derive(Debug, Error)]
+pub enum RolloutError {
+    /// The policy does not fit the environment.
+    #[error(transparent)]
+    Policy(#[from] PolicyError),
+    /// The environment failed.
+    #[error(transparent)]
+    Python(#[from] PythonError),
+    /// An environment produced a number that is NaN or infinite.
+    #[error("environment {env_index}, episode {episode}, step {step}: {name} is not finite")]
+    NotFinite {
+        /// Which environment of the worker.
+        env_index: usize,
+        /// Which of its episodes.
+        episode: u32,
+        /// Which step of the episode.
+        step: u32,
+        /// Observation or reward.
+        name: &'static str,
+    },
+}
+
+/// Who this worker is.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Identity {
+    /// The run.
+    pub run_id: u64,
+    /// The worker's slot.
+    pub worker_id: u32,
+    /// Counts the starts of this slot.
+    pub incarnation: u32,
+}
+
+#[derive(Debug, Clone, Copy, Default)]
+struct Episode {
+    number: u32,
+    steps: u32,
+}
+
+/// A rollout worker.
+#[derive(Debug)]
+pub struct Rollout {
+    identity: Identity,
+    warm_up_steps: u64,
+    environments: PythonEnvironments,
+    acting: Acting,
+    exploration: Exploration,
+    episodes: Vec<Episode>,
+    segment: Segment,
+    sequence: u64,
+    /// The policy that acts; version 0 until the first one has come.
+    pub snapshot: ParameterSnapshot,
+}
+
+impl Rollout {
+    /// Resets the environments, each with a seed of its own.
+    ///
+    /// # Errors
+    /// If policy or environments cannot be made.
+    pub fn start(
+        config: &ExperimentConfig,
+        mut environments: PythonEnvironments,
+        identity: Identity,
+    ) -> Result<Self, RolloutError> {
+        let envs = config.actors.envs_per_worker;
+        let policy = Policy::new(config, environments.spec())?;
+        let layout = policy.layout();
+        // A restarted worker continues no episode, and must not repeat those of its predecessor.
+        let worker = u64::from(identity.worker_id) << 32 | u64::from(identity.incarnation);
+        let random = seeds::stream(config.run.seed, "exploration", worker);
+        let env_seeds: Vec<u64> = (0..envs as u64)
+            .map(|env| seeds::derive(config.run.seed, "environment", worker << 16 | env) >> 33)
+            .collect();
+        environments.reset(&vec![true; envs], &env_seeds)?;
+        Ok(Self {
+            identity,
+            warm_up_steps: config.exploration.warm_up_steps,
+            exploration: Exploration::new(
+                config.exploration.clone(),
+                random,
+                (envs, layout.action_len),
+            ),
+            episodes: vec![Episode::default(); envs],
+            segment: Segment::zeroed(layout),
+            sequence: 0,
+            snapshot: ParameterSnapshot::default(),
+            acting: Acting::new(policy, envs),
+            environments,
+        })
+    }
+
+    /// The policy's architecture.
+    #[must_use]
+    pub fn policy(&self) -> &Policy {
+        &self.acting.policy
+    }
+
+    /// Decides and runs one segment in every environment with `self.snapshot`, and hands each
+    /// segment to `deliver`, which keeps it until the learner has it.
+    ///
+    /// # Errors
+    /// If an environment fails, or whatever `deliver` returns.
+    pub fn segment<E: From<RolloutError>>(
+        &mut self,
+        deliver: &mut dyn FnMut(&SegmentHeader, &[f32]) -> Result<(), E>,
+    ) -> Result<(), E> {
+        self.acting.observe(&self.environments);
+        let warming_up = self.snapshot.version == 0 || self.snapshot.env_steps < self.warm_up_steps;
+        if warming_up {
+            self.exploration.warm_up(&mut self.acting);
+        } else {
+            self.acting.run_network(&self.snapshot.values);
+            self.exploration.explore(&mut self.acting);
+        }
+        let policy_version = if warming_up { 0 } else { self.snapshot.version };
+        self.environments.step_segment(self.acting.actions()).map_err(RolloutError::from)?;
+        for env in 0..self.episodes.len() {
+            self.record(env, policy_version)?;
+            deliver(&self.segment.header, &self.segment.block)?;
+        }
+        Ok(())
+    }
+
+    /// Fills `self.segment` with what environment `env` has just done.
+    fn record(&mut self, env: usize, policy_version: u64) -> Result<(), RolloutError> {
+        let layout = self.acting.policy.layout();
+        let steps = self.environments.steps()[env] as usize;
+        self.fill_block(env, steps);
+        let flag = |set: bool, flag: u32| if set { flag } else { 0 };
+        let flags = flag(self.environments.terminated()[env] == 1, TERMINATED)
+            | flag(self.environments.truncated()[env] == 1, TRUNCATED)
+            | flag(self.environments.success()[env] == 1, SUCCESS);
+        self.sequence += 1;
+        let episode = self.episodes[env];
+        self.segment.header = SegmentHeader {
+            layout_version: LAYOUT_VERSION,
+            flags,
+            run_id: self.identity.run_id,
+            architecture_hash: self.acting.policy.architecture_hash(),
+            policy_version,
+            sequence: self.sequence,
+            worker_id: self.identity.worker_id,
+            incarnation: self.identity.incarnation,
+            env_index: env as u32,
+            episode: episode.number,
+            episode_step: episode.steps,
+            steps_len: steps as u32,
+            segment_steps: layout.segment_steps as u32,
+            observation_len: layout.observation_len as u32,
+            action_len: layout.action_len as u32,
+            checksum: block_checksum(&self.segment.block),
+        };
+        self.check_finite(env, episode)?;
+        let ended = flags & (TERMINATED | TRUNCATED) != 0;
+        self.acting.carry_on(env, ended);
+        if ended {
+            self.exploration.episode_ended(env);
+            self.episodes[env] = Episode { number: episode.number + 1, steps: 0 };
+        } else {
+            self.episodes[env].steps += steps as u32;
+        }
+        Ok(())
+    }
+
+    fn fill_block(&mut self, env: usize, steps: usize) {
+        let layout = self.acting.policy.layout();
+        let (k_max, o, a) = (layout.segment_steps, layout.observation_len, layout.action_len);
+        let env_len = self.acting.policy.env_observation_len();
+        let (observations, actions, rewards) = layout.split_mut(&mut self.segment.block);
+        let from = &self.environments.observations()[env * (k_max + 1) * env_len..];
+        for k in 0..=steps {
+            let row = &mut observations[k * o..(k + 1) * o];
+            for (out, value) in row.iter_mut().zip(&from[k * env_len..(k + 1) * env_len]) {
+                *out = *value as f32;
+            }
+            self.acting.state_at(env, k, &mut row[env_len..]);
+        }
+        observations[(steps + 1) * o..].fill(0.0);
+        let u = &self.acting.u[env * k_max * a..(env + 1) * k_max * a];
+        actions[..steps * a].copy_from_slice(&u[..steps * a]);
+        actions[steps * a..].fill(0.0);
+        let from = &self.environments.rewards()[env * k_max..];
+        for (out, value) in rewards[..steps].iter_mut().zip(from) {
+            *out = *value as f32;
+        }
+        rewards[steps..].fill(0.0);
+    }
+
+    /// A NaN must be stopped at its source: past the replay it would be everywhere.
+    fn check_finite(&self, env: usize, episode: Episode) -> Result<(), RolloutError> {
+        let layout = self.acting.policy.layout();
+        let (observations, _, rewards) = layout.split(&self.segment.block);
+        let bad = |values: &[f32], width: usize| {
+            values.iter().position(|value| !value.is_finite()).map(|at| at / width)
+        };
+        let o = layout.observation_len;
+        let found = bad(rewards, 1)
+            .map(|k| ("reward", k))
+            .or_else(|| bad(observations, o).map(|k| ("observation", k)));
+        match found {
+            None => Ok(()),
+            Some((name, k)) => Err(RolloutError::NotFinite {
+                env_index: env,
+                episode: episode.number,
+                step: episode.steps + k as u32,
+                name,
+            }),
+        }
+    }
+}

@@ -1,0 +1,146 @@
+//! A batch of windows, sampled straight into the buffers that the update reads.
+
+use dmprl_shared::config::{AlgorithmConfig, CriticInput, Target};
+use dmprl_shared::policy::Policy;
+use thiserror::Error;
+
+use crate::replay::{Replay, Sampler};
+
+/// The replay holds no window to learn from.
+#[derive(Debug, Error)]
+#[error(
+    "the replay holds {segments} segments but no window of {steps} steps; episodes that a time \
+     limit ends sooner cannot be learned from: lower policy.segment_steps"
+)]
+pub struct NoWindow {
+    /// Segments held.
+    pub segments: usize,
+    /// K.
+    pub steps: usize,
+}
+
+/// What the critic's input is made of.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct BatchShape {
+    /// B.
+    pub rows: usize,
+    /// O, the DMP state included when carried.
+    pub observation_len: usize,
+    /// Actions the critic sees: A times K or 1.
+    pub actions_len: usize,
+    /// (y_K, yd_K/omega) behind the actions when the DMP state is carried: 2A or 0.
+    pub end_state_len: usize,
+    /// A whole segment's actions, K A.
+    pub segment_actions_len: usize,
+}
+
+impl BatchShape {
+    /// The shape that algorithm and policy imply.
+    #[must_use]
+    pub fn new(config: &AlgorithmConfig, policy: &Policy) -> Self {
+        let layout = policy.layout();
+        let segment_actions_len = layout.segment_steps * layout.action_len;
+        let carried = if policy.carries_state() { 2 * layout.action_len } else { 0 };
+        let whole = config.critic == CriticInput::Segment;
+        Self {
+            rows: config.batch_size,
+            observation_len: layout.observation_len,
+            actions_len: if whole { segment_actions_len } else { layout.action_len },
+            // A critic of the first action alone judges nothing that comes after it.
+            end_state_len: if whole { carried } else { 0 },
+            segment_actions_len,
+        }
+    }
+
+    /// Width of the critic's input: observation, actions, end state.
+    #[must_use]
+    pub fn critic_inputs(&self) -> usize {
+        self.observation_len + self.actions_len + self.end_state_len
+    }
+}
+
+/// A sampled batch.
+#[derive(Debug)]
+pub struct Batch {
+    /// s_t, (B, O).
+    pub observations: Vec<f32>,
+    /// [s_t, actions, end state], (B, critic inputs).
+    pub critic_inputs: Vec<f32>,
+    /// Sum of the window's rewards, discounted or not as the target wants it, (B,).
+    pub rewards: Vec<f32>,
+    /// What multiplies Q' in the target: 0 where the episode terminated, (B,).
+    pub bootstrap: Vec<f32>,
+    /// The observation that the target bootstraps from, (B, O).
+    pub next_observations: Vec<f32>,
+    actions: Vec<f32>,
+}
+
+impl Batch {
+    /// Buffers for one batch.
+    #[must_use]
+    pub fn new(shape: BatchShape) -> Self {
+        Self {
+            observations: vec![0.0; shape.rows * shape.observation_len],
+            critic_inputs: vec![0.0; shape.rows * shape.critic_inputs()],
+            rewards: vec![0.0; shape.rows],
+            bootstrap: vec![0.0; shape.rows],
+            next_observations: vec![0.0; shape.rows * shape.observation_len],
+            actions: vec![0.0; shape.segment_actions_len],
+        }
+    }
+
+    /// Fills the batch.
+    ///
+    /// `n_step`: rewards are discounted per step and bootstrap is discount^n (1 - terminated)
+    /// from s_{t+n}. `literal`: the plain sum of the rewards, and discount (1 - terminated) from
+    /// s_{t+1}. A truncated episode bootstraps like any other step.
+    ///
+    /// # Errors
+    /// [`NoWindow`] if there is nothing to sample.
+    pub fn sample(
+        &mut self,
+        shape: BatchShape,
+        config: &AlgorithmConfig,
+        omega: f32,
+        (replay, sampler): (&Replay, &mut Sampler),
+    ) -> Result<(), NoWindow> {
+        let discount = config.discount as f32;
+        let o = shape.observation_len;
+        for row in 0..shape.rows {
+            let window = sampler
+                .draw(replay)
+                .ok_or(NoWindow { segments: replay.len(), steps: replay.layout().segment_steps })?;
+            let (reward, factor, next) = match config.target {
+                Target::NStep => (
+                    replay.discounted_reward(&window, discount),
+                    discount.powi(window.len() as i32),
+                    replay.last_observation(&window),
+                ),
+                Target::Literal => (
+                    replay.discounted_reward(&window, 1.0),
+                    discount,
+                    replay.second_observation(&window),
+                ),
+            };
+            self.rewards[row] = reward;
+            self.bootstrap[row] = if window.terminated { 0.0 } else { factor };
+            self.next_observations[row * o..(row + 1) * o].copy_from_slice(next);
+            let observation = replay.observation(&window);
+            self.observations[row * o..(row + 1) * o].copy_from_slice(observation);
+            let width = shape.critic_inputs();
+            let input = &mut self.critic_inputs[row * width..(row + 1) * width];
+            input[..o].copy_from_slice(observation);
+            replay.actions(&window, &mut self.actions);
+            input[o..o + shape.actions_len].copy_from_slice(&self.actions[..shape.actions_len]);
+            if shape.end_state_len > 0 {
+                // The carried state is the tail of the observation after the window.
+                let dims = shape.end_state_len / 2;
+                let state = &replay.last_observation(&window)[o - 2 * dims..];
+                let end = &mut input[o + shape.actions_len..];
+                end.copy_from_slice(state);
+                end[dims..].iter_mut().for_each(|velocity| *velocity /= omega);
+            }
+        }
+        Ok(())
+    }
+}

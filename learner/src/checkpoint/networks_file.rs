@@ -1,0 +1,80 @@
+//! Networks, targets and optimiser moments as one safetensors file.
+
+use std::borrow::Cow;
+
+use safetensors::tensor::{Dtype, SafeTensors, View};
+
+use crate::algorithms::ddpg::Trained;
+use crate::learner::Learner;
+
+/// A flat tensor on its way to the file.
+struct Flat {
+    len: usize,
+    values: Vec<f32>,
+}
+
+impl View for Flat {
+    fn dtype(&self) -> Dtype {
+        Dtype::F32
+    }
+
+    fn shape(&self) -> &[usize] {
+        std::slice::from_ref(&self.len)
+    }
+
+    fn data(&self) -> Cow<'_, [u8]> {
+        Cow::Borrowed(bytemuck::cast_slice(&self.values))
+    }
+
+    fn data_len(&self) -> usize {
+        self.values.len() * size_of::<f32>()
+    }
+}
+
+pub(super) fn bytes(learner: &Learner) -> Result<Vec<u8>, String> {
+    let mut tensors = Vec::new();
+    for (name, trained) in networks(learner) {
+        let text = |error: candle_core::Error| error.to_string();
+        let network = trained.network.read(<[f32]>::to_vec).map_err(text)?;
+        let target = trained.target.read(<[f32]>::to_vec).map_err(text)?;
+        let moments = &trained.adam.moments;
+        let parts = [network, target, moments.first.clone(), moments.second.clone()];
+        for (part, values) in PARTS.iter().zip(parts) {
+            tensors.push((format!("{name}.{part}"), Flat { len: values.len(), values }));
+        }
+    }
+    safetensors::serialize(tensors, None).map_err(|error| error.to_string())
+}
+
+const PARTS: [&str; 4] = ["network", "target", "adam_first", "adam_second"];
+
+fn networks(learner: &Learner) -> [(&'static str, &Trained); 2] {
+    [("actor", &learner.algorithm.actor), ("critic", &learner.algorithm.critic)]
+}
+
+pub(super) fn restore(bytes: &[u8], learner: &mut Learner) -> Result<(), String> {
+    let tensors = SafeTensors::deserialize(bytes).map_err(|error| error.to_string())?;
+    let read = |name: &str, part: &str, len: usize| -> Result<Vec<f32>, String> {
+        let name = format!("{name}.{part}");
+        let tensor = tensors.tensor(&name).map_err(|error| format!("{name}: {error}"))?;
+        if tensor.dtype() != Dtype::F32 || tensor.shape() != [len] {
+            let (dtype, shape) = (tensor.dtype(), tensor.shape());
+            return Err(format!("{name} is {dtype:?} {shape:?}, expected F32 [{len}]"));
+        }
+        // The file's bytes need not be aligned for f32.
+        let chunks = tensor.data().as_chunks::<4>().0;
+        Ok(chunks.iter().map(|bytes| f32::from_le_bytes(*bytes)).collect())
+    };
+    let algorithm = &mut learner.algorithm;
+    for (name, trained) in [("actor", &mut algorithm.actor), ("critic", &mut algorithm.critic)] {
+        let len = trained.adam.moments.first.len();
+        let set = |network: &crate::networks::Parameters, part| {
+            network.set(&read(name, part, len)?).map_err(|error| error.to_string())
+        };
+        set(&trained.network, PARTS[0])?;
+        set(&trained.target, PARTS[1])?;
+        trained.adam.moments.first = read(name, PARTS[2], len)?;
+        trained.adam.moments.second = read(name, PARTS[3], len)?;
+    }
+    Ok(())
+}

@@ -1,0 +1,81 @@
+//! Names of checkpoints, `latest`, and dropping the oldest.
+
+use std::fs;
+use std::path::Path;
+
+use super::{CheckpointError, io_error};
+
+const LATEST: &str = "latest";
+
+/// The complete checkpoints of a folder, oldest first.
+///
+/// # Errors
+/// If the folder cannot be read.
+pub fn names(folder: &Path) -> Result<Vec<String>, CheckpointError> {
+    let mut numbered = Vec::new();
+    for entry in fs::read_dir(folder).map_err(io_error(folder))? {
+        let name = entry.map_err(io_error(folder))?.file_name();
+        let name = name.to_string_lossy().into_owned();
+        if let Ok(number) = name.parse::<u64>() {
+            numbered.push((number, name));
+        }
+    }
+    numbered.sort_unstable();
+    Ok(numbered.into_iter().map(|(_, name)| name).collect())
+}
+
+pub(super) fn next_name(folder: &Path) -> Result<String, CheckpointError> {
+    let newest = names(folder)?.last().and_then(|name| name.parse::<u64>().ok()).unwrap_or(0);
+    Ok(format!("{:06}", newest + 1))
+}
+
+/// What a killed writer left.
+pub(super) fn remove_temporaries(folder: &Path) -> Result<(), CheckpointError> {
+    for entry in fs::read_dir(folder).map_err(io_error(folder))? {
+        let path = entry.map_err(io_error(folder))?.path();
+        let name = path.file_name().unwrap_or_default().to_string_lossy().into_owned();
+        if name.starts_with('.') && name.ends_with(".tmp") {
+            let removed =
+                if path.is_dir() { fs::remove_dir_all(&path) } else { fs::remove_file(&path) };
+            removed.map_err(io_error(&path))?;
+        }
+    }
+    Ok(())
+}
+
+/// Points `latest` at a checkpoint, in one step.
+pub(super) fn point_latest(folder: &Path, name: &str) -> Result<(), CheckpointError> {
+    let temporary = folder.join(".latest.tmp");
+    let link = folder.join(LATEST);
+    std::os::unix::fs::symlink(name, &temporary)
+        .and_then(|()| fs::rename(&temporary, &link))
+        .and_then(|()| fs::File::open(folder)?.sync_all())
+        .map_err(io_error(&link))
+}
+
+/// Drops the oldest checkpoints until at most `keep` are left and they take at most `bytes_max`;
+/// the newest always stays.
+pub(super) fn rotate(folder: &Path, keep: usize, bytes_max: u64) -> Result<(), CheckpointError> {
+    let names = names(folder)?;
+    let sizes: Vec<u64> =
+        names.iter().map(|name| size(&folder.join(name))).collect::<Result<_, _>>()?;
+    let mut kept_bytes = 0;
+    for (age, (name, bytes)) in names.iter().zip(sizes).rev().enumerate() {
+        kept_bytes += bytes;
+        if age > 0 && (age >= keep || kept_bytes > bytes_max) {
+            let path = folder.join(name);
+            fs::remove_dir_all(&path).map_err(io_error(&path))?;
+            kept_bytes -= bytes;
+        }
+    }
+    Ok(())
+}
+
+fn size(checkpoint: &Path) -> Result<u64, CheckpointError> {
+    let mut bytes = 0;
+    for entry in fs::read_dir(checkpoint).map_err(io_error(checkpoint))? {
+        let metadata = entry.and_then(|entry| entry.metadata()).map_err(io_error(checkpoint))?;
+        bytes += metadata.len();
+    }
+    Ok(bytes)
+}

@@ -1,0 +1,267 @@
+//! The learner's state and its three moves: take a segment, update, publish.
+//!
+//! No clock, no file and no transport here: the loop around it (`session`) brings those.
+
+use dmprl_shared::config::ExperimentConfig;
+use dmprl_shared::parameters::ParameterSnapshot;
+use dmprl_shared::policy::{Head, Policy, PolicyError};
+use dmprl_shared::seeds;
+use dmprl_shared::segment::{Expected, Rejection, Segment, check};
+use dmprl_shared::spec::EnvSpec;
+use serde::{Deserialize, Serialize};
+use thiserror::Error;
+
+use crate::algorithms::ddpg::Ddpg;
+use crate::algorithms::{Batch, NoWindow};
+use crate::metrics::{Collector, MetricsLine, Rejected};
+use crate::pacing::Pacing;
+use crate::replay::{Replay, Sampler};
+
+/// Why the learner stopped.
+#[derive(Debug, Error)]
+pub enum LearnerError {
+    /// The policy cannot be built.
+    #[error(transparent)]
+    Policy(#[from] PolicyError),
+    /// A tensor operation failed.
+    #[error("tensor operation: {0}")]
+    Tensor(#[from] candle_core::Error),
+    /// The replay has nothing to learn from.
+    #[error(transparent)]
+    NoWindow(#[from] NoWindow),
+    /// A loss or parameter is NaN or infinite.
+    #[error(
+        "update {update}: {name} is {value}; the run has diverged. The last checkpoint is sound: \
+         lower algorithm.critic_learning_rate or pacing.updates_per_segment"
+    )]
+    NotFinite {
+        /// Which update.
+        update: u64,
+        /// Which quantity.
+        name: &'static str,
+        /// Its value.
+        value: f32,
+    },
+}
+
+/// Where a run stands.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Counters {
+    /// Environment steps inserted.
+    pub env_steps: u64,
+    /// Segments inserted.
+    pub segments: u64,
+    /// Updates done.
+    pub updates: u64,
+    /// Version of the newest published policy.
+    pub policy_version: u64,
+    /// Segments refused, by reason.
+    pub rejected: Rejected,
+}
+
+/// Everything that learns.
+#[derive(Debug)]
+pub struct Learner {
+    config: ExperimentConfig,
+    policy: Policy,
+    expected: Expected,
+    /// Networks and optimisers.
+    pub algorithm: Ddpg,
+    /// Experience.
+    pub replay: Replay,
+    /// Draws batches.
+    pub sampler: Sampler,
+    /// Updates owed.
+    pub pacing: Pacing,
+    /// Where the run stands.
+    pub counters: Counters,
+    batch: Batch,
+    collector: Collector,
+    snapshot: ParameterSnapshot,
+    omega: f32,
+}
+
+impl Learner {
+    /// A learner that has seen nothing.
+    ///
+    /// # Errors
+    /// If the policy does not fit the environment.
+    pub fn new(
+        config: ExperimentConfig,
+        spec: &EnvSpec,
+        run_id: u64,
+    ) -> Result<Self, LearnerError> {
+        let policy = Policy::new(&config, spec)?;
+        let (workers, envs) = (config.actors.workers, config.actors.envs_per_worker);
+        let layout = policy.layout();
+        let algorithm = Ddpg::new(&config, &policy)?;
+        let random = seeds::stream(config.run.seed, "replay", 0);
+        Ok(Self {
+            expected: Expected {
+                run_id,
+                architecture_hash: policy.architecture_hash(),
+                layout,
+                worker_count: workers as u32,
+                env_count: envs as u32,
+            },
+            replay: Replay::new(layout, config.replay.capacity_steps, workers, envs),
+            sampler: Sampler::new(config.algorithm.windows, random),
+            pacing: Pacing::new(&config.pacing),
+            counters: Counters::default(),
+            batch: Batch::new(algorithm.batch_shape()),
+            collector: Collector::new(layout, workers, envs),
+            snapshot: ParameterSnapshot {
+                architecture_hash: policy.architecture_hash(),
+                values: vec![0.0; policy.shape().parameters_len()],
+                ..ParameterSnapshot::default()
+            },
+            omega: match policy.head() {
+                Head::Dmp(head) => head.omega(),
+                Head::Mlp => 1.0,
+            },
+            algorithm,
+            policy,
+            config,
+        })
+    }
+
+    /// The experiment.
+    #[must_use]
+    pub fn config(&self) -> &ExperimentConfig {
+        &self.config
+    }
+
+    /// The policy's architecture.
+    #[must_use]
+    pub fn policy(&self) -> &Policy {
+        &self.policy
+    }
+
+    /// Whether the run has the environment steps it was asked for.
+    #[must_use]
+    pub fn has_all_steps(&self) -> bool {
+        self.counters.env_steps >= self.config.run.steps
+    }
+
+    /// Whether the learner wants a segment now.
+    #[must_use]
+    pub fn may_take(&self) -> bool {
+        !self.has_all_steps() && self.pacing.may_take()
+    }
+
+    /// Inserts a segment.
+    ///
+    /// # Errors
+    /// The reason if it does not fit; it is counted and changes nothing else.
+    pub fn insert(&mut self, segment: &Segment) -> Result<(), Rejection> {
+        if let Err(why) = check(&segment.header, &segment.block, &self.expected) {
+            self.counters.rejected.count(why);
+            return Err(why);
+        }
+        self.collector.inserted(segment, self.counters.policy_version);
+        self.replay.insert(&segment.header, &segment.block);
+        self.counters.segments += 1;
+        self.counters.env_steps += u64::from(segment.header.steps_len);
+        if self.counters.env_steps > self.config.exploration.warm_up_steps {
+            self.pacing.inserted();
+        }
+        Ok(())
+    }
+
+    /// Samples a batch and updates the networks.
+    ///
+    /// # Errors
+    /// If there is nothing to sample or a loss is not finite.
+    pub fn update(&mut self) -> Result<(), LearnerError> {
+        let source = (&self.replay, &mut self.sampler);
+        let shape = self.algorithm.batch_shape();
+        self.batch.sample(shape, &self.config.algorithm, self.omega, source)?;
+        let losses = self.algorithm.update(&self.policy, &self.batch)?;
+        for (name, value) in
+            [("critic_loss", losses.critic_loss), ("actor_loss", losses.actor_loss)]
+        {
+            if !value.is_finite() {
+                return Err(LearnerError::NotFinite { update: self.counters.updates, name, value });
+            }
+        }
+        self.counters.updates += 1;
+        self.pacing.updated();
+        self.collector.updated(losses);
+        Ok(())
+    }
+
+    /// A snapshot of the actor under the next version.
+    ///
+    /// # Errors
+    /// If the parameters cannot be read.
+    pub fn next_snapshot(&mut self) -> Result<&ParameterSnapshot, LearnerError> {
+        self.counters.policy_version += 1;
+        self.snapshot.version = self.counters.policy_version;
+        self.snapshot.env_steps = self.counters.env_steps;
+        let values = &mut self.snapshot.values;
+        self.algorithm.actor.network.read(|parameters| values.copy_from_slice(parameters))?;
+        Ok(&self.snapshot)
+    }
+
+    /// Starts the actor and its target from another policy's parameters.
+    ///
+    /// # Errors
+    /// If the lengths differ.
+    pub fn warm_start(&mut self, parameters: &[f32]) -> Result<(), LearnerError> {
+        self.algorithm.actor.network.set(parameters)?;
+        self.algorithm.actor.target.set(parameters)?;
+        Ok(())
+    }
+
+    /// updates * batch_size / env_steps.
+    #[must_use]
+    pub fn samples_per_insert(&self) -> f64 {
+        let samples = self.counters.updates as f64 * self.config.algorithm.batch_size as f64;
+        samples / (self.counters.env_steps.max(1) as f64)
+    }
+
+    /// Closes the metrics window; the time fields are the caller's.
+    pub fn metrics_line(&mut self) -> MetricsLine {
+        let collected = self.collector.take();
+        let counters = self.counters;
+        MetricsLine {
+            env_steps: counters.env_steps,
+            updates: counters.updates,
+            segments: counters.segments,
+            policy_version: counters.policy_version,
+            replay_segments: self.replay.len() as u64,
+            samples_per_insert: self.samples_per_insert(),
+            rejected: counters.rejected,
+            critic_loss: collected.losses.map(|losses| losses.0),
+            actor_loss: collected.losses.map(|losses| losses.1),
+            q_mean: collected.losses.map(|losses| losses.2),
+            episodes: collected.episodes,
+            training_return_mean: collected.training.map(|training| training.0),
+            training_success_rate: collected.training.map(|training| training.1),
+            policy_lag_p50: collected.lag.map(|lag| lag.0),
+            policy_lag_max: collected.lag.map(|lag| lag.1),
+            updates_owed: self.pacing.owed(),
+            wall_s: 0.0,
+            env_steps_per_s: 0.0,
+            updates_per_s: 0.0,
+        }
+    }
+}
+
+#[cfg(test)]
+pub(crate) mod tests {
+    use super::*;
+
+    pub(crate) fn spec() -> EnvSpec {
+        EnvSpec {
+            id: "Test-v0".into(),
+            observation_len: 4,
+            action_len: 2,
+            action_low: vec![-1.0; 2],
+            action_high: vec![1.0; 2],
+            control_dt_s: 0.02,
+            episode_steps: 10,
+        }
+    }
+}

@@ -1,0 +1,214 @@
+//! Every scalar that a run writes to `metrics.jsonl`, with how it is computed.
+
+use dmprl_shared::segment::{Rejection, SUCCESS, Segment, SegmentLayout, TERMINATED, TRUNCATED};
+use serde::{Deserialize, Serialize};
+
+use crate::algorithms::ddpg::Losses;
+
+/// One line of `metrics.jsonl`. "Since the last line" is meant where nothing else is said; a mean
+/// over nothing is null.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct MetricsLine {
+    /// Environment steps inserted into the replay, over the whole run.
+    pub env_steps: u64,
+    /// Updates done, over the whole run.
+    pub updates: u64,
+    /// Segments inserted, over the whole run.
+    pub segments: u64,
+    /// Version of the newest published policy.
+    pub policy_version: u64,
+    /// Segments held by the replay.
+    pub replay_segments: u64,
+    /// updates * batch_size / env_steps, over the whole run.
+    pub samples_per_insert: f64,
+    /// Segments refused, over the whole run, by reason.
+    pub rejected: Rejected,
+    /// mean (Q - target)^2.
+    pub critic_loss: Option<f64>,
+    /// -mean Q(s, pi(s)).
+    pub actor_loss: Option<f64>,
+    /// mean Q over sampled windows.
+    pub q_mean: Option<f64>,
+    /// Training episodes (with exploration) that ended.
+    pub episodes: u64,
+    /// Mean of their returns.
+    pub training_return_mean: Option<f64>,
+    /// Share of them that reported success at their last step.
+    pub training_success_rate: Option<f64>,
+    /// Median over segments: newest policy version minus the one that acted.
+    pub policy_lag_p50: Option<u64>,
+    /// Largest of them.
+    pub policy_lag_max: Option<u64>,
+    /// Updates owed by the pacing.
+    pub updates_owed: f64,
+    /// Seconds of training, over all sessions of the run.
+    pub wall_s: f64,
+    /// Environment steps per second.
+    pub env_steps_per_s: f64,
+    /// Updates per second.
+    pub updates_per_s: f64,
+}
+
+/// Keys of a [`MetricsLine`] that depend on the clock: two deterministic runs differ in these only.
+pub const TIME_KEYS: [&str; 3] = ["wall_s", "env_steps_per_s", "updates_per_s"];
+
+/// Counts refused segments by reason.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Rejected {
+    /// Another layout version.
+    pub layout_version: u64,
+    /// Another run.
+    pub run: u64,
+    /// Another architecture.
+    pub architecture: u64,
+    /// Sizes differ.
+    pub sizes: u64,
+    /// A header field out of range.
+    pub field: u64,
+    /// The checksum differs.
+    pub checksum: u64,
+    /// A value that is not finite or out of bounds.
+    pub value: u64,
+}
+
+impl Rejected {
+    /// Counts one.
+    pub fn count(&mut self, why: Rejection) {
+        *match why {
+            Rejection::LayoutVersion => &mut self.layout_version,
+            Rejection::Run => &mut self.run,
+            Rejection::Architecture => &mut self.architecture,
+            Rejection::Sizes => &mut self.sizes,
+            Rejection::Field => &mut self.field,
+            Rejection::Checksum => &mut self.checksum,
+            Rejection::Value => &mut self.value,
+        } += 1;
+    }
+
+    /// All together.
+    #[must_use]
+    pub fn total(&self) -> u64 {
+        let Self { layout_version, run, architecture, sizes, field, checksum, value } = self;
+        layout_version + run + architecture + sizes + field + checksum + value
+    }
+}
+
+/// Lags kept for the median between two lines; beyond it the oldest make room.
+const LAGS_MAX: usize = 4_096;
+
+/// Collects between two lines. Buffers are made once.
+#[derive(Debug)]
+pub struct Collector {
+    layout: SegmentLayout,
+    envs_per_worker: usize,
+    /// Return so far of every environment's episode.
+    returns: Vec<f64>,
+    /// Whether the environment's episode was seen from its first step.
+    whole: Vec<bool>,
+    window: Sums,
+    lags: Vec<u64>,
+    lag_next: usize,
+}
+
+#[derive(Debug, Default)]
+struct Sums {
+    updates: u64,
+    critic_loss: f64,
+    actor_loss: f64,
+    q_mean: f64,
+    episodes: u64,
+    returns: f64,
+    successes: u64,
+    lag_max: u64,
+}
+
+/// What a line takes from a [`Collector`].
+#[derive(Debug, Clone, PartialEq)]
+pub struct Collected {
+    /// mean (Q - target)^2, -mean Q(s, pi(s)), mean Q.
+    pub losses: Option<(f64, f64, f64)>,
+    /// Training episodes that ended.
+    pub episodes: u64,
+    /// Mean return and share of successes.
+    pub training: Option<(f64, f64)>,
+    /// Median and largest policy lag.
+    pub lag: Option<(u64, u64)>,
+}
+
+impl Collector {
+    /// For `workers * envs_per_worker` environments.
+    #[must_use]
+    pub fn new(layout: SegmentLayout, workers: usize, envs_per_worker: usize) -> Self {
+        let envs = workers * envs_per_worker;
+        Self {
+            layout,
+            envs_per_worker,
+            returns: vec![0.0; envs],
+            whole: vec![false; envs],
+            window: Sums::default(),
+            lags: Vec::with_capacity(LAGS_MAX),
+            lag_next: 0,
+        }
+    }
+
+    /// Books an update.
+    pub fn updated(&mut self, losses: Losses) {
+        self.window.updates += 1;
+        self.window.critic_loss += f64::from(losses.critic_loss);
+        self.window.actor_loss += f64::from(losses.actor_loss);
+        self.window.q_mean += f64::from(losses.q_mean);
+    }
+
+    /// Books an inserted segment; `newest` is the newest policy's version.
+    pub fn inserted(&mut self, segment: &Segment, newest: u64) {
+        let header = &segment.header;
+        if header.policy_version > 0 {
+            let lag = newest.saturating_sub(header.policy_version);
+            self.window.lag_max = self.window.lag_max.max(lag);
+            if self.lags.len() < LAGS_MAX {
+                self.lags.push(lag);
+            } else {
+                self.lags[self.lag_next % LAGS_MAX] = lag;
+                self.lag_next += 1;
+            }
+        }
+        let env = header.worker_id as usize * self.envs_per_worker + header.env_index as usize;
+        if header.episode_step == 0 {
+            self.returns[env] = 0.0;
+            self.whole[env] = true;
+        }
+        let (_, _, rewards) = self.layout.split(&segment.block);
+        let rewards = &rewards[..header.steps_len as usize];
+        self.returns[env] += rewards.iter().map(|r| f64::from(*r)).sum::<f64>();
+        if header.flags & (TERMINATED | TRUNCATED) != 0 {
+            if self.whole[env] {
+                self.window.episodes += 1;
+                self.window.returns += self.returns[env];
+                self.window.successes += u64::from(header.flags & SUCCESS != 0);
+            }
+            self.whole[env] = false;
+        }
+    }
+
+    /// Closes the window and opens the next.
+    pub fn take(&mut self) -> Collected {
+        let window = std::mem::take(&mut self.window);
+        let updates = window.updates as f64;
+        let episodes = window.episodes as f64;
+        self.lags.sort_unstable();
+        let lag = (!self.lags.is_empty()).then(|| (self.lags[self.lags.len() / 2], window.lag_max));
+        self.lags.clear();
+        self.lag_next = 0;
+        Collected {
+            losses: (window.updates > 0).then(|| {
+                (window.critic_loss / updates, window.actor_loss / updates, window.q_mean / updates)
+            }),
+            episodes: window.episodes,
+            training: (window.episodes > 0)
+                .then(|| (window.returns / episodes, window.successes as f64 / episodes)),
+            lag,
+        }
+    }
+}

@@ -1,0 +1,256 @@
+//! The replay in a checkpoint: a length-checked binary of our own.
+//!
+//! ```text
+//!   magic "DMPRLRP1" · u64 K, O, A, slot count, filled, head, inserted, tail count · slots · tails · blocks
+//!   slot: u32 next, u8 steps_len, u8 terminated, u8 truncated, u8 0      (filled ones)
+//!   tail: u32 slot, incarnation, episode, episode_steps, u64 number; slot = 2^32 - 1: none
+//!   block: f32 × block_len (filled ones)                                 all little-endian
+//! ```
+//! Nothing in the file is trusted: counts are compared with what the configuration gives before
+//! anything is read, and every slot number must be below `filled`.
+
+use std::io::{self, Read, Write};
+
+use dmprl_shared::segment::SegmentLayout;
+use thiserror::Error;
+
+use super::{NONE, Replay, Slot, Tail};
+
+const MAGIC: &[u8; 8] = b"DMPRLRP1";
+
+/// Why a replay file was refused.
+#[derive(Debug, Error)]
+pub enum ReplayFileError {
+    /// Reading or writing failed, or the file ends early.
+    #[error("replay file: {0}")]
+    Io(#[from] io::Error),
+    /// Not a replay file.
+    #[error("replay file: begins with {0:?}, expected DMPRLRP1")]
+    Magic([u8; 8]),
+    /// A count that does not fit the configuration.
+    #[error("replay file: {name} is {got}, the configuration gives {expected}")]
+    Count {
+        /// Which count.
+        name: &'static str,
+        /// What the configuration gives.
+        expected: u64,
+        /// What the file says.
+        got: u64,
+    },
+    /// A slot or tail whose fields contradict each other.
+    #[error("replay file: {name} {index} is inconsistent")]
+    Inconsistent {
+        /// Slot or tail.
+        name: &'static str,
+        /// Which.
+        index: usize,
+    },
+}
+
+impl Replay {
+    fn counts(&self) -> [(&'static str, u64); 4] {
+        let SegmentLayout { segment_steps, observation_len, action_len } = self.layout;
+        [
+            ("segment_steps", segment_steps as u64),
+            ("observation_len", observation_len as u64),
+            ("action_len", action_len as u64),
+            ("slot count", self.slots.len() as u64),
+        ]
+    }
+
+    /// Writes everything that [`Replay::read`] needs.
+    ///
+    /// # Errors
+    /// If writing fails.
+    pub fn write(&self, out: &mut impl Write) -> Result<(), ReplayFileError> {
+        out.write_all(MAGIC)?;
+        let sizes = [self.filled as u64, self.head as u64, self.inserted, self.tails.len() as u64];
+        for count in self.counts().iter().map(|(_, count)| *count).chain(sizes) {
+            out.write_all(&count.to_le_bytes())?;
+        }
+        for slot in &self.slots[..self.filled] {
+            out.write_all(&slot.next.to_le_bytes())?;
+            out.write_all(&[slot.steps_len, slot.terminated.into(), slot.truncated.into(), 0])?;
+        }
+        for tail in &self.tails {
+            let (words, number) = match tail {
+                Some(t) => ([t.slot, t.incarnation, t.episode, t.episode_steps], t.number),
+                None => ([NONE, 0, 0, 0], 0),
+            };
+            for word in words {
+                out.write_all(&word.to_le_bytes())?;
+            }
+            out.write_all(&number.to_le_bytes())?;
+        }
+        // f32 in memory is little-endian on every supported processor.
+        let used = self.filled * self.layout.block_len();
+        out.write_all(bytemuck::cast_slice(&self.blocks[..used]))?;
+        Ok(())
+    }
+
+    /// Fills this replay, freshly made from the configuration, from a file.
+    ///
+    /// # Errors
+    /// If the file is not ours, is cut short or does not fit; the replay is then unusable.
+    pub fn read(&mut self, input: &mut impl Read) -> Result<(), ReplayFileError> {
+        let mut magic = [0; 8];
+        input.read_exact(&mut magic)?;
+        if &magic != MAGIC {
+            return Err(ReplayFileError::Magic(magic));
+        }
+        for (name, expected) in self.counts() {
+            match read_u64(input)? {
+                got if got == expected => {}
+                got => return Err(ReplayFileError::Count { name, expected, got }),
+            }
+        }
+        let max = self.slots.len() as u64;
+        let [filled, head] = [("filled", max + 1), ("head", max)].map(|(name, limit)| {
+            let got = read_u64(input)?;
+            let fits = got < limit;
+            fits.then_some(got as usize).ok_or(ReplayFileError::Count { name, expected: max, got })
+        });
+        (self.filled, self.head) = (filled?, head?);
+        self.inserted = read_u64(input)?;
+        self.read_tail_count(input)?;
+        for index in 0..self.filled {
+            self.slots[index] = self.read_slot(input, index)?;
+        }
+        for index in 0..self.tails.len() {
+            self.tails[index] = self.read_tail(input, index)?;
+        }
+        let used = self.filled * self.layout.block_len();
+        input.read_exact(bytemuck::cast_slice_mut(&mut self.blocks[..used]))?;
+        Ok(())
+    }
+
+    fn read_tail_count(&self, input: &mut impl Read) -> Result<(), ReplayFileError> {
+        let (expected, got) = (self.tails.len() as u64, read_u64(input)?);
+        if got != expected {
+            return Err(ReplayFileError::Count { name: "environment count", expected, got });
+        }
+        Ok(())
+    }
+
+    fn read_slot(&self, input: &mut impl Read, index: usize) -> Result<Slot, ReplayFileError> {
+        let next = read_u32(input)?;
+        let mut fields = [0; 4];
+        input.read_exact(&mut fields)?;
+        let [steps_len, terminated, truncated, zero] = fields;
+        let sound = (1..=self.layout.segment_steps).contains(&usize::from(steps_len))
+            && terminated <= 1
+            && truncated <= 1
+            && zero == 0
+            && (next == NONE || (next as usize) < self.filled);
+        if !sound {
+            return Err(ReplayFileError::Inconsistent { name: "slot", index });
+        }
+        let (terminated, truncated) = (terminated == 1, truncated == 1);
+        Ok(Slot { next, steps_len, terminated, truncated })
+    }
+
+    fn read_tail(
+        &self,
+        input: &mut impl Read,
+        index: usize,
+    ) -> Result<Option<Tail>, ReplayFileError> {
+        let slot = read_u32(input)?;
+        let [incarnation, episode, episode_steps] =
+            [read_u32(input)?, read_u32(input)?, read_u32(input)?];
+        let number = read_u64(input)?;
+        if slot != NONE && (slot as usize >= self.filled || number >= self.inserted) {
+            return Err(ReplayFileError::Inconsistent { name: "tail", index });
+        }
+        Ok((slot != NONE).then_some(Tail { slot, number, incarnation, episode, episode_steps }))
+    }
+}
+
+fn read_u64(input: &mut impl Read) -> io::Result<u64> {
+    let mut bytes = [0; 8];
+    input.read_exact(&mut bytes)?;
+    Ok(u64::from_le_bytes(bytes))
+}
+
+fn read_u32(input: &mut impl Read) -> io::Result<u32> {
+    let mut bytes = [0; 4];
+    input.read_exact(&mut bytes)?;
+    Ok(u32::from_le_bytes(bytes))
+}
+
+#[cfg(test)]
+mod tests {
+    use dmprl_shared::segment::SegmentHeader;
+
+    use super::*;
+
+    const LAYOUT: SegmentLayout =
+        SegmentLayout { segment_steps: 3, observation_len: 2, action_len: 1 };
+
+    fn filled() -> Replay {
+        let mut replay = Replay::new(LAYOUT, 30, 1, 2);
+        for i in 0..14_u32 {
+            let block: Vec<f32> =
+                (0..LAYOUT.block_len()).map(|j| (i * 100) as f32 + j as f32).collect();
+            let header = SegmentHeader {
+                env_index: i % 2,
+                episode_step: i / 2 * 3,
+                steps_len: 3,
+                ..SegmentHeader::default()
+            };
+            replay.insert(&header, &block);
+        }
+        replay
+    }
+
+    fn bytes(replay: &Replay) -> Vec<u8> {
+        let mut bytes = Vec::new();
+        replay.write(&mut bytes).unwrap();
+        bytes
+    }
+
+    #[test]
+    fn a_replay_read_back_is_the_same() {
+        let written = bytes(&filled());
+        let mut replay = Replay::new(LAYOUT, 30, 1, 2);
+        replay.read(&mut written.as_slice()).unwrap();
+        assert_eq!(bytes(&replay), written);
+    }
+
+    #[test]
+    fn every_truncation_is_refused() {
+        let written = bytes(&filled());
+        for len in 0..written.len() {
+            let mut replay = Replay::new(LAYOUT, 30, 1, 2);
+            assert!(replay.read(&mut &written[..len]).is_err(), "{len} bytes");
+        }
+    }
+
+    #[test]
+    fn a_replay_of_other_sizes_is_refused_by_name() {
+        let written = bytes(&filled());
+        let other = SegmentLayout { observation_len: 3, ..LAYOUT };
+        let error = Replay::new(other, 30, 1, 2).read(&mut written.as_slice()).unwrap_err();
+        assert!(error.to_string().contains("observation_len is 2, the configuration gives 3"));
+        let error = Replay::new(LAYOUT, 60, 1, 2).read(&mut written.as_slice()).unwrap_err();
+        assert!(error.to_string().contains("slot count is 10, the configuration gives 20"));
+    }
+
+    #[test]
+    fn flipped_bytes_never_panic_or_point_outside() {
+        let written = bytes(&filled());
+        for at in 0..written.len() {
+            let mut damaged = written.clone();
+            damaged[at] ^= 0xff;
+            let mut replay = Replay::new(LAYOUT, 30, 1, 2);
+            if replay.read(&mut damaged.as_slice()).is_ok() {
+                for slot in 0..replay.len() {
+                    for offset in 0..3 {
+                        if let Some(window) = replay.window(slot, offset) {
+                            let _ = replay.last_observation(&window);
+                        }
+                    }
+                }
+            }
+        }
+    }
+}

@@ -1,0 +1,146 @@
+//! Stage 5 of 8: experience, stored per environment step in the order of each episode.
+//!
+//! A ring of slots, one slot a segment. A slot knows the slot of the segment that continues its
+//! episode, so a window of K steps may begin at any step and run over into the next slot
+//! (`windows = "sliding"`), although the segments of many environments arrive interleaved.
+//! The oldest slot is replaced when the ring is full.
+
+mod file;
+mod window;
+
+use dmprl_shared::segment::{SegmentHeader, SegmentLayout, TERMINATED, TRUNCATED};
+
+pub use file::ReplayFileError;
+pub use window::{Sampler, Window};
+
+/// Marks the end of a chain of slots.
+const NONE: u32 = u32::MAX;
+
+/// What a slot holds besides its numbers.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+struct Slot {
+    /// The slot that continues this one's episode, or [`NONE`].
+    next: u32,
+    /// Steps really run, 1 to K; 0 in a slot that was never filled.
+    steps_len: u8,
+    terminated: bool,
+    truncated: bool,
+}
+
+/// The newest segment of one environment.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+struct Tail {
+    slot: u32,
+    /// Insertions before it: tells whether its slot has been replaced since.
+    number: u64,
+    incarnation: u32,
+    episode: u32,
+    /// Steps of the episode up to the end of the segment.
+    episode_steps: u32,
+}
+
+/// The ring.
+#[derive(Debug)]
+pub struct Replay {
+    layout: SegmentLayout,
+    slots: Vec<Slot>,
+    blocks: Vec<f32>,
+    /// Where the next segment goes.
+    head: usize,
+    /// Slots filled.
+    filled: usize,
+    /// Segments ever inserted.
+    inserted: u64,
+    /// Per worker and environment.
+    tails: Vec<Option<Tail>>,
+    envs_per_worker: usize,
+}
+
+impl Replay {
+    /// Room for `capacity_steps` environment steps from `workers * envs_per_worker` environments.
+    ///
+    /// # Panics
+    /// If K exceeds 255, which the configuration's check excludes.
+    #[must_use]
+    pub fn new(
+        layout: SegmentLayout,
+        capacity_steps: usize,
+        workers: usize,
+        envs_per_worker: usize,
+    ) -> Self {
+        assert!(layout.segment_steps <= 255, "a slot counts its steps in a byte");
+        let count = (capacity_steps / layout.segment_steps).max(1);
+        Self {
+            layout,
+            slots: vec![Slot { next: NONE, ..Slot::default() }; count],
+            // Zeroed pages cost nothing until a segment is written to them.
+            blocks: vec![0.0; count * layout.block_len()],
+            head: 0,
+            filled: 0,
+            inserted: 0,
+            tails: vec![None; workers * envs_per_worker],
+            envs_per_worker,
+        }
+    }
+
+    /// Sizes of the segments.
+    #[must_use]
+    pub fn layout(&self) -> SegmentLayout {
+        self.layout
+    }
+
+    /// Segments held.
+    #[must_use]
+    pub fn len(&self) -> usize {
+        self.filled
+    }
+
+    /// Whether nothing is held.
+    #[must_use]
+    pub fn is_empty(&self) -> bool {
+        self.filled == 0
+    }
+
+    /// Inserts a segment that has passed `segment::check`, and links it to its predecessor.
+    pub fn insert(&mut self, header: &SegmentHeader, block: &[f32]) {
+        let at = self.head;
+        self.blocks[at * block.len()..(at + 1) * block.len()].copy_from_slice(block);
+        self.slots[at] = Slot {
+            next: NONE,
+            steps_len: header.steps_len as u8,
+            terminated: header.flags & TERMINATED != 0,
+            truncated: header.flags & TRUNCATED != 0,
+        };
+        self.head = (at + 1) % self.slots.len();
+        self.filled = (self.filled + 1).min(self.slots.len());
+        self.link(header, at as u32);
+        self.inserted += 1;
+    }
+
+    /// A gap in an episode (a lost segment, a restarted worker) is never bridged.
+    fn link(&mut self, header: &SegmentHeader, slot: u32) {
+        let env = header.worker_id as usize * self.envs_per_worker + header.env_index as usize;
+        if let Some(tail) = self.tails[env] {
+            let continues = tail.incarnation == header.incarnation
+                && tail.episode == header.episode
+                && tail.episode_steps == header.episode_step
+                && self.inserted - tail.number < self.slots.len() as u64;
+            if continues {
+                self.slots[tail.slot as usize].next = slot;
+            }
+        }
+        let ended = header.flags & (TERMINATED | TRUNCATED) != 0;
+        self.tails[env] = (!ended).then_some(Tail {
+            slot,
+            number: self.inserted,
+            incarnation: header.incarnation,
+            episode: header.episode,
+            episode_steps: header.episode_step + header.steps_len,
+        });
+    }
+
+    fn block(&self, slot: usize) -> &[f32] {
+        let len = self.layout.block_len();
+        &self.blocks[slot * len..(slot + 1) * len]
+    }
+}

@@ -1,0 +1,332 @@
+//! Windows of up to K consecutive steps, and drawing them uniformly.
+
+use dmprl_shared::config::Windows;
+use rand::RngExt;
+use rand_xoshiro::Xoshiro256PlusPlus;
+
+use super::{NONE, Replay};
+
+/// K steps from step `offset` of `slot` on, running over into the next slot if `offset` > 0.
+///
+/// A window may hold fewer than K steps only where the episode terminated; one cut short by a
+/// time limit is no window, because a missing action is not a zero action.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Window {
+    slot: u32,
+    offset: u8,
+    /// Steps taken from the first slot.
+    first_len: u8,
+    /// Steps taken from the next slot.
+    second_len: u8,
+    next: u32,
+    /// Whether the episode terminated at the window's last step.
+    pub terminated: bool,
+}
+
+impl Window {
+    /// Steps n, 1 to K.
+    #[must_use]
+    pub fn len(&self) -> usize {
+        usize::from(self.first_len) + usize::from(self.second_len)
+    }
+
+    /// Never: a window has at least one step.
+    #[must_use]
+    pub fn is_empty(&self) -> bool {
+        false
+    }
+}
+
+impl Replay {
+    /// The window that starts at step `offset` of `slot`, if that is one.
+    #[must_use]
+    pub fn window(&self, slot: usize, offset: usize) -> Option<Window> {
+        let steps = self.layout.segment_steps;
+        let first = self.slots[slot];
+        let first_len = usize::from(first.steps_len).checked_sub(offset).filter(|&len| len > 0)?;
+        let window = |second_len: usize, next: u32, terminated: bool| {
+            Some(Window {
+                slot: slot as u32,
+                offset: offset as u8,
+                first_len: first_len as u8,
+                second_len: second_len as u8,
+                next,
+                terminated,
+            })
+        };
+        if first_len == steps || first.terminated {
+            return window(0, NONE, first.terminated);
+        }
+        if first.truncated || first.next == NONE {
+            return None;
+        }
+        let second = self.slots[first.next as usize];
+        let wanted = steps - first_len;
+        let available = usize::from(second.steps_len);
+        if available >= wanted {
+            let ends_there = available == wanted && second.terminated;
+            window(wanted, first.next, ends_there)
+        } else if second.terminated {
+            window(available, first.next, true)
+        } else {
+            None
+        }
+    }
+
+    /// The window's first observation, (O,).
+    #[must_use]
+    pub fn observation(&self, window: &Window) -> &[f32] {
+        self.observation_row(window.slot, usize::from(window.offset))
+    }
+
+    /// The observation one step after the window's first, (O,).
+    #[must_use]
+    pub fn second_observation(&self, window: &Window) -> &[f32] {
+        self.observation_row(window.slot, usize::from(window.offset) + 1)
+    }
+
+    /// The observation after the window's last step, (O,).
+    #[must_use]
+    pub fn last_observation(&self, window: &Window) -> &[f32] {
+        if window.second_len > 0 {
+            self.observation_row(window.next, usize::from(window.second_len))
+        } else {
+            self.observation_row(window.slot, usize::from(window.offset + window.first_len))
+        }
+    }
+
+    fn observation_row(&self, slot: u32, row: usize) -> &[f32] {
+        let len = self.layout.observation_len;
+        let (observations, _, _) = self.layout.split(self.block(slot as usize));
+        &observations[row * len..(row + 1) * len]
+    }
+
+    /// Copies the window's actions, (n, A), into the front of `out`, (K, A); the rest is zero.
+    pub fn actions(&self, window: &Window, out: &mut [f32]) {
+        let dims = self.layout.action_len;
+        let (first, second) = self.parts(window, |(_, actions, _)| actions, dims);
+        out[..first.len()].copy_from_slice(first);
+        out[first.len()..first.len() + second.len()].copy_from_slice(second);
+        out[first.len() + second.len()..].fill(0.0);
+    }
+
+    /// sum over the window's n steps of discount^i r_i.
+    #[must_use]
+    pub fn discounted_reward(&self, window: &Window, discount: f32) -> f32 {
+        let (first, second) = self.parts(window, |(_, _, rewards)| rewards, 1);
+        second.iter().rev().chain(first.iter().rev()).fold(0.0, |sum, r| r + discount * sum)
+    }
+
+    /// The window's rows of one of the block's parts, `width` numbers a step.
+    fn parts<'a>(
+        &'a self,
+        window: &Window,
+        part: impl Fn((&'a [f32], &'a [f32], &'a [f32])) -> &'a [f32],
+        width: usize,
+    ) -> (&'a [f32], &'a [f32]) {
+        let from = usize::from(window.offset) * width;
+        let first = part(self.layout.split(self.block(window.slot as usize)));
+        let first = &first[from..from + usize::from(window.first_len) * width];
+        if window.second_len == 0 {
+            return (first, &[]);
+        }
+        let second = part(self.layout.split(self.block(window.next as usize)));
+        (first, &second[..usize::from(window.second_len) * width])
+    }
+}
+
+/// Tries before the sampler concludes that the replay holds hardly any window.
+const TRIES_MAX: usize = 100_000;
+
+/// Draws windows uniformly, with replacement.
+#[derive(Debug)]
+pub struct Sampler {
+    windows: Windows,
+    random: Xoshiro256PlusPlus,
+}
+
+impl Sampler {
+    /// A sampler with a random stream of its own.
+    #[must_use]
+    pub fn new(windows: Windows, random: Xoshiro256PlusPlus) -> Self {
+        Self { windows, random }
+    }
+
+    /// The random stream, for a checkpoint.
+    #[must_use]
+    pub fn random(&self) -> &Xoshiro256PlusPlus {
+        &self.random
+    }
+
+    /// Draws one window, or `None` if `TRIES_MAX` draws met none.
+    ///
+    /// Steps that start no window are redrawn, so every window is equally likely.
+    pub fn draw(&mut self, replay: &Replay) -> Option<Window> {
+        if replay.is_empty() {
+            return None;
+        }
+        (0..TRIES_MAX).find_map(|_| {
+            let slot = self.random.random_range(0..replay.len() as u32) as usize;
+            let offset = match self.windows {
+                Windows::Segment => 0,
+                Windows::Sliding => {
+                    self.random.random_range(0..replay.layout().segment_steps as u32) as usize
+                }
+            };
+            replay.window(slot, offset)
+        })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use dmprl_shared::segment::{SegmentHeader, SegmentLayout, TERMINATED, TRUNCATED};
+
+    use super::*;
+
+    const LAYOUT: SegmentLayout =
+        SegmentLayout { segment_steps: 3, observation_len: 1, action_len: 1 };
+
+    /// Inserts an episode in which step t has observation 100 e + t, action t / 100, reward t.
+    fn episode(replay: &mut Replay, episode: u32, steps: u32, flag: u32) {
+        for start in (0..steps).step_by(3) {
+            let len = (steps - start).min(3);
+            let mut block = vec![0.0; LAYOUT.block_len()];
+            let (observations, actions, rewards) = LAYOUT.split_mut(&mut block);
+            for k in 0..len as usize {
+                let t = (start as usize + k) as f32;
+                observations[k] = 100.0 * episode as f32 + t;
+                actions[k] = t / 100.0;
+                rewards[k] = t;
+            }
+            observations[len as usize] = (100 * episode + start + len) as f32;
+            let header = SegmentHeader {
+                episode,
+                episode_step: start,
+                steps_len: len,
+                flags: if start + len == steps { flag } else { 0 },
+                ..SegmentHeader::default()
+            };
+            replay.insert(&header, &block);
+        }
+    }
+
+    fn starts(replay: &Replay) -> Vec<(f32, usize, bool)> {
+        let mut all = Vec::new();
+        for slot in 0..replay.len() {
+            for offset in 0..3 {
+                if let Some(window) = replay.window(slot, offset) {
+                    all.push((replay.observation(&window)[0], window.len(), window.terminated));
+                }
+            }
+        }
+        all.sort_by(|a, b| a.0.total_cmp(&b.0));
+        all
+    }
+
+    #[test]
+    fn windows_of_a_truncated_episode_are_all_whole() {
+        let mut replay = Replay::new(LAYOUT, 300, 1, 1);
+        episode(&mut replay, 0, 8, TRUNCATED);
+        let expected: Vec<_> = (0..=5).map(|t| (t as f32, 3, false)).collect();
+        assert_eq!(starts(&replay), expected);
+    }
+
+    #[test]
+    fn windows_of_a_terminated_episode_run_short_at_its_end() {
+        let mut replay = Replay::new(LAYOUT, 300, 1, 1);
+        episode(&mut replay, 0, 8, TERMINATED);
+        let expected: Vec<_> = (0..8).map(|t| (t as f32, (8 - t).min(3), t + 3 >= 8)).collect();
+        assert_eq!(starts(&replay), expected);
+    }
+
+    #[test]
+    fn no_window_crosses_from_one_episode_to_the_next() {
+        let mut replay = Replay::new(LAYOUT, 300, 1, 1);
+        episode(&mut replay, 0, 6, TRUNCATED);
+        episode(&mut replay, 1, 6, TRUNCATED);
+        let firsts: Vec<f32> = starts(&replay).iter().map(|start| start.0).collect();
+        assert_eq!(firsts, [0.0, 1.0, 2.0, 3.0, 100.0, 101.0, 102.0, 103.0]);
+    }
+
+    #[test]
+    fn a_sliding_window_reads_over_the_border_of_its_slot() {
+        let mut replay = Replay::new(LAYOUT, 300, 1, 1);
+        episode(&mut replay, 2, 9, TRUNCATED);
+        let window = replay.window(0, 2).unwrap();
+        let mut actions = [9.0; 3];
+        replay.actions(&window, &mut actions);
+        assert_eq!(actions, [0.02, 0.03, 0.04]);
+        assert_eq!(replay.last_observation(&window), [205.0]);
+        assert_eq!(replay.second_observation(&window), [203.0]);
+        // 2 + 0.5 * 3 + 0.25 * 4
+        assert_eq!(replay.discounted_reward(&window, 0.5), 4.5);
+    }
+
+    #[test]
+    fn missing_actions_of_a_terminated_window_are_zero() {
+        let mut replay = Replay::new(LAYOUT, 300, 1, 1);
+        episode(&mut replay, 0, 5, TERMINATED);
+        let window = replay.window(1, 1).unwrap();
+        let mut actions = [9.0; 3];
+        replay.actions(&window, &mut actions);
+        assert_eq!((actions, window.len(), window.terminated), ([0.04, 0.0, 0.0], 1, true));
+        assert_eq!(replay.last_observation(&window), [5.0]);
+    }
+
+    #[test]
+    fn a_wrapped_ring_holds_the_newest_and_bridges_nothing() {
+        let mut replay = Replay::new(LAYOUT, 12, 1, 1); // 4 slots
+        episode(&mut replay, 0, 9, TRUNCATED);
+        episode(&mut replay, 1, 9, TRUNCATED); // replaces the first two slots of episode 0
+        assert_eq!(replay.len(), 4);
+        let firsts: Vec<f32> = starts(&replay).iter().map(|start| start.0).collect();
+        assert_eq!(firsts, [6.0, 100.0, 101.0, 102.0, 103.0, 104.0, 105.0, 106.0]);
+    }
+
+    #[test]
+    fn a_lost_segment_breaks_the_chain() {
+        let mut replay = Replay::new(LAYOUT, 300, 1, 1);
+        let block = vec![0.0; LAYOUT.block_len()];
+        for start in [0, 6] {
+            let header =
+                SegmentHeader { episode_step: start, steps_len: 3, ..SegmentHeader::default() };
+            replay.insert(&header, &block);
+        }
+        assert!(replay.window(0, 0).is_some() && replay.window(0, 1).is_none());
+    }
+
+    #[test]
+    fn segments_of_other_environments_may_come_in_between() {
+        let mut replay = Replay::new(LAYOUT, 300, 2, 2);
+        let block = vec![0.0; LAYOUT.block_len()];
+        for start in [0, 3] {
+            for (worker_id, env_index) in [(0, 0), (0, 1), (1, 0), (1, 1)] {
+                let header = SegmentHeader {
+                    worker_id,
+                    env_index,
+                    episode_step: start,
+                    steps_len: 3,
+                    ..SegmentHeader::default()
+                };
+                replay.insert(&header, &block);
+            }
+        }
+        assert!((0..4).all(|slot| replay.window(slot, 2).is_some_and(|window| window.len() == 3)));
+    }
+
+    #[test]
+    fn every_window_is_drawn_equally_often() {
+        let mut replay = Replay::new(LAYOUT, 300, 1, 1);
+        episode(&mut replay, 0, 8, TERMINATED);
+        let random = dmprl_shared::seeds::stream(1, "test", 0);
+        let mut sampler = Sampler::new(Windows::Sliding, random);
+        let mut counts = [0_u32; 8];
+        for _ in 0..8_000 {
+            let window = sampler.draw(&replay).unwrap();
+            counts[replay.observation(&window)[0] as usize] += 1;
+        }
+        // Binomial(8000, 1/8): standard deviation 30; five of them.
+        assert!(counts.iter().all(|&count| count.abs_diff(1_000) < 150), "{counts:?}");
+    }
+}

@@ -1,0 +1,53 @@
+//! From u in [-1, 1] to the environment's units, per dimension: action = mid + half_range u.
+
+use crate::spec::EnvSpec;
+
+/// Middle and half range of every action dimension.
+#[derive(Debug, Clone, PartialEq)]
+pub struct ActionScaling {
+    mid: Vec<f64>,
+    half_range: Vec<f64>,
+}
+
+impl ActionScaling {
+    /// The scaling of an environment whose spec has been checked.
+    #[must_use]
+    pub fn new(spec: &EnvSpec) -> Self {
+        let bounds = || spec.action_low.iter().zip(&spec.action_high);
+        Self {
+            mid: bounds().map(|(low, high)| 0.5 * (low + high)).collect(),
+            half_range: bounds().map(|(low, high)| 0.5 * (high - low)).collect(),
+        }
+    }
+
+    /// Scales `u`, (rows, A), into `actions`, (rows, A) in the environment's units.
+    pub fn apply(&self, u: &[f32], actions: &mut [f64]) {
+        let dims = self.mid.len();
+        for (row, out) in u.chunks_exact(dims).zip(actions.chunks_exact_mut(dims)) {
+            for (d, (u, out)) in row.iter().zip(out).enumerate() {
+                *out = self.mid[d] + self.half_range[d] * f64::from(*u);
+            }
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_ends_of_u_are_the_ends_of_each_box_also_an_asymmetric_one() {
+        let spec = EnvSpec {
+            id: "test".into(),
+            observation_len: 1,
+            action_len: 2,
+            action_low: vec![-15.0, 0.0],
+            action_high: vec![15.0, 4.0],
+            control_dt_s: 0.0,
+            episode_steps: 0,
+        };
+        let mut actions = [0.0; 6];
+        ActionScaling::new(&spec).apply(&[-1.0, -1.0, 0.0, 0.0, 1.0, 1.0], &mut actions);
+        assert_eq!(actions, [-15.0, 0.0, 0.0, 2.0, 15.0, 4.0]);
+    }
+}

@@ -1,0 +1,263 @@
+//! From the network's outputs to a segment of actions, and back with gradients.
+//!
+//! Outputs of one action dimension stand together: goal, N weights, 4 rho. With t = tanh(output):
+//! g = goal_range t, w = weight_range omega² t, rho = (1, 0, 0, 0) + rho_range t, or + output for
+//! `free` rho (specification, sections 2 and 3).
+
+use super::PolicyError;
+use super::start::StartState;
+use crate::config::{ExperimentConfig, PolicyKind, RhoKind, Start};
+use crate::dmp::{Dmp, SegmentMap, act, act_backward};
+use crate::spec::EnvSpec;
+
+/// Length of the DMP state (y, yd) that a carrying policy appends to the observation.
+pub(super) fn carried_len(config: &ExperimentConfig, spec: &EnvSpec) -> usize {
+    let carries = config.policy.kind == PolicyKind::Dmp && config.policy.start == Start::Carry;
+    if carries { 2 * spec.action_len } else { 0 }
+}
+
+/// Parameters of the inverse controller, per dimension.
+const RHO_LEN: usize = 4;
+const RHO_CENTRE: [f32; RHO_LEN] = [1.0, 0.0, 0.0, 0.0];
+
+/// DMP, inverse controller and the ranges of their parameters.
+#[derive(Debug)]
+pub struct DmpHead {
+    map: SegmentMap,
+    start: StartState,
+    observation_len: usize,
+    dims: usize,
+    steps: usize,
+    basis_count: usize,
+    goal_range: f32,
+    rho: RhoKind,
+    rho_range: f32,
+    omega: f32,
+}
+
+/// What the forward pass keeps, per row and dimension.
+#[derive(Debug)]
+pub struct DmpWorkspace {
+    /// tanh of goal and weight outputs, and tanh (or the raw output) of rho's: (rows, A, 1+N+4).
+    squashed: Vec<f32>,
+    /// What the map was given: (rows, A, 3+N).
+    inputs: Vec<f32>,
+    /// y, yd/omega, ydd/omega² at the K samples: (rows, A, 3K).
+    samples: Vec<f32>,
+    scratch: Scratch,
+}
+
+#[derive(Debug)]
+struct Scratch {
+    actions: Vec<f32>,
+    actions_gradient: Vec<f32>,
+    samples_gradient: Vec<f32>,
+    inputs_gradient: Vec<f32>,
+}
+
+/// A gradient that arrives at the head.
+#[derive(Debug, Clone, Copy)]
+pub struct HeadGradient<'a> {
+    /// With respect to u, (rows, K, A).
+    pub actions: &'a [f32],
+    /// With respect to the end state (y_K (A,), yd_K/omega (A,)), (rows, 2A); empty: none.
+    pub end_state: &'a [f32],
+}
+
+impl DmpHead {
+    /// The head that `config` describes.
+    ///
+    /// # Errors
+    /// If the DMP or the start table does not fit.
+    pub fn new(config: &ExperimentConfig, spec: &EnvSpec) -> Result<Self, PolicyError> {
+        let dmp = Dmp::new(&config.dmp, config.policy.segment_steps)?;
+        let weight_scale = config.policy.weight_range * dmp.omega() * dmp.omega();
+        Ok(Self {
+            map: SegmentMap::new(&dmp, weight_scale),
+            start: StartState::new(config, spec)?,
+            observation_len: spec.observation_len + carried_len(config, spec),
+            dims: spec.action_len,
+            steps: config.policy.segment_steps,
+            basis_count: config.dmp.basis_count,
+            goal_range: config.policy.goal_range as f32,
+            rho: config.policy.rho,
+            rho_range: config.policy.rho_range as f32,
+            omega: dmp.omega() as f32,
+        })
+    }
+
+    /// Outputs that the network must have.
+    #[must_use]
+    pub fn outputs_len(&self) -> usize {
+        self.dims * self.per_dimension()
+    }
+
+    fn per_dimension(&self) -> usize {
+        1 + self.basis_count + RHO_LEN
+    }
+
+    fn inputs_len(&self) -> usize {
+        3 + self.basis_count
+    }
+
+    /// Buffers for up to `rows_max` rows.
+    #[must_use]
+    pub fn workspace(&self, rows_max: usize) -> DmpWorkspace {
+        let cells = rows_max * self.dims;
+        DmpWorkspace {
+            squashed: vec![0.0; cells * self.per_dimension()],
+            inputs: vec![0.0; cells * self.inputs_len()],
+            samples: vec![0.0; cells * 3 * self.steps],
+            scratch: Scratch {
+                actions: vec![0.0; self.steps],
+                actions_gradient: vec![0.0; self.steps],
+                samples_gradient: vec![0.0; 3 * self.steps],
+                inputs_gradient: vec![0.0; self.inputs_len()],
+            },
+        }
+    }
+
+    /// Squashes the network's outputs, (rows, A (1+N+4)).
+    pub fn squash(&self, outputs: &[f32], work: &mut DmpWorkspace) {
+        let n = self.per_dimension();
+        let bounded = 1 + self.basis_count;
+        let squashed = &mut work.squashed[..outputs.len()];
+        for (outputs, squashed) in outputs.chunks_exact(n).zip(squashed.chunks_exact_mut(n)) {
+            let tanh_len = if self.rho == RhoKind::Bounded { n } else { bounded };
+            for (squashed, output) in squashed.iter_mut().zip(outputs).take(tanh_len) {
+                *squashed = output.tanh();
+            }
+            squashed[tanh_len..].copy_from_slice(&outputs[tanh_len..]);
+        }
+    }
+
+    /// The squashed parameters of row `row`, to draw them at random instead: (A (1+N+4)).
+    pub fn squashed_mut<'a>(&self, work: &'a mut DmpWorkspace, row: usize) -> &'a mut [f32] {
+        let len = self.outputs_len();
+        &mut work.squashed[row * len..(row + 1) * len]
+    }
+
+    /// Makes the segments' actions, (rows, K, A), from squashed parameters and observations,
+    /// (rows, O).
+    pub fn segment(&self, observations: &[f32], work: &mut DmpWorkspace, actions: &mut [f32]) {
+        let (dims, steps) = (self.dims, self.steps);
+        let (n, inputs_len) = (self.per_dimension(), self.inputs_len());
+        let DmpWorkspace { squashed, inputs, samples, scratch } = work;
+        for (row, observation) in observations.chunks_exact(self.observation_len).enumerate() {
+            let actions = &mut actions[row * steps * dims..(row + 1) * steps * dims];
+            for d in 0..dims {
+                let cell = row * dims + d;
+                let squashed = &squashed[cell * n..(cell + 1) * n];
+                let inputs = &mut inputs[cell * inputs_len..(cell + 1) * inputs_len];
+                let samples = &mut samples[cell * 3 * steps..(cell + 1) * 3 * steps];
+                (inputs[0], inputs[1]) = self.start.read(observation, d, dims);
+                inputs[2] = self.goal_range * squashed[0];
+                inputs[3..].copy_from_slice(&squashed[1..=self.basis_count]);
+                self.map.forward(inputs, samples);
+                act(samples, &self.rho(squashed), &mut scratch.actions);
+                for (k, action) in scratch.actions.iter().enumerate() {
+                    actions[k * dims + d] = *action;
+                }
+            }
+        }
+    }
+
+    fn rho(&self, squashed: &[f32]) -> [f32; RHO_LEN] {
+        let range = self.rho_factor();
+        std::array::from_fn(|i| RHO_CENTRE[i] + range * squashed[1 + self.basis_count + i])
+    }
+
+    fn rho_factor(&self) -> f32 {
+        if self.rho == RhoKind::Bounded { self.rho_range } else { 1.0 }
+    }
+
+    /// (y, yd) of row `row` after step `k` (0: the start), y (A,) then yd (A,), into `state`.
+    pub fn state_at(&self, work: &DmpWorkspace, row: usize, k: usize, state: &mut [f32]) {
+        for d in 0..self.dims {
+            let cell = row * self.dims + d;
+            let inputs = &work.inputs[cell * self.inputs_len()..];
+            let samples = &work.samples[cell * 3 * self.steps..];
+            (state[d], state[self.dims + d]) = match k {
+                0 => (inputs[0], inputs[1]),
+                _ => (samples[k - 1], samples[self.steps + k - 1] * self.omega),
+            };
+        }
+    }
+
+    /// (y_K (A,), yd_K/omega (A,)) of every row, as the critic takes it, into rows of `out` that
+    /// are `stride` apart.
+    pub fn end_states(&self, work: &DmpWorkspace, out: &mut [f32], stride: usize) {
+        for (row, out) in out.chunks_mut(stride).enumerate() {
+            self.state_at(work, row, self.steps, out);
+            for velocity in &mut out[self.dims..2 * self.dims] {
+                *velocity /= self.omega;
+            }
+        }
+    }
+
+    /// omega = alpha_y / 2, by which the critic's end velocity is divided.
+    #[must_use]
+    pub fn omega(&self) -> f32 {
+        self.omega
+    }
+
+    /// Gradient with respect to the network's outputs, (rows, A (1+N+4)), overwritten.
+    ///
+    /// `actions` are those of the forward pass that filled `work`, (rows, K, A).
+    pub fn backward(
+        &self,
+        work: &mut DmpWorkspace,
+        actions: &[f32],
+        gradient: HeadGradient<'_>,
+        outputs_gradient: &mut [f32],
+    ) {
+        let (dims, steps, n) = (self.dims, self.steps, self.per_dimension());
+        let inputs_len = self.inputs_len();
+        let DmpWorkspace { squashed, inputs, samples, scratch } = work;
+        for (cell, out) in outputs_gradient.chunks_exact_mut(n).enumerate() {
+            let (row, d) = (cell / dims, cell % dims);
+            let squashed = &squashed[cell * n..(cell + 1) * n];
+            let inputs = &inputs[cell * inputs_len..(cell + 1) * inputs_len];
+            let samples = &samples[cell * 3 * steps..(cell + 1) * 3 * steps];
+            for k in 0..steps {
+                let at = (row * steps + k) * dims + d;
+                scratch.actions[k] = actions[at];
+                scratch.actions_gradient[k] = gradient.actions[at];
+            }
+            let rho = self.rho(squashed);
+            let rho_gradient = act_backward(
+                samples,
+                &rho,
+                &scratch.actions,
+                &scratch.actions_gradient,
+                &mut scratch.samples_gradient,
+            );
+            if !gradient.end_state.is_empty() {
+                let end = &gradient.end_state[row * 2 * dims..];
+                scratch.samples_gradient[steps - 1] += end[d];
+                scratch.samples_gradient[2 * steps - 1] += end[dims + d];
+            }
+            self.map.backward(inputs, &scratch.samples_gradient, &mut scratch.inputs_gradient);
+            self.unsquash(squashed, &scratch.inputs_gradient, &rho_gradient, out);
+        }
+    }
+
+    fn unsquash(
+        &self,
+        squashed: &[f32],
+        inputs_gradient: &[f32],
+        rho_gradient: &[f32; RHO_LEN],
+        out: &mut [f32],
+    ) {
+        let slope = |t: f32| 1.0 - t * t;
+        out[0] = inputs_gradient[2] * self.goal_range * slope(squashed[0]);
+        for i in 0..self.basis_count {
+            out[1 + i] = inputs_gradient[3 + i] * slope(squashed[1 + i]);
+        }
+        for (i, gradient) in rho_gradient.iter().enumerate() {
+            let at = 1 + self.basis_count + i;
+            let slope = if self.rho == RhoKind::Bounded { slope(squashed[at]) } else { 1.0 };
+            out[at] = gradient * self.rho_factor() * slope;
+        }
+    }
+}

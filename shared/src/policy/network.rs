@@ -1,0 +1,177 @@
+//! The multilayer perceptron behind every policy and critic: ReLU layers, a linear last layer.
+
+use std::ops::Range;
+
+use rand::{Rng, RngExt};
+
+use super::matrix::{Keep, Matrix, Threads, product};
+
+/// Widths of a network and where each layer's numbers stand in its flat parameters.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct MlpShape {
+    widths: Vec<usize>,
+    layers: Vec<Layer>,
+}
+
+/// One linear layer: outputs = inputs weightsᵀ + bias.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Layer {
+    /// Width of its input.
+    pub inputs: usize,
+    /// Width of its output.
+    pub outputs: usize,
+    /// Its weights, (outputs, inputs) row-major, in the flat parameters.
+    pub weights: Range<usize>,
+    /// Its bias, (outputs,), in the flat parameters.
+    pub bias: Range<usize>,
+}
+
+impl MlpShape {
+    /// A network of the given widths, input first, output last.
+    ///
+    /// # Panics
+    /// With fewer than two widths.
+    #[must_use]
+    pub fn new(widths: Vec<usize>) -> Self {
+        assert!(widths.len() >= 2, "a network has an input and an output");
+        let mut at = 0;
+        let layers = widths
+            .windows(2)
+            .map(|pair| {
+                let (inputs, outputs) = (pair[0], pair[1]);
+                let weights = at..at + inputs * outputs;
+                let bias = weights.end..weights.end + outputs;
+                at = bias.end;
+                Layer { inputs, outputs, weights, bias }
+            })
+            .collect();
+        Self { widths, layers }
+    }
+
+    /// Width of the input.
+    #[must_use]
+    pub fn inputs(&self) -> usize {
+        self.widths[0]
+    }
+
+    /// Width of the output.
+    #[must_use]
+    pub fn outputs(&self) -> usize {
+        self.widths[self.widths.len() - 1]
+    }
+
+    /// The layers, first to last.
+    #[must_use]
+    pub fn layers(&self) -> &[Layer] {
+        &self.layers
+    }
+
+    /// Length of the flat parameters.
+    #[must_use]
+    pub fn parameters_len(&self) -> usize {
+        self.layers.last().map_or(0, |layer| layer.bias.end)
+    }
+}
+
+/// Draws weights and biases from U(-1/sqrt(inputs), 1/sqrt(inputs)), PyTorch's default for a
+/// linear layer, so that results compare with the baselines'.
+pub fn initial_parameters(shape: &MlpShape, random: &mut impl Rng) -> Vec<f32> {
+    let mut parameters = Vec::with_capacity(shape.parameters_len());
+    for layer in shape.layers() {
+        let bound = 1.0 / (layer.inputs as f32).sqrt();
+        let count = layer.weights.len() + layer.bias.len();
+        parameters.extend((0..count).map(|_| random.random_range(-bound..bound)));
+    }
+    parameters
+}
+
+/// The output of every layer for up to `rows_max` inputs.
+#[derive(Debug)]
+pub struct Activations(Vec<Vec<f32>>);
+
+impl Activations {
+    /// Buffers for up to `rows_max` rows.
+    #[must_use]
+    pub fn new(shape: &MlpShape, rows_max: usize) -> Self {
+        Self(shape.layers().iter().map(|layer| vec![0.0; rows_max * layer.outputs]).collect())
+    }
+
+    /// The network's output, (rows, outputs).
+    #[must_use]
+    pub fn output(&self, shape: &MlpShape, rows: usize) -> &[f32] {
+        self.layer(shape, shape.layers().len() - 1, rows)
+    }
+
+    /// As [`Activations::output`], to disturb it.
+    pub fn output_mut(&mut self, shape: &MlpShape, rows: usize) -> &mut [f32] {
+        let last = self.0.len() - 1;
+        &mut self.0[last][..rows * shape.outputs()]
+    }
+
+    /// The output of layer `index`, after ReLU for all but the last, (rows, outputs).
+    #[must_use]
+    pub fn layer(&self, shape: &MlpShape, index: usize, rows: usize) -> &[f32] {
+        &self.0[index][..rows * shape.layers()[index].outputs]
+    }
+}
+
+/// Runs the network on `inputs`, (rows, inputs), into `activations`.
+///
+/// # Panics
+/// If a length does not fit.
+pub fn forward(
+    shape: &MlpShape,
+    parameters: &[f32],
+    inputs: &[f32],
+    activations: &mut Activations,
+    threads: Threads,
+) {
+    assert_eq!(parameters.len(), shape.parameters_len(), "network parameters");
+    let rows = inputs.len() / shape.inputs();
+    let last = shape.layers().len() - 1;
+    for (index, layer) in shape.layers().iter().enumerate() {
+        let (before, after) = activations.0.split_at_mut(index);
+        let inputs = before.last().map_or(inputs, |buffer| &buffer[..rows * layer.inputs]);
+        let out = &mut after[0][..rows * layer.outputs];
+        let bias = &parameters[layer.bias.clone()];
+        for row in out.chunks_exact_mut(layer.outputs) {
+            row.copy_from_slice(bias);
+        }
+        let inputs = Matrix::row_major(inputs, rows, layer.inputs);
+        let weights =
+            Matrix::row_major(&parameters[layer.weights.clone()], layer.outputs, layer.inputs);
+        product(out, inputs, weights.transposed(), Keep::Add, threads);
+        if index < last {
+            for value in out.iter_mut() {
+                *value = value.max(0.0);
+            }
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_network_worked_by_hand() {
+        // 2 -> 2 (ReLU) -> 1: hidden = relu([1*1 + 2*(-1) + 0.5, 3*1 + 1*(-1) - 4]) = relu([-0.5, -2])
+        // for x = (1, -1), and relu([1 + 2 + 0.5, 3 + 1 - 4]) = [3.5, 0] for x = (1, 1).
+        let shape = MlpShape::new(vec![2, 2, 1]);
+        let parameters = [1.0, 2.0, 3.0, 1.0, 0.5, -4.0, 2.0, -1.0, 0.25];
+        let mut activations = Activations::new(&shape, 2);
+        forward(&shape, &parameters, &[1.0, -1.0, 1.0, 1.0], &mut activations, Threads::ONE);
+        assert_eq!(activations.output(&shape, 2), [0.25, 7.25]);
+    }
+
+    #[test]
+    fn initial_parameters_fill_their_bounds() {
+        let shape = MlpShape::new(vec![4, 64, 3]);
+        let mut random = crate::seeds::stream(1, "test", 0);
+        let parameters = initial_parameters(&shape, &mut random);
+        assert_eq!(parameters.len(), shape.parameters_len());
+        let first = &parameters[shape.layers()[0].weights.clone()];
+        let largest = first.iter().fold(0.0_f32, |largest, value| largest.max(value.abs()));
+        assert!(largest <= 0.5 && largest > 0.45);
+    }
+}

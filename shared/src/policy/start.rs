@@ -1,0 +1,88 @@
+//! Where a segment's DMP starts: y0 and yd0 of every action dimension.
+
+use super::PolicyError;
+use crate::config::{ExperimentConfig, Start, StartSource, StartVelocity};
+use crate::spec::EnvSpec;
+
+/// How (y0, yd0) come out of an observation.
+#[derive(Debug, Clone, PartialEq)]
+pub enum StartState {
+    /// y0 = yd0 = 0.
+    Zero,
+    /// Measured: one source a dimension; velocities are multiplied by `velocity_scale`.
+    Observed {
+        /// Where each dimension's position and velocity stand.
+        sources: Vec<StartSource>,
+        /// DMP time runs tau = 1 per segment while the robot's runs K control steps:
+        /// K * control_dt_s [s], or 0 for `start_velocity = "zero"`.
+        velocity_scale: f32,
+    },
+    /// Carried: y (A,) then yd (A,) follow the environment's observation at this index.
+    Carry {
+        /// Length of the environment's observation.
+        at: usize,
+    },
+}
+
+impl StartState {
+    /// Reads the configuration.
+    ///
+    /// # Errors
+    /// `StartSources` if the table does not fit the environment.
+    pub fn new(config: &ExperimentConfig, spec: &EnvSpec) -> Result<Self, PolicyError> {
+        match config.policy.start {
+            Start::Zero => Ok(Self::Zero),
+            Start::Carry => Ok(Self::Carry { at: spec.observation_len }),
+            Start::Observed => {
+                let sources = config.task.start_sources.clone();
+                check(&sources, spec)?;
+                let segment_s = config.policy.segment_steps as f64 * spec.control_dt_s;
+                let measured = config.policy.start_velocity == StartVelocity::Measured;
+                let velocity_scale = if measured { segment_s as f32 } else { 0.0 };
+                Ok(Self::Observed { sources, velocity_scale })
+            }
+        }
+    }
+
+    /// (y0, yd0) of action dimension `d` of `dims`.
+    #[must_use]
+    pub fn read(&self, observation: &[f32], d: usize, dims: usize) -> (f32, f32) {
+        match self {
+            Self::Zero => (0.0, 0.0),
+            Self::Carry { at } => (observation[at + d], observation[at + dims + d]),
+            Self::Observed { sources, velocity_scale } => match &sources[d] {
+                StartSource::Angle { cos, sin, velocity } => {
+                    let angle = observation[*sin].atan2(observation[*cos]);
+                    (angle, observation[*velocity] * velocity_scale)
+                }
+                StartSource::Value { index, velocity, scale } => {
+                    (scale * observation[*index], scale * observation[*velocity] * velocity_scale)
+                }
+            },
+        }
+    }
+}
+
+fn check(sources: &[StartSource], spec: &EnvSpec) -> Result<(), PolicyError> {
+    if sources.len() != spec.action_len {
+        return Err(PolicyError::StartSources(format!(
+            "{} entries, expected one for each of the {} action dimensions of {}",
+            sources.len(),
+            spec.action_len,
+            spec.id
+        )));
+    }
+    for (dimension, source) in sources.iter().enumerate() {
+        let indices = match source {
+            StartSource::Angle { cos, sin, velocity } => [*cos, *sin, *velocity],
+            StartSource::Value { index, velocity, .. } => [*index, *index, *velocity],
+        };
+        if let Some(index) = indices.iter().find(|&&index| index >= spec.observation_len) {
+            return Err(PolicyError::StartSources(format!(
+                "dimension {dimension} reads index {index}, the observation of {} has {}",
+                spec.id, spec.observation_len
+            )));
+        }
+    }
+    Ok(())
+}
