@@ -46,6 +46,8 @@ mod affine_tests;
 #[cfg(test)]
 mod convergence_tests;
 #[cfg(test)]
+mod golden_tests;
+#[cfg(test)]
 mod segment_tests;
 #[cfg(test)]
 mod test_support;
