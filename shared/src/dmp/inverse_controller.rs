@@ -1,0 +1,133 @@
+//! Inverse controllers: from a segment's samples to its actions, one action dimension at a time.
+//!
+//! The paper's adaptive one, a single tanh neuron whose weights rho the policy decides (section
+//! 3.2), and the position controller of Neural Dynamic Policies. Neither allocates.
+
+/// Actions of a segment by the adaptive inverse controller.
+///     u_k = tanh(rho_1 y_k + rho_2 yd_k / omega + rho_3 ydd_k / omega^2 + rho_4)
+/// Ours rather than the paper's: velocity and acceleration are divided by omega and omega^2, since
+/// at alpha_y = 25 acceleration is about 150 times position and would saturate the tanh.
+/// - `samples`: (3K,) from `SegmentMap::forward`. `actions`: (K,), overwritten, in \[-1, 1\].
+/// # Panics
+/// If `samples` is not three times as long as `actions`.
+pub fn act(samples: &[f32], rho: &[f32; 4], actions: &mut [f32]) {
+    let [y, yd, ydd] = kinds(samples, actions.len());
+    for (k, action) in actions.iter_mut().enumerate() {
+        *action = (rho[0] * y[k] + rho[1] * yd[k] + rho[2] * ydd[k] + rho[3]).tanh();
+    }
+}
+
+/// Gradients of [`act`]: returns the one with respect to rho.
+/// - `actions`: (K,) as [`act`] returned them. `actions_gradient`: (K,).
+/// - `samples_gradient`: (3K,), overwritten.
+/// # Panics
+/// If a length is wrong.
+pub fn act_backward(
+    samples: &[f32],
+    rho: &[f32; 4],
+    actions: &[f32],
+    actions_gradient: &[f32],
+    samples_gradient: &mut [f32],
+) -> [f32; 4] {
+    let k_count = actions.len();
+    let [y, yd, ydd] = kinds(samples, k_count);
+    assert_eq!(actions_gradient.len(), k_count, "one gradient per action");
+    assert_eq!(samples_gradient.len(), 3 * k_count, "one gradient per sample");
+    let mut rho_gradient = [0.0; 4];
+    for k in 0..k_count {
+        let before_tanh = actions_gradient[k] * (1.0 - actions[k] * actions[k]);
+        for (kind, value) in [y[k], yd[k], ydd[k]].into_iter().enumerate() {
+            samples_gradient[kind * k_count + k] = before_tanh * rho[kind];
+            rho_gradient[kind] += before_tanh * value;
+        }
+        rho_gradient[3] += before_tanh;
+    }
+    rho_gradient
+}
+
+/// Actions of a segment by the position controller (Neural Dynamic Policies).
+///     u_k = position_scale (y_k - y_{k-1}),     y_0 the start
+/// Not bounded: whoever applies an action clips it.
+/// - `samples`: (3K,), of which only the positions are read. `actions`: (K,), overwritten.
+/// # Panics
+/// If `samples` is not three times as long as `actions`.
+pub fn act_position(y0: f32, samples: &[f32], position_scale: f32, actions: &mut [f32]) {
+    let [y, ..] = kinds(samples, actions.len());
+    let mut previous = y0;
+    for (action, &y) in actions.iter_mut().zip(y) {
+        *action = position_scale * (y - previous);
+        previous = y;
+    }
+}
+
+/// Gradients of [`act_position`]: returns the one with respect to y0 (the direct one; the samples
+/// depend on y0 as well).
+/// - `actions_gradient`: (K,). `samples_gradient`: (3K,), overwritten.
+/// # Panics
+/// If `samples_gradient` is not three times as long as `actions_gradient`.
+pub fn act_position_backward(
+    position_scale: f32,
+    actions_gradient: &[f32],
+    samples_gradient: &mut [f32],
+) -> f32 {
+    let k_count = actions_gradient.len();
+    assert_eq!(samples_gradient.len(), 3 * k_count, "one gradient per sample");
+    samples_gradient.fill(0.0);
+    for k in 0..k_count {
+        let next = actions_gradient.get(k + 1).copied().unwrap_or(0.0);
+        samples_gradient[k] = position_scale * (actions_gradient[k] - next);
+    }
+    -position_scale * actions_gradient.first().copied().unwrap_or(0.0)
+}
+
+/// Positions, velocities and accelerations, (K,) each.
+fn kinds(samples: &[f32], k_count: usize) -> [&[f32]; 3] {
+    assert_eq!(samples.len(), 3 * k_count, "3K samples for K actions");
+    [&samples[..k_count], &samples[k_count..2 * k_count], &samples[2 * k_count..]]
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::seeds::stream;
+    use rand::RngExt;
+
+    #[test]
+    fn actions_are_bounded_whatever_the_samples_and_rho() {
+        let mut stream = stream(1, "inverse_controller", 0);
+        for magnitude in [1.0, 1e3, 1e10, 1e18] {
+            for _ in 0..200 {
+                let mut draw = || stream.random_range(-magnitude..magnitude);
+                let samples: [f32; 15] = std::array::from_fn(|_| draw());
+                let rho: [f32; 4] = std::array::from_fn(|_| draw());
+                let mut actions = [0.0; 5];
+                act(&samples, &rho, &mut actions);
+                assert!(actions.iter().all(|u| u.abs() <= 1.0), "{actions:?}");
+            }
+        }
+    }
+
+    #[test]
+    fn rho_weighs_position_velocity_acceleration_and_bias() {
+        let samples = [0.1, 0.2, 0.3, 0.4, 0.5, 0.6];
+        let mut actions = [0.0; 2];
+        act(&samples, &[1.0, -2.0, 0.5, 0.25], &mut actions);
+        // 0.1 - 2 * 0.3 + 0.5 * 0.5 + 0.25 = 0;  0.2 - 2 * 0.4 + 0.5 * 0.6 + 0.25 = -0.05.
+        assert!(actions[0].abs() < 1e-7);
+        assert!((actions[1] - (-0.05_f32).tanh()).abs() < 1e-7);
+    }
+
+    #[test]
+    fn position_controller_takes_successive_differences() {
+        let samples = [0.3, 0.1, 0.6, 9.0, 9.0, 9.0, 9.0, 9.0, 9.0];
+        let mut actions = [0.0; 3];
+        act_position(0.1, &samples, 10.0, &mut actions);
+        for (got, expected) in actions.iter().zip([2.0, -2.0, 5.0]) {
+            assert!((got - expected).abs() < 1e-6);
+        }
+        // u = 10 (y1 - y0, y2 - y1, y3 - y2), so d(u . (1, 2, 4)) is -10 for y0, then:
+        let mut gradient = [7.0; 9];
+        assert_eq!(act_position_backward(10.0, &[1.0, 2.0, 4.0], &mut gradient), -10.0);
+        assert_eq!(gradient, [-10.0, -20.0, 40.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0]);
+    }
+}
