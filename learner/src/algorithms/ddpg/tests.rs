@@ -216,7 +216,7 @@ fn updates_fit_a_known_value_and_follow_its_gradient() {
     let mut random = seeds::stream(4, "test", 0);
     case.batch.bootstrap.fill(0.0);
     let mut losses = Losses::default();
-    for _ in 0..1_500 {
+    for _ in 0..5_000 {
         for value in &mut case.batch.critic_inputs {
             *value = random.random_range(-1.0..1.0);
         }
@@ -227,15 +227,14 @@ fn updates_fit_a_known_value_and_follow_its_gradient() {
         }
         losses = case.ddpg.update(&case.policy, &case.batch).unwrap();
     }
-    assert!(losses.critic_loss < 0.02, "{losses:?}");
+    assert!(losses.critic_loss < 0.01, "{losses:?}");
     let mut work = case.policy.workspace(128);
     let observations = &case.batch.observations;
     let act = |p: &[f32]| case.policy.act(p, observations, &mut work, Threads::ONE);
     case.ddpg.actor.network.read(act).unwrap();
     let errors = work.actions.iter().map(|u| (u - 0.5).abs());
     let mean = errors.sum::<f32>() / work.actions.len() as f32;
-    assert!(mean < 0.1, "actions are {mean} away from the best on average");
-} away from the best");
+    assert!(mean < 0.05, "actions are {mean} away from the best on average");
 }
 
 #[test]
