@@ -204,6 +204,12 @@ impl Learner {
         Ok(&self.snapshot)
     }
 
+    /// The snapshot that [`Learner::next_snapshot`] made last.
+    #[must_use]
+    pub fn snapshot(&self) -> &ParameterSnapshot {
+        &self.snapshot
+    }
+
     /// Starts the actor and its target from another policy's parameters.
     ///
     /// # Errors

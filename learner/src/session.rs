@@ -120,6 +120,24 @@ impl<R: SegmentReceiver, P: ParameterPublisher> Session<R, P> {
         Ok(if self.learner.has_all_steps() { Turn::Finished } else { Turn::Idle })
     }
 
+    /// Takes at most `segments_max` segments that are queued already, without updating.
+    ///
+    /// # Errors
+    /// As [`Session::turn`].
+    pub fn drain<E>(
+        &mut self,
+        due: &mut dyn FnMut(Due, &mut Learner) -> Result<(), E>,
+        segments_max: usize,
+    ) -> Result<(), SessionError<E>> {
+        for _ in 0..segments_max {
+            if self.learner.has_all_steps() || !self.receiver.try_receive(&mut self.segment)? {
+                break;
+            }
+            self.take(due)?;
+        }
+        Ok(())
+    }
+
     fn take<E>(
         &mut self,
         due: &mut dyn FnMut(Due, &mut Learner) -> Result<(), E>,
@@ -150,5 +168,169 @@ impl<R: SegmentReceiver, P: ParameterPublisher> Session<R, P> {
             due(what, &mut self.learner).map_err(SessionError::Due)?;
         }
         Ok(())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::convert::Infallible;
+
+    use dmprl_shared::config::Layers;
+    use dmprl_shared::parameters::ParameterSnapshot;
+    use dmprl_shared::segment::{LAYOUT_VERSION, SegmentHeader, TRUNCATED, block_checksum};
+    use dmprl_shared::transport::{ParameterSubscriber, SegmentSender, SendOutcome, in_process};
+
+    use super::*;
+    use crate::learner::tests::spec;
+
+    const CAPACITY: usize = 4;
+
+    struct Run {
+        session: Session<in_process::Receiver, in_process::Publisher>,
+        sender: in_process::Sender,
+        subscriber: in_process::Subscriber,
+        segment: Segment,
+        due: Vec<(Due, u64)>,
+    }
+
+    fn run(keys: &[(&str, &str)]) -> Run {
+        let mut layers = Layers::new();
+        let common = [
+            ("policy.hidden", "[8]"),
+            ("algorithm.critic_hidden", "[8]"),
+            ("algorithm.batch_size", "8"),
+            ("exploration.warm_up_steps", "20"),
+            ("actors.workers", "1"),
+            ("run.steps", "100"),
+            ("metrics.interval_steps", "25"),
+            ("evaluation.interval_steps", "40"),
+            ("checkpoint.interval_steps", "50"),
+        ];
+        for (key, value) in common.iter().chain(keys) {
+            layers.set("test", key, value).unwrap();
+        }
+        let learner = Learner::new(layers.finish().unwrap(), &spec(), 1).unwrap();
+        let layout = learner.policy().layout();
+        let hash = learner.policy().architecture_hash();
+        let mut segment = Segment::zeroed(layout);
+        segment.header = SegmentHeader {
+            layout_version: LAYOUT_VERSION,
+            flags: TRUNCATED,
+            run_id: 1,
+            architecture_hash: hash,
+            steps_len: 5,
+            segment_steps: 5,
+            observation_len: layout.observation_len as u32,
+            action_len: layout.action_len as u32,
+            checksum: block_checksum(&segment.block),
+            ..SegmentHeader::default()
+        };
+        let (mut senders, receiver) = in_process::segment_queues(1, CAPACITY, layout);
+        let (publisher, subscriber) = in_process::parameter_channel(hash);
+        let session = Session::start::<Infallible>(learner, receiver, publisher).unwrap();
+        Run { session, sender: senders.remove(0), subscriber, segment, due: Vec::new() }
+    }
+
+    impl Run {
+        fn send(&mut self) -> SendOutcome {
+            self.segment.header.sequence += 1;
+            self.segment.header.episode += 1;
+            self.sender.try_send(&self.segment.header, &self.segment.block).unwrap()
+        }
+
+        fn turn(&mut self) -> Turn {
+            let due = &mut self.due;
+            self.session
+                .turn(&mut |what, learner: &mut Learner| {
+                    due.push((what, learner.counters.env_steps));
+                    Ok::<_, Infallible>(())
+                })
+                .unwrap()
+        }
+
+        fn turns(&mut self) -> Turn {
+            loop {
+                match self.turn() {
+                    Turn::Worked => {}
+                    end => return end,
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn what_is_due_falls_due_at_its_step_and_the_run_ends_with_its_updates() {
+        let mut run = run(&[]);
+        let mut end = Turn::Idle;
+        for _ in 0..20 {
+            assert_eq!(end, Turn::Idle);
+            assert_eq!(run.send(), SendOutcome::Delivered);
+            end = run.turns();
+        }
+        assert_eq!(end, Turn::Finished);
+        let expected = [
+            (Due::Metrics, 25),
+            (Due::Evaluation, 40),
+            (Due::Metrics, 50),
+            (Due::Checkpoint, 50),
+            (Due::Metrics, 75),
+            (Due::Evaluation, 80),
+        ];
+        assert_eq!(run.due, expected);
+        // 2 updates for each of the 16 segments after the warm-up.
+        assert_eq!(run.session.learner.counters.updates, 32);
+        assert_eq!(run.session.learner.samples_per_insert(), 32.0 * 8.0 / 100.0);
+    }
+
+    #[test]
+    fn a_learner_behind_on_its_updates_leaves_segments_in_the_queue() {
+        let mut run =
+            run(&[("pacing.tolerance_segments", "1"), ("exploration.warm_up_steps", "0")]);
+        (0..CAPACITY).for_each(|_| assert_eq!(run.send(), SendOutcome::Delivered));
+        assert_eq!(run.send(), SendOutcome::Full);
+        assert_eq!(run.turn(), Turn::Worked);
+        let taken = |run: &Run| run.session.learner.counters.segments;
+        assert_eq!((taken(&run), run.session.learner.counters.updates), (1, 0));
+        // Two updates are owed for the first; one of them makes room for the next.
+        assert_eq!(run.turn(), Turn::Worked);
+        assert_eq!((taken(&run), run.session.learner.counters.updates), (1, 1));
+        assert_eq!(run.turn(), Turn::Worked);
+        assert_eq!((taken(&run), run.session.learner.counters.updates), (2, 1));
+    }
+
+    #[test]
+    fn the_end_of_the_warm_up_is_published_at_once() {
+        let mut run = run(&[]);
+        let mut snapshot = ParameterSnapshot::default();
+        assert!(run.subscriber.newest(&mut snapshot).unwrap());
+        assert_eq!((snapshot.version, snapshot.env_steps), (1, 0));
+        for _ in 0..4 {
+            run.send();
+            run.turns();
+        }
+        assert!(run.subscriber.newest(&mut snapshot).unwrap());
+        assert_eq!((snapshot.version, snapshot.env_steps), (2, 20));
+    }
+
+    #[test]
+    fn a_refused_segment_is_counted_and_nothing_else() {
+        let mut run = run(&[]);
+        run.segment.header.run_id = 2;
+        run.send();
+        assert_eq!(run.turns(), Turn::Idle);
+        let counters = run.session.learner.counters;
+        assert_eq!(
+            (counters.env_steps, counters.rejected.run, counters.rejected.total()),
+            (0, 1, 1)
+        );
+    }
+
+    #[test]
+    fn a_stop_takes_what_is_queued_and_updates_nothing() {
+        let mut run = run(&[("exploration.warm_up_steps", "0")]);
+        (0..3).for_each(|_| assert_eq!(run.send(), SendOutcome::Delivered));
+        run.session.drain(&mut |_, _: &mut Learner| Ok::<_, Infallible>(()), 2).unwrap();
+        let counters = run.session.learner.counters;
+        assert_eq!((counters.segments, counters.updates), (2, 0));
     }
 }

@@ -164,6 +164,19 @@ fn write_files(folder: &Path, learner: &Learner) -> Result<(), CheckpointError> 
     File::open(folder).and_then(|dir| dir.sync_all()).map_err(io_error(folder))
 }
 
+/// Environment steps at each readable checkpoint of a folder: where a resume may go back to.
+///
+/// # Errors
+/// If the folder cannot be read.
+pub fn env_steps(folder: &Path) -> Result<Vec<u64>, CheckpointError> {
+    let read = |name: String| {
+        let state: State =
+            serde_json::from_slice(&fs::read(folder.join(name).join(STATE)).ok()?).ok()?;
+        Some(state.counters.env_steps)
+    };
+    Ok(names(folder)?.into_iter().filter_map(read).collect())
+}
+
 /// Counts and sums what passes through.
 struct Summing<W> {
     inner: W,
@@ -294,3 +307,6 @@ fn verify(path: &Path, sum: &FileSum) -> Result<(), CheckpointError> {
         got => Err(damaged("CRC-32", sum.crc32.into(), got.into())),
     }
 }
+
+#[cfg(test)]
+mod tests;

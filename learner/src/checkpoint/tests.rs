@@ -1,0 +1,164 @@
+use std::fs;
+
+use dmprl_shared::config::Layers;
+use dmprl_shared::segment::{LAYOUT_VERSION, Segment, SegmentHeader, TRUNCATED, block_checksum};
+use rand::RngExt;
+
+use super::*;
+use crate::learner::LearnerError;
+use crate::learner::tests::spec;
+
+const RUN_ID: u64 = 5;
+
+fn fresh() -> Result<Learner, LearnerError> {
+    let mut layers = Layers::new();
+    for (key, value) in [
+        ("policy.hidden", "[16, 16]"),
+        ("algorithm.critic_hidden", "[16, 16]"),
+        ("algorithm.batch_size", "32"),
+        ("exploration.warm_up_steps", "50"),
+        ("replay.capacity_steps", "1000"),
+        ("actors.workers", "1"),
+        ("actors.envs_per_worker", "2"),
+        ("checkpoint.keep", "2"),
+    ] {
+        layers.set("test", key, value).unwrap();
+    }
+    Learner::new(layers.finish().unwrap(), &spec(), RUN_ID)
+}
+
+/// Feeds `rounds` segments of two interleaved environments and does the updates owed for them.
+fn train(learner: &mut Learner, rounds: std::ops::Range<u32>) {
+    let layout = learner.policy().layout();
+    for round in rounds {
+        let mut random = dmprl_shared::seeds::stream(9, "segments", round.into());
+        let mut segment = Segment::zeroed(layout);
+        segment.block.iter_mut().for_each(|value| *value = random.random_range(-1.0..1.0));
+        segment.header = SegmentHeader {
+            layout_version: LAYOUT_VERSION,
+            run_id: RUN_ID,
+            architecture_hash: learner.policy().architecture_hash(),
+            sequence: u64::from(round) + 1,
+            env_index: round % 2,
+            episode: round / 4,
+            episode_step: round / 2 % 2 * 5,
+            steps_len: 5,
+            flags: if round / 2 % 2 == 1 { TRUNCATED } else { 0 },
+            segment_steps: 5,
+            observation_len: layout.observation_len as u32,
+            action_len: layout.action_len as u32,
+            checksum: block_checksum(&segment.block),
+            ..SegmentHeader::default()
+        };
+        learner.insert(&segment).unwrap();
+        while learner.pacing.update_due() {
+            learner.update().unwrap();
+        }
+    }
+}
+
+fn checkpoint_bytes(folder: &Path, name: &str) -> Vec<(String, Vec<u8>)> {
+    [NETWORKS, REPLAY, STATE]
+        .iter()
+        .map(|file| ((*file).to_owned(), fs::read(folder.join(name).join(file)).unwrap()))
+        .collect()
+}
+
+#[test]
+fn a_resumed_learner_goes_on_to_the_same_bytes_as_one_that_never_stopped() {
+    let folder = tempfile::tempdir().unwrap();
+    let (straight, resumed) = (folder.path().join("straight"), folder.path().join("resumed"));
+    [&straight, &resumed].into_iter().for_each(|path| fs::create_dir(path).unwrap());
+
+    let mut learner = fresh().unwrap();
+    train(&mut learner, 0..60);
+    save(&resumed, &learner).unwrap();
+    train(&mut learner, 60..300);
+    let name = save(&straight, &learner).unwrap();
+    assert!(learner.counters.updates > 400);
+
+    let (mut learner, loaded) = load_newest(&resumed, &fresh).unwrap();
+    assert!(loaded.refused.is_empty());
+    train(&mut learner, 60..300);
+    let again = save(&resumed, &learner).unwrap();
+    assert!(checkpoint_bytes(&straight, &name) == checkpoint_bytes(&resumed, &again));
+}
+
+#[test]
+fn a_damaged_checkpoint_is_refused_with_the_reason_and_the_one_before_is_used() {
+    let folder = tempfile::tempdir().unwrap();
+    let folder = folder.path();
+    let mut learner = fresh().unwrap();
+    train(&mut learner, 0..60);
+    let older = save(folder, &learner).unwrap();
+    train(&mut learner, 60..80);
+    let newer = save(folder, &learner).unwrap();
+
+    let damages: [(&str, &dyn Fn(&mut Vec<u8>), &str); 5] = [
+        (REPLAY, &|bytes| bytes.truncate(100), "length in bytes is 100"),
+        (REPLAY, &|bytes| bytes[300] ^= 1, "CRC-32"),
+        (NETWORKS, &|bytes| *bytes.last_mut().unwrap() ^= 1, "CRC-32"),
+        (STATE, &|bytes| bytes.truncate(20), "EOF"),
+        (STATE, &|bytes| *bytes = b"\x80\x04}q\x00.".to_vec(), "expected value"),
+    ];
+    for (file, damage, reason) in damages {
+        let path = folder.join(&newer).join(file);
+        let sound = fs::read(&path).unwrap();
+        let mut bytes = sound.clone();
+        damage(&mut bytes);
+        fs::write(&path, bytes).unwrap();
+        let (_, loaded) = load_newest(folder, &fresh).unwrap();
+        assert_eq!(loaded.name, older);
+        let refused = loaded.refused[0].to_string();
+        assert!(refused.contains(reason), "{file}: {refused}");
+        fs::write(&path, sound).unwrap();
+    }
+    assert_eq!(load_newest(folder, &fresh).unwrap().1.name, newer);
+}
+
+#[test]
+fn a_half_written_checkpoint_is_never_taken_and_is_swept_away() {
+    let folder = tempfile::tempdir().unwrap();
+    let folder = folder.path();
+    let learner = fresh().unwrap();
+    let name = save(folder, &learner).unwrap();
+    let torn = folder.join(".000002.tmp");
+    fs::create_dir(&torn).unwrap();
+    fs::write(torn.join(REPLAY), b"half").unwrap();
+    assert_eq!(load_newest(folder, &fresh).unwrap().1.name, name);
+    assert_eq!(save(folder, &learner).unwrap(), "000002");
+    assert!(!torn.exists());
+}
+
+#[test]
+fn the_oldest_make_room_and_latest_points_at_the_newest() {
+    let folder = tempfile::tempdir().unwrap();
+    let folder = folder.path();
+    let learner = fresh().unwrap();
+    let saved: Vec<String> = (0..4).map(|_| save(folder, &learner).unwrap()).collect();
+    assert_eq!(names(folder).unwrap(), saved[2..]);
+    assert_eq!(fs::read_link(folder.join("latest")).unwrap(), Path::new(&saved[3]));
+    rotation::rotate(folder, 2, 1).unwrap();
+    assert_eq!(names(folder).unwrap(), saved[3..], "the newest stays whatever the disk cap");
+}
+
+#[test]
+fn a_folder_that_cannot_be_written_keeps_its_old_checkpoint() {
+    let folder = tempfile::tempdir().unwrap();
+    let learner = fresh().unwrap();
+    let name = save(folder.path(), &learner).unwrap();
+    // A file where the temporary directory must go fails for root too, unlike permissions.
+    let blocked = folder.path().join(".000002.tmp");
+    fs::create_dir(&blocked).unwrap();
+    let failed = write_files(&folder.path().join("missing"), &learner).unwrap_err();
+    assert!(failed.to_string().contains("missing"), "{failed}");
+    assert_eq!(load_newest(folder.path(), &fresh).unwrap().1.name, name);
+}
+
+#[test]
+fn no_checkpoint_at_all_is_an_error_that_lists_why() {
+    let folder = tempfile::tempdir().unwrap();
+    fs::create_dir(folder.path().join("000001")).unwrap();
+    let error = load_newest(folder.path(), &fresh).unwrap_err().to_string();
+    assert!(error.contains("no usable checkpoint") && error.contains(STATE), "{error}");
+}
