@@ -3,8 +3,8 @@
 //! A machine often has several Pythons of one version, each with its own `libpython3.11.so`.
 //! The program must run on the one that makes `.venv`, so: its library directory goes into the
 //! executables' rpath, and its version and prefix go into the code, which compares them with what
-//! it finds at start. The build scripts of `deploy` and `tests` get the directory as
-//! `DEP_DMPRL_PYTHON_LIBRARY_DIR`; they ask no interpreter themselves.
+//! it finds at start. The build scripts of `deploy` and `tests` get the linker's argument as
+//! `DEP_DMPRL_PYTHON_LINK_ARG`; they ask no interpreter themselves.
 //!
 //! pyo3 chooses the interpreter: `PYO3_PYTHON`, else an active virtual or conda environment, else
 //! `python`, else `python3` on `PATH`.
@@ -60,8 +60,9 @@ print(sysconfig.get_config_var('Py_ENABLE_SHARED') or 0)";
         let library = format!("lib{}.so", config.lib_name().unwrap_or("python3"));
         check_library(&facts, library_dir, &library, &version.to_string());
 
-        pyo3_build_config::add_libpython_rpath_link_args();
-        println!("cargo::metadata=LIBRARY_DIR={library_dir}");
+        let link_arg = rpath(library_dir);
+        println!("cargo::rustc-link-arg={link_arg}");
+        println!("cargo::metadata=LINK_ARG={link_arg}");
         for (name, value) in [
             ("EXECUTABLE", &facts.executable),
             ("VERSION", &facts.version),
@@ -73,6 +74,16 @@ print(sysconfig.get_config_var('Py_ENABLE_SHARED') or 0)";
         // An upgrade in place (apt) keeps the paths but changes the version: look again.
         println!("cargo::rerun-if-changed={}", facts.executable);
         println!("cargo::rerun-if-changed={}", Path::new(library_dir).join(&library).display());
+    }
+
+    /// pyo3's own argument yields DT_RUNPATH, which `LD_LIBRARY_PATH` (a cluster's modules set it)
+    /// overrides with another installation's library of the same name. DT_RPATH comes first; only
+    /// a directory of the system must not, it holds libraries that are not Python's.
+    fn rpath(library_dir: &str) -> String {
+        let is_system =
+            ["/lib", "/usr/lib"].iter().any(|dir| Path::new(library_dir).starts_with(dir));
+        let tags = if is_system { "--enable-new-dtags" } else { "--disable-new-dtags" };
+        format!("-Wl,{tags},-rpath,{library_dir}")
     }
 
     fn check_library(facts: &Facts, library_dir: &str, library: &str, version: &str) {

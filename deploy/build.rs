@@ -6,7 +6,7 @@
 fn main() {
     println!("cargo::rerun-if-changed=build.rs");
     // Absent without the feature `python`.
-    if let Ok(library_dir) = std::env::var("DEP_DMPRL_PYTHON_LIBRARY_DIR") {
-        println!("cargo::rustc-link-arg=-Wl,-rpath,{library_dir}");
+    if let Ok(link_arg) = std::env::var("DEP_DMPRL_PYTHON_LINK_ARG") {
+        println!("cargo::rustc-link-arg={link_arg}");
     }
 }

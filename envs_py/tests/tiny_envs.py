@@ -3,6 +3,11 @@
 The Rust tests use them too, as ``tiny_envs:Id`` with this folder on the Python path.
 """
 
+import os
+import signal
+import site
+import sys
+
 import gymnasium
 import numpy as np
 from gymnasium import spaces
@@ -107,6 +112,20 @@ class Batch(SegmentEnv):
     def step_segment(self, actions, out: SegmentBuffers):
         out.rewards[:] = actions[:, :, 0]
         out.steps[:] = self.segment_steps
+
+
+class Interpreter(Batch):
+    """Checks the embedded interpreter around it; the Rust tests run it."""
+
+    def step_segment(self, actions, out: SegmentBuffers):
+        assert sys.prefix != sys.base_prefix, "sys.prefix is not the virtual environment"
+        assert os.path.samefile(sys.executable, os.path.join(sys.prefix, "bin/python"))
+        assert "" not in sys.path and os.getcwd() not in sys.path, sys.path
+        assert not site.ENABLE_USER_SITE
+        assert sys.flags.isolated and sys.flags.utf8_mode and not sys.flags.hash_randomization
+        assert signal.getsignal(signal.SIGINT) is not signal.default_int_handler
+        assert sys.stdout is sys.stderr and sys.stdin.read() == ""
+        super().step_segment(actions, out)
 
 
 def register(name, entry_point, **kwargs):

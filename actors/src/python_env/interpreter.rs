@@ -5,7 +5,7 @@ use std::{
     mem::MaybeUninit,
     os::unix::ffi::OsStrExt,
     path::{Path, PathBuf},
-    sync::Mutex,
+    sync::{Mutex, PoisonError},
 };
 
 use pyo3::{ffi, prelude::*, types::PyDict};
@@ -14,9 +14,14 @@ use super::{LINKED_PYTHON, PythonError};
 
 /// Runs once after start. `stdout` carries the supervisor's protocol, so an environment's `print`
 /// must not reach it, nor its `input` the supervisor's commands. A BLAS pool of its own per worker
-/// would only fight with the other workers; whoever wants one sets the variable.
+/// would only fight with the other workers; whoever wants one sets the variable. Importing `signal`,
+/// which half of the standard library does, takes SIGINT over even where CPython was told to
+/// install no handlers, so it is imported here and SIGINT given back; a handler or an "ignore"
+/// that the role set before is left alone by CPython.
 const PREPARE: &CStr = c"\
-import os, sys
+import os, signal, sys
+if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
 sys.stdout = sys.stderr
 sys.stdin = open(os.devnull)
 for name in ('OMP_NUM_THREADS', 'OPENBLAS_NUM_THREADS', 'MKL_NUM_THREADS'):
@@ -55,8 +60,7 @@ impl Interpreter {
     /// environment is not of the linked installation; `Initialise`; `AlreadyStarted` with other
     /// options; `Path` for a python path that is no directory.
     pub fn start(options: &InterpreterOptions) -> Result<Self, PythonError> {
-        let mut running =
-            RUNNING.lock().unwrap_or_else(|poisoned| std::sync::PoisonError::into_inner(poisoned));
+        let mut running = RUNNING.lock().unwrap_or_else(PoisonError::into_inner);
         if let Some(running) = &*running {
             return if running == options {
                 Ok(Self(()))
@@ -174,8 +178,6 @@ fn absolute_paths(paths: &[PathBuf]) -> Result<Vec<String>, PythonError> {
 }
 
 fn c_path(path: &Path) -> Result<CString, PythonError> {
-    CString::new(path.as_os_str().as_bytes()).map_err(|_| PythonError::Path {
-        path: path.to_owned(),
-        reason: "it contains a NUL byte",
-    })
+    CString::new(path.as_os_str().as_bytes())
+        .map_err(|_| PythonError::Path { path: path.to_owned(), reason: "it contains a NUL byte" })
 }
