@@ -1,6 +1,10 @@
 //! A real interpreter with real environments. All tests of this file share one interpreter, as a
 //! process has only one.
 #![cfg(feature = "python")]
+#![allow(
+    clippy::unwrap_used,
+    reason = "helpers of tests; clippy.toml covers only the tests themselves"
+)]
 
 use std::{process::Command, sync::OnceLock};
 

@@ -1,5 +1,9 @@
 //! The Python package's own tests, in the environment that the program makes.
 #![cfg(feature = "python")]
+#![allow(
+    clippy::unwrap_used,
+    reason = "helpers of tests; clippy.toml covers only the tests themselves"
+)]
 
 use std::process::Command;
 

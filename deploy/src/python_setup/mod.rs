@@ -13,6 +13,8 @@ mod stamp;
 use std::{
     fs::{self, File, TryLockError},
     path::{Path, PathBuf},
+    thread,
+    time::{Duration, Instant},
 };
 
 use anyhow::{Context, Result, bail};
@@ -27,6 +29,10 @@ use self::{
 const VENV: &str = ".venv";
 /// Beside it, not in it: the lock must outlive a `.venv` that is made anew.
 const LOCK: &str = ".venv.lock";
+/// Longer than an installation takes over a slow line.
+const LOCK_WAIT_MAX: Duration = Duration::from_secs(30 * 60);
+/// Between two looks at the lock, each with a progress line.
+const LOCK_INTERVAL: Duration = Duration::from_millis(500);
 /// The Python package, relative to the project's root.
 const PACKAGE: &str = "envs_py";
 
@@ -98,17 +104,24 @@ fn locked(path: &Path, progress: &dyn Fn(&str)) -> Result<File> {
         .write(true)
         .open(path)
         .with_context(|| format!("cannot write {}", path.display()))?;
-    match lock.try_lock() {
-        Ok(()) => return Ok(lock),
-        Err(TryLockError::WouldBlock) => {
-            progress("python environment: another dmprl is making .venv, waiting for it");
+    let started = Instant::now();
+    // Asking again and again, not `File::lock`: that could neither give up nor say how long.
+    while started.elapsed() < LOCK_WAIT_MAX {
+        match lock.try_lock() {
+            Ok(()) => return Ok(lock),
+            Err(TryLockError::WouldBlock) => {}
+            Err(TryLockError::Error(error)) => {
+                return Err(error).with_context(|| format!("cannot lock {}", path.display()));
+            }
         }
-        Err(TryLockError::Error(error)) => {
-            return Err(error).with_context(|| format!("cannot lock {}", path.display()));
-        }
+        let seconds = started.elapsed().as_secs();
+        progress(&format!("python environment: waiting for another start ({seconds} s)"));
+        thread::sleep(LOCK_INTERVAL);
     }
-    lock.lock().with_context(|| format!("cannot lock {}", path.display()))?;
-    Ok(lock)
+    bail!(
+        "another start has been making {VENV} for {} minutes; end it, or its pip, and start again",
+        LOCK_WAIT_MAX.as_secs() / 60
+    )
 }
 
 /// Removes a virtual environment, and nothing else that may have that name.
