@@ -4,7 +4,7 @@ use dmprl_shared::config::ExperimentConfig;
 use dmprl_shared::policy::{Policy, PolicyError};
 
 use crate::acting::Acting;
-use crate::python_env::PythonEnvironments;
+use crate::python_env::{PythonEnvironments, SUCCESS_NOT_REPORTED, SUCCESS_YES};
 use crate::rollout::RolloutError;
 
 /// Steps after which an episode of an environment without a time limit is cut off.
@@ -34,7 +34,6 @@ impl Evaluation {
 }
 
 /// Evaluates policies of one architecture.
-#[derive(Debug)]
 pub struct Evaluator {
     environments: PythonEnvironments,
     acting: Acting,
@@ -94,9 +93,8 @@ impl Evaluator {
             jumps += wave.jumps;
             jump_count += wave.jump_count;
         }
-        // 2: the environment's info holds no success.
-        let reported = success.iter().all(|&flag| flag != 2);
-        let successes = success.iter().filter(|&&flag| flag == 1).count();
+        let reported = success.iter().all(|&flag: &u8| flag != SUCCESS_NOT_REPORTED);
+        let successes = success.iter().filter(|&&flag| flag == SUCCESS_YES).count();
         Ok(Evaluation {
             success_rate: reported.then(|| successes as f64 / success.len() as f64),
             smoothness: jumps / (jump_count.max(1) as f64),
@@ -113,7 +111,7 @@ impl Evaluator {
         let dims = self.acting.policy.layout().action_len;
         let mut wave = Wave {
             returns: vec![0.0; self.envs],
-            success: vec![2; self.envs],
+            success: vec![SUCCESS_NOT_REPORTED; self.envs],
             steps: vec![0; self.envs],
             running: (0..self.envs).map(|env| env < count).collect(),
             last_u: vec![f32::NAN; self.envs * dims],
@@ -157,8 +155,8 @@ impl Evaluator {
         }
         wave.steps[env] += steps as u32;
         wave.success[env] = self.environments.success()[env];
-        let ended = self.environments.terminated()[env] == 1
-            || self.environments.truncated()[env] == 1;
+        let ended =
+            self.environments.terminated()[env] == 1 || self.environments.truncated()[env] == 1;
         self.acting.carry_on(env, ended);
         wave.running[env] = !ended && wave.steps[env] < EPISODE_STEPS_MAX;
     }

@@ -14,7 +14,7 @@ use thiserror::Error;
 
 use crate::acting::Acting;
 use crate::exploration::Exploration;
-use crate::python_env::{PythonEnvironments, PythonError};
+use crate::python_env::{PythonEnvironments, PythonError, SUCCESS_YES};
 
 /// Why a rollout stopped.
 #[derive(Debug, Error)]
@@ -57,7 +57,6 @@ struct Episode {
 }
 
 /// A rollout worker.
-#[derive(Debug)]
 pub struct Rollout {
     identity: Identity,
     warm_up_steps: u64,
@@ -148,7 +147,7 @@ impl Rollout {
         let flag = |set: bool, flag: u32| if set { flag } else { 0 };
         let flags = flag(self.environments.terminated()[env] == 1, TERMINATED)
             | flag(self.environments.truncated()[env] == 1, TRUNCATED)
-            | flag(self.environments.success()[env] == 1, SUCCESS);
+            | flag(self.environments.success()[env] == SUCCESS_YES, SUCCESS);
         self.sequence += 1;
         let episode = self.episodes[env];
         self.segment.header = SegmentHeader {

@@ -1,0 +1,69 @@
+//! An array that Python allocated and Rust sees too.
+
+use std::ptr::NonNull;
+
+use pyo3::{
+    buffer::{Element, PyBuffer},
+    prelude::*,
+};
+
+use super::PythonError;
+
+/// A C-contiguous array behind the buffer protocol.
+///
+/// The protocol rather than the `numpy` crate: the standard library of Python defines it, pyo3
+/// checks type and layout, and one dependency less has to follow pyo3's versions.
+///
+/// Holding the buffer forbids Python to move or resize its memory, so the pointer taken once stays
+/// valid. Python writes only inside the calls that [`super::PythonEnvironments`] makes, all through
+/// `&mut self`; the slices borrow it, so none is alive meanwhile.
+pub(super) struct SharedBuffer<T> {
+    slice: NonNull<[T]>,
+    _owner: PyBuffer<T>,
+}
+
+// SAFETY: the memory belongs to the Python object that `_owner` (itself Send and Sync) keeps
+// alive; access follows the borrow of this struct. T is a plain number.
+unsafe impl<T: Send> Send for SharedBuffer<T> {}
+// SAFETY: as above; `&self` only reads.
+unsafe impl<T: Sync> Sync for SharedBuffer<T> {}
+
+impl<T: Element> SharedBuffer<T> {
+    /// Takes hold of the attribute `name` of `buffers`, which must have `len` elements.
+    pub(super) fn new(
+        buffers: &Bound<'_, PyAny>,
+        name: &'static str,
+        len: usize,
+        task_id: &str,
+    ) -> Result<Self, PythonError> {
+        let wrong = |reason| PythonError::Interface { task_id: task_id.to_owned(), name, reason };
+        let owner: PyBuffer<T> = buffers
+            .getattr(name)
+            .and_then(|array| PyBuffer::get(&array))
+            .map_err(|error| wrong(error.to_string()))?;
+        if owner.readonly() {
+            return Err(wrong("it is read-only".to_owned()));
+        }
+        let slice = owner.as_slice_ptr().ok_or_else(|| wrong("it is not contiguous".to_owned()))?;
+        if slice.len() != len {
+            return Err(PythonError::Length {
+                task_id: task_id.to_owned(),
+                name,
+                expected: len,
+                got: slice.len(),
+            });
+        }
+        Ok(Self { slice, _owner: owner })
+    }
+
+    pub(super) fn get(&self) -> &[T] {
+        // SAFETY: aligned and initialised (NumPy allocated it, pyo3 compared the type), alive
+        // while `_owner` is, and written only through `&mut` of the struct that owns this one.
+        unsafe { self.slice.as_ref() }
+    }
+
+    pub(super) fn get_mut(&mut self) -> &mut [T] {
+        // SAFETY: as `get`; `&mut self` excludes every other slice.
+        unsafe { self.slice.as_mut() }
+    }
+}

@@ -1,0 +1,240 @@
+//! E environments of one task: one Python call per segment.
+
+use dmprl_shared::spec::EnvSpec;
+use pyo3::{prelude::*, types::PyTuple};
+
+use super::{Interpreter, PythonError, buffer::SharedBuffer};
+
+/// The environment reported no success at the last step run.
+pub const SUCCESS_NO: u8 = 0;
+/// The environment reported success at the last step run.
+pub const SUCCESS_YES: u8 = 1;
+/// The environment does not say whether it succeeded.
+pub const SUCCESS_NOT_REPORTED: u8 = 2;
+
+/// The environments of a worker (`SegmentEnv` of `envs_py`), E of them, K steps a segment.
+///
+/// Slices are in C order, of the shape named at each. They show the last call's results and are
+/// valid until the next call, which the borrow checker enforces. After an error the environments'
+/// state is undefined: reset all of them or end the process.
+pub struct PythonEnvironments {
+    spec: EnvSpec,
+    segment_steps: usize,
+    reset: Call,
+    step_segment: Call,
+    mask: SharedBuffer<u8>,
+    seeds: SharedBuffer<u64>,
+    actions: SharedBuffer<f64>,
+    observations: SharedBuffer<f64>,
+    rewards: SharedBuffer<f64>,
+    terminated: SharedBuffer<u8>,
+    truncated: SharedBuffer<u8>,
+    success: SharedBuffer<u8>,
+    steps: SharedBuffer<i32>,
+    next_observations: SharedBuffer<f64>,
+}
+
+/// A bound method and its arguments, built once: the arrays stay the same, their content changes.
+struct Call {
+    method: Py<PyAny>,
+    arguments: Py<PyTuple>,
+}
+
+impl Call {
+    fn new(
+        env: &Bound<'_, PyAny>,
+        buffers: &Bound<'_, PyAny>,
+        method: &str,
+        arguments: &[&str],
+    ) -> PyResult<Self> {
+        let mut values: Vec<_> =
+            arguments.iter().map(|name| buffers.getattr(*name)).collect::<PyResult<_>>()?;
+        values.push(buffers.clone());
+        Ok(Self {
+            method: env.getattr(method)?.unbind(),
+            arguments: PyTuple::new(env.py(), values)?.unbind(),
+        })
+    }
+
+    fn run(&self) -> Result<(), PythonError> {
+        Python::attach(|py| {
+            let result = self.method.bind(py).call1(self.arguments.bind(py));
+            result.map(drop).map_err(|error| PythonError::exception(py, &error))
+        })
+    }
+}
+
+impl PythonEnvironments {
+    /// Makes the environments of `task_id` (a Gymnasium id, `module:Id` or `module:Class`); they
+    /// must be reset before the first step.
+    ///
+    /// # Errors
+    /// `Exception` with Gymnasium's own words for an unknown id (and its suggestion) or a space
+    /// that is not supported; `Spec` for bounds that cannot be used; `Interface` or `Length` when
+    /// the installed package does not fit.
+    pub fn start(
+        _interpreter: &Interpreter,
+        task_id: &str,
+        env_count: usize,
+        segment_steps: usize,
+    ) -> Result<Self, PythonError> {
+        Python::attach(|py| {
+            let exception = |error: PyErr| PythonError::exception(py, &error);
+            let module = py.import("dmprl.segment_env").map_err(exception)?;
+            let env = module
+                .getattr("make")
+                .and_then(|make| make.call1((task_id, env_count, segment_steps)))
+                .map_err(exception)?;
+            let spec = env.call_method0("spec").and_then(|s| read_spec(&s)).map_err(exception)?;
+            spec.check()?;
+            let (observation_len, action_len) = (spec.observation_len, spec.action_len);
+            let buffers = module
+                .getattr("SegmentBuffers")
+                .and_then(|new| new.call1((env_count, segment_steps, observation_len, action_len)))
+                .map_err(exception)?;
+            Self::connect(&env, &buffers, (env_count, segment_steps), spec)
+        })
+    }
+
+    fn connect(
+        env: &Bound<'_, PyAny>,
+        buffers: &Bound<'_, PyAny>,
+        (e, k): (usize, usize),
+        spec: EnvSpec,
+    ) -> Result<Self, PythonError> {
+        let (o, a, id) = (spec.observation_len, spec.action_len, spec.id.as_str());
+        let call = |method, arguments: &[&str]| {
+            Call::new(env, buffers, method, arguments)
+                .map_err(|error| PythonError::exception(env.py(), &error))
+        };
+        Ok(Self {
+            reset: call("reset", &["mask", "seeds"])?,
+            step_segment: call("step_segment", &["actions"])?,
+            mask: SharedBuffer::new(buffers, "mask", e, id)?,
+            seeds: SharedBuffer::new(buffers, "seeds", e, id)?,
+            actions: SharedBuffer::new(buffers, "actions", e * k * a, id)?,
+            observations: SharedBuffer::new(buffers, "observations", e * (k + 1) * o, id)?,
+            rewards: SharedBuffer::new(buffers, "rewards", e * k, id)?,
+            terminated: SharedBuffer::new(buffers, "terminated", e, id)?,
+            truncated: SharedBuffer::new(buffers, "truncated", e, id)?,
+            success: SharedBuffer::new(buffers, "success", e, id)?,
+            steps: SharedBuffer::new(buffers, "steps", e, id)?,
+            next_observations: SharedBuffer::new(buffers, "next_observations", e * o, id)?,
+            segment_steps: k,
+            spec,
+        })
+    }
+
+    /// Sizes, bounds and timing.
+    pub fn spec(&self) -> &EnvSpec {
+        &self.spec
+    }
+
+    /// Starts a new episode in every environment with `mask[e]`, from `seeds[e]`. Writes the rows
+    /// of [`Self::next_observations`].
+    ///
+    /// # Errors
+    /// `Length` if an argument has not E entries; `Exception` from an environment.
+    pub fn reset(&mut self, mask: &[bool], seeds: &[u64]) -> Result<(), PythonError> {
+        self.check_len("mask", mask.len(), self.mask.get().len())?;
+        self.check_len("seeds", seeds.len(), self.mask.get().len())?;
+        for (to, &from) in self.mask.get_mut().iter_mut().zip(mask) {
+            *to = u8::from(from);
+        }
+        self.seeds.get_mut().copy_from_slice(seeds);
+        self.reset.run()
+    }
+
+    /// Runs `actions` (E, K, A), in environment units; an environment stops at the end of its
+    /// episode, and has begun its next one when this returns (see [`Self::next_observations`]).
+    ///
+    /// # Errors
+    /// `Length`, `ActionNotFinite`, or `Exception` naming environment and step when one raised or
+    /// returned something not finite.
+    pub fn step_segment(&mut self, actions: &[f64]) -> Result<(), PythonError> {
+        self.check_len("actions", actions.len(), self.actions.get().len())?;
+        if let Some(index) = actions.iter().position(|action| !action.is_finite()) {
+            let step_index = index / self.spec.action_len;
+            return Err(PythonError::ActionNotFinite {
+                task_id: self.spec.id.clone(),
+                env_index: step_index / self.segment_steps,
+                step: step_index % self.segment_steps,
+                value: actions[index],
+            });
+        }
+        self.actions.get_mut().copy_from_slice(actions);
+        self.step_segment.run()?;
+        let steps_max = self.segment_steps;
+        for &steps in self.steps.get() {
+            // A foreign SegmentEnv may be wrong, and `steps` becomes an index.
+            if usize::try_from(steps).is_ok_and(|steps| (1..=steps_max).contains(&steps)) {
+                continue;
+            }
+            return Err(PythonError::Interface {
+                task_id: self.spec.id.clone(),
+                name: "steps",
+                reason: format!("{steps} steps of a segment, expected 1 to {steps_max}"),
+            });
+        }
+        Ok(())
+    }
+
+    /// (E, K+1, O): row k preceded step k; row `steps` followed the last step really run.
+    pub fn observations(&self) -> &[f64] {
+        self.observations.get()
+    }
+
+    /// (E, K): zero from `steps` on.
+    pub fn rewards(&self) -> &[f64] {
+        self.rewards.get()
+    }
+
+    /// (E,): 1 where the episode ended by the task's own rule.
+    pub fn terminated(&self) -> &[u8] {
+        self.terminated.get()
+    }
+
+    /// (E,): 1 where it ended by a time limit.
+    pub fn truncated(&self) -> &[u8] {
+        self.truncated.get()
+    }
+
+    /// (E,): [`SUCCESS_NO`], [`SUCCESS_YES`] or [`SUCCESS_NOT_REPORTED`] at the last step run.
+    pub fn success(&self) -> &[u8] {
+        self.success.get()
+    }
+
+    /// (E,): steps really run, 1 to K.
+    pub fn steps(&self) -> &[i32] {
+        self.steps.get()
+    }
+
+    /// (E, O): what to act on next: the new episode's first observation where one ended.
+    pub fn next_observations(&self) -> &[f64] {
+        self.next_observations.get()
+    }
+
+    fn check_len(
+        &self,
+        name: &'static str,
+        got: usize,
+        expected: usize,
+    ) -> Result<(), PythonError> {
+        if got == expected {
+            return Ok(());
+        }
+        Err(PythonError::Length { task_id: self.spec.id.clone(), name, expected, got })
+    }
+}
+
+fn read_spec(dict: &Bound<'_, PyAny>) -> PyResult<EnvSpec> {
+    Ok(EnvSpec {
+        id: dict.get_item("id")?.extract()?,
+        observation_len: dict.get_item("observation_len")?.extract()?,
+        action_len: dict.get_item("action_len")?.extract()?,
+        action_low: dict.get_item("action_low")?.extract()?,
+        action_high: dict.get_item("action_high")?.extract()?,
+        control_dt_s: dict.get_item("control_dt_s")?.extract()?,
+        episode_steps: dict.get_item("episode_steps")?.extract()?,
+    })
+}

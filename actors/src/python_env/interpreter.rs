@@ -1,0 +1,183 @@
+//! The one interpreter of this process: isolated, in the virtual environment, checked.
+
+use std::{
+    ffi::{CStr, CString},
+    mem::MaybeUninit,
+    os::unix::ffi::OsStrExt,
+    path::{Path, PathBuf},
+    sync::{Mutex, PoisonError},
+};
+
+use pyo3::{ffi, prelude::*, types::PyDict};
+
+use super::{LINKED_PYTHON, PythonError};
+
+/// Runs once after start. `stdout` carries the supervisor's protocol, so an environment's `print`
+/// must not reach it, nor its `input` the supervisor's commands. A BLAS pool of its own per worker
+/// would only fight with the other workers; whoever wants one sets the variable. Importing `signal`,
+/// which half of the standard library does, takes SIGINT over even where CPython was told to
+/// install no handlers, so it is imported here and SIGINT given back; a handler or an "ignore"
+/// that the role set before is left alone by CPython.
+const PREPARE: &CStr = c"\
+import os, signal, sys
+if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
+sys.stdout = sys.stderr
+sys.stdin = open(os.devnull)
+for name in ('OMP_NUM_THREADS', 'OPENBLAS_NUM_THREADS', 'MKL_NUM_THREADS'):
+    os.environ.setdefault(name, '1')
+sys.path.extend(python_path)
+base_prefix = os.path.realpath(sys.base_prefix)
+expected = os.path.realpath(expected)
+";
+
+/// Options of the first start, which hold for the life of the process.
+static RUNNING: Mutex<Option<InterpreterOptions>> = Mutex::new(None);
+
+/// Where the interpreter finds its packages.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct InterpreterOptions {
+    /// The virtual environment; becomes `sys.prefix`.
+    pub venv: PathBuf,
+    /// The user's own directories (`--python-path`), appended to `sys.path`.
+    pub python_path: Vec<PathBuf>,
+}
+
+/// Proof that CPython runs in this process and was checked. The calling thread does not hold the
+/// GIL. It is never shut down: NumPy and MuJoCo cannot be loaded twice in one process.
+#[derive(Debug, Clone, Copy)]
+pub struct Interpreter(());
+
+impl Interpreter {
+    /// Starts CPython, isolated: no `PYTHON*` variables, no user site directory, nothing of the
+    /// working directory on `sys.path`, no signal handlers (the roles have their own), and a
+    /// fixed hash seed, so that the order of a set does not differ between two runs.
+    ///
+    /// A second call with the same options returns the running interpreter.
+    ///
+    /// # Errors
+    /// `NoVenv`; `OtherVersion` or `OtherInstallation` when the loaded libpython or the virtual
+    /// environment is not of the linked installation; `Initialise`; `AlreadyStarted` with other
+    /// options; `Path` for a python path that is no directory.
+    pub fn start(options: &InterpreterOptions) -> Result<Self, PythonError> {
+        let mut running = RUNNING.lock().unwrap_or_else(PoisonError::into_inner);
+        if let Some(running) = &*running {
+            return if running == options {
+                Ok(Self(()))
+            } else {
+                Err(PythonError::AlreadyStarted {
+                    running: format!("{running:?}"),
+                    asked: format!("{options:?}"),
+                })
+            };
+        }
+        let executable = options.venv.join("bin/python");
+        if !executable.exists() {
+            return Err(PythonError::NoVenv { executable });
+        }
+        let python_path = absolute_paths(&options.python_path)?;
+        check_version()?;
+        initialise(&executable)?;
+        // From here on Python runs, for better or worse: another start could not help.
+        *running = Some(options.clone());
+        prepare(&options.venv, python_path)?;
+        Ok(Self(()))
+    }
+}
+
+/// Compares the loaded libpython with the linked one; callable before CPython starts.
+fn check_version() -> Result<(), PythonError> {
+    // SAFETY: Py_GetVersion needs no interpreter and returns a static string.
+    let version = unsafe { CStr::from_ptr(ffi::Py_GetVersion()) }.to_string_lossy();
+    let got = version.split_ascii_whitespace().collect::<Vec<_>>().join(" ");
+    if got == LINKED_PYTHON.version {
+        return Ok(());
+    }
+    Err(PythonError::OtherVersion { expected: LINKED_PYTHON.version.to_owned(), got })
+}
+
+/// Initialises CPython and releases the GIL.
+fn initialise(executable: &Path) -> Result<(), PythonError> {
+    let executable_bytes = c_path(executable)?;
+    let mut preconfig = MaybeUninit::uninit();
+    let mut config = MaybeUninit::uninit();
+    // SAFETY: CPython is not initialised (RUNNING is held and empty; nothing else in this program
+    // starts it). Both structs are filled by their Init function before any field is touched, and
+    // the config is cleared on every way out. PyEval_SaveThread follows a successful start on the
+    // same thread, which holds the GIL then.
+    unsafe {
+        ffi::PyPreConfig_InitIsolatedConfig(preconfig.as_mut_ptr());
+        let mut preconfig = preconfig.assume_init();
+        // The isolated default is the C locale's ASCII: a model file with "°" could not be read.
+        preconfig.utf8_mode = 1;
+        check(ffi::Py_PreInitialize(&raw const preconfig))?;
+
+        ffi::PyConfig_InitIsolatedConfig(config.as_mut_ptr());
+        let config: *mut ffi::PyConfig = config.as_mut_ptr();
+        (*config).install_signal_handlers = 0;
+        (*config).use_hash_seed = 1;
+        (*config).hash_seed = 0;
+        let status = ffi::PyConfig_SetBytesString(
+            config,
+            &raw mut (*config).executable,
+            executable_bytes.as_ptr(),
+        );
+        let result = check(status).and_then(|()| check(ffi::Py_InitializeFromConfig(config)));
+        ffi::PyConfig_Clear(config);
+        result?;
+        ffi::PyEval_SaveThread();
+    }
+    Ok(())
+}
+
+/// Prepares `sys` and compares prefixes.
+fn prepare(venv: &Path, python_path: Vec<String>) -> Result<(), PythonError> {
+    Python::attach(|py| {
+        let globals = PyDict::new(py);
+        let run = || -> PyResult<(String, String)> {
+            globals.set_item("python_path", python_path)?;
+            globals.set_item("expected", LINKED_PYTHON.base_prefix)?;
+            py.run(PREPARE, Some(&globals), None)?;
+            let value = |name| globals.as_any().get_item(name)?.extract();
+            Ok((value("expected")?, value("base_prefix")?))
+        };
+        let (expected, got) = run().map_err(|error| PythonError::exception(py, &error))?;
+        if expected == got {
+            return Ok(());
+        }
+        Err(PythonError::OtherInstallation { venv: venv.to_owned(), expected, got })
+    })
+}
+
+fn check(status: ffi::PyStatus) -> Result<(), PythonError> {
+    let text = |pointer: *const std::ffi::c_char| {
+        if pointer.is_null() {
+            return String::new();
+        }
+        // SAFETY: not null; CPython's status strings are static and NUL-terminated.
+        unsafe { CStr::from_ptr(pointer) }.to_string_lossy().into_owned()
+    };
+    // SAFETY: a plain predicate on a value that CPython returned.
+    if unsafe { ffi::PyStatus_Exception(status) } == 0 {
+        return Ok(());
+    }
+    Err(PythonError::Initialise { function: text(status.func), message: text(status.err_msg) })
+}
+
+/// Absolute, because `sys.path` must not depend on a later change of directory.
+fn absolute_paths(paths: &[PathBuf]) -> Result<Vec<String>, PythonError> {
+    let absolute = |path: &PathBuf| {
+        let wrong = |reason| PythonError::Path { path: path.clone(), reason };
+        let absolute = std::path::absolute(path).map_err(|_| wrong("it is empty"))?;
+        if !absolute.is_dir() {
+            return Err(wrong("it is not a directory"));
+        }
+        absolute.into_os_string().into_string().map_err(|_| wrong("it is not valid UTF-8"))
+    };
+    paths.iter().map(absolute).collect()
+}
+
+fn c_path(path: &Path) -> Result<CString, PythonError> {
+    CString::new(path.as_os_str().as_bytes())
+        .map_err(|_| PythonError::Path { path: path.to_owned(), reason: "it contains a NUL byte" })
+}

@@ -1,0 +1,88 @@
+//! What to do when `venv` or `pip` fails, from what they print.
+
+use dmprl_actors::python_env::LINKED_PYTHON;
+
+/// Phrase in the output, and what it means for the user. The first that occurs counts.
+const CAUSES: [(&str, Cause); 14] = [
+    ("ensurepip is not available", Cause::NoVenv),
+    ("No module named venv", Cause::NoVenv),
+    ("No module named 'venv'", Cause::NoVenv),
+    ("No module named ensurepip", Cause::NoVenv),
+    ("'ensurepip'", Cause::NoVenv),
+    ("No module named pip", Cause::NoPip),
+    ("No space left on device", Cause::DiskFull),
+    ("name resolution", Cause::NoNetwork),
+    ("Failed to establish a new connection", Cause::NoNetwork),
+    ("Network is unreachable", Cause::NoNetwork),
+    ("Connection refused", Cause::NoNetwork),
+    ("ProxyError", Cause::NoNetwork),
+    ("timed out", Cause::NoNetwork),
+    ("No matching distribution found", Cause::NoPackage),
+];
+
+#[derive(Clone, Copy)]
+enum Cause {
+    NoVenv,
+    NoPip,
+    DiskFull,
+    NoNetwork,
+    NoPackage,
+}
+
+/// A sentence that begins the error's message, ending in a line break; empty when unknown.
+pub(super) fn advice(output: &str) -> String {
+    let Some((_, cause)) = CAUSES.iter().find(|(phrase, _)| output.contains(phrase)) else {
+        return String::new();
+    };
+    let python = LINKED_PYTHON.executable;
+    match cause {
+        Cause::NoVenv => {
+            format!("{python} lacks its venv module. Debian, Ubuntu: apt install python3-venv\n")
+        }
+        Cause::NoPip => {
+            format!("{python} lacks pip. Debian, Ubuntu: apt install python3-pip python3-venv\n")
+        }
+        Cause::DiskFull => "The disk is full.\n".to_owned(),
+        Cause::NoNetwork => "The package index cannot be reached. The first start downloads \
+             gymnasium, mujoco and numpy; later ones need no network. Behind a proxy set \
+             HTTPS_PROXY; without a network set PIP_FIND_LINKS to a directory of wheels and \
+             PIP_NO_INDEX=1\n"
+            .to_owned(),
+        Cause::NoPackage => format!(
+            "A package is not there for Python {}, or only for another processor.\n",
+            LINKED_PYTHON.version_number()
+        ),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn missing_parts_of_python_are_named_as_debian_packages() {
+        let debian = "The virtual environment was not created successfully because ensurepip is \
+                      not available.  On Debian/Ubuntu systems, you need to install the";
+        for (output, package) in [
+            (debian, "apt install python3-venv"),
+            ("/usr/bin/python3: No module named venv", "apt install python3-venv"),
+            ("/x/.venv/bin/python: No module named pip", "apt install python3-pip"),
+        ] {
+            assert!(advice(output).contains(package), "{output}");
+        }
+    }
+
+    #[test]
+    fn unreachable_index_is_not_taken_for_a_missing_package() {
+        let output = "WARNING: Retrying after connection broken by 'NewConnectionError(<pip>: \
+                      Failed to establish a new connection: [Errno -3] Temporary failure in name \
+                      resolution')': /simple/flit-core/\n\
+                      ERROR: No matching distribution found for flit_core<5,>=3.9";
+        assert!(advice(output).contains("cannot be reached"));
+    }
+
+    #[test]
+    fn unknown_failure_gets_no_advice() {
+        assert_eq!(advice("Segmentation fault"), "");
+    }
+}

@@ -1,0 +1,134 @@
+//! The two commands that fill `.venv`, with their progress and their failures.
+
+use std::{
+    collections::VecDeque,
+    fs::File,
+    io::{self, BufRead, BufReader},
+    path::Path,
+    process::{Command, ExitStatus, Stdio},
+    sync::mpsc::{self, RecvTimeoutError},
+    thread,
+    time::{Duration, Instant},
+};
+
+use anyhow::{Context, Result, bail};
+use dmprl_actors::python_env::LINKED_PYTHON;
+
+use super::{PythonEnvironment, advice::advice, stamp};
+
+/// Lines of a failed command that are shown.
+const LAST_LINES_MAX: usize = 20;
+/// Between two progress lines of a command that prints nothing.
+const PROGRESS_INTERVAL: Duration = Duration::from_secs(1);
+/// Lines that the reading thread may be ahead; beyond, the command waits in its write.
+const LINES_AHEAD_MAX: usize = 256;
+
+/// What making `.venv` needs.
+pub(super) struct Setup<'a> {
+    /// What is made.
+    pub environment: &'a PythonEnvironment,
+    /// The directory of the package to install.
+    pub package: &'a Path,
+    /// Held until the last command that writes into `.venv` has ended.
+    pub lock: &'a File,
+    /// Takes one line at a time.
+    pub progress: &'a dyn Fn(&str),
+}
+
+impl Setup<'_> {
+    /// Makes the virtual environment, with the interpreter that this program is linked against.
+    pub fn create(&self) -> Result<()> {
+        stamp::begin(&self.environment.venv)?;
+        let mut command = Command::new(LINKED_PYTHON.executable);
+        command.args(["-I", "-m", "venv"]).arg(&self.environment.venv);
+        let phase = format!("making .venv with Python {}", LINKED_PYTHON.version_number());
+        self.run(&phase, command)
+    }
+
+    /// Installs the package and what it requires.
+    ///
+    /// Editable, that is by reference to `envs_py`: a change there holds at the next start, without
+    /// an installation, which is what who adds a task wants; only a change of requirements installs
+    /// again.
+    pub fn install(&self) -> Result<()> {
+        let mut command = Command::new(&self.environment.executable);
+        command
+            .args(["-I", "-m", "pip", "install", "--disable-pip-version-check", "--no-input"])
+            .args(["--progress-bar", "off", "--editable"])
+            .arg(self.package)
+            // A user's pip.conf may ask for these; in a virtual environment they fail or miss it.
+            .env("PIP_USER", "0")
+            .env_remove("PIP_TARGET")
+            .env_remove("PIP_PREFIX");
+        self.run("installing packages", command)
+    }
+
+    fn run(&self, phase: &str, mut command: Command) -> Result<()> {
+        let started = Instant::now();
+        let line = command_line(&command);
+        let (output, input) = io::pipe().context("no pipe")?;
+        command
+            // The lock file is empty, so it serves as an empty input, and the lock lasts until
+            // the command itself has ended: if this program is killed, the next start waits.
+            .stdin(Stdio::from(self.lock.try_clone().context("cannot share the lock")?))
+            .stdout(input.try_clone().context("no pipe")?)
+            .stderr(input);
+        let mut child = command.spawn().with_context(|| format!("cannot run {line}"))?;
+        drop(command); // it holds the pipe's writing end
+        let last_lines = self.follow(phase, started, BufReader::new(output));
+        let status = child.wait().with_context(|| format!("cannot wait for {line}"))?;
+        check(&line, status, &last_lines)
+    }
+
+    /// Shows a command's output as progress until it closes it; returns its end.
+    fn follow(
+        &self,
+        phase: &str,
+        started: Instant,
+        output: impl BufRead + Send + 'static,
+    ) -> VecDeque<String> {
+        let (sender, receiver) = mpsc::sync_channel(LINES_AHEAD_MAX);
+        // A thread, because reading a line cannot time out.
+        let reader = thread::spawn(move || {
+            for line in output.split(b'\n').map_while(Result::ok) {
+                if sender.send(String::from_utf8_lossy(&line).trim_end().to_owned()).is_err() {
+                    return;
+                }
+            }
+        });
+        let mut last_lines = VecDeque::with_capacity(LAST_LINES_MAX);
+        loop {
+            match receiver.recv_timeout(PROGRESS_INTERVAL) {
+                Ok(line) if line.is_empty() => continue,
+                Ok(line) => {
+                    if last_lines.len() == LAST_LINES_MAX {
+                        last_lines.pop_front();
+                    }
+                    last_lines.push_back(line);
+                }
+                Err(RecvTimeoutError::Timeout) => {}
+                Err(RecvTimeoutError::Disconnected) => break,
+            }
+            let last = last_lines.back().map_or("", |line: &String| line.trim_start());
+            let seconds = started.elapsed().as_secs();
+            (self.progress)(&format!("python environment: {phase} ({seconds} s) {last}"));
+        }
+        // It has dropped its sender, so it has ended or is about to.
+        let _ = reader.join();
+        last_lines
+    }
+}
+
+fn check(line: &str, status: ExitStatus, last_lines: &VecDeque<String>) -> Result<()> {
+    if status.success() {
+        return Ok(());
+    }
+    let output: Vec<&str> = last_lines.iter().map(String::as_str).collect();
+    let output = output.join("\n");
+    bail!("{}{line} failed ({status}):\n{output}", advice(&output))
+}
+
+fn command_line(command: &Command) -> String {
+    let words = std::iter::once(command.get_program()).chain(command.get_args());
+    words.map(|word| word.to_string_lossy()).collect::<Vec<_>>().join(" ")
+}

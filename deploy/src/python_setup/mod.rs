@@ -1,0 +1,161 @@
+//! Stage 2 of 8: makes `.venv` and installs `envs_py` into it; called by every command that needs
+//! environments.
+//!
+//! The virtual environment is made by the very interpreter that the program is linked against: a
+//! package built for another Python's `libpython` may crash this one. A stamp written last says
+//! what was made; where it fits, [`ensure`] reads two small files and is done. Two starts at once
+//! are kept apart by a lock file.
+
+mod advice;
+mod command;
+mod stamp;
+
+use std::{
+    fs::{self, File, TryLockError},
+    path::{Path, PathBuf},
+    thread,
+    time::{Duration, Instant},
+};
+
+use anyhow::{Context, Result, bail};
+use dmprl_actors::python_env::LINKED_PYTHON;
+
+use self::{
+    command::Setup,
+    stamp::{Fit, Stamp},
+};
+
+/// Name of the virtual environment in the project's root.
+const VENV: &str = ".venv";
+/// Beside it, not in it: the lock must outlive a `.venv` that is made anew.
+const LOCK: &str = ".venv.lock";
+/// Longer than an installation takes over a slow line.
+const LOCK_WAIT_MAX: Duration = Duration::from_secs(30 * 60);
+/// Between two looks at the lock, each with a progress line.
+const LOCK_INTERVAL: Duration = Duration::from_millis(500);
+/// The Python package, relative to the project's root.
+const PACKAGE: &str = "envs_py";
+
+/// A virtual environment in which `import dmprl` works.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct PythonEnvironment {
+    /// Its directory.
+    pub venv: PathBuf,
+    /// Its interpreter, `bin/python`.
+    pub executable: PathBuf,
+}
+
+impl PythonEnvironment {
+    fn of(venv: PathBuf) -> Self {
+        Self { executable: venv.join("bin/python"), venv }
+    }
+}
+
+/// Makes sure that `.venv` in `project_root` holds `envs_py` and what it needs.
+///
+/// - `project_root`: the directory with `envs_py`, where the program was built.
+/// - `progress`: called with one line about what is going on, at least once a second while
+///   something is; not at all when everything is there.
+///
+/// # Errors
+/// With the last lines of the command that failed, and what to do about it: which Debian package
+/// is missing, or that the network is. A `.venv` that is no virtual environment is not touched.
+pub fn ensure(project_root: &Path, progress: &dyn Fn(&str)) -> Result<PythonEnvironment> {
+    let root = fs::canonicalize(project_root)
+        .with_context(|| format!("project directory {}", project_root.display()))?;
+    let package = root.join(PACKAGE);
+    let manifest = package.join("pyproject.toml");
+    let manifest = fs::read_to_string(&manifest)
+        .with_context(|| format!("{} (is this the project's directory?)", manifest.display()))?;
+    let wanted = Stamp::new(&LINKED_PYTHON, &root, &manifest);
+    let environment = PythonEnvironment::of(root.join(VENV));
+    // Without the lock: the stamp is the last thing written and the first removed.
+    if wanted.compare(&environment.venv) == Fit::Ready {
+        return Ok(environment);
+    }
+    let lock = locked(&root.join(LOCK), progress)?;
+    let setup = Setup { environment: &environment, package: &package, lock: &lock, progress };
+    match wanted.compare(&environment.venv) {
+        Fit::Ready => return Ok(environment), // another start was faster
+        Fit::OtherPackages => {
+            progress("python environment: envs_py/pyproject.toml has changed, installing again");
+            stamp::remove(&environment.venv)?;
+        }
+        Fit::Absent => setup.create()?,
+        Fit::Unusable(why) => {
+            progress(&format!("python environment: making .venv anew, {why}"));
+            remove(&environment.venv)?;
+            setup.create()?;
+        }
+    }
+    setup.install()?;
+    wanted.write(&environment.venv)?;
+    progress("python environment: ready");
+    Ok(environment)
+}
+
+/// Waits for another start that is making the same `.venv`. The lock ends with its last holder,
+/// however that ends, so nothing stale is left by a crash.
+fn locked(path: &Path, progress: &dyn Fn(&str)) -> Result<File> {
+    let lock = File::options()
+        .create(true)
+        .truncate(false)
+        .read(true)
+        .write(true)
+        .open(path)
+        .with_context(|| format!("cannot write {}", path.display()))?;
+    let started = Instant::now();
+    // Asking again and again, not `File::lock`: that could neither give up nor say how long.
+    while started.elapsed() < LOCK_WAIT_MAX {
+        match lock.try_lock() {
+            Ok(()) => return Ok(lock),
+            Err(TryLockError::WouldBlock) => {}
+            Err(TryLockError::Error(error)) => {
+                return Err(error).with_context(|| format!("cannot lock {}", path.display()));
+            }
+        }
+        let seconds = started.elapsed().as_secs();
+        progress(&format!("python environment: waiting for another start ({seconds} s)"));
+        thread::sleep(LOCK_INTERVAL);
+    }
+    bail!(
+        "another start has been making {VENV} for {} minutes; end it, or its pip, and start again",
+        LOCK_WAIT_MAX.as_secs() / 60
+    )
+}
+
+/// Removes a virtual environment, and nothing else that may have that name.
+fn remove(venv: &Path) -> Result<()> {
+    let is_ours = venv.join("pyvenv.cfg").exists() || venv.join(stamp::MAKING).exists();
+    let is_empty = || fs::read_dir(venv).is_ok_and(|mut entries| entries.next().is_none());
+    if !is_ours && !is_empty() {
+        bail!(
+            "{} is not a virtual environment; move it away, dmprl keeps its own there",
+            venv.display()
+        );
+    }
+    // First: a removal that is interrupted must not leave something that looks complete.
+    stamp::remove(venv)?;
+    fs::remove_dir_all(venv).with_context(|| format!("cannot remove {}", venv.display()))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn directory_that_is_no_virtual_environment_is_not_removed() {
+        let directory = tempfile::tempdir().unwrap();
+        fs::write(directory.path().join("thesis.tex"), "").unwrap();
+        let error = remove(directory.path()).unwrap_err().to_string();
+        assert!(error.contains("is not a virtual environment"), "{error}");
+        assert!(directory.path().join("thesis.tex").exists());
+    }
+
+    #[test]
+    fn other_directory_than_the_project_is_refused() {
+        let directory = tempfile::tempdir().unwrap();
+        let error = format!("{:#}", ensure(directory.path(), &|_| ()).unwrap_err());
+        assert!(error.contains("is this the project's directory?"), "{error}");
+    }
+}

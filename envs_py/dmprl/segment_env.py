@@ -1,0 +1,149 @@
+"""Several environments behind one call per segment.
+
+A policy decides once per *segment*: K actions, applied open loop. So the worker needs Python only
+once per segment, for all its E environments together; this module is that one place. Shapes: E
+environments, K steps of a segment, O observation, A action.
+"""
+
+from __future__ import annotations
+
+import importlib
+from abc import ABC, abstractmethod
+from types import ModuleType
+from typing import TypedDict
+
+import numpy as np
+from numpy.typing import NDArray
+
+SUCCESS_NO, SUCCESS_YES, SUCCESS_NOT_REPORTED = 0, 1, 2
+"""Values of :attr:`SegmentBuffers.success`."""
+
+
+class SegmentEnvError(RuntimeError):
+    """An environment failed. The message names its id, its index and the step of the segment."""
+
+
+class UnsupportedSpaceError(TypeError):
+    """An environment's spaces are not what a continuous controller can use."""
+
+
+class EnvSpec(TypedDict):
+    """What learner and policy must know (``shared/src/spec.rs``)."""
+
+    id: str
+    observation_len: int
+    action_len: int
+    action_low: list[float]
+    action_high: list[float]
+    control_dt_s: float
+    """Duration of one environment step [s]; 0.0 when the environment does not say."""
+    episode_steps: int
+    """Steps after which an episode is truncated; 0 when it never is."""
+
+
+class SegmentBuffers:
+    """Where a :class:`SegmentEnv` writes: the caller's arrays, allocated once, C-contiguous.
+
+    The worker reads them through the buffer protocol, without a copy. After ``step_segment``:
+
+    - ``observations`` float64 (E, K+1, O): row k is what preceded step k; row ``steps`` is what
+      followed the last step really run, so the true final observation of an episode. Later rows
+      are zero.
+    - ``rewards`` float64 (E, K): zero from ``steps`` on.
+    - ``terminated``, ``truncated`` uint8 (E,): of the last step run. Both may be set.
+    - ``success`` uint8 (E,): 0 no, 1 yes, 2 not reported; of the last step run.
+    - ``steps`` int32 (E,): steps really run, 1 to K.
+    - ``next_observations`` float64 (E, O): the observation to act on next: of the new episode
+      where the old one ended, else the last one. ``reset`` writes only this one.
+    """
+
+    def __init__(
+        self, env_count: int, segment_steps: int, observation_len: int, action_len: int
+    ) -> None:
+        self.observations = np.zeros((env_count, segment_steps + 1, observation_len))
+        self.rewards = np.zeros((env_count, segment_steps))
+        self.terminated = np.zeros(env_count, np.uint8)
+        self.truncated = np.zeros(env_count, np.uint8)
+        self.success = np.full(env_count, SUCCESS_NOT_REPORTED, np.uint8)
+        self.steps = np.zeros(env_count, np.int32)
+        self.next_observations = np.zeros((env_count, observation_len))
+        # What the caller hands in lies beside it, for the same reason: allocated once.
+        self.actions = np.zeros((env_count, segment_steps, action_len))
+        self.mask = np.zeros(env_count, np.uint8)
+        self.seeds = np.zeros(env_count, np.uint64)
+
+
+class SegmentEnv(ABC):
+    """E environments that step a whole segment in one call.
+
+    Subclass this to bring a simulator that is faster than one Gymnasium environment after the
+    other, and name it ``module:Class``; it is constructed as ``Class(env_count, segment_steps)``.
+
+    An implementation keeps no reference to the buffers beyond a call, and writes every row of
+    every array that the call is documented to write.
+    """
+
+    env_count: int
+    segment_steps: int
+
+    @abstractmethod
+    def spec(self) -> EnvSpec:
+        """Sizes, bounds and timing; the same for all E environments, constant."""
+
+    @abstractmethod
+    def reset(
+        self, mask: NDArray[np.uint8], seeds: NDArray[np.uint64], out: SegmentBuffers
+    ) -> None:
+        """Starts a new episode in every environment whose ``mask`` is not zero.
+
+        - ``mask`` uint8 (E,); ``seeds`` uint64 (E,): the same seed gives the same episode.
+        - Writes the masked rows of ``out.next_observations``.
+        """
+
+    @abstractmethod
+    def step_segment(self, actions: NDArray[np.float64], out: SegmentBuffers) -> None:
+        """Runs up to K steps in every environment and writes all of ``out``'s results.
+
+        - ``actions`` float64 (E, K, A), in environment units.
+        - An environment stops at its first terminated or truncated step. It is then reset at the
+          end of this call, without a seed: its own random generator goes on, so a run depends on
+          the first seeds alone. Thus the caller never has to reset between episodes.
+
+        Raises:
+            SegmentEnvError: an environment raised, or returned something not finite.
+        """
+
+    def close(self) -> None:  # noqa: B027 - nothing to release is the usual case
+        """Releases what the environments hold."""
+
+
+def make(task_id: str, env_count: int, segment_steps: int) -> SegmentEnv:
+    """The environments of a task.
+
+    - ``task_id``: a Gymnasium id, ``module:Id`` for one that ``module`` registers when imported,
+      or ``module:Class`` with a :class:`SegmentEnv`.
+    """
+    if env_count < 1 or segment_steps < 1:
+        raise ValueError(f"{env_count} environments, {segment_steps} steps: both must be 1 or more")
+    module_name, _, name = task_id.rpartition(":")
+    if module_name:
+        candidate = getattr(_import(task_id, module_name), name, None)
+        if isinstance(candidate, type) and issubclass(candidate, SegmentEnv):
+            return candidate(env_count, segment_steps)
+
+    from dmprl.gymnasium_env import GymnasiumSegmentEnv  # a SegmentEnv may do without Gymnasium
+
+    return GymnasiumSegmentEnv(task_id, env_count, segment_steps)
+
+
+def _import(task_id: str, module_name: str) -> ModuleType:
+    try:
+        return importlib.import_module(module_name)
+    except ModuleNotFoundError as error:
+        if error.name is None or not f"{module_name}.".startswith(f"{error.name}."):
+            raise  # found, but something that it imports is missing
+        raise ModuleNotFoundError(
+            f"{task_id}: no module {error.name!r} among the installed packages or in the "
+            "directories given with --python-path",
+            name=error.name,
+        ) from None

@@ -1,0 +1,201 @@
+"""What a SegmentEnv promises, with Gymnasium behind it."""
+
+import sys
+import unittest
+from pathlib import Path
+
+import gymnasium
+import numpy as np
+
+from dmprl.segment_env import (
+    SUCCESS_NO,
+    SUCCESS_NOT_REPORTED,
+    SUCCESS_YES,
+    SegmentBuffers,
+    SegmentEnvError,
+    UnsupportedSpaceError,
+    make,
+)
+
+sys.path.append(str(Path(__file__).parent))  # for the tiny environments' module
+
+
+def started(task_id, env_count=1, segment_steps=5, seed=7):
+    """The environments of a task, reset with seeds `seed`, `seed` + 1, …, and their buffers."""
+    env = make(task_id, env_count, segment_steps)
+    spec = env.spec()
+    out = SegmentBuffers(env_count, segment_steps, spec["observation_len"], spec["action_len"])
+    seeds = np.arange(seed, seed + env_count, dtype=np.uint64)
+    env.reset(np.ones(env_count, np.uint8), seeds, out)
+    return env, out
+
+
+class ResetTest(unittest.TestCase):
+    def test_the_same_seed_gives_the_same_episode(self):
+        env, out = started("Reacher-v5", env_count=2)
+        first = out.next_observations.copy()
+        env.reset(np.array([1, 1], np.uint8), np.array([8, 7], np.uint64), out)
+        np.testing.assert_array_equal(out.next_observations, first[::-1])
+
+    def test_only_masked_environments_are_reset(self):
+        env, out = started("tiny_envs:Long-v0", env_count=2)
+        env.step_segment(np.zeros((2, 5, 1)), out)
+        env.reset(np.array([0, 1], np.uint8), np.array([0, 2**64 - 1], np.uint64), out)
+        self.assertEqual(out.next_observations[:, 0].tolist(), [5.0, 0.0])
+        env.step_segment(np.zeros((2, 5, 1)), out)
+        self.assertEqual(out.steps.tolist(), [2, 5])
+
+    def test_step_before_reset_is_refused(self):
+        env = make("tiny_envs:Long-v0", 2, 5)
+        out = SegmentBuffers(2, 5, 2, 1)
+        env.reset(np.array([1, 0], np.uint8), np.zeros(2, np.uint64), out)
+        with self.assertRaisesRegex(SegmentEnvError, "environment 1: step before reset"):
+            env.step_segment(np.zeros((2, 5, 1)), out)
+
+
+class SegmentTest(unittest.TestCase):
+    def test_reacher_equals_a_plain_gymnasium_loop(self):
+        env_count, segments = 3, 23  # two ends of an episode (50 steps), off a segment's border
+        env, out = started("Reacher-v5", env_count, segment_steps=6)
+        plain = [gymnasium.make("Reacher-v5") for _ in range(env_count)]
+        now = [plain[index].reset(seed=7 + index)[0] for index in range(env_count)]
+        rng = np.random.default_rng(0)
+        for _ in range(segments):
+            np.testing.assert_array_equal(out.next_observations, now)
+            actions = rng.uniform(-1, 1, (env_count, 6, 2))
+            env.step_segment(actions, out)
+            for index in range(env_count):
+                np.testing.assert_array_equal(out.observations[index, 0], now[index])
+                for step in range(out.steps[index]):
+                    action = actions[index, step].astype(np.float32)
+                    now[index], reward, terminated, truncated, _ = plain[index].step(action)
+                    np.testing.assert_array_equal(out.observations[index, step + 1], now[index])
+                    self.assertEqual(out.rewards[index, step], reward)
+                self.assertEqual(out.terminated[index], terminated)
+                self.assertEqual(out.truncated[index], truncated)
+                if terminated or truncated:
+                    now[index], _ = plain[index].reset()
+                else:
+                    self.assertEqual(out.steps[index], 6)
+
+    def test_segment_ends_with_its_episode_and_the_next_begins(self):
+        env, out = started("tiny_envs:Countdown-v0", env_count=2)
+        draw = out.next_observations[:, 1].copy()
+        out.observations[:], out.rewards[:] = 9, 9
+        env.step_segment(np.array([[[1.0]] * 5, [[-1.0]] * 5]), out)
+        self.assertEqual(out.steps.tolist(), [3, 3])
+        self.assertEqual(out.observations[0, :, 0].tolist(), [0, 1, 2, 3, 0, 0])
+        self.assertEqual(out.observations[0, :4, 1].tolist(), [draw[0]] * 4)
+        self.assertEqual(out.rewards.tolist(), [[1, 1, 1, 0, 0], [-1, -1, -1, 0, 0]])
+        self.assertEqual((out.terminated.tolist(), out.truncated.tolist()), ([1, 1], [0, 0]))
+        self.assertEqual(out.success.tolist(), [SUCCESS_YES, SUCCESS_NO])
+        self.assertEqual(out.next_observations[:, 0].tolist(), [0, 0])
+        self.assertTrue((out.next_observations[:, 1] != draw).all(), "a new draw, not the seed's")
+        expected = out.next_observations.copy()
+        env.step_segment(np.zeros((2, 5, 1)), out)
+        np.testing.assert_array_equal(out.observations[:, 0], expected)
+
+    def test_autoreset_continues_the_environments_own_generator(self):
+        draws = []
+        for _ in range(2):
+            env, out = started("tiny_envs:Countdown-v0")
+            for _ in range(3):
+                env.step_segment(np.zeros((1, 5, 1)), out)
+                draws.append(out.next_observations[0, 1])
+        self.assertEqual(draws[:3], draws[3:])
+        self.assertEqual(len(set(draws)), 3)
+
+    def test_time_limit_is_truncation_and_not_termination(self):
+        env, out = started("tiny_envs:Long-v0")
+        env.step_segment(np.zeros((1, 5, 1)), out)
+        self.assertEqual((out.truncated[0], out.steps[0]), (0, 5))
+        env.step_segment(np.zeros((1, 5, 1)), out)
+        self.assertEqual((out.terminated[0], out.truncated[0], out.steps[0]), (0, 1, 2))
+        self.assertEqual(out.observations[0, 2, 0], 7)
+
+    def test_an_environment_may_keep_its_last_action(self):
+        env, out = started("tiny_envs:Remembering-v0", segment_steps=2)
+        actions = np.array([[[0.5], [1.0]]])
+        env.step_segment(actions, out)
+        actions[:] = 0.0
+        env.step_segment(actions, out)
+        self.assertEqual(out.rewards.tolist(), [[1.0, 0.0]])
+
+    def test_a_module_may_bring_its_own_segment_env(self):
+        env, out = started("tiny_envs:Batch", env_count=2)
+        self.assertEqual(out.next_observations.tolist(), [[7], [8]])
+        self.assertEqual(env.spec()["control_dt_s"], 0.5)
+
+
+class SpecTest(unittest.TestCase):
+    def test_spec_of_reacher(self):
+        self.assertEqual(
+            make("Reacher-v5", 1, 5).spec(),
+            {
+                "id": "Reacher-v5",
+                "observation_len": 10,
+                "action_len": 2,
+                "action_low": [-1.0, -1.0],
+                "action_high": [1.0, 1.0],
+                "control_dt_s": 0.02,
+                "episode_steps": 50,
+            },
+        )
+
+    def test_spec_without_time_limit_or_dt(self):
+        spec = make("tiny_envs:Countdown-v0", 1, 5).spec()
+        self.assertEqual((spec["control_dt_s"], spec["episode_steps"]), (0.0, 0))
+
+    def test_dict_observation_is_flattened_by_key(self):
+        env, out = started("tiny_envs:Goal-v0")
+        self.assertEqual(env.spec()["observation_len"], 4)
+        self.assertEqual(out.next_observations.tolist(), [[0.5, 0.5, 0.25, 0.25]])
+        env.step_segment(np.zeros((1, 5, 1)), out)
+        self.assertEqual(out.success[0], SUCCESS_NOT_REPORTED)
+
+    def test_unsupported_spaces_are_refused_with_the_space(self):
+        for name, space in [
+            ("Discrete", r"action space Discrete\(3\)"),
+            ("Unbounded", r"action space Box\(-inf, inf, \(2,\), float32\)"),
+            ("Image", r"observation space Box\(0, 255, \(8, 8, 3\), uint8\)"),
+        ]:
+            with self.subTest(name), self.assertRaisesRegex(UnsupportedSpaceError, space) as raised:
+                make(f"tiny_envs:{name}-v0", 1, 5)
+            self.assertIn("supported are a Box", str(raised.exception))
+
+    def test_unknown_names_are_refused_with_a_suggestion(self):
+        with self.assertRaisesRegex(gymnasium.error.Error, "Reacher"):
+            make("Reachr-v5", 1, 5)
+        with self.assertRaisesRegex(ModuleNotFoundError, "--python-path"):
+            make("no_such_module:Task-v0", 1, 5)
+
+
+class FaultTest(unittest.TestCase):
+    def fault_of(self, name):
+        env, out = started(f"tiny_envs:{name}-v0", env_count=3)
+        actions = np.zeros((3, 5, 1))
+        actions[1, 3] = 2.0
+        with self.assertRaises(SegmentEnvError) as raised:
+            env.step_segment(actions, out)
+        return str(raised.exception)
+
+    def test_an_exception_names_environment_and_step(self):
+        self.assertEqual(
+            self.fault_of("Raises"),
+            "tiny_envs:Raises-v0, environment 1, step 3 of the segment: "
+            "ValueError: the joint broke",
+        )
+
+    def test_values_that_are_not_finite_are_named(self):
+        where = "environment 1, step 3 of the segment"
+        self.assertIn(f"{where}: observation[1] is nan", self.fault_of("NanObservation"))
+        self.assertIn(f"{where}: reward is inf", self.fault_of("InfReward"))
+
+    def test_actions_of_another_shape_are_refused(self):
+        env, out = started("tiny_envs:Long-v0")
+        with self.assertRaisesRegex(ValueError, r"expected \(E, K, A\) = \(1, 5, 1\)"):
+            env.step_segment(np.zeros((1, 4, 1)), out)
+
+
+if __name__ == "__main__":
+    unittest.main()

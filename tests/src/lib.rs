@@ -1,0 +1,31 @@
+//! Helpers of the tests that need more than one crate.
+
+use std::path::{Path, PathBuf};
+
+/// The project's directory.
+pub fn project_root() -> &'static Path {
+    Path::new(env!("CARGO_MANIFEST_DIR")).parent().expect("tests/ lies in the project")
+}
+
+/// Folder with the tiny environments (`tiny_envs:Id`), for `--python-path`.
+pub fn tiny_envs_dir() -> PathBuf {
+    project_root().join("envs_py/tests")
+}
+
+/// The project's own `.venv`, made if it is not there: tests run what a user runs. Test processes
+/// that come here together wait for each other.
+///
+/// # Panics
+/// When it cannot be made, with the reason.
+#[cfg(feature = "python")]
+pub fn venv() -> &'static dmprl::python_setup::PythonEnvironment {
+    use std::sync::OnceLock;
+
+    use dmprl::python_setup::{PythonEnvironment, ensure};
+
+    static VENV: OnceLock<PythonEnvironment> = OnceLock::new();
+    VENV.get_or_init(|| {
+        ensure(project_root(), &|line| eprintln!("{line}"))
+            .unwrap_or_else(|error| panic!("the tests need a Python environment: {error:#}"))
+    })
+}
