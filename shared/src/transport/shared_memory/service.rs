@@ -1,0 +1,143 @@
+//! The private, file-backed iceoryx2 service: every resource is a file below the run's directory.
+//!
+//! The stock `ipc` service keeps part of its state in `/dev/shm` under names any user can squat.
+//! With the file concepts of `iceoryx2-cal` a mode-0700 directory is the permission boundary and
+//! the unit of removal. Price: these are inner crates, hence the exact version pins.
+
+use std::fmt::{Debug, Display};
+use std::panic::{AssertUnwindSafe, catch_unwind};
+use std::path::Path;
+
+use iceoryx2::config::Config;
+use iceoryx2::node::{Node, NodeBuilder};
+use iceoryx2::prelude::{
+    FileName, FilePath, LogLevel, SemanticString, ServiceName, SignalHandlingMode, set_log_level,
+};
+use iceoryx2::service::Service;
+use iceoryx2_bb_elementary_traits::testing::abandonable::Abandonable;
+use iceoryx2_bb_elementary_traits::zero_copy_send::ZeroCopySend;
+use iceoryx2_cal::shm_allocator::bump_allocator::BumpAllocator;
+use iceoryx2_cal::shm_allocator::pool_allocator::PoolAllocator;
+use iceoryx2_cal::{
+    arc_sync_policy, bag, dynamic_storage, event, hash, monitoring, reactor,
+    resizable_shared_memory, serialize, shared_memory, static_storage, zero_copy_connection,
+};
+
+use crate::transport::TransportError;
+
+/// Prefix of every file iceoryx2 creates. Short, because Unix socket paths end at 108 bytes; the
+/// run's own directory already separates runs.
+pub(super) const PREFIX: &str = "d_";
+/// The configuration that the learner writes and every process of the run reads.
+const CONFIG_FILE: &str = "iceoryx2.toml";
+/// How often a port or service that a dead process still occupies is asked for again, each time
+/// after cleaning up after the dead.
+pub(super) const CLEAN_ATTEMPTS: usize = 3;
+
+/// The service variant; ports are mutex-protected so that an end may move to another thread.
+#[derive(Debug, Clone)]
+pub(super) struct PrivateIpc {}
+
+type FileMemory<Allocator> = shared_memory::file::Memory<Allocator>;
+
+impl Service for PrivateIpc {
+    type StaticStorage = static_storage::recommended::Ipc;
+    type ConfigSerializer = serialize::recommended::Recommended;
+    type PersistentDynamicStorage<T: Debug + Send + Sync + ZeroCopySend + 'static> =
+        dynamic_storage::file::Storage<T>;
+    type Bag = bag::recommended::Recommended;
+    type DynamicStorage<T: Debug + Send + Sync + ZeroCopySend + 'static> =
+        dynamic_storage::file::Storage<T>;
+    type ServiceNameHasher = hash::recommended::Recommended;
+    type SharedMemory = FileMemory<PoolAllocator>;
+    type ResizableSharedMemory =
+        resizable_shared_memory::dynamic::DynamicMemory<PoolAllocator, FileMemory<PoolAllocator>>;
+    type Connection = zero_copy_connection::file::Connection;
+    type Event = event::recommended::Ipc;
+    type Monitoring = monitoring::recommended::Ipc;
+    type Reactor = reactor::recommended::Ipc;
+    type ArcThreadSafetyPolicy<T: Send + Debug + Abandonable> =
+        arc_sync_policy::mutex_protected::MutexProtected<T>;
+    type BlackboardMgmt<K: Send + Sync + Debug + ZeroCopySend + 'static> =
+        dynamic_storage::file::Storage<K>;
+    type BlackboardPayload = FileMemory<BumpAllocator>;
+    type UniqueId = iceoryx2::unique_id_generator::unique_system_id::UniqueSystemId;
+}
+
+impl iceoryx2::service::internal::ServiceInternal<PrivateIpc> for PrivateIpc {}
+
+/// Turns the middleware's refusal into an error that names what was attempted on what.
+pub(super) fn refused<E: Display>(
+    operation: &'static str,
+    name: impl Display,
+) -> impl FnOnce(E) -> TransportError {
+    let name = name.to_string();
+    move |cause| TransportError::Middleware { operation, name, cause: cause.to_string() }
+}
+
+/// A service name, checked.
+pub(super) fn service_name(name: &str) -> Result<ServiceName, TransportError> {
+    name.try_into().map_err(refused("naming a service", name))
+}
+
+/// Writes the run's iceoryx2 configuration into its directory.
+///
+/// A file, because iceoryx2 takes its process-wide configuration from nothing else, and without
+/// one the cleanup of a half-started dead process would look below iceoryx2's default paths.
+pub(super) fn write_config(domain: &Path) -> Result<(), TransportError> {
+    let operation = "writing the configuration";
+    let root = iceoryx2::prelude::Path::new(domain.as_os_str().as_encoded_bytes())
+        .map_err(refused(operation, domain.display()))?;
+    let mut config = Config::default();
+    config.global.set_root_path(&root);
+    config.global.prefix =
+        FileName::new(PREFIX.as_bytes()).map_err(refused(operation, domain.display()))?;
+    // Cleaning up after the dead happens where this folder says so and nowhere else: concurrent
+    // cleanups are where iceoryx2's known bugs are.
+    config.global.node.cleanup_dead_nodes_on_creation = false;
+    config.global.node.cleanup_dead_nodes_on_destruction = false;
+    config.global.service.cleanup_dead_nodes_on_open = false;
+    let text = toml::to_string(&config).map_err(refused(operation, domain.display()))?;
+    let file = domain.join(CONFIG_FILE);
+    let fresh = file.with_extension("toml.new");
+    std::fs::write(&fresh, text)
+        .and_then(|()| std::fs::rename(&fresh, &file))
+        .map_err(refused(operation, file.display()))
+}
+
+/// Joins the run: reads its configuration and registers this process as one of its nodes.
+pub(super) fn join(domain: &Path) -> Result<Node<PrivateIpc>, TransportError> {
+    // Failures come back as errors. The log repeats them, and speaks of every dead peer.
+    set_log_level(LogLevel::Fatal);
+    let file = domain.join(CONFIG_FILE);
+    let path = FilePath::new(file.as_os_str().as_encoded_bytes())
+        .map_err(refused("reading the configuration", file.display()))?;
+    let config =
+        Config::from_file(&path).map_err(refused("reading the configuration", file.display()))?;
+    // The first run of a process decides. It only serves the cleanup of processes that died
+    // before they had written which configuration they use.
+    Config::setup_global_config_from_file(&path)
+        .map_err(refused("reading the configuration", file.display()))?;
+    NodeBuilder::new()
+        .config(&config)
+        .signal_handling_mode(SignalHandlingMode::Disabled)
+        .create::<PrivateIpc>()
+        .map_err(refused("joining the run", domain.display()))
+}
+
+/// Frees what dead processes of the run left behind.
+///
+/// iceoryx2 0.10 panics when two processes clean at once and one finds a "dead" node alive
+/// (issue 1880): the panic becomes an error here, and the next call tries again.
+pub(super) fn clean(node: &Node<PrivateIpc>) -> Result<(), TransportError> {
+    match catch_unwind(AssertUnwindSafe(|| node.try_cleanup_dead_nodes())) {
+        // A failed cleanup of one node is another process at the same work, or is tried again by
+        // the next call.
+        Ok(_) => Ok(()),
+        Err(_) => Err(TransportError::Middleware {
+            operation: "cleaning up after dead processes",
+            name: node.id().to_string(),
+            cause: "iceoryx2 panicked".to_owned(),
+        }),
+    }
+}
