@@ -1,5 +1,7 @@
 //! What every transport promises, asked of both: in one process and over shared memory.
 
+#![allow(clippy::unwrap_used, reason = "a test's helpers fail the test")]
+
 mod transport_support;
 
 use dmprl_shared::parameters::{ParameterSnapshot, SnapshotError};
@@ -114,12 +116,12 @@ fn a_full_queue_says_so_and_keeps_what_it_has(mut transport: Transport) {
 
 fn full_queues_are_drained_in_turn(mut transport: Transport) {
     let mut taken = [0_u32; 4];
-    let mut sequence = [0; 4];
+    let mut sequences = [0; 4];
     let mut segment = Segment::default();
     for _ in 0..4000 {
-        for worker in 0..4 {
-            while offer(&mut transport, worker, sequence[worker] + 1) == SendOutcome::Delivered {
-                sequence[worker] += 1;
+        for (worker, sequence) in sequences.iter_mut().enumerate() {
+            while offer(&mut transport, worker, *sequence + 1) == SendOutcome::Delivered {
+                *sequence += 1;
             }
         }
         assert!(transport.receiver.try_receive(&mut segment).unwrap());

@@ -8,14 +8,15 @@ use iceoryx2::node::Node;
 use iceoryx2::port::DegradationAction;
 use iceoryx2::prelude::{MessagingPattern, ZeroCopySend};
 use iceoryx2::service::Service;
-use iceoryx2::service::attribute::AttributeVerifier;
+use iceoryx2::service::attribute::{
+    AttributeKey, AttributeSpecifier, AttributeValue, AttributeVerifier,
+};
 use iceoryx2::service::builder::publish_subscribe::{
     Builder, PublishSubscribeOpenError as OpenError,
-    PublishSubscribeOpenOrCreateError as OpenOrCreateError,
 };
 use iceoryx2::service::port_factory::publish_subscribe::PortFactory;
 
-use super::service::{CLEAN_ATTEMPTS, PrivateIpc, clean, refused, service_name};
+use super::service::{PrivateIpc, refused, service_name};
 use crate::transport::TransportError;
 
 /// Makes the ports of one service whose samples are slices of f32 with a header `H`.
@@ -35,36 +36,35 @@ pub(super) struct Channel {
 }
 
 impl Channel {
-    /// Opens the service that a learner created. A worker never creates one: killed in the middle,
-    /// it would leave a service that hangs for everyone.
+    /// Creates the service, in a directory that is new and this learner's alone.
+    pub(super) fn create<H: Debug + ZeroCopySend>(
+        &self,
+        node: &Node<PrivateIpc>,
+        limits: impl FnOnce(ChannelBuilder<H>) -> ChannelBuilder<H>,
+    ) -> Result<Factory<H>, TransportError> {
+        let mut attributes = AttributeSpecifier::new();
+        for (key, value) in &self.agreement {
+            let (key, value) = attribute(key, value)?;
+            attributes = attributes.define(&key, &value).map_err(refused("stating", key))?;
+        }
+        limits(self.builder(node)?)
+            .create_with_attributes(&attributes)
+            .map_err(refused("creating the service", &self.name))
+    }
+
+    /// Opens the service that the learner created. A worker never creates one: killed in the
+    /// middle, it would leave a service that hangs for everyone.
     pub(super) fn open<H: Debug + ZeroCopySend>(
         &self,
         node: &Node<PrivateIpc>,
     ) -> Result<Factory<H>, TransportError> {
-        let opened = retry_cleaned(node, is_occupied, || {
-            Ok(self.builder(node)?.open_with_attributes(&self.verifier()?))
-        })?;
+        let mut attributes = AttributeVerifier::new();
+        for (key, value) in &self.agreement {
+            let (key, value) = attribute(key, value)?;
+            attributes = attributes.require(&key, &value).map_err(refused("stating", key))?;
+        }
+        let opened = self.builder(node)?.open_with_attributes(&attributes);
         opened.map_err(|cause| self.not_opened(node, cause))
-    }
-
-    /// Creates the service, or opens the one that workers have kept since a learner before.
-    pub(super) fn create<H: Debug + ZeroCopySend>(
-        &self,
-        node: &Node<PrivateIpc>,
-        limits: impl Fn(ChannelBuilder<H>) -> ChannelBuilder<H>,
-    ) -> Result<Factory<H>, TransportError> {
-        let occupied = |cause: &OpenOrCreateError| match cause {
-            OpenOrCreateError::PublishSubscribeOpenError(cause) => is_occupied(cause),
-            _ => false,
-        };
-        let created = retry_cleaned(node, occupied, || {
-            let builder = limits(self.builder(node)?);
-            Ok(builder.open_or_create_with_attributes(&self.verifier()?))
-        })?;
-        created.map_err(|cause| match cause {
-            OpenOrCreateError::PublishSubscribeOpenError(cause) => self.not_opened(node, cause),
-            cause => refused("creating the service", &self.name)(cause),
-        })
     }
 
     fn builder<H: Debug + ZeroCopySend>(
@@ -73,16 +73,6 @@ impl Channel {
     ) -> Result<ChannelBuilder<H>, TransportError> {
         let name = service_name(&self.name)?;
         Ok(node.service_builder(&name).publish_subscribe::<[f32]>().user_header::<H>())
-    }
-
-    fn verifier(&self) -> Result<AttributeVerifier, TransportError> {
-        let mut verifier = AttributeVerifier::new();
-        for (key, value) in &self.agreement {
-            let key = (*key).try_into().map_err(refused("stating", key))?;
-            let value = value.as_str().try_into().map_err(refused("stating", value))?;
-            verifier = verifier.require(&key, &value).map_err(refused("stating", &self.name))?;
-        }
-        Ok(verifier)
     }
 
     fn not_opened(&self, node: &Node<PrivateIpc>, cause: OpenError) -> TransportError {
@@ -134,25 +124,9 @@ impl Channel {
     }
 }
 
-fn is_occupied(cause: &OpenError) -> bool {
-    matches!(cause, OpenError::ExceedsMaxNumberOfNodes | OpenError::IsMarkedForDestruction)
-}
-
-/// Asks again, after cleaning up after the dead, as long as the place is `occupied`.
-pub(super) fn retry_cleaned<T, E>(
-    node: &Node<PrivateIpc>,
-    occupied: impl Fn(&E) -> bool,
-    mut request: impl FnMut() -> Result<Result<T, E>, TransportError>,
-) -> Result<Result<T, E>, TransportError> {
-    let mut answer = request()?;
-    for _ in 0..CLEAN_ATTEMPTS {
-        if !answer.as_ref().is_err_and(&occupied) {
-            break;
-        }
-        clean(node)?;
-        answer = request()?;
-    }
-    Ok(answer)
+fn attribute(key: &str, value: &str) -> Result<(AttributeKey, AttributeValue), TransportError> {
+    let name = key.try_into().map_err(refused("stating", key))?;
+    Ok((name, value.try_into().map_err(refused("stating", key))?))
 }
 
 /// Set when a port could not connect to a peer.

@@ -5,7 +5,7 @@
 //!   <token>/                0700, one run
 //!     domain                marker: this directory is ours to remove
 //!     owner.lock            locked as long as the owner lives
-//!     …                     what iceoryx2 creates
+//!     …                     see `generation`
 //! ```
 //! A lock dies with its process, however it ends: a directory with a free lock is abandoned.
 //! Creating and removing happen under a lock on the parent, so that a directory between `mkdir`
@@ -21,6 +21,7 @@ use std::time::Duration;
 use rustix::fs::{CWD, OFlags, RenameFlags, renameat_with, statvfs};
 use thiserror::Error;
 
+use super::generation::DIRECTORY_BYTES;
 use super::service::PREFIX;
 
 const MARKER_FILE: &str = "domain";
@@ -30,7 +31,7 @@ const LOCK_FILE: &str = "owner.lock";
 const UNFINISHED: &str = ".dmprl-unfinished-";
 /// A directory that is being removed: renamed first, so that no one joins any more.
 const CONDEMNED: &str = ".dmprl-condemned-";
-/// Path of a domain and iceoryx2's prefix together [bytes]: iceoryx2 appends up to 38 bytes for
+/// Path of a generation and iceoryx2's prefix together [bytes]: iceoryx2 appends up to 38 bytes for
 /// Unix sockets, whose paths end at 108.
 const ROOT_BYTES_MAX: usize = 70;
 const TOKEN_BYTES_MAX: usize = 32;
@@ -63,13 +64,13 @@ pub enum DomainError {
     },
     /// The path leaves no room for the names of sockets.
     #[error(
-        "shared-memory path {path} with prefix has {got} bytes, at most {ROOT_BYTES_MAX} fit: \
-         choose a shorter directory or token"
+        "shared-memory path {path} takes {got} bytes with what is added, at most {ROOT_BYTES_MAX} \
+         fit: choose a shorter directory or token"
     )]
     TooLong {
         /// The directory.
         path: PathBuf,
-        /// Its length with iceoryx2's prefix [bytes].
+        /// Its length with the generation's directory and iceoryx2's prefix [bytes].
         got: usize,
     },
     /// The token is empty, too long or has characters that do not belong into a name.
@@ -123,7 +124,7 @@ impl Domain {
     pub fn create(parent: &Path, token: &str) -> Result<Self, DomainError> {
         check_token(token)?;
         let path = parent.join(token);
-        let bytes = path.as_os_str().len() + "/".len() + PREFIX.len();
+        let bytes = path.as_os_str().len() + DIRECTORY_BYTES + "/".len() + PREFIX.len();
         if bytes > ROOT_BYTES_MAX {
             return Err(DomainError::TooLong { path, got: bytes });
         }

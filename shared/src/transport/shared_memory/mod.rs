@@ -1,27 +1,28 @@
 //! Segments and snapshots between processes of one host, over iceoryx2.
 //!
-//! `domain` is the run's directory, `service` and `channel` tame the middleware, `segments` and
-//! `parameters` implement the traits. iceoryx2 is named nowhere else.
+//! `domain` is the run's directory and `generation` the part of it that belongs to one learner,
+//! `service` and `channel` tame the middleware, `segments` and `parameters` implement the traits.
+//! iceoryx2 is named nowhere else.
 //!
 //! What holds when processes die:
-//! - A worker never creates a service, so that one killed in mid-creation blocks nobody.
-//! - A dead worker's queued segments are still delivered. Its places are freed by the learner's
-//!   `maintain`, or by its successor, which attaches to the same services.
+//! - A worker never creates a service and never cleans up, so one killed in the middle blocks
+//!   nobody. Its queued segments are still delivered; the learner's `maintain` frees its place.
 //! - A dead learner's queues are lost: `Delivered` promises no more than the queue. Workers see
-//!   `Full` or `Detached` until the next learner serves the same domain, then go on by themselves.
-//! - What a dead learner left half-made is removed by the next one, which alone holds the lock.
+//!   `Full` or `Detached` until the next learner serves the same domain, then follow it.
+//! - A new learner inherits nothing from the one before: whatever that left half-made is removed.
 
 mod channel;
 mod domain;
+mod generation;
 mod parameters;
 mod segments;
 mod service;
 
-use std::os::unix::fs::MetadataExt;
 use std::path::Path;
 use std::sync::Arc;
 
 pub use domain::{Domain, DomainError, remove_abandoned};
+use generation::Generation;
 use iceoryx2::service::header::publish_subscribe::Header;
 pub use parameters::{Publisher, Subscriber};
 pub use segments::{Receiver, Sender};
@@ -33,10 +34,6 @@ use crate::segment::SegmentLayout;
 const PROTOCOL: u32 = 1;
 /// Locked by the learner as long as it lives.
 const LEARNER_LOCK: &str = "learner.lock";
-/// Where iceoryx2 describes its services, below the domain.
-const SERVICE_DIRECTORY: &str = "services";
-/// Permissions of a service's description as long as it is being written; then it is read-only.
-const UNFINISHED_MODE: u32 = 0o600;
 /// Queues, registries and descriptions of one service, besides its chunks [bytes]. Measured: see
 /// the test `the_space_asked_for_covers_what_is_used`.
 const SERVICE_BYTES: usize = 64 * 1024;
@@ -118,42 +115,42 @@ pub struct WorkerEnd {
     pub parameters: Subscriber,
 }
 
-/// Makes this process the run's learner: creates all services, or takes over those that workers
-/// have kept since a learner before.
+/// Makes this process the run's learner and creates all services. Workers of a learner before it
+/// follow by themselves.
 ///
 /// # Errors
 /// `Domain` if the directory is not a domain, another learner lives or space is short,
-/// `Incompatible` if workers of another plan hold the services, `Middleware` for the rest.
+/// `Middleware` for the rest. Whatever was half-made is removed by the next call.
 pub fn serve(domain: &Path, plan: &Plan) -> Result<LearnerEnd, TransportError> {
     let domain = Domain::open(domain)?;
     let learner = Arc::new(domain.lock(LEARNER_LOCK)?);
-    remove_unfinished_services(&domain)?;
-    if !domain.path().join(SERVICE_DIRECTORY).exists() {
+    let generation = Generation::begin(&domain)?;
+    if generation.is_first() {
+        // Later, workers still hold the generation before, and give it back one by one.
         domain.check_space(plan.required_bytes())?;
     }
-    service::write_config(domain.path())?;
-    let node = service::join(domain.path())?;
-    service::clean(&node)?;
+    let node = service::join(&generation.root)?;
     let parameters = Publisher::serve(&node, plan, learner.clone())?;
     let segments = Receiver::serve(node, plan, learner)?;
+    generation.announce()?;
     Ok(LearnerEnd { segments, parameters })
 }
 
 /// Attaches this process to the run as worker `worker_index`. Opens, never creates.
 ///
 /// # Errors
-/// `Taken` if a worker of that index lives: attach again when it has ended. `Incompatible` if the
-/// learner follows another plan. `Domain` if the directory is not a domain. `Middleware` if no
-/// learner has served it yet, and for the rest.
+/// `Taken` if a worker of that index lives, or died and the learner's `maintain` has not freed its
+/// place yet: attach again a little later. `Incompatible` if the learner follows another plan.
+/// `Domain` if the directory is not a domain. `Middleware` if no learner has served it yet, and
+/// for the rest.
 pub fn attach(
     domain: &Path,
     plan: &Plan,
     worker_index: usize,
 ) -> Result<WorkerEnd, TransportError> {
     let domain = Domain::open(domain)?;
-    let node = service::join(domain.path())?;
-    let segments = Sender::attach(&node, plan, worker_index)?;
-    let parameters = Subscriber::attach(&node, plan)?;
+    let segments = Sender::attach(&domain, plan, worker_index)?;
+    let parameters = Subscriber::attach(&domain, plan)?;
     Ok(WorkerEnd { segments, parameters })
 }
 
@@ -162,25 +159,5 @@ pub fn attach(
 /// # Errors
 /// As [`attach`].
 pub fn subscribe(domain: &Path, plan: &Plan) -> Result<Subscriber, TransportError> {
-    let domain = Domain::open(domain)?;
-    Subscriber::attach(&service::join(domain.path())?, plan)
-}
-
-/// Removes the descriptions of services whose creator died in the middle. iceoryx2 0.10 never
-/// does, and every later attempt to open one fails. Only the learner creates services and only one
-/// holds the lock, so an incomplete one is nobody's.
-fn remove_unfinished_services(domain: &Domain) -> Result<(), TransportError> {
-    let directory = domain.path().join(SERVICE_DIRECTORY);
-    let failed = || service::refused("removing unfinished services from", directory.display());
-    if !directory.exists() {
-        return Ok(());
-    }
-    for entry in directory.read_dir().map_err(failed())? {
-        let entry = entry.map_err(failed())?;
-        let mode = entry.metadata().map_err(failed())?.mode() & 0o777;
-        if mode == UNFINISHED_MODE {
-            std::fs::remove_file(entry.path()).map_err(failed())?;
-        }
-    }
-    Ok(())
+    Subscriber::attach(&Domain::open(domain)?, plan)
 }

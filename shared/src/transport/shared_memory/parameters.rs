@@ -4,14 +4,16 @@ use std::fs::File;
 use std::sync::Arc;
 
 use iceoryx2::node::Node;
-use iceoryx2::port::publisher::{Publisher as Port, PublisherCreateError};
-use iceoryx2::port::subscriber::{Subscriber as SubscriberPort, SubscriberCreateError};
+use iceoryx2::port::publisher::Publisher as Port;
+use iceoryx2::port::subscriber::SubscriberCreateError;
 use iceoryx2::port::update_connections::UpdateConnections;
 use iceoryx2::prelude::PayloadHeader;
 use iceoryx2_bb_elementary_traits::zero_copy_send::ZeroCopySend;
 
 use super::Plan;
-use super::channel::{Channel, ChannelBuilder, Disconnected, Factory, retry_cleaned};
+use super::channel::{Channel, ChannelBuilder, Disconnected, Factory};
+use super::domain::Domain;
+use super::generation::Membership;
 use super::service::{PrivateIpc, refused};
 use crate::parameters::{ParameterSnapshot, SnapshotError, checksum};
 use crate::transport::{ParameterPublisher, ParameterSubscriber, TransportError};
@@ -20,8 +22,8 @@ use crate::transport::{ParameterPublisher, ParameterSubscriber, TransportError};
 const SPARE_SUBSCRIBERS: usize = 4;
 /// Processes besides the readers, likewise.
 const SPARE_NODES: usize = 4;
-/// Snapshots taken from the channel in one call: one of this learner's, one that a learner before
-/// it left behind.
+/// Snapshots taken from the channel in one call: the newest, and one more if the learner had to
+/// make a new port.
 const SNAPSHOTS_MAX: usize = 2;
 
 /// Everything about a snapshot except its values.
@@ -90,19 +92,35 @@ impl Publisher {
                 .max_subscribers(subscribers_max)
                 .max_nodes(subscribers_max + SPARE_NODES)
         })?;
-        let (parameters_len, chunk_count) = (plan.parameters_len, chunk_count(plan.worker_count));
-        let disconnected = Disconnected::default();
-        let port = retry_cleaned(
-            node,
-            |cause| *cause == PublisherCreateError::ExceedsMaxSupportedPublishers,
-            || Ok(publisher_port(&factory, parameters_len, chunk_count, &disconnected)),
-        )?;
-        let port = Some(port.map_err(|cause| match cause {
-            PublisherCreateError::ExceedsMaxSupportedPublishers => channel.taken(cause),
-            cause => refused("making a port of", &channel.name)(cause),
-        })?);
-        let _learner = learner;
-        Ok(Self { channel, factory, port, disconnected, parameters_len, chunk_count, _learner })
+        let mut publisher = Self {
+            channel,
+            factory,
+            port: None,
+            disconnected: Disconnected::default(),
+            parameters_len: plan.parameters_len,
+            chunk_count: chunk_count(plan.worker_count),
+            _learner: learner,
+        };
+        publisher.renew()?;
+        Ok(publisher)
+    }
+
+    /// A new port, at the start and after a connection failed.
+    fn renew(&mut self) -> Result<(), TransportError> {
+        self.disconnected.clear();
+        self.port = None;
+        let chunk_count = self.chunk_count;
+        let port = self
+            .factory
+            .publisher_builder()
+            .initial_max_slice_len(self.parameters_len)
+            .max_loaned_samples(1)
+            .override_sample_preallocation(move |worst_case| worst_case.min(chunk_count))
+            .set_degradation_handler(self.disconnected.remember())
+            .create()
+            .map_err(refused("making a port of", &self.channel.name))?;
+        self.port = Some(port);
+        Ok(())
     }
 
     fn port(&self) -> Result<&Port<PrivateIpc, [f32], WireHeader>, TransportError> {
@@ -119,21 +137,6 @@ impl Publisher {
         let sent = sample.write_from_slice(values).send();
         sent.map(|_workers| ()).map_err(refused("publishing on", name))
     }
-}
-
-fn publisher_port(
-    factory: &Factory<WireHeader>,
-    parameters_len: usize,
-    chunk_count: usize,
-    disconnected: &Disconnected,
-) -> Result<Port<PrivateIpc, [f32], WireHeader>, PublisherCreateError> {
-    factory
-        .publisher_builder()
-        .initial_max_slice_len(parameters_len)
-        .max_loaned_samples(1)
-        .override_sample_preallocation(move |worst_case| worst_case.min(chunk_count))
-        .set_degradation_handler(disconnected.remember())
-        .create()
 }
 
 impl ParameterPublisher for Publisher {
@@ -156,86 +159,72 @@ impl ParameterPublisher for Publisher {
     /// new port takes over, and late joiners wait for the next snapshot.
     fn maintain(&mut self) -> Result<(), TransportError> {
         if self.disconnected.is_set() || self.port.is_none() {
-            self.disconnected.clear();
-            self.port = None;
-            let (len, count) = (self.parameters_len, self.chunk_count);
-            let port = publisher_port(&self.factory, len, count, &self.disconnected);
-            self.port = Some(port.map_err(refused("renewing the port of", &self.channel.name))?);
+            self.renew()?;
         }
         self.port()?.update_connections().map_err(refused("connecting", &self.channel.name))
     }
 }
 
+type SubscriberPort = iceoryx2::port::subscriber::Subscriber<PrivateIpc, [f32], WireHeader>;
+
 /// A reader's end of the parameter channel.
 #[derive(Debug)]
 pub struct Subscriber {
     channel: Channel,
-    factory: Factory<WireHeader>,
-    /// `None` only after a new port could not be made.
-    port: Option<SubscriberPort<PrivateIpc, [f32], WireHeader>>,
-    disconnected: Disconnected,
+    membership: Membership<SubscriberPort>,
     parameters_len: usize,
     architecture_hash: u64,
 }
 
 impl Subscriber {
-    pub(super) fn attach(node: &Node<PrivateIpc>, plan: &Plan) -> Result<Self, TransportError> {
+    pub(super) fn attach(domain: &Domain, plan: &Plan) -> Result<Self, TransportError> {
         let channel = channel(plan);
-        let factory = channel.open(node)?;
-        let disconnected = Disconnected::default();
-        let port = retry_cleaned(
-            node,
-            |cause| *cause == SubscriberCreateError::ExceedsMaxSupportedSubscribers,
-            || Ok(subscriber_port(&factory, &disconnected)),
-        )?;
-        let port = Some(port.map_err(|cause| match cause {
-            SubscriberCreateError::ExceedsMaxSupportedSubscribers => channel.taken(cause),
-            cause => refused("making a port of", &channel.name)(cause),
-        })?);
+        let membership =
+            Membership::new(domain, |node, disconnected| subscribe(&channel, node, disconnected))?;
         let Plan { parameters_len, architecture_hash, .. } = *plan;
-        Ok(Self { channel, factory, port, disconnected, parameters_len, architecture_hash })
-    }
-
-    /// A new port after a connection failed; it gets the newest snapshot once more.
-    fn renew(&mut self) -> Result<(), TransportError> {
-        if self.disconnected.is_set() || self.port.is_none() {
-            self.disconnected.clear();
-            self.port = None;
-            let port = subscriber_port(&self.factory, &self.disconnected);
-            self.port = Some(port.map_err(refused("renewing the port of", &self.channel.name))?);
-        }
-        Ok(())
-    }
-
-    fn check(&self, header: &WireHeader, values: &[f32]) -> Result<(), SnapshotError> {
-        let WireHeader { version, env_steps, architecture_hash, .. } = *header;
-        let (expected, got) = (self.architecture_hash, architecture_hash);
-        if got != expected {
-            return Err(SnapshotError::Architecture { version, expected, got });
-        }
-        let expected = header.checksum;
-        let got = checksum(version, env_steps, architecture_hash, values);
-        if got != expected {
-            return Err(SnapshotError::Checksum { version, expected, got });
-        }
-        Ok(())
+        Ok(Self { channel, membership, parameters_len, architecture_hash })
     }
 }
 
-fn subscriber_port(
-    factory: &Factory<WireHeader>,
+fn subscribe(
+    channel: &Channel,
+    node: &Node<PrivateIpc>,
     disconnected: &Disconnected,
-) -> Result<SubscriberPort<PrivateIpc, [f32], WireHeader>, SubscriberCreateError> {
-    factory.subscriber_builder().set_degradation_handler(disconnected.remember()).create()
+) -> Result<SubscriberPort, TransportError> {
+    let port = channel
+        .open(node)?
+        .subscriber_builder()
+        .set_degradation_handler(disconnected.remember())
+        .create();
+    port.map_err(|cause| match cause {
+        SubscriberCreateError::ExceedsMaxSupportedSubscribers => channel.taken(cause),
+        cause => refused("making a port of", &channel.name)(cause),
+    })
+}
+
+/// Refuses a snapshot that is foreign or damaged.
+fn check(header: &WireHeader, values: &[f32], architecture_hash: u64) -> Result<(), SnapshotError> {
+    let version = header.version;
+    let (expected, got) = (architecture_hash, header.architecture_hash);
+    if got != expected {
+        return Err(SnapshotError::Architecture { version, expected, got });
+    }
+    let expected = header.checksum;
+    let got = checksum(version, header.env_steps, header.architecture_hash, values);
+    if got != expected {
+        return Err(SnapshotError::Checksum { version, expected, got });
+    }
+    Ok(())
 }
 
 impl ParameterSubscriber for Subscriber {
     fn newest(&mut self, snapshot: &mut ParameterSnapshot) -> Result<bool, TransportError> {
-        self.renew()?;
-        let Some(port) = &self.port else { return Ok(false) };
+        let Self { channel, membership, .. } = self;
+        let port = membership.port(|node, disconnected| subscribe(channel, node, disconnected))?;
+        let Some(port) = port else { return Ok(false) };
         let mut replaced = false;
         for _ in 0..SNAPSHOTS_MAX {
-            let received = port.receive().map_err(refused("receiving from", &self.channel.name))?;
+            let received = port.receive().map_err(refused("receiving from", &channel.name))?;
             let Some(sample) = received else { break };
             // The length is the peer's word: believed only if it is the agreed one.
             let got = usize::try_from(sample.header().number_of_elements()).unwrap_or(usize::MAX);
@@ -246,7 +235,7 @@ impl ParameterSubscriber for Subscriber {
             if header.version <= snapshot.version {
                 continue;
             }
-            self.check(&header, sample.payload())?;
+            check(&header, sample.payload(), self.architecture_hash)?;
             snapshot.version = header.version;
             snapshot.env_steps = header.env_steps;
             snapshot.architecture_hash = header.architecture_hash;

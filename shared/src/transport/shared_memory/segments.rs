@@ -8,13 +8,15 @@ use std::sync::Arc;
 
 use iceoryx2::node::Node;
 use iceoryx2::port::publisher::{Publisher as Port, PublisherCreateError};
-use iceoryx2::port::subscriber::{Subscriber, SubscriberCreateError};
+use iceoryx2::port::subscriber::Subscriber;
 use iceoryx2::port::{BackpressureAction, BackpressureInfo, SendError};
 use iceoryx2::prelude::PayloadHeader;
 use iceoryx2_bb_elementary_traits::zero_copy_send::ZeroCopySend;
 
 use super::Plan;
-use super::channel::{Channel, ChannelBuilder, Disconnected, Factory, retry_cleaned};
+use super::channel::{Channel, ChannelBuilder, Disconnected, Factory};
+use super::domain::Domain;
+use super::generation::Membership;
 use super::service::{PrivateIpc, clean, refused};
 use crate::segment::{LAYOUT_VERSION, Segment, SegmentHeader};
 use crate::transport::{SegmentReceiver, SegmentSender, SendOutcome, TransportError};
@@ -25,6 +27,9 @@ const TURN_SEGMENTS: usize = 8;
 /// Processes that may hold one worker's service open at once: learner, worker, and the dead whose
 /// places are not cleaned up yet.
 const NODES_MAX: usize = 8;
+/// Cleanups that may fail in a row before the caller is told. One is normal: a worker that starts
+/// or ends in that moment hides the ones behind it.
+const CLEAN_FAILURES_MAX: usize = 20;
 /// The learner copies a segment out and gives it back at once; a worker fills one at a time.
 const BORROWED_MAX: usize = 1;
 
@@ -57,64 +62,51 @@ fn channel(plan: &Plan, worker_index: usize) -> Channel {
     Channel { name: format!("segments/{worker_index}"), agreement }
 }
 
+type SenderPort = Port<PrivateIpc, [f32], WireHeader>;
+type ReceiverPort = Subscriber<PrivateIpc, [f32], WireHeader>;
+
 /// A worker's end of its queue.
 #[derive(Debug)]
 pub struct Sender {
     channel: Channel,
-    factory: Factory<WireHeader>,
-    /// `None` only after a new port could not be made.
-    port: Option<Port<PrivateIpc, [f32], WireHeader>>,
-    disconnected: Disconnected,
+    membership: Membership<SenderPort>,
     block_len: usize,
 }
 
 impl Sender {
     pub(super) fn attach(
-        node: &Node<PrivateIpc>,
+        domain: &Domain,
         plan: &Plan,
         worker_index: usize,
     ) -> Result<Self, TransportError> {
         let channel = channel(plan, worker_index);
-        let factory = channel.open(node)?;
-        let disconnected = Disconnected::default();
         let block_len = plan.layout.block_len();
-        let port = retry_cleaned(
-            node,
-            |cause| *cause == PublisherCreateError::ExceedsMaxSupportedPublishers,
-            || Ok(publish(&factory, block_len, &disconnected)),
-        )?;
-        let port = Some(port.map_err(|cause| match cause {
-            PublisherCreateError::ExceedsMaxSupportedPublishers => channel.taken(cause),
-            cause => refused("making a port of", &channel.name)(cause),
-        })?);
-        Ok(Self { channel, factory, port, disconnected, block_len })
-    }
-
-    /// The port; a new one after a connection failed. Queued segments survive the old one.
-    fn port(&mut self) -> Result<&Port<PrivateIpc, [f32], WireHeader>, TransportError> {
-        if self.disconnected.is_set() || self.port.is_none() {
-            self.disconnected.clear();
-            self.port = None;
-            let port = publish(&self.factory, self.block_len, &self.disconnected);
-            self.port = Some(port.map_err(refused("renewing the port of", &self.channel.name))?);
-        }
-        self.port.as_ref().ok_or_else(|| refused("sending to", &self.channel.name)("no port"))
+        let membership = Membership::new(domain, |node, disconnected| {
+            publish(&channel, node, block_len, disconnected)
+        })?;
+        Ok(Self { channel, membership, block_len })
     }
 }
 
 fn publish(
-    factory: &Factory<WireHeader>,
+    channel: &Channel,
+    node: &Node<PrivateIpc>,
     block_len: usize,
     disconnected: &Disconnected,
-) -> Result<Port<PrivateIpc, [f32], WireHeader>, PublisherCreateError> {
-    factory
+) -> Result<SenderPort, TransportError> {
+    let port = channel
+        .open(node)?
         .publisher_builder()
         .initial_max_slice_len(block_len)
         .max_loaned_samples(1)
         // Without it a full queue is waited for, for ever if the learner is dead.
         .set_backpressure_handler(|_: &BackpressureInfo| BackpressureAction::DiscardDataAndFail)
         .set_degradation_handler(disconnected.remember())
-        .create()
+        .create();
+    port.map_err(|cause| match cause {
+        PublisherCreateError::ExceedsMaxSupportedPublishers => channel.taken(cause),
+        cause => refused("making a port of", &channel.name)(cause),
+    })
 }
 
 impl SegmentSender for Sender {
@@ -126,7 +118,10 @@ impl SegmentSender for Sender {
         if block.len() != self.block_len {
             return Err(TransportError::Length { expected: self.block_len, got: block.len() });
         }
-        let port = self.port()?;
+        let Self { channel, membership, block_len } = self;
+        let port = membership
+            .port(|node, disconnected| publish(channel, node, *block_len, disconnected))?;
+        let Some(port) = port else { return Ok(SendOutcome::Detached) };
         let sent = port.loan_slice_uninit(block.len()).map(|mut sample| {
             *sample.user_header_mut() = WireHeader(*header);
             sample.write_from_slice(block).send()
@@ -136,8 +131,8 @@ impl SegmentSender for Sender {
             Ok(Ok(0)) => Ok(SendOutcome::Detached),
             Ok(Ok(_)) => Ok(SendOutcome::Delivered),
             Ok(Err(SendError::UnableToDeliver)) => Ok(SendOutcome::Full),
-            Ok(Err(cause)) => Err(refused("sending to", &self.channel.name)(cause)),
-            Err(cause) => Err(refused("sending to", &self.channel.name)(cause)),
+            Ok(Err(cause)) => Err(refused("sending to", &channel.name)(cause)),
+            Err(cause) => Err(refused("sending to", &channel.name)(cause)),
         }
     }
 }
@@ -148,7 +143,7 @@ struct Slot {
     channel: Channel,
     factory: Factory<WireHeader>,
     /// `None` only after a new port could not be made.
-    port: Option<Subscriber<PrivateIpc, [f32], WireHeader>>,
+    port: Option<ReceiverPort>,
     disconnected: Disconnected,
 }
 
@@ -160,6 +155,7 @@ pub struct Receiver {
     turn_left: usize,
     block_len: usize,
     node: Node<PrivateIpc>,
+    clean_failures: usize,
     /// Says to a second learner that there is one. Last: given up after the ports.
     _learner: Arc<File>,
 }
@@ -173,7 +169,16 @@ impl Receiver {
         let slots = (0..plan.worker_count).map(|index| Slot::serve(&node, plan, index));
         let slots = slots.collect::<Result<Vec<_>, _>>()?;
         let block_len = plan.layout.block_len();
-        Ok(Self { slots, next: 0, turn_left: TURN_SEGMENTS, block_len, node, _learner: learner })
+        let turn_left = TURN_SEGMENTS;
+        Ok(Self {
+            slots,
+            next: 0,
+            turn_left,
+            block_len,
+            node,
+            clean_failures: 0,
+            _learner: learner,
+        })
     }
 
     fn pass_turn(&mut self) {
@@ -200,15 +205,7 @@ impl Slot {
                 .max_nodes(NODES_MAX)
         })?;
         let disconnected = Disconnected::default();
-        let port = retry_cleaned(
-            node,
-            |cause| *cause == SubscriberCreateError::ExceedsMaxSupportedSubscribers,
-            || Ok(subscribe(&factory, &disconnected)),
-        )?;
-        let port = Some(port.map_err(|cause| match cause {
-            SubscriberCreateError::ExceedsMaxSupportedSubscribers => channel.taken(cause),
-            cause => refused("making a port of", &channel.name)(cause),
-        })?);
+        let port = Some(subscribe(&channel, &factory, &disconnected)?);
         Ok(Self { channel, factory, port, disconnected })
     }
 
@@ -229,24 +226,28 @@ impl Slot {
 
     /// Makes a new port after a connection failed, unless segments still wait at the old one.
     fn renew(&mut self) -> Result<(), TransportError> {
-        let waiting = |port: &Subscriber<_, _, _>| port.has_samples().unwrap_or(false);
+        let waiting = |port: &ReceiverPort| port.has_samples().unwrap_or(false);
         let needed = self.disconnected.is_set() || self.port.is_none();
         if !needed || self.port.as_ref().is_some_and(waiting) {
             return Ok(());
         }
         self.disconnected.clear();
         self.port = None;
-        let port = subscribe(&self.factory, &self.disconnected);
-        self.port = Some(port.map_err(refused("renewing the port of", &self.channel.name))?);
+        self.port = Some(subscribe(&self.channel, &self.factory, &self.disconnected)?);
         Ok(())
     }
 }
 
 fn subscribe(
+    channel: &Channel,
     factory: &Factory<WireHeader>,
     disconnected: &Disconnected,
-) -> Result<Subscriber<PrivateIpc, [f32], WireHeader>, SubscriberCreateError> {
-    factory.subscriber_builder().set_degradation_handler(disconnected.remember()).create()
+) -> Result<ReceiverPort, TransportError> {
+    factory
+        .subscriber_builder()
+        .set_degradation_handler(disconnected.remember())
+        .create()
+        .map_err(refused("making a port of", &channel.name))
 }
 
 impl SegmentReceiver for Receiver {
@@ -265,7 +266,11 @@ impl SegmentReceiver for Receiver {
     }
 
     fn maintain(&mut self) -> Result<(), TransportError> {
-        clean(&self.node)?;
+        match clean(&self.node) {
+            Ok(()) => self.clean_failures = 0,
+            Err(error) if self.clean_failures >= CLEAN_FAILURES_MAX => return Err(error),
+            Err(_) => self.clean_failures += 1,
+        }
         self.slots.iter_mut().try_for_each(Slot::renew)
     }
 }

@@ -9,9 +9,10 @@ use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::path::Path;
 
 use iceoryx2::config::Config;
-use iceoryx2::node::{Node, NodeBuilder};
+use iceoryx2::node::{Node, NodeBuilder, NodeState};
 use iceoryx2::prelude::{
-    FileName, FilePath, LogLevel, SemanticString, ServiceName, SignalHandlingMode, set_log_level,
+    CallbackProgression, FileName, FilePath, LogLevel, SemanticString, ServiceName,
+    SignalHandlingMode, set_log_level,
 };
 use iceoryx2::service::Service;
 use iceoryx2_bb_elementary_traits::testing::abandonable::Abandonable;
@@ -30,10 +31,6 @@ use crate::transport::TransportError;
 pub(super) const PREFIX: &str = "d_";
 /// The configuration that the learner writes and every process of the run reads.
 const CONFIG_FILE: &str = "iceoryx2.toml";
-/// How often a port or service that a dead process still occupies is asked for again, each time
-/// after cleaning up after the dead.
-pub(super) const CLEAN_ATTEMPTS: usize = 3;
-
 /// The service variant; ports are mutex-protected so that an end may move to another thread.
 #[derive(Debug, Clone)]
 pub(super) struct PrivateIpc {}
@@ -80,41 +77,38 @@ pub(super) fn service_name(name: &str) -> Result<ServiceName, TransportError> {
     name.try_into().map_err(refused("naming a service", name))
 }
 
-/// Writes the run's iceoryx2 configuration into its directory.
+/// Writes the iceoryx2 configuration of `root` into it.
 ///
 /// A file, because iceoryx2 takes its process-wide configuration from nothing else, and without
 /// one the cleanup of a half-started dead process would look below iceoryx2's default paths.
-pub(super) fn write_config(domain: &Path) -> Result<(), TransportError> {
+pub(super) fn write_config(root: &Path) -> Result<(), TransportError> {
     let operation = "writing the configuration";
-    let root = iceoryx2::prelude::Path::new(domain.as_os_str().as_encoded_bytes())
-        .map_err(refused(operation, domain.display()))?;
+    let root_path = iceoryx2::prelude::Path::new(root.as_os_str().as_encoded_bytes())
+        .map_err(refused(operation, root.display()))?;
     let mut config = Config::default();
-    config.global.set_root_path(&root);
+    config.global.set_root_path(&root_path);
     config.global.prefix =
-        FileName::new(PREFIX.as_bytes()).map_err(refused(operation, domain.display()))?;
-    // Cleaning up after the dead happens where this folder says so and nowhere else: concurrent
-    // cleanups are where iceoryx2's known bugs are.
+        FileName::new(PREFIX.as_bytes()).map_err(refused(operation, root.display()))?;
+    // Only the learner cleans up after the dead, and only in `clean`: concurrent cleanups are where
+    // iceoryx2's known bugs are, and a cleaner killed in the middle loses places for good.
     config.global.node.cleanup_dead_nodes_on_creation = false;
     config.global.node.cleanup_dead_nodes_on_destruction = false;
     config.global.service.cleanup_dead_nodes_on_open = false;
-    let text = toml::to_string(&config).map_err(refused(operation, domain.display()))?;
-    let file = domain.join(CONFIG_FILE);
-    let fresh = file.with_extension("toml.new");
-    std::fs::write(&fresh, text)
-        .and_then(|()| std::fs::rename(&fresh, &file))
-        .map_err(refused(operation, file.display()))
+    let text = toml::to_string(&config).map_err(refused(operation, root.display()))?;
+    let file = root.join(CONFIG_FILE);
+    std::fs::write(&file, text).map_err(refused(operation, file.display()))
 }
 
-/// Joins the run: reads its configuration and registers this process as one of its nodes.
-pub(super) fn join(domain: &Path) -> Result<Node<PrivateIpc>, TransportError> {
+/// Registers this process as a node below `root`.
+pub(super) fn join(root: &Path) -> Result<Node<PrivateIpc>, TransportError> {
     // Failures come back as errors. The log repeats them, and speaks of every dead peer.
     set_log_level(LogLevel::Fatal);
-    let file = domain.join(CONFIG_FILE);
+    let file = root.join(CONFIG_FILE);
     let path = FilePath::new(file.as_os_str().as_encoded_bytes())
         .map_err(refused("reading the configuration", file.display()))?;
     let config =
         Config::from_file(&path).map_err(refused("reading the configuration", file.display()))?;
-    // The first run of a process decides. It only serves the cleanup of processes that died
+    // The first root of a process decides. It only serves the cleanup of processes that died
     // before they had written which configuration they use.
     Config::setup_global_config_from_file(&path)
         .map_err(refused("reading the configuration", file.display()))?;
@@ -122,22 +116,26 @@ pub(super) fn join(domain: &Path) -> Result<Node<PrivateIpc>, TransportError> {
         .config(&config)
         .signal_handling_mode(SignalHandlingMode::Disabled)
         .create::<PrivateIpc>()
-        .map_err(refused("joining the run", domain.display()))
+        .map_err(refused("joining", root.display()))
 }
 
-/// Frees what dead processes of the run left behind.
+/// Frees what dead processes below the node's root left behind.
 ///
-/// iceoryx2 0.10 panics when two processes clean at once and one finds a "dead" node alive
-/// (issue 1880): the panic becomes an error here, and the next call tries again.
+/// iceoryx2 0.10 panics when it finds a "dead" node alive after all (issue 1880): the panic
+/// becomes an error here, and the next call tries again.
 pub(super) fn clean(node: &Node<PrivateIpc>) -> Result<(), TransportError> {
-    match catch_unwind(AssertUnwindSafe(|| node.try_cleanup_dead_nodes())) {
-        // A failed cleanup of one node is another process at the same work, or is tried again by
-        // the next call.
-        Ok(_) => Ok(()),
-        Err(_) => Err(TransportError::Middleware {
-            operation: "cleaning up after dead processes",
-            name: node.id().to_string(),
-            cause: "iceoryx2 panicked".to_owned(),
-        }),
+    let operation = "cleaning up after dead processes";
+    let cleaned = catch_unwind(AssertUnwindSafe(|| {
+        Node::<PrivateIpc>::list(node.config(), |state| {
+            if let NodeState::Dead(dead) = state {
+                // What could not be removed is found again by the next call.
+                let _ = dead.try_remove_stale_resources();
+            }
+            CallbackProgression::Continue
+        })
+    }));
+    match cleaned {
+        Ok(listed) => listed.map_err(refused(operation, node.config().global.root_path())),
+        Err(_) => Err(refused(operation, node.config().global.root_path())("iceoryx2 panicked")),
     }
 }
