@@ -25,20 +25,21 @@ const WORKERS: usize = 2;
 fn another_process_plays_its_role() {
     let Some((role, domain, incarnation)) = role() else { return };
     match role.as_str() {
-        "worker" => play_worker(&domain, incarnation),
+        "worker" => play_worker(&domain, 0, incarnation),
+        "other worker" => play_worker(&domain, 1, incarnation),
         "learner" => play_learner(&domain, incarnation),
         other => panic!("role {other}"),
     }
 }
 
 /// Attaches as soon as it can, as its caller would, and sends for ever.
-fn play_worker(domain: &Path, incarnation: u32) {
+fn play_worker(domain: &Path, index: usize, incarnation: u32) {
     let plan = plan(WORKERS, QUEUE_SEGMENTS);
-    let mut worker = eventually("the worker attaches", || attach(domain, &plan, 0).ok());
+    let mut worker = eventually("the worker attaches", || attach(domain, &plan, index).ok());
     let mut block = vec![0.0; LAYOUT.block_len()];
     for sequence in 1.. {
         fill(&mut block, sequence);
-        let header = header(0, incarnation, sequence);
+        let header = header(index as u32, incarnation, sequence);
         while worker.segments.try_send(&header, &block).unwrap() != SendOutcome::Delivered {
             std::thread::sleep(Duration::from_micros(50));
         }
@@ -63,12 +64,13 @@ fn play_learner(domain: &Path, incarnation: u32) {
 }
 
 /// Takes one segment if there is one, and checks that its worker's sequence has no gap.
-fn take(learner: &mut LearnerEnd, last: &mut (u32, u64)) -> bool {
+fn take(learner: &mut LearnerEnd, last: &mut [(u32, u64); WORKERS]) -> bool {
     let mut segment = Segment::zeroed(LAYOUT);
     if !learner.segments.try_receive(&mut segment).unwrap() {
         return false;
     }
     assert_whole(&segment);
+    let last = &mut last[segment.header.worker_id as usize];
     let (incarnation, sequence) = (segment.header.incarnation, segment.header.sequence);
     let expected = if incarnation == last.0 { last.1 + 1 } else { 1 };
     assert!(incarnation >= last.0, "incarnation {incarnation} after {}", last.0);
@@ -83,21 +85,21 @@ fn a_killed_worker_loses_nothing_delivered_and_its_successor_continues() {
     let parent = Parent::new();
     let domain = parent.domain("run");
     let mut learner = serve(domain.path(), &plan(WORKERS, QUEUE_SEGMENTS)).unwrap();
-    let mut last = (0, 0);
+    let mut last = [(0, 0); WORKERS];
     for incarnation in 1..=ROUNDS {
         let mut worker = Process::start(ENTRY, "worker", domain.path(), incarnation);
         let enough = u64::from(incarnation) * 100;
         eventually("segments of this incarnation arrive", || {
             learner.segments.maintain().unwrap();
-            while last != (incarnation, enough) && take(&mut learner, &mut last) {}
-            (last == (incarnation, enough)).then_some(())
+            while last[0] != (incarnation, enough) && take(&mut learner, &mut last) {}
+            (last[0] == (incarnation, enough)).then_some(())
         });
         worker.assert_alive();
         worker.kill();
     }
     let before = last;
     while take(&mut learner, &mut last) {}
-    assert!(last.1 - before.1 <= QUEUE_SEGMENTS as u64);
+    assert!(last[0].1 - before[0].1 <= QUEUE_SEGMENTS as u64);
     learner.segments.maintain().unwrap();
 }
 
@@ -107,7 +109,7 @@ fn workers_killed_while_they_start_block_nobody() {
     let parent = Parent::new();
     let domain = parent.domain("run");
     let mut learner = serve(domain.path(), &plan(WORKERS, QUEUE_SEGMENTS)).unwrap();
-    let mut last = (0, 0);
+    let mut last = [(0, 0); WORKERS];
     for kill in 1..=KILLS {
         let mut worker = Process::start(ENTRY, "worker", domain.path(), kill);
         // The moment is the fault that is injected, not what the test relies on.
@@ -119,9 +121,31 @@ fn workers_killed_while_they_start_block_nobody() {
     let _worker = Process::start(ENTRY, "worker", domain.path(), KILLS + 1);
     eventually("a whole worker's segments arrive", || {
         learner.segments.maintain().unwrap();
-        while last.1 < 1000 && take(&mut learner, &mut last) {}
-        (last.0 == KILLS + 1 && last.1 >= 1000).then_some(())
+        while last[0].1 < 1000 && take(&mut learner, &mut last) {}
+        (last[0].0 == KILLS + 1 && last[0].1 >= 1000).then_some(())
     });
+}
+
+/// Workers that start and die all the time beside one that must not notice.
+#[test]
+fn a_worker_is_not_disturbed_by_the_deaths_of_others() {
+    const KILLS: u32 = 60;
+    let parent = Parent::new();
+    let domain = parent.domain("run");
+    let mut learner = serve(domain.path(), &plan(WORKERS, QUEUE_SEGMENTS)).unwrap();
+    let mut steady = Process::start(ENTRY, "worker", domain.path(), 1);
+    let mut last = [(0, 0); WORKERS];
+    for kill in 1..=KILLS {
+        let mut other = Process::start(ENTRY, "other worker", domain.path(), kill);
+        let enough = last[0].1 + 50 * u64::from(kill % 5);
+        eventually("the steady worker's segments arrive", || {
+            learner.segments.maintain().unwrap();
+            while last[0].1 < enough.max(1) && take(&mut learner, &mut last) {}
+            (last[0].1 >= enough.max(1)).then_some(())
+        });
+        other.kill();
+    }
+    steady.assert_alive();
 }
 
 fn offer(worker: &mut WorkerEnd, sequence: &mut u64) -> SendOutcome {
@@ -181,7 +205,7 @@ fn learners_killed_while_they_start_leave_nothing_that_hangs() {
     let mut learner = serve(domain.path(), &plan).unwrap();
     let mut worker = attach(domain.path(), &plan, 0).unwrap();
     assert_eq!(offer(&mut worker, &mut 0), SendOutcome::Delivered);
-    assert!(take(&mut learner, &mut (1, 0)));
+    assert!(take(&mut learner, &mut [(1, 0); WORKERS]));
 }
 
 /// As above, while a worker holds the services: they must survive.

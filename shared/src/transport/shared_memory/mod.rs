@@ -97,7 +97,8 @@ pub fn required_bytes(
     u64::try_from(bytes.saturating_add(services)).unwrap_or(u64::MAX)
 }
 
-/// What the learner holds. Its parts may live on different threads.
+/// What the learner holds. Its parts may live on different threads; no worker can attach any more
+/// once one of them is dropped.
 #[derive(Debug)]
 pub struct LearnerEnd {
     /// Takes segments from all workers.

@@ -246,3 +246,51 @@ impl ParameterSubscriber for Subscriber {
         Ok(replaced)
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::segment::SegmentLayout;
+    use crate::transport::shared_memory::{Domain, serve, subscribe};
+
+    #[test]
+    fn a_damaged_snapshot_is_refused_and_changes_nothing() {
+        let directory = tempfile::tempdir().unwrap();
+        let domain = Domain::create(&directory.path().join("p"), "run").unwrap();
+        let plan = Plan {
+            run_id: 1,
+            architecture_hash: 2,
+            layout: SegmentLayout { segment_steps: 1, observation_len: 1, action_len: 1 },
+            worker_count: 1,
+            queue_segments: 1,
+            parameters_len: 3,
+        };
+        let mut learner = serve(domain.path(), &plan).unwrap();
+        let mut subscriber = subscribe(domain.path(), &plan).unwrap();
+        let sound = ParameterSnapshot {
+            version: 1,
+            env_steps: 10,
+            architecture_hash: 2,
+            values: vec![1.0, 2.0, 3.0],
+        };
+        learner.parameters.publish(&sound).unwrap();
+        let mut taken = ParameterSnapshot::default();
+        assert!(subscriber.newest(&mut taken).unwrap());
+        let header = WireHeader {
+            version: 2,
+            env_steps: 20,
+            architecture_hash: 2,
+            checksum: checksum(2, 20, 2, &[1.0, 2.0, 3.0]),
+            reserved: 0,
+        };
+        learner.parameters.send(header, &[1.0, 2.0, 4.0]).unwrap();
+        let refusal = subscriber.newest(&mut taken).unwrap_err();
+        let TransportError::Snapshot(SnapshotError::Checksum { version, expected, got }) = refusal
+        else {
+            panic!("{refusal}");
+        };
+        assert_eq!((version, expected), (2, header.checksum));
+        assert_ne!(got, expected);
+        assert_eq!(taken, sound);
+    }
+}

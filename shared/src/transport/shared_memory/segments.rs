@@ -274,3 +274,45 @@ impl SegmentReceiver for Receiver {
         self.slots.iter_mut().try_for_each(Slot::renew)
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use crate::segment::{Segment, SegmentHeader, SegmentLayout};
+    use crate::transport::shared_memory::{Domain, Plan, attach, serve};
+    use crate::transport::{SegmentReceiver, SegmentSender, SendOutcome, TransportError};
+
+    #[test]
+    fn a_segment_whose_length_the_peer_got_wrong_is_refused_before_it_is_read() {
+        let directory = tempfile::tempdir().unwrap();
+        let domain = Domain::create(&directory.path().join("p"), "run").unwrap();
+        let layout = SegmentLayout { segment_steps: 5, observation_len: 3, action_len: 2 };
+        let plan = Plan {
+            run_id: 1,
+            architecture_hash: 2,
+            layout,
+            worker_count: 1,
+            queue_segments: 4,
+            parameters_len: 1,
+        };
+        let mut learner = serve(domain.path(), &plan).unwrap();
+        let mut worker = attach(domain.path(), &plan, 0).unwrap().segments;
+        let len = layout.block_len();
+        let block = vec![1.0; len];
+        let send = |worker: &mut super::Sender, len: usize| {
+            worker.block_len = len;
+            let sent = worker.try_send(&SegmentHeader::default(), &block[..len]).unwrap();
+            assert_eq!(sent, SendOutcome::Delivered);
+        };
+        send(&mut worker, len - 1);
+        send(&mut worker, len);
+        let mut segment = Segment::zeroed(layout);
+        let refusal = learner.segments.try_receive(&mut segment).unwrap_err();
+        assert!(
+            matches!(refusal, TransportError::Length { expected, got } if (expected, got) == (len, len - 1)),
+            "{refusal}"
+        );
+        assert_eq!(segment, Segment::zeroed(layout));
+        assert!(learner.segments.try_receive(&mut segment).unwrap());
+        assert_eq!(segment.block, block);
+    }
+}

@@ -68,8 +68,11 @@ pub(super) fn refused<E: Display>(
     operation: &'static str,
     name: impl Display,
 ) -> impl FnOnce(E) -> TransportError {
-    let name = name.to_string();
-    move |cause| TransportError::Middleware { operation, name, cause: cause.to_string() }
+    move |cause| TransportError::Middleware {
+        operation,
+        name: name.to_string(),
+        cause: cause.to_string(),
+    }
 }
 
 /// A service name, checked.
