@@ -307,10 +307,8 @@ mod tests {
         send(&mut worker, len);
         let mut segment = Segment::zeroed(layout);
         let refusal = learner.segments.try_receive(&mut segment).unwrap_err();
-        assert!(
-            matches!(refusal, TransportError::Length { expected, got } if (expected, got) == (len, len - 1)),
-            "{refusal}"
-        );
+        let TransportError::Length { expected, got } = refusal else { panic!("{refusal}") };
+        assert_eq!((expected, got), (len, len - 1));
         assert_eq!(segment, Segment::zeroed(layout));
         assert!(learner.segments.try_receive(&mut segment).unwrap());
         assert_eq!(segment.block, block);
