@@ -131,6 +131,10 @@ impl ParameterPublisher for Publisher {
         lock(&self.0).clone_from(snapshot);
         Ok(())
     }
+
+    fn maintain(&mut self) -> Result<(), TransportError> {
+        Ok(())
+    }
 }
 
 impl ParameterSubscriber for Subscriber {

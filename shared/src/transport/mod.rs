@@ -44,14 +44,25 @@ pub enum TransportError {
         /// What differs.
         cause: String,
     },
-    /// A segment of the wrong length was offered.
-    #[error("segment block has {got} numbers, this queue carries {expected}")]
+    /// The place belongs to a live process, or to one that is just being cleaned up after.
+    #[error("{name} is taken ({cause}): try again when the process that holds it has ended")]
+    Taken {
+        /// Service.
+        name: String,
+        /// The middleware's own words.
+        cause: String,
+    },
+    /// A segment or a snapshot of the wrong length was offered, or received.
+    #[error("{got} numbers, this channel carries {expected}")]
     Length {
-        /// Length the queue was made for.
+        /// Length the channel was made for.
         expected: usize,
-        /// Length offered.
+        /// Length offered or received.
         got: usize,
     },
+    /// The run's shared-memory directory is not usable.
+    #[error(transparent)]
+    Domain(#[from] shared_memory::DomainError),
     /// A damaged or foreign snapshot.
     #[error(transparent)]
     Snapshot(#[from] SnapshotError),
@@ -90,8 +101,15 @@ pub trait ParameterPublisher {
     /// Publishes a snapshot to all workers, and to those that join later.
     ///
     /// # Errors
-    /// `Middleware` if publishing failed.
+    /// `Length` if it does not fit, `Middleware` if publishing failed.
     fn publish(&mut self, snapshot: &ParameterSnapshot) -> Result<(), TransportError>;
+
+    /// Hands the newest snapshot to workers that have joined since; to be called a few times a
+    /// second.
+    ///
+    /// # Errors
+    /// `Middleware` if the channel is broken.
+    fn maintain(&mut self) -> Result<(), TransportError>;
 }
 
 /// A worker's end of the parameter channel.

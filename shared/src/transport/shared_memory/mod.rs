@@ -1,1 +1,164 @@
-//! iceoryx2.
+//! Segments and snapshots between processes of one host, over iceoryx2.
+//!
+//! `domain` is the run's directory and `generation` the part of it that belongs to one learner,
+//! `service` and `channel` tame the middleware, `segments` and `parameters` implement the traits.
+//! iceoryx2 is named nowhere else.
+//!
+//! What holds when processes die:
+//! - A worker never creates a service and never cleans up, so one killed in the middle blocks
+//!   nobody. Its queued segments are still delivered; the learner's `maintain` frees its place.
+//! - A dead learner's queues are lost: `Delivered` promises no more than the queue. Workers see
+//!   `Full` or `Detached` until the next learner serves the same domain, then follow it.
+//! - A new learner inherits nothing from the one before: whatever that left half-made is removed.
+
+mod channel;
+mod domain;
+mod generation;
+mod parameters;
+mod segments;
+mod service;
+
+use std::path::Path;
+use std::sync::Arc;
+
+pub use domain::{Domain, DomainError, remove_abandoned};
+use generation::Generation;
+use iceoryx2::service::header::publish_subscribe::Header;
+pub use parameters::{Publisher, Subscriber};
+pub use segments::{Receiver, Sender};
+
+use super::TransportError;
+use crate::segment::SegmentLayout;
+
+/// Version of what the processes of a run say to each other; others are refused.
+const PROTOCOL: u32 = 1;
+/// Locked by the learner as long as it lives.
+const LEARNER_LOCK: &str = "learner.lock";
+/// Queues, registries and descriptions of one service, besides its chunks [bytes]. Measured: see
+/// the test `the_space_asked_for_covers_what_is_used`.
+const SERVICE_BYTES: usize = 64 * 1024;
+/// The same for each segment of a queue's capacity [bytes].
+const QUEUE_ENTRY_BYTES: usize = 64;
+
+/// What learner and workers of a run agree on.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Plan {
+    /// Another run's workers are refused.
+    pub run_id: u64,
+    /// Another architecture's workers are refused.
+    pub architecture_hash: u64,
+    /// Sizes of a segment.
+    pub layout: SegmentLayout,
+    /// Worker slots, each with a queue of its own.
+    pub worker_count: usize,
+    /// Segments that fit into one worker's queue.
+    pub queue_segments: usize,
+    /// Length of a snapshot's values.
+    pub parameters_len: usize,
+}
+
+impl Plan {
+    fn identity(&self) -> Vec<(&'static str, String)> {
+        vec![
+            ("protocol", PROTOCOL.to_string()),
+            ("run_id", format!("{:#018x}", self.run_id)),
+            ("architecture_hash", format!("{:#018x}", self.architecture_hash)),
+        ]
+    }
+
+    /// Shared memory that the run may use at most [bytes].
+    #[must_use]
+    pub fn required_bytes(&self) -> u64 {
+        let Self { worker_count, queue_segments, layout, parameters_len, .. } = *self;
+        required_bytes(worker_count, queue_segments, layout, parameters_len)
+    }
+}
+
+/// Shared memory that a run may use at most [bytes].
+#[must_use]
+pub fn required_bytes(
+    worker_count: usize,
+    queue_segments: usize,
+    layout: SegmentLayout,
+    parameters_len: usize,
+) -> u64 {
+    let chunk = |header: usize, len: usize| {
+        len.saturating_mul(size_of::<f32>()).saturating_add(size_of::<Header>() + header)
+    };
+    let segment = chunk(size_of::<segments::WireHeader>(), layout.block_len());
+    let queue = segments::chunk_count(queue_segments)
+        .saturating_mul(segment.saturating_add(QUEUE_ENTRY_BYTES))
+        .saturating_add(SERVICE_BYTES);
+    let snapshots = chunk(size_of::<parameters::WireHeader>(), parameters_len)
+        .saturating_mul(parameters::chunk_count(worker_count));
+    // Each worker has a connection on the parameter channel too.
+    let services = worker_count.saturating_add(1).saturating_mul(SERVICE_BYTES);
+    let bytes = worker_count.saturating_mul(queue).saturating_add(snapshots);
+    u64::try_from(bytes.saturating_add(services)).unwrap_or(u64::MAX)
+}
+
+/// What the learner holds. Its parts may live on different threads; no worker can attach any more
+/// once one of them is dropped.
+#[derive(Debug)]
+pub struct LearnerEnd {
+    /// Takes segments from all workers.
+    pub segments: Receiver,
+    /// Publishes snapshots to all workers.
+    pub parameters: Publisher,
+}
+
+/// What a worker holds.
+#[derive(Debug)]
+pub struct WorkerEnd {
+    /// Offers segments to the learner.
+    pub segments: Sender,
+    /// Takes the learner's newest snapshot.
+    pub parameters: Subscriber,
+}
+
+/// Makes this process the run's learner and creates all services. Workers of a learner before it
+/// follow by themselves.
+///
+/// # Errors
+/// `Domain` if the directory is not a domain, another learner lives or space is short,
+/// `Middleware` for the rest. Whatever was half-made is removed by the next call.
+pub fn serve(domain: &Path, plan: &Plan) -> Result<LearnerEnd, TransportError> {
+    let domain = Domain::open(domain)?;
+    let learner = Arc::new(domain.lock(LEARNER_LOCK)?);
+    let generation = Generation::begin(&domain)?;
+    if generation.is_first() {
+        // Later, workers still hold the generation before, and give it back one by one.
+        domain.check_space(plan.required_bytes())?;
+    }
+    let node = service::join(&generation.root)?;
+    let parameters = Publisher::serve(&node, plan, learner.clone())?;
+    let segments = Receiver::serve(node, plan, learner)?;
+    generation.announce()?;
+    Ok(LearnerEnd { segments, parameters })
+}
+
+/// Attaches this process to the run as worker `worker_index`. Opens, never creates.
+///
+/// # Errors
+/// `Taken` if a worker of that index lives, or died and the learner's `maintain` has not freed its
+/// place yet: attach again a little later. `Incompatible` if the learner follows another plan.
+/// `Domain` if the directory is not a domain. `Middleware` if no learner has served it yet, and
+/// for the rest.
+pub fn attach(
+    domain: &Path,
+    plan: &Plan,
+    worker_index: usize,
+) -> Result<WorkerEnd, TransportError> {
+    let domain = Domain::open(domain)?;
+    let segments = Sender::attach(&domain, plan, worker_index)?;
+    let parameters = Subscriber::attach(&domain, plan)?;
+    Ok(WorkerEnd { segments, parameters })
+}
+
+/// Attaches this process as a reader of snapshots only, such as the evaluator.
+///
+/// # Errors
+/// As [`attach`].
+pub fn subscribe(domain: &Path, plan: &Plan) -> Result<Subscriber, TransportError> {
+    Subscriber::attach(&Domain::open(domain)?, plan)
+}

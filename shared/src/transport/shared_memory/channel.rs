@@ -1,0 +1,160 @@
+//! One iceoryx2 service: created by the learner, opened by workers, with what both must agree on.
+
+use std::fmt::Debug;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+
+use iceoryx2::node::Node;
+use iceoryx2::port::DegradationAction;
+use iceoryx2::prelude::{MessagingPattern, ZeroCopySend};
+use iceoryx2::service::Service;
+use iceoryx2::service::attribute::{
+    AttributeKey, AttributeSpecifier, AttributeValue, AttributeVerifier,
+};
+use iceoryx2::service::builder::publish_subscribe::{
+    Builder, PublishSubscribeOpenError as OpenError,
+};
+use iceoryx2::service::port_factory::publish_subscribe::PortFactory;
+
+use super::service::{PrivateIpc, refused, service_name};
+use crate::transport::TransportError;
+
+/// Makes the ports of one service whose samples are slices of f32 with a header `H`.
+///
+/// Plain f32, no 64-byte element: the slice's length is then the block's length and says, before
+/// the payload is touched, whether the peer wrote what was agreed; the copies do not need more
+/// than an f32's alignment.
+pub(super) type Factory<H> = PortFactory<PrivateIpc, [f32], H>;
+/// A service before it is created or opened.
+pub(super) type ChannelBuilder<H> = Builder<[f32], H, PrivateIpc>;
+
+/// A service's name and what its peers must agree on, as names with values.
+#[derive(Debug, Clone)]
+pub(super) struct Channel {
+    pub(super) name: String,
+    pub(super) agreement: Vec<(&'static str, String)>,
+}
+
+impl Channel {
+    /// Creates the service, in a directory that is new and this learner's alone.
+    pub(super) fn create<H: Debug + ZeroCopySend>(
+        &self,
+        node: &Node<PrivateIpc>,
+        limits: impl FnOnce(ChannelBuilder<H>) -> ChannelBuilder<H>,
+    ) -> Result<Factory<H>, TransportError> {
+        let mut attributes = AttributeSpecifier::new();
+        for (key, value) in &self.agreement {
+            let (key, value) = attribute(key, value)?;
+            attributes = attributes.define(&key, &value).map_err(refused("stating", key))?;
+        }
+        limits(self.builder(node)?)
+            .create_with_attributes(&attributes)
+            .map_err(refused("creating the service", &self.name))
+    }
+
+    /// Opens the service that the learner created. A worker never creates one: killed in the
+    /// middle, it would leave a service that hangs for everyone.
+    pub(super) fn open<H: Debug + ZeroCopySend>(
+        &self,
+        node: &Node<PrivateIpc>,
+    ) -> Result<Factory<H>, TransportError> {
+        let mut attributes = AttributeVerifier::new();
+        for (key, value) in &self.agreement {
+            let (key, value) = attribute(key, value)?;
+            attributes = attributes.require(&key, &value).map_err(refused("stating", key))?;
+        }
+        let opened = self.builder(node)?.open_with_attributes(&attributes);
+        opened.map_err(|cause| self.not_opened(node, cause))
+    }
+
+    fn builder<H: Debug + ZeroCopySend>(
+        &self,
+        node: &Node<PrivateIpc>,
+    ) -> Result<ChannelBuilder<H>, TransportError> {
+        let name = service_name(&self.name)?;
+        Ok(node.service_builder(&name).publish_subscribe::<[f32]>().user_header::<H>())
+    }
+
+    fn not_opened(&self, node: &Node<PrivateIpc>, cause: OpenError) -> TransportError {
+        let name = self.name.clone();
+        match cause {
+            OpenError::IncompatibleAttributes => {
+                TransportError::Incompatible { name, cause: self.differences(node) }
+            }
+            OpenError::IncompatibleTypes
+            | OpenError::IncompatibleMessagingPattern
+            | OpenError::IncompatibleOverflowBehavior
+            | OpenError::DoesNotSupportRequestedMinBufferSize
+            | OpenError::DoesNotSupportRequestedMinHistorySize
+            | OpenError::DoesNotSupportRequestedMinSubscriberBorrowedSamples
+            | OpenError::DoesNotSupportRequestedAmountOfPublishers
+            | OpenError::DoesNotSupportRequestedAmountOfSubscribers
+            | OpenError::DoesNotSupportRequestedAmountOfNodes
+            | OpenError::VersionMismatch => {
+                TransportError::Incompatible { name, cause: format!("{cause:?}") }
+            }
+            OpenError::ExceedsMaxNumberOfNodes | OpenError::IsMarkedForDestruction => {
+                self.taken(cause)
+            }
+            cause => refused("opening the service", name)(cause),
+        }
+    }
+
+    /// The error for a place that a live process occupies.
+    pub(super) fn taken(&self, cause: impl Debug) -> TransportError {
+        TransportError::Taken { name: self.name.clone(), cause: format!("{cause:?}") }
+    }
+
+    /// "run_id is 7 there and 8 here", for all that differs.
+    fn differences(&self, node: &Node<PrivateIpc>) -> String {
+        let pattern = MessagingPattern::PublishSubscribe;
+        let details = service_name(&self.name)
+            .ok()
+            .and_then(|name| PrivateIpc::details(&name, node.config(), pattern).ok().flatten());
+        let Some(details) = details else { return "attributes".to_owned() };
+        let attributes = details.static_details.attributes();
+        let there = |wanted: &str| {
+            let found = attributes.iter().find(|attribute| attribute.key() == wanted);
+            found.map_or_else(|| "nothing".to_owned(), |attribute| attribute.value().to_string())
+        };
+        let different = self.agreement.iter().filter(|(key, here)| there(key) != *here);
+        let words =
+            different.map(|(key, here)| format!("{key} is {} there and {here} here", there(key)));
+        words.collect::<Vec<_>>().join(", ")
+    }
+}
+
+fn attribute(key: &str, value: &str) -> Result<(AttributeKey, AttributeValue), TransportError> {
+    let name = key.try_into().map_err(refused("stating", key))?;
+    Ok((name, value.try_into().map_err(refused("stating", key))?))
+}
+
+/// Set when a port could not connect to a peer.
+///
+/// Mostly the peer died in the middle and nothing is lost. But iceoryx2 tries to connect only once
+/// per peer: should a live one have been too slow, only a new port will reach it.
+#[derive(Debug, Clone, Default)]
+pub(super) struct Disconnected(Arc<AtomicBool>);
+
+impl Disconnected {
+    /// What a port does about a broken connection: remember it and serve the other peers.
+    pub(super) fn remember<Cause, Info>(
+        &self,
+    ) -> impl Fn(Cause, &Info) -> DegradationAction + Send + 'static {
+        let flag = self.0.clone();
+        move |_, _| {
+            flag.store(true, Ordering::Relaxed);
+            DegradationAction::Ignore
+        }
+    }
+
+    /// Whether it is set.
+    pub(super) fn is_set(&self) -> bool {
+        self.0.load(Ordering::Relaxed)
+    }
+
+    /// Clears it, before the port is made anew.
+    pub(super) fn clear(&self) {
+        self.0.store(false, Ordering::Relaxed);
+    }
+}

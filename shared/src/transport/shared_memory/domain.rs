@@ -1,0 +1,341 @@
+//! The run's private directory for shared memory: the permission boundary and the unit of removal.
+//!
+//! ```text
+//! /dev/shm/dmprl-<uid>/     0700, the parent: everything of this user
+//!   <token>/                0700, one run
+//!     domain                marker: this directory is ours to remove
+//!     owner.lock            locked as long as the owner lives
+//!     …                     see `generation`
+//! ```
+//! A lock dies with its process, however it ends: a directory with a free lock is abandoned.
+//! Creating and removing happen under a lock on the parent, so that a directory between `mkdir`
+//! and its lock is never seen as abandoned.
+
+use std::fs::{DirBuilder, File, OpenOptions, TryLockError};
+use std::io::{self, ErrorKind, Write};
+use std::os::unix::ffi::OsStrExt;
+use std::os::unix::fs::{DirBuilderExt, MetadataExt, OpenOptionsExt};
+use std::path::{Path, PathBuf};
+use std::time::Duration;
+
+use rustix::fs::{CWD, OFlags, RenameFlags, renameat_with, statvfs};
+use thiserror::Error;
+
+use super::generation::DIRECTORY_BYTES;
+use super::service::PREFIX;
+
+const MARKER_FILE: &str = "domain";
+const MARKER_TEXT: &str = "dmprl shared-memory domain, version 1\n";
+const LOCK_FILE: &str = "owner.lock";
+/// A directory that is being made; complete ones are renamed.
+const UNFINISHED: &str = ".dmprl-unfinished-";
+/// A directory that is being removed: renamed first, so that no one joins any more.
+const CONDEMNED: &str = ".dmprl-condemned-";
+/// Path of a generation and iceoryx2's prefix together [bytes]: iceoryx2 appends up to 38 bytes for
+/// Unix sockets, whose paths end at 108.
+const ROOT_BYTES_MAX: usize = 70;
+const TOKEN_BYTES_MAX: usize = 32;
+/// The parent's lock is held for milliseconds; it is asked for this often.
+const PARENT_LOCK_ATTEMPTS: usize = 500;
+const PARENT_LOCK_PAUSE: Duration = Duration::from_millis(10);
+
+/// Why a domain could not be made, opened or removed.
+#[derive(Debug, Error)]
+pub enum DomainError {
+    /// The operating system refused.
+    #[error("{operation} {path}: {cause}")]
+    Io {
+        /// What was attempted.
+        operation: &'static str,
+        /// On what.
+        path: PathBuf,
+        /// Why not.
+        cause: io::Error,
+    },
+    /// The directory is not private to this user, or not a domain.
+    #[error("{path}: expected {expected}, got {got}")]
+    Untrusted {
+        /// The directory.
+        path: PathBuf,
+        /// What it has to be.
+        expected: &'static str,
+        /// What it is.
+        got: String,
+    },
+    /// The path leaves no room for the names of sockets.
+    #[error(
+        "shared-memory path {path} takes {got} bytes with what is added, at most {ROOT_BYTES_MAX} \
+         fit: choose a shorter directory or token"
+    )]
+    TooLong {
+        /// The directory.
+        path: PathBuf,
+        /// Its length with the generation's directory and iceoryx2's prefix [bytes].
+        got: usize,
+    },
+    /// The token is empty, too long or has characters that do not belong into a name.
+    #[error("token {got:?}: expected 1 to {TOKEN_BYTES_MAX} characters a-z, A-Z, 0-9, - or _")]
+    Token {
+        /// The token.
+        got: String,
+    },
+    /// Another process holds a lock.
+    #[error("{path} is locked by a live process")]
+    Locked {
+        /// The locked file or directory.
+        path: PathBuf,
+    },
+    /// Shared memory would run out, which kills processes in mid-run with SIGBUS.
+    #[error(
+        "{path}: {needed} bytes of shared memory needed, {available} available: use fewer \
+         workers, shorter queues, or enlarge it (Docker: --shm-size)"
+    )]
+    Space {
+        /// The directory.
+        path: PathBuf,
+        /// Needed [bytes].
+        needed: u64,
+        /// Available [bytes].
+        available: u64,
+    },
+}
+
+fn failed(operation: &'static str, path: &Path) -> impl FnOnce(io::Error) -> DomainError {
+    let path = path.to_owned();
+    move |cause| DomainError::Io { operation, path, cause }
+}
+
+/// The run's shared-memory directory. Its creator owns it: dropped, the directory is gone.
+#[derive(Debug)]
+pub struct Domain {
+    path: PathBuf,
+    /// The owner's lock; `None` in the processes that only opened the domain.
+    owner: Option<File>,
+}
+
+impl Domain {
+    /// Makes the directory `token` in `parent`, which is made too if it is not there.
+    ///
+    /// `token` should be random, so that runs do not meet.
+    ///
+    /// # Errors
+    /// `Token` or `TooLong` for names that do not fit, `Untrusted` if `parent` is not private to
+    /// this user, `Io` (`AlreadyExists`) if the domain exists.
+    pub fn create(parent: &Path, token: &str) -> Result<Self, DomainError> {
+        check_token(token)?;
+        let path = parent.join(token);
+        let bytes = path.as_os_str().len() + DIRECTORY_BYTES + "/".len() + PREFIX.len();
+        if bytes > ROOT_BYTES_MAX {
+            return Err(DomainError::TooLong { path, got: bytes });
+        }
+        make_parent(parent)?;
+        let _parent_lock = lock_parent(parent)?;
+        let unfinished = parent.join(format!("{UNFINISHED}{token}"));
+        remove_tree(&unfinished)?;
+        private_directory().create(&unfinished).map_err(failed("making", &unfinished))?;
+        let owner = private_file(&unfinished.join(LOCK_FILE))?;
+        try_lock(&owner, &path)?;
+        let marker = unfinished.join(MARKER_FILE);
+        private_file(&marker)?
+            .write_all(MARKER_TEXT.as_bytes())
+            .map_err(failed("writing", &marker))?;
+        // Renaming onto an empty directory would replace it silently.
+        renameat_with(CWD, &unfinished, CWD, &path, RenameFlags::NOREPLACE)
+            .map_err(|errno| failed("making", &path)(errno.into()))?;
+        Ok(Self { path, owner: Some(owner) })
+    }
+
+    /// Opens a domain that another process owns.
+    ///
+    /// # Errors
+    /// `Untrusted` if it is not private to this user or not a domain, `Io` if it is not there.
+    pub fn open(path: &Path) -> Result<Self, DomainError> {
+        check_private(path)?;
+        if !has_marker(path) {
+            return Err(DomainError::Untrusted {
+                path: path.to_owned(),
+                expected: "a directory with dmprl's marker",
+                got: "none or another marker".to_owned(),
+            });
+        }
+        Ok(Self { path: path.to_owned(), owner: None })
+    }
+
+    /// The directory.
+    #[must_use]
+    pub fn path(&self) -> &Path {
+        &self.path
+    }
+
+    /// Refuses to go on if less than `needed_bytes` of shared memory are free.
+    ///
+    /// Segments are not reserved when they are made: without this check a full file system kills
+    /// whoever writes the first page that is missing.
+    ///
+    /// # Errors
+    /// `Space` with both numbers; `Io` if the file system does not tell.
+    pub fn check_space(&self, needed_bytes: u64) -> Result<(), DomainError> {
+        let file_system = statvfs(&self.path)
+            .map_err(|errno| failed("asking for free space in", &self.path)(errno.into()))?;
+        let available = file_system.f_bavail.saturating_mul(file_system.f_frsize);
+        if available < needed_bytes {
+            let path = self.path.clone();
+            return Err(DomainError::Space { path, needed: needed_bytes, available });
+        }
+        Ok(())
+    }
+
+    /// Takes the lock `name` in this domain for as long as the returned file is open.
+    pub(super) fn lock(&self, name: &str) -> Result<File, DomainError> {
+        let path = self.path.join(name);
+        let file = OpenOptions::new()
+            .write(true)
+            .create(true)
+            .truncate(false)
+            .mode(0o600)
+            .open(&path)
+            .map_err(failed("opening", &path))?;
+        try_lock(&file, &path)?;
+        Ok(file)
+    }
+}
+
+impl Drop for Domain {
+    fn drop(&mut self) {
+        if self.owner.is_some() && has_marker(&self.path) {
+            // There is no one left to tell; what remains is found by `remove_abandoned`.
+            let _ = condemn(&self.path);
+        }
+    }
+}
+
+/// Removes the domains in `parent` whose owner is dead, and returns their paths.
+///
+/// Live domains and directories without our marker stay. A missing `parent` has none.
+///
+/// # Errors
+/// `Untrusted` if `parent` is not private to this user, `Io` if something could not be removed.
+pub fn remove_abandoned(parent: &Path) -> Result<Vec<PathBuf>, DomainError> {
+    match parent.symlink_metadata() {
+        Err(error) if error.kind() == ErrorKind::NotFound => return Ok(Vec::new()),
+        _ => check_private(parent)?,
+    }
+    let _parent_lock = lock_parent(parent)?;
+    let mut removed = Vec::new();
+    for entry in parent.read_dir().map_err(failed("listing", parent))? {
+        let path = entry.map_err(failed("listing", parent))?.path();
+        let name = path.file_name().unwrap_or_default().as_bytes();
+        if check_private(&path).is_err() {
+            continue;
+        }
+        if name.starts_with(UNFINISHED.as_bytes()) || name.starts_with(CONDEMNED.as_bytes()) {
+            // Who makes one holds the parent's lock; who removes one does not mind help.
+            remove_tree(&path)?;
+            removed.push(path);
+        } else if has_marker(&path) && is_abandoned(&path) && condemn(&path)? {
+            removed.push(path);
+        }
+    }
+    Ok(removed)
+}
+
+/// Whether the domain's owner is dead. One without its lock file is damaged or just being removed
+/// by its owner: not ours to judge.
+fn is_abandoned(path: &Path) -> bool {
+    File::open(path.join(LOCK_FILE)).is_ok_and(|lock| lock.try_lock().is_ok())
+}
+
+/// Renames the domain so that no one joins it any more, then removes it. `false` if it is gone.
+fn condemn(path: &Path) -> Result<bool, DomainError> {
+    let mut name = std::ffi::OsString::from(CONDEMNED);
+    name.push(path.file_name().unwrap_or_default());
+    let condemned = path.with_file_name(name);
+    match std::fs::rename(path, &condemned) {
+        Err(error) if error.kind() == ErrorKind::NotFound => return Ok(false),
+        renamed => renamed.map_err(failed("renaming", path))?,
+    }
+    remove_tree(&condemned).map(|()| true)
+}
+
+/// Removes a directory; symbolic links below it are removed, never followed.
+fn remove_tree(path: &Path) -> Result<(), DomainError> {
+    match std::fs::remove_dir_all(path) {
+        Err(error) if error.kind() != ErrorKind::NotFound => Err(failed("removing", path)(error)),
+        _ => Ok(()),
+    }
+}
+
+fn check_token(token: &str) -> Result<(), DomainError> {
+    let sound = |byte: u8| byte.is_ascii_alphanumeric() || byte == b'-' || byte == b'_';
+    if (1..=TOKEN_BYTES_MAX).contains(&token.len()) && token.bytes().all(sound) {
+        return Ok(());
+    }
+    Err(DomainError::Token { got: token.to_owned() })
+}
+
+fn private_directory() -> DirBuilder {
+    let mut builder = DirBuilder::new();
+    builder.mode(0o700);
+    builder
+}
+
+fn private_file(path: &Path) -> Result<File, DomainError> {
+    OpenOptions::new()
+        .write(true)
+        .create_new(true)
+        .mode(0o600)
+        .open(path)
+        .map_err(failed("making", path))
+}
+
+fn make_parent(parent: &Path) -> Result<(), DomainError> {
+    match private_directory().create(parent) {
+        Err(error) if error.kind() != ErrorKind::AlreadyExists => {
+            Err(failed("making", parent)(error))
+        }
+        _ => check_private(parent),
+    }
+}
+
+fn check_private(path: &Path) -> Result<(), DomainError> {
+    let metadata = path.symlink_metadata().map_err(failed("looking at", path))?;
+    let user = rustix::process::geteuid().as_raw();
+    let mode = metadata.mode() & 0o7777;
+    if path.is_absolute() && metadata.is_dir() && metadata.uid() == user && mode == 0o700 {
+        return Ok(());
+    }
+    let kind = if metadata.is_dir() { "directory" } else { "file or symbolic link" };
+    Err(DomainError::Untrusted {
+        path: path.to_owned(),
+        expected: "an absolute path of a directory of this user with mode 0700",
+        got: format!("{kind} of user {} with mode {mode:04o}", metadata.uid()),
+    })
+}
+
+fn has_marker(path: &Path) -> bool {
+    std::fs::read(path.join(MARKER_FILE)).is_ok_and(|text| text == MARKER_TEXT.as_bytes())
+}
+
+fn try_lock(file: &File, path: &Path) -> Result<(), DomainError> {
+    match file.try_lock() {
+        Ok(()) => Ok(()),
+        Err(TryLockError::WouldBlock) => Err(DomainError::Locked { path: path.to_owned() }),
+        Err(TryLockError::Error(cause)) => Err(failed("locking", path)(cause)),
+    }
+}
+
+/// Locks the parent directory itself: there is no file in it that someone could leave behind.
+fn lock_parent(parent: &Path) -> Result<File, DomainError> {
+    let directory = OpenOptions::new()
+        .read(true)
+        .custom_flags((OFlags::DIRECTORY | OFlags::NOFOLLOW).bits().cast_signed())
+        .open(parent)
+        .map_err(failed("opening", parent))?;
+    for _ in 0..PARENT_LOCK_ATTEMPTS {
+        match try_lock(&directory, parent) {
+            Err(DomainError::Locked { .. }) => std::thread::sleep(PARENT_LOCK_PAUSE),
+            done => return done.map(|()| directory),
+        }
+    }
+    Err(DomainError::Locked { path: parent.to_owned() })
+}

@@ -1,0 +1,316 @@
+//! Segments from workers to the learner: one queue per worker slot.
+//!
+//! A service of its own for each worker, because a subscriber of several publishers serves them in
+//! a fixed order and starves the last. The learner takes from the queues in turn.
+
+use std::fs::File;
+use std::sync::Arc;
+
+use iceoryx2::node::Node;
+use iceoryx2::port::publisher::{Publisher as Port, PublisherCreateError};
+use iceoryx2::port::subscriber::Subscriber;
+use iceoryx2::port::{BackpressureAction, BackpressureInfo, SendError};
+use iceoryx2::prelude::PayloadHeader;
+use iceoryx2_bb_elementary_traits::zero_copy_send::ZeroCopySend;
+
+use super::Plan;
+use super::channel::{Channel, ChannelBuilder, Disconnected, Factory};
+use super::domain::Domain;
+use super::generation::Membership;
+use super::service::{PrivateIpc, clean, refused};
+use crate::segment::{LAYOUT_VERSION, Segment, SegmentHeader};
+use crate::transport::{SegmentReceiver, SegmentSender, SendOutcome, TransportError};
+
+/// Segments that one worker may deliver before it is the next one's turn. More than one, so that a
+/// learner with many idle workers does not ask them all for each segment.
+const TURN_SEGMENTS: usize = 8;
+/// Processes that may hold one worker's service open at once: learner, worker, and the dead whose
+/// places are not cleaned up yet.
+const NODES_MAX: usize = 8;
+/// Cleanups that may fail in a row before the caller is told. One is normal: a worker that starts
+/// or ends in that moment hides the ones behind it.
+const CLEAN_FAILURES_MAX: usize = 20;
+/// The learner copies a segment out and gives it back at once; a worker fills one at a time.
+const BORROWED_MAX: usize = 1;
+
+/// [`SegmentHeader`] in shared memory. The name states its layout to peers of other builds.
+#[derive(Debug, Default, Clone, Copy)]
+#[repr(transparent)]
+pub(super) struct WireHeader(pub(super) SegmentHeader);
+
+// SAFETY: `SegmentHeader` is `Pod`: no pointers, no padding, every bit pattern valid; its size and
+// alignment are asserted where it is defined, and its layout version is part of the agreement.
+unsafe impl ZeroCopySend for WireHeader {
+    unsafe fn type_name() -> &'static str {
+        "dmprl::SegmentHeader"
+    }
+}
+
+/// Chunks in a worker's data segment: every one queued, borrowed or being filled.
+pub(super) fn chunk_count(queue_segments: usize) -> usize {
+    queue_segments + BORROWED_MAX + 1
+}
+
+fn channel(plan: &Plan, worker_index: usize) -> Channel {
+    let mut agreement = plan.identity();
+    agreement.extend([
+        ("segment_header", LAYOUT_VERSION.to_string()),
+        ("segment_steps", plan.layout.segment_steps.to_string()),
+        ("observation_len", plan.layout.observation_len.to_string()),
+        ("action_len", plan.layout.action_len.to_string()),
+    ]);
+    Channel { name: format!("segments/{worker_index}"), agreement }
+}
+
+type SenderPort = Port<PrivateIpc, [f32], WireHeader>;
+type ReceiverPort = Subscriber<PrivateIpc, [f32], WireHeader>;
+
+/// A worker's end of its queue.
+#[derive(Debug)]
+pub struct Sender {
+    channel: Channel,
+    membership: Membership<SenderPort>,
+    block_len: usize,
+}
+
+impl Sender {
+    pub(super) fn attach(
+        domain: &Domain,
+        plan: &Plan,
+        worker_index: usize,
+    ) -> Result<Self, TransportError> {
+        let channel = channel(plan, worker_index);
+        let block_len = plan.layout.block_len();
+        let membership = Membership::new(domain, |node, disconnected| {
+            publish(&channel, node, block_len, disconnected)
+        })?;
+        Ok(Self { channel, membership, block_len })
+    }
+}
+
+fn publish(
+    channel: &Channel,
+    node: &Node<PrivateIpc>,
+    block_len: usize,
+    disconnected: &Disconnected,
+) -> Result<SenderPort, TransportError> {
+    let port = channel
+        .open(node)?
+        .publisher_builder()
+        .initial_max_slice_len(block_len)
+        .max_loaned_samples(1)
+        // Without it a full queue is waited for, for ever if the learner is dead.
+        .set_backpressure_handler(|_: &BackpressureInfo| BackpressureAction::DiscardDataAndFail)
+        .set_degradation_handler(disconnected.remember())
+        .create();
+    port.map_err(|cause| match cause {
+        PublisherCreateError::ExceedsMaxSupportedPublishers => channel.taken(cause),
+        cause => refused("making a port of", &channel.name)(cause),
+    })
+}
+
+impl SegmentSender for Sender {
+    fn try_send(
+        &mut self,
+        header: &SegmentHeader,
+        block: &[f32],
+    ) -> Result<SendOutcome, TransportError> {
+        if block.len() != self.block_len {
+            return Err(TransportError::Length { expected: self.block_len, got: block.len() });
+        }
+        let Self { channel, membership, block_len } = self;
+        let port = membership
+            .port(|node, disconnected| publish(channel, node, *block_len, disconnected))?;
+        let Some(port) = port else { return Ok(SendOutcome::Detached) };
+        let sent = port.loan_slice_uninit(block.len()).map(|mut sample| {
+            *sample.user_header_mut() = WireHeader(*header);
+            sample.write_from_slice(block).send()
+        });
+        match sent {
+            // No subscriber, or a full queue whose learner is not there: the sample is gone.
+            Ok(Ok(0)) => Ok(SendOutcome::Detached),
+            Ok(Ok(_)) => Ok(SendOutcome::Delivered),
+            Ok(Err(SendError::UnableToDeliver)) => Ok(SendOutcome::Full),
+            Ok(Err(cause)) => Err(refused("sending to", &channel.name)(cause)),
+            Err(cause) => Err(refused("sending to", &channel.name)(cause)),
+        }
+    }
+}
+
+/// The learner's end of one worker's queue.
+#[derive(Debug)]
+struct Slot {
+    channel: Channel,
+    factory: Factory<WireHeader>,
+    /// `None` only after a new port could not be made.
+    port: Option<ReceiverPort>,
+    disconnected: Disconnected,
+}
+
+/// The learner's end of all queues.
+#[derive(Debug)]
+pub struct Receiver {
+    slots: Vec<Slot>,
+    next: usize,
+    turn_left: usize,
+    block_len: usize,
+    node: Node<PrivateIpc>,
+    clean_failures: usize,
+    /// Says to a second learner that there is one. Last: given up after the ports.
+    _learner: Arc<File>,
+}
+
+impl Receiver {
+    pub(super) fn serve(
+        node: Node<PrivateIpc>,
+        plan: &Plan,
+        learner: Arc<File>,
+    ) -> Result<Self, TransportError> {
+        let slots = (0..plan.worker_count).map(|index| Slot::serve(&node, plan, index));
+        let slots = slots.collect::<Result<Vec<_>, _>>()?;
+        let block_len = plan.layout.block_len();
+        let turn_left = TURN_SEGMENTS;
+        Ok(Self {
+            slots,
+            next: 0,
+            turn_left,
+            block_len,
+            node,
+            clean_failures: 0,
+            _learner: learner,
+        })
+    }
+
+    fn pass_turn(&mut self) {
+        self.next = (self.next + 1) % self.slots.len();
+        self.turn_left = TURN_SEGMENTS;
+    }
+}
+
+impl Slot {
+    fn serve(
+        node: &Node<PrivateIpc>,
+        plan: &Plan,
+        worker_index: usize,
+    ) -> Result<Self, TransportError> {
+        let channel = channel(plan, worker_index);
+        let factory = channel.create(node, |builder: ChannelBuilder<WireHeader>| {
+            builder
+                .enable_safe_overflow(false)
+                .history_size(0)
+                .subscriber_max_buffer_size(plan.queue_segments)
+                .subscriber_max_borrowed_samples(BORROWED_MAX)
+                .max_publishers(1)
+                .max_subscribers(1)
+                .max_nodes(NODES_MAX)
+        })?;
+        let disconnected = Disconnected::default();
+        let port = Some(subscribe(&channel, &factory, &disconnected)?);
+        Ok(Self { channel, factory, port, disconnected })
+    }
+
+    fn receive(&self, segment: &mut Segment, block_len: usize) -> Result<bool, TransportError> {
+        let Some(port) = &self.port else { return Ok(false) };
+        let received = port.receive().map_err(refused("receiving from", &self.channel.name))?;
+        let Some(sample) = received else { return Ok(false) };
+        // The length is the peer's word: believed only if it is the agreed one.
+        let got = usize::try_from(sample.header().number_of_elements()).unwrap_or(usize::MAX);
+        if got != block_len {
+            return Err(TransportError::Length { expected: block_len, got });
+        }
+        segment.header = sample.user_header().0;
+        segment.block.resize(block_len, 0.0);
+        segment.block.copy_from_slice(sample.payload());
+        Ok(true)
+    }
+
+    /// Makes a new port after a connection failed, unless segments still wait at the old one.
+    fn renew(&mut self) -> Result<(), TransportError> {
+        let waiting = |port: &ReceiverPort| port.has_samples().unwrap_or(false);
+        let needed = self.disconnected.is_set() || self.port.is_none();
+        if !needed || self.port.as_ref().is_some_and(waiting) {
+            return Ok(());
+        }
+        self.disconnected.clear();
+        self.port = None;
+        self.port = Some(subscribe(&self.channel, &self.factory, &self.disconnected)?);
+        Ok(())
+    }
+}
+
+fn subscribe(
+    channel: &Channel,
+    factory: &Factory<WireHeader>,
+    disconnected: &Disconnected,
+) -> Result<ReceiverPort, TransportError> {
+    factory
+        .subscriber_builder()
+        .set_degradation_handler(disconnected.remember())
+        .create()
+        .map_err(refused("making a port of", &channel.name))
+}
+
+impl SegmentReceiver for Receiver {
+    fn try_receive(&mut self, segment: &mut Segment) -> Result<bool, TransportError> {
+        if self.turn_left == 0 {
+            self.pass_turn();
+        }
+        for _ in 0..self.slots.len() {
+            if self.slots[self.next].receive(segment, self.block_len)? {
+                self.turn_left -= 1;
+                return Ok(true);
+            }
+            self.pass_turn();
+        }
+        Ok(false)
+    }
+
+    fn maintain(&mut self) -> Result<(), TransportError> {
+        match clean(&self.node) {
+            Ok(()) => self.clean_failures = 0,
+            Err(error) if self.clean_failures >= CLEAN_FAILURES_MAX => return Err(error),
+            Err(_) => self.clean_failures += 1,
+        }
+        self.slots.iter_mut().try_for_each(Slot::renew)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use crate::segment::{Segment, SegmentHeader, SegmentLayout};
+    use crate::transport::shared_memory::{Domain, Plan, attach, serve};
+    use crate::transport::{SegmentReceiver, SegmentSender, SendOutcome, TransportError};
+
+    #[test]
+    fn a_segment_whose_length_the_peer_got_wrong_is_refused_before_it_is_read() {
+        let directory = tempfile::tempdir().unwrap();
+        let domain = Domain::create(&directory.path().join("p"), "run").unwrap();
+        let layout = SegmentLayout { segment_steps: 5, observation_len: 3, action_len: 2 };
+        let plan = Plan {
+            run_id: 1,
+            architecture_hash: 2,
+            layout,
+            worker_count: 1,
+            queue_segments: 4,
+            parameters_len: 1,
+        };
+        let mut learner = serve(domain.path(), &plan).unwrap();
+        let mut worker = attach(domain.path(), &plan, 0).unwrap().segments;
+        let len = layout.block_len();
+        let block = vec![1.0; len];
+        let send = |worker: &mut super::Sender, len: usize| {
+            worker.block_len = len;
+            let sent = worker.try_send(&SegmentHeader::default(), &block[..len]).unwrap();
+            assert_eq!(sent, SendOutcome::Delivered);
+        };
+        send(&mut worker, len - 1);
+        send(&mut worker, len);
+        let mut segment = Segment::zeroed(layout);
+        let refusal = learner.segments.try_receive(&mut segment).unwrap_err();
+        let TransportError::Length { expected, got } = refusal else { panic!("{refusal}") };
+        assert_eq!((expected, got), (len, len - 1));
+        assert_eq!(segment, Segment::zeroed(layout));
+        assert!(learner.segments.try_receive(&mut segment).unwrap());
+        assert_eq!(segment.block, block);
+    }
+}

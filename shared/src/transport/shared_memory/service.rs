@@ -1,0 +1,144 @@
+//! The private, file-backed iceoryx2 service: every resource is a file below the run's directory.
+//!
+//! The stock `ipc` service keeps part of its state in `/dev/shm` under names any user can squat.
+//! With the file concepts of `iceoryx2-cal` a mode-0700 directory is the permission boundary and
+//! the unit of removal. Price: these are inner crates, hence the exact version pins.
+
+use std::fmt::{Debug, Display};
+use std::panic::{AssertUnwindSafe, catch_unwind};
+use std::path::Path;
+
+use iceoryx2::config::Config;
+use iceoryx2::node::{Node, NodeBuilder, NodeState};
+use iceoryx2::prelude::{
+    CallbackProgression, FileName, FilePath, LogLevel, SemanticString, ServiceName,
+    SignalHandlingMode, set_log_level,
+};
+use iceoryx2::service::Service;
+use iceoryx2_bb_elementary_traits::testing::abandonable::Abandonable;
+use iceoryx2_bb_elementary_traits::zero_copy_send::ZeroCopySend;
+use iceoryx2_cal::shm_allocator::bump_allocator::BumpAllocator;
+use iceoryx2_cal::shm_allocator::pool_allocator::PoolAllocator;
+use iceoryx2_cal::{
+    arc_sync_policy, bag, dynamic_storage, event, hash, monitoring, reactor,
+    resizable_shared_memory, serialize, shared_memory, static_storage, zero_copy_connection,
+};
+
+use crate::transport::TransportError;
+
+/// Prefix of every file iceoryx2 creates. Short, because Unix socket paths end at 108 bytes; the
+/// run's own directory already separates runs.
+pub(super) const PREFIX: &str = "d_";
+/// The configuration that the learner writes and every process of the run reads.
+const CONFIG_FILE: &str = "iceoryx2.toml";
+/// The service variant; ports are mutex-protected so that an end may move to another thread.
+#[derive(Debug, Clone)]
+pub(super) struct PrivateIpc {}
+
+type FileMemory<Allocator> = shared_memory::file::Memory<Allocator>;
+
+impl Service for PrivateIpc {
+    type StaticStorage = static_storage::recommended::Ipc;
+    type ConfigSerializer = serialize::recommended::Recommended;
+    type PersistentDynamicStorage<T: Debug + Send + Sync + ZeroCopySend + 'static> =
+        dynamic_storage::file::Storage<T>;
+    type Bag = bag::recommended::Recommended;
+    type DynamicStorage<T: Debug + Send + Sync + ZeroCopySend + 'static> =
+        dynamic_storage::file::Storage<T>;
+    type ServiceNameHasher = hash::recommended::Recommended;
+    type SharedMemory = FileMemory<PoolAllocator>;
+    type ResizableSharedMemory =
+        resizable_shared_memory::dynamic::DynamicMemory<PoolAllocator, FileMemory<PoolAllocator>>;
+    type Connection = zero_copy_connection::file::Connection;
+    type Event = event::recommended::Ipc;
+    type Monitoring = monitoring::recommended::Ipc;
+    type Reactor = reactor::recommended::Ipc;
+    type ArcThreadSafetyPolicy<T: Send + Debug + Abandonable> =
+        arc_sync_policy::mutex_protected::MutexProtected<T>;
+    type BlackboardMgmt<K: Send + Sync + Debug + ZeroCopySend + 'static> =
+        dynamic_storage::file::Storage<K>;
+    type BlackboardPayload = FileMemory<BumpAllocator>;
+    type UniqueId = iceoryx2::unique_id_generator::unique_system_id::UniqueSystemId;
+}
+
+impl iceoryx2::service::internal::ServiceInternal<PrivateIpc> for PrivateIpc {}
+
+/// Turns the middleware's refusal into an error that names what was attempted on what.
+pub(super) fn refused<E: Display>(
+    operation: &'static str,
+    name: impl Display,
+) -> impl FnOnce(E) -> TransportError {
+    move |cause| TransportError::Middleware {
+        operation,
+        name: name.to_string(),
+        cause: cause.to_string(),
+    }
+}
+
+/// A service name, checked.
+pub(super) fn service_name(name: &str) -> Result<ServiceName, TransportError> {
+    name.try_into().map_err(refused("naming a service", name))
+}
+
+/// Writes the iceoryx2 configuration of `root` into it.
+///
+/// A file, because iceoryx2 takes its process-wide configuration from nothing else, and without
+/// one the cleanup of a half-started dead process would look below iceoryx2's default paths.
+pub(super) fn write_config(root: &Path) -> Result<(), TransportError> {
+    let operation = "writing the configuration";
+    let root_path = iceoryx2::prelude::Path::new(root.as_os_str().as_encoded_bytes())
+        .map_err(refused(operation, root.display()))?;
+    let mut config = Config::default();
+    config.global.set_root_path(&root_path);
+    config.global.prefix =
+        FileName::new(PREFIX.as_bytes()).map_err(refused(operation, root.display()))?;
+    // Only the learner cleans up after the dead, and only in `clean`: concurrent cleanups are where
+    // iceoryx2's known bugs are, and a cleaner killed in the middle loses places for good.
+    config.global.node.cleanup_dead_nodes_on_creation = false;
+    config.global.node.cleanup_dead_nodes_on_destruction = false;
+    config.global.service.cleanup_dead_nodes_on_open = false;
+    let text = toml::to_string(&config).map_err(refused(operation, root.display()))?;
+    let file = root.join(CONFIG_FILE);
+    std::fs::write(&file, text).map_err(refused(operation, file.display()))
+}
+
+/// Registers this process as a node below `root`.
+pub(super) fn join(root: &Path) -> Result<Node<PrivateIpc>, TransportError> {
+    // Failures come back as errors. The log repeats them, and speaks of every dead peer.
+    set_log_level(LogLevel::Fatal);
+    let file = root.join(CONFIG_FILE);
+    let path = FilePath::new(file.as_os_str().as_encoded_bytes())
+        .map_err(refused("reading the configuration", file.display()))?;
+    let config =
+        Config::from_file(&path).map_err(refused("reading the configuration", file.display()))?;
+    // The first root of a process decides. It only serves the cleanup of processes that died
+    // before they had written which configuration they use.
+    Config::setup_global_config_from_file(&path)
+        .map_err(refused("reading the configuration", file.display()))?;
+    NodeBuilder::new()
+        .config(&config)
+        .signal_handling_mode(SignalHandlingMode::Disabled)
+        .create::<PrivateIpc>()
+        .map_err(refused("joining", root.display()))
+}
+
+/// Frees what dead processes below the node's root left behind.
+///
+/// iceoryx2 0.10 panics when it finds a "dead" node alive after all (issue 1880): the panic
+/// becomes an error here, and the next call tries again.
+pub(super) fn clean(node: &Node<PrivateIpc>) -> Result<(), TransportError> {
+    let operation = "cleaning up after dead processes";
+    let cleaned = catch_unwind(AssertUnwindSafe(|| {
+        Node::<PrivateIpc>::list(node.config(), |state| {
+            if let NodeState::Dead(dead) = state {
+                // What could not be removed is found again by the next call.
+                let _ = dead.try_remove_stale_resources();
+            }
+            CallbackProgression::Continue
+        })
+    }));
+    match cleaned {
+        Ok(listed) => listed.map_err(refused(operation, node.config().global.root_path())),
+        Err(_) => Err(refused(operation, node.config().global.root_path())("iceoryx2 panicked")),
+    }
+}

@@ -1,0 +1,235 @@
+//! What every transport promises, asked of both: in one process and over shared memory.
+
+#![allow(clippy::unwrap_used, reason = "a test's helpers fail the test")]
+
+mod transport_support;
+
+use dmprl_shared::parameters::{ParameterSnapshot, SnapshotError};
+use dmprl_shared::segment::Segment;
+use dmprl_shared::transport::shared_memory::{Domain, attach, serve, subscribe};
+use dmprl_shared::transport::{
+    ParameterPublisher, ParameterSubscriber, SegmentReceiver, SegmentSender, SendOutcome,
+    TransportError, in_process,
+};
+use transport_support::{
+    ARCHITECTURE, LAYOUT, PARAMETERS_LEN, Parent, assert_whole, fill, header, plan, snapshot,
+};
+
+type Subscriber = Box<dyn ParameterSubscriber + Send>;
+
+/// One learner with its workers, whatever lies between them.
+struct Transport {
+    senders: Vec<Box<dyn SegmentSender + Send>>,
+    receiver: Box<dyn SegmentReceiver + Send>,
+    publisher: Box<dyn ParameterPublisher + Send>,
+    join: Box<dyn Fn() -> Subscriber>,
+    _domain: Option<(Domain, Parent)>,
+}
+
+fn over_memory_of_one_process(workers: usize, queue_segments: usize) -> Transport {
+    let (senders, receiver) = in_process::segment_queues(workers, queue_segments, LAYOUT);
+    let (publisher, subscriber) = in_process::parameter_channel(ARCHITECTURE);
+    Transport {
+        senders: senders.into_iter().map(|sender| Box::new(sender) as _).collect(),
+        receiver: Box::new(receiver),
+        publisher: Box::new(publisher),
+        join: Box::new(move || Box::new(subscriber.clone())),
+        _domain: None,
+    }
+}
+
+fn over_shared_memory(workers: usize, queue_segments: usize) -> Transport {
+    let parent = Parent::new();
+    let domain = parent.domain("run");
+    let path = domain.path().to_owned();
+    let plan = plan(workers, queue_segments);
+    let learner = serve(&path, &plan).unwrap();
+    let worker = |index| Box::new(attach(&path, &plan, index).unwrap().segments) as _;
+    let mut transport = Transport {
+        senders: (0..workers).map(worker).collect(),
+        receiver: Box::new(learner.segments),
+        publisher: Box::new(learner.parameters),
+        join: Box::new(move || Box::new(subscribe(&path, &plan).unwrap())),
+        _domain: Some((domain, parent)),
+    };
+    // The learner's first look connects the queues; until then a full one counts as detached.
+    assert!(!transport.receiver.try_receive(&mut Segment::default()).unwrap());
+    transport
+}
+
+fn offer(transport: &mut Transport, worker: usize, sequence: u64) -> SendOutcome {
+    let mut block = vec![0.0; LAYOUT.block_len()];
+    fill(&mut block, sequence);
+    transport.senders[worker].try_send(&header(worker as u32, 1, sequence), &block).unwrap()
+}
+
+fn nothing_is_lost_or_duplicated_with_a_slow_reader(mut transport: Transport) {
+    const SEGMENTS: u64 = 100_000;
+    const NAP_EVERY: u64 = 1000;
+    let (full, seen_full) = std::sync::mpsc::channel();
+    let mut sender = transport.senders.pop().unwrap();
+    let worker = std::thread::spawn(move || {
+        let mut block = vec![0.0; LAYOUT.block_len()];
+        for sequence in 1..=SEGMENTS {
+            fill(&mut block, sequence);
+            while sender.try_send(&header(0, 1, sequence), &block).unwrap()
+                != SendOutcome::Delivered
+            {
+                let _ = full.send(());
+                std::thread::yield_now();
+            }
+        }
+    });
+    let mut segment = Segment::zeroed(LAYOUT);
+    for sequence in 1..=SEGMENTS {
+        if sequence % NAP_EVERY == 0 && sequence < SEGMENTS - NAP_EVERY {
+            // The reader rests until the queue has been full once more.
+            while seen_full.try_recv().is_ok() {}
+            seen_full.recv().unwrap();
+        }
+        while !transport.receiver.try_receive(&mut segment).unwrap() {
+            std::thread::yield_now();
+        }
+        assert_eq!(segment.header, header(0, 1, sequence));
+        assert_whole(&segment);
+    }
+    worker.join().unwrap();
+    assert!(!transport.receiver.try_receive(&mut segment).unwrap());
+}
+
+fn a_full_queue_says_so_and_keeps_what_it_has(mut transport: Transport) {
+    for sequence in 1..=4 {
+        assert_eq!(offer(&mut transport, 0, sequence), SendOutcome::Delivered);
+    }
+    for _ in 0..3 {
+        assert_eq!(offer(&mut transport, 0, 5), SendOutcome::Full);
+    }
+    let mut segment = Segment::default();
+    for sequence in 1..=4 {
+        assert!(transport.receiver.try_receive(&mut segment).unwrap());
+        assert_eq!(segment.header.sequence, sequence);
+        assert_whole(&segment);
+    }
+    assert!(!transport.receiver.try_receive(&mut segment).unwrap());
+    assert_eq!(offer(&mut transport, 0, 5), SendOutcome::Delivered);
+}
+
+fn full_queues_are_drained_in_turn(mut transport: Transport) {
+    let mut taken = [0_u32; 4];
+    let mut sequences = [0; 4];
+    let mut segment = Segment::default();
+    for _ in 0..4000 {
+        for (worker, sequence) in sequences.iter_mut().enumerate() {
+            while offer(&mut transport, worker, *sequence + 1) == SendOutcome::Delivered {
+                *sequence += 1;
+            }
+        }
+        assert!(transport.receiver.try_receive(&mut segment).unwrap());
+        taken[segment.header.worker_id as usize] += 1;
+    }
+    let (max, min) = (taken.iter().max().unwrap(), taken.iter().min().unwrap());
+    assert!(f64::from(*max) <= 1.5 * f64::from(*min), "{taken:?}");
+}
+
+fn a_learner_that_left_is_reported(mut transport: Transport) {
+    assert_eq!(offer(&mut transport, 0, 1), SendOutcome::Delivered);
+    transport.receiver = over_memory_of_one_process(1, 1).receiver;
+    for _ in 0..10 {
+        assert_eq!(offer(&mut transport, 0, 2), SendOutcome::Detached);
+    }
+}
+
+fn a_wrong_length_is_refused(mut transport: Transport) {
+    let short = vec![0.0; LAYOUT.block_len() - 1];
+    let refusal = transport.senders[0].try_send(&header(0, 1, 1), &short).unwrap_err();
+    let TransportError::Length { expected, got } = refusal else { panic!("{refusal}") };
+    assert_eq!((expected, got), (LAYOUT.block_len(), short.len()));
+    assert!(!transport.receiver.try_receive(&mut Segment::default()).unwrap());
+}
+
+fn the_newest_snapshot_replaces_the_ones_before(mut transport: Transport) {
+    let mut subscriber = (transport.join)();
+    let mut taken = ParameterSnapshot::default();
+    assert!(!subscriber.newest(&mut taken).unwrap());
+    for version in 1..=5 {
+        transport.publisher.publish(&snapshot(version)).unwrap();
+    }
+    assert!(subscriber.newest(&mut taken).unwrap());
+    assert_eq!(taken, snapshot(5));
+    assert!(!subscriber.newest(&mut taken).unwrap());
+}
+
+fn snapshots_are_whole_and_their_version_never_decreases(mut transport: Transport) {
+    const VERSIONS: u64 = 2000;
+    let mut subscriber = (transport.join)();
+    let reader = std::thread::spawn(move || {
+        let mut taken = ParameterSnapshot::default();
+        while taken.version < VERSIONS {
+            let before = taken.version;
+            if subscriber.newest(&mut taken).unwrap() {
+                assert!(taken.version > before);
+                assert_eq!(taken, snapshot(taken.version));
+            }
+        }
+    });
+    for version in 1..=VERSIONS {
+        transport.publisher.publish(&snapshot(version)).unwrap();
+    }
+    while !reader.is_finished() {
+        transport.publisher.maintain().unwrap();
+    }
+    reader.join().unwrap();
+}
+
+fn a_late_joiner_gets_the_newest_snapshot(mut transport: Transport) {
+    transport.publisher.publish(&snapshot(1)).unwrap();
+    transport.publisher.publish(&snapshot(2)).unwrap();
+    let mut subscriber = (transport.join)();
+    transport.publisher.maintain().unwrap();
+    let mut taken = ParameterSnapshot::default();
+    assert!(subscriber.newest(&mut taken).unwrap());
+    assert_eq!(taken, snapshot(2));
+}
+
+fn a_snapshot_of_another_architecture_is_refused(mut transport: Transport) {
+    let mut subscriber = (transport.join)();
+    transport.publisher.publish(&snapshot(1)).unwrap();
+    let mut taken = ParameterSnapshot::default();
+    assert!(subscriber.newest(&mut taken).unwrap());
+    let foreign = ParameterSnapshot { architecture_hash: 1, ..snapshot(2) };
+    transport.publisher.publish(&foreign).unwrap();
+    let refusal = subscriber.newest(&mut taken).unwrap_err();
+    let expected = SnapshotError::Architecture { version: 2, expected: ARCHITECTURE, got: 1 };
+    assert!(matches!(&refusal, TransportError::Snapshot(e) if *e == expected), "{refusal}");
+    assert_eq!(taken, snapshot(1));
+    transport.publisher.publish(&snapshot(3)).unwrap();
+    assert!(subscriber.newest(&mut taken).unwrap());
+    assert_eq!(taken.values.len(), PARAMETERS_LEN);
+}
+
+macro_rules! contract {
+    ($($promise:ident($workers:expr, $queue_segments:expr);)*) => {
+        mod in_one_process {
+            $(#[test] fn $promise() {
+                super::$promise(super::over_memory_of_one_process($workers, $queue_segments));
+            })*
+        }
+        mod shared_memory {
+            $(#[test] fn $promise() {
+                super::$promise(super::over_shared_memory($workers, $queue_segments));
+            })*
+        }
+    };
+}
+
+contract! {
+    nothing_is_lost_or_duplicated_with_a_slow_reader(1, 64);
+    a_full_queue_says_so_and_keeps_what_it_has(1, 4);
+    full_queues_are_drained_in_turn(4, 16);
+    a_learner_that_left_is_reported(1, 8);
+    a_wrong_length_is_refused(1, 4);
+    the_newest_snapshot_replaces_the_ones_before(1, 1);
+    snapshots_are_whole_and_their_version_never_decreases(1, 1);
+    a_late_joiner_gets_the_newest_snapshot(1, 1);
+    a_snapshot_of_another_architecture_is_refused(1, 1);
+}
