@@ -20,6 +20,9 @@ pub enum Command {
     },
     /// To the evaluator: evaluate this policy.
     Evaluate(EvaluationRequest),
+    /// To the learner: the run has reached its goal or its time; finish as at the last step, with a
+    /// last evaluation.
+    Finish,
     /// To any role: finish what must be finished and exit.
     Stop,
 }
@@ -57,7 +60,8 @@ pub enum Report {
     },
 }
 
-/// Where the learner stands.
+/// Where the learner stands. Every number is finite: JSON has no NaN, and a line with one is no
+/// report.
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Progress {

@@ -1,4 +1,17 @@
-//! The dmprl program as a library, for its own tests.
+//! The `dmprl` program: commands, the supervisor of a run, the roles it starts, the run directory.
+//!
+//! Stage 2 of 8 (`launch`) and what a user sees of stage 8 (`terminal`, `plots`, `cli`). One
+//! binary plays every part: `dmprl train` starts itself again as `dmprl learner`, `dmprl actor`
+//! and `dmprl evaluator` and speaks with them in the lines that `control` defines.
 
+pub mod cli;
+pub mod control;
+pub mod failure;
+pub mod launch;
+pub mod plots;
+pub mod project;
 #[cfg(feature = "python")]
 pub mod python_setup;
+pub mod roles;
+pub mod run_directory;
+pub mod terminal;

@@ -32,9 +32,15 @@ pub enum Due {
     Checkpoint,
 }
 
+/// What kept something that was due from being done, in the caller's words.
+pub type DueError = Box<dyn std::error::Error + Send + Sync>;
+
+/// Does what is due.
+pub type DueHandler<'a> = &'a mut dyn FnMut(Due, &mut Learner) -> Result<(), DueError>;
+
 /// Why the session ended early.
 #[derive(Debug, Error)]
-pub enum SessionError<E> {
+pub enum SessionError {
     /// The learner failed.
     #[error(transparent)]
     Learner(#[from] LearnerError),
@@ -43,7 +49,7 @@ pub enum SessionError<E> {
     Transport(#[from] TransportError),
     /// What was due could not be done.
     #[error(transparent)]
-    Due(E),
+    Due(DueError),
 }
 
 /// A learner with its ends of the transport.
@@ -63,7 +69,7 @@ impl<R: SegmentReceiver, P: ParameterPublisher> Session<R, P> {
     ///
     /// # Errors
     /// If publishing fails.
-    pub fn start<E>(learner: Learner, receiver: R, publisher: P) -> Result<Self, SessionError<E>> {
+    pub fn start(learner: Learner, receiver: R, publisher: P) -> Result<Self, SessionError> {
         let segment = Segment::zeroed(learner.policy().layout());
         let mut session = Self {
             updates_published: learner.counters.updates,
@@ -81,7 +87,7 @@ impl<R: SegmentReceiver, P: ParameterPublisher> Session<R, P> {
     ///
     /// # Errors
     /// If publishing fails.
-    pub fn publish<E>(&mut self) -> Result<(), SessionError<E>> {
+    pub fn publish(&mut self) -> Result<(), SessionError> {
         self.publisher.publish(self.learner.next_snapshot()?)?;
         self.updates_published = self.learner.counters.updates;
         let warm_up = self.learner.config().exploration.warm_up_steps;
@@ -94,17 +100,15 @@ impl<R: SegmentReceiver, P: ParameterPublisher> Session<R, P> {
     /// # Errors
     /// If the transport fails.
     pub fn maintain(&mut self) -> Result<(), TransportError> {
-        self.receiver.maintain()
+        self.receiver.maintain()?;
+        self.publisher.maintain()
     }
 
     /// Takes at most one segment, or does at most one update.
     ///
     /// # Errors
     /// If learner or transport fail, or `due` does.
-    pub fn turn<E>(
-        &mut self,
-        due: &mut dyn FnMut(Due, &mut Learner) -> Result<(), E>,
-    ) -> Result<Turn, SessionError<E>> {
+    pub fn turn(&mut self, due: DueHandler<'_>) -> Result<Turn, SessionError> {
         if self.learner.may_take() && self.receiver.try_receive(&mut self.segment)? {
             self.take(due)?;
             return Ok(Turn::Worked);
@@ -124,11 +128,7 @@ impl<R: SegmentReceiver, P: ParameterPublisher> Session<R, P> {
     ///
     /// # Errors
     /// As [`Session::turn`].
-    pub fn drain<E>(
-        &mut self,
-        due: &mut dyn FnMut(Due, &mut Learner) -> Result<(), E>,
-        segments_max: usize,
-    ) -> Result<(), SessionError<E>> {
+    pub fn drain(&mut self, due: DueHandler<'_>, segments_max: usize) -> Result<(), SessionError> {
         for _ in 0..segments_max {
             if self.learner.has_all_steps() || !self.receiver.try_receive(&mut self.segment)? {
                 break;
@@ -138,10 +138,7 @@ impl<R: SegmentReceiver, P: ParameterPublisher> Session<R, P> {
         Ok(())
     }
 
-    fn take<E>(
-        &mut self,
-        due: &mut dyn FnMut(Due, &mut Learner) -> Result<(), E>,
-    ) -> Result<(), SessionError<E>> {
+    fn take(&mut self, due: DueHandler<'_>) -> Result<(), SessionError> {
         let before = self.learner.counters.env_steps;
         // A refused segment is counted by reason; the metrics show it.
         if self.learner.insert(&self.segment).is_err() {
@@ -173,8 +170,6 @@ impl<R: SegmentReceiver, P: ParameterPublisher> Session<R, P> {
 
 #[cfg(test)]
 mod tests {
-    use std::convert::Infallible;
-
     use dmprl_shared::config::Layers;
     use dmprl_shared::parameters::ParameterSnapshot;
     use dmprl_shared::segment::{LAYOUT_VERSION, SegmentHeader, TRUNCATED, block_checksum};
@@ -227,7 +222,7 @@ mod tests {
         };
         let (mut senders, receiver) = in_process::segment_queues(1, CAPACITY, layout);
         let (publisher, subscriber) = in_process::parameter_channel(hash);
-        let session = Session::start::<Infallible>(learner, receiver, publisher).unwrap();
+        let session = Session::start(learner, receiver, publisher).unwrap();
         Run { session, sender: senders.remove(0), subscriber, segment, due: Vec::new() }
     }
 
@@ -243,7 +238,7 @@ mod tests {
             self.session
                 .turn(&mut |what, learner: &mut Learner| {
                     due.push((what, learner.counters.env_steps));
-                    Ok::<_, Infallible>(())
+                    Ok(())
                 })
                 .unwrap()
         }
@@ -329,7 +324,7 @@ mod tests {
     fn a_stop_takes_what_is_queued_and_updates_nothing() {
         let mut run = run(&[("exploration.warm_up_steps", "0")]);
         (0..3).for_each(|_| assert_eq!(run.send(), SendOutcome::Delivered));
-        run.session.drain(&mut |_, _: &mut Learner| Ok::<_, Infallible>(()), 2).unwrap();
+        run.session.drain(&mut |_, _: &mut Learner| Ok(()), 2).unwrap();
         let counters = run.session.learner.counters;
         assert_eq!((counters.segments, counters.updates), (2, 0));
     }

@@ -1,0 +1,274 @@
+//! Stage 1 of 8, the command's side: from task, preset, file, environment and flags to one
+//! configuration.
+
+use std::path::Path;
+
+use anyhow::Context;
+use dmprl_shared::config::{
+    ConfigError, ExperimentConfig, Layers, PRESETS, TASKS, nearest, task_defaults,
+};
+use toml::{Table, Value};
+
+use crate::failure::wrong_use;
+
+const PREFIX: &str = "DMPRL_";
+/// A configuration file is a few kilobytes.
+const FILE_BYTES_MAX: u64 = 1 << 20;
+
+/// One key set by a flag of its own.
+#[derive(Debug)]
+pub(super) struct Flag {
+    /// As typed.
+    pub(super) flag: &'static str,
+    /// The dotted key.
+    pub(super) key: &'static str,
+    /// The value.
+    pub(super) value: Value,
+}
+
+/// Everything that says something about the configuration, lowest precedence first.
+#[derive(Debug)]
+pub(super) struct Sources<'a> {
+    pub(super) task: &'a str,
+    pub(super) preset: &'a str,
+    pub(super) file: Option<&'a Path>,
+    /// All environment variables; those not ours are passed over.
+    pub(super) environment: Vec<(String, String)>,
+    /// `key=value` each, in the order given.
+    pub(super) set: &'a [String],
+    /// Flags say the same as `--set` and are laid over it.
+    pub(super) flags: Vec<Flag>,
+}
+
+/// Merges the sources; every mistake in them is wrong use.
+pub(super) fn merge(sources: Sources<'_>) -> anyhow::Result<ExperimentConfig> {
+    let mut layers = Layers::new();
+    add(&mut layers, sources.task, task_table(sources.task)?)?;
+    let preset = PRESETS.iter().find(|preset| preset.name == sources.preset);
+    let preset = preset.with_context(|| format!("no preset {}", sources.preset))?;
+    add(&mut layers, preset.name, preset.table())?;
+    if let Some(file) = sources.file {
+        add(&mut layers, &file.display().to_string(), read_table(file)?)?;
+    }
+    let mut ours: Vec<_> =
+        sources.environment.into_iter().filter(|(name, _)| name.starts_with(PREFIX)).collect();
+    ours.sort();
+    for (name, text) in ours {
+        let key = name[PREFIX.len()..].to_ascii_lowercase().replace("__", ".");
+        layers.set(&format!("environment variable {name}"), &key, &text).map_err(refuse)?;
+    }
+    for pair in sources.set {
+        let (key, text) = pair.split_once('=').ok_or_else(|| {
+            wrong_use(format!("--set {pair}: expected KEY=VALUE, as in algorithm.batch_size=64"))
+        })?;
+        layers.set("--set", key.trim(), text.trim()).map_err(refuse)?;
+    }
+    for Flag { flag, key, value } in sources.flags {
+        add(&mut layers, flag, nested(key, value))?;
+    }
+    let config = layers.finish().map_err(refuse)?;
+    if config.task.name != sources.task {
+        return Err(wrong_use(format!(
+            "the configuration is for task `{}`, the command line says `{}`; name the same task \
+             or remove task.name",
+            config.task.name, sources.task
+        )));
+    }
+    Ok(config)
+}
+
+/// `ConfigError` is the user's mistake wherever it comes from.
+pub(super) fn refuse(error: ConfigError) -> anyhow::Error {
+    wrong_use(error.to_string())
+}
+
+fn add(layers: &mut Layers, origin: &str, table: Table) -> anyhow::Result<()> {
+    layers.add(origin, table).map_err(refuse)
+}
+
+fn task_table(name: &str) -> anyhow::Result<Table> {
+    if let Some(task) = task_defaults(name) {
+        return Ok(task.table());
+    }
+    if is_gymnasium_id(name) {
+        let mut task = Table::new();
+        task.insert("name".into(), name.into());
+        task.insert("id".into(), name.into());
+        return Ok(Table::from_iter([("task".to_owned(), Value::Table(task))]));
+    }
+    let near = nearest(&name.to_ascii_lowercase(), TASKS.iter().map(|task| task.name));
+    let advice = near.map_or_else(
+        || "`dmprl tasks` lists those with a short name".to_owned(),
+        |near| format!("did you mean `{near}`?"),
+    );
+    Err(wrong_use(format!(
+        "unknown task `{name}`, {advice}\n  A Gymnasium id ends in its version, as Pendulum-v1 or \
+         my_module:MyArm-v0"
+    )))
+}
+
+/// `[module:][namespace/]Name-vN`.
+fn is_gymnasium_id(text: &str) -> bool {
+    let (module, id) = text.split_once(':').map_or((None, text), |(module, id)| (Some(module), id));
+    let word = |text: &str, also: &str| {
+        text.starts_with(|letter: char| letter.is_ascii_alphanumeric() || letter == '_')
+            && text.chars().all(|letter| {
+                letter.is_ascii_alphanumeric() || letter == '_' || also.contains(letter)
+            })
+    };
+    let (namespace, versioned) =
+        id.split_once('/').map_or((None, id), |(namespace, name)| (Some(namespace), name));
+    let Some((name, version)) = versioned.rsplit_once("-v") else { return false };
+    module.is_none_or(|module| word(module, "."))
+        && namespace.is_none_or(|namespace| word(namespace, "-"))
+        && word(name, ".-")
+        && !version.is_empty()
+        && version.chars().all(|letter| letter.is_ascii_digit())
+}
+
+fn read_table(path: &Path) -> anyhow::Result<Table> {
+    let refused = |what: String| wrong_use(format!("--config {}: {what}", path.display()));
+    let metadata = std::fs::metadata(path).map_err(|error| refused(error.to_string()))?;
+    if !metadata.is_file() || metadata.len() > FILE_BYTES_MAX {
+        return Err(refused(format!("expected a file of at most {FILE_BYTES_MAX} bytes")));
+    }
+    let text = std::fs::read_to_string(path).map_err(|error| refused(error.to_string()))?;
+    text.parse().map_err(|error: toml::de::Error| refused(error.to_string()))
+}
+
+fn nested(key: &str, value: Value) -> Table {
+    let mut names: Vec<&str> = key.split('.').collect();
+    let last = names.pop().unwrap_or_default();
+    let leaf = Table::from_iter([(last.to_owned(), value)]);
+    names
+        .into_iter()
+        .rev()
+        .fold(leaf, |inner, name| Table::from_iter([(name.to_owned(), Value::Table(inner))]))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::failure::WrongUse;
+    use std::io::Write;
+
+    fn sources(task: &str) -> Sources<'_> {
+        Sources {
+            task,
+            preset: "default",
+            file: None,
+            environment: Vec::new(),
+            set: &[],
+            flags: Vec::new(),
+        }
+    }
+
+    fn variable(name: &str, value: &str) -> (String, String) {
+        (name.to_owned(), value.to_owned())
+    }
+
+    fn refused(sources: Sources<'_>) -> String {
+        let error = merge(sources).unwrap_err();
+        assert!(error.downcast_ref::<WrongUse>().is_some(), "{error:#}");
+        error.to_string()
+    }
+
+    /// One more source each time, each with a value of its own for the same key: the last wins.
+    #[test]
+    fn each_layer_overrides_the_one_before() {
+        let mut file = tempfile::NamedTempFile::new().unwrap();
+        writeln!(file, "[run]\nsteps = 3").unwrap();
+        let set = ["run.steps=5".to_owned()];
+        let mut merged = Vec::new();
+        for layers in 0..5 {
+            let mut sources = sources("pusher");
+            // The paper's preset does not set run.steps: its own key shows that it is below.
+            sources.preset = if layers >= 1 { "paper" } else { "default" };
+            sources.file = (layers >= 1).then_some(file.path());
+            sources.environment = vec![variable("HOME", "/root")];
+            if layers >= 2 {
+                sources.environment.push(variable("DMPRL_RUN__STEPS", "4"));
+            }
+            sources.set = if layers >= 3 { &set } else { &[] };
+            if layers >= 4 {
+                let value = Value::Integer(6);
+                sources.flags.push(Flag { flag: "--steps", key: "run.steps", value });
+            }
+            merged.push(merge(sources).unwrap().run.steps);
+        }
+        assert_eq!(merged, [200_000, 3, 4, 5, 6]);
+    }
+
+    #[test]
+    fn a_file_overrides_the_preset_and_the_preset_the_task() {
+        let mut file = tempfile::NamedTempFile::new().unwrap();
+        writeln!(file, "[dmp]\nalpha_y = 12").unwrap();
+        let mut paper = sources("reacher");
+        paper.preset = "paper";
+        assert_eq!(merge(paper).unwrap().dmp.alpha_y, 25.0);
+        let mut with_file = sources("reacher");
+        with_file.preset = "paper";
+        with_file.file = Some(file.path());
+        assert_eq!(merge(with_file).unwrap().dmp.alpha_y, 12.0);
+    }
+
+    #[test]
+    fn an_environment_variable_that_is_no_key_is_refused_with_the_nearest() {
+        let mut sources = sources("reacher");
+        sources.environment = vec![variable("DMPRL_ALGORITHM__BACH_SIZE", "64")];
+        let message = refused(sources);
+        assert!(message.contains("DMPRL_ALGORITHM__BACH_SIZE"), "{message}");
+        assert!(message.contains("did you mean `algorithm.batch_size`"), "{message}");
+    }
+
+    #[test]
+    fn an_unknown_task_is_refused_with_the_nearest_name() {
+        for name in ["reachr", "Reacher", "pushr"] {
+            assert!(refused(sources(name)).contains("did you mean `"), "{name}");
+        }
+        for name in ["", "zzz", "../etc-v1", "a b-v1", "os;x:Y-v1", "Y-v", "Y-v1.0"] {
+            assert!(refused(sources(name)).contains("unknown task"), "{name}");
+        }
+    }
+
+    #[test]
+    fn gymnasium_ids_are_tasks() {
+        for name in ["Pendulum-v1", "my.module:Arm-v0", "ALE/Pong-v5", "a:b/C.d-e-v12"] {
+            let config = merge(sources(name)).unwrap();
+            assert_eq!((config.task.id.as_str(), config.task.name.as_str()), (name, name));
+        }
+    }
+
+    #[test]
+    fn a_configuration_for_another_task_is_refused() {
+        let mut file = tempfile::NamedTempFile::new().unwrap();
+        writeln!(file, "[task]\nname = 'pusher'\nid = 'Pusher-v5'").unwrap();
+        let mut sources = sources("reacher");
+        sources.file = Some(file.path());
+        assert!(refused(sources).contains("`pusher`"));
+    }
+
+    #[test]
+    fn a_runs_own_configuration_gives_the_same_run_again() {
+        let parent = tempfile::tempdir().unwrap();
+        let limits = dmprl_shared::config::Limits { cores: 4 };
+        let mut first = sources("pusher");
+        first.preset = "paper";
+        let config = merge(first).unwrap().resolve(limits).unwrap();
+        let manifest = crate::run_directory::Manifest::new(None).unwrap();
+        let path = parent.path().join("run");
+        crate::run_directory::RunDirectory::create(&path, &config, &manifest).unwrap();
+        let file = path.join("config.toml");
+        let mut second = sources("pusher");
+        second.file = Some(&file);
+        assert_eq!(merge(second).unwrap().resolve(limits).unwrap(), config);
+    }
+
+    #[test]
+    fn set_needs_an_equals_sign() {
+        let set = ["run.steps".to_owned()];
+        let mut sources = sources("reacher");
+        sources.set = &set;
+        assert!(refused(sources).contains("KEY=VALUE"));
+    }
+}

@@ -1,0 +1,135 @@
+//! The command line: what may be typed, its help, and who answers.
+
+mod configuration;
+mod eval;
+mod resume;
+mod tasks;
+mod train;
+
+use std::io::Write;
+use std::path::PathBuf;
+use std::process::ExitCode;
+
+use anyhow::Context;
+use clap::{Parser, Subcommand};
+
+use crate::failure::{Outcome, exit_code, render};
+use crate::roles::{self, ActorArgs, EvaluatorArgs, LearnerArgs};
+use crate::terminal::say;
+
+const EXAMPLES: &str = "\
+EXAMPLES
+  dmprl train reacher                      train with the defaults; nothing else is needed
+  dmprl eval runs/reacher-ddpg-dmp-s1-…    how well does its best policy do?
+  dmprl resume runs/reacher-ddpg-dmp-s1-…  go on where it stopped
+  dmprl tasks                              what can be trained
+
+`dmprl COMMAND --help` has the details. Exit status: 0 done, 1 failed, 2 wrong use,
+130 interrupted.";
+
+const ROLES: &str = "\
+ROLES (train starts them; each has --help)
+  learner    replays, updates, publishes policies, writes checkpoints
+  actor      steps environments and sends segments
+  evaluator  evaluates saved policies without noise
+
+";
+
+/// Learns robot manipulation with DMP policies: one learner, many rollout workers.
+#[derive(Debug, Parser)]
+#[command(name = "dmprl", version, after_help = EXAMPLES, after_long_help = long_help())]
+struct Arguments {
+    #[command(subcommand)]
+    command: Command,
+}
+
+#[derive(Debug, Subcommand)]
+enum Command {
+    /// Train a policy on a task.
+    Train(Box<train::TrainArgs>),
+    /// Go on with a run that was stopped or has died.
+    Resume(resume::ResumeArgs),
+    /// Evaluate a run's policy without noise.
+    Eval(eval::EvalArgs),
+    /// List the tasks with a short name.
+    Tasks(tasks::TasksArgs),
+    /// A run's learner process; started by train.
+    #[command(hide = true)]
+    Learner(LearnerArgs),
+    /// A rollout worker process; started by train.
+    #[command(hide = true)]
+    Actor(ActorArgs),
+    /// The process that evaluates; started by train and eval.
+    #[command(hide = true)]
+    Evaluator(EvaluatorArgs),
+}
+
+fn long_help() -> String {
+    format!("{ROLES}{EXAMPLES}")
+}
+
+/// Parses the command line, does what it says, and tells how it ended.
+#[must_use]
+pub fn main() -> ExitCode {
+    // Prints help and version, refuses wrong use with the nearest names and exits with 2.
+    let arguments = Arguments::parse();
+    let result = run(arguments.command);
+    if let Err(error) = &result {
+        say(&render(error));
+    }
+    exit_code(&result)
+}
+
+fn run(command: Command) -> anyhow::Result<Outcome> {
+    match command {
+        Command::Train(args) => train::run(&args),
+        Command::Resume(args) => resume::run(&args),
+        Command::Eval(args) => eval::run(&args),
+        Command::Tasks(args) => tasks::run(&args),
+        Command::Learner(args) => roles::learner(&args).map(|()| Outcome::Done),
+        Command::Actor(args) => roles::actor(&args).map(|()| Outcome::Done),
+        Command::Evaluator(args) => roles::evaluator(&args).map(|()| Outcome::Done),
+    }
+}
+
+/// Prints a result. A reader that has seen enough (`| head`) is no failure.
+fn emit(text: &str) -> anyhow::Result<()> {
+    let mut out = std::io::stdout().lock();
+    match writeln!(out, "{text}").and_then(|()| out.flush()) {
+        Err(error) if error.kind() == std::io::ErrorKind::BrokenPipe => Ok(()),
+        result => result.context("cannot write to standard output"),
+    }
+}
+
+/// Makes sure that Python and our package are there, telling the user what takes time; returns
+/// the virtual environment.
+#[cfg(feature = "python")]
+fn prepare_python() -> anyhow::Result<PathBuf> {
+    let root = crate::project::root()?;
+    Ok(crate::python_setup::ensure(&root, &|line| say(line))?.venv)
+}
+
+#[cfg(not(feature = "python"))]
+fn prepare_python() -> anyhow::Result<PathBuf> {
+    anyhow::bail!("this build is a learner without Python; build it with the feature `python`")
+}
+
+/// Which program plays the roles: every peer is the same build.
+fn this_program() -> anyhow::Result<PathBuf> {
+    std::env::current_exe().context("cannot find this program's own file")
+}
+
+fn cores() -> usize {
+    std::thread::available_parallelism().map_or(1, usize::from)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use clap::CommandFactory;
+
+    #[test]
+    fn the_command_line_is_consistent() {
+        Arguments::command().debug_assert();
+    }
+}

@@ -1,0 +1,72 @@
+//! `dmprl resume`: go on with a run, from its last checkpoint.
+
+use std::path::PathBuf;
+
+use clap::Args;
+use dmprl_shared::config::Limits;
+
+use super::configuration::refuse;
+use super::{cores, prepare_python, this_program};
+use crate::failure::{Outcome, wrong_use};
+use crate::launch::{self, SessionPlan};
+use crate::run_directory::{RunDirectory, Session};
+use crate::terminal::ProgressStyle;
+
+const HELP: &str = "\
+Goes on from the last checkpoint with the run's own config.toml; environment variables and
+presets have no say. A run that has no checkpoint yet begins again.
+
+EXAMPLES
+  dmprl resume runs/reacher-ddpg-dmp-s1-20260131-120000
+  dmprl resume runs/mine --steps 120000    # longer than first asked for";
+
+/// Arguments of `dmprl resume`.
+#[derive(Debug, Args)]
+#[command(after_help = HELP)]
+pub(super) struct ResumeArgs {
+    /// The run directory.
+    run: PathBuf,
+    /// New length of the whole run [environment steps].
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(i64).range(1..))]
+    steps: Option<i64>,
+    /// Lines instead of a progress bar.
+    #[arg(long)]
+    no_progress: bool,
+}
+
+pub(super) fn run(args: &ResumeArgs) -> anyhow::Result<Outcome> {
+    let run = RunDirectory::open(&args.run)?;
+    let mut config = run.config()?.resolve(Limits { cores: cores() }).map_err(refuse)?;
+    let steps_before = config.run.steps;
+    if let Some(steps) = args.steps {
+        config.run.steps = steps.unsigned_abs();
+    }
+    for path in &config.task.python_path {
+        if !std::path::Path::new(path).is_dir() {
+            return Err(wrong_use(format!(
+                "the run's environments were in {path}, which is gone; put it back or change \
+                 task.python_path in {}",
+                run.path().join("config.toml").display()
+            )));
+        }
+    }
+    let venv = prepare_python()?;
+    // Before the lock, which children inherit: git is one.
+    let session = Session::now();
+    let lock = run.lock(launch::RESUME_WAIT)?;
+    let mut manifest = run.manifest()?;
+    manifest.sessions.push(session);
+    run.write_manifest(&manifest)?;
+    if config.run.steps != steps_before {
+        run.write_config(&config)?;
+    }
+    launch::session(SessionPlan {
+        program: this_program()?,
+        run,
+        lock,
+        config,
+        venv: Some(venv),
+        resume: true,
+        progress: ProgressStyle::from_flag(args.no_progress),
+    })
+}

@@ -1,0 +1,233 @@
+//! `dmprl train`: from the command line to a run directory, then over to `launch`.
+
+use std::path::{Path, PathBuf};
+use std::time::{Duration, SystemTime};
+
+use anyhow::Context;
+use clap::Args;
+use clap::builder::PossibleValuesParser;
+use dmprl_shared::config::{AlgorithmName, ExperimentConfig, Limits, PRESETS, PolicyKind};
+use toml::Value;
+
+use super::configuration::{Flag, Sources, merge, refuse};
+use super::{cores, prepare_python, this_program};
+use crate::failure::{Outcome, wrong_use};
+use crate::launch::{self, SessionPlan};
+use crate::run_directory::{Manifest, PolicyChoice, RunDirectory, compact, safe_name};
+use crate::terminal::ProgressStyle;
+
+/// A second run of the same second gets a number; more than this is a stuck clock.
+const SAME_SECOND_MAX: usize = 100;
+
+const HELP: &str = "\
+PRECEDENCE, lowest first: the task's defaults, --preset, --config, environment variables
+(DMPRL_ALGORITHM__BATCH_SIZE=64 sets algorithm.batch_size), --set, the flags above.
+Ctrl-C once: checkpoint and a clean end within 10 s; twice: at once.
+
+EXAMPLES
+  dmprl train reacher
+  dmprl train pusher --steps 100000 --workers 4 --seed 2
+  dmprl train reacher --policy mlp --run-dir runs/baseline
+  dmprl train reacher --preset paper --set exploration.std=0.2
+  dmprl train reacher --until-return -5 --max-minutes 30
+  dmprl train reacher --config runs/baseline/config.toml --deterministic
+  dmprl train my_module:MyArm-v0 --python-path ./envs --init-from runs/baseline";
+
+/// Arguments of `dmprl train`.
+#[derive(Debug, Args)]
+#[command(after_help = HELP)]
+pub(super) struct TrainArgs {
+    /// A task of `dmprl tasks`, or any Gymnasium id: Pendulum-v1, my_module:MyArm-v0.
+    task: String,
+    /// Learning algorithm.
+    #[arg(long, value_parser = PossibleValuesParser::new(["ddpg"]))]
+    algo: Option<String>,
+    /// What decides the actions: a DMP per segment, or a network per step.
+    #[arg(long, value_parser = PossibleValuesParser::new(["dmp", "mlp"]))]
+    policy: Option<String>,
+    /// Named set of values.
+    #[arg(long, default_value = "default",
+          value_parser = PossibleValuesParser::new(PRESETS.iter().map(|preset| preset.name)))]
+    preset: String,
+    /// Rollout processes [default: cores - 1].
+    #[arg(long, value_name = "N")]
+    workers: Option<u32>,
+    /// Environments in each worker.
+    #[arg(long, value_name = "E")]
+    envs_per_worker: Option<u32>,
+    /// Environment steps, all workers together.
+    #[arg(long, value_name = "N", value_parser = integer())]
+    steps: Option<i64>,
+    /// Seed of every random stream of the run.
+    #[arg(long, value_name = "S", value_parser = integer())]
+    seed: Option<i64>,
+    /// Where the results go; new or empty [default: runs/TASK-ALGO-POLICY-sSEED-TIME].
+    #[arg(long, value_name = "DIR")]
+    run_dir: Option<PathBuf>,
+    /// One process in lock-step: the same seed gives the same bytes.
+    #[arg(long)]
+    deterministic: bool,
+    /// Where the update runs.
+    #[arg(long, value_parser = PossibleValuesParser::new(["cpu"]))]
+    device: Option<String>,
+    /// Threads of the update.
+    #[arg(long, value_name = "N")]
+    threads: Option<u32>,
+    /// Start from a run's best policy, or from a policy file.
+    #[arg(long, value_name = "RUN|FILE")]
+    init_from: Option<PathBuf>,
+    /// Stop at this mean evaluation return.
+    #[arg(long, value_name = "X", allow_negative_numbers = true)]
+    until_return: Option<f64>,
+    /// Stop at this evaluation success rate, 0 to 1.
+    #[arg(long, value_name = "X")]
+    until_success: Option<f64>,
+    /// Stop after so many minutes of this session.
+    #[arg(long, value_name = "M")]
+    max_minutes: Option<f64>,
+    /// Directory of your own environment modules; repeatable.
+    #[arg(long, value_name = "DIR")]
+    python_path: Vec<PathBuf>,
+    /// Configuration file, such as another run's config.toml.
+    #[arg(long, value_name = "FILE")]
+    config: Option<PathBuf>,
+    /// Set any configuration key; repeatable.
+    #[arg(long, value_name = "KEY=VALUE")]
+    set: Vec<String>,
+    /// Lines instead of a progress bar.
+    #[arg(long)]
+    no_progress: bool,
+}
+
+/// TOML's integers have 64 bits with a sign.
+fn integer() -> clap::builder::RangedI64ValueParser<i64> {
+    clap::value_parser!(i64).range(0..)
+}
+
+pub(super) fn run(args: &TrainArgs) -> anyhow::Result<Outcome> {
+    let sources = Sources {
+        task: &args.task,
+        preset: &args.preset,
+        file: args.config.as_deref(),
+        environment: environment()?,
+        set: &args.set,
+        flags: flags(args)?,
+    };
+    let mut config = merge(sources)?.resolve(Limits { cores: cores() }).map_err(refuse)?;
+    // Absolute, so that the run can be resumed from anywhere.
+    for path in &mut config.task.python_path {
+        *path = absolute_folder(path)?;
+    }
+    let init_from = args.init_from.as_deref().map(policy_file).transpose()?;
+    if let Some(path) = &args.run_dir {
+        RunDirectory::check_free(path)?;
+    }
+    let venv = prepare_python()?;
+    let path = args.run_dir.clone().map_or_else(|| default_path(&config), Ok)?;
+    let manifest = Manifest::new(init_from.map(|path| path.display().to_string()))?;
+    let run = RunDirectory::create(&path, &config, &manifest)?;
+    let lock = run.lock(Duration::ZERO)?;
+    launch::session(SessionPlan {
+        program: this_program()?,
+        run,
+        lock,
+        config,
+        venv: Some(venv),
+        resume: false,
+        progress: ProgressStyle::from_flag(args.no_progress),
+    })
+}
+
+fn flags(args: &TrainArgs) -> anyhow::Result<Vec<Flag>> {
+    let text = |value: &Option<String>| value.clone().map(Value::String);
+    let count = |value: Option<u32>| value.map(|value| Value::Integer(value.into()));
+    let whole = |value: Option<i64>| value.map(Value::Integer);
+    let number = |value: Option<f64>| value.map(Value::Float);
+    let pairs = [
+        ("--algo", "algorithm.name", text(&args.algo)),
+        ("--policy", "policy.kind", text(&args.policy)),
+        ("--workers", "actors.workers", count(args.workers)),
+        ("--envs-per-worker", "actors.envs_per_worker", count(args.envs_per_worker)),
+        ("--steps", "run.steps", whole(args.steps)),
+        ("--seed", "run.seed", whole(args.seed)),
+        ("--deterministic", "run.deterministic", args.deterministic.then_some(true.into())),
+        ("--device", "learner.device", text(&args.device)),
+        ("--threads", "learner.threads", count(args.threads)),
+        ("--until-return", "run.until_return", number(args.until_return)),
+        ("--until-success", "run.until_success", number(args.until_success)),
+        ("--max-minutes", "run.max_minutes", number(args.max_minutes)),
+        ("--python-path", "task.python_path", python_path(&args.python_path)?),
+    ];
+    let given =
+        pairs.into_iter().filter_map(|(flag, key, value)| Some(Flag { flag, key, value: value? }));
+    Ok(given.collect())
+}
+
+fn python_path(paths: &[PathBuf]) -> anyhow::Result<Option<Value>> {
+    let texts = paths.iter().map(|path| {
+        let text = path.to_str().map(|text| Value::String(text.to_owned()));
+        text.ok_or_else(|| wrong_use(format!("--python-path {}: no UTF-8", path.display())))
+    });
+    let texts = texts.collect::<anyhow::Result<Vec<_>>>()?;
+    Ok((!texts.is_empty()).then_some(Value::Array(texts)))
+}
+
+fn absolute_folder(path: &str) -> anyhow::Result<String> {
+    let absolute = std::fs::canonicalize(path)
+        .map_err(|error| wrong_use(format!("python path {path}: {error}")))?;
+    if !absolute.is_dir() {
+        return Err(wrong_use(format!("python path {path} is no directory")));
+    }
+    absolute.into_os_string().into_string().map_err(|_| wrong_use(format!("{path}: no UTF-8")))
+}
+
+/// `DMPRL_` variables must be text; others may be anything and are none of our business.
+fn environment() -> anyhow::Result<Vec<(String, String)>> {
+    let mut texts = Vec::new();
+    for (name, value) in std::env::vars_os() {
+        let Ok(name) = name.into_string() else { continue };
+        match value.into_string() {
+            Ok(value) => texts.push((name, value)),
+            Err(_) if name.starts_with("DMPRL_") => {
+                return Err(wrong_use(format!("environment variable {name} is no UTF-8")));
+            }
+            Err(_) => {}
+        }
+    }
+    Ok(texts)
+}
+
+/// The policy that a run or a file stands for.
+fn policy_file(path: &Path) -> anyhow::Result<PathBuf> {
+    let file = if path.is_dir() {
+        RunDirectory::open(path)?.choose_policy(PolicyChoice::Best)?.path
+    } else if path.is_file() {
+        path.to_owned()
+    } else {
+        return Err(wrong_use(format!(
+            "--init-from {}: expected a run directory or a policy file",
+            path.display()
+        )));
+    };
+    std::fs::canonicalize(&file).with_context(|| format!("cannot resolve {}", file.display()))
+}
+
+fn default_path(config: &ExperimentConfig) -> anyhow::Result<PathBuf> {
+    let algorithm = match config.algorithm.name {
+        AlgorithmName::Ddpg => "ddpg",
+    };
+    let policy = match config.policy.kind {
+        PolicyKind::Dmp => "dmp",
+        PolicyKind::Mlp => "mlp",
+    };
+    let (task, seed) = (safe_name(&config.task.name), config.run.seed);
+    let name = format!("{task}-{algorithm}-{policy}-s{seed}-{}", compact(SystemTime::now()));
+    let candidates = (1..=SAME_SECOND_MAX).map(|number| match number {
+        1 => Path::new("runs").join(&name),
+        _ => Path::new("runs").join(format!("{name}-{number}")),
+    });
+    candidates
+        .into_iter()
+        .find(|path| !path.exists())
+        .with_context(|| format!("{SAME_SECOND_MAX} runs named {name} exist; give --run-dir"))
+}

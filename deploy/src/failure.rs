@@ -1,0 +1,79 @@
+//! How a command ends: its outcome, its exit status, and what a failure looks like on screen.
+
+use std::fmt::{self, Display, Formatter};
+use std::process::ExitCode;
+
+/// A command that did not fail.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Outcome {
+    /// Everything asked for is done.
+    Done,
+    /// The user stopped it.
+    Interrupted,
+}
+
+/// The user asked for something that cannot be: exit status 2 instead of 1.
+#[derive(Debug)]
+pub struct WrongUse(pub String);
+
+impl Display for WrongUse {
+    fn fmt(&self, formatter: &mut Formatter<'_>) -> fmt::Result {
+        formatter.write_str(&self.0)
+    }
+}
+
+impl std::error::Error for WrongUse {}
+
+/// An error of the user's making.
+pub fn wrong_use(message: impl Into<String>) -> anyhow::Error {
+    WrongUse(message.into()).into()
+}
+
+/// The exit status that scripts rely on: 0 done, 1 failed, 2 wrong use, 130 interrupted.
+#[must_use]
+pub fn exit_code(result: &anyhow::Result<Outcome>) -> ExitCode {
+    ExitCode::from(match result {
+        Ok(Outcome::Done) => 0,
+        Ok(Outcome::Interrupted) => 130,
+        Err(error) if error.downcast_ref::<WrongUse>().is_some() => 2,
+        Err(_) => 1,
+    })
+}
+
+/// `error: what`, then each cause on a line of its own.
+#[must_use]
+pub fn render(error: &anyhow::Error) -> String {
+    let mut text = format!("error: {error}");
+    // A cause that its parent already quotes is no news.
+    let mut last = error.to_string();
+    for cause in error.chain().skip(1).map(ToString::to_string) {
+        if !last.contains(&cause) {
+            text.push_str("\n  because: ");
+            text.push_str(&cause.replace('\n', "\n  "));
+        }
+        last = cause;
+    }
+    text
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use anyhow::Context;
+
+    #[test]
+    fn the_chain_of_causes_is_shown_without_debug_dumps() {
+        let error = Err::<(), _>(std::io::Error::other("disk full"))
+            .context("cannot write a/b")
+            .unwrap_err();
+        assert_eq!(render(&error), "error: cannot write a/b\n  because: disk full");
+    }
+
+    #[test]
+    fn wrong_use_is_told_from_failure_below_context_too() {
+        let error = Err::<Outcome, _>(wrong_use("no such task")).context("cannot train");
+        assert_eq!(exit_code(&error), ExitCode::from(2));
+        assert_eq!(exit_code(&Err(anyhow::anyhow!("x"))), ExitCode::from(1));
+        assert_eq!(exit_code(&Ok(Outcome::Interrupted)), ExitCode::from(130));
+    }
+}

@@ -1,0 +1,150 @@
+//! One child process: its commands go in, its reports and its end come out as events.
+
+use std::os::unix::process::ExitStatusExt;
+use std::process::ExitStatus;
+use std::sync::Arc;
+use std::time::Duration;
+
+use anyhow::Context;
+use tokio::io::{AsyncBufReadExt, AsyncReadExt, AsyncWriteExt, BufReader};
+use tokio::process::{ChildStdin, ChildStdout};
+use tokio::sync::{Notify, mpsc};
+
+use super::Process;
+use crate::control::{Command, Report};
+
+/// Events not yet handled; full: children wait, their pipes fill.
+pub(super) const EVENTS_MAX: usize = 1_024;
+/// Commands not yet written; a child that takes none of so many is stuck.
+const COMMANDS_MAX: usize = 64;
+/// A longer line is no report.
+const LINE_BYTES_MAX: u64 = 1 << 20;
+/// After a child's exit its last reports are read for so long: a grandchild may hold the pipe.
+const LAST_REPORTS: Duration = Duration::from_secs(1);
+
+/// What a child did.
+#[derive(Debug)]
+pub(super) enum Event {
+    Report(Process, Report),
+    /// It wrote a line that is no report.
+    Garbage(Process, String),
+    /// It is gone, and everything it reported has been handed over.
+    Exited(Process, ExitStatus),
+}
+
+/// A running child. Dropping it kills the process when the runtime ends.
+#[derive(Debug)]
+pub(super) struct Child {
+    commands: mpsc::Sender<Command>,
+    kill: Arc<Notify>,
+}
+
+impl Child {
+    /// Starts the command, whose three streams the launcher has set.
+    pub(super) fn spawn(
+        command: std::process::Command,
+        process: Process,
+        events: mpsc::Sender<Event>,
+    ) -> anyhow::Result<Self> {
+        let mut command = tokio::process::Command::from(command);
+        command.kill_on_drop(true);
+        let mut child = command.spawn().with_context(|| {
+            format!("cannot start {process} ({:?})", command.as_std().get_program())
+        })?;
+        let input = child.stdin.take().context("a child without standard input")?;
+        let output = child.stdout.take().context("a child without standard output")?;
+        let (commands, receiver) = mpsc::channel(COMMANDS_MAX);
+        tokio::spawn(write_commands(input, receiver));
+        let mut reader = tokio::spawn(read_reports(output, process, events.clone()));
+        let kill = Arc::new(Notify::new());
+        let killed = Arc::clone(&kill);
+        tokio::spawn(async move {
+            let status = loop {
+                tokio::select! {
+                    status = child.wait() => break status,
+                    // An error means that it has just ended: `wait` will say so.
+                    () = killed.notified() => drop(child.start_kill()),
+                }
+            };
+            if tokio::time::timeout(LAST_REPORTS, &mut reader).await.is_err() {
+                reader.abort();
+            }
+            // Waiting fails only for a process that is no child of ours any more.
+            let status = status.unwrap_or_else(|_| ExitStatus::from_raw(0xff00));
+            // Nobody listens when the supervisor has given up: nothing left to tell.
+            let _ = events.send(Event::Exited(process, status)).await;
+        });
+        Ok(Self { commands, kill })
+    }
+
+    /// Sends a command without waiting; false when the child takes none.
+    pub(super) fn send(&self, command: Command) -> bool {
+        self.commands.try_send(command).is_ok()
+    }
+
+    /// SIGKILL; the exit comes as an event.
+    pub(super) fn kill(&self) {
+        self.kill.notify_one();
+    }
+}
+
+/// Until nobody sends commands or nobody reads them, of which the exit event tells.
+async fn write_commands(mut input: ChildStdin, mut commands: mpsc::Receiver<Command>) {
+    while let Some(command) = commands.recv().await {
+        let Ok(mut line) = serde_json::to_vec(&command) else { return };
+        line.push(b'\n');
+        if input.write_all(&line).await.is_err() {
+            return;
+        }
+    }
+}
+
+async fn read_reports(output: ChildStdout, process: Process, events: mpsc::Sender<Event>) {
+    let mut reader = BufReader::new(output);
+    let mut line = Vec::new();
+    loop {
+        line.clear();
+        match (&mut reader).take(LINE_BYTES_MAX).read_until(b'\n', &mut line).await {
+            Ok(read) if read > 0 => {}
+            _ => return,
+        }
+        let event = match serde_json::from_slice(&line) {
+            Ok(report) => Event::Report(process, report),
+            Err(_) => Event::Garbage(process, String::from_utf8_lossy(&line).trim().to_owned()),
+        };
+        if events.send(event).await.is_err() {
+            return;
+        }
+    }
+}
+
+/// `exit status 3`, `signal 9 (SIGKILL), perhaps for want of memory`.
+pub(super) fn describe(status: ExitStatus) -> String {
+    let signal = match (status.code(), status.signal()) {
+        (Some(code), _) => return format!("exit status {code}"),
+        (None, Some(signal)) => signal,
+        (None, None) => return status.to_string(),
+    };
+    let name = match signal {
+        4 => " (SIGILL), an instruction this processor lacks",
+        6 => " (SIGABRT)",
+        7 => " (SIGBUS), perhaps because shared memory (/dev/shm) is full",
+        9 => " (SIGKILL), perhaps for want of memory",
+        11 => " (SIGSEGV), a fault in native code",
+        15 => " (SIGTERM)",
+        _ => "",
+    };
+    format!("signal {signal}{name}")
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn an_end_is_described_with_its_likely_cause() {
+        assert_eq!(describe(ExitStatus::from_raw(3 << 8)), "exit status 3");
+        assert!(describe(ExitStatus::from_raw(9)).contains("SIGKILL"));
+        assert!(describe(ExitStatus::from_raw(7)).contains("/dev/shm"));
+    }
+}

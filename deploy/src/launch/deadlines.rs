@@ -1,0 +1,153 @@
+//! The supervisor's clock: when the next deadline is, and what is done when one has passed.
+
+use std::time::{Duration, Instant};
+
+use anyhow::{anyhow, bail};
+
+use super::Process;
+use super::endings::log_tail;
+use super::supervisor::{Phase, Running, Supervisor};
+use crate::terminal::shown;
+
+/// The supervisor looks around at least so often.
+const IDLE: Duration = Duration::from_secs(60);
+
+impl Supervisor {
+    pub(super) fn next_deadline(&self) -> Instant {
+        let mut deadlines = vec![Instant::now() + IDLE];
+        match self.phase {
+            Phase::Stopping { deadline, .. } => return deadline,
+            Phase::Draining { deadline } | Phase::Finishing { deadline } => {
+                if self.running(Process::Learner).is_some() {
+                    deadlines.push(deadline);
+                }
+            }
+            Phase::Training => {
+                deadlines.extend(self.time_is_up());
+                deadlines.extend(self.stalled());
+            }
+        }
+        deadlines.extend(self.evaluations.deadline());
+        deadlines.extend(self.slots.values().filter_map(|slot| slot.restart_at));
+        deadlines.extend(self.starting().map(|(_, running)| running.spawned + self.limits.ready));
+        deadlines.into_iter().min().unwrap_or_else(Instant::now)
+    }
+
+    pub(super) fn on_time(&mut self, now: Instant) -> anyhow::Result<()> {
+        match self.phase {
+            Phase::Stopping { deadline, killed } => {
+                if now >= deadline && killed {
+                    self.abandon();
+                } else if now >= deadline {
+                    self.kill_all("not ended in time");
+                }
+                return Ok(());
+            }
+            Phase::Draining { deadline } | Phase::Finishing { deadline } => {
+                self.check_learner_ends(now, deadline)?;
+            }
+            Phase::Training => self.check_training(now)?,
+        }
+        self.restart_due(now)?;
+        self.check_ready(now)?;
+        self.check_evaluation(now);
+        Ok(())
+    }
+
+    /// Counted from the session's start, but nothing to end before the learner is there.
+    fn time_is_up(&self) -> Option<Instant> {
+        if !self.learner_ready {
+            return None;
+        }
+        let seconds = self.config.run.max_minutes * 60.0;
+        let limit = Duration::try_from_secs_f64(seconds).ok()?;
+        self.started.checked_add(limit)
+    }
+
+    /// A learner that is ready and neither steps nor updates: workers hang, or it does.
+    /// One process neither steps nor updates while it evaluates.
+    fn stalled(&self) -> Option<Instant> {
+        let episodes = if self.is_one_process() { self.config.evaluation.episodes } else { 0 };
+        let limit = self.limits.stall + self.limits.evaluation_of(episodes);
+        self.learner_ready.then(|| self.advanced + limit)
+    }
+
+    fn check_training(&mut self, now: Instant) -> anyhow::Result<()> {
+        if self.stalled().is_some_and(|deadline| now >= deadline) {
+            let logs = self.launcher.run.path().join("logs");
+            bail!(
+                "neither a step nor an update for {:?}: workers or learner hang; see {}",
+                self.limits.stall,
+                shown(&logs)
+            );
+        }
+        if self.time_is_up().is_some_and(|deadline| now >= deadline) {
+            self.drain("run.max_minutes are over");
+        }
+        Ok(())
+    }
+
+    fn check_learner_ends(&mut self, now: Instant, deadline: Instant) -> anyhow::Result<()> {
+        let Some(learner) = self.running(Process::Learner).filter(|_| now >= deadline) else {
+            return Ok(());
+        };
+        learner.child.kill();
+        let limit = self.limits.drain;
+        if !self.finished {
+            bail!("learner did not come to its end within {limit:?}: killed it");
+        }
+        self.display.message(&format!("learner did not exit within {limit:?}: killed it"));
+        // Its exit follows; until then no second message.
+        self.phase = Phase::Finishing { deadline: now + self.limits.kill };
+        Ok(())
+    }
+
+    fn restart_due(&mut self, now: Instant) -> anyhow::Result<()> {
+        let due: Vec<Process> = self
+            .slots
+            .iter()
+            .filter(|(_, slot)| slot.restart_at.is_some_and(|at| now >= at))
+            .map(|(process, _)| *process)
+            .collect();
+        due.into_iter().try_for_each(|process| self.spawn(process))
+    }
+
+    /// Children that are not ready and still needed: a worker is not when the learner is done.
+    fn starting(&self) -> impl Iterator<Item = (Process, &Running)> {
+        let needless = move |process| self.finished && matches!(process, Process::Actor(_));
+        self.all_running().filter(move |(process, running)| !running.ready && !needless(*process))
+    }
+
+    fn check_ready(&mut self, now: Instant) -> anyhow::Result<()> {
+        let limit = self.limits.ready;
+        let late = self
+            .starting()
+            .filter(|(_, running)| now >= running.spawned + limit)
+            .map(|(process, _)| process);
+        for process in late.collect::<Vec<_>>() {
+            let Some(slot) = self.slots.get_mut(&process) else { continue };
+            let Some(running) = slot.running.as_mut() else { continue };
+            running.child.kill();
+            if slot.restarts == 0 {
+                let tail = log_tail(&self.log_path(process));
+                return Err(anyhow!("{process} was not ready within {limit:?}{tail}"));
+            }
+            // Its exit counts as one more death. Until that event, it is late only once.
+            running.spawned = now;
+            self.display.message(&format!("{process} was not ready within {limit:?}: killed it"));
+        }
+        Ok(())
+    }
+
+    fn check_evaluation(&mut self, now: Instant) {
+        if self.evaluations.deadline().is_none_or(|deadline| now < deadline) {
+            return;
+        }
+        // Sent again when the evaluator is back, with a deadline of its own.
+        self.evaluations.send_again();
+        self.display.message("the evaluation takes too long: killing the evaluator");
+        if let Some(running) = self.running(Process::Evaluator) {
+            running.child.kill();
+        }
+    }
+}

@@ -1,0 +1,36 @@
+//! Stage 2 of 8: the processes of a run, from the first start to the last exit.
+//!
+//! ```text
+//!  train ─► session ─► supervisor ─┬─ actor × N      environment_ready … attach
+//!             │                    ├─ learner        from the first environment_ready on
+//!          domain, lock            └─ evaluator      from learner_ready on
+//! ```
+//! With `run.deterministic` there is one child, `learner --one-process`, which does everything.
+//!
+//! Who ends whom: a child ignores terminal signals and ends on `stop` or at the end of its
+//! standard input, which the death of the supervisor brings about, whatever killed it. No
+//! parent-death signal is used: it would kill the learner before its last checkpoint. The run's
+//! lock is inherited, so a `resume` waits for such an orphan.
+//!
+//! Every wait has a limit in [`TimeLimits`]. The supervisor itself is one loop over events,
+//! interrupts and the next deadline; it never waits anywhere else.
+
+mod child;
+mod deadlines;
+mod domain;
+mod endings;
+mod evaluate;
+mod evaluations;
+mod launcher;
+mod limits;
+mod reports;
+mod session;
+mod signals;
+mod supervisor;
+
+pub use evaluate::{EvaluationPlan, evaluate};
+pub use launcher::{Launcher, Process};
+pub use limits::TimeLimits;
+pub use session::{RESUME_WAIT, SessionPlan, session};
+pub use signals::interrupts;
+pub use supervisor::{Ending, SessionReport, SupervisorPlan, supervise};

@@ -1,0 +1,180 @@
+//! What the supervisor does about what its children say.
+
+use std::time::Instant;
+
+use anyhow::{bail, ensure};
+use dmprl_shared::spec::EnvSpec;
+
+use super::Process;
+use super::child::Event;
+use super::supervisor::{Phase, Supervisor};
+use crate::control::{Command, EvaluationRequest, EvaluationRow, Progress, Report};
+use crate::terminal::grouped;
+
+/// Lines that are no reports, shown to the user; the rest is only counted.
+const GARBAGE_SHOWN_MAX: u32 = 3;
+
+impl Supervisor {
+    pub(super) fn on_event(&mut self, event: Event) -> anyhow::Result<()> {
+        match event {
+            Event::Report(process, report) => self.on_report(process, report),
+            Event::Exited(process, status) => self.on_exit(process, status),
+            Event::Garbage(process, line) => {
+                self.garbage += 1;
+                if self.garbage <= GARBAGE_SHOWN_MAX {
+                    let line: String = line.escape_debug().take(200).collect();
+                    self.display.message(&format!("{process} wrote what is no report: {line}"));
+                }
+                Ok(())
+            }
+        }
+    }
+
+    fn on_report(&mut self, process: Process, report: Report) -> anyhow::Result<()> {
+        match report {
+            Report::EnvironmentReady { spec } => return self.on_environment(process, spec),
+            Report::LearnerReady => return self.on_learner_ready(process),
+            Report::FirstSegment => {
+                let seconds = self.started.elapsed().as_secs_f64();
+                self.display.message(&format!("first environment step after {seconds:.1} s"));
+            }
+            Report::Progress(progress) => self.on_progress(progress),
+            Report::Evaluate(request) => self.on_evaluate(request),
+            Report::Evaluated(row) => return self.on_evaluated(process, row),
+            Report::Checkpoint { name } => {
+                let steps = self.last.as_ref().map_or(0, |(_, progress)| progress.env_steps);
+                self.display.message(&format!("checkpoint {name} at {} steps", grouped(steps)));
+            }
+            Report::Finished => {
+                let regular = process == Process::Learner && self.learner_ready;
+                ensure!(regular, "{process} reported `finished` before `learner_ready`");
+                self.on_finished();
+            }
+            Report::Warning { message } => self.display.message(&format!("{process}: {message}")),
+        }
+        Ok(())
+    }
+
+    fn on_environment(&mut self, process: Process, spec: EnvSpec) -> anyhow::Result<()> {
+        match &self.spec {
+            None => {
+                self.launcher.run.write_spec(&spec)?;
+                self.spec = Some(spec);
+            }
+            Some(known) if *known != spec => bail!(
+                "the environment of {process} is not the run's: expected {}, got {}",
+                serde_json::to_string(known)?,
+                serde_json::to_string(&spec)?
+            ),
+            Some(_) => {}
+        }
+        if process == Process::Learner || matches!(self.phase, Phase::Stopping { .. }) {
+            return Ok(());
+        }
+        self.set_ready(process);
+        match process {
+            Process::Evaluator => self.send_evaluation(),
+            _ if self.learner_ready => self.attach(process),
+            _ if !self.slots.contains_key(&Process::Learner) => self.spawn(Process::Learner)?,
+            _ => {}
+        }
+        Ok(())
+    }
+
+    fn on_learner_ready(&mut self, process: Process) -> anyhow::Result<()> {
+        ensure!(process == Process::Learner, "{process} reported `learner_ready`");
+        self.set_ready(process);
+        self.learner_ready = true;
+        self.advanced = Instant::now();
+        if self.is_one_process() || self.phase != Phase::Training {
+            return Ok(());
+        }
+        let waiting: Vec<Process> = self
+            .all_running()
+            .filter(|(process, running)| matches!(process, Process::Actor(_)) && running.ready)
+            .map(|(process, _)| process)
+            .collect();
+        waiting.into_iter().for_each(|process| self.attach(process));
+        self.spawn(Process::Evaluator)
+    }
+
+    fn set_ready(&mut self, process: Process) {
+        if let Some(running) = self.slots.get_mut(&process).and_then(|slot| slot.running.as_mut()) {
+            running.ready = true;
+        }
+    }
+
+    fn attach(&mut self, process: Process) {
+        if let Some(domain) = self.launcher.domain.clone() {
+            self.send(process, Command::Attach { domain });
+        }
+    }
+
+    fn on_progress(&mut self, progress: Progress) {
+        let now = Instant::now();
+        let marks = |progress: &Progress| (progress.env_steps, progress.updates);
+        if self.last.as_ref().is_none_or(|(_, last)| marks(last) != marks(&progress)) {
+            self.advanced = now;
+        }
+        self.display.progress(&progress);
+        if self.first.is_none() {
+            self.first = Some((now, progress.clone()));
+        }
+        self.last = Some((now, progress));
+    }
+
+    fn on_evaluate(&mut self, request: EvaluationRequest) {
+        if matches!(self.phase, Phase::Stopping { .. }) {
+            // An interrupted run skips what is not yet evaluated.
+            return;
+        }
+        if let Some(skipped) = self.evaluations.push(request) {
+            self.display.message(&format!(
+                "the evaluator is too far behind: skipping the evaluation at {} steps",
+                grouped(skipped.env_steps)
+            ));
+        }
+        self.send_evaluation();
+    }
+
+    /// Sends the next request, if the evaluator is ready and idle.
+    fn send_evaluation(&mut self) {
+        if !self.running(Process::Evaluator).is_some_and(|running| running.ready) {
+            return;
+        }
+        if let Some(request) = self.evaluations.start(Instant::now()) {
+            self.send(Process::Evaluator, Command::Evaluate(request));
+        }
+    }
+
+    fn on_evaluated(&mut self, process: Process, row: EvaluationRow) -> anyhow::Result<()> {
+        if matches!(self.phase, Phase::Stopping { .. }) {
+            return Ok(());
+        }
+        if !self.is_one_process() {
+            ensure!(
+                process == Process::Evaluator && self.evaluations.finish(row.policy_version),
+                "{process} evaluated policy {}, which nobody asked for",
+                row.policy_version
+            );
+            self.send_evaluation();
+        }
+        let best = row.return_mean > self.best_return;
+        self.best_return = self.best_return.max(row.return_mean);
+        self.display.evaluation(&row, best);
+        let run = &self.config.run;
+        let reached = if row.return_mean >= run.until_return {
+            Some(format!("the return has reached {}", run.until_return))
+        } else if row.success_rate.is_some_and(|rate| rate >= run.until_success) {
+            Some(format!("the success rate has reached {}", run.until_success))
+        } else {
+            None
+        };
+        self.last_row = Some(row);
+        if let Some(reason) = reached {
+            self.drain(&reason);
+        }
+        self.complete_if_done();
+        Ok(())
+    }
+}

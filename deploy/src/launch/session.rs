@@ -1,0 +1,133 @@
+//! One session of a run: what stands around the supervisor, and what the user is told at the end.
+
+use std::path::PathBuf;
+use std::time::Duration;
+
+use anyhow::Context;
+use dmprl_shared::config::ExperimentConfig;
+
+use super::{
+    Ending, Launcher, SessionReport, SupervisorPlan, TimeLimits, domain, interrupts, supervise,
+};
+use crate::failure::Outcome;
+use crate::plots;
+use crate::run_directory::{RunDirectory, RunLock};
+use crate::terminal::{Display, ProgressStyle, say, shown, summary};
+
+/// How long `resume` waits for the learner of a killed supervisor to write its checkpoint.
+pub const RESUME_WAIT: Duration = Duration::from_secs(70);
+
+/// A run directory, ready to be trained in.
+pub struct SessionPlan {
+    /// The program that plays the roles: this one; tests put a fake here.
+    pub program: PathBuf,
+    /// The run.
+    pub run: RunDirectory,
+    /// Held until the end, and by every child.
+    pub lock: RunLock,
+    /// The resolved configuration.
+    pub config: ExperimentConfig,
+    /// The Python virtual environment.
+    pub venv: Option<PathBuf>,
+    /// Whether the run has been trained before.
+    pub resume: bool,
+    /// Bar or lines.
+    pub progress: ProgressStyle,
+}
+
+/// Trains until the run ends, is stopped or fails; then draws and tells.
+///
+/// # Errors
+/// Whatever kept the run from going on.
+pub fn session(plan: SessionPlan) -> anyhow::Result<Outcome> {
+    let SessionPlan { program, run, lock, config, venv, resume, progress } = plan;
+    let manifest = run.manifest()?;
+    let mut display = Display::new(progress, config.run.steps);
+    let resume = resume && can_resume(&run, &mut display)?;
+    let domain = match config.run.deterministic {
+        true => None,
+        false => Some(domain::create(&format!("{}-{}", manifest.run_id, std::process::id()))?),
+    };
+    let launcher = Launcher {
+        program,
+        run: run.clone(),
+        venv,
+        domain: domain.as_ref().map(|domain| domain.path().to_owned()),
+        resume,
+        // A checkpoint holds all that the warm start gave.
+        init_from: manifest.init_from.map(PathBuf::from).filter(|_| !resume),
+        sessions_before: u32::try_from(manifest.sessions.len().saturating_sub(1))
+            .context("too many sessions")?,
+    };
+    let title = title(&config);
+    display.message(&format!("training {title} in {}", shown(run.path())));
+    let limits = TimeLimits::default();
+    let steps_total = config.run.steps;
+    let runtime = tokio::runtime::Builder::new_current_thread()
+        .enable_all()
+        .build()
+        .context("cannot start the supervisor's runtime")?;
+    let report = runtime.block_on(async {
+        let interrupts = interrupts()?;
+        let plan = SupervisorPlan { launcher, config, limits, display, interrupts };
+        anyhow::Ok(supervise(plan).await)
+    });
+    // In this order: no child, then no shared memory, then no lock.
+    drop(runtime);
+    drop(domain);
+    drop(lock);
+    conclude(report?, &run, &title, steps_total)
+}
+
+/// A run without a checkpoint begins again, without the rows of the first attempt.
+fn can_resume(run: &RunDirectory, display: &mut Display) -> anyhow::Result<bool> {
+    if run.latest_checkpoint().is_some() {
+        return Ok(true);
+    }
+    display.message("the run has no checkpoint yet: it begins again");
+    run.begin_again()?;
+    Ok(false)
+}
+
+fn title(config: &ExperimentConfig) -> String {
+    let policy = format!("{:?}", config.policy.kind).to_lowercase();
+    let algorithm = format!("{:?}", config.algorithm.name).to_lowercase();
+    let actors = &config.actors;
+    let count =
+        |count: usize, what: &str| format!("{count} {what}{}", if count == 1 { "" } else { "s" });
+    let hands = if config.run.deterministic {
+        format!("one process, {}", count(actors.envs_per_worker, "environment"))
+    } else {
+        let workers = count(actors.workers, "worker");
+        format!("{workers} × {}", count(actors.envs_per_worker, "environment"))
+    };
+    let (task, seed) = (&config.task.name, config.run.seed);
+    format!("{task} · {algorithm} · {policy} · seed {seed} · {hands}")
+}
+
+fn conclude(
+    report: SessionReport,
+    run: &RunDirectory,
+    title: &str,
+    steps_total: u64,
+) -> anyhow::Result<Outcome> {
+    if let Err(error) = plots::learning_curve(run) {
+        // The results are there; a picture is no reason to fail.
+        say(&format!("warning: {error:#}"));
+    }
+    match report.ending {
+        Ending::Failed(error) => Err(error),
+        Ending::Interrupted => {
+            let path = shown(run.path());
+            if report.checkpointed {
+                say("checkpoint written");
+            }
+            say(&format!("go on with: dmprl resume {path}"));
+            Ok(Outcome::Interrupted)
+        }
+        Ending::Completed => {
+            say(&format!("\n{}", summary(&report, title, run.path(), steps_total)));
+            Ok(Outcome::Done)
+        }
+    }
+}

@@ -1,0 +1,235 @@
+//! The supervisor: its state, its loop, and how children are started.
+
+use std::collections::BTreeMap;
+use std::time::{Duration, Instant};
+
+use anyhow::{Context, Error};
+use dmprl_shared::config::ExperimentConfig;
+use dmprl_shared::spec::EnvSpec;
+use tokio::sync::mpsc;
+
+use super::child::{Child, EVENTS_MAX, Event};
+use super::evaluations::EvaluationQueue;
+use super::{Launcher, Process, TimeLimits};
+use crate::control::{Command, EvaluationRow, Progress};
+use crate::terminal::Display;
+
+/// What the supervisor needs to know.
+pub struct SupervisorPlan {
+    /// How children are started, and for which run.
+    pub launcher: Launcher,
+    /// The resolved configuration.
+    pub config: ExperimentConfig,
+    /// How long it waits for what.
+    pub limits: TimeLimits,
+    /// What the user sees.
+    pub display: Display,
+    /// One item an interrupt.
+    pub interrupts: mpsc::Receiver<()>,
+}
+
+/// How a session ended.
+#[derive(Debug)]
+pub enum Ending {
+    /// The learner came to its end and every evaluation was answered.
+    Completed,
+    /// The user stopped it.
+    Interrupted,
+    /// It could not go on.
+    Failed(Error),
+}
+
+/// What a session did.
+#[derive(Debug)]
+pub struct SessionReport {
+    /// How it ended.
+    pub ending: Ending,
+    /// Whether the learner said that its last checkpoint is written.
+    pub checkpointed: bool,
+    /// The first progress reported.
+    pub first: Option<Progress>,
+    /// The last progress reported.
+    pub last: Option<Progress>,
+    /// Between the two.
+    pub training: Duration,
+    /// The last evaluation.
+    pub last_row: Option<EvaluationRow>,
+    /// From the first start to the last exit.
+    pub wall: Duration,
+}
+
+/// Where a session is on its way.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Phase {
+    /// Starting and learning.
+    Training,
+    /// The learner was asked to come to its end.
+    Draining { deadline: Instant },
+    /// It has, and exits; evaluations are outstanding.
+    Finishing { deadline: Instant },
+    /// Everything is to end.
+    Stopping { deadline: Instant, killed: bool },
+}
+
+/// A child's place: the child may be dead and its restart due.
+#[derive(Debug, Default)]
+pub(super) struct Slot {
+    pub(super) running: Option<Running>,
+    pub(super) restarts: u32,
+    pub(super) restart_at: Option<Instant>,
+}
+
+/// A child that lives.
+#[derive(Debug)]
+pub(super) struct Running {
+    pub(super) child: Child,
+    pub(super) spawned: Instant,
+    pub(super) ready: bool,
+}
+
+pub(super) struct Supervisor {
+    pub(super) launcher: Launcher,
+    pub(super) config: ExperimentConfig,
+    pub(super) limits: TimeLimits,
+    pub(super) display: Display,
+    pub(super) events: mpsc::Sender<Event>,
+    pub(super) slots: BTreeMap<Process, Slot>,
+    pub(super) phase: Phase,
+    pub(super) spec: Option<EnvSpec>,
+    pub(super) learner_ready: bool,
+    pub(super) finished: bool,
+    pub(super) evaluations: EvaluationQueue,
+    pub(super) interrupts: u32,
+    pub(super) failure: Option<Error>,
+    pub(super) abandoned: bool,
+    pub(super) garbage: u32,
+    pub(super) started: Instant,
+    /// When steps or updates last grew.
+    pub(super) advanced: Instant,
+    pub(super) first: Option<(Instant, Progress)>,
+    pub(super) last: Option<(Instant, Progress)>,
+    pub(super) best_return: f64,
+    pub(super) last_row: Option<EvaluationRow>,
+}
+
+/// Runs the processes of one session until all of them have ended.
+pub async fn supervise(plan: SupervisorPlan) -> SessionReport {
+    let SupervisorPlan { launcher, config, limits, display, mut interrupts } = plan;
+    let (events, mut incoming) = mpsc::channel(EVENTS_MAX);
+    let now = Instant::now();
+    let limit = limits.evaluation_of(config.evaluation.episodes);
+    let mut supervisor = Supervisor {
+        launcher,
+        config,
+        limits,
+        display,
+        events,
+        slots: BTreeMap::new(),
+        phase: Phase::Training,
+        spec: None,
+        learner_ready: false,
+        finished: false,
+        evaluations: EvaluationQueue::new(limit),
+        interrupts: 0,
+        failure: None,
+        abandoned: false,
+        garbage: 0,
+        started: now,
+        advanced: now,
+        first: None,
+        last: None,
+        best_return: f64::NEG_INFINITY,
+        last_row: None,
+    };
+    let started = supervisor.start();
+    supervisor.check(started);
+    while !supervisor.is_over() {
+        let deadline = supervisor.next_deadline().into();
+        tokio::select! {
+            biased;
+            Some(()) = interrupts.recv() => supervisor.on_interrupt(),
+            Some(event) = incoming.recv() => {
+                let handled = supervisor.on_event(event);
+                supervisor.check(handled);
+            }
+            () = tokio::time::sleep_until(deadline) => {}
+        }
+        let handled = supervisor.on_time(Instant::now());
+        supervisor.check(handled);
+    }
+    supervisor.report()
+}
+
+impl Supervisor {
+    /// Workers first: the learner needs to know the environment. A resumed run knows it.
+    fn start(&mut self) -> anyhow::Result<()> {
+        let run = &self.launcher.run;
+        self.spec = run.spec()?;
+        self.best_return = run.best_row()?.map_or(f64::NEG_INFINITY, |row| row.return_mean);
+        if self.is_one_process() || self.spec.is_some() {
+            self.spawn(Process::Learner)?;
+        }
+        if self.is_one_process() {
+            return Ok(());
+        }
+        let workers = u32::try_from(self.config.actors.workers).context("too many workers")?;
+        (0..workers).try_for_each(|index| self.spawn(Process::Actor(index)))
+    }
+
+    pub(super) fn is_one_process(&self) -> bool {
+        self.launcher.domain.is_none()
+    }
+
+    pub(super) fn spawn(&mut self, process: Process) -> anyhow::Result<()> {
+        let slot = self.slots.entry(process).or_default();
+        slot.restart_at = None;
+        let command = self.launcher.command(process, slot.restarts)?;
+        let child = Child::spawn(command, process, self.events.clone())?;
+        slot.running = Some(Running { child, spawned: Instant::now(), ready: false });
+        Ok(())
+    }
+
+    pub(super) fn running(&self, process: Process) -> Option<&Running> {
+        self.slots.get(&process)?.running.as_ref()
+    }
+
+    pub(super) fn all_running(&self) -> impl Iterator<Item = (Process, &Running)> {
+        self.slots.iter().filter_map(|(process, slot)| Some((*process, slot.running.as_ref()?)))
+    }
+
+    /// Sends a command to a child. One that takes none is stuck or dying; its deadline or its
+    /// exit follows.
+    pub(super) fn send(&mut self, process: Process, command: Command) {
+        let sent = self.running(process).is_none_or(|running| running.child.send(command));
+        if !sent {
+            self.display.message(&format!("{process} takes no commands"));
+        }
+    }
+
+    fn is_over(&self) -> bool {
+        let stopping = matches!(self.phase, Phase::Stopping { .. });
+        stopping && (self.abandoned || self.all_running().next().is_none())
+    }
+
+    fn report(mut self) -> SessionReport {
+        self.display.close();
+        let ending = match self.failure {
+            Some(error) => Ending::Failed(error),
+            None if self.interrupts > 0 => Ending::Interrupted,
+            None => Ending::Completed,
+        };
+        let training = match (&self.first, &self.last) {
+            (Some((first, _)), Some((last, _))) => last.duration_since(*first),
+            _ => Duration::ZERO,
+        };
+        SessionReport {
+            ending,
+            checkpointed: self.finished,
+            first: self.first.map(|(_, progress)| progress),
+            last: self.last.map(|(_, progress)| progress),
+            training,
+            last_row: self.last_row,
+            wall: self.started.elapsed(),
+        }
+    }
+}

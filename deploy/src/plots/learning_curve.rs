@@ -1,0 +1,113 @@
+//! Evaluation return over environment steps: mean, and one standard deviation over episodes.
+
+use std::path::PathBuf;
+
+use anyhow::{Context, anyhow};
+use plotters::prelude::*;
+
+use crate::control::EvaluationRow;
+use crate::run_directory::RunDirectory;
+use crate::terminal::{grouped, std_of};
+
+/// Blue of the Okabe-Ito palette, told apart with every common colour vision.
+const BLUE: RGBColor = RGBColor(0, 114, 178);
+const SIZE: (u32, u32) = (800, 480);
+/// Share of the spread left free above and below.
+const MARGIN: f64 = 0.05;
+
+/// Draws `plots/learning_curve.svg`; nothing while there is no evaluation.
+///
+/// # Errors
+/// The rows cannot be read or the picture not be written.
+pub fn learning_curve(run: &RunDirectory) -> anyhow::Result<Option<PathBuf>> {
+    let rows = run.evaluations()?;
+    if rows.is_empty() {
+        return Ok(None);
+    }
+    let name = run.config()?.task.name;
+    let svg =
+        draw(&rows, &name).map_err(|error| anyhow!("cannot draw the learning curve: {error}"))?;
+    let path = run.path().join("plots").join("learning_curve.svg");
+    std::fs::write(&path, svg).with_context(|| format!("cannot write {}", path.display()))?;
+    Ok(Some(path))
+}
+
+fn draw(rows: &[EvaluationRow], title: &str) -> Result<String, Box<dyn std::error::Error>> {
+    let points: Vec<(f64, f64, f64)> = rows
+        .iter()
+        .map(|row| (row.env_steps as f64, row.return_mean, std_of(&row.returns)))
+        .collect();
+    let steps_max = points.iter().map(|point| point.0).fold(1.0, f64::max);
+    let low = points.iter().map(|point| point.1 - point.2).fold(f64::INFINITY, f64::min);
+    let high = points.iter().map(|point| point.1 + point.2).fold(f64::NEG_INFINITY, f64::max);
+    let margin = ((high - low) * MARGIN).max(1e-3);
+    let mut svg = String::new();
+    {
+        let area = SVGBackend::with_string(&mut svg, SIZE).into_drawing_area();
+        area.fill(&WHITE)?;
+        let mut chart = ChartBuilder::on(&area)
+            .caption(title, ("sans-serif", 20))
+            .margin(16)
+            .x_label_area_size(44)
+            .y_label_area_size(64)
+            .build_cartesian_2d(0.0..steps_max, (low - margin)..(high + margin))?;
+        chart
+            .configure_mesh()
+            .x_desc("environment steps")
+            .y_desc("evaluation return")
+            .x_label_formatter(&|steps| grouped(steps.round() as u64))
+            .label_style(("sans-serif", 14))
+            .axis_desc_style(("sans-serif", 16))
+            .light_line_style(WHITE)
+            .bold_line_style(BLACK.mix(0.12))
+            .draw()?;
+        let above = points.iter().map(|&(steps, mean, std)| (steps, mean + std));
+        let below = points.iter().rev().map(|&(steps, mean, std)| (steps, mean - std));
+        let band: Vec<_> = above.chain(below).collect();
+        chart.draw_series(std::iter::once(Polygon::new(band, BLUE.mix(0.2))))?;
+        let mean = points.iter().map(|&(steps, mean, _)| (steps, mean));
+        chart.draw_series(LineSeries::new(mean.clone(), BLUE.stroke_width(2)))?;
+        chart.draw_series(mean.map(|point| Circle::new(point, 3, BLUE.filled())))?;
+        let note = format!("mean ± 1 std over {} episodes", rows[0].returns.len());
+        let style = ("sans-serif", 14).into_font().color(&BLUE);
+        area.draw_text(&note, &style, (SIZE.0 as i32 - 250, 24))?;
+        area.present()?;
+    }
+    Ok(svg)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn row(env_steps: u64, returns: &[f64]) -> EvaluationRow {
+        EvaluationRow {
+            env_steps,
+            updates: 0,
+            segments: 0,
+            wall_s: 0.0,
+            policy_version: 1,
+            returns: returns.to_vec(),
+            return_mean: returns.iter().sum::<f64>() / returns.len() as f64,
+            success_rate: None,
+            smoothness: 0.0,
+        }
+    }
+
+    #[test]
+    fn the_picture_names_its_axes_and_has_one_dot_an_evaluation() {
+        let rows = [row(0, &[-12.0, -8.0]), row(5_000, &[-7.0, -6.0]), row(10_000, &[-5.0, -5.0])];
+        let svg = draw(&rows, "reacher").unwrap();
+        for text in ["environment steps", "evaluation return", "reacher", "10,000", "± 1 std"] {
+            assert!(svg.contains(text), "{text} is missing");
+        }
+        assert_eq!(svg.matches("<circle").count(), rows.len());
+        assert_eq!(svg.matches("<polygon").count(), 1);
+    }
+
+    #[test]
+    fn a_single_evaluation_without_spread_is_drawn_too() {
+        let svg = draw(&[row(0, &[0.0])], "one").unwrap();
+        assert_eq!(svg.matches("<circle").count(), 1);
+    }
+}

@@ -1,0 +1,42 @@
+//! Where this project's files lie, and which commit they are.
+
+use std::path::{Path, PathBuf};
+use std::process::{Command, Stdio};
+
+/// Ancestors searched for the project when the build's own folder is gone.
+const ANCESTORS_MAX: usize = 16;
+
+/// The folder that holds `envs_py/`: the one this program was built from, or one above the
+/// current directory.
+///
+/// # Errors
+/// Neither is there any more.
+pub fn root() -> anyhow::Result<PathBuf> {
+    let built_from = Path::new(env!("CARGO_MANIFEST_DIR")).parent().map(Path::to_owned);
+    let here = std::env::current_dir().unwrap_or_default();
+    let above = here.ancestors().take(ANCESTORS_MAX).map(Path::to_owned);
+    built_from.into_iter().chain(above).find(|path| is_root(path)).ok_or_else(|| {
+        anyhow::anyhow!(
+            "cannot find the project's Python package (envs_py); run dmprl inside a clone of the \
+             project"
+        )
+    })
+}
+
+fn is_root(path: &Path) -> bool {
+    path.join("envs_py").is_dir()
+}
+
+/// The commit of the project, `-dirty` appended where files differ from it; none without git.
+#[must_use]
+pub fn git_commit() -> Option<String> {
+    let output = Command::new("git")
+        .args(["describe", "--always", "--dirty", "--abbrev=40", "--exclude=*"])
+        .current_dir(Path::new(env!("CARGO_MANIFEST_DIR")))
+        .stdin(Stdio::null())
+        .stderr(Stdio::null())
+        .output()
+        .ok()?;
+    let commit = String::from_utf8(output.stdout).ok()?.trim().to_owned();
+    (output.status.success() && !commit.is_empty()).then_some(commit)
+}

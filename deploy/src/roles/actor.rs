@@ -1,0 +1,181 @@
+//! The worker process: stage 3.
+
+use std::path::Path;
+use std::time::{Duration, Instant};
+
+use anyhow::{Context, bail};
+use dmprl_actors::python_env::{Interpreter, InterpreterOptions, PythonEnvironments};
+use dmprl_actors::rollout::{Identity, Rollout, RolloutError};
+use dmprl_shared::config::ExperimentConfig;
+use dmprl_shared::segment::SegmentHeader;
+use dmprl_shared::transport::shared_memory::{Plan, Sender, Subscriber, WorkerEnd, attach};
+use dmprl_shared::transport::{ParameterSubscriber, SegmentSender, SendOutcome, TransportError};
+
+use super::setup::Setup;
+use super::{ActorArgs, ControlPipe};
+use crate::control::{Command, Report};
+
+/// Sleep between two offers of a segment to a full queue.
+const FULL_QUEUE: Duration = Duration::from_micros(200);
+/// Sleep between two tries to attach, or looks for the first policy.
+const ATTACH: Duration = Duration::from_millis(2);
+/// A learner that is ready answers at once; longer means that it is gone.
+const ATTACH_LIMIT: Duration = Duration::from_secs(30);
+/// How long one look for a command may block, so that a stop is seen.
+const COMMAND_WAIT: Duration = Duration::from_millis(100);
+
+/// Starts the run's interpreter.
+pub fn interpreter(venv: Option<&Path>, config: &ExperimentConfig) -> anyhow::Result<Interpreter> {
+    let venv = venv.context("--venv is missing: the Python environment to run in")?;
+    let python_path = config.task.python_path.iter().map(Into::into).collect();
+    Ok(Interpreter::start(&InterpreterOptions { venv: venv.to_owned(), python_path })?)
+}
+
+/// Steps environments until a stop is asked for.
+pub fn run(args: &ActorArgs, control: &ControlPipe) -> anyhow::Result<()> {
+    let setup = Setup::read(&args.run)?;
+    let config = &setup.config;
+    let interpreter = interpreter(args.venv.as_deref(), config)?;
+    let environments = PythonEnvironments::start(
+        &interpreter,
+        &config.task.id,
+        config.actors.envs_per_worker,
+        config.policy.decision_steps(),
+    )?;
+    control.send(&Report::EnvironmentReady { spec: environments.spec().clone() })?;
+    let identity =
+        Identity { run_id: setup.run_id, worker_id: args.index, incarnation: args.incarnation };
+    let mut rollout = Rollout::start(config, environments, identity)?;
+    let plan = super::learner::plan(&setup, rollout.policy());
+    let Some(end) = await_attach(control, &plan, args.index)? else { return Ok(()) };
+    let mut worker = Worker {
+        index: args.index,
+        control,
+        deadline: Duration::from_secs_f64(config.actors.send_deadline_s),
+        segments: end.segments,
+        parameters: end.parameters,
+    };
+    worker.await_first_policy(&mut rollout)?;
+    while !control.stop_requested() {
+        worker.take_newest(&mut rollout)?;
+        match rollout.segment(&mut |header, block| worker.deliver(header, block)) {
+            Ok(()) => {}
+            Err(Stopped::Asked) => break,
+            Err(Stopped::Failed(error)) => return Err(error),
+        }
+    }
+    Ok(())
+}
+
+fn await_attach(
+    control: &ControlPipe,
+    plan: &Plan,
+    index: u32,
+) -> anyhow::Result<Option<WorkerEnd>> {
+    // The supervisor limits how long a start may take; here only a stop ends the wait.
+    let domain = loop {
+        if control.stop_requested() {
+            return Ok(None);
+        }
+        if let Some(Command::Attach { domain }) = control.next_within(COMMAND_WAIT) {
+            break domain;
+        }
+    };
+    let deadline = Instant::now() + ATTACH_LIMIT;
+    loop {
+        match attach(&domain, plan, index as usize) {
+            Ok(end) => return Ok(Some(end)),
+            Err(error @ TransportError::Incompatible { .. }) => return Err(error.into()),
+            Err(error) if Instant::now() >= deadline => {
+                return Err(anyhow::Error::from(error).context(format!(
+                    "worker {index} could not attach to the learner within {ATTACH_LIMIT:?}"
+                )));
+            }
+            Err(_) if control.stop_requested() => return Ok(None),
+            // The place of a killed predecessor is freed by the learner, a few times a second.
+            Err(_) => std::thread::sleep(ATTACH),
+        }
+    }
+}
+
+/// Why a segment was not delivered.
+enum Stopped {
+    Asked,
+    Failed(anyhow::Error),
+}
+
+impl From<RolloutError> for Stopped {
+    fn from(error: RolloutError) -> Self {
+        Self::Failed(error.into())
+    }
+}
+
+struct Worker<'a> {
+    index: u32,
+    control: &'a ControlPipe,
+    deadline: Duration,
+    segments: Sender,
+    parameters: Subscriber,
+}
+
+impl Worker<'_> {
+    /// A damaged snapshot is reported and passed over; the next one comes soon.
+    fn take_newest(&mut self, rollout: &mut Rollout) -> anyhow::Result<bool> {
+        match self.parameters.newest(&mut rollout.snapshot) {
+            Ok(taken) => Ok(taken),
+            Err(TransportError::Snapshot(error)) => {
+                eprintln!("a policy snapshot is refused: {error}");
+                self.warn(format!("worker {} refused a policy snapshot: {error}", self.index));
+                Ok(false)
+            }
+            Err(error) => Err(error.into()),
+        }
+    }
+
+    fn await_first_policy(&mut self, rollout: &mut Rollout) -> anyhow::Result<()> {
+        let deadline = Instant::now() + ATTACH_LIMIT;
+        while !self.take_newest(rollout)? && !self.control.stop_requested() {
+            if Instant::now() >= deadline {
+                bail!(
+                    "worker {}: the learner published no policy within {ATTACH_LIMIT:?}",
+                    self.index
+                );
+            }
+            std::thread::sleep(ATTACH);
+        }
+        Ok(())
+    }
+
+    /// Offers a segment until the learner has it. Nothing is dropped: a full queue is how the
+    /// learner slows its workers down.
+    fn deliver(&mut self, header: &SegmentHeader, block: &[f32]) -> Result<(), Stopped> {
+        let mut waiting: Option<(Instant, u32)> = None;
+        loop {
+            let outcome = self.segments.try_send(header, block);
+            let outcome = outcome.map_err(|error| Stopped::Failed(error.into()))?;
+            if outcome == SendOutcome::Delivered {
+                return Ok(());
+            }
+            if self.control.stop_requested() {
+                return Err(Stopped::Asked);
+            }
+            let (since, told) = waiting.get_or_insert_with(|| (Instant::now(), 0));
+            if since.elapsed() >= self.deadline * (*told + 1) {
+                *told += 1;
+                let seconds = since.elapsed().as_secs();
+                let why = match outcome {
+                    SendOutcome::Detached => "no learner is attached to its queue",
+                    _ => "the learner takes nothing from its full queue",
+                };
+                self.warn(format!("worker {} has waited {seconds} s: {why}", self.index));
+            }
+            std::thread::sleep(FULL_QUEUE);
+        }
+    }
+
+    fn warn(&self, message: String) {
+        eprintln!("warning: {message}");
+        // A supervisor that is gone is noticed as a stop.
+        let _ = self.control.send(&Report::Warning { message });
+    }
+}

@@ -1,0 +1,89 @@
+//! The roles' command lines. The supervisor writes them; a person may, to look at one process.
+
+use std::path::PathBuf;
+
+use clap::Args;
+
+const LEARNER_HELP: &str = "\
+Speaks JSON lines with the supervisor on standard input and output; logs to standard error.
+Ends after a checkpoint when its standard input ends.
+
+EXAMPLES
+  dmprl learner --run runs/mine --domain /dev/shm/dmprl-1000/4f2a
+  dmprl learner --run runs/mine --one-process   # what `train --deterministic` starts";
+
+const ACTOR_HELP: &str = "\
+Speaks JSON lines with the supervisor on standard input and output; logs to standard error.
+Reports its environment, then waits for `attach`. Ends when its standard input ends.
+
+EXAMPLES
+  dmprl actor --run runs/mine --index 0 --incarnation 0";
+
+const EVALUATOR_HELP: &str = "\
+Speaks JSON lines with the supervisor on standard input and output; logs to standard error.
+Answers each `evaluate` with a row. Ends when its standard input ends.
+
+EXAMPLES
+  dmprl evaluator --run runs/mine
+  dmprl evaluator --run runs/mine --print-only --episodes 100   # what `eval` starts";
+
+/// Arguments of `dmprl learner`.
+#[derive(Debug, Clone, PartialEq, Eq, Args)]
+#[command(after_help = LEARNER_HELP)]
+pub struct LearnerArgs {
+    /// The run directory.
+    #[arg(long, value_name = "DIR")]
+    pub run: PathBuf,
+    /// The run's private shared-memory directory.
+    #[arg(long, value_name = "DIR", required_unless_present = "one_process")]
+    pub domain: Option<PathBuf>,
+    /// Go on from `checkpoints/latest`.
+    #[arg(long)]
+    pub resume: bool,
+    /// Be the only process: step, update and evaluate in lock-step, with neither workers nor
+    /// evaluator.
+    #[arg(long, conflicts_with = "domain")]
+    pub one_process: bool,
+    /// Start from the parameters of this policy file.
+    #[arg(long, value_name = "FILE")]
+    pub init_from: Option<PathBuf>,
+    /// The Python virtual environment (with --one-process).
+    #[arg(long, value_name = "DIR")]
+    pub venv: Option<PathBuf>,
+}
+
+/// Arguments of `dmprl actor`.
+#[derive(Debug, Clone, PartialEq, Eq, Args)]
+#[command(after_help = ACTOR_HELP)]
+pub struct ActorArgs {
+    /// The run directory.
+    #[arg(long, value_name = "DIR")]
+    pub run: PathBuf,
+    /// Which of the run's workers, from 0.
+    #[arg(long, value_name = "I")]
+    pub index: u32,
+    /// Counts this worker's starts over all sessions of the run; never given twice.
+    #[arg(long, value_name = "N", default_value_t = 0)]
+    pub incarnation: u32,
+    /// The Python virtual environment.
+    #[arg(long, value_name = "DIR")]
+    pub venv: Option<PathBuf>,
+}
+
+/// Arguments of `dmprl evaluator`.
+#[derive(Debug, Clone, PartialEq, Eq, Args)]
+#[command(after_help = EVALUATOR_HELP)]
+pub struct EvaluatorArgs {
+    /// The run directory.
+    #[arg(long, value_name = "DIR")]
+    pub run: PathBuf,
+    /// Report rows without appending them to `evaluations.jsonl`.
+    #[arg(long)]
+    pub print_only: bool,
+    /// Episodes of each evaluation instead of `evaluation.episodes`.
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u64).range(1..=1_000_000))]
+    pub episodes: Option<u64>,
+    /// The Python virtual environment.
+    #[arg(long, value_name = "DIR")]
+    pub venv: Option<PathBuf>,
+}

@@ -1,0 +1,234 @@
+//! A role's end of the conversation with its supervisor.
+
+use std::fs::File;
+use std::io::{BufRead, BufReader, Read, Write};
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::mpsc::{self, Receiver, SyncSender, TrySendError};
+use std::sync::{Arc, Mutex, PoisonError};
+use std::thread;
+use std::time::Duration;
+
+use anyhow::{Context, ensure};
+
+use crate::control::{Command, Report};
+use crate::terminal::say;
+
+/// A worker or evaluator whose supervisor is gone has so long to end before it is killed.
+pub const ORPHAN_LIMIT: Duration = Duration::from_secs(5);
+/// The learner's limit: it writes a last checkpoint.
+pub const ORPHANED_LEARNER_LIMIT: Duration = Duration::from_secs(60);
+
+/// Commands not yet taken. The supervisor sends a handful in a run, one evaluation at a time;
+/// one that does not fit is refused in the log.
+const COMMANDS_MAX: usize = 64;
+/// A longer line is no command.
+const LINE_BYTES_MAX: u64 = 1 << 20;
+
+#[derive(Debug, Default)]
+struct Flags {
+    stop: Arc<AtomicBool>,
+    finish: AtomicBool,
+    orphaned: AtomicBool,
+}
+
+/// Commands come in, reports go out; shareable between threads.
+///
+/// A thread reads the commands, so `stop` is seen while the role computes. When the supervisor
+/// dies, whatever the manner, the input ends: the role is then orphaned and asked to stop, and
+/// the thread kills the process if it is still there after the limit. No parent-death signal
+/// is needed, and none is used: it would take the learner's last checkpoint away.
+pub struct ControlPipe {
+    commands: Mutex<Receiver<Command>>,
+    flags: Arc<Flags>,
+    output: Mutex<Box<dyn Write + Send>>,
+}
+
+impl ControlPipe {
+    /// Takes over standard input and output and ignores the signals that a terminal or service
+    /// manager sends to the whole process group: only the supervisor decides when a role ends.
+    ///
+    /// What anything else in this process prints, a user's environment above all, goes to
+    /// standard error from now on: the log. What it reads is empty.
+    ///
+    /// # Errors
+    /// The descriptors cannot be moved.
+    pub fn open(orphan_limit: Duration) -> anyhow::Result<Self> {
+        // Registering a handler that sets a flag nobody reads is ignoring, without `unsafe`.
+        for signal in
+            [signal_hook::consts::SIGINT, signal_hook::consts::SIGTERM, signal_hook::consts::SIGHUP]
+        {
+            signal_hook::flag::register(signal, Arc::default())
+                .with_context(|| format!("cannot ignore signal {signal}"))?;
+        }
+        let (input, output) = take_standard_streams().context("cannot move standard streams")?;
+        Ok(Self::over(input, output, move || {
+            thread::sleep(orphan_limit);
+            say("error: the supervisor is gone and this process did not end: killing it");
+            // Not `exit`: destructors of a stuck library could hold it up for ever.
+            let _ = rustix::process::kill_process(
+                rustix::process::getpid(),
+                rustix::process::Signal::KILL,
+            );
+        }))
+    }
+
+    /// The same over any pair of streams; `orphaned` runs on the reading thread at end of input.
+    pub fn over(
+        input: impl Read + Send + 'static,
+        output: impl Write + Send + 'static,
+        orphaned: impl FnOnce() + Send + 'static,
+    ) -> Self {
+        let flags = Arc::new(Flags::default());
+        let (sender, commands) = mpsc::sync_channel(COMMANDS_MAX);
+        let seen = Arc::clone(&flags);
+        thread::spawn(move || {
+            read_commands(input, &sender, &seen);
+            seen.orphaned.store(true, Ordering::Release);
+            seen.stop.store(true, Ordering::Release);
+            drop(sender);
+            orphaned();
+        });
+        Self { commands: Mutex::new(commands), flags, output: Mutex::new(Box::new(output)) }
+    }
+
+    /// Whether to finish and exit: on `stop`, or because the supervisor is gone.
+    #[must_use]
+    pub fn stop_requested(&self) -> bool {
+        self.flags.stop.load(Ordering::Acquire)
+    }
+
+    /// Whether to end the run as if it had all its steps.
+    #[must_use]
+    pub fn finish_requested(&self) -> bool {
+        self.flags.finish.load(Ordering::Acquire)
+    }
+
+    /// The flag behind [`ControlPipe::stop_requested`], for loops that know nothing of pipes.
+    #[must_use]
+    pub fn stop_flag(&self) -> Arc<AtomicBool> {
+        Arc::clone(&self.flags.stop)
+    }
+
+    /// Whether the supervisor is gone; reports then go nowhere.
+    #[must_use]
+    pub fn orphaned(&self) -> bool {
+        self.flags.orphaned.load(Ordering::Acquire)
+    }
+
+    /// The next command, if one is there. `stop` and `finish` are no commands here, see
+    /// `stop_requested` and `finish_requested`.
+    #[must_use]
+    pub fn try_next(&self) -> Option<Command> {
+        self.commands.lock().unwrap_or_else(PoisonError::into_inner).try_recv().ok()
+    }
+
+    /// The next command, waiting so long for it; none when the wait or the input has ended.
+    #[must_use]
+    pub fn next_within(&self, wait: Duration) -> Option<Command> {
+        self.commands.lock().unwrap_or_else(PoisonError::into_inner).recv_timeout(wait).ok()
+    }
+
+    /// Sends one report.
+    ///
+    /// # Errors
+    /// The supervisor is gone.
+    pub fn send(&self, report: &Report) -> anyhow::Result<()> {
+        let mut line = serde_json::to_vec(report).context("cannot write a report as JSON")?;
+        ensure!((line.len() as u64) < LINE_BYTES_MAX, "a report of {} bytes", line.len());
+        line.push(b'\n');
+        let mut output = self.output.lock().unwrap_or_else(PoisonError::into_inner);
+        output.write_all(&line).and_then(|()| output.flush()).context("the supervisor is gone")
+    }
+}
+
+fn take_standard_streams() -> std::io::Result<(File, File)> {
+    let private = |fd| rustix::io::fcntl_dupfd_cloexec(fd, 3);
+    let input = private(rustix::stdio::stdin())?;
+    let output = private(rustix::stdio::stdout())?;
+    rustix::stdio::dup2_stdin(File::open("/dev/null")?)?;
+    rustix::stdio::dup2_stdout(rustix::stdio::stderr())?;
+    Ok((input.into(), output.into()))
+}
+
+/// Until the input ends or is broken, which is the same: nobody is there to be understood.
+fn read_commands(input: impl Read, sender: &SyncSender<Command>, flags: &Flags) {
+    let mut reader = BufReader::new(input);
+    let mut line = Vec::new();
+    loop {
+        line.clear();
+        match (&mut reader).take(LINE_BYTES_MAX).read_until(b'\n', &mut line) {
+            Ok(read) if read > 0 && line.ends_with(b"\n") => {}
+            _ => return,
+        }
+        match serde_json::from_slice(&line) {
+            Ok(Command::Stop) => flags.stop.store(true, Ordering::Release),
+            Ok(Command::Finish) => flags.finish.store(true, Ordering::Release),
+            Ok(command) => match sender.try_send(command) {
+                Ok(()) | Err(TrySendError::Disconnected(_)) => {}
+                Err(TrySendError::Full(command)) => {
+                    say(&format!(
+                        "error: {COMMANDS_MAX} commands wait already, refused: {command:?}"
+                    ));
+                }
+            },
+            Err(error) => say(&format!("error: the supervisor sent what is no command: {error}")),
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use std::sync::mpsc::Sender;
+    use std::time::Instant;
+
+    const PATIENCE: Duration = Duration::from_secs(30);
+
+    fn pipe(orphaned: Sender<()>) -> (ControlPipe, impl Write, impl BufRead) {
+        let (input, commands) = std::io::pipe().unwrap();
+        let (reports, output) = std::io::pipe().unwrap();
+        let pipe = ControlPipe::over(input, output, move || orphaned.send(()).unwrap());
+        (pipe, commands, BufReader::new(reports))
+    }
+
+    fn until(condition: impl Fn() -> bool) {
+        let deadline = Instant::now() + PATIENCE;
+        while !condition() {
+            assert!(Instant::now() < deadline, "waited {PATIENCE:?} in vain");
+            thread::yield_now();
+        }
+    }
+
+    #[test]
+    fn commands_arrive_in_order_and_stop_overtakes_them() {
+        let (pipe, mut commands, _reports) = pipe(mpsc::channel().0);
+        commands.write_all(b"nonsense\n{\"attach\":{\"domain\":\"/a\"}}\n\"stop\"\n").unwrap();
+        until(|| pipe.stop_requested());
+        assert!(!pipe.orphaned());
+        let attach = Command::Attach { domain: "/a".into() };
+        assert_eq!(pipe.next_within(PATIENCE), Some(attach));
+        assert_eq!(pipe.try_next(), None);
+    }
+
+    #[test]
+    fn end_of_input_means_orphaned_and_stop() {
+        let (sender, orphaned) = mpsc::channel();
+        let (pipe, commands, _reports) = pipe(sender);
+        assert!(!pipe.stop_requested());
+        drop(commands);
+        orphaned.recv_timeout(PATIENCE).unwrap();
+        assert!(pipe.stop_requested() && pipe.orphaned());
+        assert_eq!(pipe.next_within(PATIENCE), None);
+    }
+
+    #[test]
+    fn a_report_is_one_line_and_fails_when_nobody_reads() {
+        let (pipe, _commands, mut reports) = pipe(mpsc::channel().0);
+        pipe.send(&Report::LearnerReady).unwrap();
+        let mut line = String::new();
+        reports.read_line(&mut line).unwrap();
+        assert_eq!(line, "\"learner_ready\"\n");
+        drop(reports);
+        assert!(pipe.send(&Report::LearnerReady).is_err());
+    }
+}

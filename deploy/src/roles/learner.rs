@@ -1,0 +1,152 @@
+//! The learner process: stages 5 to 7.
+
+use std::path::Path;
+use std::time::{Duration, Instant};
+
+use anyhow::{Context, bail};
+use dmprl_learner::checkpoint;
+use dmprl_learner::learner::Learner;
+use dmprl_learner::policy_file::{self, Match};
+use dmprl_learner::session::{Due, Session, Turn};
+use dmprl_shared::spec::EnvSpec;
+use dmprl_shared::transport::shared_memory::{LearnerEnd, Plan, serve};
+use dmprl_shared::transport::{ParameterPublisher, SegmentReceiver};
+
+use super::recorder::{Evaluate, Recorder};
+use super::setup::Setup;
+use super::{ControlPipe, LearnerArgs};
+use crate::control::Report;
+
+/// Sleep of a turn that found nothing to do: short beside a worker's segment of about 1 ms.
+const IDLE: Duration = Duration::from_micros(100);
+/// Between two cleanings of what dead workers left.
+const MAINTENANCE_INTERVAL: Duration = Duration::from_millis(250);
+/// Environment steps after which the first segment is reported, on its own for the start-up time.
+const FIRST: u64 = 1;
+
+/// Serves the run's workers until the run is over or a stop is asked for.
+pub fn run(args: &LearnerArgs, control: &ControlPipe) -> anyhow::Result<()> {
+    let setup = Setup::read(&args.run)?;
+    let spec = setup.run.spec()?.context("the run has no spec.json; a worker writes it first")?;
+    let learner = make(&setup, &spec, args, control)?;
+    let domain = args.domain.as_deref().context("--domain is missing")?;
+    let plan = plan(&setup, learner.policy());
+    let LearnerEnd { segments, parameters } = serve(domain, &plan)?;
+    let mut recorder = Recorder::new(&setup.run, control, &learner)?;
+    let mut session = Session::start(learner, segments, parameters)?;
+    control.send(&Report::LearnerReady)?;
+    let finished = turns(&mut session, &mut recorder, control)?;
+    if !finished {
+        // What the workers had already sent is in the checkpoint; they are not waited for.
+        let queued_max = plan.worker_count * plan.queue_segments;
+        session.drain(&mut |_, _| Ok(()), queued_max)?;
+    }
+    let mut ask = |request| control.send(&Report::Evaluate(request));
+    close(&mut session, &mut recorder, control, (finished, &mut ask))
+}
+
+/// What learner and workers of this run agree on.
+pub fn plan(setup: &Setup, policy: &dmprl_shared::policy::Policy) -> Plan {
+    Plan {
+        run_id: setup.run_id,
+        architecture_hash: policy.architecture_hash(),
+        layout: policy.layout(),
+        worker_count: setup.config.actors.workers,
+        queue_segments: setup.config.actors.queue_segments,
+        parameters_len: policy.shape().parameters_len(),
+    }
+}
+
+/// Makes the learner: fresh, warm-started or from the newest usable checkpoint.
+pub fn make(
+    setup: &Setup,
+    spec: &EnvSpec,
+    args: &LearnerArgs,
+    control: &ControlPipe,
+) -> anyhow::Result<Learner> {
+    let fresh = || Learner::new(setup.config.clone(), spec, setup.run_id);
+    if args.resume {
+        let folder = setup.run.checkpoints_path();
+        if checkpoint::names(&folder)?.is_empty() {
+            let message = "the run has no checkpoint yet: it begins again".to_owned();
+            eprintln!("{message}");
+            control.send(&Report::Warning { message })?;
+            setup.run.begin_again()?;
+        } else {
+            let (learner, loaded) = checkpoint::load_newest(&folder, &fresh)?;
+            for error in loaded.refused {
+                let message = format!("a checkpoint is refused, an older one is used: {error}");
+                eprintln!("{message}");
+                control.send(&Report::Warning { message })?;
+            }
+            setup.run.rewind(learner.counters.env_steps)?;
+            return Ok(learner);
+        }
+    }
+    let mut learner = fresh()?;
+    if let Some(path) = &args.init_from {
+        warm_start(&mut learner, path)?;
+    }
+    Ok(learner)
+}
+
+fn warm_start(learner: &mut Learner, path: &Path) -> anyhow::Result<()> {
+    let snapshot = policy_file::load(path, learner.policy(), Match::Sizes)
+        .with_context(|| format!("cannot start from {}", path.display()))?;
+    Ok(learner.warm_start(&snapshot.values)?)
+}
+
+/// Takes turns until the run is finished (true) or a stop is asked for (false).
+fn turns<R: SegmentReceiver, P: ParameterPublisher>(
+    session: &mut Session<R, P>,
+    recorder: &mut Recorder<'_>,
+    control: &ControlPipe,
+) -> anyhow::Result<bool> {
+    let mut maintained = Instant::now();
+    let mut first = session.learner.counters.env_steps + FIRST;
+    loop {
+        if control.stop_requested() {
+            return Ok(false);
+        }
+        if control.finish_requested() {
+            return Ok(true);
+        }
+        let mut due = |due: Due, learner: &mut Learner| {
+            let mut ask = |request| control.send(&Report::Evaluate(request));
+            recorder.due(due, learner, &mut ask).map_err(Into::into)
+        };
+        match session.turn(&mut due)? {
+            Turn::Worked => {}
+            Turn::Idle => std::thread::sleep(IDLE),
+            Turn::Finished => return Ok(true),
+        }
+        if session.learner.counters.env_steps >= first {
+            first = u64::MAX;
+            control.send(&Report::FirstSegment)?;
+        }
+        if maintained.elapsed() >= MAINTENANCE_INTERVAL {
+            session.maintain()?;
+            maintained = Instant::now();
+        }
+        recorder.progress(&session.learner);
+    }
+}
+
+/// Ends a session: the last evaluation if the run is finished, the last metrics and checkpoint.
+pub fn close<R: SegmentReceiver, P: ParameterPublisher>(
+    session: &mut Session<R, P>,
+    recorder: &mut Recorder<'_>,
+    control: &ControlPipe,
+    (finished, evaluate): (bool, Evaluate<'_>),
+) -> anyhow::Result<()> {
+    if finished {
+        session.publish()?;
+        recorder.due(Due::Evaluation, &mut session.learner, evaluate)?;
+    }
+    recorder.due(Due::Metrics, &mut session.learner, evaluate)?;
+    recorder.write_checkpoint(&session.learner);
+    if control.orphaned() {
+        bail!("the supervisor is gone; the run ended after a checkpoint");
+    }
+    control.send(&Report::Finished)
+}

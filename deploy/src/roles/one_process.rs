@@ -1,0 +1,99 @@
+//! The one-process run behind `--deterministic`: worker, learner and evaluator in lock-step.
+//!
+//! Schedule: the worker runs one segment in each environment with the newest policy; the learner
+//! takes them in order and does every update that is then owed; an evaluation happens where it
+//! falls due. Nothing depends on a clock, so the same seed gives the same bytes in `metrics.jsonl`
+//! (its time keys aside), `evaluations.jsonl` and every checkpoint.
+
+use std::cell::Cell;
+
+use dmprl_actors::python_env::PythonEnvironments;
+use dmprl_actors::rollout::{Identity, Rollout, RolloutError};
+use dmprl_learner::learner::Learner;
+use dmprl_learner::session::{Due, Session, Turn};
+use dmprl_shared::config::RunConfig;
+use dmprl_shared::transport::{ParameterSubscriber, SegmentSender, SendOutcome, in_process};
+
+use super::evaluator::{self, evaluator};
+use super::recorder::Recorder;
+use super::setup::Setup;
+use super::{ControlPipe, LearnerArgs};
+use crate::control::{EvaluationRequest, Report};
+
+/// Error of a delivery.
+struct Delivery(anyhow::Error);
+
+impl From<RolloutError> for Delivery {
+    fn from(error: RolloutError) -> Self {
+        Self(error.into())
+    }
+}
+
+/// Trains in this process until the run is over or a stop is asked for.
+pub fn run(args: &LearnerArgs, control: &ControlPipe) -> anyhow::Result<()> {
+    let setup = Setup::read(&args.run)?;
+    let config = &setup.config;
+    let interpreter = super::actor::interpreter(args.venv.as_deref(), config)?;
+    let envs = config.actors.envs_per_worker;
+    let steps = config.policy.decision_steps();
+    let environments = PythonEnvironments::start(&interpreter, &config.task.id, envs, steps)?;
+    let spec = environments.spec().clone();
+    let (mut judge, _) = evaluator(&interpreter, config)?;
+    control.send(&Report::EnvironmentReady { spec: spec.clone() })?;
+
+    let learner = super::learner::make(&setup, &spec, args, control)?;
+    // A resumed run continues no episode: its worker counts as started again.
+    let incarnation = u32::try_from(learner.counters.segments)?;
+    let identity = Identity { run_id: setup.run_id, worker_id: 0, incarnation };
+    let mut rollout = Rollout::start(config, environments, identity)?;
+    let (mut senders, receiver) = in_process::segment_queues(1, envs, learner.policy().layout());
+    let hash = learner.policy().architecture_hash();
+    let (publisher, mut parameters) = in_process::parameter_channel(hash);
+
+    let mut recorder = Recorder::new(&setup.run, control, &learner)?;
+    let mut session = Session::start(learner, receiver, publisher)?;
+    control.send(&Report::LearnerReady)?;
+    let reached = Cell::new(false);
+    let mut evaluate = |request: EvaluationRequest| {
+        let row = evaluator::evaluate(&mut judge, &setup, config, &request)?;
+        evaluator::keep(&setup, &row)?;
+        let RunConfig { until_return, until_success, .. } = config.run;
+        let success = row.success_rate.is_some_and(|rate| rate >= until_success);
+        reached.set(reached.get() || success || row.return_mean >= until_return);
+        control.send(&Report::Evaluated(row))
+    };
+    let mut first = true;
+    let finished = loop {
+        let mut due = |due: Due, learner: &mut Learner| {
+            recorder.due(due, learner, &mut evaluate).map_err(Into::into)
+        };
+        let turn = loop {
+            match session.turn(&mut due)? {
+                Turn::Worked if !control.stop_requested() => {}
+                turn => break turn,
+            }
+        };
+        recorder.progress(&session.learner);
+        if control.stop_requested() {
+            break false;
+        }
+        // The goal ends the run here, at the same step every time, not when the supervisor says so.
+        if turn == Turn::Finished || reached.get() || control.finish_requested() {
+            break true;
+        }
+        parameters.newest(&mut rollout.snapshot)?;
+        rollout
+            .segment(&mut |header, block| match senders[0].try_send(header, block) {
+                Ok(SendOutcome::Delivered) => Ok(()),
+                Ok(outcome) => Err(Delivery(anyhow::anyhow!(
+                    "the lock-step schedule emptied the queue, yet it is {outcome:?}"
+                ))),
+                Err(error) => Err(Delivery(error.into())),
+            })
+            .map_err(|Delivery(error)| error)?;
+        if std::mem::take(&mut first) {
+            control.send(&Report::FirstSegment)?;
+        }
+    };
+    super::learner::close(&mut session, &mut recorder, control, (finished, &mut evaluate))
+}

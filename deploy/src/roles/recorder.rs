@@ -1,0 +1,184 @@
+//! What the learner leaves behind as it goes: metrics, policies, checkpoints, progress.
+
+use std::fs::File;
+use std::io::Write;
+use std::time::{Duration, Instant};
+
+use anyhow::Context;
+use dmprl_learner::checkpoint;
+use dmprl_learner::learner::Learner;
+use dmprl_learner::metrics::MetricsLine;
+use dmprl_learner::policy_file;
+use dmprl_learner::session::Due;
+
+use super::ControlPipe;
+use crate::control::{EvaluationRequest, Progress, Report};
+use crate::run_directory::RunDirectory;
+
+/// Between two progress reports.
+const PROGRESS_INTERVAL: Duration = Duration::from_millis(500);
+
+/// Has a saved policy evaluated.
+pub type Evaluate<'a> = &'a mut dyn FnMut(EvaluationRequest) -> anyhow::Result<()>;
+
+/// Answers what falls due in a session.
+pub struct Recorder<'a> {
+    run: &'a RunDirectory,
+    control: &'a ControlPipe,
+    metrics: File,
+    started: Instant,
+    wall_s_before: f64,
+    line: Rate,
+    progress: Rate,
+    return_mean: Option<f64>,
+    policy_lag_p50: u64,
+    /// Disk trouble is told once until it is over: a full disk must not fill the terminal too.
+    checkpoint_failing: bool,
+}
+
+/// Counts since a moment.
+#[derive(Clone, Copy)]
+struct Rate {
+    at: Instant,
+    env_steps: u64,
+    updates: u64,
+}
+
+impl Rate {
+    fn now(learner: &Learner) -> Self {
+        let counters = learner.counters;
+        Self { at: Instant::now(), env_steps: counters.env_steps, updates: counters.updates }
+    }
+
+    /// Environment steps and updates per second since `self`.
+    fn until(self, now: Self) -> (f64, f64) {
+        let seconds = now.at.duration_since(self.at).as_secs_f64().max(1e-6);
+        let per_second = |from: u64, to: u64| to.saturating_sub(from) as f64 / seconds;
+        (per_second(self.env_steps, now.env_steps), per_second(self.updates, now.updates))
+    }
+}
+
+impl<'a> Recorder<'a> {
+    pub fn new(
+        run: &'a RunDirectory,
+        control: &'a ControlPipe,
+        learner: &Learner,
+    ) -> anyhow::Result<Self> {
+        let path = run.metrics_path();
+        let metrics = File::options().append(true).create(true).open(&path);
+        Ok(Self {
+            run,
+            control,
+            metrics: metrics.with_context(|| format!("cannot open {}", path.display()))?,
+            started: Instant::now(),
+            wall_s_before: run.wall_s_before()?,
+            line: Rate::now(learner),
+            progress: Rate::now(learner),
+            return_mean: None,
+            policy_lag_p50: 0,
+            checkpoint_failing: false,
+        })
+    }
+
+    /// Seconds of training, over all sessions.
+    fn wall_s(&self) -> f64 {
+        self.wall_s_before + self.started.elapsed().as_secs_f64()
+    }
+
+    /// Does what is due. An evaluation is asked for by `evaluate`.
+    pub fn due(
+        &mut self,
+        due: Due,
+        learner: &mut Learner,
+        evaluate: Evaluate<'_>,
+    ) -> anyhow::Result<()> {
+        match due {
+            Due::Metrics => self.write_metrics(learner),
+            Due::Evaluation => {
+                let request = self.save_policy(learner)?;
+                evaluate(request)
+            }
+            Due::Checkpoint => {
+                self.write_checkpoint(learner);
+                Ok(())
+            }
+        }
+    }
+
+    fn write_metrics(&mut self, learner: &mut Learner) -> anyhow::Result<()> {
+        let now = Rate::now(learner);
+        let (env_steps_per_s, updates_per_s) = self.line.until(now);
+        self.line = now;
+        let line = MetricsLine {
+            wall_s: self.wall_s(),
+            env_steps_per_s,
+            updates_per_s,
+            ..learner.metrics_line()
+        };
+        self.return_mean = line.training_return_mean.or(self.return_mean);
+        self.policy_lag_p50 = line.policy_lag_p50.unwrap_or(self.policy_lag_p50);
+        let mut text = serde_json::to_vec(&line).context("cannot write metrics as JSON")?;
+        text.push(b'\n');
+        // A disk that is full must not end a run: the line is lost, the training is not.
+        if let Err(error) = self.metrics.write_all(&text) {
+            self.warn(format!("a line of metrics.jsonl is lost: {error}"));
+        }
+        Ok(())
+    }
+
+    fn save_policy(&self, learner: &Learner) -> anyhow::Result<EvaluationRequest> {
+        let counters = learner.counters;
+        let path = self.run.policy_path(counters.policy_version);
+        policy_file::save(&path, learner.policy(), learner.snapshot())?;
+        Ok(EvaluationRequest {
+            env_steps: counters.env_steps,
+            updates: counters.updates,
+            segments: counters.segments,
+            wall_s: self.wall_s(),
+            policy_version: counters.policy_version,
+        })
+    }
+
+    /// Writes a checkpoint; a failure is shown, the previous checkpoint and the training stay.
+    pub fn write_checkpoint(&mut self, learner: &Learner) {
+        match checkpoint::save(&self.run.checkpoints_path(), learner) {
+            Ok(name) => {
+                self.checkpoint_failing = false;
+                // A supervisor that is gone is noticed by the loop.
+                let _ = self.control.send(&Report::Checkpoint { name });
+            }
+            Err(error) if !self.checkpoint_failing => {
+                self.checkpoint_failing = true;
+                self.warn(format!("no checkpoint could be written, training goes on: {error}"));
+            }
+            Err(error) => eprintln!("checkpoint: {error}"),
+        }
+    }
+
+    fn warn(&self, message: String) {
+        eprintln!("warning: {message}");
+        let _ = self.control.send(&Report::Warning { message });
+    }
+
+    /// Reports where the learner stands if it is time to.
+    pub fn progress(&mut self, learner: &Learner) {
+        if self.progress.at.elapsed() < PROGRESS_INTERVAL {
+            return;
+        }
+        let now = Rate::now(learner);
+        let (env_steps_per_s, updates_per_s) = self.progress.until(now);
+        self.progress = now;
+        let counters = learner.counters;
+        let _ = self.control.send(&Report::Progress(Progress {
+            env_steps: counters.env_steps,
+            updates: counters.updates,
+            segments: counters.segments,
+            env_steps_per_s,
+            updates_per_s,
+            return_mean: self.return_mean,
+            samples_per_insert: learner.samples_per_insert(),
+            policy_lag_p50: self.policy_lag_p50,
+            rejected: counters.rejected.total(),
+        }));
+    }
+}

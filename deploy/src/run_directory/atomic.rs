@@ -1,0 +1,26 @@
+//! Replacing a file so that a crash leaves either the old or the new one, never a torn one.
+
+use std::fs::{self, File};
+use std::io::Write;
+use std::path::Path;
+
+use anyhow::Context;
+
+/// Writes `bytes` beside `path`, syncs, and renames over it.
+pub(super) fn replace(path: &Path, bytes: &[u8]) -> anyhow::Result<()> {
+    let parent = path.parent().with_context(|| format!("{} has no folder", path.display()))?;
+    // The process id keeps two writers apart; the rename decides which one stands.
+    let aside = path.with_extension(format!("tmp{}", std::process::id()));
+    let written = (|| -> std::io::Result<()> {
+        let mut file = File::create(&aside)?;
+        file.write_all(bytes)?;
+        file.sync_all()?;
+        fs::rename(&aside, path)?;
+        File::open(parent)?.sync_all()
+    })();
+    if written.is_err() {
+        // The error already on its way says more than a failure to tidy up.
+        let _ = fs::remove_file(&aside);
+    }
+    written.with_context(|| format!("cannot write {}", path.display()))
+}

@@ -1,0 +1,200 @@
+//! Progress while a run goes on: a bar in a terminal, a line every few seconds elsewhere.
+
+use std::io::{IsTerminal, Write};
+use std::time::{Duration, Instant};
+
+use indicatif::{ProgressBar, ProgressStyle as BarStyle};
+
+use super::format::{duration, grouped, plus_minus};
+use crate::control::{EvaluationRow, Progress};
+
+/// Between two plain lines.
+const LINE_EVERY: Duration = Duration::from_secs(5);
+/// Between two redraws of the bar while nothing is reported.
+const REDRAW_EVERY: Duration = Duration::from_millis(200);
+
+/// Bar or lines.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum ProgressStyle {
+    /// A bar when standard error is a terminal.
+    Automatic,
+    /// Lines, always.
+    Lines,
+}
+
+impl ProgressStyle {
+    /// What `--no-progress` means.
+    #[must_use]
+    pub fn from_flag(no_progress: bool) -> Self {
+        if no_progress { Self::Lines } else { Self::Automatic }
+    }
+}
+
+/// What the user sees of a run.
+pub struct Display {
+    target: Target,
+    steps_total: u64,
+    line_at: Option<Instant>,
+    evaluation: Option<String>,
+}
+
+enum Target {
+    Bar(ProgressBar),
+    Lines(Box<dyn Write + Send>),
+}
+
+impl Display {
+    /// The display on standard error.
+    #[must_use]
+    pub fn new(style: ProgressStyle, steps_total: u64) -> Self {
+        if style == ProgressStyle::Automatic && std::io::stderr().is_terminal() {
+            let bar = ProgressBar::new(steps_total);
+            // The template is a constant; were it wrong, indicatif's own would do.
+            if let Ok(style) = BarStyle::with_template("{bar:20.cyan/dim} {percent:>3}% {wide_msg}")
+            {
+                bar.set_style(style.progress_chars("━━╌"));
+            }
+            bar.set_message("starting");
+            bar.enable_steady_tick(REDRAW_EVERY);
+            return Self::on(Target::Bar(bar), steps_total);
+        }
+        Self::lines(Box::new(std::io::stderr()), steps_total)
+    }
+
+    /// Plain lines to any writer.
+    #[must_use]
+    pub fn lines(writer: Box<dyn Write + Send>, steps_total: u64) -> Self {
+        Self::on(Target::Lines(writer), steps_total)
+    }
+
+    fn on(target: Target, steps_total: u64) -> Self {
+        Self { target, steps_total, line_at: None, evaluation: None }
+    }
+
+    /// Says something, above the bar.
+    pub fn message(&mut self, text: &str) {
+        match &mut self.target {
+            Target::Bar(bar) => bar.suspend(|| super::say(text)),
+            Target::Lines(writer) => write_line(writer, text),
+        }
+    }
+
+    /// Shows where the learner stands.
+    pub fn progress(&mut self, progress: &Progress) {
+        let figures = self.figures(progress);
+        match &mut self.target {
+            Target::Bar(bar) => {
+                bar.set_position(progress.env_steps.min(self.steps_total));
+                bar.set_message(figures);
+            }
+            Target::Lines(writer) => {
+                let now = Instant::now();
+                if self.line_at.is_some_and(|at| now.duration_since(at) < LINE_EVERY) {
+                    return;
+                }
+                self.line_at = Some(now);
+                let percent = progress.env_steps * 100 / self.steps_total.max(1);
+                write_line(writer, &format!("{percent:>3}% {figures}"));
+            }
+        }
+    }
+
+    /// Shows an evaluation, and keeps it in the progress line.
+    pub fn evaluation(&mut self, row: &EvaluationRow, best: bool) {
+        let figure = plus_minus(&row.returns);
+        let success = row
+            .success_rate
+            .map(|rate| format!(", success {:.0} %", rate * 100.0))
+            .unwrap_or_default();
+        self.message(&format!(
+            "evaluation at {} steps: return {figure}{success}{}",
+            grouped(row.env_steps),
+            if best { "  (best)" } else { "" }
+        ));
+        self.evaluation = Some(figure);
+    }
+
+    /// Takes the bar away.
+    pub fn close(&mut self) {
+        if let Target::Bar(bar) = &self.target {
+            bar.finish_and_clear();
+        }
+    }
+
+    /// The most wanted first: a narrow terminal cuts the end off.
+    fn figures(&self, progress: &Progress) -> String {
+        let steps = format!("{}/{}", grouped(progress.env_steps), grouped(self.steps_total));
+        let mut parts = vec![format!("{steps} steps")];
+        match (&self.evaluation, progress.return_mean) {
+            (Some(evaluation), _) => parts.push(format!("return {evaluation}")),
+            (None, Some(mean)) => parts.push(format!("return {mean:.2} (training)")),
+            (None, None) => {}
+        }
+        let left = self.steps_total.saturating_sub(progress.env_steps) as f64;
+        let eta = left / progress.env_steps_per_s;
+        // No figure from a rate of nothing, or for a run of years.
+        if (1e-9..1e8).contains(&eta) {
+            parts.push(format!("eta {}", duration(Duration::from_secs_f64(eta))));
+        }
+        parts.push(format!("{:.0} steps/s", progress.env_steps_per_s));
+        parts.push(format!("{:.0} updates/s", progress.updates_per_s));
+        parts.push(format!("{:.1} samples/insert", progress.samples_per_insert));
+        if progress.rejected > 0 {
+            parts.push(format!("{} rejected", progress.rejected));
+        }
+        parts.join(" · ")
+    }
+}
+
+/// A user who closed standard error reads nothing: no reason to end the run.
+fn write_line(writer: &mut Box<dyn Write + Send>, text: &str) {
+    let _ = writeln!(writer, "{text}").and_then(|()| writer.flush());
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use std::io;
+    use std::sync::{Arc, Mutex};
+
+    #[derive(Clone, Default)]
+    struct Shared(Arc<Mutex<Vec<u8>>>);
+
+    impl Write for Shared {
+        fn write(&mut self, bytes: &[u8]) -> io::Result<usize> {
+            self.0.lock().unwrap().write(bytes)
+        }
+
+        fn flush(&mut self) -> io::Result<()> {
+            Ok(())
+        }
+    }
+
+    #[test]
+    fn lines_hold_every_figure_and_come_seldom() {
+        let shared = Shared::default();
+        let mut display = Display::lines(Box::new(shared.clone()), 1_000);
+        let progress = Progress {
+            env_steps: 250,
+            env_steps_per_s: 50.0,
+            updates_per_s: 20.0,
+            samples_per_insert: 12.5,
+            ..Progress::default()
+        };
+        display.progress(&progress);
+        display.progress(&progress);
+        let text = String::from_utf8(shared.0.lock().unwrap().clone()).unwrap();
+        let rates = "50 steps/s · 20 updates/s · 12.5 samples/insert";
+        assert_eq!(text, format!(" 25% 250/1,000 steps · eta 15 s · {rates}\n"));
+    }
+
+    #[test]
+    fn a_rate_of_nothing_promises_no_end() {
+        let display = Display::lines(Box::new(Shared::default()), 1_000);
+        for rate in [0.0, -1.0, f64::NAN, 1e-9] {
+            let progress = Progress { env_steps_per_s: rate, ..Progress::default() };
+            let figures = display.figures(&progress);
+            assert!(!figures.contains("eta"), "{rate}: {figures}");
+        }
+    }
+}

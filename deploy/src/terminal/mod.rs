@@ -1,0 +1,18 @@
+//! Stage 8 of 8, the part on screen: progress, messages, the summary. All of it on standard
+//! error; standard output is for results.
+
+mod display;
+mod format;
+mod summary;
+
+pub use display::{Display, ProgressStyle};
+pub use format::{duration, grouped, plus_minus, std_of};
+pub(crate) use summary::shown;
+pub use summary::summary;
+
+/// Prints a line on standard error. `eprintln!` would end the program when nobody reads any
+/// more: a terminal closed in mid-run, a log on a full disk.
+pub fn say(text: &str) {
+    use std::io::Write;
+    let _ = writeln!(std::io::stderr(), "{text}");
+}

@@ -1,0 +1,48 @@
+//! The block that ends a run.
+
+use std::path::Path;
+use std::time::Duration;
+
+use super::format::{duration, grouped, plus_minus};
+use crate::launch::SessionReport;
+
+/// What the session did, where the results lie, and what to type next.
+#[must_use]
+pub fn summary(report: &SessionReport, title: &str, run: &Path, steps_total: u64) -> String {
+    let mut lines = vec![("run", title.to_owned())];
+    if let Some(row) = &report.last_row {
+        let count = row.returns.len();
+        lines.push(("return", format!("{} over {count} episodes", plus_minus(&row.returns))));
+        if let Some(rate) = row.success_rate {
+            lines.push(("success", format!("{:.0} %", rate * 100.0)));
+        }
+    }
+    if let (Some(first), Some(last)) = (&report.first, &report.last) {
+        let seconds = report.training.as_secs_f64().max(1e-9);
+        let rate = |now: u64, then: u64| now.saturating_sub(then) as f64 / seconds;
+        let line = |now: u64, then: u64| format!("{} ({:.0}/s)", grouped(now), rate(now, then));
+        lines.push(("steps", line(last.env_steps, first.env_steps)));
+        lines.push(("updates", line(last.updates, first.updates)));
+    }
+    lines.push(("wall time", wall(report.wall)));
+    let run = shown(run);
+    lines.push(("results", run.clone()));
+    lines.push(("next", format!("dmprl eval {run}")));
+    lines.push(("", format!("dmprl resume {run} --steps {}", steps_total.saturating_mul(2))));
+    let lines = lines.iter().map(|(name, value)| format!("  {name:<10} {value}"));
+    lines.collect::<Vec<_>>().join("\n")
+}
+
+fn wall(wall: Duration) -> String {
+    if wall < Duration::from_secs(60) {
+        format!("{:.1} s", wall.as_secs_f64())
+    } else {
+        duration(wall)
+    }
+}
+
+/// Relative to where the user is, when the run lies below.
+pub(crate) fn shown(path: &Path) -> String {
+    let here = std::env::current_dir().unwrap_or_default();
+    path.strip_prefix(here).unwrap_or(path).display().to_string()
+}

@@ -1,0 +1,111 @@
+#!/bin/sh
+# Plays learner, actor and evaluator for the supervisor's tests, as `RUN/fake/NAME` says.
+# It keeps its process id in RUN/fake/pids and what it was told in RUN/fake/NAME.seen.
+trap '' INT TERM HUP
+role=$1
+shift
+while [ $# -gt 0 ]; do
+    case $1 in
+    --run) run=$2 ;;
+    --index) index=$2 ;;
+    --incarnation) incarnation=$2 ;;
+    --one-process) one=1 ;;
+    --resume) resumed=" resumed" ;;
+    esac
+    shift
+done
+name=$role${index:+-$index}
+fake=$run/fake
+echo $$ >>"$fake/pids"
+echo "started${incarnation:+ $incarnation}$resumed" >>"$fake/$name.seen"
+mode=normal
+[ -f "$fake/$name" ] && read -r mode <"$fake/$name"
+
+ready() {
+    echo '{"environment_ready":{"spec":{"id":"Fake-v0","observation_len":2,"action_len":1,"action_low":[-1.0],"action_high":[1.0],"control_dt_s":0.02,"episode_steps":50}}}'
+}
+progress() {
+    echo '{"progress":{"env_steps":'"$1"',"updates":'"$1"',"segments":2,"env_steps_per_s":10.0,"updates_per_s":4.0,"return_mean":null,"samples_per_insert":1.0,"policy_lag_p50":0,"rejected":0}}'
+}
+row() {
+    echo '{"evaluated":{"env_steps":10,"updates":10,"segments":2,"wall_s":1.0,"policy_version":'"$1"',"returns":[-2.0,-4.0],"return_mean":-3.0,"success_rate":0.5,"smoothness":0.1}}'
+}
+evaluate() {
+    echo '{"evaluate":{"env_steps":10,"updates":10,"segments":2,"wall_s":1.0,"policy_version":'"$1"'}}'
+}
+# 0 on stop, 1 at end of input.
+until_stop() {
+    while read -r line; do
+        echo "$line" >>"$fake/$name.seen"
+        [ "$line" = '"stop"' ] && return 0
+    done
+    return 1
+}
+finish() {
+    echo '{"checkpoint":{"name":"001"}}'
+    echo '"finished"'
+    exit 0
+}
+
+case $role-$mode in
+*-silent) until_stop; exit 0 ;;
+*-stubborn)
+    # Ready, then deaf to everything but the end of input.
+    [ "$role" = learner ] && echo '"learner_ready"' || ready
+    while read -r line; do :; done
+    ;;
+actor-normal) ready; until_stop; exit 0 ;;
+actor-noisy) echo 'hello from print()'; ready; until_stop; exit 0 ;;
+actor-refused) echo 'error: no environment Fake-v0' >&2; exit 1 ;;
+actor-dies) ready; exit 3 ;;
+actor-dies-once)
+    ready
+    [ "$incarnation" = 0 ] && kill -9 $$
+    until_stop
+    ;;
+learner-normal)
+    [ -n "$one" ] && ready
+    echo '"learner_ready"'
+    echo '"first_segment"'
+    progress 10
+    if [ -n "$one" ]; then row 1; else evaluate 1; evaluate 2; fi
+    finish
+    ;;
+learner-until-stopped)
+    echo '"learner_ready"'
+    progress 10
+    evaluate 1
+    until_stop && finish
+    echo saved >"$fake/orphaned"
+    ;;
+learner-dies)
+    echo '"learner_ready"'
+    line=1
+    while [ $line -le 20 ]; do echo "log line $line" >&2; line=$((line + 1)); done
+    kill -9 $$
+    ;;
+learner-asks-for-the-lock)
+    echo '"learner_ready"'
+    flock --nonblock "$run/lock" true || echo locked >>"$fake/$name.seen"
+    finish
+    ;;
+learner-after-restarts)
+    # Comes to its end when both workers have been given up or restarted.
+    echo '"learner_ready"'
+    while ! grep -q 'started 1' "$fake/actor-0.seen"; do :; done
+    finish
+    ;;
+evaluator-*)
+    ready
+    while read -r line; do
+        echo "$line" >>"$fake/$name.seen"
+        [ "$line" = '"stop"' ] && exit 0
+        if [ "$mode" = dies-once ] && [ "$(grep -c started "$fake/$name.seen")" = 1 ]; then
+            kill -9 $$
+        fi
+        [ "$mode" = dies ] && exit 4
+        version=${line##*policy_version\":}
+        row "${version%%\}*}"
+    done
+    ;;
+esac
