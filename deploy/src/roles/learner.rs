@@ -139,6 +139,7 @@ pub fn close<R: SegmentReceiver, P: ParameterPublisher>(
     control: &ControlPipe,
     (finished, evaluate): (bool, Evaluate<'_>),
 ) -> anyhow::Result<()> {
+    recorder.report_progress(&session.learner);
     if finished {
         session.publish()?;
         recorder.due(Due::Evaluation, &mut session.learner, evaluate)?;

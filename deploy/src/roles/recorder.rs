@@ -162,9 +162,13 @@ impl<'a> Recorder<'a> {
 
     /// Reports where the learner stands if it is time to.
     pub fn progress(&mut self, learner: &Learner) {
-        if self.progress.at.elapsed() < PROGRESS_INTERVAL {
-            return;
+        if self.progress.at.elapsed() >= PROGRESS_INTERVAL {
+            self.report_progress(learner);
         }
+    }
+
+    /// Reports where the learner stands.
+    pub fn report_progress(&mut self, learner: &Learner) {
         let now = Rate::now(learner);
         let (env_steps_per_s, updates_per_s) = self.progress.until(now);
         self.progress = now;

@@ -128,8 +128,7 @@ impl Domain {
         if bytes > ROOT_BYTES_MAX {
             return Err(DomainError::TooLong { path, got: bytes });
         }
-        make_parent(parent)?;
-        let _parent_lock = lock_parent(parent)?;
+        let _parent_lock = make_and_lock_parent(parent)?;
         let unfinished = parent.join(format!("{UNFINISHED}{token}"));
         remove_tree(&unfinished)?;
         private_directory().create(&unfinished).map_err(failed("making", &unfinished))?;
@@ -205,6 +204,9 @@ impl Drop for Domain {
         if self.owner.is_some() && has_marker(&self.path) {
             // There is no one left to tell; what remains is found by `remove_abandoned`.
             let _ = condemn(&self.path);
+            if let Some(parent) = self.path.parent() {
+                remove_parent_if_empty(parent);
+            }
         }
     }
 }
@@ -216,11 +218,13 @@ impl Drop for Domain {
 /// # Errors
 /// `Untrusted` if `parent` is not private to this user, `Io` if something could not be removed.
 pub fn remove_abandoned(parent: &Path) -> Result<Vec<PathBuf>, DomainError> {
-    match parent.symlink_metadata() {
-        Err(error) if error.kind() == ErrorKind::NotFound => return Ok(Vec::new()),
-        _ => check_private(parent)?,
+    if let Ok(metadata) = parent.symlink_metadata()
+        && !metadata.is_dir()
+    {
+        check_private(parent)?;
     }
-    let _parent_lock = lock_parent(parent)?;
+    let Some(_parent_lock) = lock_parent(parent)? else { return Ok(Vec::new()) };
+    check_private(parent)?;
     let mut removed = Vec::new();
     for entry in parent.read_dir().map_err(failed("listing", parent))? {
         let path = entry.map_err(failed("listing", parent))?.path();
@@ -288,12 +292,28 @@ fn private_file(path: &Path) -> Result<File, DomainError> {
         .map_err(failed("making", path))
 }
 
-fn make_parent(parent: &Path) -> Result<(), DomainError> {
-    match private_directory().create(parent) {
-        Err(error) if error.kind() != ErrorKind::AlreadyExists => {
-            Err(failed("making", parent)(error))
+/// The last domain to go takes the parent with it, so one that was there may be gone when it is
+/// locked: then it is made again.
+fn make_and_lock_parent(parent: &Path) -> Result<File, DomainError> {
+    for _ in 0..PARENT_LOCK_ATTEMPTS {
+        match private_directory().create(parent) {
+            Err(error) if error.kind() != ErrorKind::AlreadyExists => {
+                return Err(failed("making", parent)(error));
+            }
+            _ => {}
         }
-        _ => check_private(parent),
+        if let Some(lock) = lock_parent(parent)? {
+            check_private(parent)?;
+            return Ok(lock);
+        }
+    }
+    Err(DomainError::Locked { path: parent.to_owned() })
+}
+
+/// A parent that cannot be locked or holds anything stays; an empty directory harms nobody.
+fn remove_parent_if_empty(parent: &Path) {
+    if let Ok(Some(_lock)) = lock_parent(parent) {
+        let _ = std::fs::remove_dir(parent);
     }
 }
 
@@ -325,16 +345,27 @@ fn try_lock(file: &File, path: &Path) -> Result<(), DomainError> {
 }
 
 /// Locks the parent directory itself: there is no file in it that someone could leave behind.
-fn lock_parent(parent: &Path) -> Result<File, DomainError> {
-    let directory = OpenOptions::new()
+/// `None` if it is gone, or was removed while this waited for its lock.
+fn lock_parent(parent: &Path) -> Result<Option<File>, DomainError> {
+    let opened = OpenOptions::new()
         .read(true)
         .custom_flags((OFlags::DIRECTORY | OFlags::NOFOLLOW).bits().cast_signed())
-        .open(parent)
-        .map_err(failed("opening", parent))?;
+        .open(parent);
+    let directory = match opened {
+        Err(error) if error.kind() == ErrorKind::NotFound => return Ok(None),
+        opened => opened.map_err(failed("opening", parent))?,
+    };
     for _ in 0..PARENT_LOCK_ATTEMPTS {
         match try_lock(&directory, parent) {
             Err(DomainError::Locked { .. }) => std::thread::sleep(PARENT_LOCK_PAUSE),
-            done => return done.map(|()| directory),
+            Err(error) => return Err(error),
+            Ok(()) => {
+                let locked = directory.metadata().map_err(failed("looking at", parent))?;
+                let same = |there: std::fs::Metadata| {
+                    (there.dev(), there.ino()) == (locked.dev(), locked.ino())
+                };
+                return Ok(parent.symlink_metadata().is_ok_and(same).then_some(directory));
+            }
         }
     }
     Err(DomainError::Locked { path: parent.to_owned() })
