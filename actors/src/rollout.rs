@@ -8,13 +8,14 @@ use dmprl_shared::parameters::ParameterSnapshot;
 use dmprl_shared::policy::{Policy, PolicyError};
 use dmprl_shared::seeds;
 use dmprl_shared::segment::{
-    LAYOUT_VERSION, SUCCESS, Segment, SegmentHeader, TERMINATED, TRUNCATED, block_checksum,
+    LAYOUT_VERSION, SUCCESS, SUCCESS_REPORTED, Segment, SegmentHeader, TERMINATED, TRUNCATED,
+    block_checksum,
 };
 use thiserror::Error;
 
 use crate::acting::Acting;
 use crate::exploration::Exploration;
-use crate::python_env::{PythonEnvironments, PythonError, SUCCESS_YES};
+use crate::python_env::{PythonEnvironments, PythonError, SUCCESS_NOT_REPORTED, SUCCESS_YES};
 
 /// Why a rollout stopped.
 #[derive(Debug, Error)]
@@ -147,7 +148,8 @@ impl Rollout {
         let flag = |set: bool, flag: u32| if set { flag } else { 0 };
         let flags = flag(self.environments.terminated()[env] == 1, TERMINATED)
             | flag(self.environments.truncated()[env] == 1, TRUNCATED)
-            | flag(self.environments.success()[env] == SUCCESS_YES, SUCCESS);
+            | flag(self.environments.success()[env] == SUCCESS_YES, SUCCESS)
+            | flag(self.environments.success()[env] != SUCCESS_NOT_REPORTED, SUCCESS_REPORTED);
         self.sequence += 1;
         let episode = self.episodes[env];
         self.segment.header = SegmentHeader {

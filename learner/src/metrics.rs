@@ -1,6 +1,8 @@
 //! Every scalar that a run writes to `metrics.jsonl`, with how it is computed.
 
-use dmprl_shared::segment::{Rejection, SUCCESS, Segment, SegmentLayout, TERMINATED, TRUNCATED};
+use dmprl_shared::segment::{
+    Rejection, SUCCESS, SUCCESS_REPORTED, Segment, SegmentLayout, TERMINATED, TRUNCATED,
+};
 use serde::{Deserialize, Serialize};
 
 use crate::algorithms::ddpg::Losses;
@@ -34,7 +36,7 @@ pub struct MetricsLine {
     pub episodes: u64,
     /// Mean of their returns.
     pub training_return_mean: Option<f64>,
-    /// Share of them that reported success at their last step.
+    /// Share of them that ended in success; null if the task does not report it.
     pub training_success_rate: Option<f64>,
     /// Median over segments: newest policy version minus the one that acted.
     pub policy_lag_p50: Option<u64>,
@@ -120,6 +122,8 @@ struct Sums {
     q_mean: f64,
     episodes: u64,
     returns: f64,
+    /// Ended episodes that said whether they succeeded, and those that did.
+    judged: u64,
     successes: u64,
     lag_max: u64,
 }
@@ -131,8 +135,10 @@ pub struct Collected {
     pub losses: Option<(f64, f64, f64)>,
     /// Training episodes that ended.
     pub episodes: u64,
-    /// Mean return and share of successes.
-    pub training: Option<(f64, f64)>,
+    /// Mean of their returns.
+    pub return_mean: Option<f64>,
+    /// Share of successes among those that say whether they succeeded.
+    pub success_rate: Option<f64>,
     /// Median and largest policy lag.
     pub lag: Option<(u64, u64)>,
 }
@@ -186,6 +192,7 @@ impl Collector {
             if self.whole[env] {
                 self.window.episodes += 1;
                 self.window.returns += self.returns[env];
+                self.window.judged += u64::from(header.flags & SUCCESS_REPORTED != 0);
                 self.window.successes += u64::from(header.flags & SUCCESS != 0);
             }
             self.whole[env] = false;
@@ -206,8 +213,9 @@ impl Collector {
                 (window.critic_loss / updates, window.actor_loss / updates, window.q_mean / updates)
             }),
             episodes: window.episodes,
-            training: (window.episodes > 0)
-                .then(|| (window.returns / episodes, window.successes as f64 / episodes)),
+            return_mean: (window.episodes > 0).then(|| window.returns / episodes),
+            success_rate: (window.judged > 0)
+                .then(|| window.successes as f64 / window.judged as f64),
             lag,
         }
     }

@@ -21,6 +21,10 @@ pub const TERMINATED: u32 = 1;
 pub const TRUNCATED: u32 = 1 << 1;
 /// The environment reported success at the last step.
 pub const SUCCESS: u32 = 1 << 2;
+/// The environment says whether it succeeded; without it [`SUCCESS`] means nothing.
+pub const SUCCESS_REPORTED: u32 = 1 << 3;
+
+const KNOWN_FLAGS: u32 = TERMINATED | TRUNCATED | SUCCESS | SUCCESS_REPORTED;
 
 /// Everything about a segment except its numbers.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Pod, Zeroable)]
@@ -28,7 +32,7 @@ pub const SUCCESS: u32 = 1 << 2;
 pub struct SegmentHeader {
     /// [`LAYOUT_VERSION`] of the sender.
     pub layout_version: u32,
-    /// [`TERMINATED`] | [`TRUNCATED`] | [`SUCCESS`].
+    /// [`TERMINATED`] | [`TRUNCATED`] | [`SUCCESS`] | [`SUCCESS_REPORTED`].
     pub flags: u32,
     /// Which run the segment belongs to.
     pub run_id: u64,
@@ -206,7 +210,7 @@ pub fn check(header: &SegmentHeader, block: &[f32], expected: &Expected) -> Resu
         && header.env_index < expected.env_count
         && header.sequence > 0
         && (1..=header.segment_steps).contains(&header.steps_len)
-        && header.flags & !(TERMINATED | TRUNCATED | SUCCESS) == 0
+        && header.flags & !KNOWN_FLAGS == 0
         && (header.steps_len == header.segment_steps
             || header.flags & (TERMINATED | TRUNCATED) != 0);
     refuse(!in_range, Rejection::Field)?;
@@ -273,7 +277,7 @@ mod tests {
         assert_eq!(verdict(|s| s.header.worker_id = 2), Err(Rejection::Field));
         assert_eq!(verdict(|s| s.header.env_index = 4), Err(Rejection::Field));
         assert_eq!(verdict(|s| s.header.sequence = 0), Err(Rejection::Field));
-        assert_eq!(verdict(|s| s.header.flags = 8), Err(Rejection::Field));
+        assert_eq!(verdict(|s| s.header.flags = 16), Err(Rejection::Field));
         assert_eq!(verdict(|s| s.block[0] = 1.0), Err(Rejection::Checksum));
         for value in [f32::NAN, f32::INFINITY, 1.5] {
             let change = |s: &mut Segment| {

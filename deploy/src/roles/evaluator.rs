@@ -87,5 +87,6 @@ pub fn keep(setup: &Setup, row: &EvaluationRow) -> anyhow::Result<()> {
         let best = seen().max_by(|a, b| a.return_mean.total_cmp(&b.return_mean));
         versions.extend(best.into_iter().chain(seen().last()).map(|row| row.policy_version));
     }
+    setup.run.point_best()?;
     setup.run.prune_policies(&versions)
 }

@@ -24,3 +24,13 @@ pub(super) fn replace(path: &Path, bytes: &[u8]) -> anyhow::Result<()> {
     }
     written.with_context(|| format!("cannot write {}", path.display()))
 }
+
+/// Makes `link` a symbolic link to `target`, replacing the one that was there in one step.
+pub(super) fn point(link: &Path, target: &Path) -> anyhow::Result<()> {
+    let aside = link.with_extension(format!("tmp{}", std::process::id()));
+    // One that a killed process of this number left behind.
+    let _ = fs::remove_file(&aside);
+    std::os::unix::fs::symlink(target, &aside)
+        .and_then(|()| fs::rename(&aside, link))
+        .with_context(|| format!("cannot write {}", link.display()))
+}

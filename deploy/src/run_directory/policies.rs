@@ -2,12 +2,12 @@
 
 use std::collections::BTreeSet;
 use std::fmt::{self, Display, Formatter};
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::str::FromStr;
 
 use anyhow::Context;
 
-use super::RunDirectory;
+use super::{RunDirectory, atomic};
 use crate::control::EvaluationRow;
 use crate::failure::wrong_use;
 
@@ -117,6 +117,16 @@ impl RunDirectory {
             versions.extend(version.and_then(|version| version.parse::<u64>().ok()));
         }
         Ok(versions)
+    }
+
+    /// Points `checkpoints/best` at the best row's policy.
+    ///
+    /// # Errors
+    /// What the file system refuses.
+    pub fn point_best(&self) -> anyhow::Result<()> {
+        let Some(best) = self.best_row()? else { return Ok(()) };
+        let target = Path::new("../policies").join(format!("{}.safetensors", best.policy_version));
+        atomic::point(&self.checkpoints_path().join("best"), &target)
     }
 
     /// Removes the policies that nothing names any more. Kept are the best and the latest row's,
