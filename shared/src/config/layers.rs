@@ -208,11 +208,12 @@ fn collect_keys(table: &Table, path: &str, keys: &mut Vec<String>) {
 
 #[cfg(test)]
 mod tests {
-    use super::super::{PRESETS, TASKS};
+    use super::super::{PRESETS, PolicyKind, TASKS, policy_defaults};
     use super::*;
 
     #[test]
     fn every_preset_and_task_is_a_valid_layer() {
+        Layers::new().add("mlp", policy_defaults(PolicyKind::Mlp).unwrap()).unwrap();
         for (name, table) in PRESETS
             .iter()
             .map(|preset| (preset.name, preset.table()))
