@@ -145,7 +145,8 @@ impl<'a> Recorder<'a> {
             Ok(name) => {
                 self.checkpoint_failing = false;
                 // A supervisor that is gone is noticed by the loop.
-                let _ = self.control.send(&Report::Checkpoint { name });
+                let env_steps = learner.counters.env_steps;
+                let _ = self.control.send(&Report::Checkpoint { name, env_steps });
             }
             Err(error) if !self.checkpoint_failing => {
                 self.checkpoint_failing = true;
