@@ -107,7 +107,7 @@ fn title(config: &ExperimentConfig) -> String {
 }
 
 fn conclude(
-    report: SessionReport,
+    mut report: SessionReport,
     run: &RunDirectory,
     title: &str,
     steps_total: u64,
@@ -127,6 +127,10 @@ fn conclude(
             Ok(Outcome::Interrupted)
         }
         Ending::Completed => {
+            // A session that had nothing to do shows what the run has reached.
+            if report.last_row.is_none() {
+                report.last_row = run.latest_row()?;
+            }
             say(&format!("\n{}", summary(&report, title, run.path(), steps_total)));
             Ok(Outcome::Done)
         }
