@@ -50,6 +50,8 @@ pub enum Report {
     Checkpoint {
         /// Its directory's name below `checkpoints/`.
         name: String,
+        /// Environment steps in it.
+        env_steps: u64,
     },
     /// The learner has come to its end and written its last checkpoint.
     Finished,

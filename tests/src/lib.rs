@@ -1,5 +1,7 @@
 //! Helpers of the tests that need more than one crate.
 
+pub mod program;
+
 use std::path::{Path, PathBuf};
 
 /// The project's directory.

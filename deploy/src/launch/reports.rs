@@ -41,9 +41,9 @@ impl Supervisor {
             Report::Progress(progress) => self.on_progress(progress),
             Report::Evaluate(request) => self.on_evaluate(request),
             Report::Evaluated(row) => return self.on_evaluated(process, row),
-            Report::Checkpoint { name } => {
-                let steps = self.last.as_ref().map_or(0, |(_, progress)| progress.env_steps);
-                self.display.message(&format!("checkpoint {name} at {} steps", grouped(steps)));
+            Report::Checkpoint { name, env_steps } => {
+                let steps = grouped(env_steps);
+                self.display.message(&format!("checkpoint {name} at {steps} steps"));
             }
             Report::Finished => {
                 let regular = process == Process::Learner && self.learner_ready;

@@ -44,6 +44,12 @@ pub fn session(plan: SessionPlan) -> anyhow::Result<Outcome> {
     let manifest = run.manifest()?;
     let mut display = Display::new(progress, config.run.steps);
     let resume = resume && can_resume(&run, &mut display)?;
+    let runtime = tokio::runtime::Builder::new_current_thread()
+        .enable_all()
+        .build()
+        .context("cannot start the supervisor's runtime")?;
+    // Before the shared memory: a signal that still kills would leave it behind.
+    let interrupts = runtime.block_on(async { interrupts() })?;
     let domain = match config.run.deterministic {
         true => None,
         false => Some(domain::create(&format!("{}-{}", manifest.run_id, std::process::id()))?),
@@ -63,20 +69,15 @@ pub fn session(plan: SessionPlan) -> anyhow::Result<Outcome> {
     display.message(&format!("training {title} in {}", shown(run.path())));
     let limits = TimeLimits::default();
     let steps_total = config.run.steps;
-    let runtime = tokio::runtime::Builder::new_current_thread()
-        .enable_all()
-        .build()
-        .context("cannot start the supervisor's runtime")?;
     let report = runtime.block_on(async {
-        let interrupts = interrupts()?;
         let plan = SupervisorPlan { launcher, config, limits, display, interrupts };
-        anyhow::Ok(supervise(plan).await)
+        supervise(plan).await
     });
     // In this order: no child, then no shared memory, then no lock.
     drop(runtime);
     drop(domain);
     drop(lock);
-    conclude(report?, &run, &title, steps_total)
+    conclude(report, &run, &title, steps_total)
 }
 
 /// A run without a checkpoint begins again, without the rows of the first attempt.
@@ -106,7 +107,7 @@ fn title(config: &ExperimentConfig) -> String {
 }
 
 fn conclude(
-    report: SessionReport,
+    mut report: SessionReport,
     run: &RunDirectory,
     title: &str,
     steps_total: u64,
@@ -126,6 +127,10 @@ fn conclude(
             Ok(Outcome::Interrupted)
         }
         Ending::Completed => {
+            // A session that had nothing to do shows what the run has reached.
+            if report.last_row.is_none() {
+                report.last_row = run.latest_row()?;
+            }
             say(&format!("\n{}", summary(&report, title, run.path(), steps_total)));
             Ok(Outcome::Done)
         }

@@ -132,11 +132,13 @@ pub fn close<R: SegmentReceiver, P: ParameterPublisher>(
     (finished, evaluate): (bool, Evaluate<'_>),
 ) -> anyhow::Result<()> {
     recorder.report_progress(&session.learner);
-    if finished {
+    if finished && recorder.is_unevaluated(&session.learner) {
         session.publish()?;
         recorder.due(Due::Evaluation, &mut session.learner, evaluate)?;
     }
-    recorder.due(Due::Metrics, &mut session.learner, evaluate)?;
+    if recorder.is_unmeasured(&session.learner) {
+        recorder.due(Due::Metrics, &mut session.learner, evaluate)?;
+    }
     recorder.write_checkpoint(&session.learner);
     if control.orphaned() {
         bail!("the supervisor is gone; the run ended after a checkpoint");

@@ -28,6 +28,10 @@ pub struct Recorder<'a> {
     metrics: File,
     started: Instant,
     wall_s_before: f64,
+    /// Environment steps of the newest metrics line and of the newest evaluation asked for: a run
+    /// that ends where one of them is gets no second one.
+    measured: Option<u64>,
+    evaluated: Option<u64>,
     line: Rate,
     progress: Rate,
     return_mean: Option<f64>,
@@ -72,6 +76,8 @@ impl<'a> Recorder<'a> {
             metrics: metrics.with_context(|| format!("cannot open {}", path.display()))?,
             started: Instant::now(),
             wall_s_before: run.wall_s_before()?,
+            measured: run.measured_steps()?,
+            evaluated: run.latest_row()?.map(|row| row.env_steps),
             line: Rate::now(learner),
             progress: Rate::now(learner),
             return_mean: None,
@@ -95,6 +101,7 @@ impl<'a> Recorder<'a> {
         match due {
             Due::Metrics => self.write_metrics(learner),
             Due::Evaluation => {
+                self.evaluated = Some(learner.counters.env_steps);
                 let request = self.save_policy(learner)?;
                 evaluate(request)
             }
@@ -105,7 +112,18 @@ impl<'a> Recorder<'a> {
         }
     }
 
+    /// Whether the learner has come further than the newest metrics line.
+    pub fn is_unmeasured(&self, learner: &Learner) -> bool {
+        self.measured != Some(learner.counters.env_steps)
+    }
+
+    /// Whether the learner has come further than the newest evaluation.
+    pub fn is_unevaluated(&self, learner: &Learner) -> bool {
+        self.evaluated != Some(learner.counters.env_steps)
+    }
+
     fn write_metrics(&mut self, learner: &mut Learner) -> anyhow::Result<()> {
+        self.measured = Some(learner.counters.env_steps);
         let now = Rate::now(learner);
         let (env_steps_per_s, updates_per_s) = self.line.until(now);
         self.line = now;
@@ -145,7 +163,8 @@ impl<'a> Recorder<'a> {
             Ok(name) => {
                 self.checkpoint_failing = false;
                 // A supervisor that is gone is noticed by the loop.
-                let _ = self.control.send(&Report::Checkpoint { name });
+                let env_steps = learner.counters.env_steps;
+                let _ = self.control.send(&Report::Checkpoint { name, env_steps });
             }
             Err(error) if !self.checkpoint_failing => {
                 self.checkpoint_failing = true;

@@ -8,6 +8,8 @@ use std::time::{Duration, Instant};
 
 use anyhow::{Context, bail};
 
+use crate::terminal::say;
+
 /// How often a waiting process looks again.
 const POLL: Duration = Duration::from_millis(50);
 
@@ -31,19 +33,27 @@ impl RunLock {
             .open(&path)
             .with_context(|| format!("cannot open {}", path.display()))?;
         let deadline = Instant::now() + wait;
+        let mut told = false;
         loop {
             match file.try_lock() {
                 Ok(()) => break,
-                Err(TryLockError::WouldBlock) if Instant::now() < deadline => thread::sleep(POLL),
                 Err(TryLockError::WouldBlock) => {
-                    let mut holder = String::new();
-                    // Only for the message: an unreadable file is as good as an empty one.
-                    let _ = file.read_to_string(&mut holder);
-                    bail!(
-                        "run {} is being trained by process {}; stop it first or wait for its end",
-                        run.display(),
-                        holder.trim()
-                    );
+                    let holder = holder(&mut file);
+                    if lives(&holder) || Instant::now() >= deadline {
+                        bail!(
+                            "run {} is being trained by process {holder}; stop it first or wait \
+                             for its end",
+                            run.display()
+                        );
+                    }
+                    if !told {
+                        told = true;
+                        say(&format!(
+                            "process {holder} has died; waiting up to {wait:?} for the last \
+                             checkpoint of its learner"
+                        ));
+                    }
+                    thread::sleep(POLL);
                 }
                 Err(TryLockError::Error(error)) => {
                     return Err(error).with_context(|| format!("cannot lock {}", path.display()));
@@ -58,4 +68,20 @@ impl RunLock {
             .with_context(|| format!("cannot pass {} on to children", path.display()))?;
         Ok(Self { _file: file })
     }
+}
+
+/// The supervisor that took the lock last. An unreadable file is as good as an empty one.
+fn holder(file: &mut File) -> String {
+    let mut text = String::new();
+    let _ = file.rewind().and_then(|()| file.read_to_string(&mut text));
+    text.trim().to_owned()
+}
+
+/// Whether waiting for `holder`'s children is in vain, because it lives itself. This process's own
+/// number is there when it held the lock before.
+fn lives(holder: &str) -> bool {
+    let other = holder.parse().is_ok_and(|id: u32| id != std::process::id());
+    // A zombie has no command line.
+    let line = std::fs::read(Path::new("/proc").join(holder).join("cmdline"));
+    other && line.is_ok_and(|line| !line.is_empty())
 }

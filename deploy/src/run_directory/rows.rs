@@ -6,6 +6,7 @@ use std::path::Path;
 
 use anyhow::{Context, ensure};
 use serde::Deserialize;
+use serde::de::DeserializeOwned;
 
 use super::{RunDirectory, atomic};
 use crate::control::EvaluationRow;
@@ -124,15 +125,23 @@ impl RunDirectory {
         }
         let mut latest = 0.0_f64;
         for path in [self.metrics_path(), self.evaluations_path()] {
-            if let Some(line) =
-                last_line(&path).with_context(|| format!("cannot read {}", path.display()))?
-            {
-                let row: Row = serde_json::from_slice(&line)
-                    .with_context(|| format!("{}: the last line is damaged", path.display()))?;
+            if let Some(row) = last_row::<Row>(&path)? {
                 latest = latest.max(row.wall_s);
             }
         }
         Ok(latest)
+    }
+
+    /// Environment steps at the last line of `metrics.jsonl`.
+    ///
+    /// # Errors
+    /// The line cannot be read.
+    pub fn measured_steps(&self) -> anyhow::Result<Option<u64>> {
+        #[derive(Deserialize)]
+        struct Row {
+            env_steps: u64,
+        }
+        Ok(last_row::<Row>(&self.metrics_path())?.map(|row| row.env_steps))
     }
 }
 
@@ -161,6 +170,13 @@ fn whole_len(file: &mut File) -> std::io::Result<u64> {
         end = start;
     }
     Ok(0)
+}
+
+fn last_row<T: DeserializeOwned>(path: &Path) -> anyhow::Result<Option<T>> {
+    let line = last_line(path).with_context(|| format!("cannot read {}", path.display()))?;
+    line.map(|line| serde_json::from_slice(&line))
+        .transpose()
+        .with_context(|| format!("{}: the last line is damaged", path.display()))
 }
 
 /// The last whole line that is not empty, looked for in the file's last [`TAIL_BYTES`].

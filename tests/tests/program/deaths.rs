@@ -1,0 +1,179 @@
+//! SIGKILL to everything, to the supervisor, to a worker, to the learner.
+
+use std::path::PathBuf;
+
+use dmprl_tests::program::{
+    Running, Workplace, env_steps, env_steps_of, env_steps_of_checkpoint, rows, shared_memory_of,
+    until,
+};
+use rustix::process::Signal;
+
+use crate::{ENDLESS, train};
+
+/// `checkpoint.interval_steps` of the runs here, and the segment by which it may be passed.
+const CHECKPOINT_INTERVAL: u64 = 1_000 + 5;
+
+fn training(place: &Workplace, run: &str, more: &[&str]) -> Running {
+    let more = [&["--steps", ENDLESS][..], more].concat();
+    let mut running = place.start(&train("reacher", run, &more));
+    running.until_steps(run, 2_500);
+    running
+}
+
+fn signal_role(place: &Workplace, role: &str, signal: Signal) {
+    let processes = place.processes();
+    let process = processes.iter().find(|process| process.role == role);
+    process.unwrap_or_else(|| panic!("no {role} in {processes:#?}")).signal(signal);
+}
+
+/// Resumes for some steps and looks at the whole curve.
+fn resume_and_check_curve(place: &Workplace, run: &str, reached: u64) {
+    let checkpoint = env_steps_of_checkpoint(run).unwrap();
+    assert!(
+        checkpoint + CHECKPOINT_INTERVAL >= reached,
+        "{checkpoint} of {reached} steps are left"
+    );
+    let kept: Vec<_> = rows(run, "metrics.jsonl")
+        .into_iter()
+        .filter(|row| row["env_steps"].as_u64().unwrap() <= checkpoint)
+        .collect();
+    let end = (checkpoint + 2_000).to_string();
+    place.run(&["resume", run, "--steps", &end]).with_status(0);
+    let metrics = rows(run, "metrics.jsonl");
+    assert_eq!(metrics[..kept.len()], kept, "the curve before the checkpoint stays");
+    assert!(env_steps(&metrics)[kept.len()] >= checkpoint);
+    assert_eq!(env_steps(&metrics).last(), Some(&(checkpoint + 2_000)));
+    for file in ["metrics.jsonl", "evaluations.jsonl"] {
+        let steps = env_steps(&rows(run, file));
+        assert!(steps.is_sorted_by(|a, b| a < b), "{file}: {steps:?}");
+    }
+    assert_eq!(env_steps(&rows(run, "evaluations.jsonl")).last(), Some(&(checkpoint + 2_000)));
+    place.assert_no_process();
+    assert_eq!(shared_memory_of(run), Vec::<PathBuf>::new());
+}
+
+#[test]
+fn a_run_killed_as_a_whole_goes_on_from_its_checkpoint_beside_a_living_one() {
+    let (place, other_place) = (Workplace::new(), Workplace::new());
+    let (run, other) = (place.path("run"), other_place.path("other"));
+    let running = training(&place, &run, &[]);
+    running.signal_group(Signal::KILL);
+    assert_eq!(running.wait().status.code(), None);
+    until("no process of the run", || place.processes().is_empty());
+    assert_eq!(shared_memory_of(&run).len(), 1, "SIGKILL leaves its shared memory behind");
+
+    // Any next start removes what the dead run left, and nothing of a living one.
+    let mut living = training(&other_place, &other, &[]);
+    assert_eq!(shared_memory_of(&run), Vec::<PathBuf>::new());
+    let domain = shared_memory_of(&other);
+    assert_eq!(domain.len(), 1);
+    resume_and_check_curve(&place, &run, env_steps_of(&run).unwrap());
+    assert_eq!(shared_memory_of(&other), domain);
+    let steps = env_steps_of(&other).unwrap();
+    living.until_steps(&other, steps + 1_000);
+    living.signal_group(Signal::INT);
+    living.wait().with_status(130);
+    assert_eq!(shared_memory_of(&other), Vec::<PathBuf>::new());
+}
+
+#[test]
+fn when_the_supervisor_is_killed_its_children_end_and_the_learner_leaves_a_checkpoint() {
+    let place = Workplace::new();
+    let run = place.path("run");
+    let running = training(&place, &run, &[]);
+    running.signal(Signal::KILL);
+    let reached = env_steps_of(&run).unwrap();
+    running.wait();
+    until("no process of the run", || place.processes().is_empty());
+    let checkpoint = env_steps_of_checkpoint(&run).unwrap();
+    assert!(checkpoint >= reached, "a checkpoint at {checkpoint}, metrics up to {reached}");
+    resume_and_check_curve(&place, &run, reached);
+}
+
+#[test]
+fn resume_waits_for_the_learner_of_a_killed_supervisor() {
+    let place = Workplace::new();
+    let run = place.path("run");
+    let running = training(&place, &run, &[]);
+    signal_role(&place, "learner", Signal::STOP);
+    running.signal(Signal::KILL);
+    running.wait();
+    let reached = env_steps_of(&run).unwrap();
+    let mut resuming = place.start(&["resume", &run]);
+    resuming.until_said("waiting up to");
+    signal_role(&place, "learner", Signal::CONT);
+    // From the checkpoint that the old learner has written meanwhile.
+    resuming.until_steps(&run, reached + 2_000);
+    resuming.signal_group(Signal::INT);
+    resuming.wait().with_status(130);
+    let steps = env_steps(&rows(&run, "metrics.jsonl"));
+    assert!(steps.is_sorted_by(|a, b| a < b), "{steps:?}");
+    place.assert_no_process();
+}
+
+#[test]
+fn a_run_whose_learner_sleeps_for_a_while_goes_on() {
+    let place = Workplace::new();
+    let run = place.path("run");
+    let mut running = training(&place, &run, &["--set", "actors.send_deadline_s=0.5"]);
+    signal_role(&place, "learner", Signal::STOP);
+    running.until_said("the learner takes nothing from its full queue");
+    signal_role(&place, "learner", Signal::CONT);
+    let steps = env_steps_of(&run).unwrap();
+    running.until_steps(&run, steps + 2_000);
+    running.signal_group(Signal::INT);
+    running.wait().with_status(130);
+    let last = rows(&run, "metrics.jsonl").pop().unwrap();
+    assert!(last["rejected"].as_object().unwrap().values().all(|count| count == 0), "{last}");
+}
+
+#[test]
+fn a_killed_worker_is_announced_and_replaced() {
+    let place = Workplace::new();
+    let run = place.path("run");
+    let mut running = training(&place, &run, &[]);
+    signal_role(&place, "actor", Signal::KILL);
+    running.until_said("actor-0 died (signal 9 (SIGKILL)");
+    running.until_said("restart 1 of 5");
+    let steps = env_steps_of(&run).unwrap();
+    running.until_steps(&run, steps + 1_500);
+    running.signal_group(Signal::INT);
+    running.wait().with_status(130);
+    let last = rows(&run, "metrics.jsonl").pop().unwrap();
+    let refused = last["rejected"].as_object().unwrap();
+    assert!(refused.values().all(|count| count == 0), "{last}");
+    place.assert_no_process();
+}
+
+#[test]
+fn a_killed_evaluator_answers_after_its_restart() {
+    let place = Workplace::new();
+    let run = place.path("run");
+    let mut running = training(&place, &run, &[]);
+    signal_role(&place, "evaluator", Signal::KILL);
+    running.until_said("evaluator died");
+    let rows_before = rows(&run, "evaluations.jsonl").len();
+    running.until("another row", |_| rows(&run, "evaluations.jsonl").len() > rows_before);
+    running.signal_group(Signal::INT);
+    running.wait().with_status(130);
+    let steps = env_steps(&rows(&run, "evaluations.jsonl"));
+    assert!(steps.is_sorted_by(|a, b| a < b), "{steps:?}");
+}
+
+#[test]
+fn a_killed_learner_ends_the_run_with_its_log_and_advice() {
+    let place = Workplace::new();
+    let run = place.path("run");
+    let running = training(&place, &run, &[]);
+    signal_role(&place, "learner", Signal::KILL);
+    let reached = env_steps_of(&run).unwrap();
+    running
+        .wait()
+        .with_status(1)
+        .saying("error: learner died: signal 9")
+        .saying("learner.log")
+        .saying("dmprl resume");
+    place.assert_no_process();
+    assert_eq!(shared_memory_of(&run), Vec::<PathBuf>::new());
+    resume_and_check_curve(&place, &run, reached);
+}

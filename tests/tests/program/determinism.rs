@@ -1,0 +1,59 @@
+//! `--deterministic`: one seed, one result, to the byte.
+
+use std::collections::BTreeMap;
+use std::fs;
+use std::path::Path;
+
+use dmprl_learner::metrics::TIME_KEYS;
+use dmprl_tests::program::{Workplace, rows};
+use serde_json::Value;
+
+use crate::train;
+
+/// Everything that must repeat: rows without their times, and the newest checkpoint's files.
+#[derive(Debug, PartialEq)]
+struct Result {
+    metrics: Vec<Value>,
+    evaluations: Vec<Value>,
+    checkpoint: BTreeMap<String, Vec<u8>>,
+}
+
+fn trained(place: &Workplace, name: &str, seed: &str) -> Result {
+    let run = place.path(name);
+    let more = ["--deterministic", "--seed", seed, "--steps", "2500"];
+    place.run(&train("reacher", &run, &more)).with_status(0);
+    let timeless = |file| {
+        let mut rows = rows(&run, file);
+        for row in &mut rows {
+            TIME_KEYS.iter().for_each(|key| drop(row.as_object_mut().unwrap().remove(*key)));
+        }
+        rows
+    };
+    let latest = Path::new(&run).join("checkpoints/latest");
+    let files = fs::read_dir(&latest).unwrap().map(|entry| entry.unwrap());
+    Result {
+        metrics: timeless("metrics.jsonl"),
+        evaluations: timeless("evaluations.jsonl"),
+        checkpoint: files
+            .map(|file| (file.file_name().into_string().unwrap(), fs::read(file.path()).unwrap()))
+            .collect(),
+    }
+}
+
+#[test]
+fn the_same_seed_gives_the_same_bytes_and_another_seed_does_not() {
+    let place = Workplace::new();
+    let first = trained(&place, "first", "7");
+    assert_eq!((first.metrics.len(), first.evaluations.len(), first.checkpoint.len()), (5, 3, 3));
+    let second = trained(&place, "second", "7");
+    assert_eq!(first.metrics, second.metrics);
+    assert_eq!(first.evaluations, second.evaluations);
+    for (name, bytes) in &first.checkpoint {
+        assert!(second.checkpoint[name] == *bytes, "{name} of the checkpoints differs");
+    }
+    let other = trained(&place, "other", "8");
+    assert_ne!(first.evaluations, other.evaluations);
+    for (name, bytes) in &first.checkpoint {
+        assert!(other.checkpoint[name] != *bytes, "{name} does not depend on the seed");
+    }
+}

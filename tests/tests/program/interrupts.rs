@@ -1,0 +1,113 @@
+//! Ctrl-C, once and twice, in good times and in bad.
+
+use std::path::Path;
+
+use dmprl_tests::program::{
+    Running, Workplace, env_steps, env_steps_of_checkpoint, rows, shared_memory_of,
+};
+use rustix::process::Signal;
+
+use crate::{ENDLESS, train};
+
+fn training(place: &Workplace, run: &str) -> Running {
+    let mut running = place.start(&train("reacher", run, &["--steps", ENDLESS]));
+    running.until_steps(run, 1_500);
+    running
+}
+
+fn stop_role(place: &Workplace, role: &str) {
+    let processes = place.processes();
+    let process = processes.iter().find(|process| process.role == role);
+    process.unwrap_or_else(|| panic!("no {role} in {processes:#?}")).signal(Signal::STOP);
+}
+
+fn assert_nothing_left(place: &Workplace, run: &str) {
+    place.assert_no_process();
+    assert_eq!(shared_memory_of(run), Vec::<std::path::PathBuf>::new());
+}
+
+#[test]
+fn ctrl_c_once_writes_a_checkpoint_that_the_run_goes_on_from() {
+    let place = Workplace::new();
+    let run = place.path("run");
+    let running = training(&place, &run);
+    running.signal_group(Signal::INT);
+    running.wait().with_status(130).saying("checkpoint written").saying("dmprl resume");
+    assert_nothing_left(&place, &run);
+    let steps = env_steps_of_checkpoint(&run).unwrap();
+    let metrics = rows(&run, "metrics.jsonl");
+    assert_eq!(env_steps(&metrics).last(), Some(&steps), "the checkpoint is of the last moment");
+
+    let end = (steps + 1_000).to_string();
+    place.run(&["resume", &run, "--steps", &end]).with_status(0);
+    let after = rows(&run, "metrics.jsonl");
+    assert_eq!(after[..metrics.len()], metrics, "not one step is done again");
+    assert_eq!(env_steps(&after).last(), Some(&(steps + 1_000)));
+}
+
+#[test]
+fn sigterm_is_an_interrupt_too() {
+    let place = Workplace::new();
+    let run = place.path("run");
+    let running = training(&place, &run);
+    // As a service manager does: the supervisor alone.
+    running.signal(Signal::TERM);
+    running.wait().with_status(130).saying("checkpoint written");
+    assert_nothing_left(&place, &run);
+}
+
+#[test]
+fn ctrl_c_before_the_first_step_leaves_nothing_running() {
+    let place = Workplace::new();
+    let run = place.path("run");
+    let mut running = place.start(&train("reacher", &run, &["--steps", ENDLESS]));
+    running.until_said("training reacher");
+    running.signal_group(Signal::INT);
+    running.wait().with_status(130);
+    assert_nothing_left(&place, &run);
+    place.run(&["resume", &run, "--steps", "1000"]).with_status(0).saying("begins again");
+}
+
+/// The learner hangs, so that only the second interrupt can end the run at once.
+#[test]
+fn ctrl_c_twice_ends_a_run_whose_learner_hangs() {
+    let place = Workplace::new();
+    let run = place.path("run");
+    let mut running = training(&place, &run);
+    let before = env_steps_of_checkpoint(&run);
+    stop_role(&place, "learner");
+    running.signal_group(Signal::INT);
+    running.until_said("once more: stop at once");
+    running.signal_group(Signal::INT);
+    running.wait().with_status(130).saying("interrupted twice: killed");
+    assert_nothing_left(&place, &run);
+    assert_eq!(env_steps_of_checkpoint(&run), before, "the checkpoint before is still there");
+}
+
+#[test]
+fn ctrl_c_once_ends_a_run_whose_worker_hangs_and_writes_the_checkpoint() {
+    let place = Workplace::new();
+    let run = place.path("run");
+    let running = training(&place, &run);
+    stop_role(&place, "actor");
+    running.signal_group(Signal::INT);
+    running.wait().with_status(130).saying("killed actor-0").saying("checkpoint written");
+    assert_nothing_left(&place, &run);
+}
+
+#[test]
+fn ctrl_c_during_eval_leaves_the_run_as_it_is() {
+    let place = Workplace::new();
+    let run = place.path("run");
+    place.run(&train("reacher", &run, &["--steps", "1000"])).with_status(0);
+    let running = place.start(&["eval", &run, "--episodes", "1000000"]);
+    let mut running = running;
+    running.until("an evaluator", |_| {
+        place.processes().iter().any(|process| process.role == "evaluator")
+    });
+    running.signal_group(Signal::INT);
+    assert_eq!(running.wait().with_status(130).printed, "");
+    place.assert_no_process();
+    assert_eq!(rows(&run, "evaluations.jsonl").len(), 1);
+    assert!(Path::new(&run).join("logs/eval.log").is_file());
+}

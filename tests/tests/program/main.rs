@@ -1,0 +1,44 @@
+//! The whole program with real processes, as a user meets it: what a run leaves behind, how it
+//! ends, what it survives.
+//!
+//! One executable for all of them: linking is dear, and the tests run side by side.
+#![cfg(feature = "python")]
+#![allow(
+    clippy::unwrap_used,
+    reason = "helpers of tests; clippy.toml covers only the tests themselves"
+)]
+
+mod deaths;
+mod determinism;
+mod endings;
+mod environments;
+mod interrupts;
+mod learning;
+mod refusals;
+mod results;
+mod start_stop;
+mod variants;
+
+/// Settings that make a run cheap: small networks, few updates, and every kind of output often.
+const SMALL: [&str; 9] = [
+    "policy.hidden=[32,32]",
+    "algorithm.critic_hidden=[32,32]",
+    "algorithm.batch_size=32",
+    "exploration.warm_up_steps=500",
+    "pacing.updates_per_segment=0.5",
+    "evaluation.episodes=4",
+    "evaluation.interval_steps=1000",
+    "checkpoint.interval_steps=1000",
+    "metrics.interval_steps=500",
+];
+
+/// Long beyond the end of any test: for runs that something else ends.
+const ENDLESS: &str = "1000000000";
+
+/// The command line of a cheap `train`; `more` comes last and so has the last word.
+fn train<'a>(task: &'a str, run: &'a str, more: &[&'a str]) -> Vec<&'a str> {
+    let mut arguments = vec!["train", task, "--run-dir", run];
+    SMALL.iter().for_each(|setting| arguments.extend(["--set", setting]));
+    arguments.extend(more);
+    arguments
+}

@@ -1,0 +1,44 @@
+//! Wrong use costs nothing: status 2, the right name, and not a file.
+
+use std::fs;
+
+use dmprl_tests::program::Workplace;
+
+#[test]
+fn wrong_use_names_the_right_word_and_creates_nothing() {
+    let place = Workplace::new();
+    for (arguments, expected) in [
+        (&["train", "reachr"][..], "did you mean `reacher`"),
+        (&["train", "reacher", "--stps", "5"], "--steps"),
+        (&["train", "reacher", "--preset", "papr"], "paper"),
+        (&["train", "reacher", "--set", "algorithm.bach_size=3"], "algorithm.batch_size"),
+        (&["train", "reacher", "--set", "policy.start=carry"], "warm_up_kind"),
+        (&["train", "reacher", "--set", "novalue"], "KEY=VALUE"),
+        (&["train", "reacher", "--steps", "0"], "run.steps"),
+        (&["train", "reacher", "--init-from", "nowhere"], "nowhere"),
+        (&["train", "reacher", "--python-path", "nowhere"], "nowhere"),
+        (&["train", "reacher", "--run-dir", "out/.."], "needs a name"),
+        (&["resume", "nowhere"], "nowhere"),
+        (&["eval", "nowhere"], "nowhere"),
+    ] {
+        let finished = place.run(arguments).with_status(2).saying(expected);
+        assert!(finished.said.starts_with("error: "), "{}", finished.said);
+        // The harness has removed the folder for the output by now.
+        let files: Vec<_> = fs::read_dir(place.folder()).unwrap().collect();
+        assert!(files.is_empty(), "{arguments:?} left {files:?}");
+    }
+}
+
+#[test]
+fn a_run_that_is_being_trained_is_not_resumed_beside_itself() {
+    let place = Workplace::new();
+    let run = place.path("run");
+    let mut running = place.start(&crate::train("reacher", &run, &["--steps", crate::ENDLESS]));
+    running.until_steps(&run, 500);
+    place.run(&crate::train("reacher", &run, &[])).with_status(2).saying("already holds files");
+    // At once: `resume` waits only for the children of a supervisor that is gone.
+    let resumed = place.run(&["resume", &run]).with_status(1).saying("is being trained by process");
+    assert!(!resumed.said.contains("waiting"), "{}", resumed.said);
+    let steps = dmprl_tests::program::env_steps_of(&run).unwrap();
+    running.until_steps(&run, steps + 500);
+}

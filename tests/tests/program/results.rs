@@ -1,0 +1,148 @@
+//! What a run leaves behind, and that it can be used again.
+
+use std::fs;
+use std::path::Path;
+
+use dmprl_tests::program::{Workplace, env_steps, json_file, rows, shared_memory_of};
+use serde_json::Value;
+
+use crate::train;
+
+const ROW_KEYS: [&str; 9] = [
+    "env_steps",
+    "updates",
+    "segments",
+    "wall_s",
+    "policy_version",
+    "returns",
+    "return_mean",
+    "success_rate",
+    "smoothness",
+];
+
+fn number(row: &Value, key: &str) -> f64 {
+    row[key].as_f64().unwrap_or_else(|| panic!("{key} of {row}"))
+}
+
+#[test]
+fn training_with_two_workers_leaves_a_whole_run_directory_and_nothing_else() {
+    let place = Workplace::new();
+    let run = place.path("run");
+    let finished = place
+        .run(&train("reacher", &run, &["--steps", "2500", "--workers", "2"]))
+        .with_status(0)
+        .saying("first environment step after")
+        .saying("evaluation at 2,500 steps")
+        .saying("  return ")
+        .saying("dmprl eval");
+    assert_eq!(finished.printed, "", "standard output is for results that were asked for");
+    place.assert_no_process();
+    assert_eq!(shared_memory_of(&run), Vec::<std::path::PathBuf>::new());
+
+    for file in [
+        "config.toml",
+        "manifest.json",
+        "metrics.jsonl",
+        "evaluations.jsonl",
+        "checkpoints/latest/state.json",
+        "checkpoints/best",
+        "logs/learner.log",
+        "logs/actor-0.log",
+        "logs/actor-1.log",
+        "logs/evaluator.log",
+        "plots/learning_curve.svg",
+    ] {
+        assert!(Path::new(&run).join(file).is_file(), "no {file}");
+    }
+    let evaluations = rows(&run, "evaluations.jsonl");
+    for row in &evaluations {
+        let keys: Vec<&str> = row.as_object().unwrap().keys().map(String::as_str).collect();
+        assert!(ROW_KEYS.iter().all(|key| keys.contains(key)), "{row}");
+        let returns: Vec<f64> = row["returns"]
+            .as_array()
+            .unwrap()
+            .iter()
+            .map(|value| value.as_f64().unwrap())
+            .collect();
+        assert_eq!(returns.len(), 4);
+        let mean = returns.iter().sum::<f64>() / 4.0;
+        assert!((mean - number(row, "return_mean")).abs() < 1e-9, "{row}");
+    }
+    // Workers send whole segments: a step that is due is met within one segment.
+    let steps: Vec<u64> = env_steps(&evaluations).iter().map(|steps| steps / 5 * 5).collect();
+    assert_eq!(steps, [1000, 2000, 2500]);
+    let metrics = rows(&run, "metrics.jsonl");
+    assert_eq!(env_steps(&metrics), [500, 1000, 1500, 2000, 2500]);
+    let last = metrics.last().unwrap();
+    assert_eq!(last["rejected"].as_object().unwrap().values().find(|count| **count != 0), None);
+    assert_eq!(number(last, "updates_owed"), 0.0);
+    assert_eq!(json_file(&run, "checkpoints/latest/state.json")["counters"]["env_steps"], 2500);
+}
+
+#[test]
+fn eval_repeats_the_stored_evaluations() {
+    let place = Workplace::new();
+    let run = place.path("run");
+    place.run(&train("reacher", &run, &["--steps", "2000"])).with_status(0);
+    let before = fs::read(Path::new(&run).join("evaluations.jsonl")).unwrap();
+    let stored = rows(&run, "evaluations.jsonl");
+    let best =
+        stored.iter().max_by(|a, b| number(a, "return_mean").total_cmp(&number(b, "return_mean")));
+    for (policy, row) in [("best", best.unwrap()), ("latest", stored.last().unwrap())] {
+        let again = place.run(&["eval", &run, "--policy", policy, "--json"]).with_status(0).json();
+        for key in ["return_mean", "smoothness"] {
+            assert!((number(&again, key) - number(row, key)).abs() < 1e-6, "{policy}: {again}");
+        }
+        assert_eq!(again["success_rate"], row["success_rate"]);
+        let pairs =
+            again["returns"].as_array().unwrap().iter().zip(row["returns"].as_array().unwrap());
+        for (again, stored) in pairs {
+            assert!((again.as_f64().unwrap() - stored.as_f64().unwrap()).abs() < 1e-6);
+        }
+    }
+    let shown = place.run(&["eval", &run]).with_status(0).printed;
+    assert!(shown.contains("(the same)"), "{shown}");
+    assert_eq!(fs::read(Path::new(&run).join("evaluations.jsonl")).unwrap(), before);
+    place.assert_no_process();
+}
+
+#[test]
+fn resume_with_more_steps_extends_a_finished_run() {
+    let place = Workplace::new();
+    let run = place.path("run");
+    place.run(&train("reacher", &run, &["--steps", "1500"])).with_status(0);
+    let first = rows(&run, "metrics.jsonl");
+    place.run(&["resume", &run, "--steps", "3000"]).with_status(0).saying("evaluation at 3,000");
+    let metrics = rows(&run, "metrics.jsonl");
+    assert_eq!(metrics[..first.len()], first, "what was written stays");
+    assert_eq!(env_steps(&metrics), [500, 1000, 1500, 2000, 2500, 3000]);
+    assert_eq!(env_steps(&rows(&run, "evaluations.jsonl")), [1000, 1500, 2000, 3000]);
+    let clock: Vec<f64> = metrics.iter().map(|row| number(row, "wall_s")).collect();
+    assert!(clock.is_sorted(), "time goes on where it stopped: {clock:?}");
+    assert_eq!(json_file(&run, "manifest.json")["sessions"].as_array().unwrap().len(), 2);
+
+    // Nothing is left to do: said, not done again.
+    place.run(&["resume", &run]).with_status(0).saying("  return ");
+    assert_eq!(rows(&run, "metrics.jsonl"), metrics);
+    assert_eq!(env_steps(&rows(&run, "evaluations.jsonl")), [1000, 1500, 2000, 3000]);
+}
+
+#[test]
+fn a_warm_start_begins_with_the_given_policy() {
+    let place = Workplace::new();
+    let (source, run) = (place.path("source"), place.path("run"));
+    place.run(&train("reacher", &source, &["--steps", "1500"])).with_status(0);
+    // Steps so small that they are lost in the rounding of a parameter: the first evaluation is
+    // that of the policy given.
+    let still = ["--init-from", &source, "--set", "algorithm.actor_learning_rate=1e-15"];
+    let more = [&still[..], &["--steps", "1000", "--seed", "9"]].concat();
+    place.run(&train("reacher", &run, &more)).with_status(0);
+    let best = rows(&source, "evaluations.jsonl")
+        .iter()
+        .map(|row| number(row, "return_mean"))
+        .fold(f64::NEG_INFINITY, f64::max);
+    let warm = rows(&run, "evaluations.jsonl");
+    assert!((number(&warm[0], "return_mean") - best).abs() < 1e-6, "{best}: {warm:?}");
+    let manifest = json_file(&run, "manifest.json");
+    assert!(manifest["init_from"].as_str().unwrap().starts_with(&source), "{manifest}");
+}

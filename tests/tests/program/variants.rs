@@ -1,0 +1,71 @@
+//! Every policy, start and preset trains on every kind of environment.
+
+use dmprl_tests::program::{Workplace, env_steps, rows};
+use dmprl_tests::tiny_envs_dir;
+
+use crate::train;
+
+fn trains(task: &str, more: &[&str]) {
+    let place = Workplace::new();
+    let run = place.path("run");
+    let more = [&["--steps", "1200"][..], more].concat();
+    place.run(&train(task, &run, &more)).with_status(0);
+    let evaluations = rows(&run, "evaluations.jsonl");
+    assert!(env_steps(&evaluations).last() >= Some(&1200), "{evaluations:?}");
+    let last = rows(&run, "metrics.jsonl").pop().unwrap();
+    assert!(last["updates"].as_u64() > Some(0), "{last}");
+    assert!(last["rejected"].as_object().unwrap().values().all(|count| count == 0), "{last}");
+    assert!(place.run(&["eval", &run]).with_status(0).printed.contains("(the same)"));
+    place.assert_no_process();
+}
+
+#[test]
+fn the_paper_preset_trains() {
+    trains("reacher", &["--preset", "paper"]);
+}
+
+#[test]
+fn a_policy_that_decides_every_step_trains() {
+    trains("reacher", &["--policy", "mlp"]);
+}
+
+#[test]
+fn a_dmp_that_starts_where_the_joints_are_trains() {
+    trains("reacher", &["--set", "policy.start=observed"]);
+}
+
+#[test]
+fn a_dmp_that_carries_its_state_on_trains() {
+    let carry = ["--set", "policy.start=carry", "--set", "exploration.warm_up_kind=dmp_parameters"];
+    trains("reacher", &carry);
+}
+
+#[test]
+fn the_seven_joints_of_pusher_train() {
+    trains("pusher", &[]);
+}
+
+#[test]
+fn any_gymnasium_id_trains() {
+    trains("Pendulum-v1", &[]);
+}
+
+/// Its episodes terminate at the third of the five steps of a segment.
+#[test]
+fn an_environment_of_ones_own_that_ends_inside_a_segment_trains() {
+    let folder = tiny_envs_dir();
+    trains("tiny_envs:Countdown-v0", &["--python-path", folder.to_str().unwrap()]);
+}
+
+/// Episodes of seven steps: every second segment is cut short by the time limit.
+#[test]
+fn an_environment_with_a_time_limit_inside_a_segment_trains() {
+    let folder = tiny_envs_dir();
+    trains("tiny_envs:Long-v0", &["--python-path", folder.to_str().unwrap()]);
+}
+
+#[test]
+fn an_environment_whose_observation_is_a_dictionary_trains() {
+    let folder = tiny_envs_dir();
+    trains("tiny_envs:Goal-v0", &["--python-path", folder.to_str().unwrap()]);
+}
