@@ -33,11 +33,11 @@ row() {
 evaluate() {
     echo '{"evaluate":{"env_steps":10,"updates":10,"segments":2,"wall_s":1.0,"policy_version":'"$1"'}}'
 }
-# 0 on stop, 1 at end of input.
+# 0 on stop or finish, 1 at end of input.
 until_stop() {
     while read -r line; do
         echo "$line" >>"$fake/$name.seen"
-        [ "$line" = '"stop"' ] && return 0
+        case $line in '"stop"' | '"finish"') return 0 ;; esac
     done
     return 1
 }
