@@ -40,6 +40,9 @@ pub enum RolloutError {
     },
 }
 
+/// Takes a finished segment and keeps it until the learner has it.
+pub type Deliver<'a, E> = &'a mut dyn FnMut(&SegmentHeader, &[f32]) -> Result<(), E>;
+
 /// Who this worker is.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Identity {
@@ -119,10 +122,7 @@ impl Rollout {
     ///
     /// # Errors
     /// If an environment fails, or whatever `deliver` returns.
-    pub fn segment<E: From<RolloutError>>(
-        &mut self,
-        deliver: &mut dyn FnMut(&SegmentHeader, &[f32]) -> Result<(), E>,
-    ) -> Result<(), E> {
+    pub fn segment<E: From<RolloutError>>(&mut self, deliver: Deliver<'_, E>) -> Result<(), E> {
         self.acting.observe(&self.environments);
         let warming_up = self.snapshot.version == 0 || self.snapshot.env_steps < self.warm_up_steps;
         if warming_up {

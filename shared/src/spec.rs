@@ -40,7 +40,8 @@ pub enum SpecError {
     },
     /// A bound that is infinite, NaN or empty.
     #[error(
-        "{id}: action dimension {dimension} is bounded by [{low}, {high}]; expected finite, low < high"
+        "{id}: action dimension {dimension} is bounded by [{low}, {high}]; \
+         expected finite, low < high"
     )]
     Bounds {
         /// Gymnasium id.

@@ -14,9 +14,9 @@ use super::{LINKED_PYTHON, PythonError};
 
 /// Runs once after start. `stdout` carries the supervisor's protocol, so an environment's `print`
 /// must not reach it, nor its `input` the supervisor's commands. A BLAS pool of its own per worker
-/// would only fight with the other workers; whoever wants one sets the variable. Importing `signal`,
-/// which half of the standard library does, takes SIGINT over even where CPython was told to
-/// install no handlers, so it is imported here and SIGINT given back; a handler or an "ignore"
+/// would only fight with the other workers; whoever wants one sets the variable. Importing
+/// `signal`, which half of the standard library does, takes SIGINT over even where CPython was told
+/// to install no handlers, so it is imported here and SIGINT given back; a handler or an "ignore"
 /// that the role set before is left alone by CPython.
 const PREPARE: &CStr = c"\
 import os, signal, sys

@@ -5,7 +5,7 @@ use std::path::Path;
 
 use anyhow::Context;
 use dmprl_shared::config::{
-    ConfigError, ExperimentConfig, Layers, PRESETS, TASKS, nearest, task_defaults,
+    ConfigError, ExperimentConfig, Layers, PRESETS, TASKS, nearest, policy_defaults, task_defaults,
 };
 use toml::{Table, Value};
 
@@ -41,8 +41,20 @@ pub(super) struct Sources<'a> {
 }
 
 /// Merges the sources; every mistake in them is wrong use.
-pub(super) fn merge(sources: Sources<'_>) -> anyhow::Result<ExperimentConfig> {
+///
+/// Which policy decides is known only at the end, and its own defaults lie at the bottom: where
+/// it has some, the sources are merged once more on top of them.
+pub(super) fn merge(sources: &Sources<'_>) -> anyhow::Result<ExperimentConfig> {
+    let config = merge_over(Table::new(), sources)?;
+    match policy_defaults(config.policy.kind) {
+        Some(defaults) => merge_over(defaults, sources),
+        None => Ok(config),
+    }
+}
+
+fn merge_over(defaults: Table, sources: &Sources<'_>) -> anyhow::Result<ExperimentConfig> {
     let mut layers = Layers::new();
+    add(&mut layers, "policy defaults", defaults)?;
     add(&mut layers, sources.task, task_table(sources.task)?)?;
     let preset = PRESETS.iter().find(|preset| preset.name == sources.preset);
     let preset = preset.with_context(|| format!("no preset {}", sources.preset))?;
@@ -51,11 +63,11 @@ pub(super) fn merge(sources: Sources<'_>) -> anyhow::Result<ExperimentConfig> {
         add(&mut layers, &file.display().to_string(), read_table(file)?)?;
     }
     let mut ours: Vec<_> =
-        sources.environment.into_iter().filter(|(name, _)| name.starts_with(PREFIX)).collect();
+        sources.environment.iter().filter(|(name, _)| name.starts_with(PREFIX)).collect();
     ours.sort();
     for (name, text) in ours {
         let key = name[PREFIX.len()..].to_ascii_lowercase().replace("__", ".");
-        layers.set(&format!("environment variable {name}"), &key, &text).map_err(refuse)?;
+        layers.set(&format!("environment variable {name}"), &key, text).map_err(refuse)?;
     }
     for pair in sources.set {
         let (key, text) = pair.split_once('=').ok_or_else(|| {
@@ -63,8 +75,8 @@ pub(super) fn merge(sources: Sources<'_>) -> anyhow::Result<ExperimentConfig> {
         })?;
         layers.set("--set", key.trim(), text.trim()).map_err(refuse)?;
     }
-    for Flag { flag, key, value } in sources.flags {
-        add(&mut layers, flag, nested(key, value))?;
+    for Flag { flag, key, value } in &sources.flags {
+        add(&mut layers, flag, nested(key, value.clone()))?;
     }
     let config = layers.finish().map_err(refuse)?;
     if config.task.name != sources.task {
@@ -168,7 +180,7 @@ mod tests {
     }
 
     fn refused(sources: Sources<'_>) -> String {
-        let error = merge(sources).unwrap_err();
+        let error = merge(&sources).unwrap_err();
         assert!(error.downcast_ref::<WrongUse>().is_some(), "{error:#}");
         error.to_string()
     }
@@ -194,7 +206,7 @@ mod tests {
                 let value = Value::Integer(6);
                 sources.flags.push(Flag { flag: "--steps", key: "run.steps", value });
             }
-            merged.push(merge(sources).unwrap().run.steps);
+            merged.push(merge(&sources).unwrap().run.steps);
         }
         assert_eq!(merged, [200_000, 3, 4, 5, 6]);
     }
@@ -205,11 +217,11 @@ mod tests {
         writeln!(file, "[dmp]\nalpha_y = 12").unwrap();
         let mut paper = sources("reacher");
         paper.preset = "paper";
-        assert_eq!(merge(paper).unwrap().dmp.alpha_y, 25.0);
+        assert_eq!(merge(&paper).unwrap().dmp.alpha_y, 25.0);
         let mut with_file = sources("reacher");
         with_file.preset = "paper";
         with_file.file = Some(file.path());
-        assert_eq!(merge(with_file).unwrap().dmp.alpha_y, 12.0);
+        assert_eq!(merge(&with_file).unwrap().dmp.alpha_y, 12.0);
     }
 
     #[test]
@@ -234,7 +246,7 @@ mod tests {
     #[test]
     fn gymnasium_ids_are_tasks() {
         for name in ["Pendulum-v1", "my.module:Arm-v0", "ALE/Pong-v5", "a:b/C.d-e-v12"] {
-            let config = merge(sources(name)).unwrap();
+            let config = merge(&sources(name)).unwrap();
             assert_eq!((config.task.id.as_str(), config.task.name.as_str()), (name, name));
         }
     }
@@ -254,14 +266,14 @@ mod tests {
         let limits = dmprl_shared::config::Limits { cores: 4 };
         let mut first = sources("pusher");
         first.preset = "paper";
-        let config = merge(first).unwrap().resolve(limits).unwrap();
+        let config = merge(&first).unwrap().resolve(limits).unwrap();
         let manifest = crate::run_directory::Manifest::new(None).unwrap();
         let path = parent.path().join("run");
         crate::run_directory::RunDirectory::create(&path, &config, &manifest).unwrap();
         let file = path.join("config.toml");
         let mut second = sources("pusher");
         second.file = Some(&file);
-        assert_eq!(merge(second).unwrap().resolve(limits).unwrap(), config);
+        assert_eq!(merge(&second).unwrap().resolve(limits).unwrap(), config);
     }
 
     #[test]
@@ -270,5 +282,16 @@ mod tests {
         let mut sources = sources("reacher");
         sources.set = &set;
         assert!(refused(sources).contains("KEY=VALUE"));
+    }
+
+    #[test]
+    fn an_mlp_does_one_update_a_step_unless_told_otherwise() {
+        let kind = [String::from("policy.kind=mlp")];
+        let mlp = Sources { set: &kind, ..sources("reacher") };
+        assert_eq!(merge(&mlp).unwrap().pacing.updates_per_segment, 1.0);
+        let both = [kind[0].clone(), String::from("pacing.updates_per_segment=3")];
+        let told = Sources { set: &both, ..sources("reacher") };
+        assert_eq!(merge(&told).unwrap().pacing.updates_per_segment, 3.0);
+        assert_eq!(merge(&sources("reacher")).unwrap().pacing.updates_per_segment, 2.0);
     }
 }

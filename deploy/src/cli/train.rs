@@ -113,7 +113,7 @@ pub(super) fn run(args: &TrainArgs) -> anyhow::Result<Outcome> {
         set: &args.set,
         flags: flags(args)?,
     };
-    let mut config = merge(sources)?.resolve(Limits { cores: cores() }).map_err(refuse)?;
+    let mut config = merge(&sources)?.resolve(Limits { cores: cores() }).map_err(refuse)?;
     // Absolute, so that the run can be resumed from anywhere.
     for path in &mut config.task.python_path {
         *path = absolute_folder(path)?;

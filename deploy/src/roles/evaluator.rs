@@ -85,7 +85,7 @@ pub fn keep(setup: &Setup, row: &EvaluationRow) -> anyhow::Result<()> {
     for env_steps in checkpoint::env_steps(&setup.run.checkpoints_path())? {
         let seen = || rows.iter().filter(|row| row.env_steps <= env_steps);
         let best = seen().max_by(|a, b| a.return_mean.total_cmp(&b.return_mean));
-        versions.extend(best.into_iter().chain(seen().last()).map(|row| row.policy_version));
+        versions.extend(best.into_iter().chain(seen().next_back()).map(|row| row.policy_version));
     }
     setup.run.point_best()?;
     setup.run.prune_policies(&versions)

@@ -66,22 +66,14 @@ pub fn make(
 ) -> anyhow::Result<Learner> {
     let fresh = || Learner::new(setup.config.clone(), spec, setup.run_id);
     if args.resume {
-        let folder = setup.run.checkpoints_path();
-        if checkpoint::names(&folder)?.is_empty() {
-            let message = "the run has no checkpoint yet: it begins again".to_owned();
+        let (learner, loaded) = checkpoint::load_newest(&setup.run.checkpoints_path(), &fresh)?;
+        for error in loaded.refused {
+            let message = format!("a checkpoint is refused, an older one is used: {error}");
             eprintln!("{message}");
             control.send(&Report::Warning { message })?;
-            setup.run.begin_again()?;
-        } else {
-            let (learner, loaded) = checkpoint::load_newest(&folder, &fresh)?;
-            for error in loaded.refused {
-                let message = format!("a checkpoint is refused, an older one is used: {error}");
-                eprintln!("{message}");
-                control.send(&Report::Warning { message })?;
-            }
-            setup.run.rewind(learner.counters.env_steps)?;
-            return Ok(learner);
         }
+        setup.run.rewind(learner.counters.env_steps)?;
+        return Ok(learner);
     }
     let mut learner = fresh()?;
     if let Some(path) = &args.init_from {

@@ -94,7 +94,8 @@ fn a_damaged_checkpoint_is_refused_with_the_reason_and_the_one_before_is_used() 
     train(&mut learner, 60..80);
     let newer = save(folder, &learner).unwrap();
 
-    let damages: [(&str, &dyn Fn(&mut Vec<u8>), &str); 5] = [
+    type Damage = dyn Fn(&mut Vec<u8>);
+    let damages: [(&str, &Damage, &str); 5] = [
         (REPLAY, &|bytes| bytes.truncate(100), "length in bytes is 100"),
         (REPLAY, &|bytes| bytes[300] ^= 1, "CRC-32"),
         (NETWORKS, &|bytes| *bytes.last_mut().unwrap() ^= 1, "CRC-32"),

@@ -1,7 +1,8 @@
 //! The replay in a checkpoint: a length-checked binary of our own.
 //!
 //! ```text
-//!   magic "DMPRLRP1" · u64 K, O, A, slot count, filled, head, inserted, tail count · slots · tails · blocks
+//!   magic "DMPRLRP1" · u64 K, O, A, slot count, filled, head, inserted, tail count
+//!   then slots · tails · blocks:
 //!   slot: u32 next, u8 steps_len, u8 terminated, u8 truncated, u8 0      (filled ones)
 //!   tail: u32 slot, incarnation, episode, episode_steps, u64 number; slot = 2^32 - 1: none
 //!   block: f32 × block_len (filled ones)                                 all little-endian

@@ -56,9 +56,9 @@ impl Pass<'_> {
         product(out, gradient, weights, Keep::Replace, self.threads);
         let activation = self.activations.layer(self.shape, index - 1, rows);
         for (gradient, activation) in out.iter_mut().zip(activation) {
-            if *activation <= 0.0 {
-                *gradient = 0.0;
-            }
+            // A select, not a branch: activations are as good as random, and a branch on them cost
+            // a sixth of the update.
+            *gradient = if *activation > 0.0 { *gradient } else { 0.0 };
         }
     }
 }

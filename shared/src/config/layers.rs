@@ -175,11 +175,10 @@ fn unknown(origin: &str, key: String, name: &str, siblings: &Table, path: &str) 
         .map(|near| if path.is_empty() { near.to_owned() } else { format!("{path}.{near}") });
     let anywhere = || {
         let keys = Layers::new().keys();
-        let leaf = |key: &str| key.rsplit('.').next().unwrap_or_default().to_owned();
-        keys.iter()
-            .find(|key| leaf(key) == name)
-            .cloned()
-            .or_else(|| nearest(&key, keys.iter().map(String::as_str)).map(str::to_owned))
+        let leaf = |key: &'_ String| key.rsplit('.').next().unwrap_or_default().to_owned();
+        let leaves: Vec<String> = keys.iter().map(leaf).collect();
+        let near = nearest(name, leaves.iter().map(String::as_str))?;
+        keys.iter().find(|key| leaf(key) == near).cloned()
     };
     let hint = sibling.or_else(anywhere).map(|near| format!(", did you mean `{near}`?"));
     ConfigError::UnknownKey { origin: origin.to_owned(), key, hint: hint.unwrap_or_default() }
@@ -208,11 +207,12 @@ fn collect_keys(table: &Table, path: &str, keys: &mut Vec<String>) {
 
 #[cfg(test)]
 mod tests {
-    use super::super::{PRESETS, TASKS};
+    use super::super::{PRESETS, PolicyKind, TASKS, policy_defaults};
     use super::*;
 
     #[test]
     fn every_preset_and_task_is_a_valid_layer() {
+        Layers::new().add("mlp", policy_defaults(PolicyKind::Mlp).unwrap()).unwrap();
         for (name, table) in PRESETS
             .iter()
             .map(|preset| (preset.name, preset.table()))
@@ -239,6 +239,7 @@ mod tests {
         for (given, near) in [
             ("algorithm.bach_size", "algorithm.batch_size"),
             ("batch_size", "algorithm.batch_size"),
+            ("bach_size", "algorithm.batch_size"),
             ("algoritm.batch_size", "algorithm"),
         ] {
             let message = layers.set("--set", given, "64").unwrap_err().to_string();

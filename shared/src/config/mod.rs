@@ -26,6 +26,6 @@ pub use experiment::{
     MetricsConfig, PacingConfig, ReplayConfig, RunConfig, TaskConfig,
 };
 pub use layers::{ConfigError, Layers, nearest};
-pub use presets::{PRESETS, Preset};
+pub use presets::{PRESETS, Preset, policy_defaults};
 pub use resolve::Limits;
 pub use tasks::{TASKS, TaskDefaults, task_defaults};

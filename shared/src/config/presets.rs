@@ -2,6 +2,8 @@
 
 use toml::Table;
 
+use super::PolicyKind;
+
 /// A preset: its name, one line about it, and its values as TOML.
 #[derive(Debug)]
 pub struct Preset {
@@ -51,6 +53,24 @@ updates_per_segment = 1.0
 workers = 1
 envs_per_worker = 1
 "#;
+
+/// What differs from the defaults for a kind of policy, below every other layer.
+///
+/// `mlp` decides every step, so two updates a decision would be ten times as many as `dmp` does;
+/// the baselines of the paper do one a step.
+///
+/// # Panics
+/// Never: a test parses it.
+#[must_use]
+pub fn policy_defaults(kind: PolicyKind) -> Option<Table> {
+    match kind {
+        PolicyKind::Dmp => None,
+        PolicyKind::Mlp => {
+            let text = "[pacing]\nupdates_per_segment = 1.0";
+            Some(text.parse().expect("the built-in defaults are valid TOML"))
+        }
+    }
+}
 
 impl Preset {
     /// The preset's values.

@@ -26,7 +26,8 @@ pub const TASKS: [TaskDefaults; 2] = [
     },
 ];
 
-// Observation of Reacher-v5: cos (2), sin (2), target (2), angular velocity (2), fingertip - target.
+// Observation of Reacher-v5: cos (2), sin (2), target (2), angular velocity (2),
+// fingertip - target.
 const REACHER: &str = r#"
 [task]
 id = "Reacher-v5"

@@ -106,7 +106,8 @@ impl Policy {
         let mut widths = vec![layout.observation_len];
         widths.extend(&config.policy.hidden);
         widths.push(outputs);
-        let described = format!("{:?} {:?} {spec:?} {:?}", config.policy, config.dmp, config.task);
+        let sources = &config.task.start_sources;
+        let described = format!("{:?} {:?} {sources:?} {spec:?}", config.policy, config.dmp);
         Ok(Self {
             shape: MlpShape::new(widths),
             head,
@@ -117,7 +118,7 @@ impl Policy {
         })
     }
 
-    /// Identifies the architecture: configuration of policy, DMP and task, and the spec.
+    /// Identifies the architecture: configuration of policy and DMP, start table and spec.
     #[must_use]
     pub fn architecture_hash(&self) -> u64 {
         self.architecture_hash

@@ -155,8 +155,9 @@ mod tests {
 
     #[test]
     fn a_network_worked_by_hand() {
-        // 2 -> 2 (ReLU) -> 1: hidden = relu([1*1 + 2*(-1) + 0.5, 3*1 + 1*(-1) - 4]) = relu([-0.5, -2])
-        // for x = (1, -1), and relu([1 + 2 + 0.5, 3 + 1 - 4]) = [3.5, 0] for x = (1, 1).
+        // 2 -> 2 (ReLU) -> 1. For x = (1, -1) the hidden layer is
+        // relu([1*1 + 2*(-1) + 0.5, 3*1 + 1*(-1) - 4]) = relu([-0.5, -2]),
+        // and relu([1 + 2 + 0.5, 3 + 1 - 4]) = [3.5, 0] for x = (1, 1).
         let shape = MlpShape::new(vec![2, 2, 1]);
         let parameters = [1.0, 2.0, 3.0, 1.0, 0.5, -4.0, 2.0, -1.0, 0.25];
         let mut activations = Activations::new(&shape, 2);

@@ -19,10 +19,10 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from mp_pytorch.basis_gn import NormalizedRBFBasisGenerator
-from mp_pytorch.mp.dmp import DMP as TorchDmp
-from mp_pytorch.phase_gn import ExpDecayPhaseGenerator
 from movement_primitives.dmp import DMP
+from mp_pytorch.basis_gn import NormalizedRBFBasisGenerator
+from mp_pytorch.mp.dmp import DMP as TorchDmp  # noqa: N811 - two classes of one name
+from mp_pytorch.phase_gn import ExpDecayPhaseGenerator
 
 SEED = 20241105
 PACKAGES = ["movement_primitives", "mp-pytorch", "numpy", "torch"]
@@ -34,7 +34,8 @@ def draw_cases(generator):
     """The worked example of research/algorithms.md, section 6, then random parameters."""
     weights = [10.0, -20.0, 30.0, 0.0, 5.0]
     cases = [dict(alpha_y=25.0, tau=1.0, y0=0.0, yd0=0.0, goal=1.0, weights=weights)]
-    for basis_count, alpha_y, tau in [(3, 10.0, 1.0), (4, 5.0, 2.0), (5, 15.0, 0.5), (6, 25.0, 1.0)]:
+    variants = [(3, 10.0, 1.0), (4, 5.0, 2.0), (5, 15.0, 0.5), (6, 25.0, 1.0)]
+    for basis_count, alpha_y, tau in variants:
         cases.append(
             dict(
                 alpha_y=alpha_y,
@@ -73,8 +74,13 @@ def movement_primitives_case(case):
         yds.append(yd[0])
     term = dmp.forcing_term
     return dict(
-        case, alpha_x=term.alpha_z, inner_steps=INNER_STEPS, centres=list(term.centers),
-        widths=list(term.widths), y=ys, yd=yds,
+        case,
+        alpha_x=term.alpha_z,
+        inner_steps=INNER_STEPS,
+        centres=list(term.centers),
+        widths=list(term.widths),
+        y=ys,
+        yd=yds,
     )
 
 
@@ -96,9 +102,13 @@ def mp_pytorch_case(case):
     )
     y, yd = dmp.get_traj_pos(), dmp.get_traj_vel()
     return dict(
-        case, alpha_x=alpha_x, inner_steps=1, centres=basis.centers_p.tolist(),
+        case,
+        alpha_x=alpha_x,
+        inner_steps=1,
+        centres=basis.centers_p.tolist(),
         widths=(basis.bandwidth / 2).tolist(),  # psi = exp(-bandwidth d^2 / 2)
-        y=y[..., 0].tolist(), yd=yd[..., 0].tolist(),
+        y=y[..., 0].tolist(),
+        yd=yd[..., 0].tolist(),
     )
 
 
