@@ -3,6 +3,7 @@
 use std::path::PathBuf;
 
 use clap::Args;
+use dmprl_learner::checkpoint;
 use dmprl_shared::config::Limits;
 
 use super::configuration::refuse;
@@ -40,6 +41,16 @@ pub(super) fn run(args: &ResumeArgs) -> anyhow::Result<Outcome> {
     let steps_before = config.run.steps;
     if let Some(steps) = args.steps {
         config.run.steps = steps.unsigned_abs();
+    }
+    let folder = run.checkpoints_path();
+    let reached = checkpoint::env_steps(&folder)?.into_iter().max().unwrap_or(0);
+    // A run may end some steps beyond its length, in mid-segment: the same length is no mistake.
+    if config.run.steps < reached.min(steps_before) {
+        return Err(wrong_use(format!(
+            "--steps {}: the run has {reached} steps already; --steps is the length of the whole \
+             run",
+            config.run.steps
+        )));
     }
     for path in &config.task.python_path {
         if !std::path::Path::new(path).is_dir() {

@@ -42,6 +42,7 @@ impl Supervisor {
             Report::Evaluate(request) => self.on_evaluate(request),
             Report::Evaluated(row) => return self.on_evaluated(process, row),
             Report::Checkpoint { name, env_steps } => {
+                self.checkpointed = true;
                 let steps = grouped(env_steps);
                 self.display.message(&format!("checkpoint {name} at {steps} steps"));
             }
@@ -116,6 +117,7 @@ impl Supervisor {
         if self.last.as_ref().is_none_or(|(_, last)| marks(last) != marks(&progress)) {
             self.advanced = now;
         }
+        self.checkpointed = false;
         self.display.progress(&progress);
         if self.first.is_none() {
             self.first = Some((now, progress.clone()));

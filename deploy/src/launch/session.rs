@@ -116,13 +116,15 @@ fn conclude(
         // The results are there; a picture is no reason to fail.
         say(&format!("warning: {error:#}"));
     }
+    let lost = match run.latest_checkpoint() {
+        Some(_) => "the last checkpoint is missing: a resume goes back to the one before it",
+        None => "there is no checkpoint: a resume begins again",
+    };
     match report.ending {
         Ending::Failed(error) => Err(error),
         Ending::Interrupted => {
             let path = shown(run.path());
-            if report.checkpointed {
-                say("checkpoint written");
-            }
+            say(if report.checkpointed { "checkpoint written" } else { lost });
             say(&format!("go on with: dmprl resume {path}"));
             Ok(Outcome::Interrupted)
         }
@@ -132,6 +134,9 @@ fn conclude(
                 report.last_row = run.latest_row()?;
             }
             say(&format!("\n{}", summary(&report, title, run.path(), steps_total)));
+            if !report.checkpointed {
+                say(&format!("warning: {lost}"));
+            }
             Ok(Outcome::Done)
         }
     }

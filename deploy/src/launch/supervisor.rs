@@ -44,7 +44,7 @@ pub enum Ending {
 pub struct SessionReport {
     /// How it ended.
     pub ending: Ending,
-    /// Whether the learner said that its last checkpoint is written.
+    /// Whether the learner's last moment is in a checkpoint.
     pub checkpointed: bool,
     /// The first progress reported.
     pub first: Option<Progress>,
@@ -98,6 +98,8 @@ pub(super) struct Supervisor {
     pub(super) spec: Option<EnvSpec>,
     pub(super) learner_ready: bool,
     pub(super) finished: bool,
+    /// Whether the newest report of progress was followed by a checkpoint.
+    pub(super) checkpointed: bool,
     pub(super) evaluations: EvaluationQueue,
     pub(super) interrupts: u32,
     pub(super) failure: Option<Error>,
@@ -129,6 +131,7 @@ pub async fn supervise(plan: SupervisorPlan) -> SessionReport {
         spec: None,
         learner_ready: false,
         finished: false,
+        checkpointed: false,
         evaluations: EvaluationQueue::new(limit),
         interrupts: 0,
         failure: None,
@@ -224,7 +227,7 @@ impl Supervisor {
         };
         SessionReport {
             ending,
-            checkpointed: self.finished,
+            checkpointed: self.finished && self.checkpointed,
             first: self.first.map(|(_, progress)| progress),
             last: self.last.map(|(_, progress)| progress),
             training,

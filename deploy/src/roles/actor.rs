@@ -15,8 +15,11 @@ use super::setup::Setup;
 use super::{ActorArgs, ControlPipe};
 use crate::control::{Command, Report};
 
-/// Sleep between two offers of a segment to a full queue.
+/// Sleep after the first offer of a segment to a full queue; doubles with each further one,
 const FULL_QUEUE: Duration = Duration::from_micros(200);
+/// up to this: a worker waits for milliseconds often, for longer at little cost. The segments that
+/// still wait in the queue keep the learner busy for more.
+const FULL_QUEUE_MAX: Duration = Duration::from_millis(3);
 /// Sleep between two tries to attach, or looks for the first policy.
 const ATTACH: Duration = Duration::from_millis(2);
 /// A learner that is ready answers at once; longer means that it is gone.
@@ -150,6 +153,7 @@ impl Worker<'_> {
     /// learner slows its workers down.
     fn deliver(&mut self, header: &SegmentHeader, block: &[f32]) -> Result<(), Stopped> {
         let mut waiting: Option<(Instant, u32)> = None;
+        let mut pause = FULL_QUEUE;
         loop {
             let outcome = self.segments.try_send(header, block);
             let outcome = outcome.map_err(|error| Stopped::Failed(error.into()))?;
@@ -169,7 +173,8 @@ impl Worker<'_> {
                 };
                 self.warn(format!("worker {} has waited {seconds} s: {why}", self.index));
             }
-            std::thread::sleep(FULL_QUEUE);
+            std::thread::sleep(pause);
+            pause = (pause * 2).min(FULL_QUEUE_MAX);
         }
     }
 

@@ -93,7 +93,9 @@ impl Display {
                     return;
                 }
                 self.line_at = Some(now);
-                let percent = progress.env_steps * 100 / self.steps_total.max(1);
+                // The last segment may end beyond the last step.
+                let done = progress.env_steps.min(self.steps_total);
+                let percent = done * 100 / self.steps_total.max(1);
                 write_line(writer, &format!("{percent:>3}% {figures}"));
             }
         }

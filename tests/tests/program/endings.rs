@@ -1,6 +1,11 @@
 //! Runs that end by their own rules before they have all their steps.
 
-use dmprl_tests::program::{Workplace, env_steps, rows, shared_memory_of};
+use std::process::Command;
+
+use dmprl_tests::program::{
+    Workplace, env_steps, env_steps_of_checkpoint, executable, rows, shared_memory_of,
+};
+use rustix::process::Signal;
 
 use crate::{ENDLESS, train};
 
@@ -31,4 +36,48 @@ fn a_return_that_is_reached_ends_a_deterministic_run_too() {
 #[test]
 fn minutes_that_are_over_end_the_run_with_a_last_evaluation() {
     ends(&["--max-minutes", "0.05"], "run.max_minutes are over");
+}
+
+/// Largest file that a run here may write, in blocks of 512 bytes: the replay of some 6000 steps
+/// just fits. To the program it is as a full disk, and it needs no mount.
+const FILE_BLOCKS_MAX: &str = "800";
+
+fn train_on_a_full_disk(run: &str, more: &[&str]) -> Command {
+    let mut command = Command::new("sh");
+    let script = "trap '' XFSZ; ulimit -f $0; exec \"$@\"";
+    command.args(["-c", script, FILE_BLOCKS_MAX]).arg(executable());
+    command.args(train("reacher", run, more));
+    command
+}
+
+#[test]
+fn a_full_disk_costs_the_checkpoints_and_not_the_run() {
+    let place = Workplace::new();
+    let run = place.path("run");
+    let finished = place
+        .start_command(train_on_a_full_disk(&run, &["--steps", "9000"]))
+        .wait()
+        .with_status(0)
+        .saying("no checkpoint could be written, training goes on")
+        .saying("the last checkpoint is missing");
+    assert_eq!(finished.said.matches("no checkpoint could be written").count(), 1, "told once");
+    assert_eq!(env_steps(&rows(&run, "evaluations.jsonl")).last(), Some(&9000));
+    let kept = env_steps_of_checkpoint(&run).unwrap();
+    assert!((4_000..9_000).contains(&kept), "{kept}");
+
+    // With room again, from the checkpoint before.
+    place.run(&["resume", &run]).with_status(0);
+    assert_eq!(env_steps_of_checkpoint(&run), Some(9000));
+}
+
+#[test]
+fn ctrl_c_on_a_full_disk_does_not_claim_a_checkpoint() {
+    let place = Workplace::new();
+    let run = place.path("run");
+    let mut running = place.start_command(train_on_a_full_disk(&run, &["--steps", ENDLESS]));
+    running.until_said("no checkpoint could be written");
+    running.signal_group(Signal::INT);
+    let finished = running.wait().with_status(130).saying("the last checkpoint is missing");
+    assert!(!finished.said.contains("checkpoint written"), "{}", finished.said);
+    place.assert_no_process();
 }
