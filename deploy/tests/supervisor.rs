@@ -187,7 +187,7 @@ fn a_second_interrupt_kills_at_once() {
     let mut fixture = Fixture::new(&[("learner", "stubborn")]);
     // Longer than the test may take: only the second interrupt can end it.
     fixture.limits = TimeLimits { stop: PATIENCE * 10, ..fixture.limits };
-    fixture.interrupts = 2;
+    fixture.interrupted_twice = true;
     let (report, shown) = fixture.supervise_until("training");
     assert!(matches!(report.ending, Ending::Interrupted), "{:?}\n{shown}", report.ending);
     assert!(!report.checkpointed && shown.contains("interrupted twice: killed"), "{shown}");

@@ -106,7 +106,8 @@ fn emit(text: &str) -> anyhow::Result<()> {
 #[cfg(feature = "python")]
 fn prepare_python() -> anyhow::Result<PathBuf> {
     let root = crate::project::root()?;
-    Ok(crate::python_setup::ensure(&root, &|line| say(line))?.venv)
+    let progress = crate::terminal::SetupProgress::new();
+    Ok(crate::python_setup::ensure(&root, &|line| progress.show(line))?.venv)
 }
 
 #[cfg(not(feature = "python"))]

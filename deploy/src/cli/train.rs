@@ -20,7 +20,7 @@ use crate::terminal::ProgressStyle;
 const SAME_SECOND_MAX: usize = 100;
 
 const HELP: &str = "\
-PRECEDENCE, lowest first: the task's defaults, --preset, --config, environment variables
+PRECEDENCE, lowest first: the policy's and the task's defaults, --preset, --config, environment variables
 (DMPRL_ALGORITHM__BATCH_SIZE=64 sets algorithm.batch_size), --set, the flags above.
 Ctrl-C once: checkpoint and a clean end within 10 s; twice: at once.
 

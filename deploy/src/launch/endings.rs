@@ -17,6 +17,8 @@ use crate::terminal::shown;
 /// Deaths of the evaluator in one session before the run stops: a run that nobody evaluates
 /// is not worth its electricity.
 const EVALUATOR_RESTARTS_MAX: u32 = 3;
+/// Two interrupts so close together count as one.
+const INTERRUPT_GAP: Duration = Duration::from_millis(100);
 /// Lines of a dead child's log that its error shows.
 const LOG_LINES: usize = 15;
 /// How far from the log's end they are looked for.
@@ -74,6 +76,13 @@ impl Supervisor {
     }
 
     pub(super) fn on_interrupt(&mut self) {
+        // `timeout` and some job schedulers send a signal to a process and to its group at once:
+        // that is one wish, not two.
+        let now = Instant::now();
+        if self.interrupted_at.is_some_and(|at| now.duration_since(at) < INTERRUPT_GAP) {
+            return;
+        }
+        self.interrupted_at = Some(now);
         self.interrupts += 1;
         match self.interrupts {
             1 => {
@@ -132,12 +141,11 @@ impl Supervisor {
             .get_mut(&process)
             .and_then(|slot| slot.running.take())
             .is_some_and(|running| running.ready);
-        if matches!(self.phase, Phase::Stopping { .. }) {
+        if let Phase::Stopping { killed, .. } = self.phase {
             if process == Process::Learner && was_ready && !self.finished {
-                self.display.message(&format!(
-                    "learner ended without its last checkpoint: {}",
-                    describe(status)
-                ));
+                let cause = if killed { String::new() } else { format!(": {}", describe(status)) };
+                let what = "learner ended without its last checkpoint";
+                self.display.message(&format!("{what}{cause}"));
             }
             return Ok(());
         }

@@ -31,6 +31,6 @@ mod supervisor;
 pub use evaluate::{EvaluationPlan, evaluate};
 pub use launcher::{Launcher, Process};
 pub use limits::TimeLimits;
-pub use session::{RESUME_WAIT, SessionPlan, session};
+pub use session::{RESUME_WAIT, SessionPlan, session, title};
 pub use signals::interrupts;
 pub use supervisor::{Ending, SessionReport, SupervisorPlan, supervise};

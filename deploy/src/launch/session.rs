@@ -90,7 +90,9 @@ fn can_resume(run: &RunDirectory, display: &mut Display) -> anyhow::Result<bool>
     Ok(false)
 }
 
-fn title(config: &ExperimentConfig) -> String {
+/// What is trained, in one line.
+#[must_use]
+pub fn title(config: &ExperimentConfig) -> String {
     let policy = format!("{:?}", config.policy.kind).to_lowercase();
     let algorithm = format!("{:?}", config.algorithm.name).to_lowercase();
     let actors = &config.actors;

@@ -24,9 +24,9 @@ pub fn learning_curve(run: &RunDirectory) -> anyhow::Result<Option<PathBuf>> {
     if rows.is_empty() {
         return Ok(None);
     }
-    let name = run.config()?.task.name;
+    let title = crate::launch::title(&run.config()?);
     let svg =
-        draw(&rows, &name).map_err(|error| anyhow!("cannot draw the learning curve: {error}"))?;
+        draw(&rows, &title).map_err(|error| anyhow!("cannot draw the learning curve: {error}"))?;
     let path = run.path().join("plots").join("learning_curve.svg");
     std::fs::write(&path, svg).with_context(|| format!("cannot write {}", path.display()))?;
     Ok(Some(path))
@@ -48,6 +48,7 @@ fn draw(rows: &[EvaluationRow], title: &str) -> Result<String, Box<dyn std::erro
         let mut chart = ChartBuilder::on(&area)
             .caption(title, ("sans-serif", 20))
             .margin(16)
+            .margin_right(40)
             .x_label_area_size(44)
             .y_label_area_size(64)
             .build_cartesian_2d(0.0..steps_max, (low - margin)..(high + margin))?;
@@ -56,6 +57,7 @@ fn draw(rows: &[EvaluationRow], title: &str) -> Result<String, Box<dyn std::erro
             .x_desc("environment steps")
             .y_desc("evaluation return")
             .x_label_formatter(&|steps| grouped(steps.round() as u64))
+            .y_label_formatter(&|value| tick(*value))
             .label_style(("sans-serif", 14))
             .axis_desc_style(("sans-serif", 16))
             .light_line_style(WHITE)
@@ -74,6 +76,12 @@ fn draw(rows: &[EvaluationRow], title: &str) -> Result<String, Box<dyn std::erro
         area.present()?;
     }
     Ok(svg)
+}
+
+/// `-4`, `-4.5`: no digits that say nothing.
+fn tick(value: f64) -> String {
+    // Adding zero turns -0 into 0.
+    format!("{}", (value * 1e3).round() / 1e3 + 0.0)
 }
 
 #[cfg(test)]

@@ -12,6 +12,10 @@ use crate::control::{EvaluationRow, Progress};
 const LINE_EVERY: Duration = Duration::from_secs(5);
 /// Between two redraws of the bar while nothing is reported.
 const REDRAW_EVERY: Duration = Duration::from_millis(200);
+/// Between two figures.
+const SEPARATOR: &str = " · ";
+/// Bar, percentage and the blanks around them.
+const BAR_COLUMNS: usize = 27;
 
 /// Bar or lines.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -85,7 +89,7 @@ impl Display {
         match &mut self.target {
             Target::Bar(bar) => {
                 bar.set_position(progress.env_steps.min(self.steps_total));
-                bar.set_message(figures);
+                bar.set_message(whole_items(&figures, width_left()));
             }
             Target::Lines(writer) => {
                 let now = Instant::now();
@@ -144,8 +148,28 @@ impl Display {
         if progress.rejected > 0 {
             parts.push(format!("{} rejected", progress.rejected));
         }
-        parts.join(" · ")
+        parts.join(SEPARATOR)
     }
+}
+
+/// Columns that the bar leaves for the figures.
+fn width_left() -> usize {
+    let columns = rustix::termios::tcgetwinsize(std::io::stderr()).map_or(80, |size| size.ws_col);
+    usize::from(columns).saturating_sub(BAR_COLUMNS)
+}
+
+/// As many of the figures as fit, none of them cut.
+fn whole_items(figures: &str, width: usize) -> String {
+    let mut line = String::new();
+    for item in figures.split(SEPARATOR) {
+        let separator = if line.is_empty() { "" } else { SEPARATOR };
+        if (line.chars().count() + separator.chars().count() + item.chars().count()) > width {
+            break;
+        }
+        line.push_str(separator);
+        line.push_str(item);
+    }
+    line
 }
 
 /// A user who closed standard error reads nothing: no reason to end the run.
@@ -188,6 +212,17 @@ mod tests {
         let text = String::from_utf8(shared.0.lock().unwrap().clone()).unwrap();
         let rates = "50 steps/s · 20 updates/s · 12.5 samples/insert";
         assert_eq!(text, format!(" 25% 250/1,000 steps · eta 15 s · {rates}\n"));
+    }
+
+    #[test]
+    fn a_narrow_terminal_drops_whole_figures() {
+        assert_eq!(
+            whole_items("12 steps · eta 3 s · 5 steps/s", 100),
+            "12 steps · eta 3 s · 5 steps/s"
+        );
+        assert_eq!(whole_items("12 steps · eta 3 s · 5 steps/s", 20), "12 steps · eta 3 s");
+        assert_eq!(whole_items("12 steps · eta 3 s · 5 steps/s", 10), "12 steps");
+        assert_eq!(whole_items("12 steps", 3), "");
     }
 
     #[test]

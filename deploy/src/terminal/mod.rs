@@ -3,10 +3,12 @@
 
 mod display;
 mod format;
+mod setup;
 mod summary;
 
 pub use display::{Display, ProgressStyle};
 pub use format::{duration, grouped, plus_minus, std_of};
+pub use setup::SetupProgress;
 pub(crate) use summary::shown;
 pub use summary::summary;
 

@@ -22,7 +22,7 @@ pub struct Fixture {
     pub config: ExperimentConfig,
     pub limits: TimeLimits,
     pub one_process: bool,
-    pub interrupts: usize,
+    pub interrupted_twice: bool,
     _parent: tempfile::TempDir,
 }
 
@@ -64,7 +64,7 @@ impl Fixture {
             restart_max: Duration::from_millis(50),
             ..TimeLimits::default()
         };
-        Self { run, config, limits, one_process: false, interrupts: 1, _parent: parent }
+        Self { run, config, limits, one_process: false, interrupted_twice: false, _parent: parent }
     }
 
     pub fn spec(&self) -> EnvSpec {
@@ -103,8 +103,11 @@ impl Fixture {
                 while !watched.text().contains(text) {
                     tokio::task::yield_now().await;
                 }
-                for _ in 0..self.interrupts {
-                    sender.send(()).await.unwrap();
+                sender.send(()).await.unwrap();
+                // Two at almost the same moment are one, so the second is repeated.
+                while self.interrupted_twice && !watched.text().contains("interrupted twice") {
+                    let _ = sender.try_send(());
+                    tokio::task::yield_now().await;
                 }
                 std::future::pending::<()>().await;
             };

@@ -1,0 +1,63 @@
+//! Progress of the Python set-up: one line that changes in a terminal, a line now and then
+//! elsewhere.
+
+use std::cell::Cell;
+use std::io::IsTerminal;
+use std::time::{Duration, Instant};
+
+use indicatif::{ProgressBar, ProgressStyle};
+
+use super::say;
+
+/// Between two plain lines.
+const LINE_EVERY: Duration = Duration::from_secs(5);
+
+/// Shows what the set-up says; it says nothing when there is nothing to do.
+pub struct SetupProgress {
+    spinner: Option<ProgressBar>,
+    line_at: Cell<Option<Instant>>,
+}
+
+impl Default for SetupProgress {
+    fn default() -> Self {
+        Self::new()
+    }
+}
+
+impl SetupProgress {
+    /// On standard error.
+    #[must_use]
+    pub fn new() -> Self {
+        let spinner = std::io::stderr().is_terminal().then(|| {
+            let spinner = ProgressBar::new_spinner();
+            // The template is a constant; were it wrong, indicatif's own would do.
+            if let Ok(style) = ProgressStyle::with_template("{spinner:.cyan} {wide_msg}") {
+                spinner.set_style(style);
+            }
+            spinner
+        });
+        Self { spinner, line_at: Cell::new(None) }
+    }
+
+    /// Shows one line.
+    pub fn show(&self, line: &str) {
+        if let Some(spinner) = &self.spinner {
+            spinner.set_message(line.to_owned());
+            spinner.tick();
+            return;
+        }
+        let now = Instant::now();
+        if self.line_at.get().is_none_or(|at| now.duration_since(at) >= LINE_EVERY) {
+            self.line_at.set(Some(now));
+            say(line);
+        }
+    }
+}
+
+impl Drop for SetupProgress {
+    fn drop(&mut self) {
+        if let Some(spinner) = &self.spinner {
+            spinner.finish_and_clear();
+        }
+    }
+}
