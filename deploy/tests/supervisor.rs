@@ -188,7 +188,7 @@ fn a_second_interrupt_kills_at_once() {
     // Longer than the test may take: only the second interrupt can end it.
     fixture.limits = TimeLimits { stop: PATIENCE * 10, ..fixture.limits };
     fixture.interrupted_twice = true;
-    let (report, shown) = fixture.supervise_until("training");
+    let (report, shown) = fixture.supervise_until("evaluation at 10 steps");
     assert!(matches!(report.ending, Ending::Interrupted), "{:?}\n{shown}", report.ending);
     assert!(!report.checkpointed && shown.contains("interrupted twice: killed"), "{shown}");
     fixture.assert_no_child_lives();
