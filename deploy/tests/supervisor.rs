@@ -184,13 +184,13 @@ fn a_child_that_does_not_stop_in_time_is_killed_and_named() {
 
 #[test]
 fn a_second_interrupt_kills_at_once() {
-    let mut fixture = Fixture::new(&[("learner", "stubborn")]);
+    let mut fixture = Fixture::new(&[("learner", "until-stopped"), ("actor-0", "stubborn")]);
     // Longer than the test may take: only the second interrupt can end it.
     fixture.limits = TimeLimits { stop: PATIENCE * 10, ..fixture.limits };
     fixture.interrupted_twice = true;
     let (report, shown) = fixture.supervise_until("evaluation at 10 steps");
     assert!(matches!(report.ending, Ending::Interrupted), "{:?}\n{shown}", report.ending);
-    assert!(!report.checkpointed && shown.contains("interrupted twice: killed"), "{shown}");
+    assert!(shown.contains("interrupted twice: killed actor-0"), "{shown}");
     fixture.assert_no_child_lives();
 }
 
