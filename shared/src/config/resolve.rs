@@ -12,7 +12,8 @@ pub struct Limits {
 /// Caps that no experiment needs to pass; beyond them a slip of the keyboard is likelier.
 const WORKERS_MAX: usize = 1_024;
 const ENVS_PER_WORKER_MAX: usize = 4_096;
-const SEGMENT_STEPS_MAX: usize = 256;
+/// A slot of the replay counts its steps in a byte.
+const SEGMENT_STEPS_MAX: usize = 255;
 const HIDDEN_MAX: usize = 65_536;
 
 impl ExperimentConfig {
