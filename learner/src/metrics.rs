@@ -78,7 +78,17 @@ pub struct Rejected {
 impl Rejected {
     /// Counts one.
     pub fn count(&mut self, why: Rejection) {
-        *match why {
+        *self.counter(why) += 1;
+    }
+
+    /// How many were refused for this reason.
+    #[must_use]
+    pub fn of(mut self, why: Rejection) -> u64 {
+        *self.counter(why)
+    }
+
+    fn counter(&mut self, why: Rejection) -> &mut u64 {
+        match why {
             Rejection::LayoutVersion => &mut self.layout_version,
             Rejection::Run => &mut self.run,
             Rejection::Architecture => &mut self.architecture,
@@ -86,7 +96,7 @@ impl Rejected {
             Rejection::Field => &mut self.field,
             Rejection::Checksum => &mut self.checksum,
             Rejection::Value => &mut self.value,
-        } += 1;
+        }
     }
 
     /// All together.

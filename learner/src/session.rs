@@ -4,7 +4,7 @@
 //! A turn never waits, so the same loop serves the learner process (which sleeps when a turn was
 //! idle) and the one-process run (which lets the worker act instead).
 
-use dmprl_shared::segment::Segment;
+use dmprl_shared::segment::{Rejection, Segment};
 use dmprl_shared::transport::{ParameterPublisher, SegmentReceiver, TransportError};
 use thiserror::Error;
 
@@ -30,6 +30,8 @@ pub enum Due {
     Evaluation,
     /// A checkpoint.
     Checkpoint,
+    /// A word about the first segment that was refused for this reason.
+    Refusal(Rejection),
 }
 
 /// What kept something that was due from being done, in the caller's words.
@@ -140,8 +142,11 @@ impl<R: SegmentReceiver, P: ParameterPublisher> Session<R, P> {
 
     fn take(&mut self, due: DueHandler<'_>) -> Result<(), SessionError> {
         let before = self.learner.counters.env_steps;
-        // A refused segment is counted by reason; the metrics show it.
-        if self.learner.insert(&self.segment).is_err() {
+        if let Err(why) = self.learner.insert(&self.segment) {
+            // Each is counted; the first of a kind is told aloud.
+            if self.learner.counters.rejected.of(why) == 1 {
+                due(Due::Refusal(why), &mut self.learner).map_err(SessionError::Due)?;
+            }
             return Ok(());
         }
         let after = self.learner.counters.env_steps;
@@ -313,10 +318,14 @@ mod tests {
         run.segment.header.run_id = 2;
         run.send();
         assert_eq!(run.turns(), Turn::Idle);
+        assert_eq!(run.due, [(Due::Refusal(Rejection::Run), 0)]);
+        run.send();
+        assert_eq!(run.turns(), Turn::Idle);
+        assert_eq!(run.due.len(), 1, "the second of a kind is only counted");
         let counters = run.session.learner.counters;
         assert_eq!(
             (counters.env_steps, counters.rejected.run, counters.rejected.total()),
-            (0, 1, 1)
+            (0, 2, 2)
         );
     }
 

@@ -35,13 +35,22 @@ pub fn run(args: &LearnerArgs, control: &ControlPipe) -> anyhow::Result<()> {
     let mut recorder = Recorder::new(&setup.run, control, &learner)?;
     let mut session = Session::start(learner, segments, parameters)?;
     control.send(&Report::LearnerReady)?;
-    let finished = turns(&mut session, &mut recorder, control)?;
+    // A supervisor that is gone is noticed as a stop, which ends with a checkpoint; a report that
+    // it does not hear must not come before that.
+    let mut ask = |request| {
+        let _ = control.send(&Report::Evaluate(request));
+        Ok(())
+    };
+    if recorder.is_owed_an_evaluation(&session.learner) {
+        session.publish()?;
+        recorder.due(Due::Evaluation, &mut session.learner, &mut ask)?;
+    }
+    let finished = turns(&mut session, &mut recorder, control, &mut ask)?;
     if !finished {
         // What the workers had already sent is in the checkpoint; they are not waited for.
         let queued_max = plan.worker_count * plan.queue_segments;
         session.drain(&mut |_, _| Ok(()), queued_max)?;
     }
-    let mut ask = |request| control.send(&Report::Evaluate(request));
     close(&mut session, &mut recorder, control, (finished, &mut ask))
 }
 
@@ -93,6 +102,7 @@ fn turns<R: SegmentReceiver, P: ParameterPublisher>(
     session: &mut Session<R, P>,
     recorder: &mut Recorder<'_>,
     control: &ControlPipe,
+    ask: Evaluate<'_>,
 ) -> anyhow::Result<bool> {
     let mut maintained = Instant::now();
     let mut first = session.learner.counters.env_steps + FIRST;
@@ -103,10 +113,8 @@ fn turns<R: SegmentReceiver, P: ParameterPublisher>(
         if control.finish_requested() {
             return Ok(true);
         }
-        let mut due = |due: Due, learner: &mut Learner| {
-            let mut ask = |request| control.send(&Report::Evaluate(request));
-            recorder.due(due, learner, &mut ask).map_err(Into::into)
-        };
+        let mut due =
+            |due: Due, learner: &mut Learner| recorder.due(due, learner, ask).map_err(Into::into);
         match session.turn(&mut due)? {
             Turn::Worked => {}
             Turn::Idle => std::thread::sleep(IDLE),
@@ -114,7 +122,7 @@ fn turns<R: SegmentReceiver, P: ParameterPublisher>(
         }
         if session.learner.counters.env_steps >= first {
             first = u64::MAX;
-            control.send(&Report::FirstSegment)?;
+            let _ = control.send(&Report::FirstSegment);
         }
         if maintained.elapsed() >= MAINTENANCE_INTERVAL {
             session.maintain()?;
@@ -131,15 +139,18 @@ pub fn close<R: SegmentReceiver, P: ParameterPublisher>(
     control: &ControlPipe,
     (finished, evaluate): (bool, Evaluate<'_>),
 ) -> anyhow::Result<()> {
+    let mut evaluation = Ok(());
     recorder.report_progress(&session.learner);
     if finished && recorder.is_unevaluated(&session.learner) {
         session.publish()?;
-        recorder.due(Due::Evaluation, &mut session.learner, evaluate)?;
+        // Whatever becomes of the evaluation, the checkpoint comes first.
+        evaluation = recorder.due(Due::Evaluation, &mut session.learner, evaluate);
     }
     if recorder.is_unmeasured(&session.learner) {
         recorder.due(Due::Metrics, &mut session.learner, evaluate)?;
     }
     recorder.write_checkpoint(&session.learner);
+    evaluation?;
     if control.orphaned() {
         bail!("the supervisor is gone; the run ended after a checkpoint");
     }

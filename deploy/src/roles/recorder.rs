@@ -101,12 +101,28 @@ impl<'a> Recorder<'a> {
         match due {
             Due::Metrics => self.write_metrics(learner),
             Due::Evaluation => {
-                self.evaluated = Some(learner.counters.env_steps);
-                let request = self.save_policy(learner)?;
-                evaluate(request)
+                // A policy that cannot be saved is not evaluated; the training goes on.
+                match self.save_policy(learner) {
+                    Ok(request) => {
+                        self.evaluated = Some(learner.counters.env_steps);
+                        evaluate(request)
+                    }
+                    Err(error) => {
+                        let steps = learner.counters.env_steps;
+                        self.warn(format!("no evaluation at {steps} steps: {error:#}"));
+                        Ok(())
+                    }
+                }
             }
             Due::Checkpoint => {
                 self.write_checkpoint(learner);
+                Ok(())
+            }
+            Due::Refusal(why) => {
+                self.warn(format!(
+                    "a segment was refused ({why}); more of this kind are only counted, as \
+                     `rejected` in metrics.jsonl"
+                ));
                 Ok(())
             }
         }
@@ -115,6 +131,13 @@ impl<'a> Recorder<'a> {
     /// Whether the learner has come further than the newest metrics line.
     pub fn is_unmeasured(&self, learner: &Learner) -> bool {
         self.measured != Some(learner.counters.env_steps)
+    }
+
+    /// Whether an evaluation that fell due before the learner's checkpoint has no row: the run was
+    /// stopped before its evaluator answered.
+    pub fn is_owed_an_evaluation(&self, learner: &Learner) -> bool {
+        let interval = learner.config().evaluation.interval_steps;
+        learner.counters.env_steps / interval > self.evaluated.unwrap_or(0) / interval
     }
 
     /// Whether the learner has come further than the newest evaluation.
@@ -138,7 +161,10 @@ impl<'a> Recorder<'a> {
         let mut text = serde_json::to_vec(&line).context("cannot write metrics as JSON")?;
         text.push(b'\n');
         // A disk that is full must not end a run: the line is lost, the training is not.
+        let before = self.metrics.metadata().map(|metadata| metadata.len());
         if let Err(error) = self.metrics.write_all(&text) {
+            // Half a line would spoil the next one.
+            let _ = before.and_then(|len| self.metrics.set_len(len));
             self.warn(format!("a line of metrics.jsonl is lost: {error}"));
         }
         Ok(())

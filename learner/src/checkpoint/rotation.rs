@@ -47,6 +47,10 @@ pub(super) fn remove_temporaries(folder: &Path) -> Result<(), CheckpointError> {
 pub(super) fn point_latest(folder: &Path, name: &str) -> Result<(), CheckpointError> {
     let temporary = folder.join(".latest.tmp");
     let link = folder.join(LATEST);
+    // A copy made without symbolic links has the checkpoint itself under this name.
+    if link.symlink_metadata().is_ok_and(|there| there.is_dir()) {
+        fs::remove_dir_all(&link).map_err(io_error(&link))?;
+    }
     std::os::unix::fs::symlink(name, &temporary)
         .and_then(|()| fs::rename(&temporary, &link))
         .and_then(|()| fs::File::open(folder)?.sync_all())
@@ -59,13 +63,12 @@ pub(super) fn rotate(folder: &Path, keep: usize, bytes_max: u64) -> Result<(), C
     let names = names(folder)?;
     let sizes: Vec<u64> =
         names.iter().map(|name| size(&folder.join(name))).collect::<Result<_, _>>()?;
-    let mut kept_bytes = 0;
+    let mut bytes_so_far = 0;
     for (age, (name, bytes)) in names.iter().zip(sizes).rev().enumerate() {
-        kept_bytes += bytes;
-        if age > 0 && (age >= keep || kept_bytes > bytes_max) {
+        bytes_so_far += bytes;
+        if age > 0 && (age >= keep || bytes_so_far > bytes_max) {
             let path = folder.join(name);
             fs::remove_dir_all(&path).map_err(io_error(&path))?;
-            kept_bytes -= bytes;
         }
     }
     Ok(())

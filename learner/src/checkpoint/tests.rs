@@ -139,6 +139,11 @@ fn the_oldest_make_room_and_latest_points_at_the_newest() {
     let saved: Vec<String> = (0..4).map(|_| save(folder, &learner).unwrap()).collect();
     assert_eq!(names(folder).unwrap(), saved[2..]);
     assert_eq!(fs::read_link(folder.join("latest")).unwrap(), Path::new(&saved[3]));
+    // A copy without symbolic links.
+    fs::remove_file(folder.join("latest")).unwrap();
+    fs::create_dir(folder.join("latest")).unwrap();
+    rotation::point_latest(folder, &saved[3]).unwrap();
+    assert_eq!(fs::read_link(folder.join("latest")).unwrap(), Path::new(&saved[3]));
     rotation::rotate(folder, 2, 1).unwrap();
     assert_eq!(names(folder).unwrap(), saved[3..], "the newest stays whatever the disk cap");
 }
