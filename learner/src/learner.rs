@@ -6,7 +6,7 @@ use dmprl_shared::config::ExperimentConfig;
 use dmprl_shared::parameters::ParameterSnapshot;
 use dmprl_shared::policy::{Head, Policy, PolicyError};
 use dmprl_shared::seeds;
-use dmprl_shared::segment::{Expected, Rejection, Segment, check};
+use dmprl_shared::segment::{Expected, Rejection, Segment, SegmentHeader, check};
 use dmprl_shared::spec::EnvSpec;
 use serde::{Deserialize, Serialize};
 use thiserror::Error;
@@ -58,6 +58,8 @@ pub struct Counters {
     pub policy_version: u64,
     /// Segments refused, by reason.
     pub rejected: Rejected,
+    /// Segments missing in the workers' sequences.
+    pub lost: u64,
 }
 
 /// Everything that learns.
@@ -79,6 +81,8 @@ pub struct Learner {
     batch: Batch,
     collector: Collector,
     snapshot: ParameterSnapshot,
+    /// Incarnation and last sequence number of every worker heard from.
+    heard: Vec<(u32, u64)>,
     omega: f32,
 }
 
@@ -116,6 +120,7 @@ impl Learner {
                 values: vec![0.0; policy.shape().parameters_len()],
                 ..ParameterSnapshot::default()
             },
+            heard: vec![(0, 0); workers],
             omega: match policy.head() {
                 Head::Dmp(head) => head.omega(),
                 Head::Mlp => 1.0,
@@ -155,7 +160,8 @@ impl Learner {
     /// # Errors
     /// The reason if it does not fit; it is counted and changes nothing else.
     pub fn insert(&mut self, segment: &Segment) -> Result<(), Rejection> {
-        if let Err(why) = check(&segment.header, &segment.block, &self.expected) {
+        let sound = check(&segment.header, &segment.block, &self.expected);
+        if let Err(why) = sound.and_then(|()| self.follow_sequence(&segment.header)) {
             self.counters.rejected.count(why);
             return Err(why);
         }
@@ -166,6 +172,22 @@ impl Learner {
         if self.counters.env_steps > self.config.exploration.warm_up_steps {
             self.pacing.inserted();
         }
+        Ok(())
+    }
+
+    /// A worker numbers its segments from 1 without gaps: a number used before is a duplicate, one
+    /// left out is lost.
+    fn follow_sequence(&mut self, header: &SegmentHeader) -> Result<(), Rejection> {
+        let heard = &mut self.heard[header.worker_id as usize];
+        // A learner that has just started does not know how far its workers have come.
+        let new = heard.1 == 0 || header.incarnation > heard.0;
+        if !new && (header.incarnation < heard.0 || header.sequence <= heard.1) {
+            return Err(Rejection::Duplicate);
+        }
+        if !new {
+            self.counters.lost += header.sequence - heard.1 - 1;
+        }
+        *heard = (header.incarnation, header.sequence);
         Ok(())
     }
 
@@ -239,6 +261,7 @@ impl Learner {
             replay_segments: self.replay.len() as u64,
             samples_per_insert: self.samples_per_insert(),
             rejected: counters.rejected,
+            lost: counters.lost,
             critic_loss: collected.losses.map(|losses| losses.0),
             actor_loss: collected.losses.map(|losses| losses.1),
             q_mean: collected.losses.map(|losses| losses.2),

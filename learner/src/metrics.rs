@@ -26,6 +26,9 @@ pub struct MetricsLine {
     pub samples_per_insert: f64,
     /// Segments refused, over the whole run, by reason.
     pub rejected: Rejected,
+    /// Segments missing in the sequences of the workers that the learner has heard from, over the
+    /// whole run.
+    pub lost: u64,
     /// mean (Q - target)^2.
     pub critic_loss: Option<f64>,
     /// -mean Q(s, pi(s)).
@@ -73,6 +76,8 @@ pub struct Rejected {
     pub checksum: u64,
     /// A value that is not finite or out of bounds.
     pub value: u64,
+    /// A sequence number used before.
+    pub duplicate: u64,
 }
 
 impl Rejected {
@@ -96,14 +101,16 @@ impl Rejected {
             Rejection::Field => &mut self.field,
             Rejection::Checksum => &mut self.checksum,
             Rejection::Value => &mut self.value,
+            Rejection::Duplicate => &mut self.duplicate,
         }
     }
 
     /// All together.
     #[must_use]
     pub fn total(&self) -> u64 {
-        let Self { layout_version, run, architecture, sizes, field, checksum, value } = self;
-        layout_version + run + architecture + sizes + field + checksum + value
+        let Self { layout_version, run, architecture, sizes, field, checksum, value, duplicate } =
+            self;
+        layout_version + run + architecture + sizes + field + checksum + value + duplicate
     }
 }
 

@@ -330,6 +330,22 @@ mod tests {
     }
 
     #[test]
+    fn a_duplicate_is_refused_and_a_gap_is_counted_as_lost() {
+        let mut run = run(&[]);
+        run.send();
+        run.segment.header.sequence -= 1;
+        run.send();
+        run.segment.header.sequence += 3;
+        run.send();
+        run.segment.header.incarnation = 1;
+        run.segment.header.sequence = 0;
+        run.send();
+        assert_eq!(run.turns(), Turn::Idle);
+        let counters = run.session.learner.counters;
+        assert_eq!((counters.segments, counters.rejected.duplicate, counters.lost), (3, 1, 3));
+    }
+
+    #[test]
     fn a_stop_takes_what_is_queued_and_updates_nothing() {
         let mut run = run(&[("exploration.warm_up_steps", "0")]);
         (0..3).for_each(|_| assert_eq!(run.send(), SendOutcome::Delivered));

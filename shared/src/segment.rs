@@ -177,19 +177,10 @@ pub enum Rejection {
     /// A number that is NaN or infinite, or an action outside [-1, 1].
     #[error("value not finite or action out of bounds")]
     Value,
-}
-
-impl Rejection {
-    /// Every reason, in the order counters are listed.
-    pub const ALL: [Self; 7] = [
-        Self::LayoutVersion,
-        Self::Run,
-        Self::Architecture,
-        Self::Sizes,
-        Self::Field,
-        Self::Checksum,
-        Self::Value,
-    ];
+    /// A sequence number that this worker has already used. Only the learner, who remembers, finds
+    /// it.
+    #[error("duplicate")]
+    Duplicate,
 }
 
 /// Refuses a segment that does not fit.

@@ -149,6 +149,23 @@ fn prepare(venv: &Path, python_path: Vec<String>) -> Result<(), PythonError> {
     })
 }
 
+impl Interpreter {
+    /// Seeds Python's and NumPy's global generators, for environments that use them instead of the
+    /// generator that Gymnasium gives them.
+    ///
+    /// # Errors
+    /// `Exception` if NumPy cannot be imported.
+    pub fn seed(&self, seed: u64) -> Result<(), PythonError> {
+        Python::attach(|py| {
+            // NumPy takes 32 bits.
+            let seed = seed >> 32;
+            let module = |name: &str| py.import(name)?.call_method1("seed", (seed,));
+            let seeded = module("random").and_then(|_| module("numpy.random"));
+            seeded.map(drop).map_err(|error| PythonError::exception(py, &error))
+        })
+    }
+}
+
 fn check(status: ffi::PyStatus) -> Result<(), PythonError> {
     let text = |pointer: *const std::ffi::c_char| {
         if pointer.is_null() {

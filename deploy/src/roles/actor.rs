@@ -7,6 +7,7 @@ use anyhow::{Context, bail};
 use dmprl_actors::python_env::{Interpreter, InterpreterOptions, PythonEnvironments};
 use dmprl_actors::rollout::{Identity, Rollout, RolloutError};
 use dmprl_shared::config::ExperimentConfig;
+use dmprl_shared::seeds;
 use dmprl_shared::segment::SegmentHeader;
 use dmprl_shared::transport::shared_memory::{Plan, Sender, Subscriber, WorkerEnd, attach};
 use dmprl_shared::transport::{ParameterSubscriber, SegmentSender, SendOutcome, TransportError};
@@ -39,6 +40,8 @@ pub fn run(args: &ActorArgs, control: &ControlPipe) -> anyhow::Result<()> {
     let setup = Setup::read(&args.run)?;
     let config = &setup.config;
     let interpreter = interpreter(args.venv.as_deref(), config)?;
+    let worker = u64::from(args.index) << 32 | u64::from(args.incarnation);
+    interpreter.seed(seeds::derive(config.run.seed, "python", worker))?;
     let environments = PythonEnvironments::start(
         &interpreter,
         &config.task.id,

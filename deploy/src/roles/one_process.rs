@@ -12,6 +12,7 @@ use dmprl_actors::rollout::{Identity, Rollout, RolloutError};
 use dmprl_learner::learner::Learner;
 use dmprl_learner::session::{Due, Session, Turn};
 use dmprl_shared::config::RunConfig;
+use dmprl_shared::seeds;
 use dmprl_shared::transport::{ParameterSubscriber, SegmentSender, SendOutcome, in_process};
 
 use super::evaluator::{self, evaluator};
@@ -36,6 +37,7 @@ pub fn run(args: &LearnerArgs, control: &ControlPipe) -> anyhow::Result<()> {
     let interpreter = super::actor::interpreter(args.venv.as_deref(), config)?;
     let envs = config.actors.envs_per_worker;
     let steps = config.policy.decision_steps();
+    interpreter.seed(seeds::derive(config.run.seed, "python", 0))?;
     let environments = PythonEnvironments::start(&interpreter, &config.task.id, envs, steps)?;
     let spec = environments.spec().clone();
     let (mut judge, _) = evaluator(&interpreter, config)?;

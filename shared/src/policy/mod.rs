@@ -11,6 +11,7 @@
 //! policy is the network and a tanh. Everything works on flat `f32` slices and buffers made once.
 
 mod action_scaling;
+mod architecture;
 mod dmp_head;
 mod matrix;
 mod network;
@@ -106,19 +107,17 @@ impl Policy {
         let mut widths = vec![layout.observation_len];
         widths.extend(&config.policy.hidden);
         widths.push(outputs);
-        let sources = &config.task.start_sources;
-        let described = format!("{:?} {:?} {sources:?} {spec:?}", config.policy, config.dmp);
         Ok(Self {
             shape: MlpShape::new(widths),
             head,
             layout,
             scaling: ActionScaling::new(spec),
             env_observation_len: spec.observation_len,
-            architecture_hash: crate::seeds::derive(0, &described, 0),
+            architecture_hash: architecture::hash(config, spec),
         })
     }
 
-    /// Identifies the architecture: configuration of policy and DMP, start table and spec.
+    /// Identifies the architecture: everything that makes two policies the same function.
     #[must_use]
     pub fn architecture_hash(&self) -> u64 {
         self.architecture_hash
