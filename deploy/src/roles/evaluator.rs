@@ -12,6 +12,7 @@ use dmprl_shared::spec::EnvSpec;
 use super::setup::Setup;
 use super::{ControlPipe, EvaluatorArgs};
 use crate::control::{Command, EvaluationRequest, EvaluationRow, Report};
+use crate::terminal::say;
 
 /// How long one look for a command may block, so that a stop is seen.
 const COMMAND_WAIT: Duration = Duration::from_millis(100);
@@ -30,7 +31,7 @@ pub fn run(args: &EvaluatorArgs, control: &ControlPipe) -> anyhow::Result<()> {
         let Some(Command::Evaluate(request)) = control.next_within(COMMAND_WAIT) else { continue };
         let row = evaluate(&mut evaluator, &setup, &config, &request)?;
         if !args.print_only {
-            keep(&setup, &row)?;
+            keep(&setup, &row, control)?;
         }
         control.send(&Report::Evaluated(row))?;
     }
@@ -76,10 +77,37 @@ pub fn evaluate(
 }
 
 /// Appends the row and drops the policies that no row needs any more.
-pub fn keep(setup: &Setup, row: &EvaluationRow) -> anyhow::Result<()> {
-    setup.run.append_evaluation(row)?;
-    // A resume goes back to a checkpoint and forgets later rows: the policies that would then be
-    // best and latest must still be there.
+///
+/// A full disk must not end a run: what cannot be written is told, the row still reported.
+///
+/// # Errors
+/// A number of the row is not finite.
+pub fn keep(setup: &Setup, row: &EvaluationRow, control: &ControlPipe) -> anyhow::Result<()> {
+    row.check_finite()?;
+    let steps = [("is not in evaluations.jsonl", append(setup, row)), ("did not tidy up", tidy(setup))];
+    for (what, result) in steps {
+        if let Err(error) = result {
+            let message = format!("evaluation of policy {} {what}: {error:#}", row.policy_version);
+            say(&format!("warning: {message}"));
+            // A supervisor that is gone is noticed by the loop.
+            let _ = control.send(&Report::Warning { message });
+        }
+    }
+    Ok(())
+}
+
+/// An evaluator that was killed between row and report is asked again: one row is enough.
+fn append(setup: &Setup, row: &EvaluationRow) -> anyhow::Result<()> {
+    let latest = setup.run.latest_row()?;
+    if latest.is_some_and(|latest| latest.policy_version == row.policy_version) {
+        return Ok(());
+    }
+    setup.run.append_evaluation(row)
+}
+
+/// A resume goes back to a checkpoint and forgets later rows: the policies that would then be
+/// best and latest must still be there.
+fn tidy(setup: &Setup) -> anyhow::Result<()> {
     let rows = setup.run.evaluations()?;
     let mut versions = Vec::new();
     for env_steps in checkpoint::env_steps(&setup.run.checkpoints_path())? {
@@ -89,4 +117,53 @@ pub fn keep(setup: &Setup, row: &EvaluationRow) -> anyhow::Result<()> {
     }
     setup.run.point_best()?;
     setup.run.prune_policies(&versions)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::run_directory::{Manifest, RunDirectory};
+
+    const ROW: EvaluationRow = EvaluationRow {
+        env_steps: 10,
+        updates: 1,
+        segments: 1,
+        wall_s: 1.0,
+        policy_version: 3,
+        returns: Vec::new(),
+        return_mean: -1.0,
+        success_rate: None,
+        smoothness: 0.0,
+    };
+
+    fn setup(parent: &tempfile::TempDir) -> Setup {
+        let (path, manifest) = (parent.path().join("run"), Manifest::new(None).unwrap());
+        RunDirectory::create(&path, &ExperimentConfig::default(), &manifest).unwrap();
+        Setup::read(&path).unwrap()
+    }
+
+    fn control() -> ControlPipe {
+        ControlPipe::over(std::io::empty(), std::io::sink(), || {})
+    }
+
+    /// An evaluator killed between its row and its report answers the same request once more.
+    #[test]
+    fn a_policy_evaluated_twice_in_a_row_has_one_row() {
+        let parent = tempfile::tempdir().unwrap();
+        let setup = setup(&parent);
+        keep(&setup, &ROW, &control()).unwrap();
+        keep(&setup, &ROW, &control()).unwrap();
+        assert_eq!(setup.run.evaluations().unwrap(), [ROW]);
+    }
+
+    #[test]
+    fn a_row_that_cannot_be_written_is_no_failure_and_one_that_is_not_finite_is() {
+        let parent = tempfile::tempdir().unwrap();
+        let setup = setup(&parent);
+        let path = setup.run.evaluations_path();
+        std::fs::remove_file(&path).unwrap();
+        std::fs::create_dir(&path).unwrap();
+        keep(&setup, &ROW, &control()).unwrap();
+        keep(&setup, &EvaluationRow { smoothness: f64::NAN, ..ROW }, &control()).unwrap_err();
+    }
 }

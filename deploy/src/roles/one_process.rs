@@ -56,7 +56,7 @@ pub fn run(args: &LearnerArgs, control: &ControlPipe) -> anyhow::Result<()> {
     let reached = Cell::new(false);
     let mut evaluate = |request: EvaluationRequest| {
         let row = evaluator::evaluate(&mut judge, &setup, config, &request)?;
-        evaluator::keep(&setup, &row)?;
+        evaluator::keep(&setup, &row, control)?;
         let RunConfig { until_return, until_success, .. } = config.run;
         let success = row.success_rate.is_some_and(|rate| rate >= until_success);
         reached.set(reached.get() || success || row.return_mean >= until_return);
