@@ -1,8 +1,9 @@
 //! The evaluator process: noise-free episodes of saved policies.
 
+use std::sync::atomic::AtomicBool;
 use std::time::Duration;
 
-use dmprl_actors::evaluate::{ENVIRONMENTS_MAX, Evaluator};
+use dmprl_actors::evaluate::{ENVIRONMENTS_MAX, Episodes, Evaluator};
 use dmprl_actors::python_env::{Interpreter, PythonEnvironments};
 use dmprl_learner::checkpoint;
 use dmprl_learner::policy_file::{self, Match};
@@ -27,9 +28,11 @@ pub fn run(args: &EvaluatorArgs, control: &ControlPipe) -> anyhow::Result<()> {
     let interpreter = super::actor::interpreter(args.venv.as_deref(), &config)?;
     let (mut evaluator, spec) = evaluator(&interpreter, &config)?;
     control.send(&Report::EnvironmentReady { spec })?;
+    let stop = control.stop_flag();
     while !control.stop_requested() {
         let Some(Command::Evaluate(request)) = control.next_within(COMMAND_WAIT) else { continue };
-        let row = evaluate(&mut evaluator, &setup, &config, &request)?;
+        let plan = Plan { setup: &setup, config: &config, stop: &stop };
+        let Some(row) = evaluate(&mut evaluator, &plan, &request)? else { break };
         if !args.print_only {
             keep(&setup, &row, control)?;
         }
@@ -50,20 +53,30 @@ pub fn evaluator(
     Ok((Evaluator::new(config, environments, envs)?, spec))
 }
 
-/// Evaluates a saved policy.
+/// What is the same for all evaluations of a run.
+pub struct Plan<'a> {
+    pub setup: &'a Setup,
+    pub config: &'a ExperimentConfig,
+    /// Asks to give up the evaluation.
+    pub stop: &'a AtomicBool,
+}
+
+/// Evaluates a saved policy; none if a stop was asked for.
 pub fn evaluate(
     evaluator: &mut Evaluator,
-    setup: &Setup,
-    config: &ExperimentConfig,
+    plan: &Plan<'_>,
     request: &EvaluationRequest,
-) -> anyhow::Result<EvaluationRow> {
-    let path = setup.run.policy_path(request.policy_version);
+) -> anyhow::Result<Option<EvaluationRow>> {
+    let path = plan.setup.run.policy_path(request.policy_version);
     let snapshot = policy_file::load(&path, evaluator.policy(), Match::Architecture)?;
-    let settings = &config.evaluation;
-    let evaluation =
-        evaluator.evaluate(&snapshot.values, settings.episodes, settings.first_seed)?;
+    let settings = &plan.config.evaluation;
+    let episodes =
+        Episodes { count: settings.episodes, first_seed: settings.first_seed, stop: plan.stop };
+    let Some(evaluation) = evaluator.evaluate(&snapshot.values, episodes)? else {
+        return Ok(None);
+    };
     let EvaluationRequest { env_steps, updates, segments, wall_s, policy_version } = *request;
-    Ok(EvaluationRow {
+    Ok(Some(EvaluationRow {
         env_steps,
         updates,
         segments,
@@ -73,7 +86,7 @@ pub fn evaluate(
         returns: evaluation.returns,
         success_rate: evaluation.success_rate,
         smoothness: evaluation.smoothness,
-    })
+    }))
 }
 
 /// Appends the row and drops the policies that no row needs any more.
