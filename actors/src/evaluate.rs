@@ -1,5 +1,7 @@
 //! Stage 8 of 8, its first half: noise-free episodes on fixed seeds, in environments of their own.
 
+use std::sync::atomic::{AtomicBool, Ordering};
+
 use dmprl_shared::config::ExperimentConfig;
 use dmprl_shared::policy::{Policy, PolicyError};
 
@@ -13,6 +15,17 @@ const EPISODE_STEPS_MAX: u32 = 10_000;
 /// Environments that an evaluation runs side by side. Each episode begins with a reset of its own
 /// seed, so the number does not change a result.
 pub const ENVIRONMENTS_MAX: usize = 10;
+
+/// Which episodes, and whether anybody still wants to know.
+#[derive(Debug, Clone, Copy)]
+pub struct Episodes<'a> {
+    /// How many.
+    pub count: usize,
+    /// Episode i is reset with seed `first_seed + i`.
+    pub first_seed: u64,
+    /// Looked at before every segment: episodes of a slow environment take minutes.
+    pub stop: &'a AtomicBool,
+}
 
 /// What a set of episodes showed.
 #[derive(Debug, Clone, PartialEq)]
@@ -72,22 +85,25 @@ impl Evaluator {
         &self.acting.policy
     }
 
-    /// Runs `episodes` episodes; episode i is reset with seed `first_seed + i`.
+    /// Runs the episodes; none if a stop was asked for.
     ///
     /// # Errors
     /// If an environment fails.
     pub fn evaluate(
         &mut self,
         parameters: &[f32],
-        episodes: usize,
-        first_seed: u64,
-    ) -> Result<Evaluation, RolloutError> {
-        let mut returns = Vec::with_capacity(episodes);
-        let mut success = Vec::with_capacity(episodes);
+        episodes: Episodes<'_>,
+    ) -> Result<Option<Evaluation>, RolloutError> {
+        let mut returns = Vec::with_capacity(episodes.count);
+        let mut success = Vec::with_capacity(episodes.count);
         let (mut jumps, mut jump_count) = (0.0, 0);
-        while returns.len() < episodes {
-            let count = (episodes - returns.len()).min(self.envs);
-            let wave = self.wave(parameters, count, first_seed + returns.len() as u64)?;
+        while returns.len() < episodes.count {
+            let count = (episodes.count - returns.len()).min(self.envs);
+            let first_seed = episodes.first_seed + returns.len() as u64;
+            let Some(wave) = self.wave(parameters, Episodes { count, first_seed, ..episodes })?
+            else {
+                return Ok(None);
+            };
             returns.extend(&wave.returns[..count]);
             success.extend(&wave.success[..count]);
             jumps += wave.jumps;
@@ -95,19 +111,18 @@ impl Evaluator {
         }
         let reported = success.iter().all(|&flag: &u8| flag != SUCCESS_NOT_REPORTED);
         let successes = success.iter().filter(|&&flag| flag == SUCCESS_YES).count();
-        Ok(Evaluation {
+        Ok(Some(Evaluation {
             success_rate: reported.then(|| successes as f64 / success.len() as f64),
             smoothness: jumps / (jump_count.max(1) as f64),
             returns,
-        })
+        }))
     }
 
     fn wave(
         &mut self,
         parameters: &[f32],
-        count: usize,
-        first_seed: u64,
-    ) -> Result<Wave, RolloutError> {
+        Episodes { count, first_seed, stop }: Episodes<'_>,
+    ) -> Result<Option<Wave>, RolloutError> {
         let dims = self.acting.policy.layout().action_len;
         let mut wave = Wave {
             returns: vec![0.0; self.envs],
@@ -122,6 +137,9 @@ impl Evaluator {
         self.environments.reset(&vec![true; self.envs], &seeds)?;
         (0..self.envs).for_each(|env| self.acting.carry_on(env, true));
         while wave.running.iter().any(|&running| running) {
+            if stop.load(Ordering::Acquire) {
+                return Ok(None);
+            }
             self.acting.observe(&self.environments);
             self.acting.run_network(parameters);
             self.acting.decode();
@@ -132,7 +150,7 @@ impl Evaluator {
                 }
             }
         }
-        Ok(wave)
+        Ok(Some(wave))
     }
 
     /// Adds environment `env`'s segment to the wave.

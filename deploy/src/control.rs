@@ -6,6 +6,7 @@
 
 use std::path::PathBuf;
 
+use anyhow::ensure;
 use dmprl_shared::spec::EnvSpec;
 use serde::{Deserialize, Serialize};
 
@@ -125,4 +126,22 @@ pub struct EvaluationRow {
     pub success_rate: Option<f64>,
     /// Mean |u_t - u_{t-1}| over all steps and action dimensions.
     pub smoothness: f64,
+}
+
+impl EvaluationRow {
+    /// Refuses what JSON cannot say: neither `evaluations.jsonl` nor a report can hold it.
+    ///
+    /// # Errors
+    /// A number is NaN or infinite.
+    pub fn check_finite(&self) -> anyhow::Result<()> {
+        let numbers = [self.wall_s, self.return_mean, self.smoothness];
+        for number in numbers.iter().chain(&self.returns).chain(&self.success_rate) {
+            ensure!(
+                number.is_finite(),
+                "evaluation of policy {}: expected finite numbers, got {number}",
+                self.policy_version
+            );
+        }
+        Ok(())
+    }
 }

@@ -114,6 +114,14 @@ class Batch(SegmentEnv):
         out.steps[:] = self.segment_steps
 
 
+class Timed(Batch):
+    """Every episode is one segment: the time limit ends it."""
+
+    def step_segment(self, actions, out: SegmentBuffers):
+        super().step_segment(actions, out)
+        out.truncated[:] = 1
+
+
 class Interpreter(Batch):
     """Checks the embedded interpreter around it; the Rust tests run it."""
 

@@ -102,7 +102,7 @@ fn task_table(name: &str) -> anyhow::Result<Table> {
     if let Some(task) = task_defaults(name) {
         return Ok(task.table());
     }
-    if is_gymnasium_id(name) {
+    if is_gymnasium_id(name) || is_class(name) {
         let mut task = Table::new();
         task.insert("name".into(), name.into());
         task.insert("id".into(), name.into());
@@ -115,7 +115,7 @@ fn task_table(name: &str) -> anyhow::Result<Table> {
     );
     Err(wrong_use(format!(
         "unknown task `{name}`, {advice}\n  A Gymnasium id ends in its version, as Pendulum-v1 or \
-         my_module:MyArm-v0"
+         my_module:MyArm-v0; a SegmentEnv is my_module:MyClass"
     )))
 }
 
@@ -136,6 +136,16 @@ fn is_gymnasium_id(text: &str) -> bool {
         && word(name, ".-")
         && !version.is_empty()
         && version.chars().all(|letter| letter.is_ascii_digit())
+}
+
+/// `[package.]module:Class`: a `dmprl.segment_env.SegmentEnv` of the user's own.
+fn is_class(text: &str) -> bool {
+    let identifier = |text: &str| {
+        text.starts_with(|letter: char| letter.is_ascii_alphabetic() || letter == '_')
+            && text.chars().all(|letter| letter.is_ascii_alphanumeric() || letter == '_')
+    };
+    text.split_once(':')
+        .is_some_and(|(module, class)| module.split('.').all(identifier) && identifier(class))
 }
 
 fn read_table(path: &Path) -> anyhow::Result<Table> {
@@ -238,14 +248,15 @@ mod tests {
         for name in ["reachr", "Reacher", "pushr"] {
             assert!(refused(sources(name)).contains("did you mean `"), "{name}");
         }
-        for name in ["", "zzz", "../etc-v1", "a b-v1", "os;x:Y-v1", "Y-v", "Y-v1.0"] {
+        for name in ["", "zzz", "../etc-v1", "a b-v1", "os;x:Y-v1", "Y-v", "Y-v1.0", "m:", ":C", "m..n:C", "m:C.D"] {
             assert!(refused(sources(name)).contains("unknown task"), "{name}");
         }
     }
 
     #[test]
-    fn gymnasium_ids_are_tasks() {
-        for name in ["Pendulum-v1", "my.module:Arm-v0", "ALE/Pong-v5", "a:b/C.d-e-v12"] {
+    fn gymnasium_ids_and_classes_are_tasks() {
+        let ids = ["Pendulum-v1", "my.module:Arm-v0", "ALE/Pong-v5", "a:b/C.d-e-v12"];
+        for name in ids.into_iter().chain(["my_module:MyArm", "my.module:_Arm2"]) {
             let config = merge(&sources(name)).unwrap();
             assert_eq!((config.task.id.as_str(), config.task.name.as_str()), (name, name));
         }

@@ -82,7 +82,7 @@ pub fn session(plan: SessionPlan) -> anyhow::Result<Outcome> {
 
 /// A run without a checkpoint begins again, without the rows of the first attempt.
 fn can_resume(run: &RunDirectory, display: &mut Display) -> anyhow::Result<bool> {
-    if run.latest_checkpoint().is_some() {
+    if run.has_checkpoint()? {
         return Ok(true);
     }
     display.message("the run has no checkpoint yet: it begins again");
@@ -118,9 +118,10 @@ fn conclude(
         // The results are there; a picture is no reason to fail.
         say(&format!("warning: {error:#}"));
     }
-    let lost = match run.latest_checkpoint() {
-        Some(_) => "the last checkpoint is missing: a resume goes back to the one before it",
-        None => "there is no checkpoint: a resume begins again",
+    let lost = match run.has_checkpoint() {
+        Ok(true) => "the last checkpoint is missing: a resume goes back to the one before it",
+        Ok(false) => "there is no checkpoint: a resume begins again",
+        Err(_) => "the checkpoints cannot be read",
     };
     match report.ending {
         Ending::Failed(error) => Err(error),

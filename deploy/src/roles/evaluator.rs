@@ -1,8 +1,9 @@
 //! The evaluator process: noise-free episodes of saved policies.
 
+use std::sync::atomic::AtomicBool;
 use std::time::Duration;
 
-use dmprl_actors::evaluate::{ENVIRONMENTS_MAX, Evaluator};
+use dmprl_actors::evaluate::{ENVIRONMENTS_MAX, Episodes, Evaluator};
 use dmprl_actors::python_env::{Interpreter, PythonEnvironments};
 use dmprl_learner::checkpoint;
 use dmprl_learner::policy_file::{self, Match};
@@ -12,6 +13,7 @@ use dmprl_shared::spec::EnvSpec;
 use super::setup::Setup;
 use super::{ControlPipe, EvaluatorArgs};
 use crate::control::{Command, EvaluationRequest, EvaluationRow, Report};
+use crate::terminal::say;
 
 /// How long one look for a command may block, so that a stop is seen.
 const COMMAND_WAIT: Duration = Duration::from_millis(100);
@@ -26,11 +28,13 @@ pub fn run(args: &EvaluatorArgs, control: &ControlPipe) -> anyhow::Result<()> {
     let interpreter = super::actor::interpreter(args.venv.as_deref(), &config)?;
     let (mut evaluator, spec) = evaluator(&interpreter, &config)?;
     control.send(&Report::EnvironmentReady { spec })?;
+    let stop = control.stop_flag();
     while !control.stop_requested() {
         let Some(Command::Evaluate(request)) = control.next_within(COMMAND_WAIT) else { continue };
-        let row = evaluate(&mut evaluator, &setup, &config, &request)?;
+        let plan = Plan { setup: &setup, config: &config, stop: &stop };
+        let Some(row) = evaluate(&mut evaluator, &plan, &request)? else { break };
         if !args.print_only {
-            keep(&setup, &row)?;
+            keep(&setup, &row, control)?;
         }
         control.send(&Report::Evaluated(row))?;
     }
@@ -49,20 +53,30 @@ pub fn evaluator(
     Ok((Evaluator::new(config, environments, envs)?, spec))
 }
 
-/// Evaluates a saved policy.
+/// What is the same for all evaluations of a run.
+pub struct Plan<'a> {
+    pub setup: &'a Setup,
+    pub config: &'a ExperimentConfig,
+    /// Asks to give up the evaluation.
+    pub stop: &'a AtomicBool,
+}
+
+/// Evaluates a saved policy; none if a stop was asked for.
 pub fn evaluate(
     evaluator: &mut Evaluator,
-    setup: &Setup,
-    config: &ExperimentConfig,
+    plan: &Plan<'_>,
     request: &EvaluationRequest,
-) -> anyhow::Result<EvaluationRow> {
-    let path = setup.run.policy_path(request.policy_version);
+) -> anyhow::Result<Option<EvaluationRow>> {
+    let path = plan.setup.run.policy_path(request.policy_version);
     let snapshot = policy_file::load(&path, evaluator.policy(), Match::Architecture)?;
-    let settings = &config.evaluation;
-    let evaluation =
-        evaluator.evaluate(&snapshot.values, settings.episodes, settings.first_seed)?;
+    let settings = &plan.config.evaluation;
+    let episodes =
+        Episodes { count: settings.episodes, first_seed: settings.first_seed, stop: plan.stop };
+    let Some(evaluation) = evaluator.evaluate(&snapshot.values, episodes)? else {
+        return Ok(None);
+    };
     let EvaluationRequest { env_steps, updates, segments, wall_s, policy_version } = *request;
-    Ok(EvaluationRow {
+    Ok(Some(EvaluationRow {
         env_steps,
         updates,
         segments,
@@ -72,14 +86,41 @@ pub fn evaluate(
         returns: evaluation.returns,
         success_rate: evaluation.success_rate,
         smoothness: evaluation.smoothness,
-    })
+    }))
 }
 
 /// Appends the row and drops the policies that no row needs any more.
-pub fn keep(setup: &Setup, row: &EvaluationRow) -> anyhow::Result<()> {
-    setup.run.append_evaluation(row)?;
-    // A resume goes back to a checkpoint and forgets later rows: the policies that would then be
-    // best and latest must still be there.
+///
+/// A full disk must not end a run: what cannot be written is told, the row still reported.
+///
+/// # Errors
+/// A number of the row is not finite.
+pub fn keep(setup: &Setup, row: &EvaluationRow, control: &ControlPipe) -> anyhow::Result<()> {
+    row.check_finite()?;
+    let steps = [("is not in evaluations.jsonl", append(setup, row)), ("did not tidy up", tidy(setup))];
+    for (what, result) in steps {
+        if let Err(error) = result {
+            let message = format!("evaluation of policy {} {what}: {error:#}", row.policy_version);
+            say(&format!("warning: {message}"));
+            // A supervisor that is gone is noticed by the loop.
+            let _ = control.send(&Report::Warning { message });
+        }
+    }
+    Ok(())
+}
+
+/// An evaluator that was killed between row and report is asked again: one row is enough.
+fn append(setup: &Setup, row: &EvaluationRow) -> anyhow::Result<()> {
+    let latest = setup.run.latest_row()?;
+    if latest.is_some_and(|latest| latest.policy_version == row.policy_version) {
+        return Ok(());
+    }
+    setup.run.append_evaluation(row)
+}
+
+/// A resume goes back to a checkpoint and forgets later rows: the policies that would then be
+/// best and latest must still be there.
+fn tidy(setup: &Setup) -> anyhow::Result<()> {
     let rows = setup.run.evaluations()?;
     let mut versions = Vec::new();
     for env_steps in checkpoint::env_steps(&setup.run.checkpoints_path())? {
@@ -89,4 +130,53 @@ pub fn keep(setup: &Setup, row: &EvaluationRow) -> anyhow::Result<()> {
     }
     setup.run.point_best()?;
     setup.run.prune_policies(&versions)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::run_directory::{Manifest, RunDirectory};
+
+    const ROW: EvaluationRow = EvaluationRow {
+        env_steps: 10,
+        updates: 1,
+        segments: 1,
+        wall_s: 1.0,
+        policy_version: 3,
+        returns: Vec::new(),
+        return_mean: -1.0,
+        success_rate: None,
+        smoothness: 0.0,
+    };
+
+    fn setup(parent: &tempfile::TempDir) -> Setup {
+        let (path, manifest) = (parent.path().join("run"), Manifest::new(None).unwrap());
+        RunDirectory::create(&path, &ExperimentConfig::default(), &manifest).unwrap();
+        Setup::read(&path).unwrap()
+    }
+
+    fn control() -> ControlPipe {
+        ControlPipe::over(std::io::empty(), std::io::sink(), || {})
+    }
+
+    /// An evaluator killed between its row and its report answers the same request once more.
+    #[test]
+    fn a_policy_evaluated_twice_in_a_row_has_one_row() {
+        let parent = tempfile::tempdir().unwrap();
+        let setup = setup(&parent);
+        keep(&setup, &ROW, &control()).unwrap();
+        keep(&setup, &ROW, &control()).unwrap();
+        assert_eq!(setup.run.evaluations().unwrap(), [ROW]);
+    }
+
+    #[test]
+    fn a_row_that_cannot_be_written_is_no_failure_and_one_that_is_not_finite_is() {
+        let parent = tempfile::tempdir().unwrap();
+        let setup = setup(&parent);
+        let path = setup.run.evaluations_path();
+        std::fs::remove_file(&path).unwrap();
+        std::fs::create_dir(&path).unwrap();
+        keep(&setup, &ROW, &control()).unwrap();
+        keep(&setup, &EvaluationRow { smoothness: f64::NAN, ..ROW }, &control()).unwrap_err();
+    }
 }

@@ -56,9 +56,11 @@ pub fn run(args: &LearnerArgs, control: &ControlPipe) -> anyhow::Result<()> {
     let mut session = Session::start(learner, receiver, publisher)?;
     control.send(&Report::LearnerReady)?;
     let reached = Cell::new(false);
+    let stop = control.stop_flag();
+    let plan = evaluator::Plan { setup: &setup, config, stop: &stop };
     let mut evaluate = |request: EvaluationRequest| {
-        let row = evaluator::evaluate(&mut judge, &setup, config, &request)?;
-        evaluator::keep(&setup, &row)?;
+        let Some(row) = evaluator::evaluate(&mut judge, &plan, &request)? else { return Ok(()) };
+        evaluator::keep(&setup, &row, control)?;
         let RunConfig { until_return, until_success, .. } = config.run;
         let success = row.success_rate.is_some_and(|rate| rate >= until_success);
         reached.set(reached.get() || success || row.return_mean >= until_return);

@@ -210,11 +210,13 @@ impl RunDirectory {
         self.path.join("checkpoints")
     }
 
-    /// What the learner goes on from: `checkpoints/latest`, when it leads somewhere.
-    #[must_use]
-    pub fn latest_checkpoint(&self) -> Option<PathBuf> {
-        let path = self.checkpoints_path().join("latest");
-        path.exists().then_some(path)
+    /// Whether there is a checkpoint to go on from. Counted as the learner counts: by number.
+    /// `latest` is for people, and copying a run without its links must not cost the run.
+    ///
+    /// # Errors
+    /// The folder cannot be read: nobody knows then, and a run is not begun again on a guess.
+    pub fn has_checkpoint(&self) -> anyhow::Result<bool> {
+        Ok(!dmprl_learner::checkpoint::names(&self.checkpoints_path())?.is_empty())
     }
 
     /// The standard error of one process of the run.

@@ -22,15 +22,7 @@ impl RunDirectory {
     /// # Errors
     /// A number of the row is not finite (JSON has no such number), or the file system refuses.
     pub fn append_evaluation(&self, row: &EvaluationRow) -> anyhow::Result<()> {
-        let numbers = [row.wall_s, row.return_mean, row.smoothness];
-        let all = numbers.iter().chain(&row.returns).chain(&row.success_rate);
-        for number in all {
-            ensure!(
-                number.is_finite(),
-                "evaluation of policy {}: expected finite numbers, got {number}",
-                row.policy_version
-            );
-        }
+        row.check_finite()?;
         let path = self.evaluations_path();
         let mut line = serde_json::to_vec(row).context("cannot write an evaluation as JSON")?;
         line.push(b'\n');

@@ -81,3 +81,20 @@ fn ctrl_c_on_a_full_disk_does_not_claim_a_checkpoint() {
     assert!(!finished.said.contains("checkpoint written"), "{}", finished.said);
     place.assert_no_process();
 }
+
+/// The evaluation takes minutes; in one process nothing else happens meanwhile.
+#[test]
+fn ctrl_c_during_a_long_evaluation_still_writes_the_checkpoint() {
+    let place = Workplace::new();
+    let run = place.path("run");
+    let more = ["--deterministic", "--steps", ENDLESS, "--set", "evaluation.episodes=10000"];
+    let mut running = place.start(&train("reacher", &run, &more));
+    let policies = std::path::Path::new(&run).join("policies");
+    running.until("a policy to evaluate", |_| {
+        std::fs::read_dir(&policies).is_ok_and(|mut files| files.next().is_some())
+    });
+    running.signal_group(Signal::INT);
+    running.wait().with_status(130).saying("checkpoint written");
+    assert!(rows(&run, "evaluations.jsonl").is_empty());
+    place.assert_no_process();
+}

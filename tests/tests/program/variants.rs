@@ -69,3 +69,9 @@ fn an_environment_whose_observation_is_a_dictionary_trains() {
     let folder = tiny_envs_dir();
     trains("tiny_envs:Goal-v0", &["--python-path", folder.to_str().unwrap()]);
 }
+
+#[test]
+fn a_segment_env_of_ones_own_trains() {
+    let folder = tiny_envs_dir();
+    trains("tiny_envs:Timed", &["--python-path", folder.to_str().unwrap()]);
+}
