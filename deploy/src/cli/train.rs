@@ -22,8 +22,8 @@ use crate::terminal::ProgressStyle;
 const SAME_SECOND_MAX: usize = 100;
 
 const HELP: &str = "\
-PRECEDENCE, lowest first: the policy's and the task's defaults, --preset, --config, environment variables
-(DMPRL_ALGORITHM__BATCH_SIZE=64 sets algorithm.batch_size), --set, the flags above.
+PRECEDENCE, lowest first: the policy's and the task's defaults, --preset, --config, environment
+variables (DMPRL_ALGORITHM__BATCH_SIZE=64 sets algorithm.batch_size), --set, the flags above.
 Ctrl-C once: checkpoint and a clean end within 10 s; twice: at once.
 
 EXAMPLES
@@ -40,8 +40,8 @@ EXAMPLES
 #[derive(Debug, Args)]
 #[command(after_help = HELP)]
 pub(super) struct TrainArgs {
-    /// A task of `dmprl tasks`, or any Gymnasium id: Pendulum-v1, my_module:MyArm-v0; or a SegmentEnv
-    /// of your own: my_module:MyClass.
+    /// A task of `dmprl tasks`, or any Gymnasium id: Pendulum-v1, my_module:MyArm-v0; or a
+    /// SegmentEnv of your own: my_module:MyClass.
     task: String,
     /// Learning algorithm.
     #[arg(long, value_parser = PossibleValuesParser::new(["ddpg"]))]
