@@ -67,8 +67,10 @@ fn while_children_live_nobody_else_trains_the_run() {
 fn a_run_without_a_checkpoint_begins_again_without_its_old_rows() {
     let fixture = Fixture::new(&[]);
     fixture.run.append_evaluation(&row(1)).unwrap();
+    fixture.run.point_best().unwrap();
     assert_eq!(session(plan(&fixture, true)).unwrap(), Outcome::Done);
     assert_eq!(fixture.run.evaluations().unwrap(), []);
+    assert!(fixture.run.checkpoints_path().join("best").symlink_metadata().is_err());
     assert!(!fixture.seen("learner").contains("resumed"));
 }
 

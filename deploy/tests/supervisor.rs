@@ -101,6 +101,7 @@ fn an_environment_that_cannot_be_made_ends_the_run_at_once_with_its_reason() {
 #[test]
 fn a_dead_learner_ends_the_run_with_its_last_words_and_advice() {
     let fixture = Fixture::new(&[("learner", "dies")]);
+    std::fs::create_dir(fixture.run.checkpoints_path().join("000001")).unwrap();
     let (report, _) = fixture.supervise();
     let message = failure(report.ending);
     for part in ["learner died: signal 9", "logs/learner.log", "log line 20", "dmprl resume"] {
@@ -108,6 +109,13 @@ fn a_dead_learner_ends_the_run_with_its_last_words_and_advice() {
     }
     assert!(!message.contains("log line 5\n"), "15 lines are enough: {message}");
     fixture.assert_no_child_lives();
+}
+
+#[test]
+fn without_a_checkpoint_nobody_is_sent_back_to_one() {
+    let fixture = Fixture::new(&[("learner", "dies")]);
+    let message = failure(fixture.supervise().0.ending);
+    assert!(!message.contains("dmprl resume"), "{message}");
 }
 
 #[test]

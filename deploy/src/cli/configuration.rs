@@ -248,7 +248,19 @@ mod tests {
         for name in ["reachr", "Reacher", "pushr"] {
             assert!(refused(sources(name)).contains("did you mean `"), "{name}");
         }
-        for name in ["", "zzz", "../etc-v1", "a b-v1", "os;x:Y-v1", "Y-v", "Y-v1.0", "m:", ":C", "m..n:C", "m:C.D"] {
+        for name in [
+            "",
+            "zzz",
+            "../etc-v1",
+            "a b-v1",
+            "os;x:Y-v1",
+            "Y-v",
+            "Y-v1.0",
+            "m:",
+            ":C",
+            "m..n:C",
+            "m:C.D",
+        ] {
             assert!(refused(sources(name)).contains("unknown task"), "{name}");
         }
     }

@@ -53,7 +53,7 @@ pub(super) fn run(args: &EvalArgs) -> anyhow::Result<Outcome> {
         episodes: args.episodes.unwrap_or(config.evaluation.episodes as u64),
     };
     let Some(row) = launch::evaluate(plan)? else { return Ok(Outcome::Interrupted) };
-    emit(&if args.json { json(&run, &row) } else { text(&row, &chosen) })?;
+    emit(&if args.json { json(&run, &row, &chosen) } else { text(&row, &chosen) })?;
     Ok(Outcome::Done)
 }
 
@@ -74,8 +74,14 @@ fn request(chosen: &ChosenPolicy) -> EvaluationRequest {
     })
 }
 
-fn json(run: &RunDirectory, row: &EvaluationRow) -> String {
+fn json(run: &RunDirectory, row: &EvaluationRow, chosen: &ChosenPolicy) -> String {
     let mut object = serde_json::json!(row);
+    if chosen.row.is_none() {
+        // Nobody has measured them: the request had to say something.
+        for name in ["env_steps", "updates", "segments", "wall_s"] {
+            object[name] = serde_json::Value::Null;
+        }
+    }
     object["run"] = run.path().display().to_string().into();
     object["return_std"] = std_of(&row.returns).into();
     object["episodes"] = row.returns.len().into();

@@ -1,5 +1,6 @@
 //! `dmprl train`: from the command line to a run directory, then over to `launch`.
 
+use std::io::Read;
 use std::path::{Path, PathBuf};
 use std::time::{Duration, SystemTime};
 
@@ -7,6 +8,7 @@ use anyhow::Context;
 use clap::Args;
 use clap::builder::PossibleValuesParser;
 use dmprl_shared::config::{AlgorithmName, ExperimentConfig, Limits, PRESETS, PolicyKind};
+use dmprl_shared::dmp::Dmp;
 use toml::Value;
 
 use super::configuration::{Flag, Sources, merge, refuse};
@@ -20,8 +22,8 @@ use crate::terminal::ProgressStyle;
 const SAME_SECOND_MAX: usize = 100;
 
 const HELP: &str = "\
-PRECEDENCE, lowest first: the policy's and the task's defaults, --preset, --config, environment variables
-(DMPRL_ALGORITHM__BATCH_SIZE=64 sets algorithm.batch_size), --set, the flags above.
+PRECEDENCE, lowest first: the policy's and the task's defaults, --preset, --config, environment
+variables (DMPRL_ALGORITHM__BATCH_SIZE=64 sets algorithm.batch_size), --set, the flags above.
 Ctrl-C once: checkpoint and a clean end within 10 s; twice: at once.
 
 EXAMPLES
@@ -31,14 +33,15 @@ EXAMPLES
   dmprl train reacher --preset paper --set exploration.std=0.2
   dmprl train reacher --until-return -5 --max-minutes 30
   dmprl train reacher --config runs/baseline/config.toml --deterministic
-  dmprl train my_module:MyArm-v0 --python-path ./envs --init-from runs/baseline";
+  dmprl train reacher --init-from runs/baseline --seed 3
+  dmprl train my_module:MyArm-v0 --python-path ./envs";
 
 /// Arguments of `dmprl train`.
 #[derive(Debug, Args)]
 #[command(after_help = HELP)]
 pub(super) struct TrainArgs {
-    /// A task of `dmprl tasks`, or any Gymnasium id: Pendulum-v1, my_module:MyArm-v0; or a SegmentEnv
-    /// of your own: my_module:MyClass.
+    /// A task of `dmprl tasks`, or any Gymnasium id: Pendulum-v1, my_module:MyArm-v0; or a
+    /// SegmentEnv of your own: my_module:MyClass.
     task: String,
     /// Learning algorithm.
     #[arg(long, value_parser = PossibleValuesParser::new(["ddpg"]))]
@@ -115,6 +118,7 @@ pub(super) fn run(args: &TrainArgs) -> anyhow::Result<Outcome> {
         flags: flags(args)?,
     };
     let mut config = merge(&sources)?.resolve(Limits { cores: cores() }).map_err(refuse)?;
+    check(&config, args)?;
     // Absolute, so that the run can be resumed from anywhere.
     for path in &mut config.task.python_path {
         *path = absolute_folder(path)?;
@@ -137,6 +141,21 @@ pub(super) fn run(args: &TrainArgs) -> anyhow::Result<Outcome> {
         resume: false,
         progress: ProgressStyle::from_flag(args.no_progress),
     })
+}
+
+/// What is wrong before any process or environment is needed.
+fn check(config: &ExperimentConfig, args: &TrainArgs) -> anyhow::Result<()> {
+    if config.policy.kind == PolicyKind::Dmp {
+        Dmp::new(&config.dmp, config.policy.segment_steps)
+            .map_err(|error| wrong_use(error.to_string()))?;
+    }
+    if let Some(workers) = args.workers.filter(|&workers| workers > 1 && config.run.deterministic) {
+        return Err(wrong_use(format!(
+            "--workers {workers}: a deterministic run is one process in lock-step; leave out \
+             --workers, or run.deterministic"
+        )));
+    }
+    Ok(())
 }
 
 fn flags(args: &TrainArgs) -> anyhow::Result<Vec<Flag>> {
@@ -210,7 +229,22 @@ fn policy_file(path: &Path) -> anyhow::Result<PathBuf> {
             path.display()
         )));
     };
+    if !is_safetensors(&file).unwrap_or(false) {
+        return Err(wrong_use(format!("--init-from {}: no readable policy file", file.display())));
+    }
     std::fs::canonicalize(&file).with_context(|| format!("cannot resolve {}", file.display()))
+}
+
+/// Whether a file begins as safetensors do: the header's length in 8 bytes, the header in JSON.
+/// The learner reads the rest, when the environment has said how large the policy is.
+fn is_safetensors(path: &Path) -> std::io::Result<bool> {
+    let mut head = [0; 9];
+    let mut file = std::fs::File::open(path)?;
+    let bytes = file.metadata()?.len();
+    file.read_exact(&mut head)?;
+    let [a, b, c, d, e, f, g, h, brace] = head;
+    let header = u64::from_le_bytes([a, b, c, d, e, f, g, h]);
+    Ok(header.checked_add(8).is_some_and(|end| end <= bytes) && brace == b'{')
 }
 
 fn default_path(config: &ExperimentConfig) -> anyhow::Result<PathBuf> {

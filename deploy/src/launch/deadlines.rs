@@ -11,6 +11,9 @@ use crate::terminal::shown;
 
 /// The supervisor looks around at least so often.
 const IDLE: Duration = Duration::from_secs(60);
+/// Waking so long after its own deadline, the supervisor was not late but stood still: Ctrl-Z and
+/// `fg`, or a paused container.
+const STANDSTILL: Duration = Duration::from_secs(5);
 
 impl Supervisor {
     pub(super) fn next_deadline(&self) -> Instant {
@@ -31,6 +34,23 @@ impl Supervisor {
         deadlines.extend(self.slots.values().filter_map(|slot| slot.restart_at));
         deadlines.extend(self.starting().map(|(_, running)| running.spawned + self.limits.ready));
         deadlines.into_iter().min().unwrap_or_else(Instant::now)
+    }
+
+    /// Time in which the supervisor stood still, and its children with it, counts for no deadline
+    /// of theirs: each gets what it had left at `looked`, when the supervisor last looked around.
+    pub(super) fn on_wake(&mut self, looked: Instant, due: Instant, now: Instant) {
+        let Some(lost) = stood_still(looked, due, now) else { return };
+        self.advanced += lost;
+        self.evaluations.postpone(lost);
+        match &mut self.phase {
+            Phase::Training => {}
+            Phase::Draining { deadline }
+            | Phase::Finishing { deadline }
+            | Phase::Stopping { deadline, .. } => *deadline += lost,
+        }
+        for running in self.slots.values_mut().filter_map(|slot| slot.running.as_mut()) {
+            running.spawned += lost;
+        }
     }
 
     pub(super) fn on_time(&mut self, now: Instant) -> anyhow::Result<()> {
@@ -149,5 +169,29 @@ impl Supervisor {
         if let Some(running) = self.running(Process::Evaluator) {
             running.child.kill();
         }
+    }
+}
+
+/// How long a supervisor stood still that looked around at `looked`, was to wake at `due` at the
+/// latest and woke at `now`; none when it was on time.
+fn stood_still(looked: Instant, due: Instant, now: Instant) -> Option<Duration> {
+    let late = now.saturating_duration_since(due.max(looked));
+    (late >= STANDSTILL).then(|| now.duration_since(looked))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Ctrl-Z for an hour was once taken for an hour in which the learner did nothing.
+    #[test]
+    fn a_standstill_is_told_from_a_wait() {
+        let looked = Instant::now();
+        let due = looked + IDLE;
+        assert_eq!(stood_still(looked, due, looked), None, "a report came at once");
+        assert_eq!(stood_still(looked, due, due + Duration::from_millis(20)), None, "a timer");
+        let hour = Duration::from_secs(3_600);
+        assert_eq!(stood_still(looked, due, looked + hour), Some(hour));
+        assert_eq!(stood_still(due, looked, due), None, "overdue and handled at once");
     }
 }

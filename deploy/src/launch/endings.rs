@@ -231,7 +231,13 @@ impl Supervisor {
         self.launcher.run.log_path(&process.to_string())
     }
 
+    /// Nothing where a resume would only begin again and meet the same end. A learner that lives
+    /// writes a checkpoint when the run stops.
     fn resume_advice(&self) -> String {
+        let learner = self.running(Process::Learner).is_some_and(|running| running.ready);
+        if !learner && !self.launcher.run.has_checkpoint().unwrap_or(false) {
+            return String::new();
+        }
         format!(
             "\n  go on from the last checkpoint: dmprl resume {}",
             shown(self.launcher.run.path())

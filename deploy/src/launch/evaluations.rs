@@ -40,6 +40,13 @@ impl EvaluationQueue {
         Some(request)
     }
 
+    /// Gives the one in flight so much more time.
+    pub(super) fn postpone(&mut self, time: Duration) {
+        if let Some((_, deadline)) = &mut self.in_flight {
+            *deadline += time;
+        }
+    }
+
     /// Takes the answer for this policy; false when another or none was asked for.
     pub(super) fn finish(&mut self, policy_version: u64) -> bool {
         let asked = |(request, _): &mut (EvaluationRequest, Instant)| {

@@ -115,6 +115,13 @@ pub(super) struct Supervisor {
     pub(super) last_row: Option<EvaluationRow>,
 }
 
+/// What ended the supervisor's wait.
+enum Wake {
+    Interrupt,
+    Event(Event),
+    Time,
+}
+
 /// Runs the processes of one session until all of them have ended.
 pub async fn supervise(plan: SupervisorPlan) -> SessionReport {
     let SupervisorPlan { launcher, config, limits, display, mut interrupts } = plan;
@@ -149,15 +156,21 @@ pub async fn supervise(plan: SupervisorPlan) -> SessionReport {
     let started = supervisor.start();
     supervisor.check(started);
     while !supervisor.is_over() {
-        let deadline = supervisor.next_deadline().into();
-        tokio::select! {
+        let (looked, due) = (Instant::now(), supervisor.next_deadline());
+        let wake = tokio::select! {
             biased;
-            Some(()) = interrupts.recv() => supervisor.on_interrupt(),
-            Some(event) = incoming.recv() => {
+            Some(()) = interrupts.recv() => Wake::Interrupt,
+            Some(event) = incoming.recv() => Wake::Event(event),
+            () = tokio::time::sleep_until(due.into()) => Wake::Time,
+        };
+        supervisor.on_wake(looked, due, Instant::now());
+        match wake {
+            Wake::Interrupt => supervisor.on_interrupt(),
+            Wake::Event(event) => {
                 let handled = supervisor.on_event(event);
                 supervisor.check(handled);
             }
-            () = tokio::time::sleep_until(deadline) => {}
+            Wake::Time => {}
         }
         let handled = supervisor.on_time(Instant::now());
         supervisor.check(handled);

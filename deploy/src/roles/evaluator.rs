@@ -97,7 +97,8 @@ pub fn evaluate(
 /// A number of the row is not finite.
 pub fn keep(setup: &Setup, row: &EvaluationRow, control: &ControlPipe) -> anyhow::Result<()> {
     row.check_finite()?;
-    let steps = [("is not in evaluations.jsonl", append(setup, row)), ("did not tidy up", tidy(setup))];
+    let steps =
+        [("is not in evaluations.jsonl", append(setup, row)), ("did not tidy up", tidy(setup))];
     for (what, result) in steps {
         if let Err(error) = result {
             let message = format!("evaluation of policy {} {what}: {error:#}", row.policy_version);

@@ -102,7 +102,14 @@ impl RunDirectory {
             std::fs::remove_file(&path)
                 .with_context(|| format!("cannot remove {}", path.display()))?;
         }
-        Ok(())
+        // It led to one of them.
+        let best = self.checkpoints_path().join("best");
+        match std::fs::remove_file(&best) {
+            Err(error) if error.kind() != std::io::ErrorKind::NotFound => {
+                Err(error).with_context(|| format!("cannot remove {}", best.display()))
+            }
+            _ => Ok(()),
+        }
     }
 
     /// Seconds of training over all sessions so far, as the last rows tell.

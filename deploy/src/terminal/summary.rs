@@ -28,7 +28,10 @@ pub fn summary(report: &SessionReport, title: &str, run: &Path, steps_total: u64
     let run = shown(run);
     lines.push(("results", run.clone()));
     lines.push(("next", format!("dmprl eval {run}")));
-    lines.push(("", format!("dmprl resume {run} --steps {}", steps_total.saturating_mul(2))));
+    // Without its last checkpoint a run would not go on from here.
+    if report.checkpointed {
+        lines.push(("", format!("dmprl resume {run} --steps {}", steps_total.saturating_mul(2))));
+    }
     let lines = lines.iter().map(|(name, value)| format!("  {name:<10} {value}"));
     lines.collect::<Vec<_>>().join("\n")
 }
