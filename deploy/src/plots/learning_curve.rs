@@ -72,7 +72,8 @@ fn draw(rows: &[EvaluationRow], title: &str) -> Result<String, Box<dyn std::erro
         chart.draw_series(mean.map(|point| Circle::new(point, 3, BLUE.filled())))?;
         let note = format!("mean ± 1 std over {} episodes", rows[0].returns.len());
         let style = ("sans-serif", 14).into_font().color(&BLUE);
-        area.draw_text(&note, &style, (SIZE.0 as i32 - 250, 24))?;
+        // Below a curve that rises to the right.
+        area.draw_text(&note, &style, (SIZE.0 as i32 - 250, SIZE.1 as i32 - 90))?;
         area.present()?;
     }
     Ok(svg)
