@@ -122,7 +122,14 @@ impl Workplace {
                 command.env_remove(name);
             }
         }
-        command.current_dir(self.folder()).process_group(0);
+        command.current_dir(self.folder());
+        // A session of its own, not only a group: when the leader of a group in our session is
+        // killed, the kernel wakes the group's stopped members with SIGHUP and SIGCONT, and a test
+        // that had stopped the learner found it running.
+        // SAFETY: `setsid` is async-signal-safe, allocates nothing and touches no lock.
+        unsafe {
+            command.pre_exec(|| rustix::process::setsid().map(drop).map_err(Into::into));
+        }
         command.stdin(Stdio::null()).stdout(file("out")).stderr(file("err"));
         let child = command.spawn().expect("dmprl starts");
         let id = i32::try_from(child.id()).ok().and_then(Pid::from_raw).expect("a process id");
