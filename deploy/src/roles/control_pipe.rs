@@ -115,14 +115,8 @@ impl ControlPipe {
         self.flags.orphaned.load(Ordering::Acquire)
     }
 
-    /// The next command, if one is there. `stop` and `finish` are no commands here, see
-    /// `stop_requested` and `finish_requested`.
-    #[must_use]
-    pub fn try_next(&self) -> Option<Command> {
-        self.commands.lock().unwrap_or_else(PoisonError::into_inner).try_recv().ok()
-    }
-
-    /// The next command, waiting so long for it; none when the wait or the input has ended.
+    /// The next command, waiting so long for it; none when the wait or the input has ended. `stop`
+    /// and `finish` are no commands here, see `stop_requested` and `finish_requested`.
     #[must_use]
     pub fn next_within(&self, wait: Duration) -> Option<Command> {
         self.commands.lock().unwrap_or_else(PoisonError::into_inner).recv_timeout(wait).ok()
@@ -207,7 +201,7 @@ mod tests {
         assert!(!pipe.orphaned());
         let attach = Command::Attach { domain: "/a".into() };
         assert_eq!(pipe.next_within(PATIENCE), Some(attach));
-        assert_eq!(pipe.try_next(), None);
+        assert_eq!(pipe.next_within(Duration::ZERO), None);
     }
 
     #[test]

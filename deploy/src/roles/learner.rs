@@ -41,10 +41,7 @@ pub fn run(args: &LearnerArgs, control: &ControlPipe) -> anyhow::Result<()> {
         let _ = control.send(&Report::Evaluate(request));
         Ok(())
     };
-    if recorder.is_owed_an_evaluation(&session.learner) {
-        session.publish()?;
-        recorder.due(Due::Evaluation, &mut session.learner, &mut ask)?;
-    }
+    catch_up(&mut session, &mut recorder, &mut ask)?;
     let finished = turns(&mut session, &mut recorder, control, &mut ask)?;
     if !finished {
         // What the workers had already sent is in the checkpoint; they are not waited for.
@@ -52,6 +49,19 @@ pub fn run(args: &LearnerArgs, control: &ControlPipe) -> anyhow::Result<()> {
         session.drain(&mut |_, _| Ok(()), queued_max)?;
     }
     close(&mut session, &mut recorder, control, (finished, &mut ask))
+}
+
+/// Evaluates what an earlier session was stopped before it had evaluated.
+pub fn catch_up<R: SegmentReceiver, P: ParameterPublisher>(
+    session: &mut Session<R, P>,
+    recorder: &mut Recorder<'_>,
+    evaluate: Evaluate<'_>,
+) -> anyhow::Result<()> {
+    if recorder.is_owed_an_evaluation(&session.learner) {
+        session.publish()?;
+        recorder.due(Due::Evaluation, &mut session.learner, evaluate)?;
+    }
+    Ok(())
 }
 
 /// What learner and workers of this run agree on.

@@ -64,8 +64,11 @@ pub fn run(args: &LearnerArgs, control: &ControlPipe) -> anyhow::Result<()> {
         let RunConfig { until_return, until_success, .. } = config.run;
         let success = row.success_rate.is_some_and(|rate| rate >= until_success);
         reached.set(reached.get() || success || row.return_mean >= until_return);
-        control.send(&Report::Evaluated(row))
+        // A supervisor that is gone is noticed as a stop, which ends with a checkpoint.
+        let _ = control.send(&Report::Evaluated(row));
+        Ok(())
     };
+    super::learner::catch_up(&mut session, &mut recorder, &mut evaluate)?;
     let mut first = true;
     let finished = loop {
         let mut due = |due: Due, learner: &mut Learner| {
@@ -86,18 +89,23 @@ pub fn run(args: &LearnerArgs, control: &ControlPipe) -> anyhow::Result<()> {
             break true;
         }
         parameters.newest(&mut rollout.snapshot)?;
-        rollout
-            .segment(&mut |header, block| match senders[0].try_send(header, block) {
-                Ok(SendOutcome::Delivered) => Ok(()),
-                Ok(outcome) => Err(Delivery(anyhow::anyhow!(
-                    "the lock-step schedule emptied the queue, yet it is {outcome:?}"
-                ))),
-                Err(error) => Err(Delivery(error.into())),
-            })
-            .map_err(|Delivery(error)| error)?;
+        act(&mut rollout, &mut senders[0])?;
         if std::mem::take(&mut first) {
-            control.send(&Report::FirstSegment)?;
+            let _ = control.send(&Report::FirstSegment);
         }
     };
     super::learner::close(&mut session, &mut recorder, control, (finished, &mut evaluate))
+}
+
+/// Runs one segment in each environment; the schedule has emptied the queue, so each has room.
+fn act(rollout: &mut Rollout, sender: &mut in_process::Sender) -> anyhow::Result<()> {
+    rollout
+        .segment(&mut |header, block| match sender.try_send(header, block) {
+            Ok(SendOutcome::Delivered) => Ok(()),
+            Ok(outcome) => Err(Delivery(anyhow::anyhow!(
+                "the lock-step schedule emptied the queue, yet it is {outcome:?}"
+            ))),
+            Err(error) => Err(Delivery(error.into())),
+        })
+        .map_err(|Delivery(error)| error)
 }

@@ -106,6 +106,25 @@ fn eval_repeats_the_stored_evaluations() {
     place.assert_no_process();
 }
 
+/// A run that was stopped before its evaluator had answered has a checkpoint without its row.
+#[test]
+fn a_resumed_run_makes_up_for_the_evaluation_that_was_never_answered() {
+    for mode in [None, Some("--deterministic")] {
+        let place = Workplace::new();
+        let run = place.path("run");
+        let flags: Vec<&str> = ["--steps", "2000"].into_iter().chain(mode).collect();
+        place.run(&train("reacher", &run, &flags)).with_status(0);
+        let path = Path::new(&run).join("evaluations.jsonl");
+        let text = fs::read_to_string(&path).unwrap();
+        let (answered, _) = text.split_once('\n').unwrap();
+        fs::write(&path, format!("{answered}\n")).unwrap();
+
+        place.run(&["resume", &run, "--steps", "2500"]).with_status(0);
+        let evaluated = env_steps(&rows(&run, "evaluations.jsonl"));
+        assert_eq!(evaluated, [1000, 2000, 2500], "{mode:?}");
+    }
+}
+
 #[test]
 fn resume_with_more_steps_extends_a_finished_run() {
     let place = Workplace::new();
