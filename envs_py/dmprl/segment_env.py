@@ -66,6 +66,7 @@ class SegmentBuffers:
         self.truncated = np.zeros(env_count, np.uint8)
         self.success = np.full(env_count, SUCCESS_NOT_REPORTED, np.uint8)
         self.steps = np.zeros(env_count, np.int32)
+        self.failed = np.zeros(env_count, np.uint8)
         self.next_observations = np.zeros((env_count, observation_len))
         # What the caller hands in lies beside it, for the same reason: allocated once.
         self.actions = np.zeros((env_count, segment_steps, action_len))
@@ -130,6 +131,12 @@ def make(task_id: str, env_count: int, segment_steps: int) -> SegmentEnv:
         candidate = getattr(_import(task_id, module_name), name, None)
         if isinstance(candidate, type) and issubclass(candidate, SegmentEnv):
             return candidate(env_count, segment_steps)
+
+    from dmprl.tasks import make_batch
+
+    batch = make_batch(task_id.removeprefix("dmprl:"), env_count, segment_steps)
+    if batch is not None:
+        return batch
 
     from dmprl.gymnasium_env import GymnasiumSegmentEnv  # a SegmentEnv may do without Gymnasium
 

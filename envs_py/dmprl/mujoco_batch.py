@@ -1,0 +1,294 @@
+"""Tasks of our own on MuJoCo's batched simulation: a whole segment for E environments in one call.
+
+A :class:`MujocoTask` says what the task is: model, start states, observation, reward. It sees all
+environments and all steps at once, as arrays. :class:`BatchSegmentEnv` runs it on
+:class:`mujoco.batch.Batch`, which steps E simulations in C without the GIL. One thread: a machine's
+cores are filled with workers, each a process of its own.
+
+Shapes: E environments, K steps of a segment, O observation, A action.
+"""
+
+from __future__ import annotations
+
+import ctypes
+from abc import ABC, abstractmethod
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, ClassVar
+
+import mujoco
+import numpy as np
+from mujoco.batch import Batch
+from numpy.typing import NDArray
+
+from dmprl.segment_env import (
+    SUCCESS_NOT_REPORTED,
+    EnvSpec,
+    SegmentBuffers,
+    SegmentEnv,
+    SegmentEnvError,
+)
+
+Fields = Mapping[str, NDArray]
+"""Arrays of MjData by name, each with the dimensions of the call in front of MjData's own."""
+
+class MujocoTask(ABC):
+    """What a task is, for E environments at once.
+
+    Observations are rows of float64; actions come as float32, which is what Gymnasium's action
+    spaces hold. Reward and success are functions of observations and actions.
+    """
+
+    id: str
+    """Gymnasium id."""
+    frame_skip: int
+    """Steps of the simulation in one step of the environment."""
+    episode_steps: int
+    """Steps after which an episode is truncated."""
+    recorded: tuple[str, ...]
+    """Names of the MjData fields that :meth:`observe` reads."""
+    camera: ClassVar[Mapping[str, Any]] = {}
+    """Settings of MuJoCo's free camera for a picture of the task."""
+
+    def __init__(self, env_count: int) -> None:
+        self.env_count = env_count
+        self.model = self.load_model()
+        self.action_low, self.action_high = (
+            bound.astype(np.float32) for bound in self.model.actuator_ctrlrange.T
+        )
+
+    def batch(self, segment_steps: int, episode_steps: int | None) -> BatchSegmentEnv:
+        """The environments; ``episode_steps`` None leaves the time limit to the caller."""
+        return BatchSegmentEnv(self, segment_steps, episode_steps)
+
+    @abstractmethod
+    def load_model(self) -> mujoco.MjModel:
+        """Compiles the model."""
+
+    @abstractmethod
+    def observation_names(self) -> list[str]:
+        """What each of an observation's O entries is."""
+
+    @abstractmethod
+    def draw_start(
+        self,
+        rng: np.random.Generator,
+        qpos: NDArray[np.float64],
+        qvel: NDArray[np.float64],
+        mocap_pos: NDArray[np.float64],
+    ) -> None:
+        """Writes one environment's start state over the model's own, which the arrays hold."""
+
+    def episodes_began(self, indices: NDArray[np.int32]) -> None:  # noqa: B027 - most keep nothing
+        """Forgets what the task keeps of the last episode of these environments."""
+
+    @abstractmethod
+    def observe(self, fields: Fields, out: NDArray[np.float64]) -> None:
+        """Writes the observation of each state; ``fields`` (…, …), ``out`` (…, O)."""
+
+    @abstractmethod
+    def rewards(
+        self,
+        observations: NDArray[np.float64],
+        actions: NDArray[np.float32],
+        out: NDArray[np.float64],
+    ) -> None:
+        """Writes each step's reward.
+
+        ``observations`` (E, k+1, O), row i before step i; ``actions`` and ``out`` (E, k, …).
+        """
+
+    def successes(self, observations: NDArray[np.float64], out: NDArray[np.uint8]) -> None:
+        """Writes whether each state (E, O) is a success; a task without a criterion says so."""
+        out[:] = SUCCESS_NOT_REPORTED
+
+
+class BatchSegmentEnv(SegmentEnv):
+    """E simulations of one :class:`MujocoTask` whose actions are the actuators' controls."""
+
+    def __init__(self, task: MujocoTask, segment_steps: int, episode_steps: int | None) -> None:
+        _quieten_mujoco()
+        self.task = task
+        self.env_count = task.env_count
+        self.segment_steps = segment_steps
+        self.batch = Batch(task.model, self.env_count, nthread=1)
+        self._names = task.observation_names()
+        self._current = np.zeros((self.env_count, len(self._names)))
+        self._actions = np.zeros((self.env_count, segment_steps, len(task.action_low)), np.float32)
+        self._limit = np.iinfo(np.int32).max if episode_steps is None else episode_steps
+        # Steps until truncation; 0 before the first reset.
+        self._remaining = np.zeros(self.env_count, np.int32)
+        self._all_began = False
+        self._generators: list[np.random.Generator | None] = [None] * self.env_count
+        self._seeds = [0] * self.env_count
+        self._failures = [0] * self.env_count
+        self._messages: list[str] = []
+        self._state = {name: self.batch.bind(name) for name in ("qpos", "qvel", "mocap_pos")}
+        self._fields = {name: self.batch.bind(name) for name in task.recorded}
+        # What mj_resetData would leave. Copying it is cheaper: the rest of what that call clears
+        # the forward pass computes anew.
+        self._new_state = self.batch.state[0].copy()
+        self._prepare()
+
+    def _prepare(self) -> None:
+        """Makes the arrays of a segment, for each number of steps that a segment may have."""
+        task, envs = self.task, self.env_count
+        self._controls, self._records, self._ends = [], [], []
+        for steps in range(1, self.segment_steps + 1):
+            substeps = steps * task.frame_skip
+            controls = np.zeros((envs, substeps, task.model.nu))
+            records = {
+                name: np.zeros((envs, substeps, *field.shape[1:]))
+                for name, field in self._fields.items()
+            }
+            last = slice(task.frame_skip - 1, None, task.frame_skip)
+            self._controls.append(controls)
+            self._records.append(records)
+            self._ends.append({name: record[:, last] for name, record in records.items()})
+
+    def spec(self) -> EnvSpec:  # noqa: D102 - inherited
+        task = self.task
+        return {
+            "id": task.id,
+            "observation_len": len(self._names),
+            "observation_names": self._names,
+            "action_len": len(task.action_low),
+            "action_low": task.action_low.astype(np.float64).tolist(),
+            "action_high": task.action_high.astype(np.float64).tolist(),
+            "control_dt_s": task.model.opt.timestep * task.frame_skip,
+            "episode_steps": task.episode_steps,
+        }
+
+    def reset(  # noqa: D102 - inherited
+        self, mask: NDArray[np.uint8], seeds: NDArray[np.uint64], out: SegmentBuffers
+    ) -> None:
+        indices = np.flatnonzero(mask).astype(np.int32)
+        for index in indices.tolist():
+            self._seeds[index], self._failures[index] = int(seeds[index]), 0
+            self.seed(index, generator(self._seeds[index]))
+        self.begin(indices, out)
+
+    def begin(self, indices: NDArray[np.int32], out: SegmentBuffers) -> None:
+        """Starts an episode in each of these environments, drawn by its generator."""
+        self._begin(indices)
+        out.next_observations[indices] = self._current[indices]
+
+    def seed(self, index: int, rng: np.random.Generator) -> None:
+        """Gives an environment the generator that draws its start states."""
+        self._generators[index] = rng
+
+    def step_segment(  # noqa: D102 - inherited
+        self, actions: NDArray[np.float64], out: SegmentBuffers
+    ) -> None:
+        if actions.shape != self._actions.shape:
+            raise ValueError(f"actions {actions.shape}, expected (E, K, A) = {self._actions.shape}")
+        remaining = self._remaining
+        if not self._all_began:
+            index = int(remaining.argmin())
+            raise SegmentEnvError(f"{self.task.id}, environment {index}: step before reset")
+        steps = min(self.segment_steps, int(remaining.max()))
+        np.copyto(self._actions, actions, casting="same_kind")
+        out.observations[:, 0] = self._current
+        failed = self._simulate(steps, out)
+        observations = out.observations[:, : steps + 1]
+        self.task.rewards(observations, self._actions[:, :steps], out.rewards[:, :steps])
+        self.task.successes(observations[:, -1], out.success)
+        self._current[:] = observations[:, -1]
+        np.minimum(remaining, steps, out=out.steps)
+        remaining -= out.steps
+        out.terminated[:] = 0
+        np.equal(remaining, 0, out=out.truncated, casting="unsafe")
+        out.failed[:] = 0
+        if steps < self.segment_steps or out.truncated.any() or failed is not None:
+            self._end_episodes(failed, out)
+        out.next_observations[:] = self._current
+
+    def _simulate(self, steps: int, out: SegmentBuffers) -> NDArray[np.int32] | None:
+        """Runs ``steps`` steps and observes each; returns the environments that failed."""
+        skip, which = self.task.frame_skip, steps - 1
+        controls = self._controls[which]
+        controls.reshape(self.env_count, steps, skip, -1)[:] = self._actions[:, :steps, None]
+        records = self._records[which]
+        failed = None
+        try:
+            self.batch.rollout(steps * skip, controls, record=self.task.recorded, out=records)
+        except mujoco.batch.SimulationError as error:
+            failed = error.ids
+        self.task.observe(self._ends[which], out.observations[:, 1 : steps + 1])
+        return self._failed(failed)
+
+    def _failed(self, raised: NDArray[np.int32] | None) -> NDArray[np.int32] | None:
+        """Those that raised and those whose warning counters rose, with a sentence for each."""
+        if raised is None and not self.batch.warning.any():
+            return None
+        # MuJoCo has stopped the simulations that it warned about.
+        warnings = self.batch.warning[:, :, 1]
+        failed = np.flatnonzero(warnings.any(axis=1))
+        if raised is not None:
+            failed = np.union1d(failed, raised)
+        for index in failed.tolist():
+            kinds = [mujoco.mjtWarning(kind).name for kind in np.flatnonzero(warnings[index])]
+            reason = self.batch.error(index) or f"MuJoCo warned ({', '.join(kinds)})"
+            self._messages.append(f"{self.task.id}, environment {index}: {reason}")
+        return failed.astype(np.int32)
+
+    def _end_episodes(self, failed: NDArray[np.int32] | None, out: SegmentBuffers) -> None:
+        """Cuts rows at the episodes' ends and starts new ones."""
+        for index in np.flatnonzero(out.steps < self.segment_steps).tolist():
+            out.observations[index, out.steps[index] + 1 :] = 0.0
+            out.rewards[index, out.steps[index] :] = 0.0
+        if failed is not None:
+            out.failed[failed] = 1
+            for array in (out.observations, out.rewards, out.steps, out.truncated):
+                array[failed] = 0
+            for index in failed.tolist():
+                self._failures[index] += 1
+                # Another seed: the same one could lead to the same failure for ever.
+                self.seed(index, generator((self._seeds[index], self._failures[index])))
+        ended = np.flatnonzero(out.truncated | out.failed).astype(np.int32)
+        if ended.size:
+            self._begin(ended)
+
+    def _begin(self, indices: NDArray[np.int32]) -> None:
+        """Starts an episode in each of these environments."""
+        self.batch.state[indices] = self._new_state
+        qpos, qvel, mocap_pos = self._state.values()
+        for index in indices.tolist():
+            rng = self._generators[index]
+            self.task.draw_start(rng, qpos[index], qvel[index], mocap_pos[index])
+        self.batch.forward(indices)
+        self.batch.warning[indices] = 0
+        self.task.episodes_began(indices)
+        self._remaining[indices] = self._limit
+        self._all_began = bool(self._remaining.all())
+        if indices.size == self.env_count:
+            self.task.observe(self._fields, self._current)
+        else:
+            began = {name: field[indices] for name, field in self._fields.items()}
+            observations = np.zeros((indices.size, self._current.shape[1]))
+            self.task.observe(began, observations)
+            self._current[indices] = observations
+
+    def take_failures(self) -> list[str]:  # noqa: D102 - inherited
+        messages, self._messages = self._messages, []
+        return messages
+
+
+def generator(seed: int | tuple[int, ...]) -> np.random.Generator:
+    """The generator that Gymnasium makes of a seed."""
+    return np.random.Generator(np.random.PCG64(np.random.SeedSequence(seed)))
+
+
+def _quieten_mujoco() -> None:
+    """Takes the clock and the log file out of MuJoCo, for this process.
+
+    MuJoCo's Python bindings install a timer that every stage of a step reads twice: on Reacher a
+    fourth of a step's time. Nothing but ``MjData.timer`` is lost. And a warning, which here becomes
+    a failure with a sentence of its own, would be written to MUJOCO_LOG.TXT wherever the program
+    was started. The hook takes a C function only, lest a simulation's thread need the GIL; strlen
+    takes a string and does nothing.
+    """
+    library = ctypes.CDLL(str(next(Path(mujoco.__file__).parent.glob("libmujoco*"))))
+    ctypes.c_void_p.in_dll(library, "mjcb_time").value = None
+    strlen = ctypes.cast(ctypes.CDLL(None).strlen, ctypes.c_void_p)
+    ctypes.c_void_p.in_dll(library, "mju_user_warning").value = strlen.value

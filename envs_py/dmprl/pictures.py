@@ -1,0 +1,102 @@
+"""Pictures of a MuJoCo state, without a display.
+
+MuJoCo's own ``Renderer`` takes the OpenGL that the environment variable ``MUJOCO_GL`` named when
+``mujoco`` was first imported, by default one that needs a display. This one takes what works.
+"""
+
+from __future__ import annotations
+
+import importlib
+import os
+from collections.abc import Mapping
+from typing import Any
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+OFFSCREEN = ("egl", "osmesa")
+"""OpenGL without a display: on a graphics card or Mesa's processor driver, then in memory."""
+MAX_GEOMS = 1000
+
+
+class NoOpenGLError(RuntimeError):
+    """Nothing on this machine can draw."""
+
+
+class PictureMaker:
+    """Draws states of one model into arrays."""
+
+    def __init__(
+        self, model: mujoco.MjModel, width: int, height: int, camera: Mapping[str, Any]
+    ) -> None:
+        """Opens OpenGL; ``camera`` holds settings of MuJoCo's free camera."""
+        self._model = model
+        self._gl = _context(width, height)
+        self._gl.make_current()
+        # The buffer grows to the picture, and never shrinks: another picture may be larger.
+        scale = model.vis.global_
+        scale.offwidth = max(scale.offwidth, width)
+        scale.offheight = max(scale.offheight, height)
+        self._context = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_150)
+        mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN, self._context)
+        self._viewport = mujoco.MjrRect(0, 0, width, height)
+        self._scene = mujoco.MjvScene(model, MAX_GEOMS)
+        self._options = mujoco.MjvOption()
+        self._camera = mujoco.MjvCamera()
+        mujoco.mjv_defaultFreeCamera(model, self._camera)
+        for name, value in camera.items():
+            if name == "lookat":
+                self._camera.lookat[:] = value
+            else:
+                setattr(self._camera, name, value)
+
+    def _draw(self, data: mujoco.MjData) -> None:
+        # Another maker may have drawn since.
+        self._gl.make_current()
+        mujoco.mjv_updateScene(
+            self._model,
+            data,
+            self._options,
+            None,
+            self._camera,
+            mujoco.mjtCatBit.mjCAT_ALL,
+            self._scene,
+        )
+        mujoco.mjr_render(self._viewport, self._scene, self._context)
+
+    def rgb(self, data: mujoco.MjData) -> NDArray[np.uint8]:
+        """The picture (height, width, 3)."""
+        self._draw(data)
+        picture = np.zeros((self._viewport.height, self._viewport.width, 3), np.uint8)
+        mujoco.mjr_readPixels(picture, None, self._viewport, self._context)
+        return np.ascontiguousarray(picture[::-1])
+
+    def depth(self, data: mujoco.MjData) -> NDArray[np.float32]:
+        """OpenGL's depth of each pixel (height, width), 0 at the near plane, 1 at the far one."""
+        self._draw(data)
+        depth = np.zeros((self._viewport.height, self._viewport.width), np.float32)
+        mujoco.mjr_readPixels(None, depth, self._viewport, self._context)
+        return np.ascontiguousarray(depth[::-1])
+
+    def close(self) -> None:
+        """Gives OpenGL's memory back."""
+        self._gl.make_current()
+        self._context.free()
+        self._gl.free()
+
+
+def _context(width: int, height: int) -> Any:
+    """OpenGL by what ``MUJOCO_GL`` names, or by the first that works."""
+    asked = os.environ.get("MUJOCO_GL", "").lower()
+    failures = []
+    for name in (asked,) if asked else OFFSCREEN:
+        try:
+            return importlib.import_module(f"mujoco.{name}").GLContext(width, height)
+        # Each fails in its own way: a missing library, no device, no function of the library.
+        except Exception as error:
+            failures.append(f"{name}: {type(error).__name__}: {error}")
+    raise NoOpenGLError(
+        f"no OpenGL to draw with ({'; '.join(failures)}). Debian, Ubuntu: apt install libegl1 "
+        "libgl1-mesa-dri, or libosmesa6; a set MUJOCO_GL names the only one that is tried"
+    )

@@ -1,0 +1,109 @@
+"""One of our tasks as a Gymnasium environment."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from typing import Any, ClassVar
+
+import gymnasium
+import mujoco
+import numpy as np
+from gymnasium import spaces
+from numpy.typing import NDArray
+
+from dmprl.segment_env import SUCCESS_NOT_REPORTED, SegmentBuffers, SegmentEnvError
+from dmprl.tasks import make_task
+
+# A window without a display ends the whole process inside GLFW.
+HAS_DISPLAY = any(os.environ.get(name) for name in ("DISPLAY", "WAYLAND_DISPLAY"))
+
+
+class TaskEnv(gymnasium.Env[NDArray[np.float64], NDArray[np.float32]]):
+    """A batch of one environment and segments of one step, so equal to what a worker runs.
+
+    The time limit is Gymnasium's own wrapper, which ``gymnasium.make`` adds. ``render_mode``:
+    ``rgb_array`` and ``depth_array`` need no display (:mod:`dmprl.pictures`).
+    """
+
+    metadata: ClassVar[dict[str, Any]] = {
+        "render_modes": ["rgb_array", "depth_array"] + ["human"] * HAS_DISPLAY
+    }
+
+    def __init__(
+        self, task_id: str, render_mode: str | None = None, width: int = 480, height: int = 480
+    ) -> None:
+        if render_mode not in (None, *self.metadata["render_modes"]):
+            modes = ", ".join(self.metadata["render_modes"])
+            raise ValueError(f"{task_id}: render_mode {render_mode!r}; here there are {modes}")
+        task = make_task(task_id, 1)
+        if task is None:
+            raise ValueError(f"{task_id} is not a task of dmprl; `dmprl tasks` lists them")
+        self.task = task
+        self._batch = task.batch(1, None)
+        spec = self._batch.spec()
+        self.dt = spec["control_dt_s"]
+        self.metadata = {**self.metadata, "render_fps": round(1.0 / self.dt)}
+        self.observation_space = spaces.Box(-np.inf, np.inf, (spec["observation_len"],), np.float64)
+        self.action_space = spaces.Box(task.action_low, task.action_high, dtype=np.float32)
+        self._out = SegmentBuffers(1, 1, spec["observation_len"], spec["action_len"])
+        self.render_mode = render_mode
+        self._size = (width, height)
+        self._data: mujoco.MjData | None = None
+        self._view: Callable[[], Any] = lambda: None
+        self._close_view: Callable[[], None] | None = None
+
+    def reset(  # noqa: D102 - inherited
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[NDArray[np.float64], dict[str, Any]]:
+        super().reset(seed=seed)
+        self._batch.seed(0, self.np_random)
+        self._batch.begin(np.zeros(1, np.int32), self._out)
+        if self.render_mode == "human":
+            self.render()
+        return self._out.next_observations[0].copy(), {}
+
+    def step(  # noqa: D102 - inherited
+        self, action: NDArray[np.float32]
+    ) -> tuple[NDArray[np.float64], float, bool, bool, dict[str, Any]]:
+        out = self._out
+        self._batch.step_segment(np.asarray(action, np.float64).reshape(1, 1, -1), out)
+        if out.failed[0]:
+            raise SegmentEnvError("; ".join(self._batch.take_failures()))
+        info = {}
+        if out.success[0] != SUCCESS_NOT_REPORTED:
+            info["is_success"] = bool(out.success[0])
+        if self.render_mode == "human":
+            self.render()
+        return out.observations[0, 1].copy(), float(out.rewards[0, 0]), False, False, info
+
+    def render(self) -> Any:  # noqa: D102 - inherited
+        if self.render_mode is None:
+            return None
+        if self._data is None:
+            self._data = mujoco.MjData(self.task.model)
+            self._view = self._open_view(self._data)
+        self._batch.batch.get_data(0, self._data)
+        mujoco.mj_forward(self.task.model, self._data)
+        return self._view()
+
+    def _open_view(self, data: mujoco.MjData) -> Callable[[], Any]:
+        model, camera = self.task.model, dict(self.task.camera)
+        if self.render_mode == "human":
+            from gymnasium.envs.mujoco.mujoco_rendering import MujocoRenderer
+
+            window = MujocoRenderer(model, data, camera, *self._size)
+            self._close_view = window.close
+            return lambda: window.render("human")
+
+        from dmprl.pictures import PictureMaker
+
+        maker = PictureMaker(model, *self._size, camera)
+        self._close_view = maker.close
+        draw = maker.rgb if self.render_mode == "rgb_array" else maker.depth
+        return lambda: draw(data)
+
+    def close(self) -> None:  # noqa: D102 - inherited
+        if self._close_view is not None:
+            self._close_view()
+            self._close_view = None

@@ -1,0 +1,55 @@
+"""The tasks of the paper and their variants.
+
+Each runs batched in a worker (:func:`make_task`) and, one at a time, as a Gymnasium environment
+(``gymnasium.make("dmprl/Thrower-v0")`` after ``import dmprl``).
+"""
+
+from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING, NamedTuple
+
+if TYPE_CHECKING:
+    from dmprl.mujoco_batch import BatchSegmentEnv, MujocoTask
+
+
+class Registered(NamedTuple):
+    """Where a task is, and what Gymnasium must know before it is made."""
+
+    module: str
+    name: str
+    episode_steps: int
+
+
+TASKS = {
+    "dmprl/Reacher-v5": Registered("dmprl.tasks.reacher", "Reacher", 50),
+    "dmprl/Reacher-v1": Registered("dmprl.tasks.reacher", "ReacherV1", 50),
+    "dmprl/Pusher-v5": Registered("dmprl.tasks.pusher", "Pusher", 100),
+    "dmprl/Pusher-v0": Registered("dmprl.tasks.pusher", "PusherV0", 100),
+    "dmprl/Thrower-v0": Registered("dmprl.tasks.thrower", "Thrower", 100),
+}
+"""Every task by its Gymnasium id."""
+
+SAME_AS_GYMNASIUM = ("Reacher-v5", "Pusher-v5")
+"""Gymnasium's own ids whose episodes are equal bit for bit, so that a worker may take ours."""
+
+
+def registered(task_id: str) -> Registered | None:
+    """The task with this id, one of Gymnasium's ids included."""
+    return TASKS.get(f"dmprl/{task_id}" if task_id in SAME_AS_GYMNASIUM else task_id)
+
+
+def make_task(task_id: str, env_count: int) -> MujocoTask | None:
+    """A task for ``env_count`` environments; None if the id is not one of ours."""
+    entry = registered(task_id)
+    if entry is None:
+        return None
+    return getattr(importlib.import_module(entry.module), entry.name)(env_count)
+
+
+def make_batch(task_id: str, env_count: int, segment_steps: int) -> BatchSegmentEnv | None:
+    """A task's batched environments; None if the id is not one of ours."""
+    task = make_task(task_id, env_count)
+    if task is None:
+        return None
+    return task.batch(segment_steps, task.episode_steps)

@@ -1,0 +1,121 @@
+"""Pusher: an arm of seven joints pushes a cylinder to a goal.
+
+Gymnasium's Pusher-v5 to the last bit, and Gym's Pusher-v0, the one of the paper. There positions of
+bodies are centres of mass of their subtrees, which puts the tip between the arm's two prongs
+instead of at the wrist, the reward is that of the state before the step, and the cylinder weighs a
+thousandth.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, ClassVar
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from dmprl.mujoco_batch import Fields, MujocoTask
+from dmprl.tasks.models import gymnasium_model
+from dmprl.tasks.reacher import minus_distance
+
+JOINTS = (
+    "shoulder_pan",
+    "shoulder_lift",
+    "upper_arm_roll",
+    "elbow_flex",
+    "forearm_roll",
+    "wrist_flex",
+    "wrist_roll",
+)
+"""The arm's joints, which Thrower's has too."""
+OBSERVED_BODIES = ("tips_arm", "object", "goal")
+
+
+class Pusher(MujocoTask):
+    """Gymnasium's Pusher-v5."""
+
+    id = "Pusher-v5"
+    frame_skip = 5
+    episode_steps = 100
+    recorded: tuple[str, ...] = ("qpos", "qvel", "xpos")
+    camera: ClassVar[Mapping[str, Any]] = {"distance": 3.0, "elevation": -30.0, "azimuth": 130.0}
+    model_file = "pusher_v5.xml"
+
+    def load_model(self) -> mujoco.MjModel:  # noqa: D102 - inherited
+        model = gymnasium_model(self.model_file)
+        self._bodies = [model.body(name).id for name in OBSERVED_BODIES]
+        return model
+
+    def observation_names(self) -> list[str]:  # noqa: D102 - inherited
+        return arm_observation_names(OBSERVED_BODIES)
+
+    def draw_start(  # noqa: D102 - inherited
+        self,
+        rng: np.random.Generator,
+        qpos: NDArray[np.float64],
+        qvel: NDArray[np.float64],
+        mocap_pos: NDArray[np.float64],
+    ) -> None:
+        while True:
+            # The slides: y first. The goal lies at their origin.
+            offset = np.array([rng.uniform(-0.3, 0.0), rng.uniform(-0.2, 0.2)])
+            if np.linalg.norm(offset) > 0.17:
+                break
+        qpos[7:9] = offset
+        qpos[9:] = 0.0
+        qvel += rng.uniform(-0.005, 0.005, 11)
+        qvel[7:] = 0.0
+
+    def observe(self, fields: Fields, out: NDArray[np.float64]) -> None:  # noqa: D102 - inherited
+        observe_arm(fields, self.recorded[-1], self._bodies, out)
+
+    def rewards(  # noqa: D102 - inherited
+        self,
+        observations: NDArray[np.float64],
+        actions: NDArray[np.float32],
+        out: NDArray[np.float64],
+    ) -> None:
+        rows = self.rewarded(observations)
+        tips, cylinder, goal = rows[..., 14:17], rows[..., 17:20], rows[..., 20:23]
+        near = np.empty_like(out)
+        minus_distance(cylinder - tips, near)
+        minus_distance(cylinder - goal, out)
+        out -= np.square(actions).sum(-1) * 0.1
+        near *= 0.5
+        out += near
+
+    def rewarded(self, observations: NDArray[np.float64]) -> NDArray[np.float64]:
+        """The states whose distances count: those after the steps."""
+        return observations[:, 1:]
+
+
+class PusherV0(Pusher):
+    """Gym's Pusher-v0, the one of the paper."""
+
+    id = "dmprl/Pusher-v0"
+    recorded = ("qpos", "qvel", "subtree_com")
+    model_file = "pusher.xml"
+
+    def rewarded(self, observations: NDArray[np.float64]) -> NDArray[np.float64]:
+        """The states before the steps."""
+        return observations[:, :-1]
+
+
+def arm_observation_names(bodies: tuple[str, ...]) -> list[str]:
+    """Names of what :func:`observe_arm` writes."""
+    names = [f"angle_{joint}" for joint in JOINTS] + [f"velocity_{joint}" for joint in JOINTS]
+    return names + [f"{body}_{axis}" for body in bodies for axis in "xyz"]
+
+
+def observe_arm(
+    fields: Fields, positions: str, bodies: list[int], out: NDArray[np.float64]
+) -> None:
+    """Writes joint angles [rad] (7), their velocities (7) and the bodies' positions [m] (3 x 3).
+
+    ``positions`` names the field that holds them.
+    """
+    out[..., :7] = fields["qpos"][..., :7]
+    out[..., 7:14] = fields["qvel"][..., :7]
+    for place, body in enumerate(bodies):
+        out[..., 14 + 3 * place : 17 + 3 * place] = fields[positions][..., body, :]

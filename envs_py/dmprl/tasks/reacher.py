@@ -1,0 +1,114 @@
+"""Reacher: a planar arm of two joints brings its fingertip to a target.
+
+Gymnasium's Reacher-v5 to the last bit, and the version that Gym had until 0.9.4, Reacher-v1:
+targets beyond reach, a third coordinate of the distance (always zero), and the reward of the state
+before the step.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Any, ClassVar
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from dmprl.mujoco_batch import Fields, MujocoTask
+from dmprl.tasks.models import gymnasium_model
+
+FINGERTIP, TARGET = 3, 4
+"""Bodies of the model."""
+
+
+class Reacher(MujocoTask):
+    """Gymnasium's Reacher-v5."""
+
+    id = "Reacher-v5"
+    frame_skip = 2
+    episode_steps = 50
+    recorded = ("qpos", "qvel", "xpos")
+    camera: ClassVar[Mapping[str, Any]] = {"distance": 1.0, "elevation": -60.0, "azimuth": 90.0}
+    distance_dims = 2
+
+    def load_model(self) -> mujoco.MjModel:  # noqa: D102 - inherited
+        model = gymnasium_model("reacher.xml")
+        # No pair of its geoms can collide, so looking for contacts finds none and takes a fifth of
+        # the time.
+        assert not np.any(model.geom_contype), "a geom of reacher.xml can collide"
+        model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONTACT
+        return model
+
+    def observation_names(self) -> list[str]:  # noqa: D102 - inherited
+        names = ["cos_joint0", "cos_joint1", "sin_joint0", "sin_joint1", "target_x", "target_y"]
+        names += ["velocity_joint0", "velocity_joint1"]
+        return names + [f"fingertip_to_target_{axis}" for axis in "xyz"[: self.distance_dims]]
+
+    def draw_start(  # noqa: D102 - inherited
+        self,
+        rng: np.random.Generator,
+        qpos: NDArray[np.float64],
+        qvel: NDArray[np.float64],
+        mocap_pos: NDArray[np.float64],
+    ) -> None:
+        qpos += rng.uniform(-0.1, 0.1, 4)
+        qpos[2:] = self.draw_target(rng)
+        qvel += rng.uniform(-0.005, 0.005, 4)
+        qvel[2:] = 0.0
+
+    def draw_target(self, rng: np.random.Generator) -> NDArray[np.float64]:
+        """A point within reach [m]."""
+        while True:
+            target = rng.uniform(-0.2, 0.2, 2)
+            if math.sqrt(target.dot(target)) < 0.2:  # np.linalg.norm, in a fifth of its time
+                return target
+
+    def observe(self, fields: Fields, out: NDArray[np.float64]) -> None:  # noqa: D102 - inherited
+        qpos, qvel, positions = fields["qpos"], fields["qvel"], fields["xpos"]
+        dims = self.distance_dims
+        np.cos(qpos[..., :2], out=out[..., 0:2])
+        np.sin(qpos[..., :2], out=out[..., 2:4])
+        out[..., 4:6] = qpos[..., 2:]
+        out[..., 6:8] = qvel[..., :2]
+        np.subtract(
+            positions[..., FINGERTIP, :dims], positions[..., TARGET, :dims], out=out[..., 8:]
+        )
+
+    def rewards(  # noqa: D102 - inherited
+        self,
+        observations: NDArray[np.float64],
+        actions: NDArray[np.float32],
+        out: NDArray[np.float64],
+    ) -> None:
+        minus_distance(self.rewarded(observations)[..., 8:], out)
+        out -= np.square(actions).sum(-1)
+
+    def rewarded(self, observations: NDArray[np.float64]) -> NDArray[np.float64]:
+        """The states whose distance counts: those after the steps."""
+        return observations[:, 1:]
+
+
+class ReacherV1(Reacher):
+    """Gym's Reacher-v1, the one of the paper."""
+
+    id = "dmprl/Reacher-v1"
+    distance_dims = 3
+
+    def draw_target(self, rng: np.random.Generator) -> NDArray[np.float64]:
+        """A point of the square, a fifth of which is beyond reach [m].
+
+        Gym meant the disc of Reacher-v5, but compared the norm with 2.
+        """
+        return rng.uniform(-0.2, 0.2, 2)
+
+    def rewarded(self, observations: NDArray[np.float64]) -> NDArray[np.float64]:
+        """The states before the steps."""
+        return observations[:, :-1]
+
+
+def minus_distance(differences: NDArray[np.float64], out: NDArray[np.float64]) -> None:
+    """Writes ``-|difference|`` of each row, rounded as ``np.linalg.norm`` of one row rounds."""
+    np.vecdot(differences, differences, out=out)
+    np.sqrt(out, out=out)
+    np.negative(out, out=out)

@@ -1,0 +1,86 @@
+"""Thrower: an arm of seven joints throws a ball into a box.
+
+Gym's Thrower-v0, the one of the paper, which no maintained package has any more. The model is built
+from its published dimensions (``models/thrower.xml``). Positions of bodies are centres of mass of
+their subtrees, and the reward is that of the state before the step. Later versions of Gym let the
+place where the ball hit the ground roll on with the ball; here it is where it first was.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, ClassVar
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from dmprl.mujoco_batch import Fields, MujocoTask
+from dmprl.tasks.models import own_model
+from dmprl.tasks.pusher import arm_observation_names, observe_arm
+from dmprl.tasks.reacher import minus_distance
+
+OBSERVED_BODIES = ("wrist_roll", "ball", "goal")
+GROUND_HEIGHT = -0.25
+"""A ball below this height [m] has hit the ground."""
+
+
+class Thrower(MujocoTask):
+    """Gym's Thrower-v0."""
+
+    id = "dmprl/Thrower-v0"
+    frame_skip = 5
+    episode_steps = 100
+    recorded = ("qpos", "qvel", "subtree_com")
+    camera: ClassVar[Mapping[str, Any]] = {
+        "distance": 2.4,
+        "elevation": -25.0,
+        "azimuth": 150.0,
+        "lookat": (0.3, 0.0, -0.1),
+    }
+
+    def __init__(self, env_count: int) -> None:
+        super().__init__(env_count)
+        self._has_hit = np.zeros(env_count, np.bool_)
+        self._hit_xy = np.zeros((env_count, 2))
+
+    def load_model(self) -> mujoco.MjModel:  # noqa: D102 - inherited
+        model = own_model("thrower.xml")
+        self._bodies = [model.body(name).id for name in OBSERVED_BODIES]
+        return model
+
+    def observation_names(self) -> list[str]:  # noqa: D102 - inherited
+        return arm_observation_names(OBSERVED_BODIES)
+
+    def draw_start(  # noqa: D102 - inherited
+        self,
+        rng: np.random.Generator,
+        qpos: NDArray[np.float64],
+        qvel: NDArray[np.float64],
+        mocap_pos: NDArray[np.float64],
+    ) -> None:
+        qpos[7:9] = rng.uniform(-0.3, 0.3, 2)
+        qvel += rng.uniform(-0.005, 0.005, 15)
+        qvel[7:] = 0.0
+
+    def episodes_began(self, indices: NDArray[np.int32]) -> None:  # noqa: D102 - inherited
+        self._has_hit[indices] = False
+
+    def observe(self, fields: Fields, out: NDArray[np.float64]) -> None:  # noqa: D102 - inherited
+        observe_arm(fields, "subtree_com", self._bodies, out)
+
+    def rewards(  # noqa: D102 - inherited
+        self,
+        observations: NDArray[np.float64],
+        actions: NDArray[np.float32],
+        out: NDArray[np.float64],
+    ) -> None:
+        ball, goal = observations[:, :-1, 17:20], observations[:, :-1, 20:22]
+        thrown_to = ball[..., :2].copy()
+        for step in range(thrown_to.shape[1]):
+            hits = (ball[:, step, 2] < GROUND_HEIGHT) & ~self._has_hit
+            self._hit_xy[hits] = ball[hits, step, :2]
+            self._has_hit |= hits
+            thrown_to[self._has_hit, step] = self._hit_xy[self._has_hit]
+        minus_distance(thrown_to - goal, out)
+        out -= 0.002 * np.square(actions, dtype=np.float64).sum(-1)
