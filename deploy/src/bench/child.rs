@@ -99,6 +99,13 @@ impl LineChild {
         line.trim().strip_suffix("kB")?.trim().parse::<u64>().ok().map(|kib| kib * 1024)
     }
 
+    /// Processor time of its first thread so far [s], when the system tells it.
+    pub(super) fn cpu_s(&self) -> Option<f64> {
+        let path = format!("/proc/{}/schedstat", self.child.id());
+        let text = std::fs::read_to_string(path).ok()?;
+        text.split_whitespace().next()?.parse::<f64>().ok().map(|nanoseconds| nanoseconds * 1e-9)
+    }
+
     /// Its end as an error, with the last lines of its log.
     fn death(&mut self) -> anyhow::Error {
         // It has closed its output or does not read: whatever it does, it is of no more use.

@@ -6,27 +6,35 @@ use serde_json::{Map, Value, json};
 
 use super::rollout::RolloutBench;
 use crate::run_directory::Machine;
-use crate::terminal::grouped;
 
 /// The worker's name among those of its peers.
 pub(super) const WORKER: &str = "worker";
 /// Everyone who may be measured, in the order of the report.
-const NAMES: [&str; 5] = ["batch", "ceiling", WORKER, "gymnasium", "envpool"];
+pub(super) const NAMES: [&str; 5] = ["batch", "ceiling", WORKER, "gymnasium", "envpool"];
 /// Those that the worker is compared with.
 const COMPARED: [&str; 3] = ["ceiling", "gymnasium", "envpool"];
+
+/// One measurement.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Round {
+    /// Environment steps a second, all processes together.
+    pub(super) steps_per_s: f64,
+    /// Processor time over time: how many cores they really had, when the system tells it.
+    pub(super) cores: Option<f64>,
+}
 
 /// Environment steps a second of each, by round, and what else is known.
 #[derive(Debug, Clone)]
 pub struct Figures {
-    config: ExperimentConfig,
-    env_id: String,
-    seconds: f64,
+    pub(super) config: ExperimentConfig,
+    pub(super) env_id: String,
+    pub(super) seconds: f64,
     machine: Machine,
     load_average: Option<f64>,
-    /// (name, rate of each round); no entry for one that is absent.
-    rates: Vec<(&'static str, Vec<f64>)>,
+    /// (name, its rounds); no entry for one that is absent.
+    rounds: Vec<(&'static str, Vec<Round>)>,
     /// (name, what it is or why it is absent).
-    notes: Vec<(&'static str, String)>,
+    pub(super) notes: Vec<(&'static str, String)>,
     pub(super) workers: WorkerFigures,
 }
 
@@ -53,17 +61,17 @@ impl Figures {
             seconds: bench.duration.as_secs_f64(),
             machine,
             load_average: load_average(),
-            rates: Vec::new(),
+            rounds: Vec::new(),
             notes: Vec::new(),
             workers: WorkerFigures::default(),
         }
     }
 
-    /// One more round of `name` [environment steps/s].
-    pub(super) fn add(&mut self, name: &'static str, rate: f64) {
-        match self.rates.iter_mut().find(|(known, _)| *known == name) {
-            Some((_, rates)) => rates.push(rate),
-            None => self.rates.push((name, vec![rate])),
+    /// One more round of `name`.
+    pub(super) fn add(&mut self, name: &'static str, round: Round) {
+        match self.rounds.iter_mut().find(|(known, _)| *known == name) {
+            Some((_, rounds)) => rounds.push(round),
+            None => self.rounds.push((name, vec![round])),
         }
     }
 
@@ -72,20 +80,31 @@ impl Figures {
         self.notes.push((name, text.to_owned()));
     }
 
-    fn rates(&self, name: &str) -> Option<&[f64]> {
-        self.rates.iter().find(|(known, _)| *known == name).map(|(_, rates)| rates.as_slice())
+    pub(super) fn rounds(&self, name: &str) -> &[Round] {
+        let rounds = self.rounds.iter().find(|(known, _)| *known == name);
+        rounds.map_or(&[], |(_, rounds)| rounds)
     }
 
-    fn steps_per_s(&self, name: &str) -> Option<f64> {
-        self.rates(name).and_then(median)
+    pub(super) fn rates(&self, name: &str) -> Vec<f64> {
+        self.rounds(name).iter().map(|round| round.steps_per_s).collect()
+    }
+
+    /// Processor time of a step, which other programs on the machine disturb least.
+    pub(super) fn cpu_us_per_step(&self, name: &str) -> Option<f64> {
+        let of = |round: &Round| round.cores.map(|cores| 1e6 * cores / round.steps_per_s);
+        median(&self.rounds(name).iter().filter_map(of).collect::<Vec<_>>())
+    }
+
+    pub(super) fn steps_per_s(&self, name: &str) -> Option<f64> {
+        median(&self.rates(name))
     }
 
     /// The worker's median over that of `name`.
-    fn ratio(&self, name: &str) -> Option<f64> {
+    pub(super) fn ratio(&self, name: &str) -> Option<f64> {
         Some(self.steps_per_s(WORKER)? / self.steps_per_s(name)?)
     }
 
-    fn policy(&self) -> &'static str {
+    pub(super) fn policy(&self) -> &'static str {
         match self.config.policy.kind {
             PolicyKind::Dmp => "dmp",
             PolicyKind::Mlp => "mlp",
@@ -104,15 +123,14 @@ impl Figures {
         for name in COMPARED {
             object.insert(format!("worker_to_{name}"), self.ratio(name).into());
         }
-        let rounds: Map<_, _> =
-            self.rates.iter().map(|(name, rates)| ((*name).to_owned(), json!(rates))).collect();
-        let spread: Map<_, _> = self
-            .rates
-            .iter()
-            .map(|(name, rates)| {
-                ((*name).to_owned(), json!({"min": min(rates), "max": max(rates)}))
-            })
-            .collect();
+        let present = || NAMES.into_iter().filter(|name| !self.rounds(name).is_empty());
+        let each = |of: &dyn Fn(&str) -> Value| -> Map<String, Value> {
+            present().map(|name| (name.to_owned(), of(name))).collect()
+        };
+        let spread = |name: &str| {
+            let rates = self.rates(name);
+            json!({ "min": min(&rates), "max": max(&rates) })
+        };
         let notes: Map<_, _> =
             self.notes.iter().map(|(name, text)| ((*name).to_owned(), json!(text))).collect();
         let actors = &self.config.actors;
@@ -125,8 +143,9 @@ impl Figures {
             "segment_steps": self.config.policy.decision_steps(),
             "queue_segments": actors.queue_segments,
             "seconds": self.seconds,
-            "rounds": rounds,
-            "spread": spread,
+            "rounds": each(&|name| self.rates(name).into()),
+            "spread": each(&spread),
+            "cpu_us_per_step": each(&|name| self.cpu_us_per_step(name).into()),
             "first_segment_s": first_segment_s,
             "worker_rss_mb": rss_bytes.map(|bytes| bytes as f64 / 1e6),
             "sink_cpu_share": sink_cpu_share,
@@ -141,65 +160,6 @@ impl Figures {
             object.extend(more);
         }
         Value::Object(object)
-    }
-
-    /// The same as a table.
-    #[must_use]
-    pub fn text(&self) -> String {
-        let actors = &self.config.actors;
-        let rounds = self.rates(WORKER).map_or(0, <[f64]>::len);
-        let mut lines = vec![
-            format!(
-                "{} ({}) · {} · {} × {} environments · {} steps a segment",
-                self.config.task.name,
-                self.env_id,
-                self.policy(),
-                actors.workers,
-                actors.envs_per_worker,
-                self.config.policy.decision_steps()
-            ),
-            format!(
-                "median of {rounds} rounds of {} s; microseconds are of one worker",
-                self.seconds
-            ),
-            String::new(),
-            format!(
-                "  {:<10} {:>11} {:>9}   {:<21} worker is",
-                "", "steps/s", "µs/step", "from … to"
-            ),
-        ];
-        lines.extend(NAMES.iter().map(|name| self.row(name)));
-        let WorkerFigures { first_segment_s, rss_bytes, sink_cpu_share, rejected, lost } =
-            &self.workers;
-        let memory = rss_bytes.map_or_else(
-            || "unknown".to_owned(),
-            |bytes| format!("{:.0} MB at most", bytes as f64 / 1e6),
-        );
-        lines.extend([
-            String::new(),
-            format!("  first segment after {first_segment_s:.2} s; resident memory {memory}"),
-            format!("  {rejected} segments rejected, {lost} lost"),
-            format!("  draining took {:.1} % of one core", sink_cpu_share * 100.0),
-            String::new(),
-        ]);
-        lines.extend(self.notes.iter().map(|(name, text)| format!("  {name:<10} {text}")));
-        lines.join("\n")
-    }
-
-    fn row(&self, name: &str) -> String {
-        let (Some(rates), Some(rate)) = (self.rates(name), self.steps_per_s(name)) else {
-            return format!("  {name:<10} {:>11}", "absent");
-        };
-        let whole = |rate: f64| grouped(rate.round() as u64);
-        let step_us = 1e6 * self.config.actors.workers as f64 / rate;
-        let spread = format!("{} … {}", whole(min(rates)), whole(max(rates)));
-        let ratio = match self.ratio(name).filter(|_| name != WORKER) {
-            Some(ratio) => format!("{ratio:.2} ×"),
-            None => String::new(),
-        };
-        format!("  {name:<10} {:>11} {step_us:>9.2}   {spread:<21} {ratio}", whole(rate))
-            .trim_end()
-            .to_owned()
     }
 }
 
@@ -221,16 +181,16 @@ fn median(values: &[f64]) -> Option<f64> {
     }
 }
 
-fn min(values: &[f64]) -> f64 {
+pub(super) fn min(values: &[f64]) -> f64 {
     values.iter().copied().fold(f64::INFINITY, f64::min)
 }
 
-fn max(values: &[f64]) -> f64 {
+pub(super) fn max(values: &[f64]) -> f64 {
     values.iter().copied().fold(f64::NEG_INFINITY, f64::max)
 }
 
 #[cfg(test)]
-mod tests {
+pub(super) mod tests {
     use super::*;
 
     #[test]
@@ -241,7 +201,7 @@ mod tests {
         assert_eq!(median(&[4.0, 1.0, -1e9, 2.0]), Some(1.5));
     }
 
-    fn figures() -> Figures {
+    pub(in super::super) fn figures() -> Figures {
         let machine =
             Machine { os: "linux".into(), cpu: None, cores: 2, memory_bytes: Some(1 << 30) };
         let config = ExperimentConfig::default();
@@ -251,14 +211,14 @@ mod tests {
             seconds: 1.0,
             machine,
             load_average: None,
-            rates: Vec::new(),
+            rounds: Vec::new(),
             notes: Vec::new(),
             workers: WorkerFigures { rss_bytes: Some(50_000_000), ..WorkerFigures::default() },
         };
         figures.note("envpool", "is not installed");
-        for rates in [[100.0, 80.0], [400.0, 380.0], [200.0, 180.0]] {
-            figures.add("ceiling", rates[0]);
-            figures.add(WORKER, rates[1]);
+        for [ceiling, worker] in [[100.0, 80.0], [400.0, 380.0], [200.0, 180.0]] {
+            figures.add("ceiling", Round { steps_per_s: ceiling, cores: Some(2.0) });
+            figures.add(WORKER, Round { steps_per_s: worker, cores: None });
         }
         figures
     }
@@ -271,24 +231,11 @@ mod tests {
         assert_eq!(json["worker_to_ceiling"], 0.9);
         assert_eq!(json["rounds"]["worker"], json!([80.0, 380.0, 180.0]));
         assert_eq!(json["spread"]["ceiling"], json!({"min": 100.0, "max": 400.0}));
+        assert_eq!(json["cpu_us_per_step"], json!({"ceiling": 10_000.0, "worker": null}));
         assert_eq!(json["worker_rss_mb"], 50.0);
         for absent in ["envpool_steps_per_s", "gymnasium_steps_per_s", "worker_to_envpool"] {
             assert!(json[absent].is_null() && json.get(absent).is_some(), "{absent}");
         }
         assert_eq!(json["notes"]["envpool"], "is not installed");
-    }
-
-    #[test]
-    fn the_table_gives_the_time_of_a_step_in_one_worker() {
-        let text = figures().text();
-        let row = |name: &str| {
-            let line = text.lines().find(|line| line.trim_start().starts_with(name)).unwrap();
-            line.split_whitespace().skip(1).collect::<Vec<_>>().join(" ")
-        };
-        // Two workers at 180 steps a second together: 11.1 ms a step in each.
-        assert_eq!(row("worker"), "180 11111.11 80 … 380");
-        assert_eq!(row("ceiling"), "200 10000.00 100 … 400 0.90 ×");
-        assert_eq!(row("envpool"), "absent");
-        assert!(text.contains("50 MB at most"), "{text}");
     }
 }

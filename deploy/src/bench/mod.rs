@@ -2,7 +2,7 @@
 //!
 //! `rollout` measures the workers of a run. It plays the learner for real `dmprl actor` processes
 //! (`workers`, `sink`) and, in turn with them, lets processes of `dmprl.bench_rollout` in Python do
-//! the same work (`peers`, `numpy_plan`); `figures` is what comes out. Everything waits in `watch`
+//! the same work (`peers`, `numpy_plan`); `figures` and `table` are what comes out. Everything waits in `watch`
 //! or in `child`, where an interrupt is seen.
 
 mod child;
@@ -11,6 +11,7 @@ mod numpy_plan;
 mod peers;
 mod rollout;
 mod sink;
+mod table;
 mod watch;
 mod workers;
 

@@ -9,10 +9,12 @@ use anyhow::{Context, anyhow, ensure};
 use serde::Deserialize;
 
 use super::child::LineChild;
+use super::figures::Round;
 use super::watch::Watch;
-use crate::launch::TimeLimits;
 use crate::run_directory::RunDirectory;
 
+/// From a start to the first line: many processes may start at once, with many environments each.
+const READY: Duration = Duration::from_secs(300);
 /// Beyond what was asked for, a measurement may take so much longer.
 const MEASURE_SLACK: Duration = Duration::from_secs(60);
 
@@ -74,6 +76,7 @@ enum Greeting {
 struct Measured {
     steps: u64,
     seconds: f64,
+    cpu_s: f64,
 }
 
 impl Peer {
@@ -108,7 +111,7 @@ impl Peer {
     pub(super) fn ready(&mut self, watch: &Watch) -> anyhow::Result<Result<String, String>> {
         let mut about = String::new();
         for child in &mut self.children {
-            let line = child.next(watch, TimeLimits::default().ready, "the first line")?;
+            let line = child.next(watch, READY, "the first line")?;
             match serde_json::from_str(&line) {
                 Ok(Greeting::Ready(text)) => about = text,
                 Ok(Greeting::Absent(why)) => return Ok(Err(why)),
@@ -118,16 +121,16 @@ impl Peer {
         Ok(Ok(about))
     }
 
-    /// Environment steps a second that all processes together make.
-    pub(super) fn measure(&mut self, watch: &Watch, duration: Duration) -> anyhow::Result<f64> {
+    /// What all processes together make in so much time.
+    pub(super) fn measure(&mut self, watch: &Watch, duration: Duration) -> anyhow::Result<Round> {
         let seconds = duration.as_secs_f64();
         for child in &mut self.children {
             child.say(&format!("run {seconds}"))?;
         }
-        let mut rate = 0.0;
+        let (mut steps_per_s, mut cores) = (0.0, 0.0);
         for child in &mut self.children {
             let line = child.next(watch, duration + MEASURE_SLACK, "the measurement")?;
-            let Ok(Measured { steps, seconds }) = serde_json::from_str(&line) else {
+            let Ok(Measured { steps, seconds, cpu_s }) = serde_json::from_str(&line) else {
                 return Err(no_answer(child, &line));
             };
             ensure!(
@@ -135,9 +138,10 @@ impl Peer {
                 "{}: {steps} steps in {seconds} s, expected some",
                 child.name()
             );
-            rate += steps as f64 / seconds;
+            steps_per_s += steps as f64 / seconds;
+            cores += cpu_s / seconds;
         }
-        Ok(rate)
+        Ok(Round { steps_per_s, cores: Some(cores) })
     }
 }
 

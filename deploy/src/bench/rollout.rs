@@ -85,8 +85,8 @@ fn measure(mut bench: RolloutBench) -> anyhow::Result<Figures> {
             figures.add(peer.kind.name(), peer.measure(&watch, bench.duration)?);
         }
         progress.measuring(WORKER);
-        let window = workers.measure(&watch, bench.duration)?;
-        figures.add(WORKER, window.env_steps as f64 / window.seconds);
+        let (round, window) = workers.measure(&watch, bench.duration)?;
+        figures.add(WORKER, round);
         sink_cpu_s += window.cpu_s;
         measured_s += window.seconds;
     }

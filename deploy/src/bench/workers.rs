@@ -14,6 +14,7 @@ use dmprl_shared::transport::ParameterPublisher;
 use dmprl_shared::transport::shared_memory::{Domain, serve};
 
 use super::child::LineChild;
+use super::figures::Round;
 use super::sink::{Answer, Faults, Request, Sink, Window};
 use super::watch::Watch;
 use crate::control::{Command, Report};
@@ -88,12 +89,26 @@ impl Workers {
         Ok(workers)
     }
 
-    /// Environment steps that all workers together deliver in so much time.
-    pub(super) fn measure(&mut self, watch: &Watch, duration: Duration) -> anyhow::Result<Window> {
-        match self.ask(Request::Measure(duration), watch, duration + MEASURE_SLACK)? {
-            Answer::Measured(window) => Ok(window),
-            Answer::FirstOfEach(_) => bail!("the sink answered another question"),
-        }
+    /// What all workers together deliver in so much time, and what the sink took for it.
+    pub(super) fn measure(
+        &mut self,
+        watch: &Watch,
+        duration: Duration,
+    ) -> anyhow::Result<(Round, Window)> {
+        let (start, cpu_s) = (Instant::now(), self.cpu_s());
+        let answer = self.ask(Request::Measure(duration), watch, duration + MEASURE_SLACK)?;
+        let Answer::Measured(window) = answer else {
+            bail!("the sink answered another question");
+        };
+        // Over the time to settle too, in which the workers do the same.
+        let elapsed_s = start.elapsed().as_secs_f64();
+        let cores = self.cpu_s().zip(cpu_s).map(|(now, then)| (now - then) / elapsed_s);
+        let steps_per_s = window.env_steps as f64 / window.seconds;
+        Ok((Round { steps_per_s, cores }, window))
+    }
+
+    fn cpu_s(&self) -> Option<f64> {
+        self.children.iter().map(LineChild::cpu_s).sum()
     }
 
     /// Refused and lost segments so far.
