@@ -25,8 +25,8 @@ impl Figures {
             ),
             String::new(),
             format!(
-                "  {:<10} {:>11} {:>9}   {:<21} worker is",
-                "", "steps/s", "µs/step", "from … to"
+                "  {:<10} {:>11} {:>9} {:>9}   {:<21} worker is",
+                "", "steps/s", "µs/step", "CPU µs", "from … to"
             ),
         ];
         lines.extend(NAMES.iter().map(|name| row(self, name)));
