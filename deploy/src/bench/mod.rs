@@ -2,8 +2,8 @@
 //!
 //! `rollout` measures the workers of a run. It plays the learner for real `dmprl actor` processes
 //! (`workers`, `sink`) and, in turn with them, lets processes of `dmprl.bench_rollout` in Python do
-//! the same work (`peers`, `numpy_plan`); `figures` and `table` are what comes out. Everything waits
-//! in `watch` or in `child`, where an interrupt is seen.
+//! the same work (`peers`, `numpy_plan`); `figures` and `table` are what comes out. Everything
+//! waits in `watch` or in `child`, where an interrupt is seen.
 
 mod child;
 mod figures;
