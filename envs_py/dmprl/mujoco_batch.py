@@ -68,6 +68,10 @@ class MujocoTask(ABC):
     def load_model(self) -> mujoco.MjModel:
         """Compiles the model."""
 
+    def picture_model(self) -> mujoco.MjModel:
+        """The model with all that pictures show; its states are those of :attr:`model`."""
+        return self.model
+
     @abstractmethod
     def observation_names(self) -> list[str]:
         """What each of an observation's O entries is."""
