@@ -20,7 +20,7 @@ mod python {
     use std::{path::Path, process::Command};
 
     /// Oldest Python whose syntax and packages `envs_py` is written for.
-    const MINOR_VERSION_MIN: u8 = 10;
+    const MINOR_VERSION_MIN: u8 = 11;
 
     /// One fact a line. `_base_executable` because a virtual environment may be active: `.venv`
     /// must not depend on it.

@@ -32,9 +32,6 @@ from dmprl.segment_env import (
 Fields = Mapping[str, NDArray]
 """Arrays of MjData by name, each with the dimensions of the call in front of MjData's own."""
 
-WITHOUT_STAGES = mujoco.mjtStage.mjSTAGE_NONE.value
-
-
 class MujocoTask(ABC):
     """What a task is, for E environments at once.
 
@@ -126,14 +123,16 @@ class BatchSegmentEnv(SegmentEnv):
         self._limit = np.iinfo(np.int32).max if episode_steps is None else episode_steps
         # Steps until truncation; 0 before the first reset.
         self._remaining = np.zeros(self.env_count, np.int32)
+        self._all_began = False
         self._generators: list[np.random.Generator | None] = [None] * self.env_count
         self._seeds = [0] * self.env_count
         self._failures = [0] * self.env_count
         self._messages: list[str] = []
         self._state = {name: self.batch.bind(name) for name in ("qpos", "qvel", "mocap_pos")}
         self._fields = {name: self.batch.bind(name) for name in task.recorded}
-        # Simulations that MuJoCo warned about: it has stopped them.
-        self._warnings = self.batch.warning[:, :, 1]
+        # What mj_resetData would leave. Copying it is cheaper: the rest of what that call clears
+        # the forward pass computes anew.
+        self._new_state = self.batch.state[0].copy()
         self._prepare()
 
     def _prepare(self) -> None:
@@ -189,10 +188,10 @@ class BatchSegmentEnv(SegmentEnv):
         if actions.shape != self._actions.shape:
             raise ValueError(f"actions {actions.shape}, expected (E, K, A) = {self._actions.shape}")
         remaining = self._remaining
-        steps = min(self.segment_steps, int(remaining.max()))
-        if not remaining.all():
+        if not self._all_began:
             index = int(remaining.argmin())
             raise SegmentEnvError(f"{self.task.id}, environment {index}: step before reset")
+        steps = min(self.segment_steps, int(remaining.max()))
         np.copyto(self._actions, actions, casting="same_kind")
         out.observations[:, 0] = self._current
         failed = self._simulate(steps, out)
@@ -226,13 +225,15 @@ class BatchSegmentEnv(SegmentEnv):
 
     def _failed(self, raised: NDArray[np.int32] | None) -> NDArray[np.int32] | None:
         """Those that raised and those whose warning counters rose, with a sentence for each."""
-        if raised is None and not self._warnings.any():
+        if raised is None and not self.batch.warning.any():
             return None
-        failed = np.flatnonzero(self._warnings.any(axis=1))
+        # MuJoCo has stopped the simulations that it warned about.
+        warnings = self.batch.warning[:, :, 1]
+        failed = np.flatnonzero(warnings.any(axis=1))
         if raised is not None:
             failed = np.union1d(failed, raised)
         for index in failed.tolist():
-            kinds = [mujoco.mjtWarning(kind).name for kind in np.flatnonzero(self._warnings[index])]
+            kinds = [mujoco.mjtWarning(kind).name for kind in np.flatnonzero(warnings[index])]
             reason = self.batch.error(index) or f"MuJoCo warned ({', '.join(kinds)})"
             self._messages.append(f"{self.task.id}, environment {index}: {reason}")
         return failed.astype(np.int32)
@@ -256,7 +257,7 @@ class BatchSegmentEnv(SegmentEnv):
 
     def _begin(self, indices: NDArray[np.int32]) -> None:
         """Starts an episode in each of these environments."""
-        self.batch.reset(indices, stage=WITHOUT_STAGES)
+        self.batch.state[indices] = self._new_state
         qpos, qvel, mocap_pos = self._state.values()
         for index in indices.tolist():
             rng = self._generators[index]
@@ -265,6 +266,7 @@ class BatchSegmentEnv(SegmentEnv):
         self.batch.warning[indices] = 0
         self.task.episodes_began(indices)
         self._remaining[indices] = self._limit
+        self._all_began = bool(self._remaining.all())
         if indices.size == self.env_count:
             self.task.observe(self._fields, self._current)
         else:

@@ -7,6 +7,7 @@ before the step.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from typing import Any, ClassVar
 
@@ -60,7 +61,7 @@ class Reacher(MujocoTask):
         """A point within reach [m]."""
         while True:
             target = rng.uniform(-0.2, 0.2, 2)
-            if np.linalg.norm(target) < 0.2:
+            if math.sqrt(target.dot(target)) < 0.2:  # np.linalg.norm, in a fifth of its time
                 return target
 
     def observe(self, fields: Fields, out: NDArray[np.float64]) -> None:  # noqa: D102 - inherited
