@@ -66,6 +66,10 @@ class MujocoTask(ABC):
     def load_model(self) -> mujoco.MjModel:
         """Compiles the model."""
 
+    def picture_model(self) -> mujoco.MjModel:
+        """The model with all that pictures show; its states are those of :attr:`model`."""
+        return self.model
+
     @abstractmethod
     def observation_names(self) -> list[str]:
         """What each of an observation's O entries is."""
@@ -116,6 +120,7 @@ class BatchSegmentEnv(SegmentEnv):
         self._names = task.observation_names()
         self._current = np.zeros((self.env_count, len(self._names)))
         self._actions = np.zeros((self.env_count, segment_steps, len(task.action_low)), np.float32)
+        self._rows = np.arange(self.env_count)
         self._limit = np.iinfo(np.int32).max if episode_steps is None else episode_steps
         # Steps until truncation; 0 before the first reset.
         self._remaining = np.zeros(self.env_count, np.int32)
@@ -193,9 +198,10 @@ class BatchSegmentEnv(SegmentEnv):
         failed = self._simulate(steps, out)
         observations = out.observations[:, : steps + 1]
         self.task.rewards(observations, self._actions[:, :steps], out.rewards[:, :steps])
-        self.task.successes(observations[:, -1], out.success)
         self._current[:] = observations[:, -1]
         np.minimum(remaining, steps, out=out.steps)
+        # An episode that ended earlier ran on with the others; its end is what counts.
+        self.task.successes(observations[self._rows, out.steps], out.success)
         remaining -= out.steps
         out.terminated[:] = 0
         np.equal(remaining, 0, out=out.truncated, casting="unsafe")

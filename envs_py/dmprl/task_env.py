@@ -81,14 +81,16 @@ class TaskEnv(gymnasium.Env[NDArray[np.float64], NDArray[np.float32]]):
         if self.render_mode is None:
             return None
         if self._data is None:
-            self._data = mujoco.MjData(self.task.model)
+            self._model = self.task.picture_model()
+            self._data = mujoco.MjData(self._model)
             self._view = self._open_view(self._data)
-        self._batch.batch.get_data(0, self._data)
-        mujoco.mj_forward(self.task.model, self._data)
+        state = self._batch.batch.state[0]
+        mujoco.mj_setState(self._model, self._data, state, mujoco.mjtState.mjSTATE_INTEGRATION)
+        mujoco.mj_forward(self._model, self._data)
         return self._view()
 
     def _open_view(self, data: mujoco.MjData) -> Callable[[], Any]:
-        model, camera = self.task.model, dict(self.task.camera)
+        model, camera = self._model, dict(self.task.camera)
         if self.render_mode == "human":
             from gymnasium.envs.mujoco.mujoco_rendering import MujocoRenderer
 

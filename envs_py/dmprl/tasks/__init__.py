@@ -27,6 +27,8 @@ TASKS = {
     "dmprl/Pusher-v5": Registered("dmprl.tasks.pusher", "Pusher", 100),
     "dmprl/Pusher-v0": Registered("dmprl.tasks.pusher", "PusherV0", 100),
     "dmprl/Thrower-v0": Registered("dmprl.tasks.thrower", "Thrower", 100),
+    "dmprl/PandaReach-v0": Registered("dmprl.tasks.panda", "PandaReach", 50),
+    "dmprl/PandaReachJoints-v0": Registered("dmprl.tasks.panda", "PandaReachJoints", 50),
 }
 """Every task by its Gymnasium id."""
 

@@ -13,6 +13,16 @@ def own_model(name: str) -> mujoco.MjModel:
     return mujoco.MjModel.from_xml_path(str(Path(__file__).parent / name))
 
 
+def own_model_without_decoration(name: str) -> mujoco.MjModel:
+    """Compiles a model of this folder without the geoms that only pictures show.
+
+    A simulation moves every geom in every step. The state is the same as with them.
+    """
+    specification = mujoco.MjSpec.from_file(str(Path(__file__).parent / name))
+    specification.compiler.discardvisual = True
+    return specification.compile()
+
+
 def gymnasium_model(name: str) -> mujoco.MjModel:
     """Compiles a model that Gymnasium brings.
 

@@ -1,0 +1,132 @@
+"""PandaReach: a Franka Panda brings its end effector to a point.
+
+panda-gym's task in MuJoCo: its start, goals, actions, reward and timing, and an arm that answers
+like PyBullet's (``models/panda.xml``). Two things differ. Reaching the goal ends no episode, as in
+panda-gym 2: the reward asks to come close and stay there. And the observation is one vector with
+what both kinds of actions need, joints and end effector, where panda-gym has the latter alone.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, ClassVar
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from dmprl.mujoco_batch import Fields
+from dmprl.stepwise_batch import StepwiseTask
+from dmprl.tasks.models import own_model, own_model_without_decoration
+from dmprl.tasks.panda_kinematics import JOINTS, InverseKinematics
+from dmprl.tasks.reacher import minus_distance
+
+NEUTRAL = (0.0, 0.41, 0.0, -1.85, 0.0, 2.26, 0.79)
+"""Joint angles at the start [rad]; the end effector is at (0.0384, 0, 0.1974) m."""
+GOAL_LOW, GOAL_HIGH = (-0.15, -0.15, 0.0), (0.15, 0.15, 0.3)
+"""Corners of the box that goals are drawn from [m]."""
+DISPLACEMENT = 0.05
+"""What an action of 1 asks for in one step: [rad] of a joint, [m] of the end effector."""
+SUCCESS_DISTANCE = 0.05
+"""Nearer than this [m] counts as success."""
+MODEL = "panda.xml"
+
+
+class PandaReachJoints(StepwiseTask):
+    """Actions are displacements of the seven joints."""
+
+    id = "dmprl/PandaReachJoints-v0"
+    frame_skip = 20
+    episode_steps = 50
+    recorded: tuple[str, ...] = ("qpos", "qvel", "site_xpos", "mocap_pos", "sensordata")
+    camera: ClassVar[Mapping[str, Any]] = {
+        "distance": 1.5,
+        "elevation": -19.0,
+        "azimuth": 137.0,
+        "lookat": (-0.28, 0.0, 0.22),
+    }
+    action_len = JOINTS
+
+    def __init__(self, env_count: int) -> None:
+        super().__init__(env_count)
+        # The actuators' range, in joint angles, is not the actions'.
+        self.action_high = np.ones(self.action_len, np.float32)
+        self.action_low = -self.action_high
+        self._displacement = np.zeros((env_count, self.action_len))
+
+    def load_model(self) -> mujoco.MjModel:  # noqa: D102 - inherited
+        return own_model_without_decoration(MODEL)
+
+    def picture_model(self) -> mujoco.MjModel:  # noqa: D102 - inherited
+        return own_model(MODEL)
+
+    def observation_names(self) -> list[str]:  # noqa: D102 - inherited
+        joints = range(1, JOINTS + 1)
+        names = [f"angle_joint{joint}" for joint in joints]
+        names += [f"velocity_joint{joint}" for joint in joints]
+        names += [f"end_effector_to_goal_{axis}" for axis in "xyz"]
+        return names + [f"velocity_end_effector_{axis}" for axis in "xyz"]
+
+    def draw_start(  # noqa: D102 - inherited
+        self,
+        rng: np.random.Generator,
+        qpos: NDArray[np.float64],
+        qvel: NDArray[np.float64],
+        mocap_pos: NDArray[np.float64],
+    ) -> None:
+        qpos[:] = NEUTRAL
+        mocap_pos[0] = rng.uniform(GOAL_LOW, GOAL_HIGH)
+
+    def observe(self, fields: Fields, out: NDArray[np.float64]) -> None:  # noqa: D102 - inherited
+        out[..., 0:7] = fields["qpos"]
+        out[..., 7:14] = fields["qvel"]
+        np.subtract(
+            fields["mocap_pos"][..., 0, :], fields["site_xpos"][..., 0, :], out=out[..., 14:17]
+        )
+        out[..., 17:20] = fields["sensordata"]
+
+    def rewards(  # noqa: D102 - inherited
+        self,
+        observations: NDArray[np.float64],
+        actions: NDArray[np.float32],
+        out: NDArray[np.float64],
+    ) -> None:
+        minus_distance(observations[:, 1:, 14:17], out)
+
+    def successes(  # noqa: D102 - inherited
+        self, observations: NDArray[np.float64], out: NDArray[np.uint8]
+    ) -> None:
+        distance = np.linalg.norm(observations[:, 14:17], axis=1)
+        np.less(distance, SUCCESS_DISTANCE, out=out, casting="unsafe")
+
+    def targets(  # noqa: D102 - inherited
+        self, fields: Fields, actions: NDArray[np.float32], out: NDArray[np.float64]
+    ) -> None:
+        np.add(fields["qpos"], self.displacement(actions), out=out)
+
+    def displacement(self, actions: NDArray[np.float32]) -> NDArray[np.float64]:
+        """What actions (E, A) ask for [rad or m]; valid until the next call."""
+        np.clip(actions, -1.0, 1.0, out=self._displacement)
+        self._displacement *= DISPLACEMENT
+        return self._displacement
+
+
+class PandaReach(PandaReachJoints):
+    """Actions are displacements of the end effector; the gripper points down."""
+
+    id = "dmprl/PandaReach-v0"
+    recorded = tuple(sorted({*PandaReachJoints.recorded, *InverseKinematics.recorded}))
+    action_len = 3
+
+    def __init__(self, env_count: int) -> None:
+        super().__init__(env_count)
+        self._kinematics = InverseKinematics(self.model, env_count)
+
+    def targets(  # noqa: D102 - inherited
+        self, fields: Fields, actions: NDArray[np.float32], out: NDArray[np.float64]
+    ) -> None:
+        target = self.displacement(actions)
+        target += fields["site_xpos"][:, 0]
+        # Not into the table.
+        np.maximum(target[:, 2], 0.0, out=target[:, 2])
+        self._kinematics.solve(fields, target, out)

@@ -1,0 +1,190 @@
+"""Inverse kinematics of the Panda for small displacements, for all environments together.
+
+Damped least squares. MuJoCo has just computed what the Jacobian of the start consists of, so it
+costs little more than an inverse. The iterations after the first correct that inverse by what they
+have seen (Broyden's method) instead of computing their own, so each costs little more than a pose.
+
+Measured in the box of the goals, for displacements up to 0.05 m along each axis: 99.9 of 100 points
+are missed by less than 0.3 mm. Rejected: the first inverse throughout (5 mm at nearly the same
+price), a new one in every iteration (no better, twice the price), and a second
+:class:`mujoco.batch.Batch` for the poses, which also prepares dynamics that nobody asks for.
+
+Shapes: E environments; a pose is a 3 x 4 matrix [rotation, position]. No product mixes
+environments, so that a result does not depend on how many there are, to the last bit.
+"""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from dmprl.mujoco_batch import Fields
+
+JOINTS = 7
+
+CORRECTIONS = 2
+"""Iterations after the first. One leaves up to 3 mm; a third one gains what no servo resolves."""
+
+DAMPING = 0.05
+"""Damping of the least squares. Where the arm is stretched or folded, it keeps joints from turning
+far for a direction in which they cannot move the end effector."""
+
+GROWTH_MAX = 2.0
+"""Broyden's method lengthens a step by at most this factor: beyond, it is not to be trusted."""
+
+TURN_MAX = 0.5
+"""Largest change of a joint [rad]. Asking for more means that the target is out of reach."""
+
+TINY = 1e-30
+"""Keeps the quotients of an environment that need not move finite."""
+
+_IDENTITY = np.eye(6)
+
+
+class InverseKinematics:
+    """Joint angles that take the end effector to a point, with the gripper pointing down."""
+
+    recorded = ("site_xpos", "site_xmat", "cdof", "subtree_com")
+    """Fields of MjData that it reads besides qpos."""
+
+    def __init__(self, model: mujoco.MjModel, env_count: int) -> None:
+        """Takes the chain from ``model``: its joints, each the parent of the next, then a site."""
+        self._chain = _chain(model)
+        self._error_of_pose = _error_of_pose()
+        self._skew = _skew()
+        self._root = model.body_rootid[model.jnt_bodyid[0]]
+        # 1, cosine and sine of each joint's angle.
+        self._turns = np.ones((env_count, JOINTS, 1, 3))
+        self._links = np.zeros((env_count, JOINTS, 1, 16))
+        self._start = np.zeros((env_count, 3, 4))
+        self._damping = DAMPING**2 * np.eye(6)
+
+    def solve(self, fields: Fields, target: NDArray[np.float64], out: NDArray[np.float64]) -> None:
+        """Writes the angles.
+
+        - ``fields``: qpos and :attr:`recorded`, of now.
+        - ``target`` (E, 3): the point [m]. ``out`` (E, 7): angles [rad].
+        """
+        qpos, start = fields["qpos"], self._start
+        start[:, :, :3] = fields["site_xmat"][:, 0].reshape(-1, 3, 3)
+        start[:, :, 3] = fields["site_xpos"][:, 0]
+        inverse = self._inverse_at(fields)
+        step = self._step(inverse, start, target)
+        turn, steps = step.copy(), [(step, _square(step))]
+        for _ in range(CORRECTIONS):
+            pose = self.pose(qpos + turn)
+            step = _corrected(self._step(inverse, pose, target), steps)
+            turn += step
+            steps.append((step, _square(step)))
+        largest = np.abs(turn).max(axis=1, keepdims=True)
+        # The whole step gets shorter, so that the end effector still sets out towards the target.
+        turn *= TURN_MAX / np.maximum(largest, TURN_MAX)
+        np.add(qpos, turn, out=out)
+
+    def pose(self, angles: NDArray[np.float64]) -> NDArray[np.float64]:
+        """The end effector's pose (E, 3, 4) at ``angles`` (E, 7) [rad]."""
+        np.cos(angles, out=self._turns[:, :, 0, 1])
+        np.sin(angles, out=self._turns[:, :, 0, 2])
+        links = np.matmul(self._turns, self._chain, out=self._links).reshape(-1, JOINTS, 4, 4)
+        pairs = links[:, 0:6:2] @ links[:, 1:6:2]
+        return (pairs[:, 0] @ pairs[:, 1] @ (pairs[:, 2] @ links[:, 6]))[:, :3]
+
+    def _step(
+        self,
+        inverse: NDArray[np.float64],
+        pose: NDArray[np.float64],
+        target: NDArray[np.float64],
+    ) -> NDArray[np.float64]:
+        """The turn (E, 7) that takes ``pose`` to the target, to first order."""
+        error = pose.reshape(-1, 1, 12) @ self._error_of_pose
+        error[:, 0, 3:] += target
+        return (inverse @ error.transpose(0, 2, 1))[:, :, 0]
+
+    def _inverse_at(self, fields: Fields) -> NDArray[np.float64]:
+        """Damped inverse (E, 7, 6) of the Jacobian, whose rows are angular velocity and velocity.
+
+        MuJoCo's cdof is the transposed Jacobian (E, 7, 6) of the arm's centre of mass.
+        """
+        lever = fields["site_xpos"][:, 0] - fields["subtree_com"][:, self._root]
+        moved = (lever[:, None] @ self._skew).reshape(-1, 6, 6)
+        moved += _IDENTITY
+        transposed = fields["cdof"] @ moved
+        square = transposed.transpose(0, 2, 1) @ transposed
+        square += self._damping
+        return transposed @ np.linalg.inv(square)
+
+
+def _corrected(
+    step: NDArray[np.float64], steps: list[tuple[NDArray[np.float64], NDArray[np.float64]]]
+) -> NDArray[np.float64]:
+    """The step that the first inverse proposes, corrected by the ``steps`` taken so far.
+
+    Broyden's "good" update of the inverse, applied to vectors without forming a matrix, as Kelley
+    (1995) does. Each of ``steps`` comes with its square.
+    """
+    for (earlier, square), (later, _) in pairwise(steps):
+        step += later * (np.vecdot(step, earlier) / square)[:, None]
+    last, square = steps[-1]
+    step /= np.maximum(1.0 - np.vecdot(step, last) / square, 1.0 / GROWTH_MAX)[:, None]
+    return step
+
+
+def _square(step: NDArray[np.float64]) -> NDArray[np.float64]:
+    return np.vecdot(step, step) + TINY
+
+
+def _chain(model: mujoco.MjModel) -> NDArray[np.float64]:
+    """What 1, cosine and sine of each joint's angle are multiplied with (7, 3, 16).
+
+    Their sum is the transform from the joint's parent to the joint, from the last one also on to
+    the end effector.
+    """
+    chain = np.zeros((3, JOINTS, 4, 4))
+    chain[0, :, 2, 2] = chain[0, :, 3, 3] = 1.0
+    chain[1, :, 0, 0] = chain[1, :, 1, 1] = 1.0
+    chain[2, :, 1, 0], chain[2, :, 0, 1] = 1.0, -1.0
+    bodies = model.jnt_bodyid
+    links = map(_transform, model.body_pos[bodies], model.body_quat[bodies])
+    chain = np.array(list(links)) @ chain
+    chain[:, -1] @= _transform(model.site_pos[0], model.site_quat[0])
+    return np.ascontiguousarray(chain.reshape(3, JOINTS, 16).transpose(1, 0, 2))
+
+
+def _transform(
+    position: NDArray[np.float64], quaternion: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """The transform (4, 4) of a body or a site in its parent's frame."""
+    rotation = np.zeros(9)
+    mujoco.mju_quat2Mat(rotation, quaternion)
+    transform = np.eye(4)
+    transform[:3, :3] = rotation.reshape(3, 3)
+    transform[:3, 3] = position
+    return transform
+
+
+def _error_of_pose() -> NDArray[np.float64]:
+    """What a pose lacks, without the target's position, is linear in it: this matrix (12, 6).
+
+    Rotation: half the sum of the cross products of the gripper's axes with (1, 0, 0), (0, -1, 0)
+    and (0, 0, -1), which are theirs when it points down: for a small turn, the vector that undoes
+    it. Position: minus the position.
+    """
+    matrix = np.zeros((3, 4, 6))
+    matrix[2, 1, 0], matrix[1, 2, 0] = 0.5, -0.5
+    matrix[2, 0, 1] = matrix[0, 2, 1] = 0.5
+    matrix[1, 0, 2] = matrix[0, 1, 2] = -0.5
+    for axis in range(3):
+        matrix[axis, 3, 3 + axis] = -1.0
+    return matrix.reshape(12, 6)
+
+
+def _skew() -> NDArray[np.float64]:
+    """Makes of a lever (3,) the matrix (36,) of angular velocity (6,) to velocity at its end."""
+    matrix = np.zeros((3, 6, 6))
+    for first, second, third in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
+        matrix[second, first, 3 + third] = 1.0
+        matrix[first, second, 3 + third] = -1.0
+    return matrix.reshape(3, 36)
