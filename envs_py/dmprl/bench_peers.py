@@ -9,16 +9,19 @@ from __future__ import annotations
 
 import importlib
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from dmprl.numpy_policy import Noise, NumpyPolicy
+from dmprl.numpy_policy import Actor
 
-CONTROLS_BYTES_MAX = 16 << 20
-"""Of controls drawn beforehand; few enough to draw at once, many enough not to repeat soon."""
+CONTROLS_BYTES_MAX = 64 << 20
+"""Of the controls of an episode; where more would be needed, episodes are shorter."""
+EPISODE_STEPS = 100
+"""Of an episode where the task has no limit."""
 
 
 class AbsentError(Exception):
@@ -28,29 +31,29 @@ class AbsentError(Exception):
 class BatchPeer:
     """``mujoco.batch.Batch`` with no policy and nothing recorded: physics alone.
 
-    Random controls within their bounds, drawn beforehand; episodes begin at ``starts``, rows of
-    ``Batch.state``, since without new episodes such controls would leave the states of the task.
+    The same episode in each environment over and over: ``starts`` are rows of ``Batch.state``,
+    ``controls`` (steps, E, nu).
     """
 
-    def __init__(self, model, frame_skip: int, starts: NDArray, plan: dict, seed: int) -> None:
+    def __init__(self, model, frame_skip: int, starts: NDArray, controls: NDArray, k: int) -> None:
         from mujoco.batch import Batch
 
-        self._steps: int = plan["decision_steps"]
-        self._env_steps = plan["env_count"] * self._steps
-        self._substeps = self._steps * frame_skip
-        self._batch, self._starts = Batch(model, plan["env_count"], nthread=1), starts
-        episode_steps = plan["spec"]["episode_steps"] or sys.maxsize
-        self._segments_of_episode = max(1, episode_steps // self._steps)
-        self._controls = controls(model, (plan["env_count"], self._steps), frame_skip, seed)
+        env_count = controls.shape[1]
+        self._env_steps, self._substeps = env_count * k, k * frame_skip
+        self._batch, self._starts = Batch(model, env_count, nthread=1), starts
+        segments = max(1, len(controls) // k)
+        controls = controls[np.arange(segments * k) % len(controls)]
+        # (segments, E, K frame_skip, nu), as a rollout takes them.
+        controls = controls.reshape(segments, k, env_count, model.nu).swapaxes(1, 2)
+        self._controls = np.repeat(controls, frame_skip, axis=2)
         self._segment = 0
 
     def segment(self) -> int:
         """Runs one segment; returns the environment steps in it."""
-        if self._segment % self._segments_of_episode == 0:
+        if self._segment == 0:
             self._batch.state[:] = self._starts
-        control = self._controls[self._segment % len(self._controls)]
-        self._segment += 1
-        self._batch.rollout(self._substeps, control, record=())
+        self._batch.rollout(self._substeps, self._controls[self._segment], record=())
+        self._segment = (self._segment + 1) % len(self._controls)
         return self._env_steps
 
 
@@ -65,12 +68,23 @@ class StockBatch(BatchPeer):
         import mujoco
         from mujoco.batch import Batch
 
-        model = mujoco.MjModel.from_xml_path(path)
-        batch = Batch(model, plan["env_count"], nthread=1)
-        for index in range(plan["env_count"]):
-            env.reset(seed=seed + index)
+        model, env_count = mujoco.MjModel.from_xml_path(path), plan["env_count"]
+        envs = [gymnasium_env(plan["task"]["id"]).unwrapped for _ in range(env_count)]
+        batch = Batch(model, env_count, nthread=1)
+        seen = [flat(env.reset(seed=seed + index)[0]) for index, env in enumerate(envs)]
+        for index, env in enumerate(envs):
             batch.qpos[index], batch.qvel[index] = env.data.qpos, env.data.qvel
-        super().__init__(model, env.frame_skip, batch.state.copy(), plan, seed)
+
+        def step(actions: NDArray[np.float64]) -> tuple[NDArray, NDArray]:
+            actions = actions.astype(env.action_space.dtype)
+            pairs = zip(envs, actions, strict=True)
+            observations = np.stack([flat(env.step(action)[0]) for env, action in pairs])
+            return observations, np.stack([env.data.ctrl for env in envs])
+
+        steps = episode_steps(plan, env.frame_skip, model.nu)
+        controls = episode_controls(plan, seed, np.stack(seen), step, steps)
+        starts = batch.state.copy()
+        super().__init__(model, env.frame_skip, starts, controls, plan["decision_steps"])
         self.about = f"mujoco.batch {mujoco.__version__}, {Path(path).name} as Gymnasium ships it"
 
 
@@ -80,29 +94,74 @@ class Ceiling(BatchPeer):
     def __init__(self, plan: dict, seed: int) -> None:
         from dmprl.segment_env import SegmentBuffers, make
 
-        task_id, env_count, steps = plan["task"]["id"], plan["env_count"], plan["decision_steps"]
-        env = make(task_id, env_count, steps)
+        task_id, env_count = plan["task"]["id"], plan["env_count"]
+        env = make(task_id, env_count, 1)
         # Not by its class: whatever steps a Batch has a bound of this kind.
         task, batch = getattr(env, "task", None), getattr(env, "batch", None)
         if task is None or not hasattr(batch, "rollout"):
             raise AbsentError(f"{task_id} does not run on mujoco.batch")
         spec = env.spec()
-        out = SegmentBuffers(env_count, steps, spec["observation_len"], spec["action_len"])
+        out = SegmentBuffers(env_count, 1, spec["observation_len"], spec["action_len"])
         seeds = np.arange(seed, seed + env_count, dtype=np.uint64)
         env.reset(np.ones(env_count, np.uint8), seeds, out)
-        super().__init__(task.model, task.frame_skip, batch.state.copy(), plan, seed)
-        self.about = "mujoco.batch with the worker's model and settings"
+        starts = batch.state.copy()
+
+        def step(actions: NDArray[np.float64]) -> tuple[NDArray, NDArray]:
+            env.step_segment(actions[:, None], out)
+            return out.next_observations, batch.ctrl
+
+        steps = episode_steps(plan, task.frame_skip, task.model.nu)
+        controls = episode_controls(plan, seed, out.next_observations, step, steps)
+        super().__init__(task.model, task.frame_skip, starts, controls, plan["decision_steps"])
+        self.about = (
+            f"mujoco.batch with the worker's model and settings, {plan['controls']} actions"
+        )
 
 
-def controls(model, shape: tuple[int, int], frame_skip: int, seed: int) -> NDArray[np.float64]:
-    """Controls of some segments, (segments, E, K frame_skip, nu), uniform within their bounds."""
-    bytes_of_segment = shape[0] * shape[1] * frame_skip * model.nu * 8
-    segments = max(2, min(256, CONTROLS_BYTES_MAX // max(1, bytes_of_segment)))
-    low, high = model.actuator_ctrlrange.T
-    bounded = model.actuator_ctrllimited.astype(bool)
-    low, high = np.where(bounded, low, -1.0), np.where(bounded, high, 1.0)
-    drawn = np.random.default_rng(seed).uniform(low, high, (segments, *shape, model.nu))
-    return np.repeat(drawn, frame_skip, axis=2)
+class RandomActor:
+    """Actions drawn uniformly within their bounds."""
+
+    def __init__(self, plan: dict, seed: int) -> None:
+        self._random = np.random.default_rng(seed)
+        self._low, self._high = plan["spec"]["action_low"], plan["spec"]["action_high"]
+        self._shape = (plan["env_count"], plan["decision_steps"], plan["spec"]["action_len"])
+
+    def actions(self, observations: NDArray) -> NDArray[np.float64]:
+        """As the policy's."""
+        return self._random.uniform(self._low, self._high, self._shape)
+
+    def carry_on(self, ended: NDArray[np.bool_]) -> None:
+        """Nothing is carried on."""
+
+
+def episode_controls(
+    plan: dict,
+    seed: int,
+    observations: NDArray,
+    step: Callable[[NDArray[np.float64]], tuple[NDArray, NDArray]],
+    steps: int,
+) -> NDArray[np.float64]:
+    """Controls of an episode, (steps, E, nu), drawn before anything is measured.
+
+    The worker's own policy draws them, unless the plan wants random actions: physics costs what
+    the states cost that a policy leads to, and pushing against a joint's limit is dear. ``step``
+    applies actions, (E, A), and returns what is seen then, (E, O), and the controls, (E, nu).
+    """
+    actor = (Actor if plan["controls"] == "policy" else RandomActor)(plan, seed)
+    nobody, controls = np.zeros(plan["env_count"], np.bool_), []
+    while len(controls) < steps:
+        actions = actor.actions(observations)
+        for k in range(min(actions.shape[1], steps - len(controls))):
+            observations, control = step(actions[:, k])
+            controls.append(control.copy())
+        actor.carry_on(nobody)
+    return np.stack(controls)
+
+
+def episode_steps(plan: dict, frame_skip: int, nu: int) -> int:
+    """Steps of an episode without its last, after which the environments begin anew."""
+    fits = CONTROLS_BYTES_MAX // (plan["env_count"] * frame_skip * max(1, nu) * 8)
+    return max(1, min(fits, (plan["spec"]["episode_steps"] or EPISODE_STEPS) - 1))
 
 
 def gymnasium_env(task_id: str) -> Any:
@@ -120,7 +179,7 @@ class GymnasiumLoop:
 
     def __init__(self, plan: dict, seed: int) -> None:
         self._envs = [gymnasium_env(plan["task"]["id"]) for _ in range(plan["env_count"])]
-        self._policy, self._noise = NumpyPolicy(plan), Noise(plan, seed)
+        self._actor = Actor(plan, seed)
         self._dtype = self._envs[0].action_space.dtype
         shape = (plan["env_count"], plan["decision_steps"])
         # What a learner would be sent is kept here too, as the worker keeps it.
@@ -134,8 +193,8 @@ class GymnasiumLoop:
 
     def segment(self) -> int:
         """Runs one segment; returns the environment steps in it."""
-        policy, steps = self._policy, 0
-        actions = policy.scaled(policy.u(self._current, self._noise)).astype(self._dtype)
+        steps = 0
+        actions = self._actor.actions(self._current).astype(self._dtype)
         ended = np.zeros(len(self._envs), np.bool_)
         for index, env in enumerate(self._envs):
             observations, rewards = self._observations[index], self._rewards[index]
@@ -148,8 +207,7 @@ class GymnasiumLoop:
                     ended[index] = True
                     break
             self._current[index] = observation
-        policy.carry_on(ended)
-        self._noise.episodes_ended(ended)
+        self._actor.carry_on(ended)
         return steps
 
 
@@ -175,7 +233,7 @@ class EnvPoolLoop:
             task_id, env_type="gymnasium", num_envs=env_count, num_threads=1, seed=seed
         )
         self.about = f"envpool {envpool.__version__} ({task_id}), numpy {np.__version__}"
-        self._policy, self._noise = NumpyPolicy(plan), Noise(plan, seed)
+        self._actor = Actor(plan, seed)
         self._current, _ = self._env.reset()
         expected = (env_count, plan["spec"]["observation_len"])
         if self._current.shape != expected:
@@ -190,8 +248,8 @@ class EnvPoolLoop:
 
     def segment(self) -> int:
         """Runs one segment; returns the environment steps in it."""
-        policy, steps = self._policy, 0
-        actions = policy.scaled(policy.u(self._current, self._noise)).astype(self._dtype)
+        steps = 0
+        actions = self._actor.actions(self._current).astype(self._dtype)
         ended = np.zeros(len(self._resets), np.bool_)
         for k in range(actions.shape[1]):
             observations, rewards, terminated, truncated, _ = self._env.step(
@@ -202,8 +260,7 @@ class EnvPoolLoop:
             self._resets = terminated | truncated
             ended |= self._resets
         self._current = observations
-        policy.carry_on(ended)
-        self._noise.episodes_ended(ended)
+        self._actor.carry_on(ended)
         return steps
 
 

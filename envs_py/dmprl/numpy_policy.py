@@ -194,3 +194,19 @@ class Noise:
 
     def _normal(self, shape: tuple[int, ...]) -> Floats:
         return self._random.standard_normal(shape, np.float32)
+
+
+class Actor:
+    """A policy with its noise, in E environments that run one segment after the other."""
+
+    def __init__(self, plan: dict, seed: int) -> None:
+        self._policy, self._noise = NumpyPolicy(plan), Noise(plan, seed)
+
+    def actions(self, observations: NDArray) -> NDArray[np.float64]:
+        """The next segment's actions in the environment's units, (E, K, A)."""
+        return self._policy.scaled(self._policy.u(observations, self._noise))
+
+    def carry_on(self, ended: NDArray[np.bool_]) -> None:
+        """To be called after a segment, with the environments whose episode has ended."""
+        self._policy.carry_on(ended)
+        self._noise.episodes_ended(ended)

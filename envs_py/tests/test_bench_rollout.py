@@ -2,20 +2,35 @@
 
 import unittest
 
+import gymnasium
 import numpy as np
 
-from dmprl.bench_peers import AbsentError, Ceiling, GymnasiumLoop, StockBatch, envpool_id
+from dmprl.bench_peers import (
+    AbsentError,
+    Ceiling,
+    GymnasiumLoop,
+    RandomActor,
+    StockBatch,
+    envpool_id,
+)
 from dmprl.bench_rollout import run_for
 from dmprl.numpy_policy import Noise
+from dmprl.segment_env import SegmentBuffers, make
 
 
-def plan(task_id, **exploration):
+def plan(task_id, action_len=2, **exploration):
     """A plan without a policy, for peers and noise that need none."""
     return {
         "task": {"id": task_id},
         "env_count": 3,
         "decision_steps": 5,
-        "spec": {"action_len": 2, "observation_len": 10, "episode_steps": 50},
+        "controls": "random",
+        "spec": {
+            "action_low": [-1.0] * action_len,
+            "action_high": [1.0] * action_len,
+            "action_len": action_len,
+            "episode_steps": 50,
+        },
         "exploration": {"kind": "gaussian", "std": 0.1, **exploration},
     }
 
@@ -33,6 +48,33 @@ class PeerTest(unittest.TestCase):
         for peer in (StockBatch, Ceiling):
             made = peer(plan("Reacher-v5"), seed=1)
             self.assertEqual([made.segment() for _ in range(12)], [15] * 12)
+
+    def test_a_segment_longer_than_an_episode_is_made_too(self):
+        made = Ceiling({**plan("Reacher-v5"), "decision_steps": 60}, seed=1)
+        self.assertEqual([made.segment() for _ in range(2)], [180] * 2)
+
+    def test_the_ceiling_runs_the_episode_of_the_workers_environments(self):
+        for task_id, action_len in (("Pusher-v5", 7), ("dmprl/PandaReach-v0", 3)):
+            made, env = Ceiling(plan(task_id, action_len), seed=3), make(task_id, 3, 5)
+            spec = env.spec()
+            out = SegmentBuffers(3, 5, spec["observation_len"], spec["action_len"])
+            env.reset(np.ones(3, np.uint8), np.arange(3, 6, dtype=np.uint64), out)
+            actor = RandomActor(plan(task_id, action_len), seed=3)
+            for _ in range(4):
+                env.step_segment(actor.actions(out.next_observations), out)
+                made.segment()
+            np.testing.assert_array_equal(made._batch.qpos, env.batch.qpos)
+
+    def test_the_stock_batch_runs_the_episode_of_gymnasium(self):
+        made = StockBatch(plan("Reacher-v5"), seed=3)
+        env = gymnasium.make("Reacher-v5").unwrapped
+        env.reset(seed=5)
+        for _ in range(2):
+            made.segment()
+        actor = RandomActor(plan("Reacher-v5"), seed=3)
+        for action in np.concatenate([actor.actions(None)[2] for _ in range(2)]):
+            env.step(action.astype(np.float32))
+        np.testing.assert_array_equal(made._batch.qpos[2], env.data.qpos)
 
     def test_a_peer_that_is_not_to_be_had_says_why(self):
         for peer, task_id in (

@@ -8,7 +8,7 @@
 use std::path::Path;
 use std::process::Command;
 
-use dmprl::bench::NumpyPlan;
+use dmprl::bench::{Controls, NumpyPlan};
 use dmprl_shared::config::{ExperimentConfig, Layers, Limits, task_defaults};
 use dmprl_shared::policy::{Policy, Threads};
 use dmprl_shared::seeds;
@@ -88,7 +88,8 @@ fn assert_same(task: &str, keys: &[(&str, &str)]) {
 
     let folder = tempfile::tempdir().unwrap();
     let path = |name: &str| folder.path().join(name);
-    let plan = NumpyPlan::write(folder.path(), (&config, &spec), &policy, &parameters).unwrap();
+    let settings = (&config, &spec, Controls::Policy);
+    let plan = NumpyPlan::write(folder.path(), settings, &policy, &parameters).unwrap();
     let bytes: Vec<u8> = observations.iter().flat_map(|value| value.to_le_bytes()).collect();
     std::fs::write(path("observations"), bytes).unwrap();
     let output = Command::new(&venv().executable)

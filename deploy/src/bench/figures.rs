@@ -4,6 +4,7 @@ use dmprl_shared::config::{ExperimentConfig, PolicyKind};
 use dmprl_shared::spec::EnvSpec;
 use serde_json::{Map, Value, json};
 
+use super::numpy_plan::Controls;
 use super::rollout::RolloutBench;
 use crate::run_directory::Machine;
 
@@ -29,6 +30,7 @@ pub struct Figures {
     pub(super) config: ExperimentConfig,
     pub(super) env_id: String,
     pub(super) seconds: f64,
+    controls: Controls,
     machine: Machine,
     load_average: Option<f64>,
     /// (name, its rounds); no entry for one that is absent.
@@ -59,6 +61,7 @@ impl Figures {
             config: bench.config.clone(),
             env_id: spec.id.clone(),
             seconds: bench.duration.as_secs_f64(),
+            controls: bench.controls,
             machine,
             load_average: load_average(),
             rounds: Vec::new(),
@@ -143,6 +146,7 @@ impl Figures {
             "segment_steps": self.config.policy.decision_steps(),
             "queue_segments": actors.queue_segments,
             "seconds": self.seconds,
+            "controls": self.controls,
             "rounds": each(&|name| self.rates(name).into()),
             "spread": each(&spread),
             "cpu_us_per_step": each(&|name| self.cpu_us_per_step(name).into()),
@@ -209,6 +213,7 @@ pub(super) mod tests {
             config: config.resolve(dmprl_shared::config::Limits { cores: 3 }).unwrap(),
             env_id: "Reacher-v5".into(),
             seconds: 1.0,
+            controls: Controls::Policy,
             machine,
             load_average: None,
             rounds: Vec::new(),

@@ -16,5 +16,5 @@ mod watch;
 mod workers;
 
 pub use figures::Figures;
-pub use numpy_plan::NumpyPlan;
+pub use numpy_plan::{Controls, NumpyPlan};
 pub use rollout::{RolloutBench, rollout};

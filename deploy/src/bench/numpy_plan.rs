@@ -3,6 +3,7 @@
 use std::path::{Path, PathBuf};
 
 use anyhow::Context;
+use clap::ValueEnum;
 use dmprl_shared::config::{
     DmpConfig, ExperimentConfig, ExplorationConfig, PolicyConfig, PolicyKind, TaskConfig,
 };
@@ -10,6 +11,16 @@ use dmprl_shared::dmp::{Dmp, SegmentMap};
 use dmprl_shared::policy::Policy;
 use dmprl_shared::spec::EnvSpec;
 use serde::Serialize;
+
+/// What physics alone is driven by.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, ValueEnum)]
+#[serde(rename_all = "snake_case")]
+pub enum Controls {
+    /// What the policy decides, with its noise.
+    Policy,
+    /// Actions drawn uniformly within their bounds.
+    Random,
+}
 
 /// A task, its environments and a policy with its parameters, as one JSON object.
 #[derive(Debug, Serialize)]
@@ -21,6 +32,8 @@ pub struct NumpyPlan<'a> {
     spec: &'a EnvSpec,
     seed: u64,
     env_count: usize,
+    /// What draws the actions that lead to the controls of physics alone.
+    controls: Controls,
     /// Environment steps of one decision.
     decision_steps: usize,
     /// Of the network, input first, output last.
@@ -39,7 +52,7 @@ impl<'a> NumpyPlan<'a> {
     /// The DMP does not fit, or what the file system refuses.
     pub fn write(
         folder: &Path,
-        (config, spec): (&'a ExperimentConfig, &'a EnvSpec),
+        (config, spec, controls): (&'a ExperimentConfig, &'a EnvSpec, Controls),
         policy: &Policy,
         parameters: &[f32],
     ) -> anyhow::Result<PathBuf> {
@@ -54,6 +67,7 @@ impl<'a> NumpyPlan<'a> {
             spec,
             seed: config.run.seed,
             env_count: config.actors.envs_per_worker,
+            controls,
             decision_steps: config.policy.decision_steps(),
             widths: widths.chain(shape.layers().iter().map(|layer| layer.outputs)).collect(),
             segment_map: segment_map(config)?,

@@ -11,7 +11,7 @@ use anyhow::Context;
 use dmprl_shared::config::ExperimentConfig;
 
 use super::figures::{Figures, WORKER, WorkerFigures};
-use super::numpy_plan::NumpyPlan;
+use super::numpy_plan::{Controls, NumpyPlan};
 use super::peers::{Peer, PeerKind, Stage};
 use super::watch::{Interrupted, Watch};
 use super::workers::Workers;
@@ -34,6 +34,8 @@ pub struct RolloutBench {
     pub package_path: PathBuf,
     /// The interpreter that EnvPool runs in.
     pub peer_python: PathBuf,
+    /// What drives physics alone.
+    pub controls: Controls,
     /// How often each is measured.
     pub rounds: usize,
     /// How long each time.
@@ -110,7 +112,8 @@ fn start_peers(
     figures: &mut Figures,
 ) -> anyhow::Result<Vec<Peer>> {
     let Workers { spec, policy, parameters, .. } = workers;
-    let plan = NumpyPlan::write(run.path(), (&bench.config, spec), policy, parameters)?;
+    let plan =
+        NumpyPlan::write(run.path(), (&bench.config, spec, bench.controls), policy, parameters)?;
     let package_path = bench.package_path.clone();
     let stage = Stage { run, package_path, plan, workers: bench.config.actors.workers };
     let own = bench.venv.join("bin/python");

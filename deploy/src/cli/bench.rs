@@ -11,7 +11,7 @@ use toml::Value;
 use super::configuration::{Flag, Sources, merge, refuse};
 use super::train::{absolute_folder, environment, python_path};
 use super::{cores, emit, prepare_python, this_program};
-use crate::bench::{self, RolloutBench};
+use crate::bench::{self, Controls, RolloutBench};
 use crate::failure::{Outcome, wrong_use};
 
 /// Shorter rounds measure the sleep of the bench itself; longer ones are a slip of the keyboard.
@@ -26,6 +26,7 @@ const ROLLOUT_HELP: &str = "\
 In every round each of these runs once for --seconds, the others asleep; the median counts.
   batch      mujoco.batch alone, on the model file that Gymnasium ships
   ceiling    mujoco.batch alone, on the workers' own model and process settings
+             (both run episodes whose controls were recorded before, see --controls)
   worker     `dmprl actor` processes as a run has them: network, movement primitives, noise,
              environments, shared memory; this process takes the segments in the learner's place
   gymnasium  a loop over Gymnasium environments, the same policy in NumPy
@@ -89,6 +90,9 @@ struct RolloutArgs {
     /// How long each time [s].
     #[arg(long, value_name = "S", default_value_t = 1.0, value_parser = seconds)]
     seconds: f64,
+    /// What drives physics alone: what the policy decides, or random actions.
+    #[arg(long, value_enum, default_value_t = Controls::Policy)]
+    controls: Controls,
     /// Python that has EnvPool [default: the one of .venv].
     #[arg(long, value_name = "PATH")]
     peer_python: Option<PathBuf>,
@@ -136,6 +140,7 @@ fn rollout(args: &RolloutArgs) -> anyhow::Result<Outcome> {
         program: this_program()?,
         config,
         peer_python: peer_python.unwrap_or_else(|| venv.join("bin/python")),
+        controls: args.controls,
         venv,
         package_path: crate::project::root()?.join("envs_py"),
         rounds: usize::from(args.rounds),
