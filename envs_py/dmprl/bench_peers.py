@@ -113,9 +113,7 @@ class Ceiling(BatchPeer):
         steps = episode_steps(plan, task.frame_skip, task.model.nu)
         controls = episode_controls(plan, seed, out.next_observations, step, steps)
         super().__init__(task.model, task.frame_skip, starts, controls, plan["decision_steps"])
-        self.about = (
-            f"mujoco.batch with the worker's model and settings, {plan['controls']} actions"
-        )
+        self.about = "mujoco.batch with the worker's model and settings"
 
 
 class RandomActor:
