@@ -291,6 +291,7 @@ pub(crate) mod tests {
             action_high: vec![1.0; 2],
             control_dt_s: 0.02,
             episode_steps: 10,
+            observation_names: Vec::new(),
         }
     }
 }
