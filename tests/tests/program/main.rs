@@ -12,6 +12,7 @@ mod deaths;
 mod determinism;
 mod endings;
 mod environments;
+mod faults;
 mod interrupts;
 mod learning;
 mod refusals;
