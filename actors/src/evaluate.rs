@@ -109,14 +109,14 @@ impl Evaluator {
         parameters: &[f32],
         episodes: Episodes<'_>,
     ) -> Result<Option<Evaluation>, RolloutError> {
+        self.acting.take_policy(parameters);
         let mut returns = Vec::with_capacity(episodes.count);
         let mut success = Vec::with_capacity(episodes.count);
         let (mut jumps, mut jump_count) = (0.0, 0);
         while returns.len() < episodes.count {
             let count = (episodes.count - returns.len()).min(self.envs);
             let first_seed = episodes.first_seed + returns.len() as u64;
-            let Some(wave) = self.wave(parameters, Episodes { count, first_seed, ..episodes })?
-            else {
+            let Some(wave) = self.wave(Episodes { count, first_seed, ..episodes })? else {
                 return Ok(None);
             };
             returns.extend(&wave.returns[..count]);
@@ -135,7 +135,6 @@ impl Evaluator {
 
     fn wave(
         &mut self,
-        parameters: &[f32],
         Episodes { count, first_seed, stop }: Episodes<'_>,
     ) -> Result<Option<Wave>, RolloutError> {
         let dims = self.acting.policy.layout().action_len;
@@ -159,7 +158,7 @@ impl Evaluator {
                 return Ok(None);
             }
             self.acting.observe(&self.environments);
-            self.acting.run_network(parameters);
+            self.acting.run_network();
             self.acting.decode();
             self.environments.step_segment(self.acting.actions())?;
             let failed = self.faults.look(&mut self.environments)?;

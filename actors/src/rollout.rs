@@ -50,18 +50,6 @@ pub enum RolloutError {
         /// The last failure.
         cause: String,
     },
-    /// A segment holds a number that is NaN or infinite although its environment is sound.
-    #[error("environment {env_index}, episode {episode}, step {step}: {name} is not finite")]
-    NotFinite {
-        /// Which environment of the worker.
-        env_index: usize,
-        /// Which of its episodes.
-        episode: u32,
-        /// Which step of the episode.
-        step: u32,
-        /// Observation or reward.
-        name: &'static str,
-    },
 }
 
 /// Takes a finished segment and keeps it until the learner has it.
@@ -98,7 +86,9 @@ pub struct Rollout {
     new_seeds: Vec<u64>,
     segment: Segment,
     sequence: u64,
-    /// The policy that acts; version 0 until the first one has come.
+    /// Version of the policy that `acting` has taken over.
+    acting_version: u64,
+    /// The newest policy; version 0 until the first one has come.
     pub snapshot: ParameterSnapshot,
 }
 
@@ -139,6 +129,7 @@ impl Rollout {
             env_seeds,
             segment: Segment::zeroed(layout),
             sequence: 0,
+            acting_version: 0,
             snapshot: ParameterSnapshot::default(),
             acting: Acting::new(policy, envs),
             environments,
@@ -165,7 +156,11 @@ impl Rollout {
         if warming_up {
             self.exploration.warm_up(&mut self.acting);
         } else {
-            self.acting.run_network(&self.snapshot.values);
+            if self.acting_version != self.snapshot.version {
+                self.acting.take_policy(&self.snapshot.values);
+                self.acting_version = self.snapshot.version;
+            }
+            self.acting.run_network();
             self.exploration.explore(&mut self.acting);
         }
         let policy_version = if warming_up { 0 } else { self.snapshot.version };
@@ -176,7 +171,7 @@ impl Rollout {
                 self.begin_episode(env);
                 continue;
             }
-            self.record(env, policy_version)?;
+            self.record(env, policy_version);
             deliver(&self.segment.header, &self.segment.block)?;
         }
         // Last: what the others did is sound, and delivered.
@@ -211,7 +206,7 @@ impl Rollout {
     }
 
     /// Fills `self.segment` with what environment `env` has just done.
-    fn record(&mut self, env: usize, policy_version: u64) -> Result<(), RolloutError> {
+    fn record(&mut self, env: usize, policy_version: u64) {
         let layout = self.acting.policy.layout();
         let steps = self.environments.steps()[env] as usize;
         self.fill_block(env, steps);
@@ -240,7 +235,6 @@ impl Rollout {
             action_len: layout.action_len as u32,
             checksum: block_checksum(&self.segment.block),
         };
-        self.check_finite(env, episode)?;
         if flags & (TERMINATED | TRUNCATED) != 0 {
             self.begin_episode(env);
             self.faults.completed(env);
@@ -248,7 +242,6 @@ impl Rollout {
             self.acting.carry_on(env, false);
             self.episodes[env].steps += steps as u32;
         }
-        Ok(())
     }
 
     fn fill_block(&mut self, env: usize, steps: usize) {
@@ -273,27 +266,5 @@ impl Rollout {
             *out = *value as f32;
         }
         rewards[steps..].fill(0.0);
-    }
-
-    /// A NaN must be stopped at its source: past the replay it would be everywhere.
-    fn check_finite(&self, env: usize, episode: Episode) -> Result<(), RolloutError> {
-        let layout = self.acting.policy.layout();
-        let (observations, _, rewards) = layout.split(&self.segment.block);
-        let bad = |values: &[f32], width: usize| {
-            values.iter().position(|value| !value.is_finite()).map(|at| at / width)
-        };
-        let o = layout.observation_len;
-        let found = bad(rewards, 1)
-            .map(|k| ("reward", k))
-            .or_else(|| bad(observations, o).map(|k| ("observation", k)));
-        match found {
-            None => Ok(()),
-            Some((name, k)) => Err(RolloutError::NotFinite {
-                env_index: env,
-                episode: episode.number,
-                step: episode.steps + k as u32,
-                name,
-            }),
-        }
     }
 }

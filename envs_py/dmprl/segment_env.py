@@ -8,6 +8,7 @@ environments, K steps of a segment, O observation, A action.
 from __future__ import annotations
 
 import importlib
+import sys
 from abc import ABC, abstractmethod
 from types import ModuleType
 from typing import TYPE_CHECKING, TypedDict
@@ -161,7 +162,8 @@ def make(task_id: str, env_count: int, segment_steps: int) -> SegmentEnv:
     """The environments of a task.
 
     - ``task_id``: a Gymnasium id, ``module:Id`` for one that ``module`` registers when imported,
-      or ``module:Class`` with a :class:`SegmentEnv` or a ``gymnasium.Env``.
+      or ``module:Class`` with a :class:`SegmentEnv`, a ``dmprl.mujoco_batch.MujocoTask`` or a
+      ``gymnasium.Env``.
     """
     if env_count < 1 or segment_steps < 1:
         raise ValueError(f"{env_count} environments, {segment_steps} steps: both must be 1 or more")
@@ -169,6 +171,9 @@ def make(task_id: str, env_count: int, segment_steps: int) -> SegmentEnv:
     candidate = getattr(_import(task_id, module_name), name, None) if module_name else None
     if isinstance(candidate, type) and issubclass(candidate, SegmentEnv):
         return candidate(env_count, segment_steps)
+    batched = sys.modules.get("dmprl.mujoco_batch")  # imported by whoever subclasses its task
+    if batched and isinstance(candidate, type) and issubclass(candidate, batched.MujocoTask):
+        return candidate(env_count).batch(segment_steps, candidate.episode_steps)
 
     from dmprl.tasks import make_batch
 

@@ -7,6 +7,7 @@ from pathlib import Path
 import gymnasium
 import numpy as np
 
+from dmprl.gymnasium_env import GymnasiumSegmentEnv
 from dmprl.segment_env import (
     SUCCESS_NO,
     SUCCESS_NOT_REPORTED,
@@ -20,10 +21,16 @@ from dmprl.segment_env import (
 sys.path.append(str(Path(__file__).parent))  # for the tiny environments' module
 
 
+EXAMPLES = Path(__file__).resolve().parents[2] / "docs" / "examples"
+
+
 def started(task_id, env_count=1, segment_steps=5, seed=7):
     """The environments of a task, reset with seeds `seed`, `seed` + 1, …, and their buffers."""
-    env = make(task_id, env_count, segment_steps)
-    spec = env.spec()
+    return started_on(make(task_id, env_count, segment_steps), seed)
+
+
+def started_on(env, seed=7):
+    spec, env_count, segment_steps = env.spec(), env.env_count, env.segment_steps
     out = SegmentBuffers(env_count, segment_steps, spec["observation_len"], spec["action_len"])
     seeds = np.arange(seed, seed + env_count, dtype=np.uint64)
     env.reset(np.ones(env_count, np.uint8), seeds, out)
@@ -59,9 +66,10 @@ class ResetTest(unittest.TestCase):
 
 
 class SegmentTest(unittest.TestCase):
-    def test_reacher_equals_a_plain_gymnasium_loop(self):
+    def test_any_environment_equals_a_plain_gymnasium_loop(self):
+        # Reacher of Gymnasium, not ours, which `make` would give.
         env_count, segments = 3, 23  # two ends of an episode (50 steps), off a segment's border
-        env, out = started("Reacher-v5", env_count, segment_steps=6)
+        env, out = started_on(GymnasiumSegmentEnv("Reacher-v5", env_count, 6))
         plain = [gymnasium.make("Reacher-v5") for _ in range(env_count)]
         now = [plain[index].reset(seed=7 + index)[0] for index in range(env_count)]
         rng = np.random.default_rng(0)
@@ -131,13 +139,39 @@ class SegmentTest(unittest.TestCase):
         self.assertEqual(out.next_observations.tolist(), [[7], [8]])
         self.assertEqual(env.spec()["control_dt_s"], 0.5)
 
+    def test_a_module_may_bring_its_own_mujoco_task(self):
+        env, out = started("tiny_mujoco:SlowReacher", env_count=2)
+        self.assertEqual(env.spec()["control_dt_s"], 0.04)
+        env.step_segment(np.zeros((2, 5, 2)), out)
+        self.assertTrue(out.observations.any())
+
+    def test_the_batched_example_is_the_plain_one(self):
+        sys.path.append(str(EXAMPLES))
+        plain, of_plain = started("point_reach:PointReach-v0", 3, 7)
+        batch, of_batch = started("point_reach_batch:PointReachBatch", 3, 7)
+        generator = np.random.default_rng(0)
+        for _ in range(30):
+            # Drawn by generators of the same kind from the same seeds.
+            np.testing.assert_allclose(of_batch.next_observations, of_plain.next_observations)
+            actions = generator.uniform(-2, 2, (3, 7, 2))
+            for env, out in ((plain, of_plain), (batch, of_batch)):
+                env.step_segment(actions, out)
+            for name in ("observations", "rewards", "terminated", "truncated", "success", "steps"):
+                got, expected = getattr(of_batch, name), getattr(of_plain, name)
+                np.testing.assert_allclose(got, expected, atol=1e-12, err_msg=name)
+
 
 class SpecTest(unittest.TestCase):
     def test_spec_of_reacher(self):
-        spec = make("Reacher-v5", 1, 5).spec()
-        self.assertEqual(spec.pop("observation_names")[4:6], ["target_x", "target_y"])
+        names = [f"observation[{entry}]" for entry in range(10)]
+        ours = make("Reacher-v5", 1, 5).spec()
+        self.assertEqual(ours["observation_names"][4:6], ["target_x", "target_y"])
         self.assertEqual(
-            spec,
+            GymnasiumSegmentEnv("Reacher-v5", 1, 5).spec(),
+            {**ours, "observation_names": names},
+        )
+        self.assertEqual(
+            {**ours, "observation_names": names},
             {
                 "id": "Reacher-v5",
                 "observation_len": 10,
@@ -146,7 +180,7 @@ class SpecTest(unittest.TestCase):
                 "action_high": [1.0, 1.0],
                 "control_dt_s": 0.02,
                 "episode_steps": 50,
-                "observation_names": [f"observation[{entry}]" for entry in range(10)],
+                "observation_names": names,
             },
         )
 
