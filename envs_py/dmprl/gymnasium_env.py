@@ -9,12 +9,14 @@ from __future__ import annotations
 
 import copy
 import math
+import sys
 
 import gymnasium
 import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
+from dmprl import robotics_repair
 from dmprl.segment_env import (
     SUCCESS_NO,
     SUCCESS_NOT_REPORTED,
@@ -58,6 +60,8 @@ class GymnasiumSegmentEnv(SegmentEnv):
         self._finite_rewards = np.zeros((env_count, segment_steps), np.bool_)
 
     def _registration(self) -> gymnasium.envs.registration.EnvSpec:
+        if "gymnasium_robotics" in sys.modules:
+            robotics_repair.repair()
         registered = gymnasium.registry.get(self.task_id.rpartition(":")[2])
         if registered is None:  # without version, or unknown: Gymnasium finds it, or suggests
             made = gymnasium.make(self.task_id)

@@ -32,6 +32,7 @@ from dmprl.segment_env import (
 Fields = Mapping[str, NDArray]
 """Arrays of MjData by name, each with the dimensions of the call in front of MjData's own."""
 
+
 class MujocoTask(ABC):
     """What a task is, for E environments at once.
 
