@@ -11,6 +11,7 @@ use std::{process::Command, sync::OnceLock};
 use dmprl_actors::python_env::{
     Interpreter, InterpreterOptions, PythonEnvironments, PythonError, SUCCESS_NO, SUCCESS_YES,
 };
+use dmprl_shared::config::TASKS;
 use dmprl_tests::{tiny_envs_dir, venv};
 
 fn options() -> InterpreterOptions {
@@ -45,6 +46,22 @@ fn spec_of_reacher_is_gymnasiums() {
         (&[-1.0; 2][..], &[1.0; 2][..])
     );
     assert_eq!((spec.id.as_str(), spec.control_dt_s), ("Reacher-v5", 0.02));
+}
+
+#[test]
+fn what_the_list_of_tasks_says_is_what_the_environments_are() {
+    for task in &TASKS {
+        let envs = PythonEnvironments::start(interpreter(), task.id, 1, 5).unwrap();
+        let spec = envs.spec();
+        assert_eq!(spec.id, task.id);
+        assert_eq!(
+            (spec.observation_len, spec.action_len, spec.episode_steps),
+            (task.observation_len, task.action_len, task.episode_steps),
+            "{}",
+            task.name
+        );
+        assert!((spec.control_dt_s - task.control_dt_s).abs() < 1e-12, "{}", task.name);
+    }
 }
 
 #[test]

@@ -59,6 +59,9 @@ fn merge_over(defaults: Table, sources: &Sources<'_>) -> anyhow::Result<Experime
     let preset = PRESETS.iter().find(|preset| preset.name == sources.preset);
     let preset = preset.with_context(|| format!("no preset {}", sources.preset))?;
     add(&mut layers, preset.name, preset.table())?;
+    if let Some(task) = task_defaults(sources.task) {
+        add(&mut layers, preset.name, task.over_preset(preset.name))?;
+    }
     if let Some(file) = sources.file {
         add(&mut layers, &file.display().to_string(), read_table(file)?)?;
     }

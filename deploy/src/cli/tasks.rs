@@ -1,8 +1,7 @@
 //! `dmprl tasks`.
 
 use clap::Args;
-use dmprl_shared::config::{Layers, TASKS};
-use serde::Serialize;
+use dmprl_shared::config::{TASKS, TaskDefaults};
 
 use super::emit;
 use crate::failure::Outcome;
@@ -16,6 +15,9 @@ EXAMPLES
   dmprl train Pendulum-v1
   dmprl train my_module:MyArm-v0 --python-path ./envs";
 
+const OTHERS: &str = "\
+Any other Gymnasium id works too, as Pendulum-v1; my_module:MyArm-v0 imports my_module first.";
+
 /// Arguments of `dmprl tasks`.
 #[derive(Debug, Args)]
 #[command(after_help = HELP)]
@@ -25,36 +27,24 @@ pub(super) struct TasksArgs {
     json: bool,
 }
 
-#[derive(Serialize)]
-struct Task {
-    name: &'static str,
-    id: String,
-    about: &'static str,
-    steps: u64,
-}
-
 pub(super) fn run(args: &TasksArgs) -> anyhow::Result<Outcome> {
-    let mut tasks = Vec::new();
-    for task in &TASKS {
-        let mut layers = Layers::new();
-        layers.add(task.name, task.table())?;
-        let config = layers.finish()?;
-        let steps = config.run.steps;
-        tasks.push(Task { name: task.name, id: config.task.id, about: task.about, steps });
-    }
     if args.json {
-        emit(&serde_json::json!({ "tasks": tasks }).to_string())?;
+        emit(&serde_json::json!({ "tasks": TASKS }).to_string())?;
         return Ok(Outcome::Done);
     }
-    let width = |of: fn(&Task) -> usize| tasks.iter().map(of).max().unwrap_or(0);
-    let (name, id) = (width(|task| task.name.len()), width(|task| task.id.len()));
-    let lines = tasks.iter().map(|task| {
-        format!("{:name$}  {:id$}  {:>9} steps  {}", task.name, task.id, task.steps, task.about)
-    });
-    let mut text = lines.collect::<Vec<_>>().join("\n");
-    text.push_str(
-        "\n\nAny other Gymnasium id works too, such as Pendulum-v1 or my_module:MyArm-v0.",
-    );
-    emit(&text)?;
+    let tasks: Vec<String> = TASKS.iter().map(description).collect();
+    emit(&format!("{}\n\n{OTHERS}", tasks.join("\n")))?;
     Ok(Outcome::Done)
+}
+
+fn description(task: &TaskDefaults) -> String {
+    let TaskDefaults { name, id, about, control, source, .. } = task;
+    let TaskDefaults { observation_len, action_len, episode_steps, control_dt_s, .. } = task;
+    let seconds = f64::from(*episode_steps) * control_dt_s;
+    format!(
+        "{name:19} {about}\n{:19} {id}, from {source}\n{:19} observation {observation_len}, \
+         action {action_len}: {control}\n{:19} episode {episode_steps} steps of {control_dt_s} s, \
+         {seconds:.0} s\n",
+        "", "", ""
+    )
 }

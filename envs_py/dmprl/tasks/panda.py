@@ -115,7 +115,7 @@ class PandaReach(PandaReachJoints):
     """Actions are displacements of the end effector; the gripper points down."""
 
     id = "dmprl/PandaReach-v0"
-    recorded = tuple({*PandaReachJoints.recorded, *InverseKinematics.recorded})
+    recorded = tuple(sorted({*PandaReachJoints.recorded, *InverseKinematics.recorded}))
     action_len = 3
 
     def __init__(self, env_count: int) -> None:

@@ -162,13 +162,13 @@ pub enum StartSource {
         /// Index of the angular velocity [rad/s].
         velocity: usize,
     },
-    /// y0 = scale * observation[index], yd0 likewise.
+    /// y0 = scale * observation[index], yd0 from observation[velocity].
     Value {
         /// Index of the position.
         index: usize,
         /// Index of the velocity.
         velocity: usize,
-        /// Factor on both; -1 where the observation holds goal minus position.
+        /// Factor on the position; -1 where the observation holds goal minus position.
         #[serde(default = "unit_scale")]
         scale: f32,
     },

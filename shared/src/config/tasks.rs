@@ -1,36 +1,125 @@
 //! The tasks with a short name, and what differs from the defaults for each.
 
+use serde::Serialize;
 use toml::Table;
 
-/// A task known by a short name.
-#[derive(Debug)]
+/// A task known by a short name. What `dmprl tasks` says of it is written here, so that it needs
+/// no Python; a test compares it with the environment.
+#[derive(Debug, Clone, Copy, Serialize)]
 pub struct TaskDefaults {
     /// The name for `dmprl train NAME`.
     pub name: &'static str,
+    /// Gymnasium id.
+    pub id: &'static str,
     /// What it is.
     pub about: &'static str,
+    /// What an action commands, with its bounds.
+    pub control: &'static str,
+    /// Who defined it.
+    pub source: &'static str,
+    /// Length O of an observation.
+    pub observation_len: usize,
+    /// Length A of an action.
+    pub action_len: usize,
+    /// Steps of an episode.
+    pub episode_steps: u32,
+    /// Duration of a step [s].
+    pub control_dt_s: f64,
+    /// Values over the defaults, as TOML.
+    #[serde(skip)]
     text: &'static str,
+    /// Values over the preset `paper`, as TOML: where its Table 2 has a column for this task.
+    #[serde(skip)]
+    paper: &'static str,
 }
 
-/// Every task with a short name.
-pub const TASKS: [TaskDefaults; 2] = [
-    TaskDefaults {
-        name: "reacher",
-        about: "two-joint planar arm reaches a target (Gymnasium Reacher-v5)",
-        text: REACHER,
-    },
-    TaskDefaults {
-        name: "pusher",
-        about: "seven-joint arm pushes a cylinder to a goal (Gymnasium Pusher-v5)",
-        text: PUSHER,
-    },
-];
+const REACHER: TaskDefaults = TaskDefaults {
+    name: "reacher",
+    id: "Reacher-v5",
+    about: "two-joint planar arm brings its fingertip to a target",
+    control: "torque, ±1 (gear 200)",
+    source: "Gymnasium, batched, equal bit for bit",
+    observation_len: 10,
+    action_len: 2,
+    episode_steps: 50,
+    control_dt_s: 0.02,
+    text: REACHER_VALUES,
+    paper: "",
+};
 
-// Observation of Reacher-v5: cos (2), sin (2), target (2), angular velocity (2),
-// fingertip - target.
-const REACHER: &str = r#"
+const PUSHER: TaskDefaults = TaskDefaults {
+    name: "pusher",
+    id: "Pusher-v5",
+    about: "seven-joint arm pushes a cylinder to a goal",
+    control: "torque, ±2",
+    source: "Gymnasium, batched, equal bit for bit",
+    observation_len: 23,
+    action_len: 7,
+    episode_steps: 100,
+    control_dt_s: 0.05,
+    text: ARM_VALUES,
+    paper: "",
+};
+
+const THROWER: TaskDefaults = TaskDefaults {
+    name: "thrower",
+    id: "dmprl/Thrower-v0",
+    about: "seven-joint arm throws a ball into a box",
+    control: "torque, ±10, last three joints ±15",
+    source: "OpenAI Gym 0.9.4, rebuilt",
+    ..PUSHER
+};
+
+const PANDA_REACH: TaskDefaults = TaskDefaults {
+    name: "panda-reach",
+    id: "dmprl/PandaReach-v0",
+    about: "Franka Panda brings its gripper to a goal",
+    control: "gripper displacement, ±1 = 5 cm a step",
+    source: "panda-gym's task, in MuJoCo",
+    observation_len: 20,
+    action_len: 3,
+    episode_steps: 50,
+    control_dt_s: 0.04,
+    text: PANDA_REACH_VALUES,
+    paper: PANDA_PAPER,
+};
+
+const PANDA_REACH_JOINTS: TaskDefaults = TaskDefaults {
+    name: "panda-reach-joints",
+    id: "dmprl/PandaReachJoints-v0",
+    control: "joint displacement, ±1 = 0.05 rad a step",
+    action_len: 7,
+    text: PANDA_REACH_JOINTS_VALUES,
+    ..PANDA_REACH
+};
+
+const REACHER_V1: TaskDefaults = TaskDefaults {
+    name: "reacher-v1",
+    id: "dmprl/Reacher-v1",
+    about: "reacher as the paper had it: targets beyond reach, reward of the state before",
+    source: "OpenAI Gym 0.9.4, rebuilt",
+    observation_len: 11,
+    ..REACHER
+};
+
+const PUSHER_V0: TaskDefaults = TaskDefaults {
+    name: "pusher-v0",
+    id: "dmprl/Pusher-v0",
+    about: "pusher as the paper had it: other positions, reward of the state before",
+    source: "OpenAI Gym 0.9.4, rebuilt",
+    ..PUSHER
+};
+
+const THROWER_V0: TaskDefaults =
+    TaskDefaults { name: "thrower-v0", about: "another name of thrower", ..THROWER };
+
+/// Every task with a short name: the five tasks, then the paper's older versions.
+pub const TASKS: [TaskDefaults; 8] =
+    [REACHER, PUSHER, THROWER, PANDA_REACH, PANDA_REACH_JOINTS, REACHER_V1, PUSHER_V0, THROWER_V0];
+
+// Observation: cos (2), sin (2), target (2), angular velocity (2), fingertip - target.
+const REACHER_VALUES: &str = r#"
 [task]
-id = "Reacher-v5"
 start_sources = [
     { cos = 0, sin = 2, velocity = 6 },
     { cos = 1, sin = 3, velocity = 7 },
@@ -39,10 +128,9 @@ start_sources = [
 steps = 60000
 "#;
 
-// Observation of Pusher-v5: joint angles (7), joint velocities (7), tips, object, goal (3 each).
-const PUSHER: &str = r#"
+// Observation: joint angles (7), joint velocities (7), three positions (3 each).
+const ARM_VALUES: &str = r#"
 [task]
-id = "Pusher-v5"
 start_sources = [
     { index = 0, velocity = 7 },
     { index = 1, velocity = 8 },
@@ -56,8 +144,53 @@ start_sources = [
 steps = 200000
 "#;
 
+// Observation: joint angles (7), joint velocities (7), goal - end effector (3), velocity of the end
+// effector (3). The start is the end effector seen from the goal.
+const PANDA_REACH_VALUES: &str = r#"
+[task]
+start_sources = [
+    { index = 14, velocity = 17, scale = -1.0 },
+    { index = 15, velocity = 18, scale = -1.0 },
+    { index = 16, velocity = 19, scale = -1.0 },
+]
+[run]
+steps = 30000
+[algorithm]
+discount = 0.95
+actor_learning_rate = 0.0003
+"#;
+
+const PANDA_REACH_JOINTS_VALUES: &str = r#"
+[task]
+start_sources = [
+    { index = 0, velocity = 7 },
+    { index = 1, velocity = 8 },
+    { index = 2, velocity = 9 },
+    { index = 3, velocity = 10 },
+    { index = 4, velocity = 11 },
+    { index = 5, velocity = 12 },
+    { index = 6, velocity = 13 },
+]
+[run]
+steps = 30000
+[algorithm]
+discount = 0.95
+actor_learning_rate = 0.0003
+"#;
+
+// Table 2 of the paper, the column of the Panda tasks.
+const PANDA_PAPER: &str = r#"
+[algorithm]
+discount = 0.95
+actor_learning_rate = 0.0003
+[exploration]
+warm_up_steps = 2000
+[replay]
+capacity_steps = 100000
+"#;
+
 impl TaskDefaults {
-    /// The task's values, its name included.
+    /// The task's values, name and id included.
     ///
     /// # Panics
     /// Never for the built-in tasks: a test parses each.
@@ -67,7 +200,18 @@ impl TaskDefaults {
         let task = table.get_mut("task").and_then(toml::Value::as_table_mut);
         let task = task.expect("a built-in task has a [task] table");
         task.insert("name".into(), self.name.into());
+        task.insert("id".into(), self.id.into());
         table
+    }
+
+    /// What lies over a preset for this task.
+    ///
+    /// # Panics
+    /// Never for the built-in tasks: a test parses each.
+    #[must_use]
+    pub fn over_preset(&self, preset: &str) -> Table {
+        let text = if preset == "paper" { self.paper } else { "" };
+        text.parse().expect("a built-in task is valid TOML")
     }
 }
 
@@ -75,4 +219,48 @@ impl TaskDefaults {
 #[must_use]
 pub fn task_defaults(name: &str) -> Option<&'static TaskDefaults> {
     TASKS.iter().find(|task| task.name == name)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::{ExperimentConfig, Layers, PRESETS};
+    use super::*;
+
+    fn config(name: &str, preset: usize) -> ExperimentConfig {
+        let task = task_defaults(name).unwrap();
+        let mut layers = Layers::new();
+        layers.add(task.name, task.table()).unwrap();
+        layers.add(PRESETS[preset].name, PRESETS[preset].table()).unwrap();
+        layers.add(task.name, task.over_preset(PRESETS[preset].name)).unwrap();
+        layers.finish().unwrap()
+    }
+
+    #[test]
+    fn every_task_is_complete() {
+        for task in &TASKS {
+            for preset in 0..PRESETS.len() {
+                let config = config(task.name, preset);
+                assert_eq!(
+                    (config.task.name.as_str(), config.task.id.as_str()),
+                    (task.name, task.id)
+                );
+                assert_eq!(config.task.start_sources.len(), task.action_len, "{}", task.name);
+            }
+        }
+    }
+
+    #[test]
+    fn the_paper_has_a_column_for_the_panda() {
+        for (name, discount, actor, warm_up, capacity) in [
+            ("reacher-v1", 0.99, 5e-4, 10_000, 1_000_000),
+            ("panda-reach", 0.95, 3e-4, 2_000, 100_000),
+            ("panda-reach-joints", 0.95, 3e-4, 2_000, 100_000),
+        ] {
+            let config = config(name, 1);
+            let algorithm = config.algorithm;
+            assert_eq!((algorithm.discount, algorithm.actor_learning_rate), (discount, actor));
+            assert_eq!(config.exploration.warm_up_steps, warm_up);
+            assert_eq!(config.replay.capacity_steps, capacity);
+        }
+    }
 }

@@ -23,7 +23,7 @@ use thiserror::Error;
 pub use action_scaling::ActionScaling;
 pub use dmp_head::{DmpHead, DmpWorkspace, HeadGradient};
 pub use matrix::{Keep, Matrix, Threads, product};
-pub use network::{Activations, Layer, MlpShape, forward, initial_parameters};
+pub use network::{Activations, Layer, MlpShape, SmallBatchNetwork, forward, initial_parameters};
 
 use crate::config::{ExperimentConfig, PolicyKind};
 use crate::dmp::DmpError;

@@ -126,6 +126,22 @@ pub fn forward(
     activations: &mut Activations,
     threads: Threads,
 ) {
+    let weights = |layer: &Layer| {
+        let weights = &parameters[layer.weights.clone()];
+        Matrix::row_major(weights, layer.outputs, layer.inputs).transposed()
+    };
+    forward_with(shape, parameters, &weights, inputs, activations, threads);
+}
+
+/// Runs the network with each layer's (inputs, outputs) weights as `weights` gives them.
+fn forward_with<'a>(
+    shape: &MlpShape,
+    parameters: &[f32],
+    weights: &dyn Fn(&Layer) -> Matrix<'a>,
+    inputs: &[f32],
+    activations: &mut Activations,
+    threads: Threads,
+) {
     assert_eq!(parameters.len(), shape.parameters_len(), "network parameters");
     let rows = inputs.len() / shape.inputs();
     let last = shape.layers().len() - 1;
@@ -138,14 +154,65 @@ pub fn forward(
             row.copy_from_slice(bias);
         }
         let inputs = Matrix::row_major(inputs, rows, layer.inputs);
-        let weights =
-            Matrix::row_major(&parameters[layer.weights.clone()], layer.outputs, layer.inputs);
-        product(out, inputs, weights.transposed(), Keep::Add, threads);
+        product(out, inputs, weights(layer), Keep::Add, threads);
         if index < last {
             for value in out.iter_mut() {
                 *value = value.max(0.0);
             }
         }
+    }
+}
+
+/// A network that runs on few rows at a time, as a worker's does, and changes rarely.
+///
+/// A product's cost is then that of reading the weights, and gemm reads them in the order
+/// (inputs, outputs). From the order of the flat parameters it rearranges them at every product,
+/// which takes three times as long as the product: here that is done once for each new policy.
+/// The results are those of [`forward`] up to rounding.
+#[derive(Debug, Clone)]
+pub struct SmallBatchNetwork {
+    shape: MlpShape,
+    /// As the flat parameters, weights (inputs, outputs).
+    parameters: Vec<f32>,
+}
+
+impl SmallBatchNetwork {
+    /// A network whose parameters are zero.
+    #[must_use]
+    pub fn new(shape: MlpShape) -> Self {
+        let parameters = vec![0.0; shape.parameters_len()];
+        Self { shape, parameters }
+    }
+
+    /// Takes over flat parameters.
+    ///
+    /// # Panics
+    /// If there are not as many as the shape has.
+    pub fn load(&mut self, parameters: &[f32]) {
+        assert_eq!(parameters.len(), self.parameters.len(), "network parameters");
+        for layer in self.shape.layers() {
+            self.parameters[layer.bias.clone()].copy_from_slice(&parameters[layer.bias.clone()]);
+            let from = &parameters[layer.weights.clone()];
+            let to = &mut self.parameters[layer.weights.clone()];
+            for (output, row) in from.chunks_exact(layer.inputs).enumerate() {
+                for (input, weight) in row.iter().enumerate() {
+                    to[input * layer.outputs + output] = *weight;
+                }
+            }
+        }
+    }
+
+    /// Runs the network on `inputs`, (rows, inputs), into `activations`.
+    ///
+    /// # Panics
+    /// If a length does not fit.
+    pub fn forward(&self, inputs: &[f32], activations: &mut Activations) {
+        let weights = |layer: &Layer| {
+            let weights = &self.parameters[layer.weights.clone()];
+            Matrix::row_major(weights, layer.inputs, layer.outputs)
+        };
+        let (shape, parameters) = (&self.shape, &self.parameters);
+        forward_with(shape, parameters, &weights, inputs, activations, Threads::ONE);
     }
 }
 
@@ -163,6 +230,26 @@ mod tests {
         let mut activations = Activations::new(&shape, 2);
         forward(&shape, &parameters, &[1.0, -1.0, 1.0, 1.0], &mut activations, Threads::ONE);
         assert_eq!(activations.output(&shape, 2), [0.25, 7.25]);
+    }
+
+    #[test]
+    fn a_network_for_few_rows_computes_the_same() {
+        let shape = MlpShape::new(vec![14, 256, 256, 20]);
+        let mut random = crate::seeds::stream(1, "test", 0);
+        let parameters = initial_parameters(&shape, &mut random);
+        let mut network = SmallBatchNetwork::new(shape.clone());
+        network.load(&parameters);
+        for rows in [1, 8, 16, 100] {
+            let inputs: Vec<f32> = (0..rows * 14).map(|i| (i as f32).sin()).collect();
+            let mut expected = Activations::new(&shape, rows);
+            forward(&shape, &parameters, &inputs, &mut expected, Threads::ONE);
+            let mut activations = Activations::new(&shape, rows);
+            network.forward(&inputs, &mut activations);
+            let both = activations.output(&shape, rows).iter().zip(expected.output(&shape, rows));
+            for (got, want) in both {
+                assert!((got - want).abs() < 1e-6, "{rows} rows: {got} {want}");
+            }
+        }
     }
 
     #[test]

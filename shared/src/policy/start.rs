@@ -56,7 +56,7 @@ impl StartState {
                     (angle, observation[*velocity] * velocity_scale)
                 }
                 StartSource::Value { index, velocity, scale } => {
-                    (scale * observation[*index], scale * observation[*velocity] * velocity_scale)
+                    (scale * observation[*index], observation[*velocity] * velocity_scale)
                 }
             },
         }

@@ -46,6 +46,23 @@ fn the_seven_joints_of_pusher_train() {
 }
 
 #[test]
+fn thrower_trains() {
+    trains("thrower", &[]);
+}
+
+#[test]
+fn both_panda_tasks_train_from_where_the_robot_is() {
+    trains("panda-reach", &["--set", "policy.start=observed"]);
+    trains("panda-reach-joints", &["--set", "policy.start=observed"]);
+}
+
+#[test]
+fn the_papers_older_versions_train() {
+    trains("reacher-v1", &["--preset", "paper"]);
+    trains("pusher-v0", &[]);
+}
+
+#[test]
 fn any_gymnasium_id_trains() {
     trains("Pendulum-v1", &[]);
 }
