@@ -10,6 +10,7 @@ from __future__ import annotations
 import contextlib
 import copy
 import math
+import sys
 import traceback
 from collections import deque
 
@@ -19,6 +20,7 @@ from gymnasium import spaces
 from gymnasium.envs import registration
 from numpy.typing import NDArray
 
+from dmprl import robotics_repair
 from dmprl.observation_names import names_of
 from dmprl.segment_env import (
     OBSERVATION_NAMES_MAX,
@@ -83,6 +85,8 @@ class GymnasiumSegmentEnv(SegmentEnv):
         self._untold: deque[str] = deque(maxlen=FAILURES_KEPT_MAX)
 
     def _registration(self, named: object) -> registration.EnvSpec:
+        if "gymnasium_robotics" in sys.modules:
+            robotics_repair.repair()
         if isinstance(named, type) and issubclass(named, gymnasium.Env):
             limit = getattr(named, "max_episode_steps", None)
             return registration.EnvSpec(
