@@ -26,8 +26,10 @@ fn refused(arguments: &[&str]) -> String {
 
 #[test]
 fn every_command_has_help_with_examples() {
-    for command in ["train", "resume", "eval", "tasks", "learner", "actor", "evaluator"] {
-        let output = dmprl(&[command, "--help"]);
+    let commands = ["train", "resume", "eval", "bench", "tasks", "learner", "actor", "evaluator"];
+    for command in commands.into_iter().chain(["bench rollout"]) {
+        let words: Vec<&str> = command.split(' ').chain(["--help"]).collect();
+        let output = dmprl(&words);
         assert!(output.status.success());
         let help = stdout(&output);
         assert!(help.contains("EXAMPLES"), "{command}");
@@ -50,6 +52,8 @@ fn wrong_use_names_the_nearest_right_one() {
         (&["tain"][..], "'train'"),
         (&["train", "reachr"], "did you mean `reacher`"),
         (&["train", "reacher", "--stps", "5"], "'--steps'"),
+        (&["bench", "rollot"], "'rollout'"),
+        (&["bench", "rollout", "--task", "reachr"], "did you mean `reacher`"),
         (&["train", "reacher", "--policy", "dpm"], "possible values: dmp, mlp"),
         (&["train", "reacher", "--algo", "dpg"], "'ddpg'"),
         (&["train", "reacher", "--preset", "papr"], "'paper'"),
@@ -85,6 +89,13 @@ fn values_that_cannot_be_are_wrong_use() {
         &["eval", "/nowhere/at/all"],
         &["eval", "/nowhere/at/all", "--policy", "worst"],
         &["eval", "/nowhere/at/all", "--episodes", "0"],
+        &["bench"],
+        &["bench", "rollout"],
+        &["bench", "rollout", "--task", "reacher", "--seconds", "0"],
+        &["bench", "rollout", "--task", "reacher", "--seconds", "nan"],
+        &["bench", "rollout", "--task", "reacher", "--rounds", "0"],
+        &["bench", "rollout", "--task", "reacher", "--workers", "100000"],
+        &["bench", "rollout", "--task", "reacher", "--peer-python", "/nowhere/at/all"],
         &["learner", "--run", "x"],
     ] {
         refused(arguments);

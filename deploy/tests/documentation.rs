@@ -146,8 +146,12 @@ fn the_table_of_train_flags_is_complete() {
 
 #[test]
 fn every_flag_that_is_shown_exists() {
-    let commands = ["train", "resume", "eval", "tasks", "learner", "actor", "evaluator"];
-    let all: BTreeSet<_> = commands.iter().flat_map(|command| flags(&help(&[command]))).collect();
+    let commands =
+        ["train", "resume", "eval", "bench rollout", "tasks", "learner", "actor", "evaluator"];
+    let words = |command: &str| -> BTreeSet<String> {
+        flags(&help(&command.split(' ').collect::<Vec<_>>()))
+    };
+    let all: BTreeSet<_> = commands.iter().flat_map(|command| words(command)).collect();
     // Flags of other programs: cargo's, and docker's for the size of shared memory.
     let foreign = ["--release", "--check", "--shm-size"];
     for document in ["README.md", "ARCHITECTURE.md", "CHANGELOG.md"] {
@@ -160,8 +164,13 @@ fn every_flag_that_is_shown_exists() {
         for line in blocks(&text, "sh").iter().flat_map(|block| block.lines()) {
             let call = CALLS.iter().find_map(|call| line.split_once(call)).map(|(_, rest)| rest);
             let Some(rest) = call else { continue };
-            let command = rest.split(' ').next().unwrap();
-            let existing = flags(&help(&[command]));
+            let called = |command: &&&str| {
+                rest.strip_prefix(**command)
+                    .is_some_and(|more| more.is_empty() || more.starts_with(' '))
+            };
+            let command = commands.iter().find(called);
+            let command = command.unwrap_or_else(|| panic!("{document}: `{line}`: no command"));
+            let existing = words(command);
             let unknown: Vec<_> = flags(rest).difference(&existing).cloned().collect();
             assert!(unknown.is_empty(), "{document}: `{line}`: {command} has no {unknown:?}");
         }

@@ -409,9 +409,14 @@ pub fn env_steps_of_checkpoint(run: &str) -> Option<u64> {
 /// When the run has no manifest.
 pub fn shared_memory_of(run: &str) -> Vec<PathBuf> {
     let manifest = json_file(run, "manifest.json");
-    let run_id = manifest["run_id"].as_str().expect("a manifest with a run_id");
+    shared_memory_named(manifest["run_id"].as_str().expect("a manifest with a run_id"))
+}
+
+/// What lies in this user's shared memory with `text` in its name: a run's id is, and at the name's
+/// end the id of the process that made it.
+pub fn shared_memory_named(text: &str) -> Vec<PathBuf> {
     let user = fs::metadata("/proc/self").map_or(0, |metadata| metadata.uid());
     let Ok(entries) = fs::read_dir(format!("/dev/shm/dmprl-{user}")) else { return Vec::new() };
-    let names_run = |path: &PathBuf| path.to_string_lossy().contains(run_id);
-    entries.flatten().map(|entry| entry.path()).filter(names_run).collect()
+    let named = |path: &PathBuf| path.to_string_lossy().contains(text);
+    entries.flatten().map(|entry| entry.path()).filter(named).collect()
 }

@@ -1,5 +1,6 @@
 //! The command line: what may be typed, its help, and who answers.
 
+mod bench;
 mod configuration;
 mod eval;
 mod resume;
@@ -51,6 +52,8 @@ enum Command {
     Resume(resume::ResumeArgs),
     /// Evaluate a run's policy without noise.
     Eval(eval::EvalArgs),
+    /// Measure a part of the system beside what else could do its work.
+    Bench(bench::BenchArgs),
     /// List the tasks with a short name.
     Tasks(tasks::TasksArgs),
     /// A run's learner process; started by train.
@@ -85,6 +88,7 @@ fn run(command: Command) -> anyhow::Result<Outcome> {
         Command::Train(args) => train::run(&args),
         Command::Resume(args) => resume::run(&args),
         Command::Eval(args) => eval::run(&args),
+        Command::Bench(args) => bench::run(&args),
         Command::Tasks(args) => tasks::run(&args),
         Command::Learner(args) => roles::learner(&args).map(|()| Outcome::Done),
         Command::Actor(args) => roles::actor(&args).map(|()| Outcome::Done),

@@ -183,7 +183,7 @@ fn flags(args: &TrainArgs) -> anyhow::Result<Vec<Flag>> {
     Ok(given.collect())
 }
 
-fn python_path(paths: &[PathBuf]) -> anyhow::Result<Option<Value>> {
+pub(super) fn python_path(paths: &[PathBuf]) -> anyhow::Result<Option<Value>> {
     let texts = paths.iter().map(|path| {
         let text = path.to_str().map(|text| Value::String(text.to_owned()));
         text.ok_or_else(|| wrong_use(format!("--python-path {}: no UTF-8", path.display())))
@@ -192,7 +192,7 @@ fn python_path(paths: &[PathBuf]) -> anyhow::Result<Option<Value>> {
     Ok((!texts.is_empty()).then_some(Value::Array(texts)))
 }
 
-fn absolute_folder(path: &str) -> anyhow::Result<String> {
+pub(super) fn absolute_folder(path: &str) -> anyhow::Result<String> {
     let absolute = std::fs::canonicalize(path)
         .map_err(|error| wrong_use(format!("python path {path}: {error}")))?;
     if !absolute.is_dir() {
@@ -202,7 +202,7 @@ fn absolute_folder(path: &str) -> anyhow::Result<String> {
 }
 
 /// `DMPRL_` variables must be text; others may be anything and are none of our business.
-fn environment() -> anyhow::Result<Vec<(String, String)>> {
+pub(super) fn environment() -> anyhow::Result<Vec<(String, String)>> {
     let mut texts = Vec::new();
     for (name, value) in std::env::vars_os() {
         let Ok(name) = name.into_string() else { continue };

@@ -119,7 +119,7 @@ async fn read_reports(output: ChildStdout, process: Process, events: mpsc::Sende
 }
 
 /// `exit status 3`, `signal 9 (SIGKILL), perhaps for want of memory`.
-pub(super) fn describe(status: ExitStatus) -> String {
+pub(crate) fn describe(status: ExitStatus) -> String {
     let signal = match (status.code(), status.signal()) {
         (Some(ENV_HUNG_STATUS), _) => {
             return format!("exit status {ENV_HUNG_STATUS}, an environment hung");

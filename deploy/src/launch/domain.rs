@@ -17,7 +17,7 @@ fn parent() -> PathBuf {
 ///
 /// # Errors
 /// The directory cannot be made, or someone else has made it.
-pub(super) fn create(token: &str) -> anyhow::Result<Domain> {
+pub(crate) fn create(token: &str) -> anyhow::Result<Domain> {
     let parent = parent();
     remove_abandoned(&parent).with_context(|| {
         format!("cannot remove what dead runs have left in {}", parent.display())

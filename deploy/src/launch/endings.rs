@@ -251,7 +251,7 @@ impl Supervisor {
 }
 
 /// The log's last lines below a heading that names it, ready to follow an error.
-pub(super) fn log_tail(path: &Path) -> String {
+pub(crate) fn log_tail(path: &Path) -> String {
     let read = || -> std::io::Result<Vec<u8>> {
         let mut file = File::open(path)?;
         let len = file.metadata()?.len();

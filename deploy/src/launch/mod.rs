@@ -29,9 +29,13 @@ mod session;
 mod signals;
 mod supervisor;
 
+pub(crate) use child::describe;
+pub(crate) use domain::create as create_domain;
+pub(crate) use endings::log_tail;
 pub use evaluate::{EvaluationPlan, evaluate};
 pub use launcher::{Launcher, Process};
 pub use limits::TimeLimits;
 pub use session::{RESUME_WAIT, SessionPlan, session, title};
 pub use signals::interrupts;
+pub(crate) use signals::is_ignored;
 pub use supervisor::{Ending, SessionReport, SupervisorPlan, supervise};

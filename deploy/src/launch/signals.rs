@@ -15,7 +15,7 @@ pub fn interrupts() -> anyhow::Result<mpsc::Receiver<()>> {
     let (sender, receiver) = mpsc::channel(INTERRUPTS_MAX);
     let mut kinds = vec![SignalKind::interrupt(), SignalKind::terminate()];
     // `nohup` has it ignored, and means that.
-    if !is_ignored(SignalKind::hangup()) {
+    if !is_ignored(SignalKind::hangup().as_raw_value()) {
         kinds.push(SignalKind::hangup());
     }
     for kind in kinds {
@@ -33,11 +33,11 @@ pub fn interrupts() -> anyhow::Result<mpsc::Receiver<()>> {
 }
 
 /// Whether whoever started us had this signal ignored, as the kernel tells it.
-fn is_ignored(kind: SignalKind) -> bool {
+pub(crate) fn is_ignored(signal: i32) -> bool {
     let status = std::fs::read_to_string("/proc/self/status").unwrap_or_default();
     let mask = status
         .lines()
         .find_map(|line| line.strip_prefix("SigIgn:"))
         .and_then(|mask| u64::from_str_radix(mask.trim(), 16).ok());
-    mask.is_some_and(|mask| mask >> (kind.as_raw_value() - 1) & 1 == 1)
+    mask.is_some_and(|mask| mask >> (signal - 1) & 1 == 1)
 }

@@ -20,6 +20,8 @@ mod setup;
 
 pub use arguments::{ActorArgs, EvaluatorArgs, LearnerArgs};
 pub use control_pipe::{ControlPipe, ORPHAN_LIMIT, ORPHANED_LEARNER_LIMIT};
+pub(crate) use learner::plan;
+pub(crate) use setup::Setup;
 
 /// Replays, updates, publishes, writes checkpoints; with `--one-process` also steps and
 /// evaluates.

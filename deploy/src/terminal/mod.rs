@@ -3,11 +3,13 @@
 
 mod display;
 mod format;
+mod rounds;
 mod setup;
 mod summary;
 
 pub use display::{Display, ProgressStyle};
 pub use format::{duration, grouped, plus_minus, std_of};
+pub use rounds::RoundsProgress;
 pub use setup::SetupProgress;
 pub(crate) use summary::shown;
 pub use summary::summary;

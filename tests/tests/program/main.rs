@@ -8,6 +8,7 @@
     reason = "helpers of tests; clippy.toml covers only the tests themselves"
 )]
 
+mod bench;
 mod deaths;
 mod determinism;
 mod endings;

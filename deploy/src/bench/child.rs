@@ -1,0 +1,139 @@
+//! A child process that speaks in lines and never outlives this one.
+
+use std::io::{BufRead, BufReader, Read, Write};
+use std::path::{Path, PathBuf};
+use std::process::{Child, ChildStdin, ChildStdout, Command, Stdio};
+use std::sync::mpsc::{self, Receiver, SyncSender, TryRecvError};
+use std::thread;
+use std::time::{Duration, Instant};
+
+use anyhow::{Context, anyhow};
+
+use super::watch::Watch;
+use crate::launch::{describe, log_tail};
+
+/// Lines that were said and not asked for yet; full: the child waits.
+const LINES_MAX: usize = 64;
+/// A longer line is none of ours.
+const LINE_BYTES_MAX: u64 = 1 << 20;
+
+/// A running child; dropped, it is killed and waited for. It holds nothing that a kill could
+/// damage, and its input ends with this process if that is killed.
+pub(super) struct LineChild {
+    name: String,
+    child: Child,
+    input: ChildStdin,
+    lines: Receiver<String>,
+    log: PathBuf,
+    started: Instant,
+}
+
+impl LineChild {
+    /// Starts `command`, whose standard error goes to `log` already.
+    pub(super) fn start(name: String, mut command: Command, log: &Path) -> anyhow::Result<Self> {
+        command.stdin(Stdio::piped()).stdout(Stdio::piped());
+        let started = Instant::now();
+        let program = command.get_program().to_owned();
+        let mut child =
+            command.spawn().with_context(|| format!("cannot start {name} ({program:?})"))?;
+        let (sender, lines) = mpsc::sync_channel(LINES_MAX);
+        let streams = (child.stdin.take(), child.stdout.take());
+        let (Some(input), Some(output)) = streams else {
+            // Unreachable: both are asked for above.
+            let _ = child.kill();
+            return Err(anyhow!("{name} has no standard input or output"));
+        };
+        // A thread, because reading a line cannot time out. It ends with the child's output.
+        thread::spawn(move || read_lines(output, &sender));
+        Ok(Self { name, child, input, lines, log: log.to_owned(), started })
+    }
+
+    /// Its name, for messages.
+    pub(super) fn name(&self) -> &str {
+        &self.name
+    }
+
+    /// When it was started.
+    pub(super) fn started(&self) -> Instant {
+        self.started
+    }
+
+    /// Says one line to it.
+    pub(super) fn say(&mut self, line: &str) -> anyhow::Result<()> {
+        let result = writeln!(self.input, "{line}").and_then(|()| self.input.flush());
+        result.map_err(|_| self.death())
+    }
+
+    /// The next line that it says.
+    pub(super) fn next(
+        &mut self,
+        watch: &Watch,
+        limit: Duration,
+        what: &str,
+    ) -> anyhow::Result<String> {
+        let next = watch.next(&self.lines, limit, &format!("{what} of {}", self.name));
+        match next.with_context(|| log_tail(&self.log).trim().to_owned()) {
+            Ok(Some(line)) => Ok(line),
+            Ok(None) => Err(self.death()),
+            Err(error) => Err(error),
+        }
+    }
+
+    /// What it has said meanwhile.
+    pub(super) fn said(&mut self) -> anyhow::Result<Vec<String>> {
+        let mut said = Vec::new();
+        loop {
+            match self.lines.try_recv() {
+                Ok(line) => said.push(line),
+                Err(TryRecvError::Empty) => return Ok(said),
+                Err(TryRecvError::Disconnected) => return Err(self.death()),
+            }
+        }
+    }
+
+    /// The most memory that it has had at once [bytes]: `VmHWM`, when the system tells it.
+    pub(super) fn resident_bytes_max(&self) -> Option<u64> {
+        let path = format!("/proc/{}/status", self.child.id());
+        let status = std::fs::read_to_string(path).ok()?;
+        let line = status.lines().find_map(|line| line.strip_prefix("VmHWM:"))?;
+        line.trim().strip_suffix("kB")?.trim().parse::<u64>().ok().map(|kib| kib * 1024)
+    }
+
+    /// Processor time of its first thread so far [s], when the system tells it.
+    pub(super) fn cpu_s(&self) -> Option<f64> {
+        let path = format!("/proc/{}/schedstat", self.child.id());
+        let text = std::fs::read_to_string(path).ok()?;
+        text.split_whitespace().next()?.parse::<f64>().ok().map(|nanoseconds| nanoseconds * 1e-9)
+    }
+
+    /// Its end as an error, with the last lines of its log.
+    fn death(&mut self) -> anyhow::Error {
+        // It has closed its output or does not read: whatever it does, it is of no more use.
+        let _ = self.child.kill();
+        let how = self.child.wait().map_or_else(|error| error.to_string(), describe);
+        anyhow!("{} died: {how}{}", self.name, log_tail(&self.log))
+    }
+}
+
+impl Drop for LineChild {
+    fn drop(&mut self) {
+        // An error means that it has ended already.
+        let _ = self.child.kill();
+        let _ = self.child.wait();
+    }
+}
+
+fn read_lines(output: ChildStdout, lines: &SyncSender<String>) {
+    let mut reader = BufReader::new(output);
+    let mut line = String::new();
+    loop {
+        line.clear();
+        match (&mut reader).take(LINE_BYTES_MAX).read_line(&mut line) {
+            Ok(read) if read > 0 => {}
+            _ => return,
+        }
+        if lines.send(line.trim_end().to_owned()).is_err() {
+            return;
+        }
+    }
+}

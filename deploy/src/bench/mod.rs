@@ -1,0 +1,20 @@
+//! `dmprl bench`: how fast a part of the system is, beside what else could do the same work.
+//!
+//! `rollout` measures the workers of a run. It plays the learner for real `dmprl actor` processes
+//! (`workers`, `sink`) and, in turn with them, lets processes of `dmprl.bench_rollout` in Python do
+//! the same work (`peers`, `numpy_plan`); `figures` and `table` are what comes out. Everything
+//! waits in `watch` or in `child`, where an interrupt is seen.
+
+mod child;
+mod figures;
+mod numpy_plan;
+mod peers;
+mod rollout;
+mod sink;
+mod table;
+mod watch;
+mod workers;
+
+pub use figures::Figures;
+pub use numpy_plan::{Controls, NumpyPlan};
+pub use rollout::{RolloutBench, rollout};

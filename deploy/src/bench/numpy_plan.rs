@@ -1,0 +1,94 @@
+//! What the Python side must know to act as the workers do: `envs_py/dmprl/numpy_policy.py`.
+
+use std::path::{Path, PathBuf};
+
+use anyhow::Context;
+use clap::ValueEnum;
+use dmprl_shared::config::{
+    DmpConfig, ExperimentConfig, ExplorationConfig, PolicyConfig, PolicyKind, TaskConfig,
+};
+use dmprl_shared::dmp::{Dmp, SegmentMap};
+use dmprl_shared::policy::Policy;
+use dmprl_shared::spec::EnvSpec;
+use serde::Serialize;
+
+/// What physics alone is driven by.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, ValueEnum)]
+#[serde(rename_all = "snake_case")]
+pub enum Controls {
+    /// What the policy decides, with its noise.
+    Policy,
+    /// Actions drawn uniformly within their bounds.
+    Random,
+}
+
+/// A task, its environments and a policy with its parameters, as one JSON object.
+#[derive(Debug, Serialize)]
+pub struct NumpyPlan<'a> {
+    task: &'a TaskConfig,
+    policy: &'a PolicyConfig,
+    dmp: &'a DmpConfig,
+    exploration: &'a ExplorationConfig,
+    spec: &'a EnvSpec,
+    seed: u64,
+    env_count: usize,
+    /// What draws the actions that lead to the controls of physics alone.
+    controls: Controls,
+    /// Environment steps of one decision.
+    decision_steps: usize,
+    /// Of the network, input first, output last.
+    widths: Vec<usize>,
+    /// From (y0, yd0, g, w) to the samples of one dimension, (3K, 3+N); empty without a DMP.
+    segment_map: Vec<f32>,
+    /// File of the network's flat parameters, 32-bit little-endian.
+    parameters: PathBuf,
+}
+
+impl<'a> NumpyPlan<'a> {
+    /// Writes the parameters into `folder`, and the plan that names them beside; returns the
+    /// plan's path.
+    ///
+    /// # Errors
+    /// The DMP does not fit, or what the file system refuses.
+    pub fn write(
+        folder: &Path,
+        (config, spec, controls): (&'a ExperimentConfig, &'a EnvSpec, Controls),
+        policy: &Policy,
+        parameters: &[f32],
+    ) -> anyhow::Result<PathBuf> {
+        let shape = policy.shape();
+        let widths = std::iter::once(shape.inputs());
+        let parameters_path = folder.join("parameters.f32");
+        let plan = Self {
+            task: &config.task,
+            policy: &config.policy,
+            dmp: &config.dmp,
+            exploration: &config.exploration,
+            spec,
+            seed: config.run.seed,
+            env_count: config.actors.envs_per_worker,
+            controls,
+            decision_steps: config.policy.decision_steps(),
+            widths: widths.chain(shape.layers().iter().map(|layer| layer.outputs)).collect(),
+            segment_map: segment_map(config)?,
+            parameters: parameters_path.clone(),
+        };
+        let bytes: Vec<u8> = parameters.iter().flat_map(|value| value.to_le_bytes()).collect();
+        let text = serde_json::to_vec(&plan).context("cannot write the plan as JSON")?;
+        let path = folder.join("plan.json");
+        for (path, bytes) in [(&parameters_path, bytes), (&path, text)] {
+            std::fs::write(path, bytes)
+                .with_context(|| format!("cannot write {}", path.display()))?;
+        }
+        Ok(path)
+    }
+}
+
+fn segment_map(config: &ExperimentConfig) -> anyhow::Result<Vec<f32>> {
+    if config.policy.kind == PolicyKind::Mlp {
+        return Ok(Vec::new());
+    }
+    let dmp = Dmp::new(&config.dmp, config.policy.segment_steps)?;
+    let weight_scale = config.policy.weight_range * dmp.omega() * dmp.omega();
+    Ok(SegmentMap::new(&dmp, weight_scale).matrix().to_vec())
+}

@@ -1,0 +1,135 @@
+//! `dmprl bench rollout`: workers and what they are compared with, measured in turn.
+//!
+//! In turn, because a machine's speed drifts: in every round each of them runs once for the same
+//! time, the others asleep, and the median over the rounds counts. A worker sleeps because its
+//! queue is full, the others because nobody has asked them.
+
+use std::path::PathBuf;
+use std::time::Duration;
+
+use anyhow::Context;
+use dmprl_shared::config::ExperimentConfig;
+
+use super::figures::{Figures, WORKER, WorkerFigures};
+use super::numpy_plan::{Controls, NumpyPlan};
+use super::peers::{Peer, PeerKind, Stage};
+use super::watch::{Interrupted, Watch};
+use super::workers::Workers;
+use crate::launch::{Launcher, create_domain};
+use crate::run_directory::{Manifest, RunDirectory};
+use crate::terminal::RoundsProgress;
+
+/// A worker that waits for the next round is no reason for a warning [s].
+const SEND_DEADLINE_S: f64 = 1e6;
+
+/// What to measure.
+pub struct RolloutBench {
+    /// The program that plays the workers: this one.
+    pub program: PathBuf,
+    /// The resolved configuration.
+    pub config: ExperimentConfig,
+    /// The Python virtual environment of the workers.
+    pub venv: PathBuf,
+    /// The folder with the Python package.
+    pub package_path: PathBuf,
+    /// The interpreter that EnvPool runs in.
+    pub peer_python: PathBuf,
+    /// What drives physics alone.
+    pub controls: Controls,
+    /// How often each is measured.
+    pub rounds: usize,
+    /// How long each time.
+    pub duration: Duration,
+}
+
+/// Measures; none when the user interrupted it. Leaves no process and no file behind.
+///
+/// # Errors
+/// A worker or a peer could not be started or has died.
+pub fn rollout(bench: RolloutBench) -> anyhow::Result<Option<Figures>> {
+    match measure(bench) {
+        Err(error) if error.is::<Interrupted>() => Ok(None),
+        result => result.map(Some),
+    }
+}
+
+fn measure(mut bench: RolloutBench) -> anyhow::Result<Figures> {
+    let watch = Watch::start()?;
+    bench.config.actors.send_deadline_s = SEND_DEADLINE_S;
+    let folder = tempfile::Builder::new().prefix("dmprl-bench-").tempdir();
+    let folder = folder.context("cannot make a folder for the workers' run")?;
+    let manifest = Manifest::new(None)?;
+    let run = RunDirectory::create(&folder.path().join("run"), &bench.config, &manifest)?;
+    // Everything below is dropped in reverse order: processes, shared memory, files.
+    let domain = create_domain(&format!("{}-{}", manifest.run_id, std::process::id()))?;
+    let launcher = Launcher {
+        program: bench.program.clone(),
+        run: run.clone(),
+        venv: Some(bench.venv.clone()),
+        domain: Some(domain.path().to_owned()),
+        resume: false,
+        init_from: None,
+        sessions_before: 0,
+    };
+    let progress = RoundsProgress::new(bench.rounds);
+    progress.preparing("starting the workers");
+    // Alone, so that the time to the first segment is the workers' own.
+    let mut workers = Workers::start(&launcher, &domain, &watch)?;
+    progress.preparing("starting what they are compared with");
+    let mut figures = Figures::new(&bench, &workers.spec, manifest.machine);
+    let mut peers = start_peers(&bench, &run, &workers, &watch, &mut figures)?;
+    let mut sink_cpu_s = 0.0;
+    let mut measured_s = 0.0;
+    for round in 0..bench.rounds {
+        progress.round(round);
+        for peer in &mut peers {
+            progress.measuring(peer.kind.name());
+            figures.add(peer.kind.name(), peer.measure(&watch, bench.duration)?);
+        }
+        progress.measuring(WORKER);
+        let (round, window) = workers.measure(&watch, bench.duration)?;
+        figures.add(WORKER, round);
+        sink_cpu_s += window.cpu_s;
+        measured_s += window.seconds;
+    }
+    let faults = workers.faults();
+    figures.workers = WorkerFigures {
+        first_segment_s: workers.first_segment_s,
+        rss_bytes: workers.resident_bytes_max(),
+        sink_cpu_share: sink_cpu_s / measured_s,
+        rejected: faults.rejected,
+        lost: faults.lost,
+    };
+    Ok(figures)
+}
+
+/// Starts every peer; those that are not to be had here become a note.
+fn start_peers(
+    bench: &RolloutBench,
+    run: &RunDirectory,
+    workers: &Workers,
+    watch: &Watch,
+    figures: &mut Figures,
+) -> anyhow::Result<Vec<Peer>> {
+    let Workers { spec, policy, parameters, .. } = workers;
+    let plan =
+        NumpyPlan::write(run.path(), (&bench.config, spec, bench.controls), policy, parameters)?;
+    let package_path = bench.package_path.clone();
+    let stage = Stage { run, package_path, plan, workers: bench.config.actors.workers };
+    let own = bench.venv.join("bin/python");
+    // All at once: most of a start is reading Python's packages.
+    let started = PeerKind::ALL.map(|kind| {
+        let python = if kind == PeerKind::EnvPool { &bench.peer_python } else { &own };
+        Peer::start(kind, python, &stage)
+    });
+    let mut peers = Vec::new();
+    for peer in started {
+        let mut peer = peer?;
+        let ready = peer.ready(watch)?;
+        figures.note(peer.kind.name(), ready.as_ref().unwrap_or_else(|why| why));
+        if ready.is_ok() {
+            peers.push(peer);
+        }
+    }
+    Ok(peers)
+}

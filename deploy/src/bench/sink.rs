@@ -1,0 +1,259 @@
+//! The learner's place, taken by a thread that only takes segments, checks them and counts.
+//!
+//! Between two measurements it takes nothing: the workers' queues fill and the workers sleep, which
+//! leaves the machine to whatever is measured next.
+
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::mpsc::{self, Receiver, RecvTimeoutError, Sender};
+use std::thread::{self, JoinHandle};
+use std::time::{Duration, Instant};
+
+use dmprl_shared::segment::{Expected, Segment, SegmentHeader, check};
+use dmprl_shared::transport::shared_memory::LearnerEnd;
+use dmprl_shared::transport::{ParameterPublisher, SegmentReceiver, TransportError};
+use rustix::time::{ClockId, clock_gettime};
+
+/// Sleep after every queue was found empty: the learner's order of magnitude, at a few per cent of
+/// one core.
+const IDLE: Duration = Duration::from_micros(200);
+/// Between two cleanings of what dead workers left.
+const MAINTENANCE_INTERVAL: Duration = Duration::from_millis(250);
+/// Between two looks for new workers that have no policy yet, while workers start.
+const GREETING_INTERVAL: Duration = Duration::from_millis(5);
+/// Taken before the clock starts: the stale segments of the full queues, and the workers' way back
+/// to their pace.
+const SETTLE: Duration = Duration::from_millis(100);
+
+/// What the sink is asked for.
+#[derive(Debug, Clone, Copy)]
+pub(super) enum Request {
+    /// Take segments until each worker has delivered one.
+    FirstOfEach,
+    /// Take segments, and count those of so much time.
+    Measure(Duration),
+}
+
+/// What the sink answers.
+#[derive(Debug)]
+pub(super) enum Answer {
+    /// When the first segment of each worker came.
+    FirstOfEach(Vec<Instant>),
+    /// What was taken.
+    Measured(Window),
+}
+
+/// What came in during one measurement.
+#[derive(Debug, Clone, Copy, Default, PartialEq)]
+pub(super) struct Window {
+    /// Environment steps in the segments taken.
+    pub(super) env_steps: u64,
+    /// Its length [s].
+    pub(super) seconds: f64,
+    /// Processor time of the sink itself [s].
+    pub(super) cpu_s: f64,
+}
+
+/// Segments that should not be, over all measurements.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+pub(super) struct Faults {
+    /// Refused for what they hold, or come twice.
+    pub(super) rejected: u64,
+    /// Missing in their worker's sequence.
+    pub(super) lost: u64,
+}
+
+/// The sink's thread. Dropped, it is stopped and waited for.
+pub(super) struct Sink {
+    requests: Option<Sender<Request>>,
+    answers: Receiver<Result<(Answer, Faults), TransportError>>,
+    stop: Arc<AtomicBool>,
+    thread: Option<JoinHandle<()>>,
+}
+
+impl Sink {
+    /// Begins; nothing is taken before the first request.
+    pub(super) fn start(end: LearnerEnd, expected: Expected) -> Self {
+        let (requests, asked) = mpsc::channel();
+        let (sender, answers) = mpsc::channel();
+        let stop = Arc::new(AtomicBool::new(false));
+        let taker = Taker {
+            end,
+            expected,
+            stop: Arc::clone(&stop),
+            segment: Segment::zeroed(expected.layout),
+            sequences: vec![0; expected.worker_count as usize],
+            faults: Faults::default(),
+            maintained: Instant::now(),
+        };
+        let thread = thread::spawn(move || taker.serve(&asked, &sender));
+        Self { requests: Some(requests), answers, stop, thread: Some(thread) }
+    }
+
+    /// Asks; the answer comes on [`Sink::answers`].
+    pub(super) fn ask(&self, request: Request) {
+        // A thread that has ended has said why, and the next look at the answers shows it.
+        let _ = self.requests.as_ref().map(|requests| requests.send(request));
+    }
+
+    /// One answer to each request, or what went wrong.
+    pub(super) fn answers(&self) -> &Receiver<Result<(Answer, Faults), TransportError>> {
+        &self.answers
+    }
+}
+
+impl Drop for Sink {
+    fn drop(&mut self) {
+        self.stop.store(true, Ordering::Release);
+        self.requests = None;
+        // A panic of the thread was reported where it happened.
+        let _ = self.thread.take().map(JoinHandle::join);
+    }
+}
+
+struct Taker {
+    end: LearnerEnd,
+    expected: Expected,
+    stop: Arc<AtomicBool>,
+    segment: Segment,
+    /// Last sequence number of each worker; 0 before the first.
+    sequences: Vec<u64>,
+    faults: Faults,
+    maintained: Instant,
+}
+
+impl Taker {
+    fn serve(
+        mut self,
+        requests: &Receiver<Request>,
+        answers: &Sender<Result<(Answer, Faults), TransportError>>,
+    ) {
+        loop {
+            let answer = match requests.recv_timeout(MAINTENANCE_INTERVAL) {
+                Ok(Request::FirstOfEach) => self.first_of_each().map(Answer::FirstOfEach),
+                Ok(Request::Measure(duration)) => self.measure(duration).map(Answer::Measured),
+                Err(RecvTimeoutError::Timeout) => match self.maintain() {
+                    Ok(()) => continue,
+                    Err(error) => Err(error),
+                },
+                Err(RecvTimeoutError::Disconnected) => return,
+            };
+            let failed = answer.is_err();
+            let faults = self.faults;
+            if answers.send(answer.map(|answer| (answer, faults))).is_err() || failed {
+                return;
+            }
+        }
+    }
+
+    fn first_of_each(&mut self) -> Result<Vec<Instant>, TransportError> {
+        let mut first: Vec<Option<Instant>> = vec![None; self.sequences.len()];
+        let mut greeted = Instant::now();
+        while !self.stop.load(Ordering::Acquire) && first.iter().any(Option::is_none) {
+            match self.take()? {
+                Some(header) => {
+                    // A worker id out of range was refused, and belongs to nobody.
+                    if let Some(first) = first.get_mut(header.worker_id as usize) {
+                        first.get_or_insert_with(Instant::now);
+                    }
+                }
+                None => thread::sleep(IDLE),
+            }
+            if greeted.elapsed() >= GREETING_INTERVAL {
+                ParameterPublisher::maintain(&mut self.end.parameters)?;
+                greeted = Instant::now();
+            }
+            self.maintain_in_time()?;
+        }
+        Ok(first.into_iter().flatten().collect())
+    }
+
+    fn measure(&mut self, duration: Duration) -> Result<Window, TransportError> {
+        self.take_for(SETTLE)?;
+        let cpu_s = cpu_s();
+        let (env_steps, seconds) = self.take_for(duration)?;
+        Ok(Window { env_steps, seconds, cpu_s: self::cpu_s() - cpu_s })
+    }
+
+    /// Environment steps taken in so much time, and how much time it really was [s].
+    fn take_for(&mut self, duration: Duration) -> Result<(u64, f64), TransportError> {
+        let start = Instant::now();
+        let mut env_steps = 0;
+        while start.elapsed() < duration && !self.stop.load(Ordering::Acquire) {
+            match self.take()? {
+                Some(header) => env_steps += u64::from(header.steps_len),
+                None => {
+                    self.maintain_in_time()?;
+                    thread::sleep(IDLE);
+                }
+            }
+        }
+        Ok((env_steps, start.elapsed().as_secs_f64()))
+    }
+
+    /// Takes the next segment and does what a learner does first: check it and follow its worker's
+    /// sequence. One that is refused counts no steps.
+    fn take(&mut self) -> Result<Option<SegmentHeader>, TransportError> {
+        if !self.end.segments.try_receive(&mut self.segment)? {
+            return Ok(None);
+        }
+        let mut header = self.segment.header;
+        let sound = check(&header, &self.segment.block, &self.expected).is_ok();
+        let last = self.sequences.get_mut(header.worker_id as usize).filter(|_| sound);
+        if !follow(last, header.sequence, &mut self.faults) {
+            header.steps_len = 0;
+        }
+        Ok(Some(header))
+    }
+
+    fn maintain_in_time(&mut self) -> Result<(), TransportError> {
+        if self.maintained.elapsed() < MAINTENANCE_INTERVAL {
+            return Ok(());
+        }
+        self.maintain()
+    }
+
+    fn maintain(&mut self) -> Result<(), TransportError> {
+        self.maintained = Instant::now();
+        SegmentReceiver::maintain(&mut self.end.segments)?;
+        ParameterPublisher::maintain(&mut self.end.parameters)
+    }
+}
+
+/// Whether a segment is the first of its number; `last` is that of its worker, none if the segment
+/// was refused already.
+fn follow(last: Option<&mut u64>, sequence: u64, faults: &mut Faults) -> bool {
+    match last {
+        Some(last) if sequence > *last => {
+            faults.lost += sequence - *last - 1;
+            *last = sequence;
+            true
+        }
+        _ => {
+            faults.rejected += 1;
+            false
+        }
+    }
+}
+
+/// Processor time of the calling thread so far [s].
+fn cpu_s() -> f64 {
+    let time = clock_gettime(ClockId::ThreadCPUTime);
+    time.tv_sec as f64 + time.tv_nsec as f64 * 1e-9
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn gaps_are_lost_and_repetitions_are_rejected() {
+        let (mut last, mut faults) = (0, Faults::default());
+        let taken: Vec<bool> =
+            [1, 2, 5, 5, 4, 6].map(|number| follow(Some(&mut last), number, &mut faults)).to_vec();
+        assert_eq!(taken, [true, true, true, false, false, true]);
+        assert_eq!(faults, Faults { rejected: 2, lost: 2 });
+        assert!(!follow(None, 7, &mut faults));
+        assert_eq!(faults, Faults { rejected: 3, lost: 2 });
+    }
+}

@@ -1,0 +1,194 @@
+//! The workers of a run, with a sink in the learner's place.
+
+use std::sync::mpsc::RecvTimeoutError;
+use std::time::{Duration, Instant};
+
+use anyhow::{Context, anyhow, bail, ensure};
+use dmprl_shared::config::ExperimentConfig;
+use dmprl_shared::parameters::ParameterSnapshot;
+use dmprl_shared::policy::Policy;
+use dmprl_shared::seeds;
+use dmprl_shared::segment::Expected;
+use dmprl_shared::spec::EnvSpec;
+use dmprl_shared::transport::ParameterPublisher;
+use dmprl_shared::transport::shared_memory::{Domain, serve};
+
+use super::child::LineChild;
+use super::figures::Round;
+use super::sink::{Answer, Faults, Request, Sink, Window};
+use super::watch::Watch;
+use crate::control::{Command, Report};
+use crate::launch::{Launcher, Process, TimeLimits};
+use crate::roles::{Setup, plan};
+use crate::terminal::say;
+
+/// How late a worker's death may be seen.
+const LOOK: Duration = Duration::from_millis(20);
+/// Beyond what was asked for, a measurement may take so much longer.
+const MEASURE_SLACK: Duration = Duration::from_secs(30);
+
+/// Running workers, each with a full queue, and what they run.
+pub(super) struct Workers {
+    children: Vec<LineChild>,
+    sink: Sink,
+    faults: Faults,
+    /// The environment, as a worker has reported it.
+    pub(super) spec: EnvSpec,
+    /// The architecture.
+    pub(super) policy: Policy,
+    /// What the workers act with.
+    pub(super) parameters: Vec<f32>,
+    /// From a worker's start to its first delivered segment, the slowest worker's [s].
+    pub(super) first_segment_s: f64,
+}
+
+impl Workers {
+    /// Starts them, and returns when each has delivered its first segment.
+    pub(super) fn start(
+        launcher: &Launcher,
+        domain: &Domain,
+        watch: &Watch,
+    ) -> anyhow::Result<Self> {
+        let setup = Setup::read(launcher.run.path())?;
+        let config = &setup.config;
+        let limit = TimeLimits::default().ready;
+        let mut children = Vec::with_capacity(config.actors.workers);
+        for index in 0..u32::try_from(config.actors.workers).context("too many workers")? {
+            let process = Process::Actor(index);
+            let log = launcher.run.log_path(&process.to_string());
+            let command = launcher.command(process, 0)?;
+            children.push(LineChild::start(process.to_string(), command, &log)?);
+        }
+        let mut spec = None;
+        for child in &mut children {
+            spec = Some(environment(child, watch, limit)?);
+        }
+        let spec = spec.context("no worker")?;
+        let policy = Policy::new(config, &spec)?;
+        let mut random = seeds::stream(config.run.seed, "actor parameters", 0);
+        let snapshot = ParameterSnapshot {
+            version: 1,
+            // The warm-up is over: the network decides from the first segment on.
+            env_steps: config.exploration.warm_up_steps,
+            architecture_hash: policy.architecture_hash(),
+            values: policy.initial_parameters(&mut random),
+        };
+        let mut end = serve(domain.path(), &plan(&setup, &policy))?;
+        end.parameters.publish(&snapshot)?;
+        let sink = Sink::start(end, expected(&setup, &policy)?);
+        let mut workers = Self {
+            children,
+            sink,
+            faults: Faults::default(),
+            spec,
+            policy,
+            parameters: snapshot.values,
+            first_segment_s: 0.0,
+        };
+        workers.attach(domain, watch, limit)?;
+        Ok(workers)
+    }
+
+    /// What all workers together deliver in so much time, and what the sink took for it.
+    pub(super) fn measure(
+        &mut self,
+        watch: &Watch,
+        duration: Duration,
+    ) -> anyhow::Result<(Round, Window)> {
+        let (start, cpu_s) = (Instant::now(), self.cpu_s());
+        let answer = self.ask(Request::Measure(duration), watch, duration + MEASURE_SLACK)?;
+        let Answer::Measured(window) = answer else {
+            bail!("the sink answered another question");
+        };
+        // Over the time to settle too, in which the workers do the same.
+        let elapsed_s = start.elapsed().as_secs_f64();
+        let cores = self.cpu_s().zip(cpu_s).map(|(now, then)| (now - then) / elapsed_s);
+        let steps_per_s = window.env_steps as f64 / window.seconds;
+        Ok((Round { steps_per_s, cores }, window))
+    }
+
+    fn cpu_s(&self) -> Option<f64> {
+        self.children.iter().map(LineChild::cpu_s).sum()
+    }
+
+    /// Refused and lost segments so far.
+    pub(super) fn faults(&self) -> Faults {
+        self.faults
+    }
+
+    /// The most memory that any worker has had at once [bytes].
+    pub(super) fn resident_bytes_max(&self) -> Option<u64> {
+        self.children.iter().filter_map(LineChild::resident_bytes_max).max()
+    }
+
+    fn attach(&mut self, domain: &Domain, watch: &Watch, limit: Duration) -> anyhow::Result<()> {
+        let command = Command::Attach { domain: domain.path().to_owned() };
+        let line = serde_json::to_string(&command).context("cannot write a command as JSON")?;
+        for child in &mut self.children {
+            child.say(&line)?;
+        }
+        let Answer::FirstOfEach(first) = self.ask(Request::FirstOfEach, watch, limit)? else {
+            bail!("the sink answered another question");
+        };
+        ensure!(first.len() == self.children.len(), "not every worker delivered a segment");
+        let waits = self.children.iter().zip(first).map(|(child, at)| at - child.started());
+        self.first_segment_s = waits.max().unwrap_or_default().as_secs_f64();
+        Ok(())
+    }
+
+    /// Asks the sink, and looks after the workers until it answers.
+    fn ask(&mut self, request: Request, watch: &Watch, limit: Duration) -> anyhow::Result<Answer> {
+        self.sink.ask(request);
+        let deadline = Instant::now() + limit;
+        loop {
+            watch.check()?;
+            for child in &mut self.children {
+                let said = child.said()?;
+                said.iter().for_each(|line| show_warning(child.name(), line));
+            }
+            match self.sink.answers().recv_timeout(LOOK) {
+                Ok(answer) => {
+                    let (answer, faults) = answer.context("the transport failed")?;
+                    self.faults = faults;
+                    return Ok(answer);
+                }
+                Err(RecvTimeoutError::Disconnected) => bail!("the sink has ended"),
+                Err(RecvTimeoutError::Timeout) if Instant::now() >= deadline => {
+                    bail!("{request:?}: the workers delivered too little within {limit:?}")
+                }
+                Err(RecvTimeoutError::Timeout) => {}
+            }
+        }
+    }
+}
+
+/// Waits until a worker has its environments; returns what they are.
+fn environment(child: &mut LineChild, watch: &Watch, limit: Duration) -> anyhow::Result<EnvSpec> {
+    let deadline = Instant::now() + limit;
+    loop {
+        let left = deadline.saturating_duration_since(Instant::now());
+        let line = child.next(watch, left, "the environments")?;
+        match serde_json::from_str(&line) {
+            Ok(Report::EnvironmentReady { spec }) => return Ok(spec),
+            Ok(_) => show_warning(child.name(), &line),
+            Err(_) => return Err(anyhow!("{} said what is no report: {line}", child.name())),
+        }
+    }
+}
+
+fn show_warning(name: &str, line: &str) {
+    if let Ok(Report::Warning { message }) = serde_json::from_str(line) {
+        say(&format!("{name}: {message}"));
+    }
+}
+
+fn expected(setup: &Setup, policy: &Policy) -> anyhow::Result<Expected> {
+    let ExperimentConfig { actors, .. } = &setup.config;
+    Ok(Expected {
+        run_id: setup.run_id,
+        architecture_hash: policy.architecture_hash(),
+        layout: policy.layout(),
+        worker_count: u32::try_from(actors.workers).context("too many workers")?,
+        env_count: u32::try_from(actors.envs_per_worker).context("too many environments")?,
+    })
+}

@@ -1,0 +1,181 @@
+//! `dmprl bench`: measures a part of the system beside what else could do its work.
+
+use std::path::{Path, PathBuf};
+use std::time::Duration;
+
+use clap::builder::PossibleValuesParser;
+use clap::{Args, Subcommand};
+use dmprl_shared::config::{Limits, PRESETS};
+use toml::Value;
+
+use super::configuration::{Flag, Sources, merge, refuse};
+use super::train::{absolute_folder, environment, python_path};
+use super::{cores, emit, prepare_python, this_program};
+use crate::bench::{self, Controls, RolloutBench};
+use crate::failure::{Outcome, wrong_use};
+
+/// Shorter rounds measure the sleep of the bench itself; longer ones are a slip of the keyboard.
+const SECONDS: std::ops::RangeInclusive<f64> = 0.05..=3600.0;
+
+const HELP: &str = "\
+EXAMPLES
+  dmprl bench rollout --task reacher
+  dmprl bench rollout --help";
+
+const ROLLOUT_HELP: &str = "\
+In every round each of these runs once for --seconds, the others asleep; the median counts.
+  batch      mujoco.batch alone, on the model file that Gymnasium ships
+  ceiling    mujoco.batch alone, on the workers' own model and process settings
+             (both run episodes whose controls were recorded before, see --controls)
+  worker     `dmprl actor` processes as a run has them: network, movement primitives, noise,
+             environments, shared memory; this process takes the segments in the learner's place
+  gymnasium  a loop over Gymnasium environments, the same policy in NumPy
+  envpool    EnvPool with one thread a worker, the same policy in NumPy
+All but the workers have one Python process for each worker. What is not to be had is null or
+`absent`, with the reason. worker_rss_mb is the peak resident memory of a worker (VmHWM);
+first_segment_s is from the start of the slowest worker to its first delivered segment.
+Ctrl-C ends it at once and leaves nothing.
+
+EXAMPLES
+  dmprl bench rollout --task reacher
+  dmprl bench rollout --task pusher --workers 4 --envs-per-worker 16 --json
+  dmprl bench rollout --task reacher --policy mlp --rounds 9 --seconds 2
+  dmprl bench rollout --task reacher --set policy.segment_steps=10
+  dmprl bench rollout --task reacher --peer-python /opt/envpool/bin/python";
+
+/// Arguments of `dmprl bench`.
+#[derive(Debug, Args)]
+#[command(after_help = HELP)]
+pub(super) struct BenchArgs {
+    #[command(subcommand)]
+    bench: Bench,
+}
+
+#[derive(Debug, Subcommand)]
+enum Bench {
+    /// Environment steps a second of the rollout workers, and of what else could make them.
+    Rollout(Box<RolloutArgs>),
+}
+
+/// Arguments of `dmprl bench rollout`.
+#[derive(Debug, Args)]
+#[command(after_help = ROLLOUT_HELP)]
+struct RolloutArgs {
+    /// A task of `dmprl tasks`, a Gymnasium id, or a SegmentEnv of your own.
+    #[arg(long)]
+    task: String,
+    /// Learning algorithm of the configuration.
+    #[arg(long, value_parser = PossibleValuesParser::new(["ddpg"]))]
+    algo: Option<String>,
+    /// What decides the actions: a DMP per segment, or a network per step.
+    #[arg(long, value_parser = PossibleValuesParser::new(["dmp", "mlp"]))]
+    policy: Option<String>,
+    /// Named set of values.
+    #[arg(long, default_value = "default",
+          value_parser = PossibleValuesParser::new(PRESETS.iter().map(|preset| preset.name)))]
+    preset: String,
+    /// Rollout processes [default: cores - 1].
+    #[arg(long, value_name = "N")]
+    workers: Option<u32>,
+    /// Environments in each worker.
+    #[arg(long, value_name = "E")]
+    envs_per_worker: Option<u32>,
+    /// Seed of every random stream.
+    #[arg(long, value_name = "S", value_parser = clap::value_parser!(i64).range(0..))]
+    seed: Option<i64>,
+    /// How often each is measured.
+    #[arg(long, value_name = "R", default_value_t = 5,
+          value_parser = clap::value_parser!(u16).range(1..=1000))]
+    rounds: u16,
+    /// How long each time [s].
+    #[arg(long, value_name = "S", default_value_t = 1.0, value_parser = seconds)]
+    seconds: f64,
+    /// What drives physics alone: what the policy decides, or random actions.
+    #[arg(long, value_enum, default_value_t = Controls::Policy)]
+    controls: Controls,
+    /// Python that has EnvPool [default: the one of .venv].
+    #[arg(long, value_name = "PATH")]
+    peer_python: Option<PathBuf>,
+    /// Directory of your own environment modules; repeatable.
+    #[arg(long, value_name = "DIR")]
+    python_path: Vec<PathBuf>,
+    /// Configuration file, such as a run's config.toml.
+    #[arg(long, value_name = "FILE")]
+    config: Option<PathBuf>,
+    /// Set any configuration key; repeatable.
+    #[arg(long, value_name = "KEY=VALUE")]
+    set: Vec<String>,
+    /// Print one JSON object on standard output.
+    #[arg(long)]
+    json: bool,
+}
+
+fn seconds(text: &str) -> Result<f64, String> {
+    let seconds = text.parse::<f64>().ok().filter(|seconds| SECONDS.contains(seconds));
+    seconds.ok_or_else(|| format!("expected {} to {} seconds", SECONDS.start(), SECONDS.end()))
+}
+
+pub(super) fn run(args: &BenchArgs) -> anyhow::Result<Outcome> {
+    let Bench::Rollout(args) = &args.bench;
+    rollout(args)
+}
+
+fn rollout(args: &RolloutArgs) -> anyhow::Result<Outcome> {
+    let sources = Sources {
+        task: &args.task,
+        preset: &args.preset,
+        file: args.config.as_deref(),
+        environment: environment()?,
+        set: &args.set,
+        flags: flags(args)?,
+    };
+    let mut config = merge(&sources)?.resolve(Limits { cores: cores() }).map_err(refuse)?;
+    // The workers and their peers have another working directory.
+    for path in &mut config.task.python_path {
+        *path = absolute_folder(path)?;
+    }
+    let peer_python = args.peer_python.as_deref().map(interpreter).transpose()?;
+    let venv = prepare_python()?;
+    let bench = RolloutBench {
+        program: this_program()?,
+        config,
+        peer_python: peer_python.unwrap_or_else(|| venv.join("bin/python")),
+        controls: args.controls,
+        venv,
+        package_path: crate::project::root()?.join("envs_py"),
+        rounds: usize::from(args.rounds),
+        duration: Duration::from_secs_f64(args.seconds),
+    };
+    let Some(figures) = bench::rollout(bench)? else { return Ok(Outcome::Interrupted) };
+    emit(&if args.json { figures.json().to_string() } else { figures.text() })?;
+    Ok(Outcome::Done)
+}
+
+fn flags(args: &RolloutArgs) -> anyhow::Result<Vec<Flag>> {
+    let text = |value: &Option<String>| value.clone().map(Value::String);
+    let count = |value: Option<u32>| value.map(|value| Value::Integer(value.into()));
+    let pairs = [
+        ("--algo", "algorithm.name", text(&args.algo)),
+        ("--policy", "policy.kind", text(&args.policy)),
+        ("--workers", "actors.workers", count(args.workers)),
+        ("--envs-per-worker", "actors.envs_per_worker", count(args.envs_per_worker)),
+        ("--seed", "run.seed", args.seed.map(Value::Integer)),
+        ("--python-path", "task.python_path", python_path(&args.python_path)?),
+    ];
+    let given =
+        pairs.into_iter().filter_map(|(flag, key, value)| Some(Flag { flag, key, value: value? }));
+    Ok(given.collect())
+}
+
+/// Absolute, and not resolved: a virtual environment's Python is a link that knows where it lies.
+fn interpreter(path: &Path) -> anyhow::Result<PathBuf> {
+    let refused = |what: &str| {
+        wrong_use(format!(
+            "--peer-python {}: {what}; expected a Python interpreter, such as \
+             /opt/envpool/bin/python",
+            path.display()
+        ))
+    };
+    let absolute = std::path::absolute(path).map_err(|error| refused(&error.to_string()))?;
+    if absolute.is_file() { Ok(absolute) } else { Err(refused("there is no such file")) }
+}

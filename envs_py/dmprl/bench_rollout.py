@@ -1,0 +1,76 @@
+"""What ``dmprl bench rollout`` compares a rollout worker with: one process of this for each worker.
+
+``python -m dmprl.bench_rollout KIND --plan FILE --index I`` writes one JSON object a line. The
+first is ``{"ready": "what it measures"}``, or ``{"absent": "why"}`` if it cannot; then each line
+``run SECONDS`` on standard input is answered by ``{"steps": …, "seconds": …, "cpu_s": …}``. It
+ends with its input, so the death of the program that started it ends it too.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import signal
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+from dmprl.bench_peers import AbsentError, Ceiling, EnvPoolLoop, GymnasiumLoop, StockBatch
+
+SETTLE_S = 0.1
+"""Stepped before the clock starts: caches and clock frequency then are those of a long run."""
+
+KINDS = {
+    "batch": StockBatch,
+    "ceiling": Ceiling,
+    "gymnasium": GymnasiumLoop,
+    "envpool": EnvPoolLoop,
+}
+
+
+def run_for(segment: Callable[[], int], seconds: float) -> dict:
+    """Runs segments for so long; whole segments, and the time that they really took."""
+    clock = time.perf_counter
+    end = clock() + SETTLE_S
+    while clock() < end:
+        segment()
+    steps, start, cpu_s = 0, clock(), time.process_time()
+    end = start + seconds
+    now = start
+    while now < end:
+        steps += segment()
+        now = clock()
+    return {"steps": steps, "seconds": now - start, "cpu_s": time.process_time() - cpu_s}
+
+
+def main() -> None:
+    """Speaks the protocol of the module's first lines."""
+    parser = argparse.ArgumentParser(prog="dmprl.bench_rollout")
+    parser.add_argument("kind", choices=KINDS)
+    parser.add_argument("--plan", type=Path, required=True)
+    parser.add_argument("--index", type=int, required=True)
+    arguments = parser.parse_args()
+    # Ctrl-C reaches the whole process group; the program that reads our lines decides.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    # What an environment prints must not become a line of the protocol.
+    lines = os.fdopen(os.dup(1), "w", buffering=1)
+    os.dup2(2, 1)
+    plan = json.loads(arguments.plan.read_text())
+    sys.path.extend(plan["task"]["python_path"])
+    try:
+        peer = KINDS[arguments.kind](plan, plan["seed"] + plan["env_count"] * arguments.index)
+    except AbsentError as error:
+        print(json.dumps({"absent": str(error)}), file=lines)
+        return
+    print(json.dumps({"ready": peer.about}), file=lines)
+    for line in sys.stdin:
+        command, _, seconds = line.partition(" ")
+        if command != "run":
+            raise SystemExit(f"expected `run SECONDS`, got {line!r}")
+        print(json.dumps(run_for(peer.segment, float(seconds))), file=lines)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,212 @@
+"""The rollout worker's policy once more, in NumPy, for what a benchmark compares it with.
+
+The same function as ``shared/src/policy`` and the same noise as ``actors/src/exploration.rs``, for
+E environments at once; a test holds its actions to Rust's. Shapes: E environments, K steps, O
+observation, A action, N basis functions.
+"""
+
+from __future__ import annotations
+
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float32]
+
+RHO_CENTRE = np.array([1.0, 0.0, 0.0, 0.0], np.float32)
+OCTAVES = 8
+"""Of the pink noise, as in Rust."""
+
+
+class NumpyPolicy:
+    """The policy that ``plan`` describes (``deploy/src/bench/numpy_plan.rs`` writes it)."""
+
+    def __init__(self, plan: dict) -> None:
+        self.env_count: int = plan["env_count"]
+        self.segment_steps: int = plan["decision_steps"]
+        self.action_len: int = plan["spec"]["action_len"]
+        low, high = np.array(plan["spec"]["action_low"]), np.array(plan["spec"]["action_high"])
+        self._mid, self._half_range = 0.5 * (low + high), 0.5 * (high - low)
+        self._layers = layers(plan["widths"], np.fromfile(Path(plan["parameters"]), np.float32))
+        self._activations = [
+            np.empty((self.env_count, width), np.float32) for width in plan["widths"][1:]
+        ]
+        self._head = DmpHead(plan) if plan["policy"]["kind"] == "dmp" else None
+        env_len = plan["spec"]["observation_len"]
+        self._observations = np.zeros((self.env_count, plan["widths"][0]), np.float32)
+        # Views: the environment's part, and the DMP state that a policy may carry on.
+        self._seen = self._observations[:, :env_len]
+        self.carried = self._observations[:, env_len:]
+
+    def u(self, observations: NDArray, noise: Noise | None = None) -> Floats:
+        """Actions in [-1, 1], (E, K, A), for the environments' observations, (E, O)."""
+        self._seen[:] = observations
+        x = self._observations
+        for (weights, bias), out in zip(self._layers, self._activations, strict=True):
+            if x is not self._observations:
+                np.maximum(x, 0.0, out=x)
+            x = np.dot(x, weights, out=out)
+            x += bias
+        if noise is not None:
+            noise.disturb_outputs(x)
+        u = np.tanh(x)[:, None, :] if self._head is None else self._head.u(x, self._observations)
+        if noise is not None:
+            noise.disturb_u(u)
+        return u
+
+    def scaled(self, u: Floats) -> NDArray[np.float64]:
+        """``u`` in the environment's units."""
+        return self._mid + self._half_range * u
+
+    def carry_on(self, ended: NDArray[np.bool_]) -> None:
+        """Lets each DMP continue from its segment's end, or from rest where an episode ended."""
+        if self._head is not None and self.carried.shape[1] > 0:
+            self.carried[:] = self._head.end_state()
+            self.carried[ended] = 0.0
+
+
+def layers(widths: list[int], parameters: Floats) -> list[tuple[Floats, Floats]]:
+    """Weights, (inputs, outputs), and bias of each layer from the flat parameters."""
+    expected = sum((before + 1) * after for before, after in pairwise(widths))
+    if len(parameters) != expected:
+        raise ValueError(f"{len(parameters)} parameters, a network {widths} has {expected}")
+    found, at = [], 0
+    for before, after in pairwise(widths):
+        end = at + before * after
+        # Stored (outputs, inputs); a copy, since the product is quicker on contiguous rows.
+        weights = np.ascontiguousarray(parameters[at:end].reshape(after, before).T)
+        found.append((weights, parameters[end : end + after]))
+        at = end + after
+    return found
+
+
+class DmpHead:
+    """From the network's outputs to a segment of actions (``shared/src/policy/dmp_head.rs``)."""
+
+    def __init__(self, plan: dict) -> None:
+        policy, dmp = plan["policy"], plan["dmp"]
+        self._steps: int = plan["decision_steps"]
+        self._basis_count: int = dmp["basis_count"]
+        self._shape = (plan["env_count"], plan["spec"]["action_len"])
+        inputs = 3 + self._basis_count
+        segment_map = np.array(plan["segment_map"], np.float32).reshape(3 * self._steps, inputs)
+        self._map = np.ascontiguousarray(segment_map.T)
+        self._goal_scaling = dmp["forcing_scaling"] == "goal"
+        self._goal_range = np.float32(policy["goal_range"])
+        self._bounded = policy["rho"] == "bounded"
+        self._rho_range = np.float32(policy["rho_range"] if self._bounded else 1.0)
+        self._omega = np.float32(dmp["alpha_y"] / 2.0)
+        self._start: str = policy["start"]
+        self._env_len: int = plan["spec"]["observation_len"]
+        self._sources: list[dict] = plan["task"]["start_sources"]
+        measured = policy["start_velocity"] == "measured"
+        segment_s = policy["segment_steps"] * plan["spec"]["control_dt_s"]
+        self._velocity_scale = np.float32(segment_s if measured else 0.0)
+        self._inputs = np.zeros((*self._shape, inputs), np.float32)
+        self._samples = np.zeros((*self._shape, 3 * self._steps), np.float32)
+
+    def u(self, outputs: Floats, observations: Floats) -> Floats:
+        """The segments' actions, (E, K, A)."""
+        n, inputs = self._basis_count, self._inputs
+        raw = outputs.reshape(*self._shape, 1 + n + 4)
+        squashed = np.tanh(raw)
+        rho = (squashed if self._bounded else raw)[..., 1 + n :] * self._rho_range + RHO_CENTRE
+        self._read_start(observations)
+        np.multiply(squashed[..., 0], self._goal_range, out=inputs[..., 2])
+        inputs[..., 3:] = squashed[..., 1 : 1 + n]
+        if self._goal_scaling:
+            inputs[..., 3:] *= (inputs[..., 2] - inputs[..., 0])[..., None]
+        samples = np.matmul(inputs, self._map, out=self._samples)
+        y, yd, ydd = np.split(samples, 3, axis=-1)
+        u = np.tanh(rho[..., 0:1] * y + rho[..., 1:2] * yd + rho[..., 2:3] * ydd + rho[..., 3:4])
+        return np.ascontiguousarray(u.transpose(0, 2, 1))
+
+    def end_state(self) -> Floats:
+        """(y, yd) of every action dimension at the segments' end, (E, 2A)."""
+        y, yd = self._samples[..., self._steps - 1], self._samples[..., 2 * self._steps - 1]
+        return np.concatenate([y, yd * self._omega], axis=1)
+
+    def _read_start(self, observations: Floats) -> None:
+        """Writes y0 and yd0 into the map's inputs."""
+        y0, yd0 = self._inputs[..., 0], self._inputs[..., 1]
+        if self._start == "carry":
+            actions = self._shape[1]
+            y0[:] = observations[:, self._env_len : self._env_len + actions]
+            yd0[:] = observations[:, self._env_len + actions :]
+        elif self._start == "observed":
+            for d, source in enumerate(self._sources):
+                velocity = observations[:, source["velocity"]] * self._velocity_scale
+                if "cos" in source:
+                    y0[:, d] = np.arctan2(
+                        observations[:, source["sin"]], observations[:, source["cos"]]
+                    )
+                    yd0[:, d] = velocity
+                else:
+                    scale = np.float32(source["scale"])
+                    y0[:, d] = scale * observations[:, source["index"]]
+                    yd0[:, d] = scale * velocity
+
+
+class Noise:
+    """Exploration noise of the kinds that Rust has, from a generator of its own."""
+
+    def __init__(self, plan: dict, seed: int) -> None:
+        exploration = plan["exploration"]
+        self._kind: str = exploration["kind"]
+        self._std = np.float32(exploration["std"])
+        self._random = np.random.default_rng(seed)
+        shape = (plan["env_count"], plan["spec"]["action_len"], OCTAVES)
+        self._sources = np.zeros(shape, np.float32)
+        self._step = np.zeros(shape[0], np.int64)
+        self._periods = 1 << np.arange(OCTAVES)
+
+    def disturb_outputs(self, outputs: Floats) -> None:
+        """Noise on the DMP's parameters, before they are bounded."""
+        if self._kind == "dmp_parameters":
+            outputs += self._std * self._normal(outputs.shape)
+
+    def disturb_u(self, u: Floats) -> None:
+        """Noise on actions, (E, K, A), which stay in [-1, 1]."""
+        if self._kind == "dmp_parameters":
+            return
+        if self._kind == "gaussian":
+            noise = self._normal(u.shape)
+        elif self._kind == "segment":
+            noise = self._normal((u.shape[0], 1, u.shape[2]))
+        else:
+            noise = np.stack([self._pink() for _ in range(u.shape[1])], axis=1)
+        u += self._std * noise
+        np.clip(u, -1.0, 1.0, out=u)
+
+    def episodes_ended(self, ended: NDArray[np.bool_]) -> None:
+        """Noise with a memory starts anew in these environments."""
+        self._step[ended] = 0
+
+    def _pink(self) -> Floats:
+        """Voss's sum of held white sources, source i renewed every 2^i steps."""
+        renewed = self._step[:, None] % self._periods == 0
+        fresh = self._normal(self._sources.shape)
+        np.copyto(self._sources, fresh, where=renewed[:, None, :])
+        self._step += 1
+        return self._sources.sum(axis=2) / np.float32(np.sqrt(OCTAVES))
+
+    def _normal(self, shape: tuple[int, ...]) -> Floats:
+        return self._random.standard_normal(shape, np.float32)
+
+
+class Actor:
+    """A policy with its noise, in E environments that run one segment after the other."""
+
+    def __init__(self, plan: dict, seed: int) -> None:
+        self._policy, self._noise = NumpyPolicy(plan), Noise(plan, seed)
+
+    def actions(self, observations: NDArray) -> NDArray[np.float64]:
+        """The next segment's actions in the environment's units, (E, K, A)."""
+        return self._policy.scaled(self._policy.u(observations, self._noise))
+
+    def carry_on(self, ended: NDArray[np.bool_]) -> None:
+        """To be called after a segment, with the environments whose episode has ended."""
+        self._policy.carry_on(ended)
+        self._noise.episodes_ended(ended)

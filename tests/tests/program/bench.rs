@@ -1,0 +1,118 @@
+//! `dmprl bench rollout` with real workers and real peers, in rounds too short to mean anything.
+
+use std::process::Command;
+
+use dmprl_tests::program::{Running, Workplace, executable, shared_memory_named, until};
+use rustix::process::Signal;
+use serde_json::Value;
+
+/// Starts a benchmark whose temporary files lie in the test's folder.
+fn bench(place: &Workplace, task: &str, more: &[&str]) -> Running {
+    let temporary = place.path("tmp");
+    std::fs::create_dir(&temporary).unwrap();
+    let mut command = Command::new(executable());
+    command.args(["bench", "rollout", "--task", task, "--envs-per-worker", "2"]);
+    command.args(["--set", "policy.hidden=[16]", "--seconds", "0.05"]).args(more);
+    command.env("TMPDIR", temporary);
+    place.start_command(command)
+}
+
+fn assert_nothing_left(place: &Workplace, process: rustix::process::Pid) {
+    place.assert_no_process();
+    let end = format!("-{}", process.as_raw_nonzero());
+    let mut left = shared_memory_named(&end);
+    // A longer number begins alike.
+    left.retain(|path| path.to_string_lossy().ends_with(&end));
+    assert_eq!(left, Vec::<std::path::PathBuf>::new());
+    assert_eq!(std::fs::read_dir(place.path("tmp")).unwrap().count(), 0, "temporary files");
+}
+
+fn positive(json: &Value, key: &str) {
+    assert!(json[key].as_f64() > Some(0.0), "{key} is {}: {json}", json[key]);
+}
+
+#[test]
+fn a_task_on_the_batch_is_measured_beside_its_ceiling_and_gymnasium() {
+    let place = Workplace::new();
+    let running = bench(&place, "reacher", &["--workers", "2", "--rounds", "2", "--json"]);
+    let id = running.id();
+    let json = running.wait().with_status(0).json();
+    for key in ["batch", "ceiling", "worker", "gymnasium"] {
+        positive(&json, &format!("{key}_steps_per_s"));
+        assert_eq!(json["rounds"][key].as_array().unwrap().len(), 2, "{json}");
+        assert!(json["cpu_us_per_step"][key].as_f64() > Some(0.0), "{json}");
+    }
+    for key in ["worker_to_ceiling", "worker_to_gymnasium", "first_segment_s", "worker_rss_mb"] {
+        positive(&json, key);
+    }
+    // Whoever has EnvPool in .venv gets a figure, everyone else null and the reason.
+    let envpool = json.get("envpool_steps_per_s").unwrap();
+    assert!(envpool.as_f64() > Some(0.0) || envpool.is_null(), "{json}");
+    assert!(json["notes"]["envpool"].as_str().unwrap().contains("envpool"), "{json}");
+    let sizes = (&json["workers"], &json["envs_per_worker"], &json["segment_steps"]);
+    assert_eq!(sizes, (&2.into(), &2.into(), &5.into()));
+    assert_eq!((&json["rejected"], &json["lost"]), (&0.into(), &0.into()), "{json}");
+    assert_nothing_left(&place, id);
+}
+
+#[test]
+fn a_task_without_a_batch_has_no_ceiling_and_an_mlp_is_measured_too() {
+    let place = Workplace::new();
+    let running =
+        bench(&place, "Pendulum-v1", &["--policy", "mlp", "--workers", "1", "--rounds", "1"]);
+    let id = running.id();
+    let finished = running.wait().with_status(0);
+    let row = |name: &str| {
+        let mut rows = finished.printed.lines().map(str::trim_start);
+        rows.find(|row| row.starts_with(name)).unwrap_or_else(|| panic!("{}", finished.printed))
+    };
+    assert!(row("ceiling").ends_with("absent") && row("batch").ends_with("absent"));
+    assert!(row("gymnasium").ends_with('×') && row("worker").contains('…'));
+    assert!(finished.printed.contains("0 segments rejected, 0 lost"), "{}", finished.printed);
+    assert!(finished.printed.contains("Pendulum-v1 does not run on mujoco.batch"));
+    assert_nothing_left(&place, id);
+}
+
+#[test]
+fn a_segment_env_of_ones_own_is_measured_alone() {
+    let place = Workplace::new();
+    let folder = dmprl_tests::tiny_envs_dir();
+    let more = ["--workers", "1", "--rounds", "1", "--json", "--python-path"];
+    let running =
+        bench(&place, "tiny_envs:Timed", &[&more[..], &[folder.to_str().unwrap()]].concat());
+    let json = running.wait().with_status(0).json();
+    positive(&json, "worker_steps_per_s");
+    for absent in ["batch", "ceiling", "gymnasium", "envpool"] {
+        assert!(json[format!("{absent}_steps_per_s")].is_null(), "{json}");
+        assert!(json["notes"][absent].is_string(), "{json}");
+    }
+}
+
+#[test]
+fn an_environment_that_cannot_be_made_is_named_with_the_workers_own_words() {
+    let place = Workplace::new();
+    let running = bench(&place, "Reachr-v5", &["--workers", "1"]);
+    let id = running.id();
+    running.wait().with_status(1).saying("actor-0 died").saying("Reachr");
+    assert_nothing_left(&place, id);
+}
+
+#[test]
+fn ctrl_c_ends_it_at_once_and_leaves_nothing() {
+    let place = Workplace::new();
+    let mut running = bench(&place, "reacher", &["--workers", "2", "--rounds", "1000", "--json"]);
+    let id = running.id();
+    running.until_said("round 2 of 1000");
+    running.signal_group(Signal::INT);
+    assert_eq!(running.wait().with_status(130).printed, "");
+    assert_nothing_left(&place, id);
+}
+
+#[test]
+fn a_killed_benchmark_takes_its_processes_with_it() {
+    let place = Workplace::new();
+    let mut running = bench(&place, "reacher", &["--workers", "1", "--rounds", "1000"]);
+    running.until_said("round 2 of 1000");
+    running.signal(Signal::KILL);
+    until("no process", || place.processes().is_empty());
+}
