@@ -1,6 +1,6 @@
 //! A policy acting on a set of environments: what rollout and evaluation have in common.
 
-use dmprl_shared::policy::{Head, Policy, PolicyWorkspace, Threads, forward};
+use dmprl_shared::policy::{Head, Policy, PolicyWorkspace, SmallBatchNetwork};
 
 use crate::python_env::PythonEnvironments;
 
@@ -9,6 +9,7 @@ use crate::python_env::PythonEnvironments;
 pub struct Acting {
     /// The architecture.
     pub policy: Policy,
+    network: SmallBatchNetwork,
     /// Buffers of the forward pass.
     pub work: PolicyWorkspace,
     /// What the policy sees now, (E, O).
@@ -29,6 +30,7 @@ impl Acting {
         let actions_len = envs * layout.segment_steps * layout.action_len;
         let carried_len = layout.observation_len - policy.env_observation_len();
         Self {
+            network: SmallBatchNetwork::new(policy.shape().clone()),
             work: policy.workspace(envs),
             observations: vec![0.0; envs * layout.observation_len],
             u: vec![0.0; actions_len],
@@ -52,11 +54,14 @@ impl Acting {
         }
     }
 
+    /// Takes over the network's parameters.
+    pub fn take_policy(&mut self, parameters: &[f32]) {
+        self.network.load(parameters);
+    }
+
     /// Runs the network; the outputs lie in `work.activations`.
-    pub fn run_network(&mut self, parameters: &[f32]) {
-        let shape = self.policy.shape();
-        let activations = &mut self.work.activations;
-        forward(shape, parameters, &self.observations, activations, Threads::ONE);
+    pub fn run_network(&mut self) {
+        self.network.forward(&self.observations, &mut self.work.activations);
     }
 
     /// From the network's outputs to `u`, without exploration.

@@ -6,11 +6,15 @@ use dmprl_shared::config::ExperimentConfig;
 use dmprl_shared::policy::{Policy, PolicyError};
 
 use crate::acting::Acting;
+use crate::faults::Faults;
 use crate::python_env::{PythonEnvironments, SUCCESS_NOT_REPORTED, SUCCESS_YES};
 use crate::rollout::RolloutError;
 
 /// Steps after which an episode of an environment without a time limit is cut off.
 const EPISODE_STEPS_MAX: u32 = 10_000;
+
+/// An episode in which its environment fails begins again, with the same seed, so often.
+const EPISODE_REPEATS_MAX: u32 = 1;
 
 /// Environments that an evaluation runs side by side. Each episode begins with a reset of its own
 /// seed, so the number does not change a result.
@@ -50,6 +54,7 @@ impl Evaluation {
 pub struct Evaluator {
     environments: PythonEnvironments,
     acting: Acting,
+    faults: Faults,
     envs: usize,
 }
 
@@ -59,10 +64,12 @@ struct Wave {
     success: Vec<u8>,
     steps: Vec<u32>,
     running: Vec<bool>,
+    seeds: Vec<u64>,
+    failures: Vec<u32>,
     /// Last u of each environment, (E, A); NaN before the first step.
     last_u: Vec<f32>,
-    jumps: f64,
-    jump_count: u64,
+    jumps: Vec<f64>,
+    jump_count: Vec<u64>,
 }
 
 impl Evaluator {
@@ -76,7 +83,9 @@ impl Evaluator {
         envs: usize,
     ) -> Result<Self, PolicyError> {
         let policy = Policy::new(config, environments.spec())?;
-        Ok(Self { environments, acting: Acting::new(policy, envs), envs })
+        // The repeats of an episode have a limit of their own.
+        let faults = Faults::new(envs, u32::MAX);
+        Ok(Self { environments, acting: Acting::new(policy, envs), faults, envs })
     }
 
     /// The policy's architecture.
@@ -85,29 +94,35 @@ impl Evaluator {
         &self.acting.policy
     }
 
-    /// Runs the episodes; none if a stop was asked for.
+    /// One line about each failure of an environment since the last call.
+    pub fn take_failures(&mut self) -> Vec<String> {
+        self.faults.take()
+    }
+
+    /// Runs the episodes; none if a stop was asked for. An episode in which its environment fails
+    /// is repeated once, with the same seed.
     ///
     /// # Errors
-    /// If an environment fails.
+    /// `Episode` if it fails again: the next evaluation may succeed. Anything else is for good.
     pub fn evaluate(
         &mut self,
         parameters: &[f32],
         episodes: Episodes<'_>,
     ) -> Result<Option<Evaluation>, RolloutError> {
+        self.acting.take_policy(parameters);
         let mut returns = Vec::with_capacity(episodes.count);
         let mut success = Vec::with_capacity(episodes.count);
         let (mut jumps, mut jump_count) = (0.0, 0);
         while returns.len() < episodes.count {
             let count = (episodes.count - returns.len()).min(self.envs);
             let first_seed = episodes.first_seed + returns.len() as u64;
-            let Some(wave) = self.wave(parameters, Episodes { count, first_seed, ..episodes })?
-            else {
+            let Some(wave) = self.wave(Episodes { count, first_seed, ..episodes })? else {
                 return Ok(None);
             };
             returns.extend(&wave.returns[..count]);
             success.extend(&wave.success[..count]);
-            jumps += wave.jumps;
-            jump_count += wave.jump_count;
+            jumps += wave.jumps.iter().sum::<f64>();
+            jump_count += wave.jump_count.iter().sum::<u64>();
         }
         let reported = success.iter().all(|&flag: &u8| flag != SUCCESS_NOT_REPORTED);
         let successes = success.iter().filter(|&&flag| flag == SUCCESS_YES).count();
@@ -120,7 +135,6 @@ impl Evaluator {
 
     fn wave(
         &mut self,
-        parameters: &[f32],
         Episodes { count, first_seed, stop }: Episodes<'_>,
     ) -> Result<Option<Wave>, RolloutError> {
         let dims = self.acting.policy.layout().action_len;
@@ -129,28 +143,59 @@ impl Evaluator {
             success: vec![SUCCESS_NOT_REPORTED; self.envs],
             steps: vec![0; self.envs],
             running: (0..self.envs).map(|env| env < count).collect(),
+            seeds: (0..self.envs as u64).map(|env| first_seed + env).collect(),
+            failures: vec![0; self.envs],
             last_u: vec![f32::NAN; self.envs * dims],
-            jumps: 0.0,
-            jump_count: 0,
+            jumps: vec![0.0; self.envs],
+            jump_count: vec![0; self.envs],
         };
-        let seeds: Vec<u64> = (0..self.envs as u64).map(|env| first_seed + env).collect();
-        self.environments.reset(&vec![true; self.envs], &seeds)?;
+        let all = vec![true; self.envs];
+        self.environments.reset(&all, &wave.seeds)?;
+        self.faults.look_at_reset(&mut self.environments, &all)?;
         (0..self.envs).for_each(|env| self.acting.carry_on(env, true));
         while wave.running.iter().any(|&running| running) {
             if stop.load(Ordering::Acquire) {
                 return Ok(None);
             }
             self.acting.observe(&self.environments);
-            self.acting.run_network(parameters);
+            self.acting.run_network();
             self.acting.decode();
             self.environments.step_segment(self.acting.actions())?;
+            let failed = self.faults.look(&mut self.environments)?;
             for env in 0..self.envs {
-                if wave.running[env] {
+                if wave.running[env] && !self.faults.failed()[env] {
                     self.book(&mut wave, env);
                 }
             }
+            if failed {
+                self.begin_again(&mut wave)?;
+            }
         }
         Ok(Some(wave))
+    }
+
+    /// Begins the episodes of failed environments again. Those that have their episode behind them
+    /// only keep the others company, but must go on too.
+    fn begin_again(&mut self, wave: &mut Wave) -> Result<(), RolloutError> {
+        let dims = self.acting.policy.layout().action_len;
+        let mask = self.faults.failed().to_vec();
+        for env in (0..self.envs).filter(|&env| mask[env]) {
+            self.acting.carry_on(env, true);
+            if !wave.running[env] {
+                continue;
+            }
+            wave.failures[env] += 1;
+            if wave.failures[env] > EPISODE_REPEATS_MAX {
+                let (seed, count) = (wave.seeds[env], wave.failures[env]);
+                let cause = self.faults.cause(env).to_owned();
+                return Err(RolloutError::Episode { seed, count, cause });
+            }
+            (wave.returns[env], wave.steps[env]) = (0.0, 0);
+            (wave.jumps[env], wave.jump_count[env]) = (0.0, 0);
+            wave.last_u[env * dims..(env + 1) * dims].fill(f32::NAN);
+        }
+        self.environments.reset(&mask, &wave.seeds)?;
+        Ok(self.faults.look_at_reset(&mut self.environments, &mask)?)
     }
 
     /// Adds environment `env`'s segment to the wave.
@@ -165,8 +210,8 @@ impl Evaluator {
         for step in u.chunks_exact(dims) {
             for (u, last) in step.iter().zip(last.iter_mut()) {
                 if last.is_finite() {
-                    wave.jumps += f64::from((u - *last).abs());
-                    wave.jump_count += 1;
+                    wave.jumps[env] += f64::from((u - *last).abs());
+                    wave.jump_count[env] += 1;
                 }
                 *last = *u;
             }

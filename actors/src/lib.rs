@@ -10,6 +10,10 @@ pub mod evaluate;
 #[cfg(feature = "python")]
 mod exploration;
 #[cfg(feature = "python")]
+mod faults;
+#[cfg(feature = "python")]
 pub mod python_env;
 #[cfg(feature = "python")]
 pub mod rollout;
+#[cfg(feature = "python")]
+pub mod watchdog;

@@ -15,6 +15,7 @@ use thiserror::Error;
 
 use crate::acting::Acting;
 use crate::exploration::Exploration;
+use crate::faults::{Faults, Hopeless};
 use crate::python_env::{PythonEnvironments, PythonError, SUCCESS_NOT_REPORTED, SUCCESS_YES};
 
 /// Why a rollout stopped.
@@ -23,20 +24,31 @@ pub enum RolloutError {
     /// The policy does not fit the environment.
     #[error(transparent)]
     Policy(#[from] PolicyError),
-    /// The environment failed.
+    /// The environments failed for good.
     #[error(transparent)]
     Python(#[from] PythonError),
-    /// An environment produced a number that is NaN or infinite.
-    #[error("environment {env_index}, episode {episode}, step {step}: {name} is not finite")]
-    NotFinite {
+    /// One of them fails again and again.
+    #[error(
+        "environment {env_index} has failed {count} times without completing an episode, more \
+         often than actors.env_failures_max; the last time: {cause}"
+    )]
+    Hopeless {
         /// Which environment of the worker.
         env_index: usize,
-        /// Which of its episodes.
-        episode: u32,
-        /// Which step of the episode.
-        step: u32,
-        /// Observation or reward.
-        name: &'static str,
+        /// Failures since its last completed episode.
+        count: u32,
+        /// The last of them.
+        cause: String,
+    },
+    /// An episode of an evaluation failed, and failed again.
+    #[error("the episode of seed {seed} has failed {count} times; the last time: {cause}")]
+    Episode {
+        /// The seed that it is reset with.
+        seed: u64,
+        /// How often.
+        count: u32,
+        /// The last failure.
+        cause: String,
     },
 }
 
@@ -68,9 +80,15 @@ pub struct Rollout {
     acting: Acting,
     exploration: Exploration,
     episodes: Vec<Episode>,
+    faults: Faults,
+    /// (E,): of the first reset, and of a reset after a failure.
+    env_seeds: Vec<u64>,
+    new_seeds: Vec<u64>,
     segment: Segment,
     sequence: u64,
-    /// The policy that acts; version 0 until the first one has come.
+    /// Version of the policy that `acting` has taken over.
+    acting_version: u64,
+    /// The newest policy; version 0 until the first one has come.
     pub snapshot: ParameterSnapshot,
 }
 
@@ -93,7 +111,10 @@ impl Rollout {
         let env_seeds: Vec<u64> = (0..envs as u64)
             .map(|env| seeds::derive(config.run.seed, "environment", worker << 16 | env) >> 33)
             .collect();
-        environments.reset(&vec![true; envs], &env_seeds)?;
+        let mut faults = Faults::new(envs, config.actors.env_failures_max);
+        let all = vec![true; envs];
+        environments.reset(&all, &env_seeds)?;
+        faults.look_at_reset(&mut environments, &all)?;
         Ok(Self {
             identity,
             warm_up_steps: config.exploration.warm_up_steps,
@@ -103,8 +124,12 @@ impl Rollout {
                 (envs, layout.action_len),
             ),
             episodes: vec![Episode::default(); envs],
+            faults,
+            new_seeds: env_seeds.clone(),
+            env_seeds,
             segment: Segment::zeroed(layout),
             sequence: 0,
+            acting_version: 0,
             snapshot: ParameterSnapshot::default(),
             acting: Acting::new(policy, envs),
             environments,
@@ -120,28 +145,68 @@ impl Rollout {
     /// Decides and runs one segment in every environment with `self.snapshot`, and hands each
     /// segment to `deliver`, which keeps it until the learner has it.
     ///
+    /// A failed environment's segment is not delivered, so the sequence has no gap for it; its
+    /// next episode begins with the next call. [`Rollout::take_failures`] tells of it.
+    ///
     /// # Errors
-    /// If an environment fails, or whatever `deliver` returns.
+    /// If an environment fails for good or too often, or whatever `deliver` returns.
     pub fn segment<E: From<RolloutError>>(&mut self, deliver: Deliver<'_, E>) -> Result<(), E> {
         self.acting.observe(&self.environments);
         let warming_up = self.snapshot.version == 0 || self.snapshot.env_steps < self.warm_up_steps;
         if warming_up {
             self.exploration.warm_up(&mut self.acting);
         } else {
-            self.acting.run_network(&self.snapshot.values);
+            if self.acting_version != self.snapshot.version {
+                self.acting.take_policy(&self.snapshot.values);
+                self.acting_version = self.snapshot.version;
+            }
+            self.acting.run_network();
             self.exploration.explore(&mut self.acting);
         }
         let policy_version = if warming_up { 0 } else { self.snapshot.version };
         self.environments.step_segment(self.acting.actions()).map_err(RolloutError::from)?;
+        let failed = self.faults.look(&mut self.environments).map_err(RolloutError::from)?;
         for env in 0..self.episodes.len() {
-            self.record(env, policy_version)?;
+            if self.faults.failed()[env] {
+                self.begin_episode(env);
+                continue;
+            }
+            self.record(env, policy_version);
             deliver(&self.segment.header, &self.segment.block)?;
+        }
+        // Last: what the others did is sound, and delivered.
+        if failed { Ok(self.make_up()?) } else { Ok(()) }
+    }
+
+    /// One line about each failure of an environment since the last call.
+    pub fn take_failures(&mut self) -> Vec<String> {
+        self.faults.take()
+    }
+
+    /// Resets the failed environments that cannot go on as they are.
+    fn make_up(&mut self) -> Result<(), RolloutError> {
+        if let Some(Hopeless { env_index, count, cause }) = self.faults.hopeless() {
+            return Err(RolloutError::Hopeless { env_index, count, cause });
+        }
+        if self.faults.unmade().contains(&true) {
+            for (new, first) in self.new_seeds.iter_mut().zip(&self.env_seeds) {
+                *new = seeds::derive(*first, "failure", self.faults.total()) >> 33;
+            }
+            let mask = self.faults.unmade().to_vec();
+            self.environments.reset(&mask, &self.new_seeds)?;
+            self.faults.look_at_reset(&mut self.environments, &mask)?;
         }
         Ok(())
     }
 
+    fn begin_episode(&mut self, env: usize) {
+        self.acting.carry_on(env, true);
+        self.exploration.episode_ended(env);
+        self.episodes[env] = Episode { number: self.episodes[env].number + 1, steps: 0 };
+    }
+
     /// Fills `self.segment` with what environment `env` has just done.
-    fn record(&mut self, env: usize, policy_version: u64) -> Result<(), RolloutError> {
+    fn record(&mut self, env: usize, policy_version: u64) {
         let layout = self.acting.policy.layout();
         let steps = self.environments.steps()[env] as usize;
         self.fill_block(env, steps);
@@ -170,16 +235,13 @@ impl Rollout {
             action_len: layout.action_len as u32,
             checksum: block_checksum(&self.segment.block),
         };
-        self.check_finite(env, episode)?;
-        let ended = flags & (TERMINATED | TRUNCATED) != 0;
-        self.acting.carry_on(env, ended);
-        if ended {
-            self.exploration.episode_ended(env);
-            self.episodes[env] = Episode { number: episode.number + 1, steps: 0 };
+        if flags & (TERMINATED | TRUNCATED) != 0 {
+            self.begin_episode(env);
+            self.faults.completed(env);
         } else {
+            self.acting.carry_on(env, false);
             self.episodes[env].steps += steps as u32;
         }
-        Ok(())
     }
 
     fn fill_block(&mut self, env: usize, steps: usize) {
@@ -204,27 +266,5 @@ impl Rollout {
             *out = *value as f32;
         }
         rewards[steps..].fill(0.0);
-    }
-
-    /// A NaN must be stopped at its source: past the replay it would be everywhere.
-    fn check_finite(&self, env: usize, episode: Episode) -> Result<(), RolloutError> {
-        let layout = self.acting.policy.layout();
-        let (observations, _, rewards) = layout.split(&self.segment.block);
-        let bad = |values: &[f32], width: usize| {
-            values.iter().position(|value| !value.is_finite()).map(|at| at / width)
-        };
-        let o = layout.observation_len;
-        let found = bad(rewards, 1)
-            .map(|k| ("reward", k))
-            .or_else(|| bad(observations, o).map(|k| ("observation", k)));
-        match found {
-            None => Ok(()),
-            Some((name, k)) => Err(RolloutError::NotFinite {
-                env_index: env,
-                episode: episode.number,
-                step: episode.steps + k as u32,
-                name,
-            }),
-        }
     }
 }

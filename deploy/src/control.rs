@@ -10,6 +10,9 @@ use anyhow::ensure;
 use dmprl_shared::spec::EnvSpec;
 use serde::{Deserialize, Serialize};
 
+/// Exit status of a process that has ended itself because an environment hung.
+pub const ENV_HUNG_STATUS: i32 = 75;
+
 /// From the supervisor to a role.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case", deny_unknown_fields)]
@@ -21,6 +24,11 @@ pub enum Command {
     },
     /// To the evaluator: evaluate this policy.
     Evaluate(EvaluationRequest),
+    /// To the learner: so many failures of environments have been reported to the supervisor.
+    EnvFailures {
+        /// In this session, all processes together.
+        total: u64,
+    },
     /// To the learner: the run has reached its goal or its time; finish as at the last step, with a
     /// last evaluation.
     Finish,
@@ -47,6 +55,25 @@ pub enum Report {
     Evaluate(EvaluationRequest),
     /// The evaluator's answer: the row it appended to `evaluations.jsonl`.
     Evaluated(EvaluationRow),
+    /// The evaluator's other answer: the episodes of this evaluation failed; the next may succeed.
+    NotEvaluated {
+        /// Which policy was asked for.
+        policy_version: u64,
+        /// What failed.
+        reason: String,
+    },
+    /// Environments failed and were made again.
+    EnvFailures {
+        /// How many times since the last such report.
+        count: u64,
+        /// The last of them: which, when and why.
+        last: String,
+    },
+    /// A call into the environments does not return; the process ends itself after this.
+    EnvHung {
+        /// The sentence.
+        message: String,
+    },
     /// The learner wrote a checkpoint.
     Checkpoint {
         /// Its directory's name below `checkpoints/`.
@@ -86,6 +113,8 @@ pub struct Progress {
     pub policy_lag_p50: u64,
     /// Segments refused.
     pub rejected: u64,
+    /// Failures of environments.
+    pub env_failures: u64,
 }
 
 /// One evaluation to be done.

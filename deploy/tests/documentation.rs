@@ -224,6 +224,7 @@ fn the_keys_of_both_kinds_of_lines_are_documented() {
         policy_lag_max: None,
         updates_owed: 0.0,
         lost: 0,
+        env_failures: 0,
         wall_s: 0.0,
         env_steps_per_s: 0.0,
         updates_per_s: 0.0,

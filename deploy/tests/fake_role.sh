@@ -25,7 +25,7 @@ ready() {
     echo '{"environment_ready":{"spec":{"id":"Fake-v0","observation_len":2,"action_len":1,"action_low":[-1.0],"action_high":[1.0],"control_dt_s":0.02,"episode_steps":50}}}'
 }
 progress() {
-    echo '{"progress":{"env_steps":'"$1"',"updates":'"$1"',"segments":2,"env_steps_per_s":10.0,"updates_per_s":4.0,"return_mean":null,"samples_per_insert":1.0,"policy_lag_p50":0,"rejected":0}}'
+    echo '{"progress":{"env_steps":'"$1"',"updates":'"$1"',"segments":2,"env_steps_per_s":10.0,"updates_per_s":4.0,"return_mean":null,"samples_per_insert":1.0,"policy_lag_p50":0,"rejected":0,"env_failures":0}}'
 }
 row() {
     echo '{"evaluated":{"env_steps":10,"updates":10,"segments":2,"wall_s":1.0,"policy_version":'"$1"',"returns":[-2.0,-4.0],"return_mean":-3.0,"success_rate":0.5,"smoothness":0.1}}'
@@ -56,6 +56,14 @@ case $role-$mode in
     ;;
 actor-normal) ready; until_stop; exit 0 ;;
 actor-noisy) echo 'hello from print()'; ready; until_stop; exit 0 ;;
+actor-failing)
+    ready
+    for count in 1 1 1 2; do
+        echo '{"env_failures":{"count":'"$count"',"last":"the gripper fell off"}}'
+    done
+    until_stop
+    exit 0
+    ;;
 actor-refused) echo 'error: no environment Fake-v0' >&2; exit 1 ;;
 actor-dies) ready; exit 3 ;;
 actor-dies-once)
@@ -77,6 +85,12 @@ learner-until-stopped)
     evaluate 1
     until_stop && finish
     echo saved >"$fake/orphaned"
+    ;;
+learner-told-of-failures)
+    echo '"learner_ready"'
+    while read -r line; do
+        case $line in *'"total":5'*) finish ;; esac
+    done
     ;;
 learner-dies)
     echo '"learner_ready"'
@@ -105,7 +119,12 @@ evaluator-*)
         fi
         [ "$mode" = dies ] && exit 4
         version=${line##*policy_version\":}
-        row "${version%%\}*}"
+        version=${version%%\}*}
+        if [ "$mode" = fails-once ] && [ "$version" = 1 ]; then
+            echo '{"not_evaluated":{"policy_version":1,"reason":"its episode failed twice"}}'
+        else
+            row "$version"
+        fi
     done
     ;;
 esac

@@ -136,6 +136,30 @@ fn an_evaluator_that_keeps_dying_ends_the_run() {
     assert!(message.contains("evaluator died: exit status 4"), "{message}");
 }
 
+#[test]
+fn an_evaluation_that_fails_is_said_and_left_out() {
+    let fixture = Fixture::new(&[("evaluator", "fails-once")]);
+    let (report, shown) = fixture.supervise();
+    assert!(matches!(report.ending, Ending::Completed), "{:?}\n{shown}", report.ending);
+    assert_eq!(report.last_row.unwrap().policy_version, 2);
+    assert!(shown.contains("no evaluation of policy 1"), "{shown}");
+    assert!(shown.contains("its episode failed twice; log: "), "{shown}");
+    assert_eq!(fixture.seen("evaluator").matches("started").count(), 1);
+}
+
+/// The learner here comes to its end when it has been told of all five.
+#[test]
+fn failures_of_environments_are_added_up_and_each_doubling_is_shown() {
+    let fakes = [("actor-0", "failing"), ("learner", "told-of-failures")];
+    let (report, shown) = Fixture::new(&fakes).supervise();
+    assert!(matches!(report.ending, Ending::Completed), "{:?}\n{shown}", report.ending);
+    assert_eq!(report.env_failures, 5);
+    let told =
+        |count| shown.contains(&format!("actor-0: environment failure {count}: the gripper"));
+    assert_eq!([1, 2, 3, 4, 5].map(told), [true, true, false, false, true], "{shown}");
+    assert!(shown.contains("logs/actor-0.log"), "{shown}");
+}
+
 fn never_ready(name: &str) {
     let mut fixture = Fixture::new(&[("learner", "until-stopped"), (name, "silent")]);
     fixture.limits.ready = Duration::from_secs(3);

@@ -7,15 +7,23 @@ workers, each a process of its own, and half of a step is Python that threads ca
 
 from __future__ import annotations
 
+import contextlib
 import copy
 import math
+import sys
+import traceback
+from collections import deque
 
 import gymnasium
 import numpy as np
 from gymnasium import spaces
+from gymnasium.envs import registration
 from numpy.typing import NDArray
 
+from dmprl import robotics_repair
+from dmprl.observation_names import names_of
 from dmprl.segment_env import (
+    OBSERVATION_NAMES_MAX,
     SUCCESS_NO,
     SUCCESS_NOT_REPORTED,
     SUCCESS_YES,
@@ -24,6 +32,7 @@ from dmprl.segment_env import (
     SegmentEnv,
     SegmentEnvError,
     UnsupportedSpaceError,
+    seed_after_failure,
 )
 
 SUPPORTED_SPACES = (
@@ -31,20 +40,32 @@ SUPPORTED_SPACES = (
     "flatten) and a bounded Box action of floats with one dimension"
 )
 
+FAILURES_KEPT_MAX = 10_000
+"""Sentences kept for a caller that does not take them; beyond it the oldest make room."""
+
+FAILURES = (Exception, SystemExit)
+"""What an environment may raise. A call of ``sys.exit`` would end more than the environment."""
+
 
 class GymnasiumSegmentEnv(SegmentEnv):
     """E copies of one Gymnasium environment, all wrappers of its registration applied.
 
     Two wrappers are left out because they only check the caller and cost time in every step: the
     passive checker and the order enforcer (:meth:`step_segment` checks the order itself).
+
+    - ``named``: what ``task_id`` names if it is ``module:Name``. A ``gymnasium.Env`` class is made
+      without arguments; its attribute ``max_episode_steps``, if it has one, limits its episodes.
     """
 
-    def __init__(self, task_id: str, env_count: int, segment_steps: int) -> None:
+    def __init__(
+        self, task_id: str, env_count: int, segment_steps: int, named: object = None
+    ) -> None:
         self.task_id = task_id
         self.env_count = env_count
         self.segment_steps = segment_steps
-        registered = self._registration()
-        self._envs = [self._make(registered) for _ in range(env_count)]
+        self._registered = self._registration(named)
+        self._observation_space = None
+        self._envs = [self._make() for _ in range(env_count)]
         first = self._envs[0]
         self._observation_len = first.observation_space.shape[0]
         self._action_shape = (env_count, segment_steps, first.action_space.shape[0])
@@ -56,8 +77,24 @@ class GymnasiumSegmentEnv(SegmentEnv):
             (env_count, segment_steps + 1, self._observation_len), np.bool_
         )
         self._finite_rewards = np.zeros((env_count, segment_steps), np.bool_)
+        # Of the caller's last reset of each environment, and its failures since.
+        self._first_seeds = [0] * env_count
+        self._failure_counts = [0] * env_count
+        self._failed_now: list[int] = []
+        self._failure_total = 0
+        self._untold: deque[str] = deque(maxlen=FAILURES_KEPT_MAX)
 
-    def _registration(self) -> gymnasium.envs.registration.EnvSpec:
+    def _registration(self, named: object) -> registration.EnvSpec:
+        if "gymnasium_robotics" in sys.modules:
+            robotics_repair.repair()
+        if isinstance(named, type) and issubclass(named, gymnasium.Env):
+            limit = getattr(named, "max_episode_steps", None)
+            return registration.EnvSpec(
+                self.task_id,
+                entry_point=named,
+                max_episode_steps=limit if isinstance(limit, int) and limit > 0 else None,
+                order_enforce=False,
+            )
         registered = gymnasium.registry.get(self.task_id.rpartition(":")[2])
         if registered is None:  # without version, or unknown: Gymnasium finds it, or suggests
             made = gymnasium.make(self.task_id)
@@ -67,9 +104,10 @@ class GymnasiumSegmentEnv(SegmentEnv):
         registered.order_enforce = False
         return registered
 
-    def _make(self, registered: gymnasium.envs.registration.EnvSpec) -> gymnasium.Env:
-        env = gymnasium.make(registered, disable_env_checker=True)
+    def _make(self) -> gymnasium.Env:
+        env = gymnasium.make(self._registered, disable_env_checker=True)
         observation, action = env.observation_space, env.action_space
+        self._observation_space = observation
         if isinstance(observation, spaces.Dict | spaces.Tuple) and observation.is_np_flattenable:
             # A Dict's entries in the order of its space, which Gymnasium sorts by key.
             env = gymnasium.wrappers.FlattenObservation(env)
@@ -100,13 +138,25 @@ class GymnasiumSegmentEnv(SegmentEnv):
             "action_high": env.action_space.high.astype(np.float64).tolist(),
             "control_dt_s": float(control_dt_s) if np.isscalar(control_dt_s) else 0.0,
             "episode_steps": (env.spec.max_episode_steps if env.spec else None) or 0,
+            "observation_names": self._observation_names(),
         }
+
+    def _observation_names(self) -> list[str]:
+        if self._observation_len > OBSERVATION_NAMES_MAX:
+            return []
+        return names_of(self._observation_space)
 
     def reset(  # noqa: D102 - inherited
         self, mask: NDArray[np.uint8], seeds: NDArray[np.uint64], out: SegmentBuffers
     ) -> None:
         for index in np.flatnonzero(mask).tolist():
-            self._reset(index, int(seeds[index]), out)
+            seed = int(seeds[index])
+            self._first_seeds[index], self._failure_counts[index] = seed, 0
+            try:
+                self._reset(index, seed, out)
+            except SegmentEnvError as failure:
+                self._note(failure)
+                self._replace(index, seed, out)
 
     def step_segment(  # noqa: D102 - inherited
         self, actions: NDArray[np.float64], out: SegmentBuffers
@@ -120,6 +170,7 @@ class GymnasiumSegmentEnv(SegmentEnv):
         # A new array each time, in the space's own type: an environment may keep an action
         # (to charge for its change, say), so its memory must not be used again.
         actions = actions.astype(self._action_dtype)
+        out.failed.fill(0)
         out.observations[:, 0] = self._current
         for index, env in enumerate(self._envs):
             self._run(index, env, actions[index], out)
@@ -127,7 +178,21 @@ class GymnasiumSegmentEnv(SegmentEnv):
         self._current[:] = out.observations[self._rows, out.steps]
         out.next_observations[:] = self._current
         for index in np.flatnonzero(out.terminated | out.truncated).tolist():
-            self._reset(index, None, out)
+            try:
+                self._reset(index, None, out)
+            except SegmentEnvError as failure:
+                self._fail(index, failure, out)
+        # Last: whatever a new environment does must not come before what the others did.
+        while self._failed_now:
+            index = self._failed_now.pop(0)
+            self._failure_counts[index] += 1
+            seed = seed_after_failure(self._first_seeds[index], self._failure_counts[index])
+            self._replace(index, seed, out)
+
+    def take_failures(self) -> list[str]:  # noqa: D102 - inherited
+        failures = list(self._untold)
+        self._untold.clear()
+        return failures
 
     def close(self) -> None:  # noqa: D102 - inherited
         for env in self._envs:
@@ -148,8 +213,9 @@ class GymnasiumSegmentEnv(SegmentEnv):
                 step += 1
                 if terminated or truncated:
                     break
-        except Exception as error:
-            raise self._failure(index, f"step {step} of the segment", error) from error
+        except FAILURES as error:
+            self._fail(index, self._failure(index, f"step {step} of the segment", error), out)
+            return
         if step < self.segment_steps:
             observations[step + 1 :] = 0.0
             rewards[step:] = 0.0
@@ -161,35 +227,66 @@ class GymnasiumSegmentEnv(SegmentEnv):
     def _reset(self, index: int, seed: int | None, out: SegmentBuffers) -> None:
         try:
             self._current[index], _ = self._envs[index].reset(seed=seed)
-        except Exception as error:
+        except FAILURES as error:
             raise self._failure(index, "reset", error) from error
         if not np.isfinite(self._current[index]).all():
-            self._raise_not_finite(index, "reset", self._current[index])
+            raise self._not_finite(index, "reset", self._current[index])
         self._started[index] = True
         out.next_observations[index] = self._current[index]
 
     def _check_finite(self, out: SegmentBuffers) -> None:
         """Looks at the whole segment at once: step by step it would cost several times as much."""
         if not np.isfinite(out.rewards, out=self._finite_rewards).all():
-            index, step = np.argwhere(~self._finite_rewards)[0].tolist()
-            reward = out.rewards[index, step]
-            where = f"{self.task_id}, environment {index}, step {step} of the segment"
-            raise SegmentEnvError(f"{where}: reward is {reward}")
+            for index in np.flatnonzero(~self._finite_rewards.all(axis=1)).tolist():
+                step = int(self._finite_rewards[index].argmin())
+                where = f"{self.task_id}, environment {index}, step {step} of the segment"
+                reward = out.rewards[index, step]
+                self._fail(index, SegmentEnvError(f"{where}: reward is {reward}"), out)
         if not np.isfinite(out.observations, out=self._finite_observations).all():
-            index, row, _ = np.argwhere(~self._finite_observations)[0].tolist()
-            self._raise_not_finite(
-                index, f"step {row - 1} of the segment", out.observations[index, row]
-            )
+            for index in np.flatnonzero(~self._finite_observations.all(axis=(1, 2))).tolist():
+                row = int(self._finite_observations[index].all(axis=1).argmin())
+                when = f"step {row - 1} of the segment"
+                self._fail(index, self._not_finite(index, when, out.observations[index, row]), out)
 
-    def _raise_not_finite(self, index: int, when: str, row: NDArray[np.float64]) -> None:
+    def _fail(self, index: int, failure: SegmentEnvError, out: SegmentBuffers) -> None:
+        """Empties what a failed environment has written; :meth:`_replace` follows."""
+        self._note(failure)
+        self._failed_now.append(index)
+        out.failed[index] = 1
+        out.observations[index] = 0.0
+        out.rewards[index] = 0.0
+        out.terminated[index], out.truncated[index] = 0, 0
+        out.success[index], out.steps[index] = SUCCESS_NOT_REPORTED, 0
+
+    def _note(self, failure: SegmentEnvError) -> None:
+        self._untold.append(str(failure))
+        self._failure_total += 1
+        # The worker's log: a traceback is long, and most often the next one is the same.
+        if failure.__cause__ is not None and self._failure_total.bit_count() == 1:
+            traceback.print_exception(failure.__cause__)
+
+    def _replace(self, index: int, seed: int, out: SegmentBuffers) -> None:
+        """Closes a failed environment, makes it again and resets it."""
+        with contextlib.suppress(*FAILURES):  # it is broken already
+            self._envs[index].close()
+        try:
+            self._envs[index] = self._make()
+        except FAILURES as error:
+            raise self._failure(index, "made again after a failure", error) from error
+        self._reset(index, seed, out)
+
+    def _not_finite(self, index: int, when: str, row: NDArray[np.float64]) -> SegmentEnvError:
         entry = int(np.flatnonzero(~np.isfinite(row))[0])
+        name = names_of(self._observation_space)[entry]
         where = f"{self.task_id}, environment {index}, {when}"
-        raise SegmentEnvError(f"{where}: observation[{entry}] is {row[entry]}")
+        return SegmentEnvError(f"{where}: {name} is {row[entry]}")
 
-    def _failure(self, index: int, when: str, error: Exception) -> SegmentEnvError:
-        return SegmentEnvError(
+    def _failure(self, index: int, when: str, error: BaseException) -> SegmentEnvError:
+        failure = SegmentEnvError(
             f"{self.task_id}, environment {index}, {when}: {type(error).__name__}: {error}"
         )
+        failure.__cause__ = error
+        return failure
 
 
 def success_of(info: dict) -> int:

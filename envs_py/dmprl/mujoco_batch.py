@@ -27,6 +27,7 @@ from dmprl.segment_env import (
     SegmentBuffers,
     SegmentEnv,
     SegmentEnvError,
+    seed_after_failure,
 )
 
 Fields = Mapping[str, NDArray]
@@ -236,7 +237,7 @@ class BatchSegmentEnv(SegmentEnv):
         for index in failed.tolist():
             kinds = [mujoco.mjtWarning(kind).name for kind in np.flatnonzero(warnings[index])]
             reason = self.batch.error(index) or f"MuJoCo warned ({', '.join(kinds)})"
-            self._messages.append(f"{self.task.id}, environment {index}: {reason}")
+            self._messages.append(f"{self.task.id}, environment {index}, this segment: {reason}")
         return failed.astype(np.int32)
 
     def _end_episodes(self, failed: NDArray[np.int32] | None, out: SegmentBuffers) -> None:
@@ -250,8 +251,8 @@ class BatchSegmentEnv(SegmentEnv):
                 array[failed] = 0
             for index in failed.tolist():
                 self._failures[index] += 1
-                # Another seed: the same one could lead to the same failure for ever.
-                self.seed(index, generator((self._seeds[index], self._failures[index])))
+                seed = seed_after_failure(self._seeds[index], self._failures[index])
+                self.seed(index, generator(seed))
         ended = np.flatnonzero(out.truncated | out.failed).astype(np.int32)
         if ended.size:
             self._begin(ended)
@@ -281,7 +282,7 @@ class BatchSegmentEnv(SegmentEnv):
         return messages
 
 
-def generator(seed: int | tuple[int, ...]) -> np.random.Generator:
+def generator(seed: int) -> np.random.Generator:
     """The generator that Gymnasium makes of a seed."""
     return np.random.Generator(np.random.PCG64(np.random.SeedSequence(seed)))
 

@@ -8,19 +8,27 @@ environments, K steps of a segment, O observation, A action.
 from __future__ import annotations
 
 import importlib
+import sys
 from abc import ABC, abstractmethod
 from types import ModuleType
-from typing import TypedDict
+from typing import TYPE_CHECKING, TypedDict
 
 import numpy as np
 from numpy.typing import NDArray
+
+if TYPE_CHECKING:
+    from typing import NotRequired  # of Python 3.11; annotations are not evaluated
 
 SUCCESS_NO, SUCCESS_YES, SUCCESS_NOT_REPORTED = 0, 1, 2
 """Values of :attr:`SegmentBuffers.success`."""
 
 
+OBSERVATION_NAMES_MAX = 10_000
+"""Longer observations go without names: a specification is written down, and sent as one line."""
+
+
 class SegmentEnvError(RuntimeError):
-    """An environment failed. The message names its id, its index and the step of the segment."""
+    """An environment failed for good. The message names its id, its index and the step."""
 
 
 class UnsupportedSpaceError(TypeError):
@@ -39,6 +47,8 @@ class EnvSpec(TypedDict):
     """Duration of one environment step [s]; 0.0 when the environment does not say."""
     episode_steps: int
     """Steps after which an episode is truncated; 0 when it never is."""
+    observation_names: NotRequired[list[str]]
+    """Of each entry of an observation, such as ``achieved_goal[0]``; empty: they have none."""
 
 
 class SegmentBuffers:
@@ -53,6 +63,8 @@ class SegmentBuffers:
     - ``terminated``, ``truncated`` uint8 (E,): of the last step run. Both may be set.
     - ``success`` uint8 (E,): 0 no, 1 yes, 2 not reported; of the last step run.
     - ``steps`` int32 (E,): steps really run, 1 to K.
+    - ``failed`` uint8 (E,): 1 where the environment raised, or returned something not finite,
+      during this call. Its other rows of this call mean nothing then: zeros, ``steps`` too.
     - ``next_observations`` float64 (E, O): the observation to act on next: of the new episode
       where the old one ended, else the last one. ``reset`` writes only this one.
     """
@@ -99,6 +111,10 @@ class SegmentEnv(ABC):
 
         - ``mask`` uint8 (E,); ``seeds`` uint64 (E,): the same seed gives the same episode.
         - Writes the masked rows of ``out.next_observations``.
+        - An environment that fails at this is made again and reset with the same seed.
+
+        Raises:
+            SegmentEnvError: it failed again.
         """
 
     @abstractmethod
@@ -109,28 +125,55 @@ class SegmentEnv(ABC):
         - An environment stops at its first terminated or truncated step. It is then reset at the
           end of this call, without a seed: its own random generator goes on, so a run depends on
           the first seeds alone. Thus the caller never has to reset between episodes.
+        - An environment that raises or returns something not finite, in a step or in that reset,
+          costs its own segment and nothing else. It is closed, made again and reset with
+          :func:`seed_after_failure`; ``out.failed`` says so, and its row of
+          ``out.next_observations`` begins the new episode. The others go on undisturbed.
 
         Raises:
-            SegmentEnvError: an environment raised, or returned something not finite.
+            SegmentEnvError: it could not be made again. An implementation that cannot make its
+                environments again may raise at the first failure: the worker then ends, and a
+                new one is started.
         """
+
+    def take_failures(self) -> list[str]:
+        """Sentences about the failures since the last call.
+
+        Each names id, environment index, step and cause, as those of :class:`SegmentEnvError`.
+        """
+        return []
 
     def close(self) -> None:  # noqa: B027 - nothing to release is the usual case
         """Releases what the environments hold."""
+
+
+def seed_after_failure(first_seed: int, failures: int) -> int:
+    """The seed of an environment that was made again.
+
+    The same failures lead to the same episodes, and no episode that led to a failure is repeated.
+
+    - ``first_seed``: of the caller's last ``reset``; ``failures``: since then, this one included.
+    - Returns 31 bits: some environments take no more.
+    """
+    return int(np.random.SeedSequence([first_seed, failures]).generate_state(1)[0]) >> 1
 
 
 def make(task_id: str, env_count: int, segment_steps: int) -> SegmentEnv:
     """The environments of a task.
 
     - ``task_id``: a Gymnasium id, ``module:Id`` for one that ``module`` registers when imported,
-      or ``module:Class`` with a :class:`SegmentEnv`.
+      or ``module:Class`` with a :class:`SegmentEnv`, a ``dmprl.mujoco_batch.MujocoTask`` or a
+      ``gymnasium.Env``.
     """
     if env_count < 1 or segment_steps < 1:
         raise ValueError(f"{env_count} environments, {segment_steps} steps: both must be 1 or more")
     module_name, _, name = task_id.rpartition(":")
-    if module_name:
-        candidate = getattr(_import(task_id, module_name), name, None)
-        if isinstance(candidate, type) and issubclass(candidate, SegmentEnv):
-            return candidate(env_count, segment_steps)
+    candidate = getattr(_import(task_id, module_name), name, None) if module_name else None
+    if isinstance(candidate, type) and issubclass(candidate, SegmentEnv):
+        return candidate(env_count, segment_steps)
+    batched = sys.modules.get("dmprl.mujoco_batch")  # imported by whoever subclasses its task
+    if batched and isinstance(candidate, type) and issubclass(candidate, batched.MujocoTask):
+        return candidate(env_count).batch(segment_steps, candidate.episode_steps)
 
     from dmprl.tasks import make_batch
 
@@ -140,7 +183,7 @@ def make(task_id: str, env_count: int, segment_steps: int) -> SegmentEnv:
 
     from dmprl.gymnasium_env import GymnasiumSegmentEnv  # a SegmentEnv may do without Gymnasium
 
-    return GymnasiumSegmentEnv(task_id, env_count, segment_steps)
+    return GymnasiumSegmentEnv(task_id, env_count, segment_steps, candidate)
 
 
 def _import(task_id: str, module_name: str) -> ModuleType:

@@ -328,7 +328,10 @@ class BatchTest(unittest.TestCase):
                 )
             if step == 0:
                 (message,) = env.take_failures()
-                self.assertIn("Pusher-v5, environment 1: MuJoCo warned (mjWARN_BADQVEL)", message)
+                self.assertIn(
+                    "Pusher-v5, environment 1, this segment: MuJoCo warned (mjWARN_BADQVEL)",
+                    message,
+                )
                 self.assertEqual(out.steps.tolist(), [5, 0, 5])
                 np.testing.assert_array_equal(out.observations[1], 0.0)
                 self.assertTrue(out.next_observations[1].any())

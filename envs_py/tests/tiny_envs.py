@@ -3,10 +3,13 @@
 The Rust tests use them too, as ``tiny_envs:Id`` with this folder on the Python path.
 """
 
+import ctypes
 import os
+import pathlib
 import signal
 import site
 import sys
+import threading
 
 import gymnasium
 import numpy as np
@@ -48,6 +51,78 @@ class Countdown(gymnasium.Env):
         return observation, reward, ended, False, {"is_success": ended and reward > 0}
 
 
+class Faulty(Countdown):
+    """Breaks in step ``life`` of its life: of this object, over all its episodes.
+
+    With ``once``, only where nothing in the working directory says that one has broken before.
+    """
+
+    def __init__(self, fault, life=23, once=False, render_mode=None):
+        super().__init__(length=10**9)
+        self.kind, self.life, self.once, self.lived = fault, life, once, 0
+
+    def step(self, action):
+        self.lived += 1
+        observation, reward, *rest = super().step(action)
+        if self.lived == self.life and (not self.once or mark("broken")):
+            if self.kind == "raise":
+                raise ValueError("the gripper fell off")
+            if self.kind == "exit":
+                sys.exit("the gripper went home")
+            if self.kind == "observation":
+                observation[1] = np.nan
+            if self.kind == "reward":
+                reward = np.inf
+            if self.kind == "hang":
+                threading.Event().wait()
+            if self.kind == "hang-with-lock":
+                ctypes.PyDLL(None).pause()  # PyDLL keeps the interpreter's lock
+            if self.kind == "segfault":
+                ctypes.string_at(0)
+        return observation, reward, *rest
+
+
+def mark(name):
+    """Makes a file; whether it was not there before."""
+    try:
+        pathlib.Path(name).touch(exist_ok=False)
+    except FileExistsError:
+        return False
+    return True
+
+
+class FaultyReset(Countdown):
+    """Raises in reset number ``last`` of its life, and when it is closed."""
+
+    made, made_max = 0, 10**9
+
+    def __init__(self, last=2, render_mode=None):
+        if type(self).made >= type(self).made_max:
+            raise OSError("no more of them")
+        type(self).made += 1
+        super().__init__()
+        self.last, self.resets = last, 0
+
+    def reset(self, *, seed=None, options=None):
+        self.resets += 1
+        if self.resets == self.last:
+            raise ValueError("no way back")
+        return super().reset(seed=seed)
+
+    def close(self):
+        raise ValueError("it does not even close")
+
+
+class Limited(Countdown):
+    """Named as a class: ``tiny_envs:Limited``, without registration."""
+
+    max_episode_steps = 8
+    action_space = spaces.Box(np.array([-15.0, 0.0], "f"), np.array([5.0, 4.0], "f"))
+
+    def __init__(self):
+        super().__init__(length=1000)
+
+
 class Remembering(Countdown):
     """Keeps its last action, as environments do that charge for its change."""
 
@@ -70,6 +145,22 @@ class Spaces(Countdown):
         self.action_space = action or ACTION
 
 
+class Typed(Countdown):
+    """Observes numbers of any type."""
+
+    def __init__(self, dtype, render_mode=None):
+        super().__init__(length=1000)
+        self.observation_space = spaces.Box(0, 100, (2,), dtype)
+
+    def reset(self, *, seed=None, options=None):
+        observation, info = super().reset(seed=seed)
+        return observation.astype(self.observation_space.dtype), info
+
+    def step(self, action):
+        observation, *rest = super().step(action)
+        return observation.astype(self.observation_space.dtype), *rest
+
+
 class Goal(Countdown):
     """A goal-conditioned environment: a Dict observation; does not report success."""
 
@@ -87,6 +178,20 @@ class Goal(Countdown):
 
     def observe(self):
         return {"observation": np.full(2, 0.25, "f"), "desired_goal": np.full(2, 0.5, "f")}
+
+
+class Nested(Goal):
+    """Dictionaries in a tuple in a dictionary; a number that breaks like :class:`Countdown`."""
+
+    observation_space = spaces.Dict(
+        arm=spaces.Dict(q=spaces.Box(-1, 1, (2,)), grip=spaces.Discrete(2)),
+        parts=spaces.Tuple((spaces.Box(-9, 9, (1, 2), np.int8), spaces.Box(0, 1, ()))),
+    )
+
+    def observe(self):
+        broken = np.nan if self.steps == 2 else 0.5
+        parts = (np.full((1, 2), self.steps, np.int8), np.array(broken, "f"))
+        return {"arm": {"q": np.full(2, 0.25, "f"), "grip": 1}, "parts": parts}
 
 
 class Batch(SegmentEnv):
@@ -122,6 +227,18 @@ class Timed(Batch):
         out.truncated[:] = 1
 
 
+class BatchOfNan(Batch):
+    """Cannot make its environments again: the second call's first reward is NaN, all rows of it."""
+
+    calls = 0
+
+    def step_segment(self, actions, out: SegmentBuffers):
+        super().step_segment(actions, out)
+        self.calls += 1
+        if self.calls == 2:
+            out.rewards[0] = np.nan
+
+
 class Interpreter(Batch):
     """Checks the embedded interpreter around it; the Rust tests run it."""
 
@@ -146,6 +263,16 @@ register("Raises", Countdown, kwargs={"length": 1000, "fault": "raise"})
 register("NanObservation", Countdown, kwargs={"length": 1000, "fault": "observation"})
 register("InfReward", Countdown, kwargs={"length": 1000, "fault": "reward"})
 register("Remembering", Remembering, kwargs={"length": 1000})
+for kind in ("raise", "exit", "observation", "reward"):
+    register(f"Faulty{kind.title()}", Faulty, kwargs={"fault": kind}, max_episode_steps=7)
+for kind in ("hang", "hang-with-lock", "segfault"):
+    name = "".join(word.title() for word in kind.split("-"))
+    register(f"{name}Once", Faulty, kwargs={"fault": kind, "once": True}, max_episode_steps=7)
+register("Hopeless", Faulty, kwargs={"fault": "raise", "life": 1}, max_episode_steps=7)
+register("FaultyReset", FaultyReset)
+register("Nested", Nested)
+for dtype in ("int8", "uint16", "int64", "float16", "float32"):
+    register(f"Typed-{dtype}", Typed, kwargs={"dtype": dtype})
 register("Goal", Goal)
 register("Discrete", Spaces, kwargs={"action": spaces.Discrete(3)})
 register("Unbounded", Spaces, kwargs={"action": spaces.Box(-np.inf, np.inf, (2,))})

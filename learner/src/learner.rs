@@ -60,6 +60,10 @@ pub struct Counters {
     pub rejected: Rejected,
     /// Segments missing in the workers' sequences.
     pub lost: u64,
+    /// Failures of environments, as workers and evaluator reported them: counted elsewhere, kept
+    /// here for the run's later sessions. Checkpoints of older versions have none.
+    #[serde(default)]
+    pub env_failures: u64,
 }
 
 /// Everything that learns.
@@ -262,6 +266,7 @@ impl Learner {
             samples_per_insert: self.samples_per_insert(),
             rejected: counters.rejected,
             lost: counters.lost,
+            env_failures: counters.env_failures,
             critic_loss: collected.losses.map(|losses| losses.0),
             actor_loss: collected.losses.map(|losses| losses.1),
             q_mean: collected.losses.map(|losses| losses.2),
@@ -291,6 +296,7 @@ pub(crate) mod tests {
             action_high: vec![1.0; 2],
             control_dt_s: 0.02,
             episode_steps: 10,
+            observation_names: Vec::new(),
         }
     }
 }

@@ -29,6 +29,10 @@ pub struct MetricsLine {
     /// Segments missing in the sequences of the workers that the learner has heard from, over the
     /// whole run.
     pub lost: u64,
+    /// Failures of environments, over the whole run: each cost a segment, or an episode of an
+    /// evaluation, and the environment was made again.
+    #[serde(default)]
+    pub env_failures: u64,
     /// mean (Q - target)^2.
     pub critic_loss: Option<f64>,
     /// -mean Q(s, pi(s)).

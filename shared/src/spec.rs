@@ -21,6 +21,10 @@ pub struct EnvSpec {
     pub control_dt_s: f64,
     /// Steps after which an episode is truncated; 0 when it never is.
     pub episode_steps: u32,
+    /// What each entry of an observation is called, such as `achieved_goal[0]`; empty: they have
+    /// no names, as in files of older versions.
+    #[serde(default)]
+    pub observation_names: Vec<String>,
 }
 
 /// Why an environment cannot be used.
@@ -61,11 +65,16 @@ impl EnvSpec {
     /// # Errors
     /// `Length` or `Bounds`, naming the field or dimension.
     pub fn check(&self) -> Result<(), SpecError> {
+        let names_len = match self.observation_names.len() {
+            0 => self.observation_len,
+            named => named,
+        };
         let lengths = [
             ("action_low", self.action_low.len(), self.action_len),
             ("action_high", self.action_high.len(), self.action_len),
             ("observation", self.observation_len.min(1), 1),
             ("action", self.action_len.min(1), 1),
+            ("observation_names", names_len, self.observation_len),
         ];
         for (name, got, expected) in lengths {
             if got != expected {
@@ -79,5 +88,55 @@ impl EnvSpec {
             }
         }
         Ok(())
+    }
+
+    /// Whether both describe one environment; names that only one of them has tell nothing.
+    #[must_use]
+    pub fn is_same(&self, other: &Self) -> bool {
+        let named = !self.observation_names.is_empty() && !other.observation_names.is_empty();
+        if named && self.observation_names != other.observation_names {
+            return false;
+        }
+        let nameless = |spec: &Self| Self { observation_names: Vec::new(), ..spec.clone() };
+        nameless(self) == nameless(other)
+    }
+
+    /// What entry `index` of an observation is called.
+    #[must_use]
+    pub fn observation_name(&self, index: usize) -> String {
+        let name = self.observation_names.get(index).cloned();
+        name.unwrap_or_else(|| format!("observation[{index}]"))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// As version 0.1.0 wrote it.
+    const OLDER: &str = r#"{"id": "Test-v0", "observation_len": 2, "action_len": 1,
+        "action_low": [-1.0], "action_high": [1.0], "control_dt_s": 0.02, "episode_steps": 50}"#;
+
+    #[test]
+    fn a_file_without_names_is_read_and_is_the_same_environment() {
+        let older: EnvSpec = serde_json::from_str(OLDER).unwrap();
+        older.check().unwrap();
+        assert_eq!(older.observation_name(1), "observation[1]");
+        let names = ["angle", "speed"].map(str::to_owned).to_vec();
+        let newer = EnvSpec { observation_names: names, ..older.clone() };
+        newer.check().unwrap();
+        assert_eq!(newer.observation_name(1), "speed");
+        assert!(newer.is_same(&older) && older.is_same(&newer));
+        let other = EnvSpec { observation_names: vec!["x".into(), "y".into()], ..older.clone() };
+        assert!(!newer.is_same(&other));
+        assert!(!older.is_same(&EnvSpec { episode_steps: 51, ..older.clone() }));
+    }
+
+    #[test]
+    fn names_for_another_number_of_entries_are_refused() {
+        let older: EnvSpec = serde_json::from_str(OLDER).unwrap();
+        let spec = EnvSpec { observation_names: vec!["angle".into()], ..older };
+        let message = spec.check().unwrap_err().to_string();
+        assert_eq!(message, "Test-v0: observation_names has 1 entries, expected 2");
     }
 }

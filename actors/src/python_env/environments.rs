@@ -1,9 +1,12 @@
 //! E environments of one task: one Python call per segment.
 
+use std::sync::Arc;
+
 use dmprl_shared::spec::EnvSpec;
 use pyo3::{prelude::*, types::PyTuple};
 
 use super::{Interpreter, PythonError, buffer::SharedBuffer};
+use crate::watchdog::{CallKind, CallState};
 
 /// The environment reported no success at the last step run.
 pub const SUCCESS_NO: u8 = 0;
@@ -22,6 +25,8 @@ pub struct PythonEnvironments {
     segment_steps: usize,
     reset: Call,
     step_segment: Call,
+    take_failures: Py<PyAny>,
+    calls: Arc<CallState>,
     mask: SharedBuffer<u8>,
     seeds: SharedBuffer<u64>,
     actions: SharedBuffer<f64>,
@@ -31,6 +36,7 @@ pub struct PythonEnvironments {
     truncated: SharedBuffer<u8>,
     success: SharedBuffer<u8>,
     steps: SharedBuffer<i32>,
+    failed: SharedBuffer<u8>,
     next_observations: SharedBuffer<f64>,
 }
 
@@ -110,6 +116,11 @@ impl PythonEnvironments {
         Ok(Self {
             reset: call("reset", &["mask", "seeds"])?,
             step_segment: call("step_segment", &["actions"])?,
+            take_failures: env
+                .getattr("take_failures")
+                .map_err(|error| PythonError::exception(env.py(), &error))?
+                .unbind(),
+            calls: Arc::default(),
             mask: SharedBuffer::new(buffers, "mask", e, id)?,
             seeds: SharedBuffer::new(buffers, "seeds", e, id)?,
             actions: SharedBuffer::new(buffers, "actions", e * k * a, id)?,
@@ -119,6 +130,7 @@ impl PythonEnvironments {
             truncated: SharedBuffer::new(buffers, "truncated", e, id)?,
             success: SharedBuffer::new(buffers, "success", e, id)?,
             steps: SharedBuffer::new(buffers, "steps", e, id)?,
+            failed: SharedBuffer::new(buffers, "failed", e, id)?,
             next_observations: SharedBuffer::new(buffers, "next_observations", e * o, id)?,
             segment_steps: k,
             spec,
@@ -142,6 +154,7 @@ impl PythonEnvironments {
             *to = u8::from(from);
         }
         self.seeds.get_mut().copy_from_slice(seeds);
+        let _call = self.calls.enter(CallKind::Reset);
         self.reset.run()
     }
 
@@ -149,8 +162,8 @@ impl PythonEnvironments {
     /// episode, and has begun its next one when this returns (see [`Self::next_observations`]).
     ///
     /// # Errors
-    /// `Length`, `ActionNotFinite`, or `Exception` naming environment and step when one raised or
-    /// returned something not finite.
+    /// `Length`, `ActionNotFinite`, or `Exception` naming environment and step when one could not
+    /// be made again after a failure. Of failures that were made up for, [`Self::failed`] tells.
     pub fn step_segment(&mut self, actions: &[f64]) -> Result<(), PythonError> {
         self.check_len("actions", actions.len(), self.actions.get().len())?;
         if let Some(index) = actions.iter().position(|action| !action.is_finite()) {
@@ -163,11 +176,15 @@ impl PythonEnvironments {
             });
         }
         self.actions.get_mut().copy_from_slice(actions);
+        let call = self.calls.enter(CallKind::StepSegment);
         self.step_segment.run()?;
+        drop(call);
         let steps_max = self.segment_steps;
-        for &steps in self.steps.get() {
+        for (&steps, &failed) in self.steps.get().iter().zip(self.failed.get()) {
             // A foreign SegmentEnv may be wrong, and `steps` becomes an index.
-            if usize::try_from(steps).is_ok_and(|steps| (1..=steps_max).contains(&steps)) {
+            if failed != 0
+                || usize::try_from(steps).is_ok_and(|steps| (1..=steps_max).contains(&steps))
+            {
                 continue;
             }
             return Err(PythonError::Interface {
@@ -177,6 +194,22 @@ impl PythonEnvironments {
             });
         }
         Ok(())
+    }
+
+    /// What a [`crate::watchdog`] looks at.
+    pub fn calls(&self) -> &Arc<CallState> {
+        &self.calls
+    }
+
+    /// Sentences about the failures since the last call, each with environment, step and cause.
+    ///
+    /// # Errors
+    /// `Exception` from a foreign `SegmentEnv`.
+    pub fn take_failures(&mut self) -> Result<Vec<String>, PythonError> {
+        Python::attach(|py| {
+            let sentences = self.take_failures.bind(py).call0().and_then(|list| list.extract());
+            sentences.map_err(|error| PythonError::exception(py, &error))
+        })
     }
 
     /// (E, K+1, O): row k preceded step k; row `steps` followed the last step really run.
@@ -204,6 +237,12 @@ impl PythonEnvironments {
         self.success.get()
     }
 
+    /// (E,): 1 where the environment failed in the last segment and was made again: its other
+    /// rows mean nothing, and its next observation begins an episode.
+    pub fn failed(&self) -> &[u8] {
+        self.failed.get()
+    }
+
     /// (E,): steps really run, 1 to K.
     pub fn steps(&self) -> &[i32] {
         self.steps.get()
@@ -228,6 +267,7 @@ impl PythonEnvironments {
 }
 
 fn read_spec(dict: &Bound<'_, PyAny>) -> PyResult<EnvSpec> {
+    let names = dict.call_method1("get", ("observation_names",))?;
     Ok(EnvSpec {
         id: dict.get_item("id")?.extract()?,
         observation_len: dict.get_item("observation_len")?.extract()?,
@@ -236,5 +276,6 @@ fn read_spec(dict: &Bound<'_, PyAny>) -> PyResult<EnvSpec> {
         action_high: dict.get_item("action_high")?.extract()?,
         control_dt_s: dict.get_item("control_dt_s")?.extract()?,
         episode_steps: dict.get_item("episode_steps")?.extract()?,
+        observation_names: if names.is_none() { Vec::new() } else { names.extract()? },
     })
 }

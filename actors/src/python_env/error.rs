@@ -103,6 +103,20 @@ pub enum PythonError {
         /// The value.
         value: f64,
     },
+    /// An environment that nothing is left to be done about: it was reset.
+    #[error(
+        "{task_id}, environment {env}, reset: {name} is {value}, which is no finite 32-bit number"
+    )]
+    ObservationNotFinite {
+        /// Task.
+        task_id: String,
+        /// Which environment.
+        env: usize,
+        /// Which entry of the observation.
+        name: String,
+        /// The value.
+        value: f64,
+    },
     /// The package `dmprl` in `.venv` does not fit this program.
     #[error("{task_id}: {name} of the Python package dmprl: {reason}")]
     Interface {

@@ -118,7 +118,7 @@ fn task_table(name: &str) -> anyhow::Result<Table> {
     );
     Err(wrong_use(format!(
         "unknown task `{name}`, {advice}\n  A Gymnasium id ends in its version, as Pendulum-v1 or \
-         my_module:MyArm-v0; a SegmentEnv is my_module:MyClass"
+         my_module:MyArm-v0; a class is my_module:MyClass"
     )))
 }
 

@@ -40,8 +40,8 @@ EXAMPLES
 #[derive(Debug, Args)]
 #[command(after_help = HELP)]
 pub(super) struct TrainArgs {
-    /// A task of `dmprl tasks`, or any Gymnasium id: Pendulum-v1, my_module:MyArm-v0; or a
-    /// SegmentEnv of your own: my_module:MyClass.
+    /// A task of `dmprl tasks`, or any Gymnasium id: Pendulum-v1, my_module:MyArm-v0; or a class
+    /// of your own, a gymnasium.Env or a SegmentEnv: my_module:MyClass.
     task: String,
     /// Learning algorithm.
     #[arg(long, value_parser = PossibleValuesParser::new(["ddpg"]))]

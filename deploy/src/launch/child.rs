@@ -11,7 +11,7 @@ use tokio::process::{ChildStdin, ChildStdout};
 use tokio::sync::{Notify, mpsc};
 
 use super::Process;
-use crate::control::{Command, Report};
+use crate::control::{Command, ENV_HUNG_STATUS, Report};
 
 /// Events not yet handled; full: children wait, their pipes fill.
 pub(super) const EVENTS_MAX: usize = 1_024;
@@ -121,6 +121,9 @@ async fn read_reports(output: ChildStdout, process: Process, events: mpsc::Sende
 /// `exit status 3`, `signal 9 (SIGKILL), perhaps for want of memory`.
 pub(crate) fn describe(status: ExitStatus) -> String {
     let signal = match (status.code(), status.signal()) {
+        (Some(ENV_HUNG_STATUS), _) => {
+            return format!("exit status {ENV_HUNG_STATUS}, an environment hung");
+        }
         (Some(code), _) => return format!("exit status {code}"),
         (None, Some(signal)) => signal,
         (None, None) => return status.to_string(),
@@ -144,6 +147,7 @@ mod tests {
     #[test]
     fn an_end_is_described_with_its_likely_cause() {
         assert_eq!(describe(ExitStatus::from_raw(3 << 8)), "exit status 3");
+        assert!(describe(ExitStatus::from_raw(75 << 8)).contains("an environment hung"));
         assert!(describe(ExitStatus::from_raw(9)).contains("SIGKILL"));
         assert!(describe(ExitStatus::from_raw(7)).contains("/dev/shm"));
     }

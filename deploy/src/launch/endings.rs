@@ -14,8 +14,8 @@ use super::supervisor::{Phase, Supervisor};
 use crate::control::Command;
 use crate::terminal::shown;
 
-/// Deaths of the evaluator in one session before the run stops: a run that nobody evaluates
-/// is not worth its electricity.
+/// Deaths of the evaluator without an answer in between before the run stops: a run that nobody
+/// evaluates is not worth its electricity.
 const EVALUATOR_RESTARTS_MAX: u32 = 3;
 /// Two interrupts so close together count as one.
 const INTERRUPT_GAP: Duration = Duration::from_millis(100);

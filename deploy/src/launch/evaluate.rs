@@ -12,7 +12,7 @@ use super::endings::log_tail;
 use super::{Launcher, Process, TimeLimits, interrupts};
 use crate::control::{Command, EvaluationRequest, EvaluationRow, Report};
 use crate::run_directory::RunDirectory;
-use crate::terminal::say;
+use crate::terminal::{say, shown};
 
 /// What to evaluate.
 pub struct EvaluationPlan<'a> {
@@ -115,7 +115,16 @@ impl Evaluation {
                     waiting_for = "done";
                 }
                 Some(Event::Report(_, Report::Evaluated(row))) => return Ok(row),
-                Some(Event::Report(_, Report::Warning { message })) => say(&message),
+                Some(Event::Report(_, Report::NotEvaluated { reason, .. })) => {
+                    bail!("the evaluation failed: {reason}{}", log_tail(&self.log));
+                }
+                Some(Event::Report(_, Report::EnvFailures { last, .. })) => {
+                    say(&format!("environment failure: {last}; log: {}", shown(&self.log)));
+                }
+                Some(Event::Report(
+                    _,
+                    Report::Warning { message } | Report::EnvHung { message },
+                )) => say(&message),
                 Some(Event::Report(..) | Event::Garbage(..)) => {}
                 Some(Event::Exited(_, status)) => bail!("{}", self.died(status)),
                 None => bail!("the evaluator is gone"),

@@ -19,6 +19,7 @@ mod child;
 mod deadlines;
 mod domain;
 mod endings;
+mod env_failures;
 mod evaluate;
 mod evaluations;
 mod launcher;

@@ -9,7 +9,7 @@ use super::Process;
 use super::child::Event;
 use super::supervisor::{Phase, Supervisor};
 use crate::control::{Command, EvaluationRequest, EvaluationRow, Progress, Report};
-use crate::terminal::grouped;
+use crate::terminal::{grouped, shown};
 
 /// Lines that are no reports, shown to the user; the rest is only counted.
 const GARBAGE_SHOWN_MAX: u32 = 3;
@@ -41,6 +41,11 @@ impl Supervisor {
             Report::Progress(progress) => self.on_progress(progress),
             Report::Evaluate(request) => self.on_evaluate(request),
             Report::Evaluated(row) => return self.on_evaluated(process, row),
+            Report::NotEvaluated { policy_version, reason } => {
+                return self.on_not_evaluated(process, policy_version, &reason);
+            }
+            Report::EnvFailures { count, last } => self.on_env_failures(process, count, &last),
+            Report::EnvHung { message } => self.on_env_hung(process, &message),
             Report::Checkpoint { name, env_steps } => {
                 self.checkpointed = true;
                 let steps = grouped(env_steps);
@@ -62,7 +67,7 @@ impl Supervisor {
                 self.launcher.run.write_spec(&spec)?;
                 self.spec = Some(spec);
             }
-            Some(known) if *known != spec => bail!(
+            Some(known) if !known.is_same(&spec) => bail!(
                 "the environment of {process} is not the run's: expected {}, got {}",
                 serde_json::to_string(known)?,
                 serde_json::to_string(&spec)?
@@ -118,6 +123,7 @@ impl Supervisor {
             self.advanced = now;
         }
         self.checkpointed = false;
+        self.tell_learner_of_env_failures();
         self.display.progress(&progress);
         if self.first.is_none() {
             self.first = Some((now, progress.clone()));
@@ -153,14 +159,7 @@ impl Supervisor {
         if matches!(self.phase, Phase::Stopping { .. }) {
             return Ok(());
         }
-        if !self.is_one_process() {
-            ensure!(
-                process == Process::Evaluator && self.evaluations.finish(row.policy_version),
-                "{process} evaluated policy {}, which nobody asked for",
-                row.policy_version
-            );
-            self.send_evaluation();
-        }
+        self.on_answer(process, row.policy_version)?;
         let best = row.return_mean > self.best_return;
         self.best_return = self.best_return.max(row.return_mean);
         self.display.evaluation(&row, best);
@@ -177,6 +176,42 @@ impl Supervisor {
             self.drain(&reason);
         }
         self.complete_if_done();
+        Ok(())
+    }
+
+    /// A curve with a point less is no reason to end a run.
+    fn on_not_evaluated(
+        &mut self,
+        process: Process,
+        policy_version: u64,
+        reason: &str,
+    ) -> anyhow::Result<()> {
+        if matches!(self.phase, Phase::Stopping { .. }) {
+            return Ok(());
+        }
+        self.on_answer(process, policy_version)?;
+        self.display.message(&format!(
+            "no evaluation of policy {policy_version}, the run goes on: {reason}; log: {}",
+            shown(&self.log_path(process))
+        ));
+        self.complete_if_done();
+        Ok(())
+    }
+
+    /// The evaluator has answered and takes the next request.
+    fn on_answer(&mut self, process: Process, policy_version: u64) -> anyhow::Result<()> {
+        if self.is_one_process() {
+            return Ok(());
+        }
+        ensure!(
+            process == Process::Evaluator && self.evaluations.finish(policy_version),
+            "{process} evaluated policy {policy_version}, which nobody asked for"
+        );
+        // One that answers now and then is worth each restart.
+        if let Some(slot) = self.slots.get_mut(&Process::Evaluator) {
+            slot.restarts = 0;
+        }
+        self.send_evaluation();
         Ok(())
     }
 }

@@ -54,6 +54,8 @@ pub struct SessionReport {
     pub training: Duration,
     /// The last evaluation.
     pub last_row: Option<EvaluationRow>,
+    /// Failures of environments that were reported.
+    pub env_failures: u64,
     /// From the first start to the last exit.
     pub wall: Duration,
 }
@@ -113,6 +115,9 @@ pub(super) struct Supervisor {
     pub(super) last: Option<(Instant, Progress)>,
     pub(super) best_return: f64,
     pub(super) last_row: Option<EvaluationRow>,
+    /// Failures of environments in this session, and as many as the learner has been told of.
+    pub(super) env_failures: u64,
+    pub(super) env_failures_told: u64,
 }
 
 /// What ended the supervisor's wait.
@@ -152,6 +157,8 @@ pub async fn supervise(plan: SupervisorPlan) -> SessionReport {
         last: None,
         best_return: f64::NEG_INFINITY,
         last_row: None,
+        env_failures: 0,
+        env_failures_told: 0,
     };
     let started = supervisor.start();
     supervisor.check(started);
@@ -247,6 +254,7 @@ impl Supervisor {
             last: self.last.map(|(_, progress)| progress),
             training,
             last_row: self.last_row,
+            env_failures: self.env_failures,
             wall: self.started.elapsed(),
         }
     }

@@ -4,7 +4,7 @@ use std::path::Path;
 use std::time::{Duration, Instant};
 
 use anyhow::{Context, bail};
-use dmprl_actors::python_env::{Interpreter, InterpreterOptions, PythonEnvironments};
+use dmprl_actors::python_env::{Interpreter, InterpreterOptions};
 use dmprl_actors::rollout::{Identity, Rollout, RolloutError};
 use dmprl_shared::config::ExperimentConfig;
 use dmprl_shared::seeds;
@@ -13,7 +13,7 @@ use dmprl_shared::transport::shared_memory::{Plan, Sender, Subscriber, WorkerEnd
 use dmprl_shared::transport::{ParameterSubscriber, SegmentSender, SendOutcome, TransportError};
 
 use super::setup::Setup;
-use super::{ActorArgs, ControlPipe};
+use super::{ActorArgs, ControlPipe, environments};
 use crate::control::{Command, Report};
 
 /// Sleep after the first offer of a segment to a full queue; doubles with each further one,
@@ -42,16 +42,11 @@ pub fn run(args: &ActorArgs, control: &ControlPipe) -> anyhow::Result<()> {
     let interpreter = interpreter(args.venv.as_deref(), config)?;
     let worker = u64::from(args.index) << 32 | u64::from(args.incarnation);
     interpreter.seed(seeds::derive(config.run.seed, "python", worker))?;
-    let environments = PythonEnvironments::start(
-        &interpreter,
-        &config.task.id,
-        config.actors.envs_per_worker,
-        config.policy.decision_steps(),
-    )?;
-    control.send(&Report::EnvironmentReady { spec: environments.spec().clone() })?;
+    let envs = environments::make(&interpreter, config, config.actors.envs_per_worker, control)?;
+    control.send(&Report::EnvironmentReady { spec: envs.spec().clone() })?;
     let identity =
         Identity { run_id: setup.run_id, worker_id: args.index, incarnation: args.incarnation };
-    let mut rollout = Rollout::start(config, environments, identity)?;
+    let mut rollout = Rollout::start(config, envs, identity)?;
     let plan = super::learner::plan(&setup, rollout.policy());
     let Some(end) = await_attach(control, &plan, args.index)? else { return Ok(()) };
     let mut worker = Worker {
@@ -64,7 +59,9 @@ pub fn run(args: &ActorArgs, control: &ControlPipe) -> anyhow::Result<()> {
     worker.await_first_policy(&mut rollout)?;
     while !control.stop_requested() {
         worker.take_newest(&mut rollout)?;
-        match rollout.segment(&mut |header, block| worker.deliver(header, block)) {
+        let stepped = rollout.segment(&mut |header, block| worker.deliver(header, block));
+        environments::tell(&rollout.take_failures(), control);
+        match stepped {
             Ok(()) => {}
             Err(Stopped::Asked) => break,
             Err(Stopped::Failed(error)) => return Err(error),

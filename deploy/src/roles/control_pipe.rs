@@ -2,7 +2,7 @@
 
 use std::fs::File;
 use std::io::{BufRead, BufReader, Read, Write};
-use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::sync::mpsc::{self, Receiver, SyncSender, TrySendError};
 use std::sync::{Arc, Mutex, PoisonError};
 use std::thread;
@@ -29,6 +29,7 @@ struct Flags {
     stop: Arc<AtomicBool>,
     finish: AtomicBool,
     orphaned: AtomicBool,
+    env_failures: AtomicU64,
 }
 
 /// Commands come in, reports go out; shareable between threads.
@@ -40,7 +41,25 @@ struct Flags {
 pub struct ControlPipe {
     commands: Mutex<Receiver<Command>>,
     flags: Arc<Flags>,
-    output: Mutex<Box<dyn Write + Send>>,
+    reporter: Reporter,
+}
+
+/// Sends reports, from any thread.
+#[derive(Clone)]
+pub struct Reporter(Arc<Mutex<Box<dyn Write + Send>>>);
+
+impl Reporter {
+    /// Sends one report.
+    ///
+    /// # Errors
+    /// The supervisor is gone.
+    pub fn send(&self, report: &Report) -> anyhow::Result<()> {
+        let mut line = serde_json::to_vec(report).context("cannot write a report as JSON")?;
+        ensure!((line.len() as u64) < LINE_BYTES_MAX, "a report of {} bytes", line.len());
+        line.push(b'\n');
+        let mut output = self.0.lock().unwrap_or_else(PoisonError::into_inner);
+        output.write_all(&line).and_then(|()| output.flush()).context("the supervisor is gone")
+    }
 }
 
 impl ControlPipe {
@@ -88,7 +107,8 @@ impl ControlPipe {
             drop(sender);
             orphaned();
         });
-        Self { commands: Mutex::new(commands), flags, output: Mutex::new(Box::new(output)) }
+        let reporter = Reporter(Arc::new(Mutex::new(Box::new(output))));
+        Self { commands: Mutex::new(commands), flags, reporter }
     }
 
     /// Whether to finish and exit: on `stop`, or because the supervisor is gone.
@@ -109,14 +129,20 @@ impl ControlPipe {
         Arc::clone(&self.flags.stop)
     }
 
+    /// Failures of environments that the supervisor knows of in this session.
+    #[must_use]
+    pub fn env_failures(&self) -> u64 {
+        self.flags.env_failures.load(Ordering::Acquire)
+    }
+
     /// Whether the supervisor is gone; reports then go nowhere.
     #[must_use]
     pub fn orphaned(&self) -> bool {
         self.flags.orphaned.load(Ordering::Acquire)
     }
 
-    /// The next command, waiting so long for it; none when the wait or the input has ended. `stop`
-    /// and `finish` are no commands here, see `stop_requested` and `finish_requested`.
+    /// The next command, waiting so long for it; none when the wait or the input has ended. `stop`,
+    /// `finish` and `env_failures` are no commands here: there is a method for each.
     #[must_use]
     pub fn next_within(&self, wait: Duration) -> Option<Command> {
         self.commands.lock().unwrap_or_else(PoisonError::into_inner).recv_timeout(wait).ok()
@@ -127,11 +153,13 @@ impl ControlPipe {
     /// # Errors
     /// The supervisor is gone.
     pub fn send(&self, report: &Report) -> anyhow::Result<()> {
-        let mut line = serde_json::to_vec(report).context("cannot write a report as JSON")?;
-        ensure!((line.len() as u64) < LINE_BYTES_MAX, "a report of {} bytes", line.len());
-        line.push(b'\n');
-        let mut output = self.output.lock().unwrap_or_else(PoisonError::into_inner);
-        output.write_all(&line).and_then(|()| output.flush()).context("the supervisor is gone")
+        self.reporter.send(report)
+    }
+
+    /// Sends reports too, for threads of their own.
+    #[must_use]
+    pub fn reporter(&self) -> Reporter {
+        self.reporter.clone()
     }
 }
 
@@ -157,6 +185,9 @@ fn read_commands(input: impl Read, sender: &SyncSender<Command>, flags: &Flags) 
         match serde_json::from_slice(&line) {
             Ok(Command::Stop) => flags.stop.store(true, Ordering::Release),
             Ok(Command::Finish) => flags.finish.store(true, Ordering::Release),
+            Ok(Command::EnvFailures { total }) => {
+                flags.env_failures.store(total, Ordering::Release);
+            }
             Ok(command) => match sender.try_send(command) {
                 Ok(()) | Err(TrySendError::Disconnected(_)) => {}
                 Err(TrySendError::Full(command)) => {
@@ -196,8 +227,10 @@ mod tests {
     #[test]
     fn commands_arrive_in_order_and_stop_overtakes_them() {
         let (pipe, mut commands, _reports) = pipe(mpsc::channel().0);
-        commands.write_all(b"nonsense\n{\"attach\":{\"domain\":\"/a\"}}\n\"stop\"\n").unwrap();
+        commands.write_all(b"nonsense\n{\"attach\":{\"domain\":\"/a\"}}\n").unwrap();
+        commands.write_all(b"{\"env_failures\":{\"total\":3}}\n\"stop\"\n").unwrap();
         until(|| pipe.stop_requested());
+        assert_eq!(pipe.env_failures(), 3);
         assert!(!pipe.orphaned());
         let attach = Command::Attach { domain: "/a".into() };
         assert_eq!(pipe.next_within(PATIENCE), Some(attach));

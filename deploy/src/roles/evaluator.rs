@@ -4,14 +4,15 @@ use std::sync::atomic::AtomicBool;
 use std::time::Duration;
 
 use dmprl_actors::evaluate::{ENVIRONMENTS_MAX, Episodes, Evaluator};
-use dmprl_actors::python_env::{Interpreter, PythonEnvironments};
+use dmprl_actors::python_env::Interpreter;
+use dmprl_actors::rollout::RolloutError;
 use dmprl_learner::checkpoint;
 use dmprl_learner::policy_file::{self, Match};
 use dmprl_shared::config::ExperimentConfig;
 use dmprl_shared::spec::EnvSpec;
 
 use super::setup::Setup;
-use super::{ControlPipe, EvaluatorArgs};
+use super::{ControlPipe, EvaluatorArgs, environments};
 use crate::control::{Command, EvaluationRequest, EvaluationRow, Report};
 use crate::terminal::say;
 
@@ -26,17 +27,27 @@ pub fn run(args: &EvaluatorArgs, control: &ControlPipe) -> anyhow::Result<()> {
         config.evaluation.episodes = usize::try_from(episodes)?;
     }
     let interpreter = super::actor::interpreter(args.venv.as_deref(), &config)?;
-    let (mut evaluator, spec) = evaluator(&interpreter, &config)?;
+    let (mut evaluator, spec) = evaluator(&interpreter, &config, control)?;
     control.send(&Report::EnvironmentReady { spec })?;
     let stop = control.stop_flag();
     while !control.stop_requested() {
         let Some(Command::Evaluate(request)) = control.next_within(COMMAND_WAIT) else { continue };
         let plan = Plan { setup: &setup, config: &config, stop: &stop };
-        let Some(row) = evaluate(&mut evaluator, &plan, &request)? else { break };
-        if !args.print_only {
-            keep(&setup, &row, control)?;
+        let answer = evaluate(&mut evaluator, &plan, &request);
+        environments::tell(&evaluator.take_failures(), control);
+        match answer? {
+            Answer::Row(row) => {
+                if !args.print_only {
+                    keep(&setup, &row, control)?;
+                }
+                control.send(&Report::Evaluated(row))?;
+            }
+            Answer::Failed(reason) => {
+                let policy_version = request.policy_version;
+                control.send(&Report::NotEvaluated { policy_version, reason })?;
+            }
+            Answer::Stopped => break,
         }
-        control.send(&Report::Evaluated(row))?;
     }
     Ok(())
 }
@@ -45,12 +56,12 @@ pub fn run(args: &EvaluatorArgs, control: &ControlPipe) -> anyhow::Result<()> {
 pub fn evaluator(
     interpreter: &Interpreter,
     config: &ExperimentConfig,
+    control: &ControlPipe,
 ) -> anyhow::Result<(Evaluator, EnvSpec)> {
     let envs = config.evaluation.episodes.min(ENVIRONMENTS_MAX);
-    let steps = config.policy.decision_steps();
-    let environments = PythonEnvironments::start(interpreter, &config.task.id, envs, steps)?;
-    let spec = environments.spec().clone();
-    Ok((Evaluator::new(config, environments, envs)?, spec))
+    let made = environments::make(interpreter, config, envs, control)?;
+    let spec = made.spec().clone();
+    Ok((Evaluator::new(config, made, envs)?, spec))
 }
 
 /// What is the same for all evaluations of a run.
@@ -61,22 +72,34 @@ pub struct Plan<'a> {
     pub stop: &'a AtomicBool,
 }
 
-/// Evaluates a saved policy; none if a stop was asked for.
+/// What became of an evaluation.
+pub enum Answer {
+    Row(EvaluationRow),
+    /// An episode failed, and failed again: no reason why the next evaluation should.
+    Failed(String),
+    /// A stop was asked for.
+    Stopped,
+}
+
+/// Evaluates a saved policy.
 pub fn evaluate(
     evaluator: &mut Evaluator,
     plan: &Plan<'_>,
     request: &EvaluationRequest,
-) -> anyhow::Result<Option<EvaluationRow>> {
+) -> anyhow::Result<Answer> {
     let path = plan.setup.run.policy_path(request.policy_version);
     let snapshot = policy_file::load(&path, evaluator.policy(), Match::Architecture)?;
     let settings = &plan.config.evaluation;
     let episodes =
         Episodes { count: settings.episodes, first_seed: settings.first_seed, stop: plan.stop };
-    let Some(evaluation) = evaluator.evaluate(&snapshot.values, episodes)? else {
-        return Ok(None);
+    let evaluation = match evaluator.evaluate(&snapshot.values, episodes) {
+        Ok(Some(evaluation)) => evaluation,
+        Ok(None) => return Ok(Answer::Stopped),
+        Err(error @ RolloutError::Episode { .. }) => return Ok(Answer::Failed(error.to_string())),
+        Err(error) => return Err(error.into()),
     };
     let EvaluationRequest { env_steps, updates, segments, wall_s, policy_version } = *request;
-    Ok(Some(EvaluationRow {
+    Ok(Answer::Row(EvaluationRow {
         env_steps,
         updates,
         segments,

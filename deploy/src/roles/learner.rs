@@ -29,6 +29,7 @@ pub fn run(args: &LearnerArgs, control: &ControlPipe) -> anyhow::Result<()> {
     let setup = Setup::read(&args.run)?;
     let spec = setup.run.spec()?.context("the run has no spec.json; a worker writes it first")?;
     let learner = make(&setup, &spec, args, control)?;
+    let env_failures_before = learner.counters.env_failures;
     let domain = args.domain.as_deref().context("--domain is missing")?;
     let plan = plan(&setup, learner.policy());
     let LearnerEnd { segments, parameters } = serve(domain, &plan)?;
@@ -43,6 +44,8 @@ pub fn run(args: &LearnerArgs, control: &ControlPipe) -> anyhow::Result<()> {
     };
     catch_up(&mut session, &mut recorder, &mut ask)?;
     let finished = turns(&mut session, &mut recorder, control, &mut ask)?;
+    // Counted on by the supervisor while the last turns went on.
+    session.learner.counters.env_failures = env_failures_before + control.env_failures();
     if !finished {
         // What the workers had already sent is in the checkpoint; they are not waited for.
         let queued_max = plan.worker_count * plan.queue_segments;
@@ -116,7 +119,9 @@ fn turns<R: SegmentReceiver, P: ParameterPublisher>(
 ) -> anyhow::Result<bool> {
     let mut maintained = Instant::now();
     let mut first = session.learner.counters.env_steps + FIRST;
+    let env_failures_before = session.learner.counters.env_failures;
     loop {
+        session.learner.counters.env_failures = env_failures_before + control.env_failures();
         if control.stop_requested() {
             return Ok(false);
         }

@@ -9,6 +9,8 @@ mod actor;
 mod arguments;
 mod control_pipe;
 #[cfg(feature = "python")]
+mod environments;
+#[cfg(feature = "python")]
 mod evaluator;
 mod learner;
 #[cfg(feature = "python")]

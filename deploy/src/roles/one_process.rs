@@ -7,7 +7,7 @@
 
 use std::cell::Cell;
 
-use dmprl_actors::python_env::PythonEnvironments;
+use dmprl_actors::evaluate::Evaluator;
 use dmprl_actors::rollout::{Identity, Rollout, RolloutError};
 use dmprl_learner::learner::Learner;
 use dmprl_learner::session::{Due, Session, Turn};
@@ -15,7 +15,8 @@ use dmprl_shared::config::RunConfig;
 use dmprl_shared::seeds;
 use dmprl_shared::transport::{ParameterSubscriber, SegmentSender, SendOutcome, in_process};
 
-use super::evaluator::{self, evaluator};
+use super::environments;
+use super::evaluator::{self, Answer, evaluator};
 use super::recorder::Recorder;
 use super::setup::Setup;
 use super::{ControlPipe, LearnerArgs};
@@ -36,18 +37,17 @@ pub fn run(args: &LearnerArgs, control: &ControlPipe) -> anyhow::Result<()> {
     let config = &setup.config;
     let interpreter = super::actor::interpreter(args.venv.as_deref(), config)?;
     let envs = config.actors.envs_per_worker;
-    let steps = config.policy.decision_steps();
     interpreter.seed(seeds::derive(config.run.seed, "python", 0))?;
-    let environments = PythonEnvironments::start(&interpreter, &config.task.id, envs, steps)?;
-    let spec = environments.spec().clone();
-    let (mut judge, _) = evaluator(&interpreter, config)?;
+    let made = environments::make(&interpreter, config, envs, control)?;
+    let spec = made.spec().clone();
+    let (evaluator, _) = evaluator(&interpreter, config, control)?;
     control.send(&Report::EnvironmentReady { spec: spec.clone() })?;
 
     let learner = super::learner::make(&setup, &spec, args, control)?;
     // A resumed run continues no episode: its worker counts as started again.
     let incarnation = u32::try_from(learner.counters.segments)?;
     let identity = Identity { run_id: setup.run_id, worker_id: 0, incarnation };
-    let mut rollout = Rollout::start(config, environments, identity)?;
+    let mut rollout = Rollout::start(config, made, identity)?;
     let (mut senders, receiver) = in_process::segment_queues(1, envs, learner.policy().layout());
     let hash = learner.policy().architecture_hash();
     let (publisher, mut parameters) = in_process::parameter_channel(hash);
@@ -55,19 +55,11 @@ pub fn run(args: &LearnerArgs, control: &ControlPipe) -> anyhow::Result<()> {
     let mut recorder = Recorder::new(&setup.run, control, &learner)?;
     let mut session = Session::start(learner, receiver, publisher)?;
     control.send(&Report::LearnerReady)?;
-    let reached = Cell::new(false);
-    let stop = control.stop_flag();
+    let (reached, stop) = (Cell::new(false), control.stop_flag());
+    let env_failures = Cell::new(session.learner.counters.env_failures);
     let plan = evaluator::Plan { setup: &setup, config, stop: &stop };
-    let mut evaluate = |request: EvaluationRequest| {
-        let Some(row) = evaluator::evaluate(&mut judge, &plan, &request)? else { return Ok(()) };
-        evaluator::keep(&setup, &row, control)?;
-        let RunConfig { until_return, until_success, .. } = config.run;
-        let success = row.success_rate.is_some_and(|rate| rate >= until_success);
-        reached.set(reached.get() || success || row.return_mean >= until_return);
-        // A supervisor that is gone is noticed as a stop, which ends with a checkpoint.
-        let _ = control.send(&Report::Evaluated(row));
-        Ok(())
-    };
+    let mut judge = Judge { evaluator, plan, control, reached: &reached, failures: &env_failures };
+    let mut evaluate = |request: EvaluationRequest| judge.evaluate(&request);
     super::learner::catch_up(&mut session, &mut recorder, &mut evaluate)?;
     let mut first = true;
     let finished = loop {
@@ -89,12 +81,52 @@ pub fn run(args: &LearnerArgs, control: &ControlPipe) -> anyhow::Result<()> {
             break true;
         }
         parameters.newest(&mut rollout.snapshot)?;
-        act(&mut rollout, &mut senders[0])?;
+        let acted = act(&mut rollout, &mut senders[0]);
+        count(&env_failures, environments::tell(&rollout.take_failures(), control));
+        session.learner.counters.env_failures = env_failures.get();
+        acted?;
         if std::mem::take(&mut first) {
             let _ = control.send(&Report::FirstSegment);
         }
     };
     super::learner::close(&mut session, &mut recorder, control, (finished, &mut evaluate))
+}
+
+/// Evaluates where an evaluation falls due.
+struct Judge<'a> {
+    evaluator: Evaluator,
+    plan: evaluator::Plan<'a>,
+    control: &'a ControlPipe,
+    /// Set once an evaluation has reached the run's goal.
+    reached: &'a Cell<bool>,
+    failures: &'a Cell<u64>,
+}
+
+impl Judge<'_> {
+    fn evaluate(&mut self, request: &EvaluationRequest) -> anyhow::Result<()> {
+        let answer = evaluator::evaluate(&mut self.evaluator, &self.plan, request);
+        count(self.failures, environments::tell(&self.evaluator.take_failures(), self.control));
+        let row = match answer? {
+            Answer::Row(row) => row,
+            Answer::Failed(reason) => {
+                let policy_version = request.policy_version;
+                let _ = self.control.send(&Report::NotEvaluated { policy_version, reason });
+                return Ok(());
+            }
+            Answer::Stopped => return Ok(()),
+        };
+        evaluator::keep(self.plan.setup, &row, self.control)?;
+        let RunConfig { until_return, until_success, .. } = self.plan.config.run;
+        let success = row.success_rate.is_some_and(|rate| rate >= until_success);
+        self.reached.set(self.reached.get() || success || row.return_mean >= until_return);
+        // A supervisor that is gone is noticed as a stop, which ends with a checkpoint.
+        let _ = self.control.send(&Report::Evaluated(row));
+        Ok(())
+    }
+}
+
+fn count(sum: &Cell<u64>, more: u64) {
+    sum.set(sum.get() + more);
 }
 
 /// Runs one segment in each environment; the schedule has emptied the queue, so each has room.

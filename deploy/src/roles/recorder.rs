@@ -228,6 +228,7 @@ impl<'a> Recorder<'a> {
             samples_per_insert: learner.samples_per_insert(),
             policy_lag_p50: self.policy_lag_p50,
             rejected: counters.rejected.total(),
+            env_failures: counters.env_failures,
         }));
     }
 }

@@ -148,6 +148,9 @@ impl Display {
         if progress.rejected > 0 {
             parts.push(format!("{} rejected", progress.rejected));
         }
+        if progress.env_failures > 0 {
+            parts.push(format!("{} env failures", grouped(progress.env_failures)));
+        }
         parts.join(SEPARATOR)
     }
 }

@@ -24,6 +24,11 @@ pub fn summary(report: &SessionReport, title: &str, run: &Path, steps_total: u64
         lines.push(("steps", line(last.env_steps, first.env_steps)));
         lines.push(("updates", line(last.updates, first.updates)));
     }
+    if report.env_failures > 0 {
+        let logs = shown(&run.join("logs"));
+        let count = grouped(report.env_failures);
+        lines.push(("failures", format!("{count} of environments; see {logs}")));
+    }
     lines.push(("wall time", wall(report.wall)));
     let run = shown(run);
     lines.push(("results", run.clone()));

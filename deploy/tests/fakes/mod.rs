@@ -76,6 +76,7 @@ impl Fixture {
             action_high: vec![1.0],
             control_dt_s: 0.02,
             episode_steps: 50,
+            observation_names: Vec::new(),
         }
     }
 

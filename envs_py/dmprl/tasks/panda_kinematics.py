@@ -58,7 +58,9 @@ class InverseKinematics:
         self._root = model.body_rootid[model.jnt_bodyid[0]]
         # 1, cosine and sine of each joint's angle.
         self._turns = np.ones((env_count, JOINTS, 1, 3))
-        self._links = np.zeros((env_count, JOINTS, 1, 16))
+        # One for each joint, and the end effector on the last one.
+        self._links = np.zeros((env_count, JOINTS + 1, 1, 16))
+        self._links[:, -1, 0] = _transform(model.site_pos[0], model.site_quat[0]).ravel()
         self._start = np.zeros((env_count, 3, 4))
         self._damping = DAMPING**2 * np.eye(6)
 
@@ -73,12 +75,11 @@ class InverseKinematics:
         start[:, :, 3] = fields["site_xpos"][:, 0]
         inverse = self._inverse_at(fields)
         step = self._step(inverse, start, target)
-        turn, steps = step.copy(), [(step, _square(step))]
+        turn, steps = step.copy(), []
         for _ in range(CORRECTIONS):
-            pose = self.pose(qpos + turn)
-            step = _corrected(self._step(inverse, pose, target), steps)
+            steps.append((step, np.vecdot(step, step) + TINY))
+            step = _corrected(self._step(inverse, self.pose(qpos + turn), target), steps)
             turn += step
-            steps.append((step, _square(step)))
         largest = np.abs(turn).max(axis=1, keepdims=True)
         # The whole step gets shorter, so that the end effector still sets out towards the target.
         turn *= TURN_MAX / np.maximum(largest, TURN_MAX)
@@ -88,9 +89,11 @@ class InverseKinematics:
         """The end effector's pose (E, 3, 4) at ``angles`` (E, 7) [rad]."""
         np.cos(angles, out=self._turns[:, :, 0, 1])
         np.sin(angles, out=self._turns[:, :, 0, 2])
-        links = np.matmul(self._turns, self._chain, out=self._links).reshape(-1, JOINTS, 4, 4)
-        pairs = links[:, 0:6:2] @ links[:, 1:6:2]
-        return (pairs[:, 0] @ pairs[:, 1] @ (pairs[:, 2] @ links[:, 6]))[:, :3]
+        np.matmul(self._turns, self._chain, out=self._links[:, :JOINTS])
+        transforms = self._links.reshape(-1, JOINTS + 1, 4, 4)
+        while transforms.shape[1] > 1:
+            transforms = transforms[:, 0::2] @ transforms[:, 1::2]
+        return transforms[:, 0, :3]
 
     def _step(
         self,
@@ -132,15 +135,10 @@ def _corrected(
     return step
 
 
-def _square(step: NDArray[np.float64]) -> NDArray[np.float64]:
-    return np.vecdot(step, step) + TINY
-
-
 def _chain(model: mujoco.MjModel) -> NDArray[np.float64]:
     """What 1, cosine and sine of each joint's angle are multiplied with (7, 3, 16).
 
-    Their sum is the transform from the joint's parent to the joint, from the last one also on to
-    the end effector.
+    Their sum is the transform from the joint's parent to what the joint turns.
     """
     chain = np.zeros((3, JOINTS, 4, 4))
     chain[0, :, 2, 2] = chain[0, :, 3, 3] = 1.0
@@ -149,7 +147,6 @@ def _chain(model: mujoco.MjModel) -> NDArray[np.float64]:
     bodies = model.jnt_bodyid
     links = map(_transform, model.body_pos[bodies], model.body_quat[bodies])
     chain = np.array(list(links)) @ chain
-    chain[:, -1] @= _transform(model.site_pos[0], model.site_quat[0])
     return np.ascontiguousarray(chain.reshape(3, JOINTS, 16).transpose(1, 0, 2))
 
 

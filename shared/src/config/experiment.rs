@@ -73,7 +73,7 @@ impl Default for RunConfig {
 pub struct TaskConfig {
     /// The name typed on the command line.
     pub name: String,
-    /// Gymnasium id: `Name-vN` or `module:Name-vN`.
+    /// Gymnasium id, `Name-vN` or `module:Name-vN`, or a class, `module:Class`.
     pub id: String,
     /// Directories searched for the user's own environment modules.
     pub python_path: Vec<String>,
@@ -136,6 +136,12 @@ pub struct ActorsConfig {
     pub send_deadline_s: f64,
     /// Restarts of one worker before the run gives up on it.
     pub restarts_max: u32,
+    /// Failures of one environment, since it last completed an episode, that its worker makes up
+    /// for by making it again; one more ends the worker, which is then restarted.
+    pub env_failures_max: u32,
+    /// One call into the environments (a segment in each of a worker's, or their reset) that lasts
+    /// longer hangs: its process ends, the evaluator's too, and is restarted [s].
+    pub env_step_timeout_s: f64,
 }
 
 impl Default for ActorsConfig {
@@ -146,6 +152,8 @@ impl Default for ActorsConfig {
             queue_segments: 8,
             send_deadline_s: 30.0,
             restarts_max: 5,
+            env_failures_max: 10,
+            env_step_timeout_s: 60.0,
         }
     }
 }

@@ -45,6 +45,7 @@ mod tests {
             action_high: vec![15.0, 4.0],
             control_dt_s: 0.0,
             episode_steps: 0,
+            observation_names: Vec::new(),
         };
         let mut actions = [0.0; 6];
         ActionScaling::new(&spec).apply(&[-1.0, -1.0, 0.0, 0.0, 1.0, 1.0], &mut actions);

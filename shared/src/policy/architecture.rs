@@ -76,6 +76,7 @@ mod tests {
             action_high: vec![1.0; 2],
             control_dt_s: 0.02,
             episode_steps: 50,
+            observation_names: Vec::new(),
         }
     }
 

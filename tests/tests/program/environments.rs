@@ -1,4 +1,5 @@
-//! Environments that break: named, restarted within the limit, never in the replay.
+//! Environments that break in every life: named, made again and their worker restarted within the
+//! limits, never in the replay.
 
 use std::fs;
 
@@ -61,10 +62,11 @@ fn train_faulty(place: &Workplace, id: &str, more: &[&str]) -> (String, Finished
     (run, finished)
 }
 
-/// One restart is allowed, so two lives of a worker come to the replay: their whole segments.
-fn breaks(id: &str, words: &[&str]) {
+/// One restart is allowed, so two lives of a worker come to the replay: the whole segments of
+/// `lives` lives of their environments.
+fn breaks(id: &str, lives: u64, words: &[&str]) {
     let place = Workplace::new();
-    let restarts = ["--set", "actors.restarts_max=1"];
+    let restarts = ["--set", "actors.restarts_max=1", "--set", "actors.env_failures_max=1"];
     let (run, finished) = train_faulty(&place, id, &restarts);
     let finished = finished
         .with_status(1)
@@ -77,30 +79,31 @@ fn breaks(id: &str, words: &[&str]) {
     place.assert_no_process();
     assert_eq!(shared_memory_of(&run), Vec::<std::path::PathBuf>::new());
     let last = rows(&run, "metrics.jsonl").pop().unwrap();
-    assert_eq!(last["env_steps"], 2 * ENVS * WHOLE_STEPS, "{last}");
+    assert_eq!(last["env_steps"], lives * ENVS * WHOLE_STEPS, "{last}");
     assert!(last["rejected"].as_object().unwrap().values().all(|count| count == 0), "{last}");
     let state = json_file(&run, "checkpoints/latest/state.json");
-    assert_eq!(state["counters"]["env_steps"], 2 * ENVS * WHOLE_STEPS);
+    assert_eq!(state["counters"]["env_steps"], lives * ENVS * WHOLE_STEPS);
 }
 
 #[test]
 fn an_environment_that_raises_is_named_with_its_step() {
-    breaks("faulty:Raise-v0", &["faulty:Raise-v0", "step 2 ", "ValueError: the gripper fell off"]);
+    let words = ["faulty:Raise-v0", "step 2 ", "ValueError: the gripper fell off"];
+    breaks("faulty:Raise-v0", 4, &words);
 }
 
 #[test]
 fn an_observation_that_is_nan_is_named_and_never_learnt_from() {
-    breaks("faulty:Observation-v0", &["faulty:Observation-v0", "step 2", "observation", "nan"]);
+    breaks("faulty:Observation-v0", 4, &["faulty:Observation-v0", "step 2", "observation", "nan"]);
 }
 
 #[test]
 fn a_reward_that_is_infinite_is_named_and_never_learnt_from() {
-    breaks("faulty:Reward-v0", &["faulty:Reward-v0", "step 2", "reward", "inf"]);
+    breaks("faulty:Reward-v0", 4, &["faulty:Reward-v0", "step 2", "reward", "inf"]);
 }
 
 #[test]
 fn an_environment_that_ends_its_process_is_restarted_and_then_given_up() {
-    breaks("faulty:Exit-v0", &["exit status 7"]);
+    breaks("faulty:Exit-v0", 2, &["exit status 7"]);
 }
 
 #[test]

@@ -13,6 +13,7 @@ mod deaths;
 mod determinism;
 mod endings;
 mod environments;
+mod faults;
 mod interrupts;
 mod learning;
 mod refusals;

@@ -87,6 +87,13 @@ fn an_environment_whose_observation_is_a_dictionary_trains() {
     trains("tiny_envs:Goal-v0", &["--python-path", folder.to_str().unwrap()]);
 }
 
+/// Its two actions have bounds of their own, neither symmetric.
+#[test]
+fn a_class_that_nobody_registered_trains() {
+    let folder = tiny_envs_dir();
+    trains("tiny_envs:Limited", &["--python-path", folder.to_str().unwrap()]);
+}
+
 #[test]
 fn a_segment_env_of_ones_own_trains() {
     let folder = tiny_envs_dir();

@@ -1,0 +1,203 @@
+//! Environments that failed in the last call: found, described, counted.
+//!
+//! A failed environment costs its own segment and nothing else. The Python side makes it again and
+//! says so ([`PythonEnvironments::failed`]); a `SegmentEnv` that hands out numbers that are not
+//! finite without noticing is found here, and reset by the caller.
+
+use dmprl_shared::spec::EnvSpec;
+
+use crate::python_env::{PythonEnvironments, PythonError};
+
+/// Longer descriptions are cut: an exception may carry a whole model file.
+const SENTENCE_CHARS_MAX: usize = 500;
+
+/// The failures of a set of environments.
+#[derive(Debug)]
+pub struct Faults {
+    /// (E,): whose last call cannot be used.
+    failed: Vec<bool>,
+    /// (E,): those of them that cannot go on as they are.
+    unmade: Vec<bool>,
+    /// (E,): failures since the environment last completed an episode, and how many are too many.
+    in_a_row: Vec<u32>,
+    in_a_row_max: u32,
+    /// (E,): the newest failure of each; empty before the first.
+    causes: Vec<String>,
+    total: u64,
+    untold: Vec<String>,
+}
+
+/// An environment that fails whatever is done.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Hopeless {
+    /// Which.
+    pub env_index: usize,
+    /// Failures since it last completed an episode.
+    pub count: u32,
+    /// The last one.
+    pub cause: String,
+}
+
+impl Faults {
+    /// For `envs` environments; more than `in_a_row_max` failures without an episode completed in
+    /// between are hopeless.
+    #[must_use]
+    pub fn new(envs: usize, in_a_row_max: u32) -> Self {
+        Self {
+            failed: vec![false; envs],
+            unmade: vec![false; envs],
+            in_a_row: vec![0; envs],
+            in_a_row_max,
+            causes: vec![String::new(); envs],
+            total: 0,
+            untold: Vec::new(),
+        }
+    }
+
+    /// Looks at what a segment left; true if any environment failed.
+    ///
+    /// # Errors
+    /// If the Python side cannot say what happened.
+    pub fn look(&mut self, environments: &mut PythonEnvironments) -> Result<bool, PythonError> {
+        let told = environments.failed().iter().any(|&failed| failed != 0);
+        let mut sentences = if told { environments.take_failures()? } else { Vec::new() };
+        let environments = &*environments;
+        let mut any = false;
+        for env in 0..self.failed.len() {
+            let made = environments.failed()[env] != 0;
+            let cause = match made {
+                true => Some(taken(&mut sentences, environments.spec(), env)),
+                false => segment_fault(environments, env),
+            };
+            self.failed[env] = cause.is_some();
+            // One that was made again may still begin with what is no finite 32-bit number.
+            let sound = made && start_fault(environments, env).is_none();
+            self.unmade[env] = cause.is_some() && !sound;
+            if let Some(cause) = cause {
+                any = true;
+                self.note(&cause);
+                self.in_a_row[env] = self.in_a_row[env].saturating_add(1);
+                self.causes[env] = plain(&cause);
+            }
+        }
+        sentences.iter().for_each(|sentence| self.note(sentence));
+        Ok(any)
+    }
+
+    /// Looks at what a reset of the environments in `mask` left.
+    ///
+    /// # Errors
+    /// `ObservationNotFinite`: a reset is all that could have helped.
+    pub fn look_at_reset(
+        &mut self,
+        environments: &mut PythonEnvironments,
+        mask: &[bool],
+    ) -> Result<(), PythonError> {
+        environments.take_failures()?.iter().for_each(|sentence| self.note(sentence));
+        for env in (0..mask.len()).filter(|&env| mask[env]) {
+            if let Some((name, value)) = start_fault(environments, env) {
+                let task_id = environments.spec().id.clone();
+                return Err(PythonError::ObservationNotFinite { task_id, env, name, value });
+            }
+        }
+        Ok(())
+    }
+
+    /// (E,): whose last call cannot be used.
+    #[must_use]
+    pub fn failed(&self) -> &[bool] {
+        &self.failed
+    }
+
+    /// (E,): those of them that cannot go on as they are: they must be reset.
+    #[must_use]
+    pub fn unmade(&self) -> &[bool] {
+        &self.unmade
+    }
+
+    /// Environment `env` has completed an episode.
+    pub fn completed(&mut self, env: usize) {
+        self.in_a_row[env] = 0;
+    }
+
+    /// The environment that has failed too often, if there is one.
+    #[must_use]
+    pub fn hopeless(&self) -> Option<Hopeless> {
+        let env_index = self.in_a_row.iter().position(|&count| count > self.in_a_row_max)?;
+        let (count, cause) = (self.in_a_row[env_index], self.cause(env_index).to_owned());
+        Some(Hopeless { env_index, count, cause })
+    }
+
+    /// The newest failure of environment `env`.
+    #[must_use]
+    pub fn cause(&self, env: usize) -> &str {
+        &self.causes[env]
+    }
+
+    /// All failures so far.
+    #[must_use]
+    pub fn total(&self) -> u64 {
+        self.total
+    }
+
+    /// One line about each failure since the last call.
+    pub fn take(&mut self) -> Vec<String> {
+        std::mem::take(&mut self.untold)
+    }
+
+    fn note(&mut self, cause: &str) {
+        self.total += 1;
+        self.untold.push(plain(cause));
+    }
+}
+
+/// One line that steers no terminal.
+fn plain(cause: &str) -> String {
+    let plain = cause.chars().map(|letter| if letter.is_control() { ' ' } else { letter });
+    plain.take(SENTENCE_CHARS_MAX).collect()
+}
+
+/// The sentence about environment `env`; a `SegmentEnv` of somebody's own may have none.
+fn taken(sentences: &mut Vec<String>, spec: &EnvSpec, env: usize) -> String {
+    let name = format!("environment {env},");
+    match sentences.iter().position(|sentence| sentence.contains(&name)) {
+        Some(at) => sentences.remove(at),
+        None => format!("{}, environment {env}: it failed and does not say how", spec.id),
+    }
+}
+
+/// The first number of a row that is not finite in 32 bits, in which the learner gets it.
+fn not_finite(row: &[f64]) -> Option<usize> {
+    row.iter().position(|value| !(*value as f32).is_finite())
+}
+
+fn segment_fault(environments: &PythonEnvironments, env: usize) -> Option<String> {
+    const WHAT: &str = "which is no finite 32-bit number";
+    let spec = environments.spec();
+    let steps = environments.steps()[env] as usize;
+    let rewards = environments.rewards();
+    let k_max = rewards.len() / environments.steps().len();
+    let where_ = |what: &str| format!("{}, environment {env}, {what}", spec.id);
+    let rewards = &rewards[env * k_max..][..steps];
+    if let Some(step) = not_finite(rewards) {
+        let place = where_(&format!("step {step} of the segment"));
+        return Some(format!("{place}: reward is {}, {WHAT}", rewards[step]));
+    }
+    let o = spec.observation_len;
+    let rows = &environments.observations()[env * (k_max + 1) * o..][..(steps + 1) * o];
+    if let Some(at) = not_finite(rows) {
+        let place = where_(&format!("step {} of the segment", (at / o).saturating_sub(1)));
+        let name = spec.observation_name(at % o);
+        return Some(format!("{place}: {name} is {}, {WHAT}", rows[at]));
+    }
+    let (name, value) = start_fault(environments, env)?;
+    Some(format!("{}: {name} is {value}, {WHAT}", where_("reset")))
+}
+
+/// Name and value of what is not finite in the observation to act on next.
+fn start_fault(environments: &PythonEnvironments, env: usize) -> Option<(String, f64)> {
+    let spec = environments.spec();
+    let row = &environments.next_observations()[env * spec.observation_len..];
+    let row = &row[..spec.observation_len];
+    not_finite(row).map(|at| (spec.observation_name(at), row[at]))
+}

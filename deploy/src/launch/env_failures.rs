@@ -1,0 +1,60 @@
+//! Failures of environments, counted over all processes of a session.
+
+use super::Process;
+use super::supervisor::Supervisor;
+use crate::control::Command;
+use crate::terminal::{grouped, shown};
+
+impl Supervisor {
+    /// Shows the first failure and then whenever their number has doubled: an environment that
+    /// fails now and then must not fill the terminal. The process's log has each.
+    pub(super) fn on_env_failures(&mut self, process: Process, count: u64, last: &str) {
+        let before = self.env_failures;
+        self.env_failures = before.saturating_add(count);
+        if is_told(before, self.env_failures) {
+            self.display.message(&format!(
+                "{process}: environment failure {}: {last}; its segment is not used; log: {}",
+                grouped(self.env_failures),
+                shown(&self.log_path(process))
+            ));
+        }
+        self.tell_learner_of_env_failures();
+    }
+
+    /// Its process has said so with its last words; its exit follows.
+    pub(super) fn on_env_hung(&mut self, process: Process, message: &str) {
+        self.env_failures = self.env_failures.saturating_add(1);
+        self.display.message(&format!("{process}: {message}"));
+        self.tell_learner_of_env_failures();
+    }
+
+    /// The learner keeps the number for metrics and checkpoints. It is the whole session's, so one
+    /// that does not reach the learner is made up for by the next.
+    pub(super) fn tell_learner_of_env_failures(&mut self) {
+        if self.env_failures == self.env_failures_told || self.is_one_process() {
+            return;
+        }
+        let total = self.env_failures;
+        let learner = self.running(Process::Learner);
+        if learner.is_some_and(|learner| learner.child.send(Command::EnvFailures { total })) {
+            self.env_failures_told = total;
+        }
+    }
+}
+
+/// Whether a power of two lies between the two counts, the second included.
+fn is_told(before: u64, after: u64) -> bool {
+    after > before && after.checked_ilog2() != before.checked_ilog2()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_first_and_every_doubling_are_told() {
+        let told: Vec<u64> = (1..=40).filter(|&count| is_told(count - 1, count)).collect();
+        assert_eq!(told, [1, 2, 4, 8, 16, 32]);
+        assert!(is_told(5, 9) && !is_told(5, 7) && !is_told(3, 3) && !is_told(0, 0));
+    }
+}

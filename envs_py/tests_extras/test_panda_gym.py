@@ -1,0 +1,78 @@
+"""panda-gym's own tasks in a worker's hands (extra `panda-gym`)."""
+
+import unittest
+
+import gymnasium
+import numpy as np
+import panda_gym  # noqa: F401 - registers them
+
+from dmprl.segment_env import SegmentBuffers, make
+
+REACH = ("PandaReach-v3", "PandaReachDense-v3", "PandaReachJoints-v3", "PandaReachJointsDense-v3")
+
+
+def started(task_id, env_count, segment_steps):
+    env = make(f"panda_gym:{task_id}", env_count, segment_steps)
+    spec = env.spec()
+    out = SegmentBuffers(env_count, segment_steps, spec["observation_len"], spec["action_len"])
+    env.reset(np.ones(env_count, np.uint8), np.arange(env_count, dtype=np.uint64), out)
+    return env, out
+
+
+class PandaGymTest(unittest.TestCase):
+    def test_sizes_and_bounds_are_panda_gyms(self):
+        for task_id in REACH:
+            env, _ = started(task_id, 1, 5)
+            spec = env.spec()
+            env.close()
+            actions = 7 if "Joints" in task_id else 3
+            self.assertEqual((spec["observation_len"], spec["action_len"]), (12, actions))
+            self.assertEqual(spec["action_low"], [-1.0] * actions)
+            self.assertEqual(spec["action_high"], [1.0] * actions)
+            self.assertEqual(spec["episode_steps"], 50)
+
+    def test_observation_is_achieved_goal_then_desired_goal_then_observation(self):
+        """The Dict's entries by name: end effector (3), goal (3), end effector and velocity (6)."""
+        env, out = started("PandaReach-v3", 1, 5)
+        plain = gymnasium.make("PandaReach-v3")
+        entries, _ = plain.reset(seed=0)
+        self.assertEqual(
+            list(plain.observation_space), ["achieved_goal", "desired_goal", "observation"]
+        )
+        row = out.next_observations[0]
+        np.testing.assert_allclose(row[0:3], entries["achieved_goal"], atol=1e-6)
+        np.testing.assert_allclose(row[3:6], entries["desired_goal"], atol=1e-6)
+        np.testing.assert_allclose(row[6:12], entries["observation"], atol=1e-6)
+        np.testing.assert_allclose(row[0:3], [0.0384, 0.0, 0.1974], atol=1e-3)
+        env.close()
+        plain.close()
+
+    def test_episodes_of_all_four_are_finite_and_end(self):
+        rng = np.random.default_rng(0)
+        for task_id in REACH:
+            env, out = started(task_id, 2, 5)
+            ends = np.zeros(2, int)
+            while ends.min() < 2:
+                env.step_segment(rng.uniform(-1, 1, (2, 5, env.spec()["action_len"])), out)
+                self.assertTrue(np.isfinite(out.observations).all())
+                self.assertTrue(((out.rewards <= 0) & (out.rewards > -2)).all())
+                # Version 3 ends an episode where the goal is reached.
+                np.testing.assert_array_equal(out.terminated, out.success)
+                ends += (out.terminated | out.truncated) != 0
+            env.close()
+
+    def test_straight_to_the_goal_succeeds_in_few_steps(self):
+        env, out = started("PandaReachDense-v3", 4, 1)
+        steps, successes = np.zeros(4, int), 0
+        while successes < 12:
+            row = out.next_observations
+            actions = np.clip((row[:, 3:6] - row[:, 0:3]) / 0.05, -1.0, 1.0)
+            env.step_segment(actions[:, None], out)
+            successes += out.success.sum()
+            steps = np.where(out.terminated, 0, steps + 1)
+            self.assertLess(steps.max(), 10)
+        env.close()
+
+
+if __name__ == "__main__":
+    unittest.main()

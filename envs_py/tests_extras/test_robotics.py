@@ -1,0 +1,62 @@
+"""Gymnasium-Robotics' Fetch in a worker's hands (extra `robotics`)."""
+
+import subprocess
+import sys
+import unittest
+
+import numpy as np
+
+from dmprl.segment_env import SegmentBuffers, make
+
+
+def started(task_id, env_count, segment_steps):
+    env = make(f"gymnasium_robotics:{task_id}", env_count, segment_steps)
+    spec = env.spec()
+    out = SegmentBuffers(env_count, segment_steps, spec["observation_len"], spec["action_len"])
+    env.reset(np.ones(env_count, np.uint8), np.arange(env_count, dtype=np.uint64), out)
+    return env, out
+
+
+class FetchTest(unittest.TestCase):
+    def test_sizes_and_timing_are_fetchs(self):
+        env, _ = started("FetchReach-v4", 1, 5)
+        spec = env.spec()
+        self.assertEqual((spec["observation_len"], spec["action_len"]), (16, 4))
+        self.assertAlmostEqual(spec["control_dt_s"], 0.04)
+        self.assertEqual(spec["episode_steps"], 50)
+
+    def test_observation_is_achieved_goal_then_desired_goal_then_observation(self):
+        """The Dict's entries by name: gripper (3), goal (3), gripper, fingers, velocities (10)."""
+        env, out = started("FetchReach-v4", 4, 5)
+        entries = env._envs[0].env.observation_space
+        self.assertEqual(list(entries), ["achieved_goal", "desired_goal", "observation"])
+        row = out.next_observations
+        np.testing.assert_array_equal(row[:, 0:3], row[:, 6:9])
+        self.assertEqual(len({goal.tobytes() for goal in row[:, 3:6]}), 4)
+
+    def test_straight_to_the_goal_succeeds(self):
+        env, out = started("FetchReachDense-v4", 4, 5)
+        for _ in range(10):
+            row = out.next_observations
+            actions = np.zeros((4, 5, 4))
+            actions[:, :, :3] = np.clip(5.0 * (row[:, 3:6] - row[:, 0:3]), -1.0, 1.0)[:, None]
+            env.step_segment(actions, out)
+            self.assertTrue(np.isfinite(out.observations).all())
+        self.assertEqual(out.truncated.tolist(), [1] * 4)
+        self.assertEqual(out.success.tolist(), [1] * 4)
+        self.assertTrue((out.rewards[:, -1] > -0.05).all())
+
+    def test_an_id_without_a_version_works_in_a_fresh_process(self):
+        """As a worker starts: nothing has imported Gymnasium-Robotics before."""
+        code = (
+            "from dmprl.segment_env import make; "
+            "print(make('gymnasium_robotics:FetchReach', 1, 5).spec()['observation_len'])"
+        )
+        result = subprocess.run(
+            [sys.executable, "-W", "ignore", "-c", code], capture_output=True, text=True, check=True
+        )
+        self.assertEqual(result.stdout.strip(), "16")
+
+
+if __name__ == "__main__":
+    unittest.main()

@@ -1,0 +1,162 @@
+//! Environments that break, hang or end their process: the run goes on, and nothing of what broke
+//! is learnt from.
+
+use std::fs;
+use std::path::PathBuf;
+
+use dmprl_learner::metrics::TIME_KEYS;
+use dmprl_tests::program::{Finished, Workplace, env_steps, rows, shared_memory_of};
+use dmprl_tests::tiny_envs_dir;
+use serde_json::Value;
+
+use crate::train;
+
+const ENVS: u64 = 3;
+/// Steps of an episode.
+const EPISODE: u64 = 7;
+/// Steps of a life of `tiny_envs:Faulty` that can be used: three episodes.
+const LIFE: u64 = 21;
+
+fn train_tiny(place: &Workplace, task: &str, more: &[&str]) -> (String, Finished) {
+    let (run, folder, envs) = (place.path("run"), tiny_envs_dir(), ENVS.to_string());
+    let common = ["--workers", "1", "--envs-per-worker", &envs];
+    let more = [&common[..], &["--python-path", folder.to_str().unwrap()], more].concat();
+    let finished = place.run(&train(&format!("tiny_envs:{task}-v0"), &run, &more));
+    place.assert_no_process();
+    assert_eq!(shared_memory_of(&run), Vec::<PathBuf>::new());
+    (run, finished)
+}
+
+fn log(place: &Workplace, name: &str) -> String {
+    fs::read_to_string(place.path(&format!("run/logs/{name}.log"))).unwrap_or_default()
+}
+
+fn assert_sound(run: &str) -> Value {
+    let last = rows(run, "metrics.jsonl").pop().unwrap();
+    assert!(last["rejected"].as_object().unwrap().values().all(|count| count == 0), "{last}");
+    assert_eq!(last["lost"], 0, "{last}");
+    last
+}
+
+/// Three episodes of each life come to the learner, the fourth breaks in its second step.
+fn goes_on_and_counts(task: &str, words: &str) {
+    let place = Workplace::new();
+    let (run, finished) = train_tiny(&place, task, &["--steps", "4000"]);
+    let finished = finished.with_status(0).saying(words).saying("actor-0.log");
+    let last = assert_sound(&run);
+    let steps = last["env_steps"].as_u64().unwrap();
+    let episodes: u64 =
+        rows(&run, "metrics.jsonl").iter().map(|row| row["episodes"].as_u64().unwrap()).sum();
+    let unfinished = steps - episodes * EPISODE;
+    assert!(unfinished <= ENVS * EPISODE, "{steps} steps in {episodes} episodes");
+
+    // The evaluator's environments break in their fourth evaluation; its row is there all the same.
+    let evaluated = env_steps(&rows(&run, "evaluations.jsonl"));
+    assert_eq!(evaluated.iter().map(|steps| steps / 1000).collect::<Vec<_>>(), [1, 2, 3, 4]);
+    let count = |name| log(&place, name).matches("environment failure: ").count() as u64;
+    let (by_worker, by_evaluator) = (count("actor-0"), count("evaluator"));
+    assert!(by_worker >= steps / LIFE - ENVS, "{by_worker} failures in {steps} steps");
+    assert_eq!(by_evaluator, 4, "one in each episode of the evaluation");
+    let counted = last["env_failures"].as_u64().unwrap();
+    let total = by_worker + by_evaluator;
+    assert!((steps / LIFE - ENVS..=total).contains(&counted), "{counted} of {total}");
+    let summary = format!("failures   {total} of environments");
+    assert!(finished.said.contains(&summary), "{summary}\n{}", finished.said);
+    // Each doubling of the number at most.
+    let told = finished.said.matches(": environment failure ").count() as u32;
+    assert!((1..=total.ilog2() + 1).contains(&told), "{told} told\n{}", finished.said);
+}
+
+#[test]
+fn a_run_whose_environment_raises_now_and_then_goes_on_and_counts() {
+    goes_on_and_counts("FaultyRaise", "ValueError: the gripper fell off");
+}
+
+#[test]
+fn a_run_whose_environment_observes_nan_now_and_then_goes_on_and_counts() {
+    goes_on_and_counts("FaultyObservation", "observation[1] is nan");
+}
+
+#[test]
+fn a_run_whose_environment_rewards_infinitely_now_and_then_goes_on_and_counts() {
+    goes_on_and_counts("FaultyReward", "reward is inf");
+}
+
+#[test]
+fn an_environment_that_always_fails_costs_its_worker_and_then_the_run() {
+    let place = Workplace::new();
+    let settings = ["--set", "actors.env_failures_max=2", "--set", "actors.restarts_max=1"];
+    let (_, finished) = train_tiny(&place, "Hopeless", &settings);
+    finished
+        .with_status(1)
+        .saying("environment 0 has failed 3 times without completing an episode")
+        .saying("ValueError: the gripper fell off")
+        .saying("restart 1 of 1")
+        .saying("no worker is left");
+}
+
+/// The environment that breaks leaves a mark, so the next life of its worker is a sound one.
+fn survives(task: &str, words: &[&str]) -> (Workplace, String) {
+    let place = Workplace::new();
+    let more = ["--steps", "1500", "--set", "actors.env_step_timeout_s=3"];
+    let (run, finished) = train_tiny(&place, task, &more);
+    let mut finished = finished.with_status(0).saying("actor-0 died").saying("restart 1 of 5");
+    for words in words {
+        finished = finished.saying(words);
+    }
+    assert!(PathBuf::from(place.path("broken")).exists(), "nothing broke");
+    assert!(assert_sound(&run)["env_steps"].as_u64() >= Some(1500));
+    (place, run)
+}
+
+#[test]
+fn a_worker_whose_environment_hangs_is_replaced_and_an_evaluator_says_so() {
+    let words = ["an environment hangs: `step_segment`", "for 3.0 s", "exit status 75"];
+    let (place, run) = survives("HangOnce", &words);
+    fs::remove_file(place.path("broken")).unwrap();
+    // Four episodes in each of its environments: a life ends in the fourth.
+    place
+        .run(&["eval", &run, "--episodes", "40"])
+        .with_status(1)
+        .saying("the evaluator died: exit status 75, an environment hung");
+    place.assert_no_process();
+}
+
+/// No other Python code runs any more in such a worker, not even another thread's.
+#[test]
+fn a_worker_whose_environment_hangs_with_the_interpreters_lock_is_replaced() {
+    survives("HangWithLockOnce", &["an environment hangs", "exit status 75"]);
+}
+
+#[test]
+fn a_worker_whose_environment_crashes_the_process_is_replaced() {
+    survives("SegfaultOnce", &["signal 11 (SIGSEGV)"]);
+}
+
+#[test]
+fn one_process_goes_on_after_failures_and_repeats_them_to_the_byte() {
+    let repeated = || {
+        let place = Workplace::new();
+        let (run, finished) =
+            train_tiny(&place, "FaultyRaise", &["--deterministic", "--steps", "1500"]);
+        finished.with_status(0).saying("learner: environment failure ").saying("failures   ");
+        assert!(assert_sound(&run)["env_failures"].as_u64() >= Some(1500 / LIFE - ENVS));
+        let mut rows = rows(&run, "metrics.jsonl");
+        for row in &mut rows {
+            TIME_KEYS.iter().for_each(|key| drop(row.as_object_mut().unwrap().remove(*key)));
+        }
+        rows
+    };
+    assert_eq!(repeated(), repeated());
+}
+
+/// Nobody restarts the only process; it says why it ended, and a resume goes on.
+#[test]
+fn one_process_whose_environment_hangs_ends_and_can_be_resumed() {
+    let place = Workplace::new();
+    let more = ["--deterministic", "--steps", "600", "--set", "actors.env_step_timeout_s=3"];
+    let (run, finished) = train_tiny(&place, "HangOnce", &more);
+    finished.with_status(1).saying("learner died: exit status 75, an environment hung");
+    place.run(&["resume", &run]).with_status(0);
+    assert_sound(&run);
+}

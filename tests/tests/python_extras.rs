@@ -1,0 +1,95 @@
+//! The Python package with its optional extras: panda-gym and Gymnasium-Robotics.
+//!
+//! They get an environment of their own, made once: PyBullet is large, most users need neither, and
+//! not every Python has a build of it. Where one cannot be installed, the test says so and passes.
+#![cfg(feature = "python")]
+#![allow(
+    clippy::unwrap_used,
+    reason = "helpers of tests; clippy.toml covers only the tests themselves"
+)]
+
+use std::fs;
+use std::io::Write;
+use std::path::{Path, PathBuf};
+use std::process::{Command, Output};
+
+use dmprl_actors::python_env::LINKED_PYTHON;
+use dmprl_tests::project_root;
+
+/// Extras of `envs_py/pyproject.toml`, everything first, and the tests that need no more.
+const ATTEMPTS: [(&str, &str); 2] = [("test", "test_*.py"), ("robotics", "test_robotics.py")];
+/// What pip says when a package has no build for this Python, or the network cannot be reached.
+const NOT_AVAILABLE: [&str; 2] = ["No matching distribution found", "Could not find a version"];
+
+#[test]
+fn unit_tests_of_the_optional_extras_pass() {
+    for (extra, tests) in ATTEMPTS {
+        match environment_with(extra) {
+            Ok(python) => return run_tests(&python, tests),
+            Err(reason) => {
+                // Not `eprintln!`, which the harness keeps to itself when a test passes.
+                let mut stderr = std::io::stderr().lock();
+                writeln!(stderr, "the extra `{extra}` cannot be installed here: {reason}").unwrap();
+            }
+        }
+    }
+}
+
+/// An interpreter with `envs_py[extra]`, from an earlier run if nothing has changed; the reason, if
+/// the packages are not to be had.
+fn environment_with(extra: &str) -> Result<PathBuf, String> {
+    let venv = Path::new(env!("CARGO_TARGET_TMPDIR")).join(format!("extras-venv-{extra}"));
+    let python = venv.join("bin/python");
+    let package = project_root().join("envs_py");
+    let requirements = fs::read_to_string(package.join("pyproject.toml")).unwrap();
+    let stamp = format!("{}\n{}\n{requirements}", LINKED_PYTHON.executable, package.display());
+    let stamp_path = venv.join("stamp.txt");
+    if fs::read_to_string(&stamp_path).is_ok_and(|found| found == stamp) {
+        return Ok(python);
+    }
+
+    if venv.exists() {
+        fs::remove_dir_all(&venv).unwrap();
+    }
+    let made = Command::new(LINKED_PYTHON.executable)
+        .args(["-I", "-m", "venv"])
+        .arg(&venv)
+        .output()
+        .unwrap();
+    assert!(made.status.success(), "{}", report(&made));
+    let installed = Command::new(&python)
+        .args(["-I", "-m", "pip", "install", "--disable-pip-version-check", "--no-input"])
+        // Without builds from source: compiling PyBullet takes minutes. Few retries, lest a
+        // machine without a network wait for one.
+        .args(["--quiet", "--only-binary", ":all:", "--retries", "1", "--timeout", "15"])
+        .arg("--editable")
+        .arg(format!("{}[{extra}]", package.display()))
+        .env("PIP_USER", "0")
+        .env_remove("PIP_TARGET")
+        .env_remove("PIP_PREFIX")
+        .output()
+        .unwrap();
+    if installed.status.success() {
+        fs::write(&stamp_path, stamp).unwrap();
+        return Ok(python);
+    }
+    let report = report(&installed);
+    let reason = report.lines().find(|line| NOT_AVAILABLE.iter().any(|text| line.contains(text)));
+    Err(reason.unwrap_or_else(|| panic!("{report}")).trim().to_owned())
+}
+
+fn run_tests(python: &Path, tests: &str) {
+    let output = Command::new(python)
+        .args(["-m", "unittest", "discover", "--start-directory", "envs_py/tests_extras"])
+        .args(["--pattern", tests])
+        .current_dir(project_root())
+        .output()
+        .unwrap();
+    let report = report(&output);
+    assert!(output.status.success(), "{report}");
+    assert!(!report.contains("Ran 0 tests"), "{report}");
+}
+
+fn report(output: &Output) -> String {
+    String::from_utf8_lossy(&output.stderr).trim().to_owned()
+}
