@@ -137,16 +137,14 @@ class DmpHead:
             yd0[:] = observations[:, self._env_len + actions :]
         elif self._start == "observed":
             for d, source in enumerate(self._sources):
-                velocity = observations[:, source["velocity"]] * self._velocity_scale
+                yd0[:, d] = observations[:, source["velocity"]] * self._velocity_scale
                 if "cos" in source:
                     y0[:, d] = np.arctan2(
                         observations[:, source["sin"]], observations[:, source["cos"]]
                     )
-                    yd0[:, d] = velocity
                 else:
                     scale = np.float32(source["scale"])
                     y0[:, d] = scale * observations[:, source["index"]]
-                    yd0[:, d] = scale * velocity
 
 
 class Noise:

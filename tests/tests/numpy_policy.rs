@@ -46,10 +46,12 @@ fn config(task: &str, keys: &[(&str, &str)]) -> ExperimentConfig {
 
 /// Asymmetric bounds: scaling must take both into account.
 fn spec(task: &str) -> EnvSpec {
-    let (observation_len, action_len) = if task == "reacher" { (10, 2) } else { (23, 7) };
+    let task = task_defaults(task).unwrap();
+    let (observation_len, action_len) = (task.observation_len, task.action_len);
     EnvSpec {
         id: "Test-v0".into(),
         observation_len,
+        observation_names: Vec::new(),
         action_len,
         action_low: vec![-1.0; action_len],
         action_high: vec![3.0; action_len],
@@ -119,6 +121,8 @@ fn movement_primitives_act_the_same() {
 fn movement_primitives_of_other_kinds_act_the_same() {
     assert_same("reacher", &[("policy.start", "observed"), ("policy.rho", "free")]);
     assert_same("pusher", &[("policy.start", "observed"), ("policy.start_velocity", "zero")]);
+    // Its positions are goal minus position.
+    assert_same("panda-reach", &[("policy.start", "observed")]);
     let drawn = ("exploration.warm_up_kind", "dmp_parameters");
     assert_same("pusher", &[drawn, ("policy.start", "carry")]);
     assert_same("reacher", &[("dmp.forcing_scaling", "goal"), ("dmp.integrator", "explicit")]);
