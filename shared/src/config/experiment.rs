@@ -130,7 +130,8 @@ pub struct ActorsConfig {
     pub workers: usize,
     /// Environments in each worker.
     pub envs_per_worker: usize,
-    /// Segments a worker's queue to the learner holds; full: the worker waits.
+    /// Segments a worker's queue to the learner holds; full: the worker waits. 0 stands for
+    /// `envs_per_worker`: with fewer a worker would wait for the learner in every segment.
     pub queue_segments: usize,
     /// A worker that waited so long on a full queue reports it, naming the learner [s].
     pub send_deadline_s: f64,
@@ -149,7 +150,7 @@ impl Default for ActorsConfig {
         Self {
             workers: 0,
             envs_per_worker: 8,
-            queue_segments: 8,
+            queue_segments: 0,
             send_deadline_s: 30.0,
             restarts_max: 5,
             env_failures_max: 10,

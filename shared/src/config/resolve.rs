@@ -25,6 +25,9 @@ impl ExperimentConfig {
         if self.actors.workers == 0 {
             self.actors.workers = limits.cores.saturating_sub(1).max(1);
         }
+        if self.actors.queue_segments == 0 {
+            self.actors.queue_segments = self.actors.envs_per_worker;
+        }
         if self.run.deterministic {
             self.actors.workers = 1;
         }
@@ -203,6 +206,9 @@ mod tests {
     #[test]
     fn workers_default_to_the_cores_but_one() {
         assert_eq!(resolved(&[]).unwrap().actors.workers, 1);
+        let queue = |pairs| resolved(pairs).unwrap().actors.queue_segments;
+        assert_eq!(queue(&[("actors.envs_per_worker", "16")]), 16);
+        assert_eq!(queue(&[("actors.queue_segments", "3")]), 3);
         assert_eq!(
             ExperimentConfig::default().resolve(Limits { cores: 8 }).unwrap().actors.workers,
             7
