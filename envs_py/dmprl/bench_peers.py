@@ -57,45 +57,20 @@ class BatchPeer:
         return self._env_steps
 
 
-class StockBatch(BatchPeer):
-    """On the model file that Gymnasium ships, in a process as MuJoCo's import leaves it."""
+class Physics(BatchPeer):
+    """On the model of the worker's own back end, in a process that this has set up.
 
-    def __init__(self, plan: dict, seed: int) -> None:
-        env = gymnasium_env(plan["task"]["id"]).unwrapped
-        path = getattr(env, "fullpath", None)
-        if path is None or not hasattr(env, "frame_skip"):
-            raise AbsentError(f"{plan['task']['id']} has no model file of Gymnasium's")
-        import mujoco
-        from mujoco.batch import Batch
-
-        model, env_count = mujoco.MjModel.from_xml_path(path), plan["env_count"]
-        envs = [gymnasium_env(plan["task"]["id"]).unwrapped for _ in range(env_count)]
-        batch = Batch(model, env_count, nthread=1)
-        seen = [flat(env.reset(seed=seed + index)[0]) for index, env in enumerate(envs)]
-        for index, env in enumerate(envs):
-            batch.qpos[index], batch.qvel[index] = env.data.qpos, env.data.qvel
-
-        def step(actions: NDArray[np.float64]) -> tuple[NDArray, NDArray]:
-            actions = actions.astype(env.action_space.dtype)
-            pairs = zip(envs, actions, strict=True)
-            observations = np.stack([flat(env.step(action)[0]) for env, action in pairs])
-            return observations, np.stack([env.data.ctrl for env in envs])
-
-        steps = episode_steps(plan, env.frame_skip, model.nu)
-        controls = episode_controls(plan, seed, np.stack(seen), step, steps)
-        starts = batch.state.copy()
-        super().__init__(model, env.frame_skip, starts, controls, plan["decision_steps"])
-        self.about = f"mujoco.batch {mujoco.__version__}, {Path(path).name} as Gymnasium ships it"
-
-
-class Ceiling(BatchPeer):
-    """On the model of the worker's own back end, in a process that this has set up."""
+    Nothing a worker could do costs less: its time beyond this is its own.
+    """
 
     def __init__(self, plan: dict, seed: int) -> None:
         from dmprl.segment_env import SegmentBuffers, make
 
         task_id, env_count = plan["task"]["id"], plan["env_count"]
-        env = make(task_id, env_count, 1)
+        try:
+            env = make(task_id, env_count, 1)
+        except Exception as error:
+            raise AbsentError(f"{task_id} cannot be made: {error}") from None
         # Not by its class: whatever steps a Batch has a bound of this kind.
         task, batch = getattr(env, "task", None), getattr(env, "batch", None)
         if task is None or not hasattr(batch, "rollout"):
@@ -114,6 +89,57 @@ class Ceiling(BatchPeer):
         controls = episode_controls(plan, seed, out.next_observations, step, steps)
         super().__init__(task.model, task.frame_skip, starts, controls, plan["decision_steps"])
         self.about = "mujoco.batch with the worker's model and settings"
+
+
+class Ceiling(BatchPeer):
+    """In a process as MuJoCo's import leaves it, on Gymnasium's model file where there is one."""
+
+    def __init__(self, plan: dict, seed: int) -> None:
+        path = gymnasium_model_path(plan["task"]["id"])
+        if path is not None:
+            self._init_with_gymnasium(plan, seed, path)
+            return
+        import mujoco
+
+        from dmprl.mujoco_batch import mujoco_hook
+
+        clock = mujoco_hook("mjcb_time").value
+        physics = Physics(plan, seed)  # takes the clock out
+        mujoco_hook("mjcb_time").value = clock
+        self.__dict__.update(vars(physics))
+        self.about = f"mujoco.batch {mujoco.__version__} as it is imported"
+
+    def _init_with_gymnasium(self, plan: dict, seed: int, path: str) -> None:
+        import mujoco
+        from mujoco.batch import Batch
+
+        model, env_count = mujoco.MjModel.from_xml_path(path), plan["env_count"]
+        envs = [gymnasium_env(plan["task"]["id"]).unwrapped for _ in range(env_count)]
+        batch = Batch(model, env_count, nthread=1)
+        seen = [flat(env.reset(seed=seed + index)[0]) for index, env in enumerate(envs)]
+        for index, env in enumerate(envs):
+            batch.qpos[index], batch.qvel[index] = env.data.qpos, env.data.qvel
+        frame_skip, dtype = envs[0].frame_skip, envs[0].action_space.dtype
+
+        def step(actions: NDArray[np.float64]) -> tuple[NDArray, NDArray]:
+            pairs = zip(envs, actions.astype(dtype), strict=True)
+            observations = np.stack([flat(env.step(action)[0]) for env, action in pairs])
+            return observations, np.stack([env.data.ctrl for env in envs])
+
+        steps = episode_steps(plan, frame_skip, model.nu)
+        controls = episode_controls(plan, seed, np.stack(seen), step, steps)
+        starts = batch.state.copy()
+        super().__init__(model, frame_skip, starts, controls, plan["decision_steps"])
+        self.about = f"mujoco.batch {mujoco.__version__}, {Path(path).name} as Gymnasium ships it"
+
+
+def gymnasium_model_path(task_id: str) -> str | None:
+    """The model file of one of Gymnasium's own MuJoCo environments."""
+    try:
+        env = gymnasium_env(task_id).unwrapped
+    except AbsentError:
+        return None
+    return getattr(env, "fullpath", None) if hasattr(env, "frame_skip") else None
 
 
 class RandomActor:

@@ -17,14 +17,14 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
-from dmprl.bench_peers import AbsentError, Ceiling, EnvPoolLoop, GymnasiumLoop, StockBatch
+from dmprl.bench_peers import AbsentError, Ceiling, EnvPoolLoop, GymnasiumLoop, Physics
 
 SETTLE_S = 0.1
 """Stepped before the clock starts: caches and clock frequency then are those of a long run."""
 
 KINDS = {
-    "batch": StockBatch,
     "ceiling": Ceiling,
+    "physics": Physics,
     "gymnasium": GymnasiumLoop,
     "envpool": EnvPoolLoop,
 }

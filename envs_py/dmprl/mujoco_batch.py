@@ -296,7 +296,12 @@ def _quieten_mujoco() -> None:
     was started. The hook takes a C function only, lest a simulation's thread need the GIL; strlen
     takes a string and does nothing.
     """
-    library = ctypes.CDLL(str(next(Path(mujoco.__file__).parent.glob("libmujoco*"))))
-    ctypes.c_void_p.in_dll(library, "mjcb_time").value = None
+    mujoco_hook("mjcb_time").value = None
     strlen = ctypes.cast(ctypes.CDLL(None).strlen, ctypes.c_void_p)
-    ctypes.c_void_p.in_dll(library, "mju_user_warning").value = strlen.value
+    mujoco_hook("mju_user_warning").value = strlen.value
+
+
+def mujoco_hook(name: str) -> ctypes.c_void_p:
+    """A function pointer of MuJoCo's library, which Python's bindings do not show."""
+    library = ctypes.CDLL(str(next(Path(mujoco.__file__).parent.glob("libmujoco*"))))
+    return ctypes.c_void_p.in_dll(library, name)

@@ -9,8 +9,8 @@ from dmprl.bench_peers import (
     AbsentError,
     Ceiling,
     GymnasiumLoop,
+    Physics,
     RandomActor,
-    StockBatch,
     envpool_id,
 )
 from dmprl.bench_rollout import run_for
@@ -45,17 +45,17 @@ class PeerTest(unittest.TestCase):
                 envpool_id(task_id, known)
 
     def test_physics_alone_makes_whole_segments(self):
-        for peer in (StockBatch, Ceiling):
+        for peer in (Ceiling, Physics):
             made = peer(plan("Reacher-v5"), seed=1)
             self.assertEqual([made.segment() for _ in range(12)], [15] * 12)
 
     def test_a_segment_longer_than_an_episode_is_made_too(self):
-        made = Ceiling({**plan("Reacher-v5"), "decision_steps": 60}, seed=1)
+        made = Physics({**plan("Reacher-v5"), "decision_steps": 60}, seed=1)
         self.assertEqual([made.segment() for _ in range(2)], [180] * 2)
 
-    def test_the_ceiling_runs_the_episode_of_the_workers_environments(self):
+    def test_the_physics_runs_the_episode_of_the_workers_environments(self):
         for task_id, action_len in (("Pusher-v5", 7), ("dmprl/PandaReach-v0", 3)):
-            made, env = Ceiling(plan(task_id, action_len), seed=3), make(task_id, 3, 5)
+            made, env = Physics(plan(task_id, action_len), seed=3), make(task_id, 3, 5)
             spec = env.spec()
             out = SegmentBuffers(3, 5, spec["observation_len"], spec["action_len"])
             env.reset(np.ones(3, np.uint8), np.arange(3, 6, dtype=np.uint64), out)
@@ -66,7 +66,7 @@ class PeerTest(unittest.TestCase):
             np.testing.assert_array_equal(made._batch.qpos, env.batch.qpos)
 
     def test_the_stock_batch_runs_the_episode_of_gymnasium(self):
-        made = StockBatch(plan("Reacher-v5"), seed=3)
+        made = Ceiling(plan("Reacher-v5"), seed=3)
         env = gymnasium.make("Reacher-v5").unwrapped
         env.reset(seed=5)
         for _ in range(2):
@@ -78,9 +78,8 @@ class PeerTest(unittest.TestCase):
 
     def test_a_peer_that_is_not_to_be_had_says_why(self):
         for peer, task_id in (
-            (StockBatch, "CartPole-v1"),
-            (StockBatch, "dmprl/Thrower-v0"),
-            (Ceiling, "Pendulum-v1"),
+            (Ceiling, "CartPole-v1"),
+            (Physics, "Pendulum-v1"),
             (GymnasiumLoop, "Nothing-v0"),
         ):
             with self.assertRaisesRegex(AbsentError, task_id):

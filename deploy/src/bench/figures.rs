@@ -11,9 +11,9 @@ use crate::run_directory::Machine;
 /// The worker's name among those of its peers.
 pub(super) const WORKER: &str = "worker";
 /// Everyone who may be measured, in the order of the report.
-pub(super) const NAMES: [&str; 5] = ["batch", "ceiling", WORKER, "gymnasium", "envpool"];
+pub(super) const NAMES: [&str; 5] = ["ceiling", "physics", WORKER, "gymnasium", "envpool"];
 /// Those that the worker is compared with.
-const COMPARED: [&str; 3] = ["ceiling", "gymnasium", "envpool"];
+const COMPARED: [&str; 4] = ["ceiling", "physics", "gymnasium", "envpool"];
 
 /// One measurement.
 #[derive(Debug, Clone, Copy)]
@@ -102,9 +102,11 @@ impl Figures {
         median(&self.rates(name))
     }
 
-    /// The worker's median over that of `name`.
+    /// The worker's rate over that of `name`: the median of the rounds' own ratios, because within
+    /// a round a machine drifts less than over all of them.
     pub(super) fn ratio(&self, name: &str) -> Option<f64> {
-        Some(self.steps_per_s(WORKER)? / self.steps_per_s(name)?)
+        let (worker, other) = (self.rates(WORKER), self.rates(name));
+        median(&worker.iter().zip(&other).map(|(a, b)| a / b).collect::<Vec<_>>())
     }
 
     pub(super) fn policy(&self) -> &'static str {

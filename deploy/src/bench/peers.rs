@@ -21,10 +21,10 @@ const MEASURE_SLACK: Duration = Duration::from_secs(60);
 /// One way to do the workers' work.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum PeerKind {
-    /// Physics alone: `mujoco.batch` on the model file that Gymnasium ships.
-    Batch,
-    /// Physics alone: `mujoco.batch` on the worker's own model and process settings.
+    /// `mujoco.batch` alone, as it is imported, on the model file that Gymnasium ships.
     Ceiling,
+    /// `mujoco.batch` alone, on the worker's own model and process settings.
+    Physics,
     /// A plain Gymnasium loop with the policy in NumPy.
     Gymnasium,
     /// EnvPool with the policy in NumPy.
@@ -32,15 +32,16 @@ pub(super) enum PeerKind {
 }
 
 impl PeerKind {
-    /// In the order of a round. The worker comes after its ceiling, so that a machine that drifts
+    /// In the order of a round. The worker comes after its bounds, so that a machine that drifts
     /// does so for both.
-    pub(super) const ALL: [Self; 4] = [Self::EnvPool, Self::Gymnasium, Self::Batch, Self::Ceiling];
+    pub(super) const ALL: [Self; 4] =
+        [Self::EnvPool, Self::Gymnasium, Self::Ceiling, Self::Physics];
 
     /// As `dmprl.bench_rollout` calls it.
     pub(super) fn name(self) -> &'static str {
         match self {
-            Self::Batch => "batch",
             Self::Ceiling => "ceiling",
+            Self::Physics => "physics",
             Self::Gymnasium => "gymnasium",
             Self::EnvPool => "envpool",
         }

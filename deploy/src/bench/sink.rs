@@ -14,9 +14,9 @@ use dmprl_shared::transport::shared_memory::LearnerEnd;
 use dmprl_shared::transport::{ParameterPublisher, SegmentReceiver, TransportError};
 use rustix::time::{ClockId, clock_gettime};
 
-/// Sleep after every queue was found empty: the learner's order of magnitude, at a few per cent of
-/// one core.
-const IDLE: Duration = Duration::from_micros(200);
+/// Bounds of the sleep after every queue was found empty.
+const NAP_MIN: Duration = Duration::from_micros(50);
+const NAP_MAX: Duration = Duration::from_millis(5);
 /// Between two cleanings of what dead workers left.
 const MAINTENANCE_INTERVAL: Duration = Duration::from_millis(250);
 /// Between two looks for new workers that have no policy yet, while workers start.
@@ -73,7 +73,7 @@ pub(super) struct Sink {
 
 impl Sink {
     /// Begins; nothing is taken before the first request.
-    pub(super) fn start(end: LearnerEnd, expected: Expected) -> Self {
+    pub(super) fn start(end: LearnerEnd, expected: Expected, queue_segments: usize) -> Self {
         let (requests, asked) = mpsc::channel();
         let (sender, answers) = mpsc::channel();
         let stop = Arc::new(AtomicBool::new(false));
@@ -85,6 +85,10 @@ impl Sink {
             sequences: vec![0; expected.worker_count as usize],
             faults: Faults::default(),
             maintained: Instant::now(),
+            nap: Nap {
+                length: NAP_MIN,
+                queued_max: queue_segments * expected.worker_count as usize,
+            },
         };
         let thread = thread::spawn(move || taker.serve(&asked, &sender));
         Self { requests: Some(requests), answers, stop, thread: Some(thread) }
@@ -120,6 +124,26 @@ struct Taker {
     sequences: Vec<u64>,
     faults: Faults,
     maintained: Instant,
+    nap: Nap,
+}
+
+/// The sink's sleep, as long as the queues bear: each waking takes time from a worker on its core,
+/// and a worker whose queue is full loses more.
+#[derive(Debug)]
+struct Nap {
+    length: Duration,
+    queued_max: usize,
+}
+
+impl Nap {
+    /// Sets the next sleep by what had queued up during the last.
+    fn adapt(&mut self, taken: usize) {
+        if taken * 2 > self.queued_max {
+            self.length = (self.length / 2).max(NAP_MIN);
+        } else if taken * 4 < self.queued_max {
+            self.length = (self.length * 5 / 4).min(NAP_MAX);
+        }
+    }
 }
 
 impl Taker {
@@ -157,7 +181,7 @@ impl Taker {
                         first.get_or_insert_with(Instant::now);
                     }
                 }
-                None => thread::sleep(IDLE),
+                None => thread::sleep(NAP_MIN),
             }
             if greeted.elapsed() >= GREETING_INTERVAL {
                 ParameterPublisher::maintain(&mut self.end.parameters)?;
@@ -178,13 +202,18 @@ impl Taker {
     /// Environment steps taken in so much time, and how much time it really was [s].
     fn take_for(&mut self, duration: Duration) -> Result<(u64, f64), TransportError> {
         let start = Instant::now();
-        let mut env_steps = 0;
+        let (mut env_steps, mut taken) = (0, 0);
         while start.elapsed() < duration && !self.stop.load(Ordering::Acquire) {
             match self.take()? {
-                Some(header) => env_steps += u64::from(header.steps_len),
+                Some(header) => {
+                    env_steps += u64::from(header.steps_len);
+                    taken += 1;
+                }
                 None => {
                     self.maintain_in_time()?;
-                    thread::sleep(IDLE);
+                    self.nap.adapt(taken);
+                    taken = 0;
+                    thread::sleep(self.nap.length);
                 }
             }
         }
@@ -245,6 +274,19 @@ fn cpu_s() -> f64 {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn the_sink_sleeps_as_long_as_a_quarter_to_a_half_of_the_queues_fills() {
+        let mut nap = Nap { length: NAP_MIN, queued_max: 64 };
+        (0..100).for_each(|_| nap.adapt(0));
+        assert_eq!(nap.length, NAP_MAX);
+        nap.adapt(20);
+        assert_eq!(nap.length, NAP_MAX);
+        nap.adapt(33);
+        assert_eq!(nap.length, NAP_MAX / 2);
+        (0..100).for_each(|_| nap.adapt(64));
+        assert_eq!(nap.length, NAP_MIN);
+    }
 
     #[test]
     fn gaps_are_lost_and_repetitions_are_rejected() {

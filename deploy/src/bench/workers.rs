@@ -75,7 +75,7 @@ impl Workers {
         };
         let mut end = serve(domain.path(), &plan(&setup, &policy))?;
         end.parameters.publish(&snapshot)?;
-        let sink = Sink::start(end, expected(&setup, &policy)?);
+        let sink = Sink::start(end, expected(&setup, &policy)?, setup.config.actors.queue_segments);
         let mut workers = Self {
             children,
             sink,

@@ -17,6 +17,10 @@ use crate::failure::{Outcome, wrong_use};
 /// Shorter rounds measure the sleep of the bench itself; longer ones are a slip of the keyboard.
 const SECONDS: std::ops::RangeInclusive<f64> = 0.05..=3600.0;
 
+/// Of each environment in a worker's queue, unless the configuration says: enough for the sink to
+/// sleep while a worker works. The learner of a run does not sleep while it has updates to do.
+const QUEUED_SEGMENTS: usize = 4;
+
 const HELP: &str = "\
 EXAMPLES
   dmprl bench rollout --task reacher
@@ -24,8 +28,8 @@ EXAMPLES
 
 const ROLLOUT_HELP: &str = "\
 In every round each of these runs once for --seconds, the others asleep; the median counts.
-  batch      mujoco.batch alone, on the model file that Gymnasium ships
-  ceiling    mujoco.batch alone, on the workers' own model and process settings
+  ceiling    mujoco.batch alone, as it is imported, on Gymnasium's model file if there is one
+  physics    mujoco.batch alone, on the workers' own model and process settings
              (both run episodes whose controls were recorded before, see --controls)
   worker     `dmprl actor` processes as a run has them: network, movement primitives, noise,
              environments, shared memory; this process takes the segments in the learner's place
@@ -84,11 +88,11 @@ struct RolloutArgs {
     #[arg(long, value_name = "S", value_parser = clap::value_parser!(i64).range(0..))]
     seed: Option<i64>,
     /// How often each is measured.
-    #[arg(long, value_name = "R", default_value_t = 5,
+    #[arg(long, value_name = "R", default_value_t = 15,
           value_parser = clap::value_parser!(u16).range(1..=1000))]
     rounds: u16,
     /// How long each time [s].
-    #[arg(long, value_name = "S", default_value_t = 1.0, value_parser = seconds)]
+    #[arg(long, value_name = "S", default_value_t = 0.4, value_parser = seconds)]
     seconds: f64,
     /// What drives physics alone: what the policy decides, or random actions.
     #[arg(long, value_enum, default_value_t = Controls::Policy)]
@@ -129,7 +133,11 @@ fn rollout(args: &RolloutArgs) -> anyhow::Result<Outcome> {
         set: &args.set,
         flags: flags(args)?,
     };
-    let mut config = merge(&sources)?.resolve(Limits { cores: cores() }).map_err(refuse)?;
+    let mut config = merge(&sources)?;
+    if config.actors.queue_segments == 0 {
+        config.actors.queue_segments = QUEUED_SEGMENTS * config.actors.envs_per_worker;
+    }
+    let mut config = config.resolve(Limits { cores: cores() }).map_err(refuse)?;
     // The workers and their peers have another working directory.
     for path in &mut config.task.python_path {
         *path = absolute_folder(path)?;
