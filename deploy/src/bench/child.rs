@@ -8,6 +8,7 @@ use std::thread;
 use std::time::{Duration, Instant};
 
 use anyhow::{Context, anyhow};
+use rustix::process::{Pid, Signal, kill_process};
 
 use super::watch::Watch;
 use crate::launch::{describe, log_tail};
@@ -89,6 +90,12 @@ impl LineChild {
                 Err(TryRecvError::Disconnected) => return Err(self.death()),
             }
         }
+    }
+
+    /// Stops it, or lets it go on.
+    pub(super) fn signal(&self, signal: Signal) -> anyhow::Result<()> {
+        let id = Pid::from_child(&self.child);
+        kill_process(id, signal).with_context(|| format!("cannot signal {}", self.name))
     }
 
     /// The most memory that it has had at once [bytes]: `VmHWM`, when the system tells it.

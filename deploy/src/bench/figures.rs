@@ -10,10 +10,13 @@ use crate::run_directory::Machine;
 
 /// The worker's name among those of its peers.
 pub(super) const WORKER: &str = "worker";
+/// One of several workers, the others standing still.
+pub(super) const ONE_WORKER: &str = "one_worker";
 /// Everyone who may be measured, in the order of the report.
-pub(super) const NAMES: [&str; 5] = ["ceiling", "physics", WORKER, "gymnasium", "envpool"];
+pub(super) const NAMES: [&str; 6] =
+    ["ceiling", "physics", WORKER, ONE_WORKER, "gymnasium", "envpool"];
 /// Those that the worker is compared with.
-const COMPARED: [&str; 4] = ["ceiling", "physics", "gymnasium", "envpool"];
+const COMPARED: [&str; 5] = ["ceiling", "physics", ONE_WORKER, "gymnasium", "envpool"];
 
 /// One measurement.
 #[derive(Debug, Clone, Copy)]

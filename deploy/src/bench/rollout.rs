@@ -10,7 +10,7 @@ use std::time::Duration;
 use anyhow::Context;
 use dmprl_shared::config::ExperimentConfig;
 
-use super::figures::{Figures, WORKER, WorkerFigures};
+use super::figures::{Figures, ONE_WORKER, WORKER, WorkerFigures};
 use super::numpy_plan::{Controls, NumpyPlan};
 use super::peers::{Peer, PeerKind, Stage};
 use super::watch::{Interrupted, Watch};
@@ -89,6 +89,9 @@ fn measure(mut bench: RolloutBench) -> anyhow::Result<Figures> {
         progress.measuring(WORKER);
         let (round, window) = workers.measure(&watch, bench.duration)?;
         figures.add(WORKER, round);
+        if let Some(one) = workers.measure_one(&watch, bench.duration)? {
+            figures.add(ONE_WORKER, one);
+        }
         sink_cpu_s += window.cpu_s;
         measured_s += window.seconds;
     }

@@ -1,6 +1,6 @@
 //! The figures of a benchmark as a table.
 
-use super::figures::{Figures, NAMES, WORKER, WorkerFigures, max, min};
+use super::figures::{Figures, NAMES, ONE_WORKER, WORKER, WorkerFigures, max, min};
 use crate::terminal::grouped;
 
 impl Figures {
@@ -29,7 +29,9 @@ impl Figures {
                 "", "steps/s", "µs/step", "CPU µs", "from … to"
             ),
         ];
-        lines.extend(NAMES.iter().map(|name| row(self, name)));
+        let alone = actors.workers == 1;
+        let names = NAMES.iter().filter(|name| !(alone && **name == ONE_WORKER));
+        lines.extend(names.map(|name| row(self, name)));
         let WorkerFigures { first_segment_s, rss_bytes, sink_cpu_share, rejected, lost } =
             &self.workers;
         let memory = rss_bytes.map_or_else(
@@ -48,12 +50,17 @@ impl Figures {
     }
 }
 
+fn label(name: &str) -> &str {
+    if name == ONE_WORKER { "one worker" } else { name }
+}
+
 fn row(figures: &Figures, name: &str) -> String {
     let (rates, Some(rate)) = (figures.rates(name), figures.steps_per_s(name)) else {
-        return format!("  {name:<10} {:>11}", "absent");
+        return format!("  {:<10} {:>11}", label(name), "absent");
     };
     let whole = |rate: f64| grouped(rate.round() as u64);
-    let step_us = 1e6 * figures.config.actors.workers as f64 / rate;
+    let workers = if name == ONE_WORKER { 1 } else { figures.config.actors.workers };
+    let step_us = 1e6 * workers as f64 / rate;
     let spread = format!("{} … {}", whole(min(&rates)), whole(max(&rates)));
     let ratio = match figures.ratio(name).filter(|_| name != WORKER) {
         Some(ratio) => format!("{ratio:.2} ×"),
@@ -61,6 +68,7 @@ fn row(figures: &Figures, name: &str) -> String {
     };
     let cpu_us = figures.cpu_us_per_step(name).map_or_else(String::new, |us| format!("{us:.2}"));
     let rate = whole(rate);
+    let name = label(name);
     let row = format!("  {name:<10} {rate:>11} {step_us:>9.2} {cpu_us:>9}   {spread:<21} {ratio}");
     row.trim_end().to_owned()
 }

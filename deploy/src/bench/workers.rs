@@ -12,6 +12,7 @@ use dmprl_shared::segment::Expected;
 use dmprl_shared::spec::EnvSpec;
 use dmprl_shared::transport::ParameterPublisher;
 use dmprl_shared::transport::shared_memory::{Domain, serve};
+use rustix::process::Signal;
 
 use super::child::LineChild;
 use super::figures::Round;
@@ -105,6 +106,24 @@ impl Workers {
         let cores = self.cpu_s().zip(cpu_s).map(|(now, then)| (now - then) / elapsed_s);
         let steps_per_s = window.env_steps as f64 / window.seconds;
         Ok((Round { steps_per_s, cores }, window))
+    }
+
+    /// What one of them delivers while the others stand still; none where there are no others.
+    pub(super) fn measure_one(
+        &mut self,
+        watch: &Watch,
+        duration: Duration,
+    ) -> anyhow::Result<Option<Round>> {
+        if self.children.len() == 1 {
+            return Ok(None);
+        }
+        let signal_others = |workers: &Self, signal| {
+            workers.children[1..].iter().try_for_each(|child| child.signal(signal))
+        };
+        signal_others(self, Signal::STOP)?;
+        let measured = self.measure(watch, duration);
+        signal_others(self, Signal::CONT)?;
+        Ok(Some(measured?.0))
     }
 
     fn cpu_s(&self) -> Option<f64> {

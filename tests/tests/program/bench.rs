@@ -37,7 +37,7 @@ fn a_task_on_the_batch_is_measured_beside_its_ceiling_and_gymnasium() {
     let running = bench(&place, "reacher", &["--workers", "2", "--rounds", "2", "--json"]);
     let id = running.id();
     let json = running.wait().with_status(0).json();
-    for key in ["ceiling", "physics", "worker", "gymnasium"] {
+    for key in ["ceiling", "physics", "worker", "one_worker", "gymnasium"] {
         positive(&json, &format!("{key}_steps_per_s"));
         assert_eq!(json["rounds"][key].as_array().unwrap().len(), 2, "{json}");
         assert!(json["cpu_us_per_step"][key].as_f64() > Some(0.0), "{json}");
