@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dmprl.mujoco_batch import Fields, MujocoTask
-from dmprl.tasks.models import gymnasium_model
+from dmprl.tasks.models import gymnasium_model, gymnasium_picture_model
 from dmprl.tasks.reacher import minus_distance
 
 JOINTS = (
@@ -46,6 +46,9 @@ class Pusher(MujocoTask):
         model = gymnasium_model(self.model_file)
         self._bodies = [model.body(name).id for name in OBSERVED_BODIES]
         return model
+
+    def picture_model(self) -> mujoco.MjModel:  # noqa: D102 - inherited
+        return gymnasium_picture_model(self.model_file)
 
     def observation_names(self) -> list[str]:  # noqa: D102 - inherited
         return arm_observation_names(OBSERVED_BODIES)

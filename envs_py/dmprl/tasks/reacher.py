@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dmprl.mujoco_batch import Fields, MujocoTask
-from dmprl.tasks.models import gymnasium_model
+from dmprl.tasks.models import gymnasium_model, gymnasium_picture_model
 
 FINGERTIP, TARGET = 3, 4
 """Bodies of the model."""
@@ -39,6 +39,9 @@ class Reacher(MujocoTask):
         assert not np.any(model.geom_contype), "a geom of reacher.xml can collide"
         model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONTACT
         return model
+
+    def picture_model(self) -> mujoco.MjModel:  # noqa: D102 - inherited
+        return gymnasium_picture_model("reacher.xml")
 
     def observation_names(self) -> list[str]:  # noqa: D102 - inherited
         names = ["cos_joint0", "cos_joint1", "sin_joint0", "sin_joint1", "target_x", "target_y"]
