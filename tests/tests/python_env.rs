@@ -46,7 +46,7 @@ fn spec_of_reacher_is_gymnasiums() {
         (&[-1.0; 2][..], &[1.0; 2][..])
     );
     assert_eq!((spec.id.as_str(), spec.control_dt_s), ("Reacher-v5", 0.02));
-    assert_eq!(spec.observation_name(9), "observation[9]");
+    assert_eq!(spec.observation_name(9), "fingertip_to_target_y");
     let spec = started("tiny_envs:Goal-v0", 1, 5).spec().clone();
     assert_eq!(spec.observation_names[2..], ["observation[0]", "observation[1]"]);
     assert_eq!(spec.observation_name(0), "desired_goal[0]");

@@ -162,7 +162,7 @@ fn starts(case: &Case, observations: &[f32]) -> Vec<f32> {
     let row = |s: &[f32]| match case.config.policy.start {
         Start::Zero => [0.0; 4],
         Start::Carry => [s[4], s[6], s[5], s[7]],
-        Start::Observed => [s[1].atan2(s[0]), s[2] * speed, -s[3], -s[2] * speed],
+        Start::Observed => [s[1].atan2(s[0]), s[2] * speed, -s[3], s[2] * speed],
     };
     observations.chunks_exact(o).flat_map(row).collect()
 }
