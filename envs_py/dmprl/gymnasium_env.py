@@ -87,7 +87,8 @@ class GymnasiumSegmentEnv(SegmentEnv):
     def _registration(self, named: object) -> registration.EnvSpec:
         if "gymnasium_robotics" in sys.modules:
             robotics_repair.repair()
-        if isinstance(named, type) and issubclass(named, gymnasium.Env):
+        is_class = isinstance(named, type)
+        if issubclass(named, gymnasium.Env) if is_class else callable(named):
             limit = getattr(named, "max_episode_steps", None)
             return registration.EnvSpec(
                 self.task_id,
@@ -97,12 +98,24 @@ class GymnasiumSegmentEnv(SegmentEnv):
             )
         registered = gymnasium.registry.get(self.task_id.rpartition(":")[2])
         if registered is None:  # without version, or unknown: Gymnasium finds it, or suggests
-            made = gymnasium.make(self.task_id)
+            made = self._make_unregistered()
             registered = gymnasium.registry[made.unwrapped.spec.id]
             made.close()
         registered = copy.copy(registered)
         registered.order_enforce = False
         return registered
+
+    def _make_unregistered(self) -> gymnasium.Env:
+        try:
+            return gymnasium.make(self.task_id)
+        except gymnasium.error.UnregisteredEnv as error:
+            module, _, name = self.task_id.rpartition(":")
+            if not module:
+                raise
+            raise gymnasium.error.NameNotFound(
+                f"{self.task_id}: the module {module} was found, but it has no class or function "
+                f"{name} and registers no environment of that name ({error})"
+            ) from None
 
     def _make(self) -> gymnasium.Env:
         env = gymnasium.make(self._registered, disable_env_checker=True)
@@ -213,6 +226,7 @@ class GymnasiumSegmentEnv(SegmentEnv):
                 step += 1
                 if terminated or truncated:
                     break
+            out.success[index] = success_of(info)
         except FAILURES as error:
             self._fail(index, self._failure(index, f"step {step} of the segment", error), out)
             return
@@ -222,7 +236,6 @@ class GymnasiumSegmentEnv(SegmentEnv):
         out.steps[index] = step
         out.terminated[index] = bool(terminated)
         out.truncated[index] = bool(truncated)
-        out.success[index] = success_of(info)
 
     def _reset(self, index: int, seed: int | None, out: SegmentBuffers) -> None:
         try:
@@ -292,6 +305,6 @@ class GymnasiumSegmentEnv(SegmentEnv):
 def success_of(info: dict) -> int:
     """``info["is_success"]`` or ``info["success"]`` as a value of ``SegmentBuffers.success``."""
     success = info.get("is_success", info.get("success"))
-    if success is None or (isinstance(success, float) and math.isnan(success)):
+    if success is None or math.isnan(success):
         return SUCCESS_NOT_REPORTED
     return SUCCESS_YES if success else SUCCESS_NO

@@ -54,6 +54,7 @@ class MujocoTask(ABC):
 
     def __init__(self, env_count: int) -> None:
         self.env_count = env_count
+        self._scratch: dict[tuple[str, tuple[int, ...], type], NDArray] = {}
         self.model = self.load_model()
         self.action_low, self.action_high = (
             bound.astype(np.float32) for bound in self.model.actuator_ctrlrange.T
@@ -85,6 +86,19 @@ class MujocoTask(ABC):
     ) -> None:
         """Writes one environment's start state over the model's own, which the arrays hold."""
 
+    def scratch(self, name: str, shape: tuple[int, ...], dtype: type = np.float64) -> NDArray:
+        """An array to calculate in, made once for each name, shape and type."""
+        array = self._scratch.get((name, shape, dtype))
+        if array is None:
+            array = self._scratch[name, shape, dtype] = np.zeros(shape, dtype)
+        return array
+
+    def effort(self, actions: NDArray[np.float32], dtype: type = np.float32) -> NDArray:
+        """The sum of squares of each action (E, k, A), calculated in ``dtype``."""
+        squares = self.scratch("squares", actions.shape, dtype)
+        np.square(actions, out=squares, dtype=dtype)
+        return np.sum(squares, axis=-1, out=self.scratch("effort", actions.shape[:-1], dtype))
+
     def episodes_began(self, indices: NDArray[np.int32]) -> None:  # noqa: B027 - most keep nothing
         """Forgets what the task keeps of the last episode of these environments."""
 
@@ -113,7 +127,6 @@ class BatchSegmentEnv(SegmentEnv):
     """E simulations of one :class:`MujocoTask` whose actions are the actuators' controls."""
 
     def __init__(self, task: MujocoTask, segment_steps: int, episode_steps: int | None) -> None:
-        _quieten_mujoco()
         self.task = task
         self.env_count = task.env_count
         self.segment_steps = segment_steps
@@ -249,6 +262,7 @@ class BatchSegmentEnv(SegmentEnv):
             out.failed[failed] = 1
             for array in (out.observations, out.rewards, out.steps, out.truncated):
                 array[failed] = 0
+            out.success[failed] = SUCCESS_NOT_REPORTED
             for index in failed.tolist():
                 self._failures[index] += 1
                 seed = seed_after_failure(self._seeds[index], self._failures[index])
@@ -287,8 +301,8 @@ def generator(seed: int) -> np.random.Generator:
     return np.random.Generator(np.random.PCG64(np.random.SeedSequence(seed)))
 
 
-def _quieten_mujoco() -> None:
-    """Takes the clock and the log file out of MuJoCo, for this process.
+def quieten_mujoco() -> None:
+    """Takes the clock and the log file out of MuJoCo, for this process: a worker's.
 
     MuJoCo's Python bindings install a timer that every stage of a step reads twice: on Reacher a
     fourth of a step's time. Nothing but ``MjData.timer`` is lost. And a warning, which here becomes

@@ -11,17 +11,17 @@ import importlib
 import sys
 from abc import ABC, abstractmethod
 from types import ModuleType
-from typing import TYPE_CHECKING, TypedDict
+from typing import NotRequired, TypedDict
 
 import numpy as np
 from numpy.typing import NDArray
 
-if TYPE_CHECKING:
-    from typing import NotRequired  # of Python 3.11; annotations are not evaluated
-
 SUCCESS_NO, SUCCESS_YES, SUCCESS_NOT_REPORTED = 0, 1, 2
 """Values of :attr:`SegmentBuffers.success`."""
 
+
+EXTRAS = {"panda_gym": "panda-gym", "gymnasium_robotics": "robotics"}
+"""Packages that are known to work, and the extra of this one that installs each."""
 
 OBSERVATION_NAMES_MAX = 10_000
 """Longer observations go without names: a specification is written down, and sent as one line."""
@@ -162,8 +162,9 @@ def make(task_id: str, env_count: int, segment_steps: int) -> SegmentEnv:
     """The environments of a task.
 
     - ``task_id``: a Gymnasium id, ``module:Id`` for one that ``module`` registers when imported,
-      or ``module:Class`` with a :class:`SegmentEnv`, a ``dmprl.mujoco_batch.MujocoTask`` or a
-      ``gymnasium.Env``.
+      or ``module:name`` with a class that is a :class:`SegmentEnv`, a
+      ``dmprl.mujoco_batch.MujocoTask`` or a ``gymnasium.Env``, or with a function that makes one of
+      the last.
     """
     if env_count < 1 or segment_steps < 1:
         raise ValueError(f"{env_count} environments, {segment_steps} steps: both must be 1 or more")
@@ -173,6 +174,7 @@ def make(task_id: str, env_count: int, segment_steps: int) -> SegmentEnv:
         return candidate(env_count, segment_steps)
     batched = sys.modules.get("dmprl.mujoco_batch")  # imported by whoever subclasses its task
     if batched and isinstance(candidate, type) and issubclass(candidate, batched.MujocoTask):
+        batched.quieten_mujoco()
         return candidate(env_count).batch(segment_steps, candidate.episode_steps)
 
     from dmprl.tasks import make_batch
@@ -192,8 +194,14 @@ def _import(task_id: str, module_name: str) -> ModuleType:
     except ModuleNotFoundError as error:
         if error.name is None or not f"{module_name}.".startswith(f"{error.name}."):
             raise  # found, but something that it imports is missing
+        extra = EXTRAS.get(module_name)
         raise ModuleNotFoundError(
             f"{task_id}: no module {error.name!r} among the installed packages or in the "
-            "directories given with --python-path",
+            "directories given with --python-path"
+            + (
+                f"; install it with: .venv/bin/python -m pip install './envs_py[{extra}]'"
+                if extra
+                else ""
+            ),
             name=error.name,
         ) from None

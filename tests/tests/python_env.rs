@@ -59,11 +59,13 @@ fn what_the_list_of_tasks_says_is_what_the_environments_are() {
         let spec = envs.spec();
         assert_eq!(spec.id, task.id);
         assert_eq!(
-            (spec.observation_len, spec.action_len, spec.episode_steps),
-            (task.observation_len, task.action_len, task.episode_steps),
+            (spec.observation_len, spec.episode_steps),
+            (task.observation_len, task.episode_steps),
             "{}",
             task.name
         );
+        let bounds = (spec.action_low.as_slice(), spec.action_high.as_slice());
+        assert_eq!(bounds, (task.action_low, task.action_high), "{}", task.name);
         assert!((spec.control_dt_s - task.control_dt_s).abs() < 1e-12, "{}", task.name);
     }
 }

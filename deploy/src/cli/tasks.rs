@@ -39,7 +39,8 @@ pub(super) fn run(args: &TasksArgs) -> anyhow::Result<Outcome> {
 
 fn description(task: &TaskDefaults) -> String {
     let TaskDefaults { name, id, about, control, source, .. } = task;
-    let TaskDefaults { observation_len, action_len, episode_steps, control_dt_s, .. } = task;
+    let TaskDefaults { observation_len, action_low, episode_steps, control_dt_s, .. } = task;
+    let action_len = action_low.len();
     let seconds = f64::from(*episode_steps) * control_dt_s;
     format!(
         "{name:19} {about}\n{:19} {id}, from {source}\n{:19} observation {observation_len}, \

@@ -50,8 +50,15 @@ def make_task(task_id: str, env_count: int) -> MujocoTask | None:
 
 
 def make_batch(task_id: str, env_count: int, segment_steps: int) -> BatchSegmentEnv | None:
-    """A task's batched environments; None if the id is not one of ours."""
+    """A task's batched environments for a worker; None if the id is not one of ours.
+
+    They take over the process: see :func:`dmprl.mujoco_batch.quieten_mujoco`.
+    """
     task = make_task(task_id, env_count)
     if task is None:
         return None
+
+    from dmprl.mujoco_batch import quieten_mujoco
+
+    quieten_mujoco()
     return task.batch(segment_steps, task.episode_steps)

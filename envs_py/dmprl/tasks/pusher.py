@@ -81,10 +81,13 @@ class Pusher(MujocoTask):
     ) -> None:
         rows = self.rewarded(observations)
         tips, cylinder, goal = rows[..., 14:17], rows[..., 17:20], rows[..., 20:23]
-        near = np.empty_like(out)
-        minus_distance(cylinder - tips, near)
-        minus_distance(cylinder - goal, out)
-        out -= np.square(actions).sum(-1) * 0.1
+        difference = self.scratch("difference", cylinder.shape)
+        near = self.scratch("near", out.shape)
+        minus_distance(np.subtract(cylinder, tips, out=difference), near)
+        minus_distance(np.subtract(cylinder, goal, out=difference), out)
+        effort = self.effort(actions)
+        effort *= 0.1
+        out -= effort
         near *= 0.5
         out += near
 

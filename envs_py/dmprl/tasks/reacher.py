@@ -85,7 +85,7 @@ class Reacher(MujocoTask):
         out: NDArray[np.float64],
     ) -> None:
         minus_distance(self.rewarded(observations)[..., 8:], out)
-        out -= np.square(actions).sum(-1)
+        out -= self.effort(actions)
 
     def rewarded(self, observations: NDArray[np.float64]) -> NDArray[np.float64]:
         """The states whose distance counts: those after the steps."""

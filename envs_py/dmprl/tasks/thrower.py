@@ -76,11 +76,15 @@ class Thrower(MujocoTask):
         out: NDArray[np.float64],
     ) -> None:
         ball, goal = observations[:, :-1, 17:20], observations[:, :-1, 20:22]
-        thrown_to = ball[..., :2].copy()
+        thrown_to = self.scratch("thrown_to", goal.shape)
+        thrown_to[:] = ball[..., :2]
         for step in range(thrown_to.shape[1]):
             hits = (ball[:, step, 2] < GROUND_HEIGHT) & ~self._has_hit
             self._hit_xy[hits] = ball[hits, step, :2]
             self._has_hit |= hits
             thrown_to[self._has_hit, step] = self._hit_xy[self._has_hit]
-        minus_distance(thrown_to - goal, out)
-        out -= 0.002 * np.square(actions, dtype=np.float64).sum(-1)
+        thrown_to -= goal
+        minus_distance(thrown_to, out)
+        effort = self.effort(actions, np.float64)
+        effort *= 0.002
+        out -= effort

@@ -19,18 +19,20 @@ pub struct TaskDefaults {
     pub source: &'static str,
     /// Length O of an observation.
     pub observation_len: usize,
-    /// Length A of an action.
-    pub action_len: usize,
+    /// Lower bound of each action dimension; its length is A.
+    pub action_low: &'static [f64],
+    /// Upper bound of each action dimension.
+    pub action_high: &'static [f64],
     /// Steps of an episode.
     pub episode_steps: u32,
     /// Duration of a step [s].
     pub control_dt_s: f64,
-    /// Values over the defaults, as TOML.
+    /// Values over the defaults, as parts of one TOML text.
     #[serde(skip)]
-    text: &'static str,
-    /// Values over the preset `paper`, as TOML: where its Table 2 has a column for this task.
+    values: &'static [&'static str],
+    /// Values over the preset `paper`, likewise: where its Table 2 has a column for this task.
     #[serde(skip)]
-    paper: &'static str,
+    paper: &'static [&'static str],
 }
 
 const REACHER: TaskDefaults = TaskDefaults {
@@ -40,11 +42,12 @@ const REACHER: TaskDefaults = TaskDefaults {
     control: "torque, ±1 (gear 200)",
     source: "Gymnasium, batched, equal bit for bit",
     observation_len: 10,
-    action_len: 2,
+    action_low: &[-1.0; 2],
+    action_high: &[1.0; 2],
     episode_steps: 50,
     control_dt_s: 0.02,
-    text: REACHER_VALUES,
-    paper: "",
+    values: REACHER_VALUES,
+    paper: &[],
 };
 
 const PUSHER: TaskDefaults = TaskDefaults {
@@ -54,11 +57,12 @@ const PUSHER: TaskDefaults = TaskDefaults {
     control: "torque, ±2",
     source: "Gymnasium, batched, equal bit for bit",
     observation_len: 23,
-    action_len: 7,
+    action_low: &[-2.0; 7],
+    action_high: &[2.0; 7],
     episode_steps: 100,
     control_dt_s: 0.05,
-    text: ARM_VALUES,
-    paper: "",
+    values: ARM_VALUES,
+    paper: &[],
 };
 
 const THROWER: TaskDefaults = TaskDefaults {
@@ -67,6 +71,8 @@ const THROWER: TaskDefaults = TaskDefaults {
     about: "seven-joint arm throws a ball into a box",
     control: "torque, ±10, last three joints ±15",
     source: "OpenAI Gym 0.9.4, rebuilt",
+    action_low: &[-10.0, -10.0, -10.0, -10.0, -15.0, -15.0, -15.0],
+    action_high: &[10.0, 10.0, 10.0, 10.0, 15.0, 15.0, 15.0],
     ..PUSHER
 };
 
@@ -77,10 +83,11 @@ const PANDA_REACH: TaskDefaults = TaskDefaults {
     control: "gripper displacement, ±1 = 5 cm a step",
     source: "panda-gym's task, in MuJoCo",
     observation_len: 20,
-    action_len: 3,
+    action_low: &[-1.0; 3],
+    action_high: &[1.0; 3],
     episode_steps: 50,
     control_dt_s: 0.04,
-    text: PANDA_REACH_VALUES,
+    values: PANDA_REACH_VALUES,
     paper: PANDA_PAPER,
 };
 
@@ -88,8 +95,9 @@ const PANDA_REACH_JOINTS: TaskDefaults = TaskDefaults {
     name: "panda-reach-joints",
     id: "dmprl/PandaReachJoints-v0",
     control: "joint displacement, ±1 = 0.05 rad a step",
-    action_len: 7,
-    text: PANDA_REACH_JOINTS_VALUES,
+    action_low: &[-1.0; 7],
+    action_high: &[1.0; 7],
+    values: PANDA_REACH_JOINTS_VALUES,
     ..PANDA_REACH
 };
 
@@ -97,7 +105,7 @@ const REACHER_V1: TaskDefaults = TaskDefaults {
     name: "reacher-v1",
     id: "dmprl/Reacher-v1",
     about: "reacher as the paper had it: targets beyond reach, reward of the state before",
-    source: "OpenAI Gym 0.9.4, rebuilt",
+    source: "OpenAI Gym 0.9.4, on Gymnasium's model",
     observation_len: 11,
     ..REACHER
 };
@@ -106,7 +114,7 @@ const PUSHER_V0: TaskDefaults = TaskDefaults {
     name: "pusher-v0",
     id: "dmprl/Pusher-v0",
     about: "pusher as the paper had it: other positions, reward of the state before",
-    source: "OpenAI Gym 0.9.4, rebuilt",
+    source: "OpenAI Gym 0.9.4, on Gymnasium's model",
     ..PUSHER
 };
 
@@ -118,7 +126,7 @@ pub const TASKS: [TaskDefaults; 8] =
     [REACHER, PUSHER, THROWER, PANDA_REACH, PANDA_REACH_JOINTS, REACHER_V1, PUSHER_V0, THROWER_V0];
 
 // Observation: cos (2), sin (2), target (2), angular velocity (2), fingertip - target.
-const REACHER_VALUES: &str = r#"
+const REACHER_VALUES: &[&str] = &[r#"
 [task]
 start_sources = [
     { cos = 0, sin = 2, velocity = 6 },
@@ -126,10 +134,13 @@ start_sources = [
 ]
 [run]
 steps = 60000
-"#;
+"#];
 
 // Observation: joint angles (7), joint velocities (7), three positions (3 each).
-const ARM_VALUES: &str = r#"
+const ARM_VALUES: &[&str] = &[JOINTS, "[run]\nsteps = 200000"];
+
+// Angle and velocity of seven joints, as these observations begin.
+const JOINTS: &str = r#"
 [task]
 start_sources = [
     { index = 0, velocity = 7 },
@@ -140,54 +151,44 @@ start_sources = [
     { index = 5, velocity = 12 },
     { index = 6, velocity = 13 },
 ]
-[run]
-steps = 200000
 "#;
 
 // Observation: joint angles (7), joint velocities (7), goal - end effector (3), velocity of the end
 // effector (3). The start is the end effector seen from the goal.
-const PANDA_REACH_VALUES: &str = r#"
+const PANDA_REACH_VALUES: &[&str] = &[
+    r#"
 [task]
 start_sources = [
     { index = 14, velocity = 17, scale = -1.0 },
     { index = 15, velocity = 18, scale = -1.0 },
     { index = 16, velocity = 19, scale = -1.0 },
 ]
-[run]
-steps = 30000
+"#,
+    PANDA_RUN,
+    PANDA_TABLE_2,
+];
+
+const PANDA_REACH_JOINTS_VALUES: &[&str] = &[JOINTS, PANDA_RUN, PANDA_TABLE_2];
+
+const PANDA_RUN: &str = "[run]\nsteps = 30000\n";
+
+// Table 2 of the paper, the column of the Panda tasks: what every preset keeps of it,
+const PANDA_TABLE_2: &str = r#"
 [algorithm]
 discount = 0.95
 actor_learning_rate = 0.0003
 "#;
 
-const PANDA_REACH_JOINTS_VALUES: &str = r#"
-[task]
-start_sources = [
-    { index = 0, velocity = 7 },
-    { index = 1, velocity = 8 },
-    { index = 2, velocity = 9 },
-    { index = 3, velocity = 10 },
-    { index = 4, velocity = 11 },
-    { index = 5, velocity = 12 },
-    { index = 6, velocity = 13 },
-]
-[run]
-steps = 30000
-[algorithm]
-discount = 0.95
-actor_learning_rate = 0.0003
-"#;
-
-// Table 2 of the paper, the column of the Panda tasks.
-const PANDA_PAPER: &str = r#"
-[algorithm]
-discount = 0.95
-actor_learning_rate = 0.0003
+// and the rest of it.
+const PANDA_PAPER: &[&str] = &[
+    PANDA_TABLE_2,
+    r#"
 [exploration]
 warm_up_steps = 2000
 [replay]
 capacity_steps = 100000
-"#;
+"#,
+];
 
 impl TaskDefaults {
     /// The task's values, name and id included.
@@ -196,7 +197,7 @@ impl TaskDefaults {
     /// Never for the built-in tasks: a test parses each.
     #[must_use]
     pub fn table(&self) -> Table {
-        let mut table: Table = self.text.parse().expect("a built-in task is valid TOML");
+        let mut table: Table = self.values.concat().parse().expect("a built-in task is valid TOML");
         let task = table.get_mut("task").and_then(toml::Value::as_table_mut);
         let task = task.expect("a built-in task has a [task] table");
         task.insert("name".into(), self.name.into());
@@ -210,8 +211,8 @@ impl TaskDefaults {
     /// Never for the built-in tasks: a test parses each.
     #[must_use]
     pub fn over_preset(&self, preset: &str) -> Table {
-        let text = if preset == "paper" { self.paper } else { "" };
-        text.parse().expect("a built-in task is valid TOML")
+        let values = if preset == "paper" { self.paper } else { &[] };
+        values.concat().parse().expect("a built-in task is valid TOML")
     }
 }
 
@@ -244,7 +245,7 @@ mod tests {
                     (config.task.name.as_str(), config.task.id.as_str()),
                     (task.name, task.id)
                 );
-                assert_eq!(config.task.start_sources.len(), task.action_len, "{}", task.name);
+                assert_eq!(config.task.start_sources.len(), task.action_low.len(), "{}", task.name);
             }
         }
     }
