@@ -7,7 +7,7 @@ from pathlib import Path
 import gymnasium
 import numpy as np
 
-from dmprl.gymnasium_env import GymnasiumSegmentEnv
+from dmprl.gymnasium_env import GymnasiumSegmentEnv, success_of
 from dmprl.segment_env import (
     SUCCESS_NO,
     SUCCESS_NOT_REPORTED,
@@ -139,6 +139,23 @@ class SegmentTest(unittest.TestCase):
         self.assertEqual(out.next_observations.tolist(), [[7], [8]])
         self.assertEqual(env.spec()["control_dt_s"], 0.5)
 
+    def test_a_function_may_make_the_environment(self):
+        env, out = started("tiny_envs:short_countdown", env_count=2)
+        env.step_segment(np.zeros((2, 5, 1)), out)
+        self.assertEqual((out.steps.tolist(), out.terminated.tolist()), ([2, 2], [1, 1]))
+
+    def test_a_success_that_is_no_yes_or_no_is_a_failure_of_its_environment(self):
+        env, out = started("tiny_envs:StrangeInfo", env_count=1)
+        env.step_segment(np.zeros((1, 5, 1)), out)
+        self.assertEqual(out.failed.tolist(), [1])
+        self.assertIn("only 0-dimensional", env.take_failures()[0])
+
+    def test_success_that_is_not_a_number_is_not_reported(self):
+        for nan in (float("nan"), np.float32("nan")):
+            self.assertEqual(success_of({"success": nan}), SUCCESS_NOT_REPORTED)
+        self.assertEqual(success_of({"is_success": np.True_}), SUCCESS_YES)
+        self.assertEqual(success_of({"is_success": np.float32(0)}), SUCCESS_NO)
+
     def test_a_module_may_bring_its_own_mujoco_task(self):
         env, out = started("tiny_mujoco:SlowReacher", env_count=2)
         self.assertEqual(env.spec()["control_dt_s"], 0.04)
@@ -241,6 +258,8 @@ class SpecTest(unittest.TestCase):
             make("Reachr-v5", 1, 5)
         with self.assertRaisesRegex(ModuleNotFoundError, "--python-path"):
             make("no_such_module:Task-v0", 1, 5)
+        with self.assertRaisesRegex(gymnasium.error.Error, "the module tiny_envs was found, but"):
+            make("tiny_envs:Missing", 1, 5)
 
 
 if __name__ == "__main__":

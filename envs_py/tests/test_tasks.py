@@ -1,4 +1,5 @@
 import re
+import tracemalloc
 import unittest
 import warnings
 
@@ -126,6 +127,20 @@ class Contract:
             steps += out.steps
         self.assertEqual(steps.tolist(), [2 * TASKS[self.task_id].episode_steps] * 4)
 
+    def test_a_segment_keeps_no_memory_and_needs_little(self):
+        env, out = started(self.task_id, env_count=16)
+        actions = np.zeros((16, 5, len(env.spec()["action_low"])))
+        tracemalloc.start()
+        env.step_segment(actions, out)
+        before, _ = tracemalloc.get_traced_memory()
+        tracemalloc.reset_peak()
+        env.step_segment(actions, out)
+        after, peak = tracemalloc.get_traced_memory()
+        tracemalloc.stop()
+        self.assertLess(after - before, 1000)
+        # NumPy's own buffers of a call and, in end effector mode, the inverse kinematics'.
+        self.assertLess(peak - before, 30_000)
+
     def test_the_same_seed_gives_the_same_bytes(self):
         runs = []
         for _ in range(2):
@@ -232,6 +247,21 @@ class ThrowerTest(unittest.TestCase):
             self.returns(lambda spec, envs: random_actions(rng, spec, envs, 5)), -185, 40, 20
         )
 
+    def test_the_model_has_the_published_dimensions(self):
+        model = make("dmprl/Thrower-v0", 1, 5).task.model
+        sizes = (model.nq, model.nv, model.nu, model.nbody, model.ngeom)
+        self.assertEqual(sizes, (16, 15, 7, 19, 45))
+        self.assertAlmostEqual(model.body("goal").mass[0], 0.0722, places=4)
+        self.assertAlmostEqual(model.body("ball").mass[0], 0.002827, places=6)
+        ranges = [(-0.4854, 1.214602), (-0.5236, 0.7963), (-1.5, 1.7), (-0.7, 0.7)]
+        ranges += [(-1.5, 1.5), (-1.0, 1.0), (0.0, 2.25), (-10.3213, 10.3), (-10.3213, 10.3)]
+        np.testing.assert_allclose(model.jnt_range[:9], ranges)
+        np.testing.assert_array_equal(model.dof_armature, [0.75] * 9 + [0.0] * 6)
+        np.testing.assert_array_equal(model.dof_damping, [1.0] * 9 + [0.0] * 6)
+        np.testing.assert_array_equal(model.qpos0[9:], [0.5, -0.8, 0.275, 1, 0, 0, 0])
+        self.assertEqual(model.opt.timestep, 0.01)
+        self.assertEqual(list(model.opt.gravity), [0.0, 0.0, -9.81])
+
     def test_torque_bounds_differ_by_joint(self):
         spec = make("dmprl/Thrower-v0", 1, 5).spec()
         self.assertEqual(spec["action_high"], [10, 10, 10, 10, 15, 15, 15])
@@ -337,20 +367,23 @@ class BatchTest(unittest.TestCase):
                 self.assertTrue(out.next_observations[1].any())
         self.assertEqual(env.take_failures(), [])
 
-    def test_a_segment_allocates_nothing_that_grows_with_it(self):
-        import tracemalloc
-
-        env, out = started("Reacher-v5", env_count=16)
-        actions = np.zeros((16, 5, 2))
-        env.step_segment(actions, out)
-        tracemalloc.start()
-        env.step_segment(actions, out)
-        _, peak = tracemalloc.get_traced_memory()
-        tracemalloc.stop()
-        self.assertLess(peak, out.observations.nbytes)
-
 
 class ImportTest(unittest.TestCase):
+    def test_only_a_worker_takes_the_clock_and_the_warnings_out_of_mujoco(self):
+        import subprocess
+        import sys
+
+        code = (
+            "import gymnasium, dmprl; from dmprl.mujoco_batch import mujoco_hook; "
+            "hooks = lambda: [mujoco_hook(n).value for n in ('mjcb_time', 'mju_user_warning')]; "
+            "before = hooks(); gymnasium.make('dmprl/Reacher-v5'); print(hooks() == before); "
+            "from dmprl.segment_env import make; make('Reacher-v5', 1, 5); print(hooks()[0])"
+        )
+        result = subprocess.run(
+            [sys.executable, "-c", code], capture_output=True, text=True, check=True
+        )
+        self.assertEqual(result.stdout.split(), ["True", "None"])
+
     def test_worker_path_does_without_gymnasium(self):
         import subprocess
         import sys

@@ -123,6 +123,19 @@ class Limited(Countdown):
         super().__init__(length=1000)
 
 
+def short_countdown(**kwargs):
+    """A function that makes an environment."""
+    return Countdown(length=2, **kwargs)
+
+
+class StrangeInfo(Countdown):
+    """Says of its success what cannot be a yes or a no."""
+
+    def step(self, action):
+        observation, reward, ended, truncated, _ = super().step(action)
+        return observation, reward, ended, truncated, {"success": np.array([True, False])}
+
+
 class Remembering(Countdown):
     """Keeps its last action, as environments do that charge for its change."""
 
