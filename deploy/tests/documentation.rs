@@ -10,6 +10,8 @@ use dmprl_learner::metrics::{MetricsLine, Rejected};
 use dmprl_shared::config::{ExperimentConfig, Layers, Limits, task_defaults};
 
 const EXAMPLES: &str = "docs/examples";
+const DOCUMENTS: [&str; 4] =
+    ["README.md", "ARCHITECTURE.md", "CHANGELOG.md", "docs/environments.md"];
 const LIMITS: Limits = Limits { cores: 2 };
 /// How the program is called in the documents.
 const CALLS: [&str; 3] = ["cargo run --release -- ", "target/release/dmprl ", "dmprl "];
@@ -154,7 +156,7 @@ fn every_flag_that_is_shown_exists() {
     let all: BTreeSet<_> = commands.iter().flat_map(|command| words(command)).collect();
     // Flags of other programs: cargo's, and docker's for the size of shared memory.
     let foreign = ["--release", "--check", "--shm-size"];
-    for document in ["README.md", "ARCHITECTURE.md", "CHANGELOG.md"] {
+    for document in DOCUMENTS {
         let text = read(document);
         for flag in spans(&text).iter().flat_map(|span| flags(span)) {
             let exists = all.contains(&flag) || foreign.contains(&flag.as_str());
@@ -183,7 +185,7 @@ fn every_configuration_key_that_is_named_exists() {
     let keys: BTreeSet<_> = Layers::new().keys().into_iter().collect();
     let sections: BTreeSet<_> = keys.iter().filter_map(|key| key.split('.').next()).collect();
     let mut seen = 0;
-    for document in ["README.md", "ARCHITECTURE.md", "CHANGELOG.md"] {
+    for document in DOCUMENTS {
         let text = read(document);
         let allowed = |letter: char| letter.is_ascii_alphanumeric() || "._/".contains(letter);
         for word in text.split(|letter: char| !allowed(letter)) {
@@ -255,7 +257,7 @@ fn the_keys_of_both_kinds_of_lines_are_documented() {
 fn every_path_and_test_that_the_documents_name_is_there() {
     const FOLDERS: [&str; 8] =
         ["actors/", "deploy/", "docs/", "envs_py/", "learner/", "shared/", "tests/", ".ci/"];
-    for document in ["README.md", "ARCHITECTURE.md", "CHANGELOG.md"] {
+    for document in DOCUMENTS {
         let text = read(document);
         let links = text.split("](").skip(1).filter_map(|rest| rest.split(')').next());
         let links = links.filter(|link| !link.contains("://")).map(str::to_owned);
@@ -264,7 +266,13 @@ fn every_path_and_test_that_the_documents_name_is_there() {
         });
         for name in links.chain(named) {
             let (path, test) = name.split_once("::").unwrap_or((&name, ""));
-            assert!(root().join(path).exists(), "{document} names {path}, which is not there");
+            // A link is relative to its document, a path in code to the project.
+            let beside = Path::new(document).parent().unwrap_or(Path::new(""));
+            let there = [root().join(path), root().join(beside).join(path)];
+            assert!(
+                there.iter().any(|path| path.exists()),
+                "{document} names {path}, which is not there"
+            );
             let there = test.is_empty() || read(path).contains(&format!("fn {test}("));
             assert!(there, "{document} names the test {test}, which {path} does not have");
         }

@@ -1,7 +1,8 @@
 //! The Python package with its optional extras: panda-gym and Gymnasium-Robotics.
 //!
 //! They get an environment of their own, made once: PyBullet is large, most users need neither, and
-//! not every Python has a build of it. Where one cannot be installed, the test says so and passes.
+//! not every Python has a build of it. Where one cannot be installed, the test says so and passes,
+//! unless `TEST_EXTRAS_REQUIRED` is set, as it is where every change is tested.
 #![cfg(feature = "python")]
 #![allow(
     clippy::unwrap_used,
@@ -26,6 +27,9 @@ fn unit_tests_of_the_optional_extras_pass() {
     for (extra, tests) in ATTEMPTS {
         match environment_with(extra) {
             Ok(python) => return run_tests(&python, tests),
+            Err(reason) if std::env::var_os("TEST_EXTRAS_REQUIRED").is_some() => {
+                panic!("the extra `{extra}` is required and cannot be installed: {reason}")
+            }
             Err(reason) => {
                 // Not `eprintln!`, which the harness keeps to itself when a test passes.
                 let mut stderr = std::io::stderr().lock();

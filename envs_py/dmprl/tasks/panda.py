@@ -1,9 +1,11 @@
 """PandaReach: a Franka Panda brings its end effector to a point.
 
-panda-gym's task in MuJoCo: its start, goals, actions, reward and timing, and an arm that answers
-like PyBullet's (``models/panda.xml``). Two things differ. Reaching the goal ends no episode, as in
-panda-gym 2: the reward asks to come close and stay there. And the observation is one vector with
-what both kinds of actions need, joints and end effector, where panda-gym has the latter alone.
+panda-gym's task in MuJoCo: its start, goals, actions, reward and timing, and an arm whose servo
+answers like PyBullet's (``models/panda.xml``). Three things differ. Reaching the goal ends no
+episode, as in panda-gym 2: the reward asks to come close and stay there. The observation is one
+vector with what both kinds of actions need, joints and end effector, where panda-gym has the latter
+alone. And the arm bears its own weight, as the real one does; panda-gym's sags a little in every
+step, from where the next one starts, 17 cm in an episode of random actions.
 """
 
 from __future__ import annotations
