@@ -123,6 +123,12 @@ class Limited(Countdown):
         super().__init__(length=1000)
 
 
+class Timeless(Countdown):
+    """Says that a step lasts what is no time."""
+
+    dt = float("nan")
+
+
 class Remembering(Countdown):
     """Keeps its last action, as environments do that charge for its change."""
 
