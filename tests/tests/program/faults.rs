@@ -137,10 +137,13 @@ fn a_worker_whose_environment_crashes_the_process_is_replaced() {
 fn one_process_goes_on_after_failures_and_repeats_them_to_the_byte() {
     let repeated = || {
         let place = Workplace::new();
-        let (run, finished) =
-            train_tiny(&place, "FaultyRaise", &["--deterministic", "--steps", "1500"]);
+        // The fourth evaluation is the last, and the one in which its environments break.
+        let more = ["--deterministic", "--steps", "1500", "--set", "evaluation.interval_steps=400"];
+        let (run, finished) = train_tiny(&place, "FaultyRaise", &more);
         finished.with_status(0).saying("learner: environment failure ").saying("failures   ");
-        assert!(assert_sound(&run)["env_failures"].as_u64() >= Some(1500 / LIFE - ENVS));
+        let told = log(&place, "learner").matches("environment failure: ").count() as u64;
+        assert!(told >= 1500 / LIFE - ENVS, "{told} failures");
+        assert_eq!(assert_sound(&run)["env_failures"].as_u64(), Some(told), "all of them");
         let mut rows = rows(&run, "metrics.jsonl");
         for row in &mut rows {
             TIME_KEYS.iter().for_each(|key| drop(row.as_object_mut().unwrap().remove(*key)));
