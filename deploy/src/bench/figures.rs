@@ -10,7 +10,7 @@ use crate::run_directory::Machine;
 
 /// The worker's name among those of its peers.
 pub(super) const WORKER: &str = "worker";
-/// One of several workers, the others standing still.
+/// One of several workers, the others asleep.
 pub(super) const ONE_WORKER: &str = "one_worker";
 /// Everyone who may be measured, in the order of the report.
 pub(super) const NAMES: [&str; 6] =

@@ -87,21 +87,22 @@ fn measure(mut bench: RolloutBench) -> anyhow::Result<Figures> {
             figures.add(peer.kind.name(), peer.measure(&watch, bench.duration)?);
         }
         progress.measuring(WORKER);
-        let (round, window) = workers.measure(&watch, bench.duration)?;
-        figures.add(WORKER, round);
-        if let Some(one) = workers.measure_one(&watch, bench.duration)? {
+        // First, while the others' queues are full of what they made in their peers' time.
+        if let Some(one) = workers.measure_first(&watch, bench.duration)? {
             figures.add(ONE_WORKER, one);
         }
+        let (round, window) = workers.measure(&watch, bench.duration)?;
+        figures.add(WORKER, round);
         sink_cpu_s += window.cpu_s;
         measured_s += window.seconds;
     }
-    let faults = workers.faults();
+    let discrepancies = workers.discrepancies();
     figures.workers = WorkerFigures {
         first_segment_s: workers.first_segment_s,
         rss_bytes: workers.resident_bytes_max(),
         sink_cpu_share: sink_cpu_s / measured_s,
-        rejected: faults.rejected,
-        lost: faults.lost,
+        rejected: discrepancies.rejected,
+        lost: discrepancies.lost,
     };
     Ok(figures)
 }

@@ -33,7 +33,7 @@ In every round each of these runs once for --seconds, the others asleep; the med
              (both run episodes whose controls were recorded before, see --controls)
   worker     `dmprl actor` processes as a run has them: network, movement primitives, noise,
              environments, shared memory; this process takes the segments in the learner's place
-  one worker the first of them while the others are stopped, where there are several
+  one worker the first of them while the others sleep on their full queues
   gymnasium  a loop over Gymnasium environments, the same policy in NumPy
   envpool    EnvPool with one thread a worker, the same policy in NumPy
 All but the workers have one Python process for each worker. What is not to be had is null or
