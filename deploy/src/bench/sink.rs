@@ -278,8 +278,9 @@ mod tests {
     #[test]
     fn gaps_are_lost_and_repetitions_are_rejected() {
         let (mut last, mut discrepancies) = (0, Discrepancies::default());
-        let taken: Vec<bool> =
-            [1, 2, 5, 5, 4, 6].map(|number| follow(Some(&mut last), number, &mut discrepancies)).to_vec();
+        let taken: Vec<bool> = [1, 2, 5, 5, 4, 6]
+            .map(|number| follow(Some(&mut last), number, &mut discrepancies))
+            .to_vec();
         assert_eq!(taken, [true, true, true, false, false, true]);
         assert_eq!(discrepancies, Discrepancies { rejected: 2, lost: 2 });
         assert!(!follow(None, 7, &mut discrepancies));

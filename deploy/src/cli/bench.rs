@@ -36,6 +36,7 @@ In every round each of these runs once for --seconds, the others asleep; the med
   one worker the first of them while the others sleep on their full queues
   gymnasium  a loop over Gymnasium environments, the same policy in NumPy
   envpool    EnvPool with one thread a worker, the same policy in NumPy
+  panda-gym  beside the two Panda tasks: a loop over panda-gym's own, random actions, no policy
 All but the workers have one Python process for each worker. What is not to be had is null or
 `absent`, with the reason. worker_rss_mb is the peak resident memory of a worker (VmHWM);
 first_segment_s is from the start of the slowest worker to its first delivered segment.
@@ -81,7 +82,7 @@ struct RolloutArgs {
     /// What drives physics alone: what the policy decides, or random actions.
     #[arg(long, value_enum, default_value_t = Controls::Policy)]
     controls: Controls,
-    /// Python that has EnvPool [default: the one of .venv].
+    /// Python that has EnvPool or panda-gym [default: the one of .venv].
     #[arg(long, value_name = "PATH")]
     peer_python: Option<PathBuf>,
     /// Print one JSON object on standard output.

@@ -124,7 +124,11 @@ fn flags(args: &TrainArgs) -> [Option<Flag>; 7] {
         flag("--steps", "run.steps", args.steps.map(Value::Integer)),
         flag("--deterministic", "run.deterministic", args.deterministic.then_some(true.into())),
         flag("--device", "learner.device", args.device.clone().map(Value::String)),
-        flag("--threads", "learner.threads", args.threads.map(|count| Value::Integer(count.into()))),
+        flag(
+            "--threads",
+            "learner.threads",
+            args.threads.map(|count| Value::Integer(count.into())),
+        ),
         flag("--until-return", "run.until_return", number(args.until_return)),
         flag("--until-success", "run.until_success", number(args.until_success)),
         flag("--max-minutes", "run.max_minutes", number(args.max_minutes)),

@@ -37,7 +37,9 @@ fn an_environment_whose_step_lasts_no_time_is_refused_by_its_worker() {
     let run = place.path("run");
     let finished = place.run(&crate::train("tiny_envs:Timeless", &run, &more)).with_status(1);
     finished
-        .saying("tiny_envs:Timeless: the duration of a step (the environment's attribute dt) is NaN")
+        .saying(
+            "tiny_envs:Timeless: the duration of a step (the environment's attribute dt) is NaN",
+        )
         .saying("exit status 1");
     place.assert_no_process();
 }

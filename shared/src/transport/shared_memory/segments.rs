@@ -314,8 +314,7 @@ mod tests {
         let domain = Domain::create(&directory.path().join("p"), "run").unwrap();
         let plan = plan(2);
         let mut learner = serve(domain.path(), &plan).unwrap();
-        let mut workers =
-            [0, 1].map(|index| attach(domain.path(), &plan, index).unwrap().segments);
+        let mut workers = [0, 1].map(|index| attach(domain.path(), &plan, index).unwrap().segments);
         let block = vec![0.0; plan.layout.block_len()];
         let mut send = |worker: usize, sequence| {
             let header =
