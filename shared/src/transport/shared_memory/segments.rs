@@ -321,9 +321,12 @@ mod tests {
                 SegmentHeader { sequence, worker_id: worker as u32, ..SegmentHeader::default() };
             workers[worker].try_send(&header, &block).unwrap()
         };
+        let mut segment = Segment::zeroed(plan.layout);
+        // The learner joins a queue when it first looks: a full one is nobody's until then.
+        assert_eq!(send(0, 0), SendOutcome::Delivered);
+        assert!(learner.segments.try_receive(&mut segment).unwrap());
         let all_delivered = [SendOutcome::Delivered; 4];
         assert_eq!([1, 2, 3, 4].map(|sequence| send(0, sequence)), all_delivered);
-        let mut segment = Segment::zeroed(plan.layout);
         for sequence in 1..=10 {
             assert_eq!(send(1, sequence), SendOutcome::Delivered);
             assert!(learner.segments.try_receive_from(1, &mut segment).unwrap());
