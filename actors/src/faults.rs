@@ -10,6 +10,9 @@ use crate::python_env::{PythonEnvironments, PythonError};
 
 /// Longer descriptions are cut: an exception may carry a whole model file.
 const SENTENCE_CHARS_MAX: usize = 500;
+/// Segments without a fault that make up for failures as a completed episode does: an environment
+/// without a time limit may never complete one, and failures far apart are no reason to give up.
+const SOUND_SEGMENTS: u32 = 1_000;
 
 /// The failures of a set of environments.
 #[derive(Debug)]
@@ -18,13 +21,38 @@ pub struct Faults {
     failed: Vec<bool>,
     /// (E,): those of them that cannot go on as they are.
     unmade: Vec<bool>,
-    /// (E,): failures since the environment last completed an episode, and how many are too many.
-    in_a_row: Vec<u32>,
-    in_a_row_max: u32,
+    /// (E,): failures that nothing has made up for, and how many are too many.
+    records: Vec<Record>,
+    failures_max: u32,
     /// (E,): the newest failure of each; empty before the first.
     causes: Vec<String>,
     total: u64,
     untold: Vec<String>,
+}
+
+/// What counts against one environment.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+struct Record {
+    /// Since it last completed an episode or ran [`SOUND_SEGMENTS`].
+    failures: u32,
+    /// Since the first of them.
+    sound_segments: u32,
+}
+
+impl Record {
+    fn failed(&mut self) {
+        if self.failures == 0 {
+            self.sound_segments = 0;
+        }
+        self.failures = self.failures.saturating_add(1);
+    }
+
+    fn ran_soundly(&mut self) {
+        self.sound_segments += 1;
+        if self.sound_segments >= SOUND_SEGMENTS {
+            *self = Self::default();
+        }
+    }
 }
 
 /// An environment that fails whatever is done.
@@ -32,22 +60,22 @@ pub struct Faults {
 pub struct Hopeless {
     /// Which.
     pub env_index: usize,
-    /// Failures since it last completed an episode.
+    /// Failures since it last completed an episode, or a thousand segments.
     pub count: u32,
     /// The last one.
     pub cause: String,
 }
 
 impl Faults {
-    /// For `envs` environments; more than `in_a_row_max` failures without an episode completed in
-    /// between are hopeless.
+    /// For `envs` environments; more than `failures_max` failures without a completed episode, or
+    /// a thousand sound segments, in between are hopeless.
     #[must_use]
-    pub fn new(envs: usize, in_a_row_max: u32) -> Self {
+    pub fn new(envs: usize, failures_max: u32) -> Self {
         Self {
             failed: vec![false; envs],
             unmade: vec![false; envs],
-            in_a_row: vec![0; envs],
-            in_a_row_max,
+            records: vec![Record::default(); envs],
+            failures_max,
             causes: vec![String::new(); envs],
             total: 0,
             untold: Vec::new(),
@@ -76,8 +104,10 @@ impl Faults {
             if let Some(cause) = cause {
                 any = true;
                 self.note(&cause);
-                self.in_a_row[env] = self.in_a_row[env].saturating_add(1);
+                self.records[env].failed();
                 self.causes[env] = plain(&cause);
+            } else {
+                self.records[env].ran_soundly();
             }
         }
         sentences.iter().for_each(|sentence| self.note(sentence));
@@ -117,14 +147,15 @@ impl Faults {
 
     /// Environment `env` has completed an episode.
     pub fn completed(&mut self, env: usize) {
-        self.in_a_row[env] = 0;
+        self.records[env] = Record::default();
     }
 
     /// The environment that has failed too often, if there is one.
     #[must_use]
     pub fn hopeless(&self) -> Option<Hopeless> {
-        let env_index = self.in_a_row.iter().position(|&count| count > self.in_a_row_max)?;
-        let (count, cause) = (self.in_a_row[env_index], self.cause(env_index).to_owned());
+        let too_many = |record: &Record| record.failures > self.failures_max;
+        let env_index = self.records.iter().position(too_many)?;
+        let (count, cause) = (self.records[env_index].failures, self.cause(env_index).to_owned());
         Some(Hopeless { env_index, count, cause })
     }
 
@@ -200,4 +231,36 @@ fn start_fault(environments: &PythonEnvironments, env: usize) -> Option<(String,
     let row = &environments.next_observations()[env * spec.observation_len..];
     let row = &row[..spec.observation_len];
     not_finite(row).map(|at| (spec.observation_name(at), row[at]))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn sound(faults: &mut Faults, segments: u32) {
+        (0..segments).for_each(|_| faults.records[0].ran_soundly());
+    }
+
+    #[test]
+    fn an_environment_that_never_completes_an_episode_makes_up_with_sound_segments() {
+        let mut faults = Faults::new(1, 2);
+        for _ in 0..10 {
+            (0..2).for_each(|_| faults.records[0].failed());
+            assert_eq!(faults.hopeless(), None);
+            sound(&mut faults, SOUND_SEGMENTS);
+        }
+    }
+
+    #[test]
+    fn fewer_sound_segments_between_too_many_failures_make_up_for_nothing() {
+        let mut faults = Faults::new(1, 2);
+        // Sound segments before a failure are none of its reasons.
+        sound(&mut faults, SOUND_SEGMENTS - 1);
+        faults.records[0].failed();
+        sound(&mut faults, 1);
+        (0..2).for_each(|_| faults.records[0].failed());
+        assert_eq!(faults.hopeless().unwrap().count, 3);
+        faults.completed(0);
+        assert_eq!(faults.hopeless(), None);
+    }
 }

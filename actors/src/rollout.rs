@@ -35,7 +35,7 @@ pub enum RolloutError {
     Hopeless {
         /// Which environment of the worker.
         env_index: usize,
-        /// Failures since its last completed episode.
+        /// Failures since its last completed episode, or a thousand sound segments.
         count: u32,
         /// The last of them.
         cause: String,

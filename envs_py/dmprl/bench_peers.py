@@ -1,16 +1,15 @@
-"""Who makes environment steps in ``dmprl bench rollout`` besides the worker itself.
+"""Loops over environments that ``dmprl bench rollout`` compares a worker with.
 
 Each class has ``segment()``, which runs one segment in all E environments and returns the
 environment steps in it, and ``about``, which says what it is. Making one raises
-:class:`AbsentError` where it is not to be had.
+:class:`AbsentError` where it is not to be had. ``bench_physics`` has the bounds, of the same kind.
 """
 
 from __future__ import annotations
 
 import importlib
 import sys
-from collections.abc import Callable
-from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 import numpy as np
@@ -18,128 +17,15 @@ from numpy.typing import NDArray
 
 from dmprl.numpy_policy import Actor
 
-CONTROLS_BYTES_MAX = 64 << 20
-"""Of the controls of an episode; where more would be needed, episodes are shorter."""
-EPISODE_STEPS = 100
-"""Of an episode where the task has no limit."""
+PANDA_GYM_IDS = {
+    "dmprl/PandaReach-v0": "PandaReachDense-v3",
+    "dmprl/PandaReachJoints-v0": "PandaReachJointsDense-v3",
+}
+"""What this project's Panda tasks are in panda-gym."""
 
 
 class AbsentError(Exception):
     """A comparison is not to be had here. The message says why."""
-
-
-class BatchPeer:
-    """``mujoco.batch.Batch`` with no policy and nothing recorded: physics alone.
-
-    The same episode in each environment over and over: ``starts`` are rows of ``Batch.state``,
-    ``controls`` (steps, E, nu).
-    """
-
-    def __init__(self, model, frame_skip: int, starts: NDArray, controls: NDArray, k: int) -> None:
-        from mujoco.batch import Batch
-
-        env_count = controls.shape[1]
-        self._env_steps, self._substeps = env_count * k, k * frame_skip
-        self._batch, self._starts = Batch(model, env_count, nthread=1), starts
-        segments = max(1, len(controls) // k)
-        controls = controls[np.arange(segments * k) % len(controls)]
-        # (segments, E, K frame_skip, nu), as a rollout takes them.
-        controls = controls.reshape(segments, k, env_count, model.nu).swapaxes(1, 2)
-        self._controls = np.repeat(controls, frame_skip, axis=2)
-        self._segment = 0
-
-    def segment(self) -> int:
-        """Runs one segment; returns the environment steps in it."""
-        if self._segment == 0:
-            self._batch.state[:] = self._starts
-        self._batch.rollout(self._substeps, self._controls[self._segment], record=())
-        self._segment = (self._segment + 1) % len(self._controls)
-        return self._env_steps
-
-
-class Physics(BatchPeer):
-    """On the model of the worker's own back end, in a process that this has set up.
-
-    Nothing a worker could do costs less: its time beyond this is its own.
-    """
-
-    def __init__(self, plan: dict, seed: int) -> None:
-        from dmprl.segment_env import SegmentBuffers, make
-
-        task_id, env_count = plan["task"]["id"], plan["env_count"]
-        try:
-            env = make(task_id, env_count, 1)
-        except Exception as error:
-            raise AbsentError(f"{task_id} cannot be made: {error}") from None
-        # Not by its class: whatever steps a Batch has a bound of this kind.
-        task, batch = getattr(env, "task", None), getattr(env, "batch", None)
-        if task is None or not hasattr(batch, "rollout"):
-            raise AbsentError(f"{task_id} does not run on mujoco.batch")
-        spec = env.spec()
-        out = SegmentBuffers(env_count, 1, spec["observation_len"], spec["action_len"])
-        seeds = np.arange(seed, seed + env_count, dtype=np.uint64)
-        env.reset(np.ones(env_count, np.uint8), seeds, out)
-        starts = batch.state.copy()
-
-        def step(actions: NDArray[np.float64]) -> tuple[NDArray, NDArray]:
-            env.step_segment(actions[:, None], out)
-            return out.next_observations, batch.ctrl
-
-        steps = episode_steps(plan, task.frame_skip, task.model.nu)
-        controls = episode_controls(plan, seed, out.next_observations, step, steps)
-        super().__init__(task.model, task.frame_skip, starts, controls, plan["decision_steps"])
-        self.about = "mujoco.batch with the worker's model and settings"
-
-
-class Ceiling(BatchPeer):
-    """In a process as MuJoCo's import leaves it, on Gymnasium's model file where there is one."""
-
-    def __init__(self, plan: dict, seed: int) -> None:
-        path = gymnasium_model_path(plan["task"]["id"])
-        if path is not None:
-            self._init_with_gymnasium(plan, seed, path)
-            return
-        import mujoco
-
-        from dmprl.mujoco_batch import mujoco_hook
-
-        clock = mujoco_hook("mjcb_time").value
-        physics = Physics(plan, seed)  # takes the clock out
-        mujoco_hook("mjcb_time").value = clock
-        self.__dict__.update(vars(physics))
-        self.about = f"mujoco.batch {mujoco.__version__} as it is imported"
-
-    def _init_with_gymnasium(self, plan: dict, seed: int, path: str) -> None:
-        import mujoco
-        from mujoco.batch import Batch
-
-        model, env_count = mujoco.MjModel.from_xml_path(path), plan["env_count"]
-        envs = [gymnasium_env(plan["task"]["id"]).unwrapped for _ in range(env_count)]
-        batch = Batch(model, env_count, nthread=1)
-        seen = [flat(env.reset(seed=seed + index)[0]) for index, env in enumerate(envs)]
-        for index, env in enumerate(envs):
-            batch.qpos[index], batch.qvel[index] = env.data.qpos, env.data.qvel
-        frame_skip, dtype = envs[0].frame_skip, envs[0].action_space.dtype
-
-        def step(actions: NDArray[np.float64]) -> tuple[NDArray, NDArray]:
-            pairs = zip(envs, actions.astype(dtype), strict=True)
-            observations = np.stack([flat(env.step(action)[0]) for env, action in pairs])
-            return observations, np.stack([env.data.ctrl for env in envs])
-
-        steps = episode_steps(plan, frame_skip, model.nu)
-        controls = episode_controls(plan, seed, np.stack(seen), step, steps)
-        starts = batch.state.copy()
-        super().__init__(model, frame_skip, starts, controls, plan["decision_steps"])
-        self.about = f"mujoco.batch {mujoco.__version__}, {Path(path).name} as Gymnasium ships it"
-
-
-def gymnasium_model_path(task_id: str) -> str | None:
-    """The model file of one of Gymnasium's own MuJoCo environments."""
-    try:
-        env = gymnasium_env(task_id).unwrapped
-    except AbsentError:
-        return None
-    return getattr(env, "fullpath", None) if hasattr(env, "frame_skip") else None
 
 
 class RandomActor:
@@ -158,51 +44,48 @@ class RandomActor:
         """Nothing is carried on."""
 
 
-def episode_controls(
-    plan: dict,
-    seed: int,
-    observations: NDArray,
-    step: Callable[[NDArray[np.float64]], tuple[NDArray, NDArray]],
-    steps: int,
-) -> NDArray[np.float64]:
-    """Controls of an episode, (steps, E, nu), drawn before anything is measured.
-
-    The worker's own policy draws them, unless the plan wants random actions: physics costs what
-    the states cost that a policy leads to, and pushing against a joint's limit is dear. ``step``
-    applies actions, (E, A), and returns what is seen then, (E, O), and the controls, (E, nu).
-    """
-    actor = (Actor if plan["controls"] == "policy" else RandomActor)(plan, seed)
-    nobody, controls = np.zeros(plan["env_count"], np.bool_), []
-    while len(controls) < steps:
-        actions = actor.actions(observations)
-        for k in range(min(actions.shape[1], steps - len(controls))):
-            observations, control = step(actions[:, k])
-            controls.append(control.copy())
-        actor.carry_on(nobody)
-    return np.stack(controls)
-
-
-def episode_steps(plan: dict, frame_skip: int, nu: int) -> int:
-    """Steps of an episode without its last, after which the environments begin anew."""
-    fits = CONTROLS_BYTES_MAX // (plan["env_count"] * frame_skip * max(1, nu) * 8)
-    return max(1, min(fits, (plan["spec"]["episode_steps"] or EPISODE_STEPS) - 1))
-
-
-def gymnasium_env(task_id: str) -> Any:
-    """The environment as Gymnasium makes it, or :class:`AbsentError`."""
-    import gymnasium
-
+def gymnasium_env(plan: dict) -> Any:
+    """The environment as Gymnasium makes it, or :class:`AbsentError` with the reason."""
+    task_id = plan["task"]["id"]
+    module_name, _, name = task_id.rpartition(":")
     try:
-        return gymnasium.make(task_id)
-    except gymnasium.error.UnregisteredEnv:
-        raise AbsentError(f"{task_id} is no environment of Gymnasium") from None
+        import gymnasium
+
+        named = getattr(importlib.import_module(module_name), name, None) if module_name else None
+        if "gymnasium_robotics" in sys.modules:
+            from dmprl import robotics_repair
+
+            robotics_repair.repair()
+        if named is None:
+            return flattened(gymnasium.make(task_id))
+        if isinstance(named, type) and issubclass(named, gymnasium.Env):
+            limit = plan["spec"]["episode_steps"] or None
+            spec = gymnasium.envs.registration.EnvSpec(
+                task_id, entry_point=named, max_episode_steps=limit
+            )
+            return flattened(gymnasium.make(spec))
+    except Exception as error:  # whatever it is, the rest of the benchmark goes on
+        words = f"{type(error).__name__}: {error}"
+        raise AbsentError(f"Gymnasium cannot make {task_id}: {words}") from None
+    raise AbsentError(f"{task_id} is no environment of Gymnasium")
+
+
+def flattened(env: Any) -> Any:
+    """With Gymnasium's wrapper where :func:`flat` does not do: for tuples and nested spaces."""
+    from gymnasium import spaces, wrappers
+
+    space = env.observation_space
+    entries = space.values() if isinstance(space, spaces.Dict) else [space]
+    if all(isinstance(entry, spaces.Box) for entry in entries):
+        return env
+    return wrappers.FlattenObservation(env)
 
 
 class GymnasiumLoop:
     """Gymnasium environments, one after the other, under the policy in NumPy."""
 
     def __init__(self, plan: dict, seed: int) -> None:
-        self._envs = [gymnasium_env(plan["task"]["id"]) for _ in range(plan["env_count"])]
+        self._envs = [gymnasium_env(plan) for _ in range(plan["env_count"])]
         self._actor = Actor(plan, seed)
         self._dtype = self._envs[0].action_space.dtype
         shape = (plan["env_count"], plan["decision_steps"])
@@ -250,7 +133,7 @@ class EnvPoolLoop:
     """
 
     def __init__(self, plan: dict, seed: int) -> None:
-        envpool = import_envpool()
+        envpool = imported("envpool")
         task_id = envpool_id(plan["task"]["id"], envpool.list_all_envs())
         env_count = plan["env_count"]
         self._env = envpool.make(
@@ -288,14 +171,46 @@ class EnvPoolLoop:
         return steps
 
 
-def import_envpool():
+class PandaGymLoop:
+    """panda-gym's environments, one after the other, under random actions and no policy.
+
+    What a user of panda-gym has: PyBullet instead of MuJoCo, and everything in Python.
+    """
+
+    def __init__(self, plan: dict, seed: int) -> None:
+        task_id = PANDA_GYM_IDS.get(plan["task"]["id"])
+        if task_id is None:
+            raise AbsentError(f"panda-gym has no {plan['task']['id']}")
+        panda_gym, gymnasium = imported("panda_gym", "panda-gym"), imported("gymnasium")
+        self._envs = [gymnasium.make(task_id) for _ in range(plan["env_count"])]
+        self._actor = RandomActor(plan, seed)
+        self._dtype = self._envs[0].action_space.dtype
+        for index, env in enumerate(self._envs):
+            env.reset(seed=seed + index)
+        self.about = f"panda-gym {panda_gym.__version__} ({task_id}), random actions"
+
+    def segment(self) -> int:
+        """Runs one segment; returns the environment steps in it."""
+        steps = 0
+        actions = self._actor.actions(np.empty(0)).astype(self._dtype)
+        for env, env_actions in zip(self._envs, actions, strict=True):
+            for action in env_actions:
+                _, _, terminated, truncated, _ = env.step(action)
+                steps += 1
+                if terminated or truncated:
+                    env.reset()
+                    break
+        return steps
+
+
+def imported(module_name: str, package: str | None = None) -> ModuleType:
     """The module, or :class:`AbsentError`."""
     try:
-        return importlib.import_module("envpool")
+        return importlib.import_module(module_name)
     except ImportError as error:
         raise AbsentError(
-            f"{sys.executable} cannot import envpool ({error}); install it there, or name an "
-            "interpreter that has it with --peer-python"
+            f"{sys.executable} cannot import {package or module_name} ({error}); install it there, "
+            "or name an interpreter that has it with --peer-python"
         ) from None
 
 

@@ -17,7 +17,8 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
-from dmprl.bench_peers import AbsentError, Ceiling, EnvPoolLoop, GymnasiumLoop, Physics
+from dmprl.bench_peers import AbsentError, EnvPoolLoop, GymnasiumLoop, PandaGymLoop
+from dmprl.bench_physics import Ceiling, Physics
 
 SETTLE_S = 0.1
 """Stepped before the clock starts: caches and clock frequency then are those of a long run."""
@@ -27,6 +28,7 @@ KINDS = {
     "physics": Physics,
     "gymnasium": GymnasiumLoop,
     "envpool": EnvPoolLoop,
+    "panda_gym": PandaGymLoop,
 }
 
 

@@ -1,21 +1,27 @@
 """What the benchmark's peers are made of; the whole of it is tested through the program."""
 
 import unittest
+from unittest import mock
 
 import gymnasium
 import numpy as np
+import tiny_envs
 
 from dmprl.bench_peers import (
+    PANDA_GYM_IDS,
     AbsentError,
-    Ceiling,
     GymnasiumLoop,
-    Physics,
+    PandaGymLoop,
     RandomActor,
     envpool_id,
+    flat,
+    gymnasium_env,
 )
+from dmprl.bench_physics import Ceiling, Physics
 from dmprl.bench_rollout import run_for
 from dmprl.numpy_policy import Noise
 from dmprl.segment_env import SegmentBuffers, make
+from dmprl.tasks import TASKS
 
 
 def plan(task_id, action_len=2, **exploration):
@@ -81,9 +87,35 @@ class PeerTest(unittest.TestCase):
             (Ceiling, "CartPole-v1"),
             (Physics, "Pendulum-v1"),
             (GymnasiumLoop, "Nothing-v0"),
+            (GymnasiumLoop, "nowhere:Arm"),
+            (GymnasiumLoop, "tiny_envs:Batch"),
+            (PandaGymLoop, "Reacher-v5"),
         ):
             with self.assertRaisesRegex(AbsentError, task_id):
                 peer(plan(task_id), seed=1)
+
+    def test_whatever_gymnasium_raises_is_the_reason(self):
+        with (
+            mock.patch.object(tiny_envs.FaultyReset, "made_max", 0),
+            self.assertRaisesRegex(AbsentError, "OSError: no more of them"),
+        ):
+            gymnasium_env(plan("tiny_envs:FaultyReset-v0"))
+
+    def test_a_class_that_nobody_registered_is_made_with_the_workers_time_limit(self):
+        env = gymnasium_env(plan("tiny_envs:Limited"))
+        env.reset(seed=1)
+        ended = [env.step(env.action_space.sample())[3] for _ in range(50)]
+        self.assertEqual(ended, [False] * 49 + [True])
+
+    def test_nested_observations_come_in_the_workers_order(self):
+        for task_id in ("tiny_envs:Goal-v0", "tiny_envs:Nested-v0"):
+            out = SegmentBuffers(1, 1, make(task_id, 1, 1).spec()["observation_len"], 1)
+            make(task_id, 1, 1).reset(np.ones(1, np.uint8), np.ones(1, np.uint64), out)
+            observation = flat(gymnasium_env(plan(task_id)).reset(seed=1)[0])
+            np.testing.assert_allclose(observation, out.next_observations[0])
+
+    def test_panda_gym_has_what_this_projects_panda_tasks_are(self):
+        self.assertEqual(set(PANDA_GYM_IDS), {task for task in TASKS if "Panda" in task})
 
     def test_the_time_of_whole_segments_is_measured(self):
         answer = run_for(lambda: 7, 0.01)

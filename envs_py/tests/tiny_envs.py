@@ -136,6 +136,12 @@ class StrangeInfo(Countdown):
         return observation, reward, ended, truncated, {"success": np.array([True, False])}
 
 
+class Timeless(Countdown):
+    """Says that a step lasts what is no time."""
+
+    dt = float("nan")
+
+
 class Remembering(Countdown):
     """Keeps its last action, as environments do that charge for its change."""
 

@@ -57,13 +57,25 @@ pub enum SpecError {
         /// Its upper bound.
         high: f64,
     },
+    /// The duration of a step is none. It would become part of the policy's start velocity, and as
+    /// JSON, in which workers report it, NaN and infinity are null.
+    #[error(
+        "{id}: the duration of a step (the environment's attribute dt) is {got} s; expected a \
+         finite number, 0 or more, where 0 says that it is not known"
+    )]
+    Duration {
+        /// Gymnasium id.
+        id: String,
+        /// What the environment says [s].
+        got: f64,
+    },
 }
 
 impl EnvSpec {
-    /// Checks lengths and bounds.
+    /// Checks lengths, bounds and the duration of a step.
     ///
     /// # Errors
-    /// `Length` or `Bounds`, naming the field or dimension.
+    /// `Length`, `Bounds` or `Duration`, naming the field or dimension.
     pub fn check(&self) -> Result<(), SpecError> {
         let names_len = match self.observation_names.len() {
             0 => self.observation_len,
@@ -86,6 +98,9 @@ impl EnvSpec {
             if !(low.is_finite() && high.is_finite() && low < high) {
                 return Err(SpecError::Bounds { id: self.id.clone(), dimension, low, high });
             }
+        }
+        if !(self.control_dt_s.is_finite() && self.control_dt_s >= 0.0) {
+            return Err(SpecError::Duration { id: self.id.clone(), got: self.control_dt_s });
         }
         Ok(())
     }
@@ -138,5 +153,17 @@ mod tests {
         let spec = EnvSpec { observation_names: vec!["angle".into()], ..older };
         let message = spec.check().unwrap_err().to_string();
         assert_eq!(message, "Test-v0: observation_names has 1 entries, expected 2");
+    }
+
+    #[test]
+    fn a_step_without_a_finite_duration_is_refused() {
+        let older: EnvSpec = serde_json::from_str(OLDER).unwrap();
+        for (got, shown) in [(f64::NAN, "NaN"), (f64::INFINITY, "inf"), (-1.0, "-1")] {
+            let spec = EnvSpec { control_dt_s: got, ..older.clone() };
+            let message = spec.check().unwrap_err().to_string();
+            let begins = "Test-v0: the duration of a step (the environment's attribute dt) is ";
+            assert!(message.starts_with(&format!("{begins}{shown} s; expected")), "{message}");
+        }
+        EnvSpec { control_dt_s: 0.0, ..older }.check().unwrap();
     }
 }

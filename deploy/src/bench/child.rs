@@ -8,15 +8,19 @@ use std::thread;
 use std::time::{Duration, Instant};
 
 use anyhow::{Context, anyhow};
-use rustix::process::{Pid, Signal, kill_process};
 
 use super::watch::Watch;
-use crate::launch::{describe, log_tail};
+use crate::launch::{describe, last_lines};
 
 /// Lines that were said and not asked for yet; full: the child waits.
 const LINES_MAX: usize = 64;
 /// A longer line is none of ours.
 const LINE_BYTES_MAX: u64 = 1 << 20;
+/// A child that has closed its output, or does not read, has so long to end by itself: its own
+/// status says more than that of a kill.
+const END: Duration = Duration::from_secs(1);
+/// Between two looks whether it has ended.
+const END_LOOK: Duration = Duration::from_millis(5);
 
 /// A running child; dropped, it is killed and waited for. It holds nothing that a kill could
 /// damage, and its input ends with this process if that is killed.
@@ -72,12 +76,18 @@ impl LineChild {
         limit: Duration,
         what: &str,
     ) -> anyhow::Result<String> {
+        self.next_if_any(watch, limit, what)?.ok_or_else(|| self.death())
+    }
+
+    /// The next line that it says; none if it has ended without one.
+    pub(super) fn next_if_any(
+        &mut self,
+        watch: &Watch,
+        limit: Duration,
+        what: &str,
+    ) -> anyhow::Result<Option<String>> {
         let next = watch.next(&self.lines, limit, &format!("{what} of {}", self.name));
-        match next.with_context(|| log_tail(&self.log).trim().to_owned()) {
-            Ok(Some(line)) => Ok(line),
-            Ok(None) => Err(self.death()),
-            Err(error) => Err(error),
-        }
+        next.with_context(|| last_lines(&self.log).trim().to_owned())
     }
 
     /// What it has said meanwhile.
@@ -90,12 +100,6 @@ impl LineChild {
                 Err(TryRecvError::Disconnected) => return Err(self.death()),
             }
         }
-    }
-
-    /// Stops it, or lets it go on.
-    pub(super) fn signal(&self, signal: Signal) -> anyhow::Result<()> {
-        let id = Pid::from_child(&self.child);
-        kill_process(id, signal).with_context(|| format!("cannot signal {}", self.name))
     }
 
     /// The most memory that it has had at once [bytes]: `VmHWM`, when the system tells it.
@@ -113,12 +117,33 @@ impl LineChild {
         text.split_whitespace().next()?.parse::<f64>().ok().map(|nanoseconds| nanoseconds * 1e-9)
     }
 
-    /// Its end as an error, with the last lines of its log.
+    /// Its end as an error, with the last lines of its log; the log itself is deleted when the
+    /// benchmark ends.
     fn death(&mut self) -> anyhow::Error {
-        // It has closed its output or does not read: whatever it does, it is of no more use.
+        let how = self.end();
+        let lines = last_lines(&self.log);
+        anyhow!("{} died: {how}\n  last lines of its log:\n{lines}", self.name)
+    }
+
+    /// Its end in one line: how, and the last word of its log.
+    pub(super) fn last_word(&mut self) -> String {
+        let how = self.end();
+        let lines = last_lines(&self.log);
+        let last = lines.lines().map(str::trim).rfind(|line| !line.is_empty());
+        format!("it died: {how}{}", last.map_or_else(String::new, |line| format!(", {line}")))
+    }
+
+    /// How it has ended. Whatever it still does is of no more use, but how it ends may be.
+    fn end(&mut self) -> String {
+        let deadline = Instant::now() + END;
+        while Instant::now() < deadline {
+            if let Ok(Some(status)) = self.child.try_wait() {
+                return describe(status);
+            }
+            thread::sleep(END_LOOK);
+        }
         let _ = self.child.kill();
-        let how = self.child.wait().map_or_else(|error| error.to_string(), describe);
-        anyhow!("{} died: {how}{}", self.name, log_tail(&self.log))
+        self.child.wait().map_or_else(|error| error.to_string(), describe)
     }
 }
 

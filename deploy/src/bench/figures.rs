@@ -5,18 +5,19 @@ use dmprl_shared::spec::EnvSpec;
 use serde_json::{Map, Value, json};
 
 use super::numpy_plan::Controls;
+use super::peers::PANDA_GYM;
 use super::rollout::RolloutBench;
 use crate::run_directory::Machine;
 
 /// The worker's name among those of its peers.
 pub(super) const WORKER: &str = "worker";
-/// One of several workers, the others standing still.
+/// One of several workers, the others asleep.
 pub(super) const ONE_WORKER: &str = "one_worker";
 /// Everyone who may be measured, in the order of the report.
-pub(super) const NAMES: [&str; 6] =
-    ["ceiling", "physics", WORKER, ONE_WORKER, "gymnasium", "envpool"];
+pub(super) const NAMES: [&str; 7] =
+    ["ceiling", "physics", WORKER, ONE_WORKER, "gymnasium", "envpool", PANDA_GYM];
 /// Those that the worker is compared with.
-const COMPARED: [&str; 5] = ["ceiling", "physics", ONE_WORKER, "gymnasium", "envpool"];
+const COMPARED: [&str; 6] = ["ceiling", "physics", ONE_WORKER, "gymnasium", "envpool", PANDA_GYM];
 
 /// One measurement.
 #[derive(Debug, Clone, Copy)]

@@ -7,6 +7,7 @@
 
 mod child;
 mod figures;
+mod nap;
 mod numpy_plan;
 mod peers;
 mod rollout;

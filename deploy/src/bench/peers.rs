@@ -29,13 +29,25 @@ pub(super) enum PeerKind {
     Gymnasium,
     /// EnvPool with the policy in NumPy.
     EnvPool,
+    /// A loop over panda-gym's environments with random actions.
+    PandaGym,
+}
+
+/// Name of [`PeerKind::PandaGym`].
+pub(super) const PANDA_GYM: &str = "panda_gym";
+/// The tasks that panda-gym has too; `dmprl.bench_peers` knows what it calls them.
+const PANDA_GYM_TASKS: [&str; 2] = ["dmprl/PandaReach-v0", "dmprl/PandaReachJoints-v0"];
+
+/// Whether panda-gym has an environment to compare this one with.
+pub(super) fn is_in_panda_gym(env_id: &str) -> bool {
+    PANDA_GYM_TASKS.contains(&env_id)
 }
 
 impl PeerKind {
     /// In the order of a round. The worker comes after its bounds, so that a machine that drifts
     /// does so for both.
-    pub(super) const ALL: [Self; 4] =
-        [Self::EnvPool, Self::Gymnasium, Self::Ceiling, Self::Physics];
+    pub(super) const ALL: [Self; 5] =
+        [Self::PandaGym, Self::EnvPool, Self::Gymnasium, Self::Ceiling, Self::Physics];
 
     /// As `dmprl.bench_rollout` calls it.
     pub(super) fn name(self) -> &'static str {
@@ -44,7 +56,14 @@ impl PeerKind {
             Self::Physics => "physics",
             Self::Gymnasium => "gymnasium",
             Self::EnvPool => "envpool",
+            Self::PandaGym => PANDA_GYM,
         }
+    }
+
+    /// Whether it runs in the interpreter of the user's choice: it is none of this project's
+    /// requirements, and has some that do not go with them.
+    pub(super) fn is_foreign(self) -> bool {
+        matches!(self, Self::EnvPool | Self::PandaGym)
     }
 }
 
@@ -112,11 +131,15 @@ impl Peer {
     pub(super) fn ready(&mut self, watch: &Watch) -> anyhow::Result<Result<String, String>> {
         let mut about = String::new();
         for child in &mut self.children {
-            let line = child.next(watch, READY, "the first line")?;
+            // One that comes to nothing, because its interpreter lacks NumPy or is none, leaves
+            // the rest of the benchmark as it is.
+            let Some(line) = child.next_if_any(watch, READY, "the first line")? else {
+                return Ok(Err(child.last_word()));
+            };
             match serde_json::from_str(&line) {
                 Ok(Greeting::Ready(text)) => about = text,
                 Ok(Greeting::Absent(why)) => return Ok(Err(why)),
-                Err(_) => return Err(no_answer(child, &line)),
+                Err(_) => return Ok(Err(no_answer(child, &line).to_string())),
             }
         }
         Ok(Ok(about))

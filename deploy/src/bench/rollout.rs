@@ -12,7 +12,7 @@ use dmprl_shared::config::ExperimentConfig;
 
 use super::figures::{Figures, ONE_WORKER, WORKER, WorkerFigures};
 use super::numpy_plan::{Controls, NumpyPlan};
-use super::peers::{Peer, PeerKind, Stage};
+use super::peers::{PANDA_GYM, Peer, PeerKind, Stage, is_in_panda_gym};
 use super::watch::{Interrupted, Watch};
 use super::workers::Workers;
 use crate::launch::{Launcher, create_domain};
@@ -32,7 +32,7 @@ pub struct RolloutBench {
     pub venv: PathBuf,
     /// The folder with the Python package.
     pub package_path: PathBuf,
-    /// The interpreter that EnvPool runs in.
+    /// The interpreter that EnvPool and panda-gym run in.
     pub peer_python: PathBuf,
     /// What drives physics alone.
     pub controls: Controls,
@@ -87,21 +87,22 @@ fn measure(mut bench: RolloutBench) -> anyhow::Result<Figures> {
             figures.add(peer.kind.name(), peer.measure(&watch, bench.duration)?);
         }
         progress.measuring(WORKER);
-        let (round, window) = workers.measure(&watch, bench.duration)?;
-        figures.add(WORKER, round);
-        if let Some(one) = workers.measure_one(&watch, bench.duration)? {
+        // First, while the others' queues are full of what they made in their peers' time.
+        if let Some(one) = workers.measure_first(&watch, bench.duration)? {
             figures.add(ONE_WORKER, one);
         }
+        let (round, window) = workers.measure(&watch, bench.duration)?;
+        figures.add(WORKER, round);
         sink_cpu_s += window.cpu_s;
         measured_s += window.seconds;
     }
-    let faults = workers.faults();
+    let discrepancies = workers.discrepancies();
     figures.workers = WorkerFigures {
         first_segment_s: workers.first_segment_s,
         rss_bytes: workers.resident_bytes_max(),
         sink_cpu_share: sink_cpu_s / measured_s,
-        rejected: faults.rejected,
-        lost: faults.lost,
+        rejected: discrepancies.rejected,
+        lost: discrepancies.lost,
     };
     Ok(figures)
 }
@@ -121,13 +122,25 @@ fn start_peers(
     let stage = Stage { run, package_path, plan, workers: bench.config.actors.workers };
     let own = bench.venv.join("bin/python");
     // All at once: most of a start is reading Python's packages.
-    let started = PeerKind::ALL.map(|kind| {
-        let python = if kind == PeerKind::EnvPool { &bench.peer_python } else { &own };
-        Peer::start(kind, python, &stage)
+    let suits = |kind: &PeerKind| *kind != PeerKind::PandaGym || is_in_panda_gym(&spec.id);
+    if !is_in_panda_gym(&spec.id) {
+        figures.note(PANDA_GYM, &format!("panda-gym has no {}", spec.id));
+    }
+    let started = PeerKind::ALL.into_iter().filter(suits).map(|kind| {
+        let python = if kind.is_foreign() { &bench.peer_python } else { &own };
+        (kind, Peer::start(kind, python, &stage))
     });
+    let started: Vec<_> = started.collect();
     let mut peers = Vec::new();
-    for peer in started {
-        let mut peer = peer?;
+    for (kind, peer) in started {
+        let mut peer = match peer {
+            Ok(peer) => peer,
+            // Such as a --peer-python that is no program.
+            Err(error) => {
+                figures.note(kind.name(), &format!("{error:#}"));
+                continue;
+            }
+        };
         let ready = peer.ready(watch)?;
         figures.note(peer.kind.name(), ready.as_ref().unwrap_or_else(|why| why));
         if ready.is_ok() {

@@ -14,13 +14,14 @@ use dmprl_shared::transport::shared_memory::LearnerEnd;
 use dmprl_shared::transport::{ParameterPublisher, SegmentReceiver, TransportError};
 use rustix::time::{ClockId, clock_gettime};
 
-/// Bounds of the sleep after every queue was found empty.
-const NAP_MIN: Duration = Duration::from_micros(50);
-const NAP_MAX: Duration = Duration::from_millis(5);
+use super::nap::Nap;
+
 /// Between two cleanings of what dead workers left.
 const MAINTENANCE_INTERVAL: Duration = Duration::from_millis(250);
 /// Between two looks for new workers that have no policy yet, while workers start.
 const GREETING_INTERVAL: Duration = Duration::from_millis(5);
+/// Between two looks for the first segments.
+const FIRST_LOOK: Duration = Duration::from_micros(50);
 /// Taken before the clock starts: the stale segments of the full queues, and the workers' way back
 /// to their pace.
 const SETTLE: Duration = Duration::from_millis(100);
@@ -31,7 +32,16 @@ pub(super) enum Request {
     /// Take segments until each worker has delivered one.
     FirstOfEach,
     /// Take segments, and count those of so much time.
-    Measure(Duration),
+    Measure(Duration, From),
+}
+
+/// Whose segments are taken.
+#[derive(Debug, Clone, Copy)]
+pub(super) enum From {
+    /// Each worker's in turn.
+    All,
+    /// The first worker's; the others sleep once their queues are full.
+    First,
 }
 
 /// What the sink answers.
@@ -56,7 +66,7 @@ pub(super) struct Window {
 
 /// Segments that should not be, over all measurements.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
-pub(super) struct Faults {
+pub(super) struct Discrepancies {
     /// Refused for what they hold, or come twice.
     pub(super) rejected: u64,
     /// Missing in their worker's sequence.
@@ -66,7 +76,7 @@ pub(super) struct Faults {
 /// The sink's thread. Dropped, it is stopped and waited for.
 pub(super) struct Sink {
     requests: Option<Sender<Request>>,
-    answers: Receiver<Result<(Answer, Faults), TransportError>>,
+    answers: Receiver<Result<(Answer, Discrepancies), TransportError>>,
     stop: Arc<AtomicBool>,
     thread: Option<JoinHandle<()>>,
 }
@@ -83,12 +93,10 @@ impl Sink {
             stop: Arc::clone(&stop),
             segment: Segment::zeroed(expected.layout),
             sequences: vec![0; expected.worker_count as usize],
-            faults: Faults::default(),
+            discrepancies: Discrepancies::default(),
             maintained: Instant::now(),
-            nap: Nap {
-                length: NAP_MIN,
-                queued_max: queue_segments * expected.worker_count as usize,
-            },
+            nap: Nap::new(queue_segments * expected.worker_count as usize),
+            nap_of_first: Nap::new(queue_segments),
         };
         let thread = thread::spawn(move || taker.serve(&asked, &sender));
         Self { requests: Some(requests), answers, stop, thread: Some(thread) }
@@ -101,7 +109,7 @@ impl Sink {
     }
 
     /// One answer to each request, or what went wrong.
-    pub(super) fn answers(&self) -> &Receiver<Result<(Answer, Faults), TransportError>> {
+    pub(super) fn answers(&self) -> &Receiver<Result<(Answer, Discrepancies), TransportError>> {
         &self.answers
     }
 }
@@ -122,40 +130,24 @@ struct Taker {
     segment: Segment,
     /// Last sequence number of each worker; 0 before the first.
     sequences: Vec<u64>,
-    faults: Faults,
+    discrepancies: Discrepancies,
     maintained: Instant,
     nap: Nap,
-}
-
-/// The sink's sleep, as long as the queues bear: each waking takes time from a worker on its core,
-/// and a worker whose queue is full loses more.
-#[derive(Debug)]
-struct Nap {
-    length: Duration,
-    queued_max: usize,
-}
-
-impl Nap {
-    /// Sets the next sleep by what had queued up during the last.
-    fn adapt(&mut self, taken: usize) {
-        if taken * 2 > self.queued_max {
-            self.length = (self.length / 2).max(NAP_MIN);
-        } else if taken * 4 < self.queued_max {
-            self.length = (self.length * 5 / 4).min(NAP_MAX);
-        }
-    }
+    nap_of_first: Nap,
 }
 
 impl Taker {
     fn serve(
         mut self,
         requests: &Receiver<Request>,
-        answers: &Sender<Result<(Answer, Faults), TransportError>>,
+        answers: &Sender<Result<(Answer, Discrepancies), TransportError>>,
     ) {
         loop {
             let answer = match requests.recv_timeout(MAINTENANCE_INTERVAL) {
                 Ok(Request::FirstOfEach) => self.first_of_each().map(Answer::FirstOfEach),
-                Ok(Request::Measure(duration)) => self.measure(duration).map(Answer::Measured),
+                Ok(Request::Measure(duration, from)) => {
+                    self.measure(duration, from).map(Answer::Measured)
+                }
                 Err(RecvTimeoutError::Timeout) => match self.maintain() {
                     Ok(()) => continue,
                     Err(error) => Err(error),
@@ -163,8 +155,8 @@ impl Taker {
                 Err(RecvTimeoutError::Disconnected) => return,
             };
             let failed = answer.is_err();
-            let faults = self.faults;
-            if answers.send(answer.map(|answer| (answer, faults))).is_err() || failed {
+            let discrepancies = self.discrepancies;
+            if answers.send(answer.map(|answer| (answer, discrepancies))).is_err() || failed {
                 return;
             }
         }
@@ -174,14 +166,14 @@ impl Taker {
         let mut first: Vec<Option<Instant>> = vec![None; self.sequences.len()];
         let mut greeted = Instant::now();
         while !self.stop.load(Ordering::Acquire) && first.iter().any(Option::is_none) {
-            match self.take()? {
+            match self.take(From::All)? {
                 Some(header) => {
                     // A worker id out of range was refused, and belongs to nobody.
                     if let Some(first) = first.get_mut(header.worker_id as usize) {
                         first.get_or_insert_with(Instant::now);
                     }
                 }
-                None => thread::sleep(NAP_MIN),
+                None => thread::sleep(FIRST_LOOK),
             }
             if greeted.elapsed() >= GREETING_INTERVAL {
                 ParameterPublisher::maintain(&mut self.end.parameters)?;
@@ -192,28 +184,31 @@ impl Taker {
         Ok(first.into_iter().flatten().collect())
     }
 
-    fn measure(&mut self, duration: Duration) -> Result<Window, TransportError> {
-        self.take_for(SETTLE)?;
+    fn measure(&mut self, duration: Duration, from: From) -> Result<Window, TransportError> {
+        self.take_for(SETTLE, from)?;
         let cpu_s = cpu_s();
-        let (env_steps, seconds) = self.take_for(duration)?;
+        let (env_steps, seconds) = self.take_for(duration, from)?;
         Ok(Window { env_steps, seconds, cpu_s: self::cpu_s() - cpu_s })
     }
 
     /// Environment steps taken in so much time, and how much time it really was [s].
-    fn take_for(&mut self, duration: Duration) -> Result<(u64, f64), TransportError> {
+    fn take_for(&mut self, duration: Duration, from: From) -> Result<(u64, f64), TransportError> {
         let start = Instant::now();
         let (mut env_steps, mut taken) = (0, 0);
         while start.elapsed() < duration && !self.stop.load(Ordering::Acquire) {
-            match self.take()? {
+            match self.take(from)? {
                 Some(header) => {
                     env_steps += u64::from(header.steps_len);
                     taken += 1;
                 }
                 None => {
                     self.maintain_in_time()?;
-                    self.nap.adapt(taken);
+                    let nap = match from {
+                        From::All => &mut self.nap,
+                        From::First => &mut self.nap_of_first,
+                    };
+                    thread::sleep(nap.next(taken));
                     taken = 0;
-                    thread::sleep(self.nap.length);
                 }
             }
         }
@@ -222,14 +217,19 @@ impl Taker {
 
     /// Takes the next segment and does what a learner does first: check it and follow its worker's
     /// sequence. One that is refused counts no steps.
-    fn take(&mut self) -> Result<Option<SegmentHeader>, TransportError> {
-        if !self.end.segments.try_receive(&mut self.segment)? {
+    fn take(&mut self, from: From) -> Result<Option<SegmentHeader>, TransportError> {
+        let Self { end, segment, .. } = self;
+        let received = match from {
+            From::All => end.segments.try_receive(segment)?,
+            From::First => end.segments.try_receive_from(0, segment)?,
+        };
+        if !received {
             return Ok(None);
         }
         let mut header = self.segment.header;
         let sound = check(&header, &self.segment.block, &self.expected).is_ok();
         let last = self.sequences.get_mut(header.worker_id as usize).filter(|_| sound);
-        if !follow(last, header.sequence, &mut self.faults) {
+        if !follow(last, header.sequence, &mut self.discrepancies) {
             header.steps_len = 0;
         }
         Ok(Some(header))
@@ -251,15 +251,15 @@ impl Taker {
 
 /// Whether a segment is the first of its number; `last` is that of its worker, none if the segment
 /// was refused already.
-fn follow(last: Option<&mut u64>, sequence: u64, faults: &mut Faults) -> bool {
+fn follow(last: Option<&mut u64>, sequence: u64, discrepancies: &mut Discrepancies) -> bool {
     match last {
         Some(last) if sequence > *last => {
-            faults.lost += sequence - *last - 1;
+            discrepancies.lost += sequence - *last - 1;
             *last = sequence;
             true
         }
         _ => {
-            faults.rejected += 1;
+            discrepancies.rejected += 1;
             false
         }
     }
@@ -276,26 +276,14 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_sink_sleeps_as_long_as_a_quarter_to_a_half_of_the_queues_fills() {
-        let mut nap = Nap { length: NAP_MIN, queued_max: 64 };
-        (0..100).for_each(|_| nap.adapt(0));
-        assert_eq!(nap.length, NAP_MAX);
-        nap.adapt(20);
-        assert_eq!(nap.length, NAP_MAX);
-        nap.adapt(33);
-        assert_eq!(nap.length, NAP_MAX / 2);
-        (0..100).for_each(|_| nap.adapt(64));
-        assert_eq!(nap.length, NAP_MIN);
-    }
-
-    #[test]
     fn gaps_are_lost_and_repetitions_are_rejected() {
-        let (mut last, mut faults) = (0, Faults::default());
-        let taken: Vec<bool> =
-            [1, 2, 5, 5, 4, 6].map(|number| follow(Some(&mut last), number, &mut faults)).to_vec();
+        let (mut last, mut discrepancies) = (0, Discrepancies::default());
+        let taken: Vec<bool> = [1, 2, 5, 5, 4, 6]
+            .map(|number| follow(Some(&mut last), number, &mut discrepancies))
+            .to_vec();
         assert_eq!(taken, [true, true, true, false, false, true]);
-        assert_eq!(faults, Faults { rejected: 2, lost: 2 });
-        assert!(!follow(None, 7, &mut faults));
-        assert_eq!(faults, Faults { rejected: 3, lost: 2 });
+        assert_eq!(discrepancies, Discrepancies { rejected: 2, lost: 2 });
+        assert!(!follow(None, 7, &mut discrepancies));
+        assert_eq!(discrepancies, Discrepancies { rejected: 3, lost: 2 });
     }
 }

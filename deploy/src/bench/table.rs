@@ -1,6 +1,7 @@
 //! The figures of a benchmark as a table.
 
 use super::figures::{Figures, NAMES, ONE_WORKER, WORKER, WorkerFigures, max, min};
+use super::peers::{PANDA_GYM, is_in_panda_gym};
 use crate::terminal::grouped;
 
 impl Figures {
@@ -29,8 +30,7 @@ impl Figures {
                 "", "steps/s", "µs/step", "CPU µs", "from … to"
             ),
         ];
-        let alone = actors.workers == 1;
-        let names = NAMES.iter().filter(|name| !(alone && **name == ONE_WORKER));
+        let names = NAMES.iter().filter(|name| self.is_listed(name));
         lines.extend(names.map(|name| row(self, name)));
         let WorkerFigures { first_segment_s, rss_bytes, sink_cpu_share, rejected, lost } =
             &self.workers;
@@ -45,13 +45,27 @@ impl Figures {
             format!("  draining took {:.1} % of one core", sink_cpu_share * 100.0),
             String::new(),
         ]);
-        lines.extend(self.notes.iter().map(|(name, text)| format!("  {name:<10} {text}")));
+        let notes = self.notes.iter().filter(|(name, _)| self.is_listed(name));
+        lines.extend(notes.map(|(name, text)| format!("  {:<10} {text}", label(name))));
         lines.join("\n")
+    }
+
+    /// Whether there is anything to say about `name` with these workers and this task.
+    fn is_listed(&self, name: &str) -> bool {
+        match name {
+            ONE_WORKER => self.config.actors.workers > 1,
+            PANDA_GYM => is_in_panda_gym(&self.env_id),
+            _ => true,
+        }
     }
 }
 
 fn label(name: &str) -> &str {
-    if name == ONE_WORKER { "one worker" } else { name }
+    match name {
+        ONE_WORKER => "one worker",
+        PANDA_GYM => "panda-gym",
+        name => name,
+    }
 }
 
 fn row(figures: &Figures, name: &str) -> String {
@@ -88,6 +102,7 @@ mod tests {
         assert_eq!(row("worker"), "180 11111.11 80 … 380");
         assert_eq!(row("ceiling"), "200 10000.00 10000.00 100 … 400 0.90 ×");
         assert_eq!(row("envpool"), "absent");
+        assert!(!text.contains("panda-gym"), "only beside a Panda");
         assert!(text.contains("50 MB at most"), "{text}");
     }
 }

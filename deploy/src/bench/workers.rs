@@ -12,11 +12,10 @@ use dmprl_shared::segment::Expected;
 use dmprl_shared::spec::EnvSpec;
 use dmprl_shared::transport::ParameterPublisher;
 use dmprl_shared::transport::shared_memory::{Domain, serve};
-use rustix::process::Signal;
 
 use super::child::LineChild;
 use super::figures::Round;
-use super::sink::{Answer, Faults, Request, Sink, Window};
+use super::sink::{Answer, Discrepancies, From, Request, Sink, Window};
 use super::watch::Watch;
 use crate::control::{Command, Report};
 use crate::launch::{Launcher, Process, TimeLimits};
@@ -32,7 +31,7 @@ const MEASURE_SLACK: Duration = Duration::from_secs(30);
 pub(super) struct Workers {
     children: Vec<LineChild>,
     sink: Sink,
-    faults: Faults,
+    discrepancies: Discrepancies,
     /// The environment, as a worker has reported it.
     pub(super) spec: EnvSpec,
     /// The architecture.
@@ -80,7 +79,7 @@ impl Workers {
         let mut workers = Self {
             children,
             sink,
-            faults: Faults::default(),
+            discrepancies: Discrepancies::default(),
             spec,
             policy,
             parameters: snapshot.values,
@@ -96,20 +95,14 @@ impl Workers {
         watch: &Watch,
         duration: Duration,
     ) -> anyhow::Result<(Round, Window)> {
-        let (start, cpu_s) = (Instant::now(), self.cpu_s());
-        let answer = self.ask(Request::Measure(duration), watch, duration + MEASURE_SLACK)?;
-        let Answer::Measured(window) = answer else {
-            bail!("the sink answered another question");
-        };
-        // Over the time to settle too, in which the workers do the same.
-        let elapsed_s = start.elapsed().as_secs_f64();
-        let cores = self.cpu_s().zip(cpu_s).map(|(now, then)| (now - then) / elapsed_s);
-        let steps_per_s = window.env_steps as f64 / window.seconds;
-        Ok((Round { steps_per_s, cores }, window))
+        self.measure_from(watch, duration, From::All)
     }
 
-    /// What one of them delivers while the others stand still; none where there are no others.
-    pub(super) fn measure_one(
+    /// What the first of them delivers while the others sleep on their full queues; none where
+    /// there are no others. Before this, nobody may have taken from those queues for a while.
+    ///
+    /// Nothing is stopped for it: a stopped process would outlive a benchmark that is killed.
+    pub(super) fn measure_first(
         &mut self,
         watch: &Watch,
         duration: Duration,
@@ -117,22 +110,38 @@ impl Workers {
         if self.children.len() == 1 {
             return Ok(None);
         }
-        let signal_others = |workers: &Self, signal| {
-            workers.children[1..].iter().try_for_each(|child| child.signal(signal))
-        };
-        signal_others(self, Signal::STOP)?;
-        let measured = self.measure(watch, duration);
-        signal_others(self, Signal::CONT)?;
-        Ok(Some(measured?.0))
+        Ok(Some(self.measure_from(watch, duration, From::First)?.0))
     }
 
-    fn cpu_s(&self) -> Option<f64> {
-        self.children.iter().map(LineChild::cpu_s).sum()
+    fn measure_from(
+        &mut self,
+        watch: &Watch,
+        duration: Duration,
+        from: From,
+    ) -> anyhow::Result<(Round, Window)> {
+        let (start, cpu_s) = (Instant::now(), self.cpu_s(from));
+        let answer = self.ask(Request::Measure(duration, from), watch, duration + MEASURE_SLACK)?;
+        let Answer::Measured(window) = answer else {
+            bail!("the sink answered another question");
+        };
+        // Over the time to settle too, in which the workers do the same.
+        let elapsed_s = start.elapsed().as_secs_f64();
+        let cores = self.cpu_s(from).zip(cpu_s).map(|(now, then)| (now - then) / elapsed_s);
+        let steps_per_s = window.env_steps as f64 / window.seconds;
+        Ok((Round { steps_per_s, cores }, window))
+    }
+
+    fn cpu_s(&self, from: From) -> Option<f64> {
+        let count = match from {
+            From::All => self.children.len(),
+            From::First => 1,
+        };
+        self.children.iter().take(count).map(LineChild::cpu_s).sum()
     }
 
     /// Refused and lost segments so far.
-    pub(super) fn faults(&self) -> Faults {
-        self.faults
+    pub(super) fn discrepancies(&self) -> Discrepancies {
+        self.discrepancies
     }
 
     /// The most memory that any worker has had at once [bytes].
@@ -167,8 +176,8 @@ impl Workers {
             }
             match self.sink.answers().recv_timeout(LOOK) {
                 Ok(answer) => {
-                    let (answer, faults) = answer.context("the transport failed")?;
-                    self.faults = faults;
+                    let (answer, discrepancies) = answer.context("the transport failed")?;
+                    self.discrepancies = discrepancies;
                     return Ok(answer);
                 }
                 Err(RecvTimeoutError::Disconnected) => bail!("the sink has ended"),

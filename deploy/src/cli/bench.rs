@@ -3,13 +3,11 @@
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
-use clap::builder::PossibleValuesParser;
 use clap::{Args, Subcommand};
-use dmprl_shared::config::{Limits, PRESETS};
-use toml::Value;
+use dmprl_shared::config::Limits;
 
-use super::configuration::{Flag, Sources, merge, refuse};
-use super::train::{absolute_folder, environment, python_path};
+use super::configuration::{merge, refuse};
+use super::configured::{ConfiguredArgs, make_absolute};
 use super::{cores, emit, prepare_python, this_program};
 use crate::bench::{self, Controls, RolloutBench};
 use crate::failure::{Outcome, wrong_use};
@@ -32,10 +30,13 @@ In every round each of these runs once for --seconds, the others asleep; the med
   physics    mujoco.batch alone, on the workers' own model and process settings
              (both run episodes whose controls were recorded before, see --controls)
   worker     `dmprl actor` processes as a run has them: network, movement primitives, noise,
-             environments, shared memory; this process takes the segments in the learner's place
-  one worker the first of them while the others are stopped, where there are several
+             environments, shared memory; this process takes the segments in the learner's place.
+             Here the queue of each holds four segments of each environment (a run's default: one),
+             so that what is measured is the worker and not the sleep of whoever takes from it
+  one worker the first of them while the others sleep on their full queues
   gymnasium  a loop over Gymnasium environments, the same policy in NumPy
   envpool    EnvPool with one thread a worker, the same policy in NumPy
+  panda-gym  beside the two Panda tasks: a loop over panda-gym's own, random actions, no policy
 All but the workers have one Python process for each worker. What is not to be had is null or
 `absent`, with the reason. worker_rss_mb is the peak resident memory of a worker (VmHWM);
 first_segment_s is from the start of the slowest worker to its first delivered segment.
@@ -66,28 +67,11 @@ enum Bench {
 #[derive(Debug, Args)]
 #[command(after_help = ROLLOUT_HELP)]
 struct RolloutArgs {
-    /// A task of `dmprl tasks`, a Gymnasium id, or a SegmentEnv of your own.
+    /// A task of `dmprl tasks`, a Gymnasium id, or a class of your own.
     #[arg(long)]
     task: String,
-    /// Learning algorithm of the configuration.
-    #[arg(long, value_parser = PossibleValuesParser::new(["ddpg"]))]
-    algo: Option<String>,
-    /// What decides the actions: a DMP per segment, or a network per step.
-    #[arg(long, value_parser = PossibleValuesParser::new(["dmp", "mlp"]))]
-    policy: Option<String>,
-    /// Named set of values.
-    #[arg(long, default_value = "default",
-          value_parser = PossibleValuesParser::new(PRESETS.iter().map(|preset| preset.name)))]
-    preset: String,
-    /// Rollout processes [default: cores - 1].
-    #[arg(long, value_name = "N")]
-    workers: Option<u32>,
-    /// Environments in each worker.
-    #[arg(long, value_name = "E")]
-    envs_per_worker: Option<u32>,
-    /// Seed of every random stream.
-    #[arg(long, value_name = "S", value_parser = clap::value_parser!(i64).range(0..))]
-    seed: Option<i64>,
+    #[command(flatten)]
+    configured: ConfiguredArgs,
     /// How often each is measured.
     #[arg(long, value_name = "R", default_value_t = 15,
           value_parser = clap::value_parser!(u16).range(1..=1000))]
@@ -98,18 +82,9 @@ struct RolloutArgs {
     /// What drives physics alone: what the policy decides, or random actions.
     #[arg(long, value_enum, default_value_t = Controls::Policy)]
     controls: Controls,
-    /// Python that has EnvPool [default: the one of .venv].
+    /// Python that has EnvPool or panda-gym [default: the one of .venv].
     #[arg(long, value_name = "PATH")]
     peer_python: Option<PathBuf>,
-    /// Directory of your own environment modules; repeatable.
-    #[arg(long, value_name = "DIR")]
-    python_path: Vec<PathBuf>,
-    /// Configuration file, such as a run's config.toml.
-    #[arg(long, value_name = "FILE")]
-    config: Option<PathBuf>,
-    /// Set any configuration key; repeatable.
-    #[arg(long, value_name = "KEY=VALUE")]
-    set: Vec<String>,
     /// Print one JSON object on standard output.
     #[arg(long)]
     json: bool,
@@ -126,23 +101,12 @@ pub(super) fn run(args: &BenchArgs) -> anyhow::Result<Outcome> {
 }
 
 fn rollout(args: &RolloutArgs) -> anyhow::Result<Outcome> {
-    let sources = Sources {
-        task: &args.task,
-        preset: &args.preset,
-        file: args.config.as_deref(),
-        environment: environment()?,
-        set: &args.set,
-        flags: flags(args)?,
-    };
-    let mut config = merge(&sources)?;
+    let mut config = merge(&args.configured.sources(&args.task, [])?)?;
     if config.actors.queue_segments == 0 {
         config.actors.queue_segments = QUEUED_SEGMENTS * config.actors.envs_per_worker;
     }
     let mut config = config.resolve(Limits { cores: cores() }).map_err(refuse)?;
-    // The workers and their peers have another working directory.
-    for path in &mut config.task.python_path {
-        *path = absolute_folder(path)?;
-    }
+    make_absolute(&mut config)?;
     let peer_python = args.peer_python.as_deref().map(interpreter).transpose()?;
     let venv = prepare_python()?;
     let bench = RolloutBench {
@@ -158,22 +122,6 @@ fn rollout(args: &RolloutArgs) -> anyhow::Result<Outcome> {
     let Some(figures) = bench::rollout(bench)? else { return Ok(Outcome::Interrupted) };
     emit(&if args.json { figures.json().to_string() } else { figures.text() })?;
     Ok(Outcome::Done)
-}
-
-fn flags(args: &RolloutArgs) -> anyhow::Result<Vec<Flag>> {
-    let text = |value: &Option<String>| value.clone().map(Value::String);
-    let count = |value: Option<u32>| value.map(|value| Value::Integer(value.into()));
-    let pairs = [
-        ("--algo", "algorithm.name", text(&args.algo)),
-        ("--policy", "policy.kind", text(&args.policy)),
-        ("--workers", "actors.workers", count(args.workers)),
-        ("--envs-per-worker", "actors.envs_per_worker", count(args.envs_per_worker)),
-        ("--seed", "run.seed", args.seed.map(Value::Integer)),
-        ("--python-path", "task.python_path", python_path(&args.python_path)?),
-    ];
-    let given =
-        pairs.into_iter().filter_map(|(flag, key, value)| Some(Flag { flag, key, value: value? }));
-    Ok(given.collect())
 }
 
 /// Absolute, and not resolved: a virtual environment's Python is a link that knows where it lies.

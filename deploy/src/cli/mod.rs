@@ -2,6 +2,7 @@
 
 mod bench;
 mod configuration;
+mod configured;
 mod eval;
 mod resume;
 mod tasks;

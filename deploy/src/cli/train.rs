@@ -7,11 +7,12 @@ use std::time::{Duration, SystemTime};
 use anyhow::Context;
 use clap::Args;
 use clap::builder::PossibleValuesParser;
-use dmprl_shared::config::{AlgorithmName, ExperimentConfig, Limits, PRESETS, PolicyKind};
+use dmprl_shared::config::{AlgorithmName, ExperimentConfig, Limits, PolicyKind};
 use dmprl_shared::dmp::Dmp;
 use toml::Value;
 
-use super::configuration::{Flag, Sources, merge, refuse};
+use super::configuration::{Flag, merge, refuse};
+use super::configured::{ConfiguredArgs, flag, integer, make_absolute};
 use super::{cores, prepare_python, this_program};
 use crate::failure::{Outcome, wrong_use};
 use crate::launch::{self, SessionPlan};
@@ -43,28 +44,11 @@ pub(super) struct TrainArgs {
     /// A task of `dmprl tasks`, or any Gymnasium id: Pendulum-v1, my_module:MyArm-v0; or a class
     /// of your own, a gymnasium.Env or a SegmentEnv: my_module:MyClass.
     task: String,
-    /// Learning algorithm.
-    #[arg(long, value_parser = PossibleValuesParser::new(["ddpg"]))]
-    algo: Option<String>,
-    /// What decides the actions: a DMP per segment, or a network per step.
-    #[arg(long, value_parser = PossibleValuesParser::new(["dmp", "mlp"]))]
-    policy: Option<String>,
-    /// Named set of values.
-    #[arg(long, default_value = "default",
-          value_parser = PossibleValuesParser::new(PRESETS.iter().map(|preset| preset.name)))]
-    preset: String,
-    /// Rollout processes [default: cores - 1].
-    #[arg(long, value_name = "N")]
-    workers: Option<u32>,
-    /// Environments in each worker.
-    #[arg(long, value_name = "E")]
-    envs_per_worker: Option<u32>,
+    #[command(flatten)]
+    configured: ConfiguredArgs,
     /// Environment steps, all workers together.
     #[arg(long, value_name = "N", value_parser = integer())]
     steps: Option<i64>,
-    /// Seed of every random stream of the run.
-    #[arg(long, value_name = "S", value_parser = integer())]
-    seed: Option<i64>,
     /// Where the results go; new or empty [default: runs/TASK-ALGO-POLICY-sSEED-TIME].
     #[arg(long, value_name = "DIR")]
     run_dir: Option<PathBuf>,
@@ -89,40 +73,16 @@ pub(super) struct TrainArgs {
     /// Stop after so many minutes of this session.
     #[arg(long, value_name = "M")]
     max_minutes: Option<f64>,
-    /// Directory of your own environment modules; repeatable.
-    #[arg(long, value_name = "DIR")]
-    python_path: Vec<PathBuf>,
-    /// Configuration file, such as another run's config.toml.
-    #[arg(long, value_name = "FILE")]
-    config: Option<PathBuf>,
-    /// Set any configuration key; repeatable.
-    #[arg(long, value_name = "KEY=VALUE")]
-    set: Vec<String>,
     /// Lines instead of a progress bar.
     #[arg(long)]
     no_progress: bool,
 }
 
-/// TOML's integers have 64 bits with a sign.
-fn integer() -> clap::builder::RangedI64ValueParser<i64> {
-    clap::value_parser!(i64).range(0..)
-}
-
 pub(super) fn run(args: &TrainArgs) -> anyhow::Result<Outcome> {
-    let sources = Sources {
-        task: &args.task,
-        preset: &args.preset,
-        file: args.config.as_deref(),
-        environment: environment()?,
-        set: &args.set,
-        flags: flags(args)?,
-    };
+    let sources = args.configured.sources(&args.task, flags(args))?;
     let mut config = merge(&sources)?.resolve(Limits { cores: cores() }).map_err(refuse)?;
     check(&config, args)?;
-    // Absolute, so that the run can be resumed from anywhere.
-    for path in &mut config.task.python_path {
-        *path = absolute_folder(path)?;
-    }
+    make_absolute(&mut config)?;
     let init_from = args.init_from.as_deref().map(policy_file).transpose()?;
     if let Some(path) = &args.run_dir {
         RunDirectory::check_free(path)?;
@@ -149,7 +109,7 @@ fn check(config: &ExperimentConfig, args: &TrainArgs) -> anyhow::Result<()> {
         Dmp::new(&config.dmp, config.policy.segment_steps)
             .map_err(|error| wrong_use(error.to_string()))?;
     }
-    if let Some(workers) = args.workers.filter(|&workers| workers > 1 && config.run.deterministic) {
+    if let Some(workers) = args.configured.workers.filter(|&n| n > 1 && config.run.deterministic) {
         return Err(wrong_use(format!(
             "--workers {workers}: a deterministic run is one process in lock-step; leave out \
              --workers, or run.deterministic"
@@ -158,63 +118,21 @@ fn check(config: &ExperimentConfig, args: &TrainArgs) -> anyhow::Result<()> {
     Ok(())
 }
 
-fn flags(args: &TrainArgs) -> anyhow::Result<Vec<Flag>> {
-    let text = |value: &Option<String>| value.clone().map(Value::String);
-    let count = |value: Option<u32>| value.map(|value| Value::Integer(value.into()));
-    let whole = |value: Option<i64>| value.map(Value::Integer);
+fn flags(args: &TrainArgs) -> [Option<Flag>; 7] {
     let number = |value: Option<f64>| value.map(Value::Float);
-    let pairs = [
-        ("--algo", "algorithm.name", text(&args.algo)),
-        ("--policy", "policy.kind", text(&args.policy)),
-        ("--workers", "actors.workers", count(args.workers)),
-        ("--envs-per-worker", "actors.envs_per_worker", count(args.envs_per_worker)),
-        ("--steps", "run.steps", whole(args.steps)),
-        ("--seed", "run.seed", whole(args.seed)),
-        ("--deterministic", "run.deterministic", args.deterministic.then_some(true.into())),
-        ("--device", "learner.device", text(&args.device)),
-        ("--threads", "learner.threads", count(args.threads)),
-        ("--until-return", "run.until_return", number(args.until_return)),
-        ("--until-success", "run.until_success", number(args.until_success)),
-        ("--max-minutes", "run.max_minutes", number(args.max_minutes)),
-        ("--python-path", "task.python_path", python_path(&args.python_path)?),
-    ];
-    let given =
-        pairs.into_iter().filter_map(|(flag, key, value)| Some(Flag { flag, key, value: value? }));
-    Ok(given.collect())
-}
-
-pub(super) fn python_path(paths: &[PathBuf]) -> anyhow::Result<Option<Value>> {
-    let texts = paths.iter().map(|path| {
-        let text = path.to_str().map(|text| Value::String(text.to_owned()));
-        text.ok_or_else(|| wrong_use(format!("--python-path {}: no UTF-8", path.display())))
-    });
-    let texts = texts.collect::<anyhow::Result<Vec<_>>>()?;
-    Ok((!texts.is_empty()).then_some(Value::Array(texts)))
-}
-
-pub(super) fn absolute_folder(path: &str) -> anyhow::Result<String> {
-    let absolute = std::fs::canonicalize(path)
-        .map_err(|error| wrong_use(format!("python path {path}: {error}")))?;
-    if !absolute.is_dir() {
-        return Err(wrong_use(format!("python path {path} is no directory")));
-    }
-    absolute.into_os_string().into_string().map_err(|_| wrong_use(format!("{path}: no UTF-8")))
-}
-
-/// `DMPRL_` variables must be text; others may be anything and are none of our business.
-pub(super) fn environment() -> anyhow::Result<Vec<(String, String)>> {
-    let mut texts = Vec::new();
-    for (name, value) in std::env::vars_os() {
-        let Ok(name) = name.into_string() else { continue };
-        match value.into_string() {
-            Ok(value) => texts.push((name, value)),
-            Err(_) if name.starts_with("DMPRL_") => {
-                return Err(wrong_use(format!("environment variable {name} is no UTF-8")));
-            }
-            Err(_) => {}
-        }
-    }
-    Ok(texts)
+    [
+        flag("--steps", "run.steps", args.steps.map(Value::Integer)),
+        flag("--deterministic", "run.deterministic", args.deterministic.then_some(true.into())),
+        flag("--device", "learner.device", args.device.clone().map(Value::String)),
+        flag(
+            "--threads",
+            "learner.threads",
+            args.threads.map(|count| Value::Integer(count.into())),
+        ),
+        flag("--until-return", "run.until_return", number(args.until_return)),
+        flag("--until-success", "run.until_success", number(args.until_success)),
+        flag("--max-minutes", "run.max_minutes", number(args.max_minutes)),
+    ]
 }
 
 /// The policy that a run or a file stands for.

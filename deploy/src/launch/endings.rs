@@ -251,7 +251,12 @@ impl Supervisor {
 }
 
 /// The log's last lines below a heading that names it, ready to follow an error.
-pub(crate) fn log_tail(path: &Path) -> String {
+pub(super) fn log_tail(path: &Path) -> String {
+    format!("\n  last lines of {}:\n{}", shown(path), last_lines(path))
+}
+
+/// A log's last lines, indented.
+pub(crate) fn last_lines(path: &Path) -> String {
     let read = || -> std::io::Result<Vec<u8>> {
         let mut file = File::open(path)?;
         let len = file.metadata()?.len();
@@ -263,12 +268,10 @@ pub(crate) fn log_tail(path: &Path) -> String {
     let tail = read().unwrap_or_default();
     let text = String::from_utf8_lossy(&tail);
     let lines: Vec<&str> = text.lines().collect();
-    let mut shown_lines = format!("\n  last lines of {}:", shown(path));
-    for line in &lines[lines.len().saturating_sub(LOG_LINES)..] {
+    let last = lines[lines.len().saturating_sub(LOG_LINES)..].iter().map(|line| {
         // What an environment prints must not steer the user's terminal.
         let plain = line.chars().map(|letter| if letter.is_control() { ' ' } else { letter });
-        shown_lines.push_str("\n    ");
-        shown_lines.extend(plain);
-    }
-    shown_lines
+        format!("    {}", plain.collect::<String>())
+    });
+    last.collect::<Vec<_>>().join("\n")
 }

@@ -43,14 +43,14 @@ fn watch(
     config: &ExperimentConfig,
     control: &ControlPipe,
 ) -> anyhow::Result<()> {
-    let seconds = config.actors.env_step_timeout_s;
+    let seconds = config.actors.env_call_timeout_s;
     // A limit beyond what a clock can hold is none.
     let timeout = Duration::try_from_secs_f64(seconds).unwrap_or(Duration::MAX);
     let (id, reporter) = (environments.spec().id.clone(), control.reporter());
     let hung = move |hang: watchdog::Hang| {
         let message = format!(
             "{id}: an environment hangs: `{}` has not returned for {:.1} s \
-             (actors.env_step_timeout_s = {seconds})",
+             (actors.env_call_timeout_s = {seconds})",
             hang.kind.name(),
             hang.lasted.as_secs_f64()
         );

@@ -44,14 +44,14 @@ pub fn run(args: &LearnerArgs, control: &ControlPipe) -> anyhow::Result<()> {
     };
     catch_up(&mut session, &mut recorder, &mut ask)?;
     let finished = turns(&mut session, &mut recorder, control, &mut ask)?;
-    // Counted on by the supervisor while the last turns went on.
-    session.learner.counters.env_failures = env_failures_before + control.env_failures();
     if !finished {
         // What the workers had already sent is in the checkpoint; they are not waited for.
         let queued_max = plan.worker_count * plan.queue_segments;
         session.drain(&mut |_, _| Ok(()), queued_max)?;
     }
-    close(&mut session, &mut recorder, control, (finished, &mut ask))
+    let env_failures = || env_failures_before + control.env_failures();
+    let ending = Ending { finished, evaluate: &mut ask, env_failures: &env_failures };
+    close(&mut session, &mut recorder, control, ending)
 }
 
 /// Evaluates what an earlier session was stopped before it had evaluated.
@@ -147,19 +147,32 @@ fn turns<R: SegmentReceiver, P: ParameterPublisher>(
     }
 }
 
+/// What the end of a session needs.
+pub struct Ending<'a> {
+    /// Whether the run has come to its own end; it was stopped otherwise.
+    pub finished: bool,
+    pub evaluate: Evaluate<'a>,
+    /// Failures of environments so far: their number grows while the session ends.
+    pub env_failures: &'a dyn Fn() -> u64,
+}
+
 /// Ends a session: the last evaluation if the run is finished, the last metrics and checkpoint.
 pub fn close<R: SegmentReceiver, P: ParameterPublisher>(
     session: &mut Session<R, P>,
     recorder: &mut Recorder<'_>,
     control: &ControlPipe,
-    (finished, evaluate): (bool, Evaluate<'_>),
+    ending: Ending<'_>,
 ) -> anyhow::Result<()> {
+    let Ending { finished, evaluate, env_failures } = ending;
     let mut evaluation = Ok(());
+    session.learner.counters.env_failures = env_failures();
     recorder.report_progress(&session.learner);
     if finished && recorder.is_unevaluated(&session.learner) {
         session.publish()?;
         // Whatever becomes of the evaluation, the checkpoint comes first.
         evaluation = recorder.due(Due::Evaluation, &mut session.learner, evaluate);
+        // With one process, the evaluation is over by now, and what broke in it is known.
+        session.learner.counters.env_failures = env_failures();
     }
     if recorder.is_unmeasured(&session.learner) {
         recorder.due(Due::Metrics, &mut session.learner, evaluate)?;

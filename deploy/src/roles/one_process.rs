@@ -17,6 +17,7 @@ use dmprl_shared::transport::{ParameterSubscriber, SegmentSender, SendOutcome, i
 
 use super::environments;
 use super::evaluator::{self, Answer, evaluator};
+use super::learner::Ending;
 use super::recorder::Recorder;
 use super::setup::Setup;
 use super::{ControlPipe, LearnerArgs};
@@ -64,7 +65,10 @@ pub fn run(args: &LearnerArgs, control: &ControlPipe) -> anyhow::Result<()> {
     let mut first = true;
     let finished = loop {
         let mut due = |due: Due, learner: &mut Learner| {
-            recorder.due(due, learner, &mut evaluate).map_err(Into::into)
+            let done = recorder.due(due, learner, &mut evaluate).map_err(Into::into);
+            // A checkpoint may follow an evaluation at the same step.
+            learner.counters.env_failures = env_failures.get();
+            done
         };
         let turn = loop {
             match session.turn(&mut due)? {
@@ -89,7 +93,9 @@ pub fn run(args: &LearnerArgs, control: &ControlPipe) -> anyhow::Result<()> {
             let _ = control.send(&Report::FirstSegment);
         }
     };
-    super::learner::close(&mut session, &mut recorder, control, (finished, &mut evaluate))
+    let env_failures = || env_failures.get();
+    let ending = Ending { finished, evaluate: &mut evaluate, env_failures: &env_failures };
+    super::learner::close(&mut session, &mut recorder, control, ending)
 }
 
 /// Evaluates where an evaluation falls due.

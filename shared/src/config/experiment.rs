@@ -137,12 +137,13 @@ pub struct ActorsConfig {
     pub send_deadline_s: f64,
     /// Restarts of one worker before the run gives up on it.
     pub restarts_max: u32,
-    /// Failures of one environment, since it last completed an episode, that its worker makes up
-    /// for by making it again; one more ends the worker, which is then restarted.
+    /// Failures of one environment, since it last completed an episode or 1 000 sound segments,
+    /// that its worker makes up for by making it again; one more ends the worker, which is then
+    /// restarted.
     pub env_failures_max: u32,
     /// One call into the environments (a segment in each of a worker's, or their reset) that lasts
     /// longer hangs: its process ends, the evaluator's too, and is restarted [s].
-    pub env_step_timeout_s: f64,
+    pub env_call_timeout_s: f64,
 }
 
 impl Default for ActorsConfig {
@@ -154,7 +155,7 @@ impl Default for ActorsConfig {
             send_deadline_s: 30.0,
             restarts_max: 5,
             env_failures_max: 10,
-            env_step_timeout_s: 60.0,
+            env_call_timeout_s: 60.0,
         }
     }
 }

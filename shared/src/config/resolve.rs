@@ -90,7 +90,7 @@ impl ExperimentConfig {
             ("dmp.alpha_y", self.dmp.alpha_y),
             ("pacing.updates_per_segment", self.pacing.updates_per_segment),
             ("actors.send_deadline_s", self.actors.send_deadline_s),
-            ("actors.env_step_timeout_s", self.actors.env_step_timeout_s),
+            ("actors.env_call_timeout_s", self.actors.env_call_timeout_s),
         ];
         for (key, got) in positive {
             range(key, got, got.is_finite() && got > 0.0, || "a positive number".into())?;
@@ -223,8 +223,8 @@ mod tests {
             ("algorithm.discount", "1.5"),
             ("algorithm.polyak", "nan"),
             ("actors.workers", "1000000"),
-            ("actors.env_step_timeout_s", "0"),
-            ("actors.env_step_timeout_s", "inf"),
+            ("actors.env_call_timeout_s", "0"),
+            ("actors.env_call_timeout_s", "inf"),
             ("policy.hidden", "[]"),
             ("algorithm.critic", "first"),
             ("algorithm.target", "literal"),

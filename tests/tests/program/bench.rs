@@ -12,7 +12,7 @@ fn bench(place: &Workplace, task: &str, more: &[&str]) -> Running {
     std::fs::create_dir(&temporary).unwrap();
     let mut command = Command::new(executable());
     command.args(["bench", "rollout", "--task", task, "--envs-per-worker", "2"]);
-    command.args(["--set", "policy.hidden=[16]", "--seconds", "0.05"]).args(more);
+    command.args(["--set", "policy.hidden=[16]", "--seconds", "0.3"]).args(more);
     command.env("TMPDIR", temporary);
     place.start_command(command)
 }
@@ -82,9 +82,42 @@ fn a_segment_env_of_ones_own_is_measured_alone() {
         bench(&place, "tiny_envs:Timed", &[&more[..], &[folder.to_str().unwrap()]].concat());
     let json = running.wait().with_status(0).json();
     positive(&json, "worker_steps_per_s");
-    for absent in ["physics", "ceiling", "gymnasium", "envpool"] {
+    for absent in ["physics", "ceiling", "gymnasium", "envpool", "panda_gym"] {
         assert!(json[format!("{absent}_steps_per_s")].is_null(), "{json}");
         assert!(json["notes"][absent].is_string(), "{json}");
+    }
+}
+
+#[test]
+fn a_gymnasium_class_of_ones_own_is_measured_beside_gymnasiums_loop() {
+    let place = Workplace::new();
+    let folder = dmprl_tests::tiny_envs_dir();
+    let more = ["--workers", "1", "--rounds", "1", "--json", "--python-path"];
+    let running =
+        bench(&place, "tiny_envs:Limited", &[&more[..], &[folder.to_str().unwrap()]].concat());
+    let json = running.wait().with_status(0).json();
+    positive(&json, "worker_to_gymnasium");
+}
+
+/// The rest is measured all the same.
+#[test]
+fn an_interpreter_of_peers_that_is_none_makes_them_absent_with_its_last_word() {
+    let place = Workplace::new();
+    let interpreter = place.path("no-python");
+    std::fs::write(&interpreter, "#!/bin/sh\necho no python here >&2\nexit 3\n").unwrap();
+    let more = ["--workers", "1", "--rounds", "1", "--json", "--peer-python", &interpreter];
+    // Not executable at first.
+    for (mode, words) in [(0o600, "cannot start"), (0o700, "exit status 3, no python here")] {
+        let permissions = std::os::unix::fs::PermissionsExt::from_mode(mode);
+        std::fs::set_permissions(&interpreter, permissions).unwrap();
+        let _ = std::fs::remove_dir(place.path("tmp"));
+        let json = bench(&place, "panda-reach", &more).wait().with_status(0).json();
+        positive(&json, "worker_to_ceiling");
+        for peer in ["envpool", "panda_gym"] {
+            assert!(json[format!("worker_to_{peer}")].is_null(), "{json}");
+            let note = json["notes"][peer].as_str().unwrap();
+            assert!(note.contains(words), "{note}");
+        }
     }
 }
 
@@ -93,7 +126,10 @@ fn an_environment_that_cannot_be_made_is_named_with_the_workers_own_words() {
     let place = Workplace::new();
     let running = bench(&place, "Reachr-v5", &["--workers", "1"]);
     let id = running.id();
-    running.wait().with_status(1).saying("actor-0 died").saying("Reachr");
+    let finished =
+        running.wait().with_status(1).saying("actor-0 died: exit status 1").saying("Reachr");
+    // The folder of the logs is gone with the benchmark.
+    assert!(!finished.said.contains("logs/"), "{}", finished.said);
     assert_nothing_left(&place, id);
 }
 
@@ -108,10 +144,12 @@ fn ctrl_c_ends_it_at_once_and_leaves_nothing() {
     assert_nothing_left(&place, id);
 }
 
+/// Two workers, because one of several is measured alone: a worker that had been stopped for that
+/// would stay behind. Shared memory of the killed is removed by whoever starts next.
 #[test]
 fn a_killed_benchmark_takes_its_processes_with_it() {
     let place = Workplace::new();
-    let mut running = bench(&place, "reacher", &["--workers", "1", "--rounds", "1000"]);
+    let mut running = bench(&place, "reacher", &["--workers", "2", "--rounds", "1000"]);
     running.until_said("round 2 of 1000");
     running.signal(Signal::KILL);
     until("no process", || place.processes().is_empty());

@@ -98,7 +98,7 @@ fn an_environment_that_always_fails_costs_its_worker_and_then_the_run() {
 /// The environment that breaks leaves a mark, so the next life of its worker is a sound one.
 fn survives(task: &str, words: &[&str]) -> (Workplace, String) {
     let place = Workplace::new();
-    let more = ["--steps", "1500", "--set", "actors.env_step_timeout_s=3"];
+    let more = ["--steps", "1500", "--set", "actors.env_call_timeout_s=10"];
     let (run, finished) = train_tiny(&place, task, &more);
     let mut finished = finished.with_status(0).saying("actor-0 died").saying("restart 1 of 5");
     for words in words {
@@ -111,7 +111,7 @@ fn survives(task: &str, words: &[&str]) -> (Workplace, String) {
 
 #[test]
 fn a_worker_whose_environment_hangs_is_replaced_and_an_evaluator_says_so() {
-    let words = ["an environment hangs: `step_segment`", "for 3.0 s", "exit status 75"];
+    let words = ["an environment hangs: `step_segment`", "for 10.0 s", "exit status 75"];
     let (place, run) = survives("HangOnce", &words);
     fs::remove_file(place.path("broken")).unwrap();
     // Four episodes in each of its environments: a life ends in the fourth.
@@ -137,10 +137,13 @@ fn a_worker_whose_environment_crashes_the_process_is_replaced() {
 fn one_process_goes_on_after_failures_and_repeats_them_to_the_byte() {
     let repeated = || {
         let place = Workplace::new();
-        let (run, finished) =
-            train_tiny(&place, "FaultyRaise", &["--deterministic", "--steps", "1500"]);
+        // The fourth evaluation is the last, and the one in which its environments break.
+        let more = ["--deterministic", "--steps", "1500", "--set", "evaluation.interval_steps=400"];
+        let (run, finished) = train_tiny(&place, "FaultyRaise", &more);
         finished.with_status(0).saying("learner: environment failure ").saying("failures   ");
-        assert!(assert_sound(&run)["env_failures"].as_u64() >= Some(1500 / LIFE - ENVS));
+        let told = log(&place, "learner").matches("environment failure: ").count() as u64;
+        assert!(told >= 1500 / LIFE - ENVS, "{told} failures");
+        assert_eq!(assert_sound(&run)["env_failures"].as_u64(), Some(told), "all of them");
         let mut rows = rows(&run, "metrics.jsonl");
         for row in &mut rows {
             TIME_KEYS.iter().for_each(|key| drop(row.as_object_mut().unwrap().remove(*key)));
@@ -154,7 +157,7 @@ fn one_process_goes_on_after_failures_and_repeats_them_to_the_byte() {
 #[test]
 fn one_process_whose_environment_hangs_ends_and_can_be_resumed() {
     let place = Workplace::new();
-    let more = ["--deterministic", "--steps", "600", "--set", "actors.env_step_timeout_s=3"];
+    let more = ["--deterministic", "--steps", "600", "--set", "actors.env_call_timeout_s=10"];
     let (run, finished) = train_tiny(&place, "HangOnce", &more);
     finished.with_status(1).saying("learner died: exit status 75, an environment hung");
     place.run(&["resume", &run]).with_status(0);

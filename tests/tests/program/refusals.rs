@@ -29,6 +29,21 @@ fn wrong_use_names_the_right_word_and_creates_nothing() {
     }
 }
 
+/// A worker that reported it would write `null`, which is no number to whoever reads the report.
+#[test]
+fn an_environment_whose_step_lasts_no_time_is_refused_by_its_worker() {
+    let (place, folder) = (Workplace::new(), dmprl_tests::tiny_envs_dir());
+    let more = ["--workers", "1", "--python-path", folder.to_str().unwrap()];
+    let run = place.path("run");
+    let finished = place.run(&crate::train("tiny_envs:Timeless", &run, &more)).with_status(1);
+    finished
+        .saying(
+            "tiny_envs:Timeless: the duration of a step (the environment's attribute dt) is NaN",
+        )
+        .saying("exit status 1");
+    place.assert_no_process();
+}
+
 #[test]
 fn a_run_that_is_being_trained_is_not_resumed_beside_itself() {
     let place = Workplace::new();

@@ -181,6 +181,22 @@ impl Receiver {
         })
     }
 
+    /// As [`SegmentReceiver::try_receive`], but from the queue of one worker alone: the others find
+    /// theirs full, and wait.
+    ///
+    /// # Errors
+    /// `Middleware` if the queue is broken.
+    ///
+    /// # Panics
+    /// If there is no such worker.
+    pub fn try_receive_from(
+        &mut self,
+        worker_index: usize,
+        segment: &mut Segment,
+    ) -> Result<bool, TransportError> {
+        self.slots[worker_index].receive(segment, self.block_len)
+    }
+
     fn pass_turn(&mut self) {
         self.next = (self.next + 1) % self.slots.len();
         self.turn_left = TURN_SEGMENTS;
@@ -281,19 +297,56 @@ mod tests {
     use crate::transport::shared_memory::{Domain, Plan, attach, serve};
     use crate::transport::{SegmentReceiver, SegmentSender, SendOutcome, TransportError};
 
+    fn plan(worker_count: usize) -> Plan {
+        Plan {
+            run_id: 1,
+            architecture_hash: 2,
+            layout: SegmentLayout { segment_steps: 5, observation_len: 3, action_len: 2 },
+            worker_count,
+            queue_segments: 4,
+            parameters_len: 1,
+        }
+    }
+
+    #[test]
+    fn one_worker_is_taken_from_while_the_others_wait_on_their_full_queues() {
+        let directory = tempfile::tempdir().unwrap();
+        let domain = Domain::create(&directory.path().join("p"), "run").unwrap();
+        let plan = plan(2);
+        let mut learner = serve(domain.path(), &plan).unwrap();
+        let mut workers = [0, 1].map(|index| attach(domain.path(), &plan, index).unwrap().segments);
+        let block = vec![0.0; plan.layout.block_len()];
+        let mut send = |worker: usize, sequence| {
+            let header =
+                SegmentHeader { sequence, worker_id: worker as u32, ..SegmentHeader::default() };
+            workers[worker].try_send(&header, &block).unwrap()
+        };
+        let mut segment = Segment::zeroed(plan.layout);
+        // The learner joins a queue when it first looks: a full one is nobody's until then.
+        assert_eq!(send(0, 0), SendOutcome::Delivered);
+        assert!(learner.segments.try_receive(&mut segment).unwrap());
+        let all_delivered = [SendOutcome::Delivered; 4];
+        assert_eq!([1, 2, 3, 4].map(|sequence| send(0, sequence)), all_delivered);
+        for sequence in 1..=10 {
+            assert_eq!(send(1, sequence), SendOutcome::Delivered);
+            assert!(learner.segments.try_receive_from(1, &mut segment).unwrap());
+            assert_eq!((segment.header.worker_id, segment.header.sequence), (1, sequence));
+            assert!(!learner.segments.try_receive_from(1, &mut segment).unwrap());
+            assert_eq!(send(0, 5), SendOutcome::Full);
+        }
+        // Nothing of the other's is lost.
+        for sequence in 1..=4 {
+            assert!(learner.segments.try_receive(&mut segment).unwrap());
+            assert_eq!((segment.header.worker_id, segment.header.sequence), (0, sequence));
+        }
+    }
+
     #[test]
     fn a_segment_whose_length_the_peer_got_wrong_is_refused_before_it_is_read() {
         let directory = tempfile::tempdir().unwrap();
         let domain = Domain::create(&directory.path().join("p"), "run").unwrap();
-        let layout = SegmentLayout { segment_steps: 5, observation_len: 3, action_len: 2 };
-        let plan = Plan {
-            run_id: 1,
-            architecture_hash: 2,
-            layout,
-            worker_count: 1,
-            queue_segments: 4,
-            parameters_len: 1,
-        };
+        let plan = plan(1);
+        let layout = plan.layout;
         let mut learner = serve(domain.path(), &plan).unwrap();
         let mut worker = attach(domain.path(), &plan, 0).unwrap().segments;
         let len = layout.block_len();

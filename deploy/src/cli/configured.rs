@@ -1,0 +1,126 @@
+//! The arguments that `train` and `bench rollout` share: what the configuration is made of.
+
+use std::path::PathBuf;
+
+use clap::Args;
+use clap::builder::{PossibleValuesParser, RangedI64ValueParser};
+use dmprl_shared::config::{ExperimentConfig, PRESETS};
+use toml::Value;
+
+use super::configuration::{Flag, Sources};
+use crate::failure::wrong_use;
+
+/// Arguments that say something about the configuration.
+#[derive(Debug, Args)]
+pub(super) struct ConfiguredArgs {
+    /// Learning algorithm.
+    #[arg(long, value_parser = PossibleValuesParser::new(["ddpg"]))]
+    algo: Option<String>,
+    /// What decides the actions: a DMP per segment, or a network per step.
+    #[arg(long, value_parser = PossibleValuesParser::new(["dmp", "mlp"]))]
+    policy: Option<String>,
+    /// Named set of values.
+    #[arg(long, default_value = "default",
+          value_parser = PossibleValuesParser::new(PRESETS.iter().map(|preset| preset.name)))]
+    preset: String,
+    /// Rollout processes [default: cores - 1].
+    #[arg(long, value_name = "N")]
+    pub(super) workers: Option<u32>,
+    /// Environments in each worker.
+    #[arg(long, value_name = "E")]
+    envs_per_worker: Option<u32>,
+    /// Seed of every random stream.
+    #[arg(long, value_name = "S", value_parser = integer())]
+    seed: Option<i64>,
+    /// Directory of your own environment modules; repeatable.
+    #[arg(long, value_name = "DIR")]
+    python_path: Vec<PathBuf>,
+    /// Configuration file, such as a run's config.toml.
+    #[arg(long, value_name = "FILE")]
+    config: Option<PathBuf>,
+    /// Set any configuration key; repeatable.
+    #[arg(long, value_name = "KEY=VALUE")]
+    set: Vec<String>,
+}
+
+impl ConfiguredArgs {
+    /// Everything that is said about the configuration of `task`; `more`: by the command's own
+    /// flags.
+    pub(super) fn sources<'a>(
+        &'a self,
+        task: &'a str,
+        more: impl IntoIterator<Item = Option<Flag>>,
+    ) -> anyhow::Result<Sources<'a>> {
+        let text = |value: &Option<String>| value.clone().map(Value::String);
+        let count = |value: Option<u32>| value.map(|value| Value::Integer(value.into()));
+        let flags = [
+            flag("--algo", "algorithm.name", text(&self.algo)),
+            flag("--policy", "policy.kind", text(&self.policy)),
+            flag("--workers", "actors.workers", count(self.workers)),
+            flag("--envs-per-worker", "actors.envs_per_worker", count(self.envs_per_worker)),
+            flag("--seed", "run.seed", self.seed.map(Value::Integer)),
+            flag("--python-path", "task.python_path", python_path(&self.python_path)?),
+        ];
+        Ok(Sources {
+            task,
+            preset: &self.preset,
+            file: self.config.as_deref(),
+            environment: environment()?,
+            set: &self.set,
+            flags: flags.into_iter().chain(more).flatten().collect(),
+        })
+    }
+}
+
+/// A flag that sets `key`; none if it was not given.
+pub(super) fn flag(flag: &'static str, key: &'static str, value: Option<Value>) -> Option<Flag> {
+    value.map(|value| Flag { flag, key, value })
+}
+
+/// TOML's integers have 64 bits with a sign.
+pub(super) fn integer() -> RangedI64ValueParser<i64> {
+    clap::value_parser!(i64).range(0..)
+}
+
+/// Makes the folders of the user's modules absolute: other processes have other working
+/// directories, and a run is resumed from anywhere.
+pub(super) fn make_absolute(config: &mut ExperimentConfig) -> anyhow::Result<()> {
+    for path in &mut config.task.python_path {
+        *path = absolute_folder(path)?;
+    }
+    Ok(())
+}
+
+fn python_path(paths: &[PathBuf]) -> anyhow::Result<Option<Value>> {
+    let texts = paths.iter().map(|path| {
+        let text = path.to_str().map(|text| Value::String(text.to_owned()));
+        text.ok_or_else(|| wrong_use(format!("--python-path {}: no UTF-8", path.display())))
+    });
+    let texts = texts.collect::<anyhow::Result<Vec<_>>>()?;
+    Ok((!texts.is_empty()).then_some(Value::Array(texts)))
+}
+
+fn absolute_folder(path: &str) -> anyhow::Result<String> {
+    let absolute = std::fs::canonicalize(path)
+        .map_err(|error| wrong_use(format!("python path {path}: {error}")))?;
+    if !absolute.is_dir() {
+        return Err(wrong_use(format!("python path {path} is no directory")));
+    }
+    absolute.into_os_string().into_string().map_err(|_| wrong_use(format!("{path}: no UTF-8")))
+}
+
+/// `DMPRL_` variables must be text; others may be anything and are none of our business.
+fn environment() -> anyhow::Result<Vec<(String, String)>> {
+    let mut texts = Vec::new();
+    for (name, value) in std::env::vars_os() {
+        let Ok(name) = name.into_string() else { continue };
+        match value.into_string() {
+            Ok(value) => texts.push((name, value)),
+            Err(_) if name.starts_with("DMPRL_") => {
+                return Err(wrong_use(format!("environment variable {name} is no UTF-8")));
+            }
+            Err(_) => {}
+        }
+    }
+    Ok(texts)
+}

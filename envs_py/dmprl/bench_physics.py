@@ -1,0 +1,194 @@
+"""Physics alone, which ``dmprl bench rollout`` holds a worker against: its bounds.
+
+Of the same kind as the loops of ``bench_peers``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dmprl.bench_peers import AbsentError, RandomActor, flat, gymnasium_env
+from dmprl.numpy_policy import Actor
+
+CONTROLS_BYTES_MAX = 64 << 20
+"""Of the controls of an episode; where more would be needed, episodes are shorter."""
+EPISODE_STEPS = 100
+"""Of an episode where the task has no limit."""
+
+
+@dataclass(frozen=True)
+class Episode:
+    """An episode in each of E environments, as physics alone repeats it."""
+
+    model: Any
+    """MuJoCo's."""
+    frame_skip: int
+    """Steps of the simulation in one step of the environment."""
+    starts: NDArray[np.float64]
+    """Rows of ``Batch.state``, (E, …)."""
+    controls: NDArray[np.float64]
+    """Of each step of the environments, (steps, E, nu)."""
+
+
+@dataclass(frozen=True)
+class Stage:
+    """Environments at the start of an episode, whose controls can be seen."""
+
+    model: Any
+    frame_skip: int
+    observations: NDArray
+    """What is seen at the start, (E, O)."""
+    step: Callable[[NDArray[np.float64]], tuple[NDArray, NDArray]]
+    """Applies actions, (E, A); returns what is seen then, (E, O), and the controls, (E, nu)."""
+
+
+class BatchPeer:
+    """``mujoco.batch.Batch`` with no policy and nothing recorded: physics alone.
+
+    The same episode in each environment over and over.
+    """
+
+    def __init__(self, episode: Episode, k: int) -> None:
+        from mujoco.batch import Batch
+
+        model, controls, skip = episode.model, episode.controls, episode.frame_skip
+        env_count = controls.shape[1]
+        self._env_steps, self._substeps = env_count * k, k * skip
+        self._batch, self._starts = Batch(model, env_count, nthread=1), episode.starts
+        segments = max(1, len(controls) // k)
+        controls = controls[np.arange(segments * k) % len(controls)]
+        # (segments, E, K frame_skip, nu), as a rollout takes them.
+        controls = controls.reshape(segments, k, env_count, model.nu).swapaxes(1, 2)
+        self._controls = np.repeat(controls, skip, axis=2)
+        self._segment = 0
+
+    def segment(self) -> int:
+        """Runs one segment; returns the environment steps in it."""
+        if self._segment == 0:
+            self._batch.state[:] = self._starts
+        self._batch.rollout(self._substeps, self._controls[self._segment], record=())
+        self._segment = (self._segment + 1) % len(self._controls)
+        return self._env_steps
+
+
+class Physics(BatchPeer):
+    """On the model of the worker's own back end, in a process that this has set up.
+
+    Nothing a worker could do costs less: its time beyond this is its own.
+    """
+
+    def __init__(self, plan: dict, seed: int) -> None:
+        super().__init__(worker_episode(plan, seed), plan["decision_steps"])
+        self.about = "mujoco.batch with the worker's model and settings"
+
+
+class Ceiling(BatchPeer):
+    """In a process as MuJoCo's import leaves it, on Gymnasium's model file where there is one."""
+
+    def __init__(self, plan: dict, seed: int) -> None:
+        import mujoco
+
+        about = f"mujoco.batch {mujoco.__version__}"
+        path = gymnasium_model_path(plan)
+        if path is not None:
+            episode = gymnasium_episode(plan, seed, path)
+            self.about = f"{about}, {Path(path).name} as Gymnasium ships it"
+        else:
+            from dmprl.mujoco_batch import mujoco_hook
+
+            clock = mujoco_hook("mjcb_time").value
+            episode = worker_episode(plan, seed)  # takes the clock out
+            mujoco_hook("mjcb_time").value = clock
+            self.about = f"{about} as it is imported"
+        super().__init__(episode, plan["decision_steps"])
+
+
+def worker_episode(plan: dict, seed: int) -> Episode:
+    """An episode of the worker's own environments; sets this process up as theirs."""
+    from dmprl.segment_env import SegmentBuffers, make
+
+    task_id, env_count = plan["task"]["id"], plan["env_count"]
+    try:
+        env = make(task_id, env_count, 1)
+    except Exception as error:
+        raise AbsentError(f"{task_id} cannot be made: {error}") from None
+    # Not by its class: whatever steps a Batch has a bound of this kind.
+    task, batch = getattr(env, "task", None), getattr(env, "batch", None)
+    if task is None or not hasattr(batch, "rollout"):
+        raise AbsentError(f"{task_id} does not run on mujoco.batch")
+    spec = env.spec()
+    out = SegmentBuffers(env_count, 1, spec["observation_len"], spec["action_len"])
+    seeds = np.arange(seed, seed + env_count, dtype=np.uint64)
+    env.reset(np.ones(env_count, np.uint8), seeds, out)
+    starts = batch.state.copy()
+
+    def step(actions: NDArray[np.float64]) -> tuple[NDArray, NDArray]:
+        env.step_segment(actions[:, None], out)
+        return out.next_observations, batch.ctrl
+
+    stage = Stage(task.model, task.frame_skip, out.next_observations, step)
+    return Episode(task.model, task.frame_skip, starts, episode_controls(plan, seed, stage))
+
+
+def gymnasium_episode(plan: dict, seed: int, path: str) -> Episode:
+    """An episode of Gymnasium's environments, on their model file."""
+    import mujoco
+    from mujoco.batch import Batch
+
+    model, env_count = mujoco.MjModel.from_xml_path(path), plan["env_count"]
+    envs = [gymnasium_env(plan).unwrapped for _ in range(env_count)]
+    batch = Batch(model, env_count, nthread=1)
+    seen = [flat(env.reset(seed=seed + index)[0]) for index, env in enumerate(envs)]
+    for index, env in enumerate(envs):
+        batch.qpos[index], batch.qvel[index] = env.data.qpos, env.data.qvel
+    frame_skip, dtype = envs[0].frame_skip, envs[0].action_space.dtype
+
+    def step(actions: NDArray[np.float64]) -> tuple[NDArray, NDArray]:
+        pairs = zip(envs, actions.astype(dtype), strict=True)
+        observations = np.stack([flat(env.step(action)[0]) for env, action in pairs])
+        return observations, np.stack([env.data.ctrl for env in envs])
+
+    starts = batch.state.copy()
+    stage = Stage(model, frame_skip, np.stack(seen), step)
+    return Episode(model, frame_skip, starts, episode_controls(plan, seed, stage))
+
+
+def gymnasium_model_path(plan: dict) -> str | None:
+    """The model file of one of Gymnasium's own MuJoCo environments."""
+    try:
+        env = gymnasium_env(plan).unwrapped
+    except AbsentError:
+        return None
+    return getattr(env, "fullpath", None) if hasattr(env, "frame_skip") else None
+
+
+def episode_controls(plan: dict, seed: int, stage: Stage) -> NDArray[np.float64]:
+    """Controls of an episode, (steps, E, nu), drawn before anything is measured.
+
+    The worker's own policy draws them, unless the plan wants random actions: physics costs what
+    the states cost that a policy leads to, and pushing against a joint's limit is dear.
+    """
+    actor = (Actor if plan["controls"] == "policy" else RandomActor)(plan, seed)
+    steps = episode_steps(plan, stage)
+    nobody, controls = np.zeros(plan["env_count"], np.bool_), []
+    observations = stage.observations
+    while len(controls) < steps:
+        actions = actor.actions(observations)
+        for k in range(min(actions.shape[1], steps - len(controls))):
+            observations, control = stage.step(actions[:, k])
+            controls.append(control.copy())
+        actor.carry_on(nobody)
+    return np.stack(controls)
+
+
+def episode_steps(plan: dict, stage: Stage) -> int:
+    """Steps of an episode without its last, after which the environments begin anew."""
+    bytes_a_step = plan["env_count"] * stage.frame_skip * max(1, stage.model.nu) * 8
+    fits = CONTROLS_BYTES_MAX // bytes_a_step
+    return max(1, min(fits, (plan["spec"]["episode_steps"] or EPISODE_STEPS) - 1))
