@@ -47,7 +47,7 @@ fn config(task: &str, keys: &[(&str, &str)]) -> ExperimentConfig {
 /// Asymmetric bounds: scaling must take both into account.
 fn spec(task: &str) -> EnvSpec {
     let task = task_defaults(task).unwrap();
-    let (observation_len, action_len) = (task.observation_len, task.action_len);
+    let (observation_len, action_len) = (task.observation_len, task.action_low.len());
     EnvSpec {
         id: "Test-v0".into(),
         observation_len,
