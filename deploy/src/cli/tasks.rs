@@ -33,7 +33,7 @@ pub(super) fn run(args: &TasksArgs) -> anyhow::Result<Outcome> {
         return Ok(Outcome::Done);
     }
     let tasks: Vec<String> = TASKS.iter().map(description).collect();
-    emit(&format!("{}\n\n{OTHERS}", tasks.join("\n")))?;
+    emit(&format!("{}\n{OTHERS}", tasks.join("\n")))?;
     Ok(Outcome::Done)
 }
 
