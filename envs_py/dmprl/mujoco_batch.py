@@ -14,7 +14,7 @@ import ctypes
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any, ClassVar, NamedTuple
 
 import mujoco
 import numpy as np
@@ -32,6 +32,14 @@ from dmprl.segment_env import (
 
 Fields = Mapping[str, NDArray]
 """Arrays of MjData by name, each with the dimensions of the call in front of MjData's own."""
+
+
+class Start(NamedTuple):
+    """Where an episode starts: views of one environment's state, or of each, (E, …)."""
+
+    qpos: NDArray[np.float64]
+    qvel: NDArray[np.float64]
+    mocap_pos: NDArray[np.float64]
 
 
 class MujocoTask(ABC):
@@ -77,14 +85,8 @@ class MujocoTask(ABC):
         """What each of an observation's O entries is."""
 
     @abstractmethod
-    def draw_start(
-        self,
-        rng: np.random.Generator,
-        qpos: NDArray[np.float64],
-        qvel: NDArray[np.float64],
-        mocap_pos: NDArray[np.float64],
-    ) -> None:
-        """Writes one environment's start state over the model's own, which the arrays hold."""
+    def draw_start(self, rng: np.random.Generator, start: Start) -> None:
+        """Writes one environment's start state over the model's own, which ``start`` holds."""
 
     def scratch(self, name: str, shape: tuple[int, ...], dtype: type = np.float64) -> NDArray:
         """An array to calculate in, made once for each name, shape and type."""
@@ -143,7 +145,7 @@ class BatchSegmentEnv(SegmentEnv):
         self._seeds = [0] * self.env_count
         self._failures = [0] * self.env_count
         self._messages: list[str] = []
-        self._state = {name: self.batch.bind(name) for name in ("qpos", "qvel", "mocap_pos")}
+        self._starts = Start(*(self.batch.bind(name) for name in Start._fields))
         self._fields = {name: self.batch.bind(name) for name in task.recorded}
         # What mj_resetData would leave. Copying it is cheaper: the rest of what that call clears
         # the forward pass computes anew.
@@ -274,10 +276,9 @@ class BatchSegmentEnv(SegmentEnv):
     def _begin(self, indices: NDArray[np.int32]) -> None:
         """Starts an episode in each of these environments."""
         self.batch.state[indices] = self._new_state
-        qpos, qvel, mocap_pos = self._state.values()
         for index in indices.tolist():
-            rng = self._generators[index]
-            self.task.draw_start(rng, qpos[index], qvel[index], mocap_pos[index])
+            start = Start(*(states[index] for states in self._starts))
+            self.task.draw_start(self._generators[index], start)
         self.batch.forward(indices)
         self.batch.warning[indices] = 0
         self.task.episodes_began(indices)

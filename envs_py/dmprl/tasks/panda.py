@@ -17,7 +17,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from dmprl.mujoco_batch import Fields
+from dmprl.mujoco_batch import Fields, Start
 from dmprl.stepwise_batch import StepwiseTask
 from dmprl.tasks.models import own_model, own_model_without_decoration
 from dmprl.tasks.panda_kinematics import JOINTS, InverseKinematics
@@ -70,14 +70,10 @@ class PandaReachJoints(StepwiseTask):
         return names + [f"velocity_end_effector_{axis}" for axis in "xyz"]
 
     def draw_start(  # noqa: D102 - inherited
-        self,
-        rng: np.random.Generator,
-        qpos: NDArray[np.float64],
-        qvel: NDArray[np.float64],
-        mocap_pos: NDArray[np.float64],
+        self, rng: np.random.Generator, start: Start
     ) -> None:
-        qpos[:] = NEUTRAL
-        mocap_pos[0] = rng.uniform(GOAL_LOW, GOAL_HIGH)
+        start.qpos[:] = NEUTRAL
+        start.mocap_pos[0] = rng.uniform(GOAL_LOW, GOAL_HIGH)
 
     def observe(self, fields: Fields, out: NDArray[np.float64]) -> None:  # noqa: D102 - inherited
         out[..., 0:7] = fields["qpos"]

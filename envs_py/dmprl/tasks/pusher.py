@@ -15,7 +15,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from dmprl.mujoco_batch import Fields, MujocoTask
+from dmprl.mujoco_batch import Fields, MujocoTask, Start
 from dmprl.tasks.models import gymnasium_model, gymnasium_picture_model
 from dmprl.tasks.reacher import minus_distance
 
@@ -54,21 +54,17 @@ class Pusher(MujocoTask):
         return arm_observation_names(OBSERVED_BODIES)
 
     def draw_start(  # noqa: D102 - inherited
-        self,
-        rng: np.random.Generator,
-        qpos: NDArray[np.float64],
-        qvel: NDArray[np.float64],
-        mocap_pos: NDArray[np.float64],
+        self, rng: np.random.Generator, start: Start
     ) -> None:
         while True:
             # The slides: y first. The goal lies at their origin.
             offset = np.array([rng.uniform(-0.3, 0.0), rng.uniform(-0.2, 0.2)])
             if np.linalg.norm(offset) > 0.17:
                 break
-        qpos[7:9] = offset
-        qpos[9:] = 0.0
-        qvel += rng.uniform(-0.005, 0.005, 11)
-        qvel[7:] = 0.0
+        start.qpos[7:9] = offset
+        start.qpos[9:] = 0.0
+        start.qvel[:] += rng.uniform(-0.005, 0.005, 11)
+        start.qvel[7:] = 0.0
 
     def observe(self, fields: Fields, out: NDArray[np.float64]) -> None:  # noqa: D102 - inherited
         observe_arm(fields, self.recorded[-1], self._bodies, out)

@@ -15,7 +15,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from dmprl.mujoco_batch import Fields, MujocoTask
+from dmprl.mujoco_batch import Fields, MujocoTask, Start
 from dmprl.tasks.models import gymnasium_model, gymnasium_picture_model
 
 FINGERTIP, TARGET = 3, 4
@@ -49,16 +49,12 @@ class Reacher(MujocoTask):
         return names + [f"fingertip_to_target_{axis}" for axis in "xyz"[: self.distance_dims]]
 
     def draw_start(  # noqa: D102 - inherited
-        self,
-        rng: np.random.Generator,
-        qpos: NDArray[np.float64],
-        qvel: NDArray[np.float64],
-        mocap_pos: NDArray[np.float64],
+        self, rng: np.random.Generator, start: Start
     ) -> None:
-        qpos += rng.uniform(-0.1, 0.1, 4)
-        qpos[2:] = self.draw_target(rng)
-        qvel += rng.uniform(-0.005, 0.005, 4)
-        qvel[2:] = 0.0
+        start.qpos[:] += rng.uniform(-0.1, 0.1, 4)
+        start.qpos[2:] = self.draw_target(rng)
+        start.qvel[:] += rng.uniform(-0.005, 0.005, 4)
+        start.qvel[2:] = 0.0
 
     def draw_target(self, rng: np.random.Generator) -> NDArray[np.float64]:
         """A point within reach [m]."""

@@ -15,7 +15,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from dmprl.mujoco_batch import Fields, MujocoTask
+from dmprl.mujoco_batch import Fields, MujocoTask, Start
 from dmprl.tasks.models import own_model
 from dmprl.tasks.pusher import arm_observation_names, observe_arm
 from dmprl.tasks.reacher import minus_distance
@@ -53,15 +53,11 @@ class Thrower(MujocoTask):
         return arm_observation_names(OBSERVED_BODIES)
 
     def draw_start(  # noqa: D102 - inherited
-        self,
-        rng: np.random.Generator,
-        qpos: NDArray[np.float64],
-        qvel: NDArray[np.float64],
-        mocap_pos: NDArray[np.float64],
+        self, rng: np.random.Generator, start: Start
     ) -> None:
-        qpos[7:9] = rng.uniform(-0.3, 0.3, 2)
-        qvel += rng.uniform(-0.005, 0.005, 15)
-        qvel[7:] = 0.0
+        start.qpos[7:9] = rng.uniform(-0.3, 0.3, 2)
+        start.qvel[:] += rng.uniform(-0.005, 0.005, 15)
+        start.qvel[7:] = 0.0
 
     def episodes_began(self, indices: NDArray[np.int32]) -> None:  # noqa: D102 - inherited
         self._has_hit[indices] = False
