@@ -108,9 +108,7 @@ impl Rollout {
         // A restarted worker continues no episode, and must not repeat those of its predecessor.
         let worker = u64::from(identity.worker_id) << 32 | u64::from(identity.incarnation);
         let random = seeds::stream(config.run.seed, "exploration", worker);
-        let env_seeds: Vec<u64> = (0..envs as u64)
-            .map(|env| seeds::derive(config.run.seed, "environment", worker << 16 | env) >> 33)
-            .collect();
+        let env_seeds = environment_seeds(config.run.seed, worker, envs);
         let mut faults = Faults::new(envs, config.actors.env_failures_max);
         let all = vec![true; envs];
         environments.reset(&all, &env_seeds)?;
@@ -266,5 +264,25 @@ impl Rollout {
             *out = *value as f32;
         }
         rewards[steps..].fill(0.0);
+    }
+}
+
+/// One seed for each environment of a worker, 31 bits: some environments take no more.
+fn environment_seeds(master: u64, worker: u64, envs: usize) -> Vec<u64> {
+    let seed = |env| seeds::derive(master, "environment", worker << 16 | env) >> 33;
+    (0..envs as u64).map(seed).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn every_environment_of_every_worker_and_restart_has_a_seed_of_its_own() {
+        let workers = (0..16_u64).flat_map(|id| (0..4).map(move |start| id << 32 | start));
+        let all: Vec<u64> = workers.flat_map(|worker| environment_seeds(1, worker, 16)).collect();
+        let distinct: std::collections::HashSet<_> = all.iter().collect();
+        assert_eq!((all.len(), distinct.len()), (1024, 1024));
+        assert_ne!(environment_seeds(1, 0, 16), environment_seeds(2, 0, 16));
     }
 }
