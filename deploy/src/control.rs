@@ -13,6 +13,10 @@ use serde::{Deserialize, Serialize};
 /// Exit status of a process that has ended itself because an environment hung.
 pub const ENV_HUNG_STATUS: i32 = 75;
 
+/// What a terminal or a service manager sends to the whole process group. Only the supervisor
+/// listens; roles ignore it.
+pub const GROUP_SIGNALS: [i32; 3] = [libc::SIGINT, libc::SIGTERM, libc::SIGHUP];
+
 /// From the supervisor to a role.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case", deny_unknown_fields)]

@@ -1,6 +1,6 @@
 //! One child process: its commands go in, its reports and its end come out as events.
 
-use std::os::unix::process::ExitStatusExt;
+use std::os::unix::process::{CommandExt, ExitStatusExt};
 use std::process::ExitStatus;
 use std::sync::Arc;
 use std::time::Duration;
@@ -11,7 +11,7 @@ use tokio::process::{ChildStdin, ChildStdout};
 use tokio::sync::{Notify, mpsc};
 
 use super::Process;
-use crate::control::{Command, ENV_HUNG_STATUS, Report};
+use crate::control::{Command, ENV_HUNG_STATUS, GROUP_SIGNALS, Report};
 
 /// Events not yet handled; full: children wait, their pipes fill.
 pub(super) const EVENTS_MAX: usize = 1_024;
@@ -42,10 +42,11 @@ pub(super) struct Child {
 impl Child {
     /// Starts the command, whose three streams the launcher has set.
     pub(super) fn spawn(
-        command: std::process::Command,
+        mut command: std::process::Command,
         process: Process,
         events: mpsc::Sender<Event>,
     ) -> anyhow::Result<Self> {
+        start_deaf(&mut command);
         let mut command = tokio::process::Command::from(command);
         command.kill_on_drop(true);
         let mut child = command.spawn().with_context(|| {
@@ -86,6 +87,23 @@ impl Child {
     pub(super) fn kill(&self) {
         self.kill.notify_one();
     }
+}
+
+/// Has the child ignore from its first instruction on what a terminal or a service manager sends to
+/// the whole group: only the supervisor decides when a role ends, and a Ctrl-C that meets a child
+/// before it has set its own handlers must not look like the child's failure.
+fn start_deaf(command: &mut std::process::Command) {
+    let deafen = || {
+        for signal in GROUP_SIGNALS {
+            // SAFETY: `signal` is async-signal-safe and takes plain numbers.
+            if unsafe { libc::signal(signal, libc::SIG_IGN) } == libc::SIG_ERR {
+                return Err(std::io::Error::last_os_error());
+            }
+        }
+        Ok(())
+    };
+    // SAFETY: between fork and exec the closure only calls `signal` and reads `errno`.
+    unsafe { command.pre_exec(deafen) };
 }
 
 /// Until nobody sends commands or nobody reads them, of which the exit event tells.
@@ -150,5 +168,20 @@ mod tests {
         assert!(describe(ExitStatus::from_raw(75 << 8)).contains("an environment hung"));
         assert!(describe(ExitStatus::from_raw(9)).contains("SIGKILL"));
         assert!(describe(ExitStatus::from_raw(7)).contains("/dev/shm"));
+    }
+
+    /// A learner that Ctrl-C met in its first milliseconds was once reported as dead.
+    #[tokio::test]
+    async fn the_signals_of_a_group_do_not_end_a_child_that_has_only_just_started() {
+        let mut shell = std::process::Command::new("sh");
+        shell.args(["-c", "kill -INT $$; kill -TERM $$; kill -HUP $$; exit 3"]);
+        shell.stdin(std::process::Stdio::piped()).stdout(std::process::Stdio::piped());
+        let (sender, mut events) = mpsc::channel(EVENTS_MAX);
+        let _child = Child::spawn(shell, Process::Learner, sender).unwrap();
+        let exited = tokio::time::timeout(Duration::from_secs(10), events.recv()).await;
+        match exited.expect("an exit within 10 s") {
+            Some(Event::Exited(Process::Learner, status)) => assert_eq!(status.code(), Some(3)),
+            other => panic!("expected its exit, got {other:?}"),
+        }
     }
 }

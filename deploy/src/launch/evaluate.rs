@@ -59,10 +59,6 @@ pub fn evaluate(plan: EvaluationPlan<'_>) -> anyhow::Result<Option<EvaluationRow
     runtime.block_on(async { evaluation.run(command, interrupts()?).await })
 }
 
-/// Ctrl-C reaches the whole group, and an evaluator that has only just started does not catch it
-/// yet: its death may be seen so much earlier than the interrupt that was its cause.
-const INTERRUPT_LAG: Duration = Duration::from_millis(200);
-
 struct Evaluation {
     request: EvaluationRequest,
     ready: Duration,
@@ -79,16 +75,11 @@ impl Evaluation {
     ) -> anyhow::Result<Option<EvaluationRow>> {
         let (sender, mut events) = mpsc::channel(EVENTS_MAX);
         let child = Child::spawn(command, Process::Evaluator, sender)?;
-        let mut answer = tokio::select! {
+        let answer = tokio::select! {
             // It holds nothing that a kill could damage.
             Some(()) = interrupts.recv() => Ok(None),
             answer = self.answer(&child, &mut events) => answer.map(Some),
         };
-        if answer.is_err()
-            && let Ok(Some(())) = tokio::time::timeout(INTERRUPT_LAG, interrupts.recv()).await
-        {
-            answer = Ok(None);
-        }
         child.kill();
         let exited = async {
             while let Some(event) = events.recv().await {

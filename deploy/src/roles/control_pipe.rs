@@ -10,7 +10,7 @@ use std::time::Duration;
 
 use anyhow::{Context, ensure};
 
-use crate::control::{Command, Report};
+use crate::control::{Command, GROUP_SIGNALS, Report};
 use crate::terminal::say;
 
 /// A worker or evaluator whose supervisor is gone has so long to end before it is killed.
@@ -73,9 +73,7 @@ impl ControlPipe {
     /// The descriptors cannot be moved.
     pub fn open(orphan_limit: Duration) -> anyhow::Result<Self> {
         // Registering a handler that sets a flag nobody reads is ignoring, without `unsafe`.
-        for signal in
-            [signal_hook::consts::SIGINT, signal_hook::consts::SIGTERM, signal_hook::consts::SIGHUP]
-        {
+        for signal in GROUP_SIGNALS {
             signal_hook::flag::register(signal, Arc::default())
                 .with_context(|| format!("cannot ignore signal {signal}"))?;
         }
