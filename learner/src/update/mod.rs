@@ -9,6 +9,7 @@
 pub mod adam;
 pub mod crew;
 pub mod kernels;
+mod packed;
 pub mod pass;
 pub mod trained;
 

@@ -12,16 +12,27 @@ pub fn packed_len(inputs: usize, outputs: usize) -> usize {
 }
 
 /// Packs (outputs, inputs) `weights` into panels of [`PANEL`] outputs, input by input, the last
-/// panel filled with zeros. A layer's outputs may be packed in pieces that begin at multiples of
-/// [`PANEL`]: the piece from output o on begins at o * inputs.
+/// panel filled with zeros. A layer of `outputs_len` outputs may be packed in pieces that begin at
+/// multiples of [`PANEL`]: the piece from output o on begins at o * inputs.
 ///
 /// # Panics
-/// If `packed` does not have [`packed_len`] numbers.
-pub fn pack(weights: &[f32], inputs: usize, packed: &mut [f32], instructions: InstructionSet) {
+/// If the lengths do not fit.
+pub fn pack(
+    weights: &[f32],
+    inputs: usize,
+    outputs_len: usize,
+    packed: &mut [f32],
+    instructions: InstructionSet,
+) {
+    if inputs == 0 {
+        return;
+    }
     let outputs = weights.len() / inputs;
     assert_eq!(weights.len(), outputs * inputs, "weights of {inputs} inputs");
-    assert_eq!(packed.len(), packed_len(inputs, outputs), "packed weights");
-    if outputs <= NARROW {
+    let narrow = outputs_len <= NARROW;
+    let rows = if narrow { outputs } else { outputs.next_multiple_of(PANEL) };
+    assert_eq!(packed.len(), rows * inputs, "packed weights");
+    if narrow {
         return packed.copy_from_slice(weights);
     }
     let panels = packed.chunks_exact_mut(PANEL * inputs);

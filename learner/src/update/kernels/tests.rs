@@ -51,7 +51,7 @@ fn forward_is_what_the_definition_says() {
         });
         for instructions in InstructionSet::all() {
             let mut packed = vec![9.0; packed_len(depth, width)];
-            pack(&weights, depth, &mut packed, instructions);
+            pack(&weights, depth, width, &mut packed, instructions);
             for activation in [Activation::Linear, Activation::Relu] {
                 let mut got = vec![9.0; rows * width];
                 Forward {
@@ -76,12 +76,12 @@ fn a_layer_packed_in_pieces_is_the_layer_packed_at_once() {
     let weights = numbers(inputs * outputs, 1);
     for instructions in InstructionSet::all() {
         let mut whole = vec![0.0; packed_len(inputs, outputs)];
-        pack(&weights, inputs, &mut whole, instructions);
+        pack(&weights, inputs, outputs, &mut whole, instructions);
         assert_eq!(whole[2 * PANEL + 5], weights[5 * inputs + 2]);
         let mut pieces = vec![9.0; whole.len()];
         let cut = 3 * PANEL * inputs;
-        pack(&weights[..cut], inputs, &mut pieces[..cut], instructions);
-        pack(&weights[cut..], inputs, &mut pieces[cut..], instructions);
+        pack(&weights[..cut], inputs, outputs, &mut pieces[..cut], instructions);
+        pack(&weights[cut..], inputs, outputs, &mut pieces[cut..], instructions);
         assert_eq!(whole, pieces);
     }
 }
