@@ -1,6 +1,6 @@
 //! What an update costs against its matrix products alone, and those against the processor.
 //!
-//!     cargo bench -p dmprl-learner --bench update_kernels [-- --rounds 300]
+//!     cargo bench -p dmprl-learner --bench update_kernels [-- --rounds 300 --only update]
 //!
 //! DDPG-DMP on Pusher's shapes (actor 23-256-256-70, critic 58-256-256-1, batch 256). All
 //! candidates take turns in one process, and medians are compared: on a shared machine only such
@@ -26,7 +26,13 @@ struct Candidate {
 }
 
 fn candidate(name: &str, operations: usize, work: impl FnMut() + 'static) -> Candidate {
-    Candidate { name: name.into(), operations, alone: true, work: Box::new(work), times_s: Vec::new() }
+    Candidate {
+        name: name.into(),
+        operations,
+        alone: true,
+        work: Box::new(work),
+        times_s: Vec::new(),
+    }
 }
 
 /// Independent chains of fused multiplications and additions on registers alone: the processor's
@@ -140,8 +146,8 @@ fn thread_time() -> Duration {
 }
 
 fn main() {
-    let mut arguments = std::env::args().skip_while(|argument| argument != "--rounds").skip(1);
-    let rounds: usize = arguments.next().map_or(100, |text| text.parse().expect("a number"));
+    let argument = |name: &str| std::env::args().skip_while(|it| it != name).nth(1);
+    let rounds = argument("--rounds").map_or(100, |text| text.parse().expect("a number"));
     let actor = MlpShape::new(vec![23, 256, 256, 70]);
     let critic = MlpShape::new(vec![58, 256, 256, 1]);
     let all = products(&actor, &critic, 23);
@@ -159,6 +165,8 @@ fn main() {
         let update = candidate(&name, operations, update(threads));
         candidates.push(Candidate { alone: threads == "1", ..update });
     }
+    let only = argument("--only").unwrap_or_default();
+    candidates.retain(|candidate| candidate.name.contains(&only));
     for round in 0..rounds + 5 {
         for candidate in &mut candidates {
             let (begun, begun_running) = (Instant::now(), thread_time());

@@ -63,37 +63,47 @@ pub fn pack(
 #[cfg(target_arch = "x86_64")]
 #[target_feature(enable = "avx512f")]
 fn transpose(rows: &[f32], stride: usize, out: &mut [f32]) {
-    use std::arch::x86_64::{
-        _mm512_loadu_ps, _mm512_loadu_si512, _mm512_permutex2var_ps, _mm512_storeu_ps,
-    };
-    const N: usize = PANEL;
-    // Stage d exchanges, in every pair of rows d apart, the off-diagonal blocks of d x d numbers.
-    const STAGES: [(usize, [[i32; N]; 2]); 4] =
-        [(8, exchange(8)), (4, exchange(4)), (2, exchange(2)), (1, exchange(1))];
-    assert!(rows.len() >= (N - 1) * stride + N && out.len() >= N * N);
-    // SAFETY: row i reaches to i * stride + 16 of `rows`, whose length was asserted.
-    let mut at: [_; N] =
-        std::array::from_fn(|i| unsafe { _mm512_loadu_ps(rows.as_ptr().add(i * stride)) });
-    for (distance, [upper, lower]) in &STAGES {
-        // SAFETY: each index table is 64 bytes.
-        let [upper, lower] =
-            [upper, lower].map(|table| unsafe { _mm512_loadu_si512(table.as_ptr().cast()) });
-        for i in (0..N).filter(|i| i & distance == 0) {
-            let (a, b) = (at[i], at[i + distance]);
-            at[i] = _mm512_permutex2var_ps(a, upper, b);
-            at[i + distance] = _mm512_permutex2var_ps(a, lower, b);
-        }
+    use std::arch::x86_64::{_mm512_loadu_ps, _mm512_setzero_ps, _mm512_storeu_ps};
+    assert!(rows.len() >= (PANEL - 1) * stride + PANEL && out.len() >= PANEL * PANEL);
+    let mut at = [_mm512_setzero_ps(); PANEL];
+    for (i, row) in at.iter_mut().enumerate() {
+        // SAFETY: row i reaches to i * stride + 16 of `rows`, whose length was asserted.
+        *row = unsafe { _mm512_loadu_ps(rows.as_ptr().add(i * stride)) };
     }
-    for (i, row) in at.into_iter().enumerate() {
+    exchange::<8>(&mut at);
+    exchange::<4>(&mut at);
+    exchange::<2>(&mut at);
+    exchange::<1>(&mut at);
+    for (i, row) in at.iter().enumerate() {
         // SAFETY: `out` has 256 numbers (asserted above).
-        unsafe { _mm512_storeu_ps(out.as_mut_ptr().add(i * N), row) };
+        unsafe { _mm512_storeu_ps(out.as_mut_ptr().add(i * PANEL), *row) };
+    }
+}
+
+/// Exchanges, in every pair of rows D apart, the off-diagonal blocks of D x D numbers.
+#[cfg(target_arch = "x86_64")]
+#[inline]
+#[target_feature(enable = "avx512f")]
+fn exchange<const D: usize>(at: &mut [std::arch::x86_64::__m512; PANEL]) {
+    use std::arch::x86_64::{_mm512_loadu_si512, _mm512_permutex2var_ps};
+    let tables = const { &exchanged(D) };
+    // SAFETY: each table is 64 bytes.
+    let upper = unsafe { _mm512_loadu_si512(tables[0].as_ptr().cast()) };
+    // SAFETY: as above.
+    let lower = unsafe { _mm512_loadu_si512(tables[1].as_ptr().cast()) };
+    for i in 0..PANEL {
+        if i & D == 0 {
+            let (a, b) = (at[i], at[i + D]);
+            at[i] = _mm512_permutex2var_ps(a, upper, b);
+            at[i + D] = _mm512_permutex2var_ps(a, lower, b);
+        }
     }
 }
 
 /// From which place of two rows, the second's counted from 16, each number of the exchanged rows
 /// comes.
 #[cfg(target_arch = "x86_64")]
-const fn exchange(distance: usize) -> [[i32; PANEL]; 2] {
+const fn exchanged(distance: usize) -> [[i32; PANEL]; 2] {
     let mut tables = [[0; PANEL]; 2];
     let mut i = 0;
     while i < PANEL {

@@ -27,6 +27,10 @@ pub(super) struct Wide<'a> {
 /// The sums of `M` rows and [`PANEL`] = `V` * lanes columns.
 pub(super) type Sums<S, const M: usize, const V: usize> = [[<S as Simd>::f32s; V]; M];
 
+/// Depths between two computations of all addresses: with 16 rows they cost as many instructions as
+/// the products.
+const UNROLLED: usize = 4;
+
 /// Adds Σ_k left(m, k) right(k, ·), k < `depth`, to every row m of `sums`. `MASKED` says that
 /// `right.width` may be less than a panel; the columns beyond keep their sums.
 ///
@@ -50,28 +54,56 @@ pub(super) fn accumulate<S: Simd, const M: usize, const V: usize, const MASKED: 
     assert!(width <= PANEL, "a tile is {PANEL} wide");
     assert!((depth - 1) * right.stride + width <= right.data.len(), "right operand of a tile");
     let masks = masks::<S, V>(simd, width);
-    let (left_at, right_at) = (left.data.as_ptr(), right.data.as_ptr());
-    for k in 0..depth {
-        let mut vectors = [simd.splat_f32s(0.0); V];
-        for v in 0..V {
-            // SAFETY: depth k of `right` has `width` numbers inside its slice (asserted above); an
-            // unmasked tile reads exactly those, a masked one those that `masks` leaves.
-            vectors[v] = unsafe {
-                let at = right_at.add(k * right.stride).wrapping_add(v * S::F32_LANES);
-                if MASKED {
-                    simd.mask_load_ptr_f32s(masks[v], at)
-                } else {
-                    at.cast::<S::f32s>().read_unaligned()
-                }
-            };
+    let mut k = 0;
+    while k + UNROLLED <= depth {
+        for step in 0..UNROLLED {
+            // SAFETY: k + step < depth, for which both operands were checked.
+            sums = unsafe { multiply::<S, M, V, MASKED>(simd, sums, left, right, masks, k + step) };
         }
-        for m in 0..M {
-            // SAFETY: the largest index, at row M - 1 and depth - 1, was asserted above.
-            let number = unsafe { *left_at.add(m * left.row_stride + k * left.depth_stride) };
-            let number = simd.splat_f32s(number);
-            for v in 0..V {
-                sums[m][v] = simd.mul_add_e_f32s(number, vectors[v], sums[m][v]);
+        k += UNROLLED;
+    }
+    while k < depth {
+        // SAFETY: as above.
+        sums = unsafe { multiply::<S, M, V, MASKED>(simd, sums, left, right, masks, k) };
+        k += 1;
+    }
+    sums
+}
+
+/// Adds left(m, k) right(k, ·) to every row m of `sums`.
+///
+/// # Safety
+/// `right` has, at depth k, a panel or, if `MASKED`, what `masks` leaves of one; `left` has M rows
+/// at that depth.
+#[inline(always)]
+unsafe fn multiply<S: Simd, const M: usize, const V: usize, const MASKED: bool>(
+    simd: S,
+    mut sums: Sums<S, M, V>,
+    left: Broadcast<'_>,
+    right: Wide<'_>,
+    masks: [MemMask<S::m32s>; V],
+    k: usize,
+) -> Sums<S, M, V> {
+    let mut vectors = [simd.splat_f32s(0.0); V];
+    let right_at = right.data.as_ptr();
+    for (v, vector) in vectors.iter_mut().enumerate() {
+        // SAFETY: the caller's promise about `right`.
+        *vector = unsafe {
+            let at = right_at.add(k * right.stride).wrapping_add(v * S::F32_LANES);
+            if MASKED {
+                simd.mask_load_ptr_f32s(masks[v], at)
+            } else {
+                at.cast::<S::f32s>().read_unaligned()
             }
+        };
+    }
+    let left_at = left.data.as_ptr();
+    for (m, sums) in sums.iter_mut().enumerate() {
+        // SAFETY: the caller's promise about `left`.
+        let number = unsafe { *left_at.add(m * left.row_stride + k * left.depth_stride) };
+        let number = simd.splat_f32s(number);
+        for (sum, vector) in sums.iter_mut().zip(vectors) {
+            *sum = simd.mul_add_e_f32s(number, vector, *sum);
         }
     }
     sums
