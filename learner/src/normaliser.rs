@@ -160,6 +160,7 @@ impl Change {
 
 #[cfg(test)]
 mod tests {
+    use dmprl_shared::config::Precision;
     use dmprl_shared::policy::{Activations, forward, initial_parameters};
     use rand::RngExt;
 
@@ -206,7 +207,7 @@ mod tests {
             }
             inputs
         };
-        let mut trained = Trained::new(shape.clone(), initial, 1e-3, true).unwrap();
+        let mut trained = Trained::new(shape.clone(), initial, 1e-3, true, Precision::F32).unwrap();
         let plain = trained.network.read(|p| output(&shape, p, &rows)).unwrap();
         let mut normaliser = Normaliser::new(3, 1);
         for _ in 0..3 {

@@ -43,6 +43,7 @@ pub struct Algorithm {
 }
 
 #[derive(Debug)]
+#[expect(clippy::large_enum_variant, reason = "there is one, for as long as the run lasts")]
 enum Kind {
     Ddpg(Ddpg),
     Td3(Td3),
@@ -141,7 +142,7 @@ fn new_actor(config: &ExperimentConfig, policy: &Policy, target: bool) -> Result
     let mut random = seeds::stream(config.run.seed, "actor parameters", 0);
     let initial = policy.initial_parameters(&mut random);
     let rate = config.algorithm.actor_learning_rate;
-    Trained::new(policy.shape().clone(), initial, rate, target)
+    Trained::new(policy.shape().clone(), initial, rate, target, config.learner.precision)
 }
 
 /// A critic with its target; its parameters are drawn from the stream `name`.
@@ -151,7 +152,8 @@ fn new_critic(config: &ExperimentConfig, shape: BatchShape, name: &str) -> Resul
     widths.push(1);
     let layers = MlpShape::new(widths);
     let initial = initial_parameters(&layers, &mut seeds::stream(config.run.seed, name, 0));
-    Trained::new(layers, initial, config.algorithm.critic_learning_rate, true)
+    let rate = config.algorithm.critic_learning_rate;
+    Trained::new(layers, initial, rate, true, config.learner.precision)
 }
 
 #[cfg(test)]

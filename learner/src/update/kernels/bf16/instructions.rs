@@ -8,11 +8,11 @@ pub(super) use nowhere::Proof;
 #[cfg(target_arch = "x86_64")]
 mod avx512 {
     use std::arch::x86_64::{
-        __m512, __m512bh, __m512i, _CMP_GT_OQ, _mm256_storeu_si256, _mm512_cmp_ps_mask,
-        _mm512_cvtepu16_epi32, _mm512_cvtneps_pbh, _mm512_dpbf16_ps, _mm512_loadu_ps,
-        _mm512_mask_storeu_ps, _mm512_maskz_loadu_ps, _mm512_maskz_mov_ps, _mm512_max_ps,
-        _mm512_or_si512, _mm512_set1_epi32, _mm512_setzero_ps, _mm512_slli_epi32,
-        _mm512_storeu_si512,
+        __m256bh, __m256i, __m512, __m512bh, __m512i, _CMP_GT_OQ, _mm256_storeu_si256,
+        _mm512_add_ps, _mm512_cmp_ps_mask, _mm512_cvtepu16_epi32, _mm512_cvtneps_pbh,
+        _mm512_dpbf16_ps, _mm512_loadu_ps, _mm512_mask_storeu_ps, _mm512_maskz_loadu_ps,
+        _mm512_maskz_mov_ps, _mm512_max_ps, _mm512_or_si512, _mm512_set1_epi32, _mm512_setzero_ps,
+        _mm512_slli_epi32, _mm512_storeu_si512,
     };
 
     use super::super::super::{Activation, PANEL, pack::transpose};
@@ -79,6 +79,14 @@ mod avx512 {
         if len < PANEL { (1 << len) - 1 } else { u16::MAX }
     }
 
+    /// Numbers as bfloat16, side by side.
+    #[inline]
+    #[target_feature(enable = "avx512f,avx512bw,avx512vl,avx512bf16")]
+    fn rounded(numbers: __m512) -> __m256i {
+        // SAFETY: both types are 256 plain bits.
+        unsafe { std::mem::transmute::<__m256bh, __m256i>(_mm512_cvtneps_pbh(numbers)) }
+    }
+
     /// Pairs of neighbouring columns.
     #[target_feature(enable = "avx512f,avx512bw,avx512vl,avx512bf16")]
     fn pair_columns(numbers: &[f32], width: usize, out: &mut [Pair]) {
@@ -86,19 +94,19 @@ mod avx512 {
         for (row, out) in rows {
             let mut whole = 0;
             for out in out.chunks_exact_mut(PANEL / 2).take(width / PANEL) {
-                let halves = _mm512_cvtneps_pbh(load(row, whole));
-                // SAFETY: `out` has 8 pairs, 32 bytes; both types are 256 plain bits.
+                let halves = rounded(load(row, whole));
+                // SAFETY: `out` has 8 pairs, 32 bytes.
                 unsafe {
-                    _mm256_storeu_si256(out.as_mut_ptr().cast(), std::mem::transmute(halves));
+                    _mm256_storeu_si256(out.as_mut_ptr().cast(), halves);
                 }
                 whole += PANEL;
             }
             if whole < width {
                 let mut rest = [0; PANEL / 2];
-                let halves = _mm512_cvtneps_pbh(load(row, whole));
+                let halves = rounded(load(row, whole));
                 // SAFETY: `rest` has 8 pairs.
                 unsafe {
-                    _mm256_storeu_si256(rest.as_mut_ptr().cast(), std::mem::transmute(halves));
+                    _mm256_storeu_si256(rest.as_mut_ptr().cast(), halves);
                 }
                 let out = &mut out[whole / 2..];
                 out.copy_from_slice(&rest[..out.len()]);
@@ -110,8 +118,7 @@ mod avx512 {
     #[inline]
     #[target_feature(enable = "avx512f,avx512bw,avx512vl,avx512bf16")]
     fn halves(numbers: __m512) -> __m512i {
-        // SAFETY: both types are 256 plain bits.
-        _mm512_cvtepu16_epi32(unsafe { std::mem::transmute(_mm512_cvtneps_pbh(numbers)) })
+        _mm512_cvtepu16_epi32(rounded(numbers))
     }
 
     /// Pairs of neighbouring rows.
@@ -184,7 +191,7 @@ mod avx512 {
                 let at = first + begin..first + end;
                 let sum = match &product.finish {
                     Finish::Layer { bias, activation } => {
-                        let sum = std::arch::x86_64::_mm512_add_ps(*sum, load(&bias[..end], begin));
+                        let sum = _mm512_add_ps(*sum, load(&bias[..end], begin));
                         match activation {
                             Activation::Relu => _mm512_max_ps(sum, _mm512_setzero_ps()),
                             Activation::Linear => sum,
