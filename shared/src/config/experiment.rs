@@ -166,6 +166,8 @@ impl Default for ActorsConfig {
 pub enum Device {
     /// The processor.
     Cpu,
+    /// An NVIDIA GPU, in a build with the feature `cuda`.
+    Cuda,
 }
 
 /// What the products of an update multiply; sums and parameters are always f32.
