@@ -277,7 +277,7 @@ impl Learner {
                 return Ok(());
             }
             actor.network.set(parameters)?;
-            match &actor.target {
+            match &mut actor.target {
                 Some(target) => target.set(parameters),
                 None => Ok(()),
             }

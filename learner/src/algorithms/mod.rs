@@ -56,7 +56,6 @@ struct Remote {
 }
 
 #[derive(Debug)]
-#[expect(clippy::large_enum_variant, reason = "there is one, for as long as the run lasts")]
 enum Kind {
     Ddpg(Box<Ddpg>),
     Td3(Box<Td3>),
@@ -165,7 +164,10 @@ impl Algorithm {
     pub fn read_actor(&self, out: &mut [f32]) -> Result<()> {
         match &self.remote {
             Some(Remote { graph: Some(graph), is_ahead: true, .. }) => graph.read_actor(out),
-            _ => self.actor().network.read(|parameters| out.copy_from_slice(parameters)),
+            _ => {
+                out.copy_from_slice(self.actor().network.values());
+                Ok(())
+            }
         }
     }
 

@@ -1,6 +1,6 @@
 //! A network, its slowly following target and its optimiser; and the step that all take together.
 
-use candle_core::{Layout, Result, Storage};
+use candle_core::Result;
 use dmprl_shared::config::Precision;
 use dmprl_shared::policy::{Activations, MlpShape};
 use parking_lot::{RwLock, RwLockReadGuard};
@@ -51,8 +51,7 @@ pub struct Trace<'a> {
 #[derive(Debug)]
 pub struct Lent<'a> {
     shape: &'a MlpShape,
-    storage: RwLockReadGuard<'a, Storage>,
-    layout: &'a Layout,
+    parameters: &'a [f32],
     packed: RwLockReadGuard<'a, Packed>,
 }
 
@@ -68,23 +67,18 @@ impl<'a> Trace<'a> {
 }
 
 impl Lent<'_> {
-    fn parameters(&self) -> &[f32] {
-        crate::networks::values(&self.storage, self.layout).unwrap_or_default()
-    }
-
     /// Runs the network on `inputs`, (rows, inputs).
     pub fn forward(&self, inputs: &[f32], activations: &mut Activations) {
-        let parameters = self.parameters();
         for index in 0..self.shape.layers().len() {
             let (inputs, outputs) = activations.step(self.shape, index, inputs);
-            self.packed.forward(self.shape, index, parameters, inputs, outputs);
+            self.packed.forward(self.shape, index, self.parameters, inputs, outputs);
         }
     }
 
     /// The network after its forward pass over `rows` rows.
     #[must_use]
     pub fn pass<'b>(&'b self, activations: &'b Activations, rows: usize) -> Pass<'b> {
-        let (shape, parameters) = (self.shape, self.parameters());
+        let (shape, parameters) = (self.shape, self.parameters);
         Pass { shape, parameters, activations, rows, packed: &self.packed }
     }
 }
@@ -93,7 +87,7 @@ impl Trained {
     /// A network with its optimiser and, if `target`, a copy of it that follows.
     ///
     /// # Errors
-    /// If candle cannot make the variables, or the processor lacks the precision.
+    /// If the processor lacks the precision.
     pub fn new(
         shape: MlpShape,
         initial: Vec<f32>,
@@ -103,9 +97,9 @@ impl Trained {
     ) -> Result<Self> {
         let len = initial.len();
         let arithmetic = Arithmetic::new(precision)?;
-        let network = Parameters::new(initial)?;
+        let network = Parameters::new(initial);
         Ok(Self {
-            target: target.then(|| network.duplicate()).transpose()?,
+            target: target.then(|| network.duplicate()),
             network,
             adam: Adam::new(len, learning_rate),
             gradient: vec![0.0; len],
@@ -128,102 +122,88 @@ impl Trained {
     }
 
     /// One step of Adam of a single number.
-    ///
-    /// # Errors
-    /// If candle refuses access to the variable.
-    pub fn descend_scalar(&mut self, gradient: f32) -> Result<()> {
+    pub fn descend_scalar(&mut self, gradient: f32) {
         self.gradient[0] = gradient;
         let sizes = self.adam.next_step();
-        let (first, second) = (&mut self.adam.moments.first[..], &mut self.adam.moments.second[..]);
-        let (gradient, instructions) = (&self.gradient[..], self.arithmetic.instructions);
-        self.network.update(|parameters| {
-            let follow = None;
-            adam(AdamPass { parameters, first, second, gradient, follow, sizes }, instructions);
-        })
+        let pass = AdamPass {
+            parameters: self.network.values_mut(),
+            first: &mut self.adam.moments.first,
+            second: &mut self.adam.moments.second,
+            gradient: &self.gradient,
+            follow: None,
+            sizes,
+        };
+        adam(pass, self.arithmetic.instructions);
     }
 
     /// Lends the network.
-    ///
-    /// # Errors
-    /// If candle refuses access to the variable.
-    pub fn lend(&self) -> Result<Lent<'_>> {
+    #[must_use]
+    pub fn lend(&self) -> Lent<'_> {
         self.lend_parameters(&self.network, &self.packed)
     }
 
     /// Lends the target.
     ///
     /// # Errors
-    /// If candle refuses access to the variable, or there is none.
+    /// If there is none.
     pub fn lend_target(&self) -> Result<Lent<'_>> {
         match &self.target {
-            Some(target) => self.lend_parameters(target, &self.target_packed),
+            Some(target) => Ok(self.lend_parameters(target, &self.target_packed)),
             None => candle_core::bail!("a network without a target"),
         }
     }
 
     fn lend_parameters<'a>(
         &'a self,
-        parameters: &'a Parameters,
+        network: &'a Parameters,
         packed: &'a RwLock<Packed>,
-    ) -> Result<Lent<'a>> {
-        let (storage, layout) = parameters.var().storage_and_layout();
-        let values = crate::networks::values(&storage, layout)?;
-        if packed.read().changes != parameters.changes() {
+    ) -> Lent<'a> {
+        let (shape, parameters) = (&self.shape, network.values());
+        if packed.read().changes != network.changes() {
             let mut packed = packed.write();
-            packed.fill(&self.shape, values);
-            packed.changes = parameters.changes();
+            packed.fill(shape, parameters);
+            packed.changes = network.changes();
         }
-        Ok(Lent { shape: &self.shape, storage, layout, packed: packed.read() })
+        Lent { shape, parameters, packed: packed.read() }
     }
 
     /// One step of Adam along the gradient that the blocks' passes left; the target, if any,
     /// follows by `polyak` of the way.
-    ///
-    /// # Errors
-    /// If candle refuses access to a variable.
     pub fn descend<'b, B: Sync>(
         &mut self,
         crew: &Crew,
         blocks: &'b [B],
         trace: impl Fn(&'b B) -> Trace<'b> + Sync,
         polyak: Option<f32>,
-    ) -> Result<()> {
+    ) {
         let Self { shape, network, target, adam, gradient, tiles, pairs, arithmetic, .. } = self;
         let arithmetic = *arithmetic;
         pairs.fill(shape, arithmetic, crew, blocks, &trace);
         let (packed, target_packed) = (self.packed.get_mut(), self.target_packed.get_mut());
-        let target = target.as_ref().filter(|_| polyak.is_some());
-        let sizes = adam.next_step();
-        let (first, second) = (&mut adam.moments.first, &mut adam.moments.second);
-        let mut run = |parameters: &mut [f32], target: &mut [f32]| {
-            let step = Step {
-                shape,
-                sizes,
-                polyak,
-                arithmetic,
-                pairs,
-                parameters: Disjoint::new(parameters),
-                target: Disjoint::new(target),
-                gradient: Disjoint::new(gradient),
-                first: Disjoint::new(first),
-                second: Disjoint::new(second),
-                packed: packed.pieces(),
-                target_packed: target_packed.pieces(),
-            };
-            crew.run(tiles.len(), &|index| step.tile(&tiles[index], blocks, &trace));
+        let mut target = target.as_mut().filter(|_| polyak.is_some());
+        let step = Step {
+            shape,
+            sizes: adam.next_step(),
+            polyak,
+            arithmetic,
+            pairs,
+            parameters: Disjoint::new(network.values_mut()),
+            target: Disjoint::new(match &mut target {
+                Some(target) => target.values_mut(),
+                None => &mut [],
+            }),
+            gradient: Disjoint::new(gradient),
+            first: Disjoint::new(&mut adam.moments.first),
+            second: Disjoint::new(&mut adam.moments.second),
+            packed: packed.pieces(),
+            target_packed: target_packed.pieces(),
         };
-        // One closure inside the other: candle hands out one storage at a time.
-        let mut followed = Ok(());
-        network.update(|parameters| match target {
-            Some(target) => followed = target.update(|target| run(parameters, target)),
-            None => run(parameters, &mut []),
-        })?;
+        crew.run(tiles.len(), &|index| step.tile(&tiles[index], blocks, &trace));
         // The step has kept the copies up to date.
         packed.changes = network.changes();
         if let Some(target) = target {
             target_packed.changes = target.changes();
         }
-        followed
     }
 
     /// Takes over the gradient of a step that was done elsewhere.
