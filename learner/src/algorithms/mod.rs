@@ -3,6 +3,9 @@
 mod batch;
 mod block;
 pub mod ddpg;
+mod minibatch;
+pub mod ndp;
+mod ppo;
 pub mod sac;
 pub mod td3;
 
@@ -17,6 +20,7 @@ use crate::graph::Graph;
 use crate::update::crew::Crew;
 use crate::update::trained::Trained;
 use ddpg::Ddpg;
+use ndp::Ndp;
 use sac::Sac;
 use td3::Td3;
 
@@ -60,6 +64,7 @@ enum Kind {
     Ddpg(Box<Ddpg>),
     Td3(Box<Td3>),
     Sac(Box<Sac>),
+    Ndp(Box<Ndp>),
 }
 
 impl Algorithm {
@@ -73,6 +78,7 @@ impl Algorithm {
             AlgorithmName::Ddpg => Kind::Ddpg(Box::new(Ddpg::new(config, policy, shape)?)),
             AlgorithmName::Td3 => Kind::Td3(Box::new(Td3::new(config, policy, shape)?)),
             AlgorithmName::Sac => Kind::Sac(Box::new(Sac::new(config, policy, shape)?)),
+            AlgorithmName::Ndp => Kind::Ndp(Box::new(Ndp::new(config, policy)?)),
         };
         let remote = match config.learner.device {
             config::Device::Cpu => None,
@@ -92,10 +98,28 @@ impl Algorithm {
         self.shape
     }
 
-    /// Update number `update`, counted from 1.
+    /// The on-policy algorithm and the threads of its update, if it is one: it keeps its own
+    /// experience.
+    pub fn on_policy(&mut self) -> Option<(&mut Ndp, &Crew)> {
+        match &mut self.kind {
+            Kind::Ndp(ndp) => Some((ndp, &self.crew)),
+            _ => None,
+        }
+    }
+
+    /// As [`Algorithm::on_policy`], to look at it.
+    #[must_use]
+    pub fn as_on_policy(&self) -> Option<&Ndp> {
+        match &self.kind {
+            Kind::Ndp(ndp) => Some(ndp),
+            _ => None,
+        }
+    }
+
+    /// Update number `update`, counted from 1, of an algorithm that learns from the replay.
     ///
     /// # Errors
-    /// If candle refuses access to a variable.
+    /// If candle refuses access to a variable, or the algorithm is on-policy.
     pub fn update(&mut self, policy: &Policy, batch: &Batch, update: u64) -> Result<Losses> {
         if let Some(losses) = self.update_remote(policy, batch, update)? {
             return Ok(losses);
@@ -104,6 +128,7 @@ impl Algorithm {
             Kind::Ddpg(ddpg) => ddpg.update(policy, batch, &self.crew),
             Kind::Td3(td3) => td3.update(policy, batch, &self.crew, update),
             Kind::Sac(sac) => sac.update(policy, batch, &self.crew),
+            Kind::Ndp(_) => candle_core::bail!("an on-policy algorithm samples no batch"),
         }
     }
 
@@ -157,27 +182,36 @@ impl Algorithm {
         fetched
     }
 
-    /// Copies the policy's parameters, (P,), into `out`, from wherever they are newest.
+    /// Copies the policy's flat parameters, (P,), out, from wherever they are newest.
     ///
     /// # Errors
     /// If candle or the device refuses.
-    pub fn read_actor(&self, out: &mut [f32]) -> Result<()> {
-        match &self.remote {
-            Some(Remote { graph: Some(graph), is_ahead: true, .. }) => graph.read_actor(out),
-            _ => {
-                out.copy_from_slice(self.actor().network.values());
-                Ok(())
-            }
+    pub fn read_policy(&self, values: &mut [f32]) -> Result<()> {
+        if let Some(Remote { graph: Some(graph), is_ahead: true, .. }) = &self.remote {
+            return graph.read_actor(values);
         }
+        match &self.kind {
+            Kind::Ddpg(ddpg) => values.copy_from_slice(ddpg.actor.network.values()),
+            Kind::Td3(td3) => values.copy_from_slice(td3.actor.network.values()),
+            Kind::Sac(sac) => values.copy_from_slice(sac.actor.network.values()),
+            Kind::Ndp(ndp) => ndp.read_policy(values),
+        }
+        Ok(())
     }
 
-    /// The network whose parameters are the policy's.
-    #[must_use]
-    pub fn actor(&self) -> &Trained {
-        match &self.kind {
-            Kind::Ddpg(ddpg) => &ddpg.actor,
-            Kind::Td3(td3) => &td3.actor,
-            Kind::Sac(sac) => &sac.actor,
+    /// Starts the actor, and its target if it has one, from another policy's parameters.
+    ///
+    /// # Errors
+    /// If the lengths differ.
+    pub fn set_policy(&mut self, values: &[f32]) -> Result<()> {
+        if let Some(remote) = &mut self.remote {
+            remote.graph = None;
+        }
+        match &mut self.kind {
+            Kind::Ddpg(ddpg) => set(&mut ddpg.actor, values),
+            Kind::Td3(td3) => set(&mut td3.actor, values),
+            Kind::Sac(sac) => set(&mut sac.actor, values),
+            Kind::Ndp(ndp) => ndp.set_policy(values),
         }
     }
 
@@ -208,6 +242,11 @@ impl Algorithm {
                 f("critic_2", &mut sac.critics[1])?;
                 f("log_temperature", &mut sac.log_temperature)
             }
+            Kind::Ndp(ndp) => {
+                f("actor", &mut ndp.actor)?;
+                f("log_std", &mut ndp.log_std)?;
+                f("critic", &mut ndp.critic)
+            }
         }
     }
 
@@ -225,8 +264,16 @@ impl Algorithm {
                 let temperature = ("log_temperature", &sac.log_temperature);
                 vec![("actor", &sac.actor), ("critic_1", first), ("critic_2", second), temperature]
             }
+            Kind::Ndp(ndp) => {
+                vec![("actor", &ndp.actor), ("log_std", &ndp.log_std), ("critic", &ndp.critic)]
+            }
         }
     }
+}
+
+fn set(actor: &mut Trained, values: &[f32]) -> Result<()> {
+    actor.network.set(values)?;
+    actor.target.as_mut().map_or(Ok(()), |target| target.set(values))
 }
 
 fn new_actor(config: &ExperimentConfig, policy: &Policy, target: bool) -> Result<Trained> {

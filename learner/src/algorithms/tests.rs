@@ -88,7 +88,7 @@ impl Case {
     }
 }
 
-fn assert_close(name: &str, got: &[f32], expected: &[f32]) {
+pub(super) fn assert_close(name: &str, got: &[f32], expected: &[f32]) {
     let norm = |values: &mut dyn Iterator<Item = f32>| {
         values.map(|value| f64::from(value).powi(2)).sum::<f64>().sqrt()
     };
@@ -145,7 +145,7 @@ fn updates_fit_a_known_value_and_follow_its_gradient() {
     assert!(losses.critic_loss < 0.01, "{losses:?}");
     let mut work = case.policy.workspace(128);
     let observations = &case.batch.inputs;
-    let parameters = case.algorithm.actor().network.values();
+    let parameters = case.algorithm.networks()[0].1.network.values();
     case.policy.act(parameters, observations, &mut work);
     let errors = work.actions.iter().map(|u| (u - 0.5).abs());
     let mean = errors.sum::<f32>() / work.actions.len() as f32;

@@ -12,7 +12,7 @@ use super::crew::{Crew, Disjoint};
 use super::kernels::{AdamPass, adam};
 use super::packed::Packed;
 use super::pass::{Gradients, Pass};
-use super::step::{Step, Tile, tiles};
+use super::step::{GradientSum, Step, Tile, tiles};
 use crate::networks::Parameters;
 
 /// A network in training.
@@ -45,6 +45,15 @@ pub struct Trace<'a> {
     pub activations: &'a Activations,
     /// What the backward pass left.
     pub gradients: &'a Gradients,
+}
+
+/// What a step is scaled by.
+#[derive(Debug, Clone, Copy)]
+pub struct Scaling {
+    /// Multiplies the gradient.
+    pub factor: f32,
+    /// Multiplies the learning rate.
+    pub share: f32,
 }
 
 /// A network's parameters, lent to all threads of a step.
@@ -124,16 +133,7 @@ impl Trained {
     /// One step of Adam of a single number.
     pub fn descend_scalar(&mut self, gradient: f32) {
         self.gradient[0] = gradient;
-        let sizes = self.adam.next_step();
-        let pass = AdamPass {
-            parameters: self.network.values_mut(),
-            first: &mut self.adam.moments.first,
-            second: &mut self.adam.moments.second,
-            gradient: &self.gradient,
-            follow: None,
-            sizes,
-        };
-        adam(pass, self.arithmetic.instructions);
+        self.step(Scaling { factor: 1.0, share: 1.0 });
     }
 
     /// Lends the network.
@@ -182,17 +182,14 @@ impl Trained {
         let (packed, target_packed) = (self.packed.get_mut(), self.target_packed.get_mut());
         let mut target = target.as_mut().filter(|_| polyak.is_some());
         let step = Step {
-            shape,
             sizes: adam.next_step(),
             polyak,
-            arithmetic,
-            pairs,
+            sum: GradientSum { shape, arithmetic, pairs, gradient: Disjoint::new(gradient) },
             parameters: Disjoint::new(network.values_mut()),
             target: Disjoint::new(match &mut target {
                 Some(target) => target.values_mut(),
                 None => &mut [],
             }),
-            gradient: Disjoint::new(gradient),
             first: Disjoint::new(&mut adam.moments.first),
             second: Disjoint::new(&mut adam.moments.second),
             packed: packed.pieces(),
@@ -204,6 +201,48 @@ impl Trained {
         if let Some(target) = target {
             target_packed.changes = target.changes();
         }
+    }
+
+    /// Sums the gradient that the blocks' passes left, without a step: for algorithms that must
+    /// know its length first.
+    pub fn sum_gradient<'b, B: Sync>(
+        &mut self,
+        crew: &Crew,
+        blocks: &'b [B],
+        trace: impl Fn(&'b B) -> Trace<'b> + Sync,
+    ) {
+        let Self { shape, gradient, tiles, pairs, arithmetic, .. } = self;
+        pairs.fill(shape, *arithmetic, crew, blocks, &trace);
+        let gradient = Disjoint::new(gradient);
+        let sum = GradientSum { shape, arithmetic: *arithmetic, pairs, gradient };
+        crew.run(tiles.len(), &|index| sum.tile(&tiles[index], blocks, &trace));
+    }
+
+    /// One step of Adam along the gradient at hand times `factor`, with `share` of the learning
+    /// rate. The target, if any, stays.
+    pub fn step(&mut self, Scaling { factor, share }: Scaling) {
+        self.gradient.iter_mut().for_each(|gradient| *gradient *= factor);
+        let sizes = self.adam.next_step().scaled(share);
+        let pass = AdamPass {
+            parameters: self.network.values_mut(),
+            first: &mut self.adam.moments.first,
+            second: &mut self.adam.moments.second,
+            gradient: &self.gradient,
+            follow: None,
+            sizes,
+        };
+        adam(pass, self.arithmetic.instructions);
+    }
+
+    /// Sum of the squares of the gradient at hand.
+    #[must_use]
+    pub fn gradient_square(&self) -> f64 {
+        self.gradient.iter().map(|gradient| f64::from(*gradient).powi(2)).sum()
+    }
+
+    /// The gradient at hand, to fill where no pass of a network does.
+    pub fn gradient_mut(&mut self) -> &mut [f32] {
+        &mut self.gradient
     }
 
     /// Takes over the gradient of a step that was done elsewhere.

@@ -14,18 +14,18 @@ mod resolve;
 mod tasks;
 
 pub use algorithm::{
-    AlgorithmConfig, AlgorithmName, CriticInput, ExplorationConfig, ExplorationKind, SacConfig,
-    Target, Td3Config, WarmUpKind, Windows,
+    AlgorithmConfig, AlgorithmName, CriticInput, ExplorationConfig, ExplorationKind,
+    LearningRateDecay, NdpConfig, SacConfig, Target, Td3Config, WarmUpKind, Windows,
 };
 pub use dmp::{
-    BasisWidths, CanonicalIntegration, DmpConfig, ForcingScaling, Integrator, PolicyConfig,
-    PolicyKind, RhoKind, Start, StartSource, StartVelocity,
+    BasisWidths, CanonicalIntegration, Controller, DmpConfig, ForcingScaling, Integrator,
+    PolicyConfig, PolicyKind, RhoKind, Start, StartSource, StartVelocity,
 };
 pub use experiment::{
     ActorsConfig, CheckpointConfig, Device, EvaluationConfig, ExperimentConfig, LearnerConfig,
     MetricsConfig, PacingConfig, Precision, ReplayConfig, RunConfig, TaskConfig,
 };
 pub use layers::{ConfigError, Layers, nearest};
-pub use presets::{PRESETS, Preset, policy_defaults};
+pub use presets::{PRESETS, Preset, algorithm_defaults, policy_defaults};
 pub use resolve::Limits;
 pub use tasks::{TASKS, TaskDefaults, task_defaults};
