@@ -6,6 +6,8 @@ Each class has `networks` (name -> module), `losses` (name -> number) of the las
 
 import copy
 import math
+from collections.abc import Callable
+from dataclasses import dataclass
 
 import torch
 from networks import follow, mlp
@@ -24,6 +26,15 @@ def adam(parameters, learning_rate):
     return torch.optim.Adam(parameters, lr=learning_rate)
 
 
+@dataclass(frozen=True)
+class Kit:
+    """What a benchmark exchanges for something faster that computes the same."""
+
+    make_policy: Callable = make_policy
+    adam: Callable = adam
+    follow: Callable = follow
+
+
 def squared_error(q, targets):
     """mean (Q - target)^2."""
     return ((q - targets) ** 2).mean()
@@ -32,17 +43,17 @@ def squared_error(q, targets):
 class ActorCritic:
     """What the three have in common: the networks and how a critic is asked."""
 
-    def __init__(self, settings, critics, policy_class=make_policy, extra_outputs=0):
-        self.settings = settings
+    def __init__(self, settings, kit, critics, extra_outputs=0):
+        self.settings, self.kit = settings, kit
         self.updates = 0
         self.losses, self.targets = {}, None
-        self.actor = policy_class(settings, extra_outputs)
+        self.actor = kit.make_policy(settings, extra_outputs)
         inputs = settings.policy_observation_len + settings.critic_action_len
         self.critics = [mlp(inputs, settings.critic_hidden, 1) for _ in range(critics)]
         self.critic_targets = copy.deepcopy(self.critics)
         both = [values for critic in self.critics for values in critic.parameters()]
-        self.critic_adam = adam(both, settings.critic_learning_rate)
-        self.actor_adam = adam(self.actor.parameters(), settings.actor_learning_rate)
+        self.critic_adam = kit.adam(both, settings.critic_learning_rate)
+        self.actor_adam = kit.adam(self.actor.parameters(), settings.actor_learning_rate)
 
     @property
     def networks(self):
@@ -80,14 +91,14 @@ class ActorCritic:
     def follow_critics(self):
         """Moves the critics' targets."""
         for target, critic in zip(self.critic_targets, self.critics, strict=True):
-            follow(target, critic, self.settings.polyak)
+            self.kit.follow(target, critic, self.settings.polyak)
 
 
 class Ddpg(ActorCritic):
     """Lillicrap et al. 2016, Algorithm 1."""
 
-    def __init__(self, settings, policy_class=make_policy, critics=1):
-        super().__init__(settings, critics, policy_class)
+    def __init__(self, settings, kit, critics=1):
+        super().__init__(settings, kit, critics)
         self.actor_target = copy.deepcopy(self.actor)
 
     @property
@@ -114,14 +125,14 @@ class Ddpg(ActorCritic):
     def follow_all(self):
         """Moves the critics' and the actor's targets."""
         self.follow_critics()
-        follow(self.actor_target, self.actor, self.settings.polyak)
+        self.kit.follow(self.actor_target, self.actor, self.settings.polyak)
 
 
 class Td3(Ddpg):
     """Fujimoto et al. 2018, Algorithm 1: twin critics, target smoothing, a delayed actor."""
 
-    def __init__(self, settings, policy_class=make_policy):
-        super().__init__(settings, policy_class, critics=2)
+    def __init__(self, settings, kit):
+        super().__init__(settings, kit, critics=2)
 
     def update(self, batch):
         """Critics; every second time actor and targets too."""
@@ -144,12 +155,12 @@ class Sac(ActorCritic):
     The entropy is one term per decision: log pi is summed over the K A numbers of a segment.
     """
 
-    def __init__(self, settings, policy_class=make_policy):
+    def __init__(self, settings, kit):
         numbers = settings.steps * settings.action_len
-        super().__init__(settings, 2, policy_class, extra_outputs=numbers)
+        super().__init__(settings, kit, 2, extra_outputs=numbers)
         self.target_entropy = -numbers / 2 if settings.policy == "dmp" else -settings.action_len
         self.log_temperature = torch.zeros(1, requires_grad=True)
-        self.temperature_adam = adam([self.log_temperature], TEMPERATURE_LEARNING_RATE)
+        self.temperature_adam = kit.adam([self.log_temperature], TEMPERATURE_LEARNING_RATE)
 
     def draw(self, observations, noise):
         """Actions (B, K, A), end state, log pi (B,)."""

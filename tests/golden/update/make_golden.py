@@ -14,7 +14,7 @@ from importlib.metadata import version
 from pathlib import Path
 
 import torch
-from algorithms import ALGORITHMS
+from algorithms import ALGORITHMS, Kit
 from networks import flat, flat_gradient
 from safetensors.torch import save_file
 from settings import Settings, Start
@@ -79,6 +79,8 @@ def configuration(case):
         "algorithm.critic_hidden": list(case.critic_hidden),
         "algorithm.batch_size": case.batch_size,
     }
+    if case.algorithm == "sac":
+        keys["algorithm.sac.target_entropy_per_action"] = -0.5 if case.policy == "dmp" else -1.0
     return {key: str(value) for key, value in keys.items()}
 
 
@@ -106,7 +108,7 @@ def draw_batches(case):
 
 def draw_algorithm(case):
     """The algorithm with targets that differ from their networks, so that mixing them up shows."""
-    algorithm = ALGORITHMS[case.algorithm](case)
+    algorithm = ALGORITHMS[case.algorithm](case, Kit())
     with torch.no_grad():
         for name, network in algorithm.networks.items():
             if name.endswith("_target"):
@@ -180,13 +182,15 @@ def make(name, case, seed):
     # The observations are the first columns of the critic's inputs.
     kept = {key: values for key, values in batches.items() if key != "observations"}
     tensors = {**result, **{f"batch.{key}": values for key, values in kept.items()}}
-    metadata = dict(
+    about = dict(
         script="tests/golden/update/make_golden.py",
-        seed=str(seed),
-        versions=json.dumps(dict(python=platform.python_version(), torch=version("torch"))),
-        configuration=json.dumps(configuration(case)),
-        updates=str(UPDATES),
+        seed=seed,
+        versions=dict(python=platform.python_version(), torch=version("torch")),
+        configuration=configuration(case),
+        updates=UPDATES,
     )
+    # One entry: of several, the order in the file is left to chance.
+    metadata = {"about": json.dumps(about)}
     tensors = {key: values.detach().contiguous() for key, values in tensors.items()}
     save_file(tensors, Path(__file__).with_name(f"{name}.safetensors"), metadata)
 
