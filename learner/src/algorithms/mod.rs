@@ -155,4 +155,6 @@ fn new_critic(config: &ExperimentConfig, shape: BatchShape, name: &str) -> Resul
 }
 
 #[cfg(test)]
+mod golden_tests;
+#[cfg(test)]
 mod tests;

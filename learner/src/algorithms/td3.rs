@@ -29,7 +29,7 @@ pub struct Td3 {
     pub critics: [Trained; 2],
     config: Td3Config,
     polyak: f32,
-    blocks: Vec<Block>,
+    pub(super) blocks: Vec<Block>,
 }
 
 impl Td3 {
