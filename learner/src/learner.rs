@@ -13,6 +13,7 @@ use thiserror::Error;
 
 use crate::algorithms::{Algorithm, Batch, NoWindow};
 use crate::metrics::{Collector, MetricsLine, Rejected};
+use crate::normaliser::Normaliser;
 use crate::pacing::Pacing;
 use crate::replay::{Replay, Sampler};
 
@@ -77,6 +78,8 @@ pub struct Learner {
     pub replay: Replay,
     /// Draws batches.
     pub sampler: Sampler,
+    /// Observation normalisation, if it is asked for.
+    pub normaliser: Option<Normaliser>,
     /// Updates owed.
     pub pacing: Pacing,
     /// Where the run stands.
@@ -114,6 +117,10 @@ impl Learner {
             },
             replay: Replay::new(layout, config.replay.capacity_steps, workers, envs),
             sampler: Sampler::new(config.algorithm.windows, random),
+            normaliser: config.policy.normalise_observations.then(|| {
+                // Nothing is learned before; afterwards they are taken anew at each doubling.
+                Normaliser::new(layout.observation_len, config.exploration.warm_up_steps)
+            }),
             pacing: Pacing::new(&config.pacing),
             counters: Counters::default(),
             batch: Batch::new(algorithm.batch_shape()),
@@ -170,6 +177,11 @@ impl Learner {
         }
         self.collector.inserted(segment, self.counters.policy_version);
         self.replay.insert(&segment.header, &segment.block);
+        if let Some(normaliser) = &mut self.normaliser {
+            let (observations, _, _) = self.expected.layout.split(&segment.block);
+            let seen = segment.header.steps_len as usize * normaliser.observation_len();
+            normaliser.observe(&observations[..seen]);
+        }
         self.counters.segments += 1;
         self.counters.env_steps += u64::from(segment.header.steps_len);
         if self.counters.env_steps > self.config.exploration.warm_up_steps {
@@ -199,9 +211,11 @@ impl Learner {
     /// # Errors
     /// If there is nothing to sample or a loss is not finite.
     pub fn update(&mut self) -> Result<(), LearnerError> {
+        self.refresh_normaliser()?;
         let source = (&self.replay, &mut self.sampler);
         let shape = self.algorithm.batch_shape();
-        self.batch.sample(shape, &self.config.algorithm, self.omega, source)?;
+        let normaliser = self.normaliser.as_ref();
+        self.batch.sample(shape, &self.config.algorithm, self.omega, normaliser, source)?;
         let update = self.counters.updates + 1;
         let losses = self.algorithm.update(&self.policy, &self.batch, update)?;
         for (name, value) in
@@ -218,6 +232,18 @@ impl Learner {
         Ok(())
     }
 
+    fn refresh_normaliser(&mut self) -> Result<(), LearnerError> {
+        if let Some(normaliser) = self.normaliser.as_mut().filter(|normaliser| normaliser.is_due())
+        {
+            let change = normaliser.refresh();
+            let sees_observations = |name: &str| name == "actor" || name.starts_with("critic");
+            self.algorithm.each_network(|name, trained| {
+                if sees_observations(name) { change.apply(trained) } else { Ok(()) }
+            })?;
+        }
+        Ok(())
+    }
+
     /// A snapshot of the actor under the next version.
     ///
     /// # Errors
@@ -228,6 +254,9 @@ impl Learner {
         self.snapshot.env_steps = self.counters.env_steps;
         let values = &mut self.snapshot.values;
         self.algorithm.actor().network.read(|parameters| values.copy_from_slice(parameters))?;
+        if let Some(normaliser) = &self.normaliser {
+            normaliser.fold(self.policy.shape(), values);
+        }
         Ok(&self.snapshot)
     }
 
