@@ -3,6 +3,7 @@
 mod batch;
 mod block;
 pub mod ddpg;
+mod products;
 pub mod sac;
 pub mod td3;
 
@@ -12,6 +13,7 @@ use dmprl_shared::policy::{MlpShape, Policy, initial_parameters};
 use dmprl_shared::seeds;
 
 pub use batch::{Batch, BatchShape, NoWindow};
+pub use products::Cycle;
 
 use crate::update::crew::Crew;
 use crate::update::trained::Trained;
