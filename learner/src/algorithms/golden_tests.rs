@@ -21,10 +21,15 @@ fn folder() -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("../tests/golden/update")
 }
 
+/// Of the algorithms that learn from a replay.
 fn files() -> Vec<PathBuf> {
     let entries = std::fs::read_dir(folder()).unwrap().map(|entry| entry.unwrap().path());
-    let mut files: Vec<_> =
-        entries.filter(|path| path.extension().is_some_and(|it| it == "safetensors")).collect();
+    let learns_from_batches = |path: &PathBuf| {
+        let name = path.file_name().unwrap().to_str().unwrap();
+        let kinds = ["ddpg_", "td3_", "sac_"];
+        kinds.iter().any(|kind| name.starts_with(kind)) && name.ends_with(".safetensors")
+    };
+    let mut files: Vec<_> = entries.filter(learns_from_batches).collect();
     files.sort();
     files
 }
@@ -80,6 +85,9 @@ impl Golden {
         let inputs = batch.critic_inputs.chunks_exact(shape.critic_inputs());
         let rows = batch.observations.chunks_exact_mut(shape.observation_len).zip(inputs);
         rows.for_each(|(row, input)| row.copy_from_slice(&input[..row.len()]));
+        // Nothing is normalised.
+        batch.inputs.copy_from_slice(&batch.observations);
+        batch.next_inputs.copy_from_slice(&batch.next_observations);
         for (name, out) in [
             (if shape.noise { "next_noise" } else { "target_noise" }, &mut batch.next_noise),
             ("noise", &mut batch.noise),

@@ -182,17 +182,24 @@ def make(name, case, seed):
     # The observations are the first columns of the critic's inputs.
     kept = {key: values for key, values in batches.items() if key != "observations"}
     tensors = {**result, **{f"batch.{key}": values for key, values in kept.items()}}
+    write(name, tensors, configuration(case), seed)
+
+
+def write(name, tensors, keys, seed):
+    """Writes a file with its origin; `keys`: dmprl's configuration of the case."""
     about = dict(
         script="tests/golden/update/make_golden.py",
         seed=seed,
         versions=dict(python=platform.python_version(), torch=version("torch")),
-        configuration=configuration(case),
+        configuration=keys,
         updates=UPDATES,
     )
     # One entry: of several, the order in the file is left to chance.
     metadata = {"about": json.dumps(about)}
     tensors = {key: values.detach().contiguous() for key, values in tensors.items()}
-    save_file(tensors, Path(__file__).with_name(f"{name}.safetensors"), metadata)
+    path = Path(__file__).with_name(f"{name}.safetensors")
+    save_file(tensors, path, metadata)
+    path.chmod(0o644)
 
 
 def main():

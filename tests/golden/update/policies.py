@@ -26,15 +26,16 @@ class MlpPolicy(nn.Module):
 
 
 class DmpPolicy(nn.Module):
-    """A segment of K actions: DMP, then the adaptive inverse controller.
+    """A segment of K actions: DMP, then the adaptive inverse or the position controller.
 
-    Outputs of one action dimension stand together: goal, N weights, 4 rho.
+    Outputs of one action dimension stand together: goal, N weights, 4 rho (of the former only).
     """
 
     def __init__(self, settings, extra_outputs=0):
         super().__init__()
         self.settings = settings
-        self.per_dimension = 1 + settings.basis_count + 4
+        rho = 4 if settings.controller == "inverse" else 0
+        self.per_dimension = 1 + settings.basis_count + rho
         self.outputs = settings.action_len * self.per_dimension
         self.network = mlp(
             settings.policy_observation_len, settings.hidden, self.outputs + extra_outputs
@@ -54,6 +55,9 @@ class DmpPolicy(nn.Module):
         rho = s.rho_range * head[..., 1 + s.basis_count :]
         y0, yd0 = starts(s, observations)
         y, yd, ydd = self.samples(y0, yd0, goal, weights)
+        if s.controller == "position":
+            before = torch.cat([y0[:, None], y[:, :-1]], dim=1)
+            return s.position_scale * (y - before), outputs[:, :0], outputs[:, :0]
         yd, ydd = yd / s.omega, ydd / s.omega**2
         rho = rho[:, None]  # (B, 1, A, 4): the same over the K steps
         pre = (1 + rho[..., 0]) * y + rho[..., 1] * yd + rho[..., 2] * ydd + rho[..., 3]

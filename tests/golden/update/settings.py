@@ -1,6 +1,6 @@
 """What a golden case, or a benchmark, is about: the settings of one experiment and its sizes."""
 
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, fields
 
 
 @dataclass(frozen=True)
@@ -36,6 +36,8 @@ class Settings:
     start_velocity: str = "measured"
     goal_range: float = 1.0
     weight_range: float = 1.0
+    controller: str = "inverse"
+    position_scale: float = 1.0
     rho_range: float = 2.0
     basis_count: int = 5
     alpha_x: float = 1.0
@@ -46,7 +48,6 @@ class Settings:
     critic_learning_rate: float = 3e-4
     actor_learning_rate: float = 5e-4
     polyak: float = 5e-3
-    extra: dict[str, float] = field(default_factory=dict)  # one algorithm's own
 
     @staticmethod
     def from_dict(values):
