@@ -3,6 +3,7 @@
 mod batch;
 mod block;
 pub mod ddpg;
+mod optimiser_steps;
 mod products;
 pub mod sac;
 pub mod td3;
@@ -13,6 +14,7 @@ use dmprl_shared::policy::{MlpShape, Policy, initial_parameters};
 use dmprl_shared::seeds;
 
 pub use batch::{Batch, BatchShape, NoWindow};
+pub use optimiser_steps::OptimiserSteps;
 pub use products::Cycle;
 
 use crate::update::crew::Crew;

@@ -15,7 +15,7 @@ pub(super) const LIBRARY: &str = "floor_library";
 pub(super) const KERNELS: &str = "floor_kernels";
 /// Sampling a batch, alone.
 pub(super) const SAMPLE: &str = "sample";
-/// Adam and the targets, alone.
+/// The optimiser and the targets, alone.
 pub(super) const OPTIMISER: &str = "optimiser";
 
 /// The time of one update, or of one update's part.

@@ -3,11 +3,10 @@
 use std::time::{Duration, Instant};
 
 use anyhow::ensure;
-use dmprl_learner::algorithms::{Batch, Cycle};
+use dmprl_learner::algorithms::{Batch, Cycle, OptimiserSteps};
 use dmprl_learner::learner::Learner;
 use dmprl_learner::update::crew::Crew;
 use dmprl_learner::update::floor::{Engine, Floor, Product};
-use dmprl_learner::update::kernels::{AdamPass, Follow, InstructionSet, StepSizes, adam};
 use dmprl_shared::policy::Head;
 use rustix::time::{ClockId, clock_gettime};
 
@@ -107,81 +106,21 @@ impl SampleWork {
     }
 }
 
-/// What Adam and a target need of one network, or of one thread's share of it.
-struct Slot {
-    /// Parameters, first and second moment, target, (P,) each.
-    numbers: [Vec<f32>; 4],
-    gradient: Vec<f32>,
-    follows: bool,
-    /// Steps of a cycle: an actor may rest in some updates.
-    steps: u64,
-}
-
 /// The optimiser and the targets, without the gradients.
-pub(super) struct OptimiserWork {
-    crew: Crew,
-    /// Each thread's.
-    shares: Vec<Vec<Slot>>,
-    updates: u64,
-    polyak: f32,
-    instructions: InstructionSet,
-}
+pub(super) struct OptimiserWork(OptimiserSteps);
 
 impl OptimiserWork {
     pub(super) fn new(learner: &Learner) -> Self {
         let config = learner.config();
-        let threads = config.learner.threads;
-        let updates = learner.algorithm.products().updates;
-        let share = |index: usize| {
-            let networks = learner.algorithm.networks();
-            let slot = |(name, trained): (&str, &dmprl_learner::update::trained::Trained)| {
-                let all = trained.adam.moments.first.len();
-                let len = all * (index + 1) / threads - all * index / threads;
-                // Any numbers will do that are no denormals.
-                let numbers = || (0..len).map(|i| 1.0 + (i as f32).sin()).collect::<Vec<_>>();
-                Slot {
-                    numbers: [numbers(), numbers(), numbers(), numbers()],
-                    gradient: numbers(),
-                    follows: trained.target.is_some(),
-                    steps: if name == "actor" { 1 } else { updates },
-                }
-            };
-            networks.into_iter().map(slot).collect()
-        };
-        Self {
-            crew: Crew::new(threads),
-            shares: (0..threads).map(share).collect(),
-            updates,
-            polyak: config.algorithm.polyak as f32,
-            instructions: InstructionSet::detect(),
-        }
+        let (threads, polyak) = (config.learner.threads, config.algorithm.polyak as f32);
+        Self(OptimiserSteps::new(&learner.algorithm, threads, polyak))
     }
 
     pub(super) fn measure(&mut self, duration: Duration) -> anyhow::Result<Timed> {
-        let Self { crew, shares, updates, polyak, instructions } = self;
-        // Late enough for the bias corrections to be what they are in a long run.
-        let sizes = StepSizes::new(1e-6, 100_000);
         let cycle = timed(duration, || {
-            crew.each(shares, |slots| {
-                for slot in slots {
-                    for step in 1..=slot.steps {
-                        // Targets follow in the update that is the cycle's last.
-                        let share = (slot.follows && step == slot.steps).then_some(*polyak);
-                        slot.step(sizes, share, *instructions);
-                    }
-                }
-            });
+            self.0.run();
             Ok(())
         })?;
-        Ok(cycle.over(*updates as f64))
-    }
-}
-
-impl Slot {
-    fn step(&mut self, sizes: StepSizes, polyak: Option<f32>, instructions: InstructionSet) {
-        let [parameters, first, second, target] = &mut self.numbers;
-        let follow = polyak.map(|polyak| Follow { target, polyak });
-        let gradient = &self.gradient;
-        adam(AdamPass { parameters, first, second, gradient, follow, sizes }, instructions);
+        Ok(cycle.over(self.0.updates as f64))
     }
 }
