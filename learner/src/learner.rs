@@ -236,6 +236,7 @@ impl Learner {
         if let Some(normaliser) = self.normaliser.as_mut().filter(|normaliser| normaliser.is_due())
         {
             let change = normaliser.refresh();
+            self.algorithm.fetch()?;
             let sees_observations = |name: &str| name == "actor" || name.starts_with("critic");
             self.algorithm.each_network(|name, trained| {
                 if sees_observations(name) { change.apply(trained) } else { Ok(()) }
@@ -253,7 +254,7 @@ impl Learner {
         self.snapshot.version = self.counters.policy_version;
         self.snapshot.env_steps = self.counters.env_steps;
         let values = &mut self.snapshot.values;
-        self.algorithm.actor().network.read(|parameters| values.copy_from_slice(parameters))?;
+        self.algorithm.read_actor(values)?;
         if let Some(normaliser) = &self.normaliser {
             normaliser.fold(self.policy.shape(), values);
         }
@@ -271,11 +272,16 @@ impl Learner {
     /// # Errors
     /// If the lengths differ.
     pub fn warm_start(&mut self, parameters: &[f32]) -> Result<(), LearnerError> {
-        let actor = self.algorithm.actor();
-        actor.network.set(parameters)?;
-        if let Some(target) = &actor.target {
-            target.set(parameters)?;
-        }
+        self.algorithm.each_network(|name, actor| {
+            if name != "actor" {
+                return Ok(());
+            }
+            actor.network.set(parameters)?;
+            match &mut actor.target {
+                Some(target) => target.set(parameters),
+                None => Ok(()),
+            }
+        })?;
         Ok(())
     }
 

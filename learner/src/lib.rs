@@ -5,6 +5,7 @@
 
 pub mod algorithms;
 pub mod checkpoint;
+mod graph;
 pub mod learner;
 pub mod metrics;
 pub mod networks;

@@ -23,7 +23,7 @@ pub use dmp::{
 };
 pub use experiment::{
     ActorsConfig, CheckpointConfig, Device, EvaluationConfig, ExperimentConfig, LearnerConfig,
-    MetricsConfig, PacingConfig, ReplayConfig, RunConfig, TaskConfig,
+    MetricsConfig, PacingConfig, Precision, ReplayConfig, RunConfig, TaskConfig,
 };
 pub use layers::{ConfigError, Layers, nearest};
 pub use presets::{PRESETS, Preset, policy_defaults};

@@ -39,7 +39,7 @@ impl Forward<'_> {
         let width = self.bias.len();
         let rows = self.outputs.len() / width;
         assert_eq!(self.outputs.len(), rows * width, "outputs of {width} columns");
-        let depth = if rows == 0 { 0 } else { self.inputs.len() / rows };
+        let depth = self.inputs.len().checked_div(rows).unwrap_or(0);
         assert_eq!(self.inputs.len(), rows * depth, "inputs of {rows} rows");
         assert_eq!(self.packed.len(), packed_len(depth, width), "packed weights");
         instructions.run(Job { layer: self, rows, depth, width, column: 0 });
@@ -112,7 +112,8 @@ impl<S: Simd> Tiled<S> for Job<'_> {
             depth_stride: 1,
         };
         let panel = &packed[self.column * self.depth..][..self.depth * PANEL];
-        let right = Wide { data: panel, stride: PANEL, width: PANEL };
+        let right =
+            Wide { data: panel, stride: PANEL, width: PANEL, next: Some(self.depth * PANEL) };
         let sums = accumulate::<S, M, V, false>(simd, sums, left, right, self.depth);
         let zero = simd.splat_f32s(0.0);
         for (m, mut sums) in sums.into_iter().enumerate() {

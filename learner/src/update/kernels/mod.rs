@@ -17,6 +17,7 @@
 //! matters (AVX-512, AVX2 with FMA, NEON, plain); [`InstructionSet::detect`] picks at start.
 
 mod backward;
+pub mod bf16;
 mod forward;
 mod optimizer;
 mod pack;
@@ -28,6 +29,7 @@ mod weight_gradient;
 pub use backward::Backward;
 pub use forward::{Activation, Forward};
 pub use optimizer::{AdamPass, Follow, StepSizes, adam, polyak};
+pub(crate) use optimizer::{BETA1, BETA2, EPSILON};
 pub use pack::{pack, packed_len};
 pub use weight_gradient::{GradientBlock, WeightGradient};
 
