@@ -104,7 +104,7 @@ impl Golden {
         algorithm
             .each_network(|name, trained| {
                 trained.network.set(initial(name))?;
-                match &trained.target {
+                match &mut trained.target {
                     Some(target) => target.set(initial(&format!("{name}_target"))),
                     None => Ok(()),
                 }
@@ -146,7 +146,7 @@ impl Golden {
 fn log_temperature(algorithm: &Algorithm) -> Option<f32> {
     let networks = algorithm.networks();
     let (_, trained) = networks.into_iter().find(|(name, _)| *name == "log_temperature")?;
-    trained.network.read(|value| value[0]).ok()
+    trained.network.values().first().copied()
 }
 
 /// What an update has left, by the names that the files use.
@@ -175,11 +175,10 @@ fn ours(
         ours.insert("loss.temperature".into(), vec![log_temperature * (entropy - target)]);
     }
     for (name, trained) in algorithm.networks() {
-        let read = |network: &crate::networks::Parameters| network.read(<[f32]>::to_vec).unwrap();
         ours.insert(format!("gradient.{name}"), trained.gradient().to_vec());
-        ours.insert(format!("parameters.{name}"), read(&trained.network));
+        ours.insert(format!("parameters.{name}"), trained.network.values().to_vec());
         if let Some(target) = &trained.target {
-            ours.insert(format!("parameters.{name}_target"), read(target));
+            ours.insert(format!("parameters.{name}_target"), target.values().to_vec());
         }
     }
     ours

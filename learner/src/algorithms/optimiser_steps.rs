@@ -99,9 +99,9 @@ mod tests {
         let policy = Policy::new(&config, &spec()).unwrap();
         let algorithm = Algorithm::new(&config, &policy).unwrap();
         let mut steps = OptimiserSteps::new(&algorithm, 3, 0.5);
-        let lens = |slots: &[Slot]| slots.iter().map(|slot| slot.gradient.len()).sum::<usize>();
-        let expected = algorithm.networks().iter().map(|(_, it)| it.gradient().len()).sum();
-        assert_eq!(steps.shares.iter().map(|slots| lens(slots)).sum::<usize>(), expected);
+        let shared: usize = steps.shares.iter().flatten().map(|slot| slot.gradient.len()).sum();
+        let all: usize = algorithm.networks().iter().map(|(_, it)| it.gradient().len()).sum();
+        assert_eq!(shared, all);
         let of = |slot: &Slot| (slot.follows, slot.steps);
         let first: Vec<_> = steps.shares[0].iter().map(of).collect();
         assert_eq!((first, steps.updates), (vec![(true, 1), (true, 2), (true, 2)], 2));
