@@ -148,8 +148,17 @@ fn the_table_of_train_flags_is_complete() {
 
 #[test]
 fn every_flag_that_is_shown_exists() {
-    let commands =
-        ["train", "resume", "eval", "bench rollout", "tasks", "learner", "actor", "evaluator"];
+    let commands = [
+        "train",
+        "resume",
+        "eval",
+        "bench rollout",
+        "bench learner",
+        "tasks",
+        "learner",
+        "actor",
+        "evaluator",
+    ];
     let words = |command: &str| -> BTreeSet<String> {
         flags(&help(&command.split(' ').collect::<Vec<_>>()))
     };

@@ -32,7 +32,7 @@ pub struct Ddpg {
     /// Q, and its target Q'.
     pub critic: Trained,
     polyak: f32,
-    blocks: Vec<Block>,
+    pub(super) blocks: Vec<Block>,
 }
 
 impl Ddpg {

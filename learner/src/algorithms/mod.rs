@@ -5,7 +5,9 @@ mod block;
 pub mod ddpg;
 mod minibatch;
 pub mod ndp;
+mod optimiser_steps;
 mod ppo;
+mod products;
 pub mod sac;
 pub mod td3;
 
@@ -15,6 +17,8 @@ use dmprl_shared::policy::{MlpShape, Policy, initial_parameters};
 use dmprl_shared::seeds;
 
 pub use batch::{Batch, BatchShape, NoWindow};
+pub use optimiser_steps::OptimiserSteps;
+pub use products::Cycle;
 
 use crate::graph::Graph;
 use crate::update::crew::Crew;
@@ -294,5 +298,7 @@ fn new_critic(config: &ExperimentConfig, shape: BatchShape, name: &str) -> Resul
     Trained::new(layers, initial, rate, true, config.learner.precision)
 }
 
+#[cfg(test)]
+mod golden_tests;
 #[cfg(test)]
 mod tests;

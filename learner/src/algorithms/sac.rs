@@ -37,7 +37,7 @@ pub struct Sac {
     pub log_temperature: Trained,
     target_entropy: f32,
     polyak: f32,
-    blocks: Vec<Block>,
+    pub(super) blocks: Vec<Block>,
 }
 
 impl Sac {

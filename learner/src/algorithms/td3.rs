@@ -27,9 +27,9 @@ pub struct Td3 {
     pub actor: Trained,
     /// Q_1 and Q_2, and their targets.
     pub critics: [Trained; 2],
-    config: Td3Config,
+    pub(super) config: Td3Config,
     polyak: f32,
-    blocks: Vec<Block>,
+    pub(super) blocks: Vec<Block>,
 }
 
 impl Td3 {
