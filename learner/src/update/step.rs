@@ -7,7 +7,11 @@ use dmprl_shared::policy::{Layer, MlpShape};
 use super::arithmetic::Arithmetic;
 use super::batch_pairs::BatchPairs;
 use super::crew::Disjoint;
-use super::kernels::{AdamPass, Follow, GradientBlock, PANEL, StepSizes, WeightGradient, adam};
+use super::kernels::{
+    AdamPass, Follow, GainGradient, GradientBlock, NormalisedBlock, PANEL, StepSizes,
+    WeightGradient, adam,
+};
+use super::layer_norm::{GainShift, LayerNorm};
 use super::packed::PackedPieces;
 use super::trained::Trace;
 
@@ -34,6 +38,7 @@ pub(super) fn tiles(shape: &MlpShape) -> Vec<Tile> {
 /// What the threads of one step of Adam share.
 pub(super) struct Step<'a> {
     pub shape: &'a MlpShape,
+    pub layer_norm: Option<&'a LayerNorm>,
     pub sizes: StepSizes,
     pub polyak: Option<f32>,
     pub arithmetic: Arithmetic,
@@ -81,6 +86,39 @@ impl Step<'_> {
                 self.target_packed.fill(shape, tile.layer, outputs, weights);
             }
         }
+        if let Some(places) = self.layer_norm.and_then(|norm| norm.layer(tile.layer)) {
+            self.gain_and_shift(tile, places, blocks, trace);
+        }
+    }
+
+    /// Gradient, Adam and target of a tile's gains and shifts.
+    fn gain_and_shift<'b, B>(
+        &self,
+        tile: &Tile,
+        places: &GainShift,
+        blocks: &'b [B],
+        trace: &impl Fn(&'b B) -> Trace<'b>,
+    ) {
+        let (shape, outputs) = (self.shape, tile.outputs.clone());
+        let within = |place: &Range<usize>| place.start + outputs.start..place.start + outputs.end;
+        let (gain_at, shift_at) = (within(&places.gain), within(&places.shift));
+        let blocks = blocks.iter().map(|block| {
+            let trace = trace(block);
+            let rows = trace.inputs.len() / shape.inputs();
+            let normalised = trace.normalised.expect("normalised layers");
+            let [normalised, _] = normalised.layer(shape, tile.layer, rows);
+            let gradient = trace.gradients.normalised_layer(shape, tile.layer, rows);
+            NormalisedBlock { gradient, normalised }
+        });
+        // SAFETY: tiles do not overlap, nor do a tile's gains and shifts.
+        let (gain, shift) = unsafe {
+            (self.gradient.slice(gain_at.clone()), self.gradient.slice(shift_at.clone()))
+        };
+        let width = shape.layers()[tile.layer].outputs;
+        let outputs = tile.outputs.clone();
+        GainGradient { blocks, width, outputs, gain, shift }.run(self.arithmetic.instructions);
+        self.adam(gain_at);
+        self.adam(shift_at);
     }
 
     fn gradients<'b>(
