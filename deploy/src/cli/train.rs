@@ -113,8 +113,8 @@ fn check(config: &ExperimentConfig, args: &TrainArgs) -> anyhow::Result<()> {
     }
     if config.learner.device == Device::Cuda && !cfg!(feature = "cuda") {
         return Err(wrong_use(
-            "learner.device = \"cuda\": this build has no CUDA; on a machine with an NVIDIA GPU and \
-             the CUDA toolkit, build with: cargo build --release --features cuda",
+            "learner.device = \"cuda\": this build has no CUDA; on a machine with an NVIDIA GPU \
+             and the CUDA toolkit, build with: cargo build --release --features cuda",
         ));
     }
     if let Some(workers) = args.configured.workers.filter(|&n| n > 1 && config.run.deterministic) {

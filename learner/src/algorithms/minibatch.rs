@@ -169,12 +169,12 @@ impl Block {
         out: &mut [f32],
     ) {
         normalise(normaliser, observations, &mut self.inputs);
-        value.forward(&self.inputs[..observations.len()], &mut self.value);
+        value.forward(&self.inputs[..observations.len()], &mut self.value, None);
         out.copy_from_slice(self.value.output(&self.value_shape, out.len()));
     }
 
     fn act(&mut self, policy: &Policy, actor: &Lent<'_>) {
-        actor.forward(&self.inputs[..self.observations.len()], &mut self.policy.activations);
+        actor.forward(&self.inputs[..self.observations.len()], &mut self.policy.activations, None);
         policy.decode(&self.observations, &mut self.policy);
     }
 
@@ -202,7 +202,7 @@ impl Block {
             let gradient = HeadGradient { means: &self.means_gradient[..used], end_state: &[] };
             head.backward(dmp, gradient, outputs, policy.shape().outputs());
         }
-        actor.pass(&self.policy.activations, rows).backward(&mut self.actor_gradients);
+        actor.pass(&self.policy.activations, None, rows).backward(&mut self.actor_gradients);
     }
 
     /// One step's part in the loss and its gradients.
@@ -230,7 +230,7 @@ impl Block {
     /// Passes of mean (V - return)².
     pub fn regress(&mut self, value: &Lent<'_>, objective: Objective<'_>) {
         let rows = self.rows();
-        value.forward(&self.inputs[..self.observations.len()], &mut self.value);
+        value.forward(&self.inputs[..self.observations.len()], &mut self.value, None);
         let values = self.value.output(&self.value_shape, rows);
         let out = self.value_gradients.output_mut(&self.value_shape, rows);
         for ((out, value), target) in out.iter_mut().zip(values).zip(&self.returns) {
@@ -238,7 +238,7 @@ impl Block {
             *out = 2.0 * error / objective.segments;
             self.sums.value += error * error;
         }
-        value.pass(&self.value, rows).backward(&mut self.value_gradients);
+        value.pass(&self.value, None, rows).backward(&mut self.value_gradients);
     }
 
     /// This block's part in the gradient of the actor after [`Block::improve`].
@@ -248,12 +248,18 @@ impl Block {
             inputs: self.seen(),
             activations: &self.policy.activations,
             gradients: &self.actor_gradients,
+            normalised: None,
         }
     }
 
     /// This block's part in the gradient of the value after [`Block::regress`].
     #[must_use]
     pub fn value_trace(&self) -> Trace<'_> {
-        Trace { inputs: self.seen(), activations: &self.value, gradients: &self.value_gradients }
+        Trace {
+            inputs: self.seen(),
+            activations: &self.value,
+            gradients: &self.value_gradients,
+            normalised: None,
+        }
     }
 }

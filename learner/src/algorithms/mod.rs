@@ -295,7 +295,8 @@ fn new_critic(config: &ExperimentConfig, shape: BatchShape, name: &str) -> Resul
     let layers = MlpShape::new(widths);
     let initial = initial_parameters(&layers, &mut seeds::stream(config.run.seed, name, 0));
     let rate = config.algorithm.critic_learning_rate;
-    Trained::new(layers, initial, rate, true, config.learner.precision)
+    let critic = Trained::new(layers, initial, rate, true, config.learner.precision)?;
+    Ok(if config.algorithm.critic_layer_norm { critic.with_layer_norm() } else { critic })
 }
 
 #[cfg(test)]

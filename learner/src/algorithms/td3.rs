@@ -44,7 +44,7 @@ impl Td3 {
         ];
         Ok(Self {
             actor: new_actor(config, policy, true)?,
-            blocks: blocks(policy, shape, &critics[0].shape, 2),
+            blocks: blocks(policy, shape, &critics),
             critics,
             config: config.algorithm.td3.clone(),
             polyak: config.algorithm.polyak as f32,

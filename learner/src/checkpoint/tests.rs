@@ -80,6 +80,7 @@ fn a_resumed_learner_goes_on_to_the_same_bytes_as_one_that_never_stopped() {
         &[][..],
         &[("algorithm.name", "td3"), ("policy.normalise_observations", "true")],
         &[("algorithm.name", "sac"), ("policy.normalise_observations", "true")],
+        &[("algorithm.critic_layer_norm", "true"), ("policy.normalise_observations", "true")],
     ] {
         let fresh = || fresh_with(keys);
         let folder = tempfile::tempdir().unwrap();

@@ -7,7 +7,11 @@ use dmprl_shared::policy::{Layer, MlpShape};
 use super::arithmetic::Arithmetic;
 use super::batch_pairs::BatchPairs;
 use super::crew::Disjoint;
-use super::kernels::{AdamPass, Follow, GradientBlock, PANEL, StepSizes, WeightGradient, adam};
+use super::kernels::{
+    AdamPass, Follow, GainGradient, GradientBlock, NormalisedBlock, PANEL, StepSizes,
+    WeightGradient, adam,
+};
+use super::layer_norm::{GainShift, LayerNorm};
 use super::packed::PackedPieces;
 use super::trained::Trace;
 
@@ -38,11 +42,18 @@ impl Tile {
         let within = |first: usize, width: usize| first + start * width..first + end * width;
         [within(layer.weights.start, layer.inputs), within(layer.bias.start, 1)]
     }
+
+    /// Where its gains and its shifts stand.
+    fn norm_ranges(&self, places: &GainShift) -> [Range<usize>; 2] {
+        let Range { start, end } = self.outputs.clone();
+        [&places.gain, &places.shift].map(|place| place.start + start..place.start + end)
+    }
 }
 
 /// What the threads that sum a gradient share.
 pub(super) struct GradientSum<'a> {
     pub shape: &'a MlpShape,
+    pub layer_norm: Option<&'a LayerNorm>,
     pub arithmetic: Arithmetic,
     /// Filled where the arithmetic has layers of 16 bits.
     pub pairs: &'a BatchPairs,
@@ -53,13 +64,48 @@ impl GradientSum<'_> {
     /// One tile's part, summed over the blocks in their order.
     pub fn tile<'b, B>(&self, tile: &Tile, blocks: &'b [B], trace: &impl Fn(&'b B) -> Trace<'b>) {
         let shape = self.shape;
-        let layer = &shape.layers()[tile.layer];
+        if let Some(places) = self.norm_places(tile) {
+            self.gain_and_shift(tile, places, blocks, trace);
+        }
         let blocks = blocks.iter().map(|block| {
             let trace = trace(block);
             let rows = trace.inputs.len() / shape.inputs();
             let gradient = trace.gradients.layer(shape, tile.layer, rows);
             GradientBlock { gradient, inputs: trace.layer_inputs(shape, tile.layer, rows) }
         });
+        self.weights_and_bias(tile, blocks);
+    }
+
+    fn norm_places(&self, tile: &Tile) -> Option<&GainShift> {
+        self.layer_norm?.layer(tile.layer)
+    }
+
+    fn gain_and_shift<'b, B>(
+        &self,
+        tile: &Tile,
+        places: &GainShift,
+        blocks: &'b [B],
+        trace: &impl Fn(&'b B) -> Trace<'b>,
+    ) {
+        let shape = self.shape;
+        let blocks = blocks.iter().map(|block| {
+            let trace = trace(block);
+            let rows = trace.inputs.len() / shape.inputs();
+            let normalised = trace.normalised.expect("normalised layers");
+            let [normalised, _] = normalised.layer(shape, tile.layer, rows);
+            let gradient = trace.gradients.normalised_layer(shape, tile.layer, rows);
+            NormalisedBlock { gradient, normalised }
+        });
+        let [gain, shift] = tile.norm_ranges(places);
+        // SAFETY: tiles do not overlap, nor do a tile's gains and shifts.
+        let (gain, shift) = unsafe { (self.gradient.slice(gain), self.gradient.slice(shift)) };
+        let width = shape.layers()[tile.layer].outputs;
+        let outputs = tile.outputs.clone();
+        GainGradient { blocks, width, outputs, gain, shift }.run(self.arithmetic.instructions);
+    }
+
+    fn weights_and_bias<'b>(&self, tile: &Tile, blocks: impl Iterator<Item = GradientBlock<'b>>) {
+        let layer = &self.shape.layers()[tile.layer];
         let [weights, bias] = tile.ranges(layer);
         // SAFETY: tiles do not overlap, nor do a tile's weights and biases.
         let (weights, bias) = unsafe { (self.gradient.slice(weights), self.gradient.slice(bias)) };
@@ -103,6 +149,9 @@ impl Step<'_> {
         let [weights_at, bias_at] = tile.ranges(&shape.layers()[tile.layer]);
         self.adam(bias_at);
         self.adam(weights_at.clone());
+        if let Some(places) = self.sum.norm_places(tile) {
+            tile.norm_ranges(places).into_iter().for_each(|range| self.adam(range));
+        }
         // SAFETY: tiles do not overlap, and this one's slices above are no longer in use.
         unsafe {
             let weights = self.parameters.slice(weights_at.clone());

@@ -70,6 +70,9 @@ pub struct AlgorithmConfig {
     pub batch_size: usize,
     /// Widths of the critic's hidden layers.
     pub critic_hidden: Vec<usize>,
+    /// Layer normalisation (Ba et al. 2016) of the critic's hidden layers, before their ReLU, in
+    /// DDPG, TD3 and SAC: it bounds Q for actions unlike any in the replay (Ball et al. 2023).
+    pub critic_layer_norm: bool,
     /// What only TD3 has.
     pub td3: Td3Config,
     /// What only SAC has.
@@ -132,6 +135,7 @@ impl Default for AlgorithmConfig {
             actor_learning_rate: 5e-4,
             batch_size: 256,
             critic_hidden: vec![256, 256],
+            critic_layer_norm: false,
             td3: Td3Config::default(),
             sac: SacConfig::default(),
             ndp: NdpConfig::default(),

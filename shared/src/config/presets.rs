@@ -65,6 +65,7 @@ critic_learning_rate = 0.0003
 actor_learning_rate = 0.0005
 batch_size = 256
 critic_hidden = [256, 256]
+critic_layer_norm = false
 [algorithm.td3]
 target_noise_std = 0.2
 target_noise_clip = 0.5

@@ -227,6 +227,11 @@ impl ExperimentConfig {
         range("learner.device", "cuda", !on_policy || on_cpu, || {
             "cpu with algorithm.name = \"ndp\", whose minibatches are too small for a GPU".into()
         })?;
+        let layer_norm = self.algorithm.critic_layer_norm;
+        range("algorithm.critic_layer_norm", "true", !on_policy || !layer_norm, || {
+            "false with algorithm.name = \"ndp\", whose critic judges states of its own policy"
+                .into()
+        })?;
         let position = self.policy.controller == Controller::Position;
         let dmp = self.policy.kind == PolicyKind::Dmp;
         range("policy.controller", "position", on_policy || !position || !dmp, || {
