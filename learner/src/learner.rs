@@ -6,7 +6,7 @@ use dmprl_shared::config::ExperimentConfig;
 use dmprl_shared::parameters::ParameterSnapshot;
 use dmprl_shared::policy::{Head, Policy, PolicyError};
 use dmprl_shared::seeds;
-use dmprl_shared::segment::{Expected, Rejection, Segment, SegmentHeader, check};
+use dmprl_shared::segment::{Expected, HINDSIGHT, Rejection, Segment, SegmentHeader, check};
 use dmprl_shared::spec::EnvSpec;
 use serde::{Deserialize, Serialize};
 use thiserror::Error;
@@ -52,6 +52,9 @@ pub struct Counters {
     pub env_steps: u64,
     /// Segments inserted.
     pub segments: u64,
+    /// Copies of segments with other goals inserted. Checkpoints of older versions have none.
+    #[serde(default)]
+    pub hindsight_segments: u64,
     /// Updates done.
     pub updates: u64,
     /// Version of the newest published policy.
@@ -169,8 +172,13 @@ impl Learner {
             self.counters.rejected.count(why);
             return Err(why);
         }
-        self.collector.inserted(segment, self.counters.policy_version);
         self.replay.insert(&segment.header, &segment.block);
+        if segment.header.flags & HINDSIGHT != 0 {
+            // Experience, and nothing that an environment or an episode did.
+            self.counters.hindsight_segments += 1;
+            return Ok(());
+        }
+        self.collector.inserted(segment, self.counters.policy_version);
         self.counters.segments += 1;
         self.counters.env_steps += u64::from(segment.header.steps_len);
         if self.counters.env_steps > self.config.exploration.warm_up_steps {
@@ -261,6 +269,7 @@ impl Learner {
             env_steps: counters.env_steps,
             updates: counters.updates,
             segments: counters.segments,
+            hindsight_segments: counters.hindsight_segments,
             policy_version: counters.policy_version,
             replay_segments: self.replay.len() as u64,
             samples_per_insert: self.samples_per_insert(),

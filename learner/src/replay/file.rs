@@ -3,7 +3,7 @@
 //! ```text
 //!   magic "DMPRLRP1" · u64 K, O, A, slot count, filled, head, inserted, tail count
 //!   then slots · tails · blocks:
-//!   slot: u32 next, u8 steps_len, u8 terminated, u8 truncated, u8 0      (filled ones)
+//!   slot: u32 next, u8 steps_len, u8 terminated, u8 truncated, u8 hindsight     (filled ones)
 //!   tail: u32 slot, incarnation, episode, episode_steps, u64 number; slot = 2^32 - 1: none
 //!   block: f32 × block_len (filled ones)                                 all little-endian
 //! ```
@@ -71,7 +71,8 @@ impl Replay {
         }
         for slot in &self.slots[..self.filled] {
             out.write_all(&slot.next.to_le_bytes())?;
-            out.write_all(&[slot.steps_len, slot.terminated.into(), slot.truncated.into(), 0])?;
+            let flags = [slot.terminated, slot.truncated, slot.hindsight].map(u8::from);
+            out.write_all(&[slot.steps_len, flags[0], flags[1], flags[2]])?;
         }
         for tail in &self.tails {
             let (words, number) = match tail {
@@ -137,17 +138,15 @@ impl Replay {
         let next = read_u32(input)?;
         let mut fields = [0; 4];
         input.read_exact(&mut fields)?;
-        let [steps_len, terminated, truncated, zero] = fields;
+        let [steps_len, flags @ ..] = fields;
         let sound = (1..=self.layout.segment_steps).contains(&usize::from(steps_len))
-            && terminated <= 1
-            && truncated <= 1
-            && zero == 0
+            && flags.iter().all(|&flag| flag <= 1)
             && (next == NONE || (next as usize) < self.filled);
         if !sound {
             return Err(ReplayFileError::Inconsistent { name: "slot", index });
         }
-        let (terminated, truncated) = (terminated == 1, truncated == 1);
-        Ok(Slot { next, steps_len, terminated, truncated })
+        let [terminated, truncated, hindsight] = flags.map(|flag| flag == 1);
+        Ok(Slot { next, steps_len, terminated, truncated, hindsight })
     }
 
     fn read_tail(

@@ -8,7 +8,7 @@
 mod file;
 mod window;
 
-use dmprl_shared::segment::{SegmentHeader, SegmentLayout, TERMINATED, TRUNCATED};
+use dmprl_shared::segment::{HINDSIGHT, SegmentHeader, SegmentLayout, TERMINATED, TRUNCATED};
 
 pub use file::ReplayFileError;
 pub use window::{Sampler, Window};
@@ -25,6 +25,8 @@ struct Slot {
     steps_len: u8,
     terminated: bool,
     truncated: bool,
+    /// A copy with a goal of its own: a sample by itself, and a part of no episode.
+    hindsight: bool,
 }
 
 /// The newest segment of one environment.
@@ -110,10 +112,13 @@ impl Replay {
             steps_len: header.steps_len as u8,
             terminated: header.flags & TERMINATED != 0,
             truncated: header.flags & TRUNCATED != 0,
+            hindsight: header.flags & HINDSIGHT != 0,
         };
         self.head = (at + 1) % self.slots.len();
         self.filled = (self.filled + 1).min(self.slots.len());
-        self.link(header, at as u32);
+        if !self.slots[at].hindsight {
+            self.link(header, at as u32);
+        }
         self.inserted += 1;
     }
 

@@ -160,7 +160,9 @@ impl Sampler {
 
     /// Draws one window, or `None` if `TRIES_MAX` draws met none.
     ///
-    /// Steps that start no window are redrawn, so every window is equally likely.
+    /// Steps that start no window are redrawn, so every window of an episode is equally likely. A
+    /// copy with another goal is one window: it is drawn as often as the K windows of a segment,
+    /// so that copies have the same share of samples whatever `windows` says.
     pub fn draw(&mut self, replay: &Replay) -> Option<Window> {
         if replay.is_empty() {
             return None;
@@ -169,6 +171,7 @@ impl Sampler {
             let slot = self.random.random_range(0..replay.len() as u32) as usize;
             let offset = match self.windows {
                 Windows::Segment => 0,
+                Windows::Sliding if replay.slots[slot].hindsight => 0,
                 Windows::Sliding => {
                     self.random.random_range(0..replay.layout().segment_steps as u32) as usize
                 }

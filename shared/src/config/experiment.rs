@@ -92,17 +92,31 @@ impl Default for TaskConfig {
     }
 }
 
+/// Which goals an episode is repeated with.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Hindsight {
+    /// None but the one it had.
+    None,
+    /// Goals reached later in it (Andrychowicz et al. 2017, section 4.5).
+    Future,
+}
+
 /// Storage of experience.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct ReplayConfig {
-    /// Environment steps held; the oldest are replaced.
+    /// Environment steps held, copies included; the oldest are replaced.
     pub capacity_steps: usize,
+    /// Which goals the workers repeat their segments with, in goal-conditioned environments.
+    pub hindsight: Hindsight,
+    /// Copies of each segment, each with a goal of its own.
+    pub hindsight_copies: usize,
 }
 
 impl Default for ReplayConfig {
     fn default() -> Self {
-        Self { capacity_steps: 1_000_000 }
+        Self { capacity_steps: 1_000_000, hindsight: Hindsight::None, hindsight_copies: 4 }
     }
 }
 

@@ -14,6 +14,7 @@ const WORKERS_MAX: usize = 1_024;
 const ENVS_PER_WORKER_MAX: usize = 4_096;
 /// A slot of the replay counts its steps in a byte.
 const SEGMENT_STEPS_MAX: usize = 255;
+const HINDSIGHT_COPIES_MAX: usize = 64;
 const HIDDEN_MAX: usize = 65_536;
 
 impl ExperimentConfig {
@@ -48,6 +49,7 @@ impl ExperimentConfig {
             ("dmp.integration_steps", self.dmp.integration_steps, 1, 100_000),
             ("algorithm.batch_size", self.algorithm.batch_size, 1, 1 << 20),
             ("replay.capacity_steps", self.replay.capacity_steps, 1_000, 1 << 31),
+            ("replay.hindsight_copies", self.replay.hindsight_copies, 1, HINDSIGHT_COPIES_MAX),
             ("learner.threads", self.learner.threads, 1, 1_024),
             ("evaluation.episodes", self.evaluation.episodes, 1, 1_000_000),
             ("checkpoint.keep", self.checkpoint.keep, 1, 10_000),
