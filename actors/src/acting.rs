@@ -75,7 +75,8 @@ impl Acting {
         if let (Head::Dmp(head), Some(dmp)) = (self.policy.head(), &mut self.work.dmp) {
             let rows = self.observations.len() / self.policy.layout().observation_len;
             (0..rows).for_each(|row| draw(head.squashed_mut(dmp, row)));
-            head.segment(&self.observations, dmp, &mut self.work.actions);
+            head.segment(&self.observations, dmp, &mut self.work.means);
+            self.work.squash_means(self.u.len());
             self.u.copy_from_slice(&self.work.actions);
         }
     }

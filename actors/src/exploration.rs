@@ -1,6 +1,9 @@
 //! How a rollout departs from its policy: warm-up draws, and noise on actions or DMP parameters.
 
+use std::ops::Range;
+
 use dmprl_shared::config::{ExplorationConfig, ExplorationKind, WarmUpKind};
+use dmprl_shared::policy::gaussian;
 use rand::{Rng, RngExt};
 use rand_distr::StandardNormal;
 use rand_xoshiro::Xoshiro256PlusPlus;
@@ -47,7 +50,14 @@ impl Exploration {
     }
 
     /// Turns the network's outputs into `u` with noise, within [-1, 1].
+    ///
+    /// A Gaussian policy draws from itself; kind and std of the noise then mean nothing.
     pub fn explore(&mut self, acting: &mut Acting) {
+        if let Some(columns) = acting.policy.log_stds() {
+            acting.decode();
+            self.draw(acting, columns);
+            return;
+        }
         let std = self.config.std as f32;
         if self.config.kind == ExplorationKind::DmpParameters {
             let envs = acting.observations.len() / acting.policy.layout().observation_len;
@@ -66,6 +76,21 @@ impl Exploration {
                     let u = &mut u[step * dims + d];
                     *u = (*u + std * noise).clamp(-1.0, 1.0);
                 }
+            }
+        }
+    }
+
+    /// u = tanh(mean + std noise), std from the network's outputs at `columns`.
+    fn draw(&mut self, acting: &mut Acting, columns: Range<usize>) {
+        let len = acting.policy.layout().actions_len();
+        let envs = acting.u.len() / len;
+        let outputs = acting.work.activations.output(acting.policy.shape(), envs);
+        let rows = outputs.chunks_exact(acting.policy.shape().outputs());
+        for (env, row) in rows.enumerate() {
+            for (index, raw_log_std) in row[columns.clone()].iter().enumerate() {
+                let at = env * len + index;
+                let noise = normal(&mut self.random);
+                acting.u[at] = gaussian::draw(acting.work.means[at], *raw_log_std, noise).action;
             }
         }
     }

@@ -219,6 +219,8 @@ fn the_keys_of_both_kinds_of_lines_are_documented() {
         critic_loss: None,
         actor_loss: None,
         q_mean: None,
+        temperature: None,
+        entropy: None,
         episodes: 0,
         training_return_mean: None,
         training_success_rate: None,

@@ -11,8 +11,7 @@ use dmprl_shared::spec::EnvSpec;
 use serde::{Deserialize, Serialize};
 use thiserror::Error;
 
-use crate::algorithms::ddpg::Ddpg;
-use crate::algorithms::{Batch, NoWindow};
+use crate::algorithms::{Algorithm, Batch, NoWindow};
 use crate::metrics::{Collector, MetricsLine, Rejected};
 use crate::pacing::Pacing;
 use crate::replay::{Replay, Sampler};
@@ -76,7 +75,7 @@ pub struct Learner {
     policy: Policy,
     expected: Expected,
     /// Networks and optimisers.
-    pub algorithm: Ddpg,
+    pub algorithm: Algorithm,
     /// Experience.
     pub replay: Replay,
     /// Draws batches.
@@ -106,7 +105,7 @@ impl Learner {
         let policy = Policy::new(&config, spec)?;
         let (workers, envs) = (config.actors.workers, config.actors.envs_per_worker);
         let layout = policy.layout();
-        let algorithm = Ddpg::new(&config, &policy)?;
+        let algorithm = Algorithm::new(&config, &policy)?;
         let random = seeds::stream(config.run.seed, "replay", 0);
         Ok(Self {
             expected: Expected {
@@ -211,10 +210,12 @@ impl Learner {
         let source = (&self.replay, &mut self.sampler);
         let shape = self.algorithm.batch_shape();
         self.batch.sample(shape, &self.config.algorithm, self.omega, source)?;
-        let losses = self.algorithm.update(&self.policy, &self.batch)?;
+        let update = self.counters.updates + 1;
+        let losses = self.algorithm.update(&self.policy, &self.batch, update)?;
         for (name, value) in
-            [("critic_loss", losses.critic_loss), ("actor_loss", losses.actor_loss)]
+            [("critic_loss", Some(losses.critic_loss)), ("actor_loss", losses.actor_loss)]
         {
+            let Some(value) = value else { continue };
             if !value.is_finite() {
                 return Err(LearnerError::NotFinite { update: self.counters.updates, name, value });
             }
@@ -234,7 +235,7 @@ impl Learner {
         self.snapshot.version = self.counters.policy_version;
         self.snapshot.env_steps = self.counters.env_steps;
         let values = &mut self.snapshot.values;
-        self.algorithm.actor.network.read(|parameters| values.copy_from_slice(parameters))?;
+        self.algorithm.actor().network.read(|parameters| values.copy_from_slice(parameters))?;
         Ok(&self.snapshot)
     }
 
@@ -249,8 +250,11 @@ impl Learner {
     /// # Errors
     /// If the lengths differ.
     pub fn warm_start(&mut self, parameters: &[f32]) -> Result<(), LearnerError> {
-        self.algorithm.actor.network.set(parameters)?;
-        self.algorithm.actor.target.set(parameters)?;
+        let actor = self.algorithm.actor();
+        actor.network.set(parameters)?;
+        if let Some(target) = &actor.target {
+            target.set(parameters)?;
+        }
         Ok(())
     }
 
@@ -276,9 +280,11 @@ impl Learner {
             rejected: counters.rejected,
             lost: counters.lost,
             env_failures: counters.env_failures,
-            critic_loss: collected.losses.map(|losses| losses.0),
-            actor_loss: collected.losses.map(|losses| losses.1),
-            q_mean: collected.losses.map(|losses| losses.2),
+            critic_loss: collected.critic_loss,
+            actor_loss: collected.actor_loss,
+            q_mean: collected.q_mean,
+            temperature: collected.temperature,
+            entropy: collected.entropy,
             episodes: collected.episodes,
             training_return_mean: collected.return_mean,
             training_success_rate: collected.success_rate,

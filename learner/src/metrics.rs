@@ -5,7 +5,7 @@ use dmprl_shared::segment::{
 };
 use serde::{Deserialize, Serialize};
 
-use crate::algorithms::ddpg::Losses;
+use crate::algorithms::Losses;
 
 /// One line of `metrics.jsonl`. "Since the last line" is meant where nothing else is said; a mean
 /// over nothing is null.
@@ -42,6 +42,12 @@ pub struct MetricsLine {
     pub actor_loss: Option<f64>,
     /// mean Q over sampled windows.
     pub q_mean: Option<f64>,
+    /// SAC: mean weight of the entropy.
+    #[serde(default)]
+    pub temperature: Option<f64>,
+    /// SAC: mean -log pi of the actor's draws [nat].
+    #[serde(default)]
+    pub entropy: Option<f64>,
     /// Training episodes (with exploration) that ended.
     pub episodes: u64,
     /// Mean of their returns.
@@ -138,12 +144,34 @@ pub struct Collector {
     lag_next: usize,
 }
 
+/// A mean in the making.
+#[derive(Debug, Default)]
+struct Mean {
+    sum: f64,
+    count: u64,
+}
+
+impl Mean {
+    fn add(&mut self, value: impl Into<Option<f32>>) {
+        if let Some(value) = value.into() {
+            self.sum += f64::from(value);
+            self.count += 1;
+        }
+    }
+
+    /// None over nothing.
+    fn value(&self) -> Option<f64> {
+        (self.count > 0).then(|| self.sum / self.count as f64)
+    }
+}
+
 #[derive(Debug, Default)]
 struct Sums {
-    updates: u64,
-    critic_loss: f64,
-    actor_loss: f64,
-    q_mean: f64,
+    critic_loss: Mean,
+    actor_loss: Mean,
+    q_mean: Mean,
+    temperature: Mean,
+    entropy: Mean,
     episodes: u64,
     returns: f64,
     /// Ended episodes that said whether they succeeded, and those that did.
@@ -155,8 +183,16 @@ struct Sums {
 /// What a line takes from a [`Collector`].
 #[derive(Debug, Clone, PartialEq)]
 pub struct Collected {
-    /// mean (Q - target)^2, -mean Q(s, pi(s)), mean Q.
-    pub losses: Option<(f64, f64, f64)>,
+    /// Mean (Q - target)^2.
+    pub critic_loss: Option<f64>,
+    /// Mean of what the actor descends.
+    pub actor_loss: Option<f64>,
+    /// Mean Q of the batches' actions.
+    pub q_mean: Option<f64>,
+    /// Mean weight of the entropy.
+    pub temperature: Option<f64>,
+    /// Mean -log pi of the actor's draws.
+    pub entropy: Option<f64>,
     /// Training episodes that ended.
     pub episodes: u64,
     /// Mean of their returns.
@@ -185,10 +221,11 @@ impl Collector {
 
     /// Books an update.
     pub fn updated(&mut self, losses: Losses) {
-        self.window.updates += 1;
-        self.window.critic_loss += f64::from(losses.critic_loss);
-        self.window.actor_loss += f64::from(losses.actor_loss);
-        self.window.q_mean += f64::from(losses.q_mean);
+        self.window.critic_loss.add(losses.critic_loss);
+        self.window.actor_loss.add(losses.actor_loss);
+        self.window.q_mean.add(losses.q_mean);
+        self.window.temperature.add(losses.temperature);
+        self.window.entropy.add(losses.entropy);
     }
 
     /// Books an inserted segment; `newest` is the newest policy's version.
@@ -226,16 +263,17 @@ impl Collector {
     /// Closes the window and opens the next.
     pub fn take(&mut self) -> Collected {
         let window = std::mem::take(&mut self.window);
-        let updates = window.updates as f64;
         let episodes = window.episodes as f64;
         self.lags.sort_unstable();
         let lag = (!self.lags.is_empty()).then(|| (self.lags[self.lags.len() / 2], window.lag_max));
         self.lags.clear();
         self.lag_next = 0;
         Collected {
-            losses: (window.updates > 0).then(|| {
-                (window.critic_loss / updates, window.actor_loss / updates, window.q_mean / updates)
-            }),
+            critic_loss: window.critic_loss.value(),
+            actor_loss: window.actor_loss.value(),
+            q_mean: window.q_mean.value(),
+            temperature: window.temperature.value(),
+            entropy: window.entropy.value(),
             episodes: window.episodes,
             return_mean: (window.episodes > 0).then(|| window.returns / episodes),
             success_rate: (window.judged > 0)

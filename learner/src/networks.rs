@@ -42,10 +42,7 @@ impl Parameters {
     /// If the variable is not a contiguous f32 vector on the CPU.
     pub fn read<R>(&self, f: impl FnOnce(&[f32]) -> R) -> Result<R> {
         let (storage, layout) = self.0.storage_and_layout();
-        let Storage::Cpu(storage) = &*storage else {
-            candle_core::bail!("network parameters are not on the CPU");
-        };
-        Ok(f(contiguous(storage.as_slice::<f32>()?, layout)?))
+        Ok(f(values(&storage, layout)?))
     }
 
     /// Hands the values to `f` to change them in place.
@@ -69,7 +66,15 @@ impl Parameters {
     }
 }
 
-fn contiguous<'a>(values: &'a [f32], layout: &Layout) -> Result<&'a [f32]> {
+/// The values in a variable's storage.
+///
+/// # Errors
+/// If they are not a contiguous f32 vector on the CPU.
+pub(crate) fn values<'a>(storage: &'a Storage, layout: &Layout) -> Result<&'a [f32]> {
+    let Storage::Cpu(storage) = storage else {
+        candle_core::bail!("network parameters are not on the CPU");
+    };
+    let values = storage.as_slice::<f32>()?;
     match layout.contiguous_offsets() {
         Some((start, end)) => Ok(&values[start..end]),
         None => candle_core::bail!("network parameters are not contiguous"),

@@ -92,7 +92,9 @@ impl SegmentLayout {
         (self.segment_steps + 1) * self.observation_len
     }
 
-    fn actions_len(&self) -> usize {
+    /// Actions of a segment, K A.
+    #[must_use]
+    pub fn actions_len(&self) -> usize {
         self.segment_steps * self.action_len
     }
 

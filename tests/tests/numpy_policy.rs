@@ -10,7 +10,7 @@ use std::process::Command;
 
 use dmprl::bench::{Controls, NumpyPlan};
 use dmprl_shared::config::{ExperimentConfig, Layers, Limits, task_defaults};
-use dmprl_shared::policy::{Policy, Threads};
+use dmprl_shared::policy::Policy;
 use dmprl_shared::seeds;
 use dmprl_shared::spec::EnvSpec;
 use dmprl_tests::{project_root, venv};
@@ -81,7 +81,7 @@ fn assert_same(task: &str, keys: &[(&str, &str)]) {
     let len = ROWS * policy.layout().observation_len;
     let observations: Vec<f32> = (0..len).map(|index| 1.5 * (index as f32 * 1.7).sin()).collect();
     let mut work = policy.workspace(ROWS);
-    policy.act(&parameters, &observations, &mut work, Threads::ONE);
+    policy.act(&parameters, &observations, &mut work);
     let spread = work.actions.iter().fold(0.0_f32, |largest, u| largest.max(u.abs()));
     assert!(spread > 0.1, "{keys:?}: actions of nothing compare nothing");
     let mut scaled = vec![0.0; work.actions.len()];

@@ -168,6 +168,8 @@ fn is_safetensors(path: &Path) -> std::io::Result<bool> {
 fn default_path(config: &ExperimentConfig) -> anyhow::Result<PathBuf> {
     let algorithm = match config.algorithm.name {
         AlgorithmName::Ddpg => "ddpg",
+        AlgorithmName::Td3 => "td3",
+        AlgorithmName::Sac => "sac",
     };
     let policy = match config.policy.kind {
         PolicyKind::Dmp => "dmp",

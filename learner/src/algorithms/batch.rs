@@ -1,7 +1,9 @@
 //! A batch of windows, sampled straight into the buffers that the update reads.
 
-use dmprl_shared::config::{AlgorithmConfig, CriticInput, Target};
+use dmprl_shared::config::{AlgorithmConfig, AlgorithmName, CriticInput, Target};
 use dmprl_shared::policy::Policy;
+use rand::RngExt;
+use rand_distr::StandardNormal;
 use thiserror::Error;
 
 use crate::replay::{Replay, Sampler};
@@ -32,6 +34,10 @@ pub struct BatchShape {
     pub end_state_len: usize,
     /// A whole segment's actions, K A.
     pub segment_actions_len: usize,
+    /// Whether the target draws noise: TD3 and SAC.
+    pub next_noise: bool,
+    /// Whether the actor's step does: SAC.
+    pub noise: bool,
 }
 
 impl BatchShape {
@@ -49,6 +55,8 @@ impl BatchShape {
             // A critic of the first action alone judges nothing that comes after it.
             end_state_len: if whole { carried } else { 0 },
             segment_actions_len,
+            next_noise: matches!(config.name, AlgorithmName::Td3 | AlgorithmName::Sac),
+            noise: config.name == AlgorithmName::Sac,
         }
     }
 
@@ -72,6 +80,10 @@ pub struct Batch {
     pub bootstrap: Vec<f32>,
     /// The observation that the target bootstraps from, (B, O).
     pub next_observations: Vec<f32>,
+    /// Standard normal noise for the actions after the window, (B, K A), or none.
+    pub next_noise: Vec<f32>,
+    /// Standard normal noise for the actor's own actions, (B, K A), or none.
+    pub noise: Vec<f32>,
     actions: Vec<f32>,
 }
 
@@ -79,12 +91,16 @@ impl Batch {
     /// Buffers for one batch.
     #[must_use]
     pub fn new(shape: BatchShape) -> Self {
+        let actions_len = shape.rows * shape.segment_actions_len;
+        let noise = |used: bool| vec![0.0; if used { actions_len } else { 0 }];
         Self {
             observations: vec![0.0; shape.rows * shape.observation_len],
             critic_inputs: vec![0.0; shape.rows * shape.critic_inputs()],
             rewards: vec![0.0; shape.rows],
             bootstrap: vec![0.0; shape.rows],
             next_observations: vec![0.0; shape.rows * shape.observation_len],
+            next_noise: noise(shape.next_noise),
+            noise: noise(shape.noise),
             actions: vec![0.0; shape.segment_actions_len],
         }
     }
@@ -140,6 +156,9 @@ impl Batch {
                 end.copy_from_slice(state);
                 end[dims..].iter_mut().for_each(|velocity| *velocity /= omega);
             }
+        }
+        for value in self.next_noise.iter_mut().chain(&mut self.noise) {
+            *value = sampler.random_mut().sample(StandardNormal);
         }
         Ok(())
     }

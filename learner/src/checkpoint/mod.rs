@@ -12,6 +12,7 @@
 mod networks_file;
 mod rotation;
 
+use std::collections::BTreeMap;
 use std::fs::{self, File};
 use std::io::{BufReader, BufWriter, Read, Write};
 use std::path::{Path, PathBuf};
@@ -27,7 +28,7 @@ use crate::update::adam::AdamStep;
 pub use rotation::names;
 
 /// Version of this format.
-const FORMAT_VERSION: u32 = 1;
+const FORMAT_VERSION: u32 = 2;
 const NETWORKS: &str = "networks.safetensors";
 const REPLAY: &str = "replay.bin";
 const STATE: &str = "state.json";
@@ -89,8 +90,8 @@ struct State {
     architecture_hash: u64,
     counters: Counters,
     updates_owed: f64,
-    actor_adam_step: AdamStep,
-    critic_adam_step: AdamStep,
+    /// By the network's name.
+    adam_steps: BTreeMap<String, AdamStep>,
     sampler_random: Xoshiro256PlusPlus,
     files: Vec<FileSum>,
 }
@@ -141,7 +142,8 @@ pub fn save(folder: &Path, learner: &Learner) -> Result<String, CheckpointError>
 }
 
 fn write_files(folder: &Path, learner: &Learner) -> Result<(), CheckpointError> {
-    let networks = write_summed(folder, NETWORKS, |out| {
+    let networks = learner.algorithm.networks();
+    let networks_sum = write_summed(folder, NETWORKS, |out| {
         let bytes = networks_file::bytes(learner).map_err(std::io::Error::other)?;
         out.write_all(&bytes)
     })?;
@@ -153,10 +155,9 @@ fn write_files(folder: &Path, learner: &Learner) -> Result<(), CheckpointError> 
         architecture_hash: learner.policy().architecture_hash(),
         counters: learner.counters,
         updates_owed: learner.pacing.owed(),
-        actor_adam_step: learner.algorithm.actor.adam.step,
-        critic_adam_step: learner.algorithm.critic.adam.step,
+        adam_steps: networks.iter().map(|(name, t)| ((*name).to_owned(), t.adam.step)).collect(),
         sampler_random: learner.sampler.random().clone(),
-        files: vec![networks, replay],
+        files: vec![networks_sum, replay],
     };
     write_summed(folder, STATE, |out| {
         serde_json::to_writer_pretty(out, &state).map_err(Into::into)
@@ -170,8 +171,7 @@ fn write_files(folder: &Path, learner: &Learner) -> Result<(), CheckpointError> 
 /// If the folder cannot be read.
 pub fn env_steps(folder: &Path) -> Result<Vec<u64>, CheckpointError> {
     let read = |name: String| {
-        let state: State =
-            serde_json::from_slice(&fs::read(folder.join(name).join(STATE)).ok()?).ok()?;
+        let state = read_state(&fs::read(folder.join(name).join(STATE)).ok()?).ok()?;
         Some(state.counters.env_steps)
     };
     Ok(names(folder)?.into_iter().filter_map(read).collect())
@@ -245,13 +245,7 @@ fn load(folder: &Path, learner: &mut Learner) -> Result<(), CheckpointError> {
     let format =
         |path: &Path, cause: String| CheckpointError::Format { path: path.to_owned(), cause };
     let text = fs::read(&path).map_err(io_error(&path))?;
-    let state: State =
-        serde_json::from_slice(&text).map_err(|error| format(&path, error.to_string()))?;
-    if state.format_version != FORMAT_VERSION {
-        let cause =
-            format!("format version {}, this build reads {FORMAT_VERSION}", state.format_version);
-        return Err(format(&path, cause));
-    }
+    let state = read_state(&text).map_err(|cause| format(&path, cause))?;
     let own = learner.policy().architecture_hash();
     if state.architecture_hash != own {
         let got = state.architecture_hash;
@@ -273,13 +267,43 @@ fn load(folder: &Path, learner: &mut Learner) -> Result<(), CheckpointError> {
         .replay
         .read(&mut input)
         .map_err(|cause| CheckpointError::Replay { path: replay, cause })?;
-    learner.algorithm.actor.adam.step = state.actor_adam_step;
-    learner.algorithm.critic.adam.step = state.critic_adam_step;
+    learner.algorithm.each_network(|name, trained| match state.adam_steps.get(name) {
+        Some(step) => {
+            trained.adam.step = *step;
+            Ok(())
+        }
+        None => Err(format(&path, format!("has no optimiser step of {name}"))),
+    })?;
     learner.counters = state.counters;
     learner.pacing.restore(state.updates_owed);
     let windows = learner.config().algorithm.windows;
     learner.sampler = Sampler::new(windows, state.sampler_random);
     Ok(())
+}
+
+/// Reads `state.json` of this version or the one before.
+fn read_state(text: &[u8]) -> Result<State, String> {
+    let mut state: serde_json::Map<String, serde_json::Value> =
+        serde_json::from_slice(text).map_err(|error| error.to_string())?;
+    let version = state.get("format_version").and_then(serde_json::Value::as_u64);
+    match version {
+        Some(version) if version == u64::from(FORMAT_VERSION) => {}
+        // Only DDPG existed, and its two optimisers had a field each.
+        Some(1) => {
+            let mut steps = serde_json::Map::new();
+            for name in ["actor", "critic"] {
+                if let Some(step) = state.remove(&format!("{name}_adam_step")) {
+                    steps.insert(name.to_owned(), step);
+                }
+            }
+            state.insert("adam_steps".into(), steps.into());
+        }
+        _ => {
+            let got = version.map_or("none".into(), |version| version.to_string());
+            return Err(format!("format version {got}, this build reads 1 to {FORMAT_VERSION}"));
+        }
+    }
+    serde_json::from_value(state.into()).map_err(|error| error.to_string())
 }
 
 fn verify(path: &Path, sum: &FileSum) -> Result<(), CheckpointError> {

@@ -4,8 +4,8 @@ use std::borrow::Cow;
 
 use safetensors::tensor::{Dtype, SafeTensors, View};
 
-use crate::algorithms::ddpg::Trained;
 use crate::learner::Learner;
+use crate::networks::Parameters;
 
 /// A flat tensor on its way to the file.
 struct Flat {
@@ -33,13 +33,16 @@ impl View for Flat {
 
 pub(super) fn bytes(learner: &Learner) -> Result<Vec<u8>, String> {
     let mut tensors = Vec::new();
-    for (name, trained) in networks(learner) {
-        let text = |error: candle_core::Error| error.to_string();
-        let network = trained.network.read(<[f32]>::to_vec).map_err(text)?;
-        let target = trained.target.read(<[f32]>::to_vec).map_err(text)?;
+    for (name, trained) in learner.algorithm.networks() {
+        let read = |network: &Parameters| network.read(<[f32]>::to_vec);
+        let network = read(&trained.network).map_err(|error| error.to_string())?;
+        let target = trained.target.as_ref().map(read).transpose();
+        let target = target.map_err(|error| error.to_string())?;
         let moments = &trained.adam.moments;
-        let parts = [network, target, moments.first.clone(), moments.second.clone()];
+        let parts =
+            [Some(network), target, Some(moments.first.clone()), Some(moments.second.clone())];
         for (part, values) in PARTS.iter().zip(parts) {
+            let Some(values) = values else { continue };
             tensors.push((format!("{name}.{part}"), Flat { len: values.len(), values }));
         }
     }
@@ -47,10 +50,6 @@ pub(super) fn bytes(learner: &Learner) -> Result<Vec<u8>, String> {
 }
 
 const PARTS: [&str; 4] = ["network", "target", "adam_first", "adam_second"];
-
-fn networks(learner: &Learner) -> [(&'static str, &Trained); 2] {
-    [("actor", &learner.algorithm.actor), ("critic", &learner.algorithm.critic)]
-}
 
 pub(super) fn restore(bytes: &[u8], learner: &mut Learner) -> Result<(), String> {
     let tensors = SafeTensors::deserialize(bytes).map_err(|error| error.to_string())?;
@@ -65,16 +64,17 @@ pub(super) fn restore(bytes: &[u8], learner: &mut Learner) -> Result<(), String>
         let chunks = tensor.data().as_chunks::<4>().0;
         Ok(chunks.iter().map(|bytes| f32::from_le_bytes(*bytes)).collect())
     };
-    let algorithm = &mut learner.algorithm;
-    for (name, trained) in [("actor", &mut algorithm.actor), ("critic", &mut algorithm.critic)] {
+    learner.algorithm.each_network(|name, trained| {
         let len = trained.adam.moments.first.len();
-        let set = |network: &crate::networks::Parameters, part| {
+        let set = |network: &Parameters, part| {
             network.set(&read(name, part, len)?).map_err(|error| error.to_string())
         };
         set(&trained.network, PARTS[0])?;
-        set(&trained.target, PARTS[1])?;
+        if let Some(target) = &trained.target {
+            set(target, PARTS[1])?;
+        }
         trained.adam.moments.first = read(name, PARTS[2], len)?;
         trained.adam.moments.second = read(name, PARTS[3], len)?;
-    }
-    Ok(())
+        Ok(())
+    })
 }

@@ -158,6 +158,11 @@ impl Sampler {
         &self.random
     }
 
+    /// The same, to draw what else a batch needs.
+    pub fn random_mut(&mut self) -> &mut Xoshiro256PlusPlus {
+        &mut self.random
+    }
+
     /// Draws one window, or `None` if `TRIES_MAX` draws met none.
     ///
     /// Steps that start no window are redrawn, so every window of an episode is equally likely. A

@@ -42,29 +42,57 @@ impl Adam {
         }
     }
 
-    /// parameters -= learning_rate * m̂ / (sqrt(v̂) + epsilon), with bias-corrected moments.
-    ///
-    /// # Panics
-    /// If the lengths differ.
-    pub fn update(&mut self, parameters: &mut [f32], gradient: &[f32]) {
-        let Moments { first, second } = &mut self.moments;
-        assert!(parameters.len() == gradient.len() && first.len() == gradient.len());
+    /// Begins the next step.
+    pub fn next_step(&mut self) -> Step {
         self.step.0 += 1;
         // The corrections are computed in f64: 1 - beta2^t loses its digits in f32 at small t.
         let correction = |beta: f32| 1.0 - f64::from(beta).powf(self.step.0 as f64);
-        let step_size = (f64::from(self.learning_rate) / correction(BETA1)) as f32;
-        let root = correction(BETA2).sqrt() as f32;
+        Step {
+            size: (f64::from(self.learning_rate) / correction(BETA1)) as f32,
+            root: correction(BETA2).sqrt() as f32,
+        }
+    }
+}
+
+/// The bias corrections of one step.
+#[derive(Debug, Clone, Copy)]
+pub struct Step {
+    size: f32,
+    root: f32,
+}
+
+/// Some of a network's parameters, with all that belongs to them.
+#[derive(Debug)]
+pub struct Slices<'a> {
+    /// The parameters.
+    pub parameters: &'a mut [f32],
+    /// Their gradient.
+    pub gradient: &'a [f32],
+    /// First moments.
+    pub first: &'a mut [f32],
+    /// Second moments.
+    pub second: &'a mut [f32],
+}
+
+impl Step {
+    /// parameters -= learning_rate * m̂ / (sqrt(v̂) + epsilon), with bias-corrected moments;
+    /// the target, if any, then moves by its share of the way.
+    pub fn update(self, slices: Slices<'_>, follower: Option<(&mut [f32], f32)>) {
+        let Slices { parameters, gradient, first, second } = slices;
         let moments = first.iter_mut().zip(second.iter_mut());
         for ((parameter, gradient), (m, v)) in parameters.iter_mut().zip(gradient).zip(moments) {
             *m = BETA1 * *m + (1.0 - BETA1) * gradient;
             *v = BETA2 * *v + (1.0 - BETA2) * gradient * gradient;
-            *parameter -= step_size * *m / (v.sqrt() / root + EPSILON);
+            *parameter -= self.size * *m / (v.sqrt() / self.root + EPSILON);
+        }
+        if let Some((target, share)) = follower {
+            polyak(target, parameters, share);
         }
     }
 }
 
 /// target <- polyak * network + (1 - polyak) * target.
-pub fn polyak(target: &mut [f32], network: &[f32], polyak: f32) {
+fn polyak(target: &mut [f32], network: &[f32], polyak: f32) {
     for (target, network) in target.iter_mut().zip(network) {
         *target += polyak * (network - *target);
     }
@@ -86,7 +114,11 @@ mod tests {
             let t = t as i32 + 1;
             expected -= 0.1 * (m / (1.0 - 0.9_f64.powi(t)))
                 / ((v / (1.0 - 0.999_f64.powi(t))).sqrt() + 1e-8);
-            adam.update(&mut parameters, &[gradient as f32]);
+            let step = adam.next_step();
+            let Moments { first, second } = &mut adam.moments;
+            let gradient = &[gradient as f32];
+            let parameters_now = &mut parameters;
+            step.update(Slices { parameters: parameters_now, gradient, first, second }, None);
             assert!(
                 (f64::from(parameters[0]) - expected).abs() < 1e-6,
                 "{parameters:?} {expected}"

@@ -1,4 +1,15 @@
-//! Stage 6 of 8: the kernels of an update, on buffers made once.
+//! Stage 6 of 8: the arithmetic of an update, on buffers made once.
+//!
+//! The batch is cut into blocks of rows. A block goes through all forward and backward passes of
+//! a step on one thread (`crew`, `pass`), its numbers staying in that core's cache; then the
+//! gradient of every parameter is summed over the blocks in their order, and Adam and the target
+//! follow at once (`trained`), shared out by rows of the weights. Neither the blocks nor the order
+//! depend on the number of threads.
 
 pub mod adam;
-pub mod backward;
+pub mod crew;
+pub mod pass;
+pub mod trained;
+
+/// Rows of a block.
+pub const BLOCK_ROWS: usize = 64;

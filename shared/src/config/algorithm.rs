@@ -8,6 +8,10 @@ use serde::{Deserialize, Serialize};
 pub enum AlgorithmName {
     /// Deep deterministic policy gradient (Lillicrap et al. 2016), with segments DDPG-DMP.
     Ddpg,
+    /// Twin delayed deep deterministic policy gradient (Fujimoto et al. 2018).
+    Td3,
+    /// Soft actor-critic with a learned temperature (Haarnoja et al. 2018b).
+    Sac,
 }
 
 /// Which actions the critic sees.
@@ -64,6 +68,51 @@ pub struct AlgorithmConfig {
     pub batch_size: usize,
     /// Widths of the critic's hidden layers.
     pub critic_hidden: Vec<usize>,
+    /// What only TD3 has.
+    pub td3: Td3Config,
+    /// What only SAC has.
+    pub sac: SacConfig,
+}
+
+/// What only TD3 has.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct Td3Config {
+    /// Standard deviation of the noise on the target policy's actions, in units of u.
+    pub target_noise_std: f64,
+    /// That noise is clipped to plus and minus this.
+    pub target_noise_clip: f64,
+    /// Updates of the critics for one of actor and targets.
+    pub actor_interval: u64,
+}
+
+impl Default for Td3Config {
+    fn default() -> Self {
+        Self { target_noise_std: 0.2, target_noise_clip: 0.5, actor_interval: 2 }
+    }
+}
+
+/// What only SAC has.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct SacConfig {
+    /// Weight of the entropy at the start.
+    pub initial_temperature: f64,
+    /// Adam step size of the temperature's logarithm.
+    pub temperature_learning_rate: f64,
+    /// Entropy that the temperature steers to, for each action of a decision [nat]. For
+    /// `mlp` policies -1 is the default: a segment's actions go together, so it has less.
+    pub target_entropy_per_action: f64,
+}
+
+impl Default for SacConfig {
+    fn default() -> Self {
+        Self {
+            initial_temperature: 1.0,
+            temperature_learning_rate: 3e-4,
+            target_entropy_per_action: -0.5,
+        }
+    }
 }
 
 impl Default for AlgorithmConfig {
@@ -79,6 +128,8 @@ impl Default for AlgorithmConfig {
             actor_learning_rate: 5e-4,
             batch_size: 256,
             critic_hidden: vec![256, 256],
+            td3: Td3Config::default(),
+            sac: SacConfig::default(),
         }
     }
 }
@@ -107,7 +158,8 @@ pub enum WarmUpKind {
     DmpParameters,
 }
 
-/// How the rollout departs from the policy.
+/// How the rollout departs from the policy. A policy that draws from a distribution of its own
+/// (SAC) departs by that: `kind` and `std` are then not used.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct ExplorationConfig {

@@ -14,8 +14,8 @@ mod resolve;
 mod tasks;
 
 pub use algorithm::{
-    AlgorithmConfig, AlgorithmName, CriticInput, ExplorationConfig, ExplorationKind, Target,
-    WarmUpKind, Windows,
+    AlgorithmConfig, AlgorithmName, CriticInput, ExplorationConfig, ExplorationKind, SacConfig,
+    Target, Td3Config, WarmUpKind, Windows,
 };
 pub use dmp::{
     BasisWidths, CanonicalIntegration, DmpConfig, ForcingScaling, Integrator, PolicyConfig,

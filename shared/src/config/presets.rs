@@ -63,6 +63,13 @@ critic_learning_rate = 0.0003
 actor_learning_rate = 0.0005
 batch_size = 256
 critic_hidden = [256, 256]
+[algorithm.td3]
+target_noise_std = 0.2
+target_noise_clip = 0.5
+actor_interval = 2
+[algorithm.sac]
+initial_temperature = 1.0
+temperature_learning_rate = 0.0003
 [exploration]
 kind = "gaussian"
 std = 0.1
@@ -95,8 +102,10 @@ publish_every_updates = 1
 pub fn policy_defaults(kind: PolicyKind) -> Option<Table> {
     match kind {
         PolicyKind::Dmp => None,
+        // The target entropy is one of the baselines too: no preset states it.
         PolicyKind::Mlp => {
-            let text = "[pacing]\nupdates_per_segment = 1.0";
+            let text = "[pacing]\nupdates_per_segment = 1.0\n\
+                        [algorithm.sac]\ntarget_entropy_per_action = -1.0";
             Some(text.parse().expect("the built-in defaults are valid TOML"))
         }
     }

@@ -85,6 +85,12 @@ impl ExperimentConfig {
         let positive = [
             ("algorithm.critic_learning_rate", self.algorithm.critic_learning_rate),
             ("algorithm.actor_learning_rate", self.algorithm.actor_learning_rate),
+            ("algorithm.td3.target_noise_clip", self.algorithm.td3.target_noise_clip),
+            ("algorithm.sac.initial_temperature", self.algorithm.sac.initial_temperature),
+            (
+                "algorithm.sac.temperature_learning_rate",
+                self.algorithm.sac.temperature_learning_rate,
+            ),
             ("policy.goal_range", self.policy.goal_range),
             ("policy.weight_range", self.policy.weight_range),
             ("policy.rho_range", self.policy.rho_range),
@@ -105,8 +111,17 @@ impl ExperimentConfig {
         for (key, got) in unit {
             range(key, got, got > 0.0 && got <= 1.0, || "above 0, at most 1".into())?;
         }
-        let std = self.exploration.std;
-        range("exploration.std", std, std.is_finite() && std >= 0.0, || "0 or more".into())?;
+        for (key, std) in [
+            ("exploration.std", self.exploration.std),
+            ("algorithm.td3.target_noise_std", self.algorithm.td3.target_noise_std),
+        ] {
+            range(key, std, std.is_finite() && std >= 0.0, || "0 or more".into())?;
+        }
+        let interval = self.algorithm.td3.actor_interval;
+        range("algorithm.td3.actor_interval", interval, interval > 0, || "1 or more".into())?;
+        let entropy = self.algorithm.sac.target_entropy_per_action;
+        let key = "algorithm.sac.target_entropy_per_action";
+        range(key, entropy, entropy.is_finite(), || "a finite number".into())?;
         let minutes = self.run.max_minutes;
         range("run.max_minutes", minutes, minutes > 0.0, || "above 0 (inf: no limit)".into())
     }

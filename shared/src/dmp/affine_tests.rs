@@ -116,7 +116,7 @@ fn loss(map: &SegmentMap, inputs: &[f32], rho: &[f32; 4]) -> f64 {
     let (mut samples, mut actions) = (vec![0.0; 3 * k_count], vec![0.0; k_count]);
     map.forward(inputs, &mut samples);
     act(&samples, rho, &mut actions);
-    let actions: f64 = (1..).zip(&actions).map(|(k, &u)| f64::from(k) * f64::from(u)).sum();
+    let actions: f64 = (1..).zip(&actions).map(|(k, &v)| f64::from(k) * f64::from(v.tanh())).sum();
     actions + f64::from(samples[k_count - 1]) + f64::from(samples[2 * k_count - 1])
 }
 
@@ -125,9 +125,11 @@ fn gradient(map: &SegmentMap, inputs: &[f32], rho: &[f32; 4]) -> (Vec<f32>, [f32
     let (mut samples, mut actions) = (vec![0.0; 3 * k_count], vec![0.0; k_count]);
     map.forward(inputs, &mut samples);
     act(&samples, rho, &mut actions);
-    let actions_gradient: Vec<f32> = (1..=k_count).map(|k| k as f32).collect();
+    let slope = |v: f32| 1.0 - v.tanh().powi(2);
+    let values_gradient: Vec<f32> =
+        (1..).zip(&actions).map(|(k, &v)| k as f32 * slope(v)).collect();
     let mut samples_gradient = vec![f32::NAN; 3 * k_count];
-    let of_rho = act_backward(&samples, rho, &actions, &actions_gradient, &mut samples_gradient);
+    let of_rho = act_backward(&samples, rho, &values_gradient, &mut samples_gradient);
     samples_gradient[k_count - 1] += 1.0;
     samples_gradient[2 * k_count - 1] += 1.0;
     let mut of_inputs = vec![f32::NAN; inputs.len()];

@@ -1,6 +1,6 @@
 //! What makes two policies the same function of parameters and observation.
 
-use crate::config::{ExperimentConfig, PolicyKind, StartSource};
+use crate::config::{AlgorithmName, ExperimentConfig, PolicyKind, StartSource};
 use crate::seeds;
 use crate::spec::EnvSpec;
 
@@ -22,6 +22,9 @@ pub(super) fn hash(config: &ExperimentConfig, spec: &EnvSpec) -> u64 {
     match config.policy.kind {
         PolicyKind::Mlp => list.push_str(" mlp"),
         PolicyKind::Dmp => list.push_str(&dmp(config, spec)),
+    }
+    if config.algorithm.name == AlgorithmName::Sac {
+        list.push_str(" squashed gaussian");
     }
     seeds::derive(0, &list, 0)
 }
@@ -108,6 +111,7 @@ mod tests {
             ("dmp.alpha_y", "12.0"),
             ("dmp.integrator", "explicit"),
             ("policy.kind", "mlp"),
+            ("algorithm.name", "sac"),
         ] {
             assert_ne!(hash_of(&[(key, value)]), same, "{key}");
         }

@@ -49,8 +49,8 @@ pub struct DmpWorkspace {
 
 #[derive(Debug)]
 struct Scratch {
-    actions: Vec<f32>,
-    actions_gradient: Vec<f32>,
+    means: Vec<f32>,
+    means_gradient: Vec<f32>,
     samples_gradient: Vec<f32>,
     inputs_gradient: Vec<f32>,
 }
@@ -58,8 +58,8 @@ struct Scratch {
 /// A gradient that arrives at the head.
 #[derive(Debug, Clone, Copy)]
 pub struct HeadGradient<'a> {
-    /// With respect to u, (rows, K, A).
-    pub actions: &'a [f32],
+    /// With respect to the means, before their tanh, (rows, K, A).
+    pub means: &'a [f32],
     /// With respect to the end state (y_K (A,), yd_K/omega (A,)), (rows, 2A); empty: none.
     pub end_state: &'a [f32],
 }
@@ -109,25 +109,27 @@ impl DmpHead {
             inputs: vec![0.0; cells * self.inputs_len()],
             samples: vec![0.0; cells * 3 * self.steps],
             scratch: Scratch {
-                actions: vec![0.0; self.steps],
-                actions_gradient: vec![0.0; self.steps],
+                means: vec![0.0; self.steps],
+                means_gradient: vec![0.0; self.steps],
                 samples_gradient: vec![0.0; 3 * self.steps],
                 inputs_gradient: vec![0.0; self.inputs_len()],
             },
         }
     }
 
-    /// Squashes the network's outputs, (rows, A (1+N+4)).
-    pub fn squash(&self, outputs: &[f32], work: &mut DmpWorkspace) {
-        let n = self.per_dimension();
-        let bounded = 1 + self.basis_count;
-        let squashed = &mut work.squashed[..outputs.len()];
-        for (outputs, squashed) in outputs.chunks_exact(n).zip(squashed.chunks_exact_mut(n)) {
-            let tanh_len = if self.rho == RhoKind::Bounded { n } else { bounded };
-            for (squashed, output) in squashed.iter_mut().zip(outputs).take(tanh_len) {
-                *squashed = output.tanh();
+    /// Squashes the network's outputs: each row of `stride` begins with the head's A (1+N+4).
+    pub fn squash(&self, outputs: &[f32], stride: usize, work: &mut DmpWorkspace) {
+        let (n, len) = (self.per_dimension(), self.outputs_len());
+        let tanh_len = if self.rho == RhoKind::Bounded { n } else { 1 + self.basis_count };
+        let rows = outputs.chunks_exact(stride).zip(work.squashed.chunks_exact_mut(len));
+        for (outputs, squashed) in rows {
+            let dims = outputs[..len].chunks_exact(n).zip(squashed.chunks_exact_mut(n));
+            for (outputs, squashed) in dims {
+                for (squashed, output) in squashed.iter_mut().zip(outputs).take(tanh_len) {
+                    *squashed = output.tanh();
+                }
+                squashed[tanh_len..].copy_from_slice(&outputs[tanh_len..]);
             }
-            squashed[tanh_len..].copy_from_slice(&outputs[tanh_len..]);
         }
     }
 
@@ -137,14 +139,14 @@ impl DmpHead {
         &mut work.squashed[row * len..(row + 1) * len]
     }
 
-    /// Makes the segments' actions, (rows, K, A), from squashed parameters and observations,
-    /// (rows, O).
-    pub fn segment(&self, observations: &[f32], work: &mut DmpWorkspace, actions: &mut [f32]) {
+    /// Makes the means of the segments' actions before their tanh, (rows, K, A), from squashed
+    /// parameters and observations, (rows, O).
+    pub fn segment(&self, observations: &[f32], work: &mut DmpWorkspace, means: &mut [f32]) {
         let (dims, steps) = (self.dims, self.steps);
         let (n, inputs_len) = (self.per_dimension(), self.inputs_len());
         let DmpWorkspace { squashed, inputs, samples, scratch } = work;
         for (row, observation) in observations.chunks_exact(self.observation_len).enumerate() {
-            let actions = &mut actions[row * steps * dims..(row + 1) * steps * dims];
+            let means = &mut means[row * steps * dims..(row + 1) * steps * dims];
             for d in 0..dims {
                 let cell = row * dims + d;
                 let squashed = &squashed[cell * n..(cell + 1) * n];
@@ -154,9 +156,9 @@ impl DmpHead {
                 inputs[2] = self.goal_range * squashed[0];
                 inputs[3..].copy_from_slice(&squashed[1..=self.basis_count]);
                 self.map.forward(inputs, samples);
-                act(samples, &self.rho(squashed), &mut scratch.actions);
-                for (k, action) in scratch.actions.iter().enumerate() {
-                    actions[k * dims + d] = *action;
+                act(samples, &self.rho(squashed), &mut scratch.means);
+                for (k, mean) in scratch.means.iter().enumerate() {
+                    means[k * dims + d] = *mean;
                 }
             }
         }
@@ -201,37 +203,32 @@ impl DmpHead {
         self.omega
     }
 
-    /// Gradient with respect to the network's outputs, (rows, A (1+N+4)), overwritten.
-    ///
-    /// `actions` are those of the forward pass that filled `work`, (rows, K, A).
+    /// Gradient with respect to the network's outputs: overwrites the head's A (1+N+4) at the
+    /// beginning of each row of `stride`.
     pub fn backward(
         &self,
         work: &mut DmpWorkspace,
-        actions: &[f32],
         gradient: HeadGradient<'_>,
         outputs_gradient: &mut [f32],
+        stride: usize,
     ) {
         let (dims, steps, n) = (self.dims, self.steps, self.per_dimension());
         let inputs_len = self.inputs_len();
         let DmpWorkspace { squashed, inputs, samples, scratch } = work;
-        for (cell, out) in outputs_gradient.chunks_exact_mut(n).enumerate() {
+        let rows = outputs_gradient.chunks_exact_mut(stride);
+        let cells = rows.flat_map(|row| row[..dims * n].chunks_exact_mut(n));
+        for (cell, out) in cells.enumerate() {
             let (row, d) = (cell / dims, cell % dims);
             let squashed = &squashed[cell * n..(cell + 1) * n];
             let inputs = &inputs[cell * inputs_len..(cell + 1) * inputs_len];
             let samples = &samples[cell * 3 * steps..(cell + 1) * 3 * steps];
             for k in 0..steps {
                 let at = (row * steps + k) * dims + d;
-                scratch.actions[k] = actions[at];
-                scratch.actions_gradient[k] = gradient.actions[at];
+                scratch.means_gradient[k] = gradient.means[at];
             }
             let rho = self.rho(squashed);
-            let rho_gradient = act_backward(
-                samples,
-                &rho,
-                &scratch.actions,
-                &scratch.actions_gradient,
-                &mut scratch.samples_gradient,
-            );
+            let rho_gradient =
+                act_backward(samples, &rho, &scratch.means_gradient, &mut scratch.samples_gradient);
             if !gradient.end_state.is_empty() {
                 let end = &gradient.end_state[row * 2 * dims..];
                 scratch.samples_gradient[steps - 1] += end[d];

@@ -1,19 +1,8 @@
 //! The one matrix product that network forward and backward passes are made of.
 
+use std::ops::Range;
+
 use gemm::Parallelism;
-
-/// Threads a product may use. The result does not depend on it.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct Threads(pub usize);
-
-impl Threads {
-    /// The calling thread alone.
-    pub const ONE: Self = Self(1);
-
-    fn parallelism(self) -> Parallelism {
-        if self.0 > 1 { Parallelism::Rayon(self.0) } else { Parallelism::None }
-    }
-}
 
 /// A (rows, cols) matrix in a slice, with strides.
 #[derive(Debug, Clone, Copy)]
@@ -58,6 +47,16 @@ impl<'a> Matrix<'a> {
         Self { data: &self.data[first * self.col_stride..], cols: self.cols - first, ..self }
     }
 
+    /// Some of the columns.
+    ///
+    /// # Panics
+    /// If the matrix does not have them.
+    #[must_use]
+    pub fn columns(self, columns: Range<usize>) -> Self {
+        assert!(columns.start < columns.end && columns.end <= self.cols, "{columns:?}");
+        Self { cols: columns.len(), ..self.columns_from(columns.start) }
+    }
+
     fn check(&self) {
         let last = (self.rows - 1) * self.row_stride + (self.cols - 1) * self.col_stride;
         assert!(last < self.data.len(), "matrix reaches {last} of {}", self.data.len());
@@ -68,7 +67,7 @@ impl<'a> Matrix<'a> {
 ///
 /// # Panics
 /// If the shapes do not fit.
-pub fn product(out: &mut [f32], a: Matrix<'_>, b: Matrix<'_>, keep: Keep, threads: Threads) {
+pub fn product(out: &mut [f32], a: Matrix<'_>, b: Matrix<'_>, keep: Keep) {
     assert_eq!(a.cols, b.rows, "inner dimensions of a product");
     assert_eq!(out.len(), a.rows * b.cols, "output of a product");
     if out.is_empty() {
@@ -100,7 +99,7 @@ pub fn product(out: &mut [f32], a: Matrix<'_>, b: Matrix<'_>, keep: Keep, thread
             false,
             false,
             false,
-            threads.parallelism(),
+            Parallelism::None,
         );
     }
 }
@@ -127,32 +126,18 @@ mod tests {
             .collect();
         let mut out = vec![1.0; 8];
         let (left, right) = (Matrix::row_major(&a, 2, 3), Matrix::row_major(&b, 3, 4));
-        product(&mut out, left, right, Keep::Replace, Threads::ONE);
+        product(&mut out, left, right, Keep::Replace);
         for (got, want) in out.iter().zip(&expected) {
             assert!((got - want).abs() < 1e-6, "{out:?} {expected:?}");
         }
         let b_t: Vec<f32> = (0..12).map(|i| b[i % 3 * 4 + i / 3]).collect(); // 4 x 3
         let right = Matrix::row_major(&b_t, 4, 3).transposed();
-        product(&mut out, left, right, Keep::Add, Threads::ONE);
+        product(&mut out, left, right, Keep::Add);
         for (got, want) in out.iter().zip(&expected) {
             assert!((got - 2.0 * want).abs() < 1e-5);
         }
         let mut last = vec![0.0; 4];
-        product(&mut last, left, right.columns_from(2), Keep::Replace, Threads::ONE);
+        product(&mut last, left, right.columns_from(2), Keep::Replace);
         assert!((last[1] - expected[3]).abs() < 1e-6 && (last[2] - expected[6]).abs() < 1e-6);
-    }
-
-    #[test]
-    fn the_number_of_threads_does_not_change_a_bit() {
-        let a: Vec<f32> = (0..256 * 256).map(|i| (i as f32 * 0.37).sin()).collect();
-        let b: Vec<f32> = (0..256 * 300).map(|i| (i as f32 * 0.73).cos()).collect();
-        let run = |threads| {
-            let mut out = vec![0.0; 256 * 300];
-            let (a, b) = (Matrix::row_major(&a, 256, 256), Matrix::row_major(&b, 256, 300));
-            product(&mut out, a, b, Keep::Replace, Threads(threads));
-            out
-        };
-        assert_eq!(run(1), run(2));
-        assert_eq!(run(1), run(5));
     }
 }

@@ -13,19 +13,22 @@
 mod action_scaling;
 mod architecture;
 mod dmp_head;
+pub mod gaussian;
 mod matrix;
 mod network;
 mod start;
+
+use std::ops::Range;
 
 use rand_xoshiro::Xoshiro256PlusPlus;
 use thiserror::Error;
 
 pub use action_scaling::ActionScaling;
 pub use dmp_head::{DmpHead, DmpWorkspace, HeadGradient};
-pub use matrix::{Keep, Matrix, Threads, product};
+pub use matrix::{Keep, Matrix, product};
 pub use network::{Activations, Layer, MlpShape, SmallBatchNetwork, forward, initial_parameters};
 
-use crate::config::{ExperimentConfig, PolicyKind};
+use crate::config::{AlgorithmName, ExperimentConfig, PolicyKind};
 use crate::dmp::DmpError;
 use crate::segment::SegmentLayout;
 use crate::spec::{EnvSpec, SpecError};
@@ -66,6 +69,8 @@ pub enum Head {
 pub struct Policy {
     shape: MlpShape,
     head: Head,
+    /// Outputs of the network that the head reads; log-stds may follow.
+    head_outputs: usize,
     layout: SegmentLayout,
     scaling: ActionScaling,
     env_observation_len: usize,
@@ -77,10 +82,21 @@ pub struct Policy {
 pub struct PolicyWorkspace {
     /// The network's activations, kept for the backward pass.
     pub activations: Activations,
+    /// tanh⁻¹ of u, (rows, K, A).
+    pub means: Vec<f32>,
     /// u, (rows, K, A).
     pub actions: Vec<f32>,
     /// What the head keeps for the backward pass.
     pub dmp: Option<DmpWorkspace>,
+}
+
+impl PolicyWorkspace {
+    /// u = tanh(mean) for the first `len` means.
+    pub fn squash_means(&mut self, len: usize) {
+        for (action, mean) in self.actions.iter_mut().zip(&self.means[..len]) {
+            *action = mean.tanh();
+        }
+    }
 }
 
 impl Policy {
@@ -100,16 +116,19 @@ impl Policy {
             PolicyKind::Mlp => Head::Mlp,
             PolicyKind::Dmp => Head::Dmp(Box::new(DmpHead::new(config, spec)?)),
         };
-        let outputs = match &head {
+        let head_outputs = match &head {
             Head::Mlp => spec.action_len,
             Head::Dmp(head) => head.outputs_len(),
         };
+        let gaussian = config.algorithm.name == AlgorithmName::Sac;
+        let outputs = head_outputs + if gaussian { layout.actions_len() } else { 0 };
         let mut widths = vec![layout.observation_len];
         widths.extend(&config.policy.hidden);
         widths.push(outputs);
         Ok(Self {
             shape: MlpShape::new(widths),
             head,
+            head_outputs,
             layout,
             scaling: ActionScaling::new(spec),
             env_observation_len: spec.observation_len,
@@ -141,6 +160,13 @@ impl Policy {
         &self.head
     }
 
+    /// Where a Gaussian policy's raw log-stds, (K, A), stand in a row of the network's outputs.
+    #[must_use]
+    pub fn log_stds(&self) -> Option<Range<usize>> {
+        let outputs = self.head_outputs..self.shape.outputs();
+        (!outputs.is_empty()).then_some(outputs)
+    }
+
     /// From u to the environment's own units.
     #[must_use]
     pub fn scaling(&self) -> &ActionScaling {
@@ -170,7 +196,8 @@ impl Policy {
     pub fn workspace(&self, rows_max: usize) -> PolicyWorkspace {
         PolicyWorkspace {
             activations: Activations::new(&self.shape, rows_max),
-            actions: vec![0.0; rows_max * self.layout.segment_steps * self.layout.action_len],
+            means: vec![0.0; rows_max * self.layout.actions_len()],
+            actions: vec![0.0; rows_max * self.layout.actions_len()],
             dmp: match &self.head {
                 Head::Mlp => None,
                 Head::Dmp(head) => Some(head.workspace(rows_max)),
@@ -184,14 +211,8 @@ impl Policy {
     ///
     /// # Panics
     /// If a length does not fit or there are more rows than the workspace holds.
-    pub fn act(
-        &self,
-        parameters: &[f32],
-        observations: &[f32],
-        work: &mut PolicyWorkspace,
-        threads: Threads,
-    ) {
-        forward(&self.shape, parameters, observations, &mut work.activations, threads);
+    pub fn act(&self, parameters: &[f32], observations: &[f32], work: &mut PolicyWorkspace) {
+        forward(&self.shape, parameters, observations, &mut work.activations);
         self.decode(observations, work);
     }
 
@@ -199,17 +220,18 @@ impl Policy {
     /// disturbed in `work.activations`, to u.
     pub fn decode(&self, observations: &[f32], work: &mut PolicyWorkspace) {
         let rows = observations.len() / self.layout.observation_len;
-        let outputs = work.activations.output(&self.shape, rows);
+        let (outputs, stride) = (work.activations.output(&self.shape, rows), self.shape.outputs());
         match (&self.head, &mut work.dmp) {
             (Head::Dmp(head), Some(dmp)) => {
-                head.squash(outputs, dmp);
-                head.segment(observations, dmp, &mut work.actions);
+                head.squash(outputs, stride, dmp);
+                head.segment(observations, dmp, &mut work.means);
             }
             _ => {
-                for (action, output) in work.actions.iter_mut().zip(outputs) {
-                    *action = output.tanh();
-                }
+                let dims = self.layout.action_len;
+                let rows = outputs.chunks_exact(stride).zip(work.means.chunks_exact_mut(dims));
+                rows.for_each(|(outputs, means)| means.copy_from_slice(&outputs[..dims]));
             }
         }
+        work.squash_means(rows * self.layout.actions_len());
     }
 }

@@ -4,7 +4,7 @@ use std::ops::Range;
 
 use rand::{Rng, RngExt};
 
-use super::matrix::{Keep, Matrix, Threads, product};
+use super::matrix::{Keep, Matrix, product};
 
 /// Widths of a network and where each layer's numbers stand in its flat parameters.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -124,13 +124,12 @@ pub fn forward(
     parameters: &[f32],
     inputs: &[f32],
     activations: &mut Activations,
-    threads: Threads,
 ) {
     let weights = |layer: &Layer| {
         let weights = &parameters[layer.weights.clone()];
         Matrix::row_major(weights, layer.outputs, layer.inputs).transposed()
     };
-    forward_with(shape, parameters, &weights, inputs, activations, threads);
+    forward_with(shape, parameters, &weights, inputs, activations);
 }
 
 /// Runs the network with each layer's (inputs, outputs) weights as `weights` gives them.
@@ -140,7 +139,6 @@ fn forward_with<'a>(
     weights: &dyn Fn(&Layer) -> Matrix<'a>,
     inputs: &[f32],
     activations: &mut Activations,
-    threads: Threads,
 ) {
     assert_eq!(parameters.len(), shape.parameters_len(), "network parameters");
     let rows = inputs.len() / shape.inputs();
@@ -154,7 +152,7 @@ fn forward_with<'a>(
             row.copy_from_slice(bias);
         }
         let inputs = Matrix::row_major(inputs, rows, layer.inputs);
-        product(out, inputs, weights(layer), Keep::Add, threads);
+        product(out, inputs, weights(layer), Keep::Add);
         if index < last {
             for value in out.iter_mut() {
                 *value = value.max(0.0);
@@ -212,7 +210,7 @@ impl SmallBatchNetwork {
             Matrix::row_major(weights, layer.inputs, layer.outputs)
         };
         let (shape, parameters) = (&self.shape, &self.parameters);
-        forward_with(shape, parameters, &weights, inputs, activations, Threads::ONE);
+        forward_with(shape, parameters, &weights, inputs, activations);
     }
 }
 
@@ -228,7 +226,7 @@ mod tests {
         let shape = MlpShape::new(vec![2, 2, 1]);
         let parameters = [1.0, 2.0, 3.0, 1.0, 0.5, -4.0, 2.0, -1.0, 0.25];
         let mut activations = Activations::new(&shape, 2);
-        forward(&shape, &parameters, &[1.0, -1.0, 1.0, 1.0], &mut activations, Threads::ONE);
+        forward(&shape, &parameters, &[1.0, -1.0, 1.0, 1.0], &mut activations);
         assert_eq!(activations.output(&shape, 2), [0.25, 7.25]);
     }
 
@@ -242,7 +240,7 @@ mod tests {
         for rows in [1, 8, 16, 100] {
             let inputs: Vec<f32> = (0..rows * 14).map(|i| (i as f32).sin()).collect();
             let mut expected = Activations::new(&shape, rows);
-            forward(&shape, &parameters, &inputs, &mut expected, Threads::ONE);
+            forward(&shape, &parameters, &inputs, &mut expected);
             let mut activations = Activations::new(&shape, rows);
             network.forward(&inputs, &mut activations);
             let both = activations.output(&shape, rows).iter().zip(expected.output(&shape, rows));
