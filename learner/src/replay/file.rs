@@ -179,7 +179,7 @@ fn read_u32(input: &mut impl Read) -> io::Result<u32> {
 
 #[cfg(test)]
 mod tests {
-    use dmprl_shared::segment::SegmentHeader;
+    use dmprl_shared::segment::{HINDSIGHT, SegmentHeader};
 
     use super::*;
 
@@ -192,6 +192,7 @@ mod tests {
             let block: Vec<f32> =
                 (0..LAYOUT.block_len()).map(|j| (i * 100) as f32 + j as f32).collect();
             let header = SegmentHeader {
+                flags: if i % 5 == 4 { HINDSIGHT } else { 0 },
                 env_index: i % 2,
                 episode_step: i / 2 * 3,
                 steps_len: 3,
