@@ -13,6 +13,7 @@ use thiserror::Error;
 
 use crate::algorithms::{Algorithm, Batch, NoWindow};
 use crate::metrics::{Collector, MetricsLine, Rejected};
+use crate::normaliser::Normaliser;
 use crate::pacing::Pacing;
 use crate::replay::{Replay, Sampler};
 
@@ -80,6 +81,8 @@ pub struct Learner {
     pub replay: Replay,
     /// Draws batches.
     pub sampler: Sampler,
+    /// Observation normalisation, if it is asked for.
+    pub normaliser: Option<Normaliser>,
     /// Updates owed.
     pub pacing: Pacing,
     /// Where the run stands.
@@ -117,6 +120,10 @@ impl Learner {
             },
             replay: Replay::new(layout, config.replay.capacity_steps, workers, envs),
             sampler: Sampler::new(config.algorithm.windows, random),
+            normaliser: config.policy.normalise_observations.then(|| {
+                // Nothing is learned before; afterwards they are taken anew at each doubling.
+                Normaliser::new(layout.observation_len, config.exploration.warm_up_steps)
+            }),
             pacing: Pacing::new(&config.pacing),
             counters: Counters::default(),
             batch: Batch::new(algorithm.batch_shape()),
@@ -172,6 +179,11 @@ impl Learner {
             return Err(why);
         }
         self.replay.insert(&segment.header, &segment.block);
+        if let Some(normaliser) = &mut self.normaliser {
+            let (observations, _, _) = self.expected.layout.split(&segment.block);
+            let seen = segment.header.steps_len as usize * normaliser.observation_len();
+            normaliser.observe(&observations[..seen]);
+        }
         if segment.header.flags & HINDSIGHT != 0 {
             // Experience, and nothing that an environment or an episode did.
             self.counters.hindsight_segments += 1;
@@ -207,9 +219,11 @@ impl Learner {
     /// # Errors
     /// If there is nothing to sample or a loss is not finite.
     pub fn update(&mut self) -> Result<(), LearnerError> {
+        self.refresh_normaliser()?;
         let source = (&self.replay, &mut self.sampler);
         let shape = self.algorithm.batch_shape();
-        self.batch.sample(shape, &self.config.algorithm, self.omega, source)?;
+        let normaliser = self.normaliser.as_ref();
+        self.batch.sample(shape, &self.config.algorithm, self.omega, normaliser, source)?;
         let update = self.counters.updates + 1;
         let losses = self.algorithm.update(&self.policy, &self.batch, update)?;
         for (name, value) in
@@ -226,6 +240,18 @@ impl Learner {
         Ok(())
     }
 
+    fn refresh_normaliser(&mut self) -> Result<(), LearnerError> {
+        if let Some(normaliser) = self.normaliser.as_mut().filter(|normaliser| normaliser.is_due())
+        {
+            let change = normaliser.refresh();
+            let sees_observations = |name: &str| name == "actor" || name.starts_with("critic");
+            self.algorithm.each_network(|name, trained| {
+                if sees_observations(name) { change.apply(trained) } else { Ok(()) }
+            })?;
+        }
+        Ok(())
+    }
+
     /// A snapshot of the actor under the next version.
     ///
     /// # Errors
@@ -236,6 +262,9 @@ impl Learner {
         self.snapshot.env_steps = self.counters.env_steps;
         let values = &mut self.snapshot.values;
         self.algorithm.actor().network.read(|parameters| values.copy_from_slice(parameters))?;
+        if let Some(normaliser) = &self.normaliser {
+            normaliser.fold(self.policy.shape(), values);
+        }
         Ok(&self.snapshot)
     }
 

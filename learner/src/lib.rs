@@ -8,6 +8,7 @@ pub mod checkpoint;
 pub mod learner;
 pub mod metrics;
 pub mod networks;
+pub mod normaliser;
 pub mod pacing;
 pub mod policy_file;
 pub mod replay;

@@ -5,12 +5,18 @@
 //! copied between two representations.
 
 use std::cell::RefCell;
+use std::sync::atomic::{AtomicU64, Ordering};
 
 use candle_core::{CpuStorage, Device, InplaceOp1, Layout, Result, Storage, Tensor, Var};
 
 /// The parameters of one network.
-#[derive(Debug, Clone)]
-pub struct Parameters(Var);
+#[derive(Debug)]
+pub struct Parameters {
+    var: Var,
+    /// How often the values were changed: whoever keeps a copy in another order can tell whether
+    /// it is still theirs.
+    changes: AtomicU64,
+}
 
 impl Parameters {
     /// Takes over drawn or loaded parameters.
@@ -19,7 +25,8 @@ impl Parameters {
     /// If candle cannot make the variable.
     pub fn new(values: Vec<f32>) -> Result<Self> {
         let len = values.len();
-        Ok(Self(Var::from_tensor(&Tensor::from_vec(values, len, &Device::Cpu)?)?))
+        let var = Var::from_tensor(&Tensor::from_vec(values, len, &Device::Cpu)?)?;
+        Ok(Self { var, changes: AtomicU64::new(1) })
     }
 
     /// A copy with storage of its own.
@@ -33,7 +40,13 @@ impl Parameters {
     /// The candle variable.
     #[must_use]
     pub fn var(&self) -> &Var {
-        &self.0
+        &self.var
+    }
+
+    /// A number that every change of the values makes greater; at least 1.
+    #[must_use]
+    pub fn changes(&self) -> u64 {
+        self.changes.load(Ordering::Acquire)
     }
 
     /// Hands the values to `f`.
@@ -41,7 +54,7 @@ impl Parameters {
     /// # Errors
     /// If the variable is not a contiguous f32 vector on the CPU.
     pub fn read<R>(&self, f: impl FnOnce(&[f32]) -> R) -> Result<R> {
-        let (storage, layout) = self.0.storage_and_layout();
+        let (storage, layout) = self.var.storage_and_layout();
         Ok(f(values(&storage, layout)?))
     }
 
@@ -50,7 +63,8 @@ impl Parameters {
     /// # Errors
     /// As [`Parameters::read`].
     pub fn update(&self, f: impl FnOnce(&mut [f32])) -> Result<()> {
-        self.0.inplace_op1(&InPlace(RefCell::new(Some(f))))
+        self.changes.fetch_add(1, Ordering::AcqRel);
+        self.var.inplace_op1(&InPlace(RefCell::new(Some(f))))
     }
 
     /// Replaces the values.
@@ -58,7 +72,7 @@ impl Parameters {
     /// # Errors
     /// If the lengths differ.
     pub fn set(&self, values: &[f32]) -> Result<()> {
-        let len = self.0.elem_count();
+        let len = self.var.elem_count();
         if values.len() != len {
             candle_core::bail!("network has {len} parameters, got {}", values.len());
         }

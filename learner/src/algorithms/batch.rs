@@ -6,6 +6,7 @@ use rand::RngExt;
 use rand_distr::StandardNormal;
 use thiserror::Error;
 
+use crate::normaliser::Normaliser;
 use crate::replay::{Replay, Sampler};
 
 /// The replay holds no window to learn from.
@@ -70,9 +71,11 @@ impl BatchShape {
 /// A sampled batch.
 #[derive(Debug)]
 pub struct Batch {
-    /// s_t, (B, O).
+    /// s_t as the environment and the DMP know it, (B, O).
     pub observations: Vec<f32>,
-    /// [s_t, actions, end state], (B, critic inputs).
+    /// s_t as the networks see it: normalised, where that is asked for, (B, O).
+    pub inputs: Vec<f32>,
+    /// [s_t as the networks see it, actions, end state], (B, critic inputs).
     pub critic_inputs: Vec<f32>,
     /// Sum of the window's rewards, discounted or not as the target wants it, (B,).
     pub rewards: Vec<f32>,
@@ -80,6 +83,8 @@ pub struct Batch {
     pub bootstrap: Vec<f32>,
     /// The observation that the target bootstraps from, (B, O).
     pub next_observations: Vec<f32>,
+    /// The same as the networks see it, (B, O).
+    pub next_inputs: Vec<f32>,
     /// Standard normal noise for the actions after the window, (B, K A), or none.
     pub next_noise: Vec<f32>,
     /// Standard normal noise for the actor's own actions, (B, K A), or none.
@@ -87,7 +92,28 @@ pub struct Batch {
     actions: Vec<f32>,
 }
 
+/// The same states as the DMP knows them and as the networks see them, (B, O) each.
+#[derive(Debug, Clone, Copy)]
+pub struct States<'a> {
+    /// As they are.
+    pub observations: &'a [f32],
+    /// Normalised, where that is asked for.
+    pub inputs: &'a [f32],
+}
+
 impl Batch {
+    /// s_t.
+    #[must_use]
+    pub fn states(&self) -> States<'_> {
+        States { observations: &self.observations, inputs: &self.inputs }
+    }
+
+    /// What the target bootstraps from.
+    #[must_use]
+    pub fn next_states(&self) -> States<'_> {
+        States { observations: &self.next_observations, inputs: &self.next_inputs }
+    }
+
     /// Buffers for one batch.
     #[must_use]
     pub fn new(shape: BatchShape) -> Self {
@@ -95,10 +121,12 @@ impl Batch {
         let noise = |used: bool| vec![0.0; if used { actions_len } else { 0 }];
         Self {
             observations: vec![0.0; shape.rows * shape.observation_len],
+            inputs: vec![0.0; shape.rows * shape.observation_len],
             critic_inputs: vec![0.0; shape.rows * shape.critic_inputs()],
             rewards: vec![0.0; shape.rows],
             bootstrap: vec![0.0; shape.rows],
             next_observations: vec![0.0; shape.rows * shape.observation_len],
+            next_inputs: vec![0.0; shape.rows * shape.observation_len],
             next_noise: noise(shape.next_noise),
             noise: noise(shape.noise),
             actions: vec![0.0; shape.segment_actions_len],
@@ -118,6 +146,7 @@ impl Batch {
         shape: BatchShape,
         config: &AlgorithmConfig,
         omega: f32,
+        normaliser: Option<&Normaliser>,
         (replay, sampler): (&Replay, &mut Sampler),
     ) -> Result<(), NoWindow> {
         let discount = config.discount as f32;
@@ -145,7 +174,11 @@ impl Batch {
             self.observations[row * o..(row + 1) * o].copy_from_slice(observation);
             let width = shape.critic_inputs();
             let input = &mut self.critic_inputs[row * width..(row + 1) * width];
-            input[..o].copy_from_slice(observation);
+            match normaliser {
+                Some(normaliser) => normaliser.apply_row(observation, &mut input[..o]),
+                None => input[..o].copy_from_slice(observation),
+            }
+            self.inputs[row * o..(row + 1) * o].copy_from_slice(&input[..o]);
             replay.actions(&window, &mut self.actions);
             input[o..o + shape.actions_len].copy_from_slice(&self.actions[..shape.actions_len]);
             if shape.end_state_len > 0 {
@@ -156,6 +189,10 @@ impl Batch {
                 end.copy_from_slice(state);
                 end[dims..].iter_mut().for_each(|velocity| *velocity /= omega);
             }
+        }
+        match normaliser {
+            Some(normaliser) => normaliser.apply(&self.next_observations, &mut self.next_inputs),
+            None => self.next_inputs.copy_from_slice(&self.next_observations),
         }
         for value in self.next_noise.iter_mut().chain(&mut self.noise) {
             *value = sampler.random_mut().sample(StandardNormal);

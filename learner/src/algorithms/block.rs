@@ -5,6 +5,7 @@ use std::ops::Range;
 
 use dmprl_shared::policy::{Activations, Head, HeadGradient, MlpShape, Policy, PolicyWorkspace};
 
+use super::batch::States;
 use super::{Batch, BatchShape};
 use crate::update::BLOCK_ROWS;
 use crate::update::pass::Gradients;
@@ -112,17 +113,15 @@ impl Block {
         self.batch_rows
     }
 
-    /// u = pi(observations), of an actor or its target.
-    pub fn act(&mut self, policy: &Policy, actor: &Lent<'_>, observations: &[f32]) {
-        let observations = self.part(observations);
-        actor.forward(observations, &mut self.policy.activations);
-        policy.decode(observations, &mut self.policy);
+    /// u = pi(states), of an actor or its target.
+    pub fn act(&mut self, policy: &Policy, actor: &Lent<'_>, states: States<'_>) {
+        actor.forward(self.part(states.inputs), &mut self.policy.activations);
+        policy.decode(self.part(states.observations), &mut self.policy);
     }
 
-    /// Q(observations, u) of the policy's own actions for the first `critics.len()` critics.
-    pub fn judge(&mut self, policy: &Policy, critics: &[Lent<'_>], observations: &[f32]) {
-        let observations = self.part(observations);
-        self.assemble(policy, observations);
+    /// Q(states, u) of the policy's own actions for each of the critics.
+    pub fn judge(&mut self, policy: &Policy, critics: &[Lent<'_>], states: States<'_>) {
+        self.assemble(policy, self.part(states.inputs));
         for (critic, buffers) in critics.iter().zip(&mut self.critics) {
             critic.forward(&self.critic_inputs, &mut buffers.activations);
         }
@@ -265,20 +264,21 @@ impl Block {
     #[must_use]
     pub fn actor_trace<'a>(&'a self, batch: &'a Batch) -> Trace<'a> {
         Trace {
-            inputs: self.part(&batch.observations),
+            inputs: self.part(&batch.inputs),
             activations: &self.policy.activations,
             gradients: &self.actor_gradients,
         }
     }
 
-    /// Builds the critic's input from observations and the actions that `policy` holds.
-    fn assemble(&mut self, policy: &Policy, observations: &[f32]) {
+    /// Builds the critic's input from what networks see of the states and the actions that
+    /// `policy` holds.
+    fn assemble(&mut self, policy: &Policy, inputs: &[f32]) {
         let BatchShape { observation_len, actions_len, segment_actions_len, .. } = self.shape;
         let width = self.shape.critic_inputs();
         for (row, input) in self.critic_inputs.chunks_exact_mut(width).enumerate() {
-            let observation = &observations[row * observation_len..(row + 1) * observation_len];
+            let state = &inputs[row * observation_len..(row + 1) * observation_len];
             let actions = &self.policy.actions[row * segment_actions_len..];
-            input[..observation_len].copy_from_slice(observation);
+            input[..observation_len].copy_from_slice(state);
             input[observation_len..observation_len + actions_len]
                 .copy_from_slice(&actions[..actions_len]);
         }

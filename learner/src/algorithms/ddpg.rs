@@ -71,8 +71,8 @@ impl Ddpg {
         let critic = self.critic.lend()?;
         let (critic_target, critic) = ([critic_target], [critic]);
         crew.each(&mut self.blocks, |block| {
-            block.act(policy, &actor_target, &batch.next_observations);
-            block.judge(policy, &critic_target, &batch.next_observations);
+            block.act(policy, &actor_target, batch.next_states());
+            block.judge(policy, &critic_target, batch.next_states());
             block.set_targets(batch, |block, row| block.q(0)[row]);
             block.regress(&critic, batch);
         });
@@ -89,8 +89,8 @@ impl Ddpg {
     fn actor_step(&mut self, policy: &Policy, batch: &Batch, crew: &Crew) -> Result<()> {
         let (actor, critic) = (self.actor.lend()?, [self.critic.lend()?]);
         crew.each(&mut self.blocks, |block| {
-            block.act(policy, &actor, &batch.observations);
-            block.judge(policy, &critic, &batch.observations);
+            block.act(policy, &actor, batch.states());
+            block.judge(policy, &critic, batch.states());
             block.ascend_q(policy, &actor, &critic);
         });
         drop((actor, critic));

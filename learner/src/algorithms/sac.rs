@@ -20,6 +20,7 @@ use candle_core::Result;
 use dmprl_shared::config::ExperimentConfig;
 use dmprl_shared::policy::{Policy, gaussian};
 
+use super::batch::States;
 use super::block::{Block, blocks, total};
 use super::{Batch, BatchShape, Losses, new_actor, new_critic};
 use crate::update::crew::Crew;
@@ -100,8 +101,8 @@ impl Sac {
         let targets = [first.lend_target()?, second.lend_target()?];
         let critics = [first.lend()?, second.lend()?];
         crew.each(&mut self.blocks, |block| {
-            draw(block, policy, &actor, &batch.next_observations, &batch.next_noise);
-            block.judge(policy, &targets, &batch.next_observations);
+            draw(block, policy, &actor, batch.next_states(), &batch.next_noise);
+            block.judge(policy, &targets, batch.next_states());
             block.set_targets(batch, |block, row| {
                 let q = block.q(0)[row].min(block.q(1)[row]);
                 q - temperature * block.log_densities[row]
@@ -131,8 +132,8 @@ impl Sac {
         let [first, second] = &self.critics;
         let (actor, critics) = (self.actor.lend()?, [first.lend()?, second.lend()?]);
         crew.each(&mut self.blocks, |block| {
-            draw(block, policy, &actor, &batch.observations, &batch.noise);
-            block.judge(policy, &critics, &batch.observations);
+            draw(block, policy, &actor, batch.states(), &batch.noise);
+            block.judge(policy, &critics, batch.states());
             let smaller =
                 |block: &Block, row: usize| usize::from(block.q(1)[row] < block.q(0)[row]);
             block.sums = super::block::Sums::default();
@@ -166,9 +167,9 @@ impl Sac {
     }
 }
 
-/// u ~ pi(observations) into the block's actions, log pi(u) into its log densities.
-fn draw(block: &mut Block, policy: &Policy, actor: &Lent<'_>, observations: &[f32], noise: &[f32]) {
-    block.act(policy, actor, observations);
+/// u ~ pi(states) into the block's actions, log pi(u) into its log densities.
+fn draw(block: &mut Block, policy: &Policy, actor: &Lent<'_>, states: States<'_>, noise: &[f32]) {
+    block.act(policy, actor, states);
     let noise = block.part(noise);
     let len = policy.layout().actions_len();
     for row in 0..block.log_densities.len() {

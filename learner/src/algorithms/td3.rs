@@ -95,12 +95,12 @@ impl Td3 {
         let (std, clip) =
             (self.config.target_noise_std as f32, self.config.target_noise_clip as f32);
         crew.each(&mut self.blocks, |block| {
-            block.act(policy, &actor_target, &batch.next_observations);
+            block.act(policy, &actor_target, batch.next_states());
             let noise = block.part(&batch.next_noise);
             for (action, noise) in block.policy.actions.iter_mut().zip(noise) {
                 *action = (*action + (std * noise).clamp(-clip, clip)).clamp(-1.0, 1.0);
             }
-            block.judge(policy, &targets, &batch.next_observations);
+            block.judge(policy, &targets, batch.next_states());
             block.set_targets(batch, |block, row| block.q(0)[row].min(block.q(1)[row]));
             block.regress(&critics, batch);
         });
@@ -115,8 +115,8 @@ impl Td3 {
     fn actor_step(&mut self, policy: &Policy, batch: &Batch, crew: &Crew) -> Result<()> {
         let (actor, critic) = (self.actor.lend()?, [self.critics[0].lend()?]);
         crew.each(&mut self.blocks, |block| {
-            block.act(policy, &actor, &batch.observations);
-            block.judge(policy, &critic, &batch.observations);
+            block.act(policy, &actor, batch.states());
+            block.judge(policy, &critic, batch.states());
             block.ascend_q(policy, &actor, &critic);
         });
         drop((actor, critic));

@@ -49,10 +49,12 @@ fn case(keys: &[(&str, &str)]) -> Case {
         values.iter_mut().for_each(|value| *value = random.random_range(-1.0..1.0));
     };
     fill(&mut batch.observations);
+    batch.inputs.copy_from_slice(&batch.observations);
     fill(&mut batch.critic_inputs);
     fill(&mut batch.rewards);
     fill(&mut batch.bootstrap);
     fill(&mut batch.next_observations);
+    batch.next_inputs.copy_from_slice(&batch.next_observations);
     fill(&mut batch.next_noise);
     fill(&mut batch.noise);
     Case { config, policy, algorithm, batch }
@@ -342,13 +344,13 @@ fn updates_fit_a_known_value_and_follow_its_gradient() {
         for row in 0..128 {
             let input = &case.batch.critic_inputs[row * 6..(row + 1) * 6];
             case.batch.rewards[row] = 1.0 - (input[4] - 0.5).powi(2) - (input[5] - 0.5).powi(2);
-            case.batch.observations[row * 4..(row + 1) * 4].copy_from_slice(&input[..4]);
+            case.batch.inputs[row * 4..(row + 1) * 4].copy_from_slice(&input[..4]);
         }
         losses = case.algorithm.update(&case.policy, &case.batch, 1).unwrap();
     }
     assert!(losses.critic_loss < 0.01, "{losses:?}");
     let mut work = case.policy.workspace(128);
-    let observations = &case.batch.observations;
+    let observations = &case.batch.inputs;
     let act = |p: &[f32]| case.policy.act(p, observations, &mut work);
     case.algorithm.actor().network.read(act).unwrap();
     let errors = work.actions.iter().map(|u| (u - 0.5).abs());

@@ -22,6 +22,7 @@ use serde::{Deserialize, Serialize};
 use thiserror::Error;
 
 use crate::learner::{Counters, Learner};
+use crate::normaliser::Normaliser;
 use crate::replay::{ReplayFileError, Sampler};
 use crate::update::adam::AdamStep;
 
@@ -93,6 +94,8 @@ struct State {
     /// By the network's name.
     adam_steps: BTreeMap<String, AdamStep>,
     sampler_random: Xoshiro256PlusPlus,
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    normaliser: Option<Normaliser>,
     files: Vec<FileSum>,
 }
 
@@ -157,6 +160,7 @@ fn write_files(folder: &Path, learner: &Learner) -> Result<(), CheckpointError> 
         updates_owed: learner.pacing.owed(),
         adam_steps: networks.iter().map(|(name, t)| ((*name).to_owned(), t.adam.step)).collect(),
         sampler_random: learner.sampler.random().clone(),
+        normaliser: learner.normaliser.clone(),
         files: vec![networks_sum, replay],
     };
     write_summed(folder, STATE, |out| {
@@ -274,6 +278,13 @@ fn load(folder: &Path, learner: &mut Learner) -> Result<(), CheckpointError> {
         }
         None => Err(format(&path, format!("has no optimiser step of {name}"))),
     })?;
+    if state.normaliser.as_ref().map(Normaliser::observation_len)
+        != learner.normaliser.as_ref().map(Normaliser::observation_len)
+    {
+        let cause = "observation normalisation differs from policy.normalise_observations";
+        return Err(format(&path, cause.into()));
+    }
+    learner.normaliser = state.normaliser;
     learner.counters = state.counters;
     learner.pacing.restore(state.updates_owed);
     let windows = learner.config().algorithm.windows;

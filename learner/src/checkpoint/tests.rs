@@ -11,8 +11,12 @@ use crate::learner::tests::spec;
 const RUN_ID: u64 = 5;
 
 fn fresh() -> Result<Learner, LearnerError> {
+    fresh_with(&[])
+}
+
+fn fresh_with(keys: &[(&str, &str)]) -> Result<Learner, LearnerError> {
     let mut layers = Layers::new();
-    for (key, value) in [
+    let common = [
         ("policy.hidden", "[16, 16]"),
         ("algorithm.critic_hidden", "[16, 16]"),
         ("algorithm.batch_size", "32"),
@@ -21,7 +25,8 @@ fn fresh() -> Result<Learner, LearnerError> {
         ("actors.workers", "1"),
         ("actors.envs_per_worker", "2"),
         ("checkpoint.keep", "2"),
-    ] {
+    ];
+    for (key, value) in common.iter().chain(keys) {
         layers.set("test", key, value).unwrap();
     }
     Learner::new(layers.finish().unwrap(), &spec(), RUN_ID)
@@ -66,22 +71,67 @@ fn checkpoint_bytes(folder: &Path, name: &str) -> Vec<(String, Vec<u8>)> {
 
 #[test]
 fn a_resumed_learner_goes_on_to_the_same_bytes_as_one_that_never_stopped() {
-    let folder = tempfile::tempdir().unwrap();
-    let (straight, resumed) = (folder.path().join("straight"), folder.path().join("resumed"));
-    [&straight, &resumed].into_iter().for_each(|path| fs::create_dir(path).unwrap());
+    for keys in [
+        &[][..],
+        &[("algorithm.name", "td3"), ("policy.normalise_observations", "true")],
+        &[("algorithm.name", "sac"), ("policy.normalise_observations", "true")],
+    ] {
+        let fresh = || fresh_with(keys);
+        let folder = tempfile::tempdir().unwrap();
+        let (straight, resumed) = (folder.path().join("straight"), folder.path().join("resumed"));
+        [&straight, &resumed].into_iter().for_each(|path| fs::create_dir(path).unwrap());
 
+        let mut learner = fresh().unwrap();
+        train(&mut learner, 0..60);
+        save(&resumed, &learner).unwrap();
+        train(&mut learner, 60..300);
+        let name = save(&straight, &learner).unwrap();
+        assert!(learner.counters.updates > 400);
+
+        let (mut learner, loaded) = load_newest(&resumed, &fresh).unwrap();
+        assert!(loaded.refused.is_empty());
+        train(&mut learner, 60..300);
+        let again = save(&resumed, &learner).unwrap();
+        let both = [(&straight, &name), (&resumed, &again)];
+        let [straight, resumed] = both.map(|(folder, name)| checkpoint_bytes(folder, name));
+        assert!(straight == resumed, "{keys:?}");
+    }
+}
+
+#[test]
+fn a_checkpoint_of_the_format_before_is_read_and_one_of_a_later_is_refused() {
+    let folder = tempfile::tempdir().unwrap();
+    let folder = folder.path();
     let mut learner = fresh().unwrap();
     train(&mut learner, 0..60);
-    save(&resumed, &learner).unwrap();
-    train(&mut learner, 60..300);
-    let name = save(&straight, &learner).unwrap();
-    assert!(learner.counters.updates > 400);
+    let name = save(folder, &learner).unwrap();
+    let path = folder.join(&name).join(STATE);
+    let mut state: serde_json::Value = serde_json::from_slice(&fs::read(&path).unwrap()).unwrap();
+    let steps = state.as_object_mut().unwrap().remove("adam_steps").unwrap();
+    state["format_version"] = 1.into();
+    for name in ["actor", "critic"] {
+        state[format!("{name}_adam_step")] = steps[name].clone();
+    }
+    fs::write(&path, state.to_string()).unwrap();
+    let (loaded, _) = load_newest(folder, &fresh).unwrap();
+    assert_eq!(loaded.counters, learner.counters);
+    assert_eq!(loaded.algorithm.actor().adam, learner.algorithm.actor().adam);
 
-    let (mut learner, loaded) = load_newest(&resumed, &fresh).unwrap();
-    assert!(loaded.refused.is_empty());
-    train(&mut learner, 60..300);
-    let again = save(&resumed, &learner).unwrap();
-    assert!(checkpoint_bytes(&straight, &name) == checkpoint_bytes(&resumed, &again));
+    state["format_version"] = 3.into();
+    fs::write(&path, state.to_string()).unwrap();
+    let error = load_newest(folder, &fresh).unwrap_err().to_string();
+    assert!(error.contains("format version 3, this build reads 1 to 2"), "{error}");
+}
+
+#[test]
+fn normalisation_that_was_switched_on_or_off_since_is_refused() {
+    let folder = tempfile::tempdir().unwrap();
+    let mut learner = fresh().unwrap();
+    train(&mut learner, 0..4);
+    save(folder.path(), &learner).unwrap();
+    let switched = || fresh_with(&[("policy.normalise_observations", "true")]);
+    let error = load_newest(folder.path(), &switched).unwrap_err().to_string();
+    assert!(error.contains("policy.normalise_observations"), "{error}");
 }
 
 #[test]

@@ -8,6 +8,9 @@
 
 pub mod adam;
 pub mod crew;
+pub mod floor;
+pub mod kernels;
+mod packed;
 pub mod pass;
 pub mod trained;
 

@@ -1,7 +1,9 @@
 //! The backward pass of a network over one block of rows, for the gradients that are wanted and no
 //! others.
 
-use dmprl_shared::policy::{Activations, Keep, Matrix, MlpShape, product};
+use dmprl_shared::policy::{Activations, MlpShape};
+
+use super::kernels::{Backward, InstructionSet};
 
 /// The gradient with respect to every layer's output, for up to `rows_max` rows.
 #[derive(Debug)]
@@ -41,6 +43,8 @@ pub struct Pass<'a> {
     pub activations: &'a Activations,
     /// How many.
     pub rows: usize,
+    /// What computes.
+    pub instructions: InstructionSet,
 }
 
 impl Pass<'_> {
@@ -57,27 +61,29 @@ impl Pass<'_> {
         let rows = self.rows;
         let layer = &self.shape.layers()[index];
         let (before, at) = gradients.layers.split_at_mut(index);
-        let out = &mut before[index - 1][..rows * layer.inputs];
-        let gradient = Matrix::row_major(&at[0][..rows * layer.outputs], rows, layer.outputs);
-        let weights = &self.parameters[layer.weights.clone()];
-        let weights = Matrix::row_major(weights, layer.outputs, layer.inputs);
-        product(out, gradient, weights, Keep::Replace);
-        let activation = self.activations.layer(self.shape, index - 1, rows);
-        for (gradient, activation) in out.iter_mut().zip(activation) {
-            // A select, not a branch: activations are as good as random, and a branch on them cost
-            // a sixth of the update.
-            *gradient = if *activation > 0.0 { *gradient } else { 0.0 };
+        Backward {
+            gradient: &at[0][..rows * layer.outputs],
+            weights: &self.parameters[layer.weights.clone()],
+            outputs_len: layer.outputs,
+            first: 0,
+            activations: Some(self.activations.layer(self.shape, index - 1, rows)),
+            inputs_gradient: &mut before[index - 1][..rows * layer.inputs],
         }
+        .run(self.instructions);
     }
 
     /// After [`Pass::backward`]: the gradient with respect to the inputs from column `first` on,
     /// (rows, inputs - first), overwritten.
     pub fn input_gradient(self, gradients: &Gradients, first: usize, out: &mut [f32]) {
         let layer = &self.shape.layers()[0];
-        let gradient = gradients.layer(self.shape, 0, self.rows);
-        let gradient = Matrix::row_major(gradient, self.rows, layer.outputs);
-        let weights = &self.parameters[layer.weights.clone()];
-        let weights = Matrix::row_major(weights, layer.outputs, layer.inputs).columns_from(first);
-        product(out, gradient, weights, Keep::Replace);
+        Backward {
+            gradient: gradients.layer(self.shape, 0, self.rows),
+            weights: &self.parameters[layer.weights.clone()],
+            outputs_len: layer.outputs,
+            first,
+            activations: None,
+            inputs_gradient: out,
+        }
+        .run(self.instructions);
     }
 }

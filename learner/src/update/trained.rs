@@ -3,16 +3,21 @@
 use std::ops::Range;
 
 use candle_core::{Layout, Result, Storage};
-use dmprl_shared::policy::{Activations, Keep, Matrix, MlpShape, forward, product};
-use parking_lot::RwLockReadGuard;
+use dmprl_shared::policy::{Activations, MlpShape};
+use parking_lot::{RwLock, RwLockReadGuard};
 
-use super::adam::{Adam, Slices};
+use super::adam::Adam;
 use super::crew::{Crew, Disjoint};
+use super::kernels::{
+    Activation, AdamPass, Follow, Forward, GradientBlock, InstructionSet, PANEL, StepSizes,
+    WeightGradient, adam, pack,
+};
+use super::packed::Packed;
 use super::pass::{Gradients, Pass};
 use crate::networks::Parameters;
 
-/// Rows of a weight matrix whose gradient and step are one part of the work.
-const TILE_ROWS: usize = 32;
+/// Outputs of a layer whose gradient and step are one part of the work: whole panels.
+const TILE_OUTPUTS: usize = PANEL;
 
 /// A network in training.
 #[derive(Debug)]
@@ -27,6 +32,11 @@ pub struct Trained {
     pub adam: Adam,
     gradient: Vec<f32>,
     tiles: Vec<Tile>,
+    /// The weights of network and target in the order of the forward pass. Behind a lock because
+    /// whoever lends them to a step brings them up to date first.
+    packed: RwLock<Packed>,
+    target_packed: RwLock<Packed>,
+    instructions: InstructionSet,
 }
 
 /// Some rows of one layer.
@@ -53,6 +63,8 @@ pub struct Lent<'a> {
     shape: &'a MlpShape,
     storage: RwLockReadGuard<'a, Storage>,
     layout: &'a Layout,
+    packed: RwLockReadGuard<'a, Packed>,
+    instructions: InstructionSet,
 }
 
 impl Lent<'_> {
@@ -62,13 +74,22 @@ impl Lent<'_> {
 
     /// Runs the network on `inputs`, (rows, inputs).
     pub fn forward(&self, inputs: &[f32], activations: &mut Activations) {
-        forward(self.shape, self.parameters(), inputs, activations);
+        let parameters = self.parameters();
+        let last = self.shape.layers().len() - 1;
+        for (index, layer) in self.shape.layers().iter().enumerate() {
+            let (inputs, outputs) = activations.step(self.shape, index, inputs);
+            let activation = if index < last { Activation::Relu } else { Activation::Linear };
+            let bias = &parameters[layer.bias.clone()];
+            let packed = self.packed.layer(index);
+            Forward { inputs, packed, bias, activation, outputs }.run(self.instructions);
+        }
     }
 
     /// The network after its forward pass over `rows` rows.
     #[must_use]
     pub fn pass<'b>(&'b self, activations: &'b Activations, rows: usize) -> Pass<'b> {
-        Pass { shape: self.shape, parameters: self.parameters(), activations, rows }
+        let (shape, parameters) = (self.shape, self.parameters());
+        Pass { shape, parameters, activations, rows, instructions: self.instructions }
     }
 }
 
@@ -91,6 +112,9 @@ impl Trained {
             adam: Adam::new(len, learning_rate),
             gradient: vec![0.0; len],
             tiles: tiles(&shape),
+            packed: RwLock::new(Packed::new(&shape)),
+            target_packed: RwLock::new(Packed::new(&shape)),
+            instructions: InstructionSet::detect(),
             shape,
         })
     }
@@ -109,11 +133,12 @@ impl Trained {
     /// If candle refuses access to the variable.
     pub fn descend_scalar(&mut self, gradient: f32) -> Result<()> {
         self.gradient[0] = gradient;
-        let step = self.adam.next_step();
-        let (first, second) = (&mut self.adam.moments.first, &mut self.adam.moments.second);
-        let gradient = &self.gradient;
+        let sizes = self.adam.next_step();
+        let (first, second) = (&mut self.adam.moments.first[..], &mut self.adam.moments.second[..]);
+        let (gradient, instructions) = (&self.gradient[..], self.instructions);
         self.network.update(|parameters| {
-            step.update(Slices { parameters, gradient, first, second }, None);
+            let follow = None;
+            adam(AdamPass { parameters, first, second, gradient, follow, sizes }, instructions);
         })
     }
 
@@ -122,7 +147,7 @@ impl Trained {
     /// # Errors
     /// If candle refuses access to the variable.
     pub fn lend(&self) -> Result<Lent<'_>> {
-        self.lend_parameters(&self.network)
+        self.lend_parameters(&self.network, &self.packed)
     }
 
     /// Lends the target.
@@ -131,15 +156,25 @@ impl Trained {
     /// If candle refuses access to the variable, or there is none.
     pub fn lend_target(&self) -> Result<Lent<'_>> {
         match &self.target {
-            Some(target) => self.lend_parameters(target),
+            Some(target) => self.lend_parameters(target, &self.target_packed),
             None => candle_core::bail!("a network without a target"),
         }
     }
 
-    fn lend_parameters<'a>(&'a self, parameters: &'a Parameters) -> Result<Lent<'a>> {
+    fn lend_parameters<'a>(
+        &'a self,
+        parameters: &'a Parameters,
+        packed: &'a RwLock<Packed>,
+    ) -> Result<Lent<'a>> {
         let (storage, layout) = parameters.var().storage_and_layout();
-        crate::networks::values(&storage, layout)?;
-        Ok(Lent { shape: &self.shape, storage, layout })
+        let values = crate::networks::values(&storage, layout)?;
+        if packed.read().changes != parameters.changes() {
+            let mut packed = packed.write();
+            packed.fill(&self.shape, values, self.instructions);
+            packed.changes = parameters.changes();
+        }
+        let (shape, instructions) = (&self.shape, self.instructions);
+        Ok(Lent { shape, storage, layout, packed: packed.read(), instructions })
     }
 
     /// One step of Adam along the gradient that the blocks' passes left; the target, if any,
@@ -154,46 +189,38 @@ impl Trained {
         trace: impl Fn(&'b B) -> Trace<'b> + Sync,
         polyak: Option<f32>,
     ) -> Result<()> {
-        let Self { shape, network, target, adam, gradient, tiles } = self;
-        let step = adam.next_step();
+        let Self { shape, network, target, adam, gradient, tiles, .. } = self;
+        let (packed, target_packed) = (self.packed.get_mut(), self.target_packed.get_mut());
+        let target = target.as_ref().filter(|_| polyak.is_some());
+        let (sizes, instructions) = (adam.next_step(), self.instructions);
         let (first, second) = (&mut adam.moments.first, &mut adam.moments.second);
         let mut run = |parameters: &mut [f32], target: &mut [f32]| {
-            let parameters = Disjoint::new(parameters);
-            let target = Disjoint::new(target);
-            let gradient = Disjoint::new(gradient);
-            let (first, second) = (Disjoint::new(first), Disjoint::new(second));
-            crew.run(tiles.len(), &|index| {
-                let tile = &tiles[index];
-                for (range, is_bias) in tile.ranges(shape) {
-                    // SAFETY: tiles do not overlap, nor do a tile's two ranges.
-                    let (parameters, gradient, first, second) = unsafe {
-                        (
-                            parameters.slice(range.clone()),
-                            gradient.slice(range.clone()),
-                            first.slice(range.clone()),
-                            second.slice(range.clone()),
-                        )
-                    };
-                    // SAFETY: as above.
-                    let follower = polyak
-                        .filter(|_| !target.is_empty())
-                        .map(|share| (unsafe { target.slice(range.clone()) }, share));
-                    gradient.fill(0.0);
-                    for block in blocks {
-                        tile.add(shape, trace(block), is_bias, gradient);
-                    }
-                    step.update(Slices { parameters, gradient, first, second }, follower);
-                }
-            });
+            let step = Step {
+                shape,
+                sizes,
+                polyak,
+                instructions,
+                parameters: Disjoint::new(parameters),
+                target: Disjoint::new(target),
+                gradient: Disjoint::new(gradient),
+                first: Disjoint::new(first),
+                second: Disjoint::new(second),
+                packed: Disjoint::new(packed.values_mut()),
+                target_packed: Disjoint::new(target_packed.values_mut()),
+            };
+            crew.run(tiles.len(), &|index| step.tile(&tiles[index], blocks, &trace));
         };
         // One closure inside the other: candle hands out one storage at a time.
         let mut followed = Ok(());
         network.update(|parameters| match target {
-            Some(target) if polyak.is_some() => {
-                followed = target.update(|target| run(parameters, target));
-            }
-            _ => run(parameters, &mut []),
+            Some(target) => followed = target.update(|target| run(parameters, target)),
+            None => run(parameters, &mut []),
         })?;
+        // The step has kept the copies up to date.
+        packed.changes = network.changes();
+        if let Some(target) = target {
+            target_packed.changes = target.changes();
+        }
         followed
     }
 
@@ -207,46 +234,92 @@ impl Trained {
 fn tiles(shape: &MlpShape) -> Vec<Tile> {
     let of_layer = |(layer, outputs): (usize, usize)| {
         (0..outputs)
-            .step_by(TILE_ROWS)
-            .map(move |first| Tile { layer, outputs: first..(first + TILE_ROWS).min(outputs) })
+            .step_by(TILE_OUTPUTS)
+            .map(move |first| Tile { layer, outputs: first..(first + TILE_OUTPUTS).min(outputs) })
     };
     shape.layers().iter().map(|layer| layer.outputs).enumerate().flat_map(of_layer).collect()
 }
 
-impl Tile {
-    /// Where its weights and its biases stand in the flat parameters.
-    fn ranges(&self, shape: &MlpShape) -> [(Range<usize>, bool); 2] {
-        let layer = &shape.layers()[self.layer];
-        let Range { start, end } = self.outputs;
-        let weights = layer.weights.start;
-        let bias = layer.bias.start;
-        [
-            (weights + start * layer.inputs..weights + end * layer.inputs, false),
-            (bias + start..bias + end, true),
-        ]
+/// What the threads of one step of Adam share.
+struct Step<'a> {
+    shape: &'a MlpShape,
+    sizes: StepSizes,
+    polyak: Option<f32>,
+    instructions: InstructionSet,
+    parameters: Disjoint<'a, f32>,
+    /// Empty: no target follows.
+    target: Disjoint<'a, f32>,
+    gradient: Disjoint<'a, f32>,
+    first: Disjoint<'a, f32>,
+    second: Disjoint<'a, f32>,
+    packed: Disjoint<'a, f32>,
+    target_packed: Disjoint<'a, f32>,
+}
+
+impl Step<'_> {
+    /// Gradient, Adam, target and packed copies of one tile, one after the other while its numbers
+    /// are in the cache.
+    fn tile<'b, B>(&self, tile: &Tile, blocks: &'b [B], trace: &impl Fn(&'b B) -> Trace<'b>) {
+        let (shape, outputs) = (self.shape, tile.outputs.clone());
+        let layer = &shape.layers()[tile.layer];
+        let within =
+            |begin: usize, width: usize| begin + outputs.start * width..begin + outputs.end * width;
+        let weights_at = within(layer.weights.start, layer.inputs);
+        let bias_at = within(layer.bias.start, 1);
+        let gradient_blocks = blocks.iter().map(|block| {
+            let trace = trace(block);
+            let rows = trace.inputs.len() / shape.inputs();
+            let gradient = trace.gradients.layer(shape, tile.layer, rows);
+            let inputs = match tile.layer {
+                0 => trace.inputs,
+                index => trace.activations.layer(shape, index - 1, rows),
+            };
+            GradientBlock { gradient, inputs }
+        });
+        // SAFETY: tiles do not overlap, nor do a tile's weights and biases.
+        let (weights, bias) = unsafe {
+            (self.gradient.slice(weights_at.clone()), self.gradient.slice(bias_at.clone()))
+        };
+        WeightGradient {
+            blocks: gradient_blocks,
+            inputs_len: layer.inputs,
+            outputs_len: layer.outputs,
+            outputs: outputs.clone(),
+            weights,
+            bias,
+        }
+        .run(self.instructions);
+        self.adam(bias_at);
+        self.adam(weights_at.clone());
+        let packed_at = Packed::range(shape, tile.layer, outputs);
+        // SAFETY: tiles do not overlap, and this one's slices above are no longer in use.
+        unsafe {
+            let weights = self.parameters.slice(weights_at.clone());
+            let packed = self.packed.slice(packed_at.clone());
+            pack(weights, layer.inputs, layer.outputs, packed, self.instructions);
+            if !self.target.is_empty() {
+                let weights = self.target.slice(weights_at);
+                let packed = self.target_packed.slice(packed_at);
+                pack(weights, layer.inputs, layer.outputs, packed, self.instructions);
+            }
+        }
     }
 
-    /// Adds one block's part of the gradient.
-    fn add(&self, shape: &MlpShape, trace: Trace<'_>, is_bias: bool, out: &mut [f32]) {
-        let rows = trace.inputs.len() / shape.inputs();
-        let layer = &shape.layers()[self.layer];
-        let gradient = trace.gradients.layer(shape, self.layer, rows);
-        let Range { start, end } = self.outputs;
-        if is_bias {
-            for row in gradient.chunks_exact(layer.outputs) {
-                for (bias, gradient) in out.iter_mut().zip(&row[start..end]) {
-                    *bias += gradient;
-                }
+    fn adam(&self, range: Range<usize>) {
+        // SAFETY: called for ranges of one tile, one after the other, and tiles do not overlap.
+        let pass = unsafe {
+            AdamPass {
+                parameters: self.parameters.slice(range.clone()),
+                first: self.first.slice(range.clone()),
+                second: self.second.slice(range.clone()),
+                gradient: self.gradient.slice(range.clone()),
+                follow: self
+                    .polyak
+                    .filter(|_| !self.target.is_empty())
+                    .map(|polyak| Follow { target: self.target.slice(range), polyak }),
+                sizes: self.sizes,
             }
-            return;
-        }
-        let inputs = match self.layer {
-            0 => trace.inputs,
-            index => trace.activations.layer(shape, index - 1, rows),
         };
-        let inputs = Matrix::row_major(inputs, rows, layer.inputs);
-        let gradient = Matrix::row_major(gradient, rows, layer.outputs);
-        let gradient = gradient.columns(self.outputs.clone()).transposed();
-        product(out, gradient, inputs, Keep::Add);
+        adam(pass, self.instructions);
     }
 }

@@ -188,6 +188,9 @@ pub struct PolicyConfig {
     pub segment_steps: usize,
     /// Widths of the actor's hidden layers.
     pub hidden: Vec<usize>,
+    /// Whether the networks see observations of zero mean and unit scale. The statistics begin at
+    /// the end of the warm-up; published policies have them folded in.
+    pub normalise_observations: bool,
     /// g = goal_range * tanh(.).
     pub goal_range: f64,
     /// w = weight_range * omega^2 * tanh(.), omega = alpha_y / 2.
@@ -208,6 +211,7 @@ impl Default for PolicyConfig {
             kind: PolicyKind::Dmp,
             segment_steps: 5,
             hidden: vec![256, 256],
+            normalise_observations: false,
             goal_range: 1.0,
             weight_range: 1.0,
             rho: RhoKind::Bounded,

@@ -37,6 +37,7 @@ const PAPER: &str = r#"
 [policy]
 segment_steps = 5
 hidden = [256, 256]
+normalise_observations = false
 goal_range = 1.0
 weight_range = 1.0
 rho = "bounded"

@@ -6,6 +6,7 @@
 
 use super::PolicyError;
 use super::start::StartState;
+use super::tanh;
 use crate::config::{ExperimentConfig, PolicyKind, RhoKind, Start};
 use crate::dmp::{Dmp, SegmentMap, act, act_backward};
 use crate::spec::EnvSpec;
@@ -120,15 +121,17 @@ impl DmpHead {
     /// Squashes the network's outputs: each row of `stride` begins with the head's A (1+N+4).
     pub fn squash(&self, outputs: &[f32], stride: usize, work: &mut DmpWorkspace) {
         let (n, len) = (self.per_dimension(), self.outputs_len());
-        let tanh_len = if self.rho == RhoKind::Bounded { n } else { 1 + self.basis_count };
-        let rows = outputs.chunks_exact(stride).zip(work.squashed.chunks_exact_mut(len));
-        for (outputs, squashed) in rows {
-            let dims = outputs[..len].chunks_exact(n).zip(squashed.chunks_exact_mut(n));
-            for (outputs, squashed) in dims {
-                for (squashed, output) in squashed.iter_mut().zip(outputs).take(tanh_len) {
-                    *squashed = output.tanh();
-                }
-                squashed[tanh_len..].copy_from_slice(&outputs[tanh_len..]);
+        let rows = outputs.len() / stride;
+        let squashed = &mut work.squashed[..rows * len];
+        let pairs = outputs.chunks_exact(stride).zip(squashed.chunks_exact_mut(len));
+        pairs.for_each(|(outputs, squashed)| squashed.copy_from_slice(&outputs[..len]));
+        tanh(squashed);
+        if self.rho != RhoKind::Bounded {
+            let bounded = 1 + self.basis_count;
+            let pairs = outputs.chunks_exact(stride).zip(squashed.chunks_exact_mut(len));
+            for (outputs, squashed) in pairs {
+                let dims = outputs[..len].chunks_exact(n).zip(squashed.chunks_exact_mut(n));
+                dims.for_each(|(out, kept)| kept[bounded..].copy_from_slice(&out[bounded..]));
             }
         }
     }

@@ -17,6 +17,7 @@ pub mod gaussian;
 mod matrix;
 mod network;
 mod start;
+mod tanh;
 
 use std::ops::Range;
 
@@ -27,6 +28,7 @@ pub use action_scaling::ActionScaling;
 pub use dmp_head::{DmpHead, DmpWorkspace, HeadGradient};
 pub use matrix::{Keep, Matrix, product};
 pub use network::{Activations, Layer, MlpShape, SmallBatchNetwork, forward, initial_parameters};
+pub use tanh::tanh;
 
 use crate::config::{AlgorithmName, ExperimentConfig, PolicyKind};
 use crate::dmp::DmpError;
@@ -93,9 +95,8 @@ pub struct PolicyWorkspace {
 impl PolicyWorkspace {
     /// u = tanh(mean) for the first `len` means.
     pub fn squash_means(&mut self, len: usize) {
-        for (action, mean) in self.actions.iter_mut().zip(&self.means[..len]) {
-            *action = mean.tanh();
-        }
+        self.actions[..len].copy_from_slice(&self.means[..len]);
+        tanh(&mut self.actions[..len]);
     }
 }
 

@@ -113,6 +113,21 @@ impl Activations {
     pub fn layer(&self, shape: &MlpShape, index: usize, rows: usize) -> &[f32] {
         &self.0[index][..rows * shape.layers()[index].outputs]
     }
+
+    /// Where the outputs of layer `index` go, (rows, outputs), beside its inputs, (rows, inputs),
+    /// which for the first layer are `inputs`.
+    pub fn step<'a>(
+        &'a mut self,
+        shape: &MlpShape,
+        index: usize,
+        inputs: &'a [f32],
+    ) -> (&'a [f32], &'a mut [f32]) {
+        let rows = inputs.len() / shape.inputs();
+        let layer = &shape.layers()[index];
+        let (before, after) = self.0.split_at_mut(index);
+        let inputs = before.last().map_or(inputs, |buffer| &buffer[..rows * layer.inputs]);
+        (inputs, &mut after[0][..rows * layer.outputs])
+    }
 }
 
 /// Runs the network on `inputs`, (rows, inputs), into `activations`.
@@ -144,9 +159,7 @@ fn forward_with<'a>(
     let rows = inputs.len() / shape.inputs();
     let last = shape.layers().len() - 1;
     for (index, layer) in shape.layers().iter().enumerate() {
-        let (before, after) = activations.0.split_at_mut(index);
-        let inputs = before.last().map_or(inputs, |buffer| &buffer[..rows * layer.inputs]);
-        let out = &mut after[0][..rows * layer.outputs];
+        let (inputs, out) = activations.step(shape, index, inputs);
         let bias = &parameters[layer.bias.clone()];
         for row in out.chunks_exact_mut(layer.outputs) {
             row.copy_from_slice(bias);

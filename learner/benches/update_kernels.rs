@@ -1,0 +1,192 @@
+//! What an update costs against its matrix products alone, and those against the processor.
+//!
+//!     cargo bench -p dmprl-learner --bench update_kernels [-- --rounds 300 --only update]
+//!
+//! DDPG-DMP on Pusher's shapes (actor 23-256-256-70, critic 58-256-256-1, batch 256). All
+//! candidates take turns in one process, and medians are compared: on a shared machine only such
+//! ratios mean anything. Time is the calling thread's own, so that what others take of a core does
+//! not count, but for the update on two threads, where it is the clock's.
+
+use std::hint::black_box;
+use std::time::{Duration, Instant};
+
+use dmprl_learner::algorithms::{Algorithm, Batch};
+use dmprl_learner::update::floor::{Engine, Floor, Kind, Product};
+use dmprl_shared::config::{ExperimentConfig, Layers};
+use dmprl_shared::policy::{MlpShape, Policy};
+use dmprl_shared::spec::EnvSpec;
+
+struct Candidate {
+    name: String,
+    operations: usize,
+    /// Whether the calling thread does all the work.
+    alone: bool,
+    work: Box<dyn FnMut()>,
+    times_s: Vec<f64>,
+}
+
+fn candidate(name: &str, operations: usize, work: impl FnMut() + 'static) -> Candidate {
+    Candidate {
+        name: name.into(),
+        operations,
+        alone: true,
+        work: Box::new(work),
+        times_s: Vec::new(),
+    }
+}
+
+/// Independent chains of fused multiplications and additions on registers alone: the processor's
+/// limit.
+fn peak() -> Candidate {
+    const ROUNDS: usize = 20_000;
+    struct Chains;
+    impl pulp::WithSimd for Chains {
+        type Output = f32;
+
+        #[inline(always)]
+        fn with_simd<S: pulp::Simd>(self, simd: S) -> f32 {
+            let (factor, term) = (simd.splat_f32s(black_box(0.5)), simd.splat_f32s(black_box(0.1)));
+            let mut sums = [simd.splat_f32s(0.0); 12];
+            for _ in 0..ROUNDS {
+                for sum in &mut sums {
+                    *sum = simd.mul_add_f32s(*sum, factor, term);
+                }
+            }
+            sums.into_iter().map(|sum| simd.reduce_sum_f32s(sum)).sum()
+        }
+    }
+    struct Lanes;
+    impl pulp::WithSimd for Lanes {
+        type Output = usize;
+
+        #[inline(always)]
+        fn with_simd<S: pulp::Simd>(self, _: S) -> usize {
+            S::F32_LANES
+        }
+    }
+    let arch = pulp::Arch::new();
+    let operations = 2 * 12 * ROUNDS * arch.dispatch(Lanes);
+    candidate("processor's limit", operations, move || {
+        black_box(arch.dispatch(Chains));
+    })
+}
+
+fn config(threads: &str) -> (ExperimentConfig, EnvSpec) {
+    let mut layers = Layers::new();
+    let keys = [
+        ("learner.threads", threads),
+        ("algorithm.batch_size", "256"),
+        ("policy.hidden", "[256, 256]"),
+        ("algorithm.critic_hidden", "[256, 256]"),
+    ];
+    for (key, value) in keys {
+        layers.set("bench", key, value).expect("a known key");
+    }
+    let spec = EnvSpec {
+        id: "Pusher-v5".into(),
+        observation_len: 23,
+        action_len: 7,
+        action_low: vec![-2.0; 7],
+        action_high: vec![2.0; 7],
+        control_dt_s: 0.05,
+        episode_steps: 100,
+        observation_names: Vec::new(),
+    };
+    (layers.finish().expect("a valid configuration"), spec)
+}
+
+fn update(threads: &str) -> impl FnMut() + 'static {
+    let (config, spec) = config(threads);
+    let policy = Policy::new(&config, &spec).expect("a policy");
+    let mut algorithm = Algorithm::new(&config, &policy).expect("an algorithm");
+    let mut batch = Batch::new(algorithm.batch_shape());
+    let numbers = [
+        &mut batch.observations,
+        &mut batch.critic_inputs,
+        &mut batch.rewards,
+        &mut batch.bootstrap,
+        &mut batch.next_observations,
+    ];
+    for values in numbers {
+        values.iter_mut().enumerate().for_each(|(i, value)| *value = (i as f32 * 0.37).sin());
+    }
+    let mut count = 0;
+    move || {
+        count += 1;
+        black_box(algorithm.update(&policy, &batch, count).expect("an update"));
+    }
+}
+
+/// The products of one update of DDPG.
+fn products(actor: &MlpShape, critic: &MlpShape, observation_len: usize) -> Vec<Product> {
+    const ROWS: usize = 256;
+    let forward = |shape| Product::forward(shape, ROWS);
+    let backward = |shape| Product::backward(shape, ROWS);
+    let weights = |shape| Product::weight_gradient(shape, ROWS);
+    let target = forward(actor).chain(forward(critic));
+    let critic_step = forward(critic).chain(backward(critic)).chain(weights(critic));
+    let through_critic = forward(actor).chain(forward(critic)).chain(backward(critic));
+    let input = [Product::input_gradient(critic, ROWS, observation_len)];
+    let actor_step = through_critic.chain(input).chain(backward(actor)).chain(weights(actor));
+    target.chain(critic_step).chain(actor_step).collect()
+}
+
+fn floor(name: &str, products: Vec<Product>, engine: Engine) -> Candidate {
+    let mut floor = Floor::new(products);
+    candidate(name, floor.operations(), move || floor.run(engine))
+}
+
+/// Time that this thread has been running.
+fn thread_time() -> Duration {
+    let mut time = libc::timespec { tv_sec: 0, tv_nsec: 0 };
+    // SAFETY: the pointer is to a timespec of our own.
+    let status = unsafe { libc::clock_gettime(libc::CLOCK_THREAD_CPUTIME_ID, &raw mut time) };
+    assert_eq!(status, 0, "the clock of a thread");
+    Duration::new(time.tv_sec.unsigned_abs(), time.tv_nsec.unsigned_abs() as u32)
+}
+
+fn main() {
+    let argument = |name: &str| std::env::args().skip_while(|it| it != name).nth(1);
+    let rounds = argument("--rounds").map_or(100, |text| text.parse().expect("a number"));
+    let actor = MlpShape::new(vec![23, 256, 256, 70]);
+    let critic = MlpShape::new(vec![58, 256, 256, 1]);
+    let all = products(&actor, &critic, 23);
+    let square = |kind| vec![Product { kind, rows: 256, inputs: 256, outputs: 256 }];
+    let mut candidates = vec![peak()];
+    for (engine, whose) in [(Engine::Library, "library"), (Engine::Kernels, "kernels")] {
+        for kind in [Kind::Forward, Kind::Backward, Kind::WeightGradient] {
+            candidates.push(floor(&format!("{whose} {kind:?} 256^3"), square(kind), engine));
+        }
+        candidates.push(floor(&format!("{whose} all products"), all.clone(), engine));
+    }
+    for threads in ["1", "2"] {
+        let operations = all.iter().map(|product| product.operations()).sum();
+        let name = format!("update, {threads}");
+        let update = candidate(&name, operations, update(threads));
+        candidates.push(Candidate { alone: threads == "1", ..update });
+    }
+    let only = argument("--only").unwrap_or_default();
+    candidates.retain(|candidate| candidate.name.contains(&only));
+    for round in 0..rounds + 5 {
+        for candidate in &mut candidates {
+            let (begun, begun_running) = (Instant::now(), thread_time());
+            (candidate.work)();
+            let running = thread_time() - begun_running;
+            let time = if candidate.alone { running } else { begun.elapsed() };
+            if round >= 5 {
+                candidate.times_s.push(time.as_secs_f64());
+            }
+        }
+    }
+    for Candidate { name, operations, times_s, .. } in &mut candidates {
+        times_s.sort_by(f64::total_cmp);
+        let median_s = times_s[times_s.len() / 2];
+        let best_s = times_s[times_s.len() / 10];
+        println!(
+            "{name:32} {:9.1} us (10 %: {:9.1})  {:6.1} GFLOP/s",
+            median_s * 1e6,
+            best_s * 1e6,
+            *operations as f64 / median_s * 1e-9
+        );
+    }
+}

@@ -1,0 +1,226 @@
+//! Observation normalisation (`policy.normalise_observations`): the networks in training see
+//! (x - mean) / scale, and the published policy has that folded into its first layer.
+//!
+//! So a policy is a network of plain observations whoever runs it, and normalisation is part of it.
+//! When mean and scale are taken anew, the first layers are rewritten so that every network stays
+//! the function that it was: normalisation changes the steps of the optimiser, never the policy.
+
+use dmprl_shared::policy::MlpShape;
+use serde::{Deserialize, Serialize};
+
+use crate::update::trained::Trained;
+
+/// A dimension that varies less is left as it is: dividing by next to nothing would blow up the
+/// first departure from it.
+const SCALE_MIN: f64 = 1e-4;
+
+/// Mean and scale in use, and what was seen of each dimension so far.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Normaliser {
+    mean: Vec<f32>,
+    scale: Vec<f32>,
+    count: u64,
+    /// Mean, and sum of squared differences from it (Welford 1962).
+    seen_mean: Vec<f64>,
+    seen_squares: Vec<f64>,
+    /// Mean and scale are taken anew when so many observations have been seen.
+    refresh_at: u64,
+}
+
+impl Normaliser {
+    /// One that has seen nothing and changes nothing; `first` observations make it begin.
+    #[must_use]
+    pub fn new(observation_len: usize, first: u64) -> Self {
+        Self {
+            mean: vec![0.0; observation_len],
+            scale: vec![1.0; observation_len],
+            count: 0,
+            seen_mean: vec![0.0; observation_len],
+            seen_squares: vec![0.0; observation_len],
+            refresh_at: first.max(1),
+        }
+    }
+
+    /// Length O of the observations.
+    #[must_use]
+    pub fn observation_len(&self) -> usize {
+        self.mean.len()
+    }
+
+    /// Books observations, (rows, O).
+    pub fn observe(&mut self, observations: &[f32]) {
+        for row in observations.chunks_exact(self.mean.len()) {
+            self.count += 1;
+            let share = 1.0 / self.count as f64;
+            let seen = self.seen_mean.iter_mut().zip(&mut self.seen_squares);
+            for ((mean, squares), value) in seen.zip(row) {
+                let before = f64::from(*value) - *mean;
+                *mean += before * share;
+                *squares += before * (f64::from(*value) - *mean);
+            }
+        }
+    }
+
+    /// (x - mean) / scale of each row of `observations`, (rows, O), into rows of `out`.
+    pub fn apply(&self, observations: &[f32], out: &mut [f32]) {
+        let o = self.mean.len();
+        for (row, out) in observations.chunks_exact(o).zip(out.chunks_exact_mut(o)) {
+            self.apply_row(row, out);
+        }
+    }
+
+    /// The same for one row, (O,).
+    pub fn apply_row(&self, observation: &[f32], out: &mut [f32]) {
+        for (index, out) in out.iter_mut().enumerate() {
+            *out = (observation[index] - self.mean[index]) / self.scale[index];
+        }
+    }
+
+    /// Whether as many observations have come as a refresh waits for.
+    #[must_use]
+    pub fn is_due(&self) -> bool {
+        self.count >= self.refresh_at
+    }
+
+    /// Takes mean and scale anew and returns the change; due again at twice as many observations.
+    pub fn refresh(&mut self) -> Change {
+        self.refresh_at = 2 * self.count.max(1);
+        let before = (self.mean.clone(), self.scale.clone());
+        for (index, squares) in self.seen_squares.iter().enumerate() {
+            let scale = (squares / self.count.max(1) as f64).sqrt();
+            self.mean[index] = self.seen_mean[index] as f32;
+            self.scale[index] = if scale < SCALE_MIN { 1.0 } else { scale as f32 };
+        }
+        Change { before, after: (self.mean.clone(), self.scale.clone()) }
+    }
+
+    /// Rewrites flat parameters of a network of normalised observations as those of the same
+    /// function of plain ones.
+    pub fn fold(&self, shape: &MlpShape, parameters: &mut [f32]) {
+        let plain = (vec![0.0; self.mean.len()], vec![1.0; self.mean.len()]);
+        let change = Change { before: (self.mean.clone(), self.scale.clone()), after: plain };
+        change.rewrite(shape, parameters);
+    }
+}
+
+/// From one mean and scale to another.
+#[derive(Debug)]
+pub struct Change {
+    before: (Vec<f32>, Vec<f32>),
+    after: (Vec<f32>, Vec<f32>),
+}
+
+impl Change {
+    /// Keeps a network in training, and its target, the functions of plain observations that they
+    /// were; moments follow the gradient of the new weights. The observations are its first inputs.
+    ///
+    /// # Errors
+    /// If candle refuses access to a variable.
+    pub fn apply(&self, trained: &mut Trained) -> candle_core::Result<()> {
+        let Trained { shape, network, target, adam, .. } = trained;
+        network.update(|parameters| self.rewrite(shape, parameters))?;
+        if let Some(target) = target {
+            target.update(|parameters| self.rewrite(shape, parameters))?;
+        }
+        self.each_weight(shape, |at, input| {
+            let factor = self.before.1[input] / self.after.1[input];
+            adam.moments.first[at] *= factor;
+            adam.moments.second[at] *= factor * factor;
+        });
+        Ok(())
+    }
+
+    /// W (x - m) / s + b = W' (x - m') / s' + b' for every x.
+    fn rewrite(&self, shape: &MlpShape, parameters: &mut [f32]) {
+        let layer = &shape.layers()[0];
+        let ((mean, scale), (new_mean, new_scale)) = (&self.before, &self.after);
+        for output in 0..layer.outputs {
+            let from = layer.weights.start + output * layer.inputs;
+            let weights = &parameters[from..from + mean.len()];
+            let moved = (0..mean.len()).map(|input| {
+                let shift = f64::from(new_mean[input]) - f64::from(mean[input]);
+                f64::from(weights[input]) * shift / f64::from(scale[input])
+            });
+            let moved: f64 = moved.sum();
+            let bias = &mut parameters[layer.bias.start + output];
+            *bias = (f64::from(*bias) + moved) as f32;
+        }
+        self.each_weight(shape, |at, input| parameters[at] *= new_scale[input] / scale[input]);
+    }
+
+    fn each_weight(&self, shape: &MlpShape, mut f: impl FnMut(usize, usize)) {
+        let layer = &shape.layers()[0];
+        for output in 0..layer.outputs {
+            let from = layer.weights.start + output * layer.inputs;
+            (0..self.before.0.len()).for_each(|input| f(from + input, input));
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use dmprl_shared::policy::{Activations, forward, initial_parameters};
+    use rand::RngExt;
+
+    use super::*;
+
+    fn output(shape: &MlpShape, parameters: &[f32], inputs: &[f32]) -> Vec<f32> {
+        let rows = inputs.len() / shape.inputs();
+        let mut activations = Activations::new(shape, rows);
+        forward(shape, parameters, inputs, &mut activations);
+        activations.output(shape, rows).to_vec()
+    }
+
+    fn assert_close(got: &[f32], want: &[f32]) {
+        assert!(got.iter().zip(want).all(|(a, b)| (a - b).abs() < 1e-4), "{got:?} {want:?}");
+    }
+
+    #[test]
+    fn seen_observations_become_zero_mean_and_unit_scale() {
+        let mut normaliser = Normaliser::new(2, 4);
+        let seen = [1.0, 7.0, 3.0, 7.0, 5.0, 7.0, 7.0, 7.0];
+        assert!(!normaliser.is_due());
+        normaliser.observe(&seen);
+        assert!(normaliser.is_due());
+        normaliser.refresh();
+        assert!(!normaliser.is_due());
+        let mut out = [0.0; 8];
+        normaliser.apply(&seen, &mut out);
+        // Mean 4, standard deviation sqrt(5); the second never varies.
+        let unit = 5.0_f32.sqrt();
+        assert_close(&out, &[-3.0 / unit, 0.0, -1.0 / unit, 0.0, 1.0 / unit, 0.0, 3.0 / unit, 0.0]);
+    }
+
+    #[test]
+    fn neither_a_refresh_nor_folding_changes_the_function() {
+        let shape = MlpShape::new(vec![5, 16, 2]);
+        let mut random = dmprl_shared::seeds::stream(1, "test", 0);
+        let initial = initial_parameters(&shape, &mut random);
+        // Three observations and two actions, as a critic has.
+        let rows: Vec<f32> = (0..40).map(|_| random.random_range(-3.0..9.0)).collect();
+        let with = |normaliser: &Normaliser| {
+            let mut inputs = rows.clone();
+            for (row, out) in rows.chunks_exact(5).zip(inputs.chunks_exact_mut(5)) {
+                normaliser.apply_row(&row[..3], &mut out[..3]);
+            }
+            inputs
+        };
+        let mut trained = Trained::new(shape.clone(), initial, 1e-3, true).unwrap();
+        let plain = trained.network.read(|p| output(&shape, p, &rows)).unwrap();
+        let mut normaliser = Normaliser::new(3, 1);
+        for _ in 0..3 {
+            let seen: Vec<f32> = (0..30).map(|_| random.random_range(-2.0..10.0)).collect();
+            normaliser.observe(&seen);
+            normaliser.refresh().apply(&mut trained).unwrap();
+            let inputs = with(&normaliser);
+            assert!(inputs[..3] != rows[..3]);
+            assert_close(&trained.network.read(|p| output(&shape, p, &inputs)).unwrap(), &plain);
+            let target = trained.target.as_ref().unwrap();
+            assert_close(&target.read(|p| output(&shape, p, &inputs)).unwrap(), &plain);
+            let mut folded = trained.network.read(<[f32]>::to_vec).unwrap();
+            normaliser.fold(&shape, &mut folded);
+            assert_close(&output(&shape, &folded, &rows), &plain);
+        }
+    }
+}

@@ -1,0 +1,103 @@
+//! A layer's gradient with respect to its inputs.
+
+use pulp::{Simd, WithSimd};
+
+use super::tile::{Broadcast, Tiled, Wide, accumulate, for_rows, load, store};
+use super::{InstructionSet, PANEL};
+
+/// inputs' gradient = outputs' gradient weights, from column `first` on, for a block of rows.
+#[derive(Debug)]
+pub struct Backward<'a> {
+    /// Gradient with respect to the layer's outputs, (rows, outputs).
+    pub gradient: &'a [f32],
+    /// The layer's weights, (outputs, inputs) row-major as in the flat parameters.
+    pub weights: &'a [f32],
+    /// Width of the layer's output.
+    pub outputs_len: usize,
+    /// The first input whose gradient is wanted.
+    pub first: usize,
+    /// The ReLU activations that the layer had as inputs, (rows, inputs - first): where one is
+    /// zero, so is the gradient. None: the inputs come from no ReLU.
+    pub activations: Option<&'a [f32]>,
+    /// (rows, inputs - first), overwritten.
+    pub inputs_gradient: &'a mut [f32],
+}
+
+impl Backward<'_> {
+    /// Computes the inputs' gradient.
+    ///
+    /// # Panics
+    /// If the lengths do not fit.
+    pub fn run(self, instructions: InstructionSet) {
+        let depth = self.outputs_len;
+        let rows = self.gradient.len() / depth;
+        assert_eq!(self.gradient.len(), rows * depth, "gradient of {depth} columns");
+        let inputs_len = self.weights.len() / depth;
+        assert_eq!(self.weights.len(), depth * inputs_len, "weights of {depth} outputs");
+        assert!(self.first < inputs_len, "column {} of {inputs_len}", self.first);
+        let width = inputs_len - self.first;
+        assert_eq!(self.inputs_gradient.len(), rows * width, "gradient of the inputs");
+        let activations = self.activations.map_or(rows * width, <[f32]>::len);
+        assert_eq!(activations, rows * width, "activations");
+        instructions.run(Job { layer: self, rows, width, inputs_len, column: 0 });
+    }
+}
+
+struct Job<'a> {
+    layer: Backward<'a>,
+    rows: usize,
+    width: usize,
+    inputs_len: usize,
+    /// Where the panel at work begins, counted from `first`.
+    column: usize,
+}
+
+impl WithSimd for Job<'_> {
+    type Output = ();
+
+    #[inline(always)]
+    fn with_simd<S: Simd>(mut self, simd: S) {
+        while self.column < self.width {
+            for_rows(simd, 0..self.rows, &mut self);
+            self.column += PANEL;
+        }
+    }
+}
+
+impl<S: Simd> Tiled<S> for Job<'_> {
+    #[inline(always)]
+    fn tile<const M: usize, const V: usize>(&mut self, simd: S, row: usize) {
+        let zero = simd.splat_f32s(0.0);
+        let depth = self.layer.outputs_len;
+        let end = self.width.min(self.column + PANEL);
+        let left = Broadcast {
+            data: &self.layer.gradient[row * depth..],
+            row_stride: depth,
+            depth_stride: 1,
+        };
+        let right = Wide {
+            data: &self.layer.weights[self.layer.first + self.column..],
+            stride: self.inputs_len,
+            width: end - self.column,
+        };
+        let sums = [[zero; V]; M];
+        let sums = if right.width == PANEL {
+            accumulate::<S, M, V, false>(simd, sums, left, right, depth)
+        } else {
+            accumulate::<S, M, V, true>(simd, sums, left, right, depth)
+        };
+        for (m, mut sums) in sums.into_iter().enumerate() {
+            let at = (row + m) * self.width;
+            let columns = at + self.column..at + end;
+            if let Some(activations) = self.layer.activations {
+                let activations = load::<S, V>(simd, &activations[columns.clone()]);
+                for (sum, activation) in sums.iter_mut().zip(activations) {
+                    // A select, not a branch: activations are as good as random.
+                    let passed = simd.less_than_f32s(zero, activation);
+                    *sum = simd.select_f32s(passed, *sum, zero);
+                }
+            }
+            store::<S, V>(simd, &mut self.layer.inputs_gradient[columns], sums);
+        }
+    }
+}

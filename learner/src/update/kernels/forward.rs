@@ -1,0 +1,128 @@
+//! A layer's forward pass.
+
+use pulp::{Simd, WithSimd};
+
+use super::pack::{NARROW, packed_len};
+use super::tile::{Broadcast, Tiled, Wide, accumulate, for_rows, load, store};
+use super::{InstructionSet, PANEL};
+
+/// What a layer does to its sums.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Activation {
+    /// Nothing: the last layer.
+    Linear,
+    /// max(0, sum): a hidden layer.
+    Relu,
+}
+
+/// outputs = activation(inputs weightsᵀ + bias) for a block of rows.
+#[derive(Debug)]
+pub struct Forward<'a> {
+    /// (rows, inputs).
+    pub inputs: &'a [f32],
+    /// The layer's weights as [`super::pack`] leaves them.
+    pub packed: &'a [f32],
+    /// (outputs,).
+    pub bias: &'a [f32],
+    /// What is done to the sums.
+    pub activation: Activation,
+    /// (rows, outputs), overwritten.
+    pub outputs: &'a mut [f32],
+}
+
+impl Forward<'_> {
+    /// Computes the outputs.
+    ///
+    /// # Panics
+    /// If the lengths do not fit.
+    pub fn run(self, instructions: InstructionSet) {
+        let width = self.bias.len();
+        let rows = self.outputs.len() / width;
+        assert_eq!(self.outputs.len(), rows * width, "outputs of {width} columns");
+        let depth = if rows == 0 { 0 } else { self.inputs.len() / rows };
+        assert_eq!(self.inputs.len(), rows * depth, "inputs of {rows} rows");
+        assert_eq!(self.packed.len(), packed_len(depth, width), "packed weights");
+        instructions.run(Job { layer: self, rows, depth, width, column: 0 });
+    }
+}
+
+struct Job<'a> {
+    layer: Forward<'a>,
+    rows: usize,
+    depth: usize,
+    width: usize,
+    /// Where the panel at work begins.
+    column: usize,
+}
+
+impl WithSimd for Job<'_> {
+    type Output = ();
+
+    #[inline(always)]
+    fn with_simd<S: Simd>(mut self, simd: S) {
+        if self.width <= NARROW {
+            return self.narrow(simd);
+        }
+        // A panel stays in the first-level cache while all rows pass by.
+        while self.column < self.width {
+            for_rows(simd, 0..self.rows, &mut self);
+            self.column += PANEL;
+        }
+    }
+}
+
+impl Job<'_> {
+    /// Few outputs: dot products, since a panel would be mostly padding.
+    #[inline(always)]
+    fn narrow<S: Simd>(self, simd: S) {
+        let Forward { inputs, packed, bias, activation, outputs } = self.layer;
+        for row in 0..self.rows {
+            let (inputs, tail) = S::as_simd_f32s(&inputs[row * self.depth..][..self.depth]);
+            for column in 0..self.width {
+                let weights = &packed[column * self.depth..][..self.depth];
+                let (weights, weights_tail) = S::as_simd_f32s(weights);
+                let mut sums = [simd.splat_f32s(0.0); 4];
+                for (i, (input, weight)) in inputs.iter().zip(weights).enumerate() {
+                    sums[i % 4] = simd.mul_add_e_f32s(*input, *weight, sums[i % 4]);
+                }
+                let sums = [0, 2].map(|i| simd.add_f32s(sums[i], sums[i + 1]));
+                let mut sum = simd.reduce_sum_f32s(simd.add_f32s(sums[0], sums[1]));
+                for (input, weight) in tail.iter().zip(weights_tail) {
+                    sum += input * weight;
+                }
+                sum += bias[column];
+                outputs[row * self.width + column] = match activation {
+                    Activation::Linear => sum,
+                    Activation::Relu => sum.max(0.0),
+                };
+            }
+        }
+    }
+}
+
+impl<S: Simd> Tiled<S> for Job<'_> {
+    #[inline(always)]
+    fn tile<const M: usize, const V: usize>(&mut self, simd: S, row: usize) {
+        let Forward { inputs, packed, bias, activation, outputs } = &mut self.layer;
+        let end = self.width.min(self.column + PANEL);
+        let sums = [load::<S, V>(simd, &bias[self.column..end]); M];
+        let left = Broadcast {
+            data: &inputs[row * self.depth..],
+            row_stride: self.depth,
+            depth_stride: 1,
+        };
+        let panel = &packed[self.column * self.depth..][..self.depth * PANEL];
+        let right = Wide { data: panel, stride: PANEL, width: PANEL };
+        let sums = accumulate::<S, M, V, false>(simd, sums, left, right, self.depth);
+        let zero = simd.splat_f32s(0.0);
+        for (m, mut sums) in sums.into_iter().enumerate() {
+            if *activation == Activation::Relu {
+                for sum in &mut sums {
+                    *sum = simd.max_f32s(*sum, zero);
+                }
+            }
+            let at = (row + m) * self.width;
+            store::<S, V>(simd, &mut outputs[at + self.column..at + end], sums);
+        }
+    }
+}

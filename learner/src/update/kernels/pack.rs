@@ -1,0 +1,116 @@
+//! The forward pass's copy of a layer's weights.
+
+use super::{InstructionSet, PANEL};
+
+/// Layers with at most so many outputs are not packed: their outputs are dot products.
+pub(super) const NARROW: usize = 2;
+
+/// Length of the packed weights of a layer.
+#[must_use]
+pub fn packed_len(inputs: usize, outputs: usize) -> usize {
+    if outputs <= NARROW { inputs * outputs } else { inputs * outputs.next_multiple_of(PANEL) }
+}
+
+/// Packs (outputs, inputs) `weights` into panels of [`PANEL`] outputs, input by input, the last
+/// panel filled with zeros. A layer of `outputs_len` outputs may be packed in pieces that begin at
+/// multiples of [`PANEL`]: the piece from output o on begins at o * inputs.
+///
+/// # Panics
+/// If the lengths do not fit.
+pub fn pack(
+    weights: &[f32],
+    inputs: usize,
+    outputs_len: usize,
+    packed: &mut [f32],
+    instructions: InstructionSet,
+) {
+    if inputs == 0 {
+        return;
+    }
+    let outputs = weights.len() / inputs;
+    assert_eq!(weights.len(), outputs * inputs, "weights of {inputs} inputs");
+    let narrow = outputs_len <= NARROW;
+    let rows = if narrow { outputs } else { outputs.next_multiple_of(PANEL) };
+    assert_eq!(packed.len(), rows * inputs, "packed weights");
+    if narrow {
+        return packed.copy_from_slice(weights);
+    }
+    let panels = packed.chunks_exact_mut(PANEL * inputs);
+    for (weights, panel) in weights.chunks(PANEL * inputs).zip(panels) {
+        let mut done = 0;
+        #[cfg(target_arch = "x86_64")]
+        if instructions.has_avx512() && weights.len() == panel.len() {
+            done = inputs / PANEL * PANEL;
+            for input in (0..done).step_by(PANEL) {
+                // SAFETY: `has_avx512` says that the processor has these instructions.
+                unsafe { transpose(&weights[input..], inputs, &mut panel[input * PANEL..]) };
+            }
+        }
+        #[cfg(not(target_arch = "x86_64"))]
+        let _ = instructions;
+        if weights.len() < panel.len() {
+            panel.fill(0.0);
+        }
+        for (output, row) in weights.chunks_exact(inputs).enumerate() {
+            for (weight, packed) in row.iter().zip(panel.chunks_exact_mut(PANEL)).skip(done) {
+                packed[output] = *weight;
+            }
+        }
+    }
+}
+
+/// Transposes 16 rows of 16 numbers that are `stride` apart into 256 consecutive numbers.
+#[cfg(target_arch = "x86_64")]
+#[target_feature(enable = "avx512f")]
+fn transpose(rows: &[f32], stride: usize, out: &mut [f32]) {
+    use std::arch::x86_64::{_mm512_loadu_ps, _mm512_setzero_ps, _mm512_storeu_ps};
+    assert!(rows.len() >= (PANEL - 1) * stride + PANEL && out.len() >= PANEL * PANEL);
+    let mut at = [_mm512_setzero_ps(); PANEL];
+    for (i, row) in at.iter_mut().enumerate() {
+        // SAFETY: row i reaches to i * stride + 16 of `rows`, whose length was asserted.
+        *row = unsafe { _mm512_loadu_ps(rows.as_ptr().add(i * stride)) };
+    }
+    exchange::<8>(&mut at);
+    exchange::<4>(&mut at);
+    exchange::<2>(&mut at);
+    exchange::<1>(&mut at);
+    for (i, row) in at.iter().enumerate() {
+        // SAFETY: `out` has 256 numbers (asserted above).
+        unsafe { _mm512_storeu_ps(out.as_mut_ptr().add(i * PANEL), *row) };
+    }
+}
+
+/// Exchanges, in every pair of rows D apart, the off-diagonal blocks of D x D numbers.
+#[cfg(target_arch = "x86_64")]
+#[inline]
+#[target_feature(enable = "avx512f")]
+fn exchange<const D: usize>(at: &mut [std::arch::x86_64::__m512; PANEL]) {
+    use std::arch::x86_64::{_mm512_loadu_si512, _mm512_permutex2var_ps};
+    let tables = const { &exchanged(D) };
+    // SAFETY: each table is 64 bytes.
+    let upper = unsafe { _mm512_loadu_si512(tables[0].as_ptr().cast()) };
+    // SAFETY: as above.
+    let lower = unsafe { _mm512_loadu_si512(tables[1].as_ptr().cast()) };
+    for i in 0..PANEL {
+        if i & D == 0 {
+            let (a, b) = (at[i], at[i + D]);
+            at[i] = _mm512_permutex2var_ps(a, upper, b);
+            at[i + D] = _mm512_permutex2var_ps(a, lower, b);
+        }
+    }
+}
+
+/// From which place of two rows, the second's counted from 16, each number of the exchanged rows
+/// comes.
+#[cfg(target_arch = "x86_64")]
+const fn exchanged(distance: usize) -> [[i32; PANEL]; 2] {
+    let mut tables = [[0; PANEL]; 2];
+    let mut i = 0;
+    while i < PANEL {
+        let inside = i & distance != 0;
+        tables[0][i] = if inside { i - distance + PANEL } else { i } as i32;
+        tables[1][i] = if inside { i + PANEL } else { i + distance } as i32;
+        i += 1;
+    }
+    tables
+}
