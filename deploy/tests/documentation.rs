@@ -10,8 +10,13 @@ use dmprl_learner::metrics::{MetricsLine, Rejected};
 use dmprl_shared::config::{ExperimentConfig, Layers, Limits, task_defaults};
 
 const EXAMPLES: &str = "docs/examples";
-const DOCUMENTS: [&str; 4] =
-    ["README.md", "ARCHITECTURE.md", "CHANGELOG.md", "docs/environments.md"];
+const DOCUMENTS: [&str; 5] = [
+    "README.md",
+    "ARCHITECTURE.md",
+    "CHANGELOG.md",
+    "docs/environments.md",
+    "docs/demonstrations.md",
+];
 const LIMITS: Limits = Limits { cores: 2 };
 /// How the program is called in the documents.
 const CALLS: [&str; 3] = ["cargo run --release -- ", "target/release/dmprl ", "dmprl "];

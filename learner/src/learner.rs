@@ -11,7 +11,9 @@ use dmprl_shared::spec::EnvSpec;
 use serde::{Deserialize, Serialize};
 use thiserror::Error;
 
+use crate::algorithms::cloning::Cloning;
 use crate::algorithms::{Algorithm, Batch, NoWindow};
+use crate::demonstrations::{DemonstrationError, Steps};
 use crate::metrics::{Collector, MetricsLine, Rejected};
 use crate::normaliser::Normaliser;
 use crate::pacing::Pacing;
@@ -29,6 +31,9 @@ pub enum LearnerError {
     /// The replay has nothing to learn from.
     #[error(transparent)]
     NoWindow(#[from] NoWindow),
+    /// Demonstrations do not fit.
+    #[error(transparent)]
+    Demonstrations(#[from] DemonstrationError),
     /// A loss or parameter is NaN or infinite.
     #[error(
         "update {update}: {name} is {value}; the run has diverged. The last checkpoint is sound: \
@@ -241,8 +246,14 @@ impl Learner {
     }
 
     fn refresh_normaliser(&mut self) -> Result<(), LearnerError> {
-        if let Some(normaliser) = self.normaliser.as_mut().filter(|normaliser| normaliser.is_due())
-        {
+        match &self.normaliser {
+            Some(normaliser) if normaliser.is_due() => self.take_normaliser_anew(),
+            _ => Ok(()),
+        }
+    }
+
+    fn take_normaliser_anew(&mut self) -> Result<(), LearnerError> {
+        if let Some(normaliser) = &mut self.normaliser {
             let change = normaliser.refresh();
             let sees_observations = |name: &str| name == "actor" || name.starts_with("critic");
             self.algorithm.each_network(|name, trained| {
@@ -285,6 +296,46 @@ impl Learner {
             target.set(parameters)?;
         }
         Ok(())
+    }
+
+    /// Keeps demonstrations in the replay and lets the actor imitate them for as many updates as
+    /// the configuration says; returns the mean loss of the first and of the last tenth of these.
+    ///
+    /// # Errors
+    /// If they do not fit into the replay, or hold no whole window.
+    pub fn demonstrate(
+        &mut self,
+        demonstrations: &[Steps],
+    ) -> Result<Option<(f32, f32)>, LearnerError> {
+        for steps in demonstrations {
+            steps.enter(&mut self.replay)?;
+            if let Some(normaliser) = &mut self.normaliser {
+                normaliser.observe(&steps.observations);
+            }
+        }
+        let updates = self.config.demonstrations.cloning_updates;
+        if updates == 0 {
+            return Ok(None);
+        }
+        if self.normaliser.is_some() {
+            self.take_normaliser_anew()?;
+        }
+        let parameters = self.algorithm.actor().network.read(<[f32]>::to_vec)?;
+        let mut cloning = Cloning::new(&self.config, &self.policy, parameters)?;
+        let tenth = updates.div_ceil(10);
+        let (mut first, mut last) = (0.0, 0.0);
+        for update in 0..updates {
+            cloning.sample(self.normaliser.as_ref(), (&self.replay, &mut self.sampler))?;
+            let value = cloning.update(&self.policy)?;
+            if !value.is_finite() {
+                return Err(LearnerError::NotFinite { update, name: "cloning loss", value });
+            }
+            first += if update < tenth { value } else { 0.0 };
+            last += if update >= updates - tenth { value } else { 0.0 };
+        }
+        let parameters = cloning.actor.network.read(<[f32]>::to_vec)?;
+        self.warm_start(&parameters)?;
+        Ok(Some((first / tenth as f32, last / tenth as f32)))
     }
 
     /// updates * batch_size / env_steps.

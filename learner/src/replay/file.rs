@@ -1,12 +1,14 @@
 //! The replay in a checkpoint: a length-checked binary of our own.
 //!
 //! ```text
-//!   magic "DMPRLRP1" · u64 K, O, A, slot count, filled, head, inserted, tail count
+//!   magic "DMPRLRP2" · u64 K, O, A, slot count, filled, head, inserted, tail count, kept
 //!   then slots · tails · blocks:
 //!   slot: u32 next, u8 steps_len, u8 terminated, u8 truncated, u8 hindsight     (filled ones)
 //!   tail: u32 slot, incarnation, episode, episode_steps, u64 number; slot = 2^32 - 1: none
 //!   block: f32 × block_len (filled ones)                                 all little-endian
 //! ```
+//! "DMPRLRP1", of older versions, has no `kept`: it is 0.
+//!
 //! Nothing in the file is trusted: counts are compared with what the configuration gives before
 //! anything is read, and every slot number must be below `filled`.
 
@@ -17,7 +19,8 @@ use thiserror::Error;
 
 use super::{NONE, Replay, Slot, Tail};
 
-const MAGIC: &[u8; 8] = b"DMPRLRP1";
+const MAGIC: &[u8; 8] = b"DMPRLRP2";
+const MAGIC_WITHOUT_KEPT: &[u8; 8] = b"DMPRLRP1";
 
 /// Why a replay file was refused.
 #[derive(Debug, Error)]
@@ -26,7 +29,7 @@ pub enum ReplayFileError {
     #[error("replay file: {0}")]
     Io(#[from] io::Error),
     /// Not a replay file.
-    #[error("replay file: begins with {0:?}, expected DMPRLRP1")]
+    #[error("replay file: begins with {0:?}, expected DMPRLRP2")]
     Magic([u8; 8]),
     /// A count that does not fit the configuration.
     #[error("replay file: {name} is {got}, the configuration gives {expected}")]
@@ -66,6 +69,7 @@ impl Replay {
     pub fn write(&self, out: &mut impl Write) -> Result<(), ReplayFileError> {
         out.write_all(MAGIC)?;
         let sizes = [self.filled as u64, self.head as u64, self.inserted, self.tails.len() as u64];
+        let sizes = sizes.into_iter().chain([self.kept as u64]);
         for count in self.counts().iter().map(|(_, count)| *count).chain(sizes) {
             out.write_all(&count.to_le_bytes())?;
         }
@@ -97,7 +101,7 @@ impl Replay {
     pub fn read(&mut self, input: &mut impl Read) -> Result<(), ReplayFileError> {
         let mut magic = [0; 8];
         input.read_exact(&mut magic)?;
-        if &magic != MAGIC {
+        if &magic != MAGIC && &magic != MAGIC_WITHOUT_KEPT {
             return Err(ReplayFileError::Magic(magic));
         }
         for (name, expected) in self.counts() {
@@ -115,6 +119,7 @@ impl Replay {
         (self.filled, self.head) = (filled?, head?);
         self.inserted = read_u64(input)?;
         self.read_tail_count(input)?;
+        self.kept = if &magic == MAGIC { self.read_kept(input)? } else { 0 };
         for index in 0..self.filled {
             self.slots[index] = self.read_slot(input, index)?;
         }
@@ -132,6 +137,15 @@ impl Replay {
             return Err(ReplayFileError::Count { name: "environment count", expected, got });
         }
         Ok(())
+    }
+
+    /// Demonstrations lie at the front; the next segment goes behind them.
+    fn read_kept(&self, input: &mut impl Read) -> Result<usize, ReplayFileError> {
+        let (expected, got) = (self.filled.min(self.head) as u64, read_u64(input)?);
+        if got > expected {
+            return Err(ReplayFileError::Count { name: "kept", expected, got });
+        }
+        Ok(got as usize)
     }
 
     fn read_slot(&self, input: &mut impl Read, index: usize) -> Result<Slot, ReplayFileError> {

@@ -22,6 +22,8 @@ pub struct ExperimentConfig {
     pub exploration: ExplorationConfig,
     /// Storage of experience.
     pub replay: ReplayConfig,
+    /// Experience of somebody else's.
+    pub demonstrations: DemonstrationsConfig,
     /// Updates per inserted segment.
     pub pacing: PacingConfig,
     /// The rollout workers.
@@ -117,6 +119,30 @@ pub struct ReplayConfig {
 impl Default for ReplayConfig {
     fn default() -> Self {
         Self { capacity_steps: 1_000_000, hindsight: Hindsight::None, hindsight_copies: 4 }
+    }
+}
+
+/// Experience that somebody recorded, from which a run starts.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct DemonstrationsConfig {
+    /// Files of steps (docs/demonstrations.md).
+    pub files: Vec<String>,
+    /// Updates in which the actor imitates them, before anything else; 0: it does not.
+    pub cloning_updates: u64,
+}
+
+impl Default for DemonstrationsConfig {
+    fn default() -> Self {
+        Self { files: Vec::new(), cloning_updates: 1_000 }
+    }
+}
+
+impl DemonstrationsConfig {
+    /// Whether the run starts with a policy that imitates.
+    #[must_use]
+    pub fn are_cloned(&self) -> bool {
+        !self.files.is_empty() && self.cloning_updates > 0
     }
 }
 

@@ -22,8 +22,9 @@ pub use dmp::{
     PolicyKind, RhoKind, Start, StartSource, StartVelocity,
 };
 pub use experiment::{
-    ActorsConfig, CheckpointConfig, Device, EvaluationConfig, ExperimentConfig, Hindsight,
-    LearnerConfig, MetricsConfig, PacingConfig, ReplayConfig, RunConfig, TaskConfig,
+    ActorsConfig, CheckpointConfig, DemonstrationsConfig, Device, EvaluationConfig,
+    ExperimentConfig, Hindsight, LearnerConfig, MetricsConfig, PacingConfig, ReplayConfig,
+    RunConfig, TaskConfig,
 };
 pub use layers::{ConfigError, Layers, nearest};
 pub use presets::{PRESETS, Preset, policy_defaults};

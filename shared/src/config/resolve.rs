@@ -172,6 +172,12 @@ impl ExperimentConfig {
              defined during the warm-up"
                 .into()
         })?;
+        let demonstrated = !self.demonstrations.files.is_empty();
+        range("policy.start", "carry", !(carry && demonstrated), || {
+            "demonstrations hold no state of a movement primitive to carry on; choose \"zero\" or \
+             \"observed\""
+                .into()
+        })?;
         let observed = dmp && self.policy.start == Start::Observed;
         let sources = self.task.start_sources.len();
         range("policy.start", "observed", !observed || sources > 0, || {

@@ -29,6 +29,16 @@ impl ActionScaling {
             }
         }
     }
+
+    /// The u, (rows, A), that leads to `actions`, (rows, A) within their bounds.
+    pub fn invert(&self, actions: &[f64], u: &mut [f32]) {
+        let dims = self.mid.len();
+        for (row, out) in actions.chunks_exact(dims).zip(u.chunks_exact_mut(dims)) {
+            for (d, (action, u)) in row.iter().zip(out).enumerate() {
+                *u = (((action - self.mid[d]) / self.half_range[d]) as f32).clamp(-1.0, 1.0);
+            }
+        }
+    }
 }
 
 #[cfg(test)]
@@ -50,5 +60,8 @@ mod tests {
         let mut actions = [0.0; 6];
         ActionScaling::new(&spec).apply(&[-1.0, -1.0, 0.0, 0.0, 1.0, 1.0], &mut actions);
         assert_eq!(actions, [-15.0, 0.0, 0.0, 2.0, 15.0, 4.0]);
+        let mut u = [0.0; 6];
+        ActionScaling::new(&spec).invert(&actions, &mut u);
+        assert_eq!(u, [-1.0, -1.0, 0.0, 0.0, 1.0, 1.0]);
     }
 }
