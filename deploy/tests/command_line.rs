@@ -76,6 +76,8 @@ fn values_that_cannot_be_are_wrong_use() {
         &["train", "reacher", "--steps", "0"],
         &["train", "reacher", "--steps", "-5"],
         &["train", "reacher", "--threads", "0"],
+        #[cfg(not(feature = "cuda"))]
+        &["train", "reacher", "--device", "cuda"],
         &["train", "reacher", "--max-minutes", "0"],
         &["train", "reacher", "--set", "dmp.alpha_y=1000"],
         &["train", "reacher", "--deterministic", "--workers", "4"],

@@ -79,7 +79,9 @@ class GymnasiumGoals:
         A distance tells any two pairs apart; a threshold has two answers.
         """
         if not env.has_wrapper_attr("compute_reward"):
-            raise self._refused("it has no method compute_reward(achieved_goal, desired_goal, info)")
+            raise self._refused(
+                "it has no method compute_reward(achieved_goal, desired_goal, info)"
+            )
         drawn = []
         for seed, space in enumerate((achieved, desired)):
             space = copy.deepcopy(space)  # its random state is not ours
@@ -95,7 +97,7 @@ class GymnasiumGoals:
         if rewards.shape != (len(achieved),):
             raise self._refused(
                 f"its compute_reward takes one goal at a time: for goals {achieved.shape} it "
-                f"returned {rewards.shape}, expected {(len(achieved),)}; compute along the last axis"
+                f"returned {rewards.shape}, expected {(len(achieved),)}"
             )
         return rewards
 

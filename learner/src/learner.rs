@@ -12,7 +12,7 @@ use serde::{Deserialize, Serialize};
 use thiserror::Error;
 
 use crate::algorithms::cloning::Cloning;
-use crate::algorithms::{Algorithm, Batch, NoWindow};
+use crate::algorithms::{Algorithm, Batch, Losses, NoWindow};
 use crate::demonstrations::{DemonstrationError, Steps};
 use crate::metrics::{Collector, MetricsLine, Rejected};
 use crate::normaliser::Normaliser;
@@ -98,6 +98,8 @@ pub struct Learner {
     /// Incarnation and last sequence number of every worker heard from.
     heard: Vec<(u32, u64)>,
     omega: f32,
+    /// (P,): of the actor while it rests; empty where it never does.
+    resting: Vec<f32>,
 }
 
 impl Learner {
@@ -139,6 +141,10 @@ impl Learner {
                 ..ParameterSnapshot::default()
             },
             heard: vec![(0, 0); workers],
+            resting: match config.demonstrations.are_cloned() {
+                true => vec![0.0; policy.shape().parameters_len()],
+                false => Vec::new(),
+            },
             omega: match policy.head() {
                 Head::Dmp(head) => head.omega(),
                 Head::Mlp => 1.0,
@@ -197,10 +203,15 @@ impl Learner {
         self.collector.inserted(segment, self.counters.policy_version);
         self.counters.segments += 1;
         self.counters.env_steps += u64::from(segment.header.steps_len);
-        if self.counters.env_steps > self.config.exploration.warm_up_steps {
+        // A policy that imitates has no warm-up to wait for.
+        if !self.is_warming_up() || self.config.demonstrations.are_cloned() {
             self.pacing.inserted();
         }
         Ok(())
+    }
+
+    fn is_warming_up(&self) -> bool {
+        self.counters.env_steps <= self.config.exploration.warm_up_steps
     }
 
     /// A worker numbers its segments from 1 without gaps: a number used before is a duplicate, one
@@ -229,8 +240,7 @@ impl Learner {
         let shape = self.algorithm.batch_shape();
         let normaliser = self.normaliser.as_ref();
         self.batch.sample(shape, &self.config.algorithm, self.omega, normaliser, source)?;
-        let update = self.counters.updates + 1;
-        let losses = self.algorithm.update(&self.policy, &self.batch, update)?;
+        let losses = self.update_networks()?;
         for (name, value) in
             [("critic_loss", Some(losses.critic_loss)), ("actor_loss", losses.actor_loss)]
         {
@@ -245,6 +255,23 @@ impl Learner {
         Ok(())
     }
 
+    /// An actor that imitates rests through the warm-up: a critic that knows nothing yet would soon
+    /// lead it astray. Its optimiser's moments go on.
+    fn update_networks(&mut self) -> Result<Losses, LearnerError> {
+        let update = self.counters.updates + 1;
+        let rests = !self.resting.is_empty() && self.is_warming_up();
+        if !rests {
+            return Ok(self.algorithm.update(&self.policy, &self.batch, update)?);
+        }
+        let mut parameters = std::mem::take(&mut self.resting);
+        self.algorithm.read_actor(&mut parameters)?;
+        let losses = self.algorithm.update(&self.policy, &self.batch, update)?;
+        self.algorithm.fetch()?;
+        self.warm_start(&parameters)?;
+        self.resting = parameters;
+        Ok(losses)
+    }
+
     fn refresh_normaliser(&mut self) -> Result<(), LearnerError> {
         match &self.normaliser {
             Some(normaliser) if normaliser.is_due() => self.take_normaliser_anew(),
@@ -255,6 +282,7 @@ impl Learner {
     fn take_normaliser_anew(&mut self) -> Result<(), LearnerError> {
         if let Some(normaliser) = &mut self.normaliser {
             let change = normaliser.refresh();
+            self.algorithm.fetch()?;
             let sees_observations = |name: &str| name == "actor" || name.starts_with("critic");
             self.algorithm.each_network(|name, trained| {
                 if sees_observations(name) { change.apply(trained) } else { Ok(()) }
@@ -272,7 +300,7 @@ impl Learner {
         self.snapshot.version = self.counters.policy_version;
         self.snapshot.env_steps = self.counters.env_steps;
         let values = &mut self.snapshot.values;
-        self.algorithm.actor().network.read(|parameters| values.copy_from_slice(parameters))?;
+        self.algorithm.read_actor(values)?;
         if let Some(normaliser) = &self.normaliser {
             normaliser.fold(self.policy.shape(), values);
         }
@@ -290,11 +318,16 @@ impl Learner {
     /// # Errors
     /// If the lengths differ.
     pub fn warm_start(&mut self, parameters: &[f32]) -> Result<(), LearnerError> {
-        let actor = self.algorithm.actor();
-        actor.network.set(parameters)?;
-        if let Some(target) = &actor.target {
-            target.set(parameters)?;
-        }
+        self.algorithm.each_network(|name, actor| {
+            if name != "actor" {
+                return Ok(());
+            }
+            actor.network.set(parameters)?;
+            match &actor.target {
+                Some(target) => target.set(parameters),
+                None => Ok(()),
+            }
+        })?;
         Ok(())
     }
 

@@ -6,6 +6,7 @@
 pub mod algorithms;
 pub mod checkpoint;
 pub mod demonstrations;
+mod graph;
 pub mod learner;
 pub mod metrics;
 pub mod networks;

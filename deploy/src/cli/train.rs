@@ -7,7 +7,7 @@ use std::time::{Duration, SystemTime};
 use anyhow::Context;
 use clap::Args;
 use clap::builder::PossibleValuesParser;
-use dmprl_shared::config::{AlgorithmName, ExperimentConfig, Limits, PolicyKind};
+use dmprl_shared::config::{AlgorithmName, Device, ExperimentConfig, Limits, PolicyKind};
 use dmprl_shared::dmp::Dmp;
 use toml::Value;
 
@@ -56,8 +56,8 @@ pub(super) struct TrainArgs {
     /// One process in lock-step: the same seed gives the same bytes.
     #[arg(long)]
     deterministic: bool,
-    /// Where the update runs.
-    #[arg(long, value_parser = PossibleValuesParser::new(["cpu"]))]
+    /// Where the update runs; `cuda` needs a build with that feature.
+    #[arg(long, value_parser = PossibleValuesParser::new(["cpu", "cuda"]))]
     device: Option<String>,
     /// Threads of the update.
     #[arg(long, value_name = "N")]
@@ -112,6 +112,12 @@ fn check(config: &ExperimentConfig, args: &TrainArgs) -> anyhow::Result<()> {
     if config.policy.kind == PolicyKind::Dmp {
         Dmp::new(&config.dmp, config.policy.segment_steps)
             .map_err(|error| wrong_use(error.to_string()))?;
+    }
+    if config.learner.device == Device::Cuda && !cfg!(feature = "cuda") {
+        return Err(wrong_use(
+            "learner.device = \"cuda\": this build has no CUDA; on a machine with an NVIDIA GPU and \
+             the CUDA toolkit, build with: cargo build --release --features cuda",
+        ));
     }
     if let Some(workers) = args.configured.workers.filter(|&n| n > 1 && config.run.deterministic) {
         return Err(wrong_use(format!(

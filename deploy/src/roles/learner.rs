@@ -205,7 +205,7 @@ pub fn close<R: SegmentReceiver, P: ParameterPublisher>(
     if recorder.is_unmeasured(&session.learner) {
         recorder.due(Due::Metrics, &mut session.learner, evaluate)?;
     }
-    recorder.write_checkpoint(&session.learner);
+    recorder.write_checkpoint(&mut session.learner);
     evaluation?;
     if control.orphaned() {
         bail!("the supervisor is gone; the run ended after a checkpoint");

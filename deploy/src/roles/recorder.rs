@@ -184,7 +184,7 @@ impl<'a> Recorder<'a> {
     }
 
     /// Writes a checkpoint; a failure is shown, the previous checkpoint and the training stay.
-    pub fn write_checkpoint(&mut self, learner: &Learner) {
+    pub fn write_checkpoint(&mut self, learner: &mut Learner) {
         match checkpoint::save(&self.run.checkpoints_path(), learner) {
             Ok(name) => {
                 self.checkpoint_failing = false;

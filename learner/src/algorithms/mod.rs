@@ -7,13 +7,14 @@ pub mod ddpg;
 pub mod sac;
 pub mod td3;
 
-use candle_core::Result;
-use dmprl_shared::config::{AlgorithmName, ExperimentConfig};
+use candle_core::{Device, Result};
+use dmprl_shared::config::{self, AlgorithmName, ExperimentConfig};
 use dmprl_shared::policy::{MlpShape, Policy, initial_parameters};
 use dmprl_shared::seeds;
 
 pub use batch::{Batch, BatchShape, NoWindow};
 
+use crate::graph::Graph;
 use crate::update::crew::Crew;
 use crate::update::trained::Trained;
 use ddpg::Ddpg;
@@ -41,13 +42,25 @@ pub struct Algorithm {
     shape: BatchShape,
     crew: Crew,
     kind: Kind,
+    remote: Option<Remote>,
+}
+
+/// The same on another device, and which side is behind.
+#[derive(Debug)]
+struct Remote {
+    config: ExperimentConfig,
+    device: Device,
+    /// None: the networks here have changed since it was made.
+    graph: Option<Graph>,
+    /// Whether the device has done updates that the networks here have not seen.
+    is_ahead: bool,
 }
 
 #[derive(Debug)]
 enum Kind {
-    Ddpg(Ddpg),
-    Td3(Td3),
-    Sac(Sac),
+    Ddpg(Box<Ddpg>),
+    Td3(Box<Td3>),
+    Sac(Box<Sac>),
 }
 
 impl Algorithm {
@@ -58,11 +71,20 @@ impl Algorithm {
     pub fn new(config: &ExperimentConfig, policy: &Policy) -> Result<Self> {
         let shape = BatchShape::new(&config.algorithm, policy);
         let kind = match config.algorithm.name {
-            AlgorithmName::Ddpg => Kind::Ddpg(Ddpg::new(config, policy, shape)?),
-            AlgorithmName::Td3 => Kind::Td3(Td3::new(config, policy, shape)?),
-            AlgorithmName::Sac => Kind::Sac(Sac::new(config, policy, shape)?),
+            AlgorithmName::Ddpg => Kind::Ddpg(Box::new(Ddpg::new(config, policy, shape)?)),
+            AlgorithmName::Td3 => Kind::Td3(Box::new(Td3::new(config, policy, shape)?)),
+            AlgorithmName::Sac => Kind::Sac(Box::new(Sac::new(config, policy, shape)?)),
         };
-        Ok(Self { shape, crew: Crew::new(config.learner.threads), kind })
+        let remote = match config.learner.device {
+            config::Device::Cpu => None,
+            config::Device::Cuda => Some(Remote {
+                config: config.clone(),
+                device: Device::new_cuda(0)?,
+                graph: None,
+                is_ahead: false,
+            }),
+        };
+        Ok(Self { shape, crew: Crew::new(config.learner.threads), kind, remote })
     }
 
     /// The batch that [`Algorithm::update`] takes.
@@ -76,10 +98,74 @@ impl Algorithm {
     /// # Errors
     /// If candle refuses access to a variable.
     pub fn update(&mut self, policy: &Policy, batch: &Batch, update: u64) -> Result<Losses> {
+        if let Some(losses) = self.update_remote(policy, batch, update)? {
+            return Ok(losses);
+        }
         match &mut self.kind {
             Kind::Ddpg(ddpg) => ddpg.update(policy, batch, &self.crew),
             Kind::Td3(td3) => td3.update(policy, batch, &self.crew, update),
             Kind::Sac(sac) => sac.update(policy, batch, &self.crew),
+        }
+    }
+
+    /// The update on another device; none if there is no other.
+    fn update_remote(
+        &mut self,
+        policy: &Policy,
+        batch: &Batch,
+        update: u64,
+    ) -> Result<Option<Losses>> {
+        let Some(mut remote) = self.remote.take() else { return Ok(None) };
+        let losses = self.update_on(&mut remote, policy, batch, update);
+        self.remote = Some(remote);
+        losses.map(Some)
+    }
+
+    fn update_on(
+        &self,
+        remote: &mut Remote,
+        policy: &Policy,
+        batch: &Batch,
+        update: u64,
+    ) -> Result<Losses> {
+        let graph = match &mut remote.graph {
+            Some(graph) => graph,
+            None => {
+                let networks = self.networks();
+                let Remote { config, device, .. } = &*remote;
+                let graph = Graph::new(config, policy, self.shape, device, &networks)?;
+                remote.graph.insert(graph)
+            }
+        };
+        remote.is_ahead = true;
+        graph.update(policy, batch, update)
+    }
+
+    /// Brings back what another device has learned since: to be called before networks are read.
+    ///
+    /// # Errors
+    /// If the device refuses.
+    pub fn fetch(&mut self) -> Result<()> {
+        let Some(mut remote) = self.remote.take() else { return Ok(()) };
+        let fetched = match &remote.graph {
+            Some(graph) if remote.is_ahead => {
+                self.each_network(|name, trained| graph.fetch(name, trained))
+            }
+            _ => Ok(()),
+        };
+        remote.is_ahead &= fetched.is_err();
+        self.remote = Some(remote);
+        fetched
+    }
+
+    /// Copies the policy's parameters, (P,), into `out`, from wherever they are newest.
+    ///
+    /// # Errors
+    /// If candle or the device refuses.
+    pub fn read_actor(&self, out: &mut [f32]) -> Result<()> {
+        match &self.remote {
+            Some(Remote { graph: Some(graph), is_ahead: true, .. }) => graph.read_actor(out),
+            _ => self.actor().network.read(|parameters| out.copy_from_slice(parameters)),
         }
     }
 
@@ -93,7 +179,7 @@ impl Algorithm {
         }
     }
 
-    /// Hands every network, with the name it has in a checkpoint, to `f`.
+    /// Hands every network, with the name it has in a checkpoint, to `f`, which may change it.
     ///
     /// # Errors
     /// The first that `f` returns.
@@ -101,21 +187,24 @@ impl Algorithm {
         &mut self,
         mut f: impl FnMut(&'static str, &mut Trained) -> std::result::Result<(), E>,
     ) -> std::result::Result<(), E> {
+        if let Some(remote) = &mut self.remote {
+            remote.graph = None;
+        }
         match &mut self.kind {
-            Kind::Ddpg(Ddpg { actor, critic, .. }) => {
-                f("actor", actor)?;
-                f("critic", critic)
+            Kind::Ddpg(ddpg) => {
+                f("actor", &mut ddpg.actor)?;
+                f("critic", &mut ddpg.critic)
             }
-            Kind::Td3(Td3 { actor, critics: [first, second], .. }) => {
-                f("actor", actor)?;
-                f("critic_1", first)?;
-                f("critic_2", second)
+            Kind::Td3(td3) => {
+                f("actor", &mut td3.actor)?;
+                f("critic_1", &mut td3.critics[0])?;
+                f("critic_2", &mut td3.critics[1])
             }
-            Kind::Sac(Sac { actor, critics: [first, second], log_temperature, .. }) => {
-                f("actor", actor)?;
-                f("critic_1", first)?;
-                f("critic_2", second)?;
-                f("log_temperature", log_temperature)
+            Kind::Sac(sac) => {
+                f("actor", &mut sac.actor)?;
+                f("critic_1", &mut sac.critics[0])?;
+                f("critic_2", &mut sac.critics[1])?;
+                f("log_temperature", &mut sac.log_temperature)
             }
         }
     }
@@ -125,15 +214,15 @@ impl Algorithm {
     pub fn networks(&self) -> Vec<(&'static str, &Trained)> {
         match &self.kind {
             Kind::Ddpg(ddpg) => vec![("actor", &ddpg.actor), ("critic", &ddpg.critic)],
-            Kind::Td3(Td3 { actor, critics: [first, second], .. }) => {
-                vec![("actor", actor), ("critic_1", first), ("critic_2", second)]
+            Kind::Td3(td3) => {
+                let [first, second] = &td3.critics;
+                vec![("actor", &td3.actor), ("critic_1", first), ("critic_2", second)]
             }
-            Kind::Sac(Sac { actor, critics: [first, second], log_temperature, .. }) => vec![
-                ("actor", actor),
-                ("critic_1", first),
-                ("critic_2", second),
-                ("log_temperature", log_temperature),
-            ],
+            Kind::Sac(sac) => {
+                let [first, second] = &sac.critics;
+                let temperature = ("log_temperature", &sac.log_temperature);
+                vec![("actor", &sac.actor), ("critic_1", first), ("critic_2", second), temperature]
+            }
         }
     }
 }

@@ -45,6 +45,12 @@ pub enum CheckpointError {
         /// Why.
         cause: std::io::Error,
     },
+    /// What the device has learned could not be brought back.
+    #[error("cannot bring the networks back from the device: {cause}")]
+    Device {
+        /// Why.
+        cause: candle_core::Error,
+    },
     /// A file whose length or checksum differs from what `state.json` says.
     #[error("{path}: {name} is {got}, expected {expected}")]
     Damaged {
@@ -125,7 +131,9 @@ fn io_error(path: &Path) -> impl FnOnce(std::io::Error) -> CheckpointError + '_ 
 ///
 /// # Errors
 /// If writing fails; the checkpoints that were there are then untouched.
-pub fn save(folder: &Path, learner: &Learner) -> Result<String, CheckpointError> {
+pub fn save(folder: &Path, learner: &mut Learner) -> Result<String, CheckpointError> {
+    let fetched = learner.algorithm.fetch();
+    fetched.map_err(|cause| CheckpointError::Device { cause })?;
     rotation::remove_temporaries(folder)?;
     let name = rotation::next_name(folder)?;
     let temporary = folder.join(format!(".{name}.tmp"));

@@ -83,15 +83,15 @@ fn a_resumed_learner_goes_on_to_the_same_bytes_as_one_that_never_stopped() {
 
         let mut learner = fresh().unwrap();
         train(&mut learner, 0..60);
-        save(&resumed, &learner).unwrap();
+        save(&resumed, &mut learner).unwrap();
         train(&mut learner, 60..300);
-        let name = save(&straight, &learner).unwrap();
+        let name = save(&straight, &mut learner).unwrap();
         assert!(learner.counters.updates > 400);
 
         let (mut learner, loaded) = load_newest(&resumed, &fresh).unwrap();
         assert!(loaded.refused.is_empty());
         train(&mut learner, 60..300);
-        let again = save(&resumed, &learner).unwrap();
+        let again = save(&resumed, &mut learner).unwrap();
         let both = [(&straight, &name), (&resumed, &again)];
         let [straight, resumed] = both.map(|(folder, name)| checkpoint_bytes(folder, name));
         assert!(straight == resumed, "{keys:?}");
@@ -104,7 +104,7 @@ fn a_checkpoint_of_the_format_before_is_read_and_one_of_a_later_is_refused() {
     let folder = folder.path();
     let mut learner = fresh().unwrap();
     train(&mut learner, 0..60);
-    let name = save(folder, &learner).unwrap();
+    let name = save(folder, &mut learner).unwrap();
     let path = folder.join(&name).join(STATE);
     let mut state: serde_json::Value = serde_json::from_slice(&fs::read(&path).unwrap()).unwrap();
     let steps = state.as_object_mut().unwrap().remove("adam_steps").unwrap();
@@ -128,7 +128,7 @@ fn normalisation_that_was_switched_on_or_off_since_is_refused() {
     let folder = tempfile::tempdir().unwrap();
     let mut learner = fresh().unwrap();
     train(&mut learner, 0..4);
-    save(folder.path(), &learner).unwrap();
+    save(folder.path(), &mut learner).unwrap();
     let switched = || fresh_with(&[("policy.normalise_observations", "true")]);
     let error = load_newest(folder.path(), &switched).unwrap_err().to_string();
     assert!(error.contains("policy.normalise_observations"), "{error}");
@@ -140,9 +140,9 @@ fn a_damaged_checkpoint_is_refused_with_the_reason_and_the_one_before_is_used() 
     let folder = folder.path();
     let mut learner = fresh().unwrap();
     train(&mut learner, 0..60);
-    let older = save(folder, &learner).unwrap();
+    let older = save(folder, &mut learner).unwrap();
     train(&mut learner, 60..80);
-    let newer = save(folder, &learner).unwrap();
+    let newer = save(folder, &mut learner).unwrap();
 
     type Damage = dyn Fn(&mut Vec<u8>);
     let damages: [(&str, &Damage, &str); 5] = [
@@ -171,13 +171,13 @@ fn a_damaged_checkpoint_is_refused_with_the_reason_and_the_one_before_is_used() 
 fn a_half_written_checkpoint_is_never_taken_and_is_swept_away() {
     let folder = tempfile::tempdir().unwrap();
     let folder = folder.path();
-    let learner = fresh().unwrap();
-    let name = save(folder, &learner).unwrap();
+    let mut learner = fresh().unwrap();
+    let name = save(folder, &mut learner).unwrap();
     let torn = folder.join(".000002.tmp");
     fs::create_dir(&torn).unwrap();
     fs::write(torn.join(REPLAY), b"half").unwrap();
     assert_eq!(load_newest(folder, &fresh).unwrap().1.name, name);
-    assert_eq!(save(folder, &learner).unwrap(), "000002");
+    assert_eq!(save(folder, &mut learner).unwrap(), "000002");
     assert!(!torn.exists());
 }
 
@@ -185,8 +185,8 @@ fn a_half_written_checkpoint_is_never_taken_and_is_swept_away() {
 fn the_oldest_make_room_and_latest_points_at_the_newest() {
     let folder = tempfile::tempdir().unwrap();
     let folder = folder.path();
-    let learner = fresh().unwrap();
-    let saved: Vec<String> = (0..4).map(|_| save(folder, &learner).unwrap()).collect();
+    let mut learner = fresh().unwrap();
+    let saved: Vec<String> = (0..4).map(|_| save(folder, &mut learner).unwrap()).collect();
     assert_eq!(names(folder).unwrap(), saved[2..]);
     assert_eq!(fs::read_link(folder.join("latest")).unwrap(), Path::new(&saved[3]));
     // A copy without symbolic links.
@@ -201,8 +201,8 @@ fn the_oldest_make_room_and_latest_points_at_the_newest() {
 #[test]
 fn a_folder_that_cannot_be_written_keeps_its_old_checkpoint() {
     let folder = tempfile::tempdir().unwrap();
-    let learner = fresh().unwrap();
-    let name = save(folder.path(), &learner).unwrap();
+    let mut learner = fresh().unwrap();
+    let name = save(folder.path(), &mut learner).unwrap();
     // A file where the temporary directory must go fails for root too, unlike permissions.
     let blocked = folder.path().join(".000002.tmp");
     fs::create_dir(&blocked).unwrap();

@@ -39,6 +39,12 @@ impl Adam {
         }
     }
 
+    /// Step size.
+    #[must_use]
+    pub fn learning_rate(&self) -> f64 {
+        self.learning_rate
+    }
+
     /// Begins the next step.
     pub fn next_step(&mut self) -> StepSizes {
         self.step.0 += 1;

@@ -224,6 +224,11 @@ impl Trained {
         followed
     }
 
+    /// Takes over the gradient of a step that was done elsewhere.
+    pub fn set_gradient(&mut self, gradient: &[f32]) {
+        self.gradient.copy_from_slice(gradient);
+    }
+
     /// The gradient of the last step, (P,).
     #[must_use]
     pub fn gradient(&self) -> &[f32] {

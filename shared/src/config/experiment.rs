@@ -206,6 +206,8 @@ impl Default for ActorsConfig {
 pub enum Device {
     /// The processor.
     Cpu,
+    /// An NVIDIA GPU, in a build with the feature `cuda`.
+    Cuda,
 }
 
 /// The learner process.

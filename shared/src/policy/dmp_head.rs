@@ -167,6 +167,14 @@ impl DmpHead {
         }
     }
 
+    /// (y0, yd0) of every row of observations, (rows, O), and dimension: (rows A, 2).
+    #[must_use]
+    pub fn starts(&self, observations: &[f32]) -> Vec<f32> {
+        let rows = observations.chunks_exact(self.observation_len);
+        let of_row = |row| (0..self.dims).map(move |d| self.start.read(row, d, self.dims));
+        rows.flat_map(of_row).flat_map(|(y, yd)| [y, yd]).collect()
+    }
+
     fn rho(&self, squashed: &[f32]) -> [f32; RHO_LEN] {
         let range = self.rho_factor();
         std::array::from_fn(|i| RHO_CENTRE[i] + range * squashed[1 + self.basis_count + i])

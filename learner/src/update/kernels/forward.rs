@@ -39,7 +39,7 @@ impl Forward<'_> {
         let width = self.bias.len();
         let rows = self.outputs.len() / width;
         assert_eq!(self.outputs.len(), rows * width, "outputs of {width} columns");
-        let depth = if rows == 0 { 0 } else { self.inputs.len() / rows };
+        let depth = self.inputs.len().checked_div(rows).unwrap_or(0);
         assert_eq!(self.inputs.len(), rows * depth, "inputs of {rows} rows");
         assert_eq!(self.packed.len(), packed_len(depth, width), "packed weights");
         instructions.run(Job { layer: self, rows, depth, width, column: 0 });

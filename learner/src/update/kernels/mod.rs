@@ -28,6 +28,7 @@ mod weight_gradient;
 pub use backward::Backward;
 pub use forward::{Activation, Forward};
 pub use optimizer::{AdamPass, Follow, StepSizes, adam, polyak};
+pub(crate) use optimizer::{BETA1, BETA2, EPSILON};
 pub use pack::{pack, packed_len};
 pub use weight_gradient::{GradientBlock, WeightGradient};
 

@@ -5,10 +5,10 @@ use pulp::{Simd, WithSimd};
 
 use super::InstructionSet;
 
-const BETA1: f32 = 0.9;
-const BETA2: f32 = 0.999;
+pub(crate) const BETA1: f32 = 0.9;
+pub(crate) const BETA2: f32 = 0.999;
 /// Added to the root of the second moment, as PyTorch does.
-const EPSILON: f32 = 1e-8;
+pub(crate) const EPSILON: f32 = 1e-8;
 
 /// The bias-corrected factors of one step.
 #[derive(Debug, Clone, Copy, PartialEq)]

@@ -1,0 +1,170 @@
+//! The policy as a graph of candle tensors: network, DMP, inverse controller, and SAC's Gaussian.
+
+use candle_core::{Device, Result, Tensor};
+use dmprl_shared::config::{ExperimentConfig, ForcingScaling, RhoKind};
+use dmprl_shared::dmp::{Dmp, SegmentMap};
+use dmprl_shared::policy::{Head, MlpShape, Policy};
+
+/// Range of a raw log-std, as in `dmprl_shared::policy::gaussian`.
+const LOG_STD: (f64, f64) = (-20.0, 2.0);
+
+/// The constants of a policy on the device.
+#[derive(Debug)]
+pub(super) struct PolicyGraph {
+    shape: MlpShape,
+    log_std_columns: Option<std::ops::Range<usize>>,
+    dmp: Option<DmpGraph>,
+}
+
+#[derive(Debug)]
+struct DmpGraph {
+    /// Of the segment map, (3 + N, 3K).
+    matrix: Tensor,
+    /// (1, 0, 0, 0).
+    rho_centre: Tensor,
+    dims: usize,
+    steps: usize,
+    basis_count: usize,
+    goal_range: f64,
+    rho: RhoKind,
+    rho_range: f64,
+    forcing_scaling: ForcingScaling,
+    carries_state: bool,
+}
+
+/// What a policy makes of a batch of states.
+pub(super) struct Means {
+    /// Before tanh, (B, K A).
+    pub means: Tensor,
+    /// (y_K, yd_K / omega), (B, 2A), where the critic sees it.
+    pub end_state: Option<Tensor>,
+    /// SAC's, (B, K A).
+    raw_log_stds: Option<Tensor>,
+}
+
+/// A batch of states on the device.
+#[derive(Debug)]
+pub(super) struct StatesOn {
+    /// What networks see, (B, O).
+    pub inputs: Tensor,
+    /// (y0, yd0) of every row and dimension, (B A, 2); empty without a DMP.
+    pub starts: Tensor,
+}
+
+/// A multilayer perceptron over flat parameters.
+pub(super) fn network(shape: &MlpShape, flat: &Tensor, inputs: &Tensor) -> Result<Tensor> {
+    let mut x = inputs.clone();
+    for (index, layer) in shape.layers().iter().enumerate() {
+        let weights = flat.narrow(0, layer.weights.start, layer.weights.len())?;
+        let weights = weights.reshape((layer.outputs, layer.inputs))?;
+        let bias = flat.narrow(0, layer.bias.start, layer.bias.len())?;
+        x = x.matmul(&weights.t()?)?.broadcast_add(&bias)?;
+        if index + 1 < shape.layers().len() {
+            x = x.relu()?;
+        }
+    }
+    Ok(x)
+}
+
+impl PolicyGraph {
+    pub(super) fn new(config: &ExperimentConfig, policy: &Policy, device: &Device) -> Result<Self> {
+        let dmp = match policy.head() {
+            Head::Mlp => None,
+            Head::Dmp(_) => Some(DmpGraph::new(config, policy, device)?),
+        };
+        let log_std_columns = policy.log_stds();
+        Ok(Self { shape: policy.shape().clone(), log_std_columns, dmp })
+    }
+
+    /// The means that the network of parameters `flat` decides on.
+    pub(super) fn means(&self, flat: &Tensor, states: &StatesOn) -> Result<Means> {
+        let outputs = network(&self.shape, flat, &states.inputs)?;
+        let columns = self.log_std_columns.clone();
+        let raw_log_stds = columns.map(|c| outputs.narrow(1, c.start, c.len())).transpose()?;
+        let head_len = self.log_std_columns.as_ref().map_or(self.shape.outputs(), |c| c.start);
+        let outputs = outputs.narrow(1, 0, head_len)?;
+        let (means, end_state) = match &self.dmp {
+            None => (outputs, None),
+            Some(dmp) => dmp.segment(&outputs.contiguous()?, &states.starts)?,
+        };
+        Ok(Means { means, end_state, raw_log_stds })
+    }
+}
+
+impl DmpGraph {
+    fn new(config: &ExperimentConfig, policy: &Policy, device: &Device) -> Result<Self> {
+        let (dmp, steps) = (&config.dmp, policy.layout().segment_steps);
+        let primitive = Dmp::new(dmp, steps).map_err(candle_core::Error::wrap)?;
+        let weight_scale = config.policy.weight_range * primitive.omega() * primitive.omega();
+        let map = SegmentMap::new(&primitive, weight_scale);
+        let shape = (3 * steps, 3 + dmp.basis_count);
+        Ok(Self {
+            matrix: Tensor::from_slice(map.matrix(), shape, device)?.t()?.contiguous()?,
+            rho_centre: Tensor::new(&[1.0_f32, 0.0, 0.0, 0.0], device)?,
+            dims: policy.layout().action_len,
+            steps,
+            basis_count: dmp.basis_count,
+            goal_range: config.policy.goal_range,
+            rho: config.policy.rho,
+            rho_range: config.policy.rho_range,
+            forcing_scaling: dmp.forcing_scaling,
+            carries_state: policy.carries_state(),
+        })
+    }
+
+    /// From the network's outputs, (B, A (1+N+4)), to means and end state.
+    fn segment(&self, outputs: &Tensor, starts: &Tensor) -> Result<(Tensor, Option<Tensor>)> {
+        let (dims, k, n) = (self.dims, self.steps, self.basis_count);
+        let rows = outputs.dim(0)?;
+        let cells = outputs.reshape((rows * dims, n + 5))?;
+        let goal = (cells.narrow(1, 0, 1)?.tanh()? * self.goal_range)?;
+        let mut weights = cells.narrow(1, 1, n)?.tanh()?;
+        if self.forcing_scaling == ForcingScaling::Goal {
+            weights = weights.broadcast_mul(&(&goal - starts.narrow(1, 0, 1)?)?)?;
+        }
+        let rho = cells.narrow(1, n + 1, 4)?;
+        let rho = match self.rho {
+            RhoKind::Bounded => (rho.tanh()? * self.rho_range)?,
+            RhoKind::Free => rho,
+        };
+        let rho = rho.broadcast_add(&self.rho_centre)?;
+        let samples = Tensor::cat(&[starts, &goal, &weights], 1)?.matmul(&self.matrix)?;
+        let mut v = rho.narrow(1, 3, 1)?.broadcast_as((rows * dims, k))?;
+        for part in 0..3 {
+            let sample = samples.narrow(1, part * k, k)?;
+            v = (v + sample.broadcast_mul(&rho.narrow(1, part, 1)?)?)?;
+        }
+        let means = v.reshape((rows, dims, k))?.transpose(1, 2)?.reshape((rows, k * dims))?;
+        if !self.carries_state {
+            return Ok((means, None));
+        }
+        let end = |at: usize| samples.narrow(1, at, 1)?.reshape((rows, dims));
+        Ok((means, Some(Tensor::cat(&[&end(k - 1)?, &end(2 * k - 1)?], 1)?)))
+    }
+}
+
+impl Means {
+    /// What the critic gets of u, (B, K A) in [-1, 1]: u, and the end state where it sees it.
+    pub(super) fn with_end_state(&self, u: &Tensor) -> Result<Tensor> {
+        match &self.end_state {
+            Some(end) => Tensor::cat(&[u, end], 1),
+            None => Ok(u.clone()),
+        }
+    }
+
+    /// u of SAC's Gaussian for standard normal noise, (B, K A), and its log density, (B, 1).
+    pub(super) fn draw(&self, noise: &Tensor) -> Result<(Tensor, Tensor)> {
+        let Some(raw) = &self.raw_log_stds else {
+            candle_core::bail!("a draw from a policy without a distribution");
+        };
+        let log_std = raw.clamp(LOG_STD.0, LOG_STD.1)?;
+        let x = (&self.means + (log_std.exp()? * noise)?)?;
+        let normal = ((noise.sqr()? + (2.0 * std::f64::consts::PI).ln())? * -0.5)?;
+        // log(1 - u²) as 2 (log 2 - x - softplus(-2x)).
+        let y = (&x * -2.0)?;
+        let softplus = (y.relu()? + (y.abs()?.neg()?.exp()? + 1.0)?.log()?)?;
+        let log_slope = ((((x.neg()? - softplus)?) + 2.0_f64.ln())? * 2.0)?;
+        let density = ((normal - log_std)? - log_slope)?;
+        Ok((x.tanh()?, density.sum_keepdim(1)?))
+    }
+}
