@@ -132,11 +132,7 @@ impl Rollout {
         Ok(Self {
             hindsight,
             identity,
-            // A policy that imitates is a better start than chance.
-            warm_up_steps: match config.demonstrations.are_cloned() {
-                true => 0,
-                false => config.exploration.warm_up_steps,
-            },
+            warm_up_steps: config.exploration.warm_up_steps,
             exploration: Exploration::new(
                 config.exploration.clone(),
                 random,

@@ -217,6 +217,7 @@ fn the_keys_of_both_kinds_of_lines_are_documented() {
         env_steps: 0,
         updates: 0,
         segments: 0,
+        hindsight_segments: 0,
         policy_version: 0,
         replay_segments: 0,
         samples_per_insert: 0.0,

@@ -18,6 +18,7 @@ use crate::metrics::{Collector, MetricsLine, Rejected};
 use crate::normaliser::Normaliser;
 use crate::pacing::Pacing;
 use crate::replay::{Replay, Sampler};
+use crate::update::trained::Trained;
 
 /// Why the learner stopped.
 #[derive(Debug, Error)]
@@ -98,8 +99,8 @@ pub struct Learner {
     /// Incarnation and last sequence number of every worker heard from.
     heard: Vec<(u32, u64)>,
     omega: f32,
-    /// (P,): of the actor while it rests; empty where it never does.
-    resting: Vec<f32>,
+    /// Where the policy imitates demonstrations.
+    cloning: Option<Cloning>,
 }
 
 impl Learner {
@@ -141,9 +142,9 @@ impl Learner {
                 ..ParameterSnapshot::default()
             },
             heard: vec![(0, 0); workers],
-            resting: match config.demonstrations.are_cloned() {
-                true => vec![0.0; policy.shape().parameters_len()],
-                false => Vec::new(),
+            cloning: match config.demonstrations.are_cloned() {
+                true => Some(Cloning::new(&config, &policy)?),
+                false => None,
             },
             omega: match policy.head() {
                 Head::Dmp(head) => head.omega(),
@@ -203,7 +204,7 @@ impl Learner {
         self.collector.inserted(segment, self.counters.policy_version);
         self.counters.segments += 1;
         self.counters.env_steps += u64::from(segment.header.steps_len);
-        // A policy that imitates has no warm-up to wait for.
+        // While the actor imitates the critic learns from the first step on.
         if !self.is_warming_up() || self.config.demonstrations.are_cloned() {
             self.pacing.inserted();
         }
@@ -255,21 +256,40 @@ impl Learner {
         Ok(())
     }
 
-    /// An actor that imitates rests through the warm-up: a critic that knows nothing yet would soon
-    /// lead it astray. Its optimiser's moments go on.
+    /// A critic that knows nothing yet would soon lead an actor that imitates astray: through the
+    /// warm-up the actor goes on imitating instead of following it, and then less and less so.
     fn update_networks(&mut self) -> Result<Losses, LearnerError> {
         let update = self.counters.updates + 1;
-        let rests = !self.resting.is_empty() && self.is_warming_up();
-        if !rests {
+        let share = self.cloning_share();
+        let Some(mut cloning) = self.cloning.take_if(|_| share > 0.0) else {
             return Ok(self.algorithm.update(&self.policy, &self.batch, update)?);
-        }
-        let mut parameters = std::mem::take(&mut self.resting);
-        self.algorithm.read_actor(&mut parameters)?;
+        };
+        let result = self.update_beside(&mut cloning, share);
+        self.cloning = Some(cloning);
+        result
+    }
+
+    /// One update of which the actor follows 1 - `share`, and `share` of a step of imitation.
+    fn update_beside(&mut self, cloning: &mut Cloning, share: f32) -> Result<Losses, LearnerError> {
+        let update = self.counters.updates + 1;
+        self.algorithm.read_actor(&mut cloning.parameters)?;
         let losses = self.algorithm.update(&self.policy, &self.batch, update)?;
         self.algorithm.fetch()?;
-        self.warm_start(&parameters)?;
-        self.resting = parameters;
+        cloning.follow(&self.algorithm.actor().network, 1.0 - share)?;
+        cloning.sample(self.normaliser.as_ref(), (&self.replay, &mut self.sampler))?;
+        cloning.step(&self.policy, share)?;
+        self.algorithm.each_network(|name, trained| match name {
+            "actor" => trained.network.set(&cloning.parameters),
+            _ => Ok(()),
+        })?;
         Ok(losses)
+    }
+
+    /// From 1, through the warm-up, to 0 when the steps of imitation are over.
+    fn cloning_share(&self) -> f32 {
+        let after = self.counters.env_steps as f32 - self.config.exploration.warm_up_steps as f32;
+        let steps = self.config.demonstrations.imitation_steps as f32;
+        (1.0 - after.max(0.0) / steps.max(1.0)).max(0.0)
     }
 
     fn refresh_normaliser(&mut self) -> Result<(), LearnerError> {
@@ -283,12 +303,31 @@ impl Learner {
         if let Some(normaliser) = &mut self.normaliser {
             let change = normaliser.refresh();
             self.algorithm.fetch()?;
-            let sees_observations = |name: &str| name == "actor" || name.starts_with("critic");
-            self.algorithm.each_network(|name, trained| {
+            let sees_observations = |name: &str| name != "log_temperature";
+            self.each_network(|name, trained| {
                 if sees_observations(name) { change.apply(trained) } else { Ok(()) }
             })?;
         }
         Ok(())
+    }
+
+    /// Hands every network, with the name it has in a checkpoint, to `f`, which may change it.
+    ///
+    /// # Errors
+    /// The first that `f` returns.
+    pub fn each_network<E>(
+        &mut self,
+        mut f: impl FnMut(&'static str, &mut Trained) -> Result<(), E>,
+    ) -> Result<(), E> {
+        self.algorithm.each_network(&mut f)?;
+        self.cloning.as_mut().map_or(Ok(()), |cloning| f("cloning", &mut cloning.actor))
+    }
+
+    /// As [`Learner::each_network`], to read them.
+    #[must_use]
+    pub fn networks(&self) -> Vec<(&'static str, &Trained)> {
+        let cloning = self.cloning.iter().map(|cloning| ("cloning", &cloning.actor));
+        self.algorithm.networks().into_iter().chain(cloning).collect()
     }
 
     /// A snapshot of the actor under the next version.
@@ -347,26 +386,23 @@ impl Learner {
             }
         }
         let updates = self.config.demonstrations.cloning_updates;
-        if updates == 0 {
-            return Ok(None);
-        }
         if self.normaliser.is_some() {
             self.take_normaliser_anew()?;
         }
-        let parameters = self.algorithm.actor().network.read(<[f32]>::to_vec)?;
-        let mut cloning = Cloning::new(&self.config, &self.policy, parameters)?;
+        let Some(cloning) = &mut self.cloning else { return Ok(None) };
+        self.algorithm.read_actor(&mut cloning.parameters)?;
         let tenth = updates.div_ceil(10);
         let (mut first, mut last) = (0.0, 0.0);
         for update in 0..updates {
             cloning.sample(self.normaliser.as_ref(), (&self.replay, &mut self.sampler))?;
-            let value = cloning.update(&self.policy)?;
+            let value = cloning.step(&self.policy, 1.0)?;
             if !value.is_finite() {
                 return Err(LearnerError::NotFinite { update, name: "cloning loss", value });
             }
             first += if update < tenth { value } else { 0.0 };
             last += if update >= updates - tenth { value } else { 0.0 };
         }
-        let parameters = cloning.actor.network.read(<[f32]>::to_vec)?;
+        let parameters = cloning.parameters.clone();
         self.warm_start(&parameters)?;
         Ok(Some((first / tenth as f32, last / tenth as f32)))
     }

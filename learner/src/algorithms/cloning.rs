@@ -1,4 +1,5 @@
-//! Behaviour cloning: the actor imitates demonstrated windows before anything else is learned.
+//! Behaviour cloning: the actor imitates demonstrated windows, before anything else is learned and,
+//! with less and less weight, beside it.
 //!
 //!     loss = mean over windows, steps and dimensions of (pi(s) - u)²
 //!
@@ -14,20 +15,23 @@ use dmprl_shared::policy::Policy;
 use super::batch::States;
 use super::block::{Block, blocks, total};
 use super::{BatchShape, NoWindow};
+use crate::networks::Parameters;
 use crate::normaliser::Normaliser;
 use crate::replay::{Replay, Sampler};
 use crate::update::crew::Crew;
 use crate::update::trained::Trained;
 
-/// Draws of windows for one row of a batch: those that an episode's end cut short are passed over,
+/// Draws of demonstrated windows for one row of a batch: those that an episode's end cut short are passed over,
 /// as a missing action is none to imitate.
 const TRIES_MAX: usize = 1_000;
 
 /// An actor that imitates, with the buffers of its update.
 #[derive(Debug)]
 pub struct Cloning {
-    /// The actor.
+    /// A copy of the actor, with an optimiser of its own.
     pub actor: Trained,
+    /// The actor's parameters before and after a step, (P,).
+    pub parameters: Vec<f32>,
     blocks: Vec<Block>,
     crew: Crew,
     shape: BatchShape,
@@ -39,15 +43,17 @@ pub struct Cloning {
 }
 
 impl Cloning {
-    /// Starts from `parameters`, (P,).
+    /// Buffers for the configuration's batches.
     ///
     /// # Errors
     /// If candle cannot make the variables.
-    pub fn new(config: &ExperimentConfig, policy: &Policy, parameters: Vec<f32>) -> Result<Self> {
+    pub fn new(config: &ExperimentConfig, policy: &Policy) -> Result<Self> {
         let shape = BatchShape::new(&config.algorithm, policy);
         let step_size = config.algorithm.actor_learning_rate;
+        let parameters = vec![0.0; policy.shape().parameters_len()];
         Ok(Self {
-            actor: Trained::new(policy.shape().clone(), parameters, step_size, false)?,
+            actor: Trained::new(policy.shape().clone(), parameters.clone(), step_size, false)?,
+            parameters,
             blocks: blocks(policy, shape, policy.shape(), 0),
             crew: Crew::new(config.learner.threads),
             shape,
@@ -57,7 +63,7 @@ impl Cloning {
         })
     }
 
-    /// Draws whole windows.
+    /// Draws whole demonstrated windows.
     ///
     /// # Errors
     /// [`NoWindow`] if there are hardly any.
@@ -71,7 +77,7 @@ impl Cloning {
         let rows = rows.zip(self.actions.chunks_exact_mut(self.shape.segment_actions_len));
         for (observation, actions) in rows {
             let whole = (0..TRIES_MAX)
-                .map_while(|_| sampler.draw(replay))
+                .map_while(|_| sampler.draw_kept(replay))
                 .find(|window| window.len() == steps)
                 .ok_or(NoWindow { segments: replay.len(), steps })?;
             observation.copy_from_slice(replay.observation(&whole));
@@ -84,17 +90,35 @@ impl Cloning {
         Ok(())
     }
 
-    /// One step of Adam on what was drawn; returns the loss before it.
+    /// Moves `parameters` by `share` of a step of Adam on what was drawn; returns the loss before it.
     ///
     /// # Errors
     /// If candle refuses access to a variable.
-    pub fn update(&mut self, policy: &Policy) -> Result<f32> {
-        let Self { actor, blocks, crew, observations, inputs, actions, .. } = self;
+    pub fn step(&mut self, policy: &Policy, share: f32) -> Result<f32> {
+        let Self { actor, parameters, blocks, crew, observations, inputs, actions, .. } = self;
+        actor.network.set(parameters)?;
         let states = States { observations, inputs };
         let lent = actor.lend()?;
         crew.each(blocks, |block| block.imitate(policy, &lent, states, actions));
         drop(lent);
         actor.descend(crew, blocks, |block| block.trace(inputs), None)?;
+        move_towards(parameters, &actor.network, share)?;
         Ok(total(blocks).actor / actions.len() as f32)
     }
+
+    /// Moves `parameters` by `share` of the way to those of `network`.
+    ///
+    /// # Errors
+    /// If candle refuses access to a variable.
+    pub fn follow(&mut self, network: &Parameters, share: f32) -> Result<()> {
+        move_towards(&mut self.parameters, network, share)
+    }
+}
+
+fn move_towards(parameters: &mut [f32], network: &Parameters, share: f32) -> Result<()> {
+    network.read(|network| {
+        for (parameter, network) in parameters.iter_mut().zip(network) {
+            *parameter += share * (network - *parameter);
+        }
+    })
 }

@@ -33,7 +33,7 @@ impl View for Flat {
 
 pub(super) fn bytes(learner: &Learner) -> Result<Vec<u8>, String> {
     let mut tensors = Vec::new();
-    for (name, trained) in learner.algorithm.networks() {
+    for (name, trained) in learner.networks() {
         let read = |network: &Parameters| network.read(<[f32]>::to_vec);
         let network = read(&trained.network).map_err(|error| error.to_string())?;
         let target = trained.target.as_ref().map(read).transpose();
@@ -64,7 +64,7 @@ pub(super) fn restore(bytes: &[u8], learner: &mut Learner) -> Result<(), String>
         let chunks = tensor.data().as_chunks::<4>().0;
         Ok(chunks.iter().map(|bytes| f32::from_le_bytes(*bytes)).collect())
     };
-    learner.algorithm.each_network(|name, trained| {
+    learner.each_network(|name, trained| {
         let len = trained.adam.moments.first.len();
         let set = |network: &Parameters, part| {
             network.set(&read(name, part, len)?).map_err(|error| error.to_string())

@@ -174,4 +174,4 @@ impl Steps {
 }
 
 #[cfg(test)]
-mod tests;
+pub(crate) mod tests;

@@ -11,7 +11,7 @@ use crate::replay::Replay;
 
 /// Two episodes, of seven steps and of three; the file ends before the second does. The observation
 /// before step t is (t, 0, 0, episode), its action (t / 5 - 1, 0), its reward -t.
-fn steps() -> Steps {
+pub(crate) fn steps() -> Steps {
     let mut steps = Steps::default();
     for (episode, len) in [(0.0, 7), (1.0, 3)] {
         for t in 0..len {
@@ -60,6 +60,7 @@ fn config(keys: &[(&str, &str)]) -> ExperimentConfig {
         ("algorithm.batch_size", "32"),
         ("algorithm.actor_learning_rate", "0.003"),
         ("actors.workers", "1"),
+        ("demonstrations.files", "['some.npz']"),
     ];
     for (key, value) in common.iter().chain(keys) {
         layers.set("test", key, value).unwrap();
@@ -233,4 +234,29 @@ fn a_cloned_policy_does_what_was_demonstrated() {
         assert_eq!((counters.env_steps, counters.segments, counters.updates), (0, 0, 0));
         assert!(learner.update().is_ok(), "demonstrations are samples at once");
     }
+}
+
+/// Two learners whose critics differ: their actors do not while they imitate.
+#[test]
+fn an_actor_follows_its_critic_after_the_warm_up_and_then_more_and_more() {
+    let distance = |env_steps: u64| {
+        let actor = |rate: &str| {
+            let keys = [
+                ("algorithm.critic_learning_rate", rate),
+                ("exploration.warm_up_steps", "100"),
+                ("demonstrations.cloning_updates", "1"),
+                ("demonstrations.imitation_steps", "1000"),
+            ];
+            let mut learner = learner(&keys);
+            learner.demonstrate(&[steps()]).unwrap();
+            learner.counters.env_steps = env_steps;
+            (0..10).for_each(|_| learner.update().unwrap());
+            learner.next_snapshot().unwrap().values.clone()
+        };
+        let (slow, quick) = (actor("0.0003"), actor("0.03"));
+        slow.iter().zip(&quick).map(|(a, b)| (a - b).abs()).sum::<f32>()
+    };
+    let [warm_up, early, late, over] = [100, 200, 800, 1_100].map(distance);
+    assert_eq!(warm_up, 0.0);
+    assert!(0.0 < early && early < late && late < over, "{early} {late} {over}");
 }

@@ -169,11 +169,20 @@ impl Sampler {
     /// copy with another goal is one window: it is drawn as often as the K windows of a segment,
     /// so that copies have the same share of samples whatever `windows` says.
     pub fn draw(&mut self, replay: &Replay) -> Option<Window> {
-        if replay.is_empty() {
+        self.draw_from(replay, replay.len())
+    }
+
+    /// The same among the demonstrations.
+    pub fn draw_kept(&mut self, replay: &Replay) -> Option<Window> {
+        self.draw_from(replay, replay.kept)
+    }
+
+    fn draw_from(&mut self, replay: &Replay, slots: usize) -> Option<Window> {
+        if slots == 0 {
             return None;
         }
         (0..TRIES_MAX).find_map(|_| {
-            let slot = self.random.random_range(0..replay.len() as u32) as usize;
+            let slot = self.random.random_range(0..slots as u32) as usize;
             let offset = match self.windows {
                 Windows::Segment => 0,
                 Windows::Sliding if replay.slots[slot].hindsight => 0,

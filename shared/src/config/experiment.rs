@@ -130,11 +130,13 @@ pub struct DemonstrationsConfig {
     pub files: Vec<String>,
     /// Updates in which the actor imitates them, before anything else; 0: it does not.
     pub cloning_updates: u64,
+    /// Environment steps after the warm-up over which imitation beside each update fades.
+    pub imitation_steps: u64,
 }
 
 impl Default for DemonstrationsConfig {
     fn default() -> Self {
-        Self { files: Vec::new(), cloning_updates: 1_000 }
+        Self { files: Vec::new(), cloning_updates: 1_000, imitation_steps: 30_000 }
     }
 }
 

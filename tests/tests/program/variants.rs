@@ -127,11 +127,11 @@ fn hindsight_is_recommended_for_a_sparse_goal_and_refused_where_there_is_none() 
     for (task, recommended) in [("tiny_envs:Reach-v0", true), ("tiny_envs:ReachFar-v0", false)] {
         let place = Workplace::new();
         let end = place.run(&train(task, &place.path("run"), &path)).with_status(0);
-        assert_eq!(end.shown.contains("replay.hindsight=future"), recommended, "{task}");
+        assert_eq!(end.said.contains("replay.hindsight=future"), recommended, "{task}");
     }
     let place = Workplace::new();
     let more = [&path[..], &["--set", "replay.hindsight=future"]].concat();
     let end = place.run(&train("tiny_envs:Long-v0", &place.path("run"), &more)).with_status(1);
-    assert!(end.shown.contains("its observation is no Dict"), "{}", end.shown);
+    assert!(end.said.contains("its observation is no Dict"), "{}", end.said);
     place.assert_no_process();
 }
