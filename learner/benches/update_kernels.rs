@@ -12,6 +12,7 @@ use std::time::{Duration, Instant};
 
 use dmprl_learner::algorithms::{Algorithm, Batch};
 use dmprl_learner::update::floor::{Engine, Floor, Kind, Product};
+use dmprl_learner::update::kernels::bf16::Bf16;
 use dmprl_shared::config::{ExperimentConfig, Layers};
 use dmprl_shared::policy::{MlpShape, Policy};
 use dmprl_shared::spec::EnvSpec;
@@ -71,10 +72,11 @@ fn peak() -> Candidate {
     })
 }
 
-fn config(threads: &str) -> (ExperimentConfig, EnvSpec) {
+fn config(threads: &str, precision: &str) -> (ExperimentConfig, EnvSpec) {
     let mut layers = Layers::new();
     let keys = [
         ("learner.threads", threads),
+        ("learner.precision", precision),
         ("algorithm.batch_size", "256"),
         ("policy.hidden", "[256, 256]"),
         ("algorithm.critic_hidden", "[256, 256]"),
@@ -95,8 +97,8 @@ fn config(threads: &str) -> (ExperimentConfig, EnvSpec) {
     (layers.finish().expect("a valid configuration"), spec)
 }
 
-fn update(threads: &str) -> impl FnMut() + 'static {
-    let (config, spec) = config(threads);
+fn update(threads: &str, precision: &str) -> impl FnMut() + 'static {
+    let (config, spec) = config(threads, precision);
     let policy = Policy::new(&config, &spec).expect("a policy");
     let mut algorithm = Algorithm::new(&config, &policy).expect("an algorithm");
     let mut batch = Batch::new(algorithm.batch_shape());
@@ -159,10 +161,12 @@ fn main() {
         }
         candidates.push(floor(&format!("{whose} all products"), all.clone(), engine));
     }
-    for threads in ["1", "2"] {
+    let mut precisions = vec!["f32"];
+    precisions.extend(Bf16::detect().map(|_| "bf16"));
+    for (precision, threads) in precisions.into_iter().flat_map(|it| [(it, "1"), (it, "2")]) {
         let operations = all.iter().map(|product| product.operations()).sum();
-        let name = format!("update, {threads}");
-        let update = candidate(&name, operations, update(threads));
+        let name = format!("update, {precision}, {threads}");
+        let update = candidate(&name, operations, update(threads, precision));
         candidates.push(Candidate { alone: threads == "1", ..update });
     }
     let only = argument("--only").unwrap_or_default();

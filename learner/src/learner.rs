@@ -275,7 +275,7 @@ impl Learner {
         self.algorithm.read_actor(&mut cloning.parameters)?;
         let losses = self.algorithm.update(&self.policy, &self.batch, update)?;
         self.algorithm.fetch()?;
-        cloning.follow(&self.algorithm.actor().network, 1.0 - share)?;
+        cloning.follow(&self.algorithm.actor().network, 1.0 - share);
         cloning.sample(self.normaliser.as_ref(), (&self.replay, &mut self.sampler))?;
         cloning.step(&self.policy, share)?;
         self.algorithm.each_network(|name, trained| match name {
@@ -362,7 +362,7 @@ impl Learner {
                 return Ok(());
             }
             actor.network.set(parameters)?;
-            match &actor.target {
+            match &mut actor.target {
                 Some(target) => target.set(parameters),
                 None => Ok(()),
             }

@@ -119,9 +119,9 @@ impl Change {
     /// If candle refuses access to a variable.
     pub fn apply(&self, trained: &mut Trained) -> candle_core::Result<()> {
         let Trained { shape, network, target, adam, .. } = trained;
-        network.update(|parameters| self.rewrite(shape, parameters))?;
+        self.rewrite(shape, network.values_mut());
         if let Some(target) = target {
-            target.update(|parameters| self.rewrite(shape, parameters))?;
+            self.rewrite(shape, target.values_mut());
         }
         self.each_weight(shape, |at, input| {
             let factor = self.before.1[input] / self.after.1[input];
@@ -160,6 +160,7 @@ impl Change {
 
 #[cfg(test)]
 mod tests {
+    use dmprl_shared::config::Precision;
     use dmprl_shared::policy::{Activations, forward, initial_parameters};
     use rand::RngExt;
 
@@ -206,8 +207,8 @@ mod tests {
             }
             inputs
         };
-        let mut trained = Trained::new(shape.clone(), initial, 1e-3, true).unwrap();
-        let plain = trained.network.read(|p| output(&shape, p, &rows)).unwrap();
+        let mut trained = Trained::new(shape.clone(), initial, 1e-3, true, Precision::F32).unwrap();
+        let plain = output(&shape, trained.network.values(), &rows);
         let mut normaliser = Normaliser::new(3, 1);
         for _ in 0..3 {
             let seen: Vec<f32> = (0..30).map(|_| random.random_range(-2.0..10.0)).collect();
@@ -215,10 +216,10 @@ mod tests {
             normaliser.refresh().apply(&mut trained).unwrap();
             let inputs = with(&normaliser);
             assert!(inputs[..3] != rows[..3]);
-            assert_close(&trained.network.read(|p| output(&shape, p, &inputs)).unwrap(), &plain);
+            assert_close(&output(&shape, trained.network.values(), &inputs), &plain);
             let target = trained.target.as_ref().unwrap();
-            assert_close(&target.read(|p| output(&shape, p, &inputs)).unwrap(), &plain);
-            let mut folded = trained.network.read(<[f32]>::to_vec).unwrap();
+            assert_close(&output(&shape, target.values(), &inputs), &plain);
+            let mut folded = trained.network.values().to_vec();
             normaliser.fold(&shape, &mut folded);
             assert_close(&output(&shape, &folded, &rows), &plain);
         }

@@ -46,13 +46,15 @@ impl Cloning {
     /// Buffers for the configuration's batches.
     ///
     /// # Errors
-    /// If candle cannot make the variables.
+    /// If the network cannot be made.
     pub fn new(config: &ExperimentConfig, policy: &Policy) -> Result<Self> {
         let shape = BatchShape::new(&config.algorithm, policy);
-        let step_size = config.algorithm.actor_learning_rate;
+        let (step_size, precision) =
+            (config.algorithm.actor_learning_rate, config.learner.precision);
         let parameters = vec![0.0; policy.shape().parameters_len()];
+        let layers = policy.shape().clone();
         Ok(Self {
-            actor: Trained::new(policy.shape().clone(), parameters.clone(), step_size, false)?,
+            actor: Trained::new(layers, parameters.clone(), step_size, false, precision)?,
             parameters,
             blocks: blocks(policy, shape, policy.shape(), 0),
             crew: Crew::new(config.learner.threads),
@@ -98,27 +100,22 @@ impl Cloning {
         let Self { actor, parameters, blocks, crew, observations, inputs, actions, .. } = self;
         actor.network.set(parameters)?;
         let states = States { observations, inputs };
-        let lent = actor.lend()?;
+        let lent = actor.lend();
         crew.each(blocks, |block| block.imitate(policy, &lent, states, actions));
         drop(lent);
-        actor.descend(crew, blocks, |block| block.trace(inputs), None)?;
-        move_towards(parameters, &actor.network, share)?;
+        actor.descend(crew, blocks, |block| block.trace(inputs), None);
+        move_towards(parameters, &actor.network, share);
         Ok(total(blocks).actor / actions.len() as f32)
     }
 
     /// Moves `parameters` by `share` of the way to those of `network`.
-    ///
-    /// # Errors
-    /// If candle refuses access to a variable.
-    pub fn follow(&mut self, network: &Parameters, share: f32) -> Result<()> {
-        move_towards(&mut self.parameters, network, share)
+    pub fn follow(&mut self, network: &Parameters, share: f32) {
+        move_towards(&mut self.parameters, network, share);
     }
 }
 
-fn move_towards(parameters: &mut [f32], network: &Parameters, share: f32) -> Result<()> {
-    network.read(|network| {
-        for (parameter, network) in parameters.iter_mut().zip(network) {
-            *parameter += share * (network - *parameter);
-        }
-    })
+fn move_towards(parameters: &mut [f32], network: &Parameters, share: f32) {
+    for (parameter, network) in parameters.iter_mut().zip(network.values()) {
+        *parameter += share * (network - *parameter);
+    }
 }

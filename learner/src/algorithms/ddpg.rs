@@ -50,11 +50,11 @@ impl Ddpg {
     /// One update of critic, actor and both targets.
     ///
     /// # Errors
-    /// If candle refuses access to a variable.
+    /// If a network lacks its target.
     pub fn update(&mut self, policy: &Policy, batch: &Batch, crew: &Crew) -> Result<Losses> {
         self.critic_step(policy, batch, crew)?;
         let critic = total(&self.blocks);
-        self.actor_step(policy, batch, crew)?;
+        self.actor_step(policy, batch, crew);
         let actor = total(&self.blocks);
         let rows = batch.rewards.len() as f32;
         Ok(Losses {
@@ -68,7 +68,7 @@ impl Ddpg {
     /// Descends mean (Q(s, u) - target)², target = reward + bootstrap Q'(s', pi'(s')).
     fn critic_step(&mut self, policy: &Policy, batch: &Batch, crew: &Crew) -> Result<()> {
         let (actor_target, critic_target) = (self.actor.lend_target()?, self.critic.lend_target()?);
-        let critic = self.critic.lend()?;
+        let critic = self.critic.lend();
         let (critic_target, critic) = ([critic_target], [critic]);
         crew.each(&mut self.blocks, |block| {
             block.act(policy, &actor_target, batch.next_states());
@@ -82,18 +82,19 @@ impl Ddpg {
             &self.blocks,
             |block| block.critic_trace(0, batch),
             Some(self.polyak),
-        )
+        );
+        Ok(())
     }
 
     /// Descends -mean Q(s, pi(s)).
-    fn actor_step(&mut self, policy: &Policy, batch: &Batch, crew: &Crew) -> Result<()> {
-        let (actor, critic) = (self.actor.lend()?, [self.critic.lend()?]);
+    fn actor_step(&mut self, policy: &Policy, batch: &Batch, crew: &Crew) {
+        let (actor, critic) = (self.actor.lend(), [self.critic.lend()]);
         crew.each(&mut self.blocks, |block| {
             block.act(policy, &actor, batch.states());
             block.judge(policy, &critic, batch.states());
             block.ascend_q(policy, &actor, &critic);
         });
         drop((actor, critic));
-        self.actor.descend(crew, &self.blocks, |block| block.actor_trace(batch), Some(self.polyak))
+        self.actor.descend(crew, &self.blocks, |block| block.actor_trace(batch), Some(self.polyak));
     }
 }

@@ -165,7 +165,10 @@ impl Algorithm {
     pub fn read_actor(&self, out: &mut [f32]) -> Result<()> {
         match &self.remote {
             Some(Remote { graph: Some(graph), is_ahead: true, .. }) => graph.read_actor(out),
-            _ => self.actor().network.read(|parameters| out.copy_from_slice(parameters)),
+            _ => {
+                out.copy_from_slice(self.actor().network.values());
+                Ok(())
+            }
         }
     }
 
@@ -231,7 +234,7 @@ fn new_actor(config: &ExperimentConfig, policy: &Policy, target: bool) -> Result
     let mut random = seeds::stream(config.run.seed, "actor parameters", 0);
     let initial = policy.initial_parameters(&mut random);
     let rate = config.algorithm.actor_learning_rate;
-    Trained::new(policy.shape().clone(), initial, rate, target)
+    Trained::new(policy.shape().clone(), initial, rate, target, config.learner.precision)
 }
 
 /// A critic with its target; its parameters are drawn from the stream `name`.
@@ -241,7 +244,8 @@ fn new_critic(config: &ExperimentConfig, shape: BatchShape, name: &str) -> Resul
     widths.push(1);
     let layers = MlpShape::new(widths);
     let initial = initial_parameters(&layers, &mut seeds::stream(config.run.seed, name, 0));
-    Trained::new(layers, initial, config.algorithm.critic_learning_rate, true)
+    let rate = config.algorithm.critic_learning_rate;
+    Trained::new(layers, initial, rate, true, config.learner.precision)
 }
 
 #[cfg(test)]

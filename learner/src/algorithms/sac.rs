@@ -67,17 +67,17 @@ impl Sac {
     /// One update of critics, actor, temperature and targets.
     ///
     /// # Errors
-    /// If candle refuses access to a variable.
+    /// If a network lacks its target.
     pub fn update(&mut self, policy: &Policy, batch: &Batch, crew: &Crew) -> Result<Losses> {
         let rows = batch.rewards.len() as f32;
-        let temperature = self.log_temperature.network.read(|value| value[0].exp())?;
+        let temperature = self.log_temperature.network.values()[0].exp();
         self.critics_step(policy, batch, crew, temperature)?;
         let critic = total(&self.blocks);
-        self.actor_step(policy, batch, crew, temperature)?;
+        self.actor_step(policy, batch, crew, temperature);
         let actor = total(&self.blocks);
         let entropy = -actor.log_density / rows;
         // Of -log temperature (mean log pi + target entropy).
-        self.log_temperature.descend_scalar(entropy - self.target_entropy)?;
+        self.log_temperature.descend_scalar(entropy - self.target_entropy);
         Ok(Losses {
             critic_loss: critic.squared_error / rows,
             actor_loss: Some(actor.actor / rows),
@@ -97,9 +97,9 @@ impl Sac {
         temperature: f32,
     ) -> Result<()> {
         let [first, second] = &self.critics;
-        let actor = self.actor.lend()?;
+        let actor = self.actor.lend();
         let targets = [first.lend_target()?, second.lend_target()?];
-        let critics = [first.lend()?, second.lend()?];
+        let critics = [first.lend(), second.lend()];
         crew.each(&mut self.blocks, |block| {
             draw(block, policy, &actor, batch.next_states(), &batch.next_noise);
             block.judge(policy, &targets, batch.next_states());
@@ -116,21 +116,15 @@ impl Sac {
                 &self.blocks,
                 |block| block.critic_trace(index, batch),
                 Some(self.polyak),
-            )?;
+            );
         }
         Ok(())
     }
 
     /// Descends mean (temperature log pi(u|s) - min_i Q_i(s, u)), u ~ pi(s), by the path of u.
-    fn actor_step(
-        &mut self,
-        policy: &Policy,
-        batch: &Batch,
-        crew: &Crew,
-        temperature: f32,
-    ) -> Result<()> {
+    fn actor_step(&mut self, policy: &Policy, batch: &Batch, crew: &Crew, temperature: f32) {
         let [first, second] = &self.critics;
-        let (actor, critics) = (self.actor.lend()?, [first.lend()?, second.lend()?]);
+        let (actor, critics) = (self.actor.lend(), [first.lend(), second.lend()]);
         crew.each(&mut self.blocks, |block| {
             draw(block, policy, &actor, batch.states(), &batch.noise);
             block.judge(policy, &critics, batch.states());
@@ -163,7 +157,7 @@ impl Sac {
             });
         });
         drop((actor, critics));
-        self.actor.descend(crew, &self.blocks, |block| block.actor_trace(batch), None)
+        self.actor.descend(crew, &self.blocks, |block| block.actor_trace(batch), None);
     }
 }
 

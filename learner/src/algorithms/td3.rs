@@ -55,7 +55,7 @@ impl Td3 {
     /// actor and targets.
     ///
     /// # Errors
-    /// If candle refuses access to a variable.
+    /// If a network lacks its target.
     pub fn update(
         &mut self,
         policy: &Policy,
@@ -73,7 +73,7 @@ impl Td3 {
             ..Losses::default()
         };
         if whole {
-            self.actor_step(policy, batch, crew)?;
+            self.actor_step(policy, batch, crew);
             losses.actor_loss = Some(total(&self.blocks).actor / rows);
         }
         Ok(losses)
@@ -91,7 +91,7 @@ impl Td3 {
         let [first, second] = &self.critics;
         let actor_target = self.actor.lend_target()?;
         let targets = [first.lend_target()?, second.lend_target()?];
-        let critics = [first.lend()?, second.lend()?];
+        let critics = [first.lend(), second.lend()];
         let (std, clip) =
             (self.config.target_noise_std as f32, self.config.target_noise_clip as f32);
         crew.each(&mut self.blocks, |block| {
@@ -106,20 +106,20 @@ impl Td3 {
         });
         drop((actor_target, targets, critics));
         for (index, critic) in self.critics.iter_mut().enumerate() {
-            critic.descend(crew, &self.blocks, |block| block.critic_trace(index, batch), polyak)?;
+            critic.descend(crew, &self.blocks, |block| block.critic_trace(index, batch), polyak);
         }
         Ok(())
     }
 
     /// Descends -mean Q_1(s, pi(s)).
-    fn actor_step(&mut self, policy: &Policy, batch: &Batch, crew: &Crew) -> Result<()> {
-        let (actor, critic) = (self.actor.lend()?, [self.critics[0].lend()?]);
+    fn actor_step(&mut self, policy: &Policy, batch: &Batch, crew: &Crew) {
+        let (actor, critic) = (self.actor.lend(), [self.critics[0].lend()]);
         crew.each(&mut self.blocks, |block| {
             block.act(policy, &actor, batch.states());
             block.judge(policy, &critic, batch.states());
             block.ascend_q(policy, &actor, &critic);
         });
         drop((actor, critic));
-        self.actor.descend(crew, &self.blocks, |block| block.actor_trace(batch), Some(self.polyak))
+        self.actor.descend(crew, &self.blocks, |block| block.actor_trace(batch), Some(self.polyak));
     }
 }

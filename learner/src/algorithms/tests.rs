@@ -34,11 +34,10 @@ fn case(keys: &[(&str, &str)]) -> Case {
     let mut algorithm = Algorithm::new(&config, &policy).unwrap();
     // Targets that differ from their networks, so that mixing them up shows.
     let mut random = seeds::stream(3, "test", 0);
-    let disturb = |_, trained: &mut Trained| match &trained.target {
-        Some(target) => target.update(|values| {
-            values.iter_mut().for_each(|value| *value += random.random_range(-0.05..0.05));
-        }),
-        None => Ok(()),
+    let disturb = |_, trained: &mut Trained| {
+        let values = trained.target.iter_mut().flat_map(|target| target.values_mut());
+        values.for_each(|value| *value += random.random_range(-0.05..0.05));
+        Ok::<(), ()>(())
     };
     algorithm.each_network(disturb).unwrap();
     let mut batch = Batch::new(algorithm.batch_shape());
@@ -74,7 +73,7 @@ impl Case {
             optional.chain([critic_loss, q_mean]).collect::<Vec<f32>>()
         };
         assert_close(&format!("losses, {what}"), &numbers(losses), &numbers(expected_losses));
-        let read = |network: &Parameters| network.read(<[f32]>::to_vec).unwrap();
+        let read = |network: &Parameters| network.values().to_vec();
         for ((name, got), (_, want)) in self.algorithm.networks().into_iter().zip(judge.networks())
         {
             let check = |part: &str, got: &[f32], want: &[f32]| {
@@ -146,8 +145,8 @@ fn updates_fit_a_known_value_and_follow_its_gradient() {
     assert!(losses.critic_loss < 0.01, "{losses:?}");
     let mut work = case.policy.workspace(128);
     let observations = &case.batch.inputs;
-    let act = |p: &[f32]| case.policy.act(p, observations, &mut work);
-    case.algorithm.actor().network.read(act).unwrap();
+    let parameters = case.algorithm.actor().network.values();
+    case.policy.act(parameters, observations, &mut work);
     let errors = work.actions.iter().map(|u| (u - 0.5).abs());
     let mean = errors.sum::<f32>() / work.actions.len() as f32;
     assert!(mean < 0.05, "actions are {mean} away from the best on average");
@@ -169,7 +168,7 @@ fn the_number_of_threads_changes_no_bit_of_an_update() {
                 case.algorithm.update(&case.policy, &case.batch, update).unwrap();
             }
             let networks = case.algorithm.networks().into_iter();
-            let read = |network: &Parameters| network.read(<[f32]>::to_vec).unwrap();
+            let read = |network: &Parameters| network.values().to_vec();
             networks
                 .map(|(_, t)| (read(&t.network), t.target.as_ref().map(read)))
                 .collect::<Vec<_>>()

@@ -34,10 +34,8 @@ impl View for Flat {
 pub(super) fn bytes(learner: &Learner) -> Result<Vec<u8>, String> {
     let mut tensors = Vec::new();
     for (name, trained) in learner.networks() {
-        let read = |network: &Parameters| network.read(<[f32]>::to_vec);
-        let network = read(&trained.network).map_err(|error| error.to_string())?;
-        let target = trained.target.as_ref().map(read).transpose();
-        let target = target.map_err(|error| error.to_string())?;
+        let network = trained.network.values().to_vec();
+        let target = trained.target.as_ref().map(|target| target.values().to_vec());
         let moments = &trained.adam.moments;
         let parts =
             [Some(network), target, Some(moments.first.clone()), Some(moments.second.clone())];
@@ -66,11 +64,11 @@ pub(super) fn restore(bytes: &[u8], learner: &mut Learner) -> Result<(), String>
     };
     learner.each_network(|name, trained| {
         let len = trained.adam.moments.first.len();
-        let set = |network: &Parameters, part| {
+        let set = |network: &mut Parameters, part| {
             network.set(&read(name, part, len)?).map_err(|error| error.to_string())
         };
-        set(&trained.network, PARTS[0])?;
-        if let Some(target) = &trained.target {
+        set(&mut trained.network, PARTS[0])?;
+        if let Some(target) = &mut trained.target {
             set(target, PARTS[1])?;
         }
         trained.adam.moments.first = read(name, PARTS[2], len)?;

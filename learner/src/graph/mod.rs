@@ -68,7 +68,7 @@ impl Graph {
     pub fn fetch(&self, name: &str, trained: &mut Trained) -> Result<()> {
         let remote = self.remote(name)?;
         trained.network.set(&remote.network.to_vec1::<f32>()?)?;
-        if let (Some(own), Some(target)) = (&trained.target, &remote.target) {
+        if let (Some(own), Some(target)) = (&mut trained.target, &remote.target) {
             own.set(&target.to_vec1::<f32>()?)?;
         }
         trained.adam.moments.first = remote.moments[0].to_vec1()?;
@@ -312,9 +312,9 @@ impl Remote {
         Ok(Self {
             name,
             shape: trained.shape.clone(),
-            network: trained.network.read(var)??,
+            network: var(trained.network.values())?,
             target: match &trained.target {
-                Some(target) => Some(target.read(var)??),
+                Some(target) => Some(var(target.values())?),
                 None => None,
             },
             moments: [to(&moments.first)?, to(&moments.second)?],

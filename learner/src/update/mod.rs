@@ -7,12 +7,18 @@
 //! depend on the number of threads.
 
 pub mod adam;
+mod arithmetic;
+mod batch_pairs;
 pub mod crew;
 pub mod floor;
 pub mod kernels;
 mod packed;
 pub mod pass;
+mod step;
 pub mod trained;
 
 /// Rows of a block.
 pub const BLOCK_ROWS: usize = 64;
+
+#[cfg(test)]
+mod tests;

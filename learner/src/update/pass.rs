@@ -3,7 +3,8 @@
 
 use dmprl_shared::policy::{Activations, MlpShape};
 
-use super::kernels::{Backward, InstructionSet};
+use super::kernels::Backward;
+use super::packed::Packed;
 
 /// The gradient with respect to every layer's output, for up to `rows_max` rows.
 #[derive(Debug)]
@@ -43,8 +44,8 @@ pub struct Pass<'a> {
     pub activations: &'a Activations,
     /// How many.
     pub rows: usize,
-    /// What computes.
-    pub instructions: InstructionSet,
+    /// Its parameters as the passes read them.
+    pub packed: &'a Packed,
 }
 
 impl Pass<'_> {
@@ -61,29 +62,29 @@ impl Pass<'_> {
         let rows = self.rows;
         let layer = &self.shape.layers()[index];
         let (before, at) = gradients.layers.split_at_mut(index);
-        Backward {
+        let product = Backward {
             gradient: &at[0][..rows * layer.outputs],
             weights: &self.parameters[layer.weights.clone()],
             outputs_len: layer.outputs,
             first: 0,
             activations: Some(self.activations.layer(self.shape, index - 1, rows)),
             inputs_gradient: &mut before[index - 1][..rows * layer.inputs],
-        }
-        .run(self.instructions);
+        };
+        self.packed.backward(self.shape, index, product);
     }
 
     /// After [`Pass::backward`]: the gradient with respect to the inputs from column `first` on,
     /// (rows, inputs - first), overwritten.
     pub fn input_gradient(self, gradients: &Gradients, first: usize, out: &mut [f32]) {
         let layer = &self.shape.layers()[0];
-        Backward {
+        let product = Backward {
             gradient: gradients.layer(self.shape, 0, self.rows),
             weights: &self.parameters[layer.weights.clone()],
             outputs_len: layer.outputs,
             first,
             activations: None,
             inputs_gradient: out,
-        }
-        .run(self.instructions);
+        };
+        self.packed.backward(self.shape, 0, product);
     }
 }

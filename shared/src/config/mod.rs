@@ -23,8 +23,8 @@ pub use dmp::{
 };
 pub use experiment::{
     ActorsConfig, CheckpointConfig, DemonstrationsConfig, Device, EvaluationConfig,
-    ExperimentConfig, Hindsight, LearnerConfig, MetricsConfig, PacingConfig, ReplayConfig,
-    RunConfig, TaskConfig,
+    ExperimentConfig, Hindsight, LearnerConfig, MetricsConfig, PacingConfig, Precision,
+    ReplayConfig, RunConfig, TaskConfig,
 };
 pub use layers::{ConfigError, Layers, nearest};
 pub use presets::{PRESETS, Preset, policy_defaults};

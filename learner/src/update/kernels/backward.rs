@@ -79,6 +79,7 @@ impl<S: Simd> Tiled<S> for Job<'_> {
             data: &self.layer.weights[self.layer.first + self.column..],
             stride: self.inputs_len,
             width: end - self.column,
+            next: Some(PANEL),
         };
         let sums = [[zero; V]; M];
         let sums = if right.width == PANEL {

@@ -112,7 +112,8 @@ impl<S: Simd> Tiled<S> for Job<'_> {
             depth_stride: 1,
         };
         let panel = &packed[self.column * self.depth..][..self.depth * PANEL];
-        let right = Wide { data: panel, stride: PANEL, width: PANEL };
+        let right =
+            Wide { data: panel, stride: PANEL, width: PANEL, next: Some(self.depth * PANEL) };
         let sums = accumulate::<S, M, V, false>(simd, sums, left, right, self.depth);
         let zero = simd.splat_f32s(0.0);
         for (m, mut sums) in sums.into_iter().enumerate() {

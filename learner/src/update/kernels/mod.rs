@@ -17,6 +17,7 @@
 //! matters (AVX-512, AVX2 with FMA, NEON, plain); [`InstructionSet::detect`] picks at start.
 
 mod backward;
+pub mod bf16;
 mod forward;
 mod optimizer;
 mod pack;

@@ -21,9 +21,9 @@ impl StepSizes {
     /// Those of step `step`, the first being 1.
     ///
     /// parameters -= learning_rate m̂ / (sqrt(v̂) + epsilon) with m̂ = m / (1 - beta1^t) and
-    /// v̂ = v / (1 - beta2^t) is step m / (sqrt(v) + epsilon') with
-    /// root = sqrt(1 - beta2^t), step = learning_rate root / (1 - beta1^t), epsilon' = epsilon root:
-    /// one division a number instead of two.
+    /// v̂ = v / (1 - beta2^t) is step m / (sqrt(v) + epsilon') with root = sqrt(1 - beta2^t),
+    /// step = learning_rate root / (1 - beta1^t), epsilon' = epsilon root: one division a number
+    /// instead of two.
     #[must_use]
     pub fn new(learning_rate: f64, step: u64) -> Self {
         // In f64: 1 - beta2^t loses its digits in f32 at small t.

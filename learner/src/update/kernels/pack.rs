@@ -62,7 +62,7 @@ pub fn pack(
 /// Transposes 16 rows of 16 numbers that are `stride` apart into 256 consecutive numbers.
 #[cfg(target_arch = "x86_64")]
 #[target_feature(enable = "avx512f")]
-fn transpose(rows: &[f32], stride: usize, out: &mut [f32]) {
+pub(super) fn transpose(rows: &[f32], stride: usize, out: &mut [f32]) {
     use std::arch::x86_64::{_mm512_loadu_ps, _mm512_setzero_ps, _mm512_storeu_ps};
     assert!(rows.len() >= (PANEL - 1) * stride + PANEL && out.len() >= PANEL * PANEL);
     let mut at = [_mm512_setzero_ps(); PANEL];

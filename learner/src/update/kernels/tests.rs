@@ -3,13 +3,13 @@
 use super::*;
 
 /// Numbers in (-1, 1) without a pattern that sums could hide in.
-fn numbers(len: usize, seed: usize) -> Vec<f32> {
+pub(super) fn numbers(len: usize, seed: usize) -> Vec<f32> {
     let mix = |i: usize| ((i * 2_654_435_761 + seed * 40_503) >> 7) % 20_011;
     (0..len).map(|i| mix(i) as f32 / 10_005.5 - 1.0).collect()
 }
 
 /// (rows, depth) times (depth, cols), with each operand's number given by a function.
-fn product(
+pub(super) fn product(
     rows: usize,
     cols: usize,
     depth: usize,
@@ -28,7 +28,7 @@ fn assert_close(got: &[f32], want: &[f64], what: &str) {
 }
 
 /// Widths around panels and vectors, and rows around tiles.
-const SHAPES: [(usize, usize, usize); 9] = [
+pub(super) const SHAPES: [(usize, usize, usize); 9] = [
     (1, 3, 1),
     (64, 23, 256),
     (64, 256, 70),

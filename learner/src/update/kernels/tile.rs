@@ -22,6 +22,10 @@ pub(super) struct Wide<'a> {
     pub stride: usize,
     /// At most [`PANEL`].
     pub width: usize,
+    /// Where, counted from a depth's numbers, those stand that the next tiles read at that depth,
+    /// if they are to be fetched ahead: a network's weights do not stay in a core's caches from one
+    /// block of rows to the next.
+    pub next: Option<usize>,
 }
 
 /// The sums of `M` rows and [`PANEL`] = `V` * lanes columns.
@@ -97,6 +101,9 @@ unsafe fn multiply<S: Simd, const M: usize, const V: usize, const MASKED: bool>(
             }
         };
     }
+    if let Some(next) = right.next {
+        prefetch(right_at.wrapping_add(k * right.stride + next));
+    }
     let left_at = left.data.as_ptr();
     for (m, sums) in sums.iter_mut().enumerate() {
         // SAFETY: the caller's promise about `left`.
@@ -107,6 +114,19 @@ unsafe fn multiply<S: Simd, const M: usize, const V: usize, const MASKED: bool>(
         }
     }
     sums
+}
+
+/// Asks for a line to be brought into the second-level cache; a hint, for any address.
+#[inline(always)]
+fn prefetch(at: *const f32) {
+    #[cfg(target_arch = "x86_64")]
+    // SAFETY: a prefetch of an address that is not ours does nothing.
+    unsafe {
+        use std::arch::x86_64::{_MM_HINT_T1, _mm_prefetch};
+        _mm_prefetch::<_MM_HINT_T1>(at.cast());
+    }
+    #[cfg(not(target_arch = "x86_64"))]
+    let _ = at;
 }
 
 /// Masks of the first `width` columns of a tile.

@@ -1,0 +1,88 @@
+//! What an update allocates after the first ones.
+
+#![allow(clippy::unwrap_used, reason = "a test's helpers fail the test")]
+
+use std::alloc::{GlobalAlloc, Layout, System};
+use std::sync::atomic::{AtomicU64, Ordering};
+
+use dmprl_learner::algorithms::{Algorithm, Batch};
+use dmprl_learner::update::kernels::bf16::Bf16;
+use dmprl_shared::config::Layers;
+use dmprl_shared::policy::Policy;
+use dmprl_shared::spec::EnvSpec;
+
+struct Counting;
+
+static ALLOCATIONS: AtomicU64 = AtomicU64::new(0);
+
+// SAFETY: all work is the system allocator's; the counter does not touch the memory.
+unsafe impl GlobalAlloc for Counting {
+    unsafe fn alloc(&self, layout: Layout) -> *mut u8 {
+        ALLOCATIONS.fetch_add(1, Ordering::Relaxed);
+        // SAFETY: the caller's promise is passed on.
+        unsafe { System.alloc(layout) }
+    }
+
+    unsafe fn dealloc(&self, pointer: *mut u8, layout: Layout) {
+        // SAFETY: the caller's promise is passed on.
+        unsafe { System.dealloc(pointer, layout) }
+    }
+}
+
+#[global_allocator]
+static ALLOCATOR: Counting = Counting;
+
+/// Allocations of twenty updates, after some.
+fn allocations(algorithm: &str, policy: &str, precision: &str, threads: &str) -> u64 {
+    let mut layers = Layers::new();
+    let keys = [
+        ("algorithm.name", algorithm),
+        ("policy.kind", policy),
+        ("learner.precision", precision),
+        ("learner.threads", threads),
+        // Three blocks, the last short and of an odd number of rows.
+        ("algorithm.batch_size", "133"),
+    ];
+    for (key, value) in keys {
+        layers.set("test", key, value).unwrap();
+    }
+    if policy == "mlp" {
+        layers.set("test", "policy.segment_steps", "1").unwrap();
+    }
+    let config = layers.finish().unwrap();
+    let spec = EnvSpec {
+        id: "Test-v0".into(),
+        observation_len: 9,
+        action_len: 2,
+        action_low: vec![-1.0; 2],
+        action_high: vec![1.0; 2],
+        control_dt_s: 0.05,
+        episode_steps: 50,
+        observation_names: Vec::new(),
+    };
+    let policy = Policy::new(&config, &spec).unwrap();
+    let mut algorithm = Algorithm::new(&config, &policy).unwrap();
+    let batch = Batch::new(algorithm.batch_shape());
+    let mut update = |count| {
+        algorithm.update(&policy, &batch, count).unwrap();
+    };
+    (1..5).for_each(&mut update);
+    let before = ALLOCATIONS.load(Ordering::Relaxed);
+    (5..25).for_each(&mut update);
+    ALLOCATIONS.load(Ordering::Relaxed) - before
+}
+
+/// Alone in its binary: the counter sees every thread.
+#[test]
+fn no_update_allocates_once_its_buffers_are_made() {
+    for algorithm in ["ddpg", "td3", "sac"] {
+        for policy in ["dmp", "mlp"] {
+            assert_eq!(allocations(algorithm, policy, "f32", "2"), 0, "{algorithm} {policy}");
+            if Bf16::detect().is_some() {
+                // On one thread: each has a buffer for pairs, made when it first has work.
+                let got = allocations(algorithm, policy, "bf16", "1");
+                assert_eq!(got, 0, "{algorithm} {policy} bf16");
+            }
+        }
+    }
+}
