@@ -12,6 +12,8 @@ mod exploration;
 #[cfg(feature = "python")]
 mod faults;
 #[cfg(feature = "python")]
+mod hindsight;
+#[cfg(feature = "python")]
 pub mod python_env;
 #[cfg(feature = "python")]
 pub mod rollout;

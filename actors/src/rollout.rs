@@ -16,6 +16,7 @@ use thiserror::Error;
 use crate::acting::Acting;
 use crate::exploration::Exploration;
 use crate::faults::{Faults, Hopeless};
+use crate::hindsight::{Addition, Hindsight};
 use crate::python_env::{PythonEnvironments, PythonError, SUCCESS_NOT_REPORTED, SUCCESS_YES};
 
 /// Why a rollout stopped.
@@ -66,6 +67,19 @@ pub struct Identity {
     pub incarnation: u32,
 }
 
+/// What the header of a segment says beside who made it.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) struct Outline {
+    /// As in the header.
+    pub(crate) flags: u32,
+    /// Version of the policy that acted.
+    pub(crate) policy_version: u64,
+    /// Steps of the episode before it.
+    pub(crate) episode_step: u32,
+    /// Steps, 1 to K.
+    pub(crate) steps: usize,
+}
+
 #[derive(Debug, Clone, Copy, Default)]
 struct Episode {
     number: u32,
@@ -81,6 +95,7 @@ pub struct Rollout {
     exploration: Exploration,
     episodes: Vec<Episode>,
     faults: Faults,
+    hindsight: Option<Hindsight>,
     /// (E,): of the first reset, and of a reset after a failure.
     env_seeds: Vec<u64>,
     new_seeds: Vec<u64>,
@@ -113,7 +128,9 @@ impl Rollout {
         let all = vec![true; envs];
         environments.reset(&all, &env_seeds)?;
         faults.look_at_reset(&mut environments, &all)?;
+        let hindsight = Hindsight::start(config, &environments, layout, worker)?;
         Ok(Self {
+            hindsight,
             identity,
             warm_up_steps: config.exploration.warm_up_steps,
             exploration: Exploration::new(
@@ -165,15 +182,45 @@ impl Rollout {
         self.environments.step_segment(self.acting.actions()).map_err(RolloutError::from)?;
         let failed = self.faults.look(&mut self.environments).map_err(RolloutError::from)?;
         for env in 0..self.episodes.len() {
-            if self.faults.failed()[env] {
-                self.begin_episode(env);
-                continue;
+            let mut ended = self.faults.failed()[env];
+            if !ended {
+                self.record(env, policy_version)?;
+                deliver(&self.segment.header, &self.segment.block)?;
+                ended = self.segment.header.flags & (TERMINATED | TRUNCATED) != 0;
             }
-            self.record(env, policy_version);
-            deliver(&self.segment.header, &self.segment.block)?;
+            if ended {
+                self.deliver_copies(env, deliver)?;
+                self.begin_episode(env);
+            }
         }
         // Last: what the others did is sound, and delivered.
         if failed { Ok(self.make_up()?) } else { Ok(()) }
+    }
+
+    /// Segments that one call may deliver.
+    #[must_use]
+    pub fn segments_max(&self) -> usize {
+        let copies = self.hindsight.as_ref().map_or(0, Hindsight::copies_max);
+        self.episodes.len() * (1 + copies)
+    }
+
+    /// The episode of environment `env` is over: hands on its copies with other goals, if it
+    /// makes any.
+    fn deliver_copies<E: From<RolloutError>>(
+        &mut self,
+        env: usize,
+        deliver: Deliver<'_, E>,
+    ) -> Result<(), E> {
+        let Some(hindsight) = &mut self.hindsight else { return Ok(()) };
+        let copies = hindsight.relabel(env).map_err(RolloutError::from)?;
+        for index in 0..copies {
+            let Some(hindsight) = &self.hindsight else { break };
+            let copy = hindsight.write(env, index, &mut self.segment.block);
+            let Some(outline) = copy else { continue };
+            self.write_header(env, outline);
+            deliver(&self.segment.header, &self.segment.block)?;
+        }
+        Ok(())
     }
 
     /// One line about each failure of an environment since the last call.
@@ -198,14 +245,16 @@ impl Rollout {
     }
 
     fn begin_episode(&mut self, env: usize) {
+        if let Some(hindsight) = &mut self.hindsight {
+            hindsight.begin_episode(env);
+        }
         self.acting.carry_on(env, true);
         self.exploration.episode_ended(env);
         self.episodes[env] = Episode { number: self.episodes[env].number + 1, steps: 0 };
     }
 
     /// Fills `self.segment` with what environment `env` has just done.
-    fn record(&mut self, env: usize, policy_version: u64) {
-        let layout = self.acting.policy.layout();
+    fn record(&mut self, env: usize, policy_version: u64) -> Result<(), RolloutError> {
         let steps = self.environments.steps()[env] as usize;
         self.fill_block(env, steps);
         let flag = |set: bool, flag: u32| if set { flag } else { 0 };
@@ -213,33 +262,45 @@ impl Rollout {
             | flag(self.environments.truncated()[env] == 1, TRUNCATED)
             | flag(self.environments.success()[env] == SUCCESS_YES, SUCCESS)
             | flag(self.environments.success()[env] != SUCCESS_NOT_REPORTED, SUCCESS_REPORTED);
-        self.sequence += 1;
-        let episode = self.episodes[env];
-        self.segment.header = SegmentHeader {
-            layout_version: LAYOUT_VERSION,
-            flags,
-            run_id: self.identity.run_id,
-            architecture_hash: self.acting.policy.architecture_hash(),
-            policy_version,
-            sequence: self.sequence,
-            worker_id: self.identity.worker_id,
-            incarnation: self.identity.incarnation,
-            env_index: env as u32,
-            episode: episode.number,
-            episode_step: episode.steps,
-            steps_len: steps as u32,
-            segment_steps: layout.segment_steps as u32,
-            observation_len: layout.observation_len as u32,
-            action_len: layout.action_len as u32,
-            checksum: block_checksum(&self.segment.block),
-        };
+        let episode_step = self.episodes[env].steps;
+        self.write_header(env, Outline { flags, policy_version, episode_step, steps });
+        if let Some(hindsight) = &mut self.hindsight {
+            let len = self.environments.observations().len() / self.episodes.len();
+            let observations = &self.environments.observations()[env * len..(env + 1) * len];
+            let block = self.segment.block.as_slice();
+            hindsight.add(env, Addition { steps, block, observations, policy_version })?;
+        }
         if flags & (TERMINATED | TRUNCATED) != 0 {
-            self.begin_episode(env);
             self.faults.completed(env);
         } else {
             self.acting.carry_on(env, false);
             self.episodes[env].steps += steps as u32;
         }
+        Ok(())
+    }
+
+    /// Numbers the segment whose block is written, and says what it is.
+    fn write_header(&mut self, env: usize, outline: Outline) {
+        let layout = self.acting.policy.layout();
+        self.sequence += 1;
+        self.segment.header = SegmentHeader {
+            layout_version: LAYOUT_VERSION,
+            flags: outline.flags,
+            run_id: self.identity.run_id,
+            architecture_hash: self.acting.policy.architecture_hash(),
+            policy_version: outline.policy_version,
+            sequence: self.sequence,
+            worker_id: self.identity.worker_id,
+            incarnation: self.identity.incarnation,
+            env_index: env as u32,
+            episode: self.episodes[env].number,
+            episode_step: outline.episode_step,
+            steps_len: outline.steps as u32,
+            segment_steps: layout.segment_steps as u32,
+            observation_len: layout.observation_len as u32,
+            action_len: layout.action_len as u32,
+            checksum: block_checksum(&self.segment.block),
+        };
     }
 
     fn fill_block(&mut self, env: usize, steps: usize) {

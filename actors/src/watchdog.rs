@@ -22,6 +22,8 @@ pub enum CallKind {
     Reset = 1,
     /// `step_segment`.
     StepSegment = 2,
+    /// `relabel`.
+    Relabel = 3,
 }
 
 impl CallKind {
@@ -31,6 +33,7 @@ impl CallKind {
         match self {
             Self::Reset => "reset",
             Self::StepSegment => "step_segment",
+            Self::Relabel => "relabel",
         }
     }
 }

@@ -10,8 +10,13 @@ use dmprl_learner::metrics::{MetricsLine, Rejected};
 use dmprl_shared::config::{ExperimentConfig, Layers, Limits, task_defaults};
 
 const EXAMPLES: &str = "docs/examples";
-const DOCUMENTS: [&str; 4] =
-    ["README.md", "ARCHITECTURE.md", "CHANGELOG.md", "docs/environments.md"];
+const DOCUMENTS: [&str; 5] = [
+    "README.md",
+    "ARCHITECTURE.md",
+    "CHANGELOG.md",
+    "docs/environments.md",
+    "docs/demonstrations.md",
+];
 const LIMITS: Limits = Limits { cores: 2 };
 /// How the program is called in the documents.
 const CALLS: [&str; 3] = ["cargo run --release -- ", "target/release/dmprl ", "dmprl "];
@@ -221,6 +226,7 @@ fn the_keys_of_both_kinds_of_lines_are_documented() {
         env_steps: 0,
         updates: 0,
         segments: 0,
+        hindsight_segments: 0,
         policy_version: 0,
         replay_segments: 0,
         samples_per_insert: 0.0,

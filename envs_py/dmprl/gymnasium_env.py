@@ -21,6 +21,7 @@ from gymnasium.envs import registration
 from numpy.typing import NDArray
 
 from dmprl import robotics_repair
+from dmprl.hindsight import GymnasiumGoals
 from dmprl.observation_names import names_of
 from dmprl.segment_env import (
     OBSERVATION_NAMES_MAX,
@@ -28,6 +29,8 @@ from dmprl.segment_env import (
     SUCCESS_NOT_REPORTED,
     SUCCESS_YES,
     EnvSpec,
+    GoalRows,
+    Goals,
     SegmentBuffers,
     SegmentEnv,
     SegmentEnvError,
@@ -65,6 +68,7 @@ class GymnasiumSegmentEnv(SegmentEnv):
         self.segment_steps = segment_steps
         self._registered = self._registration(named)
         self._observation_space = None
+        self._goals: GymnasiumGoals | None = None
         self._envs = [self._make() for _ in range(env_count)]
         first = self._envs[0]
         self._observation_len = first.observation_space.shape[0]
@@ -206,6 +210,13 @@ class GymnasiumSegmentEnv(SegmentEnv):
         failures = list(self._untold)
         self._untold.clear()
         return failures
+
+    def goals(self) -> Goals:  # noqa: D102 - inherited
+        self._goals = GymnasiumGoals(self.task_id, self._envs[0], self._observation_space)
+        return self._goals.goals
+
+    def relabel(self, rows: GoalRows) -> None:  # noqa: D102 - inherited
+        self._goals.relabel(self._envs[0], rows)
 
     def close(self) -> None:  # noqa: D102 - inherited
         for env in self._envs:

@@ -35,6 +35,23 @@ class UnsupportedSpaceError(TypeError):
     """An environment's spaces are not what a continuous controller can use."""
 
 
+class NotGoalConditionedError(TypeError):
+    """Hindsight is asked of an environment without goals, or that cannot tell what they reward."""
+
+
+class Goals(TypedDict):
+    """Where an observation holds the goal that was reached, and the one that is wanted."""
+
+    achieved: int
+    """First entry of the one,"""
+    desired: int
+    """and of the other."""
+    length: int
+    """Entries of each."""
+    sparse: bool
+    """Whether the reward says no more than reached or not."""
+
+
 class EnvSpec(TypedDict):
     """What learner and policy must know (``shared/src/spec.rs``)."""
 
@@ -84,6 +101,21 @@ class SegmentBuffers:
         self.actions = np.zeros((env_count, segment_steps, action_len))
         self.mask = np.zeros(env_count, np.uint8)
         self.seeds = np.zeros(env_count, np.uint64)
+
+
+class GoalRows:
+    """Steps with goals of their own, for :meth:`SegmentEnv.relabel`; allocated once.
+
+    Only the first ``count[0]`` of M rows are used. ``achieved`` and ``desired`` float64 (M, G) are
+    the caller's; ``rewards`` float64 (M,) and ``terminated`` uint8 (M,) the answer.
+    """
+
+    def __init__(self, rows_max: int, goal_len: int) -> None:
+        self.count = np.zeros(1, np.uint64)
+        self.achieved = np.zeros((rows_max, goal_len))
+        self.desired = np.zeros((rows_max, goal_len))
+        self.rewards = np.zeros(rows_max)
+        self.terminated = np.zeros(rows_max, np.uint8)
 
 
 class SegmentEnv(ABC):
@@ -142,6 +174,22 @@ class SegmentEnv(ABC):
         Each names id, environment index, step and cause, as those of :class:`SegmentEnvError`.
         """
         return []
+
+    def goals(self) -> Goals:
+        """Where the goals stand in an observation.
+
+        Raises:
+            NotGoalConditionedError: there are none, or their reward cannot be asked for.
+        """
+        raise NotGoalConditionedError(f"{self.spec()['id']}: its observation holds no goals")
+
+    def relabel(self, rows: GoalRows) -> None:
+        """Writes what steps would have been rewarded with, had other goals been wanted.
+
+        For hindsight. Called at an episode's end with all its copies, and only where :meth:`goals`
+        answers.
+        """
+        raise NotImplementedError
 
     def close(self) -> None:  # noqa: B027 - nothing to release is the usual case
         """Releases what the environments hold."""

@@ -199,6 +199,71 @@ class Goal(Countdown):
         return {"observation": np.full(2, 0.25, "f"), "desired_goal": np.full(2, 0.5, "f")}
 
 
+class Reach(gymnasium.Env):
+    """A point on a line that an action moves by half of it; rewarded only near a place drawn.
+
+    - ``ends``: whether an episode ends there. ``alone``: whether a reward is computed of one goal
+      at a time. ``fault``: the reward of a goal that nobody asked for is NaN.
+    """
+
+    observation_space = spaces.Dict(
+        achieved_goal=spaces.Box(-99, 99, (1,), np.float64),
+        desired_goal=spaces.Box(-99, 99, (1,), np.float64),
+        observation=spaces.Box(-99, 99, (2,), np.float64),
+    )
+    action_space = ACTION
+
+    def __init__(self, ends=False, alone=False, fault=False, render_mode=None):
+        self.ends, self.alone, self.fault = ends, alone, fault
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.place, self.goal, self.steps = 0.0, self.np_random.uniform(-6.0, 6.0, 1), 0
+        return self.observe(), {}
+
+    def step(self, action):
+        self.place += 0.5 * float(action[0])
+        self.steps += 1
+        observation = self.observe()
+        goals = observation["achieved_goal"], self.goal
+        reached = bool(np.abs(goals[0] - goals[1])[0] <= 0.5)
+        info = {"is_success": reached}
+        return observation, float(reached) - 1.0, self.ends and reached, False, info
+
+    def observe(self):
+        place = np.array([self.place])
+        observed = np.array([self.place, self.steps])
+        return {"achieved_goal": place, "desired_goal": self.goal.copy(), "observation": observed}
+
+    def compute_reward(self, achieved_goal, desired_goal, info):
+        near = np.abs(achieved_goal - desired_goal)[..., 0] <= 0.5
+        if self.fault and np.ndim(near) and self.goal not in desired_goal and len(near) != 32:
+            return np.full(len(near), np.nan)
+        return bool(near.all()) - 1.0 if self.alone else near - 1.0
+
+    def compute_terminated(self, achieved_goal, desired_goal, info):
+        return self.ends and abs(float(achieved_goal[0] - desired_goal[0])) <= 0.5
+
+
+class ReachFar(Reach):
+    """Rewarded by the distance, at any time."""
+
+    def compute_reward(self, achieved_goal, desired_goal, info):
+        return -np.abs(achieved_goal - desired_goal)[..., 0]
+
+
+class FaultyReach(Reach):
+    """Breaks in its 12th step, and is made again."""
+
+    lived = 0
+
+    def step(self, action):
+        self.lived += 1
+        if self.lived == 12:
+            raise ValueError("the line broke")
+        return super().step(action)
+
+
 class Nested(Goal):
     """Dictionaries in a tuple in a dictionary; a number that breaks like :class:`Countdown`."""
 
@@ -293,6 +358,13 @@ register("Nested", Nested)
 for dtype in ("int8", "uint16", "int64", "float16", "float32"):
     register(f"Typed-{dtype}", Typed, kwargs={"dtype": dtype})
 register("Goal", Goal)
+register("Reach", Reach, max_episode_steps=12)
+register("ReachEnds", Reach, kwargs={"ends": True}, max_episode_steps=12)
+register("ReachAlone", Reach, kwargs={"alone": True}, max_episode_steps=12)
+register("ReachNan", Reach, kwargs={"fault": True}, max_episode_steps=12)
+register("ReachTimeless", Reach)
+register("ReachFar", ReachFar, max_episode_steps=12)
+register("FaultyReach", FaultyReach, max_episode_steps=20)
 register("Discrete", Spaces, kwargs={"action": spaces.Discrete(3)})
 register("Unbounded", Spaces, kwargs={"action": spaces.Box(-np.inf, np.inf, (2,))})
 register("Image", Spaces, kwargs={"observation": spaces.Box(0, 255, (8, 8, 3), np.uint8)})

@@ -6,18 +6,23 @@ use dmprl_shared::config::{AlgorithmName, ExperimentConfig};
 use dmprl_shared::parameters::ParameterSnapshot;
 use dmprl_shared::policy::{Head, Policy, PolicyError};
 use dmprl_shared::seeds;
-use dmprl_shared::segment::{Expected, Rejection, Segment, SegmentHeader, SegmentLayout, check};
+use dmprl_shared::segment::{
+    Expected, HINDSIGHT, Rejection, Segment, SegmentHeader, SegmentLayout, check,
+};
 use dmprl_shared::spec::EnvSpec;
 use serde::{Deserialize, Serialize};
 use thiserror::Error;
 
+use crate::algorithms::cloning::Cloning;
 use crate::algorithms::ndp::{Ndp, Scene};
-use crate::algorithms::{Algorithm, Batch, NoWindow};
+use crate::algorithms::{Algorithm, Batch, Losses, NoWindow};
+use crate::demonstrations::{DemonstrationError, Steps};
 use crate::metrics::{Collector, MetricsLine, Rejected};
 use crate::normaliser::Normaliser;
 use crate::pacing::Pacing;
 use crate::replay::{Replay, Sampler};
 use crate::rollout_buffer::RolloutBuffer;
+use crate::update::trained::Trained;
 
 /// Why the learner stopped.
 #[derive(Debug, Error)]
@@ -31,6 +36,9 @@ pub enum LearnerError {
     /// The replay has nothing to learn from.
     #[error(transparent)]
     NoWindow(#[from] NoWindow),
+    /// Demonstrations do not fit.
+    #[error(transparent)]
+    Demonstrations(#[from] DemonstrationError),
     /// A loss or parameter is NaN or infinite.
     #[error(
         "update {update}: {name} is {value}; the run has diverged. The last checkpoint is sound: \
@@ -54,6 +62,9 @@ pub struct Counters {
     pub env_steps: u64,
     /// Segments inserted.
     pub segments: u64,
+    /// Copies of segments with other goals inserted. Checkpoints of older versions have none.
+    #[serde(default)]
+    pub hindsight_segments: u64,
     /// Updates done.
     pub updates: u64,
     /// Version of the newest published policy.
@@ -96,6 +107,8 @@ pub struct Learner {
     /// Incarnation and last sequence number of every worker heard from.
     heard: Vec<(u32, u64)>,
     omega: f32,
+    /// Where the policy imitates demonstrations.
+    cloning: Option<Cloning>,
 }
 
 impl Learner {
@@ -138,6 +151,10 @@ impl Learner {
                 ..ParameterSnapshot::default()
             },
             heard: vec![(0, 0); workers],
+            cloning: match config.demonstrations.are_cloned() {
+                true => Some(Cloning::new(&config, &policy)?),
+                false => None,
+            },
             omega: match policy.head() {
                 Head::Dmp(head) => head.omega(),
                 Head::Mlp => 1.0,
@@ -205,12 +222,18 @@ impl Learner {
             self.counters.rejected.count(why);
             return Err(why);
         }
-        self.collector.inserted(segment, self.counters.policy_version);
         if let Some(normaliser) = &mut self.normaliser {
             let (observations, _, _) = self.expected.layout.split(&segment.block);
             let seen = segment.header.steps_len as usize * normaliser.observation_len();
             normaliser.observe(&observations[..seen]);
         }
+        if segment.header.flags & HINDSIGHT != 0 {
+            // Experience, and nothing that an environment or an episode did.
+            self.replay.insert(&segment.header, &segment.block);
+            self.counters.hindsight_segments += 1;
+            return Ok(());
+        }
+        self.collector.inserted(segment, self.counters.policy_version);
         self.counters.segments += 1;
         self.counters.env_steps += u64::from(segment.header.steps_len);
         if let Some((ndp, _)) = self.algorithm.on_policy() {
@@ -218,10 +241,15 @@ impl Learner {
             return Ok(());
         }
         self.replay.insert(&segment.header, &segment.block);
-        if self.counters.env_steps > self.config.exploration.warm_up_steps {
+        // While the actor imitates the critic learns from the first step on.
+        if !self.is_warming_up() || self.config.demonstrations.are_cloned() {
             self.pacing.inserted();
         }
         Ok(())
+    }
+
+    fn is_warming_up(&self) -> bool {
+        self.counters.env_steps <= self.config.exploration.warm_up_steps
     }
 
     /// A worker numbers its segments from 1 without gaps: a number used before is a duplicate, one
@@ -259,8 +287,7 @@ impl Learner {
         let source = (&self.replay, &mut self.sampler);
         let shape = self.algorithm.batch_shape();
         self.batch.sample(shape, &self.config.algorithm, self.omega, normaliser, source)?;
-        let update = self.counters.updates + 1;
-        let losses = self.algorithm.update(&self.policy, &self.batch, update)?;
+        let losses = self.update_networks()?;
         self.updated([
             ("critic_loss", Some(losses.critic_loss)),
             ("actor_loss", losses.actor_loss),
@@ -282,17 +309,82 @@ impl Learner {
         Ok(())
     }
 
+    /// A critic that knows nothing yet would soon lead an actor that imitates astray: through the
+    /// warm-up the actor goes on imitating instead of following it, and then less and less so.
+    fn update_networks(&mut self) -> Result<Losses, LearnerError> {
+        let update = self.counters.updates + 1;
+        let share = self.cloning_share();
+        let Some(mut cloning) = self.cloning.take_if(|_| share > 0.0) else {
+            return Ok(self.algorithm.update(&self.policy, &self.batch, update)?);
+        };
+        let result = self.update_beside(&mut cloning, share);
+        self.cloning = Some(cloning);
+        result
+    }
+
+    /// One update of which the actor follows 1 - `share`, and `share` of a step of imitation.
+    fn update_beside(&mut self, cloning: &mut Cloning, share: f32) -> Result<Losses, LearnerError> {
+        let update = self.counters.updates + 1;
+        self.algorithm.read_policy(&mut cloning.parameters)?;
+        let losses = self.algorithm.update(&self.policy, &self.batch, update)?;
+        self.algorithm.fetch()?;
+        let networks = self.algorithm.networks();
+        let actor = networks.iter().find(|(name, _)| *name == "actor").map(|(_, actor)| actor);
+        if let Some(actor) = actor {
+            cloning.follow(&actor.network, 1.0 - share);
+        }
+        cloning.sample(self.normaliser.as_ref(), (&self.replay, &mut self.sampler))?;
+        cloning.step(&self.policy, share)?;
+        self.algorithm.each_network(|name, trained| match name {
+            "actor" => trained.network.set(&cloning.parameters),
+            _ => Ok(()),
+        })?;
+        Ok(losses)
+    }
+
+    /// From 1, through the warm-up, to 0 when the steps of imitation are over.
+    fn cloning_share(&self) -> f32 {
+        let after = self.counters.env_steps as f32 - self.config.exploration.warm_up_steps as f32;
+        let steps = self.config.demonstrations.imitation_steps as f32;
+        (1.0 - after.max(0.0) / steps.max(1.0)).max(0.0)
+    }
+
     fn refresh_normaliser(&mut self) -> Result<(), LearnerError> {
-        if let Some(normaliser) = self.normaliser.as_mut().filter(|normaliser| normaliser.is_due())
-        {
+        match &self.normaliser {
+            Some(normaliser) if normaliser.is_due() => self.take_normaliser_anew(),
+            _ => Ok(()),
+        }
+    }
+
+    fn take_normaliser_anew(&mut self) -> Result<(), LearnerError> {
+        if let Some(normaliser) = &mut self.normaliser {
             let change = normaliser.refresh();
             self.algorithm.fetch()?;
-            let sees_observations = |name: &str| name == "actor" || name.starts_with("critic");
-            self.algorithm.each_network(|name, trained| {
+            let sees_observations = |name: &str| !name.starts_with("log_");
+            self.each_network(|name, trained| {
                 if sees_observations(name) { change.apply(trained) } else { Ok(()) }
             })?;
         }
         Ok(())
+    }
+
+    /// Hands every network, with the name it has in a checkpoint, to `f`, which may change it.
+    ///
+    /// # Errors
+    /// The first that `f` returns.
+    pub fn each_network<E>(
+        &mut self,
+        mut f: impl FnMut(&'static str, &mut Trained) -> Result<(), E>,
+    ) -> Result<(), E> {
+        self.algorithm.each_network(&mut f)?;
+        self.cloning.as_mut().map_or(Ok(()), |cloning| f("cloning", &mut cloning.actor))
+    }
+
+    /// As [`Learner::each_network`], to read them.
+    #[must_use]
+    pub fn networks(&self) -> Vec<(&'static str, &Trained)> {
+        let cloning = self.cloning.iter().map(|cloning| ("cloning", &cloning.actor));
+        self.algorithm.networks().into_iter().chain(cloning).collect()
     }
 
     /// A snapshot of the actor under the next version.
@@ -327,6 +419,43 @@ impl Learner {
         Ok(self.algorithm.set_policy(parameters)?)
     }
 
+    /// Keeps demonstrations in the replay and lets the actor imitate them for as many updates as
+    /// the configuration says; returns the mean loss of the first and of the last tenth of these.
+    ///
+    /// # Errors
+    /// If they do not fit into the replay, or hold no whole window.
+    pub fn demonstrate(
+        &mut self,
+        demonstrations: &[Steps],
+    ) -> Result<Option<(f32, f32)>, LearnerError> {
+        for steps in demonstrations {
+            steps.enter(&mut self.replay)?;
+            if let Some(normaliser) = &mut self.normaliser {
+                normaliser.observe(&steps.observations);
+            }
+        }
+        let updates = self.config.demonstrations.cloning_updates;
+        if self.normaliser.is_some() {
+            self.take_normaliser_anew()?;
+        }
+        let Some(cloning) = &mut self.cloning else { return Ok(None) };
+        self.algorithm.read_policy(&mut cloning.parameters)?;
+        let tenth = updates.div_ceil(10);
+        let (mut first, mut last) = (0.0, 0.0);
+        for update in 0..updates {
+            cloning.sample(self.normaliser.as_ref(), (&self.replay, &mut self.sampler))?;
+            let value = cloning.step(&self.policy, 1.0)?;
+            if !value.is_finite() {
+                return Err(LearnerError::NotFinite { update, name: "cloning loss", value });
+            }
+            first += if update < tenth { value } else { 0.0 };
+            last += if update >= updates - tenth { value } else { 0.0 };
+        }
+        let parameters = cloning.parameters.clone();
+        self.warm_start(&parameters)?;
+        Ok(Some((first / tenth as f32, last / tenth as f32)))
+    }
+
     /// updates * batch_size / env_steps; on-policy, segments of a minibatch for batch_size.
     #[must_use]
     pub fn samples_per_insert(&self) -> f64 {
@@ -345,6 +474,7 @@ impl Learner {
             env_steps: counters.env_steps,
             updates: counters.updates,
             segments: counters.segments,
+            hindsight_segments: counters.hindsight_segments,
             policy_version: counters.policy_version,
             replay_segments: rollout.map_or(self.replay.len(), RolloutBuffer::len) as u64,
             samples_per_insert: self.samples_per_insert(),

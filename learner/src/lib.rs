@@ -5,6 +5,7 @@
 
 pub mod algorithms;
 pub mod checkpoint;
+pub mod demonstrations;
 mod graph;
 pub mod learner;
 pub mod metrics;

@@ -19,6 +19,9 @@ pub struct MetricsLine {
     pub updates: u64,
     /// Segments inserted, over the whole run.
     pub segments: u64,
+    /// Copies of segments with other goals inserted, over the whole run.
+    #[serde(default)]
+    pub hindsight_segments: u64,
     /// Version of the newest published policy.
     pub policy_version: u64,
     /// Segments held by the replay.

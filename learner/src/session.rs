@@ -176,10 +176,13 @@ impl<R: SegmentReceiver, P: ParameterPublisher> Session<R, P> {
 mod tests {
     use dmprl_shared::config::Layers;
     use dmprl_shared::parameters::ParameterSnapshot;
-    use dmprl_shared::segment::{LAYOUT_VERSION, SegmentHeader, TRUNCATED, block_checksum};
+    use dmprl_shared::segment::{
+        HINDSIGHT, LAYOUT_VERSION, SegmentHeader, TRUNCATED, block_checksum,
+    };
     use dmprl_shared::transport::{ParameterSubscriber, SegmentSender, SendOutcome, in_process};
 
     use super::*;
+    use crate::learner::Counters;
     use crate::learner::tests::spec;
 
     const CAPACITY: usize = 4;
@@ -371,6 +374,33 @@ mod tests {
         assert_eq!(run.turns(), Turn::Idle);
         let counters = run.session.learner.counters;
         assert_eq!((counters.segments, counters.rejected.duplicate, counters.lost), (3, 1, 3));
+    }
+
+    #[test]
+    fn copies_with_other_goals_are_experience_and_nothing_else() {
+        let mut run = run(&[("exploration.warm_up_steps", "0")]);
+        run.send();
+        run.turns();
+        let real = run.session.learner.counters;
+        assert_eq!((real.env_steps, real.updates), (5, 2));
+        run.segment.header.flags = HINDSIGHT;
+        (0..3).for_each(|_| assert_eq!(run.send(), SendOutcome::Delivered));
+        run.turns();
+        let counters = run.session.learner.counters;
+        assert_eq!((counters.hindsight_segments, run.session.learner.replay.len()), (3, 4));
+        assert_eq!(counters, Counters { hindsight_segments: 3, ..real });
+        let line = run.session.learner.metrics_line();
+        assert_eq!((line.episodes, line.hindsight_segments, line.lost), (1, 3, 0));
+        assert_eq!(line.updates_owed, 0.0);
+        // Their numbers count as any: one used before is refused, one left out is missed.
+        run.segment.header.sequence -= 1;
+        run.send();
+        run.segment.header.sequence += 1;
+        run.send();
+        run.turns();
+        let counters = run.session.learner.counters;
+        let refused = counters.rejected.duplicate;
+        assert_eq!((counters.hindsight_segments, refused, counters.lost), (4, 1, 1));
     }
 
     #[test]

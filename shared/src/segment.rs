@@ -23,8 +23,11 @@ pub const TRUNCATED: u32 = 1 << 1;
 pub const SUCCESS: u32 = 1 << 2;
 /// The environment says whether it succeeded; without it [`SUCCESS`] means nothing.
 pub const SUCCESS_REPORTED: u32 = 1 << 3;
+/// A copy of steps that other segments hold, with another goal (hindsight): experience, but no
+/// steps of an environment and no part of its episode. Whole, or [`TERMINATED`].
+pub const HINDSIGHT: u32 = 1 << 4;
 
-const KNOWN_FLAGS: u32 = TERMINATED | TRUNCATED | SUCCESS | SUCCESS_REPORTED;
+const KNOWN_FLAGS: u32 = TERMINATED | TRUNCATED | SUCCESS | SUCCESS_REPORTED | HINDSIGHT;
 
 /// Everything about a segment except its numbers.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Pod, Zeroable)]
@@ -32,7 +35,7 @@ const KNOWN_FLAGS: u32 = TERMINATED | TRUNCATED | SUCCESS | SUCCESS_REPORTED;
 pub struct SegmentHeader {
     /// [`LAYOUT_VERSION`] of the sender.
     pub layout_version: u32,
-    /// [`TERMINATED`] | [`TRUNCATED`] | [`SUCCESS`] | [`SUCCESS_REPORTED`].
+    /// [`TERMINATED`] | [`TRUNCATED`] | [`SUCCESS`] | [`SUCCESS_REPORTED`] | [`HINDSIGHT`].
     pub flags: u32,
     /// Which run the segment belongs to.
     pub run_id: u64,
@@ -215,6 +218,7 @@ pub fn check(header: &SegmentHeader, block: &[f32], expected: &Expected) -> Resu
         && header.sequence > 0
         && (1..=header.segment_steps).contains(&header.steps_len)
         && header.flags & !KNOWN_FLAGS == 0
+        && (header.flags & HINDSIGHT == 0 || header.flags & !(HINDSIGHT | TERMINATED) == 0)
         && (header.steps_len == header.segment_steps
             || header.flags & (TERMINATED | TRUNCATED) != 0);
     refuse(!in_range, Rejection::Field)?;
@@ -288,7 +292,7 @@ mod tests {
         assert_eq!(verdict(|s| s.header.worker_id = 2), Err(Rejection::Field));
         assert_eq!(verdict(|s| s.header.env_index = 4), Err(Rejection::Field));
         assert_eq!(verdict(|s| s.header.sequence = 0), Err(Rejection::Field));
-        assert_eq!(verdict(|s| s.header.flags = 16), Err(Rejection::Field));
+        assert_eq!(verdict(|s| s.header.flags = 32), Err(Rejection::Field));
         assert_eq!(verdict(|s| s.block[0] = 1.0), Err(Rejection::Checksum));
         for value in [f32::NAN, f32::INFINITY, 1.5] {
             let change = |s: &mut Segment| {
@@ -311,6 +315,17 @@ mod tests {
         assert_eq!(verdict_on(1.5), Ok(()));
         assert_eq!(verdict_on(f32::NAN), Err(Rejection::Value));
         assert_eq!(verdict_on(f32::INFINITY), Err(Rejection::Value));
+    }
+
+    #[test]
+    fn a_copy_with_another_goal_is_whole_or_terminated_and_no_part_of_an_episode() {
+        let verdict = |flags: u32, steps_len: u32| {
+            verdict(|s| (s.header.flags, s.header.steps_len) = (HINDSIGHT | flags, steps_len))
+        };
+        assert_eq!((verdict(0, 5), verdict(TERMINATED, 2)), (Ok(()), Ok(())));
+        for (flags, len) in [(0, 4), (TRUNCATED, 5), (TRUNCATED, 4), (SUCCESS_REPORTED, 5)] {
+            assert_eq!(verdict(flags, len), Err(Rejection::Field), "{flags} {len}");
+        }
     }
 
     #[test]

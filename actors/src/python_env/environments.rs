@@ -25,7 +25,7 @@ pub struct PythonEnvironments {
     segment_steps: usize,
     reset: Call,
     step_segment: Call,
-    take_failures: Py<PyAny>,
+    pub(super) env: Py<PyAny>,
     calls: Arc<CallState>,
     mask: SharedBuffer<u8>,
     seeds: SharedBuffer<u64>,
@@ -41,13 +41,13 @@ pub struct PythonEnvironments {
 }
 
 /// A bound method and its arguments, built once: the arrays stay the same, their content changes.
-struct Call {
+pub(super) struct Call {
     method: Py<PyAny>,
     arguments: Py<PyTuple>,
 }
 
 impl Call {
-    fn new(
+    pub(super) fn new(
         env: &Bound<'_, PyAny>,
         buffers: &Bound<'_, PyAny>,
         method: &str,
@@ -62,7 +62,7 @@ impl Call {
         })
     }
 
-    fn run(&self) -> Result<(), PythonError> {
+    pub(super) fn run(&self) -> Result<(), PythonError> {
         Python::attach(|py| {
             let result = self.method.bind(py).call1(self.arguments.bind(py));
             result.map(drop).map_err(|error| PythonError::exception(py, &error))
@@ -116,10 +116,7 @@ impl PythonEnvironments {
         Ok(Self {
             reset: call("reset", &["mask", "seeds"])?,
             step_segment: call("step_segment", &["actions"])?,
-            take_failures: env
-                .getattr("take_failures")
-                .map_err(|error| PythonError::exception(env.py(), &error))?
-                .unbind(),
+            env: env.clone().unbind(),
             calls: Arc::default(),
             mask: SharedBuffer::new(buffers, "mask", e, id)?,
             seeds: SharedBuffer::new(buffers, "seeds", e, id)?,
@@ -207,7 +204,8 @@ impl PythonEnvironments {
     /// `Exception` from a foreign `SegmentEnv`.
     pub fn take_failures(&mut self) -> Result<Vec<String>, PythonError> {
         Python::attach(|py| {
-            let sentences = self.take_failures.bind(py).call0().and_then(|list| list.extract());
+            let told = self.env.bind(py).call_method0("take_failures");
+            let sentences = told.and_then(|list| list.extract());
             sentences.map_err(|error| PythonError::exception(py, &error))
         })
     }

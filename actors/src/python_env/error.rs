@@ -117,6 +117,28 @@ pub enum PythonError {
         /// The value.
         value: f64,
     },
+    /// The environment cannot say what a goal would have been rewarded with.
+    #[error(
+        "{task_id}: compute_reward returned {value} for goals that an episode reached; expected a \
+         finite 32-bit number"
+    )]
+    GoalRewardNotFinite {
+        /// Task.
+        task_id: String,
+        /// The value.
+        value: f64,
+    },
+    /// Hindsight cannot be had here.
+    #[error(
+        "replay.hindsight needs a goal-conditioned environment: {reason}. Its observation must be \
+         a Dict with two Boxes of one shape, achieved_goal and desired_goal, its method \
+         compute_reward(achieved_goal, desired_goal, info) must take many goals at once, and its \
+         episodes must have a time limit; without those, train with replay.hindsight = \"none\""
+    )]
+    NoGoals {
+        /// What is missing, in the environment's words.
+        reason: String,
+    },
     /// The package `dmprl` in `.venv` does not fit this program.
     #[error("{task_id}: {name} of the Python package dmprl: {reason}")]
     Interface {

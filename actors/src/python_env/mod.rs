@@ -8,10 +8,12 @@
 mod buffer;
 mod environments;
 mod error;
+mod goals;
 mod interpreter;
 
 pub use environments::{PythonEnvironments, SUCCESS_NO, SUCCESS_NOT_REPORTED, SUCCESS_YES};
 pub use error::PythonError;
+pub use goals::{Goals, Relabelling};
 pub use interpreter::{Interpreter, InterpreterOptions};
 
 /// The CPython installation that this program was linked against, as its build found it.

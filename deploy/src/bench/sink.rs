@@ -9,7 +9,7 @@ use std::sync::mpsc::{self, Receiver, RecvTimeoutError, Sender};
 use std::thread::{self, JoinHandle};
 use std::time::{Duration, Instant};
 
-use dmprl_shared::segment::{Expected, Segment, SegmentHeader, check};
+use dmprl_shared::segment::{Expected, HINDSIGHT, Segment, SegmentHeader, check};
 use dmprl_shared::transport::shared_memory::LearnerEnd;
 use dmprl_shared::transport::{ParameterPublisher, SegmentReceiver, TransportError};
 use rustix::time::{ClockId, clock_gettime};
@@ -216,7 +216,7 @@ impl Taker {
     }
 
     /// Takes the next segment and does what a learner does first: check it and follow its worker's
-    /// sequence. One that is refused counts no steps.
+    /// sequence. One that is refused, or a copy of steps that were counted, counts no steps.
     fn take(&mut self, from: From) -> Result<Option<SegmentHeader>, TransportError> {
         let Self { end, segment, .. } = self;
         let received = match from {
@@ -229,7 +229,8 @@ impl Taker {
         let mut header = self.segment.header;
         let sound = check(&header, &self.segment.block, &self.expected).is_ok();
         let last = self.sequences.get_mut(header.worker_id as usize).filter(|_| sound);
-        if !follow(last, header.sequence, &mut self.discrepancies) {
+        let counted = follow(last, header.sequence, &mut self.discrepancies);
+        if !counted || header.flags & HINDSIGHT != 0 {
             header.steps_len = 0;
         }
         Ok(Some(header))

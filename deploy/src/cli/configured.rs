@@ -59,7 +59,7 @@ impl ConfiguredArgs {
             flag("--workers", "actors.workers", count(self.workers)),
             flag("--envs-per-worker", "actors.envs_per_worker", count(self.envs_per_worker)),
             flag("--seed", "run.seed", self.seed.map(Value::Integer)),
-            flag("--python-path", "task.python_path", python_path(&self.python_path)?),
+            flag("--python-path", "task.python_path", paths("--python-path", &self.python_path)?),
         ];
         Ok(Sources {
             task,
@@ -82,19 +82,23 @@ pub(super) fn integer() -> RangedI64ValueParser<i64> {
     clap::value_parser!(i64).range(0..)
 }
 
-/// Makes the folders of the user's modules absolute: other processes have other working
+/// Makes the paths of the user's modules and demonstrations absolute: other processes have other working
 /// directories, and a run is resumed from anywhere.
 pub(super) fn make_absolute(config: &mut ExperimentConfig) -> anyhow::Result<()> {
     for path in &mut config.task.python_path {
         *path = absolute_folder(path)?;
     }
+    for path in &mut config.demonstrations.files {
+        *path = absolute_file(path)?;
+    }
     Ok(())
 }
 
-fn python_path(paths: &[PathBuf]) -> anyhow::Result<Option<Value>> {
+/// The value of a flag that names files or folders; none if it was not given.
+pub(super) fn paths(flag: &str, paths: &[PathBuf]) -> anyhow::Result<Option<Value>> {
     let texts = paths.iter().map(|path| {
         let text = path.to_str().map(|text| Value::String(text.to_owned()));
-        text.ok_or_else(|| wrong_use(format!("--python-path {}: no UTF-8", path.display())))
+        text.ok_or_else(|| wrong_use(format!("{flag} {}: no UTF-8", path.display())))
     });
     let texts = texts.collect::<anyhow::Result<Vec<_>>>()?;
     Ok((!texts.is_empty()).then_some(Value::Array(texts)))
@@ -106,7 +110,21 @@ fn absolute_folder(path: &str) -> anyhow::Result<String> {
     if !absolute.is_dir() {
         return Err(wrong_use(format!("python path {path} is no directory")));
     }
-    absolute.into_os_string().into_string().map_err(|_| wrong_use(format!("{path}: no UTF-8")))
+    text(absolute)
+}
+
+fn absolute_file(path: &str) -> anyhow::Result<String> {
+    let absolute = std::fs::canonicalize(path)
+        .map_err(|error| wrong_use(format!("demonstrations {path}: {error}")))?;
+    if !absolute.is_file() {
+        return Err(wrong_use(format!("demonstrations {path}: no file")));
+    }
+    text(absolute)
+}
+
+fn text(absolute: PathBuf) -> anyhow::Result<String> {
+    let shown = absolute.display().to_string();
+    absolute.into_os_string().into_string().map_err(|_| wrong_use(format!("{shown}: no UTF-8")))
 }
 
 /// `DMPRL_` variables must be text; others may be anything and are none of our business.

@@ -12,7 +12,7 @@ use dmprl_shared::dmp::Dmp;
 use toml::Value;
 
 use super::configuration::{Flag, merge, refuse};
-use super::configured::{ConfiguredArgs, flag, integer, make_absolute};
+use super::configured::{ConfiguredArgs, flag, integer, make_absolute, paths};
 use super::{cores, prepare_python, this_program};
 use crate::failure::{Outcome, wrong_use};
 use crate::launch::{self, SessionPlan};
@@ -37,6 +37,7 @@ EXAMPLES
   dmprl train reacher --until-return -5 --max-minutes 30
   dmprl train reacher --config runs/baseline/config.toml --deterministic
   dmprl train reacher --init-from runs/baseline --seed 3
+  dmprl train panda-reach --demos demonstrations.npz
   dmprl train my_module:MyArm-v0 --python-path ./envs";
 
 /// Arguments of `dmprl train`.
@@ -66,6 +67,9 @@ pub(super) struct TrainArgs {
     /// Start from a run's best policy, or from a policy file.
     #[arg(long, value_name = "RUN|FILE")]
     init_from: Option<PathBuf>,
+    /// Demonstrations to start from, a file of steps (docs/demonstrations.md); repeatable.
+    #[arg(long, value_name = "FILE")]
+    demos: Vec<PathBuf>,
     /// Stop at this mean evaluation return.
     #[arg(long, value_name = "X", allow_negative_numbers = true)]
     until_return: Option<f64>,
@@ -81,7 +85,7 @@ pub(super) struct TrainArgs {
 }
 
 pub(super) fn run(args: &TrainArgs) -> anyhow::Result<Outcome> {
-    let sources = args.configured.sources(&args.task, flags(args))?;
+    let sources = args.configured.sources(&args.task, flags(args)?)?;
     let mut config = merge(&sources)?.resolve(Limits { cores: cores() }).map_err(refuse)?;
     check(&config, args)?;
     make_absolute(&mut config)?;
@@ -126,9 +130,10 @@ fn check(config: &ExperimentConfig, args: &TrainArgs) -> anyhow::Result<()> {
     Ok(())
 }
 
-fn flags(args: &TrainArgs) -> [Option<Flag>; 7] {
+fn flags(args: &TrainArgs) -> anyhow::Result<[Option<Flag>; 8]> {
     let number = |value: Option<f64>| value.map(Value::Float);
-    [
+    Ok([
+        flag("--demos", "demonstrations.files", paths("--demos", &args.demos)?),
         flag("--steps", "run.steps", args.steps.map(Value::Integer)),
         flag("--deterministic", "run.deterministic", args.deterministic.then_some(true.into())),
         flag("--device", "learner.device", args.device.clone().map(Value::String)),
@@ -140,7 +145,7 @@ fn flags(args: &TrainArgs) -> [Option<Flag>; 7] {
         flag("--until-return", "run.until_return", number(args.until_return)),
         flag("--until-success", "run.until_success", number(args.until_success)),
         flag("--max-minutes", "run.max_minutes", number(args.max_minutes)),
-    ]
+    ])
 }
 
 /// The policy that a run or a file stands for.

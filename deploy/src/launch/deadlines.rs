@@ -32,7 +32,9 @@ impl Supervisor {
         }
         deadlines.extend(self.evaluations.deadline());
         deadlines.extend(self.slots.values().filter_map(|slot| slot.restart_at));
-        deadlines.extend(self.starting().map(|(_, running)| running.spawned + self.limits.ready));
+        deadlines.extend(
+            self.starting().map(|(process, running)| running.spawned + self.ready_limit(process)),
+        );
         deadlines.into_iter().min().unwrap_or_else(Instant::now)
     }
 
@@ -138,13 +140,24 @@ impl Supervisor {
         self.all_running().filter(move |(process, running)| !running.ready && !needless(*process))
     }
 
+    /// A learner that imitates demonstrations is ready after that.
+    fn ready_limit(&self, process: Process) -> Duration {
+        let demonstrations = &self.config.demonstrations;
+        let updates = match process {
+            Process::Learner if demonstrations.are_cloned() => demonstrations.cloning_updates,
+            _ => 0,
+        };
+        let updates = u32::try_from(updates).unwrap_or(u32::MAX);
+        self.limits.ready.saturating_add(self.limits.cloning_update.saturating_mul(updates))
+    }
+
     fn check_ready(&mut self, now: Instant) -> anyhow::Result<()> {
-        let limit = self.limits.ready;
         let late = self
             .starting()
-            .filter(|(_, running)| now >= running.spawned + limit)
+            .filter(|(process, running)| now >= running.spawned + self.ready_limit(*process))
             .map(|(process, _)| process);
         for process in late.collect::<Vec<_>>() {
+            let limit = self.ready_limit(process);
             let Some(slot) = self.slots.get_mut(&process) else { continue };
             let Some(running) = slot.running.as_mut() else { continue };
             running.child.kill();

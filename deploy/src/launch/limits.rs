@@ -7,6 +7,8 @@ use std::time::Duration;
 pub struct TimeLimits {
     /// From a child's start to its report that it is ready.
     pub ready: Duration,
+    /// More for a learner, for each update in which it imitates demonstrations first.
+    pub cloning_update: Duration,
     /// From an interrupt to the last exit; the rest of ten seconds is for SIGKILL.
     pub stop: Duration,
     /// For a learner that comes to a regular end: it drains, writes a checkpoint, exits.
@@ -29,6 +31,7 @@ impl Default for TimeLimits {
     fn default() -> Self {
         Self {
             ready: Duration::from_secs(60),
+            cloning_update: Duration::from_millis(200),
             stop: Duration::from_secs(9),
             drain: Duration::from_secs(60),
             kill: Duration::from_secs(5),

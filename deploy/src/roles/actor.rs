@@ -4,9 +4,9 @@ use std::path::Path;
 use std::time::{Duration, Instant};
 
 use anyhow::{Context, bail};
-use dmprl_actors::python_env::{Interpreter, InterpreterOptions};
+use dmprl_actors::python_env::{Interpreter, InterpreterOptions, PythonEnvironments};
 use dmprl_actors::rollout::{Identity, Rollout, RolloutError};
-use dmprl_shared::config::ExperimentConfig;
+use dmprl_shared::config::{ExperimentConfig, Hindsight};
 use dmprl_shared::seeds;
 use dmprl_shared::segment::SegmentHeader;
 use dmprl_shared::transport::shared_memory::{Plan, Sender, Subscriber, WorkerEnd, attach};
@@ -44,6 +44,9 @@ pub fn run(args: &ActorArgs, control: &ControlPipe) -> anyhow::Result<()> {
     interpreter.seed(seeds::derive(config.run.seed, "python", worker))?;
     let envs = environments::make(&interpreter, config, config.actors.envs_per_worker, control)?;
     control.send(&Report::EnvironmentReady { spec: envs.spec().clone() })?;
+    if args.index == 0 && args.incarnation == 0 {
+        hint(config, &envs, control);
+    }
     let identity =
         Identity { run_id: setup.run_id, worker_id: args.index, incarnation: args.incarnation };
     let mut rollout = Rollout::start(config, envs, identity)?;
@@ -68,6 +71,17 @@ pub fn run(args: &ActorArgs, control: &ControlPipe) -> anyhow::Result<()> {
         }
     }
     Ok(())
+}
+
+/// A sparse reward is hardly ever met by chance: says what helps, where it can be had.
+fn hint(config: &ExperimentConfig, envs: &PythonEnvironments, control: &ControlPipe) {
+    let without = config.replay.hindsight == Hindsight::None;
+    if without && envs.goals().is_ok_and(|goals| goals.is_sparse) {
+        let message = "the reward only says whether the goal is reached; --set \
+                       replay.hindsight=future learns from goals reached by chance";
+        // A supervisor that is gone is noticed as a stop.
+        let _ = control.send(&Report::Warning { message: message.to_owned() });
+    }
 }
 
 fn await_attach(

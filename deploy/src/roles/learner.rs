@@ -5,6 +5,7 @@ use std::time::{Duration, Instant};
 
 use anyhow::{Context, bail};
 use dmprl_learner::checkpoint;
+use dmprl_learner::demonstrations::{Steps, Summary};
 use dmprl_learner::learner::Learner;
 use dmprl_learner::policy_file::{self, Match};
 use dmprl_learner::session::{Due, Session, Turn};
@@ -101,7 +102,34 @@ pub fn make(
     if let Some(path) = &args.init_from {
         warm_start(&mut learner, path)?;
     }
+    if !setup.config.demonstrations.files.is_empty() {
+        let message = demonstrate(&mut learner, setup, spec)?;
+        control.send(&Report::Warning { message })?;
+    }
     Ok(learner)
+}
+
+/// Starts from the configuration's demonstrations; returns what is to be told about them.
+fn demonstrate(learner: &mut Learner, setup: &Setup, spec: &EnvSpec) -> anyhow::Result<String> {
+    let files = &setup.config.demonstrations.files;
+    let read = |file| Steps::read(Path::new(file), spec, learner.policy());
+    let demonstrations = files.iter().map(read).collect::<Result<Vec<_>, _>>()?;
+    let loss = learner.demonstrate(&demonstrations)?;
+    let summaries = demonstrations.iter().map(Steps::summary);
+    let all = summaries.fold(Summary::default(), |sum, more| Summary {
+        episodes: sum.episodes + more.episodes,
+        steps: sum.steps + more.steps,
+        rewards: sum.rewards + more.rewards,
+    });
+    let mean = all.rewards / all.episodes as f64;
+    let shown =
+        format!("{} demonstrated steps in {} episodes, return {mean:.2}", all.steps, all.episodes);
+    Ok(match loss {
+        None => shown,
+        Some((first, last)) => format!(
+            "{shown}; the policy imitates them (mean squared error {first:.3}, then {last:.3})"
+        ),
+    })
 }
 
 fn warm_start(learner: &mut Learner, path: &Path) -> anyhow::Result<()> {

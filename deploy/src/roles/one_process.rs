@@ -49,7 +49,8 @@ pub fn run(args: &LearnerArgs, control: &ControlPipe) -> anyhow::Result<()> {
     let incarnation = u32::try_from(learner.counters.segments)?;
     let identity = Identity { run_id: setup.run_id, worker_id: 0, incarnation };
     let mut rollout = Rollout::start(config, made, identity)?;
-    let (mut senders, receiver) = in_process::segment_queues(1, envs, learner.policy().layout());
+    let (queue, layout) = (rollout.segments_max(), learner.policy().layout());
+    let (mut senders, receiver) = in_process::segment_queues(1, queue, layout);
     let hash = learner.policy().architecture_hash();
     let (publisher, mut parameters) = in_process::parameter_channel(hash);
 

@@ -84,7 +84,8 @@ pub fn blocks(policy: &Policy, shape: BatchShape, critics: &[Trained]) -> Vec<Bl
         Block {
             rows,
             shape,
-            critic_shape: critics[0].shape.clone(),
+            // Without a critic nobody asks for its shape.
+            critic_shape: critics.first().map_or(policy.shape(), |it| &it.shape).clone(),
             batch_rows: shape.rows as f32,
             policy: policy.workspace(count),
             actor_gradients: Gradients::new(policy.shape(), count),
@@ -202,6 +203,29 @@ impl Block {
         self.act_backward(policy, actor, |_, _, _| 0.0);
     }
 
+    /// Passes of mean (pi(s) - u)², `actions` (B, K A) being the u to imitate; leaves the sum of
+    /// squares in `sums.actor`.
+    pub fn imitate(
+        &mut self,
+        policy: &Policy,
+        actor: &Lent<'_>,
+        states: States<'_>,
+        actions: &[f32],
+    ) {
+        self.act(policy, actor, states);
+        let factor = 2.0 / actions.len() as f32;
+        let wanted = &actions[self.rows.start * self.shape.segment_actions_len..];
+        self.sums = Sums::default();
+        let errors = self.policy.actions.iter().zip(wanted).map(|(action, wanted)| action - wanted);
+        for (gradient, error) in self.actions_gradient.iter_mut().zip(errors) {
+            *gradient = factor * error;
+            self.sums.actor += error * error;
+        }
+        self.end_gradient.fill(0.0);
+        self.unsquash();
+        self.act_backward(policy, actor, |_, _, _| 0.0);
+    }
+
     fn add_input_gradient(&mut self) {
         let BatchShape { actions_len, end_state_len, segment_actions_len, .. } = self.shape;
         let width = actions_len + end_state_len;
@@ -271,8 +295,14 @@ impl Block {
     /// This block's part in the gradient of the actor after [`Block::act_backward`].
     #[must_use]
     pub fn actor_trace<'a>(&'a self, batch: &'a Batch) -> Trace<'a> {
+        self.trace(&batch.inputs)
+    }
+
+    /// The same for an actor that has seen `inputs`, (B, O).
+    #[must_use]
+    pub fn trace<'a>(&'a self, inputs: &'a [f32]) -> Trace<'a> {
         Trace {
-            inputs: self.part(&batch.inputs),
+            inputs: self.part(inputs),
             activations: &self.policy.activations,
             normalised: None,
             gradients: &self.actor_gradients,

@@ -2,6 +2,7 @@
 
 mod batch;
 mod block;
+pub mod cloning;
 pub mod ddpg;
 mod minibatch;
 pub mod ndp;

@@ -153,7 +153,7 @@ pub fn save(folder: &Path, learner: &mut Learner) -> Result<String, CheckpointEr
 }
 
 fn write_files(folder: &Path, learner: &Learner) -> Result<(), CheckpointError> {
-    let networks = learner.algorithm.networks();
+    let networks = learner.networks();
     let networks_sum = write_summed(folder, NETWORKS, |out| {
         let bytes = networks_file::bytes(learner).map_err(std::io::Error::other)?;
         out.write_all(&bytes)
@@ -279,7 +279,7 @@ fn load(folder: &Path, learner: &mut Learner) -> Result<(), CheckpointError> {
         .replay
         .read(&mut input)
         .map_err(|cause| CheckpointError::Replay { path: replay, cause })?;
-    learner.algorithm.each_network(|name, trained| match state.adam_steps.get(name) {
+    learner.each_network(|name, trained| match state.adam_steps.get(name) {
         Some(step) => {
             trained.adam.step = *step;
             Ok(())

@@ -33,7 +33,7 @@ impl View for Flat {
 
 pub(super) fn bytes(learner: &Learner) -> Result<Vec<u8>, String> {
     let mut tensors = Vec::new();
-    for (name, trained) in learner.algorithm.networks() {
+    for (name, trained) in learner.networks() {
         let network = trained.network.values().to_vec();
         let target = trained.target.as_ref().map(|target| target.values().to_vec());
         let moments = &trained.adam.moments;
@@ -62,7 +62,7 @@ pub(super) fn restore(bytes: &[u8], learner: &mut Learner) -> Result<(), String>
         let chunks = tensor.data().as_chunks::<4>().0;
         Ok(chunks.iter().map(|bytes| f32::from_le_bytes(*bytes)).collect())
     };
-    learner.algorithm.each_network(|name, trained| {
+    learner.each_network(|name, trained| {
         let len = trained.adam.moments.first.len();
         let set = |network: &mut Parameters, part| {
             network.set(&read(name, part, len)?).map_err(|error| error.to_string())

@@ -35,6 +35,9 @@ fn fresh_with(keys: &[(&str, &str)]) -> Result<Learner, LearnerError> {
 /// Feeds `rounds` segments of two interleaved environments and does the updates owed for them.
 fn train(learner: &mut Learner, rounds: std::ops::Range<u32>) {
     let layout = learner.policy().layout();
+    if learner.replay.is_empty() && learner.config().demonstrations.are_cloned() {
+        learner.demonstrate(&[crate::demonstrations::tests::steps()]).unwrap();
+    }
     for round in rounds {
         let mut random = dmprl_shared::seeds::stream(9, "segments", round.into());
         let mut segment = Segment::zeroed(layout);
@@ -81,6 +84,7 @@ fn a_resumed_learner_goes_on_to_the_same_bytes_as_one_that_never_stopped() {
         &[("algorithm.name", "td3"), ("policy.normalise_observations", "true")],
         &[("algorithm.name", "sac"), ("policy.normalise_observations", "true")],
         &[("algorithm.critic_layer_norm", "true"), ("policy.normalise_observations", "true")],
+        &[("demonstrations.files", "['some.npz']"), ("policy.normalise_observations", "true")],
     ] {
         let fresh = || fresh_with(keys);
         let folder = tempfile::tempdir().unwrap();

@@ -1,12 +1,14 @@
 //! The replay in a checkpoint: a length-checked binary of our own.
 //!
 //! ```text
-//!   magic "DMPRLRP1" · u64 K, O, A, slot count, filled, head, inserted, tail count
+//!   magic "DMPRLRP2" · u64 K, O, A, slot count, filled, head, inserted, tail count, kept
 //!   then slots · tails · blocks:
-//!   slot: u32 next, u8 steps_len, u8 terminated, u8 truncated, u8 0      (filled ones)
+//!   slot: u32 next, u8 steps_len, u8 terminated, u8 truncated, u8 hindsight     (filled ones)
 //!   tail: u32 slot, incarnation, episode, episode_steps, u64 number; slot = 2^32 - 1: none
 //!   block: f32 × block_len (filled ones)                                 all little-endian
 //! ```
+//! "DMPRLRP1", of older versions, has no `kept`: it is 0.
+//!
 //! Nothing in the file is trusted: counts are compared with what the configuration gives before
 //! anything is read, and every slot number must be below `filled`.
 
@@ -17,7 +19,8 @@ use thiserror::Error;
 
 use super::{NONE, Replay, Slot, Tail};
 
-const MAGIC: &[u8; 8] = b"DMPRLRP1";
+const MAGIC: &[u8; 8] = b"DMPRLRP2";
+const MAGIC_WITHOUT_KEPT: &[u8; 8] = b"DMPRLRP1";
 
 /// Why a replay file was refused.
 #[derive(Debug, Error)]
@@ -26,7 +29,7 @@ pub enum ReplayFileError {
     #[error("replay file: {0}")]
     Io(#[from] io::Error),
     /// Not a replay file.
-    #[error("replay file: begins with {0:?}, expected DMPRLRP1")]
+    #[error("replay file: begins with {0:?}, expected DMPRLRP2")]
     Magic([u8; 8]),
     /// A count that does not fit the configuration.
     #[error("replay file: {name} is {got}, the configuration gives {expected}")]
@@ -66,12 +69,14 @@ impl Replay {
     pub fn write(&self, out: &mut impl Write) -> Result<(), ReplayFileError> {
         out.write_all(MAGIC)?;
         let sizes = [self.filled as u64, self.head as u64, self.inserted, self.tails.len() as u64];
+        let sizes = sizes.into_iter().chain([self.kept as u64]);
         for count in self.counts().iter().map(|(_, count)| *count).chain(sizes) {
             out.write_all(&count.to_le_bytes())?;
         }
         for slot in &self.slots[..self.filled] {
             out.write_all(&slot.next.to_le_bytes())?;
-            out.write_all(&[slot.steps_len, slot.terminated.into(), slot.truncated.into(), 0])?;
+            let flags = [slot.terminated, slot.truncated, slot.hindsight].map(u8::from);
+            out.write_all(&[slot.steps_len, flags[0], flags[1], flags[2]])?;
         }
         for tail in &self.tails {
             let (words, number) = match tail {
@@ -96,7 +101,7 @@ impl Replay {
     pub fn read(&mut self, input: &mut impl Read) -> Result<(), ReplayFileError> {
         let mut magic = [0; 8];
         input.read_exact(&mut magic)?;
-        if &magic != MAGIC {
+        if &magic != MAGIC && &magic != MAGIC_WITHOUT_KEPT {
             return Err(ReplayFileError::Magic(magic));
         }
         for (name, expected) in self.counts() {
@@ -114,6 +119,7 @@ impl Replay {
         (self.filled, self.head) = (filled?, head?);
         self.inserted = read_u64(input)?;
         self.read_tail_count(input)?;
+        self.kept = if &magic == MAGIC { self.read_kept(input)? } else { 0 };
         for index in 0..self.filled {
             self.slots[index] = self.read_slot(input, index)?;
         }
@@ -133,21 +139,28 @@ impl Replay {
         Ok(())
     }
 
+    /// Demonstrations lie at the front; the next segment goes behind them.
+    fn read_kept(&self, input: &mut impl Read) -> Result<usize, ReplayFileError> {
+        let (expected, got) = (self.filled.min(self.head) as u64, read_u64(input)?);
+        if got > expected {
+            return Err(ReplayFileError::Count { name: "kept", expected, got });
+        }
+        Ok(got as usize)
+    }
+
     fn read_slot(&self, input: &mut impl Read, index: usize) -> Result<Slot, ReplayFileError> {
         let next = read_u32(input)?;
         let mut fields = [0; 4];
         input.read_exact(&mut fields)?;
-        let [steps_len, terminated, truncated, zero] = fields;
+        let [steps_len, flags @ ..] = fields;
         let sound = (1..=self.layout.segment_steps).contains(&usize::from(steps_len))
-            && terminated <= 1
-            && truncated <= 1
-            && zero == 0
+            && flags.iter().all(|&flag| flag <= 1)
             && (next == NONE || (next as usize) < self.filled);
         if !sound {
             return Err(ReplayFileError::Inconsistent { name: "slot", index });
         }
-        let (terminated, truncated) = (terminated == 1, truncated == 1);
-        Ok(Slot { next, steps_len, terminated, truncated })
+        let [terminated, truncated, hindsight] = flags.map(|flag| flag == 1);
+        Ok(Slot { next, steps_len, terminated, truncated, hindsight })
     }
 
     fn read_tail(
@@ -180,7 +193,7 @@ fn read_u32(input: &mut impl Read) -> io::Result<u32> {
 
 #[cfg(test)]
 mod tests {
-    use dmprl_shared::segment::SegmentHeader;
+    use dmprl_shared::segment::{HINDSIGHT, SegmentHeader};
 
     use super::*;
 
@@ -193,6 +206,7 @@ mod tests {
             let block: Vec<f32> =
                 (0..LAYOUT.block_len()).map(|j| (i * 100) as f32 + j as f32).collect();
             let header = SegmentHeader {
+                flags: if i % 5 == 4 { HINDSIGHT } else { 0 },
                 env_index: i % 2,
                 episode_step: i / 2 * 3,
                 steps_len: 3,

@@ -8,7 +8,7 @@
 mod file;
 mod window;
 
-use dmprl_shared::segment::{SegmentHeader, SegmentLayout, TERMINATED, TRUNCATED};
+use dmprl_shared::segment::{HINDSIGHT, SegmentHeader, SegmentLayout, TERMINATED, TRUNCATED};
 
 pub use file::ReplayFileError;
 pub use window::{Sampler, Window};
@@ -25,6 +25,8 @@ struct Slot {
     steps_len: u8,
     terminated: bool,
     truncated: bool,
+    /// A copy with a goal of its own: a sample by itself, and a part of no episode.
+    hindsight: bool,
 }
 
 /// The newest segment of one environment.
@@ -49,6 +51,8 @@ pub struct Replay {
     head: usize,
     /// Slots filled.
     filled: usize,
+    /// Slots at the front that are never replaced: demonstrations.
+    kept: usize,
     /// Segments ever inserted.
     inserted: u64,
     /// Per worker and environment.
@@ -77,6 +81,7 @@ impl Replay {
             blocks: vec![0.0; count * layout.block_len()],
             head: 0,
             filled: 0,
+            kept: 0,
             inserted: 0,
             tails: vec![None; workers * envs_per_worker],
             envs_per_worker,
@@ -101,8 +106,38 @@ impl Replay {
         self.filled == 0
     }
 
+    /// Segments it has room for.
+    #[must_use]
+    pub fn capacity(&self) -> usize {
+        self.slots.len()
+    }
+
+    /// Inserts a demonstrated segment, which is never replaced. One that does not begin its episode
+    /// continues the one kept before it.
+    ///
+    /// # Panics
+    /// If anything else has been inserted, or no room were left for more.
+    pub fn keep(&mut self, header: &SegmentHeader, block: &[f32]) {
+        assert!(self.kept == self.filled && self.kept + 1 < self.slots.len(), "no room to keep it");
+        let at = self.store(header, block);
+        if header.episode_step > 0 && at > 0 {
+            self.slots[at - 1].next = at as u32;
+        }
+        self.kept = at + 1;
+        self.inserted += 1;
+    }
+
     /// Inserts a segment that has passed `segment::check`, and links it to its predecessor.
     pub fn insert(&mut self, header: &SegmentHeader, block: &[f32]) {
+        let at = self.store(header, block);
+        if !self.slots[at].hindsight {
+            self.link(header, at as u32);
+        }
+        self.inserted += 1;
+    }
+
+    /// Puts a segment where the oldest is, or nothing yet.
+    fn store(&mut self, header: &SegmentHeader, block: &[f32]) -> usize {
         let at = self.head;
         self.blocks[at * block.len()..(at + 1) * block.len()].copy_from_slice(block);
         self.slots[at] = Slot {
@@ -110,11 +145,11 @@ impl Replay {
             steps_len: header.steps_len as u8,
             terminated: header.flags & TERMINATED != 0,
             truncated: header.flags & TRUNCATED != 0,
+            hindsight: header.flags & HINDSIGHT != 0,
         };
-        self.head = (at + 1) % self.slots.len();
+        self.head = if at + 1 == self.slots.len() { self.kept } else { at + 1 };
         self.filled = (self.filled + 1).min(self.slots.len());
-        self.link(header, at as u32);
-        self.inserted += 1;
+        at
     }
 
     /// A gap in an episode (a lost segment, a restarted worker) is never bridged.
@@ -124,7 +159,7 @@ impl Replay {
             let continues = tail.incarnation == header.incarnation
                 && tail.episode == header.episode
                 && tail.episode_steps == header.episode_step
-                && self.inserted - tail.number < self.slots.len() as u64;
+                && self.inserted - tail.number < (self.slots.len() - self.kept) as u64;
             if continues {
                 self.slots[tail.slot as usize].next = slot;
             }

@@ -165,15 +165,27 @@ impl Sampler {
 
     /// Draws one window, or `None` if `TRIES_MAX` draws met none.
     ///
-    /// Steps that start no window are redrawn, so every window is equally likely.
+    /// Steps that start no window are redrawn, so every window of an episode is equally likely. A
+    /// copy with another goal is one window: it is drawn as often as the K windows of a segment,
+    /// so that copies have the same share of samples whatever `windows` says.
     pub fn draw(&mut self, replay: &Replay) -> Option<Window> {
-        if replay.is_empty() {
+        self.draw_from(replay, replay.len())
+    }
+
+    /// The same among the demonstrations.
+    pub fn draw_kept(&mut self, replay: &Replay) -> Option<Window> {
+        self.draw_from(replay, replay.kept)
+    }
+
+    fn draw_from(&mut self, replay: &Replay, slots: usize) -> Option<Window> {
+        if slots == 0 {
             return None;
         }
         (0..TRIES_MAX).find_map(|_| {
-            let slot = self.random.random_range(0..replay.len() as u32) as usize;
+            let slot = self.random.random_range(0..slots as u32) as usize;
             let offset = match self.windows {
                 Windows::Segment => 0,
+                Windows::Sliding if replay.slots[slot].hindsight => 0,
                 Windows::Sliding => {
                     self.random.random_range(0..replay.layout().segment_steps as u32) as usize
                 }
@@ -185,7 +197,7 @@ impl Sampler {
 
 #[cfg(test)]
 mod tests {
-    use dmprl_shared::segment::{SegmentHeader, SegmentLayout, TERMINATED, TRUNCATED};
+    use dmprl_shared::segment::{HINDSIGHT, SegmentHeader, SegmentLayout, TERMINATED, TRUNCATED};
 
     use super::*;
 
@@ -318,6 +330,49 @@ mod tests {
             }
         }
         assert!((0..4).all(|slot| replay.window(slot, 2).is_some_and(|window| window.len() == 3)));
+    }
+
+    /// A copy of steps 3 to 5 of the episode that is under way.
+    fn copy(replay: &mut Replay, episode_step: u32) {
+        let header = SegmentHeader {
+            flags: HINDSIGHT,
+            steps_len: 3,
+            episode_step,
+            ..SegmentHeader::default()
+        };
+        replay.insert(&header, &vec![0.5; LAYOUT.block_len()]);
+    }
+
+    #[test]
+    fn a_copy_with_another_goal_continues_nothing_and_nothing_continues_it() {
+        let mut replay = Replay::new(LAYOUT, 300, 1, 1);
+        let block = vec![0.0; LAYOUT.block_len()];
+        for start in [0, 3, 6] {
+            let header =
+                SegmentHeader { episode_step: start, steps_len: 3, ..SegmentHeader::default() };
+            replay.insert(&header, &block);
+            // Where the next segment of the episode is expected.
+            copy(&mut replay, start + 3);
+        }
+        for (slot, real) in [true, false, true, false].into_iter().enumerate() {
+            assert!(replay.window(slot, 0).is_some_and(|window| window.len() == 3));
+            assert_eq!(replay.window(slot, 1).is_some(), real, "slot {slot}");
+            if let Some(window) = replay.window(slot, 1) {
+                assert_eq!(window.next, slot as u32 + 2, "the segment, not the copy between");
+            }
+        }
+    }
+
+    #[test]
+    fn a_copy_is_drawn_as_often_as_all_windows_of_a_segment() {
+        let mut replay = Replay::new(LAYOUT, 300, 1, 1);
+        episode(&mut replay, 0, 6, TERMINATED); // two segments, six windows
+        copy(&mut replay, 0);
+        let random = dmprl_shared::seeds::stream(1, "test", 0);
+        let mut sampler = Sampler::new(Windows::Sliding, random);
+        let drawn = (0..9_000).filter(|_| sampler.draw(&replay).unwrap().slot == 2).count();
+        // Binomial(9000, 1/3): standard deviation 45; five of them.
+        assert!(drawn.abs_diff(3_000) < 225, "{drawn}");
     }
 
     #[test]

@@ -22,6 +22,8 @@ pub struct ExperimentConfig {
     pub exploration: ExplorationConfig,
     /// Storage of experience.
     pub replay: ReplayConfig,
+    /// Experience of somebody else's.
+    pub demonstrations: DemonstrationsConfig,
     /// Updates per inserted segment.
     pub pacing: PacingConfig,
     /// The rollout workers.
@@ -92,17 +94,57 @@ impl Default for TaskConfig {
     }
 }
 
+/// Which goals an episode is repeated with.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Hindsight {
+    /// None but the one it had.
+    None,
+    /// Goals reached later in it (Andrychowicz et al. 2017, section 4.5).
+    Future,
+}
+
 /// Storage of experience.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct ReplayConfig {
-    /// Environment steps held; the oldest are replaced.
+    /// Environment steps held, copies included; the oldest are replaced.
     pub capacity_steps: usize,
+    /// Which goals the workers repeat their segments with, in goal-conditioned environments.
+    pub hindsight: Hindsight,
+    /// Copies of each segment, each with a goal of its own.
+    pub hindsight_copies: usize,
 }
 
 impl Default for ReplayConfig {
     fn default() -> Self {
-        Self { capacity_steps: 1_000_000 }
+        Self { capacity_steps: 1_000_000, hindsight: Hindsight::None, hindsight_copies: 4 }
+    }
+}
+
+/// Experience that somebody recorded, from which a run starts.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct DemonstrationsConfig {
+    /// Files of steps (docs/demonstrations.md).
+    pub files: Vec<String>,
+    /// Updates in which the actor imitates them, before anything else; 0: it does not.
+    pub cloning_updates: u64,
+    /// Environment steps after the warm-up over which imitation beside each update fades.
+    pub imitation_steps: u64,
+}
+
+impl Default for DemonstrationsConfig {
+    fn default() -> Self {
+        Self { files: Vec::new(), cloning_updates: 1_000, imitation_steps: 30_000 }
+    }
+}
+
+impl DemonstrationsConfig {
+    /// Whether the run starts with a policy that imitates.
+    #[must_use]
+    pub fn are_cloned(&self) -> bool {
+        !self.files.is_empty() && self.cloning_updates > 0
     }
 }
 

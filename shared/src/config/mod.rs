@@ -22,8 +22,9 @@ pub use dmp::{
     PolicyConfig, PolicyKind, RhoKind, Start, StartSource, StartVelocity,
 };
 pub use experiment::{
-    ActorsConfig, CheckpointConfig, Device, EvaluationConfig, ExperimentConfig, LearnerConfig,
-    MetricsConfig, PacingConfig, Precision, ReplayConfig, RunConfig, TaskConfig,
+    ActorsConfig, CheckpointConfig, DemonstrationsConfig, Device, EvaluationConfig,
+    ExperimentConfig, Hindsight, LearnerConfig, MetricsConfig, PacingConfig, Precision,
+    ReplayConfig, RunConfig, TaskConfig,
 };
 pub use layers::{ConfigError, Layers, nearest};
 pub use presets::{PRESETS, Preset, algorithm_defaults, policy_defaults};

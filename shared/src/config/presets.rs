@@ -81,6 +81,8 @@ warm_up_kind = "uniform"
 warm_up_range = 1.0
 [replay]
 capacity_steps = 1000000
+hindsight = "none"
+hindsight_copies = 4
 [pacing]
 updates_per_segment = 1.0
 tolerance_segments = 1

@@ -17,6 +17,7 @@ const WORKERS_MAX: usize = 1_024;
 const ENVS_PER_WORKER_MAX: usize = 4_096;
 /// A slot of the replay counts its steps in a byte.
 const SEGMENT_STEPS_MAX: usize = 255;
+const HINDSIGHT_COPIES_MAX: usize = 64;
 const HIDDEN_MAX: usize = 65_536;
 /// 50 environment steps of each environment at K = 5, as published.
 const ROLLOUT_SEGMENTS_PER_ENV: usize = 10;
@@ -58,6 +59,7 @@ impl ExperimentConfig {
             ("dmp.integration_steps", self.dmp.integration_steps, 1, 100_000),
             ("algorithm.batch_size", self.algorithm.batch_size, 1, 1 << 20),
             ("replay.capacity_steps", self.replay.capacity_steps, 1_000, 1 << 31),
+            ("replay.hindsight_copies", self.replay.hindsight_copies, 1, HINDSIGHT_COPIES_MAX),
             ("learner.threads", self.learner.threads, 1, 1_024),
             ("evaluation.episodes", self.evaluation.episodes, 1, 1_000_000),
             ("checkpoint.keep", self.checkpoint.keep, 1, 10_000),
@@ -180,6 +182,12 @@ impl ExperimentConfig {
              defined during the warm-up"
                 .into()
         })?;
+        let demonstrated = !self.demonstrations.files.is_empty();
+        range("policy.start", "carry", !(carry && demonstrated), || {
+            "demonstrations hold no state of a movement primitive to carry on; choose \"zero\" or \
+             \"observed\""
+                .into()
+        })?;
         let observed = dmp && self.policy.start == Start::Observed;
         let sources = self.task.start_sources.len();
         range("policy.start", "observed", !observed || sources > 0, || {
@@ -226,6 +234,14 @@ impl ExperimentConfig {
         let on_cpu = self.learner.device == super::Device::Cpu;
         range("learner.device", "cuda", !on_policy || on_cpu, || {
             "cpu with algorithm.name = \"ndp\", whose minibatches are too small for a GPU".into()
+        })?;
+        let relabels = self.replay.hindsight != super::Hindsight::None;
+        range("replay.hindsight", "future", !on_policy || !relabels, || {
+            "none with algorithm.name = \"ndp\", which has no replay".into()
+        })?;
+        let demonstrated = !self.demonstrations.files.is_empty();
+        range("demonstrations.files", "files", !on_policy || !demonstrated, || {
+            "none with algorithm.name = \"ndp\", which has no replay".into()
         })?;
         let layer_norm = self.algorithm.critic_layer_norm;
         range("algorithm.critic_layer_norm", "true", !on_policy || !layer_norm, || {

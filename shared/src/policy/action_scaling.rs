@@ -30,6 +30,16 @@ impl ActionScaling {
             }
         }
     }
+
+    /// The u, (rows, A), that leads to `actions`, (rows, A) within their bounds.
+    pub fn invert(&self, actions: &[f64], u: &mut [f32]) {
+        let dims = self.mid.len();
+        for (row, out) in actions.chunks_exact(dims).zip(u.chunks_exact_mut(dims)) {
+            for (d, (action, u)) in row.iter().zip(out).enumerate() {
+                *u = (((action - self.mid[d]) / self.half_range[d]) as f32).clamp(-1.0, 1.0);
+            }
+        }
+    }
 }
 
 #[cfg(test)]
@@ -52,5 +62,8 @@ mod tests {
         let u = [-1.0, -1.0, 0.0, 0.0, 1.0, 1.0, -7.0, 1.5];
         ActionScaling::new(&spec).apply(&u, &mut actions);
         assert_eq!(actions, [-15.0, 0.0, 0.0, 2.0, 15.0, 4.0, -15.0, 4.0]);
+        let mut inverse = [0.0; 6];
+        ActionScaling::new(&spec).invert(&actions[..6], &mut inverse);
+        assert_eq!(inverse, u[..6]);
     }
 }

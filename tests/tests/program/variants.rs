@@ -110,3 +110,39 @@ fn a_segment_env_of_ones_own_trains() {
     let folder = tiny_envs_dir();
     trains("tiny_envs:Timed", &["--python-path", folder.to_str().unwrap()]);
 }
+
+#[test]
+fn a_goal_trains_with_hindsight_in_several_processes_and_in_one() {
+    let path = tiny_envs_dir();
+    let hindsight = ["--set", "replay.hindsight=future", "--python-path", path.to_str().unwrap()];
+    for more in [&[][..], &["--deterministic"]] {
+        let place = Workplace::new();
+        let run = place.path("run");
+        let more = [&["--steps", "1200"], &hindsight[..], more].concat();
+        place.run(&train("tiny_envs:Reach-v0", &run, &more)).with_status(0);
+        let last = rows(&run, "metrics.jsonl").pop().unwrap();
+        let count = |key: &str| last[key].as_u64().unwrap();
+        // Episodes of twelve steps are three segments with four copies each.
+        assert!(count("hindsight_segments") >= 12 * (1200 / 12 - 16), "{last}");
+        assert!(count("env_steps") <= 1300 && count("segments") <= 400, "{last}");
+        assert_eq!((count("lost"), last["rejected"]["duplicate"].as_u64()), (0, Some(0)));
+        assert!(last["rejected"].as_object().unwrap().values().all(|count| count == 0), "{last}");
+        place.assert_no_process();
+    }
+}
+
+#[test]
+fn hindsight_is_recommended_for_a_sparse_goal_and_refused_where_there_is_none() {
+    let path = tiny_envs_dir();
+    let path = ["--steps", "300", "--python-path", path.to_str().unwrap()];
+    for (task, recommended) in [("tiny_envs:Reach-v0", true), ("tiny_envs:ReachFar-v0", false)] {
+        let place = Workplace::new();
+        let end = place.run(&train(task, &place.path("run"), &path)).with_status(0);
+        assert_eq!(end.said.contains("replay.hindsight=future"), recommended, "{task}");
+    }
+    let place = Workplace::new();
+    let more = [&path[..], &["--set", "replay.hindsight=future"]].concat();
+    let end = place.run(&train("tiny_envs:Long-v0", &place.path("run"), &more)).with_status(1);
+    assert!(end.said.contains("its observation is no Dict"), "{}", end.said);
+    place.assert_no_process();
+}

@@ -1,0 +1,147 @@
+//! Goals in an observation, and what steps with other goals would have been rewarded with.
+
+use std::sync::Arc;
+
+use pyo3::prelude::*;
+
+use super::{PythonEnvironments, PythonError, buffer::SharedBuffer, environments::Call};
+use crate::watchdog::{CallKind, CallState};
+
+/// Where an observation holds the goal that was reached, and the one that is wanted.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Goals {
+    /// First entry of the one,
+    pub achieved: usize,
+    /// and of the other.
+    pub desired: usize,
+    /// Entries G of each.
+    pub len: usize,
+    /// Whether the reward says no more than reached or not.
+    pub is_sparse: bool,
+}
+
+/// Asks the environments about up to M steps in one call. The slices are shared with Python.
+pub struct Relabelling {
+    task_id: String,
+    relabel: Call,
+    calls: Arc<CallState>,
+    goal_len: usize,
+    count: SharedBuffer<u64>,
+    achieved: SharedBuffer<f64>,
+    desired: SharedBuffer<f64>,
+    rewards: SharedBuffer<f64>,
+    terminated: SharedBuffer<u8>,
+}
+
+impl PythonEnvironments {
+    /// Where the goals stand in an observation.
+    ///
+    /// # Errors
+    /// `NoGoals` with the reason if there are none, or nobody knows what they reward.
+    pub fn goals(&self) -> Result<Goals, PythonError> {
+        let goals = Python::attach(|py| {
+            let goals = self.env.bind(py).call_method0("goals");
+            goals.and_then(|dict| read_goals(&dict)).map_err(|error| {
+                match PythonError::exception(py, &error) {
+                    PythonError::Exception { kind, message, .. }
+                        if kind == "NotGoalConditionedError" =>
+                    {
+                        PythonError::NoGoals { reason: message }
+                    }
+                    other => other,
+                }
+            })
+        })?;
+        let (spec, Goals { achieved, desired, len, .. }) = (self.spec(), goals);
+        let fits =
+            |first: usize| first.checked_add(len).is_some_and(|end| end <= spec.observation_len);
+        if len > 0 && fits(achieved) && fits(desired) {
+            return Ok(goals);
+        }
+        Err(PythonError::Interface {
+            task_id: spec.id.clone(),
+            name: "goals",
+            reason: format!("{goals:?} in observations of {} entries", spec.observation_len),
+        })
+    }
+
+    /// What is needed to ask about `rows_max` steps at once, with goals of `goal_len` entries.
+    ///
+    /// # Errors
+    /// `Interface` or `Length` when the installed package does not fit.
+    pub fn relabelling(
+        &self,
+        rows_max: usize,
+        goal_len: usize,
+    ) -> Result<Relabelling, PythonError> {
+        let id = self.spec().id.as_str();
+        Python::attach(|py| {
+            let exception = |error: PyErr| PythonError::exception(py, &error);
+            let rows = py
+                .import("dmprl.segment_env")
+                .and_then(|module| module.getattr("GoalRows")?.call1((rows_max, goal_len)))
+                .map_err(exception)?;
+            let relabel = Call::new(self.env.bind(py), &rows, "relabel", &[]).map_err(exception)?;
+            Ok(Relabelling {
+                relabel,
+                calls: Arc::clone(self.calls()),
+                goal_len,
+                count: SharedBuffer::new(&rows, "count", 1, id)?,
+                achieved: SharedBuffer::new(&rows, "achieved", rows_max * goal_len, id)?,
+                desired: SharedBuffer::new(&rows, "desired", rows_max * goal_len, id)?,
+                rewards: SharedBuffer::new(&rows, "rewards", rows_max, id)?,
+                terminated: SharedBuffer::new(&rows, "terminated", rows_max, id)?,
+                task_id: id.to_owned(),
+            })
+        })
+    }
+}
+
+impl Relabelling {
+    /// Sets row `row`: the goal that the step reached, (G,), and the one wanted of it, (G,).
+    ///
+    /// # Panics
+    /// If the row is beyond M.
+    pub fn set(&mut self, row: usize, achieved: &[f64], desired: &[f64]) {
+        let entries = row * self.goal_len..(row + 1) * self.goal_len;
+        self.achieved.get_mut()[entries.clone()].copy_from_slice(achieved);
+        self.desired.get_mut()[entries].copy_from_slice(desired);
+    }
+
+    /// Asks about the first `rows` rows.
+    ///
+    /// # Errors
+    /// `Exception` from the environment; `GoalRewardNotFinite`.
+    pub fn run(&mut self, rows: usize) -> Result<(), PythonError> {
+        self.count.get_mut()[0] = rows as u64;
+        let call = self.calls.enter(CallKind::Relabel);
+        self.relabel.run()?;
+        drop(call);
+        let rewards = &self.rewards.get()[..rows];
+        match rewards.iter().find(|reward| !(**reward as f32).is_finite()) {
+            Some(&value) => {
+                Err(PythonError::GoalRewardNotFinite { task_id: self.task_id.clone(), value })
+            }
+            None => Ok(()),
+        }
+    }
+
+    /// (M,): the rewards.
+    pub fn rewards(&self) -> &[f64] {
+        self.rewards.get()
+    }
+
+    /// (M,): not 0 where the step would have ended its episode.
+    pub fn terminated(&self) -> &[u8] {
+        self.terminated.get()
+    }
+}
+
+fn read_goals(dict: &Bound<'_, PyAny>) -> PyResult<Goals> {
+    Ok(Goals {
+        achieved: dict.get_item("achieved")?.extract()?,
+        desired: dict.get_item("desired")?.extract()?,
+        len: dict.get_item("length")?.extract()?,
+        is_sparse: dict.get_item("sparse")?.extract()?,
+    })
+}

@@ -1,0 +1,124 @@
+"""Goals in the observations of a Gymnasium environment, and rewards for goals it was not given.
+
+Hindsight (Andrychowicz et al. 2017) repeats what happened as if another goal had been wanted. What
+that would have been rewarded with only the environment knows: ``compute_reward``, the method that
+Gymnasium-Robotics and panda-gym brought into use.
+"""
+
+from __future__ import annotations
+
+import copy
+import sys
+from typing import Any
+
+import gymnasium
+import numpy as np
+from gymnasium import spaces
+from numpy.typing import NDArray
+
+from dmprl.segment_env import GoalRows, Goals, NotGoalConditionedError
+
+PROBES = 32
+"""Pairs of goals that ``compute_reward`` is tried with before it is relied on."""
+
+
+class GymnasiumGoals:
+    """The goals of one kind of environment; the environment itself may be made again meanwhile.
+
+    - ``env``: with its ``Dict`` observation or any wrapper around that; ``space``: that ``Dict``.
+
+    Raises:
+        NotGoalConditionedError: the observation has no goals, or their reward cannot be asked for.
+    """
+
+    def __init__(self, task_id: str, env: gymnasium.Env, space: spaces.Space) -> None:
+        self._task_id = task_id
+        achieved, desired = self._spaces(space)
+        length, self._shape = spaces.flatdim(achieved), achieved.shape
+        self._dtypes = achieved.dtype, desired.dtype
+        first = self._first_entries(space)
+        self.goals: Goals = {
+            "achieved": first["achieved_goal"],
+            "desired": first["desired_goal"],
+            "length": length,
+            "sparse": self._is_sparse(env, achieved, desired),
+        }
+
+    def relabel(self, env: gymnasium.Env, rows: GoalRows) -> None:
+        """As :meth:`SegmentEnv.relabel`, by ``env``."""
+        count = int(rows.count[0])
+        achieved, desired = self._shaped(rows.achieved[:count], rows.desired[:count])
+        infos = [{} for _ in range(count)]  # nothing but the goals is known any more
+        rows.rewards[:count] = self._rewards(env, achieved, desired, infos)
+        rows.terminated[:count] = terminated_at(env, achieved, desired)
+
+    def _spaces(self, space: spaces.Space) -> tuple[spaces.Box, spaces.Box]:
+        if not isinstance(space, spaces.Dict):
+            raise self._refused(f"its observation is no Dict but {space}")
+        found = []
+        for name in ("achieved_goal", "desired_goal"):
+            part = space.spaces.get(name)
+            if not isinstance(part, spaces.Box):
+                raise self._refused(f"its observation has no Box named {name}: {space}")
+            found.append(part)
+        if found[0].shape != found[1].shape:
+            raise self._refused(f"its goals have different shapes: {found[0]}, {found[1]}")
+        return found[0], found[1]
+
+    def _first_entries(self, space: spaces.Dict) -> dict[str, int]:
+        """Where each entry of the Dict begins once it is flattened."""
+        first, at = {}, 0
+        for name, part in space.spaces.items():
+            first[name] = at
+            at += spaces.flatdim(part)
+        return first
+
+    def _is_sparse(self, env: gymnasium.Env, achieved: spaces.Box, desired: spaces.Box) -> bool:
+        """Whether goals far and near are rewarded alike, after a look at whether they are at all.
+
+        A distance tells any two pairs apart; a threshold has two answers.
+        """
+        if not env.has_wrapper_attr("compute_reward"):
+            raise self._refused(
+                "it has no method compute_reward(achieved_goal, desired_goal, info)"
+            )
+        drawn = []
+        for seed, space in enumerate((achieved, desired)):
+            space = copy.deepcopy(space)  # its random state is not ours
+            space.seed(seed)
+            drawn.append(np.stack([space.sample() for _ in range(PROBES)]))
+        rewards = self._rewards(env, *drawn, [{} for _ in range(PROBES)])
+        return len(np.unique(rewards)) <= 2
+
+    def _rewards(
+        self, env: gymnasium.Env, achieved: NDArray, desired: NDArray, infos: list[dict]
+    ) -> NDArray:
+        rewards = np.asarray(env.get_wrapper_attr("compute_reward")(achieved, desired, infos))
+        if rewards.shape != (len(achieved),):
+            raise self._refused(
+                f"its compute_reward takes one goal at a time: for goals {achieved.shape} it "
+                f"returned {rewards.shape}, expected {(len(achieved),)}"
+            )
+        return rewards
+
+    def _shaped(self, *rows: NDArray[np.float64]) -> list[NDArray]:
+        typed = zip(rows, self._dtypes, strict=True)
+        return [row.reshape(-1, *self._shape).astype(dtype) for row, dtype in typed]
+
+    def _refused(self, reason: str) -> NotGoalConditionedError:
+        return NotGoalConditionedError(f"{self._task_id}: {reason}")
+
+
+def terminated_at(env: gymnasium.Env, achieved: NDArray, desired: NDArray) -> Any:
+    """Where a step with these goals would have ended its episode.
+
+    ``compute_terminated``, where there is one, is written for one goal at a time. panda-gym has
+    none: its episodes end at success.
+    """
+    if env.has_wrapper_attr("compute_terminated"):
+        ends = env.get_wrapper_attr("compute_terminated")
+        return [bool(ends(*goals, {})) for goals in zip(achieved, desired, strict=True)]
+    panda_gym = sys.modules.get("panda_gym.envs.core")
+    if panda_gym and isinstance(env.unwrapped, panda_gym.RobotTaskEnv):
+        return env.unwrapped.task.is_success(achieved, desired)
+    return 0

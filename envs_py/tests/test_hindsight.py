@@ -1,0 +1,74 @@
+"""Where goals stand, what is asked about them, and who is refused."""
+
+import sys
+import unittest
+from pathlib import Path
+
+import numpy as np
+
+from dmprl.segment_env import GoalRows, NotGoalConditionedError, make
+
+sys.path.append(str(Path(__file__).parent))  # for the tiny environments' module
+
+
+def refusal(task_id):
+    try:
+        make(task_id, 1, 5).goals()
+    except NotGoalConditionedError as error:
+        return str(error)
+    return None
+
+
+class GoalsTest(unittest.TestCase):
+    def test_goals_are_where_the_flattened_observation_has_them(self):
+        goals = make("tiny_envs:Reach-v0", 1, 5).goals()
+        self.assertEqual(goals, {"achieved": 0, "desired": 1, "length": 1, "sparse": True})
+
+    def test_a_reward_that_tells_every_distance_apart_is_not_sparse(self):
+        self.assertFalse(make("tiny_envs:ReachFar-v0", 1, 5).goals()["sparse"])
+
+    def test_who_cannot_be_asked_is_told_why(self):
+        for task_id, reason in [
+            ("tiny_envs:Long-v0", "its observation is no Dict"),
+            ("tiny_envs:Goal-v0", "no Box named achieved_goal"),
+            ("tiny_envs:ReachAlone-v0", "takes one goal at a time"),
+            ("tiny_envs:Batch", "its observation holds no goals"),
+            ("Reacher-v5", "its observation holds no goals"),
+        ]:
+            self.assertIn(reason, refusal(task_id), task_id)
+
+
+class RelabelTest(unittest.TestCase):
+    def rows(self, task_id):
+        env = make(task_id, 2, 5)
+        rows = GoalRows(6, env.goals()["length"])
+        rows.count[0] = 4
+        rows.achieved[:4, 0] = [0.0, 1.0, 2.0, 3.0]
+        rows.desired[:4, 0] = [0.4, 1.6, 2.5, -3.0]
+        rows.rewards[:], rows.terminated[:] = 9.0, 9
+        env.relabel(rows)
+        return rows
+
+    def test_rewards_are_those_of_the_goals_given(self):
+        rows = self.rows("tiny_envs:Reach-v0")
+        self.assertEqual(rows.rewards.tolist(), [0.0, -1.0, 0.0, -1.0, 9.0, 9.0])
+        self.assertEqual(rows.terminated.tolist(), [0, 0, 0, 0, 9, 9])
+
+    def test_an_episode_that_would_have_ended_says_so(self):
+        rows = self.rows("tiny_envs:ReachEnds-v0")
+        self.assertEqual(rows.terminated.tolist(), [1, 0, 1, 0, 9, 9])
+
+    def test_a_goal_keeps_shape_and_type_of_its_space(self):
+        env = make("tiny_envs:Reach-v0", 1, 5)
+        env.goals()
+        seen = []
+        env._envs[0].unwrapped.compute_reward = lambda *given: seen.extend(given) or np.zeros(3)
+        rows = GoalRows(3, 1)
+        rows.count[0] = 3
+        env.relabel(rows)
+        achieved, desired, infos = seen
+        self.assertEqual((achieved.shape, desired.dtype, infos), ((3, 1), np.float64, [{}] * 3))
+
+
+if __name__ == "__main__":
+    unittest.main()
