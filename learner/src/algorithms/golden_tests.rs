@@ -14,10 +14,10 @@ use super::*;
 use crate::learner::tests::spec;
 
 /// Of a tensor's norm, after an update or two and after all.
-const FIRST: f64 = 1e-5;
+pub(super) const FIRST: f64 = 1e-5;
 const LAST: f64 = 1e-4;
 
-fn folder() -> PathBuf {
+pub(super) fn folder() -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("../tests/golden/update")
 }
 
@@ -34,14 +34,16 @@ fn files() -> Vec<PathBuf> {
     files
 }
 
-struct Golden {
+/// A file of one case.
+pub(super) struct Golden {
     name: String,
     about: Value,
-    tensors: BTreeMap<String, Vec<f32>>,
+    /// By their names there; what has been compared is taken out.
+    pub(super) tensors: BTreeMap<String, Vec<f32>>,
 }
 
 impl Golden {
-    fn read(path: &Path) -> Self {
+    pub(super) fn read(path: &Path) -> Self {
         let bytes = std::fs::read(path).unwrap();
         let (_, metadata) = SafeTensors::read_metadata(&bytes).unwrap();
         let about = metadata.metadata().as_ref().unwrap()["about"].clone();
@@ -57,11 +59,11 @@ impl Golden {
         }
     }
 
-    fn updates(&self) -> usize {
+    pub(super) fn updates(&self) -> usize {
         self.about["updates"].as_u64().unwrap() as usize
     }
 
-    fn config(&self) -> ExperimentConfig {
+    pub(super) fn config(&self) -> ExperimentConfig {
         let mut layers = Layers::new();
         for (key, value) in self.about["configuration"].as_object().unwrap() {
             layers.set("golden file", key, value.as_str().unwrap()).unwrap();
@@ -128,14 +130,28 @@ impl Golden {
             let ours = ours(&algorithm, losses, log_temperature, &config);
             self.compare(index + 1, &ours);
         }
+        self.assert_all_compared();
+    }
+
+    /// Nothing that the file holds of updates may be left.
+    pub(super) fn assert_all_compared(&self) {
         let left: Vec<_> = self.tensors.keys().filter(|name| name.starts_with("update_")).collect();
         assert!(left.is_empty(), "{}: nothing was compared with {left:?}", self.name);
     }
 
     /// Compares with what the file has of this update, and takes it out.
-    fn compare(&mut self, update: usize, ours: &BTreeMap<String, Vec<f32>>) {
-        let prefix = format!("update_{update}.");
+    pub(super) fn compare(&mut self, update: usize, ours: &BTreeMap<String, Vec<f32>>) {
         let tolerance = if update == self.updates() { LAST } else { FIRST };
+        self.compare_with(&format!("update_{update}."), ours, tolerance);
+    }
+
+    /// As [`Golden::compare`], with the tensors whose names begin with `prefix`.
+    pub(super) fn compare_with(
+        &mut self,
+        prefix: &str,
+        ours: &BTreeMap<String, Vec<f32>>,
+        tolerance: f64,
+    ) {
         for (name, got) in ours {
             let Some(expected) = self.tensors.remove(&format!("{prefix}{name}")) else { continue };
             assert_close(&format!("{}, {prefix}{name}", self.name), got, &expected, tolerance);

@@ -330,4 +330,6 @@ fn total(blocks: &[Block]) -> Sums {
 }
 
 #[cfg(test)]
+mod golden_tests;
+#[cfg(test)]
 mod tests;

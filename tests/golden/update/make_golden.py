@@ -185,10 +185,10 @@ def make(name, case, seed):
     write(name, tensors, configuration(case), seed)
 
 
-def write(name, tensors, keys, seed):
+def write(name, tensors, keys, seed, script="make_golden.py"):
     """Writes a file with its origin; `keys`: dmprl's configuration of the case."""
     about = dict(
-        script="tests/golden/update/make_golden.py",
+        script=f"tests/golden/update/{script}",
         seed=seed,
         versions=dict(python=platform.python_version(), torch=version("torch")),
         configuration=keys,

@@ -136,7 +136,7 @@ def main():
     precise = in_double(ndp)
     result = run(ndp)
     check_conditioning("ndp", result, run(precise))
-    write("ndp", result, keys(), SEED)
+    write("ndp", result, keys(), SEED, "make_golden_ndp.py")
 
 
 if __name__ == "__main__":

@@ -112,14 +112,14 @@ class Ndp:
         self.policy_adam.zero_grad()
         self.critic_adam.zero_grad()
         (policy_loss - ENTROPY_COEFFICIENT * entropy + value_loss).backward()
-        self.gradients = {
-            name: [values.grad.clone() for values in parameters]
-            for name, parameters in self.parameters.items()
-        }
         # Each with a norm of its own.
         self.norms = [
             clip_grad_norm_(self.policy_parameters, GRADIENT_NORM_MAX),
             clip_grad_norm_(self.critic.parameters(), GRADIENT_NORM_MAX),
         ]
+        self.gradients = {
+            name: [values.grad.clone() for values in parameters]
+            for name, parameters in self.parameters.items()
+        }
         self.policy_adam.step()
         self.critic_adam.step()

@@ -199,6 +199,7 @@ pub(super) mod tests {
             notes: Vec::new(),
             peak_memory_bytes: Some(50_000_000),
         };
+        figures.note("torch", "PyTorch, eager");
         figures.note("jax", "is not installed");
         // A machine that becomes twice and four times as slow in the middle of it.
         for slow in [1.0, 4.0, 2.0] {
