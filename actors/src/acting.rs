@@ -1,6 +1,6 @@
 //! A policy acting on a set of environments: what rollout and evaluation have in common.
 
-use dmprl_shared::policy::{Head, Policy, PolicyWorkspace, SmallBatchNetwork};
+use dmprl_shared::policy::{Head, LearnedStd, Policy, PolicyWorkspace, SmallBatchNetwork};
 
 use crate::python_env::PythonEnvironments;
 
@@ -14,8 +14,11 @@ pub struct Acting {
     pub work: PolicyWorkspace,
     /// What the policy sees now, (E, O).
     pub observations: Vec<f32>,
-    /// u of the segment, (E, K, A), exploration included.
+    /// u of the segment, (E, K, A), exploration included; beyond [-1, 1] only as drawn from a
+    /// policy's own Gaussian.
     pub u: Vec<f32>,
+    /// Standard deviations of the policy's own Gaussian, (A,); empty if it has none.
+    pub std: Vec<f32>,
     /// (y, yd) that each environment's DMP continues from, (E, 2A); empty if not carried.
     carried: Vec<f32>,
     /// The segment's actions in the environments' units, (E, K, A).
@@ -34,6 +37,7 @@ impl Acting {
             work: policy.workspace(envs),
             observations: vec![0.0; envs * layout.observation_len],
             u: vec![0.0; actions_len],
+            std: vec![0.0; policy.learned_std().map_or(0, LearnedStd::len)],
             carried: vec![0.0; envs * carried_len],
             actions: vec![0.0; actions_len],
             policy,
@@ -54,9 +58,14 @@ impl Acting {
         }
     }
 
-    /// Takes over the network's parameters.
+    /// Takes over the policy's parameters.
     pub fn take_policy(&mut self, parameters: &[f32]) {
-        self.network.load(parameters);
+        self.network.load(&parameters[..self.policy.shape().parameters_len()]);
+        if let Some(gaussian) = self.policy.learned_std() {
+            for (std, log_std) in self.std.iter_mut().zip(gaussian.log_std(parameters)) {
+                *std = log_std.exp();
+            }
+        }
     }
 
     /// Runs the network; the outputs lie in `work.activations`.
@@ -67,7 +76,14 @@ impl Acting {
     /// From the network's outputs to `u`, without exploration.
     pub fn decode(&mut self) {
         self.policy.decode(&self.observations, &mut self.work);
-        self.u.copy_from_slice(&self.work.actions);
+        self.take_u();
+    }
+
+    /// The mean of a Gaussian may lie out of bounds; it is what the environment gets of it.
+    fn take_u(&mut self) {
+        for (u, action) in self.u.iter_mut().zip(&self.work.actions) {
+            *u = action.clamp(-1.0, 1.0);
+        }
     }
 
     /// From squashed DMP parameters that `draw` fills, (A (1+N+4)) a row, to `u`.
@@ -76,8 +92,8 @@ impl Acting {
             let rows = self.observations.len() / self.policy.layout().observation_len;
             (0..rows).for_each(|row| draw(head.squashed_mut(dmp, row)));
             head.segment(&self.observations, dmp, &mut self.work.means);
-            self.work.squash_means(self.u.len());
-            self.u.copy_from_slice(&self.work.actions);
+            self.policy.bound_means(&mut self.work, self.u.len());
+            self.take_u();
         }
     }
 

@@ -51,8 +51,14 @@ impl Exploration {
 
     /// Turns the network's outputs into `u` with noise, within [-1, 1].
     ///
-    /// A Gaussian policy draws from itself; kind and std of the noise then mean nothing.
+    /// A Gaussian policy draws from itself; kind and std of the noise then mean nothing. One with
+    /// standard deviations of its own is not bounded by a tanh, and its draws not by [-1, 1].
     pub fn explore(&mut self, acting: &mut Acting) {
+        if !acting.std.is_empty() {
+            acting.decode();
+            self.draw_unbounded(acting);
+            return;
+        }
         if let Some(columns) = acting.policy.log_stds() {
             acting.decode();
             self.draw(acting, columns);
@@ -76,6 +82,17 @@ impl Exploration {
                     let u = &mut u[step * dims + d];
                     *u = (*u + std * noise).clamp(-1.0, 1.0);
                 }
+            }
+        }
+    }
+
+    /// u = mean + std noise, std the policy's own.
+    fn draw_unbounded(&mut self, acting: &mut Acting) {
+        let Acting { u, std, work, .. } = acting;
+        let means = work.actions.chunks_exact(std.len());
+        for (u, mean) in u.chunks_exact_mut(std.len()).zip(means) {
+            for ((u, mean), std) in u.iter_mut().zip(mean).zip(std.iter()) {
+                *u = mean + std * normal(&mut self.random);
             }
         }
     }

@@ -153,8 +153,17 @@ fn the_table_of_train_flags_is_complete() {
 
 #[test]
 fn every_flag_that_is_shown_exists() {
-    let commands =
-        ["train", "resume", "eval", "bench rollout", "tasks", "learner", "actor", "evaluator"];
+    let commands = [
+        "train",
+        "resume",
+        "eval",
+        "bench rollout",
+        "bench learner",
+        "tasks",
+        "learner",
+        "actor",
+        "evaluator",
+    ];
     let words = |command: &str| -> BTreeSet<String> {
         flags(&help(&command.split(' ').collect::<Vec<_>>()))
     };
@@ -234,6 +243,11 @@ fn the_keys_of_both_kinds_of_lines_are_documented() {
         policy_lag_max: None,
         updates_owed: 0.0,
         lost: 0,
+        stale_segments: 0,
+        policy_loss: None,
+        value_loss: None,
+        approx_kl: None,
+        clip_fraction: None,
         env_failures: 0,
         wall_s: 0.0,
         env_steps_per_s: 0.0,

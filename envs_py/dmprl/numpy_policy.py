@@ -41,7 +41,10 @@ class NumpyPolicy:
         self.carried = self._observations[:, env_len:]
 
     def u(self, observations: NDArray, noise: Noise | None = None) -> Floats:
-        """Actions in [-1, 1], (E, K, A), for the environments' observations, (E, O)."""
+        """Actions u, (E, K, A), for the environments' observations, (E, O).
+
+        In [-1, 1] but for the mean and the draws of a policy's own Gaussian.
+        """
         self._seen[:] = observations
         x = self._observations
         for (weights, bias), out in zip(self._layers, self._activations, strict=True):
@@ -57,8 +60,8 @@ class NumpyPolicy:
         return u
 
     def scaled(self, u: Floats) -> NDArray[np.float64]:
-        """``u`` in the environment's units."""
-        return self._mid + self._half_range * u
+        """``u``, clipped, in the environment's units."""
+        return self._mid + self._half_range * np.clip(u, -1.0, 1.0)
 
     def carry_on(self, ended: NDArray[np.bool_]) -> None:
         """Lets each DMP continue from its segment's end, or from rest where an episode ended."""
@@ -95,6 +98,8 @@ class DmpHead:
         self._map = np.ascontiguousarray(segment_map.T)
         self._goal_scaling = dmp["forcing_scaling"] == "goal"
         self._goal_range = np.float32(policy["goal_range"])
+        self._inverse = policy["controller"] == "inverse"
+        self._position_scale = np.float32(policy["position_scale"])
         self._bounded = policy["rho"] == "bounded"
         self._rho_range = np.float32(policy["rho_range"] if self._bounded else 1.0)
         self._omega = np.float32(dmp["alpha_y"] / 2.0)
@@ -110,9 +115,8 @@ class DmpHead:
     def u(self, outputs: Floats, observations: Floats) -> Floats:
         """The segments' actions, (E, K, A)."""
         n, inputs = self._basis_count, self._inputs
-        raw = outputs.reshape(*self._shape, 1 + n + 4)
+        raw = outputs.reshape(*self._shape, 1 + n + (4 if self._inverse else 0))
         squashed = np.tanh(raw)
-        rho = (squashed if self._bounded else raw)[..., 1 + n :] * self._rho_range + RHO_CENTRE
         self._read_start(observations)
         np.multiply(squashed[..., 0], self._goal_range, out=inputs[..., 2])
         inputs[..., 3:] = squashed[..., 1 : 1 + n]
@@ -120,7 +124,13 @@ class DmpHead:
             inputs[..., 3:] *= (inputs[..., 2] - inputs[..., 0])[..., None]
         samples = np.matmul(inputs, self._map, out=self._samples)
         y, yd, ydd = np.split(samples, 3, axis=-1)
-        u = np.tanh(rho[..., 0:1] * y + rho[..., 1:2] * yd + rho[..., 2:3] * ydd + rho[..., 3:4])
+        if self._inverse:
+            rho = (squashed if self._bounded else raw)[..., 1 + n :] * self._rho_range + RHO_CENTRE
+            u = np.tanh(
+                rho[..., 0:1] * y + rho[..., 1:2] * yd + rho[..., 2:3] * ydd + rho[..., 3:4]
+            )
+        else:
+            u = self._position_scale * np.diff(y, axis=-1, prepend=inputs[..., :1])
         return np.ascontiguousarray(u.transpose(0, 2, 1))
 
     def end_state(self) -> Floats:
@@ -154,6 +164,7 @@ class Noise:
         exploration = plan["exploration"]
         self._kind: str = exploration["kind"]
         self._std = np.float32(exploration["std"])
+        self._gaussian = np.array(plan["gaussian_std"], np.float32)
         self._random = np.random.default_rng(seed)
         shape = (plan["env_count"], plan["spec"]["action_len"], OCTAVES)
         self._sources = np.zeros(shape, np.float32)
@@ -162,11 +173,14 @@ class Noise:
 
     def disturb_outputs(self, outputs: Floats) -> None:
         """Noise on the DMP's parameters, before they are bounded."""
-        if self._kind == "dmp_parameters":
+        if self._gaussian.size == 0 and self._kind == "dmp_parameters":
             outputs += self._std * self._normal(outputs.shape)
 
     def disturb_u(self, u: Floats) -> None:
-        """Noise on actions, (E, K, A), which stay in [-1, 1]."""
+        """Noise on actions, (E, K, A), which stay in [-1, 1]; or the policy's own Gaussian."""
+        if self._gaussian.size > 0:
+            u += self._gaussian * self._normal(u.shape)
+            return
         if self._kind == "dmp_parameters":
             return
         if self._kind == "gaussian":

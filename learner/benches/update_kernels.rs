@@ -72,11 +72,12 @@ fn peak() -> Candidate {
     })
 }
 
-fn config(threads: &str, precision: &str) -> (ExperimentConfig, EnvSpec) {
+fn config(threads: &str, precision: &str, norm: &str) -> (ExperimentConfig, EnvSpec) {
     let mut layers = Layers::new();
     let keys = [
         ("learner.threads", threads),
         ("learner.precision", precision),
+        ("algorithm.critic_layer_norm", norm),
         ("algorithm.batch_size", "256"),
         ("policy.hidden", "[256, 256]"),
         ("algorithm.critic_hidden", "[256, 256]"),
@@ -97,8 +98,8 @@ fn config(threads: &str, precision: &str) -> (ExperimentConfig, EnvSpec) {
     (layers.finish().expect("a valid configuration"), spec)
 }
 
-fn update(threads: &str, precision: &str) -> impl FnMut() + 'static {
-    let (config, spec) = config(threads, precision);
+fn update(threads: &str, precision: &str, norm: &str) -> impl FnMut() + 'static {
+    let (config, spec) = config(threads, precision, norm);
     let policy = Policy::new(&config, &spec).expect("a policy");
     let mut algorithm = Algorithm::new(&config, &policy).expect("an algorithm");
     let mut batch = Batch::new(algorithm.batch_shape());
@@ -166,8 +167,12 @@ fn main() {
     for (precision, threads) in precisions.into_iter().flat_map(|it| [(it, "1"), (it, "2")]) {
         let operations = all.iter().map(|product| product.operations()).sum();
         let name = format!("update, {precision}, {threads}");
-        let update = candidate(&name, operations, update(threads, precision));
-        candidates.push(Candidate { alone: threads == "1", ..update });
+        let plain = candidate(&name, operations, update(threads, precision, "false"));
+        candidates.push(Candidate { alone: threads == "1", ..plain });
+        if threads == "1" {
+            let name = format!("update, {precision}, 1, layer norm");
+            candidates.push(candidate(&name, operations, update("1", precision, "true")));
+        }
     }
     let only = argument("--only").unwrap_or_default();
     candidates.retain(|candidate| candidate.name.contains(&only));

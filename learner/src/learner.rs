@@ -2,22 +2,26 @@
 //!
 //! No clock, no file and no transport here: the loop around it (`session`) brings those.
 
-use dmprl_shared::config::ExperimentConfig;
+use dmprl_shared::config::{AlgorithmName, ExperimentConfig};
 use dmprl_shared::parameters::ParameterSnapshot;
 use dmprl_shared::policy::{Head, Policy, PolicyError};
 use dmprl_shared::seeds;
-use dmprl_shared::segment::{Expected, HINDSIGHT, Rejection, Segment, SegmentHeader, check};
+use dmprl_shared::segment::{
+    Expected, HINDSIGHT, Rejection, Segment, SegmentHeader, SegmentLayout, check,
+};
 use dmprl_shared::spec::EnvSpec;
 use serde::{Deserialize, Serialize};
 use thiserror::Error;
 
 use crate::algorithms::cloning::Cloning;
+use crate::algorithms::ndp::{Ndp, Scene};
 use crate::algorithms::{Algorithm, Batch, Losses, NoWindow};
 use crate::demonstrations::{DemonstrationError, Steps};
 use crate::metrics::{Collector, MetricsLine, Rejected};
 use crate::normaliser::Normaliser;
 use crate::pacing::Pacing;
 use crate::replay::{Replay, Sampler};
+use crate::rollout_buffer::RolloutBuffer;
 use crate::update::trained::Trained;
 
 /// Why the learner stopped.
@@ -69,6 +73,10 @@ pub struct Counters {
     pub rejected: Rejected,
     /// Segments missing in the workers' sequences.
     pub lost: u64,
+    /// Segments that an on-policy algorithm did not learn from, since another policy had made
+    /// them. Checkpoints of older versions have none.
+    #[serde(default)]
+    pub stale_segments: u64,
     /// Failures of environments, as workers and evaluator reported them: counted elsewhere, kept
     /// here for the run's later sessions. Checkpoints of older versions have none.
     #[serde(default)]
@@ -123,10 +131,11 @@ impl Learner {
                 run_id,
                 architecture_hash: policy.architecture_hash(),
                 layout,
+                action_bounds: policy.action_bounds(),
                 worker_count: workers as u32,
                 env_count: envs as u32,
             },
-            replay: Replay::new(layout, config.replay.capacity_steps, workers, envs),
+            replay: Replay::new(layout, replay_steps(&config, layout), workers, envs),
             sampler: Sampler::new(config.algorithm.windows, random),
             normaliser: config.policy.normalise_observations.then(|| {
                 // Nothing is learned before; afterwards they are taken anew at each doubling.
@@ -138,7 +147,7 @@ impl Learner {
             collector: Collector::new(layout, workers, envs),
             snapshot: ParameterSnapshot {
                 architecture_hash: policy.architecture_hash(),
-                values: vec![0.0; policy.shape().parameters_len()],
+                values: vec![0.0; policy.parameters_len()],
                 ..ParameterSnapshot::default()
             },
             heard: vec![(0, 0); workers],
@@ -177,7 +186,30 @@ impl Learner {
     /// Whether the learner wants a segment now.
     #[must_use]
     pub fn may_take(&self) -> bool {
-        !self.has_all_steps() && self.pacing.may_take()
+        let ready = match self.algorithm.as_on_policy() {
+            Some(ndp) => !ndp.update_due(),
+            None => self.pacing.may_take(),
+        };
+        ready && !self.has_all_steps()
+    }
+
+    /// Whether an update is to be done now.
+    #[must_use]
+    pub fn update_due(&self) -> bool {
+        match self.algorithm.as_on_policy() {
+            Some(ndp) => ndp.update_due(),
+            None => self.pacing.update_due(),
+        }
+    }
+
+    /// Whether the policy is to be published after `updates` updates since the last time.
+    #[must_use]
+    pub fn publish_due(&self, updates: u64) -> bool {
+        match self.algorithm.as_on_policy() {
+            // At the end of its rollout, and at once: until then whatever comes is stale.
+            Some(ndp) => !ndp.update_due(),
+            None => updates >= self.config.learner.publish_every_updates,
+        }
     }
 
     /// Inserts a segment.
@@ -190,7 +222,6 @@ impl Learner {
             self.counters.rejected.count(why);
             return Err(why);
         }
-        self.replay.insert(&segment.header, &segment.block);
         if let Some(normaliser) = &mut self.normaliser {
             let (observations, _, _) = self.expected.layout.split(&segment.block);
             let seen = segment.header.steps_len as usize * normaliser.observation_len();
@@ -198,12 +229,18 @@ impl Learner {
         }
         if segment.header.flags & HINDSIGHT != 0 {
             // Experience, and nothing that an environment or an episode did.
+            self.replay.insert(&segment.header, &segment.block);
             self.counters.hindsight_segments += 1;
             return Ok(());
         }
         self.collector.inserted(segment, self.counters.policy_version);
         self.counters.segments += 1;
         self.counters.env_steps += u64::from(segment.header.steps_len);
+        if let Some((ndp, _)) = self.algorithm.on_policy() {
+            self.counters.stale_segments += u64::from(!ndp.take(segment));
+            return Ok(());
+        }
+        self.replay.insert(&segment.header, &segment.block);
         // While the actor imitates the critic learns from the first step on.
         if !self.is_warming_up() || self.config.demonstrations.are_cloned() {
             self.pacing.inserted();
@@ -237,22 +274,38 @@ impl Learner {
     /// If there is nothing to sample or a loss is not finite.
     pub fn update(&mut self) -> Result<(), LearnerError> {
         self.refresh_normaliser()?;
+        let normaliser = self.normaliser.as_ref();
+        if let Some((ndp, crew)) = self.algorithm.on_policy() {
+            let progress = self.counters.env_steps as f64 / self.config.run.steps as f64;
+            let scene = Scene { policy: &self.policy, crew, normaliser, progress };
+            let losses = ndp.update(scene, self.sampler.random_mut());
+            let named = [("policy_loss", losses.policy_loss), ("value_loss", losses.value_loss)];
+            self.updated(named.map(|(name, value)| (name, Some(value))))?;
+            self.collector.updated_on_policy(losses);
+            return Ok(());
+        }
         let source = (&self.replay, &mut self.sampler);
         let shape = self.algorithm.batch_shape();
-        let normaliser = self.normaliser.as_ref();
         self.batch.sample(shape, &self.config.algorithm, self.omega, normaliser, source)?;
         let losses = self.update_networks()?;
-        for (name, value) in
-            [("critic_loss", Some(losses.critic_loss)), ("actor_loss", losses.actor_loss)]
-        {
+        self.updated([
+            ("critic_loss", Some(losses.critic_loss)),
+            ("actor_loss", losses.actor_loss),
+        ])?;
+        self.pacing.updated();
+        self.collector.updated(losses);
+        Ok(())
+    }
+
+    /// Counts an update whose losses are finite.
+    fn updated(&mut self, losses: [(&'static str, Option<f32>); 2]) -> Result<(), LearnerError> {
+        for (name, value) in losses {
             let Some(value) = value else { continue };
             if !value.is_finite() {
                 return Err(LearnerError::NotFinite { update: self.counters.updates, name, value });
             }
         }
         self.counters.updates += 1;
-        self.pacing.updated();
-        self.collector.updated(losses);
         Ok(())
     }
 
@@ -272,10 +325,14 @@ impl Learner {
     /// One update of which the actor follows 1 - `share`, and `share` of a step of imitation.
     fn update_beside(&mut self, cloning: &mut Cloning, share: f32) -> Result<Losses, LearnerError> {
         let update = self.counters.updates + 1;
-        self.algorithm.read_actor(&mut cloning.parameters)?;
+        self.algorithm.read_policy(&mut cloning.parameters)?;
         let losses = self.algorithm.update(&self.policy, &self.batch, update)?;
         self.algorithm.fetch()?;
-        cloning.follow(&self.algorithm.actor().network, 1.0 - share);
+        let networks = self.algorithm.networks();
+        let actor = networks.iter().find(|(name, _)| *name == "actor").map(|(_, actor)| actor);
+        if let Some(actor) = actor {
+            cloning.follow(&actor.network, 1.0 - share);
+        }
         cloning.sample(self.normaliser.as_ref(), (&self.replay, &mut self.sampler))?;
         cloning.step(&self.policy, share)?;
         self.algorithm.each_network(|name, trained| match name {
@@ -303,7 +360,7 @@ impl Learner {
         if let Some(normaliser) = &mut self.normaliser {
             let change = normaliser.refresh();
             self.algorithm.fetch()?;
-            let sees_observations = |name: &str| name != "log_temperature";
+            let sees_observations = |name: &str| !name.starts_with("log_");
             self.each_network(|name, trained| {
                 if sees_observations(name) { change.apply(trained) } else { Ok(()) }
             })?;
@@ -338,10 +395,12 @@ impl Learner {
         self.counters.policy_version += 1;
         self.snapshot.version = self.counters.policy_version;
         self.snapshot.env_steps = self.counters.env_steps;
-        let values = &mut self.snapshot.values;
-        self.algorithm.read_actor(values)?;
+        self.algorithm.read_policy(&mut self.snapshot.values)?;
         if let Some(normaliser) = &self.normaliser {
-            normaliser.fold(self.policy.shape(), values);
+            normaliser.fold(self.policy.shape(), &mut self.snapshot.values);
+        }
+        if let Some((ndp, _)) = self.algorithm.on_policy() {
+            ndp.published(self.snapshot.version);
         }
         Ok(&self.snapshot)
     }
@@ -357,17 +416,7 @@ impl Learner {
     /// # Errors
     /// If the lengths differ.
     pub fn warm_start(&mut self, parameters: &[f32]) -> Result<(), LearnerError> {
-        self.algorithm.each_network(|name, actor| {
-            if name != "actor" {
-                return Ok(());
-            }
-            actor.network.set(parameters)?;
-            match &mut actor.target {
-                Some(target) => target.set(parameters),
-                None => Ok(()),
-            }
-        })?;
-        Ok(())
+        Ok(self.algorithm.set_policy(parameters)?)
     }
 
     /// Keeps demonstrations in the replay and lets the actor imitate them for as many updates as
@@ -390,7 +439,7 @@ impl Learner {
             self.take_normaliser_anew()?;
         }
         let Some(cloning) = &mut self.cloning else { return Ok(None) };
-        self.algorithm.read_actor(&mut cloning.parameters)?;
+        self.algorithm.read_policy(&mut cloning.parameters)?;
         let tenth = updates.div_ceil(10);
         let (mut first, mut last) = (0.0, 0.0);
         for update in 0..updates {
@@ -407,10 +456,12 @@ impl Learner {
         Ok(Some((first / tenth as f32, last / tenth as f32)))
     }
 
-    /// updates * batch_size / env_steps.
+    /// updates * batch_size / env_steps; on-policy, segments of a minibatch for batch_size.
     #[must_use]
     pub fn samples_per_insert(&self) -> f64 {
-        let samples = self.counters.updates as f64 * self.config.algorithm.batch_size as f64;
+        let minibatch = self.algorithm.as_on_policy().map(Ndp::minibatch);
+        let batch = minibatch.unwrap_or(self.config.algorithm.batch_size);
+        let samples = self.counters.updates as f64 * batch as f64;
         samples / (self.counters.env_steps.max(1) as f64)
     }
 
@@ -418,22 +469,28 @@ impl Learner {
     pub fn metrics_line(&mut self) -> MetricsLine {
         let collected = self.collector.take();
         let counters = self.counters;
+        let rollout = self.algorithm.as_on_policy().map(|ndp| &ndp.rollout);
         MetricsLine {
             env_steps: counters.env_steps,
             updates: counters.updates,
             segments: counters.segments,
             hindsight_segments: counters.hindsight_segments,
             policy_version: counters.policy_version,
-            replay_segments: self.replay.len() as u64,
+            replay_segments: rollout.map_or(self.replay.len(), RolloutBuffer::len) as u64,
             samples_per_insert: self.samples_per_insert(),
             rejected: counters.rejected,
             lost: counters.lost,
+            stale_segments: counters.stale_segments,
             env_failures: counters.env_failures,
             critic_loss: collected.critic_loss,
             actor_loss: collected.actor_loss,
             q_mean: collected.q_mean,
             temperature: collected.temperature,
             entropy: collected.entropy,
+            policy_loss: collected.policy_loss,
+            value_loss: collected.value_loss,
+            approx_kl: collected.approx_kl,
+            clip_fraction: collected.clip_fraction,
             episodes: collected.episodes,
             training_return_mean: collected.return_mean,
             training_success_rate: collected.success_rate,
@@ -444,6 +501,14 @@ impl Learner {
             env_steps_per_s: 0.0,
             updates_per_s: 0.0,
         }
+    }
+}
+
+/// Room of the replay: an on-policy algorithm keeps its own experience and needs none.
+fn replay_steps(config: &ExperimentConfig, layout: SegmentLayout) -> usize {
+    match config.algorithm.name {
+        AlgorithmName::Ndp => layout.segment_steps,
+        _ => config.replay.capacity_steps,
     }
 }
 

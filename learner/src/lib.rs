@@ -14,5 +14,6 @@ pub mod normaliser;
 pub mod pacing;
 pub mod policy_file;
 pub mod replay;
+pub mod rollout_buffer;
 pub mod session;
 pub mod update;

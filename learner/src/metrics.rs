@@ -6,6 +6,7 @@ use dmprl_shared::segment::{
 use serde::{Deserialize, Serialize};
 
 use crate::algorithms::Losses;
+use crate::algorithms::ndp::NdpLosses;
 
 /// One line of `metrics.jsonl`. "Since the last line" is meant where nothing else is said; a mean
 /// over nothing is null.
@@ -32,6 +33,10 @@ pub struct MetricsLine {
     /// Segments missing in the sequences of the workers that the learner has heard from, over the
     /// whole run.
     pub lost: u64,
+    /// NDP: segments of another policy than the one that was to be learned from, over the whole
+    /// run: environment steps that taught nothing.
+    #[serde(default)]
+    pub stale_segments: u64,
     /// Failures of environments, over the whole run: each cost a segment, or an episode of an
     /// evaluation, and the environment was made again.
     #[serde(default)]
@@ -45,9 +50,21 @@ pub struct MetricsLine {
     /// SAC: mean weight of the entropy.
     #[serde(default)]
     pub temperature: Option<f64>,
-    /// SAC: mean -log pi of the actor's draws [nat].
+    /// SAC: mean -log pi of the actor's draws; NDP: the policy's in one step [nat].
     #[serde(default)]
     pub entropy: Option<f64>,
+    /// NDP: mean -min(ratio advantage, clipped ratio advantage).
+    #[serde(default)]
+    pub policy_loss: Option<f64>,
+    /// NDP: mean (V - return)^2.
+    #[serde(default)]
+    pub value_loss: Option<f64>,
+    /// NDP: mean (ratio - 1) - log ratio, a divergence from the policy that acted.
+    #[serde(default)]
+    pub approx_kl: Option<f64>,
+    /// NDP: share of steps whose ratio lies beyond the clip.
+    #[serde(default)]
+    pub clip_fraction: Option<f64>,
     /// Training episodes (with exploration) that ended.
     pub episodes: u64,
     /// Mean of their returns.
@@ -172,6 +189,10 @@ struct Sums {
     q_mean: Mean,
     temperature: Mean,
     entropy: Mean,
+    policy_loss: Mean,
+    value_loss: Mean,
+    approx_kl: Mean,
+    clip_fraction: Mean,
     episodes: u64,
     returns: f64,
     /// Ended episodes that said whether they succeeded, and those that did.
@@ -191,8 +212,16 @@ pub struct Collected {
     pub q_mean: Option<f64>,
     /// Mean weight of the entropy.
     pub temperature: Option<f64>,
-    /// Mean -log pi of the actor's draws.
+    /// Mean -log pi of the actor's draws, or entropy of the policy.
     pub entropy: Option<f64>,
+    /// Mean of what an on-policy algorithm's policy descends.
+    pub policy_loss: Option<f64>,
+    /// Mean of what its value descends.
+    pub value_loss: Option<f64>,
+    /// Mean divergence from the policy that acted.
+    pub approx_kl: Option<f64>,
+    /// Share of steps beyond the clip.
+    pub clip_fraction: Option<f64>,
     /// Training episodes that ended.
     pub episodes: u64,
     /// Mean of their returns.
@@ -226,6 +255,15 @@ impl Collector {
         self.window.q_mean.add(losses.q_mean);
         self.window.temperature.add(losses.temperature);
         self.window.entropy.add(losses.entropy);
+    }
+
+    /// Books an update of an on-policy algorithm.
+    pub fn updated_on_policy(&mut self, losses: NdpLosses) {
+        self.window.policy_loss.add(losses.policy_loss);
+        self.window.value_loss.add(losses.value_loss);
+        self.window.entropy.add(losses.entropy);
+        self.window.approx_kl.add(losses.approx_kl);
+        self.window.clip_fraction.add(losses.clip_fraction);
     }
 
     /// Books an inserted segment; `newest` is the newest policy's version.
@@ -274,6 +312,10 @@ impl Collector {
             q_mean: window.q_mean.value(),
             temperature: window.temperature.value(),
             entropy: window.entropy.value(),
+            policy_loss: window.policy_loss.value(),
+            value_loss: window.value_loss.value(),
+            approx_kl: window.approx_kl.value(),
+            clip_fraction: window.clip_fraction.value(),
             episodes: window.episodes,
             return_mean: (window.episodes > 0).then(|| window.returns / episodes),
             success_rate: (window.judged > 0)

@@ -48,6 +48,11 @@ pub enum PolicyFileError {
 
 fn names(policy: &Policy) -> Vec<(String, Vec<usize>, std::ops::Range<usize>)> {
     let layers = policy.shape().layers().iter().enumerate();
+    let network_len = policy.shape().parameters_len();
+    let distribution = policy.learned_std().map(|learned| {
+        let range = network_len..network_len + learned.len();
+        ("actor.log_std".to_owned(), vec![learned.len()], range)
+    });
     layers
         .flat_map(|(index, layer)| {
             [
@@ -59,6 +64,7 @@ fn names(policy: &Policy) -> Vec<(String, Vec<usize>, std::ops::Range<usize>)> {
                 (format!("actor.{index}.bias"), vec![layer.outputs], layer.bias.clone()),
             ]
         })
+        .chain(distribution)
         .collect()
 }
 
@@ -145,7 +151,7 @@ pub fn load(
         text.parse::<u64>().map_err(|_| mismatch(name, "a whole number".into(), text))
     };
     let tensors = SafeTensors::deserialize(&bytes).map_err(format_error)?;
-    let mut values = vec![0.0_f32; policy.shape().parameters_len()];
+    let mut values = vec![0.0_f32; policy.parameters_len()];
     for (name, shape, range) in names(policy) {
         let tensor = tensors.tensor(&name).map_err(format_error)?;
         if tensor.shape() != shape || tensor.dtype() != Dtype::F32 {
@@ -179,6 +185,25 @@ mod tests {
         }
         let config: ExperimentConfig = layers.finish().unwrap();
         Policy::new(&config, &spec()).unwrap()
+    }
+
+    #[test]
+    fn a_stochastic_policy_keeps_its_standard_deviations() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("1.safetensors");
+        let own = policy(&[("algorithm.name", "ndp"), ("algorithm.ndp.initial_log_std", "-0.5")]);
+        let mut random = dmprl_shared::seeds::stream(1, "test", 0);
+        let snapshot = ParameterSnapshot {
+            version: 1,
+            env_steps: 0,
+            architecture_hash: own.architecture_hash(),
+            values: own.initial_parameters(&mut random),
+        };
+        save(&path, &own, &snapshot).unwrap();
+        let read = load(&path, &own, Match::Architecture).unwrap();
+        assert_eq!(read, snapshot);
+        assert_eq!(own.learned_std().unwrap().log_std(&read.values), [-0.5; 2]);
+        assert_eq!(read.values.len(), own.shape().parameters_len() + 2);
     }
 
     #[test]

@@ -115,10 +115,9 @@ impl<R: SegmentReceiver, P: ParameterPublisher> Session<R, P> {
             self.take(due)?;
             return Ok(Turn::Worked);
         }
-        if self.learner.pacing.update_due() {
+        if self.learner.update_due() {
             self.learner.update()?;
-            let every = self.learner.config().learner.publish_every_updates;
-            if self.learner.counters.updates - self.updates_published >= every {
+            if self.learner.publish_due(self.learner.counters.updates - self.updates_published) {
                 self.publish()?;
             }
             return Ok(Turn::Worked);
@@ -313,6 +312,35 @@ mod tests {
         }
         assert!(run.subscriber.newest(&mut snapshot).unwrap());
         assert_eq!((snapshot.version, snapshot.env_steps), (2, 20));
+    }
+
+    #[test]
+    fn a_rollout_is_learned_from_and_published_at_once_and_what_was_in_flight_is_stale() {
+        let mut run = run(&[
+            ("algorithm.name", "ndp"),
+            ("exploration.warm_up_steps", "0"),
+            ("algorithm.ndp.rollout_segments", "3"),
+            ("algorithm.ndp.minibatches", "2"),
+            ("algorithm.ndp.epochs", "2"),
+        ]);
+        let mut snapshot = ParameterSnapshot::default();
+        run.segment.header.policy_version = 1;
+        (0..CAPACITY).for_each(|_| assert_eq!(run.send(), SendOutcome::Delivered));
+        assert_eq!(run.turns(), Turn::Idle);
+        // Two epochs of two minibatches of the first three; the fourth came too late.
+        let counters = run.session.learner.counters;
+        assert_eq!((counters.segments, counters.stale_segments), (4, 1));
+        assert_eq!((counters.env_steps, counters.updates), (20, 4));
+        assert!(run.subscriber.newest(&mut snapshot).unwrap());
+        assert_eq!((snapshot.version, snapshot.env_steps), (2, 15));
+        run.segment.header.policy_version = 2;
+        (0..3).for_each(|_| assert_eq!(run.send(), SendOutcome::Delivered));
+        assert_eq!(run.turns(), Turn::Idle);
+        assert!(run.subscriber.newest(&mut snapshot).unwrap());
+        assert_eq!(snapshot.version, 3);
+        let line = run.session.learner.metrics_line();
+        assert_eq!((line.stale_segments, line.updates, line.replay_segments), (1, 8, 0));
+        assert!(line.policy_loss.is_some() && line.critic_loss.is_none());
     }
 
     #[test]

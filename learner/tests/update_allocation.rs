@@ -33,11 +33,12 @@ unsafe impl GlobalAlloc for Counting {
 static ALLOCATOR: Counting = Counting;
 
 /// Allocations of twenty updates, after some.
-fn allocations(algorithm: &str, policy: &str, precision: &str, threads: &str) -> u64 {
+fn allocations([algorithm, policy, norm]: [&str; 3], precision: &str, threads: &str) -> u64 {
     let mut layers = Layers::new();
     let keys = [
         ("algorithm.name", algorithm),
         ("policy.kind", policy),
+        ("algorithm.critic_layer_norm", norm),
         ("learner.precision", precision),
         ("learner.threads", threads),
         // Three blocks, the last short and of an odd number of rows.
@@ -76,12 +77,12 @@ fn allocations(algorithm: &str, policy: &str, precision: &str, threads: &str) ->
 #[test]
 fn no_update_allocates_once_its_buffers_are_made() {
     for algorithm in ["ddpg", "td3", "sac"] {
-        for policy in ["dmp", "mlp"] {
-            assert_eq!(allocations(algorithm, policy, "f32", "2"), 0, "{algorithm} {policy}");
+        for (policy, norm) in [("dmp", "false"), ("mlp", "false"), ("mlp", "true")] {
+            let what = [algorithm, policy, norm];
+            assert_eq!(allocations(what, "f32", "2"), 0, "{what:?}");
             if Bf16::detect().is_some() {
                 // On one thread: each has a buffer for pairs, made when it first has work.
-                let got = allocations(algorithm, policy, "bf16", "1");
-                assert_eq!(got, 0, "{algorithm} {policy} bf16");
+                assert_eq!(allocations(what, "bf16", "1"), 0, "{what:?} bf16");
             }
         }
     }

@@ -3,7 +3,7 @@
 //! Block of a segment with K steps, observation length O and action length A:
 //! ```text
 //!   observations (K+1, O)   row k: before step k; row steps_len: after the last step really run
-//!   actions      (K, A)     u in [-1, 1]; zero after steps_len
+//!   actions      (K, A)     u, in [-1, 1] unless drawn from a Gaussian; zero after steps_len
 //!   rewards      (K,)       zero after steps_len
 //! ```
 //! An observation here is what the policy sees: the environment's, followed by the DMP state
@@ -143,6 +143,15 @@ impl Segment {
     }
 }
 
+/// What an action in a segment may be, besides finite.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum ActionBounds {
+    /// In [-1, 1].
+    Unit,
+    /// Any number: as drawn from an unbounded distribution, before the environment's bounds.
+    None,
+}
+
 /// What a segment must match to be taken.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Expected {
@@ -156,6 +165,8 @@ pub struct Expected {
     pub worker_count: u32,
     /// Environments of a worker: valid indices are below.
     pub env_count: u32,
+    /// What the policy's actions may be.
+    pub action_bounds: ActionBounds,
 }
 
 /// Why a segment was refused. Each variant has its own counter.
@@ -179,7 +190,7 @@ pub enum Rejection {
     /// The block's checksum differs.
     #[error("checksum")]
     Checksum,
-    /// A number that is NaN or infinite, or an action outside [-1, 1].
+    /// A number that is NaN or infinite, or an action outside its bounds.
     #[error("value not finite or action out of bounds")]
     Value,
     /// A sequence number that this worker has already used. Only the learner, who remembers, finds
@@ -214,7 +225,8 @@ pub fn check(header: &SegmentHeader, block: &[f32], expected: &Expected) -> Resu
     refuse(block_checksum(block) != header.checksum, Rejection::Checksum)?;
     let (_, actions, _) = layout.split(block);
     let sound = block.iter().all(|value| value.is_finite())
-        && actions.iter().all(|action| action.abs() <= 1.0);
+        && (expected.action_bounds == ActionBounds::None
+            || actions.iter().all(|action| action.abs() <= 1.0));
     refuse(!sound, Rejection::Value)
 }
 
@@ -230,8 +242,14 @@ mod tests {
 
     const LAYOUT: SegmentLayout =
         SegmentLayout { segment_steps: 5, observation_len: 3, action_len: 2 };
-    const EXPECTED: Expected =
-        Expected { run_id: 7, architecture_hash: 9, layout: LAYOUT, worker_count: 2, env_count: 4 };
+    const EXPECTED: Expected = Expected {
+        run_id: 7,
+        architecture_hash: 9,
+        layout: LAYOUT,
+        worker_count: 2,
+        env_count: 4,
+        action_bounds: ActionBounds::Unit,
+    };
 
     fn sound() -> Segment {
         let mut segment = Segment::zeroed(LAYOUT);
@@ -283,6 +301,20 @@ mod tests {
             };
             assert_eq!(verdict(change), Err(Rejection::Value));
         }
+    }
+
+    #[test]
+    fn an_action_beyond_the_bounds_is_taken_from_an_unbounded_policy_and_a_nan_is_not() {
+        let expected = Expected { action_bounds: ActionBounds::None, ..EXPECTED };
+        let verdict_on = |value: f32| {
+            let mut segment = sound();
+            segment.block[18] = value;
+            segment.header.checksum = block_checksum(&segment.block);
+            check(&segment.header, &segment.block, &expected)
+        };
+        assert_eq!(verdict_on(1.5), Ok(()));
+        assert_eq!(verdict_on(f32::NAN), Err(Rejection::Value));
+        assert_eq!(verdict_on(f32::INFINITY), Err(Rejection::Value));
     }
 
     #[test]

@@ -124,7 +124,7 @@ fn a_foreign_environment_that_hands_out_nan_is_reset_and_goes_on() {
 
 fn evaluated(task_id: &str) -> (Evaluator, Result<Option<Evaluation>, RolloutError>) {
     let mut evaluator = Evaluator::new(&config(0), environments(task_id), ENVS).unwrap();
-    let len = evaluator.policy().shape().parameters_len();
+    let len = evaluator.policy().parameters_len();
     let parameters: Vec<f32> = (0..len).map(|i| ((i * 37) % 129) as f32 / 640.0 - 0.1).collect();
     let stop = AtomicBool::new(false);
     let episodes = Episodes { count: 4 * ENVS, first_seed: 50, stop: &stop };

@@ -12,7 +12,7 @@ use dmprl_actors::python_env::{Interpreter, InterpreterOptions, PythonEnvironmen
 use dmprl_actors::rollout::{Identity, Rollout, RolloutError};
 use dmprl_shared::config::{ExperimentConfig, Layers};
 use dmprl_shared::segment::{
-    Expected, HINDSIGHT, Segment, SegmentLayout, TERMINATED, TRUNCATED, check,
+    ActionBounds, Expected, HINDSIGHT, Segment, SegmentLayout, TERMINATED, TRUNCATED, check,
 };
 use dmprl_tests::{tiny_envs_dir, venv};
 
@@ -153,6 +153,7 @@ fn what_a_worker_sends_passes_the_learners_check_and_leaves_no_number_out() {
         run_id: 1,
         architecture_hash: rollout.policy().architecture_hash(),
         layout: LAYOUT,
+        action_bounds: ActionBounds::Unit,
         worker_count: 1,
         env_count: ENVS as u32,
     };

@@ -126,4 +126,11 @@ fn movement_primitives_of_other_kinds_act_the_same() {
     let drawn = ("exploration.warm_up_kind", "dmp_parameters");
     assert_same("pusher", &[drawn, ("policy.start", "carry")]);
     assert_same("reacher", &[("dmp.forcing_scaling", "goal"), ("dmp.integrator", "explicit")]);
+    let stochastic = [
+        ("algorithm.name", "ndp"),
+        ("exploration.warm_up_steps", "0"),
+        ("policy.controller", "position"),
+        ("policy.position_scale", "3.0"),
+    ];
+    assert_same("reacher", &stochastic);
 }

@@ -8,6 +8,7 @@ use std::thread;
 use std::time::{Duration, Instant};
 
 use anyhow::{Context, anyhow};
+use serde::Deserialize;
 
 use super::watch::Watch;
 use crate::launch::{describe, last_lines};
@@ -21,6 +22,22 @@ const LINE_BYTES_MAX: u64 = 1 << 20;
 const END: Duration = Duration::from_secs(1);
 /// Between two looks whether it has ended.
 const END_LOOK: Duration = Duration::from_millis(5);
+
+/// The first line of one that a benchmark compares with.
+#[derive(Debug, Deserialize)]
+#[serde(rename_all = "snake_case")]
+enum Greeting {
+    Ready(String),
+    Absent(String),
+}
+
+/// The most memory that a process has had at once [bytes]: `VmHWM`, when the system tells it.
+/// - `process`: its number, or `self`.
+pub(super) fn resident_bytes_max(process: &str) -> Option<u64> {
+    let status = std::fs::read_to_string(format!("/proc/{process}/status")).ok()?;
+    let line = status.lines().find_map(|line| line.strip_prefix("VmHWM:"))?;
+    line.trim().strip_suffix("kB")?.trim().parse::<u64>().ok().map(|kib| kib * 1024)
+}
 
 /// A running child; dropped, it is killed and waited for. It holds nothing that a kill could
 /// damage, and its input ends with this process if that is killed.
@@ -90,6 +107,29 @@ impl LineChild {
         next.with_context(|| last_lines(&self.log).trim().to_owned())
     }
 
+    /// Its first line: what it is, or an error inside that says why it is not to be had here. One
+    /// that comes to nothing, because its interpreter lacks a package or is none, leaves the rest
+    /// of the benchmark as it is.
+    pub(super) fn greeting(
+        &mut self,
+        watch: &Watch,
+        limit: Duration,
+    ) -> anyhow::Result<Result<String, String>> {
+        let Some(line) = self.next_if_any(watch, limit, "the first line")? else {
+            return Ok(Err(self.last_word()));
+        };
+        Ok(match serde_json::from_str(&line) {
+            Ok(Greeting::Ready(text)) => Ok(text),
+            Ok(Greeting::Absent(why)) => Err(why),
+            Err(_) => Err(self.no_answer(&line).to_string()),
+        })
+    }
+
+    /// What it said is none of the protocol.
+    pub(super) fn no_answer(&self, line: &str) -> anyhow::Error {
+        anyhow!("{} said what is no answer: {line}", self.name)
+    }
+
     /// What it has said meanwhile.
     pub(super) fn said(&mut self) -> anyhow::Result<Vec<String>> {
         let mut said = Vec::new();
@@ -104,10 +144,7 @@ impl LineChild {
 
     /// The most memory that it has had at once [bytes]: `VmHWM`, when the system tells it.
     pub(super) fn resident_bytes_max(&self) -> Option<u64> {
-        let path = format!("/proc/{}/status", self.child.id());
-        let status = std::fs::read_to_string(path).ok()?;
-        let line = status.lines().find_map(|line| line.strip_prefix("VmHWM:"))?;
-        line.trim().strip_suffix("kB")?.trim().parse::<u64>().ok().map(|kib| kib * 1024)
+        resident_bytes_max(&self.child.id().to_string())
     }
 
     /// Processor time of its first thread so far [s], when the system tells it.

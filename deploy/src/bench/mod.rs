@@ -3,19 +3,23 @@
 //! `rollout` measures the workers of a run. It plays the learner for real `dmprl actor` processes
 //! (`workers`, `sink`) and, in turn with them, lets processes of `dmprl.bench_rollout` in Python do
 //! the same work (`peers`, `numpy_plan`); `figures` and `table` are what comes out. Everything
-//! waits in `watch` or in `child`, where an interrupt is seen.
+//! waits in `watch` or in `child`, where an interrupt is seen. `learner` measures an update beside
+//! its matrix products and beside other libraries.
 
 mod child;
 mod figures;
+mod learner;
 mod nap;
 mod numpy_plan;
 mod peers;
 mod rollout;
 mod sink;
+mod statistics;
 mod table;
 mod watch;
 mod workers;
 
 pub use figures::Figures;
+pub use learner::{Figures as LearnerFigures, LearnerBench, PeerKind, learner, spec_of};
 pub use numpy_plan::{Controls, NumpyPlan};
 pub use rollout::{RolloutBench, rollout};

@@ -40,6 +40,8 @@ pub struct NumpyPlan<'a> {
     widths: Vec<usize>,
     /// From (y0, yd0, g, w) to the samples of one dimension, (3K, 3+N); empty without a DMP.
     segment_map: Vec<f32>,
+    /// Standard deviations of the policy's own Gaussian, (A,); empty if it has none.
+    gaussian_std: Vec<f32>,
     /// File of the network's flat parameters, 32-bit little-endian.
     parameters: PathBuf,
 }
@@ -59,6 +61,7 @@ impl<'a> NumpyPlan<'a> {
         let shape = policy.shape();
         let widths = std::iter::once(shape.inputs());
         let parameters_path = folder.join("parameters.f32");
+        let log_std = policy.learned_std().map_or(&[][..], |learned| learned.log_std(parameters));
         let plan = Self {
             task: &config.task,
             policy: &config.policy,
@@ -71,9 +74,11 @@ impl<'a> NumpyPlan<'a> {
             decision_steps: config.policy.decision_steps(),
             widths: widths.chain(shape.layers().iter().map(|layer| layer.outputs)).collect(),
             segment_map: segment_map(config)?,
+            gaussian_std: log_std.iter().map(|log_std| log_std.exp()).collect(),
             parameters: parameters_path.clone(),
         };
-        let bytes: Vec<u8> = parameters.iter().flat_map(|value| value.to_le_bytes()).collect();
+        let network = &parameters[..shape.parameters_len()];
+        let bytes: Vec<u8> = network.iter().flat_map(|value| value.to_le_bytes()).collect();
         let text = serde_json::to_vec(&plan).context("cannot write the plan as JSON")?;
         let path = folder.join("plan.json");
         for (path, bytes) in [(&parameters_path, bytes), (&path, text)] {

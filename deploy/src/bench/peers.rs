@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 use std::process::Command;
 use std::time::Duration;
 
-use anyhow::{Context, anyhow, ensure};
+use anyhow::{Context, ensure};
 use serde::Deserialize;
 
 use super::child::LineChild;
@@ -86,13 +86,6 @@ pub(super) struct Peer {
 }
 
 #[derive(Debug, Deserialize)]
-#[serde(rename_all = "snake_case")]
-enum Greeting {
-    Ready(String),
-    Absent(String),
-}
-
-#[derive(Debug, Deserialize)]
 struct Measured {
     steps: u64,
     seconds: f64,
@@ -131,15 +124,9 @@ impl Peer {
     pub(super) fn ready(&mut self, watch: &Watch) -> anyhow::Result<Result<String, String>> {
         let mut about = String::new();
         for child in &mut self.children {
-            // One that comes to nothing, because its interpreter lacks NumPy or is none, leaves
-            // the rest of the benchmark as it is.
-            let Some(line) = child.next_if_any(watch, READY, "the first line")? else {
-                return Ok(Err(child.last_word()));
-            };
-            match serde_json::from_str(&line) {
-                Ok(Greeting::Ready(text)) => about = text,
-                Ok(Greeting::Absent(why)) => return Ok(Err(why)),
-                Err(_) => return Ok(Err(no_answer(child, &line).to_string())),
+            match child.greeting(watch, READY)? {
+                Ok(text) => about = text,
+                Err(why) => return Ok(Err(why)),
             }
         }
         Ok(Ok(about))
@@ -155,7 +142,7 @@ impl Peer {
         for child in &mut self.children {
             let line = child.next(watch, duration + MEASURE_SLACK, "the measurement")?;
             let Ok(Measured { steps, seconds, cpu_s }) = serde_json::from_str(&line) else {
-                return Err(no_answer(child, &line));
+                return Err(child.no_answer(&line));
             };
             ensure!(
                 steps > 0 && seconds > 0.0,
@@ -167,8 +154,4 @@ impl Peer {
         }
         Ok(Round { steps_per_s, cores: Some(cores) })
     }
-}
-
-fn no_answer(child: &LineChild, line: &str) -> anyhow::Error {
-    anyhow!("{} said what is no answer: {line}", child.name())
 }

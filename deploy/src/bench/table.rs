@@ -1,7 +1,8 @@
 //! The figures of a benchmark as a table.
 
-use super::figures::{Figures, NAMES, ONE_WORKER, WORKER, WorkerFigures, max, min};
+use super::figures::{Figures, NAMES, ONE_WORKER, WORKER, WorkerFigures};
 use super::peers::{PANDA_GYM, is_in_panda_gym};
+use super::statistics::{max, min};
 use crate::terminal::grouped;
 
 impl Figures {

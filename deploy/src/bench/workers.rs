@@ -216,6 +216,7 @@ fn expected(setup: &Setup, policy: &Policy) -> anyhow::Result<Expected> {
         run_id: setup.run_id,
         architecture_hash: policy.architecture_hash(),
         layout: policy.layout(),
+        action_bounds: policy.action_bounds(),
         worker_count: u32::try_from(actors.workers).context("too many workers")?,
         env_count: u32::try_from(actors.envs_per_worker).context("too many environments")?,
     })

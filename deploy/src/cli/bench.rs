@@ -6,6 +6,7 @@ use std::time::Duration;
 use clap::{Args, Subcommand};
 use dmprl_shared::config::Limits;
 
+use super::bench_learner::{self, LearnerArgs};
 use super::configuration::{merge, refuse};
 use super::configured::{ConfiguredArgs, make_absolute};
 use super::{cores, emit, prepare_python, this_program};
@@ -22,7 +23,8 @@ const QUEUED_SEGMENTS: usize = 4;
 const HELP: &str = "\
 EXAMPLES
   dmprl bench rollout --task reacher
-  dmprl bench rollout --help";
+  dmprl bench learner --task pusher --threads 1
+  dmprl bench learner --help";
 
 const ROLLOUT_HELP: &str = "\
 In every round each of these runs once for --seconds, the others asleep; the median counts.
@@ -59,6 +61,8 @@ pub(super) struct BenchArgs {
 
 #[derive(Debug, Subcommand)]
 enum Bench {
+    /// Milliseconds of an update, beside its matrix products and beside PyTorch and JAX.
+    Learner(Box<LearnerArgs>),
     /// Environment steps a second of the rollout workers, and of what else could make them.
     Rollout(Box<RolloutArgs>),
 }
@@ -90,14 +94,16 @@ struct RolloutArgs {
     json: bool,
 }
 
-fn seconds(text: &str) -> Result<f64, String> {
+pub(super) fn seconds(text: &str) -> Result<f64, String> {
     let seconds = text.parse::<f64>().ok().filter(|seconds| SECONDS.contains(seconds));
     seconds.ok_or_else(|| format!("expected {} to {} seconds", SECONDS.start(), SECONDS.end()))
 }
 
 pub(super) fn run(args: &BenchArgs) -> anyhow::Result<Outcome> {
-    let Bench::Rollout(args) = &args.bench;
-    rollout(args)
+    match &args.bench {
+        Bench::Learner(args) => bench_learner::run(args),
+        Bench::Rollout(args) => rollout(args),
+    }
 }
 
 fn rollout(args: &RolloutArgs) -> anyhow::Result<Outcome> {
@@ -125,7 +131,7 @@ fn rollout(args: &RolloutArgs) -> anyhow::Result<Outcome> {
 }
 
 /// Absolute, and not resolved: a virtual environment's Python is a link that knows where it lies.
-fn interpreter(path: &Path) -> anyhow::Result<PathBuf> {
+pub(super) fn interpreter(path: &Path) -> anyhow::Result<PathBuf> {
     let refused = |what: &str| {
         wrong_use(format!(
             "--peer-python {}: {what}; expected a Python interpreter, such as \

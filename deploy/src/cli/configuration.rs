@@ -5,7 +5,8 @@ use std::path::Path;
 
 use anyhow::Context;
 use dmprl_shared::config::{
-    ConfigError, ExperimentConfig, Layers, PRESETS, TASKS, nearest, policy_defaults, task_defaults,
+    ConfigError, ExperimentConfig, Layers, PRESETS, TASKS, algorithm_defaults, nearest,
+    policy_defaults, task_defaults,
 };
 use toml::{Table, Value};
 
@@ -42,19 +43,31 @@ pub(super) struct Sources<'a> {
 
 /// Merges the sources; every mistake in them is wrong use.
 ///
-/// Which policy decides is known only at the end, and its own defaults lie at the bottom: where
-/// it has some, the sources are merged once more on top of them.
+/// Which policy and which algorithm it is is known only at the end. The policy's own defaults lie
+/// at the bottom, the algorithm's over the preset: where there are some, the sources are merged
+/// once more with them.
 pub(super) fn merge(sources: &Sources<'_>) -> anyhow::Result<ExperimentConfig> {
-    let config = merge_over(Table::new(), sources)?;
-    match policy_defaults(config.policy.kind) {
-        Some(defaults) => merge_over(defaults, sources),
-        None => Ok(config),
+    let config = merge_with(&Own::default(), sources)?;
+    let own = Own {
+        policy: policy_defaults(config.policy.kind),
+        algorithm: algorithm_defaults(config.algorithm.name),
+    };
+    match own {
+        Own { policy: None, algorithm: None } => Ok(config),
+        own => merge_with(&own, sources),
     }
 }
 
-fn merge_over(defaults: Table, sources: &Sources<'_>) -> anyhow::Result<ExperimentConfig> {
+/// What policy and algorithm bring with them.
+#[derive(Debug, Default)]
+struct Own {
+    policy: Option<Table>,
+    algorithm: Option<Table>,
+}
+
+fn merge_with(own: &Own, sources: &Sources<'_>) -> anyhow::Result<ExperimentConfig> {
     let mut layers = Layers::new();
-    add(&mut layers, "policy defaults", defaults)?;
+    add(&mut layers, "policy defaults", own.policy.clone().unwrap_or_default())?;
     add(&mut layers, sources.task, task_table(sources.task)?)?;
     let preset = PRESETS.iter().find(|preset| preset.name == sources.preset);
     let preset = preset.with_context(|| format!("no preset {}", sources.preset))?;
@@ -62,6 +75,7 @@ fn merge_over(defaults: Table, sources: &Sources<'_>) -> anyhow::Result<Experime
     if let Some(task) = task_defaults(sources.task) {
         add(&mut layers, preset.name, task.over_preset(preset.name))?;
     }
+    add(&mut layers, "algorithm defaults", own.algorithm.clone().unwrap_or_default())?;
     if let Some(file) = sources.file {
         add(&mut layers, &file.display().to_string(), read_table(file)?)?;
     }
@@ -175,6 +189,7 @@ fn nested(key: &str, value: Value) -> Table {
 mod tests {
     use super::*;
     use crate::failure::WrongUse;
+    use dmprl_shared::config::{Controller, ForcingScaling, Integrator, Limits, Start};
     use std::io::Write;
 
     fn sources(task: &str) -> Sources<'_> {
@@ -300,6 +315,25 @@ mod tests {
         let mut second = sources("pusher");
         second.file = Some(&file);
         assert_eq!(merge(&second).unwrap().resolve(limits).unwrap(), config);
+    }
+
+    #[test]
+    fn ndp_brings_its_own_dmp_over_any_preset_and_below_what_the_user_says() {
+        for preset in ["default", "paper"] {
+            let set = ["algorithm.name=ndp".to_owned(), "policy.start=zero".to_owned()];
+            let ndp = Sources { preset, set: &set[..1], ..sources("panda-reach") };
+            let config = merge(&ndp).unwrap().resolve(Limits { cores: 2 }).unwrap();
+            assert_eq!(config.policy.controller, Controller::Position);
+            assert_eq!(
+                (config.policy.start, config.policy.position_scale),
+                (Start::Observed, 20.0)
+            );
+            assert_eq!(config.dmp.integrator, Integrator::Explicit);
+            assert_eq!(config.dmp.forcing_scaling, ForcingScaling::Goal);
+            assert_eq!(config.exploration.warm_up_steps, 0);
+            let told = Sources { preset, set: &set, ..sources("panda-reach") };
+            assert_eq!(merge(&told).unwrap().policy.start, Start::Zero);
+        }
     }
 
     #[test]

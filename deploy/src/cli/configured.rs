@@ -14,7 +14,7 @@ use crate::failure::wrong_use;
 #[derive(Debug, Args)]
 pub(super) struct ConfiguredArgs {
     /// Learning algorithm.
-    #[arg(long, value_parser = PossibleValuesParser::new(["ddpg", "td3", "sac"]))]
+    #[arg(long, value_parser = PossibleValuesParser::new(["ddpg", "td3", "sac", "ndp"]))]
     algo: Option<String>,
     /// What decides the actions: a DMP per segment, or a network per step.
     #[arg(long, value_parser = PossibleValuesParser::new(["dmp", "mlp"]))]

@@ -1,6 +1,7 @@
 //! The command line: what may be typed, its help, and who answers.
 
 mod bench;
+mod bench_learner;
 mod configuration;
 mod configured;
 mod eval;

@@ -23,8 +23,9 @@ use crate::terminal::ProgressStyle;
 const SAME_SECOND_MAX: usize = 100;
 
 const HELP: &str = "\
-PRECEDENCE, lowest first: the policy's and the task's defaults, --preset, --config, environment
-variables (DMPRL_ALGORITHM__BATCH_SIZE=64 sets algorithm.batch_size), --set, the flags above.
+PRECEDENCE, lowest first: the policy's and the task's defaults, --preset, the algorithm's own values
+(ndp), --config, environment variables (DMPRL_ALGORITHM__BATCH_SIZE=64 sets algorithm.batch_size),
+--set, the flags above.
 Ctrl-C once: checkpoint and a clean end within 10 s; twice: at once.
 
 EXAMPLES
@@ -32,6 +33,7 @@ EXAMPLES
   dmprl train pusher --steps 100000 --workers 4 --seed 2
   dmprl train reacher --policy mlp --run-dir runs/baseline
   dmprl train reacher --preset paper --set exploration.std=0.2
+  dmprl train panda-reach --algo ndp
   dmprl train reacher --until-return -5 --max-minutes 30
   dmprl train reacher --config runs/baseline/config.toml --deterministic
   dmprl train reacher --init-from runs/baseline --seed 3
@@ -115,8 +117,8 @@ fn check(config: &ExperimentConfig, args: &TrainArgs) -> anyhow::Result<()> {
     }
     if config.learner.device == Device::Cuda && !cfg!(feature = "cuda") {
         return Err(wrong_use(
-            "learner.device = \"cuda\": this build has no CUDA; on a machine with an NVIDIA GPU and \
-             the CUDA toolkit, build with: cargo build --release --features cuda",
+            "learner.device = \"cuda\": this build has no CUDA; on a machine with an NVIDIA GPU \
+             and the CUDA toolkit, build with: cargo build --release --features cuda",
         ));
     }
     if let Some(workers) = args.configured.workers.filter(|&n| n > 1 && config.run.deterministic) {
@@ -181,6 +183,7 @@ fn default_path(config: &ExperimentConfig) -> anyhow::Result<PathBuf> {
         AlgorithmName::Ddpg => "ddpg",
         AlgorithmName::Td3 => "td3",
         AlgorithmName::Sac => "sac",
+        AlgorithmName::Ndp => "ndp",
     };
     let policy = match config.policy.kind {
         PolicyKind::Dmp => "dmp",

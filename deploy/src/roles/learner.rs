@@ -76,7 +76,7 @@ pub fn plan(setup: &Setup, policy: &dmprl_shared::policy::Policy) -> Plan {
         layout: policy.layout(),
         worker_count: setup.config.actors.workers,
         queue_segments: setup.config.actors.queue_segments,
-        parameters_len: policy.shape().parameters_len(),
+        parameters_len: policy.parameters_len(),
     }
 }
 

@@ -8,19 +8,30 @@ use dmprl_shared::policy::{Activations, Head, HeadGradient, MlpShape, Policy, Po
 use super::batch::States;
 use super::{Batch, BatchShape};
 use crate::update::BLOCK_ROWS;
+use crate::update::layer_norm::Normalised;
 use crate::update::pass::Gradients;
-use crate::update::trained::{Lent, Trace};
+use crate::update::trained::{Lent, Trace, Trained};
 
-/// A network's buffers for one block.
+/// A critic's buffers for one block.
 #[derive(Debug)]
 struct Buffers {
     activations: Activations,
+    normalised: Option<Normalised>,
     gradients: Gradients,
 }
 
 impl Buffers {
-    fn new(shape: &MlpShape, rows: usize) -> Self {
-        Self { activations: Activations::new(shape, rows), gradients: Gradients::new(shape, rows) }
+    fn new(critic: &Trained, rows: usize) -> Self {
+        let shape = &critic.shape;
+        let activations = Activations::new(shape, rows);
+        match critic.layer_norm {
+            None => Self { activations, normalised: None, gradients: Gradients::new(shape, rows) },
+            Some(_) => Self {
+                activations,
+                normalised: Some(Normalised::new(shape, rows)),
+                gradients: Gradients::with_layer_norm(shape, rows),
+            },
+        }
     }
 }
 
@@ -64,25 +75,21 @@ pub struct Block {
     pub sums: Sums,
 }
 
-/// The blocks of a batch.
+/// The blocks of a batch, for critics of one shape.
 #[must_use]
-pub fn blocks(
-    policy: &Policy,
-    shape: BatchShape,
-    critic_shape: &MlpShape,
-    critics: usize,
-) -> Vec<Block> {
+pub fn blocks(policy: &Policy, shape: BatchShape, critics: &[Trained]) -> Vec<Block> {
     let block = |first: usize| {
         let rows = first..(first + BLOCK_ROWS).min(shape.rows);
         let count = rows.len();
         Block {
             rows,
             shape,
-            critic_shape: critic_shape.clone(),
+            // Without a critic nobody asks for its shape.
+            critic_shape: critics.first().map_or(policy.shape(), |it| &it.shape).clone(),
             batch_rows: shape.rows as f32,
             policy: policy.workspace(count),
             actor_gradients: Gradients::new(policy.shape(), count),
-            critics: (0..critics).map(|_| Buffers::new(critic_shape, count)).collect(),
+            critics: critics.iter().map(|critic| Buffers::new(critic, count)).collect(),
             critic_inputs: vec![0.0; count * shape.critic_inputs()],
             targets: vec![0.0; count],
             log_densities: vec![0.0; count],
@@ -115,7 +122,7 @@ impl Block {
 
     /// u = pi(states), of an actor or its target.
     pub fn act(&mut self, policy: &Policy, actor: &Lent<'_>, states: States<'_>) {
-        actor.forward(self.part(states.inputs), &mut self.policy.activations);
+        actor.forward(self.part(states.inputs), &mut self.policy.activations, None);
         policy.decode(self.part(states.observations), &mut self.policy);
     }
 
@@ -123,7 +130,8 @@ impl Block {
     pub fn judge(&mut self, policy: &Policy, critics: &[Lent<'_>], states: States<'_>) {
         self.assemble(policy, self.part(states.inputs));
         for (critic, buffers) in critics.iter().zip(&mut self.critics) {
-            critic.forward(&self.critic_inputs, &mut buffers.activations);
+            let Buffers { activations, normalised, .. } = buffers;
+            critic.forward(&self.critic_inputs, activations, normalised.as_mut());
         }
     }
 
@@ -147,8 +155,8 @@ impl Block {
         let rows = self.rows_len();
         self.sums = Sums::default();
         for (index, (critic, buffers)) in critics.iter().zip(&mut self.critics).enumerate() {
-            let Buffers { activations, gradients } = buffers;
-            critic.forward(inputs, activations);
+            let Buffers { activations, normalised, gradients } = buffers;
+            critic.forward(inputs, activations, normalised.as_mut());
             let q = activations.output(&self.critic_shape, rows);
             let out = gradients.output_mut(&self.critic_shape, rows);
             for ((out, q), target) in out.iter_mut().zip(q).zip(&self.targets) {
@@ -157,7 +165,7 @@ impl Block {
                 self.sums.squared_error += error * error;
                 self.sums.q += if index == 0 { *q } else { 0.0 };
             }
-            critic.pass(activations, rows).backward(gradients);
+            critic.pass(activations, normalised.as_ref(), rows).backward(gradients);
         }
     }
 
@@ -177,8 +185,8 @@ impl Block {
                 let weight = weight(self, row, index);
                 self.critics[index].gradients.output_mut(&self.critic_shape, rows)[row] = weight;
             }
-            let Buffers { activations, gradients } = &mut self.critics[index];
-            let pass = critic.pass(activations, rows);
+            let Buffers { activations, normalised, gradients } = &mut self.critics[index];
+            let pass = critic.pass(activations, normalised.as_ref(), rows);
             pass.backward(gradients);
             let first = self.shape.observation_len;
             pass.input_gradient(gradients, first, &mut self.input_gradient);
@@ -272,15 +280,16 @@ impl Block {
                 }
             }
         }
-        let pass = actor.pass(&self.policy.activations, rows);
+        let pass = actor.pass(&self.policy.activations, None, rows);
         pass.backward(&mut self.actor_gradients);
     }
 
     /// This block's part in the gradient of critic `index` after [`Block::regress`].
     #[must_use]
     pub fn critic_trace<'a>(&'a self, index: usize, batch: &'a Batch) -> Trace<'a> {
-        let Buffers { activations, gradients } = &self.critics[index];
-        Trace { inputs: self.part(&batch.critic_inputs), activations, gradients }
+        let Buffers { activations, normalised, gradients } = &self.critics[index];
+        let inputs = self.part(&batch.critic_inputs);
+        Trace { inputs, activations, normalised: normalised.as_ref(), gradients }
     }
 
     /// This block's part in the gradient of the actor after [`Block::act_backward`].
@@ -295,6 +304,7 @@ impl Block {
         Trace {
             inputs: self.part(inputs),
             activations: &self.policy.activations,
+            normalised: None,
             gradients: &self.actor_gradients,
         }
     }

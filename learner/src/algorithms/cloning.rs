@@ -56,7 +56,7 @@ impl Cloning {
         Ok(Self {
             actor: Trained::new(layers, parameters.clone(), step_size, false, precision)?,
             parameters,
-            blocks: blocks(policy, shape, policy.shape(), 0),
+            blocks: blocks(policy, shape, &[]),
             crew: Crew::new(config.learner.threads),
             shape,
             observations: vec![0.0; shape.rows * shape.observation_len],

@@ -32,7 +32,7 @@ pub struct Ddpg {
     /// Q, and its target Q'.
     pub critic: Trained,
     polyak: f32,
-    blocks: Vec<Block>,
+    pub(super) blocks: Vec<Block>,
 }
 
 impl Ddpg {
@@ -44,7 +44,8 @@ impl Ddpg {
         let actor = new_actor(config, policy, true)?;
         let critic = new_critic(config, shape, "critic parameters")?;
         let polyak = config.algorithm.polyak as f32;
-        Ok(Self { blocks: blocks(policy, shape, &critic.shape, 1), actor, critic, polyak })
+        let blocks = blocks(policy, shape, std::slice::from_ref(&critic));
+        Ok(Self { blocks, actor, critic, polyak })
     }
 
     /// One update of critic, actor and both targets.

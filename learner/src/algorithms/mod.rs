@@ -4,6 +4,11 @@ mod batch;
 mod block;
 pub mod cloning;
 pub mod ddpg;
+mod minibatch;
+pub mod ndp;
+mod optimiser_steps;
+mod ppo;
+mod products;
 pub mod sac;
 pub mod td3;
 
@@ -13,11 +18,14 @@ use dmprl_shared::policy::{MlpShape, Policy, initial_parameters};
 use dmprl_shared::seeds;
 
 pub use batch::{Batch, BatchShape, NoWindow};
+pub use optimiser_steps::OptimiserSteps;
+pub use products::Cycle;
 
 use crate::graph::Graph;
 use crate::update::crew::Crew;
 use crate::update::trained::Trained;
 use ddpg::Ddpg;
+use ndp::Ndp;
 use sac::Sac;
 use td3::Td3;
 
@@ -61,6 +69,7 @@ enum Kind {
     Ddpg(Box<Ddpg>),
     Td3(Box<Td3>),
     Sac(Box<Sac>),
+    Ndp(Box<Ndp>),
 }
 
 impl Algorithm {
@@ -74,6 +83,7 @@ impl Algorithm {
             AlgorithmName::Ddpg => Kind::Ddpg(Box::new(Ddpg::new(config, policy, shape)?)),
             AlgorithmName::Td3 => Kind::Td3(Box::new(Td3::new(config, policy, shape)?)),
             AlgorithmName::Sac => Kind::Sac(Box::new(Sac::new(config, policy, shape)?)),
+            AlgorithmName::Ndp => Kind::Ndp(Box::new(Ndp::new(config, policy)?)),
         };
         let remote = match config.learner.device {
             config::Device::Cpu => None,
@@ -93,10 +103,28 @@ impl Algorithm {
         self.shape
     }
 
-    /// Update number `update`, counted from 1.
+    /// The on-policy algorithm and the threads of its update, if it is one: it keeps its own
+    /// experience.
+    pub fn on_policy(&mut self) -> Option<(&mut Ndp, &Crew)> {
+        match &mut self.kind {
+            Kind::Ndp(ndp) => Some((ndp, &self.crew)),
+            _ => None,
+        }
+    }
+
+    /// As [`Algorithm::on_policy`], to look at it.
+    #[must_use]
+    pub fn as_on_policy(&self) -> Option<&Ndp> {
+        match &self.kind {
+            Kind::Ndp(ndp) => Some(ndp),
+            _ => None,
+        }
+    }
+
+    /// Update number `update`, counted from 1, of an algorithm that learns from the replay.
     ///
     /// # Errors
-    /// If candle refuses access to a variable.
+    /// If candle refuses access to a variable, or the algorithm is on-policy.
     pub fn update(&mut self, policy: &Policy, batch: &Batch, update: u64) -> Result<Losses> {
         if let Some(losses) = self.update_remote(policy, batch, update)? {
             return Ok(losses);
@@ -105,6 +133,7 @@ impl Algorithm {
             Kind::Ddpg(ddpg) => ddpg.update(policy, batch, &self.crew),
             Kind::Td3(td3) => td3.update(policy, batch, &self.crew, update),
             Kind::Sac(sac) => sac.update(policy, batch, &self.crew),
+            Kind::Ndp(_) => candle_core::bail!("an on-policy algorithm samples no batch"),
         }
     }
 
@@ -158,27 +187,36 @@ impl Algorithm {
         fetched
     }
 
-    /// Copies the policy's parameters, (P,), into `out`, from wherever they are newest.
+    /// Copies the policy's flat parameters, (P,), out, from wherever they are newest.
     ///
     /// # Errors
     /// If candle or the device refuses.
-    pub fn read_actor(&self, out: &mut [f32]) -> Result<()> {
-        match &self.remote {
-            Some(Remote { graph: Some(graph), is_ahead: true, .. }) => graph.read_actor(out),
-            _ => {
-                out.copy_from_slice(self.actor().network.values());
-                Ok(())
-            }
+    pub fn read_policy(&self, values: &mut [f32]) -> Result<()> {
+        if let Some(Remote { graph: Some(graph), is_ahead: true, .. }) = &self.remote {
+            return graph.read_actor(values);
         }
+        match &self.kind {
+            Kind::Ddpg(ddpg) => values.copy_from_slice(ddpg.actor.network.values()),
+            Kind::Td3(td3) => values.copy_from_slice(td3.actor.network.values()),
+            Kind::Sac(sac) => values.copy_from_slice(sac.actor.network.values()),
+            Kind::Ndp(ndp) => ndp.read_policy(values),
+        }
+        Ok(())
     }
 
-    /// The network whose parameters are the policy's.
-    #[must_use]
-    pub fn actor(&self) -> &Trained {
-        match &self.kind {
-            Kind::Ddpg(ddpg) => &ddpg.actor,
-            Kind::Td3(td3) => &td3.actor,
-            Kind::Sac(sac) => &sac.actor,
+    /// Starts the actor, and its target if it has one, from another policy's parameters.
+    ///
+    /// # Errors
+    /// If the lengths differ.
+    pub fn set_policy(&mut self, values: &[f32]) -> Result<()> {
+        if let Some(remote) = &mut self.remote {
+            remote.graph = None;
+        }
+        match &mut self.kind {
+            Kind::Ddpg(ddpg) => set(&mut ddpg.actor, values),
+            Kind::Td3(td3) => set(&mut td3.actor, values),
+            Kind::Sac(sac) => set(&mut sac.actor, values),
+            Kind::Ndp(ndp) => ndp.set_policy(values),
         }
     }
 
@@ -209,6 +247,11 @@ impl Algorithm {
                 f("critic_2", &mut sac.critics[1])?;
                 f("log_temperature", &mut sac.log_temperature)
             }
+            Kind::Ndp(ndp) => {
+                f("actor", &mut ndp.actor)?;
+                f("log_std", &mut ndp.log_std)?;
+                f("critic", &mut ndp.critic)
+            }
         }
     }
 
@@ -226,8 +269,16 @@ impl Algorithm {
                 let temperature = ("log_temperature", &sac.log_temperature);
                 vec![("actor", &sac.actor), ("critic_1", first), ("critic_2", second), temperature]
             }
+            Kind::Ndp(ndp) => {
+                vec![("actor", &ndp.actor), ("log_std", &ndp.log_std), ("critic", &ndp.critic)]
+            }
         }
     }
+}
+
+fn set(actor: &mut Trained, values: &[f32]) -> Result<()> {
+    actor.network.set(values)?;
+    actor.target.as_mut().map_or(Ok(()), |target| target.set(values))
 }
 
 fn new_actor(config: &ExperimentConfig, policy: &Policy, target: bool) -> Result<Trained> {
@@ -245,8 +296,11 @@ fn new_critic(config: &ExperimentConfig, shape: BatchShape, name: &str) -> Resul
     let layers = MlpShape::new(widths);
     let initial = initial_parameters(&layers, &mut seeds::stream(config.run.seed, name, 0));
     let rate = config.algorithm.critic_learning_rate;
-    Trained::new(layers, initial, rate, true, config.learner.precision)
+    let critic = Trained::new(layers, initial, rate, true, config.learner.precision)?;
+    Ok(if config.algorithm.critic_layer_norm { critic.with_layer_norm() } else { critic })
 }
 
+#[cfg(test)]
+mod golden_tests;
 #[cfg(test)]
 mod tests;

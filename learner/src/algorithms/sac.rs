@@ -37,7 +37,7 @@ pub struct Sac {
     pub log_temperature: Trained,
     target_entropy: f32,
     polyak: f32,
-    blocks: Vec<Block>,
+    pub(super) blocks: Vec<Block>,
 }
 
 impl Sac {
@@ -55,7 +55,7 @@ impl Sac {
         let rate = sac.temperature_learning_rate;
         Ok(Self {
             actor: new_actor(config, policy, false)?,
-            blocks: blocks(policy, shape, &critics[0].shape, 2),
+            blocks: blocks(policy, shape, &critics),
             critics,
             log_temperature: Trained::scalar(log_temperature, rate)?,
             target_entropy: (sac.target_entropy_per_action * shape.segment_actions_len as f64)

@@ -27,9 +27,9 @@ pub struct Td3 {
     pub actor: Trained,
     /// Q_1 and Q_2, and their targets.
     pub critics: [Trained; 2],
-    config: Td3Config,
+    pub(super) config: Td3Config,
     polyak: f32,
-    blocks: Vec<Block>,
+    pub(super) blocks: Vec<Block>,
 }
 
 impl Td3 {
@@ -44,7 +44,7 @@ impl Td3 {
         ];
         Ok(Self {
             actor: new_actor(config, policy, true)?,
-            blocks: blocks(policy, shape, &critics[0].shape, 2),
+            blocks: blocks(policy, shape, &critics),
             critics,
             config: config.algorithm.td3.clone(),
             polyak: config.algorithm.polyak as f32,

@@ -32,10 +32,12 @@ fn case(keys: &[(&str, &str)]) -> Case {
     let config = layers.finish().unwrap();
     let policy = Policy::new(&config, &spec()).unwrap();
     let mut algorithm = Algorithm::new(&config, &policy).unwrap();
-    // Targets that differ from their networks, so that mixing them up shows.
+    // Targets that differ from their networks, so that mixing them up shows; gains and shifts that
+    // are not one and zero.
     let mut random = seeds::stream(3, "test", 0);
     let disturb = |_, trained: &mut Trained| {
-        let values = trained.target.iter_mut().flat_map(|target| target.values_mut());
+        let networks = [Some(&mut trained.network), trained.target.as_mut()];
+        let values = networks.into_iter().flatten().flat_map(Parameters::values_mut);
         values.for_each(|value| *value += random.random_range(-0.05..0.05));
         Ok::<(), ()>(())
     };
@@ -88,7 +90,7 @@ impl Case {
     }
 }
 
-fn assert_close(name: &str, got: &[f32], expected: &[f32]) {
+pub(super) fn assert_close(name: &str, got: &[f32], expected: &[f32]) {
     let norm = |values: &mut dyn Iterator<Item = f32>| {
         values.map(|value| f64::from(value).powi(2)).sum::<f64>().sqrt()
     };
@@ -100,7 +102,7 @@ fn assert_close(name: &str, got: &[f32], expected: &[f32]) {
 
 #[test]
 fn an_update_equals_automatic_differentiation() {
-    let cases: [&[(&str, &str)]; 8] = [
+    let cases: [&[(&str, &str)]; 10] = [
         &[],
         &[("policy.kind", "mlp")],
         &[("policy.start", "observed")],
@@ -109,11 +111,29 @@ fn an_update_equals_automatic_differentiation() {
         &[("dmp.forcing_scaling", "goal"), ("policy.start", "observed")],
         &[("algorithm.critic", "first"), ("algorithm.windows", "segment")],
         &[("dmp.integrator", "paper"), ("dmp.alpha_y", "25.0"), ("dmp.basis_count", "3")],
+        &[("algorithm.critic_layer_norm", "true"), ("policy.start", "carry")],
+        &[("algorithm.critic_layer_norm", "true"), ("policy.kind", "mlp")],
     ];
     for algorithm in ["ddpg", "td3", "sac"] {
         for keys in cases {
             let all: Vec<_> = keys.iter().copied().chain([("algorithm.name", algorithm)]).collect();
             case(&all).check(&format!("{algorithm} {keys:?}"));
+        }
+    }
+}
+
+#[test]
+fn the_switch_normalises_critics_and_no_other_network() {
+    for algorithm in ["ddpg", "td3", "sac"] {
+        for norm in ["false", "true"] {
+            let keys = [("algorithm.name", algorithm), ("algorithm.critic_layer_norm", norm)];
+            for (name, trained) in case(&keys).algorithm.networks() {
+                let want = norm == "true" && name.starts_with("critic");
+                assert_eq!(trained.layer_norm.is_some(), want, "{name} of {algorithm}");
+                // Two numbers for each of the 20 and 12 hidden units.
+                let behind = trained.network.values().len() - trained.shape.parameters_len();
+                assert_eq!(behind, if want { 64 } else { 0 }, "{name} of {algorithm}");
+            }
         }
     }
 }
@@ -145,7 +165,7 @@ fn updates_fit_a_known_value_and_follow_its_gradient() {
     assert!(losses.critic_loss < 0.01, "{losses:?}");
     let mut work = case.policy.workspace(128);
     let observations = &case.batch.inputs;
-    let parameters = case.algorithm.actor().network.values();
+    let parameters = case.algorithm.networks()[0].1.network.values();
     case.policy.act(parameters, observations, &mut work);
     let errors = work.actions.iter().map(|u| (u - 0.5).abs());
     let mean = errors.sum::<f32>() / work.actions.len() as f32;
@@ -154,10 +174,13 @@ fn updates_fit_a_known_value_and_follow_its_gradient() {
 
 #[test]
 fn the_number_of_threads_changes_no_bit_of_an_update() {
-    for algorithm in ["ddpg", "td3", "sac"] {
+    let algorithms = ["ddpg", "td3", "sac"].into_iter();
+    for (algorithm, norm) in algorithms.flat_map(|name| ["false", "true"].map(|norm| (name, norm)))
+    {
         let run = |threads: &str| {
             let keys = [
                 ("algorithm.name", algorithm),
+                ("algorithm.critic_layer_norm", norm),
                 ("learner.threads", threads),
                 ("policy.hidden", "[256, 256]"),
                 ("algorithm.critic_hidden", "[256, 256]"),
@@ -174,6 +197,6 @@ fn the_number_of_threads_changes_no_bit_of_an_update() {
                 .collect::<Vec<_>>()
         };
         let one = run("1");
-        assert!(one == run("2") && one == run("7"), "{algorithm}");
+        assert!(one == run("2") && one == run("7"), "{algorithm} {norm}");
     }
 }

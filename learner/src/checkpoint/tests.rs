@@ -46,6 +46,7 @@ fn train(learner: &mut Learner, rounds: std::ops::Range<u32>) {
             layout_version: LAYOUT_VERSION,
             run_id: RUN_ID,
             architecture_hash: learner.policy().architecture_hash(),
+            policy_version: learner.counters.policy_version,
             sequence: u64::from(round) + 1,
             env_index: round % 2,
             episode: round / 4,
@@ -59,8 +60,12 @@ fn train(learner: &mut Learner, rounds: std::ops::Range<u32>) {
             ..SegmentHeader::default()
         };
         learner.insert(&segment).unwrap();
-        while learner.pacing.update_due() {
+        let updates = learner.counters.updates;
+        while learner.update_due() {
             learner.update().unwrap();
+        }
+        if learner.algorithm.as_on_policy().is_some() && learner.counters.updates > updates {
+            learner.next_snapshot().unwrap();
         }
     }
 }
@@ -78,6 +83,7 @@ fn a_resumed_learner_goes_on_to_the_same_bytes_as_one_that_never_stopped() {
         &[][..],
         &[("algorithm.name", "td3"), ("policy.normalise_observations", "true")],
         &[("algorithm.name", "sac"), ("policy.normalise_observations", "true")],
+        &[("algorithm.critic_layer_norm", "true"), ("policy.normalise_observations", "true")],
         &[("demonstrations.files", "['some.npz']"), ("policy.normalise_observations", "true")],
     ] {
         let fresh = || fresh_with(keys);
@@ -119,7 +125,7 @@ fn a_checkpoint_of_the_format_before_is_read_and_one_of_a_later_is_refused() {
     fs::write(&path, state.to_string()).unwrap();
     let (loaded, _) = load_newest(folder, &fresh).unwrap();
     assert_eq!(loaded.counters, learner.counters);
-    assert_eq!(loaded.algorithm.actor().adam, learner.algorithm.actor().adam);
+    assert_eq!(loaded.algorithm.networks()[0].1.adam, learner.algorithm.networks()[0].1.adam);
 
     state["format_version"] = 3.into();
     fs::write(&path, state.to_string()).unwrap();
@@ -136,6 +142,46 @@ fn normalisation_that_was_switched_on_or_off_since_is_refused() {
     let switched = || fresh_with(&[("policy.normalise_observations", "true")]);
     let error = load_newest(folder.path(), &switched).unwrap_err().to_string();
     assert!(error.contains("policy.normalise_observations"), "{error}");
+}
+
+#[test]
+fn an_on_policy_learner_goes_on_from_its_networks_with_an_empty_rollout() {
+    let fresh = || {
+        fresh_with(&[
+            ("algorithm.name", "ndp"),
+            ("exploration.warm_up_steps", "0"),
+            ("algorithm.ndp.rollout_segments", "8"),
+            ("algorithm.ndp.minibatches", "2"),
+            ("algorithm.ndp.epochs", "2"),
+            ("policy.normalise_observations", "true"),
+        ])
+    };
+    let policy = |learner: &mut Learner| learner.next_snapshot().unwrap().values.clone();
+    let folder = tempfile::tempdir().unwrap();
+    let mut learner = fresh().unwrap();
+    learner.next_snapshot().unwrap();
+    train(&mut learner, 0..20);
+    assert_eq!((learner.counters.updates, learner.counters.stale_segments), (8, 0));
+    let rollout = |learner: &Learner| learner.algorithm.as_on_policy().unwrap().rollout.len();
+    assert_eq!(rollout(&learner), 4);
+    save(folder.path(), &mut learner).unwrap();
+
+    let resume = || load_newest(folder.path(), &fresh).unwrap().0;
+    let mut resumed = resume();
+    assert_eq!((resumed.counters, rollout(&resumed)), (learner.counters, 0));
+    for ((name, old), (_, new)) in
+        learner.algorithm.networks().iter().zip(resumed.algorithm.networks())
+    {
+        assert_eq!(old.adam, new.adam, "{name}");
+    }
+    assert_eq!(policy(&mut resumed), policy(&mut learner));
+    let mut again = resume();
+    policy(&mut again);
+    for learner in [&mut resumed, &mut again] {
+        train(learner, 20..60);
+        assert_eq!(learner.counters.updates, 8 + 5 * 4);
+    }
+    assert_eq!(policy(&mut resumed), policy(&mut again));
 }
 
 #[test]

@@ -12,6 +12,7 @@ use dmprl_shared::policy::{Head, MlpShape, Policy};
 
 use crate::algorithms::{Batch, BatchShape, Losses};
 use crate::update::kernels::{BETA1, BETA2, EPSILON};
+use crate::update::layer_norm::LayerNorm;
 use crate::update::trained::Trained;
 use policy::{PolicyGraph, StatesOn, network};
 
@@ -20,6 +21,7 @@ use policy::{PolicyGraph, StatesOn, network};
 struct Remote {
     name: &'static str,
     shape: MlpShape,
+    layer_norm: Option<LayerNorm>,
     network: Var,
     target: Option<Var>,
     moments: [Tensor; 2],
@@ -98,9 +100,12 @@ impl Graph {
 
     fn q(&self, name: &str, of_target: bool, inputs: &Tensor) -> Result<Tensor> {
         let remote = self.remote(name)?;
+        let layer_norm = remote.layer_norm.as_ref();
         match (&remote.target, of_target) {
-            (Some(target), true) => network(&remote.shape, &target.as_detached_tensor(), inputs),
-            _ => network(&remote.shape, &remote.network, inputs),
+            (Some(target), true) => {
+                network(&remote.shape, layer_norm, &target.as_detached_tensor(), inputs)
+            }
+            _ => network(&remote.shape, layer_norm, &remote.network, inputs),
         }
     }
 
@@ -312,6 +317,7 @@ impl Remote {
         Ok(Self {
             name,
             shape: trained.shape.clone(),
+            layer_norm: trained.layer_norm.clone(),
             network: var(trained.network.values())?,
             target: match &trained.target {
                 Some(target) => Some(var(target.values())?),

@@ -1,9 +1,12 @@
 //! The policy as a graph of candle tensors: network, DMP, inverse controller, and SAC's Gaussian.
 
-use candle_core::{Device, Result, Tensor};
+use candle_core::{D, Device, Result, Tensor};
 use dmprl_shared::config::{ExperimentConfig, ForcingScaling, RhoKind};
 use dmprl_shared::dmp::{Dmp, SegmentMap};
 use dmprl_shared::policy::{Head, MlpShape, Policy};
+
+use crate::update::kernels::VARIANCE_EPSILON;
+use crate::update::layer_norm::{GainShift, LayerNorm};
 
 /// Range of a raw log-std, as in `dmprl_shared::policy::gaussian`.
 const LOG_STD: (f64, f64) = (-20.0, 2.0);
@@ -51,19 +54,37 @@ pub(super) struct StatesOn {
     pub starts: Tensor,
 }
 
-/// A multilayer perceptron over flat parameters.
-pub(super) fn network(shape: &MlpShape, flat: &Tensor, inputs: &Tensor) -> Result<Tensor> {
+/// A multilayer perceptron over flat parameters, with layer normalisation if `layer_norm`.
+pub(super) fn network(
+    shape: &MlpShape,
+    layer_norm: Option<&LayerNorm>,
+    flat: &Tensor,
+    inputs: &Tensor,
+) -> Result<Tensor> {
     let mut x = inputs.clone();
     for (index, layer) in shape.layers().iter().enumerate() {
         let weights = flat.narrow(0, layer.weights.start, layer.weights.len())?;
         let weights = weights.reshape((layer.outputs, layer.inputs))?;
         let bias = flat.narrow(0, layer.bias.start, layer.bias.len())?;
         x = x.matmul(&weights.t()?)?.broadcast_add(&bias)?;
+        if let Some(places) = layer_norm.and_then(|norm| norm.layer(index)) {
+            x = normalise(&x, places, flat)?;
+        }
         if index + 1 < shape.layers().len() {
             x = x.relu()?;
         }
     }
     Ok(x)
+}
+
+/// Layer normalisation of every row with the layer's gain and shift.
+fn normalise(x: &Tensor, places: &GainShift, flat: &Tensor) -> Result<Tensor> {
+    let gain = flat.narrow(0, places.gain.start, places.gain.len())?;
+    let shift = flat.narrow(0, places.shift.start, places.shift.len())?;
+    let centred = x.broadcast_sub(&x.mean_keepdim(D::Minus1)?)?;
+    let variance = centred.sqr()?.mean_keepdim(D::Minus1)?;
+    let std = (variance + f64::from(VARIANCE_EPSILON))?.sqrt()?;
+    centred.broadcast_div(&std)?.broadcast_mul(&gain)?.broadcast_add(&shift)
 }
 
 impl PolicyGraph {
@@ -78,7 +99,7 @@ impl PolicyGraph {
 
     /// The means that the network of parameters `flat` decides on.
     pub(super) fn means(&self, flat: &Tensor, states: &StatesOn) -> Result<Means> {
-        let outputs = network(&self.shape, flat, &states.inputs)?;
+        let outputs = network(&self.shape, None, flat, &states.inputs)?;
         let columns = self.log_std_columns.clone();
         let raw_log_stds = columns.map(|c| outputs.narrow(1, c.start, c.len())).transpose()?;
         let head_len = self.log_std_columns.as_ref().map_or(self.shape.outputs(), |c| c.start);

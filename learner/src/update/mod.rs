@@ -12,6 +12,7 @@ mod batch_pairs;
 pub mod crew;
 pub mod floor;
 pub mod kernels;
+pub mod layer_norm;
 mod packed;
 pub mod pass;
 mod step;

@@ -2,12 +2,12 @@
 
 use std::ops::Range;
 
-use dmprl_shared::policy::MlpShape;
+use dmprl_shared::policy::{Layer, MlpShape};
 
 use super::arithmetic::Arithmetic;
 use super::crew::Disjoint;
 use super::kernels::bf16::{Pair, forward_len, pairs};
-use super::kernels::{Activation, Backward, Forward, pack, packed_len};
+use super::kernels::{Activation, Backward, Forward, InstructionSet, pack, packed_len};
 
 /// Copies of all layers' weights: panels for the forward pass and, of layers whose products are of
 /// 16 bits, pairs for both passes.
@@ -50,7 +50,7 @@ impl Packed {
             ends[index] += len;
             begin..ends[index]
         };
-        let place = |layer: &dmprl_shared::policy::Layer| {
+        let place = |layer: &Layer| {
             let (inputs, outputs) = (layer.inputs, layer.outputs);
             match arithmetic.bf16(layer) {
                 None => Places {
@@ -77,19 +77,22 @@ impl Packed {
         }
     }
 
-    /// outputs = activation(inputs weightsᵀ + bias) of layer `index`.
+    /// The instructions of its passes.
+    #[must_use]
+    pub fn instructions(&self) -> InstructionSet {
+        self.arithmetic.instructions
+    }
+
+    /// outputs = activation(inputs weightsᵀ + bias) of `layer`, which is a shape's layer `index`.
     pub fn forward(
         &self,
-        shape: &MlpShape,
-        index: usize,
+        (index, layer): (usize, &Layer),
+        activation: Activation,
         parameters: &[f32],
         inputs: &[f32],
         outputs: &mut [f32],
     ) {
-        let layer = &shape.layers()[index];
         let bias = &parameters[layer.bias.clone()];
-        let last = index + 1 == shape.layers().len();
-        let activation = if last { Activation::Linear } else { Activation::Relu };
         let places = &self.layers[index];
         match self.arithmetic.bf16(layer) {
             None => {

@@ -6,6 +6,7 @@ use dmprl_shared::seeds;
 
 use super::crew::Crew;
 use super::kernels::bf16::Bf16;
+use super::layer_norm::Normalised;
 use super::pass::Gradients;
 use super::trained::{Trace, Trained};
 use super::*;
@@ -13,37 +14,48 @@ use super::*;
 struct Block {
     inputs: Vec<f32>,
     activations: Activations,
+    normalised: Option<Normalised>,
     gradients: Gradients,
 }
 
 impl Block {
     fn trace(&self) -> Trace<'_> {
-        let Self { inputs, activations, gradients } = self;
-        Trace { inputs, activations, gradients }
+        let Self { inputs, activations, normalised, gradients } = self;
+        Trace { inputs, activations, normalised: normalised.as_ref(), gradients }
     }
 }
 
+#[derive(Debug, Clone, Copy, PartialEq)]
+enum Hidden {
+    Plain,
+    Normalised,
+}
+
 /// Gradient and parameters, of network and target, after three steps towards zero outputs.
-fn steps(precision: Precision, threads: usize) -> [Vec<f32>; 3] {
+fn steps(hidden: Hidden, precision: Precision, threads: usize) -> [Vec<f32>; 3] {
     let shape = MlpShape::new(vec![23, 96, 64, 7]);
     let initial = initial_parameters(&shape, &mut seeds::stream(1, "test", 0));
     let mut trained = Trained::new(shape.clone(), initial, 1e-3, true, precision).unwrap();
+    if hidden == Hidden::Normalised {
+        trained = trained.with_layer_norm();
+    }
     let crew = Crew::new(threads);
     // The last block is short and has an odd number of rows.
     let block = |rows: usize| Block {
         inputs: (0..rows * 23).map(|i| (i as f32 * 0.37).sin()).collect(),
         activations: Activations::new(&shape, rows),
-        gradients: Gradients::new(&shape, rows),
+        normalised: Some(Normalised::new(&shape, rows)),
+        gradients: Gradients::with_layer_norm(&shape, rows),
     };
     let mut blocks = [BLOCK_ROWS, BLOCK_ROWS, 13].map(block);
     for _ in 0..3 {
         let network = trained.lend();
-        crew.each(&mut blocks, |Block { inputs, activations, gradients }| {
+        crew.each(&mut blocks, |Block { inputs, activations, normalised, gradients }| {
             let rows = inputs.len() / 23;
-            network.forward(inputs, activations);
+            network.forward(inputs, activations, normalised.as_mut());
             let out = gradients.output_mut(&shape, rows);
             out.copy_from_slice(activations.output(&shape, rows));
-            network.pass(activations, rows).backward(gradients);
+            network.pass(activations, normalised.as_ref(), rows).backward(gradients);
         });
         drop(network);
         trained.descend(&crew, &blocks, Block::trace, Some(0.1));
@@ -58,20 +70,24 @@ fn sixteen_bits_change_a_gradient_by_no_more_than_a_hundredth() {
         return;
     }
     let norm = |x: &mut dyn Iterator<Item = f32>| x.map(|x| x * x).sum::<f32>().sqrt();
-    let (exact, rounded) = (steps(Precision::F32, 1), steps(Precision::Bf16, 1));
-    for (exact, rounded) in exact.iter().zip(&rounded) {
-        let apart = norm(&mut exact.iter().zip(rounded).map(|(a, b)| a - b));
-        let ratio = apart / norm(&mut exact.iter().copied());
-        assert!(ratio < 1e-2, "{ratio}");
-        // That it is another arithmetic at all.
-        assert!(ratio > 1e-6, "{ratio}");
+    for hidden in [Hidden::Plain, Hidden::Normalised] {
+        let [exact, rounded] = [Precision::F32, Precision::Bf16].map(|p| steps(hidden, p, 1));
+        for (exact, rounded) in exact.iter().zip(&rounded) {
+            let apart = norm(&mut exact.iter().zip(rounded).map(|(a, b)| a - b));
+            let ratio = apart / norm(&mut exact.iter().copied());
+            assert!(ratio < 1e-2, "{hidden:?}: {ratio}");
+            // That it is another arithmetic at all.
+            assert!(ratio > 1e-6, "{hidden:?}: {ratio}");
+        }
     }
 }
 
 #[test]
 fn the_number_of_threads_changes_no_bit_in_either_precision() {
-    assert!(steps(Precision::F32, 1) == steps(Precision::F32, 3));
-    if Bf16::detect().is_some() {
-        assert!(steps(Precision::Bf16, 1) == steps(Precision::Bf16, 3));
+    for hidden in [Hidden::Plain, Hidden::Normalised] {
+        assert!(steps(hidden, Precision::F32, 1) == steps(hidden, Precision::F32, 3));
+        if Bf16::detect().is_some() {
+            assert!(steps(hidden, Precision::Bf16, 1) == steps(hidden, Precision::Bf16, 3));
+        }
     }
 }

@@ -12,6 +12,8 @@ pub enum AlgorithmName {
     Td3,
     /// Soft actor-critic with a learned temperature (Haarnoja et al. 2018b).
     Sac,
+    /// Neural Dynamic Policies (Bahl et al. 2020): proximal policy optimisation, on-policy.
+    Ndp,
 }
 
 /// Which actions the critic sees.
@@ -68,10 +70,15 @@ pub struct AlgorithmConfig {
     pub batch_size: usize,
     /// Widths of the critic's hidden layers.
     pub critic_hidden: Vec<usize>,
+    /// Layer normalisation (Ba et al. 2016) of the critic's hidden layers, before their ReLU, in
+    /// DDPG, TD3 and SAC: it bounds Q for actions unlike any in the replay (Ball et al. 2023).
+    pub critic_layer_norm: bool,
     /// What only TD3 has.
     pub td3: Td3Config,
     /// What only SAC has.
     pub sac: SacConfig,
+    /// What only `ndp` reads.
+    pub ndp: NdpConfig,
 }
 
 /// What only TD3 has.
@@ -128,8 +135,61 @@ impl Default for AlgorithmConfig {
             actor_learning_rate: 5e-4,
             batch_size: 256,
             critic_hidden: vec![256, 256],
+            critic_layer_norm: false,
             td3: Td3Config::default(),
             sac: SacConfig::default(),
+            ndp: NdpConfig::default(),
+        }
+    }
+}
+
+/// How step sizes change over a run.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum LearningRateDecay {
+    /// They stay.
+    None,
+    /// They fall in a straight line to zero at `run.steps`.
+    Linear,
+}
+
+/// Proximal policy optimisation over segments, after the released code of Neural Dynamic Policies.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct NdpConfig {
+    /// Half-width of the interval around 1 beyond which a ratio of probabilities earns nothing.
+    pub clip: f64,
+    /// Weight of the next segment's advantage in this one's, beside the discount.
+    pub gae_lambda: f64,
+    /// Segments, all workers together, from one policy, learned from at once; 0 stands for 10 of
+    /// each environment.
+    pub rollout_segments: usize,
+    /// Passes over a rollout.
+    pub epochs: usize,
+    /// Parts of a pass, one step of both optimisers each; a part has at least one segment.
+    pub minibatches: usize,
+    /// Weight of the entropy in the policy's loss.
+    pub entropy_coefficient: f64,
+    /// Longest gradient of each network; longer ones are shortened.
+    pub gradient_norm_max: f64,
+    /// Logarithm of the first standard deviation, in units of u, of every action dimension.
+    pub initial_log_std: f64,
+    /// How both learning rates change over the run.
+    pub learning_rate_decay: LearningRateDecay,
+}
+
+impl Default for NdpConfig {
+    fn default() -> Self {
+        Self {
+            clip: 0.1,
+            gae_lambda: 0.95,
+            rollout_segments: 0,
+            epochs: 10,
+            minibatches: 32,
+            entropy_coefficient: 0.01,
+            gradient_norm_max: 0.5,
+            initial_log_std: 0.0,
+            learning_rate_decay: LearningRateDecay::Linear,
         }
     }
 }

@@ -127,6 +127,17 @@ pub enum RhoKind {
     Free,
 }
 
+/// What turns the DMP's motion into actions.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Controller {
+    /// The adaptive inverse controller, whose rho the network decides.
+    Inverse,
+    /// Successive differences of y, times `position_scale` (Neural Dynamic Policies); not bounded,
+    /// so only for algorithms that clip.
+    Position,
+}
+
 /// Where a segment's DMP starts.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
@@ -195,6 +206,10 @@ pub struct PolicyConfig {
     pub goal_range: f64,
     /// w = weight_range * omega^2 * tanh(.), omega = alpha_y / 2.
     pub weight_range: f64,
+    /// What turns the DMP's motion into actions.
+    pub controller: Controller,
+    /// Action per unit of y moved, for `controller = "position"`.
+    pub position_scale: f64,
     /// Whether rho is bounded.
     pub rho: RhoKind,
     /// Half-width of rho around (1, 0, 0, 0) when bounded.
@@ -214,6 +229,8 @@ impl Default for PolicyConfig {
             normalise_observations: false,
             goal_range: 1.0,
             weight_range: 1.0,
+            controller: Controller::Inverse,
+            position_scale: 1.0,
             rho: RhoKind::Bounded,
             rho_range: 2.0,
             start: Start::Zero,

@@ -14,12 +14,12 @@ mod resolve;
 mod tasks;
 
 pub use algorithm::{
-    AlgorithmConfig, AlgorithmName, CriticInput, ExplorationConfig, ExplorationKind, SacConfig,
-    Target, Td3Config, WarmUpKind, Windows,
+    AlgorithmConfig, AlgorithmName, CriticInput, ExplorationConfig, ExplorationKind,
+    LearningRateDecay, NdpConfig, SacConfig, Target, Td3Config, WarmUpKind, Windows,
 };
 pub use dmp::{
-    BasisWidths, CanonicalIntegration, DmpConfig, ForcingScaling, Integrator, PolicyConfig,
-    PolicyKind, RhoKind, Start, StartSource, StartVelocity,
+    BasisWidths, CanonicalIntegration, Controller, DmpConfig, ForcingScaling, Integrator,
+    PolicyConfig, PolicyKind, RhoKind, Start, StartSource, StartVelocity,
 };
 pub use experiment::{
     ActorsConfig, CheckpointConfig, DemonstrationsConfig, Device, EvaluationConfig,
@@ -27,6 +27,6 @@ pub use experiment::{
     ReplayConfig, RunConfig, TaskConfig,
 };
 pub use layers::{ConfigError, Layers, nearest};
-pub use presets::{PRESETS, Preset, policy_defaults};
+pub use presets::{PRESETS, Preset, algorithm_defaults, policy_defaults};
 pub use resolve::Limits;
 pub use tasks::{TASKS, TaskDefaults, task_defaults};

@@ -2,7 +2,7 @@
 
 use toml::Table;
 
-use super::PolicyKind;
+use super::{AlgorithmName, PolicyKind};
 
 /// A preset: its name, one line about it, and its values as TOML.
 #[derive(Debug)]
@@ -40,6 +40,7 @@ hidden = [256, 256]
 normalise_observations = false
 goal_range = 1.0
 weight_range = 1.0
+controller = "inverse"
 rho = "bounded"
 rho_range = 2.0
 start = "observed"
@@ -64,6 +65,7 @@ critic_learning_rate = 0.0003
 actor_learning_rate = 0.0005
 batch_size = 256
 critic_hidden = [256, 256]
+critic_layer_norm = false
 [algorithm.td3]
 target_noise_std = 0.2
 target_noise_clip = 0.5
@@ -112,6 +114,36 @@ pub fn policy_defaults(kind: PolicyKind) -> Option<Table> {
     }
 }
 
+/// What an algorithm is published with, over task and preset, below everything that the user says:
+/// presets describe DDPG-DMP, and their start, integrator and forcing are not those of others.
+///
+/// # Panics
+/// Never: a test parses it.
+#[must_use]
+pub fn algorithm_defaults(name: AlgorithmName) -> Option<Table> {
+    match name {
+        AlgorithmName::Ddpg | AlgorithmName::Td3 | AlgorithmName::Sac => None,
+        AlgorithmName::Ndp => Some(NDP.parse().expect("the built-in defaults are valid TOML")),
+    }
+}
+
+// Of the released code of Neural Dynamic Policies: integrator, forcing, start, step sizes. Workers
+// and pacing are nobody's: on-policy, each update waits for its segments.
+const NDP: &str = r#"
+[policy]
+controller = "position"
+start = "observed"
+start_velocity = "measured"
+[dmp]
+integrator = "explicit"
+forcing_scaling = "goal"
+[algorithm]
+actor_learning_rate = 0.0003
+critic_learning_rate = 0.0003
+[exploration]
+warm_up_steps = 0
+"#;
+
 impl Preset {
     /// The preset's values.
     ///
@@ -141,7 +173,11 @@ mod tests {
             let missing = |key: &String| !keys(&paper, section).contains(key);
             let missing: Vec<_> = keys(&all, section).into_iter().filter(missing).collect();
             // A policy without a DMP is the user's choice, not the paper's.
-            let missing: Vec<_> = missing.into_iter().filter(|key| key != "kind").collect();
+            // So is another algorithm, with what only that reads.
+            let others = |key: &String| {
+                !["kind", "td3", "sac", "ndp", "position_scale"].contains(&key.as_str())
+            };
+            let missing: Vec<_> = missing.into_iter().filter(others).collect();
             assert!(missing.is_empty(), "{section}: {missing:?}");
         }
     }

@@ -1,6 +1,9 @@
 //! Checks the merged tree: ranges, combinations, caps.
 
-use super::{ConfigError, CriticInput, ExperimentConfig, PolicyKind, Start, WarmUpKind, Windows};
+use super::{
+    AlgorithmName, ConfigError, Controller, CriticInput, ExperimentConfig, PolicyKind, Start,
+    WarmUpKind, Windows,
+};
 
 /// What the machine sets: passed in, never read here.
 #[derive(Debug, Clone, Copy)]
@@ -16,6 +19,8 @@ const ENVS_PER_WORKER_MAX: usize = 4_096;
 const SEGMENT_STEPS_MAX: usize = 255;
 const HINDSIGHT_COPIES_MAX: usize = 64;
 const HIDDEN_MAX: usize = 65_536;
+/// 50 environment steps of each environment at K = 5, as published.
+const ROLLOUT_SEGMENTS_PER_ENV: usize = 10;
 
 impl ExperimentConfig {
     /// Fills in what depends on the machine or the policy's kind and checks every value.
@@ -32,10 +37,15 @@ impl ExperimentConfig {
         if self.run.deterministic {
             self.actors.workers = 1;
         }
+        if self.algorithm.ndp.rollout_segments == 0 {
+            let envs = self.actors.workers.saturating_mul(self.actors.envs_per_worker);
+            self.algorithm.ndp.rollout_segments = envs.saturating_mul(ROLLOUT_SEGMENTS_PER_ENV);
+        }
         self.check_counts()?;
         self.check_numbers()?;
         self.check_dmp()?;
         self.check_combinations()?;
+        self.check_ndp()?;
         Ok(self)
     }
 
@@ -184,6 +194,66 @@ impl ExperimentConfig {
             format!("task `{}` has no task.start_sources to read y0 from", self.task.name)
         })
     }
+
+    fn check_ndp(&self) -> Result<(), ConfigError> {
+        let ndp = &self.algorithm.ndp;
+        let counts = [
+            ("algorithm.ndp.rollout_segments", ndp.rollout_segments, 1 << 24),
+            ("algorithm.ndp.epochs", ndp.epochs, 10_000),
+            ("algorithm.ndp.minibatches", ndp.minibatches, 1 << 24),
+        ];
+        for (key, got, high) in counts {
+            range(key, got, (1..=high).contains(&got), || format!("from 1 to {high}"))?;
+        }
+        let positive = [
+            ("algorithm.ndp.clip", ndp.clip),
+            ("algorithm.ndp.gradient_norm_max", ndp.gradient_norm_max),
+            ("policy.position_scale", self.policy.position_scale),
+        ];
+        for (key, got) in positive {
+            range(key, got, got.is_finite() && got > 0.0, || "a positive number".into())?;
+        }
+        let lambda = ndp.gae_lambda;
+        let fits = (0.0..=1.0).contains(&lambda);
+        range("algorithm.ndp.gae_lambda", lambda, fits, || "from 0 to 1".into())?;
+        let entropy = ndp.entropy_coefficient;
+        let fits = entropy.is_finite() && entropy >= 0.0;
+        range("algorithm.ndp.entropy_coefficient", entropy, fits, || "0 or more".into())?;
+        let log_std = ndp.initial_log_std;
+        let fits = (-10.0..=2.0).contains(&log_std);
+        range("algorithm.ndp.initial_log_std", log_std, fits, || "from -10 to 2".into())?;
+        let on_policy = self.algorithm.name == AlgorithmName::Ndp;
+        range("policy.kind", "mlp", !on_policy || self.policy.kind == PolicyKind::Dmp, || {
+            "algorithm.name = \"ndp\" is about movement primitives: leave policy.kind at \"dmp\""
+                .into()
+        })?;
+        let warm_up = self.exploration.warm_up_steps;
+        range("exploration.warm_up_steps", warm_up, !on_policy || warm_up == 0, || {
+            "0 with algorithm.name = \"ndp\", which learns only from what its own policy did".into()
+        })?;
+        let on_cpu = self.learner.device == super::Device::Cpu;
+        range("learner.device", "cuda", !on_policy || on_cpu, || {
+            "cpu with algorithm.name = \"ndp\", whose minibatches are too small for a GPU".into()
+        })?;
+        let relabels = self.replay.hindsight != super::Hindsight::None;
+        range("replay.hindsight", "future", !on_policy || !relabels, || {
+            "none with algorithm.name = \"ndp\", which has no replay".into()
+        })?;
+        let demonstrated = !self.demonstrations.files.is_empty();
+        range("demonstrations.files", "files", !on_policy || !demonstrated, || {
+            "none with algorithm.name = \"ndp\", which has no replay".into()
+        })?;
+        let layer_norm = self.algorithm.critic_layer_norm;
+        range("algorithm.critic_layer_norm", "true", !on_policy || !layer_norm, || {
+            "false with algorithm.name = \"ndp\", whose critic judges states of its own policy"
+                .into()
+        })?;
+        let position = self.policy.controller == Controller::Position;
+        let dmp = self.policy.kind == PolicyKind::Dmp;
+        range("policy.controller", "position", on_policy || !position || !dmp, || {
+            "inverse, or algorithm.name = \"ndp\", which alone clips actions without bounds".into()
+        })
+    }
 }
 
 fn range(
@@ -239,6 +309,19 @@ mod tests {
     }
 
     #[test]
+    fn ndp_wants_movement_primitives_and_no_warm_up() {
+        let ndp = ("algorithm.name", "ndp");
+        let cold = ("exploration.warm_up_steps", "0");
+        let config = resolved(&[ndp, cold, ("actors.workers", "3")]).unwrap();
+        assert_eq!(config.algorithm.ndp.rollout_segments, 10 * 3 * 8);
+        let refused = |more| resolved(&[ndp, cold, more]).unwrap_err().to_string();
+        let mlp = refused(("policy.kind", "mlp"));
+        assert!(mlp.contains("about movement primitives"), "{mlp}");
+        assert!(refused(("exploration.warm_up_steps", "1")).contains("its own policy"));
+        assert!(refused(("policy.start", "observed")).contains("start_sources"));
+    }
+
+    #[test]
     fn values_out_of_range_are_refused_by_name() {
         for (key, value) in [
             ("dmp.alpha_y", "70"),
@@ -253,6 +336,12 @@ mod tests {
             ("algorithm.target", "literal"),
             ("policy.start", "carry"),
             ("policy.start", "observed"),
+            ("policy.controller", "position"),
+            ("algorithm.name", "ndp"),
+            ("algorithm.ndp.clip", "0"),
+            ("algorithm.ndp.gae_lambda", "1.1"),
+            ("algorithm.ndp.minibatches", "0"),
+            ("algorithm.ndp.initial_log_std", "nan"),
         ] {
             let message = resolved(&[(key, value)]).unwrap_err().to_string();
             assert!(message.contains("expected"), "{key} = {value}: {message}");

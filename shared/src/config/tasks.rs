@@ -170,7 +170,8 @@ start_sources = [
 
 const PANDA_REACH_JOINTS_VALUES: &[&str] = &[JOINTS, PANDA_RUN, PANDA_TABLE_2];
 
-const PANDA_RUN: &str = "[run]\nsteps = 30000\n";
+// u = 1 moves gripper or joint by 0.05 m or rad: with 20, a robot follows its primitive's y.
+const PANDA_RUN: &str = "[run]\nsteps = 30000\n[policy]\nposition_scale = 20.0\n";
 
 // Table 2 of the paper, the column of the Panda tasks: what every preset keeps of it,
 const PANDA_TABLE_2: &str = r#"

@@ -1,4 +1,5 @@
-//! From u in [-1, 1] to the environment's units, per dimension: action = mid + half_range u.
+//! From u to the environment's units, per dimension: action = mid + half_range u, u clipped to
+//! [-1, 1], beyond which a Gaussian's draws may lie.
 
 use crate::spec::EnvSpec;
 
@@ -20,12 +21,12 @@ impl ActionScaling {
         }
     }
 
-    /// Scales `u`, (rows, A), into `actions`, (rows, A) in the environment's units.
+    /// Clips and scales `u`, (rows, A), into `actions`, (rows, A) in the environment's units.
     pub fn apply(&self, u: &[f32], actions: &mut [f64]) {
         let dims = self.mid.len();
         for (row, out) in u.chunks_exact(dims).zip(actions.chunks_exact_mut(dims)) {
             for (d, (u, out)) in row.iter().zip(out).enumerate() {
-                *out = self.mid[d] + self.half_range[d] * f64::from(*u);
+                *out = self.mid[d] + self.half_range[d] * f64::from(u.clamp(-1.0, 1.0));
             }
         }
     }
@@ -57,11 +58,12 @@ mod tests {
             episode_steps: 0,
             observation_names: Vec::new(),
         };
-        let mut actions = [0.0; 6];
-        ActionScaling::new(&spec).apply(&[-1.0, -1.0, 0.0, 0.0, 1.0, 1.0], &mut actions);
-        assert_eq!(actions, [-15.0, 0.0, 0.0, 2.0, 15.0, 4.0]);
-        let mut u = [0.0; 6];
-        ActionScaling::new(&spec).invert(&actions, &mut u);
-        assert_eq!(u, [-1.0, -1.0, 0.0, 0.0, 1.0, 1.0]);
+        let mut actions = [0.0; 8];
+        let u = [-1.0, -1.0, 0.0, 0.0, 1.0, 1.0, -7.0, 1.5];
+        ActionScaling::new(&spec).apply(&u, &mut actions);
+        assert_eq!(actions, [-15.0, 0.0, 0.0, 2.0, 15.0, 4.0, -15.0, 4.0]);
+        let mut inverse = [0.0; 6];
+        ActionScaling::new(&spec).invert(&actions[..6], &mut inverse);
+        assert_eq!(inverse, u[..6]);
     }
 }

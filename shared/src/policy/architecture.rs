@@ -1,6 +1,6 @@
 //! What makes two policies the same function of parameters and observation.
 
-use crate::config::{AlgorithmName, ExperimentConfig, PolicyKind, StartSource};
+use crate::config::{AlgorithmName, Controller, ExperimentConfig, PolicyKind, StartSource};
 use crate::seeds;
 use crate::spec::EnvSpec;
 
@@ -26,6 +26,9 @@ pub(super) fn hash(config: &ExperimentConfig, spec: &EnvSpec) -> u64 {
     if config.algorithm.name == AlgorithmName::Sac {
         list.push_str(" squashed gaussian");
     }
+    if config.algorithm.name == AlgorithmName::Ndp {
+        list.push_str(" learned std");
+    }
     seeds::derive(0, &list, 0)
 }
 
@@ -49,6 +52,9 @@ fn dmp(config: &ExperimentConfig, spec: &EnvSpec) -> String {
         policy.start,
         policy.start_velocity,
     );
+    if policy.controller == Controller::Position {
+        list.push_str(&format!(" position {:?}", policy.position_scale));
+    }
     if policy.start == crate::config::Start::Observed {
         list.push_str(&format!(" {:?}", spec.control_dt_s));
         for source in &config.task.start_sources {
@@ -101,7 +107,11 @@ mod tests {
     #[test]
     fn what_changes_the_function_changes_the_hash_and_nothing_else_does() {
         let same = hash_of(&[]);
-        for (key, value) in [("algorithm.batch_size", "8"), ("task.python_path", "[\"x\"]")] {
+        for (key, value) in [
+            ("algorithm.batch_size", "8"),
+            ("task.python_path", "[\"x\"]"),
+            ("policy.position_scale", "2.0"),
+        ] {
             assert_eq!(hash_of(&[(key, value)]), same, "{key}");
         }
         for (key, value) in [
@@ -112,6 +122,8 @@ mod tests {
             ("dmp.integrator", "explicit"),
             ("policy.kind", "mlp"),
             ("algorithm.name", "sac"),
+            ("policy.controller", "position"),
+            ("algorithm.name", "ndp"),
         ] {
             assert_ne!(hash_of(&[(key, value)]), same, "{key}");
         }

@@ -2,13 +2,13 @@
 //!
 //! Outputs of one action dimension stand together: goal, N weights, 4 rho. With t = tanh(output):
 //! g = goal_range t, w = weight_range omega² t, rho = (1, 0, 0, 0) + rho_range t, or + output for
-//! `free` rho (specification, sections 2 and 3).
+//! `free` rho (specification, sections 2 and 3). With `controller = "position"` there is no rho.
 
 use super::PolicyError;
 use super::start::StartState;
 use super::tanh;
-use crate::config::{ExperimentConfig, PolicyKind, RhoKind, Start};
-use crate::dmp::{Dmp, SegmentMap, act, act_backward};
+use crate::config::{Controller, ExperimentConfig, PolicyKind, RhoKind, Start};
+use crate::dmp::{Dmp, SegmentMap, act, act_backward, act_position, act_position_backward};
 use crate::spec::EnvSpec;
 
 /// Length of the DMP state (y, yd) that a carrying policy appends to the observation.
@@ -31,6 +31,8 @@ pub struct DmpHead {
     steps: usize,
     basis_count: usize,
     goal_range: f32,
+    controller: Controller,
+    position_scale: f32,
     rho: RhoKind,
     rho_range: f32,
     omega: f32,
@@ -81,6 +83,8 @@ impl DmpHead {
             steps: config.policy.segment_steps,
             basis_count: config.dmp.basis_count,
             goal_range: config.policy.goal_range as f32,
+            controller: config.policy.controller,
+            position_scale: config.policy.position_scale as f32,
             rho: config.policy.rho,
             rho_range: config.policy.rho_range as f32,
             omega: dmp.omega() as f32,
@@ -94,7 +98,11 @@ impl DmpHead {
     }
 
     fn per_dimension(&self) -> usize {
-        1 + self.basis_count + RHO_LEN
+        1 + self.basis_count
+            + match self.controller {
+                Controller::Inverse => RHO_LEN,
+                Controller::Position => 0,
+            }
     }
 
     fn inputs_len(&self) -> usize {
@@ -159,7 +167,12 @@ impl DmpHead {
                 inputs[2] = self.goal_range * squashed[0];
                 inputs[3..].copy_from_slice(&squashed[1..=self.basis_count]);
                 self.map.forward(inputs, samples);
-                act(samples, &self.rho(squashed), &mut scratch.means);
+                match self.controller {
+                    Controller::Inverse => act(samples, &self.rho(squashed), &mut scratch.means),
+                    Controller::Position => {
+                        act_position(inputs[0], samples, self.position_scale, &mut scratch.means);
+                    }
+                }
                 for (k, mean) in scratch.means.iter().enumerate() {
                     means[k * dims + d] = *mean;
                 }
@@ -237,9 +250,7 @@ impl DmpHead {
                 let at = (row * steps + k) * dims + d;
                 scratch.means_gradient[k] = gradient.means[at];
             }
-            let rho = self.rho(squashed);
-            let rho_gradient =
-                act_backward(samples, &rho, &scratch.means_gradient, &mut scratch.samples_gradient);
+            let rho_gradient = self.controller_backward(squashed, samples, scratch);
             if !gradient.end_state.is_empty() {
                 let end = &gradient.end_state[row * 2 * dims..];
                 scratch.samples_gradient[steps - 1] += end[d];
@@ -247,6 +258,27 @@ impl DmpHead {
             }
             self.map.backward(inputs, &scratch.samples_gradient, &mut scratch.inputs_gradient);
             self.unsquash(squashed, &scratch.inputs_gradient, &rho_gradient, out);
+        }
+    }
+
+    /// From the means' gradient to the samples', both in `scratch`; returns rho's.
+    fn controller_backward(
+        &self,
+        squashed: &[f32],
+        samples: &[f32],
+        scratch: &mut Scratch,
+    ) -> [f32; RHO_LEN] {
+        let Scratch { means_gradient, samples_gradient, .. } = scratch;
+        match self.controller {
+            Controller::Inverse => {
+                let rho = self.rho(squashed);
+                act_backward(samples, &rho, means_gradient, samples_gradient)
+            }
+            Controller::Position => {
+                // The start is measured or carried: nothing is learned through it.
+                act_position_backward(self.position_scale, means_gradient, samples_gradient);
+                [0.0; RHO_LEN]
+            }
         }
     }
 
@@ -262,6 +294,9 @@ impl DmpHead {
         for i in 0..self.basis_count {
             out[1 + i] = inputs_gradient[3 + i] * slope(squashed[1 + i]);
         }
+        if self.controller == Controller::Position {
+            return;
+        }
         for (i, gradient) in rho_gradient.iter().enumerate() {
             let at = 1 + self.basis_count + i;
             let slope = if self.rho == RhoKind::Bounded { slope(squashed[at]) } else { 1.0 };
@@ -269,3 +304,6 @@ impl DmpHead {
         }
     }
 }
+
+#[cfg(test)]
+mod tests;

@@ -14,6 +14,7 @@ mod action_scaling;
 mod architecture;
 mod dmp_head;
 pub mod gaussian;
+mod learned_std;
 mod matrix;
 mod network;
 mod start;
@@ -26,13 +27,14 @@ use thiserror::Error;
 
 pub use action_scaling::ActionScaling;
 pub use dmp_head::{DmpHead, DmpWorkspace, HeadGradient};
+pub use learned_std::LearnedStd;
 pub use matrix::{Keep, Matrix, product};
 pub use network::{Activations, Layer, MlpShape, SmallBatchNetwork, forward, initial_parameters};
 pub use tanh::tanh;
 
-use crate::config::{AlgorithmName, ExperimentConfig, PolicyKind};
+use crate::config::{AlgorithmName, Controller, ExperimentConfig, PolicyKind};
 use crate::dmp::DmpError;
-use crate::segment::SegmentLayout;
+use crate::segment::{ActionBounds, SegmentLayout};
 use crate::spec::{EnvSpec, SpecError};
 
 /// Why a policy cannot be built.
@@ -74,6 +76,9 @@ pub struct Policy {
     /// Outputs of the network that the head reads; log-stds may follow.
     head_outputs: usize,
     layout: SegmentLayout,
+    learned_std: Option<LearnedStd>,
+    /// Whether u = tanh(mean); the position controller's means are actions already.
+    squashes: bool,
     scaling: ActionScaling,
     env_observation_len: usize,
     architecture_hash: u64,
@@ -84,20 +89,12 @@ pub struct Policy {
 pub struct PolicyWorkspace {
     /// The network's activations, kept for the backward pass.
     pub activations: Activations,
-    /// tanh⁻¹ of u, (rows, K, A).
+    /// What u is made of, (rows, K, A): tanh⁻¹ of u, or u itself (see [`Policy::squashes`]).
     pub means: Vec<f32>,
     /// u, (rows, K, A).
     pub actions: Vec<f32>,
     /// What the head keeps for the backward pass.
     pub dmp: Option<DmpWorkspace>,
-}
-
-impl PolicyWorkspace {
-    /// u = tanh(mean) for the first `len` means.
-    pub fn squash_means(&mut self, len: usize) {
-        self.actions[..len].copy_from_slice(&self.means[..len]);
-        tanh(&mut self.actions[..len]);
-    }
 }
 
 impl Policy {
@@ -128,6 +125,9 @@ impl Policy {
         widths.push(outputs);
         Ok(Self {
             shape: MlpShape::new(widths),
+            learned_std: LearnedStd::of(config, spec),
+            squashes: config.policy.kind == PolicyKind::Mlp
+                || config.policy.controller == Controller::Inverse,
             head,
             head_outputs,
             layout,
@@ -153,6 +153,31 @@ impl Policy {
     #[must_use]
     pub fn shape(&self) -> &MlpShape {
         &self.shape
+    }
+
+    /// Length P of the flat parameters: the network's, then those of the action distribution.
+    #[must_use]
+    pub fn parameters_len(&self) -> usize {
+        self.shape.parameters_len() + self.learned_std.as_ref().map_or(0, LearnedStd::len)
+    }
+
+    /// The standard deviations of the Gaussian that actions are drawn from, if they are learned
+    /// and do not depend on the state.
+    #[must_use]
+    pub fn learned_std(&self) -> Option<&LearnedStd> {
+        self.learned_std.as_ref()
+    }
+
+    /// Whether u = tanh(mean) rather than the mean itself.
+    #[must_use]
+    pub fn squashes(&self) -> bool {
+        self.squashes
+    }
+
+    /// Bounds of the actions in a segment.
+    #[must_use]
+    pub fn action_bounds(&self) -> ActionBounds {
+        if self.learned_std.is_some() { ActionBounds::None } else { ActionBounds::Unit }
     }
 
     /// What follows the network.
@@ -189,7 +214,11 @@ impl Policy {
     /// Freshly drawn parameters.
     #[must_use]
     pub fn initial_parameters(&self, random: &mut Xoshiro256PlusPlus) -> Vec<f32> {
-        initial_parameters(&self.shape, random)
+        let mut parameters = initial_parameters(&self.shape, random);
+        if let Some(learned) = &self.learned_std {
+            parameters.extend(std::iter::repeat_n(learned.initial(), learned.len()));
+        }
+        parameters
     }
 
     /// Buffers for up to `rows_max` observations at a time.
@@ -206,14 +235,17 @@ impl Policy {
         }
     }
 
-    /// Computes u for every observation into `work.actions`.
+    /// Computes u for every observation into `work.actions`; with a Gaussian, its mean, which is
+    /// not bounded.
     ///
     /// - `parameters`: (P,). `observations`: (rows, O).
     ///
     /// # Panics
     /// If a length does not fit or there are more rows than the workspace holds.
     pub fn act(&self, parameters: &[f32], observations: &[f32], work: &mut PolicyWorkspace) {
-        forward(&self.shape, parameters, observations, &mut work.activations);
+        assert_eq!(parameters.len(), self.parameters_len(), "policy parameters");
+        let network = &parameters[..self.shape.parameters_len()];
+        forward(&self.shape, network, observations, &mut work.activations);
         self.decode(observations, work);
     }
 
@@ -233,6 +265,14 @@ impl Policy {
                 rows.for_each(|(outputs, means)| means.copy_from_slice(&outputs[..dims]));
             }
         }
-        work.squash_means(rows * self.layout.actions_len());
+        self.bound_means(work, rows * self.layout.actions_len());
+    }
+
+    /// From the first `len` means to u.
+    pub fn bound_means(&self, work: &mut PolicyWorkspace, len: usize) {
+        work.actions[..len].copy_from_slice(&work.means[..len]);
+        if self.squashes {
+            tanh(&mut work.actions[..len]);
+        }
     }
 }

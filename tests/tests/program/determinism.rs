@@ -18,9 +18,9 @@ struct Result {
     checkpoint: BTreeMap<String, Vec<u8>>,
 }
 
-fn trained(place: &Workplace, name: &str, seed: &str) -> Result {
+fn trained(place: &Workplace, name: &str, seed: &str, more: &[&str]) -> Result {
     let run = place.path(name);
-    let more = ["--deterministic", "--seed", seed, "--steps", "2500"];
+    let more = [&["--deterministic", "--seed", seed, "--steps", "2500"], more].concat();
     place.run(&train("reacher", &run, &more)).with_status(0);
     let timeless = |file| {
         let mut rows = rows(&run, file);
@@ -43,17 +43,27 @@ fn trained(place: &Workplace, name: &str, seed: &str) -> Result {
 #[test]
 fn the_same_seed_gives_the_same_bytes_and_another_seed_does_not() {
     let place = Workplace::new();
-    let first = trained(&place, "first", "7");
+    let first = trained(&place, "first", "7", &[]);
     assert_eq!((first.metrics.len(), first.evaluations.len(), first.checkpoint.len()), (5, 3, 3));
-    let second = trained(&place, "second", "7");
+    let second = trained(&place, "second", "7", &[]);
     assert_eq!(first.metrics, second.metrics);
     assert_eq!(first.evaluations, second.evaluations);
     for (name, bytes) in &first.checkpoint {
         assert!(second.checkpoint[name] == *bytes, "{name} of the checkpoints differs");
     }
-    let other = trained(&place, "other", "8");
+    let other = trained(&place, "other", "8", &[]);
     assert_ne!(first.evaluations, other.evaluations);
     for (name, bytes) in &first.checkpoint {
         assert!(other.checkpoint[name] != *bytes, "{name} does not depend on the seed");
     }
+}
+
+#[test]
+fn on_policy_the_same_seed_gives_the_same_bytes_too() {
+    let place = Workplace::new();
+    let ndp = ["--algo", "ndp", "--set", "exploration.warm_up_steps=0"];
+    let first = trained(&place, "first", "7", &ndp);
+    let last = first.metrics.last().unwrap();
+    assert!(last["updates"].as_u64() > Some(0), "{last}");
+    assert!(first == trained(&place, "second", "7", &ndp));
 }

@@ -9,6 +9,7 @@
 )]
 
 mod bench;
+mod bench_learner;
 mod deaths;
 mod determinism;
 mod endings;

@@ -13,6 +13,8 @@ fn wrong_use_names_the_right_word_and_creates_nothing() {
         (&["train", "reacher", "--preset", "papr"], "paper"),
         (&["train", "reacher", "--set", "algorithm.bach_size=3"], "algorithm.batch_size"),
         (&["train", "reacher", "--set", "policy.start=carry"], "warm_up_kind"),
+        (&["train", "reacher", "--algo", "ndp", "--policy", "mlp"], "movement primitives"),
+        (&["train", "Pendulum-v1", "--algo", "ndp"], "start_sources"),
         (&["train", "reacher", "--set", "novalue"], "KEY=VALUE"),
         (&["train", "reacher", "--steps", "0"], "run.steps"),
         (&["train", "reacher", "--init-from", "nowhere"], "nowhere"),

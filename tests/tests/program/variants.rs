@@ -40,6 +40,17 @@ fn a_dmp_that_carries_its_state_on_trains() {
     trains("reacher", &carry);
 }
 
+/// On-policy: its segments are not bounded, and some are stale.
+#[test]
+fn neural_dynamic_policies_train() {
+    let ndp = |more: &[&'static str]| {
+        [&["--algo", "ndp", "--set", "exploration.warm_up_steps=0"], more].concat()
+    };
+    trains("reacher", &ndp(&["--workers", "1"]));
+    trains("panda-reach", &ndp(&["--preset", "paper"]));
+    trains("pusher", &ndp(&["--set", "policy.controller=inverse"]));
+}
+
 #[test]
 fn the_seven_joints_of_pusher_train() {
     trains("pusher", &[]);

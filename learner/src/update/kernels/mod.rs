@@ -19,6 +19,7 @@
 mod backward;
 pub mod bf16;
 mod forward;
+mod layer_norm;
 mod optimizer;
 mod pack;
 #[cfg(test)]
@@ -28,6 +29,8 @@ mod weight_gradient;
 
 pub use backward::Backward;
 pub use forward::{Activation, Forward};
+pub(crate) use layer_norm::VARIANCE_EPSILON;
+pub use layer_norm::{GainGradient, Normalise, NormaliseBackward, NormalisedBlock};
 pub use optimizer::{AdamPass, Follow, StepSizes, adam, polyak};
 pub(crate) use optimizer::{BETA1, BETA2, EPSILON};
 pub use pack::{pack, packed_len};

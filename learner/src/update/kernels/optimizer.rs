@@ -34,6 +34,12 @@ impl StepSizes {
             epsilon: (f64::from(EPSILON) * root) as f32,
         }
     }
+
+    /// The same with the learning rate multiplied by `share`.
+    #[must_use]
+    pub fn scaled(self, share: f32) -> Self {
+        Self { step: self.step * share, ..self }
+    }
 }
 
 /// target <- polyak * network + (1 - polyak) * target.

@@ -1,0 +1,70 @@
+//! A replay full of segments that nobody has lived: the sizes are a task's, the numbers anything.
+
+use anyhow::Context;
+use dmprl_learner::learner::Learner;
+use dmprl_shared::config::TaskDefaults;
+use dmprl_shared::segment::{LAYOUT_VERSION, Segment, SegmentHeader, TRUNCATED, block_checksum};
+use dmprl_shared::spec::EnvSpec;
+
+/// The run that the segments say they are from.
+pub(super) const RUN_ID: u64 = 1;
+
+/// Enough for a batch not to lie in the processor's cache.
+const STEPS: usize = 100_000;
+
+/// Between two numbers; irrational to the sine's period.
+const STRIDE: f32 = 0.37;
+
+/// What the table of tasks says of an environment.
+#[must_use]
+pub fn spec_of(task: &TaskDefaults) -> EnvSpec {
+    EnvSpec {
+        id: task.id.into(),
+        observation_len: task.observation_len,
+        action_len: task.action_low.len(),
+        action_low: task.action_low.to_vec(),
+        action_high: task.action_high.to_vec(),
+        control_dt_s: task.control_dt_s,
+        episode_steps: task.episode_steps,
+        observation_names: Vec::new(),
+    }
+}
+
+/// Inserts whole episodes, one environment after the other.
+pub(super) fn fill(learner: &mut Learner, spec: &EnvSpec) -> anyhow::Result<()> {
+    let layout = learner.policy().layout();
+    let mut segment = Segment::zeroed(layout);
+    let steps = STEPS.min(learner.config().replay.capacity_steps);
+    let (mut done, mut numbers, mut sequence, mut episode) = (0, 0, 0, 0);
+    while done < steps {
+        let mut episode_step = 0;
+        while episode_step < spec.episode_steps {
+            let steps_len = (spec.episode_steps - episode_step).min(layout.segment_steps as u32);
+            for value in &mut segment.block {
+                numbers += 1;
+                *value = (numbers as f32 * STRIDE).sin();
+            }
+            sequence += 1;
+            segment.header = SegmentHeader {
+                layout_version: LAYOUT_VERSION,
+                flags: if episode_step + steps_len == spec.episode_steps { TRUNCATED } else { 0 },
+                run_id: RUN_ID,
+                architecture_hash: learner.policy().architecture_hash(),
+                sequence,
+                episode,
+                episode_step,
+                steps_len,
+                segment_steps: layout.segment_steps as u32,
+                observation_len: layout.observation_len as u32,
+                action_len: layout.action_len as u32,
+                checksum: block_checksum(&segment.block),
+                ..SegmentHeader::default()
+            };
+            learner.insert(&segment).context("a made-up segment was refused")?;
+            episode_step += steps_len;
+        }
+        done += spec.episode_steps as usize;
+        episode += 1;
+    }
+    Ok(())
+}

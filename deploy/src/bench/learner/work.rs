@@ -1,0 +1,126 @@
+//! The parts of an update alone: its matrix products, its batch, its optimiser.
+
+use std::time::{Duration, Instant};
+
+use anyhow::ensure;
+use dmprl_learner::algorithms::{Batch, Cycle, OptimiserSteps};
+use dmprl_learner::learner::Learner;
+use dmprl_learner::update::crew::Crew;
+use dmprl_learner::update::floor::{Engine, Floor, Product};
+use dmprl_shared::policy::Head;
+use rustix::time::{ClockId, clock_gettime};
+
+use super::figures::Timed;
+
+/// Run before the clock starts: caches and clock frequency then are those of a long run.
+const SETTLE_SHARE: u32 = 8;
+
+/// Calls `work` for so long and returns the time of one call.
+pub(super) fn timed(
+    duration: Duration,
+    mut work: impl FnMut() -> anyhow::Result<()>,
+) -> anyhow::Result<Timed> {
+    let end = Instant::now() + duration / SETTLE_SHARE;
+    while Instant::now() < end {
+        work()?;
+    }
+    let (start, cpu, mut calls) = (Instant::now(), cpu_s(), 0.0);
+    while start.elapsed() < duration {
+        work()?;
+        calls += 1.0;
+    }
+    let wall_s = start.elapsed().as_secs_f64() / calls;
+    ensure!(calls > 0.0 && wall_s > 0.0, "nothing was done in {duration:?}");
+    Ok(Timed { wall_s, cpu_s: (cpu_s() - cpu) / calls })
+}
+
+/// Processor time of all threads of this process so far [s].
+fn cpu_s() -> f64 {
+    let time = clock_gettime(ClockId::ProcessCPUTime);
+    time.tv_sec as f64 + time.tv_nsec as f64 * 1e-9
+}
+
+/// The products of an update. With several threads each has its share of the rows: what the
+/// shares' parts of a weight's gradient add up to is no product.
+pub(super) struct FloorWork {
+    crew: Crew,
+    shares: Vec<Floor>,
+    updates: f64,
+}
+
+impl FloorWork {
+    pub(super) fn new(learner: &Learner) -> Self {
+        let threads = learner.config().learner.threads;
+        let Cycle { products, updates } = learner.algorithm.products();
+        let share = |index: usize| {
+            let of = |product: &Product| {
+                let rows = product.rows * (index + 1) / threads - product.rows * index / threads;
+                (rows > 0).then_some(Product { rows, ..*product })
+            };
+            Floor::new(products.iter().filter_map(of))
+        };
+        Self {
+            crew: Crew::new(threads),
+            shares: (0..threads).map(share).collect(),
+            updates: updates as f64,
+        }
+    }
+
+    pub(super) fn measure(&mut self, engine: Engine, duration: Duration) -> anyhow::Result<Timed> {
+        let Self { crew, shares, updates } = self;
+        let cycle = timed(duration, || {
+            crew.each(shares, |floor| floor.run(engine));
+            Ok(())
+        })?;
+        Ok(cycle.over(*updates))
+    }
+}
+
+/// Sampling a batch.
+pub(super) struct SampleWork {
+    batch: Batch,
+    omega: f32,
+}
+
+impl SampleWork {
+    pub(super) fn new(learner: &Learner) -> Self {
+        let omega = match learner.policy().head() {
+            Head::Dmp(head) => head.omega(),
+            Head::Mlp => 1.0,
+        };
+        Self { batch: Batch::new(learner.algorithm.batch_shape()), omega }
+    }
+
+    pub(super) fn measure(
+        &mut self,
+        learner: &mut Learner,
+        duration: Duration,
+    ) -> anyhow::Result<Timed> {
+        let shape = learner.algorithm.batch_shape();
+        let config = learner.config().algorithm.clone();
+        let Self { batch, omega } = self;
+        timed(duration, || {
+            let source = (&learner.replay, &mut learner.sampler);
+            Ok(batch.sample(shape, &config, *omega, learner.normaliser.as_ref(), source)?)
+        })
+    }
+}
+
+/// The optimiser and the targets, without the gradients.
+pub(super) struct OptimiserWork(OptimiserSteps);
+
+impl OptimiserWork {
+    pub(super) fn new(learner: &Learner) -> Self {
+        let config = learner.config();
+        let (threads, polyak) = (config.learner.threads, config.algorithm.polyak as f32);
+        Self(OptimiserSteps::new(&learner.algorithm, threads, polyak))
+    }
+
+    pub(super) fn measure(&mut self, duration: Duration) -> anyhow::Result<Timed> {
+        let cycle = timed(duration, || {
+            self.0.run();
+            Ok(())
+        })?;
+        Ok(cycle.over(self.0.updates as f64))
+    }
+}

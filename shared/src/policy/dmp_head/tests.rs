@@ -1,0 +1,73 @@
+//! Gradients of the head against central differences of what it computes.
+
+use rand::RngExt;
+
+use super::*;
+use crate::config::Layers;
+use crate::seeds;
+
+const ROWS: usize = 3;
+
+fn head(keys: &[(&str, &str)]) -> DmpHead {
+    let mut layers = Layers::new();
+    let sources = "[{cos=0, sin=1, velocity=2}, {index=3, velocity=2, scale=-1.0}]";
+    layers.set("test", "task.start_sources", sources).unwrap();
+    for (key, value) in keys {
+        layers.set("test", key, value).unwrap();
+    }
+    let spec = EnvSpec {
+        id: "Test-v0".into(),
+        observation_len: 4,
+        action_len: 2,
+        action_low: vec![-1.0; 2],
+        action_high: vec![1.0; 2],
+        control_dt_s: 0.02,
+        episode_steps: 10,
+        observation_names: Vec::new(),
+    };
+    DmpHead::new(&layers.finish().unwrap(), &spec).unwrap()
+}
+
+#[test]
+fn gradients_of_both_controllers_equal_central_differences() {
+    let observed = ("policy.start", "observed");
+    let position = ("policy.controller", "position");
+    let goal = ("dmp.forcing_scaling", "goal");
+    for keys in [
+        &[][..],
+        &[observed, goal],
+        &[position, ("policy.position_scale", "3.0")],
+        &[position, observed, goal, ("dmp.integrator", "explicit")],
+    ] {
+        let head = head(keys);
+        let len = head.outputs_len();
+        let mut random = seeds::stream(1, "test", 0);
+        let mut draw = |count: usize| -> Vec<f32> {
+            (0..count).map(|_| random.random_range(-1.0..1.0)).collect()
+        };
+        let (outputs, observations) = (draw(ROWS * len), draw(ROWS * 4));
+        let weights = draw(ROWS * 10);
+        let mut work = head.workspace(ROWS);
+        let mut means = vec![0.0; ROWS * 10];
+        let mut sum = |outputs: &[f32], work: &mut DmpWorkspace| -> f64 {
+            head.squash(outputs, len, work);
+            head.segment(&observations, work, &mut means);
+            means.iter().zip(&weights).map(|(m, w)| f64::from(*m) * f64::from(*w)).sum()
+        };
+        sum(&outputs, &mut work);
+        let mut gradient = vec![0.0; ROWS * len];
+        let arriving = HeadGradient { means: &weights, end_state: &[] };
+        head.backward(&mut work, arriving, &mut gradient, len);
+        let step = 1e-2_f32;
+        for (index, gradient) in gradient.iter().enumerate() {
+            let mut moved = |by: f32| {
+                let mut outputs = outputs.clone();
+                outputs[index] += by;
+                sum(&outputs, &mut work)
+            };
+            let expected = (moved(step) - moved(-step)) / f64::from(2.0 * step);
+            let off = (f64::from(*gradient) - expected).abs();
+            assert!(off < 1e-3, "{keys:?}, output {index}: {gradient} {expected}");
+        }
+    }
+}

@@ -1,0 +1,86 @@
+"""What a golden case, or a benchmark, is about: the settings of one experiment and its sizes."""
+
+from dataclasses import dataclass, fields
+
+
+@dataclass(frozen=True)
+class Start:
+    """Where one dimension's y0 and yd0 stand in an observation.
+
+    y0 = atan2(observation[sin], observation[cos]), or scale * observation[index].
+    """
+
+    velocity: int
+    cos: int | None = None
+    sin: int | None = None
+    index: int | None = None
+    scale: float = 1.0
+
+
+@dataclass(frozen=True)
+class Settings:
+    """The values that decide what one update computes; defaults as in shared/src/config."""
+
+    algorithm: str
+    policy: str
+    observation_len: int  # the environment's, without a carried state
+    action_len: int
+    control_dt_s: float
+    start_sources: tuple[Start, ...] = ()
+    batch_size: int = 256
+    hidden: tuple[int, ...] = (256, 256)
+    critic_hidden: tuple[int, ...] = (256, 256)
+    segment_steps: int = 5
+    critic: str = "segment"
+    start: str = "zero"
+    start_velocity: str = "measured"
+    goal_range: float = 1.0
+    weight_range: float = 1.0
+    controller: str = "inverse"
+    position_scale: float = 1.0
+    rho_range: float = 2.0
+    basis_count: int = 5
+    alpha_x: float = 1.0
+    alpha_y: float = 10.0
+    integration_steps: int = 40
+    integrator: str = "semi_implicit"
+    forcing_scaling: str = "none"
+    critic_learning_rate: float = 3e-4
+    actor_learning_rate: float = 5e-4
+    polyak: float = 5e-3
+
+    @staticmethod
+    def from_dict(values):
+        """Reads what a JSON object holds, as a benchmark is told; unknown keys are refused."""
+        known = {item.name for item in fields(Settings)}
+        assert set(values) <= known, f"unknown settings: {sorted(set(values) - known)}"
+        values = {key: tuple(v) if isinstance(v, list) else v for key, v in values.items()}
+        starts = values.get("start_sources", ())
+        return Settings(**{**values, "start_sources": tuple(Start(**start) for start in starts)})
+
+    @property
+    def steps(self):
+        """K: one step for `mlp`."""
+        return self.segment_steps if self.policy == "dmp" else 1
+
+    @property
+    def carries(self):
+        """Whether (y, yd) belong to the observation."""
+        return self.policy == "dmp" and self.start == "carry"
+
+    @property
+    def policy_observation_len(self):
+        """O, a carried state included."""
+        return self.observation_len + (2 * self.action_len if self.carries else 0)
+
+    @property
+    def critic_action_len(self):
+        """Of a segment's actions and end state, what the critic sees."""
+        if self.critic == "first":
+            return self.action_len
+        return self.steps * self.action_len + (2 * self.action_len if self.carries else 0)
+
+    @property
+    def omega(self):
+        """Natural frequency of the critically damped transformation system."""
+        return self.alpha_y / 2
