@@ -1,7 +1,7 @@
 """Records demonstrations: a controller of one line brings the Panda's gripper to its goal.
 
-    .venv/bin/python docs/examples/record_demonstrations.py demonstrations.npz
-    cargo run --release -- train panda-reach --demos demonstrations.npz
+    .venv/bin/python docs/examples/record_demonstrations.py demos.npz
+    cargo run --release -- train panda-reach --demos demos.npz
 
 For another task change ``TASK`` and ``act``: a trained policy, a planner or a person may decide.
 """

@@ -6,7 +6,7 @@ import gymnasium
 import numpy as np
 import panda_gym  # noqa: F401 - registers them
 
-from dmprl.segment_env import SegmentBuffers, make
+from dmprl.segment_env import GoalRows, SegmentBuffers, make
 
 REACH = ("PandaReach-v3", "PandaReachDense-v3", "PandaReachJoints-v3", "PandaReachJointsDense-v3")
 
@@ -72,6 +72,27 @@ class PandaGymTest(unittest.TestCase):
             steps = np.where(out.terminated, 0, steps + 1)
             self.assertLess(steps.max(), 10)
         env.close()
+
+    def test_relabelled_with_its_own_goals_an_episode_is_what_it_was(self):
+        env, out = started("PandaReach-v3", 2, 5)
+        goals = env.goals()
+        self.assertEqual(goals, {"achieved": 0, "desired": 3, "length": 3, "sparse": True})
+        rows = GoalRows(10, 3)
+        while not (out.terminated | out.truncated).any():
+            seen = out.next_observations
+            actions = np.zeros((2, 5, env.spec()["action_len"]))
+            actions[:, :, :3] = np.clip(5.0 * (seen[:, 3:6] - seen[:, 0:3]), -1.0, 1.0)[:, None]
+            env.step_segment(actions, out)
+            for index, steps in enumerate(out.steps):
+                rows.count[0] = steps
+                after = out.observations[index, 1 : steps + 1]
+                rows.achieved[:steps], rows.desired[:steps] = after[:, 0:3], after[:, 3:6]
+                env.relabel(rows)
+                np.testing.assert_array_equal(rows.rewards[:steps], out.rewards[index, :steps])
+                ended = np.zeros(steps, np.uint8)
+                ended[-1] = out.terminated[index]
+                np.testing.assert_array_equal(rows.terminated[:steps], ended)
+        self.assertTrue((out.rewards == 0.0).any())
 
 
 if __name__ == "__main__":

@@ -2,6 +2,8 @@
 //!
 //! No clock, no file and no transport here: the loop around it (`session`) brings those.
 
+mod imitation;
+
 use dmprl_shared::config::{AlgorithmName, ExperimentConfig};
 use dmprl_shared::parameters::ParameterSnapshot;
 use dmprl_shared::policy::{Head, Policy, PolicyError};
@@ -15,8 +17,8 @@ use thiserror::Error;
 
 use crate::algorithms::cloning::Cloning;
 use crate::algorithms::ndp::{Ndp, Scene};
-use crate::algorithms::{Algorithm, Batch, Losses, NoWindow};
-use crate::demonstrations::{DemonstrationError, Steps};
+use crate::algorithms::{Algorithm, Batch, NoWindow};
+use crate::demonstrations::DemonstrationError;
 use crate::metrics::{Collector, MetricsLine, Rejected};
 use crate::normaliser::Normaliser;
 use crate::pacing::Pacing;
@@ -309,46 +311,6 @@ impl Learner {
         Ok(())
     }
 
-    /// A critic that knows nothing yet would soon lead an actor that imitates astray: through the
-    /// warm-up the actor goes on imitating instead of following it, and then less and less so.
-    fn update_networks(&mut self) -> Result<Losses, LearnerError> {
-        let update = self.counters.updates + 1;
-        let share = self.cloning_share();
-        let Some(mut cloning) = self.cloning.take_if(|_| share > 0.0) else {
-            return Ok(self.algorithm.update(&self.policy, &self.batch, update)?);
-        };
-        let result = self.update_beside(&mut cloning, share);
-        self.cloning = Some(cloning);
-        result
-    }
-
-    /// One update of which the actor follows 1 - `share`, and `share` of a step of imitation.
-    fn update_beside(&mut self, cloning: &mut Cloning, share: f32) -> Result<Losses, LearnerError> {
-        let update = self.counters.updates + 1;
-        self.algorithm.read_policy(&mut cloning.parameters)?;
-        let losses = self.algorithm.update(&self.policy, &self.batch, update)?;
-        self.algorithm.fetch()?;
-        let networks = self.algorithm.networks();
-        let actor = networks.iter().find(|(name, _)| *name == "actor").map(|(_, actor)| actor);
-        if let Some(actor) = actor {
-            cloning.follow(&actor.network, 1.0 - share);
-        }
-        cloning.sample(self.normaliser.as_ref(), (&self.replay, &mut self.sampler))?;
-        cloning.step(&self.policy, share)?;
-        self.algorithm.each_network(|name, trained| match name {
-            "actor" => trained.network.set(&cloning.parameters),
-            _ => Ok(()),
-        })?;
-        Ok(losses)
-    }
-
-    /// From 1, through the warm-up, to 0 when the steps of imitation are over.
-    fn cloning_share(&self) -> f32 {
-        let after = self.counters.env_steps as f32 - self.config.exploration.warm_up_steps as f32;
-        let steps = self.config.demonstrations.imitation_steps as f32;
-        (1.0 - after.max(0.0) / steps.max(1.0)).max(0.0)
-    }
-
     fn refresh_normaliser(&mut self) -> Result<(), LearnerError> {
         match &self.normaliser {
             Some(normaliser) if normaliser.is_due() => self.take_normaliser_anew(),
@@ -417,43 +379,6 @@ impl Learner {
     /// If the lengths differ.
     pub fn warm_start(&mut self, parameters: &[f32]) -> Result<(), LearnerError> {
         Ok(self.algorithm.set_policy(parameters)?)
-    }
-
-    /// Keeps demonstrations in the replay and lets the actor imitate them for as many updates as
-    /// the configuration says; returns the mean loss of the first and of the last tenth of these.
-    ///
-    /// # Errors
-    /// If they do not fit into the replay, or hold no whole window.
-    pub fn demonstrate(
-        &mut self,
-        demonstrations: &[Steps],
-    ) -> Result<Option<(f32, f32)>, LearnerError> {
-        for steps in demonstrations {
-            steps.enter(&mut self.replay)?;
-            if let Some(normaliser) = &mut self.normaliser {
-                normaliser.observe(&steps.observations);
-            }
-        }
-        let updates = self.config.demonstrations.cloning_updates;
-        if self.normaliser.is_some() {
-            self.take_normaliser_anew()?;
-        }
-        let Some(cloning) = &mut self.cloning else { return Ok(None) };
-        self.algorithm.read_policy(&mut cloning.parameters)?;
-        let tenth = updates.div_ceil(10);
-        let (mut first, mut last) = (0.0, 0.0);
-        for update in 0..updates {
-            cloning.sample(self.normaliser.as_ref(), (&self.replay, &mut self.sampler))?;
-            let value = cloning.step(&self.policy, 1.0)?;
-            if !value.is_finite() {
-                return Err(LearnerError::NotFinite { update, name: "cloning loss", value });
-            }
-            first += if update < tenth { value } else { 0.0 };
-            last += if update >= updates - tenth { value } else { 0.0 };
-        }
-        let parameters = cloning.parameters.clone();
-        self.warm_start(&parameters)?;
-        Ok(Some((first / tenth as f32, last / tenth as f32)))
     }
 
     /// updates * batch_size / env_steps; on-policy, segments of a minibatch for batch_size.

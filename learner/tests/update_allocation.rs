@@ -6,6 +6,8 @@ use std::alloc::{GlobalAlloc, Layout, System};
 use std::sync::atomic::{AtomicU64, Ordering};
 
 use dmprl_learner::algorithms::{Algorithm, Batch};
+use dmprl_learner::demonstrations::Steps;
+use dmprl_learner::learner::Learner;
 use dmprl_learner::update::kernels::bf16::Bf16;
 use dmprl_shared::config::Layers;
 use dmprl_shared::policy::Policy;
@@ -32,6 +34,19 @@ unsafe impl GlobalAlloc for Counting {
 #[global_allocator]
 static ALLOCATOR: Counting = Counting;
 
+fn spec() -> EnvSpec {
+    EnvSpec {
+        id: "Test-v0".into(),
+        observation_len: 9,
+        action_len: 2,
+        action_low: vec![-1.0; 2],
+        action_high: vec![1.0; 2],
+        control_dt_s: 0.05,
+        episode_steps: 50,
+        observation_names: Vec::new(),
+    }
+}
+
 /// Allocations of twenty updates, after some.
 fn allocations([algorithm, policy, norm]: [&str; 3], precision: &str, threads: &str) -> u64 {
     let mut layers = Layers::new();
@@ -51,16 +66,7 @@ fn allocations([algorithm, policy, norm]: [&str; 3], precision: &str, threads: &
         layers.set("test", "policy.segment_steps", "1").unwrap();
     }
     let config = layers.finish().unwrap();
-    let spec = EnvSpec {
-        id: "Test-v0".into(),
-        observation_len: 9,
-        action_len: 2,
-        action_low: vec![-1.0; 2],
-        action_high: vec![1.0; 2],
-        control_dt_s: 0.05,
-        episode_steps: 50,
-        observation_names: Vec::new(),
-    };
+    let spec = spec();
     let policy = Policy::new(&config, &spec).unwrap();
     let mut algorithm = Algorithm::new(&config, &policy).unwrap();
     let batch = Batch::new(algorithm.batch_shape());
@@ -73,9 +79,32 @@ fn allocations([algorithm, policy, norm]: [&str; 3], precision: &str, threads: &
     ALLOCATIONS.load(Ordering::Relaxed) - before
 }
 
+/// Allocations of twenty updates of an actor that imitates beside them, after some.
+fn allocations_of_imitation() -> u64 {
+    let mut layers = Layers::new();
+    layers.set("test", "demonstrations.files", "['some.npz']").unwrap();
+    layers.set("test", "demonstrations.cloning_updates", "1").unwrap();
+    let mut learner = Learner::new(layers.finish().unwrap(), &spec(), 1).unwrap();
+    let mut steps = Steps {
+        observations: vec![0.1; 30 * 9],
+        actions: vec![0.2; 30 * 2],
+        rewards: vec![0.3; 30],
+        next_observations: vec![0.1; 30 * 9],
+        terminated: vec![false; 30],
+        truncated: vec![false; 30],
+    };
+    steps.truncated[29] = true;
+    learner.demonstrate(&[steps]).unwrap();
+    (1..5).for_each(|_| learner.update().unwrap());
+    let before = ALLOCATIONS.load(Ordering::Relaxed);
+    (5..25).for_each(|_| learner.update().unwrap());
+    ALLOCATIONS.load(Ordering::Relaxed) - before
+}
+
 /// Alone in its binary: the counter sees every thread.
 #[test]
 fn no_update_allocates_once_its_buffers_are_made() {
+    assert_eq!(allocations_of_imitation(), 0, "imitation");
     for algorithm in ["ddpg", "td3", "sac"] {
         for (policy, norm) in [("dmp", "false"), ("mlp", "false"), ("mlp", "true")] {
             let what = [algorithm, policy, norm];

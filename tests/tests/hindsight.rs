@@ -1,4 +1,4 @@
-//! Copies of segments with goals that their episode reached, made by a worker in a real interpreter.
+//! Copies of segments with goals that their episode reached, made in a real interpreter.
 #![cfg(feature = "python")]
 #![allow(
     clippy::unwrap_used,

@@ -82,8 +82,8 @@ pub(super) fn integer() -> RangedI64ValueParser<i64> {
     clap::value_parser!(i64).range(0..)
 }
 
-/// Makes the paths of the user's modules and demonstrations absolute: other processes have other working
-/// directories, and a run is resumed from anywhere.
+/// Makes the paths of the user's modules and demonstrations absolute: other processes have other
+/// working directories, and a run is resumed from anywhere.
 pub(super) fn make_absolute(config: &mut ExperimentConfig) -> anyhow::Result<()> {
     for path in &mut config.task.python_path {
         *path = absolute_folder(path)?;

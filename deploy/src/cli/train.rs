@@ -37,7 +37,7 @@ EXAMPLES
   dmprl train reacher --until-return -5 --max-minutes 30
   dmprl train reacher --config runs/baseline/config.toml --deterministic
   dmprl train reacher --init-from runs/baseline --seed 3
-  dmprl train panda-reach --demos demonstrations.npz
+  dmprl train panda-reach --demos demos.npz
   dmprl train my_module:MyArm-v0 --python-path ./envs";
 
 /// Arguments of `dmprl train`.

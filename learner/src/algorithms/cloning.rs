@@ -21,8 +21,8 @@ use crate::replay::{Replay, Sampler};
 use crate::update::crew::Crew;
 use crate::update::trained::Trained;
 
-/// Draws of demonstrated windows for one row of a batch: those that an episode's end cut short are passed over,
-/// as a missing action is none to imitate.
+/// Draws of demonstrated windows for one row of a batch: those that an episode's end cut short are
+/// passed over, as a missing action is none to imitate.
 const TRIES_MAX: usize = 1_000;
 
 /// An actor that imitates, with the buffers of its update.
@@ -92,7 +92,7 @@ impl Cloning {
         Ok(())
     }
 
-    /// Moves `parameters` by `share` of a step of Adam on what was drawn; returns the loss before it.
+    /// Moves `parameters` by `share` of a step of Adam on what was drawn; returns the loss before.
     ///
     /// # Errors
     /// If candle refuses access to a variable.

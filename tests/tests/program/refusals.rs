@@ -19,6 +19,7 @@ fn wrong_use_names_the_right_word_and_creates_nothing() {
         (&["train", "reacher", "--steps", "0"], "run.steps"),
         (&["train", "reacher", "--init-from", "nowhere"], "nowhere"),
         (&["train", "reacher", "--python-path", "nowhere"], "nowhere"),
+        (&["train", "reacher", "--demos", "nowhere.npz"], "nowhere.npz"),
         (&["train", "reacher", "--run-dir", "out/.."], "needs a name"),
         (&["resume", "nowhere"], "nowhere"),
         (&["eval", "nowhere"], "nowhere"),

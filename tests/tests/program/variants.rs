@@ -146,3 +146,28 @@ fn hindsight_is_recommended_for_a_sparse_goal_and_refused_where_there_is_none() 
     assert!(end.said.contains("its observation is no Dict"), "{}", end.said);
     place.assert_no_process();
 }
+
+/// As docs/demonstrations.md has it, with the script that it names.
+#[test]
+fn a_run_starts_from_demonstrations_and_keeps_them_through_a_resume() {
+    let place = Workplace::new();
+    let (run, file) = (place.path("run"), place.path("demos.npz"));
+    let script = dmprl_tests::project_root().join("docs/examples/record_demonstrations.py");
+    let python = dmprl_tests::venv().venv.join("bin/python");
+    let recorded = std::process::Command::new(python).arg(script).arg(&file).output().unwrap();
+    assert!(recorded.status.success(), "{recorded:?}");
+    let end = place.run(&train("panda-reach", &run, &["--steps", "1200", "--demos", &file]));
+    let told = end.with_status(0).said;
+    assert!(told.contains("1000 demonstrated steps in 20 episodes, return -0.19"), "{told}");
+    // A policy that nobody has taught anything gets about -15 on these seeds, this one -5.1.
+    let reached = rows(&run, "evaluations.jsonl").pop().unwrap()["return_mean"].as_f64().unwrap();
+    assert!(reached > -9.0, "{reached}");
+    std::fs::remove_file(&file).unwrap();
+    place.run(&["resume", &run, "--steps", "1600"]).with_status(0);
+    let last = rows(&run, "metrics.jsonl").pop().unwrap();
+    let count = |key: &str| last[key].as_u64().unwrap();
+    // Episodes of fifty steps are ten segments each.
+    assert_eq!(count("replay_segments"), count("segments") + 200, "{last}");
+    assert!(count("env_steps") >= 1600 && count("updates") > 0, "{last}");
+    place.assert_no_process();
+}
