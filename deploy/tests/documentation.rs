@@ -169,7 +169,7 @@ fn every_flag_that_is_shown_exists() {
     };
     let all: BTreeSet<_> = commands.iter().flat_map(|command| words(command)).collect();
     // Flags of other programs: cargo's, and docker's for the size of shared memory.
-    let foreign = ["--release", "--check", "--shm-size"];
+    let foreign = ["--bench", "--features", "--release", "--check", "--shm-size"];
     for document in DOCUMENTS {
         let text = read(document);
         for flag in spans(&text).iter().flat_map(|span| flags(span)) {
@@ -195,7 +195,7 @@ fn every_flag_that_is_shown_exists() {
 
 #[test]
 fn every_configuration_key_that_is_named_exists() {
-    const FILE_ENDINGS: [&str; 6] = ["jsonl", "json", "toml", "safetensors", "svg", "rs"];
+    const FILE_ENDINGS: [&str; 7] = ["npz", "jsonl", "json", "toml", "safetensors", "svg", "rs"];
     let keys: BTreeSet<_> = Layers::new().keys().into_iter().collect();
     let sections: BTreeSet<_> = keys.iter().filter_map(|key| key.split('.').next()).collect();
     let mut seen = 0;

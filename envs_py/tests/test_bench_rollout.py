@@ -38,6 +38,7 @@ def plan(task_id, action_len=2, **exploration):
             "episode_steps": 50,
         },
         "exploration": {"kind": "gaussian", "std": 0.1, **exploration},
+        "gaussian_std": [],
     }
 
 

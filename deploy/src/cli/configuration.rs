@@ -44,7 +44,7 @@ pub(super) struct Sources<'a> {
 /// Merges the sources; every mistake in them is wrong use.
 ///
 /// Which policy and which algorithm it is is known only at the end. The policy's own defaults lie
-/// at the bottom, the algorithm's over the preset: where there are some, the sources are merged
+/// over the task's, the algorithm's over the preset: where there are some, the sources are merged
 /// once more with them.
 pub(super) fn merge(sources: &Sources<'_>) -> anyhow::Result<ExperimentConfig> {
     let config = merge_with(&Own::default(), sources)?;
@@ -67,8 +67,8 @@ struct Own {
 
 fn merge_with(own: &Own, sources: &Sources<'_>) -> anyhow::Result<ExperimentConfig> {
     let mut layers = Layers::new();
-    add(&mut layers, "policy defaults", own.policy.clone().unwrap_or_default())?;
     add(&mut layers, sources.task, task_table(sources.task)?)?;
+    add(&mut layers, "policy defaults", own.policy.clone().unwrap_or_default())?;
     let preset = PRESETS.iter().find(|preset| preset.name == sources.preset);
     let preset = preset.with_context(|| format!("no preset {}", sources.preset))?;
     add(&mut layers, preset.name, preset.table())?;

@@ -23,8 +23,8 @@ use crate::terminal::say;
 const EXAMPLES: &str = "\
 EXAMPLES
   dmprl train reacher                      train with the defaults; nothing else is needed
-  dmprl eval runs/reacher-ddpg-dmp-s1-…    how well does its best policy do?
-  dmprl resume runs/reacher-ddpg-dmp-s1-…  go on where it stopped
+  dmprl eval runs/reacher-td3-dmp-s1-…    how well does its best policy do?
+  dmprl resume runs/reacher-td3-dmp-s1-…  go on where it stopped
   dmprl tasks                              what can be trained
 
 `dmprl COMMAND --help` has the details. Exit status: 0 done, 1 failed, 2 wrong use,

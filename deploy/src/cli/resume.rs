@@ -18,7 +18,7 @@ Goes on from the last checkpoint with the run's own config.toml; environment var
 presets have no say. A run that has no checkpoint yet begins again.
 
 EXAMPLES
-  dmprl resume runs/reacher-ddpg-dmp-s1-20260131-120000
+  dmprl resume runs/reacher-td3-dmp-s1-20260131-120000
   dmprl resume runs/mine --steps 120000    # longer than first asked for";
 
 /// Arguments of `dmprl resume`.

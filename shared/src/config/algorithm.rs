@@ -125,7 +125,7 @@ impl Default for SacConfig {
 impl Default for AlgorithmConfig {
     fn default() -> Self {
         Self {
-            name: AlgorithmName::Ddpg,
+            name: AlgorithmName::Td3,
             critic: CriticInput::Segment,
             windows: Windows::Sliding,
             target: Target::NStep,

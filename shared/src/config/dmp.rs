@@ -226,7 +226,7 @@ impl Default for PolicyConfig {
             kind: PolicyKind::Dmp,
             segment_steps: 5,
             hidden: vec![256, 256],
-            normalise_observations: false,
+            normalise_observations: true,
             goal_range: 1.0,
             weight_range: 1.0,
             controller: Controller::Inverse,

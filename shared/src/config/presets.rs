@@ -94,7 +94,7 @@ queue_segments = 1
 publish_every_updates = 1
 "#;
 
-/// What differs from the defaults for a kind of policy, below every other layer.
+/// What differs from the defaults for a kind of policy, over those of the task.
 ///
 /// `mlp` decides every step, so two updates a decision would be ten times as many as `dmp` does;
 /// the baselines of the paper do one a step.
@@ -132,6 +132,7 @@ pub fn algorithm_defaults(name: AlgorithmName) -> Option<Table> {
 const NDP: &str = r#"
 [policy]
 controller = "position"
+normalise_observations = false
 start = "observed"
 start_velocity = "measured"
 [dmp]

@@ -171,7 +171,17 @@ start_sources = [
 const PANDA_REACH_JOINTS_VALUES: &[&str] = &[JOINTS, PANDA_RUN, PANDA_TABLE_2];
 
 // u = 1 moves gripper or joint by 0.05 m or rad: with 20, a robot follows its primitive's y.
-const PANDA_RUN: &str = "[run]\nsteps = 30000\n[policy]\nposition_scale = 20.0\n";
+// Success comes within few steps, which may cost more updates each.
+const PANDA_RUN: &str = r#"
+[run]
+steps = 30000
+[policy]
+position_scale = 20.0
+[exploration]
+warm_up_steps = 1000
+[pacing]
+updates_per_segment = 4.0
+"#;
 
 // Table 2 of the paper, the column of the Panda tasks: what every preset keeps of it,
 const PANDA_TABLE_2: &str = r#"
