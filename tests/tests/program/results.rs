@@ -154,7 +154,8 @@ fn a_warm_start_begins_with_the_given_policy() {
     let (source, run) = (place.path("source"), place.path("run"));
     place.run(&train("reacher", &source, &["--steps", "1500"])).with_status(0);
     // Steps so small that they are lost in the rounding of a parameter: the first evaluation is
-    // that of the policy given.
+    // that of the policy given, but for the rounding of its first layer when observations are
+    // normalised.
     let still = ["--init-from", &source, "--set", "algorithm.actor_learning_rate=1e-15"];
     let more = [&still[..], &["--steps", "1000", "--seed", "9"]].concat();
     place.run(&train("reacher", &run, &more)).with_status(0);
@@ -163,7 +164,7 @@ fn a_warm_start_begins_with_the_given_policy() {
         .map(|row| number(row, "return_mean"))
         .fold(f64::NEG_INFINITY, f64::max);
     let warm = rows(&run, "evaluations.jsonl");
-    assert!((number(&warm[0], "return_mean") - best).abs() < 1e-6, "{best}: {warm:?}");
+    assert!((number(&warm[0], "return_mean") - best).abs() < 1e-4, "{best}: {warm:?}");
     let manifest = json_file(&run, "manifest.json");
     assert!(manifest["init_from"].as_str().unwrap().starts_with(&source), "{manifest}");
 }
