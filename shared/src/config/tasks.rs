@@ -134,6 +134,9 @@ start_sources = [
 ]
 [run]
 steps = 60000
+[algorithm]
+critic_learning_rate = 0.001
+actor_learning_rate = 0.001
 "#];
 
 // Observation: joint angles (7), joint velocities (7), three positions (3 each).
