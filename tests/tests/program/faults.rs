@@ -59,7 +59,7 @@ fn goes_on_and_counts(task: &str, words: &str) {
     assert_eq!(by_evaluator, 4, "one in each episode of the evaluation");
     let counted = last["env_failures"].as_u64().unwrap();
     let total = by_worker + by_evaluator;
-    // The supervisor passes the number on: the learner's last line may lag behind on a busy machine.
+    // The supervisor passes the number on: on a busy machine the learner's last line lags behind.
     let at_least = (steps / LIFE - ENVS) / 2;
     assert!((at_least..=total).contains(&counted), "{counted} of {total}, {at_least} at least");
     let summary = format!("failures   {total} of environments");
