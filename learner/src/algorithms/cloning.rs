@@ -1,7 +1,7 @@
 //! Behaviour cloning: the actor imitates demonstrated windows, before anything else is learned and,
 //! with less and less weight, beside it.
 //!
-//!     loss = mean over windows, steps and dimensions of (pi(s) - u)²
+//! loss = mean over windows, steps and dimensions of (pi(s) - u)²
 //!
 //! With policy `dmp` the gradient runs through inverse controller and movement primitive, so that
 //! goal, weights and controller of a segment are fitted together. The least squares of Kim et al.
