@@ -200,3 +200,108 @@ impl Batch {
         Ok(())
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use dmprl_shared::config::Windows;
+    use dmprl_shared::segment::{SegmentHeader, SegmentLayout, TERMINATED, TRUNCATED};
+
+    use super::*;
+
+    const LAYOUT: SegmentLayout =
+        SegmentLayout { segment_steps: 2, observation_len: 1, action_len: 1 };
+    const SHAPE: BatchShape = BatchShape {
+        rows: 64,
+        observation_len: 1,
+        actions_len: 2,
+        end_state_len: 0,
+        segment_actions_len: 2,
+        next_noise: false,
+        noise: false,
+    };
+
+    /// An episode of three steps: s_t = 10 e + t, u_t = (t + 1) / 10, r_t = 1, 10, 100.
+    fn episode(replay: &mut Replay, episode: u32, flag: u32) {
+        let first = 10.0 * episode as f32;
+        let whole = [first, first + 1.0, first + 2.0, 0.1, 0.2, 1.0, 10.0];
+        let rest = [first + 2.0, first + 3.0, 0.0, 0.3, 0.0, 100.0, 0.0];
+        for (block, episode_step, steps_len, flags) in [(whole, 0, 2, 0), (rest, 2, 1, flag)] {
+            let header = SegmentHeader {
+                episode,
+                episode_step,
+                steps_len,
+                flags,
+                ..SegmentHeader::default()
+            };
+            replay.insert(&header, &block);
+        }
+    }
+
+    /// (s_t, u of the window, reward, bootstrap, s to bootstrap from) of everything drawn, once.
+    type Row = (f32, [f32; 2], f32, f32, f32);
+
+    fn rows(replay: &Replay, windows: Windows, target: Target) -> Vec<Row> {
+        let config = AlgorithmConfig { target, discount: 0.5, ..AlgorithmConfig::default() };
+        let mut sampler = Sampler::new(windows, dmprl_shared::seeds::stream(1, "test", 0));
+        let mut batch = Batch::new(SHAPE);
+        batch.sample(SHAPE, &config, 1.0, None, (replay, &mut sampler)).unwrap();
+        let mut rows: Vec<Row> = (0..SHAPE.rows)
+            .map(|row| {
+                let input = &batch.critic_inputs[3 * row..3 * row + 3];
+                assert_eq!(input[0], batch.observations[row]);
+                let (reward, factor) = (batch.rewards[row], batch.bootstrap[row]);
+                (input[0], [input[1], input[2]], reward, factor, batch.next_observations[row])
+            })
+            .collect();
+        rows.sort_by(|a, b| a.0.total_cmp(&b.0));
+        rows.dedup();
+        rows
+    }
+
+    fn replay(slots: usize, episodes: &[(u32, u32)]) -> Replay {
+        let mut replay = Replay::new(LAYOUT, 2 * slots, 1, 1);
+        episodes.iter().for_each(|&(number, flag)| episode(&mut replay, number, flag));
+        replay
+    }
+
+    #[test]
+    fn n_step_targets_of_a_terminated_episode_are_those_worked_by_hand() {
+        let expected = [
+            (0.0, [0.1, 0.2], 6.0, 0.25, 2.0),
+            (1.0, [0.2, 0.3], 60.0, 0.0, 3.0),
+            (2.0, [0.3, 0.0], 100.0, 0.0, 3.0),
+        ];
+        assert_eq!(rows(&replay(9, &[(0, TERMINATED)]), Windows::Sliding, Target::NStep), expected);
+    }
+
+    #[test]
+    fn n_step_targets_of_a_truncated_episode_bootstrap_and_leave_the_short_window_out() {
+        let expected = [(0.0, [0.1, 0.2], 6.0, 0.25, 2.0), (1.0, [0.2, 0.3], 60.0, 0.25, 3.0)];
+        assert_eq!(rows(&replay(9, &[(0, TRUNCATED)]), Windows::Sliding, Target::NStep), expected);
+    }
+
+    #[test]
+    fn segment_windows_begin_at_decisions_only() {
+        let expected = [(0.0, [0.1, 0.2], 6.0, 0.25, 2.0), (2.0, [0.3, 0.0], 100.0, 0.0, 3.0)];
+        assert_eq!(rows(&replay(9, &[(0, TERMINATED)]), Windows::Segment, Target::NStep), expected);
+    }
+
+    #[test]
+    fn literal_targets_sum_plainly_and_bootstrap_from_the_second_observation() {
+        let expected = [(0.0, [0.1, 0.2], 11.0, 0.5, 1.0), (2.0, [0.3, 0.0], 100.0, 0.0, 3.0)];
+        let replay = replay(9, &[(0, TERMINATED)]);
+        assert_eq!(rows(&replay, Windows::Segment, Target::Literal), expected);
+    }
+
+    #[test]
+    fn a_wrapped_ring_learns_from_what_it_holds_and_mixes_no_episodes() {
+        // Three slots: the second episode took the place of the first one's whole segment.
+        let replay = replay(3, &[(0, TERMINATED), (1, TRUNCATED)]);
+        let expected = [
+            (2.0, [0.3, 0.0], 100.0, 0.0, 3.0),
+            (10.0, [0.1, 0.2], 6.0, 0.25, 12.0),
+            (11.0, [0.2, 0.3], 60.0, 0.25, 13.0),
+        ];
+        assert_eq!(rows(&replay, Windows::Sliding, Target::NStep), expected);
+    }
+}
