@@ -18,6 +18,8 @@ Floats = NDArray[np.float32]
 RHO_CENTRE = np.array([1.0, 0.0, 0.0, 0.0], np.float32)
 OCTAVES = 8
 """Of the pink noise, as in Rust."""
+LOG_STD_RANGE = (-20.0, 2.0)
+"""Of standard deviations that the network puts out, as in Rust."""
 
 
 class NumpyPolicy:
@@ -34,6 +36,9 @@ class NumpyPolicy:
             np.empty((self.env_count, width), np.float32) for width in plan["widths"][1:]
         ]
         self._head = DmpHead(plan) if plan["policy"]["kind"] == "dmp" else None
+        self._bounded = self._head is None or plan["policy"]["controller"] == "inverse"
+        # Behind what decides, a network may put out the spread of its decisions.
+        self._decisions: int = plan["widths"][-1] - plan["log_stds_len"]
         env_len = plan["spec"]["observation_len"]
         self._observations = np.zeros((self.env_count, plan["widths"][0]), np.float32)
         # Views: the environment's part, and the DMP state that a policy may carry on.
@@ -52,9 +57,14 @@ class NumpyPolicy:
                 np.maximum(x, 0.0, out=x)
             x = np.dot(x, weights, out=out)
             x += bias
+        x, log_std = x[:, : self._decisions], x[:, self._decisions :]
         if noise is not None:
             noise.disturb_outputs(x)
-        u = np.tanh(x)[:, None, :] if self._head is None else self._head.u(x, self._observations)
+        u = x[:, None, :] if self._head is None else self._head.u(x, self._observations)
+        if noise is not None and log_std.size > 0:
+            u += noise.own_draws(log_std.reshape(u.shape))
+        if self._bounded:
+            u = np.tanh(u)
         if noise is not None:
             noise.disturb_u(u)
         return u
@@ -113,7 +123,7 @@ class DmpHead:
         self._samples = np.zeros((*self._shape, 3 * self._steps), np.float32)
 
     def u(self, outputs: Floats, observations: Floats) -> Floats:
-        """The segments' actions, (E, K, A)."""
+        """The segments' actions, (E, K, A); of the inverse controller before its tanh."""
         n, inputs = self._basis_count, self._inputs
         raw = outputs.reshape(*self._shape, 1 + n + (4 if self._inverse else 0))
         squashed = np.tanh(raw)
@@ -126,9 +136,7 @@ class DmpHead:
         y, yd, ydd = np.split(samples, 3, axis=-1)
         if self._inverse:
             rho = (squashed if self._bounded else raw)[..., 1 + n :] * self._rho_range + RHO_CENTRE
-            u = np.tanh(
-                rho[..., 0:1] * y + rho[..., 1:2] * yd + rho[..., 2:3] * ydd + rho[..., 3:4]
-            )
+            u = rho[..., 0:1] * y + rho[..., 1:2] * yd + rho[..., 2:3] * ydd + rho[..., 3:4]
         else:
             u = self._position_scale * np.diff(y, axis=-1, prepend=inputs[..., :1])
         return np.ascontiguousarray(u.transpose(0, 2, 1))
@@ -165,6 +173,7 @@ class Noise:
         self._kind: str = exploration["kind"]
         self._std = np.float32(exploration["std"])
         self._gaussian = np.array(plan["gaussian_std"], np.float32)
+        self._own = self._gaussian.size > 0 or plan["log_stds_len"] > 0
         self._random = np.random.default_rng(seed)
         shape = (plan["env_count"], plan["spec"]["action_len"], OCTAVES)
         self._sources = np.zeros(shape, np.float32)
@@ -173,15 +182,18 @@ class Noise:
 
     def disturb_outputs(self, outputs: Floats) -> None:
         """Noise on the DMP's parameters, before they are bounded."""
-        if self._gaussian.size == 0 and self._kind == "dmp_parameters":
+        if not self._own and self._kind == "dmp_parameters":
             outputs += self._std * self._normal(outputs.shape)
+
+    def own_draws(self, log_std: Floats) -> Floats:
+        """What a Gaussian of these logarithmic standard deviations adds to its mean."""
+        return np.exp(np.clip(log_std, *LOG_STD_RANGE)) * self._normal(log_std.shape)
 
     def disturb_u(self, u: Floats) -> None:
         """Noise on actions, (E, K, A), which stay in [-1, 1]; or the policy's own Gaussian."""
         if self._gaussian.size > 0:
             u += self._gaussian * self._normal(u.shape)
-            return
-        if self._kind == "dmp_parameters":
+        if self._own or self._kind == "dmp_parameters":
             return
         if self._kind == "gaussian":
             noise = self._normal(u.shape)

@@ -112,6 +112,12 @@ fn a_network_that_decides_every_step_acts_the_same() {
 }
 
 #[test]
+fn the_mean_of_a_squashed_gaussian_acts_the_same() {
+    assert_same("reacher", &[("algorithm.name", "sac"), ("policy.kind", "mlp")]);
+    assert_same("pusher", &[("algorithm.name", "sac")]);
+}
+
+#[test]
 fn movement_primitives_act_the_same() {
     assert_same("reacher", &[]);
     assert_same("pusher", &[("policy.segment_steps", "8")]);

@@ -42,6 +42,8 @@ pub struct NumpyPlan<'a> {
     segment_map: Vec<f32>,
     /// Standard deviations of the policy's own Gaussian, (A,); empty if it has none.
     gaussian_std: Vec<f32>,
+    /// Outputs of the network, its last ones, that are logarithmic standard deviations: K A or 0.
+    log_stds_len: usize,
     /// File of the network's flat parameters, 32-bit little-endian.
     parameters: PathBuf,
 }
@@ -75,6 +77,7 @@ impl<'a> NumpyPlan<'a> {
             widths: widths.chain(shape.layers().iter().map(|layer| layer.outputs)).collect(),
             segment_map: segment_map(config)?,
             gaussian_std: log_std.iter().map(|log_std| log_std.exp()).collect(),
+            log_stds_len: policy.log_stds().map_or(0, |columns| columns.len()),
             parameters: parameters_path.clone(),
         };
         let network = &parameters[..shape.parameters_len()];

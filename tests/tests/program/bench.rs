@@ -56,10 +56,10 @@ fn a_task_on_the_batch_is_measured_beside_its_ceiling_and_gymnasium() {
 }
 
 #[test]
-fn a_task_without_a_batch_has_no_ceiling_and_an_mlp_is_measured_too() {
+fn a_task_without_a_batch_has_no_ceiling_and_a_gaussian_mlp_is_measured_too() {
     let place = Workplace::new();
-    let running =
-        bench(&place, "Pendulum-v1", &["--policy", "mlp", "--workers", "1", "--rounds", "1"]);
+    let gaussian = ["--algo", "sac", "--policy", "mlp", "--workers", "1", "--rounds", "1"];
+    let running = bench(&place, "Pendulum-v1", &gaussian);
     let id = running.id();
     let finished = running.wait().with_status(0);
     let row = |name: &str| {
