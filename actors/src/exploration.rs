@@ -164,7 +164,179 @@ impl PinkNoise {
 
 #[cfg(test)]
 mod tests {
+    use dmprl_shared::config::{ExperimentConfig, Layers, Limits};
+    use dmprl_shared::policy::Policy;
+    use dmprl_shared::seeds;
+    use dmprl_shared::spec::EnvSpec;
+
     use super::*;
+
+    const ENVS: usize = 200;
+    const DIMS: usize = 2;
+    const K: usize = 5;
+
+    fn config(keys: &[(&str, &str)]) -> ExperimentConfig {
+        let mut layers = Layers::new();
+        layers
+            .set("test", "task.start_sources", "[{index=0, velocity=2}, {index=1, velocity=3}]")
+            .unwrap();
+        for (key, value) in keys {
+            layers.set("test", key, value).unwrap();
+        }
+        layers.finish().unwrap().resolve(Limits { cores: 1 }).unwrap()
+    }
+
+    /// A fresh policy before some observations, and the departure from it.
+    fn scene(keys: &[(&str, &str)]) -> (Acting, Exploration) {
+        let config = config(keys);
+        let spec = EnvSpec {
+            id: "Test-v0".into(),
+            observation_len: 4,
+            observation_names: Vec::new(),
+            action_len: DIMS,
+            action_low: vec![-1.0; DIMS],
+            action_high: vec![1.0; DIMS],
+            control_dt_s: 0.02,
+            episode_steps: 50,
+        };
+        let policy = Policy::new(&config, &spec).unwrap();
+        let parameters = policy.initial_parameters(&mut seeds::stream(1, "test", 0));
+        let mut acting = Acting::new(policy, ENVS);
+        acting.take_policy(&parameters);
+        for (index, value) in acting.observations.iter_mut().enumerate() {
+            *value = (index as f32 * 0.7).sin();
+        }
+        acting.run_network();
+        let random = seeds::stream(2, "test", 0);
+        (acting, Exploration::new(config.exploration, random, (ENVS, DIMS)))
+    }
+
+    /// What exploration adds to each action, (E, K, A); none of these meets a bound.
+    fn noise(keys: &[(&str, &str)]) -> Vec<f32> {
+        let (mut acting, mut exploration) = scene(keys);
+        acting.decode();
+        let clean = acting.u.clone();
+        exploration.explore(&mut acting);
+        acting.u.iter().zip(&clean).map(|(noisy, clean)| noisy - clean).collect()
+    }
+
+    fn std(values: &[f32]) -> f32 {
+        (values.iter().map(|value| value * value).sum::<f32>() / values.len() as f32).sqrt()
+    }
+
+    #[test]
+    fn noise_on_actions_has_the_configured_spread() {
+        for kind in ["gaussian", "segment", "pink"] {
+            let noise = noise(&[("exploration.kind", kind), ("exploration.std", "0.1")]);
+            // 400 independent numbers at least: standard error 0.0035; four of them.
+            assert!((std(&noise) - 0.1).abs() < 0.014, "{kind}: {}", std(&noise));
+        }
+    }
+
+    #[test]
+    fn a_draw_for_a_segment_is_held_and_one_for_a_step_is_not() {
+        let held = |kind| {
+            let noise = noise(&[("exploration.kind", kind)]);
+            let same = |segment: &[f32]| {
+                (0..DIMS).all(|d| (1..K).all(|k| (segment[k * DIMS + d] - segment[d]).abs() < 1e-6))
+            };
+            noise.chunks_exact(K * DIMS).filter(|segment| same(segment)).count()
+        };
+        assert_eq!((held("segment"), held("gaussian"), held("pink")), (ENVS, 0, 0));
+        let noise = noise(&[("exploration.kind", "segment")]);
+        assert!(noise[0] != noise[1] && noise[0] != noise[K * DIMS], "one for all dimensions");
+    }
+
+    #[test]
+    fn noise_stays_within_the_bounds() {
+        let keys = [("exploration.kind", "gaussian"), ("exploration.std", "2.0")];
+        let (mut acting, mut exploration) = scene(&keys);
+        exploration.explore(&mut acting);
+        assert!(acting.u.iter().all(|u| u.abs() <= 1.0));
+        assert!(acting.u.contains(&1.0) && acting.u.contains(&-1.0));
+    }
+
+    #[test]
+    fn noise_on_parameters_goes_through_the_movement_primitive() {
+        let keys = [("exploration.kind", "dmp_parameters"), ("exploration.std", "0.3")];
+        let (mut acting, mut exploration) = scene(&keys);
+        acting.decode();
+        let clean = acting.u.clone();
+        exploration.explore(&mut acting);
+        let explored = acting.u.clone();
+        assert!(explored.iter().zip(&clean).filter(|(a, b)| a != b).count() > clean.len() / 2);
+        // Nothing was added behind the decoder.
+        acting.decode();
+        assert_eq!(acting.u, explored);
+    }
+
+    #[test]
+    fn warm_up_draws_within_its_range_whatever_the_policy_says() {
+        for (kind, range) in [("uniform", 0.3), ("uniform", 1.0)] {
+            let text = range.to_string();
+            let keys =
+                [("exploration.warm_up_kind", kind), ("exploration.warm_up_range", text.as_str())];
+            let (mut acting, mut exploration) = scene(&keys);
+            exploration.warm_up(&mut acting);
+            let largest = acting.u.iter().fold(0.0_f32, |largest, u| largest.max(u.abs()));
+            assert!(largest <= range && largest > 0.95 * range, "{kind}: {largest} of {range}");
+            assert!(acting.u.windows(2).all(|pair| pair[0] != pair[1]));
+        }
+    }
+
+    #[test]
+    fn warm_up_on_parameters_draws_movement_primitives() {
+        let keys = [("exploration.warm_up_kind", "dmp_parameters")];
+        let (mut acting, mut exploration) = scene(&keys);
+        exploration.warm_up(&mut acting);
+        let first = acting.u.clone();
+        assert!(std(&first) > 0.01 && first.iter().all(|u| u.abs() <= 1.0));
+        // Actions of one segment are of one motion: they differ less than those of two.
+        let jump = |from: usize, to: usize| {
+            let all = first.chunks_exact(K * DIMS).zip(first.chunks_exact(K * DIMS).skip(1));
+            std(&all
+                .map(|(a, b)| [a, b][to / K][to % K * DIMS] - a[from * DIMS])
+                .collect::<Vec<_>>())
+        };
+        assert!(jump(K - 2, K - 1) < jump(K - 1, K), "not smooth");
+        exploration.warm_up(&mut acting);
+        assert_ne!(acting.u, first);
+    }
+
+    #[test]
+    fn a_gaussian_policy_draws_from_itself() {
+        // Squashed: inside the bounds, whatever the noise is set to.
+        let (mut acting, mut exploration) =
+            scene(&[("algorithm.name", "sac"), ("exploration.std", "0.0")]);
+        acting.decode();
+        let mean = acting.u.clone();
+        exploration.explore(&mut acting);
+        assert!(acting.u.iter().zip(&mean).all(|(u, mean)| u != mean && u.abs() <= 1.0));
+        // With a spread of its own: beyond them, too.
+        let ndp = [
+            ("algorithm.name", "ndp"),
+            ("policy.controller", "position"),
+            ("exploration.warm_up_steps", "0"),
+            ("algorithm.ndp.initial_log_std", "0.0"),
+        ];
+        let (mut acting, mut exploration) = scene(&ndp);
+        acting.decode();
+        let mean = acting.work.actions.clone();
+        exploration.explore(&mut acting);
+        let drawn: Vec<f32> = acting.u.iter().zip(&mean).map(|(u, mean)| u - mean).collect();
+        assert!((std(&drawn) - 1.0).abs() < 0.1, "{}", std(&drawn));
+        assert!(acting.u.iter().any(|u| u.abs() > 1.0));
+    }
+
+    #[test]
+    fn pink_noise_starts_anew_where_an_episode_ended() {
+        let (mut acting, mut exploration) = scene(&[("exploration.kind", "pink")]);
+        exploration.explore(&mut acting);
+        exploration.episode_ended(3);
+        let sources = |env: usize| &exploration.pink[env * DIMS..(env + 1) * DIMS];
+        assert!(sources(3).iter().all(|source| source.step == 0));
+        assert!(sources(2).iter().all(|source| source.step == K as u32));
+    }
 
     #[test]
     fn pink_noise_has_unit_variance_and_a_memory_that_fades() {

@@ -14,7 +14,7 @@ use dmprl_learner::algorithms::{Algorithm, Batch};
 use dmprl_learner::update::floor::{Engine, Floor, Kind, Product};
 use dmprl_learner::update::kernels::bf16::Bf16;
 use dmprl_shared::config::{ExperimentConfig, Layers};
-use dmprl_shared::policy::{MlpShape, Policy};
+use dmprl_shared::policy::Policy;
 use dmprl_shared::spec::EnvSpec;
 
 struct Candidate {
@@ -75,6 +75,7 @@ fn peak() -> Candidate {
 fn config(threads: &str, precision: &str, norm: &str) -> (ExperimentConfig, EnvSpec) {
     let mut layers = Layers::new();
     let keys = [
+        ("algorithm.name", "ddpg"),
         ("learner.threads", threads),
         ("learner.precision", precision),
         ("algorithm.critic_layer_norm", norm),
@@ -105,10 +106,12 @@ fn update(threads: &str, precision: &str, norm: &str) -> impl FnMut() + 'static 
     let mut batch = Batch::new(algorithm.batch_shape());
     let numbers = [
         &mut batch.observations,
+        &mut batch.inputs,
         &mut batch.critic_inputs,
         &mut batch.rewards,
         &mut batch.bootstrap,
         &mut batch.next_observations,
+        &mut batch.next_inputs,
     ];
     for values in numbers {
         values.iter_mut().enumerate().for_each(|(i, value)| *value = (i as f32 * 0.37).sin());
@@ -120,18 +123,11 @@ fn update(threads: &str, precision: &str, norm: &str) -> impl FnMut() + 'static 
     }
 }
 
-/// The products of one update of DDPG.
-fn products(actor: &MlpShape, critic: &MlpShape, observation_len: usize) -> Vec<Product> {
-    const ROWS: usize = 256;
-    let forward = |shape| Product::forward(shape, ROWS);
-    let backward = |shape| Product::backward(shape, ROWS);
-    let weights = |shape| Product::weight_gradient(shape, ROWS);
-    let target = forward(actor).chain(forward(critic));
-    let critic_step = forward(critic).chain(backward(critic)).chain(weights(critic));
-    let through_critic = forward(actor).chain(forward(critic)).chain(backward(critic));
-    let input = [Product::input_gradient(critic, ROWS, observation_len)];
-    let actor_step = through_critic.chain(input).chain(backward(actor)).chain(weights(actor));
-    target.chain(critic_step).chain(actor_step).collect()
+/// The products of one update.
+fn products() -> Vec<Product> {
+    let (config, spec) = config("1", "f32", "false");
+    let policy = Policy::new(&config, &spec).expect("a policy");
+    Algorithm::new(&config, &policy).expect("an algorithm").products().products
 }
 
 fn floor(name: &str, products: Vec<Product>, engine: Engine) -> Candidate {
@@ -151,9 +147,7 @@ fn thread_time() -> Duration {
 fn main() {
     let argument = |name: &str| std::env::args().skip_while(|it| it != name).nth(1);
     let rounds = argument("--rounds").map_or(100, |text| text.parse().expect("a number"));
-    let actor = MlpShape::new(vec![23, 256, 256, 70]);
-    let critic = MlpShape::new(vec![58, 256, 256, 1]);
-    let all = products(&actor, &critic, 23);
+    let all = products();
     let square = |kind| vec![Product { kind, rows: 256, inputs: 256, outputs: 256 }];
     let mut candidates = vec![peak()];
     for (engine, whose) in [(Engine::Library, "library"), (Engine::Kernels, "kernels")] {

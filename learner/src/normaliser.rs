@@ -5,6 +5,8 @@
 //! When mean and scale are taken anew, the first layers are rewritten so that every network stays
 //! the function that it was: normalisation changes the steps of the optimiser, never the policy.
 
+use std::borrow::Cow;
+
 use dmprl_shared::policy::MlpShape;
 use serde::{Deserialize, Serialize};
 
@@ -84,36 +86,41 @@ impl Normaliser {
     }
 
     /// Takes mean and scale anew and returns the change; due again at twice as many observations.
-    pub fn refresh(&mut self) -> Change {
+    pub fn refresh(&mut self) -> Change<'static> {
         self.refresh_at = 2 * self.count.max(1);
-        let before = (self.mean.clone(), self.scale.clone());
+        let before = self.in_use();
         for (index, squares) in self.seen_squares.iter().enumerate() {
             let scale = (squares / self.count.max(1) as f64).sqrt();
             self.mean[index] = self.seen_mean[index] as f32;
             self.scale[index] = if scale < SCALE_MIN { 1.0 } else { scale as f32 };
         }
-        Change { before, after: (self.mean.clone(), self.scale.clone()) }
+        Change { before, after: Some(self.in_use()) }
+    }
+
+    fn in_use(&self) -> [Cow<'static, [f32]>; 2] {
+        [self.mean.clone(), self.scale.clone()].map(Cow::Owned)
     }
 
     /// Rewrites flat parameters of a network of normalised observations as those of the same
     /// function of plain ones.
     pub fn fold(&self, shape: &MlpShape, parameters: &mut [f32]) {
-        let plain = (vec![0.0; self.mean.len()], vec![1.0; self.mean.len()]);
-        let change = Change { before: (self.mean.clone(), self.scale.clone()), after: plain };
-        change.rewrite(shape, parameters);
+        let before = [&self.mean, &self.scale].map(|values| Cow::Borrowed(values.as_slice()));
+        Change { before, after: None }.rewrite(shape, parameters);
     }
 }
 
 /// From one mean and scale to another.
 #[derive(Debug)]
-pub struct Change {
-    before: (Vec<f32>, Vec<f32>),
-    after: (Vec<f32>, Vec<f32>),
+pub struct Change<'a> {
+    before: [Cow<'a, [f32]>; 2],
+    /// None: to plain observations.
+    after: Option<[Cow<'a, [f32]>; 2]>,
 }
 
-impl Change {
+impl Change<'_> {
     /// Keeps a network in training, and its target, the functions of plain observations that they
-    /// were; moments follow the gradient of the new weights. The observations are its first inputs.
+    /// were; the observations are its first inputs. Moments are scaled as the gradients of the new
+    /// weights are; what a shift of the mean adds to these is left out.
     ///
     /// # Errors
     /// If candle refuses access to a variable.
@@ -124,36 +131,46 @@ impl Change {
             self.rewrite(shape, target.values_mut());
         }
         self.each_weight(shape, |at, input| {
-            let factor = self.before.1[input] / self.after.1[input];
+            let factor = self.before[1][input] / self.new_scale(input);
             adam.moments.first[at] *= factor;
             adam.moments.second[at] *= factor * factor;
         });
         Ok(())
     }
 
+    fn new_mean(&self, input: usize) -> f32 {
+        self.after.as_ref().map_or(0.0, |[mean, _]| mean[input])
+    }
+
+    fn new_scale(&self, input: usize) -> f32 {
+        self.after.as_ref().map_or(1.0, |[_, scale]| scale[input])
+    }
+
     /// W (x - m) / s + b = W' (x - m') / s' + b' for every x.
     fn rewrite(&self, shape: &MlpShape, parameters: &mut [f32]) {
         let layer = &shape.layers()[0];
-        let ((mean, scale), (new_mean, new_scale)) = (&self.before, &self.after);
+        let [mean, scale] = &self.before;
         for output in 0..layer.outputs {
             let from = layer.weights.start + output * layer.inputs;
             let weights = &parameters[from..from + mean.len()];
             let moved = (0..mean.len()).map(|input| {
-                let shift = f64::from(new_mean[input]) - f64::from(mean[input]);
+                let shift = f64::from(self.new_mean(input)) - f64::from(mean[input]);
                 f64::from(weights[input]) * shift / f64::from(scale[input])
             });
             let moved: f64 = moved.sum();
             let bias = &mut parameters[layer.bias.start + output];
             *bias = (f64::from(*bias) + moved) as f32;
         }
-        self.each_weight(shape, |at, input| parameters[at] *= new_scale[input] / scale[input]);
+        self.each_weight(shape, |at, input| {
+            parameters[at] *= self.new_scale(input) / scale[input];
+        });
     }
 
     fn each_weight(&self, shape: &MlpShape, mut f: impl FnMut(usize, usize)) {
         let layer = &shape.layers()[0];
         for output in 0..layer.outputs {
             let from = layer.weights.start + output * layer.inputs;
-            (0..self.before.0.len()).for_each(|input| f(from + input, input));
+            (0..self.before[0].len()).for_each(|input| f(from + input, input));
         }
     }
 }

@@ -9,8 +9,9 @@ use dmprl_learner::algorithms::{Algorithm, Batch};
 use dmprl_learner::demonstrations::Steps;
 use dmprl_learner::learner::Learner;
 use dmprl_learner::update::kernels::bf16::Bf16;
-use dmprl_shared::config::Layers;
+use dmprl_shared::config::{Layers, Limits};
 use dmprl_shared::policy::Policy;
+use dmprl_shared::segment::{LAYOUT_VERSION, Segment, SegmentHeader, block_checksum};
 use dmprl_shared::spec::EnvSpec;
 
 struct Counting;
@@ -79,6 +80,60 @@ fn allocations([algorithm, policy, norm]: [&str; 3], precision: &str, threads: &
     ALLOCATIONS.load(Ordering::Relaxed) - before
 }
 
+/// Allocations of twenty segments and the updates that they make due, sampling and normalising
+/// included, after as many as make every buffer.
+fn allocations_of_a_learner(algorithm: &str) -> u64 {
+    let mut layers = Layers::new();
+    let keys = [
+        ("algorithm.name", algorithm),
+        ("policy.start", "zero"),
+        ("policy.normalise_observations", "true"),
+        ("exploration.warm_up_steps", "0"),
+        ("algorithm.batch_size", "64"),
+        ("algorithm.ndp.rollout_segments", "4"),
+        ("algorithm.ndp.minibatches", "2"),
+    ];
+    for (key, value) in keys {
+        layers.set("test", key, value).unwrap();
+    }
+    let config = layers.finish().unwrap().resolve(Limits { cores: 1 }).unwrap();
+    let mut learner = Learner::new(config, &spec(), 1).unwrap();
+    let layout = learner.policy().layout();
+    let mut segment = Segment { block: vec![0.1; layout.block_len()], ..Segment::default() };
+    segment.header = SegmentHeader {
+        layout_version: LAYOUT_VERSION,
+        run_id: 1,
+        architecture_hash: learner.policy().architecture_hash(),
+        incarnation: 1,
+        steps_len: layout.segment_steps as u32,
+        segment_steps: layout.segment_steps as u32,
+        observation_len: layout.observation_len as u32,
+        action_len: layout.action_len as u32,
+        checksum: block_checksum(&segment.block),
+        ..SegmentHeader::default()
+    };
+    let mut updates = 0;
+    let mut turn = |sequence| {
+        if learner.publish_due(1) {
+            segment.header.policy_version = learner.next_snapshot().unwrap().version;
+        }
+        segment.header.sequence = sequence;
+        segment.header.episode = sequence as u32;
+        learner.insert(&segment).unwrap();
+        while learner.update_due() {
+            learner.update().unwrap();
+            updates += 1;
+        }
+    };
+    // Mean and scale are taken anew at each doubling of what was seen, the last time before 40.
+    (1..=40).for_each(&mut turn);
+    let before = ALLOCATIONS.load(Ordering::Relaxed);
+    (41..=60).for_each(&mut turn);
+    let allocated = ALLOCATIONS.load(Ordering::Relaxed) - before;
+    assert!(updates >= 60, "{algorithm}: {updates} updates show nothing");
+    allocated
+}
+
 /// Allocations of twenty updates of an actor that imitates beside them, after some.
 fn allocations_of_imitation() -> u64 {
     let mut layers = Layers::new();
@@ -105,6 +160,9 @@ fn allocations_of_imitation() -> u64 {
 #[test]
 fn no_update_allocates_once_its_buffers_are_made() {
     assert_eq!(allocations_of_imitation(), 0, "imitation");
+    for algorithm in ["ddpg", "td3", "sac", "ndp"] {
+        assert_eq!(allocations_of_a_learner(algorithm), 0, "a learner of {algorithm}");
+    }
     for algorithm in ["ddpg", "td3", "sac"] {
         for (policy, norm) in [("dmp", "false"), ("mlp", "false"), ("mlp", "true")] {
             let what = [algorithm, policy, norm];

@@ -304,4 +304,54 @@ mod tests {
         ];
         assert_eq!(rows(&replay, Windows::Sliding, Target::NStep), expected);
     }
+
+    #[test]
+    fn networks_see_normalised_observations_and_the_dmp_plain_ones() {
+        let mut normaliser = Normaliser::new(1, 1);
+        normaliser.observe(&[-1.0, 3.0]); // mean 1, standard deviation 2
+        normaliser.refresh();
+        let replay = replay(9, &[(0, TERMINATED)]);
+        let mut sampler = Sampler::new(Windows::Segment, dmprl_shared::seeds::stream(1, "test", 0));
+        let mut batch = Batch::new(SHAPE);
+        let config = AlgorithmConfig::default();
+        let source = (&replay, &mut sampler);
+        batch.sample(SHAPE, &config, 1.0, Some(&normaliser), source).unwrap();
+        assert!(batch.observations.contains(&0.0) && batch.observations.contains(&2.0));
+        for row in 0..SHAPE.rows {
+            let (s, next) = (batch.observations[row], batch.next_observations[row]);
+            assert_eq!(batch.inputs[row], (s - 1.0) / 2.0);
+            assert_eq!(batch.critic_inputs[3 * row], batch.inputs[row]);
+            assert_eq!(batch.next_inputs[row], (next - 1.0) / 2.0);
+        }
+    }
+
+    #[test]
+    fn a_carried_state_is_the_tail_of_the_observation_after_the_window_in_the_dmps_time() {
+        // Observation t is (t, y = t / 8, yd = 4 t); omega = 2.
+        let layout = SegmentLayout { observation_len: 3, ..LAYOUT };
+        let shape = BatchShape { observation_len: 3, end_state_len: 2, ..SHAPE };
+        let mut replay = Replay::new(layout, 18, 1, 1);
+        for (episode_step, steps_len, flags) in [(0_u32, 2_u32, 0), (2, 1, TERMINATED)] {
+            let mut block = vec![0.0; layout.block_len()];
+            let (observations, actions, _) = layout.split_mut(&mut block);
+            for k in 0..=steps_len as usize {
+                let t = (episode_step as usize + k) as f32;
+                observations[3 * k..3 * k + 3].copy_from_slice(&[t, t / 8.0, 4.0 * t]);
+            }
+            actions.fill(0.5);
+            let header = SegmentHeader { episode_step, steps_len, flags, ..Default::default() };
+            replay.insert(&header, &block);
+        }
+        let random = dmprl_shared::seeds::stream(1, "test", 0);
+        let mut sampler = Sampler::new(Windows::Sliding, random);
+        let mut batch = Batch::new(shape);
+        let config = AlgorithmConfig::default();
+        batch.sample(shape, &config, 2.0, None, (&replay, &mut sampler)).unwrap();
+        let mut ends = [None; 3];
+        for input in batch.critic_inputs.chunks_exact(7) {
+            ends[input[0] as usize] = Some([input[5], input[6]]);
+        }
+        // From step 1 the window reads over its slot's border; from step 2 it is short.
+        assert_eq!(ends, [Some([0.25, 4.0]), Some([0.375, 6.0]), Some([0.375, 6.0])]);
+    }
 }

@@ -46,13 +46,14 @@ fn case(keys: &[(&str, &str)]) -> Case {
     let mut fill = |values: &mut [f32]| {
         values.iter_mut().for_each(|value| *value = random.random_range(-1.0..1.0));
     };
+    // What the networks see is normalised, what the DMP starts from is not: mixing them up shows.
     fill(&mut batch.observations);
-    batch.inputs.copy_from_slice(&batch.observations);
+    fill(&mut batch.inputs);
     fill(&mut batch.critic_inputs);
     fill(&mut batch.rewards);
     fill(&mut batch.bootstrap);
     fill(&mut batch.next_observations);
-    batch.next_inputs.copy_from_slice(&batch.next_observations);
+    fill(&mut batch.next_inputs);
     fill(&mut batch.next_noise);
     fill(&mut batch.noise);
     Case { config, policy, algorithm, batch }

@@ -14,7 +14,13 @@ from importlib.metadata import version
 from pathlib import Path
 
 import torch
-from algorithms import ALGORITHMS, Kit
+from algorithms import (
+    ALGORITHMS,
+    SMOOTHING_MAX,
+    SMOOTHING_STD,
+    TEMPERATURE_LEARNING_RATE,
+    Kit,
+)
 from networks import flat, flat_gradient
 from safetensors.torch import save_file
 from settings import Settings, Start
@@ -57,7 +63,11 @@ CASES = {
 
 
 def configuration(case):
-    """What differs from dmprl's defaults, as its own configuration keys."""
+    """Everything that the case depends on, as dmprl's own configuration keys.
+
+    Also what is a default there, which may be tuned. (TD3 here moves its actor at every 2nd update,
+    and windows, target and discount are in the batches.)
+    """
     sources = ", ".join(
         f"{{cos = {s.cos}, sin = {s.sin}, velocity = {s.velocity}}}"
         if s.cos is not None
@@ -70,17 +80,36 @@ def configuration(case):
         "policy.hidden": list(case.hidden),
         "policy.start": case.start,
         "policy.start_velocity": case.start_velocity,
+        "policy.segment_steps": case.segment_steps,
+        "policy.goal_range": case.goal_range,
+        "policy.weight_range": case.weight_range,
+        "policy.controller": case.controller,
+        "policy.rho": "bounded",
+        "policy.rho_range": case.rho_range,
         "dmp.integrator": case.integrator,
+        "dmp.integration_steps": case.integration_steps,
+        "dmp.canonical": "euler",
+        "dmp.widths": "ndp",
+        "dmp.alpha_x": case.alpha_x,
         "dmp.alpha_y": case.alpha_y,
         "dmp.basis_count": case.basis_count,
         "dmp.forcing_scaling": case.forcing_scaling,
         "algorithm.name": case.algorithm,
         "algorithm.critic": case.critic,
         "algorithm.critic_hidden": list(case.critic_hidden),
+        "algorithm.critic_layer_norm": "false",
         "algorithm.batch_size": case.batch_size,
+        "algorithm.critic_learning_rate": case.critic_learning_rate,
+        "algorithm.actor_learning_rate": case.actor_learning_rate,
+        "algorithm.polyak": case.polyak,
     }
+    if case.algorithm == "td3":
+        keys["algorithm.td3.target_noise_std"] = SMOOTHING_STD
+        keys["algorithm.td3.target_noise_clip"] = SMOOTHING_MAX
+        keys["algorithm.td3.actor_interval"] = 2
     if case.algorithm == "sac":
         keys["algorithm.sac.target_entropy_per_action"] = -0.5 if case.policy == "dmp" else -1.0
+        keys["algorithm.sac.temperature_learning_rate"] = TEMPERATURE_LEARNING_RATE
     return {key: str(value) for key, value in keys.items()}
 
 

@@ -19,7 +19,7 @@ class Start:
 
 @dataclass(frozen=True)
 class Settings:
-    """The values that decide what one update computes; defaults as in shared/src/config."""
+    """The values that decide what one update computes."""
 
     algorithm: str
     policy: str
