@@ -7,7 +7,8 @@
 //!
 //! Differences from Andrychowicz et al., Algorithm 1:
 //! 1. A goal is drawn for a segment of K steps, not for a step; K = 1 is the published algorithm.
-//! 2. With sliding windows a copy begins at a step drawn from the segment's, as samples then do.
+//! 2. With sliding windows a copy begins at a step drawn from the segment's, but not so late that
+//!    the episode's end would cut it short: the last whole window is drawn for all that follow.
 //! 3. A copy ends where the task would have ended the episode at its goal. One that is then left
 //!    with fewer than K steps for another reason is none: a missing action is no zero action.
 

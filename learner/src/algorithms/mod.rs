@@ -64,6 +64,12 @@ struct Remote {
     is_ahead: bool,
 }
 
+impl Remote {
+    fn new(config: &ExperimentConfig, device: Device) -> Self {
+        Self { config: config.clone(), device, graph: None, is_ahead: false }
+    }
+}
+
 #[derive(Debug)]
 enum Kind {
     Ddpg(Box<Ddpg>),
@@ -87,12 +93,7 @@ impl Algorithm {
         };
         let remote = match config.learner.device {
             config::Device::Cpu => None,
-            config::Device::Cuda => Some(Remote {
-                config: config.clone(),
-                device: Device::new_cuda(0)?,
-                graph: None,
-                is_ahead: false,
-            }),
+            config::Device::Cuda => Some(Remote::new(config, Device::new_cuda(0)?)),
         };
         Ok(Self { shape, crew: Crew::new(config.learner.threads), kind, remote })
     }

@@ -7,9 +7,10 @@
 //!    noise is drawn for each of the K A numbers. A DMP state that is carried on (`start =
 //!    "carry"`) enters the target's critics undisturbed. K = 1 is the published algorithm.
 //! 2. The target is the K-step return (`target = "n_step"`).
-//! 3. Layers of 256 and 256 units for their 400 and 300, PyTorch's initialisation, step sizes of
-//!    actor and critics apart.
-//! 4. A time limit is no termination: truncated episodes bootstrap, as in their code.
+//! 3. Layers of 256 and 256 units for their 400 and 300; a batch of 256 for their 100.
+//! 4. Two updates a segment are 0.4 an environment step (theirs: 1); observations are normalised;
+//!    warm-up draws are gentler than uniform over the bounds (`exploration.warm_up_range`).
+//! 5. A time limit is no termination: truncated episodes bootstrap, as in their code.
 
 use candle_core::Result;
 use dmprl_shared::config::{ExperimentConfig, Td3Config};

@@ -92,13 +92,21 @@ impl Case {
 }
 
 pub(super) fn assert_close(name: &str, got: &[f32], expected: &[f32]) {
+    assert_within(1e-5, name, got, expected);
+}
+
+fn assert_within(tolerance: f64, name: &str, got: &[f32], expected: &[f32]) {
     let norm = |values: &mut dyn Iterator<Item = f32>| {
         values.map(|value| f64::from(value).powi(2)).sum::<f64>().sqrt()
     };
     let size = norm(&mut expected.iter().copied());
     let difference = norm(&mut got.iter().zip(expected).map(|(a, b)| a - b));
     assert!(size > 1e-6, "{name}: nothing to compare");
-    assert!(difference < 1e-5 * size, "{name}: differs by {:.1e} of its norm", difference / size);
+    assert!(
+        difference < tolerance * size,
+        "{name}: differs by {:.1e} of its norm",
+        difference / size
+    );
 }
 
 #[test]
@@ -120,6 +128,59 @@ fn an_update_equals_automatic_differentiation() {
             let all: Vec<_> = keys.iter().copied().chain([("algorithm.name", algorithm)]).collect();
             case(&all).check(&format!("{algorithm} {keys:?}"));
         }
+    }
+}
+
+/// Networks here are those that another device has learned, after `what`.
+fn assert_fetched(here: &mut Case, there: &mut Case, what: &str) {
+    let mut newest = vec![0.0; here.policy.parameters_len()];
+    there.algorithm.read_policy(&mut newest).unwrap();
+    there.algorithm.fetch().unwrap();
+    let networks = here.algorithm.networks().into_iter().zip(there.algorithm.networks());
+    for ((name, want), (_, got)) in networks {
+        let check = |part: &str, got: &[f32], want: &[f32]| {
+            assert_within(1e-4, &format!("{part} of {name} {what}"), got, want);
+        };
+        if name == "actor" {
+            assert_eq!(got.network.values(), &newest[..got.network.values().len()], "{what}");
+        }
+        check("parameters", got.network.values(), want.network.values());
+        check("moments", &got.adam.moments.first, &want.adam.moments.first);
+        check("moments", &got.adam.moments.second, &want.adam.moments.second);
+        if let (Some(got), Some(want)) = (&got.target, &want.target) {
+            check("target", got.values(), want.values());
+        }
+    }
+}
+
+/// What `--device cuda` does, on candle's CPU: the graph's updates, fetched, changed here and gone
+/// on with there.
+#[test]
+fn another_device_learns_the_same_and_hands_it_back() {
+    for algorithm in ["ddpg", "td3", "sac"] {
+        let keys = [("algorithm.name", algorithm), ("algorithm.td3.actor_interval", "2")];
+        let (mut here, mut there) = (case(&keys), case(&keys));
+        there.algorithm.remote = Some(Remote::new(&there.config, Device::Cpu));
+        let run = |case: &mut Case, updates: std::ops::RangeInclusive<u64>| {
+            for update in updates {
+                case.algorithm.update(&case.policy, &case.batch, update).unwrap();
+            }
+        };
+        for case in [&mut here, &mut there] {
+            run(case, 1..=20);
+        }
+        assert_fetched(&mut here, &mut there, &format!("{algorithm}, 20 updates"));
+        // As a new mean and scale of the observations do.
+        for case in [&mut here, &mut there] {
+            case.algorithm.fetch().unwrap();
+            let halve = |_, trained: &mut Trained| {
+                trained.network.values_mut().iter_mut().for_each(|value| *value *= 0.9);
+                Ok::<(), ()>(())
+            };
+            case.algorithm.each_network(halve).unwrap();
+            run(case, 21..=23);
+        }
+        assert_fetched(&mut here, &mut there, &format!("{algorithm}, changed between"));
     }
 }
 

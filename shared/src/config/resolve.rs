@@ -232,6 +232,10 @@ impl ExperimentConfig {
             "0 with algorithm.name = \"ndp\", which learns only from what its own policy did".into()
         })?;
         let on_cpu = self.learner.device == super::Device::Cpu;
+        let bf16 = self.learner.precision == super::Precision::Bf16;
+        range("learner.precision", "bf16", on_cpu || !bf16, || {
+            "f32 with learner.device = \"cuda\": bf16 is the processor's".into()
+        })?;
         range("learner.device", "cuda", !on_policy || on_cpu, || {
             "cpu with algorithm.name = \"ndp\", whose minibatches are too small for a GPU".into()
         })?;

@@ -43,9 +43,8 @@ fn every_algorithm_with_every_policy_is_measured_beside_its_floor() {
             assert_eq!((&json["algorithm"], &json["policy"]), (&algorithm.into(), &policy.into()));
             assert_eq!(json["rounds"]["ours"].as_array().unwrap().len(), 2, "{json}");
             assert!(json["peer_torch_ms"].is_null() && json.get("peer_jax_ms").is_some());
-            let shares = json["share_of_time"].as_object().unwrap().values();
-            let sum: f64 = shares.map(|share| share.as_f64().unwrap()).sum();
-            assert!((sum - 1.0).abs() < 1e-9, "{json}");
+            let shares = &json["share_of_time"];
+            ["sample", "products", "optimiser"].map(|part| positive(shares, part));
         }
     }
     assert_nothing_left(&place);

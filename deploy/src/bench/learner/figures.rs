@@ -164,6 +164,8 @@ impl Figures {
             "algorithm": self.config.algorithm.name,
             "policy": self.config.policy.kind,
             "task": self.config.task.name,
+            "precision": self.config.learner.precision,
+            "critic_layer_norm": self.config.algorithm.critic_layer_norm,
             "share_of_time": shares.map(|shares| shares.collect::<Map<_, _>>()),
             "peak_memory_mb": self.peak_memory_bytes.map(|bytes| bytes as f64 / 1e6),
             "seconds": self.seconds,

@@ -5,9 +5,9 @@ use std::path::Path;
 use std::process::Command;
 use std::time::Duration;
 
-use anyhow::{Context, ensure};
+use anyhow::{Context, bail, ensure};
 use clap::ValueEnum;
-use dmprl_shared::config::ExperimentConfig;
+use dmprl_shared::config::{ExperimentConfig, RhoKind};
 use dmprl_shared::spec::EnvSpec;
 use serde::Deserialize;
 use serde_json::{Value, json};
@@ -64,6 +64,9 @@ impl Peer {
         bench: &LearnerBench,
         folder: &Path,
     ) -> anyhow::Result<Self> {
+        if let Some(why) = cannot_do(&bench.config) {
+            bail!("{}", why);
+        }
         let settings = folder.join("settings.json");
         std::fs::write(&settings, settings_of(&bench.config, &bench.spec).to_string())
             .with_context(|| format!("cannot write {}", settings.display()))?;
@@ -105,6 +108,17 @@ impl Peer {
     }
 }
 
+/// Why the script's update would be another one than this configuration's.
+fn cannot_do(config: &ExperimentConfig) -> Option<&'static str> {
+    let algorithm = &config.algorithm;
+    let otherwise = [
+        (algorithm.critic_layer_norm, "tests/peers does no layer normalisation"),
+        (algorithm.td3.actor_interval != 2, "tests/peers moves TD3's actor at every second update"),
+        (config.policy.rho == RhoKind::Free, "tests/peers bounds rho"),
+    ];
+    otherwise.into_iter().find_map(|(differs, why)| differs.then_some(why))
+}
+
 /// `Settings` of `tests/golden/update/settings.py`: sizes, and what changes the amount of work.
 fn settings_of(config: &ExperimentConfig, spec: &EnvSpec) -> Value {
     let (algorithm, policy, dmp) = (&config.algorithm, &config.policy, &config.dmp);
@@ -135,4 +149,28 @@ fn settings_of(config: &ExperimentConfig, spec: &EnvSpec) -> Value {
         "actor_learning_rate": algorithm.actor_learning_rate,
         "polyak": algorithm.polyak,
     })
+}
+
+#[cfg(test)]
+mod tests {
+    use dmprl_shared::config::Layers;
+
+    use super::*;
+
+    #[test]
+    fn a_peer_is_not_compared_with_another_update() {
+        let with = |key: &str, value: &str| {
+            let mut layers = Layers::new();
+            layers.set("test", key, value).unwrap();
+            cannot_do(&layers.finish().unwrap())
+        };
+        assert_eq!(with("algorithm.batch_size", "64"), None);
+        for (key, value) in [
+            ("algorithm.critic_layer_norm", "true"),
+            ("algorithm.td3.actor_interval", "3"),
+            ("policy.rho", "free"),
+        ] {
+            assert!(with(key, value).is_some(), "{key}");
+        }
+    }
 }
