@@ -45,6 +45,7 @@ impl Supervisor {
                 return self.on_not_evaluated(process, policy_version, &reason);
             }
             Report::EnvFailures { count, last } => self.on_env_failures(process, count, &last),
+            Report::Sent(sent) => self.sent += sent,
             Report::EnvHung { message } => self.on_env_hung(process, &message),
             Report::Checkpoint { name, env_steps } => {
                 self.checkpointed = true;
@@ -123,7 +124,7 @@ impl Supervisor {
             self.advanced = now;
         }
         self.checkpointed = false;
-        self.tell_learner_of_env_failures();
+        self.tell_learner_of_counts();
         self.display.progress(&progress);
         if self.first.is_none() {
             self.first = Some((now, progress.clone()));

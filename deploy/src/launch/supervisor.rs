@@ -4,8 +4,11 @@ use std::collections::BTreeMap;
 use std::time::{Duration, Instant};
 
 use anyhow::{Context, Error};
+use dmprl_learner::checkpoint;
+use dmprl_learner::learner::Counters;
 use dmprl_shared::config::ExperimentConfig;
 use dmprl_shared::spec::EnvSpec;
+use dmprl_shared::transport::delivery::Sent;
 use tokio::sync::mpsc;
 
 use super::child::{Child, EVENTS_MAX, Event};
@@ -115,9 +118,11 @@ pub(super) struct Supervisor {
     pub(super) last: Option<(Instant, Progress)>,
     pub(super) best_return: f64,
     pub(super) last_row: Option<EvaluationRow>,
-    /// Failures of environments in this session, and as many as the learner has been told of.
+    /// Where the run stood when this session began.
+    pub(super) before: Counters,
+    /// Failures of environments in this session, and what its workers did.
     pub(super) env_failures: u64,
-    pub(super) env_failures_told: u64,
+    pub(super) sent: Sent,
 }
 
 /// What ended the supervisor's wait.
@@ -157,8 +162,9 @@ pub async fn supervise(plan: SupervisorPlan) -> SessionReport {
         last: None,
         best_return: f64::NEG_INFINITY,
         last_row: None,
+        before: Counters::default(),
         env_failures: 0,
-        env_failures_told: 0,
+        sent: Sent::default(),
     };
     let started = supervisor.start();
     supervisor.check(started);
@@ -190,6 +196,7 @@ impl Supervisor {
     fn start(&mut self) -> anyhow::Result<()> {
         let run = &self.launcher.run;
         self.spec = run.spec()?;
+        self.before = checkpoint::counters(&run.checkpoints_path())?.pop().unwrap_or_default();
         self.best_return = run.best_row()?.map_or(f64::NEG_INFINITY, |row| row.return_mean);
         if self.is_one_process() || self.spec.is_some() {
             self.spawn(Process::Learner)?;
