@@ -79,8 +79,8 @@ pub struct Counters {
     /// Segments that came, refused ones included. Checkpoints of older versions have none.
     #[serde(default)]
     pub received: u64,
-    /// Bytes behind the last whole record of the segment log, cut off. Checkpoints of older versions
-    /// have none.
+    /// Bytes behind the last whole record of the segment log, cut off. Checkpoints of older
+    /// versions have none.
     #[serde(default)]
     pub log_bytes_cut: u64,
     /// Segments that an on-policy algorithm did not learn from, since another policy had made

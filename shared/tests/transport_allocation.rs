@@ -44,6 +44,10 @@ fn allocations(work: impl FnOnce()) -> u64 {
     ALLOCATIONS.load(Ordering::Relaxed) - before
 }
 
+fn log(parent: &Parent) -> SegmentLog {
+    SegmentLog::open(&parent.path().join("log"), (7, 1), LAYOUT, 1 << 30).unwrap()
+}
+
 /// Alone in its binary: the counter sees every thread. iceoryx2 0.10 allocates about 100 bytes for
 /// each sample that is filled, 0 for each that is read; we add nothing to that.
 #[test]
@@ -54,8 +58,7 @@ fn the_steady_state_allocates_only_what_iceoryx2_does_for_a_sample() {
     let plan = plan(2, 8);
     let mut learner = serve(domain.path(), &plan).unwrap();
     let mut inbox = Inbox::new(DeliveryLevel::Log, plan.worker_count);
-    let path = parent.path().join("log");
-    let mut log = SegmentLog::open(&path, (7, 1), LAYOUT, 1 << 30).unwrap();
+    let mut log = log(&parent);
     let mut workers = [0, 1].map(|index| {
         let outbox = Outbox::new(LAYOUT, 2 * plan.queue_segments, index, 1);
         (attach(domain.path(), &plan, index as usize).unwrap(), outbox, 0)
@@ -63,8 +66,7 @@ fn the_steady_state_allocates_only_what_iceoryx2_does_for_a_sample() {
     let mut acknowledgements = Acknowledgements { epoch: 0, marks: Vec::with_capacity(2) };
     let mut segment = Segment::zeroed(LAYOUT);
     let block = vec![0.0; LAYOUT.block_len()];
-    let mut published = snapshot(0);
-    let mut taken = snapshot(0);
+    let [mut published, mut taken] = [0, 0].map(snapshot);
     // Connects everyone.
     learner.segments.try_receive(&mut segment).unwrap();
     learner.parameters.publish(&published).unwrap();

@@ -59,6 +59,8 @@ pub struct SessionReport {
     pub last_row: Option<EvaluationRow>,
     /// Failures of environments that were reported.
     pub env_failures: u64,
+    /// Starts of the learner after a death.
+    pub learner_restarts: u64,
     /// From the first start to the last exit.
     pub wall: Duration,
 }
@@ -90,6 +92,8 @@ pub(super) struct Running {
     pub(super) child: Child,
     pub(super) spawned: Instant,
     pub(super) ready: bool,
+    /// A worker that knows where the learner is, and finds the next by itself.
+    pub(super) attached: bool,
 }
 
 pub(super) struct Supervisor {
@@ -102,6 +106,12 @@ pub(super) struct Supervisor {
     pub(super) phase: Phase,
     pub(super) spec: Option<EnvSpec>,
     pub(super) learner_ready: bool,
+    /// Starts of the learner after a death in this session.
+    pub(super) learner_restarts: u64,
+    /// Since when nothing has been learned.
+    pub(super) learner_died: Option<Instant>,
+    /// The evaluator was killed with its learner, and has not ended yet.
+    pub(super) evaluator_ends: bool,
     pub(super) finished: bool,
     /// Whether the newest report of progress was followed by a checkpoint.
     pub(super) checkpointed: bool,
@@ -148,6 +158,9 @@ pub async fn supervise(plan: SupervisorPlan) -> SessionReport {
         phase: Phase::Training,
         spec: None,
         learner_ready: false,
+        learner_restarts: 0,
+        learner_died: None,
+        evaluator_ends: false,
         finished: false,
         checkpointed: false,
         evaluations: EvaluationQueue::new(limit),
@@ -217,7 +230,8 @@ impl Supervisor {
         slot.restart_at = None;
         let command = self.launcher.command(process, slot.restarts)?;
         let child = Child::spawn(command, process, self.events.clone())?;
-        slot.running = Some(Running { child, spawned: Instant::now(), ready: false });
+        slot.running =
+            Some(Running { child, spawned: Instant::now(), ready: false, attached: false });
         Ok(())
     }
 
@@ -262,6 +276,7 @@ impl Supervisor {
             training,
             last_row: self.last_row,
             env_failures: self.env_failures,
+            learner_restarts: self.learner_restarts,
             wall: self.started.elapsed(),
         }
     }
