@@ -133,7 +133,7 @@ fn value(mark: Mark, worker: usize) -> f32 {
 impl World {
     pub fn new(seed: u64, log_path: &Path) -> Self {
         let mut random = seeds::stream(seed, "delivery", 0);
-        let level = if seed % 2 == 0 { DeliveryLevel::Memory } else { DeliveryLevel::Log };
+        let level = if seed.is_multiple_of(2) { DeliveryLevel::Memory } else { DeliveryLevel::Log };
         let (outbox_segments, queue) = (random.random_range(1..=8), random.random_range(1..=4));
         let worker = |index| Worker {
             outbox: Outbox::new(LAYOUT, outbox_segments, index, 0),
