@@ -12,7 +12,7 @@ use dmprl_shared::policy::{Head, Policy, PolicyError};
 use dmprl_shared::seeds;
 use dmprl_shared::segment::{Expected, SegmentLayout};
 use dmprl_shared::spec::EnvSpec;
-use dmprl_shared::transport::delivery::{Inbox, SegmentLog, Sent};
+use dmprl_shared::transport::delivery::{Inbox, Sent};
 use serde::{Deserialize, Serialize};
 use thiserror::Error;
 
@@ -122,8 +122,6 @@ pub struct Learner {
     snapshot: ParameterSnapshot,
     /// How far each worker's segments have come.
     pub inbox: Inbox,
-    /// What came since the last checkpoint, at level `log`.
-    log: Option<SegmentLog>,
     omega: f32,
     /// Where the policy imitates demonstrations.
     cloning: Option<Cloning>,
@@ -168,8 +166,7 @@ impl Learner {
                 values: vec![0.0; policy.parameters_len()],
                 ..ParameterSnapshot::default()
             },
-            inbox: Inbox::new(config.delivery.level, workers),
-            log: None,
+            inbox: Inbox::new(workers),
             cloning: match config.demonstrations.are_cloned() {
                 true => Some(Cloning::new(&config, &policy)?),
                 false => None,
@@ -209,7 +206,7 @@ impl Learner {
             Some(ndp) => !ndp.update_due(),
             None => self.pacing.may_take(),
         };
-        ready && !self.has_all_steps() && self.log.as_ref().is_none_or(SegmentLog::has_room)
+        ready && !self.has_all_steps() && self.inbox.has_room()
     }
 
     /// Whether an update is to be done now.

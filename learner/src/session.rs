@@ -118,7 +118,7 @@ impl<R: SegmentReceiver, P: ParameterPublisher> Session<R, P> {
     /// # Errors
     /// If learner or transport fail, or `due` does.
     pub fn turn(&mut self, due: DueHandler<'_>) -> Result<Turn, SessionError> {
-        if self.learner.log_is_full() && !self.room_asked {
+        if self.learner.inbox.is_full() && !self.room_asked {
             self.room_asked = true;
             due(Due::Checkpoint, &mut self.learner).map_err(SessionError::Due)?;
         }

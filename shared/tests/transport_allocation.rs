@@ -7,7 +7,6 @@ mod transport_support;
 use std::alloc::{GlobalAlloc, Layout, System};
 use std::sync::atomic::{AtomicU64, Ordering};
 
-use dmprl_shared::config::DeliveryLevel;
 use dmprl_shared::segment::Segment;
 use dmprl_shared::transport::delivery::{Acknowledgements, Inbox, Outbox, SegmentLog};
 use dmprl_shared::transport::shared_memory::{attach, serve};
@@ -57,8 +56,8 @@ fn the_steady_state_allocates_only_what_iceoryx2_does_for_a_sample() {
     let domain = parent.domain("run");
     let plan = plan(2, 8);
     let mut learner = serve(domain.path(), &plan).unwrap();
-    let mut inbox = Inbox::new(DeliveryLevel::Log, plan.worker_count);
-    let mut log = log(&parent);
+    let mut inbox = Inbox::new(plan.worker_count);
+    inbox.log_to(log(&parent));
     let mut workers = [0, 1].map(|index| {
         let outbox = Outbox::new(LAYOUT, 2 * plan.queue_segments, index, 1);
         (attach(domain.path(), &plan, index as usize).unwrap(), outbox, 0)
@@ -70,13 +69,13 @@ fn the_steady_state_allocates_only_what_iceoryx2_does_for_a_sample() {
     // Connects everyone.
     learner.segments.try_receive(&mut segment).unwrap();
     learner.parameters.publish(&published).unwrap();
-    learner.acknowledgements.acknowledge(inbox.acknowledged()).unwrap();
+    learner.acknowledgements.acknowledge(inbox.acknowledge().unwrap()).unwrap();
     let (mut offers, mut delivered, mut sending, mut reading) = (0, 0, 0, 0);
     for version in 1..=ROUNDS {
         published.version = version;
         sending += allocations(|| {
             learner.parameters.publish(&published).unwrap();
-            learner.acknowledgements.acknowledge(inbox.acknowledged()).unwrap();
+            learner.acknowledgements.acknowledge(inbox.acknowledge().unwrap()).unwrap();
         });
         for (index, (worker, outbox, sequence)) in workers.iter_mut().enumerate() {
             reading += allocations(|| {
@@ -100,12 +99,10 @@ fn the_steady_state_allocates_only_what_iceoryx2_does_for_a_sample() {
         }
         let mut take = || {
             while learner.segments.try_receive(&mut segment).unwrap() {
-                inbox.settle(&segment.header).unwrap();
-                log.append(&segment.header, &segment.block);
+                inbox.settle(&segment.header, &segment.block).unwrap();
                 delivered += 1;
             }
-            log.write().unwrap();
-            inbox.stored();
+            inbox.acknowledge().unwrap();
         };
         for (worker, outbox, _) in &mut workers {
             reading += allocations(&mut take);

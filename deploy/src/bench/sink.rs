@@ -9,7 +9,6 @@ use std::sync::mpsc::{self, Receiver, RecvTimeoutError, Sender};
 use std::thread::{self, JoinHandle};
 use std::time::{Duration, Instant};
 
-use dmprl_shared::config::DeliveryLevel;
 use dmprl_shared::segment::{Expected, HINDSIGHT, Segment, SegmentHeader, check};
 use dmprl_shared::transport::delivery::Inbox;
 use dmprl_shared::transport::shared_memory::LearnerEnd;
@@ -96,7 +95,7 @@ impl Sink {
             expected,
             stop: Arc::clone(&stop),
             segment: Segment::zeroed(expected.layout),
-            inbox: Inbox::new(DeliveryLevel::Memory, expected.worker_count as usize),
+            inbox: Inbox::new(expected.worker_count as usize),
             discrepancies: Discrepancies::default(),
             maintained: Instant::now(),
             acknowledged: Instant::now(),
@@ -234,7 +233,7 @@ impl Taker {
         }
         let mut header = self.segment.header;
         let sound = check(&header, &self.segment.block, &self.expected);
-        match sound.and_then(|()| self.inbox.settle(&header)) {
+        match sound.and_then(|()| self.inbox.settle(&header, &self.segment.block)) {
             Ok(lost) => self.discrepancies.lost += lost,
             Err(_) => {
                 self.discrepancies.rejected += 1;
@@ -252,7 +251,7 @@ impl Taker {
             return Ok(());
         }
         self.acknowledged = Instant::now();
-        self.end.acknowledgements.acknowledge(self.inbox.acknowledged())
+        self.end.acknowledgements.acknowledge(self.inbox.settled())
     }
 
     fn maintain_in_time(&mut self) -> Result<(), TransportError> {

@@ -141,7 +141,7 @@ impl<'a> Recorder<'a> {
     /// What may be acknowledged, unless the segment log cannot be written: workers then wait, as
     /// soon as they can keep no more.
     pub fn acknowledge<'l>(&mut self, learner: &'l mut Learner) -> Option<&'l [Mark]> {
-        match learner.acknowledge() {
+        match learner.inbox.acknowledge() {
             Ok(marks) => {
                 self.log_failing = false;
                 Some(marks)

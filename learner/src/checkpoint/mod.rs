@@ -157,7 +157,7 @@ pub fn save(folder: &Path, learner: &mut Learner) -> Result<String, CheckpointEr
     let path = folder.join(&name);
     fs::rename(&temporary, &path).map_err(io_error(&path))?;
     rotation::point_latest(folder, &name)?;
-    learner.checkpointed().map_err(|cause| CheckpointError::Log { cause })?;
+    learner.inbox.checkpointed().map_err(|cause| CheckpointError::Log { cause })?;
     let config = &learner.config().checkpoint;
     rotation::rotate(folder, config.keep, config.disk_bytes_max)?;
     Ok(name)

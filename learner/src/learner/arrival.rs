@@ -1,7 +1,7 @@
-//! How segments come in: checked, settled, logged, stored, and acknowledged.
+//! How segments come in: checked, settled and stored, or recovered from the log.
 
 use dmprl_shared::segment::{HINDSIGHT, Rejection, Segment, check};
-use dmprl_shared::transport::delivery::{LogError, Mark, Replayed, SegmentLog};
+use dmprl_shared::transport::delivery::{LogError, Replayed, SegmentLog};
 
 use super::Learner;
 
@@ -26,10 +26,7 @@ impl Learner {
     }
 
     fn settle(&mut self, segment: &Segment) -> Result<(), Rejection> {
-        self.counters.lost += self.inbox.settle(&segment.header)?;
-        if let Some(log) = &mut self.log {
-            log.append(&segment.header, &segment.block);
-        }
+        self.counters.lost += self.inbox.settle(&segment.header, &segment.block)?;
         Ok(())
     }
 
@@ -76,35 +73,7 @@ impl Learner {
             }
         })?;
         self.counters.log_bytes_cut += replayed.cut_bytes;
-        self.inbox.stored();
-        self.log = Some(log);
+        self.inbox.log_to(log);
         Ok(replayed)
-    }
-
-    /// Whether nothing can be taken before a checkpoint has emptied the log.
-    #[must_use]
-    pub fn log_is_full(&self) -> bool {
-        self.log.as_ref().is_some_and(SegmentLog::is_full)
-    }
-
-    /// Up to where workers may forget their segments; at level `log` they are written first.
-    ///
-    /// # Errors
-    /// If they cannot be written: then nothing new may be acknowledged, and workers wait.
-    pub fn acknowledge(&mut self) -> Result<&[Mark], LogError> {
-        if let Some(log) = &mut self.log {
-            log.write()?;
-        }
-        self.inbox.stored();
-        Ok(self.inbox.acknowledged())
-    }
-
-    /// A checkpoint of this moment is on disk.
-    ///
-    /// # Errors
-    /// If the log cannot be emptied, which costs nothing but its room.
-    pub(crate) fn checkpointed(&mut self) -> Result<(), LogError> {
-        self.inbox.stored();
-        self.log.as_mut().map_or(Ok(()), SegmentLog::clear)
     }
 }

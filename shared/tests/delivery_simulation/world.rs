@@ -94,12 +94,6 @@ struct Worker {
     heard: u64,
 }
 
-/// A learner that lives.
-struct Learner {
-    inbox: Inbox,
-    log: Option<SegmentLog>,
-}
-
 /// What stays when a learner dies: of each worker, and how many segments of it were inserted.
 struct Checkpoint {
     marks: Vec<Mark>,
@@ -112,7 +106,8 @@ pub struct World {
     log_path: PathBuf,
     outbox_segments: usize,
     workers: Vec<Worker>,
-    learner: Option<Learner>,
+    /// A learner that lives.
+    inbox: Option<Inbox>,
     epoch: u64,
     /// The model's replay: what the learner holds of each worker, in order.
     inserted: [Vec<Mark>; WORKERS],
@@ -149,7 +144,7 @@ impl World {
             level,
             log_path: log_path.to_owned(),
             outbox_segments,
-            learner: None,
+            inbox: None,
             epoch: 0,
             inserted: Default::default(),
             forgotten: Default::default(),
@@ -285,7 +280,7 @@ impl World {
 
     /// At level `log`, once the learner is there: what any worker has forgotten is in the replay.
     fn assert_acked_is_inserted(&self) {
-        if self.level == DeliveryLevel::Memory || self.learner.is_none() {
+        if self.level == DeliveryLevel::Memory || self.inbox.is_none() {
             return;
         }
         for (index, acked) in self.acked.iter().enumerate() {
@@ -297,14 +292,13 @@ impl World {
     }
 
     fn log_is_full(&self) -> bool {
-        let log = self.learner.as_ref().and_then(|learner| learner.log.as_ref());
-        log.is_some_and(SegmentLog::is_full)
+        self.inbox.as_ref().is_some_and(Inbox::is_full)
     }
 
     /// The learner takes a segment from one of the queues, as `Learner::insert` does.
     fn take(&mut self) {
-        let Some(learner) = &mut self.learner else { return };
-        if learner.log.as_ref().is_some_and(|log| !log.has_room()) {
+        let Some(inbox) = &mut self.inbox else { return };
+        if !inbox.has_room() {
             self.tally.full_logs += 1;
             return;
         }
@@ -312,13 +306,8 @@ impl World {
         let taken = (0..WORKERS)
             .find_map(|turn| self.workers[(first + turn) % WORKERS].link.queue.pop_front());
         let Some(segment) = taken else { return };
-        match learner.inbox.settle(&segment.header) {
-            Ok(lost) => {
-                if let Some(log) = &mut learner.log {
-                    log.append(&segment.header, &segment.block);
-                }
-                self.insert(&segment, lost);
-            }
+        match inbox.settle(&segment.header, &segment.block) {
+            Ok(lost) => self.insert(&segment, lost),
             Err(Rejection::Duplicate) => self.tally.duplicates += 1,
             Err(why) => panic!("{why}"),
         }
@@ -343,48 +332,43 @@ impl World {
         self.inserted[index].push(mark);
     }
 
-    /// As the learner's loop: write, then say so.
+    /// As the learner's loop does. It may die before the workers hear of it, with what it was
+    /// writing torn: that was acknowledged to nobody.
     fn acknowledge(&mut self) {
-        let torn = self.workers[0].link.faults && self.chance(20);
-        let Some(learner) = &mut self.learner else { return };
-        if let Some(log) = &mut learner.log {
-            let len = || std::fs::metadata(&self.log_path).unwrap().len();
-            let before = if torn { len() } else { 0 };
-            log.write().unwrap();
-            let after = if torn { len() } else { 0 };
-            if after > before {
-                // The process was killed in the middle of the `write`.
-                let left = self.random.random_range(before..after);
-                let file = std::fs::File::options().write(true).open(&self.log_path).unwrap();
-                file.set_len(left).unwrap();
-                self.tally.torn_logs += 1;
-                self.kill_learner();
-                return;
-            }
-            learner.inbox.stored();
+        let dies = self.workers[0].link.faults && self.chance(20);
+        let Some(inbox) = &mut self.inbox else { return };
+        let len = || std::fs::metadata(&self.log_path).map_or(0, |metadata| metadata.len());
+        let before = if dies { len() } else { 0 };
+        let marks = inbox.acknowledge().unwrap().to_vec();
+        if !dies {
+            self.published.push(Acknowledgements { epoch: self.epoch, marks });
+            return;
         }
-        let marks = learner.inbox.acknowledged().to_vec();
-        self.published.push(Acknowledgements { epoch: self.epoch, marks });
+        let after = len();
+        if after > before {
+            let left = self.random.random_range(before..after);
+            let file = std::fs::File::options().write(true).open(&self.log_path).unwrap();
+            file.set_len(left).unwrap();
+            self.tally.torn_logs += 1;
+        }
+        self.kill_learner();
     }
 
     /// A checkpoint; the learner may die before it has emptied the log.
     fn save(&mut self) {
         let dies = self.workers[0].link.faults && self.chance(10);
-        let Some(learner) = &mut self.learner else { return };
+        let Some(inbox) = &mut self.inbox else { return };
         let inserted = self.inserted.each_ref().map(Vec::len);
-        self.checkpoint = Checkpoint { marks: learner.inbox.settled().to_vec(), inserted };
+        self.checkpoint = Checkpoint { marks: inbox.settled().to_vec(), inserted };
         if dies {
             self.kill_learner();
             return;
         }
-        if let Some(log) = &mut learner.log {
-            log.clear().unwrap();
-        }
-        learner.inbox.stored();
+        inbox.checkpointed().unwrap();
     }
 
     fn kill_learner(&mut self) {
-        if self.learner.take().is_none() {
+        if self.inbox.take().is_none() {
             return;
         }
         self.tally.learner_deaths += 1;
@@ -395,26 +379,26 @@ impl World {
 
     /// A learner goes on from checkpoint and log, with new queues.
     fn start_learner(&mut self) {
-        if self.learner.is_some() {
+        if self.inbox.is_some() {
             return;
         }
         self.epoch += 1;
-        let mut inbox = Inbox::new(self.level, WORKERS);
+        let mut inbox = Inbox::new(WORKERS);
         inbox.restore(&self.checkpoint.marks);
-        let open = || SegmentLog::open(&self.log_path, (1, 1), LAYOUT, LOG_BYTES_MAX).unwrap();
-        let mut log = (self.level == DeliveryLevel::Log).then(open);
-        if let Some(log) = &mut log {
-            let mut fresh = Vec::new();
-            log.replay(|segment| match inbox.settle(&segment.header) {
-                Ok(lost) => fresh.push((segment.clone(), lost)),
-                Err(Rejection::Duplicate) => {} // the checkpoint has it
-                Err(why) => panic!("{why}"),
+        if self.level == DeliveryLevel::Log {
+            let log = SegmentLog::open(&self.log_path, (1, 1), LAYOUT, LOG_BYTES_MAX);
+            let mut log = log.unwrap();
+            // As `Learner::recover` does.
+            log.replay(|segment| {
+                if !inbox.has(&segment.header) {
+                    let lost = inbox.settle(&segment.header, &segment.block).unwrap();
+                    self.insert(segment, lost);
+                }
             })
             .unwrap();
-            inbox.stored();
-            fresh.iter().for_each(|(segment, lost)| self.insert(segment, *lost));
+            inbox.log_to(log);
         }
-        self.learner = Some(Learner { inbox, log });
+        self.inbox = Some(inbox);
         self.workers.iter_mut().for_each(|worker| worker.link.new_learner(self.epoch));
         self.assert_acked_is_inserted();
     }

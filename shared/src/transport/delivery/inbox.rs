@@ -1,24 +1,21 @@
 //! The learner's side: what has come of each worker, and how far it is safe.
 
-use super::Mark;
-use crate::config::DeliveryLevel;
+use super::{LogError, Mark, SegmentLog};
 use crate::segment::{Rejection, SegmentHeader};
 
-/// How far each worker's segments have come.
-#[derive(Debug, Clone, PartialEq, Eq)]
+/// How far each worker's segments have come, and the log of those that no checkpoint holds yet.
+#[derive(Debug)]
 pub struct Inbox {
-    level: DeliveryLevel,
     settled: Vec<Mark>,
-    /// Up to where all is in the log or in a checkpoint.
-    stored: Vec<Mark>,
+    /// At level `log`: every segment is appended as it is settled.
+    log: Option<SegmentLog>,
 }
 
 impl Inbox {
-    /// Nothing has come of any worker.
+    /// Nothing has come of any worker, and nothing is logged.
     #[must_use]
-    pub fn new(level: DeliveryLevel, worker_count: usize) -> Self {
-        let marks = vec![Mark::default(); worker_count];
-        Self { level, settled: marks.clone(), stored: marks }
+    pub fn new(worker_count: usize) -> Self {
+        Self { settled: vec![Mark::default(); worker_count], log: None }
     }
 
     /// Goes on from a checkpoint's marks. One without has seen no worker that lives.
@@ -26,7 +23,11 @@ impl Inbox {
         for (index, settled) in self.settled.iter_mut().enumerate() {
             *settled = marks.get(index).copied().unwrap_or_default();
         }
-        self.stored.copy_from_slice(&self.settled);
+    }
+
+    /// Logs to `log` from now on, whose records have been settled.
+    pub fn log_to(&mut self, log: SegmentLog) {
+        self.log = Some(log);
     }
 
     /// Up to where segments have been settled: inserted, or refused for good. What a checkpoint
@@ -36,13 +37,11 @@ impl Inbox {
         &self.settled
     }
 
-    /// Up to where workers may forget their segments.
+    /// Whether a segment was settled before, or is of an incarnation before the newest.
     #[must_use]
-    pub fn acknowledged(&self) -> &[Mark] {
-        match self.level {
-            DeliveryLevel::Memory => &self.settled,
-            DeliveryLevel::Log => &self.stored,
-        }
+    pub fn has(&self, header: &SegmentHeader) -> bool {
+        let mark = Mark { incarnation: header.incarnation, sequence: header.sequence };
+        self.settled.get(header.worker_id as usize).is_some_and(|last| mark <= *last)
     }
 
     /// Settles a segment, to be called in the moment in which it is inserted. Returns how many
@@ -54,8 +53,8 @@ impl Inbox {
     /// `Duplicate` if it was settled before, or is of an incarnation before the newest.
     ///
     /// # Panics
-    /// If there is no such worker: `segment::check` comes first.
-    pub fn settle(&mut self, header: &SegmentHeader) -> Result<u64, Rejection> {
+    /// If there is no such worker or the block is of another length: `segment::check` comes first.
+    pub fn settle(&mut self, header: &SegmentHeader, block: &[f32]) -> Result<u64, Rejection> {
         if self.has(header) {
             return Err(Rejection::Duplicate);
         }
@@ -63,18 +62,40 @@ impl Inbox {
         let mark = Mark { incarnation: header.incarnation, sequence: header.sequence };
         let before = if mark.incarnation == last.incarnation { last.sequence } else { 0 };
         *last = mark;
+        if let Some(log) = &mut self.log {
+            log.append(header, block);
+        }
         Ok(mark.sequence - before - 1)
     }
 
-    /// Whether a segment was settled before, or is of an incarnation before the newest.
-    #[must_use]
-    pub fn has(&self, header: &SegmentHeader) -> bool {
-        let mark = Mark { incarnation: header.incarnation, sequence: header.sequence };
-        self.settled.get(header.worker_id as usize).is_some_and(|last| mark <= *last)
+    /// Up to where workers may forget their segments; at level `log` these are written first.
+    ///
+    /// # Errors
+    /// If they cannot be written: then nothing new may be acknowledged, and workers wait.
+    pub fn acknowledge(&mut self) -> Result<&[Mark], LogError> {
+        if let Some(log) = &mut self.log {
+            log.write()?;
+        }
+        Ok(&self.settled)
     }
 
-    /// Everything settled so far is in the log or in a checkpoint.
-    pub fn stored(&mut self) {
-        self.stored.copy_from_slice(&self.settled);
+    /// A checkpoint of this moment is on disk.
+    ///
+    /// # Errors
+    /// If the log cannot be emptied, which costs nothing but its room.
+    pub fn checkpointed(&mut self) -> Result<(), LogError> {
+        self.log.as_mut().map_or(Ok(()), SegmentLog::clear)
+    }
+
+    /// Whether another segment may be settled now.
+    #[must_use]
+    pub fn has_room(&self) -> bool {
+        self.log.as_ref().is_none_or(SegmentLog::has_room)
+    }
+
+    /// Whether nothing can be settled before a checkpoint has emptied the log.
+    #[must_use]
+    pub fn is_full(&self) -> bool {
+        self.log.as_ref().is_some_and(SegmentLog::is_full)
     }
 }
