@@ -105,6 +105,7 @@ impl Supervisor {
         self.set_ready(process);
         self.learner_ready = true;
         self.advanced = Instant::now();
+        self.tell_learner_of_counts();
         if matches!(self.phase, Phase::Draining { .. }) {
             // Its predecessor was asked, and died of something else.
             self.send(Process::Learner, Command::Finish);
