@@ -8,6 +8,7 @@ use std::path::PathBuf;
 
 use anyhow::ensure;
 use dmprl_shared::spec::EnvSpec;
+use dmprl_shared::transport::delivery::Sent;
 use serde::{Deserialize, Serialize};
 
 /// Exit status of a process that has ended itself because an environment hung.
@@ -30,9 +31,11 @@ pub enum Command {
     Evaluate(EvaluationRequest),
     /// To the learner: so many failures of environments have been reported to the supervisor.
     EnvFailures {
-        /// In this session, all processes together.
+        /// In the whole run, all processes together.
         total: u64,
     },
+    /// To the learner: what all workers have reported to the supervisor, in the whole run.
+    Sent(Sent),
     /// To the learner: the run has reached its goal or its time; finish as at the last step, with a
     /// last evaluation.
     Finish,
@@ -73,6 +76,8 @@ pub enum Report {
         /// The last of them: which, when and why.
         last: String,
     },
+    /// What a worker did since its last such report.
+    Sent(Sent),
     /// A call into the environments does not return; the process ends itself after this.
     EnvHung {
         /// The sentence.
@@ -115,7 +120,7 @@ pub struct Progress {
     pub samples_per_insert: f64,
     /// Median over recent segments: policy versions between acting and insertion.
     pub policy_lag_p50: u64,
-    /// Segments refused.
+    /// Segments refused, duplicates aside.
     pub rejected: u64,
     /// Failures of environments.
     pub env_failures: u64,

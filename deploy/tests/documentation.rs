@@ -6,7 +6,7 @@ use std::path::Path;
 use std::process::Command;
 
 use dmprl::control::EvaluationRow;
-use dmprl_learner::metrics::{MetricsLine, Rejected};
+use dmprl_learner::metrics::{DeliveryLine, MetricsLine, Rejected};
 use dmprl_shared::config::{ExperimentConfig, Layers, Limits, task_defaults};
 
 const EXAMPLES: &str = "docs/examples";
@@ -243,6 +243,8 @@ fn the_keys_of_both_kinds_of_lines_are_documented() {
         policy_lag_max: None,
         updates_owed: 0.0,
         lost: 0,
+        delivery: DeliveryLine::default(),
+        learner_restarts: 0,
         stale_segments: 0,
         policy_loss: None,
         value_loss: None,

@@ -98,6 +98,20 @@ learner-dies)
     while [ $line -le 20 ]; do echo "log line $line" >&2; line=$((line + 1)); done
     kill -9 $$
     ;;
+learner-dies-once)
+    # In the middle of an evaluation, the first time.
+    echo '"learner_ready"'
+    progress 10
+    if [ "$(grep -c started "$fake/$name.seen")" = 1 ]; then
+        evaluate 1
+        while ! grep -q 'policy_version":1' "$fake/evaluator.seen"; do :; done
+        kill -9 $$
+    fi
+    echo '"first_segment"'
+    evaluate 2
+    finish
+    ;;
+learner-refuses) echo 'error: no such checkpoint' >&2; exit 1 ;;
 learner-asks-for-the-lock)
     echo '"learner_ready"'
     flock --nonblock "$run/lock" true || echo locked >>"$fake/$name.seen"
@@ -118,6 +132,9 @@ evaluator-*)
             kill -9 $$
         fi
         [ "$mode" = dies ] && exit 4
+        if [ "$mode" = slow-once ] && [ "$(grep -c started "$fake/$name.seen")" = 1 ]; then
+            while read -r line; do :; done
+        fi
         version=${line##*policy_version\":}
         version=${version%%\}*}
         if [ "$mode" = fails-once ] && [ "$version" = 1 ]; then

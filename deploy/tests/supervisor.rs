@@ -99,10 +99,41 @@ fn an_environment_that_cannot_be_made_ends_the_run_at_once_with_its_reason() {
 }
 
 #[test]
-fn a_dead_learner_ends_the_run_with_its_last_words_and_advice() {
-    let fixture = Fixture::new(&[("learner", "dies")]);
+fn a_learner_that_dies_once_is_replaced_and_its_workers_stay() {
+    let fixture = Fixture::new(&[("learner", "dies-once"), ("evaluator", "slow-once")]);
     std::fs::create_dir(fixture.run.checkpoints_path().join("000001")).unwrap();
-    let (report, _) = fixture.supervise();
+    let (report, shown) = fixture.supervise();
+    assert!(matches!(report.ending, Ending::Completed), "{:?}\n{shown}", report.ending);
+    assert_eq!((report.learner_restarts, report.checkpointed), (1, true));
+    assert!(shown.contains("learner died (signal 9 (SIGKILL)"), "{shown}");
+    assert!(shown.contains("the learner is back: first segment"), "{shown}");
+    assert!(fixture.seen("learner").contains("started resumed"), "{}", fixture.seen("learner"));
+    for actor in ["actor-0", "actor-1"] {
+        let seen = fixture.seen(actor);
+        assert_eq!((seen.matches("started").count(), seen.matches("attach").count()), (1, 1));
+    }
+    // The evaluation that was going on is given up, and the next one done.
+    assert_eq!(fixture.seen("evaluator").matches("policy_version\":1").count(), 1);
+    assert_eq!(report.last_row.unwrap().policy_version, 2);
+    fixture.assert_no_child_lives();
+}
+
+#[test]
+fn a_learner_that_refuses_to_start_is_not_started_again() {
+    let fixture = Fixture::new(&[("learner", "refuses")]);
+    let message = failure(fixture.supervise().0.ending);
+    assert!(message.contains("error: no such checkpoint"), "{message}");
+    assert_eq!(fixture.seen("learner").matches("started").count(), 1);
+}
+
+#[test]
+fn a_learner_that_keeps_dying_ends_the_run_with_its_last_words_and_advice() {
+    let mut fixture = Fixture::new(&[("learner", "dies")]);
+    fixture.config.supervision.learner_restarts_max = 2;
+    std::fs::create_dir(fixture.run.checkpoints_path().join("000001")).unwrap();
+    let (report, shown) = fixture.supervise();
+    assert!(shown.contains("restart 2 of 2"), "{shown}");
+    assert_eq!(fixture.seen("learner").matches("started").count(), 3);
     let message = failure(report.ending);
     for part in ["learner died: signal 9", "logs/learner.log", "log line 20", "dmprl resume"] {
         assert!(message.contains(part), "{part}: {message}");

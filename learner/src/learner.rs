@@ -1,17 +1,18 @@
 //! The learner's state and its three moves: take a segment, update, publish.
 //!
-//! No clock, no file and no transport here: the loop around it (`session`) brings those.
+//! No clock and no transport here, and no file but the segment log it is handed: the loop around it
+//! (`session`) brings those.
 
+mod arrival;
 mod imitation;
 
 use dmprl_shared::config::{AlgorithmName, ExperimentConfig};
 use dmprl_shared::parameters::ParameterSnapshot;
 use dmprl_shared::policy::{Head, Policy, PolicyError};
 use dmprl_shared::seeds;
-use dmprl_shared::segment::{
-    Expected, HINDSIGHT, Rejection, Segment, SegmentHeader, SegmentLayout, check,
-};
+use dmprl_shared::segment::{Expected, SegmentLayout};
 use dmprl_shared::spec::EnvSpec;
+use dmprl_shared::transport::delivery::{Inbox, Sent};
 use serde::{Deserialize, Serialize};
 use thiserror::Error;
 
@@ -19,7 +20,7 @@ use crate::algorithms::cloning::Cloning;
 use crate::algorithms::ndp::{Ndp, Scene};
 use crate::algorithms::{Algorithm, Batch, NoWindow};
 use crate::demonstrations::DemonstrationError;
-use crate::metrics::{Collector, MetricsLine, Rejected};
+use crate::metrics::{Collector, DeliveryLine, MetricsLine, Rejected};
 use crate::normaliser::Normaliser;
 use crate::pacing::Pacing;
 use crate::replay::{Replay, Sampler};
@@ -75,6 +76,13 @@ pub struct Counters {
     pub rejected: Rejected,
     /// Segments missing in the workers' sequences.
     pub lost: u64,
+    /// Segments that came, refused ones included. Checkpoints of older versions have none.
+    #[serde(default)]
+    pub received: u64,
+    /// Bytes behind the last whole record of the segment log, cut off. Checkpoints of older
+    /// versions have none.
+    #[serde(default)]
+    pub log_bytes_cut: u64,
     /// Segments that an on-policy algorithm did not learn from, since another policy had made
     /// them. Checkpoints of older versions have none.
     #[serde(default)]
@@ -83,6 +91,12 @@ pub struct Counters {
     /// here for the run's later sessions. Checkpoints of older versions have none.
     #[serde(default)]
     pub env_failures: u64,
+    /// What the workers did, as they reported it, likewise.
+    #[serde(default)]
+    pub sent: Sent,
+    /// Starts of the learner after a death within a session, likewise.
+    #[serde(default)]
+    pub learner_restarts: u64,
 }
 
 /// Everything that learns.
@@ -106,8 +120,8 @@ pub struct Learner {
     batch: Batch,
     collector: Collector,
     snapshot: ParameterSnapshot,
-    /// Incarnation and last sequence number of every worker heard from.
-    heard: Vec<(u32, u64)>,
+    /// How far each worker's segments have come.
+    pub inbox: Inbox,
     omega: f32,
     /// Where the policy imitates demonstrations.
     cloning: Option<Cloning>,
@@ -152,7 +166,7 @@ impl Learner {
                 values: vec![0.0; policy.parameters_len()],
                 ..ParameterSnapshot::default()
             },
-            heard: vec![(0, 0); workers],
+            inbox: Inbox::new(workers),
             cloning: match config.demonstrations.are_cloned() {
                 true => Some(Cloning::new(&config, &policy)?),
                 false => None,
@@ -192,7 +206,7 @@ impl Learner {
             Some(ndp) => !ndp.update_due(),
             None => self.pacing.may_take(),
         };
-        ready && !self.has_all_steps()
+        ready && !self.has_all_steps() && self.inbox.has_room()
     }
 
     /// Whether an update is to be done now.
@@ -212,62 +226,6 @@ impl Learner {
             Some(ndp) => !ndp.update_due(),
             None => updates >= self.config.learner.publish_every_updates,
         }
-    }
-
-    /// Inserts a segment.
-    ///
-    /// # Errors
-    /// The reason if it does not fit; it is counted and changes nothing else.
-    pub fn insert(&mut self, segment: &Segment) -> Result<(), Rejection> {
-        let sound = check(&segment.header, &segment.block, &self.expected);
-        if let Err(why) = sound.and_then(|()| self.follow_sequence(&segment.header)) {
-            self.counters.rejected.count(why);
-            return Err(why);
-        }
-        if let Some(normaliser) = &mut self.normaliser {
-            let (observations, _, _) = self.expected.layout.split(&segment.block);
-            let seen = segment.header.steps_len as usize * normaliser.observation_len();
-            normaliser.observe(&observations[..seen]);
-        }
-        if segment.header.flags & HINDSIGHT != 0 {
-            // Experience, and nothing that an environment or an episode did.
-            self.replay.insert(&segment.header, &segment.block);
-            self.counters.hindsight_segments += 1;
-            return Ok(());
-        }
-        self.collector.inserted(segment, self.counters.policy_version);
-        self.counters.segments += 1;
-        self.counters.env_steps += u64::from(segment.header.steps_len);
-        if let Some((ndp, _)) = self.algorithm.on_policy() {
-            self.counters.stale_segments += u64::from(!ndp.take(segment));
-            return Ok(());
-        }
-        self.replay.insert(&segment.header, &segment.block);
-        // While the actor imitates the critic learns from the first step on.
-        if !self.is_warming_up() || self.config.demonstrations.are_cloned() {
-            self.pacing.inserted();
-        }
-        Ok(())
-    }
-
-    fn is_warming_up(&self) -> bool {
-        self.counters.env_steps <= self.config.exploration.warm_up_steps
-    }
-
-    /// A worker numbers its segments from 1 without gaps: a number used before is a duplicate, one
-    /// left out is lost.
-    fn follow_sequence(&mut self, header: &SegmentHeader) -> Result<(), Rejection> {
-        let heard = &mut self.heard[header.worker_id as usize];
-        // A learner that has just started does not know how far its workers have come.
-        let new = heard.1 == 0 || header.incarnation > heard.0;
-        if !new && (header.incarnation < heard.0 || header.sequence <= heard.1) {
-            return Err(Rejection::Duplicate);
-        }
-        if !new {
-            self.counters.lost += header.sequence - heard.1 - 1;
-        }
-        *heard = (header.incarnation, header.sequence);
-        Ok(())
     }
 
     /// Samples a batch and updates the networks.
@@ -405,6 +363,15 @@ impl Learner {
             samples_per_insert: self.samples_per_insert(),
             rejected: counters.rejected,
             lost: counters.lost,
+            delivery: DeliveryLine {
+                produced: counters.sent.produced,
+                sent: counters.sent.sent,
+                resent: counters.sent.resent,
+                acked: counters.sent.acked,
+                received: counters.received,
+                log_bytes_cut: counters.log_bytes_cut,
+            },
+            learner_restarts: counters.learner_restarts,
             stale_segments: counters.stale_segments,
             env_failures: counters.env_failures,
             critic_loss: collected.critic_loss,

@@ -33,6 +33,12 @@ pub struct MetricsLine {
     /// Segments missing in the sequences of the workers that the learner has heard from, over the
     /// whole run.
     pub lost: u64,
+    /// On the way from workers to learner, over the whole run.
+    #[serde(default)]
+    pub delivery: DeliveryLine,
+    /// Starts of the learner after a death within a session, over the whole run.
+    #[serde(default)]
+    pub learner_restarts: u64,
     /// NDP: segments of another policy than the one that was to be learned from, over the whole
     /// run: environment steps that taught nothing.
     #[serde(default)]
@@ -85,6 +91,25 @@ pub struct MetricsLine {
     pub updates_per_s: f64,
 }
 
+/// Segments on the way from workers to learner. The first four are counted by the workers, which
+/// report them once a second: what one had not reported when it was killed is missing.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct DeliveryLine {
+    /// Finished by a worker.
+    pub produced: u64,
+    /// Taken by a queue, those that were sent again included.
+    pub sent: u64,
+    /// Of these, sent again.
+    pub resent: u64,
+    /// Acknowledged by the learner, and heard by the worker.
+    pub acked: u64,
+    /// Taken from a queue by the learner: inserted or refused.
+    pub received: u64,
+    /// Bytes behind the last whole record of the segment log, cut off when a learner started.
+    pub log_bytes_cut: u64,
+}
+
 /// Keys of a [`MetricsLine`] that depend on the clock: two deterministic runs differ in these only.
 pub const TIME_KEYS: [&str; 3] = ["wall_s", "env_steps_per_s", "updates_per_s"];
 
@@ -106,7 +131,7 @@ pub struct Rejected {
     pub checksum: u64,
     /// A value that is not finite or out of bounds.
     pub value: u64,
-    /// A sequence number used before.
+    /// A sequence number used before: sent again to a learner that had it.
     pub duplicate: u64,
 }
 
@@ -135,12 +160,11 @@ impl Rejected {
         }
     }
 
-    /// All together.
+    /// All together but duplicates, which belong to sending again what may be lost: faults.
     #[must_use]
     pub fn total(&self) -> u64 {
-        let Self { layout_version, run, architecture, sizes, field, checksum, value, duplicate } =
-            self;
-        layout_version + run + architecture + sizes + field + checksum + value + duplicate
+        let Self { layout_version, run, architecture, sizes, field, checksum, value, .. } = self;
+        layout_version + run + architecture + sizes + field + checksum + value
     }
 }
 

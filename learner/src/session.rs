@@ -32,6 +32,8 @@ pub enum Due {
     Checkpoint,
     /// A word about the first segment that was refused for this reason.
     Refusal(Rejection),
+    /// A word about so many segments that will never come.
+    Lost(u64),
 }
 
 /// What kept something that was due from being done, in the caller's words.
@@ -64,6 +66,8 @@ pub struct Session<R, P> {
     segment: Segment,
     updates_published: u64,
     warm_up_published: bool,
+    /// Whether a checkpoint has been asked for since the log is full, lately.
+    room_asked: bool,
 }
 
 impl<R: SegmentReceiver, P: ParameterPublisher> Session<R, P> {
@@ -76,6 +80,7 @@ impl<R: SegmentReceiver, P: ParameterPublisher> Session<R, P> {
         let mut session = Self {
             updates_published: learner.counters.updates,
             warm_up_published: false,
+            room_asked: false,
             learner,
             receiver,
             publisher,
@@ -102,15 +107,21 @@ impl<R: SegmentReceiver, P: ParameterPublisher> Session<R, P> {
     /// # Errors
     /// If the transport fails.
     pub fn maintain(&mut self) -> Result<(), TransportError> {
+        self.room_asked = false;
         self.receiver.maintain()?;
         self.publisher.maintain()
     }
 
-    /// Takes at most one segment, or does at most one update.
+    /// Takes at most one segment, or does at most one update. A full segment log makes a
+    /// checkpoint due; as long as none can be written nothing is taken, and workers wait.
     ///
     /// # Errors
     /// If learner or transport fail, or `due` does.
     pub fn turn(&mut self, due: DueHandler<'_>) -> Result<Turn, SessionError> {
+        if self.learner.inbox.is_full() && !self.room_asked {
+            self.room_asked = true;
+            due(Due::Checkpoint, &mut self.learner).map_err(SessionError::Due)?;
+        }
         if self.learner.may_take() && self.receiver.try_receive(&mut self.segment)? {
             self.take(due)?;
             return Ok(Turn::Worked);
@@ -141,9 +152,15 @@ impl<R: SegmentReceiver, P: ParameterPublisher> Session<R, P> {
 
     fn take(&mut self, due: DueHandler<'_>) -> Result<(), SessionError> {
         let before = self.learner.counters.env_steps;
-        if let Err(why) = self.learner.insert(&self.segment) {
-            // Each is counted; the first of a kind is told aloud.
-            if self.learner.counters.rejected.of(why) == 1 {
+        let lost_before = self.learner.counters.lost;
+        let inserted = self.learner.insert(&self.segment);
+        let lost = self.learner.counters.lost - lost_before;
+        if lost > 0 {
+            due(Due::Lost(lost), &mut self.learner).map_err(SessionError::Due)?;
+        }
+        if let Err(why) = inserted {
+            // Each is counted; the first of a kind is told aloud. Duplicates are no fault.
+            if why != Rejection::Duplicate && self.learner.counters.rejected.of(why) == 1 {
                 due(Due::Refusal(why), &mut self.learner).map_err(SessionError::Due)?;
             }
             return Ok(());
@@ -388,7 +405,7 @@ mod tests {
         run.turns();
         let counters = run.session.learner.counters;
         assert_eq!((counters.hindsight_segments, run.session.learner.replay.len()), (3, 4));
-        assert_eq!(counters, Counters { hindsight_segments: 3, ..real });
+        assert_eq!(counters, Counters { hindsight_segments: 3, received: 4, ..real });
         let line = run.session.learner.metrics_line();
         assert_eq!((line.episodes, line.hindsight_segments, line.lost), (1, 3, 0));
         assert_eq!(line.updates_owed, 0.0);

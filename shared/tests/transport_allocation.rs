@@ -8,9 +8,10 @@ use std::alloc::{GlobalAlloc, Layout, System};
 use std::sync::atomic::{AtomicU64, Ordering};
 
 use dmprl_shared::segment::Segment;
+use dmprl_shared::transport::delivery::{Acknowledgements, Inbox, Outbox, SegmentLog};
 use dmprl_shared::transport::shared_memory::{attach, serve};
 use dmprl_shared::transport::{
-    ParameterPublisher, ParameterSubscriber, SegmentReceiver, SegmentSender, SendOutcome,
+    ParameterPublisher, ParameterSubscriber, SegmentReceiver, SendOutcome,
 };
 use transport_support::{LAYOUT, Parent, header, plan, snapshot};
 
@@ -42,6 +43,10 @@ fn allocations(work: impl FnOnce()) -> u64 {
     ALLOCATIONS.load(Ordering::Relaxed) - before
 }
 
+fn log(parent: &Parent) -> SegmentLog {
+    SegmentLog::open(&parent.path().join("log"), (7, 1), LAYOUT, 1 << 30).unwrap()
+}
+
 /// Alone in its binary: the counter sees every thread. iceoryx2 0.10 allocates about 100 bytes for
 /// each sample that is filled, 0 for each that is read; we add nothing to that.
 #[test]
@@ -51,37 +56,65 @@ fn the_steady_state_allocates_only_what_iceoryx2_does_for_a_sample() {
     let domain = parent.domain("run");
     let plan = plan(2, 8);
     let mut learner = serve(domain.path(), &plan).unwrap();
-    let mut workers = [0, 1].map(|index| attach(domain.path(), &plan, index).unwrap());
+    let mut inbox = Inbox::new(plan.worker_count);
+    inbox.log_to(log(&parent));
+    let mut workers = [0, 1].map(|index| {
+        let outbox = Outbox::new(LAYOUT, 2 * plan.queue_segments, index, 1);
+        (attach(domain.path(), &plan, index as usize).unwrap(), outbox, 0)
+    });
+    let mut acknowledgements = Acknowledgements { epoch: 0, marks: Vec::with_capacity(2) };
     let mut segment = Segment::zeroed(LAYOUT);
     let block = vec![0.0; LAYOUT.block_len()];
-    let mut published = snapshot(0);
-    let mut taken = snapshot(0);
+    let [mut published, mut taken] = [0, 0].map(snapshot);
     // Connects everyone.
     learner.segments.try_receive(&mut segment).unwrap();
     learner.parameters.publish(&published).unwrap();
+    learner.acknowledgements.acknowledge(inbox.acknowledge().unwrap()).unwrap();
     let (mut offers, mut delivered, mut sending, mut reading) = (0, 0, 0, 0);
     for version in 1..=ROUNDS {
         published.version = version;
-        sending += allocations(|| learner.parameters.publish(&published).unwrap());
-        for worker in &mut workers {
-            reading += allocations(|| assert!(worker.parameters.newest(&mut taken).unwrap()));
+        sending += allocations(|| {
+            learner.parameters.publish(&published).unwrap();
+            learner.acknowledgements.acknowledge(inbox.acknowledge().unwrap()).unwrap();
+        });
+        for (index, (worker, outbox, sequence)) in workers.iter_mut().enumerate() {
+            reading += allocations(|| {
+                assert!(worker.parameters.newest(&mut taken).unwrap());
+                assert!(worker.acknowledgements.newest(&mut acknowledgements).unwrap());
+                outbox.acknowledge(&acknowledgements);
+            });
+            assert!(outbox.is_empty());
             taken.version = 0;
             let mut outcome = SendOutcome::Delivered;
             while outcome == SendOutcome::Delivered {
-                let offer =
-                    || outcome = worker.segments.try_send(&header(0, 1, 1), &block).unwrap();
+                *sequence += 1;
+                let offer = || {
+                    assert!(outbox.put(&header(index as u32, 1, *sequence), &block));
+                    outcome = outbox.offer(&mut worker.segments).unwrap();
+                };
                 sending += allocations(offer);
                 offers += 1;
             }
             assert_eq!(outcome, SendOutcome::Full);
         }
-        reading += allocations(|| {
+        let mut take = || {
             while learner.segments.try_receive(&mut segment).unwrap() {
+                inbox.settle(&segment.header, &segment.block).unwrap();
                 delivered += 1;
             }
-        });
+            inbox.acknowledge().unwrap();
+        };
+        for (worker, outbox, _) in &mut workers {
+            reading += allocations(&mut take);
+            // The one that found its queue full.
+            sending += allocations(|| {
+                assert_eq!(outbox.offer(&mut worker.segments).unwrap(), SendOutcome::Delivered);
+            });
+            offers += 1;
+        }
+        reading += allocations(&mut take);
     }
     assert_eq!(reading, 0);
-    assert!(sending <= offers + ROUNDS, "{sending} allocations for {offers} segments");
-    assert_eq!(delivered, ROUNDS * 2 * plan.queue_segments as u64);
+    assert!(sending <= offers + 2 * ROUNDS, "{sending} allocations for {offers} segments");
+    assert_eq!(delivered, ROUNDS * 2 * (plan.queue_segments as u64 + 1));
 }

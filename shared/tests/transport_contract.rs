@@ -60,6 +60,7 @@ fn over_shared_memory(workers: usize, queue_segments: usize) -> Transport {
 fn offer(transport: &mut Transport, worker: usize, sequence: u64) -> SendOutcome {
     let mut block = vec![0.0; LAYOUT.block_len()];
     fill(&mut block, sequence);
+    assert!(!transport.senders[worker].renew().unwrap());
     transport.senders[worker].try_send(&header(worker as u32, 1, sequence), &block).unwrap()
 }
 

@@ -261,8 +261,7 @@ fn workers_of_another_plan_do_not_follow_a_new_learner() {
     let mut new = old.clone();
     new.architecture_hash += 1;
     let _learner = serve(domain.path(), &new).unwrap();
-    let block = vec![0.0; LAYOUT.block_len()];
-    let refusal = worker.segments.try_send(&header(0, 1, 1), &block).unwrap_err();
+    let refusal = worker.segments.renew().unwrap_err();
     assert!(matches!(refusal, TransportError::Incompatible { .. }), "{refusal}");
     let refusal = worker.parameters.newest(&mut snapshot(0)).unwrap_err();
     assert!(matches!(refusal, TransportError::Incompatible { .. }), "{refusal}");

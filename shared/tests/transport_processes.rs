@@ -40,8 +40,12 @@ fn play_worker(domain: &Path, index: usize, incarnation: u32) {
     for sequence in 1.. {
         fill(&mut block, sequence);
         let header = header(index as u32, incarnation, sequence);
-        while worker.segments.try_send(&header, &block).unwrap() != SendOutcome::Delivered {
-            std::thread::sleep(Duration::from_micros(50));
+        loop {
+            worker.segments.renew().unwrap();
+            match worker.segments.try_send(&header, &block).unwrap() {
+                SendOutcome::Delivered => break,
+                _ => std::thread::sleep(Duration::from_micros(50)),
+            }
         }
     }
 }
@@ -151,6 +155,7 @@ fn a_worker_is_not_disturbed_by_the_deaths_of_others() {
 fn offer(worker: &mut WorkerEnd, sequence: &mut u64) -> SendOutcome {
     let mut block = vec![0.0; LAYOUT.block_len()];
     fill(&mut block, *sequence + 1);
+    worker.segments.renew().unwrap();
     let outcome = worker.segments.try_send(&header(0, 1, *sequence + 1), &block).unwrap();
     if outcome == SendOutcome::Delivered {
         *sequence += 1;

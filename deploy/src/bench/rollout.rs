@@ -69,6 +69,7 @@ fn measure(mut bench: RolloutBench) -> anyhow::Result<Figures> {
         domain: Some(domain.path().to_owned()),
         resume: false,
         init_from: None,
+        learner_restarts: 0,
         sessions_before: 0,
     };
     let progress = RoundsProgress::new(bench.rounds);

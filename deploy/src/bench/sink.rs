@@ -10,6 +10,7 @@ use std::thread::{self, JoinHandle};
 use std::time::{Duration, Instant};
 
 use dmprl_shared::segment::{Expected, HINDSIGHT, Segment, SegmentHeader, check};
+use dmprl_shared::transport::delivery::Inbox;
 use dmprl_shared::transport::shared_memory::LearnerEnd;
 use dmprl_shared::transport::{ParameterPublisher, SegmentReceiver, TransportError};
 use rustix::time::{ClockId, clock_gettime};
@@ -18,6 +19,8 @@ use super::nap::Nap;
 
 /// Between two cleanings of what dead workers left.
 const MAINTENANCE_INTERVAL: Duration = Duration::from_millis(250);
+/// Between two acknowledgements, as the learner's.
+const ACKNOWLEDGEMENT_INTERVAL: Duration = Duration::from_millis(10);
 /// Between two looks for new workers that have no policy yet, while workers start.
 const GREETING_INTERVAL: Duration = Duration::from_millis(5);
 /// Between two looks for the first segments.
@@ -92,9 +95,10 @@ impl Sink {
             expected,
             stop: Arc::clone(&stop),
             segment: Segment::zeroed(expected.layout),
-            sequences: vec![0; expected.worker_count as usize],
+            inbox: Inbox::new(expected.worker_count as usize),
             discrepancies: Discrepancies::default(),
             maintained: Instant::now(),
+            acknowledged: Instant::now(),
             nap: Nap::new(queue_segments * expected.worker_count as usize),
             nap_of_first: Nap::new(queue_segments),
         };
@@ -128,10 +132,10 @@ struct Taker {
     expected: Expected,
     stop: Arc<AtomicBool>,
     segment: Segment,
-    /// Last sequence number of each worker; 0 before the first.
-    sequences: Vec<u64>,
+    inbox: Inbox,
     discrepancies: Discrepancies,
     maintained: Instant,
+    acknowledged: Instant,
     nap: Nap,
     nap_of_first: Nap,
 }
@@ -163,7 +167,7 @@ impl Taker {
     }
 
     fn first_of_each(&mut self) -> Result<Vec<Instant>, TransportError> {
-        let mut first: Vec<Option<Instant>> = vec![None; self.sequences.len()];
+        let mut first: Vec<Option<Instant>> = vec![None; self.expected.worker_count as usize];
         let mut greeted = Instant::now();
         while !self.stop.load(Ordering::Acquire) && first.iter().any(Option::is_none) {
             match self.take(From::All)? {
@@ -223,17 +227,31 @@ impl Taker {
             From::All => end.segments.try_receive(segment)?,
             From::First => end.segments.try_receive_from(0, segment)?,
         };
+        self.acknowledge_in_time()?;
         if !received {
             return Ok(None);
         }
         let mut header = self.segment.header;
-        let sound = check(&header, &self.segment.block, &self.expected).is_ok();
-        let last = self.sequences.get_mut(header.worker_id as usize).filter(|_| sound);
-        let counted = follow(last, header.sequence, &mut self.discrepancies);
-        if !counted || header.flags & HINDSIGHT != 0 {
+        let sound = check(&header, &self.segment.block, &self.expected);
+        match sound.and_then(|()| self.inbox.settle(&header, &self.segment.block)) {
+            Ok(lost) => self.discrepancies.lost += lost,
+            Err(_) => {
+                self.discrepancies.rejected += 1;
+                header.steps_len = 0;
+            }
+        }
+        if header.flags & HINDSIGHT != 0 {
             header.steps_len = 0;
         }
         Ok(Some(header))
+    }
+
+    fn acknowledge_in_time(&mut self) -> Result<(), TransportError> {
+        if self.acknowledged.elapsed() < ACKNOWLEDGEMENT_INTERVAL {
+            return Ok(());
+        }
+        self.acknowledged = Instant::now();
+        self.end.acknowledgements.acknowledge(self.inbox.settled())
     }
 
     fn maintain_in_time(&mut self) -> Result<(), TransportError> {
@@ -246,23 +264,8 @@ impl Taker {
     fn maintain(&mut self) -> Result<(), TransportError> {
         self.maintained = Instant::now();
         SegmentReceiver::maintain(&mut self.end.segments)?;
-        ParameterPublisher::maintain(&mut self.end.parameters)
-    }
-}
-
-/// Whether a segment is the first of its number; `last` is that of its worker, none if the segment
-/// was refused already.
-fn follow(last: Option<&mut u64>, sequence: u64, discrepancies: &mut Discrepancies) -> bool {
-    match last {
-        Some(last) if sequence > *last => {
-            discrepancies.lost += sequence - *last - 1;
-            *last = sequence;
-            true
-        }
-        _ => {
-            discrepancies.rejected += 1;
-            false
-        }
+        ParameterPublisher::maintain(&mut self.end.parameters)?;
+        self.end.acknowledgements.maintain()
     }
 }
 
@@ -270,21 +273,4 @@ fn follow(last: Option<&mut u64>, sequence: u64, discrepancies: &mut Discrepanci
 fn cpu_s() -> f64 {
     let time = clock_gettime(ClockId::ThreadCPUTime);
     time.tv_sec as f64 + time.tv_nsec as f64 * 1e-9
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn gaps_are_lost_and_repetitions_are_rejected() {
-        let (mut last, mut discrepancies) = (0, Discrepancies::default());
-        let taken: Vec<bool> = [1, 2, 5, 5, 4, 6]
-            .map(|number| follow(Some(&mut last), number, &mut discrepancies))
-            .to_vec();
-        assert_eq!(taken, [true, true, true, false, false, true]);
-        assert_eq!(discrepancies, Discrepancies { rejected: 2, lost: 2 });
-        assert!(!follow(None, 7, &mut discrepancies));
-        assert_eq!(discrepancies, Discrepancies { rejected: 3, lost: 2 });
-    }
 }

@@ -37,13 +37,15 @@ pub(super) struct ResumeArgs {
 
 pub(super) fn run(args: &ResumeArgs) -> anyhow::Result<Outcome> {
     let run = RunDirectory::open(&args.run)?;
-    let mut config = run.config()?.resolve(Limits { cores: cores() }).map_err(refuse)?;
+    let written = run.config()?;
+    let mut config = written.clone().resolve(Limits { cores: cores() }).map_err(refuse)?;
     let steps_before = config.run.steps;
     if let Some(steps) = args.steps {
         config.run.steps = steps.unsigned_abs();
     }
     let folder = run.checkpoints_path();
-    let reached = checkpoint::env_steps(&folder)?.into_iter().max().unwrap_or(0);
+    let counters = checkpoint::counters(&folder)?;
+    let reached = counters.iter().map(|counters| counters.env_steps).max().unwrap_or(0);
     // A run may end some steps beyond its length, in mid-segment: the same length is no mistake.
     if config.run.steps < reached.min(steps_before) {
         return Err(wrong_use(format!(
@@ -68,7 +70,8 @@ pub(super) fn run(args: &ResumeArgs) -> anyhow::Result<Outcome> {
     let mut manifest = run.manifest()?;
     manifest.sessions.push(session);
     run.write_manifest(&manifest)?;
-    if config.run.steps != steps_before {
+    // Of an older version, it lacks what has been added since and depends on the machine.
+    if config != written {
         run.write_config(&config)?;
     }
     launch::session(SessionPlan {

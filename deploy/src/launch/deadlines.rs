@@ -31,7 +31,8 @@ impl Supervisor {
             }
         }
         deadlines.extend(self.evaluations.deadline());
-        deadlines.extend(self.slots.values().filter_map(|slot| slot.restart_at));
+        let restarts = self.slots.iter().filter(|(process, _)| self.may_start(**process));
+        deadlines.extend(restarts.filter_map(|(_, slot)| slot.restart_at));
         deadlines.extend(
             self.starting().map(|(process, running)| running.spawned + self.ready_limit(process)),
         );
@@ -130,8 +131,15 @@ impl Supervisor {
             .iter()
             .filter(|(_, slot)| slot.restart_at.is_some_and(|at| now >= at))
             .map(|(process, _)| *process)
+            .filter(|process| self.may_start(*process))
             .collect();
-        due.into_iter().try_for_each(|process| self.spawn(process))
+        for process in due {
+            if process == Process::Learner {
+                self.go_back()?;
+            }
+            self.spawn(process)?;
+        }
+        Ok(())
     }
 
     /// Children that are not ready and still needed: a worker is not when the learner is done.

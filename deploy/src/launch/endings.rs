@@ -157,7 +157,7 @@ impl Supervisor {
                 self.complete_if_done();
                 Ok(())
             }
-            Process::Learner => Err(self.death(process, status, self.resume_advice())),
+            Process::Learner => self.on_learner_death(status),
             Process::Evaluator => self.on_evaluator_death(status),
             Process::Actor(_) if self.phase == Phase::Training => {
                 self.on_actor_death(process, status)
@@ -167,6 +167,7 @@ impl Supervisor {
     }
 
     fn on_evaluator_death(&mut self, status: ExitStatus) -> anyhow::Result<()> {
+        self.evaluator_ends = false;
         self.evaluations.send_again();
         if matches!(self.phase, Phase::Finishing { .. }) && self.evaluations.outstanding() == 0 {
             self.complete_if_done();
@@ -209,7 +210,12 @@ impl Supervisor {
     }
 
     /// Schedules a restart; false when the process has had all of them.
-    fn restart(&mut self, process: Process, status: ExitStatus, restarts_max: u32) -> bool {
+    pub(super) fn restart(
+        &mut self,
+        process: Process,
+        status: ExitStatus,
+        restarts_max: u32,
+    ) -> bool {
         let log = shown(&self.log_path(process));
         let slot = self.slots.entry(process).or_default();
         if slot.restarts >= restarts_max {
@@ -233,7 +239,7 @@ impl Supervisor {
 
     /// Nothing where a resume would only begin again and meet the same end. A learner that lives
     /// writes a checkpoint when the run stops.
-    fn resume_advice(&self) -> String {
+    pub(super) fn resume_advice(&self) -> String {
         let learner = self.running(Process::Learner).is_some_and(|running| running.ready);
         if !learner && !self.launcher.run.has_checkpoint().unwrap_or(false) {
             return String::new();
@@ -244,7 +250,7 @@ impl Supervisor {
         )
     }
 
-    fn death(&self, process: Process, status: ExitStatus, advice: String) -> Error {
+    pub(super) fn death(&self, process: Process, status: ExitStatus, advice: String) -> Error {
         let log = self.log_path(process);
         anyhow!("{process} died: {}{}{advice}", describe(status), log_tail(&log))
     }

@@ -1,4 +1,4 @@
-//! Failures of environments, counted over all processes of a session.
+//! What is counted over all processes of a session: failures of environments, and what was sent.
 
 use super::Process;
 use super::supervisor::Supervisor;
@@ -18,27 +18,30 @@ impl Supervisor {
                 shown(&self.log_path(process))
             ));
         }
-        self.tell_learner_of_env_failures();
+        self.tell_learner_of_counts();
     }
 
     /// Its process has said so with its last words; its exit follows.
     pub(super) fn on_env_hung(&mut self, process: Process, message: &str) {
         self.env_failures = self.env_failures.saturating_add(1);
         self.display.message(&format!("{process}: {message}"));
-        self.tell_learner_of_env_failures();
+        self.tell_learner_of_counts();
     }
 
-    /// The learner keeps the number for metrics and checkpoints. It is the whole session's, so one
-    /// that does not reach the learner is made up for by the next.
-    pub(super) fn tell_learner_of_env_failures(&mut self) {
-        if self.env_failures == self.env_failures_told || self.is_one_process() {
+    /// The learner keeps what is counted elsewhere for metrics and checkpoints: the numbers of the
+    /// whole run, so one that does not reach a learner is made up for by the next.
+    pub(super) fn tell_learner_of_counts(&mut self) {
+        if self.is_one_process() {
             return;
         }
-        let total = self.env_failures;
-        let learner = self.running(Process::Learner);
-        if learner.is_some_and(|learner| learner.child.send(Command::EnvFailures { total })) {
-            self.env_failures_told = total;
-        }
+        let Some(learner) = self.running(Process::Learner) else { return };
+        // A learner that takes no commands is stuck or dying; its deadline or its exit follows.
+        let _ = learner
+            .child
+            .send(Command::EnvFailures { total: self.before.env_failures + self.env_failures });
+        let mut sent = self.before.sent;
+        sent += self.sent;
+        let _ = learner.child.send(Command::Sent(sent));
     }
 }
 

@@ -40,6 +40,7 @@ pub fn evaluate(plan: EvaluationPlan<'_>) -> anyhow::Result<Option<EvaluationRow
         domain: None,
         resume: false,
         init_from: None,
+        learner_restarts: 0,
         sessions_before: 0,
     };
     let runtime = tokio::runtime::Builder::new_current_thread()

@@ -51,6 +51,8 @@ pub struct Launcher {
     pub resume: bool,
     /// The policy file of a warm start.
     pub init_from: Option<PathBuf>,
+    /// Starts of the learner after a death, over the whole run.
+    pub learner_restarts: u64,
     /// Sessions of this run before this one.
     pub sessions_before: u32,
 }
@@ -104,7 +106,11 @@ impl Launcher {
         if self.resume {
             command.arg("--resume");
         }
-        if let Some(file) = &self.init_from {
+        if self.learner_restarts > 0 {
+            command.args(["--restarts", &self.learner_restarts.to_string()]);
+        }
+        // A checkpoint holds all that the warm start gave.
+        if let Some(file) = self.init_from.as_ref().filter(|_| !self.resume) {
             command.arg("--init-from").arg(file);
         }
         if let (None, Some(venv)) = (&self.domain, &self.venv) {

@@ -23,6 +23,7 @@ mod env_failures;
 mod evaluate;
 mod evaluations;
 mod launcher;
+mod learner_restarts;
 mod limits;
 mod reports;
 mod session;

@@ -35,8 +35,17 @@ impl Supervisor {
             Report::EnvironmentReady { spec } => return self.on_environment(process, spec),
             Report::LearnerReady => return self.on_learner_ready(process),
             Report::FirstSegment => {
-                let seconds = self.started.elapsed().as_secs_f64();
-                self.display.message(&format!("first environment step after {seconds:.1} s"));
+                let message = match self.learner_died.take() {
+                    Some(died) => {
+                        let seconds = died.elapsed().as_secs_f64();
+                        format!("the learner is back: first segment {seconds:.1} s after its death")
+                    }
+                    None => {
+                        let seconds = self.started.elapsed().as_secs_f64();
+                        format!("first environment step after {seconds:.1} s")
+                    }
+                };
+                self.display.message(&message);
             }
             Report::Progress(progress) => self.on_progress(progress),
             Report::Evaluate(request) => self.on_evaluate(request),
@@ -45,9 +54,13 @@ impl Supervisor {
                 return self.on_not_evaluated(process, policy_version, &reason);
             }
             Report::EnvFailures { count, last } => self.on_env_failures(process, count, &last),
+            Report::Sent(sent) => self.sent += sent,
             Report::EnvHung { message } => self.on_env_hung(process, &message),
             Report::Checkpoint { name, env_steps } => {
                 self.checkpointed = true;
+                if let Some(learner) = self.slots.get_mut(&Process::Learner) {
+                    learner.restarts = 0;
+                }
                 let steps = grouped(env_steps);
                 self.display.message(&format!("checkpoint {name} at {steps} steps"));
             }
@@ -92,16 +105,26 @@ impl Supervisor {
         self.set_ready(process);
         self.learner_ready = true;
         self.advanced = Instant::now();
+        self.tell_learner_of_counts();
+        if matches!(self.phase, Phase::Draining { .. }) {
+            // Its predecessor was asked, and died of something else.
+            self.send(Process::Learner, Command::Finish);
+        }
         if self.is_one_process() || self.phase != Phase::Training {
             return Ok(());
         }
         let waiting: Vec<Process> = self
             .all_running()
-            .filter(|(process, running)| matches!(process, Process::Actor(_)) && running.ready)
+            .filter(|(process, running)| {
+                matches!(process, Process::Actor(_)) && running.ready && !running.attached
+            })
             .map(|(process, _)| process)
             .collect();
         waiting.into_iter().for_each(|process| self.attach(process));
-        self.spawn(Process::Evaluator)
+        match self.slots.contains_key(&Process::Evaluator) {
+            true => Ok(()),
+            false => self.spawn(Process::Evaluator),
+        }
     }
 
     fn set_ready(&mut self, process: Process) {
@@ -113,6 +136,11 @@ impl Supervisor {
     fn attach(&mut self, process: Process) {
         if let Some(domain) = self.launcher.domain.clone() {
             self.send(process, Command::Attach { domain });
+            if let Some(running) =
+                self.slots.get_mut(&process).and_then(|slot| slot.running.as_mut())
+            {
+                running.attached = true;
+            }
         }
     }
 
@@ -123,7 +151,7 @@ impl Supervisor {
             self.advanced = now;
         }
         self.checkpointed = false;
-        self.tell_learner_of_env_failures();
+        self.tell_learner_of_counts();
         self.display.progress(&progress);
         if self.first.is_none() {
             self.first = Some((now, progress.clone()));

@@ -60,8 +60,8 @@ pub fn session(plan: SessionPlan) -> anyhow::Result<Outcome> {
         venv,
         domain: domain.as_ref().map(|domain| domain.path().to_owned()),
         resume,
-        // A checkpoint holds all that the warm start gave.
-        init_from: manifest.init_from.map(PathBuf::from).filter(|_| !resume),
+        init_from: manifest.init_from.map(PathBuf::from),
+        learner_restarts: 0,
         sessions_before: u32::try_from(manifest.sessions.len().saturating_sub(1))
             .context("too many sessions")?,
     };

@@ -4,8 +4,11 @@ use std::collections::BTreeMap;
 use std::time::{Duration, Instant};
 
 use anyhow::{Context, Error};
+use dmprl_learner::checkpoint;
+use dmprl_learner::learner::Counters;
 use dmprl_shared::config::ExperimentConfig;
 use dmprl_shared::spec::EnvSpec;
+use dmprl_shared::transport::delivery::Sent;
 use tokio::sync::mpsc;
 
 use super::child::{Child, EVENTS_MAX, Event};
@@ -56,6 +59,8 @@ pub struct SessionReport {
     pub last_row: Option<EvaluationRow>,
     /// Failures of environments that were reported.
     pub env_failures: u64,
+    /// Starts of the learner after a death.
+    pub learner_restarts: u64,
     /// From the first start to the last exit.
     pub wall: Duration,
 }
@@ -87,6 +92,8 @@ pub(super) struct Running {
     pub(super) child: Child,
     pub(super) spawned: Instant,
     pub(super) ready: bool,
+    /// A worker that knows where the learner is, and finds the next by itself.
+    pub(super) attached: bool,
 }
 
 pub(super) struct Supervisor {
@@ -99,6 +106,12 @@ pub(super) struct Supervisor {
     pub(super) phase: Phase,
     pub(super) spec: Option<EnvSpec>,
     pub(super) learner_ready: bool,
+    /// Starts of the learner after a death in this session.
+    pub(super) learner_restarts: u64,
+    /// Since when nothing has been learned.
+    pub(super) learner_died: Option<Instant>,
+    /// The evaluator was killed with its learner, and has not ended yet.
+    pub(super) evaluator_ends: bool,
     pub(super) finished: bool,
     /// Whether the newest report of progress was followed by a checkpoint.
     pub(super) checkpointed: bool,
@@ -115,9 +128,11 @@ pub(super) struct Supervisor {
     pub(super) last: Option<(Instant, Progress)>,
     pub(super) best_return: f64,
     pub(super) last_row: Option<EvaluationRow>,
-    /// Failures of environments in this session, and as many as the learner has been told of.
+    /// Where the run stood when this session began.
+    pub(super) before: Counters,
+    /// Failures of environments in this session, and what its workers did.
     pub(super) env_failures: u64,
-    pub(super) env_failures_told: u64,
+    pub(super) sent: Sent,
 }
 
 /// What ended the supervisor's wait.
@@ -143,6 +158,9 @@ pub async fn supervise(plan: SupervisorPlan) -> SessionReport {
         phase: Phase::Training,
         spec: None,
         learner_ready: false,
+        learner_restarts: 0,
+        learner_died: None,
+        evaluator_ends: false,
         finished: false,
         checkpointed: false,
         evaluations: EvaluationQueue::new(limit),
@@ -157,8 +175,9 @@ pub async fn supervise(plan: SupervisorPlan) -> SessionReport {
         last: None,
         best_return: f64::NEG_INFINITY,
         last_row: None,
+        before: Counters::default(),
         env_failures: 0,
-        env_failures_told: 0,
+        sent: Sent::default(),
     };
     let started = supervisor.start();
     supervisor.check(started);
@@ -190,6 +209,7 @@ impl Supervisor {
     fn start(&mut self) -> anyhow::Result<()> {
         let run = &self.launcher.run;
         self.spec = run.spec()?;
+        self.before = checkpoint::counters(&run.checkpoints_path())?.pop().unwrap_or_default();
         self.best_return = run.best_row()?.map_or(f64::NEG_INFINITY, |row| row.return_mean);
         if self.is_one_process() || self.spec.is_some() {
             self.spawn(Process::Learner)?;
@@ -210,7 +230,8 @@ impl Supervisor {
         slot.restart_at = None;
         let command = self.launcher.command(process, slot.restarts)?;
         let child = Child::spawn(command, process, self.events.clone())?;
-        slot.running = Some(Running { child, spawned: Instant::now(), ready: false });
+        slot.running =
+            Some(Running { child, spawned: Instant::now(), ready: false, attached: false });
         Ok(())
     }
 
@@ -255,6 +276,7 @@ impl Supervisor {
             training,
             last_row: self.last_row,
             env_failures: self.env_failures,
+            learner_restarts: self.learner_restarts,
             wall: self.started.elapsed(),
         }
     }

@@ -9,8 +9,9 @@ use dmprl_actors::rollout::{Identity, Rollout, RolloutError};
 use dmprl_shared::config::{ExperimentConfig, Hindsight};
 use dmprl_shared::seeds;
 use dmprl_shared::segment::SegmentHeader;
-use dmprl_shared::transport::shared_memory::{Plan, Sender, Subscriber, WorkerEnd, attach};
-use dmprl_shared::transport::{ParameterSubscriber, SegmentSender, SendOutcome, TransportError};
+use dmprl_shared::transport::delivery::{Acknowledgements, Outbox, Sent};
+use dmprl_shared::transport::shared_memory::{Plan, WorkerEnd, attach};
+use dmprl_shared::transport::{ParameterSubscriber, SendOutcome, TransportError};
 
 use super::setup::Setup;
 use super::{ActorArgs, ControlPipe, environments};
@@ -25,6 +26,8 @@ const FULL_QUEUE_MAX: Duration = Duration::from_millis(3);
 const ATTACH: Duration = Duration::from_millis(2);
 /// A learner that is ready answers at once; longer means that it is gone.
 const ATTACH_LIMIT: Duration = Duration::from_secs(30);
+/// Between two reports of what was sent.
+const REPORT_INTERVAL: Duration = Duration::from_secs(1);
 /// How long one look for a command may block, so that a stop is seen.
 const COMMAND_WAIT: Duration = Duration::from_millis(100);
 
@@ -52,25 +55,33 @@ pub fn run(args: &ActorArgs, control: &ControlPipe) -> anyhow::Result<()> {
     let mut rollout = Rollout::start(config, envs, identity)?;
     let plan = super::learner::plan(&setup, rollout.policy());
     let Some(end) = await_attach(control, &plan, args.index)? else { return Ok(()) };
+    let kept = config.delivery.unacknowledged_segments;
+    let outbox = Outbox::new(rollout.policy().layout(), kept, args.index, args.incarnation);
     let mut worker = Worker {
         index: args.index,
         control,
         deadline: Duration::from_secs_f64(config.actors.send_deadline_s),
-        segments: end.segments,
-        parameters: end.parameters,
+        end,
+        outbox,
+        acknowledgements: Acknowledgements::default(),
+        reported: Sent::default(),
+        reported_at: Instant::now(),
     };
     worker.await_first_policy(&mut rollout)?;
     while !control.stop_requested() {
         worker.take_newest(&mut rollout)?;
         let stepped = rollout.segment(&mut |header, block| worker.deliver(header, block));
         environments::tell(&rollout.take_failures(), control);
+        if worker.reported_at.elapsed() >= REPORT_INTERVAL {
+            worker.report()?;
+        }
         match stepped {
             Ok(()) => {}
             Err(Stopped::Asked) => break,
             Err(Stopped::Failed(error)) => return Err(error),
         }
     }
-    Ok(())
+    worker.report()
 }
 
 /// A sparse reward is hardly ever met by chance: says what helps, where it can be had.
@@ -127,18 +138,29 @@ impl From<RolloutError> for Stopped {
     }
 }
 
+impl From<anyhow::Error> for Stopped {
+    fn from(error: anyhow::Error) -> Self {
+        Self::Failed(error)
+    }
+}
+
 struct Worker<'a> {
     index: u32,
     control: &'a ControlPipe,
     deadline: Duration,
-    segments: Sender,
-    parameters: Subscriber,
+    end: WorkerEnd,
+    outbox: Outbox,
+    /// The newest heard, a buffer.
+    acknowledgements: Acknowledgements,
+    /// What the supervisor knows of, and since when.
+    reported: Sent,
+    reported_at: Instant,
 }
 
 impl Worker<'_> {
     /// A damaged snapshot is reported and passed over; the next one comes soon.
     fn take_newest(&mut self, rollout: &mut Rollout) -> anyhow::Result<bool> {
-        match self.parameters.newest(&mut rollout.snapshot) {
+        match self.end.parameters.newest(&mut rollout.snapshot) {
             Ok(taken) => Ok(taken),
             Err(TransportError::Snapshot(error)) => {
                 eprintln!("a policy snapshot is refused: {error}");
@@ -163,15 +185,20 @@ impl Worker<'_> {
         Ok(())
     }
 
-    /// Offers a segment until the learner has it. Nothing is dropped: a full queue is how the
-    /// learner slows its workers down.
+    /// Keeps a segment until the learner has acknowledged it, and offers it until a queue has taken
+    /// it. Nothing is dropped: a full queue is how the learner slows its workers down.
     fn deliver(&mut self, header: &SegmentHeader, block: &[f32]) -> Result<(), Stopped> {
         let mut waiting: Option<(Instant, u32)> = None;
         let mut pause = FULL_QUEUE;
+        let mut kept = false;
         loop {
-            let outcome = self.segments.try_send(header, block);
+            if 2 * self.outbox.len() >= self.outbox.capacity() {
+                self.hear()?;
+            }
+            kept = kept || self.outbox.put(header, block);
+            let outcome = self.outbox.offer(&mut self.end.segments);
             let outcome = outcome.map_err(|error| Stopped::Failed(error.into()))?;
-            if outcome == SendOutcome::Delivered {
+            if kept && outcome == SendOutcome::Delivered {
                 return Ok(());
             }
             if self.control.stop_requested() {
@@ -183,13 +210,32 @@ impl Worker<'_> {
                 let seconds = since.elapsed().as_secs();
                 let why = match outcome {
                     SendOutcome::Detached => "no learner is attached to its queue",
-                    _ => "the learner takes nothing from its full queue",
+                    SendOutcome::Full => "the learner takes nothing from its full queue",
+                    SendOutcome::Delivered => "the learner acknowledges nothing that it has taken",
                 };
                 self.warn(format!("worker {} has waited {seconds} s: {why}", self.index));
             }
             std::thread::sleep(pause);
             pause = (pause * 2).min(FULL_QUEUE_MAX);
         }
+    }
+
+    /// Forgets what the learner has acknowledged.
+    fn hear(&mut self) -> anyhow::Result<()> {
+        if self.end.acknowledgements.newest(&mut self.acknowledgements)? {
+            self.outbox.acknowledge(&self.acknowledgements);
+        }
+        Ok(())
+    }
+
+    /// Tells the supervisor what was sent since the last time.
+    fn report(&mut self) -> anyhow::Result<()> {
+        self.hear()?;
+        let sent = self.outbox.sent();
+        // A supervisor that is gone is noticed as a stop.
+        let _ = self.control.send(&Report::Sent(sent.since(&self.reported)));
+        (self.reported, self.reported_at) = (sent, Instant::now());
+        Ok(())
     }
 
     fn warn(&self, message: String) {

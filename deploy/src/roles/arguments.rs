@@ -44,6 +44,9 @@ pub struct LearnerArgs {
     /// evaluator.
     #[arg(long, conflicts_with = "domain")]
     pub one_process: bool,
+    /// Starts of the learner after a death within a session, over the whole run, this one included.
+    #[arg(long, value_name = "N", default_value_t = 0)]
+    pub restarts: u64,
     /// Start from the parameters of this policy file.
     #[arg(long, value_name = "FILE")]
     pub init_from: Option<PathBuf>,

@@ -9,6 +9,7 @@ use std::thread;
 use std::time::Duration;
 
 use anyhow::{Context, ensure};
+use dmprl_shared::transport::delivery::Sent;
 
 use crate::control::{Command, GROUP_SIGNALS, Report};
 use crate::terminal::say;
@@ -30,6 +31,7 @@ struct Flags {
     finish: AtomicBool,
     orphaned: AtomicBool,
     env_failures: AtomicU64,
+    sent: Mutex<Sent>,
 }
 
 /// Commands come in, reports go out; shareable between threads.
@@ -127,10 +129,16 @@ impl ControlPipe {
         Arc::clone(&self.flags.stop)
     }
 
-    /// Failures of environments that the supervisor knows of in this session.
+    /// Failures of environments in the whole run; 0 before the supervisor has told of any.
     #[must_use]
     pub fn env_failures(&self) -> u64 {
         self.flags.env_failures.load(Ordering::Acquire)
+    }
+
+    /// What the workers did in the whole run; nothing before the supervisor has told of it.
+    #[must_use]
+    pub fn sent(&self) -> Sent {
+        *self.flags.sent.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
     /// Whether the supervisor is gone; reports then go nowhere.
@@ -140,7 +148,7 @@ impl ControlPipe {
     }
 
     /// The next command, waiting so long for it; none when the wait or the input has ended. `stop`,
-    /// `finish` and `env_failures` are no commands here: there is a method for each.
+    /// `finish`, `env_failures` and `sent` are no commands here: there is a method for each.
     #[must_use]
     pub fn next_within(&self, wait: Duration) -> Option<Command> {
         self.commands.lock().unwrap_or_else(PoisonError::into_inner).recv_timeout(wait).ok()
@@ -185,6 +193,9 @@ fn read_commands(input: impl Read, sender: &SyncSender<Command>, flags: &Flags) 
             Ok(Command::Finish) => flags.finish.store(true, Ordering::Release),
             Ok(Command::EnvFailures { total }) => {
                 flags.env_failures.store(total, Ordering::Release);
+            }
+            Ok(Command::Sent(total)) => {
+                *flags.sent.lock().unwrap_or_else(PoisonError::into_inner) = total;
             }
             Ok(command) => match sender.try_send(command) {
                 Ok(()) | Err(TrySendError::Disconnected(_)) => {}

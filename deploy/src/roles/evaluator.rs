@@ -147,8 +147,8 @@ fn append(setup: &Setup, row: &EvaluationRow) -> anyhow::Result<()> {
 fn tidy(setup: &Setup) -> anyhow::Result<()> {
     let rows = setup.run.evaluations()?;
     let mut versions = Vec::new();
-    for env_steps in checkpoint::env_steps(&setup.run.checkpoints_path())? {
-        let seen = || rows.iter().filter(|row| row.env_steps <= env_steps);
+    for counters in checkpoint::counters(&setup.run.checkpoints_path())? {
+        let seen = || rows.iter().filter(|row| row.env_steps <= counters.env_steps);
         let best = seen().max_by(|a, b| a.return_mean.total_cmp(&b.return_mean));
         versions.extend(best.into_iter().chain(seen().next_back()).map(|row| row.policy_version));
     }

@@ -9,8 +9,12 @@ use dmprl_learner::demonstrations::{Steps, Summary};
 use dmprl_learner::learner::Learner;
 use dmprl_learner::policy_file::{self, Match};
 use dmprl_learner::session::{Due, Session, Turn};
+use dmprl_shared::config::DeliveryLevel;
 use dmprl_shared::spec::EnvSpec;
-use dmprl_shared::transport::shared_memory::{LearnerEnd, Plan, serve};
+use dmprl_shared::transport::delivery::{Replayed, SegmentLog};
+use dmprl_shared::transport::shared_memory::{
+    Acknowledger, LearnerEnd, Plan, Publisher, Receiver, serve,
+};
 use dmprl_shared::transport::{ParameterPublisher, SegmentReceiver};
 
 use super::recorder::{Evaluate, Recorder};
@@ -22,6 +26,8 @@ use crate::control::Report;
 const IDLE: Duration = Duration::from_micros(100);
 /// Between two cleanings of what dead workers left.
 const MAINTENANCE_INTERVAL: Duration = Duration::from_millis(250);
+/// Between two acknowledgements: `delivery.unacknowledged_segments` covers what comes in meanwhile.
+const ACKNOWLEDGEMENT_INTERVAL: Duration = Duration::from_millis(10);
 /// Environment steps after which the first segment is reported, on its own for the start-up time.
 const FIRST: u64 = 1;
 
@@ -29,11 +35,14 @@ const FIRST: u64 = 1;
 pub fn run(args: &LearnerArgs, control: &ControlPipe) -> anyhow::Result<()> {
     let setup = Setup::read(&args.run)?;
     let spec = setup.run.spec()?.context("the run has no spec.json; a worker writes it first")?;
-    let learner = make(&setup, &spec, args, control)?;
-    let env_failures_before = learner.counters.env_failures;
+    let mut learner = make(&setup, &spec, args, control)?;
+    recover(&mut learner, &setup, control)?;
     let domain = args.domain.as_deref().context("--domain is missing")?;
     let plan = plan(&setup, learner.policy());
-    let LearnerEnd { segments, parameters } = serve(domain, &plan)?;
+    let LearnerEnd { segments, parameters, acknowledgements } = serve(domain, &plan)?;
+    let counters = &mut learner.counters;
+    counters.policy_version = counters.policy_version.max(parameters.newest_version());
+    counters.learner_restarts = counters.learner_restarts.max(args.restarts);
     let mut recorder = Recorder::new(&setup.run, control, &learner)?;
     let mut session = Session::start(learner, segments, parameters)?;
     control.send(&Report::LearnerReady)?;
@@ -44,15 +53,40 @@ pub fn run(args: &LearnerArgs, control: &ControlPipe) -> anyhow::Result<()> {
         Ok(())
     };
     catch_up(&mut session, &mut recorder, &mut ask)?;
-    let finished = turns(&mut session, &mut recorder, control, &mut ask)?;
+    let server = Server { session: &mut session, acknowledgements, control };
+    let finished = server.turns(&mut recorder, &mut ask)?;
     if !finished {
         // What the workers had already sent is in the checkpoint; they are not waited for.
         let queued_max = plan.worker_count * plan.queue_segments;
         session.drain(&mut |_, _| Ok(()), queued_max)?;
     }
-    let env_failures = || env_failures_before + control.env_failures();
+    let env_failures_before = session.learner.counters.env_failures;
+    let env_failures = || env_failures_before.max(control.env_failures());
     let ending = Ending { finished, evaluate: &mut ask, env_failures: &env_failures };
     close(&mut session, &mut recorder, control, ending)
+}
+
+/// At delivery level `log`, inserts what came after the checkpoint.
+fn recover(learner: &mut Learner, setup: &Setup, control: &ControlPipe) -> anyhow::Result<()> {
+    let delivery = &setup.config.delivery;
+    if delivery.level == DeliveryLevel::Memory {
+        return Ok(());
+    }
+    let path = setup.run.segment_log_path();
+    let identity = (setup.run_id, learner.policy().architecture_hash());
+    let layout = learner.policy().layout();
+    let log = SegmentLog::open(&path, identity, layout, delivery.log_bytes_max);
+    let replayed = log.and_then(|log| learner.recover(log));
+    let replayed = replayed.with_context(|| format!("cannot use {}", path.display()))?;
+    if replayed != Replayed::default() {
+        let Replayed { records, cut_bytes } = replayed;
+        let message = format!(
+            "{records} segments read from the segment log, {cut_bytes} bytes of a torn one cut off"
+        );
+        eprintln!("{message}");
+        control.send(&Report::Warning { message })?;
+    }
+    Ok(())
 }
 
 /// Evaluates what an earlier session was stopped before it had evaluated.
@@ -138,40 +172,63 @@ fn warm_start(learner: &mut Learner, path: &Path) -> anyhow::Result<()> {
     Ok(learner.warm_start(&snapshot.values)?)
 }
 
-/// Takes turns until the run is finished (true) or a stop is asked for (false).
-fn turns<R: SegmentReceiver, P: ParameterPublisher>(
-    session: &mut Session<R, P>,
-    recorder: &mut Recorder<'_>,
-    control: &ControlPipe,
-    ask: Evaluate<'_>,
-) -> anyhow::Result<bool> {
-    let mut maintained = Instant::now();
-    let mut first = session.learner.counters.env_steps + FIRST;
-    let env_failures_before = session.learner.counters.env_failures;
-    loop {
-        session.learner.counters.env_failures = env_failures_before + control.env_failures();
-        if control.stop_requested() {
-            return Ok(false);
+/// A learner among its workers.
+struct Server<'a> {
+    session: &'a mut Session<Receiver, Publisher>,
+    acknowledgements: Acknowledger,
+    control: &'a ControlPipe,
+}
+
+impl Server<'_> {
+    /// Takes turns until the run is finished (true) or a stop is asked for (false).
+    fn turns(mut self, recorder: &mut Recorder<'_>, ask: Evaluate<'_>) -> anyhow::Result<bool> {
+        let control = self.control;
+        let (mut maintained, mut acknowledged) = (Instant::now(), Instant::now());
+        let mut first = self.session.learner.counters.env_steps + FIRST;
+        loop {
+            self.hear();
+            if control.stop_requested() {
+                return Ok(false);
+            }
+            if control.finish_requested() {
+                return Ok(true);
+            }
+            let mut due = |due: Due, learner: &mut Learner| {
+                recorder.due(due, learner, ask).map_err(Into::into)
+            };
+            match self.session.turn(&mut due)? {
+                Turn::Worked => {}
+                Turn::Idle => std::thread::sleep(IDLE),
+                Turn::Finished => return Ok(true),
+            }
+            if self.session.learner.counters.env_steps >= first {
+                first = u64::MAX;
+                let _ = control.send(&Report::FirstSegment);
+            }
+            if acknowledged.elapsed() >= ACKNOWLEDGEMENT_INTERVAL {
+                if let Some(marks) = recorder.acknowledge(&mut self.session.learner) {
+                    self.acknowledgements.acknowledge(marks)?;
+                }
+                acknowledged = Instant::now();
+            }
+            if maintained.elapsed() >= MAINTENANCE_INTERVAL {
+                self.session.maintain()?;
+                self.acknowledgements.maintain()?;
+                maintained = Instant::now();
+            }
+            recorder.progress(&self.session.learner);
         }
-        if control.finish_requested() {
-            return Ok(true);
+    }
+
+    /// Takes over what was counted elsewhere. A checkpoint may know of more than the supervisor has
+    /// told yet.
+    fn hear(&mut self) {
+        let counters = &mut self.session.learner.counters;
+        counters.env_failures = counters.env_failures.max(self.control.env_failures());
+        let sent = self.control.sent();
+        if sent.produced >= counters.sent.produced {
+            counters.sent = sent;
         }
-        let mut due =
-            |due: Due, learner: &mut Learner| recorder.due(due, learner, ask).map_err(Into::into);
-        match session.turn(&mut due)? {
-            Turn::Worked => {}
-            Turn::Idle => std::thread::sleep(IDLE),
-            Turn::Finished => return Ok(true),
-        }
-        if session.learner.counters.env_steps >= first {
-            first = u64::MAX;
-            let _ = control.send(&Report::FirstSegment);
-        }
-        if maintained.elapsed() >= MAINTENANCE_INTERVAL {
-            session.maintain()?;
-            maintained = Instant::now();
-        }
-        recorder.progress(&session.learner);
     }
 }
 

@@ -10,6 +10,7 @@ use dmprl_learner::learner::Learner;
 use dmprl_learner::metrics::MetricsLine;
 use dmprl_learner::policy_file;
 use dmprl_learner::session::Due;
+use dmprl_shared::transport::delivery::Mark;
 
 use super::ControlPipe;
 use crate::control::{EvaluationRequest, Progress, Report};
@@ -38,6 +39,7 @@ pub struct Recorder<'a> {
     policy_lag_p50: u64,
     /// Disk trouble is told once until it is over: a full disk must not fill the terminal too.
     checkpoint_failing: bool,
+    log_failing: bool,
 }
 
 /// Counts since a moment.
@@ -83,6 +85,7 @@ impl<'a> Recorder<'a> {
             return_mean: None,
             policy_lag_p50: 0,
             checkpoint_failing: false,
+            log_failing: false,
         })
     }
 
@@ -124,6 +127,30 @@ impl<'a> Recorder<'a> {
                      `rejected` in metrics.jsonl"
                 ));
                 Ok(())
+            }
+            Due::Lost(count) => {
+                self.warn(format!(
+                    "{count} segments that a learner had acknowledged before it died are lost; \
+                     delivery.level = \"log\" keeps them"
+                ));
+                Ok(())
+            }
+        }
+    }
+
+    /// What may be acknowledged, unless the segment log cannot be written: workers then wait, as
+    /// soon as they can keep no more.
+    pub fn acknowledge<'l>(&mut self, learner: &'l mut Learner) -> Option<&'l [Mark]> {
+        match learner.inbox.acknowledge() {
+            Ok(marks) => {
+                self.log_failing = false;
+                Some(marks)
+            }
+            Err(error) => {
+                if !std::mem::replace(&mut self.log_failing, true) {
+                    self.warn(format!("no segment can be acknowledged: {error}"));
+                }
+                None
             }
         }
     }

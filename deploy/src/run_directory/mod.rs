@@ -6,6 +6,7 @@
 //! evaluations.jsonl  one row an evaluation                 policies/V.safetensors
 //! checkpoints/       written by the learner                logs/PROCESS.log
 //! videos/  plots/                                          lock                held while alive
+//! segments.log       at delivery level `log`: what came since the last checkpoint
 //! ```
 //! The supervisor makes it; learner and evaluator write into it; `eval`, `resume` read it.
 //! Files that are replaced are written aside, synced and renamed, so a crash leaves the old one.
@@ -202,6 +203,12 @@ impl RunDirectory {
     #[must_use]
     pub fn evaluations_path(&self) -> PathBuf {
         self.path.join("evaluations.jsonl")
+    }
+
+    /// Segments since the last checkpoint, at delivery level `log`; written by the learner.
+    #[must_use]
+    pub fn segment_log_path(&self) -> PathBuf {
+        self.path.join("segments.log")
     }
 
     /// The learner's folder.

@@ -29,6 +29,9 @@ pub fn summary(report: &SessionReport, title: &str, run: &Path, steps_total: u64
         let count = grouped(report.env_failures);
         lines.push(("failures", format!("{count} of environments; see {logs}")));
     }
+    if report.learner_restarts > 0 {
+        lines.push(("restarts", format!("{} of the learner", report.learner_restarts)));
+    }
     lines.push(("wall time", wall(report.wall)));
     let run = shown(run);
     lines.push(("results", run.clone()));

@@ -159,6 +159,7 @@ pub fn plan(
         domain: (!one_process).then(|| PathBuf::from("/nowhere")),
         resume: false,
         init_from: None,
+        learner_restarts: 0,
         sessions_before: 0,
     };
     (launcher, config.clone(), limits)

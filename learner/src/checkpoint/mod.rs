@@ -1,5 +1,5 @@
 //! Everything a run needs to go on exactly: networks, targets, optimisers, replay, counters,
-//! random states, from one moment.
+//! random states and how far each worker's segments had come, from one moment.
 //!
 //! ```text
 //!   checkpoints/000012/   networks.safetensors · replay.bin · state.json
@@ -17,6 +17,7 @@ use std::fs::{self, File};
 use std::io::{BufReader, BufWriter, Read, Write};
 use std::path::{Path, PathBuf};
 
+use dmprl_shared::transport::delivery::{LogError, Mark};
 use rand_xoshiro::Xoshiro256PlusPlus;
 use serde::{Deserialize, Serialize};
 use thiserror::Error;
@@ -44,6 +45,12 @@ pub enum CheckpointError {
         path: PathBuf,
         /// Why.
         cause: std::io::Error,
+    },
+    /// The checkpoint was written; the segment log could not be emptied.
+    #[error("a checkpoint was written, but the segment log could not be emptied: {cause}")]
+    Log {
+        /// Why.
+        cause: LogError,
     },
     /// What the device has learned could not be brought back.
     #[error("cannot bring the networks back from the device: {cause}")]
@@ -100,6 +107,9 @@ struct State {
     /// By the network's name.
     adam_steps: BTreeMap<String, AdamStep>,
     sampler_random: Xoshiro256PlusPlus,
+    /// Up to where segments are in the replay. Checkpoints of older versions have none.
+    #[serde(default)]
+    settled: Vec<Mark>,
     #[serde(default, skip_serializing_if = "Option::is_none")]
     normaliser: Option<Normaliser>,
     files: Vec<FileSum>,
@@ -147,6 +157,7 @@ pub fn save(folder: &Path, learner: &mut Learner) -> Result<String, CheckpointEr
     let path = folder.join(&name);
     fs::rename(&temporary, &path).map_err(io_error(&path))?;
     rotation::point_latest(folder, &name)?;
+    learner.inbox.checkpointed().map_err(|cause| CheckpointError::Log { cause })?;
     let config = &learner.config().checkpoint;
     rotation::rotate(folder, config.keep, config.disk_bytes_max)?;
     Ok(name)
@@ -168,6 +179,7 @@ fn write_files(folder: &Path, learner: &Learner) -> Result<(), CheckpointError> 
         updates_owed: learner.pacing.owed(),
         adam_steps: networks.iter().map(|(name, t)| ((*name).to_owned(), t.adam.step)).collect(),
         sampler_random: learner.sampler.random().clone(),
+        settled: learner.inbox.settled().to_vec(),
         normaliser: learner.normaliser.clone(),
         files: vec![networks_sum, replay],
     };
@@ -177,14 +189,15 @@ fn write_files(folder: &Path, learner: &Learner) -> Result<(), CheckpointError> 
     File::open(folder).and_then(|dir| dir.sync_all()).map_err(io_error(folder))
 }
 
-/// Environment steps at each readable checkpoint of a folder: where a resume may go back to.
+/// Where the run stood at each readable checkpoint of a folder, oldest first: where a resume may go
+/// back to.
 ///
 /// # Errors
 /// If the folder cannot be read.
-pub fn env_steps(folder: &Path) -> Result<Vec<u64>, CheckpointError> {
+pub fn counters(folder: &Path) -> Result<Vec<Counters>, CheckpointError> {
     let read = |name: String| {
         let state = read_state(&fs::read(folder.join(name).join(STATE)).ok()?).ok()?;
-        Some(state.counters.env_steps)
+        Some(state.counters)
     };
     Ok(names(folder)?.into_iter().filter_map(read).collect())
 }
@@ -294,6 +307,7 @@ fn load(folder: &Path, learner: &mut Learner) -> Result<(), CheckpointError> {
     }
     learner.normaliser = state.normaliser;
     learner.counters = state.counters;
+    learner.inbox.restore(&state.settled);
     learner.pacing.restore(state.updates_owed);
     let windows = learner.config().algorithm.windows;
     learner.sampler = Sampler::new(windows, state.sampler_random);

@@ -1,7 +1,10 @@
 use std::fs;
 
 use dmprl_shared::config::Layers;
-use dmprl_shared::segment::{LAYOUT_VERSION, Segment, SegmentHeader, TRUNCATED, block_checksum};
+use dmprl_shared::segment::{
+    LAYOUT_VERSION, Rejection, Segment, SegmentHeader, TRUNCATED, block_checksum,
+};
+use dmprl_shared::transport::delivery::{Replayed, SegmentLog};
 use rand::RngExt;
 
 use super::*;
@@ -34,34 +37,38 @@ fn fresh_with(keys: &[(&str, &str)]) -> Result<Learner, LearnerError> {
     Learner::new(layers.finish().unwrap(), &spec(), RUN_ID)
 }
 
+fn segment(learner: &Learner, round: u32) -> Segment {
+    let layout = learner.policy().layout();
+    let mut random = dmprl_shared::seeds::stream(9, "segments", round.into());
+    let mut segment = Segment::zeroed(layout);
+    segment.block.iter_mut().for_each(|value| *value = random.random_range(-1.0..1.0));
+    segment.header = SegmentHeader {
+        layout_version: LAYOUT_VERSION,
+        run_id: RUN_ID,
+        architecture_hash: learner.policy().architecture_hash(),
+        policy_version: learner.counters.policy_version,
+        sequence: u64::from(round) + 1,
+        env_index: round % 2,
+        episode: round / 4,
+        episode_step: round / 2 % 2 * 5,
+        steps_len: 5,
+        flags: if round / 2 % 2 == 1 { TRUNCATED } else { 0 },
+        segment_steps: 5,
+        observation_len: layout.observation_len as u32,
+        action_len: layout.action_len as u32,
+        checksum: block_checksum(&segment.block),
+        ..SegmentHeader::default()
+    };
+    segment
+}
+
 /// Feeds `rounds` segments of two interleaved environments and does the updates owed for them.
 fn train(learner: &mut Learner, rounds: std::ops::Range<u32>) {
-    let layout = learner.policy().layout();
     if learner.replay.is_empty() && learner.config().demonstrations.are_cloned() {
         learner.demonstrate(&[crate::demonstrations::tests::steps()]).unwrap();
     }
     for round in rounds {
-        let mut random = dmprl_shared::seeds::stream(9, "segments", round.into());
-        let mut segment = Segment::zeroed(layout);
-        segment.block.iter_mut().for_each(|value| *value = random.random_range(-1.0..1.0));
-        segment.header = SegmentHeader {
-            layout_version: LAYOUT_VERSION,
-            run_id: RUN_ID,
-            architecture_hash: learner.policy().architecture_hash(),
-            policy_version: learner.counters.policy_version,
-            sequence: u64::from(round) + 1,
-            env_index: round % 2,
-            episode: round / 4,
-            episode_step: round / 2 % 2 * 5,
-            steps_len: 5,
-            flags: if round / 2 % 2 == 1 { TRUNCATED } else { 0 },
-            segment_steps: 5,
-            observation_len: layout.observation_len as u32,
-            action_len: layout.action_len as u32,
-            checksum: block_checksum(&segment.block),
-            ..SegmentHeader::default()
-        };
-        learner.insert(&segment).unwrap();
+        learner.insert(&segment(learner, round)).unwrap();
         let updates = learner.counters.updates;
         while learner.update_due() {
             learner.update().unwrap();
@@ -133,6 +140,62 @@ fn a_checkpoint_of_the_format_before_is_read_and_one_of_a_later_is_refused() {
     fs::write(&path, state.to_string()).unwrap();
     let error = load_newest(folder, &fresh).map(drop).unwrap_err().to_string();
     assert!(error.contains("format version 3, this build reads 1 to 2"), "{error}");
+}
+
+#[test]
+fn segments_that_a_checkpoint_holds_are_refused_and_those_that_nobody_has_are_counted() {
+    let folder = tempfile::tempdir().unwrap();
+    let mut learner = fresh().unwrap();
+    train(&mut learner, 0..60);
+    save(folder.path(), &mut learner).unwrap();
+    train(&mut learner, 60..70);
+    let (mut learner, _) = load_newest(folder.path(), &fresh).unwrap();
+    assert_eq!(learner.inbox.settled(), [Mark { incarnation: 0, sequence: 60 }]);
+    let again = segment(&learner, 59);
+    assert_eq!(learner.insert(&again), Err(Rejection::Duplicate));
+    // The worker forgot ten that the dead learner had acknowledged.
+    train(&mut learner, 70..71);
+    let counters = learner.counters;
+    assert_eq!((counters.segments, counters.lost, counters.received), (61, 10, 62));
+}
+
+#[test]
+fn at_level_log_what_was_acknowledged_outlives_the_learner() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("segments.log");
+    let checkpoints = folder.path().join("checkpoints");
+    fs::create_dir(&checkpoints).unwrap();
+    let fresh = || fresh_with(&[("delivery.level", "log")]);
+    let open = |learner: &Learner| {
+        let identity = (RUN_ID, learner.policy().architecture_hash());
+        SegmentLog::open(&path, identity, learner.policy().layout(), 1 << 20).unwrap()
+    };
+    let mut learner = fresh().unwrap();
+    assert_eq!(learner.recover(open(&learner)).unwrap(), Replayed::default());
+    train(&mut learner, 0..60);
+    save(&checkpoints, &mut learner).unwrap();
+    train(&mut learner, 60..80);
+    let marks = learner.inbox.acknowledge().unwrap();
+    assert_eq!(marks, [Mark { incarnation: 0, sequence: 80 }]);
+    let mut replay = Vec::new();
+    learner.replay.write(&mut replay).unwrap();
+    train(&mut learner, 80..85);
+    drop(learner);
+
+    let (mut learner, _) = load_newest(&checkpoints, &fresh).unwrap();
+    assert_eq!(learner.counters.segments, 60);
+    let replayed = learner.recover(open(&learner)).unwrap();
+    assert_eq!(replayed, Replayed { records: 20, cut_bytes: 0 });
+    assert_eq!((learner.counters.segments, learner.counters.lost), (80, 0));
+    let mut recovered = Vec::new();
+    learner.replay.write(&mut recovered).unwrap();
+    assert!(recovered == replay, "the same segments in the same order");
+    // The worker still keeps the five, and sends them again.
+    train(&mut learner, 80..85);
+    assert_eq!(learner.counters.lost, 0);
+    save(&checkpoints, &mut learner).unwrap();
+    let (mut learner, _) = load_newest(&checkpoints, &fresh).unwrap();
+    assert_eq!(learner.recover(open(&learner)).unwrap(), Replayed::default(), "emptied");
 }
 
 #[test]

@@ -28,6 +28,10 @@ pub struct ExperimentConfig {
     pub pacing: PacingConfig,
     /// The rollout workers.
     pub actors: ActorsConfig,
+    /// What a death may cost on the way from worker to learner.
+    pub delivery: DeliveryConfig,
+    /// What happens when the learner dies.
+    pub supervision: SupervisionConfig,
     /// The learner process.
     pub learner: LearnerConfig,
     /// Noise-free evaluation.
@@ -199,6 +203,52 @@ impl Default for ActorsConfig {
             env_failures_max: 10,
             env_call_timeout_s: 60.0,
         }
+    }
+}
+
+/// When a worker may forget a segment.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum DeliveryLevel {
+    /// When the learner has inserted it: its death loses what came after its last checkpoint.
+    Memory,
+    /// When it is in the learner's segment log too: its death loses nothing.
+    Log,
+}
+
+/// What a death may cost on the way from worker to learner.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct DeliveryConfig {
+    /// When a worker may forget a segment.
+    pub level: DeliveryLevel,
+    /// Segments a worker keeps until the learner has acknowledged them; full: the worker waits. 0
+    /// stands for `actors.queue_segments` and 1 024 more, which come in while an acknowledgement
+    /// is on its way.
+    pub unacknowledged_segments: usize,
+    /// Size of the segment log [bytes]; full: a checkpoint is written, which empties it.
+    pub log_bytes_max: u64,
+}
+
+impl Default for DeliveryConfig {
+    fn default() -> Self {
+        let level = DeliveryLevel::Memory;
+        Self { level, unacknowledged_segments: 0, log_bytes_max: 1 << 30 }
+    }
+}
+
+/// What happens when the learner dies.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct SupervisionConfig {
+    /// Restarts of a learner that was killed or crashed, without a checkpoint in between, before
+    /// the run ends.
+    pub learner_restarts_max: u32,
+}
+
+impl Default for SupervisionConfig {
+    fn default() -> Self {
+        Self { learner_restarts_max: 5 }
     }
 }
 

@@ -1,8 +1,8 @@
 //! Checks the merged tree: ranges, combinations, caps.
 
 use super::{
-    AlgorithmName, ConfigError, Controller, CriticInput, ExperimentConfig, PolicyKind, Start,
-    WarmUpKind, Windows,
+    AlgorithmName, ConfigError, Controller, CriticInput, DeliveryLevel, ExperimentConfig,
+    PolicyKind, Start, WarmUpKind, Windows,
 };
 
 /// What the machine sets: passed in, never read here.
@@ -19,6 +19,12 @@ const ENVS_PER_WORKER_MAX: usize = 4_096;
 const SEGMENT_STEPS_MAX: usize = 255;
 const HINDSIGHT_COPIES_MAX: usize = 64;
 const HIDDEN_MAX: usize = 65_536;
+/// A worker of 100 000 segments a second, and acknowledgements a hundred times a second.
+const SEGMENTS_UNTIL_ACKNOWLEDGED: usize = 1_024;
+const UNACKNOWLEDGED_MAX: usize = 1 << 20;
+/// Room for some segments of any size.
+const LOG_BYTES_MIN: u64 = 1 << 20;
+const LOG_BYTES_MAX: u64 = 1 << 44;
 /// 50 environment steps of each environment at K = 5, as published.
 const ROLLOUT_SEGMENTS_PER_ENV: usize = 10;
 
@@ -34,6 +40,10 @@ impl ExperimentConfig {
         if self.actors.queue_segments == 0 {
             self.actors.queue_segments = self.actors.envs_per_worker;
         }
+        if self.delivery.unacknowledged_segments == 0 {
+            self.delivery.unacknowledged_segments =
+                self.actors.queue_segments.saturating_add(SEGMENTS_UNTIL_ACKNOWLEDGED);
+        }
         if self.run.deterministic {
             self.actors.workers = 1;
         }
@@ -46,7 +56,21 @@ impl ExperimentConfig {
         self.check_dmp()?;
         self.check_combinations()?;
         self.check_ndp()?;
+        self.check_delivery()?;
         Ok(self)
+    }
+
+    fn check_delivery(&self) -> Result<(), ConfigError> {
+        let log = self.delivery.level == DeliveryLevel::Log;
+        range("delivery.level", "log", !(log && self.run.deterministic), || {
+            "memory with run.deterministic, whose one process sends itself nothing that could be \
+             lost"
+                .into()
+        })?;
+        let (key, got) = ("delivery.log_bytes_max", self.delivery.log_bytes_max);
+        range(key, got, (LOG_BYTES_MIN..=LOG_BYTES_MAX).contains(&got), || {
+            format!("from {LOG_BYTES_MIN} to {LOG_BYTES_MAX}")
+        })
     }
 
     fn check_counts(&self) -> Result<(), ConfigError> {
@@ -54,6 +78,12 @@ impl ExperimentConfig {
             ("actors.workers", self.actors.workers, 1, WORKERS_MAX),
             ("actors.envs_per_worker", self.actors.envs_per_worker, 1, ENVS_PER_WORKER_MAX),
             ("actors.queue_segments", self.actors.queue_segments, 1, 65_536),
+            (
+                "delivery.unacknowledged_segments",
+                self.delivery.unacknowledged_segments,
+                1,
+                UNACKNOWLEDGED_MAX,
+            ),
             ("policy.segment_steps", self.policy.segment_steps, 1, SEGMENT_STEPS_MAX),
             ("dmp.basis_count", self.dmp.basis_count, 1, 256),
             ("dmp.integration_steps", self.dmp.integration_steps, 1, 100_000),

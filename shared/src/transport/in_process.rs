@@ -58,6 +58,11 @@ pub fn segment_queues(
 }
 
 impl SegmentSender for Sender {
+    /// There is one connection, and nothing that breaks.
+    fn renew(&mut self) -> Result<bool, TransportError> {
+        Ok(false)
+    }
+
     fn try_send(
         &mut self,
         header: &SegmentHeader,

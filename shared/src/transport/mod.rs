@@ -2,8 +2,10 @@
 //!
 //! Two implementations of the same four traits: `in_process` (one-process runs and tests) and
 //! `shared_memory` (iceoryx2, between processes). No call here waits: a full queue is reported,
-//! and who waits, how long and on whom to blame it is the caller's business.
+//! and who waits, how long and on whom to blame it is the caller's business. What is kept until it
+//! has arrived for good, and what has arrived before, is `delivery`'s.
 
+pub mod delivery;
 pub mod in_process;
 pub mod shared_memory;
 
@@ -70,6 +72,14 @@ pub enum TransportError {
 
 /// The worker's end of its segment queue.
 pub trait SegmentSender {
+    /// Connects anew if there is another learner or the connection broke; to be called before each
+    /// round of offers. True once for each new connection: what was delivered through the one
+    /// before and is not acknowledged may be lost.
+    ///
+    /// # Errors
+    /// `Incompatible` if the learner follows another plan, others when they persist.
+    fn renew(&mut self) -> Result<bool, TransportError>;
+
     /// Offers one segment without waiting. Only `Delivered` means that it was taken.
     ///
     /// # Errors

@@ -160,11 +160,76 @@ fn a_killed_evaluator_answers_after_its_restart() {
     assert!(steps.is_sorted_by(|a, b| a < b), "{steps:?}");
 }
 
+/// Processes of one role, by their ids.
+fn ids(place: &Workplace, role: &str) -> Vec<i32> {
+    let processes = place.processes().into_iter().filter(|process| process.role == role);
+    processes.map(|process| process.id.as_raw_nonzero().get()).collect()
+}
+
+/// Kills the learner and waits for the next one's first segment, and for some steps of it.
+fn replace_learner(place: &Workplace, run: &str, running: &mut Running, deaths: usize) {
+    signal_role(place, "learner", Signal::KILL);
+    let back = |running: &Running| {
+        running.said().matches("the learner is back: first segment").count() == deaths
+    };
+    running.until("a new learner", back);
+    let steps = env_steps_of(run).unwrap_or(0);
+    running.until_steps(run, steps + 2_000);
+}
+
 #[test]
-fn a_killed_learner_ends_the_run_with_its_log_and_advice() {
+fn a_killed_learner_is_replaced_and_its_workers_stay() {
     let place = Workplace::new();
     let run = place.path("run");
-    let running = training(&place, &run, &[]);
+    let mut running = training(&place, &run, &[]);
+    let workers = ids(&place, "actor");
+    replace_learner(&place, &run, &mut running, 1);
+    replace_learner(&place, &run, &mut running, 2);
+    assert_eq!(ids(&place, "actor"), workers);
+    assert_eq!(ids(&place, "evaluator").len(), 1);
+    running.signal_group(Signal::INT);
+    running.wait().with_status(130);
+    for file in ["metrics.jsonl", "evaluations.jsonl"] {
+        let steps = env_steps(&rows(&run, file));
+        assert!(steps.is_sorted_by(|a, b| a < b), "{file}: {steps:?}");
+    }
+    let last = rows(&run, "metrics.jsonl").pop().unwrap();
+    assert_eq!(last["learner_restarts"], 2, "{last}");
+    let mut refused = last["rejected"].as_object().unwrap().clone();
+    refused.remove("duplicate");
+    assert!(refused.values().all(|count| count == 0), "{last}");
+    place.assert_no_process();
+    assert_eq!(shared_memory_of(&run), Vec::<PathBuf>::new());
+}
+
+/// Without any checkpoint: all that the next learner knows it has from the log.
+#[test]
+fn at_delivery_level_log_a_killed_learner_loses_nothing() {
+    let place = Workplace::new();
+    let run = place.path("run");
+    let keys = ["delivery.level=log", "checkpoint.interval_steps=1000000"];
+    let keys: Vec<&str> = keys.into_iter().flat_map(|key| ["--set", key]).collect();
+    let mut running = training(&place, &run, &keys);
+    let reached = env_steps_of(&run).unwrap();
+    replace_learner(&place, &run, &mut running, 1);
+    running.until_said("segments read from the segment log");
+    replace_learner(&place, &run, &mut running, 2);
+    running.until("counts of the workers", |_| {
+        let last = rows(&run, "metrics.jsonl").pop();
+        last.is_some_and(|last| last["delivery"]["acked"].as_u64() > Some(0))
+    });
+    running.signal_group(Signal::INT);
+    running.wait().with_status(130);
+    let last = rows(&run, "metrics.jsonl").pop().unwrap();
+    assert_eq!((&last["lost"], &last["learner_restarts"]), (&0.into(), &2.into()), "{last}");
+    assert!(last["env_steps"].as_u64().unwrap() > reached, "{last}");
+}
+
+#[test]
+fn a_learner_killed_once_too_often_ends_the_run_with_its_log_and_advice() {
+    let place = Workplace::new();
+    let run = place.path("run");
+    let running = training(&place, &run, &["--set", "supervision.learner_restarts_max=0"]);
     signal_role(&place, "learner", Signal::KILL);
     let reached = env_steps_of(&run).unwrap();
     running

@@ -19,14 +19,14 @@ use iceoryx2::service::port_factory::publish_subscribe::PortFactory;
 use super::service::{PrivateIpc, refused, service_name};
 use crate::transport::TransportError;
 
-/// Makes the ports of one service whose samples are slices of f32 with a header `H`.
+/// Makes the ports of one service whose samples are slices of `E` with a header `H`.
 ///
-/// Plain f32, no 64-byte element: the slice's length is then the block's length and says, before
-/// the payload is touched, whether the peer wrote what was agreed; the copies do not need more
-/// than an f32's alignment.
-pub(super) type Factory<H> = PortFactory<PrivateIpc, [f32], H>;
+/// Plain numbers, no 64-byte element: the slice's length is then the block's length and says,
+/// before the payload is touched, whether the peer wrote what was agreed; the copies do not need
+/// more than a number's alignment.
+pub(super) type Factory<E, H> = PortFactory<PrivateIpc, [E], H>;
 /// A service before it is created or opened.
-pub(super) type ChannelBuilder<H> = Builder<[f32], H, PrivateIpc>;
+pub(super) type ChannelBuilder<E, H> = Builder<[E], H, PrivateIpc>;
 
 /// A service's name and what its peers must agree on, as names with values.
 #[derive(Debug, Clone)]
@@ -37,11 +37,15 @@ pub(super) struct Channel {
 
 impl Channel {
     /// Creates the service, in a directory that is new and this learner's alone.
-    pub(super) fn create<H: Debug + ZeroCopySend>(
+    pub(super) fn create<E, H>(
         &self,
         node: &Node<PrivateIpc>,
-        limits: impl FnOnce(ChannelBuilder<H>) -> ChannelBuilder<H>,
-    ) -> Result<Factory<H>, TransportError> {
+        limits: impl FnOnce(ChannelBuilder<E, H>) -> ChannelBuilder<E, H>,
+    ) -> Result<Factory<E, H>, TransportError>
+    where
+        E: Debug + ZeroCopySend + 'static,
+        H: Debug + ZeroCopySend,
+    {
         let mut attributes = AttributeSpecifier::new();
         for (key, value) in &self.agreement {
             let (key, value) = attribute(key, value)?;
@@ -54,10 +58,14 @@ impl Channel {
 
     /// Opens the service that the learner created. A worker never creates one: killed in the
     /// middle, it would leave a service that hangs for everyone.
-    pub(super) fn open<H: Debug + ZeroCopySend>(
+    pub(super) fn open<E, H>(
         &self,
         node: &Node<PrivateIpc>,
-    ) -> Result<Factory<H>, TransportError> {
+    ) -> Result<Factory<E, H>, TransportError>
+    where
+        E: Debug + ZeroCopySend + 'static,
+        H: Debug + ZeroCopySend,
+    {
         let mut attributes = AttributeVerifier::new();
         for (key, value) in &self.agreement {
             let (key, value) = attribute(key, value)?;
@@ -67,12 +75,13 @@ impl Channel {
         opened.map_err(|cause| self.not_opened(node, cause))
     }
 
-    fn builder<H: Debug + ZeroCopySend>(
-        &self,
-        node: &Node<PrivateIpc>,
-    ) -> Result<ChannelBuilder<H>, TransportError> {
+    fn builder<E, H>(&self, node: &Node<PrivateIpc>) -> Result<ChannelBuilder<E, H>, TransportError>
+    where
+        E: Debug + ZeroCopySend + 'static,
+        H: Debug + ZeroCopySend,
+    {
         let name = service_name(&self.name)?;
-        Ok(node.service_builder(&name).publish_subscribe::<[f32]>().user_header::<H>())
+        Ok(node.service_builder(&name).publish_subscribe::<[E]>().user_header::<H>())
     }
 
     fn not_opened(&self, node: &Node<PrivateIpc>, cause: OpenError) -> TransportError {

@@ -26,13 +26,16 @@ const DIRECTORY_PREFIX: &str = "g";
 /// Bytes that the directory adds to the domain's path: "/g" and four digits.
 pub(super) const DIRECTORY_BYTES: usize = 6;
 /// Failures in a row to join a new generation before the caller is told. A few are normal: the
-/// learner may die again in that moment, or its predecessor's worker be still registered.
-const JOIN_FAILURES_MAX: usize = 1000;
+/// learner may die again in that moment, or its predecessor's worker be still registered. Many,
+/// because a learner killed between announcing its generation and the worker's look leaves one that
+/// nobody can join until the next is announced, which takes as long as a checkpoint takes to load.
+const JOIN_FAILURES_MAX: usize = 100_000;
 
 /// A generation that is being made; workers do not see it yet.
 #[derive(Debug)]
 pub(super) struct Generation {
-    number: u64,
+    /// Counts the learners of the domain, from 1.
+    pub(super) number: u64,
     number_file: File,
     /// Its directory.
     pub(super) root: PathBuf,
@@ -116,27 +119,32 @@ impl<P> Membership<P> {
         Ok(membership)
     }
 
-    /// The port, made anew if there is a new generation or a connection failed. `None` as long as
-    /// that does not succeed.
+    /// The port, if there is one at the moment.
+    pub(super) fn port(&self) -> Option<&P> {
+        self.port.as_ref()
+    }
+
+    /// Makes the port anew if there is a new generation or a connection failed; true if it did.
     ///
     /// # Errors
     /// `Incompatible` at once, others when they persist.
-    pub(super) fn port(
+    pub(super) fn renew(
         &mut self,
         make: impl FnOnce(&Node<PrivateIpc>, &Disconnected) -> Result<P, TransportError>,
-    ) -> Result<Option<&P>, TransportError> {
+    ) -> Result<bool, TransportError> {
         // One read of eight bytes, so that nothing is delivered to a dead learner's queue while
         // the next learner waits.
         let is_current = read_number(&self.number_file) == Some(self.number);
-        if !is_current || self.port.is_none() || self.disconnected.is_set() {
-            match self.join(make) {
-                Ok(()) => self.failures = 0,
-                Err(error @ TransportError::Incompatible { .. }) => return Err(error),
-                Err(error) if self.failures >= JOIN_FAILURES_MAX => return Err(error),
-                Err(_) => self.failures += 1,
-            }
+        if is_current && self.port.is_some() && !self.disconnected.is_set() {
+            return Ok(false);
         }
-        Ok(self.port.as_ref())
+        match self.join(make) {
+            Ok(()) => self.failures = 0,
+            Err(error @ TransportError::Incompatible { .. }) => return Err(error),
+            Err(error) if self.failures >= JOIN_FAILURES_MAX => return Err(error),
+            Err(_) => self.failures += 1,
+        }
+        Ok(self.port.is_some())
     }
 
     fn join(

@@ -1,19 +1,22 @@
 //! Segments and snapshots between processes of one host, over iceoryx2.
 //!
 //! `domain` is the run's directory and `generation` the part of it that belongs to one learner,
-//! `service` and `channel` tame the middleware, `segments` and `parameters` implement the traits.
-//! iceoryx2 is named nowhere else.
+//! `service`, `channel` and `latest` tame the middleware, `segments` and `parameters` implement the
+//! traits, `acknowledgements` is what `delivery` needs beside them. iceoryx2 is named nowhere else.
 //!
 //! What holds when processes die:
 //! - A worker never creates a service and never cleans up, so one killed in the middle blocks
 //!   nobody. Its queued segments are still delivered; the learner's `maintain` frees its place.
 //! - A dead learner's queues are lost: `Delivered` promises no more than the queue. Workers see
-//!   `Full` or `Detached` until the next learner serves the same domain, then follow it.
+//!   `Full` or `Detached` until the next learner serves the same domain, then follow it. What must
+//!   not be lost is kept by `delivery` until it is acknowledged.
 //! - A new learner inherits nothing from the one before: whatever that left half-made is removed.
 
+mod acknowledgements;
 mod channel;
 mod domain;
 mod generation;
+mod latest;
 mod parameters;
 mod segments;
 mod service;
@@ -21,6 +24,7 @@ mod service;
 use std::path::Path;
 use std::sync::Arc;
 
+pub use acknowledgements::{AcknowledgementReader, Acknowledger};
 pub use domain::{Domain, DomainError, remove_abandoned};
 use generation::Generation;
 use iceoryx2::service::header::publish_subscribe::Header;
@@ -31,7 +35,7 @@ use super::TransportError;
 use crate::segment::SegmentLayout;
 
 /// Version of what the processes of a run say to each other; others are refused.
-const PROTOCOL: u32 = 1;
+const PROTOCOL: u32 = 2;
 /// Locked by the learner as long as it lives.
 const LEARNER_LOCK: &str = "learner.lock";
 /// Queues, registries and descriptions of one service, besides its chunks [bytes]. Measured: see
@@ -90,10 +94,13 @@ pub fn required_bytes(
         .saturating_mul(segment.saturating_add(QUEUE_ENTRY_BYTES))
         .saturating_add(SERVICE_BYTES);
     let snapshots = chunk(size_of::<parameters::WireHeader>(), parameters_len)
-        .saturating_mul(parameters::chunk_count(worker_count));
-    // Each worker has a connection on the parameter channel too.
-    let services = worker_count.saturating_add(1).saturating_mul(SERVICE_BYTES);
-    let bytes = worker_count.saturating_mul(queue).saturating_add(snapshots);
+        .saturating_mul(latest::chunk_count(worker_count));
+    // Two numbers a worker, each as long as two f32.
+    let marks = chunk(0, acknowledgements::sample_len(worker_count).saturating_mul(2))
+        .saturating_mul(latest::chunk_count(worker_count));
+    // Each worker has a connection on the channels for snapshots and acknowledgements too.
+    let services = worker_count.saturating_add(1).saturating_mul(2 * SERVICE_BYTES);
+    let bytes = worker_count.saturating_mul(queue).saturating_add(snapshots).saturating_add(marks);
     u64::try_from(bytes.saturating_add(services)).unwrap_or(u64::MAX)
 }
 
@@ -105,6 +112,8 @@ pub struct LearnerEnd {
     pub segments: Receiver,
     /// Publishes snapshots to all workers.
     pub parameters: Publisher,
+    /// Tells all workers what has arrived for good.
+    pub acknowledgements: Acknowledger,
 }
 
 /// What a worker holds.
@@ -114,6 +123,8 @@ pub struct WorkerEnd {
     pub segments: Sender,
     /// Takes the learner's newest snapshot.
     pub parameters: Subscriber,
+    /// Takes what the learner says has arrived for good.
+    pub acknowledgements: AcknowledgementReader,
 }
 
 /// Makes this process the run's learner and creates all services. Workers of a learner before it
@@ -131,10 +142,11 @@ pub fn serve(domain: &Path, plan: &Plan) -> Result<LearnerEnd, TransportError> {
         domain.check_space(plan.required_bytes())?;
     }
     let node = service::join(&generation.root)?;
-    let parameters = Publisher::serve(&node, plan, learner.clone())?;
+    let parameters = Publisher::serve(&domain, &node, plan, learner.clone())?;
+    let acknowledgements = Acknowledger::serve(&node, plan, generation.number, learner.clone())?;
     let segments = Receiver::serve(node, plan, learner)?;
     generation.announce()?;
-    Ok(LearnerEnd { segments, parameters })
+    Ok(LearnerEnd { segments, parameters, acknowledgements })
 }
 
 /// Attaches this process to the run as worker `worker_index`. Opens, never creates.
@@ -152,7 +164,8 @@ pub fn attach(
     let domain = Domain::open(domain)?;
     let segments = Sender::attach(&domain, plan, worker_index)?;
     let parameters = Subscriber::attach(&domain, plan)?;
-    Ok(WorkerEnd { segments, parameters })
+    let acknowledgements = AcknowledgementReader::attach(&domain, plan)?;
+    Ok(WorkerEnd { segments, parameters, acknowledgements })
 }
 
 /// Attaches this process as a reader of snapshots only, such as the evaluator.

@@ -1,30 +1,24 @@
 //! Policy snapshots from the learner to all workers: the newest replaces the one before.
 
-use std::fs::File;
+use std::fs::{File, OpenOptions};
+use std::os::unix::fs::{FileExt, OpenOptionsExt};
 use std::sync::Arc;
 
 use iceoryx2::node::Node;
-use iceoryx2::port::publisher::Publisher as Port;
-use iceoryx2::port::subscriber::SubscriberCreateError;
-use iceoryx2::port::update_connections::UpdateConnections;
 use iceoryx2::prelude::PayloadHeader;
 use iceoryx2_bb_elementary_traits::zero_copy_send::ZeroCopySend;
 
 use super::Plan;
-use super::channel::{Channel, ChannelBuilder, Disconnected, Factory};
+use super::channel::Channel;
 use super::domain::Domain;
 use super::generation::Membership;
+use super::latest::{ReaderPort, SAMPLES_MAX, Writer, subscribe};
 use super::service::{PrivateIpc, refused};
 use crate::parameters::{ParameterSnapshot, SnapshotError, checksum};
 use crate::transport::{ParameterPublisher, ParameterSubscriber, TransportError};
 
-/// Readers besides the workers: evaluator, dashboard, and the dead that are not cleaned up yet.
-const SPARE_SUBSCRIBERS: usize = 4;
-/// Processes besides the readers, likewise.
-const SPARE_NODES: usize = 4;
-/// Snapshots taken from the channel in one call: the newest, and one more if the learner had to
-/// make a new port.
-const SNAPSHOTS_MAX: usize = 2;
+/// Holds the newest version that any learner of the domain has published.
+const VERSION_FILE: &str = "policy_version";
 
 /// Everything about a snapshot except its values.
 #[derive(Debug, Default, Clone, Copy)]
@@ -48,12 +42,6 @@ unsafe impl ZeroCopySend for WireHeader {
     }
 }
 
-/// Chunks in the learner's data segment: the newest, the one being filled, and one that each
-/// reader may still be copying. Pages that are never written cost nothing.
-pub(super) fn chunk_count(worker_count: usize) -> usize {
-    worker_count + SPARE_SUBSCRIBERS + 2
-}
-
 fn channel(plan: &Plan) -> Channel {
     let mut agreement = plan.identity();
     agreement.push(("parameters_len", plan.parameters_len.to_string()));
@@ -63,88 +51,47 @@ fn channel(plan: &Plan) -> Channel {
 /// The learner's end of the parameter channel.
 #[derive(Debug)]
 pub struct Publisher {
-    channel: Channel,
-    factory: Factory<WireHeader>,
-    /// `None` only after a new port could not be made.
-    port: Option<Port<PrivateIpc, [f32], WireHeader>>,
-    disconnected: Disconnected,
-    parameters_len: usize,
-    chunk_count: usize,
-    /// Says to a second learner that there is one. Last: given up after the port.
-    _learner: Arc<File>,
+    writer: Writer<f32, WireHeader>,
+    version_file: File,
+    newest_version: u64,
 }
 
 impl Publisher {
     pub(super) fn serve(
+        domain: &Domain,
         node: &Node<PrivateIpc>,
         plan: &Plan,
         learner: Arc<File>,
     ) -> Result<Self, TransportError> {
-        let channel = channel(plan);
-        let subscribers_max = plan.worker_count + SPARE_SUBSCRIBERS;
-        let factory = channel.create(node, |builder: ChannelBuilder<WireHeader>| {
-            builder
-                .enable_safe_overflow(true)
-                .history_size(1)
-                .subscriber_max_buffer_size(1)
-                .subscriber_max_borrowed_samples(1)
-                .max_publishers(1)
-                .max_subscribers(subscribers_max)
-                .max_nodes(subscribers_max + SPARE_NODES)
-        })?;
-        let mut publisher = Self {
-            channel,
-            factory,
-            port: None,
-            disconnected: Disconnected::default(),
-            parameters_len: plan.parameters_len,
-            chunk_count: chunk_count(plan.worker_count),
-            _learner: learner,
-        };
-        publisher.renew()?;
-        Ok(publisher)
+        let path = domain.path().join(VERSION_FILE);
+        let version_file = OpenOptions::new()
+            .read(true)
+            .write(true)
+            .create(true)
+            .truncate(false)
+            .mode(0o600)
+            .open(&path)
+            .map_err(refused("opening", path.display()))?;
+        let mut bytes = [0; size_of::<u64>()];
+        // A file that is empty yet: nothing has been published.
+        let newest_version =
+            version_file.read_exact_at(&mut bytes, 0).map_or(0, |()| u64::from_le_bytes(bytes));
+        let len = (plan.parameters_len, plan.worker_count);
+        let writer = Writer::serve(node, channel(plan), len, learner)?;
+        Ok(Self { writer, version_file, newest_version })
     }
 
-    /// A new port, at the start and after a connection failed.
-    fn renew(&mut self) -> Result<(), TransportError> {
-        self.disconnected.clear();
-        self.port = None;
-        let chunk_count = self.chunk_count;
-        let port = self
-            .factory
-            .publisher_builder()
-            .initial_max_slice_len(self.parameters_len)
-            .max_loaned_samples(1)
-            .override_sample_preallocation(move |worst_case| worst_case.min(chunk_count))
-            .set_degradation_handler(self.disconnected.remember())
-            .create()
-            .map_err(refused("making a port of", &self.channel.name))?;
-        self.port = Some(port);
-        Ok(())
-    }
-
-    fn port(&self) -> Result<&Port<PrivateIpc, [f32], WireHeader>, TransportError> {
-        self.port.as_ref().ok_or_else(|| refused("publishing on", &self.channel.name)("no port"))
-    }
-
-    fn send(&self, header: WireHeader, values: &[f32]) -> Result<(), TransportError> {
-        let name = &self.channel.name;
-        let mut sample = self
-            .port()?
-            .loan_slice_uninit(values.len())
-            .map_err(refused("taking shared memory for", name))?;
-        *sample.user_header_mut() = header;
-        let sent = sample.write_from_slice(values).send();
-        sent.map(|_workers| ()).map_err(refused("publishing on", name))
+    /// The newest version that was published in this domain, by this learner or one before it.
+    /// A learner that goes on from a checkpoint must count on from here: its workers take no older
+    /// version, and two policies of one number could not be told apart.
+    #[must_use]
+    pub fn newest_version(&self) -> u64 {
+        self.newest_version
     }
 }
 
 impl ParameterPublisher for Publisher {
     fn publish(&mut self, snapshot: &ParameterSnapshot) -> Result<(), TransportError> {
-        let (expected, got) = (self.parameters_len, snapshot.values.len());
-        if got != expected {
-            return Err(TransportError::Length { expected, got });
-        }
         let header = WireHeader {
             version: snapshot.version,
             env_steps: snapshot.env_steps,
@@ -152,26 +99,24 @@ impl ParameterPublisher for Publisher {
             checksum: snapshot.checksum(),
             reserved: 0,
         };
-        self.send(header, &snapshot.values)
+        // First, so that no version is out that a successor does not know of.
+        self.version_file
+            .write_all_at(&snapshot.version.to_le_bytes(), 0)
+            .map_err(refused("writing", VERSION_FILE))?;
+        self.newest_version = snapshot.version;
+        self.writer.send(header, &snapshot.values)
     }
 
-    /// Hands the newest snapshot to workers that have joined since. After a connection failed, a
-    /// new port takes over, and late joiners wait for the next snapshot.
     fn maintain(&mut self) -> Result<(), TransportError> {
-        if self.disconnected.is_set() || self.port.is_none() {
-            self.renew()?;
-        }
-        self.port()?.update_connections().map_err(refused("connecting", &self.channel.name))
+        self.writer.maintain()
     }
 }
-
-type SubscriberPort = iceoryx2::port::subscriber::Subscriber<PrivateIpc, [f32], WireHeader>;
 
 /// A reader's end of the parameter channel.
 #[derive(Debug)]
 pub struct Subscriber {
     channel: Channel,
-    membership: Membership<SubscriberPort>,
+    membership: Membership<ReaderPort<f32, WireHeader>>,
     parameters_len: usize,
     architecture_hash: u64,
 }
@@ -184,22 +129,6 @@ impl Subscriber {
         let Plan { parameters_len, architecture_hash, .. } = *plan;
         Ok(Self { channel, membership, parameters_len, architecture_hash })
     }
-}
-
-fn subscribe(
-    channel: &Channel,
-    node: &Node<PrivateIpc>,
-    disconnected: &Disconnected,
-) -> Result<SubscriberPort, TransportError> {
-    let port = channel
-        .open(node)?
-        .subscriber_builder()
-        .set_degradation_handler(disconnected.remember())
-        .create();
-    port.map_err(|cause| match cause {
-        SubscriberCreateError::ExceedsMaxSupportedSubscribers => channel.taken(cause),
-        cause => refused("making a port of", &channel.name)(cause),
-    })
 }
 
 /// Refuses a snapshot that is foreign or damaged.
@@ -220,10 +149,10 @@ fn check(header: &WireHeader, values: &[f32], architecture_hash: u64) -> Result<
 impl ParameterSubscriber for Subscriber {
     fn newest(&mut self, snapshot: &mut ParameterSnapshot) -> Result<bool, TransportError> {
         let Self { channel, membership, .. } = self;
-        let port = membership.port(|node, disconnected| subscribe(channel, node, disconnected))?;
-        let Some(port) = port else { return Ok(false) };
+        membership.renew(|node, disconnected| subscribe(channel, node, disconnected))?;
+        let Some(port) = membership.port() else { return Ok(false) };
         let mut replaced = false;
-        for _ in 0..SNAPSHOTS_MAX {
+        for _ in 0..SAMPLES_MAX {
             let received = port.receive().map_err(refused("receiving from", &channel.name))?;
             let Some(sample) = received else { break };
             // The length is the peer's word: believed only if it is the agreed one.
@@ -283,7 +212,7 @@ mod tests {
             checksum: checksum(2, 20, 2, &[1.0, 2.0, 3.0]),
             reserved: 0,
         };
-        learner.parameters.send(header, &[1.0, 2.0, 4.0]).unwrap();
+        learner.parameters.writer.send(header, &[1.0, 2.0, 4.0]).unwrap();
         let refusal = subscriber.newest(&mut taken).unwrap_err();
         let TransportError::Snapshot(SnapshotError::Checksum { version, expected, got }) = refusal
         else {

@@ -110,6 +110,11 @@ fn publish(
 }
 
 impl SegmentSender for Sender {
+    fn renew(&mut self) -> Result<bool, TransportError> {
+        let Self { channel, membership, block_len } = self;
+        membership.renew(|node, disconnected| publish(channel, node, *block_len, disconnected))
+    }
+
     fn try_send(
         &mut self,
         header: &SegmentHeader,
@@ -118,10 +123,8 @@ impl SegmentSender for Sender {
         if block.len() != self.block_len {
             return Err(TransportError::Length { expected: self.block_len, got: block.len() });
         }
-        let Self { channel, membership, block_len } = self;
-        let port = membership
-            .port(|node, disconnected| publish(channel, node, *block_len, disconnected))?;
-        let Some(port) = port else { return Ok(SendOutcome::Detached) };
+        let Self { channel, membership, .. } = self;
+        let Some(port) = membership.port() else { return Ok(SendOutcome::Detached) };
         let sent = port.loan_slice_uninit(block.len()).map(|mut sample| {
             *sample.user_header_mut() = WireHeader(*header);
             sample.write_from_slice(block).send()
@@ -141,7 +144,7 @@ impl SegmentSender for Sender {
 #[derive(Debug)]
 struct Slot {
     channel: Channel,
-    factory: Factory<WireHeader>,
+    factory: Factory<f32, WireHeader>,
     /// `None` only after a new port could not be made.
     port: Option<ReceiverPort>,
     disconnected: Disconnected,
@@ -210,7 +213,7 @@ impl Slot {
         worker_index: usize,
     ) -> Result<Self, TransportError> {
         let channel = channel(plan, worker_index);
-        let factory = channel.create(node, |builder: ChannelBuilder<WireHeader>| {
+        let factory = channel.create(node, |builder: ChannelBuilder<f32, WireHeader>| {
             builder
                 .enable_safe_overflow(false)
                 .history_size(0)
@@ -256,7 +259,7 @@ impl Slot {
 
 fn subscribe(
     channel: &Channel,
-    factory: &Factory<WireHeader>,
+    factory: &Factory<f32, WireHeader>,
     disconnected: &Disconnected,
 ) -> Result<ReceiverPort, TransportError> {
     factory

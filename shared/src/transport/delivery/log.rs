@@ -1,0 +1,324 @@
+//! The segment log: what was settled since the last checkpoint, for a learner that starts.
+//!
+//! ```text
+//!   head:    magic "DMPRLSL1" · u64 run id, architecture hash, block length
+//!   record:  u32 bytes of the payload, u32 CRC-32 of the payload, payload: header · block
+//! ```
+//! All little-endian, as in memory on every supported processor. Records are collected and
+//! appended with one `write`, which outlives the process, but is not synced: a power failure may
+//! take it. A process killed in the middle of a `write` leaves a torn record; it was never
+//! acknowledged, and is cut off. A checkpoint holds all that the log does, so it empties the log;
+//! a process killed between the two leaves records that the checkpoint's marks recognise.
+
+use std::fs::{File, OpenOptions};
+use std::io::{self, Read, Seek, SeekFrom, Write};
+use std::os::unix::fs::OpenOptionsExt;
+use std::path::Path;
+
+use thiserror::Error;
+
+use crate::segment::{Segment, SegmentHeader, SegmentLayout};
+
+const MAGIC: &[u8; 8] = b"DMPRLSL1";
+const HEAD_BYTES: usize = 32;
+/// Length and checksum before each payload.
+const FRAME_BYTES: usize = 8;
+/// Records are collected up to here; more wait for a `write`.
+const BUFFER_BYTES: usize = 4 << 20;
+
+/// Why the log cannot be used.
+#[derive(Debug, Error)]
+pub enum LogError {
+    /// Reading or writing failed.
+    #[error("segment log: {0}")]
+    Io(#[from] io::Error),
+    /// Another run's, or of another architecture or segment length.
+    #[error("segment log: its head is another run's or another configuration's; remove the file")]
+    Foreign,
+}
+
+/// What was found in the log.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub struct Replayed {
+    /// Whole records.
+    pub records: u64,
+    /// Bytes behind the last whole record, cut off.
+    pub cut_bytes: u64,
+}
+
+/// An open log; only one process has it.
+#[derive(Debug)]
+pub struct SegmentLog {
+    file: File,
+    layout: SegmentLayout,
+    head: [u8; HEAD_BYTES],
+    /// Bytes of whole records in the file.
+    written: u64,
+    /// A `write` failed: the file may end in half a record.
+    torn: bool,
+    buffer: Vec<u8>,
+    bytes_max: u64,
+}
+
+impl SegmentLog {
+    /// Opens the log of a run, or makes an empty one. It may hold `bytes_max` bytes of records.
+    ///
+    /// # Errors
+    /// `Foreign` if it is another run's, `Io` for what the file system refuses.
+    pub fn open(
+        path: &Path,
+        (run_id, architecture_hash): (u64, u64),
+        layout: SegmentLayout,
+        bytes_max: u64,
+    ) -> Result<Self, LogError> {
+        let mut head = [0; HEAD_BYTES];
+        head[..8].copy_from_slice(MAGIC);
+        let numbers = [run_id, architecture_hash, layout.block_len() as u64];
+        for (bytes, number) in head[8..].chunks_exact_mut(8).zip(numbers) {
+            bytes.copy_from_slice(&number.to_le_bytes());
+        }
+        let mut options = OpenOptions::new();
+        options.read(true).write(true).create(true).truncate(false).mode(0o600);
+        let file = options.open(path)?;
+        let buffer = Vec::with_capacity(BUFFER_BYTES);
+        let mut log = Self { file, layout, head, written: 0, torn: false, buffer, bytes_max };
+        let mut found = Vec::new();
+        (&log.file).take(HEAD_BYTES as u64).read_to_end(&mut found)?;
+        if found.len() < HEAD_BYTES {
+            // A process was killed before it had written the head, so nothing follows.
+            log.file.set_len(0)?;
+            log.file.rewind()?;
+            log.file.write_all(&log.head)?;
+        } else if found != log.head {
+            return Err(LogError::Foreign);
+        }
+        Ok(log)
+    }
+
+    /// Hands every whole record to `each`, oldest first, and cuts off what follows the last.
+    ///
+    /// # Errors
+    /// `Io` for what the file system refuses.
+    pub fn replay(&mut self, mut each: impl FnMut(&Segment)) -> Result<Replayed, LogError> {
+        let len = self.file.metadata()?.len().saturating_sub(HEAD_BYTES as u64);
+        self.file.seek(SeekFrom::Start(HEAD_BYTES as u64))?;
+        let mut replayed = Replayed::default();
+        let mut segment = Segment::zeroed(self.layout);
+        let mut record = vec![0; self.record_bytes()];
+        let mut input = io::BufReader::with_capacity(1 << 20, &self.file);
+        self.written = 0;
+        while self.written + record.len() as u64 <= len {
+            input.read_exact(&mut record)?;
+            if !decode(&record, &mut segment) {
+                break;
+            }
+            each(&segment);
+            replayed.records += 1;
+            self.written += record.len() as u64;
+        }
+        replayed.cut_bytes = len - self.written;
+        self.cut()?;
+        Ok(replayed)
+    }
+
+    /// Whether another segment may be appended now; if not, and the log is not full, after the
+    /// next `write`.
+    #[must_use]
+    pub fn has_room(&self) -> bool {
+        // A record longer than the buffer is written by itself.
+        let fits = self.buffer.len() + self.record_bytes() <= BUFFER_BYTES;
+        !self.is_full() && (fits || self.buffer.is_empty())
+    }
+
+    /// Whether only a checkpoint makes room.
+    #[must_use]
+    pub fn is_full(&self) -> bool {
+        let bytes = self.written + (self.buffer.len() + self.record_bytes()) as u64;
+        bytes > self.bytes_max
+    }
+
+    /// Collects a segment for the next `write`.
+    ///
+    /// # Panics
+    /// If the block is of another length.
+    pub fn append(&mut self, header: &SegmentHeader, block: &[f32]) {
+        assert_eq!(block.len(), self.layout.block_len(), "segment block length");
+        let (header, block) = (bytemuck::bytes_of(header), bytemuck::cast_slice(block));
+        let mut checksum = crc32fast::Hasher::new();
+        checksum.update(header);
+        checksum.update(block);
+        let bytes = (header.len() + block.len()) as u32;
+        self.buffer.extend_from_slice(&bytes.to_le_bytes());
+        self.buffer.extend_from_slice(&checksum.finalize().to_le_bytes());
+        self.buffer.extend_from_slice(header);
+        self.buffer.extend_from_slice(block);
+    }
+
+    /// Writes what was collected. After an error it is still collected, and the next call writes
+    /// all of it.
+    ///
+    /// # Errors
+    /// `Io` for what the file system refuses.
+    pub fn write(&mut self) -> Result<(), LogError> {
+        if self.torn {
+            self.cut()?;
+        }
+        if self.buffer.is_empty() {
+            return Ok(());
+        }
+        self.torn = true;
+        self.file.write_all(&self.buffer)?;
+        self.torn = false;
+        self.written += self.buffer.len() as u64;
+        self.buffer.clear();
+        Ok(())
+    }
+
+    /// Forgets everything: a checkpoint that is on disk holds it.
+    ///
+    /// # Errors
+    /// `Io` for what the file system refuses.
+    pub fn clear(&mut self) -> Result<(), LogError> {
+        self.buffer.clear();
+        self.written = 0;
+        self.torn = true;
+        self.cut()
+    }
+
+    /// Cuts the file behind the last whole record and goes on from there.
+    fn cut(&mut self) -> Result<(), LogError> {
+        let len = HEAD_BYTES as u64 + self.written;
+        self.file.set_len(len)?;
+        self.file.seek(SeekFrom::Start(len))?;
+        self.torn = false;
+        Ok(())
+    }
+
+    fn record_bytes(&self) -> usize {
+        let block = self.layout.block_len() * size_of::<f32>();
+        FRAME_BYTES + size_of::<SegmentHeader>() + block
+    }
+}
+
+/// Reads one record; false if its length or checksum is not what it says.
+fn decode(record: &[u8], segment: &mut Segment) -> bool {
+    let (frame, payload) = record.split_at(FRAME_BYTES);
+    let expected = [payload.len() as u32, crc32fast::hash(payload)].map(u32::to_le_bytes);
+    if frame != expected.as_flattened() {
+        return false;
+    }
+    let (header, block) = payload.split_at(size_of::<SegmentHeader>());
+    segment.header = bytemuck::pod_read_unaligned(header);
+    bytemuck::cast_slice_mut(&mut segment.block).copy_from_slice(block);
+    true
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const LAYOUT: SegmentLayout =
+        SegmentLayout { segment_steps: 2, observation_len: 3, action_len: 1 };
+    const BYTES_MAX: u64 = 1_000;
+
+    fn segment(sequence: u64) -> Segment {
+        let mut segment = Segment::zeroed(LAYOUT);
+        segment.header.sequence = sequence;
+        segment.block.fill(sequence as f32);
+        segment
+    }
+
+    fn open(path: &Path) -> SegmentLog {
+        SegmentLog::open(path, (1, 2), LAYOUT, BYTES_MAX).unwrap()
+    }
+
+    fn append(log: &mut SegmentLog, sequences: std::ops::RangeInclusive<u64>) {
+        for sequence in sequences {
+            let Segment { header, block } = segment(sequence);
+            log.append(&header, &block);
+        }
+    }
+
+    fn replay(path: &Path) -> (Vec<u64>, Replayed) {
+        let mut sequences = Vec::new();
+        let replayed = open(path).replay(|found| {
+            assert_eq!(*found, segment(found.header.sequence));
+            sequences.push(found.header.sequence);
+        });
+        (sequences, replayed.unwrap())
+    }
+
+    #[test]
+    fn what_was_written_is_read_back_and_what_was_not_is_gone() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("log");
+        let mut log = open(&path);
+        append(&mut log, 1..=3);
+        log.write().unwrap();
+        append(&mut log, 4..=4);
+        drop(log);
+        assert_eq!(replay(&path), (vec![1, 2, 3], Replayed { records: 3, cut_bytes: 0 }));
+        let mut log = open(&path);
+        log.replay(|_| {}).unwrap();
+        append(&mut log, 4..=4);
+        log.write().unwrap();
+        assert_eq!(replay(&path).0, [1, 2, 3, 4]);
+        log.clear().unwrap();
+        append(&mut log, 5..=5);
+        log.write().unwrap();
+        assert_eq!(replay(&path).0, [5]);
+    }
+
+    #[test]
+    fn a_torn_or_damaged_record_is_cut_off_with_all_behind_it() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("log");
+        let mut log = open(&path);
+        append(&mut log, 1..=3);
+        log.write().unwrap();
+        let sound = std::fs::read(&path).unwrap();
+        let record = log.record_bytes();
+        drop(log);
+        for len in 0..sound.len() {
+            std::fs::write(&path, &sound[..len]).unwrap();
+            let whole = len.saturating_sub(HEAD_BYTES) / record;
+            let (sequences, replayed) = replay(&path);
+            assert_eq!(sequences.len(), whole, "{len} bytes");
+            let cut = len.saturating_sub(HEAD_BYTES) - whole * record;
+            assert_eq!(replayed, Replayed { records: whole as u64, cut_bytes: cut as u64 });
+        }
+        for at in HEAD_BYTES..sound.len() {
+            let mut damaged = sound.clone();
+            damaged[at] ^= 0x10;
+            std::fs::write(&path, &damaged).unwrap();
+            assert_eq!(replay(&path).0.len(), (at - HEAD_BYTES) / record, "byte {at}");
+            assert_eq!(replay(&path).1.cut_bytes, 0, "cut off for good");
+        }
+    }
+
+    #[test]
+    fn another_runs_log_is_refused() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("log");
+        drop(open(&path));
+        for identity in [(2, 2), (1, 3)] {
+            let refused = SegmentLog::open(&path, identity, LAYOUT, BYTES_MAX).unwrap_err();
+            assert!(matches!(refused, LogError::Foreign), "{refused}");
+        }
+    }
+
+    #[test]
+    fn a_full_log_has_no_room_until_it_is_cleared() {
+        let folder = tempfile::tempdir().unwrap();
+        let mut log = open(&folder.path().join("log"));
+        let count = BYTES_MAX / log.record_bytes() as u64;
+        for sequence in 1..=count {
+            assert!(log.has_room());
+            append(&mut log, sequence..=sequence);
+            log.write().unwrap();
+        }
+        assert!(log.is_full() && !log.has_room());
+        log.clear().unwrap();
+        assert!(log.has_room());
+    }
+}

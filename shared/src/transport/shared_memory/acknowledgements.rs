@@ -1,0 +1,143 @@
+//! How far each worker's segments have arrived, from the learner to all workers.
+//!
+//! The counts are cumulative, so the newest replaces the one before, and a lost one costs nothing
+//! but the time to the next.
+
+use std::fs::File;
+use std::sync::Arc;
+
+use iceoryx2::node::Node;
+use iceoryx2::prelude::PayloadHeader;
+use iceoryx2_bb_elementary_traits::zero_copy_send::ZeroCopySend;
+
+use super::Plan;
+use super::channel::Channel;
+use super::domain::Domain;
+use super::generation::Membership;
+use super::latest::{ReaderPort, SAMPLES_MAX, Writer, subscribe};
+use super::service::{PrivateIpc, refused};
+use crate::transport::TransportError;
+use crate::transport::delivery::{Acknowledgements, Mark};
+
+/// Numbers of a worker: incarnation and sequence.
+const NUMBERS_PER_WORKER: usize = 2;
+
+/// Which learner says so.
+#[derive(Debug, Default, Clone, Copy)]
+#[repr(transparent)]
+pub(super) struct WireHeader {
+    epoch: u64,
+}
+
+// SAFETY: one integer, no pointers; every bit pattern is valid. A change of the layout changes the
+// name.
+unsafe impl ZeroCopySend for WireHeader {
+    unsafe fn type_name() -> &'static str {
+        "dmprl::AcknowledgementHeader1"
+    }
+}
+
+/// Length of a sample.
+pub(super) fn sample_len(worker_count: usize) -> usize {
+    worker_count * NUMBERS_PER_WORKER
+}
+
+fn channel(plan: &Plan) -> Channel {
+    let mut agreement = plan.identity();
+    agreement.push(("worker_count", plan.worker_count.to_string()));
+    Channel { name: "acknowledgements".to_owned(), agreement }
+}
+
+/// The learner's end.
+#[derive(Debug)]
+pub struct Acknowledger {
+    writer: Writer<u64, WireHeader>,
+    epoch: u64,
+    numbers: Vec<u64>,
+}
+
+impl Acknowledger {
+    pub(super) fn serve(
+        node: &Node<PrivateIpc>,
+        plan: &Plan,
+        epoch: u64,
+        learner: Arc<File>,
+    ) -> Result<Self, TransportError> {
+        let len = sample_len(plan.worker_count);
+        let writer = Writer::serve(node, channel(plan), (len, plan.worker_count), learner)?;
+        Ok(Self { writer, epoch, numbers: vec![0; len] })
+    }
+
+    /// Tells every worker how far its segments have arrived; to be called a hundred times a second.
+    ///
+    /// # Errors
+    /// `Length` if there is not one mark a worker, `Middleware` if publishing failed.
+    pub fn acknowledge(&mut self, marks: &[Mark]) -> Result<(), TransportError> {
+        let (expected, got) = (self.numbers.len(), sample_len(marks.len()));
+        if got != expected {
+            return Err(TransportError::Length { expected, got });
+        }
+        for (numbers, mark) in self.numbers.chunks_exact_mut(NUMBERS_PER_WORKER).zip(marks) {
+            numbers.copy_from_slice(&[mark.incarnation.into(), mark.sequence]);
+        }
+        self.writer.send(WireHeader { epoch: self.epoch }, &self.numbers)
+    }
+
+    /// Lets workers in that have joined since; to be called a few times a second.
+    ///
+    /// # Errors
+    /// `Middleware` if the channel is broken.
+    pub fn maintain(&mut self) -> Result<(), TransportError> {
+        self.writer.maintain()
+    }
+}
+
+/// A worker's end.
+#[derive(Debug)]
+pub struct AcknowledgementReader {
+    channel: Channel,
+    membership: Membership<ReaderPort<u64, WireHeader>>,
+    len: usize,
+}
+
+impl AcknowledgementReader {
+    pub(super) fn attach(domain: &Domain, plan: &Plan) -> Result<Self, TransportError> {
+        let channel = channel(plan);
+        let membership =
+            Membership::new(domain, |node, disconnected| subscribe(&channel, node, disconnected))?;
+        Ok(Self { channel, membership, len: sample_len(plan.worker_count) })
+    }
+
+    /// Copies the newest into `acknowledgements` if it has not been taken yet.
+    ///
+    /// # Errors
+    /// `Length` if it is not one mark a worker, `Middleware` if the channel is broken.
+    pub fn newest(
+        &mut self,
+        acknowledgements: &mut Acknowledgements,
+    ) -> Result<bool, TransportError> {
+        let Self { channel, membership, len } = self;
+        membership.renew(|node, disconnected| subscribe(channel, node, disconnected))?;
+        let Some(port) = membership.port() else { return Ok(false) };
+        let mut taken = false;
+        for _ in 0..SAMPLES_MAX {
+            let received = port.receive().map_err(refused("receiving from", &channel.name))?;
+            let Some(sample) = received else { break };
+            // The length is the peer's word: believed only if it is the agreed one.
+            let got = usize::try_from(sample.header().number_of_elements()).unwrap_or(usize::MAX);
+            if got != *len {
+                return Err(TransportError::Length { expected: *len, got });
+            }
+            acknowledgements.epoch = sample.user_header().epoch;
+            acknowledgements.marks.clear();
+            let marks = sample.payload().chunks_exact(NUMBERS_PER_WORKER).map(|numbers| Mark {
+                // No worker has a larger one: such a mark is nobody's.
+                incarnation: u32::try_from(numbers[0]).unwrap_or(u32::MAX),
+                sequence: numbers[1],
+            });
+            acknowledgements.marks.extend(marks);
+            taken = true;
+        }
+        Ok(taken)
+    }
+}

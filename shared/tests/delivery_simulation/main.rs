@@ -1,0 +1,80 @@
+//! The delivery protocol under faults: the outbox, inbox and log that run in production, between
+//! links, workers and a learner that drop, repeat, delay, tear and die as a seed says.
+//!
+//! Safety first: whatever happens, nothing is inserted twice or out of order, nothing is torn, and
+//! what a worker forgot is where its level promises. Then everything heals, and all that is still
+//! kept must arrive. A failure names its seed; `DMPRL_SIMULATION_SEED=<seed>` runs that one alone.
+
+#![allow(clippy::unwrap_used, reason = "a test's helpers fail the test")]
+
+mod link;
+mod world;
+
+use std::panic::{AssertUnwindSafe, catch_unwind, resume_unwind};
+use std::path::Path;
+use std::sync::atomic::{AtomicU64, Ordering};
+
+use world::{Tally, World};
+
+const SEEDS: u64 = 100_000;
+const ONE_SEED: &str = "DMPRL_SIMULATION_SEED";
+
+/// Runs one world to its end.
+fn run(seed: u64, log: &Path) -> Tally {
+    let done = catch_unwind(AssertUnwindSafe(|| {
+        let mut world = World::new(seed, log);
+        world.suffer();
+        world.heal();
+        world.tally()
+    }));
+    done.unwrap_or_else(|panic| {
+        eprintln!(
+            "seed {seed} fails; alone: {ONE_SEED}={seed} cargo test --release -p dmprl-shared \
+             --test delivery_simulation"
+        );
+        resume_unwind(panic)
+    })
+}
+
+/// A folder whose files cost no disk, where the system has one.
+fn folder() -> tempfile::TempDir {
+    let memory = Path::new("/dev/shm");
+    let parent = if memory.is_dir() { memory.to_owned() } else { std::env::temp_dir() };
+    tempfile::tempdir_in(parent).unwrap()
+}
+
+#[test]
+fn nothing_acknowledged_is_lost_and_nothing_comes_twice_whatever_dies() {
+    let folder = folder();
+    if let Ok(seed) = std::env::var(ONE_SEED) {
+        println!("{:#?}", run(seed.parse().unwrap(), &folder.path().join("log")));
+        return;
+    }
+    let next = AtomicU64::new(0);
+    let threads = std::thread::available_parallelism().map_or(1, usize::from);
+    let tally = std::thread::scope(|scope| {
+        let runners: Vec<_> = (0..threads)
+            .map(|index| {
+                let (next, log) = (&next, folder.path().join(index.to_string()));
+                scope.spawn(move || {
+                    let mut tally = Tally::default();
+                    loop {
+                        let seed = next.fetch_add(1, Ordering::Relaxed);
+                        if seed >= SEEDS {
+                            return tally;
+                        }
+                        tally.add(&run(seed, &log));
+                    }
+                })
+            })
+            .collect();
+        let mut all = Tally::default();
+        for runner in runners {
+            all.add(&runner.join().unwrap_or_else(|panic| resume_unwind(panic)));
+        }
+        all
+    });
+    println!("{SEEDS} seeds: {tally:#?}");
+    // A fault that never strikes tests nothing.
+    assert!(tally.every_fault_has_struck(), "{tally:#?}");
+}
