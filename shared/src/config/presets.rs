@@ -35,8 +35,8 @@ pub const PRESETS: [Preset; 3] = [
 ];
 
 // What saves time on GPUs does not here, where an update takes as long as its products: larger
-// batches, fewer updates a step, smaller networks or batches all took longer to reach a return on
-// reacher, at least with some seed (ARCHITECTURE.md, "The preset fast").
+// batches, fewer updates a step, smaller networks or batches were no faster on reacher beyond the
+// spread of three seeds (ARCHITECTURE.md, "The preset fast").
 const FAST: &str = r#"
 [learner]
 threads = 2
@@ -143,8 +143,8 @@ pub fn algorithm_defaults(name: AlgorithmName) -> Option<Table> {
     }
 }
 
-// Of the released code of Neural Dynamic Policies: integrator, forcing, start, step sizes; networks as
-// in Table 2. Workers and pacing are nobody's: on-policy, each update waits for its segments.
+// Of the released code of Neural Dynamic Policies: integrator, forcing, start, step sizes; networks
+// as in Table 2. Workers and pacing are nobody's: on-policy, each update waits for its segments.
 const NDP: &str = r#"
 [policy]
 controller = "position"

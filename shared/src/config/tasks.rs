@@ -141,7 +141,7 @@ steps = 60000
 const ARM_VALUES: &[&str] = &[JOINTS, "[run]\nsteps = 200000"];
 
 // The same observation. Where the ball came down is not in it but decides all later rewards: with
-// more updates, or with the little that it varies at first scaled up, TD3 loses what it had learned.
+// more updates, or with what hardly varies at first scaled up, TD3 loses what it had learned.
 const THROWER_VALUES: &[&str] = &[
     ARM_VALUES[0],
     r#"
