@@ -53,6 +53,57 @@ fn a_run_that_shared_memory_cannot_hold_is_refused_with_both_numbers() {
     refused_by_its_size(command, &place, &words);
 }
 
+/// A command that finds a /dev/shm of its own, of so many KiB, as in a container; none, loudly,
+/// where this machine lets nobody mount one.
+fn with_shared_memory_of(kib: u32, script: &str) -> Option<Command> {
+    let mount = format!("mount -t tmpfs -o size={kib}k,mode=1777 tmpfs /dev/shm");
+    let alone = |script: &str| {
+        let mut command = Command::new("unshare");
+        command.args(["--mount", "sh", "-c", script]);
+        command
+    };
+    let probe = alone(&mount).output();
+    if probe.is_ok_and(|output| output.status.success()) {
+        return Some(alone(&format!("{mount} && {script}")));
+    }
+    use std::io::Write;
+    // Not `eprintln!`, which the harness keeps to itself when a test passes.
+    let mut stderr = std::io::stderr().lock();
+    writeln!(stderr, "a small /dev/shm was not tried: unshare and mount take root").unwrap();
+    None
+}
+
+#[test]
+fn a_container_with_too_little_shared_memory_is_told_before_it_starts() {
+    let place = Workplace::new();
+    let run = place.path("run");
+    let line = train("reacher", &run, &["--workers", "2"]).join(" ");
+    let script = format!("exec {} {line}", executable().display());
+    let Some(command) = with_shared_memory_of(256, &script) else { return };
+    let words = ["needed for 2 workers", "256.0 KiB free in /dev/shm", "--shm-size"];
+    refused_by_its_size(command, &place, &words);
+}
+
+/// What Docker gives is enough for a default run, and doctor says so with the numbers.
+#[test]
+fn dockers_shared_memory_is_enough_and_worth_a_warning() {
+    let place = Workplace::new();
+    let run = place.path("run");
+    let line = train("reacher", &run, &["--steps", "500", "--workers", "1"]).join(" ");
+    let program = executable().display();
+    let script = format!("{program} doctor; exec {program} {line}");
+    let Some(command) = with_shared_memory_of(64 << 10, &script) else { return };
+    let finished = place.start_command(command).wait().with_status(0);
+    // Where there are many cores, a default run has many workers and does not fit.
+    let warning = |line: &str| {
+        line.contains(" shared memory ")
+            && line.contains("needs")
+            && line.contains("64.0 MiB in /dev/shm")
+            && !line.starts_with("ok")
+    };
+    assert!(finished.printed.lines().any(warning), "{}", finished.printed);
+}
+
 #[test]
 fn too_few_open_files_are_refused_with_both_numbers() {
     let place = Workplace::new();
