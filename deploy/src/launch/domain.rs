@@ -155,7 +155,7 @@ mod tests {
         let first = place.create("first").unwrap();
         let parent = first.path().parent().unwrap().to_owned();
         assert_ne!(parent, squatted);
-        assert_eq!(place.others(), [parent.clone()]);
+        assert_eq!(place.others(), std::slice::from_ref(&parent));
         // The next one finds it; nothing is left of it in the end.
         let second = place.create("second").unwrap();
         assert_eq!(second.path().parent(), Some(parent.as_path()));
