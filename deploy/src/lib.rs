@@ -5,8 +5,10 @@
 //! and `dmprl evaluator` and speaks with them in the lines that `control` defines.
 
 pub mod bench;
+mod capacity;
 pub mod cli;
 pub mod control;
+mod doctor;
 pub mod failure;
 pub mod launch;
 pub mod plots;

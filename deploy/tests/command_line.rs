@@ -26,8 +26,9 @@ fn refused(arguments: &[&str]) -> String {
 
 #[test]
 fn every_command_has_help_with_examples() {
-    let commands = ["train", "resume", "eval", "bench", "tasks", "learner", "actor", "evaluator"];
-    for command in commands.into_iter().chain(["bench rollout"]) {
+    let commands = ["train", "resume", "eval", "bench", "tasks", "doctor", "clean"];
+    let more = ["learner", "actor", "evaluator", "bench rollout"];
+    for command in commands.into_iter().chain(more) {
         let words: Vec<&str> = command.split(' ').chain(["--help"]).collect();
         let output = dmprl(&words);
         assert!(output.status.success());

@@ -160,6 +160,8 @@ fn every_flag_that_is_shown_exists() {
         "bench rollout",
         "bench learner",
         "tasks",
+        "doctor",
+        "clean",
         "learner",
         "actor",
         "evaluator",

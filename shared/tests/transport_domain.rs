@@ -9,7 +9,7 @@ use std::path::{Path, PathBuf};
 
 use dmprl_shared::transport::TransportError;
 use dmprl_shared::transport::shared_memory::{
-    Domain, DomainError, attach, remove_abandoned, serve, subscribe,
+    Domain, DomainError, abandoned, attach, remove_abandoned, serve, subscribe,
 };
 use dmprl_shared::transport::{
     ParameterPublisher, ParameterSubscriber, SegmentReceiver, SegmentSender, SendOutcome,
@@ -87,12 +87,16 @@ fn only_domains_of_dead_owners_are_removed() {
     std::fs::DirBuilder::new().mode(0o700).create(&foreign).unwrap();
     std::fs::write(foreign.join("owner.lock"), "").unwrap();
     let (mut process, dead) = owner(&parent.path(), "dead");
-    assert_eq!(remove_abandoned(&parent.path()).unwrap(), Vec::<PathBuf>::new());
+    assert_eq!(remove_abandoned(&parent.path()).unwrap(), []);
     process.assert_alive();
     process.kill();
-    assert_eq!(remove_abandoned(&parent.path()).unwrap(), [dead]);
+    let found = abandoned(&parent.path()).unwrap();
+    assert_eq!(found.iter().map(|leftover| &leftover.path).collect::<Vec<_>>(), [&dead]);
+    assert!(found[0].bytes > 0);
+    assert!(dead.is_dir(), "looking removes nothing");
+    assert_eq!(remove_abandoned(&parent.path()).unwrap(), found);
     assert_eq!(entries(&parent.path()), [foreign, live.path().to_owned()]);
-    assert_eq!(remove_abandoned(&parent.path()).unwrap(), Vec::<PathBuf>::new());
+    assert_eq!(remove_abandoned(&parent.path()).unwrap(), []);
     Domain::open(live.path()).unwrap();
 }
 
@@ -105,6 +109,41 @@ fn domains_half_made_or_half_removed_are_removed() {
     }
     assert_eq!(remove_abandoned(&parent.path()).unwrap().len(), 2);
     assert_eq!(entries(&parent.path()), [live.path()]);
+}
+
+/// A learner whose supervisor was killed still writes its last checkpoint.
+#[test]
+fn a_domain_stays_as_long_as_its_learner_lives() {
+    let parent = Parent::new();
+    let (mut process, dead) = owner(&parent.path(), "dead");
+    process.kill();
+    let learner = std::fs::File::open(dead.join("learner.lock")).unwrap();
+    learner.try_lock().unwrap();
+    assert_eq!(abandoned(&parent.path()).unwrap(), []);
+    assert_eq!(remove_abandoned(&parent.path()).unwrap(), []);
+    drop(learner);
+    assert_eq!(remove_abandoned(&parent.path()).unwrap().len(), 1);
+    assert!(!parent.path().exists(), "the last domain takes its parent along");
+}
+
+#[test]
+fn a_link_among_the_domains_is_neither_followed_nor_removed() {
+    let parent = Parent::new();
+    let (mut process, dead) = owner(&parent.path(), "dead");
+    process.kill();
+    let outside = tempfile::tempdir_in(parent.path().parent().unwrap()).unwrap();
+    let theirs = outside.path().join("theirs");
+    std::fs::rename(&dead, &theirs).unwrap();
+    symlink(&theirs, &dead).unwrap();
+    assert_eq!(remove_abandoned(&parent.path()).unwrap(), []);
+    assert!(theirs.join("domain").exists());
+    // And a link inside a domain goes without what it points at.
+    std::fs::remove_file(&dead).unwrap();
+    std::fs::rename(&theirs, &dead).unwrap();
+    std::fs::write(outside.path().join("kept"), "").unwrap();
+    symlink(outside.path(), dead.join("link")).unwrap();
+    assert_eq!(remove_abandoned(&parent.path()).unwrap().len(), 1);
+    assert!(outside.path().join("kept").exists());
 }
 
 /// A directory between `mkdir` and its lock must not be taken for abandoned.
@@ -128,7 +167,7 @@ fn domains_being_made_survive_the_removal_of_abandoned_ones() {
         while makers.iter().any(|maker| !maker.is_finished()) {
             // What a maker is about to remove itself may be removed here.
             for removed in remove_abandoned(&path).unwrap() {
-                assert!(removed.to_string_lossy().contains("condemned"), "{removed:?}");
+                assert!(removed.path.to_string_lossy().contains("condemned"), "{removed:?}");
             }
         }
     });
@@ -137,7 +176,7 @@ fn domains_being_made_survive_the_removal_of_abandoned_ones() {
 
 #[test]
 fn a_missing_parent_has_nothing_abandoned() {
-    assert_eq!(remove_abandoned(&Parent::new().path()).unwrap(), Vec::<PathBuf>::new());
+    assert_eq!(remove_abandoned(&Parent::new().path()).unwrap(), []);
 }
 
 #[test]

@@ -87,13 +87,20 @@ impl Interpreter {
 
 /// Compares the loaded libpython with the linked one; callable before CPython starts.
 fn check_version() -> Result<(), PythonError> {
-    // SAFETY: Py_GetVersion needs no interpreter and returns a static string.
-    let version = unsafe { CStr::from_ptr(ffi::Py_GetVersion()) }.to_string_lossy();
-    let got = version.split_ascii_whitespace().collect::<Vec<_>>().join(" ");
+    let got = loaded_python_version();
     if got == LINKED_PYTHON.version {
         return Ok(());
     }
     Err(PythonError::OtherVersion { expected: LINKED_PYTHON.version.to_owned(), got })
+}
+
+/// `sys.version` of the libpython that this process has loaded, blanks normalised as in
+/// [`LINKED_PYTHON`]. Starts nothing.
+#[must_use]
+pub fn loaded_python_version() -> String {
+    // SAFETY: Py_GetVersion needs no interpreter and returns a static string.
+    let version = unsafe { CStr::from_ptr(ffi::Py_GetVersion()) }.to_string_lossy();
+    version.split_ascii_whitespace().collect::<Vec<_>>().join(" ")
 }
 
 /// Initialises CPython and releases the GIL.

@@ -14,7 +14,7 @@ mod interpreter;
 pub use environments::{PythonEnvironments, SUCCESS_NO, SUCCESS_NOT_REPORTED, SUCCESS_YES};
 pub use error::PythonError;
 pub use goals::{Goals, Relabelling};
-pub use interpreter::{Interpreter, InterpreterOptions};
+pub use interpreter::{Interpreter, InterpreterOptions, loaded_python_version};
 
 /// The CPython installation that this program was linked against, as its build found it.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]

@@ -2,8 +2,10 @@
 
 mod bench;
 mod bench_learner;
+mod clean;
 mod configuration;
 mod configured;
+mod doctor;
 mod eval;
 mod resume;
 mod tasks;
@@ -26,6 +28,7 @@ EXAMPLES
   dmprl eval runs/reacher-td3-dmp-s1-…    how well does its best policy do?
   dmprl resume runs/reacher-td3-dmp-s1-…  go on where it stopped
   dmprl tasks                              what can be trained
+  dmprl doctor                             what this machine has and lacks
 
 `dmprl COMMAND --help` has the details. Exit status: 0 done, 1 failed, 2 wrong use,
 130 interrupted.";
@@ -58,6 +61,10 @@ enum Command {
     Bench(bench::BenchArgs),
     /// List the tasks with a short name.
     Tasks(tasks::TasksArgs),
+    /// Check what this machine has for runs, and say what to do.
+    Doctor(doctor::DoctorArgs),
+    /// Remove what dead runs have left in shared memory.
+    Clean(clean::CleanArgs),
     /// A run's learner process; started by train.
     #[command(hide = true)]
     Learner(LearnerArgs),
@@ -92,6 +99,8 @@ fn run(command: Command) -> anyhow::Result<Outcome> {
         Command::Eval(args) => eval::run(&args),
         Command::Bench(args) => bench::run(&args),
         Command::Tasks(args) => tasks::run(&args),
+        Command::Doctor(args) => doctor::run(&args),
+        Command::Clean(args) => clean::run(&args),
         Command::Learner(args) => roles::learner(&args).map(|()| Outcome::Done),
         Command::Actor(args) => roles::actor(&args).map(|()| Outcome::Done),
         Command::Evaluator(args) => roles::evaluator(&args).map(|()| Outcome::Done),

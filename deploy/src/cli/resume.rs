@@ -8,6 +8,7 @@ use dmprl_shared::config::Limits;
 
 use super::configuration::refuse;
 use super::{cores, prepare_python, this_program};
+use crate::capacity;
 use crate::failure::{Outcome, wrong_use};
 use crate::launch::{self, SessionPlan};
 use crate::run_directory::{RunDirectory, Session};
@@ -63,6 +64,7 @@ pub(super) fn run(args: &ResumeArgs) -> anyhow::Result<Outcome> {
             )));
         }
     }
+    capacity::check(&config, run.spec()?.as_ref())?;
     let venv = prepare_python()?;
     // Before the lock, which children inherit: git is one.
     let session = Session::now();

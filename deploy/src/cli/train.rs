@@ -7,7 +7,9 @@ use std::time::{Duration, SystemTime};
 use anyhow::Context;
 use clap::Args;
 use clap::builder::PossibleValuesParser;
-use dmprl_shared::config::{AlgorithmName, Device, ExperimentConfig, Limits, PolicyKind};
+use dmprl_shared::config::{
+    AlgorithmName, Device, ExperimentConfig, Limits, PolicyKind, task_defaults,
+};
 use dmprl_shared::dmp::Dmp;
 use toml::Value;
 
@@ -18,6 +20,7 @@ use crate::failure::{Outcome, wrong_use};
 use crate::launch::{self, SessionPlan};
 use crate::run_directory::{Manifest, PolicyChoice, RunDirectory, compact, safe_name};
 use crate::terminal::ProgressStyle;
+use crate::{bench, capacity};
 
 /// A second run of the same second gets a number; more than this is a stuck clock.
 const SAME_SECOND_MAX: usize = 100;
@@ -89,6 +92,8 @@ pub(super) fn run(args: &TrainArgs) -> anyhow::Result<Outcome> {
     let mut config = merge(&sources)?.resolve(Limits { cores: cores() }).map_err(refuse)?;
     check(&config, args)?;
     make_absolute(&mut config)?;
+    let spec = task_defaults(&args.task).map(bench::spec_of);
+    capacity::check(&config, spec.as_ref())?;
     let init_from = args.init_from.as_deref().map(policy_file).transpose()?;
     if let Some(path) = &args.run_dir {
         RunDirectory::check_free(path)?;

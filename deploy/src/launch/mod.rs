@@ -31,7 +31,7 @@ mod signals;
 mod supervisor;
 
 pub(crate) use child::describe;
-pub(crate) use domain::create as create_domain;
+pub(crate) use domain::{Place, create as create_domain};
 pub(crate) use endings::last_lines;
 pub use evaluate::{EvaluationPlan, evaluate};
 pub use launcher::{Launcher, Process};

@@ -61,13 +61,8 @@ impl PythonEnvironment {
 /// With the last lines of the command that failed, and what to do about it: which Debian package
 /// is missing, or that the network is. A `.venv` that is no virtual environment is not touched.
 pub fn ensure(project_root: &Path, progress: &dyn Fn(&str)) -> Result<PythonEnvironment> {
-    let root = fs::canonicalize(project_root)
-        .with_context(|| format!("project directory {}", project_root.display()))?;
+    let (root, wanted) = wanted(project_root)?;
     let package = root.join(PACKAGE);
-    let manifest = package.join("pyproject.toml");
-    let manifest = fs::read_to_string(&manifest)
-        .with_context(|| format!("{} (is this the project's directory?)", manifest.display()))?;
-    let wanted = Stamp::new(&LINKED_PYTHON, &root, &manifest);
     let environment = PythonEnvironment::of(root.join(VENV));
     // Without the lock: the stamp is the last thing written and the first removed.
     if wanted.compare(&environment.venv) == Fit::Ready {
@@ -92,6 +87,43 @@ pub fn ensure(project_root: &Path, progress: &dyn Fn(&str)) -> Result<PythonEnvi
     wanted.write(&environment.venv)?;
     progress("python environment: ready");
     Ok(environment)
+}
+
+/// How `.venv` is found.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub enum State {
+    /// [`ensure`] would use it as it is.
+    Ready,
+    /// [`ensure`] would make it.
+    Missing,
+    /// [`ensure`] would change it or make it anew, because …
+    Stale(String),
+}
+
+/// Looks at `.venv` in `project_root`. Changes nothing, waits for nobody.
+#[must_use]
+pub fn state(project_root: &Path) -> State {
+    let (root, wanted) = match wanted(project_root) {
+        Ok(found) => found,
+        Err(error) => return State::Stale(format!("{error:#}")),
+    };
+    match wanted.compare(&root.join(VENV)) {
+        Fit::Ready => State::Ready,
+        Fit::Absent => State::Missing,
+        Fit::OtherPackages => State::Stale("envs_py/pyproject.toml has changed".to_owned()),
+        Fit::Unusable(why) => State::Stale(why),
+    }
+}
+
+/// The project's directory, resolved, and what its `.venv` has to be made from.
+fn wanted(project_root: &Path) -> Result<(PathBuf, Stamp)> {
+    let root = fs::canonicalize(project_root)
+        .with_context(|| format!("project directory {}", project_root.display()))?;
+    let manifest = root.join(PACKAGE).join("pyproject.toml");
+    let manifest = fs::read_to_string(&manifest)
+        .with_context(|| format!("{} (is this the project's directory?)", manifest.display()))?;
+    let wanted = Stamp::new(&LINKED_PYTHON, &root, &manifest);
+    Ok((root, wanted))
 }
 
 /// Waits for another start that is making the same `.venv`. The lock ends with its last holder,

@@ -2,6 +2,7 @@
 
 use std::fs::{File, OpenOptions, TryLockError};
 use std::io::{Read, Seek, Write};
+use std::os::unix::fs::OpenOptionsExt;
 use std::path::Path;
 use std::thread;
 use std::time::{Duration, Instant};
@@ -30,6 +31,8 @@ impl RunLock {
             .write(true)
             .create(true)
             .truncate(false)
+            // Who can open it can lock it, and so keep the owner from resuming.
+            .mode(0o600)
             .open(&path)
             .with_context(|| format!("cannot open {}", path.display()))?;
         let deadline = Instant::now() + wait;

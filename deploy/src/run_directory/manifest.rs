@@ -113,7 +113,8 @@ impl Session {
 }
 
 impl Machine {
-    fn this() -> Self {
+    /// The one this program runs on.
+    pub(crate) fn this() -> Self {
         let read = |path| std::fs::read_to_string(path).unwrap_or_default();
         let value = |text: &str, name: &str| {
             let line = text.lines().find(|line| line.starts_with(name))?;
@@ -130,11 +131,15 @@ impl Machine {
     }
 }
 
-fn random_u64() -> anyhow::Result<u64> {
+/// A number that nobody can guess.
+///
+/// # Errors
+/// The system gives none.
+pub(crate) fn random_u64() -> anyhow::Result<u64> {
     use std::io::Read;
     let mut bytes = [0; 8];
     std::fs::File::open("/dev/urandom")
         .and_then(|mut file| file.read_exact(&mut bytes))
-        .context("cannot draw a run id from /dev/urandom")?;
+        .context("cannot draw a random number from /dev/urandom")?;
     Ok(u64::from_le_bytes(bytes))
 }

@@ -26,6 +26,7 @@ use dmprl_shared::config::{ExperimentConfig, Layers};
 use dmprl_shared::spec::EnvSpec;
 
 pub use lock::RunLock;
+pub(crate) use manifest::random_u64;
 pub use manifest::{FORMAT_VERSION, Machine, Manifest, Session};
 pub use policies::{ChosenPolicy, PolicyChoice};
 pub use timestamp::{compact, rfc3339};

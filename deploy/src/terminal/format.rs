@@ -27,6 +27,17 @@ pub fn duration(duration: Duration) -> String {
     }
 }
 
+/// `640 B`, `3.2 MiB`: binary units, as Docker and `ulimit` count.
+#[must_use]
+pub fn binary_bytes(bytes: u64) -> String {
+    let units = [(1_u64 << 40, "TiB"), (1 << 30, "GiB"), (1 << 20, "MiB"), (1 << 10, "KiB")];
+    let fits = units.into_iter().find(|(unit, _)| bytes >= *unit);
+    fits.map_or_else(
+        || format!("{bytes} B"),
+        |(unit, name)| format!("{:.1} {name}", bytes as f64 / unit as f64),
+    )
+}
+
 /// Standard deviation over the values (population); 0 for none.
 #[must_use]
 pub fn std_of(values: &[f64]) -> f64 {
@@ -50,6 +61,15 @@ mod tests {
     fn numbers_are_grouped_by_thousands() {
         for (number, text) in [(0, "0"), (999, "999"), (1_000, "1,000"), (1_234_567, "1,234,567")] {
             assert_eq!(grouped(number), text);
+        }
+    }
+
+    #[test]
+    fn bytes_have_the_largest_unit_that_fits() {
+        for (bytes, text) in
+            [(0, "0 B"), (1_023, "1023 B"), (1_536, "1.5 KiB"), (64 << 20, "64.0 MiB")]
+        {
+            assert_eq!(binary_bytes(bytes), text);
         }
     }
 

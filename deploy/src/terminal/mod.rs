@@ -8,7 +8,7 @@ mod setup;
 mod summary;
 
 pub use display::{Display, ProgressStyle};
-pub use format::{duration, grouped, plus_minus, std_of};
+pub use format::{binary_bytes, duration, grouped, plus_minus, std_of};
 pub use rounds::RoundsProgress;
 pub use setup::SetupProgress;
 pub(crate) use summary::shown;

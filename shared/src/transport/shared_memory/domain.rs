@@ -11,15 +11,18 @@
 //! Creating and removing happen under a lock on the parent, so that a directory between `mkdir`
 //! and its lock is never seen as abandoned.
 
+mod leftovers;
+
 use std::fs::{DirBuilder, File, OpenOptions, TryLockError};
 use std::io::{self, ErrorKind, Write};
-use std::os::unix::ffi::OsStrExt;
 use std::os::unix::fs::{DirBuilderExt, MetadataExt, OpenOptionsExt};
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
 use rustix::fs::{CWD, OFlags, RenameFlags, renameat_with, statvfs};
 use thiserror::Error;
+
+pub use leftovers::{Leftover, abandoned, remove_abandoned};
 
 use super::generation::DIRECTORY_BYTES;
 use super::service::PREFIX;
@@ -209,44 +212,6 @@ impl Drop for Domain {
             }
         }
     }
-}
-
-/// Removes the domains in `parent` whose owner is dead, and returns their paths.
-///
-/// Live domains and directories without our marker stay. A missing `parent` has none.
-///
-/// # Errors
-/// `Untrusted` if `parent` is not private to this user, `Io` if something could not be removed.
-pub fn remove_abandoned(parent: &Path) -> Result<Vec<PathBuf>, DomainError> {
-    if let Ok(metadata) = parent.symlink_metadata()
-        && !metadata.is_dir()
-    {
-        check_private(parent)?;
-    }
-    let Some(_parent_lock) = lock_parent(parent)? else { return Ok(Vec::new()) };
-    check_private(parent)?;
-    let mut removed = Vec::new();
-    for entry in parent.read_dir().map_err(failed("listing", parent))? {
-        let path = entry.map_err(failed("listing", parent))?.path();
-        let name = path.file_name().unwrap_or_default().as_bytes();
-        if check_private(&path).is_err() {
-            continue;
-        }
-        if name.starts_with(UNFINISHED.as_bytes()) || name.starts_with(CONDEMNED.as_bytes()) {
-            // Who makes one holds the parent's lock; who removes one does not mind help.
-            remove_tree(&path)?;
-            removed.push(path);
-        } else if has_marker(&path) && is_abandoned(&path) && condemn(&path)? {
-            removed.push(path);
-        }
-    }
-    Ok(removed)
-}
-
-/// Whether the domain's owner is dead. One without its lock file is damaged or just being removed
-/// by its owner: not ours to judge.
-fn is_abandoned(path: &Path) -> bool {
-    File::open(path.join(LOCK_FILE)).is_ok_and(|lock| lock.try_lock().is_ok())
 }
 
 /// Renames the domain so that no one joins it any more, then removes it. `false` if it is gone.

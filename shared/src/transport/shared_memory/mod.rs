@@ -25,7 +25,7 @@ use std::path::Path;
 use std::sync::Arc;
 
 pub use acknowledgements::{AcknowledgementReader, Acknowledger};
-pub use domain::{Domain, DomainError, remove_abandoned};
+pub use domain::{Domain, DomainError, Leftover, abandoned, remove_abandoned};
 use generation::Generation;
 use iceoryx2::service::header::publish_subscribe::Header;
 pub use parameters::{Publisher, Subscriber};

@@ -1,0 +1,143 @@
+//! Whether this machine can hold a run: asked before anything of it is started, because what is
+//! missing would end it in the middle, and without a word of why.
+
+mod machine;
+mod need;
+
+use anyhow::bail;
+use dmprl_shared::config::ExperimentConfig;
+use dmprl_shared::spec::EnvSpec;
+
+pub(crate) use machine::{MachineLimits, Space};
+pub(crate) use need::Need;
+
+use crate::terminal::binary_bytes;
+
+/// Refuses a run that this machine cannot hold.
+///
+/// `spec`: none when only a worker will tell; then the smallest environment is assumed, and the
+/// learner refuses later what is too large.
+///
+/// # Errors
+/// What is short, with what the run needs, what there is, and what to do.
+pub(crate) fn check(config: &ExperimentConfig, spec: Option<&EnvSpec>) -> anyhow::Result<()> {
+    let machine = MachineLimits::this();
+    let shortages = Need::of(config, spec).shortages(&machine);
+    if shortages.is_empty() {
+        return Ok(());
+    }
+    bail!("this machine cannot hold the run\n  {}", shortages.join("\n  "))
+}
+
+impl Need {
+    /// What the machine has too little of, one sentence each.
+    pub(crate) fn shortages(&self, machine: &MachineLimits) -> Vec<String> {
+        let mut shortages = Vec::new();
+        let Self { workers, shared_memory_bytes, replay_bytes, open_files, maps, tasks } = *self;
+        let counted = format!("{workers} worker{}", if workers == 1 { "" } else { "s" });
+        if let Some(Space { path, free_bytes, .. }) = &machine.shared_memory
+            && *free_bytes < shared_memory_bytes
+        {
+            shortages.push(format!(
+                "shared memory: {} needed for {counted}, {} free in {}: use fewer workers, \
+                 shorter queues (actors.queue_segments), or enlarge it (Docker: --shm-size)",
+                binary_bytes(shared_memory_bytes),
+                binary_bytes(*free_bytes),
+                path.display()
+            ));
+        }
+        if let Some(limit) = machine.open_files.filter(|&limit| limit < open_files) {
+            shortages.push(format!(
+                "open files: {open_files} needed in one process for {counted}, the limit is \
+                 {limit}: raise it (ulimit -n {open_files}), or use fewer workers"
+            ));
+        }
+        if let Some(limit) = machine.maps.filter(|&limit| limit < maps) {
+            shortages.push(format!(
+                "memory maps: {maps} needed in one process for {counted}, the limit is {limit}: \
+                 raise it (sysctl -w vm.max_map_count={maps}), or use fewer workers"
+            ));
+        }
+        if let Some(limit) = machine.tasks.filter(|&limit| limit < tasks) {
+            shortages.push(format!(
+                "processes and threads: {tasks} needed for {counted}, the limit is {limit}: raise \
+                 it (ulimit -u, or the container's pids limit), or use fewer workers"
+            ));
+        }
+        let memory_bytes = replay_bytes.saturating_add(shared_memory_bytes);
+        if let Some(limit) = machine.memory_bytes.filter(|&limit| limit < memory_bytes) {
+            shortages.push(format!(
+                "memory: {} needed for the replay and {} of shared memory, this machine or its \
+                 container has {}: lower replay.capacity_steps",
+                binary_bytes(replay_bytes),
+                binary_bytes(shared_memory_bytes),
+                binary_bytes(limit)
+            ));
+        }
+        shortages
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const NEED: Need = Need {
+        workers: 4,
+        shared_memory_bytes: 5 << 20,
+        replay_bytes: 1 << 30,
+        open_files: 112,
+        maps: 1_100,
+        tasks: 40,
+    };
+
+    fn machine() -> MachineLimits {
+        MachineLimits {
+            shared_memory: Some(Space {
+                path: "/dev/shm".into(),
+                size_bytes: 64 << 20,
+                free_bytes: 5 << 20,
+            }),
+            open_files: Some(112),
+            maps: Some(1_100),
+            tasks: Some(40),
+            memory_bytes: Some((1 << 30) + (5 << 20)),
+        }
+    }
+
+    #[test]
+    fn what_just_fits_is_not_refused() {
+        assert_eq!(NEED.shortages(&machine()), Vec::<String>::new());
+        let unlimited = MachineLimits {
+            shared_memory: None,
+            open_files: None,
+            maps: None,
+            tasks: None,
+            memory_bytes: None,
+        };
+        assert_eq!(NEED.shortages(&unlimited), Vec::<String>::new());
+    }
+
+    #[test]
+    fn each_shortage_has_both_numbers_and_a_remedy() {
+        let space = Space { free_bytes: 1 << 20, ..machine().shared_memory.unwrap() };
+        let short = MachineLimits {
+            shared_memory: Some(space),
+            open_files: Some(64),
+            maps: Some(1_000),
+            tasks: Some(39),
+            memory_bytes: Some(1 << 29),
+        };
+        let shortages = NEED.shortages(&short);
+        for (shortage, words) in shortages.iter().zip([
+            ["5.0 MiB needed for 4 workers", "1.0 MiB free in /dev/shm", "--shm-size"],
+            ["112 needed", "the limit is 64", "ulimit -n 112"],
+            ["1100 needed", "the limit is 1000", "vm.max_map_count=1100"],
+            ["40 needed", "the limit is 39", "ulimit -u"],
+            ["1.0 GiB needed", "512.0 MiB", "replay.capacity_steps"],
+        ]) {
+            words.iter().for_each(|words| assert!(shortage.contains(words), "{shortage}"));
+        }
+        assert_eq!(shortages.len(), 5, "{shortages:#?}");
+    }
+}

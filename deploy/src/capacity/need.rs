@@ -1,0 +1,123 @@
+//! What a run needs of a machine, from its configuration.
+
+use dmprl_shared::config::{AlgorithmName, ExperimentConfig, Hindsight};
+use dmprl_shared::policy::Policy;
+use dmprl_shared::segment::SegmentLayout;
+use dmprl_shared::spec::EnvSpec;
+use dmprl_shared::transport::shared_memory::required_bytes;
+
+/// Open files of any process of a run: pipes, logs, what an environment reads [measured: 29].
+const FILES: u64 = 64;
+/// The same for each worker in the learner, which holds its services [measured: 6].
+const FILES_PER_WORKER: u64 = 12;
+/// Memory maps of any process: CPython with MuJoCo takes most [measured: 400].
+const MAPS: u64 = 1_024;
+/// The same for each worker in the learner [measured: 4].
+const MAPS_PER_WORKER: u64 = 12;
+/// Processes and threads besides workers and update: supervisor, learner, evaluator.
+const TASKS: u64 = 16;
+/// A worker, the thread that watches it, and the one that reads its commands [measured: 3].
+const TASKS_PER_WORKER: u64 = 4;
+
+/// Upper bounds, but for what depends on an environment that nobody has seen yet.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) struct Need {
+    /// Rollout processes.
+    pub(crate) workers: u64,
+    /// Shared memory of all processes together [bytes]; 0 where one process does everything.
+    pub(crate) shared_memory_bytes: u64,
+    /// Replay at the end of the run [bytes].
+    pub(crate) replay_bytes: u64,
+    /// Open files of the process that has most.
+    pub(crate) open_files: u64,
+    /// Memory maps of the process that has most.
+    pub(crate) maps: u64,
+    /// Processes and threads together.
+    pub(crate) tasks: u64,
+}
+
+impl Need {
+    /// - `config`: resolved.
+    /// - `spec`: the environment; the smallest that there is, when it is not known.
+    pub(crate) fn of(config: &ExperimentConfig, spec: Option<&EnvSpec>) -> Self {
+        // What does not fit the configuration is refused elsewhere, by name.
+        let policy = spec.and_then(|spec| Policy::new(config, spec).ok());
+        let smallest = SegmentLayout {
+            segment_steps: config.policy.decision_steps(),
+            observation_len: 1,
+            action_len: 1,
+        };
+        let layout = policy.as_ref().map_or(smallest, Policy::layout);
+        let parameters_len = policy.as_ref().map_or(0, Policy::parameters_len);
+        let actors = &config.actors;
+        let one_process = config.run.deterministic;
+        let shared =
+            || required_bytes(actors.workers, actors.queue_segments, layout, parameters_len);
+        let workers = whole(actors.workers);
+        let each = |base: u64, count: u64| base.saturating_add(count.saturating_mul(workers));
+        Self {
+            workers,
+            shared_memory_bytes: if one_process { 0 } else { shared() },
+            replay_bytes: replay_bytes(config, layout),
+            open_files: each(FILES, FILES_PER_WORKER),
+            maps: each(MAPS, MAPS_PER_WORKER),
+            tasks: each(TASKS, TASKS_PER_WORKER).saturating_add(whole(config.learner.threads)),
+        }
+    }
+}
+
+/// The replay takes its memory as it fills: no more than the run has steps.
+fn replay_bytes(config: &ExperimentConfig, layout: SegmentLayout) -> u64 {
+    if config.algorithm.name == AlgorithmName::Ndp {
+        return 0;
+    }
+    let copies = match config.replay.hindsight {
+        Hindsight::None => 0,
+        _ => whole(config.replay.hindsight_copies),
+    };
+    let inserted = config.run.steps.saturating_mul(copies.saturating_add(1));
+    let segments = whole(config.replay.capacity_steps).min(inserted) / whole(layout.segment_steps);
+    let segment = whole(layout.block_len()).saturating_mul(whole(size_of::<f32>()));
+    segments.saturating_mul(segment)
+}
+
+fn whole(count: usize) -> u64 {
+    u64::try_from(count).unwrap_or(u64::MAX)
+}
+
+#[cfg(test)]
+mod tests {
+    use dmprl_shared::config::{Layers, Limits};
+
+    use super::*;
+
+    fn need(keys: &[(&str, &str)]) -> Need {
+        let mut layers = Layers::new();
+        keys.iter().for_each(|(key, value)| layers.set("--set", key, value).unwrap());
+        Need::of(&layers.finish().unwrap().resolve(Limits { cores: 2 }).unwrap(), None)
+    }
+
+    #[test]
+    fn the_largest_configuration_that_is_accepted_has_a_size() {
+        let largest = need(&[
+            ("actors.workers", "1024"),
+            ("actors.queue_segments", "65536"),
+            ("policy.segment_steps", "255"),
+            ("dmp.integration_steps", "255"),
+            ("replay.capacity_steps", "2147483648"),
+            ("run.steps", "9223372036854775807"),
+        ]);
+        // Queues alone: workers × segments × (K + 1 observations, K actions, K rewards).
+        assert!(largest.shared_memory_bytes > 1_024 * 65_536 * (256 + 255 + 255) * 4);
+        assert!(largest.shared_memory_bytes < 1 << 40);
+        assert_eq!(largest.replay_bytes, (2_147_483_648 / 255) * (256 + 255 + 255) * 4);
+        assert_eq!(largest.open_files, 64 + 1_024 * 12);
+    }
+
+    #[test]
+    fn one_process_needs_no_shared_memory_and_a_short_run_no_large_replay() {
+        assert_eq!(need(&[("run.deterministic", "true")]).shared_memory_bytes, 0);
+        let (short, long) = (need(&[("run.steps", "1000")]), need(&[]));
+        assert!(short.replay_bytes < long.replay_bytes / 10, "{short:?} {long:?}");
+    }
+}

@@ -1,0 +1,54 @@
+//! `dmprl doctor`: what this machine has, what it lacks, and what to do.
+
+use anyhow::bail;
+use clap::Args;
+use dmprl_shared::config::{ExperimentConfig, Limits, TASKS, TaskDefaults};
+
+use super::configuration::{Sources, merge, refuse};
+use super::{cores, emit};
+use crate::doctor::{DefaultRun, Report};
+use crate::failure::Outcome;
+
+const HELP: &str = "\
+Looks only: nothing is installed, made or changed. A warning is something to know, a problem
+something that keeps runs from working; exit status 1 if there is a problem.
+
+EXAMPLES
+  dmprl doctor
+  dmprl doctor --json";
+
+/// Arguments of `dmprl doctor`.
+#[derive(Debug, Args)]
+#[command(after_help = HELP)]
+pub(super) struct DoctorArgs {
+    /// Print one JSON object on standard output.
+    #[arg(long)]
+    json: bool,
+}
+
+pub(super) fn run(args: &DoctorArgs) -> anyhow::Result<Outcome> {
+    let runs = TASKS
+        .iter()
+        .map(|task| Ok(DefaultRun { task, config: default_config(task)? }))
+        .collect::<anyhow::Result<Vec<_>>>()?;
+    let report = Report::of_this_machine(&runs);
+    emit(&if args.json { report.json().to_string() } else { report.text() })?;
+    match report.problems() {
+        0 => Ok(Outcome::Done),
+        1 => bail!("1 problem; what to do stands beside it"),
+        count => bail!("{count} problems; what to do stands beside each"),
+    }
+}
+
+/// What `dmprl train TASK` without any flag would do here.
+fn default_config(task: &TaskDefaults) -> anyhow::Result<ExperimentConfig> {
+    let sources = Sources {
+        task: task.name,
+        preset: "default",
+        file: None,
+        environment: Vec::new(),
+        set: &[],
+        flags: Vec::new(),
+    };
+    merge(&sources)?.resolve(Limits { cores: cores() }).map_err(refuse)
+}
