@@ -39,6 +39,7 @@ def plan(task_id, action_len=2, **exploration):
         },
         "exploration": {"kind": "gaussian", "std": 0.1, **exploration},
         "gaussian_std": [],
+        "log_stds_len": 0,
     }
 
 
