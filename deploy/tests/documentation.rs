@@ -10,12 +10,13 @@ use dmprl_learner::metrics::{DeliveryLine, MetricsLine, Rejected};
 use dmprl_shared::config::{ExperimentConfig, Layers, Limits, task_defaults};
 
 const EXAMPLES: &str = "docs/examples";
-const DOCUMENTS: [&str; 5] = [
+const DOCUMENTS: [&str; 6] = [
     "README.md",
     "ARCHITECTURE.md",
     "CHANGELOG.md",
     "docs/environments.md",
     "docs/demonstrations.md",
+    "tests/FAULTS.md",
 ];
 const LIMITS: Limits = Limits { cores: 2 };
 /// How the program is called in the documents.

@@ -4,6 +4,7 @@ The Rust tests use them too, as ``tiny_envs:Id`` with this folder on the Python 
 """
 
 import ctypes
+import multiprocessing
 import os
 import pathlib
 import signal
@@ -49,6 +50,18 @@ class Countdown(gymnasium.Env):
                 reward = np.inf
         ended = self.steps >= self.length
         return observation, reward, ended, False, {"is_success": ended and reward > 0}
+
+
+class Forking(Countdown):
+    """Has another process, forked from its own, draw at every reset."""
+
+    def reset(self, *, seed=None, options=None):
+        observation, info = super().reset(seed=seed)
+        with multiprocessing.get_context("fork").Pool(1) as pool:
+            self.draw = observation[1] = pool.apply(float, ("0.25",))
+            pool.close()
+            pool.join()
+        return observation, info
 
 
 class Faulty(Countdown):
@@ -343,6 +356,7 @@ def register(name, entry_point, **kwargs):
 
 register("Countdown", Countdown)
 register("Long", Countdown, kwargs={"length": 1000}, max_episode_steps=7)
+register("Forking", Forking, kwargs={"length": 1000}, max_episode_steps=100)
 register("Raises", Countdown, kwargs={"length": 1000, "fault": "raise"})
 register("NanObservation", Countdown, kwargs={"length": 1000, "fault": "observation"})
 register("InfReward", Countdown, kwargs={"length": 1000, "fault": "reward"})

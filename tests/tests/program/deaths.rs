@@ -146,6 +146,28 @@ fn a_killed_worker_is_announced_and_replaced() {
 }
 
 #[test]
+fn workers_that_are_killed_all_at_once_are_replaced() {
+    let place = Workplace::new();
+    let run = place.path("run");
+    let mut running = training(&place, &run, &["--workers", "2"]);
+    let workers: Vec<_> =
+        place.processes().into_iter().filter(|process| process.role == "actor").collect();
+    assert_eq!(workers.len(), 2);
+    workers.iter().for_each(|worker| worker.signal(Signal::KILL));
+    running.until_said("actor-0 died (signal 9 (SIGKILL)");
+    running.until_said("actor-1 died (signal 9 (SIGKILL)");
+    let steps = env_steps_of(&run).unwrap();
+    running.until_steps(&run, steps + 2_000);
+    assert_eq!(ids(&place, "actor").len(), 2);
+    running.signal_group(Signal::INT);
+    running.wait().with_status(130);
+    let last = rows(&run, "metrics.jsonl").pop().unwrap();
+    assert_eq!(last["lost"], 0, "{last}");
+    place.assert_no_process();
+    assert_eq!(shared_memory_of(&run), Vec::<PathBuf>::new());
+}
+
+#[test]
 fn a_killed_evaluator_answers_after_its_restart() {
     let place = Workplace::new();
     let run = place.path("run");

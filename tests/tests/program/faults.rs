@@ -135,6 +135,17 @@ fn a_worker_whose_environment_crashes_the_process_is_replaced() {
     survives("SegfaultOnce", &["signal 11 (SIGSEGV)"]);
 }
 
+/// A forked child inherits the worker's memory, files and locks, and ends without its clean-up.
+#[test]
+fn an_environment_that_forks_takes_nothing_from_its_worker() {
+    let place = Workplace::new();
+    let (run, finished) = train_tiny(&place, "Forking", &["--steps", "2000"]);
+    let finished = finished.with_status(0);
+    assert!(!finished.said.contains("died"), "{}", finished.said);
+    let last = assert_sound(&run);
+    assert!(last["episodes"].as_u64() > Some(0) && last["env_failures"] == 0, "{last}");
+}
+
 #[test]
 fn one_process_goes_on_after_failures_and_repeats_them_to_the_byte() {
     let repeated = || {
