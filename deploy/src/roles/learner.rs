@@ -216,6 +216,7 @@ impl Server<'_> {
                 self.acknowledgements.maintain()?;
                 maintained = Instant::now();
             }
+            recorder.poll_checkpoint(&mut self.session.learner);
             recorder.progress(&self.session.learner);
         }
     }

@@ -5,7 +5,7 @@ use std::io::Write;
 use std::time::{Duration, Instant};
 
 use anyhow::Context;
-use dmprl_learner::checkpoint;
+use dmprl_learner::checkpoint::{CheckpointError, Ended, Writer};
 use dmprl_learner::learner::Learner;
 use dmprl_learner::metrics::MetricsLine;
 use dmprl_learner::policy_file;
@@ -37,6 +37,7 @@ pub struct Recorder<'a> {
     progress: Rate,
     return_mean: Option<f64>,
     policy_lag_p50: u64,
+    checkpoints: Writer,
     /// Disk trouble is told once until it is over: a full disk must not fill the terminal too.
     checkpoint_failing: bool,
     log_failing: bool,
@@ -84,6 +85,7 @@ impl<'a> Recorder<'a> {
             progress: Rate::now(learner),
             return_mean: None,
             policy_lag_p50: 0,
+            checkpoints: Writer::new(run.checkpoints_path()),
             checkpoint_failing: false,
             log_failing: false,
         })
@@ -118,7 +120,7 @@ impl<'a> Recorder<'a> {
                 }
             }
             Due::Checkpoint => {
-                self.write_checkpoint(learner);
+                self.begin_checkpoint(learner);
                 Ok(())
             }
             Due::Refusal(why) => {
@@ -210,13 +212,43 @@ impl<'a> Recorder<'a> {
         })
     }
 
-    /// Writes a checkpoint; a failure is shown, the previous checkpoint and the training stay.
+    /// Begins a checkpoint of this moment, which is written while training goes on; only a
+    /// deterministic run waits for it. One that falls due while the one before is being written
+    /// waits for that first: the disk is then slower than the run's interval.
+    fn begin_checkpoint(&mut self, learner: &mut Learner) {
+        self.end_checkpoint(learner);
+        if let Err(error) = self.checkpoints.begin(learner) {
+            self.tell_of_checkpoint(learner.counters.env_steps, Err(error));
+        } else if learner.config().run.deterministic {
+            self.end_checkpoint(learner);
+        }
+    }
+
+    /// Looks whether the checkpoint that is being written is there.
+    pub fn poll_checkpoint(&mut self, learner: &mut Learner) {
+        if let Some(Ended { env_steps, written }) = self.checkpoints.poll(learner) {
+            self.tell_of_checkpoint(env_steps, written);
+        }
+    }
+
+    fn end_checkpoint(&mut self, learner: &mut Learner) {
+        if let Some(Ended { env_steps, written }) = self.checkpoints.wait(learner) {
+            self.tell_of_checkpoint(env_steps, written);
+        }
+    }
+
+    /// Writes the session's last checkpoint.
     pub fn write_checkpoint(&mut self, learner: &mut Learner) {
-        match checkpoint::save(&self.run.checkpoints_path(), learner) {
+        self.begin_checkpoint(learner);
+        self.end_checkpoint(learner);
+    }
+
+    /// A failure is shown; the previous checkpoint and the training stay.
+    fn tell_of_checkpoint(&mut self, env_steps: u64, written: Result<String, CheckpointError>) {
+        match written {
             Ok(name) => {
                 self.checkpoint_failing = false;
                 // A supervisor that is gone is noticed by the loop.
-                let env_steps = learner.counters.env_steps;
                 let _ = self.control.send(&Report::Checkpoint { name, env_steps });
             }
             Err(error) if !self.checkpoint_failing => {

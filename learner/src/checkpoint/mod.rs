@@ -9,6 +9,7 @@
 //! carries a number. `state.json` is written last and holds length and CRC-32 of the others: a
 //! torn or damaged checkpoint is refused with the reason, and the one before it is used.
 
+mod background;
 mod networks_file;
 mod rotation;
 
@@ -17,6 +18,7 @@ use std::fs::{self, File};
 use std::io::{BufReader, BufWriter, Read, Write};
 use std::path::{Path, PathBuf};
 
+use dmprl_shared::config::CheckpointConfig;
 use dmprl_shared::transport::delivery::{LogError, Mark};
 use rand_xoshiro::Xoshiro256PlusPlus;
 use serde::{Deserialize, Serialize};
@@ -24,9 +26,10 @@ use thiserror::Error;
 
 use crate::learner::{Counters, Learner};
 use crate::normaliser::Normaliser;
-use crate::replay::{ReplayFileError, Sampler};
+use crate::replay::{Replay, ReplayFileError, Sampler};
 use crate::update::adam::AdamStep;
 
+pub use background::{Ended, Writer};
 pub use rotation::names;
 
 /// Version of this format.
@@ -136,57 +139,83 @@ fn io_error(path: &Path) -> impl FnOnce(std::io::Error) -> CheckpointError + '_ 
     |cause| CheckpointError::Io { path: path.to_owned(), cause }
 }
 
-/// Writes a checkpoint of `learner` into `folder` and drops the oldest beyond the configured
-/// number and disk space; returns its name.
-///
-/// # Errors
-/// If writing fails; the checkpoints that were there are then untouched.
-pub fn save(folder: &Path, learner: &mut Learner) -> Result<String, CheckpointError> {
-    let fetched = learner.algorithm.fetch();
-    fetched.map_err(|cause| CheckpointError::Device { cause })?;
-    rotation::remove_temporaries(folder)?;
-    let name = rotation::next_name(folder)?;
-    let temporary = folder.join(format!(".{name}.tmp"));
-    fs::create_dir(&temporary).map_err(io_error(&temporary))?;
-    let written = write_files(&temporary, learner);
-    if let Err(error) = written {
-        // The disk may be full: the half-written one must not keep it so.
-        let _ = fs::remove_dir_all(&temporary);
-        return Err(error);
-    }
-    let path = folder.join(&name);
-    fs::rename(&temporary, &path).map_err(io_error(&path))?;
-    rotation::point_latest(folder, &name)?;
-    learner.inbox.checkpointed().map_err(|cause| CheckpointError::Log { cause })?;
-    let config = &learner.config().checkpoint;
-    rotation::rotate(folder, config.keep, config.disk_bytes_max)?;
-    Ok(name)
+/// Everything that a checkpoint holds, from one moment: what training does afterwards does not
+/// change it. It shares the replay's numbers with the learner, so it costs little more memory than
+/// the networks do, and milliseconds.
+#[derive(Debug)]
+pub struct Cut {
+    networks: Vec<u8>,
+    replay: Replay,
+    state: State,
+    config: CheckpointConfig,
+    /// What the segment log had of that moment [bytes]: forgotten once this is written.
+    logged: u64,
 }
 
-fn write_files(folder: &Path, learner: &Learner) -> Result<(), CheckpointError> {
-    let networks = learner.networks();
-    let networks_sum = write_summed(folder, NETWORKS, |out| {
-        let bytes = networks_file::bytes(learner).map_err(std::io::Error::other)?;
-        out.write_all(&bytes)
-    })?;
-    let replay = write_summed(folder, REPLAY, |out| {
-        learner.replay.write(out).map_err(std::io::Error::other)
-    })?;
-    let state = State {
-        format_version: FORMAT_VERSION,
-        architecture_hash: learner.policy().architecture_hash(),
-        counters: learner.counters,
-        updates_owed: learner.pacing.owed(),
-        adam_steps: networks.iter().map(|(name, t)| ((*name).to_owned(), t.adam.step)).collect(),
-        sampler_random: learner.sampler.random().clone(),
-        settled: learner.inbox.settled().to_vec(),
-        normaliser: learner.normaliser.clone(),
-        files: vec![networks_sum, replay],
-    };
-    write_summed(folder, STATE, |out| {
-        serde_json::to_writer_pretty(out, &state).map_err(Into::into)
-    })?;
-    File::open(folder).and_then(|dir| dir.sync_all()).map_err(io_error(folder))
+impl Cut {
+    /// Of this moment.
+    ///
+    /// # Errors
+    /// If the networks cannot be brought back from the device.
+    pub fn of(learner: &mut Learner) -> Result<Self, CheckpointError> {
+        let fetched = learner.algorithm.fetch();
+        fetched.map_err(|cause| CheckpointError::Device { cause })?;
+        let networks = networks_file::bytes(learner)
+            .map_err(|cause| CheckpointError::Format { path: NETWORKS.into(), cause })?;
+        let steps = learner.networks().into_iter();
+        let state = State {
+            format_version: FORMAT_VERSION,
+            architecture_hash: learner.policy().architecture_hash(),
+            counters: learner.counters,
+            updates_owed: learner.pacing.owed(),
+            adam_steps: steps.map(|(name, t)| (name.to_owned(), t.adam.step)).collect(),
+            sampler_random: learner.sampler.random().clone(),
+            settled: learner.inbox.settled().to_vec(),
+            normaliser: learner.normaliser.clone(),
+            files: Vec::new(),
+        };
+        Ok(Self {
+            networks,
+            replay: learner.replay.clone(),
+            state,
+            config: learner.config().checkpoint.clone(),
+            logged: learner.inbox.logged(),
+        })
+    }
+
+    /// Writes it into `folder` and drops the oldest there; returns its name.
+    ///
+    /// # Errors
+    /// If writing fails; the checkpoints that were there are then untouched.
+    pub fn write(self, folder: &Path) -> Result<String, CheckpointError> {
+        let CheckpointConfig { keep, disk_bytes_max, .. } = self.config;
+        rotation::remove_temporaries(folder)?;
+        let name = rotation::next_name(folder)?;
+        let temporary = folder.join(format!(".{name}.tmp"));
+        fs::create_dir(&temporary).map_err(io_error(&temporary))?;
+        if let Err(error) = self.write_files(&temporary) {
+            // The disk may be full: the half-written one must not keep it so.
+            let _ = fs::remove_dir_all(&temporary);
+            return Err(error);
+        }
+        let path = folder.join(&name);
+        fs::rename(&temporary, &path).map_err(io_error(&path))?;
+        rotation::point_latest(folder, &name)?;
+        rotation::rotate(folder, keep, disk_bytes_max)?;
+        Ok(name)
+    }
+
+    fn write_files(mut self, folder: &Path) -> Result<(), CheckpointError> {
+        let networks = write_summed(folder, NETWORKS, |out| out.write_all(&self.networks))?;
+        let replay = write_summed(folder, REPLAY, |out| {
+            self.replay.write(out).map_err(std::io::Error::other)
+        })?;
+        self.state.files = vec![networks, replay];
+        write_summed(folder, STATE, |out| {
+            serde_json::to_writer_pretty(out, &self.state).map_err(Into::into)
+        })?;
+        File::open(folder).and_then(|dir| dir.sync_all()).map_err(io_error(folder))
+    }
 }
 
 /// Where the run stood at each readable checkpoint of a folder, oldest first: where a resume may go

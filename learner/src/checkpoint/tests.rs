@@ -79,6 +79,13 @@ fn train(learner: &mut Learner, rounds: std::ops::Range<u32>) {
     }
 }
 
+/// Writes a checkpoint and waits for it.
+fn save(folder: &Path, learner: &mut Learner) -> Result<String, CheckpointError> {
+    let mut writer = Writer::new(folder.to_owned());
+    writer.begin(learner)?;
+    writer.wait(learner).unwrap().written
+}
+
 fn checkpoint_bytes(folder: &Path, name: &str) -> Vec<(String, Vec<u8>)> {
     [NETWORKS, REPLAY, STATE]
         .iter()
@@ -115,6 +122,34 @@ fn a_resumed_learner_goes_on_to_the_same_bytes_as_one_that_never_stopped() {
         let [straight, resumed] = both.map(|(folder, name)| checkpoint_bytes(folder, name));
         assert!(straight == resumed, "{keys:?}");
     }
+}
+
+#[test]
+fn a_checkpoint_is_of_its_moment_however_far_training_goes_while_it_is_written() {
+    let folder = tempfile::tempdir().unwrap();
+    let (at_once, later) = (folder.path().join("at_once"), folder.path().join("later"));
+    [&at_once, &later].into_iter().for_each(|path| fs::create_dir(path).unwrap());
+    let mut learner = fresh_with(&[("policy.normalise_observations", "true")]).unwrap();
+    train(&mut learner, 0..150);
+    let cut = Cut::of(&mut learner).unwrap();
+    let name = save(&at_once, &mut learner).unwrap();
+    // All 200 slots of the ring are written anew.
+    train(&mut learner, 150..400);
+    assert_eq!(cut.write(&later).unwrap(), name);
+    assert!(checkpoint_bytes(&at_once, &name) == checkpoint_bytes(&later, &name));
+}
+
+#[test]
+fn a_checkpoint_that_is_begun_is_there_when_its_writer_is_gone() {
+    let folder = tempfile::tempdir().unwrap();
+    let mut learner = fresh().unwrap();
+    train(&mut learner, 0..60);
+    let mut writer = Writer::new(folder.path().to_owned());
+    writer.begin(&mut learner).unwrap();
+    assert!(writer.is_busy());
+    drop(writer);
+    assert_eq!(names(folder.path()).unwrap(), ["000001"]);
+    assert!(load_newest(folder.path(), &fresh).is_ok());
 }
 
 #[test]
@@ -321,7 +356,8 @@ fn a_folder_that_cannot_be_written_keeps_its_old_checkpoint() {
     // A file where the temporary directory must go fails for root too, unlike permissions.
     let blocked = folder.path().join(".000002.tmp");
     fs::create_dir(&blocked).unwrap();
-    let failed = write_files(&folder.path().join("missing"), &learner).unwrap_err();
+    let cut = Cut::of(&mut learner).unwrap();
+    let failed = cut.write_files(&folder.path().join("missing")).unwrap_err();
     assert!(failed.to_string().contains("missing"), "{failed}");
     assert_eq!(load_newest(folder.path(), &fresh).unwrap().1.name, name);
 }

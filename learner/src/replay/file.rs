@@ -89,8 +89,9 @@ impl Replay {
             out.write_all(&number.to_le_bytes())?;
         }
         // f32 in memory is little-endian on every supported processor.
-        let used = self.filled * self.layout.block_len();
-        out.write_all(bytemuck::cast_slice(&self.blocks[..used]))?;
+        for numbers in self.blocks.first(self.filled) {
+            out.write_all(bytemuck::cast_slice(numbers))?;
+        }
         Ok(())
     }
 
@@ -126,8 +127,9 @@ impl Replay {
         for index in 0..self.tails.len() {
             self.tails[index] = self.read_tail(input, index)?;
         }
-        let used = self.filled * self.layout.block_len();
-        input.read_exact(bytemuck::cast_slice_mut(&mut self.blocks[..used]))?;
+        for numbers in self.blocks.first_mut(self.filled) {
+            input.read_exact(bytemuck::cast_slice_mut(numbers))?;
+        }
         Ok(())
     }
 

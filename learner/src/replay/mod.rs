@@ -5,11 +5,13 @@
 //! (`windows = "sliding"`), although the segments of many environments arrive interleaved.
 //! The oldest slot is replaced when the ring is full.
 
+mod blocks;
 mod file;
 mod window;
 
 use dmprl_shared::segment::{HINDSIGHT, SegmentHeader, SegmentLayout, TERMINATED, TRUNCATED};
 
+use blocks::Blocks;
 pub use file::ReplayFileError;
 pub use window::{Sampler, Window};
 
@@ -41,12 +43,12 @@ struct Tail {
     episode_steps: u32,
 }
 
-/// The ring.
-#[derive(Debug)]
+/// The ring. A clone shares the numbers, which are most of it, until one of the two writes to them.
+#[derive(Debug, Clone)]
 pub struct Replay {
     layout: SegmentLayout,
     slots: Vec<Slot>,
-    blocks: Vec<f32>,
+    blocks: Blocks,
     /// Where the next segment goes.
     head: usize,
     /// Slots filled.
@@ -77,8 +79,7 @@ impl Replay {
         Self {
             layout,
             slots: vec![Slot { next: NONE, ..Slot::default() }; count],
-            // Zeroed pages cost nothing until a segment is written to them.
-            blocks: vec![0.0; count * layout.block_len()],
+            blocks: Blocks::new(count, layout.block_len()),
             head: 0,
             filled: 0,
             kept: 0,
@@ -139,7 +140,7 @@ impl Replay {
     /// Puts a segment where the oldest is, or nothing yet.
     fn store(&mut self, header: &SegmentHeader, block: &[f32]) -> usize {
         let at = self.head;
-        self.blocks[at * block.len()..(at + 1) * block.len()].copy_from_slice(block);
+        self.blocks.get_mut(at).copy_from_slice(block);
         self.slots[at] = Slot {
             next: NONE,
             steps_len: header.steps_len as u8,
@@ -175,7 +176,6 @@ impl Replay {
     }
 
     fn block(&self, slot: usize) -> &[f32] {
-        let len = self.layout.block_len();
-        &self.blocks[slot * len..(slot + 1) * len]
+        self.blocks.get(slot)
     }
 }

@@ -116,6 +116,8 @@ pub struct World {
     /// The last that each incarnation of each worker has seen acknowledged.
     acked: [Vec<Mark>; WORKERS],
     checkpoint: Checkpoint,
+    /// One that is being written, and what the log had of its moment.
+    saving: Option<(Checkpoint, u64)>,
     /// Every acknowledgement ever published: an old one may come late.
     published: Vec<Acknowledgements>,
     tally: Tally,
@@ -150,6 +152,7 @@ impl World {
             forgotten: Default::default(),
             acked: std::array::from_fn(|_| vec![Mark::default()]),
             checkpoint: Checkpoint { marks: Vec::new(), inserted: [0; WORKERS] },
+            saving: None,
             published: Vec::new(),
             tally: Tally::default(),
         };
@@ -354,17 +357,23 @@ impl World {
         self.kill_learner();
     }
 
-    /// A checkpoint; the learner may die before it has emptied the log.
+    /// Begins a checkpoint, or ends the one that was begun: it is written while segments go on
+    /// coming. The learner may die before the log has forgotten what the checkpoint holds.
     fn save(&mut self) {
         let dies = self.workers[0].link.faults && self.chance(10);
         let Some(inbox) = &mut self.inbox else { return };
-        let inserted = self.inserted.each_ref().map(Vec::len);
-        self.checkpoint = Checkpoint { marks: inbox.settled().to_vec(), inserted };
+        let Some((checkpoint, logged)) = self.saving.take() else {
+            let inserted = self.inserted.each_ref().map(Vec::len);
+            let checkpoint = Checkpoint { marks: inbox.settled().to_vec(), inserted };
+            self.saving = Some((checkpoint, inbox.logged()));
+            return;
+        };
+        self.checkpoint = checkpoint;
         if dies {
             self.kill_learner();
             return;
         }
-        inbox.checkpointed().unwrap();
+        inbox.checkpointed(logged).unwrap();
     }
 
     fn kill_learner(&mut self) {
@@ -372,6 +381,7 @@ impl World {
             return;
         }
         self.tally.learner_deaths += 1;
+        self.saving = None;
         for (index, kept) in self.checkpoint.inserted.iter().enumerate() {
             self.forgotten[index].extend(self.inserted[index].drain(kept..));
         }

@@ -79,12 +79,18 @@ impl Inbox {
         Ok(&self.settled)
     }
 
-    /// A checkpoint of this moment is on disk.
+    /// How much has been logged: what a checkpoint of this moment holds of it [bytes].
+    #[must_use]
+    pub fn logged(&self) -> u64 {
+        self.log.as_ref().map_or(0, SegmentLog::logged)
+    }
+
+    /// A checkpoint is on disk, of the moment in which so much had been logged.
     ///
     /// # Errors
-    /// If the log cannot be emptied, which costs nothing but its room.
-    pub fn checkpointed(&mut self) -> Result<(), LogError> {
-        self.log.as_mut().map_or(Ok(()), SegmentLog::clear)
+    /// If the log cannot be shortened, which costs nothing but its room.
+    pub fn checkpointed(&mut self, logged: u64) -> Result<(), LogError> {
+        self.log.as_mut().map_or(Ok(()), |log| log.forget(logged))
     }
 
     /// Whether another segment may be settled now.

@@ -7,13 +7,13 @@
 //! All little-endian, as in memory on every supported processor. Records are collected and
 //! appended with one `write`, which outlives the process, but is not synced: a power failure may
 //! take it. A process killed in the middle of a `write` leaves a torn record; it was never
-//! acknowledged, and is cut off. A checkpoint holds all that the log does, so it empties the log;
+//! acknowledged, and is cut off. What a checkpoint holds the log forgets once that is on disk;
 //! a process killed between the two leaves records that the checkpoint's marks recognise.
 
 use std::fs::{File, OpenOptions};
 use std::io::{self, Read, Seek, SeekFrom, Write};
 use std::os::unix::fs::OpenOptionsExt;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 use thiserror::Error;
 
@@ -49,6 +49,7 @@ pub struct Replayed {
 /// An open log; only one process has it.
 #[derive(Debug)]
 pub struct SegmentLog {
+    path: PathBuf,
     file: File,
     layout: SegmentLayout,
     head: [u8; HEAD_BYTES],
@@ -81,7 +82,8 @@ impl SegmentLog {
         options.read(true).write(true).create(true).truncate(false).mode(0o600);
         let file = options.open(path)?;
         let buffer = Vec::with_capacity(BUFFER_BYTES);
-        let mut log = Self { file, layout, head, written: 0, torn: false, buffer, bytes_max };
+        let path = path.to_owned();
+        let mut log = Self { path, file, layout, head, written: 0, torn: false, buffer, bytes_max };
         let mut found = Vec::new();
         (&log.file).take(HEAD_BYTES as u64).read_to_end(&mut found)?;
         if found.len() < HEAD_BYTES {
@@ -174,15 +176,45 @@ impl SegmentLog {
         Ok(())
     }
 
-    /// Forgets everything: a checkpoint that is on disk holds it.
+    /// Bytes of the records there are, written or collected.
+    #[must_use]
+    pub fn logged(&self) -> u64 {
+        self.written + self.buffer.len() as u64
+    }
+
+    /// Forgets the first `bytes` of its records: a checkpoint that is on disk holds them.
     ///
     /// # Errors
-    /// `Io` for what the file system refuses.
-    pub fn clear(&mut self) -> Result<(), LogError> {
-        self.buffer.clear();
-        self.written = 0;
+    /// `Io` for what the file system refuses; the log is then as it was.
+    ///
+    /// # Panics
+    /// If there are fewer.
+    pub fn forget(&mut self, bytes: u64) -> Result<(), LogError> {
+        assert!(bytes <= self.logged(), "more than there is");
+        if bytes == self.logged() {
+            self.buffer.clear();
+            self.written = 0;
+            self.torn = true;
+            return self.cut();
+        }
+        self.write()?;
+        // Written anew, as what stays is little: what came while the checkpoint was written.
+        let mut rest = Vec::new();
+        // Until it is, the next write looks for the end of the records by itself.
         self.torn = true;
-        self.cut()
+        self.file.seek(SeekFrom::Start(HEAD_BYTES as u64 + bytes))?;
+        self.file.read_to_end(&mut rest)?;
+        let temporary = self.path.with_extension("tmp");
+        let mut options = OpenOptions::new();
+        let options = options.read(true).write(true).create(true).truncate(true).mode(0o600);
+        let mut file = options.open(&temporary)?;
+        file.write_all(&self.head)?;
+        file.write_all(&rest)?;
+        std::fs::rename(&temporary, &self.path)?;
+        self.file = file;
+        self.written = rest.len() as u64;
+        self.torn = false;
+        Ok(())
     }
 
     /// Cuts the file behind the last whole record and goes on from there.
@@ -263,10 +295,28 @@ mod tests {
         append(&mut log, 4..=4);
         log.write().unwrap();
         assert_eq!(replay(&path).0, [1, 2, 3, 4]);
-        log.clear().unwrap();
+        log.forget(log.logged()).unwrap();
         append(&mut log, 5..=5);
         log.write().unwrap();
         assert_eq!(replay(&path).0, [5]);
+    }
+
+    #[test]
+    fn what_came_after_the_moment_of_a_checkpoint_stays() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("log");
+        let mut log = open(&path);
+        append(&mut log, 1..=2);
+        log.write().unwrap();
+        append(&mut log, 3..=3);
+        let held = log.logged();
+        append(&mut log, 4..=5);
+        log.forget(held).unwrap();
+        append(&mut log, 6..=6);
+        log.write().unwrap();
+        assert_eq!(replay(&path), (vec![4, 5, 6], Replayed { records: 3, cut_bytes: 0 }));
+        let others = std::fs::read_dir(folder.path()).unwrap().count();
+        assert_eq!(others, 1, "no temporary file stays");
     }
 
     #[test]
@@ -318,7 +368,7 @@ mod tests {
             log.write().unwrap();
         }
         assert!(log.is_full() && !log.has_room());
-        log.clear().unwrap();
+        log.forget(log.logged()).unwrap();
         assert!(log.has_room());
     }
 }
