@@ -8,6 +8,7 @@
 mod actor;
 mod arguments;
 mod control_pipe;
+mod delivery;
 #[cfg(feature = "python")]
 mod environments;
 #[cfg(feature = "python")]
