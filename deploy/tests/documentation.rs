@@ -159,6 +159,7 @@ fn every_flag_that_is_shown_exists() {
         "eval",
         "bench rollout",
         "bench learner",
+        "bench transport",
         "tasks",
         "doctor",
         "clean",

@@ -5,8 +5,8 @@ line. The first is ``{"ready": "what it is"}``, or ``{"absent": "why"}`` if it c
 line ``run SECONDS`` on standard input is answered by ``{"segments": …, "seconds": …}``. It ends
 with its input, so the death of the program that started it ends it too, and its sender with it.
 
-A segment is ``bytes`` of the size asked for. The sender sends it as often as the queue takes it, and
-sleeps while the queue is full. The receiver looks at its length and at nothing else.
+A segment is ``bytes`` of the size asked for. The sender sends it as often as the queue takes it,
+and sleeps while the queue is full. The receiver looks at its length and at nothing else.
 """
 
 from __future__ import annotations
@@ -27,6 +27,10 @@ SETTLE_S = 0.1
 """Received before the clock starts: what had queued up, and the sender's way back to its pace."""
 QUEUE_SEGMENTS = 512
 """As the queue that these are compared with."""
+PARENT_LOOK_S = 0.05
+"""Between two looks whether the receiver lives."""
+CONTEXT = get_context("fork")
+"""Others name semaphores, which a killed process leaves behind."""
 RECEIVE_S = 20.0
 """A sender that sends nothing for so long is dead."""
 
@@ -40,11 +44,18 @@ def end_with(parent: int) -> None:
 
     def look() -> None:
         while os.getppid() == parent:
-            time.sleep(0.1)
+            time.sleep(PARENT_LOOK_S)
         os._exit(1)
 
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     threading.Thread(target=look, daemon=True).start()
+
+
+def started(send: Callable[..., None], target: Any, payload: bytes) -> Any:
+    """The sender's process, which runs."""
+    sender = CONTEXT.Process(target=send, args=(target, payload, os.getpid()), daemon=True)
+    sender.start()
+    return sender
 
 
 def put_all(queue: Any, payload: bytes, parent: int) -> None:
@@ -72,12 +83,8 @@ class MultiprocessingQueue:
     about = "multiprocessing.Queue of bytes, as long as ours; neither checked nor acknowledged"
 
     def __init__(self, segment_bytes: int, folder: Path) -> None:
-        context = get_context("spawn")
-        self._queue = context.Queue(QUEUE_SEGMENTS)
-        payload = os.urandom(segment_bytes)
-        arguments = (self._queue, payload, os.getpid())
-        self.sender = context.Process(target=put_all, args=arguments, daemon=True)
-        self.sender.start()
+        self._queue = CONTEXT.Queue(QUEUE_SEGMENTS)
+        self.sender = started(put_all, self._queue, os.urandom(segment_bytes))
 
     def receive(self) -> bytes:
         """The next segment."""
@@ -97,15 +104,13 @@ class ZeroMq:
             f"ZeroMQ {zmq.zmq_version()} by pyzmq {zmq.__version__}, PUSH to PULL over ipc://, "
             f"queues as long as ours; neither checked nor acknowledged"
         )
+        address = f"ipc://{folder}/zeromq-{segment_bytes}"
+        # Before there is a context here, whose threads the fork would lack.
+        self.sender = started(push_all, address, os.urandom(segment_bytes))
         self._socket = zmq.Context().socket(zmq.PULL)
         self._socket.set_hwm(QUEUE_SEGMENTS)
         self._socket.setsockopt(zmq.RCVTIMEO, int(1000 * RECEIVE_S))
-        address = f"ipc://{folder}/zeromq-{segment_bytes}"
         self._socket.bind(address)
-        context = get_context("spawn")
-        arguments = (address, os.urandom(segment_bytes), os.getpid())
-        self.sender = context.Process(target=push_all, args=arguments, daemon=True)
-        self.sender.start()
 
     def receive(self) -> bytes:
         """The next segment."""

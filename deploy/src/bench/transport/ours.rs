@@ -80,18 +80,17 @@ impl Ours {
 
     /// Stops the workers, takes what is left and compares it with what they say they have sent.
     pub(super) fn finish(mut self, watch: &Watch) -> anyhow::Result<Discrepancies> {
-        let mut sent = Sent::default();
+        let mut sent = 0;
         for child in &mut self.children {
             child.say("\"stop\"")?;
-            sent += last_report(child, watch)?;
+            sent += last_report(child, watch)?.sent;
         }
         // They have ended, which is no death any more.
         self.children.clear();
         self.ask(Request::Measure(DRAIN, From::All), watch, DRAIN + MEASURE_SLACK)?;
         let Discrepancies { received, lost, .. } = self.discrepancies;
-        let unique = sent.sent - sent.resent;
         // Missing in the middle of a sequence, or behind its end.
-        let lost = lost.max((unique + sent.resent).saturating_sub(received));
+        let lost = lost.max(sent.saturating_sub(received));
         Ok(Discrepancies { lost, ..self.discrepancies })
     }
 
