@@ -16,8 +16,8 @@ others asleep; the median counts.
   shared_memory          worker processes that only send, by the code of a run's workers: checksum,
                          outbox, queue, acknowledgements (delivery level `memory`); this process
                          takes, checks, settles and acknowledges in the learner's place
-  pipe, unix_socket      one such process that writes each segment as a frame; read and checked here,
-                         without acknowledgements
+  pipe, unix_socket      one such process that writes each segment as a frame; read and checked
+                         here, without acknowledgements
   multiprocessing_queue  Python's, between two processes; neither checked nor acknowledged
   zeromq                 the same by pyzmq, PUSH to PULL over ipc://
 `peers` are those of 1024 bytes; each of `sizes` has its own. lost and duplicate are found by the

@@ -5,7 +5,9 @@ use std::time::{Duration, Instant};
 
 use dmprl_shared::segment::SegmentHeader;
 use dmprl_shared::transport::delivery::{Acknowledgements, Outbox, Sent};
-use dmprl_shared::transport::shared_memory::{Plan, Subscriber, WorkerEnd, attach};
+#[cfg(feature = "python")]
+use dmprl_shared::transport::shared_memory::Subscriber;
+use dmprl_shared::transport::shared_memory::{Plan, WorkerEnd, attach};
 use dmprl_shared::transport::{SendOutcome, TransportError};
 
 use super::ControlPipe;
@@ -21,6 +23,7 @@ const FULL_QUEUE: Duration = Duration::from_micros(200);
 /// still wait in the queue keep the learner busy for more.
 const FULL_QUEUE_MAX: Duration = Duration::from_millis(3);
 /// Between two reports of what was sent.
+#[cfg(feature = "python")]
 const REPORT_INTERVAL: Duration = Duration::from_secs(1);
 
 /// Attaches to the learner of a domain; none if a stop is asked for.
@@ -98,6 +101,7 @@ impl<'a> Delivery<'a> {
     }
 
     /// The learner's snapshots.
+    #[cfg(feature = "python")]
     pub fn parameters(&mut self) -> &mut Subscriber {
         &mut self.end.parameters
     }
@@ -146,6 +150,7 @@ impl<'a> Delivery<'a> {
     }
 
     /// Tells the supervisor what was sent, once a second.
+    #[cfg(feature = "python")]
     pub fn report_in_time(&mut self) -> anyhow::Result<()> {
         if self.reported_at.elapsed() >= REPORT_INTERVAL { self.report() } else { Ok(()) }
     }

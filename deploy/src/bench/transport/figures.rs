@@ -141,7 +141,8 @@ impl Figures {
         let rounds = self.rates(SIZES[0].bytes, OURS).len();
         let mut lines = vec![
             format!(
-                "{} worker{} · queues of {QUEUE_SEGMENTS} segments · median of {rounds} rounds of {} s",
+                "{} worker{} · queues of {QUEUE_SEGMENTS} segments · median of {rounds} rounds \
+                 of {} s",
                 self.workers,
                 if self.workers == 1 { "" } else { "s" },
                 self.seconds
