@@ -160,6 +160,7 @@ fn every_flag_that_is_shown_exists() {
         "eval",
         "bench rollout",
         "bench learner",
+        "bench transport",
         "tasks",
         "doctor",
         "clean",

@@ -224,10 +224,16 @@ pub fn check(header: &SegmentHeader, block: &[f32], expected: &Expected) -> Resu
     refuse(!in_range, Rejection::Field)?;
     refuse(block_checksum(block) != header.checksum, Rejection::Checksum)?;
     let (_, actions, _) = layout.split(block);
-    let sound = block.iter().all(|value| value.is_finite())
+    let sound = all(block, |value| value.is_finite())
         && (expected.action_bounds == ActionBounds::None
-            || actions.iter().all(|action| action.abs() <= 1.0));
+            || all(actions, |action| action.abs() <= 1.0));
     refuse(!sound, Rejection::Value)
+}
+
+/// Whether all values pass. To the end in any case: without a way out the loop becomes vector
+/// instructions, which take a tenth of the time.
+fn all(values: &[f32], passes: impl Fn(f32) -> bool) -> bool {
+    values.iter().fold(true, |sound, &value| sound & passes(value))
 }
 
 /// CRC-32 of a block.

@@ -39,6 +39,12 @@ pub(super) fn resident_bytes_max(process: &str) -> Option<u64> {
     line.trim().strip_suffix("kB")?.trim().parse::<u64>().ok().map(|kib| kib * 1024)
 }
 
+/// Processor time of the thread that a folder below `/proc` describes [s].
+fn cpu_s(folder: &Path) -> Option<f64> {
+    let text = std::fs::read_to_string(folder.join("schedstat")).ok()?;
+    text.split_whitespace().next()?.parse::<f64>().ok().map(|nanoseconds| nanoseconds * 1e-9)
+}
+
 /// A running child; dropped, it is killed and waited for. It holds nothing that a kill could
 /// damage, and its input ends with this process if that is killed.
 pub(super) struct LineChild {
@@ -149,9 +155,13 @@ impl LineChild {
 
     /// Processor time of its first thread so far [s], when the system tells it.
     pub(super) fn cpu_s(&self) -> Option<f64> {
-        let path = format!("/proc/{}/schedstat", self.child.id());
-        let text = std::fs::read_to_string(path).ok()?;
-        text.split_whitespace().next()?.parse::<f64>().ok().map(|nanoseconds| nanoseconds * 1e-9)
+        cpu_s(&PathBuf::from(format!("/proc/{}", self.child.id())))
+    }
+
+    /// Processor time of all its threads so far [s], when the system tells it.
+    pub(super) fn cpu_s_of_all_threads(&self) -> Option<f64> {
+        let threads = std::fs::read_dir(format!("/proc/{}/task", self.child.id())).ok()?;
+        threads.map(|thread| cpu_s(&thread.ok()?.path())).sum()
     }
 
     /// Its end as an error, with the last lines of its log; the log itself is deleted when the

@@ -4,7 +4,8 @@
 //! (`workers`, `sink`) and, in turn with them, lets processes of `dmprl.bench_rollout` in Python do
 //! the same work (`peers`, `numpy_plan`); `figures` and `table` are what comes out. Everything
 //! waits in `watch` or in `child`, where an interrupt is seen. `learner` measures an update beside
-//! its matrix products and beside other libraries.
+//! its matrix products and beside other libraries. `transport` measures what carries segments, with
+//! workers that only send, beside pipes, sockets and queues of Python.
 
 mod child;
 mod figures;
@@ -16,6 +17,7 @@ mod rollout;
 mod sink;
 mod statistics;
 mod table;
+mod transport;
 mod watch;
 mod workers;
 
@@ -23,3 +25,6 @@ pub use figures::Figures;
 pub use learner::{Figures as LearnerFigures, LearnerBench, PeerKind, learner, spec_of};
 pub use numpy_plan::{Controls, NumpyPlan};
 pub use rollout::{RolloutBench, rollout};
+pub use transport::{
+    Figures as TransportFigures, TransportBench, TransportWorkerArgs, transport, transport_worker,
+};

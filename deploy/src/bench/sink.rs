@@ -9,13 +9,18 @@ use std::sync::mpsc::{self, Receiver, RecvTimeoutError, Sender};
 use std::thread::{self, JoinHandle};
 use std::time::{Duration, Instant};
 
-use dmprl_shared::segment::{Expected, HINDSIGHT, Segment, SegmentHeader, check};
+use anyhow::{Context, bail};
+use dmprl_shared::segment::{Expected, HINDSIGHT, Rejection, Segment, SegmentHeader, check};
 use dmprl_shared::transport::delivery::Inbox;
 use dmprl_shared::transport::shared_memory::LearnerEnd;
 use dmprl_shared::transport::{ParameterPublisher, SegmentReceiver, TransportError};
 use rustix::time::{ClockId, clock_gettime};
 
+use super::child::LineChild;
 use super::nap::Nap;
+use super::watch::Watch;
+use crate::control::Report;
+use crate::terminal::say;
 
 /// Between two cleanings of what dead workers left.
 const MAINTENANCE_INTERVAL: Duration = Duration::from_millis(250);
@@ -28,6 +33,9 @@ const FIRST_LOOK: Duration = Duration::from_micros(50);
 /// Taken before the clock starts: the stale segments of the full queues, and the workers' way back
 /// to their pace.
 const SETTLE: Duration = Duration::from_millis(100);
+
+/// How late a worker's death may be seen.
+const ANSWER_LOOK: Duration = Duration::from_millis(20);
 
 /// What the sink is asked for.
 #[derive(Debug, Clone, Copy)]
@@ -59,7 +67,9 @@ pub(super) enum Answer {
 /// What came in during one measurement.
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
 pub(super) struct Window {
-    /// Environment steps in the segments taken.
+    /// Sound segments taken.
+    pub(super) segments: u64,
+    /// Environment steps in them.
     pub(super) env_steps: u64,
     /// Its length [s].
     pub(super) seconds: f64,
@@ -72,8 +82,12 @@ pub(super) struct Window {
 pub(super) struct Discrepancies {
     /// Refused for what they hold, or come twice.
     pub(super) rejected: u64,
+    /// Of these, come twice.
+    pub(super) duplicate: u64,
     /// Missing in their worker's sequence.
     pub(super) lost: u64,
+    /// What came in all, refused or not: no discrepancy, but what others are found by.
+    pub(super) received: u64,
 }
 
 /// The sink's thread. Dropped, it is stopped and waited for.
@@ -106,15 +120,36 @@ impl Sink {
         Self { requests: Some(requests), answers, stop, thread: Some(thread) }
     }
 
-    /// Asks; the answer comes on [`Sink::answers`].
-    pub(super) fn ask(&self, request: Request) {
-        // A thread that has ended has said why, and the next look at the answers shows it.
-        let _ = self.requests.as_ref().map(|requests| requests.send(request));
+    /// Asks, and looks after the workers until the answer is there.
+    pub(super) fn answer(
+        &self,
+        request: Request,
+        children: &mut [LineChild],
+        watch: &Watch,
+        limit: Duration,
+    ) -> anyhow::Result<(Answer, Discrepancies)> {
+        self.ask(request);
+        let deadline = Instant::now() + limit;
+        loop {
+            watch.check()?;
+            for child in &mut *children {
+                let said = child.said()?;
+                said.iter().for_each(|line| show_warning(child.name(), line));
+            }
+            match self.answers.recv_timeout(ANSWER_LOOK) {
+                Ok(answer) => return answer.context("the transport failed"),
+                Err(RecvTimeoutError::Disconnected) => bail!("the sink has ended"),
+                Err(RecvTimeoutError::Timeout) if Instant::now() >= deadline => {
+                    bail!("{request:?}: the workers delivered too little within {limit:?}")
+                }
+                Err(RecvTimeoutError::Timeout) => {}
+            }
+        }
     }
 
-    /// One answer to each request, or what went wrong.
-    pub(super) fn answers(&self) -> &Receiver<Result<(Answer, Discrepancies), TransportError>> {
-        &self.answers
+    fn ask(&self, request: Request) {
+        // A thread that has ended has said why, and the next look at the answers shows it.
+        let _ = self.requests.as_ref().map(|requests| requests.send(request));
     }
 }
 
@@ -124,6 +159,13 @@ impl Drop for Sink {
         self.requests = None;
         // A panic of the thread was reported where it happened.
         let _ = self.thread.take().map(JoinHandle::join);
+    }
+}
+
+/// Shows the user what a worker warns of.
+pub(super) fn show_warning(name: &str, line: &str) {
+    if let Ok(Report::Warning { message }) = serde_json::from_str(line) {
+        say(&format!("{name}: {message}"));
     }
 }
 
@@ -191,18 +233,19 @@ impl Taker {
     fn measure(&mut self, duration: Duration, from: From) -> Result<Window, TransportError> {
         self.take_for(SETTLE, from)?;
         let cpu_s = cpu_s();
-        let (env_steps, seconds) = self.take_for(duration, from)?;
-        Ok(Window { env_steps, seconds, cpu_s: self::cpu_s() - cpu_s })
+        let taken = self.take_for(duration, from)?;
+        Ok(Window { cpu_s: self::cpu_s() - cpu_s, ..taken })
     }
 
-    /// Environment steps taken in so much time, and how much time it really was [s].
-    fn take_for(&mut self, duration: Duration, from: From) -> Result<(u64, f64), TransportError> {
+    /// What is taken in so much time, and how much time it really was.
+    fn take_for(&mut self, duration: Duration, from: From) -> Result<Window, TransportError> {
         let start = Instant::now();
-        let (mut env_steps, mut taken) = (0, 0);
+        let (mut window, mut taken) = (Window::default(), 0);
         while start.elapsed() < duration && !self.stop.load(Ordering::Acquire) {
             match self.take(from)? {
                 Some(header) => {
-                    env_steps += u64::from(header.steps_len);
+                    window.segments += u64::from(header.steps_len > 0);
+                    window.env_steps += u64::from(header.steps_len);
                     taken += 1;
                 }
                 None => {
@@ -216,7 +259,8 @@ impl Taker {
                 }
             }
         }
-        Ok((env_steps, start.elapsed().as_secs_f64()))
+        window.seconds = start.elapsed().as_secs_f64();
+        Ok(window)
     }
 
     /// Takes the next segment and does what a learner does first: check it and follow its worker's
@@ -231,12 +275,14 @@ impl Taker {
         if !received {
             return Ok(None);
         }
+        self.discrepancies.received += 1;
         let mut header = self.segment.header;
         let sound = check(&header, &self.segment.block, &self.expected);
         match sound.and_then(|()| self.inbox.settle(&header, &self.segment.block)) {
             Ok(lost) => self.discrepancies.lost += lost,
-            Err(_) => {
+            Err(why) => {
                 self.discrepancies.rejected += 1;
+                self.discrepancies.duplicate += u64::from(why == Rejection::Duplicate);
                 header.steps_len = 0;
             }
         }
@@ -247,11 +293,14 @@ impl Taker {
     }
 
     fn acknowledge_in_time(&mut self) -> Result<(), TransportError> {
-        if self.acknowledged.elapsed() < ACKNOWLEDGEMENT_INTERVAL {
+        let early = !self.inbox.owes_acknowledgement();
+        if early && self.acknowledged.elapsed() < ACKNOWLEDGEMENT_INTERVAL {
             return Ok(());
         }
         self.acknowledged = Instant::now();
-        self.end.acknowledgements.acknowledge(self.inbox.settled())
+        // Without a log nothing can fail.
+        let Ok(marks) = self.inbox.acknowledge() else { return Ok(()) };
+        self.end.acknowledgements.acknowledge(marks)
     }
 
     fn maintain_in_time(&mut self) -> Result<(), TransportError> {

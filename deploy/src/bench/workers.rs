@@ -1,6 +1,5 @@
 //! The workers of a run, with a sink in the learner's place.
 
-use std::sync::mpsc::RecvTimeoutError;
 use std::time::{Duration, Instant};
 
 use anyhow::{Context, anyhow, bail, ensure};
@@ -15,15 +14,12 @@ use dmprl_shared::transport::shared_memory::{Domain, serve};
 
 use super::child::LineChild;
 use super::figures::Round;
-use super::sink::{Answer, Discrepancies, From, Request, Sink, Window};
+use super::sink::{Answer, Discrepancies, From, Request, Sink, Window, show_warning};
 use super::watch::Watch;
 use crate::control::{Command, Report};
 use crate::launch::{Launcher, Process, TimeLimits};
 use crate::roles::{Setup, plan};
-use crate::terminal::say;
 
-/// How late a worker's death may be seen.
-const LOOK: Duration = Duration::from_millis(20);
 /// Beyond what was asked for, a measurement may take so much longer.
 const MEASURE_SLACK: Duration = Duration::from_secs(30);
 
@@ -166,27 +162,10 @@ impl Workers {
 
     /// Asks the sink, and looks after the workers until it answers.
     fn ask(&mut self, request: Request, watch: &Watch, limit: Duration) -> anyhow::Result<Answer> {
-        self.sink.ask(request);
-        let deadline = Instant::now() + limit;
-        loop {
-            watch.check()?;
-            for child in &mut self.children {
-                let said = child.said()?;
-                said.iter().for_each(|line| show_warning(child.name(), line));
-            }
-            match self.sink.answers().recv_timeout(LOOK) {
-                Ok(answer) => {
-                    let (answer, discrepancies) = answer.context("the transport failed")?;
-                    self.discrepancies = discrepancies;
-                    return Ok(answer);
-                }
-                Err(RecvTimeoutError::Disconnected) => bail!("the sink has ended"),
-                Err(RecvTimeoutError::Timeout) if Instant::now() >= deadline => {
-                    bail!("{request:?}: the workers delivered too little within {limit:?}")
-                }
-                Err(RecvTimeoutError::Timeout) => {}
-            }
-        }
+        let (answer, discrepancies) =
+            self.sink.answer(request, &mut self.children, watch, limit)?;
+        self.discrepancies = discrepancies;
+        Ok(answer)
     }
 }
 
@@ -201,12 +180,6 @@ fn environment(child: &mut LineChild, watch: &Watch, limit: Duration) -> anyhow:
             Ok(_) => show_warning(child.name(), &line),
             Err(_) => return Err(anyhow!("{} said what is no report: {line}", child.name())),
         }
-    }
-}
-
-fn show_warning(name: &str, line: &str) {
-    if let Ok(Report::Warning { message }) = serde_json::from_str(line) {
-        say(&format!("{name}: {message}"));
     }
 }
 

@@ -7,6 +7,7 @@ use clap::{Args, Subcommand};
 use dmprl_shared::config::Limits;
 
 use super::bench_learner::{self, LearnerArgs};
+use super::bench_transport::{self, TransportArgs};
 use super::configuration::{merge, refuse};
 use super::configured::{ConfiguredArgs, make_absolute};
 use super::{cores, emit, prepare_python, this_program};
@@ -24,6 +25,7 @@ const HELP: &str = "\
 EXAMPLES
   dmprl bench rollout --task reacher
   dmprl bench learner --task pusher --threads 1
+  dmprl bench transport
   dmprl bench learner --help";
 
 const ROLLOUT_HELP: &str = "\
@@ -65,6 +67,8 @@ enum Bench {
     Learner(Box<LearnerArgs>),
     /// Environment steps a second of the rollout workers, and of what else could make them.
     Rollout(Box<RolloutArgs>),
+    /// Segments a second from workers to learner, beside pipes, sockets and queues of Python.
+    Transport(TransportArgs),
 }
 
 /// Arguments of `dmprl bench rollout`.
@@ -103,6 +107,7 @@ pub(super) fn run(args: &BenchArgs) -> anyhow::Result<Outcome> {
     match &args.bench {
         Bench::Learner(args) => bench_learner::run(args),
         Bench::Rollout(args) => rollout(args),
+        Bench::Transport(args) => bench_transport::run(args),
     }
 }
 

@@ -2,6 +2,7 @@
 
 mod bench;
 mod bench_learner;
+mod bench_transport;
 mod clean;
 mod configuration;
 mod configured;
@@ -18,6 +19,7 @@ use std::process::ExitCode;
 use anyhow::Context;
 use clap::{Parser, Subcommand};
 
+use crate::bench::{TransportWorkerArgs, transport_worker};
 use crate::failure::{Outcome, exit_code, render};
 use crate::roles::{self, ActorArgs, EvaluatorArgs, LearnerArgs};
 use crate::terminal::say;
@@ -74,6 +76,9 @@ enum Command {
     /// The process that evaluates; started by train and eval.
     #[command(hide = true)]
     Evaluator(EvaluatorArgs),
+    /// A process that only sends segments; started by bench transport.
+    #[command(hide = true)]
+    TransportWorker(TransportWorkerArgs),
 }
 
 fn long_help() -> String {
@@ -104,6 +109,7 @@ fn run(command: Command) -> anyhow::Result<Outcome> {
         Command::Learner(args) => roles::learner(&args).map(|()| Outcome::Done),
         Command::Actor(args) => roles::actor(&args).map(|()| Outcome::Done),
         Command::Evaluator(args) => roles::evaluator(&args).map(|()| Outcome::Done),
+        Command::TransportWorker(args) => transport_worker(&args).map(|()| Outcome::Done),
     }
 }
 

@@ -26,7 +26,7 @@ use crate::control::Report;
 const IDLE: Duration = Duration::from_micros(100);
 /// Between two cleanings of what dead workers left.
 const MAINTENANCE_INTERVAL: Duration = Duration::from_millis(250);
-/// Between two acknowledgements: `delivery.unacknowledged_segments` covers what comes in meanwhile.
+/// Between two acknowledgements, at the latest.
 const ACKNOWLEDGEMENT_INTERVAL: Duration = Duration::from_millis(10);
 /// Environment steps after which the first segment is reported, on its own for the start-up time.
 const FIRST: u64 = 1;
@@ -205,7 +205,8 @@ impl Server<'_> {
                 first = u64::MAX;
                 let _ = control.send(&Report::FirstSegment);
             }
-            if acknowledged.elapsed() >= ACKNOWLEDGEMENT_INTERVAL {
+            let owed = self.session.learner.inbox.owes_acknowledgement();
+            if owed || acknowledged.elapsed() >= ACKNOWLEDGEMENT_INTERVAL {
                 if let Some(marks) = recorder.acknowledge(&mut self.session.learner) {
                     self.acknowledgements.acknowledge(marks)?;
                 }

@@ -8,6 +8,7 @@
 mod actor;
 mod arguments;
 mod control_pipe;
+mod delivery;
 #[cfg(feature = "python")]
 mod environments;
 #[cfg(feature = "python")]
@@ -20,6 +21,7 @@ mod setup;
 
 pub use arguments::{ActorArgs, EvaluatorArgs, LearnerArgs};
 pub use control_pipe::{ControlPipe, ORPHAN_LIMIT, ORPHANED_LEARNER_LIMIT};
+pub(crate) use delivery::{Delivery, Stopped, attach_within};
 pub(crate) use learner::plan;
 pub(crate) use setup::Setup;
 

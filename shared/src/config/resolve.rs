@@ -19,7 +19,8 @@ const ENVS_PER_WORKER_MAX: usize = 4_096;
 const SEGMENT_STEPS_MAX: usize = 255;
 const HINDSIGHT_COPIES_MAX: usize = 64;
 const HIDDEN_MAX: usize = 65_536;
-/// A worker of 100 000 segments a second, and acknowledgements a hundred times a second.
+/// A worker of 100 000 segments a second, and acknowledgements a hundred times a second; a learner
+/// that settles more acknowledges sooner.
 const SEGMENTS_UNTIL_ACKNOWLEDGED: usize = 1_024;
 const UNACKNOWLEDGED_MAX: usize = 1 << 20;
 /// Room for some segments of any size.

@@ -10,6 +10,7 @@
 
 mod bench;
 mod bench_learner;
+mod bench_transport;
 mod deaths;
 mod determinism;
 mod endings;

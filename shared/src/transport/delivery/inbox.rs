@@ -3,10 +3,16 @@
 use super::{LogError, Mark, SegmentLog};
 use crate::segment::{Rejection, SegmentHeader};
 
+/// Acknowledging costs far less than settling so many. A quarter of what an outbox has beyond its
+/// queue by default, so that no worker runs out of room before it hears of them.
+const ACKNOWLEDGED_TOGETHER: u64 = 256;
+
 /// How far each worker's segments have come, and the log of those that no checkpoint holds yet.
 #[derive(Debug)]
 pub struct Inbox {
     settled: Vec<Mark>,
+    /// Settled since the last acknowledgement.
+    unacknowledged: u64,
     /// At level `log`: every segment is appended as it is settled.
     log: Option<SegmentLog>,
 }
@@ -15,7 +21,7 @@ impl Inbox {
     /// Nothing has come of any worker, and nothing is logged.
     #[must_use]
     pub fn new(worker_count: usize) -> Self {
-        Self { settled: vec![Mark::default(); worker_count], log: None }
+        Self { settled: vec![Mark::default(); worker_count], unacknowledged: 0, log: None }
     }
 
     /// Goes on from a checkpoint's marks. One without has seen no worker that lives.
@@ -62,6 +68,7 @@ impl Inbox {
         let mark = Mark { incarnation: header.incarnation, sequence: header.sequence };
         let before = if mark.incarnation == last.incarnation { last.sequence } else { 0 };
         *last = mark;
+        self.unacknowledged += 1;
         if let Some(log) = &mut self.log {
             log.append(header, block);
         }
@@ -73,6 +80,8 @@ impl Inbox {
     /// # Errors
     /// If they cannot be written: then nothing new may be acknowledged, and workers wait.
     pub fn acknowledge(&mut self) -> Result<&[Mark], LogError> {
+        // First: what cannot be written now is tried again in time, not at every turn.
+        self.unacknowledged = 0;
         if let Some(log) = &mut self.log {
             log.write()?;
         }
@@ -83,6 +92,12 @@ impl Inbox {
     #[must_use]
     pub fn logged(&self) -> u64 {
         self.log.as_ref().map_or(0, SegmentLog::logged)
+    }
+
+    /// Whether so much was settled that workers should hear of it now, and not in time.
+    #[must_use]
+    pub fn owes_acknowledgement(&self) -> bool {
+        self.unacknowledged >= ACKNOWLEDGED_TOGETHER
     }
 
     /// A checkpoint is on disk, of the moment in which so much had been logged.

@@ -91,6 +91,12 @@ impl Outbox {
         }
     }
 
+    /// Whose it is.
+    #[must_use]
+    pub fn worker_id(&self) -> u32 {
+        self.worker_id
+    }
+
     /// What the worker has done so far.
     #[must_use]
     pub fn sent(&self) -> Sent {

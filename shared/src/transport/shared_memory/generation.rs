@@ -15,6 +15,7 @@ use std::os::unix::fs::{DirBuilderExt, FileExt, OpenOptionsExt};
 use std::path::{Path, PathBuf};
 
 use iceoryx2::node::Node;
+use memmap2::{Mmap, MmapOptions};
 
 use super::channel::Disconnected;
 use super::domain::Domain;
@@ -91,11 +92,39 @@ fn read_number(file: &File) -> Option<u64> {
     Some(u64::from_le_bytes(bytes))
 }
 
+/// The number of the newest generation, mapped: it is looked at before every segment, and a system
+/// call would take as long as all the rest of sending one.
+#[derive(Debug)]
+struct NewestNumber(Mmap);
+
+impl NewestNumber {
+    /// Of a domain that a learner has served.
+    fn open(domain: &Path) -> Result<Self, TransportError> {
+        let operation = "looking for a learner in";
+        let file = File::open(domain.join(NUMBER_FILE));
+        let file = file.map_err(refused(operation, domain.display()))?;
+        // Before the first announcement there is nothing to map.
+        let served = read_number(&file).ok_or("none has served it yet");
+        served.map_err(refused(operation, domain.display()))?;
+        // SAFETY: the file has these bytes and no process of the run shortens it, nor can another
+        // user, so none of them goes away below the map; that they change is looked at in `get`.
+        let map = unsafe { MmapOptions::new().len(size_of::<u64>()).map(&file) };
+        Ok(Self(map.map_err(refused("mapping a file of", domain.display()))?))
+    }
+
+    fn get(&self) -> u64 {
+        // SAFETY: a map begins at a page, so eight bytes at its start are aligned, and every
+        // pattern is a number. Volatile, because a learner writes them: with one store, as here is
+        // one load.
+        u64::from_le(unsafe { self.0.as_ptr().cast::<u64>().read_volatile() })
+    }
+}
+
 /// A worker's port `P` to the newest generation.
 #[derive(Debug)]
 pub(super) struct Membership<P> {
     domain: PathBuf,
-    number_file: File,
+    newest: NewestNumber,
     number: u64,
     /// `None` between two generations.
     port: Option<P>,
@@ -110,11 +139,10 @@ impl<P> Membership<P> {
         make: impl FnOnce(&Node<PrivateIpc>, &Disconnected) -> Result<P, TransportError>,
     ) -> Result<Self, TransportError> {
         let domain = domain.path().to_owned();
-        let number_file = File::open(domain.join(NUMBER_FILE))
-            .map_err(refused("looking for a learner in", domain.display()))?;
+        let newest = NewestNumber::open(&domain)?;
         let disconnected = Disconnected::default();
         let mut membership =
-            Self { domain, number_file, number: 0, port: None, disconnected, failures: 0 };
+            Self { domain, newest, number: 0, port: None, disconnected, failures: 0 };
         membership.join(make)?;
         Ok(membership)
     }
@@ -132,9 +160,8 @@ impl<P> Membership<P> {
         &mut self,
         make: impl FnOnce(&Node<PrivateIpc>, &Disconnected) -> Result<P, TransportError>,
     ) -> Result<bool, TransportError> {
-        // One read of eight bytes, so that nothing is delivered to a dead learner's queue while
-        // the next learner waits.
-        let is_current = read_number(&self.number_file) == Some(self.number);
+        // So that nothing is delivered to a dead learner's queue while the next learner waits.
+        let is_current = self.newest.get() == self.number;
         if is_current && self.port.is_some() && !self.disconnected.is_set() {
             return Ok(false);
         }
@@ -154,9 +181,7 @@ impl<P> Membership<P> {
         // First, because the slot has one place only.
         self.port = None;
         self.disconnected.clear();
-        let missing = refused("looking for a learner in", self.domain.display());
-        self.number =
-            read_number(&self.number_file).ok_or("none has served it yet").map_err(missing)?;
+        self.number = self.newest.get();
         let node = service::join(&root(&self.domain, self.number))?;
         self.port = Some(make(&node, &self.disconnected)?);
         Ok(())

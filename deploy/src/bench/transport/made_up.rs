@@ -1,0 +1,119 @@
+//! Segments that nobody has lived, of a given size in bytes.
+
+use dmprl_shared::segment::{
+    ActionBounds, Expected, LAYOUT_VERSION, Segment, SegmentHeader, SegmentLayout, block_checksum,
+};
+use dmprl_shared::transport::shared_memory::Plan;
+
+/// What is measured [bytes]: a segment's header and block.
+pub(super) const SIZES: [Size; 2] =
+    [Size { bytes: 1_024, layout: layout(36, 3) }, Size { bytes: 10_240, layout: layout(405, 21) }];
+/// Segments that a worker's queue holds, and its outbox too: a worker from whom nobody takes has
+/// both full.
+pub(super) const QUEUE_SEGMENTS: usize = 512;
+
+const RUN_ID: u64 = 1;
+const ARCHITECTURE_HASH: u64 = 1;
+/// Between two numbers; irrational to the sine's period.
+const STRIDE: f32 = 0.37;
+/// Larger whole numbers have no f32.
+const STAMP_MAX: u64 = 1 << 24;
+
+/// A segment's size and what it is made of.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Size {
+    pub(super) bytes: usize,
+    pub(super) layout: SegmentLayout,
+}
+
+const fn layout(observation_len: usize, action_len: usize) -> SegmentLayout {
+    SegmentLayout { segment_steps: 5, observation_len, action_len }
+}
+
+/// The size of so many bytes, if it is one of those that are measured.
+pub(super) fn size_of_bytes(bytes: usize) -> Option<Size> {
+    SIZES.into_iter().find(|size| size.bytes == bytes)
+}
+
+impl Size {
+    /// What the learner's place and the workers agree on.
+    pub(super) fn plan(self, workers: usize) -> Plan {
+        Plan {
+            run_id: RUN_ID,
+            architecture_hash: ARCHITECTURE_HASH,
+            layout: self.layout,
+            worker_count: workers,
+            queue_segments: QUEUE_SEGMENTS,
+            parameters_len: 1,
+        }
+    }
+
+    /// What a segment is checked against.
+    pub(super) fn expected(self, workers: u32) -> Expected {
+        Expected {
+            run_id: RUN_ID,
+            architecture_hash: ARCHITECTURE_HASH,
+            layout: self.layout,
+            worker_count: workers,
+            env_count: 1,
+            action_bounds: ActionBounds::Unit,
+        }
+    }
+}
+
+/// The segments of one worker, one after the other.
+#[derive(Debug)]
+pub(super) struct MadeUp(Segment);
+
+impl MadeUp {
+    /// Before the first.
+    pub(super) fn new(layout: SegmentLayout, worker_id: u32) -> Self {
+        let mut segment = Segment::zeroed(layout);
+        for (index, value) in segment.block.iter_mut().enumerate() {
+            *value = (index as f32 * STRIDE).sin();
+        }
+        segment.header = SegmentHeader {
+            layout_version: LAYOUT_VERSION,
+            run_id: RUN_ID,
+            architecture_hash: ARCHITECTURE_HASH,
+            worker_id,
+            steps_len: layout.segment_steps as u32,
+            segment_steps: layout.segment_steps as u32,
+            observation_len: layout.observation_len as u32,
+            action_len: layout.action_len as u32,
+            ..SegmentHeader::default()
+        };
+        Self(segment)
+    }
+
+    /// The next: numbered, another than the one before, and with its checksum as a worker's has.
+    pub(super) fn next(&mut self) -> &Segment {
+        let Segment { header, block } = &mut self.0;
+        header.sequence += 1;
+        block[0] = (header.sequence % STAMP_MAX) as f32;
+        header.checksum = block_checksum(block);
+        &self.0
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use dmprl_shared::segment::check;
+
+    use super::*;
+
+    #[test]
+    fn a_made_up_segment_has_its_size_and_is_sound() {
+        for size in SIZES {
+            let mut made_up = MadeUp::new(size.layout, 1);
+            let checksums = [1, 2].map(|sequence| {
+                let Segment { header, block } = made_up.next();
+                assert_eq!(size_of_val(header) + size_of_val(&block[..]), size.bytes);
+                assert_eq!(header.sequence, sequence);
+                assert_eq!(check(header, block, &size.expected(2)), Ok(()));
+                header.checksum
+            });
+            assert_ne!(checksums[0], checksums[1]);
+        }
+    }
+}

@@ -1,0 +1,184 @@
+//! `dmprl bench transport`: segments a second through shared memory, and through other things.
+//!
+//! Processes of this program only send (`worker`, `made_up`); the learner's place is taken by the
+//! sink that `bench rollout` has, which checks, settles and acknowledges (`ours`). Beside them run
+//! pipes and sockets between the same processes (`streams`) and queues between processes in Python
+//! (`python`). In every round each runs once for the same time while the others sleep on what is
+//! full; medians over the rounds count (`figures`). At the end nobody takes from anybody, and what
+//! the workers still cost is measured.
+
+mod figures;
+mod made_up;
+mod ours;
+mod python;
+mod streams;
+mod worker;
+
+use std::path::PathBuf;
+use std::process::Command;
+use std::time::{Duration, Instant};
+
+use anyhow::Context;
+
+use super::watch::{Interrupted, Watch};
+use crate::run_directory::Manifest;
+use crate::terminal::RoundsProgress;
+
+pub use figures::Figures;
+pub use worker::{TransportWorkerArgs, transport_worker};
+
+use figures::OURS;
+use made_up::{SIZES, Size};
+use ours::Ours;
+use python::PythonPeer;
+use streams::{StreamKind, StreamPeer};
+
+/// A worker whose queue has just filled waits for longer and longer, up to this from then on.
+const BLOCKED_SETTLE: Duration = Duration::from_millis(200);
+/// For so long the processor time of blocked workers is measured.
+const BLOCKED: Duration = Duration::from_millis(1_500);
+/// How late an interrupt may be seen meanwhile.
+const BLOCKED_LOOK: Duration = Duration::from_millis(20);
+
+/// What to measure.
+pub struct TransportBench {
+    /// The program that plays the workers: this one.
+    pub program: PathBuf,
+    /// Processes that send through shared memory; a peer has one.
+    pub workers: u32,
+    /// The interpreter of the peers in Python.
+    pub peer_python: PathBuf,
+    /// The folder with the Python package.
+    pub package_path: PathBuf,
+    /// How often each is measured.
+    pub rounds: usize,
+    /// How long each time.
+    pub duration: Duration,
+}
+
+/// Measures; none when the user interrupted it. Leaves no process and no file behind.
+///
+/// # Errors
+/// A worker or a peer could not be started or has died.
+pub fn transport(bench: &TransportBench) -> anyhow::Result<Option<Figures>> {
+    match measure(bench) {
+        Err(error) if error.is::<Interrupted>() => Ok(None),
+        result => result.map(Some),
+    }
+}
+
+fn measure(bench: &TransportBench) -> anyhow::Result<Figures> {
+    let watch = Watch::start()?;
+    let folder = tempfile::Builder::new().prefix("dmprl-bench-").tempdir();
+    let folder = folder.context("cannot make a folder for logs and sockets")?;
+    let manifest = Manifest::new(None)?;
+    let token = format!("{}-{}", &manifest.run_id[..8], std::process::id());
+    let progress = RoundsProgress::new(bench.rounds);
+    progress.preparing("starting workers and what they are compared with");
+    let mut figures = Figures::new(bench, manifest.machine);
+    let place = (folder.path(), &watch);
+    // All at once: reading Python's packages takes longest.
+    let mut pythons = Vec::new();
+    for size in SIZES {
+        for name in python::NAMES {
+            match PythonPeer::start(name, size, bench, folder.path()) {
+                Ok(peer) => pythons.push((size, peer)),
+                // Such as a --peer-python that is no program.
+                Err(error) => figures.note(name, &format!("{error:#}")),
+            }
+        }
+    }
+    let mut sizes = Vec::new();
+    for (number, size) in SIZES.into_iter().enumerate() {
+        let command = || {
+            let mut command = Command::new(&bench.program);
+            command.args(["transport-worker", "--segment-bytes", &size.bytes.to_string()]);
+            command
+        };
+        let token = format!("{number}{token}");
+        let ours = Ours::start(size, (bench.workers, &token), &command, place)?;
+        let start = |kind| StreamPeer::start(kind, size, command(), place);
+        let streams = StreamKind::ALL.map(start).into_iter().collect::<anyhow::Result<Vec<_>>>()?;
+        sizes.push(Contest { ours, streams, pythons: Vec::new() });
+    }
+    for kind in StreamKind::ALL {
+        figures.note(kind.name(), kind.about());
+    }
+    for (size, mut peer) in pythons {
+        let ready = peer.ready(&watch)?;
+        figures.note(peer.name, ready.as_ref().unwrap_or_else(|why| why));
+        let contest = sizes.iter_mut().find(|contest| contest.ours.size.bytes == size.bytes);
+        if let (Ok(_), Some(contest)) = (ready, contest) {
+            contest.pythons.push(peer);
+        }
+    }
+    for round in 0..bench.rounds {
+        progress.round(round);
+        for contest in &mut sizes {
+            contest.round(&watch, bench.duration, &progress, &mut figures)?;
+        }
+    }
+    progress.measuring("blocked workers");
+    figures.blocked_cpu_fraction = blocked(&sizes, &watch)?;
+    for contest in sizes {
+        let bytes = contest.ours.size.bytes;
+        figures.discrepancies.push((bytes, contest.ours.finish(&watch)?));
+    }
+    Ok(figures)
+}
+
+/// Everyone who carries segments of one size.
+struct Contest {
+    ours: Ours,
+    streams: Vec<StreamPeer>,
+    pythons: Vec<PythonPeer>,
+}
+
+impl Contest {
+    fn round(
+        &mut self,
+        watch: &Watch,
+        duration: Duration,
+        progress: &RoundsProgress,
+        figures: &mut Figures,
+    ) -> anyhow::Result<()> {
+        let Size { bytes, .. } = self.ours.size;
+        for peer in &mut self.pythons {
+            progress.measuring(peer.name);
+            figures.add(bytes, peer.name, peer.measure(watch, duration)?);
+        }
+        for peer in &mut self.streams {
+            progress.measuring(peer.kind.name());
+            figures.add(bytes, peer.kind.name(), peer.measure(watch, duration)?);
+        }
+        progress.measuring(OURS);
+        let window = self.ours.measure(watch, duration)?;
+        figures.add(bytes, OURS, window.segments as f64 / window.seconds);
+        figures.add_sink_share(bytes, window.cpu_s / window.seconds);
+        Ok(())
+    }
+}
+
+/// Share of a core that the busiest worker uses while nobody takes from any.
+fn blocked(sizes: &[Contest], watch: &Watch) -> anyhow::Result<Option<f64>> {
+    wait(watch, BLOCKED_SETTLE)?;
+    let cpu_s = || -> Option<Vec<f64>> {
+        let each: Option<Vec<_>> = sizes.iter().map(|contest| contest.ours.cpu_s()).collect();
+        each.map(|each| each.concat())
+    };
+    let (start, before) = (Instant::now(), cpu_s());
+    wait(watch, BLOCKED)?;
+    let (seconds, after) = (start.elapsed().as_secs_f64(), cpu_s());
+    let Some((before, after)) = before.zip(after) else { return Ok(None) };
+    let shares = before.iter().zip(&after).map(|(before, after)| (after - before) / seconds);
+    Ok(shares.reduce(f64::max))
+}
+
+fn wait(watch: &Watch, duration: Duration) -> anyhow::Result<()> {
+    let end = Instant::now() + duration;
+    while Instant::now() < end {
+        watch.check()?;
+        std::thread::sleep(BLOCKED_LOOK);
+    }
+    Ok(())
+}

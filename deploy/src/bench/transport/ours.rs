@@ -1,0 +1,117 @@
+//! Our own transport: processes that only send, and the sink in the learner's place.
+
+use std::fs::File;
+use std::path::Path;
+use std::process::Command;
+use std::time::{Duration, Instant};
+
+use anyhow::{Context, anyhow, bail};
+use dmprl_shared::transport::delivery::Sent;
+use dmprl_shared::transport::shared_memory::{Domain, serve};
+
+use super::made_up::Size;
+use crate::bench::child::LineChild;
+use crate::bench::sink::{Answer, Discrepancies, From, Request, Sink, Window, show_warning};
+use crate::bench::watch::Watch;
+use crate::control::Report;
+use crate::launch::create_domain;
+
+/// From the start of the processes to the first segment of each.
+const START: Duration = Duration::from_secs(60);
+/// Beyond what was asked for, a measurement may take so much longer.
+const MEASURE_SLACK: Duration = Duration::from_secs(30);
+/// A worker that is stopped answers within milliseconds; one that waits, at its next look.
+const STOP: Duration = Duration::from_secs(30);
+/// What still lies in the queues is taken in less.
+const DRAIN: Duration = Duration::from_millis(100);
+
+/// Running workers of one size, each with a full queue between two measurements.
+pub(super) struct Ours {
+    pub(super) size: Size,
+    children: Vec<LineChild>,
+    sink: Sink,
+    discrepancies: Discrepancies,
+    /// Last: removed when nobody is left who uses it.
+    _domain: Domain,
+}
+
+impl Ours {
+    /// Starts the workers; `command` is a `transport-worker` of this size without its route.
+    pub(super) fn start(
+        size: Size,
+        (workers, token): (u32, &str),
+        command: &dyn Fn() -> Command,
+        (folder, watch): (&Path, &Watch),
+    ) -> anyhow::Result<Self> {
+        let domain = create_domain(token)?;
+        let plan = size.plan(workers as usize);
+        let end = serve(domain.path(), &plan)?;
+        let sink = Sink::start(end, size.expected(workers), plan.queue_segments);
+        let mut children = Vec::new();
+        for index in 0..workers {
+            let name = format!("worker-{index}-{}", size.bytes);
+            let path = folder.join(format!("{name}.log"));
+            let log =
+                File::create(&path).with_context(|| format!("cannot make {}", path.display()))?;
+            let mut command = command();
+            command.args(["--index", &index.to_string(), "--workers", &workers.to_string()]);
+            command.arg("--shared-memory").arg(domain.path()).stderr(log);
+            children.push(LineChild::start(name, command, &path)?);
+        }
+        let discrepancies = Discrepancies::default();
+        let mut ours = Self { size, children, sink, discrepancies, _domain: domain };
+        ours.ask(Request::FirstOfEach, watch, START)?;
+        Ok(ours)
+    }
+
+    /// What all workers together deliver in so much time.
+    pub(super) fn measure(&mut self, watch: &Watch, duration: Duration) -> anyhow::Result<Window> {
+        let request = Request::Measure(duration, From::All);
+        match self.ask(request, watch, duration + MEASURE_SLACK)? {
+            Answer::Measured(window) => Ok(window),
+            Answer::FirstOfEach(_) => bail!("the sink answered another question"),
+        }
+    }
+
+    /// Processor time of each worker so far \[s\], when the system tells it.
+    pub(super) fn cpu_s(&self) -> Option<Vec<f64>> {
+        self.children.iter().map(LineChild::cpu_s_of_all_threads).collect()
+    }
+
+    /// Stops the workers, takes what is left and compares it with what they say they have sent.
+    pub(super) fn finish(mut self, watch: &Watch) -> anyhow::Result<Discrepancies> {
+        let mut sent = 0;
+        for child in &mut self.children {
+            child.say("\"stop\"")?;
+            sent += last_report(child, watch)?.sent;
+        }
+        // They have ended, which is no death any more.
+        self.children.clear();
+        self.ask(Request::Measure(DRAIN, From::All), watch, DRAIN + MEASURE_SLACK)?;
+        let Discrepancies { received, lost, .. } = self.discrepancies;
+        // Missing in the middle of a sequence, or behind its end.
+        let lost = lost.max(sent.saturating_sub(received));
+        Ok(Discrepancies { lost, ..self.discrepancies })
+    }
+
+    fn ask(&mut self, request: Request, watch: &Watch, limit: Duration) -> anyhow::Result<Answer> {
+        let (answer, discrepancies) =
+            self.sink.answer(request, &mut self.children, watch, limit)?;
+        self.discrepancies = discrepancies;
+        Ok(answer)
+    }
+}
+
+/// What a worker says that it has sent, before it ends.
+fn last_report(child: &mut LineChild, watch: &Watch) -> anyhow::Result<Sent> {
+    let deadline = Instant::now() + STOP;
+    loop {
+        let left = deadline.saturating_duration_since(Instant::now());
+        let line = child.next(watch, left, "the last report")?;
+        match serde_json::from_str(&line) {
+            Ok(Report::Sent(sent)) => return Ok(sent),
+            Ok(_) => show_warning(child.name(), &line),
+            Err(_) => return Err(anyhow!("{} said what is no report: {line}", child.name())),
+        }
+    }
+}

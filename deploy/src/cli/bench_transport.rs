@@ -1,0 +1,70 @@
+//! `dmprl bench transport`: from the command line to the benchmark.
+
+use std::path::PathBuf;
+use std::time::Duration;
+
+use clap::Args;
+
+use super::bench::{interpreter, seconds};
+use super::{cores, emit, this_program};
+use crate::bench::{self, TransportBench};
+use crate::failure::Outcome;
+
+const HELP: &str = "\
+For segments of 1024 and of 10240 bytes. In every round each of these runs once for --seconds, the
+others asleep; the median counts.
+  shared_memory          worker processes that only send, by the code of a run's workers: checksum,
+                         outbox, queue, acknowledgements (delivery level `memory`); this process
+                         takes, checks, settles and acknowledges in the learner's place
+  pipe, unix_socket      one such process that writes each segment as a frame; read and checked
+                         here, without acknowledgements
+  multiprocessing_queue  Python's, between two processes; neither checked nor acknowledged
+  zeromq                 the same by pyzmq, PUSH to PULL over ipc://
+`peers` are those of 1024 bytes; each of `sizes` has its own. lost and duplicate are found by the
+sequence numbers and by what the workers say that they have sent. blocked_cpu_fraction is the share
+of a core that a worker uses while nobody takes: queue and outbox are full. What is not to be had is
+null or `absent`, with the reason. Ctrl-C ends it at once and leaves nothing.
+
+EXAMPLES
+  dmprl bench transport
+  dmprl bench transport --workers 2 --rounds 9 --json
+  dmprl bench transport --peer-python /opt/zeromq/bin/python";
+
+/// Arguments of `dmprl bench transport`.
+#[derive(Debug, Args)]
+#[command(after_help = HELP)]
+pub(super) struct TransportArgs {
+    /// Processes that send [default: cores - 1].
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=64))]
+    workers: Option<u32>,
+    /// Python that has pyzmq [default: the one of .venv].
+    #[arg(long, value_name = "PATH")]
+    peer_python: Option<PathBuf>,
+    /// How often each is measured.
+    #[arg(long, value_name = "R", default_value_t = 9,
+          value_parser = clap::value_parser!(u16).range(1..=1000))]
+    rounds: u16,
+    /// How long each time [s].
+    #[arg(long, value_name = "S", default_value_t = 0.4, value_parser = seconds)]
+    seconds: f64,
+    /// Print one JSON object on standard output.
+    #[arg(long)]
+    json: bool,
+}
+
+pub(super) fn run(args: &TransportArgs) -> anyhow::Result<Outcome> {
+    let peer_python = args.peer_python.as_deref().map(interpreter).transpose()?;
+    let root = crate::project::root()?;
+    let default_workers = || u32::try_from(cores().saturating_sub(1)).unwrap_or(1).clamp(1, 64);
+    let bench = TransportBench {
+        program: this_program()?,
+        workers: args.workers.unwrap_or_else(default_workers),
+        peer_python: peer_python.unwrap_or_else(|| root.join(".venv/bin/python")),
+        package_path: root.join("envs_py"),
+        rounds: usize::from(args.rounds),
+        duration: Duration::from_secs_f64(args.seconds),
+    };
+    let Some(figures) = bench::transport(&bench)? else { return Ok(Outcome::Interrupted) };
+    emit(&if args.json { figures.json().to_string() } else { figures.text() })?;
+    Ok(Outcome::Done)
+}

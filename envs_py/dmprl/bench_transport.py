@@ -1,0 +1,167 @@
+"""What ``dmprl bench transport`` compares with in Python: a queue with a process at either end.
+
+``python -m dmprl.bench_transport KIND --segment-bytes N --folder DIR`` writes one JSON object a
+line. The first is ``{"ready": "what it is"}``, or ``{"absent": "why"}`` if it cannot; then each
+line ``run SECONDS`` on standard input is answered by ``{"segments": …, "seconds": …}``. It ends
+with its input, so the death of the program that started it ends it too, and its sender with it.
+
+A segment is ``bytes`` of the size asked for. The sender sends it as often as the queue takes it,
+and sleeps while the queue is full. The receiver looks at its length and at nothing else.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import signal
+import sys
+import threading
+import time
+from collections.abc import Callable
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Any
+
+SETTLE_S = 0.1
+"""Received before the clock starts: what had queued up, and the sender's way back to its pace."""
+QUEUE_SEGMENTS = 512
+"""As the queue that these are compared with."""
+PARENT_LOOK_S = 0.05
+"""Between two looks whether the receiver lives."""
+CONTEXT = get_context("fork")
+"""Others name semaphores, which a killed process leaves behind."""
+RECEIVE_S = 20.0
+"""A sender that sends nothing for so long is dead."""
+
+
+class AbsentError(Exception):
+    """A comparison is not to be had here. The message says why."""
+
+
+def end_with(parent: int) -> None:
+    """Ends this process once its parent is gone, whatever it does at that time."""
+
+    def look() -> None:
+        while os.getppid() == parent:
+            time.sleep(PARENT_LOOK_S)
+        os._exit(1)
+
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    threading.Thread(target=look, daemon=True).start()
+
+
+def started(send: Callable[..., None], target: Any, payload: bytes) -> Any:
+    """The sender's process, which runs."""
+    sender = CONTEXT.Process(target=send, args=(target, payload, os.getpid()), daemon=True)
+    sender.start()
+    return sender
+
+
+def put_all(queue: Any, payload: bytes, parent: int) -> None:
+    """Sends for ever through a queue of ``multiprocessing``."""
+    end_with(parent)
+    while True:
+        queue.put(payload)
+
+
+def push_all(address: str, payload: bytes, parent: int) -> None:
+    """Sends for ever through ZeroMQ."""
+    import zmq
+
+    end_with(parent)
+    socket = zmq.Context().socket(zmq.PUSH)
+    socket.set_hwm(QUEUE_SEGMENTS)
+    socket.connect(address)
+    while True:
+        socket.send(payload)
+
+
+class MultiprocessingQueue:
+    """``multiprocessing.Queue``: pickles into a pipe from a thread of the sender's."""
+
+    about = "multiprocessing.Queue of bytes, as long as ours; neither checked nor acknowledged"
+
+    def __init__(self, segment_bytes: int, folder: Path) -> None:
+        self._queue = CONTEXT.Queue(QUEUE_SEGMENTS)
+        self.sender = started(put_all, self._queue, os.urandom(segment_bytes))
+
+    def receive(self) -> bytes:
+        """The next segment."""
+        return self._queue.get(timeout=RECEIVE_S)
+
+
+class ZeroMq:
+    """A PUSH and a PULL socket over a Unix socket."""
+
+    def __init__(self, segment_bytes: int, folder: Path) -> None:
+        try:
+            import zmq
+        except ImportError as error:
+            words = f"pyzmq is not installed in {sys.executable} ({error})"
+            raise AbsentError(words) from None
+        self.about = (
+            f"ZeroMQ {zmq.zmq_version()} by pyzmq {zmq.__version__}, PUSH to PULL over ipc://, "
+            f"queues as long as ours; neither checked nor acknowledged"
+        )
+        address = f"ipc://{folder}/zeromq-{segment_bytes}"
+        # Before there is a context here, whose threads the fork would lack.
+        self.sender = started(push_all, address, os.urandom(segment_bytes))
+        self._socket = zmq.Context().socket(zmq.PULL)
+        self._socket.set_hwm(QUEUE_SEGMENTS)
+        self._socket.setsockopt(zmq.RCVTIMEO, int(1000 * RECEIVE_S))
+        self._socket.bind(address)
+
+    def receive(self) -> bytes:
+        """The next segment."""
+        return self._socket.recv()
+
+
+KINDS = {"multiprocessing_queue": MultiprocessingQueue, "zeromq": ZeroMq}
+
+
+def run_for(receive: Callable[[], bytes], segment_bytes: int, seconds: float) -> dict:
+    """Receives for so long; the time that it really took."""
+    clock = time.perf_counter
+    end = clock() + SETTLE_S
+    while clock() < end:
+        receive()
+    segments, start = 0, clock()
+    end = start + seconds
+    now = start
+    while now < end:
+        got = len(receive())
+        if got != segment_bytes:
+            raise SystemExit(f"expected {segment_bytes} bytes, got {got}")
+        segments += 1
+        now = clock()
+    return {"segments": segments, "seconds": now - start}
+
+
+def main() -> None:
+    """Speaks the protocol of the module's first lines."""
+    parser = argparse.ArgumentParser(prog="dmprl.bench_transport")
+    parser.add_argument("kind", choices=KINDS)
+    parser.add_argument("--segment-bytes", type=int, required=True)
+    parser.add_argument("--folder", type=Path, required=True)
+    arguments = parser.parse_args()
+    # Ctrl-C reaches the whole process group; the program that reads our lines decides.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        peer = KINDS[arguments.kind](arguments.segment_bytes, arguments.folder)
+        peer.receive()
+    except AbsentError as error:
+        print(json.dumps({"absent": str(error)}), flush=True)
+        return
+    print(json.dumps({"ready": peer.about}), flush=True)
+    for line in sys.stdin:
+        command, _, seconds = line.partition(" ")
+        if command != "run":
+            raise SystemExit(f"expected `run SECONDS`, got {line!r}")
+        measured = run_for(peer.receive, arguments.segment_bytes, float(seconds))
+        print(json.dumps(measured), flush=True)
+    peer.sender.kill()
+
+
+if __name__ == "__main__":
+    main()
