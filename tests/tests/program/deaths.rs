@@ -29,8 +29,9 @@ fn signal_role(place: &Workplace, role: &str, signal: Signal) {
 /// Resumes for some steps and looks at the whole curve.
 fn resume_and_check_curve(place: &Workplace, run: &str, reached: u64) {
     let checkpoint = env_steps_of_checkpoint(run).unwrap();
+    // The newest may have been on its way to the disk, and is then none; the one before is there.
     assert!(
-        checkpoint + CHECKPOINT_INTERVAL >= reached,
+        checkpoint + 2 * CHECKPOINT_INTERVAL >= reached,
         "{checkpoint} of {reached} steps are left"
     );
     let kept: Vec<_> = rows(run, "metrics.jsonl")
