@@ -149,6 +149,14 @@ impl Workplace {
         processes_naming(&self.path(""))
     }
 
+    /// Waits until no process names this folder and what has died has let go of its locks.
+    ///
+    /// # Panics
+    /// When that takes longer than [`PATIENCE`].
+    pub fn until_no_process(&self) {
+        until("no process of the workplace", || self.processes().is_empty() && !any_is_dying());
+    }
+
     /// Refuses a process that names this folder.
     ///
     /// # Panics
@@ -192,6 +200,27 @@ impl Process {
         let fields: Vec<&str> = stat.rsplit_once(')')?.1.split_whitespace().collect();
         Some(fields.get(11)?.parse::<u64>().ok()? + fields.get(12)?.parse::<u64>().ok()?)
     }
+}
+
+/// Whether a thread of any `dmprl` has lost its memory, and so its command line, but not its files.
+fn any_is_dying() -> bool {
+    /// `PF_EXITING` of the kernel's `flags`, field 9 of /proc/PID/stat.
+    const EXITING: u64 = 0x4;
+    let numbered = |path: &Path| {
+        let entries = fs::read_dir(path).into_iter().flatten().flatten();
+        entries
+            .filter(|entry| entry.file_name().as_encoded_bytes().iter().all(u8::is_ascii_digit))
+            .map(|entry| entry.path())
+            .collect::<Vec<_>>()
+    };
+    let threads = |process: PathBuf| numbered(&process.join("task"));
+    numbered(Path::new("/proc")).into_iter().flat_map(threads).any(|thread| {
+        let stat = fs::read_to_string(thread.join("stat")).unwrap_or_default();
+        let Some((name, rest)) = stat.rsplit_once(')') else { return false };
+        let fields: Vec<&str> = rest.split_whitespace().collect();
+        let flags = fields.get(6).and_then(|flags| flags.parse::<u64>().ok()).unwrap_or(0);
+        name.contains("dmprl") && !matches!(fields[0], "Z" | "X") && flags & EXITING != 0
+    })
 }
 
 /// The processes that have `text` on their command line. Zombies have no command line.

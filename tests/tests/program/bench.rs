@@ -2,7 +2,7 @@
 
 use std::process::Command;
 
-use dmprl_tests::program::{Running, Workplace, executable, shared_memory_named, until};
+use dmprl_tests::program::{Running, Workplace, executable, shared_memory_named};
 use rustix::process::Signal;
 use serde_json::Value;
 
@@ -152,5 +152,5 @@ fn a_killed_benchmark_takes_its_processes_with_it() {
     let mut running = bench(&place, "reacher", &["--workers", "2", "--rounds", "1000"]);
     running.until_said("round 2 of 1000");
     running.signal(Signal::KILL);
-    until("no process", || place.processes().is_empty());
+    place.until_no_process();
 }

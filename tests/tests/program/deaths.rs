@@ -4,7 +4,6 @@ use std::path::PathBuf;
 
 use dmprl_tests::program::{
     Running, Workplace, env_steps, env_steps_of, env_steps_of_checkpoint, rows, shared_memory_of,
-    until,
 };
 use rustix::process::Signal;
 
@@ -58,10 +57,10 @@ fn a_run_killed_as_a_whole_goes_on_from_its_checkpoint_beside_a_living_one() {
     let (place, other_place) = (Workplace::new(), Workplace::new());
     let (run, other) = (place.path("run"), other_place.path("other"));
     let running = training(&place, &run, &[]);
+    assert_eq!(shared_memory_of(&run).len(), 1);
     running.signal_group(Signal::KILL);
     assert_eq!(running.wait().status.code(), None);
-    until("no process of the run", || place.processes().is_empty());
-    assert_eq!(shared_memory_of(&run).len(), 1, "SIGKILL leaves its shared memory behind");
+    place.until_no_process();
 
     // Any next start removes what the dead run left, and nothing of a living one.
     let mut living = training(&other_place, &other, &[]);
@@ -85,7 +84,7 @@ fn when_the_supervisor_is_killed_its_children_end_and_the_learner_leaves_a_check
     running.signal(Signal::KILL);
     let reached = env_steps_of(&run).unwrap();
     running.wait();
-    until("no process of the run", || place.processes().is_empty());
+    place.until_no_process();
     let checkpoint = env_steps_of_checkpoint(&run).unwrap();
     assert!(checkpoint >= reached, "a checkpoint at {checkpoint}, metrics up to {reached}");
     resume_and_check_curve(&place, &run, reached);

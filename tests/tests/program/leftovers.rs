@@ -3,7 +3,7 @@
 use std::fs;
 use std::path::{Path, PathBuf};
 
-use dmprl_tests::program::{Finished, Running, Workplace, shared_memory_of, until};
+use dmprl_tests::program::{Finished, Running, Workplace, shared_memory_of};
 use rustix::process::Signal;
 
 use crate::{ENDLESS, train};
@@ -33,7 +33,7 @@ fn clean_removes_what_a_killed_run_left_and_nothing_of_a_living_one() {
     assert_eq!((dead.len(), alive.len()), (1, 1));
     killed.signal_group(Signal::KILL);
     drop(killed);
-    until("no process of the run", || place.processes().is_empty());
+    place.until_no_process();
 
     let listed = place.run(&["clean", "--dry-run", "--json"]).with_status(0);
     // Unless the start of another test was faster, it is still there.
@@ -68,7 +68,7 @@ fn clean_leaves_the_learner_of_a_killed_supervisor_its_shared_memory() {
     assert!(!names(&removed, &domain[0]), "{}", removed.printed);
     assert_eq!(shared_memory_of(&run), domain);
     learner.signal(Signal::CONT);
-    until("no process of the run", || place.processes().is_empty());
+    place.until_no_process();
     place.run(&["clean"]).with_status(0);
     assert_eq!(shared_memory_of(&run), Vec::<PathBuf>::new());
 }

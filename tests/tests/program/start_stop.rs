@@ -1,6 +1,6 @@
 //! Many starts and stops in a row leave no process and no byte behind.
 
-use dmprl_tests::program::{Workplace, shared_memory_of, until};
+use dmprl_tests::program::{Workplace, shared_memory_of};
 use rustix::process::Signal;
 
 use crate::{ENDLESS, train};
@@ -37,7 +37,7 @@ fn starts_and_stops_in_a_row_leave_no_process_and_no_byte() {
         } else {
             running.signal_group(Signal::KILL);
             drop(running);
-            until("no process", || place.processes().is_empty());
+            place.until_no_process();
         }
         runs.push(run);
     }
