@@ -13,7 +13,7 @@ use anyhow::{Context, bail};
 use dmprl_shared::segment::{Expected, HINDSIGHT, Rejection, Segment, SegmentHeader, check};
 use dmprl_shared::transport::delivery::Inbox;
 use dmprl_shared::transport::shared_memory::LearnerEnd;
-use dmprl_shared::transport::{ParameterPublisher, SegmentReceiver, TransportError};
+use dmprl_shared::transport::{ParameterPublisher, SegmentReceiver};
 use rustix::time::{ClockId, clock_gettime};
 
 use super::child::LineChild;
@@ -93,14 +93,19 @@ pub(super) struct Discrepancies {
 /// The sink's thread. Dropped, it is stopped and waited for.
 pub(super) struct Sink {
     requests: Option<Sender<Request>>,
-    answers: Receiver<Result<(Answer, Discrepancies), TransportError>>,
+    answers: Receiver<anyhow::Result<(Answer, Discrepancies)>>,
     stop: Arc<AtomicBool>,
     thread: Option<JoinHandle<()>>,
 }
 
 impl Sink {
     /// Begins; nothing is taken before the first request.
-    pub(super) fn start(end: LearnerEnd, expected: Expected, queue_segments: usize) -> Self {
+    pub(super) fn start(
+        end: LearnerEnd,
+        expected: Expected,
+        queue_segments: usize,
+        inbox: Inbox,
+    ) -> Self {
         let (requests, asked) = mpsc::channel();
         let (sender, answers) = mpsc::channel();
         let stop = Arc::new(AtomicBool::new(false));
@@ -109,7 +114,7 @@ impl Sink {
             expected,
             stop: Arc::clone(&stop),
             segment: Segment::zeroed(expected.layout),
-            inbox: Inbox::new(expected.worker_count as usize),
+            inbox,
             discrepancies: Discrepancies::default(),
             maintained: Instant::now(),
             acknowledged: Instant::now(),
@@ -186,7 +191,7 @@ impl Taker {
     fn serve(
         mut self,
         requests: &Receiver<Request>,
-        answers: &Sender<Result<(Answer, Discrepancies), TransportError>>,
+        answers: &Sender<anyhow::Result<(Answer, Discrepancies)>>,
     ) {
         loop {
             let answer = match requests.recv_timeout(MAINTENANCE_INTERVAL) {
@@ -208,7 +213,7 @@ impl Taker {
         }
     }
 
-    fn first_of_each(&mut self) -> Result<Vec<Instant>, TransportError> {
+    fn first_of_each(&mut self) -> anyhow::Result<Vec<Instant>> {
         let mut first: Vec<Option<Instant>> = vec![None; self.expected.worker_count as usize];
         let mut greeted = Instant::now();
         while !self.stop.load(Ordering::Acquire) && first.iter().any(Option::is_none) {
@@ -230,7 +235,7 @@ impl Taker {
         Ok(first.into_iter().flatten().collect())
     }
 
-    fn measure(&mut self, duration: Duration, from: From) -> Result<Window, TransportError> {
+    fn measure(&mut self, duration: Duration, from: From) -> anyhow::Result<Window> {
         self.take_for(SETTLE, from)?;
         let cpu_s = cpu_s();
         let taken = self.take_for(duration, from)?;
@@ -238,7 +243,7 @@ impl Taker {
     }
 
     /// What is taken in so much time, and how much time it really was.
-    fn take_for(&mut self, duration: Duration, from: From) -> Result<Window, TransportError> {
+    fn take_for(&mut self, duration: Duration, from: From) -> anyhow::Result<Window> {
         let start = Instant::now();
         let (mut window, mut taken) = (Window::default(), 0);
         while start.elapsed() < duration && !self.stop.load(Ordering::Acquire) {
@@ -265,7 +270,8 @@ impl Taker {
 
     /// Takes the next segment and does what a learner does first: check it and follow its worker's
     /// sequence. One that is refused, or a copy of steps that were counted, counts no steps.
-    fn take(&mut self, from: From) -> Result<Option<SegmentHeader>, TransportError> {
+    fn take(&mut self, from: From) -> anyhow::Result<Option<SegmentHeader>> {
+        self.make_room()?;
         let Self { end, segment, .. } = self;
         let received = match from {
             From::All => end.segments.try_receive(segment)?,
@@ -292,29 +298,37 @@ impl Taker {
         Ok(Some(header))
     }
 
-    fn acknowledge_in_time(&mut self) -> Result<(), TransportError> {
+    fn acknowledge_in_time(&mut self) -> anyhow::Result<()> {
         let early = !self.inbox.owes_acknowledgement();
         if early && self.acknowledged.elapsed() < ACKNOWLEDGEMENT_INTERVAL {
             return Ok(());
         }
         self.acknowledged = Instant::now();
-        // Without a log nothing can fail.
-        let Ok(marks) = self.inbox.acknowledge() else { return Ok(()) };
-        self.end.acknowledgements.acknowledge(marks)
+        Ok(self.end.acknowledgements.acknowledge(self.inbox.acknowledge()?)?)
     }
 
-    fn maintain_in_time(&mut self) -> Result<(), TransportError> {
+    /// A log that is full is emptied, as by a checkpoint.
+    fn make_room(&mut self) -> anyhow::Result<()> {
+        if self.inbox.is_full() {
+            self.inbox.checkpointed(self.inbox.logged())?;
+        } else if !self.inbox.has_room() {
+            self.inbox.acknowledge()?;
+        }
+        Ok(())
+    }
+
+    fn maintain_in_time(&mut self) -> anyhow::Result<()> {
         if self.maintained.elapsed() < MAINTENANCE_INTERVAL {
             return Ok(());
         }
         self.maintain()
     }
 
-    fn maintain(&mut self) -> Result<(), TransportError> {
+    fn maintain(&mut self) -> anyhow::Result<()> {
         self.maintained = Instant::now();
         SegmentReceiver::maintain(&mut self.end.segments)?;
         ParameterPublisher::maintain(&mut self.end.parameters)?;
-        self.end.acknowledgements.maintain()
+        Ok(self.end.acknowledgements.maintain()?)
     }
 }
 

@@ -10,6 +10,7 @@ use dmprl_shared::seeds;
 use dmprl_shared::segment::Expected;
 use dmprl_shared::spec::EnvSpec;
 use dmprl_shared::transport::ParameterPublisher;
+use dmprl_shared::transport::delivery::Inbox;
 use dmprl_shared::transport::shared_memory::{Domain, serve};
 
 use super::child::LineChild;
@@ -71,7 +72,9 @@ impl Workers {
         };
         let mut end = serve(domain.path(), &plan(&setup, &policy))?;
         end.parameters.publish(&snapshot)?;
-        let sink = Sink::start(end, expected(&setup, &policy)?, setup.config.actors.queue_segments);
+        let expected = expected(&setup, &policy)?;
+        let inbox = Inbox::new(expected.worker_count as usize);
+        let sink = Sink::start(end, expected, setup.config.actors.queue_segments, inbox);
         let mut workers = Self {
             children,
             sink,

@@ -3,7 +3,8 @@
 use std::path::PathBuf;
 use std::time::Duration;
 
-use clap::Args;
+use clap::{Args, ValueEnum};
+use dmprl_shared::config::DeliveryLevel;
 
 use super::bench::{interpreter, seconds};
 use super::{cores, emit, this_program};
@@ -14,8 +15,9 @@ const HELP: &str = "\
 For segments of 1024 and of 10240 bytes. In every round each of these runs once for --seconds, the
 others asleep; the median counts.
   shared_memory          worker processes that only send, by the code of a run's workers: checksum,
-                         outbox, queue, acknowledgements (delivery level `memory`); this process
-                         takes, checks, settles and acknowledges in the learner's place
+                         outbox, queue, acknowledgements; this process takes, checks, settles and
+                         acknowledges in the learner's place, at --level log after it has appended
+                         to a segment log in the folder for temporary files
   pipe, unix_socket      one such process that writes each segment as a frame; read and checked
                          here, without acknowledgements
   multiprocessing_queue  Python's, between two processes; neither checked nor acknowledged
@@ -28,7 +30,17 @@ null or `absent`, with the reason. Ctrl-C ends it at once and leaves nothing.
 EXAMPLES
   dmprl bench transport
   dmprl bench transport --workers 2 --rounds 9 --json
+  dmprl bench transport --level log        # what that level costs
   dmprl bench transport --peer-python /opt/zeromq/bin/python";
+
+/// As `delivery.level`.
+#[derive(Debug, Clone, Copy, ValueEnum)]
+enum Level {
+    /// Acknowledged when it is taken.
+    Memory,
+    /// Acknowledged when it is in the segment log too.
+    Log,
+}
 
 /// Arguments of `dmprl bench transport`.
 #[derive(Debug, Args)]
@@ -37,6 +49,9 @@ pub(super) struct TransportArgs {
     /// Processes that send [default: cores - 1].
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=64))]
     workers: Option<u32>,
+    /// Delivery level of ours.
+    #[arg(long, value_enum, default_value_t = Level::Memory)]
+    level: Level,
     /// Python that has pyzmq [default: the one of .venv].
     #[arg(long, value_name = "PATH")]
     peer_python: Option<PathBuf>,
@@ -59,6 +74,10 @@ pub(super) fn run(args: &TransportArgs) -> anyhow::Result<Outcome> {
     let bench = TransportBench {
         program: this_program()?,
         workers: args.workers.unwrap_or_else(default_workers),
+        level: match args.level {
+            Level::Memory => DeliveryLevel::Memory,
+            Level::Log => DeliveryLevel::Log,
+        },
         peer_python: peer_python.unwrap_or_else(|| root.join(".venv/bin/python")),
         package_path: root.join("envs_py"),
         rounds: usize::from(args.rounds),

@@ -77,6 +77,23 @@ fn nothing_is_lost_and_nothing_comes_twice_whatever_the_size() {
     until_nothing_left(&place, id);
 }
 
+/// The learner's place writes each segment before it is acknowledged.
+#[test]
+fn at_level_log_nothing_is_lost_either_and_no_log_stays() {
+    let place = Workplace::new();
+    let running = bench(&place, &["--workers", "1", "--rounds", "2", "--level", "log", "--json"]);
+    let id = running.id();
+    let json = running.wait().with_status(0).json();
+    assert_eq!(json["level"], "log");
+    for size in json["sizes"].as_array().unwrap() {
+        positive(size, "segments_per_s");
+        for fault in ["lost", "duplicate", "rejected"] {
+            assert_eq!(size[fault], 0, "{json}");
+        }
+    }
+    until_nothing_left(&place, id);
+}
+
 /// The rest is measured all the same.
 #[test]
 fn an_interpreter_that_is_none_makes_its_peers_absent_with_its_last_word() {

@@ -1,5 +1,6 @@
 //! What `dmprl bench transport` reports: for programs one JSON object, for people a table.
 
+use dmprl_shared::config::DeliveryLevel;
 use serde_json::{Map, Value, json};
 
 use super::TransportBench;
@@ -18,6 +19,7 @@ pub(super) const OURS: &str = "shared_memory";
 #[derive(Debug, Clone)]
 pub struct Figures {
     workers: u32,
+    level: DeliveryLevel,
     seconds: f64,
     machine: Machine,
     load_average: Option<f64>,
@@ -37,6 +39,7 @@ impl Figures {
     pub(super) fn new(bench: &TransportBench, machine: Machine) -> Self {
         Self {
             workers: bench.workers,
+            level: bench.level,
             seconds: bench.duration.as_secs_f64(),
             machine,
             load_average: load_average(),
@@ -102,6 +105,7 @@ impl Figures {
             // Of the first size; each size has all of its own.
             "peers": self.each_peer(|name| self.segments_per_s(SIZES[0].bytes, name)),
             "workers": self.workers,
+            "level": self.level,
             "queue_segments": QUEUE_SEGMENTS,
             "seconds": self.seconds,
             "notes": notes,
@@ -141,10 +145,11 @@ impl Figures {
         let rounds = self.rates(SIZES[0].bytes, OURS).len();
         let mut lines = vec![
             format!(
-                "{} worker{} · queues of {QUEUE_SEGMENTS} segments · median of {rounds} rounds \
-                 of {} s",
+                "{} worker{} · level {} · queues of {QUEUE_SEGMENTS} segments · median of \
+                 {rounds} rounds of {} s",
                 self.workers,
                 if self.workers == 1 { "" } else { "s" },
+                format!("{:?}", self.level).to_lowercase(),
                 self.seconds
             ),
             String::new(),
@@ -206,6 +211,7 @@ mod tests {
         let machine = Machine { os: "linux".into(), cpu: None, cores: 2, memory_bytes: None };
         let mut figures = Figures {
             workers: 1,
+            level: DeliveryLevel::Memory,
             seconds: 0.4,
             machine,
             load_average: None,

@@ -19,6 +19,7 @@ use std::process::Command;
 use std::time::{Duration, Instant};
 
 use anyhow::Context;
+use dmprl_shared::config::DeliveryLevel;
 
 use super::watch::{Interrupted, Watch};
 use crate::run_directory::Manifest;
@@ -46,6 +47,8 @@ pub struct TransportBench {
     pub program: PathBuf,
     /// Processes that send through shared memory; a peer has one.
     pub workers: u32,
+    /// When our workers may forget a segment.
+    pub level: DeliveryLevel,
     /// The interpreter of the peers in Python.
     pub peer_python: PathBuf,
     /// The folder with the Python package.
@@ -96,7 +99,7 @@ fn measure(bench: &TransportBench) -> anyhow::Result<Figures> {
             command
         };
         let token = format!("{number}{token}");
-        let ours = Ours::start(size, (bench.workers, &token), &command, place)?;
+        let ours = Ours::start(size, (bench.workers, &token), &command, bench.level, place)?;
         let start = |kind| StreamPeer::start(kind, size, command(), place);
         let streams = StreamKind::ALL.map(start).into_iter().collect::<anyhow::Result<Vec<_>>>()?;
         sizes.push(Contest { ours, streams, pythons: Vec::new() });

@@ -6,7 +6,8 @@ use std::process::Command;
 use std::time::{Duration, Instant};
 
 use anyhow::{Context, anyhow, bail};
-use dmprl_shared::transport::delivery::Sent;
+use dmprl_shared::config::DeliveryLevel;
+use dmprl_shared::transport::delivery::{Inbox, SegmentLog, Sent};
 use dmprl_shared::transport::shared_memory::{Domain, serve};
 
 use super::made_up::Size;
@@ -25,6 +26,9 @@ const STOP: Duration = Duration::from_secs(30);
 /// What still lies in the queues is taken in less.
 const DRAIN: Duration = Duration::from_millis(100);
 
+/// A full log is emptied, as by a checkpoint: a benchmark must not fill the disk.
+const LOG_BYTES_MAX: u64 = 256 << 20;
+
 /// Running workers of one size, each with a full queue between two measurements.
 pub(super) struct Ours {
     pub(super) size: Size,
@@ -41,12 +45,19 @@ impl Ours {
         size: Size,
         (workers, token): (u32, &str),
         command: &dyn Fn() -> Command,
+        level: DeliveryLevel,
         (folder, watch): (&Path, &Watch),
     ) -> anyhow::Result<Self> {
         let domain = create_domain(token)?;
         let plan = size.plan(workers as usize);
         let end = serve(domain.path(), &plan)?;
-        let sink = Sink::start(end, size.expected(workers), plan.queue_segments);
+        let mut inbox = Inbox::new(workers as usize);
+        if level == DeliveryLevel::Log {
+            let path = folder.join(format!("segments-{}.log", size.bytes));
+            let run = (plan.run_id, plan.architecture_hash);
+            inbox.log_to(SegmentLog::open(&path, run, plan.layout, LOG_BYTES_MAX)?);
+        }
+        let sink = Sink::start(end, size.expected(workers), plan.queue_segments, inbox);
         let mut children = Vec::new();
         for index in 0..workers {
             let name = format!("worker-{index}-{}", size.bytes);
