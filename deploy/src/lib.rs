@@ -17,4 +17,5 @@ pub mod project;
 pub mod python_setup;
 pub mod roles;
 pub mod run_directory;
+pub mod sweep;
 pub mod terminal;

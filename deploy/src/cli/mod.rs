@@ -9,6 +9,7 @@ mod configured;
 mod doctor;
 mod eval;
 mod resume;
+mod sweep;
 mod tasks;
 mod train;
 
@@ -18,9 +19,10 @@ use std::process::ExitCode;
 
 use anyhow::Context;
 use clap::{Parser, Subcommand};
+use dmprl_shared::config::ExperimentConfig;
 
 use crate::bench::{TransportWorkerArgs, transport_worker};
-use crate::failure::{Outcome, exit_code, render};
+use crate::failure::{Outcome, exit_code, render, wrong_use};
 use crate::roles::{self, ActorArgs, EvaluatorArgs, LearnerArgs};
 use crate::terminal::say;
 
@@ -59,6 +61,8 @@ enum Command {
     Resume(resume::ResumeArgs),
     /// Evaluate a run's policy without noise.
     Eval(eval::EvalArgs),
+    /// Train many runs from one file, side by side, and go on where it was stopped.
+    Sweep(sweep::SweepArgs),
     /// Measure a part of the system beside what else could do its work.
     Bench(bench::BenchArgs),
     /// List the tasks with a short name.
@@ -97,11 +101,22 @@ pub fn main() -> ExitCode {
     exit_code(&result)
 }
 
+/// What `dmprl train` with these arguments would train.
+fn train_configuration(arguments: &[String]) -> anyhow::Result<ExperimentConfig> {
+    let words = ["dmprl", "train"].into_iter().chain(arguments.iter().map(String::as_str));
+    match Arguments::try_parse_from(words) {
+        Ok(Arguments { command: Command::Train(args) }) => train::configuration(&args),
+        Ok(_) => Err(wrong_use("another command than train")),
+        Err(error) => Err(wrong_use(error.to_string())),
+    }
+}
+
 fn run(command: Command) -> anyhow::Result<Outcome> {
     match command {
         Command::Train(args) => train::run(&args),
         Command::Resume(args) => resume::run(&args),
         Command::Eval(args) => eval::run(&args),
+        Command::Sweep(args) => sweep::run(&args),
         Command::Bench(args) => bench::run(&args),
         Command::Tasks(args) => tasks::run(&args),
         Command::Doctor(args) => doctor::run(&args),

@@ -87,11 +87,17 @@ pub(super) struct TrainArgs {
     no_progress: bool,
 }
 
-pub(super) fn run(args: &TrainArgs) -> anyhow::Result<Outcome> {
+/// What these arguments make of the configuration, checked.
+pub(super) fn configuration(args: &TrainArgs) -> anyhow::Result<ExperimentConfig> {
     let sources = args.configured.sources(&args.task, flags(args)?)?;
     let mut config = merge(&sources)?.resolve(Limits { cores: cores() }).map_err(refuse)?;
     check(&config, args)?;
     make_absolute(&mut config)?;
+    Ok(config)
+}
+
+pub(super) fn run(args: &TrainArgs) -> anyhow::Result<Outcome> {
+    let config = configuration(args)?;
     let spec = task_defaults(&args.task).map(bench::spec_of);
     capacity::check(&config, spec.as_ref())?;
     let init_from = args.init_from.as_deref().map(policy_file).transpose()?;

@@ -24,7 +24,7 @@ pub struct RunLock {
 }
 
 impl RunLock {
-    pub(super) fn take(run: &Path, wait: Duration) -> anyhow::Result<Self> {
+    pub(crate) fn take(run: &Path, wait: Duration) -> anyhow::Result<Self> {
         let path = run.join("lock");
         let mut file = OpenOptions::new()
             .read(true)

@@ -23,6 +23,7 @@ mod leftovers;
 mod refusals;
 mod results;
 mod start_stop;
+mod sweep;
 mod variants;
 
 /// Settings that make a run cheap: small networks, few updates, and every kind of output often.

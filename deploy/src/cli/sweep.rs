@@ -1,0 +1,158 @@
+//! `dmprl sweep`: from a file to many runs.
+
+use std::path::{Path, PathBuf};
+
+use anyhow::{Context, bail};
+use clap::Args;
+use dmprl_shared::config::ExperimentConfig;
+
+use super::{cores, emit, prepare_python, this_program, train_configuration};
+use crate::failure::{Outcome, wrong_use};
+use crate::launch::RESUME_WAIT;
+use crate::run_directory::RunLock;
+use crate::sweep::{Ledger, Plan, PlannedRun, RunState, Sweep, SweepFile, states, sweep};
+use crate::terminal::{grouped, say, shown};
+
+const HELP: &str = "\
+FILE is TOML: every task with every method, at every point of the grid, with every seed.
+  seeds = [1, 2, 3]
+  set = { evaluation.episodes = 20 }      # any configuration key, for every run
+  [[task]]
+  name = \"reacher\"
+  steps = 60_000
+  [[method]]                              # none: the defaults
+  name = \"td3-mlp\"                      # part of the runs' paths
+  label = \"TD3\"                         # in plots and tables
+  algo = \"td3\"
+  policy = \"mlp\"                        # also preset; set, as above
+  [grid]
+  algorithm.batch_size = [128, 256]
+Each run is a `dmprl train` in OUTPUT/TASK/METHOD[/VALUES]/seed-S. Stopped or killed, the same
+command goes on: what has finished is not done again, what was under way goes on from its
+checkpoint. A run that fails costs the others nothing; the next start tries it again.
+Ctrl-C once: the runs write a checkpoint; twice: at once.
+
+EXAMPLES
+  dmprl sweep mine.toml --dry-run    # what it would run, and how far each is
+  dmprl sweep mine.toml --jobs 4";
+
+/// Arguments of `dmprl sweep`.
+#[derive(Debug, Args)]
+#[command(after_help = HELP)]
+pub(super) struct SweepArgs {
+    /// The sweep file.
+    file: PathBuf,
+    /// Where the runs go [default: runs/ and the file's name without .toml].
+    #[arg(long, value_name = "DIR")]
+    output: Option<PathBuf>,
+    /// Runs at once [default: as many as have cores for their workers and the learner's threads].
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u16).range(1..=1024))]
+    jobs: Option<u16>,
+    /// Train nothing, only list the runs and how far each is.
+    #[arg(long)]
+    dry_run: bool,
+    /// Print one JSON object on standard output: each run with its directory and state.
+    #[arg(long)]
+    json: bool,
+}
+
+pub(super) fn run(args: &SweepArgs) -> anyhow::Result<Outcome> {
+    let (file, text) = SweepFile::read(&args.file)?;
+    let plan = Plan::new(&file)?;
+    let output = args.output.clone().map_or_else(|| default_output(&args.file), Ok)?;
+    let runs = configured(plan)?;
+    let jobs = args.jobs.map_or_else(|| default_jobs(&runs), usize::from);
+    let ledger = Ledger::open(&output)?;
+    let mut plan = Sweep { program: this_program()?, output, runs, jobs, ledger };
+    if args.dry_run {
+        let states = states(&plan)?;
+        return report(&plan, &states, args.json).map(|()| Outcome::Done);
+    }
+    std::fs::create_dir_all(&plan.output)
+        .with_context(|| format!("cannot make {}", plan.output.display()))?;
+    plan.output = std::fs::canonicalize(&plan.output)
+        .with_context(|| format!("cannot resolve {}", plan.output.display()))?;
+    // Children inherit it: those of a sweep that was killed write their checkpoints first.
+    let _lock = RunLock::take(&plan.output, RESUME_WAIT)?;
+    plan.ledger = Ledger::open(&plan.output)?;
+    // For the report: what was asked for last.
+    std::fs::write(plan.output.join("sweep.toml"), text).context("cannot write sweep.toml")?;
+    // Once, before several runs want it at the same time.
+    prepare_python()?;
+    finish(plan, args)
+}
+
+fn finish(plan: Sweep, args: &SweepArgs) -> anyhow::Result<Outcome> {
+    let runs = plan.runs.clone();
+    let (output, jobs) = (plan.output.clone(), plan.jobs);
+    say(&format!("{} runs in {}, {jobs} at once", runs.len(), shown(&output)));
+    let ended = sweep(plan)?;
+    let ledger = Ledger::open(&output)?;
+    let shown_plan = Sweep { program: this_program()?, output, runs, jobs, ledger };
+    report(&shown_plan, &ended.states, args.json)?;
+    let again = format!("dmprl sweep {}", args.file.display());
+    if ended.interrupted {
+        say(&format!("go on with: {again}"));
+        return Ok(Outcome::Interrupted);
+    }
+    let failed = |state: &&RunState| matches!(state, RunState::Failed { .. });
+    match ended.states.iter().filter(failed).count() {
+        0 => Ok(Outcome::Done),
+        count => bail!("{count} runs failed, see above; try them again: {again}"),
+    }
+}
+
+/// The configuration of each run; the first mistake in the file is told before anything starts.
+fn configured(plan: Plan) -> anyhow::Result<Vec<(PlannedRun, ExperimentConfig)>> {
+    let configured = plan.runs.into_iter().map(|run| {
+        let config = train_configuration(&run.arguments)
+            .map_err(|error| wrong_use(format!("{}: {error:#}", run.title())))?;
+        Ok((run, config))
+    });
+    configured.collect()
+}
+
+fn default_output(file: &Path) -> anyhow::Result<PathBuf> {
+    let name = file.file_stem().with_context(|| format!("{} has no name", file.display()))?;
+    Ok(Path::new("runs").join(name))
+}
+
+/// As many as have a core for each worker and each thread of the learner.
+fn default_jobs(runs: &[(PlannedRun, ExperimentConfig)]) -> usize {
+    let wanted = |config: &ExperimentConfig| config.actors.workers + config.learner.threads;
+    let most = runs.iter().map(|(_, config)| wanted(config)).max().unwrap_or(1);
+    (cores() / most.max(1)).max(1)
+}
+
+fn report(plan: &Sweep, states: &[RunState], json: bool) -> anyhow::Result<()> {
+    let runs = plan.runs.iter().zip(states);
+    if json {
+        let listed: Vec<_> = runs
+            .map(|((run, config), state)| {
+                let (state, env_steps, reason) = match state {
+                    RunState::Finished => ("finished", config.run.steps, None),
+                    RunState::Open { env_steps } => ("open", *env_steps, None),
+                    RunState::Failed { reason } => ("failed", 0, Some(reason)),
+                };
+                serde_json::json!({
+                    "task": run.task, "method": run.method, "point": run.point, "seed": run.seed,
+                    "run": plan.output.join(&run.directory), "state": state,
+                    "env_steps": env_steps, "steps": config.run.steps, "reason": reason,
+                })
+            })
+            .collect();
+        return emit(&serde_json::json!({ "runs": listed, "jobs": plan.jobs }).to_string());
+    }
+    let lines = runs.map(|((run, config), state)| {
+        let state = match state {
+            RunState::Finished => "finished".to_owned(),
+            RunState::Open { env_steps: 0 } => "not begun".to_owned(),
+            RunState::Open { env_steps } => {
+                format!("at {} of {} steps", grouped(*env_steps), grouped(config.run.steps))
+            }
+            RunState::Failed { .. } => "failed".to_owned(),
+        };
+        format!("  {:<26} {}", state, run.title())
+    });
+    emit(&lines.collect::<Vec<_>>().join("\n"))
+}

@@ -1,0 +1,151 @@
+//! The sweep file: TOML, strict.
+
+use std::path::Path;
+
+use serde::Deserialize;
+use toml::{Table, Value};
+
+use crate::failure::wrong_use;
+
+/// A sweep file is a few kilobytes.
+const FILE_BYTES_MAX: u64 = 1 << 20;
+
+/// What to run: every task with every method, at every point of the grid, with every seed.
+#[derive(Debug, Clone, PartialEq, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct SweepFile {
+    /// `run.seed` of each repetition.
+    pub seeds: Vec<i64>,
+    /// Configuration of every run.
+    #[serde(default)]
+    pub set: Table,
+    /// What is learned.
+    #[serde(rename = "task")]
+    pub tasks: Vec<TaskEntry>,
+    /// How. None: the defaults of `train`.
+    #[serde(rename = "method", default)]
+    pub methods: Vec<MethodEntry>,
+    /// Configuration keys, each with the values that it takes in turn.
+    #[serde(default)]
+    pub grid: Table,
+}
+
+/// One task.
+#[derive(Debug, Clone, PartialEq, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct TaskEntry {
+    /// As `train` takes it.
+    pub name: String,
+    /// `run.steps` [environment steps].
+    pub steps: Option<i64>,
+    /// Configuration of its runs, over that of all.
+    #[serde(default)]
+    pub set: Table,
+}
+
+/// One method.
+#[derive(Debug, Clone, PartialEq, Default, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct MethodEntry {
+    /// Part of the runs' paths.
+    pub name: String,
+    /// What plots and tables say; the name where there is none.
+    pub label: Option<String>,
+    /// As `train --algo`.
+    pub algo: Option<String>,
+    /// As `train --policy`.
+    pub policy: Option<String>,
+    /// As `train --preset`.
+    pub preset: Option<String>,
+    /// Configuration of its runs, over that of the task.
+    #[serde(default)]
+    pub set: Table,
+}
+
+impl SweepFile {
+    /// Reads and checks a file.
+    ///
+    /// # Errors
+    /// Wrong use: no such file, no TOML, an unknown key, nothing to do, or a grid without values.
+    pub fn read(path: &Path) -> anyhow::Result<(Self, String)> {
+        let refused = |what: String| wrong_use(format!("sweep file {}: {what}", path.display()));
+        let metadata = std::fs::metadata(path).map_err(|error| refused(error.to_string()))?;
+        if !metadata.is_file() || metadata.len() > FILE_BYTES_MAX {
+            return Err(refused(format!("expected a file of at most {FILE_BYTES_MAX} bytes")));
+        }
+        let text = std::fs::read_to_string(path).map_err(|error| refused(error.to_string()))?;
+        let file = Self::parse(&text).map_err(refused)?;
+        Ok((file, text))
+    }
+
+    fn parse(text: &str) -> Result<Self, String> {
+        let mut file: Self = toml::from_str(text).map_err(|error| error.to_string())?;
+        if file.seeds.is_empty() {
+            return Err("seeds: expected at least one".to_owned());
+        }
+        if file.tasks.is_empty() {
+            return Err("expected at least one [[task]]".to_owned());
+        }
+        if file.methods.is_empty() {
+            file.methods.push(MethodEntry { name: "default".to_owned(), ..Default::default() });
+        }
+        for (key, values) in flatten(&file.grid) {
+            if values.as_array().is_none_or(Vec::is_empty) {
+                return Err(format!("grid.{key}: expected a list of values"));
+            }
+        }
+        Ok(file)
+    }
+}
+
+/// The leaves of a tree of tables with their dotted keys: `[set.algorithm] batch_size = 64` and
+/// `"algorithm.batch_size" = 64` say the same.
+pub(super) fn flatten(table: &Table) -> Vec<(String, Value)> {
+    let mut leaves = Vec::new();
+    for (key, value) in table {
+        match value {
+            Value::Table(inner) => leaves.extend(
+                flatten(inner).into_iter().map(|(below, leaf)| (format!("{key}.{below}"), leaf)),
+            ),
+            leaf => leaves.push((key.clone(), leaf.clone())),
+        }
+    }
+    leaves
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const LEAST: &str = "seeds = [1]\n[[task]]\nname = 'reacher'\n";
+
+    #[test]
+    fn the_least_file_runs_the_defaults() {
+        let file = SweepFile::parse(LEAST).unwrap();
+        assert_eq!(file.methods.len(), 1);
+        assert_eq!(file.methods[0].name, "default");
+    }
+
+    #[test]
+    fn nested_and_dotted_keys_say_the_same() {
+        let nested = "[set.algorithm]\nbatch_size = 64\n[set.dmp]\nalpha_y = 9.0\n";
+        let dotted = "[set]\n'algorithm.batch_size' = 64\ndmp.alpha_y = 9.0\n";
+        let leaves = [nested, dotted].map(|set| {
+            let mut leaves = flatten(&SweepFile::parse(&format!("{LEAST}{set}")).unwrap().set);
+            leaves.sort_by(|a, b| a.0.cmp(&b.0));
+            leaves
+        });
+        assert_eq!(leaves[0], leaves[1]);
+        assert_eq!(leaves[0][0], ("algorithm.batch_size".to_owned(), Value::Integer(64)));
+    }
+
+    #[test]
+    fn what_is_missing_or_misspelt_is_named() {
+        let refused = |text: &str| SweepFile::parse(text).unwrap_err();
+        assert!(refused("seeds = []\n[[task]]\nname = 'a'").contains("seeds"));
+        assert!(refused("seeds = [1]\ntask = []").contains("[[task]]"));
+        assert!(refused(&format!("{LEAST}step = 5")).contains("step"));
+        assert!(refused(&format!("{LEAST}[grid]\nrun.steps = 5")).contains("grid.run.steps"));
+        assert!(refused(&format!("{LEAST}[grid]\nrun.steps = []")).contains("grid.run.steps"));
+    }
+}

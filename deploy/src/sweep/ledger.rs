@@ -1,0 +1,123 @@
+//! `finished.jsonl`: which runs of a sweep have finished, and how long each took.
+
+use std::fs::{File, OpenOptions};
+use std::io::{Read, Write};
+use std::path::{Path, PathBuf};
+
+use anyhow::Context;
+use serde::{Deserialize, Serialize};
+
+/// A run that has come to its end.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Finished {
+    /// Its directory, below the sweep's.
+    pub run: PathBuf,
+    /// Environment steps that it was asked for.
+    pub env_steps: u64,
+    /// Of training, over all its sessions [s].
+    pub wall_s: f64,
+}
+
+/// The file and what it says.
+#[derive(Debug)]
+pub struct Ledger {
+    path: PathBuf,
+    finished: Vec<Finished>,
+}
+
+impl Ledger {
+    /// Reads the ledger of a sweep's directory; there may be none yet. A last line that a kill has
+    /// torn is no entry.
+    ///
+    /// # Errors
+    /// A whole line is no entry, or the file system refuses.
+    pub fn open(sweep: &Path) -> anyhow::Result<Self> {
+        let path = sweep.join("finished.jsonl");
+        let mut text = String::new();
+        match File::open(&path) {
+            Ok(mut file) => {
+                file.read_to_string(&mut text)
+                    .with_context(|| format!("cannot read {}", path.display()))?;
+            }
+            Err(error) if error.kind() == std::io::ErrorKind::NotFound => {}
+            Err(error) => {
+                return Err(error).with_context(|| format!("cannot open {}", path.display()));
+            }
+        }
+        let whole = text.rfind('\n').map_or("", |end| &text[..end]);
+        let finished = whole.lines().enumerate().map(|(index, line)| {
+            serde_json::from_str(line)
+                .with_context(|| format!("{}, line {}: no finished run", path.display(), index + 1))
+        });
+        let finished = finished.collect::<anyhow::Result<_>>()?;
+        Ok(Self { path, finished })
+    }
+
+    /// The entry of a run; of several the newest, as one that was made longer has two.
+    #[must_use]
+    pub fn of(&self, run: &Path) -> Option<&Finished> {
+        self.finished.iter().rev().find(|finished| finished.run == run)
+    }
+
+    /// Adds an entry, on disk first.
+    ///
+    /// # Errors
+    /// What the file system refuses.
+    pub fn add(&mut self, finished: Finished) -> anyhow::Result<()> {
+        let write = || -> anyhow::Result<()> {
+            let mut file =
+                OpenOptions::new().read(true).append(true).create(true).open(&self.path)?;
+            let mut text = Vec::new();
+            file.read_to_end(&mut text)?;
+            if text.last().is_some_and(|&byte| byte != b'\n') {
+                // Torn by a kill.
+                let whole = text.iter().rposition(|&byte| byte == b'\n').map_or(0, |end| end + 1);
+                file.set_len(whole as u64)?;
+            }
+            let mut line = serde_json::to_vec(&finished)?;
+            line.push(b'\n');
+            file.write_all(&line)?;
+            Ok(file.sync_data()?)
+        };
+        write().with_context(|| format!("cannot add to {}", self.path.display()))?;
+        self.finished.push(finished);
+        Ok(())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn finished(run: &str, env_steps: u64) -> Finished {
+        Finished { run: run.into(), env_steps, wall_s: 1.5 }
+    }
+
+    #[test]
+    fn what_was_added_is_read_back_and_a_torn_line_costs_only_itself() {
+        let folder = tempfile::tempdir().unwrap();
+        let mut ledger = Ledger::open(folder.path()).unwrap();
+        assert_eq!(ledger.of(Path::new("a")), None);
+        ledger.add(finished("a", 5)).unwrap();
+        ledger.add(finished("b", 6)).unwrap();
+        let path = folder.path().join("finished.jsonl");
+        let mut file = OpenOptions::new().append(true).open(&path).unwrap();
+        file.write_all(b"{\"run\": \"c").unwrap();
+        let mut ledger = Ledger::open(folder.path()).unwrap();
+        ledger.add(finished("a", 7)).unwrap();
+        for ledger in [&ledger, &Ledger::open(folder.path()).unwrap()] {
+            assert_eq!(ledger.of(Path::new("a")), Some(&finished("a", 7)));
+            assert_eq!(ledger.of(Path::new("b")), Some(&finished("b", 6)));
+            assert_eq!(ledger.of(Path::new("c")), None);
+        }
+    }
+
+    #[test]
+    fn a_whole_line_that_is_no_entry_is_named() {
+        let folder = tempfile::tempdir().unwrap();
+        std::fs::write(folder.path().join("finished.jsonl"), "{}\n").unwrap();
+        let error = format!("{:#}", Ledger::open(folder.path()).unwrap_err());
+        assert!(error.contains("line 1"), "{error}");
+    }
+}
