@@ -158,6 +158,7 @@ fn every_flag_that_is_shown_exists() {
         "train",
         "resume",
         "eval",
+        "sweep",
         "bench rollout",
         "bench learner",
         "bench transport",

@@ -118,6 +118,18 @@ fn a_run_that_fails_costs_the_others_nothing_and_is_tried_again() {
 }
 
 #[test]
+fn the_papers_comparison_is_a_sweep() {
+    let place = Workplace::new();
+    let file = concat!(env!("CARGO_MANIFEST_DIR"), "/../deploy/experiments/paper.toml");
+    let json = place.run(&["sweep", file, "--dry-run", "--json"]).with_status(0).json();
+    // Tasks, methods, seeds.
+    assert_eq!(states(&json).len(), 5 * 8 * 5);
+    let methods: std::collections::BTreeSet<_> =
+        json["runs"].as_array().unwrap().iter().map(|run| run["method"].to_string()).collect();
+    assert_eq!(methods.len(), 8);
+}
+
+#[test]
 fn a_mistake_in_the_file_is_told_before_anything_starts() {
     let place = Workplace::new();
     for (text, words) in [
