@@ -15,6 +15,7 @@ pub mod plots;
 pub mod project;
 #[cfg(feature = "python")]
 pub mod python_setup;
+pub mod report;
 pub mod roles;
 pub mod run_directory;
 pub mod sweep;

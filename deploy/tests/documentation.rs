@@ -159,6 +159,7 @@ fn every_flag_that_is_shown_exists() {
         "resume",
         "eval",
         "sweep",
+        "report",
         "bench rollout",
         "bench learner",
         "bench transport",

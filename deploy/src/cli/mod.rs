@@ -8,6 +8,7 @@ mod configuration;
 mod configured;
 mod doctor;
 mod eval;
+mod report;
 mod resume;
 mod sweep;
 mod tasks;
@@ -63,6 +64,8 @@ enum Command {
     Eval(eval::EvalArgs),
     /// Train many runs from one file, side by side, and go on where it was stopped.
     Sweep(sweep::SweepArgs),
+    /// Set runs and sweeps side by side: tables, statistics, learning curves, one page.
+    Report(report::ReportArgs),
     /// Measure a part of the system beside what else could do its work.
     Bench(bench::BenchArgs),
     /// List the tasks with a short name.
@@ -117,6 +120,7 @@ fn run(command: Command) -> anyhow::Result<Outcome> {
         Command::Resume(args) => resume::run(&args),
         Command::Eval(args) => eval::run(&args),
         Command::Sweep(args) => sweep::run(&args),
+        Command::Report(args) => report::run(&args),
         Command::Bench(args) => bench::run(&args),
         Command::Tasks(args) => tasks::run(&args),
         Command::Doctor(args) => doctor::run(&args),

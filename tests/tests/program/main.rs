@@ -21,6 +21,7 @@ mod isolation;
 mod learning;
 mod leftovers;
 mod refusals;
+mod report;
 mod results;
 mod start_stop;
 mod sweep;

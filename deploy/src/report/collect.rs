@@ -1,0 +1,129 @@
+//! The runs that a report is made of.
+
+use std::path::{Path, PathBuf};
+
+use anyhow::Context;
+use dmprl_shared::config::{AlgorithmName, ExperimentConfig, PolicyKind};
+
+use crate::control::EvaluationRow;
+use crate::failure::wrong_use;
+use crate::run_directory::RunDirectory;
+use crate::sweep::{Plan, SweepFile};
+
+/// One run and its evaluations.
+#[derive(Debug, Clone)]
+pub struct Run {
+    /// The task's name.
+    pub task: String,
+    /// The method's label.
+    pub method: String,
+    /// `run.seed`.
+    pub seed: u64,
+    /// Its directory.
+    pub path: PathBuf,
+    /// Environment steps that it was asked for.
+    pub steps: u64,
+    /// Oldest first.
+    pub rows: Vec<EvaluationRow>,
+}
+
+impl Run {
+    /// The evaluation at its end; none while it has not come there.
+    #[must_use]
+    pub fn last(&self) -> Option<&EvaluationRow> {
+        self.rows.last().filter(|row| row.env_steps >= self.steps)
+    }
+}
+
+/// All runs of a report; tasks and methods in the order in which they were named.
+#[derive(Debug, Clone, Default)]
+pub struct Results {
+    /// Rows of the tables.
+    pub tasks: Vec<String>,
+    /// Their columns.
+    pub methods: Vec<String>,
+    /// Those that have begun.
+    pub runs: Vec<Run>,
+}
+
+impl Results {
+    /// Reads runs and sweeps.
+    ///
+    /// # Errors
+    /// Wrong use: a path is neither, or nothing has begun. A run that cannot be read.
+    pub fn read(paths: &[PathBuf]) -> anyhow::Result<Self> {
+        let mut results = Self::default();
+        for path in paths {
+            if path.join("sweep.toml").is_file() {
+                results.add_sweep(path)?;
+            } else {
+                results.add_run(path)?;
+            }
+        }
+        if results.runs.iter().all(|run| run.rows.is_empty()) {
+            return Err(wrong_use("no run has an evaluation yet: there is nothing to report"));
+        }
+        Ok(results)
+    }
+
+    /// The runs of one task by one method.
+    pub fn of<'a>(&'a self, task: &'a str, method: &'a str) -> impl Iterator<Item = &'a Run> {
+        self.runs.iter().filter(move |run| run.task == task && run.method == method)
+    }
+
+    fn add_sweep(&mut self, sweep: &Path) -> anyhow::Result<()> {
+        let (file, _) = SweepFile::read(&sweep.join("sweep.toml"))?;
+        for planned in Plan::new(&file)?.runs {
+            let point = planned.point.iter().map(|value| format!(", {value}"));
+            let method = format!("{}{}", planned.method, point.collect::<String>());
+            // A cell that was not run stands in the tables too.
+            add_new(&mut self.tasks, &planned.task);
+            add_new(&mut self.methods, &method);
+            let path = sweep.join(&planned.directory);
+            if path.exists() {
+                let directory = RunDirectory::open(&path)?;
+                let config = directory.config()?;
+                self.runs.push(run(&directory, &config, method)?);
+            }
+        }
+        Ok(())
+    }
+
+    fn add_run(&mut self, path: &Path) -> anyhow::Result<()> {
+        let directory = RunDirectory::open(path)?;
+        let config = directory.config()?;
+        let run = run(&directory, &config, label(&config))?;
+        add_new(&mut self.tasks, &run.task);
+        add_new(&mut self.methods, &run.method);
+        self.runs.push(run);
+        Ok(())
+    }
+}
+
+fn add_new(names: &mut Vec<String>, name: &str) {
+    if names.iter().all(|known| known != name) {
+        names.push(name.to_owned());
+    }
+}
+
+fn run(directory: &RunDirectory, config: &ExperimentConfig, method: String) -> anyhow::Result<Run> {
+    let path = directory.path().to_owned();
+    let rows = directory.evaluations().with_context(|| format!("run {}", path.display()))?;
+    let (task, seed, steps) = (config.task.name.clone(), config.run.seed, config.run.steps);
+    Ok(Run { task, method, seed, path, steps, rows })
+}
+
+/// What a run is called that no sweep has named.
+fn label(config: &ExperimentConfig) -> String {
+    let algorithm = match config.algorithm.name {
+        AlgorithmName::Ddpg => "DDPG",
+        AlgorithmName::Td3 => "TD3",
+        AlgorithmName::Sac => "SAC",
+        // It has no other policy.
+        AlgorithmName::Ndp => return "NDP".to_owned(),
+    };
+    match config.policy.kind {
+        PolicyKind::Dmp => format!("{algorithm}-DMP"),
+        PolicyKind::Mlp => algorithm.to_owned(),
+    }
+}

@@ -1,0 +1,61 @@
+//! What the paper reports, to stand beside what was measured: its Tables 3 and 4.
+
+/// The minus signs of Table 3 were lost in the paper's print; its figures have them.
+const RETURNS: [Row; 3] = [
+    Row("reacher-v1", [(-7.36, 0.54), (-6.58, 0.54), (-7.89, 0.57), (-6.10, 0.61), (-15.56, 1.47)]),
+    Row(
+        "pusher-v0",
+        [(-33.37, 1.73), (-44.23, 8.82), (-32.06, 1.41), (-31.87, 4.01), (-46.81, 2.16)],
+    ),
+    Row(
+        "thrower-v0",
+        [(-62.74, 9.78), (-180.37, 24.61), (-111.52, 23.74), (-95.33, 27.72), (-74.90, 18.27)],
+    ),
+];
+
+/// Share of episodes that succeed.
+const SUCCESS: [Row; 2] = [
+    Row("panda-reach", [(0.99, 0.00), (0.41, 0.24), (0.99, 0.00), (0.99, 0.01), (0.0, 0.0)]),
+    Row("panda-reach-joints", [(0.99, 0.01), (0.0, 0.0), (0.92, 0.01), (0.85, 0.41), (0.0, 0.0)]),
+];
+
+/// The columns of both.
+const METHODS: [&str; 5] = ["DDPG-DMP (paper)", "DDPG", "TD3", "SAC", "NDP"];
+
+struct Row(&'static str, [(f64, f64); 5]);
+
+/// Which figure of a task.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Figure {
+    /// Table 3.
+    Return,
+    /// Table 4.
+    Success,
+}
+
+/// Mean and spread that the paper gives for a method on a task, by the names of
+/// `deploy/experiments/paper.toml`; none where it has none.
+#[must_use]
+pub fn reported(figure: Figure, task: &str, method: &str) -> Option<(f64, f64)> {
+    let table: &[Row] = match figure {
+        Figure::Return => &RETURNS,
+        Figure::Success => &SUCCESS,
+    };
+    let Row(_, row) = table.iter().find(|Row(name, _)| *name == task)?;
+    let column = METHODS.iter().position(|name| *name == method)?;
+    Some(row[column])
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn figures_are_found_by_task_and_method() {
+        assert_eq!(reported(Figure::Return, "pusher-v0", "SAC"), Some((-31.87, 4.01)));
+        assert_eq!(reported(Figure::Success, "panda-reach", "DDPG"), Some((0.41, 0.24)));
+        assert_eq!(reported(Figure::Return, "panda-reach", "DDPG"), None);
+        assert_eq!(reported(Figure::Return, "reacher", "SAC"), None);
+        assert_eq!(reported(Figure::Return, "reacher-v1", "TD3-DMP"), None);
+    }
+}

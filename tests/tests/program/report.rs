@@ -1,0 +1,55 @@
+//! `dmprl report` over runs and a sweep that were really trained.
+
+use std::fs;
+
+use dmprl_tests::program::Workplace;
+
+use crate::{ENDLESS, SMALL, train};
+
+#[test]
+fn a_sweep_is_reported_with_what_was_run_and_what_was_not() {
+    let place = Workplace::new();
+    let file = place.path("two.toml");
+    let method = "[[method]]\nname = 'td3-dmp'\nlabel = 'TD3-DMP'\n";
+    let head = "seeds = [1, 2]\n[[task]]\nname = 'reacher-v1'\nsteps = 1000\n";
+    let set = format!("[set]\n{}", SMALL.join("\n"));
+    fs::write(&file, format!("{head}{method}{set}")).unwrap();
+    place.run(&["sweep", &file, "--output", "two"]).with_status(0);
+    // Asked for since, and not run: the paper's figures stand beside nothing.
+    let paper = "[[method]]\nname = 'ndp'\nlabel = 'NDP'\nalgo = 'ndp'\n";
+    fs::write(place.path("two/sweep.toml"), format!("{head}{method}{paper}{set}")).unwrap();
+
+    let json = place.run(&["report", "two", "--json"]).with_status(0).json();
+    assert_eq!(json["methods"], serde_json::json!(["TD3-DMP", "NDP"]));
+    let returns = &json["tables"][0];
+    assert_eq!(returns["title"], "Average return");
+    let cells = &returns["rows"][0][1];
+    assert_eq!(cells[0]["summary"]["count"], 2);
+    assert!(cells[1]["summary"].is_null());
+    assert_eq!(cells[1]["paper"], serde_json::json!([-15.56, 1.47]));
+
+    let read = |name: &str| fs::read_to_string(place.path(&format!("two/report/{name}"))).unwrap();
+    let page = read("index.html");
+    for text in ["reacher-v1", "TD3-DMP", "not run", "paper -15.56 ± 1.47", "2 seeds", "<svg"] {
+        assert!(page.contains(text), "{text} is not on the page");
+    }
+    assert!(!page.contains("http://") || !page.contains("src="), "the page needs nothing else");
+    assert!(read("report.md").contains("| reacher-v1 |"));
+    assert!(read("curves/reacher-v1-evaluation-return.svg").starts_with("<svg"));
+    // One line an evaluation of each seed, and a head.
+    assert_eq!(read("runs.csv").lines().count(), 1 + 2);
+    assert!(read("figures.csv").contains("Average return,reacher-v1,NDP,0,,,,,,-15.56,1.47"));
+}
+
+#[test]
+fn what_is_no_run_or_has_no_evaluation_is_refused() {
+    let place = Workplace::new();
+    place.run(&["report", "nowhere"]).with_status(2).saying("nowhere");
+    let run = place.path("run");
+    let mut training = place.start(&train("reacher", &run, &["--steps", ENDLESS]));
+    training
+        .until("a run directory", |_| std::path::Path::new(&run).join("manifest.json").is_file());
+    training.signal_group(rustix::process::Signal::INT);
+    training.wait();
+    place.run(&["report", &run]).with_status(2).saying("no run has an evaluation");
+}
