@@ -3,6 +3,7 @@
 mod bench;
 mod bench_learner;
 mod bench_transport;
+mod chaos;
 mod clean;
 mod configuration;
 mod configured;
@@ -61,6 +62,8 @@ enum Command {
     Eval(eval::EvalArgs),
     /// Measure a part of the system beside what else could do its work.
     Bench(bench::BenchArgs),
+    /// Kill a run's processes by a schedule and check that nothing is lost.
+    Chaos(chaos::ChaosArgs),
     /// List the tasks with a short name.
     Tasks(tasks::TasksArgs),
     /// Check what this machine has for runs, and say what to do.
@@ -103,6 +106,7 @@ fn run(command: Command) -> anyhow::Result<Outcome> {
         Command::Resume(args) => resume::run(&args),
         Command::Eval(args) => eval::run(&args),
         Command::Bench(args) => bench::run(&args),
+        Command::Chaos(args) => chaos::run(&args),
         Command::Tasks(args) => tasks::run(&args),
         Command::Doctor(args) => doctor::run(&args),
         Command::Clean(args) => clean::run(&args),

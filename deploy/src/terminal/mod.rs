@@ -6,6 +6,7 @@ mod format;
 mod rounds;
 mod setup;
 mod summary;
+mod trial;
 
 pub use display::{Display, ProgressStyle};
 pub use format::{binary_bytes, duration, grouped, plus_minus, std_of};
@@ -13,6 +14,7 @@ pub use rounds::RoundsProgress;
 pub use setup::SetupProgress;
 pub(crate) use summary::shown;
 pub use summary::summary;
+pub use trial::TrialProgress;
 
 /// Prints a line on standard error. `eprintln!` would end the program when nobody reads any
 /// more: a terminal closed in mid-run, a log on a full disk.
