@@ -1,7 +1,6 @@
 //! The processes of the run, as /proc shows them.
 
 use std::fs;
-use std::path::Path;
 
 use anyhow::Context;
 use rustix::process::{Pid, Signal, kill_process};
@@ -70,19 +69,19 @@ fn role(command_line: &str) -> Option<Role> {
     }
 }
 
-/// Ids of the processes, but this one, that name a path on their command line.
-pub(super) fn naming(path: &Path) -> anyhow::Result<Vec<String>> {
-    let text = path.as_os_str().as_encoded_bytes();
-    let own = std::process::id().to_string();
+/// Ids of the processes, but this one, of a session: whatever the run has started is in its own.
+pub(super) fn of_session(session: Pid) -> anyhow::Result<Vec<String>> {
+    let (session, own) = (session.as_raw_nonzero().to_string(), std::process::id().to_string());
     let entries = fs::read_dir("/proc").context("cannot list /proc")?;
-    let named = entries.flatten().filter_map(|entry| {
-        let name = entry.file_name().into_string().ok()?;
-        let is_number = name.bytes().all(|byte| byte.is_ascii_digit());
-        let line = fs::read(entry.path().join("cmdline")).ok().filter(|_| is_number)?;
-        let names = line.windows(text.len().max(1)).any(|window| window == text);
-        (names && name != own).then_some(name)
-    });
-    Ok(named.collect())
+    let member = |name: String| {
+        let stat = fs::read_to_string(format!("/proc/{name}/stat")).ok()?;
+        let fields: Vec<&str> = stat.rsplit_once(')')?.1.split_whitespace().collect();
+        let (state, its_session) = (*fields.first()?, *fields.get(3)?);
+        let lives = !matches!(state, "Z" | "X");
+        (lives && its_session == session && name != own).then_some(name)
+    };
+    let names = entries.flatten().filter_map(|entry| entry.file_name().into_string().ok());
+    Ok(names.filter_map(member).collect())
 }
 
 /// What a process holds.

@@ -1,4 +1,4 @@
-//! The run that is struck: a real `dmprl train`, with the keys that make much happen in little time.
+//! The run that is struck: a real `dmprl train`, with keys that make much happen in little time.
 
 use std::fs::File;
 use std::os::unix::process::CommandExt;
@@ -26,8 +26,8 @@ const END: Duration = Duration::from_secs(90);
 const LOOK: Duration = Duration::from_millis(10);
 
 /// Small networks and few updates: the processes are tried, not what they learn. Outboxes so small
-/// that workers soon forget what is acknowledged, and large enough that a learner's death finds them
-/// with segments whose acknowledgement they have not heard, which come twice then.
+/// that workers soon forget what is acknowledged, and large enough that a learner's death finds
+/// them with segments whose acknowledgement they have not heard, which come twice then.
 fn keys() -> Vec<String> {
     let mut keys: Vec<String> = [
         "delivery.level=log",

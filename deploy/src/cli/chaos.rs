@@ -12,18 +12,19 @@ use crate::failure::Outcome;
 
 const HELP: &str = "\
 Starts a real `dmprl train` at delivery level `log` and, by a schedule that the seed decides, kills
-workers (one, all at once, while they start), the learner (also while it recovers and while it writes a
-checkpoint) and the evaluator with SIGKILL, and stops workers and the learner for a while. Workers and
-learner note every segment, so that in the end a checker can tell:
+workers (one, all at once, while they start), the learner (also while it recovers and while it
+writes a checkpoint) and the evaluator with SIGKILL, and stops workers and the learner for a while.
+Workers and learner note every segment, so that in the end a checker can tell:
   I1 nothing acknowledged is lost           I2 nothing is inserted twice
   I3 sequences only increase                I4 payloads arrive as they were produced
   I5 counters go back to a checkpoint only  I6 policies only become newer
   I7 work goes on, all workers come back    I8 nothing is left behind
   I9 produced = inserted + rejected + in flight with the killed
-worker_back_s, learner_back_s (from SIGKILL to the first segment inserted), fairness (most over fewest
-segments of a worker while nothing was broken) and the *_ratio (last third of the trial over the first,
-the larger of supervisor and learner) are measured and judge nothing: they depend on the machine.
-Ctrl-C ends it with the report so far. Exit status 1 if anything did not hold; everything is then kept.
+worker_back_s, learner_back_s (from SIGKILL to the first segment inserted), fairness (most over
+fewest segments of a worker while nothing was broken) and the *_ratio (last third of the trial over
+the first, the larger of supervisor and learner) are measured and judge nothing: they depend on the
+machine. Ctrl-C ends it with the report so far. Exit status 1 if anything did not hold; everything
+is then kept.
 
 EXAMPLES
   dmprl chaos --seed 1 --seconds 60
