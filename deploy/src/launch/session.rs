@@ -86,9 +86,12 @@ pub fn session(plan: SessionPlan) -> anyhow::Result<Outcome> {
         let plan = SupervisorPlan { launcher, config, limits, display, interrupts };
         supervise(plan).await
     });
-    // In this order: no child, then no shared memory, then no lock.
+    // In this order: no child, then nothing half-made, then no lock.
     drop(runtime);
     drop(domain);
+    if let Err(error) = run.remove_half_written() {
+        say(&format!("warning: {error:#}"));
+    }
     drop(lock);
     conclude(report, &run, &title, steps_total)
 }
