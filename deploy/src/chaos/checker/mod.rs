@@ -2,8 +2,8 @@
 //!
 //! What a learner has is its *lineage*: what its checkpoint held, what it read from its log, what
 //! it inserted. A learner that starts is told by its checkpoint's marks how much of its
-//! predecessor's lineage is left; the log and the workers bring the rest. Of each segment four bytes
-//! are kept, its checksum at the worker; what was inserted is a number and the gaps below it.
+//! predecessor's lineage is left; the log and the workers bring the rest. Of each segment four
+//! bytes are kept, its checksum at the worker; what was inserted is a number and the gaps below it.
 
 mod life;
 #[cfg(test)]
