@@ -6,10 +6,12 @@
 
 pub mod bench;
 mod capacity;
+pub mod chaos;
 pub mod cli;
 pub mod control;
 mod doctor;
 pub mod failure;
+pub mod journal;
 pub mod launch;
 pub mod plots;
 pub mod project;

@@ -163,6 +163,7 @@ fn every_flag_that_is_shown_exists() {
         "bench rollout",
         "bench learner",
         "bench transport",
+        "chaos",
         "tasks",
         "doctor",
         "clean",

@@ -5,12 +5,13 @@ mod fakes;
 
 use dmprl::control::EvaluationRow;
 use dmprl::failure::Outcome;
-use dmprl::launch::{SessionPlan, session};
+use dmprl::launch::{SessionPlan, Trial, session};
 use dmprl::terminal::ProgressStyle;
 use fakes::{Fixture, PATIENCE, fake_role};
 
 fn plan(fixture: &Fixture, resume: bool) -> SessionPlan {
     SessionPlan {
+        trial: Trial::default(),
         program: fake_role(),
         run: fixture.run.clone(),
         // A child of a test beside this one may hold the lock's descriptor for a moment.

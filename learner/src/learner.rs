@@ -27,6 +27,8 @@ use crate::replay::{Replay, Sampler};
 use crate::rollout_buffer::RolloutBuffer;
 use crate::update::trained::Trained;
 
+pub use arrival::Witness;
+
 /// Why the learner stopped.
 #[derive(Debug, Error)]
 pub enum LearnerError {
@@ -122,6 +124,8 @@ pub struct Learner {
     snapshot: ParameterSnapshot,
     /// How far each worker's segments have come.
     pub inbox: Inbox,
+    /// Who else is told of what comes.
+    pub witness: Witness,
     omega: f32,
     /// Where the policy imitates demonstrations.
     cloning: Option<Cloning>,
@@ -167,6 +171,7 @@ impl Learner {
                 ..ParameterSnapshot::default()
             },
             inbox: Inbox::new(workers),
+            witness: Witness::default(),
             cloning: match config.demonstrations.are_cloned() {
                 true => Some(Cloning::new(&config, &policy)?),
                 false => None,

@@ -28,3 +28,4 @@ pub use rollout::{RolloutBench, rollout};
 pub use transport::{
     Figures as TransportFigures, TransportBench, TransportWorkerArgs, transport, transport_worker,
 };
+pub(crate) use watch::Watch;

@@ -71,6 +71,7 @@ fn measure(mut bench: RolloutBench) -> anyhow::Result<Figures> {
         init_from: None,
         learner_restarts: 0,
         sessions_before: 0,
+        journal: None,
     };
     let progress = RoundsProgress::new(bench.rounds);
     progress.preparing("starting the workers");

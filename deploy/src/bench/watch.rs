@@ -27,11 +27,11 @@ impl Display for Interrupted {
 impl std::error::Error for Interrupted {}
 
 /// Sees SIGINT, SIGTERM and SIGHUP, which do not kill this process any more.
-pub(super) struct Watch(Arc<AtomicBool>);
+pub(crate) struct Watch(Arc<AtomicBool>);
 
 impl Watch {
     /// From now on.
-    pub(super) fn start() -> anyhow::Result<Self> {
+    pub(crate) fn start() -> anyhow::Result<Self> {
         let seen = Arc::new(AtomicBool::new(false));
         // `nohup` has a hang-up ignored, and means that.
         let hang_up = (!launch::is_ignored(SIGHUP)).then_some(SIGHUP);
@@ -43,7 +43,7 @@ impl Watch {
     }
 
     /// Fails with [`Interrupted`] once the user has interrupted.
-    pub(super) fn check(&self) -> anyhow::Result<()> {
+    pub(crate) fn check(&self) -> anyhow::Result<()> {
         if self.0.load(Ordering::Acquire) { Err(Interrupted.into()) } else { Ok(()) }
     }
 

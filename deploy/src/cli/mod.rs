@@ -3,6 +3,7 @@
 mod bench;
 mod bench_learner;
 mod bench_transport;
+mod chaos;
 mod clean;
 mod configuration;
 mod configured;
@@ -68,6 +69,8 @@ enum Command {
     Report(report::ReportArgs),
     /// Measure a part of the system beside what else could do its work.
     Bench(bench::BenchArgs),
+    /// Kill a run's processes by a schedule and check that nothing is lost.
+    Chaos(chaos::ChaosArgs),
     /// List the tasks with a short name.
     Tasks(tasks::TasksArgs),
     /// Check what this machine has for runs, and say what to do.
@@ -122,6 +125,7 @@ fn run(command: Command) -> anyhow::Result<Outcome> {
         Command::Sweep(args) => sweep::run(&args),
         Command::Report(args) => report::run(&args),
         Command::Bench(args) => bench::run(&args),
+        Command::Chaos(args) => chaos::run(&args),
         Command::Tasks(args) => tasks::run(&args),
         Command::Doctor(args) => doctor::run(&args),
         Command::Clean(args) => clean::run(&args),

@@ -10,7 +10,7 @@ use super::configuration::refuse;
 use super::{cores, prepare_python, this_program};
 use crate::capacity;
 use crate::failure::{Outcome, wrong_use};
-use crate::launch::{self, SessionPlan};
+use crate::launch::{self, SessionPlan, Trial};
 use crate::run_directory::{RunDirectory, Session};
 use crate::terminal::ProgressStyle;
 
@@ -77,6 +77,7 @@ pub(super) fn run(args: &ResumeArgs) -> anyhow::Result<Outcome> {
         run.write_config(&config)?;
     }
     launch::session(SessionPlan {
+        trial: Trial::default(),
         program: this_program()?,
         run,
         lock,

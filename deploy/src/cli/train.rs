@@ -17,7 +17,7 @@ use super::configuration::{Flag, merge, refuse};
 use super::configured::{ConfiguredArgs, flag, integer, make_absolute, paths};
 use super::{cores, prepare_python, this_program};
 use crate::failure::{Outcome, wrong_use};
-use crate::launch::{self, SessionPlan};
+use crate::launch::{self, SessionPlan, Trial};
 use crate::run_directory::{Manifest, PolicyChoice, RunDirectory, compact, safe_name};
 use crate::terminal::ProgressStyle;
 use crate::{bench, capacity};
@@ -85,6 +85,12 @@ pub(super) struct TrainArgs {
     /// Lines instead of a progress bar.
     #[arg(long)]
     no_progress: bool,
+    /// Have worker and learner note in files of this folder what they do; for `chaos`.
+    #[arg(long, value_name = "DIR", hide = true)]
+    journal: Option<PathBuf>,
+    /// The longest pause before a restart [ms]; for `chaos`.
+    #[arg(long, value_name = "MS", hide = true)]
+    restart_pause_max: Option<u64>,
 }
 
 /// What these arguments make of the configuration, checked.
@@ -117,6 +123,10 @@ pub(super) fn run(args: &TrainArgs) -> anyhow::Result<Outcome> {
         venv: Some(venv),
         resume: false,
         progress: ProgressStyle::from_flag(args.no_progress),
+        trial: Trial {
+            journal: args.journal.clone(),
+            restart_max: args.restart_pause_max.map(Duration::from_millis),
+        },
     })
 }
 

@@ -42,6 +42,7 @@ pub fn evaluate(plan: EvaluationPlan<'_>) -> anyhow::Result<Option<EvaluationRow
         init_from: None,
         learner_restarts: 0,
         sessions_before: 0,
+        journal: None,
     };
     let runtime = tokio::runtime::Builder::new_current_thread()
         .enable_all()

@@ -55,6 +55,8 @@ pub struct Launcher {
     pub learner_restarts: u64,
     /// Sessions of this run before this one.
     pub sessions_before: u32,
+    /// Where worker and learner note what they do, for `dmprl chaos`.
+    pub journal: Option<PathBuf>,
 }
 
 impl Launcher {
@@ -76,6 +78,9 @@ impl Launcher {
             Process::Evaluator => {
                 command.arg("evaluator").arg("--run").arg(self.run.path());
             }
+        }
+        if let Some(journal) = self.journal.as_ref().filter(|_| process != Process::Evaluator) {
+            command.arg("--journal").arg(journal);
         }
         if let Some(venv) = self.venv.as_ref().filter(|_| process != Process::Learner) {
             command.arg("--venv").arg(venv);

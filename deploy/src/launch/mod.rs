@@ -36,7 +36,7 @@ pub(crate) use endings::last_lines;
 pub use evaluate::{EvaluationPlan, evaluate};
 pub use launcher::{Launcher, Process};
 pub use limits::TimeLimits;
-pub use session::{RESUME_WAIT, SessionPlan, session, title};
+pub use session::{RESUME_WAIT, SessionPlan, Trial, session, title};
 pub use signals::interrupts;
 pub(crate) use signals::is_ignored;
 pub use supervisor::{Ending, SessionReport, SupervisorPlan, supervise};

@@ -33,6 +33,17 @@ pub struct SessionPlan {
     pub resume: bool,
     /// Bar or lines.
     pub progress: ProgressStyle,
+    /// What `dmprl chaos` wants to be otherwise.
+    pub trial: Trial,
+}
+
+/// What differs in a run whose processes are killed on purpose.
+#[derive(Debug, Default)]
+pub struct Trial {
+    /// Where worker and learner note what they do.
+    pub journal: Option<PathBuf>,
+    /// The longest pause before a restart: a death on purpose is no sign of more to come.
+    pub restart_max: Option<Duration>,
 }
 
 /// Trains until the run ends, is stopped or fails; then draws and tells.
@@ -40,7 +51,7 @@ pub struct SessionPlan {
 /// # Errors
 /// Whatever kept the run from going on.
 pub fn session(plan: SessionPlan) -> anyhow::Result<Outcome> {
-    let SessionPlan { program, run, lock, config, venv, resume, progress } = plan;
+    let SessionPlan { program, run, lock, config, venv, resume, progress, trial } = plan;
     let manifest = run.manifest()?;
     let mut display = Display::new(progress, config.run.steps);
     let resume = resume && can_resume(&run, &mut display)?;
@@ -64,18 +75,23 @@ pub fn session(plan: SessionPlan) -> anyhow::Result<Outcome> {
         learner_restarts: 0,
         sessions_before: u32::try_from(manifest.sessions.len().saturating_sub(1))
             .context("too many sessions")?,
+        journal: trial.journal,
     };
     let title = title(&config);
     display.message(&format!("training {title} in {}", shown(run.path())));
-    let limits = TimeLimits::default();
+    let mut limits = TimeLimits::default();
+    limits.restart_max = trial.restart_max.unwrap_or(limits.restart_max);
     let steps_total = config.run.steps;
     let report = runtime.block_on(async {
         let plan = SupervisorPlan { launcher, config, limits, display, interrupts };
         supervise(plan).await
     });
-    // In this order: no child, then no shared memory, then no lock.
+    // In this order: no child, then nothing half-made, then no lock.
     drop(runtime);
     drop(domain);
+    if let Err(error) = run.remove_half_written() {
+        say(&format!("warning: {error:#}"));
+    }
     drop(lock);
     conclude(report, &run, &title, steps_total)
 }

@@ -8,14 +8,15 @@ use dmprl_actors::python_env::{Interpreter, InterpreterOptions, PythonEnvironmen
 use dmprl_actors::rollout::{Identity, Rollout, RolloutError};
 use dmprl_shared::config::{ExperimentConfig, Hindsight};
 use dmprl_shared::seeds;
+use dmprl_shared::transport::TransportError;
 use dmprl_shared::transport::delivery::Outbox;
 use dmprl_shared::transport::shared_memory::{Plan, WorkerEnd};
-use dmprl_shared::transport::{ParameterSubscriber, TransportError};
 
 use super::delivery::{ATTACH, ATTACH_LIMIT, Delivery, Stopped, attach_within};
 use super::setup::Setup;
 use super::{ActorArgs, ControlPipe, environments};
 use crate::control::{Command, Report};
+use crate::journal::{Author, Journal};
 
 /// How long one look for a command may block, so that a stop is seen.
 const COMMAND_WAIT: Duration = Duration::from_millis(100);
@@ -48,6 +49,8 @@ pub fn run(args: &ActorArgs, control: &ControlPipe) -> anyhow::Result<()> {
     let outbox = Outbox::new(rollout.policy().layout(), kept, args.index, args.incarnation);
     let deadline = Duration::from_secs_f64(config.actors.send_deadline_s);
     let mut delivery = Delivery::new(control, deadline, end, outbox);
+    let author = Author::Worker(args.index, args.incarnation);
+    delivery.note_in(Journal::open(args.journal.as_deref(), author)?);
     await_first_policy(&mut delivery, &mut rollout, control)?;
     while !control.stop_requested() {
         take_newest(&mut delivery, &mut rollout)?;
@@ -92,7 +95,7 @@ fn await_attach(
 
 /// A damaged snapshot is reported and passed over; the next one comes soon.
 fn take_newest(delivery: &mut Delivery<'_>, rollout: &mut Rollout) -> anyhow::Result<bool> {
-    match delivery.parameters().newest(&mut rollout.snapshot) {
+    match delivery.newest_policy(&mut rollout.snapshot) {
         Ok(taken) => Ok(taken),
         Err(TransportError::Snapshot(error)) => {
             eprintln!("a policy snapshot is refused: {error}");

@@ -53,6 +53,9 @@ pub struct LearnerArgs {
     /// The Python virtual environment (with --one-process).
     #[arg(long, value_name = "DIR")]
     pub venv: Option<PathBuf>,
+    /// Note in a file of this folder what comes and goes; `dmprl chaos` reads it.
+    #[arg(long, value_name = "DIR", hide = true)]
+    pub journal: Option<PathBuf>,
 }
 
 /// Arguments of `dmprl actor`.
@@ -71,6 +74,9 @@ pub struct ActorArgs {
     /// The Python virtual environment.
     #[arg(long, value_name = "DIR")]
     pub venv: Option<PathBuf>,
+    /// Note in a file of this folder what comes and goes; `dmprl chaos` reads it.
+    #[arg(long, value_name = "DIR", hide = true)]
+    pub journal: Option<PathBuf>,
 }
 
 /// Arguments of `dmprl evaluator`.

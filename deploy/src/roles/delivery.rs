@@ -3,15 +3,18 @@
 use std::path::Path;
 use std::time::{Duration, Instant};
 
-use dmprl_shared::segment::SegmentHeader;
-use dmprl_shared::transport::delivery::{Acknowledgements, Outbox, Sent};
 #[cfg(feature = "python")]
-use dmprl_shared::transport::shared_memory::Subscriber;
+use dmprl_shared::parameters::ParameterSnapshot;
+use dmprl_shared::segment::SegmentHeader;
+#[cfg(feature = "python")]
+use dmprl_shared::transport::ParameterSubscriber;
+use dmprl_shared::transport::delivery::{Acknowledgements, Mark, Outbox, Sent};
 use dmprl_shared::transport::shared_memory::{Plan, WorkerEnd, attach};
 use dmprl_shared::transport::{SendOutcome, TransportError};
 
 use super::ControlPipe;
 use crate::control::Report;
+use crate::journal::{Entry, Journal, Piece};
 
 /// Sleep between two tries to attach, or looks for the first policy.
 pub const ATTACH: Duration = Duration::from_millis(2);
@@ -69,6 +72,8 @@ pub struct Delivery<'a> {
     deadline: Duration,
     end: WorkerEnd,
     outbox: Outbox,
+    /// Where somebody wants to know of everything.
+    journal: Option<Journal>,
     /// The newest heard, a buffer.
     acknowledgements: Acknowledgements,
     /// What the supervisor knows of, and since when.
@@ -89,10 +94,17 @@ impl<'a> Delivery<'a> {
             deadline,
             end,
             outbox,
+            journal: None,
             acknowledgements: Acknowledgements::default(),
             reported: Sent::default(),
             reported_at: Instant::now(),
         }
+    }
+
+    /// Notes everything in a journal from now on, if there is one.
+    #[cfg(feature = "python")]
+    pub fn note_in(&mut self, journal: Option<Journal>) {
+        self.journal = journal;
     }
 
     /// Which worker it is.
@@ -100,10 +112,18 @@ impl<'a> Delivery<'a> {
         self.outbox.worker_id()
     }
 
-    /// The learner's snapshots.
+    /// Takes over the learner's newest snapshot, if there is a newer one.
     #[cfg(feature = "python")]
-    pub fn parameters(&mut self) -> &mut Subscriber {
-        &mut self.end.parameters
+    pub fn newest_policy(
+        &mut self,
+        snapshot: &mut ParameterSnapshot,
+    ) -> Result<bool, TransportError> {
+        let taken = self.end.parameters.newest(snapshot)?;
+        if let Some(journal) = self.journal.as_ref().filter(|_| taken) {
+            let epoch = self.end.parameters.epoch();
+            journal.note(Entry::Policy { epoch, version: snapshot.version });
+        }
+        Ok(taken)
     }
 
     /// Keeps a segment until the learner has acknowledged it, and offers it until a queue has taken
@@ -112,6 +132,9 @@ impl<'a> Delivery<'a> {
         let mut waiting: Option<(Instant, u32)> = None;
         let mut pause = FULL_QUEUE;
         let mut kept = false;
+        if let Some(journal) = &self.journal {
+            journal.note(Entry::Produced(Piece::of(header, block)));
+        }
         loop {
             if 2 * self.outbox.len() >= self.outbox.capacity() {
                 self.hear()?;
@@ -144,7 +167,13 @@ impl<'a> Delivery<'a> {
     /// Forgets what the learner has acknowledged.
     fn hear(&mut self) -> anyhow::Result<()> {
         if self.end.acknowledgements.newest(&mut self.acknowledgements)? {
+            let before = self.outbox.sent().acked;
             self.outbox.acknowledge(&self.acknowledgements);
+            let sequence = self.outbox.sent().acked;
+            if let Some(journal) = self.journal.as_ref().filter(|_| sequence > before) {
+                let incarnation = self.outbox.incarnation();
+                journal.note(Entry::Acknowledged(Mark { incarnation, sequence }));
+            }
         }
         Ok(())
     }

@@ -10,6 +10,7 @@ use dmprl_learner::learner::Learner;
 use dmprl_learner::policy_file::{self, Match};
 use dmprl_learner::session::{Due, Session, Turn};
 use dmprl_shared::config::DeliveryLevel;
+use dmprl_shared::segment::Rejection;
 use dmprl_shared::spec::EnvSpec;
 use dmprl_shared::transport::delivery::{Replayed, SegmentLog};
 use dmprl_shared::transport::shared_memory::{
@@ -21,6 +22,7 @@ use super::recorder::{Evaluate, Recorder};
 use super::setup::Setup;
 use super::{ControlPipe, LearnerArgs};
 use crate::control::Report;
+use crate::journal::{Author, Entry, Journal, Piece};
 
 /// Sleep of a turn that found nothing to do: short beside a worker's segment of about 1 ms.
 const IDLE: Duration = Duration::from_micros(100);
@@ -36,7 +38,10 @@ pub fn run(args: &LearnerArgs, control: &ControlPipe) -> anyhow::Result<()> {
     let setup = Setup::read(&args.run)?;
     let spec = setup.run.spec()?.context("the run has no spec.json; a worker writes it first")?;
     let mut learner = make(&setup, &spec, args, control)?;
+    let journal = Journal::open(args.journal.as_deref(), Author::Learner(args.restarts))?;
+    journal.iter().for_each(|journal| note_all(&mut learner, journal));
     recover(&mut learner, &setup, control)?;
+    journal.iter().for_each(|journal| journal.note(Entry::Serving));
     let domain = args.domain.as_deref().context("--domain is missing")?;
     let plan = plan(&setup, learner.policy());
     let LearnerEnd { segments, parameters, acknowledgements } = serve(domain, &plan)?;
@@ -44,6 +49,7 @@ pub fn run(args: &LearnerArgs, control: &ControlPipe) -> anyhow::Result<()> {
     counters.policy_version = counters.policy_version.max(parameters.newest_version());
     counters.learner_restarts = counters.learner_restarts.max(args.restarts);
     let mut recorder = Recorder::new(&setup.run, control, &learner)?;
+    recorder.note_in(journal);
     let mut session = Session::start(learner, segments, parameters)?;
     control.send(&Report::LearnerReady)?;
     // A supervisor that is gone is noticed as a stop, which ends with a checkpoint; a report that
@@ -64,6 +70,22 @@ pub fn run(args: &LearnerArgs, control: &ControlPipe) -> anyhow::Result<()> {
     let env_failures = || env_failures_before.max(control.env_failures());
     let ending = Ending { finished, evaluate: &mut ask, env_failures: &env_failures };
     close(&mut session, &mut recorder, control, ending)
+}
+
+/// Notes where the learner begins and, from now on, every segment that comes.
+fn note_all(learner: &mut Learner, journal: &Journal) {
+    for (worker, mark) in (0..).zip(learner.inbox.settled()) {
+        journal.note(Entry::Restored(worker, *mark));
+    }
+    journal.note(Entry::Started((&learner.counters).into()));
+    let journal = journal.clone();
+    learner.witness.0 = Some(Box::new(move |segment, inserted| {
+        let piece = Piece::of(&segment.header, &segment.block);
+        journal.note(match inserted {
+            Ok(()) => Entry::Inserted(piece),
+            Err(why) => Entry::Refused(piece, why == Rejection::Duplicate),
+        });
+    }));
 }
 
 /// At delivery level `log`, inserts what came after the checkpoint.

@@ -14,6 +14,7 @@ use dmprl_shared::transport::delivery::Mark;
 
 use super::ControlPipe;
 use crate::control::{EvaluationRequest, Progress, Report};
+use crate::journal::{Entry, Journal};
 use crate::run_directory::RunDirectory;
 
 /// Between two progress reports.
@@ -41,6 +42,8 @@ pub struct Recorder<'a> {
     /// Disk trouble is told once until it is over: a full disk must not fill the terminal too.
     checkpoint_failing: bool,
     log_failing: bool,
+    /// Where somebody wants to know of every checkpoint.
+    journal: Option<Journal>,
 }
 
 /// Counts since a moment.
@@ -88,7 +91,13 @@ impl<'a> Recorder<'a> {
             checkpoints: Writer::new(run.checkpoints_path()),
             checkpoint_failing: false,
             log_failing: false,
+            journal: None,
         })
+    }
+
+    /// Notes checkpoints in a journal from now on, if there is one.
+    pub fn note_in(&mut self, journal: Option<Journal>) {
+        self.journal = journal;
     }
 
     /// Seconds of training, over all sessions.
@@ -217,6 +226,9 @@ impl<'a> Recorder<'a> {
     /// waits for that first: the disk is then slower than the run's interval.
     fn begin_checkpoint(&mut self, learner: &mut Learner) {
         self.end_checkpoint(learner);
+        if let Some(journal) = &self.journal {
+            journal.note(Entry::Cut((&learner.counters).into()));
+        }
         if let Err(error) = self.checkpoints.begin(learner) {
             self.tell_of_checkpoint(learner.counters.env_steps, Err(error));
         } else if learner.config().run.deterministic {

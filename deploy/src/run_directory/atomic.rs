@@ -34,3 +34,19 @@ pub(super) fn point(link: &Path, target: &Path) -> anyhow::Result<()> {
         .and_then(|()| fs::rename(&aside, link))
         .with_context(|| format!("cannot write {}", link.display()))
 }
+
+/// Removes what killed writers left beside the files of a folder; none may be at work there.
+pub(super) fn remove_asides(folder: &Path) -> anyhow::Result<()> {
+    let failed = |path: &Path| format!("cannot tidy up {}", path.display());
+    for entry in fs::read_dir(folder).with_context(|| failed(folder))? {
+        let path = entry.with_context(|| failed(folder))?.path();
+        let extension = path.extension().unwrap_or_default().to_string_lossy().into_owned();
+        let writer = extension.strip_prefix("tmp");
+        let is_aside = writer.is_some_and(|id| id.bytes().all(|byte| byte.is_ascii_digit()));
+        // Half-written checkpoints are folders, and the next checkpoint's business.
+        if is_aside && (path.is_symlink() || path.is_file()) {
+            fs::remove_file(&path).with_context(|| failed(&path))?;
+        }
+    }
+    Ok(())
+}

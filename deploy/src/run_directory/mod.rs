@@ -227,6 +227,16 @@ impl RunDirectory {
         Ok(!dmprl_learner::checkpoint::names(&self.checkpoints_path())?.is_empty())
     }
 
+    /// Removes what killed processes left half-written: each replaces files by writing them aside.
+    /// Only for the holder of the lock, when no other process of the run is left.
+    ///
+    /// # Errors
+    /// What the file system refuses.
+    pub fn remove_half_written(&self) -> anyhow::Result<()> {
+        let folders = ["", "policies", "checkpoints"];
+        folders.iter().try_for_each(|folder| atomic::remove_asides(&self.path.join(folder)))
+    }
+
     /// The standard error of one process of the run.
     #[must_use]
     pub fn log_path(&self, process: &str) -> PathBuf {

@@ -154,6 +154,27 @@ fn rewinding_forgets_what_came_after_the_checkpoint_and_keeps_the_rest_byte_for_
     assert_eq!(run.evaluations().unwrap(), [row(1, -3.0)]);
 }
 
+/// Learners that were killed while they cut the curve back left their half of it for good.
+#[test]
+fn what_killed_writers_left_beside_their_files_is_removed_and_nothing_else() {
+    let parent = tempfile::tempdir().unwrap();
+    let run = new_run(&parent);
+    let checkpoints = run.checkpoints_path();
+    fs::create_dir(checkpoints.join(".000002.tmp")).unwrap();
+    let left = ["evaluations.tmp21405", "segments.tmp", "policies/12.tmp", "checkpoints/best.tmp7"];
+    let kept = ["policies/12.safetensors", "evaluations.jsonl", "segments.log", "my.tmpfile"];
+    for name in left.iter().chain(&kept) {
+        fs::write(run.path().join(name), "").unwrap();
+    }
+    std::os::unix::fs::symlink("nowhere", checkpoints.join(".latest.tmp")).unwrap();
+    run.remove_half_written().unwrap();
+    let is_there = |name: &&&str| run.path().join(name).symlink_metadata().is_ok();
+    assert_eq!(left.iter().filter(is_there).count(), 0);
+    assert_eq!(kept.iter().filter(is_there).count(), kept.len());
+    assert!(checkpoints.join(".latest.tmp").symlink_metadata().is_err());
+    assert!(checkpoints.join(".000002.tmp").is_dir());
+}
+
 #[test]
 fn two_trainers_of_one_run_are_one_too_many() {
     let parent = tempfile::tempdir().unwrap();

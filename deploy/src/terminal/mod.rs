@@ -7,6 +7,7 @@ mod rounds;
 mod setup;
 mod summary;
 mod sweep;
+mod trial;
 
 pub use display::{Display, ProgressStyle};
 pub use format::{binary_bytes, duration, grouped, plus_minus, std_of};
@@ -15,6 +16,7 @@ pub use setup::SetupProgress;
 pub(crate) use summary::shown;
 pub use summary::summary;
 pub use sweep::SweepProgress;
+pub use trial::TrialProgress;
 
 /// Prints a line on standard error. `eprintln!` would end the program when nobody reads any
 /// more: a terminal closed in mid-run, a log on a full disk.

@@ -161,6 +161,7 @@ pub fn plan(
         init_from: None,
         learner_restarts: 0,
         sessions_before: 0,
+        journal: None,
     };
     (launcher, config.clone(), limits)
 }

@@ -1,9 +1,25 @@
 //! How segments come in: checked, settled and stored, or recovered from the log.
 
+use std::fmt;
+
 use dmprl_shared::segment::{HINDSIGHT, Rejection, Segment, check};
 use dmprl_shared::transport::delivery::{LogError, Replayed, SegmentLog};
 
 use super::Learner;
+
+/// Is told of a segment in the moment in which it is inserted or refused, before anybody else can
+/// see the difference.
+pub type Told = Box<dyn FnMut(&Segment, Result<(), Rejection>)>;
+
+/// Who is told, if anybody: `dmprl chaos` checks what the learner says by it.
+#[derive(Default)]
+pub struct Witness(pub Option<Told>);
+
+impl fmt::Debug for Witness {
+    fn fmt(&self, formatter: &mut fmt::Formatter<'_>) -> fmt::Result {
+        formatter.write_str(if self.0.is_some() { "Witness(somebody)" } else { "Witness(nobody)" })
+    }
+}
 
 impl Learner {
     /// Inserts a segment.
@@ -11,6 +27,14 @@ impl Learner {
     /// # Errors
     /// The reason if it does not fit; it is counted and changes nothing else.
     pub fn insert(&mut self, segment: &Segment) -> Result<(), Rejection> {
+        let inserted = self.take(segment);
+        if let Some(told) = &mut self.witness.0 {
+            told(segment, inserted);
+        }
+        inserted
+    }
+
+    fn take(&mut self, segment: &Segment) -> Result<(), Rejection> {
         self.counters.received += 1;
         let sound = check(&segment.header, &segment.block, &self.expected);
         // A header that fits says whose segment it is, so that its worker need not keep a block

@@ -11,6 +11,7 @@
 mod bench;
 mod bench_learner;
 mod bench_transport;
+mod chaos;
 mod deaths;
 mod determinism;
 mod endings;

@@ -97,6 +97,12 @@ impl Outbox {
         self.worker_id
     }
 
+    /// Which start of the worker.
+    #[must_use]
+    pub fn incarnation(&self) -> u32 {
+        self.incarnation
+    }
+
     /// What the worker has done so far.
     #[must_use]
     pub fn sent(&self) -> Sent {

@@ -152,6 +152,11 @@ impl<P> Membership<P> {
         self.port.as_ref()
     }
 
+    /// The generation it has joined, or last tried to.
+    pub(super) fn number(&self) -> u64 {
+        self.number
+    }
+
     /// Makes the port anew if there is a new generation or a connection failed; true if it did.
     ///
     /// # Errors

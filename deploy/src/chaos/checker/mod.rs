@@ -1,0 +1,314 @@
+//! Judges what the journals say: is nothing lost, nothing twice, nothing torn, nothing backwards?
+//!
+//! What a learner has is its *lineage*: what its checkpoint held, what it read from its log, what
+//! it inserted. A learner that starts is told by its checkpoint's marks how much of its
+//! predecessor's lineage is left; the log and the workers bring the rest. Of each segment four
+//! bytes are kept, its checksum at the worker; what was inserted is a number and the gaps below it.
+
+mod life;
+#[cfg(test)]
+mod tests;
+
+use std::collections::BTreeMap;
+
+use dmprl_shared::transport::delivery::Mark;
+
+use super::violations::Violations;
+use crate::journal::{Author, Entry, Piece, Record, Standing};
+use life::Life;
+
+/// A learner may get so far beyond an interval before it begins its checkpoint: while one is being
+/// written the next waits for it, and a segment crosses the line in one step.
+const INTERVALS_MAX: u64 = 2;
+/// Environment steps of a segment are fewer.
+const SEGMENT_STEPS: u64 = 100;
+
+/// What became of all segments.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub(super) struct Sums {
+    /// Finished by workers.
+    pub(super) produced: u64,
+    /// In the last learner's lineage.
+    pub(super) inserted: u64,
+    /// Refused for good, for another reason than that they came twice.
+    pub(super) rejected: u64,
+    /// Never sent, or never taken, by a worker that was killed or stopped.
+    pub(super) in_flight: u64,
+    /// Gone though acknowledged, or though later ones of their worker came.
+    pub(super) lost: u64,
+    /// Refused because they had come before: sent again to be safe.
+    pub(super) duplicate: u64,
+    /// Acknowledged to workers.
+    pub(super) acknowledged: u64,
+}
+
+/// Follows a run by its journals.
+pub(super) struct Checker {
+    /// Of each worker, by incarnation.
+    lives: Vec<BTreeMap<u32, Life>>,
+    /// The lineage's last segment of each worker.
+    settled: Vec<Mark>,
+    standing: Standing,
+    /// The beginning, and every checkpoint that was begun since, as far as they are still ahead of
+    /// nobody.
+    cuts: Vec<Standing>,
+    /// Environment steps since a checkpoint was begun, or a learner started to serve.
+    since_cut: u64,
+    checkpoint_interval: u64,
+    /// The newest learner that each worker has a policy of.
+    epochs: Vec<u64>,
+    duplicate: u64,
+    checkpoints: u64,
+    pub(super) violations: Violations,
+}
+
+impl Checker {
+    pub(super) fn new(workers: u32, checkpoint_interval: u64) -> Self {
+        let count = workers as usize;
+        Self {
+            lives: vec![BTreeMap::new(); count],
+            settled: vec![Mark::default(); count],
+            standing: Standing::default(),
+            cuts: vec![Standing::default()],
+            since_cut: 0,
+            checkpoint_interval,
+            epochs: vec![0; count],
+            duplicate: 0,
+            checkpoints: 0,
+            violations: Violations::default(),
+        }
+    }
+
+    /// Takes one record; all of one author come in order, and of a learner after those that were
+    /// written before.
+    pub(super) fn take(&mut self, author: Author, record: &Record) {
+        match (author, record.entry) {
+            (Author::Worker(worker, incarnation), entry) => {
+                if worker as usize >= self.lives.len() {
+                    self.violations.add(format!("I9: a journal of worker {worker}, who is none"));
+                } else {
+                    self.on_worker((worker, incarnation), entry);
+                }
+            }
+            (Author::Learner(_), Entry::Restored(worker, mark)) => self.on_restored(worker, mark),
+            (Author::Learner(deaths), Entry::Started(standing)) => {
+                self.on_started(deaths, standing);
+            }
+            (Author::Learner(_), Entry::Serving) => self.since_cut = 0,
+            (Author::Learner(_), Entry::Inserted(piece)) => self.on_inserted(&piece),
+            (Author::Learner(_), Entry::Refused(_, true)) => self.duplicate += 1,
+            (Author::Learner(_), Entry::Refused(piece, false)) => self.on_refused(&piece),
+            (Author::Learner(_), Entry::Cut(standing)) => {
+                self.cuts.push(standing);
+                self.checkpoints += 1;
+                self.since_cut = 0;
+            }
+            (author, entry) => {
+                self.violations.add(format!("I9: {author:?} has noted {entry:?}"));
+            }
+        }
+    }
+
+    /// Where the newest learner stands.
+    pub(super) fn standing(&self) -> Standing {
+        self.standing
+    }
+
+    /// The last segment of each worker that the newest learner has.
+    pub(super) fn settled(&self) -> &[Mark] {
+        &self.settled
+    }
+
+    /// Checkpoints that were begun.
+    pub(super) fn checkpoints(&self) -> u64 {
+        self.checkpoints
+    }
+
+    fn on_worker(&mut self, (worker, incarnation): (u32, u32), entry: Entry) {
+        let life = self.lives[worker as usize].entry(incarnation).or_default();
+        let name = format!("worker {worker}, incarnation {incarnation}");
+        match entry {
+            Entry::Produced(piece) => {
+                let expected = Mark { incarnation, sequence: life.produced.len() as u64 + 1 };
+                life.produced.push(piece.checksum);
+                if (piece.worker, piece.mark) != (worker, expected) {
+                    self.violations.add(format!(
+                        "I9: {name} has produced segment {} after {}",
+                        piece.mark.sequence,
+                        expected.sequence - 1
+                    ));
+                }
+            }
+            Entry::Acknowledged(mark) => {
+                if mark.sequence < life.acked || mark.sequence > life.produced.len() as u64 {
+                    self.violations.add(format!(
+                        "I1: {name} has had {} acknowledged after {}, and produced {}",
+                        mark.sequence,
+                        life.acked,
+                        life.produced.len()
+                    ));
+                }
+                life.acked = life.acked.max(mark.sequence);
+            }
+            Entry::Policy { epoch, version } => {
+                let newest = &mut self.epochs[worker as usize];
+                if epoch < *newest {
+                    let text = format!("I6: {name} has gone from epoch {newest} to {epoch}");
+                    self.violations.add(text);
+                }
+                *newest = epoch.max(*newest);
+                let (epoch_before, before) = life.policy;
+                if epoch == epoch_before && version < before {
+                    self.violations.add(format!(
+                        "I6: {name} has gone from policy {before} to {version} in epoch {epoch}"
+                    ));
+                }
+                life.policy = (epoch, version);
+            }
+            entry => self.violations.add(format!("I9: {name} has noted {entry:?}")),
+        }
+    }
+
+    /// The lineage goes back to what a checkpoint held.
+    fn on_restored(&mut self, worker: u32, mark: Mark) {
+        let Some(settled) = self.settled.get_mut(worker as usize) else {
+            self.violations.add(format!("I1: a checkpoint knows of worker {worker}, who is none"));
+            return;
+        };
+        if mark > *settled {
+            self.violations.add(format!(
+                "I1: a learner goes on from {mark:?} of worker {worker}, of which {settled:?} was \
+                 the last inserted"
+            ));
+        }
+        *settled = mark.min(*settled);
+        for (incarnation, life) in &mut self.lives[worker as usize] {
+            if *incarnation >= mark.incarnation {
+                let kept = if *incarnation == mark.incarnation { mark.sequence } else { 0 };
+                life.forget_after(kept);
+            }
+        }
+    }
+
+    fn on_started(&mut self, deaths: u64, standing: Standing) {
+        let lineage: u64 = self.all_lives().map(Life::inserted).sum();
+        if lineage != standing.segments {
+            self.violations.add(format!(
+                "I5: the learner after {deaths} deaths counts {} segments, its marks are of \
+                 {lineage}",
+                standing.segments
+            ));
+        }
+        // The newest checkpoint may have been on its way to the disk; the one before was there.
+        match self.cuts.iter().rposition(|cut| *cut == standing) {
+            Some(index) if index + 2 >= self.cuts.len() => self.cuts.truncate(index + 1),
+            Some(index) => {
+                self.violations.add(format!(
+                    "I5: the learner after {deaths} deaths has gone back {} checkpoints, to \
+                     {standing:?}",
+                    self.cuts.len() - 1 - index
+                ));
+                self.cuts.truncate(index + 1);
+            }
+            None => {
+                self.violations.add(format!(
+                    "I5: the learner after {deaths} deaths begins with {standing:?}, of which no \
+                     checkpoint was made"
+                ));
+                self.cuts.push(standing);
+            }
+        }
+        self.standing = standing;
+        self.since_cut = 0;
+    }
+
+    fn on_inserted(&mut self, piece: &Piece) {
+        let Some(mark) = self.arrive(piece, "inserted") else { return };
+        let life = self.lives[piece.worker as usize].entry(mark.incarnation).or_default();
+        life.settle(mark.sequence);
+        self.settled[piece.worker as usize] = mark;
+        self.standing.segments += 1;
+        self.standing.env_steps += piece.env_steps;
+        let before = self.since_cut;
+        self.since_cut += piece.env_steps;
+        let limit = INTERVALS_MAX * self.checkpoint_interval + SEGMENT_STEPS;
+        if before <= limit && self.since_cut > limit {
+            self.violations.add(format!("I5: no checkpoint was begun in {limit} steps"));
+        }
+    }
+
+    fn on_refused(&mut self, piece: &Piece) {
+        let Some(mark) = self.arrive(piece, "refused") else { return };
+        let life = self.lives[piece.worker as usize].entry(mark.incarnation).or_default();
+        life.settle(mark.sequence);
+        life.refused.insert(mark.sequence);
+        self.settled[piece.worker as usize] = mark;
+    }
+
+    /// What holds for every segment that a learner settles; none if it is not the next.
+    fn arrive(&mut self, piece: &Piece, what: &str) -> Option<Mark> {
+        let Piece { worker, mark, checksum, .. } = *piece;
+        let name = format!(
+            "segment {} of worker {worker}, incarnation {}, was {what}",
+            mark.sequence, mark.incarnation
+        );
+        let Some(last) = self.settled.get(worker as usize).copied() else {
+            self.violations.add(format!("I9: {name}, and there is no such worker"));
+            return None;
+        };
+        let life = self.lives[worker as usize].get(&mark.incarnation);
+        let index = usize::try_from(mark.sequence).unwrap_or(usize::MAX).wrapping_sub(1);
+        match life.and_then(|life| life.produced.get(index)) {
+            None => self.violations.add(format!("I9: {name}, and nobody had produced it")),
+            Some(produced) if *produced != checksum => self.violations.add(format!(
+                "I4: {name} with checksum {checksum:#010x}, produced with {produced:#010x}"
+            )),
+            Some(_) => {}
+        }
+        if mark > last {
+            return Some(mark);
+        }
+        if life.is_some_and(|life| life.holds(mark.sequence)) {
+            self.violations.add(format!("I2: {name} twice"));
+        } else {
+            self.violations.add(format!("I3: {name} after {last:?}"));
+        }
+        None
+    }
+
+    fn all_lives(&self) -> impl Iterator<Item = &Life> {
+        self.lives.iter().flat_map(BTreeMap::values)
+    }
+
+    /// Judges what is left at the end, when every journal has been read.
+    pub(super) fn conclude(&mut self) -> Sums {
+        let mut sums = Sums { duplicate: self.duplicate, ..Sums::default() };
+        for (worker, lives) in self.lives.iter().enumerate() {
+            for (incarnation, life) in lives {
+                let lost = life.lost();
+                sums.produced += life.produced.len() as u64;
+                sums.inserted += life.inserted();
+                sums.rejected += life.refused.len() as u64;
+                sums.in_flight += life.in_flight();
+                sums.acknowledged += life.acked;
+                sums.lost += lost;
+                if lost > 0 {
+                    self.violations.add(format!(
+                        "I1: {lost} segments of worker {worker}, incarnation {incarnation}, are \
+                         lost: {} acknowledged, {} inserted",
+                        life.acked,
+                        life.inserted()
+                    ));
+                }
+            }
+        }
+        let Sums { produced, inserted, rejected, in_flight, lost, .. } = sums;
+        if produced != inserted + rejected + in_flight + lost {
+            self.violations.add(format!(
+                "I9: {produced} segments were produced, and {inserted} inserted, {rejected} \
+                 rejected, {in_flight} in flight, {lost} lost"
+            ));
+        }
+        sums
+    }
+}

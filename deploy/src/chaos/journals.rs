@@ -1,0 +1,190 @@
+//! Reads the journals of a run while they are written, and removes those of the dead.
+
+use std::collections::BTreeMap;
+use std::fs::{self, File};
+use std::io::Read;
+use std::path::{Path, PathBuf};
+
+use anyhow::Context;
+
+use super::violations::Violations;
+use crate::journal::{Author, RECORD_BYTES, Record};
+
+/// All journals of a folder. Together they take what was written since the last look and what the
+/// living have written so far: those of the dead are removed when they have been read.
+pub(super) struct Journals {
+    folder: PathBuf,
+    open: BTreeMap<Author, Tail>,
+    /// Nothing is removed any more: somebody will want to read it.
+    keep: bool,
+}
+
+/// A file that may grow.
+struct Tail {
+    file: File,
+    /// Bytes of a record that is not whole yet.
+    rest: Vec<u8>,
+    records: Vec<Record>,
+    /// Records that are none.
+    damaged: u64,
+}
+
+impl Tail {
+    fn open(path: &Path) -> anyhow::Result<Self> {
+        let file = File::open(path).with_context(|| format!("cannot read {}", path.display()))?;
+        Ok(Self { file, rest: Vec::new(), records: Vec::new(), damaged: 0 })
+    }
+
+    fn read(&mut self) -> std::io::Result<()> {
+        self.file.read_to_end(&mut self.rest)?;
+        let (whole, _) = self.rest.as_chunks::<RECORD_BYTES>();
+        for bytes in whole {
+            match Record::decode(bytes) {
+                Some(record) => self.records.push(record),
+                None => self.damaged += 1,
+            }
+        }
+        let read = whole.len() * RECORD_BYTES;
+        self.rest.drain(..read);
+        Ok(())
+    }
+}
+
+impl Journals {
+    pub(super) fn new(folder: PathBuf) -> Self {
+        Self { folder, open: BTreeMap::new(), keep: false }
+    }
+
+    /// Keeps the files from now on.
+    pub(super) fn keep(&mut self) {
+        self.keep = true;
+    }
+
+    /// Hands on every record that was written since the last time: all of the workers', which come
+    /// before what the learners say of them.
+    pub(super) fn fold(
+        &mut self,
+        violations: &mut Violations,
+        mut each: impl FnMut(Author, &Record),
+    ) -> anyhow::Result<()> {
+        // What a learner has inserted by now its workers have noted before: so theirs are read, and
+        // listed, afterwards.
+        let learners = self.read(|author| matches!(author, Author::Learner(_)))?;
+        let workers = self.read(|author| matches!(author, Author::Worker(..)))?;
+        for author in workers.into_iter().chain(learners) {
+            let Some(tail) = self.open.get_mut(&author) else { continue };
+            tail.records.drain(..).for_each(|record| each(author, &record));
+            let damaged = std::mem::take(&mut tail.damaged);
+            if damaged > 0 {
+                violations.add(format!("I9: {damaged} records of {author:?} are damaged"));
+            }
+        }
+        self.remove_read();
+        Ok(())
+    }
+
+    /// Reads the journals of some authors; returns them in order.
+    fn read(&mut self, whose: impl Fn(&Author) -> bool) -> anyhow::Result<Vec<Author>> {
+        let failed = || format!("cannot read the journals in {}", self.folder.display());
+        let mut authors = Vec::new();
+        for entry in fs::read_dir(&self.folder).with_context(failed)? {
+            let name = entry.with_context(failed)?.file_name();
+            authors.extend(name.to_str().and_then(Author::of).filter(&whose));
+        }
+        authors.sort_unstable();
+        // The newest first: when a successor has written something, its predecessor is dead, and
+        // what is then read of that is all.
+        for author in authors.iter().rev() {
+            let tail = match self.open.entry(*author) {
+                std::collections::btree_map::Entry::Occupied(open) => open.into_mut(),
+                std::collections::btree_map::Entry::Vacant(place) => {
+                    place.insert(Tail::open(&author.path(&self.folder))?)
+                }
+            };
+            tail.read().with_context(|| format!("cannot read the journal of {author:?}"))?;
+        }
+        Ok(authors)
+    }
+
+    /// Removes those that have a successor: it was there before they were read for the last time.
+    fn remove_read(&mut self) {
+        if self.keep {
+            return;
+        }
+        let authors: Vec<Author> = self.open.keys().copied().collect();
+        for pair in authors.windows(2) {
+            let succeeded = match (pair[0], pair[1]) {
+                (Author::Worker(one, _), Author::Worker(other, _)) => one == other,
+                (Author::Learner(_), Author::Learner(_)) => true,
+                _ => false,
+            };
+            if succeeded {
+                self.open.remove(&pair[0]);
+                // One that cannot be removed now goes with the folder.
+                let _ = fs::remove_file(pair[0].path(&self.folder));
+            }
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::io::Write;
+
+    use dmprl_shared::transport::delivery::Mark;
+
+    use super::*;
+    use crate::journal::{Entry, Journal};
+
+    fn journal(folder: &Path, author: Author) -> Journal {
+        Journal::open(Some(folder), author).unwrap().unwrap()
+    }
+
+    fn acknowledged(sequence: u64) -> Entry {
+        Entry::Acknowledged(Mark { incarnation: 0, sequence })
+    }
+
+    fn fold(journals: &mut Journals) -> (Vec<(Author, Entry)>, Violations) {
+        let (mut found, mut violations) = (Vec::new(), Violations::default());
+        let each = |author, record: &Record| found.push((author, record.entry));
+        journals.fold(&mut violations, each).unwrap();
+        (found, violations)
+    }
+
+    #[test]
+    fn records_come_once_workers_first_and_the_journals_of_the_dead_are_removed() {
+        let folder = tempfile::tempdir().unwrap();
+        let (first, second) = (Author::Worker(0, 9), Author::Worker(0, 10));
+        let learner = journal(folder.path(), Author::Learner(0));
+        let worker = journal(folder.path(), first);
+        let mut journals = Journals::new(folder.path().to_owned());
+        learner.note(Entry::Serving);
+        worker.note(acknowledged(1));
+        let expected = [(first, acknowledged(1)), (Author::Learner(0), Entry::Serving)];
+        assert_eq!(fold(&mut journals).0, expected);
+        assert_eq!(fold(&mut journals).0, []);
+        worker.note(acknowledged(2));
+        journal(folder.path(), second).note(acknowledged(3));
+        assert_eq!(fold(&mut journals).0, [(first, acknowledged(2)), (second, acknowledged(3))]);
+        assert!(!first.path(folder.path()).exists() && second.path(folder.path()).exists());
+    }
+
+    #[test]
+    fn a_torn_record_is_waited_for_and_a_damaged_one_is_told() {
+        let folder = tempfile::tempdir().unwrap();
+        let author = Author::Learner(0);
+        let record = Record { entry: Entry::Serving, time_us: 1 }.encode();
+        let mut file = File::create(author.path(folder.path())).unwrap();
+        let mut journals = Journals::new(folder.path().to_owned());
+        file.write_all(&record[..50]).unwrap();
+        let (found, violations) = fold(&mut journals);
+        assert!(found.is_empty() && violations.is_empty());
+        file.write_all(&record[50..]).unwrap();
+        assert_eq!(fold(&mut journals).0, [(author, Entry::Serving)]);
+        let mut damaged = record;
+        damaged[0] ^= 1;
+        file.write_all(&damaged).unwrap();
+        let (found, violations) = fold(&mut journals);
+        assert_eq!((found.len(), violations.count()), (0, 1));
+    }
+}

@@ -1,0 +1,150 @@
+//! What a trial has shown, as JSON and as text.
+
+use serde_json::{Value, json};
+
+use super::checker::Sums;
+use super::nemesis::Done;
+use super::samples::{Samples, median};
+
+/// The outcome of a trial.
+pub struct Report {
+    pub(super) seed: u64,
+    pub(super) workers: u32,
+    /// From the first strike to the last [s].
+    pub(super) seconds: f64,
+    pub(super) interrupted: bool,
+    pub(super) done: Done,
+    pub(super) violations: Vec<String>,
+    pub(super) sums: Sums,
+    pub(super) env_steps: u64,
+    pub(super) checkpoints: u64,
+    pub(super) worker_back_s: Vec<f64>,
+    pub(super) learner_back_s: Vec<f64>,
+    /// Segments of each worker while nothing was broken, and for how long [s].
+    pub(super) undisturbed: Vec<u64>,
+    pub(super) undisturbed_s: f64,
+    pub(super) samples: Samples,
+    /// Where everything lies, if it is kept.
+    pub(super) kept: Option<String>,
+}
+
+impl Report {
+    /// Whether everything held.
+    #[must_use]
+    pub fn is_sound(&self) -> bool {
+        self.violations.is_empty()
+    }
+
+    /// Whether the user ended it.
+    #[must_use]
+    pub fn is_interrupted(&self) -> bool {
+        self.interrupted
+    }
+
+    /// The most segments of a worker over the fewest, while nothing was broken.
+    fn fairness(&self) -> Option<f64> {
+        let (most, fewest) = (self.undisturbed.iter().max()?, self.undisturbed.iter().min()?);
+        (*fewest > 0).then(|| *most as f64 / *fewest as f64)
+    }
+
+    /// One object.
+    #[must_use]
+    pub fn json(&self) -> Value {
+        let Sums { produced, inserted, rejected, in_flight, lost, duplicate, acknowledged } =
+            self.sums;
+        let done = &self.done;
+        let mut object = json!({
+            "seed": self.seed,
+            "workers": self.workers,
+            "seconds": self.seconds,
+            "interrupted": self.interrupted,
+            "violations": self.violations,
+            "worker_kills": done.worker_kills,
+            "learner_kills": done.learner_kills,
+            "learner_kills_in_recovery": done.learner_kills_in_recovery,
+            "learner_kills_in_checkpoint": done.learner_kills_in_checkpoint,
+            "evaluator_kills": done.evaluator_kills,
+            "stops": done.stops,
+            "strikes_left_out": done.left_out,
+            "produced": produced,
+            "inserted": inserted,
+            "rejected": rejected,
+            "in_flight": in_flight,
+            "lost": lost,
+            "duplicate": duplicate,
+            "acknowledged": acknowledged,
+            "env_steps": self.env_steps,
+            "checkpoints": self.checkpoints,
+            "worker_back_s": back(&self.worker_back_s),
+            "learner_back_s": back(&self.learner_back_s),
+            "fairness": self.fairness(),
+            "undisturbed_s": self.undisturbed_s,
+            "held": self.samples.summary(),
+            "kept": self.kept,
+        });
+        for (name, ratio) in self.samples.ratios() {
+            object[name] = ratio.into();
+        }
+        object
+    }
+
+    /// A few lines.
+    #[must_use]
+    pub fn text(&self) -> String {
+        let Sums { produced, inserted, rejected, in_flight, lost, duplicate, .. } = self.sums;
+        let done = &self.done;
+        let mut lines = vec![
+            format!(
+                "killed       {} workers, {} learners ({} recovering, {} writing a checkpoint), {} \
+                 evaluators; stopped {} times",
+                done.worker_kills,
+                done.learner_kills,
+                done.learner_kills_in_recovery,
+                done.learner_kills_in_checkpoint,
+                done.evaluator_kills,
+                done.stops
+            ),
+            format!(
+                "segments     {produced} produced = {inserted} inserted + {rejected} rejected + \
+                 {in_flight} in flight + {lost} lost; {duplicate} came twice and were refused"
+            ),
+            format!("worker back  {}", shown(&self.worker_back_s)),
+            format!("learner back {}", shown(&self.learner_back_s)),
+            format!(
+                "fairness     {} between {} workers, in {:.0} s undisturbed",
+                number(self.fairness()),
+                self.workers,
+                self.undisturbed_s
+            ),
+        ];
+        let grown = self.samples.ratios();
+        let grown: Vec<_> =
+            grown.iter().map(|(name, ratio)| format!("{name} {}", number(*ratio))).collect();
+        lines.push(format!("grown        {}", grown.join(", ")));
+        match self.violations.len() {
+            0 => lines
+                .push(format!("violations   none in {:.0} s, seed {}", self.seconds, self.seed)),
+            count => {
+                lines.push(format!("violations   {count}, seed {}:", self.seed));
+                lines.extend(self.violations.iter().map(|violation| format!("  {violation}")));
+            }
+        }
+        lines.extend(self.kept.iter().map(|path| format!("kept         {path}")));
+        lines.join("\n")
+    }
+}
+
+fn back(seconds: &[f64]) -> Value {
+    let max = seconds.iter().copied().reduce(f64::max);
+    json!({ "count": seconds.len(), "p50": median(seconds), "max": max })
+}
+
+fn shown(seconds: &[f64]) -> String {
+    let max = seconds.iter().copied().reduce(f64::max);
+    let (count, p50) = (seconds.len(), number(median(seconds)));
+    format!("after {p50} s (median of {count}), at most {} s", number(max))
+}
+
+fn number(number: Option<f64>) -> String {
+    number.map_or_else(|| "—".to_owned(), |number| format!("{number:.2}"))
+}
