@@ -55,6 +55,12 @@ impl CallState {
         self.0.store(number << 2 | kind as u64, Ordering::Relaxed);
         RunningCall(self)
     }
+
+    /// Whether a call is under way.
+    #[must_use]
+    pub fn is_running(&self) -> bool {
+        self.0.load(Ordering::Relaxed) & 3 != 0
+    }
 }
 
 impl Drop for RunningCall<'_> {

@@ -78,6 +78,8 @@ pub enum Report {
     },
     /// What a worker did since its last such report.
     Sent(Sent),
+    /// A worker's sign of life, a few times in each limit of the supervisor.
+    Alive(Doing),
     /// A call into the environments does not return; the process ends itself after this.
     EnvHung {
         /// The sentence.
@@ -97,6 +99,30 @@ pub enum Report {
         /// The sentence.
         message: String,
     },
+}
+
+/// What a worker does when it gives a sign of life.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Doing {
+    /// It waits for a learner, or for its first policy.
+    Attaching,
+    /// It steps environments; what a call into them does is the watchdog's business.
+    Stepping,
+    /// It waits because its queue or its outbox is full.
+    Waiting,
+}
+
+impl Doing {
+    /// As part of a sentence.
+    #[must_use]
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Attaching => "waiting for a learner",
+            Self::Stepping => "stepping environments",
+            Self::Waiting => "waiting for the learner to take its segments",
+        }
+    }
 }
 
 /// Where the learner stands. Every number is finite: JSON has no NaN, and a line with one is no

@@ -8,7 +8,7 @@ use anyhow::{Context, bail};
 use tokio::sync::mpsc;
 
 use super::child::{Child, EVENTS_MAX, Event, describe};
-use super::endings::log_tail;
+use super::deaths::log_tail;
 use super::{Launcher, Process, TimeLimits, interrupts};
 use crate::control::{Command, EvaluationRequest, EvaluationRow, Report};
 use crate::run_directory::RunDirectory;

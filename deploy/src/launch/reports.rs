@@ -31,6 +31,7 @@ impl Supervisor {
     }
 
     fn on_report(&mut self, process: Process, report: Report) -> anyhow::Result<()> {
+        self.heard(process, &report);
         match report {
             Report::EnvironmentReady { spec } => return self.on_environment(process, spec),
             Report::LearnerReady => return self.on_learner_ready(process),
@@ -54,13 +55,17 @@ impl Supervisor {
                 return self.on_not_evaluated(process, policy_version, &reason);
             }
             Report::EnvFailures { count, last } => self.on_env_failures(process, count, &last),
-            Report::Sent(sent) => self.sent += sent,
+            Report::Sent(sent) => {
+                self.sent += sent;
+                if sent.sent > 0 {
+                    self.worked(process);
+                }
+            }
+            Report::Alive(_) => {}
             Report::EnvHung { message } => self.on_env_hung(process, &message),
             Report::Checkpoint { name, env_steps } => {
                 self.checkpointed = true;
-                if let Some(learner) = self.slots.get_mut(&Process::Learner) {
-                    learner.restarts = 0;
-                }
+                self.worked(process);
                 let steps = grouped(env_steps);
                 self.display.message(&format!("checkpoint {name} at {steps} steps"));
             }
@@ -236,9 +241,7 @@ impl Supervisor {
             "{process} evaluated policy {policy_version}, which nobody asked for"
         );
         // One that answers now and then is worth each restart.
-        if let Some(slot) = self.slots.get_mut(&Process::Evaluator) {
-            slot.restarts = 0;
-        }
+        self.forgive(Process::Evaluator);
         self.send_evaluation();
         Ok(())
     }

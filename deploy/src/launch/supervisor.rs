@@ -12,9 +12,10 @@ use dmprl_shared::transport::delivery::Sent;
 use tokio::sync::mpsc;
 
 use super::child::{Child, EVENTS_MAX, Event};
+use super::deaths::Death;
 use super::evaluations::EvaluationQueue;
 use super::{Launcher, Process, TimeLimits};
-use crate::control::{Command, EvaluationRow, Progress};
+use crate::control::{Command, Doing, EvaluationRow, Progress};
 use crate::terminal::Display;
 
 /// What the supervisor needs to know.
@@ -82,6 +83,9 @@ pub(super) enum Phase {
 #[derive(Debug, Default)]
 pub(super) struct Slot {
     pub(super) running: Option<Running>,
+    /// All starts of this session: each has a number of its own.
+    pub(super) starts: u32,
+    /// Restarts since it was last known to do its work.
     pub(super) restarts: u32,
     pub(super) restart_at: Option<Instant>,
 }
@@ -94,6 +98,35 @@ pub(super) struct Running {
     pub(super) ready: bool,
     /// A worker that knows where the learner is, and finds the next by itself.
     pub(super) attached: bool,
+    /// When it last said anything, and what it then did.
+    pub(super) heard: Instant,
+    pub(super) doing: Option<Doing>,
+    /// When it first and last told of work: a worker of segments sent, a learner of checkpoints.
+    pub(super) worked: Option<(Instant, Instant)>,
+    /// Why the supervisor has killed it.
+    pub(super) killed_for: Option<Death>,
+}
+
+impl Running {
+    pub(super) fn new(child: Child) -> Self {
+        let now = Instant::now();
+        Self {
+            child,
+            spawned: now,
+            ready: false,
+            attached: false,
+            heard: now,
+            doing: None,
+            worked: None,
+            killed_for: None,
+        }
+    }
+
+    /// SIGKILL; the exit, which comes as an event, is then told as this.
+    pub(super) fn kill_for(&mut self, death: Death) {
+        self.child.kill();
+        self.killed_for = Some(death);
+    }
 }
 
 pub(super) struct Supervisor {
@@ -181,24 +214,35 @@ pub async fn supervise(plan: SupervisorPlan) -> SessionReport {
     };
     let started = supervisor.start();
     supervisor.check(started);
+    let mut woke = now;
     while !supervisor.is_over() {
-        let (looked, due) = (Instant::now(), supervisor.next_deadline());
+        // A terminal that takes nothing (Ctrl-S) may have held it up.
+        let looked = Instant::now();
+        supervisor.on_wake(woke, woke, looked);
+        let due = supervisor.next_deadline();
         let wake = tokio::select! {
             biased;
             Some(()) = interrupts.recv() => Wake::Interrupt,
             Some(event) = incoming.recv() => Wake::Event(event),
             () = tokio::time::sleep_until(due.into()) => Wake::Time,
         };
-        supervisor.on_wake(looked, due, Instant::now());
+        woke = Instant::now();
+        supervisor.on_wake(looked, due, woke);
         match wake {
             Wake::Interrupt => supervisor.on_interrupt(),
             Wake::Event(event) => {
                 let handled = supervisor.on_event(event);
                 supervisor.check(handled);
             }
-            Wake::Time => {}
+            Wake::Time => {
+                // Whoever has spoken meanwhile is heard first.
+                tokio::task::yield_now().await;
+                if incoming.is_empty() {
+                    supervisor.check_heartbeats(woke);
+                }
+            }
         }
-        let handled = supervisor.on_time(Instant::now());
+        let handled = supervisor.on_time(woke);
         supervisor.check(handled);
     }
     supervisor.report()
@@ -228,10 +272,9 @@ impl Supervisor {
     pub(super) fn spawn(&mut self, process: Process) -> anyhow::Result<()> {
         let slot = self.slots.entry(process).or_default();
         slot.restart_at = None;
-        let command = self.launcher.command(process, slot.restarts)?;
-        let child = Child::spawn(command, process, self.events.clone())?;
-        slot.running =
-            Some(Running { child, spawned: Instant::now(), ready: false, attached: false });
+        let command = self.launcher.command(process, slot.starts)?;
+        slot.starts += 1;
+        slot.running = Some(Running::new(Child::spawn(command, process, self.events.clone())?));
         Ok(())
     }
 

@@ -14,8 +14,8 @@ use dmprl_shared::transport::{ParameterSubscriber, TransportError};
 
 use super::delivery::{ATTACH, ATTACH_LIMIT, Delivery, Stopped, attach_within};
 use super::setup::Setup;
-use super::{ActorArgs, ControlPipe, environments};
-use crate::control::{Command, Report};
+use super::{ActorArgs, ControlPipe, environments, heartbeat};
+use crate::control::{Command, Doing, Report};
 
 /// How long one look for a command may block, so that a stop is seen.
 const COMMAND_WAIT: Duration = Duration::from_millis(100);
@@ -35,6 +35,7 @@ pub fn run(args: &ActorArgs, control: &ControlPipe) -> anyhow::Result<()> {
     let worker = u64::from(args.index) << 32 | u64::from(args.incarnation);
     interpreter.seed(seeds::derive(config.run.seed, "python", worker))?;
     let envs = environments::make(&interpreter, config, config.actors.envs_per_worker, control)?;
+    heartbeat::start(control, envs.calls())?;
     control.send(&Report::EnvironmentReady { spec: envs.spec().clone() })?;
     if args.index == 0 && args.incarnation == 0 {
         hint(config, &envs, control);
@@ -50,6 +51,7 @@ pub fn run(args: &ActorArgs, control: &ControlPipe) -> anyhow::Result<()> {
     let mut delivery = Delivery::new(control, deadline, end, outbox);
     await_first_policy(&mut delivery, &mut rollout, control)?;
     while !control.stop_requested() {
+        control.beat(Doing::Stepping);
         take_newest(&mut delivery, &mut rollout)?;
         let stepped = rollout.segment(&mut |header, block| delivery.deliver(header, block));
         environments::tell(&rollout.take_failures(), control);
@@ -84,6 +86,7 @@ fn await_attach(
         if control.stop_requested() {
             return Ok(None);
         }
+        control.beat(Doing::Attaching);
         if let Some(Command::Attach { domain }) = control.next_within(COMMAND_WAIT) {
             return attach_within(control, (&domain, plan), index);
         }
@@ -117,6 +120,7 @@ fn await_first_policy(
                 delivery.index()
             );
         }
+        control.beat(Doing::Attaching);
         std::thread::sleep(ATTACH);
     }
     Ok(())

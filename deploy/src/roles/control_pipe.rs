@@ -11,7 +11,8 @@ use std::time::Duration;
 use anyhow::{Context, ensure};
 use dmprl_shared::transport::delivery::Sent;
 
-use crate::control::{Command, GROUP_SIGNALS, Report};
+use super::heartbeat::Pulse;
+use crate::control::{Command, Doing, GROUP_SIGNALS, Report};
 use crate::terminal::say;
 
 /// A worker or evaluator whose supervisor is gone has so long to end before it is killed.
@@ -44,6 +45,7 @@ pub struct ControlPipe {
     commands: Mutex<Receiver<Command>>,
     flags: Arc<Flags>,
     reporter: Reporter,
+    pulse: Arc<Pulse>,
 }
 
 /// Sends reports, from any thread.
@@ -108,7 +110,8 @@ impl ControlPipe {
             orphaned();
         });
         let reporter = Reporter(Arc::new(Mutex::new(Box::new(output))));
-        Self { commands: Mutex::new(commands), flags, reporter }
+        let pulse = Arc::new(Pulse::new(Doing::Attaching));
+        Self { commands: Mutex::new(commands), flags, reporter, pulse }
     }
 
     /// Whether to finish and exit: on `stop`, or because the supervisor is gone.
@@ -160,6 +163,17 @@ impl ControlPipe {
     /// The supervisor is gone.
     pub fn send(&self, report: &Report) -> anyhow::Result<()> {
         self.reporter.send(report)
+    }
+
+    /// Notes that the role's loop has come round once more, for the heartbeat.
+    pub fn beat(&self, doing: Doing) {
+        self.pulse.beat(doing);
+    }
+
+    /// What [`ControlPipe::beat`] notes.
+    #[must_use]
+    pub fn pulse(&self) -> Arc<Pulse> {
+        Arc::clone(&self.pulse)
     }
 
     /// Sends reports too, for threads of their own.

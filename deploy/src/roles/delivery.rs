@@ -11,7 +11,7 @@ use dmprl_shared::transport::shared_memory::{Plan, WorkerEnd, attach};
 use dmprl_shared::transport::{SendOutcome, TransportError};
 
 use super::ControlPipe;
-use crate::control::Report;
+use crate::control::{Doing, Report};
 
 /// Sleep between two tries to attach, or looks for the first policy.
 pub const ATTACH: Duration = Duration::from_millis(2);
@@ -34,6 +34,7 @@ pub fn attach_within(
 ) -> anyhow::Result<Option<WorkerEnd>> {
     let deadline = Instant::now() + ATTACH_LIMIT;
     loop {
+        control.beat(Doing::Attaching);
         match attach(domain, plan, index as usize) {
             Ok(end) => return Ok(Some(end)),
             Err(error @ TransportError::Incompatible { .. }) => return Err(error.into()),
@@ -136,6 +137,7 @@ impl<'a> Delivery<'a> {
                 };
                 self.warn(format!("worker {} has waited {seconds} s: {why}", self.index()));
             }
+            self.control.beat(Doing::Waiting);
             std::thread::sleep(pause);
             pause = (pause * 2).min(FULL_QUEUE_MAX);
         }

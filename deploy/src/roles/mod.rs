@@ -13,6 +13,7 @@ mod delivery;
 mod environments;
 #[cfg(feature = "python")]
 mod evaluator;
+mod heartbeat;
 mod learner;
 #[cfg(feature = "python")]
 mod one_process;

@@ -80,7 +80,8 @@ fn a_container_with_too_little_shared_memory_is_told_before_it_starts() {
     let line = train("reacher", &run, &["--workers", "2"]).join(" ");
     let script = format!("exec {} {line}", executable().display());
     let Some(command) = with_shared_memory_of(256, &script) else { return };
-    let words = ["needed for 2 workers", "256.0 KiB free in /dev/shm", "--shm-size"];
+    let words =
+        ["needed for 2 workers and 4 that may join", "256.0 KiB free in /dev/shm", "--shm-size"];
     refused_by_its_size(command, &place, &words);
 }
 
@@ -111,7 +112,7 @@ fn too_few_open_files_are_refused_with_both_numbers() {
     let line = train("reacher", &run, &["--workers", "4"]).join(" ");
     let mut command = Command::new("bash");
     command.args(["-c", &format!("ulimit -n 64; exec {} {line}", executable().display())]);
-    refused_by_its_size(command, &place, &["open files: 112 needed", "the limit is 64"]);
+    refused_by_its_size(command, &place, &["open files: 160 needed", "the limit is 64"]);
 }
 
 #[test]
@@ -130,7 +131,8 @@ fn resume_asks_for_the_same_room_and_leaves_the_run_as_it_is() {
 /// The numbers that a start is refused by are bounds of what a run really takes.
 #[test]
 fn what_is_asked_for_covers_what_a_run_takes() {
-    const WORKERS: usize = 4;
+    /// The run's own and those that may join.
+    const WORKERS: usize = 4 + 4;
     let place = Workplace::new();
     let run = place.path("run");
     let more = ["--steps", ENDLESS, "--workers", "4"];
