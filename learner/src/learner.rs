@@ -389,6 +389,7 @@ impl Learner {
             policy_lag_p50: collected.lag.map(|lag| lag.0),
             policy_lag_max: collected.lag.map(|lag| lag.1),
             updates_owed: self.pacing.owed(),
+            workers: 0,
             wall_s: 0.0,
             env_steps_per_s: 0.0,
             updates_per_s: 0.0,

@@ -171,11 +171,11 @@ impl Supervisor {
             .filter(|(process, running)| now >= running.spawned + self.ready_limit(*process))
             .map(|(process, _)| process);
         for process in late.collect::<Vec<_>>() {
-            let limit = self.ready_limit(process);
+            let (limit, joined) = (self.ready_limit(process), self.is_joined(process));
             let Some(slot) = self.slots.get_mut(&process) else { continue };
             let Some(running) = slot.running.as_mut() else { continue };
             running.kill_for(Death::too_slow(format!("not ready within {limit:?}")));
-            if slot.restarts == 0 {
+            if slot.restarts == 0 && !joined {
                 let tail = log_tail(&self.log_path(process));
                 return Err(anyhow!("{process} was not ready within {limit:?}{tail}"));
             }

@@ -44,6 +44,11 @@ impl Death {
         Self { verb: "hung", cause }
     }
 
+    /// It had joined and is of no use.
+    pub(super) fn sent_away(cause: String) -> Self {
+        Self { verb: "was sent away", cause }
+    }
+
     /// It did not come to an end with what it was to do.
     pub(super) fn too_slow(cause: String) -> Self {
         Self { verb: "was killed", cause }
@@ -162,7 +167,7 @@ impl Supervisor {
     }
 
     /// Workers that live or will again.
-    fn workers_left(&self) -> usize {
+    pub(super) fn workers_left(&self) -> usize {
         let lives = |(process, slot): &(&Process, &Slot)| {
             let lives = slot.running.is_some() || slot.restart_at.is_some();
             matches!(process, Process::Actor(_)) && lives
@@ -188,6 +193,14 @@ impl Supervisor {
             wait.as_secs_f64(),
         ));
         true
+    }
+
+    /// Where to read more of a process, as part of a sentence.
+    pub(super) fn log_of(&self, process: Process) -> String {
+        match self.is_joined(process) {
+            true => "its own terminal has more".to_owned(),
+            false => format!("log: {}", shown(&self.log_path(process))),
+        }
     }
 
     pub(super) fn log_path(&self, process: Process) -> std::path::PathBuf {

@@ -127,6 +127,8 @@ impl Evaluation {
                     Report::Warning { message } | Report::EnvHung { message },
                 )) => say(&message),
                 Some(Event::Report(..) | Event::Garbage(..)) => {}
+                // Nobody joins an evaluation.
+                Some(Event::Asked(_) | Event::Gone(_)) => {}
                 Some(Event::Exited(_, status)) => bail!("{}", self.died(status)),
                 None => bail!("the evaluator is gone"),
             }

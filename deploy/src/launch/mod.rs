@@ -24,6 +24,7 @@ mod env_failures;
 mod evaluate;
 mod evaluations;
 mod heartbeats;
+mod joining;
 mod launcher;
 mod learner_restarts;
 mod limits;
@@ -34,7 +35,7 @@ mod supervisor;
 
 pub(crate) use child::describe;
 pub(crate) use deaths::last_lines;
-pub(crate) use domain::{Place, create as create_domain};
+pub(crate) use domain::{Place, create as create_domain, token as domain_token};
 pub use evaluate::{EvaluationPlan, evaluate};
 pub use launcher::{Launcher, Process};
 pub use limits::TimeLimits;

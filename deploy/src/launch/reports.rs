@@ -17,7 +17,19 @@ const GARBAGE_SHOWN_MAX: u32 = 3;
 impl Supervisor {
     pub(super) fn on_event(&mut self, event: Event) -> anyhow::Result<()> {
         match event {
-            Event::Report(process, report) => self.on_report(process, report),
+            Event::Report(process, report) => {
+                let handled = self.on_report(process, report);
+                match handled {
+                    Err(error) if self.is_joined(process) => self.send_away(process, &error),
+                    handled => return handled,
+                }
+                Ok(())
+            }
+            Event::Asked(newcomer) => {
+                self.on_asked(newcomer);
+                Ok(())
+            }
+            Event::Gone(process) => self.on_gone(process),
             Event::Exited(process, status) => self.on_exit(process, status),
             Event::Garbage(process, line) => {
                 self.garbage += 1;
@@ -62,6 +74,7 @@ impl Supervisor {
                 }
             }
             Report::Alive(_) => {}
+            Report::Left => self.on_left(process),
             Report::EnvHung { message } => self.on_env_hung(process, &message),
             Report::Checkpoint { name, env_steps } => {
                 self.checkpointed = true;
@@ -146,6 +159,10 @@ impl Supervisor {
             {
                 running.attached = true;
             }
+            if self.is_joined(process) {
+                self.display.message(&format!("{process} has joined: {}", self.counted()));
+            }
+            self.tell_learner_of_counts();
         }
     }
 

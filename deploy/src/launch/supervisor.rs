@@ -14,7 +14,7 @@ use tokio::sync::mpsc;
 use super::child::{Child, EVENTS_MAX, Event};
 use super::deaths::Death;
 use super::evaluations::EvaluationQueue;
-use super::{Launcher, Process, TimeLimits};
+use super::{Launcher, Process, TimeLimits, joining};
 use crate::control::{Command, Doing, EvaluationRow, Progress};
 use crate::terminal::Display;
 
@@ -103,6 +103,8 @@ pub(super) struct Running {
     pub(super) doing: Option<Doing>,
     /// When it first and last told of work: a worker of segments sent, a learner of checkpoints.
     pub(super) worked: Option<(Instant, Instant)>,
+    /// A worker that had joined has said that it leaves.
+    pub(super) left: bool,
     /// Why the supervisor has killed it.
     pub(super) killed_for: Option<Death>,
 }
@@ -118,6 +120,7 @@ impl Running {
             heard: now,
             doing: None,
             worked: None,
+            left: false,
             killed_for: None,
         }
     }
@@ -180,7 +183,7 @@ pub async fn supervise(plan: SupervisorPlan) -> SessionReport {
     let SupervisorPlan { launcher, config, limits, display, mut interrupts } = plan;
     let (events, mut incoming) = mpsc::channel(EVENTS_MAX);
     let now = Instant::now();
-    let limit = limits.evaluation_of(config.evaluation.episodes);
+    let (mut woke, limit) = (now, limits.evaluation_of(config.evaluation.episodes));
     let mut supervisor = Supervisor {
         launcher,
         config,
@@ -214,7 +217,6 @@ pub async fn supervise(plan: SupervisorPlan) -> SessionReport {
     };
     let started = supervisor.start();
     supervisor.check(started);
-    let mut woke = now;
     while !supervisor.is_over() {
         // A terminal that takes nothing (Ctrl-S) may have held it up.
         let looked = Instant::now();
@@ -261,7 +263,13 @@ impl Supervisor {
         if self.is_one_process() {
             return Ok(());
         }
-        let workers = u32::try_from(self.config.actors.workers).context("too many workers")?;
+        let actors = &self.config.actors;
+        if let Some(domain) = self.launcher.domain.as_ref().filter(|_| actors.joined_max > 0)
+            && let Err(error) = joining::listen(domain, self.events.clone())
+        {
+            self.display.message(&format!("warning: nobody can join this run: {error:#}"));
+        }
+        let workers = u32::try_from(actors.workers).context("too many workers")?;
         (0..workers).try_for_each(|index| self.spawn(Process::Actor(index)))
     }
 
@@ -284,6 +292,14 @@ impl Supervisor {
 
     pub(super) fn all_running(&self) -> impl Iterator<Item = (Process, &Running)> {
         self.slots.iter().filter_map(|(process, slot)| Some((*process, slot.running.as_ref()?)))
+    }
+
+    /// Workers that are attached: the run's own, and those that have joined.
+    pub(super) fn workers(&self) -> usize {
+        let attached = self.all_running().filter(|(process, running)| {
+            matches!(process, Process::Actor(_)) && running.attached && running.killed_for.is_none()
+        });
+        attached.count()
     }
 
     /// Sends a command to a child. One that takes none is stuck or dying; its deadline or its

@@ -1,6 +1,7 @@
 //! The worker process: stage 3.
 
 use std::path::Path;
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
 use anyhow::{Context, bail};
@@ -8,7 +9,7 @@ use dmprl_actors::python_env::{Interpreter, InterpreterOptions, PythonEnvironmen
 use dmprl_actors::rollout::{Identity, Rollout, RolloutError};
 use dmprl_shared::config::{ExperimentConfig, Hindsight};
 use dmprl_shared::seeds;
-use dmprl_shared::transport::delivery::Outbox;
+use dmprl_shared::transport::delivery::{Outbox, Sent};
 use dmprl_shared::transport::shared_memory::{Plan, WorkerEnd};
 use dmprl_shared::transport::{ParameterSubscriber, TransportError};
 
@@ -19,6 +20,8 @@ use crate::control::{Command, Doing, Report};
 
 /// How long one look for a command may block, so that a stop is seen.
 const COMMAND_WAIT: Duration = Duration::from_millis(100);
+/// One that leaves a run that goes on waits so long for its acknowledgements.
+const HAND_OVER: Duration = Duration::from_secs(5);
 
 /// Starts the run's interpreter.
 pub fn interpreter(venv: Option<&Path>, config: &ExperimentConfig) -> anyhow::Result<Interpreter> {
@@ -27,26 +30,53 @@ pub fn interpreter(venv: Option<&Path>, config: &ExperimentConfig) -> anyhow::Re
     Ok(Interpreter::start(&InterpreterOptions { venv: venv.to_owned(), python_path })?)
 }
 
+/// Which worker of which run.
+pub struct Seat<'a> {
+    pub setup: &'a Setup,
+    pub index: u32,
+    pub incarnation: u32,
+    pub venv: Option<&'a Path>,
+}
+
+/// What is different for a worker that joined by somebody else's doing.
+pub struct Guest<'a> {
+    /// Set when it was asked to leave a run that goes on.
+    pub leaving: &'a AtomicBool,
+    /// Told about once a second what was sent.
+    pub tell: &'a mut dyn FnMut(Sent),
+}
+
 /// Steps environments until a stop is asked for.
 pub fn run(args: &ActorArgs, control: &ControlPipe) -> anyhow::Result<()> {
-    let setup = Setup::read(&args.run)?;
+    let setup = Setup::read(args.run.as_deref().context("--run is missing")?)?;
+    let index = args.index.context("--index is missing")?;
+    let (incarnation, venv) = (args.incarnation, args.venv.as_deref());
+    work(&Seat { setup: &setup, index, incarnation, venv }, control, None)
+}
+
+/// Steps environments until a stop is asked for.
+pub fn work(
+    seat: &Seat<'_>,
+    control: &ControlPipe,
+    mut guest: Option<Guest<'_>>,
+) -> anyhow::Result<()> {
+    let Seat { setup, index, incarnation, venv } = *seat;
     let config = &setup.config;
-    let interpreter = interpreter(args.venv.as_deref(), config)?;
-    let worker = u64::from(args.index) << 32 | u64::from(args.incarnation);
+    let interpreter = interpreter(venv, config)?;
+    let worker = u64::from(index) << 32 | u64::from(incarnation);
     interpreter.seed(seeds::derive(config.run.seed, "python", worker))?;
     let envs = environments::make(&interpreter, config, config.actors.envs_per_worker, control)?;
     heartbeat::start(control, envs.calls())?;
     control.send(&Report::EnvironmentReady { spec: envs.spec().clone() })?;
-    if args.index == 0 && args.incarnation == 0 {
+    if index == 0 && incarnation == 0 {
         hint(config, &envs, control);
     }
-    let identity =
-        Identity { run_id: setup.run_id, worker_id: args.index, incarnation: args.incarnation };
+    let identity = Identity { run_id: setup.run_id, worker_id: index, incarnation };
     let mut rollout = Rollout::start(config, envs, identity)?;
-    let plan = super::learner::plan(&setup, rollout.policy());
-    let Some(end) = await_attach(control, &plan, args.index)? else { return Ok(()) };
+    let plan = super::learner::plan(setup, rollout.policy());
+    let Some(end) = await_attach(control, &plan, index)? else { return Ok(()) };
     let kept = config.delivery.unacknowledged_segments;
-    let outbox = Outbox::new(rollout.policy().layout(), kept, args.index, args.incarnation);
+    let outbox = Outbox::new(rollout.policy().layout(), kept, index, incarnation);
     let deadline = Duration::from_secs_f64(config.actors.send_deadline_s);
     let mut delivery = Delivery::new(control, deadline, end, outbox);
     await_first_policy(&mut delivery, &mut rollout, control)?;
@@ -55,14 +85,25 @@ pub fn run(args: &ActorArgs, control: &ControlPipe) -> anyhow::Result<()> {
         take_newest(&mut delivery, &mut rollout)?;
         let stepped = rollout.segment(&mut |header, block| delivery.deliver(header, block));
         environments::tell(&rollout.take_failures(), control);
-        delivery.report_in_time()?;
+        if delivery.report_in_time()?
+            && let Some(guest) = &mut guest
+        {
+            (guest.tell)(delivery.sent());
+        }
         match stepped {
             Ok(()) => {}
             Err(Stopped::Asked) => break,
             Err(Stopped::Failed(error)) => return Err(error),
         }
     }
-    delivery.report()
+    if guest.as_ref().is_some_and(|guest| guest.leaving.load(Ordering::Acquire)) {
+        delivery.hand_over(HAND_OVER)?;
+    }
+    delivery.report()?;
+    if let Some(guest) = &mut guest {
+        (guest.tell)(delivery.sent());
+    }
+    Ok(())
 }
 
 /// A sparse reward is hardly ever met by chance: says what helps, where it can be had.

@@ -143,6 +143,27 @@ impl<'a> Delivery<'a> {
         }
     }
 
+    /// Offers what is kept until the learner has acknowledged all of it, for `limit` at most.
+    #[cfg(feature = "python")]
+    pub fn hand_over(&mut self, limit: Duration) -> anyhow::Result<()> {
+        let deadline = Instant::now() + limit;
+        loop {
+            self.hear()?;
+            if self.outbox.is_empty() || self.control.orphaned() || Instant::now() >= deadline {
+                return Ok(());
+            }
+            self.outbox.offer(&mut self.end.segments)?;
+            self.control.beat(Doing::Waiting);
+            std::thread::sleep(FULL_QUEUE_MAX);
+        }
+    }
+
+    /// What the worker has done so far.
+    #[cfg(feature = "python")]
+    pub fn sent(&self) -> Sent {
+        self.outbox.sent()
+    }
+
     /// Forgets what the learner has acknowledged.
     fn hear(&mut self) -> anyhow::Result<()> {
         if self.end.acknowledgements.newest(&mut self.acknowledgements)? {
@@ -151,10 +172,14 @@ impl<'a> Delivery<'a> {
         Ok(())
     }
 
-    /// Tells the supervisor what was sent, once a second.
+    /// Tells the supervisor what was sent, once a second; whether it was time to.
     #[cfg(feature = "python")]
-    pub fn report_in_time(&mut self) -> anyhow::Result<()> {
-        if self.reported_at.elapsed() >= REPORT_INTERVAL { self.report() } else { Ok(()) }
+    pub fn report_in_time(&mut self) -> anyhow::Result<bool> {
+        let due = self.reported_at.elapsed() >= REPORT_INTERVAL;
+        if due {
+            self.report()?;
+        }
+        Ok(due)
     }
 
     /// Tells the supervisor what was sent since the last time.

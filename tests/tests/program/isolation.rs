@@ -267,6 +267,37 @@ fn nothing_of_the_working_directory_or_of_pythons_variables_is_imported() {
 }
 
 #[test]
+fn the_processes_of_a_run_gain_no_privileges_and_leave_no_core_dumps() {
+    let place = Workplace::new();
+    let run = place.path("run");
+    let mut running = place.start(&train("reacher", &run, &["--steps", ENDLESS]));
+    running.until_steps(&run, 1_500);
+    let mut joined = place.start(&["actor", "--join", &run]);
+    joined.until_said("segments sent");
+    let roles = ["learner", "evaluator", "actor"];
+    let processes: Vec<_> = place
+        .processes()
+        .into_iter()
+        .filter(|process| roles.contains(&process.role.as_str()))
+        .collect();
+    let joined_too = processes.len() == roles.len() + 1;
+    assert!(joined_too, "one each, and the worker that joined: {processes:#?}");
+    for process in processes {
+        let folder = PathBuf::from(format!("/proc/{}", process.id.as_raw_nonzero()));
+        let line = |what: &str, name: &str| {
+            let text = fs::read_to_string(folder.join(what)).unwrap();
+            let line = text.lines().find(|line| line.starts_with(name)).unwrap().to_owned();
+            line[name.len()..].split_whitespace().map(str::to_owned).collect::<Vec<_>>()
+        };
+        assert_eq!(line("status", "NoNewPrivs:"), ["1"], "{process:?}");
+        assert_eq!(line("limits", "Max core file size")[..2], ["0", "0"], "{process:?}");
+    }
+    running.signal(Signal::INT);
+    running.wait().with_status(130);
+    joined.wait().with_status(0);
+}
+
+#[test]
 fn a_run_listens_on_no_socket_of_the_network() {
     let place = Workplace::new();
     let run = place.path("run");
