@@ -4,6 +4,7 @@
 //! End of input means that the supervisor is gone: the child ends itself (the learner after a
 //! checkpoint), so no SIGKILL of the supervisor leaves an orphan.
 
+use std::fmt::{self, Display, Formatter};
 use std::path::PathBuf;
 
 use anyhow::ensure;
@@ -17,6 +18,70 @@ pub const ENV_HUNG_STATUS: i32 = 75;
 /// What a terminal or a service manager sends to the whole process group. Only the supervisor
 /// listens; roles ignore it.
 pub const GROUP_SIGNALS: [i32; 3] = [libc::SIGINT, libc::SIGTERM, libc::SIGHUP];
+
+/// Where a run's supervisor takes in workers that join, below its private directory.
+pub const JOIN_SOCKET: &str = "join.sock";
+/// Version of what a supervisor and a worker that joins say to each other. Children are of the
+/// same build and need none.
+const CONTROL_VERSION: u32 = 1;
+
+/// Which program speaks; the supervisor says so first.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Greeting {
+    /// Of the program.
+    pub version: String,
+    /// Of this protocol.
+    pub control: u32,
+}
+
+impl Greeting {
+    /// This program.
+    #[must_use]
+    pub fn this() -> Self {
+        Self { version: env!("CARGO_PKG_VERSION").to_owned(), control: CONTROL_VERSION }
+    }
+}
+
+impl Display for Greeting {
+    fn fmt(&self, formatter: &mut Formatter<'_>) -> fmt::Result {
+        write!(formatter, "dmprl {} (protocol {})", self.version, self.control)
+    }
+}
+
+/// From a worker that asks to join.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct JoinRequest {
+    /// Which program it is.
+    pub speaks: Greeting,
+}
+
+/// From the supervisor to a worker that has asked to join.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case", deny_unknown_fields)]
+pub enum JoinAnswer {
+    /// It may.
+    Welcome(Welcome),
+    /// It may not.
+    Refused {
+        /// Why, and what can be done.
+        reason: String,
+    },
+}
+
+/// What a worker that joins is from now on.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Welcome {
+    /// Which of the run's workers.
+    pub index: u32,
+    /// Which start of it.
+    pub incarnation: u32,
+    /// The run's Python virtual environment.
+    pub venv: Option<PathBuf>,
+    /// How many workers there are, with it.
+    pub workers: usize,
+}
 
 /// From the supervisor to a role.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -36,6 +101,11 @@ pub enum Command {
     },
     /// To the learner: what all workers have reported to the supervisor, in the whole run.
     Sent(Sent),
+    /// To the learner: so many workers are attached.
+    Workers {
+        /// The run's own and those that have joined.
+        count: u64,
+    },
     /// To the learner: the run has reached its goal or its time; finish as at the last step, with a
     /// last evaluation.
     Finish,
@@ -78,11 +148,15 @@ pub enum Report {
     },
     /// What a worker did since its last such report.
     Sent(Sent),
+    /// A worker's sign of life, a few times in each limit of the supervisor.
+    Alive(Doing),
     /// A call into the environments does not return; the process ends itself after this.
     EnvHung {
         /// The sentence.
         message: String,
     },
+    /// A worker that had joined leaves; it has handed over what it could.
+    Left,
     /// The learner wrote a checkpoint.
     Checkpoint {
         /// Its directory's name below `checkpoints/`.
@@ -97,6 +171,30 @@ pub enum Report {
         /// The sentence.
         message: String,
     },
+}
+
+/// What a worker does when it gives a sign of life.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Doing {
+    /// It waits for a learner, or for its first policy.
+    Attaching,
+    /// It steps environments; what a call into them does is the watchdog's business.
+    Stepping,
+    /// It waits because its queue or its outbox is full.
+    Waiting,
+}
+
+impl Doing {
+    /// As part of a sentence.
+    #[must_use]
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Attaching => "waiting for a learner",
+            Self::Stepping => "stepping environments",
+            Self::Waiting => "waiting for the learner to take its segments",
+        }
+    }
 }
 
 /// Where the learner stands. Every number is finite: JSON has no NaN, and a line with one is no

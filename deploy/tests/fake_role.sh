@@ -33,6 +33,16 @@ row() {
 evaluate() {
     echo '{"evaluate":{"env_steps":10,"updates":10,"segments":2,"wall_s":1.0,"policy_version":'"$1"'}}'
 }
+# Signs of life until the process ends; what it was told is noted meanwhile.
+beat() {
+    (while kill -0 $$ 2>/dev/null; do echo '{"alive":"stepping"}'; sleep 0.1; done) &
+}
+sent() {
+    echo '{"sent":{"produced":1,"sent":1,"resent":0,"acked":0}}'
+}
+starts() {
+    grep -c started "$fake/$name.seen"
+}
 # 0 on stop or finish, 1 at end of input.
 until_stop() {
     while read -r line; do
@@ -65,7 +75,17 @@ actor-failing)
     exit 0
     ;;
 actor-refused) echo 'error: no environment Fake-v0' >&2; exit 1 ;;
-actor-dies) ready; exit 3 ;;
+actor-dies) ready; echo 'error: out of luck' >&2; exit 3 ;;
+actor-beating) ready; beat; until_stop; exit 0 ;;
+actor-freezes-once)
+    ready
+    [ "$incarnation" = 0 ] || beat
+    echo '{"alive":"waiting"}'
+    until_stop
+    exit 0
+    ;;
+actor-dies-after-work) ready; sent; sleep 0.3; sent; kill -9 $$ ;;
+actor-dies-before-work) ready; sent; kill -9 $$ ;;
 actor-dies-once)
     ready
     [ "$incarnation" = 0 ] && kill -9 $$
@@ -109,6 +129,24 @@ learner-dies-once)
     fi
     echo '"first_segment"'
     evaluate 2
+    finish
+    ;;
+learner-dies-after-work)
+    # Lives for a while with a checkpoint in it, and comes to its end at the fourth start.
+    echo '"learner_ready"'
+    [ "$(starts)" = 4 ] && finish
+    echo '{"checkpoint":{"name":"001","env_steps":10}}'
+    sleep 0.3
+    kill -9 $$
+    ;;
+learner-dies-after-a-checkpoint)
+    echo '"learner_ready"'
+    echo '{"checkpoint":{"name":"001","env_steps":10}}'
+    kill -9 $$
+    ;;
+learner-after-four-starts)
+    echo '"learner_ready"'
+    while ! grep -q 'started 3' "$fake/actor-0.seen"; do :; done
     finish
     ;;
 learner-refuses) echo 'error: no such checkpoint' >&2; exit 1 ;;

@@ -74,7 +74,11 @@ fn a_worker_that_keeps_dying_is_given_up_and_the_rest_goes_on() {
     fixture.config.actors.restarts_max = 2;
     let (report, shown) = fixture.supervise_until("giving up on it after 2 restarts");
     assert!(matches!(report.ending, Ending::Interrupted), "{:?}\n{shown}", report.ending);
+    assert!(shown.contains("actor-0 died (exit status 3) again"), "{shown}");
     assert!(shown.contains("going on with 1 of 2 workers"), "{shown}");
+    let last_words = shown.split("going on with 1 of 2 workers").nth(1).unwrap();
+    assert!(last_words.contains("logs/actor-0.log:\n"), "{shown}");
+    assert!(last_words.contains("error: out of luck"), "{shown}");
     assert_eq!(fixture.seen("actor-0").matches("started").count(), 3);
 }
 

@@ -142,7 +142,7 @@ impl Learner {
         run_id: u64,
     ) -> Result<Self, LearnerError> {
         let policy = Policy::new(&config, spec)?;
-        let (workers, envs) = (config.actors.workers, config.actors.envs_per_worker);
+        let (workers, envs) = (config.actors.places(), config.actors.envs_per_worker);
         let layout = policy.layout();
         let algorithm = Algorithm::new(&config, &policy)?;
         let random = seeds::stream(config.run.seed, "replay", 0);
@@ -394,6 +394,7 @@ impl Learner {
             policy_lag_p50: collected.lag.map(|lag| lag.0),
             policy_lag_max: collected.lag.map(|lag| lag.1),
             updates_owed: self.pacing.owed(),
+            workers: 0,
             wall_s: 0.0,
             env_steps_per_s: 0.0,
             updates_per_s: 0.0,

@@ -36,6 +36,9 @@ pub struct MetricsLine {
     /// On the way from workers to learner, over the whole run.
     #[serde(default)]
     pub delivery: DeliveryLine,
+    /// Workers that are attached, those that have joined included.
+    #[serde(default)]
+    pub workers: u64,
     /// Starts of the learner after a death within a session, over the whole run.
     #[serde(default)]
     pub learner_restarts: u64,

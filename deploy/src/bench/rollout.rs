@@ -56,6 +56,8 @@ pub fn rollout(bench: RolloutBench) -> anyhow::Result<Option<Figures>> {
 fn measure(mut bench: RolloutBench) -> anyhow::Result<Figures> {
     let watch = Watch::start()?;
     bench.config.actors.send_deadline_s = SEND_DEADLINE_S;
+    // Nobody joins a benchmark.
+    bench.config.actors.joined_max = 0;
     let folder = tempfile::Builder::new().prefix("dmprl-bench-").tempdir();
     let folder = folder.context("cannot make a folder for the workers' run")?;
     let manifest = Manifest::new(None)?;

@@ -30,11 +30,21 @@ pub(crate) fn check(config: &ExperimentConfig, spec: Option<&EnvSpec>) -> anyhow
 }
 
 impl Need {
+    /// Its workers, as part of a sentence.
+    pub(crate) fn counted(&self) -> String {
+        let Self { workers, joined, .. } = self;
+        let workers = format!("{workers} worker{}", if *workers == 1 { "" } else { "s" });
+        match joined {
+            0 => workers,
+            joined => format!("{workers} and {joined} that may join (actors.joined_max)"),
+        }
+    }
+
     /// What the machine has too little of, one sentence each.
     pub(crate) fn shortages(&self, machine: &MachineLimits) -> Vec<String> {
         let mut shortages = Vec::new();
-        let Self { workers, shared_memory_bytes, replay_bytes, open_files, maps, tasks } = *self;
-        let counted = format!("{workers} worker{}", if workers == 1 { "" } else { "s" });
+        let Self { shared_memory_bytes, replay_bytes, open_files, maps, tasks, .. } = *self;
+        let counted = self.counted();
         if let Some(Space { path, free_bytes, .. }) = &machine.shared_memory
             && *free_bytes < shared_memory_bytes
         {
@@ -84,6 +94,7 @@ mod tests {
 
     const NEED: Need = Need {
         workers: 4,
+        joined: 0,
         shared_memory_bytes: 5 << 20,
         replay_bytes: 1 << 30,
         open_files: 112,

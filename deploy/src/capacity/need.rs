@@ -22,8 +22,10 @@ const TASKS_PER_WORKER: u64 = 4;
 /// Upper bounds, but for what depends on an environment that nobody has seen yet.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) struct Need {
-    /// Rollout processes.
+    /// Rollout processes,
     pub(crate) workers: u64,
+    /// and those that may join.
+    pub(crate) joined: u64,
     /// Shared memory of all processes together [bytes]; 0 where one process does everything.
     pub(crate) shared_memory_bytes: u64,
     /// Replay at the end of the run [bytes].
@@ -52,11 +54,12 @@ impl Need {
         let actors = &config.actors;
         let one_process = config.run.deterministic;
         let shared =
-            || required_bytes(actors.workers, actors.queue_segments, layout, parameters_len);
-        let workers = whole(actors.workers);
-        let each = |base: u64, count: u64| base.saturating_add(count.saturating_mul(workers));
+            || required_bytes(actors.places(), actors.queue_segments, layout, parameters_len);
+        let places = whole(actors.places());
+        let each = |base: u64, count: u64| base.saturating_add(count.saturating_mul(places));
         Self {
-            workers,
+            workers: whole(actors.workers),
+            joined: whole(actors.joined_max),
             shared_memory_bytes: if one_process { 0 } else { shared() },
             replay_bytes: replay_bytes(config, layout),
             open_files: each(FILES, FILES_PER_WORKER),
@@ -111,7 +114,7 @@ mod tests {
         assert!(largest.shared_memory_bytes > 1_024 * 65_536 * (256 + 255 + 255) * 4);
         assert!(largest.shared_memory_bytes < 1 << 40);
         assert_eq!(largest.replay_bytes, (2_147_483_648 / 255) * (256 + 255 + 255) * 4);
-        assert_eq!(largest.open_files, 64 + 1_024 * 12);
+        assert_eq!(largest.open_files, 64 + (1_024 + 4) * 12);
     }
 
     #[test]

@@ -33,6 +33,7 @@ EXAMPLES
   dmprl train reacher                      train with the defaults; nothing else is needed
   dmprl eval runs/reacher-td3-dmp-s1-…    how well does its best policy do?
   dmprl resume runs/reacher-td3-dmp-s1-…  go on where it stopped
+  dmprl actor --join runs/reacher-td3-…   one more worker for a run that is being trained
   dmprl tasks                              what can be trained
   dmprl doctor                             what this machine has and lacks
 
@@ -130,7 +131,7 @@ fn run(command: Command) -> anyhow::Result<Outcome> {
         Command::Doctor(args) => doctor::run(&args),
         Command::Clean(args) => clean::run(&args),
         Command::Learner(args) => roles::learner(&args).map(|()| Outcome::Done),
-        Command::Actor(args) => roles::actor(&args).map(|()| Outcome::Done),
+        Command::Actor(args) => roles::actor(&args),
         Command::Evaluator(args) => roles::evaluator(&args).map(|()| Outcome::Done),
         Command::TransportWorker(args) => transport_worker(&args).map(|()| Outcome::Done),
     }

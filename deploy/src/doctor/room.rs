@@ -27,6 +27,7 @@ fn largest(runs: &[DefaultRun]) -> Need {
     let of = |run: &DefaultRun| Need::of(&run.config, Some(&spec_of(run.task)));
     let nothing = Need {
         workers: 0,
+        joined: 0,
         shared_memory_bytes: 0,
         replay_bytes: 0,
         open_files: 0,
@@ -35,6 +36,7 @@ fn largest(runs: &[DefaultRun]) -> Need {
     };
     runs.iter().map(of).fold(nothing, |most, need| Need {
         workers: most.workers.max(need.workers),
+        joined: most.joined.max(need.joined),
         shared_memory_bytes: most.shared_memory_bytes.max(need.shared_memory_bytes),
         replay_bytes: most.replay_bytes.max(need.replay_bytes),
         open_files: most.open_files.max(need.open_files),
@@ -51,7 +53,7 @@ fn shared_memory(place: &Place, space: Option<&Space>, need: &Need) -> Check {
     };
     let needed = format!(
         "a default run with {} here needs {}",
-        workers(need),
+        need.counted(),
         binary_bytes(need.shared_memory_bytes)
     );
     let found = format!(
@@ -87,7 +89,7 @@ fn shared_memory(place: &Place, space: Option<&Space>, need: &Need) -> Check {
 }
 
 fn limit(name: &'static str, limit: Option<u64>, needed: u64, need: &Need, raise: &str) -> Check {
-    let beside = format!("a default run with {} here needs {needed}", workers(need));
+    let beside = format!("a default run with {} here needs {needed}", need.counted());
     match limit {
         None => Check::ok(name, format!("no limit; {beside}")),
         Some(limit) if limit >= needed => Check::ok(name, format!("at most {limit}; {beside}")),
@@ -97,10 +99,6 @@ fn limit(name: &'static str, limit: Option<u64>, needed: u64, need: &Need, raise
             Check::problem(name, format!("at most {limit}; {beside}"), advice)
         }
     }
-}
-
-fn workers(need: &Need) -> String {
-    format!("{} worker{}", need.workers, if need.workers == 1 { "" } else { "s" })
 }
 
 fn leftovers(place: &Place) -> Check {
@@ -127,6 +125,7 @@ mod tests {
 
     const NEED: Need = Need {
         workers: 3,
+        joined: 0,
         shared_memory_bytes: 5 << 20,
         replay_bytes: 0,
         open_files: 100,

@@ -1,17 +1,21 @@
 //! One child process: its commands go in, its reports and its end come out as events.
 
+use std::os::fd::OwnedFd;
 use std::os::unix::process::{CommandExt, ExitStatusExt};
 use std::process::ExitStatus;
 use std::sync::Arc;
 use std::time::Duration;
 
 use anyhow::Context;
-use tokio::io::{AsyncBufReadExt, AsyncReadExt, AsyncWriteExt, BufReader};
-use tokio::process::{ChildStdin, ChildStdout};
+use rustix::process::{Signal, pidfd_send_signal};
+use tokio::io::Interest;
+use tokio::io::unix::AsyncFd;
+use tokio::io::{AsyncBufReadExt, AsyncRead, AsyncReadExt, AsyncWrite, AsyncWriteExt, BufReader};
 use tokio::sync::{Notify, mpsc};
 
 use super::Process;
-use crate::control::{Command, ENV_HUNG_STATUS, GROUP_SIGNALS, Report};
+use super::joining::Newcomer;
+use crate::control::{Command, ENV_HUNG_STATUS, GROUP_SIGNALS, JoinAnswer, Report};
 
 /// Events not yet handled; full: children wait, their pipes fill.
 pub(super) const EVENTS_MAX: usize = 1_024;
@@ -21,6 +25,8 @@ const COMMANDS_MAX: usize = 64;
 const LINE_BYTES_MAX: u64 = 1 << 20;
 /// After a child's exit its last reports are read for so long: a grandchild may hold the pipe.
 const LAST_REPORTS: Duration = Duration::from_secs(1);
+/// A worker that had joined and has closed its connection has so long to end by itself.
+const SILENT_EXIT: Duration = Duration::from_secs(10);
 
 /// What a child did.
 #[derive(Debug)]
@@ -30,6 +36,10 @@ pub(super) enum Event {
     Garbage(Process, String),
     /// It is gone, and everything it reported has been handed over.
     Exited(Process, ExitStatus),
+    /// A worker asks to join.
+    Asked(Newcomer),
+    /// A worker that had joined is gone, as `Exited`; its status is another's business.
+    Gone(Process),
 }
 
 /// A running child. Dropping it kills the process when the runtime ends.
@@ -78,6 +88,56 @@ impl Child {
         Ok(Self { commands, kill })
     }
 
+    /// Goes on with a worker that joins, which is told `answer` first. Its process is watched by
+    /// its descriptor: a connection may be held open by what it has forked.
+    pub(super) fn join(
+        newcomer: Newcomer,
+        answer: &JoinAnswer,
+        process: Process,
+        events: mpsc::Sender<Event>,
+    ) -> anyhow::Result<Self> {
+        let Newcomer { stream, process: descriptor, .. } = newcomer;
+        // SAFETY: an owned descriptor is the same until it is dropped, and nobody else has it.
+        let descriptor = unsafe { AsyncFd::register_with_interest(descriptor, Interest::READABLE) };
+        let descriptor = descriptor.context("cannot watch its process")?;
+        let mut answer = serde_json::to_vec(answer).context("cannot write an answer")?;
+        answer.push(b'\n');
+        let (input, mut output) = stream.into_split();
+        let (commands, receiver) = mpsc::channel(COMMANDS_MAX);
+        tokio::spawn(async move {
+            if output.write_all(&answer).await.is_ok() {
+                write_commands(output, receiver).await;
+            }
+        });
+        let mut reader = tokio::spawn(read_reports(input, process, events.clone()));
+        let kill = Arc::new(Notify::new());
+        let killed = Arc::clone(&kill);
+        tokio::spawn(async move {
+            let mut listening = true;
+            let mut grace = Box::pin(tokio::time::sleep(Duration::MAX));
+            loop {
+                tokio::select! {
+                    _ = descriptor.readable() => break,
+                    () = killed.notified() => kill_by(&descriptor),
+                    _ = &mut reader, if listening => {
+                        listening = false;
+                        grace = Box::pin(tokio::time::sleep(SILENT_EXIT));
+                    }
+                    // Without a connection it can only end.
+                    () = &mut grace, if !listening => {
+                        kill_by(&descriptor);
+                        grace = Box::pin(tokio::time::sleep(SILENT_EXIT));
+                    }
+                }
+            }
+            if listening && tokio::time::timeout(LAST_REPORTS, &mut reader).await.is_err() {
+                reader.abort();
+            }
+            let _ = events.send(Event::Gone(process)).await;
+        });
+        Ok(Self { commands, kill })
+    }
+
     /// Sends a command without waiting; false when the child takes none.
     pub(super) fn send(&self, command: Command) -> bool {
         self.commands.try_send(command).is_ok()
@@ -106,8 +166,13 @@ fn start_deaf(command: &mut std::process::Command) {
     unsafe { command.pre_exec(deafen) };
 }
 
+/// SIGKILL to the process of a descriptor; one that has ended already needs none.
+fn kill_by(descriptor: &AsyncFd<OwnedFd>) {
+    let _ = pidfd_send_signal(descriptor.get_ref(), Signal::KILL);
+}
+
 /// Until nobody sends commands or nobody reads them, of which the exit event tells.
-async fn write_commands(mut input: ChildStdin, mut commands: mpsc::Receiver<Command>) {
+async fn write_commands(mut input: impl AsyncWrite + Unpin, mut commands: mpsc::Receiver<Command>) {
     while let Some(command) = commands.recv().await {
         let Ok(mut line) = serde_json::to_vec(&command) else { return };
         line.push(b'\n');
@@ -117,7 +182,11 @@ async fn write_commands(mut input: ChildStdin, mut commands: mpsc::Receiver<Comm
     }
 }
 
-async fn read_reports(output: ChildStdout, process: Process, events: mpsc::Sender<Event>) {
+async fn read_reports(
+    output: impl AsyncRead + Unpin,
+    process: Process,
+    events: mpsc::Sender<Event>,
+) {
     let mut reader = BufReader::new(output);
     let mut line = Vec::new();
     loop {

@@ -5,7 +5,7 @@ use std::time::{Duration, Instant};
 use anyhow::{anyhow, bail};
 
 use super::Process;
-use super::endings::log_tail;
+use super::deaths::{Death, log_tail};
 use super::supervisor::{Phase, Running, Supervisor};
 use crate::terminal::shown;
 
@@ -14,6 +14,8 @@ const IDLE: Duration = Duration::from_secs(60);
 /// Waking so long after its own deadline, the supervisor was not late but stood still: Ctrl-Z and
 /// `fg`, or a paused container.
 const STANDSTILL: Duration = Duration::from_secs(5);
+/// A supervisor that is so late cannot tell a worker that hangs from one that stood still with it.
+const LATE: Duration = Duration::from_secs(1);
 
 impl Supervisor {
     pub(super) fn next_deadline(&self) -> Instant {
@@ -28,6 +30,7 @@ impl Supervisor {
             Phase::Training => {
                 deadlines.extend(self.time_is_up());
                 deadlines.extend(self.stalled());
+                deadlines.extend(self.first_silent().map(|(at, _)| at));
             }
         }
         deadlines.extend(self.evaluations.deadline());
@@ -42,6 +45,9 @@ impl Supervisor {
     /// Time in which the supervisor stood still, and its children with it, counts for no deadline
     /// of theirs: each gets what it had left at `looked`, when the supervisor last looked around.
     pub(super) fn on_wake(&mut self, looked: Instant, due: Instant, now: Instant) {
+        if lateness(looked, due, now) >= LATE {
+            self.hear_anew(now);
+        }
         let Some(lost) = stood_still(looked, due, now) else { return };
         self.advanced += lost;
         self.evaluations.postpone(lost);
@@ -165,11 +171,11 @@ impl Supervisor {
             .filter(|(process, running)| now >= running.spawned + self.ready_limit(*process))
             .map(|(process, _)| process);
         for process in late.collect::<Vec<_>>() {
-            let limit = self.ready_limit(process);
+            let (limit, joined) = (self.ready_limit(process), self.is_joined(process));
             let Some(slot) = self.slots.get_mut(&process) else { continue };
             let Some(running) = slot.running.as_mut() else { continue };
-            running.child.kill();
-            if slot.restarts == 0 {
+            running.kill_for(Death::too_slow(format!("not ready within {limit:?}")));
+            if slot.restarts == 0 && !joined {
                 let tail = log_tail(&self.log_path(process));
                 return Err(anyhow!("{process} was not ready within {limit:?}{tail}"));
             }
@@ -187,8 +193,9 @@ impl Supervisor {
         // Sent again when the evaluator is back, with a deadline of its own.
         self.evaluations.send_again();
         self.display.message("the evaluation takes too long: killing the evaluator");
-        if let Some(running) = self.running(Process::Evaluator) {
-            running.child.kill();
+        let evaluator = self.slots.get_mut(&Process::Evaluator);
+        if let Some(running) = evaluator.and_then(|slot| slot.running.as_mut()) {
+            running.kill_for(Death::too_slow("an evaluation took too long".to_owned()));
         }
     }
 }
@@ -196,8 +203,11 @@ impl Supervisor {
 /// How long a supervisor stood still that looked around at `looked`, was to wake at `due` at the
 /// latest and woke at `now`; none when it was on time.
 fn stood_still(looked: Instant, due: Instant, now: Instant) -> Option<Duration> {
-    let late = now.saturating_duration_since(due.max(looked));
-    (late >= STANDSTILL).then(|| now.duration_since(looked))
+    (lateness(looked, due, now) >= STANDSTILL).then(|| now.duration_since(looked))
+}
+
+fn lateness(looked: Instant, due: Instant, now: Instant) -> Duration {
+    now.saturating_duration_since(due.max(looked))
 }
 
 #[cfg(test)]

@@ -10,7 +10,7 @@ use std::path::{Path, PathBuf};
 use anyhow::Context;
 use dmprl_shared::transport::shared_memory::{Domain, Leftover, abandoned, remove_abandoned};
 
-use crate::run_directory::random_u64;
+use crate::run_directory::{Manifest, random_u64};
 use crate::terminal::say;
 
 /// Digits of the random part of a name: the domain's path must stay short.
@@ -58,6 +58,13 @@ impl Place {
     /// A directory of this user's is open to others, or something cannot be removed.
     pub(crate) fn remove_leftovers(&self) -> anyhow::Result<Vec<Leftover>> {
         self.of_each_parent(remove_abandoned, "remove")
+    }
+
+    /// The domain of this user that has this token.
+    pub(crate) fn find(&self, token: &str) -> Option<PathBuf> {
+        let (standard, taken_by) = self.standard();
+        let parents = taken_by.is_none().then_some(standard).into_iter().chain(self.others());
+        parents.map(|parent| parent.join(token)).find(|path| path.is_dir())
     }
 
     fn of_each_parent<E: std::error::Error + Send + Sync + 'static>(
@@ -118,6 +125,11 @@ impl Place {
         Domain::create(&parent, token)
             .with_context(|| format!("cannot make shared memory in {}", parent.display()))
     }
+}
+
+/// The name of a run's domain: its number and its supervisor's.
+pub(crate) fn token(manifest: &Manifest, supervisor: u32) -> String {
+    format!("{}-{supervisor}", manifest.run_id)
 }
 
 /// Removes what dead runs have left, then makes a directory for this one.

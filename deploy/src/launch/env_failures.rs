@@ -1,9 +1,10 @@
-//! What is counted over all processes of a session: failures of environments, and what was sent.
+//! What is counted over all processes of a session: failures of environments, what was sent, and
+//! the workers themselves.
 
 use super::Process;
 use super::supervisor::Supervisor;
 use crate::control::Command;
-use crate::terminal::{grouped, shown};
+use crate::terminal::grouped;
 
 impl Supervisor {
     /// Shows the first failure and then whenever their number has doubled: an environment that
@@ -13,9 +14,9 @@ impl Supervisor {
         self.env_failures = before.saturating_add(count);
         if is_told(before, self.env_failures) {
             self.display.message(&format!(
-                "{process}: environment failure {}: {last}; its segment is not used; log: {}",
+                "{process}: environment failure {}: {last}; its segment is not used; {}",
                 grouped(self.env_failures),
-                shown(&self.log_path(process))
+                self.log_of(process)
             ));
         }
         self.tell_learner_of_counts();
@@ -42,6 +43,7 @@ impl Supervisor {
         let mut sent = self.before.sent;
         sent += self.sent;
         let _ = learner.child.send(Command::Sent(sent));
+        let _ = learner.child.send(Command::Workers { count: self.workers() as u64 });
     }
 }
 

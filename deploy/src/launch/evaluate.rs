@@ -8,7 +8,7 @@ use anyhow::{Context, bail};
 use tokio::sync::mpsc;
 
 use super::child::{Child, EVENTS_MAX, Event, describe};
-use super::endings::log_tail;
+use super::deaths::log_tail;
 use super::{Launcher, Process, TimeLimits, interrupts};
 use crate::control::{Command, EvaluationRequest, EvaluationRow, Report};
 use crate::run_directory::RunDirectory;
@@ -128,6 +128,8 @@ impl Evaluation {
                     Report::Warning { message } | Report::EnvHung { message },
                 )) => say(&message),
                 Some(Event::Report(..) | Event::Garbage(..)) => {}
+                // Nobody joins an evaluation.
+                Some(Event::Asked(_) | Event::Gone(_)) => {}
                 Some(Event::Exited(_, status)) => bail!("{}", self.died(status)),
                 None => bail!("the evaluator is gone"),
             }

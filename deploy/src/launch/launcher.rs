@@ -13,7 +13,7 @@ use crate::run_directory::{RunDirectory, rfc3339};
 
 /// Incarnations that one session of the run has for each worker; a segment's sender is thus
 /// never mistaken for one of an earlier session.
-const INCARNATIONS_PER_SESSION: u32 = 1 << 16;
+pub(super) const INCARNATIONS_PER_SESSION: u32 = 1 << 16;
 
 /// One of a run's children.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
@@ -60,19 +60,35 @@ pub struct Launcher {
 }
 
 impl Launcher {
-    /// The command that starts `process` for the time after `restarts` restarts, its standard
-    /// error appended to its log.
+    /// The number of a worker's start, of this session's the `start`th from 0: no start of the
+    /// run has had it before, and all of them rise.
     ///
     /// # Errors
-    /// The log cannot be opened.
-    pub fn command(&self, process: Process, restarts: u32) -> anyhow::Result<Command> {
+    /// The run has had too many sessions, or the session of the worker's starts.
+    pub fn incarnation(&self, start: u32) -> anyhow::Result<u32> {
+        let first = self.sessions_before.checked_mul(INCARNATIONS_PER_SESSION);
+        let first = first.filter(|_| start < INCARNATIONS_PER_SESSION);
+        first.and_then(|first| first.checked_add(start)).with_context(|| {
+            format!(
+                "start {start} of a worker in session {} of the run: there are numbers for \
+                 {INCARNATIONS_PER_SESSION} starts in each of {INCARNATIONS_PER_SESSION} sessions",
+                self.sessions_before
+            )
+        })
+    }
+
+    /// The command that starts `process`, of this session's starts the `start`th from 0, its
+    /// standard error appended to its log.
+    ///
+    /// # Errors
+    /// The log cannot be opened, or a worker has been started too often.
+    pub fn command(&self, process: Process, start: u32) -> anyhow::Result<Command> {
         let mut command = Command::new(&self.program);
         match process {
             Process::Learner => self.learner(&mut command),
             Process::Actor(index) => {
-                let session = self.sessions_before.saturating_mul(INCARNATIONS_PER_SESSION);
                 command.args(["actor", "--index", &index.to_string()]);
-                command.args(["--incarnation", &session.saturating_add(restarts).to_string()]);
+                command.args(["--incarnation", &self.incarnation(start)?.to_string()]);
                 command.arg("--run").arg(self.run.path());
             }
             Process::Evaluator => {
@@ -135,5 +151,39 @@ impl Launcher {
             .with_context(|| format!("cannot write {}", path.display()))?;
         command.stdin(Stdio::piped()).stdout(Stdio::piped()).stderr(log);
         Ok(command)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::run_directory::Manifest;
+
+    #[test]
+    fn no_start_of_a_run_has_the_number_of_another() {
+        let folder = tempfile::tempdir().unwrap();
+        let manifest = Manifest::new(None).unwrap();
+        let run = RunDirectory::create(&folder.path().join("run"), &Default::default(), &manifest);
+        let mut launcher = Launcher {
+            program: PathBuf::new(),
+            run: run.unwrap(),
+            venv: None,
+            domain: None,
+            resume: false,
+            init_from: None,
+            learner_restarts: 0,
+            sessions_before: 0,
+            journal: None,
+        };
+        let last = INCARNATIONS_PER_SESSION - 1;
+        assert_eq!([0, last].map(|start| launcher.incarnation(start).unwrap()), [0, last]);
+        assert!(launcher.incarnation(last + 1).is_err());
+        launcher.sessions_before = 1;
+        assert_eq!(launcher.incarnation(0).unwrap(), last + 1);
+        launcher.sessions_before = last;
+        assert_eq!(launcher.incarnation(last).unwrap(), u32::MAX);
+        launcher.sessions_before = last + 1;
+        let error = launcher.incarnation(0).unwrap_err().to_string();
+        assert!(error.contains("session 65536 of the run"), "{error}");
     }
 }

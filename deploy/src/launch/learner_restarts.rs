@@ -4,6 +4,7 @@ use std::process::ExitStatus;
 use std::time::Instant;
 
 use super::Process;
+use super::deaths::Death;
 use super::supervisor::Supervisor;
 
 /// Exit status of a program that panicked.
@@ -13,12 +14,16 @@ impl Supervisor {
     /// Starts another after a pause: from the newest usable checkpoint, or else from the beginning.
     /// Workers wait meanwhile and keep what they have sent. A learner that ended by itself gave a
     /// reason that another start does not mend.
-    pub(super) fn on_learner_death(&mut self, status: ExitStatus) -> anyhow::Result<()> {
+    pub(super) fn on_learner_death(
+        &mut self,
+        status: ExitStatus,
+        death: &Death,
+    ) -> anyhow::Result<()> {
         let crashed = status.code().is_none_or(|code| code == PANIC_STATUS);
         let restarts_max = self.config.supervision.learner_restarts_max;
         let goes_on = crashed && !self.is_one_process();
-        if !goes_on || !self.restart(Process::Learner, status, restarts_max) {
-            return Err(self.death(Process::Learner, status, self.resume_advice()));
+        if !goes_on || !self.restart(Process::Learner, death, restarts_max) {
+            return Err(self.death(Process::Learner, death, self.resume_advice()));
         }
         self.learner_restarts += 1;
         self.learner_died.get_or_insert_with(Instant::now);

@@ -25,6 +25,8 @@ pub struct TimeLimits {
     pub restart_first: Duration,
     /// up to this.
     pub restart_max: Duration,
+    /// A child that did its work for so long is no crash loop: its next death is its first.
+    pub proven: Duration,
 }
 
 impl Default for TimeLimits {
@@ -39,7 +41,9 @@ impl Default for TimeLimits {
             evaluation_episode: Duration::from_secs(30),
             stall: Duration::from_secs(600),
             restart_first: Duration::from_millis(100),
-            restart_max: Duration::from_secs(5),
+            // A worker that is started within 2 s is back within 3.
+            restart_max: Duration::from_secs(2),
+            proven: Duration::from_secs(300),
         }
     }
 }
@@ -68,6 +72,6 @@ mod tests {
     fn back_off_doubles_up_to_its_cap() {
         let limits = TimeLimits::default();
         let waits = [0, 1, 2, 5, 6, 400].map(|restarts| limits.back_off(restarts).as_millis());
-        assert_eq!(waits, [100, 200, 400, 3_200, 5_000, 5_000]);
+        assert_eq!(waits, [100, 200, 400, 2_000, 2_000, 2_000]);
     }
 }

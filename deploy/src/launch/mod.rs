@@ -17,11 +17,14 @@
 
 mod child;
 mod deadlines;
+mod deaths;
 mod domain;
 mod endings;
 mod env_failures;
 mod evaluate;
 mod evaluations;
+mod heartbeats;
+mod joining;
 mod launcher;
 mod learner_restarts;
 mod limits;
@@ -31,8 +34,8 @@ mod signals;
 mod supervisor;
 
 pub(crate) use child::describe;
-pub(crate) use domain::{Place, create as create_domain};
-pub(crate) use endings::last_lines;
+pub(crate) use deaths::last_lines;
+pub(crate) use domain::{Place, create as create_domain, token as domain_token};
 pub use evaluate::{EvaluationPlan, evaluate};
 pub use launcher::{Launcher, Process};
 pub use limits::TimeLimits;

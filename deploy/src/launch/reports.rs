@@ -17,7 +17,19 @@ const GARBAGE_SHOWN_MAX: u32 = 3;
 impl Supervisor {
     pub(super) fn on_event(&mut self, event: Event) -> anyhow::Result<()> {
         match event {
-            Event::Report(process, report) => self.on_report(process, report),
+            Event::Report(process, report) => {
+                let handled = self.on_report(process, report);
+                match handled {
+                    Err(error) if self.is_joined(process) => self.send_away(process, &error),
+                    handled => return handled,
+                }
+                Ok(())
+            }
+            Event::Asked(newcomer) => {
+                self.on_asked(newcomer);
+                Ok(())
+            }
+            Event::Gone(process) => self.on_gone(process),
             Event::Exited(process, status) => self.on_exit(process, status),
             Event::Garbage(process, line) => {
                 self.garbage += 1;
@@ -31,6 +43,7 @@ impl Supervisor {
     }
 
     fn on_report(&mut self, process: Process, report: Report) -> anyhow::Result<()> {
+        self.heard(process, &report);
         match report {
             Report::EnvironmentReady { spec } => return self.on_environment(process, spec),
             Report::LearnerReady => return self.on_learner_ready(process),
@@ -54,13 +67,18 @@ impl Supervisor {
                 return self.on_not_evaluated(process, policy_version, &reason);
             }
             Report::EnvFailures { count, last } => self.on_env_failures(process, count, &last),
-            Report::Sent(sent) => self.sent += sent,
+            Report::Sent(sent) => {
+                self.sent += sent;
+                if sent.sent > 0 {
+                    self.worked(process);
+                }
+            }
+            Report::Alive(_) => {}
+            Report::Left => self.on_left(process),
             Report::EnvHung { message } => self.on_env_hung(process, &message),
             Report::Checkpoint { name, env_steps } => {
                 self.checkpointed = true;
-                if let Some(learner) = self.slots.get_mut(&Process::Learner) {
-                    learner.restarts = 0;
-                }
+                self.worked(process);
                 let steps = grouped(env_steps);
                 self.display.message(&format!("checkpoint {name} at {steps} steps"));
             }
@@ -141,6 +159,10 @@ impl Supervisor {
             {
                 running.attached = true;
             }
+            if self.is_joined(process) {
+                self.display.message(&format!("{process} has joined: {}", self.counted()));
+            }
+            self.tell_learner_of_counts();
         }
     }
 
@@ -236,9 +258,7 @@ impl Supervisor {
             "{process} evaluated policy {policy_version}, which nobody asked for"
         );
         // One that answers now and then is worth each restart.
-        if let Some(slot) = self.slots.get_mut(&Process::Evaluator) {
-            slot.restarts = 0;
-        }
+        self.forgive(Process::Evaluator);
         self.send_evaluation();
         Ok(())
     }

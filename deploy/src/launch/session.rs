@@ -63,7 +63,7 @@ pub fn session(plan: SessionPlan) -> anyhow::Result<Outcome> {
     let interrupts = runtime.block_on(async { interrupts() })?;
     let domain = match config.run.deterministic {
         true => None,
-        false => Some(domain::create(&format!("{}-{}", manifest.run_id, std::process::id()))?),
+        false => Some(domain::create(&domain::token(&manifest, std::process::id()))?),
     };
     let launcher = Launcher {
         program,

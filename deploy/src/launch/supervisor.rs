@@ -12,9 +12,10 @@ use dmprl_shared::transport::delivery::Sent;
 use tokio::sync::mpsc;
 
 use super::child::{Child, EVENTS_MAX, Event};
+use super::deaths::Death;
 use super::evaluations::EvaluationQueue;
-use super::{Launcher, Process, TimeLimits};
-use crate::control::{Command, EvaluationRow, Progress};
+use super::{Launcher, Process, TimeLimits, joining};
+use crate::control::{Command, Doing, EvaluationRow, Progress};
 use crate::terminal::Display;
 
 /// What the supervisor needs to know.
@@ -82,6 +83,9 @@ pub(super) enum Phase {
 #[derive(Debug, Default)]
 pub(super) struct Slot {
     pub(super) running: Option<Running>,
+    /// All starts of this session: each has a number of its own.
+    pub(super) starts: u32,
+    /// Restarts since it was last known to do its work.
     pub(super) restarts: u32,
     pub(super) restart_at: Option<Instant>,
 }
@@ -94,6 +98,38 @@ pub(super) struct Running {
     pub(super) ready: bool,
     /// A worker that knows where the learner is, and finds the next by itself.
     pub(super) attached: bool,
+    /// When it last said anything, and what it then did.
+    pub(super) heard: Instant,
+    pub(super) doing: Option<Doing>,
+    /// When it first and last told of work: a worker of segments sent, a learner of checkpoints.
+    pub(super) worked: Option<(Instant, Instant)>,
+    /// A worker that had joined has said that it leaves.
+    pub(super) left: bool,
+    /// Why the supervisor has killed it.
+    pub(super) killed_for: Option<Death>,
+}
+
+impl Running {
+    pub(super) fn new(child: Child) -> Self {
+        let now = Instant::now();
+        Self {
+            child,
+            spawned: now,
+            ready: false,
+            attached: false,
+            heard: now,
+            doing: None,
+            worked: None,
+            left: false,
+            killed_for: None,
+        }
+    }
+
+    /// SIGKILL; the exit, which comes as an event, is then told as this.
+    pub(super) fn kill_for(&mut self, death: Death) {
+        self.child.kill();
+        self.killed_for = Some(death);
+    }
 }
 
 pub(super) struct Supervisor {
@@ -147,7 +183,7 @@ pub async fn supervise(plan: SupervisorPlan) -> SessionReport {
     let SupervisorPlan { launcher, config, limits, display, mut interrupts } = plan;
     let (events, mut incoming) = mpsc::channel(EVENTS_MAX);
     let now = Instant::now();
-    let limit = limits.evaluation_of(config.evaluation.episodes);
+    let (mut woke, limit) = (now, limits.evaluation_of(config.evaluation.episodes));
     let mut supervisor = Supervisor {
         launcher,
         config,
@@ -182,23 +218,33 @@ pub async fn supervise(plan: SupervisorPlan) -> SessionReport {
     let started = supervisor.start();
     supervisor.check(started);
     while !supervisor.is_over() {
-        let (looked, due) = (Instant::now(), supervisor.next_deadline());
+        // A terminal that takes nothing (Ctrl-S) may have held it up.
+        let looked = Instant::now();
+        supervisor.on_wake(woke, woke, looked);
+        let due = supervisor.next_deadline();
         let wake = tokio::select! {
             biased;
             Some(()) = interrupts.recv() => Wake::Interrupt,
             Some(event) = incoming.recv() => Wake::Event(event),
             () = tokio::time::sleep_until(due.into()) => Wake::Time,
         };
-        supervisor.on_wake(looked, due, Instant::now());
+        woke = Instant::now();
+        supervisor.on_wake(looked, due, woke);
         match wake {
             Wake::Interrupt => supervisor.on_interrupt(),
             Wake::Event(event) => {
                 let handled = supervisor.on_event(event);
                 supervisor.check(handled);
             }
-            Wake::Time => {}
+            Wake::Time => {
+                // Whoever has spoken meanwhile is heard first.
+                tokio::task::yield_now().await;
+                if incoming.is_empty() {
+                    supervisor.check_heartbeats(woke);
+                }
+            }
         }
-        let handled = supervisor.on_time(Instant::now());
+        let handled = supervisor.on_time(woke);
         supervisor.check(handled);
     }
     supervisor.report()
@@ -217,7 +263,13 @@ impl Supervisor {
         if self.is_one_process() {
             return Ok(());
         }
-        let workers = u32::try_from(self.config.actors.workers).context("too many workers")?;
+        let actors = &self.config.actors;
+        if let Some(domain) = self.launcher.domain.as_ref().filter(|_| actors.joined_max > 0)
+            && let Err(error) = joining::listen(domain, self.events.clone())
+        {
+            self.display.message(&format!("warning: nobody can join this run: {error:#}"));
+        }
+        let workers = u32::try_from(actors.workers).context("too many workers")?;
         (0..workers).try_for_each(|index| self.spawn(Process::Actor(index)))
     }
 
@@ -228,10 +280,9 @@ impl Supervisor {
     pub(super) fn spawn(&mut self, process: Process) -> anyhow::Result<()> {
         let slot = self.slots.entry(process).or_default();
         slot.restart_at = None;
-        let command = self.launcher.command(process, slot.restarts)?;
-        let child = Child::spawn(command, process, self.events.clone())?;
-        slot.running =
-            Some(Running { child, spawned: Instant::now(), ready: false, attached: false });
+        let command = self.launcher.command(process, slot.starts)?;
+        slot.starts += 1;
+        slot.running = Some(Running::new(Child::spawn(command, process, self.events.clone())?));
         Ok(())
     }
 
@@ -241,6 +292,14 @@ impl Supervisor {
 
     pub(super) fn all_running(&self) -> impl Iterator<Item = (Process, &Running)> {
         self.slots.iter().filter_map(|(process, slot)| Some((*process, slot.running.as_ref()?)))
+    }
+
+    /// Workers that are attached: the run's own, and those that have joined.
+    pub(super) fn workers(&self) -> usize {
+        let attached = self.all_running().filter(|(process, running)| {
+            matches!(process, Process::Actor(_)) && running.attached && running.killed_for.is_none()
+        });
+        attached.count()
     }
 
     /// Sends a command to a child. One that takes none is stuck or dying; its deadline or its

@@ -13,11 +13,15 @@ EXAMPLES
   dmprl learner --run runs/mine --one-process   # what `train --deterministic` starts";
 
 const ACTOR_HELP: &str = "\
-Speaks JSON lines with the supervisor on standard input and output; logs to standard error.
-Reports its environment, then waits for `attach`. Ends when its standard input ends.
+With --join, it joins a run that this user trains on this machine, up to the run's
+actors.joined_max. The first Ctrl-C lets it hand over what it has and leave (status 130), the
+second ends it at once; it also ends with the run. Without, it is one that `train` starts: speaks
+JSON lines with the supervisor on standard input and output, logs to standard error, reports its
+environment, then waits for `attach`, and ends when its standard input ends.
 
 EXAMPLES
-  dmprl actor --run runs/mine --index 0 --incarnation 0";
+  dmprl actor --join runs/mine
+  dmprl actor --run runs/mine --index 0 --incarnation 0   # what `train` starts";
 
 const EVALUATOR_HELP: &str = "\
 Speaks JSON lines with the supervisor on standard input and output; logs to standard error.
@@ -62,12 +66,15 @@ pub struct LearnerArgs {
 #[derive(Debug, Clone, PartialEq, Eq, Args)]
 #[command(after_help = ACTOR_HELP)]
 pub struct ActorArgs {
+    /// Join this run, which is being trained.
+    #[arg(long, value_name = "RUN", conflicts_with_all = ["run", "index", "incarnation", "venv"])]
+    pub join: Option<PathBuf>,
     /// The run directory.
-    #[arg(long, value_name = "DIR")]
-    pub run: PathBuf,
+    #[arg(long, value_name = "DIR", required_unless_present = "join")]
+    pub run: Option<PathBuf>,
     /// Which of the run's workers, from 0.
-    #[arg(long, value_name = "I")]
-    pub index: u32,
+    #[arg(long, value_name = "I", required_unless_present = "join")]
+    pub index: Option<u32>,
     /// Counts this worker's starts over all sessions of the run; never given twice.
     #[arg(long, value_name = "N", default_value_t = 0)]
     pub incarnation: u32,

@@ -11,7 +11,8 @@ use std::time::Duration;
 use anyhow::{Context, ensure};
 use dmprl_shared::transport::delivery::Sent;
 
-use crate::control::{Command, GROUP_SIGNALS, Report};
+use super::heartbeat::Pulse;
+use crate::control::{Command, Doing, GROUP_SIGNALS, Report};
 use crate::terminal::say;
 
 /// A worker or evaluator whose supervisor is gone has so long to end before it is killed.
@@ -31,6 +32,7 @@ struct Flags {
     finish: AtomicBool,
     orphaned: AtomicBool,
     env_failures: AtomicU64,
+    workers: AtomicU64,
     sent: Mutex<Sent>,
 }
 
@@ -44,6 +46,7 @@ pub struct ControlPipe {
     commands: Mutex<Receiver<Command>>,
     flags: Arc<Flags>,
     reporter: Reporter,
+    pulse: Arc<Pulse>,
 }
 
 /// Sends reports, from any thread.
@@ -80,15 +83,7 @@ impl ControlPipe {
                 .with_context(|| format!("cannot ignore signal {signal}"))?;
         }
         let (input, output) = take_standard_streams().context("cannot move standard streams")?;
-        Ok(Self::over(input, output, move || {
-            thread::sleep(orphan_limit);
-            say("error: the supervisor is gone and this process did not end: killing it");
-            // Not `exit`: destructors of a stuck library could hold it up for ever.
-            let _ = rustix::process::kill_process(
-                rustix::process::getpid(),
-                rustix::process::Signal::KILL,
-            );
-        }))
+        Ok(Self::over(input, output, move || end_process_after(orphan_limit)))
     }
 
     /// The same over any pair of streams; `orphaned` runs on the reading thread at end of input.
@@ -108,7 +103,8 @@ impl ControlPipe {
             orphaned();
         });
         let reporter = Reporter(Arc::new(Mutex::new(Box::new(output))));
-        Self { commands: Mutex::new(commands), flags, reporter }
+        let pulse = Arc::new(Pulse::new(Doing::Attaching));
+        Self { commands: Mutex::new(commands), flags, reporter, pulse }
     }
 
     /// Whether to finish and exit: on `stop`, or because the supervisor is gone.
@@ -135,6 +131,12 @@ impl ControlPipe {
         self.flags.env_failures.load(Ordering::Acquire)
     }
 
+    /// Workers that are attached; 0 before the supervisor has told of any.
+    #[must_use]
+    pub fn workers(&self) -> u64 {
+        self.flags.workers.load(Ordering::Acquire)
+    }
+
     /// What the workers did in the whole run; nothing before the supervisor has told of it.
     #[must_use]
     pub fn sent(&self) -> Sent {
@@ -148,7 +150,7 @@ impl ControlPipe {
     }
 
     /// The next command, waiting so long for it; none when the wait or the input has ended. `stop`,
-    /// `finish`, `env_failures` and `sent` are no commands here: there is a method for each.
+    /// `finish`, `env_failures`, `workers` and `sent` are no commands here: each has a method.
     #[must_use]
     pub fn next_within(&self, wait: Duration) -> Option<Command> {
         self.commands.lock().unwrap_or_else(PoisonError::into_inner).recv_timeout(wait).ok()
@@ -162,6 +164,17 @@ impl ControlPipe {
         self.reporter.send(report)
     }
 
+    /// Notes that the role's loop has come round once more, for the heartbeat.
+    pub fn beat(&self, doing: Doing) {
+        self.pulse.beat(doing);
+    }
+
+    /// What [`ControlPipe::beat`] notes.
+    #[must_use]
+    pub fn pulse(&self) -> Arc<Pulse> {
+        Arc::clone(&self.pulse)
+    }
+
     /// Sends reports too, for threads of their own.
     #[must_use]
     pub fn reporter(&self) -> Reporter {
@@ -169,13 +182,26 @@ impl ControlPipe {
     }
 }
 
+/// Ends this process, whose supervisor is gone, unless it has ended by itself by then.
+pub fn end_process_after(limit: Duration) {
+    thread::sleep(limit);
+    say("error: the supervisor is gone and this process did not end: killing it");
+    // Not `exit`: destructors of a stuck library could hold it up for ever.
+    let _ = rustix::process::kill_process(rustix::process::getpid(), rustix::process::Signal::KILL);
+}
+
 fn take_standard_streams() -> std::io::Result<(File, File)> {
     let private = |fd| rustix::io::fcntl_dupfd_cloexec(fd, 3);
     let input = private(rustix::stdio::stdin())?;
     let output = private(rustix::stdio::stdout())?;
-    rustix::stdio::dup2_stdin(File::open("/dev/null")?)?;
-    rustix::stdio::dup2_stdout(rustix::stdio::stderr())?;
+    detach_standard_streams()?;
     Ok((input.into(), output.into()))
+}
+
+/// From now on there is nothing to read, and what is printed goes to standard error.
+pub fn detach_standard_streams() -> std::io::Result<()> {
+    rustix::stdio::dup2_stdin(File::open("/dev/null")?)?;
+    Ok(rustix::stdio::dup2_stdout(rustix::stdio::stderr())?)
 }
 
 /// Until the input ends or is broken, which is the same: nobody is there to be understood.
@@ -194,6 +220,7 @@ fn read_commands(input: impl Read, sender: &SyncSender<Command>, flags: &Flags) 
             Ok(Command::EnvFailures { total }) => {
                 flags.env_failures.store(total, Ordering::Release);
             }
+            Ok(Command::Workers { count }) => flags.workers.store(count, Ordering::Release),
             Ok(Command::Sent(total)) => {
                 *flags.sent.lock().unwrap_or_else(PoisonError::into_inner) = total;
             }

@@ -13,7 +13,7 @@ use dmprl_shared::transport::shared_memory::{Plan, WorkerEnd, attach};
 use dmprl_shared::transport::{SendOutcome, TransportError};
 
 use super::ControlPipe;
-use crate::control::Report;
+use crate::control::{Doing, Report};
 use crate::journal::{Entry, Journal, Piece};
 
 /// Sleep between two tries to attach, or looks for the first policy.
@@ -37,6 +37,7 @@ pub fn attach_within(
 ) -> anyhow::Result<Option<WorkerEnd>> {
     let deadline = Instant::now() + ATTACH_LIMIT;
     loop {
+        control.beat(Doing::Attaching);
         match attach(domain, plan, index as usize) {
             Ok(end) => return Ok(Some(end)),
             Err(error @ TransportError::Incompatible { .. }) => return Err(error.into()),
@@ -159,9 +160,31 @@ impl<'a> Delivery<'a> {
                 };
                 self.warn(format!("worker {} has waited {seconds} s: {why}", self.index()));
             }
+            self.control.beat(Doing::Waiting);
             std::thread::sleep(pause);
             pause = (pause * 2).min(FULL_QUEUE_MAX);
         }
+    }
+
+    /// Offers what is kept until the learner has acknowledged all of it, for `limit` at most.
+    #[cfg(feature = "python")]
+    pub fn hand_over(&mut self, limit: Duration) -> anyhow::Result<()> {
+        let deadline = Instant::now() + limit;
+        loop {
+            self.hear()?;
+            if self.outbox.is_empty() || self.control.orphaned() || Instant::now() >= deadline {
+                return Ok(());
+            }
+            self.outbox.offer(&mut self.end.segments)?;
+            self.control.beat(Doing::Waiting);
+            std::thread::sleep(FULL_QUEUE_MAX);
+        }
+    }
+
+    /// What the worker has done so far.
+    #[cfg(feature = "python")]
+    pub fn sent(&self) -> Sent {
+        self.outbox.sent()
     }
 
     /// Forgets what the learner has acknowledged.
@@ -178,10 +201,14 @@ impl<'a> Delivery<'a> {
         Ok(())
     }
 
-    /// Tells the supervisor what was sent, once a second.
+    /// Tells the supervisor what was sent, once a second; whether it was time to.
     #[cfg(feature = "python")]
-    pub fn report_in_time(&mut self) -> anyhow::Result<()> {
-        if self.reported_at.elapsed() >= REPORT_INTERVAL { self.report() } else { Ok(()) }
+    pub fn report_in_time(&mut self) -> anyhow::Result<bool> {
+        let due = self.reported_at.elapsed() >= REPORT_INTERVAL;
+        if due {
+            self.report()?;
+        }
+        Ok(due)
     }
 
     /// Tells the supervisor what was sent since the last time.

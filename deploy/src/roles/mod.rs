@@ -13,11 +13,19 @@ mod delivery;
 mod environments;
 #[cfg(feature = "python")]
 mod evaluator;
+mod hardening;
+mod heartbeat;
+#[cfg(feature = "python")]
+mod joined;
 mod learner;
 #[cfg(feature = "python")]
 mod one_process;
 mod recorder;
 mod setup;
+
+use crate::failure::Outcome;
+
+use hardening::harden;
 
 pub use arguments::{ActorArgs, EvaluatorArgs, LearnerArgs};
 pub use control_pipe::{ControlPipe, ORPHAN_LIMIT, ORPHANED_LEARNER_LIMIT};
@@ -31,6 +39,7 @@ pub(crate) use setup::Setup;
 /// # Errors
 /// Whatever keeps it from going on; the run then ends.
 pub fn learner(args: &LearnerArgs) -> anyhow::Result<()> {
+    harden()?;
     let control = ControlPipe::open(ORPHANED_LEARNER_LIMIT)?;
     if !args.one_process {
         return learner::run(args, &control);
@@ -44,10 +53,14 @@ pub fn learner(args: &LearnerArgs) -> anyhow::Result<()> {
 /// Steps environments with the newest policy and sends the segments.
 ///
 /// # Errors
-/// Whatever keeps it from going on; the supervisor starts it again.
+/// Whatever keeps it from going on; the supervisor starts it again, unless it had joined.
 #[cfg(feature = "python")]
-pub fn actor(args: &ActorArgs) -> anyhow::Result<()> {
-    actor::run(args, &ControlPipe::open(ORPHAN_LIMIT)?)
+pub fn actor(args: &ActorArgs) -> anyhow::Result<Outcome> {
+    harden()?;
+    if let Some(run) = &args.join {
+        return joined::join(run);
+    }
+    actor::run(args, &ControlPipe::open(ORPHAN_LIMIT)?).map(|()| Outcome::Done)
 }
 
 /// Evaluates saved policies without noise.
@@ -56,6 +69,7 @@ pub fn actor(args: &ActorArgs) -> anyhow::Result<()> {
 /// Whatever keeps it from going on; the supervisor starts it again.
 #[cfg(feature = "python")]
 pub fn evaluator(args: &EvaluatorArgs) -> anyhow::Result<()> {
+    harden()?;
     evaluator::run(args, &ControlPipe::open(ORPHAN_LIMIT)?)
 }
 
@@ -67,7 +81,7 @@ const WITHOUT_PYTHON: &str = "this program was built without the feature `python
 /// # Errors
 /// Always.
 #[cfg(not(feature = "python"))]
-pub fn actor(_args: &ActorArgs) -> anyhow::Result<()> {
+pub fn actor(_args: &ActorArgs) -> anyhow::Result<Outcome> {
     anyhow::bail!("{WITHOUT_PYTHON}")
 }
 

@@ -192,6 +192,7 @@ impl<'a> Recorder<'a> {
             wall_s: self.wall_s(),
             env_steps_per_s,
             updates_per_s,
+            workers: if learner.config().run.deterministic { 1 } else { self.control.workers() },
             ..learner.metrics_line()
         };
         self.return_mean = line.training_return_mean.or(self.return_mean);

@@ -73,6 +73,11 @@ impl RunLock {
     }
 }
 
+/// The supervisor that took the lock last, by its process's number.
+pub(super) fn last_holder(run: &Path) -> Option<u32> {
+    holder(&mut File::open(run.join("lock")).ok()?).parse().ok()
+}
+
 /// The supervisor that took the lock last. An unreadable file is as good as an empty one.
 fn holder(file: &mut File) -> String {
     let mut text = String::new();

@@ -243,6 +243,12 @@ impl RunDirectory {
         self.path.join("logs").join(format!("{process}.log"))
     }
 
+    /// The process that took the run last, by its number; it may be gone.
+    #[must_use]
+    pub fn lock_holder(&self) -> Option<u32> {
+        lock::last_holder(&self.path)
+    }
+
     /// Takes the run for this process and those it starts; see [`RunLock`].
     ///
     /// # Errors

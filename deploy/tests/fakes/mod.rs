@@ -52,6 +52,8 @@ impl Fixture {
         let parent = tempfile::tempdir().unwrap();
         let mut config = ExperimentConfig::default();
         config.actors.workers = 2;
+        // Most fakes give no sign of life.
+        config.supervision.heartbeat_timeout_s = PATIENCE.as_secs_f64() * 10.0;
         let manifest = Manifest::new(None).unwrap();
         let run = RunDirectory::create(&parent.path().join("run"), &config, &manifest).unwrap();
         let folder = run.path().join("fake");

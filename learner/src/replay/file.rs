@@ -119,24 +119,21 @@ impl Replay {
         });
         (self.filled, self.head) = (filled?, head?);
         self.inserted = read_u64(input)?;
-        self.read_tail_count(input)?;
+        let tail_count = read_u64(input)?;
         self.kept = if &magic == MAGIC { self.read_kept(input)? } else { 0 };
         for index in 0..self.filled {
             self.slots[index] = self.read_slot(input, index)?;
         }
-        for index in 0..self.tails.len() {
-            self.tails[index] = self.read_tail(input, index)?;
+        // There may be more or fewer places for workers than when it was written. The first are
+        // the same, and what another's episode was is of no use: nobody continues it.
+        for index in 0..tail_count as usize {
+            let tail = self.read_tail(input, index)?;
+            if let Some(place) = self.tails.get_mut(index) {
+                *place = tail;
+            }
         }
         for numbers in self.blocks.first_mut(self.filled) {
             input.read_exact(bytemuck::cast_slice_mut(numbers))?;
-        }
-        Ok(())
-    }
-
-    fn read_tail_count(&self, input: &mut impl Read) -> Result<(), ReplayFileError> {
-        let (expected, got) = (self.tails.len() as u64, read_u64(input)?);
-        if got != expected {
-            return Err(ReplayFileError::Count { name: "environment count", expected, got });
         }
         Ok(())
     }
@@ -250,6 +247,20 @@ mod tests {
         assert!(error.to_string().contains("observation_len is 2, the configuration gives 3"));
         let error = Replay::new(LAYOUT, 60, 1, 2).read(&mut written.as_slice()).unwrap_err();
         assert!(error.to_string().contains("slot count is 10, the configuration gives 20"));
+    }
+
+    #[test]
+    fn a_replay_of_fewer_or_more_workers_is_read() {
+        let written = bytes(&filled());
+        for workers in [2, 3] {
+            let mut more = Replay::new(LAYOUT, 30, workers, 2);
+            more.read(&mut written.as_slice()).unwrap();
+            assert!(more.tails[..2].iter().all(Option::is_some));
+            assert!(more.tails[2..].iter().all(Option::is_none));
+            let mut fewer = Replay::new(LAYOUT, 30, 1, 2);
+            fewer.read(&mut bytes(&more).as_slice()).unwrap();
+            assert_eq!(bytes(&fewer), written);
+        }
     }
 
     #[test]

@@ -30,7 +30,7 @@ pub struct ExperimentConfig {
     pub actors: ActorsConfig,
     /// What a death may cost on the way from worker to learner.
     pub delivery: DeliveryConfig,
-    /// What happens when the learner dies.
+    /// What happens when a process dies or hangs.
     pub supervision: SupervisionConfig,
     /// The learner process.
     pub learner: LearnerConfig,
@@ -174,6 +174,9 @@ impl Default for PacingConfig {
 pub struct ActorsConfig {
     /// Worker processes; 0 stands for cores - 1, at least 1.
     pub workers: usize,
+    /// Workers that may join a running experiment (`dmprl actor --join RUN`) at once. Each has its
+    /// queue from the start, whether it comes or not.
+    pub joined_max: usize,
     /// Environments in each worker.
     pub envs_per_worker: usize,
     /// Segments a worker's queue to the learner holds; full: the worker waits. 0 stands for
@@ -181,7 +184,8 @@ pub struct ActorsConfig {
     pub queue_segments: usize,
     /// A worker that waited so long on a full queue reports it, naming the learner [s].
     pub send_deadline_s: f64,
-    /// Restarts of one worker before the run gives up on it.
+    /// Restarts of one worker before the run gives up on it. One that delivered segments for five
+    /// minutes has them all again.
     pub restarts_max: u32,
     /// Failures of one environment, since it last completed an episode or 1 000 sound segments,
     /// that its worker makes up for by making it again; one more ends the worker, which is then
@@ -196,6 +200,7 @@ impl Default for ActorsConfig {
     fn default() -> Self {
         Self {
             workers: 0,
+            joined_max: 4,
             envs_per_worker: 8,
             queue_segments: 0,
             send_deadline_s: 30.0,
@@ -203,6 +208,14 @@ impl Default for ActorsConfig {
             env_failures_max: 10,
             env_call_timeout_s: 60.0,
         }
+    }
+}
+
+impl ActorsConfig {
+    /// Workers that there may be at once: the run's own, then those that join.
+    #[must_use]
+    pub fn places(&self) -> usize {
+        self.workers.saturating_add(self.joined_max)
     }
 }
 
@@ -241,14 +254,16 @@ impl Default for DeliveryConfig {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct SupervisionConfig {
-    /// Restarts of a learner that was killed or crashed, without a checkpoint in between, before
-    /// the run ends.
+    /// Restarts of a learner that was killed or crashed before the run ends. One that wrote a
+    /// checkpoint and lived for five minutes has them all again.
     pub learner_restarts_max: u32,
+    /// A worker that gives no sign of life for so long hangs: it is killed and restarted [s].
+    pub heartbeat_timeout_s: f64,
 }
 
 impl Default for SupervisionConfig {
     fn default() -> Self {
-        Self { learner_restarts_max: 5 }
+        Self { learner_restarts_max: 5, heartbeat_timeout_s: 30.0 }
     }
 }
 

@@ -47,6 +47,7 @@ impl ExperimentConfig {
         }
         if self.run.deterministic {
             self.actors.workers = 1;
+            self.actors.joined_max = 0;
         }
         if self.algorithm.ndp.rollout_segments == 0 {
             let envs = self.actors.workers.saturating_mul(self.actors.envs_per_worker);
@@ -77,6 +78,7 @@ impl ExperimentConfig {
     fn check_counts(&self) -> Result<(), ConfigError> {
         let counts = [
             ("actors.workers", self.actors.workers, 1, WORKERS_MAX),
+            ("actors.joined_max", self.actors.joined_max, 0, WORKERS_MAX),
             ("actors.envs_per_worker", self.actors.envs_per_worker, 1, ENVS_PER_WORKER_MAX),
             ("actors.queue_segments", self.actors.queue_segments, 1, 65_536),
             (
@@ -140,6 +142,7 @@ impl ExperimentConfig {
             ("pacing.updates_per_segment", self.pacing.updates_per_segment),
             ("actors.send_deadline_s", self.actors.send_deadline_s),
             ("actors.env_call_timeout_s", self.actors.env_call_timeout_s),
+            ("supervision.heartbeat_timeout_s", self.supervision.heartbeat_timeout_s),
         ];
         for (key, got) in positive {
             range(key, got, got.is_finite() && got > 0.0, || "a positive number".into())?;

@@ -1,9 +1,11 @@
 //! SIGKILL to everything, to the supervisor, to a worker, to the learner.
 
 use std::path::PathBuf;
+use std::time::Instant;
 
 use dmprl_tests::program::{
     Running, Workplace, env_steps, env_steps_of, env_steps_of_checkpoint, rows, shared_memory_of,
+    until,
 };
 use rustix::process::Signal;
 
@@ -115,12 +117,17 @@ fn resume_waits_for_the_learner_of_a_killed_supervisor() {
 fn a_run_whose_learner_sleeps_for_a_while_goes_on() {
     let place = Workplace::new();
     let run = place.path("run");
-    let mut running = training(&place, &run, &["--set", "actors.send_deadline_s=0.5"]);
+    // A worker that waits for it lives, however long that takes.
+    let keys = ["actors.send_deadline_s=0.5", "supervision.heartbeat_timeout_s=5"];
+    let keys: Vec<&str> = keys.into_iter().flat_map(|key| ["--set", key]).collect();
+    let mut running = training(&place, &run, &keys);
+    let workers = ids(&place, "actor");
     signal_role(&place, "learner", Signal::STOP);
-    running.until_said("the learner takes nothing from its full queue");
+    running.until_said("waited 7 s: the learner takes nothing from its full queue");
     signal_role(&place, "learner", Signal::CONT);
     let steps = env_steps_of(&run).unwrap();
     running.until_steps(&run, steps + 2_000);
+    assert_eq!(ids(&place, "actor"), workers, "{}", running.said());
     running.signal_group(Signal::INT);
     running.wait().with_status(130);
     let last = rows(&run, "metrics.jsonl").pop().unwrap();
@@ -143,6 +150,41 @@ fn a_killed_worker_is_announced_and_replaced() {
     let refused = last["rejected"].as_object().unwrap();
     assert!(refused.values().all(|count| count == 0), "{last}");
     place.assert_no_process();
+}
+
+#[test]
+fn a_worker_that_somebody_stopped_is_said_to_hang_and_replaced() {
+    let place = Workplace::new();
+    let run = place.path("run");
+    let mut running = training(&place, &run, &["--set", "supervision.heartbeat_timeout_s=5"]);
+    signal_role(&place, "actor", Signal::STOP);
+    running.until_said("actor-0 hung (no sign of life for 5.");
+    running.until_said("restart 1 of 5");
+    let steps = env_steps_of(&run).unwrap();
+    running.until_steps(&run, steps + 1_500);
+    running.signal_group(Signal::INT);
+    running.wait().with_status(130);
+    assert_eq!(rows(&run, "metrics.jsonl").pop().unwrap()["lost"], 0);
+    place.assert_no_process();
+}
+
+/// Ctrl-Z, or a container that is paused: nobody is to blame for what was not said meanwhile.
+#[test]
+fn a_run_that_stands_still_as_a_whole_blames_nobody() {
+    let place = Workplace::new();
+    let run = place.path("run");
+    let mut running = training(&place, &run, &["--set", "supervision.heartbeat_timeout_s=3"]);
+    let workers = ids(&place, "actor");
+    running.signal_group(Signal::STOP);
+    // Longer than the limit, and than what the supervisor takes for being late.
+    let stopped = Instant::now();
+    until("time enough for a worker to be blamed", || stopped.elapsed().as_secs() >= 7);
+    running.signal_group(Signal::CONT);
+    let steps = env_steps_of(&run).unwrap();
+    running.until_steps(&run, steps + 2_000);
+    assert_eq!(ids(&place, "actor"), workers, "{}", running.said());
+    running.signal_group(Signal::INT);
+    running.wait().with_status(130);
 }
 
 #[test]

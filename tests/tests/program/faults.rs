@@ -100,8 +100,11 @@ fn an_environment_that_always_fails_costs_its_worker_and_then_the_run() {
 /// The environment that breaks leaves a mark, so the next life of its worker is a sound one.
 fn survives(task: &str, words: &[&str]) -> (Workplace, String) {
     let place = Workplace::new();
-    let more = ["--steps", "1500", "--set", "actors.env_call_timeout_s=10"];
+    // A call may last longer than silence may: its worker says that it is in one.
+    let keys = ["actors.env_call_timeout_s=10", "supervision.heartbeat_timeout_s=5"];
+    let more = ["--steps", "1500", "--set", keys[0], "--set", keys[1]];
     let (run, finished) = train_tiny(&place, task, &more);
+    assert!(!finished.said.contains("no sign of life"), "{}", finished.said);
     let mut finished = finished.with_status(0).saying("actor-0 died").saying("restart 1 of 5");
     for words in words {
         finished = finished.saying(words);

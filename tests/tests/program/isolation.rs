@@ -80,7 +80,8 @@ fn a_container_with_too_little_shared_memory_is_told_before_it_starts() {
     let line = train("reacher", &run, &["--workers", "2"]).join(" ");
     let script = format!("exec {} {line}", executable().display());
     let Some(command) = with_shared_memory_of(256, &script) else { return };
-    let words = ["needed for 2 workers", "256.0 KiB free in /dev/shm", "--shm-size"];
+    let words =
+        ["needed for 2 workers and 4 that may join", "256.0 KiB free in /dev/shm", "--shm-size"];
     refused_by_its_size(command, &place, &words);
 }
 
@@ -111,7 +112,7 @@ fn too_few_open_files_are_refused_with_both_numbers() {
     let line = train("reacher", &run, &["--workers", "4"]).join(" ");
     let mut command = Command::new("bash");
     command.args(["-c", &format!("ulimit -n 64; exec {} {line}", executable().display())]);
-    refused_by_its_size(command, &place, &["open files: 112 needed", "the limit is 64"]);
+    refused_by_its_size(command, &place, &["open files: 160 needed", "the limit is 64"]);
 }
 
 #[test]
@@ -130,7 +131,8 @@ fn resume_asks_for_the_same_room_and_leaves_the_run_as_it_is() {
 /// The numbers that a start is refused by are bounds of what a run really takes.
 #[test]
 fn what_is_asked_for_covers_what_a_run_takes() {
-    const WORKERS: usize = 4;
+    /// The run's own and those that may join.
+    const WORKERS: usize = 4 + 4;
     let place = Workplace::new();
     let run = place.path("run");
     let more = ["--steps", ENDLESS, "--workers", "4"];
@@ -262,6 +264,37 @@ fn nothing_of_the_working_directory_or_of_pythons_variables_is_imported() {
     command.args(train("reacher", &run, &["--steps", "500"]));
     command.env("PYTHONPATH", &elsewhere).env("PYTHONSTARTUP", elsewhere.join("numpy.py"));
     place.start_command(command).wait().with_status(0);
+}
+
+#[test]
+fn the_processes_of_a_run_gain_no_privileges_and_leave_no_core_dumps() {
+    let place = Workplace::new();
+    let run = place.path("run");
+    let mut running = place.start(&train("reacher", &run, &["--steps", ENDLESS]));
+    running.until_steps(&run, 1_500);
+    let mut joined = place.start(&["actor", "--join", &run]);
+    joined.until_said("segments sent");
+    let roles = ["learner", "evaluator", "actor"];
+    let processes: Vec<_> = place
+        .processes()
+        .into_iter()
+        .filter(|process| roles.contains(&process.role.as_str()))
+        .collect();
+    let joined_too = processes.len() == roles.len() + 1;
+    assert!(joined_too, "one each, and the worker that joined: {processes:#?}");
+    for process in processes {
+        let folder = PathBuf::from(format!("/proc/{}", process.id.as_raw_nonzero()));
+        let line = |what: &str, name: &str| {
+            let text = fs::read_to_string(folder.join(what)).unwrap();
+            let line = text.lines().find(|line| line.starts_with(name)).unwrap().to_owned();
+            line[name.len()..].split_whitespace().map(str::to_owned).collect::<Vec<_>>()
+        };
+        assert_eq!(line("status", "NoNewPrivs:"), ["1"], "{process:?}");
+        assert_eq!(line("limits", "Max core file size")[..2], ["0", "0"], "{process:?}");
+    }
+    running.signal(Signal::INT);
+    running.wait().with_status(130);
+    joined.wait().with_status(0);
 }
 
 #[test]

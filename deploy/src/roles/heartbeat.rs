@@ -1,0 +1,109 @@
+//! A worker's signs of life.
+//!
+//! A thread of its own sends one each second in which the worker's loop has come round, or in which
+//! a call into the environments is under way: how long that may take is the watchdog's business.
+//! So a worker that waits for its learner, however long, lives, and so does one with a slow
+//! environment. One that is stopped, or whose loop stands still anywhere else, falls silent, and
+//! the supervisor notices.
+
+use std::sync::atomic::{AtomicU64, Ordering};
+
+use crate::control::Doing;
+
+/// How often a loop has come round, and in the two lowest bits what it did then.
+#[derive(Debug)]
+pub struct Pulse(AtomicU64);
+
+impl Pulse {
+    /// A loop that has not begun.
+    #[must_use]
+    pub fn new(doing: Doing) -> Self {
+        Self(AtomicU64::new(bits(doing)))
+    }
+
+    /// The loop has come round; from its thread only.
+    pub fn beat(&self, doing: Doing) {
+        // The other thread compares numbers and reads no other memory: no order is needed.
+        let number = (self.0.load(Ordering::Relaxed) >> 2).wrapping_add(1);
+        self.0.store(number << 2 | bits(doing), Ordering::Relaxed);
+    }
+
+    fn state(&self) -> (u64, Doing) {
+        let state = self.0.load(Ordering::Relaxed);
+        let doing = match state & 3 {
+            1 => Doing::Stepping,
+            2 => Doing::Waiting,
+            _ => Doing::Attaching,
+        };
+        (state, doing)
+    }
+}
+
+fn bits(doing: Doing) -> u64 {
+    match doing {
+        Doing::Attaching => 0,
+        Doing::Stepping => 1,
+        Doing::Waiting => 2,
+    }
+}
+
+#[cfg(feature = "python")]
+pub use thread::start;
+
+#[cfg(feature = "python")]
+mod thread {
+    use std::sync::Arc;
+    use std::time::Duration;
+
+    use anyhow::Context;
+    use dmprl_actors::watchdog::CallState;
+
+    use crate::control::{Doing, Report};
+    use crate::roles::ControlPipe;
+
+    /// Between two signs of life.
+    const BEAT: Duration = Duration::from_secs(1);
+
+    /// Starts the thread. It ends when nobody makes calls any more, or nobody listens.
+    pub fn start(control: &ControlPipe, calls: &Arc<CallState>) -> anyhow::Result<()> {
+        let (pulse, reporter) = (control.pulse(), control.reporter());
+        let calls = Arc::downgrade(calls);
+        let run = move || {
+            let mut last = None;
+            while let Some(calls) = calls.upgrade() {
+                let (state, doing) = pulse.state();
+                let calling = calls.is_running();
+                drop(calls);
+                if calling || last != Some(state) {
+                    let doing = if calling { Doing::Stepping } else { doing };
+                    if reporter.send(&Report::Alive(doing)).is_err() {
+                        return;
+                    }
+                }
+                last = Some(state);
+                std::thread::sleep(BEAT);
+            }
+        };
+        let thread = std::thread::Builder::new().name("heartbeat".into());
+        thread.spawn(run).map(drop).context("cannot start the heartbeat")
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn each_round_is_another_state_and_says_what_was_done() {
+        let pulse = Pulse::new(Doing::Attaching);
+        let mut seen = vec![pulse.state()];
+        for doing in [Doing::Stepping, Doing::Stepping, Doing::Waiting, Doing::Attaching] {
+            pulse.beat(doing);
+            assert_eq!(pulse.state().1, doing);
+            seen.push(pulse.state());
+        }
+        seen.sort_by_key(|(state, _)| *state);
+        seen.dedup_by_key(|(state, _)| *state);
+        assert_eq!(seen.len(), 5);
+    }
+}

@@ -1,0 +1,243 @@
+//! A worker that somebody starts beside a run that is being trained: `dmprl actor --join RUN`.
+//!
+//! It asks the run's supervisor for a place (`launch/joining.rs`), and is then a worker like the
+//! others, but for its ends: a first Ctrl-C lets it hand over what the learner has not
+//! acknowledged, a second does not.
+
+use std::cell::Cell;
+use std::fs;
+use std::io::{Read, Write};
+use std::os::unix::fs::MetadataExt;
+use std::os::unix::net::UnixStream;
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::{Duration, Instant};
+
+use anyhow::{Context, bail};
+use dmprl_shared::transport::delivery::Sent;
+use signal_hook::flag;
+
+use super::actor::{self, Guest, Seat};
+use super::setup::Setup;
+use super::{ControlPipe, ORPHAN_LIMIT, control_pipe};
+use crate::control::{
+    GROUP_SIGNALS, Greeting, JOIN_SOCKET, JoinAnswer, JoinRequest, Report, Welcome,
+};
+use crate::failure::{Outcome, wrong_use};
+use crate::launch::{Place, is_ignored};
+use crate::run_directory::RunDirectory;
+use crate::terminal::{grouped, say, shown};
+
+/// The supervisor answers at once; one that is stopped does not.
+const ANSWER_LIMIT: Duration = Duration::from_secs(10);
+/// A longer line is no answer.
+const ANSWER_BYTES_MAX: u64 = 1 << 16;
+/// Between two lines about what was sent.
+const TELL_INTERVAL: Duration = Duration::from_secs(5);
+/// Exit status of a second Ctrl-C.
+const INTERRUPTED_STATUS: i32 = 130;
+
+/// Joins a run and steps environments for it until the run ends or the user stops it.
+///
+/// # Errors
+/// The run takes nobody in, or what ends any worker.
+pub fn join(run: &Path) -> anyhow::Result<Outcome> {
+    check_owner(run)?;
+    let setup = Setup::read(run)?;
+    check_takes_in(&setup)?;
+    let leaving = Arc::new(AtomicBool::new(false));
+    let stream = connect(&setup.run)?;
+    let welcome = ask(&stream, &setup.run)?;
+    let commands = stream.try_clone().context("cannot share the connection")?;
+    let control =
+        ControlPipe::over(commands, stream, || control_pipe::end_process_after(ORPHAN_LIMIT));
+    control_pipe::detach_standard_streams().context("cannot move standard streams")?;
+    leave_on_signals(&leaving, &control)?;
+    let Welcome { index, incarnation, venv, workers } = welcome;
+    let counted = format!("{workers} worker{}", if workers == 1 { "" } else { "s" });
+    say(&format!("joined {} as actor-{index}: {counted}", shown(setup.run.path())));
+    let teller = Teller::new();
+    let mut tell = |sent| teller.tell(sent);
+    let venv = venv.as_deref();
+    let seat = Seat { setup: &setup, index, incarnation, venv, journal: None };
+    let guest = Guest { leaving: &leaving, tell: &mut tell };
+    actor::work(&seat, &control, Some(guest))?;
+    let sent = teller.sent.get();
+    let acknowledged = format!("{} of {}", grouped(sent.acked), grouped(sent.produced));
+    let segments = format!("{acknowledged} segments acknowledged");
+    if leaving.load(Ordering::Acquire) {
+        // A supervisor that is gone needs no word.
+        let _ = control.send(&Report::Left);
+        say(&format!("left the run: {segments}"));
+        return Ok(Outcome::Interrupted);
+    }
+    if control.orphaned() {
+        bail!("the supervisor of {} is gone; {segments}", shown(setup.run.path()));
+    }
+    say(&format!("the run has ended: {segments}"));
+    Ok(Outcome::Done)
+}
+
+fn check_owner(run: &Path) -> anyhow::Result<()> {
+    // What is not there is refused by whoever opens it.
+    let Ok(metadata) = fs::metadata(run) else { return Ok(()) };
+    let user = rustix::process::geteuid().as_raw();
+    if metadata.uid() != user {
+        return Err(wrong_use(format!(
+            "run {} belongs to user {}, you are user {user}: only its owner's workers may join",
+            run.display(),
+            metadata.uid()
+        )));
+    }
+    Ok(())
+}
+
+fn check_takes_in(setup: &Setup) -> anyhow::Result<()> {
+    let (config, run) = (&setup.config, shown(setup.run.path()));
+    if config.run.deterministic {
+        return Err(wrong_use(format!(
+            "run {run} is deterministic: one process does everything, and nobody can join it"
+        )));
+    }
+    if config.actors.joined_max == 0 {
+        return Err(wrong_use(format!("run {run} takes nobody in: its actors.joined_max is 0")));
+    }
+    Ok(())
+}
+
+/// The supervisor's number stands in the run's lock, and names its directory together with the
+/// run's.
+fn connect(run: &RunDirectory) -> anyhow::Result<UnixStream> {
+    let not_trained = || {
+        format!(
+            "run {} is not being trained on this machine; go on with it first: dmprl resume {}",
+            shown(run.path()),
+            shown(run.path())
+        )
+    };
+    let supervisor = run.lock_holder().with_context(not_trained)?;
+    let token = crate::launch::domain_token(&run.manifest()?, supervisor);
+    let domain: PathBuf = Place::new().find(&token).with_context(not_trained)?;
+    let stream = UnixStream::connect(domain.join(JOIN_SOCKET)).with_context(not_trained)?;
+    stream.set_read_timeout(Some(ANSWER_LIMIT)).context("cannot limit the wait for an answer")?;
+    Ok(stream)
+}
+
+fn ask(mut stream: &UnixStream, run: &RunDirectory) -> anyhow::Result<Welcome> {
+    let answer = || -> anyhow::Result<Vec<u8>> {
+        let mut line = Vec::new();
+        // Byte by byte: what follows the line is for the control pipe.
+        for byte in stream.take(ANSWER_BYTES_MAX).bytes() {
+            line.push(byte.with_context(|| format!("no answer within {ANSWER_LIMIT:?}"))?);
+            if line.ends_with(b"\n") {
+                return Ok(line);
+            }
+        }
+        bail!("it has closed the connection")
+    };
+    let asked = || format!("the supervisor of {} did not answer", shown(run.path()));
+    // Of another version, it may say no more than that.
+    let greeting: Greeting =
+        serde_json::from_slice(&answer().with_context(asked)?).with_context(asked)?;
+    let this = Greeting::this();
+    if greeting != this {
+        bail!(
+            "run {} is trained by {greeting}, this program is {this}: join it with that program",
+            shown(run.path())
+        );
+    }
+    let mut request = serde_json::to_vec(&JoinRequest { speaks: this })?;
+    request.push(b'\n');
+    stream.write_all(&request).with_context(asked)?;
+    let welcome = match serde_json::from_slice(&answer().with_context(asked)?)? {
+        JoinAnswer::Welcome(welcome) => welcome,
+        JoinAnswer::Refused { reason } => {
+            bail!("run {} takes no worker in now: {reason}", shown(run.path()))
+        }
+    };
+    stream.set_read_timeout(None).context("cannot wait for commands")?;
+    Ok(welcome)
+}
+
+/// The first signal asks the worker to leave, the second ends it at once.
+fn leave_on_signals(leaving: &Arc<AtomicBool>, control: &ControlPipe) -> anyhow::Result<()> {
+    // `nohup` has one ignored, and means that.
+    for signal in GROUP_SIGNALS.into_iter().filter(|&signal| !is_ignored(signal)) {
+        // In this order: the first signal must not count as the second.
+        flag::register_conditional_shutdown(signal, INTERRUPTED_STATUS, Arc::clone(leaving))
+            .and_then(|_| flag::register(signal, Arc::clone(leaving)))
+            .and_then(|_| flag::register(signal, control.stop_flag()))
+            .with_context(|| format!("cannot catch signal {signal}"))?;
+    }
+    Ok(())
+}
+
+/// Says now and then what was sent.
+struct Teller {
+    started: Instant,
+    told: Cell<Option<Instant>>,
+    sent: Cell<Sent>,
+}
+
+impl Teller {
+    fn new() -> Self {
+        Self { started: Instant::now(), told: Cell::new(None), sent: Cell::new(Sent::default()) }
+    }
+
+    fn tell(&self, sent: Sent) {
+        let first = self.sent.replace(sent).sent == 0 && sent.sent > 0;
+        let due = self.told.get().is_none_or(|at| at.elapsed() >= TELL_INTERVAL);
+        if sent.sent > 0 && (first || due) {
+            self.told.set(Some(Instant::now()));
+            say(&format!(
+                "after {:.1} s: {} segments sent, {} acknowledged",
+                self.started.elapsed().as_secs_f64(),
+                grouped(sent.sent),
+                grouped(sent.acked)
+            ));
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::thread;
+
+    use super::*;
+    use crate::run_directory::Manifest;
+
+    /// What comes of asking a supervisor that says these lines.
+    fn ask_one_that_says(lines: &[&str]) -> anyhow::Result<Welcome> {
+        let lines: Vec<String> = lines.iter().map(ToString::to_string).collect();
+        let folder = tempfile::tempdir().unwrap();
+        let manifest = Manifest::new(None).unwrap();
+        let run = RunDirectory::create(&folder.path().join("run"), &Default::default(), &manifest);
+        let (ours, mut theirs) = UnixStream::pair().unwrap();
+        let supervisor = thread::spawn(move || {
+            lines.iter().for_each(|line| writeln!(theirs, "{line}").unwrap());
+            // Until the other end is closed.
+            theirs.read_to_end(&mut Vec::new()).unwrap();
+        });
+        let answer = ask(&ours, &run.unwrap());
+        drop(ours);
+        supervisor.join().unwrap();
+        answer
+    }
+
+    #[test]
+    fn a_supervisor_of_another_version_is_named_with_it() {
+        let error = ask_one_that_says(&[r#"{"version":"9.9.9","control":7,"new":1}"#]);
+        let error = error.unwrap_err().to_string();
+        assert!(error.contains("is trained by dmprl 9.9.9 (protocol 7)"), "{error}");
+        assert!(error.contains(env!("CARGO_PKG_VERSION")), "{error}");
+    }
+
+    #[test]
+    fn a_refusal_is_handed_on() {
+        let greeting = concat!(r#"{"version":""#, env!("CARGO_PKG_VERSION"), r#"","control":1}"#);
+        let lines = &[greeting, r#"{"refused":{"reason":"it is full"}}"#];
+        let error = ask_one_that_says(lines).unwrap_err().to_string();
+        assert!(error.contains("takes no worker in now: it is full"), "{error}");
+    }
+}

@@ -1,0 +1,261 @@
+//! Workers that join a run that is being trained, and leave it.
+
+use std::fs;
+use std::io::{BufRead, BufReader, Write};
+use std::os::unix::fs::chown;
+use std::os::unix::net::UnixStream;
+use std::path::{Path, PathBuf};
+
+use dmprl_tests::program::{
+    Process, Running, Workplace, env_steps_of, rows, shared_memory_of, until,
+};
+use rustix::process::Signal;
+use serde_json::Value;
+
+use crate::{ENDLESS, train};
+
+/// A run with one worker of its own and `places` for those that join.
+fn training(place: &Workplace, run: &str, places: &str, more: &[&str]) -> Running {
+    let places = format!("actors.joined_max={places}");
+    let more = [&["--steps", ENDLESS, "--workers", "1", "--set", &places], more].concat();
+    let mut running = place.start(&train("reacher", run, &more));
+    running.until_steps(run, 1_000);
+    running
+}
+
+fn join(place: &Workplace, run: &str) -> Running {
+    let mut joined = place.start(&["actor", "--join", run]);
+    joined.until_said("joined run as actor-1: 2 workers");
+    joined
+}
+
+/// Waits until the learner has learned from the segments of the worker that has joined: it knows
+/// how far its newest incarnation has come.
+fn until_learned_from(running: &mut Running, run: &str, incarnation: u64) {
+    running.until("a checkpoint with segments of the worker that joined", |_| {
+        let mark = &newest_state(run)["settled"][1];
+        mark["incarnation"] == incarnation && mark["sequence"].as_u64() > Some(10)
+    });
+}
+
+/// The newest checkpoint's; null while there is none.
+fn newest_state(run: &str) -> Value {
+    let folder = fs::read_dir(Path::new(run).join("checkpoints")).unwrap();
+    let states = folder.flatten().map(|entry| entry.path().join("state.json"));
+    let newest = states.filter(|path| path.exists()).max();
+    let text = newest.and_then(|path| fs::read_to_string(path).ok());
+    // One that is removed in this moment is no more the newest.
+    text.and_then(|text| serde_json::from_str(&text).ok()).unwrap_or_default()
+}
+
+fn end(place: &Workplace, run: &str, running: Running) {
+    running.signal(Signal::INT);
+    running.wait().with_status(130);
+    let last = rows(run, "metrics.jsonl").pop().unwrap();
+    let mut refused = last["rejected"].as_object().unwrap().clone();
+    refused.remove("duplicate");
+    assert!(refused.values().all(|count| count == 0), "{last}");
+    place.until_no_process();
+    assert_eq!(shared_memory_of(run), Vec::<PathBuf>::new());
+}
+
+#[test]
+fn a_worker_joins_is_learned_from_and_makes_room_when_it_leaves_or_dies() {
+    let place = Workplace::new();
+    let run = place.path("run");
+    let mut running = training(&place, &run, "1", &[]);
+    let joined = join(&place, &run);
+    running.until_said("actor-1 has joined: 2 workers");
+    until_learned_from(&mut running, &run, 0);
+    running.until("a line that counts both", |_| {
+        rows(&run, "metrics.jsonl").pop().is_some_and(|last| last["workers"] == 2)
+    });
+    let refused = place.run(&["actor", "--join", &run]).with_status(1);
+    refused.saying("1 of 1 places").saying("actors.joined_max");
+
+    joined.signal_group(Signal::INT);
+    let said = joined.wait().with_status(130).saying("left the run").said;
+    let counts = said.split("left the run: ").nth(1).unwrap();
+    let (acknowledged, rest) = counts.split_once(" of ").unwrap();
+    assert_eq!(Some(acknowledged), rest.split(' ').next(), "all of them: {said}");
+    running.until_said("actor-1, which had joined, has left: 1 worker");
+
+    // The next is killed, and the one after that has its place too.
+    let killed = join(&place, &run);
+    until_learned_from(&mut running, &run, 1);
+    killed.signal_group(Signal::KILL);
+    running.until_said("actor-1, which had joined, died");
+    let mut last = join(&place, &run);
+    until_learned_from(&mut running, &run, 2);
+    last.until_said("segments sent");
+    end(&place, &run, running);
+    last.wait().with_status(0).saying("the run has ended");
+}
+
+#[test]
+fn a_worker_that_has_joined_stays_when_the_learner_is_replaced() {
+    let place = Workplace::new();
+    let run = place.path("run");
+    let mut running = training(&place, &run, "1", &[]);
+    let joined = join(&place, &run);
+    until_learned_from(&mut running, &run, 0);
+    let learner = processes(&place, "learner").pop().unwrap();
+    let before = newest_state(&run)["settled"][1]["sequence"].as_u64().unwrap();
+    learner.signal(Signal::KILL);
+    running.until_said("the learner is back: first segment");
+    running.until("more of its segments", |_| {
+        newest_state(&run)["settled"][1]["sequence"].as_u64() > Some(before + 100)
+    });
+    joined.signal_group(Signal::INT);
+    joined.wait().with_status(130).saying("left the run");
+    end(&place, &run, running);
+}
+
+#[test]
+fn a_worker_that_has_joined_and_is_stopped_loses_its_place() {
+    let place = Workplace::new();
+    let run = place.path("run");
+    let more = ["--set", "supervision.heartbeat_timeout_s=5"];
+    let mut running = training(&place, &run, "1", &more);
+    let joined = join(&place, &run);
+    running.until_said("actor-1 has joined");
+    joined.signal_group(Signal::STOP);
+    running.until_said("actor-1, which had joined, hung (no sign of life for 5.");
+    assert_eq!(joined.wait().status.code(), None);
+    let joined = join(&place, &run);
+    until_learned_from(&mut running, &run, 1);
+    running.signal(Signal::KILL);
+    joined.wait().with_status(1).saying("the supervisor of run is gone");
+    place.until_no_process();
+}
+
+fn processes(place: &Workplace, role: &str) -> Vec<Process> {
+    place.processes().into_iter().filter(|process| process.role == role).collect()
+}
+
+/// Open files of supervisor and learner, and files in shared memory.
+fn held(place: &Workplace, run: &str) -> (Vec<usize>, usize) {
+    let files = ["train", "learner"].into_iter().flat_map(|role| processes(place, role));
+    let files = files.map(|process| {
+        let folder = format!("/proc/{}/fd", process.id.as_raw_nonzero());
+        fs::read_dir(folder).map_or(0, Iterator::count)
+    });
+    let mut folders = shared_memory_of(run);
+    let mut count = 0;
+    while let Some(folder) = folders.pop() {
+        for entry in fs::read_dir(folder).into_iter().flatten().flatten() {
+            count += 1;
+            if entry.path().is_dir() {
+                folders.push(entry.path());
+            }
+        }
+    }
+    (files.collect(), count)
+}
+
+#[test]
+fn joining_and_leaving_all_the_time_leaks_nothing() {
+    let place = Workplace::new();
+    let run = place.path("run");
+    let mut running = training(&place, &run, "1", &[]);
+    let mut before = None;
+    for round in 0..10 {
+        let mut joined = join(&place, &run);
+        match round % 4 {
+            // In the middle of its start, of its work, or of its farewell.
+            0 => joined.signal_group(Signal::KILL),
+            1 => {
+                joined.until_said("segments sent");
+                joined.signal_group(Signal::KILL);
+            }
+            2 => {
+                joined.until_said("segments sent");
+                joined.signal_group(Signal::INT);
+                joined.signal_group(Signal::KILL);
+            }
+            _ => {
+                joined.signal_group(Signal::INT);
+            }
+        }
+        joined.wait();
+        let gone = |running: &Running| {
+            let said = running.said();
+            let of = |words: &str| said.matches(&format!("which had joined, {words}")).count();
+            of("has left") + of("died") == round + 1
+        };
+        running.until("its end is noticed", gone);
+        if before.is_none() {
+            until_learned_from_own(&mut running, &run);
+            before = Some(held(&place, &run));
+        }
+    }
+    let before = before.unwrap();
+    running.until("nothing of them is left", |_| held(&place, &run) == before);
+    end(&place, &run, running);
+}
+
+/// The run goes on, and what a dead worker left has been cleaned up.
+fn until_learned_from_own(running: &mut Running, run: &str) {
+    let steps = env_steps_of(run).unwrap_or(0);
+    running.until_steps(run, steps + 2_000);
+}
+
+#[test]
+fn a_run_that_cannot_take_a_worker_in_says_why() {
+    let place = Workplace::new();
+    let run = place.path("run");
+    let refused = |run: &str, status: i32, words: &str| {
+        place.run(&["actor", "--join", run]).with_status(status).saying(words);
+    };
+    refused(&run, 2, "there is no run directory");
+    place.run(&train("reacher", &run, &["--steps", "500"])).with_status(0);
+    refused(&run, 1, "is not being trained on this machine");
+    if rustix::process::geteuid().is_root() {
+        chown(&run, Some(65_534), None).unwrap();
+        refused(&run, 2, "belongs to user 65534");
+    }
+    let alone = place.path("alone");
+    let more = ["--steps", "100", "--set", "actors.joined_max=0"];
+    place.run(&train("reacher", &alone, &more)).with_status(0);
+    refused(&alone, 2, "its actors.joined_max is 0");
+    let deterministic = place.path("deterministic");
+    let more = ["--steps", "100", "--deterministic"];
+    place.run(&train("reacher", &deterministic, &more)).with_status(0);
+    refused(&deterministic, 2, "is deterministic");
+}
+
+/// Whoever gets as far as the socket is this user, and may still be of another version, or no
+/// worker at all.
+#[test]
+fn a_run_answers_strangers_and_goes_on() {
+    let place = Workplace::new();
+    let run = place.path("run");
+    let mut running = training(&place, &run, "1", &[]);
+    let [domain] = &shared_memory_of(&run)[..] else { panic!("one domain") };
+    let knock = || BufReader::new(UnixStream::connect(domain.join("join.sock")).unwrap());
+    let silent: Vec<_> = (0..20).map(|_| knock()).collect();
+    let mut nonsense = Vec::new();
+    for line in ["{}\n", "nonsense\n", "\n", &"x".repeat(100_000)] {
+        let mut stream = knock();
+        // It may have been sent away before all of it was said.
+        let _ = stream.get_mut().write_all(line.as_bytes());
+        nonsense.push(stream);
+    }
+    drop(silent);
+    let mut older = knock();
+    let mut greeting = String::new();
+    older.read_line(&mut greeting).unwrap();
+    assert!(greeting.contains(r#""version":""#), "{greeting}");
+    let request = r#"{"speaks":{"version":"0.0.0","control":0}}"#;
+    writeln!(older.get_mut(), "{request}").unwrap();
+    let mut answer = String::new();
+    older.read_line(&mut answer).unwrap();
+    assert!(answer.contains("got dmprl 0.0.0 (protocol 0)"), "{answer}");
+    drop(nonsense);
+    let joined = join(&place, &run);
+    until_learned_from(&mut running, &run, 0);
+    until("both live", || processes(&place, "actor").len() == 2);
+    joined.signal_group(Signal::INT);
+    joined.wait().with_status(130);
+    end(&place, &run, running);
+}
