@@ -30,6 +30,7 @@ impl Supervisor {
                 deadlines.extend(self.stalled());
             }
         }
+        deadlines.extend(self.next_look_at_domain(Instant::now()));
         deadlines.extend(self.evaluations.deadline());
         let restarts = self.slots.iter().filter(|(process, _)| self.may_start(**process));
         deadlines.extend(restarts.filter_map(|(_, slot)| slot.restart_at));
@@ -71,6 +72,7 @@ impl Supervisor {
             }
             Phase::Training => self.check_training(now)?,
         }
+        self.check_domain()?;
         self.restart_due(now)?;
         self.check_ready(now)?;
         self.check_evaluation(now);

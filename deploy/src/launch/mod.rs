@@ -18,6 +18,7 @@
 mod child;
 mod deadlines;
 mod domain;
+mod domain_watch;
 mod endings;
 mod env_failures;
 mod evaluate;
