@@ -24,7 +24,10 @@ const RUN_ID: u64 = 5;
 const INTERVAL: u64 = 16;
 /// Kills at least, and until every point has been met, but no more than [`KILLS_MAX`].
 const KILLS_MIN: u32 = 40;
-const KILLS_MAX: u32 = 4_000;
+const KILLS_MAX: u32 = 2_000;
+/// Files below `latest`, where it is a folder: the writer removes them between renaming the
+/// checkpoint and pointing to it.
+const CROWD: u32 = 1_000;
 /// A learner is killed within this time after it has begun to work.
 const KILLED_WITHIN_US: u64 = 3_000;
 /// No test waits longer, on any machine.
@@ -206,6 +209,30 @@ fn folder() -> tempfile::TempDir {
     folder
 }
 
+/// What a learner is killed at the sight of; none: at any moment.
+fn moment(folder: &Path, kill: u32) -> Option<PathBuf> {
+    let checkpoints = checkpoints(folder);
+    let newest = names(&checkpoints).unwrap().pop().map_or(0, |name| name.parse().unwrap());
+    let next: u64 = newest + 1;
+    let written = checkpoints.join(format!(".{next:06}.tmp"));
+    match kill % 4 {
+        0 => None,
+        1 => Some(written.join("replay.bin")),
+        2 => Some(written.join("state.json")),
+        _ => {
+            crowd(&checkpoints.join("latest"));
+            Some(checkpoints.join(format!("{next:06}")))
+        }
+    }
+}
+
+/// Makes `latest` a folder with many files, as in a copy made without symbolic links.
+fn crowd(latest: &Path) {
+    let _ = fs::remove_file(latest).or_else(|_| fs::remove_dir_all(latest));
+    fs::create_dir(latest).unwrap();
+    (0..CROWD).for_each(|index| fs::write(latest.join(index.to_string()), "").unwrap());
+}
+
 fn replay_bytes(learner: &Learner) -> Vec<u8> {
     let mut bytes = Vec::new();
     learner.replay.write(&mut bytes).unwrap();
@@ -222,6 +249,7 @@ fn killed_at_any_point_of_a_checkpoint_it_has_everything_once() {
     let mut kills = 0;
     while kills < KILLS_MIN || !met.all() && kills < KILLS_MAX {
         let before = acknowledged(folder);
+        let moment = moment(folder, kills);
         let mut process = Process::start(folder);
         let started = Instant::now();
         while acknowledged(folder) == before {
@@ -229,8 +257,18 @@ fn killed_at_any_point_of_a_checkpoint_it_has_everything_once() {
             assert!(started.elapsed() < PATIENCE, "it acknowledged nothing");
             std::thread::yield_now();
         }
-        // The moment is the fault that is injected, not what the test relies on.
-        std::thread::sleep(Duration::from_micros(u64::from(kills) * 7_919 % KILLED_WITHIN_US));
+        match &moment {
+            Some(path) => {
+                while path.symlink_metadata().is_err() {
+                    assert!(started.elapsed() < PATIENCE, "no {}", path.display());
+                    std::hint::spin_loop();
+                }
+            }
+            // The moment is the fault that is injected, not what the test relies on.
+            None => std::thread::sleep(Duration::from_micros(
+                u64::from(kills) * 7_919 % KILLED_WITHIN_US,
+            )),
+        }
         drop(process);
         kills += 1;
         met.look(folder);

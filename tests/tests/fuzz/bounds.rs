@@ -2,6 +2,7 @@
 
 use std::alloc::{GlobalAlloc, Layout, System};
 use std::cell::Cell;
+use std::io::Write;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
@@ -15,7 +16,9 @@ const LOOK: Duration = Duration::from_millis(500);
 
 /// Says how to run a case alone.
 pub fn tell(name: &str, seed: u64, what: &str) {
-    eprintln!(
+    // Not `eprintln!`: a process that ends at once takes with it what the harness keeps.
+    let _ = writeln!(
+        std::io::stderr(),
         "{name}, seed {seed}: {what}; alone: {ONE_SEED}={seed} cargo test --release \
          -p dmprl-tests --test fuzz {name}"
     );

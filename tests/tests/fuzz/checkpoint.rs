@@ -14,6 +14,8 @@ use crate::{Target, Verdict};
 
 const STATE: &str = "state.json";
 const REPLAY: &str = "replay.bin";
+/// Before the slots of a replay, each of 8 bytes, its successor first.
+const REPLAY_HEAD: usize = 80;
 const NETWORKS: &str = "networks.safetensors";
 /// Updates after a checkpoint that was accepted: it must be fit to go on from.
 const UPDATES: usize = 2;
@@ -77,7 +79,7 @@ fn repair(files: &mut Files) {
 /// Changes one file, or two.
 fn damage(random: &mut Random, files: &mut Files, other: &Files) {
     for _ in 0..=random.below(2) {
-        match random.below(8) {
+        match random.below(9) {
             0..3 => {
                 if let Ok(mut state) = serde_json::from_slice(&files[STATE]) {
                     mutate::json(random, &mut state);
@@ -87,7 +89,15 @@ fn damage(random: &mut Random, files: &mut Files, other: &Files) {
             // The counts at its front decide how the rest is read.
             3 => overwrite_count(random, files.get_mut(REPLAY).unwrap()),
             4 => overwrite_count(random, files.get_mut(NETWORKS).unwrap()),
-            5 => drop(files.insert(REPLAY.into(), other[REPLAY].clone())),
+            // A slot's successor, of which a window takes its other half.
+            5 => {
+                let replay = files.get_mut(REPLAY).unwrap();
+                let (at, number) = (REPLAY_HEAD + 8 * random.below(240), random.number() as u32);
+                if let Some(word) = replay.get_mut(at..at + 4) {
+                    word.copy_from_slice(&number.to_le_bytes());
+                }
+            }
+            6 => drop(files.insert(REPLAY.into(), other[REPLAY].clone())),
             _ => {
                 let name = *random.pick(&[STATE, REPLAY, REPLAY, NETWORKS]);
                 mutate::bytes(random, files.get_mut(name).unwrap(), &other[name]);

@@ -99,6 +99,11 @@ fn read(path: &std::path::Path, log: &[u8], plain: &Learner) -> Verdict {
         found.flat_map(|record| &record[FRAME_BYTES..]).copied().collect::<Vec<_>>(),
         payloads
     );
+    for record in left[HEAD_BYTES..].chunks_exact(records.max(1)) {
+        let (frame, payload) = record.split_at(FRAME_BYTES);
+        let expected = [payload.len() as u32, crc32fast::hash(payload)].map(u32::to_le_bytes);
+        assert_eq!(frame, expected.as_flattened(), "what is handed over is whole");
+    }
     // The learner takes of it what is sound, each once, and goes on.
     let mut learner = fixture::learner(&[]).unwrap();
     let again = learner.recover(open(path, plain).unwrap()).unwrap();
