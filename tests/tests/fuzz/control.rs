@@ -112,10 +112,10 @@ fn commands_come_through_between_lines_that_are_none() {
             let valid_line = || serde_json::to_vec(&valid[0]).unwrap();
             let line = if random.once_in(4) { line(random, &valid) } else { valid_line() };
             let too_long = line.len() >= 1 << 20;
-            if let Ok(command) = serde_json::from_slice::<Command>(&line) {
-                if matches!(command, Command::Attach { .. } | Command::Evaluate(_)) {
-                    expected.push(command);
-                }
+            if let Ok(command) = serde_json::from_slice::<Command>(&line)
+                && matches!(command, Command::Attach { .. } | Command::Evaluate(_))
+            {
+                expected.push(command);
             }
             input.extend(line);
             input.push(b'\n');
