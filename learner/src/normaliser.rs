@@ -50,6 +50,20 @@ impl Normaliser {
         self.mean.len()
     }
 
+    /// Whether all parts, read from a file, have the same length, and none blows anything up.
+    #[must_use]
+    pub fn is_sound(&self) -> bool {
+        let len = self.mean.len();
+        let seen = [&self.seen_mean, &self.seen_squares];
+        self.scale.len() == len
+            && seen.iter().all(|part| part.len() == len)
+            && seen.into_iter().flatten().all(|value| value.is_finite())
+            && self.seen_squares.iter().all(|&squares| squares >= 0.0)
+            && self.mean.iter().all(|mean| mean.is_finite())
+            && self.scale.iter().all(|&scale| scale.is_finite() && scale > 0.0)
+            && self.count.checked_mul(4).is_some()
+    }
+
     /// Books observations, (rows, O).
     pub fn observe(&mut self, observations: &[f32]) {
         for row in observations.chunks_exact(self.mean.len()) {

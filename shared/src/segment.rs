@@ -217,6 +217,7 @@ pub fn check(header: &SegmentHeader, block: &[f32], expected: &Expected) -> Resu
         && header.env_index < expected.env_count
         && header.sequence > 0
         && (1..=header.segment_steps).contains(&header.steps_len)
+        && header.episode_step.checked_add(header.steps_len).is_some()
         && header.flags & !KNOWN_FLAGS == 0
         && (header.flags & HINDSIGHT == 0 || header.flags & !(HINDSIGHT | TERMINATED) == 0)
         && (header.steps_len == header.segment_steps
@@ -295,6 +296,7 @@ mod tests {
         assert_eq!(verdict(|s| s.header.steps_len = 0), Err(Rejection::Field));
         assert_eq!(verdict(|s| s.header.steps_len = 6), Err(Rejection::Field));
         assert_eq!(verdict(|s| s.header.steps_len = 4), Err(Rejection::Field));
+        assert_eq!(verdict(|s| s.header.episode_step = u32::MAX - 4), Err(Rejection::Field));
         assert_eq!(verdict(|s| s.header.worker_id = 2), Err(Rejection::Field));
         assert_eq!(verdict(|s| s.header.env_index = 4), Err(Rejection::Field));
         assert_eq!(verdict(|s| s.header.sequence = 0), Err(Rejection::Field));

@@ -13,6 +13,7 @@ use dmprl_shared::transport::shared_memory::{LearnerEnd, WorkerEnd, attach, serv
 use dmprl_shared::transport::{
     ParameterPublisher, ParameterSubscriber, SegmentReceiver, SegmentSender, SendOutcome,
 };
+use rustix::process::Signal;
 use transport_support::{
     LAYOUT, Parent, Process, assert_whole, eventually, fill, header, plan, role, snapshot,
 };
@@ -28,6 +29,7 @@ fn another_process_plays_its_role() {
         "worker" => play_worker(&domain, 0, incarnation),
         "other worker" => play_worker(&domain, 1, incarnation),
         "learner" => play_learner(&domain, incarnation),
+        "worker that dies in a loan" => die_in_a_loan(&domain, incarnation),
         other => panic!("role {other}"),
     }
 }
@@ -48,6 +50,38 @@ fn play_worker(domain: &Path, index: usize, incarnation: u32) {
             }
         }
     }
+}
+
+/// Segments that it sends before.
+const BEFORE_THE_LOAN: u64 = 3;
+
+/// Sends a block whose second half lies in a map where its file has ended: the copy into the sample
+/// that it has been lent meets that in the middle, and the kernel ends the process there.
+fn die_in_a_loan(domain: &Path, incarnation: u32) {
+    /// A whole number of pages, of any size.
+    const FILE_BYTES: usize = 64 << 10;
+    let none = rustix::process::Rlimit { current: Some(0), maximum: Some(0) };
+    rustix::process::setrlimit(rustix::process::Resource::Core, none).unwrap();
+    let plan = plan(WORKERS, QUEUE_SEGMENTS);
+    let mut worker = eventually("the worker attaches", || attach(domain, &plan, 0).ok());
+    let mut block = vec![0.0; LAYOUT.block_len()];
+    for sequence in 1..=BEFORE_THE_LOAN {
+        fill(&mut block, sequence);
+        let header = header(0, incarnation, sequence);
+        eventually("a segment is sent", || {
+            let sent = worker.segments.try_send(&header, &block).unwrap();
+            (sent == SendOutcome::Delivered).then_some(())
+        });
+    }
+    let file = tempfile::tempfile().unwrap();
+    file.set_len(FILE_BYTES as u64).unwrap();
+    // SAFETY: nobody else has the file; to read behind its end is what this process is to die of.
+    let map = unsafe { memmap2::MmapOptions::new().len(2 * FILE_BYTES).map(&file) }.unwrap();
+    let values: &[f32] = bytemuck::cast_slice(&map);
+    let from = FILE_BYTES / size_of::<f32>() - LAYOUT.block_len() / 2;
+    let torn = &values[from..from + LAYOUT.block_len()];
+    let outcome = worker.segments.try_send(&header(0, incarnation, BEFORE_THE_LOAN + 1), torn);
+    panic!("it outlived the end of the file: {outcome:?}");
 }
 
 /// Serves, publishes its incarnation as a version and takes for ever.
@@ -105,6 +139,31 @@ fn a_killed_worker_loses_nothing_delivered_and_its_successor_continues() {
     while take(&mut learner, &mut last) {}
     assert!(last[0].1 - before[0].1 <= QUEUE_SEGMENTS as u64);
     learner.segments.maintain().unwrap();
+}
+
+/// More often than the queue has places: a loan that stayed taken would fill it.
+#[test]
+fn a_worker_that_dies_with_a_loaned_sample_takes_no_place_with_it() {
+    const DEATHS: u32 = QUEUE_SEGMENTS as u32 + 8;
+    let parent = Parent::new();
+    let domain = parent.domain("run");
+    let mut learner = serve(domain.path(), &plan(WORKERS, QUEUE_SEGMENTS)).unwrap();
+    let mut last = [(0, 0); WORKERS];
+    for death in 1..=DEATHS {
+        let mut worker = Process::start(ENTRY, "worker that dies in a loan", domain.path(), death);
+        assert_eq!(
+            worker.died_of(|| learner.segments.maintain().unwrap()),
+            Some(Signal::BUS.as_raw())
+        );
+        while take(&mut learner, &mut last) {}
+        assert_eq!(last[0], (death, BEFORE_THE_LOAN), "nothing torn, nothing lost");
+    }
+    let _worker = Process::start(ENTRY, "worker", domain.path(), DEATHS + 1);
+    eventually("a whole worker's segments arrive", || {
+        learner.segments.maintain().unwrap();
+        while last[0].1 < 1000 && take(&mut learner, &mut last) {}
+        (last[0].0 == DEATHS + 1 && last[0].1 >= 1000).then_some(())
+    });
 }
 
 #[test]

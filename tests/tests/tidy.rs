@@ -193,6 +193,39 @@ fn shared_is_told_the_time_the_environment_and_randomness() {
     );
 }
 
+/// The clock on the wall may jump, back too. Whatever waits, limits or measures uses a clock that
+/// does not; the other only names and dates what is left behind.
+#[test]
+fn the_clock_on_the_wall_is_read_for_names_and_dates_only() {
+    const STAMPS: [&str; 4] = [
+        "deploy/src/cli/train.rs",
+        "deploy/src/launch/launcher.rs",
+        "deploy/src/run_directory/manifest.rs",
+        "deploy/src/run_directory/timestamp.rs",
+    ];
+    let stamps = |source: &Source| STAMPS.contains(&source.path.as_str());
+    let mut places = Vec::new();
+    // Of a file, too: its times are the wall's.
+    for word in ["SystemTime", "UNIX_EPOCH", "modified", "accessed", "CLOCK_REALTIME"] {
+        places.extend(named_outside(word, stamps));
+    }
+    for source in sources(&["py"]).iter().filter(|source| !source.is_test()) {
+        for word in ["time.time", "time.time_ns", "datetime"] {
+            let lines = source.code().filter(|(_, line)| names(line, word));
+            places.extend(lines.map(|(at, _)| format!("{}:{at} names {word}", source.path)));
+        }
+    }
+    none(&places, "limits and waits use Instant, in Python time.monotonic or time.perf_counter");
+    // The exceptions compare no times: they only write them.
+    for path in STAMPS {
+        let text = read(path);
+        let code = text.split("#[cfg(test)]").next().unwrap_or_default();
+        for word in ["elapsed", "duration_since(SystemTime::now"] {
+            assert!(!code.contains(word), "{path} measures by the clock on the wall: {word}");
+        }
+    }
+}
+
 #[test]
 fn nothing_is_async_on_the_data_path() {
     let mut places = Vec::new();

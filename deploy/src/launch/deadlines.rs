@@ -33,6 +33,7 @@ impl Supervisor {
                 deadlines.extend(self.first_silent().map(|(at, _)| at));
             }
         }
+        deadlines.extend(self.next_look_at_domain(Instant::now()));
         deadlines.extend(self.evaluations.deadline());
         let restarts = self.slots.iter().filter(|(process, _)| self.may_start(**process));
         deadlines.extend(restarts.filter_map(|(_, slot)| slot.restart_at));
@@ -77,6 +78,7 @@ impl Supervisor {
             }
             Phase::Training => self.check_training(now)?,
         }
+        self.check_domain()?;
         self.restart_due(now)?;
         self.check_ready(now)?;
         self.check_evaluation(now);

@@ -19,6 +19,7 @@ mod child;
 mod deadlines;
 mod deaths;
 mod domain;
+mod domain_watch;
 mod endings;
 mod env_failures;
 mod evaluate;

@@ -126,15 +126,16 @@ fn connect(run: &RunDirectory) -> anyhow::Result<UnixStream> {
 
 fn ask(mut stream: &UnixStream, run: &RunDirectory) -> anyhow::Result<Welcome> {
     let answer = || -> anyhow::Result<Vec<u8>> {
-        let mut line = Vec::new();
+        let (mut line, mut input, mut byte) = (Vec::new(), stream.take(ANSWER_BYTES_MAX), [0]);
         // Byte by byte: what follows the line is for the control pipe.
-        for byte in stream.take(ANSWER_BYTES_MAX).bytes() {
-            line.push(byte.with_context(|| format!("no answer within {ANSWER_LIMIT:?}"))?);
-            if line.ends_with(b"\n") {
-                return Ok(line);
+        while !line.ends_with(b"\n") {
+            let read = input.read(&mut byte);
+            if read.with_context(|| format!("no answer within {ANSWER_LIMIT:?}"))? == 0 {
+                bail!("it has closed the connection");
             }
+            line.extend(byte);
         }
-        bail!("it has closed the connection")
+        Ok(line)
     };
     let asked = || format!("the supervisor of {} did not answer", shown(run.path()));
     // Of another version, it may say no more than that.

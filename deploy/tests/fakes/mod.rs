@@ -158,7 +158,8 @@ pub fn plan(
         program: fake_role(),
         run: run.clone(),
         venv: None,
-        domain: (!one_process).then(|| PathBuf::from("/nowhere")),
+        // Any directory: the fakes share no memory.
+        domain: (!one_process).then(|| run.path().to_owned()),
         resume: false,
         init_from: None,
         learner_restarts: 0,

@@ -12,6 +12,7 @@
 mod background;
 mod networks_file;
 mod rotation;
+mod state;
 
 use std::collections::BTreeMap;
 use std::fs::{self, File};
@@ -33,7 +34,7 @@ pub use background::{Ended, Writer};
 pub use rotation::names;
 
 /// Version of this format.
-const FORMAT_VERSION: u32 = 2;
+const FORMAT_VERSION: u32 = 3;
 const NETWORKS: &str = "networks.safetensors";
 const REPLAY: &str = "replay.bin";
 const STATE: &str = "state.json";
@@ -116,6 +117,9 @@ struct State {
     #[serde(default, skip_serializing_if = "Option::is_none")]
     normaliser: Option<Normaliser>,
     files: Vec<FileSum>,
+    /// CRC-32 of this state without this field. Formats 1 and 2 have none.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    crc32: Option<u32>,
 }
 
 #[derive(Debug, Serialize, Deserialize)]
@@ -173,6 +177,7 @@ impl Cut {
             settled: learner.inbox.settled().to_vec(),
             normaliser: learner.normaliser.clone(),
             files: Vec::new(),
+            crc32: None,
         };
         Ok(Self {
             networks,
@@ -211,6 +216,10 @@ impl Cut {
             self.replay.write(out).map_err(std::io::Error::other)
         })?;
         self.state.files = vec![networks, replay];
+        let path = folder.join(STATE);
+        let sum = state::sum(&mut self.state);
+        self.state.crc32 =
+            Some(sum.map_err(|cause| CheckpointError::Format { path, cause: cause.to_string() })?);
         write_summed(folder, STATE, |out| {
             serde_json::to_writer_pretty(out, &self.state).map_err(Into::into)
         })?;
@@ -225,7 +234,7 @@ impl Cut {
 /// If the folder cannot be read.
 pub fn counters(folder: &Path) -> Result<Vec<Counters>, CheckpointError> {
     let read = |name: String| {
-        let state = read_state(&fs::read(folder.join(name).join(STATE)).ok()?).ok()?;
+        let state = state::read(&fs::read(folder.join(name).join(STATE)).ok()?).ok()?;
         Some(state.counters)
     };
     Ok(names(folder)?.into_iter().filter_map(read).collect())
@@ -299,7 +308,7 @@ fn load(folder: &Path, learner: &mut Learner) -> Result<(), CheckpointError> {
     let format =
         |path: &Path, cause: String| CheckpointError::Format { path: path.to_owned(), cause };
     let text = fs::read(&path).map_err(io_error(&path))?;
-    let state = read_state(&text).map_err(|cause| format(&path, cause))?;
+    let state = state::read(&text).map_err(|cause| format(&path, cause))?;
     let own = learner.policy().architecture_hash();
     if state.architecture_hash != own {
         let got = state.architecture_hash;
@@ -328,6 +337,9 @@ fn load(folder: &Path, learner: &mut Learner) -> Result<(), CheckpointError> {
         }
         None => Err(format(&path, format!("has no optimiser step of {name}"))),
     })?;
+    if state.normaliser.as_ref().is_some_and(|normaliser| !normaliser.is_sound()) {
+        return Err(format(&path, "observation normalisation contradicts itself".into()));
+    }
     if state.normaliser.as_ref().map(Normaliser::observation_len)
         != learner.normaliser.as_ref().map(Normaliser::observation_len)
     {
@@ -341,31 +353,6 @@ fn load(folder: &Path, learner: &mut Learner) -> Result<(), CheckpointError> {
     let windows = learner.config().algorithm.windows;
     learner.sampler = Sampler::new(windows, state.sampler_random);
     Ok(())
-}
-
-/// Reads `state.json` of this version or the one before.
-fn read_state(text: &[u8]) -> Result<State, String> {
-    let mut state: serde_json::Map<String, serde_json::Value> =
-        serde_json::from_slice(text).map_err(|error| error.to_string())?;
-    let version = state.get("format_version").and_then(serde_json::Value::as_u64);
-    match version {
-        Some(version) if version == u64::from(FORMAT_VERSION) => {}
-        // Only DDPG existed, and its two optimisers had a field each.
-        Some(1) => {
-            let mut steps = serde_json::Map::new();
-            for name in ["actor", "critic"] {
-                if let Some(step) = state.remove(&format!("{name}_adam_step")) {
-                    steps.insert(name.to_owned(), step);
-                }
-            }
-            state.insert("adam_steps".into(), steps.into());
-        }
-        _ => {
-            let got = version.map_or("none".into(), |version| version.to_string());
-            return Err(format!("format version {got}, this build reads 1 to {FORMAT_VERSION}"));
-        }
-    }
-    serde_json::from_value(state.into()).map_err(|error| error.to_string())
 }
 
 fn verify(path: &Path, sum: &FileSum) -> Result<(), CheckpointError> {

@@ -162,6 +162,7 @@ fn a_checkpoint_of_the_format_before_is_read_and_one_of_a_later_is_refused() {
     let path = folder.join(&name).join(STATE);
     let mut state: serde_json::Value = serde_json::from_slice(&fs::read(&path).unwrap()).unwrap();
     let steps = state.as_object_mut().unwrap().remove("adam_steps").unwrap();
+    state.as_object_mut().unwrap().remove("crc32");
     state["format_version"] = 1.into();
     for name in ["actor", "critic"] {
         state[format!("{name}_adam_step")] = steps[name].clone();
@@ -171,10 +172,40 @@ fn a_checkpoint_of_the_format_before_is_read_and_one_of_a_later_is_refused() {
     assert_eq!(loaded.counters, learner.counters);
     assert_eq!(loaded.algorithm.networks()[0].1.adam, learner.algorithm.networks()[0].1.adam);
 
-    state["format_version"] = 3.into();
+    state["format_version"] = 4.into();
     fs::write(&path, state.to_string()).unwrap();
     let error = load_newest(folder, &fresh).map(drop).unwrap_err().to_string();
-    assert!(error.contains("format version 3, this build reads 1 to 2"), "{error}");
+    assert!(error.contains("format version 4, this build reads 1 to 3"), "{error}");
+}
+
+/// The other files' checksums stand in `state.json`; what stood there itself was once believed.
+#[test]
+fn a_number_that_was_changed_in_the_state_is_noticed() {
+    let folder = tempfile::tempdir().unwrap();
+    let mut learner = fresh().unwrap();
+    train(&mut learner, 0..20);
+    let name = save(folder.path(), &mut learner).unwrap();
+    let path = folder.path().join(&name).join(STATE);
+    let sound: serde_json::Value = serde_json::from_slice(&fs::read(&path).unwrap()).unwrap();
+    let refused = |state: &serde_json::Value, why: &str| {
+        fs::write(&path, state.to_string()).unwrap();
+        let error = load_newest(folder.path(), &fresh).map(drop).unwrap_err().to_string();
+        assert!(error.contains(why), "{error}");
+    };
+    let mut other = sound.clone();
+    other["counters"]["env_steps"] = 101.into();
+    refused(&other, "CRC-32");
+    other.as_object_mut().unwrap().remove("crc32");
+    refused(&other, "CRC-32");
+    // One of a format without a sum is still held to what a run can be.
+    other["format_version"] = 2.into();
+    for (key, value) in [("updates_owed", 1e300.into()), ("updates_owed", (-1.0).into())] {
+        let mut other = other.clone();
+        other[key] = value;
+        refused(&other, "updates_owed is");
+    }
+    other["counters"]["env_steps"] = u64::MAX.into();
+    refused(&other, "a counter is");
 }
 
 #[test]

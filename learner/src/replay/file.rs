@@ -21,6 +21,8 @@ use super::{NONE, Replay, Slot, Tail};
 
 const MAGIC: &[u8; 8] = b"DMPRLRP2";
 const MAGIC_WITHOUT_KEPT: &[u8; 8] = b"DMPRLRP1";
+/// No run inserts so many.
+const INSERTED_MAX: u64 = 1 << 62;
 
 /// Why a replay file was refused.
 #[derive(Debug, Error)]
@@ -118,7 +120,15 @@ impl Replay {
             fits.then_some(got as usize).ok_or(ReplayFileError::Count { name, expected: max, got })
         });
         (self.filled, self.head) = (filled?, head?);
+        // Until it is full, it is filled from the front.
+        if (self.filled as u64) < max && self.head != self.filled {
+            return Err(ReplayFileError::Inconsistent { name: "head", index: self.head });
+        }
         self.inserted = read_u64(input)?;
+        if !(self.filled as u64..=INSERTED_MAX).contains(&self.inserted) {
+            let index = self.filled;
+            return Err(ReplayFileError::Inconsistent { name: "count of insertions at", index });
+        }
         let tail_count = read_u64(input)?;
         self.kept = if &magic == MAGIC { self.read_kept(input)? } else { 0 };
         for index in 0..self.filled {

@@ -5,6 +5,9 @@ use toml::{Table, Value};
 
 use super::ExperimentConfig;
 
+/// Names in a dotted key: more than any has.
+const KEY_NAMES_MAX: usize = 16;
+
 /// Why a configuration was refused.
 #[derive(Debug, Error, PartialEq)]
 pub enum ConfigError {
@@ -81,9 +84,17 @@ impl Layers {
     /// # Errors
     /// As [`Layers::add`]. A value that is no TOML literal is taken as a string.
     pub fn set(&mut self, origin: &str, key: &str, text: &str) -> Result<(), ConfigError> {
+        if key.split('.').nth(KEY_NAMES_MAX).is_some() {
+            // No key of ours, and a tree so deep would overflow the stack when it is dropped.
+            let (origin, hint) = (origin.to_owned(), String::new());
+            let key = key.split('.').take(KEY_NAMES_MAX).collect::<Vec<_>>().join(".") + "...";
+            return Err(ConfigError::UnknownKey { origin, key, hint });
+        }
         let value = format!("value = {text}")
             .parse::<Table>()
             .ok()
+            // Further lines would be further keys.
+            .filter(|table| table.len() == 1)
             .and_then(|mut table| table.remove("value"))
             .unwrap_or_else(|| Value::String(text.to_owned()));
         let value = self.widen(key, value);
@@ -245,6 +256,22 @@ mod tests {
             let message = layers.set("--set", given, "64").unwrap_err().to_string();
             assert!(message.contains(&format!("did you mean `{near}`")), "{given}: {message}");
         }
+    }
+
+    /// It once ended the program: the tree of tables overflowed the stack.
+    #[test]
+    fn a_key_without_end_is_unknown() {
+        let error = Layers::new().set("--set", &"a.".repeat(100_000), "1").unwrap_err();
+        assert!(matches!(error, ConfigError::UnknownKey { .. }), "{error}");
+        assert!(error.to_string().len() < 100, "{error}");
+    }
+
+    /// The second line was once dropped without a word.
+    #[test]
+    fn a_value_of_several_lines_sets_no_other_key() {
+        let mut layers = Layers::new();
+        assert!(layers.set("--set", "run.seed", "1\nsteps = 2").is_err());
+        assert_eq!(layers.finish().unwrap(), ExperimentConfig::default());
     }
 
     #[test]

@@ -26,6 +26,9 @@ const UNACKNOWLEDGED_MAX: usize = 1 << 20;
 /// Room for some segments of any size.
 const LOG_BYTES_MIN: u64 = 1 << 20;
 const LOG_BYTES_MAX: u64 = 1 << 44;
+const UPDATES_PER_SEGMENT_MAX: f64 = 1e6;
+/// Some thirty years.
+const SECONDS_MAX: f64 = 1e9;
 /// 50 environment steps of each environment at K = 5, as published.
 const ROLLOUT_SEGMENTS_PER_ENV: usize = 10;
 
@@ -139,13 +142,29 @@ impl ExperimentConfig {
             ("policy.rho_range", self.policy.rho_range),
             ("dmp.alpha_x", self.dmp.alpha_x),
             ("dmp.alpha_y", self.dmp.alpha_y),
-            ("pacing.updates_per_segment", self.pacing.updates_per_segment),
-            ("actors.send_deadline_s", self.actors.send_deadline_s),
-            ("actors.env_call_timeout_s", self.actors.env_call_timeout_s),
-            ("supervision.heartbeat_timeout_s", self.supervision.heartbeat_timeout_s),
         ];
         for (key, got) in positive {
             range(key, got, got.is_finite() && got > 0.0, || "a positive number".into())?;
+        }
+        let bounded = [
+            (
+                "pacing.updates_per_segment",
+                self.pacing.updates_per_segment,
+                UPDATES_PER_SEGMENT_MAX,
+            ),
+            ("actors.send_deadline_s", self.actors.send_deadline_s, SECONDS_MAX),
+            ("actors.env_call_timeout_s", self.actors.env_call_timeout_s, SECONDS_MAX),
+            ("supervision.heartbeat_timeout_s", self.supervision.heartbeat_timeout_s, SECONDS_MAX),
+        ];
+        for (key, got, max) in bounded {
+            range(key, got, got > 0.0 && got <= max, || format!("above 0, at most {max}"))?;
+        }
+        let goals = [
+            ("run.until_return", self.run.until_return),
+            ("run.until_success", self.run.until_success),
+        ];
+        for (key, got) in goals {
+            range(key, got, !got.is_nan(), || "a number (inf: none)".into())?;
         }
         let unit = [
             ("algorithm.discount", self.algorithm.discount),
@@ -369,6 +388,8 @@ mod tests {
             ("actors.workers", "1000000"),
             ("actors.env_call_timeout_s", "0"),
             ("actors.env_call_timeout_s", "inf"),
+            ("actors.send_deadline_s", "1e300"),
+            ("run.until_return", "nan"),
             ("policy.hidden", "[]"),
             ("algorithm.critic", "first"),
             ("algorithm.target", "literal"),

@@ -3,6 +3,7 @@
 
 #![allow(dead_code, reason = "each test binary uses a part")]
 
+use std::os::unix::process::ExitStatusExt;
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Stdio};
 use std::time::{Duration, Instant};
@@ -120,6 +121,16 @@ impl Process {
     pub fn kill(&mut self) {
         self.0.kill().unwrap();
         self.0.wait().unwrap();
+    }
+
+    /// The signal that it dies of by itself; `meanwhile` is done again and again.
+    #[track_caller]
+    pub fn died_of(&mut self, mut meanwhile: impl FnMut()) -> Option<i32> {
+        let ended = eventually("the other process dies", || {
+            meanwhile();
+            self.0.try_wait().unwrap()
+        });
+        ended.signal()
     }
 
     #[track_caller]

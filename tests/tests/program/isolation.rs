@@ -55,7 +55,7 @@ fn a_run_that_shared_memory_cannot_hold_is_refused_with_both_numbers() {
 
 /// A command that finds a /dev/shm of its own, of so many KiB, as in a container; none, loudly,
 /// where this machine lets nobody mount one.
-fn with_shared_memory_of(kib: u32, script: &str) -> Option<Command> {
+pub(crate) fn with_shared_memory_of(kib: u32, script: &str) -> Option<Command> {
     let mount = format!("mount -t tmpfs -o size={kib}k,mode=1777 tmpfs /dev/shm");
     let alone = |script: &str| {
         let mut command = Command::new("unshare");

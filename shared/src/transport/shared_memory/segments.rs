@@ -285,6 +285,11 @@ impl SegmentReceiver for Receiver {
     }
 
     fn maintain(&mut self) -> Result<(), TransportError> {
+        // Joins what has just begun: of a worker that was never joined nothing stays when it is
+        // dead and cleaned up, not even what it was told is delivered.
+        for port in self.slots.iter().filter_map(|slot| slot.port.as_ref()) {
+            let _ = port.has_samples();
+        }
         match clean(&self.node) {
             Ok(()) => self.clean_failures = 0,
             Err(error) if self.clean_failures >= CLEAN_FAILURES_MAX => return Err(error),
