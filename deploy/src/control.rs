@@ -101,11 +101,8 @@ pub enum Command {
     },
     /// To the learner: what all workers have reported to the supervisor, in the whole run.
     Sent(Sent),
-    /// To the learner: so many workers are attached.
-    Workers {
-        /// The run's own and those that have joined.
-        count: u64,
-    },
+    /// To the learner: what the supervisor knows of the workers.
+    Workers(WorkersNow),
     /// To the learner: the run has reached its goal or its time; finish as at the last step, with a
     /// last evaluation.
     Finish,
@@ -149,7 +146,12 @@ pub enum Report {
     /// What a worker did since its last such report.
     Sent(Sent),
     /// A worker's sign of life, a few times in each limit of the supervisor.
-    Alive(Doing),
+    Alive {
+        /// What it does.
+        doing: Doing,
+        /// Segments that it keeps because the learner has not acknowledged them.
+        kept: u64,
+    },
     /// A call into the environments does not return; the process ends itself after this.
     EnvHung {
         /// The sentence.
@@ -171,6 +173,18 @@ pub enum Report {
         /// The sentence.
         message: String,
     },
+}
+
+/// What the supervisor tells the learner of the workers, for its metrics.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct WorkersNow {
+    /// Attached: the run's own and those that have joined.
+    pub count: u64,
+    /// Starts after a death, in the whole run.
+    pub restarts: u64,
+    /// Segments that they keep until the learner acknowledges them, all together.
+    pub queued_segments: u64,
 }
 
 /// What a worker does when it gives a sign of life.
@@ -218,6 +232,12 @@ pub struct Progress {
     pub samples_per_insert: f64,
     /// Median over recent segments: policy versions between acting and insertion.
     pub policy_lag_p50: u64,
+    /// Largest of them.
+    pub policy_lag_max: u64,
+    /// Segments that workers keep until the learner acknowledges them.
+    pub queued_segments: u64,
+    /// Starts of workers and of the learner after a death, over the whole run.
+    pub restarts: u64,
     /// Segments refused, duplicates aside.
     pub rejected: u64,
     /// Failures of environments.

@@ -231,6 +231,8 @@ fn every_configuration_key_that_is_named_exists() {
 fn the_keys_of_both_kinds_of_lines_are_documented() {
     let metrics = MetricsLine {
         workers: 0,
+        queued_segments: 0,
+        worker_restarts: 0,
         env_steps: 0,
         updates: 0,
         segments: 0,

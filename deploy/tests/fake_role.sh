@@ -35,7 +35,7 @@ evaluate() {
 }
 # Signs of life until the process ends; what it was told is noted meanwhile.
 beat() {
-    (while kill -0 $$ 2>/dev/null; do echo '{"alive":"stepping"}'; sleep 0.1; done) &
+    (while kill -0 $$ 2>/dev/null; do echo '{"alive":{"doing":"stepping","kept":0}}'; sleep 0.1; done) &
 }
 sent() {
     echo '{"sent":{"produced":1,"sent":1,"resent":0,"acked":0}}'
@@ -80,7 +80,7 @@ actor-beating) ready; beat; until_stop; exit 0 ;;
 actor-freezes-once)
     ready
     [ "$incarnation" = 0 ] || beat
-    echo '{"alive":"waiting"}'
+    echo '{"alive":{"doing":"waiting","kept":7}}'
     until_stop
     exit 0
     ;;

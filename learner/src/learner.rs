@@ -99,6 +99,9 @@ pub struct Counters {
     /// Starts of the learner after a death within a session, likewise.
     #[serde(default)]
     pub learner_restarts: u64,
+    /// Starts of workers after a death, likewise.
+    #[serde(default)]
+    pub worker_restarts: u64,
 }
 
 /// Everything that learns.
@@ -395,6 +398,8 @@ impl Learner {
             policy_lag_max: collected.lag.map(|lag| lag.1),
             updates_owed: self.pacing.owed(),
             workers: 0,
+            queued_segments: 0,
+            worker_restarts: counters.worker_restarts,
             wall_s: 0.0,
             env_steps_per_s: 0.0,
             updates_per_s: 0.0,

@@ -39,6 +39,12 @@ pub struct MetricsLine {
     /// Workers that are attached, those that have joined included.
     #[serde(default)]
     pub workers: u64,
+    /// Segments that they keep until the learner acknowledges them, as they told last.
+    #[serde(default)]
+    pub queued_segments: u64,
+    /// Starts of workers after a death, over the whole run.
+    #[serde(default)]
+    pub worker_restarts: u64,
     /// Starts of the learner after a death within a session, over the whole run.
     #[serde(default)]
     pub learner_restarts: u64,

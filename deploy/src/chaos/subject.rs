@@ -41,6 +41,8 @@ fn keys() -> Vec<String> {
         "evaluation.interval_steps=50000",
         "metrics.interval_steps=5000",
         "actors.restarts_max=1000000",
+        // The checker knows every worker there may be.
+        "actors.joined_max=0",
         "supervision.learner_restarts_max=1000000",
     ]
     .map(str::to_owned)

@@ -187,6 +187,7 @@ impl Supervisor {
         let wait = self.limits.back_off(slot.restarts);
         slot.restarts += 1;
         slot.restart_at = Some(Instant::now() + wait);
+        self.worker_restarts += u64::from(matches!(process, Process::Actor(_)));
         self.display.message(&format!(
             "{process} {death}: restart {} of {restarts_max} in {:.1} s; log: {log}",
             slot.restarts,

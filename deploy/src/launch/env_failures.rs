@@ -3,7 +3,7 @@
 
 use super::Process;
 use super::supervisor::Supervisor;
-use crate::control::Command;
+use crate::control::{Command, WorkersNow};
 use crate::terminal::grouped;
 
 impl Supervisor {
@@ -43,7 +43,11 @@ impl Supervisor {
         let mut sent = self.before.sent;
         sent += self.sent;
         let _ = learner.child.send(Command::Sent(sent));
-        let _ = learner.child.send(Command::Workers { count: self.workers() as u64 });
+        let _ = learner.child.send(Command::Workers(WorkersNow {
+            count: self.workers() as u64,
+            restarts: self.before.worker_restarts + self.worker_restarts,
+            queued_segments: self.all_running().map(|(_, running)| running.kept).sum(),
+        }));
     }
 }
 

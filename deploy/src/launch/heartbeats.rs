@@ -18,8 +18,9 @@ impl Supervisor {
         let slot = self.slots.get_mut(&process);
         if let Some(running) = slot.and_then(|slot| slot.running.as_mut()) {
             running.heard = Instant::now();
-            if let Report::Alive(doing) = report {
+            if let Report::Alive { doing, kept } = report {
                 running.doing = Some(*doing);
+                running.kept = *kept;
             }
         }
     }

@@ -73,7 +73,7 @@ impl Supervisor {
                     self.worked(process);
                 }
             }
-            Report::Alive(_) => {}
+            Report::Alive { .. } => {}
             Report::Left => self.on_left(process),
             Report::EnvHung { message } => self.on_env_hung(process, &message),
             Report::Checkpoint { name, env_steps } => {

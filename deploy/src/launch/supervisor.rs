@@ -101,6 +101,8 @@ pub(super) struct Running {
     /// When it last said anything, and what it then did.
     pub(super) heard: Instant,
     pub(super) doing: Option<Doing>,
+    /// Segments that it keeps, as it then said.
+    pub(super) kept: u64,
     /// When it first and last told of work: a worker of segments sent, a learner of checkpoints.
     pub(super) worked: Option<(Instant, Instant)>,
     /// A worker that had joined has said that it leaves.
@@ -119,6 +121,7 @@ impl Running {
             attached: false,
             heard: now,
             doing: None,
+            kept: 0,
             worked: None,
             left: false,
             killed_for: None,
@@ -169,6 +172,8 @@ pub(super) struct Supervisor {
     /// Failures of environments in this session, and what its workers did.
     pub(super) env_failures: u64,
     pub(super) sent: Sent,
+    /// Starts of workers after a death in this session.
+    pub(super) worker_restarts: u64,
 }
 
 /// What ended the supervisor's wait.
@@ -214,6 +219,7 @@ pub async fn supervise(plan: SupervisorPlan) -> SessionReport {
         before: Counters::default(),
         env_failures: 0,
         sent: Sent::default(),
+        worker_restarts: 0,
     };
     let started = supervisor.start();
     supervisor.check(started);

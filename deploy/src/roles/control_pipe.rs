@@ -12,7 +12,7 @@ use anyhow::{Context, ensure};
 use dmprl_shared::transport::delivery::Sent;
 
 use super::heartbeat::Pulse;
-use crate::control::{Command, Doing, GROUP_SIGNALS, Report};
+use crate::control::{Command, Doing, GROUP_SIGNALS, Report, WorkersNow};
 use crate::terminal::say;
 
 /// A worker or evaluator whose supervisor is gone has so long to end before it is killed.
@@ -32,7 +32,7 @@ struct Flags {
     finish: AtomicBool,
     orphaned: AtomicBool,
     env_failures: AtomicU64,
-    workers: AtomicU64,
+    workers: Mutex<WorkersNow>,
     sent: Mutex<Sent>,
 }
 
@@ -131,10 +131,10 @@ impl ControlPipe {
         self.flags.env_failures.load(Ordering::Acquire)
     }
 
-    /// Workers that are attached; 0 before the supervisor has told of any.
+    /// What the supervisor knows of the workers; nothing before it has told of any.
     #[must_use]
-    pub fn workers(&self) -> u64 {
-        self.flags.workers.load(Ordering::Acquire)
+    pub fn workers(&self) -> WorkersNow {
+        *self.flags.workers.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
     /// What the workers did in the whole run; nothing before the supervisor has told of it.
@@ -167,6 +167,11 @@ impl ControlPipe {
     /// Notes that the role's loop has come round once more, for the heartbeat.
     pub fn beat(&self, doing: Doing) {
         self.pulse.beat(doing);
+    }
+
+    /// Notes how many segments wait for the learner's acknowledgement, likewise.
+    pub fn keep(&self, segments: usize) {
+        self.pulse.keep(segments as u64);
     }
 
     /// What [`ControlPipe::beat`] notes.
@@ -220,7 +225,9 @@ fn read_commands(input: impl Read, sender: &SyncSender<Command>, flags: &Flags) 
             Ok(Command::EnvFailures { total }) => {
                 flags.env_failures.store(total, Ordering::Release);
             }
-            Ok(Command::Workers { count }) => flags.workers.store(count, Ordering::Release),
+            Ok(Command::Workers(now)) => {
+                *flags.workers.lock().unwrap_or_else(PoisonError::into_inner) = now;
+            }
             Ok(Command::Sent(total)) => {
                 *flags.sent.lock().unwrap_or_else(PoisonError::into_inner) = total;
             }

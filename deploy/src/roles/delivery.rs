@@ -160,6 +160,7 @@ impl<'a> Delivery<'a> {
                 };
                 self.warn(format!("worker {} has waited {seconds} s: {why}", self.index()));
             }
+            self.hear()?;
             self.control.beat(Doing::Waiting);
             std::thread::sleep(pause);
             pause = (pause * 2).min(FULL_QUEUE_MAX);
@@ -198,6 +199,7 @@ impl<'a> Delivery<'a> {
                 journal.note(Entry::Acknowledged(Mark { incarnation, sequence }));
             }
         }
+        self.control.keep(self.outbox.len());
         Ok(())
     }
 

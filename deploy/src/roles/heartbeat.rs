@@ -10,26 +10,36 @@ use std::sync::atomic::{AtomicU64, Ordering};
 
 use crate::control::Doing;
 
-/// How often a loop has come round, and in the two lowest bits what it did then.
+/// What a loop tells the thread.
 #[derive(Debug)]
-pub struct Pulse(AtomicU64);
+pub struct Pulse {
+    /// How often it has come round, and in the two lowest bits what it did then.
+    state: AtomicU64,
+    /// Segments that the learner has not acknowledged.
+    kept: AtomicU64,
+}
 
 impl Pulse {
     /// A loop that has not begun.
     #[must_use]
     pub fn new(doing: Doing) -> Self {
-        Self(AtomicU64::new(bits(doing)))
+        Self { state: AtomicU64::new(bits(doing)), kept: AtomicU64::new(0) }
     }
 
     /// The loop has come round; from its thread only.
     pub fn beat(&self, doing: Doing) {
         // The other thread compares numbers and reads no other memory: no order is needed.
-        let number = (self.0.load(Ordering::Relaxed) >> 2).wrapping_add(1);
-        self.0.store(number << 2 | bits(doing), Ordering::Relaxed);
+        let number = (self.state.load(Ordering::Relaxed) >> 2).wrapping_add(1);
+        self.state.store(number << 2 | bits(doing), Ordering::Relaxed);
+    }
+
+    /// So many segments are kept.
+    pub fn keep(&self, segments: u64) {
+        self.kept.store(segments, Ordering::Relaxed);
     }
 
     fn state(&self) -> (u64, Doing) {
-        let state = self.0.load(Ordering::Relaxed);
+        let state = self.state.load(Ordering::Relaxed);
         let doing = match state & 3 {
             1 => Doing::Stepping,
             2 => Doing::Waiting,
@@ -53,6 +63,7 @@ pub use thread::start;
 #[cfg(feature = "python")]
 mod thread {
     use std::sync::Arc;
+    use std::sync::atomic::Ordering;
     use std::time::Duration;
 
     use anyhow::Context;
@@ -76,7 +87,8 @@ mod thread {
                 drop(calls);
                 if calling || last != Some(state) {
                     let doing = if calling { Doing::Stepping } else { doing };
-                    if reporter.send(&Report::Alive(doing)).is_err() {
+                    let kept = pulse.kept.load(Ordering::Relaxed);
+                    if reporter.send(&Report::Alive { doing, kept }).is_err() {
                         return;
                     }
                 }

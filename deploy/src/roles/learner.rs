@@ -249,6 +249,8 @@ impl Server<'_> {
     fn hear(&mut self) {
         let counters = &mut self.session.learner.counters;
         counters.env_failures = counters.env_failures.max(self.control.env_failures());
+        let workers = self.control.workers();
+        counters.worker_restarts = counters.worker_restarts.max(workers.restarts);
         let sent = self.control.sent();
         if sent.produced >= counters.sent.produced {
             counters.sent = sent;

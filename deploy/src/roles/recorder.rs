@@ -37,7 +37,8 @@ pub struct Recorder<'a> {
     line: Rate,
     progress: Rate,
     return_mean: Option<f64>,
-    policy_lag_p50: u64,
+    /// Median and largest, in the newest metrics line that had some.
+    policy_lag: (u64, u64),
     checkpoints: Writer,
     /// Disk trouble is told once until it is over: a full disk must not fill the terminal too.
     checkpoint_failing: bool,
@@ -87,7 +88,7 @@ impl<'a> Recorder<'a> {
             line: Rate::now(learner),
             progress: Rate::now(learner),
             return_mean: None,
-            policy_lag_p50: 0,
+            policy_lag: (0, 0),
             checkpoints: Writer::new(run.checkpoints_path()),
             checkpoint_failing: false,
             log_failing: false,
@@ -188,15 +189,17 @@ impl<'a> Recorder<'a> {
         let now = Rate::now(learner);
         let (env_steps_per_s, updates_per_s) = self.line.until(now);
         self.line = now;
+        let workers = self.control.workers();
         let line = MetricsLine {
             wall_s: self.wall_s(),
             env_steps_per_s,
             updates_per_s,
-            workers: if learner.config().run.deterministic { 1 } else { self.control.workers() },
+            workers: if learner.config().run.deterministic { 1 } else { workers.count },
+            queued_segments: workers.queued_segments,
             ..learner.metrics_line()
         };
         self.return_mean = line.training_return_mean.or(self.return_mean);
-        self.policy_lag_p50 = line.policy_lag_p50.unwrap_or(self.policy_lag_p50);
+        self.policy_lag = line.policy_lag_p50.zip(line.policy_lag_max).unwrap_or(self.policy_lag);
         let mut text = serde_json::to_vec(&line).context("cannot write metrics as JSON")?;
         text.push(b'\n');
         // A disk that is full must not end a run: the line is lost, the training is not.
@@ -298,7 +301,10 @@ impl<'a> Recorder<'a> {
             updates_per_s,
             return_mean: self.return_mean,
             samples_per_insert: learner.samples_per_insert(),
-            policy_lag_p50: self.policy_lag_p50,
+            policy_lag_p50: self.policy_lag.0,
+            policy_lag_max: self.policy_lag.1,
+            queued_segments: self.control.workers().queued_segments,
+            restarts: counters.worker_restarts + counters.learner_restarts,
             rejected: counters.rejected.total(),
             env_failures: counters.env_failures,
         }));

@@ -145,6 +145,11 @@ impl Display {
         parts.push(format!("{:.0} steps/s", progress.env_steps_per_s));
         parts.push(format!("{:.0} updates/s", progress.updates_per_s));
         parts.push(format!("{:.1} samples/insert", progress.samples_per_insert));
+        parts.push(format!("lag {} (max {})", progress.policy_lag_p50, progress.policy_lag_max));
+        parts.push(format!("{} queued", grouped(progress.queued_segments)));
+        if progress.restarts > 0 {
+            parts.push(format!("{} restarts", grouped(progress.restarts)));
+        }
         if progress.rejected > 0 {
             parts.push(format!("{} rejected", progress.rejected));
         }
@@ -208,12 +213,17 @@ mod tests {
             env_steps_per_s: 50.0,
             updates_per_s: 20.0,
             samples_per_insert: 12.5,
+            policy_lag_p50: 2,
+            policy_lag_max: 7,
+            queued_segments: 1_024,
+            restarts: 3,
             ..Progress::default()
         };
         display.progress(&progress);
         display.progress(&progress);
         let text = String::from_utf8(shared.0.lock().unwrap().clone()).unwrap();
-        let rates = "50 steps/s · 20 updates/s · 12.5 samples/insert";
+        let rates = "50 steps/s · 20 updates/s · 12.5 samples/insert · lag 2 (max 7) · \
+                     1,024 queued · 3 restarts";
         assert_eq!(text, format!(" 25% 250/1,000 steps · eta 15 s · {rates}\n"));
     }
 
