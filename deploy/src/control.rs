@@ -145,7 +145,7 @@ pub enum Report {
     },
     /// What a worker did since its last such report.
     Sent(Sent),
-    /// A worker's sign of life, a few times in each limit of the supervisor.
+    /// A worker's sign of life, once a second.
     Alive {
         /// What it does.
         doing: Doing,

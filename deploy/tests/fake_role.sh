@@ -25,7 +25,7 @@ ready() {
     echo '{"environment_ready":{"spec":{"id":"Fake-v0","observation_len":2,"action_len":1,"action_low":[-1.0],"action_high":[1.0],"control_dt_s":0.02,"episode_steps":50}}}'
 }
 progress() {
-    echo '{"progress":{"env_steps":'"$1"',"updates":'"$1"',"segments":2,"env_steps_per_s":10.0,"updates_per_s":4.0,"return_mean":null,"samples_per_insert":1.0,"policy_lag_p50":0,"rejected":0,"env_failures":0}}'
+    echo '{"progress":{"env_steps":'"$1"',"updates":'"$1"',"segments":2,"env_steps_per_s":10.0,"updates_per_s":4.0,"return_mean":null,"samples_per_insert":1.0,"policy_lag_p50":0,"policy_lag_max":0,"queued_segments":0,"restarts":0,"rejected":0,"env_failures":0}}'
 }
 row() {
     echo '{"evaluated":{"env_steps":10,"updates":10,"segments":2,"wall_s":1.0,"policy_version":'"$1"',"returns":[-2.0,-4.0],"return_mean":-3.0,"success_rate":0.5,"smoothness":0.1}}'
@@ -84,7 +84,7 @@ actor-freezes-once)
     until_stop
     exit 0
     ;;
-actor-dies-after-work) ready; sent; sleep 0.3; sent; kill -9 $$ ;;
+actor-dies-after-work) ready; sent; sleep 1.5; sent; kill -9 $$ ;;
 actor-dies-before-work) ready; sent; kill -9 $$ ;;
 actor-dies-once)
     ready

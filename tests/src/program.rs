@@ -202,25 +202,40 @@ impl Process {
     }
 }
 
-/// Whether a thread of any `dmprl` has lost its memory, and so its command line, but not its files.
+/// Whether any `dmprl` has lost its command line, but not all of its files: a thread of it is on
+/// its way out, or will be when it next runs.
 fn any_is_dying() -> bool {
-    /// `PF_EXITING` of the kernel's `flags`, field 9 of /proc/PID/stat.
-    const EXITING: u64 = 0x4;
-    let numbered = |path: &Path| {
+    let ids = |path: &Path| {
         let entries = fs::read_dir(path).into_iter().flatten().flatten();
         entries
             .filter(|entry| entry.file_name().as_encoded_bytes().iter().all(u8::is_ascii_digit))
             .map(|entry| entry.path())
             .collect::<Vec<_>>()
     };
-    let threads = |process: PathBuf| numbered(&process.join("task"));
-    numbered(Path::new("/proc")).into_iter().flat_map(threads).any(|thread| {
-        let stat = fs::read_to_string(thread.join("stat")).unwrap_or_default();
-        let Some((name, rest)) = stat.rsplit_once(')') else { return false };
-        let fields: Vec<&str> = rest.split_whitespace().collect();
-        let flags = fields.get(6).and_then(|flags| flags.parse::<u64>().ok()).unwrap_or(0);
-        name.contains("dmprl") && !matches!(fields[0], "Z" | "X") && flags & EXITING != 0
+    ids(Path::new("/proc")).into_iter().any(|process| {
+        let Some((name, state, _)) = thread_state(&process) else { return false };
+        let threads = ids(&process.join("task"));
+        name.contains("dmprl")
+            && threads
+                .iter()
+                .filter_map(|thread| thread_state(thread))
+                .any(|(_, own, exiting)| !is_gone(own) && (exiting || is_gone(state)))
     })
+}
+
+fn is_gone(state: char) -> bool {
+    matches!(state, 'Z' | 'X')
+}
+
+/// Name, state and whether it is exiting, of a thread or of a process's first one.
+fn thread_state(path: &Path) -> Option<(String, char, bool)> {
+    /// `PF_EXITING` of the kernel's `flags`, field 9 of /proc/PID/stat.
+    const EXITING: u64 = 0x4;
+    let stat = fs::read_to_string(path.join("stat")).ok()?;
+    let (name, rest) = stat.rsplit_once(')')?;
+    let fields: Vec<&str> = rest.split_whitespace().collect();
+    let flags = fields.get(6)?.parse::<u64>().ok()?;
+    Some((name.to_owned(), fields.first()?.chars().next()?, flags & EXITING != 0))
 }
 
 /// The processes that have `text` on their command line. Zombies have no command line.

@@ -1,6 +1,6 @@
 //! Reads the journals of a run while they are written, and removes those of the dead.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::fs::{self, File};
 use std::io::Read;
 use std::path::{Path, PathBuf};
@@ -15,6 +15,8 @@ use crate::journal::{Author, RECORD_BYTES, Record};
 pub(super) struct Journals {
     folder: PathBuf,
     open: BTreeMap<Author, Tail>,
+    /// Kept, and read to their ends: the dead's.
+    read: BTreeSet<Author>,
     /// Nothing is removed any more: somebody will want to read it.
     keep: bool,
 }
@@ -52,7 +54,7 @@ impl Tail {
 
 impl Journals {
     pub(super) fn new(folder: PathBuf) -> Self {
-        Self { folder, open: BTreeMap::new(), keep: false }
+        Self { folder, open: BTreeMap::new(), read: BTreeSet::new(), keep: false }
     }
 
     /// Keeps the files from now on.
@@ -89,7 +91,8 @@ impl Journals {
         let mut authors = Vec::new();
         for entry in fs::read_dir(&self.folder).with_context(failed)? {
             let name = entry.with_context(failed)?.file_name();
-            authors.extend(name.to_str().and_then(Author::of).filter(&whose));
+            let author = name.to_str().and_then(Author::of).filter(&whose);
+            authors.extend(author.filter(|author| !self.read.contains(author)));
         }
         authors.sort_unstable();
         // The newest first: when a successor has written something, its predecessor is dead, and
@@ -106,11 +109,9 @@ impl Journals {
         Ok(authors)
     }
 
-    /// Removes those that have a successor: it was there before they were read for the last time.
+    /// Closes those that have a successor, which was there before they were read for the last time;
+    /// removes them unless they are to be kept.
     fn remove_read(&mut self) {
-        if self.keep {
-            return;
-        }
         let authors: Vec<Author> = self.open.keys().copied().collect();
         for pair in authors.windows(2) {
             let succeeded = match (pair[0], pair[1]) {
@@ -120,8 +121,12 @@ impl Journals {
             };
             if succeeded {
                 self.open.remove(&pair[0]);
-                // One that cannot be removed now goes with the folder.
-                let _ = fs::remove_file(pair[0].path(&self.folder));
+                if self.keep {
+                    self.read.insert(pair[0]);
+                } else {
+                    // One that cannot be removed now goes with the folder.
+                    let _ = fs::remove_file(pair[0].path(&self.folder));
+                }
             }
         }
     }

@@ -63,7 +63,7 @@ pub fn chaos(plan: &TrialPlan) -> anyhow::Result<Report> {
     let watch = Watch::start()?;
     let (folder, temporary) = match &plan.output {
         Some(folder) => {
-            RunDirectory::check_free(folder)?;
+            RunDirectory::check_free(folder).context("cannot use --output")?;
             std::fs::create_dir_all(folder)
                 .with_context(|| format!("cannot make {}", folder.display()))?;
             (std::fs::canonicalize(folder).context("cannot resolve --output")?, None)
@@ -74,8 +74,17 @@ pub fn chaos(plan: &TrialPlan) -> anyhow::Result<Report> {
             (made.path().to_owned(), Some(made))
         }
     };
-    let subject = Subject::start(plan, &folder)?;
-    let mut report = Trial::new(plan, subject)?.run(&watch)?;
+    let tried = Subject::start(plan, &folder)
+        .and_then(|subject| Trial::new(plan, subject))
+        .and_then(|trial| trial.run(&watch));
+    let mut report = match tried {
+        Ok(report) => report,
+        Err(error) => {
+            // What it left says why.
+            let _ = temporary.map(tempfile::TempDir::keep);
+            return Err(error.context(format!("the trial failed; see {}", folder.display())));
+        }
+    };
     let kept = plan.output.is_some() || !report.is_sound();
     report.kept = kept.then(|| folder.display().to_string());
     if let Some(made) = temporary.filter(|_| kept) {

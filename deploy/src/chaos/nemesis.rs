@@ -67,6 +67,8 @@ pub(super) struct Nemesis {
     checkpoints: PathBuf,
     strike: Strike,
     stage: Stage,
+    /// Half-written checkpoints that nobody writes any more.
+    left_behind: Vec<String>,
     pub(super) done: Done,
 }
 
@@ -74,7 +76,8 @@ impl Nemesis {
     pub(super) fn new(schedule: Schedule, supervisor: Pid, checkpoints: PathBuf) -> Self {
         let strike = Strike { pause_ms: 0, fault: Fault::Rest { for_ms: 0 } };
         let stage = Stage::Pause { until_us: 0 };
-        Self { schedule, supervisor, checkpoints, strike, stage, done: Done::default() }
+        let (left_behind, done) = (Vec::new(), Done::default());
+        Self { schedule, supervisor, checkpoints, strike, stage, left_behind, done }
     }
 
     /// Does what is due.
@@ -236,7 +239,9 @@ impl Nemesis {
     }
 
     /// Waits a little for the learner to begin a checkpoint.
-    fn catch_checkpoint(&self) -> bool {
+    fn catch_checkpoint(&mut self) -> bool {
+        // A learner that was killed in one has left it behind.
+        self.left_behind = self.half_written();
         (0..CHECKPOINT_LOOKS_MAX).any(|_| {
             std::thread::sleep(CHECKPOINT_LOOK);
             self.checkpoint_under_way()
@@ -245,11 +250,13 @@ impl Nemesis {
 
     /// Whether the learner is writing a checkpoint, or was when it died.
     fn checkpoint_under_way(&self) -> bool {
+        self.half_written().iter().any(|name| !self.left_behind.contains(name))
+    }
+
+    fn half_written(&self) -> Vec<String> {
         let entries = self.checkpoints.read_dir().into_iter().flatten().flatten();
-        entries.map(|entry| entry.file_name()).any(|name| {
-            let name = name.to_string_lossy();
-            name.starts_with(".0") && name.ends_with(".tmp")
-        })
+        let names = entries.map(|entry| entry.file_name().to_string_lossy().into_owned());
+        names.filter(|name| name.starts_with(".0") && name.ends_with(".tmp")).collect()
     }
 
     fn kill(&mut self, victim: &Member, now_us: u64, timeline: &mut Timeline) -> bool {

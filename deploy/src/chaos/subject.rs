@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 use std::process::{Child, Command, ExitStatus, Stdio};
 use std::time::{Duration, Instant};
 
-use anyhow::{Context, anyhow};
+use anyhow::Context;
 use rustix::process::{Pid, Signal, kill_process};
 
 use super::TrialPlan;
@@ -125,7 +125,9 @@ impl Subject {
                 return Ok((!regular).then(|| self.told(status)));
             }
             if Instant::now() >= deadline {
-                return Err(anyhow!("dmprl train has not ended {END:?} after SIGINT"));
+                self.child.kill().context("cannot kill dmprl train")?;
+                let status = self.child.wait().context("cannot wait for dmprl train")?;
+                return Ok(Some(format!("not within {END:?} of SIGINT; {}", self.told(status))));
             }
             std::thread::sleep(LOOK);
         }

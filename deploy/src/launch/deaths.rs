@@ -160,7 +160,7 @@ impl Supervisor {
         self.display.message(&format!(
             "{process} {death} again: giving up on it after {restarts} restarts, going on with \
              {left} of {} workers{}",
-            self.config.actors.workers,
+            self.config.actors.workers + self.joined(),
             log_tail(&self.log_path(process))
         ));
         Ok(())

@@ -12,7 +12,7 @@ use anyhow::ensure;
 use super::supervisor::{Phase, Supervisor};
 use crate::terminal::shown;
 
-/// The directory is looked for at least so often: one `stat` a second.
+/// The directory is looked for at least so often, and whenever something is heard: one `stat`.
 const DOMAIN_LOOK: Duration = Duration::from_secs(1);
 
 impl Supervisor {

@@ -1,4 +1,4 @@
-//! Workers that live and give no sign of it: stopped, or standing still where nothing in them looks.
+//! Workers that live and give no sign of it: stopped, or standing still where nothing looks.
 //!
 //! Any report is a sign of life, and each second there is one, also of a worker that waits for its
 //! learner or whose environment is slow (`roles/heartbeat.rs`). So silence means a worker that

@@ -94,7 +94,12 @@ async fn introduce(mut stream: UnixStream) -> anyhow::Result<Newcomer> {
     // The directory is private to this user; root may come all the same.
     ensure!(peer.uid() == geteuid().as_raw(), "another user");
     let id = peer.pid().context("a peer without a process")?;
-    let pid = Pid::from_raw(id).context("a peer of another container")?;
+    let Some(pid) = Pid::from_raw(id) else {
+        write(&mut stream, &Greeting::this()).await?;
+        let reason = "it runs in another container, where the supervisor cannot watch over it";
+        write(&mut stream, &JoinAnswer::Refused { reason: reason.to_owned() }).await?;
+        bail!("a peer of another container");
+    };
     let process = pidfd_open(pid, PidfdFlags::NONBLOCK).context("cannot open its process")?;
     write(&mut stream, &Greeting::this()).await?;
     let mut line = Vec::new();
@@ -192,6 +197,11 @@ impl Supervisor {
         }
     }
 
+    /// Workers that have joined and live.
+    pub(super) fn joined(&self) -> usize {
+        self.all_running().filter(|(process, _)| self.is_joined(*process)).count()
+    }
+
     /// How many workers there are, as part of a sentence.
     pub(super) fn counted(&self) -> String {
         let workers = self.workers();
@@ -213,7 +223,11 @@ impl Supervisor {
             None => "died (its own terminal may say why)".to_owned(),
         };
         self.display.message(&format!("{process}, which had joined, {how}: {}", self.counted()));
-        ensure!(self.workers_left() > 0, "no worker is left: those that had joined are gone too");
+        ensure!(
+            self.workers_left() > 0,
+            "no worker is left: those that had joined are gone too{}",
+            self.resume_advice()
+        );
         Ok(())
     }
 }

@@ -39,8 +39,8 @@ impl Supervisor {
         let in_flight = self.evaluations.deadline().is_some();
         self.evaluations.clear();
         let Some(slot) = self.slots.get_mut(&Process::Evaluator) else { return };
-        if let Some(running) = slot.running.as_ref().filter(|_| in_flight) {
-            running.child.kill();
+        if let Some(running) = slot.running.as_mut().filter(|_| in_flight) {
+            running.kill_for(Death::too_slow("its learner died".to_owned()));
             // Not a death of its own.
             slot.restarts = 0;
             self.evaluator_ends = true;

@@ -238,10 +238,7 @@ pub async fn supervise(plan: SupervisorPlan) -> SessionReport {
         supervisor.on_wake(looked, due, woke);
         match wake {
             Wake::Interrupt => supervisor.on_interrupt(),
-            Wake::Event(event) => {
-                let handled = supervisor.on_event(event);
-                supervisor.check(handled);
-            }
+            Wake::Event(event) => supervisor.take(event),
             Wake::Time => {
                 // Whoever has spoken meanwhile is heard first.
                 tokio::task::yield_now().await;
@@ -257,6 +254,11 @@ pub async fn supervise(plan: SupervisorPlan) -> SessionReport {
 }
 
 impl Supervisor {
+    fn take(&mut self, event: Event) {
+        let handled = self.on_event(event);
+        self.check(handled);
+    }
+
     /// Workers first: the learner needs to know the environment. A resumed run knows it.
     fn start(&mut self) -> anyhow::Result<()> {
         let run = &self.launcher.run;

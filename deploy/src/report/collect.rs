@@ -8,7 +8,7 @@ use dmprl_shared::config::{AlgorithmName, ExperimentConfig, PolicyKind};
 use crate::control::EvaluationRow;
 use crate::failure::wrong_use;
 use crate::run_directory::RunDirectory;
-use crate::sweep::{Plan, SweepFile};
+use crate::sweep::{Ledger, Plan, SweepFile};
 
 /// One run and its evaluations.
 #[derive(Debug, Clone)]
@@ -21,8 +21,8 @@ pub struct Run {
     pub seed: u64,
     /// Its directory.
     pub path: PathBuf,
-    /// Environment steps that it was asked for.
-    pub steps: u64,
+    /// Whether it has come to its end.
+    pub ended: bool,
     /// Oldest first.
     pub rows: Vec<EvaluationRow>,
 }
@@ -31,7 +31,7 @@ impl Run {
     /// The evaluation at its end; none while it has not come there.
     #[must_use]
     pub fn last(&self) -> Option<&EvaluationRow> {
-        self.rows.last().filter(|row| row.env_steps >= self.steps)
+        self.rows.last().filter(|_| self.ended)
     }
 }
 
@@ -73,6 +73,7 @@ impl Results {
 
     fn add_sweep(&mut self, sweep: &Path) -> anyhow::Result<()> {
         let (file, _) = SweepFile::read(&sweep.join("sweep.toml"))?;
+        let ledger = Ledger::open(sweep)?;
         for planned in Plan::new(&file)?.runs {
             let point = planned.point.iter().map(|value| format!(", {value}"));
             let method = format!("{}{}", planned.method, point.collect::<String>());
@@ -80,10 +81,14 @@ impl Results {
             add_new(&mut self.tasks, &planned.task);
             add_new(&mut self.methods, &method);
             let path = sweep.join(&planned.directory);
-            if path.exists() {
+            // The manifest is the last that is written when a directory is made.
+            if path.join("manifest.json").is_file() {
                 let directory = RunDirectory::open(&path)?;
                 let config = directory.config()?;
-                self.runs.push(run(&directory, &config, method)?);
+                let mut run = run(&directory, &config, method)?;
+                let finished = ledger.of(&planned.directory);
+                run.ended |= finished.is_some_and(|finished| finished.steps >= config.run.steps);
+                self.runs.push(run);
             }
         }
         Ok(())
@@ -109,8 +114,13 @@ fn add_new(names: &mut Vec<String>, name: &str) {
 fn run(directory: &RunDirectory, config: &ExperimentConfig, method: String) -> anyhow::Result<Run> {
     let path = directory.path().to_owned();
     let rows = directory.evaluations().with_context(|| format!("run {}", path.display()))?;
-    let (task, seed, steps) = (config.task.name.clone(), config.run.seed, config.run.steps);
-    Ok(Run { task, method, seed, path, steps, rows })
+    let ended = rows.last().is_some_and(|row| {
+        row.env_steps >= config.run.steps
+            || row.return_mean >= config.run.until_return
+            || row.success_rate.is_some_and(|rate| rate >= config.run.until_success)
+    });
+    let (task, seed) = (config.task.name.clone(), config.run.seed);
+    Ok(Run { task, method, seed, path, ended, rows })
 }
 
 /// What a run is called that no sweep has named.

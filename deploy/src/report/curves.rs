@@ -56,7 +56,8 @@ pub fn curves(results: &Results) -> anyhow::Result<Vec<Curves>> {
                 .iter()
                 .enumerate()
                 .map(|(index, method)| {
-                    let runs: Vec<&Run> = results.of(task, method).collect();
+                    let begun = |run: &&Run| !run.rows.is_empty();
+                    let runs: Vec<&Run> = results.of(task, method).filter(begun).collect();
                     (index, method.as_str(), line(&runs, of))
                 })
                 .filter(|(_, _, line)| !line.is_empty())

@@ -14,6 +14,8 @@ pub struct Finished {
     /// Its directory, below the sweep's.
     pub run: PathBuf,
     /// Environment steps that it was asked for.
+    pub steps: u64,
+    /// Those it took: a run that reaches its goal ends sooner.
     pub env_steps: u64,
     /// Of training, over all its sessions [s].
     pub wall_s: f64,
@@ -91,7 +93,7 @@ mod tests {
     use super::*;
 
     fn finished(run: &str, env_steps: u64) -> Finished {
-        Finished { run: run.into(), env_steps, wall_s: 1.5 }
+        Finished { run: run.into(), steps: env_steps, env_steps, wall_s: 1.5 }
     }
 
     #[test]

@@ -75,7 +75,7 @@ pub fn states(sweep: &Sweep) -> anyhow::Result<Vec<RunState>> {
 
 fn state(sweep: &Sweep, run: &PlannedRun, config: &ExperimentConfig) -> anyhow::Result<RunState> {
     let path = sweep.output.join(&run.directory);
-    if !path.exists() {
+    if !is_whole(&path) {
         return Ok(RunState::Open { env_steps: 0 });
     }
     let directory = RunDirectory::open(&path)?;
@@ -83,12 +83,17 @@ fn state(sweep: &Sweep, run: &PlannedRun, config: &ExperimentConfig) -> anyhow::
     // The one thing that may be asked for later.
     found.run.steps = config.run.steps;
     check_same(&path, config, &found)?;
-    if sweep.ledger.of(&run.directory).is_some_and(|done| done.env_steps >= config.run.steps) {
+    if sweep.ledger.of(&run.directory).is_some_and(|done| done.steps >= config.run.steps) {
         return Ok(RunState::Finished);
     }
     let counters = checkpoint::counters(&directory.checkpoints_path())?;
     let env_steps = counters.iter().map(|counters| counters.env_steps).max().unwrap_or(0);
     Ok(RunState::Open { env_steps })
+}
+
+/// Whether a run directory was made to its end: the manifest comes last.
+fn is_whole(path: &Path) -> bool {
+    path.join("manifest.json").is_file()
 }
 
 /// Results of two configurations must not stand in one table under one name.
@@ -224,7 +229,10 @@ impl Runner {
         let (run, config) = &self.sweep.runs[index];
         let path = self.sweep.output.join(&run.directory);
         let mut command = std::process::Command::new(&self.sweep.program);
-        if path.exists() {
+        if !is_whole(&path) && path.exists() {
+            set_aside(&path)?;
+        }
+        if is_whole(&path) {
             command.arg("resume").arg(&path).args(["--steps", &config.run.steps.to_string()]);
         } else {
             command.arg("train").args(&run.arguments).arg("--run-dir").arg(&path);
@@ -275,10 +283,17 @@ impl Runner {
             self.fail(job.index, reason);
             return Ok(());
         }
-        let directory = RunDirectory::open(&path)?;
-        let (wall_s, row) = (directory.wall_s_before()?, directory.latest_row()?);
-        let env_steps = config.run.steps;
-        self.sweep.ledger.add(Finished { run: run.directory.clone(), env_steps, wall_s })?;
+        let (wall_s, row) = match ended(&path) {
+            Ok(ended) => ended,
+            Err(error) => {
+                self.fail(job.index, format!("its results cannot be read: {error:#}"));
+                return Ok(());
+            }
+        };
+        let steps = config.run.steps;
+        let env_steps = row.as_ref().map_or(steps, |row| row.env_steps);
+        let finished = Finished { run: run.directory.clone(), steps, env_steps, wall_s };
+        self.sweep.ledger.add(finished)?;
         self.estimate.add(kind(&run), env_steps, wall_s);
         self.states[job.index] = RunState::Finished;
         let result = row.map_or_else(|| "no evaluation".to_owned(), |row| result(&row));
@@ -324,6 +339,20 @@ impl Runner {
 
 fn kind(run: &PlannedRun) -> (&str, &str) {
     (&run.task, &run.method)
+}
+
+/// Seconds of training and the last evaluation of a run that has ended.
+fn ended(path: &Path) -> anyhow::Result<(f64, Option<EvaluationRow>)> {
+    let directory = RunDirectory::open(path)?;
+    Ok((directory.wall_s_before()?, directory.latest_row()?))
+}
+
+/// A directory whose making was cut short is nobody's run; what is in it stays, under another name.
+fn set_aside(path: &Path) -> anyhow::Result<()> {
+    let name = |number: u32| path.with_extension(format!("unfinished-{number}"));
+    let free = (0..).map(name).find(|name| !name.exists());
+    let aside = free.context("no name is free")?;
+    std::fs::rename(path, &aside).with_context(|| format!("cannot rename {}", path.display()))
 }
 
 fn open_log(path: &Path) -> anyhow::Result<File> {

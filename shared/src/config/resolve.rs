@@ -27,6 +27,8 @@ const UNACKNOWLEDGED_MAX: usize = 1 << 20;
 const LOG_BYTES_MIN: u64 = 1 << 20;
 const LOG_BYTES_MAX: u64 = 1 << 44;
 const UPDATES_PER_SEGMENT_MAX: f64 = 1e6;
+/// Signs of life come once a second, and later on a busy machine.
+const HEARTBEAT_S_MIN: f64 = 3.0;
 /// Some thirty years.
 const SECONDS_MAX: f64 = 1e9;
 /// 50 environment steps of each environment at K = 5, as published.
@@ -154,11 +156,15 @@ impl ExperimentConfig {
             ),
             ("actors.send_deadline_s", self.actors.send_deadline_s, SECONDS_MAX),
             ("actors.env_call_timeout_s", self.actors.env_call_timeout_s, SECONDS_MAX),
-            ("supervision.heartbeat_timeout_s", self.supervision.heartbeat_timeout_s, SECONDS_MAX),
         ];
         for (key, got, max) in bounded {
             range(key, got, got > 0.0 && got <= max, || format!("above 0, at most {max}"))?;
         }
+        let (key, got) = ("supervision.heartbeat_timeout_s", self.supervision.heartbeat_timeout_s);
+        let limits = HEARTBEAT_S_MIN..=SECONDS_MAX;
+        range(key, got, limits.contains(&got), || {
+            format!("{HEARTBEAT_S_MIN} to {SECONDS_MAX}; a worker gives a sign of life a second")
+        })?;
         let goals = [
             ("run.until_return", self.run.until_return),
             ("run.until_success", self.run.until_success),
@@ -390,6 +396,7 @@ mod tests {
             ("actors.env_call_timeout_s", "inf"),
             ("actors.send_deadline_s", "1e300"),
             ("run.until_return", "nan"),
+            ("supervision.heartbeat_timeout_s", "2.9"),
             ("policy.hidden", "[]"),
             ("algorithm.critic", "first"),
             ("algorithm.target", "literal"),

@@ -28,7 +28,7 @@ pub fn spec() -> EnvSpec {
     }
 }
 
-/// Small in everything, so that a case takes a fraction of a millisecond.
+/// Small in everything, so that a case takes a fraction of a millisecond; nobody joins.
 pub fn config(keys: &[(&str, &str)]) -> ExperimentConfig {
     let mut layers = Layers::new();
     let small = [
@@ -38,6 +38,7 @@ pub fn config(keys: &[(&str, &str)]) -> ExperimentConfig {
         ("exploration.warm_up_steps", "20"),
         ("replay.capacity_steps", "1000"),
         ("actors.workers", "2"),
+        ("actors.joined_max", "0"),
         ("actors.envs_per_worker", "3"),
         ("learner.threads", "1"),
     ];

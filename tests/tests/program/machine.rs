@@ -40,7 +40,7 @@ fn ticks_per_s(process: &Process, meanwhile: impl FnOnce()) -> f64 {
 fn a_worker_whose_learner_takes_nothing_sleeps() {
     let place = Workplace::new();
     let run = place.path("run");
-    let more = ["--steps", ENDLESS, "--set", "actors.send_deadline_s=1"];
+    let more = ["--steps", ENDLESS, "--set", "actors.send_deadline_s=0.25"];
     let mut running = place.start(&train("reacher", &run, &more));
     running.until_steps(&run, 2_500);
     let (worker, learner) = (role(&place, "actor"), role(&place, "learner"));

@@ -51,8 +51,12 @@ fn every_run_of_a_sweep_is_trained_once_and_a_longer_one_goes_on() {
     assert_eq!(states(&listed), vec![("open".to_owned(), 0); 4]);
     assert!(!std::path::Path::new(&place.path("runs")).exists(), "a dry run makes nothing");
 
+    // A kill, or a full disk, has cut the making of a run directory short.
+    let unfinished = place.path("runs/small/reacher/dmp/seed-1");
+    fs::create_dir_all(format!("{unfinished}/logs")).unwrap();
     let json = place.run(&["sweep", &file, "--jobs", "2", "--json"]).with_status(0).json();
     assert_eq!(states(&json), vec![("finished".to_owned(), 300); 4]);
+    assert!(std::path::Path::new(&format!("{unfinished}.unfinished-0/logs")).is_dir());
     assert_eq!(json["runs"][1]["method"], "TD3");
     assert!(json["runs"][3]["run"].as_str().unwrap().ends_with("runs/small/reacher/mlp/seed-2"));
     assert!(evaluations(&json).iter().all(|&rows| rows > 0));
@@ -75,7 +79,7 @@ fn every_run_of_a_sweep_is_trained_once_and_a_longer_one_goes_on() {
 #[test]
 fn a_sweep_that_is_interrupted_or_killed_goes_on_where_it_was() {
     let place = Workplace::new();
-    let file = write(&place, &TWO_METHODS.replace("300", "4000").replace("[1, 2]", "[1]"));
+    let file = write(&place, &TWO_METHODS.replace("300", "12000").replace("[1, 2]", "[1]"));
     for signal in [Signal::INT, Signal::KILL] {
         let mut running = place.start(&["sweep", &file, "--jobs", "1"]);
         let run = place.path("runs/small/reacher/dmp/seed-1");
@@ -91,7 +95,7 @@ fn a_sweep_that_is_interrupted_or_killed_goes_on_where_it_was() {
         place.until_no_process();
     }
     let json = place.run(&["sweep", &file, "--jobs", "2", "--json"]).with_status(0).json();
-    assert_eq!(states(&json), vec![("finished".to_owned(), 4_000); 2]);
+    assert_eq!(states(&json), vec![("finished".to_owned(), 12_000); 2]);
     assert_eq!(sessions(&json, 0), 3);
 }
 
