@@ -23,8 +23,8 @@ Workers and learner note every segment, so that in the end a checker can tell:
 worker_back_s, learner_back_s (from SIGKILL to the first segment inserted), fairness (most over
 fewest segments of a worker while nothing was broken) and the *_ratio (last third of the trial over
 the first, the larger of supervisor and learner) are measured and judge nothing: they depend on the
-machine. Ctrl-C ends it with the report so far. Exit status 1 if anything did not hold; everything
-is then kept.
+machine. Ctrl-C ends it: the run heals, is stopped and judged. Exit status 1 if anything did not
+hold; everything is then kept.
 
 EXAMPLES
   dmprl chaos --seed 1 --seconds 60

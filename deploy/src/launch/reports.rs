@@ -206,7 +206,7 @@ impl Supervisor {
     }
 
     fn on_evaluated(&mut self, process: Process, row: EvaluationRow) -> anyhow::Result<()> {
-        if matches!(self.phase, Phase::Stopping { .. }) {
+        if self.wants_no_answer() {
             return Ok(());
         }
         self.on_answer(process, row.policy_version)?;
@@ -236,7 +236,7 @@ impl Supervisor {
         policy_version: u64,
         reason: &str,
     ) -> anyhow::Result<()> {
-        if matches!(self.phase, Phase::Stopping { .. }) {
+        if self.wants_no_answer() {
             return Ok(());
         }
         self.on_answer(process, policy_version)?;
@@ -246,6 +246,12 @@ impl Supervisor {
         ));
         self.complete_if_done();
         Ok(())
+    }
+
+    /// Everything stops; or the learner has died, and an answer that was on its way is to a question
+    /// that its successor will ask anew.
+    fn wants_no_answer(&self) -> bool {
+        self.evaluator_ends || matches!(self.phase, Phase::Stopping { .. })
     }
 
     /// The evaluator has answered and takes the next request.
@@ -261,5 +267,48 @@ impl Supervisor {
         self.forgive(Process::Evaluator);
         self.send_evaluation();
         Ok(())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use dmprl_shared::config::ExperimentConfig;
+    use tokio::sync::mpsc;
+
+    use super::*;
+    use crate::launch::{Launcher, TimeLimits};
+    use crate::run_directory::{Manifest, RunDirectory};
+    use crate::terminal::Display;
+
+    fn supervisor(folder: &std::path::Path) -> Supervisor {
+        let config = ExperimentConfig::default();
+        let manifest = Manifest::new(None).unwrap();
+        let launcher = Launcher {
+            program: "none".into(),
+            run: RunDirectory::create(&folder.join("run"), &config, &manifest).unwrap(),
+            venv: None,
+            domain: Some(folder.to_owned()),
+            resume: false,
+            init_from: None,
+            learner_restarts: 0,
+            sessions_before: 0,
+            journal: None,
+        };
+        let display = Display::lines(Box::new(std::io::sink()), 1);
+        Supervisor::new((launcher, config, TimeLimits::default()), display, mpsc::channel(1).0)
+    }
+
+    /// Killed with the learner, an evaluator may have answered already; that once ended the run.
+    #[test]
+    fn an_answer_to_a_dead_learner_is_passed_over_and_one_that_nobody_asked_for_is_a_fault() {
+        let folder = tempfile::tempdir().unwrap();
+        let mut supervisor = supervisor(folder.path());
+        let not_evaluated =
+            || Report::NotEvaluated { policy_version: 7, reason: "a broken arm".to_owned() };
+        let answer = || Event::Report(Process::Evaluator, not_evaluated());
+        let fault = supervisor.on_event(answer()).unwrap_err().to_string();
+        assert!(fault.contains("policy 7, which nobody asked for"), "{fault}");
+        supervisor.evaluator_ends = true;
+        supervisor.on_event(answer()).unwrap();
     }
 }

@@ -187,40 +187,8 @@ enum Wake {
 pub async fn supervise(plan: SupervisorPlan) -> SessionReport {
     let SupervisorPlan { launcher, config, limits, display, mut interrupts } = plan;
     let (events, mut incoming) = mpsc::channel(EVENTS_MAX);
-    let now = Instant::now();
-    let (mut woke, limit) = (now, limits.evaluation_of(config.evaluation.episodes));
-    let mut supervisor = Supervisor {
-        launcher,
-        config,
-        limits,
-        display,
-        events,
-        slots: BTreeMap::new(),
-        phase: Phase::Training,
-        spec: None,
-        learner_ready: false,
-        learner_restarts: 0,
-        learner_died: None,
-        evaluator_ends: false,
-        finished: false,
-        checkpointed: false,
-        evaluations: EvaluationQueue::new(limit),
-        interrupts: 0,
-        interrupted_at: None,
-        failure: None,
-        abandoned: false,
-        garbage: 0,
-        started: now,
-        advanced: now,
-        first: None,
-        last: None,
-        best_return: f64::NEG_INFINITY,
-        last_row: None,
-        before: Counters::default(),
-        env_failures: 0,
-        sent: Sent::default(),
-        worker_restarts: 0,
-    };
+    let mut woke = Instant::now();
+    let mut supervisor = Supervisor::new((launcher, config, limits), display, events);
     let started = supervisor.start();
     supervisor.check(started);
     while !supervisor.is_over() {
@@ -254,6 +222,48 @@ pub async fn supervise(plan: SupervisorPlan) -> SessionReport {
 }
 
 impl Supervisor {
+    /// Nothing is started yet. What happens to children comes through the other end of `events`.
+    pub(super) fn new(
+        (launcher, config, limits): (Launcher, ExperimentConfig, TimeLimits),
+        display: Display,
+        events: mpsc::Sender<Event>,
+    ) -> Self {
+        let now = Instant::now();
+        let limit = limits.evaluation_of(config.evaluation.episodes);
+        Self {
+            launcher,
+            config,
+            limits,
+            display,
+            events,
+            slots: BTreeMap::new(),
+            phase: Phase::Training,
+            spec: None,
+            learner_ready: false,
+            learner_restarts: 0,
+            learner_died: None,
+            evaluator_ends: false,
+            finished: false,
+            checkpointed: false,
+            evaluations: EvaluationQueue::new(limit),
+            interrupts: 0,
+            interrupted_at: None,
+            failure: None,
+            abandoned: false,
+            garbage: 0,
+            started: now,
+            advanced: now,
+            first: None,
+            last: None,
+            best_return: f64::NEG_INFINITY,
+            last_row: None,
+            before: Counters::default(),
+            env_failures: 0,
+            sent: Sent::default(),
+            worker_restarts: 0,
+        }
+    }
+
     fn take(&mut self, event: Event) {
         let handled = self.on_event(event);
         self.check(handled);

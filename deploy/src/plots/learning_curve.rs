@@ -5,15 +5,14 @@ use std::path::PathBuf;
 use anyhow::{Context, anyhow};
 use plotters::prelude::*;
 
+use super::axes::Axes;
 use crate::control::EvaluationRow;
 use crate::run_directory::RunDirectory;
-use crate::terminal::{grouped, std_of};
+use crate::terminal::std_of;
 
 /// Blue of the Okabe-Ito palette, told apart with every common colour vision.
 const BLUE: RGBColor = RGBColor(0, 114, 178);
 const SIZE: (u32, u32) = (800, 480);
-/// Share of the spread left free above and below.
-const MARGIN: f64 = 0.05;
 
 /// Draws `plots/learning_curve.svg`; nothing while there is no evaluation.
 ///
@@ -40,29 +39,11 @@ fn draw(rows: &[EvaluationRow], title: &str) -> Result<String, Box<dyn std::erro
     let steps_max = points.iter().map(|point| point.0).fold(1.0, f64::max);
     let low = points.iter().map(|point| point.1 - point.2).fold(f64::INFINITY, f64::min);
     let high = points.iter().map(|point| point.1 + point.2).fold(f64::NEG_INFINITY, f64::max);
-    let margin = ((high - low) * MARGIN).max(1e-3);
     let mut svg = String::new();
     {
         let area = SVGBackend::with_string(&mut svg, SIZE).into_drawing_area();
-        area.fill(&WHITE)?;
-        let mut chart = ChartBuilder::on(&area)
-            .caption(title, ("sans-serif", 20))
-            .margin(16)
-            .margin_right(40)
-            .x_label_area_size(44)
-            .y_label_area_size(64)
-            .build_cartesian_2d(0.0..steps_max, (low - margin)..(high + margin))?;
-        chart
-            .configure_mesh()
-            .x_desc("environment steps")
-            .y_desc("evaluation return")
-            .x_label_formatter(&|steps| grouped(steps.round() as u64))
-            .y_label_formatter(&|value| tick(*value))
-            .label_style(("sans-serif", 14))
-            .axis_desc_style(("sans-serif", 16))
-            .light_line_style(WHITE)
-            .bold_line_style(BLACK.mix(0.12))
-            .draw()?;
+        let what = "evaluation return";
+        let mut chart = Axes { title, what, steps_max, values: low..high }.draw(&area)?;
         let above = points.iter().map(|&(steps, mean, std)| (steps, mean + std));
         let below = points.iter().rev().map(|&(steps, mean, std)| (steps, mean - std));
         let band: Vec<_> = above.chain(below).collect();
@@ -77,12 +58,6 @@ fn draw(rows: &[EvaluationRow], title: &str) -> Result<String, Box<dyn std::erro
         area.present()?;
     }
     Ok(svg)
-}
-
-/// `-4`, `-4.5`: no digits that say nothing.
-fn tick(value: f64) -> String {
-    // Adding zero turns -0 into 0.
-    format!("{}", (value * 1e3).round() / 1e3 + 0.0)
 }
 
 #[cfg(test)]

@@ -1,16 +1,13 @@
 //! Learning curves: evaluation return, or success, over environment steps, one line a method.
 
 use anyhow::anyhow;
-use plotters::coord::types::RangedCoordf64;
 use plotters::prelude::*;
 
 use super::collect::{Results, Run};
 use crate::control::EvaluationRow;
-use crate::terminal::grouped;
+use crate::plots::{Axes, Chart};
 
 const SIZE: (u32, u32) = (900, 520);
-/// Share of the spread left free above and below.
-const MARGIN: f64 = 0.05;
 /// Okabe and Ito's palette, told apart with every common colour vision; the yellow, which is hard
 /// to see on white, darker.
 const COLOURS: [RGBColor; 8] = [
@@ -104,28 +101,10 @@ fn draw(
     let steps_max = points().map(|point| point.0).fold(1.0, f64::max);
     let low = points().map(|point| point.2).fold(f64::INFINITY, f64::min);
     let high = points().map(|point| point.3).fold(f64::NEG_INFINITY, f64::max);
-    let margin = ((high - low) * MARGIN).max(1e-3);
     let mut svg = String::new();
     {
         let area = SVGBackend::with_string(&mut svg, SIZE).into_drawing_area();
-        area.fill(&WHITE)?;
-        let mut chart = ChartBuilder::on(&area)
-            .caption(task, ("sans-serif", 20))
-            .margin(16)
-            .margin_right(40)
-            .x_label_area_size(44)
-            .y_label_area_size(64)
-            .build_cartesian_2d(0.0..steps_max, (low - margin)..(high + margin))?;
-        chart
-            .configure_mesh()
-            .x_desc("environment steps")
-            .y_desc(what)
-            .x_label_formatter(&|steps| grouped(steps.round() as u64))
-            .label_style(("sans-serif", 14))
-            .axis_desc_style(("sans-serif", 16))
-            .light_line_style(WHITE)
-            .bold_line_style(BLACK.mix(0.12))
-            .draw()?;
+        let mut chart = Axes { title: task, what, steps_max, values: low..high }.draw(&area)?;
         for (index, method, line) in lines {
             draw_line(&mut chart, colour(*index, method), method, line)?;
         }
@@ -142,8 +121,6 @@ fn draw(
     }
     Ok(svg)
 }
-
-type Chart<'a, 'b> = ChartContext<'a, SVGBackend<'b>, Cartesian2d<RangedCoordf64, RangedCoordf64>>;
 
 fn draw_line(
     chart: &mut Chart<'_, '_>,

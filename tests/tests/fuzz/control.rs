@@ -4,7 +4,10 @@ use std::io::{Cursor, Read};
 use std::sync::mpsc;
 use std::time::Duration;
 
-use dmprl::control::{Command, EvaluationRequest, Progress, Report};
+use dmprl::control::{
+    Command, Doing, EvaluationRequest, Greeting, JoinAnswer, JoinRequest, Progress, Report,
+    Welcome, WorkersNow,
+};
 use dmprl::roles::ControlPipe;
 use serde_json::Value;
 
@@ -24,6 +27,9 @@ fn commands() -> Vec<Value> {
         Command::Evaluate(request()),
         Command::EnvFailures { total: 3 },
         Command::Sent(Default::default()),
+        Command::Workers(WorkersNow { count: 2, restarts: 1, queued_segments: 9 }),
+        Command::Finish,
+        Command::Stop,
     ];
     commands.iter().map(|command| serde_json::to_value(command).unwrap()).collect()
 }
@@ -35,6 +41,7 @@ fn reports() -> Vec<Value> {
         Report::Evaluate(request()),
         Report::EnvFailures { count: 1, last: "why".into() },
         Report::Checkpoint { name: "000001".into(), env_steps: 5 },
+        Report::Alive { doing: Doing::Waiting, kept: 8 },
         Report::Finished,
     ];
     reports.iter().map(|report| serde_json::to_value(report).unwrap()).collect()
@@ -89,6 +96,37 @@ fn a_command_that_is_accepted_is_the_same_when_written_and_read() {
         if let Ok(command) = &read {
             let written = serde_json::to_vec(command).unwrap();
             assert_eq!(serde_json::from_slice::<Command>(&written).unwrap(), *command);
+        }
+        Verdict::of(&read)
+    });
+}
+
+/// What workers that join and supervisors say before they trust each other.
+#[test]
+fn a_word_of_joining_that_is_accepted_is_the_same_when_written_and_read() {
+    let target = Target {
+        name: "control::a_word_of_joining_that_is_accepted_is_the_same_when_written_and_read",
+        cases: 10_000,
+        bytes_max: 16 << 20,
+    };
+    let welcome = Welcome { index: 1, incarnation: 2, venv: Some("/v".into()), workers: 3 };
+    let refused = JoinAnswer::Refused { reason: "full".into() };
+    let requests = [serde_json::to_value(JoinRequest { speaks: Greeting::this() }).unwrap()];
+    let answers = [JoinAnswer::Welcome(welcome), refused];
+    let answers = answers.map(|answer| serde_json::to_value(answer).unwrap());
+    target.fuzz(|random| {
+        if random.once_in(2) {
+            let read = serde_json::from_slice::<JoinRequest>(&line(random, &requests));
+            if let Ok(request) = &read {
+                let written = serde_json::to_vec(request).unwrap();
+                assert_eq!(serde_json::from_slice::<JoinRequest>(&written).unwrap(), *request);
+            }
+            return Verdict::of(&read);
+        }
+        let read = serde_json::from_slice::<JoinAnswer>(&line(random, &answers));
+        if let Ok(answer) = &read {
+            let written = serde_json::to_vec(answer).unwrap();
+            assert_eq!(serde_json::from_slice::<JoinAnswer>(&written).unwrap(), *answer);
         }
         Verdict::of(&read)
     });

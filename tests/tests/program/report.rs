@@ -38,7 +38,7 @@ fn a_sweep_is_reported_with_what_was_run_and_what_was_not() {
     assert!(read("report.md").contains("| reacher-v1 |"));
     assert!(read("curves/reacher-v1-evaluation-return.svg").starts_with("<svg"));
     // One line an evaluation of each seed, and a head.
-    assert!(read("runs.csv").lines().count() >= 1 + 2);
+    assert!(read("runs.csv").lines().count() > 2);
     assert!(read("figures.csv").contains("Average return,reacher-v1,NDP,0,,,,,,-15.56,1.47"));
 }
 
