@@ -18,9 +18,13 @@ pub fn summary(report: &SessionReport, title: &str, run: &Path, steps_total: u64
         }
     }
     if let (Some(first), Some(last)) = (&report.first, &report.last) {
-        let seconds = report.training.as_secs_f64().max(1e-9);
-        let rate = |now: u64, then: u64| now.saturating_sub(then) as f64 / seconds;
-        let line = |now: u64, then: u64| format!("{} ({:.0}/s)", grouped(now), rate(now, then));
+        let seconds = report.training.as_secs_f64();
+        let line = |now: u64, then: u64| {
+            let rate = now.saturating_sub(then) as f64 / seconds;
+            // A run shorter than the time between two reports has no rate.
+            let rate = if seconds > 0.0 { format!(" ({rate:.0}/s)") } else { String::new() };
+            format!("{}{rate}", grouped(now))
+        };
         lines.push(("steps", line(last.env_steps, first.env_steps)));
         lines.push(("updates", line(last.updates, first.updates)));
     }
