@@ -248,8 +248,8 @@ impl Supervisor {
         Ok(())
     }
 
-    /// Everything stops; or the learner has died, and an answer that was on its way is to a question
-    /// that its successor will ask anew.
+    /// Everything stops; or the learner has died, and an answer that was on its way is to a
+    /// question that its successor will ask anew.
     fn wants_no_answer(&self) -> bool {
         self.evaluator_ends || matches!(self.phase, Phase::Stopping { .. })
     }

@@ -163,8 +163,8 @@ fn ask(mut stream: &UnixStream, run: &RunDirectory) -> anyhow::Result<Welcome> {
 
 /// The first signal asks the worker to leave, the second ends it at once.
 fn leave_on_signals(leaving: &Arc<AtomicBool>, control: &ControlPipe) -> anyhow::Result<()> {
-    // `nohup` has a hang-up ignored, and means that; a script that puts a worker into the background
-    // has the interrupt ignored, and means only the terminal's.
+    // `nohup` has a hang-up ignored, and means that; a script that puts a worker into the
+    // background has the interrupt ignored, and means only the terminal's.
     let meant = |signal: &i32| *signal != libc::SIGHUP || !is_ignored(*signal);
     for signal in GROUP_SIGNALS.into_iter().filter(meant) {
         // In this order: the first signal must not count as the second.
