@@ -21,10 +21,10 @@ FILE is TOML: every task with every method, at every point of the grid, with eve
   name = \"reacher\"
   steps = 60_000
   [[method]]                              # none: the defaults
-  name = \"td3-mlp\"                      # part of the runs' paths
-  label = \"TD3\"                         # in plots and tables
+  name = \"td3-mlp\"                        # part of the runs' paths
+  label = \"TD3\"                           # in plots and tables
   algo = \"td3\"
-  policy = \"mlp\"                        # also preset; set, as above
+  policy = \"mlp\"                          # also preset; set, as above
   [grid]
   algorithm.batch_size = [128, 256]
 Each run is a `dmprl train` in OUTPUT/TASK/METHOD[/VALUES]/seed-S. Stopped or killed, the same
@@ -82,14 +82,11 @@ pub(super) fn run(args: &SweepArgs) -> anyhow::Result<Outcome> {
     finish(plan, args)
 }
 
-fn finish(plan: Sweep, args: &SweepArgs) -> anyhow::Result<Outcome> {
-    let runs = plan.runs.clone();
-    let (output, jobs) = (plan.output.clone(), plan.jobs);
-    say(&format!("{} runs in {}, {jobs} at once", runs.len(), shown(&output)));
-    let ended = sweep(plan)?;
-    let ledger = Ledger::open(&output)?;
-    let shown_plan = Sweep { program: this_program()?, output, runs, jobs, ledger };
-    report(&shown_plan, &ended.states, args.json)?;
+fn finish(mut plan: Sweep, args: &SweepArgs) -> anyhow::Result<Outcome> {
+    let (count, folder) = (plan.runs.len(), shown(&plan.output));
+    say(&format!("{count} runs in {folder}, {} at once", plan.jobs));
+    let ended = sweep(&mut plan)?;
+    report(&plan, &ended.states, args.json)?;
     let again = format!("dmprl sweep {}", args.file.display());
     if ended.interrupted {
         say(&format!("go on with: {again}"));
@@ -98,6 +95,7 @@ fn finish(plan: Sweep, args: &SweepArgs) -> anyhow::Result<Outcome> {
     let failed = |state: &&RunState| matches!(state, RunState::Failed { .. });
     match ended.states.iter().filter(failed).count() {
         0 => Ok(Outcome::Done),
+        1 => bail!("a run failed, see above; try it again: {again}"),
         count => bail!("{count} runs failed, see above; try them again: {again}"),
     }
 }

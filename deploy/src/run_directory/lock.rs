@@ -44,7 +44,7 @@ impl RunLock {
                     let holder = holder(&mut file);
                     if lives(&holder) || Instant::now() >= deadline {
                         bail!(
-                            "run {} is being trained by process {holder}; stop it first or wait \
+                            "{} is being trained by process {holder}; stop it first or wait \
                              for its end",
                             run.display()
                         );

@@ -124,8 +124,8 @@ fn check_same(
 /// # Errors
 /// A run directory is of another configuration, or the ledger cannot be written. A run that fails
 /// is no error of the sweep's: it goes on with the others.
-pub fn sweep(sweep: Sweep) -> anyhow::Result<SweepReport> {
-    let states = states(&sweep)?;
+pub fn sweep(sweep: &mut Sweep) -> anyhow::Result<SweepReport> {
+    let states = states(sweep)?;
     let runtime = tokio::runtime::Builder::new_current_thread()
         .enable_all()
         .build()
@@ -145,8 +145,8 @@ struct Job {
     env_steps: u64,
 }
 
-struct Runner {
-    sweep: Sweep,
+struct Runner<'a> {
+    sweep: &'a mut Sweep,
     states: Vec<RunState>,
     /// Those to be started, the next last.
     waiting: Vec<usize>,
@@ -156,8 +156,8 @@ struct Runner {
     interrupts: u32,
 }
 
-impl Runner {
-    fn new(sweep: Sweep, states: Vec<RunState>) -> Self {
+impl<'a> Runner<'a> {
+    fn new(sweep: &'a mut Sweep, states: Vec<RunState>) -> Self {
         let open = |index: &usize| states[*index] != RunState::Finished;
         let waiting: Vec<usize> = (0..states.len()).rev().filter(open).collect();
         let mut estimate = Estimate::default();
@@ -276,6 +276,10 @@ impl Runner {
         let path = self.sweep.output.join(&run.directory);
         if !status.success() {
             if self.interrupts > 0 {
+                // It has come further, if it wrote its checkpoint.
+                if let Ok(state) = state(self.sweep, &run, &config) {
+                    self.states[job.index] = state;
+                }
                 return Ok(());
             }
             let log = self.log_path(&run);
