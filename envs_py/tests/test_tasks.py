@@ -5,6 +5,7 @@ import unittest
 import warnings
 
 import gymnasium
+import mujoco
 import numpy as np
 from gymnasium.utils.env_checker import check_env
 
@@ -321,6 +322,28 @@ class OlderVersionsTest(unittest.TestCase):
         np.testing.assert_allclose(out.next_observations[0, 14:17], [0.821, -0.6, 0], atol=1e-3)
         mass = [env.task.model.body("object").mass[0] for env in (old, new)]
         self.assertLess(mass[0], 0.01 * mass[1])
+
+    def test_pusher_v0_pushes_as_it_did_with_mujoco_2(self):
+        """Without its armature the cylinder stays at -0.45, and the arm passes through it."""
+        env, _ = started("dmprl/Pusher-v0")
+        model = env.task.model
+        # Constants of MuJoCo 2.3.7: arm, cylinder and goal.
+        bodies = [1.05485, 16.66666, 16.66667]
+        np.testing.assert_allclose(model.body_invweight0[-3:, 0], bodies, 1e-5)
+        np.testing.assert_allclose(model.dof_invweight0[-5:], [24.21685] + [25.0] * 4, 1e-5)
+        data = mujoco.MjData(model)
+        data.qpos[1] = 0.3
+        mujoco.mj_forward(model, data)
+        cylinder, prongs = model.body("object").id, model.body("tips_arm").id
+        ahead = data.subtree_com[prongs] + [0, 0.15, 0] - data.xpos[cylinder]
+        data.qpos[7:9] = ahead[1], ahead[0]
+        data.ctrl[0] = 0.6
+        for _ in range(60):
+            data.qpos[1], data.qvel[1] = 0.3, 0.0
+            mujoco.mj_step(model, data, nstep=5)
+        pushed = data.xpos[cylinder, :2]
+        # Where it ends with MuJoCo 2.3.7, whose collisions are not quite the same.
+        np.testing.assert_allclose(pushed, [0.923, -0.316], atol=0.05)
 
     def test_pusher_v0_rewards_the_state_before_the_step(self):
         env, out = started("dmprl/Pusher-v0")

@@ -99,9 +99,35 @@ class PusherV0(Pusher):
     recorded = ("qpos", "qvel", "subtree_com")
     model_file = "pusher.xml"
 
+    def load_model(self) -> mujoco.MjModel:  # noqa: D102 - inherited
+        model = super().load_model()
+        count_armature(model)
+        return model
+
     def rewarded(self, observations: NDArray[np.float64]) -> NDArray[np.float64]:
         """The states before the steps."""
         return observations[:, :-1]
+
+
+def count_armature(model: mujoco.MjModel) -> None:
+    """Makes contacts as stiff as those of MuJoCo 1 and 2, with which Gym's versions were made.
+
+    A contact's softness is scaled by the inverse inertia of both bodies. Since MuJoCo 3 that of a
+    body which only slides leaves the armature of its joints out: the cylinder counts as a millionth
+    of what it resists with, and the arm passes through it. MuJoCo 2 put down, for each joint, its
+    entry in the diagonal of the inverse inertia matrix, and for each body the mean over the axes of
+    the inverse inertia at its centre of mass (rotation: of sliding bodies there is none).
+    """
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    inverse = np.zeros((model.nv, model.nv))
+    mujoco.mj_solveM(model, data, inverse, np.eye(model.nv))
+    for joint in np.flatnonzero(model.jnt_type == mujoco.mjtJoint.mjJNT_SLIDE):
+        dof, body = model.jnt_dofadr[joint], model.jnt_bodyid[joint]
+        model.dof_invweight0[dof] = inverse[dof, dof]
+        jacobian = np.zeros((3, model.nv))
+        mujoco.mj_jacBodyCom(model, data, jacobian, None, body)
+        model.body_invweight0[body, 0] = np.trace(jacobian @ inverse @ jacobian.T) / 3
 
 
 def arm_observation_names(bodies: tuple[str, ...]) -> list[str]:
