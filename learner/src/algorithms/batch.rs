@@ -35,6 +35,8 @@ pub struct BatchShape {
     pub end_state_len: usize,
     /// A whole segment's actions, K A.
     pub segment_actions_len: usize,
+    /// A.
+    pub action_len: usize,
     /// Whether the target draws noise: TD3 and SAC.
     pub next_noise: bool,
     /// Whether the actor's step does: SAC.
@@ -56,6 +58,7 @@ impl BatchShape {
             // A critic of the first action alone judges nothing that comes after it.
             end_state_len: if whole { carried } else { 0 },
             segment_actions_len,
+            action_len: layout.action_len,
             next_noise: matches!(config.name, AlgorithmName::Td3 | AlgorithmName::Sac),
             noise: config.name == AlgorithmName::Sac,
         }
@@ -89,6 +92,10 @@ pub struct Batch {
     pub next_noise: Vec<f32>,
     /// Standard normal noise for the actor's own actions, (B, K A), or none.
     pub noise: Vec<f32>,
+    /// u_{t-1}, (B, A), where there was one; only filled where an action's change has a price.
+    pub previous_actions: Vec<f32>,
+    /// 1 where there was one, 0 where the episode began or the replay no longer has it, (B,).
+    pub has_previous: Vec<f32>,
     actions: Vec<f32>,
 }
 
@@ -129,6 +136,8 @@ impl Batch {
             next_inputs: vec![0.0; shape.rows * shape.observation_len],
             next_noise: noise(shape.next_noise),
             noise: noise(shape.noise),
+            previous_actions: vec![0.0; shape.rows * shape.action_len],
+            has_previous: vec![0.0; shape.rows],
             actions: vec![0.0; shape.segment_actions_len],
         }
     }
@@ -181,6 +190,14 @@ impl Batch {
             self.inputs[row * o..(row + 1) * o].copy_from_slice(&input[..o]);
             replay.actions(&window, &mut self.actions);
             input[o..o + shape.actions_len].copy_from_slice(&self.actions[..shape.actions_len]);
+            if config.action_rate_penalty > 0.0 {
+                let previous = replay.previous_action(&window);
+                self.has_previous[row] = f32::from(u8::from(previous.is_some()));
+                if let Some(previous) = previous {
+                    let a = shape.action_len;
+                    self.previous_actions[row * a..(row + 1) * a].copy_from_slice(previous);
+                }
+            }
             if shape.end_state_len > 0 {
                 // The carried state is the tail of the observation after the window.
                 let dims = shape.end_state_len / 2;
@@ -216,6 +233,7 @@ mod tests {
         actions_len: 2,
         end_state_len: 0,
         segment_actions_len: 2,
+        action_len: 1,
         next_noise: false,
         noise: false,
     };
@@ -303,6 +321,24 @@ mod tests {
             (11.0, [0.2, 0.3], 60.0, 0.25, 13.0),
         ];
         assert_eq!(rows(&replay, Windows::Sliding, Target::NStep), expected);
+    }
+
+    #[test]
+    fn a_price_on_changes_asks_for_the_actions_before_the_windows() {
+        let config = AlgorithmConfig { action_rate_penalty: 1.0, ..AlgorithmConfig::default() };
+        let replay = replay(9, &[(0, TERMINATED)]);
+        let mut sampler = Sampler::new(Windows::Sliding, dmprl_shared::seeds::stream(1, "test", 0));
+        let mut batch = Batch::new(SHAPE);
+        batch.sample(SHAPE, &config, 1.0, None, (&replay, &mut sampler)).unwrap();
+        let mut seen = [false; 3];
+        for row in 0..SHAPE.rows {
+            let step = batch.observations[row] as usize;
+            let expected = if step == 0 { 0.0 } else { 0.1 * step as f32 };
+            assert_eq!(batch.has_previous[row] * batch.previous_actions[row], expected);
+            assert_eq!(batch.has_previous[row], f32::from(u8::from(step > 0)));
+            seen[step] = true;
+        }
+        assert_eq!(seen, [true; 3]);
     }
 
     #[test]

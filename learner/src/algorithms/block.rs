@@ -48,6 +48,15 @@ pub struct Sums {
     pub log_density: f32,
 }
 
+/// The price of an action's change, and the batch that knows what was done before.
+#[derive(Debug, Clone, Copy)]
+pub struct ActionRate<'a> {
+    /// Of a squared change, in units of reward.
+    pub penalty: f32,
+    /// Whose windows the policy acts on.
+    pub batch: &'a Batch,
+}
+
 /// Some rows of the batch with all buffers of an update.
 #[derive(Debug)]
 pub struct Block {
@@ -195,12 +204,46 @@ impl Block {
     }
 
     /// Passes of -mean Q of the one critic, after [`Block::act`] and [`Block::judge`].
-    pub fn ascend_q(&mut self, policy: &Policy, actor: &Lent<'_>, critic: &[Lent<'_>; 1]) {
+    pub fn ascend_q(
+        &mut self,
+        policy: &Policy,
+        actor: &Lent<'_>,
+        critic: &[Lent<'_>; 1],
+        rate: ActionRate<'_>,
+    ) {
         self.sums = Sums { actor: -self.q(0).iter().sum::<f32>(), ..Sums::default() };
         let weight = -1.0 / self.batch_rows;
         self.actions_gradient(critic, |_, _, _| weight);
+        self.penalise(rate);
         self.unsquash();
         self.act_backward(policy, actor, |_, _, _| 0.0);
+    }
+
+    /// Adds what the changes of the policy's actions cost to `sums.actor`, and its gradient to the
+    /// one with respect to u, as [`Block::actions_gradient`] left it.
+    pub fn penalise(&mut self, ActionRate { penalty, batch }: ActionRate<'_>) {
+        if penalty == 0.0 {
+            return;
+        }
+        let BatchShape { action_len: dims, segment_actions_len: len, .. } = self.shape;
+        let factor = 2.0 * penalty / self.batch_rows;
+        for row in 0..self.rows_len() {
+            let at = self.rows.start + row;
+            let actions = &self.policy.actions[row * len..(row + 1) * len];
+            let gradient = &mut self.actions_gradient[row * len..(row + 1) * len];
+            let previous = &batch.previous_actions[at * dims..(at + 1) * dims];
+            for (d, previous) in previous.iter().enumerate() {
+                let change = batch.has_previous[at] * (actions[d] - previous);
+                gradient[d] += factor * change;
+                self.sums.actor += penalty * change * change;
+            }
+            for i in dims..len {
+                let change = actions[i] - actions[i - dims];
+                gradient[i] += factor * change;
+                gradient[i - dims] -= factor * change;
+                self.sums.actor += penalty * change * change;
+            }
+        }
     }
 
     /// Passes of mean (pi(s) - u)², `actions` (B, K A) being the u to imitate; leaves the sum of

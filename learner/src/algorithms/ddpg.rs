@@ -27,7 +27,7 @@ use candle_core::Result;
 use dmprl_shared::config::ExperimentConfig;
 use dmprl_shared::policy::Policy;
 
-use super::block::{Block, blocks, total};
+use super::block::{ActionRate, Block, blocks, total};
 use super::{Batch, BatchShape, Losses, new_actor, new_critic};
 use crate::update::crew::Crew;
 use crate::update::trained::Trained;
@@ -40,6 +40,7 @@ pub struct Ddpg {
     /// Q, and its target Q'.
     pub critic: Trained,
     polyak: f32,
+    action_rate_penalty: f32,
     pub(super) blocks: Vec<Block>,
 }
 
@@ -53,7 +54,8 @@ impl Ddpg {
         let critic = new_critic(config, shape, "critic parameters")?;
         let polyak = config.algorithm.polyak as f32;
         let blocks = blocks(policy, shape, std::slice::from_ref(&critic));
-        Ok(Self { blocks, actor, critic, polyak })
+        let action_rate_penalty = config.algorithm.action_rate_penalty as f32;
+        Ok(Self { blocks, actor, critic, polyak, action_rate_penalty })
     }
 
     /// One update of critic, actor and both targets.
@@ -95,13 +97,14 @@ impl Ddpg {
         Ok(())
     }
 
-    /// Descends -mean Q(s, pi(s)).
+    /// Descends -mean Q(s, pi(s)), and what changes of pi(s) cost.
     fn actor_step(&mut self, policy: &Policy, batch: &Batch, crew: &Crew) {
         let (actor, critic) = (self.actor.lend(), [self.critic.lend()]);
+        let penalty = self.action_rate_penalty;
         crew.each(&mut self.blocks, |block| {
             block.act(policy, &actor, batch.states());
             block.judge(policy, &critic, batch.states());
-            block.ascend_q(policy, &actor, &critic);
+            block.ascend_q(policy, &actor, &critic, ActionRate { penalty, batch });
         });
         drop((actor, critic));
         self.actor.descend(crew, &self.blocks, |block| block.actor_trace(batch), Some(self.polyak));

@@ -23,7 +23,7 @@ use dmprl_shared::config::ExperimentConfig;
 use dmprl_shared::policy::{Policy, gaussian};
 
 use super::batch::States;
-use super::block::{Block, blocks, total};
+use super::block::{ActionRate, Block, blocks, total};
 use super::{Batch, BatchShape, Losses, new_actor, new_critic};
 use crate::update::crew::Crew;
 use crate::update::trained::{Lent, Trained};
@@ -39,6 +39,7 @@ pub struct Sac {
     pub log_temperature: Trained,
     target_entropy: f32,
     polyak: f32,
+    action_rate_penalty: f32,
     pub(super) blocks: Vec<Block>,
 }
 
@@ -63,6 +64,7 @@ impl Sac {
             target_entropy: (sac.target_entropy_per_action * shape.segment_actions_len as f64)
                 as f32,
             polyak: config.algorithm.polyak as f32,
+            action_rate_penalty: config.algorithm.action_rate_penalty as f32,
         })
     }
 
@@ -123,10 +125,12 @@ impl Sac {
         Ok(())
     }
 
-    /// Descends mean (temperature log pi(u|s) - min_i Q_i(s, u)), u ~ pi(s), by the path of u.
+    /// Descends mean (temperature log pi(u|s) - min_i Q_i(s, u)), u ~ pi(s), by the path of u, and
+    /// what changes of u cost.
     fn actor_step(&mut self, policy: &Policy, batch: &Batch, crew: &Crew, temperature: f32) {
         let [first, second] = &self.critics;
         let (actor, critics) = (self.actor.lend(), [first.lend(), second.lend()]);
+        let penalty = self.action_rate_penalty;
         crew.each(&mut self.blocks, |block| {
             draw(block, policy, &actor, batch.states(), &batch.noise);
             block.judge(policy, &critics, batch.states());
@@ -143,6 +147,7 @@ impl Sac {
             block.actions_gradient(&critics, |block, row, index| {
                 if smaller(block, row) == index { -1.0 / rows } else { 0.0 }
             });
+            block.penalise(ActionRate { penalty, batch });
             block.unsquash();
             // d log pi / d x = 2 u at x = mean + std noise: only the tanh's correction moves.
             let share = temperature / rows;

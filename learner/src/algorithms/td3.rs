@@ -16,7 +16,7 @@ use candle_core::Result;
 use dmprl_shared::config::{ExperimentConfig, Td3Config};
 use dmprl_shared::policy::Policy;
 
-use super::block::{Block, blocks, total};
+use super::block::{ActionRate, Block, blocks, total};
 use super::{Batch, BatchShape, Losses, new_actor, new_critic};
 use crate::update::crew::Crew;
 use crate::update::trained::Trained;
@@ -30,6 +30,7 @@ pub struct Td3 {
     pub critics: [Trained; 2],
     pub(super) config: Td3Config,
     polyak: f32,
+    action_rate_penalty: f32,
     pub(super) blocks: Vec<Block>,
 }
 
@@ -49,6 +50,7 @@ impl Td3 {
             critics,
             config: config.algorithm.td3.clone(),
             polyak: config.algorithm.polyak as f32,
+            action_rate_penalty: config.algorithm.action_rate_penalty as f32,
         })
     }
 
@@ -112,13 +114,14 @@ impl Td3 {
         Ok(())
     }
 
-    /// Descends -mean Q_1(s, pi(s)).
+    /// Descends -mean Q_1(s, pi(s)), and what changes of pi(s) cost.
     fn actor_step(&mut self, policy: &Policy, batch: &Batch, crew: &Crew) {
         let (actor, critic) = (self.actor.lend(), [self.critics[0].lend()]);
+        let penalty = self.action_rate_penalty;
         crew.each(&mut self.blocks, |block| {
             block.act(policy, &actor, batch.states());
             block.judge(policy, &critic, batch.states());
-            block.ascend_q(policy, &actor, &critic);
+            block.ascend_q(policy, &actor, &critic, ActionRate { penalty, batch });
         });
         drop((actor, critic));
         self.actor.descend(crew, &self.blocks, |block| block.actor_trace(batch), Some(self.polyak));

@@ -56,6 +56,8 @@ fn case(keys: &[(&str, &str)]) -> Case {
     fill(&mut batch.next_inputs);
     fill(&mut batch.next_noise);
     fill(&mut batch.noise);
+    fill(&mut batch.previous_actions);
+    batch.has_previous.iter_mut().step_by(3).for_each(|has| *has = 1.0);
     Case { config, policy, algorithm, batch }
 }
 
@@ -111,7 +113,7 @@ fn assert_within(tolerance: f64, name: &str, got: &[f32], expected: &[f32]) {
 
 #[test]
 fn an_update_equals_automatic_differentiation() {
-    let cases: [&[(&str, &str)]; 10] = [
+    let cases: [&[(&str, &str)]; 13] = [
         &[],
         &[("policy.kind", "mlp")],
         &[("policy.start", "observed")],
@@ -122,6 +124,9 @@ fn an_update_equals_automatic_differentiation() {
         &[("dmp.integrator", "paper"), ("dmp.alpha_y", "25.0"), ("dmp.basis_count", "3")],
         &[("algorithm.critic_layer_norm", "true"), ("policy.start", "carry")],
         &[("algorithm.critic_layer_norm", "true"), ("policy.kind", "mlp")],
+        &[("algorithm.action_rate_penalty", "0.7")],
+        &[("algorithm.action_rate_penalty", "0.7"), ("policy.kind", "mlp")],
+        &[("algorithm.action_rate_penalty", "0.7"), ("policy.start", "carry")],
     ];
     for algorithm in ["ddpg", "td3", "sac"] {
         for keys in cases {

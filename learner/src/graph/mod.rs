@@ -262,16 +262,32 @@ impl Graph {
                 let inputs = self.critic_inputs(states, &means.with_end_state(&u)?)?;
                 let entropy = -density.mean_all()?.to_scalar::<f32>()?;
                 let q = self.smallest_q(false, &inputs)?;
-                ((density.broadcast_mul(temperature)? - q)?.mean_all()?, Some(entropy))
+                let loss = (density.broadcast_mul(temperature)? - q)?.mean_all()?;
+                ((loss + self.action_rate_cost(&u, batch)?)?, Some(entropy))
             }
             None => {
                 let u = means.means.tanh()?;
                 let inputs = self.critic_inputs(states, &means.with_end_state(&u)?)?;
-                (self.q(self.critics()[0], false, &inputs)?.mean_all()?.neg()?, None)
+                let loss = self.q(self.critics()[0], false, &inputs)?.mean_all()?.neg()?;
+                ((loss + self.action_rate_cost(&u, batch)?)?, None)
             }
         };
         self.descend("actor", &loss, true)?;
         Ok((loss.to_scalar()?, entropy))
+    }
+
+    /// What the changes of u, (B, K A), cost: a mean over the batch.
+    fn action_rate_cost(&self, u: &Tensor, batch: &Batch) -> Result<Tensor> {
+        let BatchShape { action_len, segment_actions_len, .. } = self.shape;
+        let previous = self.on_device(&batch.previous_actions)?;
+        let first = (u.narrow(1, 0, action_len)? - previous)?;
+        let mut changes = first.broadcast_mul(&self.on_device(&batch.has_previous)?)?;
+        let len = segment_actions_len - action_len;
+        if len > 0 {
+            let others = (u.narrow(1, action_len, len)? - u.narrow(1, 0, len)?)?;
+            changes = Tensor::cat(&[&changes, &others], 1)?;
+        }
+        changes.sqr()?.sum(1)?.mean_all()? * self.config.algorithm.action_rate_penalty
     }
 
     fn descend(&mut self, name: &str, loss: &Tensor, follow: bool) -> Result<()> {

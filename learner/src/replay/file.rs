@@ -134,6 +134,12 @@ impl Replay {
         for index in 0..self.filled {
             self.slots[index] = self.read_slot(input, index)?;
         }
+        for index in 0..self.filled {
+            let next = self.slots[index].next;
+            if next != NONE {
+                self.slots[next as usize].previous = index as u32;
+            }
+        }
         // There may be more or fewer places for workers than when it was written. The first are
         // the same, and what another's episode was is of no use: nobody continues it.
         for index in 0..tail_count as usize {
@@ -169,7 +175,7 @@ impl Replay {
             return Err(ReplayFileError::Inconsistent { name: "slot", index });
         }
         let [terminated, truncated, hindsight] = flags.map(|flag| flag == 1);
-        Ok(Slot { next, steps_len, terminated, truncated, hindsight })
+        Ok(Slot { next, previous: NONE, steps_len, terminated, truncated, hindsight })
     }
 
     fn read_tail(

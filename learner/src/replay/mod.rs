@@ -23,6 +23,9 @@ const NONE: u32 = u32::MAX;
 struct Slot {
     /// The slot that continues this one's episode, or [`NONE`].
     next: u32,
+    /// The slot that this one continued when it came, or [`NONE`]; its segment may have been
+    /// replaced since, and then continues elsewhere or nowhere.
+    previous: u32,
     /// Steps really run, 1 to K; 0 in a slot that was never filled.
     steps_len: u8,
     terminated: bool,
@@ -78,7 +81,7 @@ impl Replay {
         let count = (capacity_steps / layout.segment_steps).max(1);
         Self {
             layout,
-            slots: vec![Slot { next: NONE, ..Slot::default() }; count],
+            slots: vec![Slot { next: NONE, previous: NONE, ..Slot::default() }; count],
             blocks: Blocks::new(count, layout.block_len()),
             head: 0,
             filled: 0,
@@ -122,7 +125,7 @@ impl Replay {
         assert!(self.kept == self.filled && self.kept + 1 < self.slots.len(), "no room to keep it");
         let at = self.store(header, block);
         if header.episode_step > 0 && at > 0 {
-            self.slots[at - 1].next = at as u32;
+            self.chain(at as u32 - 1, at as u32);
         }
         self.kept = at + 1;
         self.inserted += 1;
@@ -143,6 +146,7 @@ impl Replay {
         self.blocks.get_mut(at).copy_from_slice(block);
         self.slots[at] = Slot {
             next: NONE,
+            previous: NONE,
             steps_len: header.steps_len as u8,
             terminated: header.flags & TERMINATED != 0,
             truncated: header.flags & TRUNCATED != 0,
@@ -162,7 +166,7 @@ impl Replay {
                 && tail.episode_steps == header.episode_step
                 && self.inserted - tail.number < (self.slots.len() - self.kept) as u64;
             if continues {
-                self.slots[tail.slot as usize].next = slot;
+                self.chain(tail.slot, slot);
             }
         }
         let ended = header.flags & (TERMINATED | TRUNCATED) != 0;
@@ -173,6 +177,11 @@ impl Replay {
             episode: header.episode,
             episode_steps: header.episode_step + header.steps_len,
         });
+    }
+
+    fn chain(&mut self, slot: u32, next: u32) {
+        self.slots[slot as usize].next = next;
+        self.slots[next as usize].previous = slot;
     }
 
     fn block(&self, slot: usize) -> &[f32] {

@@ -110,6 +110,25 @@ impl Replay {
         out[first.len() + second.len()..].fill(0.0);
     }
 
+    /// The action before the window's first, (A,); none where the episode began or the replay does
+    /// not hold the segment any more.
+    #[must_use]
+    pub fn previous_action(&self, window: &Window) -> Option<&[f32]> {
+        let dims = self.layout.action_len;
+        let (slot, step) = match usize::from(window.offset).checked_sub(1) {
+            Some(step) => (window.slot, step),
+            None => {
+                let previous = self.slots[window.slot as usize].previous;
+                let before = self.slots.get(previous as usize)?;
+                // One that has been replaced since continues somewhere else.
+                (before.next == window.slot)
+                    .then(|| (previous, usize::from(before.steps_len).saturating_sub(1)))?
+            }
+        };
+        let (_, actions, _) = self.layout.split(self.block(slot as usize));
+        Some(&actions[step * dims..(step + 1) * dims])
+    }
+
     /// sum over the window's n steps of discount^i r_i.
     #[must_use]
     pub fn discounted_reward(&self, window: &Window, discount: f32) -> f32 {
@@ -301,6 +320,58 @@ mod tests {
         assert_eq!(firsts, [6.0, 100.0, 101.0, 102.0, 103.0, 104.0, 105.0, 106.0]);
     }
 
+    /// (observation, action before) of every window.
+    fn previous(replay: &Replay) -> Vec<(f32, Option<f32>)> {
+        let windows = (0..replay.len()).flat_map(|slot| (0..3).map(move |at| (slot, at)));
+        let windows = windows.filter_map(|(slot, offset)| replay.window(slot, offset));
+        let mut all: Vec<_> = windows
+            .map(|window| {
+                let previous = replay.previous_action(&window).map(|action| action[0]);
+                (replay.observation(&window)[0], previous)
+            })
+            .collect();
+        all.sort_by(|a, b| a.0.total_cmp(&b.0));
+        all
+    }
+
+    #[test]
+    fn the_action_before_a_window_is_that_of_its_own_episode() {
+        let mut replay = Replay::new(LAYOUT, 300, 1, 1);
+        episode(&mut replay, 0, 6, TERMINATED);
+        episode(&mut replay, 1, 3, TRUNCATED);
+        let expected = [None, Some(0.0), Some(0.01), Some(0.02), Some(0.03), Some(0.04), None];
+        let (steps, actions): (Vec<_>, Vec<_>) = previous(&replay).into_iter().unzip();
+        assert_eq!(
+            (steps, actions),
+            ((0..6).map(|t| t as f32).chain([100.0]).collect(), expected.into())
+        );
+    }
+
+    #[test]
+    fn no_action_comes_before_a_window_whose_predecessor_was_replaced() {
+        let mut replay = Replay::new(LAYOUT, 12, 1, 1); // 4 slots
+        episode(&mut replay, 0, 9, TRUNCATED);
+        // Replaces the first two slots of episode 0; the last one's predecessor is gone.
+        episode(&mut replay, 1, 9, TRUNCATED);
+        let of = |step| previous(&replay).into_iter().find(|found| found.0 == step).unwrap().1;
+        assert_eq!(
+            (of(6.0), of(100.0), of(103.0), of(106.0)),
+            (None, None, Some(0.02), Some(0.05))
+        );
+    }
+
+    #[test]
+    fn a_replay_read_from_a_file_knows_the_actions_before_too() {
+        let mut replay = Replay::new(LAYOUT, 12, 1, 1);
+        episode(&mut replay, 0, 9, TRUNCATED);
+        episode(&mut replay, 1, 9, TRUNCATED);
+        let mut bytes = Vec::new();
+        replay.write(&mut bytes).unwrap();
+        let mut read = Replay::new(LAYOUT, 12, 1, 1);
+        read.read(&mut bytes.as_slice()).unwrap();
+        assert_eq!(previous(&read), previous(&replay));
+    }
+
     #[test]
     fn a_lost_segment_breaks_the_chain() {
         let mut replay = Replay::new(LAYOUT, 300, 1, 1);
@@ -355,7 +426,9 @@ mod tests {
             copy(&mut replay, start + 3);
         }
         for (slot, real) in [true, false, true, false].into_iter().enumerate() {
-            assert!(replay.window(slot, 0).is_some_and(|window| window.len() == 3));
+            let whole = replay.window(slot, 0).unwrap();
+            assert_eq!(whole.len(), 3);
+            assert_eq!(replay.previous_action(&whole).is_some(), real && slot > 0, "slot {slot}");
             assert_eq!(replay.window(slot, 1).is_some(), real, "slot {slot}");
             if let Some(window) = replay.window(slot, 1) {
                 assert_eq!(window.next, slot as u32 + 2, "the segment, not the copy between");

@@ -73,6 +73,10 @@ pub struct AlgorithmConfig {
     /// Layer normalisation (Ba et al. 2016) of the critic's hidden layers, before their ReLU, in
     /// DDPG, TD3 and SAC: it bounds Q for actions unlike any in the replay (Ball et al. 2023).
     pub critic_layer_norm: bool,
+    /// What the actor of DDPG, TD3 or SAC pays, beside Q, for the sum over a decision's actions and
+    /// their dimensions of (u_t - u_{t-1})², in units of reward. The first action's predecessor is
+    /// the one in the replay. The larger, the smoother.
+    pub action_rate_penalty: f64,
     /// What only TD3 has.
     pub td3: Td3Config,
     /// What only SAC has.
@@ -136,6 +140,7 @@ impl Default for AlgorithmConfig {
             batch_size: 256,
             critic_hidden: vec![256, 256],
             critic_layer_norm: false,
+            action_rate_penalty: 0.0,
             td3: Td3Config::default(),
             sac: SacConfig::default(),
             ndp: NdpConfig::default(),

@@ -82,6 +82,7 @@ actor_learning_rate = 0.0005
 batch_size = 256
 critic_hidden = [256, 256]
 critic_layer_norm = false
+action_rate_penalty = 0.0
 [algorithm.td3]
 target_noise_std = 0.2
 target_noise_clip = 0.5
@@ -159,6 +160,7 @@ forcing_scaling = "goal"
 actor_learning_rate = 0.0003
 critic_learning_rate = 0.0003
 critic_hidden = [256, 256]
+action_rate_penalty = 0.0
 [exploration]
 warm_up_steps = 0
 "#;

@@ -183,6 +183,7 @@ impl ExperimentConfig {
         for (key, std) in [
             ("exploration.std", self.exploration.std),
             ("algorithm.td3.target_noise_std", self.algorithm.td3.target_noise_std),
+            ("algorithm.action_rate_penalty", self.algorithm.action_rate_penalty),
         ] {
             range(key, std, std.is_finite() && std >= 0.0, || "0 or more".into())?;
         }
@@ -310,6 +311,10 @@ impl ExperimentConfig {
         range("algorithm.critic_layer_norm", "true", !on_policy || !layer_norm, || {
             "false with algorithm.name = \"ndp\", whose critic judges states of its own policy"
                 .into()
+        })?;
+        let penalty = self.algorithm.action_rate_penalty;
+        range("algorithm.action_rate_penalty", penalty, !on_policy || penalty == 0.0, || {
+            "0 with algorithm.name = \"ndp\", whose actor learns from probabilities alone".into()
         })?;
         let position = self.policy.controller == Controller::Position;
         let dmp = self.policy.kind == PolicyKind::Dmp;
