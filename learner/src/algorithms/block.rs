@@ -42,6 +42,8 @@ pub struct Sums {
     pub squared_error: f32,
     /// Q of the batch's actions, first critic.
     pub q: f32,
+    /// |Q| of the batch's actions, first critic.
+    pub q_size: f32,
     /// Whatever the actor descends.
     pub actor: f32,
     /// log pi of the actor's own draws.
@@ -51,7 +53,7 @@ pub struct Sums {
 /// The price of an action's change, and the batch that knows what was done before.
 #[derive(Debug, Clone, Copy)]
 pub struct ActionRate<'a> {
-    /// Of a squared change, in units of reward.
+    /// Of a squared change, in units of Q.
     pub penalty: f32,
     /// Whose windows the policy acts on.
     pub batch: &'a Batch,
@@ -172,7 +174,10 @@ impl Block {
                 let error = q - target;
                 *out = 2.0 * error / self.batch_rows;
                 self.sums.squared_error += error * error;
-                self.sums.q += if index == 0 { *q } else { 0.0 };
+                if index == 0 {
+                    self.sums.q += *q;
+                    self.sums.q_size += q.abs();
+                }
             }
             critic.pass(activations, normalised.as_ref(), rows).backward(gradients);
         }
@@ -379,6 +384,7 @@ pub fn total(blocks: &[Block]) -> Sums {
     blocks.iter().map(|block| block.sums).fold(Sums::default(), |a, b| Sums {
         squared_error: a.squared_error + b.squared_error,
         q: a.q + b.q,
+        q_size: a.q_size + b.q_size,
         actor: a.actor + b.actor,
         log_density: a.log_density + b.log_density,
     })

@@ -65,9 +65,9 @@ impl Ddpg {
     pub fn update(&mut self, policy: &Policy, batch: &Batch, crew: &Crew) -> Result<Losses> {
         self.critic_step(policy, batch, crew)?;
         let critic = total(&self.blocks);
-        self.actor_step(policy, batch, crew);
-        let actor = total(&self.blocks);
         let rows = batch.rewards.len() as f32;
+        self.actor_step(policy, batch, crew, self.action_rate_penalty * critic.q_size / rows);
+        let actor = total(&self.blocks);
         Ok(Losses {
             critic_loss: critic.squared_error / rows,
             actor_loss: Some(actor.actor / rows),
@@ -98,9 +98,8 @@ impl Ddpg {
     }
 
     /// Descends -mean Q(s, pi(s)), and what changes of pi(s) cost.
-    fn actor_step(&mut self, policy: &Policy, batch: &Batch, crew: &Crew) {
+    fn actor_step(&mut self, policy: &Policy, batch: &Batch, crew: &Crew, penalty: f32) {
         let (actor, critic) = (self.actor.lend(), [self.critic.lend()]);
-        let penalty = self.action_rate_penalty;
         crew.each(&mut self.blocks, |block| {
             block.act(policy, &actor, batch.states());
             block.judge(policy, &critic, batch.states());

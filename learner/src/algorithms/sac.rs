@@ -77,7 +77,8 @@ impl Sac {
         let temperature = self.log_temperature.network.values()[0].exp();
         self.critics_step(policy, batch, crew, temperature)?;
         let critic = total(&self.blocks);
-        self.actor_step(policy, batch, crew, temperature);
+        let penalty = self.action_rate_penalty * critic.q_size / rows;
+        self.actor_step(policy, batch, crew, (temperature, penalty));
         let actor = total(&self.blocks);
         let entropy = -actor.log_density / rows;
         // Of -log temperature (mean log pi + target entropy).
@@ -127,10 +128,15 @@ impl Sac {
 
     /// Descends mean (temperature log pi(u|s) - min_i Q_i(s, u)), u ~ pi(s), by the path of u, and
     /// what changes of u cost.
-    fn actor_step(&mut self, policy: &Policy, batch: &Batch, crew: &Crew, temperature: f32) {
+    fn actor_step(
+        &mut self,
+        policy: &Policy,
+        batch: &Batch,
+        crew: &Crew,
+        (temperature, penalty): (f32, f32),
+    ) {
         let [first, second] = &self.critics;
         let (actor, critics) = (self.actor.lend(), [first.lend(), second.lend()]);
-        let penalty = self.action_rate_penalty;
         crew.each(&mut self.blocks, |block| {
             draw(block, policy, &actor, batch.states(), &batch.noise);
             block.judge(policy, &critics, batch.states());

@@ -76,7 +76,8 @@ impl Td3 {
             ..Losses::default()
         };
         if whole {
-            self.actor_step(policy, batch, crew);
+            let penalty = self.action_rate_penalty * critic.q_size / rows;
+            self.actor_step(policy, batch, crew, penalty);
             losses.actor_loss = Some(total(&self.blocks).actor / rows);
         }
         Ok(losses)
@@ -115,9 +116,8 @@ impl Td3 {
     }
 
     /// Descends -mean Q_1(s, pi(s)), and what changes of pi(s) cost.
-    fn actor_step(&mut self, policy: &Policy, batch: &Batch, crew: &Crew) {
+    fn actor_step(&mut self, policy: &Policy, batch: &Batch, crew: &Crew, penalty: f32) {
         let (actor, critic) = (self.actor.lend(), [self.critics[0].lend()]);
-        let penalty = self.action_rate_penalty;
         crew.each(&mut self.blocks, |block| {
             block.act(policy, &actor, batch.states());
             block.judge(policy, &critic, batch.states());

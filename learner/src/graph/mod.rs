@@ -127,10 +127,12 @@ impl Graph {
             || update.is_multiple_of(td3.actor_interval);
         let states = self.states(policy, &batch.observations, &batch.inputs)?;
         let temperature = self.temperature()?;
-        let (critic_loss, q_mean) = self.critics_step(policy, batch, &temperature, whole)?;
+        let (critic_loss, q_mean, q_size) =
+            self.critics_step(policy, batch, &temperature, whole)?;
         let mut losses = Losses { critic_loss, q_mean, ..Losses::default() };
         if whole {
-            let (loss, entropy) = self.actor_step(&states, batch, &temperature)?;
+            let penalty = self.config.algorithm.action_rate_penalty * q_size;
+            let (loss, entropy) = self.actor_step(&states, batch, &temperature, penalty)?;
             losses.actor_loss = Some(loss);
             losses.entropy = entropy;
             losses.temperature = temperature
@@ -233,20 +235,21 @@ impl Graph {
         batch: &Batch,
         temperature: &Option<Tensor>,
         follow: bool,
-    ) -> Result<(f32, f32)> {
+    ) -> Result<(f32, f32, f64)> {
         let targets = self.targets(policy, batch, temperature)?;
         let inputs = self.on_device(&batch.critic_inputs)?;
-        let (mut sum, mut q_mean) = (0.0, 0.0);
+        let (mut sum, mut q_mean, mut q_size) = (0.0, 0.0, 0.0);
         for (index, critic) in self.critics().iter().enumerate() {
             let q = self.q(critic, false, &inputs)?;
             if index == 0 {
                 q_mean = q.mean_all()?.to_scalar()?;
+                q_size = f64::from(q.abs()?.mean_all()?.to_scalar::<f32>()?);
             }
             let loss = (q - &targets)?.sqr()?.mean_all()?;
             sum += loss.to_scalar::<f32>()?;
             self.descend(critic, &loss, follow)?;
         }
-        Ok((sum, q_mean))
+        Ok((sum, q_mean, q_size))
     }
 
     fn actor_step(
@@ -254,8 +257,10 @@ impl Graph {
         states: &StatesOn,
         batch: &Batch,
         temperature: &Option<Tensor>,
+        penalty: f64,
     ) -> Result<(f32, Option<f32>)> {
         let means = self.policy.means(&self.remote("actor")?.network, states)?;
+        let cost = |u: &Tensor| self.squared_changes(u, batch)? * penalty;
         let (loss, entropy) = match temperature {
             Some(temperature) => {
                 let (u, density) = means.draw(&self.on_device(&batch.noise)?)?;
@@ -263,21 +268,21 @@ impl Graph {
                 let entropy = -density.mean_all()?.to_scalar::<f32>()?;
                 let q = self.smallest_q(false, &inputs)?;
                 let loss = (density.broadcast_mul(temperature)? - q)?.mean_all()?;
-                ((loss + self.action_rate_cost(&u, batch)?)?, Some(entropy))
+                ((loss + cost(&u)?)?, Some(entropy))
             }
             None => {
                 let u = means.means.tanh()?;
                 let inputs = self.critic_inputs(states, &means.with_end_state(&u)?)?;
                 let loss = self.q(self.critics()[0], false, &inputs)?.mean_all()?.neg()?;
-                ((loss + self.action_rate_cost(&u, batch)?)?, None)
+                ((loss + cost(&u)?)?, None)
             }
         };
         self.descend("actor", &loss, true)?;
         Ok((loss.to_scalar()?, entropy))
     }
 
-    /// What the changes of u, (B, K A), cost: a mean over the batch.
-    fn action_rate_cost(&self, u: &Tensor, batch: &Batch) -> Result<Tensor> {
+    /// Sum of the squared changes of u, (B, K A): a mean over the batch.
+    fn squared_changes(&self, u: &Tensor, batch: &Batch) -> Result<Tensor> {
         let BatchShape { action_len, segment_actions_len, .. } = self.shape;
         let previous = self.on_device(&batch.previous_actions)?;
         let first = (u.narrow(1, 0, action_len)? - previous)?;
@@ -287,7 +292,7 @@ impl Graph {
             let others = (u.narrow(1, action_len, len)? - u.narrow(1, 0, len)?)?;
             changes = Tensor::cat(&[&changes, &others], 1)?;
         }
-        changes.sqr()?.sum(1)?.mean_all()? * self.config.algorithm.action_rate_penalty
+        changes.sqr()?.sum(1)?.mean_all()
     }
 
     fn descend(&mut self, name: &str, loss: &Tensor, follow: bool) -> Result<()> {
