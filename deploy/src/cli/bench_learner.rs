@@ -22,7 +22,8 @@ In every round each of these runs once for --seconds, the others asleep; the med
                   has its share of the batch's rows
   floor, library  the same by the gemm crate; the faster of the two is floor_ms
   torch, jax      the same update in eager PyTorch, or compiled by JAX, on as many cores, with
-                  batches at hand; asked for with --peer, run by tests/peers/learner_peer.py
+                  batches at hand; asked for with --peer, run by tests/peers/learner_peer.py; then
+                  nobody's actor pays for changes of actions (algorithm.action_rate_penalty = 0)
 Sampling and optimiser are measured alone too: the shares of the time. peak_memory_mb is the
 learner's (VmHWM), its replay included. What is not to be had is null or `absent`, with the reason.
 Ctrl-C ends it and leaves nothing.
@@ -73,8 +74,13 @@ pub(super) fn run(args: &LearnerArgs) -> anyhow::Result<Outcome> {
         )));
     };
     let threads = args.threads.map(|threads| Value::Integer(threads.into()));
-    let sources =
-        args.configured.sources(&args.task, [flag("--threads", "learner.threads", threads)])?;
+    // A price of ours, which others do not know.
+    let no_price = (!args.peer.is_empty()).then_some(Value::Float(0.0));
+    let flags = [
+        flag("--threads", "learner.threads", threads),
+        flag("--peer", "algorithm.action_rate_penalty", no_price),
+    ];
+    let sources = args.configured.sources(&args.task, flags)?;
     let config = merge(&sources)?.resolve(Limits { cores: cores() }).map_err(refuse)?;
     if config.algorithm.name == AlgorithmName::Ndp {
         return Err(wrong_use(

@@ -219,36 +219,10 @@ impl Block {
         self.sums = Sums { actor: -self.q(0).iter().sum::<f32>(), ..Sums::default() };
         let weight = -1.0 / self.batch_rows;
         self.actions_gradient(critic, |_, _, _| weight);
-        self.penalise(rate);
         self.unsquash();
-        self.act_backward(policy, actor, |_, _, _| 0.0);
-    }
-
-    /// Adds what the changes of the policy's actions cost to `sums.actor`, and its gradient to the
-    /// one with respect to u, as [`Block::actions_gradient`] left it.
-    pub fn penalise(&mut self, ActionRate { penalty, batch }: ActionRate<'_>) {
-        if penalty == 0.0 {
-            return;
-        }
-        let BatchShape { action_len: dims, segment_actions_len: len, .. } = self.shape;
-        let factor = 2.0 * penalty / self.batch_rows;
-        for row in 0..self.rows_len() {
-            let at = self.rows.start + row;
-            let actions = &self.policy.actions[row * len..(row + 1) * len];
-            let gradient = &mut self.actions_gradient[row * len..(row + 1) * len];
-            let previous = &batch.previous_actions[at * dims..(at + 1) * dims];
-            for (d, previous) in previous.iter().enumerate() {
-                let change = batch.has_previous[at] * (actions[d] - previous);
-                gradient[d] += factor * change;
-                self.sums.actor += penalty * change * change;
-            }
-            for i in dims..len {
-                let change = actions[i] - actions[i - dims];
-                gradient[i] += factor * change;
-                gradient[i - dims] -= factor * change;
-                self.sums.actor += penalty * change * change;
-            }
-        }
+        self.penalise(policy, rate);
+        self.log_stds_backward(policy, |_, _, _| 0.0);
+        self.act_backward(policy, actor);
     }
 
     /// Passes of mean (pi(s) - u)², `actions` (B, K A) being the u to imitate; leaves the sum of
@@ -271,7 +245,8 @@ impl Block {
         }
         self.end_gradient.fill(0.0);
         self.unsquash();
-        self.act_backward(policy, actor, |_, _, _| 0.0);
+        self.log_stds_backward(policy, |_, _, _| 0.0);
+        self.act_backward(policy, actor);
     }
 
     fn add_input_gradient(&mut self) {
@@ -294,24 +269,56 @@ impl Block {
         }
     }
 
-    /// Passes of the actor, from the gradient with respect to the means in `actions_gradient` and
-    /// to the raw log-stds, which `log_std(block, row, action)` gives, if the policy has any.
-    pub fn act_backward(
+    /// Adds what the changes of tanh(means) cost to `sums.actor`, and its gradient to that with
+    /// respect to the means, as [`Block::unsquash`] left it. Leaves tanh(means) as the actions.
+    pub fn penalise(&mut self, policy: &Policy, ActionRate { penalty, batch }: ActionRate<'_>) {
+        if penalty == 0.0 {
+            return;
+        }
+        let BatchShape { action_len: dims, segment_actions_len: len, .. } = self.shape;
+        policy.bound_means(&mut self.policy, self.rows.len() * len);
+        let factor = 2.0 * penalty / self.batch_rows;
+        for row in 0..self.rows_len() {
+            let at = self.rows.start + row;
+            let actions = &self.policy.actions[row * len..(row + 1) * len];
+            let gradient = &mut self.actions_gradient[row * len..(row + 1) * len];
+            let slope = |i: usize| factor * (1.0 - actions[i] * actions[i]);
+            let previous = &batch.previous_actions[at * dims..(at + 1) * dims];
+            for (d, previous) in previous.iter().enumerate() {
+                let change = batch.has_previous[at] * (actions[d] - previous);
+                gradient[d] += slope(d) * change;
+                self.sums.actor += penalty * change * change;
+            }
+            for i in dims..len {
+                let change = actions[i] - actions[i - dims];
+                gradient[i] += slope(i) * change;
+                gradient[i - dims] -= slope(i - dims) * change;
+                self.sums.actor += penalty * change * change;
+            }
+        }
+    }
+
+    /// Gradient to the raw log-stds, which `log_std(block, row, action)` gives, if the policy has
+    /// any; before [`Block::act_backward`].
+    pub fn log_stds_backward(
         &mut self,
         policy: &Policy,
-        actor: &Lent<'_>,
         log_std: impl Fn(&Self, usize, usize) -> f32,
     ) {
         let rows = self.rows_len();
-        if let Some(columns) = policy.log_stds() {
+        for (index, column) in policy.log_stds().into_iter().flatten().enumerate() {
             for row in 0..rows {
-                for (index, column) in columns.clone().enumerate() {
-                    let at = row * policy.shape().outputs() + column;
-                    let gradient = log_std(self, row, index);
-                    self.actor_gradients.output_mut(policy.shape(), rows)[at] = gradient;
-                }
+                let at = row * policy.shape().outputs() + column;
+                let gradient = log_std(self, row, index);
+                self.actor_gradients.output_mut(policy.shape(), rows)[at] = gradient;
             }
         }
+    }
+
+    /// Passes of the actor, from the gradient with respect to the means in `actions_gradient`, and
+    /// what [`Block::log_stds_backward`] left.
+    pub fn act_backward(&mut self, policy: &Policy, actor: &Lent<'_>) {
+        let rows = self.rows_len();
         let stride = policy.shape().outputs();
         let outputs = self.actor_gradients.output_mut(policy.shape(), rows);
         match (policy.head(), &mut self.policy.dmp) {

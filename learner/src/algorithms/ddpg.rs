@@ -14,13 +14,14 @@
 //! 5. Step sizes, polyak, batch and warm-up are the configuration's; `paper` has Table 2's of the
 //!    DDPG-DMP paper.
 //!
-//! Differences of DDPG-DMP with the preset `default` from the paper (`paper` has none of 6 to 10):
+//! Differences of DDPG-DMP with the preset `default` from the paper (`paper` has none of 6 to 11):
 //! 6. Critic of the whole segment, sliding windows, n-step target.
 //! 7. The DMP starts at zero, has alpha_y 10 and a semi-implicit integrator.
 //! 8. Observations are normalised; both step sizes are 1e-3.
 //! 9. Two updates a segment; 3 000 warm-up steps within 0.3 of the range; 8 environments a worker.
 //! 10. What a task's own defaults say (`shared/src/config/tasks.rs`).
-//! 11. rho stays within `rho_range` of (1, 0, 0, 0): our reading of what the paper leaves open,
+//! 11. The actor pays for changes of its actions (`action_rate_penalty`).
+//! 12. rho stays within `rho_range` of (1, 0, 0, 0): our reading of what the paper leaves open,
 //!     also in `paper`.
 
 use candle_core::Result;

@@ -15,7 +15,8 @@
 //! 3. The temperature's loss is linear in its logarithm, as in their code.
 //! 4. Squared errors without the factor one half; PyTorch's initialisation.
 //! 5. A time limit is no termination: truncated episodes bootstrap.
-//! 6. Step sizes of networks are the configuration's (1e-3; theirs 3e-4), the temperature's 3e-4;
+//! 6. With policy `dmp` the actor pays for changes of its means (`action_rate_penalty`).
+//! 7. Step sizes of networks are the configuration's (1e-3; theirs 3e-4), the temperature's 3e-4;
 //!    two updates a segment are 0.4 an environment step (theirs: 1); observations are normalised.
 
 use candle_core::Result;
@@ -127,7 +128,7 @@ impl Sac {
     }
 
     /// Descends mean (temperature log pi(u|s) - min_i Q_i(s, u)), u ~ pi(s), by the path of u, and
-    /// what changes of u cost.
+    /// what changes of the means' u cost.
     fn actor_step(
         &mut self,
         policy: &Policy,
@@ -153,7 +154,6 @@ impl Sac {
             block.actions_gradient(&critics, |block, row, index| {
                 if smaller(block, row) == index { -1.0 / rows } else { 0.0 }
             });
-            block.penalise(ActionRate { penalty, batch });
             block.unsquash();
             // d log pi / d x = 2 u at x = mean + std noise: only the tanh's correction moves.
             let share = temperature / rows;
@@ -161,13 +161,16 @@ impl Sac {
                 *gradient += share * 2.0 * u;
             }
             let noise = block.part(&batch.noise);
-            block.act_backward(policy, &actor, |block, row, index| {
+            block.log_stds_backward(policy, |block, row, index| {
                 let at = row * policy.layout().actions_len() + index;
                 let drawn = drawn(block, policy, noise, at);
                 // log std moves x by std noise, and log pi by -1 directly.
                 let gradient = block.actions_gradient[at] * drawn.shift - share;
                 if drawn.in_range { gradient } else { 0.0 }
             });
+            // Of the means, which act where nothing is drawn: noise is not to be smooth.
+            block.penalise(policy, ActionRate { penalty, batch });
+            block.act_backward(policy, &actor);
         });
         drop((actor, critics));
         self.actor.descend(crew, &self.blocks, |block| block.actor_trace(batch), None);

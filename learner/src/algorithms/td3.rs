@@ -10,7 +10,8 @@
 //! 3. Layers of 256 and 256 units for their 400 and 300; a batch of 256 for their 100.
 //! 4. Two updates a segment are 0.4 an environment step (theirs: 1); observations are normalised;
 //!    warm-up draws are gentler than uniform over the bounds (`exploration.warm_up_range`).
-//! 5. A time limit is no termination: truncated episodes bootstrap, as in their code.
+//! 5. With policy `dmp` the actor pays for changes of its actions (`action_rate_penalty`).
+//! 6. A time limit is no termination: truncated episodes bootstrap, as in their code.
 
 use candle_core::Result;
 use dmprl_shared::config::{ExperimentConfig, Td3Config};

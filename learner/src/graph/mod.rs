@@ -268,7 +268,7 @@ impl Graph {
                 let entropy = -density.mean_all()?.to_scalar::<f32>()?;
                 let q = self.smallest_q(false, &inputs)?;
                 let loss = (density.broadcast_mul(temperature)? - q)?.mean_all()?;
-                ((loss + cost(&u)?)?, Some(entropy))
+                ((loss + cost(&means.means.tanh()?)?)?, Some(entropy))
             }
             None => {
                 let u = means.means.tanh()?;

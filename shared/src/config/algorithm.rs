@@ -74,9 +74,9 @@ pub struct AlgorithmConfig {
     /// DDPG, TD3 and SAC: it bounds Q for actions unlike any in the replay (Ball et al. 2023).
     pub critic_layer_norm: bool,
     /// What the actor of DDPG, TD3 or SAC pays, beside Q, for the sum over a decision's actions and
-    /// their dimensions of (u_t - u_{t-1})², as a share of the batch's mean |Q|, so that it means
-    /// the same whatever the rewards' scale. The first action's predecessor is the one in the
-    /// replay. The larger, the smoother.
+    /// their dimensions of (u_t - u_{t-1})², u being made without noise: as a share of the batch's
+    /// mean |Q|, so that it means the same whatever the rewards' scale. What comes before the first
+    /// action is the one in the replay. The larger, the smoother.
     pub action_rate_penalty: f64,
     /// What only TD3 has.
     pub td3: Td3Config,
@@ -141,7 +141,7 @@ impl Default for AlgorithmConfig {
             batch_size: 256,
             critic_hidden: vec![256, 256],
             critic_layer_norm: false,
-            action_rate_penalty: 0.0,
+            action_rate_penalty: 0.2,
             td3: Td3Config::default(),
             sac: SacConfig::default(),
             ndp: NdpConfig::default(),

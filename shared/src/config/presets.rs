@@ -125,6 +125,7 @@ pub fn policy_defaults(kind: PolicyKind) -> Option<Table> {
         // The target entropy is one of the baselines too: no preset states it.
         PolicyKind::Mlp => {
             let text = "[pacing]\nupdates_per_segment = 1.0\n\
+                        [algorithm]\naction_rate_penalty = 0.0\n\
                         [algorithm.sac]\ntarget_entropy_per_action = -1.0";
             Some(text.parse().expect("the built-in defaults are valid TOML"))
         }

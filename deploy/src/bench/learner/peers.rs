@@ -115,6 +115,7 @@ fn cannot_do(config: &ExperimentConfig) -> Option<&'static str> {
         (algorithm.critic_layer_norm, "tests/peers does no layer normalisation"),
         (algorithm.td3.actor_interval != 2, "tests/peers moves TD3's actor at every second update"),
         (config.policy.rho == RhoKind::Free, "tests/peers bounds rho"),
+        (algorithm.action_rate_penalty > 0.0, "tests/peers puts no price on changes of actions"),
     ];
     otherwise.into_iter().find_map(|(differs, why)| differs.then_some(why))
 }
@@ -161,6 +162,7 @@ mod tests {
     fn a_peer_is_not_compared_with_another_update() {
         let with = |key: &str, value: &str| {
             let mut layers = Layers::new();
+            layers.set("test", "algorithm.action_rate_penalty", "0.0").unwrap();
             layers.set("test", key, value).unwrap();
             cannot_do(&layers.finish().unwrap())
         };
@@ -169,6 +171,7 @@ mod tests {
             ("algorithm.critic_layer_norm", "true"),
             ("algorithm.td3.actor_interval", "3"),
             ("policy.rho", "free"),
+            ("algorithm.action_rate_penalty", "0.2"),
         ] {
             assert!(with(key, value).is_some(), "{key}");
         }
