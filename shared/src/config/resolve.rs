@@ -380,12 +380,14 @@ mod tests {
     fn ndp_wants_movement_primitives_and_no_warm_up() {
         let ndp = ("algorithm.name", "ndp");
         let cold = ("exploration.warm_up_steps", "0");
-        let config = resolved(&[ndp, cold, ("actors.workers", "3")]).unwrap();
+        let free = ("algorithm.action_rate_penalty", "0.0");
+        let config = resolved(&[ndp, cold, free, ("actors.workers", "3")]).unwrap();
         assert_eq!(config.algorithm.ndp.rollout_segments, 10 * 3 * 8);
-        let refused = |more| resolved(&[ndp, cold, more]).unwrap_err().to_string();
+        let refused = |more| resolved(&[ndp, cold, free, more]).unwrap_err().to_string();
         let mlp = refused(("policy.kind", "mlp"));
         assert!(mlp.contains("about movement primitives"), "{mlp}");
         assert!(refused(("exploration.warm_up_steps", "1")).contains("its own policy"));
+        assert!(refused(("algorithm.action_rate_penalty", "0.1")).contains("probabilities"));
         assert!(refused(("policy.start", "observed")).contains("start_sources"));
     }
 
@@ -396,6 +398,7 @@ mod tests {
             ("dmp.integration_steps", "41"),
             ("algorithm.discount", "1.5"),
             ("algorithm.polyak", "nan"),
+            ("algorithm.action_rate_penalty", "-0.1"),
             ("actors.workers", "1000000"),
             ("actors.env_call_timeout_s", "0"),
             ("actors.env_call_timeout_s", "inf"),
