@@ -1,8 +1,8 @@
-//! The Python package with its optional extras: panda-gym and Gymnasium-Robotics.
+//! The Python package with its optional extras: panda-gym, Gymnasium-Robotics and Optuna.
 //!
-//! They get an environment of their own, made once: PyBullet is large, most users need neither, and
-//! not every Python has a build of it. Where one cannot be installed, the test says so and passes,
-//! unless `TEST_EXTRAS_REQUIRED` is set, as it is where every change is tested.
+//! They get an environment of their own, made once: PyBullet is large, most users need none of
+//! them, and not every Python has a build of it. Where one cannot be installed, the test says so
+//! and passes, unless `TEST_EXTRAS_REQUIRED` is set, as it is where every change is tested.
 #![cfg(feature = "python")]
 #![allow(
     clippy::unwrap_used,
@@ -18,7 +18,7 @@ use dmprl_actors::python_env::LINKED_PYTHON;
 use dmprl_tests::project_root;
 
 /// Extras of `envs_py/pyproject.toml`, everything first, and the tests that need no more.
-const ATTEMPTS: [(&str, &str); 2] = [("test", "test_*.py"), ("robotics", "test_robotics.py")];
+const ATTEMPTS: [(&str, &str); 2] = [("test", "test_*.py"), ("robotics,search", "test_[rs]*.py")];
 /// What pip says when a package has no build for this Python, or the network cannot be reached.
 const NOT_AVAILABLE: [&str; 2] = ["No matching distribution found", "Could not find a version"];
 

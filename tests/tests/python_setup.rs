@@ -13,7 +13,7 @@ use std::{
     thread,
 };
 
-use dmprl::python_setup::{PythonEnvironment, ensure};
+use dmprl::python_setup::{PythonEnvironment, ensure, ensure_extra};
 
 const MANIFEST: &str = "\
 [build-system]
@@ -119,4 +119,45 @@ fn failed_or_killed_installation_is_reported_and_then_made_anew() {
     assert!(imports_dmprl(&installed.unwrap()));
     assert!(lines[0].contains("pyproject.toml has changed"), "{lines:#?}");
     assert!(!lines.iter().any(|line| line.contains("making .venv")), "{lines:#?}");
+}
+
+#[test]
+fn an_extra_is_installed_when_it_is_asked_for_and_once() {
+    let project = project();
+    let manifest = project.path().join("envs_py/pyproject.toml");
+    // What it requires lies in a folder beside: nothing of this needs a network.
+    let other = project.path().join("other");
+    fs::create_dir(&other).unwrap();
+    fs::write(other.join("pyproject.toml"), MANIFEST.replace("\"dmprl\"", "\"other\"")).unwrap();
+    let backend = BACKEND.replace("dmprl-0.1.0", "other-0.1.0").replace("dmprl", "other");
+    fs::write(other.join("backend.py"), format!("{backend}\nbuild_wheel = build_editable\n"))
+        .unwrap();
+    fs::write(other.join("other.py"), "").unwrap();
+    let extras = format!(
+        "{MANIFEST}\n[project.optional-dependencies]\nsearch = ['other @ file://{0}']\n\
+         broken = ['nothing @ file://{0}/nothing']\n",
+        other.display()
+    );
+    fs::write(&manifest, extras).unwrap();
+
+    let lines = Mutex::new(Vec::new());
+    let asked = |extra: &str| {
+        lines.lock().unwrap().clear();
+        ensure_extra(project.path(), extra, &|line| lines.lock().unwrap().push(line.to_owned()))
+    };
+    let environment = asked("search").unwrap();
+    let imports_other = || {
+        let mut command = Command::new(&environment.executable);
+        command.args(["-I", "-c", "import other, dmprl"]).status().unwrap().success()
+    };
+    assert!(imports_other());
+    assert!(lines.lock().unwrap().iter().any(|line| line.contains("installing other @ file")));
+    asked("search").unwrap();
+    assert_eq!(*lines.lock().unwrap(), [""; 0], "it is there");
+
+    let error = format!("{:#}", asked("broken").unwrap_err());
+    assert!(error.contains("cannot install nothing @ file"), "{error}");
+    let error = format!("{:#}", asked("none").unwrap_err());
+    assert!(error.contains("no optional part `none`"), "{error}");
+    assert!(imports_other(), "what failed has harmed nothing");
 }

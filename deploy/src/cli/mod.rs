@@ -11,6 +11,7 @@ mod doctor;
 mod eval;
 mod report;
 mod resume;
+mod search;
 mod sweep;
 mod tasks;
 mod train;
@@ -153,6 +154,20 @@ fn prepare_python() -> anyhow::Result<PathBuf> {
     let root = crate::project::root()?;
     let progress = crate::terminal::SetupProgress::new();
     Ok(crate::python_setup::ensure(&root, &|line| progress.show(line))?.venv)
+}
+
+/// The same with an optional part of the package; returns the interpreter.
+#[cfg(feature = "python")]
+fn prepare_python_with(extra: &str) -> anyhow::Result<PathBuf> {
+    let root = crate::project::root()?;
+    let progress = crate::terminal::SetupProgress::new();
+    let ready = crate::python_setup::ensure_extra(&root, extra, &|line| progress.show(line));
+    Ok(ready?.executable)
+}
+
+#[cfg(not(feature = "python"))]
+fn prepare_python_with(_extra: &str) -> anyhow::Result<PathBuf> {
+    prepare_python()
 }
 
 #[cfg(not(feature = "python"))]

@@ -6,11 +6,11 @@ use anyhow::{Context, bail};
 use clap::Args;
 use dmprl_shared::config::ExperimentConfig;
 
-use super::{cores, emit, prepare_python, this_program, train_configuration};
+use super::{cores, emit, prepare_python, search, this_program, train_configuration};
 use crate::failure::{Outcome, wrong_use};
 use crate::launch::RESUME_WAIT;
 use crate::run_directory::RunLock;
-use crate::sweep::{Ledger, Plan, PlannedRun, RunState, Sweep, SweepFile, states, sweep};
+use crate::sweep::{Ledger, Plan, PlannedRun, RunState, Site, Sweep, SweepFile, states, sweep};
 use crate::terminal::{grouped, say, shown};
 
 const HELP: &str = "\
@@ -32,58 +32,93 @@ command goes on: what has finished is not done again, what was under way goes on
 checkpoint. A run that fails costs the others nothing; the next start tries it again.
 Ctrl-C once: the runs write a checkpoint; twice: at once.
 
+SEARCH, instead of [grid]: Optuna proposes the values, trial by trial.
+  [search]
+  trials = 40                             # of each task and method
+  objective = \"return\"                    # or success; of the last evaluation, maximised
+  sampler = \"tpe\"                         # or random
+  pruner = \"median\"                       # or hyperband, none
+  prune_after_trials = 5                  # finished ones, before median gives any up
+  seed = 0                                # of the sampler
+  [search.space]
+  algorithm.critic_learning_rate = { low = 1e-4, high = 3e-3, log = true }
+  dmp.basis_count = { low = 3, high = 7 }    # the key holds an integer: whole numbers
+  exploration.kind = [\"gaussian\", \"pink\"]  # one of these
+  [[search.first]]                        # tried before any other; what is left out is proposed
+  dmp.basis_count = 5
+A trial is trained with each seed, one after the other, in OUTPUT/TASK/METHOD/trial-N/seed-S; its
+objective is the mean over them. The pruner sees each evaluation and compares it with that of the
+same number in other trials; a trial given up is interrupted and stays as it is. A trial that fails
+counts as one. The runs evaluate on episodes of seeds from 5000 on (evaluation.first_seed; less is
+refused), never on those of the evaluation, 1000 and on: train the best anew to know how good it is.
+  dmprl train TASK --config OUTPUT/TASK/METHOD/best.toml
+Optuna is installed into .venv by the first search. OUTPUT/optuna.db is its storage, for its own
+tools too: optuna-dashboard sqlite:///OUTPUT/optuna.db
+
 EXAMPLES
   dmprl sweep mine.toml --dry-run    # what it would run, and how far each is
-  dmprl sweep mine.toml --jobs 4";
+  dmprl sweep mine.toml --jobs 4
+  dmprl sweep deploy/experiments/search-reacher.toml";
 
 /// Arguments of `dmprl sweep`.
 #[derive(Debug, Args)]
 #[command(after_help = HELP)]
 pub(super) struct SweepArgs {
     /// The sweep file.
-    file: PathBuf,
+    pub(super) file: PathBuf,
     /// Where the runs go [default: runs/ and the file's name without .toml].
     #[arg(long, value_name = "DIR")]
     output: Option<PathBuf>,
-    /// Runs at once [default: as many as have cores for their workers and the learner's threads].
+    /// Runs at once, in a search trials [default: as many as have cores for their workers and the
+    /// learner's threads].
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u16).range(1..=1024))]
-    jobs: Option<u16>,
-    /// Train nothing, only list the runs and how far each is.
+    pub(super) jobs: Option<u16>,
+    /// Train nothing, only list the runs, or space and trials of a search, and how far each is.
     #[arg(long)]
-    dry_run: bool,
-    /// Print one JSON object on standard output: each run with its directory and state.
+    pub(super) dry_run: bool,
+    /// Print one JSON object on standard output: each run, or trial, with directory and state.
     #[arg(long)]
-    json: bool,
+    pub(super) json: bool,
 }
 
 pub(super) fn run(args: &SweepArgs) -> anyhow::Result<Outcome> {
     let (file, text) = SweepFile::read(&args.file)?;
-    let plan = Plan::new(&file)?;
     let output = args.output.clone().map_or_else(|| default_output(&args.file), Ok)?;
-    let runs = configured(plan)?;
-    let jobs = args.jobs.map_or_else(|| default_jobs(&runs), usize::from);
-    let ledger = Ledger::open(&output)?;
-    let mut plan = Sweep { program: this_program()?, output, runs, jobs, ledger };
+    let site = Site { program: this_program()?, output };
+    if let Some(search) = &file.search {
+        return search::run(args, (&file, &text), search, site);
+    }
+    let runs = configured(Plan::new(&file)?)?;
+    let jobs = jobs(args, runs.iter().map(|(_, config)| config));
+    let ledger = Ledger::open(&site.output)?;
+    let mut plan = Sweep { site, runs, jobs, ledger };
     if args.dry_run {
         let states = states(&plan)?;
         return report(&plan, &states, args.json).map(|()| Outcome::Done);
     }
-    std::fs::create_dir_all(&plan.output)
-        .with_context(|| format!("cannot make {}", plan.output.display()))?;
-    plan.output = std::fs::canonicalize(&plan.output)
-        .with_context(|| format!("cannot resolve {}", plan.output.display()))?;
-    // Children inherit it: those of a sweep that was killed write their checkpoints first.
-    let _lock = RunLock::take(&plan.output, RESUME_WAIT)?;
-    plan.ledger = Ledger::open(&plan.output)?;
-    // For the report: what was asked for last.
-    std::fs::write(plan.output.join("sweep.toml"), text).context("cannot write sweep.toml")?;
+    let _lock = take(&mut plan.site, &text)?;
+    plan.ledger = Ledger::open(&plan.site.output)?;
     // Once, before several runs want it at the same time.
     prepare_python()?;
     finish(plan, args)
 }
 
+/// Makes the sweep's directory, takes it for this process, and leaves the file there.
+pub(super) fn take(site: &mut Site, text: &str) -> anyhow::Result<RunLock> {
+    let output = &mut site.output;
+    std::fs::create_dir_all(&*output)
+        .with_context(|| format!("cannot make {}", output.display()))?;
+    *output = std::fs::canonicalize(&*output)
+        .with_context(|| format!("cannot resolve {}", output.display()))?;
+    // Children inherit it: those of a sweep that was killed write their checkpoints first.
+    let lock = RunLock::take(output, RESUME_WAIT)?;
+    // For the report: what was asked for last.
+    std::fs::write(output.join("sweep.toml"), text).context("cannot write sweep.toml")?;
+    Ok(lock)
+}
+
 fn finish(mut plan: Sweep, args: &SweepArgs) -> anyhow::Result<Outcome> {
-    let (count, folder) = (plan.runs.len(), shown(&plan.output));
+    let (count, folder) = (plan.runs.len(), shown(&plan.site.output));
     say(&format!("{count} runs in {folder}, {} at once", plan.jobs));
     let ended = sweep(&mut plan)?;
     report(&plan, &ended.states, args.json)?;
@@ -115,11 +150,14 @@ fn default_output(file: &Path) -> anyhow::Result<PathBuf> {
     Ok(Path::new("runs").join(name))
 }
 
-/// As many as have a core for each worker and each thread of the learner.
-fn default_jobs(runs: &[(PlannedRun, ExperimentConfig)]) -> usize {
+/// As many as the user says, else as have a core for each worker and each thread of the learner.
+pub(super) fn jobs<'a>(
+    args: &SweepArgs,
+    runs: impl Iterator<Item = &'a ExperimentConfig>,
+) -> usize {
     let wanted = |config: &ExperimentConfig| config.actors.workers + config.learner.threads;
-    let most = runs.iter().map(|(_, config)| wanted(config)).max().unwrap_or(1);
-    (cores() / most.max(1)).max(1)
+    let most = runs.map(wanted).max().unwrap_or(1);
+    args.jobs.map_or_else(|| (cores() / most.max(1)).max(1), usize::from)
 }
 
 fn report(plan: &Sweep, states: &[RunState], json: bool) -> anyhow::Result<()> {
@@ -134,7 +172,7 @@ fn report(plan: &Sweep, states: &[RunState], json: bool) -> anyhow::Result<()> {
                 };
                 serde_json::json!({
                     "task": run.task, "method": run.method, "point": run.point, "seed": run.seed,
-                    "run": plan.output.join(&run.directory), "state": state,
+                    "run": plan.site.output.join(&run.directory), "state": state,
                     "env_steps": env_steps, "steps": config.run.steps, "reason": reason,
                 })
             })

@@ -2,6 +2,7 @@
 
 use std::{
     collections::VecDeque,
+    ffi::OsStr,
     fs::File,
     io::{self, BufRead, BufReader},
     path::Path,
@@ -51,16 +52,29 @@ impl Setup<'_> {
     /// an installation, which is what who adds a task wants; only a change of requirements installs
     /// again.
     pub fn install(&self) -> Result<()> {
+        let package: [&OsStr; 2] = ["--editable".as_ref(), self.package.as_ref()];
+        self.pip("installing packages", &package)
+    }
+
+    /// Installs what an optional part of the package requires, as `pip` writes requirements. Not
+    /// by the package's name with the extra in brackets: that would make the package again, which
+    /// asks the network for its build tool even where all requirements are met.
+    pub fn install_extra(&self, requirements: &[String]) -> Result<()> {
+        let arguments: Vec<&OsStr> = requirements.iter().map(AsRef::as_ref).collect();
+        self.pip(&format!("installing {}", requirements.join(" ")), &arguments)
+    }
+
+    fn pip(&self, phase: &str, arguments: &[&OsStr]) -> Result<()> {
         let mut command = Command::new(&self.environment.executable);
         command
             .args(["-I", "-m", "pip", "install", "--disable-pip-version-check", "--no-input"])
-            .args(["--progress-bar", "off", "--editable"])
-            .arg(self.package)
+            .args(["--progress-bar", "off"])
+            .args(arguments)
             // A user's pip.conf may ask for these; in a virtual environment they fail or miss it.
             .env("PIP_USER", "0")
             .env_remove("PIP_TARGET")
             .env_remove("PIP_PREFIX");
-        self.run("installing packages", command)
+        self.run(phase, command)
     }
 
     fn run(&self, phase: &str, mut command: Command) -> Result<()> {

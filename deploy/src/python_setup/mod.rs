@@ -8,6 +8,7 @@
 
 mod advice;
 mod command;
+mod extra;
 mod stamp;
 
 use std::{
@@ -20,6 +21,7 @@ use std::{
 use anyhow::{Context, Result, bail};
 use dmprl_actors::python_env::LINKED_PYTHON;
 
+pub use self::extra::ensure_extra;
 use self::{
     command::Setup,
     stamp::{Fit, Stamp},

@@ -8,6 +8,7 @@ use dmprl_shared::config::{AlgorithmName, ExperimentConfig, PolicyKind};
 use crate::control::EvaluationRow;
 use crate::failure::wrong_use;
 use crate::run_directory::RunDirectory;
+use crate::sweep::search::found;
 use crate::sweep::{Ledger, Plan, SweepFile};
 
 /// One run and its evaluations.
@@ -74,22 +75,49 @@ impl Results {
     fn add_sweep(&mut self, sweep: &Path) -> anyhow::Result<()> {
         let (file, _) = SweepFile::read(&sweep.join("sweep.toml"))?;
         let ledger = Ledger::open(sweep)?;
+        if let Some(search) = &file.search {
+            // What it found: dozens of trials side by side would be no comparison of methods.
+            for found in found(&file, search, sweep)? {
+                let method = format!("{}, best trial", found.method);
+                self.add_planned(&found.task, &method);
+                for run in &found.runs {
+                    self.add_begun(sweep, &ledger, run, &method)?;
+                }
+            }
+            return Ok(());
+        }
         for planned in Plan::new(&file)?.runs {
             let point = planned.point.iter().map(|value| format!(", {value}"));
             let method = format!("{}{}", planned.method, point.collect::<String>());
-            // A cell that was not run stands in the tables too.
-            add_new(&mut self.tasks, &planned.task);
-            add_new(&mut self.methods, &method);
-            let path = sweep.join(&planned.directory);
-            // The manifest is the last that is written when a directory is made.
-            if path.join("manifest.json").is_file() {
-                let directory = RunDirectory::open(&path)?;
-                let config = directory.config()?;
-                let mut run = run(&directory, &config, method)?;
-                let finished = ledger.of(&planned.directory);
-                run.ended |= finished.is_some_and(|finished| finished.steps >= config.run.steps);
-                self.runs.push(run);
-            }
+            self.add_planned(&planned.task, &method);
+            self.add_begun(sweep, &ledger, &planned.directory, &method)?;
+        }
+        Ok(())
+    }
+
+    /// A cell that was not run stands in the tables too.
+    fn add_planned(&mut self, task: &str, method: &str) {
+        add_new(&mut self.tasks, task);
+        add_new(&mut self.methods, method);
+    }
+
+    /// A run of a sweep, if it has begun.
+    fn add_begun(
+        &mut self,
+        sweep: &Path,
+        ledger: &Ledger,
+        place: &Path,
+        method: &str,
+    ) -> anyhow::Result<()> {
+        let path = sweep.join(place);
+        // The manifest is the last that is written when a directory is made.
+        if path.join("manifest.json").is_file() {
+            let directory = RunDirectory::open(&path)?;
+            let config = directory.config()?;
+            let mut run = run(&directory, &config, method.to_owned())?;
+            let finished = ledger.of(place);
+            run.ended |= finished.is_some_and(|finished| finished.is_whole(config.run.steps));
+            self.runs.push(run);
         }
         Ok(())
     }

@@ -7,7 +7,7 @@ use std::path::Path;
 use anyhow::Context;
 
 /// Writes `bytes` beside `path`, syncs, and renames over it.
-pub(super) fn replace(path: &Path, bytes: &[u8]) -> anyhow::Result<()> {
+pub(crate) fn replace(path: &Path, bytes: &[u8]) -> anyhow::Result<()> {
     let parent = path.parent().with_context(|| format!("{} has no folder", path.display()))?;
     // The process id keeps two writers apart; the rename decides which one stands.
     let aside = path.with_extension(format!("tmp{}", std::process::id()));

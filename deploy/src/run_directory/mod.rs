@@ -25,6 +25,7 @@ use anyhow::{Context, bail, ensure};
 use dmprl_shared::config::{ExperimentConfig, Layers};
 use dmprl_shared::spec::EnvSpec;
 
+pub(crate) use atomic::replace as replace_file;
 pub use lock::RunLock;
 pub(crate) use manifest::random_u64;
 pub use manifest::{FORMAT_VERSION, Machine, Manifest, Session};

@@ -5,12 +5,14 @@ use std::path::Path;
 use serde::Deserialize;
 use toml::{Table, Value};
 
+use super::Search;
 use crate::failure::wrong_use;
 
 /// A sweep file is a few kilobytes.
 const FILE_BYTES_MAX: u64 = 1 << 20;
 
-/// What to run: every task with every method, at every point of the grid, with every seed.
+/// What to run: every task with every method, at every point of the grid or of a search, with every
+/// seed.
 #[derive(Debug, Clone, PartialEq, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct SweepFile {
@@ -28,6 +30,8 @@ pub struct SweepFile {
     /// Configuration keys, each with the values that it takes in turn.
     #[serde(default)]
     pub grid: Table,
+    /// Instead of the grid: keys whose values are searched for.
+    pub search: Option<Search>,
 }
 
 /// One task.
@@ -89,6 +93,9 @@ impl SweepFile {
         if file.methods.is_empty() {
             file.methods.push(MethodEntry { name: "default".to_owned(), ..Default::default() });
         }
+        if file.search.is_some() && !file.grid.is_empty() {
+            return Err("[grid] and [search] stand there both; expected one of them".to_owned());
+        }
         for (key, values) in flatten(&file.grid) {
             if values.as_array().is_none_or(Vec::is_empty) {
                 return Err(format!("grid.{key}: expected a list of values"));
@@ -147,5 +154,9 @@ mod tests {
         assert!(refused(&format!("{LEAST}step = 5")).contains("step"));
         assert!(refused(&format!("{LEAST}[grid]\nrun.steps = 5")).contains("grid.run.steps"));
         assert!(refused(&format!("{LEAST}[grid]\nrun.steps = []")).contains("grid.run.steps"));
+        let search = "[search]\ntrials = 2\nspace = { dmp.alpha_y = [9.0] }\n";
+        assert!(SweepFile::parse(&format!("{LEAST}{search}")).unwrap().search.is_some());
+        let both = refused(&format!("{LEAST}[grid]\ndmp.alpha_y = [9.0]\n{search}"));
+        assert!(both.contains("[grid] and [search]"), "{both}");
     }
 }

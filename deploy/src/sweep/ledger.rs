@@ -19,6 +19,36 @@ pub struct Finished {
     pub env_steps: u64,
     /// Of training, over all its sessions [s].
     pub wall_s: f64,
+    /// Whether it came to its end or was given up.
+    #[serde(default, skip_serializing_if = "End::is_finished")]
+    pub state: End,
+}
+
+/// How a run came to its end.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum End {
+    /// All its steps are done, or it reached what it was to reach.
+    #[default]
+    Finished,
+    /// A search has given its trial up.
+    Pruned,
+}
+
+impl End {
+    /// Whether it has come to its own end.
+    #[must_use]
+    pub fn is_finished(&self) -> bool {
+        *self == Self::Finished
+    }
+}
+
+impl Finished {
+    /// Whether it is all that a run of so many steps is asked for.
+    #[must_use]
+    pub fn is_whole(&self, steps: u64) -> bool {
+        self.state.is_finished() && self.steps >= steps
+    }
 }
 
 /// The file and what it says.
@@ -93,7 +123,8 @@ mod tests {
     use super::*;
 
     fn finished(run: &str, env_steps: u64) -> Finished {
-        Finished { run: run.into(), steps: env_steps, env_steps, wall_s: 1.5 }
+        let state = End::Finished;
+        Finished { run: run.into(), steps: env_steps, env_steps, wall_s: 1.5, state }
     }
 
     #[test]
@@ -113,6 +144,19 @@ mod tests {
             assert_eq!(ledger.of(Path::new("b")), Some(&finished("b", 6)));
             assert_eq!(ledger.of(Path::new("c")), None);
         }
+    }
+
+    #[test]
+    fn a_pruned_run_is_not_whole() {
+        let folder = tempfile::tempdir().unwrap();
+        let mut ledger = Ledger::open(folder.path()).unwrap();
+        ledger.add(Finished { state: End::Pruned, ..finished("a", 5) }).unwrap();
+        ledger.add(finished("b", 5)).unwrap();
+        let text = std::fs::read_to_string(folder.path().join("finished.jsonl")).unwrap();
+        assert_eq!(text.matches("state").count(), 1, "{text}");
+        let ledger = Ledger::open(folder.path()).unwrap();
+        let is_whole = |run: &str| ledger.of(Path::new(run)).is_some_and(|run| run.is_whole(5));
+        assert_eq!([is_whole("a"), is_whole("b")], [false, true]);
     }
 
     #[test]

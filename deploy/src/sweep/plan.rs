@@ -111,19 +111,9 @@ fn planned(
     point: &Point,
     seed: i64,
 ) -> PlannedRun {
-    let mut arguments = vec![task.name.clone()];
-    let flags =
-        [("--algo", &method.algo), ("--policy", &method.policy), ("--preset", &method.preset)];
-    for (flag, value) in flags {
-        arguments.extend(value.iter().flat_map(|value| [flag.to_owned(), value.clone()]));
-    }
-    let sets = [&file.set, &task.set, &method.set].into_iter().flat_map(flatten);
-    for (key, value) in sets.chain(point.iter().cloned()) {
-        arguments.extend(["--set".to_owned(), format!("{key}={value}")]);
-    }
-    arguments.extend(task.steps.iter().flat_map(|n| ["--steps".to_owned(), n.to_string()]));
+    let mut arguments = arguments(file, (task, method), point);
     arguments.extend(["--seed".to_owned(), seed.to_string()]);
-    let mut directory = PathBuf::from(safe_name(&task.name)).join(safe_name(&method.name));
+    let mut directory = method_directory(task, method);
     if !point.is_empty() {
         let short = |key: &str| key.rsplit('.').next().unwrap_or_default().to_owned();
         let name: Vec<String> =
@@ -138,6 +128,31 @@ fn planned(
         directory: directory.join(format!("seed-{seed}")),
         arguments,
     }
+}
+
+/// What `dmprl train` is given, seed and run directory aside.
+pub(super) fn arguments(
+    file: &SweepFile,
+    (task, method): (&TaskEntry, &MethodEntry),
+    point: &[(String, Value)],
+) -> Vec<String> {
+    let mut arguments = vec![task.name.clone()];
+    let flags =
+        [("--algo", &method.algo), ("--policy", &method.policy), ("--preset", &method.preset)];
+    for (flag, value) in flags {
+        arguments.extend(value.iter().flat_map(|value| [flag.to_owned(), value.clone()]));
+    }
+    let sets = [&file.set, &task.set, &method.set].into_iter().flat_map(flatten);
+    for (key, value) in sets.chain(point.iter().cloned()) {
+        arguments.extend(["--set".to_owned(), format!("{key}={value}")]);
+    }
+    arguments.extend(task.steps.iter().flat_map(|n| ["--steps".to_owned(), n.to_string()]));
+    arguments
+}
+
+/// Where the runs of a task by a method lie, below the sweep's directory.
+pub(super) fn method_directory(task: &TaskEntry, method: &MethodEntry) -> PathBuf {
+    PathBuf::from(safe_name(&task.name)).join(safe_name(&method.name))
 }
 
 #[cfg(test)]

@@ -10,29 +10,41 @@ use super::{duration, say};
 /// Between two redraws.
 const REDRAW_EVERY: Duration = Duration::from_millis(200);
 
-/// Shows how many runs have ended and how long the others will take.
+/// Shows how many runs, or trials, have ended and how long the others will take.
 pub struct SweepProgress {
     bar: Option<ProgressBar>,
-    runs: usize,
+    what: &'static str,
+    count: usize,
     ended: usize,
 }
 
 impl SweepProgress {
-    /// On standard error; `ended` runs were finished before.
+    /// On standard error; `ended` of so many were finished before.
+    /// - `what`: their plural.
     #[must_use]
-    pub fn new(runs: usize, ended: usize) -> Self {
+    pub fn new(what: &'static str, count: usize, ended: usize) -> Self {
         let bar = std::io::stderr().is_terminal().then(|| {
-            let bar = ProgressBar::new(runs as u64);
-            let template = "{spinner:.cyan} {bar:20.cyan/dim} {pos}/{len} runs {wide_msg}";
+            let bar = ProgressBar::new(count as u64);
+            let template = format!(
+                "{{spinner:.cyan}} {{bar:20.cyan/dim}} {{pos}}/{{len}} {what} {{wide_msg}}"
+            );
             // The template is a constant; were it wrong, indicatif's own would do.
-            if let Ok(style) = ProgressStyle::with_template(template) {
+            if let Ok(style) = ProgressStyle::with_template(&template) {
                 bar.set_style(style.progress_chars("━━╌"));
             }
             bar.set_position(ended as u64);
             bar.enable_steady_tick(REDRAW_EVERY);
             bar
         });
-        Self { bar, runs, ended }
+        Self { bar, what, count, ended }
+    }
+
+    /// So many had ended before.
+    pub fn begin_at(&mut self, ended: usize) {
+        self.ended = ended;
+        if let Some(bar) = &self.bar {
+            bar.set_position(ended as u64);
+        }
     }
 
     /// Says something, above the bar.
@@ -48,8 +60,9 @@ impl SweepProgress {
         self.ended += 1;
         match &self.bar {
             Some(bar) => bar.set_position(self.ended as u64),
-            None if self.ended < self.runs => {
-                say(&format!("{} of {} runs; {}", self.ended, self.runs, left(remaining)));
+            None if self.ended < self.count => {
+                let Self { what, count, ended, .. } = self;
+                say(&format!("{ended} of {count} {what}; {}", left(remaining)));
             }
             None => {}
         }

@@ -28,6 +28,7 @@ mod machine;
 mod refusals;
 mod report;
 mod results;
+mod search;
 mod start_stop;
 mod sweep;
 mod variants;
