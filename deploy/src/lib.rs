@@ -13,10 +13,12 @@ mod doctor;
 pub mod failure;
 pub mod journal;
 pub mod launch;
+pub mod motion;
 pub mod plots;
 pub mod project;
 #[cfg(feature = "python")]
 pub mod python_setup;
+pub mod record;
 pub mod report;
 pub mod roles;
 pub mod run_directory;

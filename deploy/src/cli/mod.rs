@@ -9,6 +9,7 @@ mod configuration;
 mod configured;
 mod doctor;
 mod eval;
+mod record;
 mod report;
 mod resume;
 mod search;
@@ -26,7 +27,7 @@ use dmprl_shared::config::ExperimentConfig;
 
 use crate::bench::{TransportWorkerArgs, transport_worker};
 use crate::failure::{Outcome, exit_code, render, wrong_use};
-use crate::roles::{self, ActorArgs, EvaluatorArgs, LearnerArgs};
+use crate::roles::{self, ActorArgs, EvaluatorArgs, LearnerArgs, ObserverArgs};
 use crate::terminal::say;
 
 const EXAMPLES: &str = "\
@@ -35,6 +36,7 @@ EXAMPLES
   dmprl eval runs/reacher-td3-dmp-s1-…    how well does its best policy do?
   dmprl resume runs/reacher-td3-dmp-s1-…  go on where it stopped
   dmprl actor --join runs/reacher-td3-…   one more worker for a run that is being trained
+  dmprl record runs/reacher-td3-dmp-s1-…  what does it look like?
   dmprl tasks                              what can be trained
   dmprl doctor                             what this machine has and lacks
 
@@ -46,6 +48,7 @@ ROLES (train starts them; each has --help)
   learner    replays, updates, publishes policies, writes checkpoints
   actor      steps environments and sends segments
   evaluator  evaluates saved policies without noise
+  observer   writes down, step by step, what a saved policy does
 
 ";
 
@@ -69,6 +72,8 @@ enum Command {
     Sweep(sweep::SweepArgs),
     /// Set runs and sweeps side by side: tables, statistics, learning curves, one page.
     Report(report::ReportArgs),
+    /// Make a video of a policy, or of two side by side.
+    Record(record::RecordArgs),
     /// Measure a part of the system beside what else could do its work.
     Bench(bench::BenchArgs),
     /// Kill a run's processes by a schedule and check that nothing is lost.
@@ -88,6 +93,9 @@ enum Command {
     /// The process that evaluates; started by train and eval.
     #[command(hide = true)]
     Evaluator(EvaluatorArgs),
+    /// The process that writes down what a policy does; started by record.
+    #[command(hide = true)]
+    Observer(ObserverArgs),
     /// A process that only sends segments; started by bench transport.
     #[command(hide = true)]
     TransportWorker(TransportWorkerArgs),
@@ -126,6 +134,7 @@ fn run(command: Command) -> anyhow::Result<Outcome> {
         Command::Eval(args) => eval::run(&args),
         Command::Sweep(args) => sweep::run(&args),
         Command::Report(args) => report::run(&args),
+        Command::Record(args) => record::run(&args),
         Command::Bench(args) => bench::run(&args),
         Command::Chaos(args) => chaos::run(&args),
         Command::Tasks(args) => tasks::run(&args),
@@ -134,6 +143,7 @@ fn run(command: Command) -> anyhow::Result<Outcome> {
         Command::Learner(args) => roles::learner(&args).map(|()| Outcome::Done),
         Command::Actor(args) => roles::actor(&args),
         Command::Evaluator(args) => roles::evaluator(&args).map(|()| Outcome::Done),
+        Command::Observer(args) => roles::observer(&args).map(|()| Outcome::Done),
         Command::TransportWorker(args) => transport_worker(&args).map(|()| Outcome::Done),
     }
 }
@@ -156,18 +166,18 @@ fn prepare_python() -> anyhow::Result<PathBuf> {
     Ok(crate::python_setup::ensure(&root, &|line| progress.show(line))?.venv)
 }
 
-/// The same with an optional part of the package; returns the interpreter.
+/// The same with an optional part of the package; returns the interpreter, too.
 #[cfg(feature = "python")]
-fn prepare_python_with(extra: &str) -> anyhow::Result<PathBuf> {
+fn prepare_python_with(extra: &str) -> anyhow::Result<(PathBuf, PathBuf)> {
     let root = crate::project::root()?;
     let progress = crate::terminal::SetupProgress::new();
-    let ready = crate::python_setup::ensure_extra(&root, extra, &|line| progress.show(line));
-    Ok(ready?.executable)
+    let ready = crate::python_setup::ensure_extra(&root, extra, &|line| progress.show(line))?;
+    Ok((ready.venv, ready.executable))
 }
 
 #[cfg(not(feature = "python"))]
-fn prepare_python_with(_extra: &str) -> anyhow::Result<PathBuf> {
-    prepare_python()
+fn prepare_python_with(_extra: &str) -> anyhow::Result<(PathBuf, PathBuf)> {
+    prepare_python().map(|venv| (venv.clone(), venv.join("bin/python")))
 }
 
 #[cfg(not(feature = "python"))]

@@ -30,7 +30,7 @@ pub(super) fn run(
         return listing.print(args).map(|()| Outcome::Done);
     }
     let lock = take(&mut site, text)?;
-    let python = prepare_python_with(EXTRA)
+    let (_, python) = prepare_python_with(EXTRA)
         .with_context(|| format!("{}: [search] needs Optuna", args.file.display()))?;
     let count = studies.len() * search.trials as usize;
     say(&format!("{count} trials in {}, {jobs} at once", shown(&site.output)));

@@ -44,7 +44,8 @@ pub(super) fn advice(output: &str) -> String {
         }
         Cause::DiskFull => "The disk is full.\n".to_owned(),
         Cause::NoNetwork => "The package index cannot be reached. The first start downloads \
-             gymnasium, mujoco and numpy, the first search optuna; later ones need no network. \
+             gymnasium, mujoco and numpy, the first search Optuna and the first video PyAV; later \
+             ones need no network. \
              Behind a proxy set HTTPS_PROXY; without a network set PIP_FIND_LINKS to a directory \
              of wheels and PIP_NO_INDEX=1\n"
             .to_owned(),

@@ -25,6 +25,8 @@ mod joining;
 mod learning;
 mod leftovers;
 mod machine;
+mod motion;
+mod record;
 mod refusals;
 mod report;
 mod results;
