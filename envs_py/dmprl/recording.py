@@ -7,14 +7,24 @@ episodes are those of an evaluation with the same seeds: the same actions, one s
 from __future__ import annotations
 
 import functools
+import os
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple, TypedDict
 
 import gymnasium
-import mujoco
 import numpy as np
 from numpy.typing import NDArray
+
+try:
+    import mujoco
+except Exception as error:  # whatever the OpenGL that MUJOCO_GL names fails with
+    if not os.environ.get("MUJOCO_GL"):
+        raise
+    raise RuntimeError(
+        f"no OpenGL to draw with (MUJOCO_GL={os.environ['MUJOCO_GL']}: {error}). Unset MUJOCO_GL, "
+        "or Debian, Ubuntu: apt install libegl1 libgl1-mesa-dri for egl, libosmesa6 for osmesa"
+    ) from None
 
 from dmprl.gymnasium_env import GymnasiumSegmentEnv, success_of
 from dmprl.mujoco_batch import MujocoTask, quieten_mujoco

@@ -4,7 +4,7 @@ use std::fs;
 use std::path::Path;
 use std::process::Command;
 
-use dmprl_tests::program::Workplace;
+use dmprl_tests::program::{Workplace, executable};
 use dmprl_tests::venv;
 use rustix::process::Signal;
 use serde_json::Value;
@@ -92,6 +92,14 @@ fn what_cannot_be_recorded_is_said() {
         .run(&["record", &run, "--compare", &other])
         .with_status(2)
         .saying("an episode of the same seed would be another");
+    let mut without_opengl = Command::new(executable());
+    without_opengl.args(["record", &run]).env("MUJOCO_GL", "osmosis");
+    place
+        .start_command(without_opengl)
+        .wait()
+        .with_status(1)
+        .saying("no OpenGL to draw with (MUJOCO_GL=osmosis")
+        .saying("apt install libegl1");
     let folder = dmprl_tests::project_root().join("docs/examples");
     let more = ["--steps", "1000", "--python-path", folder.to_str().unwrap()];
     place.run(&train("point_reach:PointReach-v0", &own, &more)).with_status(0);
