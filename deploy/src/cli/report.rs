@@ -8,13 +8,13 @@ use clap::Args;
 
 use super::emit;
 use crate::failure::Outcome;
-use crate::report::{Report, Results, curves, tables};
+use crate::report::{Report, Results, curves, efficiency, judge, tables};
 use crate::run_directory::rfc3339;
 use crate::terminal::{say, shown};
 
 const HELP: &str = "\
-Writes index.html (one page that needs nothing else), report.md, figures.csv, runs.csv and
-curves/*.svg. Tables give mean and standard deviation over seeds, and the interquartile mean with a
+Writes index.html (one page that needs nothing else), report.md, figures.csv, runs.csv, curves.json
+and every picture as SVG and PNG. Tables give mean and standard deviation over seeds, and the interquartile mean with a
 95 % interval by stratified bootstrap (Agarwal et al. 2021), beside the paper's figures where the
 task and the method are the paper's. Only runs that have come to their end count in a table.
 
@@ -47,7 +47,13 @@ pub(super) fn run(args: &ReportArgs) -> anyhow::Result<Outcome> {
         (None, _) => PathBuf::from("report"),
     };
     let tables = tables(&results);
-    let json = serde_json::json!({ "methods": results.methods, "tables": tables });
+    let (efficiency, judged) = (efficiency(&results), judge(&results));
+    let json = serde_json::json!({
+        "methods": results.methods,
+        "tables": tables,
+        "efficiency": efficiency,
+        "statements": judged,
+    });
     let names: Vec<_> = args.runs.iter().map(|path| path.display().to_string()).collect();
     let title = match results.tasks.as_slice() {
         [task] => format!("{task}: {}", results.methods.join(", ")),
@@ -61,6 +67,8 @@ pub(super) fn run(args: &ReportArgs) -> anyhow::Result<Outcome> {
         curves: curves(&results)?,
         results,
         tables,
+        efficiency,
+        judged,
     };
     report.write(&output).with_context(|| format!("no report in {}", output.display()))?;
     if args.json {

@@ -28,6 +28,15 @@ fn a_sweep_is_reported_with_what_was_run_and_what_was_not() {
     assert_eq!(cells[0]["summary"]["count"], 2);
     assert!(cells[1]["summary"].is_null());
     assert_eq!(cells[1]["paper"], serde_json::json!([-15.56, 1.47]));
+    // Two seeds that ended before they learnt anything: told, and nothing made of it.
+    let efficiency = &json["efficiency"][0];
+    assert_eq!(efficiency["threshold"], "return ≥ -10");
+    assert_eq!(efficiency["cells"][0]["steps"].as_array().unwrap().len(), 2);
+    let verdicts = json["statements"].as_array().unwrap().iter();
+    let verdicts: Vec<_> =
+        verdicts.map(|it| it["findings"][0]["verdict"].as_str().unwrap()).collect();
+    assert!(verdicts.contains(&"cannot_hold") && verdicts.contains(&"not_run"), "{verdicts:?}");
+    assert!(!verdicts.contains(&"held"), "{verdicts:?}");
 
     let read = |name: &str| fs::read_to_string(place.path(&format!("two/report/{name}"))).unwrap();
     let page = read("index.html");
@@ -35,8 +44,16 @@ fn a_sweep_is_reported_with_what_was_run_and_what_was_not() {
         assert!(page.contains(text), "{text} is not on the page");
     }
     assert!(!page.contains("http://") || !page.contains("src="), "the page needs nothing else");
+    for heading in ["What was run", "Sample efficiency", "What held of the paper"] {
+        assert!(page.contains(heading), "{heading} is not on the page");
+    }
     assert!(read("report.md").contains("| reacher-v1 |"));
     assert!(read("curves/reacher-v1-evaluation-return.svg").starts_with("<svg"));
+    let png = fs::read(place.path("two/report/curves/reacher-v1-evaluation-return.png")).unwrap();
+    assert_eq!(&png[1..4], b"PNG");
+    let curves: serde_json::Value = serde_json::from_str(&read("curves.json")).unwrap();
+    assert_eq!(curves["runs"].as_array().unwrap().len(), 2);
+    assert!(!curves["runs"][0]["return_mean"].as_array().unwrap().is_empty());
     // One line an evaluation of each seed, and a head.
     assert!(read("runs.csv").lines().count() > 2);
     assert!(read("figures.csv").contains("Average return,reacher-v1,NDP,0,,,,,,-15.56,1.47"));
