@@ -56,6 +56,16 @@ pub struct Evaluator {
     acting: Acting,
     faults: Faults,
     envs: usize,
+    trace: Option<Trace>,
+}
+
+/// What an evaluator of one environment notes of an episode, step by step.
+#[derive(Debug, Clone, PartialEq, Default)]
+pub struct Trace {
+    /// The policy's actions, in [-1, 1], (T, A).
+    pub u: Vec<f32>,
+    /// (T,).
+    pub rewards: Vec<f64>,
 }
 
 /// What accumulates over one wave of episodes.
@@ -85,7 +95,35 @@ impl Evaluator {
         let policy = Policy::new(config, environments.spec())?;
         // The repeats of an episode have a limit of their own.
         let faults = Faults::new(envs, u32::MAX);
-        Ok(Self { environments, acting: Acting::new(policy, envs), faults, envs })
+        Ok(Self { environments, acting: Acting::new(policy, envs), faults, envs, trace: None })
+    }
+
+    /// One on a single environment, which notes each step of an episode.
+    ///
+    /// The network still sees as many rows as in an evaluation: the product of a single row is
+    /// rounded differently, and a bounce of a ball makes much of the last bit.
+    ///
+    /// # Errors
+    /// As [`Evaluator::new`].
+    pub fn tracing(
+        config: &ExperimentConfig,
+        environment: PythonEnvironments,
+    ) -> Result<Self, PolicyError> {
+        let rows = config.evaluation.episodes.clamp(1, ENVIRONMENTS_MAX);
+        let evaluator = Self::new(config, environment, rows)?;
+        let (faults, trace) = (Faults::new(1, u32::MAX), Some(Trace::default()));
+        Ok(Self { envs: 1, faults, trace, ..evaluator })
+    }
+
+    /// The steps of the last episode; empty of an evaluator that notes none.
+    pub fn take_trace(&mut self) -> Trace {
+        self.trace.as_mut().map(std::mem::take).unwrap_or_default()
+    }
+
+    /// Its environments.
+    #[must_use]
+    pub fn environments(&self) -> &PythonEnvironments {
+        &self.environments
     }
 
     /// The policy's architecture.
@@ -137,7 +175,9 @@ impl Evaluator {
         &mut self,
         Episodes { count, first_seed, stop }: Episodes<'_>,
     ) -> Result<Option<Wave>, RolloutError> {
-        let dims = self.acting.policy.layout().action_len;
+        let layout = self.acting.policy.layout();
+        let dims = layout.action_len;
+        let actions_len = self.envs * layout.segment_steps * dims;
         let mut wave = Wave {
             returns: vec![0.0; self.envs],
             success: vec![SUCCESS_NOT_REPORTED; self.envs],
@@ -149,6 +189,7 @@ impl Evaluator {
             jumps: vec![0.0; self.envs],
             jump_count: vec![0; self.envs],
         };
+        drop(self.take_trace());
         let all = vec![true; self.envs];
         self.environments.reset(&all, &wave.seeds)?;
         self.faults.look_at_reset(&mut self.environments, &all)?;
@@ -160,7 +201,7 @@ impl Evaluator {
             self.acting.observe(&self.environments);
             self.acting.run_network();
             self.acting.decode();
-            self.environments.step_segment(self.acting.actions())?;
+            self.environments.step_segment(&self.acting.actions()[..actions_len])?;
             let failed = self.faults.look(&mut self.environments)?;
             for env in 0..self.envs {
                 if wave.running[env] && !self.faults.failed()[env] {
@@ -193,6 +234,7 @@ impl Evaluator {
             (wave.returns[env], wave.steps[env]) = (0.0, 0);
             (wave.jumps[env], wave.jump_count[env]) = (0.0, 0);
             wave.last_u[env * dims..(env + 1) * dims].fill(f32::NAN);
+            drop(self.take_trace());
         }
         self.environments.reset(&mask, &wave.seeds)?;
         Ok(self.faults.look_at_reset(&mut self.environments, &mask)?)
@@ -203,9 +245,13 @@ impl Evaluator {
         let layout = self.acting.policy.layout();
         let (k_max, dims) = (layout.segment_steps, layout.action_len);
         let steps = self.environments.steps()[env] as usize;
-        wave.returns[env] +=
-            self.environments.rewards()[env * k_max..][..steps].iter().sum::<f64>();
+        let rewards = &self.environments.rewards()[env * k_max..][..steps];
+        wave.returns[env] += rewards.iter().sum::<f64>();
         let u = &self.acting.u[env * k_max * dims..][..steps * dims];
+        if let Some(trace) = &mut self.trace {
+            trace.u.extend(u);
+            trace.rewards.extend(rewards);
+        }
         let last = &mut wave.last_u[env * dims..(env + 1) * dims];
         for step in u.chunks_exact(dims) {
             for (u, last) in step.iter().zip(last.iter_mut()) {

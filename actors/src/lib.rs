@@ -16,6 +16,8 @@ mod hindsight;
 #[cfg(feature = "python")]
 pub mod python_env;
 #[cfg(feature = "python")]
+pub mod recording;
+#[cfg(feature = "python")]
 pub mod rollout;
 #[cfg(feature = "python")]
 pub mod watchdog;

@@ -136,6 +136,11 @@ pub enum Report {
         /// What failed.
         reason: String,
     },
+    /// The observer has written so many episodes down.
+    Observed {
+        /// Of those asked for.
+        episodes: u64,
+    },
     /// Environments failed and were made again.
     EnvFailures {
         /// How many times since the last such report.

@@ -13,6 +13,7 @@ mod doctor;
 pub mod failure;
 pub mod journal;
 pub mod launch;
+pub mod motion;
 pub mod plots;
 pub mod project;
 #[cfg(feature = "python")]

@@ -13,6 +13,8 @@ import math
 import sys
 import traceback
 from collections import deque
+from collections.abc import Mapping
+from types import MappingProxyType
 
 import gymnasium
 import numpy as np
@@ -121,8 +123,8 @@ class GymnasiumSegmentEnv(SegmentEnv):
                 f"{name} and registers no environment of that name ({error})"
             ) from None
 
-    def _make(self) -> gymnasium.Env:
-        env = gymnasium.make(self._registered, disable_env_checker=True)
+    def _make(self, options: Mapping[str, object] = MappingProxyType({})) -> gymnasium.Env:
+        env = gymnasium.make(self._registered, disable_env_checker=True, **options)
         observation, action = env.observation_space, env.action_space
         self._observation_space = observation
         if isinstance(observation, spaces.Dict | spaces.Tuple) and observation.is_np_flattenable:

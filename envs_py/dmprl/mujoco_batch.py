@@ -59,6 +59,8 @@ class MujocoTask(ABC):
     """Names of the MjData fields that :meth:`observe` reads."""
     camera: ClassVar[Mapping[str, Any]] = {}
     """Settings of MuJoCo's free camera for a picture of the task."""
+    goal_in_pictures: ClassVar[str] = ""
+    """What a picture shows the goal as; empty if it does not, or nobody has said."""
 
     def __init__(self, env_count: int) -> None:
         self.env_count = env_count

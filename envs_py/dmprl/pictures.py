@@ -86,6 +86,20 @@ class PictureMaker:
         self._gl.free()
 
 
+def name_opengl() -> None:
+    """Lets Gymnasium's own pictures take what works: they obey ``MUJOCO_GL``, which it sets."""
+    if os.environ.get("MUJOCO_GL"):
+        return
+    for name in OFFSCREEN:
+        try:
+            importlib.import_module(f"mujoco.{name}").GLContext(8, 8).free()
+        # As below. Without any, whoever draws says so; not everybody draws with OpenGL.
+        except Exception:
+            continue
+        os.environ["MUJOCO_GL"] = name
+        return
+
+
 def _context(width: int, height: int) -> Any:
     """OpenGL by what ``MUJOCO_GL`` names, or by the first that works."""
     asked = os.environ.get("MUJOCO_GL", "").lower()

@@ -216,8 +216,7 @@ def make(task_id: str, env_count: int, segment_steps: int) -> SegmentEnv:
     """
     if env_count < 1 or segment_steps < 1:
         raise ValueError(f"{env_count} environments, {segment_steps} steps: both must be 1 or more")
-    module_name, _, name = task_id.rpartition(":")
-    candidate = getattr(_import(task_id, module_name), name, None) if module_name else None
+    candidate = named_object(task_id)
     if isinstance(candidate, type) and issubclass(candidate, SegmentEnv):
         return candidate(env_count, segment_steps)
     batched = sys.modules.get("dmprl.mujoco_batch")  # imported by whoever subclasses its task
@@ -234,6 +233,12 @@ def make(task_id: str, env_count: int, segment_steps: int) -> SegmentEnv:
     from dmprl.gymnasium_env import GymnasiumSegmentEnv  # a SegmentEnv may do without Gymnasium
 
     return GymnasiumSegmentEnv(task_id, env_count, segment_steps, candidate)
+
+
+def named_object(task_id: str) -> object:
+    """What ``module:name`` names in that module; None without a module, or if it has no such."""
+    module_name, _, name = task_id.rpartition(":")
+    return getattr(_import(task_id, module_name), name, None) if module_name else None
 
 
 def _import(task_id: str, module_name: str) -> ModuleType:

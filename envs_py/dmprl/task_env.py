@@ -12,6 +12,7 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
+from dmprl.mujoco_batch import MujocoTask
 from dmprl.segment_env import SUCCESS_NOT_REPORTED, SegmentBuffers, SegmentEnvError
 from dmprl.tasks import make_task
 
@@ -31,21 +32,30 @@ class TaskEnv(gymnasium.Env[NDArray[np.float64], NDArray[np.float32]]):
     }
 
     def __init__(
-        self, task_id: str, render_mode: str | None = None, width: int = 480, height: int = 480
+        self,
+        task_id: str,
+        render_mode: str | None = None,
+        width: int = 480,
+        height: int = 480,
+        task: Callable[[int], MujocoTask] | None = None,
     ) -> None:
+        """``task`` makes a task that is not one of ours, for so many environments."""
         if render_mode not in (None, *self.metadata["render_modes"]):
             modes = ", ".join(self.metadata["render_modes"])
             raise ValueError(f"{task_id}: render_mode {render_mode!r}; here there are {modes}")
-        task = make_task(task_id, 1)
-        if task is None:
+        made = make_task(task_id, 1) if task is None else task(1)
+        if made is None:
             raise ValueError(f"{task_id} is not a task of dmprl; `dmprl tasks` lists them")
-        self.task = task
-        self._batch = task.batch(1, None)
+        self.task = made
+        self._batch = made.batch(1, None)
+        batch = self._batch.batch
+        # (nq,) and (nv,) of :attr:`task`'s model; they change with every step.
+        self.positions_and_velocities = batch.bind("qpos")[0], batch.bind("qvel")[0]
         spec = self._batch.spec()
         self.dt = spec["control_dt_s"]
         self.metadata = {**self.metadata, "render_fps": round(1.0 / self.dt)}
         self.observation_space = spaces.Box(-np.inf, np.inf, (spec["observation_len"],), np.float64)
-        self.action_space = spaces.Box(task.action_low, task.action_high, dtype=np.float32)
+        self.action_space = spaces.Box(made.action_low, made.action_high, dtype=np.float32)
         self._out = SegmentBuffers(1, 1, spec["observation_len"], spec["action_len"])
         self.render_mode = render_mode
         self._size = (width, height)

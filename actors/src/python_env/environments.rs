@@ -84,18 +84,27 @@ impl PythonEnvironments {
         env_count: usize,
         segment_steps: usize,
     ) -> Result<Self, PythonError> {
+        Self::start_with(env_count, segment_steps, |py| {
+            let module = py.import("dmprl.segment_env")?;
+            module.getattr("make")?.call1((task_id, env_count, segment_steps))
+        })
+    }
+
+    /// The environments that `make` makes.
+    pub(super) fn start_with(
+        env_count: usize,
+        segment_steps: usize,
+        make: impl for<'py> FnOnce(Python<'py>) -> PyResult<Bound<'py, PyAny>>,
+    ) -> Result<Self, PythonError> {
         Python::attach(|py| {
             let exception = |error: PyErr| PythonError::exception(py, &error);
-            let module = py.import("dmprl.segment_env").map_err(exception)?;
-            let env = module
-                .getattr("make")
-                .and_then(|make| make.call1((task_id, env_count, segment_steps)))
-                .map_err(exception)?;
+            let env = make(py).map_err(exception)?;
             let spec = env.call_method0("spec").and_then(|s| read_spec(&s)).map_err(exception)?;
             spec.check()?;
             let (observation_len, action_len) = (spec.observation_len, spec.action_len);
-            let buffers = module
-                .getattr("SegmentBuffers")
+            let buffers = py
+                .import("dmprl.segment_env")
+                .and_then(|module| module.getattr("SegmentBuffers"))
                 .and_then(|new| new.call1((env_count, segment_steps, observation_len, action_len)))
                 .map_err(exception)?;
             Self::connect(&env, &buffers, (env_count, segment_steps), spec)

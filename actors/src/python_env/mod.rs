@@ -10,11 +10,13 @@ mod environments;
 mod error;
 mod goals;
 mod interpreter;
+mod recording;
 
 pub use environments::{PythonEnvironments, SUCCESS_NO, SUCCESS_NOT_REPORTED, SUCCESS_YES};
 pub use error::PythonError;
 pub use goals::{Goals, Relabelling};
 pub use interpreter::{Interpreter, InterpreterOptions, loaded_python_version};
+pub use recording::{JointKind, Joints, WrittenDown};
 
 /// The CPython installation that this program was linked against, as its build found it.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]

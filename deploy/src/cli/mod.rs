@@ -25,7 +25,7 @@ use dmprl_shared::config::ExperimentConfig;
 
 use crate::bench::{TransportWorkerArgs, transport_worker};
 use crate::failure::{Outcome, exit_code, render, wrong_use};
-use crate::roles::{self, ActorArgs, EvaluatorArgs, LearnerArgs};
+use crate::roles::{self, ActorArgs, EvaluatorArgs, LearnerArgs, ObserverArgs};
 use crate::terminal::say;
 
 const EXAMPLES: &str = "\
@@ -45,6 +45,7 @@ ROLES (train starts them; each has --help)
   learner    replays, updates, publishes policies, writes checkpoints
   actor      steps environments and sends segments
   evaluator  evaluates saved policies without noise
+  observer   writes down, step by step, what a saved policy does
 
 ";
 
@@ -87,6 +88,9 @@ enum Command {
     /// The process that evaluates; started by train and eval.
     #[command(hide = true)]
     Evaluator(EvaluatorArgs),
+    /// The process that writes down what a policy does; started by report.
+    #[command(hide = true)]
+    Observer(ObserverArgs),
     /// A process that only sends segments; started by bench transport.
     #[command(hide = true)]
     TransportWorker(TransportWorkerArgs),
@@ -133,6 +137,7 @@ fn run(command: Command) -> anyhow::Result<Outcome> {
         Command::Learner(args) => roles::learner(&args).map(|()| Outcome::Done),
         Command::Actor(args) => roles::actor(&args),
         Command::Evaluator(args) => roles::evaluator(&args).map(|()| Outcome::Done),
+        Command::Observer(args) => roles::observer(&args).map(|()| Outcome::Done),
         Command::TransportWorker(args) => transport_worker(&args).map(|()| Outcome::Done),
     }
 }

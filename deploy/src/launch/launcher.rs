@@ -9,6 +9,7 @@ use std::time::SystemTime;
 
 use anyhow::Context;
 
+use crate::roles::ObserverArgs;
 use crate::run_directory::{RunDirectory, rfc3339};
 
 /// Incarnations that one session of the run has for each worker; a segment's sender is thus
@@ -60,6 +61,22 @@ pub struct Launcher {
 }
 
 impl Launcher {
+    /// For a single child of a run that nobody trains.
+    #[must_use]
+    pub fn outside_training(program: PathBuf, run: &RunDirectory, venv: Option<PathBuf>) -> Self {
+        Self {
+            program,
+            run: run.clone(),
+            venv,
+            domain: None,
+            resume: false,
+            init_from: None,
+            learner_restarts: 0,
+            sessions_before: 0,
+            journal: None,
+        }
+    }
+
     /// The number of a worker's start, of this session's the `start`th from 0: no start of the
     /// run has had it before, and all of them rise.
     ///
@@ -116,6 +133,27 @@ impl Launcher {
             command.arg("--venv").arg(venv);
         }
         self.streams(command, "eval")
+    }
+
+    /// The command of an observer, which leaves the run as it is too.
+    ///
+    /// # Errors
+    /// The log cannot be opened.
+    pub fn observe(&self, args: &ObserverArgs) -> anyhow::Result<Command> {
+        let mut command = Command::new(&self.program);
+        command.arg("observer").arg("--run").arg(&args.run);
+        for (flag, number) in [
+            ("--policy", args.policy),
+            ("--first-seed", args.first_seed),
+            ("--episodes", args.episodes),
+        ] {
+            command.args([flag, &number.to_string()]);
+        }
+        command.arg("--output").arg(&args.output);
+        if let Some(venv) = &self.venv {
+            command.arg("--venv").arg(venv);
+        }
+        self.streams(command, "observer")
     }
 
     fn learner(&self, command: &mut Command) {

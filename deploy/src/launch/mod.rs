@@ -16,6 +16,7 @@
 //! interrupts and the next deadline; it never waits anywhere else.
 
 mod child;
+mod conversation;
 mod deadlines;
 mod deaths;
 mod domain;
@@ -29,6 +30,7 @@ mod joining;
 mod launcher;
 mod learner_restarts;
 mod limits;
+mod observe;
 mod reports;
 mod session;
 mod signals;
@@ -40,6 +42,7 @@ pub(crate) use domain::{Place, create as create_domain, token as domain_token};
 pub use evaluate::{EvaluationPlan, evaluate};
 pub use launcher::{Launcher, Process};
 pub use limits::TimeLimits;
+pub use observe::{ObservationPlan, observe};
 pub use session::{RESUME_WAIT, SessionPlan, Trial, session, title};
 pub use signals::interrupts;
 pub(crate) use signals::is_ignored;

@@ -73,7 +73,8 @@ impl Supervisor {
                     self.worked(process);
                 }
             }
-            Report::Alive { .. } => {}
+            // Observing is none of a training's children's business.
+            Report::Alive { .. } | Report::Observed { .. } => {}
             Report::Left => self.on_left(process),
             Report::EnvHung { message } => self.on_env_hung(process, &message),
             Report::Checkpoint { name, env_steps } => {

@@ -31,6 +31,13 @@ EXAMPLES
   dmprl evaluator --run runs/mine
   dmprl evaluator --run runs/mine --print-only --episodes 100   # what `eval` starts";
 
+const OBSERVER_HELP: &str = "\
+Speaks JSON lines with whoever started it on standard input and output; logs to standard error.
+Writes one JSON object a line: the robot, then each episode. Ends when its standard input ends.
+
+EXAMPLES
+  dmprl observer --run runs/mine --policy 4120 --first-seed 1000 --episodes 20 --output e.jsonl";
+
 /// Arguments of `dmprl learner`.
 #[derive(Debug, Clone, PartialEq, Eq, Args)]
 #[command(after_help = LEARNER_HELP)]
@@ -99,6 +106,30 @@ pub struct EvaluatorArgs {
     /// Episodes of each evaluation instead of `evaluation.episodes`.
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u64).range(1..=1_000_000))]
     pub episodes: Option<u64>,
+    /// The Python virtual environment.
+    #[arg(long, value_name = "DIR")]
+    pub venv: Option<PathBuf>,
+}
+
+/// Arguments of `dmprl observer`.
+#[derive(Debug, Clone, PartialEq, Eq, Args)]
+#[command(after_help = OBSERVER_HELP)]
+pub struct ObserverArgs {
+    /// The run directory.
+    #[arg(long, value_name = "DIR")]
+    pub run: PathBuf,
+    /// Version of the saved policy.
+    #[arg(long, value_name = "VERSION")]
+    pub policy: u64,
+    /// Episode i is reset with seed first-seed + i.
+    #[arg(long, value_name = "S")]
+    pub first_seed: u64,
+    /// Episodes.
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u64).range(1..=1_000_000))]
+    pub episodes: u64,
+    /// The file to write.
+    #[arg(long, value_name = "FILE")]
+    pub output: PathBuf,
     /// The Python virtual environment.
     #[arg(long, value_name = "DIR")]
     pub venv: Option<PathBuf>,

@@ -38,7 +38,7 @@ pub fn make(
 
 /// Ends this process when a call into the environments does not return: nothing but another
 /// process could help, and the supervisor starts one.
-fn watch(
+pub fn watch(
     environments: &PythonEnvironments,
     config: &ExperimentConfig,
     control: &ControlPipe,

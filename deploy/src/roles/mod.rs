@@ -19,6 +19,8 @@ mod heartbeat;
 mod joined;
 mod learner;
 #[cfg(feature = "python")]
+mod observer;
+#[cfg(feature = "python")]
 mod one_process;
 mod recorder;
 mod setup;
@@ -27,7 +29,7 @@ use crate::failure::Outcome;
 
 use hardening::harden;
 
-pub use arguments::{ActorArgs, EvaluatorArgs, LearnerArgs};
+pub use arguments::{ActorArgs, EvaluatorArgs, LearnerArgs, ObserverArgs};
 pub use control_pipe::{ControlPipe, ORPHAN_LIMIT, ORPHANED_LEARNER_LIMIT};
 pub(crate) use delivery::{Delivery, Stopped, attach_within};
 pub(crate) use learner::plan;
@@ -73,6 +75,16 @@ pub fn evaluator(args: &EvaluatorArgs) -> anyhow::Result<()> {
     evaluator::run(args, &ControlPipe::open(ORPHAN_LIMIT)?)
 }
 
+/// Rolls a saved policy out and writes down what the robot does.
+///
+/// # Errors
+/// Whatever keeps it from going on.
+#[cfg(feature = "python")]
+pub fn observer(args: &ObserverArgs) -> anyhow::Result<()> {
+    harden()?;
+    observer::run(args, &ControlPipe::open(ORPHAN_LIMIT)?)
+}
+
 #[cfg(not(feature = "python"))]
 const WITHOUT_PYTHON: &str = "this program was built without the feature `python`";
 
@@ -91,5 +103,14 @@ pub fn actor(_args: &ActorArgs) -> anyhow::Result<Outcome> {
 /// Always.
 #[cfg(not(feature = "python"))]
 pub fn evaluator(_args: &EvaluatorArgs) -> anyhow::Result<()> {
+    anyhow::bail!("{WITHOUT_PYTHON}")
+}
+
+/// Stands in for the observer in a learner-only build.
+///
+/// # Errors
+/// Always.
+#[cfg(not(feature = "python"))]
+pub fn observer(_args: &ObserverArgs) -> anyhow::Result<()> {
     anyhow::bail!("{WITHOUT_PYTHON}")
 }

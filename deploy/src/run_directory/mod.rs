@@ -6,6 +6,7 @@
 //! evaluations.jsonl  one row an evaluation                 policies/V.safetensors
 //! checkpoints/       written by the learner                logs/PROCESS.log
 //! videos/  plots/                                          lock                held while alive
+//! motion.json        how the latest policy moves, once somebody has asked
 //! segments.log       at delivery level `log`: what came since the last checkpoint
 //! ```
 //! The supervisor makes it; learner and evaluator write into it; `eval`, `resume` read it.
@@ -204,6 +205,20 @@ impl RunDirectory {
     #[must_use]
     pub fn evaluations_path(&self) -> PathBuf {
         self.path.join("evaluations.jsonl")
+    }
+
+    /// How the latest policy moves; read and written by [`crate::motion`].
+    #[must_use]
+    pub fn motion_path(&self) -> PathBuf {
+        self.path.join("motion.json")
+    }
+
+    /// Replaces `motion.json`.
+    ///
+    /// # Errors
+    /// What the file system refuses.
+    pub fn write_motion(&self, text: &str) -> anyhow::Result<()> {
+        atomic::replace(&self.motion_path(), text.as_bytes())
     }
 
     /// Segments since the last checkpoint, at delivery level `log`; written by the learner.

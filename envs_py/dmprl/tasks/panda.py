@@ -47,6 +47,7 @@ class PandaReachJoints(StepwiseTask):
         "azimuth": 137.0,
         "lookat": (-0.28, 0.0, 0.22),
     }
+    goal_in_pictures = "green ball"
     action_len = JOINTS
 
     def __init__(self, env_count: int) -> None:

@@ -40,6 +40,7 @@ class Pusher(MujocoTask):
     episode_steps = 100
     recorded: tuple[str, ...] = ("qpos", "qvel", "xpos")
     camera: ClassVar[Mapping[str, Any]] = {"distance": 3.0, "elevation": -30.0, "azimuth": 130.0}
+    goal_in_pictures = "red disc"
     model_file = "pusher_v5.xml"
 
     def load_model(self) -> mujoco.MjModel:  # noqa: D102 - inherited

@@ -30,6 +30,7 @@ class Reacher(MujocoTask):
     episode_steps = 50
     recorded = ("qpos", "qvel", "xpos")
     camera: ClassVar[Mapping[str, Any]] = {"distance": 1.0, "elevation": -60.0, "azimuth": 90.0}
+    goal_in_pictures = "red ball"
     distance_dims = 2
 
     def load_model(self) -> mujoco.MjModel:  # noqa: D102 - inherited

@@ -38,6 +38,7 @@ class Thrower(MujocoTask):
         "azimuth": 150.0,
         "lookat": (0.3, 0.0, -0.1),
     }
+    goal_in_pictures = "red box"
 
     def __init__(self, env_count: int) -> None:
         super().__init__(env_count)

@@ -25,6 +25,7 @@ mod joining;
 mod learning;
 mod leftovers;
 mod machine;
+mod motion;
 mod refusals;
 mod report;
 mod results;

@@ -1,0 +1,90 @@
+//! Stage 8 of 8, beside evaluation: noise-free episodes, one at a time, written down step by step.
+
+use std::sync::atomic::AtomicBool;
+
+use dmprl_shared::config::ExperimentConfig;
+use dmprl_shared::policy::Policy;
+
+use crate::evaluate::{Episodes, Evaluator, Trace};
+use crate::python_env::{Joints, PythonEnvironments, WrittenDown};
+use crate::rollout::RolloutError;
+
+/// One episode of T steps.
+#[derive(Debug, Clone, PartialEq)]
+pub struct EpisodeRecord {
+    /// What it was reset with.
+    pub seed: u64,
+    /// Sum of its rewards, as an evaluation has it.
+    pub return_: f64,
+    /// Whether its last step reported success; none if the task reports none.
+    pub success: Option<bool>,
+    /// Mean |u_t - u_{t-1}| over steps and action dimensions.
+    pub smoothness: f64,
+    /// Actions and rewards.
+    pub trace: Trace,
+    /// Joints, and success after each step.
+    pub written_down: WrittenDown,
+}
+
+/// Records episodes of policies of one architecture.
+pub struct Recorder {
+    evaluator: Evaluator,
+    joints: Joints,
+}
+
+impl Recorder {
+    /// On the environment of [`PythonEnvironments::start_recording`].
+    ///
+    /// # Errors
+    /// If the policy does not fit it, or it cannot tell its joints.
+    pub fn new(
+        config: &ExperimentConfig,
+        environment: PythonEnvironments,
+    ) -> Result<Self, RolloutError> {
+        let joints = environment.joints()?;
+        Ok(Self { evaluator: Evaluator::tracing(config, environment)?, joints })
+    }
+
+    /// The robot's.
+    #[must_use]
+    pub fn joints(&self) -> &Joints {
+        &self.joints
+    }
+
+    /// The policy's architecture.
+    #[must_use]
+    pub fn policy(&self) -> &Policy {
+        self.evaluator.policy()
+    }
+
+    /// One line about each failure of the environment since the last call.
+    pub fn take_failures(&mut self) -> Vec<String> {
+        self.evaluator.take_failures()
+    }
+
+    /// Runs the episode of a seed; none if a stop was asked for.
+    ///
+    /// # Errors
+    /// As [`Evaluator::evaluate`].
+    pub fn record(
+        &mut self,
+        parameters: &[f32],
+        seed: u64,
+        stop: &AtomicBool,
+    ) -> Result<Option<EpisodeRecord>, RolloutError> {
+        let episode = Episodes { count: 1, first_seed: seed, stop };
+        let Some(evaluation) = self.evaluator.evaluate(parameters, episode)? else {
+            return Ok(None);
+        };
+        let trace = self.evaluator.take_trace();
+        let written_down = self.evaluator.environments().written_down(trace.rewards.len())?;
+        Ok(Some(EpisodeRecord {
+            seed,
+            return_: evaluation.return_mean(),
+            success: evaluation.success_rate.map(|rate| rate > 0.0),
+            smoothness: evaluation.smoothness,
+            trace,
+            written_down,
+        }))
+    }
+}

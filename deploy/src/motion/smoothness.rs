@@ -1,0 +1,160 @@
+//! How smooth a motion is: three measures, each a pure function of an episode.
+
+use rustfft::FftPlanner;
+use rustfft::num_complex::Complex64;
+
+/// Padding of the spectrum: 2^4 times the profile's length, rounded up to a power of two.
+const PAD_LEVEL: u32 = 4;
+/// Frequencies above are not of a movement [Hz].
+const CUTOFF_HZ: f64 = 10.0;
+/// Share of the spectrum's maximum below which its end is cut off.
+const AMPLITUDE_THRESHOLD: f64 = 0.05;
+
+/// A mean under way.
+#[derive(Debug, Clone, Copy, Default, PartialEq)]
+pub struct Mean {
+    sum: f64,
+    count: u64,
+}
+
+impl Mean {
+    /// One more value.
+    pub fn add(&mut self, value: f64) {
+        self.sum += value;
+        self.count += 1;
+    }
+
+    /// The mean; none of nothing.
+    #[must_use]
+    pub fn value(self) -> Option<f64> {
+        (self.count > 0).then(|| self.sum / self.count as f64)
+    }
+}
+
+/// Adds |u_t - u_{t-1}| of each dimension to its mean.
+///
+/// - `u`: (T, A). `means`: (A,).
+pub fn add_action_changes(u: &[Vec<f32>], means: &mut [Mean]) {
+    for pair in u.windows(2) {
+        for ((before, after), mean) in pair[0].iter().zip(&pair[1]).zip(means.iter_mut()) {
+            mean.add(f64::from((after - before).abs()));
+        }
+    }
+}
+
+/// Adds the absolute jerk of each joint to its mean: the second difference of velocities at control
+/// rate, `(qd_{t+1} - 2 qd_t + qd_{t-1}) / dt²`, which needs no model and no filter.
+///
+/// - `velocities`: (T+1, J) [rad/s]. `dt`: [s]. `means`: (J,) [rad/s³].
+pub fn add_jerks(velocities: &[Vec<f64>], dt: f64, means: &mut [Mean]) {
+    for three in velocities.windows(3) {
+        for (joint, mean) in means.iter_mut().enumerate() {
+            let difference = three[2][joint] - 2.0 * three[1][joint] + three[0][joint];
+            mean.add((difference / (dt * dt)).abs());
+        }
+    }
+}
+
+/// The spectral arc length of a speed profile, in which -1.6 is smooth and less is less so
+/// (Balasubramanian et al. 2015, "On the analysis of movement smoothness", with its parameters).
+///
+/// - `speed`: (T,), not negative. `rate_hz`: samples a second.
+/// - Returns none of a profile that does not move, or is too short to have a spectrum.
+///
+/// Differs from the paper: where half the rate is below 10 Hz, that is the cutoff.
+#[must_use]
+pub fn sparc(speed: &[f64], rate_hz: f64) -> Option<f64> {
+    if speed.len() < 2 || rate_hz.is_nan() || rate_hz <= 0.0 {
+        return None;
+    }
+    let len = speed.len().next_power_of_two() << PAD_LEVEL;
+    let mut spectrum = vec![Complex64::default(); len];
+    for (entry, value) in spectrum.iter_mut().zip(speed) {
+        entry.re = *value;
+    }
+    FftPlanner::new().plan_fft_forward(len).process(&mut spectrum);
+    let magnitudes: Vec<f64> = spectrum.iter().map(|entry| entry.norm()).collect();
+    let largest = magnitudes.iter().copied().fold(0.0, f64::max);
+    if largest.is_nan() || largest <= 0.0 {
+        return None;
+    }
+    let (step, cutoff) = (rate_hz / len as f64, CUTOFF_HZ.min(rate_hz / 2.0));
+    let below = (0..len).take_while(|&index| index as f64 * step <= cutoff).count();
+    let heights: Vec<f64> = magnitudes[..below].iter().map(|value| value / largest).collect();
+    let is_high = |height: &f64| *height >= AMPLITUDE_THRESHOLD;
+    let (first, last) = (heights.iter().position(is_high)?, heights.iter().rposition(is_high)?);
+    let width = 1.0 / (last - first) as f64;
+    let arc = heights[first..=last].windows(2).map(|pair| width.hypot(pair[1] - pair[0]));
+    (last > first).then(|| -arc.sum::<f64>())
+}
+
+#[cfg(test)]
+mod tests {
+    use serde::Deserialize;
+
+    use super::*;
+
+    #[derive(Deserialize)]
+    struct Golden {
+        cases: Vec<Case>,
+    }
+
+    #[derive(Deserialize)]
+    struct Case {
+        rate_hz: f64,
+        speed: Vec<f64>,
+        sparc: f64,
+    }
+
+    /// tests/golden/sparc/make_golden.py
+    const GOLDEN: &str = include_str!("../../../tests/golden/sparc/golden.json");
+
+    #[test]
+    fn arc_lengths_are_those_of_the_authors_package() {
+        let golden: Golden = serde_json::from_str(GOLDEN).unwrap();
+        assert_eq!(golden.cases.len(), 27);
+        for Case { rate_hz, speed, sparc: expected } in golden.cases {
+            let got = sparc(&speed, rate_hz).unwrap();
+            assert!((got - expected).abs() < 1e-9, "{got}, expected {expected} of {speed:?}");
+        }
+    }
+
+    #[test]
+    fn what_does_not_move_has_no_arc_length() {
+        assert_eq!(sparc(&[0.0; 50], 50.0), None);
+        assert_eq!(sparc(&[1.0], 50.0), None);
+        assert_eq!(sparc(&[0.0, f64::NAN, 1.0], 50.0), None);
+        assert_eq!(sparc(&[0.0, 1.0, 0.0], 0.0), None);
+    }
+
+    #[test]
+    fn jerk_is_the_second_derivative_of_velocity() {
+        // qd = 3 t² and sin(2 t): jerk 6 everywhere, and the mean of |4 sin(2 t)|, which is 8 / π.
+        let dt = std::f64::consts::PI / 10_000.0;
+        let row = |step: u32| {
+            let time = f64::from(step) * dt;
+            vec![3.0 * time * time, (2.0 * time).sin()]
+        };
+        let velocities: Vec<_> = (0..=10_001).map(row).collect();
+        let mut means = [Mean::default(); 2];
+        add_jerks(&velocities, dt, &mut means);
+        let [parabola, sine] = means.map(|mean| mean.value().unwrap());
+        assert!((parabola - 6.0).abs() < 1e-6, "{parabola}");
+        assert!((sine - 8.0 / std::f64::consts::PI).abs() < 1e-4, "{sine}");
+    }
+
+    #[test]
+    fn two_states_have_no_jerk() {
+        let mut means = [Mean::default()];
+        add_jerks(&[vec![0.0], vec![1.0]], 0.1, &mut means);
+        assert_eq!(means[0].value(), None);
+    }
+
+    #[test]
+    fn changes_of_actions_are_counted_within_an_episode_only() {
+        let mut means = [Mean::default(); 2];
+        add_action_changes(&[vec![0.0, 1.0], vec![0.5, -1.0]], &mut means);
+        add_action_changes(&[vec![-1.0, 0.0], vec![-1.0, 0.0]], &mut means);
+        assert_eq!(means.map(|mean| mean.value().unwrap()), [0.25, 1.0]);
+    }
+}

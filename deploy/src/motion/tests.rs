@@ -1,0 +1,88 @@
+use super::*;
+
+fn joint(name: &str, kind: JointKind) -> Joint {
+    Joint { name: name.to_owned(), kind }
+}
+
+/// Velocities that rise by one more each step have a jerk of 1 / dt²; a slide's do not count.
+fn written(folder: &Path, robot: &Robot, lengths: &[usize]) -> PathBuf {
+    let mut lines = vec![serde_json::to_string(robot).unwrap()];
+    for (index, &steps) in lengths.iter().enumerate() {
+        let row = |step: usize| {
+            let joints = robot.joints.iter().map(|joint| match joint.kind {
+                JointKind::Hinge => (step * step) as f64 / 2.0,
+                JointKind::Slide => 1_000.0 * (step % 2) as f64,
+            });
+            joints.collect::<Vec<_>>()
+        };
+        let rows = if robot.joints.is_empty() { 0 } else { steps + 1 };
+        let episode = RecordedEpisode {
+            seed: 7 + index as u64,
+            return_: -(steps as f64),
+            success: None,
+            rewards: vec![-1.0; steps],
+            actions: (0..steps).map(|step| vec![(step % 2) as f32, 0.0]).collect(),
+            joint_positions: (0..rows).map(row).collect(),
+            joint_velocities: (0..rows).map(row).collect(),
+            success_by_step: Vec::new(),
+        };
+        lines.push(serde_json::to_string(&episode).unwrap());
+    }
+    let path = folder.join("episodes.jsonl");
+    std::fs::write(&path, lines.join("\n") + "\n").unwrap();
+    path
+}
+
+#[test]
+fn all_episodes_are_measured_and_the_first_is_kept() {
+    let folder = tempfile::tempdir().unwrap();
+    let joints = vec![joint("rail", JointKind::Slide), joint("elbow", JointKind::Hinge)];
+    let robot = Robot { joints, why_no_joints: String::new(), control_dt_s: 0.1 };
+    let motion = of_recorded(&written(folder.path(), &robot, &[20, 30]), (3, 500, 7)).unwrap();
+    assert_eq!(motion.returns, [-20.0, -30.0]);
+    assert_eq!((motion.episode.seed, motion.times().len()), (7, 21));
+    assert_eq!(motion.action_change_by_dimension, [Some(1.0), Some(0.0)]);
+    assert_eq!(motion.action_change, Some(0.5));
+    assert_eq!(motion.unit, "rad");
+    assert_eq!(motion.joint_jerk_by_joint[0], None);
+    assert!((motion.joint_jerk.unwrap() - 100.0).abs() < 1e-6, "{:?}", motion.joint_jerk);
+    assert!(motion.sparc_by_episode.iter().all(Option::is_some));
+    let json = serde_json::to_string(&motion).unwrap();
+    assert_eq!(serde_json::from_str::<Motion>(&json).unwrap(), motion);
+}
+
+#[test]
+fn a_robot_of_slides_is_measured_in_metres() {
+    let folder = tempfile::tempdir().unwrap();
+    let joints = vec![joint("rail", JointKind::Slide)];
+    let robot = Robot { joints, why_no_joints: String::new(), control_dt_s: 0.1 };
+    let motion = of_recorded(&written(folder.path(), &robot, &[20]), (3, 500, 7)).unwrap();
+    assert_eq!(motion.unit, "m");
+    assert!((motion.joint_jerk.unwrap() - 200_000.0).abs() < 1e-3, "{:?}", motion.joint_jerk);
+}
+
+#[test]
+fn without_joints_only_actions_are_measured() {
+    let folder = tempfile::tempdir().unwrap();
+    let why_no_joints = "it does not say".to_owned();
+    let robot = Robot { joints: Vec::new(), why_no_joints, control_dt_s: 0.0 };
+    let motion = of_recorded(&written(folder.path(), &robot, &[5]), (3, 500, 7)).unwrap();
+    assert_eq!((motion.joint_jerk, motion.sparc, motion.action_change), (None, None, Some(0.5)));
+    assert_eq!(motion.times(), [0.0, 1.0, 2.0, 3.0, 4.0, 5.0]);
+}
+
+#[test]
+fn an_episode_that_does_not_fit_its_robot_is_refused() {
+    let folder = tempfile::tempdir().unwrap();
+    let robot = |joints| Robot { joints, why_no_joints: String::new(), control_dt_s: 0.1 };
+    let none = written(folder.path(), &robot(Vec::new()), &[4]);
+    let text = std::fs::read_to_string(&none).unwrap();
+    let (_, episode) = text.split_once('\n').unwrap();
+    let head = serde_json::to_string(&robot(vec![joint("elbow", JointKind::Hinge)])).unwrap();
+    std::fs::write(&none, format!("{head}\n{episode}")).unwrap();
+    let error = of_recorded(&none, (3, 500, 7)).unwrap_err().to_string();
+    assert!(error.contains("0 positions, 0 velocities of 1 joints"), "{error}");
+    let torn = text.trim_end();
+    std::fs::write(&none, torn).unwrap();
+    assert!(of_recorded(&none, (3, 500, 7)).unwrap_err().to_string().contains("not whole"));
+}

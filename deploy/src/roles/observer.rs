@@ -1,0 +1,78 @@
+//! The observer process: rolls a saved policy out and writes down what the robot does.
+
+use std::fs::File;
+use std::io::{BufWriter, Write};
+
+use anyhow::Context;
+use dmprl_actors::python_env::{self, PythonEnvironments, SUCCESS_NOT_REPORTED, SUCCESS_YES};
+use dmprl_actors::recording::{EpisodeRecord, Recorder};
+use dmprl_learner::policy_file::{self, Match};
+use serde::Serialize;
+
+use super::setup::Setup;
+use super::{ControlPipe, ObserverArgs, environments};
+use crate::control::Report;
+use crate::motion::{Joint, JointKind, RecordedEpisode, Robot};
+
+/// Writes the episodes that its arguments name, and reports after each.
+pub fn run(args: &ObserverArgs, control: &ControlPipe) -> anyhow::Result<()> {
+    let setup = Setup::read(&args.run)?;
+    let interpreter = super::actor::interpreter(args.venv.as_deref(), &setup.config)?;
+    let (id, steps) = (&setup.config.task.id, setup.config.policy.decision_steps());
+    let environment = PythonEnvironments::start_recording(&interpreter, id, steps)?;
+    environments::watch(&environment, &setup.config, control)?;
+    let spec = environment.spec().clone();
+    let mut recorder = Recorder::new(&setup.config, environment)?;
+    let path = setup.run.policy_path(args.policy);
+    let snapshot = policy_file::load(&path, recorder.policy(), Match::Architecture)?;
+    let file = File::create(&args.output)
+        .with_context(|| format!("cannot write {}", args.output.display()))?;
+    let mut lines = BufWriter::new(file);
+    append(&mut lines, &robot(&recorder, spec.control_dt_s))?;
+    let dims = spec.action_len;
+    control.send(&Report::EnvironmentReady { spec })?;
+    let stop = control.stop_flag();
+    for index in 0..args.episodes {
+        let seed = args.first_seed + index;
+        let record = recorder.record(&snapshot.values, seed, &stop);
+        environments::tell(&recorder.take_failures(), control);
+        let Some(record) = record? else { return Ok(()) };
+        append(&mut lines, &episode(record, dims))?;
+        control.send(&Report::Observed { episodes: index + 1 })?;
+    }
+    Ok(())
+}
+
+/// Whole before the report: whoever reads it may end this process.
+fn append(lines: &mut BufWriter<File>, object: &impl Serialize) -> anyhow::Result<()> {
+    serde_json::to_writer(&mut *lines, object).context("cannot write an episode")?;
+    lines.write_all(b"\n").and_then(|()| lines.flush()).context("cannot write an episode")
+}
+
+fn robot(recorder: &Recorder, control_dt_s: f64) -> Robot {
+    let joints = recorder.joints();
+    let kind = |kind| match kind {
+        python_env::JointKind::Hinge => JointKind::Hinge,
+        python_env::JointKind::Slide => JointKind::Slide,
+    };
+    let of = |(name, of): &(String, _)| Joint { name: name.clone(), kind: kind(*of) };
+    Robot {
+        joints: joints.joints.iter().map(of).collect(),
+        why_no_joints: joints.why_none.clone(),
+        control_dt_s,
+    }
+}
+
+fn episode(record: EpisodeRecord, dims: usize) -> RecordedEpisode {
+    let success = |flag: &u8| (*flag != SUCCESS_NOT_REPORTED).then_some(*flag == SUCCESS_YES);
+    RecordedEpisode {
+        seed: record.seed,
+        return_: record.return_,
+        success: record.success,
+        rewards: record.trace.rewards,
+        actions: record.trace.u.chunks_exact(dims).map(<[f32]>::to_vec).collect(),
+        joint_positions: record.written_down.joint_positions,
+        joint_velocities: record.written_down.joint_velocities,
+        success_by_step: record.written_down.success.iter().map(success).collect(),
+    }
+}

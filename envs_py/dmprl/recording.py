@@ -1,0 +1,288 @@
+"""One environment that writes down what its robot does, at control rate.
+
+For ``dmprl record`` and the measurement of motion (``actors/src/python_env/recording.rs``). The
+episodes are those of an evaluation with the same seeds: the same actions, one step after the other.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NamedTuple, TypedDict
+
+import gymnasium
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+
+from dmprl.gymnasium_env import GymnasiumSegmentEnv, success_of
+from dmprl.mujoco_batch import MujocoTask, quieten_mujoco
+from dmprl.pictures import name_opengl
+from dmprl.robot_joints import Joints, robot_joints
+from dmprl.segment_env import EnvSpec, SegmentBuffers, SegmentEnv, named_object
+from dmprl.task_env import TaskEnv
+from dmprl.tasks import registered
+
+RENDER_MODE = "rgb_array"
+DRAWABLE = f"a Gymnasium environment that can be has the render mode {RENDER_MODE!r}"
+FRAME_RATE_MAX = 50.0
+"""Frames a second of an episode: a screen shows hardly more."""
+
+
+class NoPicturesError(RuntimeError):
+    """The environment cannot be drawn."""
+
+
+class Recording(TypedDict):
+    """An episode, T steps long. Rows of joints are those of :meth:`RecordingEnv.joints`."""
+
+    joint_positions: list[list[float]]
+    """(T+1, J) [rad or m]: before the first step, and after each; empty without joints."""
+    joint_velocities: list[list[float]]
+    """(T+1, J) [rad/s or m/s]."""
+    success: list[int]
+    """(T,): after each step, a value of ``SegmentBuffers.success``."""
+    frames: list[str]
+    """Files of pictures, if they were asked for, and"""
+    frame_steps: list[int]
+    """the number of steps done at each."""
+
+
+class State(NamedTuple):
+    """Where the state of a MuJoCo model lies; arrays that change with it."""
+
+    model: mujoco.MjModel
+    qpos: NDArray[np.float64]
+    qvel: NDArray[np.float64]
+
+
+class Log:
+    """What is written down of the episode that began with the last seeded reset."""
+
+    def __init__(self, pictures: Path | None) -> None:
+        self.joints: Joints | None = None
+        self.recording = nothing()
+        self._pictures = pictures
+        self._open = False
+        self._seed = 0
+
+    def begin(self, env: Watched, seed: int | None) -> None:
+        """An episode begins; one without a seed follows another on its own and is not asked for."""
+        self._open = seed is not None
+        if seed is not None:
+            self._seed = seed
+            self.recording = nothing()
+            self._note_state(env)
+            self._draw(env)
+
+    def step(self, env: Watched, info: dict[str, Any], ended: bool) -> None:
+        """A step has been done."""
+        if not self._open:
+            return
+        self.recording["success"].append(success_of(info))
+        self._note_state(env)
+        if ended or len(self.recording["success"]) % steps_a_frame(env) == 0:
+            self._draw(env)
+
+    def _draw(self, env: Watched) -> None:
+        if self._pictures is None:
+            return
+        step = len(self.recording["success"])
+        file = self._pictures / f"{self._seed}-{step:06}.png"
+        picture = env.render()
+        if not isinstance(picture, np.ndarray) or picture.ndim != 3:
+            raise NoPicturesError(f"{env.spec.id}: render() returned {type(picture).__name__}")
+        # Small enough at once: it is read once and thrown away.
+        Image.fromarray(picture[..., :3].astype(np.uint8)).save(file, compress_level=1)
+        self.recording["frames"].append(str(file))
+        self.recording["frame_steps"].append(step)
+
+    def _note_state(self, env: Watched) -> None:
+        state = env.state()
+        if state is None or self.joints is None:
+            return
+        self.recording["joint_positions"].append(state.qpos[self.joints.qpos].tolist())
+        self.recording["joint_velocities"].append(state.qvel[self.joints.qvel].tolist())
+
+
+class Watched(gymnasium.Wrapper):
+    """Writes down every step."""
+
+    def __init__(self, env: gymnasium.Env, log: Log) -> None:
+        super().__init__(env)
+        self._log = log
+
+    def state(self) -> State | None:
+        """The simulation's state; None if it is not MuJoCo's."""
+        env = self.unwrapped
+        if isinstance(env, TaskEnv):
+            return State(env.task.model, *env.positions_and_velocities)
+        model, data = getattr(env, "model", None), getattr(env, "data", None)
+        if isinstance(model, mujoco.MjModel) and isinstance(data, mujoco.MjData):
+            return State(model, data.qpos, data.qvel)
+        return None
+
+    def reset(  # noqa: D102 - inherited
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Any, dict[str, Any]]:
+        result = self.env.reset(seed=seed, options=options)
+        self._log.begin(self, seed)
+        return result
+
+    def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:  # noqa: D102
+        result = self.env.step(action)
+        self._log.step(self, result[4], bool(result[2] or result[3]))
+        return result
+
+
+class RecordingEnv(GymnasiumSegmentEnv):
+    """One Gymnasium environment, watched."""
+
+    def __init__(
+        self,
+        task_id: str,
+        segment_steps: int,
+        named: object = None,
+        pictures: Path | None = None,
+    ) -> None:
+        self._log = Log(pictures)
+        self.name = task_id
+        self._options = {} if pictures is None else {"render_mode": RENDER_MODE}
+        super().__init__(_gymnasium_id(task_id), 1, segment_steps, named)
+        state = self._envs[0].state()
+        self._log.joints = None if state is None else robot_joints(state.model)
+
+    def _make(self) -> gymnasium.Env:
+        if not self._options:
+            return Watched(super()._make(), self._log)
+        try:
+            env = Watched(super()._make(self._options), self._log)
+        except TypeError as error:
+            raise NoPicturesError(f"{self.name} cannot be drawn: {error}; {DRAWABLE}") from error
+        if env.render_mode != RENDER_MODE:
+            raise NoPicturesError(f"{self.name} cannot be drawn; {DRAWABLE}")
+        return env
+
+    def goal_in_pictures(self) -> str:
+        """How pictures show the goal; empty if nobody knows."""
+        env = self._envs[0].unwrapped
+        return env.task.goal_in_pictures if isinstance(env, TaskEnv) else ""
+
+    def spec(self) -> EnvSpec:  # noqa: D102 - inherited
+        spec = {**super().spec(), "id": self.name}
+        env = self._envs[0].unwrapped
+        if isinstance(env, TaskEnv):
+            spec["observation_names"] = env.task.observation_names()
+        return spec
+
+    def joints(self) -> list[tuple[str, str]]:
+        """Name and kind, ``hinge`` or ``slide``, of each joint of the robot."""
+        joints = self._log.joints
+        return [] if joints is None else list(zip(joints.names, joints.kinds, strict=True))
+
+    def why_no_joints(self) -> str:
+        """Why there are none; empty if there are some."""
+        if self._log.joints is None:
+            return "not a MuJoCo environment: nobody knows where its joints stand"
+        return "" if self._log.joints.names else "no actuator of its model moves a joint"
+
+    def recording(self) -> Recording:
+        """The episode that began with the last seeded reset, as far as it has come."""
+        return self._log.recording
+
+
+class OpaqueEnv(SegmentEnv):
+    """Somebody's own :class:`SegmentEnv`, of which only rewards are known."""
+
+    def __init__(self, env: SegmentEnv) -> None:
+        self._env = env
+        self.env_count, self.segment_steps = env.env_count, env.segment_steps
+
+    def spec(self) -> EnvSpec:  # noqa: D102 - inherited
+        return self._env.spec()
+
+    def reset(  # noqa: D102 - inherited
+        self, mask: NDArray[np.uint8], seeds: NDArray[np.uint64], out: SegmentBuffers
+    ) -> None:
+        self._env.reset(mask, seeds, out)
+
+    def step_segment(  # noqa: D102 - inherited
+        self, actions: NDArray[np.float64], out: SegmentBuffers
+    ) -> None:
+        self._env.step_segment(actions, out)
+
+    def take_failures(self) -> list[str]:  # noqa: D102 - inherited
+        return self._env.take_failures()
+
+    def close(self) -> None:  # noqa: D102 - inherited
+        self._env.close()
+
+    def joints(self) -> list[tuple[str, str]]:
+        """None."""
+        return []
+
+    def why_no_joints(self) -> str:
+        """The reason."""
+        return "a SegmentEnv runs a whole segment at once: what its robot does within is not seen"
+
+    def goal_in_pictures(self) -> str:
+        """There are none."""
+        return ""
+
+    def recording(self) -> Recording:
+        """Nothing."""
+        return nothing()
+
+
+def nothing() -> Recording:
+    """Of an episode that has not begun."""
+    return {
+        "joint_positions": [],
+        "joint_velocities": [],
+        "success": [],
+        "frames": [],
+        "frame_steps": [],
+    }
+
+
+def steps_a_frame(env: gymnasium.Env) -> int:
+    """Steps of the environment from one frame to the next."""
+    dt = getattr(env.unwrapped, "dt", 0.0)
+    return max(1, round(1.0 / (FRAME_RATE_MAX * dt))) if np.isscalar(dt) and dt > 0 else 1
+
+
+def make(task_id: str, segment_steps: int, pictures: str | None = None) -> RecordingEnv | OpaqueEnv:
+    """One environment of a task, which may be named as for :func:`dmprl.segment_env.make`.
+
+    ``pictures`` names a folder to draw into.
+    """
+    if pictures is not None:
+        name_opengl()
+    named = named_object(task_id)
+    if isinstance(named, type) and issubclass(named, SegmentEnv):
+        if pictures is not None:
+            raise NoPicturesError(f"{task_id} is a SegmentEnv, which cannot be drawn; {DRAWABLE}")
+        return OpaqueEnv(named(1, segment_steps))
+    folder = None if pictures is None else Path(pictures)
+    if isinstance(named, type) and issubclass(named, MujocoTask):
+        named = _maker(task_id, named)
+    elif registered(task_id.removeprefix("dmprl:")) is None:
+        return RecordingEnv(task_id, segment_steps, named, folder)
+    quieten_mujoco()
+    return RecordingEnv(task_id, segment_steps, named, folder)
+
+
+def _maker(task_id: str, task: type[MujocoTask]) -> Callable[..., TaskEnv]:
+    maker = functools.partial(TaskEnv, task_id, task=task)
+    maker.max_episode_steps = task.episode_steps
+    return maker
+
+
+def _gymnasium_id(task_id: str) -> str:
+    """Ours instead of Gymnasium's where the two are equal, since a worker takes ours too."""
+    ours = task_id.removeprefix("dmprl:")
+    if registered(ours) is None or ours.startswith("dmprl/"):
+        return ours
+    return f"dmprl/{ours}"
