@@ -4,8 +4,10 @@ mod axes;
 mod colours;
 mod learning_curve;
 mod png;
+mod small_multiples;
 
 pub(crate) use axes::{Axes, Chart};
 pub(crate) use colours::colour;
 pub use learning_curve::learning_curve;
 pub(crate) use png::png;
+pub(crate) use small_multiples::{Panel, SmallMultiples};

@@ -7,6 +7,7 @@ use dmprl_shared::config::{AlgorithmName, ExperimentConfig, PolicyKind};
 
 use crate::control::EvaluationRow;
 use crate::failure::wrong_use;
+use crate::motion::Motion;
 use crate::run_directory::{Machine, Manifest, RunDirectory, Session};
 use crate::sweep::{Ledger, Plan, SweepFile};
 use crate::terminal::binary_bytes;
@@ -33,6 +34,8 @@ pub struct Run {
     pub origin: Origin,
     /// Oldest first.
     pub rows: Vec<EvaluationRow>,
+    /// How its last policy moves, where that was measured.
+    pub motion: Option<Motion>,
 }
 
 /// Who made a run, where and when.
@@ -93,6 +96,8 @@ pub struct Results {
     pub planned: usize,
     /// The files of the sweeps, by the names of their directories.
     pub sweeps: Vec<(String, String)>,
+    /// Runs whose motion could not be measured, and why.
+    pub unmeasured: Vec<String>,
 }
 
 impl Results {
@@ -112,6 +117,7 @@ impl Results {
         if results.runs.iter().all(|run| run.rows.is_empty()) {
             return Err(wrong_use("no run has an evaluation yet: there is nothing to report"));
         }
+        super::motion::read_motions(&mut results)?;
         Ok(results)
     }
 
@@ -174,7 +180,7 @@ fn run(directory: &RunDirectory, config: &ExperimentConfig, method: String) -> a
     });
     let (task, seed, steps) = (config.task.name.clone(), config.run.seed, config.run.steps);
     let origin = Origin::of(&directory.manifest()?);
-    Ok(Run { task, method, seed, path, ended, steps, origin, rows })
+    Ok(Run { task, method, seed, path, ended, steps, origin, rows, motion: None })
 }
 
 /// What a run is called that no sweep has named.

@@ -2,6 +2,7 @@
 
 use super::collect::Run;
 use super::paper::Figure;
+use super::tables::TableKind;
 use super::thresholds::threshold;
 use crate::control::EvaluationRow;
 
@@ -14,6 +15,10 @@ pub enum Measure {
     Success,
     /// Mean absolute change of an action.
     ActionChange,
+    /// Mean absolute jerk of a joint.
+    JointJerk,
+    /// Spectral arc length of the joints' speed.
+    Sparc,
     /// Segments decided upon.
     Decisions,
     /// Updates of the learner.
@@ -28,10 +33,12 @@ pub enum Measure {
 
 impl Measure {
     /// Those that have a table of means.
-    pub const TABLES: [Self; 6] = [
+    pub const TABLES: [Self; 8] = [
         Self::Return,
         Self::Success,
         Self::ActionChange,
+        Self::JointJerk,
+        Self::Sparc,
         Self::Decisions,
         Self::Updates,
         Self::TrainingTime,
@@ -44,6 +51,8 @@ impl Measure {
             Self::Return => "Average return",
             Self::Success => "Success rate",
             Self::ActionChange => "Smoothness: change of actions",
+            Self::JointJerk => "Smoothness: joint jerk [rad/s³]",
+            Self::Sparc => "Smoothness: SPARC",
             Self::Decisions => "Decisions",
             Self::Updates => "Updates",
             Self::TrainingTime => "Training time [s]",
@@ -66,6 +75,14 @@ impl Measure {
                 "Mean absolute change of an action between two steps in the last evaluation, \
                  actions scaled to [-1, 1]; lower is smoother."
             }
+            Self::JointJerk => {
+                "Mean absolute jerk of a joint, from its velocity in each step, over the last \
+                 evaluation's episodes; lower is smoother. Joints that only slide: m/s³."
+            }
+            Self::Sparc => {
+                "Spectral arc length of the joints' speed (Balasubramanian et al. 2015), mean over \
+                 the last evaluation's episodes; nearer to zero is smoother."
+            }
             Self::Decisions => {
                 "Segments decided upon in training; an mlp policy decides in every step."
             }
@@ -85,7 +102,8 @@ impl Measure {
     #[must_use]
     pub fn digits(self) -> usize {
         match self {
-            Self::Return | Self::Success | Self::UpdateRate => 2,
+            Self::Return | Self::Success | Self::Sparc | Self::UpdateRate => 2,
+            Self::JointJerk => 1,
             Self::ActionChange => 3,
             Self::Decisions | Self::Updates | Self::TrainingTime | Self::StepsToThreshold => 0,
         }
@@ -104,13 +122,25 @@ impl Measure {
     /// Whether more is better.
     #[must_use]
     pub fn higher_is_better(self) -> bool {
-        matches!(self, Self::Return | Self::Success)
+        matches!(self, Self::Return | Self::Success | Self::Sparc)
     }
 
-    /// Whether it is of what training took.
+    /// Whether it is measured after training.
     #[must_use]
-    pub fn is_cost(self) -> bool {
-        matches!(self, Self::Decisions | Self::Updates | Self::TrainingTime | Self::UpdateRate)
+    pub fn is_of_motion(self) -> bool {
+        matches!(self, Self::JointJerk | Self::Sparc)
+    }
+
+    /// What it is about.
+    #[must_use]
+    pub fn kind(self) -> TableKind {
+        match self {
+            Self::Return | Self::Success | Self::StepsToThreshold => TableKind::Result,
+            Self::ActionChange | Self::JointJerk | Self::Sparc => TableKind::Smoothness,
+            Self::Decisions | Self::Updates | Self::TrainingTime | Self::UpdateRate => {
+                TableKind::Cost
+            }
+        }
     }
 
     /// The run's figure; none while it is not known.
@@ -124,6 +154,8 @@ impl Measure {
             Self::Return => Some(last.return_mean),
             Self::Success => last.success_rate,
             Self::ActionChange => Some(last.smoothness),
+            Self::JointJerk => run.motion.as_ref()?.joint_jerk,
+            Self::Sparc => run.motion.as_ref()?.sparc,
             Self::Decisions => Some(last.segments as f64),
             Self::Updates => Some(last.updates as f64),
             Self::TrainingTime => Some(last.wall_s),

@@ -28,6 +28,13 @@ pub fn sentences(results: &Results) -> Vec<String> {
     sentences.push(format!("By dmprl {}.", distinct(programs)));
     let machines = results.runs.iter().map(|run| run.origin.machine.clone());
     sentences.push(format!("On {}.", distinct(machines)));
+    if let Some(first) = results.unmeasured.first() {
+        let count = match results.unmeasured.len() {
+            1 => "1 run".to_owned(),
+            count => format!("{count} runs"),
+        };
+        sentences.push(format!("Motion is not measured of {count}; the first: {first}."));
+    }
     sentences
 }
 

@@ -41,6 +41,8 @@ pub struct Report {
     pub judged: Vec<Judged>,
     /// Learning curves.
     pub curves: Vec<Picture>,
+    /// Joints over a rollout.
+    pub trajectories: Vec<Picture>,
 }
 
 impl Report {
@@ -50,7 +52,7 @@ impl Report {
     /// # Errors
     /// What the file system refuses.
     pub fn write(&self, folder: &Path) -> anyhow::Result<()> {
-        for picture in &self.curves {
+        for picture in self.curves.iter().chain(&self.trajectories) {
             let file = |ending: &str| folder.join(format!("{}.{ending}", picture.path));
             let svg = file("svg");
             let parent = svg.parent().unwrap_or(folder);

@@ -2,6 +2,7 @@
 
 use super::collect::{Origin, Results, Run};
 use crate::control::EvaluationRow;
+use crate::motion::{Joint, JointKind, Motion, RecordedEpisode, Robot};
 
 /// Between two evaluations.
 const INTERVAL: u64 = 1_000;
@@ -36,6 +37,7 @@ pub(super) fn planted(runs: &[Planted]) -> Results {
             steps: run.rows.len() as u64 * INTERVAL,
             origin: Origin::default(),
             rows: rows.collect(),
+            motion: None,
         });
     }
     results
@@ -53,5 +55,39 @@ fn row(task: &str, value: f64, index: u64) -> EvaluationRow {
         return_mean: value,
         success_rate: panda.then_some(value),
         smoothness: 0.1,
+    }
+}
+
+/// Of an arm with an elbow and a finger that slides; two steps.
+pub(super) fn planted_motion(jerk: f64, sparc: f64) -> Motion {
+    let joint = |name: &str, kind| Joint { name: name.to_owned(), kind };
+    Motion {
+        format: 1,
+        policy_version: 1,
+        env_steps: INTERVAL,
+        first_seed: 1_000,
+        returns: vec![0.0],
+        robot: Robot {
+            joints: vec![joint("elbow", JointKind::Hinge), joint("finger", JointKind::Slide)],
+            why_no_joints: String::new(),
+            control_dt_s: 0.05,
+        },
+        unit: "rad".to_owned(),
+        action_change: Some(0.1),
+        action_change_by_dimension: vec![Some(0.1)],
+        joint_jerk: Some(jerk),
+        joint_jerk_by_joint: vec![Some(jerk), None],
+        sparc: Some(sparc),
+        sparc_by_episode: vec![Some(sparc)],
+        episode: RecordedEpisode {
+            seed: 1_000,
+            return_: 0.0,
+            success: None,
+            rewards: vec![0.0; 2],
+            actions: vec![vec![0.0]; 2],
+            joint_positions: vec![vec![0.0, 0.0], vec![0.1, 0.0], vec![0.3, 0.0]],
+            joint_velocities: vec![vec![0.0, 0.0], vec![2.0, 0.0], vec![4.0, 0.0]],
+            success_by_step: Vec::new(),
+        },
     }
 }

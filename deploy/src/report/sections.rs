@@ -7,7 +7,7 @@ use super::efficiency::EfficiencyRow;
 use super::overview::{runs_table, sentences};
 use super::page::Report;
 use super::statements::{Judged, SEEDS_MIN, SUBJECTS, counts};
-use super::tables::Table;
+use super::tables::{Table, TableKind};
 
 /// A drawing.
 #[derive(Debug, Clone, Serialize)]
@@ -74,9 +74,11 @@ impl Section {
 #[must_use]
 pub fn sections(report: &Report) -> Vec<Section> {
     let mut sections = vec![overview(report)];
-    let (results, costs): (Vec<&Table>, Vec<&Table>) =
-        report.tables.iter().partition(|table| !table.is_cost);
-    sections.extend(results.into_iter().map(|table| of_table(report, table)));
+    let of_kind = |kind: TableKind| {
+        let tables = report.tables.iter().filter(move |table| table.kind == kind);
+        tables.map(|table| of_table(report, table))
+    };
+    sections.extend(of_kind(TableKind::Result));
     if !report.curves.is_empty() {
         let mut curves = Section::new(
             "Learning curves",
@@ -92,7 +94,17 @@ pub fn sections(report: &Report) -> Vec<Section> {
     if !report.efficiency.is_empty() {
         sections.push(efficiency(report));
     }
-    sections.extend(costs.into_iter().map(|table| of_table(report, table)));
+    sections.extend(of_kind(TableKind::Smoothness));
+    if !report.trajectories.is_empty() {
+        let mut joints = Section::new(
+            "Joints over a rollout",
+            &["One noise-free episode of each method's policy at the end of training, all reset \
+               with the same seed; every panel has the same axes. As the paper's figures 6 and 7."],
+        );
+        joints.pictures = report.trajectories.clone();
+        sections.push(joints);
+    }
+    sections.extend(of_kind(TableKind::Cost));
     if !report.judged.is_empty() {
         sections.push(statements(&report.judged));
     }

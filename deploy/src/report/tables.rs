@@ -7,6 +7,17 @@ use super::measures::Measure;
 use super::paper::reported;
 use super::statistics::Summary;
 
+/// What a table is about.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum TableKind {
+    /// What was learnt.
+    Result,
+    /// How it moves.
+    Smoothness,
+    /// What training took.
+    Cost,
+}
+
 /// One table: a cell for each task and method.
 #[derive(Debug, Clone, Serialize)]
 pub struct Table {
@@ -16,9 +27,9 @@ pub struct Table {
     pub about: &'static str,
     /// Digits behind the point.
     pub digits: usize,
-    /// Whether it shows what training took, rather than what came of it.
+    /// Where it stands in the report.
     #[serde(skip)]
-    pub is_cost: bool,
+    pub kind: TableKind,
     /// (task, its cells in the order of the methods).
     pub rows: Vec<(String, Vec<Cell>)>,
 }
@@ -92,7 +103,7 @@ fn table(results: &Results, measure: Measure) -> Table {
         title: measure.title(),
         about: measure.about(),
         digits: measure.digits(),
-        is_cost: measure.is_cost(),
+        kind: measure.kind(),
         rows: rows.filter(tells).collect(),
     }
 }

@@ -80,7 +80,7 @@ const PANDA: &str = "panda-reach";
 const JOINTS: &str = "panda-reach-joints";
 const RETURN: &[Measure] = &[Measure::Return];
 const SUCCESS: &[Measure] = &[Measure::Success];
-const SMOOTH: &[Measure] = &[Measure::ActionChange];
+const SMOOTH: &[Measure] = &[Measure::ActionChange, Measure::JointJerk, Measure::Sparc];
 const OTHERS: Methods = &["DDPG", "TD3", "SAC", "NDP"];
 const PLAIN: Methods = &["DDPG", "TD3", "SAC"];
 /// A success rate that counts as failure, and one as "almost 100 %".

@@ -149,6 +149,10 @@ impl On<'_> {
         let name = self.name(method);
         match self.estimate(measure, method) {
             None if self.runs(method).is_empty() => format!("{name}: not run"),
+            // Only motion can be unknown of a run at its end.
+            None if self.runs(method).iter().any(|run| run.ended) && measure.is_of_motion() => {
+                format!("{name}: not measured")
+            }
             None => format!("{name}: not finished"),
             Some(estimate) if measure == Measure::StepsToThreshold => {
                 let [point, low, high] =
