@@ -57,6 +57,8 @@ pub struct Evaluator {
     faults: Faults,
     envs: usize,
     trace: Option<Trace>,
+    /// Told after each segment how many steps the traced episode has.
+    on_steps: Box<dyn FnMut(usize)>,
 }
 
 /// What an evaluator of one environment notes of an episode, step by step.
@@ -95,10 +97,18 @@ impl Evaluator {
         let policy = Policy::new(config, environments.spec())?;
         // The repeats of an episode have a limit of their own.
         let faults = Faults::new(envs, u32::MAX);
-        Ok(Self { environments, acting: Acting::new(policy, envs), faults, envs, trace: None })
+        Ok(Self {
+            environments,
+            acting: Acting::new(policy, envs),
+            faults,
+            envs,
+            trace: None,
+            on_steps: Box::new(|_| ()),
+        })
     }
 
-    /// One on a single environment, which notes each step of an episode.
+    /// One on a single environment, which notes each step of an episode; `on_steps` is told after
+    /// each segment how many there are.
     ///
     /// The network still sees as many rows as in an evaluation: the product of a single row is
     /// rounded differently, and a bounce of a ball makes much of the last bit.
@@ -108,11 +118,12 @@ impl Evaluator {
     pub fn tracing(
         config: &ExperimentConfig,
         environment: PythonEnvironments,
+        on_steps: Box<dyn FnMut(usize)>,
     ) -> Result<Self, PolicyError> {
         let rows = config.evaluation.episodes.clamp(1, ENVIRONMENTS_MAX);
         let evaluator = Self::new(config, environment, rows)?;
         let (faults, trace) = (Faults::new(1, u32::MAX), Some(Trace::default()));
-        Ok(Self { envs: 1, faults, trace, ..evaluator })
+        Ok(Self { envs: 1, faults, trace, on_steps, ..evaluator })
     }
 
     /// The steps of the last episode; empty of an evaluator that notes none.
@@ -251,6 +262,7 @@ impl Evaluator {
         if let Some(trace) = &mut self.trace {
             trace.u.extend(u);
             trace.rewards.extend(rewards);
+            (self.on_steps)(trace.rewards.len());
         }
         let last = &mut wave.last_u[env * dims..(env + 1) * dims];
         for step in u.chunks_exact(dims) {

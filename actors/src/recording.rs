@@ -18,8 +18,6 @@ pub struct EpisodeRecord {
     pub return_: f64,
     /// Whether its last step reported success; none if the task reports none.
     pub success: Option<bool>,
-    /// Mean |u_t - u_{t-1}| over steps and action dimensions.
-    pub smoothness: f64,
     /// Actions and rewards.
     pub trace: Trace,
     /// Joints, and success after each step.
@@ -30,25 +28,35 @@ pub struct EpisodeRecord {
 pub struct Recorder {
     evaluator: Evaluator,
     joints: Joints,
+    goal_in_pictures: String,
 }
 
 impl Recorder {
-    /// On the environment of [`PythonEnvironments::start_recording`].
+    /// On the environment of [`PythonEnvironments::start_recording`]; `on_steps` is told after each
+    /// segment how many steps its episode has.
     ///
     /// # Errors
     /// If the policy does not fit it, or it cannot tell its joints.
     pub fn new(
         config: &ExperimentConfig,
         environment: PythonEnvironments,
+        on_steps: Box<dyn FnMut(usize)>,
     ) -> Result<Self, RolloutError> {
-        let joints = environment.joints()?;
-        Ok(Self { evaluator: Evaluator::tracing(config, environment)?, joints })
+        let (joints, goal_in_pictures) = (environment.joints()?, environment.goal_in_pictures()?);
+        let evaluator = Evaluator::tracing(config, environment, on_steps)?;
+        Ok(Self { evaluator, joints, goal_in_pictures })
     }
 
     /// The robot's.
     #[must_use]
     pub fn joints(&self) -> &Joints {
         &self.joints
+    }
+
+    /// What the goal looks like in a picture; empty if nobody knows.
+    #[must_use]
+    pub fn goal_in_pictures(&self) -> &str {
+        &self.goal_in_pictures
     }
 
     /// The policy's architecture.
@@ -82,7 +90,6 @@ impl Recorder {
             seed,
             return_: evaluation.return_mean(),
             success: evaluation.success_rate.map(|rate| rate > 0.0),
-            smoothness: evaluation.smoothness,
             trace,
             written_down,
         }))

@@ -136,10 +136,19 @@ pub enum Report {
         /// What failed.
         reason: String,
     },
-    /// The observer has written so many episodes down.
+    /// How far the observer is.
     Observed {
-        /// Of those asked for.
+        /// Episodes written down.
         episodes: u64,
+        /// Steps of the next one; 0 when an episode has just ended.
+        steps: u64,
+    },
+    /// How far the video is.
+    Filmed {
+        /// Frames in it.
+        done: u64,
+        /// How many there will be.
+        of: u64,
     },
     /// Environments failed and were made again.
     EnvFailures {

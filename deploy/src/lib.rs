@@ -18,6 +18,7 @@ pub mod plots;
 pub mod project;
 #[cfg(feature = "python")]
 pub mod python_setup;
+pub mod record;
 pub mod report;
 pub mod roles;
 pub mod run_directory;

@@ -160,6 +160,7 @@ fn every_flag_that_is_shown_exists() {
         "eval",
         "sweep",
         "report",
+        "record",
         "bench rollout",
         "bench learner",
         "bench transport",
@@ -170,6 +171,7 @@ fn every_flag_that_is_shown_exists() {
         "learner",
         "actor",
         "evaluator",
+        "observer",
     ];
     let words = |command: &str| -> BTreeSet<String> {
         flags(&help(&command.split(' ').collect::<Vec<_>>()))

@@ -15,7 +15,6 @@ import gymnasium
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image
 
 from dmprl.gymnasium_env import GymnasiumSegmentEnv, success_of
 from dmprl.mujoco_batch import MujocoTask, quieten_mujoco
@@ -89,6 +88,8 @@ class Log:
     def _draw(self, env: Watched) -> None:
         if self._pictures is None:
             return
+        from PIL import Image  # the extra `video`
+
         step = len(self.recording["success"])
         file = self._pictures / f"{self._seed}-{step:06}.png"
         picture = env.render()

@@ -1,13 +1,19 @@
 """What is written down of an episode, and which joints are the robot's."""
 
+import os
 import sys
+import tempfile
 import unittest
+from itertools import pairwise
 from pathlib import Path
 
+import gymnasium
 import mujoco
 import numpy as np
+from PIL import Image
 
-from dmprl import recording
+from dmprl import film, recording
+from dmprl.pictures import NoOpenGLError
 from dmprl.robot_joints import robot_joints
 from dmprl.segment_env import SegmentBuffers, make
 
@@ -77,6 +83,75 @@ class EpisodeTest(unittest.TestCase):
             self.assertEqual(env.joints(), [])
             self.assertIn(reason, env.why_no_joints())
             self.assertEqual(env.recording()["joint_positions"], [])
+
+
+class PicturesTest(unittest.TestCase):
+    def test_frames_are_drawn_before_the_first_step_and_after_each(self):
+        with tempfile.TemporaryDirectory() as folder:
+            env = recording.make("Reacher-v5", STEPS, folder)
+            try:
+                episode(env)
+            except NoOpenGLError as error:
+                if os.environ.get("TEST_EXTRAS_REQUIRED"):
+                    raise
+                self.skipTest(str(error))
+            written = env.recording()
+            self.assertEqual(written["frame_steps"], list(range(51)))
+            self.assertEqual(sorted(os.listdir(folder)), [Path(f).name for f in written["frames"]])
+            self.assertEqual(env.goal_in_pictures(), "red ball")
+
+    def test_what_cannot_be_drawn_says_so(self):
+        for task_id in ("point_reach:PointReach-v0", "point_reach_batch:PointReachBatch"):
+            with self.assertRaisesRegex(recording.NoPicturesError, "has the render mode"):
+                recording.make(task_id, STEPS, "/nowhere")
+
+    def test_a_fast_environment_is_not_drawn_at_every_step(self):
+        env = gymnasium.make("Reacher-v5")
+        for dt, steps in [(0.0, 1), (0.05, 1), (0.02, 1), (0.01, 2), (0.002, 10)]:
+            env.unwrapped.frame_skip = dt / env.unwrapped.model.opt.timestep
+            self.assertEqual(recording.steps_a_frame(env), steps, dt)
+
+
+class FilmTest(unittest.TestCase):
+    def side(self, folder, frames, flags):
+        files = []
+        for frame in range(frames):
+            files.append(f"{folder}/{frame}.png")
+            Image.new("RGB", (64, 48), (5 * frame, 0, 0)).save(files[-1])
+        return film.Scenes(
+            {
+                "title": "a title",
+                "success": "",
+                "goal": "red ball",
+                "frames": files,
+                "steps": list(range(0, 2 * frames, 2)),
+                "rewards": [-1.0] * (2 * frames - 2),
+                "success_by_step": flags,
+            },
+            0.1,
+        )
+
+    def test_captions_follow_the_episode(self):
+        with tempfile.TemporaryDirectory() as folder:
+            scenes = self.side(folder, 4, [False] * 5 + [True])
+            self.assertEqual([scenes.when(frame) for frame in (0, 3)], ["0.00 s", "0.60 s"])
+            self.assertEqual(scenes.return_so_far(2), "return -4.00")
+            words = [scenes.goal(frame)[0] for frame in (0, 1, 3)]
+            self.assertEqual(
+                words,
+                ["goal: red ball", "not at the goal (red ball)", "at the goal (red ball)"],
+            )
+
+    def test_a_side_that_ends_first_waits_and_all_frames_have_one_size(self):
+        with tempfile.TemporaryDirectory() as one, tempfile.TemporaryDirectory() as other:
+            sides = [self.side(one, 3, []), self.side(other, 8, [])]
+            made = list(film.pictures([sides]))
+            self.assertEqual(len(made), 8)
+            self.assertEqual({picture.size for picture in made}, {(2 * 640 + 8, 568)})
+            left = [picture.crop((0, 44, 640, 524)).tobytes() for picture in made]
+            self.assertEqual([a == b for a, b in pairwise(left)], [False] * 2 + [True] * 5)
+            # A line for each side; one has fewer frames than the strip has room for.
+            self.assertEqual(film.strip([sides]).size, (6 * 320 + 5 * 8, 2 * (240 + 88)))
 
 
 class JointsTest(unittest.TestCase):

@@ -1,5 +1,7 @@
 //! One environment that writes down what its robot does (`envs_py/dmprl/recording.py`).
 
+use std::path::Path;
+
 use pyo3::prelude::*;
 
 use super::{Interpreter, PythonEnvironments, PythonError};
@@ -32,22 +34,34 @@ pub struct WrittenDown {
     /// (T,): after each step, as [`PythonEnvironments::success`]; empty if only a segment's is
     /// known.
     pub success: Vec<u8>,
+    /// Files of pictures, if they were asked for,
+    pub frames: Vec<String>,
+    /// and the number of steps done at each.
+    pub frame_steps: Vec<usize>,
 }
 
 impl PythonEnvironments {
-    /// Makes one environment of `task_id` whose steps are written down.
+    /// Makes one environment of `task_id` whose steps are written down, and drawn into a folder.
     ///
     /// # Errors
-    /// As [`PythonEnvironments::start`].
+    /// As [`PythonEnvironments::start`]; `Exception` if nothing can draw it.
     pub fn start_recording(
         _interpreter: &Interpreter,
-        task_id: &str,
-        segment_steps: usize,
+        (task_id, segment_steps): (&str, usize),
+        pictures: Option<&Path>,
     ) -> Result<Self, PythonError> {
         Self::start_with(1, segment_steps, |py| {
             let module = py.import("dmprl.recording")?;
-            module.getattr("make")?.call1((task_id, segment_steps))
+            module.getattr("make")?.call1((task_id, segment_steps, pictures))
         })
+    }
+
+    /// What the goal looks like in a picture; empty if nobody knows.
+    ///
+    /// # Errors
+    /// `Exception` when the installed package does not fit.
+    pub fn goal_in_pictures(&self) -> Result<String, PythonError> {
+        self.ask(|env| env.call_method0("goal_in_pictures")?.extract())
     }
 
     /// The robot's joints; only of [`PythonEnvironments::start_recording`].
@@ -83,6 +97,8 @@ impl PythonEnvironments {
                 joint_positions: recording.get_item("joint_positions")?.extract()?,
                 joint_velocities: recording.get_item("joint_velocities")?.extract()?,
                 success: recording.get_item("success")?.extract()?,
+                frames: recording.get_item("frames")?.extract()?,
+                frame_steps: recording.get_item("frame_steps")?.extract()?,
             })
         })?;
         let fits = |rows: usize, expected: usize| rows == 0 || rows == expected;

@@ -9,6 +9,7 @@ mod configuration;
 mod configured;
 mod doctor;
 mod eval;
+mod record;
 mod report;
 mod resume;
 mod sweep;
@@ -34,6 +35,7 @@ EXAMPLES
   dmprl eval runs/reacher-td3-dmp-s1-…    how well does its best policy do?
   dmprl resume runs/reacher-td3-dmp-s1-…  go on where it stopped
   dmprl actor --join runs/reacher-td3-…   one more worker for a run that is being trained
+  dmprl record runs/reacher-td3-dmp-s1-…  what does it look like?
   dmprl tasks                              what can be trained
   dmprl doctor                             what this machine has and lacks
 
@@ -69,6 +71,8 @@ enum Command {
     Sweep(sweep::SweepArgs),
     /// Set runs and sweeps side by side: tables, statistics, learning curves, one page.
     Report(report::ReportArgs),
+    /// Make a video of a policy, or of two side by side.
+    Record(record::RecordArgs),
     /// Measure a part of the system beside what else could do its work.
     Bench(bench::BenchArgs),
     /// Kill a run's processes by a schedule and check that nothing is lost.
@@ -88,7 +92,7 @@ enum Command {
     /// The process that evaluates; started by train and eval.
     #[command(hide = true)]
     Evaluator(EvaluatorArgs),
-    /// The process that writes down what a policy does; started by report.
+    /// The process that writes down what a policy does; started by record.
     #[command(hide = true)]
     Observer(ObserverArgs),
     /// A process that only sends segments; started by bench transport.
@@ -129,6 +133,7 @@ fn run(command: Command) -> anyhow::Result<Outcome> {
         Command::Eval(args) => eval::run(&args),
         Command::Sweep(args) => sweep::run(&args),
         Command::Report(args) => report::run(&args),
+        Command::Record(args) => record::run(&args),
         Command::Bench(args) => bench::run(&args),
         Command::Chaos(args) => chaos::run(&args),
         Command::Tasks(args) => tasks::run(&args),
@@ -158,6 +163,20 @@ fn prepare_python() -> anyhow::Result<PathBuf> {
     let root = crate::project::root()?;
     let progress = crate::terminal::SetupProgress::new();
     Ok(crate::python_setup::ensure(&root, &|line| progress.show(line))?.venv)
+}
+
+/// As [`prepare_python`], with an extra of our package; returns the interpreter, too.
+#[cfg(feature = "python")]
+fn prepare_python_extra(extra: &str) -> anyhow::Result<(PathBuf, PathBuf)> {
+    let root = crate::project::root()?;
+    let progress = crate::terminal::SetupProgress::new();
+    let made = crate::python_setup::ensure_extra(&root, extra, &|line| progress.show(line))?;
+    Ok((made.venv, made.executable))
+}
+
+#[cfg(not(feature = "python"))]
+fn prepare_python_extra(_extra: &str) -> anyhow::Result<(PathBuf, PathBuf)> {
+    prepare_python().map(|venv| (venv.clone(), venv.join("bin/python")))
 }
 
 #[cfg(not(feature = "python"))]

@@ -3,7 +3,7 @@
 use std::fmt::{self, Display, Formatter};
 use std::fs::OpenOptions;
 use std::io::Write;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
 use std::time::SystemTime;
 
@@ -150,10 +150,23 @@ impl Launcher {
             command.args([flag, &number.to_string()]);
         }
         command.arg("--output").arg(&args.output);
+        if let Some(pictures) = &args.pictures {
+            command.arg("--pictures").arg(pictures);
+        }
         if let Some(venv) = &self.venv {
             command.arg("--venv").arg(venv);
         }
         self.streams(command, "observer")
+    }
+
+    /// The command of the process that makes a video of a plan.
+    ///
+    /// # Errors
+    /// The log cannot be opened.
+    pub fn film(&self, plan: &Path) -> anyhow::Result<Command> {
+        let mut command = Command::new(&self.program);
+        command.args(["-I", "-m", "dmprl.film"]).arg(plan);
+        self.streams(command, "film")
     }
 
     fn learner(&self, command: &mut Command) {

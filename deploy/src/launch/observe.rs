@@ -1,6 +1,7 @@
 //! Episodes of a saved policy outside training, written down step by step.
 
 use std::path::PathBuf;
+use std::time::Duration;
 
 use super::conversation::{Conversation, Turn};
 use super::{Launcher, TimeLimits};
@@ -25,9 +26,12 @@ pub struct ObservationPlan<'a> {
     pub episodes: u64,
     /// The file to write, which [`crate::motion::Recorded`] reads.
     pub output: PathBuf,
+    /// A folder for frames, if they are wanted.
+    pub pictures: Option<PathBuf>,
 }
 
-/// Observes; `progress` is called with the number of episodes done, and of how many.
+/// Observes; `progress` is called with the number of episodes done, and of steps of the next one: 0
+/// when an episode has just ended.
 ///
 /// # Errors
 /// The observer died or took too long.
@@ -39,20 +43,21 @@ pub fn observe(plan: ObservationPlan<'_>, progress: &dyn Fn(u64, u64)) -> anyhow
         first_seed: plan.first_seed,
         episodes: plan.episodes,
         output: plan.output,
+        pictures: plan.pictures,
         venv: None,
     })?;
-    let limits = TimeLimits::default();
-    let limit_of = |done: u64| {
-        limits.evaluation_of(usize::try_from(plan.episodes - done).unwrap_or(usize::MAX))
-    };
+    // A report follows each call into the environment, over which the watchdog watches.
+    let seconds = plan.run.config()?.actors.env_call_timeout_s;
+    let call = Duration::try_from_secs_f64(seconds).unwrap_or(Duration::MAX);
+    let limit = TimeLimits::default().evaluation_of(1).saturating_add(call);
     let observer = Conversation { who: "the observer", log: plan.run.log_path("observer") };
     let answer = observer.hold(command, |report| {
         Ok(match report {
-            Report::EnvironmentReady { .. } => Turn::Wait("done", limit_of(0)),
-            Report::Observed { episodes } => {
-                progress(episodes, plan.episodes);
+            Report::EnvironmentReady { .. } => Turn::Wait("done", limit),
+            Report::Observed { episodes, steps } => {
+                progress(episodes, steps);
                 match episodes < plan.episodes {
-                    true => Turn::Wait("done", limit_of(episodes)),
+                    true => Turn::Wait("done", limit),
                     false => Turn::Over(()),
                 }
             }

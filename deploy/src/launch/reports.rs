@@ -73,8 +73,8 @@ impl Supervisor {
                     self.worked(process);
                 }
             }
-            // Observing is none of a training's children's business.
-            Report::Alive { .. } | Report::Observed { .. } => {}
+            // Observing and filming are none of a training's children's business.
+            Report::Alive { .. } | Report::Observed { .. } | Report::Filmed { .. } => {}
             Report::Left => self.on_left(process),
             Report::EnvHung { message } => self.on_env_hung(process, &message),
             Report::Checkpoint { name, env_steps } => {

@@ -136,9 +136,16 @@ pub fn measure(
         first_seed: settings.first_seed,
         episodes: settings.episodes as u64,
         output: folder.path().join("episodes.jsonl"),
+        pictures: None,
     };
     let output = plan.output.clone();
-    if launch::observe(plan, progress)? == Outcome::Interrupted {
+    let of = plan.episodes;
+    let told = |done, steps| {
+        if steps == 0 {
+            progress(done, of);
+        }
+    };
+    if launch::observe(plan, &told)? == Outcome::Interrupted {
         return Ok(None);
     }
     let env_steps = chosen.row.map_or(0, |row| row.env_steps);

@@ -3,7 +3,7 @@
 
 use std::fs::File;
 use std::io::{BufRead, BufReader, Read};
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 use anyhow::{Context, ensure};
 use serde::de::DeserializeOwned;
@@ -51,6 +51,9 @@ pub struct Robot {
     pub joints: Vec<Joint>,
     /// Why there are none; empty if there are some.
     pub why_no_joints: String,
+    /// What the goal looks like in a picture; empty if nobody knows.
+    #[serde(default, skip_serializing_if = "String::is_empty")]
+    pub goal_in_pictures: String,
     /// Duration of a step [s]; 0 if the environment does not say.
     pub control_dt_s: f64,
 }
@@ -76,6 +79,12 @@ pub struct RecordedEpisode {
     pub joint_velocities: Vec<Vec<f64>>,
     /// (T,): whether each step reported success; empty where that is not known.
     pub success_by_step: Vec<Option<bool>>,
+    /// Files of pictures, if they were asked for,
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub frames: Vec<PathBuf>,
+    /// and the number of steps done at each.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub frame_steps: Vec<usize>,
 }
 
 /// Episodes, read one at a time.
@@ -111,6 +120,8 @@ impl Recorded {
         };
         ensure!(
             episode.actions.len() == steps
+                && episode.frames.len() == episode.frame_steps.len()
+                && episode.frame_steps.iter().all(|&step| step <= steps)
                 && fits(&episode.joint_positions)
                 && fits(&episode.joint_velocities),
             "{}: the episode of seed {} does not fit together: {steps} rewards, {} actions, {} \

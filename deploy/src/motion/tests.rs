@@ -25,6 +25,8 @@ fn written(folder: &Path, robot: &Robot, lengths: &[usize]) -> PathBuf {
             joint_positions: (0..rows).map(row).collect(),
             joint_velocities: (0..rows).map(row).collect(),
             success_by_step: Vec::new(),
+            frames: Vec::new(),
+            frame_steps: Vec::new(),
         };
         lines.push(serde_json::to_string(&episode).unwrap());
     }
@@ -37,7 +39,12 @@ fn written(folder: &Path, robot: &Robot, lengths: &[usize]) -> PathBuf {
 fn all_episodes_are_measured_and_the_first_is_kept() {
     let folder = tempfile::tempdir().unwrap();
     let joints = vec![joint("rail", JointKind::Slide), joint("elbow", JointKind::Hinge)];
-    let robot = Robot { joints, why_no_joints: String::new(), control_dt_s: 0.1 };
+    let robot = Robot {
+        joints,
+        why_no_joints: String::new(),
+        goal_in_pictures: String::new(),
+        control_dt_s: 0.1,
+    };
     let motion = of_recorded(&written(folder.path(), &robot, &[20, 30]), (3, 500, 7)).unwrap();
     assert_eq!(motion.returns, [-20.0, -30.0]);
     assert_eq!((motion.episode.seed, motion.times().len()), (7, 21));
@@ -55,7 +62,12 @@ fn all_episodes_are_measured_and_the_first_is_kept() {
 fn a_robot_of_slides_is_measured_in_metres() {
     let folder = tempfile::tempdir().unwrap();
     let joints = vec![joint("rail", JointKind::Slide)];
-    let robot = Robot { joints, why_no_joints: String::new(), control_dt_s: 0.1 };
+    let robot = Robot {
+        joints,
+        why_no_joints: String::new(),
+        goal_in_pictures: String::new(),
+        control_dt_s: 0.1,
+    };
     let motion = of_recorded(&written(folder.path(), &robot, &[20]), (3, 500, 7)).unwrap();
     assert_eq!(motion.unit, "m");
     assert!((motion.joint_jerk.unwrap() - 200_000.0).abs() < 1e-3, "{:?}", motion.joint_jerk);
@@ -65,7 +77,12 @@ fn a_robot_of_slides_is_measured_in_metres() {
 fn without_joints_only_actions_are_measured() {
     let folder = tempfile::tempdir().unwrap();
     let why_no_joints = "it does not say".to_owned();
-    let robot = Robot { joints: Vec::new(), why_no_joints, control_dt_s: 0.0 };
+    let robot = Robot {
+        joints: Vec::new(),
+        why_no_joints,
+        goal_in_pictures: String::new(),
+        control_dt_s: 0.0,
+    };
     let motion = of_recorded(&written(folder.path(), &robot, &[5]), (3, 500, 7)).unwrap();
     assert_eq!((motion.joint_jerk, motion.sparc, motion.action_change), (None, None, Some(0.5)));
     assert_eq!(motion.times(), [0.0, 1.0, 2.0, 3.0, 4.0, 5.0]);
@@ -74,7 +91,12 @@ fn without_joints_only_actions_are_measured() {
 #[test]
 fn an_episode_that_does_not_fit_its_robot_is_refused() {
     let folder = tempfile::tempdir().unwrap();
-    let robot = |joints| Robot { joints, why_no_joints: String::new(), control_dt_s: 0.1 };
+    let robot = |joints| Robot {
+        joints,
+        why_no_joints: String::new(),
+        goal_in_pictures: String::new(),
+        control_dt_s: 0.1,
+    };
     let none = written(folder.path(), &robot(Vec::new()), &[4]);
     let text = std::fs::read_to_string(&none).unwrap();
     let (_, episode) = text.split_once('\n').unwrap();

@@ -51,16 +51,28 @@ impl Setup<'_> {
     /// an installation, which is what who adds a task wants; only a change of requirements installs
     /// again.
     pub fn install(&self) -> Result<()> {
+        let mut command = self.pip_install();
+        command.arg("--editable").arg(self.package);
+        self.run("installing packages", command)
+    }
+
+    /// Adds packages. Ours is left alone: others may be importing it.
+    pub fn add(&self, requirements: &[String]) -> Result<()> {
+        let mut command = self.pip_install();
+        command.args(requirements);
+        self.run("installing packages", command)
+    }
+
+    fn pip_install(&self) -> Command {
         let mut command = Command::new(&self.environment.executable);
         command
             .args(["-I", "-m", "pip", "install", "--disable-pip-version-check", "--no-input"])
-            .args(["--progress-bar", "off", "--editable"])
-            .arg(self.package)
+            .args(["--progress-bar", "off"])
             // A user's pip.conf may ask for these; in a virtual environment they fail or miss it.
             .env("PIP_USER", "0")
             .env_remove("PIP_TARGET")
             .env_remove("PIP_PREFIX");
-        self.run("installing packages", command)
+        command
     }
 
     fn run(&self, phase: &str, mut command: Command) -> Result<()> {

@@ -89,6 +89,33 @@ pub fn ensure(project_root: &Path, progress: &dyn Fn(&str)) -> Result<PythonEnvi
     Ok(environment)
 }
 
+/// As [`ensure`], with what an extra of the package needs, too: a command that few use must not
+/// make every first start longer.
+///
+/// - `extra`: its name in `envs_py/pyproject.toml`.
+///
+/// # Errors
+/// As [`ensure`].
+pub fn ensure_extra(
+    project_root: &Path,
+    extra: &str,
+    progress: &dyn Fn(&str),
+) -> Result<PythonEnvironment> {
+    let environment = ensure(project_root, progress)?;
+    let (root, wanted) = wanted(project_root)?;
+    if wanted.has_extra(&environment.venv, extra) {
+        return Ok(environment);
+    }
+    let lock = locked(&root.join(LOCK), progress)?;
+    if !wanted.has_extra(&environment.venv, extra) {
+        let package = root.join(PACKAGE);
+        let setup = Setup { environment: &environment, package: &package, lock: &lock, progress };
+        setup.add(&wanted.requirements_of(extra)?)?;
+        wanted.write_extra(&environment.venv, extra)?;
+    }
+    Ok(environment)
+}
+
 /// How `.venv` is found.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum State {

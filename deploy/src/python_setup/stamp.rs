@@ -82,6 +82,27 @@ impl Stamp {
         Fit::Unusable(format!("it was made for {was}, needed is {wanted}"))
     }
 
+    /// What an extra of the package needs.
+    pub(super) fn requirements_of(&self, extra: &str) -> Result<Vec<String>> {
+        let manifest: toml::Table = self.manifest.parse().context("envs_py/pyproject.toml")?;
+        let extras = manifest.get("project").and_then(|it| it.get("optional-dependencies"));
+        let requirements = extras.and_then(|extras| extras.get(extra)?.as_array());
+        let requirements = requirements
+            .with_context(|| format!("envs_py/pyproject.toml has no extra `{extra}`"))?;
+        Ok(requirements.iter().filter_map(|it| it.as_str().map(str::to_owned)).collect())
+    }
+
+    /// Whether an extra of the package was installed with these requirements.
+    pub(super) fn has_extra(&self, venv: &Path, extra: &str) -> bool {
+        fs::read_to_string(extra_file(venv, extra)).is_ok_and(|found| found == self.text())
+    }
+
+    /// Declares an extra installed.
+    pub(super) fn write_extra(&self, venv: &Path, extra: &str) -> Result<()> {
+        let path = extra_file(venv, extra);
+        fs::write(&path, self.text()).with_context(|| format!("cannot write {}", path.display()))
+    }
+
     /// Declares a virtual environment complete.
     pub(super) fn write(&self, venv: &Path) -> Result<()> {
         let temporary = venv.join(format!("{FILE}.part"));
@@ -90,6 +111,10 @@ impl Stamp {
             .and_then(|()| remove_if_present(&venv.join(MAKING)))
             .with_context(|| format!("cannot write {}", venv.join(FILE).display()))
     }
+}
+
+fn extra_file(venv: &Path, extra: &str) -> PathBuf {
+    venv.join(format!("dmprl-stamp-{extra}.txt"))
 }
 
 /// Makes the directory, marked as being worked on.
@@ -148,6 +173,17 @@ mod tests {
         assert_eq!(stamp.compare(&venv), Fit::Ready);
         remove(&venv).unwrap();
         assert_eq!(why(stamp.compare(&venv)), "the last attempt did not finish");
+    }
+
+    #[test]
+    fn an_extra_is_there_for_the_requirements_it_was_installed_with() {
+        let (directory, venv, stamp) = made();
+        assert!(!stamp.has_extra(&venv, "video"));
+        stamp.write_extra(&venv, "video").unwrap();
+        assert!(stamp.requirements_of("video").is_err(), "this package has none");
+        assert!(stamp.has_extra(&venv, "video") && !stamp.has_extra(&venv, "other"));
+        let changed = Stamp::new(&LINKED, directory.path(), "[project]\nname = 'other'\n");
+        assert!(!changed.has_extra(&venv, "video"));
     }
 
     #[test]

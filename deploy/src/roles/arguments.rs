@@ -130,6 +130,9 @@ pub struct ObserverArgs {
     /// The file to write.
     #[arg(long, value_name = "FILE")]
     pub output: PathBuf,
+    /// Draw frames into this folder, too.
+    #[arg(long, value_name = "DIR")]
+    pub pictures: Option<PathBuf>,
     /// The Python virtual environment.
     #[arg(long, value_name = "DIR")]
     pub venv: Option<PathBuf>,

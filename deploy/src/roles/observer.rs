@@ -2,6 +2,9 @@
 
 use std::fs::File;
 use std::io::{BufWriter, Write};
+use std::path::PathBuf;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicU64, Ordering};
 
 use anyhow::Context;
 use dmprl_actors::python_env::{self, PythonEnvironments, SUCCESS_NOT_REPORTED, SUCCESS_YES};
@@ -18,11 +21,19 @@ use crate::motion::{Joint, JointKind, RecordedEpisode, Robot};
 pub fn run(args: &ObserverArgs, control: &ControlPipe) -> anyhow::Result<()> {
     let setup = Setup::read(&args.run)?;
     let interpreter = super::actor::interpreter(args.venv.as_deref(), &setup.config)?;
-    let (id, steps) = (&setup.config.task.id, setup.config.policy.decision_steps());
-    let environment = PythonEnvironments::start_recording(&interpreter, id, steps)?;
+    let task = (setup.config.task.id.as_str(), setup.config.policy.decision_steps());
+    let environment =
+        PythonEnvironments::start_recording(&interpreter, task, args.pictures.as_deref())?;
     environments::watch(&environment, &setup.config, control)?;
     let spec = environment.spec().clone();
-    let mut recorder = Recorder::new(&setup.config, environment)?;
+    let done = Arc::new(AtomicU64::new(0));
+    let (episodes, reporter) = (Arc::clone(&done), control.reporter());
+    let on_steps = Box::new(move |steps| {
+        // Whoever is gone is noticed as a stop.
+        let episodes = episodes.load(Ordering::Relaxed);
+        let _ = reporter.send(&Report::Observed { episodes, steps: steps as u64 });
+    });
+    let mut recorder = Recorder::new(&setup.config, environment, on_steps)?;
     let path = setup.run.policy_path(args.policy);
     let snapshot = policy_file::load(&path, recorder.policy(), Match::Architecture)?;
     let file = File::create(&args.output)
@@ -38,7 +49,8 @@ pub fn run(args: &ObserverArgs, control: &ControlPipe) -> anyhow::Result<()> {
         environments::tell(&recorder.take_failures(), control);
         let Some(record) = record? else { return Ok(()) };
         append(&mut lines, &episode(record, dims))?;
-        control.send(&Report::Observed { episodes: index + 1 })?;
+        done.store(index + 1, Ordering::Relaxed);
+        control.send(&Report::Observed { episodes: index + 1, steps: 0 })?;
     }
     Ok(())
 }
@@ -59,6 +71,7 @@ fn robot(recorder: &Recorder, control_dt_s: f64) -> Robot {
     Robot {
         joints: joints.joints.iter().map(of).collect(),
         why_no_joints: joints.why_none.clone(),
+        goal_in_pictures: recorder.goal_in_pictures().to_owned(),
         control_dt_s,
     }
 }
@@ -74,5 +87,7 @@ fn episode(record: EpisodeRecord, dims: usize) -> RecordedEpisode {
         joint_positions: record.written_down.joint_positions,
         joint_velocities: record.written_down.joint_velocities,
         success_by_step: record.written_down.success.iter().map(success).collect(),
+        frames: record.written_down.frames.into_iter().map(PathBuf::from).collect(),
+        frame_steps: record.written_down.frame_steps,
     }
 }

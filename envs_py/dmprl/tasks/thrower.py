@@ -33,10 +33,10 @@ class Thrower(MujocoTask):
     episode_steps = 100
     recorded = ("qpos", "qvel", "subtree_com")
     camera: ClassVar[Mapping[str, Any]] = {
-        "distance": 2.4,
+        "distance": 2.8,
         "elevation": -25.0,
         "azimuth": 150.0,
-        "lookat": (0.3, 0.0, -0.1),
+        "lookat": (0.15, 0.0, -0.1),
     }
     goal_in_pictures = "red box"
 

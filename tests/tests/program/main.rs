@@ -26,6 +26,7 @@ mod learning;
 mod leftovers;
 mod machine;
 mod motion;
+mod record;
 mod refusals;
 mod report;
 mod results;

@@ -1,0 +1,138 @@
+//! `dmprl record`: what a policy does, as a video, an animation and a strip of frames.
+
+use std::path::PathBuf;
+
+use clap::Args;
+
+use super::{emit, prepare_python_extra, this_program};
+use crate::failure::{Outcome, wrong_use};
+use crate::motion::{Means, RecordedEpisode};
+use crate::record::{RecordPlan, Recordings, record};
+use crate::run_directory::{PolicyChoice, RunDirectory};
+use crate::terminal::{StagesProgress, say, shown};
+
+const HELP: &str = "\
+The episodes are those of `dmprl eval`: noise-free, a seed each. Written are an MP4, a GIF and a
+PNG with frames in a row, with time, return so far and, where the task says so, success. Needs no
+display: OpenGL by EGL or OSMesa; where there is none, the error names the packages. The tasks of
+`dmprl tasks` draw their goal, other environments whatever their render mode `rgb_array` draws.
+
+EXAMPLES
+  dmprl record runs/mine
+  dmprl record runs/mine --policy latest --episodes 3
+  dmprl record runs/td3-dmp --compare runs/td3-mlp --seed 1004
+  dmprl record runs/mine --output pictures --json";
+
+/// More episodes than anybody watches.
+const EPISODES_MAX: u64 = 100;
+
+/// Arguments of `dmprl record`.
+#[derive(Debug, Args)]
+#[command(after_help = HELP)]
+pub(super) struct RecordArgs {
+    /// The run directory.
+    run: PathBuf,
+    /// best, latest, or a policy version.
+    #[arg(long, default_value_t = PolicyChoice::Best, value_name = "best|latest|VERSION")]
+    policy: PolicyChoice,
+    /// Seed of the first episode [default: evaluation.first_seed of the run].
+    #[arg(long, value_name = "N")]
+    seed: Option<u64>,
+    /// Episodes, one after the other, each with the next seed.
+    #[arg(long, value_name = "N", default_value_t = 1,
+        value_parser = clap::value_parser!(u64).range(1..=EPISODES_MAX))]
+    episodes: u64,
+    /// Show this run's episodes beside them: the same task, the same seeds. Of its policies the
+    /// best or the latest; the best where --policy is a version.
+    #[arg(long, value_name = "RUN2")]
+    compare: Option<PathBuf>,
+    /// Where the files go [default: videos in the run].
+    #[arg(long, value_name = "DIR")]
+    output: Option<PathBuf>,
+    /// Print one JSON object on standard output.
+    #[arg(long)]
+    json: bool,
+}
+
+pub(super) fn run(args: &RecordArgs) -> anyhow::Result<Outcome> {
+    let run = RunDirectory::open(&args.run)?;
+    let other = args.compare.as_deref().map(RunDirectory::open).transpose()?;
+    let mut sides = vec![(&run, run.choose_policy(args.policy)?)];
+    if let Some(other) = &other {
+        // A version is of one run; the other shows its best.
+        let choice = match args.policy {
+            PolicyChoice::Version(_) => PolicyChoice::Best,
+            choice => choice,
+        };
+        sides.push((other, other.choose_policy(choice)?));
+    }
+    let first_seed = match args.seed {
+        Some(seed) => seed,
+        None => run.config()?.evaluation.first_seed,
+    };
+    if first_seed.checked_add(args.episodes).is_none() {
+        return Err(wrong_use(format!("--seed {first_seed} leaves no seeds for its episodes")));
+    }
+    let (venv, python) = prepare_python_extra("video")?;
+    let plan = RecordPlan {
+        sides,
+        first_seed,
+        episodes: args.episodes,
+        output: args.output.clone().unwrap_or_else(|| run.path().join("videos")),
+        means: Means { program: this_program()?, venv },
+        python,
+    };
+    let progress = StagesProgress::new();
+    let made = record(&plan, &progress);
+    drop(progress);
+    let Some(recordings) = made? else { return Ok(Outcome::Interrupted) };
+    if args.json {
+        emit(&json(&recordings))?;
+    } else {
+        emit(&text(&recordings))?;
+        if recordings.sides[0].robot.goal_in_pictures.is_empty() {
+            say("whether the pictures show a goal is the environment's business: it does not say");
+        }
+    }
+    Ok(Outcome::Done)
+}
+
+fn json(recordings: &Recordings) -> String {
+    let mut object = serde_json::json!(recordings);
+    for (side, made) in recordings.sides.iter().enumerate() {
+        let episode = |episode: &RecordedEpisode| {
+            serde_json::json!({
+                "seed": episode.seed,
+                "return": episode.return_,
+                "success": episode.success,
+                "steps": episode.rewards.len(),
+                "frames": episode.frames.len(),
+            })
+        };
+        object["sides"][side]["episodes"] = made.episodes.iter().map(episode).collect();
+    }
+    object.to_string()
+}
+
+fn text(recordings: &Recordings) -> String {
+    let mut lines = Vec::new();
+    for side in &recordings.sides {
+        for episode in &side.episodes {
+            let success = match episode.success {
+                Some(true) => ", at the goal",
+                Some(false) => ", not at the goal",
+                None => "",
+            };
+            lines.push(format!(
+                "episode     {}: return {:.2}{success} ({})",
+                episode.seed, episode.return_, side.title
+            ));
+        }
+    }
+    for (what, path) in
+        [("video", &recordings.mp4), ("animation", &recordings.gif), ("frames", &recordings.strip)]
+    {
+        lines.push(format!("{what:<12}{}", shown(path)));
+    }
+    lines.join("\n")
+}

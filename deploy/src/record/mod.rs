@@ -1,0 +1,198 @@
+//! Videos of a policy's episodes, of one run or of two side by side.
+//!
+//! An observer for each run draws the episodes, then `envs_py/dmprl/film.py` makes video, animation
+//! and strip of the frames. Everything is made in a folder beside its place and moved there when it
+//! is whole.
+
+mod film_plan;
+
+use std::path::{Path, PathBuf};
+
+use anyhow::{Context, ensure};
+use serde::Serialize;
+
+use crate::failure::{Outcome, wrong_use};
+use crate::launch::{self, ObservationPlan};
+use crate::motion::{Means, Recorded, RecordedEpisode, Robot};
+use crate::run_directory::{ChosenPolicy, RunDirectory};
+use crate::terminal::StagesProgress;
+
+use film_plan::write;
+
+/// What to record.
+pub struct RecordPlan<'a> {
+    /// The runs, side by side, and which policy of each.
+    pub sides: Vec<(&'a RunDirectory, ChosenPolicy)>,
+    /// Episode i is reset with seed `first_seed + i`.
+    pub first_seed: u64,
+    /// How many, one after the other.
+    pub episodes: u64,
+    /// Where the files go.
+    pub output: PathBuf,
+    /// What observers are started with.
+    pub means: Means,
+    /// The interpreter that makes the video.
+    pub python: PathBuf,
+}
+
+/// What one side showed.
+#[derive(Debug, Serialize)]
+pub struct SideRecord {
+    /// The run.
+    pub run: PathBuf,
+    /// Version of the policy.
+    pub policy_version: u64,
+    /// What is written above the picture.
+    #[serde(skip)]
+    pub title: String,
+    /// What is known of the robot.
+    #[serde(skip)]
+    pub robot: Robot,
+    /// The episodes.
+    #[serde(skip)]
+    pub episodes: Vec<RecordedEpisode>,
+}
+
+/// What was made.
+#[derive(Debug, Serialize)]
+pub struct Recordings {
+    /// Whose.
+    pub sides: Vec<SideRecord>,
+    /// The video,
+    pub mp4: PathBuf,
+    /// the animation,
+    pub gif: PathBuf,
+    /// and frames in a row.
+    pub strip: PathBuf,
+}
+
+/// Records; none when the user interrupted it.
+///
+/// # Errors
+/// Wrong use for runs that cannot be compared; an environment that cannot be drawn, for want of
+/// OpenGL too; what the file system refuses.
+pub fn record(
+    plan: &RecordPlan<'_>,
+    progress: &StagesProgress,
+) -> anyhow::Result<Option<Recordings>> {
+    let mut task = None;
+    for (run, _) in &plan.sides {
+        let id = run.config()?.task.id;
+        let first = task.get_or_insert_with(|| id.clone());
+        if *first != id {
+            return Err(wrong_use(format!(
+                "{} is a run of {id}, not of {first}: an episode of the same seed would be another",
+                run.path().display()
+            )));
+        }
+    }
+    let cannot = || format!("cannot write into {}", plan.output.display());
+    std::fs::create_dir_all(&plan.output).with_context(cannot)?;
+    let workshop = tempfile::Builder::new()
+        .prefix(".recording-")
+        .tempdir_in(&plan.output)
+        .with_context(cannot)?;
+    let titles = titles(&plan.sides)?;
+    let mut sides = Vec::new();
+    for (index, title) in titles.into_iter().enumerate() {
+        let folder = workshop.path().join(index.to_string());
+        let Some(side) = observe(plan, index, (title, &folder), progress)? else {
+            return Ok(None);
+        };
+        sides.push(side);
+    }
+    progress.stage("making the video");
+    let name = name(plan);
+    let file = |ending: &str| workshop.path().join(format!("{name}{ending}"));
+    let made = [".mp4", ".gif", ".png"].map(file);
+    let film = write(&sides, &made, workshop.path())?;
+    let run = plan.sides[0].0;
+    if launch::film(run, &plan.python, &film, &|done, of| progress.at(done, of))?
+        == Outcome::Interrupted
+    {
+        return Ok(None);
+    }
+    let [mp4, gif, strip] = made.map(|path| {
+        let to = plan.output.join(path.file_name().unwrap_or_default());
+        std::fs::rename(&path, &to).map(|()| to)
+    });
+    let (mp4, gif, strip) =
+        (|| Ok::<_, std::io::Error>((mp4?, gif?, strip?)))().with_context(cannot)?;
+    Ok(Some(Recordings { sides, mp4, gif, strip }))
+}
+
+/// Draws the episodes of one side.
+fn observe(
+    plan: &RecordPlan<'_>,
+    index: usize,
+    (title, folder): (String, &Path),
+    progress: &StagesProgress,
+) -> anyhow::Result<Option<SideRecord>> {
+    let (run, chosen) = &plan.sides[index];
+    let pictures = folder.join("pictures");
+    std::fs::create_dir_all(&pictures)
+        .with_context(|| format!("cannot make {}", pictures.display()))?;
+    let output = folder.join("episodes.jsonl");
+    progress.stage(&format!("drawing {title}"));
+    let episode_steps = run.spec()?.map_or(0, |spec| u64::from(spec.episode_steps));
+    let told = |episodes: u64, steps: u64| {
+        progress.at(episodes * episode_steps + steps, plan.episodes * episode_steps);
+    };
+    let observation = ObservationPlan {
+        program: plan.means.program.clone(),
+        run,
+        venv: Some(plan.means.venv.clone()),
+        policy_version: chosen.version,
+        first_seed: plan.first_seed,
+        episodes: plan.episodes,
+        output: output.clone(),
+        pictures: Some(pictures),
+    };
+    if launch::observe(observation, &told)? == Outcome::Interrupted {
+        return Ok(None);
+    }
+    let mut recorded = Recorded::open(&output)?;
+    let mut episodes = Vec::new();
+    while let Some(episode) = recorded.next_episode()? {
+        ensure!(!episode.frames.is_empty(), "the episode of seed {} has no frame", episode.seed);
+        episodes.push(episode);
+    }
+    let (run, robot) = (run.path().to_owned(), recorded.robot);
+    Ok(Some(SideRecord { run, policy_version: chosen.version, title, robot, episodes }))
+}
+
+/// What tells the sides apart: the method, or the run's name where that is the same.
+fn titles(sides: &[(&RunDirectory, ChosenPolicy)]) -> anyhow::Result<Vec<String>> {
+    let mut methods = Vec::new();
+    for (run, _) in sides {
+        let config = run.config()?;
+        let algorithm = format!("{:?}", config.algorithm.name).to_lowercase();
+        let policy = format!("{:?}", config.policy.kind).to_lowercase();
+        let task = if config.task.name.is_empty() { &config.task.id } else { &config.task.name };
+        methods.push(format!("{task} · {algorithm} · {policy}"));
+    }
+    let same = methods.iter().skip(1).any(|method| *method == methods[0]);
+    let titled = sides.iter().zip(methods).map(|((run, chosen), method)| {
+        let name = run.path().file_name().unwrap_or_default().to_string_lossy().into_owned();
+        let steps = chosen.row.as_ref().map_or_else(String::new, |row| {
+            format!(" · {} steps", crate::terminal::grouped(row.env_steps))
+        });
+        format!("{}{steps}", if same { name } else { method })
+    });
+    Ok(titled.collect())
+}
+
+/// A file's name that tells what it shows.
+fn name(plan: &RecordPlan<'_>) -> String {
+    let (_, chosen) = &plan.sides[0];
+    let beside = plan.sides.iter().skip(1).map(|(run, chosen)| {
+        let name = run.path().file_name().unwrap_or_default().to_string_lossy().into_owned();
+        format!("-beside-{}-policy-{}", crate::run_directory::safe_name(&name), chosen.version)
+    });
+    let beside: String = beside.collect();
+    let seeds = match plan.episodes {
+        1 => format!("seed-{}", plan.first_seed),
+        count => format!("seeds-{}-{}", plan.first_seed, plan.first_seed + count - 1),
+    };
+    format!("policy-{}{beside}-{seeds}", chosen.version)
+}
