@@ -6,22 +6,26 @@ use std::time::SystemTime;
 use anyhow::Context;
 use clap::Args;
 
-use super::emit;
+use super::{emit, prepare_python, this_program};
 use crate::failure::Outcome;
-use crate::report::{Report, Results, curves, tables};
+use crate::motion::Means;
+use crate::report::{
+    Report, Results, curves, efficiency, judge, measure_motions, tables, trajectories, unmeasured,
+};
 use crate::run_directory::rfc3339;
 use crate::terminal::{say, shown};
 
 const HELP: &str = "\
-Writes index.html (one page that needs nothing else), report.md, figures.csv, runs.csv and
-curves/*.svg. Tables give mean and standard deviation over seeds, and the interquartile mean with a
+Writes index.html (one page that needs nothing else), report.md, figures.csv, runs.csv, curves.json
+and every picture as SVG and PNG. Tables give mean and standard deviation over seeds, and the interquartile mean with a
 95 % interval by stratified bootstrap (Agarwal et al. 2021), beside the paper's figures where the
 task and the method are the paper's. Only runs that have come to their end count in a table.
+How a run moves is measured once, by rolling its last policy out, and kept in the run.
 
 EXAMPLES
   dmprl report runs/paper
   dmprl report runs/reacher-s1 runs/reacher-s2 runs/reacher-s3 --output report
-  dmprl report runs/paper --json";
+  dmprl report runs/paper --no-motion --json";
 
 /// Arguments of `dmprl report`.
 #[derive(Debug, Args)]
@@ -33,13 +37,19 @@ pub(super) struct ReportArgs {
     /// Where the report goes [default: SWEEP/report for one sweep, else report].
     #[arg(long, value_name = "DIR")]
     output: Option<PathBuf>,
+    /// Measure no motion; what was measured before is shown.
+    #[arg(long)]
+    no_motion: bool,
     /// Print the tables as one JSON object on standard output, too.
     #[arg(long)]
     json: bool,
 }
 
 pub(super) fn run(args: &ReportArgs) -> anyhow::Result<Outcome> {
-    let results = Results::read(&args.runs)?;
+    let mut results = Results::read(&args.runs)?;
+    if !args.no_motion && measure(&mut results)? == Outcome::Interrupted {
+        return Ok(Outcome::Interrupted);
+    }
     let of_one = |path: &PathBuf| path.join("sweep.toml").is_file().then(|| path.join("report"));
     let output = match (&args.output, args.runs.as_slice()) {
         (Some(output), _) => output.clone(),
@@ -47,7 +57,13 @@ pub(super) fn run(args: &ReportArgs) -> anyhow::Result<Outcome> {
         (None, _) => PathBuf::from("report"),
     };
     let tables = tables(&results);
-    let json = serde_json::json!({ "methods": results.methods, "tables": tables });
+    let (efficiency, judged) = (efficiency(&results), judge(&results));
+    let json = serde_json::json!({
+        "methods": results.methods,
+        "tables": tables,
+        "efficiency": efficiency,
+        "statements": judged,
+    });
     let names: Vec<_> = args.runs.iter().map(|path| path.display().to_string()).collect();
     let title = match results.tasks.as_slice() {
         [task] => format!("{task}: {}", results.methods.join(", ")),
@@ -59,8 +75,11 @@ pub(super) fn run(args: &ReportArgs) -> anyhow::Result<Outcome> {
         made: rfc3339(SystemTime::now()),
         commit: crate::project::git_commit(),
         curves: curves(&results)?,
+        trajectories: trajectories(&results)?,
         results,
         tables,
+        efficiency,
+        judged,
     };
     report.write(&output).with_context(|| format!("no report in {}", output.display()))?;
     if args.json {
@@ -68,4 +87,22 @@ pub(super) fn run(args: &ReportArgs) -> anyhow::Result<Outcome> {
     }
     say(&format!("written: {}", shown(&output.join("index.html"))));
     Ok(Outcome::Done)
+}
+
+/// Rolls out what nobody has; a report without motion is better than none.
+fn measure(results: &mut Results) -> anyhow::Result<Outcome> {
+    if unmeasured(results) == 0 {
+        return Ok(Outcome::Done);
+    }
+    let outcome = match prepare_python() {
+        Ok(venv) => measure_motions(results, &Means { program: this_program()?, venv }),
+        Err(error) => {
+            results.unmeasured.push(format!("all of them: {error:#}"));
+            Outcome::Done
+        }
+    };
+    for reason in &results.unmeasured {
+        say(&format!("motion not measured: {reason}"));
+    }
+    Ok(outcome)
 }

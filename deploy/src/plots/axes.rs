@@ -25,6 +25,8 @@ pub(crate) struct Axes<'t> {
     pub(crate) steps_max: f64,
     /// The lowest and the highest value.
     pub(crate) values: Range<f64>,
+    /// Left free to the right of them.
+    pub(crate) beside: u32,
 }
 
 impl Axes<'_> {
@@ -39,7 +41,7 @@ impl Axes<'_> {
         let mut chart = ChartBuilder::on(area)
             .caption(self.title, ("sans-serif", 20))
             .margin(16)
-            .margin_right(40)
+            .margin_right(self.beside)
             .x_label_area_size(44)
             .y_label_area_size(64)
             .build_cartesian_2d(0.0..self.steps_max, (low - margin)..(high + margin))?;

@@ -13,6 +13,8 @@ use crate::terminal::std_of;
 /// Blue of the Okabe-Ito palette, told apart with every common colour vision.
 const BLUE: RGBColor = RGBColor(0, 114, 178);
 const SIZE: (u32, u32) = (800, 480);
+/// Half of the last step's label.
+const BESIDE: u32 = 40;
 
 /// Draws `plots/learning_curve.svg`; nothing while there is no evaluation.
 ///
@@ -43,7 +45,8 @@ fn draw(rows: &[EvaluationRow], title: &str) -> Result<String, Box<dyn std::erro
     {
         let area = SVGBackend::with_string(&mut svg, SIZE).into_drawing_area();
         let what = "evaluation return";
-        let mut chart = Axes { title, what, steps_max, values: low..high }.draw(&area)?;
+        let axes = Axes { title, what, steps_max, values: low..high, beside: BESIDE };
+        let mut chart = axes.draw(&area)?;
         let above = points.iter().map(|&(steps, mean, std)| (steps, mean + std));
         let below = points.iter().rev().map(|&(steps, mean, std)| (steps, mean - std));
         let band: Vec<_> = above.chain(below).collect();

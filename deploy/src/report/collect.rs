@@ -7,9 +7,14 @@ use dmprl_shared::config::{AlgorithmName, ExperimentConfig, PolicyKind};
 
 use crate::control::EvaluationRow;
 use crate::failure::wrong_use;
-use crate::run_directory::RunDirectory;
+use crate::motion::Motion;
+use crate::run_directory::{Machine, Manifest, RunDirectory, Session};
 use crate::sweep::search::found;
 use crate::sweep::{Ledger, Plan, SweepFile};
+use crate::terminal::binary_bytes;
+
+/// Of a commit's hash, enough to find it.
+const HASH_LEN: usize = 12;
 
 /// One run and its evaluations.
 #[derive(Debug, Clone)]
@@ -24,8 +29,51 @@ pub struct Run {
     pub path: PathBuf,
     /// Whether it has come to its end.
     pub ended: bool,
+    /// Environment steps that it was asked for.
+    pub steps: u64,
+    /// Who made it, where and when.
+    pub origin: Origin,
     /// Oldest first.
     pub rows: Vec<EvaluationRow>,
+    /// How its last policy moves, where that was measured.
+    pub motion: Option<Motion>,
+}
+
+/// Who made a run, where and when.
+#[derive(Debug, Clone, Default, PartialEq)]
+pub struct Origin {
+    /// UTC, RFC 3339, of its first session.
+    pub started: String,
+    /// Versions of the program, with the commit where it is known; one a session.
+    pub programs: Vec<String>,
+    /// Processor, cores and memory.
+    pub machine: String,
+}
+
+impl Origin {
+    fn of(manifest: &Manifest) -> Self {
+        let program = |session: &Session| match &session.git_commit {
+            Some(commit) => {
+                let (hash, dirty) = commit.split_once('-').unwrap_or((commit, ""));
+                let hash: String = hash.chars().take(HASH_LEN).collect();
+                let dirty = if dirty.is_empty() { "" } else { ", changed since" };
+                format!("{} (commit {hash}{dirty})", session.dmprl_version)
+            }
+            None => session.dmprl_version.clone(),
+        };
+        let Machine { os, cpu, cores, memory_bytes } = &manifest.machine;
+        let cpu = cpu.as_deref().unwrap_or("unknown processor");
+        let memory = memory_bytes.map(|bytes| format!(", {}", binary_bytes(bytes)));
+        Self {
+            started: manifest
+                .sessions
+                .first()
+                .map(|first| first.started.clone())
+                .unwrap_or_default(),
+            programs: manifest.sessions.iter().map(program).collect(),
+            machine: format!("{cpu}, {cores} cores{}, {os}", memory.unwrap_or_default()),
+        }
+    }
 }
 
 impl Run {
@@ -45,6 +93,12 @@ pub struct Results {
     pub methods: Vec<String>,
     /// Those that have begun.
     pub runs: Vec<Run>,
+    /// How many there are to be.
+    pub planned: usize,
+    /// The files of the sweeps, by the names of their directories.
+    pub sweeps: Vec<(String, String)>,
+    /// Runs whose motion could not be measured, and why.
+    pub unmeasured: Vec<String>,
 }
 
 impl Results {
@@ -64,6 +118,7 @@ impl Results {
         if results.runs.iter().all(|run| run.rows.is_empty()) {
             return Err(wrong_use("no run has an evaluation yet: there is nothing to report"));
         }
+        super::motion::read_motions(&mut results)?;
         Ok(results)
     }
 
@@ -73,7 +128,9 @@ impl Results {
     }
 
     fn add_sweep(&mut self, sweep: &Path) -> anyhow::Result<()> {
-        let (file, _) = SweepFile::read(&sweep.join("sweep.toml"))?;
+        let (file, text) = SweepFile::read(&sweep.join("sweep.toml"))?;
+        let name = sweep.file_name().map(|name| name.to_string_lossy().into_owned());
+        self.sweeps.push((name.unwrap_or_default(), text));
         let ledger = Ledger::open(sweep)?;
         if let Some(search) = &file.search {
             // What it found: dozens of trials side by side would be no comparison of methods.
@@ -81,6 +138,7 @@ impl Results {
                 let method = format!("{}, best trial", found.method);
                 self.add_planned(&found.task, &method);
                 for run in &found.runs {
+                    self.planned += 1;
                     self.add_begun(sweep, &ledger, run, &method)?;
                 }
             }
@@ -89,6 +147,7 @@ impl Results {
         for planned in Plan::new(&file)?.runs {
             let point = planned.point.iter().map(|value| format!(", {value}"));
             let method = format!("{}{}", planned.method, point.collect::<String>());
+            self.planned += 1;
             self.add_planned(&planned.task, &method);
             self.add_begun(sweep, &ledger, &planned.directory, &method)?;
         }
@@ -128,6 +187,7 @@ impl Results {
         let run = run(&directory, &config, label(&config))?;
         add_new(&mut self.tasks, &run.task);
         add_new(&mut self.methods, &run.method);
+        self.planned += 1;
         self.runs.push(run);
         Ok(())
     }
@@ -147,8 +207,9 @@ fn run(directory: &RunDirectory, config: &ExperimentConfig, method: String) -> a
             || row.return_mean >= config.run.until_return
             || row.success_rate.is_some_and(|rate| rate >= config.run.until_success)
     });
-    let (task, seed) = (config.task.name.clone(), config.run.seed);
-    Ok(Run { task, method, seed, path, ended, rows })
+    let (task, seed, steps) = (config.task.name.clone(), config.run.seed, config.run.steps);
+    let origin = Origin::of(&directory.manifest()?);
+    Ok(Run { task, method, seed, path, ended, steps, origin, rows, motion: None })
 }
 
 /// What a run is called that no sweep has named.

@@ -4,36 +4,19 @@ use anyhow::anyhow;
 use plotters::prelude::*;
 
 use super::collect::{Results, Run};
-use crate::control::EvaluationRow;
-use crate::plots::{Axes, Chart};
+use super::measures::Measure;
+use super::paper::reported;
+use super::sections::Picture;
+use crate::plots::{Axes, Chart, colour};
+use crate::run_directory::safe_name;
 
-const SIZE: (u32, u32) = (900, 520);
-/// Okabe and Ito's palette, told apart with every common colour vision; the yellow, which is hard
-/// to see on white, darker.
-const COLOURS: [RGBColor; 8] = [
-    RGBColor(0, 114, 178),
-    RGBColor(213, 94, 0),
-    RGBColor(0, 158, 115),
-    RGBColor(204, 121, 167),
-    RGBColor(230, 159, 0),
-    RGBColor(86, 180, 233),
-    RGBColor(0, 0, 0),
-    RGBColor(150, 140, 0),
-];
-/// Methods that have the same colour in every report.
-const KNOWN: [&str; 8] =
-    ["DDPG-DMP", "DDPG-DMP (paper)", "TD3-DMP", "SAC-DMP", "DDPG", "TD3", "SAC", "NDP"];
-
-/// A picture of one task.
-#[derive(Debug, Clone)]
-pub struct Curves {
-    /// The task.
-    pub task: String,
-    /// What stands on the vertical axis.
-    pub what: &'static str,
-    /// The picture.
-    pub svg: String,
-}
+/// Of the plot with its axes.
+const SIZE: (u32, u32) = (760, 520);
+/// For the methods' names, which would hide lines if they stood among them: before and behind
+/// them, a letter, and at most.
+const BESIDE: (u32, u32, u32) = (76, 7, 480);
+/// Between two of the names.
+const LINE_HEIGHT: i32 = 24;
 
 /// One method's line: (environment steps, mean, lowest, highest) over its seeds.
 type Line = Vec<(f64, f64, f64, f64)>;
@@ -42,29 +25,25 @@ type Line = Vec<(f64, f64, f64, f64)>;
 ///
 /// # Errors
 /// The picture cannot be drawn.
-pub fn curves(results: &Results) -> anyhow::Result<Vec<Curves>> {
+pub fn curves(results: &Results) -> anyhow::Result<Vec<Picture>> {
     let mut curves = Vec::new();
     for task in &results.tasks {
-        let of_return: fn(&EvaluationRow) -> Option<f64> = |row| Some(row.return_mean);
-        let of_success: fn(&EvaluationRow) -> Option<f64> = |row| row.success_rate;
-        for (what, of) in [("evaluation return", of_return), ("success rate", of_success)] {
-            let lines: Vec<(usize, &str, Line)> = results
-                .methods
-                .iter()
-                .enumerate()
-                .map(|(index, method)| {
-                    let begun = |run: &&Run| !run.rows.is_empty();
-                    let runs: Vec<&Run> = results.of(task, method).filter(begun).collect();
-                    (index, method.as_str(), line(&runs, of))
-                })
-                .filter(|(_, _, line)| !line.is_empty())
+        for (what, measure) in
+            [("evaluation return", Measure::Return), ("success rate", Measure::Success)]
+        {
+            let methods = results.methods.iter().enumerate();
+            let lines: Vec<Drawn> = methods
+                .map(|(index, method)| Drawn::of(results, (task, method), measure, index))
+                .filter(|drawn| !drawn.line.is_empty())
                 .collect();
             if lines.is_empty() {
                 continue;
             }
             let svg = draw(task, what, &lines)
                 .map_err(|error| anyhow!("cannot draw the curves of {task}: {error}"))?;
-            curves.push(Curves { task: task.clone(), what, svg });
+            let path = format!("curves/{}-{}", safe_name(task), what.replace(' ', "-"));
+            let alt = format!("{task}: {what} over environment steps");
+            curves.push(Picture { path, alt, svg });
         }
     }
     Ok(curves)
@@ -72,10 +51,11 @@ pub fn curves(results: &Results) -> anyhow::Result<Vec<Curves>> {
 
 /// The n-th evaluation of each seed belongs together: all are made after the same steps but for
 /// the rest of a segment. A line ends where the first seed's does, so no mean changes its members.
-fn line(runs: &[&Run], of: fn(&EvaluationRow) -> Option<f64>) -> Line {
+fn line(runs: &[&Run], measure: Measure) -> Line {
     let rows = runs.iter().map(|run| run.rows.len()).min().unwrap_or(0);
     let at = |index: usize| {
-        let values: Option<Vec<f64>> = runs.iter().map(|run| of(&run.rows[index])).collect();
+        let values: Option<Vec<f64>> =
+            runs.iter().map(|run| measure.of_row(&run.rows[index])).collect();
         let values = values?;
         let count = runs.len() as f64;
         let steps = runs.iter().map(|run| run.rows[index].env_steps as f64).sum::<f64>() / count;
@@ -87,55 +67,95 @@ fn line(runs: &[&Run], of: fn(&EvaluationRow) -> Option<f64>) -> Line {
     (0..rows).map_while(at).collect()
 }
 
-fn colour(index: usize, method: &str) -> RGBColor {
-    let known = KNOWN.iter().position(|known| *known == method);
-    COLOURS[known.unwrap_or(index) % COLOURS.len()]
+/// A method's line and what the paper has at its end.
+struct Drawn {
+    label: String,
+    colour: RGBColor,
+    line: Line,
+    paper: Option<f64>,
 }
 
-fn draw(
-    task: &str,
-    what: &str,
-    lines: &[(usize, &str, Line)],
-) -> Result<String, Box<dyn std::error::Error>> {
-    let points = || lines.iter().flat_map(|(_, _, line)| line);
+impl Drawn {
+    /// Of the runs at their end, so that a seed that has just begun cuts nothing short; of those
+    /// under way while there are no others.
+    fn of(results: &Results, (task, method): (&str, &str), measure: Measure, index: usize) -> Self {
+        let mut runs: Vec<&Run> = results.of(task, method).filter(|run| run.ended).collect();
+        if runs.is_empty() {
+            runs = results.of(task, method).filter(|run| !run.rows.is_empty()).collect();
+        }
+        let paper = measure.in_paper().and_then(|figure| reported(figure, task, method));
+        Self {
+            label: format!("{method} · n = {}", runs.len()),
+            colour: colour(index, method),
+            line: line(&runs, measure),
+            paper: paper.map(|(mean, _)| mean),
+        }
+    }
+}
+
+fn draw(task: &str, what: &str, lines: &[Drawn]) -> Result<String, Box<dyn std::error::Error>> {
+    let points = || lines.iter().flat_map(|drawn| &drawn.line);
+    let papers = || lines.iter().filter_map(|drawn| drawn.paper);
     let steps_max = points().map(|point| point.0).fold(1.0, f64::max);
-    let low = points().map(|point| point.2).fold(f64::INFINITY, f64::min);
-    let high = points().map(|point| point.3).fold(f64::NEG_INFINITY, f64::max);
+    let low = points().map(|point| point.2).chain(papers()).fold(f64::INFINITY, f64::min);
+    let high = points().map(|point| point.3).chain(papers()).fold(f64::NEG_INFINITY, f64::max);
     let mut svg = String::new();
     {
-        let area = SVGBackend::with_string(&mut svg, SIZE).into_drawing_area();
-        let mut chart = Axes { title: task, what, steps_max, values: low..high }.draw(&area)?;
-        for (index, method, line) in lines {
-            draw_line(&mut chart, colour(*index, method), method, line)?;
+        let letters = lines.iter().map(|drawn| drawn.label.chars().count()).max().unwrap_or(0);
+        let beside = (BESIDE.0 + BESIDE.1 * letters as u32).min(BESIDE.2);
+        let size = (SIZE.0 + beside, SIZE.1);
+        let area = SVGBackend::with_string(&mut svg, size).into_drawing_area();
+        let axes = Axes { title: task, what, steps_max, values: low..high, beside };
+        let mut chart = axes.draw(&area)?;
+        for drawn in lines {
+            draw_line(&mut chart, drawn)?;
         }
-        chart
-            .configure_series_labels()
-            .position(SeriesLabelPosition::LowerRight)
-            .legend_area_size(30)
-            .margin(14)
-            .background_style(WHITE.mix(0.85))
-            .border_style(BLACK.mix(0.2))
-            .label_font(("sans-serif", 14))
-            .draw()?;
+        let plotted = chart.plotting_area().get_pixel_range();
+        let (right, top) = (plotted.0.end, plotted.1.start);
+        for drawn in lines {
+            if let Some(paper) = drawn.paper {
+                let (_, y) = chart.backend_coord(&(steps_max, paper));
+                area.draw(&triangle((right + 4, y), drawn.colour))?;
+            }
+        }
+        let words = |text: &str, at: (i32, i32)| {
+            let style = ("sans-serif", 14).into_font().color(&BLACK.mix(0.85));
+            area.draw_text(text, &style, at)
+        };
+        let mut y = top + 4;
+        for Drawn { label, colour, .. } in lines {
+            let stroke = vec![(right + 28, y + 7), (right + 50, y + 7)];
+            area.draw(&PathElement::new(stroke, colour.stroke_width(3)))?;
+            words(label, (right + 56, y))?;
+            y += LINE_HEIGHT;
+        }
+        if papers().next().is_some() {
+            area.draw(&triangle((right + 34, y + 7), RGBColor(90, 90, 90)))?;
+            words("the paper's end", (right + 56, y))?;
+        }
         area.present()?;
     }
     Ok(svg)
 }
 
+/// Points at the plot from its right edge.
+fn triangle((x, y): (i32, i32), colour: RGBColor) -> Polygon<(i32, i32)> {
+    Polygon::new(vec![(x, y), (x + 10, y - 5), (x + 10, y + 5)], colour.filled())
+}
+
 fn draw_line(
     chart: &mut Chart<'_, '_>,
-    colour: RGBColor,
-    method: &str,
-    line: &Line,
+    Drawn { colour, line, .. }: &Drawn,
 ) -> Result<(), Box<dyn std::error::Error>> {
     let above = line.iter().map(|&(steps, _, _, high)| (steps, high));
     let below = line.iter().rev().map(|&(steps, _, low, _)| (steps, low));
     let band: Vec<_> = above.chain(below).collect();
     chart.draw_series(std::iter::once(Polygon::new(band, colour.mix(0.15))))?;
     let mean = line.iter().map(|&(steps, mean, _, _)| (steps, mean));
-    let series = chart.draw_series(LineSeries::new(mean, colour.stroke_width(2)))?;
-    series
-        .label(method)
-        .legend(move |(x, y)| PathElement::new(vec![(x, y), (x + 20, y)], colour.stroke_width(2)));
+    chart.draw_series(LineSeries::new(mean.clone(), colour.stroke_width(2)))?;
+    if let [only] = line.as_slice() {
+        // A line of one point is none.
+        chart.draw_series(std::iter::once(Circle::new((only.0, only.1), 3, colour.filled())))?;
+    }
     Ok(())
 }

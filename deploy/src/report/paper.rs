@@ -19,6 +19,9 @@ const SUCCESS: [Row; 2] = [
     Row("panda-reach-joints", [(0.99, 0.01), (0.0, 0.0), (0.92, 0.01), (0.85, 0.41), (0.0, 0.0)]),
 ];
 
+/// Trials behind each of its figures.
+pub const SEEDS: usize = 5;
+
 /// The columns of both.
 const METHODS: [&str; 5] = ["DDPG-DMP (paper)", "DDPG", "TD3", "SAC", "NDP"];
 

@@ -55,27 +55,51 @@ pub fn interquartile_mean(scores: &mut [f64]) -> f64 {
     middle.iter().sum::<f64>() / middle.len() as f64
 }
 
-/// The interquartile mean over all scores, and its 95 % interval.
+/// The interquartile mean over all scores, and its 95 % interval by [`bootstrap`].
 ///
-/// The bootstrap is stratified: the runs of each task are drawn anew from those of the same task.
-/// Its random numbers are always the same.
 /// - `scores`: (task, run), at least one.
 #[must_use]
 pub fn interquartile_mean_with_interval(scores: &[Vec<f64>]) -> (f64, [f64; 2]) {
+    bootstrap(scores, interquartile_mean)
+}
+
+/// The median, and its 95 % interval by [`bootstrap`]. Unlike a mean it stays a number while fewer
+/// than half of the scores are infinite.
+///
+/// - `scores`: at least one; infinite for what never came.
+#[must_use]
+pub fn median_with_interval(scores: &[f64]) -> (f64, [f64; 2]) {
+    bootstrap(&[scores.to_vec()], |scores| {
+        scores.sort_by(f64::total_cmp);
+        let upper = scores.len() / 2;
+        let lower = scores.len().div_ceil(2) - 1;
+        f64::midpoint(scores[lower], scores[upper])
+    })
+}
+
+/// A statistic of all scores, and the interval in which 95 % of its resamplings lie.
+///
+/// The bootstrap is stratified: the runs of each task are drawn anew from those of the same task.
+/// Its random numbers are always the same.
+fn bootstrap(scores: &[Vec<f64>], statistic: fn(&mut [f64]) -> f64) -> (f64, [f64; 2]) {
     let mut drawn: Vec<f64> = scores.concat();
-    let point = interquartile_mean(&mut drawn);
+    let point = statistic(&mut drawn);
+    if scores.iter().all(|runs| runs.iter().all(|score| *score == runs[0])) {
+        // Nothing else can be drawn.
+        return (point, [point; 2]);
+    }
     let mut random = seeds::stream(0, "bootstrap", 0);
-    let mut means: Vec<f64> = (0..REPETITIONS)
+    let mut values: Vec<f64> = (0..REPETITIONS)
         .map(|_| {
             drawn.clear();
             for runs in scores {
                 drawn.extend((0..runs.len()).map(|_| runs[random.random_range(0..runs.len())]));
             }
-            interquartile_mean(&mut drawn)
+            statistic(&mut drawn)
         })
         .collect();
-    means.sort_by(f64::total_cmp);
-    (point, QUANTILES.map(|quantile| quantile_of(&means, quantile)))
+    values.sort_by(f64::total_cmp);
+    (point, QUANTILES.map(|quantile| quantile_of(&values, quantile)))
 }
 
 /// Between two sorted values linearly, as numpy's default.
@@ -83,6 +107,10 @@ fn quantile_of(sorted: &[f64], quantile: f64) -> f64 {
     let place = quantile * (sorted.len() - 1) as f64;
     let (below, share) = (place.floor() as usize, place.fract());
     let above = (below + 1).min(sorted.len() - 1);
+    if sorted[below] == sorted[above] {
+        // Two infinite ones have no difference.
+        return sorted[below];
+    }
     sorted[below] + share * (sorted[above] - sorted[below])
 }
 
@@ -132,5 +160,16 @@ mod tests {
         let summary = Summary::of(&[1.0, 2.0, 3.0, 10.0]).unwrap();
         assert_eq!((summary.mean, summary.iqm), (4.0, 2.5));
         assert!((summary.std - (50.0_f64 / 3.0).sqrt()).abs() < 1e-12);
+    }
+
+    #[test]
+    fn a_median_takes_what_never_came_for_later_than_everything() {
+        let never = f64::INFINITY;
+        assert_eq!(median_with_interval(&[3.0, 1.0, 2.0]), (2.0, [1.0, 3.0]));
+        assert_eq!(median_with_interval(&[1.0, 2.0]).0, 1.5);
+        assert_eq!(median_with_interval(&[7.0]), (7.0, [7.0, 7.0]));
+        assert_eq!(median_with_interval(&[never, 1.0, 2.0]), (2.0, [1.0, never]));
+        assert_eq!(median_with_interval(&[never, 1.0, never]), (never, [1.0, never]));
+        assert_eq!(median_with_interval(&[never, never]), (never, [never, never]));
     }
 }

@@ -2,10 +2,21 @@
 
 use serde::Serialize;
 
-use super::collect::{Results, Run};
-use super::paper::{Figure, reported};
+use super::collect::Results;
+use super::measures::Measure;
+use super::paper::reported;
 use super::statistics::Summary;
-use crate::control::EvaluationRow;
+
+/// What a table is about.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum TableKind {
+    /// What was learnt.
+    Result,
+    /// How it moves.
+    Smoothness,
+    /// What training took.
+    Cost,
+}
 
 /// One table: a cell for each task and method.
 #[derive(Debug, Clone, Serialize)]
@@ -13,9 +24,12 @@ pub struct Table {
     /// What it shows.
     pub title: &'static str,
     /// How it was measured.
-    pub about: String,
+    pub about: &'static str,
     /// Digits behind the point.
     pub digits: usize,
+    /// Where it stands in the report.
+    #[serde(skip)]
+    pub kind: TableKind,
     /// (task, its cells in the order of the methods).
     pub rows: Vec<(String, Vec<Cell>)>,
 }
@@ -27,6 +41,8 @@ pub struct Cell {
     pub summary: Option<Summary>,
     /// Seeds that are not at their end.
     pub unfinished: usize,
+    /// Seeds at their end of which the figure is not known.
+    pub unknown: usize,
     /// Mean and spread in the paper.
     pub paper: Option<(f64, f64)>,
 }
@@ -37,6 +53,7 @@ impl Cell {
     pub fn lines(&self, digits: usize) -> Vec<String> {
         let mut lines = Vec::new();
         match &self.summary {
+            None if self.unknown > 0 => lines.push("not measured".to_owned()),
             None if self.unfinished > 0 => lines.push("not finished".to_owned()),
             None => lines.push("not run".to_owned()),
             Some(Summary { count, mean, std, iqm, interval: [low, high] }) => {
@@ -56,85 +73,69 @@ impl Cell {
 /// Every table that the runs have something for.
 #[must_use]
 pub fn tables(results: &Results) -> Vec<Table> {
-    let at_end = |of: fn(&EvaluationRow) -> Option<f64>| move |run: &Run| run.last().and_then(of);
-    let all = [
-        table(
-            results,
-            "Average return",
-            "Of the evaluation at the end of each run, without noise.".to_owned(),
-            2,
-            &at_end(|row| Some(row.return_mean)),
-            Some(Figure::Return),
-        ),
-        table(
-            results,
-            "Success rate",
-            "Share of the last evaluation's episodes that end in success.".to_owned(),
-            2,
-            &at_end(|row| row.success_rate),
-            Some(Figure::Success),
-        ),
-        table(
-            results,
-            "Smoothness",
-            "Mean absolute change of an action between two steps in the last evaluation, actions \
-             scaled to [-1, 1]; lower is smoother."
-                .to_owned(),
-            3,
-            &at_end(|row| Some(row.smoothness)),
-            None,
-        ),
-        table(
-            results,
-            "Decisions",
-            "Segments decided upon in training; an mlp policy decides in every step.".to_owned(),
-            0,
-            &at_end(|row| Some(row.segments as f64)),
-            None,
-        ),
-        table(
-            results,
-            "Updates",
-            "Of the learner, in training.".to_owned(),
-            0,
-            &at_end(|row| Some(row.updates as f64)),
-            None,
-        ),
-        table(
-            results,
-            "Training time [s]",
-            "Wall clock of a run; several ran side by side where the machine had cores.".to_owned(),
-            0,
-            &at_end(|row| Some(row.wall_s)),
-            None,
-        ),
-    ];
     let shows = |table: &Table| {
         table.rows.iter().any(|(_, cells)| cells.iter().any(|cell| cell.summary.is_some()))
     };
-    all.into_iter().filter(shows).collect()
+    Measure::TABLES.into_iter().map(|measure| table(results, measure)).filter(shows).collect()
 }
 
-fn table(
-    results: &Results,
-    title: &'static str,
-    about: String,
-    digits: usize,
-    score: &dyn Fn(&Run) -> Option<f64>,
-    figure: Option<Figure>,
-) -> Table {
+fn table(results: &Results, measure: Measure) -> Table {
     let cell = |task: &str, method: &str| {
         let runs = || results.of(task, method);
-        let scores: Vec<f64> = runs().filter_map(score).collect();
+        let scores: Vec<f64> = runs().filter_map(|run| measure.of(run)).collect();
         Cell {
             summary: Summary::of(&scores),
             unfinished: runs().filter(|run| run.last().is_none()).count(),
-            paper: figure.and_then(|figure| reported(figure, task, method)),
+            unknown: runs().filter(|run| run.last().is_some() && measure.of(run).is_none()).count(),
+            paper: measure.in_paper().and_then(|figure| reported(figure, task, method)),
         }
     };
     let rows = results.tasks.iter().map(|task| {
         let cells = results.methods.iter().map(|method| cell(task, method));
-        (task.clone(), cells.collect())
+        (task.clone(), cells.collect::<Vec<_>>())
     });
-    Table { title, about, digits, rows: rows.collect() }
+    // A task that knows no success, say, has no row of it.
+    let tells = |(_, cells): &(String, Vec<Cell>)| {
+        cells.iter().any(|cell| cell.summary.is_some())
+            || cells.iter().all(|cell| cell.unknown == 0)
+    };
+    Table {
+        title: measure.title(),
+        about: measure.about(),
+        digits: measure.digits(),
+        kind: measure.kind(),
+        rows: rows.filter(tells).collect(),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::planted::{Planted, planted};
+    use super::*;
+
+    #[test]
+    fn a_task_without_success_has_no_row_of_it_and_what_was_not_run_says_so() {
+        let run = |task, method, ended| Planted { task, method, seed: 1, rows: vec![0.5], ended };
+        let results = planted(&[
+            run("reacher-v1", "TD3", true),
+            run("panda-reach", "TD3", true),
+            run("panda-reach", "SAC", false),
+            run("panda-reach-joints", "SAC", false),
+        ]);
+        let tables = tables(&results);
+        let table = |title: &str| tables.iter().find(|table| table.title == title).unwrap();
+        let rows = |title: &str| {
+            let rows = table(title).rows.iter().map(|(task, cells)| {
+                let first = cells.iter().map(|cell| cell.lines(2).swap_remove(0));
+                (task.as_str(), first.collect::<Vec<_>>())
+            });
+            rows.collect::<Vec<_>>()
+        };
+        let success = rows("Success rate");
+        assert_eq!(success.len(), 2, "{success:?}");
+        assert_eq!(success[0].1, ["0.50 ± 0.00", "not finished"]);
+        assert_eq!(success[1].1, ["not run", "not finished"]);
+        assert_eq!(rows("Average return")[0].1, ["0.50 ± 0.00", "not run"]);
+        assert!(tables.iter().all(|table| !table.rows.is_empty()));
+    }
 }

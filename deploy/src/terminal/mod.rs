@@ -1,6 +1,7 @@
 //! Stage 8 of 8, the part on screen: progress, messages, the summary. All of it on standard
 //! error; standard output is for results.
 
+mod count;
 mod display;
 mod format;
 mod rounds;
@@ -10,6 +11,7 @@ mod summary;
 mod sweep;
 mod trial;
 
+pub use count::CountProgress;
 pub use display::{Display, ProgressStyle};
 pub use format::{binary_bytes, duration, grouped, plus_minus, std_of};
 pub use rounds::RoundsProgress;

@@ -1,6 +1,7 @@
 //! `dmprl report` over runs and a sweep that were really trained.
 
 use std::fs;
+use std::path::Path;
 
 use dmprl_tests::program::Workplace;
 
@@ -20,7 +21,14 @@ fn a_sweep_is_reported_with_what_was_run_and_what_was_not() {
     let paper = "[[method]]\nname = 'ndp'\nlabel = 'NDP'\nalgo = 'ndp'\n";
     fs::write(place.path("two/sweep.toml"), format!("{head}{method}{paper}{set}")).unwrap();
 
+    let without = place.run(&["report", "two", "--no-motion", "--json"]).with_status(0).json();
+    let titles = |json: &serde_json::Value| -> Vec<String> {
+        let tables = json["tables"].as_array().unwrap().iter();
+        tables.map(|table| table["title"].as_str().unwrap().to_owned()).collect()
+    };
+    assert!(!titles(&without).iter().any(|title| title.contains("jerk")));
     let json = place.run(&["report", "two", "--json"]).with_status(0).json();
+    assert!(titles(&json).iter().any(|title| title == "Smoothness: joint jerk [rad/s³]"));
     assert_eq!(json["methods"], serde_json::json!(["TD3-DMP", "NDP"]));
     let returns = &json["tables"][0];
     assert_eq!(returns["title"], "Average return");
@@ -28,6 +36,15 @@ fn a_sweep_is_reported_with_what_was_run_and_what_was_not() {
     assert_eq!(cells[0]["summary"]["count"], 2);
     assert!(cells[1]["summary"].is_null());
     assert_eq!(cells[1]["paper"], serde_json::json!([-15.56, 1.47]));
+    // Two seeds that ended before they learnt anything: told, and nothing made of it.
+    let efficiency = &json["efficiency"][0];
+    assert_eq!(efficiency["threshold"], "return ≥ -10");
+    assert_eq!(efficiency["cells"][0]["steps"].as_array().unwrap().len(), 2);
+    let verdicts = json["statements"].as_array().unwrap().iter();
+    let verdicts: Vec<_> =
+        verdicts.map(|it| it["findings"][0]["verdict"].as_str().unwrap()).collect();
+    assert!(verdicts.contains(&"cannot_hold") && verdicts.contains(&"not_run"), "{verdicts:?}");
+    assert!(!verdicts.contains(&"held"), "{verdicts:?}");
 
     let read = |name: &str| fs::read_to_string(place.path(&format!("two/report/{name}"))).unwrap();
     let page = read("index.html");
@@ -35,8 +52,22 @@ fn a_sweep_is_reported_with_what_was_run_and_what_was_not() {
         assert!(page.contains(text), "{text} is not on the page");
     }
     assert!(!page.contains("http://") || !page.contains("src="), "the page needs nothing else");
+    for seed in [1, 2] {
+        let motion = place.path(&format!("two/reacher-v1/td3-dmp/seed-{seed}/motion.json"));
+        assert!(Path::new(&motion).is_file(), "{motion}: measured once, and kept");
+    }
+    assert!(read("joints/reacher-v1-velocity.svg").contains("joint velocity [rad/s]"));
+    assert!(Path::new(&place.path("two/report/joints/reacher-v1-position.png")).is_file());
+    for heading in ["What was run", "Sample efficiency", "What held of the paper"] {
+        assert!(page.contains(heading), "{heading} is not on the page");
+    }
     assert!(read("report.md").contains("| reacher-v1 |"));
     assert!(read("curves/reacher-v1-evaluation-return.svg").starts_with("<svg"));
+    let png = fs::read(place.path("two/report/curves/reacher-v1-evaluation-return.png")).unwrap();
+    assert_eq!(&png[1..4], b"PNG");
+    let curves: serde_json::Value = serde_json::from_str(&read("curves.json")).unwrap();
+    assert_eq!(curves["runs"].as_array().unwrap().len(), 2);
+    assert!(!curves["runs"][0]["return_mean"].as_array().unwrap().is_empty());
     // One line an evaluation of each seed, and a head.
     assert!(read("runs.csv").lines().count() > 2);
     assert!(read("figures.csv").contains("Average return,reacher-v1,NDP,0,,,,,,-15.56,1.47"));
@@ -48,9 +79,25 @@ fn what_is_no_run_or_has_no_evaluation_is_refused() {
     place.run(&["report", "nowhere"]).with_status(2).saying("nowhere");
     let run = place.path("run");
     let mut training = place.start(&train("reacher", &run, &["--steps", ENDLESS]));
-    training
-        .until("a run directory", |_| std::path::Path::new(&run).join("manifest.json").is_file());
+    training.until("a run directory", |_| Path::new(&run).join("manifest.json").is_file());
     training.signal_group(rustix::process::Signal::INT);
     training.wait();
     place.run(&["report", &run]).with_status(2).saying("no run has an evaluation");
+}
+
+#[test]
+fn a_run_whose_environment_is_gone_is_reported_without_its_motion() {
+    let place = Workplace::new();
+    let (run, folder) = (place.path("run"), place.path("envs"));
+    let example = dmprl_tests::project_root().join("docs/examples/point_reach.py");
+    fs::create_dir(&folder).unwrap();
+    fs::copy(example, format!("{folder}/point_reach.py")).unwrap();
+    let more = ["--steps", "1000", "--python-path", &folder];
+    place.run(&train("point_reach:PointReach-v0", &run, &more)).with_status(0);
+    fs::remove_dir_all(&folder).unwrap();
+    let ended = place.run(&["report", &run]).with_status(0);
+    ended.saying("motion not measured: point_reach:PointReach-v0").saying("python_path");
+    let page = fs::read_to_string(place.path("report/index.html")).unwrap();
+    assert!(page.contains("Motion is not measured of 1 run"), "the page says so too");
+    assert!(!page.contains("What held of the paper"), "a task of one's own is not the paper's");
 }

@@ -1,0 +1,25 @@
+//! One colour a method, the same in every picture.
+
+use plotters::style::RGBColor;
+
+/// Okabe and Ito's palette, told apart with every common colour vision; the yellow, which is hard
+/// to see on white, darker.
+const COLOURS: [RGBColor; 8] = [
+    RGBColor(0, 114, 178),
+    RGBColor(213, 94, 0),
+    RGBColor(0, 158, 115),
+    RGBColor(204, 121, 167),
+    RGBColor(230, 159, 0),
+    RGBColor(86, 180, 233),
+    RGBColor(0, 0, 0),
+    RGBColor(150, 140, 0),
+];
+/// Methods that have the same colour in every report.
+const KNOWN: [&str; 8] =
+    ["DDPG-DMP", "DDPG-DMP (paper)", "TD3-DMP", "SAC-DMP", "DDPG", "TD3", "SAC", "NDP"];
+
+/// The colour of a method, which is the report's `index`-th.
+pub(crate) fn colour(index: usize, method: &str) -> RGBColor {
+    let known = KNOWN.iter().position(|known| *known == method);
+    COLOURS[known.unwrap_or(index) % COLOURS.len()]
+}

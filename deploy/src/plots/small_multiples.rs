@@ -1,0 +1,181 @@
+//! Panels side by side on the same axes: what differs between them can be seen.
+
+use plotters::prelude::*;
+
+/// Panels in a row.
+const COLUMNS_MAX: usize = 4;
+/// Of a panel, with the room for its labels.
+const PANEL: (u32, u32) = (270, 210);
+/// For the title above and the axis' name below all of them.
+const TITLE_HEIGHT: u32 = 44;
+const FOOT_HEIGHT: u32 = 40;
+/// For the vertical axis' name, and for the names of the lines.
+const LEFT: u32 = 34;
+const RIGHT: u32 = 190;
+/// Between two names of lines.
+const LINE_HEIGHT: i32 = 22;
+/// Share of the spread left free above and below.
+const MARGIN: f64 = 0.05;
+const INK: RGBAColor = RGBAColor(0, 0, 0, 0.85);
+/// Viridis without its palest end: in order from first to last, whatever one's colour vision, and
+/// none of the methods' colours.
+const COLOURS: [RGBColor; 7] = [
+    RGBColor(68, 1, 84),
+    RGBColor(70, 50, 126),
+    RGBColor(54, 92, 141),
+    RGBColor(39, 127, 142),
+    RGBColor(31, 161, 135),
+    RGBColor(74, 193, 109),
+    RGBColor(150, 205, 50),
+];
+
+/// One of the panels.
+pub(crate) struct Panel {
+    /// Above it.
+    pub(crate) title: String,
+    /// Its mark.
+    pub(crate) colour: RGBColor,
+    /// (x, y) of each point of each line.
+    pub(crate) lines: Vec<Vec<(f64, f64)>>,
+}
+
+/// All of them.
+pub(crate) struct SmallMultiples<'t> {
+    /// Above all.
+    pub(crate) title: &'t str,
+    /// Names of the axes, with units.
+    pub(crate) axes: [&'t str; 2],
+    /// Names of the lines, the same in each panel.
+    pub(crate) names: &'t [String],
+    /// At least one with a point.
+    pub(crate) panels: Vec<Panel>,
+}
+
+impl SmallMultiples<'_> {
+    /// Draws them.
+    pub(crate) fn draw(&self) -> Result<String, Box<dyn std::error::Error>> {
+        let columns = self.panels.len().clamp(1, COLUMNS_MAX);
+        let rows = self.panels.len().div_ceil(columns);
+        let inner = (PANEL.0 * columns as u32, PANEL.1 * rows as u32);
+        let size = (LEFT + inner.0 + RIGHT, TITLE_HEIGHT + inner.1 + FOOT_HEIGHT);
+        let mut svg = String::new();
+        {
+            let area = SVGBackend::with_string(&mut svg, size).into_drawing_area();
+            area.fill(&WHITE)?;
+            let words = |text: &str, points: u32, at: (u32, u32)| {
+                let style = ("sans-serif", points).into_font().color(&INK);
+                area.draw_text(text, &style, (at.0 as i32, at.1 as i32))
+            };
+            words(self.title, 20, (LEFT + 16, 10))?;
+            words(self.axes[0], 16, (LEFT + inner.0 / 2, TITLE_HEIGHT + inner.1 + 10))?;
+            let upright =
+                ("sans-serif", 16).into_font().transform(FontTransform::Rotate270).color(&INK);
+            let middle = (TITLE_HEIGHT + inner.1 / 2 + 60) as i32;
+            area.draw_text(self.axes[1], &upright, (10, middle))?;
+            let panels = area.margin(TITLE_HEIGHT, FOOT_HEIGHT, LEFT, RIGHT);
+            let places = panels.split_evenly((rows, columns));
+            for (index, (panel, place)) in self.panels.iter().zip(&places).enumerate() {
+                let outer = (index % columns == 0, index + columns >= self.panels.len());
+                self.draw_panel(place, panel, outer)?;
+            }
+            let x = (LEFT + inner.0 + 16) as i32;
+            for (index, name) in self.names.iter().enumerate() {
+                let y = (TITLE_HEIGHT + 12) as i32 + index as i32 * LINE_HEIGHT;
+                let stroke = vec![(x, y + 7), (x + 22, y + 7)];
+                area.draw(&PathElement::new(stroke, line_colour(index).stroke_width(3)))?;
+                words(name, 14, ((x + 28) as u32, y as u32))?;
+            }
+            area.present()?;
+        }
+        Ok(svg)
+    }
+
+    /// - `outer`: whether it is leftmost, and lowest in its column: only there are numbers.
+    fn draw_panel<DB: DrawingBackend>(
+        &self,
+        place: &DrawingArea<DB, plotters::coord::Shift>,
+        panel: &Panel,
+        (leftmost, lowest): (bool, bool),
+    ) -> Result<(), Box<dyn std::error::Error>>
+    where
+        DB::ErrorType: 'static,
+    {
+        let [x, y] = self.ranges();
+        let mut chart = ChartBuilder::on(place)
+            .margin(8)
+            .margin_top(26)
+            .x_label_area_size(22)
+            .y_label_area_size(44)
+            .build_cartesian_2d(x, y)?;
+        let tick = |shown: bool, value: f64| {
+            let rounded = (value * 1e3).round() / 1e3 + 0.0;
+            if shown { format!("{rounded}") } else { String::new() }
+        };
+        chart
+            .configure_mesh()
+            .x_labels(4)
+            .y_labels(5)
+            .x_label_formatter(&|value| tick(lowest, *value))
+            .y_label_formatter(&|value| tick(leftmost, *value))
+            .label_style(("sans-serif", 13))
+            .light_line_style(WHITE)
+            .bold_line_style(BLACK.mix(0.12))
+            .draw()?;
+        for (index, line) in panel.lines.iter().enumerate() {
+            let stroke = line_colour(index).stroke_width(2);
+            chart.draw_series(LineSeries::new(line.iter().copied(), stroke))?;
+        }
+        let style = ("sans-serif", 15).into_font().color(&INK);
+        place.draw(&Rectangle::new([(52, 9), (64, 21)], panel.colour.filled()))?;
+        place.draw_text(&panel.title, &style, (70, 7))?;
+        Ok(())
+    }
+
+    fn ranges(&self) -> [std::ops::Range<f64>; 2] {
+        let points = || self.panels.iter().flat_map(|panel| panel.lines.iter().flatten());
+        let over = |of: fn(&(f64, f64)) -> f64| {
+            let low = points().map(of).fold(f64::INFINITY, f64::min);
+            let high = points().map(of).fold(f64::NEG_INFINITY, f64::max);
+            (low, high)
+        };
+        let (first, last) = over(|point| point.0);
+        let (low, high) = over(|point| point.1);
+        let margin = ((high - low) * MARGIN).max(1e-3);
+        [first..last.max(first + 1e-3), (low - margin)..(high + margin)]
+    }
+}
+
+fn line_colour(index: usize) -> RGBColor {
+    COLOURS[index % COLOURS.len()]
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn panels_share_their_axes_and_name_lines_once() {
+        let panel = |title: &str, top: f64| Panel {
+            title: title.to_owned(),
+            colour: RGBColor(0, 114, 178),
+            lines: vec![vec![(0.0, 0.0), (1.0, top)], vec![(0.0, 0.1), (1.0, 0.2)]],
+        };
+        let names = ["shoulder".to_owned(), "elbow".to_owned()];
+        let multiples = SmallMultiples {
+            title: "reacher",
+            axes: ["time [s]", "joint position [rad]"],
+            names: &names,
+            panels: (0..5).map(|index| panel(&format!("m{index}"), f64::from(index))).collect(),
+        };
+        let [x, y] = multiples.ranges();
+        assert_eq!((x.start, x.end), (0.0, 1.0));
+        assert!((y.start + 0.2).abs() < 1e-9 && (y.end - 4.2).abs() < 1e-9, "{y:?}");
+        let svg = multiples.draw().unwrap();
+        for text in ["reacher", "time [s]", "joint position [rad]", "m0", "m4"] {
+            assert!(svg.contains(text), "{text} is missing");
+        }
+        for name in &names {
+            assert_eq!(svg.matches(name.as_str()).count(), 1);
+        }
+    }
+}

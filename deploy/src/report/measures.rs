@@ -1,0 +1,188 @@
+//! What is measured of a run, each with how to read it.
+
+use super::collect::Run;
+use super::paper::Figure;
+use super::tables::TableKind;
+use super::thresholds::threshold;
+use crate::control::EvaluationRow;
+
+/// One figure a run.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+pub enum Measure {
+    /// Mean return of the last evaluation.
+    Return,
+    /// Share of its episodes that end in success.
+    Success,
+    /// Mean absolute change of an action.
+    ActionChange,
+    /// Mean absolute jerk of a joint.
+    JointJerk,
+    /// Spectral arc length of the joints' speed.
+    Sparc,
+    /// Segments decided upon.
+    Decisions,
+    /// Updates of the learner.
+    Updates,
+    /// Wall clock [s].
+    TrainingTime,
+    /// Updates an environment step.
+    UpdateRate,
+    /// Environment steps to the task's threshold; infinite for a run that ended below it.
+    StepsToThreshold,
+}
+
+impl Measure {
+    /// Those that have a table of means.
+    pub const TABLES: [Self; 8] = [
+        Self::Return,
+        Self::Success,
+        Self::ActionChange,
+        Self::JointJerk,
+        Self::Sparc,
+        Self::Decisions,
+        Self::Updates,
+        Self::TrainingTime,
+    ];
+
+    /// Its heading.
+    #[must_use]
+    pub fn title(self) -> &'static str {
+        match self {
+            Self::Return => "Average return",
+            Self::Success => "Success rate",
+            Self::ActionChange => "Smoothness: change of actions",
+            Self::JointJerk => "Smoothness: joint jerk [rad/s³]",
+            Self::Sparc => "Smoothness: SPARC",
+            Self::Decisions => "Decisions",
+            Self::Updates => "Updates",
+            Self::TrainingTime => "Training time [s]",
+            Self::UpdateRate => "Updates an environment step",
+            Self::StepsToThreshold => "Environment steps to a threshold",
+        }
+    }
+
+    /// How it was measured.
+    #[must_use]
+    pub fn about(self) -> &'static str {
+        match self {
+            Self::Return => {
+                "Of the evaluation at the end of each run, without noise. The paper's Table 3."
+            }
+            Self::Success => {
+                "Share of the last evaluation's episodes that end in success. The paper's Table 4."
+            }
+            Self::ActionChange => {
+                "Mean absolute change of an action between two steps in the last evaluation, \
+                 actions scaled to [-1, 1]; lower is smoother."
+            }
+            Self::JointJerk => {
+                "Mean absolute jerk of a joint, from its velocity in each step, over the last \
+                 evaluation's episodes; lower is smoother. Joints that only slide: m/s³."
+            }
+            Self::Sparc => {
+                "Spectral arc length of the joints' speed (Balasubramanian et al. 2015), mean over \
+                 the last evaluation's episodes; nearer to zero is smoother."
+            }
+            Self::Decisions => {
+                "Segments decided upon in training; an mlp policy decides in every step."
+            }
+            Self::Updates => "Of the learner, in training.",
+            Self::TrainingTime => {
+                "Wall clock of a run; several ran side by side where the machine had cores."
+            }
+            Self::UpdateRate => "Updates of the learner for each environment step.",
+            Self::StepsToThreshold => {
+                "Until the evaluation's mean first reaches the threshold; only as fine as the \
+                 evaluations are apart."
+            }
+        }
+    }
+
+    /// Digits behind the point.
+    #[must_use]
+    pub fn digits(self) -> usize {
+        match self {
+            Self::Return | Self::Success | Self::Sparc | Self::UpdateRate => 2,
+            Self::JointJerk => 1,
+            Self::ActionChange => 3,
+            Self::Decisions | Self::Updates | Self::TrainingTime | Self::StepsToThreshold => 0,
+        }
+    }
+
+    /// The paper's figure of the same.
+    #[must_use]
+    pub fn in_paper(self) -> Option<Figure> {
+        match self {
+            Self::Return => Some(Figure::Return),
+            Self::Success => Some(Figure::Success),
+            _ => None,
+        }
+    }
+
+    /// Whether more is better.
+    #[must_use]
+    pub fn higher_is_better(self) -> bool {
+        matches!(self, Self::Return | Self::Success | Self::Sparc)
+    }
+
+    /// Whether it is measured after training.
+    #[must_use]
+    pub fn is_of_motion(self) -> bool {
+        matches!(self, Self::JointJerk | Self::Sparc)
+    }
+
+    /// What it is about.
+    #[must_use]
+    pub fn kind(self) -> TableKind {
+        match self {
+            Self::Return | Self::Success | Self::StepsToThreshold => TableKind::Result,
+            Self::ActionChange | Self::JointJerk | Self::Sparc => TableKind::Smoothness,
+            Self::Decisions | Self::Updates | Self::TrainingTime | Self::UpdateRate => {
+                TableKind::Cost
+            }
+        }
+    }
+
+    /// The run's figure; none while it is not known.
+    #[must_use]
+    pub fn of(self, run: &Run) -> Option<f64> {
+        if self == Self::StepsToThreshold {
+            return steps_to_threshold(run);
+        }
+        let last = run.last()?;
+        match self {
+            Self::Return => Some(last.return_mean),
+            Self::Success => last.success_rate,
+            Self::ActionChange => Some(last.smoothness),
+            Self::JointJerk => run.motion.as_ref()?.joint_jerk,
+            Self::Sparc => run.motion.as_ref()?.sparc,
+            Self::Decisions => Some(last.segments as f64),
+            Self::Updates => Some(last.updates as f64),
+            Self::TrainingTime => Some(last.wall_s),
+            Self::UpdateRate => Some(last.updates as f64 / last.env_steps.max(1) as f64),
+            Self::StepsToThreshold => None,
+        }
+    }
+
+    /// The same of an evaluation, where each has it.
+    #[must_use]
+    pub fn of_row(self, row: &EvaluationRow) -> Option<f64> {
+        match self {
+            Self::Return => Some(row.return_mean),
+            Self::Success => row.success_rate,
+            _ => None,
+        }
+    }
+}
+
+fn steps_to_threshold(run: &Run) -> Option<f64> {
+    let threshold = threshold(&run.task)?;
+    let reached = |row: &&EvaluationRow| {
+        threshold.measure.of_row(row).is_some_and(|value| value >= threshold.value)
+    };
+    match run.rows.iter().find(reached) {
+        Some(row) => Some(row.env_steps as f64),
+        // It may still come there.
+        None => run.ended.then_some(f64::INFINITY),
+    }
+}

@@ -1,0 +1,66 @@
+//! How the runs move: what is known already is read, what is not is measured, by rolling each run's
+//! last policy out.
+
+use super::collect::{Results, Run};
+use crate::failure::Outcome;
+use crate::motion::{self, Means};
+use crate::run_directory::RunDirectory;
+use crate::terminal::CountProgress;
+
+/// Where that many runs of a task in a row cannot be measured, the others cannot either.
+const FAILURES_MAX: usize = 2;
+
+/// Reads what was measured before.
+///
+/// # Errors
+/// A run cannot be read.
+pub(super) fn read_motions(results: &mut Results) -> anyhow::Result<()> {
+    for run in results.runs.iter_mut().filter(|run| run.ended) {
+        run.motion = motion::read(&RunDirectory::open(&run.path)?)?;
+    }
+    Ok(())
+}
+
+/// Runs at their end that nobody has measured.
+#[must_use]
+pub fn unmeasured(results: &Results) -> usize {
+    results.runs.iter().filter(|run| is_unmeasured(run)).count()
+}
+
+fn is_unmeasured(run: &Run) -> bool {
+    run.last().is_some() && run.motion.is_none()
+}
+
+/// Measures them; keeps the result in each run, so that it is done once. A run that cannot be
+/// measured is left out, with the reason in `results.unmeasured`.
+pub fn measure_motions(results: &mut Results, means: &Means) -> Outcome {
+    let progress = CountProgress::new("measuring motion", unmeasured(results) as u64);
+    let mut failures: Vec<(String, usize)> = Vec::new();
+    let runs = results.runs.iter_mut().filter(|run| is_unmeasured(run));
+    for (done, run) in (0..).zip(runs) {
+        let name = format!("{} · {} · seed {}", run.task, run.method, run.seed);
+        progress.at(done, &name);
+        let failed = failures.iter().position(|(task, _)| *task == run.task);
+        if failed.is_some_and(|index| failures[index].1 >= FAILURES_MAX) {
+            results.unmeasured.push(format!("{name}: not tried after those before it"));
+            continue;
+        }
+        let measured = RunDirectory::open(&run.path)
+            .and_then(|directory| motion::measure(&directory, means, &|_, _| ()));
+        match measured {
+            Ok(Some(motion)) => {
+                run.motion = Some(motion);
+                failures.retain(|(task, _)| *task != run.task);
+            }
+            Ok(None) => return Outcome::Interrupted,
+            Err(error) => {
+                results.unmeasured.push(format!("{name}: {error:#}"));
+                match failed {
+                    Some(index) => failures[index].1 += 1,
+                    None => failures.push((run.task.clone(), 1)),
+                }
+            }
+        }
+    }
+    Outcome::Done
+}

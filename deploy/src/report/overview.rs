@@ -1,0 +1,112 @@
+//! What was run: how much of it, by which program, on which machine, when.
+
+use super::collect::{Results, Run};
+use super::sections::Grid;
+use crate::terminal::grouped;
+
+/// The sentences at the top of a report.
+#[must_use]
+pub fn sentences(results: &Results) -> Vec<String> {
+    let ended = results.runs.iter().filter(|run| run.ended).count();
+    let begun = results.runs.len() - ended;
+    let waiting = results.planned.saturating_sub(results.runs.len());
+    let mut runs = format!("Of {} runs {ended} have come to their end", results.planned);
+    for (count, what) in [(begun, "under way or stopped"), (waiting, "not begun")] {
+        if count > 0 {
+            runs.push_str(&format!(", {count} {what}"));
+        }
+    }
+    runs.push('.');
+    let mut sentences = vec![runs];
+    let mut started: Vec<&str> =
+        results.runs.iter().map(|run| run.origin.started.as_str()).collect();
+    started.sort_unstable();
+    if let (Some(first), Some(last)) = (started.first(), started.last()) {
+        sentences.push(format!("Begun between {first} and {last}."));
+    }
+    let programs = results.runs.iter().flat_map(|run| run.origin.programs.iter().cloned());
+    sentences.push(format!("By dmprl {}.", distinct(programs)));
+    let machines = results.runs.iter().map(|run| run.origin.machine.clone());
+    sentences.push(format!("On {}.", distinct(machines)));
+    if let Some(first) = results.unmeasured.first() {
+        let count = match results.unmeasured.len() {
+            1 => "1 run".to_owned(),
+            count => format!("{count} runs"),
+        };
+        sentences.push(format!("Motion is not measured of {count}; the first: {first}."));
+    }
+    sentences
+}
+
+/// Each once, in order; with "; " between.
+fn distinct(values: impl Iterator<Item = String>) -> String {
+    let mut known: Vec<String> = Vec::new();
+    for value in values {
+        if !known.contains(&value) {
+            known.push(value);
+        }
+    }
+    known.join("; ")
+}
+
+/// Seeds and steps by task and method.
+#[must_use]
+pub fn runs_table(results: &Results) -> Grid {
+    let cell = |task: &str, method: &str| {
+        let runs: Vec<&Run> = results.of(task, method).collect();
+        let seeds_of = |ended: bool| {
+            let seeds = runs.iter().filter(|run| run.ended == ended);
+            let seeds: Vec<_> = seeds.map(|run| run.seed.to_string()).collect();
+            format!("{} {}", if seeds.len() == 1 { "seed" } else { "seeds" }, seeds.join(", "))
+        };
+        let mut lines = Vec::new();
+        if runs.is_empty() {
+            lines.push("not run".to_owned());
+        }
+        if runs.iter().any(|run| run.ended) {
+            lines.push(seeds_of(true));
+        }
+        if runs.iter().any(|run| !run.ended) {
+            lines.push(format!("begun: {}", seeds_of(false)));
+        }
+        let mut steps: Vec<u64> = runs.iter().map(|run| run.steps).collect();
+        steps.sort_unstable();
+        steps.dedup();
+        let steps: Vec<_> = steps.into_iter().map(grouped).collect();
+        if !steps.is_empty() {
+            lines.push(format!("{} steps each", steps.join(" or ")));
+        }
+        lines
+    };
+    Grid::of(results, cell)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::planted::{Planted, planted};
+    use super::*;
+
+    #[test]
+    fn what_ended_what_began_and_what_did_not_are_told_apart() {
+        let run = |seed, ended| Planted {
+            task: "reacher-v1",
+            method: "DDPG",
+            seed,
+            rows: vec![-9.0, -8.0],
+            ended,
+        };
+        let mut results = planted(&[run(1, true), run(2, true), run(3, false)]);
+        results.planned = 10;
+        for (run, machine) in results.runs.iter_mut().zip(["a", "b", "a"]) {
+            run.origin.machine = machine.to_owned();
+        }
+        let sentences = sentences(&results);
+        assert_eq!(
+            sentences[0],
+            "Of 10 runs 2 have come to their end, 1 under way or stopped, 7 not begun."
+        );
+        assert_eq!(sentences[3], "On a; b.");
+        let grid = runs_table(&results);
+        assert_eq!(grid.rows[0].1[0], ["seeds 1, 2", "begun: seed 3", "2,000 steps each"]);
+    }
+}

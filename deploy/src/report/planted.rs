@@ -1,0 +1,93 @@
+//! Results made up for tests.
+
+use super::collect::{Origin, Results, Run};
+use crate::control::EvaluationRow;
+use crate::motion::{Joint, JointKind, Motion, RecordedEpisode, Robot};
+
+/// Between two evaluations.
+const INTERVAL: u64 = 1_000;
+
+/// One run.
+#[derive(Debug, Clone)]
+pub(super) struct Planted {
+    pub(super) task: &'static str,
+    pub(super) method: &'static str,
+    pub(super) seed: u64,
+    /// Return, or on a Panda task success, of each evaluation; one every 1 000 steps.
+    pub(super) rows: Vec<f64>,
+    pub(super) ended: bool,
+}
+
+/// What these runs are together.
+pub(super) fn planted(runs: &[Planted]) -> Results {
+    let mut results = Results { planned: runs.len(), ..Results::default() };
+    for run in runs {
+        for (names, name) in [(&mut results.tasks, run.task), (&mut results.methods, run.method)] {
+            if !names.iter().any(|known| known == name) {
+                names.push(name.to_owned());
+            }
+        }
+        let rows = run.rows.iter().zip(1..).map(|(value, index)| row(run.task, *value, index));
+        results.runs.push(Run {
+            task: run.task.to_owned(),
+            method: run.method.to_owned(),
+            seed: run.seed,
+            path: format!("{}-{}-{}", run.task, run.method, run.seed).into(),
+            ended: run.ended,
+            steps: run.rows.len() as u64 * INTERVAL,
+            origin: Origin::default(),
+            rows: rows.collect(),
+            motion: None,
+        });
+    }
+    results
+}
+
+fn row(task: &str, value: f64, index: u64) -> EvaluationRow {
+    let panda = task.starts_with("panda");
+    EvaluationRow {
+        env_steps: index * INTERVAL,
+        updates: index * INTERVAL,
+        segments: index * INTERVAL,
+        wall_s: index as f64,
+        policy_version: index,
+        returns: vec![value],
+        return_mean: value,
+        success_rate: panda.then_some(value),
+        smoothness: 0.1,
+    }
+}
+
+/// Of an arm with an elbow and a finger that slides; two steps.
+pub(super) fn planted_motion(jerk: f64, sparc: f64) -> Motion {
+    let joint = |name: &str, kind| Joint { name: name.to_owned(), kind };
+    Motion {
+        format: 1,
+        policy_version: 1,
+        env_steps: INTERVAL,
+        first_seed: 1_000,
+        returns: vec![0.0],
+        robot: Robot {
+            joints: vec![joint("elbow", JointKind::Hinge), joint("finger", JointKind::Slide)],
+            why_no_joints: String::new(),
+            control_dt_s: 0.05,
+        },
+        unit: "rad".to_owned(),
+        action_change: Some(0.1),
+        action_change_by_dimension: vec![Some(0.1)],
+        joint_jerk: Some(jerk),
+        joint_jerk_by_joint: vec![Some(jerk), None],
+        sparc: Some(sparc),
+        sparc_by_episode: vec![Some(sparc)],
+        episode: RecordedEpisode {
+            seed: 1_000,
+            return_: 0.0,
+            success: None,
+            rewards: vec![0.0; 2],
+            actions: vec![vec![0.0]; 2],
+            joint_positions: vec![vec![0.0, 0.0], vec![0.1, 0.0], vec![0.3, 0.0]],
+            joint_velocities: vec![vec![0.0, 0.0], vec![2.0, 0.0], vec![4.0, 0.0]],
+            success_by_step: Vec::new(),
+        },
+    }
+}

@@ -1,0 +1,177 @@
+//! A report's contents in reading order, the same for the page and for Markdown.
+
+use serde::Serialize;
+
+use super::collect::Results;
+use super::efficiency::EfficiencyRow;
+use super::overview::{runs_table, sentences};
+use super::page::Report;
+use super::statements::{Judged, SEEDS_MIN, SUBJECTS, counts};
+use super::tables::{Table, TableKind};
+
+/// A drawing.
+#[derive(Debug, Clone, Serialize)]
+pub struct Picture {
+    /// In the report's folder, without the ending.
+    pub path: String,
+    /// For those who do not see it.
+    pub alt: String,
+    /// The drawing itself.
+    pub svg: String,
+}
+
+/// Cells of some lines each, by task and method.
+#[derive(Debug, Clone, Default, Serialize)]
+pub struct Grid {
+    /// Above the cells.
+    pub columns: Vec<String>,
+    /// (task, its cells).
+    pub rows: Vec<(String, Vec<Vec<String>>)>,
+}
+
+impl Grid {
+    /// A cell for each task and method.
+    pub fn of(results: &Results, cell: impl Fn(&str, &str) -> Vec<String>) -> Self {
+        let rows = results.tasks.iter().map(|task| {
+            let cells = results.methods.iter().map(|method| cell(task, method));
+            (task.clone(), cells.collect())
+        });
+        Self { columns: results.methods.clone(), rows: rows.collect() }
+    }
+}
+
+/// One heading and what stands below it.
+#[derive(Debug, Clone, Default, Serialize)]
+pub struct Section {
+    /// What a link names.
+    pub id: String,
+    /// The heading.
+    pub title: String,
+    /// Paragraphs.
+    pub about: Vec<String>,
+    /// Figures.
+    pub grid: Option<Grid>,
+    /// Drawings.
+    pub pictures: Vec<Picture>,
+    /// Statements of the paper.
+    pub statements: Vec<Judged>,
+    /// Files, by name.
+    pub files: Vec<(String, String)>,
+}
+
+impl Section {
+    fn new(title: &str, about: &[&str]) -> Self {
+        Self {
+            id: crate::run_directory::safe_name(&title.to_lowercase().replace(' ', "-")),
+            title: title.to_owned(),
+            about: about.iter().map(|&text| text.to_owned()).collect(),
+            ..Self::default()
+        }
+    }
+}
+
+/// All sections of a report; none is empty.
+#[must_use]
+pub fn sections(report: &Report) -> Vec<Section> {
+    let mut sections = vec![overview(report)];
+    let of_kind = |kind: TableKind| {
+        let tables = report.tables.iter().filter(move |table| table.kind == kind);
+        tables.map(|table| of_table(report, table))
+    };
+    sections.extend(of_kind(TableKind::Result));
+    if !report.curves.is_empty() {
+        let mut curves = Section::new(
+            "Learning curves",
+            &[
+                "Evaluations without noise: mean over the seeds (n), the band from the lowest to the \
+               highest. Triangles at the right edge are what the paper's method ended at (its \
+               Tables 3 and 4), after as many steps as it trained for.",
+            ],
+        );
+        curves.pictures = report.curves.clone();
+        sections.push(curves);
+    }
+    if !report.efficiency.is_empty() {
+        sections.push(efficiency(report));
+    }
+    sections.extend(of_kind(TableKind::Smoothness));
+    if !report.trajectories.is_empty() {
+        let mut joints = Section::new(
+            "Joints over a rollout",
+            &["One noise-free episode of each method's policy at the end of training, all reset \
+               with the same seed; every panel has the same axes. As the paper's figures 6 and 7."],
+        );
+        joints.pictures = report.trajectories.clone();
+        sections.push(joints);
+    }
+    sections.extend(of_kind(TableKind::Cost));
+    if !report.judged.is_empty() {
+        sections.push(statements(&report.judged));
+    }
+    sections
+}
+
+fn overview(report: &Report) -> Section {
+    let mut section = Section::new("What was run", &[]);
+    section.about.push(sentences(&report.results).join(" "));
+    for subject in SUBJECTS {
+        let named = report.results.methods.iter().any(|method| method == subject);
+        if named && !report.judged.is_empty() {
+            let counts = counts(&report.judged, subject).into_iter();
+            let counts: Vec<_> =
+                counts.map(|(verdict, count)| format!("{count} {}", verdict.text())).collect();
+            section.about.push(format!(
+                "Of {} statements of the paper, with {subject} as its DDPG-DMP: {}.",
+                report.judged.len(),
+                counts.join(", ")
+            ));
+        }
+    }
+    section.grid = Some(runs_table(&report.results));
+    section.files = report.results.sweeps.clone();
+    section
+}
+
+fn of_table(report: &Report, table: &Table) -> Section {
+    let mut section = Section::new(table.title, &[table.about]);
+    let rows = table.rows.iter().map(|(task, cells)| {
+        (task.clone(), cells.iter().map(|cell| cell.lines(table.digits)).collect())
+    });
+    section.grid = Some(Grid { columns: report.results.methods.clone(), rows: rows.collect() });
+    section
+}
+
+fn efficiency(report: &Report) -> Section {
+    let mut section = Section::new(
+        "Sample efficiency",
+        &["Environment steps until an evaluation's mean first reaches the threshold: median over \
+           the seeds with its 95 % interval by bootstrap, and how many of the seeds that ended got \
+           there. One that ended without counts as later than all. Only as fine as the evaluations \
+           are apart."],
+    );
+    let sources =
+        report.efficiency.iter().map(|EfficiencyRow { task, threshold, source, .. }| {
+            format!("{task}: {threshold} ({source})")
+        });
+    section.about.push(format!("Thresholds: {}.", sources.collect::<Vec<_>>().join("; ")));
+    let rows = report.efficiency.iter().map(|row| {
+        let cells = row.cells.iter().map(super::efficiency::EfficiencyCell::lines);
+        (format!("{}, {}", row.task, row.threshold), cells.collect())
+    });
+    section.grid = Some(Grid { columns: report.results.methods.clone(), rows: rows.collect() });
+    section
+}
+
+fn statements(judged: &[Judged]) -> Section {
+    let rule = format!(
+        "Judged by the runs' figures, not by eye. \"Held\" and \"did not hold\" need 95 % intervals \
+         that lie apart (interquartile mean over seeds; median for steps) with at least {SEEDS_MIN} \
+         seeds each; \"no clear difference\" is anything between. A statement that methods are \
+         alike, or that one does not improve, held where no difference is clear. \"Cannot hold\": \
+         the paper's own figures contradict it. The paper trained for about 200,000 steps; nothing \
+         is extrapolated."
+    );
+    let mut section = Section::new("What held of the paper's statements", &[&rule]);
+    section.statements = judged.to_vec();
+    section
+}

@@ -1,0 +1,105 @@
+//! Statements that the paper's own figures contradict: recomputed, not listed.
+
+use super::PROPOSED;
+use super::list::{Rule, Statement};
+use crate::report::measures::Measure;
+use crate::report::paper::{Figure, SEEDS, reported};
+
+/// Percentages are printed with one digit, of figures that are rounded too.
+const ROUNDING_PERCENT: f64 = 0.15;
+/// What the paper calls its method in its tables.
+const IN_TABLES: &str = "DDPG-DMP (paper)";
+
+/// How the paper contradicts the statement; none where it does not.
+pub(super) fn of(statement: &Statement) -> Option<String> {
+    let task = statement.task;
+    match statement.rule {
+        Rule::Better { measures, method, than } => {
+            measures.iter().find_map(|measure| surpassed(task, *measure, method, than))
+        }
+        Rule::BetterBy { method, than } => {
+            let wrong = than.iter().filter_map(|(other, percent)| {
+                let [ours, theirs] = [method, other].map(|name| figure(Figure::Return, task, name));
+                let real = 100.0 * (ours? - theirs?) / theirs?.abs();
+                let differs = (real - percent).abs() > ROUNDING_PERCENT;
+                differs.then(|| format!("{real:.1} % over {other}, not {percent:.1} %"))
+            });
+            let wrong: Vec<_> = wrong.collect();
+            (!wrong.is_empty()).then(|| format!("by its Table 3 it is {}", wrong.join(" and ")))
+        }
+        Rule::Sooner { share, steps: Some((ours, theirs)), .. } => {
+            let (said, real) = (100.0 * (1.0 - share), 100.0 * (1.0 - ours / theirs));
+            let differs = (real - said).abs() > ROUNDING_PERCENT;
+            differs.then(|| format!("of these steps it is {real:.1} % fewer, not {said:.1} %"))
+        }
+        Rule::Spread { method } => {
+            let (mean, std) = reported(Figure::Success, task, in_tables(method))?;
+            let most = spread_max(mean, SEEDS);
+            (std > most).then(|| {
+                format!(
+                    "{SEEDS} rates between 0 and 1 with the mean {mean:.2} have a standard \
+                     deviation of at most {most:.2}"
+                )
+            })
+        }
+        _ => None,
+    }
+}
+
+/// Methods that the paper's own table has above the one that is to be best.
+fn surpassed(task: &str, measure: Measure, method: &str, than: &[&str]) -> Option<String> {
+    let of = measure.in_paper()?;
+    let ours = figure(of, task, method)?;
+    let above = than.iter().filter_map(|other| {
+        let theirs = figure(of, task, other)?;
+        (theirs > ours).then(|| format!("{other} at {theirs:.2}"))
+    });
+    let above: Vec<_> = above.collect();
+    let table = if of == Figure::Return { 3 } else { 4 };
+    (!above.is_empty())
+        .then(|| format!("its Table {table} has {} above {ours:.2}", above.join(" and ")))
+}
+
+fn figure(figure: Figure, task: &str, method: &str) -> Option<f64> {
+    reported(figure, task, in_tables(method)).map(|(mean, _)| mean)
+}
+
+fn in_tables(method: &str) -> &str {
+    if method == PROPOSED { IN_TABLES } else { method }
+}
+
+/// The largest standard deviation of a sample of rates: all of them at 0 or at 1.
+fn spread_max(mean: f64, count: usize) -> f64 {
+    let count = count as f64;
+    (mean * (1.0 - mean) * count / (count - 1.0)).sqrt()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::list::STATEMENTS;
+    use super::*;
+
+    #[test]
+    fn the_papers_inconsistencies_are_found_and_no_others() {
+        let found: Vec<String> = STATEMENTS
+            .iter()
+            .filter_map(|statement| Some(format!("{}: {}", statement.task, of(statement)?)))
+            .collect();
+        let expected = [
+            "reacher-v1: its Table 3 has DDPG at -6.58 and SAC at -6.10 above -7.36",
+            "reacher-v1: of these steps it is 21.2 % fewer, not 11.7 %",
+            "pusher-v0: its Table 3 has TD3 at -32.06 and SAC at -31.87 above -33.37",
+            "pusher-v0: by its Table 3 it is 24.6 % over DDPG, not 43.7 % and 28.7 % over NDP, \
+             not 26.7 %",
+            "panda-reach-joints: 5 rates between 0 and 1 with the mean 0.85 have a standard \
+             deviation of at most 0.40",
+        ];
+        assert_eq!(found, expected);
+    }
+
+    #[test]
+    fn rates_spread_most_when_each_is_all_or_nothing() {
+        assert!((spread_max(0.5, 2) - 0.5_f64.sqrt()).abs() < 1e-12);
+        assert_eq!(spread_max(1.0, 5), 0.0);
+    }
+}
