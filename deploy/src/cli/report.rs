@@ -6,21 +6,24 @@ use std::time::SystemTime;
 use anyhow::Context;
 use clap::Args;
 
-use super::{emit, prepare_python, this_program};
+use super::{emit, prepare_python, prepare_python_extra, this_program};
 use crate::failure::Outcome;
 use crate::motion::Means;
 use crate::report::{
-    Report, Results, curves, efficiency, judge, measure_motions, tables, trajectories, unmeasured,
+    Report, Results, Wanted, curves, draw, efficiency, judge, measure_motions, strips, tables,
+    trajectories, undrawn, unmeasured, wanted,
 };
 use crate::run_directory::rfc3339;
 use crate::terminal::{say, shown};
 
 const HELP: &str = "\
 Writes index.html (one page that needs nothing else), report.md, figures.csv, runs.csv, curves.json
-and every picture as SVG and PNG. Tables give mean and standard deviation over seeds, and the interquartile mean with a
-95 % interval by stratified bootstrap (Agarwal et al. 2021), beside the paper's figures where the
-task and the method are the paper's. Only runs that have come to their end count in a table.
-How a run moves is measured once, by rolling its last policy out, and kept in the run.
+and every picture as SVG and PNG. Tables give mean and standard deviation over seeds, and the
+interquartile mean with a 95 % interval by stratified bootstrap (Agarwal et al. 2021), beside the
+paper's figures where the task and the method are the paper's. Only runs that have come to their end
+count in a table.
+How a run moves is measured once, by rolling its last policy out, and kept in the run; so are
+frames of a rollout, which need an environment that can be drawn.
 
 EXAMPLES
   dmprl report runs/paper
@@ -37,7 +40,7 @@ pub(super) struct ReportArgs {
     /// Where the report goes [default: SWEEP/report for one sweep, else report].
     #[arg(long, value_name = "DIR")]
     output: Option<PathBuf>,
-    /// Measure no motion; what was measured before is shown.
+    /// Roll nothing out; what was measured and drawn before is shown.
     #[arg(long)]
     no_motion: bool,
     /// Print the tables as one JSON object on standard output, too.
@@ -48,6 +51,10 @@ pub(super) struct ReportArgs {
 pub(super) fn run(args: &ReportArgs) -> anyhow::Result<Outcome> {
     let mut results = Results::read(&args.runs)?;
     if !args.no_motion && measure(&mut results)? == Outcome::Interrupted {
+        return Ok(Outcome::Interrupted);
+    }
+    let wanted = wanted(&results)?;
+    if !args.no_motion && drawn(&wanted, &mut results)? == Outcome::Interrupted {
         return Ok(Outcome::Interrupted);
     }
     let of_one = |path: &PathBuf| path.join("sweep.toml").is_file().then(|| path.join("report"));
@@ -75,6 +82,7 @@ pub(super) fn run(args: &ReportArgs) -> anyhow::Result<Outcome> {
         made: rfc3339(SystemTime::now()),
         commit: crate::project::git_commit(),
         curves: curves(&results)?,
+        strips: strips(&wanted)?,
         trajectories: trajectories(&results)?,
         results,
         tables,
@@ -103,6 +111,27 @@ fn measure(results: &mut Results) -> anyhow::Result<Outcome> {
     };
     for reason in &results.unmeasured {
         say(&format!("motion not measured: {reason}"));
+    }
+    Ok(outcome)
+}
+
+/// Draws frames that nobody has drawn; a report without pictures is better than none.
+fn drawn(wanted: &[Wanted], results: &mut Results) -> anyhow::Result<Outcome> {
+    if !undrawn(wanted) {
+        return Ok(Outcome::Done);
+    }
+    let outcome = match prepare_python_extra("video") {
+        Ok((venv, python)) => {
+            let means = Means { program: this_program()?, venv };
+            draw(wanted, (&means, &python), &mut results.undrawn)
+        }
+        Err(error) => {
+            results.undrawn.push(format!("anything: {error:#}"));
+            Outcome::Done
+        }
+    };
+    for reason in &results.undrawn {
+        say(&format!("not drawn: {reason}"));
     }
     Ok(outcome)
 }

@@ -22,6 +22,8 @@ pub struct Run {
     pub task: String,
     /// The method's label.
     pub method: String,
+    /// What its method plans with.
+    pub policy: PolicyKind,
     /// `run.seed`.
     pub seed: u64,
     /// Its directory.
@@ -98,6 +100,8 @@ pub struct Results {
     pub sweeps: Vec<(String, String)>,
     /// Runs whose motion could not be measured, and why.
     pub unmeasured: Vec<String>,
+    /// Runs that could not be drawn, and why.
+    pub undrawn: Vec<String>,
 }
 
 impl Results {
@@ -180,7 +184,8 @@ fn run(directory: &RunDirectory, config: &ExperimentConfig, method: String) -> a
     });
     let (task, seed, steps) = (config.task.name.clone(), config.run.seed, config.run.steps);
     let origin = Origin::of(&directory.manifest()?);
-    Ok(Run { task, method, seed, path, ended, steps, origin, rows, motion: None })
+    let policy = config.policy.kind;
+    Ok(Run { task, method, policy, seed, path, ended, steps, origin, rows, motion: None })
 }
 
 /// What a run is called that no sweep has named.

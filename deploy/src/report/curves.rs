@@ -107,6 +107,10 @@ fn draw(task: &str, what: &str, lines: &[Drawn]) -> Result<String, Box<dyn std::
         let area = SVGBackend::with_string(&mut svg, size).into_drawing_area();
         let axes = Axes { title: task, what, steps_max, values: low..high, beside };
         let mut chart = axes.draw(&area)?;
+        // Lines last: a band over another method's line would change its colour.
+        for drawn in lines {
+            draw_band(&mut chart, drawn)?;
+        }
         for drawn in lines {
             draw_line(&mut chart, drawn)?;
         }
@@ -143,16 +147,24 @@ fn triangle((x, y): (i32, i32), colour: RGBColor) -> Polygon<(i32, i32)> {
     Polygon::new(vec![(x, y), (x + 10, y - 5), (x + 10, y + 5)], colour.filled())
 }
 
-fn draw_line(
+/// From the lowest seed to the highest.
+fn draw_band(
     chart: &mut Chart<'_, '_>,
     Drawn { colour, line, .. }: &Drawn,
 ) -> Result<(), Box<dyn std::error::Error>> {
     let above = line.iter().map(|&(steps, _, _, high)| (steps, high));
     let below = line.iter().rev().map(|&(steps, _, low, _)| (steps, low));
     let band: Vec<_> = above.chain(below).collect();
-    chart.draw_series(std::iter::once(Polygon::new(band, colour.mix(0.15))))?;
+    chart.draw_series(std::iter::once(Polygon::new(band, colour.mix(0.12))))?;
+    Ok(())
+}
+
+fn draw_line(
+    chart: &mut Chart<'_, '_>,
+    Drawn { colour, line, .. }: &Drawn,
+) -> Result<(), Box<dyn std::error::Error>> {
     let mean = line.iter().map(|&(steps, mean, _, _)| (steps, mean));
-    chart.draw_series(LineSeries::new(mean.clone(), colour.stroke_width(2)))?;
+    chart.draw_series(LineSeries::new(mean, colour.stroke_width(2)))?;
     if let [only] = line.as_slice() {
         // A line of one point is none.
         chart.draw_series(std::iter::once(Circle::new((only.0, only.1), 3, colour.filled())))?;

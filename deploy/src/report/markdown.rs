@@ -34,6 +34,9 @@ fn of_section(section: &Section) -> String {
     for picture in &section.pictures {
         text.push_str(&format!("\n![{}]({}.svg)\n", picture.alt, picture.path));
     }
+    for strip in &section.strips {
+        text.push_str(&format!("\n![{}]({}.png)\n", strip.alt, strip.path));
+    }
     for (name, file) in &section.files {
         text.push_str(&format!(
             "\n<details><summary>The sweep <code>{name}</code></summary>\n\n```toml\n{}\n```\n\n\

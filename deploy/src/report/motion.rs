@@ -54,7 +54,7 @@ pub fn measure_motions(results: &mut Results, means: &Means) -> Outcome {
             }
             Ok(None) => return Outcome::Interrupted,
             Err(error) => {
-                results.unmeasured.push(format!("{name}: {error:#}"));
+                results.unmeasured.push(format!("{name}: {}", in_a_line(&error)));
                 match failed {
                     Some(index) => failures[index].1 += 1,
                     None => failures.push((run.task.clone(), 1)),
@@ -63,4 +63,30 @@ pub fn measure_motions(results: &mut Results, means: &Means) -> Outcome {
         }
     }
     Outcome::Done
+}
+
+/// An error that quotes the end of a log, as its first line and the last of the log.
+pub(super) fn in_a_line(error: &anyhow::Error) -> String {
+    let text = format!("{error:#}");
+    let mut lines = text.lines().map(str::trim);
+    let first = lines.next().unwrap_or_default().to_owned();
+    match lines.rfind(|line| !line.is_empty() && !line.starts_with("--- ")) {
+        Some(last) => format!("{first}: {}", last.trim_start_matches("error: ")),
+        None => first,
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn of_an_error_with_a_log_the_cause_is_told() {
+        let died = anyhow::anyhow!(
+            "the observer died: exit status 1\n  last lines of a.log:\n    \
+             error: no such folder\n    --- observer, later ---"
+        );
+        assert_eq!(in_a_line(&died), "the observer died: exit status 1: no such folder");
+        assert_eq!(in_a_line(&anyhow::anyhow!("one line")), "one line");
+    }
 }

@@ -35,6 +35,9 @@ pub fn sentences(results: &Results) -> Vec<String> {
         };
         sentences.push(format!("Motion is not measured of {count}; the first: {first}."));
     }
+    if !results.undrawn.is_empty() {
+        sentences.push(format!("Not drawn: {}.", results.undrawn.join("; ")));
+    }
     sentences
 }
 

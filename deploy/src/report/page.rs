@@ -12,6 +12,7 @@ use super::efficiency::EfficiencyRow;
 use super::markdown::markdown;
 use super::sections::{Picture, sections};
 use super::statements::Judged;
+use super::strips::Strip;
 use super::tables::Table;
 use crate::plots::png;
 
@@ -41,6 +42,8 @@ pub struct Report {
     pub judged: Vec<Judged>,
     /// Learning curves.
     pub curves: Vec<Picture>,
+    /// Frames of a rollout.
+    pub strips: Vec<Strip>,
     /// Joints over a rollout.
     pub trajectories: Vec<Picture>,
 }
@@ -55,12 +58,15 @@ impl Report {
         for picture in self.curves.iter().chain(&self.trajectories) {
             let file = |ending: &str| folder.join(format!("{}.{ending}", picture.path));
             let svg = file("svg");
-            let parent = svg.parent().unwrap_or(folder);
-            std::fs::create_dir_all(parent)
-                .with_context(|| format!("cannot make {}", parent.display()))?;
+            make_parent(&svg)?;
             write(&svg, picture.svg.as_bytes())?;
             let png = png(&picture.svg).with_context(|| picture.alt.clone())?;
             write(&file("png"), &png)?;
+        }
+        for strip in &self.strips {
+            let file = folder.join(format!("{}.png", strip.path));
+            make_parent(&file)?;
+            write(&file, &strip.png)?;
         }
         write(&folder.join("figures.csv"), &figures_csv(self)?)?;
         write(&folder.join("runs.csv"), &runs_csv(&self.results.runs)?)?;
@@ -83,6 +89,11 @@ impl Report {
         });
         page.context("cannot fill in the report's page")
     }
+}
+
+fn make_parent(path: &Path) -> anyhow::Result<()> {
+    let Some(parent) = path.parent() else { return Ok(()) };
+    std::fs::create_dir_all(parent).with_context(|| format!("cannot make {}", parent.display()))
 }
 
 fn write(path: &Path, bytes: &[u8]) -> anyhow::Result<()> {

@@ -1,5 +1,7 @@
 //! Results made up for tests.
 
+use dmprl_shared::config::PolicyKind;
+
 use super::collect::{Origin, Results, Run};
 use crate::control::EvaluationRow;
 use crate::motion::{Joint, JointKind, Motion, RecordedEpisode, Robot};
@@ -31,6 +33,10 @@ pub(super) fn planted(runs: &[Planted]) -> Results {
         results.runs.push(Run {
             task: run.task.to_owned(),
             method: run.method.to_owned(),
+            policy: match run.method {
+                "DDPG" | "TD3" | "SAC" => PolicyKind::Mlp,
+                _ => PolicyKind::Dmp,
+            },
             seed: run.seed,
             path: format!("{}-{}-{}", run.task, run.method, run.seed).into(),
             ended: run.ended,
@@ -70,6 +76,7 @@ pub(super) fn planted_motion(jerk: f64, sparc: f64) -> Motion {
         robot: Robot {
             joints: vec![joint("elbow", JointKind::Hinge), joint("finger", JointKind::Slide)],
             why_no_joints: String::new(),
+            goal_in_pictures: String::new(),
             control_dt_s: 0.05,
         },
         unit: "rad".to_owned(),
@@ -88,6 +95,8 @@ pub(super) fn planted_motion(jerk: f64, sparc: f64) -> Motion {
             joint_positions: vec![vec![0.0, 0.0], vec![0.1, 0.0], vec![0.3, 0.0]],
             joint_velocities: vec![vec![0.0, 0.0], vec![2.0, 0.0], vec![4.0, 0.0]],
             success_by_step: Vec::new(),
+            frames: Vec::new(),
+            frame_steps: Vec::new(),
         },
     }
 }

@@ -6,7 +6,8 @@ use super::collect::Results;
 use super::efficiency::EfficiencyRow;
 use super::overview::{runs_table, sentences};
 use super::page::Report;
-use super::statements::{Judged, SEEDS_MIN, SUBJECTS, counts};
+use super::statements::{ALMOST_ALL, Judged, LOSS, NONE, SEEDS_MIN, SUBJECTS, counts};
+use super::strips::Strip;
 use super::tables::{Table, TableKind};
 
 /// A drawing.
@@ -53,6 +54,8 @@ pub struct Section {
     pub grid: Option<Grid>,
     /// Drawings.
     pub pictures: Vec<Picture>,
+    /// Photographs.
+    pub strips: Vec<Strip>,
     /// Statements of the paper.
     pub statements: Vec<Judged>,
     /// Files, by name.
@@ -82,11 +85,9 @@ pub fn sections(report: &Report) -> Vec<Section> {
     if !report.curves.is_empty() {
         let mut curves = Section::new(
             "Learning curves",
-            &[
-                "Evaluations without noise: mean over the seeds (n), the band from the lowest to the \
-               highest. Triangles at the right edge are what the paper's method ended at (its \
-               Tables 3 and 4), after as many steps as it trained for.",
-            ],
+            &["Evaluations without noise: mean over the seeds (n), the band from the lowest to \
+                 the highest. Triangles at the right edge are what each method ended at in the \
+                 paper (its Tables 3 and 4), after as many steps as that trained for."],
         );
         curves.pictures = report.curves.clone();
         sections.push(curves);
@@ -95,6 +96,15 @@ pub fn sections(report: &Report) -> Vec<Section> {
         sections.push(efficiency(report));
     }
     sections.extend(of_kind(TableKind::Smoothness));
+    if !report.strips.is_empty() {
+        let mut frames = Section::new(
+            "Frames of a rollout",
+            &["One noise-free episode at the end of training of the best method with a dmp \
+                 policy, and of DDPG: the same episode for both. As the paper's figure 5."],
+        );
+        frames.strips = report.strips.clone();
+        sections.push(frames);
+    }
     if !report.trajectories.is_empty() {
         let mut joints = Section::new(
             "Joints over a rollout",
@@ -164,12 +174,14 @@ fn efficiency(report: &Report) -> Section {
 
 fn statements(judged: &[Judged]) -> Section {
     let rule = format!(
-        "Judged by the runs' figures, not by eye. \"Held\" and \"did not hold\" need 95 % intervals \
-         that lie apart (interquartile mean over seeds; median for steps) with at least {SEEDS_MIN} \
-         seeds each; \"no clear difference\" is anything between. A statement that methods are \
-         alike, or that one does not improve, held where no difference is clear. \"Cannot hold\": \
-         the paper's own figures contradict it. The paper trained for about 200,000 steps; nothing \
-         is extrapolated."
+        "Judged by the runs' figures, not by eye. \"Held\" and \"did not hold\" need 95 % \
+         intervals that lie apart (interquartile mean over seeds; median for steps) with at least \
+         {SEEDS_MIN} seeds each; \"no clear difference\" is anything between. A statement that \
+         methods are alike, or that one does not improve, held where no difference is clear. \
+         \"Cannot hold\": the paper's own figures contradict it. Fails: a success rate of at most \
+         {NONE}; almost always: of at least {ALMOST_ALL}; loses again: more than {LOSS} of what it \
+         had won, by moving means of five evaluations. The paper trained for about 200,000 steps; \
+         nothing is extrapolated."
     );
     let mut section = Section::new("What held of the paper's statements", &[&rule]);
     section.statements = judged.to_vec();

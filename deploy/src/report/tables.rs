@@ -6,6 +6,7 @@ use super::collect::Results;
 use super::measures::Measure;
 use super::paper::reported;
 use super::statistics::Summary;
+use crate::terminal::grouped;
 
 /// What a table is about.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -57,8 +58,10 @@ impl Cell {
             None if self.unfinished > 0 => lines.push("not finished".to_owned()),
             None => lines.push("not run".to_owned()),
             Some(Summary { count, mean, std, iqm, interval: [low, high] }) => {
-                lines.push(format!("{mean:.digits$} ± {std:.digits$}"));
-                lines.push(format!("IQM {iqm:.digits$} [{low:.digits$}, {high:.digits$}]"));
+                let [mean, std, iqm, low, high] =
+                    [mean, std, iqm, low, high].map(|value| number(*value, digits));
+                lines.push(format!("{mean} ± {std}"));
+                lines.push(format!("IQM {iqm} [{low}, {high}]"));
                 let seeds = if *count == 1 { "seed" } else { "seeds" };
                 lines.push(format!("{count} {seeds}"));
             }
@@ -67,6 +70,15 @@ impl Cell {
             lines.push(format!("paper {mean:.digits$} ± {std:.digits$}"));
         }
         lines
+    }
+}
+
+/// Whole ones, which are counts, by thousands.
+fn number(value: f64, digits: usize) -> String {
+    if digits == 0 && value >= 0.0 {
+        grouped(value.round() as u64)
+    } else {
+        format!("{value:.digits$}")
     }
 }
 

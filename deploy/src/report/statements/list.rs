@@ -83,13 +83,14 @@ const SUCCESS: &[Measure] = &[Measure::Success];
 const SMOOTH: &[Measure] = &[Measure::ActionChange, Measure::JointJerk, Measure::Sparc];
 const OTHERS: Methods = &["DDPG", "TD3", "SAC", "NDP"];
 const PLAIN: Methods = &["DDPG", "TD3", "SAC"];
-/// A success rate that counts as failure, and one as "almost 100 %".
-const NONE: f64 = 0.05;
-const ALMOST_ALL: f64 = 0.95;
+/// A success rate that counts as failure.
+pub const NONE: f64 = 0.05;
+/// One that counts as "almost 100 %".
+pub const ALMOST_ALL: f64 = 0.95;
 /// More often than not.
 const MOSTLY: f64 = 0.5;
 /// Of what was won; less is noise.
-const LOSS: f64 = 0.1;
+pub const LOSS: f64 = 0.1;
 
 const fn statement(
     place: &'static str,
@@ -218,7 +219,8 @@ pub(super) const STATEMENTS: [Statement; 34] = [
     statement(
         "section 4.2",
         THROWER,
-        "DDPG-DMP's return is better by 65.1 % than DDPG's, 43.8 % than TD3's, 34.2 % than SAC's and 16.2 % than NDP's",
+        "DDPG-DMP's return is better by 65.1 % than DDPG's, 43.8 % than TD3's, 34.2 % than SAC's \
+         and 16.2 % than NDP's",
         Rule::BetterBy {
             method: PROPOSED,
             than: &[("DDPG", 65.1), ("TD3", 43.8), ("SAC", 34.2), ("NDP", 16.2)],

@@ -10,6 +10,7 @@ mod tests;
 
 use serde::Serialize;
 
+pub use self::list::{ALMOST_ALL, LOSS, NONE};
 use self::list::{STATEMENTS, Statement};
 use self::rules::Judge;
 use super::collect::Results;

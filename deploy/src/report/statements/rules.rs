@@ -154,6 +154,9 @@ impl On<'_> {
                 format!("{name}: not measured")
             }
             None => format!("{name}: not finished"),
+            Some(Estimate { low: f64::INFINITY, count, .. }) => {
+                format!("{name} not reached, {count} seeds")
+            }
             Some(estimate) if measure == Measure::StepsToThreshold => {
                 let [point, low, high] =
                     [estimate.point, estimate.low, estimate.high].map(series::steps_text);

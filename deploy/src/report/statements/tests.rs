@@ -160,7 +160,7 @@ fn sooner_counts_a_seed_that_never_came_as_later_than_all() {
     assert_eq!(with(&[third; 3], &[third; 3]).verdict, Verdict::DidNotHold);
     let against = with(&[first; 3], &[never; 3]);
     assert_eq!(against.verdict, Verdict::Held);
-    assert!(against.evidence.contains("NDP not reached"), "{}", against.evidence);
+    assert!(against.evidence.contains("NDP not reached, 3 seeds"), "{}", against.evidence);
     assert_eq!(with(&[never; 3], &[never; 3]).verdict, Verdict::NoClearDifference);
     assert_eq!(with(&[never; 3], &[fourth; 3]).verdict, Verdict::DidNotHold);
     assert_eq!(with(&[first, first, never], &[fourth; 3]).verdict, Verdict::NoClearDifference);
