@@ -17,16 +17,16 @@ const LINE_HEIGHT: i32 = 22;
 /// Share of the spread left free above and below.
 const MARGIN: f64 = 0.05;
 const INK: RGBAColor = RGBAColor(0, 0, 0, 0.85);
-/// Viridis without its palest end: in order from first to last, whatever one's colour vision, and
-/// none of the methods' colours.
+/// Tol's "bright" scheme, told apart with every common colour vision and other than the methods'
+/// colours; the grey, which is pale on white, darker.
 const COLOURS: [RGBColor; 7] = [
-    RGBColor(68, 1, 84),
-    RGBColor(70, 50, 126),
-    RGBColor(54, 92, 141),
-    RGBColor(39, 127, 142),
-    RGBColor(31, 161, 135),
-    RGBColor(74, 193, 109),
-    RGBColor(150, 205, 50),
+    RGBColor(68, 119, 170),
+    RGBColor(238, 102, 119),
+    RGBColor(34, 136, 51),
+    RGBColor(204, 187, 68),
+    RGBColor(102, 204, 238),
+    RGBColor(170, 51, 119),
+    RGBColor(120, 120, 120),
 ];
 
 /// One of the panels.

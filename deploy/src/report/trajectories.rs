@@ -34,7 +34,7 @@ pub fn trajectories(results: &Results) -> anyhow::Result<Vec<Picture>> {
             let names: Vec<String> =
                 joints.iter().map(|joint| first.robot.joints[*joint].name.clone()).collect();
             let panels = rollouts.iter().map(|rollout| panel(rollout, &joints, rows));
-            let title = format!("{task}: joint {what}, episode {}", first.first_seed);
+            let title = format!("{task}: joint {what}, episode of seed {}", first.first_seed);
             let time = if first.robot.control_dt_s > 0.0 { "time [s]" } else { "steps" };
             let drawn = SmallMultiples {
                 title: &title,
