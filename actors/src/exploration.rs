@@ -317,6 +317,7 @@ mod tests {
             ("algorithm.name", "ndp"),
             ("policy.controller", "position"),
             ("exploration.warm_up_steps", "0"),
+            ("algorithm.action_rate_penalty", "0.0"),
             ("algorithm.ndp.initial_log_std", "0.0"),
         ];
         let (mut acting, mut exploration) = scene(&ndp);

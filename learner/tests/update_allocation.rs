@@ -84,8 +84,11 @@ fn allocations([algorithm, policy, norm]: [&str; 3], precision: &str, threads: &
 /// included, after as many as make every buffer.
 fn allocations_of_a_learner(algorithm: &str) -> u64 {
     let mut layers = Layers::new();
+    // On-policy there is no price on changes.
+    let penalty = if algorithm == "ndp" { "0.0" } else { "0.2" };
     let keys = [
         ("algorithm.name", algorithm),
+        ("algorithm.action_rate_penalty", penalty),
         ("policy.start", "zero"),
         ("policy.normalise_observations", "true"),
         ("exploration.warm_up_steps", "0"),

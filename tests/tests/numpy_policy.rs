@@ -135,6 +135,7 @@ fn movement_primitives_of_other_kinds_act_the_same() {
     let stochastic = [
         ("algorithm.name", "ndp"),
         ("exploration.warm_up_steps", "0"),
+        ("algorithm.action_rate_penalty", "0.0"),
         ("policy.controller", "position"),
         ("policy.position_scale", "3.0"),
     ];

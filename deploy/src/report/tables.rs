@@ -57,13 +57,16 @@ impl Cell {
             None if self.unknown > 0 => lines.push("not measured".to_owned()),
             None if self.unfinished > 0 => lines.push("not finished".to_owned()),
             None => lines.push("not run".to_owned()),
+            // One seed has no spread: zeros would claim that it is known.
+            Some(Summary { count: 1, mean, .. }) => {
+                lines.extend([number(*mean, digits), "1 seed".to_owned()]);
+            }
             Some(Summary { count, mean, std, iqm, interval: [low, high] }) => {
                 let [mean, std, iqm, low, high] =
                     [mean, std, iqm, low, high].map(|value| number(*value, digits));
                 lines.push(format!("{mean} ± {std}"));
                 lines.push(format!("IQM {iqm} [{low}, {high}]"));
-                let seeds = if *count == 1 { "seed" } else { "seeds" };
-                lines.push(format!("{count} {seeds}"));
+                lines.push(format!("{count} seeds"));
             }
         }
         if let Some((mean, std)) = self.paper {
@@ -145,9 +148,9 @@ mod tests {
         };
         let success = rows("Success rate");
         assert_eq!(success.len(), 2, "{success:?}");
-        assert_eq!(success[0].1, ["0.50 ± 0.00", "not finished"]);
+        assert_eq!(success[0].1, ["0.50", "not finished"]);
         assert_eq!(success[1].1, ["not run", "not finished"]);
-        assert_eq!(rows("Average return")[0].1, ["0.50 ± 0.00", "not run"]);
+        assert_eq!(rows("Average return")[0].1, ["0.50", "not run"]);
         assert!(tables.iter().all(|table| !table.rows.is_empty()));
     }
 }
