@@ -14,7 +14,7 @@ const EXTRA: &str = "search";
 
 pub(super) fn run(
     args: &SweepArgs,
-    (file, text): (&SweepFile, &str),
+    file: &SweepFile,
     search: &Search,
     mut site: Site,
 ) -> anyhow::Result<Outcome> {
@@ -29,7 +29,7 @@ pub(super) fn run(
         let listing = Listing { site: &site, search, studies: &studies, jobs };
         return listing.print(args).map(|()| Outcome::Done);
     }
-    let lock = take(&mut site, text)?;
+    let lock = take(&mut site)?;
     let (_, python) = prepare_python_with(EXTRA)
         .with_context(|| format!("{}: [search] needs Optuna", args.file.display()))?;
     let count = studies.len() * search.trials as usize;

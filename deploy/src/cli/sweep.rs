@@ -84,9 +84,9 @@ pub(super) struct SweepArgs {
 pub(super) fn run(args: &SweepArgs) -> anyhow::Result<Outcome> {
     let (file, text) = SweepFile::read(&args.file)?;
     let output = args.output.clone().map_or_else(|| default_output(&args.file), Ok)?;
-    let site = Site { program: this_program()?, output };
+    let site = Site { program: this_program()?, output, text };
     if let Some(search) = &file.search {
-        return search::run(args, (&file, &text), search, site);
+        return search::run(args, &file, search, site);
     }
     let runs = configured(Plan::new(&file)?)?;
     let jobs = jobs(args, runs.iter().map(|(_, config)| config));
@@ -96,25 +96,22 @@ pub(super) fn run(args: &SweepArgs) -> anyhow::Result<Outcome> {
         let states = states(&plan)?;
         return report(&plan, &states, args.json).map(|()| Outcome::Done);
     }
-    let _lock = take(&mut plan.site, &text)?;
+    let _lock = take(&mut plan.site)?;
     plan.ledger = Ledger::open(&plan.site.output)?;
     // Once, before several runs want it at the same time.
     prepare_python()?;
     finish(plan, args)
 }
 
-/// Makes the sweep's directory, takes it for this process, and leaves the file there.
-pub(super) fn take(site: &mut Site, text: &str) -> anyhow::Result<RunLock> {
+/// Makes the sweep's directory and takes it for this process.
+pub(super) fn take(site: &mut Site) -> anyhow::Result<RunLock> {
     let output = &mut site.output;
     std::fs::create_dir_all(&*output)
         .with_context(|| format!("cannot make {}", output.display()))?;
     *output = std::fs::canonicalize(&*output)
         .with_context(|| format!("cannot resolve {}", output.display()))?;
     // Children inherit it: those of a sweep that was killed write their checkpoints first.
-    let lock = RunLock::take(output, RESUME_WAIT)?;
-    // For the report: what was asked for last.
-    std::fs::write(output.join("sweep.toml"), text).context("cannot write sweep.toml")?;
-    Ok(lock)
+    RunLock::take(output, RESUME_WAIT)
 }
 
 fn finish(mut plan: Sweep, args: &SweepArgs) -> anyhow::Result<Outcome> {

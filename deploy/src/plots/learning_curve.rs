@@ -6,6 +6,7 @@ use anyhow::{Context, anyhow};
 use plotters::prelude::*;
 
 use super::axes::Axes;
+use super::png::png;
 use crate::control::EvaluationRow;
 use crate::run_directory::RunDirectory;
 use crate::terminal::std_of;
@@ -16,7 +17,7 @@ const SIZE: (u32, u32) = (800, 480);
 /// Half of the last step's label.
 const BESIDE: u32 = 40;
 
-/// Draws `plots/learning_curve.svg`; nothing while there is no evaluation.
+/// Draws `plots/learning_curve.svg`, and the same as PNG; nothing while there is no evaluation.
 ///
 /// # Errors
 /// The rows cannot be read or the picture not be written.
@@ -29,7 +30,11 @@ pub fn learning_curve(run: &RunDirectory) -> anyhow::Result<Option<PathBuf>> {
     let svg =
         draw(&rows, &title).map_err(|error| anyhow!("cannot draw the learning curve: {error}"))?;
     let path = run.path().join("plots").join("learning_curve.svg");
-    std::fs::write(&path, svg).with_context(|| format!("cannot write {}", path.display()))?;
+    let pictures = [(path.with_extension("png"), png(&svg)?), (path.clone(), svg.into_bytes())];
+    for (path, picture) in pictures {
+        std::fs::write(&path, picture)
+            .with_context(|| format!("cannot write {}", path.display()))?;
+    }
     Ok(Some(path))
 }
 

@@ -3,7 +3,7 @@
 use std::path::{Path, PathBuf};
 
 use anyhow::Context;
-use dmprl_shared::config::{AlgorithmName, ExperimentConfig, PolicyKind};
+use dmprl_shared::config::{AlgorithmName, ExperimentConfig, PRESETS, PolicyKind};
 
 use crate::control::EvaluationRow;
 use crate::failure::wrong_use;
@@ -188,7 +188,8 @@ impl Results {
     fn add_run(&mut self, path: &Path) -> anyhow::Result<()> {
         let directory = RunDirectory::open(path)?;
         let config = directory.config()?;
-        let run = run(&directory, &config, label(&config))?;
+        let manifest = directory.manifest()?;
+        let run = run(&directory, &config, label(&config, manifest.preset()))?;
         add_new(&mut self.tasks, &run.task);
         add_new(&mut self.methods, &run.method);
         self.planned += 1;
@@ -217,8 +218,16 @@ fn run(directory: &RunDirectory, config: &ExperimentConfig, method: String) -> a
     Ok(Run { task, method, policy, seed, path, ended, steps, origin, rows, motion: None })
 }
 
-/// What a run is called that no sweep has named.
-fn label(config: &ExperimentConfig) -> String {
+/// What a run is called that no sweep has named: a preset's runs are no seeds of the default's.
+fn label(config: &ExperimentConfig, preset: Option<&str>) -> String {
+    let method = method(config);
+    match preset.filter(|&name| name != PRESETS[0].name) {
+        Some(name) => format!("{method} ({name})"),
+        None => method,
+    }
+}
+
+fn method(config: &ExperimentConfig) -> String {
     let algorithm = match config.algorithm.name {
         AlgorithmName::Ddpg => "DDPG",
         AlgorithmName::Td3 => "TD3",

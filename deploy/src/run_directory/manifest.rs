@@ -97,6 +97,15 @@ impl Manifest {
             format!("run_id: expected 16 hexadecimal digits, got {:?}", self.run_id)
         })
     }
+
+    /// The preset that the run was begun with, where its command names one.
+    #[must_use]
+    pub fn preset(&self) -> Option<&str> {
+        let words = &self.sessions.first()?.command;
+        let named = words.iter().zip(words.iter().skip(1)).find(|(flag, _)| *flag == "--preset");
+        let joined = || words.iter().find_map(|word| word.strip_prefix("--preset="));
+        named.map(|(_, name)| name.as_str()).or_else(joined)
+    }
 }
 
 impl Session {

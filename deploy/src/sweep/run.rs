@@ -15,7 +15,7 @@ use tokio::process::{Child, Command};
 use super::{Ledger, PlannedRun};
 use crate::control::EvaluationRow;
 use crate::launch::{describe, last_lines};
-use crate::run_directory::RunDirectory;
+use crate::run_directory::{RunDirectory, replace_file};
 use crate::terminal::shown;
 
 /// Where a sweep is made, and by what.
@@ -25,6 +25,8 @@ pub struct Site {
     pub program: PathBuf,
     /// Where everything goes.
     pub output: PathBuf,
+    /// The sweep file's text.
+    pub text: String,
 }
 
 /// How far a run is.
@@ -45,6 +47,12 @@ pub enum RunState {
 }
 
 impl Site {
+    /// Leaves the sweep's file for the report: what was asked for last. Only once all that lies here
+    /// is known to be of it, since the report calls the runs what the file calls them.
+    pub(super) fn keep_file(&self) -> anyhow::Result<()> {
+        replace_file(&self.output.join("sweep.toml"), self.text.as_bytes())
+    }
+
     /// How far a run is, by what lies in its directory.
     pub(super) fn state(
         &self,

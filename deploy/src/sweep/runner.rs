@@ -55,6 +55,7 @@ pub fn states(sweep: &Sweep) -> anyhow::Result<Vec<RunState>> {
 /// is no error of the sweep's: it goes on with the others.
 pub fn sweep(sweep: &mut Sweep) -> anyhow::Result<SweepReport> {
     let states = states(sweep)?;
+    sweep.site.keep_file()?;
     let runtime = tokio::runtime::Builder::new_current_thread()
         .enable_all()
         .build()

@@ -88,6 +88,19 @@ fn what_is_no_run_or_has_no_evaluation_is_refused() {
 }
 
 #[test]
+fn runs_of_another_preset_have_a_column_of_their_own() {
+    let place = Workplace::new();
+    let runs = [("ours", "default"), ("theirs", "paper")].map(|(name, preset)| {
+        let run = place.path(name);
+        let more = ["--algo", "ddpg", "--preset", preset, "--steps", "500"];
+        place.run(&train("reacher", &run, &more)).with_status(0);
+        run
+    });
+    let json = place.run(&["report", &runs[0], &runs[1], "--no-motion", "--json"]).json();
+    assert_eq!(json["methods"], serde_json::json!(["DDPG-DMP", "DDPG-DMP (paper)"]));
+}
+
+#[test]
 fn a_run_whose_environment_is_gone_is_reported_without_its_motion() {
     let place = Workplace::new();
     let (run, folder) = (place.path("run"), place.path("envs"));

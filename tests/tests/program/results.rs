@@ -51,6 +51,7 @@ fn training_with_two_workers_leaves_a_whole_run_directory_and_nothing_else() {
         "logs/actor-1.log",
         "logs/evaluator.log",
         "plots/learning_curve.svg",
+        "plots/learning_curve.png",
     ] {
         assert!(Path::new(&run).join(file).is_file(), "no {file}");
     }

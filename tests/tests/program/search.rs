@@ -149,7 +149,10 @@ fn a_search_that_is_killed_goes_on_with_the_trials_under_way() {
 
     // Another space in the same place is refused before anything is asked or begun.
     let other = write(&place, 12_000, "[1]", &space.replace("1e-5", "1e-6"));
+    let kept = place.path("runs/small/sweep.toml");
+    let before = fs::read_to_string(&kept).unwrap();
     place.run(&["sweep", &other]).with_status(1).saying("space").saying("--output");
+    assert_eq!(fs::read_to_string(&kept).unwrap(), before, "it still says what was searched");
 }
 
 #[test]

@@ -73,6 +73,8 @@ fn every_run_of_a_sweep_is_trained_once_and_a_longer_one_goes_on() {
     let other = write(&place, &TWO_METHODS.replace("'dmp'", "'dmp'\nset = { dmp.alpha_y = 9.0 }"));
     let refused = place.run(&["sweep", &other]).with_status(1);
     refused.saying("dmp.alpha_y").saying("another configuration");
+    let kept = fs::read_to_string(place.path("runs/small/sweep.toml")).unwrap();
+    assert!(!kept.contains("alpha_y"), "what lies there is of the file before");
     place.assert_no_process();
 }
 

@@ -67,6 +67,7 @@ pub fn search(sweep: &mut SearchSweep) -> anyhow::Result<SearchReport> {
         let optuna = Optuna::start(&sweep.python, &sweep.site.output).await?;
         let mut runner = Runner::new(sweep, optuna);
         runner.open().await?;
+        runner.sweep.site.keep_file()?;
         runner.run(interrupts).await
     })
 }
