@@ -47,8 +47,8 @@ pub enum RunState {
 }
 
 impl Site {
-    /// Leaves the sweep's file for the report: what was asked for last. Only once all that lies here
-    /// is known to be of it, since the report calls the runs what the file calls them.
+    /// Leaves the sweep's file for the report: what was asked for last. Only once all that lies
+    /// here is known to be of it, since the report calls the runs what the file calls them.
     pub(super) fn keep_file(&self) -> anyhow::Result<()> {
         replace_file(&self.output.join("sweep.toml"), self.text.as_bytes())
     }
