@@ -10,6 +10,7 @@ pub mod chaos;
 pub mod cli;
 pub mod control;
 mod doctor;
+pub mod export;
 pub mod failure;
 pub mod journal;
 pub mod launch;

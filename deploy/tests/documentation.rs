@@ -161,6 +161,7 @@ fn every_flag_that_is_shown_exists() {
         "sweep",
         "report",
         "record",
+        "export",
         "bench rollout",
         "bench learner",
         "bench transport",
@@ -211,8 +212,12 @@ fn every_configuration_key_that_is_named_exists() {
     for document in DOCUMENTS {
         let text = read(document);
         let allowed = |letter: char| letter.is_ascii_alphanumeric() || "._/".contains(letter);
-        for word in text.split(|letter: char| !allowed(letter)) {
-            let word = word.trim_end_matches('.');
+        for word in text.split_inclusive(|letter: char| !allowed(letter)) {
+            // A method: `policy.segment(observation)`.
+            if word.ends_with('(') {
+                continue;
+            }
+            let word = word.trim_end_matches(|letter| !allowed(letter)).trim_end_matches('.');
             let variable = word.strip_prefix("DMPRL_").filter(|rest| rest.contains("__"));
             let key = match variable {
                 Some(variable) => variable.to_ascii_lowercase().replace("__", "."),
@@ -301,6 +306,12 @@ fn every_path_and_test_that_the_documents_name_is_there() {
             FOLDERS.iter().any(|folder| span.starts_with(folder)) && !span.contains(' ')
         });
         for name in links.chain(named) {
+            if let Some(anchor) = name.strip_prefix('#') {
+                let headings = text.lines().filter(|line| line.starts_with('#'));
+                let found = headings.map(anchor_of).any(|heading| heading == anchor);
+                assert!(found, "{document} names #{anchor}, which no heading has");
+                continue;
+            }
             let (path, test) = name.split_once("::").unwrap_or((&name, ""));
             // A link is relative to its document, a path in code to the project.
             let beside = Path::new(document).parent().unwrap_or(Path::new(""));
@@ -313,6 +324,13 @@ fn every_path_and_test_that_the_documents_name_is_there() {
             assert!(there, "{document} names the test {test}, which {path} does not have");
         }
     }
+}
+
+/// What a link to a heading is called.
+fn anchor_of(heading: &str) -> String {
+    let words = heading.trim_start_matches('#').trim().to_lowercase();
+    let kept = words.chars().filter(|letter| letter.is_alphanumeric() || " -_".contains(*letter));
+    kept.collect::<String>().replace(' ', "-")
 }
 
 #[test]

@@ -1,6 +1,13 @@
-"""Environments of dmprl.
+"""Environments and trained policies of dmprl.
 
-Importing this package registers its tasks with Gymnasium::
+A policy that dmprl has trained, with NumPy alone::
+
+    import dmprl
+
+    policy = dmprl.Policy.load("policy.safetensors")
+    actions = policy.segment(observation)
+
+Importing this package registers its tasks with Gymnasium, where that is installed::
 
     import dmprl
     import gymnasium
@@ -11,6 +18,10 @@ The rollout worker (Rust, ``actors/src/python_env``) embeds Python and calls
 :func:`dmprl.segment_env.make`, then ``step_segment`` once per policy decision.
 """
 
+from dmprl.policy import Policy
+from dmprl.policy_file import PolicyFileError
+
+__all__ = ["Policy", "PolicyFileError"]
 __version__ = "0.1.0"
 
 

@@ -1,8 +1,8 @@
-"""The rollout worker's policy once more, in NumPy, for what a benchmark compares it with.
+"""The policy once more, in NumPy: for whoever has no Rust, and as a benchmark's peer.
 
 The same function as ``shared/src/policy`` and the same noise as ``actors/src/exploration.rs``, for
-E environments at once; a test holds its actions to Rust's. Shapes: E environments, K steps, O
-observation, A action, N basis functions.
+E environments at once; a test holds its actions to Rust's. :class:`dmprl.Policy` is it with a file
+and what a robot needs. Shapes: E environments, K steps, O observation, A action, N basis functions.
 """
 
 from __future__ import annotations
@@ -23,15 +23,20 @@ LOG_STD_RANGE = (-20.0, 2.0)
 
 
 class NumpyPolicy:
-    """The policy that ``plan`` describes (``deploy/src/bench/numpy_plan.rs`` writes it)."""
+    """The policy that ``plan`` describes (``deploy/src/bench/numpy_plan.rs`` writes it).
 
-    def __init__(self, plan: dict) -> None:
+    ``parameters`` are the network's, flat; without them, those of the file that the plan names.
+    """
+
+    def __init__(self, plan: dict, parameters: Floats | None = None) -> None:
         self.env_count: int = plan["env_count"]
         self.segment_steps: int = plan["decision_steps"]
         self.action_len: int = plan["spec"]["action_len"]
         low, high = np.array(plan["spec"]["action_low"]), np.array(plan["spec"]["action_high"])
         self._mid, self._half_range = 0.5 * (low + high), 0.5 * (high - low)
-        self._layers = layers(plan["widths"], np.fromfile(Path(plan["parameters"]), np.float32))
+        if parameters is None:
+            parameters = np.fromfile(Path(plan["parameters"]), np.float32)
+        self._layers = layers(plan["widths"], parameters)
         self._activations = [
             np.empty((self.env_count, width), np.float32) for width in plan["widths"][1:]
         ]
@@ -75,9 +80,13 @@ class NumpyPolicy:
 
     def carry_on(self, ended: NDArray[np.bool_]) -> None:
         """Lets each DMP continue from its segment's end, or from rest where an episode ended."""
+        self.carry_from(self.segment_steps)
+        self.carried[ended] = 0.0
+
+    def carry_from(self, step: int) -> None:
+        """Lets each DMP continue from where it is after so many steps, 1 to K, of its segment."""
         if self._head is not None and self.carried.shape[1] > 0:
-            self.carried[:] = self._head.end_state()
-            self.carried[ended] = 0.0
+            self.carried[:] = self._head.state_after(step)
 
 
 def layers(widths: list[int], parameters: Floats) -> list[tuple[Floats, Floats]]:
@@ -141,9 +150,9 @@ class DmpHead:
             u = self._position_scale * np.diff(y, axis=-1, prepend=inputs[..., :1])
         return np.ascontiguousarray(u.transpose(0, 2, 1))
 
-    def end_state(self) -> Floats:
-        """(y, yd) of every action dimension at the segments' end, (E, 2A)."""
-        y, yd = self._samples[..., self._steps - 1], self._samples[..., 2 * self._steps - 1]
+    def state_after(self, step: int) -> Floats:
+        """(y, yd) of every action dimension after so many steps of the segments, (E, 2A)."""
+        y, yd = self._samples[..., step - 1], self._samples[..., self._steps + step - 1]
         return np.concatenate([y, yd * self._omega], axis=1)
 
     def _read_start(self, observations: Floats) -> None:

@@ -12,7 +12,6 @@ pub mod metrics;
 pub mod networks;
 pub mod normaliser;
 pub mod pacing;
-pub mod policy_file;
 pub mod replay;
 pub mod rollout_buffer;
 pub mod session;

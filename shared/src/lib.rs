@@ -9,6 +9,8 @@ pub mod config;
 pub mod dmp;
 pub mod parameters;
 pub mod policy;
+pub mod policy_file;
+pub mod runtime;
 pub mod seeds;
 pub mod segment;
 pub mod spec;

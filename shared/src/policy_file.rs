@@ -1,17 +1,32 @@
-//! A policy on disk: safetensors, one tensor a weight matrix or bias, and who it is.
+//! A policy on disk: safetensors, one tensor a weight matrix or bias, and what it is.
+//!
+//! A file says everything that it takes to act: beside the network's tensors, of which observation
+//! normalisation is a part, its metadata hold the policy's description (environment, DMP, ranges,
+//! controller, start) as JSON, and `segment_map` the DMP as one matrix, so that who reads it needs
+//! no integrator.
 
 use std::collections::HashMap;
 use std::fs;
 use std::io;
 use std::path::Path;
 
-use dmprl_shared::parameters::ParameterSnapshot;
-use dmprl_shared::policy::Policy;
 use safetensors::tensor::{Dtype, SafeTensors, TensorView};
+use serde::{Deserialize, Serialize};
 use thiserror::Error;
+
+use crate::parameters::ParameterSnapshot;
+use crate::policy::{Head, Policy, PolicyDescription};
 
 /// Version of this format.
 const FORMAT: &str = "dmprl-policy-1";
+const FORMAT_KEY: &str = "format";
+const HASH_KEY: &str = "architecture_hash";
+const VERSION_KEY: &str = "policy_version";
+const STEPS_KEY: &str = "env_steps";
+const DESCRIPTION_KEY: &str = "description";
+const ORIGIN_KEY: &str = "origin";
+/// From (y0, yd0, g, w) to the samples of one dimension, (3K, 3+N).
+const MAP: &str = "segment_map";
 
 /// Why a policy file was refused.
 #[derive(Debug, Error)]
@@ -46,6 +61,136 @@ pub enum PolicyFileError {
     },
 }
 
+/// Where a policy comes from, for whoever finds the file later.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Origin {
+    /// Id of the run that trained it.
+    pub run_id: String,
+    /// The task's name.
+    pub task: String,
+    /// `run.seed`.
+    pub seed: u64,
+    /// Version of the program that wrote the file.
+    pub dmprl_version: String,
+    /// Commit of that program, where it is known.
+    pub git_commit: Option<String>,
+    /// Its mean evaluation return, where it was evaluated.
+    pub return_mean: Option<f64>,
+    /// Its rate of success, where the task reports one.
+    pub success_rate: Option<f64>,
+}
+
+/// A policy with its parameters.
+#[derive(Debug)]
+pub struct OpenedPolicy {
+    /// The architecture.
+    pub policy: Policy,
+    /// Its parameters.
+    pub snapshot: ParameterSnapshot,
+    /// Where it comes from; none in a run's own files, which lie where they come from.
+    pub origin: Option<Origin>,
+}
+
+/// How strictly a file must match the policy it is loaded into.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Match {
+    /// The same architecture: configuration, DMP, task and sizes.
+    Architecture,
+    /// The same network sizes, for a warm start under another configuration.
+    Sizes,
+}
+
+/// Writes a snapshot, first to a temporary name beside `path`.
+///
+/// - `origin`: where it comes from, if the file is to leave its run.
+///
+/// # Errors
+/// `Io` if writing fails; nothing is left at `path` then.
+pub fn save(
+    path: &Path,
+    policy: &Policy,
+    snapshot: &ParameterSnapshot,
+    origin: Option<&Origin>,
+) -> Result<(), PolicyFileError> {
+    let io_error = |cause| PolicyFileError::Io { path: path.display().to_string(), cause };
+    let view = |shape, numbers| {
+        let view = TensorView::new(Dtype::F32, shape, bytemuck::cast_slice::<f32, u8>(numbers));
+        view.map_err(|error| format_error(path, error))
+    };
+    let mut tensors = Vec::new();
+    for (name, shape, range) in names(policy) {
+        tensors.push((name, view(shape, &snapshot.values[range])?));
+    }
+    if let Head::Dmp(head) = policy.head() {
+        let map = head.map();
+        let shape = vec![map.sample_count(), map.input_count()];
+        tensors.push((MAP.to_owned(), view(shape, map.matrix())?));
+    }
+    let json = |value: serde_json::Result<String>| value.map_err(|e| format_error(path, e));
+    let mut metadata = HashMap::from([
+        (FORMAT_KEY.to_owned(), FORMAT.to_owned()),
+        (HASH_KEY.to_owned(), format!("{:016x}", snapshot.architecture_hash)),
+        (VERSION_KEY.to_owned(), snapshot.version.to_string()),
+        (STEPS_KEY.to_owned(), snapshot.env_steps.to_string()),
+        (DESCRIPTION_KEY.to_owned(), json(serde_json::to_string(policy.description()))?),
+    ]);
+    if let Some(origin) = origin {
+        metadata.insert(ORIGIN_KEY.to_owned(), json(serde_json::to_string(origin))?);
+    }
+    let bytes =
+        safetensors::serialize(tensors, Some(metadata)).map_err(|e| format_error(path, e))?;
+    let temporary = path.with_extension("tmp");
+    fs::write(&temporary, bytes)
+        .and_then(|()| fs::File::open(&temporary)?.sync_all())
+        .and_then(|()| fs::rename(&temporary, path))
+        .map_err(io_error)
+}
+
+/// Reads a snapshot into a policy that is there already.
+///
+/// # Errors
+/// If the file is unreadable, damaged or of another architecture.
+pub fn load(
+    path: &Path,
+    policy: &Policy,
+    strictness: Match,
+) -> Result<ParameterSnapshot, PolicyFileError> {
+    let bytes = read(path)?;
+    Contents::new(path, &bytes)?.snapshot(policy, strictness)
+}
+
+/// Reads a policy with its parameters: nothing but the file is needed.
+///
+/// # Errors
+/// If the file is unreadable or damaged, or says too little: it is older than descriptions are.
+pub fn open(path: &Path) -> Result<OpenedPolicy, PolicyFileError> {
+    let bytes = read(path)?;
+    let contents = Contents::new(path, &bytes)?;
+    let Some(text) = contents.fields.get(DESCRIPTION_KEY) else {
+        let expected = "there; write the file anew with dmprl export RUN";
+        return Err(contents.mismatch(DESCRIPTION_KEY, expected.into(), "missing".into()));
+    };
+    let unfit = |name, error: &dyn std::error::Error| {
+        contents.mismatch(name, "one that this dmprl knows".into(), error.to_string())
+    };
+    let description: PolicyDescription =
+        serde_json::from_str(text).map_err(|error| unfit(DESCRIPTION_KEY, &error))?;
+    let policy = description.build().map_err(|error| unfit(DESCRIPTION_KEY, &error))?;
+    let origin = contents.fields.get(ORIGIN_KEY).map(|text| serde_json::from_str(text));
+    let origin = origin.transpose().map_err(|error| unfit(ORIGIN_KEY, &error))?;
+    let snapshot = contents.snapshot(&policy, Match::Architecture)?;
+    Ok(OpenedPolicy { policy, snapshot, origin })
+}
+
+fn read(path: &Path) -> Result<Vec<u8>, PolicyFileError> {
+    let shown = path.display().to_string();
+    fs::read(path).map_err(|cause| PolicyFileError::Io { path: shown, cause })
+}
+
+fn format_error(path: &Path, cause: impl std::fmt::Display) -> PolicyFileError {
+    PolicyFileError::Format { path: path.display().to_string(), cause: cause.to_string() }
+}
+
 fn names(policy: &Policy) -> Vec<(String, Vec<usize>, std::ops::Range<usize>)> {
     let layers = policy.shape().layers().iter().enumerate();
     let network_len = policy.shape().parameters_len();
@@ -68,118 +213,98 @@ fn names(policy: &Policy) -> Vec<(String, Vec<usize>, std::ops::Range<usize>)> {
         .collect()
 }
 
-/// Writes a snapshot, first to a temporary name beside `path`.
-///
-/// # Errors
-/// `Io` if writing fails; nothing is left at `path` then.
-pub fn save(
-    path: &Path,
-    policy: &Policy,
-    snapshot: &ParameterSnapshot,
-) -> Result<(), PolicyFileError> {
-    let io_error = |cause| PolicyFileError::Io { path: path.display().to_string(), cause };
-    let format_error = |cause: safetensors::SafeTensorError| PolicyFileError::Format {
-        path: path.display().to_string(),
-        cause: cause.to_string(),
-    };
-    let mut tensors = Vec::new();
-    for (name, shape, range) in names(policy) {
-        let bytes = bytemuck::cast_slice(&snapshot.values[range]);
-        let view = TensorView::new(Dtype::F32, shape, bytes).map_err(format_error)?;
-        tensors.push((name, view));
-    }
-    let metadata = HashMap::from([
-        ("format".to_owned(), FORMAT.to_owned()),
-        ("architecture_hash".to_owned(), format!("{:016x}", snapshot.architecture_hash)),
-        ("policy_version".to_owned(), snapshot.version.to_string()),
-        ("env_steps".to_owned(), snapshot.env_steps.to_string()),
-    ]);
-    let bytes = safetensors::serialize(tensors, Some(metadata)).map_err(format_error)?;
-    let temporary = path.with_extension("tmp");
-    fs::write(&temporary, bytes)
-        .and_then(|()| fs::File::open(&temporary)?.sync_all())
-        .and_then(|()| fs::rename(&temporary, path))
-        .map_err(io_error)
+/// What a file holds, of the format that we know.
+struct Contents<'a> {
+    path: &'a Path,
+    fields: HashMap<String, String>,
+    tensors: SafeTensors<'a>,
 }
 
-/// How strictly a file must match the policy it is loaded into.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Match {
-    /// The same architecture: configuration, DMP, task and sizes.
-    Architecture,
-    /// The same network sizes, for a warm start under another configuration.
-    Sizes,
-}
+impl<'a> Contents<'a> {
+    fn new(path: &'a Path, bytes: &'a [u8]) -> Result<Self, PolicyFileError> {
+        let (_, metadata) =
+            SafeTensors::read_metadata(bytes).map_err(|error| format_error(path, error))?;
+        let fields = metadata.metadata().clone().unwrap_or_default();
+        let tensors = SafeTensors::deserialize(bytes).map_err(|error| format_error(path, error))?;
+        let contents = Self { path, fields, tensors };
+        contents.expect(FORMAT_KEY, FORMAT.to_owned())?;
+        Ok(contents)
+    }
 
-/// Reads a snapshot.
-///
-/// # Errors
-/// If the file is unreadable, damaged or of another architecture.
-pub fn load(
-    path: &Path,
-    policy: &Policy,
-    strictness: Match,
-) -> Result<ParameterSnapshot, PolicyFileError> {
-    let shown = path.display().to_string();
-    let bytes =
-        fs::read(path).map_err(|cause| PolicyFileError::Io { path: shown.clone(), cause })?;
-    let format_error = |cause: safetensors::SafeTensorError| PolicyFileError::Format {
-        path: path.display().to_string(),
-        cause: cause.to_string(),
-    };
-    let mismatch = |name: &str, expected: String, got: String| PolicyFileError::Mismatch {
-        path: path.display().to_string(),
-        name: name.to_owned(),
-        expected,
-        got,
-    };
-    let (_, metadata) = SafeTensors::read_metadata(&bytes).map_err(format_error)?;
-    let empty = HashMap::new();
-    let fields = metadata.metadata().as_ref().unwrap_or(&empty);
-    let field = |name: &str| fields.get(name).cloned().unwrap_or_else(|| "missing".into());
-    let mut expected = vec![("format", FORMAT.to_owned())];
-    if strictness == Match::Architecture {
-        expected.push(("architecture_hash", format!("{:016x}", policy.architecture_hash())));
-    }
-    for (name, expected) in expected {
-        if field(name) != expected {
-            return Err(mismatch(name, expected, field(name)));
+    fn snapshot(
+        &self,
+        policy: &Policy,
+        strictness: Match,
+    ) -> Result<ParameterSnapshot, PolicyFileError> {
+        if strictness == Match::Architecture {
+            self.expect(HASH_KEY, format!("{:016x}", policy.architecture_hash()))?;
         }
-    }
-    let number = |name: &str| {
-        let text = field(name);
-        text.parse::<u64>().map_err(|_| mismatch(name, "a whole number".into(), text))
-    };
-    let tensors = SafeTensors::deserialize(&bytes).map_err(format_error)?;
-    let mut values = vec![0.0_f32; policy.parameters_len()];
-    for (name, shape, range) in names(policy) {
-        let tensor = tensors.tensor(&name).map_err(format_error)?;
-        if tensor.shape() != shape || tensor.dtype() != Dtype::F32 {
-            let got = format!("{:?} {:?}", tensor.dtype(), tensor.shape());
-            return Err(mismatch(&name, format!("F32 {shape:?}"), got));
+        let mut tensors = Vec::new();
+        for (name, shape, range) in names(policy) {
+            let tensor = self.tensors.tensor(&name).map_err(|e| format_error(self.path, e))?;
+            if tensor.shape() != shape || tensor.dtype() != Dtype::F32 {
+                let got = format!("{:?} {:?}", tensor.dtype(), tensor.shape());
+                return Err(self.mismatch(&name, format!("F32 {shape:?}"), got));
+            }
+            tensors.push((tensor, range));
         }
-        bytemuck::cast_slice_mut(&mut values[range]).copy_from_slice(tensor.data());
+        // Not before the shapes are known to be the file's: a description may ask for any size.
+        let mut values = vec![0.0_f32; policy.parameters_len()];
+        for (tensor, range) in tensors {
+            bytemuck::cast_slice_mut(&mut values[range]).copy_from_slice(tensor.data());
+        }
+        if let Some(at) = values.iter().position(|value| !value.is_finite()) {
+            return Err(self.mismatch("a parameter", "finite".into(), values[at].to_string()));
+        }
+        Ok(ParameterSnapshot {
+            version: self.number(VERSION_KEY)?,
+            env_steps: self.number(STEPS_KEY)?,
+            architecture_hash: policy.architecture_hash(),
+            values,
+        })
     }
-    if let Some(at) = values.iter().position(|value| !value.is_finite()) {
-        return Err(mismatch("a parameter", "finite".into(), values[at].to_string()));
+
+    fn field(&self, name: &str) -> String {
+        self.fields.get(name).cloned().unwrap_or_else(|| "missing".into())
     }
-    Ok(ParameterSnapshot {
-        version: number("policy_version")?,
-        env_steps: number("env_steps")?,
-        architecture_hash: policy.architecture_hash(),
-        values,
-    })
+
+    fn expect(&self, name: &str, expected: String) -> Result<(), PolicyFileError> {
+        let got = self.field(name);
+        if got == expected { Ok(()) } else { Err(self.mismatch(name, expected, got)) }
+    }
+
+    fn number(&self, name: &str) -> Result<u64, PolicyFileError> {
+        let text = self.field(name);
+        text.parse().map_err(|_| self.mismatch(name, "a whole number".into(), text))
+    }
+
+    fn mismatch(&self, name: &str, expected: String, got: String) -> PolicyFileError {
+        let path = self.path.display().to_string();
+        PolicyFileError::Mismatch { path, name: name.to_owned(), expected, got }
+    }
 }
 
 #[cfg(test)]
 mod tests {
-    use dmprl_shared::config::ExperimentConfig;
-
     use super::*;
-    use crate::learner::tests::spec;
+    use crate::config::{ExperimentConfig, Layers};
+    use crate::spec::EnvSpec;
+
+    fn spec() -> EnvSpec {
+        EnvSpec {
+            id: "Test-v0".into(),
+            observation_len: 4,
+            action_len: 2,
+            action_low: vec![-1.0, 0.0],
+            action_high: vec![1.0, 3.0],
+            control_dt_s: 0.1,
+            episode_steps: 50,
+            observation_names: Vec::new(),
+        }
+    }
 
     fn policy(keys: &[(&str, &str)]) -> Policy {
-        let mut layers = dmprl_shared::config::Layers::new();
+        let mut layers = Layers::new();
         for (key, value) in keys {
             layers.set("test", key, value).unwrap();
         }
@@ -192,14 +317,14 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("1.safetensors");
         let own = policy(&[("algorithm.name", "ndp"), ("algorithm.ndp.initial_log_std", "-0.5")]);
-        let mut random = dmprl_shared::seeds::stream(1, "test", 0);
+        let mut random = crate::seeds::stream(1, "test", 0);
         let snapshot = ParameterSnapshot {
             version: 1,
             env_steps: 0,
             architecture_hash: own.architecture_hash(),
             values: own.initial_parameters(&mut random),
         };
-        save(&path, &own, &snapshot).unwrap();
+        save(&path, &own, &snapshot, None).unwrap();
         let read = load(&path, &own, Match::Architecture).unwrap();
         assert_eq!(read, snapshot);
         assert_eq!(own.learned_std().unwrap().log_std(&read.values), [-0.5; 2]);
@@ -211,14 +336,14 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("7.safetensors");
         let own = policy(&[]);
-        let mut random = dmprl_shared::seeds::stream(1, "test", 0);
+        let mut random = crate::seeds::stream(1, "test", 0);
         let snapshot = ParameterSnapshot {
             version: 7,
             env_steps: 100,
             architecture_hash: own.architecture_hash(),
             values: own.initial_parameters(&mut random),
         };
-        save(&path, &own, &snapshot).unwrap();
+        save(&path, &own, &snapshot, None).unwrap();
         assert_eq!(load(&path, &own, Match::Architecture).unwrap(), snapshot);
 
         let other = policy(&[("dmp.alpha_y", "8.0")]);
@@ -233,5 +358,73 @@ mod tests {
         fs::write(&path, &bytes[..bytes.len() / 2]).unwrap();
         let error = load(&path, &own, Match::Architecture).unwrap_err().to_string();
         assert!(error.contains("not a readable safetensors file"), "{error}");
+    }
+
+    fn saved(keys: &[(&str, &str)], path: &Path) -> (Policy, ParameterSnapshot, Origin) {
+        let own = policy(keys);
+        let mut random = crate::seeds::stream(1, "test", 0);
+        let snapshot = ParameterSnapshot {
+            version: 3,
+            env_steps: 100,
+            architecture_hash: own.architecture_hash(),
+            values: own.initial_parameters(&mut random),
+        };
+        let origin = Origin {
+            run_id: "00000000000000ab".into(),
+            task: "test".into(),
+            seed: 1,
+            dmprl_version: "0.1.0".into(),
+            git_commit: None,
+            return_mean: Some(-4.25),
+            success_rate: None,
+        };
+        save(path, &own, &snapshot, Some(&origin)).unwrap();
+        (own, snapshot, origin)
+    }
+
+    #[test]
+    fn a_file_alone_makes_the_policy_again() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("mine.safetensors");
+        let sources =
+            "[{ cos = 0, sin = 1, velocity = 2 }, { index = 3, velocity = 2, scale = -1.0 }]";
+        for keys in [
+            &[][..],
+            &[("policy.kind", "mlp"), ("algorithm.name", "sac")],
+            &[("algorithm.name", "ndp"), ("policy.controller", "position")],
+            &[("policy.start", "carry"), ("dmp.alpha_y", "12.5"), ("policy.rho", "free")],
+            &[("policy.start", "observed"), ("task.start_sources", sources)],
+        ] {
+            let (own, snapshot, origin) = saved(keys, &path);
+            let opened = open(&path).unwrap();
+            assert_eq!(opened.policy.architecture_hash(), own.architecture_hash(), "{keys:?}");
+            assert_eq!(opened.policy.description(), own.description());
+            assert_eq!((opened.snapshot, opened.origin), (snapshot, Some(origin)));
+        }
+    }
+
+    #[test]
+    fn a_description_that_is_missing_or_absurd_is_refused() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("mine.safetensors");
+        let refused = |from: &str, to: &str| {
+            saved(&[], &path);
+            let mut bytes = fs::read(&path).unwrap();
+            let at = bytes.windows(from.len()).position(|part| part == from.as_bytes()).unwrap();
+            // The header's length stays what it was.
+            bytes[at..at + from.len()].copy_from_slice(format!("{to:<0$}", from.len()).as_bytes());
+            fs::write(&path, bytes).unwrap();
+            open(&path).unwrap_err().to_string()
+        };
+        let error = refused("\"description\":", "\"descripti--\":");
+        assert!(error.contains("description is missing") && error.contains("dmprl export"));
+        let hidden = "\\\"hidden\\\":[256,256]";
+        let error = refused(hidden, &hidden.replace("256,256", "0,99999"));
+        assert!(error.contains("policy.hidden"), "{error}");
+        let error = refused(hidden, &hidden.replace("256,256", "256,255"));
+        assert!(error.contains("architecture_hash"), "{error}");
+        let dims = "\\\"action_len\\\":2";
+        let error = refused(dims, &dims.replace('2', "9"));
+        assert!(error.contains("action_low has 2 entries, expected 9"), "{error}");
     }
 }

@@ -1,5 +1,6 @@
 //! Helpers of the tests that need more than one crate.
 
+pub mod exported;
 pub mod program;
 
 use std::path::{Path, PathBuf};

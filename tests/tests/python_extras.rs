@@ -1,4 +1,5 @@
-//! The Python package with its optional extras: panda-gym, Gymnasium-Robotics and Optuna.
+//! The Python package with its optional extras: panda-gym, Gymnasium-Robotics, Optuna, and an ONNX
+//! runtime.
 //!
 //! They get an environment of their own, made once: PyBullet is large, most users need none of
 //! them, and not every Python has a build of it. Where one cannot be installed, the test says so
@@ -15,10 +16,11 @@ use std::path::{Path, PathBuf};
 use std::process::{Command, Output};
 
 use dmprl_actors::python_env::LINKED_PYTHON;
-use dmprl_tests::project_root;
+use dmprl_tests::{exported, project_root};
 
 /// Extras of `envs_py/pyproject.toml`, everything first, and the tests that need no more.
-const ATTEMPTS: [(&str, &str); 2] = [("test", "test_*.py"), ("robotics,search", "test_[rs]*.py")];
+const ATTEMPTS: [(&str, &str); 2] =
+    [("test", "test_*.py"), ("onnx,robotics,search", "test_[ors]*.py")];
 /// What pip says when a package has no build for this Python, or the network cannot be reached.
 const NOT_AVAILABLE: [&str; 2] = ["No matching distribution found", "Could not find a version"];
 
@@ -83,7 +85,10 @@ fn environment_with(extra: &str) -> Result<PathBuf, String> {
 }
 
 fn run_tests(python: &Path, tests: &str) {
+    let exported = tempfile::tempdir().unwrap();
+    exported::write(exported.path());
     let output = Command::new(python)
+        .env("TEST_EXPORTED", exported.path())
         .args(["-m", "unittest", "discover", "--start-directory", "envs_py/tests_extras"])
         .args(["--pattern", tests])
         .current_dir(project_root())

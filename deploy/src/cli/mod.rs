@@ -9,6 +9,7 @@ mod configuration;
 mod configured;
 mod doctor;
 mod eval;
+mod export;
 mod record;
 mod report;
 mod resume;
@@ -74,6 +75,8 @@ enum Command {
     Report(report::ReportArgs),
     /// Make a video of a policy, or of two side by side.
     Record(record::RecordArgs),
+    /// Write a run's policy as one file, for a robot or an ONNX runtime.
+    Export(export::ExportArgs),
     /// Measure a part of the system beside what else could do its work.
     Bench(bench::BenchArgs),
     /// Kill a run's processes by a schedule and check that nothing is lost.
@@ -135,6 +138,7 @@ fn run(command: Command) -> anyhow::Result<Outcome> {
         Command::Sweep(args) => sweep::run(&args),
         Command::Report(args) => report::run(&args),
         Command::Record(args) => record::run(&args),
+        Command::Export(args) => export::run(&args),
         Command::Bench(args) => bench::run(&args),
         Command::Chaos(args) => chaos::run(&args),
         Command::Tasks(args) => tasks::run(&args),

@@ -7,8 +7,8 @@ use dmprl_actors::evaluate::{ENVIRONMENTS_MAX, Episodes, Evaluator};
 use dmprl_actors::python_env::Interpreter;
 use dmprl_actors::rollout::RolloutError;
 use dmprl_learner::checkpoint;
-use dmprl_learner::policy_file::{self, Match};
 use dmprl_shared::config::ExperimentConfig;
+use dmprl_shared::policy_file::{self, Match};
 use dmprl_shared::spec::EnvSpec;
 
 use super::setup::Setup;

@@ -9,7 +9,7 @@ use std::sync::atomic::{AtomicU64, Ordering};
 use anyhow::Context;
 use dmprl_actors::python_env::{self, PythonEnvironments, SUCCESS_NOT_REPORTED, SUCCESS_YES};
 use dmprl_actors::recording::{EpisodeRecord, Recorder};
-use dmprl_learner::policy_file::{self, Match};
+use dmprl_shared::policy_file::{self, Match};
 use serde::Serialize;
 
 use super::setup::Setup;

@@ -8,8 +8,8 @@ use anyhow::Context;
 use dmprl_learner::checkpoint::{CheckpointError, Ended, Writer};
 use dmprl_learner::learner::Learner;
 use dmprl_learner::metrics::MetricsLine;
-use dmprl_learner::policy_file;
 use dmprl_learner::session::Due;
+use dmprl_shared::policy_file;
 use dmprl_shared::transport::delivery::Mark;
 
 use super::ControlPipe;
@@ -215,7 +215,7 @@ impl<'a> Recorder<'a> {
     fn save_policy(&self, learner: &Learner) -> anyhow::Result<EvaluationRequest> {
         let counters = learner.counters;
         let path = self.run.policy_path(counters.policy_version);
-        policy_file::save(&path, learner.policy(), learner.snapshot())?;
+        policy_file::save(&path, learner.policy(), learner.snapshot(), None)?;
         Ok(EvaluationRequest {
             env_steps: counters.env_steps,
             updates: counters.updates,

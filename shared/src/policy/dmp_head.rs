@@ -221,6 +221,12 @@ impl DmpHead {
         }
     }
 
+    /// From (y0, yd0, g, w) to the samples of one dimension.
+    #[must_use]
+    pub fn map(&self) -> &SegmentMap {
+        &self.map
+    }
+
     /// omega = alpha_y / 2, by which the critic's end velocity is divided.
     #[must_use]
     pub fn omega(&self) -> f32 {

@@ -12,6 +12,7 @@
 
 mod action_scaling;
 mod architecture;
+mod description;
 mod dmp_head;
 pub mod gaussian;
 mod learned_std;
@@ -26,13 +27,14 @@ use rand_xoshiro::Xoshiro256PlusPlus;
 use thiserror::Error;
 
 pub use action_scaling::ActionScaling;
+pub use description::PolicyDescription;
 pub use dmp_head::{DmpHead, DmpWorkspace, HeadGradient};
 pub use learned_std::LearnedStd;
 pub use matrix::{Keep, Matrix, product};
 pub use network::{Activations, Layer, MlpShape, SmallBatchNetwork, forward, initial_parameters};
 pub use tanh::tanh;
 
-use crate::config::{AlgorithmName, Controller, ExperimentConfig, PolicyKind};
+use crate::config::{AlgorithmName, ConfigError, Controller, ExperimentConfig, PolicyKind};
 use crate::dmp::DmpError;
 use crate::segment::{ActionBounds, SegmentLayout};
 use crate::spec::{EnvSpec, SpecError};
@@ -46,6 +48,9 @@ pub enum PolicyError {
     /// The DMP's configuration does not fit.
     #[error(transparent)]
     Dmp(#[from] DmpError),
+    /// A value of a description is out of its range.
+    #[error(transparent)]
+    Config(#[from] ConfigError),
     /// `task.start_sources` does not fit the environment.
     #[error("task.start_sources: {0}")]
     StartSources(String),
@@ -82,6 +87,7 @@ pub struct Policy {
     scaling: ActionScaling,
     env_observation_len: usize,
     architecture_hash: u64,
+    description: PolicyDescription,
 }
 
 /// Buffers of one forward pass over up to `rows_max` observations.
@@ -134,6 +140,7 @@ impl Policy {
             scaling: ActionScaling::new(spec),
             env_observation_len: spec.observation_len,
             architecture_hash: architecture::hash(config, spec),
+            description: PolicyDescription::new(config, spec),
         })
     }
 
@@ -141,6 +148,12 @@ impl Policy {
     #[must_use]
     pub fn architecture_hash(&self) -> u64 {
         self.architecture_hash
+    }
+
+    /// What it is apart from its parameters.
+    #[must_use]
+    pub fn description(&self) -> &PolicyDescription {
+        &self.description
     }
 
     /// Sizes of the segments that this policy makes.

@@ -2,9 +2,9 @@
 
 use std::fs;
 
-use dmprl_learner::policy_file::{self, Match};
 use dmprl_shared::parameters::ParameterSnapshot;
 use dmprl_shared::policy::Policy;
+use dmprl_shared::policy_file::{self, Match};
 
 use crate::mutate;
 use crate::{Target, Verdict, fixture};
@@ -23,7 +23,7 @@ fn one_that_is_accepted_is_finite_and_stays_what_it_is() {
         let values = policy.initial_parameters(&mut dmprl_shared::seeds::stream(version, "p", 0));
         let architecture_hash = policy.architecture_hash();
         let snapshot = ParameterSnapshot { version, env_steps: 10, architecture_hash, values };
-        policy_file::save(&path, &policy, &snapshot).unwrap();
+        policy_file::save(&path, &policy, &snapshot, None).unwrap();
         fs::read(&path).unwrap()
     });
     target.fuzz(|random| {
@@ -49,7 +49,7 @@ fn one_that_is_accepted_is_finite_and_stays_what_it_is() {
         if let Ok(snapshot) = &loaded {
             assert_eq!(snapshot.values.len(), policy.parameters_len());
             assert!(snapshot.values.iter().all(|value| value.is_finite()));
-            policy_file::save(&path, &policy, snapshot).unwrap();
+            policy_file::save(&path, &policy, snapshot, None).unwrap();
             let again = policy_file::load(&path, &policy, Match::Architecture).unwrap();
             assert_eq!(again, *snapshot);
         }

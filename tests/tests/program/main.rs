@@ -17,6 +17,7 @@ mod delivery;
 mod determinism;
 mod endings;
 mod environments;
+mod export;
 mod fairness;
 mod faults;
 mod interrupts;

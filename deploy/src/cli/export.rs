@@ -1,0 +1,122 @@
+//! `dmprl export`: a run's policy as one file.
+
+use std::path::PathBuf;
+
+use anyhow::Context;
+use clap::{Args, ValueEnum};
+
+use super::emit;
+use crate::export::{onnx, read_policy, safetensors};
+use crate::failure::{Outcome, wrong_use};
+use crate::run_directory::{PolicyChoice, RunDirectory, replace_file};
+use crate::terminal::{binary_bytes, shown};
+
+const HELP: &str = "\
+The file holds all that it takes to act: observation normalisation, network, movement primitive,
+controller, start, action bounds, and where it comes from. safetensors is read by the crate
+dmprl-shared (dmprl_shared::runtime), without Python, and by dmprl.Policy in Python, with NumPy
+alone; onnx by every ONNX runtime: input `observation` (batch, O), output `actions` (batch, K, A).
+
+EXAMPLES
+  dmprl export runs/mine                           # runs/mine/reacher.safetensors
+  dmprl export runs/mine --format onnx --output reacher.onnx
+  dmprl export runs/mine --policy latest --json";
+
+/// Arguments of `dmprl export`.
+#[derive(Debug, Args)]
+#[command(after_help = HELP)]
+pub(super) struct ExportArgs {
+    /// The run directory.
+    run: PathBuf,
+    /// What to write [default: by the end of --output, else safetensors].
+    #[arg(long)]
+    format: Option<Format>,
+    /// The file; one that is there is replaced [default: the task's name, in the run directory].
+    #[arg(long, value_name = "PATH")]
+    output: Option<PathBuf>,
+    /// best, latest, or a policy version.
+    #[arg(long, default_value_t = PolicyChoice::Best, value_name = "best|latest|VERSION")]
+    policy: PolicyChoice,
+    /// Print one JSON object on standard output.
+    #[arg(long)]
+    json: bool,
+}
+
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+enum Format {
+    Safetensors,
+    Onnx,
+}
+
+impl Format {
+    fn extension(self) -> &'static str {
+        match self {
+            Self::Safetensors => "safetensors",
+            Self::Onnx => "onnx",
+        }
+    }
+
+    fn of(output: &std::path::Path) -> Option<Self> {
+        let end = output.extension()?.to_str()?;
+        [Self::Safetensors, Self::Onnx].into_iter().find(|format| format.extension() == end)
+    }
+}
+
+pub(super) fn run(args: &ExportArgs) -> anyhow::Result<Outcome> {
+    let named = args.output.as_deref().and_then(Format::of);
+    let format = args.format.or(named).unwrap_or(Format::Safetensors);
+    if let (Some(named), Some(output)) = (named, &args.output)
+        && named != format
+    {
+        return Err(wrong_use(format!(
+            "--output {} ends like the other format; expected .{}, or leave --format out",
+            output.display(),
+            format.extension()
+        )));
+    }
+    let run = RunDirectory::open(&args.run)?;
+    let chosen = run.choose_policy(args.policy)?;
+    let opened = read_policy(&run, &chosen)?;
+    let task = run.config()?.task.name;
+    let path = args.output.clone().unwrap_or_else(|| {
+        let name = crate::run_directory::safe_name(&task);
+        run.path().join(format!("{name}.{}", format.extension()))
+    });
+    if path.is_dir() {
+        return Err(wrong_use(format!("--output {} is a directory; name a file", path.display())));
+    }
+    match format {
+        Format::Safetensors => safetensors(&path, &opened)?,
+        Format::Onnx => replace_file(&path, &onnx(&opened)?)?,
+    }
+    let bytes =
+        std::fs::metadata(&path).with_context(|| format!("cannot read {}", path.display()))?.len();
+    let (layout, row) = (opened.policy.layout(), chosen.row.as_ref());
+    emit(&if args.json {
+        serde_json::json!({
+            "path": path, "format": format.extension(), "bytes": bytes,
+            "task": task, "policy_version": chosen.version,
+            "return_mean": row.map(|row| row.return_mean),
+            "success_rate": row.and_then(|row| row.success_rate),
+            "observation_len": opened.policy.env_observation_len(),
+            "segment_steps": layout.segment_steps, "action_len": layout.action_len,
+        })
+        .to_string()
+    } else {
+        let did = row.map(|row| format!(", return {:.2}", row.return_mean)).unwrap_or_default();
+        let head = format!(
+            "{} ({}): policy {} of {task}{did}",
+            shown(&path),
+            binary_bytes(bytes),
+            chosen.version
+        );
+        match format {
+            Format::Safetensors => format!(
+                "{head}\nin Python: dmprl.Policy.load({:?}).segment(observation)",
+                path.display().to_string()
+            ),
+            Format::Onnx => head,
+        }
+    })?;
+    Ok(Outcome::Done)
+}

@@ -1,0 +1,251 @@
+"""A trained policy next to a robot, with NumPy alone: no Rust, no simulator, no run.
+
+::
+
+    policy = dmprl.Policy.load("policy.safetensors")
+    policy.reset()
+    action = policy.action(observation)  # once a control step
+
+The same as ``shared/src/runtime`` in Rust, which a test holds it to. Shapes: K steps of a decision,
+O observation, A action.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from dmprl.numpy_policy import NumpyPolicy
+from dmprl.policy_file import PolicyFile, PolicyFileError, read
+
+Actions = NDArray[np.float64]
+
+
+class Policy:
+    """A policy that acts, one observation at a time; :meth:`load` makes one."""
+
+    def __init__(self, file: PolicyFile) -> None:
+        self.file = file
+        """Where it comes from: description, origin, version."""
+        spec = file.description["spec"]
+        self.spec: dict[str, Any] = spec
+        """The environment: ``observation_len``, ``action_low``, ``control_dt_s`` [s], …"""
+        self.low: Actions = np.array(spec["action_low"], np.float64)
+        self.high: Actions = np.array(spec["action_high"], np.float64)
+        self._network = NumpyPolicy(_plan(file), _flat(file))
+        self._carries = self._network.carried.shape[1] > 0
+        self.segment_steps: int = self._network.segment_steps
+        """K, the control steps of one decision."""
+        self._rate: Actions = np.full(self.low.shape, np.inf)
+        self._hold: Actions = np.clip(0.0, self.low, self.high)
+        self._hold_after = self.segment_steps
+        self._decided: Actions = np.zeros((self.segment_steps, self.low.size))
+        self.reset()
+
+    @classmethod
+    def load(cls, path: str | Path) -> Policy:
+        """Loads a policy file that ``dmprl export`` wrote, or the best policy of a run directory.
+
+        :raises OSError: it cannot be read.
+        :raises dmprl.PolicyFileError: it is no policy file, or damaged, or of an older dmprl.
+        """
+        path = Path(path)
+        if path.is_dir():
+            run, path = path, path / "checkpoints" / "best"
+            if not path.exists():
+                raise PolicyFileError(
+                    f"{run}: a directory without checkpoints/best: no run that "
+                    "has an evaluated policy"
+                )
+        file = read(path)
+        try:
+            return cls(file)
+        except (KeyError, TypeError, IndexError, ValueError) as error:
+            raise PolicyFileError(f"{path}: its parts do not fit: {error!r}") from error
+
+    @property
+    def is_holding(self) -> bool:
+        """Whether the last action was the hold, because observations had stopped."""
+        return self._holding
+
+    @property
+    def hold(self) -> Actions:
+        """The action that is commanded when observations have stopped, (A,)."""
+        return self._hold.copy()
+
+    def limit(
+        self,
+        *,
+        rate: ArrayLike | None = None,
+        hold: ArrayLike | None = None,
+        hold_after: int | None = None,
+    ) -> None:
+        """Sets limits; what is not named stays as it is.
+
+        :param rate: largest change of an action from one control step to the next, (A,) or one for
+            all, in the environment's units; at first infinite.
+        :param hold: the action that holds the robot, (A,) within the bounds; at first 0 (no torque,
+            no displacement) or the bound next to it.
+        :param hold_after: control steps without an observation after which the robot holds; at
+            first K. More changes nothing: without an observation there is no next segment.
+        :raises ValueError: a limit is none; nothing is changed then.
+        """
+        rates, held, after = self._rate, self._hold, self._hold_after
+        if rate is not None:
+            rates = _broadcast("rate", rate, self.low.shape)
+            if not (rates > 0.0).all():
+                raise ValueError(f"rate is {rates}: expected positive numbers")
+        if hold is not None:
+            held = _broadcast("hold", hold, self.low.shape)
+            if not ((held >= self.low) & (held <= self.high)).all():
+                raise ValueError(f"hold is {held}: expected {self.low} to {self.high}")
+        if hold_after is not None:
+            if hold_after < 0:
+                raise ValueError(f"hold_after is {hold_after}: expected 0 or more")
+            after = int(hold_after)
+        self._rate, self._hold, self._hold_after = rates, held, after
+
+    def reset(self, y0: Sequence[float] | NDArray | None = None) -> None:
+        """Begins an episode: the next action begins a segment.
+
+        The robot is taken to have commanded the hold before, which is where a limited rate begins.
+
+        :param y0: where the DMP begins, (A,) in units of y, for a policy that carries its state
+            from segment to segment (``policy.start = "carry"``); at 0 by default, as in training.
+        :raises ValueError: y0 is not A finite numbers, or the policy's start is not its own to
+            choose.
+        """
+        if y0 is not None:
+            if not self._carries:
+                raise ValueError("this policy's start comes from the observation: leave y0 out")
+            y0 = np.asarray(y0, np.float32)
+            if y0.shape != self.low.shape or not np.isfinite(y0).all():
+                raise ValueError(f"y0 is {y0}: expected {self.low.size} finite numbers")
+        self._network.carried[:] = 0.0
+        if y0 is not None:
+            self._network.carried[0, : self.low.size] = y0
+        self._step = self.segment_steps
+        self._previous = self._hold.copy()
+        self._missed = 0
+        self._holding = False
+
+    def segment(self, observation: ArrayLike) -> Actions:
+        """Decides: the next segment's actions, (K, A), in the environment's units.
+
+        All of them are to be executed.
+
+        :param observation: (O,) in the environment's units.
+        :raises ValueError: the observation is not one, or what the network makes of it is no
+            action. Nothing has changed then, and nothing is to be commanded but :attr:`hold`.
+        """
+        self._decide(self._checked(observation))
+        return np.stack([self._give() for _ in range(self.segment_steps)])
+
+    def action(self, observation: ArrayLike | None = None) -> Actions:
+        """The next control step's action, (A,), in the environment's units.
+
+        At a segment's first step the policy decides by the observation; within a segment it moves
+        on as it has decided, and an observation only tells the watchdog that there are some.
+
+        :param observation: (O,); none if no new one has come since the last call. After
+            ``hold_after`` calls without one, and where a decision is due, the action is the hold,
+            and the next observation begins a new segment.
+        :raises ValueError: as :meth:`segment`, at every step.
+        """
+        if observation is not None:
+            seen = self._checked(observation)
+            if self._step == self.segment_steps or self._holding:
+                self._decide(seen)
+            self._missed, self._holding = 0, False
+        else:
+            self._missed += 1
+            due = self._step == self.segment_steps
+            self._holding = self._holding or due or self._missed > self._hold_after
+        if self._holding:
+            return self._limited(self._hold)
+        return self._give()
+
+    def _give(self) -> Actions:
+        """Gives out the segment's next action."""
+        action = self._limited(self._decided[self._step])
+        self._step += 1
+        self._network.carry_from(self._step)
+        return action
+
+    def _limited(self, wanted: Actions) -> Actions:
+        near = np.clip(wanted, self._previous - self._rate, self._previous + self._rate)
+        self._previous = np.clip(near, self.low, self.high)
+        return self._previous.copy()
+
+    def _decide(self, seen: NDArray[np.float32]) -> None:
+        # Beyond all that was trained on, sums of large numbers can be no number.
+        with np.errstate(over="ignore", invalid="ignore"):
+            u = self._network.u(seen[None])
+        if np.isnan(u).any():
+            self._step = self.segment_steps
+            raise ValueError(
+                "the policy makes no finite action of this observation: it is far beyond what it "
+                "was trained on"
+            )
+        self._decided = self._network.scaled(u)[0]
+        self._step = 0
+
+    def _checked(self, observation: ArrayLike) -> NDArray[np.float32]:
+        """The observation as the network sees it."""
+        with np.errstate(over="ignore"):
+            seen = np.asarray(observation, np.float64).astype(np.float32)
+        expected = (self.spec["observation_len"],)
+        if seen.shape != expected:
+            raise ValueError(f"an observation of shape {seen.shape}, expected {expected}")
+        unfit = np.flatnonzero(~np.isfinite(seen))
+        if unfit.size > 0:
+            index = int(unfit[0])
+            names = self.spec["observation_names"]
+            name = f", {names[index]}," if names else ""
+            value = np.asarray(observation)[index]
+            raise ValueError(f"observation[{index}]{name} is {value}: expected a finite number")
+        return seen
+
+
+def _broadcast(what: str, values: ArrayLike, shape: tuple[int, ...]) -> Actions:
+    """One value an action dimension; NaN is none."""
+    array = np.asarray(values, np.float64)
+    if array.shape not in ((), shape) or np.isnan(array).any():
+        raise ValueError(f"{what} is {values}: expected one number, or {shape[0]}")
+    return np.broadcast_to(array, shape).copy()
+
+
+def _plan(file: PolicyFile) -> dict[str, Any]:
+    """What :class:`NumpyPolicy` asks for."""
+    description = file.description
+    policy, spec = description["policy"], description["spec"]
+    is_dmp = policy["kind"] == "dmp"
+    steps: int = policy["segment_steps"] if is_dmp else 1
+    if is_dmp:
+        expected = (3 * steps, 3 + description["dmp"]["basis_count"])
+        if file.segment_map is None or file.segment_map.shape != expected:
+            raise ValueError(f"segment_map, expected {expected}")
+    carried = 2 * spec["action_len"] if is_dmp and policy["start"] == "carry" else 0
+    widths = [file.layers[0][0].shape[1], *(len(bias) for _, bias in file.layers)]
+    if widths[0] != spec["observation_len"] + carried:
+        raise ValueError(f"actor.0.weight of {widths[0]} inputs")
+    return {
+        "env_count": 1,
+        "decision_steps": steps,
+        "spec": spec,
+        "widths": widths,
+        "policy": policy,
+        "dmp": description["dmp"],
+        "task": {"start_sources": description["start_sources"]},
+        "segment_map": file.segment_map,
+        # Behind its decisions SAC's network puts out the logarithm of their spread.
+        "log_stds_len": steps * spec["action_len"] if description["algorithm"] == "sac" else 0,
+    }
+
+
+def _flat(file: PolicyFile) -> NDArray[np.float32]:
+    return np.concatenate([part.ravel() for layer in file.layers for part in layer])

@@ -1,0 +1,104 @@
+"""Reads a policy file: safetensors with the policy's description among its metadata.
+
+Written by ``dmprl export`` and into a run's ``policies/`` (``shared/src/policy_file.rs``). NumPy is
+all that this takes: the container is a length, a header in JSON, and the numbers.
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+FORMAT = "dmprl-policy-1"
+HEADER_BYTES_MAX = 100_000_000
+"""As the safetensors library has it: a longer header is damage."""
+
+
+class PolicyFileError(ValueError):
+    """A file that is no policy, or is damaged, or older than this."""
+
+
+@dataclass(frozen=True)
+class PolicyFile:
+    """What a policy file holds."""
+
+    path: Path
+    description: dict[str, Any]
+    """Environment, algorithm, policy, DMP and start, as ``PolicyDescription`` in Rust."""
+    origin: dict[str, Any] | None
+    """Run, task, seed, return: where it comes from; none in a run's own files."""
+    version: int
+    env_steps: int
+    layers: list[tuple[NDArray[np.float32], NDArray[np.float32]]]
+    """Weights, (outputs, inputs), and bias of each layer."""
+    segment_map: NDArray[np.float32] | None
+    """From (y0, yd0, g, w) to the samples of one dimension, (3K, 3+N); none without a DMP."""
+
+
+def read(path: Path) -> PolicyFile:
+    """Reads a policy file.
+
+    :raises OSError: it cannot be read.
+    :raises PolicyFileError: it is no policy file, or damaged; the message names the field.
+    """
+    fields, tensors = _contents(path)
+    if (found := fields.get("format")) != FORMAT:
+        raise PolicyFileError(f"{path}: format is {found or 'missing'}, expected {FORMAT}")
+    if "description" not in fields:
+        raise PolicyFileError(
+            f"{path}: no description: an older dmprl wrote it; write it anew with dmprl export RUN"
+        )
+    layers = []
+    while (name := f"actor.{len(layers)}.weight") in tensors:
+        weight, bias = tensors[name], tensors.get(f"actor.{len(layers)}.bias")
+        before = layers[-1][0].shape[0] if layers else None
+        fits = weight.ndim == 2 and bias is not None and bias.shape == weight.shape[:1]
+        if not fits or (before is not None and weight.shape[1] != before):
+            raise PolicyFileError(f"{path}: {name} does not fit its bias or the layer before")
+        layers.append((weight, bias))
+    if not layers:
+        raise PolicyFileError(f"{path}: no tensor actor.0.weight")
+    if not all(np.isfinite(tensor).all() for tensor in tensors.values()):
+        raise PolicyFileError(f"{path}: a parameter is not finite")
+    try:
+        return PolicyFile(
+            path=path,
+            description=json.loads(fields["description"]),
+            origin=json.loads(fields["origin"]) if "origin" in fields else None,
+            version=int(fields["policy_version"]),
+            env_steps=int(fields["env_steps"]),
+            layers=layers,
+            segment_map=tensors.get("segment_map"),
+        )
+    except (KeyError, ValueError) as error:
+        raise PolicyFileError(f"{path}: damaged: {error!r}") from error
+
+
+def _contents(path: Path) -> tuple[dict[str, str], dict[str, NDArray[np.float32]]]:
+    """The metadata and the tensors of a safetensors file."""
+    data = path.read_bytes()
+    length = int.from_bytes(data[:8], "little")
+    if len(data) < 8 or length > min(HEADER_BYTES_MAX, len(data) - 8):
+        raise PolicyFileError(f"{path}: not a safetensors file, or cut short")
+    numbers = memoryview(data)[8 + length :]
+    tensors: dict[str, NDArray[np.float32]] = {}
+    try:
+        header = json.loads(data[8 : 8 + length])
+        fields = header.pop("__metadata__", {})
+        for name, entry in header.items():
+            begin, end = entry["data_offsets"]
+            if entry["dtype"] != "F32" or not 0 <= begin <= end <= len(numbers):
+                raise PolicyFileError(f"{path}: {name} is damaged")
+            # A copy of its own: alignment is not promised, and the file's bytes can go.
+            tensor = np.frombuffer(numbers[begin:end], "<f4").astype(np.float32)
+            tensors[name] = tensor.reshape(entry["shape"])
+    except PolicyFileError:
+        raise
+    except (AttributeError, KeyError, TypeError, ValueError) as error:
+        raise PolicyFileError(f"{path}: not a readable safetensors file: {error!r}") from error
+    return fields, tensors

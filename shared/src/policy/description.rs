@@ -1,0 +1,67 @@
+//! What a policy is apart from its parameters, in a form that a file can hold: enough to build it
+//! again far from the run that trained it.
+
+use serde::{Deserialize, Serialize};
+
+use super::{Policy, PolicyError};
+use crate::config::{
+    AlgorithmName, ConfigError, DmpConfig, ExperimentConfig, Layers, Limits, PolicyConfig,
+    PolicyKind, Start, StartSource, WarmUpKind, algorithm_defaults, policy_defaults,
+};
+use crate::spec::EnvSpec;
+
+/// Environment, algorithm, policy and DMP: the parts of a configuration that make a policy.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct PolicyDescription {
+    /// The environment's sizes, bounds and timing.
+    pub spec: EnvSpec,
+    /// What trained it: SAC's network puts out log-stds too, NDP's actions are not squashed.
+    pub algorithm: AlgorithmName,
+    /// Kind, network, ranges, controller and start.
+    pub policy: PolicyConfig,
+    /// The movement primitive; of no meaning for `mlp`.
+    pub dmp: DmpConfig,
+    /// Where an observation holds y0 and yd0, for `start = "observed"`.
+    pub start_sources: Vec<StartSource>,
+}
+
+impl PolicyDescription {
+    /// The description of the policy that `config` makes for an environment.
+    #[must_use]
+    pub fn new(config: &ExperimentConfig, spec: &EnvSpec) -> Self {
+        Self {
+            spec: spec.clone(),
+            algorithm: config.algorithm.name,
+            policy: config.policy.clone(),
+            dmp: config.dmp.clone(),
+            start_sources: config.task.start_sources.clone(),
+        }
+    }
+
+    /// Builds the policy. The description may come from anywhere: every value is checked as that
+    /// of a configuration is.
+    ///
+    /// # Errors
+    /// A value is out of its range, or does not fit the environment.
+    pub fn build(&self) -> Result<Policy, PolicyError> {
+        let config = self.config()?;
+        Policy::new(&config, &self.spec)
+    }
+
+    /// A configuration that makes this policy; what is not the policy's is at its default.
+    fn config(&self) -> Result<ExperimentConfig, ConfigError> {
+        let mut layers = Layers::new();
+        for own in [policy_defaults(self.policy.kind), algorithm_defaults(self.algorithm)] {
+            layers.add("policy", own.unwrap_or_default())?;
+        }
+        let mut config = layers.finish()?;
+        config.algorithm.name = self.algorithm;
+        config.policy = self.policy.clone();
+        config.dmp = self.dmp.clone();
+        config.task.start_sources.clone_from(&self.start_sources);
+        if self.policy.kind == PolicyKind::Dmp && self.policy.start == Start::Carry {
+            config.exploration.warm_up_kind = WarmUpKind::DmpParameters;
+        }
+        config.resolve(Limits { cores: 1 })
+    }
+}

@@ -1,0 +1,103 @@
+//! What stands between a policy and a robot: bounds, a limited rate, and the hold.
+
+use super::RuntimeError;
+use crate::spec::EnvSpec;
+
+/// Limits of the actions that are given out, and what is commanded when observations stop.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Safety {
+    low: Vec<f64>,
+    high: Vec<f64>,
+    /// Largest change of each action dimension from one control step to the next.
+    rate: Vec<f64>,
+    hold: Vec<f64>,
+    hold_after: usize,
+}
+
+impl Safety {
+    /// The environment's bounds, any rate, a hold of 0 (no torque, no displacement) or the bound
+    /// next to it, after `segment_steps` steps without an observation.
+    pub(super) fn new(spec: &EnvSpec, segment_steps: usize) -> Self {
+        let bounds = spec.action_low.iter().zip(&spec.action_high);
+        Self {
+            hold: bounds.map(|(&low, &high)| 0.0_f64.clamp(low, high)).collect(),
+            low: spec.action_low.clone(),
+            high: spec.action_high.clone(),
+            rate: vec![f64::INFINITY; spec.action_len],
+            hold_after: segment_steps,
+        }
+    }
+
+    /// The action that is commanded when observations have stopped, (A,).
+    #[must_use]
+    pub fn hold(&self) -> &[f64] {
+        &self.hold
+    }
+
+    /// Control steps without an observation after which the robot holds.
+    #[must_use]
+    pub fn hold_after(&self) -> usize {
+        self.hold_after
+    }
+
+    /// Lets the robot hold after so many control steps without an observation. More than K changes
+    /// nothing: without an observation there is no next segment.
+    pub fn set_hold_after(&mut self, steps: usize) {
+        self.hold_after = steps;
+    }
+
+    /// Sets the action that holds the robot, (A,).
+    ///
+    /// # Errors
+    /// `Limit`: a dimension is missing, too many, or out of its bounds; nothing is changed then.
+    pub fn set_hold(&mut self, hold: &[f64]) -> Result<(), RuntimeError> {
+        let expected = |d: usize| format!("{} to {}", self.low[d], self.high[d]);
+        self.check("the hold", hold, &expected, |d, value| {
+            value >= self.low[d] && value <= self.high[d]
+        })?;
+        self.hold.copy_from_slice(hold);
+        Ok(())
+    }
+
+    /// Limits the change of each action dimension from one control step to the next, (A,) in the
+    /// environment's units; infinity: no limit.
+    ///
+    /// # Errors
+    /// `Limit`: a dimension is missing, too many, or not positive; nothing is changed then.
+    pub fn set_rate(&mut self, rate: &[f64]) -> Result<(), RuntimeError> {
+        let expected = |_| "a positive number".to_owned();
+        self.check("the rate", rate, &expected, |_, value| value > 0.0)?;
+        self.rate.copy_from_slice(rate);
+        Ok(())
+    }
+
+    fn check(
+        &self,
+        what: &'static str,
+        values: &[f64],
+        expected: &dyn Fn(usize) -> String,
+        fits: impl Fn(usize, f64) -> bool,
+    ) -> Result<(), RuntimeError> {
+        let dims = self.low.len();
+        let unfit = values.iter().enumerate().position(|(d, &value)| d >= dims || !fits(d, value));
+        let missing = (values.len() < dims).then_some(values.len());
+        let Some(dimension) = unfit.or(missing) else { return Ok(()) };
+        let got = values.get(dimension).map_or_else(|| "missing".to_owned(), f64::to_string);
+        let expected =
+            if dimension < dims { expected(dimension) } else { format!("{dims} dimensions") };
+        Err(RuntimeError::Limit { what, dimension, expected, got })
+    }
+
+    /// Moves `previous` towards `wanted` as far as is allowed.
+    pub(super) fn limit(&self, wanted: &[f64], previous: &mut [f64]) {
+        for (d, (wanted, previous)) in wanted.iter().zip(previous).enumerate() {
+            let reach = *previous - self.rate[d]..=*previous + self.rate[d];
+            *previous = wanted.clamp(*reach.start(), *reach.end()).clamp(self.low[d], self.high[d]);
+        }
+    }
+
+    /// Moves `previous` towards the hold as far as is allowed.
+    pub(super) fn approach_hold(&self, previous: &mut [f64]) {
+        self.limit(&self.hold, previous);
+    }
+}

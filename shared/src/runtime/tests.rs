@@ -1,0 +1,217 @@
+//! A policy next to a robot, fed with what robots send.
+
+use super::*;
+use crate::config::{ExperimentConfig, Layers};
+use crate::seeds;
+
+const DIMS: usize = 2;
+const STEPS: usize = 5;
+
+fn spec() -> EnvSpec {
+    EnvSpec {
+        id: "Test-v0".into(),
+        observation_len: 4,
+        action_len: DIMS,
+        action_low: vec![-1.0, 1.0],
+        action_high: vec![1.0, 4.0],
+        control_dt_s: 0.05,
+        episode_steps: 50,
+        observation_names: ["cos", "sin", "speed", "force"].map(str::to_owned).to_vec(),
+    }
+}
+
+fn policy(keys: &[(&str, &str)]) -> Policy {
+    let mut layers = Layers::new();
+    layers.set("test", "policy.hidden", "[32]").unwrap();
+    for (key, value) in keys {
+        layers.set("test", key, value).unwrap();
+    }
+    let config: ExperimentConfig = layers.finish().unwrap();
+    Policy::new(&config, &spec()).unwrap()
+}
+
+/// With parameters large enough that actions differ from step to step.
+fn runtime(keys: &[(&str, &str)]) -> PolicyRuntime {
+    let policy = policy(keys);
+    let mut parameters = policy.initial_parameters(&mut seeds::stream(1, "test", 0));
+    parameters.iter_mut().for_each(|value| *value *= 3.0);
+    PolicyRuntime::new(policy, &parameters)
+}
+
+const CARRY: &[(&str, &str)] = &[("policy.start", "carry")];
+
+fn observation(seed: f64) -> [f64; 4] {
+    std::array::from_fn(|i| (seed + i as f64).sin())
+}
+
+#[test]
+fn a_segment_is_what_the_policy_decides_in_the_environments_units() {
+    for keys in [&[][..], &[("policy.kind", "mlp")], CARRY, &[("algorithm.name", "sac")]] {
+        let mut runtime = runtime(keys);
+        let own = policy(keys);
+        let mut parameters = own.initial_parameters(&mut seeds::stream(1, "test", 0));
+        parameters.iter_mut().for_each(|value| *value *= 3.0);
+        let mut work = own.workspace(1);
+        let mut seen: Vec<f32> = observation(0.0).iter().map(|&value| value as f32).collect();
+        seen.resize(own.layout().observation_len, 0.0);
+        own.act(&parameters, &seen, &mut work);
+        let mut expected = vec![0.0; own.layout().actions_len()];
+        own.scaling().apply(&work.actions, &mut expected);
+        let actions = runtime.segment(&observation(0.0)).unwrap();
+        assert_eq!(actions.len(), expected.len());
+        for (action, expected) in actions.iter().zip(&expected) {
+            assert!((action - expected).abs() < 1e-6, "{keys:?}: {action} {expected}");
+        }
+    }
+}
+
+#[test]
+fn one_action_a_step_is_the_segment_step_by_step() {
+    for keys in [&[][..], CARRY] {
+        let (mut whole, mut stepwise) = (runtime(keys), runtime(keys));
+        for decision in 0..3 {
+            let first = observation(f64::from(decision));
+            let segment = whole.segment(&first).unwrap().to_vec();
+            for (k, expected) in segment.chunks(DIMS).enumerate() {
+                // What comes within a segment decides nothing.
+                let now = if k == 0 { first } else { observation(100.0 + k as f64) };
+                let action = stepwise.action((k != 2).then_some(&now)).unwrap();
+                assert_eq!(action, expected, "{keys:?}, decision {decision}, step {k}");
+            }
+        }
+    }
+}
+
+#[test]
+fn a_bad_observation_is_refused_at_every_step_and_changes_nothing() {
+    let (mut disturbed, mut calm) = (runtime(CARRY), runtime(CARRY));
+    let bad: [(&[f64], &str); 5] = [
+        (&[0.0; 3], "of 3 numbers, expected 4"),
+        (&[0.0; 5], "of 5 numbers, expected 4"),
+        (&[0.0, f64::NAN, 0.0, 0.0], "observation[1], sin, is NaN"),
+        (&[0.0, 0.0, f64::NEG_INFINITY, 0.0], "observation[2], speed, is -inf"),
+        (&[0.0, 0.0, 0.0, 1e300], "observation[3], force, is 1"),
+    ];
+    for step in 0..12 {
+        for (observation, message) in bad {
+            let error = disturbed.action(Some(observation)).unwrap_err().to_string();
+            assert!(error.contains(message), "{error}");
+            assert!(step % STEPS > 0 || disturbed.segment(observation).is_err());
+        }
+        let now = observation(f64::from(step as u32));
+        let expected = calm.action(Some(&now)).unwrap();
+        assert_eq!(disturbed.action(Some(&now)).unwrap(), expected, "step {step}");
+    }
+}
+
+#[test]
+fn no_action_leaves_its_bounds_whatever_is_observed() {
+    for keys in [&[][..], &[("policy.rho", "free")], CARRY, &[("policy.kind", "mlp")]] {
+        let mut runtime = runtime(keys);
+        for exponent in 0..39 {
+            for sign in [-1.0, 1.0] {
+                let scale = sign * 10_f64.powi(exponent);
+                let large = observation(f64::from(exponent)).map(|value| scale * value);
+                match runtime.segment(&large) {
+                    Ok(actions) => {
+                        for action in actions.chunks(DIMS) {
+                            assert!((-1.0..=1.0).contains(&action[0]), "{action:?}");
+                            assert!((1.0..=4.0).contains(&action[1]), "{action:?}");
+                        }
+                    }
+                    // Sums of what large numbers make need not be numbers.
+                    Err(RuntimeError::Decision) => {}
+                    Err(error) => panic!("{error}"),
+                }
+            }
+        }
+        // And afterwards it acts as ever.
+        runtime.reset(None).unwrap();
+        runtime.segment(&observation(1.0)).unwrap();
+    }
+}
+
+#[test]
+fn actions_move_no_faster_than_allowed_and_get_there() {
+    let mut runtime = runtime(&[]);
+    let error = runtime.safety_mut().set_rate(&[0.1, 0.0]).unwrap_err().to_string();
+    assert_eq!(error, "the rate of action dimension 1 is 0: expected a positive number");
+    runtime.safety_mut().set_rate(&[0.1, f64::INFINITY]).unwrap();
+    runtime.reset(None).unwrap();
+    let mut before = runtime.safety().hold().to_vec();
+    assert_eq!(before, [0.0, 1.0], "0, or the bound next to it");
+    let mut limited = 0;
+    for step in 0..40 {
+        let now = observation(f64::from(step / 10));
+        let action = runtime.action(Some(&now)).unwrap();
+        let change = (action[0] - before[0]).abs();
+        assert!(change <= 0.1 + 1e-12, "{change}");
+        limited += usize::from(change > 0.1 - 1e-12);
+        before.copy_from_slice(action);
+    }
+    assert!(limited > 0, "nothing was limited: this shows nothing");
+}
+
+#[test]
+fn the_robot_holds_when_observations_stop_and_goes_on_when_they_come_again() {
+    let mut runtime = runtime(&[]);
+    runtime.safety_mut().set_hold(&[0.5, 2.0]).unwrap();
+    runtime.safety_mut().set_hold_after(2);
+    runtime.safety_mut().set_rate(&[0.4, 10.0]).unwrap();
+    let now = observation(0.0);
+    runtime.action(Some(&now)).unwrap();
+    for _ in 0..2 {
+        runtime.action(None).unwrap();
+        assert!(!runtime.is_holding(), "the segment goes on for so many steps");
+    }
+    let mut actions = Vec::new();
+    for _ in 0..10 {
+        actions.push(runtime.action(None).unwrap().to_vec());
+        assert!(runtime.is_holding());
+    }
+    assert_eq!(actions[9], [0.5, 2.0]);
+    assert!(actions.windows(2).all(|pair| (pair[1][0] - pair[0][0]).abs() <= 0.4 + 1e-12));
+    // A new segment, not the rest of the old one.
+    runtime.safety_mut().set_rate(&[f64::INFINITY; DIMS]).unwrap();
+    let expected = self::runtime(&[]).segment(&now).unwrap()[..DIMS].to_vec();
+    assert_eq!(runtime.action(Some(&now)).unwrap(), expected);
+    assert!(!runtime.is_holding());
+
+    // Where a decision is due there is nothing to go on with.
+    for _ in 1..STEPS {
+        runtime.action(Some(&now)).unwrap();
+    }
+    assert_eq!(runtime.action(None).unwrap(), [0.5, 2.0]);
+    assert!(runtime.is_holding());
+}
+
+#[test]
+fn a_hold_out_of_bounds_is_refused() {
+    let mut runtime = runtime(&[]);
+    for (hold, message) in [
+        (&[0.0, 0.5][..], "the hold of action dimension 1 is 0.5: expected 1 to 4"),
+        (&[0.0][..], "the hold of action dimension 1 is missing: expected 1 to 4"),
+        (&[0.0, 2.0, 0.0][..], "dimension 2 is 0: expected 2 dimensions"),
+        (&[f64::NAN, 2.0][..], "dimension 0 is NaN: expected -1 to 1"),
+    ] {
+        let error = runtime.safety_mut().set_hold(hold).unwrap_err().to_string();
+        assert!(error.contains(message), "{error}");
+    }
+    assert_eq!(runtime.safety().hold(), [0.0, 1.0]);
+}
+
+#[test]
+fn only_a_policy_that_carries_its_state_begins_where_it_is_told() {
+    let error = runtime(&[]).reset(Some(&[0.0; DIMS])).unwrap_err().to_string();
+    assert!(error.contains("comes from the observation"), "{error}");
+    let mut carrying = runtime(CARRY);
+    let at_rest = carrying.segment(&observation(0.0)).unwrap().to_vec();
+    carrying.reset(Some(&[0.5, -0.5])).unwrap();
+    assert_ne!(carrying.segment(&observation(0.0)).unwrap(), at_rest);
+    carrying.reset(None).unwrap();
+    assert_eq!(carrying.segment(&observation(0.0)).unwrap(), at_rest);
+    for y0 in [&[0.0][..], &[0.0, f32::NAN]] {
+        let error = carrying.reset(Some(y0)).unwrap_err().to_string();
+        assert!(error.contains("expected 2 finite numbers"), "{error}");
+    }
+}

@@ -1,0 +1,132 @@
+//! Exported policies of every kind, and what Rust's runtime makes of a thousand observations: what
+//! other runtimes are held to.
+
+use std::fs;
+use std::path::{Path, PathBuf};
+
+use dmprl::export;
+use dmprl_shared::config::{ExperimentConfig, Layers, Limits, task_defaults};
+use dmprl_shared::parameters::ParameterSnapshot;
+use dmprl_shared::policy::Policy;
+use dmprl_shared::policy_file::OpenedPolicy;
+use dmprl_shared::runtime::PolicyRuntime;
+use dmprl_shared::seeds;
+use dmprl_shared::spec::EnvSpec;
+
+/// Observations of each policy.
+pub const OBSERVATIONS: usize = 1_000;
+
+type Keys = &'static [(&'static str, &'static str)];
+
+/// A name, a task, and what differs from its defaults.
+pub const KINDS: [(&str, &str, Keys); 9] = [
+    ("dmp", "reacher", &[]),
+    ("mlp", "pusher", &[("policy.kind", "mlp")]),
+    ("sac-mlp", "reacher", &[("algorithm.name", "sac"), ("policy.kind", "mlp")]),
+    ("sac-dmp", "pusher", &[("algorithm.name", "sac"), ("policy.segment_steps", "8")]),
+    ("angles", "reacher", &[("policy.start", "observed"), ("policy.rho", "free")]),
+    ("values", "panda-reach", &[("policy.start", "observed")]),
+    ("resting", "pusher", &[("policy.start", "observed"), ("policy.start_velocity", "zero")]),
+    (
+        "carry",
+        "pusher",
+        &[("policy.start", "carry"), ("exploration.warm_up_kind", "dmp_parameters")],
+    ),
+    (
+        "ndp",
+        "reacher",
+        &[
+            ("algorithm.name", "ndp"),
+            ("exploration.warm_up_steps", "0"),
+            ("algorithm.action_rate_penalty", "0.0"),
+            ("policy.controller", "position"),
+            ("policy.start", "observed"),
+            ("policy.position_scale", "3.0"),
+            ("dmp.forcing_scaling", "goal"),
+            ("dmp.integrator", "explicit"),
+        ],
+    ),
+];
+
+/// Writes for each kind, into a folder of its name, `policy.safetensors`, `policy.onnx`,
+/// `observations.f64`, (n, O), and what [`PolicyRuntime::segment`] makes of them one after the
+/// other, `segments.f64`, (n, K, A).
+///
+/// # Panics
+/// If anything cannot be made.
+pub fn write(folder: &Path) {
+    for (name, task, keys) in KINDS {
+        let folder = folder.join(name);
+        fs::create_dir(&folder).unwrap();
+        let opened = policy(task, keys);
+        export::safetensors(&folder.join("policy.safetensors"), &opened).unwrap();
+        fs::write(folder.join("policy.onnx"), export::onnx(&opened).unwrap()).unwrap();
+        let mut runtime = PolicyRuntime::load(&folder.join("policy.safetensors")).unwrap();
+        let len = runtime.spec().observation_len;
+        // Numbers that f32 holds, so that each runtime is given the same.
+        let observations: Vec<f64> =
+            (0..OBSERVATIONS * len).map(|i| f64::from(1.5 * (i as f32 * 1.7).sin())).collect();
+        let mut segments = Vec::new();
+        for observation in observations.chunks(len) {
+            segments.extend_from_slice(runtime.segment(observation).unwrap());
+        }
+        write_numbers(&folder.join("observations.f64"), &observations);
+        write_numbers(&folder.join("segments.f64"), &segments);
+    }
+}
+
+/// A policy of fresh, large parameters.
+///
+/// # Panics
+/// If the keys make none.
+#[must_use]
+pub fn policy(task: &str, keys: &[(&str, &str)]) -> OpenedPolicy {
+    let mut layers = Layers::new();
+    layers.add(task, task_defaults(task).unwrap().table()).unwrap();
+    for (key, value) in keys {
+        layers.set("test", key, value).unwrap();
+    }
+    let config: ExperimentConfig = layers.finish().unwrap().resolve(Limits { cores: 2 }).unwrap();
+    let policy = Policy::new(&config, &spec(task)).unwrap();
+    let mut values = policy.initial_parameters(&mut seeds::stream(1, "test", 0));
+    // Fresh networks hardly leave the middle of the tanh.
+    values.iter_mut().for_each(|value| *value *= 2.0);
+    let architecture_hash = policy.architecture_hash();
+    let snapshot = ParameterSnapshot { version: 7, env_steps: 100, architecture_hash, values };
+    OpenedPolicy { policy, snapshot, origin: None }
+}
+
+/// Asymmetric bounds: scaling must take both into account.
+fn spec(task: &str) -> EnvSpec {
+    let task = task_defaults(task).unwrap();
+    let action_len = task.action_low.len();
+    EnvSpec {
+        id: "Test-v0".into(),
+        observation_len: task.observation_len,
+        observation_names: Vec::new(),
+        action_len,
+        action_low: vec![-1.0; action_len],
+        action_high: vec![3.0; action_len],
+        control_dt_s: 0.02,
+        episode_steps: 50,
+    }
+}
+
+/// Little-endian, one after the other.
+///
+/// # Panics
+/// If the file cannot be written.
+pub fn write_numbers(path: &Path, numbers: &[f64]) {
+    let bytes: Vec<u8> = numbers.iter().flat_map(|number| number.to_le_bytes()).collect();
+    fs::write(path, bytes).unwrap();
+}
+
+/// What [`write_numbers`] wrote.
+///
+/// # Panics
+/// If the file cannot be read.
+#[must_use]
+pub fn read_numbers(path: &Path) -> Vec<f64> {
+    let bytes = fs::read(PathBuf::from(path)).unwrap();
+    bytes.chunks_exact(8).map(|eight| f64::from_le_bytes(eight.try_into().unwrap())).collect()
+}
