@@ -164,6 +164,7 @@ fn every_flag_that_is_shown_exists() {
         "export",
         "bench rollout",
         "bench learner",
+        "bench policy",
         "bench transport",
         "chaos",
         "tasks",

@@ -289,6 +289,11 @@ impl Running {
         self.read("err")
     }
 
+    /// What it has written to standard output so far.
+    pub fn printed(&self) -> String {
+        self.read("out")
+    }
+
     /// Waits for a condition.
     ///
     /// # Panics

@@ -13,6 +13,7 @@ mod learner;
 mod nap;
 mod numpy_plan;
 mod peers;
+mod policy;
 mod rollout;
 mod sink;
 mod statistics;
@@ -24,6 +25,7 @@ mod workers;
 pub use figures::Figures;
 pub use learner::{Figures as LearnerFigures, LearnerBench, PeerKind, learner, spec_of};
 pub use numpy_plan::{Controls, NumpyPlan};
+pub use policy::{PolicyBench, PolicyFigures, policy};
 pub use rollout::{RolloutBench, rollout};
 pub use transport::{
     Figures as TransportFigures, TransportBench, TransportWorkerArgs, transport, transport_worker,

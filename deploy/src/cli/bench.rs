@@ -7,6 +7,7 @@ use clap::{Args, Subcommand};
 use dmprl_shared::config::Limits;
 
 use super::bench_learner::{self, LearnerArgs};
+use super::bench_policy::{self, PolicyArgs};
 use super::bench_transport::{self, TransportArgs};
 use super::configuration::{merge, refuse};
 use super::configured::{ConfiguredArgs, make_absolute};
@@ -26,6 +27,7 @@ EXAMPLES
   dmprl bench rollout --task reacher
   dmprl bench learner --task pusher --threads 1
   dmprl bench transport
+  dmprl bench policy runs/mine
   dmprl bench learner --help";
 
 const ROLLOUT_HELP: &str = "\
@@ -65,6 +67,8 @@ pub(super) struct BenchArgs {
 enum Bench {
     /// Milliseconds of an update, beside its matrix products and beside PyTorch and JAX.
     Learner(Box<LearnerArgs>),
+    /// Microseconds of a decision next to a robot, beside NumPy and onnxruntime.
+    Policy(Box<PolicyArgs>),
     /// Environment steps a second of the rollout workers, and of what else could make them.
     Rollout(Box<RolloutArgs>),
     /// Segments a second from workers to learner, beside pipes, sockets and queues of Python.
@@ -106,6 +110,7 @@ pub(super) fn seconds(text: &str) -> Result<f64, String> {
 pub(super) fn run(args: &BenchArgs) -> anyhow::Result<Outcome> {
     match &args.bench {
         Bench::Learner(args) => bench_learner::run(args),
+        Bench::Policy(args) => bench_policy::run(args),
         Bench::Rollout(args) => rollout(args),
         Bench::Transport(args) => bench_transport::run(args),
     }

@@ -2,6 +2,7 @@
 
 mod bench;
 mod bench_learner;
+mod bench_policy;
 mod bench_transport;
 mod chaos;
 mod clean;

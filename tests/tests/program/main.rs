@@ -10,6 +10,7 @@
 
 mod bench;
 mod bench_learner;
+mod bench_policy;
 mod bench_transport;
 mod chaos;
 mod deaths;
@@ -31,6 +32,7 @@ mod record;
 mod refusals;
 mod report;
 mod results;
+mod robot;
 mod search;
 mod start_stop;
 mod sweep;

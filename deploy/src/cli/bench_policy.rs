@@ -1,0 +1,106 @@
+//! `dmprl bench policy`: from the command line to the benchmark.
+
+use std::path::PathBuf;
+
+use clap::Args;
+use dmprl_shared::config::{Limits, TASKS, task_defaults};
+use dmprl_shared::parameters::ParameterSnapshot;
+use dmprl_shared::policy::Policy;
+use dmprl_shared::policy_file::{self, OpenedPolicy};
+use dmprl_shared::seeds;
+
+use super::bench::interpreter;
+use super::configuration::{merge, refuse};
+use super::configured::ConfiguredArgs;
+use super::{cores, emit, prepare_python};
+use crate::bench::{self, PolicyBench};
+use crate::export::read_policy;
+use crate::failure::{Outcome, wrong_use};
+use crate::run_directory::{PolicyChoice, RunDirectory};
+
+const HELP: &str = "\
+One observation at a time, on one core, as next to a robot. In every round each of these makes
+--calls calls; all calls of all rounds count.
+  decision   observation to the actions of a segment, by dmprl_shared::runtime
+  action     one control step of the same; one in K of them decides
+  numpy      the decision by dmprl.Policy, from the file that `dmprl export` writes
+  onnx       the decision by onnxruntime, where the interpreter has it
+Ctrl-C ends it at once and leaves nothing.
+
+EXAMPLES
+  dmprl bench policy runs/mine
+  dmprl bench policy reacher.safetensors --json
+  dmprl bench policy --task pusher --policy mlp
+  dmprl bench policy --task reacher --peer-python /opt/onnx/bin/python";
+
+/// Arguments of `dmprl bench policy`.
+#[derive(Debug, Args)]
+#[command(after_help = HELP)]
+pub(super) struct PolicyArgs {
+    /// A run, of which the best policy, or a file of `dmprl export`.
+    #[arg(required_unless_present = "task", conflicts_with = "task")]
+    run: Option<PathBuf>,
+    /// Instead of a trained policy: a fresh one for a task of `dmprl tasks`.
+    #[arg(long)]
+    task: Option<String>,
+    #[command(flatten)]
+    configured: ConfiguredArgs,
+    /// Decisions of a round.
+    #[arg(long, value_name = "N", default_value_t = 2_000,
+          value_parser = clap::value_parser!(u32).range(10..=20_000))]
+    calls: u32,
+    /// How often each is measured.
+    #[arg(long, value_name = "R", default_value_t = 5,
+          value_parser = clap::value_parser!(u16).range(1..=1000))]
+    rounds: u16,
+    /// Python that has onnxruntime [default: the one of .venv].
+    #[arg(long, value_name = "PATH")]
+    peer_python: Option<PathBuf>,
+    /// Print one JSON object on standard output.
+    #[arg(long)]
+    json: bool,
+}
+
+pub(super) fn run(args: &PolicyArgs) -> anyhow::Result<Outcome> {
+    let opened = opened(args)?;
+    let peer_python = args.peer_python.as_deref().map(interpreter).transpose()?;
+    let python = match peer_python {
+        Some(python) => python,
+        None => prepare_python()?.join("bin/python"),
+    };
+    let bench = PolicyBench {
+        opened,
+        python,
+        package_path: crate::project::root()?.join("envs_py"),
+        rounds: usize::from(args.rounds),
+        calls: args.calls as usize,
+    };
+    let Some(figures) = bench::policy(&bench)? else { return Ok(Outcome::Interrupted) };
+    emit(&if args.json { figures.json().to_string() } else { figures.text() })?;
+    Ok(Outcome::Done)
+}
+
+fn opened(args: &PolicyArgs) -> anyhow::Result<OpenedPolicy> {
+    if let Some(path) = &args.run {
+        if path.is_file() {
+            return Ok(policy_file::open(path)?);
+        }
+        let run = RunDirectory::open(path)?;
+        return read_policy(&run, &run.choose_policy(PolicyChoice::Best)?);
+    }
+    let name = args.task.as_deref().unwrap_or_default();
+    let Some(task) = task_defaults(name) else {
+        let names: Vec<_> = TASKS.iter().map(|task| task.name).collect();
+        return Err(wrong_use(format!(
+            "--task {name}: its sizes are not known without Python; expected one of {}",
+            names.join(", ")
+        )));
+    };
+    let sources = args.configured.sources(name, [])?;
+    let config = merge(&sources)?.resolve(Limits { cores: cores() }).map_err(refuse)?;
+    let policy = Policy::new(&config, &bench::spec_of(task))?;
+    let values = policy.initial_parameters(&mut seeds::stream(config.run.seed, "policy", 0));
+    let architecture_hash = policy.architecture_hash();
+    let snapshot = ParameterSnapshot { version: 0, env_steps: 0, architecture_hash, values };
+    Ok(OpenedPolicy { policy, snapshot, origin: None })
+}

@@ -1,0 +1,116 @@
+"""A trained policy drives a robot with Gymnasium's interface, over the network, at control rate.
+
+``reset()`` and ``step(action)`` are what robo-gym, panda_robot and others offer; with one of them
+the class below goes, and the rest stays::
+
+    dmprl export runs/mine --output panda.safetensors
+    python stand_in_robot.py dmprl/PandaReachJoints-v0 &
+    python drive_robot.py panda.safetensors --hz 20
+
+NumPy, the package ``dmprl`` and this file are all that the robot's computer needs.
+"""
+
+import argparse
+import json
+import socket
+import time
+
+import numpy as np
+
+import dmprl
+
+
+class RemoteRobot:
+    """Gymnasium's ``reset`` and ``step``, spoken with ``stand_in_robot.py``.
+
+    A step that is not answered within ``patience_s`` has no observation: None.
+    """
+
+    def __init__(self, host: str, port: int, patience_s: float) -> None:
+        self._socket = socket.create_connection((host, port), timeout=5.0)
+        self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        self._patience_s = patience_s
+        self._received = b""
+        self._number = 0
+
+    def reset(self, seed: int) -> tuple[np.ndarray, dict]:
+        """Begins an episode."""
+        answer = self._ask({"reset": seed}, 5.0)
+        if answer is None:
+            raise TimeoutError("the robot does not answer a reset")
+        return np.array(answer["observation"]), answer["info"]
+
+    def step(self, action: np.ndarray) -> tuple[np.ndarray | None, float, bool, bool, dict]:
+        """One control step."""
+        answer = self._ask({"action": action.tolist()}, self._patience_s)
+        if answer is None:
+            return None, 0.0, False, False, {}
+        observation = np.array(answer["observation"])
+        done = answer["terminated"], answer["truncated"]
+        return observation, answer["reward"], *done, answer["info"]
+
+    def _ask(self, message: dict, patience_s: float) -> dict | None:
+        self._number += 1
+        line = json.dumps({**message, "number": self._number})
+        self._socket.sendall(line.encode() + b"\n")
+        deadline = time.monotonic() + patience_s
+        while (left := deadline - time.monotonic()) > 0.0:
+            self._socket.settimeout(left)
+            try:
+                received = self._socket.recv(65536)
+            except TimeoutError:
+                break
+            if not received:
+                raise ConnectionError("the robot has hung up")
+            *lines, self._received = (self._received + received).split(b"\n")
+            # What came too late for its step is of no use now.
+            answers = [json.loads(line) for line in lines]
+            if answers and answers[-1]["number"] == self._number:
+                return answers[-1]
+        return None
+
+
+def drive(policy: dmprl.Policy, robot: RemoteRobot, seed: int, hz: float) -> dict:
+    """One episode, a step every 1 / ``hz`` seconds; 0: as fast as the robot answers."""
+    steps_max = policy.spec["episode_steps"]
+    policy.reset()
+    observation, info = robot.reset(seed)
+    result = {"return": 0.0, "steps": 0, "held": 0, "late": 0, "is_success": False}
+    due = time.monotonic()
+    while result["steps"] < steps_max:
+        action = policy.action(observation)
+        observation, reward, terminated, truncated, info = robot.step(action)
+        result["return"] += reward
+        result["steps"] += 1
+        result["held"] += policy.is_holding
+        result["is_success"] = info.get("is_success", result["is_success"])
+        if terminated or truncated:
+            break
+        if hz > 0.0:
+            due += 1.0 / hz
+            wait = due - time.monotonic()
+            result["late"] += wait < 0.0
+            time.sleep(max(wait, 0.0))
+    return result
+
+
+def main() -> None:
+    """Drives an episode and prints what came of it as JSON."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("policy", help="a file of dmprl export, or a run directory")
+    parser.add_argument("--host", default="127.0.0.1")
+    parser.add_argument("--port", type=int, default=5555)
+    parser.add_argument("--hz", type=float, default=20.0, help="control rate; 0: no waiting")
+    parser.add_argument("--seed", type=int, default=1000)
+    parser.add_argument("--rate", type=float, help="largest change of an action in a step")
+    arguments = parser.parse_args()
+    policy = dmprl.Policy.load(arguments.policy)
+    if arguments.rate is not None:
+        policy.limit(rate=arguments.rate)
+    patience_s = 1.0 if arguments.hz == 0.0 else 1.0 / arguments.hz
+    robot = RemoteRobot(arguments.host, arguments.port, patience_s)
+    print(json.dumps(drive(policy, robot, arguments.seed, arguments.hz)))
+
+
+if __name__ == "__main__":
+    main()

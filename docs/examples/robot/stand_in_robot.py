@@ -1,0 +1,70 @@
+"""A robot that is none: one simulated episode after the other, behind a socket.
+
+It stands where a robot's controller would, so that ``drive_robot.py`` can be tried, and tested,
+without one::
+
+    python stand_in_robot.py dmprl/PandaReachJoints-v0 --port 5555
+
+One client at a time; a JSON object a line. ``{"reset": seed, "number": n}`` and ``{"action": […],
+"number": n}`` are answered by ``{"number": n, "observation": […], "reward": …, "terminated": …,
+"truncated": …, "info": {…}}``.
+``--silence FROM TO`` leaves the steps FROM to TO of each episode without an answer, as a bad
+network does: the robot moves, and nobody sees it.
+"""
+
+import argparse
+import contextlib
+import json
+import socketserver
+
+import gymnasium
+
+import dmprl  # noqa: F401 - registers its tasks
+
+
+class Controller(socketserver.StreamRequestHandler):
+    """Serves one client until it leaves."""
+
+    def handle(self) -> None:
+        """Answers line by line."""
+        environment, silence = self.server.environment, self.server.silence
+        step = 0
+        for line in self.rfile:
+            message = json.loads(line)
+            if "reset" in message:
+                observation, info = environment.reset(seed=message["reset"])
+                reward, terminated, truncated, step = 0.0, False, False, 0
+            else:
+                step += 1
+                action = environment.action_space.dtype.type(message["action"])
+                observation, reward, terminated, truncated, info = environment.step(action)
+            if step in silence:
+                continue
+            answer = {
+                "number": message["number"],
+                "observation": observation.tolist(),
+                "reward": float(reward),
+                "terminated": bool(terminated),
+                "truncated": bool(truncated),
+                "info": {"is_success": bool(info.get("is_success", False))},
+            }
+            self.wfile.write(json.dumps(answer).encode() + b"\n")
+
+
+def main() -> None:
+    """Serves until it is interrupted."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("environment", help="a Gymnasium id, such as dmprl/PandaReachJoints-v0")
+    parser.add_argument("--port", type=int, default=5555, help="0: any that is free")
+    parser.add_argument("--silence", type=int, nargs=2, metavar=("FROM", "TO"), default=(0, 0))
+    arguments = parser.parse_args()
+    with socketserver.TCPServer(("127.0.0.1", arguments.port), Controller) as server:
+        server.environment = gymnasium.make(arguments.environment)
+        server.silence = range(*arguments.silence)
+        print(f"listening on port {server.server_address[1]}", flush=True)
+        with contextlib.suppress(KeyboardInterrupt):
+            server.serve_forever()
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,63 @@
+//! A trained policy drives a robot over the network: docs/examples/robot.
+
+use std::path::PathBuf;
+use std::process::Command;
+
+use dmprl_tests::program::{Running, Workplace};
+use dmprl_tests::{project_root, venv};
+
+use crate::train;
+
+const TASK: &str = "panda-reach-joints";
+/// Both compute in f32 and add in different orders.
+const TOLERANCE: f64 = 1e-3;
+
+fn script(name: &str) -> PathBuf {
+    project_root().join("docs/examples/robot").join(name)
+}
+
+fn python(script: PathBuf) -> Command {
+    let mut command = Command::new(&venv().executable);
+    command.arg(script).env("PYTHONPATH", project_root().join("envs_py"));
+    command
+}
+
+/// A robot that is none, and its port.
+fn robot(place: &Workplace, more: &[&str]) -> (Running, String) {
+    let mut command = python(script("stand_in_robot.py"));
+    command.args(["dmprl/PandaReachJoints-v0", "--port", "0"]).args(more);
+    let mut robot = place.start_command(command);
+    robot.until("a port", |robot| robot.printed().contains('\n'));
+    let port = robot.printed().trim().rsplit(' ').next().unwrap().to_owned();
+    (robot, port)
+}
+
+#[test]
+fn a_policy_drives_a_robot_over_the_network_and_holds_when_it_falls_silent() {
+    let place = Workplace::new();
+    let run = place.path("run");
+    place.run(&train(TASK, &run, &["--steps", "1000"])).with_status(0);
+    let policy = place.path("panda.safetensors");
+    place.run(&["export", &run, "--output", &policy]).with_status(0);
+    let evaluated = place.run(&["eval", &run, "--episodes", "1", "--json"]).with_status(0).json();
+
+    let (answering, port) = robot(&place, &[]);
+    let drive = |port: &str, hz: &str| {
+        let mut command = python(script("drive_robot.py"));
+        command.args([&policy, "--port", port, "--hz", hz]);
+        place.start_command(command).wait().with_status(0).json()
+    };
+    // Without waiting, so that no answer comes too late: the very episode of the evaluation.
+    let driven = drive(&port, "0");
+    assert_eq!((driven["steps"].as_u64(), driven["held"].as_u64()), (Some(50), Some(0)));
+    let difference = driven["return"].as_f64().unwrap() - evaluated["returns"][0].as_f64().unwrap();
+    assert!(difference.abs() < TOLERANCE, "{driven} {evaluated}");
+    drop(answering);
+
+    // Steps 11 to 19 are not answered: what was decided at step 11 is moved to its end, then it
+    // holds, until the answer to step 20.
+    let (_silent, port) = robot(&place, &["--silence", "11", "20"]);
+    let driven = drive(&port, "100");
+    assert_eq!(driven["steps"], 50);
+    assert!((1..50).contains(&driven["held"].as_u64().unwrap()), "{driven}");
+}
