@@ -24,4 +24,5 @@ pub mod report;
 pub mod roles;
 pub mod run_directory;
 pub mod sweep;
+pub mod tensorboard;
 pub mod terminal;

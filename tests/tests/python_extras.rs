@@ -1,5 +1,5 @@
-//! The Python package with its optional extras: panda-gym, Gymnasium-Robotics, Optuna, and an ONNX
-//! runtime.
+//! The Python package with its optional extras: panda-gym, Gymnasium-Robotics, Optuna, an ONNX
+//! runtime and TensorBoard's reader.
 //!
 //! They get an environment of their own, made once: PyBullet is large, most users need none of
 //! them, and not every Python has a build of it. Where one cannot be installed, the test says so
@@ -16,11 +16,12 @@ use std::path::{Path, PathBuf};
 use std::process::{Command, Output};
 
 use dmprl_actors::python_env::LINKED_PYTHON;
+use dmprl_tests::program::Workplace;
 use dmprl_tests::{exported, project_root};
 
 /// Extras of `envs_py/pyproject.toml`, everything first, and the tests that need no more.
 const ATTEMPTS: [(&str, &str); 2] =
-    [("test", "test_*.py"), ("onnx,robotics,search", "test_[ors]*.py")];
+    [("test", "test_*.py"), ("onnx,robotics,search,tensorboard", "test_[orst]*.py")];
 /// What pip says when a package has no build for this Python, or the network cannot be reached.
 const NOT_AVAILABLE: [&str; 2] = ["No matching distribution found", "Could not find a version"];
 
@@ -85,10 +86,11 @@ fn environment_with(extra: &str) -> Result<PathBuf, String> {
 }
 
 fn run_tests(python: &Path, tests: &str) {
-    let exported = tempfile::tempdir().unwrap();
+    let (exported, place) = (tempfile::tempdir().unwrap(), Workplace::new());
     exported::write(exported.path());
     let output = Command::new(python)
         .env("TEST_EXPORTED", exported.path())
+        .env("TEST_TENSORBOARD", trained(&place))
         .args(["-m", "unittest", "discover", "--start-directory", "envs_py/tests_extras"])
         .args(["--pattern", tests])
         .current_dir(project_root())
@@ -97,6 +99,25 @@ fn run_tests(python: &Path, tests: &str) {
     let report = report(&output);
     assert!(output.status.success(), "{report}");
     assert!(!report.contains("Ran 0 tests"), "{report}");
+}
+
+/// A run that was resumed.
+fn trained(place: &Workplace) -> String {
+    let run = place.path("run");
+    let settings = [
+        "policy.hidden=[32]",
+        "algorithm.critic_hidden=[32]",
+        "exploration.warm_up_steps=500",
+        "evaluation.episodes=2",
+        "evaluation.interval_steps=500",
+        "checkpoint.interval_steps=500",
+        "metrics.interval_steps=250",
+    ];
+    let mut arguments = vec!["train", "reacher", "--run-dir", &run, "--steps", "1500"];
+    settings.iter().for_each(|setting| arguments.extend(["--set", setting]));
+    place.run(&arguments).with_status(0);
+    place.run(&["resume", &run, "--steps", "2500"]).with_status(0);
+    run
 }
 
 fn report(output: &Output) -> String {

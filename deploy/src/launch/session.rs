@@ -12,6 +12,7 @@ use super::{
 use crate::failure::Outcome;
 use crate::plots;
 use crate::run_directory::{RunDirectory, RunLock};
+use crate::tensorboard::Mirror;
 use crate::terminal::{Display, ProgressStyle, say, shown, summary};
 
 /// How long `resume` waits for the learner of a killed supervisor to write its checkpoint.
@@ -82,6 +83,7 @@ pub fn session(plan: SessionPlan) -> anyhow::Result<Outcome> {
     let mut limits = TimeLimits::default();
     limits.restart_max = trial.restart_max.unwrap_or(limits.restart_max);
     let steps_total = config.run.steps;
+    let mirror = Mirror::start(&run);
     let report = runtime.block_on(async {
         let plan = SupervisorPlan { launcher, config, limits, display, interrupts };
         supervise(plan).await
@@ -89,6 +91,7 @@ pub fn session(plan: SessionPlan) -> anyhow::Result<Outcome> {
     // In this order: no child, then nothing half-made, then no lock.
     drop(runtime);
     drop(domain);
+    drop(mirror);
     if let Err(error) = run.remove_half_written() {
         say(&format!("warning: {error:#}"));
     }

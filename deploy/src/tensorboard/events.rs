@@ -1,0 +1,120 @@
+//! TensorBoard's event files: TFRecords of `tensorflow.Event` messages, with their field numbers.
+
+use std::fs::File;
+use std::io::{BufWriter, Write};
+use std::path::Path;
+
+use prost::Message;
+
+/// `SessionLog.SessionStatus` START: whoever reads forgets what came at or after its step.
+const START: i32 = 1;
+/// Of the checksums, as TFRecord has it.
+const MASK: u32 = 0xa282_ead8;
+
+/// A record.
+#[derive(Clone, PartialEq, Message)]
+struct Event {
+    #[prost(double, tag = "1")]
+    wall_time: f64,
+    #[prost(int64, tag = "2")]
+    step: i64,
+    #[prost(oneof = "What", tags = "3, 5, 7")]
+    what: Option<What>,
+}
+
+#[derive(Clone, PartialEq, prost::Oneof)]
+enum What {
+    #[prost(string, tag = "3")]
+    FileVersion(String),
+    #[prost(message, tag = "5")]
+    Summary(Summary),
+    #[prost(message, tag = "7")]
+    SessionLog(SessionLog),
+}
+
+#[derive(Clone, PartialEq, Message)]
+struct Summary {
+    #[prost(message, repeated, tag = "1")]
+    value: Vec<Value>,
+}
+
+#[derive(Clone, PartialEq, Message)]
+struct Value {
+    #[prost(string, tag = "1")]
+    tag: String,
+    #[prost(float, optional, tag = "2")]
+    simple_value: Option<f32>,
+}
+
+#[derive(Clone, PartialEq, Message)]
+struct SessionLog {
+    #[prost(int32, tag = "1")]
+    status: i32,
+}
+
+/// An event file that is being written.
+pub(super) struct EventFile(BufWriter<File>);
+
+impl EventFile {
+    /// Begins one.
+    pub(super) fn create(path: &Path, wall_time: f64) -> std::io::Result<Self> {
+        let mut file = Self(BufWriter::new(File::create(path)?));
+        let version = What::FileVersion("brain.Event:2".into());
+        file.write(&Event { wall_time, step: 0, what: Some(version) })?;
+        let start = What::SessionLog(SessionLog { status: START });
+        file.write(&Event { wall_time, step: 0, what: Some(start) })?;
+        Ok(file)
+    }
+
+    /// Numbers of one moment, by tag.
+    pub(super) fn scalars(
+        &mut self,
+        wall_time: f64,
+        step: u64,
+        scalars: &[(String, f64)],
+    ) -> std::io::Result<()> {
+        let value = scalars
+            .iter()
+            .map(|(tag, number)| Value { tag: tag.clone(), simple_value: Some(*number as f32) });
+        let summary = What::Summary(Summary { value: value.collect() });
+        let step = i64::try_from(step).unwrap_or(i64::MAX);
+        self.write(&Event { wall_time, step, what: Some(summary) })
+    }
+
+    pub(super) fn flush(&mut self) -> std::io::Result<()> {
+        self.0.flush()
+    }
+
+    fn write(&mut self, event: &Event) -> std::io::Result<()> {
+        let data = event.encode_to_vec();
+        let length = (data.len() as u64).to_le_bytes();
+        self.0.write_all(&length)?;
+        self.0.write_all(&masked(&length).to_le_bytes())?;
+        self.0.write_all(&data)?;
+        self.0.write_all(&masked(&data).to_le_bytes())
+    }
+}
+
+fn masked(bytes: &[u8]) -> u32 {
+    crc32c::crc32c(bytes).rotate_right(15).wrapping_add(MASK)
+}
+
+/// (tag, step, number) of every scalar of a file whose checksums are right.
+#[cfg(test)]
+pub(super) fn scalars_of(mut bytes: &[u8]) -> Vec<(String, i64, f32)> {
+    let mut scalars = Vec::new();
+    while !bytes.is_empty() {
+        let (head, rest) = bytes.split_at(12);
+        let length = u64::from_le_bytes(head[..8].try_into().unwrap()) as usize;
+        assert_eq!(head[8..], masked(&head[..8]).to_le_bytes());
+        let (data, rest) = rest.split_at(length);
+        assert_eq!(rest[..4], masked(data).to_le_bytes());
+        bytes = &rest[4..];
+        let event = Event::decode(data).unwrap();
+        if let Some(What::Summary(Summary { value })) = event.what {
+            let values = value.into_iter().map(|it| (it.tag, event.step, it.simple_value.unwrap()));
+            scalars.extend(values);
+        }
+    }
+    scalars
+}
