@@ -170,6 +170,8 @@ fn every_flag_that_is_shown_exists() {
         "tasks",
         "doctor",
         "clean",
+        "completions",
+        "man",
         "learner",
         "actor",
         "evaluator",
@@ -179,8 +181,8 @@ fn every_flag_that_is_shown_exists() {
         flags(&help(&command.split(' ').collect::<Vec<_>>()))
     };
     let all: BTreeSet<_> = commands.iter().flat_map(|command| words(command)).collect();
-    // Flags of other programs: cargo's, and docker's for the size of shared memory.
-    let foreign = ["--bench", "--features", "--release", "--check", "--shm-size"];
+    // Flags of other programs: cargo's, TensorBoard's, and docker's for the size of shared memory.
+    let foreign = ["--bench", "--features", "--release", "--check", "--logdir", "--shm-size"];
     for document in DOCUMENTS {
         let text = read(document);
         for flag in spans(&text).iter().flat_map(|span| flags(span)) {

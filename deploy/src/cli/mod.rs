@@ -6,6 +6,7 @@ mod bench_policy;
 mod bench_transport;
 mod chaos;
 mod clean;
+mod completions;
 mod configuration;
 mod configured;
 mod doctor;
@@ -88,6 +89,10 @@ enum Command {
     Doctor(doctor::DoctorArgs),
     /// Remove what dead runs have left in shared memory.
     Clean(clean::CleanArgs),
+    /// Print what a shell needs to complete commands and flags.
+    Completions(completions::CompletionsArgs),
+    /// Write the manual pages.
+    Man(completions::ManArgs),
     /// A run's learner process; started by train.
     #[command(hide = true)]
     Learner(LearnerArgs),
@@ -145,6 +150,8 @@ fn run(command: Command) -> anyhow::Result<Outcome> {
         Command::Tasks(args) => tasks::run(&args),
         Command::Doctor(args) => doctor::run(&args),
         Command::Clean(args) => clean::run(&args),
+        Command::Completions(args) => completions::completions(&args),
+        Command::Man(args) => completions::man(&args),
         Command::Learner(args) => roles::learner(&args).map(|()| Outcome::Done),
         Command::Actor(args) => roles::actor(&args),
         Command::Evaluator(args) => roles::evaluator(&args).map(|()| Outcome::Done),

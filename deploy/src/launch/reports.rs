@@ -175,7 +175,8 @@ impl Supervisor {
         }
         self.checkpointed = false;
         self.tell_learner_of_counts();
-        self.display.progress(&progress);
+        let processes = if self.display.is_live() { self.overview(now) } else { Vec::new() };
+        self.display.progress(&progress, &processes);
         if self.first.is_none() {
             self.first = Some((now, progress.clone()));
         }

@@ -56,6 +56,7 @@ pub fn session(plan: SessionPlan) -> anyhow::Result<Outcome> {
     let manifest = run.manifest()?;
     let mut display = Display::new(progress, config.run.steps);
     let resume = resume && can_resume(&run, &mut display)?;
+    display.begin_with(run.evaluations()?);
     let runtime = tokio::runtime::Builder::new_current_thread()
         .enable_all()
         .build()

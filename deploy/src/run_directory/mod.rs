@@ -31,6 +31,7 @@ pub use lock::RunLock;
 pub(crate) use manifest::random_u64;
 pub use manifest::{FORMAT_VERSION, Machine, Manifest, Session};
 pub use policies::{ChosenPolicy, PolicyChoice};
+pub(crate) use timestamp::unix_s;
 pub use timestamp::{compact, rfc3339};
 
 use crate::failure::wrong_use;

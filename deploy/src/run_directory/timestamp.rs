@@ -1,6 +1,12 @@
 //! UTC calendar times without a calendar library: two formats are all that is needed.
 
-use std::time::SystemTime;
+use std::time::{SystemTime, UNIX_EPOCH};
+
+/// Seconds since 1970, for files whose readers want them.
+#[must_use]
+pub fn unix_s() -> f64 {
+    SystemTime::now().duration_since(UNIX_EPOCH).map_or(0.0, |since| since.as_secs_f64())
+}
 
 /// `2026-01-31T23:59:58Z`.
 #[must_use]

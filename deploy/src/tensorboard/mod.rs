@@ -13,12 +13,12 @@ use std::os::unix::fs::MetadataExt;
 use std::path::{Path, PathBuf};
 use std::sync::mpsc::{self, RecvTimeoutError, Sender};
 use std::thread::JoinHandle;
-use std::time::{Duration, SystemTime, UNIX_EPOCH};
+use std::time::Duration;
 
 use anyhow::Context;
 use serde_json::Value;
 
-use crate::run_directory::RunDirectory;
+use crate::run_directory::{RunDirectory, unix_s};
 use crate::terminal::say;
 use events::EventFile;
 
@@ -189,7 +189,7 @@ fn begin(folder: &Path, wall_time: f64) -> anyhow::Result<(EventFile, PathBuf)> 
         .filter(|path| path.to_string_lossy().contains("events.out.tfevents."))
         .collect();
     // Whoever reads takes files in the order of their names.
-    let now = UNIX_EPOCH.elapsed().unwrap_or_default().as_nanos();
+    let now = (unix_s() * 1e9) as u64;
     let path = folder.join(format!("events.out.tfevents.{now}.{}", std::process::id()));
     let file = EventFile::create(&path, wall_time).with_context(refused)?;
     for old in old {
@@ -211,10 +211,6 @@ fn flatten(value: &Value, tag: &str, scalars: &mut Vec<(String, f64)>) {
         // Lists (an evaluation's returns) and what was not measured.
         _ => {}
     }
-}
-
-fn unix_s() -> f64 {
-    SystemTime::now().duration_since(UNIX_EPOCH).map_or(0.0, |since| since.as_secs_f64())
 }
 
 #[cfg(test)]

@@ -1,4 +1,5 @@
-//! Progress while a run goes on: a bar in a terminal, a line every few seconds elsewhere.
+//! Progress while a run goes on: a bar with a panel below it in a terminal, a line every few
+//! seconds elsewhere.
 
 use std::io::{IsTerminal, Write};
 use std::time::{Duration, Instant};
@@ -6,14 +7,13 @@ use std::time::{Duration, Instant};
 use indicatif::{ProgressBar, ProgressStyle as BarStyle};
 
 use super::format::{duration, grouped, plus_minus};
+use super::panel::{Panel, ProcessLine, SEPARATOR, terminal_size, trouble, whole_items};
 use crate::control::{EvaluationRow, Progress};
 
 /// Between two plain lines.
 const LINE_EVERY: Duration = Duration::from_secs(5);
 /// Between two redraws of the bar while nothing is reported.
 const REDRAW_EVERY: Duration = Duration::from_millis(200);
-/// Between two figures.
-const SEPARATOR: &str = " · ";
 /// Bar, percentage and the blanks around them.
 const BAR_COLUMNS: usize = 27;
 
@@ -39,7 +39,8 @@ pub struct Display {
     target: Target,
     steps_total: u64,
     line_at: Option<Instant>,
-    evaluation: Option<String>,
+    /// Oldest first.
+    evaluations: Vec<EvaluationRow>,
 }
 
 enum Target {
@@ -54,8 +55,7 @@ impl Display {
         if style == ProgressStyle::Automatic && std::io::stderr().is_terminal() {
             let bar = ProgressBar::new(steps_total);
             // The template is a constant; were it wrong, indicatif's own would do.
-            if let Ok(style) = BarStyle::with_template("{bar:20.cyan/dim} {percent:>3}% {wide_msg}")
-            {
+            if let Ok(style) = BarStyle::with_template("{bar:20.cyan/dim} {percent:>3}% {msg}") {
                 bar.set_style(style.progress_chars("━━╌"));
             }
             bar.set_message("starting");
@@ -72,7 +72,18 @@ impl Display {
     }
 
     fn on(target: Target, steps_total: u64) -> Self {
-        Self { target, steps_total, line_at: None, evaluation: None }
+        Self { target, steps_total, line_at: None, evaluations: Vec::new() }
+    }
+
+    /// Whether there is a panel that tells of processes.
+    #[must_use]
+    pub fn is_live(&self) -> bool {
+        matches!(self.target, Target::Bar(_))
+    }
+
+    /// A run that goes on has evaluations already.
+    pub fn begin_with(&mut self, evaluations: Vec<EvaluationRow>) {
+        self.evaluations = evaluations;
     }
 
     /// Says something, above the bar.
@@ -83,13 +94,17 @@ impl Display {
         }
     }
 
-    /// Shows where the learner stands.
-    pub fn progress(&mut self, progress: &Progress) {
-        let figures = self.figures(progress);
+    /// Shows where the learner stands, and what each process does where there is room for it.
+    pub fn progress(&mut self, progress: &Progress, processes: &[ProcessLine]) {
+        let (steps, figures) = (self.steps(progress), self.figures(progress));
         match &mut self.target {
             Target::Bar(bar) => {
                 bar.set_position(progress.env_steps.min(self.steps_total));
-                bar.set_message(whole_items(&figures, width_left()));
+                let size = terminal_size();
+                let panel = Panel { progress, evaluations: &self.evaluations, processes };
+                let head = whole_items(&steps, size.0.saturating_sub(BAR_COLUMNS));
+                let lines = std::iter::once(head).chain(panel.lines(size));
+                bar.set_message(lines.collect::<Vec<_>>().join("\n"));
             }
             Target::Lines(writer) => {
                 let now = Instant::now();
@@ -100,12 +115,12 @@ impl Display {
                 // The last segment may end beyond the last step.
                 let done = progress.env_steps.min(self.steps_total);
                 let percent = done * 100 / self.steps_total.max(1);
-                write_line(writer, &format!("{percent:>3}% {figures}"));
+                write_line(writer, &format!("{percent:>3}% {steps}{SEPARATOR}{figures}"));
             }
         }
     }
 
-    /// Shows an evaluation, and keeps it in the progress line.
+    /// Shows an evaluation, and keeps it for the progress.
     pub fn evaluation(&mut self, row: &EvaluationRow, best: bool) {
         let figure = plus_minus(&row.returns);
         let success = row
@@ -117,7 +132,7 @@ impl Display {
             grouped(row.env_steps),
             if best { "  (best)" } else { "" }
         ));
-        self.evaluation = Some(figure);
+        self.evaluations.push(row.clone());
     }
 
     /// Takes the bar away.
@@ -127,57 +142,34 @@ impl Display {
         }
     }
 
-    /// The most wanted first: a narrow terminal cuts the end off.
-    fn figures(&self, progress: &Progress) -> String {
-        let steps = format!("{}/{}", grouped(progress.env_steps), grouped(self.steps_total));
-        let mut parts = vec![format!("{steps} steps")];
-        match (&self.evaluation, progress.return_mean) {
-            (Some(evaluation), _) => parts.push(format!("return {evaluation}")),
-            (None, Some(mean)) => parts.push(format!("return {mean:.2} (training)")),
-            (None, None) => {}
-        }
+    /// How far it is, and how long the rest will take.
+    fn steps(&self, progress: &Progress) -> String {
+        let steps = format!("{}/{} steps", grouped(progress.env_steps), grouped(self.steps_total));
         let left = self.steps_total.saturating_sub(progress.env_steps) as f64;
         let eta = left / progress.env_steps_per_s;
         // No figure from a rate of nothing, or for a run of years.
         if (1e-9..1e8).contains(&eta) {
-            parts.push(format!("eta {}", duration(Duration::from_secs_f64(eta))));
+            return format!("{steps}{SEPARATOR}eta {}", duration(Duration::from_secs_f64(eta)));
+        }
+        steps
+    }
+
+    /// The rest of a plain line.
+    fn figures(&self, progress: &Progress) -> String {
+        let mut parts = Vec::new();
+        match (self.evaluations.last(), progress.return_mean) {
+            (Some(row), _) => parts.push(format!("return {}", plus_minus(&row.returns))),
+            (None, Some(mean)) => parts.push(format!("return {mean:.2} (training)")),
+            (None, None) => {}
         }
         parts.push(format!("{:.0} steps/s", progress.env_steps_per_s));
         parts.push(format!("{:.0} updates/s", progress.updates_per_s));
         parts.push(format!("{:.1} samples/insert", progress.samples_per_insert));
         parts.push(format!("lag {} (max {})", progress.policy_lag_p50, progress.policy_lag_max));
         parts.push(format!("{} queued", grouped(progress.queued_segments)));
-        if progress.restarts > 0 {
-            parts.push(format!("{} restarts", grouped(progress.restarts)));
-        }
-        if progress.rejected > 0 {
-            parts.push(format!("{} rejected", progress.rejected));
-        }
-        if progress.env_failures > 0 {
-            parts.push(format!("{} env failures", grouped(progress.env_failures)));
-        }
+        parts.extend(trouble(progress));
         parts.join(SEPARATOR)
     }
-}
-
-/// Columns that the bar leaves for the figures.
-fn width_left() -> usize {
-    let columns = rustix::termios::tcgetwinsize(std::io::stderr()).map_or(80, |size| size.ws_col);
-    usize::from(columns).saturating_sub(BAR_COLUMNS)
-}
-
-/// As many of the figures as fit, none of them cut.
-fn whole_items(figures: &str, width: usize) -> String {
-    let mut line = String::new();
-    for item in figures.split(SEPARATOR) {
-        let separator = if line.is_empty() { "" } else { SEPARATOR };
-        if (line.chars().count() + separator.chars().count() + item.chars().count()) > width {
-            break;
-        }
-        line.push_str(separator);
-        line.push_str(item);
-    }
-    line
 }
 
 /// A user who closed standard error reads nothing: no reason to end the run.
@@ -219,8 +211,8 @@ mod tests {
             restarts: 3,
             ..Progress::default()
         };
-        display.progress(&progress);
-        display.progress(&progress);
+        display.progress(&progress, &[]);
+        display.progress(&progress, &[]);
         let text = String::from_utf8(shared.0.lock().unwrap().clone()).unwrap();
         let rates = "50 steps/s · 20 updates/s · 12.5 samples/insert · lag 2 (max 7) · \
                      1,024 queued · 3 restarts";
@@ -228,22 +220,11 @@ mod tests {
     }
 
     #[test]
-    fn a_narrow_terminal_drops_whole_figures() {
-        assert_eq!(
-            whole_items("12 steps · eta 3 s · 5 steps/s", 100),
-            "12 steps · eta 3 s · 5 steps/s"
-        );
-        assert_eq!(whole_items("12 steps · eta 3 s · 5 steps/s", 20), "12 steps · eta 3 s");
-        assert_eq!(whole_items("12 steps · eta 3 s · 5 steps/s", 10), "12 steps");
-        assert_eq!(whole_items("12 steps", 3), "");
-    }
-
-    #[test]
     fn a_rate_of_nothing_promises_no_end() {
         let display = Display::lines(Box::new(Shared::default()), 1_000);
         for rate in [0.0, -1.0, f64::NAN, 1e-9] {
             let progress = Progress { env_steps_per_s: rate, ..Progress::default() };
-            let figures = display.figures(&progress);
+            let figures = display.steps(&progress);
             assert!(!figures.contains("eta"), "{rate}: {figures}");
         }
     }

@@ -13,6 +13,7 @@ mod bench_learner;
 mod bench_policy;
 mod bench_transport;
 mod chaos;
+mod completions;
 mod deaths;
 mod delivery;
 mod determinism;
