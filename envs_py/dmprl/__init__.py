@@ -7,6 +7,12 @@ A policy that dmprl has trained, with NumPy alone::
     policy = dmprl.Policy.load("policy.safetensors")
     actions = policy.segment(observation)
 
+Training, a run's figures, and an environment::
+
+    run = dmprl.train("reacher", steps=20_000)
+    run.evaluations().plot(x="env_steps", y="return_mean")
+    env = dmprl.make("reacher", render_mode="rgb_array")
+
 Importing this package registers its tasks with Gymnasium, where that is installed::
 
     import dmprl
@@ -18,11 +24,40 @@ The rollout worker (Rust, ``actors/src/python_env``) embeds Python and calls
 :func:`dmprl.segment_env.make`, then ``step_segment`` once per policy decision.
 """
 
+from typing import TYPE_CHECKING, Any
+
 from dmprl.policy import Policy
 from dmprl.policy_file import PolicyFileError
+from dmprl.run import Run
+from dmprl.training import TrainingError, train
 
-__all__ = ["Policy", "PolicyFileError"]
+if TYPE_CHECKING:
+    import gymnasium
+
+__all__ = ["Policy", "PolicyFileError", "Run", "TrainingError", "make", "train"]
 __version__ = "0.1.0"
+
+SHORT_NAMES = {
+    "reacher": "dmprl/Reacher-v5",
+    "pusher": "dmprl/Pusher-v5",
+    "thrower": "dmprl/Thrower-v0",
+    "panda-reach": "dmprl/PandaReach-v0",
+    "panda-reach-joints": "dmprl/PandaReachJoints-v0",
+    "reacher-v1": "dmprl/Reacher-v1",
+    "pusher-v0": "dmprl/Pusher-v0",
+    "thrower-v0": "dmprl/Thrower-v0",
+}
+"""Gymnasium ids by the names of ``dmprl tasks``."""
+
+
+def make(task: str, **options: Any) -> "gymnasium.Env":
+    """A task as a Gymnasium environment, by its short name or any Gymnasium id.
+
+    :param options: what ``gymnasium.make`` takes, such as ``render_mode="rgb_array"``.
+    """
+    import gymnasium
+
+    return gymnasium.make(SHORT_NAMES.get(task, task), **options)
 
 
 def _register() -> None:

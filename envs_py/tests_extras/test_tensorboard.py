@@ -1,6 +1,6 @@
 """A run's event file in TensorBoard's own reader, beside the run's JSON lines.
 
-``tests/tests/python_extras.rs`` makes them and says where (``TEST_TENSORBOARD``).
+``tests/tests/python_extras.rs`` trains it and says where (``TEST_RUN``).
 """
 
 import json
@@ -17,7 +17,7 @@ def lines(path: pathlib.Path) -> list[dict]:
 
 class EventFile(unittest.TestCase):
     def setUp(self) -> None:
-        self.run_directory = pathlib.Path(os.environ["TEST_TENSORBOARD"])
+        self.run_directory = pathlib.Path(os.environ["TEST_RUN"])
         self.events = EventAccumulator(str(self.run_directory / "tensorboard"))
         self.events.Reload()
 

@@ -21,7 +21,7 @@ use dmprl_tests::{exported, project_root};
 
 /// Extras of `envs_py/pyproject.toml`, everything first, and the tests that need no more.
 const ATTEMPTS: [(&str, &str); 2] =
-    [("test", "test_*.py"), ("onnx,robotics,search,tensorboard", "test_[orst]*.py")];
+    [("test", "test_*.py"), ("frames,onnx,robotics,search,tensorboard", "test_[forst]*.py")];
 /// What pip says when a package has no build for this Python, or the network cannot be reached.
 const NOT_AVAILABLE: [&str; 2] = ["No matching distribution found", "Could not find a version"];
 
@@ -90,7 +90,7 @@ fn run_tests(python: &Path, tests: &str) {
     exported::write(exported.path());
     let output = Command::new(python)
         .env("TEST_EXPORTED", exported.path())
-        .env("TEST_TENSORBOARD", trained(&place))
+        .env("TEST_RUN", trained(&place))
         .args(["-m", "unittest", "discover", "--start-directory", "envs_py/tests_extras"])
         .args(["--pattern", tests])
         .current_dir(project_root())

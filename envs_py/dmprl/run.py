@@ -1,0 +1,109 @@
+"""A run directory in Python: configuration, rows as data frames, policies.
+
+::
+
+    run = dmprl.Run("runs/mine")
+    frame = run.evaluations()  # pandas; run.evaluations("polars")
+    frame.plot(x="env_steps", y="return_mean")
+    policy = run.policy()
+"""
+
+from __future__ import annotations
+
+import json
+import tomllib
+from pathlib import Path
+from typing import Any
+
+from dmprl.policy import Policy
+from dmprl.policy_file import PolicyFileError
+
+LIBRARIES = ("pandas", "polars")
+
+
+class Run:
+    """What ``dmprl train`` leaves behind. Reads anew at each call: the run may be under way."""
+
+    def __init__(self, path: str | Path) -> None:
+        """:raises FileNotFoundError: there is no run at ``path``."""
+        self.path = Path(path)
+        if not (self.path / "manifest.json").is_file():
+            raise FileNotFoundError(f"{self.path}: no run directory, it has no manifest.json")
+
+    def __repr__(self) -> str:
+        return f"Run({str(self.path)!r})"
+
+    @property
+    def config(self) -> dict[str, Any]:
+        """The resolved configuration, by sections."""
+        return tomllib.loads((self.path / "config.toml").read_text())
+
+    @property
+    def manifest(self) -> dict[str, Any]:
+        """Versions, machine, commands: who made it, where and when."""
+        return json.loads((self.path / "manifest.json").read_text())
+
+    def metrics(self, library: str = "pandas") -> Any:
+        """``metrics.jsonl`` as a data frame of ``pandas`` or ``polars``.
+
+        A column for each number; those of an object in a line are ``object/key``.
+
+        :raises ImportError: the library is not installed.
+        """
+        return _frame(self._lines("metrics.jsonl"), library)
+
+    def evaluations(self, library: str = "pandas") -> Any:
+        """``evaluations.jsonl`` likewise; ``returns`` is a list of the episodes' returns."""
+        return _frame(self._lines("evaluations.jsonl"), library)
+
+    def policy(self, which: str | int = "best") -> Policy:
+        """A saved policy: ``best``, ``latest`` or a version.
+
+        :raises dmprl.PolicyFileError: it is not there, or cannot be read.
+        """
+        rows = self._lines("evaluations.jsonl")
+        if not rows and isinstance(which, str):
+            raise PolicyFileError(f"{self.path}: no evaluation yet, so no {which} policy")
+        if which == "best":
+            # Of equals the latest, as everywhere.
+            version = max(reversed(rows), key=lambda row: row["return_mean"])["policy_version"]
+        elif which == "latest":
+            version = rows[-1]["policy_version"]
+        elif isinstance(which, int):
+            version = which
+        else:
+            raise ValueError(f"policy {which!r}: expected best, latest or a version")
+        file = self.path / "policies" / f"{version}.safetensors"
+        if not file.is_file():
+            raise PolicyFileError(f"{self.path} has not kept policy {version}")
+        return Policy.load(file)
+
+    def _lines(self, name: str) -> list[dict[str, Any]]:
+        """The whole lines of a file; one that is being written comes the next time."""
+        file = self.path / name
+        text = file.read_text() if file.is_file() else ""
+        return [json.loads(line) for line in text.splitlines(keepends=True) if line.endswith("\n")]
+
+
+def _frame(rows: list[dict[str, Any]], library: str) -> Any:
+    flat = [_flat(row) for row in rows]
+    if library == "pandas":
+        import pandas
+
+        return pandas.DataFrame.from_records(flat)
+    if library == "polars":
+        import polars
+
+        # By all rows: a key's first numbers may be none.
+        return polars.from_dicts(flat, infer_schema_length=None) if flat else polars.DataFrame()
+    raise ValueError(f"library {library!r}: expected one of {', '.join(LIBRARIES)}")
+
+
+def _flat(row: dict[str, Any], prefix: str = "") -> dict[str, Any]:
+    flat: dict[str, Any] = {}
+    for key, value in row.items():
+        if isinstance(value, dict):
+            flat |= _flat(value, f"{prefix}{key}/")
+        else:
+            flat[prefix + key] = value
+    return flat

@@ -1,0 +1,92 @@
+//! The program from Python: `dmprl.train`, `dmprl.Run`, `dmprl.make`.
+
+use std::process::Command;
+
+use dmprl_shared::config::TASKS;
+use dmprl_tests::program::{Finished, Workplace};
+use dmprl_tests::{project_root, venv};
+use rustix::process::Signal;
+
+/// Of every script: small networks, few updates.
+const SMALL: &str = "dict(
+    policy__hidden=[32], algorithm__critic_hidden=[32], exploration__warm_up_steps=500,
+    evaluation__episodes=2, evaluation__interval_steps=500, checkpoint__interval_steps=500,
+    metrics__interval_steps=500)";
+
+fn command(script: &str) -> Command {
+    let mut command = Command::new(&venv().executable);
+    let path = dmprl_tests::program::executable().parent().unwrap().to_owned();
+    command.args(["-c", &format!("import dmprl\nSMALL = {SMALL}\n{script}")]);
+    command.env("PYTHONPATH", project_root().join("envs_py"));
+    command.env("PATH", format!("{}:{}", path.display(), std::env::var("PATH").unwrap()));
+    command
+}
+
+fn python(place: &Workplace, script: &str) -> Finished {
+    place.start_command(command(script)).wait()
+}
+
+#[test]
+fn a_run_is_trained_read_and_acted_with() {
+    let place = Workplace::new();
+    let script = "
+run = dmprl.train('reacher', run_dir='mine', steps=1200, seed=3, **SMALL)
+assert run.config['run']['seed'] == 3 and run.config['policy']['hidden'] == [32]
+env = dmprl.make('reacher')
+observation, _ = env.reset(seed=1)
+policy = run.policy('latest')
+for action in policy.segment(observation):
+    assert env.action_space.contains(action.astype('f4')), action
+    observation, *_ = env.step(action)
+print(run, policy.segment_steps)
+";
+    let ended = python(&place, script).with_status(0).saying("evaluation at");
+    assert_eq!(ended.printed.trim(), format!("Run('{}') 5", place.path("mine")));
+    place.assert_no_process();
+}
+
+#[test]
+fn what_the_program_refuses_is_an_error_in_its_own_words() {
+    let place = Workplace::new();
+    let script = "
+for task, settings in [('reachr', {}), ('reacher', {'algorithm__batch_sise': 3})]:
+    try:
+        dmprl.train(task, quiet=True, **settings)
+    except dmprl.TrainingError as error:
+        print(error.status, error)
+";
+    let printed = python(&place, script).with_status(0).printed;
+    for words in ["2 dmprl train ended with status 2", "reacher", "algorithm.batch_size"] {
+        assert!(printed.contains(words), "no `{words}` in {printed}");
+    }
+}
+
+#[test]
+fn an_interrupt_of_python_stops_the_training_with_a_checkpoint() {
+    for signal in [Signal::INT, Signal::KILL] {
+        let place = Workplace::new();
+        let script = "dmprl.train('reacher', run_dir='mine', steps=10**9, **SMALL)";
+        let mut running = place.start_command(command(script));
+        running.until_steps(&place.path("mine"), 500);
+        running.signal(signal);
+        let ended = running.wait();
+        place.until_no_process();
+        if signal == Signal::INT {
+            assert!(ended.said.contains("KeyboardInterrupt"), "{}", ended.said);
+        }
+        let latest = place.path("mine/checkpoints/latest/state.json");
+        assert!(std::path::Path::new(&latest).is_file(), "{signal:?}: no checkpoint");
+    }
+}
+
+#[test]
+fn every_task_has_its_short_name_in_python_too() {
+    let place = Workplace::new();
+    let script = "import json; print(json.dumps(dmprl.SHORT_NAMES))";
+    let names = python(&place, script).with_status(0).json();
+    assert_eq!(names.as_object().unwrap().len(), TASKS.len());
+    for task in TASKS {
+        let id = names[task.name].as_str().unwrap();
+        assert_eq!(id.trim_start_matches("dmprl/"), task.id.trim_start_matches("dmprl/"));
+    }
+}
