@@ -162,6 +162,7 @@ fn every_flag_that_is_shown_exists() {
         "report",
         "record",
         "export",
+        "play",
         "bench rollout",
         "bench learner",
         "bench policy",

@@ -161,7 +161,7 @@ class RecordingEnv(GymnasiumSegmentEnv):
         self._log = Log(pictures)
         self.name = task_id
         self._options = {} if pictures is None else {"render_mode": RENDER_MODE}
-        super().__init__(_gymnasium_id(task_id), 1, segment_steps, named)
+        super().__init__(gymnasium_id(task_id), 1, segment_steps, named)
         state = self._envs[0].state()
         self._log.joints = None if state is None else robot_joints(state.model)
 
@@ -278,20 +278,21 @@ def make(task_id: str, segment_steps: int, pictures: str | None = None) -> Recor
         return OpaqueEnv(named(1, segment_steps))
     folder = None if pictures is None else Path(pictures)
     if isinstance(named, type) and issubclass(named, MujocoTask):
-        named = _maker(task_id, named)
+        named = task_maker(task_id, named)
     elif registered(task_id.removeprefix("dmprl:")) is None:
         return RecordingEnv(task_id, segment_steps, named, folder)
     quieten_mujoco()
     return RecordingEnv(task_id, segment_steps, named, folder)
 
 
-def _maker(task_id: str, task: type[MujocoTask]) -> Callable[..., TaskEnv]:
+def task_maker(task_id: str, task: type[MujocoTask]) -> Callable[..., TaskEnv]:
+    """A task of one's own as Gymnasium makes environments."""
     maker = functools.partial(TaskEnv, task_id, task=task)
     maker.max_episode_steps = task.episode_steps
     return maker
 
 
-def _gymnasium_id(task_id: str) -> str:
+def gymnasium_id(task_id: str) -> str:
     """Ours instead of Gymnasium's where the two are equal, since a worker takes ours too."""
     ours = task_id.removeprefix("dmprl:")
     if registered(ours) is None or ours.startswith("dmprl/"):

@@ -12,6 +12,7 @@ mod configured;
 mod doctor;
 mod eval;
 mod export;
+mod play;
 mod record;
 mod report;
 mod resume;
@@ -77,6 +78,8 @@ enum Command {
     Report(report::ReportArgs),
     /// Make a video of a policy, or of two side by side.
     Record(record::RecordArgs),
+    /// Watch a policy at work, in a window or in a browser.
+    Play(play::PlayArgs),
     /// Write a run's policy as one file, for a robot or an ONNX runtime.
     Export(export::ExportArgs),
     /// Measure a part of the system beside what else could do its work.
@@ -144,6 +147,7 @@ fn run(command: Command) -> anyhow::Result<Outcome> {
         Command::Sweep(args) => sweep::run(&args),
         Command::Report(args) => report::run(&args),
         Command::Record(args) => record::run(&args),
+        Command::Play(args) => play::run(&args),
         Command::Export(args) => export::run(&args),
         Command::Bench(args) => bench::run(&args),
         Command::Chaos(args) => chaos::run(&args),

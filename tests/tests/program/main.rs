@@ -29,6 +29,7 @@ mod learning;
 mod leftovers;
 mod machine;
 mod motion;
+mod play;
 mod python_front;
 mod record;
 mod refusals;

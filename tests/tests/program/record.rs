@@ -28,7 +28,7 @@ fn python(arguments: &[&str]) -> std::process::Output {
 }
 
 /// Nothing is drawn without OpenGL; only then is there nothing to test.
-fn can_draw() -> bool {
+pub(super) fn can_draw() -> bool {
     let asked = "import os; from dmprl.pictures import name_opengl; name_opengl(); \
                  raise SystemExit('MUJOCO_GL' not in os.environ)";
     let can = python(&["-c", asked]).status.success();

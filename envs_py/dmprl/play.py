@@ -1,0 +1,253 @@
+"""Shows a policy at work, live; started by ``dmprl play``.
+
+``python -m dmprl.play POLICY --task ID``: with ``--window`` in a window of the environment's own,
+otherwise as a web page on loopback that any browser on this machine, or at the other end of
+``ssh -L``, can look at.
+"""
+
+from __future__ import annotations
+
+import argparse
+import io
+import itertools
+import signal
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from typing import Any
+
+import gymnasium
+import numpy as np
+
+from dmprl.gymnasium_env import GymnasiumSegmentEnv, success_of
+from dmprl.mujoco_batch import MujocoTask
+from dmprl.pictures import name_opengl
+from dmprl.policy import Policy
+from dmprl.recording import gymnasium_id, task_maker
+from dmprl.segment_env import SUCCESS_YES, SegmentEnv, named_object
+
+INTERRUPTED = 130
+"""Exit status."""
+DEFAULT_DT = 0.05
+"""Of an environment that does not say how long a step takes [s]."""
+PAUSE_S = 0.8
+"""After an episode, to see how it ended."""
+BETWEEN_FRAMES_S = 1 / 50
+"""A screen shows hardly more."""
+QUALITY = 85
+"""Of the pictures, as JPEG has it."""
+WAIT_S = 5.0
+"""A browser waits so long for the next picture before it gets the last one again."""
+BOUNDARY = "frame"
+LOCAL_NAMES = ("127.0.0.1", "localhost", "[::1]")
+"""What a browser that means this machine calls it; other names may lead here by a trick."""
+PAGE = """<!doctype html>
+<html lang="en"><head><meta charset="utf-8"><title>{title}</title>
+<meta name="viewport" content="width=device-width, initial-scale=1"><style>
+body {{ font: 16px system-ui, sans-serif; margin: 1.5rem auto; max-width: 46rem; padding: 0 1rem;
+color: #1a1a1a; background: #fff }}
+img {{ width: 100%; height: auto; border: 1px solid #ddd }}
+</style></head><body><h1 style="font-size: 1.2rem">{title}</h1>
+<img src="stream" alt="The policy at work, live: time, return so far, and the scene"></body></html>
+"""
+
+
+class Show:
+    """The newest picture, for any number of browsers."""
+
+    def __init__(self, title: str) -> None:
+        self.title = title
+        self._picture = b""
+        self._number = 0
+        self._changed = threading.Condition()
+
+    def show(self, picture: bytes) -> None:
+        """A new picture, as JPEG."""
+        with self._changed:
+            self._picture, self._number = picture, self._number + 1
+            self._changed.notify_all()
+
+    def pictures(self) -> Iterator[bytes]:
+        """Each picture that is there when the one before has been taken."""
+        seen = 0
+        while True:
+            with self._changed:
+                self._changed.wait_for(lambda: self._number != seen, WAIT_S)  # noqa: B023
+                picture, seen = self._picture, self._number
+            if picture:
+                yield picture
+
+
+class Handler(BaseHTTPRequestHandler):
+    """The page and its stream, to browsers on this machine."""
+
+    server: Server
+
+    def do_GET(self) -> None:
+        """Answers a browser."""
+        host = self.headers.get("Host", "").rsplit(":", 1)[0]
+        if host not in LOCAL_NAMES:
+            self.send_error(403, "this page is for this machine alone")
+        elif self.path == "/":
+            page = PAGE.format(title=self.server.show.title).encode()
+            self.send_response(200)
+            self.send_header("Content-Type", "text/html; charset=utf-8")
+            self.send_header("Content-Length", str(len(page)))
+            self.end_headers()
+            self.wfile.write(page)
+        elif self.path == "/stream":
+            self._stream()
+        else:
+            self.send_error(404)
+
+    def _stream(self) -> None:
+        self.send_response(200)
+        self.send_header("Content-Type", f"multipart/x-mixed-replace; boundary={BOUNDARY}")
+        self.send_header("Cache-Control", "no-store")
+        self.end_headers()
+        try:
+            for picture in self.server.show.pictures():
+                head = f"--{BOUNDARY}\r\nContent-Type: image/jpeg\r\n"
+                head += f"Content-Length: {len(picture)}\r\n\r\n"
+                self.wfile.write(head.encode() + picture + b"\r\n")
+        except OSError:
+            pass  # it has seen enough
+
+    def log_message(self, format: str, *arguments: Any) -> None:
+        """Says nothing of every request."""
+
+
+class Server(ThreadingHTTPServer):
+    """Serves one show."""
+
+    daemon_threads = True
+
+    def __init__(self, port: int, show: Show) -> None:
+        super().__init__(("127.0.0.1", port), Handler)
+        self.show = show
+
+
+class Painter:
+    """Pictures of an environment with a line of text, as JPEG."""
+
+    def __init__(self, environment: gymnasium.Env) -> None:
+        from PIL import Image, ImageDraw, ImageFont  # the extra `video`
+
+        self._environment = environment
+        self._image, self._draw, self._font = Image, ImageDraw, ImageFont.load_default(18)
+
+    def paint(self, text: str) -> bytes:
+        """The environment as it is now."""
+        frame = self._environment.render()
+        if not isinstance(frame, np.ndarray) or frame.ndim != 3:
+            raise SystemExit(
+                f"{self._environment.spec.id} cannot be drawn: its render mode "
+                f"'rgb_array' returned {type(frame).__name__}"
+            )
+        picture = self._image.fromarray(frame[..., :3].astype(np.uint8))
+        whole = self._image.new("RGB", (picture.width, picture.height + 36), "#ffffff")
+        whole.paste(picture, (0, 36))
+        self._draw.Draw(whole).text((12, 18), text, "#1a1a1a", self._font, anchor="lm")
+        data = io.BytesIO()
+        whole.save(data, "JPEG", quality=QUALITY)
+        return data.getvalue()
+
+
+class Shown(GymnasiumSegmentEnv):
+    """One Gymnasium environment that shows itself."""
+
+    def __init__(self, task_id: str, render_mode: str) -> None:
+        named = named_object(task_id)
+        if isinstance(named, type) and issubclass(named, SegmentEnv):
+            raise SystemExit(f"{task_id} is a SegmentEnv, which cannot be shown")
+        if isinstance(named, type) and issubclass(named, MujocoTask):
+            named = task_maker(task_id, named)
+        self._mode = render_mode
+        super().__init__(gymnasium_id(task_id), 1, 1, named)
+
+    def _make(self) -> gymnasium.Env:
+        why = f"{self.task_id} cannot be shown; one that can be has the render mode {self._mode!r}"
+        try:
+            made = super()._make({"render_mode": self._mode})
+        except TypeError as error:
+            raise SystemExit(f"{why} ({error})") from error
+        if made.render_mode != self._mode:
+            raise SystemExit(why)
+        return made
+
+    @property
+    def environment(self) -> gymnasium.Env:
+        """It."""
+        return self._envs[0]
+
+
+def play(policy: Policy, made: gymnasium.Env, seeds: Iterator[int], paint) -> None:
+    """One episode after the other at the robot's own pace; ``paint`` shows each step."""
+    dt = policy.spec["control_dt_s"] or DEFAULT_DT
+    every = max(1, round(BETWEEN_FRAMES_S / dt))
+    for seed in seeds:
+        observation, info = made.reset(seed=seed)
+        policy.reset()
+        total, steps, ended, due = 0.0, 0, False, time.monotonic()
+        paint(f"seed {seed}    {0.0:.2f} s    return {total:.2f}")
+        while not ended:
+            action = policy.action(np.asarray(observation))
+            observation, reward, terminated, truncated, info = made.step(
+                action.astype(made.action_space.dtype)
+            )
+            total, steps, ended = total + float(reward), steps + 1, terminated or truncated
+            if ended or steps % every == 0:
+                reached = "    at the goal" if success_of(info) == SUCCESS_YES else ""
+                paint(f"seed {seed}    {steps * dt:.2f} s    return {total:.2f}{reached}")
+            due += dt
+            time.sleep(max(0.0, due - time.monotonic()))
+        print(f"seed {seed}: return {total:.2f} in {steps} steps", flush=True)
+        time.sleep(PAUSE_S)
+
+
+def main() -> int:
+    """Plays until the episodes are over or it is interrupted."""
+    parser = argparse.ArgumentParser(prog="dmprl play")
+    parser.add_argument("policy")
+    parser.add_argument("--task", required=True)
+    parser.add_argument("--title", required=True)
+    parser.add_argument("--seed", type=int, required=True)
+    parser.add_argument("--episodes", type=int, default=0, help="0: until it is interrupted")
+    parser.add_argument("--port", type=int, default=0)
+    parser.add_argument("--window", action="store_true")
+    parser.add_argument("--python-path", action="append", default=[])
+    arguments = parser.parse_args()
+    signal.signal(signal.SIGTERM, signal.getsignal(signal.SIGINT))
+    sys.path[:0] = arguments.python_path
+    policy = Policy.load(arguments.policy)
+    seeds = itertools.count(arguments.seed)
+    if arguments.episodes > 0:
+        seeds = itertools.islice(seeds, arguments.episodes)
+    try:
+        if arguments.window:
+            shown = Shown(arguments.task, "human").environment
+            play(policy, shown, seeds, lambda text: None)
+            return 0
+        name_opengl()
+        shown = Shown(arguments.task, "rgb_array").environment
+        painter = Painter(shown)
+        show = Show(arguments.title)
+        try:
+            server = Server(arguments.port, show)
+        except OSError as error:
+            raise SystemExit(
+                f"cannot serve on port {arguments.port}: {error}; name another "
+                "--port, or 0 for any that is free"
+            ) from error
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        print(f"http://127.0.0.1:{server.server_address[1]}/", flush=True)
+        play(policy, shown, seeds, lambda text: show.show(painter.paint(text)))
+    except KeyboardInterrupt:
+        return INTERRUPTED
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
