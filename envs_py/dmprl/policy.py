@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from dmprl.numpy_policy import NumpyPolicy
+from dmprl.policy_description import check
 from dmprl.policy_file import PolicyFile, PolicyFileError, read
 
 Actions = NDArray[np.float64]
@@ -29,6 +30,7 @@ class Policy:
     """A policy that acts, one observation at a time; :meth:`load` makes one."""
 
     def __init__(self, file: PolicyFile) -> None:
+        check(file.description)
         self.file = file
         """Where it comes from: description, origin, version."""
         spec = file.description["spec"]
@@ -64,18 +66,13 @@ class Policy:
         file = read(path)
         try:
             return cls(file)
-        except (KeyError, TypeError, IndexError, ValueError) as error:
+        except (AttributeError, IndexError, KeyError, TypeError, ValueError) as error:
             raise PolicyFileError(f"{path}: its parts do not fit: {error!r}") from error
 
     @property
     def is_holding(self) -> bool:
-        """Whether the last action was the hold, because observations had stopped."""
+        """Whether the last action was the hold: observations had stopped, or it was asked for."""
         return self._holding
-
-    @property
-    def hold(self) -> Actions:
-        """The action that is commanded when observations have stopped, (A,)."""
-        return self._hold.copy()
 
     def limit(
         self,
@@ -129,7 +126,7 @@ class Policy:
         if y0 is not None:
             self._network.carried[0, : self.low.size] = y0
         self._step = self.segment_steps
-        self._previous = self._hold.copy()
+        self._previous: Actions | None = None
         self._missed = 0
         self._holding = False
 
@@ -140,9 +137,11 @@ class Policy:
 
         :param observation: (O,) in the environment's units.
         :raises ValueError: the observation is not one, or what the network makes of it is no
-            action. Nothing has changed then, and nothing is to be commanded but :attr:`hold`.
+            action. There is no action then but :meth:`hold`; the policy goes on at the next good
+            observation.
         """
         self._decide(self._checked(observation))
+        self._missed, self._holding = 0, False
         return np.stack([self._give() for _ in range(self.segment_steps)])
 
     def action(self, observation: ArrayLike | None = None) -> Actions:
@@ -169,6 +168,15 @@ class Policy:
             return self._limited(self._hold)
         return self._give()
 
+    def hold(self) -> Actions:
+        """A control step towards the hold, as far as the rate allows, (A,).
+
+        What to command after an error, and whenever the policy is not to act. The next observation
+        begins a new segment.
+        """
+        self._holding = True
+        return self._limited(self._hold)
+
     def _give(self) -> Actions:
         """Gives out the segment's next action."""
         action = self._limited(self._decided[self._step])
@@ -177,7 +185,9 @@ class Policy:
         return action
 
     def _limited(self, wanted: Actions) -> Actions:
-        near = np.clip(wanted, self._previous - self._rate, self._previous + self._rate)
+        # The robot is taken to have commanded the hold before its first action.
+        previous = self._hold if self._previous is None else self._previous
+        near = np.clip(wanted, previous - self._rate, previous + self._rate)
         self._previous = np.clip(near, self.low, self.high)
         return self._previous.copy()
 
@@ -233,6 +243,12 @@ def _plan(file: PolicyFile) -> dict[str, Any]:
     widths = [file.layers[0][0].shape[1], *(len(bias) for _, bias in file.layers)]
     if widths[0] != spec["observation_len"] + carried:
         raise ValueError(f"actor.0.weight of {widths[0]} inputs")
+    # Behind its decisions SAC's network puts out the logarithm of their spread.
+    log_stds_len = steps * spec["action_len"] if description["algorithm"] == "sac" else 0
+    controlled = 4 if policy["controller"] == "inverse" else 0
+    decided = 1 + description["dmp"]["basis_count"] + controlled if is_dmp else 1
+    if widths[-1] != decided * spec["action_len"] + log_stds_len:
+        raise ValueError(f"actor.{len(file.layers) - 1}.weight of {widths[-1]} outputs")
     return {
         "env_count": 1,
         "decision_steps": steps,
@@ -242,8 +258,7 @@ def _plan(file: PolicyFile) -> dict[str, Any]:
         "dmp": description["dmp"],
         "task": {"start_sources": description["start_sources"]},
         "segment_map": file.segment_map,
-        # Behind its decisions SAC's network puts out the logarithm of their spread.
-        "log_stds_len": steps * spec["action_len"] if description["algorithm"] == "sac" else 0,
+        "log_stds_len": log_stds_len,
     }
 
 

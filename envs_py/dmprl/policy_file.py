@@ -7,6 +7,7 @@ all that this takes: the container is a length, a header in JSON, and the number
 from __future__ import annotations
 
 import json
+import zlib
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -65,6 +66,9 @@ def read(path: Path) -> PolicyFile:
         raise PolicyFileError(f"{path}: no tensor actor.0.weight")
     if not all(np.isfinite(tensor).all() for tensor in tensors.values()):
         raise PolicyFileError(f"{path}: a parameter is not finite")
+    found, expected = fields.get("checksum"), checksum(fields["description"], tensors)
+    if found != expected:
+        raise PolicyFileError(f"{path}: checksum is {found or 'missing'}, expected {expected}")
     try:
         return PolicyFile(
             path=path,
@@ -75,8 +79,16 @@ def read(path: Path) -> PolicyFile:
             layers=layers,
             segment_map=tensors.get("segment_map"),
         )
-    except (KeyError, ValueError) as error:
+    except (KeyError, TypeError, ValueError, RecursionError) as error:
         raise PolicyFileError(f"{path}: damaged: {error!r}") from error
+
+
+def checksum(description: str, tensors: dict[str, NDArray[np.float32]]) -> str:
+    """CRC-32 over the description and the tensors' bytes, in the order of their names."""
+    crc = zlib.crc32(description.encode())
+    for name in sorted(tensors):
+        crc = zlib.crc32(tensors[name].astype("<f4").tobytes(), crc)
+    return f"{crc:08x}"
 
 
 def _contents(path: Path) -> tuple[dict[str, str], dict[str, NDArray[np.float32]]]:
@@ -90,6 +102,8 @@ def _contents(path: Path) -> tuple[dict[str, str], dict[str, NDArray[np.float32]
     try:
         header = json.loads(data[8 : 8 + length])
         fields = header.pop("__metadata__", {})
+        if not all(isinstance(field, str) for field in fields.values()):
+            raise PolicyFileError(f"{path}: metadata that are no text")
         for name, entry in header.items():
             begin, end = entry["data_offsets"]
             if entry["dtype"] != "F32" or not 0 <= begin <= end <= len(numbers):
@@ -99,6 +113,6 @@ def _contents(path: Path) -> tuple[dict[str, str], dict[str, NDArray[np.float32]
             tensors[name] = tensor.reshape(entry["shape"])
     except PolicyFileError:
         raise
-    except (AttributeError, KeyError, TypeError, ValueError) as error:
+    except (AttributeError, KeyError, TypeError, ValueError, RecursionError) as error:
         raise PolicyFileError(f"{path}: not a readable safetensors file: {error!r}") from error
     return fields, tensors

@@ -86,17 +86,20 @@ class Run:
 
 
 def _frame(rows: list[dict[str, Any]], library: str) -> Any:
+    if library not in LIBRARIES:
+        raise ValueError(f"library {library!r}: expected one of {', '.join(LIBRARIES)}")
     flat = [_flat(row) for row in rows]
-    if library == "pandas":
-        import pandas
+    try:
+        if library == "pandas":
+            import pandas
 
-        return pandas.DataFrame.from_records(flat)
-    if library == "polars":
+            return pandas.DataFrame.from_records(flat)
         import polars
 
         # By all rows: a key's first numbers may be none.
         return polars.from_dicts(flat, infer_schema_length=None) if flat else polars.DataFrame()
-    raise ValueError(f"library {library!r}: expected one of {', '.join(LIBRARIES)}")
+    except ModuleNotFoundError as error:
+        raise ImportError(f"{error}; pip install {library}") from error
 
 
 def _flat(row: dict[str, Any], prefix: str = "") -> dict[str, Any]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import collections
 import ctypes
-import os
+import json
 import shutil
 import signal
 import subprocess
@@ -19,6 +19,10 @@ INTERRUPTED = 130
 """Exit status of a program that was interrupted and has saved."""
 LAST_LINES = 20
 """Of what it said, for an error."""
+STOP_S = 30.0
+"""For its last checkpoint, when something else than an interrupt ends the call [s]."""
+NAME_MAX = 60
+"""Letters of a task in the name of a run."""
 PARENT_DEATH_SIGNAL = 1
 """``PR_SET_PDEATHSIG``."""
 
@@ -48,8 +52,10 @@ def train(
     :param deterministic: one process in lock-step: the same seed gives the same bytes.
     :param quiet: says nothing while it trains.
     :param overrides: flags of ``dmprl train`` (``steps=20_000``, ``algo="sac"``, ``seed=2``) and
-        configuration keys with two underscores for the dot (``algorithm__batch_size=64``).
-    :raises TrainingError: the run failed, or a value was refused; the message says why.
+        configuration keys with two underscores for the dot (``algorithm__batch_size=64``). None is
+        left out.
+    :raises TrainingError: the run failed, or a value was refused; the message says why, except in
+        a terminal, where the program has said so itself.
     :raises KeyboardInterrupt: it was interrupted, and has written a checkpoint.
     :raises FileNotFoundError: the program ``dmprl`` is not installed.
     """
@@ -60,10 +66,17 @@ def train(
     if deterministic:
         command.append("--deterministic")
     for name, value in overrides.items():
+        flag = f"--{name.replace('_', '-')}"
+        if value is None or (value is False and "__" not in name):
+            continue  # as if it were not there
         if "__" in name:
             command += ["--set", f"{name.replace('__', '.')}={_toml(value)}"]
+        elif value is True:
+            command.append(flag)
+        elif isinstance(value, (list, tuple)):  # a flag that may come several times
+            command += [word for entry in value for word in (flag, str(entry))]
         else:
-            command += [f"--{name.replace('_', '-')}", str(value)]
+            command += [flag, str(value)]
     status, said = _run(command, quiet)
     if status == INTERRUPTED:
         raise KeyboardInterrupt
@@ -100,21 +113,41 @@ def _run(command: list[str], quiet: bool) -> tuple[int, str]:
         stdin=subprocess.DEVNULL,
         stdout=subprocess.DEVNULL,
         stderr=None if live else subprocess.PIPE,
-        text=True,
+        encoding="utf-8",
+        errors="replace",
         # The terminal's interrupt comes to this process alone, which passes it on, once.
         start_new_session=True,
         preexec_fn=_end_with_parent,
     )
     said: collections.deque[str] = collections.deque(maxlen=LAST_LINES)
-    while True:
-        try:
-            for line in child.stderr or ():
-                said.append(line)
-                if not quiet:
-                    print(line, end="", file=sys.stderr)
-            return child.wait(), "".join(said)
-        except KeyboardInterrupt:
-            child.send_signal(signal.SIGINT)
+    try:
+        while True:
+            try:
+                for line in child.stderr or ():
+                    said.append(line)
+                    if not quiet:
+                        print(line, end="", file=sys.stderr)
+                status = child.wait()
+                return status, "what it said is above" if live else "".join(said)
+            except KeyboardInterrupt:
+                child.send_signal(signal.SIGINT)
+    finally:
+        # Whatever else came up here: nobody trains on unseen.
+        if child.poll() is None:
+            _stop(child)
+
+
+def _stop(child: subprocess.Popen[str]) -> None:
+    """Lets it write its checkpoint, and ends it if that takes too long."""
+    child.send_signal(signal.SIGINT)
+    if child.stderr is not None:
+        # Or it would wait for somebody to read.
+        child.stderr.close()
+    try:
+        child.wait(STOP_S)
+    except subprocess.TimeoutExpired:
+        child.kill()
+        child.wait()
 
 
 def _end_with_parent() -> None:
@@ -125,12 +158,17 @@ def _end_with_parent() -> None:
 
 def _toml(value: Any) -> str:
     """A value as ``--set`` takes it."""
-    if isinstance(value, bool):
-        return str(value).lower()
     if isinstance(value, (list, tuple)):
-        return f"[{', '.join(_toml(entry) for entry in value)}]"
-    return os.fspath(value) if isinstance(value, os.PathLike) else str(value)
+        # Strings of TOML are written as those of JSON.
+        entries = (json.dumps(it) if isinstance(it, str) else _toml(it) for it in value)
+        return f"[{', '.join(entries)}]"
+    if isinstance(value, dict):
+        entries = (f"{json.dumps(key)} = {_toml([entry])[1:-1]}" for key, entry in value.items())
+        return f"{{{', '.join(entries)}}}"
+    return str(value).lower() if isinstance(value, bool) else str(value)
 
 
 def _safe(task: str) -> str:
-    return "".join(letter if letter.isalnum() else "-" for letter in task).strip("-").lower()
+    """A name that every file system takes."""
+    letters = (it if it.isascii() and it.isalnum() else "-" for it in task)
+    return "".join(letters).strip("-").lower()[:NAME_MAX] or "run"

@@ -24,6 +24,7 @@ const HASH_KEY: &str = "architecture_hash";
 const VERSION_KEY: &str = "policy_version";
 const STEPS_KEY: &str = "env_steps";
 const DESCRIPTION_KEY: &str = "description";
+const CHECKSUM_KEY: &str = "checksum";
 const ORIGIN_KEY: &str = "origin";
 /// From (y0, yd0, g, w) to the samples of one dimension, (3K, 3+N).
 const MAP: &str = "segment_map";
@@ -31,7 +32,7 @@ const MAP: &str = "segment_map";
 /// Why a policy file was refused.
 #[derive(Debug, Error)]
 pub enum PolicyFileError {
-    /// Reading or writing failed.
+    /// Reading failed.
     #[error("{path}: {cause}")]
     Io {
         /// The file.
@@ -100,19 +101,18 @@ pub enum Match {
     Sizes,
 }
 
-/// Writes a snapshot, first to a temporary name beside `path`.
+/// The bytes of a policy's file.
 ///
 /// - `origin`: where it comes from, if the file is to leave its run.
 ///
 /// # Errors
-/// `Io` if writing fails; nothing is left at `path` then.
-pub fn save(
-    path: &Path,
+/// `Format` if the parameters do not fit the policy.
+pub fn encode(
     policy: &Policy,
     snapshot: &ParameterSnapshot,
     origin: Option<&Origin>,
-) -> Result<(), PolicyFileError> {
-    let io_error = |cause| PolicyFileError::Io { path: path.display().to_string(), cause };
+) -> Result<Vec<u8>, PolicyFileError> {
+    let path = Path::new("a policy's file");
     let view = |shape, numbers| {
         let view = TensorView::new(Dtype::F32, shape, bytemuck::cast_slice::<f32, u8>(numbers));
         view.map_err(|error| format_error(path, error))
@@ -127,23 +127,30 @@ pub fn save(
         tensors.push((MAP.to_owned(), view(shape, map.matrix())?));
     }
     let json = |value: serde_json::Result<String>| value.map_err(|e| format_error(path, e));
+    let description = json(serde_json::to_string(policy.description()))?;
     let mut metadata = HashMap::from([
         (FORMAT_KEY.to_owned(), FORMAT.to_owned()),
         (HASH_KEY.to_owned(), format!("{:016x}", snapshot.architecture_hash)),
         (VERSION_KEY.to_owned(), snapshot.version.to_string()),
         (STEPS_KEY.to_owned(), snapshot.env_steps.to_string()),
-        (DESCRIPTION_KEY.to_owned(), json(serde_json::to_string(policy.description()))?),
+        (CHECKSUM_KEY.to_owned(), checksum(&description, &tensors)),
+        (DESCRIPTION_KEY.to_owned(), description),
     ]);
     if let Some(origin) = origin {
         metadata.insert(ORIGIN_KEY.to_owned(), json(serde_json::to_string(origin))?);
     }
-    let bytes =
-        safetensors::serialize(tensors, Some(metadata)).map_err(|e| format_error(path, e))?;
-    let temporary = path.with_extension("tmp");
-    fs::write(&temporary, bytes)
-        .and_then(|()| fs::File::open(&temporary)?.sync_all())
-        .and_then(|()| fs::rename(&temporary, path))
-        .map_err(io_error)
+    safetensors::serialize(tensors, Some(metadata)).map_err(|e| format_error(path, e))
+}
+
+/// CRC-32 over the description and the tensors' bytes, in the order of their names: neither is of
+/// use with another's.
+fn checksum(description: &str, tensors: &[(String, TensorView<'_>)]) -> String {
+    let mut hasher = crc32fast::Hasher::new();
+    hasher.update(description.as_bytes());
+    let mut sorted: Vec<_> = tensors.iter().collect();
+    sorted.sort_by(|(a, _), (b, _)| a.cmp(b));
+    sorted.iter().for_each(|(_, tensor)| hasher.update(tensor.data()));
+    format!("{:08x}", hasher.finalize())
 }
 
 /// Reads a snapshot into a policy that is there already.
@@ -179,6 +186,7 @@ pub fn open(path: &Path) -> Result<OpenedPolicy, PolicyFileError> {
     let origin = contents.fields.get(ORIGIN_KEY).map(|text| serde_json::from_str(text));
     let origin = origin.transpose().map_err(|error| unfit(ORIGIN_KEY, &error))?;
     let snapshot = contents.snapshot(&policy, Match::Architecture)?;
+    contents.expect(CHECKSUM_KEY, checksum(text, &contents.tensors.tensors()))?;
     Ok(OpenedPolicy { policy, snapshot, origin })
 }
 
@@ -324,7 +332,7 @@ mod tests {
             architecture_hash: own.architecture_hash(),
             values: own.initial_parameters(&mut random),
         };
-        save(&path, &own, &snapshot, None).unwrap();
+        fs::write(&path, encode(&own, &snapshot, None).unwrap()).unwrap();
         let read = load(&path, &own, Match::Architecture).unwrap();
         assert_eq!(read, snapshot);
         assert_eq!(own.learned_std().unwrap().log_std(&read.values), [-0.5; 2]);
@@ -343,7 +351,7 @@ mod tests {
             architecture_hash: own.architecture_hash(),
             values: own.initial_parameters(&mut random),
         };
-        save(&path, &own, &snapshot, None).unwrap();
+        fs::write(&path, encode(&own, &snapshot, None).unwrap()).unwrap();
         assert_eq!(load(&path, &own, Match::Architecture).unwrap(), snapshot);
 
         let other = policy(&[("dmp.alpha_y", "8.0")]);
@@ -378,7 +386,7 @@ mod tests {
             return_mean: Some(-4.25),
             success_rate: None,
         };
-        save(path, &own, &snapshot, Some(&origin)).unwrap();
+        fs::write(path, encode(&own, &snapshot, Some(&origin)).unwrap()).unwrap();
         (own, snapshot, origin)
     }
 
@@ -423,8 +431,20 @@ mod tests {
         assert!(error.contains("policy.hidden"), "{error}");
         let error = refused(hidden, &hidden.replace("256,256", "256,255"));
         assert!(error.contains("architecture_hash"), "{error}");
+        // Another function of the same numbers.
+        let range = "\\\"goal_range\\\":1.0";
+        let error = refused(range, &range.replace("1.0", "2.0"));
+        assert!(error.contains("architecture_hash"), "{error}");
         let dims = "\\\"action_len\\\":2";
         let error = refused(dims, &dims.replace('2', "9"));
         assert!(error.contains("action_low has 2 entries, expected 9"), "{error}");
+        // A number that is one, and not the policy's.
+        saved(&[], &path);
+        let mut bytes = fs::read(&path).unwrap();
+        let last = bytes.len() - 1;
+        bytes[last] ^= 1;
+        fs::write(&path, bytes).unwrap();
+        let error = open(&path).unwrap_err().to_string();
+        assert!(error.contains("checksum"), "{error}");
     }
 }

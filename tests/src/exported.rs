@@ -59,9 +59,10 @@ pub fn write(folder: &Path) {
         let folder = folder.join(name);
         fs::create_dir(&folder).unwrap();
         let opened = policy(task, keys);
-        export::safetensors(&folder.join("policy.safetensors"), &opened).unwrap();
+        let file = folder.join("policy.safetensors");
+        fs::write(&file, export::safetensors(&opened).unwrap()).unwrap();
         fs::write(folder.join("policy.onnx"), export::onnx(&opened).unwrap()).unwrap();
-        let mut runtime = PolicyRuntime::load(&folder.join("policy.safetensors")).unwrap();
+        let mut runtime = PolicyRuntime::load(&file).unwrap();
         let len = runtime.spec().observation_len;
         // Numbers that f32 holds, so that each runtime is given the same.
         let observations: Vec<f64> =

@@ -138,6 +138,18 @@ for name in ('dmp', 'carry', 'mlp'):
     refused(lambda: policy.limit(hold=np.full(policy.low.size, 9.0)), 'hold', 'expected')
     refused(lambda: policy.limit(hold_after=-1), 'hold_after')
     refused(lambda: policy.reset(np.zeros(99)), 'y0')
+    policy.limit(rate=0.05, hold=np.full(policy.low.size, 0.5))
+    policy.reset()
+    before = np.full(policy.low.size, 0.5)
+    for step in range(120):
+        try:
+            action = policy.action(np.full(length, np.nan if step // 20 % 2 else 0.1))
+        except ValueError:
+            action = policy.hold()
+        assert (abs(action - before) <= 0.05 + 1e-12).all(), (step, action, before)
+        assert policy.is_holding == bool(step // 20 % 2)
+        before = action
+    assert (abs(before - 0.5) < 1e-9).all(), before
 refused(lambda: dmprl.Policy.load(folder), 'checkpoints/best')
 refused(lambda: dmprl.Policy.load(folder / 'none'), kind=OSError)
 whole = (folder / 'dmp/policy.safetensors').read_bytes()
@@ -148,10 +160,41 @@ for damaged, word in [
     (whole.replace(b'\"description\"', b'\"descripti--\"'), 'dmprl export'),
     (whole.replace(b'\"actor.1.bias\"', b'\"actor.9.bias\"'), 'actor.1.weight'),
     (whole[:-4] + np.float32(np.nan).tobytes(), 'finite'),
+    (whole[:-1] + bytes([whole[-1] ^ 1]), 'checksum'),
     (whole[:-400], 'damaged'),
 ]:
     (folder / 'damaged').write_bytes(damaged)
     refused(lambda: dmprl.Policy.load(folder / 'damaged'), word, kind=dmprl.PolicyFileError)
+import json, zlib
+from dmprl.policy_file import read
+good = read(folder / 'dmp/policy.safetensors').description
+for change, word in [
+    (lambda d: d['spec'].update(action_low=[float('nan'), 0.0]), 'action_low'),
+    (lambda d: d['spec'].update(action_low=[4.0, 4.0]), 'below action_high'),
+    (lambda d: d['spec'].update(action_high=[1.0]), 'action_high'),
+    (lambda d: d['policy'].update(start='elsewhere'), 'policy.start'),
+    (lambda d: d['policy'].update(rho='twisted'), 'policy.rho'),
+    (lambda d: d['policy'].update(goal_range=float('inf')), 'goal_range'),
+    (lambda d: d['policy'].update(kind='mlp'), 'actor'),
+    (lambda d: d['policy'].update(start='observed'), 'start_sources'),
+    (lambda d: d['dmp'].update(basis_count=9), 'segment_map'),
+    (lambda d: d.pop('spec'), 'spec'),
+]:
+    description = json.loads(json.dumps(good))
+    change(description)
+    import dataclasses
+    file = dataclasses.replace(read(folder / 'dmp/policy.safetensors'), description=description)
+    refused(lambda: dmprl.Policy(file), word, kind=(KeyError, ValueError))
+random = np.random.default_rng(1)
+for _ in range(500):
+    damaged = bytearray(whole)
+    for _ in range(random.integers(1, 4)):
+        damaged[random.integers(0, min(3000, len(whole)))] = random.integers(0, 256)
+    (folder / 'damaged').write_bytes(damaged)
+    try:
+        dmprl.Policy.load(folder / 'damaged')
+    except dmprl.PolicyFileError:
+        pass
 print('all refused')
 ";
     assert_eq!(python(script, folder.path()).trim(), "all refused");

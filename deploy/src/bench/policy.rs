@@ -138,8 +138,10 @@ fn measure(bench: &PolicyBench, watch: &Watch) -> anyhow::Result<PolicyFigures> 
         ("numpy", folder.path().join("policy.safetensors")),
         ("onnx", folder.path().join("policy.onnx")),
     ];
-    export::safetensors(&files[0].1, &bench.opened)?;
-    std::fs::write(&files[1].1, export::onnx(&bench.opened)?).context("cannot write the graph")?;
+    let made = [export::safetensors(&bench.opened)?, export::onnx(&bench.opened)?];
+    for ((_, file), bytes) in files.iter().zip(made) {
+        std::fs::write(file, bytes).context("cannot write the policy")?;
+    }
     let mut peers = Vec::new();
     for (kind, file) in &files {
         let mut child = start(bench, kind, file, folder.path())?;

@@ -82,6 +82,12 @@ pub(super) fn run(args: &PolicyArgs) -> anyhow::Result<Outcome> {
 
 fn opened(args: &PolicyArgs) -> anyhow::Result<OpenedPolicy> {
     if let Some(path) = &args.run {
+        if !args.configured.is_empty() {
+            return Err(wrong_use(format!(
+                "{} is what it is: flags of a configuration go with --task",
+                path.display()
+            )));
+        }
         if path.is_file() {
             return Ok(policy_file::open(path)?);
         }

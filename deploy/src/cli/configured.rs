@@ -44,6 +44,15 @@ pub(super) struct ConfiguredArgs {
 }
 
 impl ConfiguredArgs {
+    /// Whether nothing was said.
+    pub(super) fn is_empty(&self) -> bool {
+        let words = [&self.algo, &self.policy].into_iter().all(Option::is_none);
+        let counts = [self.workers, self.envs_per_worker].into_iter().all(|count| count.is_none());
+        let lists = self.python_path.is_empty() && self.set.is_empty();
+        let seed = self.seed.is_none() && self.config.is_none();
+        words && counts && lists && seed && self.preset == PRESETS[0].name
+    }
+
     /// Everything that is said about the configuration of `task`; `more`: by the command's own
     /// flags.
     pub(super) fn sources<'a>(

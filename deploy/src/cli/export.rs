@@ -1,8 +1,7 @@
 //! `dmprl export`: a run's policy as one file.
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
-use anyhow::Context;
 use clap::{Args, ValueEnum};
 
 use super::emit;
@@ -56,9 +55,21 @@ impl Format {
         }
     }
 
-    fn of(output: &std::path::Path) -> Option<Self> {
+    fn of(output: &Path) -> Option<Self> {
         let end = output.extension()?.to_str()?;
         [Self::Safetensors, Self::Onnx].into_iter().find(|format| format.extension() == end)
+    }
+}
+
+/// What is replaced must be a file: no folder, and no device, which root could replace.
+fn check_output(path: &Path) -> anyhow::Result<()> {
+    let refused = |what: &str| Err(wrong_use(format!("--output {}: {what}", path.display())));
+    if path.exists() && !path.is_file() {
+        return refused("expected a file or a new name, got what is no regular file");
+    }
+    match path.parent().filter(|parent| !parent.as_os_str().is_empty()) {
+        Some(folder) if !folder.is_dir() => refused("there is no such folder; make it first"),
+        _ => Ok(()),
     }
 }
 
@@ -82,15 +93,13 @@ pub(super) fn run(args: &ExportArgs) -> anyhow::Result<Outcome> {
         let name = crate::run_directory::safe_name(&task);
         run.path().join(format!("{name}.{}", format.extension()))
     });
-    if path.is_dir() {
-        return Err(wrong_use(format!("--output {} is a directory; name a file", path.display())));
-    }
-    match format {
-        Format::Safetensors => safetensors(&path, &opened)?,
-        Format::Onnx => replace_file(&path, &onnx(&opened)?)?,
-    }
-    let bytes =
-        std::fs::metadata(&path).with_context(|| format!("cannot read {}", path.display()))?.len();
+    check_output(&path)?;
+    let file = match format {
+        Format::Safetensors => safetensors(&opened)?,
+        Format::Onnx => onnx(&opened)?,
+    };
+    replace_file(&path, &file)?;
+    let bytes = file.len() as u64;
     let (layout, row) = (opened.policy.layout(), chosen.row.as_ref());
     emit(&if args.json {
         serde_json::json!({

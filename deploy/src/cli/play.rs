@@ -23,9 +23,9 @@ const END: Duration = Duration::from_secs(5);
 const EXTRA: &str = "video";
 
 const HELP: &str = "\
-Plays noise-free episodes at the robot's own pace, a seed each, until Ctrl-C: in a window where there
-is a display, otherwise as a page on this machine's loopback, whose address is printed. From another
-machine: ssh -L 8788:127.0.0.1:8788 HOST, then http://127.0.0.1:8788/.
+Plays noise-free episodes at the robot's own pace, a seed each, until Ctrl-C: in a window where
+there is a display, otherwise as a page on loopback, whose address is printed. From another machine:
+ssh -L 8788:127.0.0.1:8788 HOST, then http://127.0.0.1:8788/.
 
 EXAMPLES
   dmprl play runs/mine
@@ -62,7 +62,7 @@ pub(super) fn run(args: &PlayArgs) -> anyhow::Result<Outcome> {
     let (_, python) = prepare_python_with(EXTRA)?;
     let folder = tempfile::tempdir().context("cannot make a folder for the policy")?;
     let file = folder.path().join("policy.safetensors");
-    safetensors(&file, &opened)?;
+    std::fs::write(&file, safetensors(&opened)?).context("cannot write the policy")?;
     let window = !args.stream && has_display();
     let mut command = Command::new(python);
     command.args(["-I", "-m", "dmprl.play"]).arg(&file);

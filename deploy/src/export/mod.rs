@@ -7,8 +7,6 @@ mod graph;
 mod onnx;
 mod onnx_format;
 
-use std::path::Path;
-
 use anyhow::Context;
 use dmprl_shared::policy::Policy;
 use dmprl_shared::policy_file::{self, Match, OpenedPolicy, Origin};
@@ -42,10 +40,10 @@ pub fn read_policy(run: &RunDirectory, chosen: &ChosenPolicy) -> anyhow::Result<
     Ok(OpenedPolicy { policy, snapshot, origin: Some(origin) })
 }
 
-/// Writes the project's own file.
+/// The project's own file, as bytes.
 ///
 /// # Errors
-/// What the file system refuses; nothing is left at `path` then.
-pub fn safetensors(path: &Path, opened: &OpenedPolicy) -> anyhow::Result<()> {
-    Ok(policy_file::save(path, &opened.policy, &opened.snapshot, opened.origin.as_ref())?)
+/// None is known: the parameters are the policy's.
+pub fn safetensors(opened: &OpenedPolicy) -> anyhow::Result<Vec<u8>> {
+    Ok(policy_file::encode(&opened.policy, &opened.snapshot, opened.origin.as_ref())?)
 }

@@ -123,6 +123,9 @@ impl Supervisor {
         ensure!(process == Process::Learner, "{process} reported `learner_ready`");
         self.set_ready(process);
         self.learner_ready = true;
+        if self.learner_restarts > 0 {
+            self.forget_what_was_taken_back()?;
+        }
         self.advanced = Instant::now();
         self.tell_learner_of_counts();
         if matches!(self.phase, Phase::Draining { .. }) {
@@ -144,6 +147,15 @@ impl Supervisor {
             true => Ok(()),
             false => self.spawn(Process::Evaluator),
         }
+    }
+
+    /// A learner that came back has gone back to a checkpoint, and its run's rows with it.
+    fn forget_what_was_taken_back(&mut self) -> anyhow::Result<()> {
+        let rows = self.launcher.run.evaluations()?;
+        let returns = rows.iter().map(|row| row.return_mean);
+        self.best_return = returns.fold(f64::NEG_INFINITY, f64::max);
+        self.display.begin_with(rows);
+        Ok(())
     }
 
     fn set_ready(&mut self, process: Process) {
@@ -176,6 +188,7 @@ impl Supervisor {
         self.checkpointed = false;
         self.tell_learner_of_counts();
         let processes = if self.display.is_live() { self.overview(now) } else { Vec::new() };
+        self.drawn = now;
         self.display.progress(&progress, &processes);
         if self.first.is_none() {
             self.first = Some((now, progress.clone()));
@@ -273,7 +286,7 @@ impl Supervisor {
 }
 
 #[cfg(test)]
-mod tests {
+pub(super) mod tests {
     use dmprl_shared::config::ExperimentConfig;
     use tokio::sync::mpsc;
 
@@ -282,7 +295,7 @@ mod tests {
     use crate::run_directory::{Manifest, RunDirectory};
     use crate::terminal::Display;
 
-    fn supervisor(folder: &std::path::Path) -> Supervisor {
+    pub(in crate::launch) fn supervisor(folder: &std::path::Path) -> Supervisor {
         let config = ExperimentConfig::default();
         let manifest = Manifest::new(None).unwrap();
         let launcher = Launcher {

@@ -165,6 +165,8 @@ pub(super) struct Supervisor {
     pub(super) advanced: Instant,
     pub(super) first: Option<(Instant, Progress)>,
     pub(super) last: Option<(Instant, Progress)>,
+    /// When the live display was last drawn.
+    pub(super) drawn: Instant,
     pub(super) best_return: f64,
     pub(super) last_row: Option<EvaluationRow>,
     /// Where the run stood when this session began.
@@ -217,6 +219,7 @@ pub async fn supervise(plan: SupervisorPlan) -> SessionReport {
         }
         let handled = supervisor.on_time(woke);
         supervisor.check(handled);
+        supervisor.refresh(woke);
     }
     supervisor.report()
 }
@@ -255,6 +258,7 @@ impl Supervisor {
             advanced: now,
             first: None,
             last: None,
+            drawn: now,
             best_return: f64::NEG_INFINITY,
             last_row: None,
             before: Counters::default(),

@@ -15,7 +15,7 @@ use dmprl_shared::transport::delivery::Mark;
 use super::ControlPipe;
 use crate::control::{EvaluationRequest, Progress, Report};
 use crate::journal::{Entry, Journal};
-use crate::run_directory::RunDirectory;
+use crate::run_directory::{RunDirectory, replace_file};
 
 /// Between two progress reports.
 const PROGRESS_INTERVAL: Duration = Duration::from_millis(500);
@@ -215,7 +215,7 @@ impl<'a> Recorder<'a> {
     fn save_policy(&self, learner: &Learner) -> anyhow::Result<EvaluationRequest> {
         let counters = learner.counters;
         let path = self.run.policy_path(counters.policy_version);
-        policy_file::save(&path, learner.policy(), learner.snapshot(), None)?;
+        replace_file(&path, &policy_file::encode(learner.policy(), learner.snapshot(), None)?)?;
         Ok(EvaluationRequest {
             env_steps: counters.env_steps,
             updates: counters.updates,

@@ -9,6 +9,7 @@ use anyhow::Context;
 /// Writes `bytes` beside `path`, syncs, and renames over it.
 pub(crate) fn replace(path: &Path, bytes: &[u8]) -> anyhow::Result<()> {
     let parent = path.parent().with_context(|| format!("{} has no folder", path.display()))?;
+    let parent = if parent.as_os_str().is_empty() { Path::new(".") } else { parent };
     // The process id keeps two writers apart; the rename decides which one stands.
     let aside = path.with_extension(format!("tmp{}", std::process::id()));
     let written = (|| -> std::io::Result<()> {

@@ -90,13 +90,15 @@ struct Source {
     /// The file's identity, and how much of it was read.
     inode: u64,
     offset: u64,
+    was_replaced: bool,
 }
 
 impl Writer {
     /// For a run; nothing is written yet.
     #[must_use]
     pub fn new(run: &RunDirectory) -> Self {
-        let source = |path, prefix| Source { path, prefix, inode: 0, offset: 0 };
+        let source =
+            |path, prefix| Source { path, prefix, inode: 0, offset: 0, was_replaced: false };
         let before = run.wall_s_before().unwrap_or(0.0);
         Self {
             folder: run.path().join(FOLDER),
@@ -114,18 +116,15 @@ impl Writer {
     /// # Errors
     /// The file system refuses, or a whole line is no JSON object.
     pub fn follow(&mut self) -> anyhow::Result<()> {
-        if self.sources.iter().any(Source::was_replaced) {
-            self.file = None;
-            self.sources.iter_mut().for_each(|source| source.offset = 0);
-        }
         for index in 0..self.sources.len() {
-            let source = &mut self.sources[index];
-            let (lines, prefix) = (source.new_lines()?, source.prefix);
-            let path = source.path.clone();
-            for line in lines.split(|&byte| byte == b'\n').filter(|line| !line.is_empty()) {
-                let line: Value = serde_json::from_slice(line)
-                    .with_context(|| format!("{}: a line is no JSON", path.display()))?;
-                self.write(&line, prefix)?;
+            while let Some(lines) = self.sources[index].new_lines()? {
+                if self.sources[index].was_replaced {
+                    // All of both, into a new file.
+                    self.file = None;
+                    self.sources.iter_mut().for_each(Source::begin_again);
+                    return self.follow();
+                }
+                self.write_all(index, &lines)?;
             }
         }
         match &mut self.file {
@@ -134,6 +133,16 @@ impl Writer {
             }
             None => Ok(()),
         }
+    }
+
+    fn write_all(&mut self, index: usize, lines: &[u8]) -> anyhow::Result<()> {
+        let (path, prefix) = (self.sources[index].path.clone(), self.sources[index].prefix);
+        for line in lines.split(|&byte| byte == b'\n').filter(|line| !line.is_empty()) {
+            let line: Value = serde_json::from_slice(line)
+                .with_context(|| format!("{}: a line is no JSON", path.display()))?;
+            self.write(&line, prefix)?;
+        }
+        Ok(())
     }
 
     fn write(&mut self, line: &Value, prefix: &str) -> anyhow::Result<()> {
@@ -151,29 +160,35 @@ impl Writer {
 }
 
 impl Source {
-    /// Whether what was read is not what lies there now: a resume has gone back.
-    fn was_replaced(&self) -> bool {
-        let metadata = std::fs::metadata(&self.path);
-        self.offset > 0
-            && !metadata.is_ok_and(|now| now.ino() == self.inode && now.len() >= self.offset)
+    fn begin_again(&mut self) {
+        self.offset = 0;
+        self.was_replaced = false;
     }
 
-    /// The whole lines that were not read yet.
-    fn new_lines(&mut self) -> anyhow::Result<Vec<u8>> {
+    /// The next whole lines that were not read yet; none when there are no more for now. Notes if
+    /// what was read is not what lies there now: a resume has gone back.
+    fn new_lines(&mut self) -> anyhow::Result<Option<Vec<u8>>> {
+        let cannot = || format!("cannot read {}", self.path.display());
         let mut file = match File::open(&self.path) {
-            Err(error) if error.kind() == std::io::ErrorKind::NotFound => return Ok(Vec::new()),
-            file => file.with_context(|| format!("cannot read {}", self.path.display()))?,
+            Err(error) if error.kind() == std::io::ErrorKind::NotFound => return Ok(None),
+            file => file.with_context(cannot)?,
         };
+        // Of the file that is open: another may take its name at any moment.
+        let now = file.metadata().with_context(cannot)?;
+        if self.offset > 0 && (now.ino() != self.inode || now.len() < self.offset) {
+            self.was_replaced = true;
+            return Ok(Some(Vec::new()));
+        }
+        self.inode = now.ino();
         let mut lines = Vec::new();
-        self.inode = file.metadata().map_or(0, |metadata| metadata.ino());
         file.seek(SeekFrom::Start(self.offset))
             .and_then(|_| file.take(READ_BYTES_MAX).read_to_end(&mut lines))
-            .with_context(|| format!("cannot read {}", self.path.display()))?;
+            .with_context(cannot)?;
         // One that is being written comes whole the next time.
         let whole = lines.iter().rposition(|&byte| byte == b'\n').map_or(0, |at| at + 1);
         lines.truncate(whole);
         self.offset += whole as u64;
-        Ok(lines)
+        Ok((whole > 0).then_some(lines))
     }
 }
 

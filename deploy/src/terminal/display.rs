@@ -41,6 +41,8 @@ pub struct Display {
     line_at: Option<Instant>,
     /// Oldest first.
     evaluations: Vec<EvaluationRow>,
+    /// The last that was shown.
+    last: Progress,
 }
 
 enum Target {
@@ -72,7 +74,13 @@ impl Display {
     }
 
     fn on(target: Target, steps_total: u64) -> Self {
-        Self { target, steps_total, line_at: None, evaluations: Vec::new() }
+        Self {
+            target,
+            steps_total,
+            line_at: None,
+            evaluations: Vec::new(),
+            last: Progress::default(),
+        }
     }
 
     /// Whether there is a panel that tells of processes.
@@ -81,7 +89,15 @@ impl Display {
         matches!(self.target, Target::Bar(_))
     }
 
-    /// A run that goes on has evaluations already.
+    /// Shows what each process does now, between two reports of progress.
+    pub fn refresh(&mut self, processes: &[ProcessLine]) {
+        if self.is_live() {
+            let last = std::mem::take(&mut self.last);
+            self.progress(&last, processes);
+        }
+    }
+
+    /// A run that goes on has evaluations already; one that goes back has fewer than were shown.
     pub fn begin_with(&mut self, evaluations: Vec<EvaluationRow>) {
         self.evaluations = evaluations;
     }
@@ -97,6 +113,7 @@ impl Display {
     /// Shows where the learner stands, and what each process does where there is room for it.
     pub fn progress(&mut self, progress: &Progress, processes: &[ProcessLine]) {
         let (steps, figures) = (self.steps(progress), self.figures(progress));
+        self.last = progress.clone();
         match &mut self.target {
             Target::Bar(bar) => {
                 bar.set_position(progress.env_steps.min(self.steps_total));

@@ -36,8 +36,10 @@ pub(super) struct Panel<'a> {
 
 /// Columns and rows of the terminal that standard error is.
 pub(super) fn terminal_size() -> (usize, usize) {
-    rustix::termios::tcgetwinsize(std::io::stderr())
-        .map_or(SIZE, |size| (usize::from(size.ws_col), usize::from(size.ws_row)))
+    let size = rustix::termios::tcgetwinsize(std::io::stderr()).ok();
+    // Many terminals that are none say 0 by 0.
+    let said = |count: u16, otherwise| if count == 0 { otherwise } else { usize::from(count) };
+    size.map_or(SIZE, |size| (said(size.ws_col, SIZE.0), said(size.ws_row, SIZE.1)))
 }
 
 impl Panel<'_> {
@@ -59,12 +61,13 @@ impl Panel<'_> {
         };
         let returns: Vec<f64> = self.evaluations.iter().map(|row| row.return_mean).collect();
         let best = returns.iter().copied().fold(f64::NEG_INFINITY, f64::max);
-        let mut text = format!("{}  {}", plus_minus(&latest.returns), sparkline(&returns, None));
-        text.push_str(&format!("{SEPARATOR}best {best:.2}"));
+        let mut text = format!("{}{SEPARATOR}best {best:.2}", plus_minus(&latest.returns));
+        text.push_str(&format!("{SEPARATOR}{}", sparkline(&returns, None)));
         let rates: Option<Vec<f64>> = self.evaluations.iter().map(|row| row.success_rate).collect();
         if let (Some(rate), Some(rates)) = (latest.success_rate, rates) {
             let sparks = sparkline(&rates, Some((0.0, 1.0)));
-            text.push_str(&format!("{SEPARATOR}success {:.0} %  {sparks}", rate * 100.0));
+            let success = format!("success {:.0} %", rate * 100.0);
+            text.push_str(&format!("{SEPARATOR}{success}{SEPARATOR}{sparks}"));
         }
         named("return", &text)
     }
@@ -151,15 +154,18 @@ fn sparkline(values: &[f64], range: Option<(f64, f64)>) -> String {
     means.iter().map(block).collect()
 }
 
-/// As many of the figures as fit, none of them cut.
+/// As many of the figures as fit, none of them cut but the first.
 pub(super) fn whole_items(figures: &str, width: usize) -> String {
     let mut line = String::new();
     for item in figures.split(SEPARATOR) {
-        let separator = if line.is_empty() { "" } else { SEPARATOR };
-        if (line.chars().count() + separator.chars().count() + item.chars().count()) > width {
+        if line.is_empty() {
+            line.extend(item.chars().take(width));
+            continue;
+        }
+        if line.chars().count() + SEPARATOR.chars().count() + item.chars().count() > width {
             break;
         }
-        line.push_str(separator);
+        line.push_str(SEPARATOR);
         line.push_str(item);
     }
     line
@@ -203,7 +209,7 @@ mod tests {
         let processes = [process("learner", "learning", 0), process("actor-0", "stepping", 2)];
         let panel = Panel { progress: &progress, evaluations: &rows, processes: &processes };
         let expected = [
-            "  return     -5.00 ± 1.00  ▁█▅ · best -2.00 · success 100 %  ▁▅█",
+            "  return     -5.00 ± 1.00 · best -2.00 · ▁█▅ · success 100 % · ▁▅█",
             "  rates      520 steps/s · 205 updates/s · 12.5 samples/insert · lag 2 (max 7) · \
              1,024 queued",
             "  trouble    2 restarts",
@@ -250,6 +256,6 @@ mod tests {
         );
         assert_eq!(whole_items("12 steps · eta 3 s · 5 steps/s", 20), "12 steps · eta 3 s");
         assert_eq!(whole_items("12 steps · eta 3 s · 5 steps/s", 10), "12 steps");
-        assert_eq!(whole_items("12 steps", 3), "");
+        assert_eq!(whole_items("12 steps", 3), "12 ");
     }
 }

@@ -13,11 +13,15 @@ NumPy, the package ``dmprl`` and this file are all that the robot's computer nee
 import argparse
 import json
 import socket
+import sys
 import time
 
 import numpy as np
 
 import dmprl
+
+STEPS_MAX = 1_000
+"""Of an episode that nothing else ends."""
 
 
 class RemoteRobot:
@@ -49,10 +53,12 @@ class RemoteRobot:
         done = answer["terminated"], answer["truncated"]
         return observation, answer["reward"], *done, answer["info"]
 
+    def command(self, action: np.ndarray) -> None:
+        """A last command, whose answer nobody waits for."""
+        self._send({"action": action.tolist()})
+
     def _ask(self, message: dict, patience_s: float) -> dict | None:
-        self._number += 1
-        line = json.dumps({**message, "number": self._number})
-        self._socket.sendall(line.encode() + b"\n")
+        self._send(message)
         deadline = time.monotonic() + patience_s
         while (left := deadline - time.monotonic()) > 0.0:
             self._socket.settimeout(left)
@@ -69,28 +75,45 @@ class RemoteRobot:
                 return answers[-1]
         return None
 
+    def _send(self, message: dict) -> None:
+        self._number += 1
+        line = json.dumps({**message, "number": self._number})
+        self._socket.sendall(line.encode() + b"\n")
+
 
 def drive(policy: dmprl.Policy, robot: RemoteRobot, seed: int, hz: float) -> dict:
-    """One episode, a step every 1 / ``hz`` seconds; 0: as fast as the robot answers."""
-    steps_max = policy.spec["episode_steps"]
+    """One episode, a step every 1 / ``hz`` seconds; 0: as fast as the robot answers.
+
+    However it ends, the last command is the hold.
+    """
+    steps_max = policy.spec["episode_steps"] or STEPS_MAX
     policy.reset()
-    observation, info = robot.reset(seed)
-    result = {"return": 0.0, "steps": 0, "held": 0, "late": 0, "is_success": False}
+    observation, _ = robot.reset(seed)
+    result = {"return": 0.0, "steps": 0, "held_steps": [], "late": 0, "is_success": False}
     due = time.monotonic()
-    while result["steps"] < steps_max:
-        action = policy.action(observation)
-        observation, reward, terminated, truncated, info = robot.step(action)
-        result["return"] += reward
-        result["steps"] += 1
-        result["held"] += policy.is_holding
-        result["is_success"] = info.get("is_success", result["is_success"])
-        if terminated or truncated:
-            break
-        if hz > 0.0:
-            due += 1.0 / hz
-            wait = due - time.monotonic()
-            result["late"] += wait < 0.0
-            time.sleep(max(wait, 0.0))
+    try:
+        while result["steps"] < steps_max:
+            try:
+                action = policy.action(observation)
+            except ValueError as error:
+                print(f"step {result['steps'] + 1}: {error}", file=sys.stderr)
+                action = policy.hold()
+            observation, reward, terminated, truncated, info = robot.step(action)
+            result["return"] += reward
+            result["steps"] += 1
+            if policy.is_holding:
+                result["held_steps"].append(result["steps"])
+            result["is_success"] = info.get("is_success", result["is_success"])
+            if terminated or truncated:
+                break
+            if hz > 0.0:
+                # After a stall the rhythm begins anew: what was missed is not made up for in haste.
+                now = time.monotonic()
+                result["late"] += due + 1.0 / hz < now
+                due = max(due + 1.0 / hz, now)
+                time.sleep(due - now)
+    finally:
+        robot.command(policy.hold())
     return result
 
 
@@ -101,13 +124,14 @@ def main() -> None:
     parser.add_argument("--host", default="127.0.0.1")
     parser.add_argument("--port", type=int, default=5555)
     parser.add_argument("--hz", type=float, default=20.0, help="control rate; 0: no waiting")
+    parser.add_argument("--patience", type=float, help="of a step [s]; else its own duration")
     parser.add_argument("--seed", type=int, default=1000)
     parser.add_argument("--rate", type=float, help="largest change of an action in a step")
     arguments = parser.parse_args()
     policy = dmprl.Policy.load(arguments.policy)
     if arguments.rate is not None:
         policy.limit(rate=arguments.rate)
-    patience_s = 1.0 if arguments.hz == 0.0 else 1.0 / arguments.hz
+    patience_s = arguments.patience or (1.0 / arguments.hz if arguments.hz > 0.0 else 1.0)
     robot = RemoteRobot(arguments.host, arguments.port, patience_s)
     print(json.dumps(drive(policy, robot, arguments.seed, arguments.hz)))
 

@@ -8,7 +8,7 @@ without one::
 One client at a time; a JSON object a line. ``{"reset": seed, "number": n}`` and ``{"action": […],
 "number": n}`` are answered by ``{"number": n, "observation": […], "reward": …, "terminated": …,
 "truncated": …, "info": {…}}``.
-``--silence FROM TO`` leaves the steps FROM to TO of each episode without an answer, as a bad
+``--silence FROM TO`` leaves the steps FROM to TO - 1 of each episode without an answer, as a bad
 network does: the robot moves, and nobody sees it.
 """
 
@@ -20,6 +20,12 @@ import socketserver
 import gymnasium
 
 import dmprl  # noqa: F401 - registers its tasks
+
+
+class Server(socketserver.TCPServer):
+    """May take the port of one that has just ended."""
+
+    allow_reuse_address = True
 
 
 class Controller(socketserver.StreamRequestHandler):
@@ -48,7 +54,10 @@ class Controller(socketserver.StreamRequestHandler):
                 "truncated": bool(truncated),
                 "info": {"is_success": bool(info.get("is_success", False))},
             }
-            self.wfile.write(json.dumps(answer).encode() + b"\n")
+            try:
+                self.wfile.write(json.dumps(answer).encode() + b"\n")
+            except ConnectionError:
+                return  # it has left without waiting for the answer
 
 
 def main() -> None:
@@ -58,7 +67,7 @@ def main() -> None:
     parser.add_argument("--port", type=int, default=5555, help="0: any that is free")
     parser.add_argument("--silence", type=int, nargs=2, metavar=("FROM", "TO"), default=(0, 0))
     arguments = parser.parse_args()
-    with socketserver.TCPServer(("127.0.0.1", arguments.port), Controller) as server:
+    with Server(("127.0.0.1", arguments.port), Controller) as server:
         server.environment = gymnasium.make(arguments.environment)
         server.silence = range(*arguments.silence)
         print(f"listening on port {server.server_address[1]}", flush=True)

@@ -51,8 +51,10 @@ pub struct PolicyRuntime {
     given: Vec<f64>,
     /// Steps of the segment that were given out; K: a decision is due.
     step: usize,
-    /// The action before, (A,).
+    /// The action before, (A,); before the first, the hold.
     previous: Vec<f64>,
+    /// Whether an action was given out since the reset.
+    has_acted: bool,
     /// Calls of [`PolicyRuntime::action`] without an observation, in a row.
     missed: usize,
     holding: bool,
@@ -87,6 +89,7 @@ impl PolicyRuntime {
             given: vec![0.0; layout.actions_len()],
             step: layout.segment_steps,
             previous: safety.hold().to_vec(),
+            has_acted: false,
             missed: 0,
             holding: false,
             network,
@@ -118,7 +121,7 @@ impl PolicyRuntime {
         &mut self.safety
     }
 
-    /// Whether the last action was the hold, because observations had stopped.
+    /// Whether the last action was the hold: observations had stopped, or it was asked for.
     #[must_use]
     pub fn is_holding(&self) -> bool {
         self.holding
@@ -149,7 +152,7 @@ impl PolicyRuntime {
         self.step = self.segment_steps();
         self.missed = 0;
         self.holding = false;
-        self.previous.copy_from_slice(self.safety.hold());
+        self.has_acted = false;
         Ok(())
     }
 
@@ -158,10 +161,12 @@ impl PolicyRuntime {
     /// - `observation`: (O,) in the environment's units.
     ///
     /// # Errors
-    /// The observation is not one, or what the network makes of it is no action. Nothing has
-    /// changed then, and nothing is to be commanded but [`Safety::hold`].
+    /// The observation is not one, or what the network makes of it is no action. There is no action
+    /// then but [`PolicyRuntime::hold`]; the policy goes on at the next good observation.
     pub fn segment(&mut self, observation: &[f64]) -> Result<&[f64], RuntimeError> {
         self.decide(observation)?;
+        self.missed = 0;
+        self.holding = false;
         while self.step < self.segment_steps() {
             self.give();
         }
@@ -197,15 +202,36 @@ impl PolicyRuntime {
             }
         }
         if self.holding {
-            self.safety.approach_hold(&mut self.previous);
+            self.approach_hold();
         } else {
             self.give();
         }
         Ok(&self.previous)
     }
 
+    /// A control step towards the hold, as far as the rate allows, (A,): what to command after an
+    /// error, and whenever the policy is not to act. The next observation begins a new segment.
+    pub fn hold(&mut self) -> &[f64] {
+        self.holding = true;
+        self.approach_hold();
+        &self.previous
+    }
+
+    fn approach_hold(&mut self) {
+        self.begin_at_hold();
+        self.safety.approach_hold(&mut self.previous);
+    }
+
+    /// The robot is taken to have commanded the hold before its first action.
+    fn begin_at_hold(&mut self) {
+        if !std::mem::replace(&mut self.has_acted, true) {
+            self.previous.copy_from_slice(self.safety.hold());
+        }
+    }
+
     /// Gives out the segment's next action, into `given` and `previous`.
     fn give(&mut self) {
+        self.begin_at_hold();
         let dims = self.previous.len();
         let cells = self.step * dims..(self.step + 1) * dims;
         self.safety.limit(&self.decided[cells.clone()], &mut self.previous);

@@ -215,3 +215,37 @@ fn only_a_policy_that_carries_its_state_begins_where_it_is_told() {
         assert!(error.contains("expected 2 finite numbers"), "{error}");
     }
 }
+
+#[test]
+fn errors_answered_by_the_hold_move_no_faster_than_allowed_either() {
+    let mut runtime = runtime(&[]);
+    runtime.safety_mut().set_rate(&[0.05, 0.05]).unwrap();
+    runtime.safety_mut().set_hold(&[0.5, 2.0]).unwrap();
+    runtime.reset(None).unwrap();
+    let bad = [f64::NAN; 4];
+    let mut before = runtime.safety().hold().to_vec();
+    let (mut held, mut acted) = (0, 0);
+    for step in 0..120 {
+        // Twenty good ones, then twenty bad ones, and so on.
+        let now = if step / 20 % 2 == 0 { observation(f64::from(step)) } else { bad };
+        let action = match runtime.action(Some(&now)) {
+            Ok(action) => {
+                acted += 1;
+                action.to_vec()
+            }
+            Err(_) => {
+                held += 1;
+                runtime.hold().to_vec()
+            }
+        };
+        for (now, before) in action.iter().zip(&before) {
+            assert!((now - before).abs() <= 0.05 + 1e-12, "step {step}: {before} to {now}");
+        }
+        assert_eq!(runtime.is_holding(), now[0].is_nan());
+        before = action;
+    }
+    assert_eq!((held, acted), (60, 60));
+    for (held, wanted) in before.iter().zip([0.5, 2.0]) {
+        assert!((held - wanted).abs() < 1e-9, "twenty steps are enough to get there: {held}");
+    }
+}

@@ -23,8 +23,7 @@ fn one_that_is_accepted_is_finite_and_stays_what_it_is() {
         let values = policy.initial_parameters(&mut dmprl_shared::seeds::stream(version, "p", 0));
         let architecture_hash = policy.architecture_hash();
         let snapshot = ParameterSnapshot { version, env_steps: 10, architecture_hash, values };
-        policy_file::save(&path, &policy, &snapshot, None).unwrap();
-        fs::read(&path).unwrap()
+        policy_file::encode(&policy, &snapshot, None).unwrap()
     });
     target.fuzz(|random| {
         let mut bytes = made[0].clone();
@@ -45,11 +44,14 @@ fn one_that_is_accepted_is_finite_and_stays_what_it_is() {
         }
         fs::write(&path, &bytes).unwrap();
         let strictness = *random.pick(&[Match::Architecture, Match::Sizes]);
+        if let Ok(opened) = policy_file::open(&path) {
+            assert_eq!(opened.snapshot.values.len(), opened.policy.parameters_len());
+        }
         let loaded = policy_file::load(&path, &policy, strictness);
         if let Ok(snapshot) = &loaded {
             assert_eq!(snapshot.values.len(), policy.parameters_len());
             assert!(snapshot.values.iter().all(|value| value.is_finite()));
-            policy_file::save(&path, &policy, snapshot, None).unwrap();
+            fs::write(&path, policy_file::encode(&policy, snapshot, None).unwrap()).unwrap();
             let again = policy_file::load(&path, &policy, Match::Architecture).unwrap();
             assert_eq!(again, *snapshot);
         }

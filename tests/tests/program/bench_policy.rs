@@ -24,6 +24,8 @@ fn what_is_no_policy_is_refused() {
     place.run(&["bench", "policy", "nowhere"]).with_status(2).saying("nowhere");
     place.run(&["bench", "policy", "--task", "Pendulum-v1"]).with_status(2).saying("pusher");
     place.run(&["bench", "policy"]).with_status(2);
+    let set = ["bench", "policy", "mine", "--set", "dmp.alpha_y=3.0"];
+    place.run(&set).with_status(2).saying("go with --task");
     std::fs::write(place.path("text"), "no policy").unwrap();
     place.run(&["bench", "policy", &place.path("text")]).with_status(1).saying("safetensors");
 }

@@ -38,8 +38,10 @@ fn a_runs_policy_leaves_as_one_file() {
     let warm = ["--steps", "600", "--init-from", &moved];
     place.run(&train("reacher", &place.path("warm"), &warm)).with_status(0);
 
+    // As --help shows it: a name in the folder where one is.
     let onnx = place.path("reacher.onnx");
-    let said = place.run(&["export", &run, "--output", &onnx]).with_status(0);
+    let said = place.run(&["export", "run", "--format", "onnx", "--output", "reacher.onnx"]);
+    let said = said.with_status(0);
     assert!(said.printed.contains("reacher.onnx"), "{}", said.printed);
     assert!(fs::read(&onnx).unwrap().windows(11).any(|name| name == b"observation"));
 }
@@ -60,4 +62,12 @@ fn what_cannot_be_exported_is_told_and_leaves_no_file() {
         .with_status(2)
         .saying("ends like the other format");
     assert!(!Path::new(&output).exists());
+    let trained = place.path("trained");
+    place.run(&train("reacher", &trained, &["--steps", "1000"])).with_status(0);
+    let before = fs::read_dir(place.path("")).unwrap().count();
+    for (output, words) in [("/dev/null", "no regular file"), ("no/such/p.onnx", "no such folder")]
+    {
+        place.run(&["export", &trained, "--output", output]).with_status(2).saying(words);
+    }
+    assert_eq!(fs::read_dir(place.path("")).unwrap().count(), before, "nothing is left");
 }

@@ -80,6 +80,28 @@ fn an_interrupt_of_python_stops_the_training_with_a_checkpoint() {
 }
 
 #[test]
+fn whatever_ends_the_call_nobody_trains_on() {
+    let place = Workplace::new();
+    let script = "
+import signal, threading
+def alarm(*_): raise TimeoutError('enough')
+signal.signal(signal.SIGALRM, alarm)
+class Watch(threading.Thread):
+    def run(self):
+        import os, pathlib
+        while not pathlib.Path('mine/checkpoints/latest').exists(): threading.Event().wait(0.05)
+        os.kill(os.getpid(), signal.SIGALRM)
+Watch(daemon=True).start()
+try:
+    dmprl.train('reacher', run_dir='mine', steps=10**9, init_from=None, quiet=True, **SMALL)
+except TimeoutError as error:
+    print(error)
+";
+    assert_eq!(python(&place, script).with_status(0).printed.trim(), "enough");
+    place.until_no_process();
+}
+
+#[test]
 fn every_task_has_its_short_name_in_python_too() {
     let place = Workplace::new();
     let script = "import json; print(json.dumps(dmprl.SHORT_NAMES))";

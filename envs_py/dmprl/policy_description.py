@@ -1,0 +1,78 @@
+"""What a policy's description may say: as Rust checks it (``shared/src/policy/description.rs``)."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+WORDS = {
+    "algorithm": ("ddpg", "td3", "sac", "ndp"),
+    "policy.kind": ("dmp", "mlp"),
+    "policy.controller": ("inverse", "position"),
+    "policy.rho": ("bounded", "free"),
+    "policy.start": ("zero", "observed", "carry"),
+    "policy.start_velocity": ("measured", "zero"),
+    "dmp.forcing_scaling": ("none", "goal"),
+}
+"""Every word that changes what a policy does; a file of a newer dmprl may have others."""
+POSITIVE = ("policy.goal_range", "policy.rho_range", "policy.position_scale", "dmp.alpha_y")
+COUNTS = ("policy.segment_steps", "dmp.basis_count", "spec.observation_len", "spec.action_len")
+
+
+def check(description: dict[str, Any]) -> None:
+    """Refuses what no policy is.
+
+    :raises ValueError: with the key, what it is and what is expected.
+    :raises KeyError: a key is missing.
+    """
+    for key, words in WORDS.items():
+        expect(key, found := value(description, key), found in words, f"one of {', '.join(words)}")
+    for key in POSITIVE:
+        found = value(description, key)
+        expect(key, found, is_finite(found) and found > 0, "a positive number")
+    for key in COUNTS:
+        found = value(description, key)
+        expect(key, found, isinstance(found, int) and found > 0, "a whole number, 1 or more")
+    spec = description["spec"]
+    low, high, length = spec["action_low"], spec["action_high"], spec["action_len"]
+    for key, bounds in (("spec.action_low", low), ("spec.action_high", high)):
+        fits = len(bounds) == length and all(is_finite(bound) for bound in bounds)
+        expect(key, bounds, fits, f"{length} finite numbers")
+    ordered = all(below < above for below, above in zip(low, high, strict=True))
+    expect("spec.action_low", low, ordered, f"below action_high = {high}")
+    duration = spec["control_dt_s"]
+    expect("spec.control_dt_s", duration, is_finite(duration) and duration >= 0, "0 or more [s]")
+    names = spec["observation_names"]
+    fits = len(names) in (0, spec["observation_len"])
+    expect("spec.observation_names", names, fits, f"{spec['observation_len']} names, or none")
+    if description["policy"]["kind"] == "dmp" and description["policy"]["start"] == "observed":
+        check_sources(description["start_sources"], length, spec["observation_len"])
+
+
+def check_sources(sources: list[dict[str, Any]], count: int, observation_len: int) -> None:
+    """Refuses starts that are not in the observation."""
+    expect("start_sources", sources, len(sources) == count, f"{count} entries")
+    for source in sources:
+        keys = ("cos", "sin", "velocity") if "cos" in source else ("index", "velocity")
+        places = [source[key] for key in keys]
+        fits = all(isinstance(at, int) and 0 <= at < observation_len for at in places)
+        expect("start_sources", source, fits, f"places within {observation_len} observations")
+        expect("start_sources", source, is_finite(source.get("scale", 1.0)), "a finite scale")
+
+
+def value(description: dict[str, Any], key: str) -> Any:
+    """The value of a dotted key."""
+    for part in key.split("."):
+        description = description[part]
+    return description
+
+
+def is_finite(number: Any) -> bool:
+    """Whether it is a number, and one that computing goes on with."""
+    return isinstance(number, int | float) and math.isfinite(number)
+
+
+def expect(key: str, found: Any, fits: bool, expected: str) -> None:
+    """Refuses a value that does not fit."""
+    if not fits:
+        raise ValueError(f"{key} is {found!r}, expected {expected}")
