@@ -104,11 +104,8 @@ for folder in pathlib.Path(sys.argv[1]).iterdir():
     assert!(held > 0, "nothing held: this shows nothing");
 }
 
-#[test]
-fn numpy_refuses_what_is_no_observation_no_limit_and_no_policy() {
-    let folder = tempfile::tempdir().unwrap();
-    exported::write(folder.path());
-    let script = "
+/// The beginning of a script: `refused` insists on an error and its words.
+const REFUSED: &str = "
 import pathlib, dmprl, numpy as np
 folder = pathlib.Path(sys.argv[1])
 def refused(call, *words, kind=ValueError):
@@ -118,7 +115,13 @@ def refused(call, *words, kind=ValueError):
         assert all(word in str(error) for word in words), error
     else:
         raise AssertionError(words)
+";
 
+#[test]
+fn numpy_refuses_what_is_no_observation_and_no_limit() {
+    let folder = tempfile::tempdir().unwrap();
+    exported::write(folder.path());
+    let script = "
 for name in ('dmp', 'carry', 'mlp'):
     policy, calm = (dmprl.Policy.load(folder / name / 'policy.safetensors') for _ in range(2))
     length = policy.spec['observation_len']
@@ -150,6 +153,16 @@ for name in ('dmp', 'carry', 'mlp'):
         assert policy.is_holding == bool(step // 20 % 2)
         before = action
     assert (abs(before - 0.5) < 1e-9).all(), before
+print('all refused')
+";
+    assert_eq!(python(&format!("{REFUSED}{script}"), folder.path()).trim(), "all refused");
+}
+
+#[test]
+fn numpy_refuses_files_that_are_damaged_or_of_no_policy() {
+    let folder = tempfile::tempdir().unwrap();
+    exported::write(folder.path());
+    let script = "
 refused(lambda: dmprl.Policy.load(folder), 'checkpoints/best')
 refused(lambda: dmprl.Policy.load(folder / 'none'), kind=OSError)
 whole = (folder / 'dmp/policy.safetensors').read_bytes()
@@ -165,7 +178,7 @@ for damaged, word in [
 ]:
     (folder / 'damaged').write_bytes(damaged)
     refused(lambda: dmprl.Policy.load(folder / 'damaged'), word, kind=dmprl.PolicyFileError)
-import json, zlib
+import dataclasses, json
 from dmprl.policy_file import read
 good = read(folder / 'dmp/policy.safetensors').description
 for change, word in [
@@ -176,13 +189,12 @@ for change, word in [
     (lambda d: d['policy'].update(rho='twisted'), 'policy.rho'),
     (lambda d: d['policy'].update(goal_range=float('inf')), 'goal_range'),
     (lambda d: d['policy'].update(kind='mlp'), 'actor'),
-    (lambda d: d['policy'].update(start='observed'), 'start_sources'),
+    (lambda d: (d['policy'].update(start='observed'), d.update(start_sources=[])), 'start_sources'),
     (lambda d: d['dmp'].update(basis_count=9), 'segment_map'),
     (lambda d: d.pop('spec'), 'spec'),
 ]:
     description = json.loads(json.dumps(good))
     change(description)
-    import dataclasses
     file = dataclasses.replace(read(folder / 'dmp/policy.safetensors'), description=description)
     refused(lambda: dmprl.Policy(file), word, kind=(KeyError, ValueError))
 random = np.random.default_rng(1)
@@ -197,5 +209,5 @@ for _ in range(500):
         pass
 print('all refused')
 ";
-    assert_eq!(python(script, folder.path()).trim(), "all refused");
+    assert_eq!(python(&format!("{REFUSED}{script}"), folder.path()).trim(), "all refused");
 }

@@ -66,6 +66,9 @@ impl Latency {
     }
 }
 
+/// What a peer is and how long its decisions take, or why it is not there.
+pub type Peer = Result<(String, Latency), String>;
+
 /// What came out.
 #[derive(Debug)]
 pub struct PolicyFigures {
@@ -77,8 +80,8 @@ pub struct PolicyFigures {
     pub decision: Latency,
     /// A control step, decisions included.
     pub action: Latency,
-    /// By runtime: what it is and its decisions, or why it is not there.
-    pub peers: Vec<(&'static str, Result<(String, Latency), String>)>,
+    /// By runtime.
+    pub peers: Vec<(&'static str, Peer)>,
 }
 
 impl PolicyFigures {
