@@ -32,6 +32,7 @@ mod launcher;
 mod learner_restarts;
 mod limits;
 mod observe;
+mod process_table;
 mod reports;
 mod session;
 mod signals;

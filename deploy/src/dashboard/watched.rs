@@ -1,0 +1,249 @@
+//! One run as the dashboard knows it: what is read once, and what is read on.
+
+use std::os::unix::fs::MetadataExt;
+use std::path::Path;
+use std::sync::atomic::{AtomicU64, Ordering};
+use std::time::{Duration, Instant};
+
+use serde::Serialize;
+use serde_json::Value;
+
+use super::table::{Curve, Table};
+use super::tail::Tail;
+use crate::control::EvaluationRow;
+use crate::report::method_label;
+use crate::run_directory::RunDirectory;
+
+/// A run whose supervisor is not to be found here is trained somewhere else if its metrics have
+/// grown within this time, as the dashboard saw it.
+const GROWS_WITHIN: Duration = Duration::from_secs(60);
+/// Tables that nobody has asked for are forgotten after this time.
+const TABLE_KEPT: Duration = Duration::from_secs(300);
+/// Points of a curve: no screen shows more side by side.
+const POINTS_MAX: usize = 1_000;
+
+/// What a run is; changes with its files only.
+#[derive(Debug, Clone, Default, Serialize)]
+pub struct Facts {
+    pub task: String,
+    /// As a report calls it: `TD3-DMP`.
+    pub method: String,
+    pub algorithm: String,
+    pub policy: String,
+    pub seed: u64,
+    /// Environment steps that it was asked for.
+    pub steps: u64,
+    /// UTC, RFC 3339, of its first session.
+    pub started: String,
+    until_return: f64,
+    until_success: f64,
+}
+
+/// Where a run stands.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
+#[serde(rename_all = "snake_case")]
+pub enum State {
+    Training,
+    Finished,
+    Stopped,
+}
+
+/// Which file of rows.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Rows {
+    Metrics,
+    Evaluations,
+}
+
+/// New points of curves.
+#[derive(Debug, Serialize)]
+pub struct Curves {
+    /// Names the table that `next` is about; another means that everything is sent anew.
+    pub table: u64,
+    /// Row to ask from the next time.
+    pub next: usize,
+    /// In the order asked for.
+    pub curves: Vec<Curve>,
+}
+
+#[derive(Debug)]
+struct Growing {
+    number: u64,
+    tail: Tail,
+    table: Table,
+    asked: Instant,
+}
+
+/// Inode and length: every file of a run is appended to or replaced by another.
+type Stamp = (u64, u64);
+
+/// A run that is looked at.
+#[derive(Debug)]
+pub struct Watched {
+    pub directory: RunDirectory,
+    pub facts: Facts,
+    /// Why its files cannot be used.
+    pub fault: Option<String>,
+    /// The last line of `metrics.jsonl`.
+    pub last: Value,
+    /// Newest last, of all evaluations.
+    pub evaluations: Vec<EvaluationRow>,
+    pub state: State,
+    facts_stamp: [Stamp; 2],
+    metrics_stamp: Stamp,
+    evaluations_stamp: Stamp,
+    grown: Option<Instant>,
+    tables: [Option<Growing>; 2],
+}
+
+impl Watched {
+    /// A run of which nothing has been read.
+    pub fn new(directory: RunDirectory) -> Self {
+        Self {
+            directory,
+            facts: Facts::default(),
+            fault: None,
+            last: Value::Null,
+            evaluations: Vec::new(),
+            state: State::Stopped,
+            facts_stamp: [(0, 0); 2],
+            metrics_stamp: (0, 0),
+            evaluations_stamp: (0, 0),
+            grown: None,
+            tables: [None, None],
+        }
+    }
+
+    /// Reads what has changed. A run that cannot be read says so, and the others are shown.
+    pub fn refresh(&mut self) {
+        self.fault = self.read_changes().err().map(|error| format!("{error:#}"));
+        self.state = self.state_now();
+        for table in &mut self.tables {
+            if table.as_ref().is_some_and(|table| table.asked.elapsed() > TABLE_KEPT) {
+                *table = None;
+            }
+        }
+    }
+
+    fn read_changes(&mut self) -> anyhow::Result<()> {
+        let path = self.directory.path();
+        let facts = ["config.toml", "manifest.json"].map(|name| stamp(&path.join(name)));
+        if facts != self.facts_stamp {
+            self.facts = read_facts(&self.directory)?;
+            self.facts_stamp = facts;
+        }
+        let metrics = stamp(&self.directory.metrics_path());
+        if metrics != self.metrics_stamp {
+            self.last = self.directory.last_metrics()?.unwrap_or_default();
+            // What was there at the first look says nothing about now.
+            self.grown = (self.metrics_stamp != (0, 0)).then(Instant::now);
+            self.metrics_stamp = metrics;
+        }
+        let evaluations = stamp(&self.directory.evaluations_path());
+        if evaluations != self.evaluations_stamp {
+            self.evaluations = self.directory.evaluations()?;
+            self.evaluations_stamp = evaluations;
+        }
+        Ok(())
+    }
+
+    fn state_now(&self) -> State {
+        let reached = self.evaluations.last().is_some_and(|row| {
+            row.env_steps >= self.facts.steps
+                || row.return_mean >= self.facts.until_return
+                || row.success_rate.is_some_and(|rate| rate >= self.facts.until_success)
+        });
+        let grows = self.grown.is_some_and(|grown| grown.elapsed() < GROWS_WITHIN);
+        match (self.directory.is_trained_here(), reached) {
+            (true, _) => State::Training,
+            (false, true) => State::Finished,
+            (false, false) if grows && self.is_elsewhere() => State::Training,
+            (false, false) => State::Stopped,
+        }
+    }
+
+    /// Whether nothing here says that its session has ended.
+    fn is_elsewhere(&self) -> bool {
+        !matches!(self.directory.processes(), Ok(Some(processes)) if processes.ended)
+    }
+
+    /// What is new of curves since row `from` of the table with number `table`.
+    ///
+    /// # Errors
+    /// The file cannot be read, or a whole line is no JSON.
+    pub fn curves(
+        &mut self,
+        rows: Rows,
+        names: &[&str],
+        (table, from): (u64, usize),
+    ) -> anyhow::Result<Curves> {
+        let path = match rows {
+            Rows::Metrics => self.directory.metrics_path(),
+            Rows::Evaluations => self.directory.evaluations_path(),
+        };
+        let growing = self.tables[rows as usize].get_or_insert_with(|| Growing::new(&path));
+        growing.read_on(&path)?;
+        growing.asked = Instant::now();
+        let from = if table == growing.number { from } else { 0 };
+        let curve = |name: &&str| growing.table.curve(name, from, POINTS_MAX);
+        let curves = names.iter().map(curve).collect();
+        Ok(Curves { table: growing.number, next: growing.table.rows(), curves })
+    }
+}
+
+impl Growing {
+    fn new(path: &Path) -> Self {
+        Self {
+            number: next_number(),
+            tail: Tail::new(path),
+            table: Table::default(),
+            asked: Instant::now(),
+        }
+    }
+
+    fn read_on(&mut self, path: &Path) -> anyhow::Result<()> {
+        loop {
+            let look = self.tail.look()?;
+            if look.begun_again {
+                (self.number, self.table) = (next_number(), Table::default());
+            }
+            for line in look.lines.split(|&byte| byte == b'\n').filter(|line| !line.is_empty()) {
+                let row: Value = serde_json::from_slice(line).map_err(|error| {
+                    anyhow::anyhow!("{}: a line is no JSON: {error}", path.display())
+                })?;
+                if self.table.push(&row) {
+                    self.number = next_number();
+                }
+            }
+            if !look.more {
+                return Ok(());
+            }
+        }
+    }
+}
+
+/// No two tables of this process have the same.
+fn next_number() -> u64 {
+    static NUMBER: AtomicU64 = AtomicU64::new(1);
+    NUMBER.fetch_add(1, Ordering::Relaxed)
+}
+
+fn stamp(path: &Path) -> Stamp {
+    std::fs::metadata(path).map_or((0, 0), |metadata| (metadata.ino(), metadata.len()))
+}
+
+fn read_facts(directory: &RunDirectory) -> anyhow::Result<Facts> {
+    let (config, manifest) = (directory.config()?, directory.manifest()?);
+    let name = |name: &dyn std::fmt::Debug| format!("{name:?}").to_lowercase();
+    Ok(Facts {
+        method: method_label(&config, manifest.preset()),
+        algorithm: name(&config.algorithm.name),
+        policy: name(&config.policy.kind),
+        seed: config.run.seed,
+        steps: config.run.steps,
+        started: manifest.sessions.first().map(|first| first.started.clone()).unwrap_or_default(),
+        until_return: config.run.until_return,
+        until_success: config.run.until_success,
+        task: config.task.name,
+    })
+}
