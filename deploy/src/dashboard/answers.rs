@@ -8,7 +8,7 @@ use super::catalogue::Catalogue;
 use super::table::rounded;
 use super::watched::{Curves, Facts, Rows, State, Watched};
 use super::{configuration, episode, videos};
-use crate::plots::colour;
+use crate::plots::{colour, has_colour};
 
 /// Curves in one request: a page has a dozen.
 const CURVES_MAX: usize = 64;
@@ -84,7 +84,10 @@ fn listed<'r>(name: &'r str, watched: &'r Watched, index: usize) -> Listed<'r> {
     let number = |key: &str| watched.last[key].as_f64().map(rounded);
     let newest = watched.evaluations.last();
     let best = watched.evaluations.iter().map(|row| row.return_mean).max_by(f64::total_cmp);
-    let colour = colour(index, &watched.facts.method);
+    let method = watched.facts.method.as_str();
+    // A preset's runs are drawn as the method's others are; dashes tell them apart.
+    let plain = method.split_once(" (").map_or(method, |(plain, _)| plain);
+    let colour = colour(index, if has_colour(method) { method } else { plain });
     Listed {
         name,
         facts: &watched.facts,

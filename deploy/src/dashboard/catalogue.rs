@@ -101,3 +101,44 @@ impl Walk {
         }
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use std::os::unix::fs::symlink;
+
+    use super::*;
+    use crate::run_directory::Manifest;
+
+    fn make(path: &Path) {
+        let manifest = Manifest::new(None).unwrap();
+        RunDirectory::create(path, &Default::default(), &manifest).unwrap();
+    }
+
+    fn names(catalogue: &Catalogue) -> Vec<&str> {
+        catalogue.runs.keys().map(String::as_str).collect()
+    }
+
+    #[test]
+    fn runs_are_found_at_any_depth_and_nothing_behind_a_link() {
+        let folder = tempfile::tempdir().unwrap();
+        let elsewhere = tempfile::tempdir().unwrap();
+        make(&folder.path().join("alone"));
+        make(&folder.path().join("sweep/reacher/td3/seed-1"));
+        make(&elsewhere.path().join("foreign"));
+        symlink(elsewhere.path(), folder.path().join("link")).unwrap();
+        let mut catalogue = Catalogue::new(folder.path()).unwrap();
+        catalogue.walk();
+        assert_eq!(names(&catalogue), ["alone", "sweep/reacher/td3/seed-1"]);
+        assert_eq!(catalogue.left_out, 0);
+    }
+
+    #[test]
+    fn one_run_is_called_by_its_own_name() {
+        let folder = tempfile::tempdir().unwrap();
+        let run = folder.path().join("mine");
+        make(&run);
+        let mut catalogue = Catalogue::new(&run).unwrap();
+        catalogue.walk();
+        assert_eq!(names(&catalogue), ["mine"]);
+    }
+}

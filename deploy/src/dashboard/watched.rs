@@ -247,3 +247,60 @@ fn read_facts(directory: &RunDirectory) -> anyhow::Result<Facts> {
         task: config.task.name,
     })
 }
+
+#[cfg(test)]
+mod tests {
+    use std::fs;
+
+    use super::*;
+    use crate::run_directory::Manifest;
+
+    fn run(folder: &Path) -> RunDirectory {
+        let manifest = Manifest::new(None).unwrap();
+        RunDirectory::create(&folder.join("run"), &Default::default(), &manifest).unwrap()
+    }
+
+    fn steps(curves: &Curves) -> &[f64] {
+        &curves.curves[0].env_steps
+    }
+
+    /// A resume forgets what its checkpoint has not seen; a page that kept those points would draw
+    /// the curve twice.
+    #[test]
+    fn after_a_resume_has_cut_the_rows_a_curve_is_sent_anew() {
+        let folder = tempfile::tempdir().unwrap();
+        let directory = run(folder.path());
+        let row =
+            |steps: u32| format!("{{\"env_steps\":{steps},\"wall_s\":1.5,\"loss\":{steps}}}\n");
+        let rows = |steps: &[u32]| steps.iter().map(|steps| row(*steps)).collect::<String>();
+        fs::write(directory.metrics_path(), rows(&[1, 2, 3])).unwrap();
+        let mut watched = Watched::new(directory.clone());
+        let mut look = |since| watched.curves(Rows::Metrics, &["loss"], since).unwrap();
+        let first = look((0, 0));
+        assert_eq!(steps(&first), [1.0, 2.0, 3.0]);
+        let since = (first.table, first.next);
+        assert_eq!(steps(&look(since)), [0.0; 0]);
+        directory.rewind(2).unwrap();
+        let text = fs::read_to_string(directory.metrics_path()).unwrap();
+        fs::write(directory.metrics_path(), text + &rows(&[4, 5, 6])).unwrap();
+        let anew = look(since);
+        assert_ne!(anew.table, first.table);
+        assert_eq!(steps(&anew), [1.0, 2.0, 4.0, 5.0, 6.0]);
+    }
+
+    #[test]
+    fn a_run_that_cannot_be_read_says_so_until_it_can() {
+        let folder = tempfile::tempdir().unwrap();
+        let directory = run(folder.path());
+        let mut watched = Watched::new(directory.clone());
+        watched.refresh();
+        assert_eq!((watched.fault.as_deref(), watched.state), (None, State::Stopped));
+        let config = fs::read(directory.path().join("config.toml")).unwrap();
+        fs::write(directory.path().join("config.toml"), "no TOML").unwrap();
+        watched.refresh();
+        assert!(watched.fault.as_ref().is_some_and(|fault| fault.contains("config.toml")));
+        fs::write(directory.path().join("config.toml"), config).unwrap();
+        watched.refresh();
+        assert_eq!(watched.fault, None);
+    }
+}

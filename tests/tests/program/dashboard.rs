@@ -95,7 +95,7 @@ fn a_run_that_begins_later_appears_grows_and_stays_when_it_has_ended() {
     for (key, expected) in [("task", json!("reacher")), ("method", json!("TD3-DMP"))] {
         assert_eq!(entry[key], expected);
     }
-    assert_eq!(entry["colour"], "#d55e00", "as in every plot");
+    assert_eq!(entry["colour"], "#009e73", "as in every plot");
     let rows = dmprl_tests::program::env_steps(&dmprl_tests::program::rows(&run, "metrics.jsonl"));
     assert_eq!(steps(&curves(&address, "")), rows);
     let metrics = get(&address, "/metrics");
@@ -223,4 +223,28 @@ fn a_rollout_that_was_measured_is_shown_joint_by_joint() {
     assert_eq!(lengths("positions"), [rows, rows]);
     assert_eq!(lengths("velocities"), [rows, rows]);
     assert_eq!(lengths("actions"), [rows - 1, rows - 1]);
+}
+
+#[test]
+fn a_restarted_worker_and_a_session_that_was_killed_are_told() {
+    let place = Workplace::new();
+    let run = place.path("one");
+    let training = place.start(&train("reacher", &run, &["--steps", ENDLESS]));
+    until("a run", || Path::new(&run).join("processes.json").is_file());
+    let (_dashboard, address) = start(&place, &run);
+    let actor = || {
+        let answer = get(&address, "/api/processes?run=one").json();
+        let rows = answer["session"]["processes"].as_array().cloned().unwrap_or_default();
+        rows.into_iter().find(|row| row["name"] == "actor-0" && row["state"] == "running")
+    };
+    until("a worker", || actor().is_some());
+    assert_eq!(actor().unwrap()["starts"], 1);
+    let processes = place.processes();
+    let worker = processes.iter().find(|one| one.role == "actor").expect("a worker");
+    worker.signal(Signal::KILL);
+    until("another start", || actor().is_some_and(|row| row["starts"] == 2));
+    training.signal_group(Signal::KILL);
+    until("its end", || listed(&address, "one").is_some_and(|one| one["state"] == "stopped"));
+    let answer = get(&address, "/api/processes?run=one").json();
+    assert_eq!(answer["session"]["ended"], false, "killed, not ended");
 }

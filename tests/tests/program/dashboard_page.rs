@@ -72,7 +72,7 @@ fn a_browser_watches_a_run_grow_beside_another() {
     );
     assert!(bytes.as_u64().unwrap() < BYTES_MAX, "{bytes} bytes");
     browser.evaluate(&format!("document.querySelector('figure[data-key={key}]').scrollIntoView()"));
-    browser.until(&draws(key, [0xd5, 0x5e, 0x00]));
+    browser.until(&draws(key, [0x00, 0x9e, 0x73]));
     let points = of_chart(&browser, key, "points");
     browser.until(&format!(
         "Number(document.querySelector('figure[data-key={key}]').dataset.points) > {points}"
@@ -94,7 +94,7 @@ fn a_browser_watches_a_run_grow_beside_another() {
     browser.until(&format!("{lines} === 2"));
     browser.evaluate("document.querySelector('figure[data-key=return_mean]').scrollIntoView()");
     browser.until(&draws("return_mean", [0x00, 0x72, 0xb2]));
-    browser.until(&draws("return_mean", [0xd5, 0x5e, 0x00]));
+    browser.until(&draws("return_mean", [0x00, 0x9e, 0x73]));
     let keys = "[...document.querySelectorAll('#keys tbody th')].map((one) => one.textContent)";
     browser.until(&format!("{keys}.includes('run.seed')"));
     browser.until(&format!("{keys}.includes('algorithm.name')"));

@@ -7,20 +7,20 @@ const DASHES = [[], [9, 4], [2, 3], [9, 3, 2, 3], [16, 4], [5, 2]];
 const SECONDS = [1, 2, 5, 10, 20, 30, 60, 120, 300, 600, 1200, 1800, 3600, 7200, 14400, 21600,
   43200, 86400, 172800, 432000, 864000];
 
-/** Every chart: title, unit, file of the run, key. */
+/** Every chart: title, unit, file of the run, key, and whether it may have a log scale. */
 export const GROUPS = [
   ["Evaluation, without noise", [
     ["Return", "mean over episodes", "evaluations", "return_mean"],
     ["Success rate", "share of episodes", "evaluations", "success_rate"],
-    ["Roughness", "mean change of an action a step; lower is smoother", "evaluations", "smoothness"],
+    ["Smoothness", "mean change of an action; lower is smoother", "evaluations", "smoothness"],
   ]],
   ["Training, with exploration", [
     ["Training return", "mean over episodes", "metrics", "training_return_mean"],
     ["Training success rate", "share of episodes", "metrics", "training_success_rate"],
   ]],
   ["Throughput and queues", [
-    ["Environment steps", "1/s", "metrics", "env_steps_per_s"],
-    ["Updates", "1/s", "metrics", "updates_per_s"],
+    ["Environment steps", "1/s", "metrics", "env_steps_per_s", true],
+    ["Updates", "1/s", "metrics", "updates_per_s", true],
     ["Queued segments", "waiting for the learner", "metrics", "queued_segments"],
     ["Policy lag", "versions, largest", "metrics", "policy_lag_max"],
     ["Updates owed", "updates that the pacing demands", "metrics", "updates_owed"],
@@ -60,6 +60,7 @@ export function styles(runs) {
 export function smoothed(values, weight) {
   let [mean, mass] = [0, 0];
   return values.map((value) => {
+    if (value === null) return null;
     mean = weight * mean + (1 - weight) * value;
     mass = weight * mass + (1 - weight);
     return mean / mass;
@@ -135,7 +136,8 @@ export class Plot {
     this.each = weight > 0 ? 2 : 1;
     const { points, end } = extent(lines);
     Object.assign(this.figure.dataset, { points, end });
-    this.write(null);
+    const { left, idx } = this.uplot.cursor;
+    this.write(left >= 0 ? idx : null);
   }
 
   make(series, data, axis, log) {
@@ -166,7 +168,7 @@ export class Plot {
     };
     this.readout.replaceChildren(...this.lines.map(({ label, style }, number) =>
       element("li", {}, swatch(style.colour, style.dash),
-        `${label}: ${figure(at(data[(number + 1) * this.each]) ?? null)}`)));
+        `${label}: ${figure(at(data[number * this.each + 1]) ?? null)}`)));
   }
 
   drop() {
@@ -189,11 +191,11 @@ export class Charts {
     for (const [title, charts] of GROUPS) {
       const group = element("div", { className: "charts" });
       const section = element("section", {}, element("h2", {}, title), group);
-      for (const [name, unit, file, key, isLoss] of charts) {
+      for (const [name, unit, file, key, mayBeLog] of charts) {
         const plot = new Plot(name, unit);
         plot.figure.dataset.key = key;
         group.append(plot.figure);
-        this.charts.push({ plot, file, key, isLoss, section, seen: false, stale: true });
+        this.charts.push({ plot, file, key, mayBeLog, section, seen: false, stale: true });
         watcher.observe(plot.figure);
       }
       place.append(section);
@@ -217,13 +219,16 @@ export class Charts {
   drawOne(chart) {
     if (!this.view || !chart.stale || chart.plot.figure.hidden) return;
     chart.stale = false;
-    const { runs, store, styles: known, axis, weight, logLosses } = this.view;
+    const { runs, store, styles: known, axis, weight } = this.view;
+    const log = this.view.log && Boolean(chart.mayBeLog);
     const lines = runs.flatMap((run) => {
       const curve = store.curve(run.name, chart.file, chart.key);
       if (!curve) return [];
-      return [{ label: run.label, style: known.get(run.name), x: curve[axis], y: curve.values }];
+      // A logarithm has no place for a rate of 0.
+      const y = log ? curve.values.map((value) => (value > 0 ? value : null)) : curve.values;
+      return [{ label: run.label, style: known.get(run.name), x: curve[axis], y }];
     });
-    const positive = lines.every((line) => line.y.every((value) => value > 0));
-    chart.plot.draw(lines, { axis, weight, log: Boolean(logLosses && chart.isLoss && positive) });
+    const positive = lines.some(({ y }) => y.some((value) => value !== null));
+    chart.plot.draw(lines, { axis, weight, log: log && positive });
   }
 }

@@ -110,7 +110,7 @@ export class Details {
       + (all > rows.length ? `The newest ${rows.length} of ${count(all)} evaluations.` : "");
     const best = Math.max(...rows.map((row) => row.return_mean));
     const heads = [["Steps", true], ["Time", true], ["Policy", true], ["Return", true],
-      ["Lowest", true], ["Highest", true], ["Success", true], ["Roughness", true],
+      ["Lowest", true], ["Highest", true], ["Success", true], ["Smoothness", true],
       ["Return of each episode", false]];
     fill(table, heads, rows.map((row) => [
       count(row.env_steps), duration(row.wall_s), count(row.policy_version),
@@ -205,6 +205,7 @@ export class Configuration {
   constructor() {
     this.known = new Map();
     this.runs = [];
+    this.drawn = "";
     get("all-keys").addEventListener("change", () => this.draw());
     get("key-filter").addEventListener("input", () => this.draw());
   }
@@ -216,6 +217,9 @@ export class Configuration {
         const { keys } = await ask("/api/config", { run: run.name });
         this.known.set(run.name, { steps: run.steps, keys });
       }));
+    const content = JSON.stringify(runs.map((run) => [run.name, run.label, run.steps]));
+    if (content === this.drawn) return;
+    this.drawn = content;
     this.draw();
   }
 

@@ -31,21 +31,21 @@ export const count = (value) => (value === null || value === undefined ? "–" :
 
 /** A share as per cent. */
 export const share = (value) => (value === null || value === undefined ? "–"
-  : `${small.format(100 * value)} %`);
+  : `${small.format(100 * value)}\u00a0%`);
 
 /** A duration: 42 s, 12 min, 3.5 h. */
 export function duration(seconds) {
   if (seconds === null || seconds === undefined) return "–";
-  if (seconds < 120) return `${small.format(Math.round(seconds * 10) / 10)} s`;
-  if (seconds < 7200) return `${small.format(Math.round(seconds / 6) / 10)} min`;
-  return `${small.format(Math.round(seconds / 360) / 10)} h`;
+  if (seconds < 120) return `${small.format(Math.round(seconds * 10) / 10)}\u00a0s`;
+  if (seconds < 7200) return `${small.format(Math.round(seconds / 6) / 10)}\u00a0min`;
+  return `${small.format(Math.round(seconds / 360) / 10)}\u00a0h`;
 }
 
 /** Bytes, as MiB or GiB. */
 export function bytes(value) {
   if (value === null || value === undefined) return "–";
   const mebi = value / 1048576;
-  return mebi < 1024 ? `${small.format(mebi)} MiB` : `${small.format(mebi / 1024)} GiB`;
+  return mebi < 1024 ? `${small.format(mebi)}\u00a0MiB` : `${small.format(mebi / 1024)}\u00a0GiB`;
 }
 
 /** A piece of the line that a run is drawn with. */

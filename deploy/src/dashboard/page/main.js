@@ -24,6 +24,8 @@ const chosen = readAddress();
 let listed = [];
 let root = "";
 let leftOut = 0;
+/** What the page shows already: nothing is drawn twice. */
+const drawn = { list: "", labels: "" };
 let timer = 0;
 let looking = false;
 let again = false;
@@ -35,7 +37,7 @@ function readAddress() {
     details: said.get("details"),
     axis: said.get("axis") === "wall_s" ? "wall_s" : "env_steps",
     weight: Math.min(0.95, Math.max(0, Number(said.get("smoothing")) || 0)),
-    logLosses: said.has("log"),
+    log: said.has("log"),
   };
 }
 
@@ -46,7 +48,7 @@ function writeAddress() {
   if (chosen.details) says.set("details", chosen.details);
   if (chosen.axis !== "env_steps") says.set("axis", chosen.axis);
   if (chosen.weight > 0) says.set("smoothing", chosen.weight);
-  if (chosen.logLosses) says.set("log", "");
+  if (chosen.log) says.set("log", "");
   history.replaceState(null, "", `#${says}`);
 }
 
@@ -103,7 +105,11 @@ async function update() {
   const runs = shownRuns();
   const asked = await Promise.allSettled(runs.map((run) => store.update(run)));
   store.keep(runs.map((run) => run.name));
-  drawCurves();
+  const labels = JSON.stringify([runs.map((run) => [run.name, run.label]), listed.length > 0]);
+  if (labels !== drawn.labels || asked.some((one) => one.value)) {
+    drawn.labels = labels;
+    drawCurves();
+  }
   await configuration.update(runs.filter((run) => !run.fault));
   await showDetails(runs);
   const failed = asked.find((one) => one.status === "rejected");
@@ -112,8 +118,8 @@ async function update() {
 
 function drawCurves() {
   const runs = shownRuns();
-  const { axis, weight, logLosses } = chosen;
-  charts.show({ runs, store, styles: styles(runs), axis, weight, logLosses });
+  const { axis, weight, log } = chosen;
+  charts.show({ runs, store, styles: styles(runs), axis, weight, log });
   const note = get("nothing");
   note.hidden = runs.some((run) => store.runs.get(run.name)?.files.some((file) => file.next > 0));
   if (!listed.length) note.textContent = "There is no run here yet; one that begins will appear.";
@@ -140,17 +146,21 @@ function facts(run) {
   if (run.fault) return element("span", { className: "facts fault" }, run.fault);
   const rate = run.success_rate === null ? "" : `, success ${share(run.success_rate)}`;
   const speed = run.state === "training" ? `, ${figure(run.env_steps_per_s)}/s` : "";
+  const [done, all] = [run.env_steps, run.steps];
+  const progress = done === all ? count(done) : `${count(done)} of ${count(all)}`;
   return element("span", { className: "facts" },
     element("span", { className: "state" }, STATES[run.state]),
-    ` · ${run.task} · ${run.method} · seed ${run.seed}`, element("br"),
-    `${count(run.env_steps)} of ${count(run.steps)} steps${speed}, ${duration(run.wall_s)}`,
-    element("br"), `return ${figure(run.return_mean)}${rate}`);
+    ` · ${run.task} · ${run.method} · seed\u00a0${run.seed}`, element("br"),
+    `${progress} steps${speed}, ${duration(run.wall_s)}`, element("br"),
+    `return ${figure(run.return_mean)}${rate}`);
 }
 
 function drawList() {
   const wanted = get("runs-filter").value.trim().toLowerCase().split(/\s+/);
   const says = (run) => `${run.name} ${run.task} ${run.method} ${run.state}`.toLowerCase();
-  const found = listed.filter((run) => wanted.every((word) => says(run).includes(word)));
+  const order = { training: 0, stopped: 1, finished: 1 };
+  const sorted = [...listed].sort((a, b) => order[a.state] - order[b.state]);
+  const found = sorted.filter((run) => wanted.every((word) => says(run).includes(word)));
   const known = styles(shownRuns());
   get("runs-count").textContent = `(${found.length === listed.length ? "" : `${found.length} of `}`
     + `${count(listed.length)}, ${chosen.runs?.length ?? 0} shown)`;
@@ -158,6 +168,9 @@ function drawList() {
   get("runs-note").textContent = [full ? `At most ${SHOWN_MAX} runs are shown at once.` : "",
     leftOut ? `${count(leftOut)} more runs are below this directory.` : ""].join(" ").trim();
   const list = get("runs");
+  const content = JSON.stringify([found, chosen.runs, full, [...known]]);
+  if (content === drawn.list) return;
+  drawn.list = content;
   const focused = document.activeElement?.value;
   const inside = list.contains(document.activeElement);
   list.replaceChildren(...found.map((run) => {
@@ -166,8 +179,8 @@ function drawList() {
       disabled: full && !checked });
     const style = known.get(run.name);
     return element("li", { className: run.state }, element("label", {}, box,
-      swatch(style?.colour ?? (checked ? run.colour : "#c4c4c4"), style?.dash ?? []),
-      element("span", { className: "name" }, run.name), facts(run)));
+      element("span", { className: "name" }, run.name),
+      swatch(style?.colour ?? "#0000", style?.dash ?? []), facts(run)));
   }));
   if (inside) list.querySelector(`input[value="${CSS.escape(focused)}"]`)?.focus();
 }
@@ -199,8 +212,8 @@ function listen() {
     set({ weight: Number(slider.value) });
     say();
   });
-  get("log-losses").checked = chosen.logLosses;
-  get("log-losses").addEventListener("change", ({ target }) => set({ logLosses: target.checked }));
+  get("log").checked = chosen.log;
+  get("log").addEventListener("change", ({ target }) => set({ log: target.checked }));
   get("details-run").addEventListener("change", ({ target }) => {
     chosen.details = target.value;
     writeAddress();
