@@ -9,8 +9,10 @@ use super::watched::Watched;
 use crate::failure::wrong_use;
 use crate::run_directory::RunDirectory;
 
-/// Between two looks for new runs.
+/// Between two looks for new runs, at least,
 const WALK_INTERVAL: Duration = Duration::from_secs(2);
+/// and so many times what a look takes, where there is much to look through.
+const WALK_REST: u32 = 50;
 /// Folders between the directory and a run: a sweep has three.
 const DEPTH_MAX: usize = 6;
 /// Entries looked at in one walk: a directory with more is not one of runs.
@@ -26,7 +28,8 @@ pub struct Catalogue {
     pub runs: BTreeMap<String, Watched>,
     /// Runs beyond [`RUNS_MAX`].
     pub left_out: usize,
-    walked: Option<Instant>,
+    /// When it is time to look again; none before the first.
+    due: Option<Instant>,
 }
 
 impl Catalogue {
@@ -40,7 +43,7 @@ impl Catalogue {
                 root.display()
             ))
         })?;
-        Ok(Self { root, runs: BTreeMap::new(), left_out: 0, walked: None })
+        Ok(Self { root, runs: BTreeMap::new(), left_out: 0, due: None })
     }
 
     /// The directory, absolute.
@@ -50,7 +53,8 @@ impl Catalogue {
 
     /// Looks for runs that have come or gone, if that was not done just now.
     pub fn walk(&mut self) {
-        if self.walked.is_some_and(|walked| walked.elapsed() < WALK_INTERVAL) {
+        let begun = Instant::now();
+        if self.due.is_some_and(|due| begun < due) {
             return;
         }
         let mut walk = Walk { found: Vec::new(), entries: 0 };
@@ -65,7 +69,7 @@ impl Catalogue {
             let watched = known.or_else(|| RunDirectory::open(&path).ok().map(Watched::new));
             self.runs.extend(watched.map(|watched| (name, watched)));
         }
-        self.walked = Some(Instant::now());
+        self.due = begun.checked_add(WALK_INTERVAL.max(begun.elapsed() * WALK_REST));
     }
 
     fn name_of(&self, path: &Path) -> String {

@@ -93,6 +93,8 @@ pub struct Watched {
     metrics_stamp: Stamp,
     evaluations_stamp: Stamp,
     grown: Option<Instant>,
+    /// The supervisor that was last seen alive on this machine.
+    seen_here: Option<u32>,
     tables: [Option<Growing>; 2],
 }
 
@@ -110,6 +112,7 @@ impl Watched {
             metrics_stamp: (0, 0),
             evaluations_stamp: (0, 0),
             grown: None,
+            seen_here: None,
             tables: [None, None],
         }
     }
@@ -147,23 +150,30 @@ impl Watched {
         Ok(())
     }
 
-    fn state_now(&self) -> State {
+    fn state_now(&mut self) -> State {
+        let holder = self.directory.lock_holder();
+        let here = self.directory.is_trained_here();
+        if here {
+            self.seen_here = holder;
+        }
         let reached = self.evaluations.last().is_some_and(|row| {
             row.env_steps >= self.facts.steps
                 || row.return_mean >= self.facts.until_return
                 || row.success_rate.is_some_and(|rate| rate >= self.facts.until_success)
         });
         let grows = self.grown.is_some_and(|grown| grown.elapsed() < GROWS_WITHIN);
-        match (self.directory.is_trained_here(), reached) {
+        // Who was seen here and is not any more has died, and trains nowhere else.
+        let elsewhere = grows && holder != self.seen_here && self.has_not_ended();
+        match (here, reached) {
             (true, _) => State::Training,
             (false, true) => State::Finished,
-            (false, false) if grows && self.is_elsewhere() => State::Training,
+            (false, false) if elsewhere => State::Training,
             (false, false) => State::Stopped,
         }
     }
 
-    /// Whether nothing here says that its session has ended.
-    fn is_elsewhere(&self) -> bool {
+    /// Whether its files do not say that its session has ended.
+    fn has_not_ended(&self) -> bool {
         !matches!(self.directory.processes(), Ok(Some(processes)) if processes.ended)
     }
 

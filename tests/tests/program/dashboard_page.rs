@@ -17,6 +17,10 @@ const BYTES_MAX: u64 = 300_000;
 /// A phone's width in CSS pixels, a narrow one.
 const PHONE: u32 = 360;
 
+/// Whether two runs have a return.
+const TWO_LINES: &str =
+    "document.querySelectorAll('figure[data-key=return_mean] .readout li').length === 2";
+
 /// Whether some of a chart is drawn in a colour, given as it is in its data.
 fn draws(key: &str, colour: [u8; 3]) -> String {
     let [red, green, blue] = colour;
@@ -87,11 +91,26 @@ fn a_browser_watches_a_run_grow_beside_another() {
         "Number(document.querySelector('figure[data-key={key}]').dataset.end) < {steps}"
     ));
 
-    // Another run beside it: two lines, two figures, and what differs in their configurations.
+    compare_with(&browser, "first");
+    look_on_a_phone(&browser);
+
+    // Afterwards everything is still there; and a dashboard that has ended is told.
+    training.signal_group(Signal::INT);
+    training.wait().with_status(130);
+    browser.until(
+        "document.querySelector('input[value=second]').closest('li').className === 'stopped'",
+    );
+    assert_eq!(browser.complaints(), Vec::<String>::new());
+    dashboard.signal_group(Signal::INT);
+    dashboard.wait().with_status(0);
+    browser.until("document.getElementById('connection').className === 'lost'");
+}
+
+/// Another run beside it: two lines, two figures, and what differs in their configurations.
+fn compare_with(browser: &Browser, other: &str) {
     assert_eq!(browser.evaluate("document.querySelectorAll('#keys td.differs').length"), 0);
-    browser.click("input[value=first]");
-    let lines = "document.querySelectorAll('figure[data-key=return_mean] .readout li').length";
-    browser.until(&format!("{lines} === 2"));
+    browser.click(&format!("input[value={other}]"));
+    browser.until(TWO_LINES);
     browser.evaluate("document.querySelector('figure[data-key=return_mean]').scrollIntoView()");
     browser.until(&draws("return_mean", [0x00, 0x72, 0xb2]));
     browser.until(&draws("return_mean", [0x00, 0x9e, 0x73]));
@@ -105,26 +124,17 @@ fn a_browser_watches_a_run_grow_beside_another() {
          select.value = 'second'; select.dispatchEvent(new Event('change')); })()",
     );
     browser.until(&format!("{processes}.some((one) => one.textContent === 'actor-0')"));
+}
 
-    // The same address on a phone: the same view, and nothing to scroll sideways.
+/// The same address on a phone: the same view, and nothing to scroll sideways.
+fn look_on_a_phone(browser: &Browser) {
     let view = browser.evaluate("location.href");
     browser.resize(PHONE, true);
     browser.open("about:blank");
     browser.open(view.as_str().unwrap());
-    browser.until(&format!("{lines} === 2"));
+    browser.until(TWO_LINES);
     browser.until("document.querySelectorAll('#keys tbody tr').length > 1");
     let width = browser.evaluate("document.documentElement.scrollWidth");
     assert_eq!(width, PHONE, "the page is wider than the phone");
     assert_eq!(browser.evaluate("document.querySelector('input[value=wall_s]').checked"), true);
-
-    // Afterwards everything is still there; and a dashboard that has ended is told.
-    training.signal_group(Signal::INT);
-    training.wait().with_status(130);
-    browser.until(
-        "document.querySelector('input[value=second]').closest('li').className === 'stopped'",
-    );
-    assert_eq!(browser.complaints(), Vec::<String>::new());
-    dashboard.signal_group(Signal::INT);
-    dashboard.wait().with_status(0);
-    browser.until("document.getElementById('connection').className === 'lost'");
 }

@@ -5,8 +5,9 @@ import { ask, Store } from "./data.js";
 import { Configuration, Details } from "./details.js";
 import { count, duration, element, figure, share, swatch } from "./format.js";
 
-/** Between two looks while something is trained, and while nothing is. */
-const LOOK_MS = { training: 2000, still: 5000 };
+/** A look costs the browser a few hundredths of a second of a core that training may want.
+ * Between two of them while something is trained, and while nothing is. */
+const LOOK_MS = { training: 4000, still: 6000 };
 /** Runs that are drawn at once: more lines nobody tells apart. */
 const SHOWN_MAX = 12;
 /** Of these so many are shown at first. */
@@ -29,6 +30,8 @@ const drawn = { list: "", labels: "" };
 let timer = 0;
 let looking = false;
 let again = false;
+/** A click on an entry of the list ends where it began only if the entry is still there. */
+let pressed = false;
 
 function readAddress() {
   const said = new URLSearchParams(location.hash.slice(1));
@@ -169,7 +172,7 @@ function drawList() {
     leftOut ? `${count(leftOut)} more runs are below this directory.` : ""].join(" ").trim();
   const list = get("runs");
   const content = JSON.stringify([found, chosen.runs, full, [...known]]);
-  if (content === drawn.list) return;
+  if (pressed || content === drawn.list) return;
   drawn.list = content;
   const focused = document.activeElement?.value;
   const inside = list.contains(document.activeElement);
@@ -196,6 +199,10 @@ function listen() {
     const others = (chosen.runs ?? []).filter((run) => run !== target.value);
     choose(target.checked ? [...others, target.value] : others);
   });
+  get("runs").addEventListener("pointerdown", () => { pressed = true; });
+  for (const end of ["pointerup", "pointercancel"]) {
+    addEventListener(end, () => setTimeout(() => { pressed = false; }));
+  }
   get("runs-filter").addEventListener("input", drawList);
   get("show-training").addEventListener("click", () => choose(listed
     .filter((run) => run.state === "training").slice(0, SHOWN_MAX).map((run) => run.name)));
