@@ -9,6 +9,7 @@ mod capacity;
 pub mod chaos;
 pub mod cli;
 pub mod control;
+mod dashboard;
 mod doctor;
 pub mod export;
 pub mod failure;

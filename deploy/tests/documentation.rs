@@ -160,6 +160,7 @@ fn every_flag_that_is_shown_exists() {
         "eval",
         "sweep",
         "report",
+        "dashboard",
         "record",
         "export",
         "play",

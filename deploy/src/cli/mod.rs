@@ -9,6 +9,7 @@ mod clean;
 mod completions;
 mod configuration;
 mod configured;
+mod dashboard;
 mod doctor;
 mod eval;
 mod export;
@@ -41,6 +42,7 @@ EXAMPLES
   dmprl resume runs/reacher-td3-dmp-s1-…  go on where it stopped
   dmprl actor --join runs/reacher-td3-…   one more worker for a run that is being trained
   dmprl record runs/reacher-td3-dmp-s1-…  what does it look like?
+  dmprl dashboard                          watch every run in a browser
   dmprl tasks                              what can be trained
   dmprl doctor                             what this machine has and lacks
 
@@ -76,6 +78,8 @@ enum Command {
     Sweep(sweep::SweepArgs),
     /// Set runs and sweeps side by side: tables, statistics, learning curves, one page.
     Report(report::ReportArgs),
+    /// Show runs on a web page, while they are trained and afterwards.
+    Dashboard(dashboard::DashboardArgs),
     /// Make a video of a policy, or of two side by side.
     Record(record::RecordArgs),
     /// Watch a policy at work, in a window or in a browser.
@@ -146,6 +150,7 @@ fn run(command: Command) -> anyhow::Result<Outcome> {
         Command::Eval(args) => eval::run(&args),
         Command::Sweep(args) => sweep::run(&args),
         Command::Report(args) => report::run(&args),
+        Command::Dashboard(args) => dashboard::run(&args),
         Command::Record(args) => record::run(&args),
         Command::Play(args) => play::run(&args),
         Command::Export(args) => export::run(&args),

@@ -47,6 +47,8 @@ pub(super) enum Event {
 pub(super) struct Child {
     commands: mpsc::Sender<Command>,
     kill: Arc<Notify>,
+    /// The process's number.
+    id: Option<u32>,
 }
 
 impl Child {
@@ -62,6 +64,7 @@ impl Child {
         let mut child = command.spawn().with_context(|| {
             format!("cannot start {process} ({:?})", command.as_std().get_program())
         })?;
+        let id = child.id();
         let input = child.stdin.take().context("a child without standard input")?;
         let output = child.stdout.take().context("a child without standard output")?;
         let (commands, receiver) = mpsc::channel(COMMANDS_MAX);
@@ -85,7 +88,7 @@ impl Child {
             // Nobody listens when the supervisor has given up: nothing left to tell.
             let _ = events.send(Event::Exited(process, status)).await;
         });
-        Ok(Self { commands, kill })
+        Ok(Self { commands, kill, id })
     }
 
     /// Goes on with a worker that joins, which is told `answer` first. Its process is watched by
@@ -96,7 +99,7 @@ impl Child {
         process: Process,
         events: mpsc::Sender<Event>,
     ) -> anyhow::Result<Self> {
-        let Newcomer { stream, process: descriptor, .. } = newcomer;
+        let Newcomer { stream, process: descriptor, id, .. } = newcomer;
         // SAFETY: an owned descriptor is the same until it is dropped, and nobody else has it.
         let descriptor = unsafe { AsyncFd::register_with_interest(descriptor, Interest::READABLE) };
         let descriptor = descriptor.context("cannot watch its process")?;
@@ -135,7 +138,12 @@ impl Child {
             }
             let _ = events.send(Event::Gone(process)).await;
         });
-        Ok(Self { commands, kill })
+        Ok(Self { commands, kill, id: u32::try_from(id).ok() })
+    }
+
+    /// The process's number; another's once it has ended and somebody needs a number.
+    pub(super) fn id(&self) -> Option<u32> {
+        self.id
     }
 
     /// Sends a command without waiting; false when the child takes none.

@@ -33,6 +33,7 @@ mod learner_restarts;
 mod limits;
 mod observe;
 mod overview;
+mod process_table;
 mod reports;
 mod session;
 mod signals;

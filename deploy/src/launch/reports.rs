@@ -69,6 +69,9 @@ impl Supervisor {
             Report::EnvFailures { count, last } => self.on_env_failures(process, count, &last),
             Report::Sent(sent) => {
                 self.sent += sent;
+                if let Some(slot) = self.slots.get_mut(&process) {
+                    slot.sent += sent;
+                }
                 if sent.sent > 0 {
                     self.worked(process);
                 }

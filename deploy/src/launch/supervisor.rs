@@ -88,6 +88,8 @@ pub(super) struct Slot {
     /// Restarts since it was last known to do its work.
     pub(super) restarts: u32,
     pub(super) restart_at: Option<Instant>,
+    /// What a worker did in this session.
+    pub(super) sent: Sent,
 }
 
 /// A child that lives.
@@ -176,6 +178,8 @@ pub(super) struct Supervisor {
     pub(super) sent: Sent,
     /// Starts of workers after a death in this session.
     pub(super) worker_restarts: u64,
+    /// When `processes.json` is to be written next; none once that has failed.
+    pub(super) processes_due: Option<Instant>,
 }
 
 /// What ended the supervisor's wait.
@@ -220,7 +224,9 @@ pub async fn supervise(plan: SupervisorPlan) -> SessionReport {
         let handled = supervisor.on_time(woke);
         supervisor.check(handled);
         supervisor.refresh(woke);
+        supervisor.tell_processes(woke);
     }
+    supervisor.tell_end();
     supervisor.report()
 }
 
@@ -265,6 +271,7 @@ impl Supervisor {
             env_failures: 0,
             sent: Sent::default(),
             worker_restarts: 0,
+            processes_due: Some(now),
         }
     }
 

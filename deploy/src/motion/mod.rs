@@ -90,7 +90,7 @@ pub struct Means {
 pub fn read(run: &RunDirectory) -> anyhow::Result<Option<Motion>> {
     let Some(row) = run.latest_row()? else { return Ok(None) };
     let settings = run.config()?.evaluation;
-    let Some(motion) = stored(&run.motion_path())? else { return Ok(None) };
+    let Some(motion) = stored(run)? else { return Ok(None) };
     let fresh = motion.format == FORMAT
         && motion.policy_version == row.policy_version
         && motion.first_seed == settings.first_seed
@@ -98,8 +98,13 @@ pub fn read(run: &RunDirectory) -> anyhow::Result<Option<Motion>> {
     Ok(fresh.then_some(motion))
 }
 
-fn stored(path: &Path) -> anyhow::Result<Option<Motion>> {
-    let file = match File::open(path) {
+/// What was measured last, of whichever policy; none if it is damaged or older.
+///
+/// # Errors
+/// The file cannot be read.
+pub fn stored(run: &RunDirectory) -> anyhow::Result<Option<Motion>> {
+    let path = run.motion_path();
+    let file = match File::open(&path) {
         Ok(file) => file,
         Err(error) if error.kind() == ErrorKind::NotFound => return Ok(None),
         Err(error) => return Err(error).context(format!("cannot open {}", path.display())),

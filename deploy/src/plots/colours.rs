@@ -18,6 +18,11 @@ const COLOURS: [RGBColor; 8] = [
 const KNOWN: [&str; 8] =
     ["DDPG-DMP", "DDPG-DMP (paper)", "TD3-DMP", "SAC-DMP", "DDPG", "TD3", "SAC", "NDP"];
 
+/// Whether a method has a colour of its own.
+pub(crate) fn has_colour(method: &str) -> bool {
+    KNOWN.contains(&method)
+}
+
 /// The colour of a method, which is the report's `index`-th.
 pub(crate) fn colour(index: usize, method: &str) -> RGBColor {
     let known = KNOWN.iter().position(|known| *known == method);

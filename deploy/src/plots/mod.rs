@@ -7,7 +7,7 @@ mod png;
 mod small_multiples;
 
 pub(crate) use axes::{Axes, Chart};
-pub(crate) use colours::colour;
+pub(crate) use colours::{colour, has_colour};
 pub use learning_curve::learning_curve;
 pub(crate) use png::png;
 pub(crate) use small_multiples::{Panel, SmallMultiples};

@@ -219,7 +219,7 @@ fn run(directory: &RunDirectory, config: &ExperimentConfig, method: String) -> a
 }
 
 /// What a run is called that no sweep has named: a preset's runs are no seeds of the default's.
-fn label(config: &ExperimentConfig, preset: Option<&str>) -> String {
+pub(crate) fn label(config: &ExperimentConfig, preset: Option<&str>) -> String {
     let method = method(config);
     match preset.filter(|&name| name != PRESETS[0].name) {
         Some(name) => format!("{method} ({name})"),

@@ -25,6 +25,7 @@ mod tables;
 mod thresholds;
 mod trajectories;
 
+pub(crate) use collect::label as method_label;
 pub use collect::{Origin, Results, Run};
 pub use curves::curves;
 pub use efficiency::{EfficiencyCell, EfficiencyRow, efficiency};

@@ -26,6 +26,16 @@ pub(crate) fn replace(path: &Path, bytes: &[u8]) -> anyhow::Result<()> {
     written.with_context(|| format!("cannot write {}", path.display()))
 }
 
+/// The same without a sync: after a crash of the machine the file may be empty.
+pub(super) fn replace_unsynced(path: &Path, bytes: &[u8]) -> anyhow::Result<()> {
+    let aside = path.with_extension(format!("tmp{}", std::process::id()));
+    let written = fs::write(&aside, bytes).and_then(|()| fs::rename(&aside, path));
+    if written.is_err() {
+        let _ = fs::remove_file(&aside);
+    }
+    written.with_context(|| format!("cannot write {}", path.display()))
+}
+
 /// Makes `link` a symbolic link to `target`, replacing the one that was there in one step.
 pub(super) fn point(link: &Path, target: &Path) -> anyhow::Result<()> {
     let aside = link.with_extension(format!("tmp{}", std::process::id()));

@@ -7,6 +7,7 @@
 //! checkpoints/       written by the learner                logs/PROCESS.log
 //! videos/  plots/                                          lock                held while alive
 //! motion.json        how the latest policy moves, once somebody has asked
+//! processes.json     which processes there are and what they do, while it is trained
 //! segments.log       at delivery level `log`: what came since the last checkpoint
 //! ```
 //! The supervisor makes it; learner and evaluator write into it; `eval`, `resume` read it.
@@ -16,6 +17,7 @@ mod atomic;
 mod lock;
 mod manifest;
 mod policies;
+mod processes;
 mod rows;
 mod timestamp;
 
@@ -31,6 +33,7 @@ pub use lock::RunLock;
 pub(crate) use manifest::random_u64;
 pub use manifest::{FORMAT_VERSION, Machine, Manifest, Session};
 pub use policies::{ChosenPolicy, PolicyChoice};
+pub use processes::{ProcessRow, ProcessState, Processes};
 pub(crate) use timestamp::unix_s;
 pub use timestamp::{compact, rfc3339};
 
@@ -264,6 +267,12 @@ impl RunDirectory {
     #[must_use]
     pub fn lock_holder(&self) -> Option<u32> {
         lock::last_holder(&self.path)
+    }
+
+    /// Whether the run's supervisor lives, on this machine.
+    #[must_use]
+    pub fn is_trained_here(&self) -> bool {
+        self.lock_holder().is_some_and(lock::is_trainer)
     }
 
     /// Takes the run for this process and those it starts; see [`RunLock`].

@@ -131,6 +131,14 @@ impl RunDirectory {
         Ok(latest)
     }
 
+    /// The last line of `metrics.jsonl`.
+    ///
+    /// # Errors
+    /// The line cannot be read.
+    pub fn last_metrics(&self) -> anyhow::Result<Option<serde_json::Value>> {
+        last_row(&self.metrics_path())
+    }
+
     /// Environment steps at the last line of `metrics.jsonl`.
     ///
     /// # Errors

@@ -1,0 +1,276 @@
+//! HTTP on loopback: who may ask, what can be asked for, and how it ends.
+
+use std::net::{Ipv4Addr, SocketAddr};
+use std::path::{Path, PathBuf};
+use std::sync::{Arc, Mutex, PoisonError};
+use std::time::Duration;
+
+use anyhow::Context;
+use axum::extract::{Query, Request, State};
+use axum::http::uri::Authority;
+use axum::http::{HeaderName, HeaderValue, StatusCode, header};
+use axum::middleware::{self, Next};
+use axum::response::{IntoResponse, Response};
+use axum::routing::get;
+use axum::{Json, Router};
+use serde::{Deserialize, Serialize};
+use serde_json::json;
+use tokio::net::TcpListener;
+use tower_http::compression::CompressionLayer;
+use tower_http::services::ServeFile;
+use tower_http::timeout::TimeoutLayer;
+
+use super::answers::{self, Refusal};
+use super::catalogue::Catalogue;
+use super::{page, prometheus};
+use crate::failure::Outcome;
+use crate::launch::interrupts;
+
+/// A request that takes longer is given up.
+const REQUEST_MAX: Duration = Duration::from_secs(30);
+/// After Ctrl-C, answers under way have so long.
+const LAST_ANSWERS: Duration = Duration::from_millis(500);
+/// Names of this machine for itself. A page of another site that has its own name lead here (DNS
+/// rebinding) asks for that name.
+const OWN_NAMES: [&str; 3] = ["localhost", "127.0.0.1", "[::1]"];
+/// Nothing from anywhere else, and nothing that is written into the page.
+const POLICY: &str = "default-src 'none'; script-src 'self'; style-src 'self'; \
+                      img-src 'self' data:; media-src 'self'; connect-src 'self'; \
+                      base-uri 'none'; form-action 'none'; frame-ancestors 'none'";
+/// Of every answer.
+const HEADERS: [(HeaderName, HeaderValue); 4] = [
+    (header::CONTENT_SECURITY_POLICY, HeaderValue::from_static(POLICY)),
+    (header::X_CONTENT_TYPE_OPTIONS, HeaderValue::from_static("nosniff")),
+    (header::REFERRER_POLICY, HeaderValue::from_static("no-referrer")),
+    // A newer program at the same address must not be shown with an older one's page.
+    (header::CACHE_CONTROL, HeaderValue::from_static("no-store")),
+];
+
+/// What is shown, and where.
+#[derive(Debug)]
+pub struct Plan<'p> {
+    /// A run, or a directory with runs below it.
+    pub root: &'p Path,
+    /// On 127.0.0.1; 0: any that is free.
+    pub port: u16,
+}
+
+type Shared = Arc<Mutex<Catalogue>>;
+
+#[derive(Deserialize)]
+struct RunQuery {
+    run: String,
+}
+
+#[derive(Deserialize)]
+struct CurvesQuery {
+    run: String,
+    file: String,
+    names: String,
+    #[serde(default)]
+    table: u64,
+    #[serde(default)]
+    from: usize,
+}
+
+#[derive(Deserialize)]
+struct VideoQuery {
+    run: String,
+    name: String,
+}
+
+/// Serves the page until the user interrupts, which is its usual end.
+///
+/// - `listening`: told the address once somebody can ask.
+///
+/// # Errors
+/// Wrong use: there is no such directory. The port is taken.
+pub fn serve(
+    plan: &Plan,
+    listening: impl FnOnce(SocketAddr) -> anyhow::Result<()>,
+) -> anyhow::Result<Outcome> {
+    let mut catalogue = Catalogue::new(plan.root)?;
+    catalogue.walk();
+    let runtime = tokio::runtime::Builder::new_current_thread()
+        .enable_all()
+        .build()
+        .context("cannot start the dashboard's runtime")?;
+    let served = runtime.block_on(async {
+        let mut interrupts = interrupts()?;
+        let address = SocketAddr::from((Ipv4Addr::LOCALHOST, plan.port));
+        let listener = TcpListener::bind(address).await.with_context(|| {
+            format!("cannot listen on {address}; choose another --port, 0 for any that is free")
+        })?;
+        listening(listener.local_addr().context("cannot tell the port")?)?;
+        let (stop, stopped) = tokio::sync::oneshot::channel::<()>();
+        let server = axum::serve(listener, router(Arc::new(Mutex::new(catalogue))))
+            .with_graceful_shutdown(async { drop(stopped.await) });
+        let mut server = std::pin::pin!(server.into_future());
+        tokio::select! {
+            ended = &mut server => return ended.context("the dashboard's server has ended"),
+            _ = interrupts.recv() => drop(stop),
+        }
+        // A connection that takes nothing may be open for ever; its end is no failure.
+        let _ = tokio::time::timeout(LAST_ANSWERS, server).await;
+        Ok(())
+    });
+    // A file that is being read is not waited for.
+    runtime.shutdown_background();
+    served.map(|()| Outcome::Done)
+}
+
+fn router(shared: Shared) -> Router {
+    let mut texts = Router::new()
+        .route("/", get(|| async { file(&page::FILES[0]) }))
+        .route("/api/runs", get(runs))
+        .route("/api/curves", get(curves))
+        .route("/api/evaluations", get(evaluations))
+        .route("/api/motion", get(motion))
+        .route("/api/videos", get(videos))
+        .route("/api/processes", get(processes))
+        .route("/api/config", get(config))
+        .route("/metrics", get(metrics));
+    for one in &page::FILES[1..] {
+        texts = texts.route(&format!("/page/{}", one.0), get(move || async move { file(one) }));
+    }
+    // A video is small already, and a player asks for parts of it.
+    let texts = texts.layer(CompressionLayer::new());
+    let all = texts.route("/video", get(video)).fallback(nothing);
+    let timeout = TimeoutLayer::with_status_code(StatusCode::SERVICE_UNAVAILABLE, REQUEST_MAX);
+    all.layer(timeout).layer(middleware::from_fn(guard)).with_state(shared)
+}
+
+/// Answers only to those who know that they ask this machine, and says how to use what it answers.
+async fn guard(request: Request, next: Next) -> Response {
+    let host = request.headers().get(header::HOST).and_then(|host| host.to_str().ok());
+    let mut response = match host {
+        Some(host) if is_own_name(host) => next.run(request).await,
+        _ => {
+            let host = host.unwrap_or("nothing");
+            let message = format!(
+                "expected a request to localhost or 127.0.0.1, got one to {host:?}; from another \
+                 machine: ssh -L 8787:127.0.0.1:PORT, then http://127.0.0.1:8787\n"
+            );
+            (StatusCode::FORBIDDEN, message).into_response()
+        }
+    };
+    response.headers_mut().extend(HEADERS);
+    response
+}
+
+/// Any port: one may have been forwarded.
+fn is_own_name(host: &str) -> bool {
+    let host = host.parse::<Authority>();
+    host.is_ok_and(|host| OWN_NAMES.iter().any(|name| host.host().eq_ignore_ascii_case(name)))
+}
+
+fn file((_, kind, content): &(&str, &'static str, &'static [u8])) -> Response {
+    ([(header::CONTENT_TYPE, *kind)], *content).into_response()
+}
+
+async fn nothing(request: Request) -> Response {
+    let message = format!("there is no {}; the page is at /", request.uri().path());
+    Refusal::Missing(message).into_response()
+}
+
+/// Reads files on a thread that may wait for them.
+async fn read<T: Send + 'static>(
+    shared: Shared,
+    work: impl FnOnce(&mut Catalogue) -> Result<T, Refusal> + Send + 'static,
+) -> Result<T, Refusal> {
+    let work = move || work(&mut shared.lock().unwrap_or_else(PoisonError::into_inner));
+    let joined = tokio::task::spawn_blocking(work).await;
+    joined.map_err(|error| Refusal::Failed(error.into()))?
+}
+
+async fn answer<T: Serialize + Send + 'static>(
+    shared: Shared,
+    work: impl FnOnce(&mut Catalogue) -> Result<T, Refusal> + Send + 'static,
+) -> Result<Json<T>, Refusal> {
+    read(shared, work).await.map(Json)
+}
+
+async fn runs(State(shared): State<Shared>) -> impl IntoResponse {
+    answer(shared, |catalogue| Ok(answers::runs(catalogue))).await
+}
+
+async fn curves(
+    State(shared): State<Shared>,
+    Query(query): Query<CurvesQuery>,
+) -> impl IntoResponse {
+    answer(shared, move |catalogue| {
+        let CurvesQuery { run, file, names, table, from } = query;
+        answers::curves(catalogue, (&run, &file), &names, (table, from))
+    })
+    .await
+}
+
+async fn evaluations(
+    State(shared): State<Shared>,
+    Query(query): Query<RunQuery>,
+) -> impl IntoResponse {
+    answer(shared, move |catalogue| answers::evaluations(catalogue, &query.run)).await
+}
+
+async fn motion(State(shared): State<Shared>, Query(query): Query<RunQuery>) -> impl IntoResponse {
+    answer(shared, move |catalogue| answers::motion(catalogue, &query.run)).await
+}
+
+async fn videos(State(shared): State<Shared>, Query(query): Query<RunQuery>) -> impl IntoResponse {
+    answer(shared, move |catalogue| answers::videos(catalogue, &query.run)).await
+}
+
+async fn processes(
+    State(shared): State<Shared>,
+    Query(query): Query<RunQuery>,
+) -> impl IntoResponse {
+    answer(shared, move |catalogue| answers::processes(catalogue, &query.run)).await
+}
+
+async fn config(State(shared): State<Shared>, Query(query): Query<RunQuery>) -> impl IntoResponse {
+    answer(shared, move |catalogue| answers::config(catalogue, &query.run)).await
+}
+
+async fn metrics(State(shared): State<Shared>) -> Result<Response, Refusal> {
+    let text = read(shared, |catalogue| Ok(prometheus::text(catalogue)?)).await?;
+    Ok(([(header::CONTENT_TYPE, prometheus::CONTENT_TYPE)], text).into_response())
+}
+
+async fn video(
+    State(shared): State<Shared>,
+    Query(query): Query<VideoQuery>,
+    request: Request,
+) -> Result<Response, Refusal> {
+    let find = move |catalogue: &mut Catalogue| answers::video(catalogue, &query.run, &query.name);
+    let path: PathBuf = read(shared, find).await?;
+    // Parts of it, too, as players ask for them.
+    let served = ServeFile::new(&path).try_call(request).await;
+    let served = served.with_context(|| format!("cannot read {}", path.display()))?;
+    Ok(served.into_response())
+}
+
+impl IntoResponse for Refusal {
+    fn into_response(self) -> Response {
+        let (status, message) = match self {
+            Self::Missing(message) => (StatusCode::NOT_FOUND, message),
+            Self::Senseless(message) => (StatusCode::BAD_REQUEST, message),
+            Self::Failed(error) => (StatusCode::INTERNAL_SERVER_ERROR, format!("{error:#}")),
+        };
+        (status, Json(json!({ "error": message }))).into_response()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn only_names_of_this_machine_are_its_own() {
+        for own in ["localhost", "127.0.0.1:8787", "LOCALHOST:1", "[::1]:8787"] {
+            assert!(is_own_name(own), "{own}");
+        }
+        for foreign in ["", "evil.example:8787", "localhost.evil.example", "0.0.0.0", "a b"] {
+            assert!(!is_own_name(foreign), "{foreign}");
+        }
+    }
+}

@@ -1,0 +1,316 @@
+//! One run as the dashboard knows it: what is read once, and what is read on.
+
+use std::os::unix::fs::MetadataExt;
+use std::path::Path;
+use std::sync::atomic::{AtomicU64, Ordering};
+use std::time::{Duration, Instant};
+
+use serde::Serialize;
+use serde_json::Value;
+
+use super::table::{Curve, Table};
+use super::tail::Tail;
+use crate::control::EvaluationRow;
+use crate::report::method_label;
+use crate::run_directory::RunDirectory;
+
+/// A run whose supervisor is not to be found here is trained somewhere else if its metrics have
+/// grown within this time, as the dashboard saw it.
+const GROWS_WITHIN: Duration = Duration::from_secs(60);
+/// Tables that nobody has asked for are forgotten after this time.
+const TABLE_KEPT: Duration = Duration::from_secs(300);
+/// Points of a curve: no screen shows more side by side.
+const POINTS_MAX: usize = 1_000;
+
+/// What a run is; changes with its files only.
+#[derive(Debug, Clone, Default, Serialize)]
+pub struct Facts {
+    pub task: String,
+    /// As a report calls it: `TD3-DMP`.
+    pub method: String,
+    pub algorithm: String,
+    pub policy: String,
+    pub seed: u64,
+    /// Environment steps that it was asked for.
+    pub steps: u64,
+    /// UTC, RFC 3339, of its first session.
+    pub started: String,
+    until_return: f64,
+    until_success: f64,
+}
+
+/// Where a run stands.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
+#[serde(rename_all = "snake_case")]
+pub enum State {
+    Training,
+    Finished,
+    Stopped,
+}
+
+/// Which file of rows.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Rows {
+    Metrics,
+    Evaluations,
+}
+
+/// New points of curves.
+#[derive(Debug, Serialize)]
+pub struct Curves {
+    /// Names the table that `next` is about; another means that everything is sent anew.
+    pub table: u64,
+    /// Row to ask from the next time.
+    pub next: usize,
+    /// In the order asked for.
+    pub curves: Vec<Curve>,
+}
+
+#[derive(Debug)]
+struct Growing {
+    number: u64,
+    tail: Tail,
+    table: Table,
+    asked: Instant,
+}
+
+/// Inode and length: every file of a run is appended to or replaced by another.
+type Stamp = (u64, u64);
+
+/// A run that is looked at.
+#[derive(Debug)]
+pub struct Watched {
+    pub directory: RunDirectory,
+    pub facts: Facts,
+    /// Why its files cannot be used.
+    pub fault: Option<String>,
+    /// The last line of `metrics.jsonl`.
+    pub last: Value,
+    /// Newest last, of all evaluations.
+    pub evaluations: Vec<EvaluationRow>,
+    pub state: State,
+    facts_stamp: [Stamp; 2],
+    metrics_stamp: Stamp,
+    evaluations_stamp: Stamp,
+    grown: Option<Instant>,
+    /// The supervisor that was last seen alive on this machine.
+    seen_here: Option<u32>,
+    tables: [Option<Growing>; 2],
+}
+
+impl Watched {
+    /// A run of which nothing has been read.
+    pub fn new(directory: RunDirectory) -> Self {
+        Self {
+            directory,
+            facts: Facts::default(),
+            fault: None,
+            last: Value::Null,
+            evaluations: Vec::new(),
+            state: State::Stopped,
+            facts_stamp: [(0, 0); 2],
+            metrics_stamp: (0, 0),
+            evaluations_stamp: (0, 0),
+            grown: None,
+            seen_here: None,
+            tables: [None, None],
+        }
+    }
+
+    /// Reads what has changed. A run that cannot be read says so, and the others are shown.
+    pub fn refresh(&mut self) {
+        self.fault = self.read_changes().err().map(|error| format!("{error:#}"));
+        self.state = self.state_now();
+        for table in &mut self.tables {
+            if table.as_ref().is_some_and(|table| table.asked.elapsed() > TABLE_KEPT) {
+                *table = None;
+            }
+        }
+    }
+
+    fn read_changes(&mut self) -> anyhow::Result<()> {
+        let path = self.directory.path();
+        let facts = ["config.toml", "manifest.json"].map(|name| stamp(&path.join(name)));
+        if facts != self.facts_stamp {
+            self.facts = read_facts(&self.directory)?;
+            self.facts_stamp = facts;
+        }
+        let metrics = stamp(&self.directory.metrics_path());
+        if metrics != self.metrics_stamp {
+            self.last = self.directory.last_metrics()?.unwrap_or_default();
+            // What was there at the first look says nothing about now.
+            self.grown = (self.metrics_stamp != (0, 0)).then(Instant::now);
+            self.metrics_stamp = metrics;
+        }
+        let evaluations = stamp(&self.directory.evaluations_path());
+        if evaluations != self.evaluations_stamp {
+            self.evaluations = self.directory.evaluations()?;
+            self.evaluations_stamp = evaluations;
+        }
+        Ok(())
+    }
+
+    fn state_now(&mut self) -> State {
+        let holder = self.directory.lock_holder();
+        let here = self.directory.is_trained_here();
+        if here {
+            self.seen_here = holder;
+        }
+        let reached = self.evaluations.last().is_some_and(|row| {
+            row.env_steps >= self.facts.steps
+                || row.return_mean >= self.facts.until_return
+                || row.success_rate.is_some_and(|rate| rate >= self.facts.until_success)
+        });
+        let grows = self.grown.is_some_and(|grown| grown.elapsed() < GROWS_WITHIN);
+        // Who was seen here and is not any more has died, and trains nowhere else.
+        let elsewhere = grows && holder != self.seen_here && self.has_not_ended();
+        match (here, reached) {
+            (true, _) => State::Training,
+            (false, true) => State::Finished,
+            (false, false) if elsewhere => State::Training,
+            (false, false) => State::Stopped,
+        }
+    }
+
+    /// Whether its files do not say that its session has ended.
+    fn has_not_ended(&self) -> bool {
+        !matches!(self.directory.processes(), Ok(Some(processes)) if processes.ended)
+    }
+
+    /// What is new of curves since row `from` of the table with number `table`.
+    ///
+    /// # Errors
+    /// The file cannot be read, or a whole line is no JSON.
+    pub fn curves(
+        &mut self,
+        rows: Rows,
+        names: &[&str],
+        (table, from): (u64, usize),
+    ) -> anyhow::Result<Curves> {
+        let path = match rows {
+            Rows::Metrics => self.directory.metrics_path(),
+            Rows::Evaluations => self.directory.evaluations_path(),
+        };
+        let growing = self.tables[rows as usize].get_or_insert_with(|| Growing::new(&path));
+        growing.read_on(&path)?;
+        growing.asked = Instant::now();
+        let from = if table == growing.number { from } else { 0 };
+        let curve = |name: &&str| growing.table.curve(name, from, POINTS_MAX);
+        let curves = names.iter().map(curve).collect();
+        Ok(Curves { table: growing.number, next: growing.table.rows(), curves })
+    }
+}
+
+impl Growing {
+    fn new(path: &Path) -> Self {
+        Self {
+            number: next_number(),
+            tail: Tail::new(path),
+            table: Table::default(),
+            asked: Instant::now(),
+        }
+    }
+
+    fn read_on(&mut self, path: &Path) -> anyhow::Result<()> {
+        loop {
+            let look = self.tail.look()?;
+            if look.begun_again {
+                (self.number, self.table) = (next_number(), Table::default());
+            }
+            for line in look.lines.split(|&byte| byte == b'\n').filter(|line| !line.is_empty()) {
+                let row: Value = serde_json::from_slice(line).map_err(|error| {
+                    anyhow::anyhow!("{}: a line is no JSON: {error}", path.display())
+                })?;
+                if self.table.push(&row) {
+                    self.number = next_number();
+                }
+            }
+            if !look.more {
+                return Ok(());
+            }
+        }
+    }
+}
+
+/// No two tables of this process have the same.
+fn next_number() -> u64 {
+    static NUMBER: AtomicU64 = AtomicU64::new(1);
+    NUMBER.fetch_add(1, Ordering::Relaxed)
+}
+
+fn stamp(path: &Path) -> Stamp {
+    std::fs::metadata(path).map_or((0, 0), |metadata| (metadata.ino(), metadata.len()))
+}
+
+fn read_facts(directory: &RunDirectory) -> anyhow::Result<Facts> {
+    let (config, manifest) = (directory.config()?, directory.manifest()?);
+    let name = |name: &dyn std::fmt::Debug| format!("{name:?}").to_lowercase();
+    Ok(Facts {
+        method: method_label(&config, manifest.preset()),
+        algorithm: name(&config.algorithm.name),
+        policy: name(&config.policy.kind),
+        seed: config.run.seed,
+        steps: config.run.steps,
+        started: manifest.sessions.first().map(|first| first.started.clone()).unwrap_or_default(),
+        until_return: config.run.until_return,
+        until_success: config.run.until_success,
+        task: config.task.name,
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use std::fs;
+
+    use super::*;
+    use crate::run_directory::Manifest;
+
+    fn run(folder: &Path) -> RunDirectory {
+        let manifest = Manifest::new(None).unwrap();
+        RunDirectory::create(&folder.join("run"), &Default::default(), &manifest).unwrap()
+    }
+
+    fn steps(curves: &Curves) -> &[f64] {
+        &curves.curves[0].env_steps
+    }
+
+    /// A resume forgets what its checkpoint has not seen; a page that kept those points would draw
+    /// the curve twice.
+    #[test]
+    fn after_a_resume_has_cut_the_rows_a_curve_is_sent_anew() {
+        let folder = tempfile::tempdir().unwrap();
+        let directory = run(folder.path());
+        let row =
+            |steps: u32| format!("{{\"env_steps\":{steps},\"wall_s\":1.5,\"loss\":{steps}}}\n");
+        let rows = |steps: &[u32]| steps.iter().map(|steps| row(*steps)).collect::<String>();
+        fs::write(directory.metrics_path(), rows(&[1, 2, 3])).unwrap();
+        let mut watched = Watched::new(directory.clone());
+        let mut look = |since| watched.curves(Rows::Metrics, &["loss"], since).unwrap();
+        let first = look((0, 0));
+        assert_eq!(steps(&first), [1.0, 2.0, 3.0]);
+        let since = (first.table, first.next);
+        assert_eq!(steps(&look(since)), [0.0; 0]);
+        directory.rewind(2).unwrap();
+        let text = fs::read_to_string(directory.metrics_path()).unwrap();
+        fs::write(directory.metrics_path(), text + &rows(&[4, 5, 6])).unwrap();
+        let anew = look(since);
+        assert_ne!(anew.table, first.table);
+        assert_eq!(steps(&anew), [1.0, 2.0, 4.0, 5.0, 6.0]);
+    }
+
+    #[test]
+    fn a_run_that_cannot_be_read_says_so_until_it_can() {
+        let folder = tempfile::tempdir().unwrap();
+        let directory = run(folder.path());
+        let mut watched = Watched::new(directory.clone());
+        watched.refresh();
+        assert_eq!((watched.fault.as_deref(), watched.state), (None, State::Stopped));
+        let config = fs::read(directory.path().join("config.toml")).unwrap();
+        fs::write(directory.path().join("config.toml"), "no TOML").unwrap();
+        watched.refresh();
+        assert!(watched.fault.as_ref().is_some_and(|fault| fault.contains("config.toml")));
+        fs::write(directory.path().join("config.toml"), config).unwrap();
+        watched.refresh();
+        assert_eq!(watched.fault, None);
+    }
+}
