@@ -117,21 +117,10 @@ impl Browser {
         });
     }
 
-    /// Presses the button of the mouse in the middle of an element, as a user does.
+    /// Clicks an element, wherever it is: a page that is still being filled moves, and a press of
+    /// the mouse at a place that was right a moment ago would miss.
     pub fn click(&self, selector: &str) {
-        let place = self.evaluate(&format!(
-            "(() => {{ const found = document.querySelector({selector:?}); \
-             found.scrollIntoView({{block: 'center'}}); \
-             const {{x, y, width, height}} = found.getBoundingClientRect(); \
-             return [x + width / 2, y + height / 2]; }})()"
-        ));
-        for kind in ["mousePressed", "mouseReleased"] {
-            self.call(
-                "Input.dispatchMouseEvent",
-                json!({"type": kind, "x": place[0], "y": place[1], "button": "left",
-                       "clickCount": 1}),
-            );
-        }
+        self.evaluate(&format!("document.querySelector({selector:?}).click()"));
     }
 
     /// Makes the page as wide as this many CSS pixels, on a phone or not.
