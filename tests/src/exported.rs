@@ -1,6 +1,11 @@
 //! Exported policies of every kind, and what Rust's runtime makes of a thousand observations: what
 //! other runtimes are held to.
 
+#![allow(
+    clippy::unwrap_used,
+    reason = "helpers of tests; clippy.toml covers only the tests themselves"
+)]
+
 use std::fs;
 use std::path::{Path, PathBuf};
 
