@@ -186,6 +186,8 @@ fn joining_and_leaving_all_the_time_leaks_nothing() {
         running.until("its end is noticed", gone);
         if before.is_none() {
             until_learned_from_own(&mut running, &run);
+            // Which stays open from the first line of metrics on.
+            running.until("its event file", |_| Path::new(&run).join("tensorboard").is_dir());
             before = Some(held(&place, &run));
         }
     }
