@@ -166,9 +166,9 @@ class DmpHead:
             for d, source in enumerate(self._sources):
                 yd0[:, d] = observations[:, source["velocity"]] * self._velocity_scale
                 if "cos" in source:
-                    y0[:, d] = np.arctan2(
-                        observations[:, source["sin"]], observations[:, source["cos"]]
-                    )
+                    # -0 counts as 0: it would lead to the other side.
+                    sin, cos = observations[:, source["sin"]], observations[:, source["cos"]]
+                    y0[:, d] = np.arctan2(sin + 0.0, cos + 0.0)
                 else:
                     scale = np.float32(source["scale"])
                     y0[:, d] = scale * observations[:, source["index"]]

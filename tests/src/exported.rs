@@ -21,6 +21,9 @@ use dmprl_shared::spec::EnvSpec;
 /// Observations of each policy.
 pub const OBSERVATIONS: usize = 1_000;
 
+/// Where an angle changes sides.
+const CORNERS: [f64; 4] = [0.0, -0.0, 1.0, -1.0];
+
 type Keys = &'static [(&'static str, &'static str)];
 
 /// A name, a task, and what differs from its defaults.
@@ -70,8 +73,14 @@ pub fn write(folder: &Path) {
         let mut runtime = PolicyRuntime::load(&file).unwrap();
         let len = runtime.spec().observation_len;
         // Numbers that f32 holds, so that each runtime is given the same.
-        let observations: Vec<f64> =
+        let mut observations: Vec<f64> =
             (0..OBSERVATIONS * len).map(|i| f64::from(1.5 * (i as f32 * 1.7).sin())).collect();
+        // Zeros of both signs, in every combination with what is not zero.
+        for (row, observation) in observations.chunks_mut(len).take(4 * CORNERS.len()).enumerate() {
+            for (i, value) in observation.iter_mut().enumerate() {
+                *value = CORNERS[(row + i * (1 + row / CORNERS.len())) % CORNERS.len()];
+            }
+        }
         let mut segments = Vec::new();
         for observation in observations.chunks(len) {
             segments.extend_from_slice(runtime.segment(observation).unwrap());

@@ -3,28 +3,17 @@
 use std::collections::BTreeMap;
 
 use dmprl_shared::config::ExperimentConfig;
-use toml::Value;
+use toml::Table;
+
+use crate::sweep::flatten;
 
 /// Every key as `section.key`, with its value as a file would have it.
 ///
 /// # Errors
 /// None is known: a configuration that was read can be written.
 pub fn flat(config: &ExperimentConfig) -> anyhow::Result<BTreeMap<String, String>> {
-    let mut keys = BTreeMap::new();
-    add(String::new(), &Value::try_from(config)?, &mut keys);
-    Ok(keys)
-}
-
-fn add(name: String, value: &Value, keys: &mut BTreeMap<String, String>) {
-    match value {
-        Value::Table(table) => {
-            for (key, value) in table {
-                let name = if name.is_empty() { key.clone() } else { format!("{name}.{key}") };
-                add(name, value, keys);
-            }
-        }
-        other => drop(keys.insert(name, other.to_string())),
-    }
+    let keys = flatten(&Table::try_from(config)?);
+    Ok(keys.into_iter().map(|(key, value)| (key, value.to_string())).collect())
 }
 
 #[cfg(test)]

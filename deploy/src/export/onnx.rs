@@ -20,8 +20,6 @@ use super::onnx_format::{ModelProto, OperatorSetIdProto, StringStringEntryProto}
 /// Version 17 of the operators and 8 of the format, of 2022: every runtime in use reads them.
 const OPERATORS: i64 = 17;
 const IR_VERSION: i64 = 8;
-/// Of (y0, yd0, g).
-const STATE_INPUTS: usize = 3;
 
 /// The policy as the bytes of an ONNX file.
 ///
@@ -142,7 +140,7 @@ impl<'a> PolicyGraph<'a> {
             weights = graph.op("Mul", &[&weights, &way]);
         }
         let inputs = graph.concat(&[&start.y, &start.yd, &goal, &weights], 2);
-        let (rows, columns) = (map.sample_count(), STATE_INPUTS + basis_count);
+        let (rows, columns) = (map.sample_count(), map.input_count());
         let transposed: Vec<f32> =
             (0..columns * rows).map(|at| map.matrix()[(at % rows) * columns + at / rows]).collect();
         let transposed = graph.constant(&[columns, rows], &transposed);
@@ -286,6 +284,11 @@ fn angle(graph: &mut Graph, sin: &str, cos: &str) -> String {
     let zero = graph.scalar(0.0);
     let [pi, minus_pi] = [std::f32::consts::PI, -std::f32::consts::PI].map(|pi| graph.scalar(pi));
     let one = graph.scalar(1.0);
+    // -0 counts as 0: it would lead to the other side. Runtimes leave out what adds 0.
+    let [sin, cos] = &[sin, cos].map(|part| {
+        let none = graph.op("Equal", &[part, &zero]);
+        graph.op("Where", &[&none, &zero, part])
+    });
     let no_way = graph.op("Equal", &[cos, &zero]);
     let no_height = graph.op("Equal", &[sin, &zero]);
     let nowhere = graph.op("And", &[&no_way, &no_height]);

@@ -3,8 +3,9 @@
 use std::time::{Duration, Instant};
 
 use super::Process;
-use super::supervisor::{Running, Slot, Supervisor};
+use super::supervisor::{Slot, Supervisor};
 use crate::control::Doing;
+use crate::run_directory::ProcessState;
 use crate::terminal::ProcessLine;
 
 /// Between two redraws; a worker gives a sign of life a second, so that each is an occasion.
@@ -25,39 +26,39 @@ impl Supervisor {
     pub(super) fn overview(&self, now: Instant) -> Vec<ProcessLine> {
         let line = |(process, slot): (&Process, &Slot)| ProcessLine {
             name: process.to_string(),
-            state: match &slot.running {
-                Some(running) => self.state(*process, running),
-                None => absent(slot, now),
-            },
+            state: self.in_words(*process, slot, now),
             restarts: slot.starts.saturating_sub(1),
         };
         self.slots.iter().map(line).collect()
     }
 
-    fn state(&self, process: Process, running: &Running) -> String {
-        if running.killed_for.is_some() {
+    fn in_words(&self, process: Process, slot: &Slot, now: Instant) -> String {
+        let running = slot.running.as_ref();
+        if running.is_some_and(|running| running.killed_for.is_some()) {
             return "killed, to be replaced".into();
         }
-        let state = match process {
-            _ if !running.ready => "starting",
-            Process::Learner => "learning",
-            Process::Evaluator if self.evaluations.deadline().is_some() => "evaluating",
-            Process::Evaluator => "waiting for the next evaluation",
-            Process::Actor(_) if !running.attached => "waiting for the learner",
-            // Its first sign of life is still to come.
-            Process::Actor(_) => running.doing.unwrap_or(Doing::Attaching).name(),
+        let attached = running.is_some_and(|running| running.attached);
+        let words = match (self.process_state(slot), process) {
+            (ProcessState::Starting, _) => "starting",
+            (ProcessState::Gone, _) => "ended",
+            (ProcessState::Restarting, _) => {
+                let wait = slot.restart_at.map(|at| at.saturating_duration_since(now));
+                let seconds = wait.unwrap_or_default().as_secs_f64().ceil();
+                return format!("dead, starts again in {seconds:.0} s");
+            }
+            (ProcessState::Running, Process::Learner) => "learning",
+            (ProcessState::Running, Process::Evaluator) => match self.evaluations.deadline() {
+                Some(_) => "evaluating",
+                None => "waiting for the next evaluation",
+            },
+            (ProcessState::Running, Process::Actor(_)) if !attached => "waiting for the learner",
+            (ProcessState::Running, Process::Actor(_)) => {
+                // Its first sign of life is still to come.
+                let doing = running.and_then(|running| running.doing);
+                doing.unwrap_or(Doing::Attaching).name()
+            }
         };
-        state.to_owned()
-    }
-}
-
-fn absent(slot: &Slot, now: Instant) -> String {
-    match slot.restart_at {
-        Some(at) => {
-            let seconds = at.saturating_duration_since(now).as_secs_f64().ceil();
-            format!("dead, starts again in {seconds:.0} s")
-        }
-        None => "ended".into(),
+        words.to_owned()
     }
 }
 

@@ -35,19 +35,24 @@ impl Supervisor {
         }
     }
 
+    /// Where a child is in its life.
+    pub(super) fn process_state(&self, slot: &Slot) -> ProcessState {
+        let again = slot.restart_at.is_some() && !matches!(self.phase, Phase::Stopping { .. });
+        match &slot.running {
+            Some(Running { ready: true, .. }) => ProcessState::Running,
+            Some(_) => ProcessState::Starting,
+            None if again => ProcessState::Restarting,
+            None => ProcessState::Gone,
+        }
+    }
+
     fn row(&self, process: Process, slot: &Slot) -> ProcessRow {
         let running = slot.running.as_ref();
-        let again = slot.restart_at.is_some() && !matches!(self.phase, Phase::Stopping { .. });
         let usage = running.and_then(|running| running.child.id()).map(usage).unwrap_or_default();
         ProcessRow {
             name: process.to_string(),
             joined: self.is_joined(process),
-            state: match running {
-                Some(Running { ready: true, .. }) => ProcessState::Running,
-                Some(_) => ProcessState::Starting,
-                None if again => ProcessState::Restarting,
-                None => ProcessState::Gone,
-            },
+            state: self.process_state(slot),
             doing: running.and_then(|running| running.doing),
             kept_segments: running.map_or(0, |running| running.kept),
             acknowledged_segments: slot.sent.acked,

@@ -1,5 +1,6 @@
 //! The runs that a report is made of.
 
+use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
 use anyhow::Context;
@@ -10,7 +11,7 @@ use crate::failure::wrong_use;
 use crate::motion::Motion;
 use crate::run_directory::{Machine, Manifest, RunDirectory, Session};
 use crate::sweep::search::found;
-use crate::sweep::{Ledger, Plan, SweepFile};
+use crate::sweep::{Ledger, Plan, SweepFile, flatten};
 use crate::terminal::binary_bytes;
 
 /// Of a commit's hash, enough to find it.
@@ -185,17 +186,44 @@ impl Results {
         Ok(())
     }
 
+    /// The label, with the first value that differs where another run of the task has it and learns
+    /// otherwise: whatever they were begun with, they are no seeds of one method.
+    fn own_label(&self, label: String, config: &ExperimentConfig) -> anyhow::Result<String> {
+        let own = learning(config)?;
+        for other in self.of(&config.task.name, &label) {
+            let others = learning(&RunDirectory::open(&other.path)?.config()?)?;
+            if let Some((key, value)) =
+                own.iter().find(|(key, value)| others.get(*key) != Some(value))
+            {
+                return Ok(format!("{label}, {key}={value}"));
+            }
+        }
+        Ok(label)
+    }
+
     fn add_run(&mut self, path: &Path) -> anyhow::Result<()> {
         let directory = RunDirectory::open(path)?;
         let config = directory.config()?;
         let manifest = directory.manifest()?;
-        let run = run(&directory, &config, label(&config, manifest.preset()))?;
+        let label = self.own_label(label(&config, manifest.preset()), &config)?;
+        let run = run(&directory, &config, label)?;
         add_new(&mut self.tasks, &run.task);
         add_new(&mut self.methods, &run.method);
         self.planned += 1;
         self.runs.push(run);
         Ok(())
     }
+}
+
+/// What is learned, and how: runs that differ in nothing else are seeds of one method.
+const LEARNING: [&str; 7] =
+    ["policy", "dmp", "algorithm", "exploration", "replay", "demonstrations", "pacing"];
+
+/// Every key that says what is learned and how, with its value.
+fn learning(config: &ExperimentConfig) -> anyhow::Result<BTreeMap<String, toml::Value>> {
+    let mut table = toml::Table::try_from(config).context("cannot compare configurations")?;
+    table.retain(|section, _| LEARNING.contains(&section));
+    Ok(flatten(&table).into_iter().collect())
 }
 
 fn add_new(names: &mut Vec<String>, name: &str) {

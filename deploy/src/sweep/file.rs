@@ -107,7 +107,7 @@ impl SweepFile {
 
 /// The leaves of a tree of tables with their dotted keys: `[set.algorithm] batch_size = 64` and
 /// `"algorithm.batch_size" = 64` say the same.
-pub(super) fn flatten(table: &Table) -> Vec<(String, Value)> {
+pub(crate) fn flatten(table: &Table) -> Vec<(String, Value)> {
     let mut leaves = Vec::new();
     for (key, value) in table {
         match value {

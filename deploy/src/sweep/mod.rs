@@ -19,6 +19,7 @@ mod runner;
 pub mod search;
 
 pub use file::SweepFile;
+pub(crate) use file::flatten;
 pub use ledger::{End, Finished, Ledger};
 pub use plan::{Plan, PlannedRun};
 pub use run::{RunState, Site};

@@ -52,7 +52,8 @@ impl StartState {
             Self::Carry { at } => (observation[at + d], observation[at + dims + d]),
             Self::Observed { sources, velocity_scale } => match &sources[d] {
                 StartSource::Angle { cos, sin, velocity } => {
-                    let angle = observation[*sin].atan2(observation[*cos]);
+                    // -0 counts as 0: it would lead to the other side.
+                    let angle = (observation[*sin] + 0.0).atan2(observation[*cos] + 0.0);
                     (angle, observation[*velocity] * velocity_scale)
                 }
                 StartSource::Value { index, velocity, scale } => {

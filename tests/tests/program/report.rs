@@ -98,6 +98,17 @@ fn runs_of_another_preset_have_a_column_of_their_own() {
     });
     let json = place.run(&["report", &runs[0], &runs[1], "--no-motion", "--json"]).json();
     assert_eq!(json["methods"], serde_json::json!(["DDPG-DMP", "DDPG-DMP (paper)"]));
+    // However it was said: another seed is one of the method's, another value another method.
+    let [seed, value] =
+        [("seed", "run.seed=3"), ("value", "dmp.alpha_y=9.0")].map(|(name, set)| {
+            let run = place.path(name);
+            let more = ["--algo", "ddpg", "--steps", "500", "--set", set];
+            place.run(&train("reacher", &run, &more)).with_status(0);
+            run
+        });
+    let runs = ["report", &runs[0], &seed, &value, "--no-motion", "--json"];
+    let json = place.run(&runs).with_status(0).json();
+    assert_eq!(json["methods"], serde_json::json!(["DDPG-DMP", "DDPG-DMP, dmp.alpha_y=9.0"]));
 }
 
 #[test]

@@ -1,0 +1,66 @@
+//! Next to a robot nothing is allocated: a control step takes as long as it takes.
+
+#![allow(clippy::unwrap_used, reason = "a test's helpers fail the test")]
+
+use std::alloc::{GlobalAlloc, Layout, System};
+use std::sync::atomic::{AtomicU64, Ordering};
+
+use dmprl_shared::config::Layers;
+use dmprl_shared::policy::Policy;
+use dmprl_shared::runtime::PolicyRuntime;
+use dmprl_shared::seeds;
+use dmprl_shared::spec::EnvSpec;
+
+struct Counting;
+
+static ALLOCATIONS: AtomicU64 = AtomicU64::new(0);
+
+// SAFETY: all work is the system allocator's; the counter does not touch the memory.
+unsafe impl GlobalAlloc for Counting {
+    unsafe fn alloc(&self, layout: Layout) -> *mut u8 {
+        ALLOCATIONS.fetch_add(1, Ordering::Relaxed);
+        // SAFETY: the caller's promise is passed on.
+        unsafe { System.alloc(layout) }
+    }
+
+    unsafe fn dealloc(&self, pointer: *mut u8, layout: Layout) {
+        // SAFETY: the caller's promise is passed on.
+        unsafe { System.dealloc(pointer, layout) }
+    }
+}
+
+#[global_allocator]
+static ALLOCATOR: Counting = Counting;
+
+/// Alone in its binary: the counter sees every thread.
+#[test]
+fn decisions_steps_and_holds_allocate_nothing() {
+    let spec = EnvSpec {
+        id: "Test-v0".into(),
+        observation_len: 4,
+        action_len: 2,
+        action_low: vec![-1.0; 2],
+        action_high: vec![1.0; 2],
+        control_dt_s: 0.05,
+        episode_steps: 50,
+        observation_names: Vec::new(),
+    };
+    for keys in [&[][..], &[("policy.kind", "mlp")], &[("policy.start", "carry")]] {
+        let mut layers = Layers::new();
+        keys.iter().for_each(|(key, value)| layers.set("test", key, value).unwrap());
+        let policy = Policy::new(&layers.finish().unwrap(), &spec).unwrap();
+        let parameters = policy.initial_parameters(&mut seeds::stream(1, "test", 0));
+        let mut runtime = PolicyRuntime::new(policy, &parameters);
+        let observation = [0.1, -0.2, 0.3, -0.4];
+        // gemm makes its buffers at its first product.
+        runtime.segment(&observation).unwrap();
+        let before = ALLOCATIONS.load(Ordering::Relaxed);
+        for step in 0..100 {
+            runtime.segment(&observation).unwrap();
+            runtime.action((step % 3 > 0).then_some(&observation[..])).unwrap();
+            runtime.hold();
+            runtime.reset(None).unwrap();
+        }
+        assert_eq!(ALLOCATIONS.load(Ordering::Relaxed), before, "{keys:?}");
+    }
+}
