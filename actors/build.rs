@@ -83,7 +83,9 @@ print(sysconfig.get_config_var('Py_ENABLE_SHARED') or 0)";
         let is_system =
             ["/lib", "/usr/lib"].iter().any(|dir| Path::new(library_dir).starts_with(dir));
         let tags = if is_system { "--enable-new-dtags" } else { "--disable-new-dtags" };
-        format!("-Wl,{tags},-rpath,{library_dir}")
+        // Last, the library beside a program that was brought to another machine: a conda
+        // environment has its own.
+        format!("-Wl,{tags},-rpath,{library_dir}:$ORIGIN/../lib")
     }
 
     fn check_library(facts: &Facts, library_dir: &str, library: &str, version: &str) {

@@ -6,19 +6,20 @@ use std::process::{Command, Stdio};
 /// Ancestors searched for the project when the build's own folder is gone.
 const ANCESTORS_MAX: usize = 16;
 
-/// The folder that holds `envs_py/`: the one this program was built from, or one above the
-/// current directory.
+/// The folder that holds `envs_py/`: the one this program was built from, the one it lies in, as
+/// in a released archive, or one above the current directory.
 ///
 /// # Errors
 /// Neither is there any more.
 pub fn root() -> anyhow::Result<PathBuf> {
     let built_from = Path::new(env!("CARGO_MANIFEST_DIR")).parent().map(Path::to_owned);
+    let beside = std::env::current_exe().ok().and_then(|file| file.parent().map(Path::to_owned));
     let here = std::env::current_dir().unwrap_or_default();
     let above = here.ancestors().take(ANCESTORS_MAX).map(Path::to_owned);
-    built_from.into_iter().chain(above).find(|path| is_root(path)).ok_or_else(|| {
+    built_from.into_iter().chain(beside).chain(above).find(|path| is_root(path)).ok_or_else(|| {
         anyhow::anyhow!(
-            "cannot find the project's Python package (envs_py); run dmprl inside a clone of the \
-             project"
+            "cannot find the project's Python package; run dmprl inside a clone of the project, or \
+             install it into a virtual environment (pip install ., in a clone)"
         )
     })
 }

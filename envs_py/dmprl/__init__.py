@@ -28,13 +28,14 @@ from typing import TYPE_CHECKING, Any
 
 from dmprl.policy import Policy
 from dmprl.policy_file import PolicyFileError
+from dmprl.program import ProgramError
 from dmprl.run import Run
 from dmprl.training import TrainingError, train
 
 if TYPE_CHECKING:
     import gymnasium
 
-__all__ = ["Policy", "PolicyFileError", "Run", "TrainingError", "make", "train"]
+__all__ = ["Policy", "PolicyFileError", "ProgramError", "Run", "TrainingError", "make", "train"]
 __version__ = "0.1.0"
 
 SHORT_NAMES = {

@@ -69,6 +69,13 @@ class Policy:
         except (AttributeError, IndexError, KeyError, TypeError, ValueError) as error:
             raise PolicyFileError(f"{path}: its parts do not fit: {error!r}") from error
 
+    def __repr__(self) -> str:
+        spec, every = self.spec, self.spec["control_dt_s"]
+        return (
+            f"<Policy for {spec['id']}: {spec['observation_len']} numbers observed, "
+            f"{self.segment_steps} actions of {self.low.size} decided, one every {every:g} s>"
+        )
+
     @property
     def is_holding(self) -> bool:
         """Whether the last action was the hold: observations had stopped, or it was asked for."""

@@ -6,6 +6,7 @@
     frame = run.evaluations()  # pandas; run.evaluations("polars")
     frame.plot(x="env_steps", y="return_mean")
     policy = run.policy()
+    video = run.record(episodes=3)
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ import tomllib
 from pathlib import Path
 from typing import Any
 
+from dmprl import program
 from dmprl.policy import Policy
 from dmprl.policy_file import PolicyFileError
 
@@ -77,6 +79,17 @@ class Run:
         if not file.is_file():
             raise PolicyFileError(f"{self.path} has not kept policy {version}")
         return Policy.load(file)
+
+    def record(self, *, quiet: bool = True, **flags: Any) -> Path:
+        """Makes a video of a policy's episodes, headless; the MP4, a GIF and a strip are beside it.
+
+        :param quiet: says nothing while it works.
+        :param flags: those of ``dmprl record``: ``episodes=3``, ``seed=7``, ``policy="latest"``,
+            ``compare=...`` another run, ``output=...`` a folder instead of ``videos`` in the run.
+        :raises dmprl.ProgramError: it cannot be made; the message says why.
+        """
+        arguments = [str(self.path), "--json", *program.flags(flags)]
+        return Path(json.loads(program.call("record", *arguments, quiet=quiet))["mp4"])
 
     def _lines(self, name: str) -> list[dict[str, Any]]:
         """The whole lines of a file; one that is being written comes the next time."""

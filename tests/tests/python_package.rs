@@ -8,6 +8,10 @@
 use std::process::Command;
 
 use dmprl_tests::{project_root, venv};
+use toml::Table;
+
+/// Of the package alone.
+const ONLY_FOR_TESTS: &str = "test";
 
 #[test]
 fn unit_tests_of_the_python_package_pass() {
@@ -19,4 +23,22 @@ fn unit_tests_of_the_python_package_pass() {
     let report = String::from_utf8_lossy(&output.stderr);
     assert!(output.status.success(), "{report}");
     assert!(!report.contains("Ran 0 tests"), "{report}");
+}
+
+#[test]
+fn package_alone_and_with_the_program_ask_for_the_same() {
+    let project = |manifest: &str| {
+        let text = std::fs::read_to_string(project_root().join(manifest)).unwrap();
+        let manifest: Table = text.parse().unwrap();
+        let mut project = manifest["project"].as_table().unwrap().clone();
+        for of_its_own in ["description", "readme", "license-files"] {
+            project.remove(of_its_own);
+        }
+        let extras = project.get_mut("optional-dependencies").unwrap().as_table_mut().unwrap();
+        extras.remove(ONLY_FOR_TESTS);
+        project
+    };
+    let package = project("envs_py/pyproject.toml");
+    assert_eq!(project("pyproject.toml"), package);
+    assert_eq!(package["version"].as_str().unwrap(), env!("CARGO_PKG_VERSION"));
 }

@@ -13,7 +13,7 @@ use std::{
     thread,
 };
 
-use dmprl::python_setup::{PythonEnvironment, ensure, ensure_extra};
+use dmprl::python_setup::{Home, PythonEnvironment, ensure, ensure_extra};
 
 const MANIFEST: &str = "\
 [build-system]
@@ -143,7 +143,8 @@ fn an_extra_is_installed_when_it_is_asked_for_and_once() {
     let lines = Mutex::new(Vec::new());
     let asked = |extra: &str| {
         lines.lock().unwrap().clear();
-        ensure_extra(project.path(), extra, &|line| lines.lock().unwrap().push(line.to_owned()))
+        let home = Home::Clone(project.path().to_owned());
+        ensure_extra(&home, extra, &|line| lines.lock().unwrap().push(line.to_owned()))
     };
     let environment = asked("search").unwrap();
     let imports_other = || {

@@ -10,7 +10,7 @@ use std::{
 
 use pyo3::{ffi, prelude::*, types::PyDict};
 
-use super::{LINKED_PYTHON, PythonError};
+use super::{LINKED_PYTHON, PythonError, loaded_python_version};
 
 /// Runs once after start. `stdout` carries the supervisor's protocol, so an environment's `print`
 /// must not reach it, nor its `input` the supervisor's commands. A BLAS pool of its own per worker
@@ -92,15 +92,6 @@ fn check_version() -> Result<(), PythonError> {
         return Ok(());
     }
     Err(PythonError::OtherVersion { expected: LINKED_PYTHON.version.to_owned(), got })
-}
-
-/// `sys.version` of the libpython that this process has loaded, blanks normalised as in
-/// [`LINKED_PYTHON`]. Starts nothing.
-#[must_use]
-pub fn loaded_python_version() -> String {
-    // SAFETY: Py_GetVersion needs no interpreter and returns a static string.
-    let version = unsafe { CStr::from_ptr(ffi::Py_GetVersion()) }.to_string_lossy();
-    version.split_ascii_whitespace().collect::<Vec<_>>().join(" ")
 }
 
 /// Initialises CPython and releases the GIL.

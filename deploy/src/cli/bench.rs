@@ -11,7 +11,7 @@ use super::bench_policy::{self, PolicyArgs};
 use super::bench_transport::{self, TransportArgs};
 use super::configuration::{merge, refuse};
 use super::configured::{ConfiguredArgs, make_absolute};
-use super::{cores, emit, prepare_python, this_program};
+use super::{cores, emit, prepare_python, python_home, this_program};
 use crate::bench::{self, Controls, RolloutBench};
 use crate::failure::{Outcome, wrong_use};
 
@@ -131,7 +131,7 @@ fn rollout(args: &RolloutArgs) -> anyhow::Result<Outcome> {
         peer_python: peer_python.unwrap_or_else(|| venv.join("bin/python")),
         controls: args.controls,
         venv,
-        package_path: crate::project::root()?.join("envs_py"),
+        package_path: python_home()?.1,
         rounds: usize::from(args.rounds),
         duration: Duration::from_secs_f64(args.seconds),
     };

@@ -12,7 +12,7 @@ use dmprl_shared::seeds;
 use super::bench::interpreter;
 use super::configuration::{merge, refuse};
 use super::configured::ConfiguredArgs;
-use super::{cores, emit, prepare_python};
+use super::{cores, emit, prepare_python, python_home};
 use crate::bench::{self, PolicyBench};
 use crate::export::read_policy;
 use crate::failure::{Outcome, wrong_use};
@@ -71,7 +71,7 @@ pub(super) fn run(args: &PolicyArgs) -> anyhow::Result<Outcome> {
     let bench = PolicyBench {
         opened,
         python,
-        package_path: crate::project::root()?.join("envs_py"),
+        package_path: python_home()?.1,
         rounds: usize::from(args.rounds),
         calls: args.calls as usize,
     };

@@ -7,7 +7,7 @@ use clap::{Args, ValueEnum};
 use dmprl_shared::config::DeliveryLevel;
 
 use super::bench::{interpreter, seconds};
-use super::{cores, emit, this_program};
+use super::{cores, emit, python_home, this_program};
 use crate::bench::{self, TransportBench};
 use crate::failure::Outcome;
 
@@ -69,7 +69,7 @@ pub(super) struct TransportArgs {
 
 pub(super) fn run(args: &TransportArgs) -> anyhow::Result<Outcome> {
     let peer_python = args.peer_python.as_deref().map(interpreter).transpose()?;
-    let root = crate::project::root()?;
+    let (venv, package_path) = python_home()?;
     let default_workers = || u32::try_from(cores().saturating_sub(1)).unwrap_or(1).clamp(1, 64);
     let bench = TransportBench {
         program: this_program()?,
@@ -78,8 +78,8 @@ pub(super) fn run(args: &TransportArgs) -> anyhow::Result<Outcome> {
             Level::Memory => DeliveryLevel::Memory,
             Level::Log => DeliveryLevel::Log,
         },
-        peer_python: peer_python.unwrap_or_else(|| root.join(".venv/bin/python")),
-        package_path: root.join("envs_py"),
+        peer_python: peer_python.unwrap_or_else(|| venv.join("bin/python")),
+        package_path,
         rounds: usize::from(args.rounds),
         duration: Duration::from_secs_f64(args.seconds),
     };

@@ -32,6 +32,8 @@ use dmprl_shared::config::ExperimentConfig;
 
 use crate::bench::{TransportWorkerArgs, transport_worker};
 use crate::failure::{Outcome, exit_code, render, wrong_use};
+#[cfg(feature = "python")]
+use crate::python_setup::{Home, ensure_extra};
 use crate::roles::{self, ActorArgs, EvaluatorArgs, LearnerArgs, ObserverArgs};
 use crate::terminal::say;
 
@@ -182,18 +184,29 @@ fn emit(text: &str) -> anyhow::Result<()> {
 /// the virtual environment.
 #[cfg(feature = "python")]
 fn prepare_python() -> anyhow::Result<PathBuf> {
-    let root = crate::project::root()?;
     let progress = crate::terminal::SetupProgress::new();
-    Ok(crate::python_setup::ensure(&root, &|line| progress.show(line))?.venv)
+    Ok(Home::find()?.ensure(&|line| progress.show(line))?.venv)
 }
 
 /// The same with an optional part of the package; returns the interpreter, too.
 #[cfg(feature = "python")]
 fn prepare_python_with(extra: &str) -> anyhow::Result<(PathBuf, PathBuf)> {
-    let root = crate::project::root()?;
     let progress = crate::terminal::SetupProgress::new();
-    let ready = crate::python_setup::ensure_extra(&root, extra, &|line| progress.show(line))?;
+    let ready = ensure_extra(&Home::find()?, extra, &|line| progress.show(line))?;
     Ok((ready.venv, ready.executable))
+}
+
+/// The virtual environment, made or not, and what other interpreters need to `import dmprl`.
+#[cfg(feature = "python")]
+fn python_home() -> anyhow::Result<(PathBuf, PathBuf)> {
+    let home = Home::find()?;
+    Ok((home.venv(), home.package_path()))
+}
+
+#[cfg(not(feature = "python"))]
+fn python_home() -> anyhow::Result<(PathBuf, PathBuf)> {
+    let root = crate::project::root()?;
+    Ok((root.join(".venv"), root.join("envs_py")))
 }
 
 #[cfg(not(feature = "python"))]

@@ -7,8 +7,7 @@ use serde::Deserialize;
 
 use super::Check;
 use super::answer::answer;
-use crate::project;
-use crate::python_setup::{State, state};
+use crate::python_setup::{Home, State};
 
 /// What the interpreter is asked. `find_spec` imports nothing.
 const QUESTIONS: &str = "\
@@ -41,8 +40,8 @@ struct Facts {
 
 pub(super) fn checks() -> Vec<Check> {
     let mut checks = Vec::new();
-    let root = project::root();
-    let made = root.as_deref().map_or(State::Missing, state);
+    let home = Home::find();
+    let made = home.as_ref().map_or(State::Missing, Home::state);
     match facts() {
         Ok(facts) => checks.extend([
             interpreter(&facts),
@@ -55,11 +54,11 @@ pub(super) fn checks() -> Vec<Check> {
             checks.push(Check::problem("python", found, BUILD_AGAIN));
         }
     }
-    match root {
-        Ok(root) => checks.extend(environment(&root.join(".venv"), made)),
+    match home {
+        Ok(home) => checks.extend(environment(&home.venv(), made)),
         Err(error) => {
             let advice = "without envs_py there are no environments";
-            checks.push(Check::problem(".venv", error.to_string(), advice));
+            checks.push(Check::problem("environment", error.to_string(), advice));
         }
     }
     checks
@@ -119,7 +118,7 @@ fn venv_module(facts: &Facts, is_made: bool) -> Check {
 }
 
 fn environment(venv: &Path, made: State) -> Vec<Check> {
-    const NAME: &str = ".venv";
+    const NAME: &str = "environment";
     let path = venv.display();
     match made {
         State::Ready => {

@@ -28,8 +28,6 @@ const LINES_AHEAD_MAX: usize = 256;
 pub(super) struct Setup<'a> {
     /// What is made.
     pub environment: &'a PythonEnvironment,
-    /// The directory of the package to install.
-    pub package: &'a Path,
     /// Held until the last command that writes into `.venv` has ended.
     pub lock: &'a File,
     /// Takes one line at a time.
@@ -51,8 +49,8 @@ impl Setup<'_> {
     /// Editable, that is by reference to `envs_py`: a change there holds at the next start, without
     /// an installation, which is what who adds a task wants; only a change of requirements installs
     /// again.
-    pub fn install(&self) -> Result<()> {
-        let package: [&OsStr; 2] = ["--editable".as_ref(), self.package.as_ref()];
+    pub fn install(&self, package: &Path) -> Result<()> {
+        let package: [&OsStr; 2] = ["--editable".as_ref(), package.as_ref()];
         self.pip("installing packages", &package)
     }
 

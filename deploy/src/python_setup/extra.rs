@@ -1,39 +1,37 @@
 //! Optional parts of the Python package, which are installed when a command first needs them.
 
-use std::{fs, path::Path};
+use std::{ffi::OsStr, fs, path::Path};
 
 use anyhow::{Context, Result};
 use toml::Table;
 
-use super::{LOCK, PACKAGE, PythonEnvironment, command::Setup, ensure, locked, wanted};
+use super::{Home, PythonEnvironment, command::Setup, locked};
 
-/// Makes sure that `.venv` holds the package, as [`ensure`] does, and what its optional part
-/// `extra` requires: `[project.optional-dependencies]` of `envs_py/pyproject.toml`.
+/// Makes sure that the environment of `home` holds the package, as [`Home::ensure`] does, and what
+/// its optional part `extra` requires.
 ///
-/// A file in `.venv` says which requirements were met, so that later starts neither run pip nor
-/// need a network; it goes with a `.venv` that is made anew.
+/// A file in the environment says which requirements were met, so that later starts neither run
+/// pip nor need a network; it goes with a `.venv` that is made anew.
 ///
 /// # Errors
-/// As [`ensure`]; the package has no such part.
+/// As [`Home::ensure`]; the package has no such part.
 pub fn ensure_extra(
-    project_root: &Path,
+    home: &Home,
     extra: &str,
     progress: &dyn Fn(&str),
 ) -> Result<PythonEnvironment> {
-    let environment = ensure(project_root, progress)?;
-    let (root, _) = wanted(project_root)?;
-    let package = root.join(PACKAGE);
-    let requirements = requirements(&package.join("pyproject.toml"), extra)?;
+    let environment = home.ensure(progress)?;
+    let requirements = requirements(&home.requirements(), extra)?;
     let (stamp, text) =
         (environment.venv.join(format!("dmprl-extra-{extra}.txt")), requirements.join("\n"));
     let is_ready = || fs::read_to_string(&stamp).is_ok_and(|found| found == text);
     if is_ready() {
         return Ok(environment);
     }
-    let lock = locked(&root.join(LOCK), progress)?;
+    let lock = locked(&home.lock(), progress)?;
     // Another start may have been faster.
     if !is_ready() {
-        let setup = Setup { environment: &environment, package: &package, lock: &lock, progress };
+        let setup = Setup { environment: &environment, lock: &lock, progress };
         setup
             .install_extra(&requirements)
             .with_context(|| format!("cannot install {}", requirements.join(" ")))?;
@@ -43,14 +41,55 @@ pub fn ensure_extra(
     Ok(environment)
 }
 
-fn requirements(manifest: &Path, extra: &str) -> Result<Vec<String>> {
-    let text = fs::read_to_string(manifest)
-        .with_context(|| format!("cannot read {}", manifest.display()))?;
-    let table: Table = text.parse().with_context(|| format!("{}", manifest.display()))?;
-    let extras = table.get("project").and_then(|project| project.get("optional-dependencies"));
-    let listed = extras.and_then(|extras| extras.get(extra)).and_then(|listed| listed.as_array());
-    let texts = listed.map(|listed| {
-        listed.iter().filter_map(|text| text.as_str().map(str::to_owned)).collect::<Vec<_>>()
-    });
-    texts.with_context(|| format!("{} has no optional part `{extra}`", manifest.display()))
+/// From `pyproject.toml`, or from the METADATA of an installed package.
+fn requirements(file: &Path, extra: &str) -> Result<Vec<String>> {
+    let text =
+        fs::read_to_string(file).with_context(|| format!("cannot read {}", file.display()))?;
+    let listed = if file.extension() == Some(OsStr::new("toml")) {
+        of_project(&text.parse().with_context(|| format!("{}", file.display()))?, extra)
+    } else {
+        of_metadata(&text, extra)
+    };
+    listed.with_context(|| format!("{} has no optional part `{extra}`", file.display()))
+}
+
+fn of_project(project: &Table, extra: &str) -> Option<Vec<String>> {
+    let extras = project.get("project")?.get("optional-dependencies")?;
+    let listed = extras.get(extra)?.as_array()?;
+    Some(listed.iter().filter_map(|text| text.as_str().map(str::to_owned)).collect())
+}
+
+/// `Requires-Dist: av>=18,<19 ; extra == 'video'`
+fn of_metadata(metadata: &str, extra: &str) -> Option<Vec<String>> {
+    let headers = metadata.lines().take_while(|line| !line.is_empty());
+    let required = headers.filter_map(|line| line.strip_prefix("Requires-Dist:"));
+    let of_extra: Vec<String> = required
+        .filter_map(|line| line.split_once(';'))
+        .filter(|(_, marker)| {
+            let wanted = marker.trim().strip_prefix("extra ==").map(str::trim);
+            wanted.map(|name| name.trim_matches(['\'', '"'])) == Some(extra)
+        })
+        .map(|(requirement, _)| requirement.trim().to_owned())
+        .collect();
+    (!of_extra.is_empty()).then_some(of_extra)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn both_kinds_of_files_say_what_an_optional_part_requires() {
+        let metadata = "Name: dmprl\nRequires-Dist: numpy>=2\n\
+                        Requires-Dist: av>=18,<19 ; extra == 'video'\n\
+                        Requires-Dist: pillow>=12 ; extra == \"video\"\n\
+                        Requires-Dist: optuna>=5 ; extra == 'search'\n\n\
+                        Requires-Dist: prose ; extra == 'video'\n";
+        let project = "[project.optional-dependencies]\nvideo = ['av>=18,<19', 'pillow>=12']\n";
+        let expected = Some(vec!["av>=18,<19".to_owned(), "pillow>=12".to_owned()]);
+        assert_eq!(of_metadata(metadata, "video"), expected);
+        assert_eq!(of_project(&project.parse().unwrap(), "video"), expected);
+        assert_eq!(of_metadata(metadata, "sound"), None);
+        assert_eq!(of_project(&project.parse().unwrap(), "sound"), None);
+    }
 }

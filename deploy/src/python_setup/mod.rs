@@ -4,11 +4,13 @@
 //! The virtual environment is made by the very interpreter that the program is linked against: a
 //! package built for another Python's `libpython` may crash this one. A stamp written last says
 //! what was made; where it fits, [`ensure`] reads two small files and is done. Two starts at once
-//! are kept apart by a lock file.
+//! are kept apart by a lock file. Where pip has installed the program, it is in an environment
+//! already ([`Home`]).
 
 mod advice;
 mod command;
 mod extra;
+mod home;
 mod stamp;
 
 use std::{
@@ -21,11 +23,11 @@ use std::{
 use anyhow::{Context, Result, bail};
 use dmprl_actors::python_env::LINKED_PYTHON;
 
-pub use self::extra::ensure_extra;
 use self::{
     command::Setup,
     stamp::{Fit, Stamp},
 };
+pub use self::{extra::ensure_extra, home::Home};
 
 /// Name of the virtual environment in the project's root.
 const VENV: &str = ".venv";
@@ -71,7 +73,7 @@ pub fn ensure(project_root: &Path, progress: &dyn Fn(&str)) -> Result<PythonEnvi
         return Ok(environment);
     }
     let lock = locked(&root.join(LOCK), progress)?;
-    let setup = Setup { environment: &environment, package: &package, lock: &lock, progress };
+    let setup = Setup { environment: &environment, lock: &lock, progress };
     match wanted.compare(&environment.venv) {
         Fit::Ready => return Ok(environment), // another start was faster
         Fit::OtherPackages => {
@@ -85,7 +87,7 @@ pub fn ensure(project_root: &Path, progress: &dyn Fn(&str)) -> Result<PythonEnvi
             setup.create()?;
         }
     }
-    setup.install()?;
+    setup.install(&package)?;
     wanted.write(&environment.venv)?;
     progress("python environment: ready");
     Ok(environment)

@@ -84,7 +84,7 @@ fn doctor_tells_what_it_found_and_changes_nothing() {
         let check = checks.iter().find(|check| check["name"] == name);
         check.unwrap_or_else(|| panic!("no {name} in {checks:#?}")).clone()
     };
-    for name in ["platform", "python", "libpython", ".venv", "packages", "open files"] {
+    for name in ["platform", "python", "libpython", "environment", "packages", "open files"] {
         assert_eq!(check(name)["status"], "ok", "{}", check(name));
     }
     let packages = check("packages")["found"].as_str().unwrap().to_owned();

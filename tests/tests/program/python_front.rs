@@ -38,10 +38,23 @@ policy = run.policy('latest')
 for action in policy.segment(observation):
     assert env.action_space.contains(action.astype('f4')), action
     observation, *_ = env.step(action)
-print(run, policy.segment_steps)
+print(run, policy)
+try:
+    run.record(policy='first')
+except dmprl.ProgramError as error:
+    print(error)
 ";
     let ended = python(&place, script).with_status(0).saying("evaluation at");
-    assert_eq!(ended.printed.trim(), format!("Run('{}') 5", place.path("mine")));
+    let first = format!(
+        "Run('{}') <Policy for Reacher-v5: 10 numbers observed, 5 actions of 2 \
+                         decided, one every 0.02 s>",
+        place.path("mine")
+    );
+    let (printed, refused) = ended.printed.split_once('\n').unwrap();
+    assert_eq!(printed, first);
+    for words in ["dmprl record ended with status 2", "first", "latest"] {
+        assert!(refused.contains(words), "no `{words}` in {refused}");
+    }
     place.assert_no_process();
 }
 

@@ -1,0 +1,129 @@
+//! Where this program's Python package lies: in a clone of the project, or where pip put both.
+
+use std::path::{Path, PathBuf};
+
+use anyhow::{Context, Result};
+use dmprl_actors::python_env::LINKED_PYTHON;
+
+use super::{LOCK, PACKAGE, PythonEnvironment, State, VENV, ensure, state};
+use crate::project;
+
+/// A place with the package `dmprl`, and an environment in which it can be imported.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub enum Home {
+    /// The project's directory: `envs_py`, and `.venv`, which refers to it and is made when needed.
+    Clone(PathBuf),
+    /// The environment that `pip install` put program and package into. It is its owner's: nothing
+    /// but what optional parts require is ever installed there.
+    Installed(PythonEnvironment),
+}
+
+impl Home {
+    /// The environment that this program was installed into; else the project's directory.
+    ///
+    /// # Errors
+    /// Neither is there; this program's own file cannot be found.
+    pub fn find() -> Result<Self> {
+        let program = std::env::current_exe().context("cannot find this program's own file")?;
+        match installed(&program) {
+            Some(environment) => Ok(Self::Installed(environment)),
+            None => project::root().map(Self::Clone),
+        }
+    }
+
+    /// Makes sure that there is an environment in which the package can be imported.
+    ///
+    /// # Errors
+    /// As [`ensure`].
+    pub fn ensure(&self, progress: &dyn Fn(&str)) -> Result<PythonEnvironment> {
+        match self {
+            Self::Clone(root) => ensure(root, progress),
+            Self::Installed(environment) => Ok(environment.clone()),
+        }
+    }
+
+    /// Looks at the environment. Changes nothing, waits for nobody.
+    #[must_use]
+    pub fn state(&self) -> State {
+        match self {
+            Self::Clone(root) => state(root),
+            Self::Installed(_) => State::Ready,
+        }
+    }
+
+    /// The directory of the environment, made or not.
+    #[must_use]
+    pub fn venv(&self) -> PathBuf {
+        match self {
+            Self::Clone(root) => root.join(VENV),
+            Self::Installed(environment) => environment.venv.clone(),
+        }
+    }
+
+    /// What `import dmprl` needs on its path, for an interpreter that is not the environment's.
+    #[must_use]
+    pub fn package_path(&self) -> PathBuf {
+        match self {
+            Self::Clone(root) => root.join(PACKAGE),
+            Self::Installed(environment) => site_packages(&environment.venv),
+        }
+    }
+
+    /// Held by who changes the environment.
+    pub(super) fn lock(&self) -> PathBuf {
+        match self {
+            Self::Clone(root) => root.join(LOCK),
+            Self::Installed(environment) => environment.venv.join(LOCK),
+        }
+    }
+
+    /// The file that says what the package requires.
+    pub(super) fn requirements(&self) -> PathBuf {
+        match self {
+            Self::Clone(root) => root.join(PACKAGE).join("pyproject.toml"),
+            Self::Installed(environment) => metadata(&environment.venv),
+        }
+    }
+}
+
+/// The environment whose `bin` holds `program`, if pip put it there with the package of its own
+/// version.
+fn installed(program: &Path) -> Option<PythonEnvironment> {
+    let bin = program.parent()?;
+    let environment = PythonEnvironment::of(bin.parent()?.to_owned());
+    let is_there = environment.executable.exists() && metadata(&environment.venv).is_file();
+    (bin.file_name()? == "bin" && is_there).then_some(environment)
+}
+
+fn site_packages(prefix: &Path) -> PathBuf {
+    let number = LINKED_PYTHON.version_number();
+    let minor = number.rsplit_once('.').map_or(number, |(minor, _)| minor);
+    prefix.join("lib").join(format!("python{minor}")).join("site-packages")
+}
+
+fn metadata(prefix: &Path) -> PathBuf {
+    let folder = format!("dmprl-{}.dist-info", env!("CARGO_PKG_VERSION"));
+    site_packages(prefix).join(folder).join("METADATA")
+}
+
+#[cfg(test)]
+mod tests {
+    use std::fs;
+
+    use super::*;
+
+    #[test]
+    fn program_is_installed_where_pip_put_the_package_beside_it() {
+        let directory = tempfile::tempdir().unwrap();
+        let (prefix, bin) = (directory.path(), directory.path().join("bin"));
+        let program = bin.join("dmprl");
+        fs::create_dir(&bin).unwrap();
+        fs::write(bin.join("python"), "").unwrap();
+        assert_eq!(installed(&program), None, "a program beside any Python is not installed");
+        let metadata = metadata(prefix);
+        fs::create_dir_all(metadata.parent().unwrap()).unwrap();
+        fs::write(&metadata, "").unwrap();
+        assert_eq!(installed(&program), Some(PythonEnvironment::of(prefix.to_owned())));
+        assert_eq!(installed(&prefix.join("libexec/dmprl")), None);
+    }
+}
