@@ -1,9 +1,10 @@
 //! Configuration of the policy: its kind, its DMP and its inverse controller.
 
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 /// How the phase x of the canonical system advances.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "snake_case")]
 pub enum CanonicalIntegration {
     /// Explicit Euler, advanced before the basis is evaluated (x_1 = 0.975).
@@ -13,7 +14,7 @@ pub enum CanonicalIntegration {
 }
 
 /// Widths h_i of the Gaussian basis functions.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "snake_case")]
 pub enum BasisWidths {
     /// h_i = N^1.5 / (c_i alpha_x), as in Neural Dynamic Policies.
@@ -23,7 +24,7 @@ pub enum BasisWidths {
 }
 
 /// What multiplies the forcing term.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "snake_case")]
 pub enum ForcingScaling {
     /// Nothing (the paper's equation 9).
@@ -33,7 +34,7 @@ pub enum ForcingScaling {
 }
 
 /// How the transformation system is integrated over a segment.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "snake_case")]
 pub enum Integrator {
     /// yd first, then y with the new yd.
@@ -71,7 +72,7 @@ impl Integrator {
 }
 
 /// The dynamic movement primitive, one per action dimension.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct DmpConfig {
     /// Number of basis functions N.
@@ -108,7 +109,7 @@ impl Default for DmpConfig {
 }
 
 /// What decides the actions.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "snake_case")]
 pub enum PolicyKind {
     /// A network that outputs DMP and inverse-controller parameters for a segment.
@@ -118,7 +119,7 @@ pub enum PolicyKind {
 }
 
 /// Bounds of the inverse controller's parameters rho.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "snake_case")]
 pub enum RhoKind {
     /// rho = (1, 0, 0, 0) + rho_range * tanh(.).
@@ -128,7 +129,7 @@ pub enum RhoKind {
 }
 
 /// What turns the DMP's motion into actions.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "snake_case")]
 pub enum Controller {
     /// The adaptive inverse controller, whose rho the network decides.
@@ -139,7 +140,7 @@ pub enum Controller {
 }
 
 /// Where a segment's DMP starts.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "snake_case")]
 pub enum Start {
     /// y = yd = 0 at every segment.
@@ -151,7 +152,7 @@ pub enum Start {
 }
 
 /// Where yd0 comes from when `start = "observed"`.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "snake_case")]
 pub enum StartVelocity {
     /// Measured velocity, converted to DMP time.
@@ -161,7 +162,7 @@ pub enum StartVelocity {
 }
 
 /// How one action dimension's y0 and yd0 are read from an observation.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(untagged, deny_unknown_fields)]
 pub enum StartSource {
     /// y0 = atan2(observation[sin], observation[cos]).
@@ -190,7 +191,7 @@ fn unit_scale() -> f32 {
 }
 
 /// The policy: from observation to the actions of a segment.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct PolicyConfig {
     /// What decides the actions.

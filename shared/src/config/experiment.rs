@@ -1,11 +1,12 @@
 //! The root of the configuration tree and the sections that are neither policy nor algorithm.
 
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 use super::{AlgorithmConfig, DmpConfig, ExplorationConfig, PolicyConfig, StartSource};
 
 /// One experiment: everything that decides what a run does.
-#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct ExperimentConfig {
     /// Length, seed and stopping rules.
@@ -43,7 +44,7 @@ pub struct ExperimentConfig {
 }
 
 /// Length, seed and stopping rules. An infinite bound never stops a run.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct RunConfig {
     /// Master seed; every random stream of the run derives from it.
@@ -74,7 +75,7 @@ impl Default for RunConfig {
 }
 
 /// The environment.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct TaskConfig {
     /// The name typed on the command line.
@@ -99,7 +100,7 @@ impl Default for TaskConfig {
 }
 
 /// Which goals an episode is repeated with.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "snake_case")]
 pub enum Hindsight {
     /// None but the one it had.
@@ -109,7 +110,7 @@ pub enum Hindsight {
 }
 
 /// Storage of experience.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct ReplayConfig {
     /// Environment steps held, copies included; the oldest are replaced.
@@ -127,7 +128,7 @@ impl Default for ReplayConfig {
 }
 
 /// Experience that somebody recorded, from which a run starts.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct DemonstrationsConfig {
     /// Files of steps (docs/demonstrations.md).
@@ -153,7 +154,7 @@ impl DemonstrationsConfig {
 }
 
 /// Updates per inserted segment, and how far either side may run ahead.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct PacingConfig {
     /// Updates per segment inserted after the warm-up.
@@ -169,7 +170,7 @@ impl Default for PacingConfig {
 }
 
 /// The rollout workers.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct ActorsConfig {
     /// Worker processes; 0 stands for cores - 1, at least 1.
@@ -220,7 +221,7 @@ impl ActorsConfig {
 }
 
 /// When a worker may forget a segment.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "snake_case")]
 pub enum DeliveryLevel {
     /// When the learner has inserted it: its death loses what came after its last checkpoint.
@@ -230,7 +231,7 @@ pub enum DeliveryLevel {
 }
 
 /// What a death may cost on the way from worker to learner.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct DeliveryConfig {
     /// When a worker may forget a segment.
@@ -251,7 +252,7 @@ impl Default for DeliveryConfig {
 }
 
 /// What happens when the learner dies.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct SupervisionConfig {
     /// Restarts of a learner that was killed or crashed before the run ends. One that wrote a
@@ -268,7 +269,7 @@ impl Default for SupervisionConfig {
 }
 
 /// Where the update runs.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "snake_case")]
 pub enum Device {
     /// The processor.
@@ -278,7 +279,7 @@ pub enum Device {
 }
 
 /// What the products of an update multiply; sums and parameters are always f32.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "snake_case")]
 pub enum Precision {
     /// 32 bits.
@@ -288,7 +289,7 @@ pub enum Precision {
 }
 
 /// The learner process.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct LearnerConfig {
     /// Where the update runs.
@@ -313,7 +314,7 @@ impl Default for LearnerConfig {
 }
 
 /// Noise-free evaluation in its own process.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct EvaluationConfig {
     /// Environment steps between evaluations; one more always follows the last step.
@@ -331,7 +332,7 @@ impl Default for EvaluationConfig {
 }
 
 /// What is kept on disk to go on from.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct CheckpointConfig {
     /// Environment steps between checkpoints; one more always ends a run.
@@ -349,7 +350,7 @@ impl Default for CheckpointConfig {
 }
 
 /// What is written about the run.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct MetricsConfig {
     /// Environment steps between two lines of `metrics.jsonl`.
