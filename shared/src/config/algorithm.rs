@@ -113,7 +113,7 @@ pub struct SacConfig {
     pub initial_temperature: f64,
     /// Adam step size of the temperature's logarithm.
     pub temperature_learning_rate: f64,
-    /// Entropy that the temperature steers to, for each action of a decision [nat]. For
+    /// Entropy that the temperature steers to, for each action of a decision \[nat\]. For
     /// `mlp` policies -1 is the default: a segment's actions go together, so it has less.
     pub target_entropy_per_action: f64,
 }

@@ -75,11 +75,13 @@ impl Integrator {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct DmpConfig {
-    /// Number of basis functions N.
+    /// Number of basis functions N: with more a segment's motion may have more shape.
     pub basis_count: usize,
-    /// Decay of the phase, alpha_x.
+    /// Decay of the phase, alpha_x: the larger, the sooner the forcing term fades.
     pub alpha_x: f64,
-    /// Stiffness of the transformation system; beta_y = alpha_y / 4 (critically damped).
+    /// Stiffness of the transformation system; beta_y = alpha_y / 4 (critically damped). The
+    /// larger, the sooner the motion reaches its goal. Refused where the integrator would be
+    /// unstable.
     pub alpha_y: f64,
     /// Integration steps m over one segment; a multiple of `policy.segment_steps`.
     pub integration_steps: usize,
@@ -165,7 +167,7 @@ pub enum StartVelocity {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(untagged, deny_unknown_fields)]
 pub enum StartSource {
-    /// y0 = atan2(observation[sin], observation[cos]).
+    /// y0 = atan2(observation\[sin\], observation\[cos\]).
     Angle {
         /// Index of the cosine.
         cos: usize,
@@ -174,7 +176,7 @@ pub enum StartSource {
         /// Index of the angular velocity [rad/s].
         velocity: usize,
     },
-    /// y0 = scale * observation[index], yd0 from observation[velocity].
+    /// y0 = scale * observation\[index\], yd0 from observation\[velocity\].
     Value {
         /// Index of the position.
         index: usize,
@@ -196,16 +198,17 @@ fn unit_scale() -> f32 {
 pub struct PolicyConfig {
     /// What decides the actions.
     pub kind: PolicyKind,
-    /// Environment steps K of one decision; `mlp` decides every step whatever stands here.
+    /// Environment steps K of one decision, carried out without looking again; `mlp` decides every
+    /// step whatever stands here.
     pub segment_steps: usize,
     /// Widths of the actor's hidden layers.
     pub hidden: Vec<usize>,
     /// Whether the networks see observations of zero mean and unit scale. The statistics begin at
     /// the end of the warm-up; published policies have them folded in.
     pub normalise_observations: bool,
-    /// g = goal_range * tanh(.).
+    /// Bound of the goal: g = goal_range * tanh(.).
     pub goal_range: f64,
-    /// w = weight_range * omega^2 * tanh(.), omega = alpha_y / 2.
+    /// Bound of the weights: w = weight_range * omega^2 * tanh(.), omega = alpha_y / 2.
     pub weight_range: f64,
     /// What turns the DMP's motion into actions.
     pub controller: Controller,

@@ -53,11 +53,11 @@ pub struct RunConfig {
     pub steps: u64,
     /// One process in lock-step; the same seed gives the same bytes.
     pub deterministic: bool,
-    /// Stop at this mean evaluation return.
+    /// Stop at the first evaluation whose mean return is this or more; inf: at none.
     pub until_return: f64,
-    /// Stop at this evaluation success rate.
+    /// Stop at the first evaluation whose success rate, 0 to 1, is this or more; inf: at none.
     pub until_success: f64,
-    /// Stop after so many minutes of wall clock.
+    /// Stop after so many minutes of wall clock, counted anew by `resume`; inf: never.
     pub max_minutes: f64,
 }
 
@@ -157,7 +157,8 @@ impl DemonstrationsConfig {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct PacingConfig {
-    /// Updates per segment inserted after the warm-up.
+    /// Updates per segment inserted after the warm-up: more learn more from each step, take longer,
+    /// and may make the critic diverge.
     pub updates_per_segment: f64,
     /// Segments the learner may hold un-updated before it stops taking more, so that workers wait.
     pub tolerance_segments: u64,
@@ -178,12 +179,12 @@ pub struct ActorsConfig {
     /// Workers that may join a running experiment (`dmprl actor --join RUN`) at once. Each has its
     /// queue from the start, whether it comes or not.
     pub joined_max: usize,
-    /// Environments in each worker.
+    /// Environments in each worker, which run a segment in one call.
     pub envs_per_worker: usize,
     /// Segments a worker's queue to the learner holds; full: the worker waits. 0 stands for
     /// `envs_per_worker`: with fewer a worker would wait for the learner in every segment.
     pub queue_segments: usize,
-    /// A worker that waited so long on a full queue reports it, naming the learner [s].
+    /// A worker that waited so long on a full queue reports it, naming the learner \[s\].
     pub send_deadline_s: f64,
     /// Restarts of one worker before the run gives up on it. One that delivered segments for five
     /// minutes has them all again.
@@ -193,7 +194,7 @@ pub struct ActorsConfig {
     /// restarted.
     pub env_failures_max: u32,
     /// One call into the environments (a segment in each of a worker's, or their reset) that lasts
-    /// longer hangs: its process ends, the evaluator's too, and is restarted [s].
+    /// longer hangs: its process ends, the evaluator's too, and is restarted \[s\].
     pub env_call_timeout_s: f64,
 }
 
@@ -240,7 +241,7 @@ pub struct DeliveryConfig {
     /// stands for `actors.queue_segments` and 1 024 more, which come in while an acknowledgement
     /// is on its way.
     pub unacknowledged_segments: usize,
-    /// Size of the segment log [bytes]; full: a checkpoint is written, which empties it.
+    /// Size of the segment log \[bytes\]; full: a checkpoint is written, which empties it.
     pub log_bytes_max: u64,
 }
 
@@ -251,14 +252,14 @@ impl Default for DeliveryConfig {
     }
 }
 
-/// What happens when the learner dies.
+/// What happens when a process dies or hangs.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct SupervisionConfig {
     /// Restarts of a learner that was killed or crashed before the run ends. One that wrote a
     /// checkpoint and lived for five minutes has them all again.
     pub learner_restarts_max: u32,
-    /// A worker that gives no sign of life for so long hangs: it is killed and restarted [s].
+    /// A worker that gives no sign of life for so long hangs: it is killed and restarted \[s\].
     pub heartbeat_timeout_s: f64,
 }
 
@@ -294,11 +295,11 @@ pub enum Precision {
 pub struct LearnerConfig {
     /// Where the update runs.
     pub device: Device,
-    /// Threads of the update.
+    /// Threads of the update; their number changes no bit of the result.
     pub threads: usize,
     /// What the update's products multiply.
     pub precision: Precision,
-    /// Updates between two published parameter snapshots.
+    /// Updates between two published parameter snapshots, which workers then act by.
     pub publish_every_updates: u64,
 }
 
@@ -321,7 +322,8 @@ pub struct EvaluationConfig {
     pub interval_steps: u64,
     /// Episodes of one evaluation.
     pub episodes: usize,
-    /// Episode i is reset with seed first_seed + i.
+    /// Episode i is reset with seed first_seed + i, in every evaluation. Searches use 5000 and
+    /// on, so that what they find is judged by episodes that they have not seen.
     pub first_seed: u64,
 }
 
@@ -339,7 +341,7 @@ pub struct CheckpointConfig {
     pub interval_steps: u64,
     /// Checkpoints kept.
     pub keep: usize,
-    /// Disk space all checkpoints of a run may take together [bytes]; at least one is kept.
+    /// Disk space all checkpoints of a run may take together \[bytes\]; at least one is kept.
     pub disk_bytes_max: u64,
 }
 

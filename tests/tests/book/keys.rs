@@ -25,7 +25,8 @@ const HEAD: &str = "\
 
 Each key can stand in a file for `--config`, in `--set KEY=VALUE`, and in an environment variable;
 [Configuration](configuration.md) says how these are laid over each other. Where a preset, a kind of
-policy, an algorithm or a task brings another value, it stands below the default.
+policy, an algorithm or a task brings another value, it stands below the default. Of several, an
+algorithm wins over a preset, a preset over a kind of policy, and that over a task.
 ";
 
 /// The page.
@@ -174,11 +175,15 @@ fn default_text(key: &str, defaults: &Table, others: &[(String, Table)]) -> Stri
     let default = at(defaults, key).unwrap().to_string();
     let mut by_value: BTreeMap<String, Vec<&str>> = BTreeMap::new();
     for (label, table) in others {
-        if let Some(value) = at(table, key).map(ToString::to_string)
-            && value != default
-        {
+        if let Some(value) = at(table, key).map(ToString::to_string) {
             by_value.entry(value).or_default().push(label);
         }
+    }
+    // Who says what is the default says something only where a task says otherwise.
+    let of_tasks = |labels: &Vec<&str>| labels.iter().any(|label| label.starts_with("on "));
+    let same = by_value.remove(&default);
+    if let Some(labels) = same.filter(|_| by_value.values().any(of_tasks)) {
+        by_value.insert(default.clone(), labels);
     }
     if by_value.is_empty() {
         return format!("Default: `{default}`.");
@@ -192,8 +197,22 @@ fn default_text(key: &str, defaults: &Table, others: &[(String, Table)]) -> Stri
     let mut rest: Vec<_> = by_value.into_iter().collect();
     rest.sort_by_key(|(_, labels)| others.iter().position(|(label, _)| label == labels[0]));
     for (value, labels) in rest {
-        writeln!(text, "- `{value}` {}", labels.join(", ")).unwrap();
+        writeln!(text, "- `{value}` {}", joined(&labels)).unwrap();
     }
     text.pop();
+    text
+}
+
+/// `on a, on b` is `on a, b`.
+fn joined(labels: &[&str]) -> String {
+    let mut text = String::new();
+    let mut last = "";
+    for label in labels {
+        let (word, name) = label.split_once(' ').unwrap();
+        let gap = if text.is_empty() { "" } else { ", " };
+        let word = if word == last { String::new() } else { format!("{word} ") };
+        write!(text, "{gap}{word}{name}").unwrap();
+        last = label.split_once(' ').unwrap().0;
+    }
     text
 }
