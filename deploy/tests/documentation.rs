@@ -1,4 +1,6 @@
-//! README, ARCHITECTURE and the example configurations, held to what the program really has.
+//! README, the book, ARCHITECTURE and the example configurations, held to what the program really
+//! has. Their code is run by `tests/tests/program/documents.rs`, the book built and its links
+//! followed by `tests/tests/book/main.rs`.
 #![allow(clippy::unwrap_used)] // helpers of tests fail as tests do
 
 use std::collections::BTreeSet;
@@ -10,14 +12,6 @@ use dmprl_learner::metrics::{DeliveryLine, MetricsLine, Rejected};
 use dmprl_shared::config::{ExperimentConfig, Layers, Limits, task_defaults};
 
 const EXAMPLES: &str = "docs/examples";
-const DOCUMENTS: [&str; 6] = [
-    "README.md",
-    "ARCHITECTURE.md",
-    "CHANGELOG.md",
-    "docs/environments.md",
-    "docs/demonstrations.md",
-    "tests/FAULTS.md",
-];
 const LIMITS: Limits = Limits { cores: 2 };
 /// How the program is called in the documents.
 const CALLS: [&str; 3] = ["cargo run --release -- ", "target/release/dmprl ", "dmprl "];
@@ -35,6 +29,21 @@ fn help(arguments: &[&str]) -> String {
         Command::new(env!("CARGO_BIN_EXE_dmprl")).args(arguments).arg("--help").output().unwrap();
     assert!(output.status.success(), "{arguments:?}");
     String::from_utf8(output.stdout).unwrap()
+}
+
+/// What people write: README, the pages of the book and what lies beside the code. What `report`
+/// has written in `docs/results` speaks for itself.
+fn documents() -> Vec<String> {
+    let beside = ["README.md", "ARCHITECTURE.md", "CHANGELOG.md", "tests/FAULTS.md"];
+    let mut documents: Vec<String> = beside.map(str::to_owned).into();
+    for entry in std::fs::read_dir(root().join("docs")).unwrap() {
+        let name = entry.unwrap().file_name().into_string().unwrap();
+        if name.ends_with(".md") {
+            documents.push(format!("docs/{name}"));
+        }
+    }
+    assert!(documents.len() > 20, "only {documents:?}: has the book moved?");
+    documents
 }
 
 /// The long flags in a text.
@@ -58,11 +67,13 @@ fn spans(text: &str) -> Vec<String> {
     spans
 }
 
-/// Fenced blocks of a language.
+/// Fenced blocks of a language, whatever else stands behind its name.
 fn blocks(text: &str, language: &str) -> Vec<String> {
-    let fence = format!("```{language}\n");
+    let fence = format!("```{language}");
     let starts = text.split(fence.as_str()).skip(1);
-    starts.map(|rest| rest.split("\n```").next().unwrap_or_default().to_owned()).collect()
+    let of_language = starts.filter(|rest| rest.starts_with(['\n', ',']));
+    let code = of_language.filter_map(|rest| rest.split_once('\n'));
+    code.map(|(_, code)| code.split("\n```").next().unwrap_or_default().to_owned()).collect()
 }
 
 /// The section below a heading, up to the next heading of any level.
@@ -91,8 +102,8 @@ fn merged(text: &str, origin: &str) -> ExperimentConfig {
 }
 
 #[test]
-fn every_example_configuration_is_accepted_and_named_in_the_readme() {
-    let readme = read("README.md");
+fn every_example_is_named_and_every_configuration_among_them_accepted() {
+    let texts: Vec<_> = documents().iter().map(|document| read(document)).collect();
     let mut seen = 0;
     for entry in std::fs::read_dir(root().join(EXAMPLES)).unwrap() {
         let entry = entry.unwrap();
@@ -100,7 +111,8 @@ fn every_example_configuration_is_accepted_and_named_in_the_readme() {
             continue; // Python's cache, once the example has been trained
         }
         let name = entry.file_name().into_string().unwrap();
-        assert!(readme.contains(&format!("({EXAMPLES}/{name})")), "README does not link {name}");
+        let path = format!("examples/{name}");
+        assert!(texts.iter().any(|text| text.contains(&path)), "no page names {name}");
         if name.ends_with(".toml") {
             let path = format!("{EXAMPLES}/{name}");
             let config = merged(&read(&path), &path);
@@ -112,15 +124,6 @@ fn every_example_configuration_is_accepted_and_named_in_the_readme() {
         }
     }
     assert!(seen >= 3, "only {seen} example configurations in {EXAMPLES}");
-}
-
-#[test]
-fn configuration_blocks_of_the_readme_are_accepted() {
-    let blocks = blocks(&read("README.md"), "toml");
-    assert!(!blocks.is_empty());
-    for block in blocks {
-        merged(&block, "README.md");
-    }
 }
 
 #[test]
@@ -143,13 +146,16 @@ fn the_table_of_commands_is_what_the_program_has() {
 
 #[test]
 fn the_table_of_train_flags_is_complete() {
-    let readme = read("README.md");
-    let cells = first_cells(section(&readme, "### Flags of `train`"));
+    let page = read("docs/commands.md");
+    let cells = first_cells(section(&page, "## Flags of `train`"));
     let documented: BTreeSet<_> = cells.iter().flat_map(|cell| flags(cell)).collect();
     let usage = help(&["train"]);
     let mut existing = flags(usage.split("PRECEDENCE").next().unwrap());
     existing.remove("--help");
-    assert_eq!(documented, existing, "README, `### Flags of train`, against `train --help`");
+    assert_eq!(
+        documented, existing,
+        "docs/commands.md, `## Flags of train`, against `train --help`"
+    );
 }
 
 #[test]
@@ -185,8 +191,8 @@ fn every_flag_that_is_shown_exists() {
     let all: BTreeSet<_> = commands.iter().flat_map(|command| words(command)).collect();
     // Flags of other programs: cargo's, TensorBoard's, and docker's for the size of shared memory.
     let foreign = ["--bench", "--features", "--release", "--check", "--logdir", "--shm-size"];
-    for document in DOCUMENTS {
-        let text = read(document);
+    for document in documents() {
+        let text = read(&document);
         for flag in spans(&text).iter().flat_map(|span| flags(span)) {
             let exists = all.contains(&flag) || foreign.contains(&flag.as_str());
             assert!(exists, "{document} shows {flag}, which no command has");
@@ -210,12 +216,13 @@ fn every_flag_that_is_shown_exists() {
 
 #[test]
 fn every_configuration_key_that_is_named_exists() {
-    const FILE_ENDINGS: [&str; 7] = ["npz", "jsonl", "json", "toml", "safetensors", "svg", "rs"];
+    const FILE_ENDINGS: [&str; 8] =
+        ["npz", "jsonl", "json", "toml", "safetensors", "svg", "rs", "md"];
     let keys: BTreeSet<_> = Layers::new().keys().into_iter().collect();
     let sections: BTreeSet<_> = keys.iter().filter_map(|key| key.split('.').next()).collect();
     let mut seen = 0;
-    for document in DOCUMENTS {
-        let text = read(document);
+    for document in documents() {
+        let text = read(&document);
         let allowed = |letter: char| letter.is_ascii_alphanumeric() || "._/".contains(letter);
         for word in text.split_inclusive(|letter: char| !allowed(letter)) {
             // A method: `policy.segment(observation)`.
@@ -232,7 +239,9 @@ fn every_configuration_key_that_is_named_exists() {
             if !sections.contains(section) || FILE_ENDINGS.contains(&rest) {
                 continue;
             }
-            assert!(keys.contains(&key), "{document} names the key `{key}`, which does not exist");
+            let below = format!("{key}.");
+            let exists = keys.iter().any(|it| *it == key || it.starts_with(&below));
+            assert!(exists, "{document} names the key `{key}`, which does not exist");
             seen += 1;
         }
     }
@@ -288,14 +297,14 @@ fn the_keys_of_both_kinds_of_lines_are_documented() {
         success_rate: None,
         smoothness: 0.0,
     };
-    let readme = read("README.md");
+    let page = read("docs/metrics.md");
     let lines = [
-        ("### A line of metrics.jsonl", serde_json::to_value(metrics).unwrap()),
-        ("### A line of evaluations.jsonl", serde_json::to_value(evaluation).unwrap()),
+        ("## A line of metrics.jsonl", serde_json::to_value(metrics).unwrap()),
+        ("## A line of evaluations.jsonl", serde_json::to_value(evaluation).unwrap()),
     ];
     for (heading, line) in lines {
         let written: BTreeSet<_> = line.as_object().unwrap().keys().cloned().collect();
-        assert_eq!(first_cells(section(&readme, heading)), written, "README, `{heading}`");
+        assert_eq!(first_cells(section(&page, heading)), written, "docs/metrics.md, `{heading}`");
     }
 }
 
@@ -303,8 +312,8 @@ fn the_keys_of_both_kinds_of_lines_are_documented() {
 fn every_path_and_test_that_the_documents_name_is_there() {
     const FOLDERS: [&str; 8] =
         ["actors/", "deploy/", "docs/", "envs_py/", "learner/", "shared/", "tests/", ".ci/"];
-    for document in DOCUMENTS {
-        let text = read(document);
+    for document in documents() {
+        let text = read(&document);
         let links = text.split("](").skip(1).filter_map(|rest| rest.split(')').next());
         let links = links.filter(|link| !link.contains("://")).map(str::to_owned);
         let named = spans(&text).into_iter().filter(|span| {
@@ -318,8 +327,10 @@ fn every_path_and_test_that_the_documents_name_is_there() {
                 continue;
             }
             let (path, test) = name.split_once("::").unwrap_or((&name, ""));
+            // The book's test looks at headings of other pages.
+            let path = path.split('#').next().unwrap_or(path);
             // A link is relative to its document, a path in code to the project.
-            let beside = Path::new(document).parent().unwrap_or(Path::new(""));
+            let beside = Path::new(&document).parent().unwrap_or(Path::new(""));
             let there = [root().join(path), root().join(beside).join(path)];
             assert!(
                 there.iter().any(|path| path.exists()),

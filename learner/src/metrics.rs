@@ -65,7 +65,7 @@ pub struct MetricsLine {
     /// SAC: mean weight of the entropy.
     #[serde(default)]
     pub temperature: Option<f64>,
-    /// SAC: mean -log pi of the actor's draws; NDP: the policy's in one step [nat].
+    /// SAC: mean -log pi of the actor's draws; NDP: the policy's in one step \[nat\].
     #[serde(default)]
     pub entropy: Option<f64>,
     /// NDP: mean -min(ratio advantage, clipped ratio advantage).

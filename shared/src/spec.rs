@@ -17,7 +17,7 @@ pub struct EnvSpec {
     pub action_low: Vec<f64>,
     /// Upper bound of each action dimension.
     pub action_high: Vec<f64>,
-    /// Duration of one environment step [s]; 0 when the environment does not say.
+    /// Duration of one environment step \[s\]; 0 when the environment does not say.
     pub control_dt_s: f64,
     /// Steps after which an episode is truncated; 0 when it never is.
     pub episode_steps: u32,
@@ -66,7 +66,7 @@ pub enum SpecError {
     Duration {
         /// Gymnasium id.
         id: String,
-        /// What the environment says [s].
+        /// What the environment says \[s\].
         got: f64,
     },
 }

@@ -9,9 +9,9 @@ use super::{Interpreter, PythonEnvironments, PythonError};
 /// What a joint's position is a measure of.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum JointKind {
-    /// An angle [rad].
+    /// An angle \[rad\].
     Hinge,
-    /// A length [m].
+    /// A length \[m\].
     Slide,
 }
 

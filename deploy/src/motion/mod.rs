@@ -64,7 +64,7 @@ pub struct Motion {
 }
 
 impl Motion {
-    /// When each row of the episode's joints is [s], (T+1,); row t of actions and rewards is from
+    /// When each row of the episode's joints is \[s\], (T+1,); row t of actions and rewards is from
     /// time t to t+1. Steps where the environment does not say how long one takes.
     #[must_use]
     pub fn times(&self) -> Vec<f64> {

@@ -16,9 +16,9 @@ const LINE_BYTES_MAX: u64 = 256 << 20;
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum JointKind {
-    /// An angle [rad].
+    /// An angle \[rad\].
     Hinge,
-    /// A length [m].
+    /// A length \[m\].
     Slide,
 }
 
@@ -54,7 +54,7 @@ pub struct Robot {
     /// What the goal looks like in a picture; empty if nobody knows.
     #[serde(default, skip_serializing_if = "String::is_empty")]
     pub goal_in_pictures: String,
-    /// Duration of a step [s]; 0 if the environment does not say.
+    /// Duration of a step \[s\]; 0 if the environment does not say.
     pub control_dt_s: f64,
 }
 

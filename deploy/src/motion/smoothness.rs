@@ -45,7 +45,7 @@ pub fn add_action_changes(u: &[Vec<f32>], means: &mut [Mean]) {
 /// Adds the absolute jerk of each joint to its mean: the second difference of velocities at control
 /// rate, `(qd_{t+1} - 2 qd_t + qd_{t-1}) / dt²`, which needs no model and no filter.
 ///
-/// - `velocities`: (T+1, J) [rad/s]. `dt`: [s]. `means`: (J,) [rad/s³].
+/// - `velocities`: (T+1, J) [rad/s]. `dt`: \[s\]. `means`: (J,) [rad/s³].
 pub fn add_jerks(velocities: &[Vec<f64>], dt: f64, means: &mut [Mean]) {
     for three in velocities.windows(3) {
         for (joint, mean) in means.iter_mut().enumerate() {

@@ -23,7 +23,7 @@ pub enum Measure {
     Decisions,
     /// Updates of the learner.
     Updates,
-    /// Wall clock [s].
+    /// Wall clock \[s\].
     TrainingTime,
     /// Updates an environment step.
     UpdateRate,

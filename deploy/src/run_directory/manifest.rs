@@ -47,7 +47,7 @@ pub struct Machine {
     pub cpu: Option<String>,
     /// Cores this process may use.
     pub cores: usize,
-    /// Main memory [bytes], when the system tells it.
+    /// Main memory \[bytes\], when the system tells it.
     pub memory_bytes: Option<u64>,
 }
 

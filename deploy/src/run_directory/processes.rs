@@ -16,7 +16,7 @@ pub struct Processes {
     format: u32,
     /// Whether the session has come to its end; if not, and nobody trains, it was killed.
     pub ended: bool,
-    /// How old the session was when this was written [s].
+    /// How old the session was when this was written \[s\].
     pub session_s: f64,
     /// Learner, workers, evaluator.
     pub processes: Vec<ProcessRow>,
@@ -43,7 +43,7 @@ pub struct ProcessRow {
     pub up_s: Option<f64>,
     /// Seconds since it last said anything.
     pub silent_s: Option<f64>,
-    /// Processor time since its start [s].
+    /// Processor time since its start \[s\].
     pub cpu_s: Option<f64>,
     /// Memory that it occupies, what it shares included.
     pub memory_bytes: Option<u64>,

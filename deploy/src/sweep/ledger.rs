@@ -17,7 +17,7 @@ pub struct Finished {
     pub steps: u64,
     /// Those it took: a run that reaches its goal ends sooner.
     pub env_steps: u64,
-    /// Of training, over all its sessions [s].
+    /// Of training, over all its sessions \[s\].
     pub wall_s: f64,
     /// Whether it came to its end or was given up.
     #[serde(default, skip_serializing_if = "End::is_finished")]

@@ -40,7 +40,7 @@ pub struct Losses {
     pub q_mean: f32,
     /// Weight of the entropy; SAC's.
     pub temperature: Option<f32>,
-    /// -log pi of the actor's draws [nat]; SAC's.
+    /// -log pi of the actor's draws \[nat\]; SAC's.
     pub entropy: Option<f32>,
 }
 

@@ -61,7 +61,7 @@ pub struct NdpLosses {
     pub policy_loss: f32,
     /// (V - return)².
     pub value_loss: f32,
-    /// Of the policy in one step [nat].
+    /// Of the policy in one step \[nat\].
     pub entropy: f32,
     /// Divergence from the policy that acted, (ratio - 1) - log ratio.
     pub approx_kl: f32,

@@ -1,9 +1,10 @@
 //! Configuration of the learning algorithm and of exploration.
 
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 /// Which algorithm updates the networks.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "snake_case")]
 pub enum AlgorithmName {
     /// Deep deterministic policy gradient (Lillicrap et al. 2016), with segments DDPG-DMP.
@@ -17,7 +18,7 @@ pub enum AlgorithmName {
 }
 
 /// Which actions the critic sees.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "snake_case")]
 pub enum CriticInput {
     /// Q(s_t, u_t .. u_{t+K-1}).
@@ -27,7 +28,7 @@ pub enum CriticInput {
 }
 
 /// Which K-step windows of the replay are samples.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "snake_case")]
 pub enum Windows {
     /// Any window of K steps inside an episode.
@@ -37,7 +38,7 @@ pub enum Windows {
 }
 
 /// The critic's regression target.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "snake_case")]
 pub enum Target {
     /// sum_{k<n} discount^k r_{t+k} + discount^n (1 - terminated) Q'(s_{t+n}, pi'(s_{t+n})).
@@ -47,7 +48,7 @@ pub enum Target {
 }
 
 /// The learning algorithm.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct AlgorithmConfig {
     /// Which algorithm.
@@ -87,7 +88,7 @@ pub struct AlgorithmConfig {
 }
 
 /// What only TD3 has.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct Td3Config {
     /// Standard deviation of the noise on the target policy's actions, in units of u.
@@ -105,14 +106,14 @@ impl Default for Td3Config {
 }
 
 /// What only SAC has.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct SacConfig {
     /// Weight of the entropy at the start.
     pub initial_temperature: f64,
     /// Adam step size of the temperature's logarithm.
     pub temperature_learning_rate: f64,
-    /// Entropy that the temperature steers to, for each action of a decision [nat]. For
+    /// Entropy that the temperature steers to, for each action of a decision \[nat\]. For
     /// `mlp` policies -1 is the default: a segment's actions go together, so it has less.
     pub target_entropy_per_action: f64,
 }
@@ -150,7 +151,7 @@ impl Default for AlgorithmConfig {
 }
 
 /// How step sizes change over a run.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "snake_case")]
 pub enum LearningRateDecay {
     /// They stay.
@@ -160,7 +161,7 @@ pub enum LearningRateDecay {
 }
 
 /// Proximal policy optimisation over segments, after the released code of Neural Dynamic Policies.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct NdpConfig {
     /// Half-width of the interval around 1 beyond which a ratio of probabilities earns nothing.
@@ -201,7 +202,7 @@ impl Default for NdpConfig {
 }
 
 /// What exploration adds, and where.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "snake_case")]
 pub enum ExplorationKind {
     /// Independent Gaussian noise on every action.
@@ -215,7 +216,7 @@ pub enum ExplorationKind {
 }
 
 /// What the warm-up draws.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "snake_case")]
 pub enum WarmUpKind {
     /// Uniform actions within `warm_up_range` of the range.
@@ -226,7 +227,7 @@ pub enum WarmUpKind {
 
 /// How the rollout departs from the policy. A policy that draws from a distribution of its own
 /// (SAC) departs by that: `kind` and `std` are then not used.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct ExplorationConfig {
     /// What is added.

@@ -1,9 +1,10 @@
 //! Configuration of the policy: its kind, its DMP and its inverse controller.
 
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 /// How the phase x of the canonical system advances.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "snake_case")]
 pub enum CanonicalIntegration {
     /// Explicit Euler, advanced before the basis is evaluated (x_1 = 0.975).
@@ -13,7 +14,7 @@ pub enum CanonicalIntegration {
 }
 
 /// Widths h_i of the Gaussian basis functions.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "snake_case")]
 pub enum BasisWidths {
     /// h_i = N^1.5 / (c_i alpha_x), as in Neural Dynamic Policies.
@@ -23,7 +24,7 @@ pub enum BasisWidths {
 }
 
 /// What multiplies the forcing term.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "snake_case")]
 pub enum ForcingScaling {
     /// Nothing (the paper's equation 9).
@@ -33,7 +34,7 @@ pub enum ForcingScaling {
 }
 
 /// How the transformation system is integrated over a segment.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "snake_case")]
 pub enum Integrator {
     /// yd first, then y with the new yd.
@@ -71,14 +72,16 @@ impl Integrator {
 }
 
 /// The dynamic movement primitive, one per action dimension.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct DmpConfig {
-    /// Number of basis functions N.
+    /// Number of basis functions N: with more a segment's motion may have more shape.
     pub basis_count: usize,
-    /// Decay of the phase, alpha_x.
+    /// Decay of the phase, alpha_x: the larger, the sooner the forcing term fades.
     pub alpha_x: f64,
-    /// Stiffness of the transformation system; beta_y = alpha_y / 4 (critically damped).
+    /// Stiffness of the transformation system; beta_y = alpha_y / 4 (critically damped). The
+    /// larger, the sooner the motion reaches its goal. Refused where the integrator would be
+    /// unstable.
     pub alpha_y: f64,
     /// Integration steps m over one segment; a multiple of `policy.segment_steps`.
     pub integration_steps: usize,
@@ -108,7 +111,7 @@ impl Default for DmpConfig {
 }
 
 /// What decides the actions.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "snake_case")]
 pub enum PolicyKind {
     /// A network that outputs DMP and inverse-controller parameters for a segment.
@@ -118,7 +121,7 @@ pub enum PolicyKind {
 }
 
 /// Bounds of the inverse controller's parameters rho.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "snake_case")]
 pub enum RhoKind {
     /// rho = (1, 0, 0, 0) + rho_range * tanh(.).
@@ -128,7 +131,7 @@ pub enum RhoKind {
 }
 
 /// What turns the DMP's motion into actions.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "snake_case")]
 pub enum Controller {
     /// The adaptive inverse controller, whose rho the network decides.
@@ -139,7 +142,7 @@ pub enum Controller {
 }
 
 /// Where a segment's DMP starts.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "snake_case")]
 pub enum Start {
     /// y = yd = 0 at every segment.
@@ -151,7 +154,7 @@ pub enum Start {
 }
 
 /// Where yd0 comes from when `start = "observed"`.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "snake_case")]
 pub enum StartVelocity {
     /// Measured velocity, converted to DMP time.
@@ -161,10 +164,10 @@ pub enum StartVelocity {
 }
 
 /// How one action dimension's y0 and yd0 are read from an observation.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(untagged, deny_unknown_fields)]
 pub enum StartSource {
-    /// y0 = atan2(observation[sin], observation[cos]).
+    /// y0 = atan2(observation\[sin\], observation\[cos\]).
     Angle {
         /// Index of the cosine.
         cos: usize,
@@ -173,7 +176,7 @@ pub enum StartSource {
         /// Index of the angular velocity [rad/s].
         velocity: usize,
     },
-    /// y0 = scale * observation[index], yd0 from observation[velocity].
+    /// y0 = scale * observation\[index\], yd0 from observation\[velocity\].
     Value {
         /// Index of the position.
         index: usize,
@@ -190,21 +193,22 @@ fn unit_scale() -> f32 {
 }
 
 /// The policy: from observation to the actions of a segment.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct PolicyConfig {
     /// What decides the actions.
     pub kind: PolicyKind,
-    /// Environment steps K of one decision; `mlp` decides every step whatever stands here.
+    /// Environment steps K of one decision, carried out without looking again; `mlp` decides every
+    /// step whatever stands here.
     pub segment_steps: usize,
     /// Widths of the actor's hidden layers.
     pub hidden: Vec<usize>,
     /// Whether the networks see observations of zero mean and unit scale. The statistics begin at
     /// the end of the warm-up; published policies have them folded in.
     pub normalise_observations: bool,
-    /// g = goal_range * tanh(.).
+    /// Bound of the goal: g = goal_range * tanh(.).
     pub goal_range: f64,
-    /// w = weight_range * omega^2 * tanh(.), omega = alpha_y / 2.
+    /// Bound of the weights: w = weight_range * omega^2 * tanh(.), omega = alpha_y / 2.
     pub weight_range: f64,
     /// What turns the DMP's motion into actions.
     pub controller: Controller,

@@ -1,11 +1,12 @@
 //! The root of the configuration tree and the sections that are neither policy nor algorithm.
 
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 use super::{AlgorithmConfig, DmpConfig, ExplorationConfig, PolicyConfig, StartSource};
 
 /// One experiment: everything that decides what a run does.
-#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct ExperimentConfig {
     /// Length, seed and stopping rules.
@@ -43,7 +44,7 @@ pub struct ExperimentConfig {
 }
 
 /// Length, seed and stopping rules. An infinite bound never stops a run.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct RunConfig {
     /// Master seed; every random stream of the run derives from it.
@@ -52,11 +53,11 @@ pub struct RunConfig {
     pub steps: u64,
     /// One process in lock-step; the same seed gives the same bytes.
     pub deterministic: bool,
-    /// Stop at this mean evaluation return.
+    /// Stop at the first evaluation whose mean return is this or more; inf: at none.
     pub until_return: f64,
-    /// Stop at this evaluation success rate.
+    /// Stop at the first evaluation whose success rate, 0 to 1, is this or more; inf: at none.
     pub until_success: f64,
-    /// Stop after so many minutes of wall clock.
+    /// Stop after so many minutes of wall clock, counted anew by `resume`; inf: never.
     pub max_minutes: f64,
 }
 
@@ -74,7 +75,7 @@ impl Default for RunConfig {
 }
 
 /// The environment.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct TaskConfig {
     /// The name typed on the command line.
@@ -99,7 +100,7 @@ impl Default for TaskConfig {
 }
 
 /// Which goals an episode is repeated with.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "snake_case")]
 pub enum Hindsight {
     /// None but the one it had.
@@ -109,7 +110,7 @@ pub enum Hindsight {
 }
 
 /// Storage of experience.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct ReplayConfig {
     /// Environment steps held, copies included; the oldest are replaced.
@@ -127,7 +128,7 @@ impl Default for ReplayConfig {
 }
 
 /// Experience that somebody recorded, from which a run starts.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct DemonstrationsConfig {
     /// Files of steps (docs/demonstrations.md).
@@ -153,10 +154,11 @@ impl DemonstrationsConfig {
 }
 
 /// Updates per inserted segment, and how far either side may run ahead.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct PacingConfig {
-    /// Updates per segment inserted after the warm-up.
+    /// Updates per segment inserted after the warm-up: more learn more from each step, take longer,
+    /// and may make the critic diverge.
     pub updates_per_segment: f64,
     /// Segments the learner may hold un-updated before it stops taking more, so that workers wait.
     pub tolerance_segments: u64,
@@ -169,7 +171,7 @@ impl Default for PacingConfig {
 }
 
 /// The rollout workers.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct ActorsConfig {
     /// Worker processes; 0 stands for cores - 1, at least 1.
@@ -177,12 +179,12 @@ pub struct ActorsConfig {
     /// Workers that may join a running experiment (`dmprl actor --join RUN`) at once. Each has its
     /// queue from the start, whether it comes or not.
     pub joined_max: usize,
-    /// Environments in each worker.
+    /// Environments in each worker, which run a segment in one call.
     pub envs_per_worker: usize,
     /// Segments a worker's queue to the learner holds; full: the worker waits. 0 stands for
     /// `envs_per_worker`: with fewer a worker would wait for the learner in every segment.
     pub queue_segments: usize,
-    /// A worker that waited so long on a full queue reports it, naming the learner [s].
+    /// A worker that waited so long on a full queue reports it, naming the learner \[s\].
     pub send_deadline_s: f64,
     /// Restarts of one worker before the run gives up on it. One that delivered segments for five
     /// minutes has them all again.
@@ -192,7 +194,7 @@ pub struct ActorsConfig {
     /// restarted.
     pub env_failures_max: u32,
     /// One call into the environments (a segment in each of a worker's, or their reset) that lasts
-    /// longer hangs: its process ends, the evaluator's too, and is restarted [s].
+    /// longer hangs: its process ends, the evaluator's too, and is restarted \[s\].
     pub env_call_timeout_s: f64,
 }
 
@@ -220,7 +222,7 @@ impl ActorsConfig {
 }
 
 /// When a worker may forget a segment.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "snake_case")]
 pub enum DeliveryLevel {
     /// When the learner has inserted it: its death loses what came after its last checkpoint.
@@ -230,7 +232,7 @@ pub enum DeliveryLevel {
 }
 
 /// What a death may cost on the way from worker to learner.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct DeliveryConfig {
     /// When a worker may forget a segment.
@@ -239,7 +241,7 @@ pub struct DeliveryConfig {
     /// stands for `actors.queue_segments` and 1 024 more, which come in while an acknowledgement
     /// is on its way.
     pub unacknowledged_segments: usize,
-    /// Size of the segment log [bytes]; full: a checkpoint is written, which empties it.
+    /// Size of the segment log \[bytes\]; full: a checkpoint is written, which empties it.
     pub log_bytes_max: u64,
 }
 
@@ -250,14 +252,14 @@ impl Default for DeliveryConfig {
     }
 }
 
-/// What happens when the learner dies.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+/// What happens when a process dies or hangs.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct SupervisionConfig {
     /// Restarts of a learner that was killed or crashed before the run ends. One that wrote a
     /// checkpoint and lived for five minutes has them all again.
     pub learner_restarts_max: u32,
-    /// A worker that gives no sign of life for so long hangs: it is killed and restarted [s].
+    /// A worker that gives no sign of life for so long hangs: it is killed and restarted \[s\].
     pub heartbeat_timeout_s: f64,
 }
 
@@ -268,7 +270,7 @@ impl Default for SupervisionConfig {
 }
 
 /// Where the update runs.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "snake_case")]
 pub enum Device {
     /// The processor.
@@ -278,7 +280,7 @@ pub enum Device {
 }
 
 /// What the products of an update multiply; sums and parameters are always f32.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "snake_case")]
 pub enum Precision {
     /// 32 bits.
@@ -288,16 +290,16 @@ pub enum Precision {
 }
 
 /// The learner process.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct LearnerConfig {
     /// Where the update runs.
     pub device: Device,
-    /// Threads of the update.
+    /// Threads of the update; their number changes no bit of the result.
     pub threads: usize,
     /// What the update's products multiply.
     pub precision: Precision,
-    /// Updates between two published parameter snapshots.
+    /// Updates between two published parameter snapshots, which workers then act by.
     pub publish_every_updates: u64,
 }
 
@@ -313,14 +315,15 @@ impl Default for LearnerConfig {
 }
 
 /// Noise-free evaluation in its own process.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct EvaluationConfig {
     /// Environment steps between evaluations; one more always follows the last step.
     pub interval_steps: u64,
     /// Episodes of one evaluation.
     pub episodes: usize,
-    /// Episode i is reset with seed first_seed + i.
+    /// Episode i is reset with seed first_seed + i, in every evaluation. Searches use 5000 and
+    /// on, so that what they find is judged by episodes that they have not seen.
     pub first_seed: u64,
 }
 
@@ -331,14 +334,14 @@ impl Default for EvaluationConfig {
 }
 
 /// What is kept on disk to go on from.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct CheckpointConfig {
     /// Environment steps between checkpoints; one more always ends a run.
     pub interval_steps: u64,
     /// Checkpoints kept.
     pub keep: usize,
-    /// Disk space all checkpoints of a run may take together [bytes]; at least one is kept.
+    /// Disk space all checkpoints of a run may take together \[bytes\]; at least one is kept.
     pub disk_bytes_max: u64,
 }
 
@@ -349,7 +352,7 @@ impl Default for CheckpointConfig {
 }
 
 /// What is written about the run.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct MetricsConfig {
     /// Environment steps between two lines of `metrics.jsonl`.

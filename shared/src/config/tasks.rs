@@ -25,7 +25,7 @@ pub struct TaskDefaults {
     pub action_high: &'static [f64],
     /// Steps of an episode.
     pub episode_steps: u32,
-    /// Duration of a step [s].
+    /// Duration of a step \[s\].
     pub control_dt_s: f64,
     /// Values over the defaults, as parts of one TOML text.
     #[serde(skip)]

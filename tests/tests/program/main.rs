@@ -20,6 +20,7 @@ mod dashboard_page;
 mod deaths;
 mod delivery;
 mod determinism;
+mod documents;
 mod endings;
 mod environments;
 mod export;

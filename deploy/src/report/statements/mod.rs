@@ -32,7 +32,7 @@ pub enum Verdict {
     DidNotHold,
     /// A difference within the intervals.
     NoClearDifference,
-    /// There are runs, but fewer than [`SEEDS_MIN`] of a method.
+    /// There are runs, but fewer than `SEEDS_MIN` of a method.
     TooFewSeeds,
     /// Nothing to judge by.
     NotRun,

@@ -214,7 +214,7 @@ impl Study {
         best_of(&self.trials)
     }
 
-    /// Where [`Study::write_best`] writes.
+    /// Where `Study::write_best` writes.
     #[must_use]
     pub fn best_path(&self, output: &Path) -> PathBuf {
         output.join(&self.directory).join("best.toml")

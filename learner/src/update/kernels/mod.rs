@@ -9,7 +9,7 @@
 //! | [`Backward`]  dX = dY W, masked   | dY, by rows | W as it stands               |
 //! | [`WeightGradient`] dW = Σ dYᵀ X   | dY, by columns | X as it stands            |
 //!
-//! so one register tile ([`tile`]) does them all, and the panels of Wᵀ are the only copy. A tile
+//! so one register tile (`tile`) does them all, and the panels of Wᵀ are the only copy. A tile
 //! holds its outputs from the first product to the last: bias, ReLU and its mask cost no pass over
 //! memory, and every output is a sum in a fixed order whatever the number of threads.
 //!

@@ -88,7 +88,7 @@ impl Inbox {
         Ok(&self.settled)
     }
 
-    /// How much has been logged: what a checkpoint of this moment holds of it [bytes].
+    /// How much has been logged: what a checkpoint of this moment holds of it \[bytes\].
     #[must_use]
     pub fn logged(&self) -> u64 {
         self.log.as_ref().map_or(0, SegmentLog::logged)

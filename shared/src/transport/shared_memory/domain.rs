@@ -73,7 +73,7 @@ pub enum DomainError {
     TooLong {
         /// The directory.
         path: PathBuf,
-        /// Its length with the generation's directory and iceoryx2's prefix [bytes].
+        /// Its length with the generation's directory and iceoryx2's prefix \[bytes\].
         got: usize,
     },
     /// The token is empty, too long or has characters that do not belong into a name.
@@ -96,9 +96,9 @@ pub enum DomainError {
     Space {
         /// The directory.
         path: PathBuf,
-        /// Needed [bytes].
+        /// Needed \[bytes\].
         needed: u64,
-        /// Available [bytes].
+        /// Available \[bytes\].
         available: u64,
     },
 }

@@ -70,7 +70,7 @@ impl Plan {
         ]
     }
 
-    /// Shared memory that the run may use at most [bytes].
+    /// Shared memory that the run may use at most \[bytes\].
     #[must_use]
     pub fn required_bytes(&self) -> u64 {
         let Self { worker_count, queue_segments, layout, parameters_len, .. } = *self;
@@ -78,7 +78,7 @@ impl Plan {
     }
 }
 
-/// Shared memory that a run may use at most [bytes].
+/// Shared memory that a run may use at most \[bytes\].
 #[must_use]
 pub fn required_bytes(
     worker_count: usize,

@@ -21,7 +21,7 @@ const DEPTH_MAX: usize = 16;
 pub struct Leftover {
     /// The directory.
     pub path: PathBuf,
-    /// What it takes [bytes].
+    /// What it takes \[bytes\].
     pub bytes: u64,
 }
 

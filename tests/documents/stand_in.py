@@ -1,0 +1,155 @@
+"""`cargo` and `dmprl` for the code blocks of README and the book, as a test runs these.
+
+    stand_in.py cargo run --release -- train reacher --steps 60000
+    stand_in.py dmprl eval runs/mine
+
+It runs the program itself, but a fiftieth of the steps, few rounds of a benchmark, a sweep without
+its runs, and a page only until it can be opened. Everything else is done as it is written.
+"""
+
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+STEPS_SHARE = 50
+STEPS = 400
+"""Of a training that says nothing of its length."""
+WAIT_S = 100.0
+"""For a page or a run to begin [s]."""
+POLL_S = 0.02
+INTERRUPTED = 130
+"""Exit status after Ctrl-C."""
+SERVERS = ("dashboard", "play")
+FEW = {
+    "bench": {"--rounds": "1"},
+    "chaos": {"--seconds": "1", "--worker-kills": "1", "--learner-kills": "1"},
+    "eval": {"--episodes": "2"},
+    "record": {"--episodes": "1"},
+}
+"""Flags that cost time, and what they become where a block has them, or has them by default."""
+MEASURED_S = {"rollout": "0.2", "learner": "0.05", "transport": "0.05"}
+
+PROGRAM = os.environ["STAND_IN_PROGRAM"]
+PROJECT = Path(os.environ["STAND_IN_PROJECT"])
+
+
+def main(words):
+    """Does what one command line says; returns its exit status."""
+    called, *words = words
+    if called == "cargo":
+        if words[:3] != ["run", "--release", "--"]:
+            return cargo(" ".join(["cargo", *words]))
+        words = words[3:]
+    command = words[0]
+    if command in SERVERS:
+        if command == "play" and "--stream" not in words:
+            words = [*words, "--stream"]
+        return serve([*words, "--port", "0"])
+    if words[:2] == ["actor", "--join"]:
+        return join(words[2])
+    return subprocess.run([PROGRAM, *cheap(words)], check=False).returncode
+
+
+def cargo(line):
+    """No test builds or tests the project once more: what is shown must be what is done anyway."""
+    if line in (PROJECT / ".ci/run").read_text().splitlines():
+        return 0
+    test = re.fullmatch(r"cargo test --release --test (\w+)", line)
+    places = [PROJECT / f"{crate}/tests" for crate in ("tests", "deploy", "learner", "shared")]
+    names = [f"{test[1]}.rs", f"{test[1]}/main.rs"] if test else []
+    if any((place / name).is_file() for place in places for name in names):
+        return 0
+    print(f"`{line}` is not in .ci/run and names no test", file=sys.stderr)
+    return 1
+
+
+def cheap(words):
+    """The command line, with less to do."""
+    command = words[0]
+    if command in ("train", "resume"):
+        steps = flag(words, "--steps")
+        if steps is not None:
+            words = replaced(words, "--steps", str(max(int(steps) // STEPS_SHARE, 1)))
+        elif command == "train":
+            words = [*words, "--steps", str(STEPS)]
+    if command == "train" and "ndp" not in words:
+        words = [*words, "--set", "exploration.warm_up_steps=40"]
+    if command == "sweep" and "--dry-run" not in words:
+        words = [*words, "--dry-run"]
+    for name, value in FEW.get(command, {}).items():
+        words = replaced(words, name, value)
+    if command == "bench":
+        if words[1] in MEASURED_S:
+            words = replaced(words, "--seconds", MEASURED_S[words[1]])
+        if words[1] == "policy":
+            words = replaced(words, "--calls", "20")
+    return words
+
+
+def flag(words, name):
+    """A flag's value; none where the flag is not given."""
+    return words[words.index(name) + 1] if name in words else None
+
+
+def replaced(words, name, value):
+    """The words with another value of a flag."""
+    if name in words:
+        at = words.index(name)
+        words = words[:at] + words[at + 2 :]
+    return [*words, name, value]
+
+
+def serve(words):
+    """Starts what is there until Ctrl-C, and stops it as soon as it has an address."""
+    server = subprocess.Popen([PROGRAM, *words], stdout=subprocess.PIPE, encoding="utf-8")
+    # The program has limits of its own for everything before this line.
+    line = server.stdout.readline()
+    server.send_signal(signal.SIGINT)
+    server.communicate(timeout=WAIT_S)
+    if "http://127.0.0.1:" not in line:
+        print(f"{words} printed no address but {line!r}", file=sys.stderr)
+        return 1
+    return 0 if server.returncode in (0, INTERRUPTED) else 1
+
+
+def join(run):
+    """Joins a run that is being trained, in the place of the one that is named, and leaves it."""
+    run = f"{run}-joined"
+    trained = [PROGRAM, "train", "reacher", "--run-dir", run, "--steps", str(10**9)]
+    training = subprocess.Popen(trained, stderr=subprocess.DEVNULL)
+    try:
+        until(lambda: Path(run, "processes.json").is_file(), "a run to join")
+        joined = subprocess.Popen(
+            [PROGRAM, "actor", "--join", run], stderr=subprocess.PIPE, encoding="utf-8"
+        )
+        # Its last line, if it may not join, is followed by none.
+        said = joined.stderr.readline()
+        while said and not re.match(r"joined .+ as actor-\d+", said):
+            said = joined.stderr.readline()
+        joined.send_signal(signal.SIGINT)
+        joined.communicate(timeout=WAIT_S)
+        # Its hand-over is an end by Ctrl-C.
+        return 0 if said and joined.returncode == INTERRUPTED else 1
+    finally:
+        training.send_signal(signal.SIGINT)
+        training.wait(WAIT_S)
+
+
+def until(condition, what):
+    """Waits for a condition.
+
+    :raises TimeoutError: it does not come about.
+    """
+    deadline = time.monotonic() + WAIT_S
+    while not condition():
+        if time.monotonic() > deadline:
+            raise TimeoutError(f"waited {WAIT_S} s for {what}")
+        time.sleep(POLL_S)
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

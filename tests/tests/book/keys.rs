@@ -1,0 +1,218 @@
+//! `docs/configuration-keys.md`: every key with meaning and default, made from the types in
+//! `shared/src/config/`, whose comments are the meanings and whose `Default`s are the defaults.
+
+use std::collections::BTreeMap;
+use std::fmt::Write;
+
+use dmprl_shared::config::{
+    AlgorithmName, ExperimentConfig, PRESETS, PolicyKind, TASKS, algorithm_defaults,
+    policy_defaults,
+};
+use schemars::schema_for;
+use serde_json::Value;
+use toml::Table;
+
+/// A longer value would hide the rest of its line.
+const VALUE_LETTERS_MAX: usize = 40;
+/// With more, nobody reads the line.
+const VALUES_MAX: usize = 6;
+
+const HEAD: &str = "\
+# Every configuration key
+
+<!-- Made from the types in shared/src/config by the test `book`. To write it anew:
+     WRITE_CONFIGURATION_KEYS=1 cargo test --release --test book -->
+
+Each key can stand in a file for `--config`, in `--set KEY=VALUE`, and in an environment variable;
+[Configuration](configuration.md) says how these are laid over each other. Where a preset, a kind of
+policy, an algorithm or a task brings another value, it stands below the default. Of several, an
+algorithm wins over a preset, a preset over a kind of policy, and that over a task.
+";
+
+/// The page.
+pub fn page() -> String {
+    let schema = schema_for!(ExperimentConfig).to_value();
+    let defaults = Table::try_from(ExperimentConfig::default()).unwrap();
+    let others = others();
+    let mut text = HEAD.to_owned();
+    let mut last_section = String::new();
+    for key in keys_in_order() {
+        let (section, name) = key.rsplit_once('.').unwrap();
+        let of_section = described(&schema, section);
+        if section != last_section {
+            let about = meaning(&resolved(&schema, &of_section));
+            let level = "#".repeat(section.split('.').count() + 1);
+            write!(text, "\n{level} {section}\n\n{about}\n").unwrap();
+            section.clone_into(&mut last_section);
+        }
+        let property = &resolved(&schema, &of_section)["properties"][name];
+        let about = meaning(property);
+        assert!(!about.is_empty(), "{key} has no comment in shared/src/config");
+        let value = default_text(&key, &defaults, &others);
+        let kind = kind(&schema, property);
+        // A list stands by itself, a sentence goes on.
+        let gap = if kind.ends_with('\n') { "\n" } else { " " };
+        write!(text, "\n### {key}\n\n{about}\n\n{kind}{gap}{value}\n").unwrap();
+    }
+    text
+}
+
+/// Every key, in the order in which the types list them.
+fn keys_in_order() -> Vec<String> {
+    let text = toml::to_string(&ExperimentConfig::default()).unwrap();
+    let mut section = String::new();
+    let mut keys = Vec::new();
+    for line in text.lines() {
+        if let Some(name) = line.strip_prefix('[') {
+            section = name.trim_end_matches(']').to_owned();
+        } else if let Some((name, _)) = line.split_once(" = ") {
+            keys.push(format!("{section}.{name}"));
+        }
+    }
+    keys
+}
+
+/// What the schema says of a dotted name.
+fn described(schema: &Value, name: &str) -> Value {
+    name.split('.').fold(schema.clone(), |at, part| {
+        let found = resolved(schema, &at)["properties"][part].clone();
+        assert!(!found.is_null(), "the schema has no `{name}`");
+        found
+    })
+}
+
+/// What a reference refers to.
+fn resolved(schema: &Value, part: &Value) -> Value {
+    match part["$ref"].as_str() {
+        Some(path) => schema.pointer(path.trim_start_matches('#')).unwrap().clone(),
+        None => part.clone(),
+    }
+}
+
+/// A comment in one line; what is meant literally stays literal.
+fn meaning(part: &Value) -> String {
+    let text = part["description"].as_str().unwrap_or_default();
+    text.split_whitespace().collect::<Vec<_>>().join(" ")
+}
+
+/// What a value may be.
+fn kind(schema: &Value, property: &Value) -> String {
+    let part = resolved(schema, property);
+    if let Some(choices) = part["oneOf"].as_array() {
+        let line = |choice: &Value| {
+            format!("- `{}`: {}\n", choice["const"].as_str().unwrap(), meaning(choice))
+        };
+        return choices.iter().map(line).collect();
+    }
+    if let Some(forms) = part["anyOf"].as_array() {
+        return forms.iter().map(table_form).collect();
+    }
+    match part["type"].as_str().unwrap_or_default() {
+        "integer" => "A whole number.".into(),
+        "number" => "A number.".into(),
+        "boolean" => "`true` or `false`.".into(),
+        "string" => "A text.".into(),
+        "array" => {
+            let items = resolved(schema, &part["items"]);
+            let each = kind(schema, &items);
+            match items["anyOf"].is_array() {
+                true => format!("A list of these:\n\n{each}"),
+                false => format!("A list; each entry {}{}", each[..1].to_lowercase(), &each[1..]),
+            }
+        }
+        other => panic!("no words for values of type `{other}`: {part}"),
+    }
+}
+
+/// One form of a table as a value.
+fn table_form(form: &Value) -> String {
+    let fields = form["properties"].as_object().unwrap();
+    let names: Vec<_> = fields.keys().map(|name| format!("{name} = …")).collect();
+    let mut text = format!("- `{{ {} }}`: {}\n", names.join(", "), meaning(form));
+    for (name, field) in fields {
+        writeln!(text, "  - `{name}`: {}", meaning(field)).unwrap();
+    }
+    text
+}
+
+/// Who lays what over the defaults: a label and a table each.
+fn others() -> Vec<(String, Table)> {
+    let mut others = Vec::new();
+    for kind in [PolicyKind::Dmp, PolicyKind::Mlp] {
+        if let Some(table) = policy_defaults(kind) {
+            others.push((format!("with `--policy {}`", name_of(kind)), table));
+        }
+    }
+    let all = [AlgorithmName::Ddpg, AlgorithmName::Td3, AlgorithmName::Sac, AlgorithmName::Ndp];
+    for algorithm in all {
+        if let Some(table) = algorithm_defaults(algorithm) {
+            others.push((format!("with `--algo {}`", name_of(algorithm)), table));
+        }
+    }
+    for preset in &PRESETS {
+        others.push((format!("with `--preset {}`", preset.name), preset.table()));
+        for task in &TASKS {
+            let label = format!("with `--preset {}` on `{}`", preset.name, task.name);
+            others.push((label, task.over_preset(preset.name)));
+        }
+    }
+    others.extend(TASKS.iter().map(|task| (format!("on `{}`", task.name), task.table())));
+    others
+}
+
+fn name_of(value: impl serde::Serialize) -> String {
+    serde_json::to_value(value).unwrap().as_str().unwrap().to_owned()
+}
+
+fn at<'a>(table: &'a Table, key: &str) -> Option<&'a toml::Value> {
+    let (first, rest) = key.split_once('.')?;
+    let inner = table.get(first)?;
+    rest.split('.').try_fold(inner, |value, name| value.get(name))
+}
+
+/// The default, and who else brings another value.
+fn default_text(key: &str, defaults: &Table, others: &[(String, Table)]) -> String {
+    let default = at(defaults, key).unwrap().to_string();
+    let mut by_value: BTreeMap<String, Vec<&str>> = BTreeMap::new();
+    for (label, table) in others {
+        if let Some(value) = at(table, key).map(ToString::to_string) {
+            by_value.entry(value).or_default().push(label);
+        }
+    }
+    // Who says what is the default says something only where a task says otherwise.
+    let of_tasks = |labels: &Vec<&str>| labels.iter().any(|label| label.starts_with("on "));
+    let same = by_value.remove(&default);
+    if let Some(labels) = same.filter(|_| by_value.values().any(of_tasks)) {
+        by_value.insert(default.clone(), labels);
+    }
+    if by_value.is_empty() {
+        return format!("Default: `{default}`.");
+    }
+    let long = by_value.keys().any(|value| value.len() > VALUE_LETTERS_MAX);
+    if long || by_value.len() >= VALUES_MAX {
+        return format!("Default: `{default}`; each of the tasks has its own.");
+    }
+    let mut text = format!("Default: `{default}`, but\n\n");
+    // By who comes first in the list above.
+    let mut rest: Vec<_> = by_value.into_iter().collect();
+    rest.sort_by_key(|(_, labels)| others.iter().position(|(label, _)| label == labels[0]));
+    for (value, labels) in rest {
+        writeln!(text, "- `{value}` {}", joined(&labels)).unwrap();
+    }
+    text.pop();
+    text
+}
+
+/// `on a, on b` is `on a, b`.
+fn joined(labels: &[&str]) -> String {
+    let mut text = String::new();
+    let mut last = "";
+    for label in labels {
+        let (word, name) = label.split_once(' ').unwrap();
+        let gap = if text.is_empty() { "" } else { ", " };
+        let word = if word == last { String::new() } else { format!("{word} ") };
+        write!(text, "{gap}{word}{name}").unwrap();
+        last = label.split_once(' ').unwrap().0;
+    }
+    text
+}
