@@ -18,6 +18,8 @@ use std::process::Command;
 use dmprl_tests::program::{Workplace, executable};
 use dmprl_tests::{project_root, venv};
 
+use super::record::can_draw;
+
 /// Blocks that are not run, in all pages together. Better than raising it: say less, or run it.
 const NOT_RUN_MAX: usize = 6;
 /// What a clone has that blocks name.
@@ -120,6 +122,9 @@ fn follow(page: &str) {
     settle(&place);
     let blocks: Vec<_> = blocks(page).into_iter().filter(Block::is_run).collect();
     assert!(!blocks.is_empty(), "{page} has nothing to run: take it out of `pages!`");
+    // Asked only where there is something to draw: it takes a second.
+    let draws = |block: &Block| ["record", "play"].iter().any(|word| block.text.contains(word));
+    let can_draw = !blocks.iter().any(draws) || can_draw();
     for block in blocks {
         if let Some(name) = block.attributes.iter().find_map(|it| it.strip_prefix("file=")) {
             fs::write(place.path(name), &block.text).unwrap();
@@ -141,6 +146,9 @@ fn follow(page: &str) {
         };
         command.envs(SMALL).env("PATH", search_path(&place));
         command.env("PYTHONPATH", project_root().join("envs_py"));
+        if !can_draw {
+            command.env("STAND_IN_CANNOT_DRAW", "1");
+        }
         command.env("STAND_IN_PROGRAM", executable()).env("STAND_IN_PROJECT", project_root());
         let ended = place.start_command(command).wait();
         assert!(
