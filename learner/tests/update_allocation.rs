@@ -2,9 +2,10 @@
 
 #![allow(clippy::unwrap_used, reason = "a test's helpers fail the test")]
 
-use std::alloc::{GlobalAlloc, Layout, System};
-use std::sync::atomic::{AtomicU64, Ordering};
+#[path = "../../shared/tests/counting_allocator/mod.rs"]
+mod counting_allocator;
 
+use counting_allocator::allocations_of;
 use dmprl_learner::algorithms::{Algorithm, Batch};
 use dmprl_learner::demonstrations::Steps;
 use dmprl_learner::learner::Learner;
@@ -13,27 +14,6 @@ use dmprl_shared::config::{Layers, Limits};
 use dmprl_shared::policy::Policy;
 use dmprl_shared::segment::{LAYOUT_VERSION, Segment, SegmentHeader, block_checksum};
 use dmprl_shared::spec::EnvSpec;
-
-struct Counting;
-
-static ALLOCATIONS: AtomicU64 = AtomicU64::new(0);
-
-// SAFETY: all work is the system allocator's; the counter does not touch the memory.
-unsafe impl GlobalAlloc for Counting {
-    unsafe fn alloc(&self, layout: Layout) -> *mut u8 {
-        ALLOCATIONS.fetch_add(1, Ordering::Relaxed);
-        // SAFETY: the caller's promise is passed on.
-        unsafe { System.alloc(layout) }
-    }
-
-    unsafe fn dealloc(&self, pointer: *mut u8, layout: Layout) {
-        // SAFETY: the caller's promise is passed on.
-        unsafe { System.dealloc(pointer, layout) }
-    }
-}
-
-#[global_allocator]
-static ALLOCATOR: Counting = Counting;
 
 fn spec() -> EnvSpec {
     EnvSpec {
@@ -75,9 +55,7 @@ fn allocations([algorithm, policy, norm]: [&str; 3], precision: &str, threads: &
         algorithm.update(&policy, &batch, count).unwrap();
     };
     (1..5).for_each(&mut update);
-    let before = ALLOCATIONS.load(Ordering::Relaxed);
-    (5..25).for_each(&mut update);
-    ALLOCATIONS.load(Ordering::Relaxed) - before
+    allocations_of(|| (5..25).for_each(&mut update))
 }
 
 /// Allocations of twenty segments and the updates that they make due, sampling and normalising
@@ -130,9 +108,7 @@ fn allocations_of_a_learner(algorithm: &str) -> u64 {
     };
     // Mean and scale are taken anew at each doubling of what was seen, the last time before 40.
     (1..=40).for_each(&mut turn);
-    let before = ALLOCATIONS.load(Ordering::Relaxed);
-    (41..=60).for_each(&mut turn);
-    let allocated = ALLOCATIONS.load(Ordering::Relaxed) - before;
+    let allocated = allocations_of(|| (41..=60).for_each(&mut turn));
     assert!(updates >= 60, "{algorithm}: {updates} updates show nothing");
     allocated
 }
@@ -154,9 +130,7 @@ fn allocations_of_imitation() -> u64 {
     steps.truncated[29] = true;
     learner.demonstrate(&[steps]).unwrap();
     (1..5).for_each(|_| learner.update().unwrap());
-    let before = ALLOCATIONS.load(Ordering::Relaxed);
-    (5..25).for_each(|_| learner.update().unwrap());
-    ALLOCATIONS.load(Ordering::Relaxed) - before
+    allocations_of(|| (5..25).for_each(|_| learner.update().unwrap()))
 }
 
 /// Alone in its binary: the counter sees every thread.

@@ -2,35 +2,14 @@
 
 #![allow(clippy::unwrap_used, reason = "a test's helpers fail the test")]
 
-use std::alloc::{GlobalAlloc, Layout, System};
-use std::sync::atomic::{AtomicU64, Ordering};
+mod counting_allocator;
 
+use counting_allocator::allocations_of;
 use dmprl_shared::config::Layers;
 use dmprl_shared::policy::Policy;
 use dmprl_shared::runtime::PolicyRuntime;
 use dmprl_shared::seeds;
 use dmprl_shared::spec::EnvSpec;
-
-struct Counting;
-
-static ALLOCATIONS: AtomicU64 = AtomicU64::new(0);
-
-// SAFETY: all work is the system allocator's; the counter does not touch the memory.
-unsafe impl GlobalAlloc for Counting {
-    unsafe fn alloc(&self, layout: Layout) -> *mut u8 {
-        ALLOCATIONS.fetch_add(1, Ordering::Relaxed);
-        // SAFETY: the caller's promise is passed on.
-        unsafe { System.alloc(layout) }
-    }
-
-    unsafe fn dealloc(&self, pointer: *mut u8, layout: Layout) {
-        // SAFETY: the caller's promise is passed on.
-        unsafe { System.dealloc(pointer, layout) }
-    }
-}
-
-#[global_allocator]
-static ALLOCATOR: Counting = Counting;
 
 /// Alone in its binary: the counter sees every thread.
 #[test]
@@ -54,13 +33,14 @@ fn decisions_steps_and_holds_allocate_nothing() {
         let observation = [0.1, -0.2, 0.3, -0.4];
         // gemm makes its buffers at its first product.
         runtime.segment(&observation).unwrap();
-        let before = ALLOCATIONS.load(Ordering::Relaxed);
-        for step in 0..100 {
-            runtime.segment(&observation).unwrap();
-            runtime.action((step % 3 > 0).then_some(&observation[..])).unwrap();
-            runtime.hold();
-            runtime.reset(None).unwrap();
-        }
-        assert_eq!(ALLOCATIONS.load(Ordering::Relaxed), before, "{keys:?}");
+        let allocated = allocations_of(|| {
+            for step in 0..100 {
+                runtime.segment(&observation).unwrap();
+                runtime.action((step % 3 > 0).then_some(&observation[..])).unwrap();
+                runtime.hold();
+                runtime.reset(None).unwrap();
+            }
+        });
+        assert_eq!(allocated, 0, "{keys:?}");
     }
 }

@@ -2,11 +2,10 @@
 
 #![allow(clippy::unwrap_used, reason = "a test's helpers fail the test")]
 
+mod counting_allocator;
 mod transport_support;
 
-use std::alloc::{GlobalAlloc, Layout, System};
-use std::sync::atomic::{AtomicU64, Ordering};
-
+use counting_allocator::allocations_of;
 use dmprl_shared::segment::Segment;
 use dmprl_shared::transport::delivery::{Acknowledgements, Inbox, Outbox, SegmentLog};
 use dmprl_shared::transport::shared_memory::{attach, serve};
@@ -14,34 +13,6 @@ use dmprl_shared::transport::{
     ParameterPublisher, ParameterSubscriber, SegmentReceiver, SendOutcome,
 };
 use transport_support::{LAYOUT, Parent, header, plan, snapshot};
-
-struct Counting;
-
-static ALLOCATIONS: AtomicU64 = AtomicU64::new(0);
-
-// SAFETY: all work is the system allocator's; the counter does not touch the memory.
-unsafe impl GlobalAlloc for Counting {
-    unsafe fn alloc(&self, layout: Layout) -> *mut u8 {
-        ALLOCATIONS.fetch_add(1, Ordering::Relaxed);
-        // SAFETY: the caller's promise is passed on.
-        unsafe { System.alloc(layout) }
-    }
-
-    unsafe fn dealloc(&self, pointer: *mut u8, layout: Layout) {
-        // SAFETY: the caller's promise is passed on.
-        unsafe { System.dealloc(pointer, layout) }
-    }
-}
-
-#[global_allocator]
-static ALLOCATOR: Counting = Counting;
-
-/// How many allocations `work` does.
-fn allocations(work: impl FnOnce()) -> u64 {
-    let before = ALLOCATIONS.load(Ordering::Relaxed);
-    work();
-    ALLOCATIONS.load(Ordering::Relaxed) - before
-}
 
 fn log(parent: &Parent) -> SegmentLog {
     SegmentLog::open(&parent.path().join("log"), (7, 1), LAYOUT, 1 << 30).unwrap()
@@ -73,12 +44,12 @@ fn the_steady_state_allocates_only_what_iceoryx2_does_for_a_sample() {
     let (mut offers, mut delivered, mut sending, mut reading) = (0, 0, 0, 0);
     for version in 1..=ROUNDS {
         published.version = version;
-        sending += allocations(|| {
+        sending += allocations_of(|| {
             learner.parameters.publish(&published).unwrap();
             learner.acknowledgements.acknowledge(inbox.acknowledge().unwrap()).unwrap();
         });
         for (index, (worker, outbox, sequence)) in workers.iter_mut().enumerate() {
-            reading += allocations(|| {
+            reading += allocations_of(|| {
                 assert!(worker.parameters.newest(&mut taken).unwrap());
                 assert!(worker.acknowledgements.newest(&mut acknowledgements).unwrap());
                 outbox.acknowledge(&acknowledgements);
@@ -92,7 +63,7 @@ fn the_steady_state_allocates_only_what_iceoryx2_does_for_a_sample() {
                     assert!(outbox.put(&header(index as u32, 1, *sequence), &block));
                     outcome = outbox.offer(&mut worker.segments).unwrap();
                 };
-                sending += allocations(offer);
+                sending += allocations_of(offer);
                 offers += 1;
             }
             assert_eq!(outcome, SendOutcome::Full);
@@ -105,14 +76,14 @@ fn the_steady_state_allocates_only_what_iceoryx2_does_for_a_sample() {
             inbox.acknowledge().unwrap();
         };
         for (worker, outbox, _) in &mut workers {
-            reading += allocations(&mut take);
+            reading += allocations_of(&mut take);
             // The one that found its queue full.
-            sending += allocations(|| {
+            sending += allocations_of(|| {
                 assert_eq!(outbox.offer(&mut worker.segments).unwrap(), SendOutcome::Delivered);
             });
             offers += 1;
         }
-        reading += allocations(&mut take);
+        reading += allocations_of(&mut take);
     }
     assert_eq!(reading, 0);
     assert!(sending <= offers + 2 * ROUNDS, "{sending} allocations for {offers} segments");
