@@ -10,8 +10,8 @@ use super::{emit, prepare_python, prepare_python_with, this_program};
 use crate::failure::Outcome;
 use crate::motion::Means;
 use crate::report::{
-    Report, Results, Wanted, curves, draw, efficiency, judge, measure_motions, strips, tables,
-    trajectories, undrawn, unmeasured, wanted,
+    Report, Results, Wanted, curves, draw, efficiency, judge, lost_strips, lost_trajectories,
+    measure_motions, strips, tables, trajectories, undrawn, unmeasured, wanted,
 };
 use crate::run_directory::rfc3339;
 use crate::terminal::{say, shown};
@@ -24,18 +24,22 @@ paper's figures where the task and the method are the paper's. Only runs that ha
 count in a table.
 How a run moves is measured once, by rolling its last policy out, and kept in the run; so are
 frames of a rollout, which need an environment that can be drawn.
+The folder of an earlier report stands in for runs that lie elsewhere or nowhere any more: its runs
+count wherever no run or sweep that is given has the same task, method and seed at its end. It may
+be the folder that is written.
 
 EXAMPLES
   dmprl report runs/paper
   dmprl report runs/reacher-s1 runs/reacher-s2 runs/reacher-s3 --output report
+  dmprl report runs/paper reports/of-another-machine --output reports/both
   dmprl report runs/paper --no-motion --json";
 
 /// Arguments of `dmprl report`.
 #[derive(Debug, Args)]
 #[command(after_help = HELP)]
 pub(super) struct ReportArgs {
-    /// Run directories, and directories of sweeps.
-    #[arg(required = true, value_name = "RUN|SWEEP")]
+    /// Run directories, directories of sweeps, and folders of earlier reports.
+    #[arg(required = true, value_name = "RUN|SWEEP|REPORT")]
     runs: Vec<PathBuf>,
     /// Where the report goes [default: SWEEP/report for one sweep, else report].
     #[arg(long, value_name = "DIR")]
@@ -56,6 +60,15 @@ pub(super) fn run(args: &ReportArgs) -> anyhow::Result<Outcome> {
     let wanted = wanted(&results)?;
     if !args.no_motion && drawn(&wanted, &mut results)? == Outcome::Interrupted {
         return Ok(Outcome::Interrupted);
+    }
+    let lost = lost_strips(&wanted).into_iter().chain(lost_trajectories(&results));
+    let lost: Vec<String> = lost.collect();
+    results.undrawn.extend(lost);
+    for reason in &results.unmeasured {
+        say(&format!("motion not measured: {reason}"));
+    }
+    for reason in &results.undrawn {
+        say(&format!("not drawn: {reason}"));
     }
     let of_one = |path: &PathBuf| path.join("sweep.toml").is_file().then(|| path.join("report"));
     let output = match (&args.output, args.runs.as_slice()) {
@@ -102,17 +115,13 @@ fn measure(results: &mut Results) -> anyhow::Result<Outcome> {
     if unmeasured(results) == 0 {
         return Ok(Outcome::Done);
     }
-    let outcome = match prepare_python() {
+    Ok(match prepare_python() {
         Ok(venv) => measure_motions(results, &Means { program: this_program()?, venv }),
         Err(error) => {
             results.unmeasured.push(format!("all of them: {error:#}"));
             Outcome::Done
         }
-    };
-    for reason in &results.unmeasured {
-        say(&format!("motion not measured: {reason}"));
-    }
-    Ok(outcome)
+    })
 }
 
 /// Draws frames that nobody has drawn; a report without pictures is better than none.
@@ -120,7 +129,7 @@ fn drawn(wanted: &[Wanted], results: &mut Results) -> anyhow::Result<Outcome> {
     if !undrawn(wanted) {
         return Ok(Outcome::Done);
     }
-    let outcome = match prepare_python_with("video") {
+    Ok(match prepare_python_with("video") {
         Ok((venv, python)) => {
             let means = Means { program: this_program()?, venv };
             draw(wanted, (&means, &python), &mut results.undrawn)
@@ -129,9 +138,5 @@ fn drawn(wanted: &[Wanted], results: &mut Results) -> anyhow::Result<Outcome> {
             results.undrawn.push(format!("anything: {error:#}"));
             Outcome::Done
         }
-    };
-    for reason in &results.undrawn {
-        say(&format!("not drawn: {reason}"));
-    }
-    Ok(outcome)
+    })
 }

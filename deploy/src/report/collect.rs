@@ -6,86 +6,12 @@ use std::path::{Path, PathBuf};
 use anyhow::Context;
 use dmprl_shared::config::{AlgorithmName, ExperimentConfig, PRESETS, PolicyKind};
 
-use crate::control::EvaluationRow;
+use super::landed;
+use super::run::{Key, Origin, Run, Source};
 use crate::failure::wrong_use;
-use crate::motion::Motion;
-use crate::run_directory::{Machine, Manifest, RunDirectory, Session};
+use crate::run_directory::RunDirectory;
 use crate::sweep::search::found;
 use crate::sweep::{Ledger, Plan, SweepFile, flatten};
-use crate::terminal::binary_bytes;
-
-/// Of a commit's hash, enough to find it.
-const HASH_LEN: usize = 12;
-
-/// One run and its evaluations.
-#[derive(Debug, Clone)]
-pub struct Run {
-    /// The task's name.
-    pub task: String,
-    /// The method's label.
-    pub method: String,
-    /// What its method plans with.
-    pub policy: PolicyKind,
-    /// `run.seed`.
-    pub seed: u64,
-    /// Its directory.
-    pub path: PathBuf,
-    /// Whether it has come to its end.
-    pub ended: bool,
-    /// Environment steps that it was asked for.
-    pub steps: u64,
-    /// Who made it, where and when.
-    pub origin: Origin,
-    /// Oldest first.
-    pub rows: Vec<EvaluationRow>,
-    /// How its last policy moves, where that was measured.
-    pub motion: Option<Motion>,
-}
-
-/// Who made a run, where and when.
-#[derive(Debug, Clone, Default, PartialEq)]
-pub struct Origin {
-    /// UTC, RFC 3339, of its first session.
-    pub started: String,
-    /// Versions of the program, with the commit where it is known; one a session.
-    pub programs: Vec<String>,
-    /// Processor, cores and memory.
-    pub machine: String,
-}
-
-impl Origin {
-    fn of(manifest: &Manifest) -> Self {
-        let program = |session: &Session| match &session.git_commit {
-            Some(commit) => {
-                let (hash, dirty) = commit.split_once('-').unwrap_or((commit, ""));
-                let hash: String = hash.chars().take(HASH_LEN).collect();
-                let dirty = if dirty.is_empty() { "" } else { ", changed since" };
-                format!("{} (commit {hash}{dirty})", session.dmprl_version)
-            }
-            None => session.dmprl_version.clone(),
-        };
-        let Machine { os, cpu, cores, memory_bytes } = &manifest.machine;
-        let cpu = cpu.as_deref().unwrap_or("unknown processor");
-        let memory = memory_bytes.map(|bytes| format!(", {}", binary_bytes(bytes)));
-        Self {
-            started: manifest
-                .sessions
-                .first()
-                .map(|first| first.started.clone())
-                .unwrap_or_default(),
-            programs: manifest.sessions.iter().map(program).collect(),
-            machine: format!("{cpu}, {cores} cores{}, {os}", memory.unwrap_or_default()),
-        }
-    }
-}
-
-impl Run {
-    /// The evaluation at its end; none while it has not come there.
-    #[must_use]
-    pub fn last(&self) -> Option<&EvaluationRow> {
-        self.rows.last().filter(|_| self.ended)
-    }
-}
 
 /// All runs of a report; tasks and methods in the order in which they were named.
 #[derive(Debug, Clone, Default)]
@@ -96,8 +22,8 @@ pub struct Results {
     pub methods: Vec<String>,
     /// Those that have begun.
     pub runs: Vec<Run>,
-    /// How many there are to be.
-    pub planned: usize,
+    /// Those that are to be.
+    pub waiting: Vec<Key>,
     /// The files of the sweeps, by the names of their directories.
     pub sweeps: Vec<(String, String)>,
     /// Runs whose motion could not be measured, and why.
@@ -107,19 +33,22 @@ pub struct Results {
 }
 
 impl Results {
-    /// Reads runs and sweeps.
+    /// Reads runs, sweeps and the folders of earlier reports.
     ///
     /// # Errors
-    /// Wrong use: a path is neither, or nothing has begun. A run that cannot be read.
+    /// Wrong use: a path is none of these, or nothing has begun. A run that cannot be read.
     pub fn read(paths: &[PathBuf]) -> anyhow::Result<Self> {
         let mut results = Self::default();
         for path in paths {
             if path.join("sweep.toml").is_file() {
                 results.add_sweep(path)?;
+            } else if path.join(landed::FILE).is_file() {
+                results.add_landed(path)?;
             } else {
                 results.add_run(path)?;
             }
         }
+        results.settle();
         if results.runs.iter().all(|run| run.rows.is_empty()) {
             return Err(wrong_use("no run has an evaluation yet: there is nothing to report"));
         }
@@ -142,9 +71,8 @@ impl Results {
             for found in found(&file, search, sweep)? {
                 let method = format!("{}, best trial", found.method);
                 self.add_planned(&found.task, &method);
-                for run in &found.runs {
-                    self.planned += 1;
-                    self.add_begun(sweep, &ledger, run, &method)?;
+                for (run, seed) in found.runs.iter().zip(&file.seeds) {
+                    self.add_begun((sweep, &ledger), run, (&found.task, &method, *seed))?;
                 }
             }
             return Ok(());
@@ -152,9 +80,9 @@ impl Results {
         for planned in Plan::new(&file)?.runs {
             let point = planned.point.iter().map(|value| format!(", {value}"));
             let method = format!("{}{}", planned.method, point.collect::<String>());
-            self.planned += 1;
             self.add_planned(&planned.task, &method);
-            self.add_begun(sweep, &ledger, &planned.directory, &method)?;
+            let which = (planned.task.as_str(), method.as_str(), planned.seed);
+            self.add_begun((sweep, &ledger), &planned.directory, which)?;
         }
         Ok(())
     }
@@ -165,33 +93,78 @@ impl Results {
         add_new(&mut self.methods, method);
     }
 
-    /// A run of a sweep, if it has begun.
+    /// A run of a sweep; one that has not begun waits.
     fn add_begun(
         &mut self,
-        sweep: &Path,
-        ledger: &Ledger,
+        (sweep, ledger): (&Path, &Ledger),
         place: &Path,
-        method: &str,
+        (task, method, seed): (&str, &str, i64),
     ) -> anyhow::Result<()> {
         let path = sweep.join(place);
         // The manifest is the last that is written when a directory is made.
-        if path.join("manifest.json").is_file() {
-            let directory = RunDirectory::open(&path)?;
-            let config = directory.config()?;
-            let mut run = run(&directory, &config, method.to_owned())?;
-            let finished = ledger.of(place);
-            run.ended |= finished.is_some_and(|finished| finished.is_whole(config.run.steps));
-            self.runs.push(run);
+        if !path.join("manifest.json").is_file() {
+            let (task, method) = (task.to_owned(), method.to_owned());
+            let seed =
+                u64::try_from(seed).with_context(|| format!("seed of {}", path.display()))?;
+            self.waiting.push(Key { task, method, seed });
+            return Ok(());
         }
+        let directory = RunDirectory::open(&path)?;
+        let config = directory.config()?;
+        let mut run = run(&directory, &config, method.to_owned())?;
+        let finished = ledger.of(place);
+        run.ended |= finished.is_some_and(|finished| finished.is_whole(config.run.steps));
+        self.runs.push(run);
         Ok(())
+    }
+
+    /// What an earlier report knew.
+    fn add_landed(&mut self, report: &Path) -> anyhow::Result<()> {
+        let landed = landed::read(report)?;
+        landed.tasks.iter().for_each(|task| add_new(&mut self.tasks, task));
+        landed.methods.iter().for_each(|method| add_new(&mut self.methods, method));
+        for sweep in landed.sweeps {
+            if !self.sweeps.contains(&sweep) {
+                self.sweeps.push(sweep);
+            }
+        }
+        self.runs.extend(landed.runs);
+        self.waiting.extend(landed.waiting);
+        Ok(())
+    }
+
+    /// Of a run that was landed and lies here too, or was landed by two reports, one stays: before
+    /// others one that has come to its end, then one in a directory, then the one named first.
+    /// Runs of directories, or of one report, are never set against each other.
+    fn settle(&mut self) {
+        let rank = |index: usize, run: &Run| (!run.ended, run.directory().is_none(), index);
+        let beaten = |(index, run): &(usize, &Run)| {
+            self.runs.iter().enumerate().any(|(other_index, other)| {
+                let landed = other.directory().is_none() || run.directory().is_none();
+                landed
+                    && other.source != run.source
+                    && other.is(&run.key())
+                    && rank(other_index, other) < rank(*index, run)
+            })
+        };
+        let stay = self.runs.iter().enumerate().filter(|run| !beaten(run));
+        self.runs = stay.map(|(_, run)| run.clone()).collect();
+        let mut waiting: Vec<Key> = Vec::new();
+        for key in std::mem::take(&mut self.waiting) {
+            if !waiting.contains(&key) && !self.runs.iter().any(|run| run.is(&key)) {
+                waiting.push(key);
+            }
+        }
+        self.waiting = waiting;
     }
 
     /// The label, with the first value that differs where another run of the task has it and learns
     /// otherwise: whatever they were begun with, they are no seeds of one method.
     fn own_label(&self, label: String, config: &ExperimentConfig) -> anyhow::Result<String> {
         let own = learning(config)?;
-        for other in self.of(&config.task.name, &label) {
-            let others = learning(&RunDirectory::open(&other.path)?.config()?)?;
+        let others = self.of(&config.task.name, &label).filter_map(Run::directory);
+        for other in others {
+            let others = learning(&RunDirectory::open(other)?.config()?)?;
             if let Some((key, value)) =
                 own.iter().find(|(key, value)| others.get(*key) != Some(value))
             {
@@ -209,7 +182,6 @@ impl Results {
         let run = run(&directory, &config, label)?;
         add_new(&mut self.tasks, &run.task);
         add_new(&mut self.methods, &run.method);
-        self.planned += 1;
         self.runs.push(run);
         Ok(())
     }
@@ -242,8 +214,8 @@ fn run(directory: &RunDirectory, config: &ExperimentConfig, method: String) -> a
     });
     let (task, seed, steps) = (config.task.name.clone(), config.run.seed, config.run.steps);
     let origin = Origin::of(&directory.manifest()?);
-    let policy = config.policy.kind;
-    Ok(Run { task, method, policy, seed, path, ended, steps, origin, rows, motion: None })
+    let (policy, source) = (config.policy.kind, Source::Directory(path));
+    Ok(Run { task, method, policy, seed, source, ended, steps, origin, rows, motion: None })
 }
 
 /// What a run is called that no sweep has named: a preset's runs are no seeds of the default's.
@@ -266,5 +238,54 @@ fn method(config: &ExperimentConfig) -> String {
     match config.policy.kind {
         PolicyKind::Dmp => format!("{algorithm}-DMP"),
         PolicyKind::Mlp => algorithm.to_owned(),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::planted::{Planted, planted};
+    use super::*;
+
+    /// Runs of one task and method: seed, whether it lies here, whether it has ended, its return.
+    fn settled(runs: &[(u64, bool, bool, f64)]) -> Vec<(u64, f64)> {
+        let run = |(seed, _, ended, value): &(u64, bool, bool, f64)| Planted {
+            task: "reacher-v1",
+            method: "TD3",
+            seed: *seed,
+            rows: vec![*value],
+            ended: *ended,
+        };
+        let mut results = planted(&runs.iter().map(run).collect::<Vec<_>>());
+        for (index, (run, (_, here, ..))) in results.runs.iter_mut().zip(runs).enumerate() {
+            if !here {
+                run.source = Source::Report(format!("report-{index}").into());
+            }
+        }
+        results.waiting = [1, 8, 8].map(|seed| Key { seed, ..results.runs[0].key() }).to_vec();
+        results.settle();
+        assert_eq!(results.waiting.iter().filter(|key| key.seed == 8).count(), 1);
+        assert!(results.waiting.iter().all(|key| key.seed != 1), "it has begun");
+        results.runs.iter().map(|run| (run.seed, run.rows[0].return_mean)).collect()
+    }
+
+    #[test]
+    fn a_landed_run_stands_where_none_that_lies_here_has_come_to_its_end() {
+        let (here, landed, ended, begun) = (true, false, true, false);
+        let cases = [
+            // In whichever order they are named.
+            (vec![(1, here, ended, -1.0), (1, landed, ended, -2.0)], vec![(1, -1.0)]),
+            (vec![(1, landed, ended, -2.0), (1, here, ended, -1.0)], vec![(1, -1.0)]),
+            (vec![(1, here, begun, -1.0), (1, landed, ended, -2.0)], vec![(1, -2.0)]),
+            (vec![(1, landed, begun, -2.0), (1, here, begun, -1.0)], vec![(1, -1.0)]),
+            // Two reports: the first that has its end.
+            (vec![(1, landed, ended, -1.0), (1, landed, ended, -2.0)], vec![(1, -1.0)]),
+            (vec![(1, landed, begun, -1.0), (1, landed, ended, -2.0)], vec![(1, -2.0)]),
+            // Other seeds are other runs; two directories are never set against each other.
+            (vec![(1, here, ended, -1.0), (2, landed, ended, -2.0)], vec![(1, -1.0), (2, -2.0)]),
+            (vec![(1, here, ended, -1.0), (1, here, ended, -2.0)], vec![(1, -1.0), (1, -2.0)]),
+        ];
+        for (runs, expected) in cases {
+            assert_eq!(settled(&runs), expected, "{runs:?}");
+        }
     }
 }

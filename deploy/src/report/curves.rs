@@ -3,9 +3,10 @@
 use anyhow::anyhow;
 use plotters::prelude::*;
 
-use super::collect::{Results, Run};
+use super::collect::Results;
 use super::measures::Measure;
 use super::paper::reported;
+use super::run::Run;
 use super::sections::Picture;
 use crate::plots::{Axes, Chart, colour};
 use crate::run_directory::safe_name;

@@ -2,8 +2,9 @@
 
 use serde::Serialize;
 
-use super::collect::{Results, Run};
+use super::collect::Results;
 use super::measures::Measure;
+use super::run::Run;
 use super::statistics::median_with_interval;
 use super::thresholds::{mark, threshold};
 use crate::terminal::grouped;

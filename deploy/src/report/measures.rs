@@ -1,7 +1,7 @@
 //! What is measured of a run, each with how to read it.
 
-use super::collect::Run;
 use super::paper::Figure;
+use super::run::Run;
 use super::tables::TableKind;
 use super::thresholds::threshold;
 use crate::control::EvaluationRow;

@@ -1,7 +1,10 @@
 //! How the runs move: what is known already is read, what is not is measured, by rolling each run's
 //! last policy out.
 
-use super::collect::{Results, Run};
+use super::collect::Results;
+use super::landed;
+use super::moves::Moves;
+use super::run::{Run, Source};
 use crate::failure::Outcome;
 use crate::motion::{self, Means};
 use crate::run_directory::RunDirectory;
@@ -10,25 +13,35 @@ use crate::terminal::CountProgress;
 /// Where that many runs of a task in a row cannot be measured, the others cannot either.
 const FAILURES_MAX: usize = 2;
 
-/// Reads what was measured before.
+/// Reads what was measured before. A landed run brings it along, or nobody can measure it any more.
 ///
 /// # Errors
 /// A run cannot be read.
 pub(super) fn read_motions(results: &mut Results) -> anyhow::Result<()> {
     for run in results.runs.iter_mut().filter(|run| run.ended) {
-        run.motion = motion::read(&RunDirectory::open(&run.path)?)?;
+        match &run.source {
+            Source::Directory(path) => {
+                let motion = motion::read(&RunDirectory::open(path)?)?;
+                run.motion = motion.as_ref().map(Moves::of);
+            }
+            Source::Report(report) if run.motion.is_none() => {
+                let file = report.join(landed::FILE);
+                results.unmeasured.push(format!("{}: {} has none", run.key(), file.display()));
+            }
+            Source::Report(_) => {}
+        }
     }
     Ok(())
 }
 
-/// Runs at their end that nobody has measured.
+/// Runs at their end that can be measured and are not.
 #[must_use]
 pub fn unmeasured(results: &Results) -> usize {
     results.runs.iter().filter(|run| is_unmeasured(run)).count()
 }
 
 fn is_unmeasured(run: &Run) -> bool {
-    run.last().is_some() && run.motion.is_none()
+    run.last().is_some() && run.motion.is_none() && run.directory().is_some()
 }
 
 /// Measures them; keeps the result in each run, so that it is done once. A run that cannot be
@@ -38,18 +51,19 @@ pub fn measure_motions(results: &mut Results, means: &Means) -> Outcome {
     let mut failures: Vec<(String, usize)> = Vec::new();
     let runs = results.runs.iter_mut().filter(|run| is_unmeasured(run));
     for (done, run) in (0..).zip(runs) {
-        let name = format!("{} · {} · seed {}", run.task, run.method, run.seed);
+        let Some(path) = run.directory() else { continue };
+        let name = run.key().to_string();
         progress.at(done, &name);
         let failed = failures.iter().position(|(task, _)| *task == run.task);
         if failed.is_some_and(|index| failures[index].1 >= FAILURES_MAX) {
             results.unmeasured.push(format!("{name}: not tried after those before it"));
             continue;
         }
-        let measured = RunDirectory::open(&run.path)
+        let measured = RunDirectory::open(path)
             .and_then(|directory| motion::measure(&directory, means, &|_, _| ()));
         match measured {
             Ok(Some(motion)) => {
-                run.motion = Some(motion);
+                run.motion = Some(Moves::of(&motion));
                 failures.retain(|(task, _)| *task != run.task);
             }
             Ok(None) => return Outcome::Interrupted,

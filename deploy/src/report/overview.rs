@@ -1,6 +1,7 @@
 //! What was run: how much of it, by which program, on which machine, when.
 
-use super::collect::{Results, Run};
+use super::collect::Results;
+use super::run::Run;
 use super::sections::Grid;
 use crate::terminal::grouped;
 
@@ -9,8 +10,9 @@ use crate::terminal::grouped;
 pub fn sentences(results: &Results) -> Vec<String> {
     let ended = results.runs.iter().filter(|run| run.ended).count();
     let begun = results.runs.len() - ended;
-    let waiting = results.planned.saturating_sub(results.runs.len());
-    let mut runs = format!("Of {} runs {ended} have come to their end", results.planned);
+    let waiting = results.waiting.len();
+    let planned = results.runs.len() + waiting;
+    let mut runs = format!("Of {planned} runs {ended} have come to their end");
     for (count, what) in [(begun, "under way or stopped"), (waiting, "not begun")] {
         if count > 0 {
             runs.push_str(&format!(", {count} {what}"));
@@ -22,7 +24,9 @@ pub fn sentences(results: &Results) -> Vec<String> {
         results.runs.iter().map(|run| run.origin.started.as_str()).collect();
     started.sort_unstable();
     if let (Some(first), Some(last)) = (started.first(), started.last()) {
-        sentences.push(format!("Begun between {first} and {last}."));
+        let span =
+            if first == last { (*first).to_owned() } else { format!("between {first} and {last}") };
+        sentences.push(format!("Begun {span}."));
     }
     let programs = results.runs.iter().flat_map(|run| run.origin.programs.iter().cloned());
     sentences.push(format!("By dmprl {}.", distinct(programs)));
@@ -99,7 +103,7 @@ mod tests {
             ended,
         };
         let mut results = planted(&[run(1, true), run(2, true), run(3, false)]);
-        results.planned = 10;
+        results.waiting = vec![results.runs[0].key(); 7];
         for (run, machine) in results.runs.iter_mut().zip(["a", "b", "a"]) {
             run.origin.machine = machine.to_owned();
         }

@@ -7,8 +7,9 @@ use minijinja::value::Serde;
 use minijinja::{AutoEscape, Environment, context};
 
 use super::collect::Results;
-use super::data::{curves_json, figures_csv, runs_csv};
+use super::data::{figures_csv, runs_csv};
 use super::efficiency::EfficiencyRow;
+use super::landed::{self, curves_json};
 use super::markdown::markdown;
 use super::sections::{Picture, sections};
 use super::statements::Judged;
@@ -70,7 +71,7 @@ impl Report {
         }
         write(&folder.join("figures.csv"), &figures_csv(self)?)?;
         write(&folder.join("runs.csv"), &runs_csv(&self.results.runs)?)?;
-        write(&folder.join("curves.json"), &curves_json(&self.results.runs)?)?;
+        write(&folder.join(landed::FILE), &curves_json(&self.results)?)?;
         write(&folder.join("report.md"), markdown(self).as_bytes())?;
         write(&folder.join("index.html"), self.html()?.as_bytes())
     }

@@ -2,7 +2,9 @@
 
 use dmprl_shared::config::PolicyKind;
 
-use super::collect::{Origin, Results, Run};
+use super::collect::Results;
+use super::moves::Moves;
+use super::run::{Origin, Run, Source};
 use crate::control::EvaluationRow;
 use crate::motion::{Joint, JointKind, Motion, RecordedEpisode, Robot};
 
@@ -22,7 +24,7 @@ pub(super) struct Planted {
 
 /// What these runs are together.
 pub(super) fn planted(runs: &[Planted]) -> Results {
-    let mut results = Results { planned: runs.len(), ..Results::default() };
+    let mut results = Results::default();
     for run in runs {
         for (names, name) in [(&mut results.tasks, run.task), (&mut results.methods, run.method)] {
             if !names.iter().any(|known| known == name) {
@@ -38,7 +40,7 @@ pub(super) fn planted(runs: &[Planted]) -> Results {
                 _ => PolicyKind::Dmp,
             },
             seed: run.seed,
-            path: format!("{}-{}-{}", run.task, run.method, run.seed).into(),
+            source: Source::Directory(format!("{}-{}-{}", run.task, run.method, run.seed).into()),
             ended: run.ended,
             steps: run.rows.len() as u64 * INTERVAL,
             origin: Origin::default(),
@@ -65,9 +67,9 @@ fn row(task: &str, value: f64, index: u64) -> EvaluationRow {
 }
 
 /// Of an arm with an elbow and a finger that slides; two steps.
-pub(super) fn planted_motion(jerk: f64, sparc: f64) -> Motion {
+pub(super) fn planted_moves(jerk: f64, sparc: f64) -> Moves {
     let joint = |name: &str, kind| Joint { name: name.to_owned(), kind };
-    Motion {
+    Moves::of(&Motion {
         format: 1,
         policy_version: 1,
         env_steps: INTERVAL,
@@ -98,5 +100,5 @@ pub(super) fn planted_motion(jerk: f64, sparc: f64) -> Motion {
             frames: Vec::new(),
             frame_steps: Vec::new(),
         },
-    }
+    })
 }

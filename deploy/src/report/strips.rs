@@ -9,9 +9,10 @@ use base64::engine::general_purpose::STANDARD;
 use dmprl_shared::config::PolicyKind;
 use serde::Serialize;
 
-use super::collect::{Results, Run};
+use super::collect::Results;
 use super::measures::Measure;
 use super::motion::in_a_line;
+use super::run::{Run, Source};
 use super::statistics::Summary;
 use crate::failure::Outcome;
 use crate::motion::Means;
@@ -41,8 +42,14 @@ pub struct Strip {
 pub struct Wanted {
     task: String,
     method: String,
-    run: RunDirectory,
+    /// None of a landed run: nobody can draw it any more.
+    run: Option<RunDirectory>,
     file: PathBuf,
+}
+
+/// In a report's folder, without the ending.
+fn path(task: &str, method: &str) -> String {
+    format!("frames/{}-{}", safe_name(task), safe_name(method))
 }
 
 /// The strips of every task whose motion is known.
@@ -53,11 +60,20 @@ pub fn wanted(results: &Results) -> anyhow::Result<Vec<Wanted>> {
     let mut wanted = Vec::new();
     for task in &results.tasks {
         for run in best_dmp(results, task).into_iter().chain(first_run(results, task, BESIDE)) {
-            let directory = RunDirectory::open(&run.path)?;
-            let seed = directory.config()?.evaluation.first_seed;
-            let version = run.last().map_or(0, |row| row.policy_version);
-            // As `record` calls it: drawn once, found again.
-            let file = run.path.join("videos").join(format!("policy-{version}-seed-{seed}.png"));
+            let (directory, file) = match &run.source {
+                Source::Directory(path) => {
+                    let directory = RunDirectory::open(path)?;
+                    let seed = directory.config()?.evaluation.first_seed;
+                    let version = run.last().map_or(0, |row| row.policy_version);
+                    // As `record` calls it: drawn once, found again.
+                    let name = format!("policy-{version}-seed-{seed}.png");
+                    (Some(directory), path.join("videos").join(name))
+                }
+                // Drawn of the same run: it was the first of its method there, too.
+                Source::Report(report) => {
+                    (None, report.join(path(&run.task, &run.method) + ".png"))
+                }
+            };
             let (task, method) = (run.task.clone(), run.method.clone());
             // What could not be rolled out to be measured cannot be to be drawn.
             if run.motion.is_some() || file.is_file() {
@@ -71,7 +87,17 @@ pub fn wanted(results: &Results) -> anyhow::Result<Vec<Wanted>> {
 /// Whether somebody has to draw any.
 #[must_use]
 pub fn undrawn(wanted: &[Wanted]) -> bool {
-    wanted.iter().any(|wanted| !wanted.file.is_file())
+    wanted.iter().any(|wanted| wanted.run.is_some() && !wanted.file.is_file())
+}
+
+/// Those of landed runs that an earlier report did not draw.
+#[must_use]
+pub fn lost_strips(wanted: &[Wanted]) -> Vec<String> {
+    let lost = wanted.iter().filter(|wanted| wanted.run.is_none() && !wanted.file.is_file());
+    let line = |Wanted { task, method, file, .. }: &Wanted| {
+        format!("frames of {task} · {method}: there is no {}", file.display())
+    };
+    lost.map(line).collect()
 }
 
 /// Draws what has not been drawn; what cannot be is left out, with the reason in `undrawn`.
@@ -84,7 +110,8 @@ pub fn draw(
 ) -> Outcome {
     let progress = StagesProgress::new();
     for wanted in wanted.iter().filter(|wanted| !wanted.file.is_file()) {
-        match draw_one(wanted, means, python, &progress) {
+        let Some(run) = &wanted.run else { continue };
+        match draw_one(run, means, python, &progress) {
             Ok(Outcome::Done) => {}
             Ok(Outcome::Interrupted) => return Outcome::Interrupted,
             Err(error) => {
@@ -97,16 +124,16 @@ pub fn draw(
 }
 
 fn draw_one(
-    wanted: &Wanted,
+    run: &RunDirectory,
     means: &Means,
     python: &Path,
     progress: &StagesProgress,
 ) -> anyhow::Result<Outcome> {
     let plan = RecordPlan {
-        sides: vec![(&wanted.run, wanted.run.choose_policy(PolicyChoice::Latest)?)],
-        first_seed: wanted.run.config()?.evaluation.first_seed,
+        sides: vec![(run, run.choose_policy(PolicyChoice::Latest)?)],
+        first_seed: run.config()?.evaluation.first_seed,
         episodes: 1,
-        output: wanted.run.path().join("videos"),
+        output: run.path().join("videos"),
         means: means.clone(),
         python: python.to_owned(),
     };
@@ -123,7 +150,7 @@ pub fn strips(wanted: &[Wanted]) -> anyhow::Result<Vec<Strip>> {
         let Wanted { task, method, file, .. } = wanted;
         let png = std::fs::read(file).with_context(|| format!("cannot read {}", file.display()))?;
         Ok(Strip {
-            path: format!("frames/{}-{}", safe_name(task), safe_name(method)),
+            path: path(task, method),
             alt: format!("{task}: frames of a rollout of {method}"),
             base64: STANDARD.encode(&png),
             png,
@@ -157,6 +184,7 @@ fn first_run<'r>(results: &'r Results, task: &str, method: &str) -> Option<&'r R
 
 #[cfg(test)]
 mod tests {
+    use super::super::moves::Moves;
     use super::super::planted::{Planted, planted};
     use super::*;
 
@@ -195,5 +223,27 @@ mod tests {
         results.runs[0].rows[0].return_mean = -0.5;
         results.runs[1].rows[0].return_mean = -1.5;
         assert_eq!(best_dmp(&results, "panda-reach").unwrap().method, "TD3-DMP");
+    }
+    #[test]
+    fn a_landed_run_is_shown_by_the_earlier_reports_picture_and_a_missing_one_is_told() {
+        let run =
+            |method| Planted { task: "panda-reach", method, seed: 1, rows: vec![0.5], ended: true };
+        let mut results = planted(&[run("TD3-DMP"), run("DDPG")]);
+        let report = tempfile::tempdir().unwrap();
+        std::fs::create_dir(report.path().join("frames")).unwrap();
+        std::fs::write(report.path().join("frames/panda-reach-TD3-DMP.png"), "pixels").unwrap();
+        for run in &mut results.runs {
+            run.source = Source::Report(report.path().to_owned());
+            run.motion = Some(Moves { joint_jerk: None, sparc: None, rollout: None });
+        }
+        let wanted = wanted(&results).unwrap();
+        assert!(!undrawn(&wanted), "nobody can draw a landed run");
+        let strips = strips(&wanted).unwrap();
+        assert_eq!(strips.len(), 1);
+        assert_eq!(strips[0].path, "frames/panda-reach-TD3-DMP");
+        assert_eq!(strips[0].png, b"pixels");
+        let lost = lost_strips(&wanted);
+        assert_eq!(lost.len(), 1);
+        assert!(lost[0].starts_with("frames of panda-reach · DDPG: there is no "), "{lost:?}");
     }
 }

@@ -2,18 +2,19 @@
 
 use anyhow::anyhow;
 
-use super::collect::{Results, Run};
+use super::collect::Results;
+use super::moves::Rollout;
+use super::run::Run;
 use super::sections::Picture;
-use crate::motion::Motion;
 use crate::plots::{Panel, SmallMultiples, colour};
 use crate::run_directory::safe_name;
 
 /// One method's rollout.
-struct Rollout<'r> {
+struct Shown<'r> {
     /// The method's place in the report.
     index: usize,
     run: &'r Run,
-    motion: &'r Motion,
+    rollout: &'r Rollout,
 }
 
 /// Two pictures a task whose joints are known: the same episode for every method.
@@ -23,23 +24,20 @@ struct Rollout<'r> {
 pub fn trajectories(results: &Results) -> anyhow::Result<Vec<Picture>> {
     let mut pictures = Vec::new();
     for task in &results.tasks {
-        let rollouts = rollouts(results, task);
-        let Some(first) = rollouts.first().map(|rollout| rollout.motion) else { continue };
+        let shown = shown(results, task);
+        let Some(first) = shown.first().map(|shown| shown.rollout) else { continue };
         let unit = &first.unit;
         for (what, unit, rows) in [
-            ("position", unit.clone(), positions as fn(&Motion) -> &[Vec<f64>]),
+            ("position", unit.clone(), positions as fn(&Rollout) -> &[Vec<f64>]),
             ("velocity", format!("{unit}/s"), velocities),
         ] {
-            let joints = counted(first);
-            let names: Vec<String> =
-                joints.iter().map(|joint| first.robot.joints[*joint].name.clone()).collect();
-            let panels = rollouts.iter().map(|rollout| panel(rollout, &joints, rows));
-            let title = format!("{task}: joint {what}, episode of seed {}", first.first_seed);
-            let time = if first.robot.control_dt_s > 0.0 { "time [s]" } else { "steps" };
+            let panels = shown.iter().map(|shown| panel(shown, rows));
+            let title = format!("{task}: joint {what}, episode of seed {}", first.seed);
+            let time = if first.control_dt_s > 0.0 { "time [s]" } else { "steps" };
             let drawn = SmallMultiples {
                 title: &title,
                 axes: [time, &format!("joint {what} [{unit}]")],
-                names: &names,
+                names: &first.joints,
                 panels: panels.collect(),
             };
             let svg = drawn
@@ -52,57 +50,75 @@ pub fn trajectories(results: &Results) -> anyhow::Result<Vec<Picture>> {
     Ok(pictures)
 }
 
-fn positions(motion: &Motion) -> &[Vec<f64>] {
-    &motion.episode.joint_positions
+/// Whether the run is the one that stands for its method.
+#[must_use]
+pub fn is_drawn(results: &Results, run: &Run) -> bool {
+    shown(results, &run.task).iter().any(|shown| std::ptr::eq(shown.run, run))
 }
 
-fn velocities(motion: &Motion) -> &[Vec<f64>] {
-    &motion.episode.joint_velocities
+/// Methods that have no panel though a landed run of theirs once had joints: an earlier report
+/// keeps the rollout of no run but the one that it drew.
+#[must_use]
+pub fn lost_trajectories(results: &Results) -> Vec<String> {
+    let mut lost = Vec::new();
+    for task in &results.tasks {
+        let shown = shown(results, task);
+        for method in &results.methods {
+            let had_joints = |run: &Run| {
+                let jerk = run.motion.as_ref().and_then(|motion| motion.joint_jerk);
+                run.directory().is_none() && jerk.is_some()
+            };
+            let is_shown = shown.iter().any(|shown| shown.run.method == *method);
+            if !is_shown && results.of(task, method).any(had_joints) {
+                lost.push(format!("joints of {task} · {method}: no rollout was landed"));
+            }
+        }
+    }
+    lost
 }
 
-/// Of each method the first run that was measured; of the same robot and episode as the first
-/// method's.
-fn rollouts<'r>(results: &'r Results, task: &str) -> Vec<Rollout<'r>> {
-    let mut rollouts: Vec<Rollout<'r>> = Vec::new();
+fn positions(rollout: &Rollout) -> &[Vec<f64>] {
+    &rollout.positions
+}
+
+fn velocities(rollout: &Rollout) -> &[Vec<f64>] {
+    &rollout.velocities
+}
+
+/// Of each method the first run whose rollout is at hand; of the same robot and episode as the
+/// first method's.
+fn shown<'r>(results: &'r Results, task: &str) -> Vec<Shown<'r>> {
+    let mut all: Vec<Shown<'r>> = Vec::new();
     for (index, method) in results.methods.iter().enumerate() {
         let mut runs: Vec<&Run> =
             results.runs.iter().filter(|run| run.task == task && run.method == *method).collect();
         runs.sort_by_key(|run| run.seed);
         let measured = runs.into_iter().find_map(|run| {
-            let motion = run.motion.as_ref().filter(|motion| !counted(motion).is_empty())?;
-            let comparable = rollouts.first().is_none_or(|first| {
-                (first.motion.first_seed, &first.motion.robot) == (motion.first_seed, &motion.robot)
-            });
-            comparable.then_some((run, motion))
+            let rollout = run.motion.as_ref()?.rollout.as_ref()?;
+            let comparable = all.first().is_none_or(|first| first.rollout.is_beside(rollout));
+            comparable.then_some((run, rollout))
         });
-        rollouts.extend(measured.map(|(run, motion)| Rollout { index, run, motion }));
+        all.extend(measured.map(|(run, rollout)| Shown { index, run, rollout }));
     }
-    rollouts
+    all
 }
 
-/// Joints that are measured in the same unit.
-fn counted(motion: &Motion) -> Vec<usize> {
-    let joints = motion.robot.joints.iter().enumerate();
-    let counted = joints.filter(|(_, joint)| joint.kind.unit() == motion.unit);
-    counted.map(|(index, _)| index).collect()
-}
-
-fn panel(rollout: &Rollout<'_>, joints: &[usize], rows: fn(&Motion) -> &[Vec<f64>]) -> Panel {
-    let Rollout { index, run, motion } = rollout;
-    let (times, rows) = (motion.times(), rows(motion));
+fn panel(Shown { index, run, rollout }: &Shown<'_>, rows: fn(&Rollout) -> &[Vec<f64>]) -> Panel {
+    let (times, rows) = (rollout.times(), rows(rollout));
     let line = |joint: usize| -> Vec<(f64, f64)> {
         times.iter().copied().zip(rows.iter().map(|row| row[joint])).collect()
     };
     Panel {
         title: format!("{}, seed {}", run.method, run.seed),
         colour: colour(*index, &run.method),
-        lines: joints.iter().map(|joint| line(*joint)).collect(),
+        lines: (0..rollout.joints.len()).map(line).collect(),
     }
 }
 
 #[cfg(test)]
 mod tests {
-    use super::super::planted::{Planted, planted, planted_motion};
+    use super::super::planted::{Planted, planted, planted_moves};
+    use super::super::run::Source;
     use super::*;
 
     #[test]
@@ -117,10 +133,11 @@ mod tests {
         let mut results =
             planted(&[run("DDPG", 2), run("DDPG", 1), run("SAC", 3), run("TD3", 1), run("NDP", 1)]);
         for run in results.runs.iter_mut().take(4) {
-            run.motion = Some(planted_motion(3.0, -2.0));
+            run.motion = Some(planted_moves(3.0, -2.0));
         }
         // Of another episode, and never measured.
-        results.runs[3].motion.as_mut().unwrap().first_seed += 1;
+        let other = results.runs[3].motion.as_mut().unwrap();
+        other.rollout.as_mut().unwrap().seed += 1;
         let pictures = trajectories(&results).unwrap();
         let paths: Vec<_> = pictures.iter().map(|picture| picture.path.as_str()).collect();
         assert_eq!(paths, ["joints/pusher-v0-position", "joints/pusher-v0-velocity"]);
@@ -139,5 +156,32 @@ mod tests {
         let run =
             Planted { task: "pusher-v0", method: "SAC", seed: 1, rows: vec![-40.0], ended: true };
         assert!(trajectories(&planted(&[run])).unwrap().is_empty());
+    }
+    #[test]
+    fn a_landed_run_whose_rollout_was_not_kept_is_told_and_one_of_another_seed_stands_in() {
+        let run = |method, seed| Planted {
+            task: "pusher-v0",
+            method,
+            seed,
+            rows: vec![-40.0],
+            ended: true,
+        };
+        let mut results = planted(&[run("SAC", 1), run("SAC", 2), run("TD3", 1), run("NDP", 1)]);
+        for (index, run) in results.runs.iter_mut().enumerate() {
+            let mut moves = planted_moves(3.0, -2.0);
+            if index != 1 {
+                moves.rollout = None;
+            }
+            run.motion = Some(moves);
+            run.source = Source::Report("earlier".into());
+        }
+        // Of an environment that shows no joints.
+        results.runs[3].motion.as_mut().unwrap().joint_jerk = None;
+        assert_eq!(
+            lost_trajectories(&results),
+            ["joints of pusher-v0 · TD3: no rollout was landed"]
+        );
+        let drawn = [0, 1, 2].map(|index| is_drawn(&results, &results.runs[index]));
+        assert_eq!(drawn, [false, true, false]);
     }
 }

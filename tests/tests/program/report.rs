@@ -73,6 +73,21 @@ fn a_sweep_is_reported_with_what_was_run_and_what_was_not() {
     // One line an evaluation of each seed, and a head.
     assert!(read("runs.csv").lines().count() > 2);
     assert!(read("figures.csv").contains("Average return,reacher-v1,NDP,0,,,,,,-15.56,1.47"));
+
+    its_report_says_the_same_once_the_runs_are_gone(&place, &json);
+}
+
+/// Written over itself: all of it is read first.
+fn its_report_says_the_same_once_the_runs_are_gone(place: &Workplace, json: &serde_json::Value) {
+    let read = |name| fs::read_to_string(place.path(&format!("two/report/{name}"))).unwrap();
+    let files = ["curves.json", "runs.csv", "figures.csv", "joints/reacher-v1-velocity.svg"];
+    let before = files.map(read);
+    fs::remove_dir_all(place.path("two/reacher-v1")).unwrap();
+    let landed = ["report", "two/report", "--output", "two/report", "--json"];
+    let again = place.run(&landed).with_status(0).json();
+    assert_eq!(again, *json);
+    assert_eq!(files.map(read), before);
+    assert!(read("report.md").contains("Of 4 runs 2 have come to their end, 2 not begun."));
 }
 
 #[test]

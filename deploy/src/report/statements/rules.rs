@@ -5,9 +5,10 @@ use std::collections::BTreeMap;
 
 use super::list::{Methods, Rule, Statement};
 use super::{PROPOSED, SEEDS_MIN, Verdict, series};
-use crate::report::collect::{Results, Run};
+use crate::report::collect::Results;
 use crate::report::measures::Measure;
 use crate::report::paper::{Figure, reported};
+use crate::report::run::Run;
 use crate::report::statistics::{Summary, median_with_interval};
 use crate::report::thresholds::threshold;
 use crate::terminal::grouped;

@@ -3,8 +3,8 @@
 use super::Verdict;
 use super::list::Methods;
 use super::rules::{Estimate, Judgement, On, all, clear};
-use crate::report::collect::Run;
 use crate::report::measures::Measure;
+use crate::report::run::Run;
 use crate::terminal::grouped;
 
 /// Evaluations in a moving mean: a best of many single ones would be luck.

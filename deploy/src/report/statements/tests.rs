@@ -2,7 +2,7 @@
 
 use super::list::{Rule, STATEMENTS};
 use super::*;
-use crate::report::planted::{Planted, planted, planted_motion};
+use crate::report::planted::{Planted, planted, planted_moves};
 
 /// Seeds 1, 2, ... of a method, each with its evaluations.
 fn seeds<R: AsRef<[f64]>>(task: &'static str, method: &'static str, rows: &[R]) -> Vec<Planted> {
@@ -279,12 +279,11 @@ fn motion_is_smoother_only_by_every_measure() {
     for run in &mut results.runs {
         let ours = run.method == OURS;
         run.rows[0].smoothness = if ours { 0.1 } else { 0.3 };
-        run.motion =
-            Some(if ours { planted_motion(5.0, -1.7) } else { planted_motion(50.0, -3.0) });
+        run.motion = Some(if ours { planted_moves(5.0, -1.7) } else { planted_moves(50.0, -3.0) });
     }
     assert_eq!(verdict(&results, PUSHER, claim), Verdict::Held);
     for run in results.runs.iter_mut().filter(|run| run.method == OURS) {
-        run.motion = Some(planted_motion(50.0, -1.7));
+        run.motion = Some(planted_moves(50.0, -1.7));
     }
     assert_eq!(verdict(&results, PUSHER, claim), Verdict::NoClearDifference);
 }
