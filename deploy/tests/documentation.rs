@@ -15,6 +15,25 @@ const EXAMPLES: &str = "docs/examples";
 const LIMITS: Limits = Limits { cores: 2 };
 /// How the program is called in the documents.
 const CALLS: [&str; 3] = ["cargo run --release -- ", "target/release/dmprl ", "dmprl "];
+/// Flags of other programs: cargo's, TensorBoard's, docker's, and those of Slurm's sbatch.
+const FOREIGN: [&str; 16] = [
+    "--bench",
+    "--features",
+    "--release",
+    "--check",
+    "--logdir",
+    "--shm-size",
+    "--volumes",
+    "--nodes",
+    "--ntasks-per-node",
+    "--cpus-per-task",
+    "--mem",
+    "--time",
+    "--signal",
+    "--requeue",
+    "--open-mode",
+    "--no-kill",
+];
 
 fn root() -> &'static Path {
     Path::new(env!("CARGO_MANIFEST_DIR")).parent().unwrap()
@@ -189,12 +208,10 @@ fn every_flag_that_is_shown_exists() {
         flags(&help(&command.split(' ').collect::<Vec<_>>()))
     };
     let all: BTreeSet<_> = commands.iter().flat_map(|command| words(command)).collect();
-    // Flags of other programs: cargo's, TensorBoard's, and docker's for the size of shared memory.
-    let foreign = ["--bench", "--features", "--release", "--check", "--logdir", "--shm-size"];
     for document in documents() {
         let text = read(&document);
         for flag in spans(&text).iter().flat_map(|span| flags(span)) {
-            let exists = all.contains(&flag) || foreign.contains(&flag.as_str());
+            let exists = all.contains(&flag) || FOREIGN.contains(&flag.as_str());
             assert!(exists, "{document} shows {flag}, which no command has");
         }
         // In a block the command is known, so the flag must be one of that command.

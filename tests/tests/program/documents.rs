@@ -7,7 +7,8 @@
 //! - `file=NAME` after the language: the block is saved under that name, for blocks that follow.
 //! - `not-run` after the language: it cannot be run in a test; its first line is a comment that
 //!   says why. There is a limit to their number.
-//! - `text` and `json` are what something prints.
+//! - `text` and `json` are what something prints. `text` is also what is typed where there is a
+//!   cluster, a container engine or systemd; `tests/tests/placement/main.rs` tries what it starts.
 
 use std::fmt::Write;
 use std::fs;
