@@ -5,9 +5,9 @@
 //! the same work (`peers`, `numpy_plan`); `figures` and `table` are what comes out. Everything
 //! waits in `watch` or in `child`, where an interrupt is seen. `learner` measures an update beside
 //! its matrix products and beside other libraries. `transport` measures what carries segments, with
-//! workers that only send, beside pipes, sockets and queues of Python. `system` measures a whole run,
-//! and `scale` what many workers would do: by a model of what each part costs, and by a learner
-//! that 256 synthetic workers feed. `made_up` are the segments of those that only send.
+//! workers that only send, beside pipes, sockets and queues of Python. `system` measures a whole
+//! run, and `scale` what many workers would do: by a model of what each part costs, and by a
+//! learner that 256 synthetic workers feed. `made_up` are the segments of those that only send.
 
 mod child;
 mod figures;

@@ -17,7 +17,7 @@ use crate::bench::statistics::median;
 use crate::bench::watch::Watch;
 use crate::bench::workers::{Stage, Workers};
 
-/// Of a worker's cost the median counts.
+/// Each cost is measured so often; of a worker's the median counts.
 const ROUNDS: u32 = 5;
 /// Of each environment in a worker's queue: what is measured is the worker, and not the sleep of
 /// whoever takes from it.
@@ -139,15 +139,25 @@ impl Pool {
 }
 
 /// Of a run's learner, on a replay full of made-up segments.
+///
+/// The least of several rounds, and on one thread its processor time: what other programs on the
+/// machine take from it is none of its cost.
 pub(super) fn update(
     config: &ExperimentConfig,
     spec: &EnvSpec,
-    duration: Duration,
+    (watch, duration): (&Watch, Duration),
 ) -> anyhow::Result<Timed> {
     let mut config = config.clone();
-    // Its places are of no account here, and those of a worker that joins would be unused.
     config.actors.joined_max = 0;
+    let threads = config.learner.threads;
     let mut learner = Learner::new(config, spec, RUN_ID)?;
     fill(&mut learner, spec)?;
-    timed(duration, || Ok(learner.update()?))
+    let mut least = Timed { wall_s: f64::INFINITY, cpu_s: f64::INFINITY };
+    for _ in 0..ROUNDS {
+        watch.check()?;
+        let Timed { wall_s, cpu_s } = timed(duration / ROUNDS, || Ok(learner.update()?))?;
+        least.wall_s = least.wall_s.min(if threads == 1 { cpu_s } else { wall_s });
+        least.cpu_s = least.cpu_s.min(cpu_s);
+    }
+    Ok(least)
 }

@@ -1,7 +1,8 @@
 //! `dmprl segment-feeder`: a process that plays many workers, which only send made-up segments.
 //!
-//! Each of its workers is a thread with the code of a run's worker behind it: its own queue and
-//! outbox, checksums, acknowledgements, and the pauses of a worker whose queue is full.
+//! Each of its workers has what a run's worker has: its own queue and outbox, checksums,
+//! acknowledgements. One thread serves all of them in turn: with a thread or a process each, most
+//! of a small machine's time would go into waking those whose queues are full.
 
 use std::path::PathBuf;
 use std::thread;
@@ -9,23 +10,28 @@ use std::time::Duration;
 
 use clap::Args;
 use dmprl_shared::segment::{Segment, SegmentLayout};
-use dmprl_shared::transport::delivery::Outbox;
-use dmprl_shared::transport::shared_memory::Plan;
+use dmprl_shared::transport::SendOutcome;
+use dmprl_shared::transport::delivery::{Acknowledgements, Outbox};
+use dmprl_shared::transport::shared_memory::{Plan, WorkerEnd};
 
 use crate::bench::made_up::{MadeUp, RUN_ID};
-use crate::roles::{ControlPipe, Delivery, ORPHAN_LIMIT, Stopped, attach_within};
+use crate::control::Report;
+use crate::roles::{ControlPipe, ORPHAN_LIMIT, attach_within};
 
-/// A worker that waits for its turn is no reason for a warning.
-const NO_WARNING: Duration = Duration::from_secs(1_000_000);
+/// A round through all queues that fills less than this part of them is followed by a pause: to ask
+/// a full queue takes as long as to send a segment.
+const FILLED_PART: usize = 4;
+/// The learner empties a small part of the queues meanwhile.
+const PAUSE: Duration = Duration::from_micros(500);
 
 const HELP: &str = "\
 Speaks JSON lines on standard input and output as the roles of a run do, and ends when its standard
 input ends. `bench scale` starts it.
 
 EXAMPLES
-  dmprl segment-feeder --shared-memory /dev/shm/dmprl-1000/4f2a --workers 256 --first 0 --count 64 \\
-      --queue-segments 32 --outbox-segments 1056 --segment-steps 5 --observation-len 36 \\
-      --action-len 3 --parameters-len 75000 --architecture-hash 1";
+  dmprl segment-feeder --shared-memory /dev/shm/dmprl-1000/4f2a --workers 256 --first 0 \\
+      --count 64 --queue-segments 32 --outbox-segments 1056 --segment-steps 5 \\
+      --observation-len 36 --action-len 3 --parameters-len 75000 --architecture-hash 1";
 
 /// Arguments of `dmprl segment-feeder`.
 #[derive(Debug, Clone, PartialEq, Eq, Args)]
@@ -107,50 +113,62 @@ impl SegmentFeederArgs {
 pub fn segment_feeder(args: &SegmentFeederArgs) -> anyhow::Result<()> {
     let control = ControlPipe::open(ORPHAN_LIMIT)?;
     let plan = args.plan();
-    let mut ends = Vec::new();
+    let mut workers = Vec::new();
     for index in args.first..args.first + args.count {
         let domain = args.shared_memory.as_path();
         let Some(end) = attach_within(&control, (domain, &plan), index)? else { return Ok(()) };
-        ends.push((index, end));
+        workers.push(Worker {
+            end,
+            outbox: Outbox::new(plan.layout, args.outbox_segments, index, 0),
+            made_up: MadeUp::of(plan.layout, index, plan.architecture_hash),
+            acknowledgements: Acknowledgements::default(),
+        });
     }
-    thread::scope(|scope| {
-        let start = |(index, end)| {
-            let outbox = Outbox::new(plan.layout, args.outbox_segments, index, 0);
-            let mut delivery = Delivery::new(&control, NO_WARNING, end, outbox);
-            let mut made_up = MadeUp::of(plan.layout, index, plan.architecture_hash);
-            let (control, flag) = (&control, control.stop_flag());
-            scope.spawn(move || {
-                let sent = deliver(&mut delivery, &mut made_up, control);
-                if sent.is_err() {
-                    // The others cannot go on without this one's error being seen.
-                    flag.store(true, std::sync::atomic::Ordering::Release);
-                }
-                sent
-            })
-        };
-        let threads: Vec<_> = ends.into_iter().map(start).collect();
-        for thread in threads {
-            match thread.join() {
-                Ok(sent) => sent?,
-                Err(panic) => std::panic::resume_unwind(panic),
-            }
+    let queued_max = plan.queue_segments * workers.len();
+    while !control.stop_requested() {
+        let mut sent = 0;
+        for worker in &mut workers {
+            sent += worker.fill(plan.queue_segments)?;
         }
-        Ok(())
-    })
+        if sent * FILLED_PART < queued_max {
+            thread::sleep(PAUSE);
+        }
+    }
+    for worker in &mut workers {
+        control.send(&Report::Sent(worker.outbox.sent()))?;
+    }
+    Ok(())
 }
 
-fn deliver(
-    delivery: &mut Delivery<'_>,
-    made_up: &mut MadeUp,
-    control: &ControlPipe,
-) -> anyhow::Result<()> {
-    while !control.stop_requested() {
-        let Segment { header, block } = made_up.next();
-        match delivery.deliver(header, block) {
-            Ok(()) => {}
-            Err(Stopped::Asked) => break,
-            Err(Stopped::Failed(error)) => return Err(error),
+/// One of those that this process plays.
+struct Worker {
+    end: WorkerEnd,
+    outbox: Outbox,
+    made_up: MadeUp,
+    acknowledgements: Acknowledgements,
+}
+
+impl Worker {
+    /// Sends until its queue is full, `segments_max` at most; returns how many. A worker of a run
+    /// would sleep on its full queue, where this one lets others have the processor.
+    fn fill(&mut self, segments_max: usize) -> anyhow::Result<usize> {
+        let Self { end, outbox, made_up, acknowledgements } = self;
+        for sent in 0..segments_max {
+            if 2 * outbox.len() >= outbox.capacity()
+                && end.acknowledgements.newest(acknowledgements)?
+            {
+                outbox.acknowledge(acknowledgements);
+            }
+            // What found no room the last time comes first.
+            if outbox.offer(&mut end.segments)? != SendOutcome::Delivered
+                || outbox.len() == outbox.capacity()
+            {
+                return Ok(sent);
+            }
+            let Segment { header, block } = made_up.next();
+            outbox.put(header, block);
         }
+        outbox.offer(&mut end.segments)?;
+        Ok(segments_max)
     }
-    delivery.report()
 }

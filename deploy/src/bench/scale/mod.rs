@@ -113,7 +113,9 @@ fn simulate(
 ) -> anyhow::Result<Simulated> {
     let size = Size::of_bytes(bench.segment_bytes).context("no such size")?;
     let spec = spec_of(size);
-    let config = ExperimentConfig::default().resolve(Limits { cores: bench.cores })?;
+    // A task's own policy may need more of an observation than these have.
+    let mut config = ExperimentConfig::default().resolve(Limits { cores: bench.cores })?;
+    config.replay.capacity_steps = bench.config.replay.capacity_steps;
     let feed = feed_plan(bench, &config, &spec);
     progress.preparing(&format!("{} synthetic workers", feed.workers));
     let (window, feeders_cpu_s, discrepancies) = fed(&feed, "s", watch, bench.duration)?;
@@ -139,8 +141,7 @@ fn measure_costs(
     let insert = costs::insert(&feed, folder.path(), *cost_duration)?;
     watch.check()?;
     progress.preparing("what an update costs");
-    let update = costs::update(config, &worker.spec, *cost_duration)?;
-    watch.check()?;
+    let update = costs::update(config, &worker.spec, (watch, *cost_duration))?;
     let segment_bytes = feed.segment_bytes()?;
     let demand = Demand {
         steps_per_segment: worker.steps_per_segment,
