@@ -48,8 +48,6 @@ const START: Duration = Duration::from_secs(300);
 const SLACK: Duration = Duration::from_secs(60);
 /// With the replay full, caches and outboxes too are a long run's after so long.
 const SETTLE: Duration = Duration::from_millis(500);
-/// What still lies in the queues is taken in less.
-const DRAIN: Duration = Duration::from_millis(200);
 
 /// Who feeds whom.
 pub(super) struct FeedPlan<'a> {
@@ -200,7 +198,7 @@ impl Feed {
         }
         // They have ended, which is no death any more.
         self.children.clear();
-        self.turns_for(watch, DRAIN)?;
+        self.drain(watch)?;
         let counters = self.session.learner.counters;
         let duplicate = counters.rejected.duplicate;
         Ok(Discrepancies {
@@ -210,6 +208,20 @@ impl Feed {
             lost: counters.lost.max(sent.sent.saturating_sub(counters.received)),
             received: counters.received,
         })
+    }
+
+    /// Takes what still lies in the queues, which nobody fills any more: until all are empty,
+    /// however long that takes on a busy machine.
+    fn drain(&mut self, watch: &Watch) -> anyhow::Result<()> {
+        let deadline = Instant::now() + SLACK;
+        loop {
+            let (turn, now) = self.turn()?;
+            watch.check()?;
+            if turn == Turn::Idle {
+                return Ok(());
+            }
+            ensure!(now < deadline, "the queues were not empty within {SLACK:?}");
+        }
     }
 
     fn turns_for(&mut self, watch: &Watch, duration: Duration) -> anyhow::Result<()> {
@@ -227,7 +239,7 @@ impl Feed {
     ) -> anyhow::Result<bool> {
         let deadline = Instant::now() + limit;
         loop {
-            let now = self.turn()?;
+            let (_, now) = self.turn()?;
             if until(&self.session.learner) {
                 return Ok(true);
             }
@@ -246,10 +258,11 @@ impl Feed {
     }
 
     /// One turn, as the learner process takes it.
-    fn turn(&mut self) -> anyhow::Result<Instant> {
+    fn turn(&mut self) -> anyhow::Result<(Turn, Instant)> {
         // Nothing is due before the run's end; lost and refused segments are counted.
         let mut due = |_: Due, _: &mut Learner| Ok(());
-        match self.session.turn(&mut due)? {
+        let turn = self.session.turn(&mut due)?;
+        match turn {
             Turn::Worked => {}
             Turn::Idle => std::thread::sleep(IDLE),
             Turn::Finished => bail!("the run without an end has ended"),
@@ -266,7 +279,7 @@ impl Feed {
             self.acknowledgements.maintain()?;
             self.maintained = now;
         }
-        Ok(now)
+        Ok((turn, now))
     }
 }
 
