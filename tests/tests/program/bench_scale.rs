@@ -116,5 +116,11 @@ fn a_feeder_that_dies_is_named_with_how_it_ended() {
 fn more_learner_cores_than_there_are_cannot_be_measured() {
     let place = Workplace::new();
     bench(&place, &["--learner-cores", "1024"]).wait().with_status(2).saying("not extrapolated");
-    bench(&place, &["--algo", "ndp"]).wait().with_status(2).saying("whole rollouts");
+}
+
+#[test]
+fn an_algorithm_without_a_replay_has_no_such_costs() {
+    let place = Workplace::new();
+    let more = ["--algo", "ndp", "--set", "exploration.warm_up_steps=0"];
+    bench(&place, &more).wait().with_status(2).saying("whole rollouts");
 }
