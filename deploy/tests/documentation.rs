@@ -192,6 +192,8 @@ fn every_flag_that_is_shown_exists() {
         "bench rollout",
         "bench learner",
         "bench policy",
+        "bench system",
+        "bench scale",
         "bench transport",
         "chaos",
         "tasks",

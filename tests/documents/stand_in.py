@@ -26,13 +26,26 @@ INTERRUPTED = 130
 SERVERS = ("dashboard", "play")
 PICTURES = ("play", "record")
 FEW = {
-    "bench": {"--rounds": "1"},
     "chaos": {"--seconds": "1", "--worker-kills": "1", "--learner-kills": "1"},
     "eval": {"--episodes": "2"},
     "record": {"--episodes": "1"},
 }
 """Flags that cost time, and what they become where a block has them, or has them by default."""
-MEASURED_S = {"rollout": "0.2", "learner": "0.05", "transport": "0.05"}
+FEW_OF_BENCH = {
+    "rollout": {"--rounds": "1", "--seconds": "0.2"},
+    "learner": {"--rounds": "1", "--seconds": "0.05"},
+    "transport": {"--rounds": "1", "--seconds": "0.05"},
+    "policy": {"--rounds": "1", "--calls": "20"},
+    "system": {"--seconds": "0.2"},
+    "scale": {
+        "--seconds": "0.1",
+        "--cost-seconds": "0.1",
+        "--check-seconds": "0.1",
+        "--check-workers": "1",
+        "--synthetic-workers": "8",
+    },
+}
+"""The same of each benchmark."""
 
 PROGRAM = os.environ["STAND_IN_PROGRAM"]
 PROJECT = Path(os.environ["STAND_IN_PROJECT"])
@@ -84,13 +97,9 @@ def cheap(words):
         words = [*words, "--set", "exploration.warm_up_steps=40"]
     if command == "sweep" and "--dry-run" not in words:
         words = [*words, "--dry-run"]
-    for name, value in FEW.get(command, {}).items():
+    few = FEW_OF_BENCH[words[1]] if command == "bench" else FEW.get(command, {})
+    for name, value in few.items():
         words = replaced(words, name, value)
-    if command == "bench":
-        if words[1] in MEASURED_S:
-            words = replaced(words, "--seconds", MEASURED_S[words[1]])
-        if words[1] == "policy":
-            words = replaced(words, "--calls", "20")
     return words
 
 

@@ -34,8 +34,17 @@ enum Greeting {
 /// The most memory that a process has had at once [bytes]: `VmHWM`, when the system tells it.
 /// - `process`: its number, or `self`.
 pub(super) fn resident_bytes_max(process: &str) -> Option<u64> {
+    bytes_of(process, "VmHWM:")
+}
+
+/// The memory that this process has now [bytes], likewise: shared memory it has touched included.
+pub(super) fn resident_bytes() -> Option<u64> {
+    bytes_of("self", "VmRSS:")
+}
+
+fn bytes_of(process: &str, field: &str) -> Option<u64> {
     let status = std::fs::read_to_string(format!("/proc/{process}/status")).ok()?;
-    let line = status.lines().find_map(|line| line.strip_prefix("VmHWM:"))?;
+    let line = status.lines().find_map(|line| line.strip_prefix(field))?;
     line.trim().strip_suffix("kB")?.trim().parse::<u64>().ok().map(|kib| kib * 1024)
 }
 

@@ -68,7 +68,7 @@ impl PeerKind {
 }
 
 /// What every peer's command line is made of.
-pub(super) struct Stage<'a> {
+pub(super) struct PeerStage<'a> {
     /// Where logs go.
     pub(super) run: &'a RunDirectory,
     /// The folder with the package `dmprl`.
@@ -94,7 +94,11 @@ struct Measured {
 
 impl Peer {
     /// Starts the processes without waiting for them.
-    pub(super) fn start(kind: PeerKind, python: &Path, stage: &Stage<'_>) -> anyhow::Result<Self> {
+    pub(super) fn start(
+        kind: PeerKind,
+        python: &Path,
+        stage: &PeerStage<'_>,
+    ) -> anyhow::Result<Self> {
         let start = |index: usize| {
             let name = format!("{}-{index}", kind.name());
             let path = stage.run.log_path(&name);

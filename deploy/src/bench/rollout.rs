@@ -7,20 +7,15 @@
 use std::path::PathBuf;
 use std::time::Duration;
 
-use anyhow::Context;
 use dmprl_shared::config::ExperimentConfig;
 
 use super::figures::{Figures, ONE_WORKER, WORKER, WorkerFigures};
 use super::numpy_plan::{Controls, NumpyPlan};
-use super::peers::{PANDA_GYM, Peer, PeerKind, Stage, is_in_panda_gym};
+use super::peers::{PANDA_GYM, Peer, PeerKind, PeerStage, is_in_panda_gym};
 use super::watch::{Interrupted, Watch};
-use super::workers::Workers;
-use crate::launch::{Launcher, create_domain};
-use crate::run_directory::{Manifest, RunDirectory};
+use super::workers::{Stage, Workers};
+use crate::run_directory::RunDirectory;
 use crate::terminal::RoundsProgress;
-
-/// A worker that waits for the next round is no reason for a warning [s].
-const SEND_DEADLINE_S: f64 = 1e6;
 
 /// What to measure.
 pub struct RolloutBench {
@@ -53,35 +48,18 @@ pub fn rollout(bench: RolloutBench) -> anyhow::Result<Option<Figures>> {
     }
 }
 
-fn measure(mut bench: RolloutBench) -> anyhow::Result<Figures> {
+fn measure(bench: RolloutBench) -> anyhow::Result<Figures> {
     let watch = Watch::start()?;
-    bench.config.actors.send_deadline_s = SEND_DEADLINE_S;
-    // Nobody joins a benchmark.
-    bench.config.actors.joined_max = 0;
-    let folder = tempfile::Builder::new().prefix("dmprl-bench-").tempdir();
-    let folder = folder.context("cannot make a folder for the workers' run")?;
-    let manifest = Manifest::new(None)?;
-    let run = RunDirectory::create(&folder.path().join("run"), &bench.config, &manifest)?;
     // Everything below is dropped in reverse order: processes, shared memory, files.
-    let domain = create_domain(&format!("{}-{}", manifest.run_id, std::process::id()))?;
-    let launcher = Launcher {
-        program: bench.program.clone(),
-        run: run.clone(),
-        venv: Some(bench.venv.clone()),
-        domain: Some(domain.path().to_owned()),
-        resume: false,
-        init_from: None,
-        learner_restarts: 0,
-        sessions_before: 0,
-        journal: None,
-    };
+    let stage = Stage::new(bench.program.clone(), bench.venv.clone(), &bench.config)?;
+    let run = &stage.launcher.run;
     let progress = RoundsProgress::new(bench.rounds);
     progress.preparing("starting the workers");
     // Alone, so that the time to the first segment is the workers' own.
-    let mut workers = Workers::start(&launcher, &domain, &watch)?;
+    let mut workers = Workers::start(&stage, &watch)?;
     progress.preparing("starting what they are compared with");
-    let mut figures = Figures::new(&bench, &workers.spec, manifest.machine);
-    let mut peers = start_peers(&bench, &run, &workers, &watch, &mut figures)?;
+    let mut figures = Figures::new(&bench, &workers.spec, stage.manifest.machine.clone());
+    let mut peers = start_peers(&bench, run, &workers, &watch, &mut figures)?;
     let mut sink_cpu_s = 0.0;
     let mut measured_s = 0.0;
     for round in 0..bench.rounds {
@@ -123,7 +101,7 @@ fn start_peers(
     let plan =
         NumpyPlan::write(run.path(), (&bench.config, spec, bench.controls), policy, parameters)?;
     let package_path = bench.package_path.clone();
-    let stage = Stage { run, package_path, plan, workers: bench.config.actors.workers };
+    let stage = PeerStage { run, package_path, plan, workers: bench.config.actors.workers };
     let own = bench.venv.join("bin/python");
     // All at once: most of a start is reading Python's packages.
     let suits = |kind: &PeerKind| *kind != PeerKind::PandaGym || is_in_panda_gym(&spec.id);

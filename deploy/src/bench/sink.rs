@@ -237,9 +237,9 @@ impl Taker {
 
     fn measure(&mut self, duration: Duration, from: From) -> anyhow::Result<Window> {
         self.take_for(SETTLE, from)?;
-        let cpu_s = cpu_s();
+        let cpu_s = thread_cpu_s();
         let taken = self.take_for(duration, from)?;
-        Ok(Window { cpu_s: self::cpu_s() - cpu_s, ..taken })
+        Ok(Window { cpu_s: thread_cpu_s() - cpu_s, ..taken })
     }
 
     /// What is taken in so much time, and how much time it really was.
@@ -333,7 +333,7 @@ impl Taker {
 }
 
 /// Processor time of the calling thread so far [s].
-fn cpu_s() -> f64 {
+pub(super) fn thread_cpu_s() -> f64 {
     let time = clock_gettime(ClockId::ThreadCPUTime);
     time.tv_sec as f64 + time.tv_nsec as f64 * 1e-9
 }

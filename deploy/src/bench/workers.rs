@@ -1,5 +1,6 @@
 //! The workers of a run, with a sink in the learner's place.
 
+use std::path::PathBuf;
 use std::time::{Duration, Instant};
 
 use anyhow::{Context, anyhow, bail, ensure};
@@ -12,17 +13,55 @@ use dmprl_shared::spec::EnvSpec;
 use dmprl_shared::transport::ParameterPublisher;
 use dmprl_shared::transport::delivery::Inbox;
 use dmprl_shared::transport::shared_memory::{Domain, serve};
+use tempfile::TempDir;
 
 use super::child::LineChild;
 use super::figures::Round;
 use super::sink::{Answer, Discrepancies, From, Request, Sink, Window, show_warning};
 use super::watch::Watch;
 use crate::control::{Command, Report};
-use crate::launch::{Launcher, Process, TimeLimits};
+use crate::launch::{Launcher, Process, TimeLimits, create_domain};
 use crate::roles::{Setup, plan};
+use crate::run_directory::{Manifest, RunDirectory};
 
 /// Beyond what was asked for, a measurement may take so much longer.
 const MEASURE_SLACK: Duration = Duration::from_secs(30);
+
+/// A worker that waits for the next round is no reason for a warning [s].
+const SEND_DEADLINE_S: f64 = 1e6;
+
+/// A run that nobody trains: what workers need around them. Dropped, it leaves nothing.
+pub(super) struct Stage {
+    pub(super) launcher: Launcher,
+    pub(super) domain: Domain,
+    pub(super) manifest: Manifest,
+    /// Last: removed when nobody is left who uses it.
+    _folder: TempDir,
+}
+
+impl Stage {
+    /// Makes a folder and shared memory.
+    pub(super) fn new(
+        program: PathBuf,
+        venv: PathBuf,
+        config: &ExperimentConfig,
+    ) -> anyhow::Result<Self> {
+        let mut config = config.clone();
+        config.actors.send_deadline_s = SEND_DEADLINE_S;
+        // Nobody joins a benchmark.
+        config.actors.joined_max = 0;
+        let folder = tempfile::Builder::new().prefix("dmprl-bench-").tempdir();
+        let folder = folder.context("cannot make a folder for the workers' run")?;
+        let manifest = Manifest::new(None)?;
+        let run = RunDirectory::create(&folder.path().join("run"), &config, &manifest)?;
+        let domain = create_domain(&format!("{}-{}", manifest.run_id, std::process::id()))?;
+        let launcher = Launcher {
+            domain: Some(domain.path().to_owned()),
+            ..Launcher::outside_training(program, &run, Some(venv))
+        };
+        Ok(Self { launcher, domain, manifest, _folder: folder })
+    }
+}
 
 /// Running workers, each with a full queue, and what they run.
 pub(super) struct Workers {
@@ -41,11 +80,8 @@ pub(super) struct Workers {
 
 impl Workers {
     /// Starts them, and returns when each has delivered its first segment.
-    pub(super) fn start(
-        launcher: &Launcher,
-        domain: &Domain,
-        watch: &Watch,
-    ) -> anyhow::Result<Self> {
+    pub(super) fn start(stage: &Stage, watch: &Watch) -> anyhow::Result<Self> {
+        let Stage { launcher, domain, .. } = stage;
         let setup = Setup::read(launcher.run.path())?;
         let config = &setup.config;
         let limit = TimeLimits::default().ready;

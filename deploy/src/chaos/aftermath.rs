@@ -10,10 +10,10 @@ use dmprl_learner::metrics::MetricsLine;
 use rustix::process::Pid;
 
 use super::checker::{Checker, Sums};
-use super::processes::of_session;
 use super::samples::shared_memory;
 use super::violations::Violations;
 use crate::journal::Standing;
+use crate::launch::members::of_session;
 use crate::roles::Setup;
 
 /// Processes of a run that has ended are gone by then.

@@ -15,7 +15,6 @@ mod aftermath;
 mod checker;
 mod journals;
 mod nemesis;
-mod processes;
 mod report;
 mod samples;
 mod schedule;

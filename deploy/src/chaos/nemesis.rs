@@ -6,9 +6,9 @@ use std::time::Duration;
 
 use rustix::process::{Pid, Signal};
 
-use super::processes::{Member, Role, members};
 use super::schedule::{Fault, Schedule, Strike};
 use super::timeline::Timeline;
+use crate::launch::members::{Member, Role, members};
 
 /// A strike waits so long for its victim to be there and at work [us]; then it takes what is there,
 /// or is left out.

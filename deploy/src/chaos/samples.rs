@@ -7,8 +7,8 @@ use std::path::{Path, PathBuf};
 use rustix::process::Pid;
 use serde_json::{Value, json};
 
-use super::processes::holdings;
 use crate::launch::Place;
+use crate::launch::members::holdings;
 
 /// Between two samples [us].
 const INTERVAL_US: u64 = 1_000_000;

@@ -10,7 +10,6 @@ use super::aftermath;
 use super::checker::Checker;
 use super::journals::Journals;
 use super::nemesis::Nemesis;
-use super::processes::{Member, Role, members};
 use super::report::Report;
 use super::samples::Samples;
 use super::schedule::Schedule;
@@ -19,6 +18,7 @@ use super::timeline::Timeline;
 use super::violations::Violations;
 use crate::bench::Watch;
 use crate::journal::now_us;
+use crate::launch::members::{Member, Role, members};
 use crate::run_directory::RunDirectory;
 use crate::terminal::TrialProgress;
 

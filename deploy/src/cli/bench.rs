@@ -8,6 +8,8 @@ use dmprl_shared::config::Limits;
 
 use super::bench_learner::{self, LearnerArgs};
 use super::bench_policy::{self, PolicyArgs};
+use super::bench_scale::{self, ScaleArgs};
+use super::bench_system::{self, SystemArgs};
 use super::bench_transport::{self, TransportArgs};
 use super::configuration::{merge, refuse};
 use super::configured::{ConfiguredArgs, make_absolute};
@@ -28,6 +30,8 @@ EXAMPLES
   dmprl bench learner --task pusher --threads 1
   dmprl bench transport
   dmprl bench policy runs/mine
+  dmprl bench system --task reacher
+  dmprl bench scale
   dmprl bench learner --help";
 
 const ROLLOUT_HELP: &str = "\
@@ -71,6 +75,10 @@ enum Bench {
     Policy(Box<PolicyArgs>),
     /// Environment steps a second of the rollout workers, and of what else could make them.
     Rollout(Box<RolloutArgs>),
+    /// What many workers would do, and a learner's ingest under 256 of them.
+    Scale(Box<ScaleArgs>),
+    /// Steps and updates a second of a whole run that learns.
+    System(Box<SystemArgs>),
     /// Segments a second from workers to learner, beside pipes, sockets and queues of Python.
     Transport(TransportArgs),
 }
@@ -112,6 +120,8 @@ pub(super) fn run(args: &BenchArgs) -> anyhow::Result<Outcome> {
         Bench::Learner(args) => bench_learner::run(args),
         Bench::Policy(args) => bench_policy::run(args),
         Bench::Rollout(args) => rollout(args),
+        Bench::Scale(args) => bench_scale::run(args),
+        Bench::System(args) => bench_system::run(args),
         Bench::Transport(args) => bench_transport::run(args),
     }
 }

@@ -3,6 +3,8 @@
 mod bench;
 mod bench_learner;
 mod bench_policy;
+mod bench_scale;
+mod bench_system;
 mod bench_transport;
 mod chaos;
 mod clean;
@@ -30,7 +32,7 @@ use anyhow::Context;
 use clap::{Parser, Subcommand};
 use dmprl_shared::config::ExperimentConfig;
 
-use crate::bench::{TransportWorkerArgs, transport_worker};
+use crate::bench::{SegmentFeederArgs, TransportWorkerArgs, segment_feeder, transport_worker};
 use crate::failure::{Outcome, exit_code, render, wrong_use};
 #[cfg(feature = "python")]
 use crate::python_setup::{Home, ensure_extra};
@@ -117,6 +119,9 @@ enum Command {
     /// A process that only sends segments; started by bench transport.
     #[command(hide = true)]
     TransportWorker(TransportWorkerArgs),
+    /// A process that plays many workers, which only send segments; started by bench scale.
+    #[command(hide = true)]
+    SegmentFeeder(SegmentFeederArgs),
 }
 
 fn long_help() -> String {
@@ -168,6 +173,7 @@ fn run(command: Command) -> anyhow::Result<Outcome> {
         Command::Evaluator(args) => roles::evaluator(&args).map(|()| Outcome::Done),
         Command::Observer(args) => roles::observer(&args).map(|()| Outcome::Done),
         Command::TransportWorker(args) => transport_worker(&args).map(|()| Outcome::Done),
+        Command::SegmentFeeder(args) => segment_feeder(&args).map(|()| Outcome::Done),
     }
 }
 

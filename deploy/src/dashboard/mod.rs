@@ -17,7 +17,7 @@ mod page;
 mod prometheus;
 mod server;
 mod table;
-mod tail;
+pub(crate) mod tail;
 mod videos;
 mod watched;
 

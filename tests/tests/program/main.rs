@@ -11,6 +11,8 @@
 mod bench;
 mod bench_learner;
 mod bench_policy;
+mod bench_scale;
+mod bench_system;
 mod bench_transport;
 mod browser;
 mod chaos;

@@ -20,16 +20,16 @@ pub(super) const OPTIMISER: &str = "optimiser";
 
 /// The time of one update, or of one update's part.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub(super) struct Timed {
+pub(in crate::bench) struct Timed {
     /// By the clock \[s\].
-    pub(super) wall_s: f64,
+    pub(in crate::bench) wall_s: f64,
     /// Of all threads together \[s\]: what other programs on the machine disturb least.
-    pub(super) cpu_s: f64,
+    pub(in crate::bench) cpu_s: f64,
 }
 
 impl Timed {
     /// Of one of `count` updates that took this long together.
-    pub(super) fn over(self, count: f64) -> Self {
+    pub(in crate::bench) fn over(self, count: f64) -> Self {
         Self { wall_s: self.wall_s / count, cpu_s: self.cpu_s / count }
     }
 }

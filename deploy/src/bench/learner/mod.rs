@@ -25,12 +25,15 @@ use super::watch::{Interrupted, Watch};
 use crate::terminal::RoundsProgress;
 
 pub use figures::Figures;
+pub(super) use figures::Timed;
 pub use peers::PeerKind;
+pub(super) use synthetic::fill;
 pub use synthetic::spec_of;
+pub(super) use work::timed;
 
 use figures::{KERNELS, LIBRARY, OPTIMISER, OURS, SAMPLE};
 use peers::Peer;
-use work::{FloorWork, OptimiserWork, SampleWork, timed};
+use work::{FloorWork, OptimiserWork, SampleWork};
 
 /// What to measure.
 pub struct LearnerBench {

@@ -31,7 +31,7 @@ pub fn spec_of(task: &TaskDefaults) -> EnvSpec {
 }
 
 /// Inserts whole episodes, one environment after the other.
-pub(super) fn fill(learner: &mut Learner, spec: &EnvSpec) -> anyhow::Result<()> {
+pub(in crate::bench) fn fill(learner: &mut Learner, spec: &EnvSpec) -> anyhow::Result<()> {
     let layout = learner.policy().layout();
     let mut segment = Segment::zeroed(layout);
     let steps = STEPS.min(learner.config().replay.capacity_steps);

@@ -16,7 +16,7 @@ use super::figures::Timed;
 const SETTLE_SHARE: u32 = 8;
 
 /// Calls `work` for so long and returns the time of one call.
-pub(super) fn timed(
+pub(in crate::bench) fn timed(
     duration: Duration,
     mut work: impl FnMut() -> anyhow::Result<()>,
 ) -> anyhow::Result<Timed> {

@@ -4,9 +4,9 @@ use dmprl_shared::config::DeliveryLevel;
 use serde_json::{Map, Value, json};
 
 use super::TransportBench;
-use super::made_up::{QUEUE_SEGMENTS, SIZES};
 use super::python;
 use super::streams::StreamKind;
+use crate::bench::made_up::{QUEUE_SEGMENTS, SIZES};
 use crate::bench::sink::Discrepancies;
 use crate::bench::statistics::{load_average, max, median, min};
 use crate::run_directory::Machine;

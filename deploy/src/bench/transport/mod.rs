@@ -8,7 +8,6 @@
 //! the workers still cost is measured.
 
 mod figures;
-mod made_up;
 mod ours;
 mod python;
 mod streams;
@@ -28,8 +27,8 @@ use crate::terminal::RoundsProgress;
 pub use figures::Figures;
 pub use worker::{TransportWorkerArgs, transport_worker};
 
+use super::made_up::{SIZES, Size};
 use figures::OURS;
-use made_up::{SIZES, Size};
 use ours::Ours;
 use python::PythonPeer;
 use streams::{StreamKind, StreamPeer};

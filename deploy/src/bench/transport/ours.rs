@@ -10,8 +10,8 @@ use dmprl_shared::config::DeliveryLevel;
 use dmprl_shared::transport::delivery::{Inbox, SegmentLog, Sent};
 use dmprl_shared::transport::shared_memory::{Domain, serve};
 
-use super::made_up::Size;
 use crate::bench::child::LineChild;
+use crate::bench::made_up::Size;
 use crate::bench::sink::{Answer, Discrepancies, From, Request, Sink, Window, show_warning};
 use crate::bench::watch::Watch;
 use crate::control::Report;

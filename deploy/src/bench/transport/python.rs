@@ -9,8 +9,8 @@ use anyhow::{Context, ensure};
 use serde::Deserialize;
 
 use super::TransportBench;
-use super::made_up::Size;
 use crate::bench::child::LineChild;
+use crate::bench::made_up::Size;
 use crate::bench::watch::Watch;
 
 /// From a start to the first line.

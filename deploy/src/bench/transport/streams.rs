@@ -18,8 +18,8 @@ use anyhow::{Context, anyhow, bail, ensure};
 use dmprl_shared::segment::{Expected, Segment, SegmentHeader, check};
 use dmprl_shared::transport::delivery::Inbox;
 
-use super::made_up::Size;
 use crate::bench::child::LineChild;
+use crate::bench::made_up::Size;
 use crate::bench::watch::Watch;
 
 /// From the start of a process to its connection.

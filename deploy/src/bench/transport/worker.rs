@@ -14,8 +14,8 @@ use clap::Args;
 use dmprl_shared::segment::Segment;
 use dmprl_shared::transport::delivery::{Outbox, Sent};
 
-use super::made_up::{MadeUp, QUEUE_SEGMENTS, Size, size_of_bytes};
 use super::streams::frame_bytes;
+use crate::bench::made_up::{MadeUp, QUEUE_SEGMENTS, Size};
 use crate::control::Report;
 use crate::roles::{ControlPipe, Delivery, ORPHAN_LIMIT, Stopped, attach_within};
 
@@ -61,7 +61,7 @@ struct Route {
 }
 
 fn size(text: &str) -> Result<usize, String> {
-    let bytes = text.parse().ok().and_then(size_of_bytes).map(|size| size.bytes);
+    let bytes = text.parse().ok().and_then(Size::of_bytes).map(|size| size.bytes);
     bytes.ok_or_else(|| "expected 1024 or 10240".to_owned())
 }
 
@@ -71,7 +71,7 @@ fn size(text: &str) -> Result<usize, String> {
 /// Whoever receives is gone, or the transport is broken.
 pub fn transport_worker(args: &TransportWorkerArgs) -> anyhow::Result<()> {
     let control = ControlPipe::open(ORPHAN_LIMIT)?;
-    let size = size_of_bytes(args.segment_bytes).context("no such size")?;
+    let size = Size::of_bytes(args.segment_bytes).context("no such size")?;
     let Route { shared_memory, pipe, socket } = &args.route;
     if let Some(domain) = shared_memory {
         return through_shared_memory(args, size, domain, &control);

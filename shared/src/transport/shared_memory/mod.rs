@@ -1,8 +1,9 @@
 //! Segments and snapshots between processes of one host, over iceoryx2.
 //!
 //! `domain` is the run's directory and `generation` the part of it that belongs to one learner,
-//! `service`, `channel` and `latest` tame the middleware, `segments` and `parameters` implement the
-//! traits, `acknowledgements` is what `delivery` needs beside them. iceoryx2 is named nowhere else.
+//! `service`, `channel`, `cleaning` and `latest` tame the middleware, `segments` and `parameters`
+//! implement the traits, `acknowledgements` is what `delivery` needs beside them. iceoryx2 is named
+//! nowhere else.
 //!
 //! What holds when processes die:
 //! - A worker never creates a service and never cleans up, so one killed in the middle blocks
@@ -14,6 +15,7 @@
 
 mod acknowledgements;
 mod channel;
+mod cleaning;
 mod domain;
 mod generation;
 mod latest;

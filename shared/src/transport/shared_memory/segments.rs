@@ -15,9 +15,10 @@ use iceoryx2_bb_elementary_traits::zero_copy_send::ZeroCopySend;
 
 use super::Plan;
 use super::channel::{Channel, ChannelBuilder, Disconnected, Factory};
+use super::cleaning::{Cleaning, sender_died};
 use super::domain::Domain;
 use super::generation::Membership;
-use super::service::{PrivateIpc, clean, refused};
+use super::service::{PrivateIpc, refused};
 use crate::segment::{LAYOUT_VERSION, Segment, SegmentHeader};
 use crate::transport::{SegmentReceiver, SegmentSender, SendOutcome, TransportError};
 
@@ -27,9 +28,6 @@ const TURN_SEGMENTS: usize = 8;
 /// Processes that may hold one worker's service open at once: learner, worker, and the dead whose
 /// places are not cleaned up yet.
 const NODES_MAX: usize = 8;
-/// Cleanups that may fail in a row before the caller is told. One is normal: a worker that starts
-/// or ends in that moment hides the ones behind it.
-const CLEAN_FAILURES_MAX: usize = 20;
 /// The learner copies a segment out and gives it back at once; a worker fills one at a time.
 const BORROWED_MAX: usize = 1;
 
@@ -158,7 +156,7 @@ pub struct Receiver {
     turn_left: usize,
     block_len: usize,
     node: Node<PrivateIpc>,
-    clean_failures: usize,
+    cleaning: Cleaning,
     /// Says to a second learner that there is one. Last: given up after the ports.
     _learner: Arc<File>,
 }
@@ -179,7 +177,7 @@ impl Receiver {
             turn_left,
             block_len,
             node,
-            clean_failures: 0,
+            cleaning: Cleaning::default(),
             _learner: learner,
         })
     }
@@ -290,11 +288,8 @@ impl SegmentReceiver for Receiver {
         for port in self.slots.iter().filter_map(|slot| slot.port.as_ref()) {
             let _ = port.has_samples();
         }
-        match clean(&self.node) {
-            Ok(()) => self.clean_failures = 0,
-            Err(error) if self.clean_failures >= CLEAN_FAILURES_MAX => return Err(error),
-            Err(_) => self.clean_failures += 1,
-        }
+        let died = self.slots.iter().any(|slot| sender_died(&slot.factory));
+        self.cleaning.clean_in_time(&self.node, died)?;
         self.slots.iter_mut().try_for_each(Slot::renew)
     }
 }

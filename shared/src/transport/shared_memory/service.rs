@@ -122,20 +122,24 @@ pub(super) fn join(root: &Path) -> Result<Node<PrivateIpc>, TransportError> {
         .map_err(refused("joining", root.display()))
 }
 
-/// Frees what dead processes below the node's root left behind.
+/// Frees what dead processes below the node's root left behind; returns how many nodes, dead or
+/// alive, it has looked at.
 ///
 /// iceoryx2 0.10 panics when it finds a "dead" node alive after all (issue 1880): the panic
 /// becomes an error here, and the next call tries again.
-pub(super) fn clean(node: &Node<PrivateIpc>) -> Result<(), TransportError> {
+pub(super) fn clean(node: &Node<PrivateIpc>) -> Result<usize, TransportError> {
     let operation = "cleaning up after dead processes";
     let cleaned = catch_unwind(AssertUnwindSafe(|| {
-        Node::<PrivateIpc>::list(node.config(), |state| {
+        let mut looked = 0;
+        let listed = Node::<PrivateIpc>::list(node.config(), |state| {
+            looked += 1;
             if let NodeState::Dead(dead) = state {
                 // What could not be removed is found again by the next call.
                 let _ = dead.try_remove_stale_resources();
             }
             CallbackProgression::Continue
-        })
+        });
+        listed.map(|()| looked)
     }));
     match cleaned {
         Ok(listed) => listed.map_err(refused(operation, node.config().global.root_path())),

@@ -1,4 +1,4 @@
-//! The processes of the run, as /proc shows them.
+//! The processes of a run that somebody else supervises, as /proc shows them.
 
 use std::fs;
 
@@ -7,7 +7,7 @@ use rustix::process::{Pid, Signal, kill_process};
 
 /// Which part of the run a process plays.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) enum Role {
+pub(crate) enum Role {
     /// A worker, by index and incarnation.
     Worker(u32, u32),
     /// A learner, by the number of deaths before it.
@@ -18,25 +18,25 @@ pub(super) enum Role {
 
 /// A child of the supervisor.
 #[derive(Debug, Clone, Copy)]
-pub(super) struct Member {
-    pub(super) role: Role,
+pub(crate) struct Member {
+    pub(crate) role: Role,
     pid: Pid,
 }
 
 impl Member {
     /// Sends it a signal; false if it is gone.
-    pub(super) fn signal(&self, signal: Signal) -> bool {
+    pub(crate) fn signal(&self, signal: Signal) -> bool {
         kill_process(self.pid, signal).is_ok()
     }
 
     /// Its id.
-    pub(super) fn pid(&self) -> Pid {
+    pub(crate) fn pid(&self) -> Pid {
         self.pid
     }
 }
 
 /// The supervisor's children that have told their command line already.
-pub(super) fn members(supervisor: Pid) -> anyhow::Result<Vec<Member>> {
+pub(crate) fn members(supervisor: Pid) -> anyhow::Result<Vec<Member>> {
     let entries = fs::read_dir("/proc").context("cannot list /proc")?;
     let child = |name: &str| {
         let pid = Pid::from_raw(name.parse().ok()?)?;
@@ -70,7 +70,7 @@ fn role(command_line: &str) -> Option<Role> {
 }
 
 /// Ids of the processes, but this one, of a session: whatever the run has started is in its own.
-pub(super) fn of_session(session: Pid) -> anyhow::Result<Vec<String>> {
+pub(crate) fn of_session(session: Pid) -> anyhow::Result<Vec<String>> {
     let (session, own) = (session.as_raw_nonzero().to_string(), std::process::id().to_string());
     let entries = fs::read_dir("/proc").context("cannot list /proc")?;
     let member = |name: String| {
@@ -84,19 +84,29 @@ pub(super) fn of_session(session: Pid) -> anyhow::Result<Vec<String>> {
     Ok(names.filter_map(member).collect())
 }
 
+/// Processor time of a process so far, ended threads included [s]; none if it is gone.
+pub(crate) fn cpu_s(pid: Pid) -> Option<f64> {
+    let stat = fs::read_to_string(format!("/proc/{}/stat", pid.as_raw_nonzero())).ok()?;
+    // The name in parentheses may hold anything; utime and stime are the twelfth and thirteenth
+    // field behind it.
+    let fields: Vec<&str> = stat.rsplit_once(')')?.1.split_whitespace().collect();
+    let ticks = fields.get(11)?.parse::<u64>().ok()? + fields.get(12)?.parse::<u64>().ok()?;
+    Some(ticks as f64 / rustix::param::clock_ticks_per_second() as f64)
+}
+
 /// What a process holds.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) struct Holdings {
+pub(crate) struct Holdings {
     /// Memory [KiB].
-    pub(super) rss_kib: u64,
+    pub(crate) rss_kib: u64,
     /// Open files.
-    pub(super) fds: u64,
+    pub(crate) fds: u64,
     /// Memory maps.
-    pub(super) maps: u64,
+    pub(crate) maps: u64,
 }
 
 /// What a process holds now; none if it is gone.
-pub(super) fn holdings(pid: Pid) -> Option<Holdings> {
+pub(crate) fn holdings(pid: Pid) -> Option<Holdings> {
     let folder = format!("/proc/{}", pid.as_raw_nonzero());
     let status = fs::read_to_string(format!("{folder}/status")).ok()?;
     let line = status.lines().find_map(|line| line.strip_prefix("VmRSS:"))?;
@@ -127,5 +137,13 @@ mod tests {
     fn this_process_holds_something() {
         let held = holdings(rustix::process::getpid()).unwrap();
         assert!(held.rss_kib > 0 && held.fds > 2 && held.maps > 2, "{held:?}");
+    }
+
+    #[test]
+    fn processor_time_is_counted_in_seconds() {
+        let clock = rustix::time::clock_gettime(rustix::time::ClockId::ProcessCPUTime);
+        let told = cpu_s(rustix::process::getpid()).unwrap();
+        // The clock was read first, and /proc rounds down to ticks of a hundredth.
+        assert!(told >= clock.tv_sec as f64 - 1.0 && told < clock.tv_sec as f64 + 60.0, "{told}");
     }
 }

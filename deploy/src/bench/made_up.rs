@@ -1,7 +1,8 @@
 //! Segments that nobody has lived, of a given size in bytes.
 
 use dmprl_shared::segment::{
-    ActionBounds, Expected, LAYOUT_VERSION, Segment, SegmentHeader, SegmentLayout, block_checksum,
+    ActionBounds, Expected, LAYOUT_VERSION, Segment, SegmentHeader, SegmentLayout, TRUNCATED,
+    block_checksum,
 };
 use dmprl_shared::transport::shared_memory::Plan;
 
@@ -12,7 +13,10 @@ pub(super) const SIZES: [Size; 2] =
 /// both full.
 pub(super) const QUEUE_SEGMENTS: usize = 512;
 
-const RUN_ID: u64 = 1;
+/// The run that the segments say they are from.
+pub(super) const RUN_ID: u64 = 1;
+/// Segments of an episode: its parts are linked in a replay.
+const EPISODE_SEGMENTS: u64 = 10;
 const ARCHITECTURE_HASH: u64 = 1;
 /// Between two numbers; irrational to the sine's period.
 const STRIDE: f32 = 0.37;
@@ -30,12 +34,12 @@ const fn layout(observation_len: usize, action_len: usize) -> SegmentLayout {
     SegmentLayout { segment_steps: 5, observation_len, action_len }
 }
 
-/// The size of so many bytes, if it is one of those that are measured.
-pub(super) fn size_of_bytes(bytes: usize) -> Option<Size> {
-    SIZES.into_iter().find(|size| size.bytes == bytes)
-}
-
 impl Size {
+    /// The size of so many bytes, if it is one of those that are measured.
+    pub(super) fn of_bytes(bytes: usize) -> Option<Self> {
+        SIZES.into_iter().find(|size| size.bytes == bytes)
+    }
+
     /// What the learner's place and the workers agree on.
     pub(super) fn plan(self, workers: usize) -> Plan {
         Plan {
@@ -68,6 +72,11 @@ pub(super) struct MadeUp(Segment);
 impl MadeUp {
     /// Before the first.
     pub(super) fn new(layout: SegmentLayout, worker_id: u32) -> Self {
+        Self::of(layout, worker_id, ARCHITECTURE_HASH)
+    }
+
+    /// The same for a learner that has an architecture.
+    pub(super) fn of(layout: SegmentLayout, worker_id: u32, architecture_hash: u64) -> Self {
         let mut segment = Segment::zeroed(layout);
         for (index, value) in segment.block.iter_mut().enumerate() {
             *value = (index as f32 * STRIDE).sin();
@@ -75,7 +84,7 @@ impl MadeUp {
         segment.header = SegmentHeader {
             layout_version: LAYOUT_VERSION,
             run_id: RUN_ID,
-            architecture_hash: ARCHITECTURE_HASH,
+            architecture_hash,
             worker_id,
             steps_len: layout.segment_steps as u32,
             segment_steps: layout.segment_steps as u32,
@@ -89,6 +98,11 @@ impl MadeUp {
     /// The next: numbered, another than the one before, and with its checksum as a worker's has.
     pub(super) fn next(&mut self) -> &Segment {
         let Segment { header, block } = &mut self.0;
+        let (episode, place) =
+            (header.sequence / EPISODE_SEGMENTS, header.sequence % EPISODE_SEGMENTS);
+        header.episode = episode as u32;
+        header.episode_step = place as u32 * header.segment_steps;
+        header.flags = if place + 1 == EPISODE_SEGMENTS { TRUNCATED } else { 0 };
         header.sequence += 1;
         block[0] = (header.sequence % STAMP_MAX) as f32;
         header.checksum = block_checksum(block);
@@ -115,5 +129,18 @@ mod tests {
             });
             assert_ne!(checksums[0], checksums[1]);
         }
+    }
+
+    #[test]
+    fn made_up_segments_follow_each_other_in_episodes() {
+        let layout = SIZES[0].layout;
+        let mut made_up = MadeUp::of(layout, 0, 7);
+        let mut next = || made_up.next().header;
+        let (first, second) = (next(), next());
+        assert_eq!((first.episode, first.episode_step, first.architecture_hash), (0, 0, 7));
+        assert_eq!((second.episode, second.episode_step), (0, layout.segment_steps as u32));
+        let tenth = (2..10).map(|_| next()).last().unwrap();
+        assert_eq!((tenth.episode, tenth.flags), (0, TRUNCATED));
+        assert_eq!((next().episode, next().flags), (1, 0));
     }
 }

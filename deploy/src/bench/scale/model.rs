@@ -1,0 +1,270 @@
+//! What a system of many workers would do, from what its parts cost: pure arithmetic.
+//!
+//! Every environment step passes four stages, each with a bound of its own on segments a second.
+//! The smallest decides, and is called the bottleneck:
+//!
+//! ```text
+//!   workers   workers at work / worker_s            a worker is one thread: at most a core each
+//!   learner   1 / (ingest_s + u update_s)           one thread takes segments and does updates,
+//!                                                   in turn; u updates for each segment (pacing)
+//!   link      link_bytes_per_s / segment_bytes      into the learner's host, if it is given
+//!   cores     cores / (worker_s + ingest_s + u update_cpu_s)     only where all share one machine
+//! ```
+//! The learner's bound is called `ingest` where taking segments is most of it, else `updates`.
+//!
+//! Assumed, and checked against a real system only on one machine:
+//! - Costs are constants: of a worker whatever the number of workers, of the learner whatever the
+//!   number of queues it takes from (they are measured with many), of an update whatever else goes
+//!   on. Cores are alike and have nothing else to do.
+//! - Queues are long enough that nobody waits but for the bottleneck.
+//! - Each worker host has `cores_per_host` workers, the learner has a host of its own, and its
+//!   threads have a core each.
+//! - A network costs its bytes and nothing else. dmprl has no transport between machines yet: what
+//!   it will cost the learner's thread a segment comes on top of `ingest_s`.
+//! - Publishing, metrics, checkpoints and evaluations cost nothing. They are rare beside updates.
+
+use serde::Serialize;
+
+/// What one segment and one update cost [s].
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(super) struct Costs {
+    /// Processor time of a worker for a segment.
+    pub(super) worker_s: f64,
+    /// Time of the learner's thread for a segment: to take, check, settle, insert and acknowledge.
+    pub(super) ingest_s: f64,
+    /// Time of an update on the learner's threads,
+    pub(super) update_s: f64,
+    /// and of all of them together.
+    pub(super) update_cpu_s: f64,
+}
+
+/// What a run asks for.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(super) struct Demand {
+    /// Environment steps in a segment, on average.
+    pub(super) steps_per_segment: f64,
+    /// Updates for each segment.
+    pub(super) updates_per_segment: f64,
+    /// Header and block.
+    pub(super) segment_bytes: usize,
+}
+
+/// Where it runs.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(super) enum Place {
+    /// Workers and learner share a machine.
+    OneMachine {
+        /// That it has for them.
+        cores: f64,
+    },
+    /// The learner has a host of its own, the workers have others.
+    Hosts {
+        /// Workers of each host.
+        cores_per_host: usize,
+        /// Into the learner's host; none: no bound.
+        link_bytes_per_s: Option<f64>,
+    },
+}
+
+/// What bounds a system.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
+#[serde(rename_all = "snake_case")]
+pub(super) enum Bottleneck {
+    /// The workers, who can do no more.
+    Workers,
+    /// The learner's thread, most of whose time goes into taking segments.
+    Ingest,
+    /// The same, most of whose time goes into updates.
+    Updates,
+    /// The network into the learner's host.
+    Link,
+    /// The cores of the one machine.
+    Cores,
+}
+
+impl Bottleneck {
+    /// As reports call it.
+    pub(super) fn name(self) -> &'static str {
+        match self {
+            Self::Workers => "workers",
+            Self::Ingest => "ingest",
+            Self::Updates => "updates",
+            Self::Link => "link",
+            Self::Cores => "cores",
+        }
+    }
+}
+
+/// What is to be expected of so many workers.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
+pub(super) struct Prediction {
+    pub(super) workers: usize,
+    /// Machines, the learner's included.
+    pub(super) hosts: usize,
+    pub(super) steps_per_s: f64,
+    pub(super) bottleneck: Bottleneck,
+    /// Share of its time in which the learner's thread works.
+    pub(super) learner_utilisation: f64,
+}
+
+/// Costs, a demand and a place.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(super) struct Model {
+    pub(super) costs: Costs,
+    pub(super) demand: Demand,
+    pub(super) place: Place,
+}
+
+impl Model {
+    /// Time of the learner's thread for a segment and the updates that it asks for [s].
+    fn learner_s(&self) -> f64 {
+        self.costs.ingest_s + self.demand.updates_per_segment * self.costs.update_s
+    }
+
+    /// Processor time of a worker and of the learner for an environment step [s].
+    pub(super) fn cpu_s_per_step(&self) -> f64 {
+        self.cpu_s() / self.demand.steps_per_segment
+    }
+
+    /// The same for a segment.
+    fn cpu_s(&self) -> f64 {
+        let Costs { worker_s, ingest_s, update_cpu_s, .. } = self.costs;
+        worker_s + ingest_s + self.demand.updates_per_segment * update_cpu_s
+    }
+
+    /// Segments a second that the workers alone would make.
+    fn workers_rate(&self, workers: usize) -> f64 {
+        let at_work = match self.place {
+            Place::OneMachine { cores } => (workers as f64).min(cores),
+            Place::Hosts { .. } => workers as f64,
+        };
+        at_work / self.costs.worker_s
+    }
+
+    /// Everything else that bounds segments a second.
+    fn other_bounds(&self) -> [(Bottleneck, f64); 3] {
+        let Self { costs, demand, place } = self;
+        let updates_s = demand.updates_per_segment * costs.update_s;
+        let learner =
+            if updates_s > costs.ingest_s { Bottleneck::Updates } else { Bottleneck::Ingest };
+        let (cores, link) = match *place {
+            Place::OneMachine { cores } => (cores / self.cpu_s(), None),
+            Place::Hosts { link_bytes_per_s, .. } => (f64::INFINITY, link_bytes_per_s),
+        };
+        let link = link.map_or(f64::INFINITY, |bytes| bytes / demand.segment_bytes as f64);
+        [(learner, 1.0 / self.learner_s()), (Bottleneck::Link, link), (Bottleneck::Cores, cores)]
+    }
+
+    /// What so many workers would do.
+    pub(super) fn predict(&self, workers: usize) -> Prediction {
+        let bounds = self.other_bounds().into_iter();
+        let least = |a: (Bottleneck, f64), b: (Bottleneck, f64)| if b.1 < a.1 { b } else { a };
+        let (bottleneck, segments_per_s) =
+            bounds.fold((Bottleneck::Workers, self.workers_rate(workers)), least);
+        let hosts = match self.place {
+            Place::OneMachine { .. } => 1,
+            Place::Hosts { cores_per_host, .. } => 1 + workers.div_ceil(cores_per_host.max(1)),
+        };
+        Prediction {
+            workers,
+            hosts,
+            steps_per_s: segments_per_s * self.demand.steps_per_segment,
+            bottleneck,
+            learner_utilisation: segments_per_s * self.learner_s(),
+        }
+    }
+
+    /// What the workers meet first as they become more, and how many of them reach it.
+    pub(super) fn first_bottleneck(&self) -> (Bottleneck, usize) {
+        let least = |a: (Bottleneck, f64), b: (Bottleneck, f64)| if b.1 < a.1 { b } else { a };
+        let none = (Bottleneck::Workers, f64::INFINITY);
+        let (bottleneck, rate) = self.other_bounds().into_iter().fold(none, least);
+        (bottleneck, (rate * self.costs.worker_s).ceil() as usize)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// A worker makes 100 segments a second; the learner takes 10,000 or does 500 updates.
+    const COSTS: Costs =
+        Costs { worker_s: 1e-2, ingest_s: 1e-4, update_s: 2e-3, update_cpu_s: 2e-3 };
+    const DEMAND: Demand =
+        Demand { steps_per_segment: 5.0, updates_per_segment: 0.0, segment_bytes: 1_000 };
+
+    fn hosts(costs: Costs, demand: Demand, link_bytes_per_s: Option<f64>) -> Model {
+        Model { costs, demand, place: Place::Hosts { cores_per_host: 16, link_bytes_per_s } }
+    }
+
+    #[track_caller]
+    fn close(got: f64, expected: f64) {
+        assert!((got / expected - 1.0).abs() < 1e-9, "{got}, expected {expected}");
+    }
+
+    #[test]
+    fn few_workers_are_their_own_bound_and_the_learner_idles() {
+        let prediction = hosts(COSTS, DEMAND, None).predict(50);
+        assert_eq!((prediction.bottleneck, prediction.hosts), (Bottleneck::Workers, 5));
+        close(prediction.steps_per_s, 50.0 * 100.0 * 5.0);
+        close(prediction.learner_utilisation, 0.5);
+    }
+
+    #[test]
+    fn without_updates_taking_segments_is_the_first_bound_of_many() {
+        let model = hosts(COSTS, DEMAND, None);
+        assert_eq!(model.first_bottleneck(), (Bottleneck::Ingest, 100));
+        let prediction = model.predict(1_024);
+        assert_eq!((prediction.bottleneck, prediction.hosts), (Bottleneck::Ingest, 65));
+        close(prediction.steps_per_s, 10_000.0 * 5.0);
+        close(prediction.learner_utilisation, 1.0);
+    }
+
+    #[test]
+    fn updates_and_segments_share_the_learners_time() {
+        let demand = Demand { updates_per_segment: 0.2, ..DEMAND };
+        let model = hosts(COSTS, demand, None);
+        // 0.1 ms to take a segment, 0.4 ms for its updates.
+        assert_eq!(model.first_bottleneck(), (Bottleneck::Updates, 20));
+        close(model.predict(64).steps_per_s, 2_000.0 * 5.0);
+        let rare = Demand { updates_per_segment: 0.01, ..DEMAND };
+        assert_eq!(hosts(COSTS, rare, None).predict(1_024).bottleneck, Bottleneck::Ingest);
+    }
+
+    #[test]
+    fn a_narrow_link_bounds_what_the_learner_could_take() {
+        let model = hosts(COSTS, DEMAND, Some(1e6));
+        assert_eq!(model.first_bottleneck(), (Bottleneck::Link, 10));
+        close(model.predict(16).steps_per_s, 1_000.0 * 5.0);
+        assert_eq!(hosts(COSTS, DEMAND, Some(1e9)).predict(512).bottleneck, Bottleneck::Ingest);
+    }
+
+    #[test]
+    fn on_one_machine_learner_and_workers_share_the_cores() {
+        let demand = Demand { updates_per_segment: 3.0, ..DEMAND };
+        let place = Place::OneMachine { cores: 2.0 };
+        let model = Model { costs: COSTS, demand, place };
+        // 10 ms of a worker, 6.1 ms of the learner.
+        let [one, two, four] = [1, 2, 4].map(|workers| model.predict(workers));
+        assert_eq!((one.bottleneck, one.hosts), (Bottleneck::Workers, 1));
+        close(one.steps_per_s, 500.0);
+        assert_eq!((two.bottleneck, four.bottleneck), (Bottleneck::Cores, Bottleneck::Cores));
+        close(two.steps_per_s, 5.0 * 2.0 / 16.1e-3);
+        close(two.steps_per_s, four.steps_per_s);
+        close(two.learner_utilisation, 2.0 * 6.1 / 16.1);
+    }
+
+    /// Two threads halve the time of an update and not what it takes of the machine.
+    #[test]
+    fn threads_of_the_learner_count_as_cores() {
+        let costs = Costs { update_s: 1e-3, ..COSTS };
+        let demand = Demand { updates_per_segment: 50.0, ..DEMAND };
+        let one_machine = Model { costs, demand, place: Place::OneMachine { cores: 2.0 } };
+        let prediction = one_machine.predict(2);
+        assert_eq!(prediction.bottleneck, Bottleneck::Cores);
+        close(prediction.steps_per_s, 5.0 * 2.0 / 110.1e-3);
+        let hosts = hosts(costs, demand, None).predict(16);
+        assert_eq!(hosts.bottleneck, Bottleneck::Updates);
+        close(hosts.steps_per_s, 5.0 / 50.1e-3);
+    }
+}

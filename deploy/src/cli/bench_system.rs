@@ -1,0 +1,83 @@
+//! `dmprl bench system`: from the command line to the benchmark.
+
+use std::time::Duration;
+
+use clap::Args;
+use dmprl_shared::config::{ExperimentConfig, Limits};
+
+use super::bench::seconds;
+use super::configuration::{merge, refuse};
+use super::configured::{ConfiguredArgs, make_absolute};
+use super::{cores, emit, prepare_python, this_program};
+use crate::bench::{self, SystemBench};
+use crate::failure::{Outcome, wrong_use};
+
+const HELP: &str = "\
+Starts a real `dmprl train` in a temporary folder and measures it for --seconds: its supervisor, its
+learner, its workers. The policy is not evaluated unless --evaluate says so; checkpoints are written
+as configured. Rates are differences between two lines of the run's metrics.jsonl, of which there is
+one every 500 steps at least. Left out is what comes before the first of the two: starting, the
+warm-up (exploration.warm_up_steps), in which nothing is learned, and one second after it.
+  updates_per_segment   as measured, beside what the pacing asks for (pacing.updates_per_segment)
+  policy_lag            newest policy version minus the one that acted: the median over the lines'
+                        medians, and the largest
+  busy, *_utilisation   processor time of the learner and of the workers, of a core for each thread;
+                        whichever is near 100 % bounds the rates, if the machine has cores for both
+Ctrl-C ends it and leaves nothing.
+
+EXAMPLES
+  dmprl bench system --task reacher
+  dmprl bench system --task pusher --workers 2 --envs-per-worker 16 --seconds 30 --json
+  dmprl bench system --task reacher --preset fast --evaluate
+  dmprl bench system --task reacher --set pacing.updates_per_segment=0.1";
+
+/// Arguments of `dmprl bench system`.
+#[derive(Debug, Args)]
+#[command(after_help = HELP)]
+pub(super) struct SystemArgs {
+    /// A task of `dmprl tasks`, a Gymnasium id, or a class of your own.
+    #[arg(long)]
+    task: String,
+    #[command(flatten)]
+    configured: ConfiguredArgs,
+    /// How long it is measured, at least; starting and warm-up come on top [s].
+    #[arg(long, value_name = "S", default_value_t = 20.0, value_parser = seconds)]
+    seconds: f64,
+    /// Evaluate the policy as the configuration says.
+    #[arg(long)]
+    evaluate: bool,
+    /// Print one JSON object on standard output.
+    #[arg(long)]
+    json: bool,
+}
+
+pub(super) fn run(args: &SystemArgs) -> anyhow::Result<Outcome> {
+    let config = whole_system(&args.configured, &args.task)?;
+    // Before the clock runs: making the environment takes minutes.
+    prepare_python()?;
+    let bench = SystemBench {
+        program: this_program()?,
+        config,
+        evaluate: args.evaluate,
+        duration: Duration::from_secs_f64(args.seconds),
+    };
+    let Some(figures) = bench::system(&bench)? else { return Ok(Outcome::Interrupted) };
+    emit(&if args.json { figures.json().to_string() } else { figures.text() })?;
+    Ok(Outcome::Done)
+}
+
+/// The configuration of a run of several processes.
+pub(super) fn whole_system(
+    configured: &ConfiguredArgs,
+    task: &str,
+) -> anyhow::Result<ExperimentConfig> {
+    let config = merge(&configured.sources(task, [])?)?;
+    let mut config = config.resolve(Limits { cores: cores() }).map_err(refuse)?;
+    if config.run.deterministic {
+        return Err(wrong_use(
+            "run.deterministic: such a run is one process, which has no system to measure",
+        ));
+    }
+    make_absolute(&mut config)?;
+    Ok(config)
+}

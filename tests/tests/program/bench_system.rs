@@ -1,0 +1,78 @@
+//! `dmprl bench system` with a real run, for too short a time to mean anything.
+
+use std::process::Command;
+
+use dmprl_tests::program::{Running, Workplace, executable};
+use rustix::process::Signal;
+use serde_json::Value;
+
+/// Starts a benchmark whose temporary files, the run among them, lie in the test's folder.
+fn bench(place: &Workplace, more: &[&str]) -> Running {
+    let temporary = place.path("tmp");
+    std::fs::create_dir_all(&temporary).unwrap();
+    let mut command = Command::new(executable());
+    command.args(["bench", "system", "--task", "reacher", "--envs-per-worker", "2"]);
+    command.args(["--set", "policy.hidden=[16]", "--set", "algorithm.critic_hidden=[16]"]);
+    command.args(["--set", "algorithm.batch_size=16", "--set", "exploration.warm_up_steps=200"]);
+    command.args(["--set", "metrics.interval_steps=50"]).args(more);
+    command.env("TMPDIR", temporary);
+    place.start_command(command)
+}
+
+/// The supervisor of the run is in a session of its own, so the benchmark waits for it.
+fn assert_nothing_left(place: &Workplace) {
+    place.assert_no_process();
+    assert_eq!(std::fs::read_dir(place.path("tmp")).unwrap().count(), 0, "temporary files");
+}
+
+fn positive(json: &Value, key: &str) {
+    assert!(json[key].as_f64() > Some(0.0), "{key} is {}: {json}", json[key]);
+}
+
+#[test]
+fn a_whole_run_is_measured_after_its_warm_up_and_leaves_nothing() {
+    let place = Workplace::new();
+    let more = ["--workers", "2", "--seconds", "0.5", "--json"];
+    let json = bench(&place, &more).wait().with_status(0).json();
+    for key in ["env_steps_per_s", "updates_per_s", "samples_per_insert", "wall_s"] {
+        positive(&json, key);
+    }
+    assert!(json["wall_s"].as_f64() >= Some(0.5), "{json}");
+    // Both kinds of lag are there, and no median is larger than the largest.
+    assert!(json["policy_lag_p50"].as_u64() <= json["policy_lag_max"].as_u64(), "{json}");
+    assert!(json["policy_lag_max"].is_u64(), "{json}");
+    assert!(json["excluded"]["env_steps"].as_u64() > Some(200), "{json}");
+    // The pacing holds over any stretch, up to what may be owed at its ends.
+    assert_eq!(json["updates_per_segment_asked"], 2.0);
+    let measured = json["updates_per_segment"].as_f64().unwrap();
+    assert!((0.5..4.0).contains(&measured), "{json}");
+    positive(&json["cpu_s"], "learner");
+    assert_eq!((&json["lost"], &json["rejected"]), (&0.into(), &0.into()), "{json}");
+    assert_eq!((&json["workers"], &json["envs_per_worker"]), (&2.into(), &2.into()));
+    assert_nothing_left(&place);
+}
+
+#[test]
+fn ctrl_c_ends_the_run_and_leaves_nothing() {
+    let place = Workplace::new();
+    let mut running = bench(&place, &["--seconds", "3600", "--json"]);
+    running.until_said("measuring for 3600 s");
+    running.signal_group(Signal::INT);
+    assert_eq!(running.wait().with_status(130).printed, "");
+    assert_nothing_left(&place);
+}
+
+#[test]
+fn a_run_that_cannot_start_is_named_with_its_own_words() {
+    let place = Workplace::new();
+    let more = ["--set", "task.id=Reachr-v5"];
+    bench(&place, &more).wait().with_status(1).saying("dmprl train has ended").saying("Reachr");
+    assert_nothing_left(&place);
+}
+
+#[test]
+fn a_deterministic_run_has_no_system_to_measure() {
+    let place = Workplace::new();
+    let more = ["--set", "run.deterministic=true"];
+    bench(&place, &more).wait().with_status(2).saying("one process");
+}
