@@ -65,6 +65,9 @@ pub struct Identity {
     pub worker_id: u32,
     /// Counts the starts of this slot.
     pub incarnation: u32,
+    /// Which of the whole run's workers it is: a host that has no learner numbers its own from 0,
+    /// and no two workers may draw the same random numbers.
+    pub seed_index: u32,
 }
 
 /// What the header of a segment says beside who made it.
@@ -121,7 +124,7 @@ impl Rollout {
         let policy = Policy::new(config, environments.spec())?;
         let layout = policy.layout();
         // A restarted worker continues no episode, and must not repeat those of its predecessor.
-        let worker = u64::from(identity.worker_id) << 32 | u64::from(identity.incarnation);
+        let worker = u64::from(identity.seed_index) << 32 | u64::from(identity.incarnation);
         let random = seeds::stream(config.run.seed, "exploration", worker);
         let env_seeds = environment_seeds(config.run.seed, worker, envs);
         let mut faults = Faults::new(envs, config.actors.env_failures_max);

@@ -171,6 +171,8 @@ pub enum Report {
         /// The sentence.
         message: String,
     },
+    /// From the gateway, once a second: the hosts that take part.
+    Hosts(Vec<HostNow>),
     /// A worker that had joined leaves; it has handed over what it could.
     Left,
     /// The learner wrote a checkpoint.
@@ -199,6 +201,24 @@ pub struct WorkersNow {
     pub restarts: u64,
     /// Segments that they keep until the learner acknowledges them, all together.
     pub queued_segments: u64,
+}
+
+/// Another host that takes part in the run.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct HostNow {
+    /// What people call it.
+    pub name: String,
+    /// Whether it can be reached.
+    pub here: bool,
+    /// Workers that it has attached.
+    pub workers: u64,
+    /// Segments that they keep until the learner acknowledges them.
+    pub kept: u64,
+    /// Segments of theirs that the learner has acknowledged.
+    pub acked: u64,
+    /// Starts of its workers after a death.
+    pub restarts: u64,
 }
 
 /// What a worker does when it gives a sign of life.

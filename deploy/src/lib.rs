@@ -5,6 +5,7 @@
 //! and `dmprl evaluator` and speaks with them in the lines that `control` defines.
 
 pub mod bench;
+pub mod bridge;
 mod capacity;
 pub mod chaos;
 pub mod cli;

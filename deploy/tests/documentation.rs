@@ -195,6 +195,7 @@ fn every_flag_that_is_shown_exists() {
         "bench system",
         "bench scale",
         "bench transport",
+        "bridge",
         "chaos",
         "tasks",
         "doctor",
@@ -235,8 +236,8 @@ fn every_flag_that_is_shown_exists() {
 
 #[test]
 fn every_configuration_key_that_is_named_exists() {
-    const FILE_ENDINGS: [&str; 8] =
-        ["npz", "jsonl", "json", "toml", "safetensors", "svg", "rs", "md"];
+    const FILE_ENDINGS: [&str; 9] =
+        ["npz", "jsonl", "json", "toml", "token", "safetensors", "svg", "rs", "md"];
     let keys: BTreeSet<_> = Layers::new().keys().into_iter().collect();
     let sections: BTreeSet<_> = keys.iter().filter_map(|key| key.split('.').next()).collect();
     let mut seen = 0;

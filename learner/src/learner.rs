@@ -145,7 +145,7 @@ impl Learner {
         run_id: u64,
     ) -> Result<Self, LearnerError> {
         let policy = Policy::new(&config, spec)?;
-        let (workers, envs) = (config.actors.places(), config.actors.envs_per_worker);
+        let (workers, envs) = (config.places(), config.actors.envs_per_worker);
         let layout = policy.layout();
         let algorithm = Algorithm::new(&config, &policy)?;
         let random = seeds::stream(config.run.seed, "replay", 0);

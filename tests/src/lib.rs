@@ -1,6 +1,7 @@
 //! Helpers of the tests that need more than one crate.
 
 pub mod exported;
+pub mod hosts;
 pub mod program;
 
 use std::path::{Path, PathBuf};

@@ -56,7 +56,7 @@ fn delivered(rollout: &mut Rollout, calls: usize) -> (Vec<SegmentHeader>, Option
 }
 
 fn started(task_id: &str, failures_max: u32) -> Rollout {
-    let identity = Identity { run_id: 1, worker_id: 0, incarnation: 0 };
+    let identity = Identity { run_id: 1, worker_id: 0, incarnation: 0, seed_index: 0 };
     Rollout::start(&config(failures_max), environments(task_id), identity).unwrap()
 }
 

@@ -43,7 +43,7 @@ fn started(task: &str, keys: &[(&str, &str)]) -> Result<Rollout, RolloutError> {
     let interpreter = INTERPRETER.get_or_init(start);
     let task = format!("tiny_envs:{task}-v0");
     let environments = PythonEnvironments::start(interpreter, &task, ENVS, 5).unwrap();
-    let identity = Identity { run_id: 1, worker_id: 0, incarnation: 0 };
+    let identity = Identity { run_id: 1, worker_id: 0, incarnation: 0, seed_index: 0 };
     Rollout::start(&config(keys), environments, identity)
 }
 

@@ -16,8 +16,7 @@ const COLUMNS_MAX: usize = 100;
 const STAGES: u32 = 8;
 /// Built, downloaded or left by runs: nobody's source.
 const FOREIGN_FOLDERS: [&str; 5] = ["target", "runs", "__pycache__", ".git", ".venv"];
-const MEMBERS: [&str; 6] =
-    ["actors", "deploy", "learner", "shared", "tests", "tests/manifests"];
+const MEMBERS: [&str; 6] = ["actors", "deploy", "learner", "shared", "tests", "tests/manifests"];
 
 /// A file of the repository.
 struct Source {

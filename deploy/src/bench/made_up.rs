@@ -9,6 +9,8 @@ use dmprl_shared::transport::shared_memory::Plan;
 /// What is measured [bytes]: a segment's header and block.
 pub(super) const SIZES: [Size; 2] =
     [Size { bytes: 1_024, layout: layout(36, 3) }, Size { bytes: 10_240, layout: layout(405, 21) }];
+/// What is measured between hosts.
+pub(super) const BETWEEN_HOSTS: Size = Size { bytes: 2_048, layout: layout(77, 5) };
 /// Segments that a worker's queue holds, and its outbox too: a worker from whom nobody takes has
 /// both full.
 pub(super) const QUEUE_SEGMENTS: usize = 512;
@@ -118,7 +120,7 @@ mod tests {
 
     #[test]
     fn a_made_up_segment_has_its_size_and_is_sound() {
-        for size in SIZES {
+        for size in SIZES.into_iter().chain([BETWEEN_HOSTS]) {
             let mut made_up = MadeUp::new(size.layout, 1);
             let checksums = [1, 2].map(|sequence| {
                 let Segment { header, block } = made_up.next();

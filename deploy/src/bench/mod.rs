@@ -35,6 +35,7 @@ pub use rollout::{RolloutBench, rollout};
 pub use scale::{Figures as ScaleFigures, ScaleBench, SegmentFeederArgs, scale, segment_feeder};
 pub use system::{Figures as SystemFigures, SystemBench, system};
 pub use transport::{
-    Figures as TransportFigures, TransportBench, TransportWorkerArgs, transport, transport_worker,
+    Figures as TransportFigures, TransportBench, TransportWorkerArgs, connect, listen, transport,
+    transport_worker,
 };
 pub(crate) use watch::Watch;

@@ -32,12 +32,15 @@ pub(crate) fn check(config: &ExperimentConfig, spec: Option<&EnvSpec>) -> anyhow
 impl Need {
     /// Its workers, as part of a sentence.
     pub(crate) fn counted(&self) -> String {
-        let Self { workers, joined, .. } = self;
-        let workers = format!("{workers} worker{}", if *workers == 1 { "" } else { "s" });
-        match joined {
-            0 => workers,
-            joined => format!("{workers} and {joined} that may join (actors.joined_max)"),
+        let Self { workers, joined, remote, .. } = self;
+        let mut counted = format!("{workers} worker{}", if *workers == 1 { "" } else { "s" });
+        if *joined > 0 {
+            counted += &format!(" and {joined} that may join (actors.joined_max)");
         }
+        if *remote > 0 {
+            counted += &format!(" and {remote} of other hosts (bridge.workers_max)");
+        }
+        counted
     }
 
     /// What the machine has too little of, one sentence each.
@@ -95,6 +98,7 @@ mod tests {
     const NEED: Need = Need {
         workers: 4,
         joined: 0,
+        remote: 0,
         shared_memory_bytes: 5 << 20,
         replay_bytes: 1 << 30,
         open_files: 112,

@@ -26,6 +26,8 @@ pub(crate) struct Need {
     pub(crate) workers: u64,
     /// and those that may join.
     pub(crate) joined: u64,
+    /// Those of other hosts.
+    pub(crate) remote: u64,
     /// Shared memory of all processes together [bytes]; 0 where one process does everything.
     pub(crate) shared_memory_bytes: u64,
     /// Replay at the end of the run [bytes].
@@ -54,12 +56,13 @@ impl Need {
         let actors = &config.actors;
         let one_process = config.run.deterministic;
         let shared =
-            || required_bytes(actors.places(), actors.queue_segments, layout, parameters_len);
-        let places = whole(actors.places());
+            || required_bytes(config.places(), actors.queue_segments, layout, parameters_len);
+        let places = whole(config.places());
         let each = |base: u64, count: u64| base.saturating_add(count.saturating_mul(places));
         Self {
             workers: whole(actors.workers),
             joined: whole(actors.joined_max),
+            remote: whole(config.bridge.places()),
             shared_memory_bytes: if one_process { 0 } else { shared() },
             replay_bytes: replay_bytes(config, layout),
             open_files: each(FILES, FILES_PER_WORKER),

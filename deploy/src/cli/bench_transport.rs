@@ -27,10 +27,16 @@ sequence numbers and by what the workers say that they have sent. blocked_cpu_fr
 of a core that a worker uses while nobody takes: queue and outbox are full. What is not to be had is
 null or `absent`, with the reason. Ctrl-C ends it at once and leaves nothing.
 
+BETWEEN HOSTS: one end listens, the other connects, both with this version. Segments are of 2048
+bytes, policies of half a megabyte. Who listens prints segments_per_s over --seconds, and
+policy_ms_median: from publishing a policy until the other host has said that its workers have it.
+
 EXAMPLES
   dmprl bench transport
   dmprl bench transport --workers 2 --rounds 9 --json
   dmprl bench transport --level log        # what that level costs
+  dmprl bench transport --listen tcp/0.0.0.0:7448 --seconds 10
+  dmprl bench transport --connect tcp/10.0.0.1:7448 --workers 4
   dmprl bench transport --peer-python /opt/zeromq/bin/python";
 
 /// As `delivery.level`.
@@ -62,12 +68,24 @@ pub(super) struct TransportArgs {
     /// How long each time [s].
     #[arg(long, value_name = "S", default_value_t = 0.4, value_parser = seconds)]
     seconds: f64,
+    /// Measure between hosts: take the learner's place at this Zenoh endpoint.
+    #[arg(long, value_name = "ENDPOINT", conflicts_with = "connect")]
+    listen: Option<String>,
+    /// Measure between hosts: send to who listens at this Zenoh endpoint.
+    #[arg(long, value_name = "ENDPOINT")]
+    connect: Option<String>,
+    /// Zenoh's own configuration (JSON5), with --listen or --connect.
+    #[arg(long, value_name = "FILE")]
+    zenoh_config: Option<PathBuf>,
     /// Print one JSON object on standard output.
     #[arg(long)]
     json: bool,
 }
 
 pub(super) fn run(args: &TransportArgs) -> anyhow::Result<Outcome> {
+    if args.listen.is_some() || args.connect.is_some() {
+        return between_hosts(args);
+    }
     let peer_python = args.peer_python.as_deref().map(interpreter).transpose()?;
     let (venv, package_path) = python_home()?;
     let default_workers = || u32::try_from(cores().saturating_sub(1)).unwrap_or(1).clamp(1, 64);
@@ -85,5 +103,19 @@ pub(super) fn run(args: &TransportArgs) -> anyhow::Result<Outcome> {
     };
     let Some(figures) = bench::transport(&bench)? else { return Ok(Outcome::Interrupted) };
     emit(&if args.json { figures.json().to_string() } else { figures.text() })?;
+    Ok(Outcome::Done)
+}
+
+fn between_hosts(args: &TransportArgs) -> anyhow::Result<Outcome> {
+    let (file, duration) = (args.zenoh_config.as_deref(), Duration::from_secs_f64(args.seconds));
+    let figures = match (&args.listen, &args.connect) {
+        (Some(endpoint), _) => bench::listen(endpoint, file, duration)?,
+        (None, Some(endpoint)) => bench::connect(endpoint, file, args.workers.unwrap_or(1))?,
+        (None, None) => return Ok(Outcome::Done),
+    };
+    let Some(figures) = figures else { return Ok(Outcome::Interrupted) };
+    let lines = figures.as_object().into_iter().flatten();
+    let text = || lines.map(|(key, value)| format!("{key:18} {value}")).collect::<Vec<_>>();
+    emit(&if args.json { figures.to_string() } else { text().join("\n") })?;
     Ok(Outcome::Done)
 }

@@ -6,6 +6,7 @@ mod bench_policy;
 mod bench_scale;
 mod bench_system;
 mod bench_transport;
+mod bridge;
 mod chaos;
 mod clean;
 mod completions;
@@ -36,7 +37,9 @@ use crate::bench::{SegmentFeederArgs, TransportWorkerArgs, segment_feeder, trans
 use crate::failure::{Outcome, exit_code, render, wrong_use};
 #[cfg(feature = "python")]
 use crate::python_setup::{Home, ensure_extra};
-use crate::roles::{self, ActorArgs, EvaluatorArgs, LearnerArgs, ObserverArgs};
+use crate::roles::{
+    self, ActorArgs, EvaluatorArgs, GatewayArgs, LearnerArgs, ObserverArgs, RelayArgs,
+};
 use crate::terminal::say;
 
 const EXAMPLES: &str = "\
@@ -45,6 +48,7 @@ EXAMPLES
   dmprl eval runs/reacher-td3-dmp-s1-…    how well does its best policy do?
   dmprl resume runs/reacher-td3-dmp-s1-…  go on where it stopped
   dmprl actor --join runs/reacher-td3-…   one more worker for a run that is being trained
+  dmprl bridge --connect tcp/10.0.0.1:7447 --token-file bridge.token   workers on another host
   dmprl record runs/reacher-td3-dmp-s1-…  what does it look like?
   dmprl dashboard                          watch every run in a browser
   dmprl tasks                              what can be trained
@@ -59,6 +63,8 @@ ROLES (train starts them; each has --help)
   actor      steps environments and sends segments
   evaluator  evaluates saved policies without noise
   observer   writes down, step by step, what a saved policy does
+  gateway    stands for the workers of other hosts
+  relay      stands for the learner on a host that has none (bridge starts it)
 
 ";
 
@@ -94,6 +100,8 @@ enum Command {
     Bench(bench::BenchArgs),
     /// Kill a run's processes by a schedule and check that nothing is lost.
     Chaos(chaos::ChaosArgs),
+    /// Step environments on this host for a run whose learner is on another.
+    Bridge(bridge::BridgeArgs),
     /// List the tasks with a short name.
     Tasks(tasks::TasksArgs),
     /// Check what this machine has for runs, and say what to do.
@@ -116,6 +124,12 @@ enum Command {
     /// The process that writes down what a policy does; started by record.
     #[command(hide = true)]
     Observer(ObserverArgs),
+    /// What stands for the workers of other hosts; started by train.
+    #[command(hide = true)]
+    Gateway(GatewayArgs),
+    /// What stands for the learner on a host that has none; started by bridge.
+    #[command(hide = true)]
+    Relay(RelayArgs),
     /// A process that only sends segments; started by bench transport.
     #[command(hide = true)]
     TransportWorker(TransportWorkerArgs),
@@ -163,6 +177,7 @@ fn run(command: Command) -> anyhow::Result<Outcome> {
         Command::Export(args) => export::run(&args),
         Command::Bench(args) => bench::run(&args),
         Command::Chaos(args) => chaos::run(&args),
+        Command::Bridge(args) => bridge::run(&args),
         Command::Tasks(args) => tasks::run(&args),
         Command::Doctor(args) => doctor::run(&args),
         Command::Clean(args) => clean::run(&args),
@@ -172,6 +187,8 @@ fn run(command: Command) -> anyhow::Result<Outcome> {
         Command::Actor(args) => roles::actor(&args),
         Command::Evaluator(args) => roles::evaluator(&args).map(|()| Outcome::Done),
         Command::Observer(args) => roles::observer(&args).map(|()| Outcome::Done),
+        Command::Gateway(args) => roles::gateway(&args).map(|()| Outcome::Done),
+        Command::Relay(args) => roles::relay(&args).map(|()| Outcome::Done),
         Command::TransportWorker(args) => transport_worker(&args).map(|()| Outcome::Done),
         Command::SegmentFeeder(args) => segment_feeder(&args).map(|()| Outcome::Done),
     }

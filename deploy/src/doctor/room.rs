@@ -28,6 +28,7 @@ fn largest(runs: &[DefaultRun]) -> Need {
     let nothing = Need {
         workers: 0,
         joined: 0,
+        remote: 0,
         shared_memory_bytes: 0,
         replay_bytes: 0,
         open_files: 0,
@@ -37,6 +38,7 @@ fn largest(runs: &[DefaultRun]) -> Need {
     runs.iter().map(of).fold(nothing, |most, need| Need {
         workers: most.workers.max(need.workers),
         joined: most.joined.max(need.joined),
+        remote: most.remote.max(need.remote),
         shared_memory_bytes: most.shared_memory_bytes.max(need.shared_memory_bytes),
         replay_bytes: most.replay_bytes.max(need.replay_bytes),
         open_files: most.open_files.max(need.open_files),
@@ -126,6 +128,7 @@ mod tests {
     const NEED: Need = Need {
         workers: 3,
         joined: 0,
+        remote: 0,
         shared_memory_bytes: 5 << 20,
         replay_bytes: 0,
         open_files: 100,

@@ -23,7 +23,7 @@ impl Supervisor {
         match self.phase {
             Phase::Stopping { deadline, .. } => return deadline,
             Phase::Draining { deadline } | Phase::Finishing { deadline } => {
-                if self.running(Process::Learner).is_some() {
+                if self.running(self.hub()).is_some() {
                     deadlines.push(deadline);
                 }
             }
@@ -99,6 +99,10 @@ impl Supervisor {
     /// One process neither steps nor updates while it evaluates.
     fn stalled(&self) -> Option<Instant> {
         let episodes = if self.is_one_process() { self.config.evaluation.episodes } else { 0 };
+        if self.hub() == Process::Relay {
+            // How long the learner's host may be away is the relay's to say.
+            return None;
+        }
         let limit = self.limits.stall + self.limits.evaluation_of(episodes);
         self.learner_ready.then(|| self.advanced + limit)
     }
@@ -119,15 +123,15 @@ impl Supervisor {
     }
 
     fn check_learner_ends(&mut self, now: Instant, deadline: Instant) -> anyhow::Result<()> {
-        let Some(learner) = self.running(Process::Learner).filter(|_| now >= deadline) else {
+        let Some(learner) = self.running(self.hub()).filter(|_| now >= deadline) else {
             return Ok(());
         };
         learner.child.kill();
         let limit = self.limits.drain;
         if !self.finished {
-            bail!("learner did not come to its end within {limit:?}: killed it");
+            bail!("{} did not come to its end within {limit:?}: killed it", self.hub());
         }
-        self.display.message(&format!("learner did not exit within {limit:?}: killed it"));
+        self.display.message(&format!("{} did not exit within {limit:?}: killed it", self.hub()));
         // Its exit follows; until then no second message.
         self.phase = Phase::Finishing { deadline: now + self.limits.kill };
         Ok(())
@@ -142,7 +146,7 @@ impl Supervisor {
             .filter(|process| self.may_start(*process))
             .collect();
         for process in due {
-            if process == Process::Learner {
+            if process == self.hub() {
                 self.go_back()?;
             }
             self.spawn(process)?;
@@ -164,6 +168,10 @@ impl Supervisor {
             _ => 0,
         };
         let updates = u32::try_from(updates).unwrap_or(u32::MAX);
+        if let Some(upstream) = self.launcher.upstream.as_ref().filter(|_| process == self.hub()) {
+            // It is ready when it has a policy, for which it waits so long by itself.
+            return self.limits.ready.saturating_add(Duration::from_secs(upstream.patience_s));
+        }
         self.limits.ready.saturating_add(self.limits.cloning_update.saturating_mul(updates))
     }
 

@@ -79,14 +79,22 @@ impl Supervisor {
         let killed_for = ended.and_then(|running| running.killed_for);
         let death = killed_for.unwrap_or_else(|| Death::of(status));
         match process {
-            Process::Learner if self.finished => {
+            Process::Learner | Process::Relay if self.finished => {
                 if !status.success() {
-                    self.display.message(&format!("learner ended with {}", describe(status)));
+                    self.display.message(&format!("{process} ended with {}", describe(status)));
                 }
                 self.complete_if_done();
                 Ok(())
             }
-            Process::Learner => self.on_learner_death(status, &death),
+            Process::Learner | Process::Relay => self.on_learner_death(status, &death),
+            // An address that is not free, a file that is not there: no start mends that.
+            Process::Gateway if !was_ready && status.code().is_some() => {
+                Err(self.death(process, &death, String::new()))
+            }
+            Process::Gateway => {
+                self.on_gateway_death(&death);
+                Ok(())
+            }
             Process::Evaluator => self.on_evaluator_death(&death),
             Process::Actor(_) if self.phase == Phase::Training => {
                 self.on_actor_death(process, status, &death)
@@ -102,7 +110,9 @@ impl Supervisor {
         let Some((first, last)) = running.worked else { return false };
         match process {
             Process::Actor(_) => last.duration_since(first) >= self.limits.proven,
-            Process::Learner => running.spawned.elapsed() >= self.limits.proven,
+            Process::Learner | Process::Relay | Process::Gateway => {
+                running.spawned.elapsed() >= self.limits.proven
+            }
             Process::Evaluator => false,
         }
     }
@@ -120,6 +130,19 @@ impl Supervisor {
         if let Some(running) = slot.and_then(|slot| slot.running.as_mut()) {
             let now = Instant::now();
             running.worked = Some((running.worked.map_or(now, |(first, _)| first), now));
+        }
+    }
+
+    /// A run that other hosts have left goes on with its own workers.
+    fn on_gateway_death(&mut self, death: &Death) {
+        self.hosts.clear();
+        let restarts_max = self.config.supervision.learner_restarts_max;
+        if self.phase == Phase::Training && !self.restart(Process::Gateway, death, restarts_max) {
+            self.display.message(&format!(
+                "gateway {death}: giving up on it after {restarts_max} restarts; the run goes on \
+                 without other hosts{}",
+                log_tail(&self.log_path(Process::Gateway))
+            ));
         }
     }
 

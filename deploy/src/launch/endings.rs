@@ -26,7 +26,7 @@ impl Supervisor {
             return;
         }
         self.failure = Some(error);
-        let learner = self.running(Process::Learner).is_some_and(|running| running.ready);
+        let learner = self.running(self.hub()).is_some_and(|running| running.ready);
         self.stop(if learner { self.limits.drain } else { self.limits.stop });
     }
 
@@ -35,7 +35,7 @@ impl Supervisor {
         if self.phase == Phase::Training {
             self.display.message(&format!("{reason}: coming to an end"));
             self.phase = Phase::Draining { deadline: Instant::now() + self.limits.drain };
-            self.send(Process::Learner, Command::Finish);
+            self.send(self.hub(), Command::Finish);
         }
     }
 
@@ -50,13 +50,15 @@ impl Supervisor {
                 // One that takes no command is killed when everything stops.
                 let _ = slot.running.as_ref().map(|running| running.child.send(Command::Stop));
             }
+            // It tells the other hosts that the run is over, and ends.
+            self.send(Process::Gateway, Command::Finish);
         }
     }
 
     /// The regular end: the learner is gone, nothing is left to evaluate.
     pub(super) fn complete_if_done(&mut self) {
         let finishing = matches!(self.phase, Phase::Finishing { .. });
-        let learner_gone = self.running(Process::Learner).is_none();
+        let learner_gone = self.running(self.hub()).is_none();
         if finishing && learner_gone && self.evaluations.outstanding() == 0 {
             self.stop(self.limits.stop);
         }
@@ -73,8 +75,11 @@ impl Supervisor {
         self.interrupts += 1;
         match self.interrupts {
             1 => {
-                let what =
-                    if self.finished { "skipping evaluations" } else { "writing a checkpoint" };
+                let what = match self.hub() {
+                    Process::Relay => "handing over what the workers have sent",
+                    _ if self.finished => "skipping evaluations",
+                    _ => "writing a checkpoint",
+                };
                 self.display.message(&format!("interrupted: {what} (once more: stop at once)"));
                 self.stop(self.limits.stop);
             }

@@ -3,7 +3,7 @@
 
 use super::Process;
 use super::supervisor::Supervisor;
-use crate::control::{Command, WorkersNow};
+use crate::control::{Command, HostNow, WorkersNow};
 use crate::terminal::grouped;
 
 impl Supervisor {
@@ -35,7 +35,7 @@ impl Supervisor {
         if self.is_one_process() {
             return;
         }
-        let Some(learner) = self.running(Process::Learner) else { return };
+        let Some(learner) = self.running(self.hub()) else { return };
         // A learner that takes no commands is stuck or dying; its deadline or its exit follows.
         let _ = learner
             .child
@@ -43,10 +43,15 @@ impl Supervisor {
         let mut sent = self.before.sent;
         sent += self.sent;
         let _ = learner.child.send(Command::Sent(sent));
+        let of_hosts = |of: fn(&HostNow) -> u64| self.hosts.iter().map(of).sum::<u64>();
         let _ = learner.child.send(Command::Workers(WorkersNow {
-            count: self.workers() as u64,
-            restarts: self.before.worker_restarts + self.worker_restarts,
-            queued_segments: self.all_running().map(|(_, running)| running.kept).sum(),
+            count: self.workers() as u64
+                + of_hosts(|host| if host.here { host.workers } else { 0 }),
+            restarts: self.before.worker_restarts
+                + self.worker_restarts
+                + of_hosts(|host| host.restarts),
+            queued_segments: self.all_running().map(|(_, running)| running.kept).sum::<u64>()
+                + of_hosts(|host| host.kept),
         }));
     }
 }

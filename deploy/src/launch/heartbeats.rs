@@ -32,8 +32,8 @@ impl Supervisor {
         }
     }
 
-    /// The worker whose silence will first have lasted too long, and when. One that is not ready
-    /// has another limit.
+    /// Who of workers, gateway and relay will first have been silent for too long, and when. One
+    /// that is not ready has another limit.
     pub(super) fn first_silent(&self) -> Option<(Instant, Process)> {
         if self.phase != Phase::Training {
             return None;
@@ -42,7 +42,8 @@ impl Supervisor {
         let limit =
             Duration::try_from_secs_f64(self.config.supervision.heartbeat_timeout_s).ok()?;
         let workers = self.all_running().filter(|(process, running)| {
-            matches!(process, Process::Actor(_)) && running.ready && running.killed_for.is_none()
+            let speaks = !matches!(process, Process::Learner | Process::Evaluator);
+            speaks && running.ready && running.killed_for.is_none()
         });
         workers
             .filter_map(|(process, running)| Some((running.heard.checked_add(limit)?, process)))

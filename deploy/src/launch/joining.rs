@@ -157,7 +157,7 @@ impl Supervisor {
         if self.phase != Phase::Training {
             return Err("the run is coming to its end".to_owned());
         }
-        if !self.slots.contains_key(&Process::Learner) {
+        if !self.slots.contains_key(&self.hub()) {
             return Err("the run is still starting; try again in a moment".to_owned());
         }
         let actors = &self.config.actors;

@@ -21,16 +21,22 @@ pub(super) const INCARNATIONS_PER_SESSION: u32 = 1 << 16;
 pub enum Process {
     /// The learner.
     Learner,
+    /// What stands for the learner on another host.
+    Relay,
     /// A worker, by its index.
     Actor(u32),
     /// The evaluator.
     Evaluator,
+    /// What stands for the workers of other hosts.
+    Gateway,
 }
 
 impl Display for Process {
     fn fmt(&self, formatter: &mut Formatter<'_>) -> fmt::Result {
         match self {
             Self::Learner => formatter.write_str("learner"),
+            Self::Relay => formatter.write_str("relay"),
+            Self::Gateway => formatter.write_str("gateway"),
             Self::Actor(index) => write!(formatter, "actor-{index}"),
             Self::Evaluator => formatter.write_str("evaluator"),
         }
@@ -58,9 +64,36 @@ pub struct Launcher {
     pub sessions_before: u32,
     /// Where worker and learner note what they do, for `dmprl chaos`.
     pub journal: Option<PathBuf>,
+    /// Where the learner is, on a host that has none.
+    pub upstream: Option<Upstream>,
+}
+
+/// The learner's host, as another host sees it.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Upstream {
+    /// The Zenoh endpoint.
+    pub endpoint: String,
+    /// The file with the run's secret.
+    pub token_file: PathBuf,
+    /// Tells this start of `dmprl bridge` from every other.
+    pub host: u64,
+    /// What people call this host.
+    pub name: String,
+    /// The first of the run's workers that is this host's.
+    pub first: u32,
+    /// Zenoh's own configuration.
+    pub zenoh_file: Option<PathBuf>,
+    /// How long the learner's host may be away \[s\].
+    pub patience_s: u64,
 }
 
 impl Launcher {
+    /// What workers send to.
+    #[must_use]
+    pub fn hub(&self) -> Process {
+        if self.upstream.is_some() { Process::Relay } else { Process::Learner }
+    }
+
     /// For a single child of a run that nobody trains.
     #[must_use]
     pub fn outside_training(program: PathBuf, run: &RunDirectory, venv: Option<PathBuf>) -> Self {
@@ -74,6 +107,7 @@ impl Launcher {
             learner_restarts: 0,
             sessions_before: 0,
             journal: None,
+            upstream: None,
         }
     }
 
@@ -103,19 +137,30 @@ impl Launcher {
         let mut command = Command::new(&self.program);
         match process {
             Process::Learner => self.learner(&mut command),
+            Process::Relay => self.relay(&mut command),
+            Process::Gateway => {
+                command.arg("gateway").arg("--run").arg(self.run.path());
+                command.args(["--session", &self.sessions_before.to_string()]);
+                command.arg("--domain").args(&self.domain);
+            }
             Process::Actor(index) => {
                 command.args(["actor", "--index", &index.to_string()]);
                 command.args(["--incarnation", &self.incarnation(start)?.to_string()]);
                 command.arg("--run").arg(self.run.path());
+                if let Some(upstream) = &self.upstream {
+                    command.args(["--first", &upstream.first.to_string()]);
+                }
             }
             Process::Evaluator => {
                 command.arg("evaluator").arg("--run").arg(self.run.path());
             }
         }
-        if let Some(journal) = self.journal.as_ref().filter(|_| process != Process::Evaluator) {
+        let notes = matches!(process, Process::Learner | Process::Actor(_));
+        if let Some(journal) = self.journal.as_ref().filter(|_| notes) {
             command.arg("--journal").arg(journal);
         }
-        if let Some(venv) = self.venv.as_ref().filter(|_| process != Process::Learner) {
+        let python = matches!(process, Process::Evaluator | Process::Actor(_));
+        if let Some(venv) = self.venv.as_ref().filter(|_| python) {
             command.arg("--venv").arg(venv);
         }
         self.streams(command, &process.to_string())
@@ -190,6 +235,25 @@ impl Launcher {
         }
     }
 
+    fn relay(&self, command: &mut Command) {
+        let Some(upstream) = &self.upstream else { return };
+        command.arg("relay").arg("--run").arg(self.run.path());
+        command.arg("--domain").args(&self.domain);
+        command.args(["--connect", &upstream.endpoint, "--name", &upstream.name]);
+        command.arg("--token-file").arg(&upstream.token_file);
+        for (flag, number) in [
+            ("--host", upstream.host),
+            ("--first", upstream.first.into()),
+            ("--session", self.sessions_before.into()),
+            ("--patience", upstream.patience_s),
+        ] {
+            command.args([flag, &number.to_string()]);
+        }
+        if let Some(file) = &upstream.zenoh_file {
+            command.arg("--zenoh-config").arg(file);
+        }
+    }
+
     fn streams(&self, mut command: Command, name: &str) -> anyhow::Result<Command> {
         let path = self.run.log_path(name);
         let mut log = OpenOptions::new()
@@ -225,6 +289,7 @@ mod tests {
             learner_restarts: 0,
             sessions_before: 0,
             journal: None,
+            upstream: None,
         };
         let last = INCARNATIONS_PER_SESSION - 1;
         assert_eq!([0, last].map(|start| launcher.incarnation(start).unwrap()), [0, last]);

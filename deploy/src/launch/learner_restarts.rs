@@ -22,8 +22,8 @@ impl Supervisor {
         let crashed = status.code().is_none_or(|code| code == PANIC_STATUS);
         let restarts_max = self.config.supervision.learner_restarts_max;
         let goes_on = crashed && !self.is_one_process();
-        if !goes_on || !self.restart(Process::Learner, death, restarts_max) {
-            return Err(self.death(Process::Learner, death, self.resume_advice()));
+        if !goes_on || !self.restart(self.hub(), death, restarts_max) {
+            return Err(self.death(self.hub(), death, self.resume_advice()));
         }
         self.learner_restarts += 1;
         self.learner_died.get_or_insert_with(Instant::now);
@@ -54,6 +54,9 @@ impl Supervisor {
 
     /// What the successor of a dead learner starts from.
     pub(super) fn go_back(&mut self) -> anyhow::Result<()> {
+        if self.hub() == Process::Relay {
+            return Ok(());
+        }
         self.launcher.learner_restarts = self.before.learner_restarts + self.learner_restarts;
         self.launcher.resume = self.launcher.run.has_checkpoint()?;
         if !self.launcher.resume {

@@ -4,7 +4,7 @@ use std::time::{Duration, Instant};
 
 use super::Process;
 use super::supervisor::{Slot, Supervisor};
-use crate::control::Doing;
+use crate::control::{Doing, HostNow};
 use crate::run_directory::ProcessState;
 use crate::terminal::ProcessLine;
 
@@ -32,6 +32,21 @@ impl Supervisor {
         self.slots.iter().map(line).collect()
     }
 
+    fn hosts_in_words(&self) -> String {
+        if self.hosts.is_empty() {
+            return "waiting for other hosts".to_owned();
+        }
+        let host = |host: &HostNow| {
+            let state = match (host.here, host.workers) {
+                (false, _) => "out of reach".to_owned(),
+                (true, 1) => "1 worker".to_owned(),
+                (true, workers) => format!("{workers} workers"),
+            };
+            format!("{}: {state}", host.name.escape_debug())
+        };
+        self.hosts.iter().map(host).collect::<Vec<_>>().join(", ")
+    }
+
     fn in_words(&self, process: Process, slot: &Slot, now: Instant) -> String {
         let running = slot.running.as_ref();
         if running.is_some_and(|running| running.killed_for.is_some()) {
@@ -47,6 +62,8 @@ impl Supervisor {
                 return format!("dead, starts again in {seconds:.0} s");
             }
             (ProcessState::Running, Process::Learner) => "learning",
+            (ProcessState::Running, Process::Relay) => "passing segments and policies on",
+            (ProcessState::Running, Process::Gateway) => return self.hosts_in_words(),
             (ProcessState::Running, Process::Evaluator) => match self.evaluations.deadline() {
                 Some(_) => "evaluating",
                 None => "waiting for the next evaluation",

@@ -4,6 +4,7 @@ use std::time::{Duration, Instant};
 
 use super::Process;
 use super::supervisor::{Phase, Running, Slot, Supervisor};
+use crate::control::HostNow;
 use crate::run_directory::{ProcessRow, ProcessState, Processes};
 
 /// Between two times that the table is written. Workers speak once a second.
@@ -28,6 +29,7 @@ impl Supervisor {
 
     fn write_processes(&mut self, ended: bool) {
         let rows = self.slots.iter().map(|(process, slot)| self.row(*process, slot));
+        let rows = rows.chain(self.hosts.iter().map(host_row));
         let table = Processes::new(ended, self.started.elapsed().as_secs_f64(), rows.collect());
         if let Err(error) = self.launcher.run.write_processes(&table) {
             self.display.message(&format!("warning: {error:#}; the run goes on without this file"));
@@ -62,6 +64,24 @@ impl Supervisor {
             cpu_s: usage.0,
             memory_bytes: usage.1,
         }
+    }
+}
+
+/// Another host as a row: what its workers do, all together.
+fn host_row(host: &HostNow) -> ProcessRow {
+    let state = if host.here { ProcessState::Running } else { ProcessState::Gone };
+    ProcessRow {
+        name: format!("host {}", host.name.escape_debug()),
+        joined: true,
+        state,
+        doing: None,
+        kept_segments: host.kept,
+        acknowledged_segments: host.acked,
+        starts: 1,
+        up_s: None,
+        silent_s: None,
+        cpu_s: None,
+        memory_bytes: None,
     }
 }
 

@@ -78,6 +78,13 @@ impl Supervisor {
             }
             // Observing and filming are none of a training's children's business.
             Report::Alive { .. } | Report::Observed { .. } | Report::Filmed { .. } => {}
+            Report::Hosts(hosts) => {
+                // Its first words: it has opened its endpoints.
+                self.set_ready(process);
+                self.hosts = hosts;
+                self.worked(process);
+                self.tell_learner_of_counts();
+            }
             Report::Left => self.on_left(process),
             Report::EnvHung { message } => self.on_env_hung(process, &message),
             Report::Checkpoint { name, env_steps } => {
@@ -87,7 +94,7 @@ impl Supervisor {
                 self.display.message(&format!("checkpoint {name} at {steps} steps"));
             }
             Report::Finished => {
-                let regular = process == Process::Learner && self.learner_ready;
+                let regular = process == self.hub() && self.learner_ready;
                 ensure!(regular, "{process} reported `finished` before `learner_ready`");
                 self.on_finished();
             }
@@ -109,21 +116,21 @@ impl Supervisor {
             ),
             Some(_) => {}
         }
-        if process == Process::Learner || matches!(self.phase, Phase::Stopping { .. }) {
+        if process == self.hub() || matches!(self.phase, Phase::Stopping { .. }) {
             return Ok(());
         }
         self.set_ready(process);
         match process {
             Process::Evaluator => self.send_evaluation(),
             _ if self.learner_ready => self.attach(process),
-            _ if !self.slots.contains_key(&Process::Learner) => self.spawn(Process::Learner)?,
+            _ if !self.slots.contains_key(&self.hub()) => self.spawn(self.hub())?,
             _ => {}
         }
         Ok(())
     }
 
     fn on_learner_ready(&mut self, process: Process) -> anyhow::Result<()> {
-        ensure!(process == Process::Learner, "{process} reported `learner_ready`");
+        ensure!(process == self.hub(), "{process} reported `learner_ready`");
         self.set_ready(process);
         self.learner_ready = true;
         if self.learner_restarts > 0 {
@@ -133,7 +140,7 @@ impl Supervisor {
         self.tell_learner_of_counts();
         if matches!(self.phase, Phase::Draining { .. }) {
             // Its predecessor was asked, and died of something else.
-            self.send(Process::Learner, Command::Finish);
+            self.send(self.hub(), Command::Finish);
         }
         if self.is_one_process() || self.phase != Phase::Training {
             return Ok(());
@@ -146,10 +153,15 @@ impl Supervisor {
             .map(|(process, _)| process)
             .collect();
         waiting.into_iter().for_each(|process| self.attach(process));
-        match self.slots.contains_key(&Process::Evaluator) {
-            true => Ok(()),
-            false => self.spawn(Process::Evaluator),
+        if self.hub() == Process::Relay {
+            return Ok(());
         }
+        let mut missing = vec![Process::Evaluator];
+        if self.config.bridge.is_open() {
+            missing.push(Process::Gateway);
+        }
+        missing.retain(|process| !self.slots.contains_key(process));
+        missing.into_iter().try_for_each(|process| self.spawn(process))
     }
 
     /// A learner that came back has gone back to a checkpoint, and its run's rows with it.
@@ -311,6 +323,7 @@ pub(super) mod tests {
             learner_restarts: 0,
             sessions_before: 0,
             journal: None,
+            upstream: None,
         };
         let display = Display::lines(Box::new(std::io::sink()), 1);
         Supervisor::new((launcher, config, TimeLimits::default()), display, mpsc::channel(1).0)

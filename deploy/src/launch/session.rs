@@ -78,6 +78,7 @@ pub fn session(plan: SessionPlan) -> anyhow::Result<Outcome> {
         sessions_before: u32::try_from(manifest.sessions.len().saturating_sub(1))
             .context("too many sessions")?,
         journal: trial.journal,
+        upstream: None,
     };
     let title = title(&config);
     display.message(&format!("training {title} in {}", shown(run.path())));

@@ -15,7 +15,7 @@ use super::child::{Child, EVENTS_MAX, Event};
 use super::deaths::Death;
 use super::evaluations::EvaluationQueue;
 use super::{Launcher, Process, TimeLimits, joining};
-use crate::control::{Command, Doing, EvaluationRow, Progress};
+use crate::control::{Command, Doing, EvaluationRow, HostNow, Progress};
 use crate::terminal::Display;
 
 /// What the supervisor needs to know.
@@ -173,6 +173,8 @@ pub(super) struct Supervisor {
     pub(super) last_row: Option<EvaluationRow>,
     /// Where the run stood when this session began.
     pub(super) before: Counters,
+    /// Other hosts that take part, as the gateway says.
+    pub(super) hosts: Vec<HostNow>,
     /// Failures of environments in this session, and what its workers did.
     pub(super) env_failures: u64,
     pub(super) sent: Sent,
@@ -268,6 +270,7 @@ impl Supervisor {
             best_return: f64::NEG_INFINITY,
             last_row: None,
             before: Counters::default(),
+            hosts: Vec::new(),
             env_failures: 0,
             sent: Sent::default(),
             worker_restarts: 0,
@@ -287,7 +290,7 @@ impl Supervisor {
         self.before = checkpoint::counters(&run.checkpoints_path())?.pop().unwrap_or_default();
         self.best_return = run.best_row()?.map_or(f64::NEG_INFINITY, |row| row.return_mean);
         if self.is_one_process() || self.spec.is_some() {
-            self.spawn(Process::Learner)?;
+            self.spawn(self.hub())?;
         }
         if self.is_one_process() {
             return Ok(());
@@ -300,6 +303,11 @@ impl Supervisor {
         }
         let workers = u32::try_from(actors.workers).context("too many workers")?;
         (0..workers).try_for_each(|index| self.spawn(Process::Actor(index)))
+    }
+
+    /// What workers send to: the learner, or what stands for it on this host.
+    pub(super) fn hub(&self) -> Process {
+        self.launcher.hub()
     }
 
     pub(super) fn is_one_process(&self) -> bool {

@@ -35,6 +35,8 @@ pub fn interpreter(venv: Option<&Path>, config: &ExperimentConfig) -> anyhow::Re
 pub struct Seat<'a> {
     pub setup: &'a Setup,
     pub index: u32,
+    /// Which of the run's workers the first of this host is.
+    pub first: u32,
     pub incarnation: u32,
     pub venv: Option<&'a Path>,
     /// Where everything that is sent is noted, for `dmprl chaos`.
@@ -55,7 +57,8 @@ pub fn run(args: &ActorArgs, control: &ControlPipe) -> anyhow::Result<()> {
     let index = args.index.context("--index is missing")?;
     let (incarnation, venv) = (args.incarnation, args.venv.as_deref());
     let journal = args.journal.as_deref();
-    work(&Seat { setup: &setup, index, incarnation, venv, journal }, control, None)
+    let first = args.first;
+    work(&Seat { setup: &setup, index, first, incarnation, venv, journal }, control, None)
 }
 
 /// Steps environments until a stop is asked for.
@@ -64,18 +67,19 @@ pub fn work(
     control: &ControlPipe,
     mut guest: Option<Guest<'_>>,
 ) -> anyhow::Result<()> {
-    let Seat { setup, index, incarnation, venv, journal } = *seat;
+    let Seat { setup, index, first, incarnation, venv, journal } = *seat;
     let config = &setup.config;
     let interpreter = interpreter(venv, config)?;
-    let worker = u64::from(index) << 32 | u64::from(incarnation);
+    let seed_index = first + index;
+    let worker = u64::from(seed_index) << 32 | u64::from(incarnation);
     interpreter.seed(seeds::derive(config.run.seed, "python", worker))?;
     let envs = environments::make(&interpreter, config, config.actors.envs_per_worker, control)?;
     heartbeat::start(control, envs.calls())?;
     control.send(&Report::EnvironmentReady { spec: envs.spec().clone() })?;
-    if index == 0 && incarnation == 0 {
+    if seed_index == 0 && incarnation == 0 {
         hint(config, &envs, control);
     }
-    let identity = Identity { run_id: setup.run_id, worker_id: index, incarnation };
+    let identity = Identity { run_id: setup.run_id, worker_id: index, incarnation, seed_index };
     let mut rollout = Rollout::start(config, envs, identity)?;
     let plan = super::learner::plan(setup, rollout.policy());
     let Some(end) = await_attach(control, &plan, index)? else { return Ok(()) };

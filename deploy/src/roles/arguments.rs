@@ -23,6 +23,20 @@ EXAMPLES
   dmprl actor --join runs/mine
   dmprl actor --run runs/mine --index 0 --incarnation 0   # what `train` starts";
 
+const GATEWAY_HELP: &str = "\
+Speaks JSON lines with the supervisor on standard input and output; logs to standard error.
+Listens at bridge.listen for other hosts. Ends when its standard input ends.
+
+EXAMPLES
+  dmprl gateway --run runs/mine --domain /dev/shm/dmprl-1000/4f2a   # what `train` starts";
+
+const RELAY_HELP: &str = "\
+Speaks JSON lines with the supervisor on standard input and output; logs to standard error.
+To the workers of its host it is the learner. Ends when its standard input ends.
+
+EXAMPLES
+  dmprl bridge --connect tcp/10.0.0.1:7447 --token-file bridge.token --workers 4   # starts one";
+
 const EVALUATOR_HELP: &str = "\
 Speaks JSON lines with the supervisor on standard input and output; logs to standard error.
 Answers each `evaluate` with a row. Ends when its standard input ends.
@@ -91,6 +105,60 @@ pub struct ActorArgs {
     /// Note in a file of this folder what comes and goes; `dmprl chaos` reads it.
     #[arg(long, value_name = "DIR", hide = true)]
     pub journal: Option<PathBuf>,
+    /// On a host that has no learner: which of the run's workers its first is.
+    #[arg(long, value_name = "I", default_value_t = 0)]
+    pub first: u32,
+}
+
+/// Arguments of `dmprl gateway`.
+#[derive(Debug, Clone, PartialEq, Eq, Args)]
+#[command(after_help = GATEWAY_HELP)]
+pub struct GatewayArgs {
+    /// The run directory.
+    #[arg(long, value_name = "DIR")]
+    pub run: PathBuf,
+    /// The run's private shared-memory directory.
+    #[arg(long, value_name = "DIR")]
+    pub domain: PathBuf,
+    /// Which session of the run this is, from 0.
+    #[arg(long, value_name = "N", default_value_t = 0)]
+    pub session: u32,
+}
+
+/// Arguments of `dmprl relay`.
+#[derive(Debug, Clone, PartialEq, Eq, Args)]
+#[command(after_help = RELAY_HELP)]
+pub struct RelayArgs {
+    /// This host's directory of the run.
+    #[arg(long, value_name = "DIR")]
+    pub run: PathBuf,
+    /// This host's private shared-memory directory.
+    #[arg(long, value_name = "DIR")]
+    pub domain: PathBuf,
+    /// The Zenoh endpoint of the learner's host.
+    #[arg(long, value_name = "ENDPOINT")]
+    pub connect: String,
+    /// File with the run's secret.
+    #[arg(long, value_name = "FILE")]
+    pub token_file: PathBuf,
+    /// What people call this host.
+    #[arg(long)]
+    pub name: String,
+    /// Tells this start of `dmprl bridge` from every other.
+    #[arg(long, value_name = "N")]
+    pub host: u64,
+    /// Which of the run's workers the first of this host is.
+    #[arg(long, value_name = "I")]
+    pub first: u32,
+    /// Its workers' incarnations are counted as in this session of the run.
+    #[arg(long, value_name = "N", default_value_t = 0)]
+    pub session: u32,
+    /// How long the learner's host may be away [s].
+    #[arg(long, value_name = "S")]
+    pub patience: u64,
+    /// Zenoh's own configuration: certificates.
+    #[arg(long, value_name = "FILE")]
+    pub zenoh_config: Option<PathBuf>,
 }
 
 /// Arguments of `dmprl evaluator`.

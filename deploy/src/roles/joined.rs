@@ -60,7 +60,7 @@ pub fn join(run: &Path) -> anyhow::Result<Outcome> {
     let teller = Teller::new();
     let mut tell = |sent| teller.tell(sent);
     let venv = venv.as_deref();
-    let seat = Seat { setup: &setup, index, incarnation, venv, journal: None };
+    let seat = Seat { setup: &setup, index, first: 0, incarnation, venv, journal: None };
     let guest = Guest { leaving: &leaving, tell: &mut tell };
     actor::work(&seat, &control, Some(guest))?;
     let sent = teller.sent.get();

@@ -130,7 +130,7 @@ pub fn plan(setup: &Setup, policy: &dmprl_shared::policy::Policy) -> Plan {
         run_id: setup.run_id,
         architecture_hash: policy.architecture_hash(),
         layout: policy.layout(),
-        worker_count: setup.config.actors.places(),
+        worker_count: setup.config.places(),
         queue_segments: setup.config.actors.queue_segments,
         parameters_len: policy.parameters_len(),
     }

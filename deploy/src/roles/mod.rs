@@ -13,6 +13,7 @@ mod delivery;
 mod environments;
 #[cfg(feature = "python")]
 mod evaluator;
+mod gateway;
 mod hardening;
 mod heartbeat;
 #[cfg(feature = "python")]
@@ -23,13 +24,14 @@ mod observer;
 #[cfg(feature = "python")]
 mod one_process;
 mod recorder;
+mod relay;
 mod setup;
 
 use crate::failure::Outcome;
 
 use hardening::harden;
 
-pub use arguments::{ActorArgs, EvaluatorArgs, LearnerArgs, ObserverArgs};
+pub use arguments::{ActorArgs, EvaluatorArgs, GatewayArgs, LearnerArgs, ObserverArgs, RelayArgs};
 pub use control_pipe::{ControlPipe, ORPHAN_LIMIT, ORPHANED_LEARNER_LIMIT};
 pub(crate) use delivery::{Delivery, Stopped, attach_within};
 pub(crate) use learner::plan;
@@ -63,6 +65,24 @@ pub fn actor(args: &ActorArgs) -> anyhow::Result<Outcome> {
         return joined::join(run);
     }
     actor::run(args, &ControlPipe::open(ORPHAN_LIMIT)?).map(|()| Outcome::Done)
+}
+
+/// Stands for the workers of other hosts.
+///
+/// # Errors
+/// Whatever keeps it from going on; the supervisor starts it again.
+pub fn gateway(args: &GatewayArgs) -> anyhow::Result<()> {
+    harden()?;
+    gateway::run(args, &ControlPipe::open(ORPHAN_LIMIT)?)
+}
+
+/// Stands for the learner on a host that has none.
+///
+/// # Errors
+/// Whatever keeps it from going on; the supervisor starts it again if it crashed.
+pub fn relay(args: &RelayArgs) -> anyhow::Result<()> {
+    harden()?;
+    relay::run(args, &ControlPipe::open(ORPHAN_LIMIT)?)
 }
 
 /// Evaluates saved policies without noise.

@@ -47,7 +47,7 @@ pub fn run(args: &LearnerArgs, control: &ControlPipe) -> anyhow::Result<()> {
     let learner = super::learner::make(&setup, &spec, args, control)?;
     // A resumed run continues no episode: its worker counts as started again.
     let incarnation = u32::try_from(learner.counters.segments)?;
-    let identity = Identity { run_id: setup.run_id, worker_id: 0, incarnation };
+    let identity = Identity { run_id: setup.run_id, worker_id: 0, incarnation, seed_index: 0 };
     let mut rollout = Rollout::start(config, made, identity)?;
     let (queue, layout) = (rollout.segments_max(), learner.policy().layout());
     let (mut senders, receiver) = in_process::segment_queues(1, queue, layout);

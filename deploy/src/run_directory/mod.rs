@@ -35,7 +35,7 @@ pub use manifest::{FORMAT_VERSION, Machine, Manifest, Session};
 pub use policies::{ChosenPolicy, PolicyChoice};
 pub use processes::{ProcessRow, ProcessState, Processes};
 pub(crate) use timestamp::unix_s;
-pub use timestamp::{compact, rfc3339};
+pub use timestamp::{compact, compact_now, rfc3339};
 
 use crate::failure::wrong_use;
 
@@ -52,6 +52,9 @@ pub struct RunDirectory {
     path: PathBuf,
 }
 
+/// The secret that other hosts must know, where the configuration names no other file.
+pub(crate) const TOKEN_FILE: &str = "bridge.token";
+
 impl RunDirectory {
     /// Refuses a path that [`RunDirectory::create`] would refuse, before any long work.
     ///
@@ -65,7 +68,11 @@ impl RunDirectory {
         }
         let mut entries =
             fs::read_dir(path).with_context(|| format!("cannot read {}", path.display()))?;
-        if entries.next().is_some() {
+        // The secret for other hosts may be there before the run.
+        let is_file = |entry: std::io::Result<fs::DirEntry>| {
+            entry.map_or(true, |entry| entry.file_name() != TOKEN_FILE)
+        };
+        if entries.any(is_file) {
             let path = path.display();
             return Err(wrong_use(format!(
                 "run directory {path} already holds files; choose another --run-dir, or go on \

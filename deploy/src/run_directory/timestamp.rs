@@ -22,6 +22,12 @@ pub fn compact(time: SystemTime) -> String {
     format!("{year:04}{month:02}{day:02}-{hour:02}{minute:02}{second:02}")
 }
 
+/// This moment, for names that sort by time.
+#[must_use]
+pub fn compact_now() -> String {
+    compact(SystemTime::now())
+}
+
 fn fields(time: SystemTime) -> [u64; 6] {
     // A clock before 1970 is broken; 1970 is as good an answer as any.
     let seconds = time.duration_since(SystemTime::UNIX_EPOCH).map_or(0, |since| since.as_secs());

@@ -165,6 +165,7 @@ pub fn plan(
         learner_restarts: 0,
         sessions_before: 0,
         journal: None,
+        upstream: None,
     };
     (launcher, config.clone(), limits)
 }

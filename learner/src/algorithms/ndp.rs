@@ -152,7 +152,7 @@ impl Ndp {
                 layout: policy.layout(),
                 segments,
                 discount: config.algorithm.discount as f32,
-                workers: config.actors.places(),
+                workers: config.places(),
                 envs_per_worker: config.actors.envs_per_worker,
             }),
             config: settings,

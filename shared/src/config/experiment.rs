@@ -31,6 +31,8 @@ pub struct ExperimentConfig {
     pub actors: ActorsConfig,
     /// What a death may cost on the way from worker to learner.
     pub delivery: DeliveryConfig,
+    /// Workers of other hosts (docs/several-hosts.md).
+    pub bridge: BridgeConfig,
     /// What happens when a process dies or hangs.
     pub supervision: SupervisionConfig,
     /// The learner process.
@@ -41,6 +43,14 @@ pub struct ExperimentConfig {
     pub checkpoint: CheckpointConfig,
     /// What is written about the run.
     pub metrics: MetricsConfig,
+}
+
+impl ExperimentConfig {
+    /// Workers that there may be at once: the run's own, those that join, those of other hosts.
+    #[must_use]
+    pub fn places(&self) -> usize {
+        self.actors.places().saturating_add(self.bridge.places())
+    }
 }
 
 /// Length, seed and stopping rules. An infinite bound never stops a run.
@@ -214,10 +224,57 @@ impl Default for ActorsConfig {
 }
 
 impl ActorsConfig {
-    /// Workers that there may be at once: the run's own, then those that join.
+    /// Workers that there may be at once on the learner's host: its own, then those that join.
     #[must_use]
     pub fn places(&self) -> usize {
         self.workers.saturating_add(self.joined_max)
+    }
+}
+
+/// Workers of other hosts, which `dmprl bridge` brings in.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields, default)]
+pub struct BridgeConfig {
+    /// Zenoh endpoints that other hosts connect to, such as `tcp/0.0.0.0:7447` or
+    /// `tls/[::]:7447`; empty: the run stays on this host.
+    pub listen: Vec<String>,
+    /// Workers that other hosts may bring, all together. Each has its queue from the start, whether
+    /// it comes or not.
+    pub workers_max: usize,
+    /// What a host may have on its way without the learner's acknowledgement \[bytes\]; full: its
+    /// workers wait. At least the link's rate times its round trip, or it is never filled.
+    pub under_way_bytes_max: u64,
+    /// File with the secret that other hosts must know, readable by its owner alone; empty:
+    /// `bridge.token` in the run's directory, which is made.
+    pub token_file: String,
+    /// A file of Zenoh's own configuration (JSON5) for certificates and access control; empty:
+    /// neither.
+    pub zenoh_file: String,
+}
+
+impl Default for BridgeConfig {
+    fn default() -> Self {
+        Self {
+            listen: Vec::new(),
+            workers_max: 16,
+            under_way_bytes_max: 64 << 20,
+            token_file: String::new(),
+            zenoh_file: String::new(),
+        }
+    }
+}
+
+impl BridgeConfig {
+    /// Whether other hosts may take part.
+    #[must_use]
+    pub fn is_open(&self) -> bool {
+        !self.listen.is_empty()
+    }
+
+    /// Workers of other hosts that there may be at once.
+    #[must_use]
+    pub fn places(&self) -> usize {
+        if self.is_open() { self.workers_max } else { 0 }
     }
 }
 

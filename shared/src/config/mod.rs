@@ -22,9 +22,9 @@ pub use dmp::{
     PolicyConfig, PolicyKind, RhoKind, Start, StartSource, StartVelocity,
 };
 pub use experiment::{
-    ActorsConfig, CheckpointConfig, DeliveryConfig, DeliveryLevel, DemonstrationsConfig, Device,
-    EvaluationConfig, ExperimentConfig, Hindsight, LearnerConfig, MetricsConfig, PacingConfig,
-    Precision, ReplayConfig, RunConfig, SupervisionConfig, TaskConfig,
+    ActorsConfig, BridgeConfig, CheckpointConfig, DeliveryConfig, DeliveryLevel,
+    DemonstrationsConfig, Device, EvaluationConfig, ExperimentConfig, Hindsight, LearnerConfig,
+    MetricsConfig, PacingConfig, Precision, ReplayConfig, RunConfig, SupervisionConfig, TaskConfig,
 };
 pub use layers::{ConfigError, Layers, nearest};
 pub use presets::{PRESETS, Preset, algorithm_defaults, policy_defaults};

@@ -26,6 +26,9 @@ const UNACKNOWLEDGED_MAX: usize = 1 << 20;
 /// Room for some segments of any size.
 const LOG_BYTES_MIN: u64 = 1 << 20;
 const LOG_BYTES_MAX: u64 = 1 << 44;
+/// Below, a link of any length is hardly used; above, a slow learner's policy is old news.
+const UNDER_WAY_BYTES_MIN: u64 = 1 << 16;
+const UNDER_WAY_BYTES_MAX: u64 = 1 << 34;
 const UPDATES_PER_SEGMENT_MAX: f64 = 1e6;
 /// Signs of life come once a second, and later on a busy machine.
 const HEARTBEAT_S_MIN: f64 = 3.0;
@@ -53,6 +56,7 @@ impl ExperimentConfig {
         if self.run.deterministic {
             self.actors.workers = 1;
             self.actors.joined_max = 0;
+            self.bridge.listen.clear();
         }
         if self.algorithm.ndp.rollout_segments == 0 {
             let envs = self.actors.workers.saturating_mul(self.actors.envs_per_worker);
@@ -64,6 +68,7 @@ impl ExperimentConfig {
         self.check_combinations()?;
         self.check_ndp()?;
         self.check_delivery()?;
+        self.check_bridge()?;
         Ok(self)
     }
 
@@ -80,10 +85,26 @@ impl ExperimentConfig {
         })
     }
 
+    fn check_bridge(&self) -> Result<(), ConfigError> {
+        for endpoint in &self.bridge.listen {
+            let known = endpoint.split_once('/').is_some_and(|(protocol, address)| {
+                ["tcp", "tls"].contains(&protocol) && address.contains(':')
+            });
+            range("bridge.listen", endpoint, known, || {
+                "tcp/ADDRESS:PORT or tls/ADDRESS:PORT, such as tcp/0.0.0.0:7447".into()
+            })?;
+        }
+        let (key, got) = ("bridge.under_way_bytes_max", self.bridge.under_way_bytes_max);
+        range(key, got, (UNDER_WAY_BYTES_MIN..=UNDER_WAY_BYTES_MAX).contains(&got), || {
+            format!("from {UNDER_WAY_BYTES_MIN} to {UNDER_WAY_BYTES_MAX}")
+        })
+    }
+
     fn check_counts(&self) -> Result<(), ConfigError> {
         let counts = [
             ("actors.workers", self.actors.workers, 1, WORKERS_MAX),
             ("actors.joined_max", self.actors.joined_max, 0, WORKERS_MAX),
+            ("bridge.workers_max", self.bridge.workers_max, 1, WORKERS_MAX),
             ("actors.envs_per_worker", self.actors.envs_per_worker, 1, ENVS_PER_WORKER_MAX),
             ("actors.queue_segments", self.actors.queue_segments, 1, 65_536),
             (

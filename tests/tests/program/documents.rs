@@ -65,6 +65,7 @@ pages! {
     every_block_about_robots_runs: "docs/robot.md",
     every_block_about_python_runs: "docs/python.md",
     every_block_about_workers_runs: "docs/workers.md",
+    every_block_about_several_hosts_runs: "docs/several-hosts.md",
     every_block_about_trouble_runs: "docs/troubleshooting.md",
     every_block_about_results_runs: "docs/results.md",
     every_block_about_benchmarks_runs: "docs/benchmarks.md",

@@ -8,6 +8,7 @@
 //! the workers still cost is measured.
 
 mod figures;
+mod hosts;
 mod ours;
 mod python;
 mod streams;
@@ -25,6 +26,7 @@ use crate::run_directory::Manifest;
 use crate::terminal::RoundsProgress;
 
 pub use figures::Figures;
+pub use hosts::{connect, listen};
 pub use worker::{TransportWorkerArgs, transport_worker};
 
 use super::made_up::{SIZES, Size};

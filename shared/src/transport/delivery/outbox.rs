@@ -2,7 +2,7 @@
 
 use serde::{Deserialize, Serialize};
 
-use super::Acknowledgements;
+use super::{Acknowledgements, Mark};
 use crate::segment::{SegmentHeader, SegmentLayout};
 use crate::transport::{SegmentSender, SendOutcome, TransportError};
 
@@ -74,7 +74,22 @@ impl Outbox {
         worker_id: u32,
         incarnation: u32,
     ) -> Self {
+        Self::starting_at(1, (layout, segments_max), worker_id, incarnation)
+    }
+
+    /// The same for whoever takes over in the middle: the segments before `first` are acknowledged.
+    ///
+    /// # Panics
+    /// If it has room for none, or `first` is 0: sequences begin at 1.
+    #[must_use]
+    pub fn starting_at(
+        first: u64,
+        (layout, segments_max): (SegmentLayout, usize),
+        worker_id: u32,
+        incarnation: u32,
+    ) -> Self {
         assert!(segments_max > 0, "an outbox holds at least one segment");
+        assert!(first > 0, "the first segment has sequence 1");
         let block_len = layout.block_len();
         Self {
             worker_id,
@@ -82,10 +97,10 @@ impl Outbox {
             block_len,
             headers: vec![SegmentHeader::default(); segments_max],
             blocks: vec![0.0; segments_max * block_len],
-            first: 1,
-            next: 1,
-            end: 1,
-            highest_sent: 0,
+            first,
+            next: first,
+            end: first,
+            highest_sent: first - 1,
             epoch: 0,
             sent: Sent::default(),
         }
@@ -113,6 +128,30 @@ impl Outbox {
     #[must_use]
     pub fn len(&self) -> usize {
         (self.end - self.first) as usize
+    }
+
+    /// Sequence number of the oldest segment that is kept; all before it are acknowledged.
+    #[must_use]
+    pub fn first(&self) -> u64 {
+        self.first
+    }
+
+    /// Sequence number of the segment that is to be put in next.
+    #[must_use]
+    pub fn end(&self) -> u64 {
+        self.end
+    }
+
+    /// Segments that were offered and taken, and are not acknowledged.
+    #[must_use]
+    pub fn under_way(&self) -> usize {
+        (self.next - self.first) as usize
+    }
+
+    /// Segments that were put in and are still to be offered.
+    #[must_use]
+    pub fn unsent(&self) -> usize {
+        (self.end - self.next) as usize
     }
 
     /// Whether all are acknowledged.
@@ -178,6 +217,12 @@ impl Outbox {
             return;
         }
         self.epoch = acknowledgements.epoch;
+        self.acknowledge_to(*mark);
+    }
+
+    /// Forgets what has arrived, where the caller knows that the mark is of its worker, and the
+    /// newest.
+    pub fn acknowledge_to(&mut self, mark: Mark) {
         let ours = mark.incarnation == self.incarnation && mark.sequence < self.end;
         if ours && mark.sequence >= self.first {
             self.sent.acked += mark.sequence + 1 - self.first;

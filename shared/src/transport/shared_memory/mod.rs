@@ -170,6 +170,26 @@ pub fn attach(
     Ok(WorkerEnd { segments, parameters, acknowledgements })
 }
 
+/// Attaches this process to the queue of one worker only, on whose behalf it sends.
+///
+/// # Errors
+/// As [`attach`].
+pub fn attach_queue(
+    domain: &Path,
+    plan: &Plan,
+    worker_index: usize,
+) -> Result<Sender, TransportError> {
+    Sender::attach(&Domain::open(domain)?, plan, worker_index)
+}
+
+/// Attaches this process as a reader of acknowledgements only.
+///
+/// # Errors
+/// As [`attach`].
+pub fn hear(domain: &Path, plan: &Plan) -> Result<AcknowledgementReader, TransportError> {
+    AcknowledgementReader::attach(&Domain::open(domain)?, plan)
+}
+
 /// Attaches this process as a reader of snapshots only, such as the evaluator.
 ///
 /// # Errors

@@ -1,0 +1,221 @@
+//! The learner's end.
+
+use std::path::Path;
+use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
+use std::sync::{Arc, Mutex, PoisonError};
+use std::thread::{self, JoinHandle};
+use std::time::{Duration, Instant};
+
+use anyhow::{anyhow, bail};
+use dmprl_shared::config::TASKS;
+use dmprl_shared::parameters::ParameterSnapshot;
+use dmprl_shared::segment::{Segment, check};
+use dmprl_shared::transport::delivery::Inbox;
+use dmprl_shared::transport::shared_memory::{LearnerEnd, serve};
+use dmprl_shared::transport::{ParameterPublisher, SegmentReceiver};
+use serde_json::{Value, json};
+
+use super::{IDLE, INTERVAL, KEPT, PARAMETERS, PATIENCE, TOKEN, domain, plan};
+use crate::bench::learner::spec_of;
+use crate::bench::made_up::BETWEEN_HOSTS;
+use crate::bench::statistics::{max, median};
+use crate::bench::watch::Watch;
+use crate::bridge::gateway::{Gateway, News, RunFacts};
+use crate::bridge::wire::Course;
+use crate::terminal::say;
+
+const WORKERS_MAX: usize = 64;
+const PUBLISH_INTERVAL: Duration = Duration::from_millis(300);
+/// The clock starts so long after the first segment: the window grows first.
+const SETTLE: Duration = Duration::from_secs(3);
+/// Times that the end is told: a message may meet a link that is full.
+const GOODBYES: u32 = 10;
+
+/// Takes the learner's place for `duration`, at a Zenoh endpoint; none when interrupted.
+///
+/// # Errors
+/// The endpoint is taken, nobody comes, or an end fails.
+pub fn listen(
+    endpoint: &str,
+    zenoh_file: Option<&Path>,
+    duration: Duration,
+) -> anyhow::Result<Option<Value>> {
+    let watch = Watch::start()?;
+    let domain = domain()?;
+    let mut taker = Taker::new(serve(domain.path(), &plan(WORKERS_MAX))?);
+    let policies = Arc::new(Policies::default());
+    let gateway = start_gateway(&policies, (endpoint, zenoh_file), domain.path());
+    let began = Instant::now();
+    let ended = loop {
+        if watch.check().is_err() {
+            break None;
+        }
+        taker.turn(&policies)?;
+        if gateway.is_finished() {
+            break Some(0.0);
+        }
+        match taker.first {
+            Some(first) if first.elapsed() >= SETTLE + duration => {
+                break Some((first.elapsed() - SETTLE).as_secs_f64());
+            }
+            None if began.elapsed() >= PATIENCE => bail!("no host came to {endpoint}"),
+            _ => {}
+        }
+    };
+    policies.over.store(true, Ordering::Release);
+    gateway.join().map_err(|_| anyhow!("the gateway has panicked"))??;
+    let Some(seconds) = ended else { return Ok(None) };
+    let ages_ms = policies.ages_ms.lock().unwrap_or_else(PoisonError::into_inner).clone();
+    Ok(Some(json!({
+        "segment_bytes": BETWEEN_HOSTS.bytes,
+        "segments_per_s": taker.taken as f64 / seconds,
+        "lost": taker.lost,
+        "sent_again": taker.repeated,
+        "refused": taker.refused,
+        "seconds": seconds,
+        "policy_bytes": PARAMETERS * size_of::<f32>(),
+        "policies": ages_ms.len(),
+        "policy_ms_median": median(&ages_ms),
+        "policy_ms_max": (!ages_ms.is_empty()).then(|| max(&ages_ms)),
+    })))
+}
+
+/// Policies on their way, and how long they took.
+#[derive(Default)]
+struct Policies {
+    over: AtomicBool,
+    published: AtomicU64,
+    /// Of the newest: when it was published, until the other host has confirmed it.
+    under_way: Mutex<Option<Instant>>,
+    /// From publishing to the other host's confirmation, the way back included \[ms\].
+    ages_ms: Mutex<Vec<f64>>,
+}
+
+impl Policies {
+    fn publish(&self) -> u64 {
+        *self.under_way.lock().unwrap_or_else(PoisonError::into_inner) = Some(Instant::now());
+        self.published.fetch_add(1, Ordering::AcqRel) + 1
+    }
+
+    fn confirm(&self, version: u64) {
+        let mut under_way = self.under_way.lock().unwrap_or_else(PoisonError::into_inner);
+        if version == self.published.load(Ordering::Acquire)
+            && let Some(since) = under_way.take()
+        {
+            let age_ms = since.elapsed().as_secs_f64() * 1e3;
+            self.ages_ms.lock().unwrap_or_else(PoisonError::into_inner).push(age_ms);
+        }
+    }
+}
+
+/// Checks, settles and acknowledges, and publishes policies.
+struct Taker {
+    end: LearnerEnd,
+    inbox: Inbox,
+    segment: Segment,
+    told: Instant,
+    published: Option<Instant>,
+    first: Option<Instant>,
+    taken: u64,
+    lost: u64,
+    repeated: u64,
+    refused: u64,
+}
+
+impl Taker {
+    fn new(end: LearnerEnd) -> Self {
+        Self {
+            end,
+            inbox: Inbox::new(WORKERS_MAX),
+            segment: Segment::zeroed(BETWEEN_HOSTS.layout),
+            told: Instant::now(),
+            published: None,
+            first: None,
+            taken: 0,
+            lost: 0,
+            repeated: 0,
+            refused: 0,
+        }
+    }
+
+    fn turn(&mut self, policies: &Policies) -> anyhow::Result<()> {
+        if self.end.segments.try_receive(&mut self.segment)? {
+            self.take();
+        } else {
+            thread::sleep(IDLE);
+        }
+        let due = self.told.elapsed() >= INTERVAL;
+        if due || self.inbox.owes_acknowledgement() {
+            self.end.acknowledgements.acknowledge(self.inbox.acknowledge()?)?;
+        }
+        if due {
+            self.told = Instant::now();
+            self.end.segments.maintain()?;
+            self.end.parameters.maintain()?;
+            self.end.acknowledgements.maintain()?;
+        }
+        if self.published.is_none_or(|at| at.elapsed() >= PUBLISH_INTERVAL) {
+            self.published = Some(Instant::now());
+            let version = policies.publish();
+            let values = vec![version as f32; PARAMETERS];
+            let architecture_hash = plan(1).architecture_hash;
+            let env_steps = self.taken;
+            let snapshot = ParameterSnapshot { version, env_steps, architecture_hash, values };
+            self.end.parameters.publish(&snapshot)?;
+        }
+        Ok(())
+    }
+
+    fn take(&mut self) {
+        let since = *self.first.get_or_insert_with(Instant::now);
+        let Segment { header, block } = &self.segment;
+        if check(header, block, &BETWEEN_HOSTS.expected(WORKERS_MAX as u32)).is_err() {
+            self.refused += 1;
+            return;
+        }
+        match self.inbox.settle(header, block) {
+            Ok(gap) => {
+                self.lost += gap;
+                self.taken += u64::from(since.elapsed() >= SETTLE);
+            }
+            Err(_) => self.repeated += 1,
+        }
+    }
+}
+
+fn start_gateway(
+    policies: &Arc<Policies>,
+    (endpoint, zenoh_file): (&str, Option<&Path>),
+    domain: &Path,
+) -> JoinHandle<anyhow::Result<()>> {
+    let policies = Arc::clone(policies);
+    let (endpoints, domain) = ([endpoint.to_owned()], domain.to_owned());
+    let zenoh_file = zenoh_file.map(Path::to_owned);
+    thread::spawn(move || {
+        let facts = RunFacts {
+            run_id: format!("{:016x}", plan(1).run_id),
+            config: String::new(),
+            // Nobody asks for it.
+            spec: spec_of(&TASKS[0]),
+            token: TOKEN.to_owned(),
+        };
+        let at = (endpoints.as_slice(), zenoh_file.as_deref());
+        let mut gateway = Gateway::open(at, (&domain, plan(WORKERS_MAX)), (0, 0, KEPT), facts)?;
+        while !policies.over.load(Ordering::Acquire) {
+            if !gateway.turn()? {
+                thread::sleep(IDLE);
+            }
+            gateway.policy_versions().for_each(|version| policies.confirm(version));
+            for news in gateway.news() {
+                if let News::Told(what) = news {
+                    say(&what);
+                }
+            }
+        }
+        for _ in 0..GOODBYES {
+            gateway.tell(Course::Complete)?;
+            thread::sleep(INTERVAL);
+        }
+        Ok(())
+    })
+}

@@ -1,0 +1,130 @@
+//! The other end.
+
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::thread::{self, JoinHandle};
+use std::time::Instant;
+
+use anyhow::{Context, anyhow, bail};
+use dmprl_shared::config::ExperimentConfig;
+use dmprl_shared::segment::Segment;
+use dmprl_shared::transport::delivery::{Acknowledgements, Outbox};
+use dmprl_shared::transport::shared_memory::{Plan, attach};
+use serde_json::{Value, json};
+
+use super::{IDLE, INTERVAL, KEPT, PATIENCE, TOKEN, domain, plan};
+use crate::bench::made_up::MadeUp;
+use crate::bench::watch::Watch;
+use crate::bridge::relay::{Asked, Asking, HostCounts, Relay, Turn, ask};
+use crate::bridge::wire::Held;
+use crate::bridge::{Ends, Link};
+use crate::run_directory::random_u64;
+
+/// Segments made before the worker listens again.
+const TOGETHER: usize = 32;
+
+/// Sends made-up segments to who listens at the endpoint until that has enough; none when
+/// interrupted.
+///
+/// # Errors
+/// Nobody listens there, or an end fails.
+pub fn connect(
+    endpoint: &str,
+    zenoh_file: Option<&Path>,
+    workers: u32,
+) -> anyhow::Result<Option<Value>> {
+    let watch = Watch::start()?;
+    let asking = Asking {
+        endpoint: endpoint.to_owned(),
+        token: TOKEN.to_owned(),
+        host: random_u64()?,
+        name: "bench".to_owned(),
+        workers,
+    };
+    let Some(held) = welcomed(&asking, zenoh_file, &watch)? else { return Ok(None) };
+    let mut config = ExperimentConfig::default();
+    config.delivery.unacknowledged_segments = KEPT;
+    let domain = domain()?;
+    let plan = plan(workers as usize);
+    let at = (domain.path(), &plan);
+    let mut relay = Relay::start(asking, (held, zenoh_file), at, &config)?;
+    let over = Arc::new(AtomicBool::new(false));
+    let threads: Vec<JoinHandle<anyhow::Result<()>>> = (0..workers)
+        .map(|index| {
+            let (over, path, plan) = (Arc::clone(&over), domain.path().to_owned(), plan.clone());
+            thread::spawn(move || work(index, (&path, &plan), &over))
+        })
+        .collect();
+    let interrupted = loop {
+        match relay.turn(&HostCounts::default())? {
+            Turn::Complete => break false,
+            Turn::Idle => thread::sleep(IDLE),
+            Turn::Worked => {}
+        }
+        if watch.check().is_err() || threads.iter().any(JoinHandle::is_finished) {
+            break true;
+        }
+        if relay.away().is_some_and(|(since, _)| since.elapsed() >= PATIENCE) {
+            bail!("{endpoint} does not answer any more");
+        }
+    };
+    over.store(true, Ordering::Release);
+    for thread in threads {
+        let ended = thread.join().map_err(|_| anyhow!("a worker has panicked"))?;
+        ended.context("a worker failed")?;
+    }
+    let (acknowledged, window_bytes) = (relay.acked(), relay.window_bytes());
+    let figures =
+        json!({"workers": workers, "acknowledged": acknowledged, "window_bytes": window_bytes});
+    Ok((!interrupted).then_some(figures))
+}
+
+fn welcomed(
+    asking: &Asking,
+    zenoh_file: Option<&Path>,
+    watch: &Watch,
+) -> anyhow::Result<Option<Held>> {
+    let (began, endpoint) = (Instant::now(), &asking.endpoint);
+    let link = Link::open(Ends::Connect(endpoint), zenoh_file)?;
+    loop {
+        match ask(&link, asking, None)? {
+            Asked::Welcome(welcome) => return Ok(Some(welcome.held)),
+            Asked::Refused(why) => bail!("{endpoint} refuses: {why}"),
+            Asked::Later(why) if began.elapsed() >= PATIENCE => bail!("{why}"),
+            Asked::Later(_) if watch.check().is_err() => return Ok(None),
+            Asked::Later(_) => thread::sleep(INTERVAL),
+        }
+    }
+}
+
+/// A worker that only sends.
+fn work(index: u32, (domain, plan): (&PathBuf, &Plan), over: &AtomicBool) -> anyhow::Result<()> {
+    let began = Instant::now();
+    let mut end = loop {
+        match attach(domain, plan, index as usize) {
+            Ok(end) => break end,
+            Err(error) if began.elapsed() >= PATIENCE => return Err(error.into()),
+            Err(_) => thread::sleep(INTERVAL),
+        }
+    };
+    let mut outbox = Outbox::new(plan.layout, KEPT, index, 0);
+    let mut made_up = MadeUp::new(plan.layout, index);
+    let mut heard = Acknowledgements::default();
+    while !over.load(Ordering::Acquire) {
+        if end.acknowledgements.newest(&mut heard)? {
+            outbox.acknowledge(&heard);
+        }
+        let room = outbox.capacity() - outbox.len();
+        let together = if outbox.unsent() == 0 { room.min(TOGETHER) } else { 0 };
+        for _ in 0..together {
+            let Segment { header, block } = made_up.next();
+            outbox.put(header, block);
+        }
+        outbox.offer(&mut end.segments)?;
+        if outbox.unsent() > 0 || room == 0 {
+            thread::sleep(IDLE);
+        }
+    }
+    Ok(())
+}

@@ -1,0 +1,119 @@
+//! Policies for one host, on a thread of their own: a host whose link is full waits alone.
+//!
+//! One is under way at a time, and the next is the newest of that moment: a long link would
+//! otherwise be full of policies that are old when they come.
+
+use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
+use std::thread;
+use std::time::{Duration, Instant};
+
+use anyhow::Context;
+
+use super::link::Outlet;
+
+/// One that is not confirmed within this was lost with its link, and is sent again.
+const CONFIRMED_WITHIN: Duration = Duration::from_secs(2);
+
+#[derive(Debug, Default)]
+struct State {
+    newest: Option<(u64, Arc<Vec<u8>>)>,
+    /// The version that the host has.
+    confirmed: u64,
+    sent: Option<(u64, Instant)>,
+    closed: bool,
+}
+
+/// Sends a host the newest policy; ends with this.
+#[derive(Debug)]
+pub struct Feed(Arc<(Mutex<State>, Condvar)>);
+
+fn lock(shared: &(Mutex<State>, Condvar)) -> MutexGuard<'_, State> {
+    // Plain numbers, sound after every statement.
+    shared.0.lock().unwrap_or_else(PoisonError::into_inner)
+}
+
+impl Feed {
+    /// Starts the thread.
+    ///
+    /// # Errors
+    /// The system gives none.
+    pub fn start(outlet: Outlet) -> anyhow::Result<Self> {
+        let shared = Arc::new((Mutex::new(State::default()), Condvar::new()));
+        let feeding = Arc::clone(&shared);
+        let thread = thread::Builder::new().name("policies".into());
+        thread.spawn(move || feed(&feeding, &outlet)).context("cannot start a thread")?;
+        Ok(Self(shared))
+    }
+
+    /// There is a newer policy.
+    pub fn offer(&self, version: u64, message: &Arc<Vec<u8>>) {
+        lock(&self.0).newest = Some((version, Arc::clone(message)));
+        self.0.1.notify_one();
+    }
+
+    /// The host has this one.
+    pub fn confirm(&self, version: u64) {
+        lock(&self.0).confirmed = version;
+        self.0.1.notify_one();
+    }
+}
+
+impl Drop for Feed {
+    fn drop(&mut self) {
+        lock(&self.0).closed = true;
+        self.0.1.notify_one();
+    }
+}
+
+fn feed(shared: &(Mutex<State>, Condvar), outlet: &Outlet) {
+    let mut state = lock(shared);
+    while !state.closed {
+        match state.due(Instant::now()) {
+            Some((version, message)) => {
+                drop(state);
+                // A closed session ends the gateway, and this with it.
+                let _ = outlet.send(message.as_ref().clone());
+                state = lock(shared);
+                state.sent = Some((version, Instant::now()));
+            }
+            None => {
+                let waited = shared.1.wait_timeout(state, CONFIRMED_WITHIN);
+                state = waited.unwrap_or_else(PoisonError::into_inner).0;
+            }
+        }
+    }
+}
+
+impl State {
+    /// What is to be sent now.
+    fn due(&self, now: Instant) -> Option<(u64, Arc<Vec<u8>>)> {
+        let (version, message) = self.newest.as_ref()?;
+        let under_way = self.sent.is_some_and(|(sent, at)| {
+            sent > self.confirmed && now.duration_since(at) < CONFIRMED_WITHIN
+        });
+        let wanted = *version > self.confirmed && !under_way;
+        wanted.then(|| (*version, Arc::clone(message)))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn one_policy_is_under_way_at_a_time_and_a_lost_one_is_sent_again() {
+        let now = Instant::now();
+        let mut state = State::default();
+        assert!(state.due(now).is_none());
+        state.newest = Some((3, Arc::default()));
+        assert_eq!(state.due(now).unwrap().0, 3);
+        state.sent = Some((3, now));
+        state.newest = Some((5, Arc::default()));
+        assert!(state.due(now).is_none());
+        assert_eq!(state.due(now + CONFIRMED_WITHIN).unwrap().0, 5);
+        state.confirmed = 3;
+        assert_eq!(state.due(now).unwrap().0, 5);
+        state.confirmed = 5;
+        assert!(state.due(now).is_none());
+    }
+}

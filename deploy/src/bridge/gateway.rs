@@ -1,0 +1,484 @@
+//! The learner's end: to the learner it is the workers of all other hosts.
+
+use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+use std::time::{Duration, Instant};
+
+use anyhow::Context;
+use dmprl_shared::parameters::ParameterSnapshot;
+use dmprl_shared::segment::Segment;
+use dmprl_shared::spec::EnvSpec;
+use dmprl_shared::transport::delivery::{Acknowledgements, Sent};
+use dmprl_shared::transport::shared_memory::{
+    AcknowledgementReader, Plan, Sender, Subscriber, attach_queue, hear, subscribe,
+};
+use dmprl_shared::transport::{ParameterSubscriber, TransportError};
+
+use super::feed::Feed;
+use super::landing::Landing;
+use super::link::{Ends, Inlet, Link, Message, Outlet, Question, Questions, Token, Urgency};
+use super::relay::JOIN;
+use super::seats::{Host, Refusal, Seats};
+use super::token;
+use super::wire::{self, Course, HostAnswer, HostRequest, HostStatus, HostWelcome};
+use crate::control::{Greeting, HostNow};
+use crate::run_directory::random_u64;
+
+/// Between two times that the hosts are told what was acknowledged, when it has changed,
+const HEARING_INTERVAL: Duration = Duration::from_millis(5);
+/// and when it has not.
+const ALIVE_INTERVAL: Duration = Duration::from_millis(250);
+/// Between two tries to take a worker's queue, whose last holder may not be cleaned up after yet.
+const ATTACH_INTERVAL: Duration = Duration::from_millis(50);
+/// Hosts of a gateway that died speak by their old seats for a while: longer than it takes them to
+/// notice.
+const FORMER: Duration = Duration::from_secs(15);
+/// Messages taken before the queues are looked at again.
+const MESSAGES_TOGETHER: usize = 64;
+
+/// What a host that joins is told of the run.
+#[derive(Debug, Clone)]
+pub struct RunFacts {
+    /// As in the manifest.
+    pub run_id: String,
+    /// As in `config.toml`.
+    pub config: String,
+    /// The environment.
+    pub spec: EnvSpec,
+    /// The secret.
+    pub token: String,
+}
+
+/// The queue of one worker, and what is to go into it.
+struct Port {
+    worker: usize,
+    landing: Landing,
+    queue: Option<Sender>,
+}
+
+/// What goes out to a host.
+struct Outlets {
+    hearings: Outlet,
+    /// From its first words on: before, it does not listen, and a policy would be lost.
+    policies: Option<Feed>,
+}
+
+/// Something that the user should read, or the supervisor should count.
+#[derive(Debug, Clone, PartialEq)]
+pub enum News {
+    /// A sentence.
+    Told(String),
+    /// What the workers of other hosts did.
+    Sent(Sent),
+    /// Environments failed there.
+    EnvFailures {
+        /// How many times.
+        count: u64,
+        /// Where.
+        host: String,
+    },
+}
+
+/// The gateway of a run.
+pub struct Gateway {
+    link: Link,
+    questions: Questions,
+    segments: Inlet,
+    statuses: Inlet,
+    tokens: Inlet,
+    facts: RunFacts,
+    domain: PathBuf,
+    plan: Plan,
+    capacity: usize,
+    first: usize,
+    seats: Seats,
+    outlets: BTreeMap<u64, Outlets>,
+    ports: BTreeMap<usize, Port>,
+    acknowledgements: AcknowledgementReader,
+    heard: Acknowledgements,
+    policies: Subscriber,
+    snapshot: ParameterSnapshot,
+    policy: Option<(u64, Arc<Vec<u8>>)>,
+    buffer: Segment,
+    changed: bool,
+    told: Instant,
+    attached: Instant,
+    /// Messages of nobody, or damaged.
+    refused: u64,
+    /// When any host last was given another seat than it had, here or by a gateway before.
+    reseated: Instant,
+    id: u64,
+    _token: Token,
+    news: Vec<News>,
+}
+
+impl Gateway {
+    /// Opens the run to other hosts; `first`: the first worker that is theirs, `session`: which of
+    /// the run's this is, from 0.
+    ///
+    /// # Errors
+    /// An endpoint cannot be listened at, or the learner's shared memory not be joined.
+    pub fn open(
+        (endpoints, zenoh_file): (&[String], Option<&Path>),
+        (domain, plan): (&Path, Plan),
+        (first, session, capacity): (usize, u32, usize),
+        facts: RunFacts,
+    ) -> anyhow::Result<Self> {
+        let acknowledgements = hear(domain, &plan)?;
+        let policies = subscribe(domain, &plan)?;
+        let link = Link::open(Ends::Listen(endpoints), zenoh_file)?;
+        let all = |what: &str| format!("dmprl/{}/{what}/*", facts.run_id);
+        let places = u32::try_from(plan.worker_count - first).context("too many places")?;
+        let first_worker = u32::try_from(first).context("too many workers")?;
+        let (now, id) = (Instant::now(), random_u64()?);
+        Ok(Self {
+            segments: link.inlet(&all("segments"))?,
+            statuses: link.inlet(&all("status"))?,
+            tokens: link.tokens(&all("hosts"))?,
+            // Last: whoever asks finds everything else there.
+            questions: link.questions(JOIN)?,
+            domain: domain.to_owned(),
+            buffer: Segment::zeroed(plan.layout),
+            plan,
+            capacity,
+            first,
+            seats: Seats::new(first_worker, places, session),
+            outlets: BTreeMap::new(),
+            ports: BTreeMap::new(),
+            acknowledgements,
+            heard: Acknowledgements::default(),
+            policies,
+            snapshot: ParameterSnapshot::default(),
+            policy: None,
+            changed: false,
+            told: now,
+            attached: now,
+            refused: 0,
+            reseated: now,
+            _token: link.token(format!("dmprl/{}/gateway/{id:016x}", facts.run_id))?,
+            id,
+            link,
+            news: Vec::new(),
+            facts,
+        })
+    }
+
+    /// One round; whether there was anything to do.
+    ///
+    /// # Errors
+    /// Something is broken that does not mend.
+    pub fn turn(&mut self) -> anyhow::Result<bool> {
+        let now = Instant::now();
+        while let Some(question) = self.questions.next()? {
+            self.answer(&question, now)?;
+        }
+        while let Some(message) = self.tokens.next()? {
+            self.on_token(&message, now);
+        }
+        let mut worked = false;
+        for _ in 0..MESSAGES_TOGETHER {
+            let Some(message) = self.segments.next()? else { break };
+            worked = true;
+            self.land(&message, now);
+        }
+        while let Some(message) = self.statuses.next()? {
+            self.on_status(&message, now)?;
+        }
+        self.attach(now)?;
+        self.offer()?;
+        if self.acknowledgements.newest(&mut self.heard)? {
+            for port in self.ports.values_mut() {
+                let mark = self.heard.marks.get(port.worker).copied().unwrap_or_default();
+                port.landing.acknowledge(mark);
+            }
+            self.changed = true;
+        }
+        self.take_policy()?;
+        let since = now.duration_since(self.told);
+        if since >= ALIVE_INTERVAL || self.changed && since >= HEARING_INTERVAL {
+            (self.told, self.changed) = (now, false);
+            self.tell(Course::On)?;
+        }
+        Ok(worked)
+    }
+
+    /// What has happened since this was last asked.
+    pub fn news(&mut self) -> Vec<News> {
+        std::mem::take(&mut self.news)
+    }
+
+    /// All hosts, for whoever watches the run.
+    #[must_use]
+    pub fn hosts(&self) -> Vec<HostNow> {
+        let of = |host: &Host| HostNow {
+            name: host.name.clone(),
+            here: host.here,
+            workers: host.status.as_ref().map_or(0, |status| status.workers.count),
+            kept: host.status.as_ref().map_or(0, |status| status.workers.queued_segments),
+            acked: host.status.as_ref().map_or(0, |status| status.sent.acked),
+            restarts: host.status.as_ref().map_or(0, |status| status.workers.restarts),
+        };
+        self.seats.hosts().iter().map(of).collect()
+    }
+
+    /// The policy that each host has.
+    pub fn policy_versions(&self) -> impl Iterator<Item = u64> + '_ {
+        let statuses = self.seats.hosts().iter().filter_map(|host| host.status.as_ref());
+        statuses.map(|status| status.policy_version)
+    }
+
+    /// Whether no host is there.
+    #[must_use]
+    pub fn is_alone(&self) -> bool {
+        self.seats.hosts().iter().all(|host| !host.here)
+    }
+
+    /// Tells all hosts where the run is on its way, and what was acknowledged.
+    ///
+    /// # Errors
+    /// The session is closed.
+    pub fn tell(&mut self, course: Course) -> anyhow::Result<()> {
+        for host in self.seats.hosts() {
+            let Some(outlets) = self.outlets.get(&host.seat).filter(|_| host.here) else {
+                continue;
+            };
+            let first = host.held.first as usize;
+            let of = |index: u32| self.ports.get(&(first + index as usize));
+            let hearings: Vec<_> = (0..host.workers)
+                .map(|index| of(index).map(|port| port.landing.hearing()).unwrap_or_default())
+                .collect();
+            outlets.hearings.send(wire::write_hearings(course, &hearings))?;
+        }
+        Ok(())
+    }
+
+    /// Notes who comes and goes while nothing else is done.
+    ///
+    /// # Errors
+    /// The session is closed.
+    pub fn watch(&mut self) -> anyhow::Result<()> {
+        while let Some(message) = self.tokens.next()? {
+            self.on_token(&message, Instant::now());
+        }
+        Ok(())
+    }
+
+    fn answer(&mut self, question: &Question, now: Instant) -> anyhow::Result<()> {
+        let answer = match self.admit(&question.bytes(), now) {
+            Ok(welcome) => HostAnswer::Welcome(Box::new(welcome)),
+            Err(Refusal { reason, later }) => HostAnswer::Refused { reason, later },
+        };
+        question.answer(serde_json::to_vec(&answer).context("cannot write an answer")?)
+    }
+
+    fn admit(&mut self, bytes: &[u8], now: Instant) -> Result<HostWelcome, Refusal> {
+        let never = |reason: String| Refusal { reason, later: false };
+        // The greeting first: the rest of another version may not fit.
+        #[derive(serde::Deserialize)]
+        struct Speaks {
+            speaks: Greeting,
+        }
+        let this = Greeting::this();
+        let Speaks { speaks } = serde_json::from_slice(bytes)
+            .map_err(|_| never(format!("expected a request of {this}, got something else")))?;
+        if speaks != this {
+            let reason = format!("expected {this}, got {speaks}: start both from the same build");
+            self.news.push(News::Told(format!("a host of {speaks} may not take part")));
+            return Err(never(reason));
+        }
+        let request: HostRequest = serde_json::from_slice(bytes)
+            .map_err(|error| never(format!("expected a request, got another: {error}")))?;
+        if !token::equal(&request.token, &self.facts.token) {
+            let name = request.name.escape_debug();
+            self.news
+                .push(News::Told(format!("host {name} may not take part: its token is wrong")));
+            let reason = "its token is not the run's: copy bridge.token of the run's directory";
+            return Err(never(reason.to_owned()));
+        }
+        if self.heard.marks.is_empty() {
+            let reason = "the learner has not said yet how far its workers are".to_owned();
+            return Err(Refusal { reason, later: true });
+        }
+        let seat = random_u64().map_err(|error| never(format!("{error:#}")))?;
+        let known = self.seats.hosts().iter().find(|host| host.host == request.host);
+        let before = known.map(|host| host.seat);
+        // Its relay asks once more than its command line did: nothing that anybody should read.
+        let was_here = known.is_some_and(|host| host.here);
+        let held = self.seats.admit(&request, seat, (&self.heard.marks, now))?;
+        if let Some(before) = before {
+            self.outlets.remove(&before);
+            self.reseated = now;
+        }
+        let outlets = self.outlets(seat).map_err(|error| never(format!("{error:#}")))?;
+        self.outlets.insert(seat, outlets);
+        for index in 0..request.workers {
+            let worker = (held.first + index) as usize;
+            let landing = || Landing::new(held.first + index, self.plan.layout, self.capacity);
+            let port = || Port { worker, landing: landing(), queue: None };
+            self.ports.entry(worker).or_insert_with(port);
+        }
+        if !was_here {
+            let again = if request.held.is_some() { "is back" } else { "takes part" };
+            let workers = request.workers;
+            let counted = format!("{workers} worker{}", if workers == 1 { "" } else { "s" });
+            let name = request.name.escape_debug();
+            self.news.push(News::Told(format!("host {name} {again}: {counted}")));
+        }
+        let RunFacts { run_id, config, spec, .. } = self.facts.clone();
+        Ok(HostWelcome { seat, gateway: self.id, held, run_id, config, spec })
+    }
+
+    fn outlets(&self, seat: u64) -> anyhow::Result<Outlets> {
+        let name = format!("dmprl/{}/hearings/{seat:016x}", self.facts.run_id);
+        let hearings = self.link.outlet(name, Urgency::First)?;
+        Ok(Outlets { hearings, policies: None })
+    }
+
+    fn feed(&mut self, seat: u64, has: u64) -> anyhow::Result<()> {
+        let name = format!("dmprl/{}/policies/{seat:016x}", self.facts.run_id);
+        let Some(outlets) = self.outlets.get_mut(&seat) else { return Ok(()) };
+        let feed = match &outlets.policies {
+            Some(feed) => feed,
+            None => {
+                let feed = Feed::start(self.link.outlet(name, Urgency::Policies)?)?;
+                if let Some((version, message)) = &self.policy {
+                    feed.offer(*version, message);
+                }
+                outlets.policies.insert(feed)
+            }
+        };
+        feed.confirm(has);
+        Ok(())
+    }
+
+    /// Whose message it is: the seat in its name is known to nobody else.
+    fn host(&mut self, message: &Message) -> Option<&mut Host> {
+        let seat = u64::from_str_radix(message.last_name(), 16).ok()?;
+        self.seats.of_seat(seat)
+    }
+
+    fn on_token(&mut self, message: &Message, now: Instant) {
+        let here = message.has_come();
+        let Some(host) = self.host(message) else { return };
+        (host.here, host.heard) = (here, now);
+        if !here {
+            let name = host.name.escape_debug().to_string();
+            self.news.push(News::Told(format!("host {name} is out of reach")));
+        }
+    }
+
+    fn land(&mut self, message: &Message, now: Instant) {
+        let Some(host) = self.host(message) else {
+            self.refused += u64::from(now.duration_since(self.reseated) >= FORMER);
+            return;
+        };
+        (host.heard, host.here) = (now, true);
+        let places = host.held.first as usize..(host.held.first + host.workers) as usize;
+        let Self { ports, buffer, refused, .. } = self;
+        let read = wire::read_batch(&message.bytes(), buffer, |stretch, segment| {
+            let port = Some(stretch.worker as usize).filter(|worker| places.contains(worker));
+            match (port.and_then(|worker| ports.get_mut(&worker)), segment) {
+                (Some(port), None) => port.landing.begin(stretch),
+                (Some(port), Some(segment)) => port.landing.land(stretch, segment),
+                (None, _) => *refused += 1,
+            }
+        });
+        *refused += u64::from(read.is_err());
+    }
+
+    fn on_status(&mut self, message: &Message, now: Instant) -> anyhow::Result<()> {
+        let Ok(status) = serde_json::from_slice::<HostStatus>(&message.bytes()) else {
+            self.refused += 1;
+            return Ok(());
+        };
+        let Some(host) = self.host(message) else { return Ok(()) };
+        host.heard = now;
+        let (name, seat) = (host.name.clone(), host.seat);
+        // A gateway that took over mid-way begins to count where the host is.
+        let before = host.status.replace(status.clone());
+        let before = before.unwrap_or_else(|| match host.counted_before {
+            true => status.clone(),
+            false => HostStatus::default(),
+        });
+        self.feed(seat, status.policy_version)?;
+        let sent = status.sent.since(&before.sent);
+        if sent != Sent::default() {
+            self.news.push(News::Sent(sent));
+        }
+        let count = status.env_failures.saturating_sub(before.env_failures);
+        if count > 0 {
+            self.news.push(News::EnvFailures { count, host: name.clone() });
+        }
+        if status.leaves {
+            self.seats.remove(seat);
+            self.outlets.remove(&seat);
+            self.reseated = now;
+            self.news.push(News::Told(format!("host {} has left", name.escape_debug())));
+        }
+        Ok(())
+    }
+
+    /// Takes the queues of workers that have come.
+    fn attach(&mut self, now: Instant) -> anyhow::Result<()> {
+        if now.duration_since(self.attached) < ATTACH_INTERVAL {
+            return Ok(());
+        }
+        self.attached = now;
+        for port in self.ports.values_mut().filter(|port| port.queue.is_none()) {
+            match attach_queue(&self.domain, &self.plan, port.worker) {
+                Ok(queue) => port.queue = Some(queue),
+                Err(error @ TransportError::Incompatible { .. }) => return Err(error.into()),
+                // The learner is being replaced, or the place of a killed gateway not free yet.
+                Err(_) => {}
+            }
+        }
+        Ok(())
+    }
+
+    fn offer(&mut self) -> anyhow::Result<()> {
+        for port in self.ports.values_mut() {
+            if let Some(queue) = &mut port.queue {
+                port.landing.offer(queue)?;
+            }
+        }
+        Ok(())
+    }
+
+    fn take_policy(&mut self) -> anyhow::Result<()> {
+        match self.policies.newest(&mut self.snapshot) {
+            Ok(true) => {
+                let message = Arc::new(wire::write_snapshot(&self.snapshot));
+                for feed in self.outlets.values().filter_map(|outlets| outlets.policies.as_ref()) {
+                    feed.offer(self.snapshot.version, &message);
+                }
+                self.policy = Some((self.snapshot.version, message));
+            }
+            Ok(false) => {}
+            // A damaged one: the next comes soon.
+            Err(TransportError::Snapshot(error)) => {
+                self.news.push(News::Told(format!("a policy snapshot is refused: {error}")));
+            }
+            Err(error) => return Err(error.into()),
+        }
+        Ok(())
+    }
+
+    /// Messages and segments that were refused: of nobody, damaged, or not what they said.
+    #[must_use]
+    pub fn refused(&self) -> u64 {
+        self.refused + self.ports.values().map(|port| port.landing.misfits()).sum::<u64>()
+    }
+
+    /// Segments that the learner has not acknowledged yet.
+    #[must_use]
+    pub fn kept(&self) -> usize {
+        self.ports.values().map(|port| port.landing.kept()).sum()
+    }
+
+    /// The first worker of other hosts.
+    #[must_use]
+    pub fn first(&self) -> usize {
+        self.first
+    }
+}

@@ -1,0 +1,370 @@
+//! A worker's segments on their way over a link, from the host's end.
+//!
+//! A [`Lane`] is an outbox like the worker's own: it keeps what the learner has not acknowledged
+//! and offers it, in order, to the link. The link may lose what was under way when it breaks; the
+//! gateway finds the gap, refuses the attempt, and the lane sends everything it keeps once more as
+//! the next attempt. So nothing is lost, and what comes twice is left out where it arrives.
+
+use std::time::Instant;
+
+use dmprl_shared::segment::{Segment, SegmentHeader, SegmentLayout};
+use dmprl_shared::transport::delivery::{Mark, Outbox};
+use dmprl_shared::transport::{SegmentSender, SendOutcome, TransportError};
+
+use super::wire::{Batch, Hearing, Stretch};
+
+/// One worker's.
+#[derive(Debug)]
+pub struct Lane {
+    /// Which worker of the run; on its host it has another number.
+    worker: u32,
+    layout: SegmentLayout,
+    capacity: usize,
+    outbox: Option<Outbox>,
+    /// The first segment of a new start of the worker: it waits until all of the one before is
+    /// acknowledged, because the learner takes nothing of an older start once it knows a newer.
+    pending: Option<Segment>,
+    attempt: u32,
+    anew: bool,
+    /// A segment whose acknowledgement is timed, and since when.
+    timed: Option<(u64, Instant)>,
+    misfits: u64,
+}
+
+/// What an acknowledgement brought.
+#[derive(Debug, Clone, Copy, Default, PartialEq)]
+pub struct Acked {
+    /// Segments.
+    pub segments: u64,
+    /// How long a segment of them was under way, where one was timed \[s\].
+    pub delay_s: Option<f64>,
+}
+
+impl Lane {
+    /// Nothing has come of the worker yet.
+    #[must_use]
+    pub fn new(worker: u32, layout: SegmentLayout, capacity: usize) -> Self {
+        let (outbox, pending, timed) = (None, None, None);
+        Self {
+            worker,
+            layout,
+            capacity,
+            outbox,
+            pending,
+            attempt: 1,
+            anew: false,
+            timed,
+            misfits: 0,
+        }
+    }
+
+    /// Whether another of the worker's segments may be taken in: nothing waits to be sent.
+    #[must_use]
+    pub fn has_room(&self) -> bool {
+        let free = |outbox: &Outbox| outbox.unsent() == 0 && outbox.len() < outbox.capacity();
+        self.pending.is_none() && !self.anew && self.outbox.as_ref().is_none_or(free)
+    }
+
+    /// Segments under way.
+    #[must_use]
+    pub fn under_way(&self) -> usize {
+        self.outbox.as_ref().map_or(0, Outbox::under_way)
+    }
+
+    /// Segments that are kept.
+    #[must_use]
+    pub fn kept(&self) -> usize {
+        self.outbox.as_ref().map_or(0, Outbox::len) + usize::from(self.pending.is_some())
+    }
+
+    /// Segments that followed on none that came before; a worker that keeps the rules sends none.
+    #[must_use]
+    pub fn misfits(&self) -> u64 {
+        self.misfits
+    }
+
+    /// Takes in what the worker sent. What it sends again, on a new connection, is kept already.
+    pub fn take(&mut self, segment: &Segment) {
+        let header = SegmentHeader { worker_id: self.worker, ..segment.header };
+        let newer = match &self.outbox {
+            None => true,
+            Some(outbox) if header.incarnation > outbox.incarnation() => {
+                if !outbox.is_empty() {
+                    self.pending = Some(Segment { header, block: segment.block.clone() });
+                    return;
+                }
+                true
+            }
+            Some(outbox) if header.incarnation < outbox.incarnation() => return,
+            Some(_) => false,
+        };
+        if newer {
+            self.begin(&header);
+        }
+        let Some(outbox) = &mut self.outbox else { return };
+        if header.sequence < outbox.end() {
+            return;
+        }
+        let fits = header.sequence == outbox.end() && outbox.put(&header, &segment.block);
+        self.misfits += u64::from(!fits);
+    }
+
+    fn begin(&mut self, header: &SegmentHeader) {
+        let room = (self.layout, self.capacity);
+        let first = header.sequence.max(1);
+        self.outbox = Some(Outbox::starting_at(first, room, self.worker, header.incarnation));
+        self.anew = false;
+        self.timed = None;
+    }
+
+    /// Puts what waits into the batch, as long as there is `room` \[segments\].
+    pub fn send(&mut self, batch: &mut Batch, room: &mut usize, now: Instant) {
+        let Some(outbox) = &mut self.outbox else { return };
+        let (first, incarnation) = (outbox.first(), outbox.incarnation());
+        let stretch = Stretch {
+            first,
+            next: 0,
+            worker: self.worker,
+            incarnation,
+            attempt: self.attempt,
+            count: 0,
+        };
+        let mut link = Boarding { batch, room, anew: &mut self.anew, stretch, begun: false };
+        // Boarding refuses nothing but for want of room.
+        let _ = outbox.offer(&mut link);
+        let next = first + outbox.under_way() as u64;
+        if self.timed.is_none() && next > first {
+            self.timed = Some((next - 1, now));
+        }
+    }
+
+    /// Tells the gateway how far the worker is: what was lost behind the last segment that came,
+    /// nothing else would tell.
+    pub fn say_how_far(&self, batch: &mut Batch) {
+        let Some(outbox) = &self.outbox else { return };
+        batch.begin(Stretch {
+            first: outbox.first(),
+            next: outbox.first() + outbox.under_way() as u64,
+            worker: self.worker,
+            incarnation: outbox.incarnation(),
+            attempt: self.attempt,
+            count: 0,
+        });
+    }
+
+    /// Everything that is kept is to be sent once more: there is another gateway.
+    pub fn begin_anew(&mut self) {
+        self.attempt = self.attempt.wrapping_add(1).max(1);
+        // What is not kept cannot be missing.
+        self.anew = self.outbox.is_some();
+        self.timed = None;
+    }
+
+    /// Takes in what the gateway has heard and the learner acknowledged.
+    pub fn hear(&mut self, hearing: &Hearing, now: Instant) -> Acked {
+        let mut acked = Acked::default();
+        if let Some(outbox) = &mut self.outbox {
+            let before = outbox.first();
+            acknowledge(outbox, hearing.mark(), (self.layout, self.capacity));
+            acked.segments = outbox.first() - before;
+            if let Some((_, since)) = self.timed.filter(|(last, _)| *last < outbox.first()) {
+                acked.delay_s = Some(now.duration_since(since).as_secs_f64());
+                self.timed = None;
+            }
+        }
+        if hearing.refused == self.attempt {
+            self.begin_anew();
+        }
+        let done = self.outbox.as_ref().is_none_or(Outbox::is_empty);
+        if done && let Some(segment) = self.pending.take() {
+            self.begin(&segment.header);
+            self.take(&segment);
+        }
+        acked
+    }
+
+    /// What the worker may forget.
+    #[must_use]
+    pub fn mark(&self) -> Mark {
+        self.outbox.as_ref().map_or(Mark::default(), |outbox| Mark {
+            incarnation: outbox.incarnation(),
+            sequence: outbox.first() - 1,
+        })
+    }
+}
+
+/// Forgets what the learner has. That may be more than came here yet, when the one who passed it on
+/// has died since: what the worker sends again of it is then left out.
+pub(super) fn acknowledge(outbox: &mut Outbox, mark: Mark, room: (SegmentLayout, usize)) {
+    let (worker, incarnation) = (outbox.worker_id(), outbox.incarnation());
+    if mark.incarnation == incarnation && mark.sequence >= outbox.end() {
+        *outbox = Outbox::starting_at(mark.sequence + 1, room, worker, incarnation);
+    } else {
+        outbox.acknowledge_to(mark);
+    }
+}
+
+/// A batch as the link of an outbox.
+struct Boarding<'a> {
+    batch: &'a mut Batch,
+    room: &'a mut usize,
+    anew: &'a mut bool,
+    stretch: Stretch,
+    begun: bool,
+}
+
+impl SegmentSender for Boarding<'_> {
+    fn renew(&mut self) -> Result<bool, TransportError> {
+        Ok(std::mem::take(self.anew))
+    }
+
+    fn try_send(
+        &mut self,
+        header: &SegmentHeader,
+        block: &[f32],
+    ) -> Result<SendOutcome, TransportError> {
+        if *self.room == 0 {
+            return Ok(SendOutcome::Full);
+        }
+        *self.room -= 1;
+        if !self.begun {
+            self.begun = true;
+            self.batch.begin(Stretch { next: header.sequence, ..self.stretch });
+        }
+        self.batch.add(header, block);
+        Ok(SendOutcome::Delivered)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::bridge::landing::Landing;
+    use crate::bridge::wire::read_batch;
+
+    const LAYOUT: SegmentLayout =
+        SegmentLayout { segment_steps: 1, observation_len: 1, action_len: 1 };
+
+    fn segment(incarnation: u32, sequence: u64) -> Segment {
+        let header = SegmentHeader { incarnation, sequence, ..SegmentHeader::default() };
+        Segment { header, ..Segment::zeroed(LAYOUT) }
+    }
+
+    /// Everything that a batch holds, taken in.
+    fn land(batch: &mut Batch, landing: &mut Landing) {
+        let mut buffer = Segment::zeroed(LAYOUT);
+        read_batch(&batch.take(), &mut buffer, |stretch, segment| match segment {
+            None => landing.begin(stretch),
+            Some(segment) => landing.land(stretch, segment),
+        })
+        .unwrap();
+    }
+
+    struct Ends {
+        lane: Lane,
+        landing: Landing,
+        batch: Batch,
+        now: Instant,
+    }
+
+    impl Ends {
+        fn new() -> Self {
+            let (lane, landing) = (Lane::new(7, LAYOUT, 8), Landing::new(7, LAYOUT, 8));
+            Self { lane, landing, batch: Batch::default(), now: Instant::now() }
+        }
+
+        fn send(&mut self, incarnation: u32, sequences: std::ops::RangeInclusive<u64>) {
+            sequences.for_each(|sequence| self.lane.take(&segment(incarnation, sequence)));
+            self.send_rest();
+        }
+
+        fn send_rest(&mut self) {
+            self.lane.send(&mut self.batch, &mut 100, self.now);
+        }
+
+        fn land(&mut self) {
+            land(&mut self.batch, &mut self.landing);
+        }
+
+        fn acknowledge(&mut self, incarnation: u32, sequence: u64) -> Acked {
+            self.landing.acknowledge(Mark { incarnation, sequence });
+            self.lane.hear(&self.landing.hearing(), self.now)
+        }
+    }
+
+    #[test]
+    fn what_the_link_lost_is_found_missing_and_sent_again() {
+        let mut ends = Ends::new();
+        ends.send(0, 1..=2);
+        ends.land();
+        ends.send(0, 3..=4);
+        drop(ends.batch.take());
+        assert_eq!(ends.landing.kept(), 2);
+        // Nothing follows that could be found out of order: the lane says how far it is.
+        ends.lane.say_how_far(&mut ends.batch);
+        ends.land();
+        assert_ne!(ends.landing.hearing().refused, 0);
+        ends.acknowledge(0, 0);
+        assert!(!ends.lane.has_room(), "what is kept goes first");
+        ends.send_rest();
+        ends.land();
+        assert_eq!(ends.landing.kept(), 4);
+        assert_eq!(ends.acknowledge(0, 4).segments, 4);
+        assert_eq!((ends.lane.kept(), ends.landing.kept(), ends.lane.misfits()), (0, 0, 0));
+        assert_eq!(ends.lane.mark(), Mark { incarnation: 0, sequence: 4 });
+    }
+
+    #[test]
+    fn a_landing_that_takes_over_begins_with_the_oldest_that_is_kept() {
+        let mut ends = Ends::new();
+        ends.send(0, 1..=5);
+        ends.land();
+        ends.acknowledge(0, 2);
+        ends.landing = Landing::new(7, LAYOUT, 8);
+        ends.send(0, 6..=6);
+        ends.land();
+        assert_eq!(ends.landing.kept(), 0, "3 to 5 are missing");
+        ends.acknowledge(0, 2);
+        ends.send_rest();
+        ends.land();
+        assert_eq!(ends.landing.kept(), 4);
+    }
+
+    /// Its worker sends again from where it last heard; the learner has more. That once kept the
+    /// lane waiting for ever for an acknowledgement of what it had not been sent yet.
+    #[test]
+    fn a_lane_that_takes_over_believes_a_mark_beyond_what_it_has_seen() {
+        let mut ends = Ends::new();
+        ends.send(0, 1..=8);
+        ends.land();
+        ends.landing.acknowledge(Mark { incarnation: 0, sequence: 7 });
+        ends.lane = Lane::new(7, LAYOUT, 8);
+        ends.lane.begin_anew();
+        ends.send(0, 3..=5);
+        assert_eq!(ends.lane.under_way(), 3);
+        ends.land();
+        ends.acknowledge(0, 7);
+        assert_eq!(ends.lane.mark(), Mark { incarnation: 0, sequence: 7 });
+        assert_eq!(ends.lane.under_way(), 0);
+        ends.send(0, 6..=9);
+        ends.land();
+        assert_eq!((ends.lane.kept(), ends.landing.kept()), (2, 2));
+    }
+
+    #[test]
+    fn a_new_start_of_the_worker_waits_until_all_of_the_old_is_acknowledged() {
+        let mut ends = Ends::new();
+        ends.send(3, 1..=2);
+        ends.land();
+        ends.send(4, 1..=1);
+        ends.land();
+        assert!(!ends.lane.has_room());
+        assert_eq!((ends.lane.kept(), ends.landing.kept()), (3, 2));
+        ends.acknowledge(3, 2);
+        ends.send(4, 2..=2);
+        ends.land();
+        assert_eq!(ends.landing.kept(), 2);
+        ends.acknowledge(4, 2);
+        assert_eq!(ends.lane.mark(), Mark { incarnation: 4, sequence: 2 });
+    }
+}

@@ -1,0 +1,465 @@
+//! A host's end: to its workers it is the learner.
+//!
+//! It takes a segment only when the link has room for it, so that what waits, waits in the workers'
+//! queues, where they feel it. What it has under way it keeps until the learner has acknowledged
+//! it; a worker hears of an acknowledgement when the learner has given it, not before.
+
+use std::path::Path;
+use std::time::{Duration, Instant};
+
+use anyhow::{Context, bail, ensure};
+use dmprl_shared::config::ExperimentConfig;
+use dmprl_shared::segment::Segment;
+use dmprl_shared::transport::delivery::{Mark, Sent};
+use dmprl_shared::transport::shared_memory::{LearnerEnd, Plan, serve};
+use dmprl_shared::transport::{ParameterPublisher, SegmentReceiver};
+
+use super::lane::Lane;
+use super::link::{Ends, Inlet, Link, Outlet, Token, Urgency};
+use super::window::Window;
+use super::wire::{self, Batch, Course, Held, HostAnswer, HostRequest, HostStatus, HostWelcome};
+use crate::control::{Greeting, WorkersNow};
+
+/// Name of the question by which a host asks to take part.
+pub(super) const JOIN: &str = "dmprl/join";
+/// An answer takes a round trip.
+const ANSWER_LIMIT: Duration = Duration::from_secs(3);
+/// Between two times that a host asks.
+const ASK_AGAIN: Duration = Duration::from_millis(500);
+/// The gateway speaks a few times a second; so long a silence means that it, or the link, is gone.
+const SILENCE: Duration = Duration::from_secs(5);
+/// A batch of so many bytes is sent at once. The link cuts messages into pieces of 64 KiB.
+const BATCH_BYTES: usize = 60_000;
+/// Segments of one worker before it is the next one's turn.
+const TURN_SEGMENTS: usize = 16;
+const ACKNOWLEDGE_INTERVAL: Duration = Duration::from_millis(5);
+const MAINTENANCE_INTERVAL: Duration = Duration::from_millis(100);
+const STATUS_INTERVAL: Duration = Duration::from_millis(250);
+
+/// Whom a host asks, and as whom.
+#[derive(Debug, Clone)]
+pub struct Asking {
+    /// The learner's host.
+    pub endpoint: String,
+    /// The run's secret.
+    pub token: String,
+    /// Tells this start of the program from every other.
+    pub host: u64,
+    /// What people call the host.
+    pub name: String,
+    /// Workers that it brings.
+    pub workers: u32,
+}
+
+/// What came of asking once.
+#[derive(Debug)]
+pub enum Asked {
+    /// The host takes part.
+    Welcome(Box<HostWelcome>),
+    /// Nobody is there, or there is no room now.
+    Later(String),
+    /// Asking again is of no use.
+    Refused(String),
+}
+
+/// Asks to take part, once.
+///
+/// # Errors
+/// The session is closed.
+pub fn ask(link: &Link, asking: &Asking, held: Option<Held>) -> anyhow::Result<Asked> {
+    let Asking { endpoint, token, host, name, workers } = asking;
+    let request = HostRequest {
+        speaks: Greeting::this(),
+        token: token.clone(),
+        host: *host,
+        name: name.clone(),
+        workers: *workers,
+        held,
+    };
+    let question = serde_json::to_vec(&request).context("cannot write a request")?;
+    let Some(answer) = link.ask(JOIN, question, ANSWER_LIMIT)? else {
+        return Ok(Asked::Later(format!("no learner's host answers at {endpoint}")));
+    };
+    Ok(match serde_json::from_slice(&answer) {
+        Ok(HostAnswer::Welcome(welcome)) => Asked::Welcome(welcome),
+        Ok(HostAnswer::Refused { reason, later: true }) => Asked::Later(reason),
+        Ok(HostAnswer::Refused { reason, later: false }) => Asked::Refused(reason),
+        Err(error) => Asked::Refused(format!("{endpoint} answered what is no answer: {error}")),
+    })
+}
+
+/// What the host's supervisor has told of it.
+#[derive(Debug, Clone, Copy, Default)]
+pub struct HostCounts {
+    /// What its workers did.
+    pub sent: Sent,
+    /// Failures of environments.
+    pub env_failures: u64,
+    /// Its workers.
+    pub workers: WorkersNow,
+}
+
+/// A session's names for one seat.
+struct Seat {
+    segments: Outlet,
+    status: Outlet,
+    hearings: Inlet,
+    policies: Inlet,
+    /// Gateways that come and go, and the one that gave this seat.
+    gateways: Inlet,
+    gateway: u64,
+    _token: Token,
+}
+
+impl Seat {
+    fn take(link: &Link, welcome: &HostWelcome) -> anyhow::Result<Self> {
+        let name = |what: &str| format!("dmprl/{}/{what}/{:016x}", welcome.run_id, welcome.seat);
+        Ok(Self {
+            gateways: link.tokens(&format!("dmprl/{}/gateway/*", welcome.run_id))?,
+            gateway: welcome.gateway,
+            hearings: link.inlet(&name("hearings"))?,
+            policies: link.inlet(&name("policies"))?,
+            segments: link.outlet(name("segments"), Urgency::Segments)?,
+            status: link.outlet(name("status"), Urgency::First)?,
+            _token: link.token(name("hosts"))?,
+        })
+    }
+
+    /// Whether the gateway that gave the seat is gone, or another has come.
+    fn is_in_doubt(&self) -> anyhow::Result<bool> {
+        let mut doubt = false;
+        while let Some(message) = self.gateways.next()? {
+            let ours = u64::from_str_radix(message.last_name(), 16) == Ok(self.gateway);
+            doubt |= ours != message.has_come();
+        }
+        Ok(doubt)
+    }
+}
+
+/// What a turn brought.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Turn {
+    /// There may be more.
+    Worked,
+    /// Nothing was to be done.
+    Idle,
+    /// The run has come to its end.
+    Complete,
+}
+
+/// A host's relay.
+pub struct Relay {
+    link: Link,
+    asking: Asking,
+    /// Its places.
+    given: Held,
+    seat: Option<Seat>,
+    end: LearnerEnd,
+    lanes: Vec<Lane>,
+    marks: Vec<Mark>,
+    /// The worker whose turn is next.
+    next: usize,
+    window: Window,
+    segment_bytes: u64,
+    segment_steps: usize,
+    architecture_hash: u64,
+    batch: Batch,
+    buffer: Segment,
+    version: u64,
+    env_steps: u64,
+    acked: u64,
+    started: Instant,
+    heard: Instant,
+    /// The gateway seems to be gone, or another.
+    doubt: bool,
+    asked: Option<Instant>,
+    acknowledged: Instant,
+    maintained: Instant,
+    told: Instant,
+    tell_now: bool,
+    /// Since when the learner's host does not answer, and why.
+    away: Option<(Instant, String)>,
+    /// Messages that could not be read.
+    damaged: u64,
+}
+
+impl Relay {
+    /// Serves the host's workers; `held`: the places that it was given before.
+    ///
+    /// # Errors
+    /// The session or the shared memory cannot be opened.
+    pub fn start(
+        asking: Asking,
+        (held, zenoh_file): (Held, Option<&Path>),
+        (domain, plan): (&Path, &Plan),
+        config: &ExperimentConfig,
+    ) -> anyhow::Result<Self> {
+        let link = Link::open(Ends::Connect(&asking.endpoint), zenoh_file)?;
+        let end = serve(domain, plan)?;
+        let capacity = config.delivery.unacknowledged_segments;
+        let lane = |index: u32| Lane::new(held.first + index, plan.layout, capacity);
+        let buffer = Segment::zeroed(plan.layout);
+        let segment_bytes = size_of_val(&buffer.header) + size_of_val(buffer.block.as_slice());
+        let now = Instant::now();
+        Ok(Self {
+            link,
+            lanes: (0..asking.workers).map(lane).collect(),
+            marks: vec![Mark::default(); asking.workers as usize],
+            asking,
+            given: held,
+            seat: None,
+            end,
+            next: 0,
+            window: Window::new(config.bridge.under_way_bytes_max),
+            segment_bytes: segment_bytes as u64,
+            segment_steps: plan.layout.segment_steps,
+            architecture_hash: plan.architecture_hash,
+            batch: Batch::default(),
+            buffer,
+            version: 0,
+            env_steps: 0,
+            acked: 0,
+            started: now,
+            heard: now,
+            doubt: false,
+            asked: None,
+            acknowledged: now,
+            maintained: now,
+            told: now,
+            tell_now: false,
+            away: Some((now, "it has not been asked yet".to_owned())),
+            damaged: 0,
+        })
+    }
+
+    /// Version of the newest policy that the host's workers have; 0: none.
+    #[must_use]
+    pub fn version(&self) -> u64 {
+        self.version
+    }
+
+    /// Environment steps of the run when that was published.
+    #[must_use]
+    pub fn env_steps(&self) -> u64 {
+        self.env_steps
+    }
+
+    /// Environment steps of a segment.
+    #[must_use]
+    pub fn segment_steps(&self) -> usize {
+        self.segment_steps
+    }
+
+    /// Segments that the learner has acknowledged.
+    #[must_use]
+    pub fn acked(&self) -> u64 {
+        self.acked
+    }
+
+    /// Bytes that may be under way now.
+    #[must_use]
+    pub fn window_bytes(&self) -> u64 {
+        self.window.bytes()
+    }
+
+    /// Segments that the learner has not acknowledged.
+    #[must_use]
+    pub fn under_way(&self) -> u64 {
+        self.lanes.iter().map(|lane| lane.under_way() as u64).sum()
+    }
+
+    /// Since when the learner's host does not answer, and why.
+    #[must_use]
+    pub fn away(&self) -> Option<&(Instant, String)> {
+        self.away.as_ref()
+    }
+
+    /// Messages and segments that were not what they should be.
+    #[must_use]
+    pub fn damaged(&self) -> u64 {
+        self.damaged + self.lanes.iter().map(Lane::misfits).sum::<u64>()
+    }
+
+    /// One round: hears, takes, sends.
+    ///
+    /// # Errors
+    /// Its places are another host's now, or something is broken that does not mend.
+    pub fn turn(&mut self, counts: &HostCounts) -> anyhow::Result<Turn> {
+        let now = Instant::now();
+        self.stay_in_touch(now)?;
+        let course = self.hear(now)?;
+        let sent = self.send(now)?;
+        self.take_policy()?;
+        if now.duration_since(self.acknowledged) >= ACKNOWLEDGE_INTERVAL {
+            self.acknowledged = now;
+            self.acknowledge()?;
+        }
+        if now.duration_since(self.maintained) >= MAINTENANCE_INTERVAL {
+            self.maintained = now;
+            self.end.segments.maintain()?;
+            self.end.parameters.maintain()?;
+            self.end.acknowledgements.maintain()?;
+        }
+        if self.tell_now || now.duration_since(self.told) >= STATUS_INTERVAL {
+            (self.told, self.tell_now) = (now, false);
+            self.tell(counts, false)?;
+        }
+        Ok(match course {
+            Course::Complete => Turn::Complete,
+            _ if sent => Turn::Worked,
+            _ => Turn::Idle,
+        })
+    }
+
+    /// Says that the host leaves.
+    ///
+    /// # Errors
+    /// The session is closed.
+    pub fn leave(&mut self, counts: &HostCounts) -> anyhow::Result<()> {
+        self.tell(counts, true)
+    }
+
+    /// Asks anew when the gateway is silent: it may be another, which knows nothing of this host.
+    fn stay_in_touch(&mut self, now: Instant) -> anyhow::Result<()> {
+        self.doubt |= self.seat.as_ref().map_or(Ok(false), Seat::is_in_doubt)?;
+        let silent = now.duration_since(self.heard) >= SILENCE;
+        let silent = self.seat.is_none() || self.doubt || silent;
+        let due = self.asked.is_none_or(|asked| now.duration_since(asked) >= ASK_AGAIN);
+        if !silent || !due {
+            return Ok(());
+        }
+        let asked = ask(&self.link, &self.asking, Some(self.given))?;
+        self.asked = Some(Instant::now());
+        match asked {
+            Asked::Welcome(welcome) => {
+                ensure!(
+                    welcome.held == self.given,
+                    "expected the places {:?} of its workers, got {:?}: start the bridge again",
+                    self.given,
+                    welcome.held
+                );
+                self.seat = Some(Seat::take(&self.link, &welcome)?);
+                self.lanes.iter_mut().for_each(Lane::begin_anew);
+                self.heard = Instant::now();
+                // Its first words say that it listens.
+                (self.away, self.doubt, self.tell_now) = (None, false, true);
+            }
+            Asked::Later(reason) => {
+                let since = self.away.as_ref().map_or(now, |(since, _)| *since);
+                self.away = Some((since, reason));
+            }
+            Asked::Refused(reason) => bail!("the learner's host refuses: {reason}"),
+        }
+        Ok(())
+    }
+
+    fn hear(&mut self, now: Instant) -> anyhow::Result<Course> {
+        let Some(seat) = &self.seat else { return Ok(Course::On) };
+        let mut course = Course::On;
+        while let Some(message) = seat.hearings.next()? {
+            let (said, hearings) = match wire::read_hearings(&message.bytes()) {
+                Ok(read) if read.1.len() == self.lanes.len() => read,
+                _ => {
+                    self.damaged += 1;
+                    continue;
+                }
+            };
+            self.heard = now;
+            self.away = None;
+            course = said;
+            let under_way = self.segment_bytes * self.under_way();
+            let mut segments = 0;
+            for (lane, hearing) in self.lanes.iter_mut().zip(&hearings) {
+                let acked = lane.hear(hearing, now);
+                segments += acked.segments;
+                if let Some(delay_s) = acked.delay_s {
+                    self.window.time(delay_s, now.duration_since(self.started).as_secs_f64());
+                }
+            }
+            if segments > 0 {
+                self.acked += segments;
+                self.window.acknowledged(segments * self.segment_bytes, under_way);
+            }
+        }
+        if course == Course::Stopped {
+            let since = self.away.as_ref().map_or(now, |(since, _)| *since);
+            self.away = Some((since, "the run was stopped; it may be resumed".to_owned()));
+        }
+        Ok(course)
+    }
+
+    /// Takes segments from the workers in turn as long as there is room, and sends them.
+    fn send(&mut self, now: Instant) -> anyhow::Result<bool> {
+        let Some(seat) = &self.seat else { return Ok(false) };
+        let window = self.window.bytes() / self.segment_bytes;
+        let mut room = usize::try_from(window.saturating_sub(self.under_way())).unwrap_or(0);
+        let count = self.lanes.len();
+        let mut sent = false;
+        for turn in 0..count {
+            let worker = (self.next + turn) % count;
+            let lane = &mut self.lanes[worker];
+            lane.send(&mut self.batch, &mut room, now);
+            for _ in 0..TURN_SEGMENTS.min(room) {
+                if !lane.has_room()
+                    || !self.end.segments.try_receive_from(worker, &mut self.buffer)?
+                {
+                    break;
+                }
+                lane.take(&self.buffer);
+                lane.send(&mut self.batch, &mut room, now);
+            }
+            if self.batch.bytes() >= BATCH_BYTES {
+                seat.segments.send(self.batch.take())?;
+                sent = true;
+            }
+        }
+        self.next = (self.next + 1) % count.max(1);
+        if !self.batch.is_empty() {
+            seat.segments.send(self.batch.take())?;
+            sent = true;
+        }
+        Ok(sent)
+    }
+
+    fn take_policy(&mut self) -> anyhow::Result<()> {
+        let Some(seat) = &self.seat else { return Ok(()) };
+        let mut newest = None;
+        while let Some(message) = seat.policies.next()? {
+            newest = Some(message);
+        }
+        let Some(message) = newest else { return Ok(()) };
+        let snapshot = match wire::read_snapshot(&message.bytes()) {
+            Ok(snapshot) if snapshot.architecture_hash == self.architecture_hash => snapshot,
+            _ => {
+                self.damaged += 1;
+                return Ok(());
+            }
+        };
+        if snapshot.version > self.version {
+            self.end.parameters.publish(&snapshot)?;
+            (self.version, self.env_steps) = (snapshot.version, snapshot.env_steps);
+        }
+        // The gateway sends the next when it knows that this one has come.
+        self.tell_now = true;
+        Ok(())
+    }
+
+    fn acknowledge(&mut self) -> anyhow::Result<()> {
+        self.marks.clear();
+        self.marks.extend(self.lanes.iter().map(Lane::mark));
+        Ok(self.end.acknowledgements.acknowledge(&self.marks)?)
+    }
+
+    fn tell(&mut self, counts: &HostCounts, leaves: bool) -> anyhow::Result<()> {
+        let Some(seat) = &self.seat else { return Ok(()) };
+        // In the order of the segments, or it would seem that some are missing.
+        self.lanes.iter().for_each(|lane| lane.say_how_far(&mut self.batch));
+        if !self.batch.is_empty() {
+            seat.segments.send(self.batch.take())?;
+        }
+        let HostCounts { sent, env_failures, workers } = *counts;
+        let policy_version = self.version;
+        let status = HostStatus { policy_version, sent, env_failures, workers, leaves };
+        seat.status.send(serde_json::to_vec(&status).context("cannot write a status")?)
+    }
+}

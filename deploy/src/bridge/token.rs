@@ -1,0 +1,95 @@
+//! The run's secret, which other hosts must know: a file that only its owner can read.
+
+use std::fs::OpenOptions;
+use std::io::Write;
+use std::os::unix::fs::{MetadataExt, OpenOptionsExt};
+use std::path::Path;
+
+use anyhow::Context;
+
+use crate::failure::wrong_use;
+use crate::run_directory::random_u64;
+
+/// Shorter ones could be guessed.
+const CHARACTERS_MIN: usize = 16;
+const CHARACTERS_MAX: usize = 1_024;
+/// Bits that nobody but the owner may have.
+const OTHERS: u32 = 0o077;
+
+/// Reads a run's secret; makes it where there is none.
+///
+/// # Errors
+/// The file can be read by others, is no secret, or cannot be made.
+pub fn ensure(path: &Path) -> anyhow::Result<String> {
+    if !path.exists() {
+        let mut random = String::new();
+        for _ in 0..4 {
+            random += &format!("{:016x}", random_u64()?);
+        }
+        let failed = || format!("cannot make {}", path.display());
+        let mut options = OpenOptions::new();
+        let file = options.write(true).create_new(true).mode(0o600).open(path);
+        file.and_then(|mut file| writeln!(file, "{random}")).with_context(failed)?;
+    }
+    read(path)
+}
+
+/// Reads a run's secret.
+///
+/// # Errors
+/// Wrong use: there is none, others can read it, or it is too short or long to be one.
+pub fn read(path: &Path) -> anyhow::Result<String> {
+    let shown = path.display();
+    let metadata = std::fs::metadata(path)
+        .map_err(|error| wrong_use(format!("no token in {shown}: {error}; {WHERE}")))?;
+    if metadata.mode() & OTHERS != 0 {
+        let mode = metadata.mode() & 0o777;
+        return Err(wrong_use(format!(
+            "token {shown} can be read by others: expected mode 0600, got {mode:04o}; chmod 600 it"
+        )));
+    }
+    let text = std::fs::read_to_string(path).with_context(|| format!("cannot read {shown}"))?;
+    let token = text.trim();
+    if !(CHARACTERS_MIN..=CHARACTERS_MAX).contains(&token.len()) {
+        return Err(wrong_use(format!(
+            "token {shown}: expected {CHARACTERS_MIN} to {CHARACTERS_MAX} characters, got {}; \
+             {WHERE}",
+            token.len()
+        )));
+    }
+    Ok(token.to_owned())
+}
+
+const WHERE: &str = "copy bridge.token of the run's directory from the learner's host";
+
+/// Whether two secrets are equal, in a time that does not tell where they differ.
+#[must_use]
+pub fn equal(one: &str, other: &str) -> bool {
+    let pairs = one.bytes().zip(other.bytes());
+    let differ = pairs.fold(0, |bits, (one, other)| bits | (one ^ other));
+    one.len() == other.len() && std::hint::black_box(differ) == 0
+}
+
+#[cfg(test)]
+mod tests {
+    use std::os::unix::fs::PermissionsExt;
+
+    use super::*;
+
+    #[test]
+    fn a_secret_is_made_once_and_read_by_its_owner_alone() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("bridge.token");
+        let token = ensure(&path).unwrap();
+        assert_eq!(token.len(), 64);
+        assert_eq!(ensure(&path).unwrap(), token);
+        assert!(equal(&token, &read(&path).unwrap()));
+        assert!(!equal(&token, &token[1..]) && !equal(&token, &token.replace(&token[..1], "x")));
+        std::fs::set_permissions(&path, PermissionsExt::from_mode(0o640)).unwrap();
+        assert!(read(&path).unwrap_err().to_string().contains("got 0640"));
+        std::fs::set_permissions(&path, PermissionsExt::from_mode(0o600)).unwrap();
+        std::fs::write(&path, "short\n").unwrap();
+        assert!(read(&path).unwrap_err().to_string().contains("got 5"));
+        assert!(read(&folder.path().join("none")).is_err());
+    }
+}

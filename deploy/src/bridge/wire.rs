@@ -1,0 +1,451 @@
+//! What relay and gateway say to each other, as bytes.
+//!
+//! Segments go as they lie in shared memory, header and block, in *stretches*: consecutive
+//! segments of one worker. The head tells another layout, another byte order or damage; a block's
+//! own checksum is the learner's to check, as with any worker.
+//!
+//! What is small and rare (joining, what a host tells of itself) is JSON.
+
+use bytemuck::{Pod, Zeroable};
+use dmprl_shared::parameters::ParameterSnapshot;
+use dmprl_shared::segment::{Segment, SegmentHeader};
+use dmprl_shared::spec::EnvSpec;
+use dmprl_shared::transport::delivery::{Mark, Sent};
+use serde::{Deserialize, Serialize};
+use thiserror::Error;
+
+use crate::control::{Greeting, WorkersNow};
+
+/// First four bytes of every message; another byte order reads another number.
+const MAGIC: u32 = 0x4442_524d;
+const HEADER_BYTES: usize = size_of::<SegmentHeader>();
+
+/// Why a message is not read.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Error)]
+pub enum WireError {
+    /// It is no message of ours.
+    #[error("expected a message of this protocol, got other bytes")]
+    Foreign,
+    /// Its length is not what it says.
+    #[error("expected {expected} bytes, got {got}")]
+    Length {
+        /// By what the message says.
+        expected: usize,
+        /// What came.
+        got: usize,
+    },
+    /// Its checksum differs.
+    #[error("checksum {got:#010x}, expected {expected:#010x}")]
+    Checksum {
+        /// What the message says.
+        expected: u32,
+        /// What its bytes have.
+        got: u32,
+    },
+}
+
+#[derive(Debug, Clone, Copy, Pod, Zeroable)]
+#[repr(C)]
+struct Head {
+    magic: u32,
+    /// Stretches, or workers.
+    count: u32,
+    /// CRC-32 of what follows, blocks of segments aside.
+    checksum: u32,
+    /// Of a host to its learner 0; the other way [`Course`].
+    course: u32,
+}
+
+/// Consecutive segments of one worker; none: it only says how far the worker is.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Pod, Zeroable)]
+#[repr(C)]
+pub struct Stretch {
+    /// The oldest that the host keeps: all before it are acknowledged.
+    pub first: u64,
+    /// Sequence number of the first of these, or of the one that will be sent next.
+    pub next: u64,
+    /// Which worker of the run.
+    pub worker: u32,
+    /// Which start of it.
+    pub incarnation: u32,
+    /// Counts how often the worker's segments were sent anew.
+    pub attempt: u32,
+    /// Segments that follow.
+    pub count: u32,
+}
+
+/// What a gateway has heard of one worker, and what the learner has acknowledged.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Pod, Zeroable)]
+#[repr(C)]
+pub struct Hearing {
+    /// Acknowledged by the learner up to here,
+    pub sequence: u64,
+    /// of this start of the worker.
+    pub incarnation: u32,
+    /// An attempt in which something was missing: the host sends what it keeps anew. 0: none.
+    pub refused: u32,
+}
+
+impl Hearing {
+    /// The learner's mark.
+    #[must_use]
+    pub fn mark(&self) -> Mark {
+        Mark { incarnation: self.incarnation, sequence: self.sequence }
+    }
+}
+
+/// Where a run is on its way, for the hosts.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Course {
+    /// It goes on.
+    On,
+    /// It has come to its end.
+    Complete,
+    /// It was stopped, and may be resumed.
+    Stopped,
+}
+
+impl Course {
+    fn of(number: u32) -> Self {
+        match number {
+            1 => Self::Complete,
+            2 => Self::Stopped,
+            _ => Self::On,
+        }
+    }
+
+    fn number(self) -> u32 {
+        match self {
+            Self::On => 0,
+            Self::Complete => 1,
+            Self::Stopped => 2,
+        }
+    }
+}
+
+/// A message of segments that is being written.
+#[derive(Debug, Default)]
+pub struct Batch {
+    stretches: Vec<Stretch>,
+    body: Vec<u8>,
+    headers: crc32fast::Hasher,
+}
+
+impl Batch {
+    /// Begins a stretch; its segments follow.
+    pub fn begin(&mut self, stretch: Stretch) {
+        self.stretches.push(Stretch { count: 0, ..stretch });
+    }
+
+    /// Adds a segment to the stretch begun last.
+    ///
+    /// # Panics
+    /// If none has begun.
+    pub fn add(&mut self, header: &SegmentHeader, block: &[f32]) {
+        let stretch = self.stretches.last_mut();
+        stretch.expect("a segment belongs to a stretch").count += 1;
+        self.headers.update(bytemuck::bytes_of(header));
+        self.body.extend_from_slice(bytemuck::bytes_of(header));
+        self.body.extend_from_slice(bytemuck::cast_slice(block));
+    }
+
+    /// Bytes of segments in it.
+    #[must_use]
+    pub fn bytes(&self) -> usize {
+        self.body.len()
+    }
+
+    /// Whether nothing has been begun.
+    #[must_use]
+    pub fn is_empty(&self) -> bool {
+        self.stretches.is_empty()
+    }
+
+    /// The message; the batch is empty afterwards.
+    pub fn take(&mut self) -> Vec<u8> {
+        let mut hasher = std::mem::take(&mut self.headers);
+        hasher.update(bytemuck::cast_slice(&self.stretches));
+        let count = u32::try_from(self.stretches.len()).unwrap_or(u32::MAX);
+        let head = Head { magic: MAGIC, count, checksum: hasher.finalize(), course: 0 };
+        let table = size_of_val(self.stretches.as_slice());
+        let mut message = Vec::with_capacity(size_of::<Head>() + table + self.body.len());
+        message.extend_from_slice(bytemuck::bytes_of(&head));
+        message.extend_from_slice(bytemuck::cast_slice(&self.stretches));
+        message.extend_from_slice(&self.body);
+        self.stretches.clear();
+        self.body.clear();
+        message
+    }
+}
+
+fn head(message: &[u8]) -> Result<(Head, &[u8]), WireError> {
+    let (head, rest) = message.split_at_checked(size_of::<Head>()).ok_or(WireError::Foreign)?;
+    let head: Head = bytemuck::pod_read_unaligned(head);
+    if head.magic != MAGIC {
+        return Err(WireError::Foreign);
+    }
+    Ok((head, rest))
+}
+
+fn check(expected: u32, hasher: crc32fast::Hasher) -> Result<(), WireError> {
+    let got = hasher.finalize();
+    if got == expected { Ok(()) } else { Err(WireError::Checksum { expected, got }) }
+}
+
+/// Reads a message of segments, each of which has `block_len` numbers: `begin` hears of each
+/// stretch, `segment` of each of its segments, in `buffer`. Nothing is said before all of it is
+/// known to be sound.
+///
+/// # Errors
+/// It is none, or damaged.
+pub fn read_batch(
+    message: &[u8],
+    buffer: &mut Segment,
+    mut take: impl FnMut(&Stretch, Option<&Segment>),
+) -> Result<(), WireError> {
+    let (head, rest) = head(message)?;
+    let length = |expected: usize| WireError::Length { expected, got: message.len() };
+    let table = (head.count as usize).saturating_mul(size_of::<Stretch>());
+    let (table, body) = rest.split_at_checked(table).ok_or_else(|| length(table))?;
+    let stretches =
+        table.chunks_exact(size_of::<Stretch>()).map(bytemuck::pod_read_unaligned::<Stretch>);
+    let each = HEADER_BYTES + size_of_val(buffer.block.as_slice());
+    let segments: u64 = stretches.clone().map(|stretch| u64::from(stretch.count)).sum();
+    let expected = usize::try_from(segments).unwrap_or(usize::MAX).saturating_mul(each);
+    if expected != body.len() {
+        let around = message.len() - body.len();
+        return Err(length(expected.saturating_add(around)));
+    }
+    let mut hasher = crc32fast::Hasher::new();
+    body.chunks_exact(each).for_each(|segment| hasher.update(&segment[..HEADER_BYTES]));
+    hasher.update(table);
+    check(head.checksum, hasher)?;
+    let mut segments = body.chunks_exact(each);
+    for stretch in stretches {
+        take(&stretch, None);
+        for bytes in segments.by_ref().take(stretch.count as usize) {
+            let (header, block) = bytes.split_at(HEADER_BYTES);
+            buffer.header = bytemuck::pod_read_unaligned(header);
+            bytemuck::cast_slice_mut(&mut buffer.block).copy_from_slice(block);
+            take(&stretch, Some(buffer));
+        }
+    }
+    Ok(())
+}
+
+/// What a gateway tells a host of its workers.
+#[must_use]
+pub fn write_hearings(course: Course, hearings: &[Hearing]) -> Vec<u8> {
+    let body: &[u8] = bytemuck::cast_slice(hearings);
+    let count = u32::try_from(hearings.len()).unwrap_or(u32::MAX);
+    let (checksum, course) = (crc32fast::hash(body), course.number());
+    let head = Head { magic: MAGIC, count, checksum, course };
+    [bytemuck::bytes_of(&head), body].concat()
+}
+
+/// Reads it.
+///
+/// # Errors
+/// It is none, or damaged.
+pub fn read_hearings(message: &[u8]) -> Result<(Course, Vec<Hearing>), WireError> {
+    let (head, body) = head(message)?;
+    let expected = (head.count as usize).saturating_mul(size_of::<Hearing>());
+    if expected != body.len() {
+        let expected = expected.saturating_add(size_of::<Head>());
+        return Err(WireError::Length { expected, got: message.len() });
+    }
+    let mut hasher = crc32fast::Hasher::new();
+    hasher.update(body);
+    check(head.checksum, hasher)?;
+    let hearings = body.chunks_exact(size_of::<Hearing>()).map(bytemuck::pod_read_unaligned);
+    Ok((Course::of(head.course), hearings.collect()))
+}
+
+/// A policy snapshot.
+#[must_use]
+pub fn write_snapshot(snapshot: &ParameterSnapshot) -> Vec<u8> {
+    let values: &[u8] = bytemuck::cast_slice(&snapshot.values);
+    let count = u32::try_from(snapshot.values.len()).unwrap_or(u32::MAX);
+    let head = Head { magic: MAGIC, count, checksum: snapshot.checksum(), course: 0 };
+    let words = [snapshot.version, snapshot.env_steps, snapshot.architecture_hash];
+    [bytemuck::bytes_of(&head), bytemuck::cast_slice(&words), values].concat()
+}
+
+/// Reads a policy snapshot.
+///
+/// # Errors
+/// It is none, or damaged.
+pub fn read_snapshot(message: &[u8]) -> Result<ParameterSnapshot, WireError> {
+    const WORDS: usize = 3 * size_of::<u64>();
+    let (head, rest) = head(message)?;
+    let expected = (head.count as usize).saturating_mul(size_of::<f32>()).saturating_add(WORDS);
+    if expected != rest.len() {
+        let expected = expected.saturating_add(size_of::<Head>());
+        return Err(WireError::Length { expected, got: message.len() });
+    }
+    let (words, values) = rest.split_at(WORDS);
+    let [version, env_steps, architecture_hash] = bytemuck::pod_read_unaligned(words);
+    let values = bytemuck::pod_collect_to_vec(values);
+    let snapshot = ParameterSnapshot { version, env_steps, architecture_hash, values };
+    let (expected, got) = (head.checksum, snapshot.checksum());
+    if got != expected {
+        return Err(WireError::Checksum { expected, got });
+    }
+    Ok(snapshot)
+}
+
+/// A host asks to take part.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct HostRequest {
+    /// Which program asks.
+    pub speaks: Greeting,
+    /// The run's secret.
+    pub token: String,
+    /// Tells this start of `dmprl bridge` from every other.
+    pub host: u64,
+    /// What people call it.
+    pub name: String,
+    /// Workers that it brings.
+    pub workers: u32,
+    /// What it was given before, when it comes back.
+    pub held: Option<Held>,
+}
+
+/// The places that a host has.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Held {
+    /// Which worker of the run its first is.
+    pub first: u32,
+    /// Its workers' incarnations are counted as in this session of the run.
+    pub session: u32,
+}
+
+/// What a host that asked is answered.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case", deny_unknown_fields)]
+pub enum HostAnswer {
+    /// It takes part.
+    Welcome(Box<HostWelcome>),
+    /// It does not.
+    Refused {
+        /// Why, and what can be done.
+        reason: String,
+        /// Whether asking again may help.
+        later: bool,
+    },
+}
+
+/// What a host that takes part needs to know.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct HostWelcome {
+    /// Part of the names under which host and gateway speak from now on; nobody else knows it.
+    pub seat: u64,
+    /// Which gateway says so: its successor knows nothing of the seat.
+    pub gateway: u64,
+    /// Which of the run's workers are its.
+    pub held: Held,
+    /// The run's number, as in its manifest.
+    pub run_id: String,
+    /// The run's configuration, as in its `config.toml`.
+    pub config: String,
+    /// The run's environment.
+    pub spec: EnvSpec,
+}
+
+/// What a host tells of itself, a few times a second.
+#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct HostStatus {
+    /// The policy that it has.
+    pub policy_version: u64,
+    /// What its workers did since the host began.
+    pub sent: Sent,
+    /// Failures of environments since then.
+    pub env_failures: u64,
+    /// Its workers.
+    pub workers: WorkersNow,
+    /// Whether it leaves.
+    pub leaves: bool,
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn segment(sequence: u64) -> Segment {
+        let header = SegmentHeader { sequence, worker_id: 3, ..SegmentHeader::default() };
+        Segment { header, block: vec![sequence as f32, 0.5, -1.0] }
+    }
+
+    fn batch() -> Vec<u8> {
+        let mut batch = Batch::default();
+        batch.begin(Stretch { worker: 2, first: 7, next: 9, ..Stretch::default() });
+        batch.begin(Stretch { worker: 3, first: 1, next: 4, attempt: 5, ..Stretch::default() });
+        [4, 5].map(segment).iter().for_each(|segment| batch.add(&segment.header, &segment.block));
+        let message = batch.take();
+        assert!(batch.is_empty());
+        message
+    }
+
+    fn read(message: &[u8]) -> Result<Vec<(Stretch, Option<Segment>)>, WireError> {
+        let mut buffer = segment(0);
+        let mut read = Vec::new();
+        read_batch(message, &mut buffer, |stretch, segment| {
+            read.push((*stretch, segment.cloned()));
+        })?;
+        Ok(read)
+    }
+
+    #[test]
+    fn segments_come_out_as_they_went_in_wherever_the_message_lies() {
+        let message = batch();
+        let read_well = read(&message).unwrap();
+        let counts: Vec<_> = read_well.iter().map(|(stretch, _)| stretch.count).collect();
+        assert_eq!(counts, [0, 2, 2, 2]);
+        assert_eq!(read_well[2].1, Some(segment(4)));
+        assert_eq!(read_well[3].1, Some(segment(5)));
+        let shifted = [&[0][..], &message].concat();
+        assert_eq!(read(&shifted[1..]).unwrap(), read_well);
+    }
+
+    #[test]
+    fn what_is_cut_damaged_or_foreign_is_refused_before_anything_is_taken() {
+        let message = batch();
+        for len in 0..message.len() {
+            assert!(read(&message[..len]).is_err(), "cut at {len}");
+        }
+        // A block's own damage is found by the learner: its last 12 bytes.
+        for at in 0..message.len() - 12 {
+            let mut damaged = message.clone();
+            damaged[at] ^= 1;
+            let block = (16 + 64 + 80..16 + 64 + 92).contains(&at);
+            let unused = (12..16).contains(&at);
+            assert_eq!(read(&damaged).is_err(), !block && !unused, "byte {at}");
+        }
+        assert_eq!(read(b"GET / HTTP/1.1\r\nHost: x\r\n\r\n"), Err(WireError::Foreign));
+    }
+
+    #[test]
+    fn hearings_and_snapshots_come_out_as_they_went_in_or_not_at_all() {
+        let hearings = [Hearing { sequence: 9, incarnation: 2, refused: 1 }, Hearing::default()];
+        let message = write_hearings(Course::Stopped, &hearings);
+        assert_eq!(read_hearings(&message), Ok((Course::Stopped, hearings.to_vec())));
+        let snapshot = ParameterSnapshot {
+            version: 4,
+            env_steps: 100,
+            architecture_hash: 7,
+            values: vec![0.25, -3.0],
+        };
+        let written = write_snapshot(&snapshot);
+        assert_eq!(read_snapshot(&written), Ok(snapshot));
+        for message in [&message, &written] {
+            for len in 0..message.len() {
+                assert!(read_hearings(&message[..len]).is_err());
+                assert!(read_snapshot(&message[..len]).is_err());
+            }
+        }
+    }
+}

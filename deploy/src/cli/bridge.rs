@@ -1,0 +1,227 @@
+//! `dmprl bridge`: this host's workers for a run whose learner is on another.
+
+use std::path::{Path, PathBuf};
+use std::time::{Duration, Instant};
+
+use anyhow::{Context, bail};
+use clap::Args;
+use dmprl_shared::config::{ExperimentConfig, Limits};
+
+use super::configuration::refuse;
+use super::{cores, prepare_python, this_program};
+use crate::bench::Watch;
+use crate::bridge::relay::{Asked, Asking, ask};
+use crate::bridge::wire::HostWelcome;
+use crate::bridge::{Ends, Link, token};
+use crate::capacity;
+use crate::failure::{Outcome, wrong_use};
+use crate::launch::{self, HostPlan, Upstream};
+use crate::run_directory::{Manifest, RunDirectory, Session, compact_now, random_u64, safe_name};
+use crate::terminal::{ProgressStyle, say};
+
+/// Between two times that a host asks whether it may take part.
+const ASK_AGAIN: Duration = Duration::from_millis(500);
+
+const HELP: &str = "\
+On the learner's host, open the run and give the other hosts its secret, bridge.token of the run's
+directory; the file must be readable by its owner alone:
+  dmprl train reacher --set 'bridge.listen=[\"tcp/0.0.0.0:7447\"]' --run-dir runs/mine
+This host needs the same version of dmprl, and the run's environments. It gets configuration and
+policies from the learner's host, waits for it when it is away, and ends with the run. Ctrl-C lets
+the workers' last segments be handed over, and the others go on; twice: at once. Exit status: 0 the
+run has ended, 130 interrupted, 2 refused, 1 failed or waited longer than --patience.
+
+EXAMPLES
+  dmprl bridge --connect tcp/10.0.0.1:7447 --token-file bridge.token
+  dmprl bridge --connect tcp/10.0.0.1:7447 --token-file bridge.token --workers 16 --name gpu3
+  dmprl bridge --connect tls/learner.lab:7447 --token-file bridge.token --zenoh-config tls.json5";
+
+/// Arguments of `dmprl bridge`.
+#[derive(Debug, Args)]
+#[command(after_help = HELP)]
+pub(super) struct BridgeArgs {
+    /// Zenoh endpoint of the learner's host: tcp/ADDRESS:PORT or tls/ADDRESS:PORT.
+    #[arg(long, value_name = "ENDPOINT")]
+    connect: String,
+    /// File with the run's secret, of mode 0600.
+    #[arg(long, value_name = "FILE")]
+    token_file: PathBuf,
+    /// Workers of this host [default: one a core].
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u16).range(1..=1024))]
+    workers: Option<u16>,
+    /// What the learner's host calls this one [default: the host's name].
+    #[arg(long)]
+    name: Option<String>,
+    /// Where this host's logs go; one that a bridge of the same run has used may be used again
+    /// [default: runs/bridge-NAME-TIME].
+    #[arg(long, value_name = "DIR")]
+    run_dir: Option<PathBuf>,
+    /// Where the environments of your own are on this host; repeatable.
+    #[arg(long, value_name = "DIR")]
+    python_path: Vec<PathBuf>,
+    /// Zenoh's own configuration (JSON5), for certificates.
+    #[arg(long, value_name = "FILE")]
+    zenoh_config: Option<PathBuf>,
+    /// How long the learner's host may be away [min].
+    #[arg(long, value_name = "M", default_value_t = 60,
+          value_parser = clap::value_parser!(u64).range(1..=1_000_000))]
+    patience: u64,
+    /// Lines instead of a progress bar.
+    #[arg(long)]
+    no_progress: bool,
+}
+
+pub(super) fn run(args: &BridgeArgs) -> anyhow::Result<Outcome> {
+    let absolute = |path: &PathBuf| {
+        std::path::absolute(path).with_context(|| format!("cannot resolve {}", path.display()))
+    };
+    let zenoh_file = args.zenoh_config.as_ref().map(absolute).transpose()?;
+    let token_file = absolute(&args.token_file)?;
+    let workers = args.workers.map_or_else(cores, usize::from);
+    let asking = Asking {
+        endpoint: endpoint(&args.connect)?,
+        token: token::read(&token_file)?,
+        host: random_u64()?,
+        name: args.name.clone().unwrap_or_else(host_name),
+        workers: u32::try_from(workers).context("too many workers")?,
+    };
+    let patience = Duration::from_secs(args.patience * 60);
+    let venv = prepare_python()?;
+    let asked = wait_for_welcome(&asking, zenoh_file.as_deref(), patience);
+    let Some(welcome) = asked? else { return Ok(Outcome::Interrupted) };
+    let config = host_config(&welcome, workers, &args.python_path)?;
+    capacity::check(&config, Some(&welcome.spec))?;
+    let run = run_directory(args, &asking.name, &welcome, &config)?;
+    let lock = run.lock(Duration::ZERO)?;
+    let upstream = Upstream {
+        endpoint: asking.endpoint,
+        token_file,
+        host: asking.host,
+        name: asking.name,
+        first: welcome.held.first,
+        zenoh_file,
+        patience_s: patience.as_secs(),
+    };
+    let progress = ProgressStyle::from_flag(args.no_progress);
+    let (program, session) = (this_program()?, welcome.held.session);
+    launch::host(HostPlan { program, run, lock, config, venv, upstream, session, progress })
+}
+
+fn endpoint(text: &str) -> anyhow::Result<String> {
+    let known = text.split_once('/').is_some_and(|(protocol, address)| {
+        ["tcp", "tls"].contains(&protocol) && address.contains(':')
+    });
+    if known {
+        return Ok(text.to_owned());
+    }
+    Err(wrong_use(format!(
+        "--connect {text}: expected tcp/ADDRESS:PORT or tls/ADDRESS:PORT, such as \
+         tcp/10.0.0.1:7447"
+    )))
+}
+
+fn host_name() -> String {
+    let name = rustix::system::uname().nodename().to_string_lossy().into_owned();
+    if name.is_empty() { "host".to_owned() } else { name }
+}
+
+/// Asks until the learner's host takes this one in; none when the user has enough.
+fn wait_for_welcome(
+    asking: &Asking,
+    zenoh_file: Option<&Path>,
+    patience: Duration,
+) -> anyhow::Result<Option<HostWelcome>> {
+    let watch = Watch::start()?;
+    let link = Link::open(Ends::Connect(&asking.endpoint), zenoh_file)?;
+    let (began, mut told) = (Instant::now(), String::new());
+    loop {
+        if watch.check().is_err() {
+            return Ok(None);
+        }
+        match ask(&link, asking, None)? {
+            Asked::Welcome(welcome) => return Ok(Some(*welcome)),
+            Asked::Refused(reason) => {
+                return Err(wrong_use(format!(
+                    "the learner's host at {} refuses: {reason}",
+                    asking.endpoint
+                )));
+            }
+            Asked::Later(reason) if began.elapsed() >= patience => {
+                bail!("waited {} min: {reason}", patience.as_secs() / 60)
+            }
+            Asked::Later(reason) => {
+                if reason != told {
+                    let minutes = patience.as_secs() / 60;
+                    say(&format!("{reason}; waiting, for {minutes} min at most"));
+                    told = reason;
+                }
+            }
+        }
+        std::thread::sleep(ASK_AGAIN);
+    }
+}
+
+/// The run's configuration, as it is on this host.
+fn host_config(
+    welcome: &HostWelcome,
+    workers: usize,
+    python_path: &[PathBuf],
+) -> anyhow::Result<ExperimentConfig> {
+    let mut config: ExperimentConfig =
+        toml::from_str(&welcome.config).context("the learner's host sent no configuration")?;
+    config.actors.workers = workers;
+    config.actors.joined_max = 0;
+    config.bridge.listen.clear();
+    config.demonstrations.files.clear();
+    // What the learner's host keeps takes no memory here.
+    config.replay.capacity_steps = 1_000;
+    config.run.max_minutes = f64::INFINITY;
+    if !python_path.is_empty() {
+        let absolute = |path: &PathBuf| {
+            let path = std::fs::canonicalize(path)
+                .map_err(|error| wrong_use(format!("--python-path {}: {error}", path.display())))?;
+            Ok(path.display().to_string())
+        };
+        config.task.python_path =
+            python_path.iter().map(absolute).collect::<anyhow::Result<_>>()?;
+    }
+    if let Some(gone) = config.task.python_path.iter().find(|path| !Path::new(path).is_dir()) {
+        return Err(wrong_use(format!(
+            "the run's environments are in {gone} on the learner's host, which is not here: say \
+             with --python-path where they are on this host"
+        )));
+    }
+    config.resolve(Limits { cores: cores() }).map_err(refuse)
+}
+
+/// A directory of its own, or that of an earlier bridge of the same run.
+fn run_directory(
+    args: &BridgeArgs,
+    name: &str,
+    welcome: &HostWelcome,
+    config: &ExperimentConfig,
+) -> anyhow::Result<RunDirectory> {
+    let named = format!("bridge-{}-{}", safe_name(name), compact_now());
+    let path = args.run_dir.clone().unwrap_or_else(|| Path::new("runs").join(named));
+    let run = if path.join("manifest.json").is_file() {
+        let run = RunDirectory::open(&path)?;
+        let mut manifest = run.manifest()?;
+        if manifest.run_id != welcome.run_id {
+            return Err(wrong_use(format!(
+                "{} is of run {}, the learner's host trains run {}: choose another --run-dir",
+                path.display(),
+                manifest.run_id,
+                welcome.run_id
+            )));
+        }
+        manifest.sessions.push(Session::now());
+        run.write_manifest(&manifest)?;
+        run.write_config(config)?;
+        run
+    } else {
+        let manifest = Manifest { run_id: welcome.run_id.clone(), ..Manifest::new(None)? };
+        RunDirectory::create(&path, config, &manifest)?
+    };
+    run.write_spec(&welcome.spec)?;
+    Ok(run)
+}

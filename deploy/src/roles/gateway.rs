@@ -1,0 +1,121 @@
+//! The gateway process: the workers of all other hosts, to the learner.
+
+use std::path::{Path, PathBuf};
+use std::time::{Duration, Instant};
+
+use anyhow::Context;
+use dmprl_shared::policy::Policy;
+
+use super::setup::Setup;
+use super::{ControlPipe, GatewayArgs, learner};
+use crate::bridge::gateway::{Gateway, News, RunFacts};
+use crate::bridge::token;
+use crate::bridge::wire::Course;
+use crate::control::Report;
+use crate::run_directory::{RunDirectory, TOKEN_FILE};
+
+/// Sleep of a turn that found nothing to do.
+const IDLE: Duration = Duration::from_micros(300);
+/// Between two reports of the hosts.
+const REPORT_INTERVAL: Duration = Duration::from_millis(500);
+/// A learner that is being replaced can be joined again after as long as a checkpoint takes.
+const JOIN_LIMIT: Duration = Duration::from_secs(60);
+const JOIN_PAUSE: Duration = Duration::from_millis(20);
+/// Hosts are told so long how the run has ended; those that hear it leave.
+const GOODBYE: Duration = Duration::from_secs(3);
+const GOODBYE_INTERVAL: Duration = Duration::from_millis(100);
+/// The first refusals of what nobody should have sent are told, then each doubling.
+const REFUSED_FIRST: u64 = 1;
+
+/// Where a run's secret is.
+pub(crate) fn token_path(run: &RunDirectory, token_file: &str) -> PathBuf {
+    match token_file {
+        "" => run.path().join(TOKEN_FILE),
+        file => PathBuf::from(file),
+    }
+}
+
+/// Passes on what other hosts send until a stop is asked for.
+pub fn run(args: &GatewayArgs, control: &ControlPipe) -> anyhow::Result<()> {
+    let Some(mut gateway) = open(args, control)? else { return Ok(()) };
+    let mut reported: Option<Instant> = None;
+    let mut refused_told = REFUSED_FIRST;
+    while !control.stop_requested() && !control.finish_requested() {
+        let worked = gateway.turn()?;
+        for news in gateway.news() {
+            // A supervisor that is gone is noticed as a stop.
+            let _ = control.send(&match news {
+                News::Told(message) => {
+                    eprintln!("{message}");
+                    Report::Warning { message }
+                }
+                News::Sent(sent) => Report::Sent(sent),
+                News::EnvFailures { count, host } => {
+                    Report::EnvFailures { count, last: format!("on host {host}") }
+                }
+            });
+        }
+        if gateway.refused() >= refused_told {
+            let message = format!("{} messages of nobody, or damaged, refused", gateway.refused());
+            eprintln!("{message}");
+            let _ = control.send(&Report::Warning { message });
+            refused_told = gateway.refused().saturating_mul(2);
+        }
+        if reported.is_none_or(|at| at.elapsed() >= REPORT_INTERVAL) {
+            reported = Some(Instant::now());
+            let _ = control.send(&Report::Hosts(gateway.hosts()));
+        }
+        if !worked {
+            std::thread::sleep(IDLE);
+        }
+    }
+    say_goodbye(&mut gateway, control)
+}
+
+fn open(args: &GatewayArgs, control: &ControlPipe) -> anyhow::Result<Option<Gateway>> {
+    let setup = Setup::read(&args.run)?;
+    let spec = setup.run.spec()?.context("the run has no spec.json; a worker writes it first")?;
+    let policy = Policy::new(&setup.config, &spec)?;
+    let (config, bridge) = (&setup.config, &setup.config.bridge);
+    let facts = RunFacts {
+        run_id: setup.run.manifest()?.run_id,
+        config: toml::to_string(config).context("cannot write the configuration")?,
+        spec,
+        token: token::ensure(&token_path(&setup.run, &bridge.token_file))?,
+    };
+    let zenoh_file =
+        Some(Path::new(&bridge.zenoh_file)).filter(|path| !path.as_os_str().is_empty());
+    let places = (config.actors.places(), args.session, config.delivery.unacknowledged_segments);
+    let deadline = Instant::now() + JOIN_LIMIT;
+    loop {
+        let plan = learner::plan(&setup, &policy);
+        let at = (bridge.listen.as_slice(), zenoh_file);
+        match Gateway::open(at, (&args.domain, plan), places, facts.clone()) {
+            Ok(gateway) => return Ok(Some(gateway)),
+            // Only the learner comes back by itself.
+            Err(error) if !is_transport(&error) || Instant::now() >= deadline => return Err(error),
+            Err(_) if control.stop_requested() => return Ok(None),
+            Err(_) => std::thread::sleep(JOIN_PAUSE),
+        }
+    }
+}
+
+fn is_transport(error: &anyhow::Error) -> bool {
+    error.is::<dmprl_shared::transport::TransportError>()
+}
+
+/// Tells the hosts whether the run is complete or only stops.
+fn say_goodbye(gateway: &mut Gateway, control: &ControlPipe) -> anyhow::Result<()> {
+    let course = if control.finish_requested() { Course::Complete } else { Course::Stopped };
+    let began = Instant::now();
+    loop {
+        gateway.tell(course)?;
+        gateway.watch()?;
+        // A run that was stopped has hosts that wait for it.
+        let heard = course == Course::Stopped && began.elapsed() >= GOODBYE_INTERVAL * 2;
+        if heard || gateway.is_alone() || began.elapsed() >= GOODBYE || control.orphaned() {
+            return Ok(());
+        }
+        std::thread::sleep(GOODBYE_INTERVAL);
+    }
+}

@@ -1,0 +1,178 @@
+//! The relay process: the learner, to the workers of a host that has none.
+
+use std::time::{Duration, Instant};
+
+use anyhow::{Context, bail};
+use dmprl_shared::policy::Policy;
+
+use super::setup::Setup;
+use super::{ControlPipe, RelayArgs, learner};
+use crate::bridge::relay::{Asking, HostCounts, Relay, Turn};
+use crate::bridge::token;
+use crate::bridge::wire::Held;
+use crate::control::{Progress, Report};
+
+/// Sleep of a turn that found nothing to do.
+const IDLE: Duration = Duration::from_micros(300);
+const REPORT_INTERVAL: Duration = Duration::from_millis(500);
+/// The learner's host is said to be away when it has not answered for so long.
+const AWAY_TOLD: Duration = Duration::from_secs(2);
+/// A host that leaves waits so long for its segments to be acknowledged.
+const HAND_OVER: Duration = Duration::from_secs(5);
+
+/// Passes on what the host's workers send, and the learner's policies, until the run is complete or
+/// a stop is asked for.
+pub fn run(args: &RelayArgs, control: &ControlPipe) -> anyhow::Result<()> {
+    let mut relay = start(args)?;
+    let mut teller = Teller::new(args);
+    loop {
+        let turn = relay.turn(&counts(control))?;
+        teller.tell(&relay, control)?;
+        if turn == Turn::Complete {
+            teller.ready(&relay, control);
+            return control.send(&Report::Finished);
+        }
+        if control.stop_requested() {
+            return leave(&mut relay, control);
+        }
+        if turn == Turn::Idle {
+            std::thread::sleep(IDLE);
+        }
+    }
+}
+
+fn start(args: &RelayArgs) -> anyhow::Result<Relay> {
+    let setup = Setup::read(&args.run)?;
+    let spec = setup.run.spec()?.context("the run has no spec.json: start the bridge again")?;
+    let policy = Policy::new(&setup.config, &spec)?;
+    let plan = learner::plan(&setup, &policy);
+    let asking = Asking {
+        endpoint: args.connect.clone(),
+        token: token::read(&args.token_file)?,
+        host: args.host,
+        name: args.name.clone(),
+        workers: u32::try_from(setup.config.actors.workers).context("too many workers")?,
+    };
+    let held = Held { first: args.first, session: args.session };
+    let zenoh_file = args.zenoh_config.as_deref();
+    Relay::start(asking, (held, zenoh_file), (&args.domain, &plan), &setup.config)
+}
+
+fn counts(control: &ControlPipe) -> HostCounts {
+    let (sent, env_failures) = (control.sent(), control.env_failures());
+    HostCounts { sent, env_failures, workers: control.workers() }
+}
+
+/// Hands over what the workers have sent, as far as the learner's host takes it.
+fn leave(relay: &mut Relay, control: &ControlPipe) -> anyhow::Result<()> {
+    let deadline = Instant::now() + HAND_OVER;
+    while relay.away().is_none() && !control.orphaned() && Instant::now() < deadline {
+        let turn = relay.turn(&counts(control))?;
+        if turn == Turn::Complete || turn == Turn::Idle && relay.under_way() == 0 {
+            break;
+        }
+        if turn == Turn::Idle {
+            std::thread::sleep(IDLE);
+        }
+    }
+    relay.leave(&counts(control))
+}
+
+/// What the host's supervisor is told.
+struct Teller {
+    patience: Duration,
+    endpoint: String,
+    ready: bool,
+    first: bool,
+    away: Option<(Instant, String)>,
+    damaged: u64,
+    reported: Instant,
+    acked: u64,
+}
+
+impl Teller {
+    fn new(args: &RelayArgs) -> Self {
+        Self {
+            patience: Duration::from_secs(args.patience),
+            endpoint: args.connect.clone(),
+            ready: false,
+            first: false,
+            away: None,
+            damaged: 0,
+            reported: Instant::now(),
+            acked: 0,
+        }
+    }
+
+    fn ready(&mut self, relay: &Relay, control: &ControlPipe) {
+        // Workers that attach wait for a policy, and not for ever.
+        if !self.ready && relay.version() > 0 {
+            self.ready = true;
+            // A supervisor that is gone is noticed as a stop, here and below.
+            let _ = control.send(&Report::LearnerReady);
+        }
+    }
+
+    fn tell(&mut self, relay: &Relay, control: &ControlPipe) -> anyhow::Result<()> {
+        self.ready(relay, control);
+        if !self.first && relay.acked() > 0 {
+            self.first = true;
+            let _ = control.send(&Report::FirstSegment);
+        }
+        self.tell_of_absence(relay, control)?;
+        if relay.damaged() > self.damaged {
+            self.damaged = relay.damaged();
+            warn(control, format!("{} messages or segments are no such, refused", self.damaged));
+        }
+        let since = self.reported.elapsed();
+        if since >= REPORT_INTERVAL {
+            self.reported = Instant::now();
+            let segments = relay.acked() - std::mem::replace(&mut self.acked, relay.acked());
+            let _ = control.send(&Report::Progress(Progress {
+                env_steps: relay.env_steps(),
+                segments: relay.acked(),
+                env_steps_per_s: segments as f64 * relay.segment_steps() as f64
+                    / since.as_secs_f64(),
+                queued_segments: control.workers().queued_segments,
+                env_failures: control.env_failures(),
+                restarts: control.workers().restarts,
+                ..Progress::default()
+            }));
+        }
+        Ok(())
+    }
+
+    /// Says when the learner's host is away, why, and when it is back; gives up after a while.
+    fn tell_of_absence(&mut self, relay: &Relay, control: &ControlPipe) -> anyhow::Result<()> {
+        match (relay.away(), &self.away) {
+            (Some((since, reason)), told) => {
+                let elapsed = since.elapsed();
+                if elapsed >= self.patience {
+                    bail!(
+                        "waited {} s for the learner's host at {}: {reason}",
+                        elapsed.as_secs(),
+                        self.endpoint
+                    );
+                }
+                let new = told.as_ref().is_none_or(|(_, before)| before != reason);
+                if new && elapsed >= AWAY_TOLD {
+                    let patience = self.patience.as_secs();
+                    warn(control, format!("{reason}; workers wait, for {patience} s at most"));
+                    self.away = Some((*since, reason.clone()));
+                }
+            }
+            (None, Some((since, _))) => {
+                let seconds = since.elapsed().as_secs_f64();
+                warn(control, format!("the learner's host is back after {seconds:.1} s"));
+                self.away = None;
+            }
+            (None, None) => {}
+        }
+        Ok(())
+    }
+}
+
+fn warn(control: &ControlPipe, message: String) {
+    eprintln!("{message}");
+    let _ = control.send(&Report::Warning { message });
+}

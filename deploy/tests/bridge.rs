@@ -1,0 +1,356 @@
+//! Relay and gateway between real shared memory, over real Zenoh on loopback, while each of the
+//! three ends is replaced again and again: everything arrives, once, in order.
+#![allow(clippy::unwrap_used)] // helpers of tests fail as tests do
+
+use std::net::TcpListener;
+use std::path::PathBuf;
+use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
+use std::sync::{Arc, Mutex};
+use std::thread;
+use std::time::{Duration, Instant};
+
+use dmprl::bench::spec_of;
+use dmprl::bridge::gateway::{Gateway, RunFacts};
+use dmprl::bridge::relay::{Asked, Asking, HostCounts, Relay, ask};
+use dmprl::bridge::wire::{Course, Held};
+use dmprl::bridge::{Ends, Link};
+use dmprl_shared::config::{ExperimentConfig, task_defaults};
+use dmprl_shared::parameters::ParameterSnapshot;
+use dmprl_shared::segment::{
+    LAYOUT_VERSION, Segment, SegmentHeader, SegmentLayout, block_checksum,
+};
+use dmprl_shared::transport::delivery::{Acknowledgements, Inbox, Outbox};
+use dmprl_shared::transport::shared_memory::{Domain, LearnerEnd, Plan, attach, serve};
+use dmprl_shared::transport::{ParameterPublisher, ParameterSubscriber, SegmentReceiver};
+
+const PATIENCE: Duration = Duration::from_secs(120);
+/// Between two looks at a condition.
+const POLL: Duration = Duration::from_millis(1);
+const WORKERS: usize = 3;
+const SEGMENTS: u64 = 20_000;
+/// Workers of the learner's own host come first.
+const FIRST: usize = 1;
+const ARCHITECTURE: u64 = 9;
+const LAYOUT: SegmentLayout =
+    SegmentLayout { segment_steps: 5, observation_len: 20, action_len: 4 };
+
+fn plan(worker_count: usize) -> Plan {
+    Plan {
+        run_id: 7,
+        architecture_hash: ARCHITECTURE,
+        layout: LAYOUT,
+        worker_count,
+        queue_segments: 8,
+        parameters_len: 1_000,
+    }
+}
+
+fn config() -> ExperimentConfig {
+    let mut config = ExperimentConfig::default();
+    config.delivery.unacknowledged_segments = 512;
+    config.bridge.under_way_bytes_max = 1 << 20;
+    config
+}
+
+/// An endpoint on loopback that nobody has.
+fn endpoint() -> String {
+    let free = TcpListener::bind("127.0.0.1:0").unwrap();
+    format!("tcp/{}", free.local_addr().unwrap())
+}
+
+fn facts() -> RunFacts {
+    RunFacts {
+        run_id: "0000000000000007".into(),
+        config: String::new(),
+        spec: spec_of(task_defaults("reacher").unwrap()),
+        token: "a secret of some length".into(),
+    }
+}
+
+fn asking(endpoint: &str) -> Asking {
+    let (endpoint, token) = (endpoint.to_owned(), facts().token);
+    Asking { endpoint, token, host: 1, name: "b".into(), workers: WORKERS as u32 }
+}
+
+/// What everybody shares.
+#[derive(Default)]
+struct Stage {
+    over: AtomicBool,
+    settled: AtomicU64,
+    gaps: AtomicU64,
+    refused: AtomicU64,
+    /// Ends that were replaced.
+    replaced: AtomicU64,
+    /// How often each end is to be replaced in all: grows as the test goes on.
+    replacements: [AtomicU64; 3],
+}
+
+impl Stage {
+    fn is_over(&self) -> bool {
+        self.over.load(Ordering::Acquire)
+    }
+
+    /// Whether the end that was begun `times` times is to be replaced now.
+    fn is_replaced(&self, end: usize, times: u64) -> bool {
+        self.replacements[end].load(Ordering::Acquire) >= times
+    }
+
+    fn until(&self, what: &str, condition: impl Fn() -> bool) {
+        let deadline = Instant::now() + PATIENCE;
+        while !condition() {
+            assert!(Instant::now() < deadline, "not within {PATIENCE:?}: {what}");
+            thread::sleep(POLL);
+        }
+    }
+}
+
+/// A learner that remembers what it has settled, as one with a segment log does.
+fn learner(stage: &Stage, domain: PathBuf) {
+    let mut inbox = Inbox::new(FIRST + WORKERS);
+    let mut version = 0;
+    for times in 1.. {
+        let LearnerEnd { mut segments, mut parameters, mut acknowledgements } =
+            serve(&domain, &plan(FIRST + WORKERS)).unwrap();
+        let mut segment = Segment::zeroed(LAYOUT);
+        let mut looked = Instant::now() - PATIENCE;
+        while !stage.is_over() && !stage.is_replaced(0, times) {
+            if !segments.try_receive(&mut segment).unwrap() {
+                thread::sleep(Duration::from_micros(100));
+            } else {
+                assert_eq!(block_checksum(&segment.block), segment.header.checksum);
+                assert_eq!(segment.block[0], segment.header.sequence as f32);
+                match inbox.settle(&segment.header, &segment.block) {
+                    Ok(gap) => {
+                        stage.gaps.fetch_add(gap, Ordering::AcqRel);
+                        stage.settled.fetch_add(1, Ordering::AcqRel);
+                    }
+                    Err(_) => drop(stage.refused.fetch_add(1, Ordering::AcqRel)),
+                }
+            }
+            if looked.elapsed() >= Duration::from_millis(5) {
+                looked = Instant::now();
+                version += 1;
+                let values = vec![version as f32; 1_000];
+                let architecture_hash = ARCHITECTURE;
+                let snapshot =
+                    ParameterSnapshot { version, env_steps: 1, architecture_hash, values };
+                parameters.publish(&snapshot).unwrap();
+                acknowledgements.acknowledge(inbox.acknowledge().unwrap()).unwrap();
+                segments.maintain().unwrap();
+                parameters.maintain().unwrap();
+                acknowledgements.maintain().unwrap();
+            }
+        }
+        if stage.is_over() {
+            return;
+        }
+        stage.replaced.fetch_add(1, Ordering::AcqRel);
+    }
+}
+
+fn gateway(stage: &Stage, domain: PathBuf, endpoint: String) {
+    for times in 1.. {
+        let endpoints = [endpoint.clone()];
+        let open = || {
+            let plan = plan(FIRST + WORKERS);
+            let places = (FIRST, 0, 512);
+            Gateway::open((&endpoints, None), (&domain, plan), places, facts())
+        };
+        let deadline = Instant::now() + PATIENCE;
+        // The learner may just be being replaced.
+        let mut gateway = loop {
+            match open() {
+                Ok(gateway) => break gateway,
+                Err(error) => assert!(Instant::now() < deadline, "{error:#}"),
+            }
+            thread::sleep(Duration::from_millis(5));
+        };
+        while !stage.is_over() && !stage.is_replaced(1, times) {
+            if !gateway.turn().unwrap() {
+                thread::sleep(Duration::from_micros(200));
+            }
+        }
+        if stage.is_over() {
+            gateway.tell(Course::Complete).unwrap();
+            return;
+        }
+        stage.replaced.fetch_add(1, Ordering::AcqRel);
+    }
+}
+
+fn relay(stage: &Stage, domain: PathBuf, endpoint: String) {
+    for times in 1.. {
+        let held = Held { first: FIRST as u32, session: 0 };
+        let at = (domain.as_path(), &plan(WORKERS));
+        let mut relay = Relay::start(asking(&endpoint), (held, None), at, &config()).unwrap();
+        while !stage.is_over() && !stage.is_replaced(2, times) {
+            relay.turn(&HostCounts::default()).unwrap();
+            thread::sleep(Duration::from_micros(100));
+        }
+        assert_eq!(relay.damaged(), 0);
+        if stage.is_over() {
+            return;
+        }
+        stage.replaced.fetch_add(1, Ordering::AcqRel);
+    }
+}
+
+/// A worker that sends as fast as it may, until the learner has acknowledged all of it; returns the
+/// newest policy that it has seen.
+fn worker(index: u32, domain: PathBuf) -> u64 {
+    let deadline = Instant::now() + PATIENCE;
+    let mut end = loop {
+        match attach(&domain, &plan(WORKERS), index as usize) {
+            Ok(end) => break end,
+            Err(error) => assert!(Instant::now() < deadline, "{error}"),
+        }
+        thread::sleep(Duration::from_millis(2));
+    };
+    let mut outbox = Outbox::new(LAYOUT, 512, index, 0);
+    let (mut heard, mut snapshot) = (Acknowledgements::default(), ParameterSnapshot::default());
+    let mut sequence = 0;
+    let mut block = vec![0.0; LAYOUT.block_len()];
+    while sequence < SEGMENTS || !outbox.is_empty() {
+        assert!(Instant::now() < deadline, "worker {index} at {sequence}, kept {}", outbox.len());
+        if sequence < SEGMENTS && outbox.len() < outbox.capacity() {
+            sequence += 1;
+            block[0] = sequence as f32;
+            let header = SegmentHeader {
+                layout_version: LAYOUT_VERSION,
+                sequence,
+                worker_id: index,
+                checksum: block_checksum(&block),
+                ..SegmentHeader::default()
+            };
+            assert!(outbox.put(&header, &block));
+        } else {
+            thread::sleep(Duration::from_micros(200));
+        }
+        outbox.offer(&mut end.segments).unwrap();
+        if end.acknowledgements.newest(&mut heard).unwrap() {
+            outbox.acknowledge(&heard);
+        }
+        end.parameters.newest(&mut snapshot).unwrap();
+    }
+    snapshot.version
+}
+
+#[test]
+fn all_arrives_once_and_in_order_while_learner_gateway_and_relay_are_replaced() {
+    let folder = tempfile::tempdir().unwrap();
+    let domains = ["a", "b"].map(|name| Domain::create(&folder.path().join("p"), name).unwrap());
+    let [here, there] = domains.each_ref().map(|domain| domain.path().to_owned());
+    let endpoint = endpoint();
+    let stage = Arc::new(Stage::default());
+    let spawn = |work: fn(&Stage, PathBuf, String), domain: &PathBuf| {
+        let (stage, domain, endpoint) = (Arc::clone(&stage), domain.clone(), endpoint.clone());
+        thread::spawn(move || work(&stage, domain, endpoint))
+    };
+    let ends = [
+        spawn(|stage, domain, _| learner(stage, domain), &here),
+        spawn(gateway, &here),
+        spawn(relay, &there),
+    ];
+    let workers: Vec<_> = (0..WORKERS as u32)
+        .map(|index| {
+            let there = there.clone();
+            thread::spawn(move || worker(index, there))
+        })
+        .collect();
+    let total = WORKERS as u64 * SEGMENTS;
+    for (round, end) in [2, 1, 0, 1, 0, 2].into_iter().enumerate() {
+        let some = total * (round as u64 + 1) / 8;
+        stage.until("segments", || {
+            ends.iter().any(thread::JoinHandle::is_finished)
+                || stage.settled.load(Ordering::Acquire) >= some
+        });
+        stage.replacements[end].fetch_add(1, Ordering::AcqRel);
+        stage.until("a replacement", || {
+            ends.iter().any(thread::JoinHandle::is_finished)
+                || stage.replaced.load(Ordering::Acquire) > round as u64
+        });
+    }
+    let versions: Vec<u64> = workers.into_iter().map(|worker| worker.join().unwrap()).collect();
+    stage.over.store(true, Ordering::Release);
+    ends.into_iter().for_each(|end| end.join().unwrap());
+    assert_eq!(stage.settled.load(Ordering::Acquire), total);
+    assert_eq!(stage.gaps.load(Ordering::Acquire), 0);
+    assert!(versions.iter().all(|version| *version > 10), "{versions:?}");
+}
+
+/// Somebody who has not been let in, and guesses: what it sends is counted.
+fn speak_nonsense(link: &Link, stage: &Stage) {
+    let name = "dmprl/0000000000000007/segments/00000000000000aa".to_owned();
+    let stranger = link.outlet(name, dmprl::bridge::Urgency::Segments).unwrap();
+    stage.until("the stranger's messages counted", || {
+        stranger.send(b"nonsense".to_vec()).unwrap();
+        stage.refused.load(Ordering::Acquire) > 0
+    });
+}
+
+#[test]
+fn who_has_another_token_or_version_is_told_so_and_who_speaks_nonsense_is_passed_over() {
+    let folder = tempfile::tempdir().unwrap();
+    let domain = Domain::create(&folder.path().join("p"), "a").unwrap();
+    let path = domain.path().to_owned();
+    let endpoint = endpoint();
+    let stage = Arc::new(Stage::default());
+    let learning = Arc::clone(&stage);
+    let serving = path.clone();
+    let learner = thread::spawn(move || learner(&learning, serving));
+    let news = Arc::new(Mutex::new(Vec::new()));
+    let gateway = {
+        let (stage, news, endpoint) = (Arc::clone(&stage), Arc::clone(&news), endpoint.clone());
+        thread::spawn(move || {
+            let deadline = Instant::now() + PATIENCE;
+            let open = || {
+                let plan = plan(FIRST + WORKERS);
+                let at = ([endpoint.clone()], FIRST);
+                Gateway::open((&at.0, None), (&path, plan), (at.1, 0, 512), facts())
+            };
+            let mut gateway = loop {
+                match open() {
+                    Ok(gateway) => break gateway,
+                    Err(error) => assert!(Instant::now() < deadline, "{error:#}"),
+                }
+            };
+            while !stage.is_over() {
+                gateway.turn().unwrap();
+                news.lock().unwrap().extend(gateway.news());
+                stage.refused.store(gateway.refused(), Ordering::Release);
+                thread::sleep(POLL);
+            }
+        })
+    };
+    let link = Link::open(Ends::Connect(&endpoint), None).unwrap();
+    let answered = |asking: &Asking, held| {
+        let deadline = Instant::now() + PATIENCE;
+        loop {
+            match ask(&link, asking, held).unwrap() {
+                Asked::Later(why) => assert!(Instant::now() < deadline, "{why}"),
+                answer => return answer,
+            }
+        }
+    };
+    let refused = |asking: &Asking, held| match answered(asking, held) {
+        Asked::Refused(reason) => reason,
+        other => panic!("{other:?}"),
+    };
+    let right = asking(&endpoint);
+    let wrong = Asking { token: "another secret of some length".into(), ..right.clone() };
+    assert!(refused(&wrong, None).contains("token"));
+    let many = Asking { workers: 99, ..right.clone() };
+    assert!(refused(&many, None).contains("bridge.workers_max"));
+    assert!(matches!(answered(&right, None), Asked::Welcome(_)));
+    let other = serde_json::json!({"speaks": {"version": "9.9.9", "control": 77}, "new": 1});
+    let answer = link.ask("dmprl/join", other.to_string().into(), PATIENCE).unwrap().unwrap();
+    let answer = String::from_utf8(answer).unwrap();
+    assert!(answer.contains("9.9.9") && answer.contains("\"later\":false"), "{answer}");
+    speak_nonsense(&link, &stage);
+    stage.over.store(true, Ordering::Release);
+    learner.join().unwrap();
+    gateway.join().unwrap();
+    assert_eq!(stage.settled.load(Ordering::Acquire), 0);
+    let news = format!("{:?}", news.lock().unwrap());
+    assert!(news.contains("its token is wrong") && news.contains("9.9.9"), "{news}");
+}

@@ -1,0 +1,55 @@
+//! `dmprl bench transport` between two hosts of its own, network namespaces on a wire that takes
+//! its time and loses some: what docs/benchmarks.md has figures of. Needs root.
+//!
+//!     cargo run --release --package dmprl-tests --example namespaces -- MS_EACH_WAY LOSS SECONDS
+//!
+//! Prints what both ends print as JSON, a line each, and what became of the packets.
+
+use std::process::{Command, ExitCode, Stdio};
+use std::time::Duration;
+
+use dmprl_tests::hosts::Hosts;
+use dmprl_tests::program::executable;
+
+/// What a connection may have under way: several times rate and round trip.
+const TCP_BYTES_MAX: usize = 128 << 20;
+const WORKERS: &str = "2";
+
+fn main() -> ExitCode {
+    let numbers: Vec<f64> =
+        std::env::args().skip(1).filter_map(|number| number.parse().ok()).collect();
+    let [delay_ms, loss, seconds] = numbers[..] else {
+        eprintln!("usage: namespaces MILLISECONDS_EACH_WAY SHARE_LOST SECONDS");
+        return ExitCode::from(2);
+    };
+    let hosts = match Hosts::new(2, TCP_BYTES_MAX, 1) {
+        Ok(hosts) => hosts,
+        Err(error) => {
+            eprintln!("network namespaces and TUN devices need root: {error}");
+            return ExitCode::FAILURE;
+        }
+    };
+    hosts.delay(Duration::from_secs_f64(delay_ms / 1e3));
+    hosts.lose(loss);
+    let endpoint = format!("tcp/{}:7448", hosts.address(0));
+    let seconds = seconds.to_string();
+    let ends = [
+        ["--listen", &endpoint, "--seconds", &seconds],
+        ["--connect", &endpoint, "--workers", WORKERS],
+    ];
+    let started = ends.into_iter().enumerate().map(|(host, end)| {
+        let mut command = Command::new(executable());
+        command.args(["bench", "transport", "--json"]).args(end).stdout(Stdio::piped());
+        hosts.place(host, &mut command);
+        command.spawn().expect("dmprl starts")
+    });
+    let mut all_well = true;
+    for end in started.collect::<Vec<_>>() {
+        let output = end.wait_with_output().expect("an end can be waited for");
+        all_well &= output.status.success();
+        print!("{}", String::from_utf8_lossy(&output.stdout));
+    }
+    let (carried, lost) = hosts.counts();
+    println!("{{\"delay_ms\":{delay_ms},\"packets\":{carried},\"packets_lost\":{lost}}}");
+    if all_well { ExitCode::SUCCESS } else { ExitCode::FAILURE }
+}

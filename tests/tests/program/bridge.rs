@@ -1,0 +1,155 @@
+//! A run whose workers are on other hosts, all of them this one: real processes, real deaths.
+
+use std::fs;
+use std::net::TcpListener;
+use std::os::unix::fs::PermissionsExt;
+use std::path::{Path, PathBuf};
+
+use dmprl_tests::program::{
+    Running, Workplace, json_file, processes_naming, rows, shared_memory_of,
+};
+use rustix::process::Signal;
+
+use crate::{ENDLESS, train};
+
+/// An endpoint on loopback that nobody has.
+fn endpoint() -> String {
+    let free = TcpListener::bind("127.0.0.1:0").unwrap();
+    format!("tcp/{}", free.local_addr().unwrap())
+}
+
+/// A run that other hosts may take part in.
+fn learner(place: &Workplace, run: &str, endpoint: &str, more: &[&str]) -> Running {
+    let listen = format!("bridge.listen=[\"{endpoint}\"]");
+    let open = ["--workers", "1", "--set", &listen, "--set", "bridge.workers_max=2"];
+    let more = [&open[..], &["--set", "delivery.level=log"], more].concat();
+    let mut running = place.start(&train("reacher", run, &more));
+    running.until("a gateway", |running| {
+        Path::new(run).join("bridge.token").is_file()
+            && running.said().contains("first environment step")
+    });
+    running
+}
+
+fn bridge(place: &Workplace, run: &str, endpoint: &str, name: &str) -> Running {
+    let token = format!("{run}/bridge.token");
+    let (host, connect) = (place.path(name), ["--connect", endpoint, "--token-file", &token]);
+    let own = ["--workers", "1", "--name", name, "--run-dir", &host];
+    place.start(&[&["bridge"], &connect[..], &own].concat())
+}
+
+fn strike(run: &str, role: &str, signal: Signal) {
+    let processes = processes_naming(run);
+    let process = processes.iter().find(|process| process.role == role);
+    process.unwrap_or_else(|| panic!("no {role} in {processes:#?}")).signal(signal);
+}
+
+fn last(run: &str) -> serde_json::Value {
+    rows(run, "metrics.jsonl").pop().unwrap_or_default()
+}
+
+/// Segments of the other host's worker that the learner has, as its newest checkpoint knows.
+fn learned(run: &str, worker: usize) -> u64 {
+    let state = json_file(run, "checkpoints/latest/state.json");
+    state["settled"][worker]["sequence"].as_u64().unwrap_or(0)
+}
+
+/// The worker of another host comes after the run's own and the four that may join.
+const REMOTE: usize = 5;
+
+#[test]
+fn another_hosts_worker_is_learned_from_whoever_dies_and_nothing_is_lost() {
+    let place = Workplace::new();
+    let (run, endpoint) = (place.path("run"), endpoint());
+    let mut training = learner(&place, &run, &endpoint, &["--steps", ENDLESS]);
+    let mut host = bridge(&place, &run, &endpoint, "far");
+    training.until_said("host far takes part: 1 worker");
+    training.until("a line that counts both workers", |_| last(&run)["workers"] == 2);
+    let mut before = 0;
+    for (who, role) in [("far", "relay"), ("run", "gateway"), ("run", "learner"), ("far", "actor")]
+    {
+        strike(&place.path(who), role, Signal::KILL);
+        training.until("segments of the other host after that", |_| learned(&run, REMOTE) > before);
+        // Beyond what was on its way, and of a new start of the worker from the beginning.
+        before = if role == "actor" { 0 } else { learned(&run, REMOTE) + 20 };
+        training.until("more of them", |_| learned(&run, REMOTE) > before);
+    }
+    host.until_said("restart 1 of");
+    training.until("the host in the table of processes", |_| {
+        let table = json_file(&run, "processes.json");
+        let rows = table["processes"].as_array().cloned().unwrap_or_default();
+        rows.iter().any(|row| row["name"] == "host far")
+    });
+    // The host leaves; the run goes on.
+    host.signal_group(Signal::INT);
+    host.wait().with_status(130).saying("left the run");
+    training.until_said("host far has left");
+    training.until("a line without it", |_| last(&run)["workers"] == 1);
+    training.signal_group(Signal::INT);
+    training.wait().with_status(130).saying("checkpoint written");
+    assert_eq!(last(&run)["lost"], 0, "{}", last(&run));
+    place.until_no_process();
+    for folder in ["run", "far"] {
+        assert_eq!(shared_memory_of(&place.path(folder)), Vec::<PathBuf>::new());
+    }
+}
+
+#[test]
+fn hosts_wait_for_a_run_that_was_stopped_and_end_with_one_that_is_over() {
+    let place = Workplace::new();
+    let (run, endpoint) = (place.path("run"), endpoint());
+    // It is there before the run is.
+    let mut early = {
+        let token = place.path("early.token");
+        fs::write(&token, "a secret that was made beforehand\n").unwrap();
+        fs::set_permissions(&token, fs::Permissions::from_mode(0o600)).unwrap();
+        let host = place.path("early");
+        let connect = ["--connect", &endpoint, "--token-file", &token, "--name", "early"];
+        place.start(&[&["bridge"], &connect[..], &["--workers", "1", "--run-dir", &host]].concat())
+    };
+    early.until_said("no learner's host answers");
+    let token = format!("bridge.token_file={}", place.path("early.token"));
+    let listen = format!("bridge.listen=[\"{endpoint}\"]");
+    let more = ["--workers", "1", "--set", &listen, "--set", &token, "--steps", ENDLESS];
+    let mut training = place.start(&train("reacher", &run, &more));
+    training.until("segments of the other host", |_| learned(&run, REMOTE) > 10);
+    training.signal_group(Signal::INT);
+    training.wait().with_status(130);
+    early.until_said("workers wait");
+    let steps =
+        json_file(&run, "checkpoints/latest/state.json")["counters"]["env_steps"].as_u64().unwrap();
+    let end = (steps + 5_000).to_string();
+    let before = learned(&run, REMOTE);
+    place.run(&["resume", &run, "--steps", &end]).with_status(0).saying("host early is back");
+    assert!(learned(&run, REMOTE) > before, "its worker went on");
+    early.wait().with_status(0).saying("the run has ended");
+    assert_eq!(last(&run)["lost"], 0, "{}", last(&run));
+    place.until_no_process();
+}
+
+#[test]
+fn a_host_with_a_wrong_token_or_too_many_workers_is_told_what_to_do() {
+    let place = Workplace::new();
+    let (run, endpoint) = (place.path("run"), endpoint());
+    let training = learner(&place, &run, &endpoint, &["--steps", ENDLESS]);
+    let wrong = place.path("wrong");
+    fs::write(&wrong, "not the secret of this run\n").unwrap();
+    let with = |token: &str, workers: &str| {
+        let connect = ["bridge", "--connect", &endpoint, "--token-file", token];
+        place.run(&[&connect[..], &["--workers", workers]].concat()).with_status(2)
+    };
+    with(&wrong, "1").saying("chmod 600");
+    fs::set_permissions(&wrong, fs::Permissions::from_mode(0o600)).unwrap();
+    with(&wrong, "1").saying("its token is not the run's: copy bridge.token");
+    with(&format!("{run}/bridge.token"), "3").saying("bridge.workers_max");
+    with(&place.path("none"), "1").saying("copy bridge.token of the run's directory");
+    let odd = place.run(&["bridge", "--connect", "10.0.0.1", "--token-file", &wrong]);
+    odd.with_status(2).saying("expected tcp/ADDRESS:PORT");
+    drop(training);
+    // An address that is taken is said at once, and ends the run.
+    let taken = TcpListener::bind("127.0.0.1:0").unwrap();
+    let listen = format!("bridge.listen=[\"tcp/{}\"]", taken.local_addr().unwrap());
+    let second = place.path("second");
+    let more = ["--workers", "1", "--set", &listen, "--steps", ENDLESS];
+    place.run(&train("reacher", &second, &more)).with_status(1).saying("cannot listen at");
+}
