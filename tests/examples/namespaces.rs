@@ -1,7 +1,7 @@
 //! `dmprl bench transport` between two hosts of its own, network namespaces on a wire that takes
 //! its time and loses some: what docs/benchmarks.md has figures of. Needs root.
 //!
-//!     cargo run --release --package dmprl-tests --example namespaces -- MS_EACH_WAY LOSS SECONDS
+//!     cargo run --release --package dmprl-tests --example namespaces -- MS_EACH_WAY LOSS SECONDS WORKERS
 //!
 //! Prints what both ends print as JSON, a line each, and what became of the packets.
 
@@ -13,13 +13,12 @@ use dmprl_tests::program::executable;
 
 /// What a connection may have under way: several times rate and round trip.
 const TCP_BYTES_MAX: usize = 128 << 20;
-const WORKERS: &str = "2";
 
 fn main() -> ExitCode {
     let numbers: Vec<f64> =
         std::env::args().skip(1).filter_map(|number| number.parse().ok()).collect();
-    let [delay_ms, loss, seconds] = numbers[..] else {
-        eprintln!("usage: namespaces MILLISECONDS_EACH_WAY SHARE_LOST SECONDS");
+    let [delay_ms, loss, seconds, workers] = numbers[..] else {
+        eprintln!("usage: namespaces MILLISECONDS_EACH_WAY SHARE_LOST SECONDS WORKERS");
         return ExitCode::from(2);
     };
     let hosts = match Hosts::new(2, TCP_BYTES_MAX, 1) {
@@ -32,10 +31,10 @@ fn main() -> ExitCode {
     hosts.delay(Duration::from_secs_f64(delay_ms / 1e3));
     hosts.lose(loss);
     let endpoint = format!("tcp/{}:7448", hosts.address(0));
-    let seconds = seconds.to_string();
+    let (seconds, workers) = (seconds.to_string(), workers.to_string());
     let ends = [
         ["--listen", &endpoint, "--seconds", &seconds],
-        ["--connect", &endpoint, "--workers", WORKERS],
+        ["--connect", &endpoint, "--workers", &workers],
     ];
     let started = ends.into_iter().enumerate().map(|(host, end)| {
         let mut command = Command::new(executable());

@@ -118,6 +118,9 @@ impl Landing {
     #[must_use]
     pub fn hearing(&self) -> Hearing {
         let Mark { incarnation, sequence } = self.mark;
-        Hearing { sequence, incarnation, refused: self.refused }
+        let landed = self.outbox.as_ref().map_or(0, |outbox| outbox.end() - 1);
+        let landed_incarnation = self.outbox.as_ref().map_or(0, Outbox::incarnation);
+        let refused = self.refused;
+        Hearing { sequence, landed, incarnation, landed_incarnation, refused, reserved: 0 }
     }
 }

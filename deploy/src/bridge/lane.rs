@@ -26,7 +26,7 @@ pub struct Lane {
     pending: Option<Segment>,
     attempt: u32,
     anew: bool,
-    /// A segment whose acknowledgement is timed, and since when.
+    /// A segment whose landing is timed, and since when.
     timed: Option<(u64, Instant)>,
     misfits: u64,
 }
@@ -36,8 +36,8 @@ pub struct Lane {
 pub struct Acked {
     /// Segments.
     pub segments: u64,
-    /// How long a segment of them was under way, where one was timed \[s\].
-    pub delay_s: Option<f64>,
+    /// From sending a segment until it was heard that it has landed, where one was timed \[s\].
+    pub round_trip_s: Option<f64>,
 }
 
 impl Lane {
@@ -132,9 +132,9 @@ impl Lane {
         let mut link = Boarding { batch, room, anew: &mut self.anew, stretch, begun: false };
         // Boarding refuses nothing but for want of room.
         let _ = outbox.offer(&mut link);
-        let next = first + outbox.under_way() as u64;
-        if self.timed.is_none() && next > first {
-            self.timed = Some((next - 1, now));
+        // What was sent in an earlier turn is older than it would seem.
+        if link.begun && self.timed.is_none() {
+            self.timed = Some((first + outbox.under_way() as u64 - 1, now));
         }
     }
 
@@ -167,8 +167,10 @@ impl Lane {
             let before = outbox.first();
             acknowledge(outbox, hearing.mark(), (self.layout, self.capacity));
             acked.segments = outbox.first() - before;
-            if let Some((_, since)) = self.timed.filter(|(last, _)| *last < outbox.first()) {
-                acked.delay_s = Some(now.duration_since(since).as_secs_f64());
+            let here = hearing.landed_incarnation == outbox.incarnation();
+            let landed = self.timed.filter(|(last, _)| here && *last <= hearing.landed);
+            if let Some((_, since)) = landed {
+                acked.round_trip_s = Some(now.duration_since(since).as_secs_f64());
                 self.timed = None;
             }
         }
@@ -349,6 +351,20 @@ mod tests {
         ends.send(0, 6..=9);
         ends.land();
         assert_eq!((ends.lane.kept(), ends.landing.kept()), (2, 2));
+    }
+
+    /// It once was, and a long link seemed to make its segments wait: the window stayed the smallest.
+    #[test]
+    fn what_was_sent_before_is_not_timed_as_if_it_were_sent_now() {
+        let mut ends = Ends::new();
+        ends.send(0, 1..=2);
+        ends.land();
+        let second = std::time::Duration::from_secs(1);
+        ends.now += second;
+        assert_eq!(ends.acknowledge(0, 1), Acked { segments: 1, round_trip_s: Some(1.0) });
+        ends.send_rest();
+        ends.now += second;
+        assert_eq!(ends.acknowledge(0, 2), Acked { segments: 1, round_trip_s: None });
     }
 
     #[test]

@@ -367,19 +367,17 @@ impl Relay {
             self.heard = now;
             self.away = None;
             course = said;
-            let under_way = self.segment_bytes * self.under_way();
+            let now_s = now.duration_since(self.started).as_secs_f64();
             let mut segments = 0;
             for (lane, hearing) in self.lanes.iter_mut().zip(&hearings) {
                 let acked = lane.hear(hearing, now);
                 segments += acked.segments;
-                if let Some(delay_s) = acked.delay_s {
-                    self.window.time(delay_s, now.duration_since(self.started).as_secs_f64());
+                if let Some(round_trip_s) = acked.round_trip_s {
+                    self.window.time(round_trip_s, now_s);
                 }
             }
-            if segments > 0 {
-                self.acked += segments;
-                self.window.acknowledged(segments * self.segment_bytes, under_way);
-            }
+            self.acked += segments;
+            self.window.acknowledge(segments * self.segment_bytes, now_s);
         }
         if course == Course::Stopped {
             let since = self.away.as_ref().map_or(now, |(since, _)| *since);

@@ -1,66 +1,85 @@
 //! How much a host may have under way.
 //!
 //! Too little, and a long link is never filled; too much, and the segments of a fast host wait
-//! behind a slow learner, made by a policy that is long replaced. So the window follows the delay
-//! from sending to the learner's acknowledgement, as LEDBAT (RFC 6817) does: it grows while that is
-//! near the shortest seen lately, and shrinks when what is under way only waits.
+//! behind a slow learner, made by a policy that is long replaced. What fills the one and hardly
+//! waits for the other is what the learner acknowledges in one round trip, as BBR has it (Cardwell
+//! et al. 2016): the fastest rate of acknowledgements lately times the shortest round trip lately.
+//! The round trip is the link's alone, to the gateway and back, so that a learner that makes
+//! segments wait does not make the link seem longer.
 
-/// What may wait beyond the shortest delay before the window shrinks \[s\]. Some times the interval
-/// of acknowledgements, a hundredth of a second.
-const WAITING_S: f64 = 0.1;
-/// The shortest delay is that of the last one or two of these intervals \[s\].
+/// On top of a round trip: some intervals of acknowledgements, and what an update takes \[s\].
+const SLACK_S: f64 = 0.05;
+/// A window so many times what is needed lets the rate show that it could be higher.
+const GAIN: f64 = 2.0;
+/// The rate is taken over at least so long \[s\], and the fastest of so many times counts.
+const RATE_S: f64 = 0.1;
+const RATES: usize = 8;
+/// The shortest round trip is that of the last one or two of these intervals \[s\].
 const MEMORY_S: f64 = 10.0;
 /// A window never is smaller \[bytes\]: some segments of each of some environments.
 const WINDOW_MIN: f64 = 65_536.0;
-/// At most so much of what is acknowledged is taken away again.
-const SHRINK_MAX: f64 = 0.5;
 
 /// A host's window.
 #[derive(Debug, Clone)]
 pub struct Window {
-    bytes: f64,
     max: f64,
-    /// Shortest delay in this interval and in the one before \[s\].
-    shortest: [f64; 2],
-    /// Of this interval \[s\].
+    /// Shortest in this interval and in the one before \[s\], and when this began \[s\].
+    round_trips: [f64; 2],
     began_s: f64,
-    waiting_s: f64,
+    /// The last rates \[bytes/s\], and what has been acknowledged since the newest.
+    rates: [f64; RATES],
+    next: usize,
+    acknowledged: u64,
+    since_s: f64,
 }
 
 impl Window {
     /// The smallest, which may grow to `bytes_max`.
     #[must_use]
     pub fn new(bytes_max: u64) -> Self {
-        let max = (bytes_max as f64).max(WINDOW_MIN);
-        let shortest = [f64::INFINITY; 2];
-        Self { bytes: WINDOW_MIN, max, shortest, began_s: 0.0, waiting_s: 0.0 }
+        Self {
+            max: (bytes_max as f64).max(WINDOW_MIN),
+            round_trips: [f64::INFINITY; 2],
+            began_s: 0.0,
+            rates: [0.0; RATES],
+            next: 0,
+            acknowledged: 0,
+            since_s: 0.0,
+        }
     }
 
     /// Bytes that may be under way.
     #[must_use]
     pub fn bytes(&self) -> u64 {
-        self.bytes as u64
+        let rate = self.rates.into_iter().fold(0.0, f64::max);
+        let needed = rate * (self.round_trip_s().unwrap_or(0.0) + SLACK_S);
+        (GAIN * needed).clamp(WINDOW_MIN, self.max) as u64
     }
 
-    /// A segment was acknowledged `delay_s` after it was sent, at the time `now_s`.
-    pub fn time(&mut self, delay_s: f64, now_s: f64) {
+    fn round_trip_s(&self) -> Option<f64> {
+        let shortest = self.round_trips[0].min(self.round_trips[1]);
+        shortest.is_finite().then_some(shortest)
+    }
+
+    /// At the time `now_s` the gateway was heard to have a segment that was sent `round_trip_s`
+    /// ago.
+    pub fn time(&mut self, round_trip_s: f64, now_s: f64) {
         if now_s - self.began_s >= MEMORY_S {
-            self.shortest = [f64::INFINITY, self.shortest[0]];
+            self.round_trips = [f64::INFINITY, self.round_trips[0]];
             self.began_s = now_s;
         }
-        self.shortest[0] = self.shortest[0].min(delay_s);
-        let shortest = self.shortest[0].min(self.shortest[1]);
-        self.waiting_s = delay_s - shortest;
+        self.round_trips[0] = self.round_trips[0].min(round_trip_s);
     }
 
-    /// So many bytes were acknowledged, of `under_way` before.
-    pub fn acknowledged(&mut self, bytes: u64, under_way: u64) {
-        let off = (1.0 - self.waiting_s / WAITING_S).max(-SHRINK_MAX);
-        // A window that nobody fills says nothing about what it could be.
-        if off > 0.0 && (under_way as f64) < self.bytes / 2.0 {
-            return;
+    /// At the time `now_s` so many bytes more were heard to be acknowledged.
+    pub fn acknowledge(&mut self, bytes: u64, now_s: f64) {
+        self.acknowledged += bytes;
+        let seconds = now_s - self.since_s;
+        if seconds >= RATE_S.max(self.round_trip_s().unwrap_or(0.0)) {
+            self.rates[self.next] = self.acknowledged as f64 / seconds;
+            self.next = (self.next + 1) % RATES;
+            (self.acknowledged, self.since_s) = (0, now_s);
         }
-        self.bytes = (self.bytes + off * bytes as f64).clamp(WINDOW_MIN, self.max);
     }
 }
 
@@ -71,18 +90,21 @@ mod tests {
     use super::*;
 
     /// A link of `round_trip_s` to a learner that takes `bytes_per_s`, for a minute; what it took
-    /// in the second half \[bytes/s\], and the longest delay in it.
+    /// in the second half \[bytes/s\], and the longest delay to an acknowledgement in it.
     fn run(round_trip_s: f64, bytes_per_s: f64) -> (f64, f64) {
-        const STEP_S: f64 = 0.01;
+        const STEP_S: f64 = 0.005;
+        const STEPS: u32 = 12_000;
         let mut window = Window::new(64 << 20);
         // When it arrives, when it was sent, how much it is.
         let (mut link, mut acks) = (VecDeque::new(), VecDeque::new());
+        let mut landed: VecDeque<(f64, f64)> = VecDeque::new();
         let (mut under_way, mut taken, mut delay_max) = (0.0, 0.0, 0.0_f64);
-        for step in 0..6_000 {
+        for step in 0..STEPS {
             let now_s = f64::from(step) * STEP_S;
             let sent = (window.bytes() as f64 - under_way).max(0.0);
             under_way += sent;
             link.push_back((now_s + round_trip_s / 2.0, now_s, sent));
+            landed.push_back((now_s + round_trip_s + STEP_S, now_s));
             let mut room = bytes_per_s * STEP_S;
             while let Some((_, sent_s, bytes)) = link.front_mut().filter(|(at, ..)| *at <= now_s) {
                 let part = f64::min(*bytes, room);
@@ -93,13 +115,16 @@ mod tests {
                 }
                 link.pop_front();
             }
+            while let Some((_, sent_s)) = landed.front().filter(|(at, _)| *at <= now_s) {
+                window.time(now_s - sent_s, now_s);
+                landed.pop_front();
+            }
             while let Some((_, sent_s, bytes)) = acks.front().copied().filter(|ack| ack.0 <= now_s)
             {
                 acks.pop_front();
-                window.time(now_s - sent_s, now_s);
-                window.acknowledged(bytes as u64, under_way as u64);
+                window.acknowledge(bytes as u64, now_s);
                 under_way -= bytes;
-                if step >= 3_000 {
+                if step >= STEPS / 2 {
                     taken += bytes;
                     delay_max = delay_max.max(now_s - sent_s);
                 }
@@ -111,13 +136,15 @@ mod tests {
     #[test]
     fn a_long_link_is_filled() {
         let (taken, _) = run(0.2, 40e6);
-        assert!(taken > 0.9 * 40e6, "{taken}");
+        assert!(taken > 0.95 * 40e6, "{taken}");
     }
 
     #[test]
-    fn a_slow_learner_is_not_run_ahead_of() {
-        let (taken, delay_s) = run(0.001, 1e6);
-        assert!(taken > 0.9 * 1e6, "{taken}");
-        assert!(delay_s < 0.5, "{delay_s}");
+    fn a_slow_learner_is_not_run_ahead_of_over_a_short_link_or_a_long_one() {
+        for (round_trip_s, longest_s) in [(0.001, 0.25), (0.2, 0.8)] {
+            let (taken, delay_s) = run(round_trip_s, 2e6);
+            assert!(taken > 0.95 * 2e6, "{taken}");
+            assert!(delay_s < longest_s, "{delay_s}");
+        }
     }
 }

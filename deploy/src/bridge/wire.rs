@@ -80,10 +80,16 @@ pub struct Stretch {
 pub struct Hearing {
     /// Acknowledged by the learner up to here,
     pub sequence: u64,
-    /// of this start of the worker.
+    /// The gateway has all up to here,
+    pub landed: u64,
+    /// `sequence` is of this start of the worker,
     pub incarnation: u32,
+    /// and `landed` of this.
+    pub landed_incarnation: u32,
     /// An attempt in which something was missing: the host sends what it keeps anew. 0: none.
     pub refused: u32,
+    /// Fills the last word.
+    pub reserved: u32,
 }
 
 impl Hearing {
@@ -430,7 +436,9 @@ mod tests {
 
     #[test]
     fn hearings_and_snapshots_come_out_as_they_went_in_or_not_at_all() {
-        let hearings = [Hearing { sequence: 9, incarnation: 2, refused: 1 }, Hearing::default()];
+        let first =
+            Hearing { sequence: 9, landed: 11, incarnation: 2, refused: 1, ..Hearing::default() };
+        let hearings = [first, Hearing::default()];
         let message = write_hearings(Course::Stopped, &hearings);
         assert_eq!(read_hearings(&message), Ok((Course::Stopped, hearings.to_vec())));
         let snapshot = ParameterSnapshot {

@@ -29,7 +29,7 @@ Three parts:
   model       steps/s and the first bottleneck for 16 to 1024 workers, by these costs: the workers,
               the learner's thread, which takes segments and does updates in turn, and the network,
               if --link-gbps says what it carries. Each worker has a core; the learner's host has
-              no workers. dmprl runs on one machine: for several it is a forecast
+              no workers. For several machines it is a forecast
   check       real systems (as `bench system`) of 1 to --check-workers workers on this machine
               beside the model, in which learner and workers share its cores. A busy machine has
               fewer; the processor time for a step, which it disturbs least, stands beside

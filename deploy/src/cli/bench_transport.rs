@@ -9,7 +9,7 @@ use dmprl_shared::config::DeliveryLevel;
 use super::bench::{interpreter, seconds};
 use super::{cores, emit, python_home, this_program};
 use crate::bench::{self, TransportBench};
-use crate::failure::Outcome;
+use crate::failure::{Outcome, wrong_use};
 
 const HELP: &str = "\
 For segments of 1024 and of 10240 bytes. In every round each of these runs once for --seconds, the
@@ -52,8 +52,8 @@ enum Level {
 #[derive(Debug, Args)]
 #[command(after_help = HELP)]
 pub(super) struct TransportArgs {
-    /// Processes that send [default: cores - 1].
-    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=64))]
+    /// Processes that send [default: cores - 1]; with --connect 0 for policies alone [default: 1].
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(0..=64))]
     workers: Option<u32>,
     /// Delivery level of ours.
     #[arg(long, value_enum, default_value_t = Level::Memory)]
@@ -85,6 +85,9 @@ pub(super) struct TransportArgs {
 pub(super) fn run(args: &TransportArgs) -> anyhow::Result<Outcome> {
     if args.listen.is_some() || args.connect.is_some() {
         return between_hosts(args);
+    }
+    if args.workers == Some(0) {
+        return Err(wrong_use("--workers 0: nobody would send; 0 goes with --connect alone"));
     }
     let peer_python = args.peer_python.as_deref().map(interpreter).transpose()?;
     let (venv, package_path) = python_home()?;

@@ -153,7 +153,7 @@ pub struct RelayArgs {
     /// Its workers' incarnations are counted as in this session of the run.
     #[arg(long, value_name = "N", default_value_t = 0)]
     pub session: u32,
-    /// How long the learner's host may be away [s].
+    /// How long the learner's host may be away, in seconds.
     #[arg(long, value_name = "S")]
     pub patience: u64,
     /// Zenoh's own configuration: certificates.

@@ -51,6 +51,10 @@ pub fn listen(
             break None;
         }
         taker.turn(&policies)?;
+        if policies.has_confirmed() {
+            // A host without workers only takes policies.
+            taker.first.get_or_insert_with(Instant::now);
+        }
         if gateway.is_finished() {
             break Some(0.0);
         }
@@ -95,6 +99,10 @@ impl Policies {
     fn publish(&self) -> u64 {
         *self.under_way.lock().unwrap_or_else(PoisonError::into_inner) = Some(Instant::now());
         self.published.fetch_add(1, Ordering::AcqRel) + 1
+    }
+
+    fn has_confirmed(&self) -> bool {
+        !self.ages_ms.lock().unwrap_or_else(PoisonError::into_inner).is_empty()
     }
 
     fn confirm(&self, version: u64) {
