@@ -32,16 +32,18 @@ pub(super) struct Cleaning {
 }
 
 impl Cleaning {
-    /// To be called a few times a second; `died`: a process that is known is gone.
+    /// To be called a few times a second; `died`: a process that is known is gone; `found_dead`:
+    /// see [`clean`].
     pub(super) fn clean_in_time(
         &mut self,
         node: &Node<PrivateIpc>,
         died: bool,
+        found_dead: impl FnMut(),
     ) -> Result<(), TransportError> {
         if !self.is_due(died) {
             return Ok(());
         }
-        match clean(node) {
+        match clean(node, found_dead) {
             Ok(looked) => *self = Self { owed: looked, failures: 0 },
             Err(error) if self.failures >= FAILURES_MAX => return Err(error),
             Err(_) => self.failures += 1,

@@ -283,13 +283,17 @@ impl SegmentReceiver for Receiver {
     }
 
     fn maintain(&mut self) -> Result<(), TransportError> {
-        // Joins what has just begun: of a worker that was never joined nothing stays when it is
-        // dead and cleaned up, not even what it was told is delivered.
-        for port in self.slots.iter().filter_map(|slot| slot.port.as_ref()) {
-            let _ = port.has_samples();
-        }
-        let died = self.slots.iter().any(|slot| sender_died(&slot.factory));
-        self.cleaning.clean_in_time(&self.node, died)?;
+        let Self { slots, cleaning, node, .. } = self;
+        let died = slots.iter().any(|slot| sender_died(&slot.factory));
+        // Of a worker that was never joined nothing stays when it is cleaned up, not even what it
+        // was told is delivered. Joined before it is known to be dead, one that begins, sends and
+        // dies in between would be missed.
+        let join = || {
+            for port in slots.iter().filter_map(|slot| slot.port.as_ref()) {
+                let _ = port.has_samples();
+            }
+        };
+        cleaning.clean_in_time(node, died, join)?;
         self.slots.iter_mut().try_for_each(Slot::renew)
     }
 }

@@ -123,17 +123,22 @@ pub(super) fn join(root: &Path) -> Result<Node<PrivateIpc>, TransportError> {
 }
 
 /// Frees what dead processes below the node's root left behind; returns how many nodes, dead or
-/// alive, it has looked at.
+/// alive, it has looked at. `found_dead` is called for each dead one before anything of it is gone:
+/// it says and sends nothing more, so what it has left can be taken over then, and all of it.
 ///
 /// iceoryx2 0.10 panics when it finds a "dead" node alive after all (issue 1880): the panic
 /// becomes an error here, and the next call tries again.
-pub(super) fn clean(node: &Node<PrivateIpc>) -> Result<usize, TransportError> {
+pub(super) fn clean(
+    node: &Node<PrivateIpc>,
+    mut found_dead: impl FnMut(),
+) -> Result<usize, TransportError> {
     let operation = "cleaning up after dead processes";
     let cleaned = catch_unwind(AssertUnwindSafe(|| {
         let mut looked = 0;
         let listed = Node::<PrivateIpc>::list(node.config(), |state| {
             looked += 1;
             if let NodeState::Dead(dead) = state {
+                found_dead();
                 // What could not be removed is found again by the next call.
                 let _ = dead.try_remove_stale_resources();
             }
