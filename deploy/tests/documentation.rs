@@ -236,8 +236,8 @@ fn every_flag_that_is_shown_exists() {
 
 #[test]
 fn every_configuration_key_that_is_named_exists() {
-    const FILE_ENDINGS: [&str; 9] =
-        ["npz", "jsonl", "json", "toml", "token", "safetensors", "svg", "rs", "md"];
+    const FILE_ENDINGS: [&str; 10] =
+        ["npz", "jsonl", "json", "json5", "toml", "token", "safetensors", "svg", "rs", "md"];
     let keys: BTreeSet<_> = Layers::new().keys().into_iter().collect();
     let sections: BTreeSet<_> = keys.iter().filter_map(|key| key.split('.').next()).collect();
     let mut seen = 0;

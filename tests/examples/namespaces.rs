@@ -1,7 +1,9 @@
 //! `dmprl bench transport` between two hosts of its own, network namespaces on a wire that takes
 //! its time and loses some: what docs/benchmarks.md has figures of. Needs root.
 //!
-//!     cargo run --release --package dmprl-tests --example namespaces -- MS_EACH_WAY LOSS SECONDS WORKERS
+//!     cargo run --release --package dmprl-tests --example namespaces -- MS LOSS SECONDS WORKERS
+//!
+//! MS: milliseconds each way. WORKERS: 0 for policies alone.
 //!
 //! Prints what both ends print as JSON, a line each, and what became of the packets.
 

@@ -353,7 +353,7 @@ mod tests {
         assert_eq!((ends.lane.kept(), ends.landing.kept()), (2, 2));
     }
 
-    /// It once was, and a long link seemed to make its segments wait: the window stayed the smallest.
+    /// It once was: a long link seemed to make its segments wait, and the window stayed small.
     #[test]
     fn what_was_sent_before_is_not_timed_as_if_it_were_sent_now() {
         let mut ends = Ends::new();

@@ -111,17 +111,17 @@ fn hosts_wait_for_a_run_that_was_stopped_and_end_with_one_that_is_over() {
     let token = format!("bridge.token_file={}", place.path("early.token"));
     let listen = format!("bridge.listen=[\"{endpoint}\"]");
     let more = ["--workers", "1", "--set", &listen, "--set", &token, "--steps", ENDLESS];
+    let more = [&more[..], &["--max-minutes", "1"]].concat();
     let mut training = place.start(&train("reacher", &run, &more));
     training.until("segments of the other host", |_| learned(&run, REMOTE) > 10);
     training.signal_group(Signal::INT);
     training.wait().with_status(130);
     early.until_said("workers wait");
-    let steps =
-        json_file(&run, "checkpoints/latest/state.json")["counters"]["env_steps"].as_u64().unwrap();
-    let end = (steps + 5_000).to_string();
     let before = learned(&run, REMOTE);
-    place.run(&["resume", &run, "--steps", &end]).with_status(0).saying("host early is back");
-    assert!(learned(&run, REMOTE) > before, "its worker went on");
+    let mut resumed = place.start(&["resume", &run]);
+    resumed.until_said("host early is back");
+    resumed.until("more of its worker's segments", |_| learned(&run, REMOTE) > before);
+    resumed.wait().with_status(0);
     early.wait().with_status(0).saying("the run has ended");
     assert_eq!(last(&run)["lost"], 0, "{}", last(&run));
     place.until_no_process();
