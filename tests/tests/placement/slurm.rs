@@ -129,7 +129,8 @@ fn job_whose_time_is_over_is_stopped_requeued_and_resumed() {
     job.until_called(3);
     job.learner_ends("0");
     assert_eq!(script.wait().unwrap().code(), Some(0));
-    assert_eq!(job.calls()[0], "dmprl resume runs/slurm-7 --no-progress");
+    // The token is there already, so the hosts may come first.
+    assert!(job.calls().contains(&"dmprl resume runs/slurm-7 --no-progress".to_owned()));
 }
 
 #[test]
