@@ -19,6 +19,8 @@ use crate::bench::workers::{Stage, Workers};
 
 /// Each cost is measured so often; of a worker's the median counts.
 const ROUNDS: u32 = 5;
+/// A round too short for a busy machine to deliver anything in is repeated, so often at most.
+const TRIES_MAX: u32 = 20 * ROUNDS;
 /// Of each environment in a worker's queue: what is measured is the worker, and not the sleep of
 /// whoever takes from it.
 const QUEUED_SEGMENTS: usize = 4;
@@ -52,18 +54,20 @@ pub(super) fn worker(
     let stage = Stage::new(program, venv, &config)?;
     let mut workers = Workers::start(&stage, watch)?;
     let (mut cpu_s, mut steps) = (Vec::new(), Vec::new());
-    for _ in 0..ROUNDS {
+    for _ in 0..TRIES_MAX {
         let (round, window) = workers.measure(watch, duration / ROUNDS)?;
-        ensure!(
-            window.segments > 0,
-            "the workers delivered nothing within {:?}",
-            duration / ROUNDS
-        );
+        if window.segments == 0 {
+            continue;
+        }
         let segments = window.segments as f64;
         let cores = round.cores.context("the system tells no processor time of the workers")?;
         cpu_s.push(cores * window.seconds / segments);
         steps.push(window.env_steps as f64 / segments);
+        if cpu_s.len() == ROUNDS as usize {
+            break;
+        }
     }
+    ensure!(!cpu_s.is_empty(), "the workers delivered nothing in {TRIES_MAX} rounds");
     let middle = |values: &[f64]| median(values).context("no round");
     Ok(WorkerCost {
         cpu_s: middle(&cpu_s)?,

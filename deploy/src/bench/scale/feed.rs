@@ -168,7 +168,12 @@ impl Feed {
         let (start, cpu_s) = (Instant::now(), thread_cpu_s());
         self.turns_for(watch, duration / 2)?;
         let middle_bytes = resident_bytes();
-        self.turns_for(watch, duration / 2)?;
+        // Longer, if nothing has come: a busy machine may have let nobody send.
+        let received = self.session.learner.counters.received;
+        let end = Instant::now() + duration / 2;
+        let over =
+            |learner: &Learner| learner.counters.received > received && Instant::now() >= end;
+        ensure!(self.turns(watch, duration + SLACK, over)?, "nothing came within {SLACK:?}");
         let (seconds, cpu_s) = (start.elapsed().as_secs_f64(), thread_cpu_s() - cpu_s);
         let came = |(now, before): (&Mark, &Mark)| now.sequence - before.sequence;
         let segments = self.session.learner.inbox.settled().iter().zip(&before).map(came).collect();
