@@ -1,9 +1,10 @@
 //! `dmprl bench transport` between two hosts of its own, network namespaces on a wire that takes
 //! its time and loses some: what docs/benchmarks.md has figures of. Needs root.
 //!
-//!     cargo run --release --package dmprl-tests --example namespaces -- MS LOSS SECONDS WORKERS
+//!     cargo run --release --package dmprl-tests --example namespaces -- MS LOSS SECONDS WORKERS [RATE]
 //!
-//! MS: milliseconds each way. WORKERS: 0 for policies alone.
+//! MS: milliseconds each way. WORKERS: 0 for policies alone. RATE: segments a second they make
+//! together; without it as many as they can.
 //!
 //! Prints what both ends print as JSON, a line each, and what became of the packets.
 
@@ -19,8 +20,8 @@ const TCP_BYTES_MAX: usize = 128 << 20;
 fn main() -> ExitCode {
     let numbers: Vec<f64> =
         std::env::args().skip(1).filter_map(|number| number.parse().ok()).collect();
-    let [delay_ms, loss, seconds, workers] = numbers[..] else {
-        eprintln!("usage: namespaces MILLISECONDS_EACH_WAY SHARE_LOST SECONDS WORKERS");
+    let [delay_ms, loss, seconds, workers, ref rate @ ..] = numbers[..] else {
+        eprintln!("usage: namespaces MILLISECONDS_EACH_WAY SHARE_LOST SECONDS WORKERS [RATE]");
         return ExitCode::from(2);
     };
     let hosts = match Hosts::new(2, TCP_BYTES_MAX, 1) {
@@ -34,10 +35,9 @@ fn main() -> ExitCode {
     hosts.lose(loss);
     let endpoint = format!("tcp/{}:7448", hosts.address(0));
     let (seconds, workers) = (seconds.to_string(), workers.to_string());
-    let ends = [
-        ["--listen", &endpoint, "--seconds", &seconds],
-        ["--connect", &endpoint, "--workers", &workers],
-    ];
+    let mut there = vec!["--connect".to_owned(), endpoint.clone(), "--workers".into(), workers];
+    there.extend(rate.iter().flat_map(|rate| ["--rate".to_owned(), rate.to_string()]));
+    let ends = [vec!["--listen".to_owned(), endpoint, "--seconds".into(), seconds], there];
     let started = ends.into_iter().enumerate().map(|(host, end)| {
         let mut command = Command::new(executable());
         command.args(["bench", "transport", "--json"]).args(end).stdout(Stdio::piped());

@@ -26,6 +26,8 @@ use rand_xoshiro::Xoshiro256PlusPlus;
 const NETWORK: [u8; 3] = [10, 203, 0];
 /// As between machines of one rack; larger packets cost the wire less.
 const PACKET_BYTES_MAX: i32 = 9_000;
+/// What waits for the wire; a device of TUN's loses what is more, without a word [packets].
+const QUEUE_PACKETS_MAX: i32 = 32_768;
 /// What a router holds; more is lost [bytes].
 const UNDER_WAY_BYTES_MAX: usize = 256 << 20;
 /// The longest wait without a look whether it is over.
@@ -167,6 +169,7 @@ fn tun_device(address: Ipv4Addr) -> io::Result<File> {
     };
     with(libc::SIOCSIFMTU, &|request| request.ifr_ifru.ifru_mtu = PACKET_BYTES_MAX)?;
     with(libc::SIOCSIFADDR, &|request| request.ifr_ifru.ifru_addr = socket_address(address))?;
+    with(libc::SIOCSIFTXQLEN, &|request| request.ifr_ifru.ifru_metric = QUEUE_PACKETS_MAX)?;
     let mask = Ipv4Addr::new(255, 255, 255, 0);
     with(libc::SIOCSIFNETMASK, &|request| request.ifr_ifru.ifru_netmask = socket_address(mask))?;
     let up = (libc::IFF_UP | libc::IFF_RUNNING) as libc::c_short;
@@ -208,6 +211,7 @@ struct Packet {
     due: Instant,
     to: usize,
     bytes: Vec<u8>,
+    len: usize,
 }
 
 fn await_packets(tuns: &[File], wait: Duration) {
@@ -222,42 +226,52 @@ fn await_packets(tuns: &[File], wait: Duration) {
 fn carry(wire: &Wire, mut tuns: Vec<File>, mut random: Xoshiro256PlusPlus) {
     let mut under_way: VecDeque<Packet> = VecDeque::new();
     let mut under_way_bytes = 0;
-    let mut buffer = vec![0; PACKET_BYTES_MAX as usize];
+    // Used again: the wire shares the processor with what is measured on it.
+    let mut free: Vec<Vec<u8>> = Vec::new();
     while !wire.over.load(Ordering::Acquire) {
         let now = Instant::now();
         let wait = under_way.front().map_or(LOOK, |first| first.due.saturating_duration_since(now));
-        let wait = wait.min(LOOK);
-        await_packets(&tuns, wait);
+        await_packets(&tuns, wait.min(LOOK));
         for from in 0..tuns.len() {
-            while let Ok(len) = tuns[from].read(&mut buffer) {
-                let to =
-                    buffer.get(19).map_or(usize::MAX, |last| usize::from(*last).wrapping_sub(1));
-                let ours = len >= 20 && buffer[0] >> 4 == 4 && buffer[16..19] == NETWORK;
-                let down = wire.down.load(Ordering::Acquire);
-                let is_down = to < tuns.len() && (down >> from | down >> to) & 1 == 1;
+            loop {
+                let mut bytes = free.pop().unwrap_or_else(|| vec![0; PACKET_BYTES_MAX as usize]);
+                let Ok(len) = tuns[from].read(&mut bytes) else {
+                    free.push(bytes);
+                    break;
+                };
+                let to = receiver(wire, (from, tuns.len()), &bytes[..len]);
                 let loss = wire.loss_per_million.load(Ordering::Acquire);
                 let is_lost = random.random_range(0..PER_MILLION) < loss;
                 let full = under_way_bytes + len > UNDER_WAY_BYTES_MAX;
-                if !ours || to >= tuns.len() || is_down || is_lost || full {
+                let Some(to) = to.filter(|_| !is_lost && !full) else {
                     wire.lost.fetch_add(1, Ordering::AcqRel);
+                    free.push(bytes);
                     continue;
-                }
+                };
                 let delay = Duration::from_micros(wire.delay_us.load(Ordering::Acquire));
-                let due = Instant::now() + delay;
                 under_way_bytes += len;
-                under_way.push_back(Packet { due, to, bytes: buffer[..len].to_vec() });
+                under_way.push_back(Packet { due: Instant::now() + delay, to, bytes, len });
             }
         }
         while under_way.front().is_some_and(|first| first.due <= Instant::now()) {
-            let Some(Packet { to, bytes, .. }) = under_way.pop_front() else { break };
-            under_way_bytes -= bytes.len();
+            let Some(Packet { to, bytes, len, .. }) = under_way.pop_front() else { break };
+            under_way_bytes -= len;
             // A queue of the kernel's that is full loses a packet, as they do.
-            match tuns[to].write(&bytes) {
+            match tuns[to].write(&bytes[..len]) {
                 Err(error) if error.kind() == ErrorKind::WouldBlock => {
                     wire.lost.fetch_add(1, Ordering::AcqRel);
                 }
                 _ => drop(wire.carried.fetch_add(1, Ordering::AcqRel)),
             }
+            free.push(bytes);
         }
     }
+}
+
+/// The host that a packet goes to, if it is one of ours and neither end is cut off.
+fn receiver(wire: &Wire, (from, hosts): (usize, usize), packet: &[u8]) -> Option<usize> {
+    let is_ours = packet.len() >= 20 && packet[0] >> 4 == 4 && packet[16..19] == NETWORK;
+    let to = usize::from(packet.get(19)?.checked_sub(1)?);
+    let down = wire.down.load(Ordering::Acquire);
+    (is_ours && to < hosts && (down >> from | down >> to) & 1 == 0).then_some(to)
 }

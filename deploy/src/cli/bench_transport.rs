@@ -37,6 +37,7 @@ EXAMPLES
   dmprl bench transport --level log        # what that level costs
   dmprl bench transport --listen tcp/0.0.0.0:7448 --seconds 10
   dmprl bench transport --connect tcp/10.0.0.1:7448 --workers 4
+  dmprl bench transport --connect tcp/10.0.0.1:7448 --workers 4 --rate 20000
   dmprl bench transport --peer-python /opt/zeromq/bin/python";
 
 /// As `delivery.level`.
@@ -74,6 +75,10 @@ pub(super) struct TransportArgs {
     /// Measure between hosts: send to who listens at this Zenoh endpoint.
     #[arg(long, value_name = "ENDPOINT")]
     connect: Option<String>,
+    /// Segments a second that the workers make together, with --connect [default: as many as can be].
+    #[arg(long, value_name = "N", requires = "connect",
+          value_parser = clap::value_parser!(u32).range(1..))]
+    rate: Option<u32>,
     /// Zenoh's own configuration (JSON5), with --listen or --connect.
     #[arg(long, value_name = "FILE")]
     zenoh_config: Option<PathBuf>,
@@ -113,7 +118,9 @@ fn between_hosts(args: &TransportArgs) -> anyhow::Result<Outcome> {
     let (file, duration) = (args.zenoh_config.as_deref(), Duration::from_secs_f64(args.seconds));
     let figures = match (&args.listen, &args.connect) {
         (Some(endpoint), _) => bench::listen(endpoint, file, duration)?,
-        (None, Some(endpoint)) => bench::connect(endpoint, file, args.workers.unwrap_or(1))?,
+        (None, Some(endpoint)) => {
+            bench::connect(endpoint, file, (args.workers.unwrap_or(1), args.rate))?
+        }
         (None, None) => return Ok(Outcome::Done),
     };
     let Some(figures) = figures else { return Ok(Outcome::Interrupted) };

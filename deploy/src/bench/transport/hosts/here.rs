@@ -1,7 +1,8 @@
 //! The learner's end.
 
+use std::collections::VecDeque;
 use std::path::Path;
-use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex, PoisonError};
 use std::thread::{self, JoinHandle};
 use std::time::{Duration, Instant};
@@ -88,28 +89,27 @@ pub fn listen(
 #[derive(Default)]
 struct Policies {
     over: AtomicBool,
-    published: AtomicU64,
-    /// Of the newest: when it was published, until the other host has confirmed it.
-    under_way: Mutex<Option<Instant>>,
+    /// Version and time of those that no host has confirmed.
+    under_way: Mutex<VecDeque<(u64, Instant)>>,
     /// From publishing to the other host's confirmation, the way back included \[ms\].
     ages_ms: Mutex<Vec<f64>>,
 }
 
 impl Policies {
-    fn publish(&self) -> u64 {
-        *self.under_way.lock().unwrap_or_else(PoisonError::into_inner) = Some(Instant::now());
-        self.published.fetch_add(1, Ordering::AcqRel) + 1
+    fn publish(&self, version: u64) {
+        let mut under_way = self.under_way.lock().unwrap_or_else(PoisonError::into_inner);
+        under_way.push_back((version, Instant::now()));
     }
 
     fn has_confirmed(&self) -> bool {
         !self.ages_ms.lock().unwrap_or_else(PoisonError::into_inner).is_empty()
     }
 
+    /// Those before it were replaced on the way.
     fn confirm(&self, version: u64) {
         let mut under_way = self.under_way.lock().unwrap_or_else(PoisonError::into_inner);
-        if version == self.published.load(Ordering::Acquire)
-            && let Some(since) = under_way.take()
-        {
+        let arrived = under_way.iter().take_while(|(first, _)| *first <= version).count();
+        if let Some((_, since)) = under_way.drain(..arrived).next_back() {
             let age_ms = since.elapsed().as_secs_f64() * 1e3;
             self.ages_ms.lock().unwrap_or_else(PoisonError::into_inner).push(age_ms);
         }
@@ -124,6 +124,7 @@ struct Taker {
     told: Instant,
     published: Option<Instant>,
     first: Option<Instant>,
+    version: u64,
     taken: u64,
     lost: u64,
     repeated: u64,
@@ -139,6 +140,7 @@ impl Taker {
             told: Instant::now(),
             published: None,
             first: None,
+            version: 0,
             taken: 0,
             lost: 0,
             repeated: 0,
@@ -164,7 +166,9 @@ impl Taker {
         }
         if self.published.is_none_or(|at| at.elapsed() >= PUBLISH_INTERVAL) {
             self.published = Some(Instant::now());
-            let version = policies.publish();
+            self.version += 1;
+            let version = self.version;
+            policies.publish(version);
             let values = vec![version as f32; PARAMETERS];
             let architecture_hash = plan(1).architecture_hash;
             let env_steps = self.taken;

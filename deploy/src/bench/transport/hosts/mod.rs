@@ -20,7 +20,9 @@ use crate::run_directory::random_u64;
 /// Values of a policy: half a megabyte.
 const PARAMETERS: usize = 131_072;
 /// What a worker keeps, and the gateway of each: more than any link here has under way.
-const KEPT: usize = 16_384;
+const KEPT: usize = 32_768;
+/// What a host may have under way \[bytes\]: likewise.
+const UNDER_WAY_BYTES_MAX: u64 = 256 << 20;
 /// Made-up segments are no secret.
 const TOKEN: &str = "bench transport between hosts";
 const IDLE: Duration = Duration::from_micros(200);

@@ -13,7 +13,7 @@ use dmprl_shared::transport::delivery::{Acknowledgements, Outbox};
 use dmprl_shared::transport::shared_memory::{Plan, attach};
 use serde_json::{Value, json};
 
-use super::{IDLE, INTERVAL, KEPT, PATIENCE, TOKEN, domain, plan};
+use super::{IDLE, INTERVAL, KEPT, PATIENCE, TOKEN, UNDER_WAY_BYTES_MAX, domain, plan};
 use crate::bench::made_up::MadeUp;
 use crate::bench::watch::Watch;
 use crate::bridge::relay::{Asked, Asking, HostCounts, Relay, Turn, ask};
@@ -25,14 +25,14 @@ use crate::run_directory::random_u64;
 const TOGETHER: usize = 32;
 
 /// Sends made-up segments to who listens at the endpoint until that has enough; none when
-/// interrupted.
+/// interrupted. `rate`: what the workers make together \[segments/s\]; else as many as they can.
 ///
 /// # Errors
 /// Nobody listens there, or an end fails.
 pub fn connect(
     endpoint: &str,
     zenoh_file: Option<&Path>,
-    workers: u32,
+    (workers, rate): (u32, Option<u32>),
 ) -> anyhow::Result<Option<Value>> {
     let watch = Watch::start()?;
     let asking = Asking {
@@ -45,15 +45,17 @@ pub fn connect(
     let Some(held) = welcomed(&asking, zenoh_file, &watch)? else { return Ok(None) };
     let mut config = ExperimentConfig::default();
     config.delivery.unacknowledged_segments = KEPT;
+    config.bridge.under_way_bytes_max = UNDER_WAY_BYTES_MAX;
     let domain = domain()?;
     let plan = plan(workers as usize);
     let at = (domain.path(), &plan);
     let mut relay = Relay::start(asking, (held, zenoh_file), at, &config)?;
     let over = Arc::new(AtomicBool::new(false));
+    let each = rate.map(|rate| f64::from(rate) / f64::from(workers));
     let threads: Vec<JoinHandle<anyhow::Result<()>>> = (0..workers)
         .map(|index| {
             let (over, path, plan) = (Arc::clone(&over), domain.path().to_owned(), plan.clone());
-            thread::spawn(move || work(index, (&path, &plan), &over))
+            thread::spawn(move || work((index, each), (&path, &plan), &over))
         })
         .collect();
     let interrupted = loop {
@@ -98,8 +100,12 @@ fn welcomed(
     }
 }
 
-/// A worker that only sends.
-fn work(index: u32, (domain, plan): (&PathBuf, &Plan), over: &AtomicBool) -> anyhow::Result<()> {
+/// A worker that only sends, `rate` segments a second or as many as it can.
+fn work(
+    (index, rate): (u32, Option<f64>),
+    (domain, plan): (&PathBuf, &Plan),
+    over: &AtomicBool,
+) -> anyhow::Result<()> {
     let began = Instant::now();
     let mut end = loop {
         match attach(domain, plan, index as usize) {
@@ -111,18 +117,26 @@ fn work(index: u32, (domain, plan): (&PathBuf, &Plan), over: &AtomicBool) -> any
     let mut outbox = Outbox::new(plan.layout, KEPT, index, 0);
     let mut made_up = MadeUp::new(plan.layout, index);
     let mut heard = Acknowledgements::default();
+    let (began, mut made) = (Instant::now(), 0_usize);
     while !over.load(Ordering::Acquire) {
         if end.acknowledgements.newest(&mut heard)? {
             outbox.acknowledge(&heard);
         }
         let room = outbox.capacity() - outbox.len();
-        let together = if outbox.unsent() == 0 { room.min(TOGETHER) } else { 0 };
+        let due = rate.map_or(TOGETHER, |rate| {
+            let due = (began.elapsed().as_secs_f64() * rate) as usize;
+            // Time in which nothing could be made is gone, as it is for a robot.
+            made = made.max(due.saturating_sub(TOGETHER));
+            due - made
+        });
+        let together = if outbox.unsent() == 0 { room.min(TOGETHER).min(due) } else { 0 };
+        made += together;
         for _ in 0..together {
             let Segment { header, block } = made_up.next();
             outbox.put(header, block);
         }
         outbox.offer(&mut end.segments)?;
-        if outbox.unsent() > 0 || room == 0 {
+        if outbox.unsent() > 0 || together == 0 {
             thread::sleep(IDLE);
         }
     }
