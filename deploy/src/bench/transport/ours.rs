@@ -23,8 +23,10 @@ const START: Duration = Duration::from_secs(60);
 const MEASURE_SLACK: Duration = Duration::from_secs(30);
 /// A worker that is stopped answers within milliseconds; one that waits, at its next look.
 const STOP: Duration = Duration::from_secs(30);
-/// What still lies in the queues is taken in less.
+/// What still lies in the queues is taken so long at a time, and is lost if it has not come after so
+/// long altogether: a busy machine may not let this process take.
 const DRAIN: Duration = Duration::from_millis(100);
+const DRAIN_MAX: Duration = Duration::from_secs(10);
 
 /// A full log is emptied, as by a checkpoint: a benchmark must not fill the disk.
 const LOG_BYTES_MAX: u64 = 256 << 20;
@@ -98,7 +100,13 @@ impl Ours {
         }
         // They have ended, which is no death any more.
         self.children.clear();
-        self.ask(Request::Measure(DRAIN, From::All), watch, DRAIN + MEASURE_SLACK)?;
+        let began = Instant::now();
+        loop {
+            self.ask(Request::Measure(DRAIN, From::All), watch, DRAIN + MEASURE_SLACK)?;
+            if self.discrepancies.received >= sent || began.elapsed() >= DRAIN_MAX {
+                break;
+            }
+        }
         let Discrepancies { received, lost, .. } = self.discrepancies;
         // Missing in the middle of a sequence, or behind its end.
         let lost = lost.max(sent.saturating_sub(received));
