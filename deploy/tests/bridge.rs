@@ -33,21 +33,12 @@ const FIRST: usize = 1;
 const ARCHITECTURE: u64 = 9;
 const LAYOUT: SegmentLayout =
     SegmentLayout { segment_steps: 5, observation_len: 20, action_len: 4 };
-
-fn plan(worker_count: usize) -> Plan {
-    Plan {
-        run_id: 7,
-        architecture_hash: ARCHITECTURE,
-        layout: LAYOUT,
-        worker_count,
-        queue_segments: 8,
-        parameters_len: 1_000,
-    }
-}
+/// What an end keeps of each worker.
+const KEPT: usize = 512;
 
 fn config() -> ExperimentConfig {
     let mut config = ExperimentConfig::default();
-    config.delivery.unacknowledged_segments = 512;
+    config.delivery.unacknowledged_segments = KEPT;
     config.bridge.under_way_bytes_max = 1 << 20;
     config
 }
@@ -67,14 +58,17 @@ fn facts() -> RunFacts {
     }
 }
 
-fn asking(endpoint: &str) -> Asking {
+fn asking(endpoint: &str, workers: usize) -> Asking {
     let (endpoint, token) = (endpoint.to_owned(), facts().token);
-    Asking { endpoint, token, host: 1, name: "b".into(), workers: WORKERS as u32 }
+    Asking { endpoint, token, host: 1, name: "b".into(), workers: workers as u32 }
 }
 
 /// What everybody shares.
-#[derive(Default)]
 struct Stage {
+    layout: SegmentLayout,
+    /// Of the other host, and how many segments each of them sends.
+    workers: usize,
+    segments: u64,
     over: AtomicBool,
     settled: AtomicU64,
     gaps: AtomicU64,
@@ -86,6 +80,36 @@ struct Stage {
 }
 
 impl Stage {
+    fn new(layout: SegmentLayout, workers: usize, segments: u64) -> Arc<Self> {
+        Arc::new(Self {
+            layout,
+            workers,
+            segments,
+            over: AtomicBool::default(),
+            settled: AtomicU64::default(),
+            gaps: AtomicU64::default(),
+            refused: AtomicU64::default(),
+            replaced: AtomicU64::default(),
+            replacements: Default::default(),
+        })
+    }
+
+    fn plan(&self, worker_count: usize) -> Plan {
+        Plan {
+            run_id: 7,
+            architecture_hash: ARCHITECTURE,
+            layout: self.layout,
+            worker_count,
+            queue_segments: 8,
+            parameters_len: 1_000,
+        }
+    }
+
+    /// The learner's.
+    fn whole_plan(&self) -> Plan {
+        self.plan(FIRST + self.workers)
+    }
+
     fn is_over(&self) -> bool {
         self.over.load(Ordering::Acquire)
     }
@@ -106,12 +130,12 @@ impl Stage {
 
 /// A learner that remembers what it has settled, as one with a segment log does.
 fn learner(stage: &Stage, domain: PathBuf) {
-    let mut inbox = Inbox::new(FIRST + WORKERS);
+    let mut inbox = Inbox::new(FIRST + stage.workers);
     let mut version = 0;
     for times in 1.. {
         let LearnerEnd { mut segments, mut parameters, mut acknowledgements } =
-            serve(&domain, &plan(FIRST + WORKERS)).unwrap();
-        let mut segment = Segment::zeroed(LAYOUT);
+            serve(&domain, &stage.whole_plan()).unwrap();
+        let mut segment = Segment::zeroed(stage.layout);
         let mut looked = Instant::now() - PATIENCE;
         while !stage.is_over() && !stage.is_replaced(0, times) {
             if !segments.try_receive(&mut segment).unwrap() {
@@ -152,9 +176,8 @@ fn gateway(stage: &Stage, domain: PathBuf, endpoint: String) {
     for times in 1.. {
         let endpoints = [endpoint.clone()];
         let open = || {
-            let plan = plan(FIRST + WORKERS);
-            let places = (FIRST, 0, 512);
-            Gateway::open((&endpoints, None), (&domain, plan), places, facts())
+            let places = (FIRST, 0, KEPT);
+            Gateway::open((&endpoints, None), (&domain, stage.whole_plan()), places, facts())
         };
         let deadline = Instant::now() + PATIENCE;
         // The learner may just be being replaced.
@@ -181,8 +204,9 @@ fn gateway(stage: &Stage, domain: PathBuf, endpoint: String) {
 fn relay(stage: &Stage, domain: PathBuf, endpoint: String) {
     for times in 1.. {
         let held = Held { first: FIRST as u32, session: 0 };
-        let at = (domain.as_path(), &plan(WORKERS));
-        let mut relay = Relay::start(asking(&endpoint), (held, None), at, &config()).unwrap();
+        let at = (domain.as_path(), &stage.plan(stage.workers));
+        let asking = asking(&endpoint, stage.workers);
+        let mut relay = Relay::start(asking, (held, None), at, &config()).unwrap();
         while !stage.is_over() && !stage.is_replaced(2, times) {
             relay.turn(&HostCounts::default()).unwrap();
             thread::sleep(Duration::from_micros(100));
@@ -197,22 +221,22 @@ fn relay(stage: &Stage, domain: PathBuf, endpoint: String) {
 
 /// A worker that sends as fast as it may, until the learner has acknowledged all of it; returns the
 /// newest policy that it has seen.
-fn worker(index: u32, domain: PathBuf) -> u64 {
+fn worker(stage: &Stage, index: u32, domain: PathBuf) -> u64 {
     let deadline = Instant::now() + PATIENCE;
     let mut end = loop {
-        match attach(&domain, &plan(WORKERS), index as usize) {
+        match attach(&domain, &stage.plan(stage.workers), index as usize) {
             Ok(end) => break end,
             Err(error) => assert!(Instant::now() < deadline, "{error}"),
         }
         thread::sleep(Duration::from_millis(2));
     };
-    let mut outbox = Outbox::new(LAYOUT, 512, index, 0);
+    let mut outbox = Outbox::new(stage.layout, KEPT, index, 0);
     let (mut heard, mut snapshot) = (Acknowledgements::default(), ParameterSnapshot::default());
     let mut sequence = 0;
-    let mut block = vec![0.0; LAYOUT.block_len()];
-    while sequence < SEGMENTS || !outbox.is_empty() {
+    let mut block = vec![0.0; stage.layout.block_len()];
+    while sequence < stage.segments || !outbox.is_empty() {
         assert!(Instant::now() < deadline, "worker {index} at {sequence}, kept {}", outbox.len());
-        if sequence < SEGMENTS && outbox.len() < outbox.capacity() {
+        if sequence < stage.segments && outbox.len() < outbox.capacity() {
             sequence += 1;
             block[0] = sequence as f32;
             let header = SegmentHeader {
@@ -235,15 +259,14 @@ fn worker(index: u32, domain: PathBuf) -> u64 {
     snapshot.version
 }
 
-#[test]
-fn all_arrives_once_and_in_order_while_learner_gateway_and_relay_are_replaced() {
-    let folder = tempfile::tempdir().unwrap();
-    let domains = ["a", "b"].map(|name| Domain::create(&folder.path().join("p"), name).unwrap());
+/// Learner, gateway and relay, then workers, each on a thread.
+type Replaced = [thread::JoinHandle<()>; 3];
+
+fn start(stage: &Arc<Stage>, domains: &[Domain; 2]) -> (Replaced, Vec<thread::JoinHandle<u64>>) {
     let [here, there] = domains.each_ref().map(|domain| domain.path().to_owned());
     let endpoint = endpoint();
-    let stage = Arc::new(Stage::default());
     let spawn = |work: fn(&Stage, PathBuf, String), domain: &PathBuf| {
-        let (stage, domain, endpoint) = (Arc::clone(&stage), domain.clone(), endpoint.clone());
+        let (stage, domain, endpoint) = (Arc::clone(stage), domain.clone(), endpoint.clone());
         thread::spawn(move || work(&stage, domain, endpoint))
     };
     let ends = [
@@ -251,12 +274,40 @@ fn all_arrives_once_and_in_order_while_learner_gateway_and_relay_are_replaced() 
         spawn(gateway, &here),
         spawn(relay, &there),
     ];
-    let workers: Vec<_> = (0..WORKERS as u32)
-        .map(|index| {
-            let there = there.clone();
-            thread::spawn(move || worker(index, there))
-        })
-        .collect();
+    let workers = (0..stage.workers as u32).map(|index| {
+        let (stage, there) = (Arc::clone(stage), there.clone());
+        thread::spawn(move || worker(&stage, index, there))
+    });
+    (ends, workers.collect())
+}
+
+fn two_domains(folder: &std::path::Path) -> [Domain; 2] {
+    ["a", "b"].map(|name| Domain::create(&folder.join("p"), name).unwrap())
+}
+
+/// Longer than the window is at first: it once was never opened for the first of them.
+#[test]
+fn segments_of_any_length_arrive() {
+    let layout = SegmentLayout { segment_steps: 5, observation_len: 5_000, action_len: 4 };
+    assert!(layout.block_len() * size_of::<f32>() > 65_536);
+    let folder = tempfile::tempdir().unwrap();
+    let domains = two_domains(folder.path());
+    let stage = Stage::new(layout, 1, 100);
+    let (ends, workers) = start(&stage, &domains);
+    for worker in workers {
+        worker.join().unwrap();
+    }
+    stage.over.store(true, Ordering::Release);
+    ends.into_iter().for_each(|end| end.join().unwrap());
+    assert_eq!(stage.settled.load(Ordering::Acquire), 100);
+}
+
+#[test]
+fn all_arrives_once_and_in_order_while_learner_gateway_and_relay_are_replaced() {
+    let folder = tempfile::tempdir().unwrap();
+    let domains = two_domains(folder.path());
+    let stage = Stage::new(LAYOUT, WORKERS, SEGMENTS);
+    let (ends, workers) = start(&stage, &domains);
     let total = WORKERS as u64 * SEGMENTS;
     for (round, end) in [2, 1, 0, 1, 0, 2].into_iter().enumerate() {
         let some = total * (round as u64 + 1) / 8;
@@ -294,7 +345,7 @@ fn who_has_another_token_or_version_is_told_so_and_who_speaks_nonsense_is_passed
     let domain = Domain::create(&folder.path().join("p"), "a").unwrap();
     let path = domain.path().to_owned();
     let endpoint = endpoint();
-    let stage = Arc::new(Stage::default());
+    let stage = Stage::new(LAYOUT, WORKERS, SEGMENTS);
     let learning = Arc::clone(&stage);
     let serving = path.clone();
     let learner = thread::spawn(move || learner(&learning, serving));
@@ -304,9 +355,8 @@ fn who_has_another_token_or_version_is_told_so_and_who_speaks_nonsense_is_passed
         thread::spawn(move || {
             let deadline = Instant::now() + PATIENCE;
             let open = || {
-                let plan = plan(FIRST + WORKERS);
-                let at = ([endpoint.clone()], FIRST);
-                Gateway::open((&at.0, None), (&path, plan), (at.1, 0, 512), facts())
+                let at = ([endpoint.clone()], (&*path, stage.whole_plan()));
+                Gateway::open((&at.0, None), at.1, (FIRST, 0, KEPT), facts())
             };
             let mut gateway = loop {
                 match open() {
@@ -336,7 +386,7 @@ fn who_has_another_token_or_version_is_told_so_and_who_speaks_nonsense_is_passed
         Asked::Refused(reason) => reason,
         other => panic!("{other:?}"),
     };
-    let right = asking(&endpoint);
+    let right = asking(&endpoint, WORKERS);
     let wrong = Asking { token: "another secret of some length".into(), ..right.clone() };
     assert!(refused(&wrong, None).contains("token"));
     let many = Asking { workers: 99, ..right.clone() };

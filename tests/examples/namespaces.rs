@@ -1,7 +1,8 @@
 //! `dmprl bench transport` between two hosts of its own, network namespaces on a wire that takes
 //! its time and loses some: what docs/benchmarks.md has figures of. Needs root.
 //!
-//!     cargo run --release --package dmprl-tests --example namespaces -- MS LOSS SECONDS WORKERS [RATE]
+//!     cargo run --release --package dmprl-tests --example namespaces -- \
+//!         MS LOSS SECONDS WORKERS [RATE]
 //!
 //! MS: milliseconds each way. WORKERS: 0 for policies alone. RATE: segments a second they make
 //! together; without it as many as they can.

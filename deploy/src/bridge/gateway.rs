@@ -21,7 +21,7 @@ use super::link::{Ends, Inlet, Link, Message, Outlet, Question, Questions, Token
 use super::relay::JOIN;
 use super::seats::{Host, Refusal, Seats};
 use super::token;
-use super::wire::{self, Course, HostAnswer, HostRequest, HostStatus, HostWelcome};
+use super::wire::{self, Course, Hearing, HostAnswer, HostRequest, HostStatus, HostWelcome};
 use crate::control::{Greeting, HostNow};
 use crate::run_directory::random_u64;
 
@@ -34,8 +34,10 @@ const ATTACH_INTERVAL: Duration = Duration::from_millis(50);
 /// Hosts of a gateway that died speak by their old seats for a while: longer than it takes them to
 /// notice.
 const FORMER: Duration = Duration::from_secs(15);
-/// Messages taken before the queues are looked at again.
+/// Messages of a kind taken before anything else is looked at again.
 const MESSAGES_TOGETHER: usize = 64;
+/// Characters of a host's name.
+const NAME_MAX: usize = 64;
 
 /// What a host that joins is told of the run.
 #[derive(Debug, Clone)]
@@ -91,7 +93,6 @@ pub struct Gateway {
     domain: PathBuf,
     plan: Plan,
     capacity: usize,
-    first: usize,
     seats: Seats,
     outlets: BTreeMap<u64, Outlets>,
     ports: BTreeMap<usize, Port>,
@@ -106,6 +107,8 @@ pub struct Gateway {
     attached: Instant,
     /// Messages of nobody, or damaged.
     refused: u64,
+    /// Questions of those that may not take part; the first is told of, then each doubling.
+    refusals: u64,
     /// When any host last was given another seat than it had, here or by a gateway before.
     reseated: Instant,
     id: u64,
@@ -142,7 +145,6 @@ impl Gateway {
             buffer: Segment::zeroed(plan.layout),
             plan,
             capacity,
-            first,
             seats: Seats::new(first_worker, places, session),
             outlets: BTreeMap::new(),
             ports: BTreeMap::new(),
@@ -155,6 +157,7 @@ impl Gateway {
             told: now,
             attached: now,
             refused: 0,
+            refusals: 0,
             reseated: now,
             _token: link.token(format!("dmprl/{}/gateway/{id:016x}", facts.run_id))?,
             id,
@@ -170,20 +173,16 @@ impl Gateway {
     /// Something is broken that does not mend.
     pub fn turn(&mut self) -> anyhow::Result<bool> {
         let now = Instant::now();
-        while let Some(question) = self.questions.next()? {
+        for _ in 0..MESSAGES_TOGETHER {
+            let Some(question) = self.questions.next()? else { break };
             self.answer(&question, now)?;
         }
-        while let Some(message) = self.tokens.next()? {
-            self.on_token(&message, now);
-        }
+        self.watch(now)?;
         let mut worked = false;
         for _ in 0..MESSAGES_TOGETHER {
             let Some(message) = self.segments.next()? else { break };
             worked = true;
             self.land(&message, now);
-        }
-        while let Some(message) = self.statuses.next()? {
-            self.on_status(&message, now)?;
         }
         self.attach(now)?;
         self.offer()?;
@@ -211,15 +210,7 @@ impl Gateway {
     /// All hosts, for whoever watches the run.
     #[must_use]
     pub fn hosts(&self) -> Vec<HostNow> {
-        let of = |host: &Host| HostNow {
-            name: host.name.clone(),
-            here: host.here,
-            workers: host.status.as_ref().map_or(0, |status| status.workers.count),
-            kept: host.status.as_ref().map_or(0, |status| status.workers.queued_segments),
-            acked: host.status.as_ref().map_or(0, |status| status.sent.acked),
-            restarts: host.status.as_ref().map_or(0, |status| status.workers.restarts),
-        };
-        self.seats.hosts().iter().map(of).collect()
+        self.seats.hosts().iter().map(Host::shown).collect()
     }
 
     /// The policy that each host has.
@@ -228,10 +219,16 @@ impl Gateway {
         statuses.map(|status| status.policy_version)
     }
 
-    /// Whether no host is there.
+    /// Whether no host has been heard from for so long that has not left since.
     #[must_use]
-    pub fn is_alone(&self) -> bool {
-        self.seats.hosts().iter().all(|host| !host.here)
+    pub fn is_alone(&self, for_so_long: Duration) -> bool {
+        self.seats.hosts().iter().all(|host| host.heard.elapsed() >= for_so_long)
+    }
+
+    /// The first session that no host was given yet: what the next gateway of the run begins with.
+    #[must_use]
+    pub fn session(&self) -> u32 {
+        self.seats.session()
     }
 
     /// Tells all hosts where the run is on its way, and what was acknowledged.
@@ -253,15 +250,28 @@ impl Gateway {
         Ok(())
     }
 
-    /// Notes who comes and goes while nothing else is done.
+    /// Notes who comes and goes, and what the hosts tell of themselves.
     ///
     /// # Errors
     /// The session is closed.
-    pub fn watch(&mut self) -> anyhow::Result<()> {
-        while let Some(message) = self.tokens.next()? {
-            self.on_token(&message, Instant::now());
+    pub fn watch(&mut self, now: Instant) -> anyhow::Result<()> {
+        for _ in 0..MESSAGES_TOGETHER {
+            let Some(message) = self.tokens.next()? else { break };
+            self.on_token(&message, now);
+        }
+        for _ in 0..MESSAGES_TOGETHER {
+            let Some(message) = self.statuses.next()? else { break };
+            self.on_status(&message, now)?;
         }
         Ok(())
+    }
+
+    /// Whoever may not take part may ask as often as it likes: that fills no log.
+    fn tell_of_refusal(&mut self, what: impl FnOnce() -> String) {
+        self.refusals += 1;
+        if self.refusals.is_power_of_two() {
+            self.news.push(News::Told(what()));
+        }
     }
 
     fn answer(&mut self, question: &Question, now: Instant) -> anyhow::Result<()> {
@@ -284,17 +294,21 @@ impl Gateway {
             .map_err(|_| never(format!("expected a request of {this}, got something else")))?;
         if speaks != this {
             let reason = format!("expected {this}, got {speaks}: start both from the same build");
-            self.news.push(News::Told(format!("a host of {speaks} may not take part")));
+            self.tell_of_refusal(|| format!("a host of {speaks} may not take part"));
             return Err(never(reason));
         }
         let request: HostRequest = serde_json::from_slice(bytes)
             .map_err(|error| never(format!("expected a request, got another: {error}")))?;
         if !token::equal(&request.token, &self.facts.token) {
-            let name = request.name.escape_debug();
-            self.news
-                .push(News::Told(format!("host {name} may not take part: its token is wrong")));
+            self.tell_of_refusal(|| {
+                let name = request.name.escape_debug().take(NAME_MAX).collect::<String>();
+                format!("host {name} may not take part: its token is wrong")
+            });
             let reason = "its token is not the run's: copy bridge.token of the run's directory";
             return Err(never(reason.to_owned()));
+        }
+        if request.name.chars().count() > NAME_MAX {
+            return Err(never(format!("its name has more than {NAME_MAX} characters (--name)")));
         }
         if self.heard.marks.is_empty() {
             let reason = "the learner has not said yet how far its workers are".to_owned();
@@ -304,7 +318,7 @@ impl Gateway {
         let known = self.seats.hosts().iter().find(|host| host.host == request.host);
         let before = known.map(|host| host.seat);
         // Its relay asks once more than its command line did: nothing that anybody should read.
-        let was_here = known.is_some_and(|host| host.here);
+        let was_here = request.held.is_some() && known.is_some_and(|host| host.here);
         let held = self.seats.admit(&request, seat, (&self.heard.marks, now))?;
         if let Some(before) = before {
             self.outlets.remove(&before);
@@ -388,13 +402,16 @@ impl Gateway {
     }
 
     fn on_status(&mut self, message: &Message, now: Instant) -> anyhow::Result<()> {
-        let Ok(status) = serde_json::from_slice::<HostStatus>(&message.bytes()) else {
+        let Ok(mut status) = serde_json::from_slice::<HostStatus>(&message.bytes()) else {
             self.refused += 1;
             return Ok(());
         };
         let Some(host) = self.host(message) else { return Ok(()) };
         host.heard = now;
         let (name, seat) = (host.name.clone(), host.seat);
+        if let Some(before) = &host.status {
+            status.no_less_than(before);
+        }
         // A gateway that took over mid-way begins to count where the host is.
         let before = host.status.replace(status.clone());
         let before = before.unwrap_or_else(|| match host.counted_before {
@@ -411,8 +428,11 @@ impl Gateway {
             self.news.push(News::EnvFailures { count, host: name.clone() });
         }
         if status.leaves {
-            self.seats.remove(seat);
-            self.outlets.remove(&seat);
+            let workers = self.seats.remove(seat).map_or(0, |host| host.workers);
+            if let Some(outlets) = self.outlets.remove(&seat) {
+                let none = vec![Hearing::default(); workers as usize];
+                outlets.hearings.send(wire::write_hearings(Course::Left, &none))?;
+            }
             self.reseated = now;
             self.news.push(News::Told(format!("host {} has left", name.escape_debug())));
         }
@@ -474,11 +494,5 @@ impl Gateway {
     #[must_use]
     pub fn kept(&self) -> usize {
         self.ports.values().map(|port| port.landing.kept()).sum()
-    }
-
-    /// The first worker of other hosts.
-    #[must_use]
-    pub fn first(&self) -> usize {
-        self.first
     }
 }

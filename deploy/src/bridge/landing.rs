@@ -18,6 +18,9 @@ pub struct Landing {
     layout: SegmentLayout,
     capacity: usize,
     outbox: Option<Outbox>,
+    /// What is kept of the start of the worker before: the learner takes nothing of it any more
+    /// once it knows the newer, so it goes first.
+    older: Option<Outbox>,
     /// The attempt in which something was missing.
     refused: u32,
     /// The segment that follows in the stretch that is being read; none: it is passed over.
@@ -30,8 +33,17 @@ impl Landing {
     /// Nothing has come of the worker yet.
     #[must_use]
     pub fn new(worker: u32, layout: SegmentLayout, capacity: usize) -> Self {
-        let (outbox, expected, mark) = (None, None, Mark::default());
-        Self { worker, layout, capacity, outbox, refused: 0, expected, mark, misfits: 0 }
+        Self {
+            worker,
+            layout,
+            capacity,
+            outbox: None,
+            older: None,
+            refused: 0,
+            expected: None,
+            mark: Mark::default(),
+            misfits: 0,
+        }
     }
 
     /// Segments that were not what their stretch said.
@@ -43,7 +55,7 @@ impl Landing {
     /// Segments that the learner has not acknowledged.
     #[must_use]
     pub fn kept(&self) -> usize {
-        self.outbox.as_ref().map_or(0, Outbox::len)
+        self.older.iter().chain(&self.outbox).map(Outbox::len).sum()
     }
 
     /// A stretch begins. Where something is missing before it, its attempt is refused, and the host
@@ -64,6 +76,16 @@ impl Landing {
         if starts {
             let room = (self.layout, self.capacity);
             let incarnation = stretch.incarnation;
+            let newer = self.outbox.take_if(|outbox| outbox.incarnation() < incarnation);
+            if let Some(outbox) = newer.filter(|outbox| !outbox.is_empty()) {
+                if self.older.is_some() {
+                    // Two starts in the time of a learner's absence are kept, a third comes later.
+                    self.outbox = Some(outbox);
+                    self.refused = stretch.attempt;
+                    return;
+                }
+                self.older = Some(outbox);
+            }
             self.outbox = Some(Outbox::starting_at(stretch.first, room, self.worker, incarnation));
         }
         let Some(outbox) = &self.outbox else { return };
@@ -100,7 +122,7 @@ impl Landing {
     /// # Errors
     /// Those of the queue.
     pub fn offer(&mut self, queue: &mut impl SegmentSender) -> Result<SendOutcome, TransportError> {
-        match &mut self.outbox {
+        match self.older.as_mut().or(self.outbox.as_mut()) {
             Some(outbox) if !outbox.is_empty() => outbox.offer(queue),
             _ => Ok(SendOutcome::Delivered),
         }
@@ -109,9 +131,10 @@ impl Landing {
     /// The learner has acknowledged so much.
     pub fn acknowledge(&mut self, mark: Mark) {
         self.mark = mark;
-        if let Some(outbox) = &mut self.outbox {
+        for outbox in self.older.iter_mut().chain(&mut self.outbox) {
             lane::acknowledge(outbox, mark, (self.layout, self.capacity));
         }
+        self.older.take_if(|outbox| outbox.is_empty());
     }
 
     /// What the host is to know.
@@ -122,5 +145,71 @@ impl Landing {
         let landed_incarnation = self.outbox.as_ref().map_or(0, Outbox::incarnation);
         let refused = self.refused;
         Hearing { sequence, landed, incarnation, landed_incarnation, refused, reserved: 0 }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use dmprl_shared::segment::SegmentHeader;
+
+    use super::*;
+
+    const LAYOUT: SegmentLayout =
+        SegmentLayout { segment_steps: 1, observation_len: 1, action_len: 1 };
+
+    /// A queue that takes everything.
+    #[derive(Default)]
+    struct Queue {
+        taken: Vec<(u32, u64)>,
+    }
+
+    impl SegmentSender for Queue {
+        fn renew(&mut self) -> Result<bool, TransportError> {
+            Ok(false)
+        }
+
+        fn try_send(
+            &mut self,
+            header: &SegmentHeader,
+            _block: &[f32],
+        ) -> Result<SendOutcome, TransportError> {
+            self.taken.push((header.incarnation, header.sequence));
+            Ok(SendOutcome::Delivered)
+        }
+    }
+
+    fn land(landing: &mut Landing, incarnation: u32, attempt: u32, sequences: [u64; 2]) {
+        let [first, last] = sequences;
+        let count = (last + 1 - first) as u32;
+        let stretch = Stretch { first, next: first, worker: 7, incarnation, attempt, count };
+        landing.begin(&stretch);
+        for sequence in first..=last {
+            let header =
+                SegmentHeader { worker_id: 7, incarnation, sequence, ..SegmentHeader::default() };
+            landing.land(&stretch, &Segment { header, ..Segment::zeroed(LAYOUT) });
+        }
+    }
+
+    /// Its relay and worker died together, so nobody else has them; they were thrown away once.
+    #[test]
+    fn what_a_dead_start_of_the_worker_left_goes_to_the_learner_before_the_next() {
+        let mut landing = Landing::new(7, LAYOUT, 8);
+        let mut queue = Queue::default();
+        land(&mut landing, 1, 1, [1, 3]);
+        land(&mut landing, 2, 1, [1, 2]);
+        landing.offer(&mut queue).unwrap();
+        assert_eq!((landing.kept(), queue.taken.len()), (5, 3));
+        landing.offer(&mut queue).unwrap();
+        assert_eq!(queue.taken.len(), 3, "not before the learner has the first three");
+        // A third start has to wait.
+        land(&mut landing, 3, 2, [1, 1]);
+        assert_eq!((landing.kept(), landing.hearing().refused), (5, 2));
+        landing.acknowledge(Mark { incarnation: 1, sequence: 3 });
+        landing.offer(&mut queue).unwrap();
+        assert_eq!(queue.taken, [(1, 1), (1, 2), (1, 3), (2, 1), (2, 2)]);
+        land(&mut landing, 3, 3, [1, 1]);
+        landing.acknowledge(Mark { incarnation: 2, sequence: 2 });
+        landing.offer(&mut queue).unwrap();
+        assert_eq!((landing.kept(), queue.taken.last()), (1, Some(&(3, 1))));
     }
 }

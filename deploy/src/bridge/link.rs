@@ -26,8 +26,12 @@ const LEASE_MS: u64 = 4_000;
 /// Between two tries to connect: at first, and at most \[ms\].
 const RETRY_FIRST_MS: u64 = 250;
 const RETRY_MAX_MS: u64 = 2_000;
-/// A longer message is nobody's \[bytes\]: a batch of segments and a policy of any size fit.
-const MESSAGE_BYTES_MAX: usize = 256 << 20;
+/// A longer message is nobody's \[bytes\]: to a host a policy of any size comes,
+const POLICY_BYTES_MAX: usize = 256 << 20;
+/// to the learner's host a few hundred KiB of segments, or one that is longer.
+const BATCH_BYTES_MAX: usize = 16 << 20;
+/// Other ends of the learner's host.
+const SESSIONS_MAX: usize = 256;
 
 /// Which end of a link.
 #[derive(Debug, Clone, Copy)]
@@ -89,9 +93,9 @@ fn config(ends: Ends<'_>, zenoh_file: Option<&Path>) -> anyhow::Result<Config> {
         })?,
     };
     let endpoints = |endpoints: &[String]| serde_json::to_string(endpoints);
-    let (listen, connect) = match ends {
-        Ends::Listen(at) => (endpoints(at)?, endpoints(&[])?),
-        Ends::Connect(to) => (endpoints(&[])?, endpoints(&[to.to_owned()])?),
+    let (listen, connect, bytes_max) = match ends {
+        Ends::Listen(at) => (endpoints(at)?, endpoints(&[])?, BATCH_BYTES_MAX),
+        Ends::Connect(to) => (endpoints(&[])?, endpoints(&[to.to_owned()])?, POLICY_BYTES_MAX),
     };
     let retry = format!(
         "{{period_init_ms: {RETRY_FIRST_MS}, period_max_ms: {RETRY_MAX_MS}, \
@@ -108,7 +112,8 @@ fn config(ends: Ends<'_>, zenoh_file: Option<&Path>) -> anyhow::Result<Config> {
         ("scouting/multicast/enabled", "false".to_owned()),
         ("scouting/gossip/enabled", "false".to_owned()),
         ("transport/link/tx/lease", LEASE_MS.to_string()),
-        ("transport/link/rx/max_message_size", MESSAGE_BYTES_MAX.to_string()),
+        ("transport/link/rx/max_message_size", bytes_max.to_string()),
+        ("transport/unicast/max_sessions", SESSIONS_MAX.to_string()),
     ] {
         config
             .insert_json5(key, &value)

@@ -5,6 +5,7 @@
 //! it; a worker hears of an acknowledgement when the learner has given it, not before.
 
 use std::path::Path;
+use std::thread;
 use std::time::{Duration, Instant};
 
 use anyhow::{Context, bail, ensure};
@@ -30,11 +31,16 @@ const ASK_AGAIN: Duration = Duration::from_millis(500);
 const SILENCE: Duration = Duration::from_secs(5);
 /// A batch of so many bytes is sent at once. The link cuts messages into pieces of 64 KiB.
 const BATCH_BYTES: usize = 60_000;
+/// More is not sent before anything is heard again: what was lost with a link is sent piece by
+/// piece.
+const TURN_BYTES: u64 = 262_144;
 /// Segments of one worker before it is the next one's turn.
 const TURN_SEGMENTS: usize = 16;
 const ACKNOWLEDGE_INTERVAL: Duration = Duration::from_millis(5);
 const MAINTENANCE_INTERVAL: Duration = Duration::from_millis(100);
 const STATUS_INTERVAL: Duration = Duration::from_millis(250);
+/// A host that leaves is heard within a round trip.
+const LEAVE_LIMIT: Duration = Duration::from_secs(2);
 
 /// Whom a host asks, and as whom.
 #[derive(Debug, Clone)]
@@ -286,8 +292,9 @@ impl Relay {
     /// Its places are another host's now, or something is broken that does not mend.
     pub fn turn(&mut self, counts: &HostCounts) -> anyhow::Result<Turn> {
         let now = Instant::now();
-        self.stay_in_touch(now)?;
+        // First: after a turn in which the link was full, words may wait that break the silence.
         let course = self.hear(now)?;
+        self.stay_in_touch(now)?;
         let sent = self.send(now)?;
         self.take_policy()?;
         if now.duration_since(self.acknowledged) >= ACKNOWLEDGE_INTERVAL {
@@ -311,12 +318,23 @@ impl Relay {
         })
     }
 
-    /// Says that the host leaves.
+    /// Says that the host leaves, until it is heard: what is sent last a closing session may lose.
     ///
     /// # Errors
     /// The session is closed.
     pub fn leave(&mut self, counts: &HostCounts) -> anyhow::Result<()> {
-        self.tell(counts, true)
+        let deadline = Instant::now() + LEAVE_LIMIT;
+        while self.away.is_none() && Instant::now() < deadline {
+            self.tell(counts, true)?;
+            let again = Instant::now() + STATUS_INTERVAL;
+            while Instant::now() < again {
+                if self.hear(Instant::now())? == Course::Left {
+                    return Ok(());
+                }
+                thread::sleep(ACKNOWLEDGE_INTERVAL);
+            }
+        }
+        Ok(())
     }
 
     /// Asks anew when the gateway is silent: it may be another, which knows nothing of this host.
@@ -389,8 +407,11 @@ impl Relay {
     /// Takes segments from the workers in turn as long as there is room, and sends them.
     fn send(&mut self, now: Instant) -> anyhow::Result<bool> {
         let Some(seat) = &self.seat else { return Ok(false) };
-        let window = self.window.bytes() / self.segment_bytes;
-        let mut room = usize::try_from(window.saturating_sub(self.under_way())).unwrap_or(0);
+        // However long a segment is, one may be under way: without any nothing would be learned.
+        let window = (self.window.bytes() / self.segment_bytes).max(1);
+        let together = (TURN_BYTES / self.segment_bytes).max(1);
+        let room = window.saturating_sub(self.under_way()).min(together);
+        let mut room = usize::try_from(room).unwrap_or(0);
         let count = self.lanes.len();
         let mut sent = false;
         for turn in 0..count {

@@ -15,6 +15,10 @@ const CHARACTERS_MIN: usize = 16;
 const CHARACTERS_MAX: usize = 1_024;
 /// Bits that nobody but the owner may have.
 const OTHERS: u32 = 0o077;
+/// systemd gives a service its credentials by an access-control list, which shows as the group's.
+const OTHERS_THAN_A_SERVICE: u32 = 0o037;
+/// Where they are.
+const CREDENTIALS: &str = "CREDENTIALS_DIRECTORY";
 
 /// Reads a run's secret; makes it where there is none.
 ///
@@ -39,10 +43,16 @@ pub fn ensure(path: &Path) -> anyhow::Result<String> {
 /// # Errors
 /// Wrong use: there is none, others can read it, or it is too short or long to be one.
 pub fn read(path: &Path) -> anyhow::Result<String> {
+    read_as_service(path, std::env::var_os(CREDENTIALS).as_deref().map(Path::new))
+}
+
+fn read_as_service(path: &Path, credentials: Option<&Path>) -> anyhow::Result<String> {
     let shown = path.display();
+    let is_credential = credentials.is_some() && path.parent() == credentials;
+    let others = if is_credential { OTHERS_THAN_A_SERVICE } else { OTHERS };
     let metadata = std::fs::metadata(path)
         .map_err(|error| wrong_use(format!("no token in {shown}: {error}; {WHERE}")))?;
-    if metadata.mode() & OTHERS != 0 {
+    if metadata.mode() & others != 0 {
         let mode = metadata.mode() & 0o777;
         return Err(wrong_use(format!(
             "token {shown} can be read by others: expected mode 0600, got {mode:04o}; chmod 600 it"
@@ -87,6 +97,12 @@ mod tests {
         assert!(!equal(&token, &token[1..]) && !equal(&token, &token.replace(&token[..1], "x")));
         std::fs::set_permissions(&path, PermissionsExt::from_mode(0o640)).unwrap();
         assert!(read(&path).unwrap_err().to_string().contains("got 0640"));
+        // As a service's credential is shown.
+        std::fs::set_permissions(&path, PermissionsExt::from_mode(0o440)).unwrap();
+        assert!(read_as_service(&path, Some(Path::new("/other"))).is_err());
+        assert_eq!(read_as_service(&path, Some(folder.path())).unwrap(), token);
+        std::fs::set_permissions(&path, PermissionsExt::from_mode(0o444)).unwrap();
+        assert!(read_as_service(&path, Some(folder.path())).is_err());
         std::fs::set_permissions(&path, PermissionsExt::from_mode(0o600)).unwrap();
         std::fs::write(&path, "short\n").unwrap();
         assert!(read(&path).unwrap_err().to_string().contains("got 5"));

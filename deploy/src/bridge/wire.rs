@@ -109,6 +109,8 @@ pub enum Course {
     Complete,
     /// It was stopped, and may be resumed.
     Stopped,
+    /// It goes on without the host, which has left.
+    Left,
 }
 
 impl Course {
@@ -116,6 +118,7 @@ impl Course {
         match number {
             1 => Self::Complete,
             2 => Self::Stopped,
+            3 => Self::Left,
             _ => Self::On,
         }
     }
@@ -125,6 +128,7 @@ impl Course {
             Self::On => 0,
             Self::Complete => 1,
             Self::Stopped => 2,
+            Self::Left => 3,
         }
     }
 }
@@ -377,9 +381,41 @@ pub struct HostStatus {
     pub leaves: bool,
 }
 
+impl HostStatus {
+    /// Keeps the counts of the status before where these are less: a relay that was started again
+    /// knows none until its supervisor has spoken, and nobody may count backwards.
+    pub fn no_less_than(&mut self, before: &Self) {
+        let (now, then) = (&self.sent, &before.sent);
+        let less = now.produced < then.produced
+            || now.sent < then.sent
+            || now.resent < then.resent
+            || now.acked < then.acked
+            || self.env_failures < before.env_failures;
+        if less {
+            (self.sent, self.env_failures) = (before.sent, before.env_failures);
+        }
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn counts_of_a_host_never_fall() {
+        let of = |produced, env_failures| HostStatus {
+            sent: Sent { produced, sent: 2, ..Sent::default() },
+            env_failures,
+            ..HostStatus::default()
+        };
+        let before = of(5, 1);
+        let mut status = HostStatus { policy_version: 9, ..HostStatus::default() };
+        status.no_less_than(&before);
+        assert_eq!(status, HostStatus { policy_version: 9, ..before.clone() });
+        let mut more = of(6, 1);
+        more.no_less_than(&before);
+        assert_eq!(more, of(6, 1));
+    }
 
     fn segment(sequence: u64) -> Segment {
         let header = SegmentHeader { sequence, worker_id: 3, ..SegmentHeader::default() };

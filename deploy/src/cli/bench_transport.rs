@@ -75,7 +75,7 @@ pub(super) struct TransportArgs {
     /// Measure between hosts: send to who listens at this Zenoh endpoint.
     #[arg(long, value_name = "ENDPOINT")]
     connect: Option<String>,
-    /// Segments a second that the workers make together, with --connect [default: as many as can be].
+    /// Segments a second that the workers make together, with --connect [default: what they can].
     #[arg(long, value_name = "N", requires = "connect",
           value_parser = clap::value_parser!(u32).range(1..))]
     rate: Option<u32>,

@@ -16,11 +16,18 @@ use crate::bridge::{Ends, Link, token};
 use crate::capacity;
 use crate::failure::{Outcome, wrong_use};
 use crate::launch::{self, HostPlan, Upstream};
-use crate::run_directory::{Manifest, RunDirectory, Session, compact_now, random_u64, safe_name};
+use crate::run_directory::{
+    Manifest, RunDirectory, RunLock, Session, compact_now, random_u64, replace_file, safe_name,
+};
 use crate::terminal::{ProgressStyle, say};
 
 /// Between two times that a host asks whether it may take part.
 const ASK_AGAIN: Duration = Duration::from_millis(500);
+
+/// What a killed bridge had started ends with it: at once, unless the machine is very busy.
+const LEFT_OVER: Duration = Duration::from_secs(60);
+/// In a bridge's directory: the number by which the learner's host knows this one.
+const HOST_FILE: &str = "bridge.host";
 
 const HELP: &str = "\
 On the learner's host, open the run and give the other hosts its secret, bridge.token of the run's
@@ -78,10 +85,11 @@ pub(super) fn run(args: &BridgeArgs) -> anyhow::Result<Outcome> {
     let zenoh_file = args.zenoh_config.as_ref().map(absolute).transpose()?;
     let token_file = absolute(&args.token_file)?;
     let workers = args.workers.map_or_else(cores, usize::from);
+    let earlier = earlier(args)?;
     let asking = Asking {
         endpoint: endpoint(&args.connect)?,
         token: token::read(&token_file)?,
-        host: random_u64()?,
+        host: earlier.as_ref().map_or_else(random_u64, |(_, host)| Ok(*host))?,
         name: args.name.clone().unwrap_or_else(host_name),
         workers: u32::try_from(workers).context("too many workers")?,
     };
@@ -92,7 +100,11 @@ pub(super) fn run(args: &BridgeArgs) -> anyhow::Result<Outcome> {
     let config = host_config(&welcome, workers, &args.python_path)?;
     capacity::check(&config, Some(&welcome.spec))?;
     let run = run_directory(args, &asking.name, &welcome, &config)?;
-    let lock = run.lock(Duration::ZERO)?;
+    let lock = match earlier {
+        Some((lock, _)) => lock,
+        None => run.lock(Duration::ZERO)?,
+    };
+    replace_file(&run.path().join(HOST_FILE), format!("{:016x}", asking.host).as_bytes())?;
     let upstream = Upstream {
         endpoint: asking.endpoint,
         token_file,
@@ -105,6 +117,19 @@ pub(super) fn run(args: &BridgeArgs) -> anyhow::Result<Outcome> {
     let progress = ProgressStyle::from_flag(args.no_progress);
     let (program, session) = (this_program()?, welcome.held.session);
     launch::host(HostPlan { program, run, lock, config, venv, upstream, session, progress })
+}
+
+/// The directory of an earlier bridge, taken, and its number: started again, by systemd for one,
+/// this host has the places that it had, which would else be kept for it for minutes.
+fn earlier(args: &BridgeArgs) -> anyhow::Result<Option<(RunLock, u64)>> {
+    let Some(path) = args.run_dir.as_deref().filter(|path| path.join(HOST_FILE).is_file()) else {
+        return Ok(None);
+    };
+    let lock = RunDirectory::open(path)?.lock(LEFT_OVER)?;
+    let file = path.join(HOST_FILE);
+    let read = || format!("cannot read {}", file.display());
+    let text = std::fs::read_to_string(&file).with_context(read)?;
+    Ok(Some((lock, u64::from_str_radix(text.trim(), 16).with_context(read)?)))
 }
 
 fn endpoint(text: &str) -> anyhow::Result<String> {

@@ -12,8 +12,10 @@ use crate::bridge::gateway::{Gateway, News, RunFacts};
 use crate::bridge::token;
 use crate::bridge::wire::Course;
 use crate::control::Report;
-use crate::run_directory::{RunDirectory, TOKEN_FILE};
+use crate::run_directory::{RunDirectory, TOKEN_FILE, replace_file};
 
+/// In a run's directory: the first session that no host was given yet.
+const SESSIONS_FILE: &str = "bridge.session";
 /// Sleep of a turn that found nothing to do.
 const IDLE: Duration = Duration::from_micros(300);
 /// Between two reports of the hosts.
@@ -21,8 +23,11 @@ const REPORT_INTERVAL: Duration = Duration::from_millis(500);
 /// A learner that is being replaced can be joined again after as long as a checkpoint takes.
 const JOIN_LIMIT: Duration = Duration::from_secs(60);
 const JOIN_PAUSE: Duration = Duration::from_millis(20);
-/// Hosts are told so long how the run has ended; those that hear it leave.
-const GOODBYE: Duration = Duration::from_secs(3);
+/// Hosts are told so long how the run has ended, less than their supervisor waits for this process;
+/// those that hear it leave.
+const GOODBYE: Duration = Duration::from_secs(8);
+/// One that was not heard from for so long is not waited for.
+const GONE: Duration = Duration::from_secs(60);
 const GOODBYE_INTERVAL: Duration = Duration::from_millis(100);
 /// The first refusals of what nobody should have sent are told, then each doubling.
 const REFUSED_FIRST: u64 = 1;
@@ -40,8 +45,14 @@ pub fn run(args: &GatewayArgs, control: &ControlPipe) -> anyhow::Result<()> {
     let Some(mut gateway) = open(args, control)? else { return Ok(()) };
     let mut reported: Option<Instant> = None;
     let mut refused_told = REFUSED_FIRST;
+    let sessions = args.run.join(SESSIONS_FILE);
+    let mut given = gateway.session();
     while !control.stop_requested() && !control.finish_requested() {
         let worked = gateway.turn()?;
+        if given != gateway.session() {
+            given = gateway.session();
+            replace_file(&sessions, given.to_string().as_bytes())?;
+        }
         for news in gateway.news() {
             // A supervisor that is gone is noticed as a stop.
             let _ = control.send(&match news {
@@ -85,7 +96,8 @@ fn open(args: &GatewayArgs, control: &ControlPipe) -> anyhow::Result<Option<Gate
     };
     let zenoh_file =
         Some(Path::new(&bridge.zenoh_file)).filter(|path| !path.as_os_str().is_empty());
-    let places = (config.actors.places(), args.session, config.delivery.unacknowledged_segments);
+    let session = args.session.max(sessions_given(&args.run.join(SESSIONS_FILE))?);
+    let places = (config.actors.places(), session, config.delivery.unacknowledged_segments);
     let deadline = Instant::now() + JOIN_LIMIT;
     loop {
         let plan = learner::plan(&setup, &policy);
@@ -100,6 +112,17 @@ fn open(args: &GatewayArgs, control: &ControlPipe) -> anyhow::Result<Option<Gate
     }
 }
 
+/// How many sessions the gateways before this one have given to hosts; a worker's start has the
+/// number of none of them again.
+fn sessions_given(path: &Path) -> anyhow::Result<u32> {
+    if !path.exists() {
+        return Ok(0);
+    }
+    let read = || format!("cannot read {}", path.display());
+    let text = std::fs::read_to_string(path).with_context(read)?;
+    text.trim().parse().with_context(read)
+}
+
 fn is_transport(error: &anyhow::Error) -> bool {
     error.is::<dmprl_shared::transport::TransportError>()
 }
@@ -110,10 +133,10 @@ fn say_goodbye(gateway: &mut Gateway, control: &ControlPipe) -> anyhow::Result<(
     let began = Instant::now();
     loop {
         gateway.tell(course)?;
-        gateway.watch()?;
+        gateway.watch(Instant::now())?;
         // A run that was stopped has hosts that wait for it.
         let heard = course == Course::Stopped && began.elapsed() >= GOODBYE_INTERVAL * 2;
-        if heard || gateway.is_alone() || began.elapsed() >= GOODBYE || control.orphaned() {
+        if heard || gateway.is_alone(GONE) || began.elapsed() >= GOODBYE || control.orphaned() {
             return Ok(());
         }
         std::thread::sleep(GOODBYE_INTERVAL);

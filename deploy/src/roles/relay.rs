@@ -30,6 +30,8 @@ pub fn run(args: &RelayArgs, control: &ControlPipe) -> anyhow::Result<()> {
         teller.tell(&relay, control)?;
         if turn == Turn::Complete {
             teller.ready(&relay, control);
+            // The gateway waits until all hosts have heard.
+            relay.leave(&counts(control))?;
             return control.send(&Report::Finished);
         }
         if control.stop_requested() {
@@ -74,6 +76,10 @@ fn leave(relay: &mut Relay, control: &ControlPipe) -> anyhow::Result<()> {
         if turn == Turn::Idle {
             std::thread::sleep(IDLE);
         }
+    }
+    if relay.under_way() > 0 {
+        let message = format!("{} segments could not be handed over", relay.under_way());
+        warn(control, message);
     }
     relay.leave(&counts(control))
 }

@@ -50,8 +50,17 @@ fn last(run: &str) -> serde_json::Value {
 
 /// Segments of the other host's worker that the learner has, as its newest checkpoint knows.
 fn learned(run: &str, worker: usize) -> u64 {
+    settled(run, worker, "sequence")
+}
+
+/// Which start of the worker those are of.
+fn incarnation(run: &str, worker: usize) -> u64 {
+    settled(run, worker, "incarnation")
+}
+
+fn settled(run: &str, worker: usize, what: &str) -> u64 {
     let state = json_file(run, "checkpoints/latest/state.json");
-    state["settled"][worker]["sequence"].as_u64().unwrap_or(0)
+    state["settled"][worker][what].as_u64().unwrap_or(0)
 }
 
 /// The worker of another host comes after the run's own and the four that may join.
@@ -66,15 +75,22 @@ fn another_hosts_worker_is_learned_from_whoever_dies_and_nothing_is_lost() {
     training.until_said("host far takes part: 1 worker");
     training.until("a line that counts both workers", |_| last(&run)["workers"] == 2);
     let mut before = 0;
-    for (who, role) in [("far", "relay"), ("run", "gateway"), ("run", "learner"), ("far", "actor")]
-    {
+    for (who, role) in [("far", "relay"), ("run", "gateway"), ("run", "learner")] {
         strike(&place.path(who), role, Signal::KILL);
         training.until("segments of the other host after that", |_| learned(&run, REMOTE) > before);
-        // Beyond what was on its way, and of a new start of the worker from the beginning.
-        before = if role == "actor" { 0 } else { learned(&run, REMOTE) + 20 };
+        // Beyond what was on its way.
+        before = learned(&run, REMOTE) + 20;
         training.until("more of them", |_| learned(&run, REMOTE) > before);
     }
+    let first = incarnation(&run, REMOTE);
+    strike(&place.path("far"), "actor", Signal::KILL);
+    training.until("segments of its next start", |_| incarnation(&run, REMOTE) > first);
     host.until_said("restart 1 of");
+    // All of the host at once, which says no goodbye; started again it has its places.
+    let first = incarnation(&run, REMOTE);
+    host.signal_group(Signal::KILL);
+    let mut host = bridge(&place, &run, &endpoint, "far");
+    host.until("segments of the next bridge", |_| incarnation(&run, REMOTE) >> 16 > first >> 16);
     training.until("the host in the table of processes", |_| {
         let table = json_file(&run, "processes.json");
         let rows = table["processes"].as_array().cloned().unwrap_or_default();

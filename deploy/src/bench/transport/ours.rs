@@ -23,8 +23,8 @@ const START: Duration = Duration::from_secs(60);
 const MEASURE_SLACK: Duration = Duration::from_secs(30);
 /// A worker that is stopped answers within milliseconds; one that waits, at its next look.
 const STOP: Duration = Duration::from_secs(30);
-/// What still lies in the queues is taken so long at a time, and is lost if it has not come after so
-/// long altogether: a busy machine may not let this process take.
+/// What still lies in the queues is taken so long at a time, and is lost if it has not come after
+/// so long altogether: a busy machine may not let this process take.
 const DRAIN: Duration = Duration::from_millis(100);
 const DRAIN_MAX: Duration = Duration::from_secs(10);
 
