@@ -252,7 +252,7 @@ mod tests {
         };
         let (a, b) = (admit(1, 4, None).unwrap(), admit(2, 3, None).unwrap());
         assert_eq!((a.first, b.first), (3, 7));
-        assert_eq!(admit(1, 4, None).unwrap(), a, "the same start of the program");
+        assert_eq!(admit(1, 4, Some(a)).unwrap(), a, "the same start of the program");
         let full = admit(3, 2, None).unwrap_err();
         assert!(full.later && full.reason.contains("7 of 8 places"), "{}", full.reason);
         let never = admit(4, 9, None).unwrap_err();

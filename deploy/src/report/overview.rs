@@ -60,7 +60,8 @@ fn distinct(values: impl Iterator<Item = String>) -> String {
 #[must_use]
 pub fn runs_table(results: &Results) -> Grid {
     let cell = |task: &str, method: &str| {
-        let runs: Vec<&Run> = results.of(task, method).collect();
+        let mut runs: Vec<&Run> = results.of(task, method).collect();
+        runs.sort_by_key(|run| run.seed);
         let seeds_of = |ended: bool| {
             let seeds = runs.iter().filter(|run| run.ended == ended);
             let seeds: Vec<_> = seeds.map(|run| run.seed.to_string()).collect();
@@ -102,7 +103,7 @@ mod tests {
             rows: vec![-9.0, -8.0],
             ended,
         };
-        let mut results = planted(&[run(1, true), run(2, true), run(3, false)]);
+        let mut results = planted(&[run(2, true), run(1, true), run(3, false)]);
         results.waiting = vec![results.runs[0].key(); 7];
         for (run, machine) in results.runs.iter_mut().zip(["a", "b", "a"]) {
             run.origin.machine = machine.to_owned();
