@@ -91,7 +91,10 @@ fn three_hosts_lose_nothing_on_a_long_lossy_wire_that_is_cut_while_processes_die
     let mut bridges = [0, 1].map(|host| {
         let name = ["near", "far"][host];
         let arguments = bridge_arguments(&token, &endpoint, (name, &far[host]));
-        start(&place, (&hosts, host + 1), &arguments)
+        let bridge = start(&place, (&hosts, host + 1), &arguments);
+        // Who comes first has the first place, by which its segments are told from the other's.
+        training.until_said(&format!("host {name} takes part"));
+        bridge
     });
     until_more(&mut training, &run, &[0, 1], "segments of both hosts");
 
