@@ -46,7 +46,7 @@ impl Landing {
         }
     }
 
-    /// Segments that were not what their stretch said.
+    /// Segments that were not what their stretch said, or that the learner will not take.
     #[must_use]
     pub fn misfits(&self) -> u64 {
         self.misfits
@@ -135,6 +135,11 @@ impl Landing {
             lane::acknowledge(outbox, mark, (self.layout, self.capacity));
         }
         self.older.take_if(|outbox| outbox.is_empty());
+        // The learner knows a newer start, by whatever way: kept, these would bar that one's.
+        if let Some(of_no_use) = self.older.take_if(|older| older.incarnation() < mark.incarnation)
+        {
+            self.misfits += of_no_use.len() as u64;
+        }
     }
 
     /// What the host is to know.
@@ -211,5 +216,17 @@ mod tests {
         landing.acknowledge(Mark { incarnation: 2, sequence: 2 });
         landing.offer(&mut queue).unwrap();
         assert_eq!((landing.kept(), queue.taken.last()), (1, Some(&(3, 1))));
+    }
+
+    #[test]
+    fn what_the_learner_will_not_take_any_more_bars_no_newer_start() {
+        let mut landing = Landing::new(7, LAYOUT, 8);
+        let mut queue = Queue::default();
+        land(&mut landing, 1, 1, [1, 3]);
+        land(&mut landing, 2, 1, [1, 2]);
+        landing.acknowledge(Mark { incarnation: 2, sequence: 0 });
+        landing.offer(&mut queue).unwrap();
+        assert_eq!(queue.taken, [(2, 1), (2, 2)]);
+        assert_eq!(landing.misfits(), 3, "and they are counted");
     }
 }

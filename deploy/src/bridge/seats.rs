@@ -138,6 +138,13 @@ impl Seats {
         let held = match (known, request.held) {
             (Some(at), Some(_)) => {
                 let known = &mut self.hosts[at];
+                if known.workers != workers {
+                    let reason = format!(
+                        "it took part with {} workers and asks now with {workers}: start it again",
+                        known.workers
+                    );
+                    return Err(Refusal { reason, later: false });
+                }
                 (known.seat, known.heard, known.here) = (seat, now, true);
                 return Ok(known.held);
             }
@@ -253,6 +260,8 @@ mod tests {
         let (a, b) = (admit(1, 4, None).unwrap(), admit(2, 3, None).unwrap());
         assert_eq!((a.first, b.first), (3, 7));
         assert_eq!(admit(1, 4, Some(a)).unwrap(), a, "the same start of the program");
+        let other = admit(1, 3, Some(a)).unwrap_err();
+        assert!(!other.later && other.reason.contains("with 4 workers"), "{}", other.reason);
         let full = admit(3, 2, None).unwrap_err();
         assert!(full.later && full.reason.contains("7 of 8 places"), "{}", full.reason);
         let never = admit(4, 9, None).unwrap_err();

@@ -71,6 +71,10 @@ impl Supervisor {
                 let what = "learner ended without its last checkpoint";
                 self.display.message(&format!("{what}{cause}"));
             }
+            if self.hub() == Process::Relay {
+                // It stays until the last worker is gone, whose last segment may come yet.
+                self.tell_learner_of_counts();
+            }
             return Ok(());
         }
         if ended.as_ref().is_some_and(|running| self.is_proven(process, running)) {

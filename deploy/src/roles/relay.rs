@@ -65,12 +65,15 @@ fn counts(control: &ControlPipe) -> HostCounts {
     HostCounts { sent, env_failures, workers: control.workers() }
 }
 
-/// Hands over what the workers have sent, as far as the learner's host takes it.
+/// Hands over what the workers have sent, as far as the learner's host takes it, and what those in
+/// mid-segment still send.
 fn leave(relay: &mut Relay, control: &ControlPipe) -> anyhow::Result<()> {
     let deadline = Instant::now() + HAND_OVER;
     while relay.away().is_none() && !control.orphaned() && Instant::now() < deadline {
+        // Asked before the turn: a worker that is gone has sent all that it ever will.
+        let gone = control.workers().count == 0;
         let turn = relay.turn(&counts(control))?;
-        if turn == Turn::Complete || turn == Turn::Idle && relay.under_way() == 0 {
+        if turn == Turn::Complete || turn == Turn::Idle && gone && relay.under_way() == 0 {
             break;
         }
         if turn == Turn::Idle {
@@ -78,7 +81,11 @@ fn leave(relay: &mut Relay, control: &ControlPipe) -> anyhow::Result<()> {
         }
     }
     if relay.under_way() > 0 {
-        let message = format!("{} segments could not be handed over", relay.under_way());
+        let message = format!(
+            "{} segments are not acknowledged yet: those that have come to the learner's host will \
+             be learned, the others are lost",
+            relay.under_way()
+        );
         warn(control, message);
     }
     relay.leave(&counts(control))

@@ -20,10 +20,19 @@ fn endpoint() -> String {
 
 /// A run that other hosts may take part in.
 fn learner(place: &Workplace, run: &str, endpoint: &str, more: &[&str]) -> Running {
+    learner_of("reacher", place, (run, endpoint), more)
+}
+
+fn learner_of(
+    task: &str,
+    place: &Workplace,
+    (run, endpoint): (&str, &str),
+    more: &[&str],
+) -> Running {
     let listen = format!("bridge.listen=[\"{endpoint}\"]");
     let open = ["--workers", "1", "--set", &listen, "--set", "bridge.workers_max=2"];
     let more = [&open[..], &["--set", "delivery.level=log"], more].concat();
-    let mut running = place.start(&train("reacher", run, &more));
+    let mut running = place.start(&train(task, run, &more));
     running.until("a gateway", |running| {
         Path::new(run).join("bridge.token").is_file()
             && running.said().contains("first environment step")
@@ -168,4 +177,72 @@ fn a_host_with_a_wrong_token_or_too_many_workers_is_told_what_to_do() {
     let second = place.path("second");
     let more = ["--workers", "1", "--set", &listen, "--steps", ENDLESS];
     place.run(&train("reacher", &second, &more)).with_status(1).saying("cannot listen at");
+}
+
+/// Every step stops while `hold` is there, and says in which of its process's steps it does.
+const HELD: &str = "
+import os
+import pathlib
+import time
+
+import gymnasium
+import numpy as np
+from gymnasium import spaces
+
+HERE = pathlib.Path(__file__).parent
+
+
+class Held(gymnasium.Env):
+    observation_space = spaces.Box(-np.inf, np.inf, (2,), np.float64)
+    action_space = spaces.Box(-1.0, 1.0, (1,), np.float64)
+
+    def __init__(self, render_mode=None):
+        self.steps = 0
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        return self.np_random.uniform(size=2), {}
+
+    def step(self, action):
+        self.steps += 1
+        time.sleep(0.002)
+        if (HERE / 'hold').exists() and self.steps % 5 == 3:
+            told = HERE / f'writing-{os.getpid()}'
+            told.write_text(str(self.steps))
+            told.rename(HERE / f'held-{os.getpid()}')
+            while (HERE / 'hold').exists():
+                time.sleep(0.01)
+        return self.np_random.uniform(size=2), float(action[0]), False, False, {}
+
+
+gymnasium.register('Held-v0', Held, max_episode_steps=50)
+";
+
+#[test]
+fn a_host_that_leaves_hands_over_the_segment_that_its_worker_was_in() {
+    let place = Workplace::new();
+    let (run, endpoint) = (place.path("run"), endpoint());
+    fs::write(place.path("held.py"), HELD).unwrap();
+    let more = ["--python-path", &place.path(""), "--envs-per-worker", "1", "--steps", ENDLESS];
+    let mut training = learner_of("held:Held-v0", &place, (&run, &endpoint), &more);
+    let mut host = bridge(&place, &run, &endpoint, "far");
+    training.until_said("host far takes part: 1 worker");
+    let far = place.path("far");
+    let worker = |process: &dmprl_tests::program::Process| process.role == "actor";
+    host.until("a worker of the host", |_| processes_naming(&far).iter().any(worker));
+    let id = processes_naming(&far).into_iter().find(worker).unwrap().id;
+    training.until("a line that counts both workers", |_| last(&run)["workers"] == 2);
+    fs::write(place.path("hold"), "").unwrap();
+    let held = place.path(&format!("held-{id}"));
+    host.until("the worker in mid-segment", |_| Path::new(&held).is_file());
+    let steps: u64 = fs::read_to_string(&held).unwrap().parse().unwrap();
+    host.signal_group(Signal::INT);
+    host.until_said("handing over what the workers have sent");
+    fs::remove_file(place.path("hold")).unwrap();
+    host.wait().with_status(130).saying("left the run");
+    training.until_said("host far has left");
+    training.signal_group(Signal::INT);
+    training.wait().with_status(130).saying("checkpoint written");
+    assert!(learned(&run, REMOTE) > steps / 5, "{} after {steps} steps", learned(&run, REMOTE));
+    assert_eq!(last(&run)["lost"], 0, "{}", last(&run));
 }
