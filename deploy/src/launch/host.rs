@@ -45,7 +45,7 @@ pub fn host(plan: HostPlan) -> anyhow::Result<Outcome> {
     // Before the shared memory: a signal that still kills would leave it behind.
     let interrupts = runtime.block_on(async { interrupts() })?;
     let domain = domain::create(&domain::token(&run.manifest()?, std::process::id()))?;
-    let mut display = Display::new(progress, config.run.steps);
+    let mut display = Display::new(progress, config.run.steps).of_host();
     display.message(&format!(
         "{} for the learner at {}, in {}",
         title(&config),

@@ -7,7 +7,9 @@ use std::time::{Duration, Instant};
 use indicatif::{ProgressBar, ProgressStyle as BarStyle};
 
 use super::format::{duration, grouped, plus_minus};
-use super::panel::{Panel, ProcessLine, SEPARATOR, terminal_size, trouble, whole_items};
+use super::panel::{
+    Panel, ProcessLine, SEPARATOR, Scope, speed, terminal_size, trouble, whole_items,
+};
 use crate::control::{EvaluationRow, Progress};
 
 /// Between two plain lines.
@@ -37,6 +39,7 @@ impl ProgressStyle {
 /// What the user sees of a run.
 pub struct Display {
     target: Target,
+    scope: Scope,
     steps_total: u64,
     line_at: Option<Instant>,
     /// Oldest first.
@@ -67,6 +70,12 @@ impl Display {
         Self::lines(Box::new(std::io::stderr()), steps_total)
     }
 
+    /// Of a host whose learner is elsewhere: nothing that only the learner knows.
+    #[must_use]
+    pub fn of_host(self) -> Self {
+        Self { scope: Scope::Host, ..self }
+    }
+
     /// Plain lines to any writer.
     #[must_use]
     pub fn lines(writer: Box<dyn Write + Send>, steps_total: u64) -> Self {
@@ -76,6 +85,7 @@ impl Display {
     fn on(target: Target, steps_total: u64) -> Self {
         Self {
             target,
+            scope: Scope::Run,
             steps_total,
             line_at: None,
             evaluations: Vec::new(),
@@ -118,7 +128,8 @@ impl Display {
             Target::Bar(bar) => {
                 bar.set_position(progress.env_steps.min(self.steps_total));
                 let size = terminal_size();
-                let panel = Panel { progress, evaluations: &self.evaluations, processes };
+                let (scope, evaluations) = (self.scope, self.evaluations.as_slice());
+                let panel = Panel { scope, progress, evaluations, processes };
                 let head = whole_items(&steps, size.0.saturating_sub(BAR_COLUMNS));
                 let lines = std::iter::once(head).chain(panel.lines(size));
                 bar.set_message(lines.collect::<Vec<_>>().join("\n"));
@@ -164,8 +175,8 @@ impl Display {
         let steps = format!("{}/{} steps", grouped(progress.env_steps), grouped(self.steps_total));
         let left = self.steps_total.saturating_sub(progress.env_steps) as f64;
         let eta = left / progress.env_steps_per_s;
-        // No figure from a rate of nothing, or for a run of years.
-        if (1e-9..1e8).contains(&eta) {
+        // No figure from a rate of nothing, for a run of years, or by a part of the run's workers.
+        if self.scope == Scope::Run && (1e-9..1e8).contains(&eta) {
             return format!("{steps}{SEPARATOR}eta {}", duration(Duration::from_secs_f64(eta)));
         }
         steps
@@ -179,11 +190,7 @@ impl Display {
             (None, Some(mean)) => parts.push(format!("return {mean:.2} (training)")),
             (None, None) => {}
         }
-        parts.push(format!("{:.0} steps/s", progress.env_steps_per_s));
-        parts.push(format!("{:.0} updates/s", progress.updates_per_s));
-        parts.push(format!("{:.1} samples/insert", progress.samples_per_insert));
-        parts.push(format!("lag {} (max {})", progress.policy_lag_p50, progress.policy_lag_max));
-        parts.push(format!("{} queued", grouped(progress.queued_segments)));
+        parts.extend(speed(progress, self.scope));
         parts.extend(trouble(progress));
         parts.join(SEPARATOR)
     }
@@ -234,6 +241,16 @@ mod tests {
         let rates = "50 steps/s · 20 updates/s · 12.5 samples/insert · lag 2 (max 7) · \
                      1,024 queued · 3 restarts";
         assert_eq!(text, format!(" 25% 250/1,000 steps · eta 15 s · {rates}\n"));
+    }
+
+    #[test]
+    fn a_host_promises_no_end_of_a_run_that_others_step_too() {
+        let display = Display::lines(Box::new(Shared::default()), 1_000).of_host();
+        let progress =
+            Progress { env_steps: 250, env_steps_per_s: 50.0, segments: 10, ..Progress::default() };
+        assert_eq!(display.steps(&progress), "250/1,000 steps");
+        let figures = display.figures(&progress);
+        assert_eq!(figures, "50 steps/s here · 0 queued · 10 segments acknowledged");
     }
 
     #[test]

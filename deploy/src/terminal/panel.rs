@@ -26,8 +26,18 @@ pub struct ProcessLine {
     pub restarts: u32,
 }
 
+/// Whose figures are shown.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Scope {
+    /// The run's, by its learner.
+    Run,
+    /// Those of a host whose learner, and evaluations, are elsewhere.
+    Host,
+}
+
 /// What the lines are made of.
 pub(super) struct Panel<'a> {
+    pub(super) scope: Scope,
     pub(super) progress: &'a Progress,
     /// Oldest first.
     pub(super) evaluations: &'a [EvaluationRow],
@@ -45,8 +55,11 @@ pub(super) fn terminal_size() -> (usize, usize) {
 impl Panel<'_> {
     /// The lines, none of them longer than the terminal is wide.
     pub(super) fn lines(&self, (columns, rows): (usize, usize)) -> Vec<String> {
-        let mut lines = vec![self.quality()];
-        lines.extend(rates(self.progress));
+        let mut lines = Vec::new();
+        if self.scope == Scope::Run {
+            lines.push(self.quality());
+        }
+        lines.extend(rates(self.progress, self.scope));
         let room = rows.saturating_sub(OTHER_LINES + lines.len()).max(1);
         lines.extend(self.process_lines(room));
         lines.into_iter().map(|line| whole_items(&line, columns)).collect()
@@ -104,20 +117,33 @@ impl Panel<'_> {
 pub(super) const SEPARATOR: &str = " · ";
 
 /// The figures of speed and of trouble: two lines at most.
-fn rates(progress: &Progress) -> Vec<String> {
-    let speed = [
-        format!("{:.0} steps/s", progress.env_steps_per_s),
-        format!("{:.0} updates/s", progress.updates_per_s),
-        format!("{:.1} samples/insert", progress.samples_per_insert),
-        format!("lag {} (max {})", progress.policy_lag_p50, progress.policy_lag_max),
-        format!("{} queued", grouped(progress.queued_segments)),
-    ];
+fn rates(progress: &Progress, scope: Scope) -> Vec<String> {
     let trouble = trouble(progress);
-    let mut lines = vec![named("rates", &speed.join(SEPARATOR))];
+    let mut lines = vec![named("rates", &speed(progress, scope).join(SEPARATOR))];
     if !trouble.is_empty() {
         lines.push(named("trouble", &trouble.join(SEPARATOR)));
     }
     lines
+}
+
+/// How fast it goes.
+pub(super) fn speed(progress: &Progress, scope: Scope) -> Vec<String> {
+    let steps = format!("{:.0} steps/s", progress.env_steps_per_s);
+    let queued = format!("{} queued", grouped(progress.queued_segments));
+    match scope {
+        Scope::Run => vec![
+            steps,
+            format!("{:.0} updates/s", progress.updates_per_s),
+            format!("{:.1} samples/insert", progress.samples_per_insert),
+            format!("lag {} (max {})", progress.policy_lag_p50, progress.policy_lag_max),
+            queued,
+        ],
+        Scope::Host => vec![
+            format!("{steps} here"),
+            queued,
+            format!("{} segments acknowledged", grouped(progress.segments)),
+        ],
+    }
 }
 
 /// What went wrong and was put right; nothing on a good day.
@@ -207,7 +233,8 @@ mod tests {
         };
         let rows = [row(-8.0, Some(0.0)), row(-2.0, Some(0.5)), row(-5.0, Some(1.0))];
         let processes = [process("learner", "learning", 0), process("actor-0", "stepping", 2)];
-        let panel = Panel { progress: &progress, evaluations: &rows, processes: &processes };
+        let scope = Scope::Run;
+        let panel = Panel { scope, progress: &progress, evaluations: &rows, processes: &processes };
         let expected = [
             "  return     -5.00 ± 1.00 · best -2.00 · ▁█▅ · success 100 % · ▁▅█",
             "  rates      520 steps/s · 205 updates/s · 12.5 samples/insert · lag 2 (max 7) · \
@@ -222,13 +249,33 @@ mod tests {
         assert!(narrow.iter().all(|line| line.chars().count() <= 40), "{narrow:?}");
     }
 
+    /// It once told of no updates a second, of a learner that it knows nothing of.
+    #[test]
+    fn of_a_host_it_says_nothing_that_only_the_learner_knows() {
+        let progress = Progress {
+            env_steps_per_s: 240.2,
+            queued_segments: 181,
+            segments: 1_008,
+            ..Progress::default()
+        };
+        let processes = [process("relay", "relaying", 0)];
+        let scope = Scope::Host;
+        let panel = Panel { scope, progress: &progress, evaluations: &[], processes: &processes };
+        let expected = [
+            "  rates      240 steps/s here · 181 queued · 1,008 segments acknowledged",
+            "  relay      relaying",
+        ];
+        assert_eq!(panel.lines((100, 24)), expected);
+    }
+
     #[test]
     fn more_processes_than_lines_are_counted_by_what_they_do() {
         let progress = Progress::default();
         let mut processes: Vec<_> =
             (0..32).map(|index| process(&format!("actor-{index}"), "stepping", 0)).collect();
         processes[30] = process("actor-30", "starting", 0);
-        let panel = Panel { progress: &progress, evaluations: &[], processes: &processes };
+        let scope = Scope::Run;
+        let panel = Panel { scope, progress: &progress, evaluations: &[], processes: &processes };
         let lines = panel.lines((80, 16));
         assert!(lines.len() + OTHER_LINES <= 16, "{lines:?}");
         assert_eq!(lines.last().unwrap(), "  23 more    22 stepping · 1 starting");
