@@ -31,7 +31,8 @@ def train(
     :param task: a task of ``dmprl tasks``, a Gymnasium id, or ``module:Class``.
     :param run_dir: where the results go; new or empty. By default a new folder in ``runs/``.
     :param python_path: directory of your own environment modules.
-    :param deterministic: one process in lock-step: the same seed gives the same bytes.
+    :param deterministic: one worker, in one process with the learner and in lock-step with it:
+        the same seed gives the same bytes.
     :param quiet: says nothing while it trains.
     :param overrides: flags of ``dmprl train`` (``steps=20_000``, ``algo="sac"``, ``seed=2``) and
         configuration keys with two underscores for the dot (``algorithm__batch_size=64``). None is

@@ -58,7 +58,8 @@ pub(super) struct TrainArgs {
     /// Where the results go; new or empty [default: runs/TASK-ALGO-POLICY-sSEED-TIME].
     #[arg(long, value_name = "DIR")]
     run_dir: Option<PathBuf>,
-    /// One process in lock-step: the same seed gives the same bytes.
+    /// One worker, in one process with the learner and in lock-step with it: the same seed gives
+    /// the same bytes.
     #[arg(long)]
     deterministic: bool,
     /// Where the update runs; `cuda` needs a build with that feature.
@@ -144,8 +145,8 @@ fn check(config: &ExperimentConfig, args: &TrainArgs) -> anyhow::Result<()> {
     }
     if let Some(workers) = args.configured.workers.filter(|&n| n > 1 && config.run.deterministic) {
         return Err(wrong_use(format!(
-            "--workers {workers}: a deterministic run is one process in lock-step; leave out \
-             --workers, or run.deterministic"
+            "--workers {workers}: a deterministic run has one worker, in one process with the \
+             learner; leave out --workers, or run.deterministic"
         )));
     }
     Ok(())

@@ -119,12 +119,9 @@ pub fn title(config: &ExperimentConfig) -> String {
     let actors = &config.actors;
     let count =
         |count: usize, what: &str| format!("{count} {what}{}", if count == 1 { "" } else { "s" });
-    let hands = if config.run.deterministic {
-        format!("one process, {}", count(actors.envs_per_worker, "environment"))
-    } else {
-        let workers = count(actors.workers, "worker");
-        format!("{workers} × {}", count(actors.envs_per_worker, "environment"))
-    };
+    let process = if config.run.deterministic { "one process, " } else { "" };
+    let workers = count(actors.workers, "worker");
+    let hands = format!("{process}{workers} × {}", count(actors.envs_per_worker, "environment"));
     let (task, seed) = (&config.task.name, config.run.seed);
     format!("{task} · {algorithm} · {policy} · seed {seed} · {hands}")
 }
@@ -163,5 +160,20 @@ fn conclude(
             }
             Ok(Outcome::Done)
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use dmprl_shared::config::Limits;
+
+    use super::*;
+
+    #[test]
+    fn a_deterministic_run_has_one_worker_whatever_was_asked_for() {
+        let mut config = ExperimentConfig::default();
+        (config.actors.workers, config.run.deterministic) = (4, true);
+        let config = config.resolve(Limits { cores: 8 }).unwrap();
+        assert!(title(&config).ends_with("one process, 1 worker × 8 environments"));
     }
 }

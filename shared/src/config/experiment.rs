@@ -61,7 +61,8 @@ pub struct RunConfig {
     pub seed: u64,
     /// Environment steps, all workers together.
     pub steps: u64,
-    /// One process in lock-step; the same seed gives the same bytes.
+    /// One worker, in one process with the learner and in lock-step with it: the same seed gives
+    /// the same bytes. `actors.workers`, `actors.joined_max` and `bridge.listen` have no effect.
     pub deterministic: bool,
     /// Stop at the first evaluation whose mean return is this or more; inf: at none.
     pub until_return: f64,
