@@ -1,12 +1,67 @@
-//! Lets this crate's executables find libpython where the linked interpreter keeps it.
+//! Records which commit the program is built from, and lets its executables find libpython where
+//! the linked interpreter keeps it.
 //!
 //! `actors/build.rs` asked the interpreter; its answer arrives in the environment because
 //! `dmprl-actors` has a `links` key.
 
+use std::path::Path;
+use std::process::{Command, Stdio};
+
+/// What the program is compiled from, relative to the project's root. Documents and tests are no
+/// part of it. The Python package is read when a run starts: a manifest has its hash.
+const SOURCES: [&str; 8] = [
+    "Cargo.toml",
+    "Cargo.lock",
+    "shared",
+    "actors",
+    "learner",
+    "deploy/Cargo.toml",
+    "deploy/build.rs",
+    "deploy/src",
+];
+
 fn main() {
-    println!("cargo::rerun-if-changed=build.rs");
     // Absent without the feature `python`.
     if let Ok(link_arg) = std::env::var("DEP_DMPRL_PYTHON_LINK_ARG") {
         println!("cargo::rustc-link-arg={link_arg}");
     }
+    let root = Path::new("..");
+    for source in SOURCES.iter().filter(|source| root.join(source).exists()) {
+        println!("cargo::rerun-if-changed=../{source}");
+    }
+    let commit = commit();
+    println!("cargo::rustc-env=DMPRL_GIT_COMMIT={}", commit.unwrap_or_default());
+}
+
+/// The commit that is checked out, with `-dirty` where the sources differ from it; none outside a
+/// git repository. A new commit makes Cargo run this again.
+fn commit() -> Option<String> {
+    let mut heads = vec!["HEAD".to_owned(), "packed-refs".to_owned()];
+    heads.extend(git(&["symbolic-ref", "--quiet", "HEAD"]));
+    for head in heads {
+        // A path that is not there would count as changed in every build.
+        if let Some(path) = git(&["rev-parse", "--git-path", &head])
+            && Path::new("..").join(&path).exists()
+        {
+            let path = Path::new("..").join(path);
+            println!("cargo::rerun-if-changed={}", path.display());
+        }
+    }
+    let hash = git(&["rev-parse", "--verify", "HEAD"])?;
+    let status = ["status", "--porcelain", "--untracked-files=normal", "--"];
+    let changes = git(&[&status[..], &SOURCES[..]].concat())?;
+    Some(if changes.is_empty() { hash } else { format!("{hash}-dirty") })
+}
+
+/// Standard output of a git command in the project's root.
+fn git(arguments: &[&str]) -> Option<String> {
+    let output = Command::new("git")
+        .args(arguments)
+        .current_dir("..")
+        .stdin(Stdio::null())
+        .stderr(Stdio::null())
+        .output()
+        .ok()?;
+    let text = String::from_utf8(output.stdout).ok()?;
+    output.status.success().then(|| text.trim().to_owned())
 }

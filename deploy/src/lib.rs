@@ -4,6 +4,7 @@
 //! binary plays every part: `dmprl train` starts itself again as `dmprl learner`, `dmprl actor`
 //! and `dmprl evaluator` and speaks with them in the lines that `control` defines.
 
+mod answer;
 pub mod bench;
 pub mod bridge;
 mod capacity;

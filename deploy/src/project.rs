@@ -1,7 +1,6 @@
-//! Where this project's files lie, and which commit they are.
+//! Finds the project's files, and says which commit the program was built from.
 
 use std::path::{Path, PathBuf};
-use std::process::{Command, Stdio};
 
 /// Ancestors searched for the project when the build's own folder is gone.
 const ANCESTORS_MAX: usize = 16;
@@ -28,16 +27,9 @@ fn is_root(path: &Path) -> bool {
     path.join("envs_py").is_dir()
 }
 
-/// The commit of the project, `-dirty` appended where files differ from it; none without git.
+/// The commit that this program was built from, with `-dirty` where its sources differed from it;
+/// none if it was built outside a git repository. `build.rs` records it.
 #[must_use]
 pub fn git_commit() -> Option<String> {
-    let output = Command::new("git")
-        .args(["describe", "--always", "--dirty", "--abbrev=40", "--exclude=*"])
-        .current_dir(Path::new(env!("CARGO_MANIFEST_DIR")))
-        .stdin(Stdio::null())
-        .stderr(Stdio::null())
-        .output()
-        .ok()?;
-    let commit = String::from_utf8(output.stdout).ok()?.trim().to_owned();
-    (output.status.success() && !commit.is_empty()).then_some(commit)
+    Some(env!("DMPRL_GIT_COMMIT")).filter(|commit| !commit.is_empty()).map(str::to_owned)
 }

@@ -32,7 +32,7 @@ pub(super) struct EvalArgs {
     /// best, latest, or a policy version.
     #[arg(long, default_value_t = PolicyChoice::Best, value_name = "best|latest|VERSION")]
     policy: PolicyChoice,
-    /// Episodes [default: evaluation.episodes of the run].
+    /// Episodes [default: as many as the policy was evaluated with in training].
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u64).range(1..=1_000_000))]
     episodes: Option<u64>,
     /// Print one JSON object on standard output.
@@ -44,13 +44,14 @@ pub(super) fn run(args: &EvalArgs) -> anyhow::Result<Outcome> {
     let run = RunDirectory::open(&args.run)?;
     let chosen = run.choose_policy(args.policy)?;
     let config = run.config()?;
+    let stored = chosen.row.as_ref().map_or(config.evaluation.episodes, |row| row.returns.len());
     let venv = prepare_python()?;
     let plan = EvaluationPlan {
         program: this_program()?,
         run: &run,
         venv: Some(venv),
         request: request(&chosen),
-        episodes: args.episodes.unwrap_or(config.evaluation.episodes as u64),
+        episodes: args.episodes.unwrap_or(stored as u64),
     };
     let Some(row) = launch::evaluate(plan)? else { return Ok(Outcome::Interrupted) };
     emit(&if args.json { json(&run, &row, &chosen) } else { text(&row, &chosen) })?;

@@ -26,7 +26,7 @@ mod tasks;
 mod train;
 
 use std::io::Write;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 
 use anyhow::Context;
@@ -40,6 +40,7 @@ use crate::python_setup::{Home, ensure_extra};
 use crate::roles::{
     self, ActorArgs, EvaluatorArgs, GatewayArgs, LearnerArgs, ObserverArgs, RelayArgs,
 };
+use crate::run_directory::Session;
 use crate::terminal::say;
 
 const EXAMPLES: &str = "\
@@ -209,6 +210,17 @@ fn emit(text: &str) -> anyhow::Result<()> {
 fn prepare_python() -> anyhow::Result<PathBuf> {
     let progress = crate::terminal::SetupProgress::new();
     Ok(Home::find()?.ensure(&|line| progress.show(line))?.venv)
+}
+
+/// A session that trains `config` in this virtual environment.
+#[cfg(feature = "python")]
+fn training_session(config: &ExperimentConfig, venv: &Path) -> anyhow::Result<Session> {
+    Session::training(config, crate::python_setup::packages(&venv.join("bin/python"))?)
+}
+
+#[cfg(not(feature = "python"))]
+fn training_session(_config: &ExperimentConfig, _venv: &Path) -> anyhow::Result<Session> {
+    Ok(Session::now())
 }
 
 /// The same with an optional part of the package; returns the interpreter, too.

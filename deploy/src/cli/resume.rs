@@ -7,11 +7,11 @@ use dmprl_learner::checkpoint;
 use dmprl_shared::config::Limits;
 
 use super::configuration::refuse;
-use super::{cores, prepare_python, this_program};
+use super::{cores, prepare_python, this_program, training_session};
 use crate::capacity;
 use crate::failure::{Outcome, wrong_use};
 use crate::launch::{self, SessionPlan, Trial};
-use crate::run_directory::{RunDirectory, Session};
+use crate::run_directory::RunDirectory;
 use crate::terminal::ProgressStyle;
 
 const HELP: &str = "\
@@ -66,8 +66,8 @@ pub(super) fn run(args: &ResumeArgs) -> anyhow::Result<Outcome> {
     }
     capacity::check(&config, run.spec()?.as_ref())?;
     let venv = prepare_python()?;
-    // Before the lock, which children inherit: git is one.
-    let session = Session::now();
+    // Before the lock, which children inherit: the interpreter that names its packages is one.
+    let session = training_session(&config, &venv)?;
     let lock = run.lock(launch::RESUME_WAIT)?;
     let mut manifest = run.manifest()?;
     manifest.sessions.push(session);

@@ -15,7 +15,7 @@ use toml::Value;
 
 use super::configuration::{Flag, merge, refuse};
 use super::configured::{ConfiguredArgs, flag, integer, make_absolute, paths};
-use super::{cores, prepare_python, this_program};
+use super::{cores, prepare_python, this_program, training_session};
 use crate::failure::{Outcome, wrong_use};
 use crate::launch::{self, SessionPlan, Trial};
 use crate::run_directory::{Manifest, PolicyChoice, RunDirectory, compact, safe_name};
@@ -113,7 +113,8 @@ pub(super) fn run(args: &TrainArgs) -> anyhow::Result<Outcome> {
     }
     let venv = prepare_python()?;
     let path = args.run_dir.clone().map_or_else(|| default_path(&config), Ok)?;
-    let manifest = Manifest::new(init_from.map(|path| path.display().to_string()))?;
+    let session = training_session(&config, &venv)?;
+    let manifest = Manifest::begin(init_from.map(|path| path.display().to_string()), session)?;
     let run = RunDirectory::create(&path, &config, &manifest)?;
     let lock = run.lock(Duration::ZERO)?;
     launch::session(SessionPlan {

@@ -5,7 +5,7 @@ use std::path::Path;
 use rustix::fs::{Access, access};
 
 use super::Check;
-use super::answer::answer;
+use crate::answer::answer;
 use crate::capacity::{MachineLimits, Space};
 use crate::run_directory::Machine;
 use crate::terminal::binary_bytes;

@@ -3,7 +3,6 @@
 //! `machine` asks the system, `room` compares its limits with what a run takes, `python` looks at
 //! the interpreter and `.venv`. Nothing here changes anything.
 
-mod answer;
 mod machine;
 #[cfg(feature = "python")]
 mod python;

@@ -6,7 +6,7 @@ use dmprl_actors::python_env::{LINKED_PYTHON, loaded_python_version};
 use serde::Deserialize;
 
 use super::Check;
-use super::answer::answer;
+use crate::answer::answer;
 use crate::python_setup::{Home, State};
 
 /// What the interpreter is asked. `find_spec` imports nothing.

@@ -98,7 +98,8 @@ impl Supervisor {
     /// A learner that is ready and neither steps nor updates: workers hang, or it does.
     /// One process neither steps nor updates while it evaluates.
     fn stalled(&self) -> Option<Instant> {
-        let episodes = if self.is_one_process() { self.config.evaluation.episodes } else { 0 };
+        let episodes =
+            if self.is_one_process() { self.config.evaluation.episodes_max() } else { 0 };
         if self.hub() == Process::Relay {
             // How long the learner's host may be away is the relay's to say.
             return None;

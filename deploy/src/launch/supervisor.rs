@@ -240,7 +240,7 @@ impl Supervisor {
         events: mpsc::Sender<Event>,
     ) -> Self {
         let now = Instant::now();
-        let limit = limits.evaluation_of(config.evaluation.episodes);
+        let limit = limits.evaluation_of(config.evaluation.episodes_max());
         Self {
             launcher,
             config,

@@ -11,6 +11,7 @@ mod advice;
 mod command;
 mod extra;
 mod home;
+mod packages;
 mod stamp;
 
 use std::{
@@ -27,7 +28,7 @@ use self::{
     command::Setup,
     stamp::{Fit, Stamp},
 };
-pub use self::{extra::ensure_extra, home::Home};
+pub use self::{extra::ensure_extra, home::Home, packages::packages};
 
 /// Name of the virtual environment in the project's root.
 const VENV: &str = ".venv";

@@ -25,6 +25,7 @@ pub fn run(args: &EvaluatorArgs, control: &ControlPipe) -> anyhow::Result<()> {
     let mut config = setup.config.clone();
     if let Some(episodes) = args.episodes {
         config.evaluation.episodes = usize::try_from(episodes)?;
+        config.evaluation.final_episodes = 0;
     }
     let interpreter = super::actor::interpreter(args.venv.as_deref(), &config)?;
     let (mut evaluator, spec) = evaluator(&interpreter, &config, control)?;
@@ -90,8 +91,8 @@ pub fn evaluate(
     let path = plan.setup.run.policy_path(request.policy_version);
     let snapshot = policy_file::load(&path, evaluator.policy(), Match::Architecture)?;
     let settings = &plan.config.evaluation;
-    let episodes =
-        Episodes { count: settings.episodes, first_seed: settings.first_seed, stop: plan.stop };
+    let count = settings.episodes_at(request.env_steps, plan.config.run.steps);
+    let episodes = Episodes { count, first_seed: settings.first_seed, stop: plan.stop };
     let evaluation = match evaluator.evaluate(&snapshot.values, episodes) {
         Ok(Some(evaluation)) => evaluation,
         Ok(None) => return Ok(Answer::Stopped),

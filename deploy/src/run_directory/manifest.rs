@@ -3,7 +3,9 @@
 use std::time::SystemTime;
 
 use anyhow::{Context, bail, ensure};
+use dmprl_shared::config::ExperimentConfig;
 use serde::{Deserialize, Serialize};
+use sha2::{Digest, Sha256};
 
 use super::timestamp::rfc3339;
 
@@ -34,8 +36,33 @@ pub struct Session {
     pub command: Vec<String>,
     /// Version of this program.
     pub dmprl_version: String,
-    /// Commit of the project, when git knows it.
+    /// Commit that the program was built from, `-dirty` appended where its sources differed from
+    /// it; none if it was built outside a git repository.
     pub git_commit: Option<String>,
+    /// SHA-256 of the resolved configuration, as hexadecimal digits; none in manifests of older
+    /// programs.
+    #[serde(default)]
+    pub config_sha256: Option<String>,
+    /// What its environments run on; none in manifests of older programs.
+    #[serde(default)]
+    pub packages: Option<Packages>,
+}
+
+/// Versions of the Python packages that decide what an environment does.
+///
+/// A version is none where the package is not installed.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Packages {
+    /// The interpreter's version.
+    pub python: String,
+    /// MuJoCo's version.
+    pub mujoco: Option<String>,
+    /// Gymnasium's version.
+    pub gymnasium: Option<String>,
+    /// NumPy's version.
+    pub numpy: Option<String>,
+    /// SHA-256 over the Python sources of the package `dmprl`, as hexadecimal digits.
+    pub dmprl_sha256: Option<String>,
 }
 
 /// What figures like steps per second depend on.
@@ -52,17 +79,26 @@ pub struct Machine {
 }
 
 impl Manifest {
-    /// The manifest of a run that begins now.
+    /// The manifest of something other than a training run, which records neither configuration
+    /// nor packages.
+    ///
+    /// # Errors
+    /// As [`Manifest::begin`].
+    pub fn new(init_from: Option<String>) -> anyhow::Result<Self> {
+        Self::begin(init_from, Session::now())
+    }
+
+    /// The manifest of a run whose first session begins now.
     ///
     /// # Errors
     /// The system gives no random number for the run's id.
-    pub fn new(init_from: Option<String>) -> anyhow::Result<Self> {
+    pub fn begin(init_from: Option<String>, session: Session) -> anyhow::Result<Self> {
         Ok(Self {
             format_version: FORMAT_VERSION,
             run_id: format!("{:016x}", random_u64()?),
             machine: Machine::this(),
             init_from,
-            sessions: vec![Session::now()],
+            sessions: vec![session],
         })
     }
 
@@ -117,8 +153,30 @@ impl Session {
             command: std::env::args_os().map(|arg| arg.to_string_lossy().into_owned()).collect(),
             dmprl_version: env!("CARGO_PKG_VERSION").into(),
             git_commit: crate::project::git_commit(),
+            config_sha256: None,
+            packages: None,
         }
     }
+
+    /// The session of this process, which trains `config` with `packages`.
+    ///
+    /// # Errors
+    /// The configuration cannot be written as TOML.
+    pub fn training(config: &ExperimentConfig, packages: Packages) -> anyhow::Result<Self> {
+        let config_sha256 = Some(config_sha256(config)?);
+        Ok(Self { config_sha256, packages: Some(packages), ..Self::now() })
+    }
+}
+
+/// Hash of a resolved configuration as `config.toml` holds it, without the comment above it.
+fn config_sha256(config: &ExperimentConfig) -> anyhow::Result<String> {
+    let text = toml::to_string(config).context("cannot write the configuration as TOML")?;
+    Ok(hexadecimal(&Sha256::digest(text)))
+}
+
+/// Two digits a byte.
+fn hexadecimal(bytes: &[u8]) -> String {
+    bytes.iter().map(|byte| format!("{byte:02x}")).collect()
 }
 
 impl Machine {

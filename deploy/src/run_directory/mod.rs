@@ -31,7 +31,7 @@ use dmprl_shared::spec::EnvSpec;
 pub(crate) use atomic::replace as replace_file;
 pub use lock::RunLock;
 pub(crate) use manifest::random_u64;
-pub use manifest::{FORMAT_VERSION, Machine, Manifest, Session};
+pub use manifest::{FORMAT_VERSION, Machine, Manifest, Packages, Session};
 pub use policies::{ChosenPolicy, PolicyChoice};
 pub use processes::{ProcessRow, ProcessState, Processes};
 pub(crate) use timestamp::unix_s;

@@ -380,6 +380,9 @@ pub struct EvaluationConfig {
     pub interval_steps: u64,
     /// Episodes of one evaluation.
     pub episodes: usize,
+    /// Episodes of the evaluation at the end of the run, if that is more: results that are
+    /// published need 100, and 100 in each evaluation would take longer than training.
+    pub final_episodes: usize,
     /// Episode i is reset with seed first_seed + i, in every evaluation. Searches use 5000 and
     /// on, so that what they find is judged by episodes that they have not seen.
     pub first_seed: u64,
@@ -387,7 +390,21 @@ pub struct EvaluationConfig {
 
 impl Default for EvaluationConfig {
     fn default() -> Self {
-        Self { interval_steps: 5_000, episodes: 20, first_seed: 1_000 }
+        Self { interval_steps: 5_000, episodes: 20, final_episodes: 0, first_seed: 1_000 }
+    }
+}
+
+impl EvaluationConfig {
+    /// Episodes of an evaluation after `env_steps` of a run of `run_steps`.
+    #[must_use]
+    pub fn episodes_at(&self, env_steps: u64, run_steps: u64) -> usize {
+        if env_steps >= run_steps { self.episodes_max() } else { self.episodes }
+    }
+
+    /// Episodes of the longest evaluation.
+    #[must_use]
+    pub fn episodes_max(&self) -> usize {
+        self.episodes.max(self.final_episodes)
     }
 }
 

@@ -121,6 +121,7 @@ impl ExperimentConfig {
             ("replay.hindsight_copies", self.replay.hindsight_copies, 1, HINDSIGHT_COPIES_MAX),
             ("learner.threads", self.learner.threads, 1, 1_024),
             ("evaluation.episodes", self.evaluation.episodes, 1, 1_000_000),
+            ("evaluation.final_episodes", self.evaluation.final_episodes, 0, 1_000_000),
             ("checkpoint.keep", self.checkpoint.keep, 1, 10_000),
         ];
         for (key, got, low, high) in counts {

@@ -28,8 +28,9 @@ fn number(row: &Value, key: &str) -> f64 {
 fn training_with_two_workers_leaves_a_whole_run_directory_and_nothing_else() {
     let place = Workplace::new();
     let run = place.path("run");
+    let more = ["--steps", "2500", "--workers", "2", "--set", "evaluation.final_episodes=6"];
     let finished = place
-        .run(&train("reacher", &run, &["--steps", "2500", "--workers", "2"]))
+        .run(&train("reacher", &run, &more))
         .with_status(0)
         .saying("first environment step after")
         .saying("evaluation at 2,500 steps")
@@ -65,8 +66,10 @@ fn training_with_two_workers_leaves_a_whole_run_directory_and_nothing_else() {
             .iter()
             .map(|value| value.as_f64().unwrap())
             .collect();
-        assert_eq!(returns.len(), 4);
-        let mean = returns.iter().sum::<f64>() / 4.0;
+        // The last evaluation has evaluation.final_episodes.
+        let episodes = if row["env_steps"].as_u64() >= Some(2500) { 6 } else { 4 };
+        assert_eq!(returns.len(), episodes);
+        let mean = returns.iter().sum::<f64>() / episodes as f64;
         assert!((mean - number(row, "return_mean")).abs() < 1e-9, "{row}");
     }
     // Workers send whole segments: a step that is due is met within one segment.
@@ -78,6 +81,29 @@ fn training_with_two_workers_leaves_a_whole_run_directory_and_nothing_else() {
     assert_eq!(last["rejected"].as_object().unwrap().values().find(|count| **count != 0), None);
     assert_eq!(number(last, "updates_owed"), 0.0);
     assert_eq!(json_file(&run, "checkpoints/latest/state.json")["counters"]["env_steps"], 2500);
+}
+
+#[test]
+fn the_manifest_says_what_each_session_ran_on_and_with_which_configuration() {
+    let place = Workplace::new();
+    let run = place.path("run");
+    place.run(&train("reacher", &run, &["--steps", "500"])).with_status(0);
+    place.run(&["resume", &run, "--steps", "1000"]).with_status(0);
+    let sessions = json_file(&run, "manifest.json")["sessions"].clone();
+    let [first, second] = sessions.as_array().unwrap().as_slice() else { panic!("{sessions}") };
+    for session in [first, second] {
+        for package in ["python", "mujoco", "gymnasium", "numpy"] {
+            let version = session["packages"][package].as_str().unwrap_or_default();
+            assert!(version.starts_with(|digit: char| digit.is_ascii_digit()), "{session}");
+        }
+        for hash in [&session["config_sha256"], &session["packages"]["dmprl_sha256"]] {
+            assert_eq!(hash.as_str().unwrap_or_default().len(), 64, "{session}");
+        }
+        // The tests are built from a clone.
+        assert!(session["git_commit"].as_str().unwrap_or_default().len() >= 40, "{session}");
+    }
+    assert_ne!(first["config_sha256"], second["config_sha256"], "run.steps has changed");
+    assert_eq!(first["packages"], second["packages"]);
 }
 
 #[test]

@@ -1,4 +1,4 @@
-//! What another program says, within a limit: a hung one must not hang the check.
+//! Asks another program a question, within a time limit.
 
 use std::ffi::OsStr;
 use std::process::Stdio;
@@ -13,7 +13,7 @@ const ANSWER_MAX: Duration = Duration::from_secs(60);
 ///
 /// # Errors
 /// It cannot be run, fails (with its last line), or takes too long.
-pub(super) fn answer(program: impl AsRef<OsStr>, arguments: &[&str]) -> Result<String, String> {
+pub(crate) fn answer(program: impl AsRef<OsStr>, arguments: &[&str]) -> Result<String, String> {
     let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build();
     let runtime = runtime.map_err(|error| error.to_string())?;
     let mut command = Command::new(program);
