@@ -4,6 +4,8 @@
 
 #[path = "../../shared/tests/counting_allocator/mod.rs"]
 mod counting_allocator;
+#[path = "../../tests/src/skipped.rs"]
+mod skipped;
 
 use counting_allocator::allocations_of;
 use dmprl_learner::algorithms::{Algorithm, Batch};
@@ -14,6 +16,7 @@ use dmprl_shared::config::{Layers, Limits};
 use dmprl_shared::policy::Policy;
 use dmprl_shared::segment::{LAYOUT_VERSION, Segment, SegmentHeader, block_checksum};
 use dmprl_shared::spec::EnvSpec;
+use skipped::skipped;
 
 fn spec() -> EnvSpec {
     EnvSpec {
@@ -136,6 +139,7 @@ fn allocations_of_imitation() -> u64 {
 /// Alone in its binary: the counter sees every thread.
 #[test]
 fn no_update_allocates_once_its_buffers_are_made() {
+    let has_bf16 = Bf16::detect().is_some();
     assert_eq!(allocations_of_imitation(), 0, "imitation");
     for algorithm in ["ddpg", "td3", "sac", "ndp"] {
         assert_eq!(allocations_of_a_learner(algorithm), 0, "a learner of {algorithm}");
@@ -144,10 +148,14 @@ fn no_update_allocates_once_its_buffers_are_made() {
         for (policy, norm) in [("dmp", "false"), ("mlp", "false"), ("mlp", "true")] {
             let what = [algorithm, policy, norm];
             assert_eq!(allocations(what, "f32", "2"), 0, "{what:?}");
-            if Bf16::detect().is_some() {
+            if has_bf16 {
                 // On one thread: each has a buffer for pairs, made when it first has work.
                 assert_eq!(allocations(what, "bf16", "1"), 0, "{what:?} bf16");
             }
         }
+    }
+    if !has_bf16 {
+        let remedy = "run the tests on a processor with AVX512-BF16";
+        skipped("TEST_BF16_REQUIRED", "allocations of updates in 16 bits", remedy);
     }
 }

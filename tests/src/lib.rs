@@ -3,6 +3,8 @@
 pub mod exported;
 pub mod hosts;
 pub mod program;
+pub mod skip_list;
+pub mod skipped;
 
 use std::path::{Path, PathBuf};
 

@@ -7,6 +7,7 @@
 
 use std::process::Command;
 
+use dmprl_tests::skipped::skipped;
 use dmprl_tests::{project_root, venv};
 use toml::Table;
 
@@ -17,12 +18,18 @@ const ONLY_FOR_TESTS: &str = "test";
 fn unit_tests_of_the_python_package_pass() {
     let output = Command::new(&venv().executable)
         .args(["-W", "error::SyntaxWarning", "-m", "unittest", "discover", "envs_py/tests"])
+        // Names the tests that are skipped.
+        .arg("--verbose")
         .current_dir(project_root())
         .output()
         .unwrap();
     let report = String::from_utf8_lossy(&output.stderr);
     assert!(output.status.success(), "{report}");
     assert!(!report.contains("Ran 0 tests"), "{report}");
+    for (_, reason) in report.lines().filter_map(|line| line.split_once("... skipped ")) {
+        let what = format!("tests of the Python package: {}", reason.trim_matches(['\'', '"']));
+        skipped("TEST_OPENGL_REQUIRED", &what, "apt install libegl1 libgl1-mesa-dri");
+    }
 }
 
 #[test]

@@ -392,6 +392,30 @@ fn the_workspace_decides_versions_and_lints_once() {
     none(&places, "versions and lints stand in the workspace's Cargo.toml");
 }
 
+/// A test run ends with the list of what was skipped: nothing runs after it.
+#[test]
+fn the_list_of_skipped_tests_comes_last() {
+    const LAST: &str = "what_was_skipped";
+    let mut places = Vec::new();
+    for member in MEMBERS {
+        let manifest = read(&format!("{member}/Cargo.toml"));
+        if !manifest.contains("[lib]\ndoctest = false") {
+            places.push(format!("{member}/Cargo.toml: doc-tests would run after the list"));
+        }
+        let name = manifest.split('"').nth(1).unwrap();
+        if name > "dmprl-tests" {
+            places.push(format!("{member}: cargo runs the tests of {name} after dmprl-tests"));
+        }
+    }
+    for entry in fs::read_dir(project_root().join("tests/tests")).unwrap().flatten() {
+        let name = entry.path().file_stem().unwrap().to_string_lossy().into_owned();
+        if name.as_str() > LAST {
+            places.push(format!("tests/tests/{name} runs after {LAST}"));
+        }
+    }
+    none(&places, "cargo runs packages and their tests in the order of their names");
+}
+
 #[test]
 fn the_lock_file_is_part_of_the_repository() {
     assert!(project_root().join("Cargo.lock").is_file(), "Cargo.lock is missing: commit it");

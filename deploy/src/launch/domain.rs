@@ -141,9 +141,14 @@ pub(crate) fn create(token: &str) -> anyhow::Result<Domain> {
 }
 
 #[cfg(test)]
+#[path = "../../../tests/src/skipped.rs"]
+mod skipped;
+
+#[cfg(test)]
 mod tests {
     use std::os::unix::fs::{PermissionsExt, symlink};
 
+    use super::skipped::skipped;
     use super::*;
 
     fn place() -> (tempfile::TempDir, Place) {
@@ -159,10 +164,8 @@ mod tests {
         let (squatted, _) = place.standard();
         std::fs::create_dir(&squatted).unwrap();
         if std::os::unix::fs::chown(&squatted, Some(place.user + 1), None).is_err() {
-            use std::io::Write;
-            // Not `eprintln!`, which the harness keeps to itself when a test passes.
-            writeln!(std::io::stderr(), "not tested: only root can give a directory away").unwrap();
-            return;
+            let what = "a name in shared memory that another user has taken";
+            return skipped("TEST_ROOT_REQUIRED", what, "run the tests as root");
         }
         let first = place.create("first").unwrap();
         let parent = first.path().parent().unwrap().to_owned();

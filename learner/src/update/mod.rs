@@ -22,4 +22,7 @@ pub mod trained;
 pub const BLOCK_ROWS: usize = 64;
 
 #[cfg(test)]
+#[path = "../../../tests/src/skipped.rs"]
+mod skipped;
+#[cfg(test)]
 mod tests;

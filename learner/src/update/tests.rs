@@ -8,6 +8,7 @@ use super::crew::Crew;
 use super::kernels::bf16::Bf16;
 use super::layer_norm::Normalised;
 use super::pass::Gradients;
+use super::skipped::skipped;
 use super::trained::{Trace, Trained};
 use super::*;
 
@@ -64,9 +65,19 @@ fn steps(hidden: Hidden, precision: Precision, threads: usize) -> [Vec<f32>; 3] 
     [trained.gradient(), trained.network.values(), target].map(<[f32]>::to_vec)
 }
 
+/// 16-bit arithmetic; none, and the test is skipped, on a processor without it.
+pub(super) fn bf16() -> Option<Bf16> {
+    let bf16 = Bf16::detect();
+    if bf16.is_none() {
+        let remedy = "run the tests on a processor with AVX512-BF16";
+        skipped("TEST_BF16_REQUIRED", "updates in 16 bits (learner.precision = \"bf16\")", remedy);
+    }
+    bf16
+}
+
 #[test]
 fn sixteen_bits_change_a_gradient_by_no_more_than_a_hundredth() {
-    if Bf16::detect().is_none() {
+    if bf16().is_none() {
         return;
     }
     let norm = |x: &mut dyn Iterator<Item = f32>| x.map(|x| x * x).sum::<f32>().sqrt();
@@ -86,7 +97,7 @@ fn sixteen_bits_change_a_gradient_by_no_more_than_a_hundredth() {
 fn the_number_of_threads_changes_no_bit_in_either_precision() {
     for hidden in [Hidden::Plain, Hidden::Normalised] {
         assert!(steps(hidden, Precision::F32, 1) == steps(hidden, Precision::F32, 3));
-        if Bf16::detect().is_some() {
+        if bf16().is_some() {
             assert!(steps(hidden, Precision::Bf16, 1) == steps(hidden, Precision::Bf16, 3));
         }
     }

@@ -3,19 +3,8 @@
 //! needs besides: no observation is acted on that is not one, no action leaves its bounds or moves
 //! faster than allowed, and when observations stop, the robot holds.
 //!
-//! ```no_run
-//! use dmprl_shared::runtime::PolicyRuntime;
-//!
-//! let mut policy = PolicyRuntime::load("policy.safetensors".as_ref())?;
-//! policy.reset(None)?;
-//! # let observation = vec![0.0; policy.spec().observation_len];
-//! loop {
-//!     // Once a control step; None: no observation has come since.
-//!     let action = policy.action(Some(&observation))?;
-//!     // … to the robot
-//! #   let _ = action; break;
-//! }
-//! # Ok::<(), dmprl_shared::runtime::RuntimeError>(())
+//! ```
+#![doc = include_str!("../../examples/act.rs")]
 //! ```
 //! `dmprl.Policy` does the same with NumPy (`envs_py/dmprl/policy.py`); a test holds both to each
 //! other, and the ONNX graph to both.

@@ -1,37 +1,39 @@
-//! Scripts, units and the Compose file, by the programs that will read them. Where one of these is
-//! not installed there is nothing to ask, and the test says so and passes.
+//! Scripts, units and the Compose file, checked by the programs that will read them. A test whose
+//! program is not installed is skipped.
 
 use std::fs;
-use std::io::Write;
 use std::process::{Command, Output};
 
 use dmprl_tests::project_root;
+use dmprl_tests::skipped::skipped;
 
 use super::read;
 
-/// What a program says; none if there is no such program.
+const REQUIRED_BY: &str = "TEST_TOOLS_REQUIRED";
+
+/// Runs a program in the project's directory; none if it is not installed.
 fn asked(program: &str, arguments: &[&str]) -> Option<Output> {
     match Command::new(program).args(arguments).current_dir(project_root()).output() {
         Ok(output) => Some(output),
-        Err(error) if error.kind() == std::io::ErrorKind::NotFound => {
-            // Not `eprintln!`, which the harness keeps to itself when a test passes.
-            writeln!(std::io::stderr().lock(), "there is no {program} here to ask").unwrap();
-            None
-        }
+        Err(error) if error.kind() == std::io::ErrorKind::NotFound => None,
         Err(error) => panic!("{program}: {error}"),
     }
 }
 
-fn approved(program: &str, arguments: &[&str]) {
-    let Some(output) = asked(program, arguments) else { return };
-    let said = String::from_utf8_lossy(&output.stderr);
-    assert!(output.status.success(), "{program} {arguments:?}: {said}{:?}", output.stdout);
+fn assert_approved(output: &Output) {
+    let [printed, said] = [&output.stdout, &output.stderr].map(|it| String::from_utf8_lossy(it));
+    assert!(output.status.success(), "{said}{printed}");
 }
 
 #[test]
-fn bash_and_its_linter_approve_of_the_slurm_script() {
-    approved("bash", &["-n", "deploy/slurm/train.sbatch"]);
-    approved("shellcheck", &["deploy/slurm/train.sbatch"]);
+fn bash_and_its_linter_approve_of_the_scripts() {
+    for script in ["deploy/slurm/train.sbatch", ".ci/run", ".ci/installed"] {
+        assert_approved(&asked("bash", &["-n", script]).expect("bash"));
+        match asked("shellcheck", &[script]) {
+            Some(output) => assert_approved(&output),
+            None => skipped(REQUIRED_BY, script, "apt install shellcheck"),
+        }
+    }
 }
 
 /// `systemd-analyze` wants to see the program, so another takes its place.
@@ -44,7 +46,10 @@ fn systemd_approves_of_the_units() {
         let path = folder.path().join(name);
         fs::write(&path, unit.replace("/opt/dmprl/bin/dmprl", "/bin/true")).unwrap();
         let arguments = ["verify", "--man=no", path.to_str().unwrap()];
-        let Some(output) = asked("systemd-analyze", &arguments) else { return };
+        let Some(output) = asked("systemd-analyze", &arguments) else {
+            skipped(REQUIRED_BY, "the units of systemd", "apt install systemd");
+            return;
+        };
         // It ends well whatever it says about keys that it does not know.
         let said = String::from_utf8_lossy(&output.stderr);
         let of_ours: Vec<_> = said.lines().filter(|line| line.contains("dmprl")).collect();
@@ -69,14 +74,29 @@ fn units_leave_shared_memory_alone_and_stop_the_supervisor_first() {
     }
 }
 
+/// Docker itself, or else the schema that the Compose specification publishes, in check-jsonschema.
 #[test]
 fn compose_approves_of_its_file() {
-    let Some(version) = asked("docker", &["compose", "version"]) else { return };
-    if !version.status.success() {
-        writeln!(std::io::stderr().lock(), "docker has no compose here to ask").unwrap();
-        return;
+    const FILE: &str = "deploy/compose.yaml";
+    let version = asked("docker", &["compose", "version"]);
+    if version.is_some_and(|output| output.status.success()) {
+        let arguments = ["compose", "--file", FILE, "config", "--quiet"];
+        return assert_approved(&asked("docker", &arguments).expect("docker"));
     }
-    approved("docker", &["compose", "--file", "deploy/compose.yaml", "config", "--quiet"]);
+    let schema = ["--builtin-schema", "vendor.compose-spec"];
+    match asked("check-jsonschema", &[&schema[..], &[FILE]].concat()) {
+        Some(output) => {
+            assert_approved(&output);
+            // That it judges at all.
+            let folder = tempfile::tempdir().unwrap();
+            let path = folder.path().join("compose.yaml");
+            fs::write(&path, read(FILE).replace("restart: on-failure:5", "restarts: 5")).unwrap();
+            let wrong =
+                asked("check-jsonschema", &[&schema[..], &[path.to_str().unwrap()]].concat());
+            assert!(!wrong.unwrap().status.success());
+        }
+        None => skipped(REQUIRED_BY, FILE, "pip install check-jsonschema"),
+    }
 }
 
 /// The same with no program at all: what the file must say.

@@ -1,11 +1,10 @@
 //! The dashboard's page in a real browser: start, watch a curve grow, switch the axis, compare two
 //! runs, and the same on a phone.
 //!
-//! Where there is no Chromium the test says so and passes, unless `TEST_BROWSER_REQUIRED` is set.
-
-use std::io::Write;
+//! Skipped where there is no Chromium.
 
 use dmprl_tests::program::Workplace;
+use dmprl_tests::skipped::skipped;
 use rustix::process::Signal;
 
 use crate::browser::{self, Browser};
@@ -47,13 +46,8 @@ fn of_chart(browser: &Browser, key: &str, what: &str) -> f64 {
 #[test]
 fn a_browser_watches_a_run_grow_beside_another() {
     let Some(program) = browser::find() else {
-        assert!(
-            std::env::var_os("TEST_BROWSER_REQUIRED").is_none(),
-            "a browser is required: install chromium, or name one in TEST_CHROMIUM"
-        );
-        let mut stderr = std::io::stderr().lock();
-        writeln!(stderr, "no chromium here: the dashboard's page is not tested").unwrap();
-        return;
+        let remedy = "apt install chromium, or name another in TEST_CHROMIUM";
+        return skipped("TEST_BROWSER_REQUIRED", "the dashboard's page in a browser", remedy);
     };
     let place = Workplace::new();
     std::fs::create_dir(place.path("runs")).unwrap();

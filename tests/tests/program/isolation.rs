@@ -8,6 +8,7 @@ use std::process::{Command, Output};
 use dmprl_tests::program::{
     Workplace, env_steps_of, executable, json_file, rows, shared_memory_of,
 };
+use dmprl_tests::skipped::skipped;
 use rustix::process::Signal;
 
 use crate::{ENDLESS, train};
@@ -53,8 +54,8 @@ fn a_run_that_shared_memory_cannot_hold_is_refused_with_both_numbers() {
     refused_by_its_size(command, &place, &words);
 }
 
-/// A command that finds a /dev/shm of its own, of so many KiB, as in a container; none, loudly,
-/// where this machine lets nobody mount one.
+/// A command with a /dev/shm of its own, of so many KiB, as in a container; none, and the test is
+/// skipped, where it cannot be mounted.
 pub(crate) fn with_shared_memory_of(kib: u32, script: &str) -> Option<Command> {
     let mount = format!("mount -t tmpfs -o size={kib}k,mode=1777 tmpfs /dev/shm");
     let alone = |script: &str| {
@@ -66,10 +67,8 @@ pub(crate) fn with_shared_memory_of(kib: u32, script: &str) -> Option<Command> {
     if probe.is_ok_and(|output| output.status.success()) {
         return Some(alone(&format!("{mount} && {script}")));
     }
-    use std::io::Write;
-    // Not `eprintln!`, which the harness keeps to itself when a test passes.
-    let mut stderr = std::io::stderr().lock();
-    writeln!(stderr, "a small /dev/shm was not tried: unshare and mount take root").unwrap();
+    let remedy = "run the tests as root, where it may mount";
+    skipped("TEST_ROOT_REQUIRED", "runs with a small /dev/shm", remedy);
     None
 }
 
@@ -213,11 +212,8 @@ fn another_user_can_neither_read_nor_inject_nor_block() {
 
     let probe = Command::new("setpriv").args(["--reuid", STRANGER, "true"]).status();
     if !rustix::process::geteuid().is_root() || !probe.is_ok_and(|status| status.success()) {
-        use std::io::Write;
-        // Not `eprintln!`, which the harness keeps to itself when a test passes.
-        let mut stderr = std::io::stderr().lock();
-        writeln!(stderr, "another user was not played: that takes root and setpriv").unwrap();
-        return;
+        let remedy = "run the tests as root, with setpriv (apt install util-linux)";
+        return skipped("TEST_ROOT_REQUIRED", "a run that another user attacks", remedy);
     }
     // Everybody may come as far as the run's directory, as on a shared machine.
     fs::set_permissions(place.folder(), PermissionsExt::from_mode(0o755)).unwrap();

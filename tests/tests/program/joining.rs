@@ -9,6 +9,7 @@ use std::path::{Path, PathBuf};
 use dmprl_tests::program::{
     Process, Running, Workplace, env_steps_of, rows, shared_memory_of, until,
 };
+use dmprl_tests::skipped::skipped;
 use rustix::process::Signal;
 use serde_json::Value;
 
@@ -215,6 +216,9 @@ fn a_run_that_cannot_take_a_worker_in_says_why() {
     if rustix::process::geteuid().is_root() {
         chown(&run, Some(65_534), None).unwrap();
         refused(&run, 2, "belongs to user 65534");
+    } else {
+        let what = "joining a run of another user";
+        skipped("TEST_ROOT_REQUIRED", what, "run the tests as root");
     }
     let alone = place.path("alone");
     let more = ["--steps", "100", "--set", "actors.joined_max=0"];

@@ -5,6 +5,7 @@ use std::path::Path;
 use std::process::Command;
 
 use dmprl_tests::program::{Workplace, executable};
+use dmprl_tests::skipped::skipped;
 use dmprl_tests::venv;
 use rustix::process::Signal;
 use serde_json::Value;
@@ -27,14 +28,14 @@ fn python(arguments: &[&str]) -> std::process::Output {
     Command::new(&venv().executable).arg("-I").args(arguments).output().unwrap()
 }
 
-/// Nothing is drawn without OpenGL; only then is there nothing to test.
+/// Whether this machine can draw; if not, the caller skips what draws.
 pub(super) fn can_draw() -> bool {
     let asked = "import os; from dmprl.pictures import name_opengl; name_opengl(); \
                  raise SystemExit('MUJOCO_GL' not in os.environ)";
     let can = python(&["-c", asked]).status.success();
     if !can {
-        assert!(std::env::var_os("TEST_EXTRAS_REQUIRED").is_none(), "no OpenGL to draw with");
-        eprintln!("skipped: no OpenGL to draw with; apt install libegl1 libgl1-mesa-dri");
+        let what = "videos and live pictures, which OpenGL draws";
+        skipped("TEST_OPENGL_REQUIRED", what, "apt install libegl1 libgl1-mesa-dri");
     }
     can
 }

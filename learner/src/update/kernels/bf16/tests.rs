@@ -3,6 +3,7 @@
 
 use super::super::tests::{SHAPES, numbers, product};
 use super::*;
+use crate::update::tests::bf16;
 
 /// To the nearest bfloat16, ties to even.
 fn rounded(number: f32) -> f64 {
@@ -29,7 +30,7 @@ fn check(got: &[f32], cols: usize, depth: usize, at: impl Fn(usize, usize, usize
 
 #[test]
 fn products_of_rounded_numbers_are_exact_and_of_others_within_a_hundredth() {
-    let Some(bf16) = Bf16::detect() else { return };
+    let Some(bf16) = bf16() else { return };
     for (rows, inputs_len, outputs_len) in SHAPES {
         let inputs = numbers(rows * inputs_len, 1);
         let weights = numbers(outputs_len * inputs_len, 2);
@@ -69,7 +70,7 @@ fn products_of_rounded_numbers_are_exact_and_of_others_within_a_hundredth() {
 
 #[test]
 fn bias_activation_and_mask_are_those_of_f32() {
-    let Some(bf16) = Bf16::detect() else { return };
+    let Some(bf16) = bf16() else { return };
     let (inputs, weights) = ([1.0, 2.0, 4.0], [1.0, 0.0, 0.0, 0.0, -1.0, 0.0, 0.0, 0.0, 1.0]);
     let mut packed = vec![0; forward_len(3, 3)];
     bf16.pack_forward(&weights, 3, &mut packed);
@@ -84,7 +85,7 @@ fn bias_activation_and_mask_are_those_of_f32() {
 
 #[test]
 fn a_layer_packed_in_pieces_is_the_layer_packed_at_once() {
-    let Some(bf16) = Bf16::detect() else { return };
+    let Some(bf16) = bf16() else { return };
     let (inputs, outputs) = (37, 70);
     let weights = numbers(inputs * outputs, 1);
     let mut whole = vec![9; forward_len(inputs, outputs)];
