@@ -18,15 +18,16 @@ use crate::terminal::{say, shown};
 
 const HELP: &str = "\
 Writes index.html (one page that needs nothing else), report.md, figures.csv, runs.csv, curves.json
-and every picture as SVG and PNG. Tables give mean and standard deviation over seeds, and the
-interquartile mean with a 95 % interval by stratified bootstrap (Agarwal et al. 2021), beside the
-paper's figures where the task and the method are the paper's. Only runs that have come to their end
-count in a table.
-How a run moves is measured once, by rolling its last policy out, and kept in the run; so are
-frames of a rollout, which need an environment that can be drawn.
-The folder of an earlier report stands in for runs that lie elsewhere or nowhere any more: its runs
-count wherever no run or sweep that is given has the same task, method and seed at its end. It may
-be the folder that is written.
+and every picture as SVG and PNG. Tables give mean and standard deviation over seeds, and from four
+seeds on the interquartile mean with a 95 % interval by stratified bootstrap (Agarwal et al. 2021);
+below four seeds they give the range. The paper's figures stand beside them for its own tasks and
+methods. Only finished runs count. Figures over runs of different programs or package versions are
+marked.
+Motion is measured once per run, by rolling out its last policy, and kept in the run directory. So
+are the frames of a rollout, which need an environment that can render.
+The folder of an earlier report replaces runs that are elsewhere or deleted: its runs count where
+no given run or sweep has a finished run of the same task, method and seed. It may be the output
+folder itself.
 
 EXAMPLES
   dmprl report runs/paper

@@ -215,7 +215,20 @@ fn run(directory: &RunDirectory, config: &ExperimentConfig, method: String) -> a
     let (task, seed, steps) = (config.task.name.clone(), config.run.seed, config.run.steps);
     let origin = Origin::of(&directory.manifest()?);
     let (policy, source) = (config.policy.kind, Source::Directory(path));
-    Ok(Run { task, method, policy, seed, source, ended, steps, origin, rows, motion: None })
+    let final_episodes = rows.last().map(|row| row.returns.len() as u64);
+    Ok(Run {
+        task,
+        method,
+        policy,
+        seed,
+        source,
+        ended,
+        steps,
+        origin,
+        rows,
+        final_episodes,
+        motion: None,
+    })
 }
 
 /// What a run is called that no sweep has named: a preset's runs are no seeds of the default's.

@@ -21,6 +21,8 @@ pub fn figures_csv(report: &Report) -> anyhow::Result<Vec<u8>> {
         "high",
         "paper_mean",
         "paper_std",
+        "min",
+        "max",
     ])?;
     for table in &report.tables {
         for (task, cells) in &table.rows {
@@ -32,11 +34,13 @@ pub fn figures_csv(report: &Report) -> anyhow::Result<Vec<u8>> {
                 let of = [
                     summary.map(|summary| summary.mean),
                     summary.map(|summary| summary.std),
-                    summary.map(|summary| summary.iqm),
-                    summary.map(|summary| summary.interval[0]),
-                    summary.map(|summary| summary.interval[1]),
+                    summary.and_then(|summary| summary.iqm),
+                    summary.and_then(|summary| Some(summary.interval?[0])),
+                    summary.and_then(|summary| Some(summary.interval?[1])),
                     cell.paper.map(|paper| paper.0),
                     cell.paper.map(|paper| paper.1),
+                    summary.map(|summary| summary.range[0]),
+                    summary.map(|summary| summary.range[1]),
                 ];
                 let words = [table.title, task, method, count.as_str()];
                 let words = words.into_iter().map(str::to_owned);
@@ -64,6 +68,8 @@ pub fn runs_csv(runs: &[Run]) -> anyhow::Result<Vec<u8>> {
         "return_mean",
         "success_rate",
         "smoothness",
+        "program",
+        "packages",
     ])?;
     for run in runs {
         for row in &run.rows {
@@ -78,6 +84,8 @@ pub fn runs_csv(runs: &[Run]) -> anyhow::Result<Vec<u8>> {
                 row.return_mean.to_string(),
                 row.success_rate.map(|rate| rate.to_string()).unwrap_or_default(),
                 row.smoothness.to_string(),
+                run.origin.programs.join("; "),
+                run.origin.packages.join("; "),
             ])?;
         }
     }

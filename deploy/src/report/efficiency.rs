@@ -5,7 +5,7 @@ use serde::Serialize;
 use super::collect::Results;
 use super::measures::Measure;
 use super::run::Run;
-use super::statistics::median_with_interval;
+use super::statistics::{INTERVAL_SCORES_MIN, median_with_bounds, range};
 use super::thresholds::{mark, threshold};
 use crate::terminal::grouped;
 
@@ -31,8 +31,11 @@ pub struct EfficiencyCell {
     pub unfinished: usize,
     /// Null where half of the seeds or more ended without.
     pub median: Option<f64>,
-    /// Its 95 % interval by bootstrap, ends null where they lie beyond every run.
+    /// Its 95 % interval by bootstrap from four seeds on. An end is null if it lies beyond every
+    /// run; both are null below four seeds.
     pub interval: [Option<f64>; 2],
+    /// Fewest and most steps; null for a seed that ended without.
+    pub range: [Option<f64>; 2],
     /// What the paper says.
     pub paper: Option<&'static str>,
 }
@@ -49,9 +52,12 @@ impl EfficiencyCell {
         let mut cell =
             Self { unfinished, paper: mark(task, method).map(|mark| mark.0), ..Self::default() };
         if !steps.is_empty() {
-            let (median, interval) = median_with_interval(&steps);
+            let (median, bounds) = median_with_bounds(&steps);
             cell.median = finite(median);
-            cell.interval = interval.map(finite);
+            if steps.len() >= INTERVAL_SCORES_MIN {
+                cell.interval = bounds.map(finite);
+            }
+            cell.range = range(&steps).map(finite);
         }
         cell.steps = steps.into_iter().map(finite).collect();
         cell
@@ -68,8 +74,10 @@ impl EfficiencyCell {
             let reached = self.steps.iter().flatten().count();
             lines.push(number(self.median));
             if reached > 0 && self.steps.len() > 1 {
-                let [low, high] = self.interval.map(number);
-                lines.push(format!("[{low} – {high}]"));
+                let is_range = self.steps.len() < INTERVAL_SCORES_MIN;
+                let [low, high] = if is_range { self.range } else { self.interval }.map(number);
+                let name = if is_range { "range " } else { "" };
+                lines.push(format!("{name}[{low} – {high}]"));
             }
             lines.push(format!("{reached} of {} seeds", self.steps.len()));
             if self.unfinished > 0 {
@@ -132,12 +140,13 @@ mod tests {
         assert_eq!((rows.len(), rows[0].source), (1, "the paper's section 4.2"));
         let cell = &rows[0].cells[0];
         assert_eq!(cell.steps, [Some(2_000.0), Some(3_000.0), None]);
-        assert_eq!((cell.median, cell.interval), (Some(3_000.0), [Some(2_000.0), None]));
+        assert_eq!((cell.median, cell.interval), (Some(3_000.0), [None, None]));
+        assert_eq!(cell.range, [Some(2_000.0), None]);
         assert_eq!(
             cell.lines(),
             [
                 "3,000",
-                "[2,000 – not reached]",
+                "range [2,000 – not reached]",
                 "2 of 3 seeds",
                 "1 under way",
                 "paper: about 33,000"

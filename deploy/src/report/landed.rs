@@ -20,8 +20,10 @@ use crate::control::EvaluationRow;
 
 /// By which the folder of a report is known.
 pub const FILE: &str = "curves.json";
-/// Of that file.
-const FORMAT_VERSION: u32 = 2;
+/// Version of the file that is written.
+const FORMAT_VERSION: u32 = 3;
+/// Oldest version that is read. It lacks final episodes, packages and hashes.
+const FORMAT_VERSION_MIN: u32 = 2;
 
 /// What every version of the file begins with.
 #[derive(Debug, Deserialize)]
@@ -74,6 +76,9 @@ struct Line {
     /// Null where the task reports none.
     success_rate: Option<Vec<f64>>,
     smoothness: Vec<f64>,
+    /// Episodes of the last evaluation.
+    #[serde(default)]
+    final_episodes: Option<u64>,
     motion: Option<Moves>,
 }
 
@@ -103,6 +108,7 @@ impl Line {
             return_mean: numbers(|row| row.return_mean),
             success_rate: run.rows.iter().map(|row| row.success_rate).collect(),
             smoothness: numbers(|row| row.smoothness),
+            final_episodes: run.final_episodes,
             motion,
         }
     }
@@ -146,8 +152,22 @@ impl Line {
             smoothness: self.smoothness[index],
         };
         let rows = (0..self.env_steps.len()).map(row).collect();
-        let Self { task, method, seed, policy, steps, ended, origin, motion, .. } = self;
-        Run { task, method, policy, seed, source, ended, steps, origin, rows, motion }
+        let Self {
+            task, method, seed, policy, steps, ended, origin, final_episodes, motion, ..
+        } = self;
+        Run {
+            task,
+            method,
+            policy,
+            seed,
+            source,
+            ended,
+            steps,
+            origin,
+            rows,
+            final_episodes,
+            motion,
+        }
     }
 }
 
@@ -176,8 +196,8 @@ pub fn read(report: &Path) -> anyhow::Result<Results> {
     let Versioned { format_version } =
         serde_json::from_str(&text).with_context(|| format!("{name} is no report's file"))?;
     match format_version {
-        FORMAT_VERSION => {}
-        ..FORMAT_VERSION => bail!(
+        FORMAT_VERSION_MIN..=FORMAT_VERSION => {}
+        ..FORMAT_VERSION_MIN => bail!(
             "{name} is of format {format_version}, expected {FORMAT_VERSION}: it holds no more \
              than curves; make that report again, from its runs, with this program"
         ),
@@ -230,7 +250,6 @@ mod tests {
             run("panda-reach", 3, &[], false),
         ]);
         results.runs[0].motion = Some(planted_moves(1.0 / 3.0, -2.0));
-        results.runs[0].origin.programs = vec!["0.1.0".to_owned()];
         results.waiting = vec![Key { seed: 9, ..results.runs[0].key() }];
         results.sweeps = vec![("paper".to_owned(), "seeds = [1]\n".to_owned())];
         results
@@ -259,6 +278,19 @@ mod tests {
         });
         assert_eq!(ours, theirs);
         assert!(landed.runs.iter().all(|run| run.directory().is_none()));
+    }
+
+    #[test]
+    fn a_file_of_the_version_before_is_read_without_what_it_lacks() {
+        let text = String::from_utf8(curves_json(&results()).unwrap()).unwrap();
+        let older = text
+            .replace("\"format_version\":3", "\"format_version\":2")
+            .replace("\"final_episodes\":100,", "")
+            .replace(",\"packages\":[\"Python 3.11.7\"],\"config_sha256\":null", "");
+        assert_ne!(older.len(), text.len());
+        let landed = read(written(older.as_bytes()).path()).unwrap();
+        assert_eq!(landed.runs.len(), 3);
+        assert!(landed.runs.iter().all(|run| run.final_episodes.is_none()));
     }
 
     #[test]
@@ -294,9 +326,9 @@ mod tests {
             }
         }
         for (from, to, expected) in [
-            ("\"format_version\":2", "\"format_version\":1", "it holds no more than curves"),
-            ("\"format_version\":2", "\"format_version\":3", "of format 3, expected 2: a newer"),
-            ("\"format_version\":2", "\"version\":2", "is no report's file"),
+            ("\"format_version\":3", "\"format_version\":1", "it holds no more than curves"),
+            ("\"format_version\":3", "\"format_version\":4", "of format 4, expected 3: a newer"),
+            ("\"format_version\":3", "\"version\":3", "is no report's file"),
             ("\"methods\":[\"TD3\"]", "\"methods\":[]", "not in the lists"),
             ("-1.000049", "1e999", "number out of range"),
         ] {

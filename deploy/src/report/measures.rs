@@ -76,12 +76,13 @@ impl Measure {
                  actions scaled to [-1, 1]; lower is smoother."
             }
             Self::JointJerk => {
-                "Mean absolute jerk of a joint, from its velocity in each step, over the last \
-                 evaluation's episodes; lower is smoother. Joints that only slide: m/s³."
+                "Mean absolute jerk of a joint, from its velocity in each step, over the first \
+                 evaluation.episodes episodes of the last evaluation; lower is smoother. Joints \
+                 that only slide: m/s³."
             }
             Self::Sparc => {
                 "Spectral arc length of the joints' speed (Balasubramanian et al. 2015), mean over \
-                 the last evaluation's episodes; nearer to zero is smoother."
+                 the same episodes as joint jerk; nearer to zero is smoother."
             }
             Self::Decisions => {
                 "Segments decided upon in training; an mlp policy decides in every step."

@@ -1,7 +1,7 @@
 //! `dmprl report`: what several runs have shown, as one page, Markdown, CSV, JSON and pictures.
 //!
 //! `collect` reads runs and sweeps, `landed` what an earlier report knew of some, `motion` measures
-//! how they move; `run` and `moves` are what is known of one; `measures` says what is measured of
+//! how they move; `run` and `moves` are what is known of one, `provenance` what made them; `measures` says what is measured of
 //! it, `tables`, `efficiency`, `curves`, `trajectories`, `strips` and `statements` what that shows,
 //! `statistics` how sure one can be; `paper` and `thresholds` are what the paper has. `sections`
 //! puts it in order for `page` and `markdown`, `data` and `landed` write it for other programs.
@@ -20,6 +20,7 @@ mod page;
 mod paper;
 #[cfg(test)]
 mod planted;
+mod provenance;
 mod run;
 mod sections;
 mod statements;

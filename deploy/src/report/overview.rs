@@ -28,8 +28,6 @@ pub fn sentences(results: &Results) -> Vec<String> {
             if first == last { (*first).to_owned() } else { format!("between {first} and {last}") };
         sentences.push(format!("Begun {span}."));
     }
-    let programs = results.runs.iter().flat_map(|run| run.origin.programs.iter().cloned());
-    sentences.push(format!("By dmprl {}.", distinct(programs)));
     let machines = results.runs.iter().map(|run| run.origin.machine.clone());
     sentences.push(format!("On {}.", distinct(machines)));
     if let Some(first) = results.unmeasured.first() {
@@ -113,7 +111,7 @@ mod tests {
             sentences[0],
             "Of 10 runs 2 have come to their end, 1 under way or stopped, 7 not begun."
         );
-        assert_eq!(sentences[3], "On a; b.");
+        assert_eq!(sentences[2], "On a; b.");
         let grid = runs_table(&results);
         assert_eq!(grid.rows[0].1[0], ["seeds 1, 2", "begun: seed 3", "2,000 steps each"]);
     }

@@ -19,6 +19,15 @@ const SUCCESS: [Row; 2] = [
     Row("panda-reach-joints", [(0.99, 0.01), (0.0, 0.0), (0.92, 0.01), (0.85, 0.41), (0.0, 0.0)]),
 ];
 
+/// The method that follows the paper by this project's first reading of it.
+pub const READING_METHOD: &str = "DDPG-DMP (paper)";
+/// What that method reads into the paper, for a footnote beside its figures.
+pub const READING: &str = "¹ DDPG-DMP (paper) is one reading of the paper, which leaves these \
+    choices open: goal, weights and rho are bounded by tanh; the controller sees velocity and \
+    acceleration divided by omega and omega²; the target takes s' = s_{t+1} after the sum of K \
+    rewards; forcing-term widths follow NDP's code. Other readings are methods of \
+    deploy/experiments/paper.toml.";
+
 /// Trials behind each of its figures.
 pub const SEEDS: usize = 5;
 

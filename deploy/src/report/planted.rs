@@ -43,8 +43,13 @@ pub(super) fn planted(runs: &[Planted]) -> Results {
             source: Source::Directory(format!("{}-{}-{}", run.task, run.method, run.seed).into()),
             ended: run.ended,
             steps: run.rows.len() as u64 * INTERVAL,
-            origin: Origin::default(),
+            origin: Origin {
+                programs: vec!["0.1.0 (commit 0123)".to_owned()],
+                packages: vec!["Python 3.11.7".to_owned()],
+                ..Origin::default()
+            },
             rows: rows.collect(),
+            final_episodes: Some(100),
             motion: None,
         });
     }

@@ -8,7 +8,7 @@ use serde::{Deserialize, Serialize};
 
 use super::moves::Moves;
 use crate::control::EvaluationRow;
-use crate::run_directory::{Machine, Manifest, Session};
+use crate::run_directory::{Machine, Manifest, Packages, Session};
 use crate::terminal::binary_bytes;
 
 /// Of a commit's hash, enough to find it.
@@ -35,6 +35,8 @@ pub struct Run {
     pub origin: Origin,
     /// Oldest first.
     pub rows: Vec<EvaluationRow>,
+    /// Episodes of its last evaluation; none where an older report does not say.
+    pub final_episodes: Option<u64>,
     /// How its last policy moves, where that was measured.
     pub motion: Option<Moves>,
 }
@@ -74,6 +76,12 @@ pub struct Origin {
     pub started: String,
     /// Versions of the program, with the commit where it is known; one a session.
     pub programs: Vec<String>,
+    /// Versions of Python, MuJoCo, Gymnasium and NumPy; one a session that recorded them.
+    #[serde(default)]
+    pub packages: Vec<String>,
+    /// SHA-256 of the resolved configuration of the last session that recorded it.
+    #[serde(default)]
+    pub config_sha256: Option<String>,
     /// Processor, cores and memory.
     pub machine: String,
 }
@@ -84,7 +92,7 @@ impl Origin {
             Some(commit) => {
                 let (hash, dirty) = commit.split_once('-').unwrap_or((commit, ""));
                 let hash: String = hash.chars().take(HASH_LEN).collect();
-                let dirty = if dirty.is_empty() { "" } else { ", changed since" };
+                let dirty = if dirty.is_empty() { "" } else { " with changes" };
                 format!("{} (commit {hash}{dirty})", session.dmprl_version)
             }
             None => session.dmprl_version.clone(),
@@ -99,9 +107,48 @@ impl Origin {
                 .map(|first| first.started.clone())
                 .unwrap_or_default(),
             programs: manifest.sessions.iter().map(program).collect(),
+            packages: manifest.sessions.iter().filter_map(packages).collect(),
+            config_sha256: manifest
+                .sessions
+                .iter()
+                .rev()
+                .find_map(|session| session.config_sha256.clone()),
             machine: format!("{cpu}, {cores} cores{}, {os}", memory.unwrap_or_default()),
         }
     }
+}
+
+impl Origin {
+    /// The programs of its sessions; none if the commit of one is not known.
+    pub(super) fn known_programs(&self) -> Option<&[String]> {
+        let is_known = |program: &String| {
+            let commit = program.split_once("(commit ").map(|(_, commit)| commit);
+            commit
+                .is_some_and(|commit| commit.starts_with(|letter: char| letter.is_ascii_hexdigit()))
+        };
+        let all = !self.programs.is_empty() && self.programs.iter().all(is_known);
+        all.then_some(self.programs.as_slice())
+    }
+
+    /// The packages of its sessions; none if one did not record them.
+    pub(super) fn known_packages(&self) -> Option<&[String]> {
+        let all = !self.packages.is_empty() && self.packages.len() == self.programs.len();
+        all.then_some(self.packages.as_slice())
+    }
+}
+
+/// `Python 3.11.7, MuJoCo 4.0.0, Gymnasium 1.4.0, NumPy 2.4.6, dmprl c4b5c29bb027`.
+fn packages(session: &Session) -> Option<String> {
+    let Packages { python, mujoco, gymnasium, numpy, dmprl_sha256 } = session.packages.as_ref()?;
+    let version = |version: &Option<String>| version.clone().unwrap_or_else(|| "none".to_owned());
+    let sources = version(dmprl_sha256);
+    let sources: String = sources.chars().take(HASH_LEN).collect();
+    Some(format!(
+        "Python {python}, MuJoCo {}, Gymnasium {}, NumPy {}, dmprl's Python package {sources}",
+        version(mujoco),
+        version(gymnasium),
+        version(numpy),
+    ))
 }
 
 impl Run {

@@ -6,7 +6,11 @@ use super::collect::Results;
 use super::efficiency::EfficiencyRow;
 use super::overview::{runs_table, sentences};
 use super::page::Report;
-use super::statements::{ALMOST_ALL, Judged, LOSS, NONE, SEEDS_MIN, SUBJECTS, counts};
+use super::paper;
+use super::provenance::Provenance;
+use super::statements::{
+    ALMOST_ALL, EPISODES_MIN, Judged, LOSS, NONE, SEEDS_MIN, SUBJECTS, counts,
+};
 use super::strips::Strip;
 use super::tables::{Table, TableKind};
 
@@ -118,7 +122,39 @@ pub fn sections(report: &Report) -> Vec<Section> {
     if !report.judged.is_empty() {
         sections.push(statements(&report.judged));
     }
+    if report.results.methods.iter().any(|method| method == paper::READING_METHOD) {
+        sections.iter_mut().for_each(mark_reading);
+    }
+    sections.push(provenance(&report.results));
     sections
+}
+
+/// Marks the column of the paper's method, and says below it what was read into the paper.
+fn mark_reading(section: &mut Section) {
+    let has_figures =
+        section.grid.is_some() || !section.pictures.is_empty() || !section.statements.is_empty();
+    if !has_figures {
+        return;
+    }
+    let columns = section.grid.iter_mut().flat_map(|grid| &mut grid.columns);
+    for column in columns.filter(|column| *column == paper::READING_METHOD) {
+        column.push_str(" ¹");
+    }
+    section.about.push(paper::READING.to_owned());
+}
+
+fn provenance(results: &Results) -> Section {
+    let provenance = Provenance::of(results);
+    let mut section = Section::new(
+        "Provenance",
+        &[
+            "Which program and packages made the runs of each cell, by number, and of which seeds \
+           this report has measures of motion and a recorded rollout.",
+            &provenance.legend(),
+        ],
+    );
+    section.grid = Some(provenance.grid);
+    section
 }
 
 fn overview(report: &Report) -> Section {
@@ -155,9 +191,9 @@ fn efficiency(report: &Report) -> Section {
     let mut section = Section::new(
         "Sample efficiency",
         &["Environment steps until an evaluation's mean first reaches the threshold: median over \
-           the seeds with its 95 % interval by bootstrap, and how many of the seeds that ended got \
-           there. One that ended without counts as later than all. Only as fine as the evaluations \
-           are apart."],
+           the seeds, with its 95 % interval by bootstrap from four seeds on and the range below \
+           four, and how many of the finished seeds reached it. A seed that did not reach it counts \
+           as later than all others. The resolution is the interval between evaluations."],
     );
     let sources =
         report.efficiency.iter().map(|EfficiencyRow { task, threshold, source, .. }| {
@@ -174,10 +210,12 @@ fn efficiency(report: &Report) -> Section {
 
 fn statements(judged: &[Judged]) -> Section {
     let rule = format!(
-        "Judged by the runs' figures, not by eye. \"Held\" and \"did not hold\" need 95 % \
-         intervals that lie apart (interquartile mean over seeds; median for steps) with at least \
-         {SEEDS_MIN} seeds each; \"no clear difference\" is anything between. A statement that \
-         methods are alike, or that one does not improve, held where no difference is clear. \
+        "Rules applied to the runs' figures decide. \"Held\" and \"did not hold\" need at least \
+         {SEEDS_MIN} seeds of each method, {EPISODES_MIN} episodes in each last evaluation, and 95 % \
+         intervals that do not overlap (of the interquartile mean, or of the median for steps). \
+         With fewer the verdict is \"too few seeds\" or \"too few episodes\"; overlapping intervals \
+         are \"no clear difference\". A statement that methods are alike, or that one does not \
+         improve, held where no difference is clear. \
          \"Cannot hold\": the paper's own figures contradict it. Fails: a success rate of at most \
          {NONE}; almost always: of at least {ALMOST_ALL}; loses again: more than {LOSS} of what it \
          had won, by moving means of five evaluations. The paper trained for about 200,000 steps; \

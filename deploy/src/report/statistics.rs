@@ -1,4 +1,6 @@
-//! What is said of a few seeds: mean and spread, and the interquartile mean with its interval.
+//! Statistics over seeds: mean and spread, and from four seeds on the interquartile mean and median
+//! with their bootstrap intervals. Below four, an interquartile mean is the mean, and a bootstrap
+//! interval is the range of the scores: only that range is given.
 //!
 //! Interquartile mean and stratified bootstrap are those of Agarwal et al. 2021, "Deep
 //! Reinforcement Learning at the Edge of the Statistical Precipice" (arXiv 2108.13264), as their
@@ -8,6 +10,8 @@ use dmprl_shared::seeds;
 use rand::RngExt;
 use serde::Serialize;
 
+/// Fewest scores that have an interquartile mean and an interval.
+pub const INTERVAL_SCORES_MIN: usize = 4;
 /// Resamplings of a bootstrap, as many as rliable's default.
 const REPETITIONS: usize = 50_000;
 /// Share of values cut off at either end of an interquartile mean.
@@ -24,10 +28,12 @@ pub struct Summary {
     pub mean: f64,
     /// Standard deviation over the scores (of the sample: n - 1); 0 for one.
     pub std: f64,
-    /// Interquartile mean.
-    pub iqm: f64,
-    /// Its 95 % interval by bootstrap.
-    pub interval: [f64; 2],
+    /// Lowest and highest score.
+    pub range: [f64; 2],
+    /// Interquartile mean; none below [`INTERVAL_SCORES_MIN`].
+    pub iqm: Option<f64>,
+    /// Its 95 % interval by bootstrap; none below [`INTERVAL_SCORES_MIN`].
+    pub interval: Option<[f64; 2]>,
 }
 
 impl Summary {
@@ -41,9 +47,26 @@ impl Summary {
         let mean = scores.iter().sum::<f64>() / count as f64;
         let squares = scores.iter().map(|score| (score - mean).powi(2)).sum::<f64>();
         let std = (squares / count.saturating_sub(1).max(1) as f64).sqrt();
+        let range = range(scores);
+        if count < INTERVAL_SCORES_MIN {
+            return Some(Self { count, mean, std, range, iqm: None, interval: None });
+        }
         let (iqm, interval) = interquartile_mean_with_interval(&[scores.to_vec()]);
-        Some(Self { count, mean, std, iqm, interval })
+        Some(Self { count, mean, std, range, iqm: Some(iqm), interval: Some(interval) })
     }
+
+    /// Interquartile mean with its interval, or mean with range where there are too few scores.
+    #[must_use]
+    pub fn point_and_bounds(&self) -> (f64, [f64; 2]) {
+        (self.iqm.unwrap_or(self.mean), self.interval.unwrap_or(self.range))
+    }
+}
+
+/// Lowest and highest of at least one score.
+pub(super) fn range(scores: &[f64]) -> [f64; 2] {
+    let low = scores.iter().copied().fold(f64::INFINITY, f64::min);
+    let high = scores.iter().copied().fold(f64::NEG_INFINITY, f64::max);
+    [low, high]
 }
 
 /// The mean of the middle half.
@@ -63,18 +86,23 @@ pub fn interquartile_mean_with_interval(scores: &[Vec<f64>]) -> (f64, [f64; 2]) 
     bootstrap(scores, interquartile_mean)
 }
 
-/// The median, and its 95 % interval by [`bootstrap`]. Unlike a mean it stays a number while fewer
-/// than half of the scores are infinite.
+/// The median, and its 95 % interval by [`bootstrap`], or the range below [`INTERVAL_SCORES_MIN`].
+/// Unlike a mean it stays a number while fewer than half of the scores are infinite.
 ///
 /// - `scores`: at least one; infinite for what never came.
 #[must_use]
-pub fn median_with_interval(scores: &[f64]) -> (f64, [f64; 2]) {
-    bootstrap(&[scores.to_vec()], |scores| {
-        scores.sort_by(f64::total_cmp);
-        let upper = scores.len() / 2;
-        let lower = scores.len().div_ceil(2) - 1;
-        f64::midpoint(scores[lower], scores[upper])
-    })
+pub fn median_with_bounds(scores: &[f64]) -> (f64, [f64; 2]) {
+    if scores.len() < INTERVAL_SCORES_MIN {
+        return (median(&mut scores.to_vec()), range(scores));
+    }
+    bootstrap(&[scores.to_vec()], median)
+}
+
+fn median(scores: &mut [f64]) -> f64 {
+    scores.sort_by(f64::total_cmp);
+    let upper = scores.len() / 2;
+    let lower = scores.len().div_ceil(2) - 1;
+    f64::midpoint(scores[lower], scores[upper])
 }
 
 /// A statistic of all scores, and the interval in which 95 % of its resamplings lie.
@@ -153,23 +181,33 @@ mod tests {
     #[test]
     fn one_score_has_no_spread() {
         let summary = Summary::of(&[-4.5]).unwrap();
-        let expected =
-            Summary { count: 1, mean: -4.5, std: 0.0, iqm: -4.5, interval: [-4.5, -4.5] };
+        let range = [-4.5; 2];
+        let expected = Summary { count: 1, mean: -4.5, std: 0.0, range, iqm: None, interval: None };
         assert_eq!(summary, expected);
         assert_eq!(Summary::of(&[]), None);
         let summary = Summary::of(&[1.0, 2.0, 3.0, 10.0]).unwrap();
-        assert_eq!((summary.mean, summary.iqm), (4.0, 2.5));
+        assert_eq!((summary.mean, summary.iqm), (4.0, Some(2.5)));
         assert!((summary.std - (50.0_f64 / 3.0).sqrt()).abs() < 1e-12);
+    }
+
+    #[test]
+    fn three_scores_have_a_range_and_no_interval() {
+        let summary = Summary::of(&[3.0, 1.0, 5.0]).unwrap();
+        assert_eq!((summary.range, summary.iqm, summary.interval), ([1.0, 5.0], None, None));
+        assert_eq!(summary.point_and_bounds(), (3.0, [1.0, 5.0]));
+        let summary = Summary::of(&[3.0, 1.0, 5.0, 4.0]).unwrap();
+        assert_eq!((summary.range, summary.iqm), ([1.0, 5.0], Some(3.5)));
+        assert!(summary.interval.is_some());
     }
 
     #[test]
     fn a_median_takes_what_never_came_for_later_than_everything() {
         let never = f64::INFINITY;
-        assert_eq!(median_with_interval(&[3.0, 1.0, 2.0]), (2.0, [1.0, 3.0]));
-        assert_eq!(median_with_interval(&[1.0, 2.0]).0, 1.5);
-        assert_eq!(median_with_interval(&[7.0]), (7.0, [7.0, 7.0]));
-        assert_eq!(median_with_interval(&[never, 1.0, 2.0]), (2.0, [1.0, never]));
-        assert_eq!(median_with_interval(&[never, 1.0, never]), (never, [1.0, never]));
-        assert_eq!(median_with_interval(&[never, never]), (never, [never, never]));
+        assert_eq!(median_with_bounds(&[3.0, 1.0, 2.0]), (2.0, [1.0, 3.0]));
+        assert_eq!(median_with_bounds(&[1.0, 2.0]).0, 1.5);
+        assert_eq!(median_with_bounds(&[7.0]), (7.0, [7.0, 7.0]));
+        assert_eq!(median_with_bounds(&[never, 1.0, 2.0]), (2.0, [1.0, never]));
+        assert_eq!(median_with_bounds(&[never, 1.0, never]), (never, [1.0, never]));
+        assert_eq!(median_with_bounds(&[never, never]), (never, [never, never]));
     }
 }

@@ -1,10 +1,13 @@
 //! The figures of a report, by task and method.
 
+use std::collections::BTreeSet;
+
 use serde::Serialize;
 
 use super::collect::Results;
 use super::measures::Measure;
 use super::paper::reported;
+use super::run::Origin;
 use super::statistics::Summary;
 use crate::terminal::grouped;
 
@@ -46,9 +49,23 @@ pub struct Cell {
     pub unknown: usize,
     /// Mean and spread in the paper.
     pub paper: Option<(f64, f64)>,
+    /// Programs that made the runs of the figure, by version and commit. A run whose commit was not
+    /// recorded counts as made by a program of its own.
+    pub programs: usize,
+    /// Sets of package versions that the runs used, counted in the same way.
+    pub package_sets: usize,
 }
 
+/// Marks a figure over runs of different programs or packages.
+pub const MIXED: &str = " †";
+
 impl Cell {
+    /// Whether the figure is over runs of different programs or packages.
+    #[must_use]
+    pub fn is_mixed(&self) -> bool {
+        self.programs > 1 || self.package_sets > 1
+    }
+
     /// The cell's lines, for people.
     #[must_use]
     pub fn lines(&self, digits: usize) -> Vec<String> {
@@ -61,13 +78,22 @@ impl Cell {
             Some(Summary { count: 1, mean, .. }) => {
                 lines.extend([number(*mean, digits), "1 seed".to_owned()]);
             }
-            Some(Summary { count, mean, std, iqm, interval: [low, high] }) => {
-                let [mean, std, iqm, low, high] =
-                    [mean, std, iqm, low, high].map(|value| number(*value, digits));
+            Some(summary) => {
+                let Summary { count, mean, std, .. } = *summary;
+                let (point, bounds) = summary.point_and_bounds();
+                let [mean, std, point, low, high] =
+                    [mean, std, point, bounds[0], bounds[1]].map(|value| number(value, digits));
                 lines.push(format!("{mean} ± {std}"));
-                lines.push(format!("IQM {iqm} [{low}, {high}]"));
-                lines.push(format!("{count} seeds"));
+                lines.push(match summary.interval {
+                    Some(_) => format!("IQM {point} [{low}, {high}]"),
+                    None => format!("range [{low}, {high}]"),
+                });
+                let mixed = if self.is_mixed() { MIXED } else { "" };
+                lines.push(format!("{count} seeds{mixed}"));
             }
+        }
+        if self.summary.is_some() && self.unknown > 0 {
+            lines.push(format!("{} not measured", self.unknown));
         }
         if let Some((mean, std)) = self.paper {
             lines.push(format!("paper {mean:.digits$} ± {std:.digits$}"));
@@ -98,7 +124,15 @@ fn table(results: &Results, measure: Measure) -> Table {
     let cell = |task: &str, method: &str| {
         let runs = || results.of(task, method);
         let scores: Vec<f64> = runs().filter_map(|run| measure.of(run)).collect();
+        let measured = || runs().filter(|run| measure.of(run).is_some());
+        let count = |of: fn(&Origin) -> Option<&[String]>| {
+            let (known, unknown): (Vec<_>, Vec<_>) =
+                measured().map(|run| of(&run.origin)).partition(Option::is_some);
+            known.into_iter().collect::<BTreeSet<_>>().len() + unknown.len()
+        };
         Cell {
+            programs: count(Origin::known_programs),
+            package_sets: count(Origin::known_packages),
             summary: Summary::of(&scores),
             unfinished: runs().filter(|run| run.last().is_none()).count(),
             unknown: runs().filter(|run| run.last().is_some() && measure.of(run).is_none()).count(),
@@ -127,6 +161,30 @@ fn table(results: &Results, measure: Measure) -> Table {
 mod tests {
     use super::super::planted::{Planted, planted};
     use super::*;
+
+    #[test]
+    fn a_cell_says_its_range_below_four_seeds_and_that_its_runs_are_of_several_programs() {
+        let run = |seed| Planted {
+            task: "point-reach",
+            method: "TD3",
+            seed,
+            rows: vec![-(seed as f64)],
+            ended: true,
+        };
+        let runs: Vec<_> = (1..=4).map(run).collect();
+        let lines = |results: &Results| tables(results)[0].rows[0].1[0].lines(1);
+        let mut three = planted(&runs[..3]);
+        assert_eq!(lines(&three), ["-2.0 ± 1.0", "range [-3.0, -1.0]", "3 seeds"]);
+        three.runs[0].origin.programs = vec!["0.1.0 (commit 1234)".to_owned()];
+        assert_eq!(lines(&three)[2], "3 seeds †");
+        three.runs.iter_mut().for_each(|run| run.origin.programs = vec!["0.1.0".to_owned()]);
+        assert_eq!(lines(&three)[2], "3 seeds †", "the commits are unknown");
+        let four = planted(&runs);
+        assert!(lines(&four)[1].starts_with("IQM -2.5 ["), "{:?}", lines(&four));
+        let mut packages = four;
+        packages.runs[3].origin.packages = vec!["Python 3.12.1".to_owned()];
+        assert_eq!(lines(&packages)[2], "4 seeds †");
+    }
 
     #[test]
     fn a_task_without_success_has_no_row_of_it_and_what_was_not_run_says_so() {

@@ -23,7 +23,7 @@ pub const PRESETS: [Preset; 3] = [
     },
     Preset {
         name: "paper",
-        about: "the paper to the letter: first-action critic, literal target, Table 2",
+        about: "one reading of the paper: first-action critic, literal target, its Table 2",
         text: PAPER,
     },
     Preset {

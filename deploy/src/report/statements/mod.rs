@@ -19,8 +19,10 @@ use super::collect::Results;
 const PROPOSED: &str = "DDPG-DMP of the paper";
 /// The paper's method with the paper's values, and with ours.
 pub const SUBJECTS: [&str; 2] = ["DDPG-DMP (paper)", "DDPG-DMP"];
-/// With fewer, an interval says nothing of what another seed would do.
-pub const SEEDS_MIN: usize = 3;
+/// Fewest seeds of a method that a statement is judged by.
+pub const SEEDS_MIN: usize = 5;
+/// Fewest episodes of a run's last evaluation that a statement is judged by.
+pub const EPISODES_MIN: u64 = 100;
 
 /// What became of a statement.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize)]
@@ -34,6 +36,8 @@ pub enum Verdict {
     NoClearDifference,
     /// There are runs, but fewer than `SEEDS_MIN` of a method.
     TooFewSeeds,
+    /// There are seeds enough, but a last evaluation has fewer than `EPISODES_MIN` episodes.
+    TooFewEpisodes,
     /// Nothing to judge by.
     NotRun,
     /// The paper contradicts itself.
@@ -49,17 +53,19 @@ impl Verdict {
             Self::DidNotHold => "did not hold",
             Self::NoClearDifference => "no clear difference",
             Self::TooFewSeeds => "too few seeds",
+            Self::TooFewEpisodes => "too few episodes",
             Self::NotRun => "not run",
             Self::CannotHold => "cannot hold",
         }
     }
 
     /// All, in the order in which they are counted.
-    pub const ALL: [Self; 6] = [
+    pub const ALL: [Self; 7] = [
         Self::Held,
         Self::DidNotHold,
         Self::NoClearDifference,
         Self::TooFewSeeds,
+        Self::TooFewEpisodes,
         Self::NotRun,
         Self::CannotHold,
     ];

@@ -4,12 +4,12 @@ use std::cell::RefCell;
 use std::collections::BTreeMap;
 
 use super::list::{Methods, Rule, Statement};
-use super::{PROPOSED, SEEDS_MIN, Verdict, series};
+use super::{EPISODES_MIN, PROPOSED, SEEDS_MIN, Verdict, series};
 use crate::report::collect::Results;
 use crate::report::measures::Measure;
 use crate::report::paper::{Figure, reported};
 use crate::report::run::Run;
-use crate::report::statistics::{Summary, median_with_interval};
+use crate::report::statistics::{INTERVAL_SCORES_MIN, Summary, median_with_bounds};
 use crate::report::thresholds::threshold;
 use crate::terminal::grouped;
 
@@ -26,15 +26,22 @@ pub(super) struct Estimate {
 }
 
 impl Estimate {
-    /// Interquartile mean and its interval; none of nothing.
+    /// Interquartile mean and its interval, or mean and range below four seeds; none of nothing.
     pub(super) fn of(scores: &[f64]) -> Option<Self> {
-        let Summary { count, iqm: point, interval: [low, high], .. } = Summary::of(scores)?;
-        Some(Self { count, point, low, high })
+        let summary = Summary::of(scores)?;
+        let (point, [low, high]) = summary.point_and_bounds();
+        Some(Self { count: summary.count, point, low, high })
     }
 
     pub(super) fn text(&self, digits: usize) -> String {
         let Self { count, point, low, high } = self;
-        format!("{point:.digits$} [{low:.digits$}, {high:.digits$}], {count} seeds")
+        let range = self.range();
+        format!("{point:.digits$} {range}[{low:.digits$}, {high:.digits$}], {count} seeds")
+    }
+
+    /// The word before the bounds where they are the range of the seeds and no interval.
+    fn range(&self) -> &'static str {
+        if self.count < INTERVAL_SCORES_MIN { "range " } else { "" }
     }
 }
 
@@ -46,6 +53,7 @@ pub(super) fn all(verdicts: impl IntoIterator<Item = Verdict>) -> Verdict {
         Verdict::DidNotHold,
         Verdict::NotRun,
         Verdict::TooFewSeeds,
+        Verdict::TooFewEpisodes,
         Verdict::NoClearDifference,
         Verdict::Held,
     ];
@@ -115,11 +123,14 @@ impl On<'_> {
         threshold(self.task).map_or(Measure::Return, |threshold| threshold.measure)
     }
 
-    /// What a method lacks that has too few scores to be judged.
-    pub(super) fn lacking(count: usize) -> Option<Verdict> {
+    /// What a method with `count` scores lacks to be judged.
+    pub(super) fn lacking(&self, method: &str, count: usize) -> Option<Verdict> {
+        let is_short =
+            |run: &&Run| run.ended && run.final_episodes.is_none_or(|count| count < EPISODES_MIN);
         match count {
             0 => Some(Verdict::NotRun),
             _ if count < SEEDS_MIN => Some(Verdict::TooFewSeeds),
+            _ if self.runs(method).iter().any(is_short) => Some(Verdict::TooFewEpisodes),
             _ => None,
         }
     }
@@ -135,7 +146,7 @@ impl On<'_> {
         let estimate = if measure == Measure::StepsToThreshold {
             // Those under way would come later than those that are there: all or none.
             (!scores.is_empty() && scores.len() == runs.len()).then(|| {
-                let (point, [low, high]) = median_with_interval(&scores);
+                let (point, [low, high]) = median_with_bounds(&scores);
                 Estimate { count: scores.len(), point, low, high }
             })
         } else {
@@ -161,7 +172,8 @@ impl On<'_> {
             Some(estimate) if measure == Measure::StepsToThreshold => {
                 let [point, low, high] =
                     [estimate.point, estimate.low, estimate.high].map(series::steps_text);
-                format!("{name} {point} [{low} – {high}] steps, {} seeds", estimate.count)
+                let range = estimate.range();
+                format!("{name} {point} {range}[{low} – {high}] steps, {} seeds", estimate.count)
             }
             Some(estimate) => format!("{name} {}", estimate.text(measure.digits())),
         }
@@ -181,7 +193,7 @@ impl On<'_> {
     ) -> Verdict {
         let [a, b] = [one, other].map(|method| self.estimate(measure, method));
         let count = |estimate: Option<Estimate>| estimate.map_or(0, |estimate| estimate.count);
-        let lacking = [a, b].map(|estimate| Self::lacking(count(estimate)));
+        let lacking = [self.lacking(one, count(a)), self.lacking(other, count(b))];
         match (a, b) {
             (Some(a), Some(b)) if lacking == [None, None] => judge(a, b),
             _ => all(lacking.into_iter().flatten()),
@@ -303,7 +315,7 @@ impl On<'_> {
 
     fn alone(&self, method: &str, judge: impl Fn(Estimate) -> Verdict) -> Verdict {
         let estimate = self.estimate(Measure::Success, method);
-        let lacking = Self::lacking(estimate.map_or(0, |estimate| estimate.count));
+        let lacking = self.lacking(method, estimate.map_or(0, |estimate| estimate.count));
         match (lacking, estimate) {
             (Some(lacking), _) => lacking,
             (None, None) => Verdict::NotRun,

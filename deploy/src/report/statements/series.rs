@@ -38,8 +38,9 @@ pub(super) fn within(on: &On<'_>, method: &str, steps: u64) -> Judgement {
         (0, _) => format!("{}: not finished", on.name(method)),
         (count, _) => format!("{}: {reached} of {count} seeds", on.name(method)),
     };
-    let verdict =
-        On::lacking(known.len()).unwrap_or_else(|| clear(reached == known.len(), reached == 0));
+    let verdict = on
+        .lacking(method, known.len())
+        .unwrap_or_else(|| clear(reached == known.len(), reached == 0));
     (verdict, evidence)
 }
 
@@ -69,7 +70,7 @@ fn not_within(on: &On<'_>, method: &str, (success, steps): (f64, u64)) -> Judgem
         grouped(shortest.min(steps)),
         runs.len()
     );
-    let verdict = match On::lacking(runs.len()) {
+    let verdict = match on.lacking(method, runs.len()) {
         Some(lacking) => lacking,
         None if passed == runs.len() => Verdict::DidNotHold,
         // What is still to come may decide.
@@ -146,7 +147,7 @@ fn over_seeds(
         return (Verdict::NotRun, format!("{name}: {state}"));
     };
     let (verdict, text) = judge(estimate);
-    (On::lacking(scores.len()).unwrap_or(verdict), format!("{name}: {text}"))
+    (on.lacking(method, scores.len()).unwrap_or(verdict), format!("{name}: {text}"))
 }
 
 #[cfg(test)]

@@ -4,8 +4,13 @@ use super::list::{Rule, STATEMENTS};
 use super::*;
 use crate::report::planted::{Planted, planted, planted_moves};
 
-/// Seeds 1, 2, ... of a method, each with its evaluations.
+/// Seeds 1, 2, ... of a method, each with its evaluations. Three rows stand for the five seeds that
+/// a verdict needs: the first and the last are planted twice.
 fn seeds<R: AsRef<[f64]>>(task: &'static str, method: &'static str, rows: &[R]) -> Vec<Planted> {
+    let rows: Vec<&R> = match rows {
+        [first, middle, last] => vec![first, first, middle, last, last],
+        rows => rows.iter().collect(),
+    };
     let run = |(seed, rows): (u64, &R)| Planted {
         task,
         method,
@@ -78,6 +83,27 @@ fn what_is_missing_is_said_and_never_guessed() {
     let found = found(&together(vec![ours, ddpg, under_way]), PUSHER, claim);
     assert_eq!(found[0].verdict, Verdict::NotRun);
     assert!(found[0].evidence.ends_with("NDP: not finished"), "{}", found[0].evidence);
+}
+
+#[test]
+fn nothing_is_judged_by_three_seeds_or_by_twenty_episodes() {
+    let claim = "DDPG-DMP ends at a higher return than DDPG and NDP";
+    let mut results = together(vec![
+        seeds(PUSHER, OURS, &[&[-33.0], &[-34.0], &[-35.0]]),
+        seeds(PUSHER, "DDPG", &[&[-44.0], &[-45.0], &[-46.0]]),
+        seeds(PUSHER, "NDP", &[&[-44.0], &[-45.0], &[-46.0]]),
+    ]);
+    assert_eq!(verdict(&results, PUSHER, claim), Verdict::Held);
+    let of_ours = results.runs[0].clone();
+    for episodes in [Some(20), None] {
+        results.runs[0].final_episodes = episodes;
+        assert_eq!(verdict(&results, PUSHER, claim), Verdict::TooFewEpisodes);
+    }
+    results.runs[0] = of_ours;
+    results.runs.retain(|run| run.seed <= 3);
+    let found = found(&results, PUSHER, claim).remove(0);
+    assert_eq!(found.verdict, Verdict::TooFewSeeds);
+    assert!(found.evidence.contains("range ["), "{}", found.evidence);
 }
 
 #[test]
@@ -160,7 +186,7 @@ fn sooner_counts_a_seed_that_never_came_as_later_than_all() {
     assert_eq!(with(&[third; 3], &[third; 3]).verdict, Verdict::DidNotHold);
     let against = with(&[first; 3], &[never; 3]);
     assert_eq!(against.verdict, Verdict::Held);
-    assert!(against.evidence.contains("NDP not reached, 3 seeds"), "{}", against.evidence);
+    assert!(against.evidence.contains("NDP not reached, 5 seeds"), "{}", against.evidence);
     assert_eq!(with(&[never; 3], &[never; 3]).verdict, Verdict::NoClearDifference);
     assert_eq!(with(&[never; 3], &[fourth; 3]).verdict, Verdict::DidNotHold);
     assert_eq!(with(&[first, first, never], &[fourth; 3]).verdict, Verdict::NoClearDifference);

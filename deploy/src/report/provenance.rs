@@ -1,0 +1,125 @@
+//! Where the figures of a report come from: which program and packages made the runs of each cell,
+//! and which data of theirs is at hand.
+
+use super::collect::Results;
+use super::run::Run;
+use super::sections::Grid;
+
+/// Programs and package versions of a report's runs, numbered for its cells.
+#[derive(Debug, Clone)]
+pub struct Provenance {
+    /// Each program and the packages it ran with.
+    sources: Vec<String>,
+    /// What each cell's runs were made by, and what is known of them.
+    pub grid: Grid,
+}
+
+/// What a run was made by, as one text.
+fn source(run: &Run) -> String {
+    let programs = distinct(&run.origin.programs);
+    let packages = if run.origin.packages.is_empty() {
+        "package versions not recorded".to_owned()
+    } else {
+        distinct(&run.origin.packages)
+    };
+    format!("dmprl {programs}; {packages}")
+}
+
+/// Each text once, in order, with "; then " between.
+fn distinct(texts: &[String]) -> String {
+    let mut known: Vec<&str> = Vec::new();
+    for text in texts {
+        if !known.contains(&text.as_str()) {
+            known.push(text);
+        }
+    }
+    known.join("; then ")
+}
+
+impl Provenance {
+    /// Of all runs that have begun.
+    #[must_use]
+    pub fn of(results: &Results) -> Self {
+        let mut sources: Vec<String> = Vec::new();
+        for run in &results.runs {
+            let source = source(run);
+            if !sources.contains(&source) {
+                sources.push(source);
+            }
+        }
+        let grid = Grid::of(results, |task, method| cell(results, task, method, &sources));
+        Self { sources, grid }
+    }
+
+    /// The numbered programs as one paragraph.
+    #[must_use]
+    pub fn legend(&self) -> String {
+        let numbered =
+            self.sources.iter().zip(1..).map(|(text, number)| format!("[{number}] {text}"));
+        format!("{}.", numbered.collect::<Vec<_>>().join(". "))
+    }
+}
+
+/// `[1]: seeds 1, 2`, then which data the report has of which seeds.
+fn cell(results: &Results, task: &str, method: &str, sources: &[String]) -> Vec<String> {
+    let mut runs: Vec<&Run> = results.of(task, method).collect();
+    runs.sort_by_key(|run| run.seed);
+    let seeds = |filter: &dyn Fn(&Run) -> bool| -> Option<String> {
+        let seeds: Vec<String> =
+            runs.iter().filter(|run| filter(run)).map(|run| run.seed.to_string()).collect();
+        let word = if seeds.len() == 1 { "seed" } else { "seeds" };
+        (!seeds.is_empty()).then(|| format!("{word} {}", seeds.join(", ")))
+    };
+    let mut lines = Vec::new();
+    for (text, number) in sources.iter().zip(1..) {
+        lines
+            .extend(seeds(&|run| source(run) == *text).map(|seeds| format!("[{number}]: {seeds}")));
+    }
+    let has_motion = |run: &Run| run.motion.is_some();
+    let has_rollout =
+        |run: &Run| run.motion.as_ref().is_some_and(|motion| motion.rollout.is_some());
+    lines.extend(seeds(&has_motion).map(|seeds| format!("motion: {seeds}")));
+    lines.extend(seeds(&has_rollout).map(|seeds| format!("rollout: {seeds}")));
+    if lines.is_empty() {
+        lines.push("not run".to_owned());
+    }
+    lines
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::planted::{Planted, planted, planted_moves};
+    use super::*;
+
+    #[test]
+    fn each_cell_names_the_programs_of_its_seeds_and_the_data_at_hand() {
+        let run = |method, seed| Planted {
+            task: "pusher-v0",
+            method,
+            seed,
+            rows: vec![-40.0],
+            ended: true,
+        };
+        let mut results = planted(&[run("SAC", 2), run("SAC", 1), run("SAC", 3), run("TD3", 1)]);
+        for run in &mut results.runs {
+            run.origin.packages.clear();
+            run.origin.programs = vec!["0.1.0 (commit 1)".to_owned(); 2];
+        }
+        results.runs[2].origin.programs.push("0.1.0 (commit 2)".to_owned());
+        results.runs[3].origin.packages = vec!["Python 3.11.7".to_owned()];
+        results.runs[0].motion = Some(planted_moves(1.0, -1.0));
+        results.tasks.push("thrower-v0".to_owned());
+        let provenance = Provenance::of(&results);
+        assert_eq!(
+            provenance.legend(),
+            "[1] dmprl 0.1.0 (commit 1); package versions not recorded. \
+             [2] dmprl 0.1.0 (commit 1); then 0.1.0 (commit 2); package versions not recorded. \
+             [3] dmprl 0.1.0 (commit 1); Python 3.11.7."
+        );
+        let (_, cells) = &provenance.grid.rows[0];
+        let expected = ["[1]: seeds 1, 2", "[2]: seed 3", "motion: seed 2", "rollout: seed 2"];
+        assert_eq!(cells[0], expected);
+        assert_eq!(cells[1], ["[3]: seed 1"]);
+        assert_eq!(provenance.grid.rows[1].1[0], ["not run"]);
+    }
+}
