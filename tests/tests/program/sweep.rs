@@ -126,15 +126,20 @@ fn a_run_that_fails_costs_the_others_nothing_and_is_tried_again() {
 }
 
 #[test]
-fn the_papers_comparison_is_a_sweep() {
+fn the_sweeps_behind_the_published_results_can_be_started() {
     let place = Workplace::new();
-    let file = concat!(env!("CARGO_MANIFEST_DIR"), "/../deploy/experiments/paper.toml");
-    let json = place.run(&["sweep", file, "--dry-run", "--json"]).with_status(0).json();
-    // Tasks, methods, seeds.
-    assert_eq!(states(&json).len(), 5 * 8 * 5);
-    let methods: std::collections::BTreeSet<_> =
-        json["runs"].as_array().unwrap().iter().map(|run| run["method"].to_string()).collect();
-    assert_eq!(methods.len(), 8);
+    let folder = dmprl_tests::project_root().join("deploy/experiments");
+    // Tasks × methods × seeds.
+    for (name, runs) in [
+        ("paper", 5 * 11 * 5),
+        ("defaults", 5 * 3),
+        ("algorithms", 4 * 3),
+        ("demonstrations", 2 * 3),
+    ] {
+        let file = folder.join(format!("{name}.toml")).display().to_string();
+        let json = place.run(&["sweep", &file, "--dry-run", "--json"]).with_status(0).json();
+        assert_eq!(states(&json).len(), runs, "{name}");
+    }
 }
 
 #[test]
