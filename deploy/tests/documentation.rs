@@ -55,10 +55,12 @@ fn help(arguments: &[&str]) -> String {
 fn documents() -> Vec<String> {
     let beside = ["README.md", "ARCHITECTURE.md", "CHANGELOG.md", "tests/FAULTS.md"];
     let mut documents: Vec<String> = beside.map(str::to_owned).into();
-    for entry in std::fs::read_dir(root().join("docs")).unwrap() {
-        let name = entry.unwrap().file_name().into_string().unwrap();
-        if name.ends_with(".md") {
-            documents.push(format!("docs/{name}"));
+    for folder in ["docs", "docs/decisions", "docs/internals"] {
+        for entry in std::fs::read_dir(root().join(folder)).unwrap() {
+            let name = entry.unwrap().file_name().into_string().unwrap();
+            if name.ends_with(".md") {
+                documents.push(format!("{folder}/{name}"));
+            }
         }
     }
     assert!(documents.len() > 20, "only {documents:?}: has the book moved?");

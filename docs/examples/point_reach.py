@@ -1,7 +1,7 @@
-"""A point mass that reaches a target: the smallest environment worth a movement primitive.
+"""A point mass that reaches a target: a minimal environment for a movement primitive.
 
-Importing the module registers ``PointReach-v0``; ``dmprl train point_reach:PointReach-v0`` with
-this folder as ``--python-path`` trains it.
+Importing the module registers ``PointReach-v0``. To train on it, run
+``dmprl train point_reach:PointReach-v0`` with this folder as ``--python-path``.
 """
 
 import gymnasium
@@ -26,7 +26,7 @@ class PointReach(gymnasium.Env):
     success_distance = 0.05
 
     def reset(self, *, seed=None, options=None):
-        """Starts at rest in the origin, with a new target."""
+        """Starts at rest at the origin, with a new target."""
         super().reset(seed=seed)
         self.position, self.velocity = np.zeros(2), np.zeros(2)
         self.target = self.np_random.uniform(-1.0, 1.0, 2)
@@ -37,7 +37,7 @@ class PointReach(gymnasium.Env):
         self.velocity += self.dt * (action - self.damping * self.velocity)
         self.position += self.dt * self.velocity
         distance = float(np.linalg.norm(self.target - self.position))
-        # Success is what `is_success` says at an episode's last step; the time limit ends it.
+        # An episode is a success if `is_success` is true at its last step. The time limit ends it.
         info = {"is_success": distance < self.success_distance}
         return self._observation(), -distance, False, False, info
 

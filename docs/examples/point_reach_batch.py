@@ -1,7 +1,7 @@
-"""The point mass of ``point_reach.py``, many at once: the smallest ``SegmentEnv``.
+"""The point mass of ``point_reach.py`` as a minimal ``SegmentEnv``, which steps many at once.
 
-``dmprl train point_reach_batch:PointReachBatch --python-path docs/examples`` trains it. NumPy steps
-all environments together, so a step costs as much for sixteen of them as for one.
+``dmprl train point_reach_batch:PointReachBatch --python-path docs/examples`` trains on it. NumPy
+steps all environments together, so a step of sixteen costs as much as a step of one.
 """
 
 import numpy as np
@@ -12,17 +12,17 @@ DT, DAMPING, SUCCESS_DISTANCE, EPISODE_STEPS = 0.05, 0.5, 0.05, 60
 
 
 class PointReachBatch(SegmentEnv):
-    """E point masses; shapes as in the interface, O = 6, A = 2."""
+    """E point masses, with O = 6 and A = 2. Shapes are those of ``SegmentEnv``."""
 
     def __init__(self, env_count: int, segment_steps: int) -> None:
         self.env_count, self.segment_steps = env_count, segment_steps
-        # Position (2), velocity (2), target - position (2) of each.
+        # Per environment: position (2), velocity (2), target - position (2).
         self.state = np.zeros((env_count, 6))
         self.steps_left = np.zeros(env_count, np.int32)
         self.generators = [np.random.default_rng() for _ in range(env_count)]
 
     def spec(self) -> EnvSpec:
-        """States sizes, bounds and timing."""
+        """Returns sizes, bounds and timing."""
         axes = ("x", "y")
         return {
             "id": "PointReachBatch",
@@ -47,9 +47,9 @@ class PointReachBatch(SegmentEnv):
         out.next_observations[mask != 0] = self.state[mask != 0]
 
     def step_segment(self, actions: np.ndarray, out: SegmentBuffers) -> None:
-        """Runs K steps in all environments, then ends the episodes that are over."""
+        """Runs K steps in all environments, and resets those whose episode has ended."""
         out.observations[:, 0] = self.state
-        # An environment whose episode ends inside the segment is stepped on, and then cut.
+        # Environments whose episode ends within the segment run on; the surplus is zeroed below.
         position, velocity, to_target = np.split(self.state, 3, axis=1)  # views
         for step in range(self.segment_steps):
             target = position + to_target

@@ -1,9 +1,9 @@
-"""Records demonstrations: a controller of one line brings the Panda's gripper to its goal.
+"""Records demonstrations of a one-line controller that moves the Panda's gripper to its goal.
 
     .venv/bin/python docs/examples/record_demonstrations.py demos.npz
     cargo run --release -- train panda-reach --demos demos.npz
 
-For another task change ``TASK`` and ``act``: a trained policy, a planner or a person may decide.
+For another task change ``TASK`` and ``act``. A trained policy, a planner or a person can also act.
 """
 
 import sys
@@ -17,12 +17,12 @@ TASK, EPISODES, SEED = "dmprl/PandaReach-v0", 20, 0
 
 
 def act(observation):
-    """Towards the goal: entries 14 to 16 are goal - gripper [m]; an action of 1 moves by 5 cm."""
+    """Moves to the goal. Entries 14 to 16 are goal - gripper [m]; an action of 1 moves by 5 cm."""
     return np.clip(observation[14:17] / 0.05, -1.0, 1.0)
 
 
 def record(env, act, episodes, seed):
-    """One row a step, episode after episode."""
+    """Returns one row per step, episode after episode."""
     keys = "observations", "actions", "rewards", "next_observations", "terminated", "truncated"
     rows = {key: [] for key in keys}
     for episode in range(episodes):

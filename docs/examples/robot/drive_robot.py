@@ -1,13 +1,13 @@
-"""A trained policy drives a robot with Gymnasium's interface, over the network, at control rate.
+"""Drives a robot at control rate with a trained policy, through Gymnasium's interface.
 
-``reset()`` and ``step(action)`` are what robo-gym, panda_robot and others offer; with one of them
-the class below goes, and the rest stays::
+robo-gym, panda_robot and others offer ``reset()`` and ``step(action)``. To use one of them, replace
+the class ``RemoteRobot`` below. This example drives a simulated robot over the network::
 
     dmprl export runs/mine --output panda.safetensors
     python stand_in_robot.py dmprl/PandaReachJoints-v0 &
     python drive_robot.py panda.safetensors --hz 20
 
-NumPy, the package ``dmprl`` and this file are all that the robot's computer needs.
+The robot's computer needs only NumPy, the package ``dmprl`` and this file.
 """
 
 import argparse
@@ -21,13 +21,13 @@ import numpy as np
 import dmprl
 
 STEPS_MAX = 1_000
-"""Of an episode that nothing else ends."""
+"""Limit of an episode whose task has no time limit."""
 
 
 class RemoteRobot:
-    """Gymnasium's ``reset`` and ``step``, spoken with ``stand_in_robot.py``.
+    """Client of ``stand_in_robot.py`` with Gymnasium's ``reset`` and ``step``.
 
-    A step that is not answered within ``patience_s`` has no observation: None.
+    The observation of a step is None if the robot does not answer within ``patience_s``.
     """
 
     def __init__(self, host: str, port: int, patience_s: float) -> None:
@@ -38,14 +38,14 @@ class RemoteRobot:
         self._number = 0
 
     def reset(self, seed: int) -> tuple[np.ndarray, dict]:
-        """Begins an episode."""
+        """Starts an episode."""
         answer = self._ask({"reset": seed}, 5.0)
         if answer is None:
             raise TimeoutError("the robot does not answer a reset")
         return np.array(answer["observation"]), answer["info"]
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray | None, float, bool, bool, dict]:
-        """One control step."""
+        """Runs one control step."""
         answer = self._ask({"action": action.tolist()}, self._patience_s)
         if answer is None:
             return None, 0.0, False, False, {}
@@ -54,7 +54,7 @@ class RemoteRobot:
         return observation, answer["reward"], *done, answer["info"]
 
     def command(self, action: np.ndarray) -> None:
-        """A last command, whose answer nobody waits for."""
+        """Sends a command without waiting for the answer."""
         self._send({"action": action.tolist()})
 
     def _ask(self, message: dict, patience_s: float) -> dict | None:
@@ -69,7 +69,7 @@ class RemoteRobot:
             if not received:
                 raise ConnectionError("the robot has hung up")
             *lines, self._received = (self._received + received).split(b"\n")
-            # What came too late for its step is of no use now.
+            # Answers to earlier steps came too late and are dropped.
             answers = [json.loads(line) for line in lines]
             if answers and answers[-1]["number"] == self._number:
                 return answers[-1]
@@ -82,9 +82,9 @@ class RemoteRobot:
 
 
 def drive(policy: dmprl.Policy, robot: RemoteRobot, seed: int, hz: float) -> dict:
-    """One episode, a step every 1 / ``hz`` seconds; 0: as fast as the robot answers.
+    """Runs one episode with a step every 1 / ``hz`` seconds; 0: as fast as the robot answers.
 
-    However it ends, the last command is the hold.
+    The last command is always the hold, also after an error.
     """
     steps_max = policy.spec["episode_steps"] or STEPS_MAX
     policy.reset()
@@ -107,7 +107,7 @@ def drive(policy: dmprl.Policy, robot: RemoteRobot, seed: int, hz: float) -> dic
             if terminated or truncated:
                 break
             if hz > 0.0:
-                # After a stall the rhythm begins anew: what was missed is not made up for in haste.
+                # After a stall the schedule restarts: missed steps are not caught up.
                 now = time.monotonic()
                 result["late"] += due + 1.0 / hz < now
                 due = max(due + 1.0 / hz, now)
@@ -118,7 +118,7 @@ def drive(policy: dmprl.Policy, robot: RemoteRobot, seed: int, hz: float) -> dic
 
 
 def main() -> None:
-    """Drives an episode and prints what came of it as JSON."""
+    """Runs an episode and prints the result as JSON."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("policy", help="a file of dmprl export, or a run directory")
     parser.add_argument("--host", default="127.0.0.1")

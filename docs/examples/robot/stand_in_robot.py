@@ -1,15 +1,15 @@
-"""A robot that is none: one simulated episode after the other, behind a socket.
+"""A simulated robot behind a socket, for trying and testing ``drive_robot.py`` without a robot.
 
-It stands where a robot's controller would, so that ``drive_robot.py`` can be tried, and tested,
-without one::
+It takes the place of a robot's controller::
 
     python stand_in_robot.py dmprl/PandaReachJoints-v0 --port 5555
 
-One client at a time; a JSON object a line. ``{"reset": seed, "number": n}`` and ``{"action": […],
-"number": n}`` are answered by ``{"number": n, "observation": […], "reward": …, "terminated": …,
-"truncated": …, "info": {…}}``.
-``--silence FROM TO`` leaves the steps FROM to TO - 1 of each episode without an answer, as a bad
-network does: the robot moves, and nobody sees it.
+It serves one client at a time, with one JSON object per line. The answer to
+``{"reset": seed, "number": n}`` and ``{"action": […], "number": n}`` is ``{"number": n,
+"observation": […], "reward": …, "terminated": …, "truncated": …, "info": {…}}``.
+
+``--silence FROM TO`` simulates a bad network: the robot executes the steps FROM to TO - 1 of each
+episode, but does not answer them.
 """
 
 import argparse
@@ -23,16 +23,16 @@ import dmprl  # noqa: F401 - registers its tasks
 
 
 class Server(socketserver.TCPServer):
-    """May take the port of one that has just ended."""
+    """Can reuse the port of a server that has just stopped."""
 
     allow_reuse_address = True
 
 
 class Controller(socketserver.StreamRequestHandler):
-    """Serves one client until it leaves."""
+    """Serves one client until it disconnects."""
 
     def handle(self) -> None:
-        """Answers line by line."""
+        """Answers each line."""
         environment, silence = self.server.environment, self.server.silence
         step = 0
         for line in self.rfile:
@@ -57,11 +57,11 @@ class Controller(socketserver.StreamRequestHandler):
             try:
                 self.wfile.write(json.dumps(answer).encode() + b"\n")
             except ConnectionError:
-                return  # it has left without waiting for the answer
+                return  # the client has disconnected
 
 
 def main() -> None:
-    """Serves until it is interrupted."""
+    """Serves until interrupted."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("environment", help="a Gymnasium id, such as dmprl/PandaReachJoints-v0")
     parser.add_argument("--port", type=int, default=5555, help="0: any that is free")

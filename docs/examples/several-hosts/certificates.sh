@@ -1,9 +1,9 @@
 #!/usr/bin/env bash
-# Makes a certificate authority for one run, a certificate for the learner's host and one for each
-# other host, for zenoh-learner.json5 and zenoh-host.json5 beside this file.
+# Creates a certificate authority for one run, a certificate for the learner's host, and one for each
+# other host. zenoh-learner.json5 and zenoh-host.json5 in this folder use them.
 #   certificates.sh FOLDER LEARNER HOST...
-# LEARNER: the name or address that other hosts connect to. HOST: what zenoh-learner.json5 lets in.
-# authority-key.pem signs whatever it likes: keep it away from every host, or throw it away.
+# LEARNER: the name or address that other hosts connect to. HOST: a name that zenoh-learner.json5
+# admits. authority-key.pem can sign further certificates: keep it off all hosts, or delete it.
 set -euo pipefail
 if [ $# -lt 3 ]; then
     echo "usage: certificates.sh FOLDER LEARNER HOST..." >&2

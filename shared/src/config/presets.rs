@@ -36,7 +36,7 @@ pub const PRESETS: [Preset; 3] = [
 
 // What saves time on GPUs does not here, where an update takes as long as its products: larger
 // batches, fewer updates a step, smaller networks or batches were no faster on reacher beyond the
-// spread of three seeds (ARCHITECTURE.md, "The preset fast").
+// spread of three seeds (docs/decisions/0031-preset-fast.md).
 const FAST: &str = r#"
 [learner]
 threads = 2

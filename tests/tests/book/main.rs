@@ -88,10 +88,12 @@ fn fault(page: &Page, link: &str, pages: &[Page]) -> Option<String> {
 fn every_page_in_docs_is_in_the_table_of_contents() {
     let docs = project_root().join("docs");
     let contents = fs::read_to_string(docs.join("SUMMARY.md")).unwrap();
-    let pages = fs::read_dir(&docs).unwrap().flatten().map(|entry| entry.file_name());
-    for page in pages.map(|name| name.into_string().unwrap()) {
-        let is_page = Path::new(&page).extension().is_some_and(|it| it == "md");
-        let listed = contents.contains(&format!("]({page})"));
-        assert!(!is_page || listed || page == "SUMMARY.md", "docs/SUMMARY.md lacks {page}");
+    for folder in ["", "decisions/", "internals/"] {
+        for entry in fs::read_dir(docs.join(folder)).unwrap().flatten() {
+            let page = format!("{folder}{}", entry.file_name().into_string().unwrap());
+            let is_page = Path::new(&page).extension().is_some_and(|it| it == "md");
+            let listed = contents.contains(&format!("]({page})"));
+            assert!(!is_page || listed || page == "SUMMARY.md", "docs/SUMMARY.md lacks {page}");
+        }
     }
 }
