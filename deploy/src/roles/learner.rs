@@ -16,7 +16,7 @@ use dmprl_shared::transport::delivery::{Replayed, SegmentLog};
 use dmprl_shared::transport::shared_memory::{
     Acknowledger, LearnerEnd, Plan, Publisher, Receiver, serve,
 };
-use dmprl_shared::transport::{ParameterPublisher, SegmentReceiver};
+use dmprl_shared::transport::{AcknowledgementPublisher, ParameterPublisher, SegmentReceiver};
 
 use super::recorder::{Evaluate, Recorder};
 use super::setup::Setup;
@@ -43,7 +43,7 @@ pub fn run(args: &LearnerArgs, control: &ControlPipe) -> anyhow::Result<()> {
     recover(&mut learner, &setup, control)?;
     journal.iter().for_each(|journal| journal.note(Entry::Serving));
     let domain = args.domain.as_deref().context("--domain is missing")?;
-    let plan = plan(&setup, learner.policy());
+    let plan = Plan::new(&setup.config, setup.run_id, learner.policy());
     let LearnerEnd { segments, parameters, acknowledgements } = serve(domain, &plan)?;
     let counters = &mut learner.counters;
     counters.policy_version = counters.policy_version.max(parameters.newest_version());
@@ -122,18 +122,6 @@ pub fn catch_up<R: SegmentReceiver, P: ParameterPublisher>(
         recorder.due(Due::Evaluation, &mut session.learner, evaluate)?;
     }
     Ok(())
-}
-
-/// What learner and workers of this run agree on.
-pub fn plan(setup: &Setup, policy: &dmprl_shared::policy::Policy) -> Plan {
-    Plan {
-        run_id: setup.run_id,
-        architecture_hash: policy.architecture_hash(),
-        layout: policy.layout(),
-        worker_count: setup.config.places(),
-        queue_segments: setup.config.actors.queue_segments,
-        parameters_len: policy.parameters_len(),
-    }
 }
 
 /// Makes the learner: fresh, warm-started or from the newest usable checkpoint.

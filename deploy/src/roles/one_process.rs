@@ -7,16 +7,19 @@
 
 use std::cell::Cell;
 
+use dmprl_actors::environments::report_failures;
 use dmprl_actors::evaluate::Evaluator;
+use dmprl_actors::evaluator::{self, Answer, Evaluations};
 use dmprl_actors::rollout::{Identity, Rollout, RolloutError};
+use dmprl_actors::worker;
 use dmprl_learner::learner::Learner;
 use dmprl_learner::session::{Due, Session, Turn};
 use dmprl_shared::config::RunConfig;
-use dmprl_shared::seeds;
+use dmprl_shared::supervision::Supervisor;
 use dmprl_shared::transport::{ParameterSubscriber, SegmentSender, SendOutcome, in_process};
 
-use super::environments;
-use super::evaluator::{self, Answer, evaluator};
+use super::environments::on_hang;
+use super::evaluator::keep;
 use super::learner::Ending;
 use super::recorder::Recorder;
 use super::setup::Setup;
@@ -36,12 +39,10 @@ impl From<RolloutError> for Delivery {
 pub fn run(args: &LearnerArgs, control: &ControlPipe) -> anyhow::Result<()> {
     let setup = Setup::read(&args.run)?;
     let config = &setup.config;
-    let interpreter = super::actor::interpreter(args.venv.as_deref(), config)?;
-    let envs = config.actors.envs_per_worker;
-    interpreter.seed(seeds::derive(config.run.seed, "python", 0))?;
-    let made = environments::make(&interpreter, config, envs, control)?;
+    let interpreter = super::actor::start_interpreter(args.venv.as_deref(), config)?;
+    let made = worker::environments(&interpreter, config, 0, on_hang(control))?;
     let spec = made.spec().clone();
-    let (evaluator, _) = evaluator(&interpreter, config, control)?;
+    let evaluator = evaluator::evaluator(&interpreter, config, on_hang(control))?;
     control.send(&Report::EnvironmentReady { spec: spec.clone() })?;
 
     let learner = super::learner::make(&setup, &spec, args, control)?;
@@ -58,9 +59,12 @@ pub fn run(args: &LearnerArgs, control: &ControlPipe) -> anyhow::Result<()> {
     let mut session = Session::start(learner, receiver, publisher)?;
     control.send(&Report::LearnerReady)?;
     let (reached, stop) = (Cell::new(false), control.stop_flag());
+    let policy_path = |version| setup.run.policy_path(version);
     let env_failures = Cell::new(session.learner.counters.env_failures);
-    let plan = evaluator::Plan { setup: &setup, config, stop: &stop };
-    let mut judge = Judge { evaluator, plan, control, reached: &reached, failures: &env_failures };
+    let evaluations = Evaluations { config, policy_path: &policy_path, stop };
+    let (reached_by, failures) = (&reached, &env_failures);
+    let setup = &setup;
+    let mut judge = Judge { evaluator, evaluations, setup, control, reached: reached_by, failures };
     let mut evaluate = |request: EvaluationRequest| judge.evaluate(&request);
     super::learner::catch_up(&mut session, &mut recorder, &mut evaluate)?;
     let mut first = true;
@@ -87,7 +91,7 @@ pub fn run(args: &LearnerArgs, control: &ControlPipe) -> anyhow::Result<()> {
         }
         parameters.newest(&mut rollout.snapshot)?;
         let acted = act(&mut rollout, &mut senders[0]);
-        count(&env_failures, environments::tell(&rollout.take_failures(), control));
+        count(&env_failures, report_failures(&rollout.take_failures(), control));
         session.learner.counters.env_failures = env_failures.get();
         acted?;
         if std::mem::take(&mut first) {
@@ -102,7 +106,8 @@ pub fn run(args: &LearnerArgs, control: &ControlPipe) -> anyhow::Result<()> {
 /// Evaluates where an evaluation falls due.
 struct Judge<'a> {
     evaluator: Evaluator,
-    plan: evaluator::Plan<'a>,
+    evaluations: Evaluations<'a>,
+    setup: &'a Setup,
     control: &'a ControlPipe,
     /// Set once an evaluation has reached the run's goal.
     reached: &'a Cell<bool>,
@@ -111,8 +116,8 @@ struct Judge<'a> {
 
 impl Judge<'_> {
     fn evaluate(&mut self, request: &EvaluationRequest) -> anyhow::Result<()> {
-        let answer = evaluator::evaluate(&mut self.evaluator, &self.plan, request);
-        count(self.failures, environments::tell(&self.evaluator.take_failures(), self.control));
+        let answer = evaluator::evaluate(&mut self.evaluator, &self.evaluations, request);
+        count(self.failures, report_failures(&self.evaluator.take_failures(), self.control));
         let row = match answer? {
             Answer::Row(row) => row,
             Answer::Failed(reason) => {
@@ -122,8 +127,8 @@ impl Judge<'_> {
             }
             Answer::Stopped => return Ok(()),
         };
-        evaluator::keep(self.plan.setup, &row, self.control)?;
-        let RunConfig { until_return, until_success, .. } = self.plan.config.run;
+        keep(self.setup, &row, self.control)?;
+        let RunConfig { until_return, until_success, .. } = self.evaluations.config.run;
         let success = row.success_rate.is_some_and(|rate| rate >= until_success);
         self.reached.set(self.reached.get() || success || row.return_mean >= until_return);
         // A supervisor that is gone is noticed as a stop, which ends with a checkpoint.
