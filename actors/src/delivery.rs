@@ -304,3 +304,94 @@ impl<'a, T: WorkerTransport> Delivery<'a, T> {
         self.supervisor.warn(message);
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use dmprl_shared::segment::{Segment, SegmentLayout};
+    use dmprl_shared::supervision::FakeSupervisor;
+    use dmprl_shared::transport::in_process::{
+        Acknowledger, InProcess, Receiver, acknowledgement_channel, parameter_channel,
+        segment_queues,
+    };
+    use dmprl_shared::transport::{AcknowledgementPublisher, SegmentReceiver};
+
+    use super::*;
+
+    const LAYOUT: SegmentLayout =
+        SegmentLayout { segment_steps: 1, observation_len: 1, action_len: 1 };
+    const QUEUE_SEGMENTS: usize = 2;
+    const OUTBOX_SEGMENTS: usize = 4;
+
+    fn delivery(
+        supervisor: &FakeSupervisor,
+        deadline: Duration,
+    ) -> (Delivery<'_, InProcess>, Receiver, Acknowledger) {
+        let (mut senders, receiver) = segment_queues(1, QUEUE_SEGMENTS, LAYOUT);
+        let (_, parameters) = parameter_channel(0);
+        let (acknowledger, acknowledgements) = acknowledgement_channel(1);
+        let end = WorkerEnd { segments: senders.remove(0), parameters, acknowledgements };
+        let outbox = Outbox::new(LAYOUT, OUTBOX_SEGMENTS, 0, 0);
+        (Delivery::new(supervisor, deadline, end, outbox), receiver, acknowledger)
+    }
+
+    fn deliver(to: &mut Delivery<'_, InProcess>, sequence: u64) -> Result<(), DeliveryError> {
+        let segment = Segment::zeroed(LAYOUT);
+        to.deliver(&SegmentHeader { sequence, ..SegmentHeader::default() }, &segment.block)
+    }
+
+    #[test]
+    fn a_segment_that_waits_for_a_full_queue_is_kept_and_named_in_a_warning() {
+        let supervisor =
+            FakeSupervisor::stopping_on(|report| matches!(report, Report::Warning { .. }));
+        let (mut delivery, _receiver, _) = delivery(&supervisor, Duration::from_millis(2));
+        (1..=2).for_each(|sequence| deliver(&mut delivery, sequence).unwrap());
+        let refused = deliver(&mut delivery, 3).unwrap_err();
+        assert!(matches!(refused, DeliveryError::StopRequested), "{refused}");
+        let warnings = supervisor.warnings();
+        assert_eq!(warnings.len(), 1, "{warnings:?}");
+        assert!(warnings[0].contains("the learner takes nothing from its full queue"));
+        assert!(supervisor.heartbeats().iter().all(|doing| *doing == Doing::Waiting));
+        let sent = delivery.sent();
+        assert_eq!((sent.produced, sent.sent, sent.acked), (3, 2, 0));
+    }
+
+    #[test]
+    fn a_full_outbox_waits_for_the_learners_acknowledgement() {
+        let supervisor = FakeSupervisor::default();
+        let (mut delivery, mut receiver, mut acknowledger) =
+            delivery(&supervisor, Duration::from_secs(60));
+        let mut segment = Segment::default();
+        for sequence in 1..=OUTBOX_SEGMENTS as u64 {
+            deliver(&mut delivery, sequence).unwrap();
+            assert!(receiver.try_receive(&mut segment).unwrap());
+        }
+        acknowledger.acknowledge(&[Mark { incarnation: 0, sequence: 3 }]).unwrap();
+        deliver(&mut delivery, 5).unwrap();
+        assert_eq!(delivery.sent().acked, 3);
+        assert_eq!(supervisor.unacknowledged(), 1, "before the fifth");
+        assert_eq!(supervisor.heartbeats(), [], "nothing had to wait");
+    }
+
+    #[test]
+    fn a_witness_sees_segments_before_they_are_sent_and_each_new_acknowledgement() {
+        let supervisor = FakeSupervisor::default();
+        let (mut delivery, _receiver, mut acknowledger) =
+            delivery(&supervisor, Duration::from_secs(60));
+        let (events, seen) = std::sync::mpsc::channel();
+        delivery.set_witness(Some(Box::new(move |event| {
+            let sequence = match event {
+                DeliveryEvent::Produced { header, .. } => Ok(header.sequence),
+                DeliveryEvent::Acknowledged(mark) => Err(mark.sequence),
+                DeliveryEvent::PolicyTaken { .. } => unreachable!("none was published"),
+            };
+            events.send(sequence).unwrap();
+        })));
+        deliver(&mut delivery, 1).unwrap();
+        acknowledger.acknowledge(&[Mark { incarnation: 0, sequence: 1 }]).unwrap();
+        delivery.report().unwrap();
+        delivery.report().unwrap();
+        assert_eq!(seen.try_iter().collect::<Vec<_>>(), [Ok(1), Err(1)]);
+        let sent = |produced, sent, acked| Report::Sent(Sent { produced, sent, resent: 0, acked });
+        assert_eq!(supervisor.reports(), [sent(1, 1, 1), sent(0, 0, 0)]);
+    }
+}

@@ -1,5 +1,5 @@
-//! The evaluator's process: arguments, environments and the rows of `evaluations.jsonl` for the loop
-//! in `dmprl_actors::evaluator`.
+//! The evaluator's process: arguments, environments and the rows of `evaluations.jsonl` around the
+//! loop in `dmprl_actors::evaluator`.
 
 use dmprl_actors::evaluator::{self, Evaluations};
 use dmprl_learner::checkpoint;

@@ -18,11 +18,11 @@ mod heartbeat;
 #[cfg(feature = "python")]
 mod joined;
 mod learner;
+mod learner_files;
 #[cfg(feature = "python")]
 mod observer;
 #[cfg(feature = "python")]
 mod one_process;
-mod recorder;
 mod relay;
 mod setup;
 

@@ -17,12 +17,9 @@ pub struct FakeSupervisor {
     pub finish: AtomicBool,
     /// Makes every report fail.
     pub gone: AtomicBool,
-    /// Requests a stop after so many heartbeats; 0 means never.
-    pub stop_after_heartbeats: AtomicU64,
-    /// Requests a stop once a report satisfies this predicate.
-    pub stop_on: Option<fn(&Report) -> bool>,
-    /// What [`Supervisor::totals`] returns.
-    pub totals: Mutex<RunTotals>,
+    stop_after_heartbeats: Option<usize>,
+    stop_on: Option<fn(&Report) -> bool>,
+    totals: Mutex<RunTotals>,
     commands: Mutex<VecDeque<Command>>,
     heartbeats: Mutex<Vec<Doing>>,
     reports: Mutex<Vec<Report>>,
@@ -34,6 +31,23 @@ fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
 }
 
 impl FakeSupervisor {
+    /// A supervisor that requests a stop at heartbeat number `count`.
+    #[must_use]
+    pub fn stopping_after_heartbeats(count: usize) -> Self {
+        Self { stop_after_heartbeats: Some(count), ..Self::default() }
+    }
+
+    /// A supervisor that requests a stop at a report that satisfies `predicate`.
+    #[must_use]
+    pub fn stopping_on(predicate: fn(&Report) -> bool) -> Self {
+        Self { stop_on: Some(predicate), ..Self::default() }
+    }
+
+    /// Sets what [`Supervisor::totals`] returns.
+    pub fn set_totals(&self, totals: RunTotals) {
+        *lock(&self.totals) = totals;
+    }
+
     /// Appends a command to those that the process has not taken yet.
     pub fn command(&self, command: Command) {
         lock(&self.commands).push_back(command);
@@ -93,7 +107,7 @@ impl Supervisor for FakeSupervisor {
     fn heartbeat(&self, doing: Doing) {
         let mut heartbeats = lock(&self.heartbeats);
         heartbeats.push(doing);
-        if heartbeats.len() as u64 == self.stop_after_heartbeats.load(Ordering::Acquire) {
+        if self.stop_after_heartbeats == Some(heartbeats.len()) {
             self.stop.store(true, Ordering::Release);
         }
     }
