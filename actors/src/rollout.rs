@@ -70,6 +70,14 @@ pub struct Identity {
     pub seed_index: u32,
 }
 
+impl Identity {
+    /// Number of this start's random streams: no two starts of workers of a run share one.
+    #[must_use]
+    pub fn stream(&self) -> u64 {
+        u64::from(self.seed_index) << 32 | u64::from(self.incarnation)
+    }
+}
+
 /// What the header of a segment says beside who made it.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) struct Outline {
@@ -124,7 +132,7 @@ impl Rollout {
         let policy = Policy::new(config, environments.spec())?;
         let layout = policy.layout();
         // A restarted worker continues no episode, and must not repeat those of its predecessor.
-        let worker = u64::from(identity.seed_index) << 32 | u64::from(identity.incarnation);
+        let worker = identity.stream();
         let random = seeds::stream(config.run.seed, "exploration", worker);
         let env_seeds = environment_seeds(config.run.seed, worker, envs);
         let mut faults = Faults::new(envs, config.actors.env_failures_max);

@@ -21,7 +21,10 @@ use dmprl_shared::segment::{
 };
 use dmprl_shared::transport::delivery::{Acknowledgements, Inbox, Outbox};
 use dmprl_shared::transport::shared_memory::{Domain, LearnerEnd, Plan, attach, serve};
-use dmprl_shared::transport::{ParameterPublisher, ParameterSubscriber, SegmentReceiver};
+use dmprl_shared::transport::{
+    AcknowledgementPublisher, AcknowledgementSubscriber, ParameterPublisher, ParameterSubscriber,
+    SegmentReceiver,
+};
 
 const PATIENCE: Duration = Duration::from_secs(120);
 /// Between two looks at a condition.

@@ -1,7 +1,9 @@
 //! Stages 5 to 7 of 8 on the learner's side: replay, pacing, update, publishing, checkpoints.
 //!
-//! The learner knows no environment and no Python: it sees segments and policies. Its loop is a
-//! plain loop on a plain thread.
+//! A learner's life, in reading order: [`start`] makes it, [`serve`] is its loop, [`session`] one
+//! turn of that loop, [`learner`] the state behind it, [`recorder`] what it records. It knows no
+//! environment and no Python: it sees segments and policies, and knows its supervisor by
+//! `dmprl_shared::supervision` only. The loop is a plain loop on a plain thread.
 
 pub mod algorithms;
 pub mod checkpoint;
@@ -12,7 +14,10 @@ pub mod metrics;
 pub mod networks;
 pub mod normaliser;
 pub mod pacing;
+pub mod recorder;
 pub mod replay;
 pub mod rollout_buffer;
+pub mod serve;
 pub mod session;
+pub mod start;
 pub mod update;

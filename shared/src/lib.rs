@@ -14,4 +14,5 @@ pub mod runtime;
 pub mod seeds;
 pub mod segment;
 pub mod spec;
+pub mod supervision;
 pub mod transport;

@@ -10,7 +10,8 @@ use dmprl_shared::segment::Segment;
 use dmprl_shared::transport::delivery::{Acknowledgements, Inbox, Outbox, SegmentLog};
 use dmprl_shared::transport::shared_memory::{attach, serve};
 use dmprl_shared::transport::{
-    ParameterPublisher, ParameterSubscriber, SegmentReceiver, SendOutcome,
+    AcknowledgementPublisher, AcknowledgementSubscriber, ParameterPublisher, ParameterSubscriber,
+    SegmentReceiver, SendOutcome,
 };
 use transport_support::{LAYOUT, Parent, header, plan, snapshot};
 

@@ -6,34 +6,41 @@ mod transport_support;
 
 use dmprl_shared::parameters::{ParameterSnapshot, SnapshotError};
 use dmprl_shared::segment::Segment;
-use dmprl_shared::transport::shared_memory::{Domain, attach, serve, subscribe};
+use dmprl_shared::transport::delivery::{Acknowledgements, Mark};
+use dmprl_shared::transport::shared_memory::{Domain, attach, hear, serve, subscribe};
 use dmprl_shared::transport::{
-    ParameterPublisher, ParameterSubscriber, SegmentReceiver, SegmentSender, SendOutcome,
-    TransportError, in_process,
+    AcknowledgementPublisher, AcknowledgementSubscriber, ParameterPublisher, ParameterSubscriber,
+    SegmentReceiver, SegmentSender, SendOutcome, TransportError, in_process,
 };
 use transport_support::{
     ARCHITECTURE, LAYOUT, PARAMETERS_LEN, Parent, assert_whole, fill, header, plan, snapshot,
 };
 
 type Subscriber = Box<dyn ParameterSubscriber + Send>;
+type Listener = Box<dyn AcknowledgementSubscriber + Send>;
 
 /// One learner with its workers, whatever lies between them.
 struct Transport {
     senders: Vec<Box<dyn SegmentSender + Send>>,
     receiver: Box<dyn SegmentReceiver + Send>,
     publisher: Box<dyn ParameterPublisher + Send>,
+    acknowledger: Box<dyn AcknowledgementPublisher + Send>,
     join: Box<dyn Fn() -> Subscriber>,
+    listen: Box<dyn Fn() -> Listener>,
     _domain: Option<(Domain, Parent)>,
 }
 
 fn over_memory_of_one_process(workers: usize, queue_segments: usize) -> Transport {
     let (senders, receiver) = in_process::segment_queues(workers, queue_segments, LAYOUT);
     let (publisher, subscriber) = in_process::parameter_channel(ARCHITECTURE);
+    let (acknowledger, listener) = in_process::acknowledgement_channel(workers);
     Transport {
         senders: senders.into_iter().map(|sender| Box::new(sender) as _).collect(),
         receiver: Box::new(receiver),
         publisher: Box::new(publisher),
+        acknowledger: Box::new(acknowledger),
         join: Box::new(move || Box::new(subscriber.clone())),
+        listen: Box::new(move || Box::new(listener.clone())),
         _domain: None,
     }
 }
@@ -49,7 +56,12 @@ fn over_shared_memory(workers: usize, queue_segments: usize) -> Transport {
         senders: (0..workers).map(worker).collect(),
         receiver: Box::new(learner.segments),
         publisher: Box::new(learner.parameters),
-        join: Box::new(move || Box::new(subscribe(&path, &plan).unwrap())),
+        acknowledger: Box::new(learner.acknowledgements),
+        join: {
+            let (path, plan) = (path.clone(), plan.clone());
+            Box::new(move || Box::new(subscribe(&path, &plan).unwrap()))
+        },
+        listen: Box::new(move || Box::new(hear(&path, &plan).unwrap())),
         _domain: Some((domain, parent)),
     };
     // The learner's first look connects the queues; until then a full one counts as detached.
@@ -208,6 +220,22 @@ fn a_snapshot_of_another_architecture_is_refused(mut transport: Transport) {
     assert_eq!(taken.values.len(), PARAMETERS_LEN);
 }
 
+fn the_newest_acknowledgements_replace_the_ones_before(mut transport: Transport) {
+    let marks = |sequence| [1, 2].map(|incarnation| Mark { incarnation, sequence });
+    let mut listener = (transport.listen)();
+    let mut taken = Acknowledgements::default();
+    assert!(!listener.newest(&mut taken).unwrap());
+    for sequence in 1..=5 {
+        transport.acknowledger.acknowledge(&marks(sequence)).unwrap();
+    }
+    assert!(listener.newest(&mut taken).unwrap());
+    assert_eq!((taken.epoch, &taken.marks[..]), (1, &marks(5)[..]));
+    assert!(!listener.newest(&mut taken).unwrap());
+    let refusal = transport.acknowledger.acknowledge(&marks(6)[..1]).unwrap_err();
+    assert!(matches!(refusal, TransportError::Length { .. }), "{refusal}");
+    assert!(!listener.newest(&mut taken).unwrap());
+}
+
 macro_rules! contract {
     ($($promise:ident($workers:expr, $queue_segments:expr);)*) => {
         mod in_one_process {
@@ -233,4 +261,5 @@ contract! {
     snapshots_are_whole_and_their_version_never_decreases(1, 1);
     a_late_joiner_gets_the_newest_snapshot(1, 1);
     a_snapshot_of_another_architecture_is_refused(1, 1);
+    the_newest_acknowledgements_replace_the_ones_before(2, 1);
 }

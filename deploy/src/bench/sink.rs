@@ -13,7 +13,7 @@ use anyhow::{Context, bail};
 use dmprl_shared::segment::{Expected, HINDSIGHT, Rejection, Segment, SegmentHeader, check};
 use dmprl_shared::transport::delivery::Inbox;
 use dmprl_shared::transport::shared_memory::LearnerEnd;
-use dmprl_shared::transport::{ParameterPublisher, SegmentReceiver};
+use dmprl_shared::transport::{AcknowledgementPublisher, ParameterPublisher, SegmentReceiver};
 use rustix::time::{ClockId, clock_gettime};
 
 use super::child::LineChild;

@@ -12,7 +12,7 @@ use dmprl_shared::segment::Expected;
 use dmprl_shared::spec::EnvSpec;
 use dmprl_shared::transport::ParameterPublisher;
 use dmprl_shared::transport::delivery::Inbox;
-use dmprl_shared::transport::shared_memory::{Domain, serve};
+use dmprl_shared::transport::shared_memory::{Domain, Plan, serve};
 use tempfile::TempDir;
 
 use super::child::LineChild;
@@ -21,7 +21,7 @@ use super::sink::{Answer, Discrepancies, From, Request, Sink, Window, show_warni
 use super::watch::Watch;
 use crate::control::{Command, Report};
 use crate::launch::{Launcher, Process, TimeLimits, create_domain};
-use crate::roles::{Setup, plan};
+use crate::roles::Setup;
 use crate::run_directory::{Manifest, RunDirectory};
 
 /// Beyond what was asked for, a measurement may take so much longer.
@@ -106,7 +106,7 @@ impl Workers {
             architecture_hash: policy.architecture_hash(),
             values: policy.initial_parameters(&mut random),
         };
-        let mut end = serve(domain.path(), &plan(&setup, &policy))?;
+        let mut end = serve(domain.path(), &Plan::new(&setup.config, setup.run_id, &policy))?;
         end.parameters.publish(&snapshot)?;
         let expected = expected(&setup, &policy)?;
         let inbox = Inbox::new(expected.worker_count as usize);

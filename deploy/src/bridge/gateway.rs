@@ -13,7 +13,7 @@ use dmprl_shared::transport::delivery::{Acknowledgements, Sent};
 use dmprl_shared::transport::shared_memory::{
     AcknowledgementReader, Plan, Sender, Subscriber, attach_queue, hear, subscribe,
 };
-use dmprl_shared::transport::{ParameterSubscriber, TransportError};
+use dmprl_shared::transport::{AcknowledgementSubscriber, ParameterSubscriber, TransportError};
 
 use super::feed::Feed;
 use super::landing::Landing;

@@ -13,7 +13,7 @@ use dmprl_shared::config::ExperimentConfig;
 use dmprl_shared::segment::Segment;
 use dmprl_shared::transport::delivery::{Mark, Sent};
 use dmprl_shared::transport::shared_memory::{LearnerEnd, Plan, serve};
-use dmprl_shared::transport::{ParameterPublisher, SegmentReceiver};
+use dmprl_shared::transport::{AcknowledgementPublisher, ParameterPublisher, SegmentReceiver};
 
 use super::lane::Lane;
 use super::link::{Ends, Inlet, Link, Outlet, Token, Urgency};

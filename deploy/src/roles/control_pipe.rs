@@ -9,6 +9,7 @@ use std::thread;
 use std::time::Duration;
 
 use anyhow::{Context, ensure};
+use dmprl_shared::supervision::{ReportError, RunTotals, Supervisor};
 use dmprl_shared::transport::delivery::Sent;
 
 use super::heartbeat::Pulse;
@@ -119,9 +120,9 @@ impl ControlPipe {
         self.flags.finish.load(Ordering::Acquire)
     }
 
-    /// The flag behind [`ControlPipe::stop_requested`], for loops that know nothing of pipes.
+    /// The flag behind [`ControlPipe::stop_requested`], for handlers of signals.
     #[must_use]
-    pub fn stop_flag(&self) -> Arc<AtomicBool> {
+    pub fn shared_stop_flag(&self) -> Arc<AtomicBool> {
         Arc::clone(&self.flags.stop)
     }
 
@@ -164,17 +165,7 @@ impl ControlPipe {
         self.reporter.send(report)
     }
 
-    /// Notes that the role's loop has come round once more, for the heartbeat.
-    pub fn beat(&self, doing: Doing) {
-        self.pulse.beat(doing);
-    }
-
-    /// Notes how many segments wait for the learner's acknowledgement, likewise.
-    pub fn keep(&self, segments: usize) {
-        self.pulse.keep(segments as u64);
-    }
-
-    /// What [`ControlPipe::beat`] notes.
+    /// What the loop's heartbeats leave for the thread that sends them.
     #[must_use]
     pub fn pulse(&self) -> Arc<Pulse> {
         Arc::clone(&self.pulse)
@@ -184,6 +175,41 @@ impl ControlPipe {
     #[must_use]
     pub fn reporter(&self) -> Reporter {
         self.reporter.clone()
+    }
+}
+
+impl Supervisor for ControlPipe {
+    fn stop_flag(&self) -> &AtomicBool {
+        &self.flags.stop
+    }
+
+    fn finish_requested(&self) -> bool {
+        self.flags.finish.load(Ordering::Acquire)
+    }
+
+    fn is_gone(&self) -> bool {
+        self.orphaned()
+    }
+
+    fn next_command(&self, wait: Duration) -> Option<Command> {
+        self.next_within(wait)
+    }
+
+    fn totals(&self) -> RunTotals {
+        let (env_failures, workers, sent) = (self.env_failures(), self.workers(), self.sent());
+        RunTotals { env_failures, workers, sent }
+    }
+
+    fn heartbeat(&self, doing: Doing) {
+        self.pulse.beat(doing);
+    }
+
+    fn note_unacknowledged(&self, segments: usize) {
+        self.pulse.keep(segments as u64);
+    }
+
+    fn report(&self, report: &Report) -> Result<(), ReportError> {
+        self.send(report).map_err(|error| ReportError(error.into()))
     }
 }
 

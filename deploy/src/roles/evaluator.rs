@@ -1,23 +1,15 @@
-//! The evaluator process: noise-free episodes of saved policies.
+//! The evaluator's process: arguments, environments and the rows of `evaluations.jsonl` around the
+//! loop in `dmprl_actors::evaluator`.
 
-use std::sync::atomic::AtomicBool;
-use std::time::Duration;
-
-use dmprl_actors::evaluate::{ENVIRONMENTS_MAX, Episodes, Evaluator};
-use dmprl_actors::python_env::Interpreter;
-use dmprl_actors::rollout::RolloutError;
+use dmprl_actors::evaluator::{self, Evaluations};
 use dmprl_learner::checkpoint;
-use dmprl_shared::config::ExperimentConfig;
-use dmprl_shared::policy_file::{self, Match};
-use dmprl_shared::spec::EnvSpec;
+use dmprl_shared::supervision::Supervisor;
 
+use super::environments::on_hang;
 use super::setup::Setup;
-use super::{ControlPipe, EvaluatorArgs, environments};
-use crate::control::{Command, EvaluationRequest, EvaluationRow, Report};
+use super::{ControlPipe, EvaluatorArgs};
+use crate::control::{EvaluationRow, Report};
 use crate::terminal::say;
-
-/// How long one look for a command may block, so that a stop is seen.
-const COMMAND_WAIT: Duration = Duration::from_millis(100);
 
 /// Answers requests until a stop is asked for.
 pub fn run(args: &EvaluatorArgs, control: &ControlPipe) -> anyhow::Result<()> {
@@ -27,90 +19,16 @@ pub fn run(args: &EvaluatorArgs, control: &ControlPipe) -> anyhow::Result<()> {
         config.evaluation.episodes = usize::try_from(episodes)?;
         config.evaluation.final_episodes = 0;
     }
-    let interpreter = super::actor::interpreter(args.venv.as_deref(), &config)?;
-    let (mut evaluator, spec) = evaluator(&interpreter, &config, control)?;
-    control.send(&Report::EnvironmentReady { spec })?;
+    let interpreter = super::actor::start_interpreter(args.venv.as_deref(), &config)?;
+    let mut evaluator = evaluator::evaluator(&interpreter, &config, on_hang(control))?;
+    let policy_path = |version| setup.run.policy_path(version);
     let stop = control.stop_flag();
-    while !control.stop_requested() {
-        let Some(Command::Evaluate(request)) = control.next_within(COMMAND_WAIT) else { continue };
-        let plan = Plan { setup: &setup, config: &config, stop: &stop };
-        let answer = evaluate(&mut evaluator, &plan, &request);
-        environments::tell(&evaluator.take_failures(), control);
-        match answer? {
-            Answer::Row(row) => {
-                if !args.print_only {
-                    keep(&setup, &row, control)?;
-                }
-                control.send(&Report::Evaluated(row))?;
-            }
-            Answer::Failed(reason) => {
-                let policy_version = request.policy_version;
-                control.send(&Report::NotEvaluated { policy_version, reason })?;
-            }
-            Answer::Stopped => break,
-        }
-    }
-    Ok(())
-}
-
-/// Environments and policy of an evaluation.
-pub fn evaluator(
-    interpreter: &Interpreter,
-    config: &ExperimentConfig,
-    control: &ControlPipe,
-) -> anyhow::Result<(Evaluator, EnvSpec)> {
-    let envs = config.evaluation.episodes.min(ENVIRONMENTS_MAX);
-    let made = environments::make(interpreter, config, envs, control)?;
-    let spec = made.spec().clone();
-    Ok((Evaluator::new(config, made, envs)?, spec))
-}
-
-/// What is the same for all evaluations of a run.
-pub struct Plan<'a> {
-    pub setup: &'a Setup,
-    pub config: &'a ExperimentConfig,
-    /// Asks to give up the evaluation.
-    pub stop: &'a AtomicBool,
-}
-
-/// What became of an evaluation.
-pub enum Answer {
-    Row(EvaluationRow),
-    /// An episode failed, and failed again: no reason why the next evaluation should.
-    Failed(String),
-    /// A stop was asked for.
-    Stopped,
-}
-
-/// Evaluates a saved policy.
-pub fn evaluate(
-    evaluator: &mut Evaluator,
-    plan: &Plan<'_>,
-    request: &EvaluationRequest,
-) -> anyhow::Result<Answer> {
-    let path = plan.setup.run.policy_path(request.policy_version);
-    let snapshot = policy_file::load(&path, evaluator.policy(), Match::Architecture)?;
-    let settings = &plan.config.evaluation;
-    let count = settings.episodes_at(request.env_steps, plan.config.run.steps);
-    let episodes = Episodes { count, first_seed: settings.first_seed, stop: plan.stop };
-    let evaluation = match evaluator.evaluate(&snapshot.values, episodes) {
-        Ok(Some(evaluation)) => evaluation,
-        Ok(None) => return Ok(Answer::Stopped),
-        Err(error @ RolloutError::Episode { .. }) => return Ok(Answer::Failed(error.to_string())),
-        Err(error) => return Err(error.into()),
+    let evaluations = Evaluations { config: &config, policy_path: &policy_path, stop };
+    let mut kept = |row: &EvaluationRow| match args.print_only {
+        true => Ok(()),
+        false => keep(&setup, row, control).map_err(Into::into),
     };
-    let EvaluationRequest { env_steps, updates, segments, wall_s, policy_version } = *request;
-    Ok(Answer::Row(EvaluationRow {
-        env_steps,
-        updates,
-        segments,
-        wall_s,
-        policy_version,
-        return_mean: evaluation.return_mean(),
-        returns: evaluation.returns,
-        success_rate: evaluation.success_rate,
-        smoothness: evaluation.smoothness,
-    }))
+    Ok(evaluator::run(&mut evaluator, &evaluations, control, &mut kept)?)
 }
 
 /// Appends the row and drops the policies that no row needs any more.
@@ -159,6 +77,8 @@ fn tidy(setup: &Setup) -> anyhow::Result<()> {
 
 #[cfg(test)]
 mod tests {
+    use dmprl_shared::config::ExperimentConfig;
+
     use super::*;
     use crate::run_directory::{Manifest, RunDirectory};
 

@@ -5,9 +5,10 @@ use std::time::{Duration, Instant};
 
 use anyhow::Context;
 use dmprl_shared::policy::Policy;
+use dmprl_shared::transport::shared_memory::Plan;
 
 use super::setup::Setup;
-use super::{ControlPipe, GatewayArgs, learner};
+use super::{ControlPipe, GatewayArgs};
 use crate::bridge::gateway::{Gateway, News, RunFacts};
 use crate::bridge::token;
 use crate::bridge::wire::Course;
@@ -100,7 +101,7 @@ fn open(args: &GatewayArgs, control: &ControlPipe) -> anyhow::Result<Option<Gate
     let places = (config.actors.places(), session, config.delivery.unacknowledged_segments);
     let deadline = Instant::now() + JOIN_LIMIT;
     loop {
-        let plan = learner::plan(&setup, &policy);
+        let plan = Plan::new(&setup.config, setup.run_id, &policy);
         let at = (bridge.listen.as_slice(), zenoh_file);
         match Gateway::open(at, (&args.domain, plan), places, facts.clone()) {
             Ok(gateway) => return Ok(Some(gateway)),

@@ -15,10 +15,11 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
 use anyhow::{Context, bail};
+use dmprl_actors::worker::Guest;
 use dmprl_shared::transport::delivery::Sent;
 use signal_hook::flag;
 
-use super::actor::{self, Guest, Seat};
+use super::actor::{self, Seat};
 use super::setup::Setup;
 use super::{ControlPipe, ORPHAN_LIMIT, control_pipe};
 use crate::control::{
@@ -58,10 +59,10 @@ pub fn join(run: &Path) -> anyhow::Result<Outcome> {
     let counted = format!("{workers} worker{}", if workers == 1 { "" } else { "s" });
     say(&format!("joined {} as actor-{index}: {counted}", shown(setup.run.path())));
     let teller = Teller::new();
-    let mut tell = |sent| teller.tell(sent);
+    let tell = |sent| teller.tell(sent);
     let venv = venv.as_deref();
     let seat = Seat { setup: &setup, index, first: 0, incarnation, venv, journal: None };
-    let guest = Guest { leaving: &leaving, tell: &mut tell };
+    let guest = Guest { leaving: &leaving, tell: &tell };
     actor::work(&seat, &control, Some(guest))?;
     let sent = teller.sent.get();
     let acknowledged = format!("{} of {}", grouped(sent.acked), grouped(sent.produced));
@@ -170,7 +171,7 @@ fn leave_on_signals(leaving: &Arc<AtomicBool>, control: &ControlPipe) -> anyhow:
         // In this order: the first signal must not count as the second.
         flag::register_conditional_shutdown(signal, INTERRUPTED_STATUS, Arc::clone(leaving))
             .and_then(|_| flag::register(signal, Arc::clone(leaving)))
-            .and_then(|_| flag::register(signal, control.stop_flag()))
+            .and_then(|_| flag::register(signal, control.shared_stop_flag()))
             .with_context(|| format!("cannot catch signal {signal}"))?;
     }
     Ok(())

@@ -8,7 +8,6 @@
 mod actor;
 mod arguments;
 mod control_pipe;
-mod delivery;
 #[cfg(feature = "python")]
 mod environments;
 #[cfg(feature = "python")]
@@ -19,11 +18,11 @@ mod heartbeat;
 #[cfg(feature = "python")]
 mod joined;
 mod learner;
+mod learner_files;
 #[cfg(feature = "python")]
 mod observer;
 #[cfg(feature = "python")]
 mod one_process;
-mod recorder;
 mod relay;
 mod setup;
 
@@ -33,8 +32,6 @@ use hardening::harden;
 
 pub use arguments::{ActorArgs, EvaluatorArgs, GatewayArgs, LearnerArgs, ObserverArgs, RelayArgs};
 pub use control_pipe::{ControlPipe, ORPHAN_LIMIT, ORPHANED_LEARNER_LIMIT};
-pub(crate) use delivery::{Delivery, Stopped, attach_within};
-pub(crate) use learner::plan;
 pub(crate) use setup::Setup;
 
 /// Replays, updates, publishes, writes checkpoints; with `--one-process` also steps and

@@ -7,24 +7,27 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
 
 use anyhow::Context;
+use dmprl_actors::environments;
 use dmprl_actors::python_env::{self, PythonEnvironments, SUCCESS_NOT_REPORTED, SUCCESS_YES};
 use dmprl_actors::recording::{EpisodeRecord, Recorder};
 use dmprl_shared::policy_file::{self, Match};
+use dmprl_shared::supervision::Supervisor;
 use serde::Serialize;
 
+use super::environments::on_hang;
 use super::setup::Setup;
-use super::{ControlPipe, ObserverArgs, environments};
+use super::{ControlPipe, ObserverArgs};
 use crate::control::Report;
 use crate::motion::{Joint, JointKind, RecordedEpisode, Robot};
 
 /// Writes the episodes that its arguments name, and reports after each.
 pub fn run(args: &ObserverArgs, control: &ControlPipe) -> anyhow::Result<()> {
     let setup = Setup::read(&args.run)?;
-    let interpreter = super::actor::interpreter(args.venv.as_deref(), &setup.config)?;
+    let interpreter = super::actor::start_interpreter(args.venv.as_deref(), &setup.config)?;
     let task = (setup.config.task.id.as_str(), setup.config.policy.decision_steps());
     let environment =
         PythonEnvironments::start_recording(&interpreter, task, args.pictures.as_deref())?;
-    environments::watch(&environment, &setup.config, control)?;
+    environments::watch(&environment, &setup.config, on_hang(control))?;
     let spec = environment.spec().clone();
     let done = Arc::new(AtomicU64::new(0));
     let (episodes, reporter) = (Arc::clone(&done), control.reporter());
@@ -45,8 +48,8 @@ pub fn run(args: &ObserverArgs, control: &ControlPipe) -> anyhow::Result<()> {
     let stop = control.stop_flag();
     for index in 0..args.episodes {
         let seed = args.first_seed + index;
-        let record = recorder.record(&snapshot.values, seed, &stop);
-        environments::tell(&recorder.take_failures(), control);
+        let record = recorder.record(&snapshot.values, seed, stop);
+        environments::report_failures(&recorder.take_failures(), control);
         let Some(record) = record? else { return Ok(()) };
         append(&mut lines, &episode(record, dims))?;
         done.store(index + 1, Ordering::Relaxed);

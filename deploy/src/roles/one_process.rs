@@ -7,18 +7,22 @@
 
 use std::cell::Cell;
 
+use dmprl_actors::environments::report_failures;
 use dmprl_actors::evaluate::Evaluator;
+use dmprl_actors::evaluator::{self, Answer, Evaluations};
 use dmprl_actors::rollout::{Identity, Rollout, RolloutError};
+use dmprl_actors::worker;
 use dmprl_learner::learner::Learner;
+use dmprl_learner::recorder::Recorder;
+use dmprl_learner::serve::{Ending, catch_up, close};
 use dmprl_learner::session::{Due, Session, Turn};
 use dmprl_shared::config::RunConfig;
-use dmprl_shared::seeds;
+use dmprl_shared::supervision::Supervisor;
 use dmprl_shared::transport::{ParameterSubscriber, SegmentSender, SendOutcome, in_process};
 
-use super::environments;
-use super::evaluator::{self, Answer, evaluator};
-use super::learner::Ending;
-use super::recorder::Recorder;
+use super::environments::on_hang;
+use super::evaluator::keep;
+use super::learner_files::{LearnerFiles, past};
 use super::setup::Setup;
 use super::{ControlPipe, LearnerArgs};
 use crate::control::{EvaluationRequest, Report};
@@ -34,17 +38,15 @@ impl From<RolloutError> for Delivery {
 
 /// Trains in this process until the run is over or a stop is asked for.
 pub fn run(args: &LearnerArgs, control: &ControlPipe) -> anyhow::Result<()> {
-    let setup = Setup::read(&args.run)?;
+    let setup = &Setup::read(&args.run)?;
     let config = &setup.config;
-    let interpreter = super::actor::interpreter(args.venv.as_deref(), config)?;
-    let envs = config.actors.envs_per_worker;
-    interpreter.seed(seeds::derive(config.run.seed, "python", 0))?;
-    let made = environments::make(&interpreter, config, envs, control)?;
+    let interpreter = super::actor::start_interpreter(args.venv.as_deref(), config)?;
+    let made = worker::environments(&interpreter, config, 0, on_hang(control))?;
     let spec = made.spec().clone();
-    let (evaluator, _) = evaluator(&interpreter, config, control)?;
+    let evaluator = evaluator::evaluator(&interpreter, config, on_hang(control))?;
     control.send(&Report::EnvironmentReady { spec: spec.clone() })?;
 
-    let learner = super::learner::make(&setup, &spec, args, control)?;
+    let learner = super::learner::make(setup, &spec, args, control)?;
     // A resumed run continues no episode: its worker counts as started again.
     let incarnation = u32::try_from(learner.counters.segments)?;
     let identity = Identity { run_id: setup.run_id, worker_id: 0, incarnation, seed_index: 0 };
@@ -54,21 +56,24 @@ pub fn run(args: &LearnerArgs, control: &ControlPipe) -> anyhow::Result<()> {
     let hash = learner.policy().architecture_hash();
     let (publisher, mut parameters) = in_process::parameter_channel(hash);
 
-    let mut recorder = Recorder::new(&setup.run, control, &learner)?;
+    let mut files = LearnerFiles::open(&setup.run, None)?;
+    let mut recorder = Recorder::new(&mut files, past(&setup.run)?, control, &learner);
     let mut session = Session::start(learner, receiver, publisher)?;
     control.send(&Report::LearnerReady)?;
     let (reached, stop) = (Cell::new(false), control.stop_flag());
-    let env_failures = Cell::new(session.learner.counters.env_failures);
-    let plan = evaluator::Plan { setup: &setup, config, stop: &stop };
-    let mut judge = Judge { evaluator, plan, control, reached: &reached, failures: &env_failures };
-    let mut evaluate = |request: EvaluationRequest| judge.evaluate(&request);
-    super::learner::catch_up(&mut session, &mut recorder, &mut evaluate)?;
+    let policy_path = |version| setup.run.policy_path(version);
+    let failures = Cell::new(session.learner.counters.env_failures);
+    let evaluations = Evaluations { config, policy_path: &policy_path, stop };
+    let mut judge =
+        Judge { evaluator, evaluations, setup, control, reached: &reached, failures: &failures };
+    let mut evaluate = |request: EvaluationRequest| judge.evaluate(&request).map_err(Into::into);
+    catch_up(&mut session, &mut recorder, &mut evaluate)?;
     let mut first = true;
-    let finished = loop {
+    let is_complete = loop {
         let mut due = |due: Due, learner: &mut Learner| {
-            let done = recorder.due(due, learner, &mut evaluate).map_err(Into::into);
+            let done = recorder.due(due, learner, &mut evaluate);
             // A checkpoint may follow an evaluation at the same step.
-            learner.counters.env_failures = env_failures.get();
+            learner.counters.env_failures = failures.get();
             done
         };
         let turn = loop {
@@ -87,22 +92,23 @@ pub fn run(args: &LearnerArgs, control: &ControlPipe) -> anyhow::Result<()> {
         }
         parameters.newest(&mut rollout.snapshot)?;
         let acted = act(&mut rollout, &mut senders[0]);
-        count(&env_failures, environments::tell(&rollout.take_failures(), control));
-        session.learner.counters.env_failures = env_failures.get();
+        count(&failures, report_failures(&rollout.take_failures(), control));
+        session.learner.counters.env_failures = failures.get();
         acted?;
         if std::mem::take(&mut first) {
             let _ = control.send(&Report::FirstSegment);
         }
     };
-    let env_failures = || env_failures.get();
-    let ending = Ending { finished, evaluate: &mut evaluate, env_failures: &env_failures };
-    super::learner::close(&mut session, &mut recorder, control, ending)
+    let env_failures = || failures.get();
+    let ending = Ending { is_complete, evaluate: &mut evaluate, env_failures: &env_failures };
+    Ok(close(&mut session, &mut recorder, control, ending)?)
 }
 
 /// Evaluates where an evaluation falls due.
 struct Judge<'a> {
     evaluator: Evaluator,
-    plan: evaluator::Plan<'a>,
+    evaluations: Evaluations<'a>,
+    setup: &'a Setup,
     control: &'a ControlPipe,
     /// Set once an evaluation has reached the run's goal.
     reached: &'a Cell<bool>,
@@ -111,8 +117,8 @@ struct Judge<'a> {
 
 impl Judge<'_> {
     fn evaluate(&mut self, request: &EvaluationRequest) -> anyhow::Result<()> {
-        let answer = evaluator::evaluate(&mut self.evaluator, &self.plan, request);
-        count(self.failures, environments::tell(&self.evaluator.take_failures(), self.control));
+        let answer = evaluator::evaluate(&mut self.evaluator, &self.evaluations, request);
+        count(self.failures, report_failures(&self.evaluator.take_failures(), self.control));
         let row = match answer? {
             Answer::Row(row) => row,
             Answer::Failed(reason) => {
@@ -122,8 +128,8 @@ impl Judge<'_> {
             }
             Answer::Stopped => return Ok(()),
         };
-        evaluator::keep(self.plan.setup, &row, self.control)?;
-        let RunConfig { until_return, until_success, .. } = self.plan.config.run;
+        keep(self.setup, &row, self.control)?;
+        let RunConfig { until_return, until_success, .. } = self.evaluations.config.run;
         let success = row.success_rate.is_some_and(|rate| rate >= until_success);
         self.reached.set(self.reached.get() || success || row.return_mean >= until_return);
         // A supervisor that is gone is noticed as a stop, which ends with a checkpoint.

@@ -4,9 +4,10 @@ use std::time::{Duration, Instant};
 
 use anyhow::{Context, bail};
 use dmprl_shared::policy::Policy;
+use dmprl_shared::transport::shared_memory::Plan;
 
 use super::setup::Setup;
-use super::{ControlPipe, RelayArgs, learner};
+use super::{ControlPipe, RelayArgs};
 use crate::bridge::relay::{Asking, HostCounts, Relay, Turn};
 use crate::bridge::token;
 use crate::bridge::wire::Held;
@@ -47,7 +48,7 @@ fn start(args: &RelayArgs) -> anyhow::Result<Relay> {
     let setup = Setup::read(&args.run)?;
     let spec = setup.run.spec()?.context("the run has no spec.json: start the bridge again")?;
     let policy = Policy::new(&setup.config, &spec)?;
-    let plan = learner::plan(&setup, &policy);
+    let plan = Plan::new(&setup.config, setup.run_id, &policy);
     let asking = Asking {
         endpoint: args.connect.clone(),
         token: token::read(&args.token_file)?,

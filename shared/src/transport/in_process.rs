@@ -1,4 +1,4 @@
-//! Segment queues and the parameter channel inside one process.
+//! Segment queues, the parameter channel and the acknowledgement channel inside one process.
 //!
 //! Bounded like the shared-memory ones and under the same contract test. Buffers circulate
 //! between a free list and the queue, so nothing is allocated after construction.
@@ -6,12 +6,26 @@
 use std::collections::VecDeque;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
+use super::delivery::{Acknowledgements, Mark};
 use super::{
-    ParameterPublisher, ParameterSubscriber, SegmentReceiver, SegmentSender, SendOutcome,
-    TransportError,
+    AcknowledgementPublisher, AcknowledgementSubscriber, ParameterPublisher, ParameterSubscriber,
+    SegmentReceiver, SegmentSender, SendOutcome, TransportError, WorkerTransport,
 };
 use crate::parameters::{ParameterSnapshot, SnapshotError};
 use crate::segment::{Segment, SegmentHeader, SegmentLayout};
+
+/// Names this transport's types.
+#[derive(Debug)]
+pub struct InProcess;
+
+impl WorkerTransport for InProcess {
+    type Segments = Sender;
+    type Parameters = Subscriber;
+    type Acknowledgements = AcknowledgementReader;
+}
+
+/// Number of the only learner of a session inside one process.
+const EPOCH: u64 = 1;
 
 #[derive(Debug)]
 struct Queue {
@@ -157,6 +171,68 @@ impl ParameterSubscriber for Subscriber {
             .into());
         }
         snapshot.clone_from(&newest);
+        Ok(true)
+    }
+
+    /// There is one learner.
+    fn epoch(&self) -> u64 {
+        EPOCH
+    }
+}
+
+/// The newest acknowledgements and how many there have been.
+#[derive(Debug)]
+struct Acknowledged {
+    marks: Vec<Mark>,
+    count: u64,
+}
+
+/// The learner's end of the acknowledgement channel.
+#[derive(Debug)]
+pub struct Acknowledger(Arc<Mutex<Acknowledged>>);
+
+/// A worker's end of the acknowledgement channel.
+#[derive(Debug, Clone)]
+pub struct AcknowledgementReader {
+    newest: Arc<Mutex<Acknowledged>>,
+    taken: u64,
+}
+
+/// A channel for the acknowledgements of `workers` workers.
+#[must_use]
+pub fn acknowledgement_channel(workers: usize) -> (Acknowledger, AcknowledgementReader) {
+    let newest = Acknowledged { marks: vec![Mark::default(); workers], count: 0 };
+    let newest = Arc::new(Mutex::new(newest));
+    (Acknowledger(newest.clone()), AcknowledgementReader { newest, taken: 0 })
+}
+
+impl AcknowledgementPublisher for Acknowledger {
+    fn acknowledge(&mut self, marks: &[Mark]) -> Result<(), TransportError> {
+        let mut newest = lock(&self.0);
+        let (expected, got) = (newest.marks.len(), marks.len());
+        if got != expected {
+            return Err(TransportError::Length { expected, got });
+        }
+        newest.marks.copy_from_slice(marks);
+        newest.count += 1;
+        Ok(())
+    }
+
+    fn maintain(&mut self) -> Result<(), TransportError> {
+        Ok(())
+    }
+}
+
+impl AcknowledgementSubscriber for AcknowledgementReader {
+    fn newest(&mut self, acknowledgements: &mut Acknowledgements) -> Result<bool, TransportError> {
+        let newest = lock(&self.newest);
+        if newest.count == self.taken {
+            return Ok(false);
+        }
+        self.taken = newest.count;
+        acknowledgements.epoch = EPOCH;
+        acknowledgements.marks.clear();
+        acknowledgements.marks.extend_from_slice(&newest.marks);
         Ok(true)
     }
 }

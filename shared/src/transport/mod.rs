@@ -1,6 +1,6 @@
 //! Stages 4 and 7 of 8: segments from workers to the learner, policy snapshots back.
 //!
-//! Two implementations of the same four traits: `in_process` (one-process runs and tests) and
+//! Two implementations of the same six traits: `in_process` (one-process runs and tests) and
 //! `shared_memory` (iceoryx2, between processes). No call here waits: a full queue is reported,
 //! and who waits, how long and on whom to blame it is the caller's business. What is kept until it
 //! has arrived for good, and what has arrived before, is `delivery`'s.
@@ -9,6 +9,7 @@ pub mod delivery;
 pub mod in_process;
 pub mod shared_memory;
 
+use delivery::{Acknowledgements, Mark};
 use thiserror::Error;
 
 use crate::parameters::{ParameterSnapshot, SnapshotError};
@@ -130,4 +131,53 @@ pub trait ParameterSubscriber {
     /// `Snapshot` if it is damaged or foreign (then `snapshot` is unchanged), `Middleware` if the
     /// channel is broken.
     fn newest(&mut self, snapshot: &mut ParameterSnapshot) -> Result<bool, TransportError>;
+
+    /// Number of the learner that this channel is connected to, counted over a session.
+    fn epoch(&self) -> u64;
+}
+
+/// The learner's end of the acknowledgement channel. Acknowledgements are cumulative: the newest
+/// replace the ones before.
+pub trait AcknowledgementPublisher {
+    /// Tells every worker how far its segments have arrived; to be called a hundred times a second.
+    ///
+    /// # Errors
+    /// `Length` if there is not one mark a worker, `Middleware` if publishing failed.
+    fn acknowledge(&mut self, marks: &[Mark]) -> Result<(), TransportError>;
+
+    /// Lets workers in that have joined since; to be called a few times a second.
+    ///
+    /// # Errors
+    /// `Middleware` if the channel is broken.
+    fn maintain(&mut self) -> Result<(), TransportError>;
+}
+
+/// A worker's end of the acknowledgement channel.
+pub trait AcknowledgementSubscriber {
+    /// Copies the newest acknowledgements into `acknowledgements` if they have not been taken yet.
+    ///
+    /// # Errors
+    /// `Length` if there is not one mark a worker, `Middleware` if the channel is broken.
+    fn newest(&mut self, acknowledgements: &mut Acknowledgements) -> Result<bool, TransportError>;
+}
+
+/// The types of a worker's ends in one implementation of the transport.
+pub trait WorkerTransport {
+    /// Offers segments to the learner.
+    type Segments: SegmentSender;
+    /// Takes the learner's newest snapshot.
+    type Parameters: ParameterSubscriber;
+    /// Takes what the learner says has arrived for good.
+    type Acknowledgements: AcknowledgementSubscriber;
+}
+
+/// A worker's three ends of the transport.
+#[derive(Debug)]
+pub struct WorkerEnd<T: WorkerTransport> {
+    /// Offers segments to the learner.
+    pub segments: T::Segments,
+    /// Takes the learner's newest snapshot.
+    pub parameters: T::Parameters,
+    /// Takes what the learner says has arrived for good.
+    pub acknowledgements: T::Acknowledgements,
 }

@@ -17,6 +17,7 @@ use dmprl_shared::config::ExperimentConfig;
 use dmprl_shared::policy::Policy;
 use dmprl_shared::segment::SegmentHeader;
 use dmprl_shared::spec::EnvSpec;
+use dmprl_shared::transport::AcknowledgementPublisher;
 use dmprl_shared::transport::delivery::{Mark, Sent};
 use dmprl_shared::transport::shared_memory::{
     Acknowledger, Domain, LearnerEnd, Plan, Publisher, Receiver, serve,

@@ -9,14 +9,15 @@ use std::thread;
 use std::time::Duration;
 
 use clap::Args;
+use dmprl_actors::delivery::attach;
 use dmprl_shared::segment::{Segment, SegmentLayout};
-use dmprl_shared::transport::SendOutcome;
 use dmprl_shared::transport::delivery::{Acknowledgements, Outbox};
 use dmprl_shared::transport::shared_memory::{Plan, WorkerEnd};
+use dmprl_shared::transport::{AcknowledgementSubscriber, SendOutcome};
 
 use crate::bench::made_up::{MadeUp, RUN_ID};
 use crate::control::Report;
-use crate::roles::{ControlPipe, ORPHAN_LIMIT, attach_within};
+use crate::roles::{ControlPipe, ORPHAN_LIMIT};
 
 /// A round through all queues that fills less than this part of them is followed by a pause: to ask
 /// a full queue takes as long as to send a segment.
@@ -116,7 +117,7 @@ pub fn segment_feeder(args: &SegmentFeederArgs) -> anyhow::Result<()> {
     let mut workers = Vec::new();
     for index in args.first..args.first + args.count {
         let domain = args.shared_memory.as_path();
-        let Some(end) = attach_within(&control, (domain, &plan), index)? else { return Ok(()) };
+        let Some(end) = attach(&control, domain, &plan, index)? else { return Ok(()) };
         workers.push(Worker {
             end,
             outbox: Outbox::new(plan.layout, args.outbox_segments, index, 0),

@@ -11,13 +11,14 @@ use std::time::Duration;
 
 use anyhow::Context;
 use clap::Args;
+use dmprl_actors::delivery::{Delivery, DeliveryError, attach};
 use dmprl_shared::segment::Segment;
 use dmprl_shared::transport::delivery::{Outbox, Sent};
 
 use super::streams::frame_bytes;
 use crate::bench::made_up::{MadeUp, QUEUE_SEGMENTS, Size};
 use crate::control::Report;
-use crate::roles::{ControlPipe, Delivery, ORPHAN_LIMIT, Stopped, attach_within};
+use crate::roles::{ControlPipe, ORPHAN_LIMIT};
 
 /// A worker from whom nobody takes waits for its turn: no reason for a warning.
 const NO_WARNING: Duration = Duration::from_secs(1_000_000);
@@ -95,19 +96,18 @@ fn through_shared_memory(
     control: &ControlPipe,
 ) -> anyhow::Result<()> {
     let plan = size.plan(args.workers);
-    let Some(end) = attach_within(control, (domain, &plan), args.index)? else { return Ok(()) };
+    let Some(end) = attach(control, domain, &plan, args.index)? else { return Ok(()) };
     let outbox = Outbox::new(size.layout, QUEUE_SEGMENTS, args.index, 0);
     let mut delivery = Delivery::new(control, NO_WARNING, end, outbox);
     let mut made_up = MadeUp::new(size.layout, args.index);
     while !control.stop_requested() {
         let Segment { header, block } = made_up.next();
         match delivery.deliver(header, block) {
-            Ok(()) => {}
-            Err(Stopped::Asked) => break,
-            Err(Stopped::Failed(error)) => return Err(error),
+            Err(DeliveryError::StopRequested) => break,
+            delivered => delivered?,
         }
     }
-    delivery.report()
+    Ok(delivery.report()?)
 }
 
 fn through_stream(

@@ -16,8 +16,8 @@ use super::domain::Domain;
 use super::generation::Membership;
 use super::latest::{ReaderPort, SAMPLES_MAX, Writer, subscribe};
 use super::service::{PrivateIpc, refused};
-use crate::transport::TransportError;
 use crate::transport::delivery::{Acknowledgements, Mark};
+use crate::transport::{AcknowledgementPublisher, AcknowledgementSubscriber, TransportError};
 
 /// Numbers of a worker: incarnation and sequence.
 const NUMBERS_PER_WORKER: usize = 2;
@@ -67,12 +67,10 @@ impl Acknowledger {
         let writer = Writer::serve(node, channel(plan), (len, plan.worker_count), learner)?;
         Ok(Self { writer, epoch, numbers: vec![0; len] })
     }
+}
 
-    /// Tells every worker how far its segments have arrived; to be called a hundred times a second.
-    ///
-    /// # Errors
-    /// `Length` if there is not one mark a worker, `Middleware` if publishing failed.
-    pub fn acknowledge(&mut self, marks: &[Mark]) -> Result<(), TransportError> {
+impl AcknowledgementPublisher for Acknowledger {
+    fn acknowledge(&mut self, marks: &[Mark]) -> Result<(), TransportError> {
         let (expected, got) = (self.numbers.len(), sample_len(marks.len()));
         if got != expected {
             return Err(TransportError::Length { expected, got });
@@ -83,11 +81,7 @@ impl Acknowledger {
         self.writer.send(WireHeader { epoch: self.epoch }, &self.numbers)
     }
 
-    /// Lets workers in that have joined since; to be called a few times a second.
-    ///
-    /// # Errors
-    /// `Middleware` if the channel is broken.
-    pub fn maintain(&mut self) -> Result<(), TransportError> {
+    fn maintain(&mut self) -> Result<(), TransportError> {
         self.writer.maintain()
     }
 }
@@ -107,15 +101,10 @@ impl AcknowledgementReader {
             Membership::new(domain, |node, disconnected| subscribe(&channel, node, disconnected))?;
         Ok(Self { channel, membership, len: sample_len(plan.worker_count) })
     }
+}
 
-    /// Copies the newest into `acknowledgements` if it has not been taken yet.
-    ///
-    /// # Errors
-    /// `Length` if it is not one mark a worker, `Middleware` if the channel is broken.
-    pub fn newest(
-        &mut self,
-        acknowledgements: &mut Acknowledgements,
-    ) -> Result<bool, TransportError> {
+impl AcknowledgementSubscriber for AcknowledgementReader {
+    fn newest(&mut self, acknowledgements: &mut Acknowledgements) -> Result<bool, TransportError> {
         let Self { channel, membership, len } = self;
         membership.renew(|node, disconnected| subscribe(channel, node, disconnected))?;
         let Some(port) = membership.port() else { return Ok(false) };

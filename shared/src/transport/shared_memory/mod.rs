@@ -33,7 +33,9 @@ use iceoryx2::service::header::publish_subscribe::Header;
 pub use parameters::{Publisher, Subscriber};
 pub use segments::{Receiver, Sender};
 
-use super::TransportError;
+use super::{TransportError, WorkerTransport};
+use crate::config::ExperimentConfig;
+use crate::policy::Policy;
 use crate::segment::SegmentLayout;
 
 /// Version of what the processes of a run say to each other; others are refused.
@@ -64,6 +66,19 @@ pub struct Plan {
 }
 
 impl Plan {
+    /// The plan of a run whose policy is known.
+    #[must_use]
+    pub fn new(config: &ExperimentConfig, run_id: u64, policy: &Policy) -> Self {
+        Self {
+            run_id,
+            architecture_hash: policy.architecture_hash(),
+            layout: policy.layout(),
+            worker_count: config.places(),
+            queue_segments: config.actors.queue_segments,
+            parameters_len: policy.parameters_len(),
+        }
+    }
+
     fn identity(&self) -> Vec<(&'static str, String)> {
         vec![
             ("protocol", PROTOCOL.to_string()),
@@ -118,16 +133,18 @@ pub struct LearnerEnd {
     pub acknowledgements: Acknowledger,
 }
 
-/// What a worker holds.
+/// Names this transport's types.
 #[derive(Debug)]
-pub struct WorkerEnd {
-    /// Offers segments to the learner.
-    pub segments: Sender,
-    /// Takes the learner's newest snapshot.
-    pub parameters: Subscriber,
-    /// Takes what the learner says has arrived for good.
-    pub acknowledgements: AcknowledgementReader,
+pub struct SharedMemory;
+
+impl WorkerTransport for SharedMemory {
+    type Segments = Sender;
+    type Parameters = Subscriber;
+    type Acknowledgements = AcknowledgementReader;
 }
+
+/// What a worker holds.
+pub type WorkerEnd = super::WorkerEnd<SharedMemory>;
 
 /// Makes this process the run's learner and creates all services. Workers of a learner before it
 /// follow by themselves.

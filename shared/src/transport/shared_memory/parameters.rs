@@ -131,14 +131,6 @@ impl Subscriber {
     }
 }
 
-impl Subscriber {
-    /// Counts the learners of a domain: whose snapshot was taken last.
-    #[must_use]
-    pub fn epoch(&self) -> u64 {
-        self.membership.number()
-    }
-}
-
 /// Refuses a snapshot that is foreign or damaged.
 fn check(header: &WireHeader, values: &[f32], architecture_hash: u64) -> Result<(), SnapshotError> {
     let version = header.version;
@@ -181,6 +173,10 @@ impl ParameterSubscriber for Subscriber {
             replaced = true;
         }
         Ok(replaced)
+    }
+
+    fn epoch(&self) -> u64 {
+        self.membership.number()
     }
 }
 

@@ -13,7 +13,7 @@ use dmprl_shared::parameters::ParameterSnapshot;
 use dmprl_shared::segment::{Segment, check};
 use dmprl_shared::transport::delivery::Inbox;
 use dmprl_shared::transport::shared_memory::{LearnerEnd, serve};
-use dmprl_shared::transport::{ParameterPublisher, SegmentReceiver};
+use dmprl_shared::transport::{AcknowledgementPublisher, ParameterPublisher, SegmentReceiver};
 use serde_json::{Value, json};
 
 use super::{IDLE, INTERVAL, KEPT, PARAMETERS, PATIENCE, TOKEN, domain, plan};

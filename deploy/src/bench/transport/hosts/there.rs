@@ -9,6 +9,7 @@ use std::time::Instant;
 use anyhow::{Context, anyhow, bail};
 use dmprl_shared::config::ExperimentConfig;
 use dmprl_shared::segment::Segment;
+use dmprl_shared::transport::AcknowledgementSubscriber;
 use dmprl_shared::transport::delivery::{Acknowledgements, Outbox};
 use dmprl_shared::transport::shared_memory::{Plan, attach};
 use serde_json::{Value, json};

@@ -1,53 +1,79 @@
-//! What the learner leaves behind as it goes: metrics, policies, checkpoints, progress.
+//! What a learner records as it goes: metrics, policies to be evaluated, checkpoints, progress.
+//!
+//! Called by [`crate::serve`] and by the one-process run for everything that falls due. Where the
+//! records lie is the caller's business ([`RunFiles`]).
 
-use std::fs::File;
-use std::io::Write;
+use std::error::Error;
+use std::io;
+use std::path::PathBuf;
 use std::time::{Duration, Instant};
 
-use anyhow::Context;
-use dmprl_learner::checkpoint::{CheckpointError, Ended, Writer};
-use dmprl_learner::learner::Learner;
-use dmprl_learner::metrics::MetricsLine;
-use dmprl_learner::session::Due;
 use dmprl_shared::policy_file;
+use dmprl_shared::supervision::{EvaluationRequest, Progress, Report, Supervisor};
 use dmprl_shared::transport::delivery::Mark;
 
-use super::ControlPipe;
-use crate::control::{EvaluationRequest, Progress, Report};
-use crate::journal::{Entry, Journal};
-use crate::run_directory::{RunDirectory, replace_file};
+use crate::checkpoint::{CheckpointError, Ended, Writer};
+use crate::learner::{Counters, Learner};
+use crate::metrics::MetricsLine;
+use crate::session::{Due, DueError};
 
-/// Between two progress reports.
+/// Interval between two progress reports.
 const PROGRESS_INTERVAL: Duration = Duration::from_millis(500);
 
 /// Has a saved policy evaluated.
-pub type Evaluate<'a> = &'a mut dyn FnMut(EvaluationRequest) -> anyhow::Result<()>;
+pub type Evaluate<'a> = &'a mut dyn FnMut(EvaluationRequest) -> Result<(), DueError>;
 
-/// Answers what falls due in a session.
+/// Where a learner's records lie: the run directory in the program, memory in a test.
+pub trait RunFiles {
+    /// Appends a whole line to `metrics.jsonl`, or nothing.
+    ///
+    /// # Errors
+    /// What the file system refuses.
+    fn append_metrics(&mut self, line: &[u8]) -> io::Result<()>;
+
+    /// Saves a policy file under its version.
+    ///
+    /// # Errors
+    /// What the file system refuses.
+    fn save_policy(&mut self, version: u64, bytes: &[u8]) -> Result<(), DueError>;
+
+    /// The folder of the checkpoints.
+    fn checkpoints(&self) -> PathBuf;
+
+    /// Called when a checkpoint of this moment begins.
+    fn checkpoint_begins(&mut self, counters: &Counters);
+}
+
+/// Where the run's earlier sessions ended.
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+pub struct Past {
+    /// Seconds of training.
+    pub wall_s: f64,
+    /// Environment steps at the newest metrics line and at the newest evaluation: a run that ends
+    /// at one of them gets no second one.
+    pub measured: Option<u64>,
+    /// As above, of the newest evaluation.
+    pub evaluated: Option<u64>,
+}
+
+/// Does what falls due in a session.
 pub struct Recorder<'a> {
-    run: &'a RunDirectory,
-    control: &'a ControlPipe,
-    metrics: File,
+    files: &'a mut dyn RunFiles,
+    supervisor: &'a dyn Supervisor,
+    past: Past,
     started: Instant,
-    wall_s_before: f64,
-    /// Environment steps of the newest metrics line and of the newest evaluation asked for: a run
-    /// that ends where one of them is gets no second one.
-    measured: Option<u64>,
-    evaluated: Option<u64>,
     line: Rate,
     progress: Rate,
     return_mean: Option<f64>,
     /// Median and largest, in the newest metrics line that had some.
     policy_lag: (u64, u64),
     checkpoints: Writer,
-    /// Disk trouble is told once until it is over: a full disk must not fill the terminal too.
+    /// Disk trouble is reported once until it is over: a full disk must not fill the terminal too.
     checkpoint_failing: bool,
     log_failing: bool,
-    /// Where somebody wants to know of every checkpoint.
-    journal: Option<Journal>,
 }
 
-/// Counts since a moment.
+/// Counts at a moment.
 #[derive(Clone, Copy)]
 struct Rate {
     at: Instant,
@@ -70,61 +96,55 @@ impl Rate {
 }
 
 impl<'a> Recorder<'a> {
+    /// A recorder of a session that begins now.
     pub fn new(
-        run: &'a RunDirectory,
-        control: &'a ControlPipe,
+        files: &'a mut dyn RunFiles,
+        past: Past,
+        supervisor: &'a dyn Supervisor,
         learner: &Learner,
-    ) -> anyhow::Result<Self> {
-        let path = run.metrics_path();
-        let metrics = File::options().append(true).create(true).open(&path);
-        Ok(Self {
-            run,
-            control,
-            metrics: metrics.with_context(|| format!("cannot open {}", path.display()))?,
+    ) -> Self {
+        Self {
+            checkpoints: Writer::new(files.checkpoints()),
+            files,
+            supervisor,
+            past,
             started: Instant::now(),
-            wall_s_before: run.wall_s_before()?,
-            measured: run.measured_steps()?,
-            evaluated: run.latest_row()?.map(|row| row.env_steps),
             line: Rate::now(learner),
             progress: Rate::now(learner),
             return_mean: None,
             policy_lag: (0, 0),
-            checkpoints: Writer::new(run.checkpoints_path()),
             checkpoint_failing: false,
             log_failing: false,
-            journal: None,
-        })
-    }
-
-    /// Notes checkpoints in a journal from now on, if there is one.
-    pub fn note_in(&mut self, journal: Option<Journal>) {
-        self.journal = journal;
+        }
     }
 
     /// Seconds of training, over all sessions.
     fn wall_s(&self) -> f64 {
-        self.wall_s_before + self.started.elapsed().as_secs_f64()
+        self.past.wall_s + self.started.elapsed().as_secs_f64()
     }
 
-    /// Does what is due. An evaluation is asked for by `evaluate`.
+    /// Does what is due. `evaluate` is called for an evaluation.
+    ///
+    /// # Errors
+    /// Whatever `evaluate` returns. A full disk is no error: it is reported, and training goes on.
     pub fn due(
         &mut self,
         due: Due,
         learner: &mut Learner,
         evaluate: Evaluate<'_>,
-    ) -> anyhow::Result<()> {
+    ) -> Result<(), DueError> {
         match due {
             Due::Metrics => self.write_metrics(learner),
             Due::Evaluation => {
                 // A policy that cannot be saved is not evaluated; the training goes on.
                 match self.save_policy(learner) {
                     Ok(request) => {
-                        self.evaluated = Some(learner.counters.env_steps);
+                        self.past.evaluated = Some(learner.counters.env_steps);
                         evaluate(request)
                     }
                     Err(error) => {
-                        let steps = learner.counters.env_steps;
-                        self.warn(format!("no evaluation at {steps} steps: {error:#}"));
+                        let (steps, why) = (learner.counters.env_steps, with_causes(&*error));
+                        self.warn(format!("no evaluation at {steps} steps: {why}"));
                         Ok(())
                     }
                 }
@@ -150,8 +170,8 @@ impl<'a> Recorder<'a> {
         }
     }
 
-    /// What may be acknowledged, unless the segment log cannot be written: workers then wait, as
-    /// soon as they can keep no more.
+    /// The marks up to which segments may be acknowledged; none while the segment log cannot be
+    /// written. Workers then wait as soon as their outboxes are full.
     pub fn acknowledge<'l>(&mut self, learner: &'l mut Learner) -> Option<&'l [Mark]> {
         match learner.inbox.acknowledge() {
             Ok(marks) => {
@@ -168,28 +188,31 @@ impl<'a> Recorder<'a> {
     }
 
     /// Whether the learner has come further than the newest metrics line.
+    #[must_use]
     pub fn is_unmeasured(&self, learner: &Learner) -> bool {
-        self.measured != Some(learner.counters.env_steps)
+        self.past.measured != Some(learner.counters.env_steps)
     }
 
     /// Whether an evaluation that fell due before the learner's checkpoint has no row: the run was
     /// stopped before its evaluator answered.
+    #[must_use]
     pub fn is_owed_an_evaluation(&self, learner: &Learner) -> bool {
         let interval = learner.config().evaluation.interval_steps;
-        learner.counters.env_steps / interval > self.evaluated.unwrap_or(0) / interval
+        learner.counters.env_steps / interval > self.past.evaluated.unwrap_or(0) / interval
     }
 
     /// Whether the learner has come further than the newest evaluation.
+    #[must_use]
     pub fn is_unevaluated(&self, learner: &Learner) -> bool {
-        self.evaluated != Some(learner.counters.env_steps)
+        self.past.evaluated != Some(learner.counters.env_steps)
     }
 
-    fn write_metrics(&mut self, learner: &mut Learner) -> anyhow::Result<()> {
-        self.measured = Some(learner.counters.env_steps);
+    fn write_metrics(&mut self, learner: &mut Learner) -> Result<(), DueError> {
+        self.past.measured = Some(learner.counters.env_steps);
         let now = Rate::now(learner);
         let (env_steps_per_s, updates_per_s) = self.line.until(now);
         self.line = now;
-        let workers = self.control.workers();
+        let workers = self.supervisor.totals().workers;
         let line = MetricsLine {
             wall_s: self.wall_s(),
             env_steps_per_s,
@@ -200,22 +223,19 @@ impl<'a> Recorder<'a> {
         };
         self.return_mean = line.training_return_mean.or(self.return_mean);
         self.policy_lag = line.policy_lag_p50.zip(line.policy_lag_max).unwrap_or(self.policy_lag);
-        let mut text = serde_json::to_vec(&line).context("cannot write metrics as JSON")?;
+        let mut text = serde_json::to_vec(&line)?;
         text.push(b'\n');
-        // A disk that is full must not end a run: the line is lost, the training is not.
-        let before = self.metrics.metadata().map(|metadata| metadata.len());
-        if let Err(error) = self.metrics.write_all(&text) {
-            // Half a line would spoil the next one.
-            let _ = before.and_then(|len| self.metrics.set_len(len));
+        // A full disk must not end a run: the line is lost, the training is not.
+        if let Err(error) = self.files.append_metrics(&text) {
             self.warn(format!("a line of metrics.jsonl is lost: {error}"));
         }
         Ok(())
     }
 
-    fn save_policy(&self, learner: &Learner) -> anyhow::Result<EvaluationRequest> {
+    fn save_policy(&mut self, learner: &Learner) -> Result<EvaluationRequest, DueError> {
         let counters = learner.counters;
-        let path = self.run.policy_path(counters.policy_version);
-        replace_file(&path, &policy_file::encode(learner.policy(), learner.snapshot(), None)?)?;
+        let bytes = policy_file::encode(learner.policy(), learner.snapshot(), None)?;
+        self.files.save_policy(counters.policy_version, &bytes)?;
         Ok(EvaluationRequest {
             env_steps: counters.env_steps,
             updates: counters.updates,
@@ -226,30 +246,28 @@ impl<'a> Recorder<'a> {
     }
 
     /// Begins a checkpoint of this moment, which is written while training goes on; only a
-    /// deterministic run waits for it. One that falls due while the one before is being written
-    /// waits for that first: the disk is then slower than the run's interval.
+    /// deterministic run waits for it. Waits first for the one before if that is still being
+    /// written: the disk is then slower than the run's interval.
     fn begin_checkpoint(&mut self, learner: &mut Learner) {
         self.end_checkpoint(learner);
-        if let Some(journal) = &self.journal {
-            journal.note(Entry::Cut((&learner.counters).into()));
-        }
+        self.files.checkpoint_begins(&learner.counters);
         if let Err(error) = self.checkpoints.begin(learner) {
-            self.tell_of_checkpoint(learner.counters.env_steps, Err(error));
+            self.report_checkpoint(learner.counters.env_steps, Err(error));
         } else if learner.config().run.deterministic {
             self.end_checkpoint(learner);
         }
     }
 
-    /// Looks whether the checkpoint that is being written is there.
+    /// Reports the checkpoint that was being written if it is complete, or failed.
     pub fn poll_checkpoint(&mut self, learner: &mut Learner) {
         if let Some(Ended { env_steps, written }) = self.checkpoints.poll(learner) {
-            self.tell_of_checkpoint(env_steps, written);
+            self.report_checkpoint(env_steps, written);
         }
     }
 
     fn end_checkpoint(&mut self, learner: &mut Learner) {
         if let Some(Ended { env_steps, written }) = self.checkpoints.wait(learner) {
-            self.tell_of_checkpoint(env_steps, written);
+            self.report_checkpoint(env_steps, written);
         }
     }
 
@@ -259,13 +277,13 @@ impl<'a> Recorder<'a> {
         self.end_checkpoint(learner);
     }
 
-    /// A failure is shown; the previous checkpoint and the training stay.
-    fn tell_of_checkpoint(&mut self, env_steps: u64, written: Result<String, CheckpointError>) {
+    /// After a failure the previous checkpoint stays, and training goes on.
+    fn report_checkpoint(&mut self, env_steps: u64, written: Result<String, CheckpointError>) {
         match written {
             Ok(name) => {
                 self.checkpoint_failing = false;
-                // A supervisor that is gone is noticed by the loop.
-                let _ = self.control.send(&Report::Checkpoint { name, env_steps });
+                // The loop notices a supervisor that is gone.
+                let _ = self.supervisor.report(&Report::Checkpoint { name, env_steps });
             }
             Err(error) if !self.checkpoint_failing => {
                 self.checkpoint_failing = true;
@@ -277,23 +295,23 @@ impl<'a> Recorder<'a> {
 
     fn warn(&self, message: String) {
         eprintln!("warning: {message}");
-        let _ = self.control.send(&Report::Warning { message });
+        self.supervisor.warn(message);
     }
 
-    /// Reports where the learner stands if it is time to.
+    /// Reports progress if it is time to.
     pub fn progress(&mut self, learner: &Learner) {
         if self.progress.at.elapsed() >= PROGRESS_INTERVAL {
             self.report_progress(learner);
         }
     }
 
-    /// Reports where the learner stands.
+    /// Reports progress.
     pub fn report_progress(&mut self, learner: &Learner) {
         let now = Rate::now(learner);
         let (env_steps_per_s, updates_per_s) = self.progress.until(now);
         self.progress = now;
         let counters = learner.counters;
-        let _ = self.control.send(&Report::Progress(Progress {
+        let _ = self.supervisor.report(&Report::Progress(Progress {
             env_steps: counters.env_steps,
             updates: counters.updates,
             segments: counters.segments,
@@ -303,10 +321,22 @@ impl<'a> Recorder<'a> {
             samples_per_insert: learner.samples_per_insert(),
             policy_lag_p50: self.policy_lag.0,
             policy_lag_max: self.policy_lag.1,
-            queued_segments: self.control.workers().queued_segments,
+            queued_segments: self.supervisor.totals().workers.queued_segments,
             restarts: counters.worker_restarts + counters.learner_restarts,
             rejected: counters.rejected.total(),
             env_failures: counters.env_failures,
         }));
     }
+}
+
+/// An error and its causes on one line.
+fn with_causes(error: &dyn Error) -> String {
+    let mut text = error.to_string();
+    let mut cause = error.source();
+    while let Some(error) = cause {
+        text.push_str(": ");
+        text.push_str(&error.to_string());
+        cause = error.source();
+    }
+    text
 }

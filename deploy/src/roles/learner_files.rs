@@ -1,0 +1,63 @@
+//! The learner's records in the run directory.
+
+use std::fs::File;
+use std::io::{self, Write};
+use std::path::PathBuf;
+
+use anyhow::Context;
+use dmprl_learner::learner::Counters;
+use dmprl_learner::recorder::{Past, RunFiles};
+use dmprl_learner::session::DueError;
+
+use crate::journal::{Entry, Journal};
+use crate::run_directory::{RunDirectory, replace_file};
+
+/// Where the run's earlier sessions ended, as its rows tell.
+pub fn past(run: &RunDirectory) -> anyhow::Result<Past> {
+    Ok(Past {
+        wall_s: run.wall_s_before()?,
+        measured: run.measured_steps()?,
+        evaluated: run.latest_row()?.map(|row| row.env_steps),
+    })
+}
+
+/// A run directory, and the journal of a learner that has one.
+pub struct LearnerFiles<'a> {
+    run: &'a RunDirectory,
+    metrics: File,
+    journal: Option<Journal>,
+}
+
+impl<'a> LearnerFiles<'a> {
+    /// Opens `metrics.jsonl`.
+    pub fn open(run: &'a RunDirectory, journal: Option<Journal>) -> anyhow::Result<Self> {
+        let path = run.metrics_path();
+        let metrics = File::options().append(true).create(true).open(&path);
+        let metrics = metrics.with_context(|| format!("cannot open {}", path.display()))?;
+        Ok(Self { run, metrics, journal })
+    }
+}
+
+impl RunFiles for LearnerFiles<'_> {
+    fn append_metrics(&mut self, line: &[u8]) -> io::Result<()> {
+        let before = self.metrics.metadata().map(|metadata| metadata.len());
+        self.metrics.write_all(line).inspect_err(|_| {
+            // Half a line would spoil the next one.
+            let _ = before.and_then(|len| self.metrics.set_len(len));
+        })
+    }
+
+    fn save_policy(&mut self, version: u64, bytes: &[u8]) -> Result<(), DueError> {
+        Ok(replace_file(&self.run.policy_path(version), bytes)?)
+    }
+
+    fn checkpoints(&self) -> PathBuf {
+        self.run.checkpoints_path()
+    }
+
+    fn checkpoint_begins(&mut self, counters: &Counters) {
+        if let Some(journal) = &self.journal {
+            journal.note(Entry::Cut(counters.into()));
+        }
+    }
+}

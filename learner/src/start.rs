@@ -1,0 +1,158 @@
+//! How a learner begins: new, with another policy's parameters, from demonstrations, or from a
+//! checkpoint and the segments logged since.
+
+use std::path::{Path, PathBuf};
+
+use dmprl_shared::config::{DeliveryLevel, ExperimentConfig};
+use dmprl_shared::policy_file::{self, Match, PolicyFileError};
+use dmprl_shared::spec::EnvSpec;
+use dmprl_shared::supervision::{Report, ReportError, Supervisor};
+use dmprl_shared::transport::delivery::{LogError, Replayed, SegmentLog};
+use thiserror::Error;
+
+use crate::checkpoint::{self, CheckpointError};
+use crate::demonstrations::{DemonstrationError, Steps, Summary};
+use crate::learner::{Learner, LearnerError};
+
+/// Why a learner could not begin.
+#[derive(Debug, Error)]
+pub enum StartError {
+    /// It cannot be made.
+    #[error(transparent)]
+    Learner(#[from] LearnerError),
+    /// No checkpoint can be used.
+    #[error(transparent)]
+    Checkpoint(#[from] CheckpointError),
+    /// The demonstrations cannot be used.
+    #[error(transparent)]
+    Demonstrations(#[from] DemonstrationError),
+    /// The policy file to start from cannot be used.
+    #[error("cannot start from {}", path.display())]
+    Policy {
+        /// The file.
+        path: PathBuf,
+        /// Why not.
+        #[source]
+        cause: PolicyFileError,
+    },
+    /// The segment log cannot be used.
+    #[error("cannot use {}", path.display())]
+    Log {
+        /// The file.
+        path: PathBuf,
+        /// Why not.
+        #[source]
+        cause: LogError,
+    },
+    /// A report could not be sent.
+    #[error(transparent)]
+    Report(#[from] ReportError),
+}
+
+/// What a learner begins from.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Origin<'a> {
+    /// Nothing, or the parameters of this policy file; and the configuration's demonstrations.
+    New(Option<&'a Path>),
+    /// The newest usable checkpoint in this folder.
+    Checkpoint(&'a Path),
+}
+
+/// A run, as far as its learner must know it.
+#[derive(Debug, Clone, Copy)]
+pub struct Run<'a> {
+    /// The experiment.
+    pub config: &'a ExperimentConfig,
+    /// What the environments are.
+    pub spec: &'a EnvSpec,
+    /// The run's number.
+    pub run_id: u64,
+}
+
+/// Makes the learner of a run. Warns of each checkpoint that it had to reject.
+///
+/// # Errors
+/// If it cannot be made from `origin`, or the supervisor is gone.
+pub fn learner(
+    run: Run<'_>,
+    origin: Origin<'_>,
+    supervisor: &dyn Supervisor,
+) -> Result<Learner, StartError> {
+    let fresh = || Learner::new(run.config.clone(), run.spec, run.run_id);
+    let policy = match origin {
+        Origin::New(policy) => policy,
+        Origin::Checkpoint(folder) => {
+            let (learner, loaded) = checkpoint::load_newest(folder, &fresh)?;
+            for error in loaded.refused {
+                let message = format!("a checkpoint is refused, an older one is used: {error}");
+                eprintln!("{message}");
+                supervisor.report(&Report::Warning { message })?;
+            }
+            return Ok(learner);
+        }
+    };
+    let mut learner = fresh()?;
+    if let Some(path) = policy {
+        let snapshot = policy_file::load(path, learner.policy(), Match::Sizes)
+            .map_err(|cause| StartError::Policy { path: path.to_owned(), cause })?;
+        learner.warm_start(&snapshot.values)?;
+    }
+    if !run.config.demonstrations.files.is_empty() {
+        let message = demonstrate(&mut learner, run)?;
+        supervisor.report(&Report::Warning { message })?;
+    }
+    Ok(learner)
+}
+
+/// Starts from the configuration's demonstrations; returns a sentence about them.
+fn demonstrate(learner: &mut Learner, run: Run<'_>) -> Result<String, StartError> {
+    let files = &run.config.demonstrations.files;
+    let read = |file| Steps::read(Path::new(file), run.spec, learner.policy());
+    let demonstrations = files.iter().map(read).collect::<Result<Vec<_>, _>>()?;
+    let loss = learner.demonstrate(&demonstrations)?;
+    let summaries = demonstrations.iter().map(Steps::summary);
+    let all = summaries.fold(Summary::default(), |sum, more| Summary {
+        episodes: sum.episodes + more.episodes,
+        steps: sum.steps + more.steps,
+        rewards: sum.rewards + more.rewards,
+    });
+    let mean = all.rewards / all.episodes as f64;
+    let shown =
+        format!("{} demonstrated steps in {} episodes, return {mean:.2}", all.steps, all.episodes);
+    Ok(match loss {
+        None => shown,
+        Some((first, last)) => format!(
+            "{shown}; the policy imitates them (mean squared error {first:.3}, then {last:.3})"
+        ),
+    })
+}
+
+/// At delivery level `log`, inserts the segments that came after the checkpoint, from the log at
+/// `path`.
+///
+/// # Errors
+/// If the log cannot be used, or the supervisor is gone.
+pub fn recover(
+    learner: &mut Learner,
+    run_id: u64,
+    path: &Path,
+    supervisor: &dyn Supervisor,
+) -> Result<(), StartError> {
+    let delivery = &learner.config().delivery;
+    if delivery.level == DeliveryLevel::Memory {
+        return Ok(());
+    }
+    let identity = (run_id, learner.policy().architecture_hash());
+    let log = SegmentLog::open(path, identity, learner.policy().layout(), delivery.log_bytes_max);
+    let replayed = log.and_then(|log| learner.recover(log));
+    let replayed = replayed.map_err(|cause| StartError::Log { path: path.to_owned(), cause })?;
+    if replayed != Replayed::default() {
+        let Replayed { records, cut_bytes } = replayed;
+        let message = format!(
+            "{records} segments read from the segment log, {cut_bytes} bytes of a torn one cut off"
+        );
+        eprintln!("{message}");
+        supervisor.report(&Report::Warning { message })?;
+    }
+    Ok(())
+}
