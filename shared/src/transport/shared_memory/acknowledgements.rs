@@ -1,7 +1,7 @@
-//! How far each worker's segments have arrived, from the learner to all workers.
+//! Acknowledgements from the learner to all workers.
 //!
-//! The counts are cumulative, so the newest replaces the one before, and a lost one costs nothing
-//! but the time to the next.
+//! They are cumulative: the newest replaces the previous one, and a lost one only delays workers
+//! until the next.
 
 use std::fs::File;
 use std::sync::Arc;
@@ -19,10 +19,10 @@ use super::service::{PrivateIpc, refused};
 use crate::transport::TransportError;
 use crate::transport::delivery::{Acknowledgements, Mark};
 
-/// Numbers of a worker: incarnation and sequence.
+/// Incarnation and sequence of a worker's mark.
 const NUMBERS_PER_WORKER: usize = 2;
 
-/// Which learner says so.
+/// Header of a sample: the learner that sent it.
 #[derive(Debug, Default, Clone, Copy)]
 #[repr(transparent)]
 pub(super) struct WireHeader {
@@ -37,7 +37,7 @@ unsafe impl ZeroCopySend for WireHeader {
     }
 }
 
-/// Length of a sample.
+/// Length of a sample in numbers.
 pub(super) fn sample_len(worker_count: usize) -> usize {
     worker_count * NUMBERS_PER_WORKER
 }
@@ -48,7 +48,7 @@ fn channel(plan: &Plan) -> Channel {
     Channel { name: "acknowledgements".to_owned(), agreement }
 }
 
-/// The learner's end.
+/// The learner's end of the channel.
 #[derive(Debug)]
 pub struct Acknowledger {
     writer: Writer<u64, WireHeader>,
@@ -68,10 +68,10 @@ impl Acknowledger {
         Ok(Self { writer, epoch, numbers: vec![0; len] })
     }
 
-    /// Tells every worker how far its segments have arrived; to be called a hundred times a second.
+    /// Publishes the marks to all workers. Call it a hundred times a second.
     ///
     /// # Errors
-    /// `Length` if there is not one mark a worker, `Middleware` if publishing failed.
+    /// `Length` if there is not one mark per worker, `Middleware` if publishing failed.
     pub fn acknowledge(&mut self, marks: &[Mark]) -> Result<(), TransportError> {
         let (expected, got) = (self.numbers.len(), sample_len(marks.len()));
         if got != expected {
@@ -83,7 +83,7 @@ impl Acknowledger {
         self.writer.send(WireHeader { epoch: self.epoch }, &self.numbers)
     }
 
-    /// Lets workers in that have joined since; to be called a few times a second.
+    /// Connects workers that have joined since. Call it a few times a second.
     ///
     /// # Errors
     /// `Middleware` if the channel is broken.
@@ -92,7 +92,7 @@ impl Acknowledger {
     }
 }
 
-/// A worker's end.
+/// A worker's end of the channel.
 #[derive(Debug)]
 pub struct AcknowledgementReader {
     channel: Channel,
@@ -108,10 +108,11 @@ impl AcknowledgementReader {
         Ok(Self { channel, membership, len: sample_len(plan.worker_count) })
     }
 
-    /// Copies the newest into `acknowledgements` if it has not been taken yet.
+    /// Copies the newest acknowledgements into `acknowledgements` if they have not been read yet.
+    /// Returns whether it did.
     ///
     /// # Errors
-    /// `Length` if it is not one mark a worker, `Middleware` if the channel is broken.
+    /// `Length` if there is not one mark per worker, `Middleware` if the channel is broken.
     pub fn newest(
         &mut self,
         acknowledgements: &mut Acknowledgements,
@@ -123,7 +124,7 @@ impl AcknowledgementReader {
         for _ in 0..SAMPLES_MAX {
             let received = port.receive().map_err(refused("receiving from", &channel.name))?;
             let Some(sample) = received else { break };
-            // The length is the peer's word: believed only if it is the agreed one.
+            // The peer states the length, so check it against the agreed one.
             let got = usize::try_from(sample.header().number_of_elements()).unwrap_or(usize::MAX);
             if got != *len {
                 return Err(TransportError::Length { expected: *len, got });
@@ -131,7 +132,7 @@ impl AcknowledgementReader {
             acknowledgements.epoch = sample.user_header().epoch;
             acknowledgements.marks.clear();
             let marks = sample.payload().chunks_exact(NUMBERS_PER_WORKER).map(|numbers| Mark {
-                // No worker has a larger one: such a mark is nobody's.
+                // No worker has an incarnation this large, so the mark matches none.
                 incarnation: u32::try_from(numbers[0]).unwrap_or(u32::MAX),
                 sequence: numbers[1],
             });
