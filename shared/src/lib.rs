@@ -1,9 +1,9 @@
-//! What actor and learner must agree on.
+//! Types and code that actor and learner share.
 //!
-//! This crate knows no Python, no async runtime and no optimiser; it reads no clock, no
-//! environment variable and no global source of randomness: all three are passed in.
-//! `config` is stage 1 of the data flow, `transport` stages 4 and 7; `dmp` and `policy` are used
-//! by both the rollout (stage 3) and the update (stage 6).
+//! This crate does not depend on Python, an async runtime or an optimiser. It reads no clock, no
+//! environment variable and no global source of randomness: all three are passed in. `config` is
+//! stage 1 of the data flow, `transport` is stages 4 and 7. Both the rollout (stage 3) and the
+//! update (stage 6) use `dmp` and `policy`.
 
 pub mod config;
 pub mod dmp;

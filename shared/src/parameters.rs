@@ -1,34 +1,35 @@
-//! A policy snapshot: what the learner publishes and the workers act with.
+//! Policy snapshots, which the learner publishes and the workers act with.
 
 use thiserror::Error;
 
-/// The actor's parameters at one version, used whole or not at all.
+/// The actor's parameters at one version.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct ParameterSnapshot {
-    /// Counts published snapshots of a run; never decreases, survives a resume.
+    /// Number of the snapshot within the run. It never decreases, and continues after a resume.
     pub version: u64,
-    /// Environment steps inserted when it was published: workers read the warm-up's end from it.
+    /// Environment steps inserted before publication; workers derive the end of the warm-up from
+    /// it.
     pub env_steps: u64,
-    /// Hash of the architecture that `values` belong to.
+    /// Hash of the architecture that `values` belongs to.
     pub architecture_hash: u64,
-    /// All parameters, flat.
+    /// All parameters as one flat vector.
     pub values: Vec<f32>,
 }
 
-/// Why a snapshot was refused.
+/// Why a snapshot was rejected.
 #[derive(Debug, Error, PartialEq, Eq)]
 pub enum SnapshotError {
-    /// Torn or damaged in transit.
+    /// A wrong checksum: the snapshot is incomplete or damaged.
     #[error("policy version {version}: checksum {got:#010x}, expected {expected:#010x}")]
     Checksum {
         /// The snapshot's version.
         version: u64,
-        /// Checksum its header states.
+        /// Checksum stated in its header.
         expected: u32,
         /// Checksum of its values.
         got: u32,
     },
-    /// From another architecture.
+    /// A snapshot of another architecture.
     #[error("policy version {version}: architecture {got:#018x}, expected {expected:#018x}")]
     Architecture {
         /// The snapshot's version.
@@ -48,7 +49,7 @@ impl ParameterSnapshot {
     }
 }
 
-/// CRC-32 over the parts of a snapshot, for values that are not in a `Vec` yet.
+/// CRC-32 over the parts of a snapshot whose values are not in a `Vec` yet.
 #[must_use]
 pub fn checksum(version: u64, env_steps: u64, architecture_hash: u64, values: &[f32]) -> u32 {
     let mut hasher = crc32fast::Hasher::new();

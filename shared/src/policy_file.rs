@@ -1,9 +1,8 @@
-//! A policy on disk: safetensors, one tensor a weight matrix or bias, and what it is.
+//! Policy files: safetensors with one tensor per weight matrix or bias, and a description.
 //!
-//! A file says everything that it takes to act: beside the network's tensors, of which observation
-//! normalisation is a part, its metadata hold the policy's description (environment, DMP, ranges,
-//! controller, start) as JSON, and `segment_map` the DMP as one matrix, so that who reads it needs
-//! no integrator.
+//! A file contains everything that is needed to act. Its tensors include observation normalisation.
+//! Its metadata contain the policy's description (environment, DMP, ranges, controller, start) as
+//! JSON, and `segment_map` is the DMP as one matrix, so that a reader needs no integrator.
 
 use std::collections::HashMap;
 use std::fs;
@@ -26,43 +25,43 @@ const STEPS_KEY: &str = "env_steps";
 const DESCRIPTION_KEY: &str = "description";
 const CHECKSUM_KEY: &str = "checksum";
 const ORIGIN_KEY: &str = "origin";
-/// From (y0, yd0, g, w) to the samples of one dimension, (3K, 3+N).
+/// Map from (y0, yd0, g, w) to the samples of one dimension, (3K, 3+N).
 const MAP: &str = "segment_map";
 
-/// Why a policy file was refused.
+/// Why a policy file was rejected.
 #[derive(Debug, Error)]
 pub enum PolicyFileError {
-    /// Reading failed.
+    /// The file cannot be read.
     #[error("{path}: {cause}")]
     Io {
         /// The file.
         path: String,
-        /// Why.
+        /// The error.
         cause: io::Error,
     },
-    /// Not a safetensors file, or cut short.
+    /// Not a safetensors file, or a truncated one.
     #[error("{path}: not a readable safetensors file, {cause}")]
     Format {
         /// The file.
         path: String,
-        /// Why.
+        /// The error.
         cause: String,
     },
-    /// A field or tensor that is missing or does not fit.
+    /// A field or tensor is missing or wrong.
     #[error("{path}: {name} is {got}, expected {expected}")]
     Mismatch {
         /// The file.
         path: String,
-        /// Which field or tensor.
+        /// Name of the field or tensor.
         name: String,
-        /// What fits.
+        /// Expected value.
         expected: String,
-        /// What the file has.
+        /// Actual value.
         got: String,
     },
 }
 
-/// Where a policy comes from, for whoever finds the file later.
+/// Origin of a policy, for readers of the file.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Origin {
     /// Id of the run that trained it.
@@ -71,13 +70,13 @@ pub struct Origin {
     pub task: String,
     /// `run.seed`.
     pub seed: u64,
-    /// Version of the program that wrote the file.
+    /// Version of dmprl that wrote the file.
     pub dmprl_version: String,
-    /// Commit of that program, where it is known.
+    /// Commit of that version, if known.
     pub git_commit: Option<String>,
-    /// Its mean evaluation return, where it was evaluated.
+    /// Mean return of its evaluation, if it was evaluated.
     pub return_mean: Option<f64>,
-    /// Its rate of success, where the task reports one.
+    /// Success rate of its evaluation, if the task reports success.
     pub success_rate: Option<f64>,
 }
 
@@ -88,11 +87,11 @@ pub struct OpenedPolicy {
     pub policy: Policy,
     /// Its parameters.
     pub snapshot: ParameterSnapshot,
-    /// Where it comes from; none in a run's own files, which lie where they come from.
+    /// Its origin; `None` in a run's own files.
     pub origin: Option<Origin>,
 }
 
-/// How strictly a file must match the policy it is loaded into.
+/// Required match between a file and the policy it is loaded into.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Match {
     /// The same architecture: configuration, DMP, task and sizes.
@@ -101,9 +100,9 @@ pub enum Match {
     Sizes,
 }
 
-/// The bytes of a policy's file.
+/// Encodes a policy file.
 ///
-/// - `origin`: where it comes from, if the file is to leave its run.
+/// - `origin`: where the policy comes from, for files that leave their run.
 ///
 /// # Errors
 /// `Format` if the parameters do not fit the policy.
@@ -142,8 +141,8 @@ pub fn encode(
     safetensors::serialize(tensors, Some(metadata)).map_err(|e| format_error(path, e))
 }
 
-/// CRC-32 over the description and the tensors' bytes, in the order of their names: neither is of
-/// use with another's.
+/// CRC-32 over the description and the tensors' bytes, in the order of their names, because each is
+/// only valid with the other.
 fn checksum(description: &str, tensors: &[(String, TensorView<'_>)]) -> String {
     let mut hasher = crc32fast::Hasher::new();
     hasher.update(description.as_bytes());
@@ -153,7 +152,7 @@ fn checksum(description: &str, tensors: &[(String, TensorView<'_>)]) -> String {
     format!("{:08x}", hasher.finalize())
 }
 
-/// Reads a snapshot into a policy that is there already.
+/// Reads a snapshot for an existing policy.
 ///
 /// # Errors
 /// If the file is unreadable, damaged or of another architecture.
@@ -166,10 +165,10 @@ pub fn load(
     Contents::new(path, &bytes)?.snapshot(policy, strictness)
 }
 
-/// Reads a policy with its parameters: nothing but the file is needed.
+/// Reads a policy with its parameters from the file alone.
 ///
 /// # Errors
-/// If the file is unreadable or damaged, or says too little: it is older than descriptions are.
+/// If the file is unreadable or damaged, or so old that it has no description.
 pub fn open(path: &Path) -> Result<OpenedPolicy, PolicyFileError> {
     let bytes = read(path)?;
     let contents = Contents::new(path, &bytes)?;
@@ -221,7 +220,7 @@ fn names(policy: &Policy) -> Vec<(String, Vec<usize>, std::ops::Range<usize>)> {
         .collect()
 }
 
-/// What a file holds, of the format that we know.
+/// Contents of a file in the supported format.
 struct Contents<'a> {
     path: &'a Path,
     fields: HashMap<String, String>,
@@ -256,7 +255,8 @@ impl<'a> Contents<'a> {
             }
             tensors.push((tensor, range));
         }
-        // Not before the shapes are known to be the file's: a description may ask for any size.
+        // Only after the shapes have been checked against the file, because a description may ask
+        // for any size.
         let mut values = vec![0.0_f32; policy.parameters_len()];
         for (tensor, range) in tensors {
             bytemuck::cast_slice_mut(&mut values[range]).copy_from_slice(tensor.data());
@@ -419,7 +419,7 @@ mod tests {
             saved(&[], &path);
             let mut bytes = fs::read(&path).unwrap();
             let at = bytes.windows(from.len()).position(|part| part == from.as_bytes()).unwrap();
-            // The header's length stays what it was.
+            // The length of the header must not change.
             bytes[at..at + from.len()].copy_from_slice(format!("{to:<0$}", from.len()).as_bytes());
             fs::write(&path, bytes).unwrap();
             open(&path).unwrap_err().to_string()
@@ -431,14 +431,14 @@ mod tests {
         assert!(error.contains("policy.hidden"), "{error}");
         let error = refused(hidden, &hidden.replace("256,256", "256,255"));
         assert!(error.contains("architecture_hash"), "{error}");
-        // Another function of the same numbers.
+        // Another function with the same parameters.
         let range = "\\\"goal_range\\\":1.0";
         let error = refused(range, &range.replace("1.0", "2.0"));
         assert!(error.contains("architecture_hash"), "{error}");
         let dims = "\\\"action_len\\\":2";
         let error = refused(dims, &dims.replace('2', "9"));
         assert!(error.contains("action_low has 2 entries, expected 9"), "{error}");
-        // A number that is one, and not the policy's.
+        // A valid number that is not the policy's.
         saved(&[], &path);
         let mut bytes = fs::read(&path).unwrap();
         let last = bytes.len() - 1;

@@ -1,18 +1,18 @@
-//! One master seed, many named independent random streams.
+//! Independent named random streams derived from one master seed.
 
 use rand::SeedableRng;
 pub use rand_xoshiro::Xoshiro256PlusPlus as Stream;
 
-/// The stream `name`/`index` of the run seeded with `master`.
+/// The stream `name`/`index` of the run with seed `master`.
 ///
-/// Streams of different names or indices are independent for all practical purposes: their
-/// seeds are a 64-bit hash (FNV-1a, then the SplitMix64 finaliser) of all three.
+/// Streams with different names or indices are independent for all practical purposes. Their seeds
+/// are a 64-bit hash (FNV-1a, then the SplitMix64 finaliser) of all three arguments.
 #[must_use]
 pub fn stream(master: u64, name: &str, index: u64) -> Stream {
     Stream::seed_from_u64(derive(master, name, index))
 }
 
-/// The seed behind [`stream`], for sources of randomness outside Rust (environment resets).
+/// The seed of [`stream`], for sources of randomness outside Rust (environment resets).
 #[must_use]
 pub fn derive(master: u64, name: &str, index: u64) -> u64 {
     let mut hash = 0xcbf2_9ce4_8422_2325_u64;

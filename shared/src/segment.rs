@@ -1,35 +1,37 @@
-//! The K-step record that travels from worker to learner: a fixed header and one block of f32.
+//! The K-step record that a worker sends to the learner: a fixed header and one block of f32.
 //!
 //! Block of a segment with K steps, observation length O and action length A:
 //! ```text
-//!   observations (K+1, O)   row k: before step k; row steps_len: after the last step really run
+//!   observations (K+1, O)   row k: before step k; row steps_len: after the last executed step
 //!   actions      (K, A)     u, in [-1, 1] unless drawn from a Gaussian; zero after steps_len
 //!   rewards      (K,)       zero after steps_len
 //! ```
-//! An observation here is what the policy sees: the environment's, followed by the DMP state
-//! (y, yd) when the policy carries it from segment to segment.
+//! An observation here is the policy's input: the environment's observation, followed by the DMP
+//! state (y, yd) if the policy carries it from segment to segment.
 
 use bytemuck::{Pod, Zeroable};
 use thiserror::Error;
 
-/// Version of this layout; peers of another version are refused.
+/// Version of this layout; peers with another version are rejected.
 pub const LAYOUT_VERSION: u32 = 1;
 
 /// The last step ended the episode by the task's own rule.
 pub const TERMINATED: u32 = 1;
-/// The last step was the last that the time limit allows.
+/// The last step reached the time limit.
 pub const TRUNCATED: u32 = 1 << 1;
 /// The environment reported success at the last step.
 pub const SUCCESS: u32 = 1 << 2;
-/// The environment says whether it succeeded; without it [`SUCCESS`] means nothing.
+/// The environment reports success; without this flag [`SUCCESS`] has no meaning.
 pub const SUCCESS_REPORTED: u32 = 1 << 3;
-/// A copy of steps that other segments hold, with another goal (hindsight): experience, but no
-/// steps of an environment and no part of its episode. Whole, or [`TERMINATED`].
+/// Hindsight copy: the steps of other segments with another goal.
+///
+/// It counts as experience, but not as environment steps or as part of an episode. It has all K
+/// steps or is [`TERMINATED`].
 pub const HINDSIGHT: u32 = 1 << 4;
 
 const KNOWN_FLAGS: u32 = TERMINATED | TRUNCATED | SUCCESS | SUCCESS_REPORTED | HINDSIGHT;
 
-/// Everything about a segment except its numbers.
+/// Metadata of a segment.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Pod, Zeroable)]
 #[repr(C)]
 pub struct SegmentHeader {
@@ -37,52 +39,52 @@ pub struct SegmentHeader {
     pub layout_version: u32,
     /// [`TERMINATED`] | [`TRUNCATED`] | [`SUCCESS`] | [`SUCCESS_REPORTED`] | [`HINDSIGHT`].
     pub flags: u32,
-    /// Which run the segment belongs to.
+    /// Run that the segment belongs to.
     pub run_id: u64,
-    /// Hash of the architecture that acted.
+    /// Hash of the acting policy's architecture.
     pub architecture_hash: u64,
-    /// Version of the policy that acted; 0 during the warm-up.
+    /// Version of the acting policy; 0 during the warm-up.
     pub policy_version: u64,
-    /// Counts this worker's segments, from 1, without gaps, over one incarnation.
+    /// Sequence number, from 1 without gaps, per worker and incarnation.
     pub sequence: u64,
-    /// Which worker.
+    /// Worker that produced the segment.
     pub worker_id: u32,
-    /// Counts the worker's starts.
+    /// Number of the worker's start.
     pub incarnation: u32,
-    /// Which of the worker's environments.
+    /// Index of the worker's environment.
     pub env_index: u32,
-    /// Counts this environment's episodes over one incarnation.
+    /// Number of the environment's episode within this incarnation.
     pub episode: u32,
     /// Environment steps of the episode before this segment.
     pub episode_step: u32,
-    /// Steps really run, 1 to K.
+    /// Executed steps, 1 to K.
     pub steps_len: u32,
-    /// K.
+    /// Segment length K \[steps\].
     pub segment_steps: u32,
-    /// O.
+    /// Observation length O.
     pub observation_len: u32,
-    /// A.
+    /// Action length A.
     pub action_len: u32,
     /// CRC-32 of the block.
     pub checksum: u32,
 }
 
-// The header is shared memory between processes: its layout may not drift unnoticed.
+// The header is shared between processes, so a change of its layout must not go unnoticed.
 const _: () = assert!(size_of::<SegmentHeader>() == 80 && align_of::<SegmentHeader>() == 8);
 
-/// The sizes that decide a block's layout.
+/// Sizes that determine a block's layout.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct SegmentLayout {
-    /// K.
+    /// Segment length K \[steps\].
     pub segment_steps: usize,
-    /// O, DMP state included when carried.
+    /// Observation length O, including the DMP state if carried.
     pub observation_len: usize,
-    /// A.
+    /// Action length A.
     pub action_len: usize,
 }
 
 impl SegmentLayout {
-    /// Length of the block.
+    /// Length of the block in f32 values.
     #[must_use]
     pub fn block_len(&self) -> usize {
         self.actions_len() + self.observations_len() + self.segment_steps
@@ -92,7 +94,7 @@ impl SegmentLayout {
         (self.segment_steps + 1) * self.observation_len
     }
 
-    /// Actions of a segment, K A.
+    /// Length of a segment's actions, K A.
     #[must_use]
     pub fn actions_len(&self) -> usize {
         self.segment_steps * self.action_len
@@ -110,7 +112,7 @@ impl SegmentLayout {
         (observations, actions, rewards)
     }
 
-    /// As [`SegmentLayout::split`], to write.
+    /// Splits a block into mutable observations, actions and rewards.
     ///
     /// # Panics
     /// If the block's length is not [`SegmentLayout::block_len`].
@@ -126,12 +128,12 @@ impl SegmentLayout {
     }
 }
 
-/// A segment in memory of its own.
+/// An owned segment.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct Segment {
-    /// Everything but the numbers.
+    /// The metadata.
     pub header: SegmentHeader,
-    /// The numbers; see the module's doc for the layout.
+    /// Observations, actions and rewards; the module documentation describes the layout.
     pub block: Vec<f32>,
 }
 
@@ -143,33 +145,34 @@ impl Segment {
     }
 }
 
-/// What an action in a segment may be, besides finite.
+/// Range of an action in a segment; actions are always finite.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum ActionBounds {
     /// In [-1, 1].
     Unit,
-    /// Any number: as drawn from an unbounded distribution, before the environment's bounds.
+    /// Unbounded: as drawn from an unbounded distribution, before the environment's bounds are
+    /// applied.
     None,
 }
 
-/// What a segment must match to be taken.
+/// Properties that a segment must have to be accepted.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Expected {
-    /// The run.
+    /// Run that the segment must belong to.
     pub run_id: u64,
-    /// The policy's architecture.
+    /// Hash of the policy's architecture.
     pub architecture_hash: u64,
-    /// The block's sizes.
+    /// Sizes of the block.
     pub layout: SegmentLayout,
-    /// Workers of the run: valid ids are below.
+    /// Number of workers; valid ids are below it.
     pub worker_count: u32,
-    /// Environments of a worker: valid indices are below.
+    /// Environments per worker; valid indices are below it.
     pub env_count: u32,
-    /// What the policy's actions may be.
+    /// Range of the policy's actions.
     pub action_bounds: ActionBounds,
 }
 
-/// Why a segment was refused. Each variant has its own counter.
+/// Why a segment was rejected. Each variant has its own counter.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord, Error)]
 pub enum Rejection {
     /// Another layout version.
@@ -181,28 +184,28 @@ pub enum Rejection {
     /// Another architecture.
     #[error("architecture hash")]
     Architecture,
-    /// Sizes K, O, A or the block's length differ.
+    /// Different sizes K, O or A, or a wrong block length.
     #[error("sizes")]
     Sizes,
     /// Worker, environment, sequence or step count out of range, or unknown flags.
     #[error("header field out of range")]
     Field,
-    /// The block's checksum differs.
+    /// The block's checksum does not match.
     #[error("checksum")]
     Checksum,
     /// A number that is NaN or infinite, or an action outside its bounds.
     #[error("value not finite or action out of bounds")]
     Value,
-    /// A sequence number that this worker has already used. Only the learner, who remembers, finds
-    /// it.
+    /// A sequence number that this worker has already used. Only the learner detects it, because it
+    /// remembers sequence numbers.
     #[error("duplicate")]
     Duplicate,
 }
 
-/// Refuses a segment that does not fit.
+/// Rejects a segment that does not match.
 ///
 /// # Errors
-/// The first reason found; header before block.
+/// The first reason found; the header is checked before the block.
 pub fn check(header: &SegmentHeader, block: &[f32], expected: &Expected) -> Result<(), Rejection> {
     let refuse = |wrong: bool, why: Rejection| if wrong { Err(why) } else { Ok(()) };
     let layout = expected.layout;
@@ -231,8 +234,8 @@ pub fn check(header: &SegmentHeader, block: &[f32], expected: &Expected) -> Resu
     refuse(!sound, Rejection::Value)
 }
 
-/// Whether all values pass. To the end in any case: without a way out the loop becomes vector
-/// instructions, which take a tenth of the time.
+/// Whether all values pass. It never returns early: without an early exit the compiler vectorises
+/// the loop, which makes it ten times as fast.
 fn all(values: &[f32], passes: impl Fn(f32) -> bool) -> bool {
     values.iter().fold(true, |sound, &value| sound & passes(value))
 }

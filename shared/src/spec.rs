@@ -1,4 +1,4 @@
-//! What an environment is, as far as learner and policy care.
+//! Properties of an environment that learner and policy need.
 
 use serde::{Deserialize, Serialize};
 use thiserror::Error;
@@ -17,12 +17,12 @@ pub struct EnvSpec {
     pub action_low: Vec<f64>,
     /// Upper bound of each action dimension.
     pub action_high: Vec<f64>,
-    /// Duration of one environment step \[s\]; 0 when the environment does not say.
+    /// Duration of one environment step \[s\]; 0 if the environment does not report it.
     pub control_dt_s: f64,
-    /// Steps after which an episode is truncated; 0 when it never is.
+    /// Steps after which an episode is truncated; 0 if it never is.
     pub episode_steps: u32,
-    /// What each entry of an observation is called, such as `achieved_goal[0]`; empty: they have
-    /// no names, as in files of older versions.
+    /// Name of each entry of an observation, such as `achieved_goal[0]`. Empty if there are no
+    /// names, as in files of older versions.
     #[serde(default)]
     pub observation_names: Vec<String>,
 }
@@ -30,12 +30,12 @@ pub struct EnvSpec {
 /// Why an environment cannot be used.
 #[derive(Debug, Error)]
 pub enum SpecError {
-    /// Lengths that do not fit each other.
+    /// Lengths that do not match.
     #[error("{id}: {name} has {got} entries, expected {expected}")]
     Length {
         /// Gymnasium id.
         id: String,
-        /// Which field.
+        /// Name of the field.
         name: &'static str,
         /// Expected length.
         expected: usize,
@@ -50,15 +50,15 @@ pub enum SpecError {
     Bounds {
         /// Gymnasium id.
         id: String,
-        /// Which action dimension.
+        /// Index of the action dimension.
         dimension: usize,
         /// Its lower bound.
         low: f64,
         /// Its upper bound.
         high: f64,
     },
-    /// The duration of a step is none. It would become part of the policy's start velocity, and as
-    /// JSON, in which workers report it, NaN and infinity are null.
+    /// An invalid duration of a step. The duration scales the policy's start velocity. Workers
+    /// report it as JSON, where NaN and infinity become null.
     #[error(
         "{id}: the duration of a step (the environment's attribute dt) is {got} s; expected a \
          finite number, 0 or more, where 0 says that it is not known"
@@ -66,7 +66,7 @@ pub enum SpecError {
     Duration {
         /// Gymnasium id.
         id: String,
-        /// What the environment says \[s\].
+        /// Reported duration \[s\].
         got: f64,
     },
 }
@@ -105,7 +105,7 @@ impl EnvSpec {
         Ok(())
     }
 
-    /// Whether both describe one environment; names that only one of them has tell nothing.
+    /// Whether both describe the same environment. Names are ignored if only one side has them.
     #[must_use]
     pub fn is_same(&self, other: &Self) -> bool {
         let named = !self.observation_names.is_empty() && !other.observation_names.is_empty();
@@ -116,7 +116,7 @@ impl EnvSpec {
         nameless(self) == nameless(other)
     }
 
-    /// What entry `index` of an observation is called.
+    /// Name of entry `index` of an observation.
     #[must_use]
     pub fn observation_name(&self, index: usize) -> String {
         let name = self.observation_names.get(index).cloned();
@@ -128,7 +128,7 @@ impl EnvSpec {
 mod tests {
     use super::*;
 
-    /// As version 0.1.0 wrote it.
+    /// As written by version 0.1.0.
     const OLDER: &str = r#"{"id": "Test-v0", "observation_len": 2, "action_len": 1,
         "action_low": [-1.0], "action_high": [1.0], "control_dt_s": 0.02, "episode_steps": 50}"#;
 

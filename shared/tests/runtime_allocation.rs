@@ -1,4 +1,4 @@
-//! Next to a robot nothing is allocated: a control step takes as long as it takes.
+//! The runtime does not allocate after its start, so that control steps take a constant time.
 
 #![allow(clippy::unwrap_used, reason = "a test's helpers fail the test")]
 
@@ -11,7 +11,7 @@ use dmprl_shared::runtime::PolicyRuntime;
 use dmprl_shared::seeds;
 use dmprl_shared::spec::EnvSpec;
 
-/// Alone in its binary: the counter sees every thread.
+/// The only test in its binary, because the counter counts every thread.
 #[test]
 fn decisions_steps_and_holds_allocate_nothing() {
     let spec = EnvSpec {
@@ -31,7 +31,7 @@ fn decisions_steps_and_holds_allocate_nothing() {
         let parameters = policy.initial_parameters(&mut seeds::stream(1, "test", 0));
         let mut runtime = PolicyRuntime::new(policy, &parameters);
         let observation = [0.1, -0.2, 0.3, -0.4];
-        // gemm makes its buffers at its first product.
+        // gemm allocates its buffers in its first product.
         runtime.segment(&observation).unwrap();
         let allocated = allocations_of(|| {
             for step in 0..100 {

@@ -1,4 +1,4 @@
-//! What sending, receiving and taking snapshots allocate after start-up.
+//! Allocations of sending, receiving and reading snapshots after start-up.
 
 #![allow(clippy::unwrap_used, reason = "a test's helpers fail the test")]
 
@@ -19,8 +19,8 @@ fn log(parent: &Parent) -> SegmentLog {
     SegmentLog::open(&parent.path().join("log"), (7, 1), LAYOUT, 1 << 30).unwrap()
 }
 
-/// Alone in its binary: the counter sees every thread. iceoryx2 0.10 allocates about 100 bytes for
-/// each sample that is filled, 0 for each that is read; we add nothing to that.
+/// The only test in its binary, because the counter counts every thread. iceoryx2 0.10 allocates
+/// about 100 bytes for each sample that is filled, and 0 for each that is read; dmprl adds none.
 #[test]
 fn the_steady_state_allocates_only_what_iceoryx2_does_for_a_sample() {
     const ROUNDS: u64 = 1000;
@@ -38,7 +38,7 @@ fn the_steady_state_allocates_only_what_iceoryx2_does_for_a_sample() {
     let mut segment = Segment::zeroed(LAYOUT);
     let block = vec![0.0; LAYOUT.block_len()];
     let [mut published, mut taken] = [0, 0].map(snapshot);
-    // Connects everyone.
+    // Connects all ports.
     learner.segments.try_receive(&mut segment).unwrap();
     learner.parameters.publish(&published).unwrap();
     learner.acknowledgements.acknowledge(inbox.acknowledge().unwrap()).unwrap();
@@ -78,7 +78,7 @@ fn the_steady_state_allocates_only_what_iceoryx2_does_for_a_sample() {
         };
         for (worker, outbox, _) in &mut workers {
             reading += allocations_of(&mut take);
-            // The one that found its queue full.
+            // The segment that found its queue full.
             sending += allocations_of(|| {
                 assert_eq!(outbox.offer(&mut worker.segments).unwrap(), SendOutcome::Delivered);
             });

@@ -1,4 +1,4 @@
-//! What every transport promises, asked of both: in one process and over shared memory.
+//! The contract of every transport, tested in one process and over shared memory.
 
 #![allow(clippy::unwrap_used, reason = "a test's helpers fail the test")]
 
@@ -19,7 +19,7 @@ use transport_support::{
 type Subscriber = Box<dyn ParameterSubscriber + Send>;
 type Listener = Box<dyn AcknowledgementSubscriber + Send>;
 
-/// One learner with its workers, whatever lies between them.
+/// One learner with its workers over either transport.
 struct Transport {
     senders: Vec<Box<dyn SegmentSender + Send>>,
     receiver: Box<dyn SegmentReceiver + Send>,
@@ -64,7 +64,7 @@ fn over_shared_memory(workers: usize, queue_segments: usize) -> Transport {
         listen: Box::new(move || Box::new(hear(&path, &plan).unwrap())),
         _domain: Some((domain, parent)),
     };
-    // The learner's first look connects the queues; until then a full one counts as detached.
+    // The learner's first poll connects the queues; until then a full queue counts as detached.
     assert!(!transport.receiver.try_receive(&mut Segment::default()).unwrap());
     transport
 }
@@ -96,7 +96,7 @@ fn nothing_is_lost_or_duplicated_with_a_slow_reader(mut transport: Transport) {
     let mut segment = Segment::zeroed(LAYOUT);
     for sequence in 1..=SEGMENTS {
         if sequence % NAP_EVERY == 0 && sequence < SEGMENTS - NAP_EVERY {
-            // The reader rests until the queue has been full once more.
+            // The reader pauses until the queue has been full again.
             while seen_full.try_recv().is_ok() {}
             seen_full.recv().unwrap();
         }

@@ -1,4 +1,4 @@
-//! The run's shared-memory directory: private, checked, and gone when its owner is.
+//! The run's shared-memory directory: its permissions, its checks and its removal.
 
 #![allow(clippy::unwrap_used, reason = "a test's helpers fail the test")]
 
@@ -37,14 +37,14 @@ fn owner(parent: &Path, token: &str) -> (Process, PathBuf) {
 }
 
 fn entries(directory: &Path) -> Vec<PathBuf> {
-    // The last domain to go takes its parent along.
+    // The last domain removes its parent.
     let Ok(entries) = directory.read_dir() else { return Vec::new() };
     let mut paths: Vec<_> = entries.map(|entry| entry.unwrap().path()).collect();
     paths.sort();
     paths
 }
 
-/// What iceoryx2 leaves at its default places when a resource escapes the domain.
+/// Files that iceoryx2 creates in its default locations if a resource is not in the domain.
 fn loose_resources() -> Vec<PathBuf> {
     let loose = |path: &PathBuf| {
         let name = path.file_name().unwrap().to_string_lossy();
@@ -71,7 +71,7 @@ fn nothing_is_left_when_the_domain_is_dropped() {
     assert_eq!(sent, SendOutcome::Delivered);
     assert_eq!(loose_resources(), loose_before);
     assert_eq!(Path::new("/tmp/iceoryx2").exists(), default_place);
-    // The directory goes first here: ends that live longer must not mind.
+    // The directory is removed first; ends that outlive it must tolerate this.
     drop(domain);
     assert!(!parent.path().exists(), "the last domain takes its parent along");
     drop((learner, worker));
@@ -137,7 +137,7 @@ fn a_link_among_the_domains_is_neither_followed_nor_removed() {
     symlink(&theirs, &dead).unwrap();
     assert_eq!(remove_abandoned(&parent.path()).unwrap(), []);
     assert!(theirs.join("domain").exists());
-    // And a link inside a domain goes without what it points at.
+    // A link inside a domain is removed without its target.
     std::fs::remove_file(&dead).unwrap();
     std::fs::rename(&theirs, &dead).unwrap();
     std::fs::write(outside.path().join("kept"), "").unwrap();
@@ -146,7 +146,7 @@ fn a_link_among_the_domains_is_neither_followed_nor_removed() {
     assert!(outside.path().join("kept").exists());
 }
 
-/// A directory between `mkdir` and its lock must not be taken for abandoned.
+/// A directory between `mkdir` and its lock must not count as abandoned.
 #[test]
 fn domains_being_made_survive_the_removal_of_abandoned_ones() {
     let parent = Parent::new();
@@ -165,7 +165,7 @@ fn domains_being_made_survive_the_removal_of_abandoned_ones() {
             })
             .into();
         while makers.iter().any(|maker| !maker.is_finished()) {
-            // What a maker is about to remove itself may be removed here.
+            // A directory that a maker is removing may be removed here too.
             for removed in remove_abandoned(&path).unwrap() {
                 assert!(removed.path.to_string_lossy().contains("condemned"), "{removed:?}");
             }

@@ -1,4 +1,4 @@
-//! Processes over shared memory, killed at any moment.
+//! Processes over shared memory that are killed at any moment.
 
 #![allow(clippy::unwrap_used, reason = "a test's helpers fail the test")]
 
@@ -34,7 +34,7 @@ fn another_process_plays_its_role() {
     }
 }
 
-/// Attaches as soon as it can, as its caller would, and sends for ever.
+/// Attaches as soon as possible, as its caller would, and sends forever.
 fn play_worker(domain: &Path, index: usize, incarnation: u32) {
     let plan = plan(WORKERS, QUEUE_SEGMENTS);
     let mut worker = eventually("the worker attaches", || attach(domain, &plan, index).ok());
@@ -52,13 +52,13 @@ fn play_worker(domain: &Path, index: usize, incarnation: u32) {
     }
 }
 
-/// Segments that it sends before.
+/// Segments sent before the fatal one.
 const BEFORE_THE_LOAN: u64 = 3;
 
-/// Sends a block whose second half lies in a map where its file has ended: the copy into the sample
-/// that it has been lent meets that in the middle, and the kernel ends the process there.
+/// Sends a block whose second half is mapped beyond the end of its file. Copying it into the loaned
+/// sample fails in the middle, and the kernel kills the process there.
 fn die_in_a_loan(domain: &Path, incarnation: u32) {
-    /// A whole number of pages, of any size.
+    /// A multiple of every page size.
     const FILE_BYTES: usize = 64 << 10;
     let none = rustix::process::Rlimit { current: Some(0), maximum: Some(0) };
     rustix::process::setrlimit(rustix::process::Resource::Core, none).unwrap();
@@ -75,7 +75,7 @@ fn die_in_a_loan(domain: &Path, incarnation: u32) {
     }
     let file = tempfile::tempfile().unwrap();
     file.set_len(FILE_BYTES as u64).unwrap();
-    // SAFETY: nobody else has the file; to read behind its end is what this process is to die of.
+    // SAFETY: no other process has the file. Reading beyond its end is meant to kill this process.
     let map = unsafe { memmap2::MmapOptions::new().len(2 * FILE_BYTES).map(&file) }.unwrap();
     let values: &[f32] = bytemuck::cast_slice(&map);
     let from = FILE_BYTES / size_of::<f32>() - LAYOUT.block_len() / 2;
@@ -84,7 +84,7 @@ fn die_in_a_loan(domain: &Path, incarnation: u32) {
     panic!("it outlived the end of the file: {outcome:?}");
 }
 
-/// Serves, publishes its incarnation as a version and takes for ever.
+/// Serves, publishes its incarnation as a version and receives forever.
 fn play_learner(domain: &Path, incarnation: u32) {
     let plan = plan(WORKERS, QUEUE_SEGMENTS);
     let mut learner = eventually("the learner serves", || serve(domain, &plan).ok());
@@ -141,7 +141,7 @@ fn a_killed_worker_loses_nothing_delivered_and_its_successor_continues() {
     learner.segments.maintain().unwrap();
 }
 
-/// More often than the queue has places: a loan that stayed taken would fill it.
+/// More deaths than the queue has slots: loans that are not returned would fill it.
 #[test]
 fn a_worker_that_dies_with_a_loaned_sample_takes_no_place_with_it() {
     const DEATHS: u32 = QUEUE_SEGMENTS as u32 + 8;
@@ -175,7 +175,7 @@ fn workers_killed_while_they_start_block_nobody() {
     let mut last = [(0, 0); WORKERS];
     for kill in 1..=KILLS {
         let mut worker = Process::start(ENTRY, "worker", domain.path(), kill);
-        // The moment is the fault that is injected, not what the test relies on.
+        // The delay chooses the moment of the injected fault; the test does not depend on it.
         std::thread::sleep(Duration::from_micros(u64::from(kill) * 500));
         worker.kill();
         learner.segments.maintain().unwrap();
@@ -189,7 +189,7 @@ fn workers_killed_while_they_start_block_nobody() {
     });
 }
 
-/// Workers that start and die all the time beside one that must not notice.
+/// Starts and kills other workers continuously; the first one must not be affected.
 #[test]
 fn a_worker_is_not_disturbed_by_the_deaths_of_others() {
     const KILLS: u32 = 60;
@@ -245,7 +245,7 @@ fn a_killed_learner_stops_no_worker_and_its_successor_takes_over() {
         });
         learner.assert_alive();
         learner.kill();
-        // Nobody takes: at most a queue's worth is accepted, and every call returns.
+        // Without a learner, at most a queue's capacity is accepted, and every call returns.
         let accepted = (0..1000)
             .filter(|_| offer(&mut worker, &mut sequence) == SendOutcome::Delivered)
             .count();
@@ -254,7 +254,7 @@ fn a_killed_learner_stops_no_worker_and_its_successor_takes_over() {
     }
 }
 
-/// iceoryx2 0.10 leaves a service that hangs for ever when its creator is killed in the middle.
+/// iceoryx2 0.10 leaves a service that hangs forever if its creator is killed in the middle.
 #[test]
 fn learners_killed_while_they_start_leave_nothing_that_hangs() {
     const KILLS: u32 = 60;
@@ -272,7 +272,7 @@ fn learners_killed_while_they_start_leave_nothing_that_hangs() {
     assert!(take(&mut learner, &mut [(1, 0); WORKERS]));
 }
 
-/// As above, while a worker holds the services: they must survive.
+/// As above, with a worker that holds the services, which must survive.
 #[test]
 fn learners_killed_while_they_take_over_leave_nothing_that_hangs() {
     const KILLS: u32 = 40;

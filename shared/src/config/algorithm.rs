@@ -3,7 +3,7 @@
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
-/// Which algorithm updates the networks.
+/// Algorithm that updates the networks.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "snake_case")]
 pub enum AlgorithmName {
@@ -17,23 +17,23 @@ pub enum AlgorithmName {
     Ndp,
 }
 
-/// Which actions the critic sees.
+/// Actions that the critic sees.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "snake_case")]
 pub enum CriticInput {
     /// Q(s_t, u_t .. u_{t+K-1}).
     Segment,
-    /// Q(s_t, u_t), as the paper; only with `windows = "segment"`.
+    /// Q(s_t, u_t), as in the paper; only with `windows = "segment"`.
     First,
 }
 
-/// Which K-step windows of the replay are samples.
+/// K-step windows of the replay that are used as samples.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "snake_case")]
 pub enum Windows {
-    /// Any window of K steps inside an episode.
+    /// Every window of K steps inside an episode.
     Sliding,
-    /// Only windows that start where a segment started.
+    /// Only windows that begin at the start of a segment.
     Segment,
 }
 
@@ -43,7 +43,7 @@ pub enum Windows {
 pub enum Target {
     /// sum_{k<n} discount^k r_{t+k} + discount^n (1 - terminated) Q'(s_{t+n}, pi'(s_{t+n})).
     NStep,
-    /// sum of the K rewards + discount (1 - terminated) Q'(s_{t+1}, pi'(s_{t+1})), as the paper.
+    /// sum of the K rewards + discount (1 - terminated) Q'(s_{t+1}, pi'(s_{t+1})), as in the paper.
     Literal,
 }
 
@@ -51,11 +51,11 @@ pub enum Target {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct AlgorithmConfig {
-    /// Which algorithm.
+    /// Algorithm that updates the networks.
     pub name: AlgorithmName,
-    /// Which actions the critic sees.
+    /// Actions that the critic sees.
     pub critic: CriticInput,
-    /// Which windows are samples.
+    /// K-step windows of the replay that are used as samples.
     pub windows: Windows,
     /// The critic's regression target.
     pub target: Target,
@@ -67,35 +67,37 @@ pub struct AlgorithmConfig {
     pub critic_learning_rate: f64,
     /// Adam step size of the actor.
     pub actor_learning_rate: f64,
-    /// Windows in one update.
+    /// Windows per update.
     pub batch_size: usize,
     /// Widths of the critic's hidden layers.
     pub critic_hidden: Vec<usize>,
-    /// Layer normalisation (Ba et al. 2016) of the critic's hidden layers, before their ReLU, in
-    /// DDPG, TD3 and SAC: it bounds Q for actions unlike any in the replay (Ball et al. 2023).
+    /// Applies layer normalisation (Ba et al. 2016) to the critic's hidden layers, before their
+    /// ReLU, in DDPG, TD3 and SAC. It bounds Q for actions unlike any in the replay (Ball et al.
+    /// 2023).
     pub critic_layer_norm: bool,
-    /// What the actor of DDPG, TD3 or SAC pays, beside Q, for the sum over a decision's actions and
-    /// their dimensions of (u_t - u_{t-1})², u being made without noise: as a share of the batch's
-    /// mean |Q|, so that it means the same whatever the rewards' scale. What comes before the first
-    /// action is the one in the replay. The larger, the smoother.
+    /// Weight of a penalty on the action rate in the actor's loss (DDPG, TD3 and SAC). The penalty
+    /// is the sum of (u_t - u_{t-1})² over a decision's noise-free actions and their dimensions.
+    /// The weight is relative to the batch's mean |Q|, so it does not depend on the scale of the
+    /// rewards. The action before the first one is read from the replay. Larger values give
+    /// smoother motion.
     pub action_rate_penalty: f64,
-    /// What only TD3 has.
+    /// Settings of TD3.
     pub td3: Td3Config,
-    /// What only SAC has.
+    /// Settings of SAC.
     pub sac: SacConfig,
-    /// What only `ndp` reads.
+    /// Settings of `ndp`.
     pub ndp: NdpConfig,
 }
 
-/// What only TD3 has.
+/// Settings of TD3.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct Td3Config {
     /// Standard deviation of the noise on the target policy's actions, in units of u.
     pub target_noise_std: f64,
-    /// That noise is clipped to plus and minus this.
+    /// Target noise is clipped to this absolute value, in units of u.
     pub target_noise_clip: f64,
-    /// Updates of the critics for one of actor and targets.
+    /// Critic updates per update of the actor and the targets.
     pub actor_interval: u64,
 }
 
@@ -105,16 +107,16 @@ impl Default for Td3Config {
     }
 }
 
-/// What only SAC has.
+/// Settings of SAC.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct SacConfig {
-    /// Weight of the entropy at the start.
+    /// Initial weight of the entropy.
     pub initial_temperature: f64,
     /// Adam step size of the temperature's logarithm.
     pub temperature_learning_rate: f64,
-    /// Entropy that the temperature steers to, for each action of a decision \[nat\]. For
-    /// `mlp` policies -1 is the default: a segment's actions go together, so it has less.
+    /// Target entropy for each action of a decision \[nat\]. The default for `mlp` policies is -1.
+    /// The magnitude is smaller for segments because their actions are correlated.
     pub target_entropy_per_action: f64,
 }
 
@@ -150,13 +152,13 @@ impl Default for AlgorithmConfig {
     }
 }
 
-/// How step sizes change over a run.
+/// How learning rates change over a run.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "snake_case")]
 pub enum LearningRateDecay {
-    /// They stay.
+    /// Constant.
     None,
-    /// They fall in a straight line to zero at `run.steps`.
+    /// Linear decay to zero at `run.steps`.
     Linear,
 }
 
@@ -164,22 +166,23 @@ pub enum LearningRateDecay {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct NdpConfig {
-    /// Half-width of the interval around 1 beyond which a ratio of probabilities earns nothing.
+    /// Clipping range of the probability ratio: beyond 1 ± `clip` it no longer improves the
+    /// objective.
     pub clip: f64,
-    /// Weight of the next segment's advantage in this one's, beside the discount.
+    /// Decay of the generalised advantage estimate per segment, in addition to the discount.
     pub gae_lambda: f64,
-    /// Segments, all workers together, from one policy, learned from at once; 0 stands for 10 of
-    /// each environment.
+    /// Segments of one policy, from all workers together, that form a rollout; 0 means 10 per
+    /// environment.
     pub rollout_segments: usize,
     /// Passes over a rollout.
     pub epochs: usize,
-    /// Parts of a pass, one step of both optimisers each; a part has at least one segment.
+    /// Minibatches per pass. Each gives one step of both optimisers and has at least one segment.
     pub minibatches: usize,
     /// Weight of the entropy in the policy's loss.
     pub entropy_coefficient: f64,
-    /// Longest gradient of each network; longer ones are shortened.
+    /// Maximum gradient norm of each network; longer gradients are scaled down.
     pub gradient_norm_max: f64,
-    /// Logarithm of the first standard deviation, in units of u, of every action dimension.
+    /// Logarithm of the initial standard deviation of every action dimension, in units of u.
     pub initial_log_std: f64,
     /// How both learning rates change over the run.
     pub learning_rate_decay: LearningRateDecay,
@@ -201,13 +204,13 @@ impl Default for NdpConfig {
     }
 }
 
-/// What exploration adds, and where.
+/// Kind of exploration noise.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "snake_case")]
 pub enum ExplorationKind {
     /// Independent Gaussian noise on every action.
     Gaussian,
-    /// One Gaussian draw per segment and dimension, held over its steps.
+    /// One Gaussian draw per segment and dimension, held over the segment's steps.
     Segment,
     /// Pink (1/f) noise over the episode.
     Pink,
@@ -215,30 +218,30 @@ pub enum ExplorationKind {
     DmpParameters,
 }
 
-/// What the warm-up draws.
+/// How actions are drawn during the warm-up.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "snake_case")]
 pub enum WarmUpKind {
-    /// Uniform actions within `warm_up_range` of the range.
+    /// Actions uniform within `warm_up_range` of the full range.
     Uniform,
-    /// Uniform DMP parameters within their ranges, so that y is defined.
+    /// DMP parameters uniform within their ranges, so that y is defined.
     DmpParameters,
 }
 
-/// How the rollout departs from the policy. A policy that draws from a distribution of its own
-/// (SAC) departs by that: `kind` and `std` are then not used.
+/// Exploration noise of the rollout. A policy with an action distribution of its own (SAC) explores
+/// by sampling from it; `kind` and `std` then have no effect.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct ExplorationConfig {
-    /// What is added.
+    /// Kind of noise.
     pub kind: ExplorationKind,
     /// Standard deviation, in units of u (actions scaled to [-1, 1]).
     pub std: f64,
-    /// Environment steps, all workers together, before the policy acts.
+    /// Environment steps of all workers together before the policy acts.
     pub warm_up_steps: u64,
-    /// What the warm-up draws.
+    /// How actions are drawn during the warm-up.
     pub warm_up_kind: WarmUpKind,
-    /// Half-width of the warm-up's draw, as a share of the full range.
+    /// Half-width of the warm-up's distribution, as a share of the full range.
     pub warm_up_range: f64,
 }
 

@@ -19,15 +19,16 @@ pub enum CanonicalIntegration {
 pub enum BasisWidths {
     /// h_i = N^1.5 / (c_i alpha_x), as in Neural Dynamic Policies.
     Ndp,
-    /// Neighbours overlap at 0.8: h_i = -ln(0.8) / (c_{i+1} - c_i)^2, the last as the one before.
+    /// Neighbours overlap at 0.8: h_i = -ln(0.8) / (c_{i+1} - c_i)^2; the last width repeats the
+    /// one before.
     Overlap,
 }
 
-/// What multiplies the forcing term.
+/// Factor on the forcing term.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "snake_case")]
 pub enum ForcingScaling {
-    /// Nothing (the paper's equation 9).
+    /// None (the paper's equation 9).
     None,
     /// g - y0, as in Neural Dynamic Policies.
     Goal,
@@ -41,16 +42,16 @@ pub enum Integrator {
     SemiImplicit,
     /// y with the old yd, then yd (Neural Dynamic Policies).
     Explicit,
-    /// The paper's equation 14 to the letter: the acceleration acts one step late, ydd_0 = 0.
+    /// The paper's equation 14 as printed: the acceleration acts one step late, ydd_0 = 0.
     Paper,
 }
 
 impl Integrator {
-    /// Stability limit of `alpha_y` at the step `dt` = tau / integration_steps, with tau = 1: the
-    /// unforced system decays if and only if `alpha_y` is below.
+    /// Stability limit of `alpha_y` at the step `dt` = tau / integration_steps, with tau = 1.
     ///
-    /// With a = omega dt = alpha_y dt / 2, the step's characteristic polynomial has all roots
-    /// inside the unit circle (Jury's criterion) while
+    /// The unforced system decays if and only if `alpha_y` is below the limit. With a = omega dt =
+    /// alpha_y dt / 2, all roots of the step's characteristic polynomial are inside the unit circle
+    /// (Jury's criterion) while
     /// - `explicit`: (z - 1 + a)^2; a < 2.
     /// - `semi_implicit`: z^2 - (2 - 2a - a^2) z + 1 - 2a; a^2 + 4a < 4, so a < 2 sqrt(2) - 2.
     /// - `paper`: z^3 - 2z^2 + (1 + 2a) z + a^2 - 2a; a^3 - 4a^2 + 6a < 2, so a < 0.456.
@@ -75,13 +76,13 @@ impl Integrator {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct DmpConfig {
-    /// Number of basis functions N: with more a segment's motion may have more shape.
+    /// Number of basis functions N; more allow more detailed motions.
     pub basis_count: usize,
-    /// Decay of the phase, alpha_x: the larger, the sooner the forcing term fades.
+    /// Decay of the phase, alpha_x. Larger values make the forcing term fade sooner.
     pub alpha_x: f64,
-    /// Stiffness of the transformation system; beta_y = alpha_y / 4 (critically damped). The
-    /// larger, the sooner the motion reaches its goal. Refused where the integrator would be
-    /// unstable.
+    /// Stiffness of the transformation system; beta_y = alpha_y / 4 (critically damped). Larger
+    /// values make the motion reach its goal sooner. Values at which the integrator is unstable are
+    /// rejected.
     pub alpha_y: f64,
     /// Integration steps m over one segment; a multiple of `policy.segment_steps`.
     pub integration_steps: usize,
@@ -91,7 +92,7 @@ pub struct DmpConfig {
     pub canonical: CanonicalIntegration,
     /// Widths of the basis functions.
     pub widths: BasisWidths,
-    /// What multiplies the forcing term.
+    /// Factor on the forcing term.
     pub forcing_scaling: ForcingScaling,
 }
 
@@ -110,13 +111,13 @@ impl Default for DmpConfig {
     }
 }
 
-/// What decides the actions.
+/// Kind of policy.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "snake_case")]
 pub enum PolicyKind {
     /// A network that outputs DMP and inverse-controller parameters for a segment.
     Dmp,
-    /// A network that outputs one action; decides every environment step.
+    /// A network that outputs one action; it decides at every environment step.
     Mlp,
 }
 
@@ -130,40 +131,40 @@ pub enum RhoKind {
     Free,
 }
 
-/// What turns the DMP's motion into actions.
+/// How actions follow from the DMP's motion.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "snake_case")]
 pub enum Controller {
-    /// The adaptive inverse controller, whose rho the network decides.
+    /// The adaptive inverse controller, with rho from the network.
     Inverse,
-    /// Successive differences of y, times `position_scale` (Neural Dynamic Policies); not bounded,
-    /// so only for algorithms that clip.
+    /// Successive differences of y, times `position_scale` (Neural Dynamic Policies). They are
+    /// unbounded, so only algorithms that clip actions allow them.
     Position,
 }
 
-/// Where a segment's DMP starts.
+/// Initial state of a segment's DMP.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "snake_case")]
 pub enum Start {
     /// y = yd = 0 at every segment.
     Zero,
-    /// y0, yd0 measured: read from the observation by `task.start_sources`.
+    /// y0 and yd0 are read from the observation by `task.start_sources`.
     Observed,
-    /// y, yd continue from the end of the previous segment, zero at reset.
+    /// y and yd continue from the end of the previous segment; they are zero after a reset.
     Carry,
 }
 
-/// Where yd0 comes from when `start = "observed"`.
+/// Source of yd0 for `start = "observed"`.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "snake_case")]
 pub enum StartVelocity {
-    /// Measured velocity, converted to DMP time.
+    /// The measured velocity, converted to DMP time.
     Measured,
-    /// Zero, as the paper.
+    /// Zero, as in the paper.
     Zero,
 }
 
-/// How one action dimension's y0 and yd0 are read from an observation.
+/// Entries of an observation that give one action dimension's y0 and yd0.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(untagged, deny_unknown_fields)]
 pub enum StartSource {
@@ -182,7 +183,7 @@ pub enum StartSource {
         index: usize,
         /// Index of the velocity.
         velocity: usize,
-        /// Factor on the position; -1 where the observation holds goal minus position.
+        /// Factor on the position; -1 where the observation is goal minus position.
         #[serde(default = "unit_scale")]
         scale: f32,
     },
@@ -192,35 +193,35 @@ fn unit_scale() -> f32 {
     1.0
 }
 
-/// The policy: from observation to the actions of a segment.
+/// The policy, which maps an observation to the actions of a segment.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct PolicyConfig {
-    /// What decides the actions.
+    /// Kind of policy.
     pub kind: PolicyKind,
-    /// Environment steps K of one decision, carried out without looking again; `mlp` decides every
-    /// step whatever stands here.
+    /// Environment steps K per decision, executed open-loop; `mlp` ignores this and decides at
+    /// every step.
     pub segment_steps: usize,
     /// Widths of the actor's hidden layers.
     pub hidden: Vec<usize>,
-    /// Whether the networks see observations of zero mean and unit scale. The statistics begin at
-    /// the end of the warm-up; published policies have them folded in.
+    /// Whether observations are normalised to zero mean and unit scale for the networks. The
+    /// statistics start at the end of the warm-up and are folded into published policies.
     pub normalise_observations: bool,
     /// Bound of the goal: g = goal_range * tanh(.).
     pub goal_range: f64,
     /// Bound of the weights: w = weight_range * omega^2 * tanh(.), omega = alpha_y / 2.
     pub weight_range: f64,
-    /// What turns the DMP's motion into actions.
+    /// How actions follow from the DMP's motion.
     pub controller: Controller,
-    /// Action per unit of y moved, for `controller = "position"`.
+    /// Action per unit of motion in y, for `controller = "position"`.
     pub position_scale: f64,
     /// Whether rho is bounded.
     pub rho: RhoKind,
     /// Half-width of rho around (1, 0, 0, 0) when bounded.
     pub rho_range: f64,
-    /// Where a segment's DMP starts.
+    /// Initial state of a segment's DMP.
     pub start: Start,
-    /// Where yd0 comes from when `start = "observed"`.
+    /// Source of yd0 for `start = "observed"`.
     pub start_velocity: StartVelocity,
 }
 

@@ -5,7 +5,7 @@ use serde::{Deserialize, Serialize};
 
 use super::{AlgorithmConfig, DmpConfig, ExplorationConfig, PolicyConfig, StartSource};
 
-/// One experiment: everything that decides what a run does.
+/// Configuration of one experiment.
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct ExperimentConfig {
@@ -13,40 +13,40 @@ pub struct ExperimentConfig {
     pub run: RunConfig,
     /// The environment.
     pub task: TaskConfig,
-    /// From observation to actions.
+    /// The policy, which maps an observation to actions.
     pub policy: PolicyConfig,
     /// The dynamic movement primitive.
     pub dmp: DmpConfig,
     /// The learning algorithm.
     pub algorithm: AlgorithmConfig,
-    /// Departure from the policy in the rollout.
+    /// Exploration noise of the rollout.
     pub exploration: ExplorationConfig,
-    /// Storage of experience.
+    /// The replay.
     pub replay: ReplayConfig,
-    /// Experience of somebody else's.
+    /// Recorded experience from other sources.
     pub demonstrations: DemonstrationsConfig,
     /// Updates per inserted segment.
     pub pacing: PacingConfig,
     /// The rollout workers.
     pub actors: ActorsConfig,
-    /// What a death may cost on the way from worker to learner.
+    /// Guarantees for segments on their way from worker to learner.
     pub delivery: DeliveryConfig,
-    /// Workers of other hosts (docs/several-hosts.md).
+    /// Workers on other hosts (docs/several-hosts.md).
     pub bridge: BridgeConfig,
-    /// What happens when a process dies or hangs.
+    /// Reaction to processes that die or hang.
     pub supervision: SupervisionConfig,
     /// The learner process.
     pub learner: LearnerConfig,
     /// Noise-free evaluation.
     pub evaluation: EvaluationConfig,
-    /// What is kept on disk to go on from.
+    /// Checkpoints for `resume`.
     pub checkpoint: CheckpointConfig,
-    /// What is written about the run.
+    /// Metrics of the run.
     pub metrics: MetricsConfig,
 }
 
 impl ExperimentConfig {
-    /// Workers that there may be at once: the run's own, those that join, those of other hosts.
+    /// Maximum number of simultaneous workers: the run's own, joined ones and those on other hosts.
     #[must_use]
     pub fn places(&self) -> usize {
         self.actors.places().saturating_add(self.bridge.places())
@@ -59,16 +59,17 @@ impl ExperimentConfig {
 pub struct RunConfig {
     /// Master seed; every random stream of the run derives from it.
     pub seed: u64,
-    /// Environment steps, all workers together.
+    /// Environment steps of all workers together.
     pub steps: u64,
     /// One worker, in one process with the learner and in lock-step with it: the same seed gives
     /// the same bytes. `actors.workers`, `actors.joined_max` and `bridge.listen` have no effect.
     pub deterministic: bool,
-    /// Stop at the first evaluation whose mean return is this or more; inf: at none.
+    /// Stop at the first evaluation with at least this mean return; inf: never.
     pub until_return: f64,
-    /// Stop at the first evaluation whose success rate, 0 to 1, is this or more; inf: at none.
+    /// Stop at the first evaluation with at least this success rate (0 to 1); inf: never.
     pub until_success: f64,
-    /// Stop after so many minutes of wall clock, counted anew by `resume`; inf: never.
+    /// Stop after this many minutes of wall-clock time, which `resume` counts from zero; inf:
+    /// never.
     pub max_minutes: f64,
 }
 
@@ -89,13 +90,14 @@ impl Default for RunConfig {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct TaskConfig {
-    /// The name typed on the command line.
+    /// Name of the task on the command line.
     pub name: String,
-    /// Gymnasium id, `Name-vN` or `module:Name-vN`, or a class, `module:Class`.
+    /// Gymnasium id (`Name-vN` or `module:Name-vN`), or a class (`module:Class`).
     pub id: String,
-    /// Directories searched for the user's own environment modules.
+    /// Directories that are searched for your own environment modules.
     pub python_path: Vec<String>,
-    /// Per action dimension, where y0 and yd0 stand in the observation; empty: not known.
+    /// Entries of the observation that give y0 and yd0, one source per action dimension; empty:
+    /// unknown.
     pub start_sources: Vec<StartSource>,
 }
 
@@ -110,25 +112,25 @@ impl Default for TaskConfig {
     }
 }
 
-/// Which goals an episode is repeated with.
+/// Goals of an episode's copies.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "snake_case")]
 pub enum Hindsight {
-    /// None but the one it had.
+    /// No copies.
     None,
-    /// Goals reached later in it (Andrychowicz et al. 2017, section 4.5).
+    /// Goals reached later in the episode (Andrychowicz et al. 2017, section 4.5).
     Future,
 }
 
-/// Storage of experience.
+/// The replay.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct ReplayConfig {
-    /// Environment steps held, copies included; the oldest are replaced.
+    /// Capacity in environment steps, hindsight copies included; the oldest are overwritten.
     pub capacity_steps: usize,
-    /// Which goals the workers repeat their segments with, in goal-conditioned environments.
+    /// Goals of the copies that workers make of their segments, in goal-conditioned environments.
     pub hindsight: Hindsight,
-    /// Copies of each segment, each with a goal of its own.
+    /// Copies of each segment, each with a different goal.
     pub hindsight_copies: usize,
 }
 
@@ -138,15 +140,15 @@ impl Default for ReplayConfig {
     }
 }
 
-/// Experience that somebody recorded, from which a run starts.
+/// Recorded experience that a run starts from.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct DemonstrationsConfig {
-    /// Files of steps (docs/demonstrations.md).
+    /// Files of recorded steps (docs/demonstrations.md).
     pub files: Vec<String>,
-    /// Updates in which the actor imitates them, before anything else; 0: it does not.
+    /// Updates in which the actor imitates the demonstrations before training starts; 0: none.
     pub cloning_updates: u64,
-    /// Environment steps after the warm-up over which imitation beside each update fades.
+    /// Environment steps after the warm-up over which the imitation term of the updates fades out.
     pub imitation_steps: u64,
 }
 
@@ -157,21 +159,21 @@ impl Default for DemonstrationsConfig {
 }
 
 impl DemonstrationsConfig {
-    /// Whether the run starts with a policy that imitates.
+    /// Whether the run starts with a cloned policy.
     #[must_use]
     pub fn are_cloned(&self) -> bool {
         !self.files.is_empty() && self.cloning_updates > 0
     }
 }
 
-/// Updates per inserted segment, and how far either side may run ahead.
+/// Updates per inserted segment, and how far workers and learner may drift apart.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct PacingConfig {
-    /// Updates per segment inserted after the warm-up: more learn more from each step, take longer,
-    /// and may make the critic diverge.
+    /// Updates per segment inserted after the warm-up. More updates learn more from each step but
+    /// take longer, and can make the critic diverge.
     pub updates_per_segment: f64,
-    /// Segments the learner may hold un-updated before it stops taking more, so that workers wait.
+    /// Segments with pending updates at which the learner stops receiving, so that workers wait.
     pub tolerance_segments: u64,
 }
 
@@ -185,27 +187,27 @@ impl Default for PacingConfig {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct ActorsConfig {
-    /// Worker processes; 0 stands for cores - 1, at least 1.
+    /// Worker processes; 0 means cores - 1, at least 1.
     pub workers: usize,
-    /// Workers that may join a running experiment (`dmprl actor --join RUN`) at once. Each has its
-    /// queue from the start, whether it comes or not.
+    /// Maximum number of simultaneous workers that join a running experiment (`dmprl actor --join
+    /// RUN`). Their queues are reserved at the start of the run.
     pub joined_max: usize,
-    /// Environments in each worker, which run a segment in one call.
+    /// Environments per worker; one call runs a segment in all of them.
     pub envs_per_worker: usize,
-    /// Segments a worker's queue to the learner holds; full: the worker waits. 0 stands for
-    /// `envs_per_worker`: with fewer a worker would wait for the learner in every segment.
+    /// Capacity of a worker's queue to the learner; a worker waits while it is full. 0 means
+    /// `envs_per_worker`; with less, a worker would wait for the learner in every segment.
     pub queue_segments: usize,
-    /// A worker that waited so long on a full queue reports it, naming the learner \[s\].
+    /// Wait on a full queue after which a worker reports that the learner is slow \[s\].
     pub send_deadline_s: f64,
-    /// Restarts of one worker before the run gives up on it. One that delivered segments for five
-    /// minutes has them all again.
+    /// Restarts of one worker before the run fails. Delivering segments for five minutes resets the
+    /// count.
     pub restarts_max: u32,
-    /// Failures of one environment, since it last completed an episode or 1 000 sound segments,
-    /// that its worker makes up for by making it again; one more ends the worker, which is then
-    /// restarted.
+    /// Environment failures that a worker tolerates by recreating the environment. The count is per
+    /// environment and restarts after a completed episode or 1 000 valid segments. One more failure
+    /// ends the worker, which is then restarted.
     pub env_failures_max: u32,
-    /// One call into the environments (a segment in each of a worker's, or their reset) that lasts
-    /// longer hangs: its process ends, the evaluator's too, and is restarted \[s\].
+    /// Timeout of one call into the environments (a segment in each of a worker's environments, or
+    /// their reset) \[s\]. On a timeout the worker or evaluator exits and is restarted.
     pub env_call_timeout_s: f64,
 }
 
@@ -225,31 +227,31 @@ impl Default for ActorsConfig {
 }
 
 impl ActorsConfig {
-    /// Workers that there may be at once on the learner's host: its own, then those that join.
+    /// Maximum number of simultaneous workers on the learner's host: its own and joined ones.
     #[must_use]
     pub fn places(&self) -> usize {
         self.workers.saturating_add(self.joined_max)
     }
 }
 
-/// Workers of other hosts, which `dmprl bridge` brings in.
+/// Workers on other hosts, which connect with `dmprl bridge`.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct BridgeConfig {
-    /// Zenoh endpoints that other hosts connect to, such as `tcp/0.0.0.0:7447` or
-    /// `tls/[::]:7447`; empty: the run stays on this host.
+    /// Zenoh endpoints that accept other hosts, such as `tcp/0.0.0.0:7447` or `tls/[::]:7447`;
+    /// empty: the run uses one host.
     pub listen: Vec<String>,
-    /// Workers that other hosts may bring, all together. Each has its queue from the start, whether
-    /// it comes or not.
+    /// Maximum number of workers on all other hosts together. Their queues are reserved at the
+    /// start of the run.
     pub workers_max: usize,
-    /// What a host may have on its way without the learner's acknowledgement \[bytes\]; full: its
-    /// workers wait. At least the link's rate times its round trip, or it is never filled.
+    /// Maximum amount of unacknowledged data per host \[bytes\]; its workers wait while it is
+    /// reached. Set it to at least the link's rate times its round trip, or the link is never fully
+    /// used.
     pub under_way_bytes_max: u64,
-    /// File with the secret that other hosts must know, readable by its owner alone; empty:
-    /// `bridge.token` in the run's directory, which is made.
+    /// File with the secret that other hosts must present, readable only by its owner; empty:
+    /// `bridge.token` is created in the run's directory.
     pub token_file: String,
-    /// A file of Zenoh's own configuration (JSON5) for certificates and access control; empty:
-    /// neither.
+    /// File of Zenoh's own configuration (JSON5), for certificates and access control; empty: none.
     pub zenoh_file: String,
 }
 
@@ -266,40 +268,42 @@ impl Default for BridgeConfig {
 }
 
 impl BridgeConfig {
-    /// Whether other hosts may take part.
+    /// Whether other hosts may connect.
     #[must_use]
     pub fn is_open(&self) -> bool {
         !self.listen.is_empty()
     }
 
-    /// Workers of other hosts that there may be at once.
+    /// Maximum number of simultaneous workers on other hosts.
     #[must_use]
     pub fn places(&self) -> usize {
         if self.is_open() { self.workers_max } else { 0 }
     }
 }
 
-/// When a worker may forget a segment.
+/// When a worker discards a segment.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "snake_case")]
 pub enum DeliveryLevel {
-    /// When the learner has inserted it: its death loses what came after its last checkpoint.
+    /// After the learner has inserted it. A learner that dies loses the segments since its last
+    /// checkpoint.
     Memory,
-    /// When it is in the learner's segment log too: its death loses nothing.
+    /// After it is also in the learner's segment log. A learner that dies loses nothing.
     Log,
 }
 
-/// What a death may cost on the way from worker to learner.
+/// Guarantees for segments on their way from worker to learner.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct DeliveryConfig {
-    /// When a worker may forget a segment.
+    /// When a worker discards a segment.
     pub level: DeliveryLevel,
-    /// Segments a worker keeps until the learner has acknowledged them; full: the worker waits. 0
-    /// stands for `actors.queue_segments` and 1 024 more, which come in while an acknowledgement
-    /// is on its way.
+    /// Unacknowledged segments that a worker keeps; it waits when this many are kept. 0 means
+    /// `actors.queue_segments` plus 1 024, for segments sent while an acknowledgement is on its
+    /// way.
     pub unacknowledged_segments: usize,
-    /// Size of the segment log \[bytes\]; full: a checkpoint is written, which empties it.
+    /// Maximum size of the segment log \[bytes\]. A full log triggers a checkpoint, which empties
+    /// it.
     pub log_bytes_max: u64,
 }
 
@@ -310,14 +314,14 @@ impl Default for DeliveryConfig {
     }
 }
 
-/// What happens when a process dies or hangs.
+/// Reaction to processes that die or hang.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct SupervisionConfig {
-    /// Restarts of a learner that was killed or crashed before the run ends. One that wrote a
-    /// checkpoint and lived for five minutes has them all again.
+    /// Restarts of a killed or crashed learner before the run fails. Writing a checkpoint and
+    /// living for five minutes resets the count.
     pub learner_restarts_max: u32,
-    /// A worker that gives no sign of life for so long hangs: it is killed and restarted \[s\].
+    /// Heartbeat timeout of a worker \[s\]; after it the worker is killed and restarted.
     pub heartbeat_timeout_s: f64,
 }
 
@@ -327,23 +331,23 @@ impl Default for SupervisionConfig {
     }
 }
 
-/// Where the update runs.
+/// Device of the update.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "snake_case")]
 pub enum Device {
-    /// The processor.
+    /// The CPU.
     Cpu,
     /// An NVIDIA GPU, in a build with the feature `cuda`.
     Cuda,
 }
 
-/// What the products of an update multiply; sums and parameters are always f32.
+/// Precision of the products in an update; sums and parameters are always f32.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "snake_case")]
 pub enum Precision {
     /// 32 bits.
     F32,
-    /// 16 bits (bfloat16), on processors with AVX512-BF16: faster, to three digits.
+    /// 16 bits (bfloat16), on processors with AVX512-BF16: faster, with three significant digits.
     Bf16,
 }
 
@@ -351,13 +355,13 @@ pub enum Precision {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct LearnerConfig {
-    /// Where the update runs.
+    /// Device of the update.
     pub device: Device,
-    /// Threads of the update; their number changes no bit of the result.
+    /// Threads of the update; the result is bit-identical for every number.
     pub threads: usize,
-    /// What the update's products multiply.
+    /// Precision of the products in an update; sums and parameters are always f32.
     pub precision: Precision,
-    /// Updates between two published parameter snapshots, which workers then act by.
+    /// Updates between two published parameter snapshots.
     pub publish_every_updates: u64,
 }
 
@@ -372,19 +376,19 @@ impl Default for LearnerConfig {
     }
 }
 
-/// Noise-free evaluation in its own process.
+/// Noise-free evaluation in a separate process.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct EvaluationConfig {
-    /// Environment steps between evaluations; one more always follows the last step.
+    /// Environment steps between evaluations; one more follows the last step.
     pub interval_steps: u64,
-    /// Episodes of one evaluation.
+    /// Episodes per evaluation.
     pub episodes: usize,
-    /// Episodes of the evaluation at the end of the run, if that is more: results that are
-    /// published need 100, and 100 in each evaluation would take longer than training.
+    /// Episodes of the last evaluation of a run, if that is more than `episodes`. Published
+    /// results need 100; 100 in each evaluation would take longer than training.
     pub final_episodes: usize,
-    /// Episode i is reset with seed first_seed + i, in every evaluation. Searches use 5000 and
-    /// on, so that what they find is judged by episodes that they have not seen.
+    /// Seed of the first episode: every evaluation resets episode i with seed first_seed + i.
+    /// Searches use seeds from 5000, so that their results are evaluated on unseen episodes.
     pub first_seed: u64,
 }
 
@@ -408,15 +412,15 @@ impl EvaluationConfig {
     }
 }
 
-/// What is kept on disk to go on from.
+/// Checkpoints for `resume`.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct CheckpointConfig {
-    /// Environment steps between checkpoints; one more always ends a run.
+    /// Environment steps between checkpoints; one more is written at the end of a run.
     pub interval_steps: u64,
-    /// Checkpoints kept.
+    /// Number of checkpoints that are kept.
     pub keep: usize,
-    /// Disk space all checkpoints of a run may take together \[bytes\]; at least one is kept.
+    /// Maximum disk space for all checkpoints of a run \[bytes\]; at least one is kept.
     pub disk_bytes_max: u64,
 }
 
@@ -426,7 +430,7 @@ impl Default for CheckpointConfig {
     }
 }
 
-/// What is written about the run.
+/// Metrics of the run.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct MetricsConfig {

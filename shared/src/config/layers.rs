@@ -1,42 +1,42 @@
-//! Merges the layers of configuration and refuses unknown keys with the nearest known name.
+//! Merges the layers of configuration and rejects unknown keys with the nearest known name.
 
 use thiserror::Error;
 use toml::{Table, Value};
 
 use super::ExperimentConfig;
 
-/// Names in a dotted key: more than any has.
+/// Maximum number of names in a dotted key; real keys have fewer.
 const KEY_NAMES_MAX: usize = 16;
 
-/// Why a configuration was refused.
+/// Why a configuration was rejected.
 #[derive(Debug, Error, PartialEq)]
 pub enum ConfigError {
     /// A key that does not exist.
     #[error("{origin}: unknown key `{key}`{hint}")]
     UnknownKey {
-        /// Which layer it came from: a file name, `--set`, an environment variable.
+        /// The layer it came from: a file name, `--set`, an environment variable.
         origin: String,
         /// The dotted key.
         key: String,
         /// `, did you mean ...?` or empty.
         hint: String,
     },
-    /// A value of the wrong type or not among the allowed ones.
+    /// A value of the wrong type, or not one of the allowed ones.
     #[error("{origin}: {message}")]
     Value {
-        /// Which layer it came from.
+        /// The layer it came from.
         origin: String,
-        /// What is wrong, naming key, expected and got.
+        /// The error, with key, expected and actual value.
         message: String,
     },
-    /// A value out of its range, or values that exclude each other.
+    /// A value out of range, or values that exclude each other.
     #[error("`{key}` = {got}: {expected}")]
     Range {
         /// The dotted key.
         key: &'static str,
-        /// What must hold.
+        /// The condition that the value must meet.
         expected: String,
-        /// The refused value.
+        /// The rejected value.
         got: String,
     },
 }
@@ -58,18 +58,18 @@ impl Layers {
     /// Starts from the defaults of the configuration tree.
     ///
     /// # Panics
-    /// Never: the default tree serialises, which a test shows.
+    /// Never: a test shows that the default tree serialises.
     #[must_use]
     pub fn new() -> Self {
         let known = Table::try_from(ExperimentConfig::default()).expect("defaults serialise");
         Self { merged: known.clone(), known }
     }
 
-    /// Lays `table` over what is there.
+    /// Merges `table` over the existing layers.
     ///
     /// # Errors
-    /// `UnknownKey` for a key the tree does not have, `Value` for one of the wrong type; the
-    /// layers are then unchanged.
+    /// `UnknownKey` if the tree has no such key, `Value` for a wrong type. The layers are then
+    /// unchanged.
     pub fn add(&mut self, origin: &str, table: Table) -> Result<(), ConfigError> {
         check_keys(origin, &self.known, &table, "")?;
         let mut merged = self.merged.clone();
@@ -79,13 +79,15 @@ impl Layers {
         Ok(())
     }
 
-    /// Lays one dotted key over what is there, as `--set key=value` and `DMPRL_KEY` do.
+    /// Sets one dotted key over the existing layers, as `--set key=value` and `DMPRL_KEY` do.
+    ///
+    /// A value that is not a TOML literal is taken as a string.
     ///
     /// # Errors
-    /// As [`Layers::add`]. A value that is no TOML literal is taken as a string.
+    /// As [`Layers::add`].
     pub fn set(&mut self, origin: &str, key: &str, text: &str) -> Result<(), ConfigError> {
         if key.split('.').nth(KEY_NAMES_MAX).is_some() {
-            // No key of ours, and a tree so deep would overflow the stack when it is dropped.
+            // No key is this long, and dropping a tree this deep would overflow the stack.
             let (origin, hint) = (origin.to_owned(), String::new());
             let key = key.split('.').take(KEY_NAMES_MAX).collect::<Vec<_>>().join(".") + "...";
             return Err(ConfigError::UnknownKey { origin, key, hint });
@@ -93,7 +95,7 @@ impl Layers {
         let value = format!("value = {text}")
             .parse::<Table>()
             .ok()
-            // Further lines would be further keys.
+            // Further lines would set further keys.
             .filter(|table| table.len() == 1)
             .and_then(|mut table| table.remove("value"))
             .unwrap_or_else(|| Value::String(text.to_owned()));
@@ -123,12 +125,12 @@ impl Layers {
     /// The merged tree.
     ///
     /// # Errors
-    /// `Value` if a value does not fit its type, which `add` has already refused.
+    /// `Value` if a value does not fit its type; `add` has already rejected these.
     pub fn finish(self) -> Result<ExperimentConfig, ConfigError> {
         typed("configuration", self.merged)
     }
 
-    /// `0.1 -> 0.1`, `1 -> 1.0` where the key holds a float: people type `--set x=1`.
+    /// Converts `1` to `1.0` where the key is a float, because users type `--set x=1`.
     fn widen(&self, key: &str, value: Value) -> Value {
         let default = key.split('.').try_fold(None::<&Value>, |at, name| match at {
             None => self.known.get(name).map(Some),
@@ -141,7 +143,7 @@ impl Layers {
     }
 }
 
-/// The candidate nearest to `name` when it is near enough to be a slip.
+/// The candidate nearest to `name`, if it is near enough to be a typo.
 #[must_use]
 pub fn nearest<'a>(name: &str, candidates: impl IntoIterator<Item = &'a str>) -> Option<&'a str> {
     candidates
@@ -179,7 +181,7 @@ fn check_keys(origin: &str, known: &Table, given: &Table, path: &str) -> Result<
     Ok(())
 }
 
-/// Looks first among the siblings, then over the whole tree: `--set batch_size=64` means
+/// Searches the siblings first, then the whole tree: `--set batch_size=64` means
 /// `algorithm.batch_size`.
 fn unknown(origin: &str, key: String, name: &str, siblings: &Table, path: &str) -> ConfigError {
     let sibling = nearest(name, siblings.keys().map(String::as_str))
@@ -258,7 +260,7 @@ mod tests {
         }
     }
 
-    /// It once ended the program: the tree of tables overflowed the stack.
+    /// Regression: the tree of tables overflowed the stack and ended the program.
     #[test]
     fn a_key_without_end_is_unknown() {
         let error = Layers::new().set("--set", &"a.".repeat(100_000), "1").unwrap_err();
@@ -266,7 +268,7 @@ mod tests {
         assert!(error.to_string().len() < 100, "{error}");
     }
 
-    /// The second line was once dropped without a word.
+    /// Regression: the second line was silently dropped.
     #[test]
     fn a_value_of_several_lines_sets_no_other_key() {
         let mut layers = Layers::new();

@@ -1,9 +1,9 @@
 //! Stage 1 of 8: the typed experiment tree, its defaults, and how a user's values reach it.
 //!
 //! Precedence, lowest first: task defaults, preset, file, environment variables, `--set` and flags.
-//! `layers` merges them as TOML tables and refuses unknown keys with the nearest known name;
-//! `resolve` turns the merged tree into checked values. Every default of the system stands in the
-//! files of this folder and nowhere else.
+//! `layers` merges them as TOML tables and rejects unknown keys with the nearest known name.
+//! `resolve` turns the merged tree into checked values. This folder contains every default of the
+//! system.
 
 mod algorithm;
 mod dmp;

@@ -1,20 +1,20 @@
-//! Named sets of values between task defaults and the user's file.
+//! Named sets of values between the task defaults and the user's file.
 
 use toml::Table;
 
 use super::{AlgorithmName, PolicyKind};
 
-/// A preset: its name, one line about it, and its values as TOML.
+/// A preset: its name, a one-line description, and its values as TOML.
 #[derive(Debug)]
 pub struct Preset {
     /// The name for `--preset`.
     pub name: &'static str,
-    /// What it is for.
+    /// Its purpose, in one line.
     pub about: &'static str,
     text: &'static str,
 }
 
-/// All presets, in the order `--help` lists them.
+/// All presets, in the order of `--help`.
 pub const PRESETS: [Preset; 3] = [
     Preset {
         name: "default",
@@ -34,9 +34,9 @@ pub const PRESETS: [Preset; 3] = [
     },
 ];
 
-// What saves time on GPUs does not here, where an update takes as long as its products: larger
-// batches, fewer updates a step, smaller networks or batches were no faster on reacher beyond the
-// spread of three seeds (docs/decisions/0031-preset-fast.md).
+// The usual ways to save time on GPUs do not help here, because an update takes as long as its
+// matrix products. Larger batches, fewer updates per step, and smaller networks or batches were no
+// faster on reacher beyond the spread of three seeds (docs/decisions/0031-preset-fast.md).
 const FAST: &str = r#"
 [learner]
 threads = 2
@@ -44,11 +44,11 @@ threads = 2
 interval_steps = 1000
 "#;
 
-// Table 2 of the paper and section 4 of the specification, written out whole: what `default`
-// learns to do better must not move the paper. What the paper leaves open (N, widths, ranges, Adam)
-// is our reading. `tolerance_segments`, `queue_segments` and `publish_every_updates` of 1 keep the
-// worker as close behind its learner as two processes can be. The Panda tasks have a column of
-// their own in Table 2, which lies over this (`tasks.rs`).
+// Table 2 of the paper and section 4 of the specification, written out in full, so that changes of
+// `default` do not affect the paper's settings. The paper leaves N, widths, ranges and Adam open;
+// these values are our reading. `tolerance_segments`, `queue_segments` and `publish_every_updates`
+// of 1 keep the worker as close behind its learner as two processes can be. The Panda tasks have
+// their own column in Table 2, which is merged over this (`tasks.rs`).
 const PAPER: &str = r#"
 [policy]
 segment_steps = 5
@@ -111,10 +111,10 @@ queue_segments = 1
 publish_every_updates = 1
 "#;
 
-/// What differs from the defaults for a kind of policy, over those of the task.
+/// Values that differ from the defaults for a kind of policy, merged over those of the task.
 ///
-/// `mlp` decides every step, so two updates a decision would be ten times as many as `dmp` does;
-/// the baselines of the paper do one a step.
+/// `mlp` decides at every step, so two updates per decision would be ten times as many as for
+/// `dmp`. The paper's baselines do one per step.
 ///
 /// # Panics
 /// Never: a test parses it.
@@ -122,7 +122,7 @@ publish_every_updates = 1
 pub fn policy_defaults(kind: PolicyKind) -> Option<Table> {
     match kind {
         PolicyKind::Dmp => None,
-        // The target entropy is one of the baselines too: no preset states it.
+        // The target entropy also belongs to the baselines; no preset sets it.
         PolicyKind::Mlp => {
             let text = "[pacing]\nupdates_per_segment = 1.0\n\
                         [algorithm]\naction_rate_penalty = 0.0\n\
@@ -132,8 +132,9 @@ pub fn policy_defaults(kind: PolicyKind) -> Option<Table> {
     }
 }
 
-/// What an algorithm is published with, over task and preset, below everything that the user says:
-/// presets describe DDPG-DMP, and their start, integrator and forcing are not those of others.
+/// Published settings of an algorithm, merged over task and preset and below the user's own values.
+///
+/// Presets describe DDPG-DMP; other algorithms use a different start, integrator and forcing.
 ///
 /// # Panics
 /// Never: a test parses it.
@@ -145,8 +146,9 @@ pub fn algorithm_defaults(name: AlgorithmName) -> Option<Table> {
     }
 }
 
-// Of the released code of Neural Dynamic Policies: integrator, forcing, start, step sizes; networks
-// as in Table 2. Workers and pacing are nobody's: on-policy, each update waits for its segments.
+// From the released code of Neural Dynamic Policies: integrator, forcing, start, learning rates.
+// The networks are those of Table 2. Workers and pacing are not set: on-policy, each update waits
+// for its segments.
 const NDP: &str = r#"
 [policy]
 controller = "position"
@@ -194,8 +196,8 @@ mod tests {
         for section in ["policy", "dmp", "algorithm", "exploration", "replay", "pacing"] {
             let missing = |key: &String| !keys(&paper, section).contains(key);
             let missing: Vec<_> = keys(&all, section).into_iter().filter(missing).collect();
-            // A policy without a DMP is the user's choice, not the paper's.
-            // So is another algorithm, with what only that reads.
+            // A policy without a DMP is the user's choice, not the paper's. The same holds for
+            // another algorithm and its settings.
             let others = |key: &String| {
                 !["kind", "td3", "sac", "ndp", "position_scale"].contains(&key.as_str())
             };

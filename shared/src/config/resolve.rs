@@ -1,47 +1,49 @@
-//! Checks the merged tree: ranges, combinations, caps.
+//! Checks the merged tree: ranges, combinations and limits.
 
 use super::{
     AlgorithmName, ConfigError, Controller, CriticInput, DeliveryLevel, ExperimentConfig,
     PolicyKind, Start, WarmUpKind, Windows,
 };
 
-/// What the machine sets: passed in, never read here.
+/// Properties of the machine; they are passed in, never read here.
 #[derive(Debug, Clone, Copy)]
 pub struct Limits {
-    /// Processor cores at hand.
+    /// Available processor cores.
     pub cores: usize,
 }
 
-/// Caps that no experiment needs to pass; beyond them a slip of the keyboard is likelier.
+/// Limits that no experiment needs to exceed; a larger value is more likely a typo.
 const WORKERS_MAX: usize = 1_024;
 const ENVS_PER_WORKER_MAX: usize = 4_096;
-/// A slot of the replay counts its steps in a byte.
+/// A slot of the replay counts its steps in one byte.
 const SEGMENT_STEPS_MAX: usize = 255;
 const HINDSIGHT_COPIES_MAX: usize = 64;
 const HIDDEN_MAX: usize = 65_536;
-/// A worker of 100 000 segments a second, and acknowledgements a hundred times a second; a learner
-/// that settles more acknowledges sooner.
+/// Enough for a worker of 100 000 segments per second and 100 acknowledgements per second. A
+/// learner that settles more acknowledges sooner.
 const SEGMENTS_UNTIL_ACKNOWLEDGED: usize = 1_024;
 const UNACKNOWLEDGED_MAX: usize = 1 << 20;
-/// Room for some segments of any size.
+/// Space for a few segments of any size.
 const LOG_BYTES_MIN: u64 = 1 << 20;
 const LOG_BYTES_MAX: u64 = 1 << 44;
-/// Below, a link of any length is hardly used; above, a slow learner's policy is old news.
+/// A smaller window leaves any long link nearly idle. With a larger one, segments that queue for a
+/// slow learner come from outdated policies.
 const UNDER_WAY_BYTES_MIN: u64 = 1 << 16;
 const UNDER_WAY_BYTES_MAX: u64 = 1 << 34;
 const UPDATES_PER_SEGMENT_MAX: f64 = 1e6;
-/// Signs of life come once a second, and later on a busy machine.
+/// Heartbeats are sent once a second, and later on a busy machine.
 const HEARTBEAT_S_MIN: f64 = 3.0;
-/// Some thirty years.
+/// About thirty years.
 const SECONDS_MAX: f64 = 1e9;
 /// 50 environment steps of each environment at K = 5, as published.
 const ROLLOUT_SEGMENTS_PER_ENV: usize = 10;
 
 impl ExperimentConfig {
-    /// Fills in what depends on the machine or the policy's kind and checks every value.
+    /// Fills in values that depend on the machine or the kind of policy, and checks every value.
     ///
     /// # Errors
-    /// `Range` for the first value out of range or pair of values that exclude each other.
+    /// `Range` for the first value out of range or the first pair of values that exclude each
+    /// other.
     pub fn resolve(mut self, limits: Limits) -> Result<Self, ConfigError> {
         if self.actors.workers == 0 {
             self.actors.workers = limits.cores.saturating_sub(1).max(1);

@@ -1,21 +1,23 @@
-//! The tasks with a short name, and what differs from the defaults for each.
+//! The tasks with a short name, and the values that differ from the defaults for each.
 
 use serde::Serialize;
 use toml::Table;
 
-/// A task known by a short name. What `dmprl tasks` says of it is written here, so that it needs
-/// no Python; a test compares it with the environment.
+/// A task with a short name.
+///
+/// `dmprl tasks` prints these fields, so that it needs no Python. A test compares them with the
+/// environment.
 #[derive(Debug, Clone, Copy, Serialize)]
 pub struct TaskDefaults {
     /// The name for `dmprl train NAME`.
     pub name: &'static str,
     /// Gymnasium id.
     pub id: &'static str,
-    /// What it is.
+    /// One-line description.
     pub about: &'static str,
-    /// What an action commands, with its bounds.
+    /// Meaning and bounds of an action.
     pub control: &'static str,
-    /// Who defined it.
+    /// Origin of the task.
     pub source: &'static str,
     /// Length O of an observation.
     pub observation_len: usize,
@@ -23,14 +25,14 @@ pub struct TaskDefaults {
     pub action_low: &'static [f64],
     /// Upper bound of each action dimension.
     pub action_high: &'static [f64],
-    /// Steps of an episode.
+    /// Steps per episode.
     pub episode_steps: u32,
     /// Duration of a step \[s\].
     pub control_dt_s: f64,
     /// Values over the defaults, as parts of one TOML text.
     #[serde(skip)]
     values: &'static [&'static str],
-    /// Values over the preset `paper`, likewise: where its Table 2 has a column for this task.
+    /// Values over the preset `paper` in the same form, for tasks with their own column in Table 2.
     #[serde(skip)]
     paper: &'static [&'static str],
 }
@@ -141,13 +143,13 @@ steps = 60000
 // Observation: joint angles (7), joint velocities (7), three positions (3 each).
 const ARM_VALUES: &[&str] = &[JOINTS, "[run]\nsteps = 200000"];
 
-// With half of this noise the arm hardly ever met the cylinder: -34 to -36 where this comes to -25
-// and -31 after 60,000 steps (TD3, seeds 5000 and on); with 0.3 it came to -37.
+// With half of this noise the arm rarely touched the cylinder: the return was -34 to -36, against
+// -25 and -31 with this value, after 60,000 steps (TD3, seeds from 5000). With 0.3 it was -37.
 const PUSHER_V0_VALUES: &[&str] = &[ARM_VALUES[0], ARM_VALUES[1], "\n[exploration]\nstd = 0.2"];
 
-// The same observation. Where the ball came down is not in it but decides all later rewards: with
-// more updates, or with what hardly varies at first scaled up, TD3 loses what it had learned. A
-// throw is a jerk: a fifth of |Q| for smoothness cost it return.
+// The same observation. It does not contain the ball's landing point, which determines all later
+// rewards. With more updates, or with near-constant entries scaled up, TD3 forgets what it has
+// learned. A throw is a jerk: a smoothness penalty of a fifth of |Q| reduced the return.
 const THROWER_VALUES: &[&str] = &[
     ARM_VALUES[0],
     r#"
@@ -162,7 +164,7 @@ action_rate_penalty = 0.05
 "#,
 ];
 
-// Angle and velocity of seven joints, as these observations begin.
+// Angles and velocities of seven joints, at the start of these observations.
 const JOINTS: &str = r#"
 [task]
 start_sources = [
@@ -177,7 +179,7 @@ start_sources = [
 "#;
 
 // Observation: joint angles (7), joint velocities (7), goal - end effector (3), velocity of the end
-// effector (3). The start is the end effector seen from the goal.
+// effector (3). The start is the end effector's position relative to the goal.
 const PANDA_REACH_VALUES: &[&str] = &[
     r#"
 [task]
@@ -196,7 +198,7 @@ discount = 0.95
 "#,
 ];
 
-// Small networks learn it sooner, by steps and by the clock.
+// Small networks learn this task in fewer steps and in less time.
 const PANDA_REACH_JOINTS_VALUES: &[&str] = &[
     JOINTS,
     PANDA_RUN,
@@ -210,8 +212,8 @@ critic_hidden = [128, 128]
 "#,
 ];
 
-// u = 1 moves gripper or joint by 0.05 m or rad: with 20, a robot follows its primitive's y.
-// Success comes within few steps, which may cost more updates each. The discount is Table 2's.
+// u = 1 moves the gripper or joint by 0.05 m or rad, so with 20 a robot follows its primitive's y.
+// Success takes few steps, so each may have more updates. The discount is from Table 2.
 const PANDA_RUN: &str = r#"
 [run]
 steps = 30000
@@ -221,7 +223,7 @@ warm_up_steps = 1000
 updates_per_segment = 4.0
 "#;
 
-// Table 2 of the paper, the column of the Panda tasks.
+// Table 2 of the paper, column of the Panda tasks.
 const PANDA_PAPER: &[&str] = &[r#"
 [algorithm]
 discount = 0.95
@@ -247,7 +249,7 @@ impl TaskDefaults {
         table
     }
 
-    /// What lies over a preset for this task.
+    /// Values merged over a preset for this task.
     ///
     /// # Panics
     /// Never for the built-in tasks: a test parses each.

@@ -1,17 +1,20 @@
-//! The fast map of a segment, in controller units. Called for every decision and every sample of
-//! an update: batch times action dimensions, so it allocates nothing and vectorises.
+//! The fast map of a segment, in controller units.
+//!
+//! It runs for every decision and every sample of an update: batch times action dimensions. It
+//! therefore allocates nothing and vectorises.
 
 use super::{Dmp, STATE_INPUTS};
 use crate::config::ForcingScaling;
 
-/// Rows of a product computed together: two SSE registers or one AVX register of f32.
+/// Rows of a product that are computed together: two SSE registers or one AVX register of f32.
 const LANES: usize = 8;
 
-/// (y0, yd0, g, w) to the K samples the inverse controller reads, in f32, one action dimension.
+/// Maps (y0, yd0, g, w) to the K samples that the inverse controller reads, in f32, for one action
+/// dimension.
 ///
-/// Controller units: samples are (y, yd / omega, ydd / omega^2), all of the size of y. Weights
-/// enter as the network's bounded outputs; `weight_scale` (weight_range * omega^2) is part of the
-/// matrix. Computed in f64 and rounded once, so it is as good as f32 allows.
+/// Controller units: samples are (y, yd / omega, ydd / omega^2), all of the size of y. Weights are
+/// the network's bounded outputs; `weight_scale` (weight_range * omega^2) is part of the matrix.
+/// The matrix is computed in f64 and rounded once, so it is as accurate as f32 allows.
 ///     samples = M_s (y0, yd0, g) + factor M_w w,     factor = 1 or g - y0 (goal scaling)
 #[derive(Debug, Clone, PartialEq)]
 pub struct SegmentMap {
@@ -60,7 +63,7 @@ impl SegmentMap {
         3 * self.segment_steps
     }
 
-    /// The segment of one dimension.
+    /// Computes the segment of one dimension.
     /// - `inputs`: (3 + N,) y0, yd0 in DMP units, g, and weights as the network's outputs.
     /// - `samples`: (3K,) y_k, then yd_k / omega, then ydd_k / omega^2; overwritten.
     /// # Panics
@@ -82,8 +85,8 @@ impl SegmentMap {
         }
     }
 
-    /// Gradient with respect to the inputs.
-    /// - `inputs`: (3 + N,) as given to [`forward`](Self::forward).
+    /// Computes the gradient with respect to the inputs.
+    /// - `inputs`: (3 + N,) as passed to [`forward`](Self::forward).
     /// - `samples_gradient`: (3K,). `inputs_gradient`: (3 + N,), overwritten.
     /// # Panics
     /// If a length is wrong.
@@ -106,7 +109,7 @@ impl SegmentMap {
         }
     }
 
-    /// Where the segment ends, in DMP units: (y_K, yd_K), the next segment's (y0, yd0) under
+    /// End state of the segment in DMP units: (y_K, yd_K), the next segment's (y0, yd0) under
     /// `carry`.
     /// - `samples`: (3K,) from [`forward`](Self::forward).
     /// # Panics
@@ -130,7 +133,7 @@ impl SegmentMap {
     }
 }
 
-/// A matrix in blocks of [`LANES`] rows, each stored column by column and padded with zeros: a
+/// A matrix in blocks of [`LANES`] rows, each stored column by column and padded with zeros. A
 /// product keeps one block's sums in registers, and needs neither a horizontal sum nor a remainder
 /// loop.
 #[derive(Debug, Clone, PartialEq)]

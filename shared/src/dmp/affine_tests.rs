@@ -1,4 +1,4 @@
-//! The fast map against the stepped reference, and its gradients against differences.
+//! The fast map against the stepped reference, and its gradients against finite differences.
 
 use super::test_support::{Draw, INTEGRATORS, every_config};
 use super::*;
@@ -20,7 +20,7 @@ fn distance(a: &[f64], b: &[f64]) -> f64 {
     norm(a.iter().zip(b).map(|(a, b)| a - b))
 }
 
-/// (y0, yd0, g, w..), weights divided by `weight_scale`: what a policy feeds the map.
+/// (y0, yd0, g, w..) with weights divided by `weight_scale`, as a policy passes them to the map.
 fn inputs_of(start: State<f64>, goal: f64, weights: &[f64], weight_scale: f64) -> Vec<f64> {
     let weights = weights.iter().map(|w| w / weight_scale);
     [start.y, start.yd, goal].into_iter().chain(weights).collect()
@@ -109,7 +109,7 @@ fn stepping_in_f32_agrees_with_f64_to_1e_5() {
     }
 }
 
-/// A loss of the actions, so that the gradient of every sample differs: sum_k (k + 1) u_k, plus
+/// A loss of the actions for which the gradient of every sample differs: sum_k (k + 1) u_k, plus
 /// the end state's y and yd / omega.
 fn loss(map: &SegmentMap, inputs: &[f32], rho: &[f32; 4]) -> f64 {
     let k_count = map.sample_count() / 3;
@@ -179,7 +179,7 @@ fn gradients_through_map_and_inverse_controller_match_central_differences() {
 #[test]
 fn backward_of_the_map_is_the_transpose_of_its_jacobian_up_to_rounding() {
     // Forward is affine in each single input (bilinear with goal scaling), so central differences
-    // are exact but for rounding, at any step: a sharper check than through the tanh.
+    // are exact up to rounding, for any step. This check is sharper than one through the tanh.
     let mut draw = Draw::new("transpose", 0);
     for config in every_config() {
         let dmp = Dmp::new(&config, 5).unwrap();

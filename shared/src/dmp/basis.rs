@@ -12,12 +12,13 @@ pub struct Basis {
 }
 
 impl Basis {
-    /// Centres equally spaced in time, c_i = exp(-alpha_x t_i) with t from 0 to 1.
+    /// Creates N functions with centres equally spaced in time, c_i = exp(-alpha_x t_i) with t from
+    /// 0 to 1.
     ///
-    /// Widths are the reading of the paper's unspecified sigma_i; see [`BasisWidths`].
+    /// The paper does not specify sigma_i; [`BasisWidths`] lists the interpretations.
     /// - `count`: N.
     /// # Errors
-    /// `Parameter` if `count` is zero (one, with `overlap`, which needs a neighbour) or `alpha_x`
+    /// `Parameter` if `count` is zero (or one with `overlap`, which needs a neighbour) or `alpha_x`
     /// is not positive and finite.
     pub fn new(count: usize, alpha_x: f64, widths: BasisWidths) -> Result<Self, DmpError> {
         let count_min = match widths {
@@ -47,7 +48,7 @@ impl Basis {
         Self::from_centres_and_widths(centres, widths)
     }
 
-    /// Basis functions placed by hand.
+    /// Creates basis functions with explicit centres and widths.
     /// - `centres`, `widths`: (N,).
     /// # Errors
     /// `Shape` if the lengths differ or are zero; `NotFinite`; `Parameter` if a width is not
@@ -79,11 +80,12 @@ impl Basis {
         &self.widths
     }
 
-    /// Normalised activations psi_i / sum psi at phase `x`; they sum to one.
+    /// Computes the normalised activations psi_i / sum psi at phase `x`; they sum to one.
     /// - `out`: (N,), overwritten.
     ///
-    /// The largest exponent is subtracted from all, as in a softmax: far from every centre all
-    /// psi underflow, and 0 / 0 (or an epsilon in the denominator, as elsewhere) would follow.
+    /// The largest exponent is subtracted from all, as in a softmax. Far from every centre all psi
+    /// would otherwise underflow to 0 / 0. Other implementations add an epsilon to the denominator
+    /// instead.
     /// # Panics
     /// If `out` is not N long.
     pub fn normalised(&self, x: f64, out: &mut [f64]) {
@@ -102,7 +104,7 @@ impl Basis {
     }
 }
 
-/// Each basis function is worth 0.8 at the next centre; the last is as wide as the one before.
+/// Widths for which each basis function is 0.8 at the next centre; the last repeats the one before.
 fn overlap_widths(centres: &[f64]) -> Vec<f64> {
     let width = |pair: &[f64]| -(0.8_f64.ln()) / (pair[1] - pair[0]).powi(2);
     let mut widths: Vec<f64> = centres.windows(2).map(width).collect();

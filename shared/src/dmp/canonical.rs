@@ -1,24 +1,24 @@
-//! Canonical system: the phase, which replaces time. Called by `primitive`.
+//! Canonical system: the phase, which replaces time. Used by `primitive`.
 
 use crate::config::CanonicalIntegration;
 
 /// The phase's decay from x_0 = 1 towards 0.
 ///     tau xd = -alpha_x x      (paper, section 2.3)
-/// Ours rather than the paper's: x is advanced *before* the basis functions are evaluated, so the
-/// first integration step sees x_1. The paper leaves the order open; Neural Dynamic Policies has
-/// this one.
+/// Differs from the paper: x advances *before* the basis functions are evaluated, so the first
+/// integration step uses x_1. The paper leaves the order open; Neural Dynamic Policies uses this
+/// one.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct CanonicalSystem {
     /// Decay alpha_x.
     pub alpha_x: f64,
     /// Duration tau \[s\].
     pub tau: f64,
-    /// How x advances.
+    /// Integration of x.
     pub integration: CanonicalIntegration,
 }
 
 impl CanonicalSystem {
-    /// Phases x_0 .. x_steps at the times 0, dt, .., steps * dt.
+    /// Computes the phases x_0 .. x_steps at the times 0, dt, .., steps * dt.
     /// - `dt`: \[s\].
     /// - Returns (steps + 1,), the first always 1.
     #[must_use]

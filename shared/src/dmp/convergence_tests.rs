@@ -1,11 +1,11 @@
-//! What each integrator is worth: order of convergence and limit of stability, measured.
+//! Measures each integrator's order of convergence and stability limit.
 
 use super::test_support::{Draw, INTEGRATORS};
 use super::*;
 use crate::config::{CanonicalIntegration, DmpConfig, Integrator};
 
-/// The differential equation itself, with the exact phase, by the classical Runge-Kutta method at
-/// 4000 steps, whose error is far below those measured; y and yd at the five sample times.
+/// Solves the differential equation with the exact phase by the classical Runge-Kutta method in
+/// 4000 steps, whose error is far below those measured. Returns y and yd at the five sample times.
 fn reference(dmp: &Dmp, start: State<f64>, goal: f64, weights: &[f64]) -> [State<f64>; 5] {
     let (steps, omega) = (4000, dmp.omega());
     let dt = 1.0 / f64::from(steps);
@@ -54,8 +54,8 @@ fn errors(config: &DmpConfig) -> [f64; 2] {
     worst
 }
 
-/// All three are of first order, in y as in yd; `semi_implicit` too, which is symplectic Euler (its
-/// relatives of second order need half steps). They differ in their stability limit.
+/// All three are of first order in y and yd, including `semi_implicit`, which is symplectic Euler
+/// (its second-order relatives need half steps). They differ in their stability limit.
 #[test]
 fn every_integrator_converges_with_first_order_in_y_and_yd() {
     for integrator in INTEGRATORS {
@@ -88,12 +88,12 @@ fn every_integrator_converges_with_first_order_in_y_and_yd() {
     }
 }
 
-/// Spectral radius of one unforced step, by its action on (y, yd, ydd): |A^n|^(1/n) with n = 2^40,
-/// squaring, which also holds for a defective or complex pair.
+/// Spectral radius of one unforced step on (y, yd, ydd): |A^n|^(1/n) with n = 2^40, by repeated
+/// squaring, which also works for a defective or complex pair.
 fn spectral_radius(integrator: Integrator, alpha_y: f64, dt: f64) -> f64 {
     let system = TransformationSystem { alpha_y, tau: 1.0, dt, integrator };
     let mut power = [[0.0; 3]; 3];
-    // Transposed, which has the same eigenvalues.
+    // The transpose, which has the same eigenvalues.
     for (column, response) in power.iter_mut().enumerate() {
         let unit = |row| f64::from(u8::from(row == column));
         let next = system.step(Sample { y: unit(0), yd: unit(1), ydd: unit(2) }, 0.0, 0.0);

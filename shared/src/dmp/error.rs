@@ -1,4 +1,4 @@
-//! What can be wrong with a DMP or a demonstration.
+//! Errors of a DMP or a demonstration.
 
 use thiserror::Error;
 
@@ -8,35 +8,35 @@ pub enum DmpError {
     /// A parameter outside the range in which the equations make sense.
     #[error("{name}: expected {expected}, got {got}")]
     Parameter {
-        /// The parameter, as the configuration calls it.
+        /// Name of the parameter in the configuration.
         name: &'static str,
-        /// The range.
+        /// The valid range.
         expected: String,
-        /// The value.
+        /// The actual value.
         got: String,
     },
     /// A slice of the wrong length.
     #[error("{name}: expected {expected} values, got {got}")]
     Shape {
-        /// The slice.
+        /// Name of the slice.
         name: &'static str,
-        /// Its length, had it fitted.
+        /// Expected length.
         expected: usize,
-        /// Its length.
+        /// Actual length.
         got: usize,
     },
     /// A value that is infinite or not a number.
     #[error("{name}[{index}]: expected a finite number, got {got}")]
     NotFinite {
-        /// The slice.
+        /// Name of the slice.
         name: &'static str,
-        /// Where in it.
+        /// Index in the slice.
         index: usize,
-        /// The value.
+        /// The actual value.
         got: f64,
     },
-    /// With goal scaling the forcing term vanishes when goal and start coincide, so that no
-    /// weights can shape the motion.
+    /// With goal scaling the forcing term vanishes if goal and start coincide, so no weights can
+    /// shape the motion.
     #[error("goal {goal} and start {start} coincide: forcing_scaling = \"goal\" cannot imitate")]
     GoalEqualsStart {
         /// The demonstration's goal.
@@ -44,7 +44,7 @@ pub enum DmpError {
         /// The demonstration's start.
         start: f64,
     },
-    /// Too few samples, or basis functions too alike, to determine every weight.
+    /// Too few samples, or too similar basis functions, to determine every weight.
     #[error(
         "weight {weight} is not determined by the demonstration: use fewer basis functions \
              or more integration steps"
@@ -56,7 +56,7 @@ pub enum DmpError {
 }
 
 impl DmpError {
-    /// A [`DmpError::Parameter`], if `accepted` does not hold.
+    /// Returns a [`DmpError::Parameter`] unless `accepted` holds.
     pub(crate) fn parameter(
         accepted: bool,
         name: &'static str,
@@ -69,8 +69,8 @@ impl DmpError {
         Err(Self::Parameter { name, expected: expected(), got: got.to_string() })
     }
 
-    /// A [`DmpError::Shape`], if `values` is not `expected` long; else a [`DmpError::NotFinite`],
-    /// if one of them is not finite.
+    /// Returns a [`DmpError::Shape`] if `values` is not `expected` long, or a
+    /// [`DmpError::NotFinite`] if a value is not finite.
     pub(crate) fn values(name: &'static str, values: &[f64], expected: usize) -> Result<(), Self> {
         if values.len() != expected {
             return Err(Self::Shape { name, expected, got: values.len() });

@@ -1,10 +1,10 @@
-//! Forcing term: what shapes the motion between start and goal. Called by `primitive` and
+//! The forcing term, which shapes the motion between start and goal. Used by `primitive` and
 //! `imitation`.
 
 use super::Basis;
 use crate::config::ForcingScaling;
 
-/// Features of the forcing term at phase `x`: what multiplies the weights.
+/// Computes the features of the forcing term at phase `x`, the factors of the weights.
 ///     phi_i(x) = x psi_i(x) / sum_j psi_j(x)      (paper, equation 9)
 /// - `out`: (N,), overwritten.
 /// # Panics
@@ -41,7 +41,7 @@ pub fn forcing(basis: &Basis, x: f64, weights: &[f64]) -> f64 {
     phi.iter().zip(weights).map(|(phi, w)| phi * w).sum()
 }
 
-/// What multiplies the forcing term: 1, or g - y0 (not in the paper; Neural Dynamic Policies).
+/// Factor on the forcing term: 1, or g - y0 (not in the paper; Neural Dynamic Policies).
 #[must_use]
 pub fn forcing_factor(scaling: ForcingScaling, y0: f64, goal: f64) -> f64 {
     match scaling {

@@ -1,8 +1,8 @@
-//! Our building blocks against two public packages.
+//! The DMP's building blocks against two public packages.
 //!
-//! The numbers in tests/golden/dmp/golden.json come from movement_primitives 0.9.1 and mp-pytorch
-//! 0.1.4 by tests/golden/dmp/make_golden.py. Both step semi-implicitly with an exact phase; where
-//! else they differ from our defaults is composed here from the parts.
+//! tests/golden/dmp/make_golden.py made the numbers in tests/golden/dmp/golden.json with
+//! movement_primitives 0.9.1 and mp-pytorch 0.1.4. Both step semi-implicitly with an exact phase.
+//! Where they differ from our defaults otherwise, the tests compose the parts accordingly.
 
 use super::*;
 use crate::config::{BasisWidths, CanonicalIntegration, Integrator};
@@ -21,7 +21,7 @@ impl Case {
         self.0[key].as_array().expect(key).iter().map(|v| v.as_f64().expect(key)).collect()
     }
 
-    /// Our movement with this basis; step j of the package sees the phase x_{j - `phase_delay`}.
+    /// The trajectory with this basis; step j of the package uses the phase x_{j - `phase_delay`}.
     fn movement(&self, basis: &Basis, phase_delay: usize) -> Trajectory<f64> {
         let tau = self.number("tau");
         let steps = (self.number("inner_steps") as usize) * (self.numbers("y").len() - 1);
@@ -53,7 +53,8 @@ impl Case {
     }
 }
 
-/// 1e-12 of the largest: the packages sum in another order, and one adds up its time.
+/// Tolerance: 1e-12 of the largest value. The packages sum in another order, and one accumulates
+/// its time.
 fn assert_close(got: &[f64], expected: &[f64], what: &str) {
     assert_eq!(got.len(), expected.len(), "{what}");
     let size = expected.iter().fold(0.0_f64, |max, v| max.max(v.abs()));

@@ -1,15 +1,15 @@
-//! Imitation: the weights that make a DMP follow a demonstrated movement.
+//! Imitation: the weights with which a DMP follows a demonstrated movement.
 //!
-//! Not used in training; for starting a policy from a demonstration, and for tests.
+//! Training does not use it. It can initialise a policy from a demonstration, and serves tests.
 
 use super::least_squares::solve;
 use super::{Dmp, DmpError, Trajectory, forcing_factor};
 
-/// With goal scaling, goal and start closer than this part of the demonstration's extent count as
-/// one point.
+/// With goal scaling, goal and start coincide if they are closer than this fraction of the
+/// demonstration's extent.
 const GOAL_DISTANCE_MIN: f64 = 1e-9;
 
-/// What reproduces a demonstration.
+/// Goal and weights that reproduce a demonstration.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Imitation {
     /// Goal g \[u\].
@@ -18,9 +18,9 @@ pub struct Imitation {
     pub weights: Vec<f64>,
 }
 
-/// The DMP that follows `demonstration` to its last position (paper, equations 11 and 12).
+/// Fits a DMP that follows `demonstration` to its last position (paper, equations 11 and 12).
 /// - `demonstration`: m + 1 samples at the DMP's own steps, in DMP time (tau = 1). `ydd[j]` is the
-///   acceleration between samples j - 1 and j, as [`Dmp::integrate`] has it; `ydd[0]` is not read.
+///   acceleration between samples j - 1 and j, as in [`Dmp::integrate`]; `ydd[0]` is not read.
 /// # Errors
 /// As [`fit_weights`].
 pub fn imitate(dmp: &Dmp, demonstration: &Trajectory<f64>) -> Result<Imitation, DmpError> {
@@ -29,16 +29,16 @@ pub fn imitate(dmp: &Dmp, demonstration: &Trajectory<f64>) -> Result<Imitation, 
     Ok(Imitation { goal, weights: fit_weights(dmp, demonstration, goal)? })
 }
 
-/// The weights with which the DMP, drawn to `goal`, comes closest to the demonstration's
+/// Fits the weights for which the DMP with goal `goal` comes closest to the demonstration's
 /// accelerations.
 ///     f_j = tau^2 ydd_j - alpha_y (beta_y (g - y_{j-1}) - tau yd_{j-1})     (paper, equation 11)
 ///     w = argmin |Phi w - f|^2 = (Phi^T Phi)^-1 Phi^T f                     (paper, equation 12)
-/// Ours rather than the paper's: y and yd are taken one step before ydd, as the integrators do, so
-/// that the DMP's own movements give back their weights exactly; with goal scaling f is first
-/// divided by g - y0.
+/// Differs from the paper: y and yd are taken one step before ydd, as the integrators do, so that
+/// the DMP's own movements give back their weights exactly. With goal scaling f is first divided by
+/// g - y0.
 /// - `demonstration`: as in [`imitate`].
 /// # Errors
-/// `Shape` or `NotFinite` if it is not m + 1 finite samples of each; `RankDeficient` if it does not
+/// `Shape` or `NotFinite` unless each is m + 1 finite samples; `RankDeficient` if it does not
 /// determine the weights; `GoalEqualsStart` with goal scaling.
 pub fn fit_weights(
     dmp: &Dmp,
@@ -76,7 +76,7 @@ mod tests {
     use crate::config::{DmpConfig, ForcingScaling};
     use crate::dmp::State;
 
-    /// The path of least jerk from 0 to 1 in one second.
+    /// The minimum-jerk path from 0 to 1 in one second.
     fn minimum_jerk(steps: usize) -> Trajectory<f64> {
         let at = |polynomial: fn(f64) -> f64| {
             (0..=steps).map(|j| polynomial(j as f64 / steps as f64)).collect()
@@ -88,7 +88,7 @@ mod tests {
         }
     }
 
-    /// Largest deviation from the path, which is 1 long.
+    /// Largest deviation from the path, whose length is 1.
     fn deviation(config: &DmpConfig) -> f64 {
         let dmp = Dmp::new(config, 5).unwrap();
         let path = minimum_jerk(config.integration_steps);
@@ -112,7 +112,8 @@ mod tests {
         }
     }
 
-    /// Measured: at most 6.6 % of the way off with three weights, 3.8 % with four to six.
+    /// Measured: a deviation of at most 6.6 % of the path with three weights, and 3.8 % with four
+    /// to six.
     #[test]
     fn minimum_jerk_path_is_reproduced_in_every_configuration() {
         for config in every_config() {

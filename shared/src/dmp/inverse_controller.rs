@@ -1,12 +1,14 @@
-//! Inverse controllers: from a segment's samples to its actions, one action dimension at a time.
+//! Inverse controllers, which compute a segment's actions from its samples, one action dimension at
+//! a time.
 //!
-//! The paper's adaptive one, a single tanh neuron whose weights rho the policy decides (section
-//! 3.2), and the position controller of Neural Dynamic Policies. Neither allocates.
+//! There are two: the paper's adaptive controller, a single tanh neuron whose weights rho the
+//! policy outputs (section 3.2), and the position controller of Neural Dynamic Policies. Neither
+//! allocates.
 
-/// The adaptive inverse controller before its tanh.
+/// Computes the adaptive inverse controller before its tanh.
 ///     v_k = rho_1 y_k + rho_2 yd_k / omega + rho_3 ydd_k / omega^2 + rho_4,     u_k = tanh(v_k)
-/// Ours rather than the paper's: velocity and acceleration are divided by omega and omega^2, since
-/// at alpha_y = 25 acceleration is about 150 times position and would saturate the tanh.
+/// Differs from the paper: velocity and acceleration are divided by omega and omega^2, because at
+/// alpha_y = 25 the acceleration is about 150 times the position and would saturate the tanh.
 /// - `samples`: (3K,) from `SegmentMap::forward`. `values`: v, (K,), overwritten.
 /// # Panics
 /// If `samples` is not three times as long as `values`.
@@ -17,7 +19,7 @@ pub fn act(samples: &[f32], rho: &[f32; 4], values: &mut [f32]) {
     }
 }
 
-/// Gradients of [`act`]: returns the one with respect to rho.
+/// Computes the gradients of [`act`] and returns the one with respect to rho.
 /// - `values_gradient`: with respect to v, (K,). `samples_gradient`: (3K,), overwritten.
 /// # Panics
 /// If a length is wrong.
@@ -41,9 +43,9 @@ pub fn act_backward(
     rho_gradient
 }
 
-/// Actions of a segment by the position controller (Neural Dynamic Policies).
+/// Computes a segment's actions with the position controller (Neural Dynamic Policies).
 ///     u_k = position_scale (y_k - y_{k-1}),     y_0 the start
-/// Not bounded: whoever applies an action clips it.
+/// The actions are unbounded; the caller clips them.
 /// - `samples`: (3K,), of which only the positions are read. `actions`: (K,), overwritten.
 /// # Panics
 /// If `samples` is not three times as long as `actions`.
@@ -56,8 +58,8 @@ pub fn act_position(y0: f32, samples: &[f32], position_scale: f32, actions: &mut
     }
 }
 
-/// Gradients of [`act_position`]: returns the one with respect to y0 (the direct one; the samples
-/// depend on y0 as well).
+/// Computes the gradients of [`act_position`] and returns the direct one with respect to y0 (the
+/// samples depend on y0 as well).
 /// - `actions_gradient`: (K,). `samples_gradient`: (3K,), overwritten.
 /// # Panics
 /// If `samples_gradient` is not three times as long as `actions_gradient`.

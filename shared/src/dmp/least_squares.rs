@@ -1,18 +1,18 @@
 //! Linear least squares by Householder QR, for `imitation`.
 //!
-//! Rather than the normal equations of the paper's equation 12, which square the condition number:
+//! The normal equations of the paper's equation 12 would square the condition number, and
 //! neighbouring basis functions overlap. Measured relative errors of recovered weights, QR and
 //! Cholesky: 4e-16 and 2e-14 with N = 5, 2e-12 and 2e-5 with N = 20 (`ndp` widths). Both have the
-//! same minimum, and 40 x 5 values cost nothing either way. No regularisation: it would bias the
-//! weights, and a deficient matrix is reported instead.
+//! same minimum, and 40 x 5 values are cheap either way. There is no regularisation, because it
+//! would bias the weights; a rank-deficient matrix is reported instead.
 
-/// Smallest diagonal of R, relative to its largest, that still counts as full rank.
+/// Smallest diagonal entry of R, relative to the largest, for full rank.
 const RANK_TOLERANCE: f64 = 1e-12;
 
-/// The vector that minimises |matrix * vector - target|.
+/// Returns the vector that minimises |matrix * vector - target|.
 /// - `matrix`: (R, C), row-major. `target`: (R,).
 /// # Errors
-/// The index of the first column that (nearly) depends on those before it, or has no row left.
+/// The index of the first column that (nearly) depends on those before it, or that has no row left.
 /// # Panics
 /// If the lengths do not match.
 pub(super) fn solve(matrix: &[f64], columns: usize, target: &[f64]) -> Result<Vec<f64>, usize> {
@@ -21,7 +21,7 @@ pub(super) fn solve(matrix: &[f64], columns: usize, target: &[f64]) -> Result<Ve
     if rows < columns {
         return Err(rows);
     }
-    // Column by column, the target last: reflections then act on contiguous slices.
+    // Columns, then the target, so that reflections act on contiguous slices.
     let mut work: Vec<Vec<f64>> =
         (0..columns).map(|c| matrix.iter().skip(c).step_by(columns).copied().collect()).collect();
     work.push(target.to_vec());
@@ -42,11 +42,11 @@ pub(super) fn solve(matrix: &[f64], columns: usize, target: &[f64]) -> Result<Ve
     Ok(solution)
 }
 
-/// Reflects `column` onto its first axis, and all of `rest` (from `first` on) with it; returns the
-/// diagonal entry of R. `column` is left holding the reflection's direction.
+/// Reflects `column` onto its first axis, and all of `rest` (from `first` on) with it. Returns the
+/// diagonal entry of R. `column` then contains the reflection's direction.
 fn reflect(column: &mut [f64], rest: &mut [Vec<f64>], first: usize) -> f64 {
     let norm = column.iter().map(|v| v * v).sum::<f64>().sqrt();
-    // The sign that avoids cancellation.
+    // This sign avoids cancellation.
     let diagonal = if column[0] > 0.0 { -norm } else { norm };
     column[0] -= diagonal;
     let square: f64 = column.iter().map(|v| v * v).sum();

@@ -1,21 +1,21 @@
-//! Dynamic movement primitives: from a decision (g, w, rho) to the actions of a segment.
+//! Dynamic movement primitives, which turn a decision (g, w, rho) into the actions of a segment.
 //!
-//! Stages 3 (rollout) and 6 (update) of the data flow; called by `policy`, once per action
+//! Stages 3 (rollout) and 6 (update) of the data flow; `policy` calls this module once per action
 //! dimension. "The paper" is "Efficient Robot Manipulation via Reinforcement Learning with Dynamic
-//! Movement Primitives-Based Policy" (Appl. Sci. 2024, 14, 10665), its equations 8 to 14; each item
-//! says where it reads an ambiguity in one way, or departs.
+//! Movement Primitives-Based Policy" (Appl. Sci. 2024, 14, 10665), with equations 8 to 14. Each
+//! item names its differences from the paper and its interpretation of ambiguous passages.
 //!
 //! | symbol | meaning | unit (DMP time, tau = 1) |
 //! |---|---|---|
 //! | y, yd, ydd | position, velocity, acceleration of the transformation system | u, u/s, u/s^2 |
 //! | y0, yd0 | state at the start of a segment | u, u/s |
-//! | g | goal, the point the system converges to | u |
+//! | g | goal, the point to which the system converges | u |
 //! | w (w_i) | weights of the forcing term, one per basis function | u/s^2 |
 //! | f | forcing term | u/s^2 |
 //! | x (x_j) | phase, from 1 towards 0; x_j after j steps | 1 |
 //! | psi (psi_i) | Gaussian basis functions of the phase | 1 |
 //! | c, h (c_i, h_i) | their centres and widths: psi = exp(-h (x - c)^2) | 1 |
-//! | phi (phi_i) | x psi_i / sum psi: what multiplies w_i | 1 |
+//! | phi (phi_i) | x psi_i / sum psi, the factor of w_i | 1 |
 //! | tau | duration of the movement | s |
 //! | alpha_x | decay of the phase | 1 |
 //! | alpha_y, beta_y | stiffness of the transformation system; beta_y = alpha_y / 4 | 1 |
@@ -23,12 +23,12 @@
 //! | rho | the inverse controller's four parameters | 1 |
 //! | K, m, N | samples of a segment, integration steps, basis functions | |
 //!
-//! "u" is whatever y measures (an angle, a torque as a fraction of its bound, ...).
+//! "u" is the unit of y (an angle, a torque as a fraction of its bound, ...).
 //!
-//! Two roads lead through a segment. [`Dmp::integrate`] steps the differential equation and is the
-//! reference. [`SegmentMap`] is what runs: the whole segment is an affine map of (y0, yd0, g, w)
-//! with constant coefficients, one small product, whose gradient is the transposed product. Tests
-//! hold the second to the first.
+//! A segment can be computed in two ways. [`Dmp::integrate`] steps the differential equation and is
+//! the reference. [`SegmentMap`] is used in production: the whole segment is an affine map of (y0,
+//! yd0, g, w) with constant coefficients, that is, one small product, whose gradient is the
+//! transposed product. Tests compare the two.
 
 mod affine;
 mod basis;

@@ -1,6 +1,6 @@
 //! One DMP with its constants: phases, features, steps, and the matrix of a whole segment.
 //!
-//! Built once per run from the configuration. `SegmentMap` derives the fast map from it.
+//! It is built once per run from the configuration. `SegmentMap` derives the fast map from it.
 
 use super::{
     Basis, CanonicalSystem, DmpError, State, Trajectory, TransformationSystem, feature_matrix,
@@ -8,10 +8,10 @@ use super::{
 };
 use crate::config::{DmpConfig, ForcingScaling};
 
-/// Inputs of the segment's map before the weights: y0, yd0, g.
+/// Number of the map's inputs before the weights: y0, yd0, g.
 pub const STATE_INPUTS: usize = 3;
 
-/// One DMP of duration tau = 1 per segment, the same for every action dimension.
+/// A DMP with duration tau = 1 per segment, shared by all action dimensions.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Dmp {
     system: TransformationSystem<f64>,
@@ -28,12 +28,12 @@ pub struct Dmp {
 }
 
 impl Dmp {
-    /// Derives the constants.
+    /// Creates a DMP and computes its constants.
     /// - `segment_steps`: K.
     /// # Errors
     /// `Parameter` if m is not a multiple of K, or either is zero; if `alpha_y` is not positive or
     /// unstable with m steps ([`crate::config::Integrator::alpha_y_max`]); if `alpha_x` or N do not
-    /// make a basis, or the phase does not decay monotonically (alpha_x >= m, `euler` only).
+    /// give a basis, or the phase does not decay monotonically (alpha_x >= m, `euler` only).
     pub fn new(config: &DmpConfig, segment_steps: usize) -> Result<Self, DmpError> {
         let integration_steps = config.integration_steps;
         check(config, segment_steps)?;
@@ -62,19 +62,19 @@ impl Dmp {
         Ok(dmp)
     }
 
-    /// Samples of a segment, K.
+    /// Number of samples per segment, K.
     #[must_use]
     pub fn segment_steps(&self) -> usize {
         self.segment_steps
     }
 
-    /// Integration steps of a segment, m.
+    /// Number of integration steps per segment, m.
     #[must_use]
     pub fn integration_steps(&self) -> usize {
         self.integration_steps
     }
 
-    /// Basis functions, N.
+    /// Number of basis functions, N.
     #[must_use]
     pub fn basis_count(&self) -> usize {
         self.basis.count()
@@ -86,7 +86,7 @@ impl Dmp {
         self.system.alpha_y / 2.0
     }
 
-    /// What multiplies the forcing term.
+    /// Factor on the forcing term.
     #[must_use]
     pub fn forcing_scaling(&self) -> ForcingScaling {
         self.forcing_scaling
@@ -110,13 +110,13 @@ impl Dmp {
         &self.system
     }
 
-    /// Features phi at x_1 .. x_m, (m, N), row-major: what step j multiplies the weights with.
+    /// Features phi at x_1 .. x_m, (m, N), row-major: the factors of the weights in step j.
     #[must_use]
     pub fn features(&self) -> &[f64] {
         &self.features
     }
 
-    /// The stepped reference: all m + 1 samples of a segment of duration tau = 1.
+    /// Computes all m + 1 samples of a segment of duration tau = 1 by stepping, as the reference.
     /// - `weights`: (N,) \[u/s^2\].
     /// # Panics
     /// If `weights` is not N long.
@@ -125,8 +125,8 @@ impl Dmp {
         self.integrate_over(1.0, start, goal, weights)
     }
 
-    /// The same in m steps of a duration `tau`: the same path, 1 / tau times as fast, if `start.yd`
-    /// is too.
+    /// As [`integrate`](Self::integrate), in m steps of a duration `tau`. The path is the same at 1
+    /// / tau times the speed, if `start.yd` is scaled by it too.
     /// - `tau`: \[s\], positive. `weights`: (N,) \[u/s^2 at tau = 1\].
     /// # Panics
     /// If `weights` is not N long.
@@ -150,16 +150,16 @@ impl Dmp {
 
     /// The segment as a matrix: samples = matrix * (y0, yd0, g, w_1 .. w_N).
     ///
-    /// (3K) x (3 + N), row-major, f64; rows y_1 .. y_K, yd_1 .. yd_K, ydd_1 .. ydd_K, sample k
-    /// being the one after k m / K steps (never the start, so that the first action already
-    /// depends on g and w). With goal scaling the weights' columns are those of g - y0 = 1, and are
-    /// to be multiplied by g - y0.
+    /// (3K) x (3 + N), row-major, f64. The rows are y_1 .. y_K, yd_1 .. yd_K, ydd_1 .. ydd_K.
+    /// Sample k is the one after k m / K steps; the start is never included, so that the first
+    /// action already depends on g and w. With goal scaling the weights' columns are those of g -
+    /// y0 = 1; the caller multiplies them by g - y0.
     #[must_use]
     pub fn matrix(&self) -> &[f64] {
         &self.matrix
     }
 
-    /// The map is affine and without constant term, so its columns are the responses to unit
+    /// Computes the matrix. The map has no constant term, so its columns are the responses to unit
     /// inputs.
     fn segment_matrix(&self) -> Vec<f64> {
         let (n, m, k_count) = (self.basis_count(), self.integration_steps, self.segment_steps);
@@ -206,8 +206,8 @@ fn check(config: &DmpConfig, segment_steps: usize) -> Result<(), DmpError> {
         || format!("above 0 and below {max:.2}, where {:?} is stable", config.integrator),
         alpha_y,
     )?;
-    // Beyond, explicit Euler's factor 1 - alpha_x / m is not positive any more. The exact phase
-    // would allow more, but a phase gone within one step shapes nothing.
+    // From this bound on, explicit Euler's factor 1 - alpha_x / m is not positive. The exact phase
+    // would allow more, but a phase that decays within one step does not shape the motion.
     DmpError::parameter(
         alpha_x > 0.0 && alpha_x < steps as f64,
         "dmp.alpha_x",

@@ -1,11 +1,11 @@
-//! Segments in a row: what is continuous, what is not, and where they lead.
+//! Consecutive segments: continuity at the borders, and convergence.
 
 use super::test_support::{Draw, INTEGRATORS};
 use super::*;
 use crate::config::{CanonicalIntegration, DmpConfig};
 
-/// The unforced system knows no time: with f = 0 and one goal, segments with carry are one long
-/// movement. `paper` is left out: it restarts each segment with ydd_0 = 0, so it is not.
+/// The unforced system is time-invariant: with f = 0 and one goal, segments with carry form one
+/// long movement. `paper` is excluded, because it restarts each segment with ydd_0 = 0.
 #[test]
 fn unforced_segments_with_carry_are_one_long_movement() {
     for integrator in [INTEGRATORS[0], INTEGRATORS[1]] {
@@ -24,9 +24,9 @@ fn unforced_segments_with_carry_are_one_long_movement() {
     }
 }
 
-/// Runs three segments of random goals and weights with carry through the f32 map, and returns the
-/// largest jumps of y, yd and ydd at the borders: between the last sample of one segment and the
-/// first *step* of the next (the step is also K = m samples, so the map shows every one).
+/// Runs three segments of random goals and weights with carry through the f32 map. Returns the
+/// largest jumps of y, yd and ydd at the borders, between the last sample of one segment and the
+/// first *step* of the next (K = m here, so the map returns every step).
 fn jumps(integration_steps: usize, config: &DmpConfig) -> [f32; 3] {
     let config = DmpConfig { integration_steps, ..config.clone() };
     let dmp = Dmp::new(&config, integration_steps).unwrap();
@@ -53,13 +53,13 @@ fn jumps(integration_steps: usize, config: &DmpConfig) -> [f32; 3] {
     largest
 }
 
-/// With carry, position and velocity at a border differ by one step's worth only: the jump shrinks
-/// with the step. Acceleration (and so, in general, the action) jumps with the new goal and
-/// weights, however small the step.
+/// With carry, position and velocity at a border only differ by the change within one step, so the
+/// jump shrinks with the step. Acceleration (and so, in general, the action) jumps with the new
+/// goal and weights, for any step.
 #[test]
 fn with_carry_position_and_velocity_are_continuous_across_segments_and_acceleration_is_not() {
     for integrator in INTEGRATORS {
-        // `exact`: the phase then is the same at every step size.
+        // With `exact` the phase does not depend on the step size.
         let config = DmpConfig {
             integrator,
             canonical: CanonicalIntegration::Exact,
@@ -68,7 +68,7 @@ fn with_carry_position_and_velocity_are_continuous_across_segments_and_accelerat
         let (coarse, fine) = (jumps(40, &config), jumps(640, &config));
         for (kind, name) in ["y", "yd"].into_iter().enumerate() {
             let ratio = coarse[kind] / fine[kind];
-            // `paper` holds yd for its first step exactly: its jump is rounding at any step.
+            // `paper` keeps yd constant for its first step: its jump is rounding at any step.
             let held = coarse[kind] < 1e-5;
             assert!(held || (8.0..32.0).contains(&ratio), "{integrator:?} {name} {ratio}");
         }

@@ -1,4 +1,4 @@
-//! What several DMP tests share: every configuration, and random parameters from a named seed.
+//! Shared parts of the DMP tests: every configuration, and random parameters from a named seed.
 
 use super::{Dmp, State};
 use crate::config::{BasisWidths, CanonicalIntegration, DmpConfig, ForcingScaling, Integrator};
@@ -8,8 +8,8 @@ use rand::RngExt;
 pub const INTEGRATORS: [Integrator; 3] =
     [Integrator::SemiImplicit, Integrator::Explicit, Integrator::Paper];
 
-/// Every integrator, forcing scaling, canonical integration and widths, with N and alpha_y cycling
-/// through 3..6 and 5..25 within each: 24 x 16 configurations.
+/// Every combination of integrator, forcing scaling, canonical integration and widths, each with N
+/// from 3 to 6 and alpha_y from 5 to 25: 24 x 16 configurations.
 pub fn every_config() -> impl Iterator<Item = DmpConfig> {
     let mut configs = Vec::new();
     for integrator in INTEGRATORS {
@@ -36,7 +36,7 @@ pub fn every_config() -> impl Iterator<Item = DmpConfig> {
     configs.into_iter()
 }
 
-/// Random parameters of the size that a policy decides.
+/// Random parameters of the same size as a policy's.
 pub struct Draw(pub Stream);
 
 impl Draw {
@@ -49,7 +49,7 @@ impl Draw {
         self.0.random_range(-range..range)
     }
 
-    /// Start, goal, weights: up to 1, omega, 1 and omega^2.
+    /// Start, goal and weights within 1, omega, 1 and omega^2.
     pub fn parameters(&mut self, dmp: &Dmp) -> (State<f64>, f64, Vec<f64>) {
         let omega = dmp.omega();
         let start = State { y: self.uniform(1.0), yd: self.uniform(omega) };

@@ -1,7 +1,7 @@
 //! Transformation system: the spring-damper that the forcing term shapes, stepped through time.
 //!
-//! The reference that the affine map is tested against. Called by `primitive`, which knows where
-//! the forcing values come from; here they are plain numbers.
+//! It is the reference for the tests of the affine map. `primitive` computes the forcing values,
+//! which are plain numbers here.
 
 use crate::config::Integrator;
 use std::ops::{Add, Div, Mul, Sub};
@@ -12,7 +12,7 @@ mod sealed {
     impl Sealed for f64 {}
 }
 
-/// `f32` or `f64`: the precision in which a transformation system is stepped.
+/// Precision in which a transformation system is stepped: `f32` or `f64`.
 pub trait Real:
     sealed::Sealed
     + Copy
@@ -21,7 +21,7 @@ pub trait Real:
     + Mul<Output = Self>
     + Div<Output = Self>
 {
-    /// The nearest number of this precision.
+    /// Rounds to the nearest number of this precision.
     fn from_f64(value: f64) -> Self;
 }
 
@@ -37,7 +37,7 @@ impl Real for f64 {
     }
 }
 
-/// Where a movement starts.
+/// Start of a movement.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct State<T> {
     /// Position y \[u\].
@@ -46,26 +46,26 @@ pub struct State<T> {
     pub yd: T,
 }
 
-/// One moment of a movement.
+/// State of a movement after one step.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Sample<T> {
     /// Position y \[u\].
     pub y: T,
     /// Velocity yd \[u/s\].
     pub yd: T,
-    /// Acceleration ydd \[u/s^2\]: the one that the step which led here computed.
+    /// Acceleration ydd \[u/s^2\] that the step to this sample has computed.
     pub ydd: T,
 }
 
-/// A movement in m steps: m + 1 samples each, index 0 the start.
+/// A movement in m steps: m + 1 samples each, of which index 0 is the start.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Trajectory<T> {
     /// Positions y, (m + 1,) \[u\].
     pub y: Vec<T>,
     /// Velocities yd, (m + 1,) \[u/s\].
     pub yd: Vec<T>,
-    /// Accelerations ydd, (m + 1,) \[u/s^2\]. `ydd[0]` is 0: no step has led to the start (and the
-    /// paper initialises it so).
+    /// Accelerations ydd, (m + 1,) \[u/s^2\]. `ydd[0]` is 0, because no step led to the start (the
+    /// paper initialises it to 0 as well).
     pub ydd: Vec<T>,
 }
 
@@ -85,29 +85,29 @@ impl<T: Real> Trajectory<T> {
     }
 }
 
-/// The transformation system with its step.
+/// The transformation system with its step size.
 ///     tau^2 ydd = alpha_y (beta_y (g - y) - tau yd) + f      (paper, equation 8)
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct TransformationSystem<T> {
-    /// Stiffness alpha_y; beta_y is a quarter of it, which damps critically.
+    /// Stiffness alpha_y; beta_y is a quarter of it, for critical damping.
     pub alpha_y: T,
     /// Duration tau \[s\].
     pub tau: T,
-    /// Step \[s\].
+    /// Step size \[s\].
     pub dt: T,
     /// Order in which position, velocity and acceleration advance.
     pub integrator: Integrator,
 }
 
 impl<T: Real> TransformationSystem<T> {
-    /// One step of `dt`.
+    /// Advances by one step of `dt`.
     ///
     /// With j the step, and ydd_j = ydd(y_{j-1}, yd_{j-1}, f_j) in all three:
     /// - `SemiImplicit`: yd_j = yd_{j-1} + ydd_j dt; y_j = y_{j-1} + yd_j dt.
     /// - `Explicit`: yd_j as above; y_j = y_{j-1} + yd_{j-1} dt.
     /// - `Paper`: yd_j = yd_{j-1} + ydd_{j-1} dt; y_j = y_{j-1} + yd_{j-1} dt (equation 14).
     ///
-    /// - `f`: forcing of this step, f(x_j), goal scaling included \[u/s^2\].
+    /// - `f`: forcing of this step, f(x_j), including goal scaling \[u/s^2\].
     #[must_use]
     pub fn step(&self, previous: Sample<T>, goal: T, f: T) -> Sample<T> {
         let ydd = (self.pull(previous, goal) + f) / (self.tau * self.tau);
@@ -127,16 +127,16 @@ impl<T: Real> TransformationSystem<T> {
         }
     }
 
-    /// The forcing that makes [`step`](Self::step) compute the acceleration `ydd`.
+    /// Computes the forcing for which [`step`](Self::step) gives the acceleration `ydd`.
     ///     f_j = tau^2 ydd_j - alpha_y (beta_y (g - y_{j-1}) - tau yd_{j-1})   (paper, eq. 11)
-    /// The paper writes all with the same index; ours is the exact inverse of the step.
+    /// The paper uses the same index throughout; this is the exact inverse of the step.
     #[must_use]
     pub fn required_forcing(&self, previous: Sample<T>, goal: T, ydd: T) -> T {
         self.tau * self.tau * ydd - self.pull(previous, goal)
     }
 
-    /// One step per forcing value.
-    /// - `forcing`: f(x_1), f(x_2), ... \[u/s^2\], goal scaling included.
+    /// Advances by one step per forcing value.
+    /// - `forcing`: f(x_1), f(x_2), ... \[u/s^2\], including goal scaling.
     pub fn integrate(
         &self,
         start: State<T>,
@@ -153,7 +153,7 @@ impl<T: Real> TransformationSystem<T> {
         trajectory
     }
 
-    /// alpha_y (beta_y (g - y) - tau yd): what spring and damper contribute.
+    /// Contribution of spring and damper, alpha_y (beta_y (g - y) - tau yd).
     fn pull(&self, at: Sample<T>, goal: T) -> T {
         let beta_y = self.alpha_y / T::from_f64(4.0);
         self.alpha_y * (beta_y * (goal - at.y) - self.tau * at.yd)
@@ -164,7 +164,7 @@ impl<T: Real> TransformationSystem<T> {
 mod tests {
     use super::*;
 
-    /// Reference fractions of Neural Dynamic Policies' released code: research/algorithms.md,
+    /// Reference fractions from Neural Dynamic Policies' released code: research/algorithms.md,
     /// section 1, steps 8, 16, 24, 32, 40 of 0.025.
     #[test]
     fn unforced_explicit_response_has_the_fractions_of_neural_dynamic_policies() {

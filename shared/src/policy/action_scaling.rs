@@ -1,5 +1,6 @@
-//! From u to the environment's units, per dimension: action = mid + half_range u, u clipped to
-//! [-1, 1], beyond which a Gaussian's draws may lie.
+//! Scaling from u to the environment's units, per dimension: action = mid + half_range u.
+//!
+//! u is first clipped to [-1, 1], because a Gaussian's draws may be outside.
 
 use crate::spec::EnvSpec;
 
@@ -11,7 +12,7 @@ pub struct ActionScaling {
 }
 
 impl ActionScaling {
-    /// The scaling of an environment whose spec has been checked.
+    /// Creates the scaling for an environment whose spec has been checked.
     #[must_use]
     pub fn new(spec: &EnvSpec) -> Self {
         let bounds = || spec.action_low.iter().zip(&spec.action_high);
@@ -31,7 +32,7 @@ impl ActionScaling {
         }
     }
 
-    /// The u, (rows, A), that leads to `actions`, (rows, A) within their bounds.
+    /// Computes the u, (rows, A), of `actions`, (rows, A), which must be within their bounds.
     pub fn invert(&self, actions: &[f64], u: &mut [f32]) {
         let dims = self.mid.len();
         for (row, out) in actions.chunks_exact(dims).zip(u.chunks_exact_mut(dims)) {

@@ -1,14 +1,16 @@
-//! What makes two policies the same function of parameters and observation.
+//! Hash of a policy's architecture. With equal hashes, equal parameters and observations give equal
+//! actions.
 
 use crate::config::{AlgorithmName, Controller, ExperimentConfig, PolicyKind, StartSource};
 use crate::seeds;
 use crate::spec::EnvSpec;
 
-/// Version of the list below. Snapshots, policy files and checkpoints of another one are foreign.
+/// Version of the hashed list. Snapshots, policy files and checkpoints of another version are
+/// rejected.
 const VERSION: u32 = 1;
 
-/// Hash of everything that changes the function, spelled out: a configuration key that is added
-/// later, or that this kind of policy does not use, leaves stored policies what they were.
+/// Hashes the values that change the policy's function, listed explicitly. Keys that are added
+/// later, or that this kind of policy does not use, do not change the hash of stored policies.
 pub(super) fn hash(config: &ExperimentConfig, spec: &EnvSpec) -> u64 {
     let mut list = format!(
         "{VERSION} {} {} {} {:?} {:?} {:?}",
@@ -99,8 +101,8 @@ mod tests {
 
     #[test]
     fn the_default_policys_hash_is_the_one_that_stored_runs_have() {
-        // If this changes, every stored checkpoint and policy is refused: raise VERSION and say so
-        // in the changelog, or find out what changed by mistake.
+        // If this changes, every stored checkpoint and policy is rejected: raise VERSION and say so
+        // in the changelog, or find the accidental change.
         assert_eq!(format!("{:016x}", hash_of(&[])), "458fc872445cefcd");
     }
 

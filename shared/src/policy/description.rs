@@ -1,5 +1,5 @@
-//! What a policy is apart from its parameters, in a form that a file can hold: enough to build it
-//! again far from the run that trained it.
+//! Serialisable description of a policy without its parameters, from which it can be rebuilt
+//! without the run that trained it.
 
 use serde::{Deserialize, Serialize};
 
@@ -10,23 +10,24 @@ use crate::config::{
 };
 use crate::spec::EnvSpec;
 
-/// Environment, algorithm, policy and DMP: the parts of a configuration that make a policy.
+/// The parts of a configuration that define a policy: environment, algorithm, policy and DMP.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct PolicyDescription {
     /// The environment's sizes, bounds and timing.
     pub spec: EnvSpec,
-    /// What trained it: SAC's network puts out log-stds too, NDP's actions are not squashed.
+    /// Algorithm that trained it: SAC's network also outputs log-stds, and NDP's actions are not
+    /// squashed.
     pub algorithm: AlgorithmName,
     /// Kind, network, ranges, controller and start.
     pub policy: PolicyConfig,
-    /// The movement primitive; of no meaning for `mlp`.
+    /// The movement primitive; unused for `mlp`.
     pub dmp: DmpConfig,
-    /// Where an observation holds y0 and yd0, for `start = "observed"`.
+    /// Entries of an observation that give y0 and yd0, for `start = "observed"`.
     pub start_sources: Vec<StartSource>,
 }
 
 impl PolicyDescription {
-    /// The description of the policy that `config` makes for an environment.
+    /// Describes the policy that `config` defines for an environment.
     #[must_use]
     pub fn new(config: &ExperimentConfig, spec: &EnvSpec) -> Self {
         Self {
@@ -38,17 +39,17 @@ impl PolicyDescription {
         }
     }
 
-    /// Builds the policy. The description may come from anywhere: every value is checked as that
-    /// of a configuration is.
+    /// Builds the policy. The description may be untrusted: every value is checked like that of a
+    /// configuration.
     ///
     /// # Errors
-    /// A value is out of its range, or does not fit the environment.
+    /// If a value is out of range, or does not fit the environment.
     pub fn build(&self) -> Result<Policy, PolicyError> {
         let config = self.config()?;
         Policy::new(&config, &self.spec)
     }
 
-    /// A configuration that makes this policy; what is not the policy's is at its default.
+    /// A configuration that gives this policy; all other values are defaults.
     fn config(&self) -> Result<ExperimentConfig, ConfigError> {
         let mut layers = Layers::new();
         for own in [policy_defaults(self.policy.kind), algorithm_defaults(self.algorithm)] {

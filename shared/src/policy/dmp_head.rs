@@ -1,8 +1,8 @@
-//! From the network's outputs to a segment of actions, and back with gradients.
+//! Maps the network's outputs to a segment of actions, and propagates gradients back.
 //!
-//! Outputs of one action dimension stand together: goal, N weights, 4 rho. With t = tanh(output):
+//! The outputs of one action dimension are adjacent: goal, N weights, 4 rho. With t = tanh(output):
 //! g = goal_range t, w = weight_range omega² t, rho = (1, 0, 0, 0) + rho_range t, or + output for
-//! `free` rho (specification, sections 2 and 3). With `controller = "position"` there is no rho.
+//! `free` rho (specification, sections 2 and 3). There is no rho with `controller = "position"`.
 
 use super::PolicyError;
 use super::start::StartState;
@@ -17,11 +17,11 @@ pub(super) fn carried_len(config: &ExperimentConfig, spec: &EnvSpec) -> usize {
     if carries { 2 * spec.action_len } else { 0 }
 }
 
-/// Parameters of the inverse controller, per dimension.
+/// Number of inverse-controller parameters per dimension.
 const RHO_LEN: usize = 4;
 const RHO_CENTRE: [f32; RHO_LEN] = [1.0, 0.0, 0.0, 0.0];
 
-/// DMP, inverse controller and the ranges of their parameters.
+/// DMP and inverse controller with the ranges of their parameters.
 #[derive(Debug)]
 pub struct DmpHead {
     map: SegmentMap,
@@ -38,12 +38,12 @@ pub struct DmpHead {
     omega: f32,
 }
 
-/// What the forward pass keeps, per row and dimension.
+/// Values that the forward pass keeps, per row and dimension.
 #[derive(Debug)]
 pub struct DmpWorkspace {
-    /// tanh of goal and weight outputs, and tanh (or the raw output) of rho's: (rows, A, 1+N+4).
+    /// tanh of goal and weight outputs, and tanh of (or the raw) rho outputs: (rows, A, 1+N+4).
     squashed: Vec<f32>,
-    /// What the map was given: (rows, A, 3+N).
+    /// Inputs of the segment map: (rows, A, 3+N).
     inputs: Vec<f32>,
     /// y, yd/omega, ydd/omega² at the K samples: (rows, A, 3K).
     samples: Vec<f32>,
@@ -58,20 +58,20 @@ struct Scratch {
     inputs_gradient: Vec<f32>,
 }
 
-/// A gradient that arrives at the head.
+/// Incoming gradient of the head's backward pass.
 #[derive(Debug, Clone, Copy)]
 pub struct HeadGradient<'a> {
-    /// With respect to the means, before their tanh, (rows, K, A).
+    /// Gradient with respect to the means, before their tanh, (rows, K, A).
     pub means: &'a [f32],
-    /// With respect to the end state (y_K (A,), yd_K/omega (A,)), (rows, 2A); empty: none.
+    /// Gradient with respect to the end state (y_K (A,), yd_K/omega (A,)), (rows, 2A); empty: none.
     pub end_state: &'a [f32],
 }
 
 impl DmpHead {
-    /// The head that `config` describes.
+    /// Creates the head that `config` describes.
     ///
     /// # Errors
-    /// If the DMP or the start table does not fit.
+    /// If the DMP or the start table does not fit the environment.
     pub fn new(config: &ExperimentConfig, spec: &EnvSpec) -> Result<Self, PolicyError> {
         let dmp = Dmp::new(&config.dmp, config.policy.segment_steps)?;
         let weight_scale = config.policy.weight_range * dmp.omega() * dmp.omega();
@@ -91,7 +91,7 @@ impl DmpHead {
         })
     }
 
-    /// Outputs that the network must have.
+    /// Number of network outputs that the head reads.
     #[must_use]
     pub fn outputs_len(&self) -> usize {
         self.dims * self.per_dimension()
@@ -126,7 +126,7 @@ impl DmpHead {
         }
     }
 
-    /// Squashes the network's outputs: each row of `stride` begins with the head's A (1+N+4).
+    /// Squashes the network's outputs. Each row of `stride` starts with the head's A (1+N+4).
     pub fn squash(&self, outputs: &[f32], stride: usize, work: &mut DmpWorkspace) {
         let (n, len) = (self.per_dimension(), self.outputs_len());
         let rows = outputs.len() / stride;
@@ -144,13 +144,14 @@ impl DmpHead {
         }
     }
 
-    /// The squashed parameters of row `row`, to draw them at random instead: (A (1+N+4)).
+    /// The squashed parameters of row `row`, (A (1+N+4)), so that they can be drawn at random
+    /// instead.
     pub fn squashed_mut<'a>(&self, work: &'a mut DmpWorkspace, row: usize) -> &'a mut [f32] {
         let len = self.outputs_len();
         &mut work.squashed[row * len..(row + 1) * len]
     }
 
-    /// Makes the means of the segments' actions before their tanh, (rows, K, A), from squashed
+    /// Computes the means of the segments' actions before their tanh, (rows, K, A), from squashed
     /// parameters and observations, (rows, O).
     pub fn segment(&self, observations: &[f32], work: &mut DmpWorkspace, means: &mut [f32]) {
         let (dims, steps) = (self.dims, self.steps);
@@ -180,7 +181,7 @@ impl DmpHead {
         }
     }
 
-    /// (y0, yd0) of every row of observations, (rows, O), and dimension: (rows A, 2).
+    /// Reads (y0, yd0) of every row of observations, (rows, O), and dimension: (rows A, 2).
     #[must_use]
     pub fn starts(&self, observations: &[f32]) -> Vec<f32> {
         let rows = observations.chunks_exact(self.observation_len);
@@ -197,7 +198,8 @@ impl DmpHead {
         if self.rho == RhoKind::Bounded { self.rho_range } else { 1.0 }
     }
 
-    /// (y, yd) of row `row` after step `k` (0: the start), y (A,) then yd (A,), into `state`.
+    /// Writes (y, yd) of row `row` after step `k` (0: the start) into `state`: y (A,), then yd
+    /// (A,).
     pub fn state_at(&self, work: &DmpWorkspace, row: usize, k: usize, state: &mut [f32]) {
         for d in 0..self.dims {
             let cell = row * self.dims + d;
@@ -210,7 +212,7 @@ impl DmpHead {
         }
     }
 
-    /// (y_K (A,), yd_K/omega (A,)) of every row, as the critic takes it, into rows of `out` that
+    /// Writes (y_K (A,), yd_K/omega (A,)) of every row, the critic's input, into rows of `out` that
     /// are `stride` apart.
     pub fn end_states(&self, work: &DmpWorkspace, out: &mut [f32], stride: usize) {
         for (row, out) in out.chunks_mut(stride).enumerate() {
@@ -221,20 +223,20 @@ impl DmpHead {
         }
     }
 
-    /// From (y0, yd0, g, w) to the samples of one dimension.
+    /// The map from (y0, yd0, g, w) to the samples of one dimension.
     #[must_use]
     pub fn map(&self) -> &SegmentMap {
         &self.map
     }
 
-    /// omega = alpha_y / 2, by which the critic's end velocity is divided.
+    /// omega = alpha_y / 2; the critic's end velocity is divided by it.
     #[must_use]
     pub fn omega(&self) -> f32 {
         self.omega
     }
 
-    /// Gradient with respect to the network's outputs: overwrites the head's A (1+N+4) at the
-    /// beginning of each row of `stride`.
+    /// Computes the gradient with respect to the network's outputs. Overwrites the head's A (1+N+4)
+    /// at the start of each row of `stride`.
     pub fn backward(
         &self,
         work: &mut DmpWorkspace,
@@ -267,7 +269,8 @@ impl DmpHead {
         }
     }
 
-    /// From the means' gradient to the samples', both in `scratch`; returns rho's.
+    /// Computes the samples' gradient from the means' gradient, both in `scratch`. Returns rho's
+    /// gradient.
     fn controller_backward(
         &self,
         squashed: &[f32],
@@ -281,7 +284,7 @@ impl DmpHead {
                 act_backward(samples, &rho, means_gradient, samples_gradient)
             }
             Controller::Position => {
-                // The start is measured or carried: nothing is learned through it.
+                // The start is measured or carried, so it gets no gradient.
                 act_position_backward(self.position_scale, means_gradient, samples_gradient);
                 [0.0; RHO_LEN]
             }

@@ -2,27 +2,28 @@
 
 use std::f32::consts::{LN_2, PI};
 
-/// Raw log-stds are clamped to this range, as the published implementations do.
+/// Range to which raw log-stds are clamped, as in the published implementations.
 const LOG_STD_MIN: f32 = -20.0;
 const LOG_STD_MAX: f32 = 2.0;
 
-/// One action drawn, with what the gradients need.
+/// One drawn action, with the values that its gradients need.
 #[derive(Debug, Clone, Copy)]
 pub struct Draw {
     /// u = tanh(mean + std noise).
     pub action: f32,
-    /// log of the density of u.
+    /// Logarithm of the density of u.
     pub log_density: f32,
-    /// std noise: what a change of log-std moves mean + std noise by.
+    /// std noise, which is the derivative of mean + std noise with respect to log-std.
     pub shift: f32,
-    /// Whether the raw log-std lies within its range: beyond, it has no gradient.
+    /// Whether the raw log-std is within its range; outside, its gradient is zero.
     pub in_range: bool,
 }
 
-/// The action that standard normal `noise` makes of a mean before tanh and a raw log-std.
+/// Draws an action from a mean before tanh, a raw log-std and standard normal `noise`.
 ///
-/// log density = log N(noise) - log std - log(1 - u²), the last as 2 (log 2 - x - softplus(-2x)),
-/// which does not lose its digits where tanh saturates (Haarnoja et al. 2018, appendix C).
+/// log density = log N(noise) - log std - log(1 - u²). The last term is computed as 2 (log 2 - x -
+/// softplus(-2x)), which keeps its precision where tanh saturates (Haarnoja et al. 2018, appendix
+/// C).
 #[must_use]
 pub fn draw(mean: f32, raw_log_std: f32, noise: f32) -> Draw {
     let log_std = raw_log_std.clamp(LOG_STD_MIN, LOG_STD_MAX);

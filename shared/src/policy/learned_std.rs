@@ -1,15 +1,15 @@
-//! The distribution that a stochastic policy draws its actions from: one Gaussian whose logarithmic
-//! standard deviation is learned and does not depend on the state (Schulman et al. 2017, section
-//! 6.1; Neural Dynamic Policies), the same for all K steps of a segment.
+//! Action distribution of a stochastic policy: a Gaussian with a learned, state-independent
+//! logarithmic standard deviation.
 //!
-//! The A logarithms stand behind the network's parameters in the policy's flat ones. A draw is not
-//! bounded: the segment keeps it as it is, since its probability is what is learned from, and the
+//! It is the same for all K steps of a segment (Schulman et al. 2017, section 6.1; Neural Dynamic
+//! Policies). The A logarithms follow the network's parameters in the policy's flat ones. A draw is
+//! not bounded. The segment keeps it unclipped, because learning uses its probability; the
 //! environment gets it clipped to the action's bounds.
 
 use crate::config::{AlgorithmName, ExperimentConfig};
 use crate::spec::EnvSpec;
 
-/// Where the logarithms stand, and how they begin.
+/// Position and initial value of the logarithms.
 #[derive(Debug, Clone, PartialEq)]
 pub struct LearnedStd {
     dims: usize,
@@ -17,7 +17,7 @@ pub struct LearnedStd {
 }
 
 impl LearnedStd {
-    /// The one that the algorithm asks for, if it does.
+    /// Creates it if the algorithm uses one.
     pub(super) fn of(config: &ExperimentConfig, spec: &EnvSpec) -> Option<Self> {
         (config.algorithm.name == AlgorithmName::Ndp).then_some(Self {
             dims: spec.action_len,
@@ -25,7 +25,7 @@ impl LearnedStd {
         })
     }
 
-    /// A, the number of its parameters.
+    /// Number of its parameters, A.
     #[must_use]
     #[expect(clippy::len_without_is_empty, reason = "an action has at least one dimension")]
     pub fn len(&self) -> usize {
@@ -36,7 +36,7 @@ impl LearnedStd {
         self.initial_log_std
     }
 
-    /// The logarithms, (A,), of a policy's flat parameters, (P,).
+    /// Returns the logarithms, (A,), of a policy's flat parameters, (P,).
     ///
     /// # Panics
     /// If there are fewer parameters than logarithms.

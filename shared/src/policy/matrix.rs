@@ -1,4 +1,4 @@
-//! The one matrix product that network forward and backward passes are made of.
+//! The matrix product of the networks' forward and backward passes.
 
 use std::ops::Range;
 
@@ -15,7 +15,7 @@ pub struct Matrix<'a> {
 }
 
 impl<'a> Matrix<'a> {
-    /// A row-major matrix that fills `data`.
+    /// Creates a row-major matrix that fills `data`.
     ///
     /// # Panics
     /// If `data` does not have `rows * cols` numbers.
@@ -25,7 +25,7 @@ impl<'a> Matrix<'a> {
         Self { data, rows, cols, row_stride: cols, col_stride: 1 }
     }
 
-    /// The matrix with rows and columns exchanged.
+    /// Returns the transposed matrix.
     #[must_use]
     pub fn transposed(self) -> Self {
         Self {
@@ -37,7 +37,7 @@ impl<'a> Matrix<'a> {
         }
     }
 
-    /// The columns from `first` on.
+    /// Returns the columns from `first` on.
     ///
     /// # Panics
     /// If the matrix has no such column.
@@ -47,7 +47,7 @@ impl<'a> Matrix<'a> {
         Self { data: &self.data[first * self.col_stride..], cols: self.cols - first, ..self }
     }
 
-    /// Some of the columns.
+    /// Returns a range of columns.
     ///
     /// # Panics
     /// If the matrix does not have them.
@@ -63,10 +63,10 @@ impl<'a> Matrix<'a> {
     }
 }
 
-/// `out` = a b, plus what `out` held if `accumulate`; `out` is row-major.
+/// Computes `out` = a b, or `out` += a b, depending on `keep`; `out` is row-major.
 ///
 /// # Panics
-/// If the shapes do not fit.
+/// If the shapes do not match.
 pub fn product(out: &mut [f32], a: Matrix<'_>, b: Matrix<'_>, keep: Keep) {
     assert_eq!(a.cols, b.rows, "inner dimensions of a product");
     assert_eq!(out.len(), a.rows * b.cols, "output of a product");
@@ -77,8 +77,8 @@ pub fn product(out: &mut [f32], a: Matrix<'_>, b: Matrix<'_>, keep: Keep) {
     b.check();
     let (rows, cols, depth) = (a.rows, b.cols, a.cols);
     let keep = keep == Keep::Add;
-    // SAFETY: `check` and the asserts above show that every index that the product reads or
-    // writes lies inside the three slices; `out` is borrowed mutably, so nothing aliases it.
+    // SAFETY: `check` and the asserts above ensure that every index that the product reads or
+    // writes is inside the three slices. `out` is borrowed mutably, so nothing aliases it.
     unsafe {
         gemm::gemm(
             rows,
@@ -104,12 +104,12 @@ pub fn product(out: &mut [f32], a: Matrix<'_>, b: Matrix<'_>, keep: Keep) {
     }
 }
 
-/// What becomes of the output's previous content.
+/// Whether a product replaces the output or adds to it.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Keep {
-    /// It is overwritten.
+    /// The product replaces the output.
     Replace,
-    /// The product is added to it.
+    /// The product is added to the output.
     Add,
 }
 

@@ -1,5 +1,6 @@
-//! From observation to the actions of a segment: the forward pass that rollout, evaluation and
-//! update share.
+//! Policies, which map an observation to the actions of a segment.
+//!
+//! Rollout, evaluation and update share this forward pass.
 //!
 //! ```text
 //!   observation ── network ──► outputs ── tanh, ranges ──► goal, weights, rho   (per dimension)
@@ -7,8 +8,9 @@
 //!                                                            ▼
 //!                              actions u in [-1, 1] ◄── inverse controller ◄── y, yd, ydd
 //! ```
-//! `network` is the multilayer perceptron, `dmp_head` the rest of the `dmp` policy; the `mlp`
-//! policy is the network and a tanh. Everything works on flat `f32` slices and buffers made once.
+//! `network` is the multilayer perceptron, and `dmp_head` the rest of the `dmp` policy. The `mlp`
+//! policy is the network and a tanh. All code works on flat `f32` slices and on buffers that are
+//! allocated once.
 
 mod action_scaling;
 mod architecture;
@@ -42,29 +44,29 @@ use crate::spec::{EnvSpec, SpecError};
 /// Why a policy cannot be built.
 #[derive(Debug, Error)]
 pub enum PolicyError {
-    /// The environment does not fit.
+    /// The environment's spec is invalid.
     #[error(transparent)]
     Spec(#[from] SpecError),
-    /// The DMP's configuration does not fit.
+    /// The DMP's configuration is invalid.
     #[error(transparent)]
     Dmp(#[from] DmpError),
-    /// A value of a description is out of its range.
+    /// A value of a description is out of range.
     #[error(transparent)]
     Config(#[from] ConfigError),
     /// `task.start_sources` does not fit the environment.
     #[error("task.start_sources: {0}")]
     StartSources(String),
-    /// Parameters of another length.
+    /// Wrong number of parameters.
     #[error("policy takes {expected} parameters, got {got}")]
     Length {
-        /// Length the architecture has.
+        /// Length of the architecture's parameters.
         expected: usize,
-        /// Length offered.
+        /// Length of the given parameters.
         got: usize,
     },
 }
 
-/// What turns the network's outputs into actions.
+/// The part of a policy that turns the network's outputs into actions.
 #[derive(Debug)]
 pub enum Head {
     /// One action: u = tanh(output).
@@ -78,11 +80,11 @@ pub enum Head {
 pub struct Policy {
     shape: MlpShape,
     head: Head,
-    /// Outputs of the network that the head reads; log-stds may follow.
+    /// Number of network outputs that the head reads; log-stds may follow.
     head_outputs: usize,
     layout: SegmentLayout,
     learned_std: Option<LearnedStd>,
-    /// Whether u = tanh(mean); the position controller's means are actions already.
+    /// Whether u = tanh(mean). The means of the position controller are already actions.
     squashes: bool,
     scaling: ActionScaling,
     env_observation_len: usize,
@@ -95,11 +97,12 @@ pub struct Policy {
 pub struct PolicyWorkspace {
     /// The network's activations, kept for the backward pass.
     pub activations: Activations,
-    /// What u is made of, (rows, K, A): tanh⁻¹ of u, or u itself (see [`Policy::squashes`]).
+    /// Values from which u is computed, (rows, K, A): tanh⁻¹ of u, or u itself (see
+    /// [`Policy::squashes`]).
     pub means: Vec<f32>,
     /// u, (rows, K, A).
     pub actions: Vec<f32>,
-    /// What the head keeps for the backward pass.
+    /// Values that the head keeps for the backward pass.
     pub dmp: Option<DmpWorkspace>,
 }
 
@@ -107,7 +110,7 @@ impl Policy {
     /// Builds the architecture that `config` describes for an environment.
     ///
     /// # Errors
-    /// If the environment's spec is unsound or does not fit the configuration.
+    /// If the environment's spec is invalid or does not fit the configuration.
     pub fn new(config: &ExperimentConfig, spec: &EnvSpec) -> Result<Self, PolicyError> {
         spec.check()?;
         let steps = config.policy.decision_steps();
@@ -144,19 +147,19 @@ impl Policy {
         })
     }
 
-    /// Identifies the architecture: everything that makes two policies the same function.
+    /// Hash of everything that determines the policy's function, except the parameters.
     #[must_use]
     pub fn architecture_hash(&self) -> u64 {
         self.architecture_hash
     }
 
-    /// What it is apart from its parameters.
+    /// Description of the policy without its parameters.
     #[must_use]
     pub fn description(&self) -> &PolicyDescription {
         &self.description
     }
 
-    /// Sizes of the segments that this policy makes.
+    /// Sizes of the segments that this policy produces.
     #[must_use]
     pub fn layout(&self) -> SegmentLayout {
         self.layout
@@ -168,14 +171,13 @@ impl Policy {
         &self.shape
     }
 
-    /// Length P of the flat parameters: the network's, then those of the action distribution.
+    /// Number P of flat parameters: the network's, then those of the action distribution.
     #[must_use]
     pub fn parameters_len(&self) -> usize {
         self.shape.parameters_len() + self.learned_std.as_ref().map_or(0, LearnedStd::len)
     }
 
-    /// The standard deviations of the Gaussian that actions are drawn from, if they are learned
-    /// and do not depend on the state.
+    /// The state-independent learned standard deviations of the action distribution, if it has any.
     #[must_use]
     pub fn learned_std(&self) -> Option<&LearnedStd> {
         self.learned_std.as_ref()
@@ -193,20 +195,20 @@ impl Policy {
         if self.learned_std.is_some() { ActionBounds::None } else { ActionBounds::Unit }
     }
 
-    /// What follows the network.
+    /// The part that turns the network's outputs into actions.
     #[must_use]
     pub fn head(&self) -> &Head {
         &self.head
     }
 
-    /// Where a Gaussian policy's raw log-stds, (K, A), stand in a row of the network's outputs.
+    /// Range of a Gaussian policy's raw log-stds, (K, A), in a row of the network's outputs.
     #[must_use]
     pub fn log_stds(&self) -> Option<Range<usize>> {
         let outputs = self.head_outputs..self.shape.outputs();
         (!outputs.is_empty()).then_some(outputs)
     }
 
-    /// From u to the environment's own units.
+    /// Scaling from u to the environment's units.
     #[must_use]
     pub fn scaling(&self) -> &ActionScaling {
         &self.scaling
@@ -218,13 +220,13 @@ impl Policy {
         self.env_observation_len
     }
 
-    /// Whether (y, yd) continue from segment to segment and are part of the observation.
+    /// Whether (y, yd) continue across segments and are part of the observation.
     #[must_use]
     pub fn carries_state(&self) -> bool {
         self.layout.observation_len > self.env_observation_len
     }
 
-    /// Freshly drawn parameters.
+    /// Draws initial parameters.
     #[must_use]
     pub fn initial_parameters(&self, random: &mut Xoshiro256PlusPlus) -> Vec<f32> {
         let mut parameters = initial_parameters(&self.shape, random);
@@ -248,13 +250,13 @@ impl Policy {
         }
     }
 
-    /// Computes u for every observation into `work.actions`; with a Gaussian, its mean, which is
-    /// not bounded.
+    /// Computes u for every observation into `work.actions`. For a Gaussian policy this is its
+    /// mean, which is not bounded.
     ///
     /// - `parameters`: (P,). `observations`: (rows, O).
     ///
     /// # Panics
-    /// If a length does not fit or there are more rows than the workspace holds.
+    /// If a length is wrong or there are more rows than the workspace has.
     pub fn act(&self, parameters: &[f32], observations: &[f32], work: &mut PolicyWorkspace) {
         assert_eq!(parameters.len(), self.parameters_len(), "policy parameters");
         let network = &parameters[..self.shape.parameters_len()];
@@ -262,8 +264,8 @@ impl Policy {
         self.decode(observations, work);
     }
 
-    /// The second half of [`Policy::act`]: from the network's outputs, which exploration may have
-    /// disturbed in `work.activations`, to u.
+    /// The second half of [`Policy::act`]: computes u from the network's outputs in
+    /// `work.activations`, to which exploration may have added noise.
     pub fn decode(&self, observations: &[f32], work: &mut PolicyWorkspace) {
         let rows = observations.len() / self.layout.observation_len;
         let (outputs, stride) = (work.activations.output(&self.shape, rows), self.shape.outputs());
@@ -281,7 +283,7 @@ impl Policy {
         self.bound_means(work, rows * self.layout.actions_len());
     }
 
-    /// From the first `len` means to u.
+    /// Computes u from the first `len` means.
     pub fn bound_means(&self, work: &mut PolicyWorkspace, len: usize) {
         work.actions[..len].copy_from_slice(&work.means[..len]);
         if self.squashes {

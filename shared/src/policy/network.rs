@@ -1,4 +1,4 @@
-//! The multilayer perceptron behind every policy and critic: ReLU layers, a linear last layer.
+//! The multilayer perceptron of every policy and critic: ReLU layers and a linear last layer.
 
 use std::ops::Range;
 
@@ -6,7 +6,7 @@ use rand::{Rng, RngExt};
 
 use super::matrix::{Keep, Matrix, product};
 
-/// Widths of a network and where each layer's numbers stand in its flat parameters.
+/// Widths of a network, and the position of each layer in its flat parameters.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct MlpShape {
     widths: Vec<usize>,
@@ -20,14 +20,14 @@ pub struct Layer {
     pub inputs: usize,
     /// Width of its output.
     pub outputs: usize,
-    /// Its weights, (outputs, inputs) row-major, in the flat parameters.
+    /// Range of its weights in the flat parameters, (outputs, inputs) row-major.
     pub weights: Range<usize>,
-    /// Its bias, (outputs,), in the flat parameters.
+    /// Range of its bias in the flat parameters, (outputs,).
     pub bias: Range<usize>,
 }
 
 impl MlpShape {
-    /// A network of the given widths, input first, output last.
+    /// Creates a network of the given widths, input first, output last.
     ///
     /// # Panics
     /// With fewer than two widths.
@@ -73,8 +73,8 @@ impl MlpShape {
     }
 }
 
-/// Draws weights and biases from U(-1/sqrt(inputs), 1/sqrt(inputs)), PyTorch's default for a
-/// linear layer, so that results compare with the baselines'.
+/// Draws weights and biases from U(-1/sqrt(inputs), 1/sqrt(inputs)), PyTorch's default for a linear
+/// layer, so that results are comparable with the baselines.
 pub fn initial_parameters(shape: &MlpShape, random: &mut impl Rng) -> Vec<f32> {
     let mut parameters = Vec::with_capacity(shape.parameters_len());
     for layer in shape.layers() {
@@ -102,7 +102,7 @@ impl Activations {
         self.layer(shape, shape.layers().len() - 1, rows)
     }
 
-    /// As [`Activations::output`], to disturb it.
+    /// As [`Activations::output`], but mutable, so that exploration can add noise.
     pub fn output_mut(&mut self, shape: &MlpShape, rows: usize) -> &mut [f32] {
         let last = self.0.len() - 1;
         &mut self.0[last][..rows * shape.outputs()]
@@ -114,8 +114,8 @@ impl Activations {
         &self.0[index][..rows * shape.layers()[index].outputs]
     }
 
-    /// Where the outputs of layer `index` go, (rows, outputs), beside its inputs, (rows, inputs),
-    /// which for the first layer are `inputs`.
+    /// Returns the inputs, (rows, inputs), and the output buffer, (rows, outputs), of layer
+    /// `index`. For the first layer the inputs are `inputs`.
     pub fn step<'a>(
         &'a mut self,
         shape: &MlpShape,
@@ -133,7 +133,7 @@ impl Activations {
 /// Runs the network on `inputs`, (rows, inputs), into `activations`.
 ///
 /// # Panics
-/// If a length does not fit.
+/// If a length is wrong.
 pub fn forward(
     shape: &MlpShape,
     parameters: &[f32],
@@ -147,7 +147,7 @@ pub fn forward(
     forward_with(shape, parameters, &weights, inputs, activations);
 }
 
-/// Runs the network with each layer's (inputs, outputs) weights as `weights` gives them.
+/// Runs the network with each layer's (inputs, outputs) weights from `weights`.
 fn forward_with<'a>(
     shape: &MlpShape,
     parameters: &[f32],
@@ -174,31 +174,31 @@ fn forward_with<'a>(
     }
 }
 
-/// A network that runs on few rows at a time, as a worker's does, and changes rarely.
+/// A network for few rows at a time and rarely changing parameters, as in a worker.
 ///
-/// A product's cost is then that of reading the weights, and gemm reads them in the order
-/// (inputs, outputs). From the order of the flat parameters it rearranges them at every product,
-/// which takes three times as long as the product: here that is done once for each new policy.
-/// The results are those of [`forward`] up to rounding.
+/// The cost of a product is then that of reading the weights, which gemm needs in the order
+/// (inputs, outputs). From the order of the flat parameters it would rearrange them for every
+/// product, which takes three times as long as the product itself. Here this is done once per new
+/// policy. The results equal those of [`forward`] up to rounding.
 #[derive(Debug, Clone)]
 pub struct SmallBatchNetwork {
     shape: MlpShape,
-    /// As the flat parameters, weights (inputs, outputs).
+    /// The flat parameters with the weights in the order (inputs, outputs).
     parameters: Vec<f32>,
 }
 
 impl SmallBatchNetwork {
-    /// A network whose parameters are zero.
+    /// Creates a network whose parameters are zero.
     #[must_use]
     pub fn new(shape: MlpShape) -> Self {
         let parameters = vec![0.0; shape.parameters_len()];
         Self { shape, parameters }
     }
 
-    /// Takes over flat parameters.
+    /// Loads flat parameters.
     ///
     /// # Panics
-    /// If there are not as many as the shape has.
+    /// If their number does not match the shape.
     pub fn load(&mut self, parameters: &[f32]) {
         assert_eq!(parameters.len(), self.parameters.len(), "network parameters");
         for layer in self.shape.layers() {
@@ -216,7 +216,7 @@ impl SmallBatchNetwork {
     /// Runs the network on `inputs`, (rows, inputs), into `activations`.
     ///
     /// # Panics
-    /// If a length does not fit.
+    /// If a length is wrong.
     pub fn forward(&self, inputs: &[f32], activations: &mut Activations) {
         let weights = |layer: &Layer| {
             let weights = &self.parameters[layer.weights.clone()];

@@ -1,23 +1,24 @@
-//! Where a segment's DMP starts: y0 and yd0 of every action dimension.
+//! Initial state (y0, yd0) of a segment's DMP, for every action dimension.
 
 use super::PolicyError;
 use crate::config::{ExperimentConfig, Start, StartSource, StartVelocity};
 use crate::spec::EnvSpec;
 
-/// How (y0, yd0) come out of an observation.
+/// Source of (y0, yd0).
 #[derive(Debug, Clone, PartialEq)]
 pub enum StartState {
     /// y0 = yd0 = 0.
     Zero,
-    /// Measured: one source a dimension; velocities are multiplied by `velocity_scale`.
+    /// Read from the observation with one source per dimension. Velocities are multiplied by
+    /// `velocity_scale`.
     Observed {
-        /// Where each dimension's position and velocity stand.
+        /// Entries that give each dimension's position and velocity.
         sources: Vec<StartSource>,
-        /// DMP time runs tau = 1 per segment while the robot's runs K control steps:
-        /// K * control_dt_s [s], or 0 for `start_velocity = "zero"`.
+        /// Duration of a segment, K * control_dt_s [s], or 0 for `start_velocity = "zero"`. It
+        /// converts velocities to DMP time, in which a segment has the duration tau = 1.
         velocity_scale: f32,
     },
-    /// Carried: y (A,) then yd (A,) follow the environment's observation at this index.
+    /// Carried: y (A,), then yd (A,) follow the environment's observation at this index.
     Carry {
         /// Length of the environment's observation.
         at: usize,
@@ -25,7 +26,7 @@ pub enum StartState {
 }
 
 impl StartState {
-    /// Reads the configuration.
+    /// Creates it from the configuration.
     ///
     /// # Errors
     /// `StartSources` if the table does not fit the environment.
@@ -44,7 +45,7 @@ impl StartState {
         }
     }
 
-    /// (y0, yd0) of action dimension `d` of `dims`.
+    /// Returns (y0, yd0) of action dimension `d` of `dims`.
     #[must_use]
     pub fn read(&self, observation: &[f32], d: usize, dims: usize) -> (f32, f32) {
         match self {
@@ -52,7 +53,7 @@ impl StartState {
             Self::Carry { at } => (observation[at + d], observation[at + dims + d]),
             Self::Observed { sources, velocity_scale } => match &sources[d] {
                 StartSource::Angle { cos, sin, velocity } => {
-                    // -0 counts as 0: it would lead to the other side.
+                    // Converts -0 to 0, because atan2 of -0 can be -pi instead of pi.
                     let angle = (observation[*sin] + 0.0).atan2(observation[*cos] + 0.0);
                     (angle, observation[*velocity] * velocity_scale)
                 }

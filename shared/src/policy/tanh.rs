@@ -1,20 +1,20 @@
-//! tanh of many numbers at once, by which policies bound their outputs.
+//! Vectorised tanh, with which policies bound their outputs.
 //!
-//! The library's takes a call and 20 ns a number, which was a tenth of an update. This one has no
-//! branch, so the compiler turns the loop into vector instructions, and rounds the same with all
-//! of them: workers and learner get the same bits whatever their processors.
+//! The library's tanh takes a call and 20 ns per number, which was a tenth of an update. This one
+//! has no branch, so the compiler vectorises the loop. It rounds identically for all instruction
+//! sets, so workers and learner get the same bits on any processor.
 
 use pulp::{Arch, Simd, WithSimd};
 
-/// From here on tanh is 1 in f32.
+/// From this value on, tanh is 1 in f32.
 const SATURATED: f32 = 9.02;
-/// 1.5 * 2^23: adding it rounds to a whole number, which then stands in the lowest bits.
+/// 1.5 * 2^23: adding it rounds to an integer, which is then in the lowest bits.
 const ROUNDING: f32 = 12_582_912.0;
-/// ln 2 in two parts, the first with so few digits that small multiples of it are exact.
+/// ln 2 in two parts, of which the first has so few digits that small multiples of it are exact.
 const LN_2_HIGH: f32 = 0.693_359_4;
 const LN_2_LOW: f32 = -2.121_944_4e-4;
 
-/// Replaces every number by its tanh, to 3e-7 of it; NaN stays NaN.
+/// Replaces every number by its tanh, with a relative error of at most 3e-7. NaN stays NaN.
 pub fn tanh(values: &mut [f32]) {
     Arch::new().dispatch(Job(values));
 }
@@ -32,13 +32,13 @@ impl WithSimd for Job<'_> {
     }
 }
 
-/// With e = exp(2|x|) - 1: tanh|x| = e / (e + 2), which loses nothing near zero.
+/// Computes tanh|x| = e / (e + 2) with e = exp(2|x|) - 1, which keeps full precision near zero.
 ///
-/// exp(t) = 2^n exp(r), |r| <= ln(2) / 2, exp(r) - 1 by its Taylor series; so
-/// e = 2^n (exp(r) - 1) + (2^n - 1).
+/// With t = 2|x|, exp(t) = 2^n exp(r), |r| <= ln(2) / 2, and exp(r) - 1 from its Taylor series, e =
+/// 2^n (exp(r) - 1) + (2^n - 1).
 #[inline(always)]
 fn tanh_of(x: f32) -> f32 {
-    // Not `min`, which would make a number of NaN.
+    // Not `min`, which would replace NaN by a number.
     let size = if x.abs() > SATURATED { SATURATED } else { x.abs() };
     let t = 2.0 * size;
     let rounded = t * std::f32::consts::LOG2_E + ROUNDING;

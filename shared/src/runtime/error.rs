@@ -1,55 +1,55 @@
-//! What the runtime refuses.
+//! Errors of the runtime.
 
 use thiserror::Error;
 
 use crate::policy_file::PolicyFileError;
 
-/// Why there is no action.
+/// Why the runtime returns no action.
 #[derive(Debug, Error)]
 pub enum RuntimeError {
-    /// The policy's file.
+    /// The policy file cannot be used.
     #[error(transparent)]
     File(#[from] PolicyFileError),
-    /// An observation of another length.
+    /// An observation of the wrong length.
     #[error("an observation of {got} numbers, expected {expected}")]
     Length {
         /// Length O of the environment's observations.
         expected: usize,
-        /// Length offered.
+        /// Actual length.
         got: usize,
     },
-    /// An observation that is none.
+    /// An observation with a value that is not finite.
     #[error("observation[{index}], {name}, is {value}: expected a finite number")]
     NotFinite {
-        /// Which entry.
+        /// Index of the entry.
         index: usize,
-        /// What it is called.
+        /// Name of the entry.
         name: String,
         /// Its value.
         value: f64,
     },
-    /// The network's outputs are no numbers.
+    /// The network's outputs are NaN.
     #[error(
         "the policy makes no finite action of this observation: it is far beyond what it was \
          trained on"
     )]
     Decision,
-    /// A start that the policy cannot begin at.
+    /// The given start is invalid for this policy.
     #[error("this policy cannot begin at that y0: {reason}")]
     Start {
-        /// Why not.
+        /// The reason.
         reason: String,
     },
-    /// A limit that is none.
+    /// An invalid limit.
     #[error("{what} of action dimension {dimension} is {got}: expected {expected}")]
     Limit {
-        /// Which limit.
+        /// Name of the limit.
         what: &'static str,
-        /// Which action dimension.
+        /// Index of the action dimension.
         dimension: usize,
-        /// What fits.
+        /// Expected value.
         expected: String,
-        /// What was offered.
+        /// Actual value.
         got: String,
     },
 }

@@ -1,13 +1,14 @@
-//! A trained policy next to a robot: from an observation to the actions of a segment, or to one
-//! action a control step, without Python, without the run that trained it, and with what a robot
-//! needs besides: no observation is acted on that is not one, no action leaves its bounds or moves
-//! faster than allowed, and when observations stop, the robot holds.
+//! Runs a trained policy on a robot, without Python and without the run that trained it.
+//!
+//! It returns the actions of a segment, or one action per control step. It rejects invalid
+//! observations, keeps actions within their bounds and below a maximum rate, and holds the robot
+//! when observations stop.
 //!
 //! ```
 #![doc = include_str!("../../examples/act.rs")]
 //! ```
-//! `dmprl.Policy` does the same with NumPy (`envs_py/dmprl/policy.py`); a test holds both to each
-//! other, and the ONNX graph to both.
+//! `dmprl.Policy` does the same with NumPy (`envs_py/dmprl/policy.py`). A test compares both with
+//! each other and with the ONNX graph.
 
 mod error;
 mod safety;
@@ -23,46 +24,46 @@ use crate::policy::{Head, Policy, PolicyWorkspace, SmallBatchNetwork};
 use crate::policy_file::{self, OpenedPolicy};
 use crate::spec::EnvSpec;
 
-/// A policy that acts, one observation at a time. It allocates nothing once it is made.
+/// Runs a policy on one observation at a time. It allocates only on creation.
 #[derive(Debug)]
 pub struct PolicyRuntime {
     policy: Policy,
     network: SmallBatchNetwork,
     work: PolicyWorkspace,
     safety: Safety,
-    /// What the policy sees, (O,): the environment's part, then a carried DMP state.
+    /// The policy's input, (O,): the environment's observation, then a carried DMP state.
     seen: Vec<f32>,
-    /// (y, yd) that the next segment's DMP begins at, (2A,); empty if it is not carried.
+    /// Start (y, yd) of the next segment's DMP, (2A,); empty if it is not carried.
     carried: Vec<f32>,
-    /// The segment's actions as decided, (K, A), in the environment's units.
+    /// The segment's actions before limits, (K, A), in the environment's units.
     decided: Vec<f64>,
-    /// As they were given out, (K, A).
+    /// The segment's actions after limits, (K, A).
     given: Vec<f64>,
-    /// Steps of the segment that were given out; K: a decision is due.
+    /// Number of the segment's steps already executed; at K a decision is due.
     step: usize,
-    /// The action before, (A,); before the first, the hold.
+    /// The previous action, (A,); initially the hold.
     previous: Vec<f64>,
-    /// Whether an action was given out since the reset.
+    /// Whether any action has been returned since the reset.
     has_acted: bool,
-    /// Calls of [`PolicyRuntime::action`] without an observation, in a row.
+    /// Consecutive calls of [`PolicyRuntime::action`] without an observation.
     missed: usize,
     holding: bool,
 }
 
 impl PolicyRuntime {
-    /// Loads a policy file: one that `dmprl export` wrote, or one of a run's `policies/`.
+    /// Loads a policy file, written by `dmprl export` or from a run's `policies/`.
     ///
     /// # Errors
-    /// `File` if it cannot be read or says too little.
+    /// `File` if it cannot be read or is incomplete.
     pub fn load(path: &Path) -> Result<Self, RuntimeError> {
         let OpenedPolicy { policy, snapshot, .. } = policy_file::open(path)?;
         Ok(Self::new(policy, &snapshot.values))
     }
 
-    /// Acts with a policy and its parameters, (P,).
+    /// Creates a runtime from a policy and its parameters, (P,).
     ///
     /// # Panics
-    /// If there are not as many parameters as the policy has.
+    /// If the number of parameters is not the policy's.
     #[must_use]
     pub fn new(policy: Policy, parameters: &[f32]) -> Self {
         assert_eq!(parameters.len(), policy.parameters_len(), "policy parameters");
@@ -93,7 +94,7 @@ impl PolicyRuntime {
         &self.policy.description().spec
     }
 
-    /// K, the control steps of one decision.
+    /// Control steps per decision, K.
     #[must_use]
     pub fn segment_steps(&self) -> usize {
         self.policy.layout().segment_steps
@@ -105,25 +106,26 @@ impl PolicyRuntime {
         &self.safety
     }
 
-    /// As [`PolicyRuntime::safety`], to set them; they hold from the next action on.
+    /// Mutable limits and watchdog. Changes apply from the next action on.
     pub fn safety_mut(&mut self) -> &mut Safety {
         &mut self.safety
     }
 
-    /// Whether the last action was the hold: observations had stopped, or it was asked for.
+    /// Whether the last action was the hold, because observations had stopped or by request.
     #[must_use]
     pub fn is_holding(&self) -> bool {
         self.holding
     }
 
-    /// Begins an episode: the next action begins a segment. The robot is taken to have commanded
-    /// the hold before, which is where a limited rate begins.
+    /// Starts an episode. The next action starts a segment.
     ///
-    /// - `y0`: where the DMP begins, (A,) in units of y, for a policy that carries its state from
-    ///   segment to segment (`policy.start = "carry"`); at 0 by default, as in training.
+    /// A limited rate starts from the hold, as if the robot had executed the hold before.
+    ///
+    /// - `y0`: start of the DMP, (A,) in units of y, for a policy that carries its state across
+    ///   segments (`policy.start = "carry"`). The default is 0, as in training.
     ///
     /// # Errors
-    /// `Start`: y0 is not A finite numbers, or the policy's start is not its own to choose.
+    /// `Start` if y0 is not A finite numbers, or if the policy does not carry its state.
     pub fn reset(&mut self, y0: Option<&[f32]>) -> Result<(), RuntimeError> {
         if let Some(y0) = y0 {
             let dims = self.policy.layout().action_len;
@@ -145,13 +147,14 @@ impl PolicyRuntime {
         Ok(())
     }
 
-    /// Decides: the next segment's actions, (K, A), in the environment's units, all to be executed.
+    /// Decides the next segment's actions, (K, A), in the environment's units. All of them must be
+    /// executed.
     ///
     /// - `observation`: (O,) in the environment's units.
     ///
     /// # Errors
-    /// The observation is not one, or what the network makes of it is no action. There is no action
-    /// then but [`PolicyRuntime::hold`]; the policy goes on at the next good observation.
+    /// If the observation is invalid, or the network's outputs are NaN. The only available action
+    /// is then [`PolicyRuntime::hold`]; the policy continues at the next valid observation.
     pub fn segment(&mut self, observation: &[f64]) -> Result<&[f64], RuntimeError> {
         self.decide(observation)?;
         self.missed = 0;
@@ -162,14 +165,14 @@ impl PolicyRuntime {
         Ok(&self.given)
     }
 
-    /// The next control step's action, (A,), in the environment's units.
+    /// Returns the next control step's action, (A,), in the environment's units.
     ///
-    /// At a segment's first step the policy decides by the observation; within a segment it moves
-    /// on as it has decided, and an observation only tells the watchdog that there are some.
+    /// At a segment's first step the policy decides from the observation. Within a segment it
+    /// executes that decision, and observations only reset the watchdog.
     ///
-    /// - `observation`: (O,) in the environment's units; none if no new one has come since the
-    ///   last call. After [`Safety::hold_after`] calls without one, and where a decision is due,
-    ///   the action is the hold, and the next observation begins a new segment.
+    /// - `observation`: (O,) in the environment's units; `None` if there is no new one since the
+    ///   last call. After [`Safety::hold_after`] calls without one, or if a decision is due without
+    ///   one, the action is the hold, and the next observation starts a new segment.
     ///
     /// # Errors
     /// As [`PolicyRuntime::segment`], at every step.
@@ -198,8 +201,8 @@ impl PolicyRuntime {
         Ok(&self.previous)
     }
 
-    /// A control step towards the hold, as far as the rate allows, (A,): what to command after an
-    /// error, and whenever the policy is not to act. The next observation begins a new segment.
+    /// Returns a control step towards the hold, as far as the rate allows, (A,). Use it after an
+    /// error, and whenever the policy must not act. The next observation starts a new segment.
     pub fn hold(&mut self) -> &[f64] {
         self.holding = true;
         self.approach_hold();
@@ -211,14 +214,14 @@ impl PolicyRuntime {
         self.safety.approach_hold(&mut self.previous);
     }
 
-    /// The robot is taken to have commanded the hold before its first action.
+    /// Starts from the hold before the first action.
     fn begin_at_hold(&mut self) {
         if !std::mem::replace(&mut self.has_acted, true) {
             self.previous.copy_from_slice(self.safety.hold());
         }
     }
 
-    /// Gives out the segment's next action, into `given` and `previous`.
+    /// Executes the segment's next action, into `given` and `previous`.
     fn give(&mut self) {
         self.begin_at_hold();
         let dims = self.previous.len();
@@ -242,7 +245,7 @@ impl PolicyRuntime {
         of_dmp.copy_from_slice(&self.carried);
         self.network.forward(&self.seen, &mut self.work.activations);
         self.policy.decode(&self.seen, &mut self.work);
-        // Beyond all that was trained on, sums of large numbers can be no number.
+        // Far outside the training data, sums of large numbers can be NaN.
         if self.work.actions.iter().any(|u| u.is_nan()) {
             self.step = self.segment_steps();
             return Err(RuntimeError::Decision);
@@ -257,7 +260,7 @@ impl PolicyRuntime {
         if observation.len() != expected {
             return Err(RuntimeError::Length { expected, got: observation.len() });
         }
-        // As the policy sees it: 1e300 is infinite to it.
+        // The policy reads f32, in which 1e300 is infinite.
         match observation.iter().position(|&value| !(value as f32).is_finite()) {
             None => Ok(()),
             Some(index) => Err(RuntimeError::NotFinite {

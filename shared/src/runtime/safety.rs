@@ -1,22 +1,22 @@
-//! What stands between a policy and a robot: bounds, a limited rate, and the hold.
+//! Limits between a policy and a robot: bounds, a maximum rate, and the hold.
 
 use super::RuntimeError;
 use crate::spec::EnvSpec;
 
-/// Limits of the actions that are given out, and what is commanded when observations stop.
+/// Limits of the returned actions, and the hold for missing observations.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Safety {
     low: Vec<f64>,
     high: Vec<f64>,
-    /// Largest change of each action dimension from one control step to the next.
+    /// Maximum change of each action dimension between control steps.
     rate: Vec<f64>,
     hold: Vec<f64>,
     hold_after: usize,
 }
 
 impl Safety {
-    /// The environment's bounds, any rate, a hold of 0 (no torque, no displacement) or the bound
-    /// next to it, after `segment_steps` steps without an observation.
+    /// Defaults: the environment's bounds, no rate limit, and a hold after `segment_steps` steps
+    /// without an observation. The hold is 0 (no torque, no displacement), or the nearest bound.
     pub(super) fn new(spec: &EnvSpec, segment_steps: usize) -> Self {
         let bounds = spec.action_low.iter().zip(&spec.action_high);
         Self {
@@ -28,7 +28,7 @@ impl Safety {
         }
     }
 
-    /// The action that is commanded when observations have stopped, (A,).
+    /// The action for missing observations, (A,).
     #[must_use]
     pub fn hold(&self) -> &[f64] {
         &self.hold
@@ -40,8 +40,8 @@ impl Safety {
         self.hold_after
     }
 
-    /// Lets the robot hold after so many control steps without an observation. More than K changes
-    /// nothing: without an observation there is no next segment.
+    /// Sets the number of control steps without an observation after which the robot holds. More
+    /// than K has no effect, because the next segment needs an observation.
     pub fn set_hold_after(&mut self, steps: usize) {
         self.hold_after = steps;
     }
@@ -49,7 +49,7 @@ impl Safety {
     /// Sets the action that holds the robot, (A,).
     ///
     /// # Errors
-    /// `Limit`: a dimension is missing, too many, or out of its bounds; nothing is changed then.
+    /// `Limit` if the number of dimensions is wrong, or one is out of bounds. Nothing changes then.
     pub fn set_hold(&mut self, hold: &[f64]) -> Result<(), RuntimeError> {
         let expected = |d: usize| format!("{} to {}", self.low[d], self.high[d]);
         self.check("the hold", hold, &expected, |d, value| {
@@ -59,11 +59,11 @@ impl Safety {
         Ok(())
     }
 
-    /// Limits the change of each action dimension from one control step to the next, (A,) in the
+    /// Sets the maximum change of each action dimension between control steps, (A,) in the
     /// environment's units; infinity: no limit.
     ///
     /// # Errors
-    /// `Limit`: a dimension is missing, too many, or not positive; nothing is changed then.
+    /// `Limit` if the number of dimensions is wrong, or one is not positive. Nothing changes then.
     pub fn set_rate(&mut self, rate: &[f64]) -> Result<(), RuntimeError> {
         let expected = |_| "a positive number".to_owned();
         self.check("the rate", rate, &expected, |_, value| value > 0.0)?;
@@ -88,7 +88,7 @@ impl Safety {
         Err(RuntimeError::Limit { what, dimension, expected, got })
     }
 
-    /// Moves `previous` towards `wanted` as far as is allowed.
+    /// Moves `previous` towards `wanted` as far as the limits allow.
     pub(super) fn limit(&self, wanted: &[f64], previous: &mut [f64]) {
         for (d, (wanted, previous)) in wanted.iter().zip(previous).enumerate() {
             let reach = *previous - self.rate[d]..=*previous + self.rate[d];
@@ -96,7 +96,7 @@ impl Safety {
         }
     }
 
-    /// Moves `previous` towards the hold as far as is allowed.
+    /// Moves `previous` towards the hold as far as the limits allow.
     pub(super) fn approach_hold(&self, previous: &mut [f64]) {
         self.limit(&self.hold, previous);
     }

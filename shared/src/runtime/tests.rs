@@ -1,4 +1,4 @@
-//! A policy next to a robot, fed with what robots send.
+//! The runtime with the observations that robots send, valid and invalid.
 
 use super::*;
 use crate::config::{ExperimentConfig, Layers};
@@ -30,7 +30,7 @@ fn policy(keys: &[(&str, &str)]) -> Policy {
     Policy::new(&config, &spec()).unwrap()
 }
 
-/// With parameters large enough that actions differ from step to step.
+/// Scales the parameters up, so that actions differ from step to step.
 fn runtime(keys: &[(&str, &str)]) -> PolicyRuntime {
     let policy = policy(keys);
     let mut parameters = policy.initial_parameters(&mut seeds::stream(1, "test", 0));
@@ -73,7 +73,7 @@ fn one_action_a_step_is_the_segment_step_by_step() {
             let first = observation(f64::from(decision));
             let segment = whole.segment(&first).unwrap().to_vec();
             for (k, expected) in segment.chunks(DIMS).enumerate() {
-                // What comes within a segment decides nothing.
+                // Observations within a segment decide nothing.
                 let now = if k == 0 { first } else { observation(100.0 + k as f64) };
                 let action = stepwise.action((k != 2).then_some(&now)).unwrap();
                 assert_eq!(action, expected, "{keys:?}, decision {decision}, step {k}");
@@ -119,13 +119,13 @@ fn no_action_leaves_its_bounds_whatever_is_observed() {
                             assert!((1.0..=4.0).contains(&action[1]), "{action:?}");
                         }
                     }
-                    // Sums of what large numbers make need not be numbers.
+                    // Sums of large numbers can be NaN.
                     Err(RuntimeError::Decision) => {}
                     Err(error) => panic!("{error}"),
                 }
             }
         }
-        // And afterwards it acts as ever.
+        // Afterwards it acts as before.
         runtime.reset(None).unwrap();
         runtime.segment(&observation(1.0)).unwrap();
     }
@@ -177,7 +177,7 @@ fn the_robot_holds_when_observations_stop_and_goes_on_when_they_come_again() {
     assert_eq!(runtime.action(Some(&now)).unwrap(), expected);
     assert!(!runtime.is_holding());
 
-    // Where a decision is due there is nothing to go on with.
+    // Where a decision is due, a missing observation leads to the hold.
     for _ in 1..STEPS {
         runtime.action(Some(&now)).unwrap();
     }
@@ -226,7 +226,7 @@ fn errors_answered_by_the_hold_move_no_faster_than_allowed_either() {
     let mut before = runtime.safety().hold().to_vec();
     let (mut held, mut acted) = (0, 0);
     for step in 0..120 {
-        // Twenty good ones, then twenty bad ones, and so on.
+        // Twenty good observations, then twenty bad ones, and so on.
         let now = if step / 20 % 2 == 0 { observation(f64::from(step)) } else { bad };
         let action = match runtime.action(Some(&now)) {
             Ok(action) => {

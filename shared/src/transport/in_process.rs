@@ -1,6 +1,6 @@
 //! Segment queues, the parameter channel and the acknowledgement channel inside one process.
 //!
-//! Bounded like the shared-memory ones and under the same contract test. Buffers circulate
+//! They are bounded like the shared-memory ones and pass the same contract test. Buffers circulate
 //! between a free list and the queue, so nothing is allocated after construction.
 
 use std::collections::VecDeque;
@@ -35,13 +35,13 @@ struct Queue {
     attached: bool,
 }
 
-/// A queue holds plain data that is consistent after every statement: a panic elsewhere while the
-/// lock was held leaves nothing half-written.
+/// Locks a mutex and ignores poisoning: the data is consistent after every statement, so a panic
+/// while the lock was held leaves nothing half-written.
 fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
     mutex.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
-/// A worker's end.
+/// A worker's end of its queue.
 #[derive(Debug)]
 pub struct Sender(Arc<Mutex<Queue>>);
 
@@ -52,7 +52,7 @@ pub struct Receiver {
     next: usize,
 }
 
-/// One queue of `capacity` segments for each of `workers` workers.
+/// Creates one queue of `capacity` segments for each of `workers` workers.
 #[must_use]
 pub fn segment_queues(
     workers: usize,
@@ -72,7 +72,7 @@ pub fn segment_queues(
 }
 
 impl SegmentSender for Sender {
-    /// There is one connection, and nothing that breaks.
+    /// Does nothing: the one connection never breaks.
     fn renew(&mut self) -> Result<bool, TransportError> {
         Ok(false)
     }
@@ -104,7 +104,7 @@ impl SegmentReceiver for Receiver {
             let mut queue = lock(&self.queues[index]);
             if let Some(mut taken) = queue.full.pop_front() {
                 std::mem::swap(segment, &mut taken);
-                // The caller's buffer takes the place of the one handed out.
+                // The caller's buffer replaces the one handed out.
                 taken.block.resize(queue.block_len, 0.0);
                 queue.free.push(taken);
                 self.next = index + 1;
@@ -138,7 +138,7 @@ pub struct Subscriber {
     architecture_hash: u64,
 }
 
-/// A channel for snapshots of one architecture.
+/// Creates a channel for snapshots of one architecture.
 #[must_use]
 pub fn parameter_channel(architecture_hash: u64) -> (Publisher, Subscriber) {
     let newest = Arc::new(Mutex::new(ParameterSnapshot::default()));

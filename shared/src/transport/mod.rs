@@ -1,9 +1,9 @@
 //! Stages 4 and 7 of 8: segments from workers to the learner, policy snapshots back.
 //!
-//! Two implementations of the same six traits: `in_process` (one-process runs and tests) and
-//! `shared_memory` (iceoryx2, between processes). No call here waits: a full queue is reported,
-//! and who waits, how long and on whom to blame it is the caller's business. What is kept until it
-//! has arrived for good, and what has arrived before, is `delivery`'s.
+//! The same six traits have two implementations: `in_process` (one-process runs and tests) and
+//! `shared_memory` (iceoryx2, between processes). No call blocks: a full queue is reported, and the
+//! caller decides how long to wait. `delivery` keeps segments until they are acknowledged, and
+//! drops duplicates.
 
 pub mod delivery;
 pub mod in_process;
@@ -15,76 +15,79 @@ use thiserror::Error;
 use crate::parameters::{ParameterSnapshot, SnapshotError};
 use crate::segment::{Segment, SegmentHeader};
 
-/// What became of a segment that was offered.
+/// Result of offering a segment.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum SendOutcome {
-    /// It lies in the learner's queue.
+    /// The segment is in the learner's queue.
     Delivered,
-    /// The queue is full: offer it again later.
+    /// The queue is full; retry later.
     Full,
-    /// No learner is attached (not yet, or no longer): offer it again later.
+    /// No learner is attached (not yet, or no longer); retry later.
     Detached,
 }
 
 /// Why the transport failed.
 #[derive(Debug, Error)]
 pub enum TransportError {
-    /// The middleware refused an operation.
+    /// The middleware returned an error.
     #[error("{operation} on {name}: {cause}")]
     Middleware {
-        /// What was attempted.
+        /// The attempted operation.
         operation: &'static str,
-        /// Service or directory.
+        /// The service or directory.
         name: String,
-        /// The middleware's own words.
+        /// The middleware's error message.
         cause: String,
     },
-    /// The peer was built from another version or runs another configuration.
+    /// The peer has another version or another configuration.
     #[error("{name}: peers disagree, {cause}; start both from the same build and configuration")]
     Incompatible {
-        /// Service.
+        /// The service.
         name: String,
-        /// What differs.
+        /// The difference.
         cause: String,
     },
-    /// The place belongs to a live process, or to one that is just being cleaned up after.
+    /// The slot belongs to a live process, or to a dead one that has not been cleaned up yet.
     #[error("{name} is taken ({cause}): try again when the process that holds it has ended")]
     Taken {
-        /// Service.
+        /// The service.
         name: String,
-        /// The middleware's own words.
+        /// The middleware's error message.
         cause: String,
     },
-    /// A segment or a snapshot of the wrong length was offered, or received.
+    /// A segment or snapshot of the wrong length was offered or received.
     #[error("{got} numbers, this channel carries {expected}")]
     Length {
-        /// Length the channel was made for.
+        /// Length that the channel was created for.
         expected: usize,
-        /// Length offered or received.
+        /// Length that was offered or received.
         got: usize,
     },
-    /// The run's shared-memory directory is not usable.
+    /// The run's shared-memory directory is unusable.
     #[error(transparent)]
     Domain(#[from] shared_memory::DomainError),
-    /// A damaged or foreign snapshot.
+    /// A damaged snapshot, or one of another architecture.
     #[error(transparent)]
     Snapshot(#[from] SnapshotError),
 }
 
 /// The worker's end of its segment queue.
 pub trait SegmentSender {
-    /// Connects anew if there is another learner or the connection broke; to be called before each
-    /// round of offers. True once for each new connection: what was delivered through the one
-    /// before and is not acknowledged may be lost.
+    /// Reconnects if there is a new learner or the connection broke. Call it before each round of
+    /// offers.
+    ///
+    /// Returns true once for each new connection. Unacknowledged segments that were delivered
+    /// through the previous connection may be lost.
     ///
     /// # Errors
-    /// `Incompatible` if the learner follows another plan, others when they persist.
+    /// `Incompatible` if the learner has another plan; other errors if they persist.
     fn renew(&mut self) -> Result<bool, TransportError>;
 
-    /// Offers one segment without waiting. Only `Delivered` means that it was taken.
+    /// Offers one segment without blocking. The queue has accepted it only if the result is
+    /// `Delivered`.
     ///
     /// # Errors
-    /// `Length` if the block does not fit, `Middleware` if the queue is broken.
+    /// `Length` if the block has the wrong length, `Middleware` if the queue is broken.
     fn try_send(
         &mut self,
         header: &SegmentHeader,
@@ -92,7 +95,7 @@ pub trait SegmentSender {
     ) -> Result<SendOutcome, TransportError>;
 }
 
-/// The learner's end of all segment queues, taken from in turn so that none starves.
+/// The learner's end of all segment queues, which it serves in turn so that no worker starves.
 pub trait SegmentReceiver {
     /// Copies the next segment into `segment`; `false` if every queue is empty.
     ///
@@ -100,23 +103,22 @@ pub trait SegmentReceiver {
     /// `Middleware` if a queue is broken.
     fn try_receive(&mut self, segment: &mut Segment) -> Result<bool, TransportError>;
 
-    /// Frees what dead workers left behind; to be called a few times a second.
+    /// Frees the resources of dead workers. Call it a few times a second.
     ///
     /// # Errors
-    /// `Middleware` if the cleaning itself failed.
+    /// `Middleware` if the cleanup failed.
     fn maintain(&mut self) -> Result<(), TransportError>;
 }
 
-/// The learner's end of the parameter channel: the newest snapshot replaces the one before.
+/// The learner's end of the parameter channel. Each snapshot replaces the previous one.
 pub trait ParameterPublisher {
-    /// Publishes a snapshot to all workers, and to those that join later.
+    /// Publishes a snapshot to all workers, including those that join later.
     ///
     /// # Errors
-    /// `Length` if it does not fit, `Middleware` if publishing failed.
+    /// `Length` if its length is wrong, `Middleware` if publishing failed.
     fn publish(&mut self, snapshot: &ParameterSnapshot) -> Result<(), TransportError>;
 
-    /// Hands the newest snapshot to workers that have joined since; to be called a few times a
-    /// second.
+    /// Sends the newest snapshot to workers that have joined since. Call it a few times a second.
     ///
     /// # Errors
     /// `Middleware` if the channel is broken.
@@ -125,11 +127,12 @@ pub trait ParameterPublisher {
 
 /// A worker's end of the parameter channel.
 pub trait ParameterSubscriber {
-    /// Copies the newest snapshot into `snapshot` if there is one newer than the last taken.
+    /// Copies the newest snapshot into `snapshot` if it is newer than the last one. Returns whether
+    /// it did.
     ///
     /// # Errors
-    /// `Snapshot` if it is damaged or foreign (then `snapshot` is unchanged), `Middleware` if the
-    /// channel is broken.
+    /// `Snapshot` if it is damaged or of another architecture (then `snapshot` is unchanged),
+    /// `Middleware` if the channel is broken.
     fn newest(&mut self, snapshot: &mut ParameterSnapshot) -> Result<bool, TransportError>;
 
     /// Number of the learner that this channel is connected to, counted over a session.

@@ -1,4 +1,4 @@
-//! A worker's queue in a world of faults.
+//! A worker's queue with injected faults.
 
 use std::collections::VecDeque;
 
@@ -7,11 +7,11 @@ use dmprl_shared::transport::{SegmentSender, SendOutcome, TransportError};
 use rand::RngExt;
 use rand_xoshiro::Xoshiro256PlusPlus;
 
-/// What shared memory promises, at its worst.
+/// The worst behaviour that shared memory allows.
 pub struct Link {
     random: Xoshiro256PlusPlus,
     pub faults: bool,
-    /// A dead learner's queue still takes, for nobody.
+    /// A dead learner's queue still accepts segments.
     pub queue: VecDeque<Segment>,
     capacity: usize,
     epoch: u64,
@@ -36,7 +36,7 @@ impl Link {
         }
     }
 
-    /// A learner starts: the queue of the one before is gone.
+    /// Starts a learner, which discards the previous one's queue.
     pub fn new_learner(&mut self, epoch: u64) {
         self.epoch = epoch;
         self.queue.clear();
@@ -52,7 +52,7 @@ impl SegmentSender for Link {
         let broke = self.chance(30);
         if broke {
             self.renewals += 1;
-            // With what lay in it or not.
+            // With or without its content.
             if self.chance(2) {
                 self.queue.clear();
             }
@@ -68,11 +68,11 @@ impl SegmentSender for Link {
         block: &[f32],
     ) -> Result<SendOutcome, TransportError> {
         if self.chance(20) {
-            // iceoryx2's Ok(0).
+            // Corresponds to iceoryx2's Ok(0).
             self.drops += 1;
             return Ok(SendOutcome::Detached);
         }
-        // A learner that came in this moment: the connection is the dead one's.
+        // A learner has just started, so the connection is the dead one's.
         if self.connected != self.epoch {
             return Ok(SendOutcome::Detached);
         }

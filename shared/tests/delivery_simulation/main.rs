@@ -1,9 +1,10 @@
-//! The delivery protocol under faults: the outbox, inbox and log that run in production, between
-//! links, workers and a learner that drop, repeat, delay, tear and die as a seed says.
+//! Simulates the delivery protocol under faults, with the outbox, inbox and log of production.
 //!
-//! Safety first: whatever happens, nothing is inserted twice or out of order, nothing is torn, and
-//! what a worker forgot is where its level promises. Then everything heals, and all that is still
-//! kept must arrive. A failure names its seed; `DMPRL_SIMULATION_SEED=<seed>` runs that one alone.
+//! Links, workers and the learner drop, repeat, delay, tear and die as derived from a seed. First,
+//! safety must hold at all times: no segment is inserted twice, out of order or torn, and every
+//! segment that a worker has discarded is where its level guarantees. Then all faults stop, and
+//! every segment still kept must arrive. A failure names its seed; `DMPRL_SIMULATION_SEED=<seed>`
+//! runs only that one.
 
 #![allow(clippy::unwrap_used, reason = "a test's helpers fail the test")]
 
@@ -36,7 +37,7 @@ fn run(seed: u64, log: &Path) -> Tally {
     })
 }
 
-/// A folder whose files cost no disk, where the system has one.
+/// A folder in memory, if the system has one.
 fn folder() -> tempfile::TempDir {
     let memory = Path::new("/dev/shm");
     let parent = if memory.is_dir() { memory.to_owned() } else { std::env::temp_dir() };
@@ -75,6 +76,6 @@ fn nothing_acknowledged_is_lost_and_nothing_comes_twice_whatever_dies() {
         all
     });
     println!("{SEEDS} seeds: {tally:#?}");
-    // A fault that never strikes tests nothing.
+    // A fault that never occurs tests nothing.
     assert!(tally.every_fault_has_struck(), "{tally:#?}");
 }

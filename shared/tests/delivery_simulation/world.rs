@@ -1,4 +1,4 @@
-//! One world: two workers, their links, one learner with its checkpoint and log.
+//! A simulated world: two workers, their links, and one learner with its checkpoint and log.
 
 use std::path::{Path, PathBuf};
 
@@ -13,16 +13,16 @@ use crate::link::Link;
 
 const WORKERS: usize = 2;
 const STEPS: u32 = 250;
-/// Healthy rounds within which everything that is kept must have arrived.
+/// Rounds without faults, within which every kept segment must arrive.
 const HEALING_ROUNDS: u32 = 100;
-/// In so many of them workers produce.
+/// Number of these rounds in which workers produce.
 const NEW_ROUNDS: u32 = 3;
-/// Small enough to be full now and then.
+/// Small enough to fill up occasionally.
 const LOG_BYTES_MAX: u64 = 5_000;
 pub const LAYOUT: SegmentLayout =
     SegmentLayout { segment_steps: 1, observation_len: 1, action_len: 1 };
 
-/// How often what happened, over one world or many.
+/// Counts of all events, over one world or many.
 #[derive(Debug, Default)]
 pub struct Tally {
     pub inserted: u64,
@@ -90,11 +90,11 @@ struct Worker {
     /// The next sequence number.
     sequence: u64,
     link: Link,
-    /// The newest learner it has heard of.
+    /// The newest learner whose acknowledgement it has read.
     heard: u64,
 }
 
-/// What stays when a learner dies: of each worker, and how many segments of it were inserted.
+/// State that survives a learner's death: per worker, its mark and the number of inserted segments.
 struct Checkpoint {
     marks: Vec<Mark>,
     inserted: [usize; WORKERS],
@@ -106,19 +106,19 @@ pub struct World {
     log_path: PathBuf,
     outbox_segments: usize,
     workers: Vec<Worker>,
-    /// A learner that lives.
+    /// `None` while no learner lives.
     inbox: Option<Inbox>,
     epoch: u64,
-    /// The model's replay: what the learner holds of each worker, in order.
+    /// The model's replay: the learner's segments of each worker, in order.
     inserted: [Vec<Mark>; WORKERS],
-    /// Inserted by learners that died before they had stored it.
+    /// Segments that were inserted by learners that died before storing them.
     forgotten: [Vec<Mark>; WORKERS],
-    /// The last that each incarnation of each worker has seen acknowledged.
+    /// The last acknowledged segment of each incarnation of each worker.
     acked: [Vec<Mark>; WORKERS],
     checkpoint: Checkpoint,
-    /// One that is being written, and what the log had of its moment.
+    /// A checkpoint in progress, and the size of the log at its start.
     saving: Option<(Checkpoint, u64)>,
-    /// Every acknowledgement ever published: an old one may come late.
+    /// All published acknowledgements, because an old one may arrive late.
     published: Vec<Acknowledgements>,
     tally: Tally,
 }
@@ -164,7 +164,7 @@ impl World {
         self.random.random_range(0..one_in) == 0
     }
 
-    /// Anything may happen.
+    /// Runs random events with faults.
     pub fn suffer(&mut self) {
         for _ in 0..STEPS {
             match self.random.random_range(0..100) {
@@ -185,7 +185,7 @@ impl World {
         }
     }
 
-    /// Nothing fails any more: what is kept must arrive, and what is produced now too.
+    /// Runs without faults: all kept and newly produced segments must arrive.
     pub fn heal(&mut self) {
         self.workers.iter_mut().for_each(|worker| worker.link.faults = false);
         self.start_learner();
@@ -228,7 +228,7 @@ impl World {
         self.tally
     }
 
-    /// A worker hears, perhaps, produces if it has room, and offers.
+    /// A worker may read an acknowledgement, produces a segment if it has space, and offers.
     fn work(&mut self, index: usize) {
         if !self.published.is_empty() && self.chance(2) {
             let newest = self.published.len() - 1;
@@ -259,7 +259,8 @@ impl World {
         }
     }
 
-    /// A worker hears an acknowledgement. What it then forgets must be where the level promises.
+    /// A worker reads an acknowledgement. The segments that it then discards must be where the
+    /// level guarantees.
     fn hear(&mut self, index: usize, which: Option<usize>) {
         let Some(acknowledgements) = which.map(|which| &self.published[which]) else { return };
         self.tally.stale_acknowledgements += u64::from(acknowledgements.epoch < self.epoch);
@@ -281,7 +282,8 @@ impl World {
         self.assert_acked_is_inserted();
     }
 
-    /// At level `log`, once the learner is there: what any worker has forgotten is in the replay.
+    /// Checks, at level `log` and with a live learner, that every segment a worker has discarded is
+    /// in the replay.
     fn assert_acked_is_inserted(&self) {
         if self.level == DeliveryLevel::Memory || self.inbox.is_none() {
             return;
@@ -324,7 +326,7 @@ impl World {
         let last = self.inserted[index].last().copied().unwrap_or_default();
         assert!(mark > last, "worker {index}: {mark:?} after {last:?}");
         for sequence in mark.sequence - lost..mark.sequence {
-            // Only a dead learner may have lost it, and only where that is the promise.
+            // Only a dead learner may have lost it, and only at level `memory`.
             let missing = Mark { sequence, ..mark };
             assert_eq!(self.level, DeliveryLevel::Memory, "worker {index}: {missing:?} is lost");
             assert!(self.forgotten[index].contains(&missing), "{missing:?} never came");
@@ -335,8 +337,8 @@ impl World {
         self.inserted[index].push(mark);
     }
 
-    /// As the learner's loop does. It may die before the workers hear of it, with what it was
-    /// writing torn: that was acknowledged to nobody.
+    /// Acknowledges as the learner's loop does. The learner may die before publishing and leave a
+    /// torn log record, which was never acknowledged.
     fn acknowledge(&mut self) {
         let dies = self.workers[0].link.faults && self.chance(20);
         let Some(inbox) = &mut self.inbox else { return };
@@ -357,8 +359,8 @@ impl World {
         self.kill_learner();
     }
 
-    /// Begins a checkpoint, or ends the one that was begun: it is written while segments go on
-    /// coming. The learner may die before the log has forgotten what the checkpoint holds.
+    /// Starts a checkpoint, or completes the current one; segments continue to arrive while it is
+    /// written. The learner may die before it truncates the log.
     fn save(&mut self) {
         let dies = self.workers[0].link.faults && self.chance(10);
         let Some(inbox) = &mut self.inbox else { return };
@@ -387,7 +389,7 @@ impl World {
         }
     }
 
-    /// A learner goes on from checkpoint and log, with new queues.
+    /// Starts a learner from checkpoint and log, with new queues.
     fn start_learner(&mut self) {
         if self.inbox.is_some() {
             return;
@@ -398,7 +400,7 @@ impl World {
         if self.level == DeliveryLevel::Log {
             let log = SegmentLog::open(&self.log_path, (1, 1), LAYOUT, LOG_BYTES_MAX);
             let mut log = log.unwrap();
-            // As `Learner::recover` does.
+            // As in `Learner::recover`.
             log.replay(|segment| {
                 if !inbox.has(&segment.header) {
                     let lost = inbox.settle(&segment.header, &segment.block).unwrap();
@@ -413,7 +415,7 @@ impl World {
         self.assert_acked_is_inserted();
     }
 
-    /// A worker dies with all that no queue has taken, and perhaps with its queue.
+    /// Kills a worker with all unsent segments, and possibly with its queue.
     fn kill_worker(&mut self, index: usize) {
         let with_queue = self.chance(2);
         let worker = &mut self.workers[index];

@@ -1,5 +1,7 @@
-//! What the transport tests share: a run's directory, segments with sequence numbers, conditions
-//! with a deadline, and this test binary in the role of another process.
+//! Shared parts of the transport tests.
+//!
+//! They are a run's directory, segments with sequence numbers, conditions with a deadline, and this
+//! test binary as another process.
 
 #![allow(dead_code, reason = "each test binary uses a part")]
 
@@ -32,7 +34,7 @@ pub fn plan(worker_count: usize, queue_segments: usize) -> Plan {
     }
 }
 
-/// A parent directory for domains that is gone when the test ends.
+/// A parent directory for domains, removed at the end of the test.
 pub struct Parent {
     directory: tempfile::TempDir,
 }
@@ -54,7 +56,7 @@ impl Parent {
     }
 }
 
-/// Waits for `condition`, asking again and again.
+/// Polls `condition` until it returns a value.
 #[track_caller]
 pub fn eventually<T>(what: &str, mut condition: impl FnMut() -> Option<T>) -> T {
     let start = Instant::now();
@@ -72,14 +74,14 @@ pub fn header(worker_id: u32, incarnation: u32, sequence: u64) -> SegmentHeader 
     SegmentHeader { worker_id, incarnation, sequence, ..SegmentHeader::default() }
 }
 
-/// Writes numbers that only this sequence number has.
+/// Fills a block with numbers that depend on the sequence number.
 pub fn fill(block: &mut [f32], sequence: u64) {
     for (index, value) in block.iter_mut().enumerate() {
         *value = (sequence % 65_536) as f32 + index as f32;
     }
 }
 
-/// Panics unless the segment carries the numbers of its sequence number.
+/// Panics unless the block has the numbers of the segment's sequence number.
 #[track_caller]
 pub fn assert_whole(segment: &Segment) {
     let mut expected = vec![0.0; LAYOUT.block_len()];
@@ -87,7 +89,7 @@ pub fn assert_whole(segment: &Segment) {
     assert_eq!(segment.block, expected);
 }
 
-/// A snapshot whose values tell its version.
+/// A snapshot whose values are its version.
 pub fn snapshot(version: u64) -> ParameterSnapshot {
     ParameterSnapshot {
         version,
@@ -101,7 +103,7 @@ const ROLE: &str = "DMPRL_TEST_ROLE";
 const DOMAIN: &str = "DMPRL_TEST_DOMAIN";
 const INCARNATION: &str = "DMPRL_TEST_INCARNATION";
 
-/// Another process: this test binary, running only the test `entry`. Killed when dropped.
+/// Another process: this test binary running only the test `entry`. Killed on drop.
 pub struct Process(Child);
 
 impl Process {
@@ -117,13 +119,13 @@ impl Process {
         Self(child)
     }
 
-    /// SIGKILL, and gone when this returns.
+    /// Kills the process with SIGKILL and waits for its end.
     pub fn kill(&mut self) {
         self.0.kill().unwrap();
         self.0.wait().unwrap();
     }
 
-    /// The signal that it dies of by itself; `meanwhile` is done again and again.
+    /// Waits until the process dies, and returns its signal; calls `meanwhile` repeatedly.
     #[track_caller]
     pub fn died_of(&mut self, mut meanwhile: impl FnMut()) -> Option<i32> {
         let ended = eventually("the other process dies", || {
@@ -146,7 +148,7 @@ impl Drop for Process {
     }
 }
 
-/// Role, domain and incarnation, in a process made by [`Process::start`].
+/// Role, domain and incarnation, in a process started by [`Process::start`].
 pub fn role() -> Option<(String, PathBuf, u32)> {
     let role = std::env::var(ROLE).ok()?;
     let incarnation = std::env::var(INCARNATION).unwrap().parse().unwrap();

@@ -1,65 +1,68 @@
-//! The learner's side: what has come of each worker, and how far it is safe.
+//! The learner's side of the delivery: which segments of each worker have been settled.
 
 use super::{LogError, Mark, SegmentLog};
 use crate::segment::{Rejection, SegmentHeader};
 
-/// Acknowledging costs far less than settling so many. A quarter of what an outbox has beyond its
-/// queue by default, so that no worker runs out of room before it hears of them.
+/// Settled segments after which an acknowledgement is due, because an acknowledgement costs far
+/// less than settling this many. It is a quarter of the default outbox capacity beyond its queue,
+/// so no worker runs out of space before the acknowledgement arrives.
 const ACKNOWLEDGED_TOGETHER: u64 = 256;
 
-/// How far each worker's segments have come, and the log of those that no checkpoint holds yet.
+/// Settled segments of each worker, and the log of those that no checkpoint contains yet.
 #[derive(Debug)]
 pub struct Inbox {
     settled: Vec<Mark>,
-    /// Settled since the last acknowledgement.
+    /// Segments settled since the last acknowledgement.
     unacknowledged: u64,
-    /// At level `log`: every segment is appended as it is settled.
+    /// At level `log`, every settled segment is appended.
     log: Option<SegmentLog>,
 }
 
 impl Inbox {
-    /// Nothing has come of any worker, and nothing is logged.
+    /// Creates an inbox without settled segments and without a log.
     #[must_use]
     pub fn new(worker_count: usize) -> Self {
         Self { settled: vec![Mark::default(); worker_count], unacknowledged: 0, log: None }
     }
 
-    /// Goes on from a checkpoint's marks. One without has seen no worker that lives.
+    /// Continues from a checkpoint's marks. Workers without a mark start from zero.
     pub fn restore(&mut self, marks: &[Mark]) {
         for (index, settled) in self.settled.iter_mut().enumerate() {
             *settled = marks.get(index).copied().unwrap_or_default();
         }
     }
 
-    /// Logs to `log` from now on, whose records have been settled.
+    /// Appends settled segments to `log` from now on. Its existing records must be settled already.
     pub fn log_to(&mut self, log: SegmentLog) {
         self.log = Some(log);
     }
 
-    /// Up to where segments have been settled: inserted, or refused for good. What a checkpoint
-    /// holds.
+    /// Last settled segment of each worker, as stored in a checkpoint. Settled means inserted or
+    /// finally rejected.
     #[must_use]
     pub fn settled(&self) -> &[Mark] {
         &self.settled
     }
 
-    /// Whether a segment was settled before, or is of an incarnation before the newest.
+    /// Whether a segment has been settled, or belongs to an incarnation before the newest.
     #[must_use]
     pub fn has(&self, header: &SegmentHeader) -> bool {
         let mark = Mark { incarnation: header.incarnation, sequence: header.sequence };
         self.settled.get(header.worker_id as usize).is_some_and(|last| mark <= *last)
     }
 
-    /// Settles a segment, to be called in the moment in which it is inserted. Returns how many
-    /// before it will never come: a worker numbers its segments from 1 without gaps and sends what
-    /// it keeps in order, so those it keeps no more. Only a learner that died after it had
-    /// acknowledged them leaves such a gap, at level `memory`.
+    /// Settles a segment. Call it at the moment of insertion.
+    ///
+    /// Returns the number of missing segments before it, which will never arrive. A worker numbers
+    /// its segments from 1 without gaps and sends them in order, so it no longer has the missing
+    /// ones. Such a gap only occurs at level `memory`, if a learner died after acknowledging the
+    /// segments.
     ///
     /// # Errors
-    /// `Duplicate` if it was settled before, or is of an incarnation before the newest.
+    /// `Duplicate` if it has been settled, or belongs to an incarnation before the newest.
     ///
     /// # Panics
-    /// If there is no such worker or the block is of another length: `segment::check` comes first.
+    /// If the worker does not exist or the block has the wrong length. Call `segment::check` first.
     pub fn settle(&mut self, header: &SegmentHeader, block: &[f32]) -> Result<u64, Rejection> {
         if self.has(header) {
             return Err(Rejection::Duplicate);
@@ -75,12 +78,14 @@ impl Inbox {
         Ok(mark.sequence - before - 1)
     }
 
-    /// Up to where workers may forget their segments; at level `log` these are written first.
+    /// Returns the marks up to which workers may discard their segments. At level `log`, the
+    /// segments are written to the log first.
     ///
     /// # Errors
-    /// If they cannot be written: then nothing new may be acknowledged, and workers wait.
+    /// If writing fails. Nothing new may be acknowledged then, and the workers wait.
     pub fn acknowledge(&mut self) -> Result<&[Mark], LogError> {
-        // First: what cannot be written now is tried again in time, not at every turn.
+        // Reset first, so that a failed write is retried at the regular interval and not on every
+        // turn.
         self.unacknowledged = 0;
         if let Some(log) = &mut self.log {
             log.write()?;
@@ -88,33 +93,34 @@ impl Inbox {
         Ok(&self.settled)
     }
 
-    /// How much has been logged: what a checkpoint of this moment holds of it \[bytes\].
+    /// Size of the log at this moment \[bytes\]; a checkpoint taken now contains all of it.
     #[must_use]
     pub fn logged(&self) -> u64 {
         self.log.as_ref().map_or(0, SegmentLog::logged)
     }
 
-    /// Whether so much was settled that workers should hear of it now, and not in time.
+    /// Whether enough segments are settled to acknowledge now instead of at the regular interval.
     #[must_use]
     pub fn owes_acknowledgement(&self) -> bool {
         self.unacknowledged >= ACKNOWLEDGED_TOGETHER
     }
 
-    /// A checkpoint is on disk, of the moment in which so much had been logged.
+    /// Removes the first `logged` bytes of the log after the checkpoint that contains them is on
+    /// disk.
     ///
     /// # Errors
-    /// If the log cannot be shortened, which costs nothing but its room.
+    /// If the log cannot be truncated; this only wastes its space.
     pub fn checkpointed(&mut self, logged: u64) -> Result<(), LogError> {
         self.log.as_mut().map_or(Ok(()), |log| log.forget(logged))
     }
 
-    /// Whether another segment may be settled now.
+    /// Whether another segment can be settled now.
     #[must_use]
     pub fn has_room(&self) -> bool {
         self.log.as_ref().is_none_or(SegmentLog::has_room)
     }
 
-    /// Whether nothing can be settled before a checkpoint has emptied the log.
+    /// Whether a checkpoint must empty the log before anything can be settled.
     #[must_use]
     pub fn is_full(&self) -> bool {
         self.log.as_ref().is_some_and(SegmentLog::is_full)

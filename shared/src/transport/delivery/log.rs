@@ -1,14 +1,15 @@
-//! The segment log: what was settled since the last checkpoint, for a learner that starts.
+//! The segment log: segments settled since the last checkpoint, for a restarted learner.
 //!
 //! ```text
 //!   head:    magic "DMPRLSL1" · u64 run id, architecture hash, block length
 //!   record:  u32 bytes of the payload, u32 CRC-32 of the payload, payload: header · block
 //! ```
-//! All little-endian, as in memory on every supported processor. Records are collected and
-//! appended with one `write`, which outlives the process, but is not synced: a power failure may
-//! take it. A process killed in the middle of a `write` leaves a torn record; it was never
-//! acknowledged, and is cut off. What a checkpoint holds the log forgets once that is on disk;
-//! a process killed between the two leaves records that the checkpoint's marks recognise.
+//! All numbers are little-endian, as in memory on every supported processor. Records are collected
+//! and appended with one `write`. They survive the process, but are not synced: a power failure can
+//! lose them. A process killed during a `write` leaves a torn record, which was never acknowledged
+//! and is cut off. Once a checkpoint is on disk, the log removes the records that it contains. A
+//! process killed between these two steps leaves records that the checkpoint's marks identify as
+//! duplicates.
 
 use std::fs::{File, OpenOptions};
 use std::io::{self, Read, Seek, SeekFrom, Write};
@@ -23,49 +24,49 @@ const MAGIC: &[u8; 8] = b"DMPRLSL1";
 const HEAD_BYTES: usize = 32;
 /// Length and checksum before each payload.
 const FRAME_BYTES: usize = 8;
-/// Records are collected up to here; more wait for a `write`.
+/// Size of the buffer that collects records between two `write`s.
 const BUFFER_BYTES: usize = 4 << 20;
 
 /// Why the log cannot be used.
 #[derive(Debug, Error)]
 pub enum LogError {
-    /// Reading or writing failed.
+    /// Reading or writing the file failed.
     #[error("segment log: {0}")]
     Io(#[from] io::Error),
-    /// Another run's, or of another architecture or segment length.
+    /// The log of another run, architecture or segment length.
     #[error("segment log: its head is another run's or another configuration's; remove the file")]
     Foreign,
 }
 
-/// What was found in the log.
+/// Result of reading the log.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct Replayed {
-    /// Whole records.
+    /// Number of complete records.
     pub records: u64,
-    /// Bytes behind the last whole record, cut off.
+    /// Bytes after the last complete record, which were cut off.
     pub cut_bytes: u64,
 }
 
-/// An open log; only one process has it.
+/// An open segment log. Only one process opens it.
 #[derive(Debug)]
 pub struct SegmentLog {
     path: PathBuf,
     file: File,
     layout: SegmentLayout,
     head: [u8; HEAD_BYTES],
-    /// Bytes of whole records in the file.
+    /// Bytes of complete records in the file.
     written: u64,
-    /// A `write` failed: the file may end in half a record.
+    /// A `write` failed, so the file may end in an incomplete record.
     torn: bool,
     buffer: Vec<u8>,
     bytes_max: u64,
 }
 
 impl SegmentLog {
-    /// Opens the log of a run, or makes an empty one. It may hold `bytes_max` bytes of records.
+    /// Opens the log of a run, or creates an empty one, for at most `bytes_max` bytes of records.
     ///
     /// # Errors
-    /// `Foreign` if it is another run's, `Io` for what the file system refuses.
+    /// `Foreign` if it belongs to another run, `Io` if the file system returns an error.
     pub fn open(
         path: &Path,
         (run_id, architecture_hash): (u64, u64),
@@ -97,10 +98,10 @@ impl SegmentLog {
         Ok(log)
     }
 
-    /// Hands every whole record to `each`, oldest first, and cuts off what follows the last.
+    /// Passes every complete record to `each`, oldest first, and cuts off the rest of the file.
     ///
     /// # Errors
-    /// `Io` for what the file system refuses.
+    /// `Io` if the file system returns an error.
     pub fn replay(&mut self, mut each: impl FnMut(&Segment)) -> Result<Replayed, LogError> {
         let len = self.file.metadata()?.len().saturating_sub(HEAD_BYTES as u64);
         self.file.seek(SeekFrom::Start(HEAD_BYTES as u64))?;
@@ -123,16 +124,16 @@ impl SegmentLog {
         Ok(replayed)
     }
 
-    /// Whether another segment may be appended now; if not, and the log is not full, after the
-    /// next `write`.
+    /// Whether another segment can be appended now. If not, and the log is not full, it can be
+    /// after the next `write`.
     #[must_use]
     pub fn has_room(&self) -> bool {
-        // A record longer than the buffer is written by itself.
+        // A record longer than the buffer is written on its own.
         let fits = self.buffer.len() + self.record_bytes() <= BUFFER_BYTES;
         !self.is_full() && (fits || self.buffer.is_empty())
     }
 
-    /// Whether only a checkpoint makes room.
+    /// Whether the log is full. Only a checkpoint empties it.
     #[must_use]
     pub fn is_full(&self) -> bool {
         let bytes = self.written + (self.buffer.len() + self.record_bytes()) as u64;
@@ -142,7 +143,7 @@ impl SegmentLog {
     /// Collects a segment for the next `write`.
     ///
     /// # Panics
-    /// If the block is of another length.
+    /// If the block has the wrong length.
     pub fn append(&mut self, header: &SegmentHeader, block: &[f32]) {
         assert_eq!(block.len(), self.layout.block_len(), "segment block length");
         let (header, block) = (bytemuck::bytes_of(header), bytemuck::cast_slice(block));
@@ -156,11 +157,11 @@ impl SegmentLog {
         self.buffer.extend_from_slice(block);
     }
 
-    /// Writes what was collected. After an error it is still collected, and the next call writes
-    /// all of it.
+    /// Writes the collected records. After an error they stay collected, and the next call retries
+    /// all of them.
     ///
     /// # Errors
-    /// `Io` for what the file system refuses.
+    /// `Io` if the file system returns an error.
     pub fn write(&mut self) -> Result<(), LogError> {
         if self.torn {
             self.cut()?;
@@ -176,19 +177,19 @@ impl SegmentLog {
         Ok(())
     }
 
-    /// Bytes of the records there are, written or collected.
+    /// Total bytes of records, written or collected.
     #[must_use]
     pub fn logged(&self) -> u64 {
         self.written + self.buffer.len() as u64
     }
 
-    /// Forgets the first `bytes` of its records: a checkpoint that is on disk holds them.
+    /// Removes the first `bytes` of records, which a checkpoint on disk contains.
     ///
     /// # Errors
-    /// `Io` for what the file system refuses; the log is then as it was.
+    /// `Io` if the file system returns an error; the log is then unchanged.
     ///
     /// # Panics
-    /// If there are fewer.
+    /// If the log has fewer bytes.
     pub fn forget(&mut self, bytes: u64) -> Result<(), LogError> {
         assert!(bytes <= self.logged(), "more than there is");
         if bytes == self.logged() {
@@ -198,9 +199,10 @@ impl SegmentLog {
             return self.cut();
         }
         self.write()?;
-        // Written anew, as what stays is little: what came while the checkpoint was written.
+        // The file is rewritten, because the rest is small: records added while the checkpoint was
+        // written.
         let mut rest = Vec::new();
-        // Until it is, the next write looks for the end of the records by itself.
+        // Until the rewrite is complete, the next write has to find the end of the records again.
         self.torn = true;
         self.file.seek(SeekFrom::Start(HEAD_BYTES as u64 + bytes))?;
         self.file.read_to_end(&mut rest)?;
@@ -217,7 +219,7 @@ impl SegmentLog {
         Ok(())
     }
 
-    /// Cuts the file behind the last whole record and goes on from there.
+    /// Truncates the file after the last complete record and continues there.
     fn cut(&mut self) -> Result<(), LogError> {
         let len = HEAD_BYTES as u64 + self.written;
         self.file.set_len(len)?;
@@ -232,7 +234,7 @@ impl SegmentLog {
     }
 }
 
-/// Reads one record; false if its length or checksum is not what it says.
+/// Decodes one record. Returns false if its length or checksum is wrong.
 fn decode(record: &[u8], segment: &mut Segment) -> bool {
     let (frame, payload) = record.split_at(FRAME_BYTES);
     let expected = [payload.len() as u32, crc32fast::hash(payload)].map(u32::to_le_bytes);

@@ -1,4 +1,4 @@
-//! Segments that arrive once: kept by the worker until the learner has them for good.
+//! Reliable delivery: a worker keeps each segment until the learner has acknowledged it.
 //!
 //! ```text
 //!   worker                                    learner
@@ -6,19 +6,20 @@
 //!             ▲                                 │         └─► log ──────────┤ (level "log")
 //!             └────── acknowledgements ◄────────┴───────── marks ◄──────────┘
 //! ```
-//! A queue in shared memory dies with its learner. So the worker's [`Outbox`] keeps every segment
-//! that is not acknowledged, and offers all of them again, oldest first, whenever a new connection
-//! was made. The learner's [`Inbox`] knows of each worker the last one it has, refuses what comes
-//! twice and says how far what came is safe. These [`Mark`]s are part of a checkpoint, from the
-//! same moment as the replay.
+//! A queue in shared memory dies with its learner. The worker's [`Outbox`] therefore keeps every
+//! unacknowledged segment and retransmits all of them, oldest first, after each reconnection. The
+//! learner's [`Inbox`] stores the last settled segment of each worker, rejects duplicates and
+//! acknowledges settled segments. Its [`Mark`]s are part of a checkpoint and always match the
+//! replay in it.
 //!
-//! What "safe" means is the level's. `memory`: in the replay; a learner that dies loses what came
-//! after its last checkpoint, and nothing else. `log`: in the [`SegmentLog`] too, which a learner
-//! that starts reads after the checkpoint; its death loses nothing. Neither survives the worker's
-//! own death for what it had not sent, nor a power failure.
+//! The delivery level decides when a segment is acknowledged. `memory`: when it is in the replay; a
+//! learner that dies loses the segments since its last checkpoint. `log`: when it is in the
+//! [`SegmentLog`] too, which a restarted learner reads after the checkpoint; its death loses
+//! nothing. At neither level do unsent segments survive the death of their worker. A power failure
+//! can lose segments at both levels.
 //!
-//! Nothing here waits or knows the time: the same code runs in a simulation under faults
-//! (`shared/tests/delivery_simulation.rs`).
+//! Nothing here blocks or reads a clock, so the same code runs in a simulation with faults
+//! (`shared/tests/delivery_simulation/`).
 
 mod inbox;
 mod log;
@@ -30,21 +31,22 @@ pub use inbox::Inbox;
 pub use log::{LogError, Replayed, SegmentLog};
 pub use outbox::{Outbox, Sent};
 
-/// The last segment of a worker up to which all are settled.
+/// The last segment of a worker up to which all segments are settled.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, PartialOrd, Ord, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Mark {
-    /// Which start of the worker.
+    /// Number of the worker's start.
     pub incarnation: u32,
-    /// Its sequence number; 0 before the first.
+    /// Sequence number of the segment; 0 before the first.
     pub sequence: u64,
 }
 
-/// What a learner tells its workers: cumulative, so that only the newest matters.
+/// The learner's acknowledgements to its workers. They are cumulative: the newest replaces all
+/// older ones.
 #[derive(Debug, Clone, PartialEq, Eq, Default)]
 pub struct Acknowledgements {
-    /// Counts the learners of a run's session.
+    /// Number of the learner within the domain; a restarted learner has a higher one.
     pub epoch: u64,
-    /// Of each worker.
+    /// One mark per worker.
     pub marks: Vec<Mark>,
 }

@@ -1,4 +1,4 @@
-//! The worker's side: a bounded ring of segments that the learner has not acknowledged.
+//! The worker's side of the delivery: a bounded ring of unacknowledged segments.
 
 use serde::{Deserialize, Serialize};
 
@@ -6,22 +6,22 @@ use super::{Acknowledgements, Mark};
 use crate::segment::{SegmentHeader, SegmentLayout};
 use crate::transport::{SegmentSender, SendOutcome, TransportError};
 
-/// What a worker did; each a count of segments.
+/// Counts of a worker's segments.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Sent {
-    /// Finished and put into the outbox.
+    /// Segments put into the outbox.
     pub produced: u64,
-    /// Taken by a queue, those that were sent again included.
+    /// Segments accepted by a queue, including retransmits.
     pub sent: u64,
-    /// Of these, sent again.
+    /// Retransmits; part of `sent`.
     pub resent: u64,
-    /// Acknowledged.
+    /// Acknowledged segments.
     pub acked: u64,
 }
 
 impl Sent {
-    /// What has been added since `before`.
+    /// Difference to an earlier count.
     #[must_use]
     pub fn since(&self, before: &Self) -> Self {
         Self {
@@ -42,31 +42,31 @@ impl std::ops::AddAssign for Sent {
     }
 }
 
-/// Everything of one incarnation of a worker that is not acknowledged yet. Full: the worker waits.
+/// Unacknowledged segments of one incarnation of a worker. The worker waits while it is full.
 #[derive(Debug)]
 pub struct Outbox {
     worker_id: u32,
     incarnation: u32,
     block_len: usize,
     headers: Vec<SegmentHeader>,
-    /// (ring, block). Zeroed pages cost nothing until a segment is written to them.
+    /// (ring, block). Zeroed pages take no memory until a segment is written to them.
     blocks: Vec<f32>,
-    /// Sequence numbers: the oldest that is kept, the next to be offered, the next to be put in,
-    /// and the highest that any queue has taken. first <= next <= end.
+    /// Sequence numbers: the oldest kept, the next to be offered, the next to be put in, and the
+    /// highest that any queue has accepted. first <= next <= end.
     first: u64,
     next: u64,
     end: u64,
     highest_sent: u64,
-    /// The newest learner that has acknowledged anything.
+    /// The newest learner that has sent an acknowledgement.
     epoch: u64,
     sent: Sent,
 }
 
 impl Outbox {
-    /// An empty one for `segments_max` segments.
+    /// Creates an empty outbox for `segments_max` segments.
     ///
     /// # Panics
-    /// If it has room for none.
+    /// If `segments_max` is 0.
     #[must_use]
     pub fn new(
         layout: SegmentLayout,
@@ -77,10 +77,11 @@ impl Outbox {
         Self::starting_at(1, (layout, segments_max), worker_id, incarnation)
     }
 
-    /// The same for whoever takes over in the middle: the segments before `first` are acknowledged.
+    /// Creates an empty outbox that continues a sequence: all segments before `first` are
+    /// acknowledged.
     ///
     /// # Panics
-    /// If it has room for none, or `first` is 0: sequences begin at 1.
+    /// If the capacity is 0, or `first` is 0: sequences start at 1.
     #[must_use]
     pub fn starting_at(
         first: u64,
@@ -106,70 +107,70 @@ impl Outbox {
         }
     }
 
-    /// Whose it is.
+    /// Worker that owns the outbox.
     #[must_use]
     pub fn worker_id(&self) -> u32 {
         self.worker_id
     }
 
-    /// Which start of the worker.
+    /// Number of the worker's start.
     #[must_use]
     pub fn incarnation(&self) -> u32 {
         self.incarnation
     }
 
-    /// What the worker has done so far.
+    /// Counts of the worker's segments so far.
     #[must_use]
     pub fn sent(&self) -> Sent {
         self.sent
     }
 
-    /// Segments that are not acknowledged.
+    /// Number of unacknowledged segments.
     #[must_use]
     pub fn len(&self) -> usize {
         (self.end - self.first) as usize
     }
 
-    /// Sequence number of the oldest segment that is kept; all before it are acknowledged.
+    /// Sequence number of the oldest segment kept; all earlier ones are acknowledged.
     #[must_use]
     pub fn first(&self) -> u64 {
         self.first
     }
 
-    /// Sequence number of the segment that is to be put in next.
+    /// Sequence number of the next segment to be put in.
     #[must_use]
     pub fn end(&self) -> u64 {
         self.end
     }
 
-    /// Segments that were offered and taken, and are not acknowledged.
+    /// Number of unacknowledged segments that a queue has accepted.
     #[must_use]
     pub fn under_way(&self) -> usize {
         (self.next - self.first) as usize
     }
 
-    /// Segments that were put in and are still to be offered.
+    /// Number of segments that no queue has accepted yet.
     #[must_use]
     pub fn unsent(&self) -> usize {
         (self.end - self.next) as usize
     }
 
-    /// Whether all are acknowledged.
+    /// Whether all segments are acknowledged.
     #[must_use]
     pub fn is_empty(&self) -> bool {
         self.first == self.end
     }
 
-    /// Segments there is room for.
+    /// Maximum number of segments kept.
     #[must_use]
     pub fn capacity(&self) -> usize {
         self.headers.len()
     }
 
-    /// Keeps a copy of the worker's next segment; false if there is no room.
+    /// Keeps a copy of the worker's next segment. Returns false if the outbox is full.
     ///
     /// # Panics
-    /// If it is another worker's, not the next in sequence, or of another length.
+    /// If the segment is of another worker, not the next in sequence, or of another length.
     pub fn put(&mut self, header: &SegmentHeader, block: &[f32]) -> bool {
         let origin = (header.worker_id, header.incarnation, header.sequence);
         assert_eq!(origin, (self.worker_id, self.incarnation, self.end), "not the next segment");
@@ -184,9 +185,11 @@ impl Outbox {
         true
     }
 
-    /// Offers what no queue has taken yet, oldest first, and after a new connection everything
-    /// that is kept. `Delivered`: nothing is left to offer; otherwise why not. To be called while
-    /// anything is kept, not only when there is something new: the next learner may lack it.
+    /// Offers unsent segments, oldest first, and all kept segments after a reconnection.
+    ///
+    /// Returns `Delivered` if nothing is left to offer, or the reason why not. Call it as long as
+    /// the outbox is not empty, even without new segments: a new learner may lack the ones already
+    /// sent.
     ///
     /// # Errors
     /// Those of the link.
@@ -209,8 +212,8 @@ impl Outbox {
         Ok(SendOutcome::Delivered)
     }
 
-    /// Forgets what has arrived. What a learner said that is gone by now is not taken: its
-    /// successor may have less, and is still to be sent the rest.
+    /// Discards acknowledged segments. Acknowledgements of a replaced learner are ignored: its
+    /// successor may have fewer segments and still needs the rest.
     pub fn acknowledge(&mut self, acknowledgements: &Acknowledgements) {
         let Some(mark) = acknowledgements.marks.get(self.worker_id as usize) else { return };
         if acknowledgements.epoch < self.epoch {
@@ -220,8 +223,8 @@ impl Outbox {
         self.acknowledge_to(*mark);
     }
 
-    /// Forgets what has arrived, where the caller knows that the mark is of its worker, and the
-    /// newest.
+    /// Discards segments up to `mark`. The caller ensures that the mark belongs to this worker and
+    /// is the newest.
     pub fn acknowledge_to(&mut self, mark: Mark) {
         let ours = mark.incarnation == self.incarnation && mark.sequence < self.end;
         if ours && mark.sequence >= self.first {

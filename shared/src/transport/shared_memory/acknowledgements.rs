@@ -1,7 +1,7 @@
-//! How far each worker's segments have arrived, from the learner to all workers.
+//! Acknowledgements from the learner to all workers.
 //!
-//! The counts are cumulative, so the newest replaces the one before, and a lost one costs nothing
-//! but the time to the next.
+//! They are cumulative: the newest replaces the previous one, and a lost one only delays workers
+//! until the next.
 
 use std::fs::File;
 use std::sync::Arc;
@@ -19,10 +19,10 @@ use super::service::{PrivateIpc, refused};
 use crate::transport::delivery::{Acknowledgements, Mark};
 use crate::transport::{AcknowledgementPublisher, AcknowledgementSubscriber, TransportError};
 
-/// Numbers of a worker: incarnation and sequence.
+/// Incarnation and sequence of a worker's mark.
 const NUMBERS_PER_WORKER: usize = 2;
 
-/// Which learner says so.
+/// Header of a sample: the learner that sent it.
 #[derive(Debug, Default, Clone, Copy)]
 #[repr(transparent)]
 pub(super) struct WireHeader {
@@ -37,7 +37,7 @@ unsafe impl ZeroCopySend for WireHeader {
     }
 }
 
-/// Length of a sample.
+/// Length of a sample in numbers.
 pub(super) fn sample_len(worker_count: usize) -> usize {
     worker_count * NUMBERS_PER_WORKER
 }
@@ -48,7 +48,7 @@ fn channel(plan: &Plan) -> Channel {
     Channel { name: "acknowledgements".to_owned(), agreement }
 }
 
-/// The learner's end.
+/// The learner's end of the channel.
 #[derive(Debug)]
 pub struct Acknowledger {
     writer: Writer<u64, WireHeader>,
@@ -86,7 +86,7 @@ impl AcknowledgementPublisher for Acknowledger {
     }
 }
 
-/// A worker's end.
+/// A worker's end of the channel.
 #[derive(Debug)]
 pub struct AcknowledgementReader {
     channel: Channel,
@@ -112,7 +112,7 @@ impl AcknowledgementSubscriber for AcknowledgementReader {
         for _ in 0..SAMPLES_MAX {
             let received = port.receive().map_err(refused("receiving from", &channel.name))?;
             let Some(sample) = received else { break };
-            // The length is the peer's word: believed only if it is the agreed one.
+            // The peer states the length, so check it against the agreed one.
             let got = usize::try_from(sample.header().number_of_elements()).unwrap_or(usize::MAX);
             if got != *len {
                 return Err(TransportError::Length { expected: *len, got });
@@ -120,7 +120,7 @@ impl AcknowledgementSubscriber for AcknowledgementReader {
             acknowledgements.epoch = sample.user_header().epoch;
             acknowledgements.marks.clear();
             let marks = sample.payload().chunks_exact(NUMBERS_PER_WORKER).map(|numbers| Mark {
-                // No worker has a larger one: such a mark is nobody's.
+                // No worker has an incarnation this large, so the mark matches none.
                 incarnation: u32::try_from(numbers[0]).unwrap_or(u32::MAX),
                 sequence: numbers[1],
             });

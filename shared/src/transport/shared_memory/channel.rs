@@ -1,4 +1,4 @@
-//! One iceoryx2 service: created by the learner, opened by workers, with what both must agree on.
+//! One iceoryx2 service with agreed attributes: the learner creates it, and workers open it.
 
 use std::fmt::Debug;
 use std::sync::Arc;
@@ -21,14 +21,14 @@ use crate::transport::TransportError;
 
 /// Makes the ports of one service whose samples are slices of `E` with a header `H`.
 ///
-/// Plain numbers, no 64-byte element: the slice's length is then the block's length and says,
-/// before the payload is touched, whether the peer wrote what was agreed; the copies do not need
-/// more than a number's alignment.
+/// The elements are plain numbers, not 64-byte blocks. The slice's length is then the block's
+/// length, so a wrong length is detected before the payload is read. The copies need no more than a
+/// number's alignment.
 pub(super) type Factory<E, H> = PortFactory<PrivateIpc, [E], H>;
 /// A service before it is created or opened.
 pub(super) type ChannelBuilder<E, H> = Builder<[E], H, PrivateIpc>;
 
-/// A service's name and what its peers must agree on, as names with values.
+/// A service's name, and the attributes that its peers must agree on (name and value).
 #[derive(Debug, Clone)]
 pub(super) struct Channel {
     pub(super) name: String,
@@ -36,7 +36,7 @@ pub(super) struct Channel {
 }
 
 impl Channel {
-    /// Creates the service, in a directory that is new and this learner's alone.
+    /// Creates the service, in a new directory that belongs only to this learner.
     pub(super) fn create<E, H>(
         &self,
         node: &Node<PrivateIpc>,
@@ -56,8 +56,8 @@ impl Channel {
             .map_err(refused("creating the service", &self.name))
     }
 
-    /// Opens the service that the learner created. A worker never creates one: killed in the
-    /// middle, it would leave a service that hangs for everyone.
+    /// Opens the service that the learner created. A worker never creates one: if it were killed
+    /// while doing so, the incomplete service would hang every process that opens it.
     pub(super) fn open<E, H>(
         &self,
         node: &Node<PrivateIpc>,
@@ -109,12 +109,12 @@ impl Channel {
         }
     }
 
-    /// The error for a place that a live process occupies.
+    /// The error for a slot that a live process occupies.
     pub(super) fn taken(&self, cause: impl Debug) -> TransportError {
         TransportError::Taken { name: self.name.clone(), cause: format!("{cause:?}") }
     }
 
-    /// "run_id is 7 there and 8 here", for all that differs.
+    /// Lists the differing attributes, such as "run_id is 7 there and 8 here".
     fn differences(&self, node: &Node<PrivateIpc>) -> String {
         let pattern = MessagingPattern::PublishSubscribe;
         let details = service_name(&self.name)
@@ -140,13 +140,13 @@ fn attribute(key: &str, value: &str) -> Result<(AttributeKey, AttributeValue), T
 
 /// Set when a port could not connect to a peer.
 ///
-/// Mostly the peer died in the middle and nothing is lost. But iceoryx2 tries to connect only once
-/// per peer: should a live one have been too slow, only a new port will reach it.
+/// Usually the peer died while connecting, and nothing is lost. But iceoryx2 tries to connect only
+/// once per peer: if a live peer was too slow, only a new port can reach it.
 #[derive(Debug, Clone, Default)]
 pub(super) struct Disconnected(Arc<AtomicBool>);
 
 impl Disconnected {
-    /// What a port does about a broken connection: remember it and serve the other peers.
+    /// Handler for a broken connection: sets the flag and continues to serve the other peers.
     pub(super) fn remember<Cause, Info>(
         &self,
     ) -> impl Fn(Cause, &Info) -> DegradationAction + Send + 'static {
@@ -157,12 +157,12 @@ impl Disconnected {
         }
     }
 
-    /// Whether it is set.
+    /// Whether the flag is set.
     pub(super) fn is_set(&self) -> bool {
         self.0.load(Ordering::Relaxed)
     }
 
-    /// Clears it, before the port is made anew.
+    /// Clears the flag, before the port is recreated.
     pub(super) fn clear(&self) {
         self.0.store(false, Ordering::Relaxed);
     }

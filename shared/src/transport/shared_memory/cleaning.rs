@@ -1,10 +1,10 @@
-//! When the learner cleans up after dead processes.
+//! Decides when the learner cleans up after dead processes.
 //!
-//! To find the dead, iceoryx2 reads several files of every process that there is, three times for a
-//! worker: with 256 workers, 0.1 s, which a learner that did so at each turn of its maintenance
-//! would take from its workers four times a second. So it looks at once when the process behind a
-//! worker's port is gone, which costs a system call, and for all else, such as a process that died
-//! before it had a port, only as often as its share of time allows.
+//! To find dead processes, iceoryx2 reads several files per process, and three times as many for a
+//! worker. With 256 workers this takes 0.1 s, which the learner would spend four times a second if
+//! it did so in each maintenance call. The learner therefore scans immediately only if the process
+//! of a worker's port is gone, which one system call shows. In all other cases, such as a process
+//! that died before it had a port, it scans only as often as a fixed share of its time allows.
 
 use iceoryx2::node::Node;
 use iceoryx2::prelude::CallbackProgression;
@@ -16,24 +16,24 @@ use super::channel::Factory;
 use super::service::{PrivateIpc, clean};
 use crate::transport::TransportError;
 
-/// Nodes looked at by each call on average: all of them at every call with up to ten workers, once
-/// in six seconds with 256.
+/// Nodes scanned per call on average. With up to ten workers every call scans all nodes; with 256
+/// workers a scan happens once in six seconds.
 const LOOKS: usize = 32;
-/// Cleanups that may fail in a row before the caller is told. One is normal: a worker that starts
-/// or ends in that moment hides the ones behind it.
+/// Consecutive failed cleanups before the error is returned. Single failures are normal: a worker
+/// that starts or ends during the scan hides the ones behind it.
 const FAILURES_MAX: usize = 20;
 
-/// How much was looked at lately.
+/// Rate limiter of the scans.
 #[derive(Debug, Default)]
 pub(super) struct Cleaning {
-    /// Nodes that were looked at and not yet paid for by calls without a look.
+    /// Scanned nodes that are not yet compensated by calls without a scan.
     owed: usize,
     failures: usize,
 }
 
 impl Cleaning {
-    /// To be called a few times a second; `died`: a process that is known is gone; `found_dead`:
-    /// see [`clean`].
+    /// Cleans up if a scan is due. Call it a few times a second. `died` says that a known process
+    /// is gone; for `found_dead` see [`clean`].
     pub(super) fn clean_in_time(
         &mut self,
         node: &Node<PrivateIpc>,
@@ -57,8 +57,8 @@ impl Cleaning {
     }
 }
 
-/// Whether the process behind a port of the service is gone. One whose number another process has
-/// by now, or that lives where numbers mean others, is found in time.
+/// Whether the process of one of the service's ports is gone. A process whose number has been
+/// reused, or that lives in another PID namespace, is found by the regular scans.
 pub(super) fn sender_died<E, H>(factory: &Factory<E, H>) -> bool
 where
     E: core::fmt::Debug + iceoryx2::prelude::ZeroCopySend + 'static,

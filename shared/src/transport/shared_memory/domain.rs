@@ -1,15 +1,15 @@
-//! The run's private directory for shared memory: the permission boundary and the unit of removal.
+//! The run's private directory for shared memory, with its permissions, locks and removal.
 //!
 //! ```text
-//! /dev/shm/dmprl-<uid>/     0700, the parent: everything of this user
+//! /dev/shm/dmprl-<uid>/     0700, the parent: all runs of this user
 //!   <token>/                0700, one run
-//!     domain                marker: this directory is ours to remove
+//!     domain                marker: dmprl may remove this directory
 //!     owner.lock            locked as long as the owner lives
 //!     …                     see `generation`
 //! ```
-//! A lock dies with its process, however it ends: a directory with a free lock is abandoned.
-//! Creating and removing happen under a lock on the parent, so that a directory between `mkdir`
-//! and its lock is never seen as abandoned.
+//! The kernel releases a lock when its process ends for any reason, so a directory with a free lock
+//! is abandoned. Directories are created and removed under a lock on the parent, so that a
+//! directory between `mkdir` and its lock never looks abandoned.
 
 mod leftovers;
 
@@ -30,42 +30,42 @@ use super::service::PREFIX;
 const MARKER_FILE: &str = "domain";
 const MARKER_TEXT: &str = "dmprl shared-memory domain, version 1\n";
 const LOCK_FILE: &str = "owner.lock";
-/// A directory that is being made; complete ones are renamed.
+/// Prefix of directories under construction; complete ones are renamed.
 const UNFINISHED: &str = ".dmprl-unfinished-";
-/// A directory that is being removed: renamed first, so that no one joins any more.
+/// Prefix of directories under removal; they are renamed first, so that no process can join them.
 const CONDEMNED: &str = ".dmprl-condemned-";
-/// Path of a generation and iceoryx2's prefix together [bytes]: iceoryx2 appends up to 38 bytes for
-/// Unix sockets, whose paths end at 108.
+/// Maximum length of a generation's path with iceoryx2's prefix [bytes]: iceoryx2 appends up to 38
+/// bytes for Unix sockets, whose paths are limited to 108.
 const ROOT_BYTES_MAX: usize = 70;
 const TOKEN_BYTES_MAX: usize = 32;
-/// The parent's lock is held for milliseconds; it is asked for this often.
+/// Attempts to take the parent's lock, which is held for milliseconds.
 const PARENT_LOCK_ATTEMPTS: usize = 500;
 const PARENT_LOCK_PAUSE: Duration = Duration::from_millis(10);
 
-/// Why a domain could not be made, opened or removed.
+/// Why a domain could not be created, opened or removed.
 #[derive(Debug, Error)]
 pub enum DomainError {
-    /// The operating system refused.
+    /// The operating system returned an error.
     #[error("{operation} {path}: {cause}")]
     Io {
-        /// What was attempted.
+        /// The attempted operation.
         operation: &'static str,
-        /// On what.
+        /// The file or directory.
         path: PathBuf,
-        /// Why not.
+        /// The error.
         cause: io::Error,
     },
-    /// The directory is not private to this user, or not a domain.
+    /// The directory is not private to this user, or is not a domain.
     #[error("{path}: expected {expected}, got {got}")]
     Untrusted {
         /// The directory.
         path: PathBuf,
-        /// What it has to be.
+        /// Required properties.
         expected: &'static str,
-        /// What it is.
+        /// Actual properties.
         got: String,
     },
-    /// The path leaves no room for the names of sockets.
+    /// The path leaves too little space for the names of sockets.
     #[error(
         "shared-memory path {path} takes {got} bytes with what is added, at most {ROOT_BYTES_MAX} \
          fit: choose a shorter directory or token"
@@ -73,10 +73,10 @@ pub enum DomainError {
     TooLong {
         /// The directory.
         path: PathBuf,
-        /// Its length with the generation's directory and iceoryx2's prefix \[bytes\].
+        /// Length of the path with the generation's directory and iceoryx2's prefix \[bytes\].
         got: usize,
     },
-    /// The token is empty, too long or has characters that do not belong into a name.
+    /// The token is empty, too long or contains invalid characters.
     #[error("token {got:?}: expected 1 to {TOKEN_BYTES_MAX} characters a-z, A-Z, 0-9, - or _")]
     Token {
         /// The token.
@@ -88,7 +88,7 @@ pub enum DomainError {
         /// The locked file or directory.
         path: PathBuf,
     },
-    /// Shared memory would run out, which kills processes in mid-run with SIGBUS.
+    /// Too little shared memory is free. Processes would later be killed by SIGBUS.
     #[error(
         "{path}: {needed} bytes of shared memory needed, {available} available: use fewer \
          workers, shorter queues, or enlarge it (Docker: --shm-size)"
@@ -96,9 +96,9 @@ pub enum DomainError {
     Space {
         /// The directory.
         path: PathBuf,
-        /// Needed \[bytes\].
+        /// Required shared memory \[bytes\].
         needed: u64,
-        /// Available \[bytes\].
+        /// Available shared memory \[bytes\].
         available: u64,
     },
 }
@@ -108,22 +108,22 @@ fn failed(operation: &'static str, path: &Path) -> impl FnOnce(io::Error) -> Dom
     move |cause| DomainError::Io { operation, path, cause }
 }
 
-/// The run's shared-memory directory. Its creator owns it: dropped, the directory is gone.
+/// The run's shared-memory directory. Its creator owns it and removes it on drop.
 #[derive(Debug)]
 pub struct Domain {
     path: PathBuf,
-    /// The owner's lock; `None` in the processes that only opened the domain.
+    /// The owner's lock; `None` in processes that only opened the domain.
     owner: Option<File>,
 }
 
 impl Domain {
-    /// Makes the directory `token` in `parent`, which is made too if it is not there.
+    /// Creates the directory `token` in `parent`, and `parent` if it does not exist.
     ///
-    /// `token` should be random, so that runs do not meet.
+    /// `token` should be random, so that runs do not collide.
     ///
     /// # Errors
-    /// `Token` or `TooLong` for names that do not fit, `Untrusted` if `parent` is not private to
-    /// this user, `Io` (`AlreadyExists`) if the domain exists.
+    /// `Token` or `TooLong` for invalid names, `Untrusted` if `parent` is not private to this user,
+    /// `Io` (`AlreadyExists`) if the domain exists.
     pub fn create(parent: &Path, token: &str) -> Result<Self, DomainError> {
         check_token(token)?;
         let path = parent.join(token);
@@ -141,7 +141,7 @@ impl Domain {
         private_file(&marker)?
             .write_all(MARKER_TEXT.as_bytes())
             .map_err(failed("writing", &marker))?;
-        // Renaming onto an empty directory would replace it silently.
+        // A plain rename would silently replace an empty directory.
         renameat_with(CWD, &unfinished, CWD, &path, RenameFlags::NOREPLACE)
             .map_err(|errno| failed("making", &path)(errno.into()))?;
         Ok(Self { path, owner: Some(owner) })
@@ -150,7 +150,7 @@ impl Domain {
     /// Opens a domain that another process owns.
     ///
     /// # Errors
-    /// `Untrusted` if it is not private to this user or not a domain, `Io` if it is not there.
+    /// `Untrusted` if it is not private to this user or not a domain, `Io` if it does not exist.
     pub fn open(path: &Path) -> Result<Self, DomainError> {
         check_private(path)?;
         if !has_marker(path) {
@@ -163,19 +163,19 @@ impl Domain {
         Ok(Self { path: path.to_owned(), owner: None })
     }
 
-    /// The directory.
+    /// Path of the directory.
     #[must_use]
     pub fn path(&self) -> &Path {
         &self.path
     }
 
-    /// Refuses to go on if less than `needed_bytes` of shared memory are free.
+    /// Fails if less than `needed_bytes` of shared memory are free.
     ///
-    /// Segments are not reserved when they are made: without this check a full file system kills
-    /// whoever writes the first page that is missing.
+    /// Files in shared memory are not reserved on creation. On a full file system, the kernel kills
+    /// the process that first writes to a missing page; this check prevents that.
     ///
     /// # Errors
-    /// `Space` with both numbers; `Io` if the file system does not tell.
+    /// `Space` with both numbers; `Io` if the free space cannot be read.
     pub fn check_space(&self, needed_bytes: u64) -> Result<(), DomainError> {
         let file_system = statvfs(&self.path)
             .map_err(|errno| failed("asking for free space in", &self.path)(errno.into()))?;
@@ -205,7 +205,7 @@ impl Domain {
 impl Drop for Domain {
     fn drop(&mut self) {
         if self.owner.is_some() && has_marker(&self.path) {
-            // There is no one left to tell; what remains is found by `remove_abandoned`.
+            // `drop` cannot report errors; `remove_abandoned` finds the rest.
             let _ = condemn(&self.path);
             if let Some(parent) = self.path.parent() {
                 remove_parent_if_empty(parent);
@@ -214,7 +214,7 @@ impl Drop for Domain {
     }
 }
 
-/// Renames the domain so that no one joins it any more, then removes it. `false` if it is gone.
+/// Renames the domain, so that no process can join it, and removes it. `false` if it did not exist.
 fn condemn(path: &Path) -> Result<bool, DomainError> {
     let mut name = std::ffi::OsString::from(CONDEMNED);
     name.push(path.file_name().unwrap_or_default());
@@ -226,7 +226,7 @@ fn condemn(path: &Path) -> Result<bool, DomainError> {
     remove_tree(&condemned).map(|()| true)
 }
 
-/// Removes a directory; symbolic links below it are removed, never followed.
+/// Removes a directory. Symbolic links below it are removed, not followed.
 fn remove_tree(path: &Path) -> Result<(), DomainError> {
     match std::fs::remove_dir_all(path) {
         Err(error) if error.kind() != ErrorKind::NotFound => Err(failed("removing", path)(error)),
@@ -257,8 +257,8 @@ fn private_file(path: &Path) -> Result<File, DomainError> {
         .map_err(failed("making", path))
 }
 
-/// The last domain to go takes the parent with it, so one that was there may be gone when it is
-/// locked: then it is made again.
+/// Creates and locks the parent. The last domain to be removed also removes the parent, so an
+/// existing parent may be gone when it is locked; it is then created again.
 fn make_and_lock_parent(parent: &Path) -> Result<File, DomainError> {
     for _ in 0..PARENT_LOCK_ATTEMPTS {
         match private_directory().create(parent) {
@@ -275,7 +275,7 @@ fn make_and_lock_parent(parent: &Path) -> Result<File, DomainError> {
     Err(DomainError::Locked { path: parent.to_owned() })
 }
 
-/// A parent that cannot be locked or holds anything stays; an empty directory harms nobody.
+/// Removes the parent if it is empty and can be locked. An empty directory that stays does no harm.
 fn remove_parent_if_empty(parent: &Path) {
     if let Ok(Some(_lock)) = lock_parent(parent) {
         let _ = std::fs::remove_dir(parent);
@@ -309,8 +309,8 @@ fn try_lock(file: &File, path: &Path) -> Result<(), DomainError> {
     }
 }
 
-/// Locks the parent directory itself: there is no file in it that someone could leave behind.
-/// `None` if it is gone, or was removed while this waited for its lock.
+/// Locks the parent directory itself, so that no lock file can be left behind. `None` if the
+/// directory does not exist, or was removed while waiting for its lock.
 fn lock_parent(parent: &Path) -> Result<Option<File>, DomainError> {
     let opened = OpenOptions::new()
         .read(true)

@@ -1,13 +1,13 @@
-//! A directory of its own for each learner of a run, and how workers follow from one to the next.
+//! A separate directory for each learner of a run, and the workers' switch from one to the next.
 //!
 //! ```text
 //! <domain>/generation    number of the newest complete generation
 //! <domain>/g<number>/    all that iceoryx2 creates for one learner and its workers
 //! ```
-//! iceoryx2 0.10 does not recover from every death: a creator killed in the middle leaves a
-//! service that hangs, a cleaner killed in the middle leaves places taken for good. So a new
-//! learner inherits nothing. It starts in a new directory, removes the old one, and announces its
-//! number when all services are complete; workers notice the number and join anew.
+//! iceoryx2 0.10 does not recover from every death: a process killed while creating a service
+//! leaves one that hangs, and a process killed during cleanup leaves slots that are never freed.
+//! Therefore a new learner inherits nothing. It starts in a new directory, removes the old one, and
+//! announces its number when all services are complete. Workers detect the new number and rejoin.
 
 use std::fs::{DirBuilder, File, OpenOptions};
 use std::os::unix::ffi::OsStrExt;
@@ -24,26 +24,27 @@ use crate::transport::TransportError;
 
 const NUMBER_FILE: &str = "generation";
 const DIRECTORY_PREFIX: &str = "g";
-/// Bytes that the directory adds to the domain's path: "/g" and four digits.
+/// Length that the directory adds to the domain's path: "/g" and four digits [bytes].
 pub(super) const DIRECTORY_BYTES: usize = 6;
-/// Failures in a row to join a new generation before the caller is told. A few are normal: the
-/// learner may die again in that moment, or its predecessor's worker be still registered. Many,
-/// because a learner killed between announcing its generation and the worker's look leaves one that
-/// nobody can join until the next is announced, which takes as long as a checkpoint takes to load.
+/// Consecutive failures to join a new generation before the error is returned. A few are normal:
+/// the learner may die again during the join, or the predecessor's worker may still be registered.
+/// The limit is high because a learner may be killed just after announcing its generation. No
+/// worker can join that generation, and the next one is announced only after a checkpoint has been
+/// loaded.
 const JOIN_FAILURES_MAX: usize = 100_000;
 
-/// A generation that is being made; workers do not see it yet.
+/// A generation under construction, which workers do not see yet.
 #[derive(Debug)]
 pub(super) struct Generation {
-    /// Counts the learners of the domain, from 1.
+    /// Number of the learner within the domain, from 1.
     pub(super) number: u64,
     number_file: File,
-    /// Its directory.
+    /// Directory of the generation.
     pub(super) root: PathBuf,
 }
 
 impl Generation {
-    /// Starts a new generation and removes all others. Only for the holder of the learner's lock.
+    /// Starts a new generation and removes all others. The caller must hold the learner's lock.
     pub(super) fn begin(domain: &Domain) -> Result<Self, TransportError> {
         let path = domain.path();
         let failed = || refused("starting a generation in", path.display());
@@ -69,12 +70,12 @@ impl Generation {
         Ok(Self { number, number_file, root })
     }
 
-    /// Whether no learner has served the domain before.
+    /// Whether this is the domain's first learner.
     pub(super) fn is_first(&self) -> bool {
         self.number == 1
     }
 
-    /// Tells the workers that it is complete.
+    /// Announces to the workers that the generation is complete.
     pub(super) fn announce(self) -> Result<(), TransportError> {
         self.number_file
             .write_all_at(&self.number.to_le_bytes(), 0)
@@ -92,30 +93,30 @@ fn read_number(file: &File) -> Option<u64> {
     Some(u64::from_le_bytes(bytes))
 }
 
-/// The number of the newest generation, mapped: it is looked at before every segment, and a system
-/// call would take as long as all the rest of sending one.
+/// The number of the newest generation, memory-mapped: it is read before every segment, and a
+/// system call would take as long as the rest of sending one.
 #[derive(Debug)]
 struct NewestNumber(Mmap);
 
 impl NewestNumber {
-    /// Of a domain that a learner has served.
+    /// Opens the number of a domain that a learner has served.
     fn open(domain: &Path) -> Result<Self, TransportError> {
         let operation = "looking for a learner in";
         let file = File::open(domain.join(NUMBER_FILE));
         let file = file.map_err(refused(operation, domain.display()))?;
-        // Before the first announcement there is nothing to map.
+        // Before the first announcement the file is empty and cannot be mapped.
         let served = read_number(&file).ok_or("none has served it yet");
         served.map_err(refused(operation, domain.display()))?;
-        // SAFETY: the file has these bytes and no process of the run shortens it, nor can another
-        // user, so none of them goes away below the map; that they change is looked at in `get`.
+        // SAFETY: the file has these bytes. No process of the run truncates it and no other user
+        // can, so the mapping stays valid. `get` handles concurrent changes.
         let map = unsafe { MmapOptions::new().len(size_of::<u64>()).map(&file) };
         Ok(Self(map.map_err(refused("mapping a file of", domain.display()))?))
     }
 
     fn get(&self) -> u64 {
-        // SAFETY: a map begins at a page, so eight bytes at its start are aligned, and every
-        // pattern is a number. Volatile, because a learner writes them: with one store, as here is
-        // one load.
+        // SAFETY: a mapping starts at a page boundary, so its first eight bytes are aligned, and
+        // every bit pattern is a valid number. The read is volatile because a learner writes the
+        // number concurrently, with a single store.
         u64::from_le(unsafe { self.0.as_ptr().cast::<u64>().read_volatile() })
     }
 }
@@ -147,25 +148,26 @@ impl<P> Membership<P> {
         Ok(membership)
     }
 
-    /// The port, if there is one at the moment.
+    /// The port, or `None` between two generations.
     pub(super) fn port(&self) -> Option<&P> {
         self.port.as_ref()
     }
 
-    /// The generation it has joined, or last tried to.
+    /// Number of the generation that it has joined or last tried to join.
     pub(super) fn number(&self) -> u64 {
         self.number
     }
 
-    /// Makes the port anew if there is a new generation or a connection failed; true if it did.
+    /// Recreates the port if there is a new generation or a connection failed. Returns true if it
+    /// did.
     ///
     /// # Errors
-    /// `Incompatible` at once, others when they persist.
+    /// `Incompatible` immediately; other errors if they persist.
     pub(super) fn renew(
         &mut self,
         make: impl FnOnce(&Node<PrivateIpc>, &Disconnected) -> Result<P, TransportError>,
     ) -> Result<bool, TransportError> {
-        // So that nothing is delivered to a dead learner's queue while the next learner waits.
+        // This avoids deliveries to a dead learner's queue while the next learner waits.
         let is_current = self.newest.get() == self.number;
         if is_current && self.port.is_some() && !self.disconnected.is_set() {
             return Ok(false);
@@ -183,7 +185,7 @@ impl<P> Membership<P> {
         &mut self,
         make: impl FnOnce(&Node<PrivateIpc>, &Disconnected) -> Result<P, TransportError>,
     ) -> Result<(), TransportError> {
-        // First, because the slot has one place only.
+        // The old port goes first, because the slot allows only one.
         self.port = None;
         self.disconnected.clear();
         self.number = self.newest.get();

@@ -1,4 +1,4 @@
-//! A channel from the learner to many readers on which the newest sample replaces the one before.
+//! A channel from the learner to many readers; each sample replaces the previous one.
 
 use std::fmt::Debug;
 use std::fs::File;
@@ -14,16 +14,16 @@ use super::channel::{Channel, ChannelBuilder, Disconnected, Factory};
 use super::service::{PrivateIpc, refused};
 use crate::transport::TransportError;
 
-/// Readers besides the workers: evaluator, dashboard, and the dead that are not cleaned up yet.
+/// Readers besides the workers: evaluator, dashboard, and dead ones that are not cleaned up yet.
 const SPARE_SUBSCRIBERS: usize = 4;
-/// Processes besides the readers, likewise.
+/// Processes besides the readers: dead ones that are not cleaned up yet.
 const SPARE_NODES: usize = 4;
-/// Samples taken from the channel in one call: the newest, and one more if the learner had to make
-/// a new port.
+/// Samples read from the channel per call: the newest, and one more if the learner had to recreate
+/// its port.
 pub(super) const SAMPLES_MAX: usize = 2;
 
-/// Chunks in the learner's data segment: the newest, the one being filled, and one that each
-/// reader may still be copying. Pages that are never written cost nothing.
+/// Chunks in the learner's data segment: the newest, the one being filled, and one that each reader
+/// may still be copying. Unwritten pages take no memory.
 pub(super) fn chunk_count(worker_count: usize) -> usize {
     worker_count + SPARE_SUBSCRIBERS + 2
 }
@@ -31,7 +31,7 @@ pub(super) fn chunk_count(worker_count: usize) -> usize {
 /// A reader's port.
 pub(super) type ReaderPort<E, H> = Subscriber<PrivateIpc, [E], H>;
 
-/// The learner's end.
+/// The learner's end of the channel.
 #[derive(Debug)]
 pub(super) struct Writer<E, H>
 where
@@ -40,12 +40,13 @@ where
 {
     channel: Channel,
     factory: Factory<E, H>,
-    /// `None` only after a new port could not be made.
+    /// `None` only after a port could not be recreated.
     port: Option<Port<PrivateIpc, [E], H>>,
     disconnected: Disconnected,
     len: usize,
     chunk_count: usize,
-    /// Says to a second learner that there is one. Last: given up after the port.
+    /// Keeps the learner's lock, which prevents a second learner. The last field, so that it is
+    /// released after the port.
     _learner: Arc<File>,
 }
 
@@ -54,7 +55,7 @@ where
     E: Copy + Debug + ZeroCopySend + 'static,
     H: Debug + Default + ZeroCopySend,
 {
-    /// Creates the channel, whose samples have `len` elements.
+    /// Creates the channel. Its samples have `len` elements.
     pub(super) fn serve(
         node: &Node<PrivateIpc>,
         channel: Channel,
@@ -85,7 +86,7 @@ where
         Ok(writer)
     }
 
-    /// A new port, at the start and after a connection failed.
+    /// Creates the port, at the start and after a failed connection.
     fn renew(&mut self) -> Result<(), TransportError> {
         self.disconnected.clear();
         self.port = None;
@@ -123,7 +124,7 @@ where
         sent.map(|_readers| ()).map_err(refused("publishing on", name))
     }
 
-    /// Hands the newest sample to readers that have joined since. After a connection failed, a new
+    /// Sends the newest sample to readers that have joined since. After a failed connection a new
     /// port takes over, and late joiners wait for the next sample.
     pub(super) fn maintain(&mut self) -> Result<(), TransportError> {
         if self.disconnected.is_set() || self.port.is_none() {

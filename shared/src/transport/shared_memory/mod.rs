@@ -1,17 +1,18 @@
 //! Segments and snapshots between processes of one host, over iceoryx2.
 //!
-//! `domain` is the run's directory and `generation` the part of it that belongs to one learner,
-//! `service`, `channel`, `cleaning` and `latest` tame the middleware, `segments` and `parameters`
-//! implement the traits, `acknowledgements` is what `delivery` needs beside them. iceoryx2 is named
-//! nowhere else.
+//! `domain` is the run's directory, and `generation` the part of it that belongs to one learner.
+//! `service`, `channel`, `cleaning` and `latest` wrap the middleware. `segments` and `parameters`
+//! implement the traits; `acknowledgements` is the third channel, for `delivery`. No other module
+//! uses iceoryx2.
 //!
-//! What holds when processes die:
-//! - A worker never creates a service and never cleans up, so one killed in the middle blocks
-//!   nobody. Its queued segments are still delivered; the learner's `maintain` frees its place.
-//! - A dead learner's queues are lost: `Delivered` promises no more than the queue. Workers see
-//!   `Full` or `Detached` until the next learner serves the same domain, then follow it. What must
-//!   not be lost is kept by `delivery` until it is acknowledged.
-//! - A new learner inherits nothing from the one before: whatever that left half-made is removed.
+//! Guarantees when processes die:
+//! - A worker never creates a service and never cleans up, so its death at any point blocks no
+//!   other process. Its queued segments are still delivered; the learner's `maintain` frees its
+//!   slot.
+//! - A dead learner's queues are lost: `Delivered` only means that the segment is in the queue.
+//!   Workers get `Full` or `Detached` until the next learner serves the same domain, and then
+//!   reconnect to it. `delivery` keeps unacknowledged segments until then.
+//! - A new learner inherits nothing from its predecessor: it removes all incomplete files.
 
 mod acknowledgements;
 mod channel;
@@ -38,28 +39,28 @@ use crate::config::ExperimentConfig;
 use crate::policy::Policy;
 use crate::segment::SegmentLayout;
 
-/// Version of what the processes of a run say to each other; others are refused.
+/// Version of the protocol between the processes of a run; other versions are rejected.
 const PROTOCOL: u32 = 2;
-/// Locked by the learner as long as it lives.
+/// The learner holds this lock as long as it lives.
 const LEARNER_LOCK: &str = "learner.lock";
-/// Queues, registries and descriptions of one service, besides its chunks [bytes]. Measured: see
+/// Queues, registries and descriptions of one service, without its chunks [bytes]. Measured: see
 /// the test `the_space_asked_for_covers_what_is_used`.
 const SERVICE_BYTES: usize = 64 * 1024;
-/// The same for each segment of a queue's capacity [bytes].
+/// The same per segment of a queue's capacity [bytes].
 const QUEUE_ENTRY_BYTES: usize = 64;
 
-/// What learner and workers of a run agree on.
+/// Parameters that must be equal in the learner and the workers of a run.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Plan {
-    /// Another run's workers are refused.
+    /// Run; workers of another run are rejected.
     pub run_id: u64,
-    /// Another architecture's workers are refused.
+    /// Hash of the architecture; workers with another one are rejected.
     pub architecture_hash: u64,
     /// Sizes of a segment.
     pub layout: SegmentLayout,
-    /// Worker slots, each with a queue of its own.
+    /// Number of worker slots, each with its own queue.
     pub worker_count: usize,
-    /// Segments that fit into one worker's queue.
+    /// Capacity of each worker's queue in segments.
     pub queue_segments: usize,
     /// Length of a snapshot's values.
     pub parameters_len: usize,
@@ -87,7 +88,7 @@ impl Plan {
         ]
     }
 
-    /// Shared memory that the run may use at most \[bytes\].
+    /// Maximum shared memory of the run \[bytes\].
     #[must_use]
     pub fn required_bytes(&self) -> u64 {
         let Self { worker_count, queue_segments, layout, parameters_len, .. } = *self;
@@ -95,7 +96,7 @@ impl Plan {
     }
 }
 
-/// Shared memory that a run may use at most \[bytes\].
+/// Maximum shared memory of a run \[bytes\].
 #[must_use]
 pub fn required_bytes(
     worker_count: usize,
@@ -112,24 +113,25 @@ pub fn required_bytes(
         .saturating_add(SERVICE_BYTES);
     let snapshots = chunk(size_of::<parameters::WireHeader>(), parameters_len)
         .saturating_mul(latest::chunk_count(worker_count));
-    // Two numbers a worker, each as long as two f32.
+    // Two numbers per worker, each as large as two f32.
     let marks = chunk(0, acknowledgements::sample_len(worker_count).saturating_mul(2))
         .saturating_mul(latest::chunk_count(worker_count));
-    // Each worker has a connection on the channels for snapshots and acknowledgements too.
+    // Each worker also has a connection on the channels for snapshots and acknowledgements.
     let services = worker_count.saturating_add(1).saturating_mul(2 * SERVICE_BYTES);
     let bytes = worker_count.saturating_mul(queue).saturating_add(snapshots).saturating_add(marks);
     u64::try_from(bytes.saturating_add(services)).unwrap_or(u64::MAX)
 }
 
-/// What the learner holds. Its parts may live on different threads; no worker can attach any more
-/// once one of them is dropped.
+/// The learner's ends of all channels.
+///
+/// The fields may be moved to different threads. Once one of them is dropped, no worker can attach.
 #[derive(Debug)]
 pub struct LearnerEnd {
-    /// Takes segments from all workers.
+    /// Receives segments from all workers.
     pub segments: Receiver,
     /// Publishes snapshots to all workers.
     pub parameters: Publisher,
-    /// Tells all workers what has arrived for good.
+    /// Publishes acknowledgements to all workers.
     pub acknowledgements: Acknowledger,
 }
 
@@ -146,18 +148,18 @@ impl WorkerTransport for SharedMemory {
 /// What a worker holds.
 pub type WorkerEnd = super::WorkerEnd<SharedMemory>;
 
-/// Makes this process the run's learner and creates all services. Workers of a learner before it
-/// follow by themselves.
+/// Makes this process the run's learner and creates all services. Workers of a previous learner
+/// reconnect on their own.
 ///
 /// # Errors
-/// `Domain` if the directory is not a domain, another learner lives or space is short,
-/// `Middleware` for the rest. Whatever was half-made is removed by the next call.
+/// `Domain` if the directory is not a domain, another learner lives or space is short, `Middleware`
+/// for other errors. The next call removes incomplete files.
 pub fn serve(domain: &Path, plan: &Plan) -> Result<LearnerEnd, TransportError> {
     let domain = Domain::open(domain)?;
     let learner = Arc::new(domain.lock(LEARNER_LOCK)?);
     let generation = Generation::begin(&domain)?;
     if generation.is_first() {
-        // Later, workers still hold the generation before, and give it back one by one.
+        // Later, workers still hold the previous generation's memory and release it one by one.
         domain.check_space(plan.required_bytes())?;
     }
     let node = service::join(&generation.root)?;
@@ -168,13 +170,14 @@ pub fn serve(domain: &Path, plan: &Plan) -> Result<LearnerEnd, TransportError> {
     Ok(LearnerEnd { segments, parameters, acknowledgements })
 }
 
-/// Attaches this process to the run as worker `worker_index`. Opens, never creates.
+/// Attaches this process to the run as worker `worker_index`. It opens services and never creates
+/// one.
 ///
 /// # Errors
-/// `Taken` if a worker of that index lives, or died and the learner's `maintain` has not freed its
-/// place yet: attach again a little later. `Incompatible` if the learner follows another plan.
-/// `Domain` if the directory is not a domain. `Middleware` if no learner has served it yet, and
-/// for the rest.
+/// `Taken` if a worker with this index lives, or died and the learner's `maintain` has not freed
+/// its slot yet: retry a little later. `Incompatible` if the learner has another plan. `Domain` if
+/// the directory is not a domain. `Middleware` if no learner has served it yet, and for other
+/// errors.
 pub fn attach(
     domain: &Path,
     plan: &Plan,
@@ -187,7 +190,7 @@ pub fn attach(
     Ok(WorkerEnd { segments, parameters, acknowledgements })
 }
 
-/// Attaches this process to the queue of one worker only, on whose behalf it sends.
+/// Attaches this process only to the queue of one worker, on whose behalf it sends.
 ///
 /// # Errors
 /// As [`attach`].

@@ -1,4 +1,4 @@
-//! Policy snapshots from the learner to all workers: the newest replaces the one before.
+//! Policy snapshots from the learner to all workers; each replaces the previous one.
 
 use std::fs::{File, OpenOptions};
 use std::os::unix::fs::{FileExt, OpenOptionsExt};
@@ -17,10 +17,10 @@ use super::service::{PrivateIpc, refused};
 use crate::parameters::{ParameterSnapshot, SnapshotError, checksum};
 use crate::transport::{ParameterPublisher, ParameterSubscriber, TransportError};
 
-/// Holds the newest version that any learner of the domain has published.
+/// File with the newest version that any learner of the domain has published.
 const VERSION_FILE: &str = "policy_version";
 
-/// Everything about a snapshot except its values.
+/// Metadata of a snapshot.
 #[derive(Debug, Default, Clone, Copy)]
 #[repr(C)]
 pub(super) struct WireHeader {
@@ -28,7 +28,7 @@ pub(super) struct WireHeader {
     env_steps: u64,
     architecture_hash: u64,
     checksum: u32,
-    /// Fills the last word.
+    /// Explicit padding of the last word.
     reserved: u32,
 }
 
@@ -73,7 +73,7 @@ impl Publisher {
             .open(&path)
             .map_err(refused("opening", path.display()))?;
         let mut bytes = [0; size_of::<u64>()];
-        // A file that is empty yet: nothing has been published.
+        // The file is empty before the first publication.
         let newest_version =
             version_file.read_exact_at(&mut bytes, 0).map_or(0, |()| u64::from_le_bytes(bytes));
         let len = (plan.parameters_len, plan.worker_count);
@@ -81,9 +81,10 @@ impl Publisher {
         Ok(Self { writer, version_file, newest_version })
     }
 
-    /// The newest version that was published in this domain, by this learner or one before it.
-    /// A learner that goes on from a checkpoint must count on from here: its workers take no older
-    /// version, and two policies of one number could not be told apart.
+    /// The newest version published in this domain, by this learner or a previous one.
+    ///
+    /// A learner that resumes from a checkpoint must continue from this number: workers ignore
+    /// older versions, and two policies must not have the same number.
     #[must_use]
     pub fn newest_version(&self) -> u64 {
         self.newest_version
@@ -99,7 +100,7 @@ impl ParameterPublisher for Publisher {
             checksum: snapshot.checksum(),
             reserved: 0,
         };
-        // First, so that no version is out that a successor does not know of.
+        // Written first, so that a successor knows of every published version.
         self.version_file
             .write_all_at(&snapshot.version.to_le_bytes(), 0)
             .map_err(refused("writing", VERSION_FILE))?;
@@ -131,7 +132,7 @@ impl Subscriber {
     }
 }
 
-/// Refuses a snapshot that is foreign or damaged.
+/// Rejects a damaged snapshot, or one of another architecture.
 fn check(header: &WireHeader, values: &[f32], architecture_hash: u64) -> Result<(), SnapshotError> {
     let version = header.version;
     let (expected, got) = (architecture_hash, header.architecture_hash);
@@ -155,7 +156,7 @@ impl ParameterSubscriber for Subscriber {
         for _ in 0..SAMPLES_MAX {
             let received = port.receive().map_err(refused("receiving from", &channel.name))?;
             let Some(sample) = received else { break };
-            // The length is the peer's word: believed only if it is the agreed one.
+            // The peer states the length, so check it against the agreed one.
             let got = usize::try_from(sample.header().number_of_elements()).unwrap_or(usize::MAX);
             if got != self.parameters_len {
                 return Err(TransportError::Length { expected: self.parameters_len, got });

@@ -1,7 +1,7 @@
 //! Segments from workers to the learner: one queue per worker slot.
 //!
-//! A service of its own for each worker, because a subscriber of several publishers serves them in
-//! a fixed order and starves the last. The learner takes from the queues in turn.
+//! Each worker has its own service, because a subscriber of several publishers serves them in a
+//! fixed order and starves the last. The learner serves the queues in turn.
 
 use std::fs::File;
 use std::sync::Arc;
@@ -22,29 +22,29 @@ use super::service::{PrivateIpc, refused};
 use crate::segment::{LAYOUT_VERSION, Segment, SegmentHeader};
 use crate::transport::{SegmentReceiver, SegmentSender, SendOutcome, TransportError};
 
-/// Segments that one worker may deliver before it is the next one's turn. More than one, so that a
-/// learner with many idle workers does not ask them all for each segment.
+/// Segments received from one worker before the next one's turn. More than one, so that a learner
+/// with many idle workers does not poll all of them for each segment.
 const TURN_SEGMENTS: usize = 8;
-/// Processes that may hold one worker's service open at once: learner, worker, and the dead whose
-/// places are not cleaned up yet.
+/// Maximum number of processes that have one worker's service open: learner, worker, and dead ones
+/// that are not cleaned up yet.
 const NODES_MAX: usize = 8;
-/// The learner copies a segment out and gives it back at once; a worker fills one at a time.
+/// The learner copies a segment and returns it immediately; a worker fills one at a time.
 const BORROWED_MAX: usize = 1;
 
-/// [`SegmentHeader`] in shared memory. The name states its layout to peers of other builds.
+/// [`SegmentHeader`] in shared memory. Its name identifies the layout to peers of other builds.
 #[derive(Debug, Default, Clone, Copy)]
 #[repr(transparent)]
 pub(super) struct WireHeader(pub(super) SegmentHeader);
 
-// SAFETY: `SegmentHeader` is `Pod`: no pointers, no padding, every bit pattern valid; its size and
-// alignment are asserted where it is defined, and its layout version is part of the agreement.
+// SAFETY: `SegmentHeader` is `Pod`: no pointers, no padding, every bit pattern valid. Its
+// definition asserts size and alignment, and its layout version is part of the agreement.
 unsafe impl ZeroCopySend for WireHeader {
     unsafe fn type_name() -> &'static str {
         "dmprl::SegmentHeader"
     }
 }
 
-/// Chunks in a worker's data segment: every one queued, borrowed or being filled.
+/// Chunks in a worker's data segment: queued, borrowed and being filled.
 pub(super) fn chunk_count(queue_segments: usize) -> usize {
     queue_segments + BORROWED_MAX + 1
 }
@@ -97,7 +97,7 @@ fn publish(
         .publisher_builder()
         .initial_max_slice_len(block_len)
         .max_loaned_samples(1)
-        // Without it a full queue is waited for, for ever if the learner is dead.
+        // By default iceoryx2 blocks on a full queue, forever if the learner is dead.
         .set_backpressure_handler(|_: &BackpressureInfo| BackpressureAction::DiscardDataAndFail)
         .set_degradation_handler(disconnected.remember())
         .create();
@@ -128,7 +128,7 @@ impl SegmentSender for Sender {
             sample.write_from_slice(block).send()
         });
         match sent {
-            // No subscriber, or a full queue whose learner is not there: the sample is gone.
+            // No subscriber, or a full queue without a learner: the sample is dropped.
             Ok(Ok(0)) => Ok(SendOutcome::Detached),
             Ok(Ok(_)) => Ok(SendOutcome::Delivered),
             Ok(Err(SendError::UnableToDeliver)) => Ok(SendOutcome::Full),
@@ -143,7 +143,7 @@ impl SegmentSender for Sender {
 struct Slot {
     channel: Channel,
     factory: Factory<f32, WireHeader>,
-    /// `None` only after a new port could not be made.
+    /// `None` only after a port could not be recreated.
     port: Option<ReceiverPort>,
     disconnected: Disconnected,
 }
@@ -157,7 +157,8 @@ pub struct Receiver {
     block_len: usize,
     node: Node<PrivateIpc>,
     cleaning: Cleaning,
-    /// Says to a second learner that there is one. Last: given up after the ports.
+    /// Keeps the learner's lock, which prevents a second learner. The last field, so that it is
+    /// released after the ports.
     _learner: Arc<File>,
 }
 
@@ -182,14 +183,14 @@ impl Receiver {
         })
     }
 
-    /// As [`SegmentReceiver::try_receive`], but from the queue of one worker alone: the others find
-    /// theirs full, and wait.
+    /// Receives as [`SegmentReceiver::try_receive`] does, but only from the queue of one worker.
+    /// The other workers wait once their queues are full.
     ///
     /// # Errors
     /// `Middleware` if the queue is broken.
     ///
     /// # Panics
-    /// If there is no such worker.
+    /// If the worker does not exist.
     pub fn try_receive_from(
         &mut self,
         worker_index: usize,
@@ -230,7 +231,7 @@ impl Slot {
         let Some(port) = &self.port else { return Ok(false) };
         let received = port.receive().map_err(refused("receiving from", &self.channel.name))?;
         let Some(sample) = received else { return Ok(false) };
-        // The length is the peer's word: believed only if it is the agreed one.
+        // The peer states the length, so check it against the agreed one.
         let got = usize::try_from(sample.header().number_of_elements()).unwrap_or(usize::MAX);
         if got != block_len {
             return Err(TransportError::Length { expected: block_len, got });
@@ -241,7 +242,7 @@ impl Slot {
         Ok(true)
     }
 
-    /// Makes a new port after a connection failed, unless segments still wait at the old one.
+    /// Recreates the port after a failed connection, unless the old one still has segments.
     fn renew(&mut self) -> Result<(), TransportError> {
         let waiting = |port: &ReceiverPort| port.has_samples().unwrap_or(false);
         let needed = self.disconnected.is_set() || self.port.is_none();
@@ -285,9 +286,9 @@ impl SegmentReceiver for Receiver {
     fn maintain(&mut self) -> Result<(), TransportError> {
         let Self { slots, cleaning, node, .. } = self;
         let died = slots.iter().any(|slot| sender_died(&slot.factory));
-        // Of a worker that was never joined nothing stays when it is cleaned up, not even what it
-        // was told is delivered. Joined before it is known to be dead, one that begins, sends and
-        // dies in between would be missed.
+        // Connect to dead workers before their cleanup, because the cleanup of a worker that was
+        // never connected discards its delivered segments. Connecting earlier, before a worker is
+        // known to be dead, would miss one that starts, sends and dies in between.
         let join = || {
             for port in slots.iter().filter_map(|slot| slot.port.as_ref()) {
                 let _ = port.has_samples();
@@ -329,7 +330,8 @@ mod tests {
             workers[worker].try_send(&header, &block).unwrap()
         };
         let mut segment = Segment::zeroed(plan.layout);
-        // The learner joins a queue when it first looks: a full one is nobody's until then.
+        // The learner connects to a queue on its first poll; before that, a full queue drops
+        // segments.
         assert_eq!(send(0, 0), SendOutcome::Delivered);
         assert!(learner.segments.try_receive(&mut segment).unwrap());
         let all_delivered = [SendOutcome::Delivered; 4];
@@ -341,7 +343,7 @@ mod tests {
             assert!(!learner.segments.try_receive_from(1, &mut segment).unwrap());
             assert_eq!(send(0, 5), SendOutcome::Full);
         }
-        // Nothing of the other's is lost.
+        // The other worker's segments are all there.
         for sequence in 1..=4 {
             assert!(learner.segments.try_receive(&mut segment).unwrap());
             assert_eq!((segment.header.worker_id, segment.header.sequence), (0, sequence));

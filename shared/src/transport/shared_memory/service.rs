@@ -1,8 +1,9 @@
 //! The private, file-backed iceoryx2 service: every resource is a file below the run's directory.
 //!
-//! The stock `ipc` service keeps part of its state in `/dev/shm` under names any user can squat.
-//! With the file concepts of `iceoryx2-cal` a mode-0700 directory is the permission boundary and
-//! the unit of removal. Price: these are inner crates, hence the exact version pins.
+//! The stock `ipc` service keeps part of its state in `/dev/shm` under names that any user can
+//! squat. With the file concepts of `iceoryx2-cal`, a mode-0700 directory restricts access, and
+//! removing it removes everything. The price: these are inner crates, so their versions are pinned
+//! exactly.
 
 use std::fmt::{Debug, Display};
 use std::panic::{AssertUnwindSafe, catch_unwind};
@@ -26,12 +27,12 @@ use iceoryx2_cal::{
 
 use crate::transport::TransportError;
 
-/// Prefix of every file iceoryx2 creates. Short, because Unix socket paths end at 108 bytes; the
-/// run's own directory already separates runs.
+/// Prefix of every file that iceoryx2 creates. It is short because Unix socket paths are limited to
+/// 108 bytes, and the run's own directory already separates runs.
 pub(super) const PREFIX: &str = "d_";
-/// The configuration that the learner writes and every process of the run reads.
+/// The iceoryx2 configuration, which the learner writes and every process of the run reads.
 const CONFIG_FILE: &str = "iceoryx2.toml";
-/// The service variant; ports are mutex-protected so that an end may move to another thread.
+/// The service variant. Ports are mutex-protected, so that they may move to another thread.
 #[derive(Debug, Clone)]
 pub(super) struct PrivateIpc {}
 
@@ -63,7 +64,7 @@ impl Service for PrivateIpc {
 
 impl iceoryx2::service::internal::ServiceInternal<PrivateIpc> for PrivateIpc {}
 
-/// Turns the middleware's refusal into an error that names what was attempted on what.
+/// Converts a middleware error into one that names the operation and its target.
 pub(super) fn refused<E: Display>(
     operation: &'static str,
     name: impl Display,
@@ -75,15 +76,15 @@ pub(super) fn refused<E: Display>(
     }
 }
 
-/// A service name, checked.
+/// Validates a service name.
 pub(super) fn service_name(name: &str) -> Result<ServiceName, TransportError> {
     name.try_into().map_err(refused("naming a service", name))
 }
 
-/// Writes the iceoryx2 configuration of `root` into it.
+/// Writes the iceoryx2 configuration for `root` into that directory.
 ///
-/// A file, because iceoryx2 takes its process-wide configuration from nothing else, and without
-/// one the cleanup of a half-started dead process would look below iceoryx2's default paths.
+/// iceoryx2 reads its process-wide configuration only from a file. Without one, the cleanup of a
+/// process that died during its start would search below iceoryx2's default paths.
 pub(super) fn write_config(root: &Path) -> Result<(), TransportError> {
     let operation = "writing the configuration";
     let root_path = iceoryx2::prelude::Path::new(root.as_os_str().as_encoded_bytes())
@@ -92,8 +93,8 @@ pub(super) fn write_config(root: &Path) -> Result<(), TransportError> {
     config.global.set_root_path(&root_path);
     config.global.prefix =
         FileName::new(PREFIX.as_bytes()).map_err(refused(operation, root.display()))?;
-    // Only the learner cleans up after the dead, and only in `clean`: concurrent cleanups are where
-    // iceoryx2's known bugs are, and a cleaner killed in the middle loses places for good.
+    // Only the learner cleans up, and only in `clean`. iceoryx2's known bugs are in concurrent
+    // cleanups, and a process killed during cleanup leaves slots that are never freed.
     config.global.node.cleanup_dead_nodes_on_creation = false;
     config.global.node.cleanup_dead_nodes_on_destruction = false;
     config.global.service.cleanup_dead_nodes_on_open = false;
@@ -104,15 +105,15 @@ pub(super) fn write_config(root: &Path) -> Result<(), TransportError> {
 
 /// Registers this process as a node below `root`.
 pub(super) fn join(root: &Path) -> Result<Node<PrivateIpc>, TransportError> {
-    // Failures come back as errors. The log repeats them, and speaks of every dead peer.
+    // Failures are returned as errors. The log only repeats them, and reports every dead peer.
     set_log_level(LogLevel::Fatal);
     let file = root.join(CONFIG_FILE);
     let path = FilePath::new(file.as_os_str().as_encoded_bytes())
         .map_err(refused("reading the configuration", file.display()))?;
     let config =
         Config::from_file(&path).map_err(refused("reading the configuration", file.display()))?;
-    // The first root of a process decides. It only serves the cleanup of processes that died
-    // before they had written which configuration they use.
+    // The first root of a process stays in effect. It only serves the cleanup of processes that
+    // died before they had recorded their configuration.
     Config::setup_global_config_from_file(&path)
         .map_err(refused("reading the configuration", file.display()))?;
     NodeBuilder::new()
@@ -122,12 +123,14 @@ pub(super) fn join(root: &Path) -> Result<Node<PrivateIpc>, TransportError> {
         .map_err(refused("joining", root.display()))
 }
 
-/// Frees what dead processes below the node's root left behind; returns how many nodes, dead or
-/// alive, it has looked at. `found_dead` is called for each dead one before anything of it is gone:
-/// it says and sends nothing more, so what it has left can be taken over then, and all of it.
+/// Frees the resources of dead processes below the node's root. Returns the number of nodes
+/// scanned, dead or alive.
 ///
-/// iceoryx2 0.10 panics when it finds a "dead" node alive after all (issue 1880): the panic
-/// becomes an error here, and the next call tries again.
+/// Calls `found_dead` for each dead node before any of its resources are removed. A dead process
+/// sends nothing more, so `found_dead` can take over everything that it left.
+///
+/// iceoryx2 0.10 panics when it finds a "dead" node alive after all (issue 1880). The panic becomes
+/// an error here, and the next call retries.
 pub(super) fn clean(
     node: &Node<PrivateIpc>,
     mut found_dead: impl FnMut(),
@@ -139,7 +142,7 @@ pub(super) fn clean(
             looked += 1;
             if let NodeState::Dead(dead) = state {
                 found_dead();
-                // What could not be removed is found again by the next call.
+                // The next call finds what could not be removed.
                 let _ = dead.try_remove_stale_resources();
             }
             CallbackProgression::Continue

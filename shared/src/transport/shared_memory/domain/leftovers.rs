@@ -1,4 +1,4 @@
-//! What dead runs have left: finding it, and removing it while holding its locks.
+//! Finds and removes the directories of dead runs, holding their locks.
 
 use std::fs::File;
 use std::os::unix::ffi::OsStrExt;
@@ -11,31 +11,31 @@ use super::{
     lock_parent, remove_parent_if_empty, remove_tree,
 };
 
-/// A file system counts in blocks of this size, whatever its own [bytes].
+/// Unit of `st_blocks`, independent of the file system [bytes].
 const BLOCK_BYTES: u64 = 512;
-/// Folders in each other that a size is counted of; ours are three deep.
+/// Maximum directory depth for sizes; domains are three levels deep.
 const DEPTH_MAX: usize = 16;
 
-/// A directory that a dead run has left.
+/// Directory of a dead run.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Leftover {
     /// The directory.
     pub path: PathBuf,
-    /// What it takes \[bytes\].
+    /// Disk usage \[bytes\].
     pub bytes: u64,
 }
 
-/// A directory that may be removed, and the locks that keep it so.
+/// A directory that may be removed, with its locks.
 struct Abandoned {
     leftover: Leftover,
-    /// Whether it is a whole domain, which others may still find under its name.
+    /// Whether it is a complete domain, which other processes can still find by its name.
     whole: bool,
     _locks: Vec<File>,
 }
 
-/// The domains in `parent` whose processes are dead. Changes nothing.
+/// Lists the domains in `parent` whose processes are dead, without changing anything.
 ///
-/// Live domains and directories without our marker are left out. A missing `parent` has none.
+/// Live domains and directories without dmprl's marker are skipped. A missing `parent` has none.
 ///
 /// # Errors
 /// `Untrusted` if `parent` is not private to this user, `Io` if it cannot be read.
@@ -48,19 +48,19 @@ pub fn abandoned(parent: &Path) -> Result<Vec<Leftover>, DomainError> {
     Ok(found)
 }
 
-/// Removes the domains in `parent` whose processes are dead, and the parent with the last one.
+/// Removes the domains in `parent` whose processes are dead, and the parent if it is then empty.
 ///
-/// Live domains and directories without our marker stay. A missing `parent` has none.
+/// Live domains and directories without dmprl's marker are kept. A missing `parent` has none.
 ///
 /// # Errors
-/// `Untrusted` if `parent` is not private to this user, `Io` if something could not be removed.
+/// `Untrusted` if `parent` is not private to this user, `Io` if a domain could not be removed.
 pub fn remove_abandoned(parent: &Path) -> Result<Vec<Leftover>, DomainError> {
     let Some(parent_lock) = private_parent(parent)? else { return Ok(Vec::new()) };
     let mut removed = Vec::new();
     for path in entries(parent)? {
         let Some(abandoned) = take(&path) else { continue };
         if !abandoned.whole {
-            // Who removes one does not mind help.
+            // Another process may be removing it at the same time; this does no harm.
             remove_tree(&path)?;
         } else if !condemn(&path)? {
             continue;
@@ -74,7 +74,7 @@ pub fn remove_abandoned(parent: &Path) -> Result<Vec<Leftover>, DomainError> {
     Ok(removed)
 }
 
-/// The lock of a parent that is private to this user; `None` if there is no parent.
+/// Locks a parent that is private to this user; `None` if it does not exist.
 fn private_parent(parent: &Path) -> Result<Option<File>, DomainError> {
     if parent.symlink_metadata().is_ok_and(|metadata| !metadata.is_dir()) {
         check_private(parent)?;
@@ -89,8 +89,9 @@ fn entries(parent: &Path) -> Result<Vec<PathBuf>, DomainError> {
     listed.map(|entry| entry.map(|entry| entry.path()).map_err(failed("listing", parent))).collect()
 }
 
-/// Takes a directory's locks, if it is ours and nobody else has them. For the holder of the
-/// parent's lock: who makes a domain holds it until the domain's own is taken.
+/// Takes a directory's locks, if it belongs to dmprl and no other process holds them. The caller
+/// must hold the parent's lock: a process that creates a domain holds that lock until it has the
+/// domain's own.
 fn take(path: &Path) -> Option<Abandoned> {
     check_private(path).ok()?;
     let name = path.file_name().unwrap_or_default().as_bytes();
@@ -100,9 +101,9 @@ fn take(path: &Path) -> Option<Abandoned> {
     Some(Abandoned { leftover, whole, _locks: locks })
 }
 
-/// The locks of owner and learner: a learner outlives a killed owner for as long as it writes its
-/// last checkpoint. A domain without its owner's lock file is damaged or just being removed: not
-/// ours to judge.
+/// Takes the locks of owner and learner, because a learner outlives a killed owner while it writes
+/// its last checkpoint. A domain without the owner's lock file is damaged or being removed, and is
+/// skipped.
 fn locks(path: &Path) -> Option<Vec<File>> {
     if !has_marker(path) {
         return None;
@@ -119,7 +120,7 @@ fn locks(path: &Path) -> Option<Vec<File>> {
     Some(locks)
 }
 
-/// What a directory takes. What cannot be looked at, or is gone by now, counts nothing.
+/// Disk usage of a directory. Entries that cannot be read, or no longer exist, count as 0.
 fn bytes(directory: &Path, depth: usize) -> u64 {
     let Ok(entries) = directory.read_dir() else { return 0 };
     let of = |entry: std::fs::DirEntry| match entry.metadata() {
