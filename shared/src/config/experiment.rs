@@ -188,8 +188,8 @@ impl Default for PacingConfig {
 pub struct ActorsConfig {
     /// Worker processes; 0 means cores - 1, at least 1.
     pub workers: usize,
-    /// Maximum number of simultaneous workers that join a running experiment (`dmprl actor --join
-    /// RUN`). Their queues are reserved at the start of the run.
+    /// Maximum number of simultaneous workers that join a running experiment
+    /// (`dmprl actor --join RUN`). Their queues are reserved at the start of the run.
     pub joined_max: usize,
     /// Environments per worker; one call runs a segment in all of them.
     pub envs_per_worker: usize,
