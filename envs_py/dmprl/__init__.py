@@ -1,19 +1,19 @@
 """Environments and trained policies of dmprl.
 
-A policy that dmprl has trained, with NumPy alone::
+Run a trained policy with NumPy alone::
 
     import dmprl
 
     policy = dmprl.Policy.load("policy.safetensors")
     actions = policy.segment(observation)
 
-Training, a run's figures, and an environment::
+Train, read a run's figures, and make an environment::
 
     run = dmprl.train("reacher", steps=20_000)
     run.evaluations().plot(x="env_steps", y="return_mean")
     env = dmprl.make("reacher", render_mode="rgb_array")
 
-Importing this package registers its tasks with Gymnasium, where that is installed::
+Importing this package registers its tasks with Gymnasium, if that is installed::
 
     import dmprl
     import gymnasium
@@ -48,13 +48,13 @@ SHORT_NAMES = {
     "pusher-v0": "dmprl/Pusher-v0",
     "thrower-v0": "dmprl/Thrower-v0",
 }
-"""Gymnasium ids by the names of ``dmprl tasks``."""
+"""Gymnasium ids by their names in ``dmprl tasks``."""
 
 
 def make(task: str, **options: Any) -> "gymnasium.Env":
-    """A task as a Gymnasium environment, by its short name or any Gymnasium id.
+    """Makes a task as a Gymnasium environment, by its short name or any Gymnasium id.
 
-    :param options: what ``gymnasium.make`` takes, such as ``render_mode="rgb_array"``.
+    :param options: arguments of ``gymnasium.make``, such as ``render_mode="rgb_array"``.
     """
     import gymnasium
 
@@ -65,7 +65,7 @@ def _register() -> None:
     try:
         from gymnasium import register
     except ModuleNotFoundError:
-        return  # who only loads a policy needs no environments
+        return  # loading a policy needs no environments
 
     from dmprl.tasks import TASKS
 

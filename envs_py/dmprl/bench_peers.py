@@ -1,8 +1,8 @@
-"""Loops over environments that ``dmprl bench rollout`` compares a worker with.
+"""Environment loops that ``dmprl bench rollout`` compares with a worker.
 
-Each class has ``segment()``, which runs one segment in all E environments and returns the
-environment steps in it, and ``about``, which says what it is. Making one raises
-:class:`AbsentError` where it is not to be had. ``bench_physics`` has the bounds, of the same kind.
+Each class has ``segment()``, which runs one segment in all E environments and returns the number of
+environment steps, and ``about``, its description. The constructor raises :class:`AbsentError` if
+the peer is unavailable. ``bench_physics`` has the upper bounds, with the same interface.
 """
 
 from __future__ import annotations
@@ -21,15 +21,15 @@ PANDA_GYM_IDS = {
     "dmprl/PandaReach-v0": "PandaReachDense-v3",
     "dmprl/PandaReachJoints-v0": "PandaReachJointsDense-v3",
 }
-"""What this project's Panda tasks are in panda-gym."""
+"""panda-gym's ids of dmprl's Panda tasks."""
 
 
 class AbsentError(Exception):
-    """A comparison is not to be had here. The message says why."""
+    """Raised if a peer is unavailable. The message gives the reason."""
 
 
 class RandomActor:
-    """Actions drawn uniformly within their bounds."""
+    """Draws actions uniformly within their bounds."""
 
     def __init__(self, plan: dict, seed: int) -> None:
         self._random = np.random.default_rng(seed)
@@ -37,15 +37,15 @@ class RandomActor:
         self._shape = (plan["env_count"], plan["decision_steps"], plan["spec"]["action_len"])
 
     def actions(self, observations: NDArray) -> NDArray[np.float64]:
-        """As the policy's."""
+        """Returns actions like those of the policy, (E, K, A)."""
         return self._random.uniform(self._low, self._high, self._shape)
 
     def carry_on(self, ended: NDArray[np.bool_]) -> None:
-        """Nothing is carried on."""
+        """Does nothing, because random actions have no state."""
 
 
 def gymnasium_env(plan: dict) -> Any:
-    """The environment as Gymnasium makes it, or :class:`AbsentError` with the reason."""
+    """Makes the environment with Gymnasium, or raises :class:`AbsentError` with the reason."""
     task_id = plan["task"]["id"]
     module_name, _, name = task_id.rpartition(":")
     try:
@@ -64,14 +64,14 @@ def gymnasium_env(plan: dict) -> Any:
                 task_id, entry_point=named, max_episode_steps=limit
             )
             return flattened(gymnasium.make(spec))
-    except Exception as error:  # whatever it is, the rest of the benchmark goes on
+    except Exception as error:  # for any error, the rest of the benchmark continues
         words = f"{type(error).__name__}: {error}"
         raise AbsentError(f"Gymnasium cannot make {task_id}: {words}") from None
     raise AbsentError(f"{task_id} is no environment of Gymnasium")
 
 
 def flattened(env: Any) -> Any:
-    """With Gymnasium's wrapper where :func:`flat` does not do: for tuples and nested spaces."""
+    """Adds Gymnasium's wrapper where :func:`flat` is not enough: tuples and nested spaces."""
     from gymnasium import spaces, wrappers
 
     space = env.observation_space
@@ -82,14 +82,14 @@ def flattened(env: Any) -> Any:
 
 
 class GymnasiumLoop:
-    """Gymnasium environments, one after the other, under the policy in NumPy."""
+    """Runs Gymnasium environments one after the other, with the policy in NumPy."""
 
     def __init__(self, plan: dict, seed: int) -> None:
         self._envs = [gymnasium_env(plan) for _ in range(plan["env_count"])]
         self._actor = Actor(plan, seed)
         self._dtype = self._envs[0].action_space.dtype
         shape = (plan["env_count"], plan["decision_steps"])
-        # What a learner would be sent is kept here too, as the worker keeps it.
+        # The data for a learner are stored here too, as in the worker.
         self._observations = np.zeros((*shape, plan["spec"]["observation_len"]))
         self._rewards = np.zeros(shape)
         self._current = np.zeros((plan["env_count"], plan["spec"]["observation_len"]))
@@ -99,7 +99,7 @@ class GymnasiumLoop:
         self.about += f", numpy {np.__version__}"
 
     def segment(self) -> int:
-        """Runs one segment; returns the environment steps in it."""
+        """Runs one segment; returns the number of environment steps."""
         steps = 0
         actions = self._actor.actions(self._current).astype(self._dtype)
         ended = np.zeros(len(self._envs), np.bool_)
@@ -119,17 +119,17 @@ class GymnasiumLoop:
 
 
 def flat(observation) -> np.ndarray:
-    """A dictionary's entries in the order of its sorted keys, as the worker sees them."""
+    """Concatenates a dictionary's entries in the order of its sorted keys, as the worker does."""
     if isinstance(observation, dict):
         return np.concatenate([np.ravel(observation[key]) for key in sorted(observation)])
     return observation
 
 
 class EnvPoolLoop:
-    """EnvPool in its synchronous mode on one thread, under the policy in NumPy.
+    """Runs EnvPool in its synchronous mode on one thread, with the policy in NumPy.
 
-    EnvPool spends a step on each reset; that is no environment step and is not counted. An episode
-    that ends inside a segment is followed by the rest of that segment in the next one.
+    EnvPool spends a step on each reset; that step is not counted. If an episode ends inside a
+    segment, the rest of that segment runs in the next episode.
     """
 
     def __init__(self, plan: dict, seed: int) -> None:
@@ -154,7 +154,7 @@ class EnvPoolLoop:
         self._resets = np.zeros(env_count, np.bool_)
 
     def segment(self) -> int:
-        """Runs one segment; returns the environment steps in it."""
+        """Runs one segment; returns the number of environment steps."""
         steps = 0
         actions = self._actor.actions(self._current).astype(self._dtype)
         ended = np.zeros(len(self._resets), np.bool_)
@@ -172,9 +172,9 @@ class EnvPoolLoop:
 
 
 class PandaGymLoop:
-    """panda-gym's environments, one after the other, under random actions and no policy.
+    """Runs panda-gym's environments one after the other, with random actions and no policy.
 
-    What a user of panda-gym has: PyBullet instead of MuJoCo, and everything in Python.
+    This is a panda-gym user's setup: PyBullet instead of MuJoCo, and everything in Python.
     """
 
     def __init__(self, plan: dict, seed: int) -> None:
@@ -190,7 +190,7 @@ class PandaGymLoop:
         self.about = f"panda-gym {panda_gym.__version__} ({task_id}), random actions"
 
     def segment(self) -> int:
-        """Runs one segment; returns the environment steps in it."""
+        """Runs one segment; returns the number of environment steps."""
         steps = 0
         actions = self._actor.actions(np.empty(0)).astype(self._dtype)
         for env, env_actions in zip(self._envs, actions, strict=True):
@@ -204,7 +204,7 @@ class PandaGymLoop:
 
 
 def imported(module_name: str, package: str | None = None) -> ModuleType:
-    """The module, or :class:`AbsentError`."""
+    """Imports a module, or raises :class:`AbsentError`."""
     try:
         return importlib.import_module(module_name)
     except ImportError as error:
@@ -215,7 +215,7 @@ def imported(module_name: str, package: str | None = None) -> ModuleType:
 
 
 def envpool_id(task_id: str, known: list[str]) -> str:
-    """EnvPool's id of a Gymnasium task: the same, or its newest version there."""
+    """Finds EnvPool's id of a Gymnasium task: the same one, or its newest version there."""
     if task_id in known:
         return task_id
     name = task_id.rpartition("-v")[0]

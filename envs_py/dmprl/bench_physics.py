@@ -1,6 +1,6 @@
-"""Physics alone, which ``dmprl bench rollout`` holds a worker against: its bounds.
+"""Physics alone, as an upper bound for the worker in ``dmprl bench rollout``.
 
-Of the same kind as the loops of ``bench_peers``.
+The classes have the same interface as the loops of ``bench_peers``.
 """
 
 from __future__ import annotations
@@ -17,41 +17,41 @@ from dmprl.bench_peers import AbsentError, RandomActor, flat, gymnasium_env
 from dmprl.numpy_policy import Actor
 
 CONTROLS_BYTES_MAX = 64 << 20
-"""Of the controls of an episode; where more would be needed, episodes are shorter."""
+"""Maximum size of an episode's controls; longer episodes are shortened."""
 EPISODE_STEPS = 100
-"""Of an episode where the task has no limit."""
+"""Length of an episode if the task has no limit."""
 
 
 @dataclass(frozen=True)
 class Episode:
-    """An episode in each of E environments, as physics alone repeats it."""
+    """An episode in each of E environments, which physics alone repeats."""
 
     model: Any
-    """MuJoCo's."""
+    """Model of MuJoCo."""
     frame_skip: int
-    """Steps of the simulation in one step of the environment."""
+    """Simulation steps per environment step."""
     starts: NDArray[np.float64]
     """Rows of ``Batch.state``, (E, …)."""
     controls: NDArray[np.float64]
-    """Of each step of the environments, (steps, E, nu)."""
+    """Controls of each environment step, (steps, E, nu)."""
 
 
 @dataclass(frozen=True)
 class Stage:
-    """Environments at the start of an episode, whose controls can be seen."""
+    """Environments at the start of an episode, with access to their controls."""
 
     model: Any
     frame_skip: int
     observations: NDArray
-    """What is seen at the start, (E, O)."""
+    """Observations at the start, (E, O)."""
     step: Callable[[NDArray[np.float64]], tuple[NDArray, NDArray]]
-    """Applies actions, (E, A); returns what is seen then, (E, O), and the controls, (E, nu)."""
+    """Applies actions, (E, A); returns the observations, (E, O), and the controls, (E, nu)."""
 
 
 class BatchPeer:
-    """``mujoco.batch.Batch`` with no policy and nothing recorded: physics alone.
+    """Runs ``mujoco.batch.Batch`` without a policy and without recording: physics alone.
 
-    The same episode in each environment over and over.
+    It repeats the same episode in each environment.
     """
 
     def __init__(self, episode: Episode, k: int) -> None:
@@ -63,13 +63,13 @@ class BatchPeer:
         self._batch, self._starts = Batch(model, env_count, nthread=1), episode.starts
         segments = max(1, len(controls) // k)
         controls = controls[np.arange(segments * k) % len(controls)]
-        # (segments, E, K frame_skip, nu), as a rollout takes them.
+        # (segments, E, K frame_skip, nu), as rollout expects.
         controls = controls.reshape(segments, k, env_count, model.nu).swapaxes(1, 2)
         self._controls = np.repeat(controls, skip, axis=2)
         self._segment = 0
 
     def segment(self) -> int:
-        """Runs one segment; returns the environment steps in it."""
+        """Runs one segment; returns the number of environment steps."""
         if self._segment == 0:
             self._batch.state[:] = self._starts
         self._batch.rollout(self._substeps, self._controls[self._segment], record=())
@@ -78,9 +78,9 @@ class BatchPeer:
 
 
 class Physics(BatchPeer):
-    """On the model of the worker's own back end, in a process that this has set up.
+    """Runs physics with the worker's model and process settings.
 
-    Nothing a worker could do costs less: its time beyond this is its own.
+    No worker can be faster; the difference is the worker's own time.
     """
 
     def __init__(self, plan: dict, seed: int) -> None:
@@ -89,7 +89,7 @@ class Physics(BatchPeer):
 
 
 class Ceiling(BatchPeer):
-    """In a process as MuJoCo's import leaves it, on Gymnasium's model file where there is one."""
+    """Runs physics with MuJoCo's default settings, on Gymnasium's model file if there is one."""
 
     def __init__(self, plan: dict, seed: int) -> None:
         import mujoco
@@ -103,14 +103,14 @@ class Ceiling(BatchPeer):
             from dmprl.mujoco_batch import mujoco_hook
 
             clock = mujoco_hook("mjcb_time").value
-            episode = worker_episode(plan, seed)  # takes the clock out
+            episode = worker_episode(plan, seed)  # removes the clock
             mujoco_hook("mjcb_time").value = clock
             self.about = f"{about} as it is imported"
         super().__init__(episode, plan["decision_steps"])
 
 
 def worker_episode(plan: dict, seed: int) -> Episode:
-    """An episode of the worker's own environments; sets this process up as theirs."""
+    """Creates an episode of the worker's environments, and applies their process settings."""
     from dmprl.segment_env import SegmentBuffers, make
 
     task_id, env_count = plan["task"]["id"], plan["env_count"]
@@ -118,7 +118,7 @@ def worker_episode(plan: dict, seed: int) -> Episode:
         env = make(task_id, env_count, 1)
     except Exception as error:
         raise AbsentError(f"{task_id} cannot be made: {error}") from None
-    # Not by its class: whatever steps a Batch has a bound of this kind.
+    # Not by class: everything that steps a Batch has a bound of this kind.
     task, batch = getattr(env, "task", None), getattr(env, "batch", None)
     if task is None or not hasattr(batch, "rollout"):
         raise AbsentError(f"{task_id} does not run on mujoco.batch")
@@ -137,7 +137,7 @@ def worker_episode(plan: dict, seed: int) -> Episode:
 
 
 def gymnasium_episode(plan: dict, seed: int, path: str) -> Episode:
-    """An episode of Gymnasium's environments, on their model file."""
+    """Creates an episode of Gymnasium's environments, on their model file."""
     import mujoco
     from mujoco.batch import Batch
 
@@ -160,7 +160,7 @@ def gymnasium_episode(plan: dict, seed: int, path: str) -> Episode:
 
 
 def gymnasium_model_path(plan: dict) -> str | None:
-    """The model file of one of Gymnasium's own MuJoCo environments."""
+    """Finds the model file of one of Gymnasium's own MuJoCo environments."""
     try:
         env = gymnasium_env(plan).unwrapped
     except AbsentError:
@@ -169,10 +169,11 @@ def gymnasium_model_path(plan: dict) -> str | None:
 
 
 def episode_controls(plan: dict, seed: int, stage: Stage) -> NDArray[np.float64]:
-    """Controls of an episode, (steps, E, nu), drawn before anything is measured.
+    """Draws the controls of an episode, (steps, E, nu), before the measurement.
 
-    The worker's own policy draws them, unless the plan wants random actions: physics costs what
-    the states cost that a policy leads to, and pushing against a joint's limit is dear.
+    They come from the worker's own policy, unless the plan asks for random actions. The cost of
+    physics depends on the states that a policy visits: pushing against a joint's limit is
+    expensive.
     """
     actor = (Actor if plan["controls"] == "policy" else RandomActor)(plan, seed)
     steps = episode_steps(plan, stage)
@@ -188,7 +189,7 @@ def episode_controls(plan: dict, seed: int, stage: Stage) -> NDArray[np.float64]
 
 
 def episode_steps(plan: dict, stage: Stage) -> int:
-    """Steps of an episode without its last, after which the environments begin anew."""
+    """Steps of an episode without its last, after which the environments are reset."""
     bytes_a_step = plan["env_count"] * stage.frame_skip * max(1, stage.model.nu) * 8
     fits = CONTROLS_BYTES_MAX // bytes_a_step
     return max(1, min(fits, (plan["spec"]["episode_steps"] or EPISODE_STEPS) - 1))

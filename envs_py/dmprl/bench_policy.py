@@ -1,9 +1,9 @@
-"""What ``dmprl bench policy`` compares with in Python: the same decisions, one at a time.
+"""Python peers of ``dmprl bench policy``, which make the same decisions one at a time.
 
-``python -m dmprl.bench_policy KIND FILE`` writes one JSON object a line. The first is
-``{"ready": "what it is"}``, or ``{"absent": "why"}`` if it cannot; then each line ``run CALLS`` on
-standard input is answered by ``{"us": […]}``, the microseconds of each call. It ends with its
-input, so the death of the program that started it ends it too.
+``python -m dmprl.bench_policy KIND FILE`` writes one JSON object per line. The first is
+``{"ready": "description"}``, or ``{"absent": "reason"}`` if the peer is unavailable. Each line
+``run CALLS`` on standard input is then answered by ``{"us": […]}``, the microseconds of each call.
+The process exits at the end of its input, and thus with the program that started it.
 """
 
 from __future__ import annotations
@@ -19,15 +19,15 @@ from pathlib import Path
 import numpy as np
 
 OBSERVATIONS = 256
-"""Different ones, in turn."""
+"""Number of different observations, which are used in turn."""
 
 
 class AbsentError(Exception):
-    """A comparison is not to be had here. The message says why."""
+    """Raised if a peer is unavailable. The message gives the reason."""
 
 
 def numpy_policy(path: Path) -> tuple[str, Callable[[np.ndarray], object], int]:
-    """``dmprl.Policy``."""
+    """Loads ``dmprl.Policy``."""
     from dmprl import Policy
 
     policy = Policy.load(path)
@@ -35,7 +35,7 @@ def numpy_policy(path: Path) -> tuple[str, Callable[[np.ndarray], object], int]:
 
 
 def onnx_policy(path: Path) -> tuple[str, Callable[[np.ndarray], object], int]:
-    """The graph in onnxruntime, with one thread."""
+    """Loads the graph in onnxruntime with one thread."""
     try:
         import onnxruntime
     except ImportError as error:
@@ -53,7 +53,7 @@ def onnx_policy(path: Path) -> tuple[str, Callable[[np.ndarray], object], int]:
 
 
 def main() -> None:
-    """Answers until its input ends."""
+    """Answers requests until the end of the input."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     parser = argparse.ArgumentParser()
     parser.add_argument("kind", choices=("numpy", "onnx"))

@@ -1,9 +1,10 @@
-"""What ``dmprl bench rollout`` compares a rollout worker with: one process of this for each worker.
+"""Peers of ``dmprl bench rollout``: one process of this module for each worker.
 
-``python -m dmprl.bench_rollout KIND --plan FILE --index I`` writes one JSON object a line. The
-first is ``{"ready": "what it measures"}``, or ``{"absent": "why"}`` if it cannot; then each line
-``run SECONDS`` on standard input is answered by ``{"steps": …, "seconds": …, "cpu_s": …}``. It
-ends with its input, so the death of the program that started it ends it too.
+``python -m dmprl.bench_rollout KIND --plan FILE --index I`` writes one JSON object per line. The
+first is ``{"ready": "description"}``, or ``{"absent": "reason"}`` if the peer is unavailable. Each
+line ``run SECONDS`` on standard input is then answered by
+``{"steps": …, "seconds": …, "cpu_s": …}``. The process exits at the end of its input, and thus with
+the program that started it.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ from dmprl.bench_peers import AbsentError, EnvPoolLoop, GymnasiumLoop, PandaGymL
 from dmprl.bench_physics import Ceiling, Physics
 
 SETTLE_S = 0.1
-"""Stepped before the clock starts: caches and clock frequency then are those of a long run."""
+"""Time stepped before the measurement, so that caches and clock frequency settle."""
 
 KINDS = {
     "ceiling": Ceiling,
@@ -33,7 +34,7 @@ KINDS = {
 
 
 def run_for(segment: Callable[[], int], seconds: float) -> dict:
-    """Runs segments for so long; whole segments, and the time that they really took."""
+    """Runs whole segments for ``seconds``; returns the steps and the time that they took."""
     clock = time.perf_counter
     end = clock() + SETTLE_S
     while clock() < end:
@@ -48,15 +49,15 @@ def run_for(segment: Callable[[], int], seconds: float) -> dict:
 
 
 def main() -> None:
-    """Speaks the protocol of the module's first lines."""
+    """Answers requests, as described in the module's docstring."""
     parser = argparse.ArgumentParser(prog="dmprl.bench_rollout")
     parser.add_argument("kind", choices=KINDS)
     parser.add_argument("--plan", type=Path, required=True)
     parser.add_argument("--index", type=int, required=True)
     arguments = parser.parse_args()
-    # Ctrl-C reaches the whole process group; the program that reads our lines decides.
+    # Ctrl-C reaches the whole process group; the program that reads our output decides.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    # What an environment prints must not become a line of the protocol.
+    # Output of an environment must not become a line of the protocol.
     lines = os.fdopen(os.dup(1), "w", buffering=1)
     os.dup2(2, 1)
     plan = json.loads(arguments.plan.read_text())

@@ -1,12 +1,13 @@
-"""What ``dmprl bench transport`` compares with in Python: a queue with a process at either end.
+"""Python peers of ``dmprl bench transport``: a queue with a process at either end.
 
-``python -m dmprl.bench_transport KIND --segment-bytes N --folder DIR`` writes one JSON object a
-line. The first is ``{"ready": "what it is"}``, or ``{"absent": "why"}`` if it cannot; then each
-line ``run SECONDS`` on standard input is answered by ``{"segments": …, "seconds": …}``. It ends
-with its input, so the death of the program that started it ends it too, and its sender with it.
+``python -m dmprl.bench_transport KIND --segment-bytes N --folder DIR`` writes one JSON object per
+line. The first is ``{"ready": "description"}``, or ``{"absent": "reason"}`` if the peer is
+unavailable. Each line ``run SECONDS`` on standard input is then answered by
+``{"segments": …, "seconds": …}``. The process and its sender exit at the end of its input, and thus
+with the program that started it.
 
-A segment is ``bytes`` of the size asked for. The sender sends it as often as the queue takes it,
-and sleeps while the queue is full. The receiver looks at its length and at nothing else.
+A segment is ``bytes`` of the given size. The sender sends it as fast as the queue accepts it, and
+sleeps while the queue is full. The receiver only checks its length.
 """
 
 from __future__ import annotations
@@ -24,23 +25,23 @@ from pathlib import Path
 from typing import Any
 
 SETTLE_S = 0.1
-"""Received before the clock starts: what had queued up, and the sender's way back to its pace."""
+"""Time received before the measurement: the queue drains and the sender reaches its pace."""
 QUEUE_SEGMENTS = 512
-"""As the queue that these are compared with."""
+"""Capacity, equal to that of the queue under comparison."""
 PARENT_LOOK_S = 0.05
-"""Between two looks whether the receiver lives."""
+"""Interval between checks whether the receiver is alive."""
 CONTEXT = get_context("fork")
-"""Others name semaphores, which a killed process leaves behind."""
+"""Other start methods create named semaphores, which a killed process leaves behind."""
 RECEIVE_S = 20.0
-"""A sender that sends nothing for so long is dead."""
+"""Timeout after which the sender counts as dead."""
 
 
 class AbsentError(Exception):
-    """A comparison is not to be had here. The message says why."""
+    """Raised if a peer is unavailable. The message gives the reason."""
 
 
 def end_with(parent: int) -> None:
-    """Ends this process once its parent is gone, whatever it does at that time."""
+    """Ends this process as soon as its parent is gone, from a thread."""
 
     def look() -> None:
         while os.getppid() == parent:
@@ -52,21 +53,21 @@ def end_with(parent: int) -> None:
 
 
 def started(send: Callable[..., None], target: Any, payload: bytes) -> Any:
-    """The sender's process, which runs."""
+    """Starts the sender's process."""
     sender = CONTEXT.Process(target=send, args=(target, payload, os.getpid()), daemon=True)
     sender.start()
     return sender
 
 
 def put_all(queue: Any, payload: bytes, parent: int) -> None:
-    """Sends for ever through a queue of ``multiprocessing``."""
+    """Sends forever through a queue of ``multiprocessing``."""
     end_with(parent)
     while True:
         queue.put(payload)
 
 
 def push_all(address: str, payload: bytes, parent: int) -> None:
-    """Sends for ever through ZeroMQ."""
+    """Sends forever through ZeroMQ."""
     import zmq
 
     end_with(parent)
@@ -78,7 +79,7 @@ def push_all(address: str, payload: bytes, parent: int) -> None:
 
 
 class MultiprocessingQueue:
-    """``multiprocessing.Queue``: pickles into a pipe from a thread of the sender's."""
+    """``multiprocessing.Queue``, which pickles into a pipe from a thread of the sender."""
 
     about = "multiprocessing.Queue of bytes, as long as ours; neither checked nor acknowledged"
 
@@ -87,7 +88,7 @@ class MultiprocessingQueue:
         self.sender = started(put_all, self._queue, os.urandom(segment_bytes))
 
     def receive(self) -> bytes:
-        """The next segment."""
+        """Returns the next segment."""
         return self._queue.get(timeout=RECEIVE_S)
 
 
@@ -105,7 +106,7 @@ class ZeroMq:
             f"queues as long as ours; neither checked nor acknowledged"
         )
         address = f"ipc://{folder}/zeromq-{segment_bytes}"
-        # Before there is a context here, whose threads the fork would lack.
+        # Before this process has a context, whose threads the fork would lack.
         self.sender = started(push_all, address, os.urandom(segment_bytes))
         self._socket = zmq.Context().socket(zmq.PULL)
         self._socket.set_hwm(QUEUE_SEGMENTS)
@@ -113,7 +114,7 @@ class ZeroMq:
         self._socket.bind(address)
 
     def receive(self) -> bytes:
-        """The next segment."""
+        """Returns the next segment."""
         return self._socket.recv()
 
 
@@ -121,7 +122,7 @@ KINDS = {"multiprocessing_queue": MultiprocessingQueue, "zeromq": ZeroMq}
 
 
 def run_for(receive: Callable[[], bytes], segment_bytes: int, seconds: float) -> dict:
-    """Receives for so long; the time that it really took."""
+    """Receives for ``seconds``; returns the segments and the time that they took."""
     clock = time.perf_counter
     end = clock() + SETTLE_S
     while clock() < end:
@@ -139,13 +140,13 @@ def run_for(receive: Callable[[], bytes], segment_bytes: int, seconds: float) ->
 
 
 def main() -> None:
-    """Speaks the protocol of the module's first lines."""
+    """Answers requests, as described in the module's docstring."""
     parser = argparse.ArgumentParser(prog="dmprl.bench_transport")
     parser.add_argument("kind", choices=KINDS)
     parser.add_argument("--segment-bytes", type=int, required=True)
     parser.add_argument("--folder", type=Path, required=True)
     arguments = parser.parse_args()
-    # Ctrl-C reaches the whole process group; the program that reads our lines decides.
+    # Ctrl-C reaches the whole process group; the program that reads our output decides.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     try:
         peer = KINDS[arguments.kind](arguments.segment_bytes, arguments.folder)

@@ -1,7 +1,7 @@
 """Makes a video, an animation and a strip of frames of episodes; started by ``dmprl record``.
 
-``python -m dmprl.film PLAN``: PLAN is a JSON file (``deploy/src/record/film.rs`` writes it). Says
-how far it is on standard output, in the lines that ``deploy/src/control.rs`` reads.
+``python -m dmprl.film PLAN``: PLAN is a JSON file, written by ``deploy/src/record/film.rs``.
+Progress is reported on standard output, in the format that ``deploy/src/control.rs`` reads.
 """
 
 from __future__ import annotations
@@ -15,22 +15,22 @@ import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
 HEIGHT = 480
-"""Of a scene [pixels]; wider or narrower as it was drawn."""
+"""Height of a scene [pixels]; the width follows from its aspect ratio."""
 BAR = 44
 """Height of the lines of text above and below a scene [pixels]."""
 RETURN_AT = 100
-"""Where the return begins, beside the time [pixels]."""
+"""Position of the return, to the right of the time [pixels]."""
 GAP = 8
 MARGIN = 12
 GIF_HEIGHT = 360
 GIF_COLOURS = 128
 GIF_RATE_MAX = 25.0
-"""Frames a second: an animation is coarser than a video, or it would be larger."""
+"""Maximum frames per second of the animation, which would otherwise be larger than the video."""
 STRIP_FRAMES = 6
 STRIP_HEIGHT = 240
 PAPER, INK, SOFT = "#ffffff", "#1a1a1a", "#5a5a5a"
 GOOD, BAD = "#00704d", "#b04a00"
-"""Told apart by all; the words beside them say the same."""
+"""Distinguishable with colour blindness; the words beside them give the same information."""
 
 
 class Side(TypedDict):
@@ -38,38 +38,38 @@ class Side(TypedDict):
 
     title: str
     success: str
-    """How the episode ended; empty where the task does not say."""
+    """Outcome of the episode; empty if the task does not report success."""
     goal: str
-    """How the scene shows the goal; empty if nobody knows."""
+    """Appearance of the goal in the scene; empty if unknown."""
     frames: list[str]
-    """Files, and"""
+    """Files of the pictures."""
     steps: list[int]
-    """the number of steps done at each."""
+    """Number of steps executed before each frame."""
     rewards: list[float]
     success_by_step: list[bool | None]
 
 
 class Plan(TypedDict):
-    """What to make."""
+    """The files to make, and the episodes in them."""
 
     episodes: list[list[Side]]
-    """One after the other, each of one side or two."""
+    """Episodes in order, each with one side or two."""
     control_dt_s: float
-    """0 where the environment does not say."""
+    """Duration of a step [s]; 0 if the environment does not report it."""
     rate: float
-    """Frames a second."""
+    """Frames per second."""
     mp4: str
     gif: str
     strip: str
 
 
 def font(size: int) -> ImageFont.FreeTypeFont | ImageFont.ImageFont:
-    """The one that Pillow brings."""
+    """Pillow's own font."""
     return ImageFont.load_default(size)
 
 
 class Scenes:
-    """Pictures of one side, frame by frame."""
+    """The frames of one side."""
 
     def __init__(self, side: Side, dt: float) -> None:
         self.side = side
@@ -80,28 +80,28 @@ class Scenes:
         return len(self.side["frames"])
 
     def scene(self, frame: int, height: int) -> Image.Image:
-        """The picture alone."""
+        """Returns the frame without text."""
         with Image.open(self.side["frames"][frame]) as picture:
             width = max(2, round(picture.width * height / picture.height))
             return picture.convert("RGB").resize((width, height), Image.Resampling.LANCZOS)
 
     def when(self, frame: int) -> str:
-        """Time, or steps where nobody knows how long one takes."""
+        """Formats the time, or the step if the duration of a step is unknown."""
         step = self.side["steps"][frame]
         return f"{step * self._dt:.2f} s" if self._dt > 0 else f"step {step}"
 
     def return_so_far(self, frame: int) -> str:
-        """Sum of the rewards up to this frame."""
+        """Formats the sum of the rewards up to this frame."""
         return f"return {self._returns[self.side['steps'][frame]]:.2f}"
 
     def succeeded(self, frame: int) -> bool | None:
-        """Whether the last step up to this frame reported success."""
+        """Returns whether the last step up to this frame reported success."""
         step, flags = self.side["steps"][frame], self.side["success_by_step"]
-        # Before the first step nothing was reported, though it will be.
+        # Before the first step there is no report, even if later steps have one.
         return flags[step - 1] if flags and step > 0 else None
 
     def picture(self, frame: int) -> Image.Image:
-        """The scene between its title and where the episode stands; the last one stays."""
+        """Draws a frame between its title and its captions; after the end, the last frame."""
         frame = min(frame, len(self) - 1)
         scene = self.scene(frame, HEIGHT)
         picture = Image.new("RGB", (scene.width, HEIGHT + 2 * BAR), PAPER)
@@ -117,7 +117,7 @@ class Scenes:
         return picture
 
     def goal(self, frame: int) -> tuple[str, str]:
-        """What is known of the goal by this frame, and the words' colour."""
+        """Returns the caption about the goal at this frame, and its colour."""
         success, looks = self.succeeded(frame), self.side["goal"]
         if success is None:
             return (f"goal: {looks}" if looks else ""), SOFT
@@ -126,7 +126,7 @@ class Scenes:
 
 
 def fitted(draw: ImageDraw.ImageDraw, at: tuple[int, int], text: str, width: int) -> None:
-    """Writes text as large as fits."""
+    """Writes text in the largest size that fits."""
     for size in (18, 16, 14, 12, 10):
         if draw.textlength(text, font(size)) <= width:
             break
@@ -134,7 +134,7 @@ def fitted(draw: ImageDraw.ImageDraw, at: tuple[int, int], text: str, width: int
 
 
 def beside(pictures: list[Image.Image]) -> Image.Image:
-    """One picture of several; width and height are even, as video wants them."""
+    """Joins pictures side by side, with even width and height as video requires."""
     width = sum(picture.width for picture in pictures) + GAP * (len(pictures) - 1)
     height = max(picture.height for picture in pictures)
     whole = Image.new("RGB", (width + width % 2, height + height % 2), PAPER)
@@ -146,14 +146,14 @@ def beside(pictures: list[Image.Image]) -> Image.Image:
 
 
 def pictures(episodes: list[list[Scenes]]) -> Iterator[Image.Image]:
-    """Every picture of the video; a side that has ended waits for the other."""
+    """Yields every picture of the video; a side that has ended shows its last frame."""
     for sides in episodes:
         for frame in range(max(len(side) for side in sides)):
             yield beside([side.picture(frame) for side in sides])
 
 
 def padded(picture: Image.Image, size: tuple[int, int]) -> Image.Image:
-    """As large as the first: a video has one size."""
+    """Pads a picture to the size of the first, because a video has one size."""
     if picture.size == size:
         return picture
     whole = Image.new("RGB", size, PAPER)
@@ -162,10 +162,10 @@ def padded(picture: Image.Image, size: tuple[int, int]) -> Image.Image:
 
 
 class Film:
-    """A video and an animation under way."""
+    """A video and an animation in progress."""
 
     def __init__(self, plan: Plan, size: tuple[int, int]) -> None:
-        import av  # not in every environment; the strip does without
+        import av  # not installed everywhere; the strip does not need it
 
         self._av = av
         self._size = size
@@ -187,7 +187,7 @@ class Film:
         return Fraction(rate).limit_denominator(1000)
 
     def add(self, picture: Image.Image) -> None:
-        """One more frame."""
+        """Adds one frame."""
         picture = padded(picture, self._size)
         frame = self._av.VideoFrame.from_ndarray(np.asarray(picture), format="rgb24")
         self._container.mux(self._stream.encode(frame))
@@ -198,7 +198,7 @@ class Film:
         self._count += 1
 
     def close(self, gif: str) -> None:
-        """Writes the end of the video, and the animation."""
+        """Finishes the video and writes the animation."""
         self._container.mux(self._stream.encode(None))
         self._container.close()
         first, *others = self._animation
@@ -213,7 +213,7 @@ class Film:
 
 
 def strip(episodes: list[list[Scenes]]) -> Image.Image:
-    """Some frames of each episode in a row, each with its time."""
+    """Draws some frames of each episode in a row, each with its time."""
     rows = [row(side) for sides in episodes for side in sides]
     width = max(row.width for row in rows)
     height = sum(row.height for row in rows)
@@ -226,7 +226,7 @@ def strip(episodes: list[list[Scenes]]) -> Image.Image:
 
 
 def row(scenes: Scenes) -> Image.Image:
-    """An episode's line of the strip."""
+    """Draws an episode's row of the strip."""
     count = min(STRIP_FRAMES, len(scenes))
     frames = np.linspace(0, len(scenes) - 1, count).round().astype(int).tolist()
     shown = [scenes.scene(frame, STRIP_HEIGHT) for frame in frames]
@@ -250,7 +250,7 @@ def row(scenes: Scenes) -> Image.Image:
 
 
 def main() -> None:
-    """Makes what the plan asks for."""
+    """Makes the files that the plan asks for."""
     with open(sys.argv[1], encoding="utf-8") as file:
         plan: Plan = json.load(file)
     episodes = [

@@ -1,8 +1,8 @@
 """Any Gymnasium environment as a :class:`~dmprl.segment_env.SegmentEnv`.
 
 The environments of a worker step one after the other in one thread. MuJoCo releases the GIL inside
-``mj_step``, so threads could overlap their physics; but a machine's cores are already filled with
-workers, each a process of its own, and half of a step is Python that threads cannot overlap.
+``mj_step``, so threads could overlap their physics. But workers, each a process, already use all
+cores, and half of a step is Python code that threads cannot overlap.
 """
 
 from __future__ import annotations
@@ -46,20 +46,21 @@ SUPPORTED_SPACES = (
 )
 
 FAILURES_KEPT_MAX = 10_000
-"""Sentences kept for a caller that does not take them; beyond it the oldest make room."""
+"""Maximum number of stored failure messages; the oldest are dropped."""
 
 FAILURES = (Exception, SystemExit)
-"""What an environment may raise. A call of ``sys.exit`` would end more than the environment."""
+"""Exceptions of an environment. ``sys.exit`` would otherwise end the whole worker."""
 
 
 class GymnasiumSegmentEnv(SegmentEnv):
-    """E copies of one Gymnasium environment, all wrappers of its registration applied.
+    """E copies of one Gymnasium environment, with all wrappers of its registration.
 
-    Two wrappers are left out because they only check the caller and cost time in every step: the
+    Two wrappers are left out, because they only check the caller and cost time in every step: the
     passive checker and the order enforcer (:meth:`step_segment` checks the order itself).
 
-    - ``named``: what ``task_id`` names if it is ``module:Name``. A ``gymnasium.Env`` class is made
-      without arguments; its attribute ``max_episode_steps``, if it has one, limits its episodes.
+    - ``named``: the object that ``task_id`` names if it is ``module:Name``. A ``gymnasium.Env``
+      class is created without arguments; its optional attribute ``max_episode_steps`` limits its
+      episodes.
     """
 
     def __init__(
@@ -83,7 +84,7 @@ class GymnasiumSegmentEnv(SegmentEnv):
             (env_count, segment_steps + 1, self._observation_len), np.bool_
         )
         self._finite_rewards = np.zeros((env_count, segment_steps), np.bool_)
-        # Of the caller's last reset of each environment, and its failures since.
+        # Seed of the caller's last reset of each environment, and its failures since.
         self._first_seeds = [0] * env_count
         self._failure_counts = [0] * env_count
         self._failed_now: list[int] = []
@@ -103,7 +104,7 @@ class GymnasiumSegmentEnv(SegmentEnv):
                 order_enforce=False,
             )
         registered = gymnasium.registry.get(self.task_id.rpartition(":")[2])
-        if registered is None:  # without version, or unknown: Gymnasium finds it, or suggests
+        if registered is None:  # without version, or unknown
             made = self._make_unregistered()
             registered = gymnasium.registry[made.unwrapped.spec.id]
             made.close()
@@ -128,7 +129,7 @@ class GymnasiumSegmentEnv(SegmentEnv):
         observation, action = env.observation_space, env.action_space
         self._observation_space = observation
         if isinstance(observation, spaces.Dict | spaces.Tuple) and observation.is_np_flattenable:
-            # A Dict's entries in the order of its space, which Gymnasium sorts by key.
+            # A Dict's entries have the order of its space, which Gymnasium sorts by key.
             env = gymnasium.wrappers.FlattenObservation(env)
             observation = env.observation_space
         if not isinstance(observation, spaces.Box) or len(observation.shape) != 1:
@@ -186,8 +187,8 @@ class GymnasiumSegmentEnv(SegmentEnv):
             )
         if actions.shape != self._action_shape:
             raise ValueError(f"actions {actions.shape}, expected (E, K, A) = {self._action_shape}")
-        # A new array each time, in the space's own type: an environment may keep an action
-        # (to charge for its change, say), so its memory must not be used again.
+        # A new array for each call, in the space's own type. An environment may keep an action (to
+        # penalise its change, for example), so its memory must not be reused.
         actions = actions.astype(self._action_dtype)
         out.failed.fill(0)
         out.observations[:, 0] = self._current
@@ -201,7 +202,7 @@ class GymnasiumSegmentEnv(SegmentEnv):
                 self._reset(index, None, out)
             except SegmentEnvError as failure:
                 self._fail(index, failure, out)
-        # Last: whatever a new environment does must not come before what the others did.
+        # Last, so that new environments cannot affect the results of the others.
         while self._failed_now:
             index = self._failed_now.pop(0)
             self._failure_counts[index] += 1
@@ -227,7 +228,7 @@ class GymnasiumSegmentEnv(SegmentEnv):
     def _run(
         self, index: int, env: gymnasium.Env, actions: NDArray[np.floating], out: SegmentBuffers
     ) -> None:
-        """Steps one environment up to the end of the segment or of its episode."""
+        """Steps one environment to the end of the segment or of its episode."""
         observations, rewards = out.observations[index], out.rewards[index]
         env_step = env.step
         step = 0
@@ -261,7 +262,7 @@ class GymnasiumSegmentEnv(SegmentEnv):
         out.next_observations[index] = self._current[index]
 
     def _check_finite(self, out: SegmentBuffers) -> None:
-        """Looks at the whole segment at once: step by step it would cost several times as much."""
+        """Checks the whole segment at once, which is several times as fast as step by step."""
         if not np.isfinite(out.rewards, out=self._finite_rewards).all():
             for index in np.flatnonzero(~self._finite_rewards.all(axis=1)).tolist():
                 step = int(self._finite_rewards[index].argmin())
@@ -275,7 +276,7 @@ class GymnasiumSegmentEnv(SegmentEnv):
                 self._fail(index, self._not_finite(index, when, out.observations[index, row]), out)
 
     def _fail(self, index: int, failure: SegmentEnvError, out: SegmentBuffers) -> None:
-        """Empties what a failed environment has written; :meth:`_replace` follows."""
+        """Clears the results of a failed environment; :meth:`_replace` follows."""
         self._note(failure)
         self._failed_now.append(index)
         out.failed[index] = 1
@@ -287,13 +288,13 @@ class GymnasiumSegmentEnv(SegmentEnv):
     def _note(self, failure: SegmentEnvError) -> None:
         self._untold.append(str(failure))
         self._failure_total += 1
-        # The worker's log: a traceback is long, and most often the next one is the same.
+        # The worker's log: tracebacks are long, and usually the next one is the same.
         if failure.__cause__ is not None and self._failure_total.bit_count() == 1:
             traceback.print_exception(failure.__cause__)
 
     def _replace(self, index: int, seed: int, out: SegmentBuffers) -> None:
-        """Closes a failed environment, makes it again and resets it."""
-        with contextlib.suppress(*FAILURES):  # it is broken already
+        """Closes a failed environment, recreates it and resets it."""
+        with contextlib.suppress(*FAILURES):  # it is already broken
             self._envs[index].close()
         try:
             self._envs[index] = self._make()
@@ -316,7 +317,7 @@ class GymnasiumSegmentEnv(SegmentEnv):
 
 
 def success_of(info: dict) -> int:
-    """``info["is_success"]`` or ``info["success"]`` as a value of ``SegmentBuffers.success``."""
+    """Converts ``info["is_success"]`` or ``["success"]`` for ``SegmentBuffers.success``."""
     success = info.get("is_success", info.get("success"))
     if success is None or math.isnan(success):
         return SUCCESS_NOT_REPORTED

@@ -1,8 +1,8 @@
-"""Goals in the observations of a Gymnasium environment, and rewards for goals it was not given.
+"""Goals in the observations of a Gymnasium environment, and rewards for other goals.
 
-Hindsight (Andrychowicz et al. 2017) repeats what happened as if another goal had been wanted. What
-that would have been rewarded with only the environment knows: ``compute_reward``, the method that
-Gymnasium-Robotics and panda-gym brought into use.
+Hindsight (Andrychowicz et al. 2017) repeats experience with another goal. Only the environment can
+compute the reward for that goal, with ``compute_reward``, the method that Gymnasium-Robotics and
+panda-gym introduced.
 """
 
 from __future__ import annotations
@@ -19,16 +19,16 @@ from numpy.typing import NDArray
 from dmprl.segment_env import GoalRows, Goals, NotGoalConditionedError
 
 PROBES = 32
-"""Pairs of goals that ``compute_reward`` is tried with before it is relied on."""
+"""Pairs of goals for testing ``compute_reward`` before use."""
 
 
 class GymnasiumGoals:
-    """The goals of one kind of environment; the environment itself may be made again meanwhile.
+    """The goals of one kind of environment, independent of its instances.
 
-    - ``env``: with its ``Dict`` observation or any wrapper around that; ``space``: that ``Dict``.
+    - ``env``: has the ``Dict`` observation or any wrapper around it; ``space``: that ``Dict``.
 
     Raises:
-        NotGoalConditionedError: the observation has no goals, or their reward cannot be asked for.
+        NotGoalConditionedError: the observation has no goals, or rewards for them are unavailable.
     """
 
     def __init__(self, task_id: str, env: gymnasium.Env, space: spaces.Space) -> None:
@@ -45,10 +45,10 @@ class GymnasiumGoals:
         }
 
     def relabel(self, env: gymnasium.Env, rows: GoalRows) -> None:
-        """As :meth:`SegmentEnv.relabel`, by ``env``."""
+        """Implements :meth:`SegmentEnv.relabel` with ``env``."""
         count = int(rows.count[0])
         achieved, desired = self._shaped(rows.achieved[:count], rows.desired[:count])
-        infos = [{} for _ in range(count)]  # nothing but the goals is known any more
+        infos = [{} for _ in range(count)]  # only the goals are known here
         rows.rewards[:count] = self._rewards(env, achieved, desired, infos)
         rows.terminated[:count] = terminated_at(env, achieved, desired)
 
@@ -66,7 +66,7 @@ class GymnasiumGoals:
         return found[0], found[1]
 
     def _first_entries(self, space: spaces.Dict) -> dict[str, int]:
-        """Where each entry of the Dict begins once it is flattened."""
+        """Computes the index of each entry of the Dict in the flattened observation."""
         first, at = {}, 0
         for name, part in space.spaces.items():
             first[name] = at
@@ -74,9 +74,9 @@ class GymnasiumGoals:
         return first
 
     def _is_sparse(self, env: gymnasium.Env, achieved: spaces.Box, desired: spaces.Box) -> bool:
-        """Whether goals far and near are rewarded alike, after a look at whether they are at all.
+        """Returns whether the reward is sparse, after checking that it can be computed.
 
-        A distance tells any two pairs apart; a threshold has two answers.
+        A reward by distance differs between random pairs; one by threshold has two values.
         """
         if not env.has_wrapper_attr("compute_reward"):
             raise self._refused(
@@ -84,7 +84,7 @@ class GymnasiumGoals:
             )
         drawn = []
         for seed, space in enumerate((achieved, desired)):
-            space = copy.deepcopy(space)  # its random state is not ours
+            space = copy.deepcopy(space)  # the space's random state must not change
             space.seed(seed)
             drawn.append(np.stack([space.sample() for _ in range(PROBES)]))
         rewards = self._rewards(env, *drawn, [{} for _ in range(PROBES)])
@@ -110,10 +110,10 @@ class GymnasiumGoals:
 
 
 def terminated_at(env: gymnasium.Env, achieved: NDArray, desired: NDArray) -> Any:
-    """Where a step with these goals would have ended its episode.
+    """Returns where a step with these goals would have ended its episode.
 
-    ``compute_terminated``, where there is one, is written for one goal at a time. panda-gym has
-    none: its episodes end at success.
+    ``compute_terminated``, if there is one, takes one goal at a time. panda-gym has none: its
+    episodes end at success.
     """
     if env.has_wrapper_attr("compute_terminated"):
         ends = env.get_wrapper_attr("compute_terminated")

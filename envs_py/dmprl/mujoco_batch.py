@@ -1,9 +1,9 @@
-"""Tasks of our own on MuJoCo's batched simulation: a whole segment for E environments in one call.
+"""dmprl's own tasks on MuJoCo's batched simulation: one call per segment for E environments.
 
-A :class:`MujocoTask` says what the task is: model, start states, observation, reward. It sees all
-environments and all steps at once, as arrays. :class:`BatchSegmentEnv` runs it on
-:class:`mujoco.batch.Batch`, which steps E simulations in C without the GIL. One thread: a machine's
-cores are filled with workers, each a process of its own.
+A :class:`MujocoTask` defines the task: model, start states, observation, reward. Its methods get
+all environments and all steps at once, as arrays. :class:`BatchSegmentEnv` runs it on
+:class:`mujoco.batch.Batch`, which steps E simulations in C without the GIL. It uses one thread,
+because workers, each a process, already use all cores.
 
 Shapes: E environments, K steps of a segment, O observation, A action.
 """
@@ -31,11 +31,11 @@ from dmprl.segment_env import (
 )
 
 Fields = Mapping[str, NDArray]
-"""Arrays of MjData by name, each with the dimensions of the call in front of MjData's own."""
+"""Arrays of MjData by name; the dimensions of the call precede MjData's own."""
 
 
 class Start(NamedTuple):
-    """Where an episode starts: views of one environment's state, or of each, (E, …)."""
+    """Start state of an episode: views of one environment's state, or of each, (E, …)."""
 
     qpos: NDArray[np.float64]
     qvel: NDArray[np.float64]
@@ -43,24 +43,24 @@ class Start(NamedTuple):
 
 
 class MujocoTask(ABC):
-    """What a task is, for E environments at once.
+    """Definition of a task, for E environments at once.
 
-    Observations are rows of float64; actions come as float32, which is what Gymnasium's action
-    spaces hold. Reward and success are functions of observations and actions.
+    Observations are rows of float64. Actions are float32, as in Gymnasium's action spaces. Reward
+    and success are functions of observations and actions.
     """
 
     id: str
     """Gymnasium id."""
     frame_skip: int
-    """Steps of the simulation in one step of the environment."""
+    """Simulation steps per environment step."""
     episode_steps: int
     """Steps after which an episode is truncated."""
     recorded: tuple[str, ...]
     """Names of the MjData fields that :meth:`observe` reads."""
     camera: ClassVar[Mapping[str, Any]] = {}
-    """Settings of MuJoCo's free camera for a picture of the task."""
+    """Settings of MuJoCo's free camera for pictures of the task."""
     goal_in_pictures: ClassVar[str] = ""
-    """What a picture shows the goal as; empty if it does not, or nobody has said."""
+    """Appearance of the goal in pictures; empty if it is not visible or unknown."""
 
     def __init__(self, env_count: int) -> None:
         self.env_count = env_count
@@ -71,7 +71,7 @@ class MujocoTask(ABC):
         )
 
     def batch(self, segment_steps: int, episode_steps: int | None) -> BatchSegmentEnv:
-        """The environments; ``episode_steps`` None leaves the time limit to the caller."""
+        """Creates the environments; with ``episode_steps`` None the caller limits the time."""
         return BatchSegmentEnv(self, segment_steps, episode_steps)
 
     @abstractmethod
@@ -79,32 +79,32 @@ class MujocoTask(ABC):
         """Compiles the model."""
 
     def picture_model(self) -> mujoco.MjModel:
-        """The model with all that pictures show; its states are those of :attr:`model`."""
+        """Returns the model for pictures; its states are those of :attr:`model`."""
         return self.model
 
     @abstractmethod
     def observation_names(self) -> list[str]:
-        """What each of an observation's O entries is."""
+        """Names the O entries of an observation."""
 
     @abstractmethod
     def draw_start(self, rng: np.random.Generator, start: Start) -> None:
-        """Writes one environment's start state over the model's own, which ``start`` holds."""
+        """Writes one environment's start state over the model's default in ``start``."""
 
     def scratch(self, name: str, shape: tuple[int, ...], dtype: type = np.float64) -> NDArray:
-        """An array to calculate in, made once for each name, shape and type."""
+        """Returns a work array, created once for each name, shape and type."""
         array = self._scratch.get((name, shape, dtype))
         if array is None:
             array = self._scratch[name, shape, dtype] = np.zeros(shape, dtype)
         return array
 
     def effort(self, actions: NDArray[np.float32], dtype: type = np.float32) -> NDArray:
-        """The sum of squares of each action (E, k, A), calculated in ``dtype``."""
+        """Returns the sum of squares of each action (E, k, A), computed in ``dtype``."""
         squares = self.scratch("squares", actions.shape, dtype)
         np.square(actions, out=squares, dtype=dtype)
         return np.sum(squares, axis=-1, out=self.scratch("effort", actions.shape[:-1], dtype))
 
     def episodes_began(self, indices: NDArray[np.int32]) -> None:  # noqa: B027 - most keep nothing
-        """Forgets what the task keeps of the last episode of these environments."""
+        """Discards the task's data of the last episode of these environments."""
 
     @abstractmethod
     def observe(self, fields: Fields, out: NDArray[np.float64]) -> None:
@@ -123,7 +123,7 @@ class MujocoTask(ABC):
         """
 
     def successes(self, observations: NDArray[np.float64], out: NDArray[np.uint8]) -> None:
-        """Writes whether each state (E, O) is a success; a task without a criterion says so."""
+        """Writes whether each state (E, O) is a success; the default reports none."""
         out[:] = SUCCESS_NOT_REPORTED
 
 
@@ -149,13 +149,13 @@ class BatchSegmentEnv(SegmentEnv):
         self._messages: list[str] = []
         self._starts = Start(*(self.batch.bind(name) for name in Start._fields))
         self._fields = {name: self.batch.bind(name) for name in task.recorded}
-        # What mj_resetData would leave. Copying it is cheaper: the rest of what that call clears
-        # the forward pass computes anew.
+        # The state that mj_resetData would leave. Copying it is cheaper; the forward pass
+        # recomputes everything else that mj_resetData clears.
         self._new_state = self.batch.state[0].copy()
         self._prepare()
 
     def _prepare(self) -> None:
-        """Makes the arrays of a segment, for each number of steps that a segment may have."""
+        """Allocates the arrays of a segment, for each possible number of steps."""
         task, envs = self.task, self.env_count
         self._controls, self._records, self._ends = [], [], []
         for steps in range(1, self.segment_steps + 1):
@@ -198,7 +198,7 @@ class BatchSegmentEnv(SegmentEnv):
         out.next_observations[indices] = self._current[indices]
 
     def seed(self, index: int, rng: np.random.Generator) -> None:
-        """Gives an environment the generator that draws its start states."""
+        """Sets the generator of an environment's start states."""
         self._generators[index] = rng
 
     def step_segment(  # noqa: D102 - inherited
@@ -218,7 +218,7 @@ class BatchSegmentEnv(SegmentEnv):
         self.task.rewards(observations, self._actions[:, :steps], out.rewards[:, :steps])
         self._current[:] = observations[:, -1]
         np.minimum(remaining, steps, out=out.steps)
-        # An episode that ended earlier ran on with the others; its end is what counts.
+        # An episode that ended earlier ran on with the others; only its end counts.
         self.task.successes(observations[self._rows, out.steps], out.success)
         remaining -= out.steps
         out.terminated[:] = 0
@@ -243,10 +243,10 @@ class BatchSegmentEnv(SegmentEnv):
         return self._failed(failed)
 
     def _failed(self, raised: NDArray[np.int32] | None) -> NDArray[np.int32] | None:
-        """Those that raised and those whose warning counters rose, with a sentence for each."""
+        """Returns the environments with an error or a warning, and stores a message for each."""
         if raised is None and not self.batch.warning.any():
             return None
-        # MuJoCo has stopped the simulations that it warned about.
+        # MuJoCo stops simulations that it warns about.
         warnings = self.batch.warning[:, :, 1]
         failed = np.flatnonzero(warnings.any(axis=1))
         if raised is not None:
@@ -258,7 +258,7 @@ class BatchSegmentEnv(SegmentEnv):
         return failed.astype(np.int32)
 
     def _end_episodes(self, failed: NDArray[np.int32] | None, out: SegmentBuffers) -> None:
-        """Cuts rows at the episodes' ends and starts new ones."""
+        """Clears rows after the episodes' ends and starts new ones."""
         for index in np.flatnonzero(out.steps < self.segment_steps).tolist():
             out.observations[index, out.steps[index] + 1 :] = 0.0
             out.rewards[index, out.steps[index] :] = 0.0
@@ -300,18 +300,18 @@ class BatchSegmentEnv(SegmentEnv):
 
 
 def generator(seed: int) -> np.random.Generator:
-    """The generator that Gymnasium makes of a seed."""
+    """Creates the generator that Gymnasium would create from a seed."""
     return np.random.Generator(np.random.PCG64(np.random.SeedSequence(seed)))
 
 
 def quieten_mujoco() -> None:
-    """Takes the clock and the log file out of MuJoCo, for this process: a worker's.
+    """Removes the clock and the log file from MuJoCo, in a worker's process.
 
-    MuJoCo's Python bindings install a timer that every stage of a step reads twice: on Reacher a
-    fourth of a step's time. Nothing but ``MjData.timer`` is lost. And a warning, which here becomes
-    a failure with a sentence of its own, would be written to MUJOCO_LOG.TXT wherever the program
-    was started. The hook takes a C function only, lest a simulation's thread need the GIL; strlen
-    takes a string and does nothing.
+    MuJoCo's Python bindings install a timer that every stage of a step reads twice, which takes a
+    quarter of a step's time on Reacher. Only ``MjData.timer`` is lost. Warnings, which become
+    failures with a message here, would be written to MUJOCO_LOG.TXT in the working directory. The
+    hook must be a C function, so that a simulation's thread does not need the GIL; strlen takes a
+    string and does nothing.
     """
     mujoco_hook("mjcb_time").value = None
     strlen = ctypes.cast(ctypes.CDLL(None).strlen, ctypes.c_void_p)
@@ -319,6 +319,6 @@ def quieten_mujoco() -> None:
 
 
 def mujoco_hook(name: str) -> ctypes.c_void_p:
-    """A function pointer of MuJoCo's library, which Python's bindings do not show."""
+    """Returns a function pointer of MuJoCo's library that its Python bindings do not expose."""
     library = ctypes.CDLL(str(next(Path(mujoco.__file__).parent.glob("libmujoco*"))))
     return ctypes.c_void_p.in_dll(library, name)

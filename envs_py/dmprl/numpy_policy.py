@@ -1,8 +1,9 @@
-"""The policy once more, in NumPy: for whoever has no Rust, and as a benchmark's peer.
+"""The policy in NumPy, for use without Rust and as a peer in benchmarks.
 
-The same function as ``shared/src/policy`` and the same noise as ``actors/src/exploration.rs``, for
-E environments at once; a test holds its actions to Rust's. :class:`dmprl.Policy` is it with a file
-and what a robot needs. Shapes: E environments, K steps, O observation, A action, N basis functions.
+It computes the same function as ``shared/src/policy`` and the same noise as
+``actors/src/exploration.rs``, for E environments at once; a test compares its actions with Rust's.
+:class:`dmprl.Policy` adds a file and a robot's safety limits. Shapes: E environments, K steps, O
+observation, A action, N basis functions.
 """
 
 from __future__ import annotations
@@ -17,15 +18,15 @@ Floats = NDArray[np.float32]
 
 RHO_CENTRE = np.array([1.0, 0.0, 0.0, 0.0], np.float32)
 OCTAVES = 8
-"""Of the pink noise, as in Rust."""
+"""Number of octaves of the pink noise, as in Rust."""
 LOG_STD_RANGE = (-20.0, 2.0)
-"""Of standard deviations that the network puts out, as in Rust."""
+"""Range of the network's log-stds, as in Rust."""
 
 
 class NumpyPolicy:
-    """The policy that ``plan`` describes (``deploy/src/bench/numpy_plan.rs`` writes it).
+    """The policy that ``plan`` describes (written by ``deploy/src/bench/numpy_plan.rs``).
 
-    ``parameters`` are the network's, flat; without them, those of the file that the plan names.
+    ``parameters`` are the network's, flat. By default they are read from the plan's file.
     """
 
     def __init__(self, plan: dict, parameters: Floats | None = None) -> None:
@@ -42,18 +43,18 @@ class NumpyPolicy:
         ]
         self._head = DmpHead(plan) if plan["policy"]["kind"] == "dmp" else None
         self._bounded = self._head is None or plan["policy"]["controller"] == "inverse"
-        # Behind what decides, a network may put out the spread of its decisions.
+        # After the decisions, a network may output their log-stds.
         self._decisions: int = plan["widths"][-1] - plan["log_stds_len"]
         env_len = plan["spec"]["observation_len"]
         self._observations = np.zeros((self.env_count, plan["widths"][0]), np.float32)
-        # Views: the environment's part, and the DMP state that a policy may carry on.
+        # Views: the environment's observation, and the DMP state that a policy may carry.
         self._seen = self._observations[:, :env_len]
         self.carried = self._observations[:, env_len:]
 
     def u(self, observations: NDArray, noise: Noise | None = None) -> Floats:
-        """Actions u, (E, K, A), for the environments' observations, (E, O).
+        """Computes actions u, (E, K, A), for the environments' observations, (E, O).
 
-        In [-1, 1] but for the mean and the draws of a policy's own Gaussian.
+        They are in [-1, 1], except for a policy's own Gaussian.
         """
         self._seen[:] = observations
         x = self._observations
@@ -75,29 +76,29 @@ class NumpyPolicy:
         return u
 
     def scaled(self, u: Floats) -> NDArray[np.float64]:
-        """``u``, clipped, in the environment's units."""
+        """Clips ``u`` and scales it to the environment's units."""
         return self._mid + self._half_range * np.clip(u, -1.0, 1.0)
 
     def carry_on(self, ended: NDArray[np.bool_]) -> None:
-        """Lets each DMP continue from its segment's end, or from rest where an episode ended."""
+        """Continues each DMP from its segment's end, or from rest if the episode ended."""
         self.carry_from(self.segment_steps)
         self.carried[ended] = 0.0
 
     def carry_from(self, step: int) -> None:
-        """Lets each DMP continue from where it is after so many steps, 1 to K, of its segment."""
+        """Continues each DMP from its state after 1 to K steps of its segment."""
         if self._head is not None and self.carried.shape[1] > 0:
             self.carried[:] = self._head.state_after(step)
 
 
 def layers(widths: list[int], parameters: Floats) -> list[tuple[Floats, Floats]]:
-    """Weights, (inputs, outputs), and bias of each layer from the flat parameters."""
+    """Splits the flat parameters into weights, (inputs, outputs), and bias of each layer."""
     expected = sum((before + 1) * after for before, after in pairwise(widths))
     if len(parameters) != expected:
         raise ValueError(f"{len(parameters)} parameters, a network {widths} has {expected}")
     found, at = [], 0
     for before, after in pairwise(widths):
         end = at + before * after
-        # Stored (outputs, inputs); a copy, since the product is quicker on contiguous rows.
+        # Stored as (outputs, inputs); copied, because products are faster on contiguous rows.
         weights = np.ascontiguousarray(parameters[at:end].reshape(after, before).T)
         found.append((weights, parameters[end : end + after]))
         at = end + after
@@ -105,7 +106,7 @@ def layers(widths: list[int], parameters: Floats) -> list[tuple[Floats, Floats]]
 
 
 class DmpHead:
-    """From the network's outputs to a segment of actions (``shared/src/policy/dmp_head.rs``)."""
+    """Maps the network's outputs to a segment of actions (``shared/src/policy/dmp_head.rs``)."""
 
     def __init__(self, plan: dict) -> None:
         policy, dmp = plan["policy"], plan["dmp"]
@@ -132,7 +133,7 @@ class DmpHead:
         self._samples = np.zeros((*self._shape, 3 * self._steps), np.float32)
 
     def u(self, outputs: Floats, observations: Floats) -> Floats:
-        """The segments' actions, (E, K, A); of the inverse controller before its tanh."""
+        """Computes the segments' actions, (E, K, A); for the inverse controller before its tanh."""
         n, inputs = self._basis_count, self._inputs
         raw = outputs.reshape(*self._shape, 1 + n + (4 if self._inverse else 0))
         squashed = np.tanh(raw)
@@ -151,7 +152,7 @@ class DmpHead:
         return np.ascontiguousarray(u.transpose(0, 2, 1))
 
     def state_after(self, step: int) -> Floats:
-        """(y, yd) of every action dimension after so many steps of the segments, (E, 2A)."""
+        """Returns (y, yd) of every action dimension after some steps of the segments, (E, 2A)."""
         y, yd = self._samples[..., step - 1], self._samples[..., self._steps + step - 1]
         return np.concatenate([y, yd * self._omega], axis=1)
 
@@ -166,7 +167,7 @@ class DmpHead:
             for d, source in enumerate(self._sources):
                 yd0[:, d] = observations[:, source["velocity"]] * self._velocity_scale
                 if "cos" in source:
-                    # -0 counts as 0: it would lead to the other side.
+                    # Converts -0 to 0, because arctan2 of -0 can be -pi instead of pi.
                     sin, cos = observations[:, source["sin"]], observations[:, source["cos"]]
                     y0[:, d] = np.arctan2(sin + 0.0, cos + 0.0)
                 else:
@@ -175,7 +176,7 @@ class DmpHead:
 
 
 class Noise:
-    """Exploration noise of the kinds that Rust has, from a generator of its own."""
+    """Exploration noise of the same kinds as in Rust, from its own generator."""
 
     def __init__(self, plan: dict, seed: int) -> None:
         exploration = plan["exploration"]
@@ -190,16 +191,16 @@ class Noise:
         self._periods = 1 << np.arange(OCTAVES)
 
     def disturb_outputs(self, outputs: Floats) -> None:
-        """Noise on the DMP's parameters, before they are bounded."""
+        """Adds noise to the DMP's parameters, before they are bounded."""
         if not self._own and self._kind == "dmp_parameters":
             outputs += self._std * self._normal(outputs.shape)
 
     def own_draws(self, log_std: Floats) -> Floats:
-        """What a Gaussian of these logarithmic standard deviations adds to its mean."""
+        """Draws the noise of a Gaussian with these logarithmic standard deviations."""
         return np.exp(np.clip(log_std, *LOG_STD_RANGE)) * self._normal(log_std.shape)
 
     def disturb_u(self, u: Floats) -> None:
-        """Noise on actions, (E, K, A), which stay in [-1, 1]; or the policy's own Gaussian."""
+        """Adds noise to actions, (E, K, A), clipped to [-1, 1]; or the policy's own Gaussian."""
         if self._gaussian.size > 0:
             u += self._gaussian * self._normal(u.shape)
         if self._own or self._kind == "dmp_parameters":
@@ -214,11 +215,11 @@ class Noise:
         np.clip(u, -1.0, 1.0, out=u)
 
     def episodes_ended(self, ended: NDArray[np.bool_]) -> None:
-        """Noise with a memory starts anew in these environments."""
+        """Resets noise that has a memory in these environments."""
         self._step[ended] = 0
 
     def _pink(self) -> Floats:
-        """Voss's sum of held white sources, source i renewed every 2^i steps."""
+        """Voss's sum of held white sources; source i is renewed every 2^i steps."""
         renewed = self._step[:, None] % self._periods == 0
         fresh = self._normal(self._sources.shape)
         np.copyto(self._sources, fresh, where=renewed[:, None, :])
@@ -230,16 +231,16 @@ class Noise:
 
 
 class Actor:
-    """A policy with its noise, in E environments that run one segment after the other."""
+    """A policy with its noise, for E environments that run one segment after the other."""
 
     def __init__(self, plan: dict, seed: int) -> None:
         self._policy, self._noise = NumpyPolicy(plan), Noise(plan, seed)
 
     def actions(self, observations: NDArray) -> NDArray[np.float64]:
-        """The next segment's actions in the environment's units, (E, K, A)."""
+        """Computes the next segment's actions in the environment's units, (E, K, A)."""
         return self._policy.scaled(self._policy.u(observations, self._noise))
 
     def carry_on(self, ended: NDArray[np.bool_]) -> None:
-        """To be called after a segment, with the environments whose episode has ended."""
+        """Ends a segment; ``ended`` are the environments whose episode has ended."""
         self._policy.carry_on(ended)
         self._noise.episodes_ended(ended)

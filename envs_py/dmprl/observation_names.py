@@ -1,4 +1,4 @@
-"""What the entries of a flattened observation are called."""
+"""Names of the entries of a flattened observation."""
 
 from __future__ import annotations
 
@@ -7,10 +7,10 @@ from gymnasium import spaces
 
 
 def names_of(space: spaces.Space, path: str = "") -> list[str]:
-    """The name of each entry that ``gymnasium.spaces.flatten`` makes of ``space``, in its order.
+    """Returns the name of each entry of ``gymnasium.spaces.flatten`` for ``space``, in order.
 
     ``achieved_goal[0]`` in a Dict, ``arm.position[0]`` in a Dict of Dicts, ``observation.0[2]`` in
-    a Tuple, ``observation[0]`` elsewhere. A Discrete has an entry a value.
+    a Tuple, ``observation[0]`` elsewhere. A Discrete has one entry per value.
     """
     if isinstance(space, spaces.Dict):
         parts = [

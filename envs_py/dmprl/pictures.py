@@ -1,7 +1,7 @@
 """Pictures of a MuJoCo state, without a display.
 
-MuJoCo's own ``Renderer`` takes the OpenGL that the environment variable ``MUJOCO_GL`` named when
-``mujoco`` was first imported, by default one that needs a display. This one takes what works.
+MuJoCo's own ``Renderer`` uses the OpenGL that the environment variable ``MUJOCO_GL`` named when
+``mujoco`` was first imported; the default needs a display. This module uses the first that works.
 """
 
 from __future__ import annotations
@@ -16,12 +16,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 OFFSCREEN = ("egl", "osmesa")
-"""OpenGL without a display: on a graphics card or Mesa's processor driver, then in memory."""
+"""OpenGL without a display: first on a graphics card or Mesa's CPU driver, then in memory."""
 MAX_GEOMS = 1000
 
 
 class NoOpenGLError(RuntimeError):
-    """Nothing on this machine can draw."""
+    """Raised if no OpenGL on this machine works."""
 
 
 class PictureMaker:
@@ -30,11 +30,11 @@ class PictureMaker:
     def __init__(
         self, model: mujoco.MjModel, width: int, height: int, camera: Mapping[str, Any]
     ) -> None:
-        """Opens OpenGL; ``camera`` holds settings of MuJoCo's free camera."""
+        """Opens OpenGL; ``camera`` contains settings of MuJoCo's free camera."""
         self._model = model
         self._gl = _context(width, height)
         self._gl.make_current()
-        # The buffer grows to the picture, and never shrinks: another picture may be larger.
+        # The buffer only grows, because another picture may be larger.
         scale = model.vis.global_
         scale.offwidth = max(scale.offwidth, width)
         scale.offheight = max(scale.offheight, height)
@@ -52,7 +52,7 @@ class PictureMaker:
                 setattr(self._camera, name, value)
 
     def _draw(self, data: mujoco.MjData) -> None:
-        # Another maker may have drawn since.
+        # Another maker may have drawn in the meantime.
         self._gl.make_current()
         mujoco.mjv_updateScene(
             self._model,
@@ -66,34 +66,34 @@ class PictureMaker:
         mujoco.mjr_render(self._viewport, self._scene, self._context)
 
     def rgb(self, data: mujoco.MjData) -> NDArray[np.uint8]:
-        """The picture (height, width, 3)."""
+        """Draws the picture (height, width, 3)."""
         self._draw(data)
         picture = np.zeros((self._viewport.height, self._viewport.width, 3), np.uint8)
         mujoco.mjr_readPixels(picture, None, self._viewport, self._context)
         return np.ascontiguousarray(picture[::-1])
 
     def depth(self, data: mujoco.MjData) -> NDArray[np.float32]:
-        """OpenGL's depth of each pixel (height, width), 0 at the near plane, 1 at the far one."""
+        """Draws OpenGL's depth of each pixel (height, width): 0 near, 1 far."""
         self._draw(data)
         depth = np.zeros((self._viewport.height, self._viewport.width), np.float32)
         mujoco.mjr_readPixels(None, depth, self._viewport, self._context)
         return np.ascontiguousarray(depth[::-1])
 
     def close(self) -> None:
-        """Gives OpenGL's memory back."""
+        """Frees OpenGL's memory."""
         self._gl.make_current()
         self._context.free()
         self._gl.free()
 
 
 def name_opengl() -> None:
-    """Lets Gymnasium's own pictures take what works: they obey ``MUJOCO_GL``, which it sets."""
+    """Sets ``MUJOCO_GL``, which Gymnasium's own pictures use, to the first OpenGL that works."""
     if os.environ.get("MUJOCO_GL"):
         return
     for name in OFFSCREEN:
         try:
             importlib.import_module(f"mujoco.{name}").GLContext(8, 8).free()
-        # As below. Without any, whoever draws says so; not everybody draws with OpenGL.
+        # As below. If none works, drawing reports it; not every environment needs OpenGL.
         except Exception:
             continue
         os.environ["MUJOCO_GL"] = name
@@ -101,13 +101,13 @@ def name_opengl() -> None:
 
 
 def _context(width: int, height: int) -> Any:
-    """OpenGL by what ``MUJOCO_GL`` names, or by the first that works."""
+    """Opens the OpenGL that ``MUJOCO_GL`` names, or the first that works."""
     asked = os.environ.get("MUJOCO_GL", "").lower()
     failures = []
     for name in (asked,) if asked else OFFSCREEN:
         try:
             return importlib.import_module(f"mujoco.{name}").GLContext(width, height)
-        # Each fails in its own way: a missing library, no device, no function of the library.
+        # Each fails differently: a missing library, no device, no function of the library.
         except Exception as error:
             failures.append(f"{name}: {type(error).__name__}: {error}")
     raise NoOpenGLError(

@@ -1,8 +1,8 @@
-"""Shows a policy at work, live; started by ``dmprl play``.
+"""Shows a policy in its environment, live; started by ``dmprl play``.
 
-``python -m dmprl.play POLICY --task ID``: with ``--window`` in a window of the environment's own,
-otherwise as a web page on loopback that any browser on this machine, or at the other end of
-``ssh -L``, can look at.
+``python -m dmprl.play POLICY --task ID`` serves a web page on loopback, for any browser on this
+machine or at the other end of ``ssh -L``. With ``--window`` it opens a window of the environment
+instead.
 """
 
 from __future__ import annotations
@@ -29,20 +29,20 @@ from dmprl.recording import gymnasium_id, task_maker
 from dmprl.segment_env import SUCCESS_YES, SegmentEnv, named_object
 
 INTERRUPTED = 130
-"""Exit status."""
+"""Exit status after an interrupt."""
 DEFAULT_DT = 0.05
-"""Of an environment that does not say how long a step takes [s]."""
+"""Duration of a step if the environment does not report it [s]."""
 PAUSE_S = 0.8
-"""After an episode, to see how it ended."""
+"""Pause after an episode, to show how it ended [s]."""
 BETWEEN_FRAMES_S = 1 / 50
-"""A screen shows hardly more."""
+"""Minimum time between frames; most screens show no more."""
 QUALITY = 85
-"""Of the pictures, as JPEG has it."""
+"""JPEG quality of the pictures."""
 WAIT_S = 5.0
-"""A browser waits so long for the next picture before it gets the last one again."""
+"""Time after which a browser gets the last picture again [s]."""
 BOUNDARY = "frame"
 LOCAL_NAMES = ("127.0.0.1", "localhost", "[::1]")
-"""What a browser that means this machine calls it; other names may lead here by a trick."""
+"""Host names for this machine. Others are rejected, because of DNS rebinding."""
 PAGE = """<!doctype html>
 <html lang="en"><head><meta charset="utf-8"><title>{title}</title>
 <meta name="viewport" content="width=device-width, initial-scale=1"><style>
@@ -64,13 +64,13 @@ class Show:
         self._changed = threading.Condition()
 
     def show(self, picture: bytes) -> None:
-        """A new picture, as JPEG."""
+        """Stores a new picture, as JPEG."""
         with self._changed:
             self._picture, self._number = picture, self._number + 1
             self._changed.notify_all()
 
     def pictures(self) -> Iterator[bytes]:
-        """Each picture that is there when the one before has been taken."""
+        """Yields the newest picture each time the previous one has been sent."""
         seen = 0
         while True:
             with self._changed:
@@ -81,12 +81,12 @@ class Show:
 
 
 class Handler(BaseHTTPRequestHandler):
-    """The page and its stream, to browsers on this machine."""
+    """Serves the page and its stream to browsers on this machine."""
 
     server: Server
 
     def do_GET(self) -> None:
-        """Answers a browser."""
+        """Answers a browser's request."""
         host = self.headers.get("Host", "").rsplit(":", 1)[0]
         if host not in LOCAL_NAMES:
             self.send_error(403, "this page is for this machine alone")
@@ -113,14 +113,14 @@ class Handler(BaseHTTPRequestHandler):
                 head += f"Content-Length: {len(picture)}\r\n\r\n"
                 self.wfile.write(head.encode() + picture + b"\r\n")
         except OSError:
-            pass  # it has seen enough
+            pass  # the browser has closed the connection
 
     def log_message(self, format: str, *arguments: Any) -> None:
-        """Says nothing of every request."""
+        """Suppresses the log line of every request."""
 
 
 class Server(ThreadingHTTPServer):
-    """Serves one show."""
+    """HTTP server for one show."""
 
     daemon_threads = True
 
@@ -130,16 +130,16 @@ class Server(ThreadingHTTPServer):
 
 
 class Painter:
-    """Pictures of an environment with a line of text, as JPEG."""
+    """Draws an environment with a line of text, as JPEG."""
 
     def __init__(self, environment: gymnasium.Env) -> None:
-        from PIL import Image, ImageDraw, ImageFont  # the extra `video`
+        from PIL import Image, ImageDraw, ImageFont  # extra `video`
 
         self._environment = environment
         self._image, self._draw, self._font = Image, ImageDraw, ImageFont.load_default(18)
 
     def paint(self, text: str) -> bytes:
-        """The environment as it is now."""
+        """Draws the environment's current state."""
         frame = self._environment.render()
         if not isinstance(frame, np.ndarray) or frame.ndim != 3:
             raise SystemExit(
@@ -156,7 +156,7 @@ class Painter:
 
 
 class Shown(GymnasiumSegmentEnv):
-    """One Gymnasium environment that shows itself."""
+    """One Gymnasium environment with a render mode."""
 
     def __init__(self, task_id: str, render_mode: str) -> None:
         named = named_object(task_id)
@@ -179,12 +179,12 @@ class Shown(GymnasiumSegmentEnv):
 
     @property
     def environment(self) -> gymnasium.Env:
-        """It."""
+        """The Gymnasium environment."""
         return self._envs[0]
 
 
 def play(policy: Policy, made: gymnasium.Env, seeds: Iterator[int], paint) -> None:
-    """One episode after the other at the robot's own pace; ``paint`` shows each step."""
+    """Plays one episode after the other at the robot's own pace; ``paint`` shows each step."""
     dt = policy.spec["control_dt_s"] or DEFAULT_DT
     every = max(1, round(BETWEEN_FRAMES_S / dt))
     for seed in seeds:
@@ -208,7 +208,7 @@ def play(policy: Policy, made: gymnasium.Env, seeds: Iterator[int], paint) -> No
 
 
 def main() -> int:
-    """Plays until the episodes are over or it is interrupted."""
+    """Plays until the episodes are over or the program is interrupted."""
     parser = argparse.ArgumentParser(prog="dmprl play")
     parser.add_argument("policy")
     parser.add_argument("--task", required=True)

@@ -1,12 +1,12 @@
-"""A trained policy next to a robot, with NumPy alone: no Rust, no simulator, no run.
+"""Runs a trained policy on a robot with NumPy alone: no Rust, no simulator, no run.
 
 ::
 
     policy = dmprl.Policy.load("policy.safetensors")
     policy.reset()
-    action = policy.action(observation)  # once a control step
+    action = policy.action(observation)  # once per control step
 
-The same as ``shared/src/runtime`` in Rust, which a test holds it to. Shapes: K steps of a decision,
+It behaves like ``shared/src/runtime`` in Rust; a test compares them. Shapes: K steps of a decision,
 O observation, A action.
 """
 
@@ -27,12 +27,12 @@ Actions = NDArray[np.float64]
 
 
 class Policy:
-    """A policy that acts, one observation at a time; :meth:`load` makes one."""
+    """Runs a policy on one observation at a time; :meth:`load` creates one."""
 
     def __init__(self, file: PolicyFile) -> None:
         check(file.description)
         self.file = file
-        """Where it comes from: description, origin, version."""
+        """Description, origin and version of the policy."""
         spec = file.description["spec"]
         self.spec: dict[str, Any] = spec
         """The environment: ``observation_len``, ``action_low``, ``control_dt_s`` [s], …"""
@@ -41,7 +41,7 @@ class Policy:
         self._network = NumpyPolicy(_plan(file), _flat(file))
         self._carries = self._network.carried.shape[1] > 0
         self.segment_steps: int = self._network.segment_steps
-        """K, the control steps of one decision."""
+        """Control steps per decision, K."""
         self._rate: Actions = np.full(self.low.shape, np.inf)
         self._hold: Actions = np.clip(0.0, self.low, self.high)
         self._hold_after = self.segment_steps
@@ -50,10 +50,10 @@ class Policy:
 
     @classmethod
     def load(cls, path: str | Path) -> Policy:
-        """Loads a policy file that ``dmprl export`` wrote, or the best policy of a run directory.
+        """Loads a policy file written by ``dmprl export``, or the best policy of a run directory.
 
-        :raises OSError: it cannot be read.
-        :raises dmprl.PolicyFileError: it is no policy file, or damaged, or of an older dmprl.
+        :raises OSError: if it cannot be read.
+        :raises dmprl.PolicyFileError: if it is not a policy file, is damaged, or is too old.
         """
         path = Path(path)
         if path.is_dir():
@@ -78,7 +78,7 @@ class Policy:
 
     @property
     def is_holding(self) -> bool:
-        """Whether the last action was the hold: observations had stopped, or it was asked for."""
+        """Whether the last action was the hold: observations had stopped, or by request."""
         return self._holding
 
     def limit(
@@ -88,15 +88,15 @@ class Policy:
         hold: ArrayLike | None = None,
         hold_after: int | None = None,
     ) -> None:
-        """Sets limits; what is not named stays as it is.
+        """Sets limits; omitted ones do not change.
 
-        :param rate: largest change of an action from one control step to the next, (A,) or one for
-            all, in the environment's units; at first infinite.
-        :param hold: the action that holds the robot, (A,) within the bounds; at first 0 (no torque,
-            no displacement) or the bound next to it.
-        :param hold_after: control steps without an observation after which the robot holds; at
-            first K. More changes nothing: without an observation there is no next segment.
-        :raises ValueError: a limit is none; nothing is changed then.
+        :param rate: maximum change of an action between control steps, (A,) or one number for all,
+            in the environment's units; initially infinite.
+        :param hold: action that holds the robot, (A,) within the bounds; initially 0 (no torque, no
+            displacement) or the nearest bound.
+        :param hold_after: control steps without an observation after which the robot holds;
+            initially K. More than K has no effect, because the next segment needs an observation.
+        :raises ValueError: if a limit is invalid; nothing changes then.
         """
         rates, held, after = self._rate, self._hold, self._hold_after
         if rate is not None:
@@ -114,14 +114,13 @@ class Policy:
         self._rate, self._hold, self._hold_after = rates, held, after
 
     def reset(self, y0: Sequence[float] | NDArray | None = None) -> None:
-        """Begins an episode: the next action begins a segment.
+        """Starts an episode. The next action starts a segment.
 
-        The robot is taken to have commanded the hold before, which is where a limited rate begins.
+        A limited rate starts from the hold, as if the robot had executed the hold before.
 
-        :param y0: where the DMP begins, (A,) in units of y, for a policy that carries its state
-            from segment to segment (``policy.start = "carry"``); at 0 by default, as in training.
-        :raises ValueError: y0 is not A finite numbers, or the policy's start is not its own to
-            choose.
+        :param y0: start of the DMP, (A,) in units of y, for a policy that carries its state across
+            segments (``policy.start = "carry"``). The default is 0, as in training.
+        :raises ValueError: if y0 is not A finite numbers, or the policy does not carry its state.
         """
         if y0 is not None:
             if not self._carries:
@@ -138,13 +137,13 @@ class Policy:
         self._holding = False
 
     def segment(self, observation: ArrayLike) -> Actions:
-        """Decides: the next segment's actions, (K, A), in the environment's units.
+        """Decides the next segment's actions, (K, A), in the environment's units.
 
-        All of them are to be executed.
+        All of them must be executed.
 
         :param observation: (O,) in the environment's units.
-        :raises ValueError: the observation is not one, or what the network makes of it is no
-            action. There is no action then but :meth:`hold`; the policy goes on at the next good
+        :raises ValueError: if the observation is invalid, or the network's outputs are NaN. The
+            only available action is then :meth:`hold`; the policy continues at the next valid
             observation.
         """
         self._decide(self._checked(observation))
@@ -152,14 +151,14 @@ class Policy:
         return np.stack([self._give() for _ in range(self.segment_steps)])
 
     def action(self, observation: ArrayLike | None = None) -> Actions:
-        """The next control step's action, (A,), in the environment's units.
+        """Returns the next control step's action, (A,), in the environment's units.
 
-        At a segment's first step the policy decides by the observation; within a segment it moves
-        on as it has decided, and an observation only tells the watchdog that there are some.
+        At a segment's first step the policy decides from the observation. Within a segment it
+        executes that decision, and observations only reset the watchdog.
 
-        :param observation: (O,); none if no new one has come since the last call. After
-            ``hold_after`` calls without one, and where a decision is due, the action is the hold,
-            and the next observation begins a new segment.
+        :param observation: (O,); None if there is no new one since the last call. After
+            ``hold_after`` calls without one, or if a decision is due without one, the action is the
+            hold, and the next observation starts a new segment.
         :raises ValueError: as :meth:`segment`, at every step.
         """
         if observation is not None:
@@ -176,30 +175,30 @@ class Policy:
         return self._give()
 
     def hold(self) -> Actions:
-        """A control step towards the hold, as far as the rate allows, (A,).
+        """Returns a control step towards the hold, as far as the rate allows, (A,).
 
-        What to command after an error, and whenever the policy is not to act. The next observation
-        begins a new segment.
+        Use it after an error, and whenever the policy must not act. The next observation starts a
+        new segment.
         """
         self._holding = True
         return self._limited(self._hold)
 
     def _give(self) -> Actions:
-        """Gives out the segment's next action."""
+        """Executes the segment's next action."""
         action = self._limited(self._decided[self._step])
         self._step += 1
         self._network.carry_from(self._step)
         return action
 
     def _limited(self, wanted: Actions) -> Actions:
-        # The robot is taken to have commanded the hold before its first action.
+        # The first action starts from the hold.
         previous = self._hold if self._previous is None else self._previous
         near = np.clip(wanted, previous - self._rate, previous + self._rate)
         self._previous = np.clip(near, self.low, self.high)
         return self._previous.copy()
 
     def _decide(self, seen: NDArray[np.float32]) -> None:
-        # Beyond all that was trained on, sums of large numbers can be no number.
+        # Far outside the training data, sums of large numbers can be NaN.
         with np.errstate(over="ignore", invalid="ignore"):
             u = self._network.u(seen[None])
         if np.isnan(u).any():
@@ -212,7 +211,7 @@ class Policy:
         self._step = 0
 
     def _checked(self, observation: ArrayLike) -> NDArray[np.float32]:
-        """The observation as the network sees it."""
+        """Checks an observation and converts it to the network's type."""
         with np.errstate(over="ignore"):
             seen = np.asarray(observation, np.float64).astype(np.float32)
         expected = (self.spec["observation_len"],)
@@ -229,7 +228,7 @@ class Policy:
 
 
 def _broadcast(what: str, values: ArrayLike, shape: tuple[int, ...]) -> Actions:
-    """One value an action dimension; NaN is none."""
+    """Returns one value per action dimension; rejects NaN."""
     array = np.asarray(values, np.float64)
     if array.shape not in ((), shape) or np.isnan(array).any():
         raise ValueError(f"{what} is {values}: expected one number, or {shape[0]}")
@@ -237,7 +236,7 @@ def _broadcast(what: str, values: ArrayLike, shape: tuple[int, ...]) -> Actions:
 
 
 def _plan(file: PolicyFile) -> dict[str, Any]:
-    """What :class:`NumpyPolicy` asks for."""
+    """Creates the plan for :class:`NumpyPolicy`."""
     description = file.description
     policy, spec = description["policy"], description["spec"]
     is_dmp = policy["kind"] == "dmp"
@@ -250,7 +249,7 @@ def _plan(file: PolicyFile) -> dict[str, Any]:
     widths = [file.layers[0][0].shape[1], *(len(bias) for _, bias in file.layers)]
     if widths[0] != spec["observation_len"] + carried:
         raise ValueError(f"actor.0.weight of {widths[0]} inputs")
-    # Behind its decisions SAC's network puts out the logarithm of their spread.
+    # After its decisions SAC's network outputs their log-stds.
     log_stds_len = steps * spec["action_len"] if description["algorithm"] == "sac" else 0
     controlled = 4 if policy["controller"] == "inverse" else 0
     decided = 1 + description["dmp"]["basis_count"] + controlled if is_dmp else 1

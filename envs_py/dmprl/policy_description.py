@@ -1,4 +1,4 @@
-"""What a policy's description may say: as Rust checks it (``shared/src/policy/description.rs``)."""
+"""Checks a policy's description, like ``shared/src/policy/description.rs`` in Rust."""
 
 from __future__ import annotations
 
@@ -14,16 +14,16 @@ WORDS = {
     "policy.start_velocity": ("measured", "zero"),
     "dmp.forcing_scaling": ("none", "goal"),
 }
-"""Every word that changes what a policy does; a file of a newer dmprl may have others."""
+"""Known values of every key that changes the policy's function; newer files may have others."""
 POSITIVE = ("policy.goal_range", "policy.rho_range", "policy.position_scale", "dmp.alpha_y")
 COUNTS = ("policy.segment_steps", "dmp.basis_count", "spec.observation_len", "spec.action_len")
 
 
 def check(description: dict[str, Any]) -> None:
-    """Refuses what no policy is.
+    """Rejects an invalid description.
 
-    :raises ValueError: with the key, what it is and what is expected.
-    :raises KeyError: a key is missing.
+    :raises ValueError: with the key, its value and the expected one.
+    :raises KeyError: if a key is missing.
     """
     for key, words in WORDS.items():
         expect(key, found := value(description, key), found in words, f"one of {', '.join(words)}")
@@ -50,7 +50,7 @@ def check(description: dict[str, Any]) -> None:
 
 
 def check_sources(sources: list[dict[str, Any]], count: int, observation_len: int) -> None:
-    """Refuses starts that are not in the observation."""
+    """Rejects starts that are not in the observation."""
     expect("start_sources", sources, len(sources) == count, f"{count} entries")
     for source in sources:
         keys = ("cos", "sin", "velocity") if "cos" in source else ("index", "velocity")
@@ -61,18 +61,18 @@ def check_sources(sources: list[dict[str, Any]], count: int, observation_len: in
 
 
 def value(description: dict[str, Any], key: str) -> Any:
-    """The value of a dotted key."""
+    """Returns the value of a dotted key."""
     for part in key.split("."):
         description = description[part]
     return description
 
 
 def is_finite(number: Any) -> bool:
-    """Whether it is a number, and one that computing goes on with."""
+    """Returns whether it is a finite number."""
     return isinstance(number, int | float) and math.isfinite(number)
 
 
 def expect(key: str, found: Any, fits: bool, expected: str) -> None:
-    """Refuses a value that does not fit."""
+    """Raises ValueError unless ``fits``."""
     if not fits:
         raise ValueError(f"{key} is {found!r}, expected {expected}")

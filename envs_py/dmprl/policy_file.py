@@ -1,7 +1,8 @@
-"""Reads a policy file: safetensors with the policy's description among its metadata.
+"""Reads a policy file: safetensors with the policy's description in its metadata.
 
-Written by ``dmprl export`` and into a run's ``policies/`` (``shared/src/policy_file.rs``). NumPy is
-all that this takes: the container is a length, a header in JSON, and the numbers.
+The files are written by ``dmprl export`` and into a run's ``policies/``
+(``shared/src/policy_file.rs``). Only NumPy is needed: the container is a length, a header in JSON,
+and the numbers.
 """
 
 from __future__ import annotations
@@ -17,35 +18,35 @@ from numpy.typing import NDArray
 
 FORMAT = "dmprl-policy-1"
 HEADER_BYTES_MAX = 100_000_000
-"""As the safetensors library has it: a longer header is damage."""
+"""Limit of the safetensors library: a longer header means damage."""
 
 
 class PolicyFileError(ValueError):
-    """A file that is no policy, or is damaged, or older than this."""
+    """Raised for a file that is not a policy, is damaged, or is too old."""
 
 
 @dataclass(frozen=True)
 class PolicyFile:
-    """What a policy file holds."""
+    """Contents of a policy file."""
 
     path: Path
     description: dict[str, Any]
     """Environment, algorithm, policy, DMP and start, as ``PolicyDescription`` in Rust."""
     origin: dict[str, Any] | None
-    """Run, task, seed, return: where it comes from; none in a run's own files."""
+    """Run, task, seed and return of the policy; None in a run's own files."""
     version: int
     env_steps: int
     layers: list[tuple[NDArray[np.float32], NDArray[np.float32]]]
     """Weights, (outputs, inputs), and bias of each layer."""
     segment_map: NDArray[np.float32] | None
-    """From (y0, yd0, g, w) to the samples of one dimension, (3K, 3+N); none without a DMP."""
+    """Map from (y0, yd0, g, w) to the samples of one dimension, (3K, 3+N); None without a DMP."""
 
 
 def read(path: Path) -> PolicyFile:
     """Reads a policy file.
 
-    :raises OSError: it cannot be read.
-    :raises PolicyFileError: it is no policy file, or damaged; the message names the field.
+    :raises OSError: if it cannot be read.
+    :raises PolicyFileError: if it is not a policy file, or is damaged; the message names the field.
     """
     fields, tensors = _contents(path)
     if (found := fields.get("format")) != FORMAT:
@@ -84,7 +85,7 @@ def read(path: Path) -> PolicyFile:
 
 
 def checksum(description: str, tensors: dict[str, NDArray[np.float32]]) -> str:
-    """CRC-32 over the description and the tensors' bytes, in the order of their names."""
+    """Computes the CRC-32 of the description and the tensors' bytes, in name order."""
     crc = zlib.crc32(description.encode())
     for name in sorted(tensors):
         crc = zlib.crc32(tensors[name].astype("<f4").tobytes(), crc)
@@ -92,7 +93,7 @@ def checksum(description: str, tensors: dict[str, NDArray[np.float32]]) -> str:
 
 
 def _contents(path: Path) -> tuple[dict[str, str], dict[str, NDArray[np.float32]]]:
-    """The metadata and the tensors of a safetensors file."""
+    """Reads the metadata and the tensors of a safetensors file."""
     data = path.read_bytes()
     length = int.from_bytes(data[:8], "little")
     if len(data) < 8 or length > min(HEADER_BYTES_MAX, len(data) - 8):
@@ -108,7 +109,7 @@ def _contents(path: Path) -> tuple[dict[str, str], dict[str, NDArray[np.float32]
             begin, end = entry["data_offsets"]
             if entry["dtype"] != "F32" or not 0 <= begin <= end <= len(numbers):
                 raise PolicyFileError(f"{path}: {name} is damaged")
-            # A copy of its own: alignment is not promised, and the file's bytes can go.
+            # Copied, because the data may be unaligned and the file's bytes can then be freed.
             tensor = np.frombuffer(numbers[begin:end], "<f4").astype(np.float32)
             tensors[name] = tensor.reshape(entry["shape"])
     except PolicyFileError:

@@ -1,4 +1,4 @@
-"""The program ``dmprl`` from Python, in a process of its own."""
+"""Runs the program ``dmprl`` from Python, in a separate process."""
 
 from __future__ import annotations
 
@@ -14,17 +14,17 @@ from pathlib import Path
 from typing import IO, Any
 
 INTERRUPTED = 130
-"""Exit status of a program that was interrupted and has saved."""
+"""Exit status of a program that saved after an interrupt."""
 LAST_LINES = 20
-"""Of what it said, for an error."""
+"""Output lines kept for an error message."""
 STOP_S = 30.0
-"""For its last checkpoint, when something else than an interrupt ends the call [s]."""
+"""Time for the last checkpoint, if anything but an interrupt ends the call [s]."""
 PARENT_DEATH_SIGNAL = 1
 """``PR_SET_PDEATHSIG``."""
 
 
 class ProgramError(RuntimeError):
-    """A command of the program failed; the message is the program's own."""
+    """Raised if a command of the program fails; the message is the program's own."""
 
     def __init__(self, command: str, status: int, said: str) -> None:
         super().__init__(f"dmprl {command} ended with status {status}:\n{said}")
@@ -34,14 +34,14 @@ class ProgramError(RuntimeError):
 def call(
     command: str, *arguments: str, quiet: bool = False, error: type[ProgramError] = ProgramError
 ) -> str:
-    """Runs a command of the program to its end; what it printed.
+    """Runs a command of the program to its end; returns its standard output.
 
-    What it says on the way is drawn in a terminal, and printed as lines elsewhere, in a notebook
-    for instance; ``quiet`` keeps it.
+    Its progress is drawn in a terminal, and printed as lines elsewhere, for example in a notebook;
+    ``quiet`` suppresses it.
 
-    :raises ProgramError: it failed, as an ``error``.
-    :raises KeyboardInterrupt: it was interrupted.
-    :raises FileNotFoundError: the program is not installed.
+    :raises ProgramError: if it failed, as an ``error``.
+    :raises KeyboardInterrupt: if it was interrupted.
+    :raises FileNotFoundError: if the program is not installed.
     """
     with tempfile.TemporaryFile() as printed:
         status, said = _run([str(find()), command, *arguments], quiet, printed)
@@ -54,17 +54,17 @@ def call(
 
 
 def flags(values: dict[str, Any]) -> list[str]:
-    """Keyword arguments as they would be typed.
+    """Converts keyword arguments to command-line flags.
 
     ``steps=20_000`` becomes ``--steps 20000``, ``algorithm__batch_size=64`` becomes
-    ``--set algorithm.batch_size=64``, True the flag alone; None and False are left out, and a list
-    of a flag that may come several times is written as often.
+    ``--set algorithm.batch_size=64``, and True gives the flag alone. None and False are omitted. A
+    list repeats the flag for each entry.
     """
     typed: list[str] = []
     for name, value in values.items():
         flag = f"--{name.replace('_', '-')}"
         if value is None or (value is False and "__" not in name):
-            continue  # as if it were not there
+            continue  # omitted
         if "__" in name:
             typed += ["--set", f"{name.replace('__', '.')}={_toml(value)}"]
         elif value is True:
@@ -77,9 +77,9 @@ def flags(values: dict[str, Any]) -> list[str]:
 
 
 def find() -> Path:
-    """The program: beside this Python, on the search path, or built in the repository.
+    """Finds the program: beside this Python, on the search path, or built in the repository.
 
-    :raises FileNotFoundError: it is nowhere; the message says how to get it.
+    :raises FileNotFoundError: if it is not found; the message says how to get it.
     """
     beside = Path(sys.executable).with_name("dmprl")
     if beside.is_file():
@@ -96,8 +96,8 @@ def find() -> Path:
 
 
 def _run(command: list[str], quiet: bool, printed: IO[bytes]) -> tuple[int, str]:
-    """Runs the program to its end; its status, and the last of what it said."""
-    # In a terminal it draws by itself; a notebook gets its lines.
+    """Runs the program to its end; returns its status and the last lines of its output."""
+    # In a terminal the program draws its own progress; a notebook gets its lines.
     live = not quiet and sys.stderr.isatty()
     child = subprocess.Popen(
         command,
@@ -106,7 +106,7 @@ def _run(command: list[str], quiet: bool, printed: IO[bytes]) -> tuple[int, str]
         stderr=None if live else subprocess.PIPE,
         encoding="utf-8",
         errors="replace",
-        # The terminal's interrupt comes to this process alone, which passes it on, once.
+        # Only this process gets the terminal's interrupt, and forwards it once.
         start_new_session=True,
         preexec_fn=_end_with_parent,
     )
@@ -123,16 +123,16 @@ def _run(command: list[str], quiet: bool, printed: IO[bytes]) -> tuple[int, str]
             except KeyboardInterrupt:
                 child.send_signal(signal.SIGINT)
     finally:
-        # Whatever else came up here: nobody trains on unseen.
+        # No training continues unnoticed after any other exception.
         if child.poll() is None:
             _stop(child)
 
 
 def _stop(child: subprocess.Popen[str]) -> None:
-    """Lets it write its checkpoint, and ends it if that takes too long."""
+    """Interrupts the program so that it writes its checkpoint; kills it on a timeout."""
     child.send_signal(signal.SIGINT)
     if child.stderr is not None:
-        # Or it would wait for somebody to read.
+        # Otherwise it could block on a full pipe.
         child.stderr.close()
     try:
         child.wait(STOP_S)
@@ -142,15 +142,15 @@ def _stop(child: subprocess.Popen[str]) -> None:
 
 
 def _end_with_parent() -> None:
-    """A Python that is killed takes the training with it, which writes a checkpoint."""
+    """Stops the program, which writes a checkpoint, when this Python process is killed."""
     if sys.platform == "linux":
         ctypes.CDLL(None, use_errno=True).prctl(PARENT_DEATH_SIGNAL, signal.SIGTERM)
 
 
 def _toml(value: Any) -> str:
-    """A value as ``--set`` takes it."""
+    """Formats a value for ``--set``."""
     if isinstance(value, (list, tuple)):
-        # Strings of TOML are written as those of JSON.
+        # JSON strings are valid TOML strings.
         entries = (json.dumps(it) if isinstance(it, str) else _toml(it) for it in value)
         return f"[{', '.join(entries)}]"
     if isinstance(value, dict):

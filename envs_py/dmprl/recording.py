@@ -1,7 +1,7 @@
-"""One environment that writes down what its robot does, at control rate.
+"""One environment that records its robot's motion at control rate.
 
 For ``dmprl record`` and the measurement of motion (``actors/src/python_env/recording.rs``). The
-episodes are those of an evaluation with the same seeds: the same actions, one step after the other.
+episodes equal those of an evaluation with the same seeds: the same actions, one step at a time.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 try:
     import mujoco
-except Exception as error:  # whatever the OpenGL that MUJOCO_GL names fails with
+except Exception as error:  # any error of the OpenGL that MUJOCO_GL names
     if not os.environ.get("MUJOCO_GL"):
         raise
     raise RuntimeError(
@@ -37,30 +37,30 @@ from dmprl.tasks import registered
 RENDER_MODE = "rgb_array"
 DRAWABLE = f"a Gymnasium environment that can be has the render mode {RENDER_MODE!r}"
 FRAME_RATE_MAX = 50.0
-"""Frames a second of an episode: a screen shows hardly more."""
+"""Maximum frames per second of an episode; most screens show no more."""
 
 
 class NoPicturesError(RuntimeError):
-    """The environment cannot be drawn."""
+    """Raised if the environment cannot be drawn."""
 
 
 class Recording(TypedDict):
-    """An episode, T steps long. Rows of joints are those of :meth:`RecordingEnv.joints`."""
+    """An episode of T steps. Rows of joints follow :meth:`RecordingEnv.joints`."""
 
     joint_positions: list[list[float]]
-    """(T+1, J) [rad or m]: before the first step, and after each; empty without joints."""
+    """(T+1, J) [rad or m]: before the first step and after each; empty without joints."""
     joint_velocities: list[list[float]]
     """(T+1, J) [rad/s or m/s]."""
     success: list[int]
-    """(T,): after each step, a value of ``SegmentBuffers.success``."""
+    """(T,): value of ``SegmentBuffers.success`` after each step."""
     frames: list[str]
-    """Files of pictures, if they were asked for, and"""
+    """Files of the pictures, if requested."""
     frame_steps: list[int]
-    """the number of steps done at each."""
+    """Number of steps executed before each picture."""
 
 
 class State(NamedTuple):
-    """Where the state of a MuJoCo model lies; arrays that change with it."""
+    """State of a MuJoCo model, as arrays that change with it."""
 
     model: mujoco.MjModel
     qpos: NDArray[np.float64]
@@ -68,7 +68,7 @@ class State(NamedTuple):
 
 
 class Log:
-    """What is written down of the episode that began with the last seeded reset."""
+    """Record of the episode that started with the last seeded reset."""
 
     def __init__(self, pictures: Path | None) -> None:
         self.joints: Joints | None = None
@@ -78,7 +78,7 @@ class Log:
         self._seed = 0
 
     def begin(self, env: Watched, seed: int | None) -> None:
-        """An episode begins; one without a seed follows another on its own and is not asked for."""
+        """Starts an episode; one without a seed follows automatically and is not recorded."""
         self._open = seed is not None
         if seed is not None:
             self._seed = seed
@@ -87,7 +87,7 @@ class Log:
             self._draw(env)
 
     def step(self, env: Watched, info: dict[str, Any], ended: bool) -> None:
-        """A step has been done."""
+        """Records a step."""
         if not self._open:
             return
         self.recording["success"].append(success_of(info))
@@ -98,14 +98,14 @@ class Log:
     def _draw(self, env: Watched) -> None:
         if self._pictures is None:
             return
-        from PIL import Image  # the extra `video`
+        from PIL import Image  # extra `video`
 
         step = len(self.recording["success"])
         file = self._pictures / f"{self._seed}-{step:06}.png"
         picture = env.render()
         if not isinstance(picture, np.ndarray) or picture.ndim != 3:
             raise NoPicturesError(f"{env.spec.id}: render() returned {type(picture).__name__}")
-        # Small enough at once: it is read once and thrown away.
+        # Low compression, because the file is read once and deleted.
         Image.fromarray(picture[..., :3].astype(np.uint8)).save(file, compress_level=1)
         self.recording["frames"].append(str(file))
         self.recording["frame_steps"].append(step)
@@ -119,14 +119,14 @@ class Log:
 
 
 class Watched(gymnasium.Wrapper):
-    """Writes down every step."""
+    """Records every step."""
 
     def __init__(self, env: gymnasium.Env, log: Log) -> None:
         super().__init__(env)
         self._log = log
 
     def state(self) -> State | None:
-        """The simulation's state; None if it is not MuJoCo's."""
+        """Returns the simulation's state; None if it is not MuJoCo's."""
         env = self.unwrapped
         if isinstance(env, TaskEnv):
             return State(env.task.model, *env.positions_and_velocities)
@@ -149,7 +149,7 @@ class Watched(gymnasium.Wrapper):
 
 
 class RecordingEnv(GymnasiumSegmentEnv):
-    """One Gymnasium environment, watched."""
+    """One recorded Gymnasium environment."""
 
     def __init__(
         self,
@@ -177,7 +177,7 @@ class RecordingEnv(GymnasiumSegmentEnv):
         return env
 
     def goal_in_pictures(self) -> str:
-        """How pictures show the goal; empty if nobody knows."""
+        """Returns the appearance of the goal in pictures; empty if unknown."""
         env = self._envs[0].unwrapped
         return env.task.goal_in_pictures if isinstance(env, TaskEnv) else ""
 
@@ -189,23 +189,23 @@ class RecordingEnv(GymnasiumSegmentEnv):
         return spec
 
     def joints(self) -> list[tuple[str, str]]:
-        """Name and kind, ``hinge`` or ``slide``, of each joint of the robot."""
+        """Returns name and kind, ``hinge`` or ``slide``, of each joint of the robot."""
         joints = self._log.joints
         return [] if joints is None else list(zip(joints.names, joints.kinds, strict=True))
 
     def why_no_joints(self) -> str:
-        """Why there are none; empty if there are some."""
+        """Returns why there are no joints; empty if there are some."""
         if self._log.joints is None:
             return "not a MuJoCo environment: nobody knows where its joints stand"
         return "" if self._log.joints.names else "no actuator of its model moves a joint"
 
     def recording(self) -> Recording:
-        """The episode that began with the last seeded reset, as far as it has come."""
+        """Returns the record of the episode that started with the last seeded reset."""
         return self._log.recording
 
 
 class OpaqueEnv(SegmentEnv):
-    """Somebody's own :class:`SegmentEnv`, of which only rewards are known."""
+    """A user's own :class:`SegmentEnv`, of which only rewards are known."""
 
     def __init__(self, env: SegmentEnv) -> None:
         self._env = env
@@ -231,24 +231,24 @@ class OpaqueEnv(SegmentEnv):
         self._env.close()
 
     def joints(self) -> list[tuple[str, str]]:
-        """None."""
+        """Returns an empty list."""
         return []
 
     def why_no_joints(self) -> str:
-        """The reason."""
+        """Returns the reason."""
         return "a SegmentEnv runs a whole segment at once: what its robot does within is not seen"
 
     def goal_in_pictures(self) -> str:
-        """There are none."""
+        """Returns an empty string: there are no pictures."""
         return ""
 
     def recording(self) -> Recording:
-        """Nothing."""
+        """Returns an empty record."""
         return nothing()
 
 
 def nothing() -> Recording:
-    """Of an episode that has not begun."""
+    """Returns the record of an episode that has not started."""
     return {
         "joint_positions": [],
         "joint_velocities": [],
@@ -259,15 +259,15 @@ def nothing() -> Recording:
 
 
 def steps_a_frame(env: gymnasium.Env) -> int:
-    """Steps of the environment from one frame to the next."""
+    """Returns the number of environment steps per frame."""
     dt = getattr(env.unwrapped, "dt", 0.0)
     return max(1, round(1.0 / (FRAME_RATE_MAX * dt))) if np.isscalar(dt) and dt > 0 else 1
 
 
 def make(task_id: str, segment_steps: int, pictures: str | None = None) -> RecordingEnv | OpaqueEnv:
-    """One environment of a task, which may be named as for :func:`dmprl.segment_env.make`.
+    """Makes one environment of a task, named as for :func:`dmprl.segment_env.make`.
 
-    ``pictures`` names a folder to draw into.
+    ``pictures`` is a folder for pictures.
     """
     if pictures is not None:
         name_opengl()
@@ -286,14 +286,14 @@ def make(task_id: str, segment_steps: int, pictures: str | None = None) -> Recor
 
 
 def task_maker(task_id: str, task: type[MujocoTask]) -> Callable[..., TaskEnv]:
-    """A task of one's own as Gymnasium makes environments."""
+    """Wraps a user's own task for ``gymnasium.make``."""
     maker = functools.partial(TaskEnv, task_id, task=task)
     maker.max_episode_steps = task.episode_steps
     return maker
 
 
 def gymnasium_id(task_id: str) -> str:
-    """Ours instead of Gymnasium's where the two are equal, since a worker takes ours too."""
+    """Prefers dmprl's task to an equal one of Gymnasium, as a worker does."""
     ours = task_id.removeprefix("dmprl:")
     if registered(ours) is None or ours.startswith("dmprl/"):
         return ours

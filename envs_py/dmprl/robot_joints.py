@@ -1,4 +1,4 @@
-"""Which joints of a MuJoCo model are the robot's."""
+"""Finds the joints of a MuJoCo model that belong to the robot."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ KINDS = {
     mujoco.mjtJoint.mjJNT_HINGE.value: "hinge",
     mujoco.mjtJoint.mjJNT_SLIDE.value: "slide",
 }
-"""Joints with one position: a ball and a free body have several."""
+"""Joints with one degree of freedom; ball and free joints have several."""
 BY_JOINT = (mujoco.mjtTrn.mjTRN_JOINT.value, mujoco.mjtTrn.mjTRN_JOINTINPARENT.value)
 
 
@@ -22,16 +22,16 @@ class Joints(NamedTuple):
     kinds: list[str]
     """``hinge`` [rad] or ``slide`` [m]."""
     qpos: list[int]
-    """Where each stands in the model's positions,"""
+    """Index of each joint in the model's positions."""
     qvel: list[int]
-    """and in its velocities."""
+    """Index of each joint in the model's velocities."""
 
 
 def robot_joints(model: mujoco.MjModel) -> Joints:
-    """The joints that actuators move, by themselves or by a tendon.
+    """Finds the joints that actuators move, directly or by a tendon.
 
-    A robot may also hang on a body that the program drags (Gymnasium-Robotics' Fetch): all joints
-    between that body and the world are the robot's then.
+    A robot may also hang on a body that the program drags (Gymnasium-Robotics' Fetch). All joints
+    between that body and the world then belong to the robot.
     """
     moved = _actuated(model) | _dragged(model)
     kept = [joint for joint in sorted(moved) if model.jnt_type[joint] in KINDS]

@@ -1,8 +1,8 @@
-"""Gymnasium-Robotics with MuJoCo 4.
+"""Makes Gymnasium-Robotics work with MuJoCo 4.
 
-Its version 1.4.2, the newest, asks whether a joint's type, a NumPy integer, is in a tuple of
-MuJoCo's enumerators. In MuJoCo 4 an enumerator on the left equals no NumPy integer, so that
-FetchReach and all that set a joint by name end in an AssertionError without a word.
+Its newest version, 1.4.2, tests whether a joint's type, a NumPy integer, is in a tuple of MuJoCo's
+enumerators. In MuJoCo 4 an enumerator on the left equals no NumPy integer, so FetchReach and
+everything that sets a joint by name end in an AssertionError without a message.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import numpy as np
 
 
 def repair() -> None:
-    """Gives that one module of Gymnasium-Robotics joint types that compare as they used to."""
+    """Gives one module of Gymnasium-Robotics joint types that compare as before."""
     from gymnasium_robotics.utils import mujoco_utils
 
     seen = mujoco_utils.mujoco

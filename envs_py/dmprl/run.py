@@ -1,4 +1,4 @@
-"""A run directory in Python: configuration, rows as data frames, policies.
+"""A run directory in Python: configuration, metrics as data frames, policies.
 
 ::
 
@@ -24,10 +24,10 @@ LIBRARIES = ("pandas", "polars")
 
 
 class Run:
-    """What ``dmprl train`` leaves behind. Reads anew at each call: the run may be under way."""
+    """A run of ``dmprl train``. Every call reads the files again, because the run may be active."""
 
     def __init__(self, path: str | Path) -> None:
-        """:raises FileNotFoundError: there is no run at ``path``."""
+        """:raises FileNotFoundError: if there is no run at ``path``."""
         self.path = Path(path)
         if not (self.path / "manifest.json").is_file():
             raise FileNotFoundError(f"{self.path}: no run directory, it has no manifest.json")
@@ -37,37 +37,37 @@ class Run:
 
     @property
     def config(self) -> dict[str, Any]:
-        """The resolved configuration, by sections."""
+        """The resolved configuration, by section."""
         return tomllib.loads((self.path / "config.toml").read_text())
 
     @property
     def manifest(self) -> dict[str, Any]:
-        """Versions, machine, commands: who made it, where and when."""
+        """Versions, machine and commands of the run."""
         return json.loads((self.path / "manifest.json").read_text())
 
     def metrics(self, library: str = "pandas") -> Any:
-        """``metrics.jsonl`` as a data frame of ``pandas`` or ``polars``.
+        """Returns ``metrics.jsonl`` as a data frame of ``pandas`` or ``polars``.
 
-        A column for each number; those of an object in a line are ``object/key``.
+        Each number has a column; those of a nested object are ``object/key``.
 
-        :raises ImportError: the library is not installed.
+        :raises ImportError: if the library is not installed.
         """
         return _frame(self._lines("metrics.jsonl"), library)
 
     def evaluations(self, library: str = "pandas") -> Any:
-        """``evaluations.jsonl`` likewise; ``returns`` is a list of the episodes' returns."""
+        """Returns ``evaluations.jsonl`` likewise; ``returns`` lists the episodes' returns."""
         return _frame(self._lines("evaluations.jsonl"), library)
 
     def policy(self, which: str | int = "best") -> Policy:
-        """A saved policy: ``best``, ``latest`` or a version.
+        """Loads a saved policy: ``best``, ``latest`` or a version.
 
-        :raises dmprl.PolicyFileError: it is not there, or cannot be read.
+        :raises dmprl.PolicyFileError: if it does not exist, or cannot be read.
         """
         rows = self._lines("evaluations.jsonl")
         if not rows and isinstance(which, str):
             raise PolicyFileError(f"{self.path}: no evaluation yet, so no {which} policy")
         if which == "best":
-            # Of equals the latest, as everywhere.
+            # The latest of equals, as elsewhere.
             version = max(reversed(rows), key=lambda row: row["return_mean"])["policy_version"]
         elif which == "latest":
             version = rows[-1]["policy_version"]
@@ -81,18 +81,20 @@ class Run:
         return Policy.load(file)
 
     def record(self, *, quiet: bool = True, **flags: Any) -> Path:
-        """Makes a video of a policy's episodes, headless; the MP4, a GIF and a strip are beside it.
+        """Makes a video of a policy's episodes, headless, and returns the path of the MP4.
 
-        :param quiet: says nothing while it works.
-        :param flags: those of ``dmprl record``: ``episodes=3``, ``seed=7``, ``policy="latest"``,
+        A GIF and a strip of frames are written beside it.
+
+        :param quiet: suppresses progress.
+        :param flags: flags of ``dmprl record``: ``episodes=3``, ``seed=7``, ``policy="latest"``,
             ``compare=...`` another run, ``output=...`` a folder instead of ``videos`` in the run.
-        :raises dmprl.ProgramError: it cannot be made; the message says why.
+        :raises dmprl.ProgramError: if it cannot be made; the message gives the reason.
         """
         arguments = [str(self.path), "--json", *program.flags(flags)]
         return Path(json.loads(program.call("record", *arguments, quiet=quiet))["mp4"])
 
     def _lines(self, name: str) -> list[dict[str, Any]]:
-        """The whole lines of a file; one that is being written comes the next time."""
+        """Reads the complete lines of a file; the last one may still be in progress."""
         file = self.path / name
         text = file.read_text() if file.is_file() else ""
         return [json.loads(line) for line in text.splitlines(keepends=True) if line.endswith("\n")]
@@ -109,7 +111,7 @@ def _frame(rows: list[dict[str, Any]], library: str) -> Any:
             return pandas.DataFrame.from_records(flat)
         import polars
 
-        # By all rows: a key's first numbers may be none.
+        # From all rows, because a key's first values may be null.
         return polars.from_dicts(flat, infer_schema_length=None) if flat else polars.DataFrame()
     except ModuleNotFoundError as error:
         raise ImportError(f"{error}; pip install {library}") from error

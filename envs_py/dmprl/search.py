@@ -1,7 +1,8 @@
-"""The search of ``dmprl sweep``: which values to try next, and which trials to give up.
+"""The search of ``dmprl sweep``: proposes the next values, and prunes trials.
 
-``python -m dmprl.search STORAGE`` answers each JSON object on standard input, one a line, with one
-on standard output. The first line is ``{"ready": "optuna 5.0.0"}``, or ``{"absent": "why"}``.
+``python -m dmprl.search STORAGE`` answers each JSON object on standard input, one per line, with
+one on standard output. The first output line is ``{"ready": "optuna 5.0.0"}``, or
+``{"absent": "reason"}``.
 
 ================================================= =============================================
 ``{"op": "open", "study": …, "identity": …, …}``  ``{"identity": …, "trials": [{"trial", "state",
@@ -11,9 +12,9 @@ on standard output. The first line is ``{"ready": "optuna 5.0.0"}``, or ``{"abse
 ``{"op": "tell", …, "state": …, "objective": …}`` ``{}``
 ================================================= =============================================
 
-A request that cannot be done is answered by ``{"error": "why"}``. It ends with its input, so the
-death of the program that started it ends it too. Everything stands in an Optuna storage, written
-before the answer: whoever opens it again finds each trial, those under way too.
+A failed request is answered by ``{"error": "reason"}``. The process exits at the end of its input,
+and thus with the program that started it. All data are in an Optuna storage and are written before
+the answer. Reopening it gives all trials, including active ones.
 """
 
 from __future__ import annotations
@@ -32,17 +33,17 @@ except ModuleNotFoundError as error:
     optuna, ABSENT = None, str(error)
 
 IDENTITY = "dmprl"
-"""The study's attribute with what its trials have in common."""
+"""Attribute of the study with the common properties of its trials."""
 STATES = {"running": "RUNNING", "finished": "COMPLETE", "pruned": "PRUNED", "failed": "FAIL"}
-"""Our words for Optuna's. A trial that waits has not been asked for."""
+"""Our names of Optuna's states. A waiting trial has not been asked for."""
 
 
 class RefusedError(Exception):
-    """A request that cannot be done. The message says why."""
+    """Raised for an invalid request. The message gives the reason."""
 
 
 class Study:
-    """One task and method: an Optuna study, and the space that it is asked for values of."""
+    """One task and method: an Optuna study and its search space."""
 
     def __init__(self, storage: str, request: dict) -> None:
         self.sampler, self.seed = request["sampler"], request["seed"]
@@ -59,13 +60,16 @@ class Study:
             self.study.set_user_attr(IDENTITY, self.identity)
 
     def asked(self) -> list[FrozenTrial]:
-        """Every trial that anybody has asked for, in order."""
+        """Returns every trial that has been asked for, in order."""
         return [trial for trial in self.study.trials if trial.state != TrialState.WAITING]
 
     def opened(self) -> dict:
-        """All that the storage knows. A kill may have left a trial with some of its values."""
+        """Returns all stored data.
+
+        A killed process may have left a trial with some of its values; the others are added.
+        """
         identity = self.study.user_attrs[IDENTITY]
-        # Otherwise the caller refuses it, and nothing may be changed.
+        # Otherwise the caller rejects the study, and nothing may change.
         if identity == self.identity:
             for values in self.first:
                 self.study.enqueue_trial(values, skip_if_exists=True)
@@ -75,16 +79,16 @@ class Study:
         return {"identity": identity, "trials": [described(trial) for trial in self.asked()]}
 
     def ask(self) -> dict:
-        """The next trial."""
-        # A seed of its own for each trial: with one for all, a study that goes on would be asked
-        # what it was asked at its start.
+        """Creates the next trial."""
+        # A different seed for each trial: with a common one, a resumed study would repeat its first
+        # values.
         seed = np.random.SeedSequence([self.seed, len(self.asked())]).generate_state(1)[0]
         self.study.sampler = sampler(self.sampler, int(seed))
         trial = self.study.ask()
         return {"trial": trial.number, "values": self.suggest(trial)}
 
     def suggest(self, trial: Trial) -> dict:
-        """A value for each key; those that the trial has already stay."""
+        """Suggests a value for each key; values that the trial already has are kept."""
         values = {}
         for entry in self.space:
             key = entry["key"]
@@ -96,14 +100,14 @@ class Study:
         return values
 
     def running(self, number: int) -> Trial:
-        """A trial under way; another state is a mistake of the caller's."""
+        """Returns an active trial; any other state is an error of the caller."""
         frozen = self.study.trials[number]
         if frozen.state != TrialState.RUNNING:
             raise RefusedError(f"trial {number} is {frozen.state.name}, expected RUNNING")
         return Trial(self.study, frozen._trial_id)
 
     def report(self, number: int, step: int, value: float) -> dict:
-        """Adds an intermediate value, the first of a step only; whether to give the trial up."""
+        """Reports an intermediate value, the first of a step only; returns whether to prune."""
         trial = self.running(number)
         if step not in self.study.trials[number].intermediate_values:
             trial.report(value, step)
@@ -117,7 +121,7 @@ class Study:
 
 
 def described(trial: FrozenTrial) -> dict:
-    """A trial in JSON."""
+    """Converts a trial to JSON."""
     names = {name: ours for ours, name in STATES.items()}
     return {
         "trial": trial.number,
@@ -129,14 +133,14 @@ def described(trial: FrozenTrial) -> dict:
 
 
 def sampler(name: str, seed: int) -> optuna.samplers.BaseSampler:
-    """By the name that the sweep file has."""
+    """Creates a sampler by its name in the sweep file."""
     if name == "random":
         return optuna.samplers.RandomSampler(seed=seed)
     return optuna.samplers.TPESampler(seed=seed)
 
 
 def pruner(request: dict) -> optuna.pruners.BasePruner:
-    """By the name that the sweep file has."""
+    """Creates a pruner by its name in the sweep file."""
     if request["pruner"] == "median":
         return optuna.pruners.MedianPruner(n_startup_trials=request["prune_after_trials"])
     if request["pruner"] == "hyperband":
@@ -152,7 +156,7 @@ class Search:
         self.studies: dict[str, Study] = {}
 
     def answer(self, request: dict) -> dict:
-        """Does what a request asks for."""
+        """Executes a request."""
         operation, name = request["op"], request["study"]
         if operation == "open":
             self.studies[name] = Study(self.storage, request)
@@ -168,10 +172,10 @@ class Search:
 
 
 def main() -> None:
-    """Speaks the protocol of the module's first lines."""
-    # Ctrl-C may reach the whole process group; the program that reads our lines decides.
+    """Answers requests, as described in the module's docstring."""
+    # Ctrl-C may reach the whole process group; the program that reads our output decides.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    # What a library prints must not become a line of the protocol.
+    # Output of a library must not become a line of the protocol.
     lines = os.fdopen(os.dup(1), "w", buffering=1)
     os.dup2(2, 1)
 

@@ -1,4 +1,4 @@
-"""One of our tasks as a Gymnasium environment."""
+"""One of dmprl's tasks as a Gymnasium environment."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ from dmprl.mujoco_batch import MujocoTask
 from dmprl.segment_env import SUCCESS_NOT_REPORTED, SegmentBuffers, SegmentEnvError
 from dmprl.tasks import make_task
 
-# A window without a display ends the whole process inside GLFW.
+# Opening a window without a display ends the whole process inside GLFW.
 HAS_DISPLAY = any(os.environ.get(name) for name in ("DISPLAY", "WAYLAND_DISPLAY"))
 
 
 class TaskEnv(gymnasium.Env[NDArray[np.float64], NDArray[np.float32]]):
-    """A batch of one environment and segments of one step, so equal to what a worker runs.
+    """A batch of one environment with segments of one step, and thus equal to a worker's.
 
-    The time limit is Gymnasium's own wrapper, which ``gymnasium.make`` adds. ``render_mode``:
+    ``gymnasium.make`` adds Gymnasium's own wrapper for the time limit. ``render_mode``:
     ``rgb_array`` and ``depth_array`` need no display (:mod:`dmprl.pictures`).
     """
 
@@ -39,7 +39,7 @@ class TaskEnv(gymnasium.Env[NDArray[np.float64], NDArray[np.float32]]):
         height: int = 480,
         task: Callable[[int], MujocoTask] | None = None,
     ) -> None:
-        """``task`` makes a task that is not one of ours, for so many environments."""
+        """Use ``task``, if given, to make a user's own task for a number of environments."""
         if render_mode not in (None, *self.metadata["render_modes"]):
             modes = ", ".join(self.metadata["render_modes"])
             raise ValueError(f"{task_id}: render_mode {render_mode!r}; here there are {modes}")

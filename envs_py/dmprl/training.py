@@ -1,4 +1,4 @@
-"""``dmprl.train``: a policy is trained, from Python."""
+"""``dmprl.train``, which trains a policy from Python."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ from dmprl import program
 from dmprl.run import Run
 
 NAME_MAX = 60
-"""Letters of a task in the name of a run."""
+"""Maximum letters of the task in a run's name."""
 
 
 class TrainingError(program.ProgramError):
-    """Training failed; the message is the program's own."""
+    """Raised if training failed; the message is the program's own."""
 
 
 def train(
@@ -29,18 +29,18 @@ def train(
     """Trains a policy and returns its run; an interrupt stops it with a checkpoint.
 
     :param task: a task of ``dmprl tasks``, a Gymnasium id, or ``module:Class``.
-    :param run_dir: where the results go; new or empty. By default a new folder in ``runs/``.
+    :param run_dir: directory for the results, new or empty. By default a new folder in ``runs/``.
     :param python_path: directory of your own environment modules.
     :param deterministic: one worker, in one process with the learner and in lock-step with it:
         the same seed gives the same bytes.
-    :param quiet: says nothing while it trains.
+    :param quiet: suppresses progress.
     :param overrides: flags of ``dmprl train`` (``steps=20_000``, ``algo="sac"``, ``seed=2``) and
         configuration keys with two underscores for the dot (``algorithm__batch_size=64``). None is
-        left out.
-    :raises TrainingError: the run failed, or a value was refused; the message says why, except in
-        a terminal, where the program has said so itself.
-    :raises KeyboardInterrupt: it was interrupted, and has written a checkpoint.
-    :raises FileNotFoundError: the program ``dmprl`` is not installed.
+        omitted.
+    :raises TrainingError: if the run failed, or a value was rejected. The message gives the reason;
+        in a terminal the program has already printed it.
+    :raises KeyboardInterrupt: if it was interrupted, after writing a checkpoint.
+    :raises FileNotFoundError: if the program ``dmprl`` is not installed.
     """
     directory = Path(run_dir or Path("runs") / f"{_safe(task)}-{uuid.uuid4().hex[:8]}").absolute()
     arguments = [task, "--run-dir", str(directory), *program.flags(overrides)]
@@ -53,6 +53,6 @@ def train(
 
 
 def _safe(task: str) -> str:
-    """A name that every file system takes."""
+    """Derives a name that every file system accepts."""
     letters = (it if it.isascii() and it.isalnum() else "-" for it in task)
     return "".join(letters).strip("-").lower()[:NAME_MAX] or "run"

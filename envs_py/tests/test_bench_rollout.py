@@ -1,4 +1,4 @@
-"""What the benchmark's peers are made of; the whole of it is tested through the program."""
+"""Parts of the rollout benchmark's peers; the whole is tested through the program."""
 
 import unittest
 from unittest import mock
@@ -139,7 +139,7 @@ class NoiseTest(unittest.TestCase):
         noise.disturb_u(first)
         noise.episodes_ended(np.ones(2000, np.bool_))
         noise.disturb_u(second)
-        # 4000 draws: a standard error of 0.02 each. A step later 7 of 8 sources are the same.
+        # 4000 draws: a standard error of 0.02 each. One step later, 7 of 8 sources are the same.
         self.assertAlmostEqual(float((first[:, 0] ** 2).mean()) / 0.01, 1.0, delta=0.1)
         correlation = (first[:, 0] * first[:, 1]).mean() / 0.01
         self.assertAlmostEqual(float(correlation), 7 / 8, delta=0.1)

@@ -1,4 +1,4 @@
-"""Environments that raise, hand out what is not finite, or do not reset."""
+"""Environments that raise exceptions, return NaN or infinity, or fail to reset."""
 
 import contextlib
 import io
@@ -13,7 +13,7 @@ from dmprl.segment_env import SUCCESS_NOT_REPORTED, SegmentEnvError, make, seed_
 
 
 class StepTest(unittest.TestCase):
-    """The middle one of three environments breaks in the fourth step of a segment."""
+    """The second of three environments fails in the fourth step of a segment."""
 
     def broken(self, name):
         env, out = started(f"tiny_envs:{name}-v0", env_count=3)

@@ -1,4 +1,4 @@
-"""Where goals stand, what is asked about them, and who is refused."""
+"""Positions of goals, rewards for other goals, and environments that are rejected."""
 
 import sys
 import unittest

@@ -1,4 +1,4 @@
-"""The two Panda tasks, against MuJoCo's own kinematics and what was measured on panda-gym."""
+"""The two Panda tasks, against MuJoCo's own kinematics and measurements on panda-gym."""
 
 import unittest
 
@@ -22,7 +22,7 @@ def started(task_id, env_count=1, segment_steps=1, seed=7):
 
 
 def run_episodes(task_id, env_count, act):
-    """One episode each: observations (E, 51, 20), rewards (E, 50), success at the end (E,)."""
+    """Runs one episode each: observations (E, 51, 20), rewards (E, 50), success at the end (E,)."""
     env, out = started(task_id, env_count)
     observations, rewards = [out.next_observations.copy()], []
     for _ in range(EPISODE_STEPS):
@@ -34,7 +34,7 @@ def run_episodes(task_id, env_count, act):
 
 
 def proportional(observation):
-    """Straight to the goal, as fast as actions go."""
+    """Moves straight to the goal, as fast as actions allow."""
     return np.clip(observation[:, 14:17] / 0.05, -1.0, 1.0)
 
 
@@ -111,7 +111,7 @@ class ObservationTest(unittest.TestCase):
         self.assertTrue(20 <= success.sum() < 40, "not both outcomes")
 
     def test_success_is_that_of_the_last_step_run(self):
-        """An episode may end within a segment, while other environments run on."""
+        """An episode may end within a segment, while other environments continue."""
         env, out = started(REACH, env_count=40, segment_steps=7)
         for segment in range(10):
             actions = np.repeat(proportional(out.next_observations)[:, None], 7, axis=1)
@@ -155,7 +155,7 @@ class EndEffectorTest(unittest.TestCase):
         for _ in range(30):
             fields = self.fields_at(env.task.model, data, angles, kinematics.recorded)
             position = fields["site_xpos"][:, 0]
-            # Away from the box's far corner, where the arm is stretched to its limit.
+            # Not near the box's far corner, where the arm is fully stretched.
             target = position + 0.05 * rng.uniform(-1.0, 1.0, position.shape)
             target = np.clip(target, GOAL_LOW, np.array(GOAL_HIGH) - [0.03, 0.0, 0.03])
             target = position + np.clip(target - position, -0.05, 0.05)
@@ -186,13 +186,13 @@ class EndEffectorTest(unittest.TestCase):
 
 class JointsTest(unittest.TestCase):
     def test_displacement_of_each_joint_is_reached_as_in_panda_gym(self):
-        """From rest, one joint alone: four fifths of it in the step, all of it in the next ones."""
+        """From rest, one joint moves four fifths within the step, and the rest in the next ones."""
         env, out = started(REACH_JOINTS, env_count=14)
         signs = np.concatenate([np.eye(7), -np.eye(7)])
         env.step_segment(signs[:, None], out)
         moved = (out.observations[:, 1, :7] - NEUTRAL) @ signs.T / 0.05
         share = np.diag(moved)
-        # Joint 1 has its torque limit to overcome; PyBullet's servo leaves 12 % to the others.
+        # Joint 1 is limited by its torque; PyBullet's servo leaves 12 % to the other joints.
         self.assertTrue((share > 0.55).all() and (share < 1.1).all(), share)
         self.assertGreater(np.median(share), 0.8)
 
@@ -208,7 +208,7 @@ class JointsTest(unittest.TestCase):
         asked = 0.05 * np.stack(actions, 1)
         moved = np.diff(observations[:, :, :7], axis=1)
         slope = (asked * moved).sum((0, 1)) / np.square(asked).sum((0, 1))
-        # panda-gym 3.0.7, 30 episodes. Gravity, which its joint 2 carries, does not exist here.
+        # panda-gym 3.0.7, 30 episodes. Gravity, which loads its joint 2, has no effect here.
         panda_gym = [0.594, 0.518, 0.844, 0.821, 0.853, 0.878, 0.878]
         np.testing.assert_allclose(slope, panda_gym, atol=0.13)
 
@@ -231,7 +231,7 @@ class PhysicsTest(unittest.TestCase):
         model = own_model(MODEL)
         data = mujoco.MjData(model)
         env, out = started(REACH_JOINTS, env_count=16)
-        # Bend shoulder and elbow down, with some noise.
+        # Bends shoulder and elbow down, with some noise.
         rng, touched = np.random.default_rng(0), 0
         for _ in range(40):
             actions = 0.5 * rng.uniform(-1.0, 1.0, (16, 1, 7))

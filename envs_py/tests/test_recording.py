@@ -1,4 +1,4 @@
-"""What is written down of an episode, and which joints are the robot's."""
+"""The record of an episode, and the joints that belong to the robot."""
 
 import os
 import sys
@@ -150,7 +150,7 @@ class FilmTest(unittest.TestCase):
             self.assertEqual({picture.size for picture in made}, {(2 * 640 + 8, 568)})
             left = [picture.crop((0, 44, 640, 524)).tobytes() for picture in made]
             self.assertEqual([a == b for a, b in pairwise(left)], [False] * 2 + [True] * 5)
-            # A line for each side; one has fewer frames than the strip has room for.
+            # One row per side, one of which has fewer frames than a strip shows.
             self.assertEqual(film.strip([sides]).size, (6 * 320 + 5 * 8, 2 * (240 + 88)))
 
 
@@ -159,7 +159,7 @@ class JointsTest(unittest.TestCase):
         for task_id, count in [
             ("dmprl/Reacher-v1", 2),  # the target is on slides
             ("dmprl/Pusher-v0", 7),  # and so are cylinder and goal
-            ("dmprl/Thrower-v0", 7),  # the ball flies
+            ("dmprl/Thrower-v0", 7),  # the ball moves freely
             ("dmprl/PandaReachJoints-v0", 7),
         ]:
             self.assertEqual(

@@ -1,4 +1,4 @@
-"""What a SegmentEnv promises, with Gymnasium behind it."""
+"""The contract of SegmentEnv, tested with Gymnasium environments."""
 
 import sys
 import unittest
@@ -67,8 +67,8 @@ class ResetTest(unittest.TestCase):
 
 class SegmentTest(unittest.TestCase):
     def test_any_environment_equals_a_plain_gymnasium_loop(self):
-        # Reacher of Gymnasium, not ours, which `make` would give.
-        env_count, segments = 3, 23  # two ends of an episode (50 steps), off a segment's border
+        # Gymnasium's Reacher; `make` would return dmprl's.
+        env_count, segments = 3, 23  # two ends of an episode (50 steps), not at a segment's end
         env, out = started_on(GymnasiumSegmentEnv("Reacher-v5", env_count, 6))
         plain = [gymnasium.make("Reacher-v5") for _ in range(env_count)]
         now = [plain[index].reset(seed=7 + index)[0] for index in range(env_count)]
@@ -168,7 +168,7 @@ class SegmentTest(unittest.TestCase):
         batch, of_batch = started("point_reach_batch:PointReachBatch", 3, 7)
         generator = np.random.default_rng(0)
         for _ in range(30):
-            # Drawn by generators of the same kind from the same seeds.
+            # Drawn by equal generators from equal seeds.
             np.testing.assert_allclose(of_batch.next_observations, of_plain.next_observations)
             actions = generator.uniform(-2, 2, (3, 7, 2))
             for env, out in ((plain, of_plain), (batch, of_batch)):

@@ -30,7 +30,7 @@ def random_actions(rng, spec, env_count, segment_steps):
 
 
 class GymnasiumTest(unittest.TestCase):
-    """Reacher-v5 and Pusher-v5 are Gymnasium's, to the last bit."""
+    """Reacher-v5 and Pusher-v5 are bit-identical to Gymnasium's."""
 
     def assert_equal_over(self, task_id, episodes, env_count, segment_steps):
         env, out = started(task_id, env_count, segment_steps)
@@ -100,7 +100,7 @@ class GymnasiumTest(unittest.TestCase):
 
 
 class Contract:
-    """What holds for every registered task."""
+    """The contract of every registered task."""
 
     task_id: str
 
@@ -140,7 +140,7 @@ class Contract:
         after, peak = tracemalloc.get_traced_memory()
         tracemalloc.stop()
         self.assertLess(after - before, 1000)
-        # NumPy's own buffers of a call and, in end effector mode, the inverse kinematics'.
+        # NumPy's own buffers of a call and, with end-effector actions, the inverse kinematics'.
         self.assertLess(peak - before, 30_000)
 
     def test_the_same_seed_gives_the_same_bytes(self):
@@ -171,7 +171,7 @@ class Contract:
 
     def test_the_gymnasium_environment_is_the_batch(self):
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # "out of date": the paper's versions are
+            warnings.simplefilter("ignore")  # "out of date": true of the paper's versions
             plain = gymnasium.make(self.task_id)
         batch, out = started(self.task_id)
         now, _ = plain.reset(seed=7)
@@ -195,7 +195,7 @@ class Contract:
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always")
             check_env(gymnasium.make(self.task_id).unwrapped, skip_render_check=True)
-        # Observations without bounds and torques that are not [-1, 1] are Gymnasium's own.
+        # Gymnasium's own tasks also have unbounded observations, and torques outside [-1, 1].
         expected = ("infinity", "symmetric and normalized", "out of date")
         others = [w for w in caught if not any(text in str(w.message) for text in expected)]
         self.assertEqual([str(warning.message) for warning in others], [])
@@ -221,7 +221,7 @@ class Contract:
 
 
 for task_id in TASKS:
-    # One class a task, so that a failure names it.
+    # One class per task, so that a failure names it.
     name = re.sub(r"\W", "", task_id) + "ContractTest"
     globals()[name] = type(name, (Contract, unittest.TestCase), {"task_id": task_id})
 
@@ -302,7 +302,7 @@ class OlderVersionsTest(unittest.TestCase):
     def test_reacher_v1_draws_targets_beyond_reach_and_observes_a_third_coordinate(self):
         _, out = started("dmprl/Reacher-v1", env_count=1000)
         distances = np.linalg.norm(out.next_observations[:, 4:6], axis=1)
-        # A square of side 0.4 outside of the circle of radius 0.2: 1 - pi/4.
+        # The part of a square of side 0.4 outside the circle of radius 0.2: 1 - pi/4.
         self.assertAlmostEqual((distances > 0.2).mean(), 1 - np.pi / 4, delta=0.04)
         np.testing.assert_array_equal(out.next_observations[:, 10], 0.0)
         _, out = started("Reacher-v5", env_count=1000)
@@ -316,7 +316,7 @@ class OlderVersionsTest(unittest.TestCase):
 
     def test_pusher_v0_measures_between_the_prongs_and_pushes_a_light_cylinder(self):
         old, out = started("dmprl/Pusher-v0")
-        # Centre of mass of the prongs against the wrist: 0.1 m ahead.
+        # Centre of mass of the prongs, 0.1 m ahead of the wrist.
         np.testing.assert_allclose(out.next_observations[0, 14:17], [0.921, -0.6, 0], atol=1e-3)
         new, out = started("Pusher-v5")
         np.testing.assert_allclose(out.next_observations[0, 14:17], [0.821, -0.6, 0], atol=1e-3)
@@ -342,7 +342,7 @@ class OlderVersionsTest(unittest.TestCase):
             data.qpos[1], data.qvel[1] = 0.3, 0.0
             mujoco.mj_step(model, data, nstep=5)
         pushed = data.xpos[cylinder, :2]
-        # Where it ends with MuJoCo 2.3.7, whose collisions are not quite the same.
+        # The final position with MuJoCo 2.3.7, whose collisions differ slightly.
         np.testing.assert_allclose(pushed, [0.923, -0.316], atol=0.05)
 
     def test_pusher_v0_rewards_the_state_before_the_step(self):

@@ -22,9 +22,9 @@ ACTION = spaces.Box(-2.0, 2.0, (1,), np.float64)
 
 
 class Countdown(gymnasium.Env):
-    """Observes (steps taken, a number drawn at reset); terminates after ``length`` steps.
+    """Observes (number of steps, a number drawn at reset); terminates after ``length`` steps.
 
-    The reward is the action. A fault happens in the step whose action is 2: ``fault`` says which.
+    The reward is the action. The fault ``fault`` occurs in the step whose action is 2.
     """
 
     observation_space = spaces.Box(-np.inf, np.inf, (2,), np.float64)
@@ -53,7 +53,7 @@ class Countdown(gymnasium.Env):
 
 
 class Forking(Countdown):
-    """Has another process, forked from its own, draw at every reset."""
+    """Forks a process that draws at every reset."""
 
     def reset(self, *, seed=None, options=None):
         observation, info = super().reset(seed=seed)
@@ -65,9 +65,9 @@ class Forking(Countdown):
 
 
 class Faulty(Countdown):
-    """Breaks in step ``life`` of its life: of this object, over all its episodes.
+    """Fails in step ``life`` of this object's life, counted over all its episodes.
 
-    With ``once``, only where nothing in the working directory says that one has broken before.
+    With ``once``, only if no file in the working directory marks an earlier failure.
     """
 
     def __init__(self, fault, life=23, once=False, render_mode=None):
@@ -96,7 +96,7 @@ class Faulty(Countdown):
 
 
 def mark(name):
-    """Makes a file; whether it was not there before."""
+    """Creates a file; returns whether it did not exist before."""
     try:
         pathlib.Path(name).touch(exist_ok=False)
     except FileExistsError:
@@ -142,7 +142,7 @@ def short_countdown(**kwargs):
 
 
 class StrangeInfo(Countdown):
-    """Says of its success what cannot be a yes or a no."""
+    """Reports a success that is neither true nor false."""
 
     def step(self, action):
         observation, reward, ended, truncated, _ = super().step(action)
@@ -150,13 +150,13 @@ class StrangeInfo(Countdown):
 
 
 class Timeless(Countdown):
-    """Says that a step lasts what is no time."""
+    """Reports NaN as the duration of a step."""
 
     dt = float("nan")
 
 
 class Remembering(Countdown):
-    """Keeps its last action, as environments do that charge for its change."""
+    """Keeps its last action, as environments do that penalise its change."""
 
     def reset(self, *, seed=None, options=None):
         self.last = np.zeros(1)
@@ -169,7 +169,7 @@ class Remembering(Countdown):
 
 
 class Spaces(Countdown):
-    """Has the spaces that it is given."""
+    """Has the given spaces."""
 
     def __init__(self, observation=None, action=None, render_mode=None):
         super().__init__()
@@ -178,7 +178,7 @@ class Spaces(Countdown):
 
 
 class Typed(Countdown):
-    """Observes numbers of any type."""
+    """Observes numbers of a given type."""
 
     def __init__(self, dtype, render_mode=None):
         super().__init__(length=1000)
@@ -194,7 +194,7 @@ class Typed(Countdown):
 
 
 class Goal(Countdown):
-    """A goal-conditioned environment: a Dict observation; does not report success."""
+    """Goal-conditioned, with a Dict observation; does not report success."""
 
     observation_space = spaces.Dict(
         {name: spaces.Box(-1, 1, (2,)) for name in ("observation", "desired_goal")}
@@ -213,10 +213,10 @@ class Goal(Countdown):
 
 
 class Reach(gymnasium.Env):
-    """A point on a line that an action moves by half of it; rewarded only near a place drawn.
+    """A point on a line that an action moves by half of it; rewarded only near a drawn goal.
 
-    - ``ends``: whether an episode ends there. ``alone``: whether a reward is computed of one goal
-      at a time. ``fault``: the reward of a goal that nobody asked for is NaN.
+    - ``ends``: whether an episode ends there. ``alone``: whether ``compute_reward`` takes only one
+      goal at a time. ``fault``: the reward of a goal other than the current one is NaN.
     """
 
     observation_space = spaces.Dict(
@@ -266,7 +266,7 @@ class ReachFar(Reach):
 
 
 class FaultyReach(Reach):
-    """Breaks in its 12th step, and is made again."""
+    """Fails in its 12th step, and is recreated."""
 
     lived = 0
 
@@ -278,7 +278,7 @@ class FaultyReach(Reach):
 
 
 class Nested(Goal):
-    """Dictionaries in a tuple in a dictionary; a number that breaks like :class:`Countdown`."""
+    """Dictionaries in a tuple in a dictionary; a number that fails like :class:`Countdown`."""
 
     observation_space = spaces.Dict(
         arm=spaces.Dict(q=spaces.Box(-1, 1, (2,)), grip=spaces.Discrete(2)),
@@ -292,7 +292,7 @@ class Nested(Goal):
 
 
 class Batch(SegmentEnv):
-    """A SegmentEnv of its own, without Gymnasium."""
+    """A SegmentEnv without Gymnasium."""
 
     def __init__(self, env_count, segment_steps):
         self.env_count, self.segment_steps = env_count, segment_steps
@@ -317,7 +317,7 @@ class Batch(SegmentEnv):
 
 
 class Timed(Batch):
-    """Every episode is one segment: the time limit ends it."""
+    """Every episode is one segment, ended by the time limit."""
 
     def step_segment(self, actions, out: SegmentBuffers):
         super().step_segment(actions, out)
@@ -325,7 +325,7 @@ class Timed(Batch):
 
 
 class BatchOfNan(Batch):
-    """Cannot make its environments again: the second call's first reward is NaN, all rows of it."""
+    """Cannot recreate its environments: in the second call all rewards of the first row are NaN."""
 
     calls = 0
 
@@ -337,7 +337,7 @@ class BatchOfNan(Batch):
 
 
 class Interpreter(Batch):
-    """Checks the embedded interpreter around it; the Rust tests run it."""
+    """Checks the embedded interpreter; the Rust tests run it."""
 
     def step_segment(self, actions, out: SegmentBuffers):
         assert sys.prefix != sys.base_prefix, "sys.prefix is not the virtual environment"

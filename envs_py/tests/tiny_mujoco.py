@@ -1,4 +1,4 @@
-"""A MujocoTask of one's own, as a user's module would hold it."""
+"""A user's own MujocoTask, in a module of its own."""
 
 from dmprl.tasks.reacher import Reacher
 

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
 
 class Registered(NamedTuple):
-    """Where a task is, and what Gymnasium must know before it is made."""
+    """Module and class of a task, and the limit that Gymnasium needs before it is made."""
 
     module: str
     name: str
@@ -33,16 +33,16 @@ TASKS = {
 """Every task by its Gymnasium id."""
 
 SAME_AS_GYMNASIUM = ("Reacher-v5", "Pusher-v5")
-"""Gymnasium's own ids whose episodes are equal bit for bit, so that a worker may take ours."""
+"""Gymnasium ids whose episodes are bit-identical to dmprl's, so that a worker may use dmprl's."""
 
 
 def registered(task_id: str) -> Registered | None:
-    """The task with this id, one of Gymnasium's ids included."""
+    """Returns the task with this id, which may be one of Gymnasium's ids."""
     return TASKS.get(f"dmprl/{task_id}" if task_id in SAME_AS_GYMNASIUM else task_id)
 
 
 def make_task(task_id: str, env_count: int) -> MujocoTask | None:
-    """A task for ``env_count`` environments; None if the id is not one of ours."""
+    """Makes a task for ``env_count`` environments; None if the id is not one of dmprl's."""
     entry = registered(task_id)
     if entry is None:
         return None
@@ -50,9 +50,9 @@ def make_task(task_id: str, env_count: int) -> MujocoTask | None:
 
 
 def make_batch(task_id: str, env_count: int, segment_steps: int) -> BatchSegmentEnv | None:
-    """A task's batched environments for a worker; None if the id is not one of ours.
+    """Makes a task's batched environments for a worker; None if the id is not one of dmprl's.
 
-    They take over the process: see :func:`dmprl.mujoco_batch.quieten_mujoco`.
+    This changes settings of the process: see :func:`dmprl.mujoco_batch.quieten_mujoco`.
     """
     task = make_task(task_id, env_count)
     if task is None:

@@ -1,11 +1,12 @@
-"""PandaReach: a Franka Panda brings its end effector to a point.
+"""PandaReach: a Franka Panda moves its end effector to a point.
 
-panda-gym's task in MuJoCo: its start, goals, actions, reward and timing, and an arm whose servo
-answers like PyBullet's (``models/panda.xml``). Three things differ. Reaching the goal ends no
-episode, as in panda-gym 2: the reward asks to come close and stay there. The observation is one
-vector with what both kinds of actions need, joints and end effector, where panda-gym has the latter
-alone. And the arm bears its own weight, as the real one does; panda-gym's sags a little in every
-step, from where the next one starts, 17 cm in an episode of random actions.
+This is panda-gym's task in MuJoCo: its start, goals, actions, reward and timing, and an arm whose
+servo responds like PyBullet's (``models/panda.xml``). It differs in three ways. Reaching the goal
+does not end the episode, as in panda-gym 2: the reward is for coming close and staying there. The
+observation is one vector with joints and end effector, for both kinds of actions, where panda-gym
+only has the end effector. And the arm supports its own weight, as the real one does; panda-gym's
+sags a little in every step, from where the next step starts, by 17 cm in an episode of random
+actions.
 """
 
 from __future__ import annotations
@@ -26,16 +27,16 @@ from dmprl.tasks.reacher import minus_distance
 NEUTRAL = (0.0, 0.41, 0.0, -1.85, 0.0, 2.26, 0.79)
 """Joint angles at the start [rad]; the end effector is at (0.0384, 0, 0.1974) m."""
 GOAL_LOW, GOAL_HIGH = (-0.15, -0.15, 0.0), (0.15, 0.15, 0.3)
-"""Corners of the box that goals are drawn from [m]."""
+"""Corners of the box from which goals are drawn [m]."""
 DISPLACEMENT = 0.05
-"""What an action of 1 asks for in one step: [rad] of a joint, [m] of the end effector."""
+"""Displacement of an action of 1 in one step: [rad] of a joint, [m] of the end effector."""
 SUCCESS_DISTANCE = 0.05
-"""Nearer than this [m] counts as success."""
+"""Distance below which the goal counts as reached [m]."""
 MODEL = "panda.xml"
 
 
 class PandaReachJoints(StepwiseTask):
-    """Actions are displacements of the seven joints."""
+    """The task with displacements of the seven joints as actions."""
 
     id = "dmprl/PandaReachJoints-v0"
     frame_skip = 20
@@ -52,7 +53,7 @@ class PandaReachJoints(StepwiseTask):
 
     def __init__(self, env_count: int) -> None:
         super().__init__(env_count)
-        # The actuators' range, in joint angles, is not the actions'.
+        # The actuators' range is in joint angles, unlike the actions'.
         self.action_high = np.ones(self.action_len, np.float32)
         self.action_low = -self.action_high
         self._displacement = np.zeros((env_count, self.action_len))
@@ -104,14 +105,14 @@ class PandaReachJoints(StepwiseTask):
         np.add(fields["qpos"], self.displacement(actions), out=out)
 
     def displacement(self, actions: NDArray[np.float32]) -> NDArray[np.float64]:
-        """What actions (E, A) ask for [rad or m]; valid until the next call."""
+        """Returns the displacement of actions (E, A) [rad or m]; valid until the next call."""
         np.clip(actions, -1.0, 1.0, out=self._displacement)
         self._displacement *= DISPLACEMENT
         return self._displacement
 
 
 class PandaReach(PandaReachJoints):
-    """Actions are displacements of the end effector; the gripper points down."""
+    """The task with displacements of the end effector as actions; the gripper points down."""
 
     id = "dmprl/PandaReach-v0"
     recorded = tuple(sorted({*PandaReachJoints.recorded, *InverseKinematics.recorded}))
@@ -126,6 +127,6 @@ class PandaReach(PandaReachJoints):
     ) -> None:
         target = self.displacement(actions)
         target += fields["site_xpos"][:, 0]
-        # Not into the table.
+        # Keeps the target above the table.
         np.maximum(target[:, 2], 0.0, out=target[:, 2])
         self._kinematics.solve(fields, target, out)

@@ -1,16 +1,15 @@
 """Inverse kinematics of the Panda for small displacements, for all environments together.
 
-Damped least squares. MuJoCo has just computed what the Jacobian of the start consists of, so it
-costs little more than an inverse. The iterations after the first correct that inverse by what they
-have seen (Broyden's method) instead of computing their own, so each costs little more than a pose.
-
-Measured in the box of the goals, for displacements up to 0.05 m along each axis: 99.9 of 100 points
-are missed by less than 0.3 mm. Rejected: the first inverse throughout (5 mm at nearly the same
-price), a new one in every iteration (no better, twice the price), and a second
-:class:`mujoco.batch.Batch` for the poses, which also prepares dynamics that nobody asks for.
+The method is damped least squares. MuJoCo has just computed the parts of the Jacobian at the start,
+so it costs little more than an inverse. The iterations after the first correct that inverse with
+their own results (Broyden's method) instead of computing another, so each costs little more than a
+pose. Measured in the box of the goals, for displacements up to 0.05 m along each axis: 99.9 of 100
+points have an error of less than 0.3 mm. Rejected: the first inverse throughout (5 mm at nearly the
+same cost), a new one in every iteration (no better, twice the cost), and a second
+:class:`mujoco.batch.Batch` for the poses, which also computes unneeded dynamics.
 
 Shapes: E environments; a pose is a 3 x 4 matrix [rotation, position]. No product mixes
-environments, so that a result does not depend on how many there are, to the last bit.
+environments, so results do not depend on their number, to the last bit.
 """
 
 from __future__ import annotations
@@ -26,32 +25,32 @@ from dmprl.mujoco_batch import Fields
 JOINTS = 7
 
 CORRECTIONS = 2
-"""Iterations after the first. One leaves up to 3 mm; a third one gains what no servo resolves."""
+"""Iterations after the first. One leaves up to 3 mm; a third gains less than a servo resolves."""
 
 DAMPING = 0.05
-"""Damping of the least squares. Where the arm is stretched or folded, it keeps joints from turning
-far for a direction in which they cannot move the end effector."""
+"""Damping of the least squares. Near a stretched or folded pose, it prevents large joint motions
+for a direction in which they cannot move the end effector."""
 
 GROWTH_MAX = 2.0
-"""Broyden's method lengthens a step by at most this factor: beyond, it is not to be trusted."""
+"""Largest factor by which Broyden's method lengthens a step; larger ones are unreliable."""
 
 TURN_MAX = 0.5
-"""Largest change of a joint [rad]. Asking for more means that the target is out of reach."""
+"""Largest change of a joint [rad]. A larger one means that the target is out of reach."""
 
 TINY = 1e-30
-"""Keeps the quotients of an environment that need not move finite."""
+"""Keeps the quotients finite in environments without motion."""
 
 _IDENTITY = np.eye(6)
 
 
 class InverseKinematics:
-    """Joint angles that take the end effector to a point, with the gripper pointing down."""
+    """Computes joint angles that bring the end effector to a point, with the gripper down."""
 
     recorded = ("site_xpos", "site_xmat", "cdof", "subtree_com")
     """Fields of MjData that it reads besides qpos."""
 
     def __init__(self, model: mujoco.MjModel, env_count: int) -> None:
-        """Takes the chain from ``model``: its joints, each the parent of the next, then a site."""
+        """Reads the chain from ``model``: its joints, each the parent of the next, then a site."""
         self._chain = _chain(model)
         self._error_of_pose = _error_of_pose()
         self._skew = _skew()
@@ -67,7 +66,7 @@ class InverseKinematics:
     def solve(self, fields: Fields, target: NDArray[np.float64], out: NDArray[np.float64]) -> None:
         """Writes the angles.
 
-        - ``fields``: qpos and :attr:`recorded`, of now.
+        - ``fields``: current qpos and :attr:`recorded`.
         - ``target`` (E, 3): the point [m]. ``out`` (E, 7): angles [rad].
         """
         qpos, start = fields["qpos"], self._start
@@ -81,12 +80,12 @@ class InverseKinematics:
             step = _corrected(self._step(inverse, self.pose(qpos + turn), target), steps)
             turn += step
         largest = np.abs(turn).max(axis=1, keepdims=True)
-        # The whole step gets shorter, so that the end effector still sets out towards the target.
+        # The whole step is shortened, so that the end effector still moves towards the target.
         turn *= TURN_MAX / np.maximum(largest, TURN_MAX)
         np.add(qpos, turn, out=out)
 
     def pose(self, angles: NDArray[np.float64]) -> NDArray[np.float64]:
-        """The end effector's pose (E, 3, 4) at ``angles`` (E, 7) [rad]."""
+        """Computes the end effector's pose (E, 3, 4) at ``angles`` (E, 7) [rad]."""
         np.cos(angles, out=self._turns[:, :, 0, 1])
         np.sin(angles, out=self._turns[:, :, 0, 2])
         np.matmul(self._turns, self._chain, out=self._links[:, :JOINTS])
@@ -101,15 +100,16 @@ class InverseKinematics:
         pose: NDArray[np.float64],
         target: NDArray[np.float64],
     ) -> NDArray[np.float64]:
-        """The turn (E, 7) that takes ``pose`` to the target, to first order."""
+        """Computes the joint displacement (E, 7) from ``pose`` to the target, to first order."""
         error = pose.reshape(-1, 1, 12) @ self._error_of_pose
         error[:, 0, 3:] += target
         return (inverse @ error.transpose(0, 2, 1))[:, :, 0]
 
     def _inverse_at(self, fields: Fields) -> NDArray[np.float64]:
-        """Damped inverse (E, 7, 6) of the Jacobian, whose rows are angular velocity and velocity.
+        """Computes the damped inverse (E, 7, 6) of the Jacobian.
 
-        MuJoCo's cdof is the transposed Jacobian (E, 7, 6) of the arm's centre of mass.
+        The Jacobian's rows are angular velocity and velocity. MuJoCo's cdof is the transposed
+        Jacobian (E, 7, 6) of the arm's centre of mass.
         """
         lever = fields["site_xpos"][:, 0] - fields["subtree_com"][:, self._root]
         moved = (lever[:, None] @ self._skew).reshape(-1, 6, 6)
@@ -123,10 +123,10 @@ class InverseKinematics:
 def _corrected(
     step: NDArray[np.float64], steps: list[tuple[NDArray[np.float64], NDArray[np.float64]]]
 ) -> NDArray[np.float64]:
-    """The step that the first inverse proposes, corrected by the ``steps`` taken so far.
+    """Corrects the step that the first inverse proposes by the ``steps`` taken so far.
 
-    Broyden's "good" update of the inverse, applied to vectors without forming a matrix, as Kelley
-    (1995) does. Each of ``steps`` comes with its square.
+    This is Broyden's "good" update of the inverse, applied to vectors without forming a matrix, as
+    in Kelley (1995). Each of ``steps`` has its squared norm.
     """
     for (earlier, square), (later, _) in pairwise(steps):
         step += later * (np.vecdot(step, earlier) / square)[:, None]
@@ -136,9 +136,9 @@ def _corrected(
 
 
 def _chain(model: mujoco.MjModel) -> NDArray[np.float64]:
-    """What 1, cosine and sine of each joint's angle are multiplied with (7, 3, 16).
+    """Computes the factors of 1, cosine and sine of each joint's angle (7, 3, 16).
 
-    Their sum is the transform from the joint's parent to what the joint turns.
+    The weighted sum is the transform from the joint's parent to the link that the joint turns.
     """
     chain = np.zeros((3, JOINTS, 4, 4))
     chain[0, :, 2, 2] = chain[0, :, 3, 3] = 1.0
@@ -153,7 +153,7 @@ def _chain(model: mujoco.MjModel) -> NDArray[np.float64]:
 def _transform(
     position: NDArray[np.float64], quaternion: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """The transform (4, 4) of a body or a site in its parent's frame."""
+    """Returns the transform (4, 4) of a body or a site in its parent's frame."""
     rotation = np.zeros(9)
     mujoco.mju_quat2Mat(rotation, quaternion)
     transform = np.eye(4)
@@ -163,11 +163,11 @@ def _transform(
 
 
 def _error_of_pose() -> NDArray[np.float64]:
-    """What a pose lacks, without the target's position, is linear in it: this matrix (12, 6).
+    """Returns the matrix (12, 6) of a pose's error without the target's position, which is linear.
 
     Rotation: half the sum of the cross products of the gripper's axes with (1, 0, 0), (0, -1, 0)
-    and (0, 0, -1), which are theirs when it points down: for a small turn, the vector that undoes
-    it. Position: minus the position.
+    and (0, 0, -1), their directions when it points down. For a small rotation this is the vector
+    that reverts it. Position: minus the position.
     """
     matrix = np.zeros((3, 4, 6))
     matrix[2, 1, 0], matrix[1, 2, 0] = 0.5, -0.5
@@ -179,7 +179,7 @@ def _error_of_pose() -> NDArray[np.float64]:
 
 
 def _skew() -> NDArray[np.float64]:
-    """Makes of a lever (3,) the matrix (36,) of angular velocity (6,) to velocity at its end."""
+    """Returns the matrix (3, 36) from a lever to the map of angular velocity to velocity."""
     matrix = np.zeros((3, 6, 6))
     for first, second, third in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
         matrix[second, first, 3 + third] = 1.0

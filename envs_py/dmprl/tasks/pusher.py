@@ -1,9 +1,9 @@
 """Pusher: an arm of seven joints pushes a cylinder to a goal.
 
-Gymnasium's Pusher-v5 to the last bit, and Gym's Pusher-v0, the one of the paper. There positions of
-bodies are centres of mass of their subtrees, which puts the tip between the arm's two prongs
-instead of at the wrist, the reward is that of the state before the step, and the cylinder weighs a
-thousandth.
+There are two versions: Gymnasium's Pusher-v5, bit-identical, and Gym's Pusher-v0, which the paper
+used. In Pusher-v0 positions of bodies are centres of mass of their subtrees, which puts the tip
+between the arm's two prongs instead of at the wrist. Its reward is that of the state before the
+step, and its cylinder has a thousandth of the mass.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ JOINTS = (
     "wrist_flex",
     "wrist_roll",
 )
-"""The arm's joints, which Thrower's has too."""
+"""The arm's joints; Thrower has the same."""
 OBSERVED_BODIES = ("tips_arm", "object", "goal")
 
 
@@ -58,7 +58,7 @@ class Pusher(MujocoTask):
         self, rng: np.random.Generator, start: Start
     ) -> None:
         while True:
-            # The slides: y first. The goal lies at their origin.
+            # The slides: y first. The goal is at their origin.
             offset = np.array([rng.uniform(-0.3, 0.0), rng.uniform(-0.2, 0.2)])
             if np.linalg.norm(offset) > 0.17:
                 break
@@ -89,12 +89,12 @@ class Pusher(MujocoTask):
         out += near
 
     def rewarded(self, observations: NDArray[np.float64]) -> NDArray[np.float64]:
-        """The states whose distances count: those after the steps."""
+        """Returns the states whose distances are rewarded: those after the steps."""
         return observations[:, 1:]
 
 
 class PusherV0(Pusher):
-    """Gym's Pusher-v0, the one of the paper."""
+    """Gym's Pusher-v0, which the paper used."""
 
     id = "dmprl/Pusher-v0"
     recorded = ("qpos", "qvel", "subtree_com")
@@ -106,18 +106,18 @@ class PusherV0(Pusher):
         return model
 
     def rewarded(self, observations: NDArray[np.float64]) -> NDArray[np.float64]:
-        """The states before the steps."""
+        """Returns the states before the steps."""
         return observations[:, :-1]
 
 
 def count_armature(model: mujoco.MjModel) -> None:
-    """Makes contacts as stiff as those of MuJoCo 1 and 2, with which Gym's versions were made.
+    """Makes contacts as stiff as in MuJoCo 1 and 2, for which Gym's versions were made.
 
-    A contact's softness is scaled by the inverse inertia of both bodies. Since MuJoCo 3 that of a
-    body which only slides leaves the armature of its joints out: the cylinder counts as a millionth
-    of what it resists with, and the arm passes through it. MuJoCo 2 put down, for each joint, its
-    entry in the diagonal of the inverse inertia matrix, and for each body the mean over the axes of
-    the inverse inertia at its centre of mass (rotation: of sliding bodies there is none).
+    A contact's softness is scaled by the inverse inertia of both bodies. Since MuJoCo 3, for a body
+    with slide joints only, this value ignores the armature of the joints. The cylinder then counts
+    as a millionth of its effective inertia, and the arm passes through it. MuJoCo 2 used, for each
+    joint, its entry in the diagonal of the inverse inertia matrix, and for each body the mean over
+    the axes of the inverse inertia at its centre of mass (sliding bodies have no rotation).
     """
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
@@ -132,7 +132,7 @@ def count_armature(model: mujoco.MjModel) -> None:
 
 
 def arm_observation_names(bodies: tuple[str, ...]) -> list[str]:
-    """Names of what :func:`observe_arm` writes."""
+    """Names the entries that :func:`observe_arm` writes."""
     names = [f"angle_{joint}" for joint in JOINTS] + [f"velocity_{joint}" for joint in JOINTS]
     return names + [f"{body}_{axis}" for body in bodies for axis in "xyz"]
 
@@ -142,7 +142,7 @@ def observe_arm(
 ) -> None:
     """Writes joint angles [rad] (7), their velocities (7) and the bodies' positions [m] (3 x 3).
 
-    ``positions`` names the field that holds them.
+    ``positions`` names the field with the positions.
     """
     out[..., :7] = fields["qpos"][..., :7]
     out[..., 7:14] = fields["qvel"][..., :7]

@@ -1,8 +1,8 @@
-"""Reacher: a planar arm of two joints brings its fingertip to a target.
+"""Reacher: a planar arm of two joints moves its fingertip to a target.
 
-Gymnasium's Reacher-v5 to the last bit, and the version that Gym had until 0.9.4, Reacher-v1:
-targets beyond reach, a third coordinate of the distance (always zero), and the reward of the state
-before the step.
+There are two versions: Gymnasium's Reacher-v5, bit-identical, and Reacher-v1, which Gym had until
+0.9.4. Reacher-v1 has targets beyond reach, a third coordinate of the distance (always zero), and
+the reward of the state before the step.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from dmprl.mujoco_batch import Fields, MujocoTask, Start
 from dmprl.tasks.models import gymnasium_model, gymnasium_picture_model
 
 FINGERTIP, TARGET = 3, 4
-"""Bodies of the model."""
+"""Indices of bodies in the model."""
 
 
 class Reacher(MujocoTask):
@@ -35,8 +35,8 @@ class Reacher(MujocoTask):
 
     def load_model(self) -> mujoco.MjModel:  # noqa: D102 - inherited
         model = gymnasium_model("reacher.xml")
-        # No pair of its geoms can collide, so looking for contacts finds none and takes a fifth of
-        # the time.
+        # No pair of its geoms can collide, so the search for contacts, a fifth of the time, is
+        # disabled.
         assert not np.any(model.geom_contype), "a geom of reacher.xml can collide"
         model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONTACT
         return model
@@ -58,7 +58,7 @@ class Reacher(MujocoTask):
         start.qvel[2:] = 0.0
 
     def draw_target(self, rng: np.random.Generator) -> NDArray[np.float64]:
-        """A point within reach [m]."""
+        """Draws a point within reach [m]."""
         while True:
             target = rng.uniform(-0.2, 0.2, 2)
             if math.sqrt(target.dot(target)) < 0.2:  # np.linalg.norm, in a fifth of its time
@@ -85,30 +85,30 @@ class Reacher(MujocoTask):
         out -= self.effort(actions)
 
     def rewarded(self, observations: NDArray[np.float64]) -> NDArray[np.float64]:
-        """The states whose distance counts: those after the steps."""
+        """Returns the states whose distances are rewarded: those after the steps."""
         return observations[:, 1:]
 
 
 class ReacherV1(Reacher):
-    """Gym's Reacher-v1, the one of the paper."""
+    """Gym's Reacher-v1, which the paper used."""
 
     id = "dmprl/Reacher-v1"
     distance_dims = 3
 
     def draw_target(self, rng: np.random.Generator) -> NDArray[np.float64]:
-        """A point of the square, a fifth of which is beyond reach [m].
+        """Draws a point of the square, a fifth of which is beyond reach [m].
 
         Gym meant the disc of Reacher-v5, but compared the norm with 2.
         """
         return rng.uniform(-0.2, 0.2, 2)
 
     def rewarded(self, observations: NDArray[np.float64]) -> NDArray[np.float64]:
-        """The states before the steps."""
+        """Returns the states before the steps."""
         return observations[:, :-1]
 
 
 def minus_distance(differences: NDArray[np.float64], out: NDArray[np.float64]) -> None:
-    """Writes ``-|difference|`` of each row, rounded as ``np.linalg.norm`` of one row rounds."""
+    """Writes ``-|difference|`` of each row, with the rounding of ``np.linalg.norm`` of one row."""
     np.vecdot(differences, differences, out=out)
     np.sqrt(out, out=out)
     np.negative(out, out=out)

@@ -1,9 +1,9 @@
 """Thrower: an arm of seven joints throws a ball into a box.
 
-Gym's Thrower-v0, the one of the paper, which no maintained package has any more. The model is built
-from its published dimensions (``models/thrower.xml``). Positions of bodies are centres of mass of
-their subtrees, and the reward is that of the state before the step. Later versions of Gym let the
-place where the ball hit the ground roll on with the ball; here it is where it first was.
+This is Gym's Thrower-v0, which the paper used and no maintained package provides. The model is
+built from its published dimensions (``models/thrower.xml``). Positions of bodies are centres of
+mass of their subtrees, and the reward is that of the state before the step. In later versions of
+Gym, the point where the ball hit the ground moves on with the rolling ball; here it stays fixed.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from dmprl.tasks.reacher import minus_distance
 
 OBSERVED_BODIES = ("wrist_roll", "ball", "goal")
 GROUND_HEIGHT = -0.25
-"""A ball below this height [m] has hit the ground."""
+"""Height below which a ball has hit the ground [m]."""
 
 
 class Thrower(MujocoTask):

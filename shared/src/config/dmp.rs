@@ -28,7 +28,7 @@ pub enum BasisWidths {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "snake_case")]
 pub enum ForcingScaling {
-    /// None (the paper's equation 9).
+    /// No factor (the paper's equation 9).
     None,
     /// g - y0, as in Neural Dynamic Policies.
     Goal,

@@ -189,8 +189,9 @@ impl Default for PacingConfig {
 pub struct ActorsConfig {
     /// Worker processes; 0 means cores - 1, at least 1.
     pub workers: usize,
-    /// Maximum number of simultaneous workers that join a running experiment (`dmprl actor --join
-    /// RUN`). Their queues are reserved at the start of the run.
+    /// Maximum number of workers that take part in a running experiment by joining it
+    /// (`dmprl actor --join RUN`), at any one time. Their queues are reserved at the start of the
+    /// run.
     pub joined_max: usize,
     /// Environments per worker; one call runs a segment in all of them.
     pub envs_per_worker: usize,
@@ -199,8 +200,8 @@ pub struct ActorsConfig {
     pub queue_segments: usize,
     /// Wait on a full queue after which a worker reports that the learner is slow \[s\].
     pub send_deadline_s: f64,
-    /// Restarts of one worker before the run fails. Delivering segments for five minutes resets the
-    /// count.
+    /// Restarts of one worker before the run continues without it. Delivering segments for five
+    /// minutes resets the count.
     pub restarts_max: u32,
     /// Environment failures that a worker tolerates by recreating the environment. The count is per
     /// environment and restarts after a completed episode or 1 000 valid segments. One more failure

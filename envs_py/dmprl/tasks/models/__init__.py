@@ -9,14 +9,14 @@ import mujoco
 
 
 def own_model(name: str) -> mujoco.MjModel:
-    """Compiles a model of this folder."""
+    """Compiles a model in this folder."""
     return mujoco.MjModel.from_xml_path(str(Path(__file__).parent / name))
 
 
 def own_model_without_decoration(name: str) -> mujoco.MjModel:
-    """Compiles a model of this folder without the geoms that only pictures show.
+    """Compiles a model in this folder without the geoms that only pictures show.
 
-    A simulation moves every geom in every step. The state is the same as with them.
+    A simulation moves every geom in every step. The state is the same with and without them.
     """
     specification = mujoco.MjSpec.from_file(str(Path(__file__).parent / name))
     specification.compiler.discardvisual = True
@@ -24,12 +24,12 @@ def own_model_without_decoration(name: str) -> mujoco.MjModel:
 
 
 def gymnasium_model(name: str) -> mujoco.MjModel:
-    """Compiles a model that Gymnasium brings."""
+    """Compiles a model from Gymnasium's package."""
     return mujoco.MjModel.from_xml_path(str(_gymnasium_file(name)))
 
 
 def gymnasium_picture_model(name: str) -> mujoco.MjModel:
-    """The same under a sky and with more light, for pictures: by itself it stands in the dark."""
+    """Compiles the same model for pictures, with a sky and more light; by default it is dark."""
     spec = mujoco.MjSpec.from_file(str(_gymnasium_file(name)))
     spec.visual.headlight.ambient = [0.35, 0.35, 0.35]
     spec.visual.headlight.diffuse = [0.5, 0.5, 0.5]
@@ -46,7 +46,7 @@ def gymnasium_picture_model(name: str) -> mujoco.MjModel:
 
 
 def _gymnasium_file(name: str) -> Path:
-    """Found without importing Gymnasium, which a worker can do without."""
+    """Finds a file without importing Gymnasium, which a worker does not need."""
     package = importlib.util.find_spec("gymnasium")
     if package is None or package.origin is None:
         raise ModuleNotFoundError(f"the model {name} belongs to the package gymnasium")
