@@ -9,12 +9,16 @@ use std::process::{Command, Stdio};
 
 /// What the program is compiled from, relative to the project's root. Documents and tests are no
 /// part of it. The Python package is read when a run starts: a manifest has its hash.
-const SOURCES: [&str; 8] = [
+const SOURCES: [&str; 12] = [
     "Cargo.toml",
     "Cargo.lock",
-    "shared",
-    "actors",
-    "learner",
+    "shared/Cargo.toml",
+    "shared/src",
+    "actors/Cargo.toml",
+    "actors/build.rs",
+    "actors/src",
+    "learner/Cargo.toml",
+    "learner/src",
     "deploy/Cargo.toml",
     "deploy/build.rs",
     "deploy/src",
@@ -36,7 +40,12 @@ fn main() {
 /// The commit that is checked out, with `-dirty` where the sources differ from it; none outside a
 /// git repository. A new commit makes Cargo run this again.
 fn commit() -> Option<String> {
-    let mut heads = vec!["HEAD".to_owned(), "packed-refs".to_owned()];
+    // A folder inside another project's repository has that project's commits.
+    if !git(&["rev-parse", "--show-prefix"])?.is_empty() {
+        return None;
+    }
+    // `logs/HEAD` grows with every commit and checkout, also where refs are packed.
+    let mut heads = ["HEAD", "logs/HEAD", "packed-refs"].map(str::to_owned).to_vec();
     heads.extend(git(&["symbolic-ref", "--quiet", "HEAD"]));
     for head in heads {
         // A path that is not there would count as changed in every build.
@@ -58,6 +67,8 @@ fn git(arguments: &[&str]) -> Option<String> {
     let output = Command::new("git")
         .args(arguments)
         .current_dir("..")
+        // Takes no lock that a commit at the same time would wait for.
+        .env("GIT_OPTIONAL_LOCKS", "0")
         .stdin(Stdio::null())
         .stderr(Stdio::null())
         .output()

@@ -1,7 +1,7 @@
 //! Stage 3 of 8, its loop: a worker's life, from its environments to its last report.
 //!
 //! The program around it reads the arguments, opens the conversation with the supervisor and makes
-//! the environments ([`environments`]). [`run`] does the rest: it reports the environments, waits
+//! the environments ([`environments()`]). [`run`] does the rest: it reports the environments, waits
 //! for the learner, then takes the newest policy, runs one segment in each environment and delivers
 //! it, until a stop is requested.
 
@@ -50,7 +50,7 @@ pub struct Worker<'a> {
     pub config: &'a ExperimentConfig,
     /// Which worker of which run it is.
     pub identity: Identity,
-    /// Its environments, made by [`environments`].
+    /// Its environments, made by [`environments()`].
     pub environments: PythonEnvironments,
     /// Called for everything that is produced, acknowledged or taken over.
     pub witness: Option<Witness>,

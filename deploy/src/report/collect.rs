@@ -57,7 +57,11 @@ impl Results {
     }
 
     /// The runs of one task by one method.
-    pub fn of<'a>(&'a self, task: &'a str, method: &'a str) -> impl Iterator<Item = &'a Run> {
+    pub fn of<'a>(
+        &'a self,
+        task: &'a str,
+        method: &'a str,
+    ) -> impl Iterator<Item = &'a Run> + Clone {
         self.runs.iter().filter(move |run| run.task == task && run.method == method)
     }
 

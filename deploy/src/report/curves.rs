@@ -6,6 +6,7 @@ use plotters::prelude::*;
 use super::collect::Results;
 use super::measures::Measure;
 use super::paper::reported;
+use super::provenance::Makers;
 use super::run::Run;
 use super::sections::Picture;
 use crate::plots::{Axes, Chart, colour};
@@ -85,8 +86,9 @@ impl Drawn {
             runs = results.of(task, method).filter(|run| !run.rows.is_empty()).collect();
         }
         let paper = measure.in_paper().and_then(|figure| reported(figure, task, method));
+        let makers = Makers::of(runs.iter().copied());
         Self {
-            label: format!("{method} · n = {}", runs.len()),
+            label: format!("{method} · n = {}{}", runs.len(), makers.mark()),
             colour: colour(index, method),
             line: line(&runs, measure),
             paper: paper.map(|(mean, _)| mean),

@@ -23,6 +23,8 @@ pub fn figures_csv(report: &Report) -> anyhow::Result<Vec<u8>> {
         "paper_std",
         "min",
         "max",
+        "programs",
+        "package_sets",
     ])?;
     for table in &report.tables {
         for (task, cells) in &table.rows {
@@ -44,7 +46,9 @@ pub fn figures_csv(report: &Report) -> anyhow::Result<Vec<u8>> {
                 ];
                 let words = [table.title, task, method, count.as_str()];
                 let words = words.into_iter().map(str::to_owned);
-                csv.write_record(words.chain(of.map(number)))?;
+                let makers = [cell.makers.programs, cell.makers.package_sets];
+                let makers = makers.map(|count| count.to_string());
+                csv.write_record(words.chain(of.map(number)).chain(makers))?;
             }
         }
     }

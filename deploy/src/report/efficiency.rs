@@ -4,6 +4,7 @@ use serde::Serialize;
 
 use super::collect::Results;
 use super::measures::Measure;
+use super::provenance::Makers;
 use super::run::Run;
 use super::statistics::{INTERVAL_SCORES_MIN, median_with_bounds, range};
 use super::thresholds::{mark, threshold};
@@ -38,10 +39,14 @@ pub struct EfficiencyCell {
     pub range: [Option<f64>; 2],
     /// What the paper says.
     pub paper: Option<&'static str>,
+    /// Programs and packages behind the figure.
+    #[serde(flatten)]
+    pub makers: Makers,
 }
 
 impl EfficiencyCell {
-    fn of<'r>(task: &str, method: &str, runs: impl Iterator<Item = &'r Run>) -> Self {
+    fn of<'r>(task: &str, method: &str, runs: impl Iterator<Item = &'r Run> + Clone) -> Self {
+        let makers = Makers::of(runs.clone());
         let (mut steps, mut unfinished) = (Vec::new(), 0);
         for run in runs {
             match Measure::StepsToThreshold.of(run) {
@@ -49,8 +54,12 @@ impl EfficiencyCell {
                 None => unfinished += 1,
             }
         }
-        let mut cell =
-            Self { unfinished, paper: mark(task, method).map(|mark| mark.0), ..Self::default() };
+        let mut cell = Self {
+            unfinished,
+            paper: mark(task, method).map(|mark| mark.0),
+            makers,
+            ..Self::default()
+        };
         if !steps.is_empty() {
             let (median, bounds) = median_with_bounds(&steps);
             cell.median = finite(median);
@@ -79,7 +88,8 @@ impl EfficiencyCell {
                 let name = if is_range { "range " } else { "" };
                 lines.push(format!("{name}[{low} – {high}]"));
             }
-            lines.push(format!("{reached} of {} seeds", self.steps.len()));
+            let mark = self.makers.mark();
+            lines.push(format!("{reached} of {} seeds{mark}", self.steps.len()));
             if self.unfinished > 0 {
                 lines.push(format!("{} under way", self.unfinished));
             }

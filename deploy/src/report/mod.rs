@@ -1,10 +1,12 @@
 //! `dmprl report`: what several runs have shown, as one page, Markdown, CSV, JSON and pictures.
 //!
-//! `collect` reads runs and sweeps, `landed` what an earlier report knew of some, `motion` measures
-//! how they move; `run` and `moves` are what is known of one, `provenance` what made them; `measures` says what is measured of
-//! it, `tables`, `efficiency`, `curves`, `trajectories`, `strips` and `statements` what that shows,
-//! `statistics` how sure one can be; `paper` and `thresholds` are what the paper has. `sections`
-//! puts it in order for `page` and `markdown`, `data` and `landed` write it for other programs.
+//! - Input: `collect` reads runs and sweeps, `landed` the data of earlier reports. `motion` measures
+//!   how policies move. `run` and `moves` describe one run, `provenance` the programs behind runs.
+//! - Analysis: `measures` takes the figures of a run. `tables`, `efficiency`, `curves`,
+//!   `trajectories`, `strips` and `statements` compare methods, with `statistics`. `paper` and
+//!   `thresholds` hold the paper's figures.
+//! - Output: `sections` orders the report for `page` and `markdown`. `data` and `landed` write it
+//!   for other programs.
 
 mod collect;
 mod curves;

@@ -19,10 +19,11 @@ use crate::plots::png;
 
 const TEMPLATE: &str = include_str!("page.html");
 /// How to read a cell.
-pub(super) const READING: &str = "mean ± standard deviation over seeds. From four seeds on, IQM \
-    is the interquartile mean with its 95 % interval by stratified bootstrap; below four, the range \
-    from the lowest seed to the highest is given instead. Only finished runs count. † marks seeds \
-    that different programs or package versions made; Provenance lists them.";
+pub(super) const READING: &str = "mean ± standard deviation over seeds. From four seeds \
+    on, IQM is the interquartile mean with its 95 % interval by stratified bootstrap; below four, \
+    the range from the lowest seed to the highest is given instead. Only finished runs count. † \
+    marks seeds that different programs or package versions made, or that did not record them; \
+    Provenance lists them.";
 
 /// What a report says.
 pub struct Report {

@@ -1,9 +1,45 @@
 //! Where the figures of a report come from: which program and packages made the runs of each cell,
 //! and which data of theirs is at hand.
 
+use std::collections::BTreeSet;
+
+use serde::Serialize;
+
 use super::collect::Results;
-use super::run::Run;
+use super::run::{Origin, Run};
 use super::sections::Grid;
+
+/// How many programs and sets of package versions made the runs behind a figure.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize)]
+pub struct Makers {
+    /// Programs, by version and commit. A run whose sources are not known counts as made by a
+    /// program of its own.
+    pub programs: usize,
+    /// Sets of package versions, counted in the same way.
+    pub package_sets: usize,
+}
+
+impl Makers {
+    /// Of the sessions of some runs.
+    pub fn of<'r>(runs: impl Iterator<Item = &'r Run>) -> Self {
+        let runs: Vec<&Run> = runs.collect();
+        let count = |known: fn(&Origin) -> Option<&[String]>| {
+            let of_runs = || runs.iter().map(|run| known(&run.origin));
+            let distinct: BTreeSet<&String> = of_runs().flatten().flatten().collect();
+            distinct.len() + of_runs().filter(Option::is_none).count()
+        };
+        Self {
+            programs: count(Origin::known_programs),
+            package_sets: count(Origin::known_packages),
+        }
+    }
+
+    /// The mark behind a figure over several of either.
+    #[must_use]
+    pub fn mark(self) -> &'static str {
+        if self.programs > 1 || self.package_sets > 1 { " †" } else { "" }
+    }
+}
 
 /// Programs and package versions of a report's runs, numbered for its cells.
 #[derive(Debug, Clone)]

@@ -119,12 +119,13 @@ impl Origin {
 }
 
 impl Origin {
-    /// The programs of its sessions; none if the commit of one is not known.
+    /// The programs of its sessions; none if the sources of one are not known: no commit was
+    /// recorded, or they differed from it.
     pub(super) fn known_programs(&self) -> Option<&[String]> {
         let is_known = |program: &String| {
-            let commit = program.split_once("(commit ").map(|(_, commit)| commit);
-            commit
-                .is_some_and(|commit| commit.starts_with(|letter: char| letter.is_ascii_hexdigit()))
+            let commit = program.split_once("(commit ").map_or("", |(_, rest)| rest);
+            let hash = commit.trim_end_matches(')');
+            !hash.is_empty() && hash.chars().all(|letter| letter.is_ascii_hexdigit())
         };
         let all = !self.programs.is_empty() && self.programs.iter().all(is_known);
         all.then_some(self.programs.as_slice())
@@ -137,7 +138,7 @@ impl Origin {
     }
 }
 
-/// `Python 3.11.7, MuJoCo 4.0.0, Gymnasium 1.4.0, NumPy 2.4.6, dmprl c4b5c29bb027`.
+/// `Python 3.11.7, MuJoCo 4.0.0, Gymnasium 1.4.0, NumPy 2.4.6, dmprl's Python package c4b5c29b`.
 fn packages(session: &Session) -> Option<String> {
     let Packages { python, mujoco, gymnasium, numpy, dmprl_sha256 } = session.packages.as_ref()?;
     let version = |version: &Option<String>| version.clone().unwrap_or_else(|| "none".to_owned());

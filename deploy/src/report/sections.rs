@@ -192,8 +192,8 @@ fn efficiency(report: &Report) -> Section {
         "Sample efficiency",
         &["Environment steps until an evaluation's mean first reaches the threshold: median over \
            the seeds, with its 95 % interval by bootstrap from four seeds on and the range below \
-           four, and how many of the finished seeds reached it. A seed that did not reach it counts \
-           as later than all others. The resolution is the interval between evaluations."],
+           four, and how many of the finished seeds reached it. A seed that did not reach it \
+           counts as later than all others. The resolution is the interval between evaluations."],
     );
     let sources =
         report.efficiency.iter().map(|EfficiencyRow { task, threshold, source, .. }| {
@@ -211,9 +211,11 @@ fn efficiency(report: &Report) -> Section {
 fn statements(judged: &[Judged]) -> Section {
     let rule = format!(
         "Rules applied to the runs' figures decide. \"Held\" and \"did not hold\" need at least \
-         {SEEDS_MIN} seeds of each method, {EPISODES_MIN} episodes in each last evaluation, and 95 % \
-         intervals that do not overlap (of the interquartile mean, or of the median for steps). \
-         With fewer the verdict is \"too few seeds\" or \"too few episodes\"; overlapping intervals \
+         {SEEDS_MIN} seeds of each method, {EPISODES_MIN} episodes in each last evaluation, and \
+         95 % intervals that do not overlap (of the interquartile mean, or of the median for steps). \
+         With fewer the verdict is \"too few seeds\" or \"too few episodes\". Statements about the \
+         course of training use the evaluations before the last, whatever their number of \
+         episodes. Overlapping intervals \
          are \"no clear difference\". A statement that methods are alike, or that one does not \
          improve, held where no difference is clear. \
          \"Cannot hold\": the paper's own figures contradict it. Fails: a success rate of at most \

@@ -30,9 +30,9 @@ pub struct Summary {
     pub std: f64,
     /// Lowest and highest score.
     pub range: [f64; 2],
-    /// Interquartile mean; none below [`INTERVAL_SCORES_MIN`].
+    /// Interquartile mean; none below four scores.
     pub iqm: Option<f64>,
-    /// Its 95 % interval by bootstrap; none below [`INTERVAL_SCORES_MIN`].
+    /// Its 95 % interval by bootstrap; none below four scores.
     pub interval: Option<[f64; 2]>,
 }
 
@@ -86,7 +86,7 @@ pub fn interquartile_mean_with_interval(scores: &[Vec<f64>]) -> (f64, [f64; 2]) 
     bootstrap(scores, interquartile_mean)
 }
 
-/// The median, and its 95 % interval by [`bootstrap`], or the range below [`INTERVAL_SCORES_MIN`].
+/// The median, and its 95 % interval by [`bootstrap`], or the range below four scores.
 /// Unlike a mean it stays a number while fewer than half of the scores are infinite.
 ///
 /// - `scores`: at least one; infinite for what never came.

@@ -1,13 +1,11 @@
 //! The figures of a report, by task and method.
 
-use std::collections::BTreeSet;
-
 use serde::Serialize;
 
 use super::collect::Results;
 use super::measures::Measure;
 use super::paper::reported;
-use super::run::Origin;
+use super::provenance::Makers;
 use super::statistics::Summary;
 use crate::terminal::grouped;
 
@@ -49,23 +47,12 @@ pub struct Cell {
     pub unknown: usize,
     /// Mean and spread in the paper.
     pub paper: Option<(f64, f64)>,
-    /// Programs that made the runs of the figure, by version and commit. A run whose commit was not
-    /// recorded counts as made by a program of its own.
-    pub programs: usize,
-    /// Sets of package versions that the runs used, counted in the same way.
-    pub package_sets: usize,
+    /// Programs and packages behind the figure.
+    #[serde(flatten)]
+    pub makers: Makers,
 }
 
-/// Marks a figure over runs of different programs or packages.
-pub const MIXED: &str = " †";
-
 impl Cell {
-    /// Whether the figure is over runs of different programs or packages.
-    #[must_use]
-    pub fn is_mixed(&self) -> bool {
-        self.programs > 1 || self.package_sets > 1
-    }
-
     /// The cell's lines, for people.
     #[must_use]
     pub fn lines(&self, digits: usize) -> Vec<String> {
@@ -76,7 +63,7 @@ impl Cell {
             None => lines.push("not run".to_owned()),
             // One seed has no spread: zeros would claim that it is known.
             Some(Summary { count: 1, mean, .. }) => {
-                lines.extend([number(*mean, digits), "1 seed".to_owned()]);
+                lines.extend([number(*mean, digits), format!("1 seed{}", self.makers.mark())]);
             }
             Some(summary) => {
                 let Summary { count, mean, std, .. } = *summary;
@@ -88,8 +75,7 @@ impl Cell {
                     Some(_) => format!("IQM {point} [{low}, {high}]"),
                     None => format!("range [{low}, {high}]"),
                 });
-                let mixed = if self.is_mixed() { MIXED } else { "" };
-                lines.push(format!("{count} seeds{mixed}"));
+                lines.push(format!("{count} seeds{}", self.makers.mark()));
             }
         }
         if self.summary.is_some() && self.unknown > 0 {
@@ -124,15 +110,8 @@ fn table(results: &Results, measure: Measure) -> Table {
     let cell = |task: &str, method: &str| {
         let runs = || results.of(task, method);
         let scores: Vec<f64> = runs().filter_map(|run| measure.of(run)).collect();
-        let measured = || runs().filter(|run| measure.of(run).is_some());
-        let count = |of: fn(&Origin) -> Option<&[String]>| {
-            let (known, unknown): (Vec<_>, Vec<_>) =
-                measured().map(|run| of(&run.origin)).partition(Option::is_some);
-            known.into_iter().collect::<BTreeSet<_>>().len() + unknown.len()
-        };
         Cell {
-            programs: count(Origin::known_programs),
-            package_sets: count(Origin::known_packages),
+            makers: Makers::of(runs().filter(|run| measure.of(run).is_some())),
             summary: Summary::of(&scores),
             unfinished: runs().filter(|run| run.last().is_none()).count(),
             unknown: runs().filter(|run| run.last().is_some() && measure.of(run).is_none()).count(),
@@ -179,6 +158,16 @@ mod tests {
         assert_eq!(lines(&three)[2], "3 seeds †");
         three.runs.iter_mut().for_each(|run| run.origin.programs = vec!["0.1.0".to_owned()]);
         assert_eq!(lines(&three)[2], "3 seeds †", "the commits are unknown");
+        let known = || "0.1.0 (commit 1234)".to_owned();
+        three.runs.iter_mut().for_each(|run| run.origin.programs = vec![known()]);
+        three.runs[0].origin.programs = vec![known(), known()];
+        three.runs[0].origin.packages.push("Python 3.11.7".to_owned());
+        assert_eq!(lines(&three)[2], "3 seeds", "one was resumed by the same program");
+        let mut one = planted(&runs[..1]);
+        assert_eq!(lines(&one), ["-1.0", "1 seed"]);
+        one.runs[0].origin.programs = vec![known(), "0.1.0 (commit 5678)".to_owned()];
+        one.runs[0].origin.packages.push("Python 3.11.7".to_owned());
+        assert_eq!(lines(&one), ["-1.0", "1 seed †"]);
         let four = planted(&runs);
         assert!(lines(&four)[1].starts_with("IQM -2.5 ["), "{:?}", lines(&four));
         let mut packages = four;

@@ -385,8 +385,9 @@ pub struct EvaluationConfig {
     pub interval_steps: u64,
     /// Episodes per evaluation.
     pub episodes: usize,
-    /// Episodes of the last evaluation of a run, if that is more than `episodes`. Published
-    /// results need 100; 100 in each evaluation would take longer than training.
+    /// Episodes of the evaluation after the last step of `run.steps`, if that is more than
+    /// `episodes`. Published results need 100; 100 in each evaluation would take longer than
+    /// training. A run that stops earlier, at its goal or time limit, ends with `episodes`.
     pub final_episodes: usize,
     /// Seed of the first episode: every evaluation resets episode i with seed first_seed + i.
     /// Searches use seeds from 5000, so that their results are evaluated on unseen episodes.

@@ -8,6 +8,7 @@ use super::{EPISODES_MIN, PROPOSED, SEEDS_MIN, Verdict, series};
 use crate::report::collect::Results;
 use crate::report::measures::Measure;
 use crate::report::paper::{Figure, reported};
+use crate::report::provenance::Makers;
 use crate::report::run::Run;
 use crate::report::statistics::{INTERVAL_SCORES_MIN, Summary, median_with_bounds};
 use crate::report::thresholds::threshold;
@@ -125,8 +126,7 @@ impl On<'_> {
 
     /// What a method with `count` scores lacks to be judged.
     pub(super) fn lacking(&self, method: &str, count: usize) -> Option<Verdict> {
-        let is_short =
-            |run: &&Run| run.ended && run.final_episodes.is_none_or(|count| count < EPISODES_MIN);
+        let is_short = |run: &&Run| run.final_episodes.is_none_or(|count| count < EPISODES_MIN);
         match count {
             0 => Some(Verdict::NotRun),
             _ if count < SEEDS_MIN => Some(Verdict::TooFewSeeds),
@@ -159,6 +159,8 @@ impl On<'_> {
     /// `TD3 -7.89 [-8.40, -7.31], 3 seeds`.
     fn figure(&self, measure: Measure, method: &str) -> String {
         let name = self.name(method);
+        let measured = self.runs(method).into_iter().filter(|run| measure.of(run).is_some());
+        let mark = Makers::of(measured).mark();
         match self.estimate(measure, method) {
             None if self.runs(method).is_empty() => format!("{name}: not run"),
             // Only motion can be unknown of a run at its end.
@@ -167,15 +169,16 @@ impl On<'_> {
             }
             None => format!("{name}: not finished"),
             Some(Estimate { low: f64::INFINITY, count, .. }) => {
-                format!("{name} not reached, {count} seeds")
+                format!("{name} not reached, {count} seeds{mark}")
             }
             Some(estimate) if measure == Measure::StepsToThreshold => {
                 let [point, low, high] =
                     [estimate.point, estimate.low, estimate.high].map(series::steps_text);
                 let range = estimate.range();
-                format!("{name} {point} {range}[{low} – {high}] steps, {} seeds", estimate.count)
+                let count = estimate.count;
+                format!("{name} {point} {range}[{low} – {high}] steps, {count} seeds{mark}")
             }
-            Some(estimate) => format!("{name} {}", estimate.text(measure.digits())),
+            Some(estimate) => format!("{name} {}{mark}", estimate.text(measure.digits())),
         }
     }
 
