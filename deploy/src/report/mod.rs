@@ -1,7 +1,8 @@
 //! `dmprl report`: what several runs have shown, as one page, Markdown, CSV, JSON and pictures.
 //!
-//! - Input: `collect` reads runs and sweeps, `landed` the data of earlier reports. `motion` measures
-//!   how policies move. `run` and `moves` describe one run, `provenance` the programs behind runs.
+//! - Input: `collect` reads runs and sweeps, `landed` the data of earlier reports. `motion`
+//!   measures how policies move. `run` and `moves` describe one run, `provenance` the programs
+//!   behind several.
 //! - Analysis: `measures` takes the figures of a run. `tables`, `efficiency`, `curves`,
 //!   `trajectories`, `strips` and `statements` compare methods, with `statistics`. `paper` and
 //!   `thresholds` hold the paper's figures.

@@ -212,8 +212,8 @@ fn statements(judged: &[Judged]) -> Section {
     let rule = format!(
         "Rules applied to the runs' figures decide. \"Held\" and \"did not hold\" need at least \
          {SEEDS_MIN} seeds of each method, {EPISODES_MIN} episodes in each last evaluation, and \
-         95 % intervals that do not overlap (of the interquartile mean, or of the median for steps). \
-         With fewer the verdict is \"too few seeds\" or \"too few episodes\". Statements about the \
+         95 % intervals that do not overlap (of the interquartile mean, or of the median for \
+         steps). With fewer the verdict is \"too few seeds\" or \"too few episodes\". Statements about the \
          course of training use the evaluations before the last, whatever their number of \
          episodes. Overlapping intervals \
          are \"no clear difference\". A statement that methods are alike, or that one does not \
