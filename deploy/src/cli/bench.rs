@@ -1,4 +1,4 @@
-//! `dmprl bench`: measures a part of the system beside what else could do its work.
+//! `dmprl bench`: measures a part of the system and compares it with alternatives.
 
 use std::path::{Path, PathBuf};
 use std::time::Duration;
@@ -17,11 +17,11 @@ use super::{cores, emit, prepare_python, python_home, this_program};
 use crate::bench::{self, Controls, RolloutBench};
 use crate::failure::{Outcome, wrong_use};
 
-/// Shorter rounds measure the sleep of the bench itself; longer ones are a slip of the keyboard.
+/// Shorter rounds would mostly measure the benchmark's own sleep; longer ones are a typing error.
 const SECONDS: std::ops::RangeInclusive<f64> = 0.05..=3600.0;
 
-/// Of each environment in a worker's queue, unless the configuration says: enough for the sink to
-/// sleep while a worker works. The learner of a run does not sleep while it has updates to do.
+/// Queue length in segments per environment, unless configured. It lets the sink sleep while a
+/// worker works. A run's learner does not sleep while it has updates to do.
 const QUEUED_SEGMENTS: usize = 4;
 
 const HELP: &str = "\
@@ -35,22 +35,22 @@ EXAMPLES
   dmprl bench learner --help";
 
 const ROLLOUT_HELP: &str = "\
-In every round each of these runs once for --seconds, the others asleep; the median counts.
-  ceiling    mujoco.batch alone, as it is imported, on Gymnasium's model file if there is one
-  physics    mujoco.batch alone, on the workers' own model and process settings
-             (both run episodes whose controls were recorded before, see --controls)
-  worker     `dmprl actor` processes as a run has them: network, movement primitives, noise,
-             environments, shared memory; this process takes the segments in the learner's place.
-             Here the queue of each holds four segments of each environment (a run's default: one),
-             so that what is measured is the worker and not the sleep of whoever takes from it
-  one worker the first of them while the others sleep on their full queues
-  gymnasium  a loop over Gymnasium environments, the same policy in NumPy
-  envpool    EnvPool with one thread a worker, the same policy in NumPy
-  panda-gym  beside the two Panda tasks: a loop over panda-gym's own, random actions, no policy
-All but the workers have one Python process for each worker. What is not to be had is null or
-`absent`, with the reason. worker_rss_mb is the peak resident memory of a worker (VmHWM);
-first_segment_s is from the start of the slowest worker to its first delivered segment.
-Ctrl-C ends it at once and leaves nothing.
+In every round each of these runs once for --seconds while the others sleep; the median counts.
+  ceiling    mujoco.batch alone, as imported, on Gymnasium's model file if there is one
+  physics    mujoco.batch alone, with the workers' own model and process settings
+             (both replay recorded controls, see --controls)
+  worker     `dmprl actor` processes as in a run: network, movement primitives, noise,
+             environments, shared memory; this process receives the segments instead of a learner.
+             Each queue holds four segments per environment (a run's default: one), so that the
+             result does not depend on the receiver's sleep
+  one worker the first worker alone, while the others wait with full queues
+  gymnasium  a loop over Gymnasium environments, with the same policy in NumPy
+  envpool    EnvPool with one thread per worker, with the same policy in NumPy
+  panda-gym  for the two Panda tasks: a loop over panda-gym's own, random actions, no policy
+All but the workers use one Python process per worker. Unavailable figures are null or `absent`,
+with the reason. worker_rss_mb is the peak resident memory of a worker (VmHWM); first_segment_s is
+the time from the start of the slowest worker to its first delivered segment.
+Ctrl-C stops the benchmark at once and leaves nothing behind.
 
 EXAMPLES
   dmprl bench rollout --task reacher
@@ -69,17 +69,19 @@ pub(super) struct BenchArgs {
 
 #[derive(Debug, Subcommand)]
 enum Bench {
-    /// Milliseconds of an update, beside its matrix products and beside PyTorch and JAX.
+    /// Measure the time of an update, and compare it with its matrix products, PyTorch and JAX.
     Learner(Box<LearnerArgs>),
-    /// Microseconds of a decision next to a robot, beside NumPy and onnxruntime.
+    /// Measure the time of a decision of an exported policy, and compare it with NumPy and
+    /// onnxruntime.
     Policy(Box<PolicyArgs>),
-    /// Environment steps a second of the rollout workers, and of what else could make them.
+    /// Measure environment steps per second of the workers, and compare them with other simulators.
     Rollout(Box<RolloutArgs>),
-    /// What many workers would do, and a learner's ingest under 256 of them.
+    /// Measure a learner with 256 synthetic workers, and predict the throughput of up to 1024.
     Scale(Box<ScaleArgs>),
-    /// Steps and updates a second of a whole run that learns.
+    /// Measure steps and updates per second of a complete training run.
     System(Box<SystemArgs>),
-    /// Segments a second from workers to learner, beside pipes, sockets and queues of Python.
+    /// Measure segments per second from workers to learner, and compare them with pipes, sockets
+    /// and Python's queues.
     Transport(TransportArgs),
 }
 
@@ -87,22 +89,22 @@ enum Bench {
 #[derive(Debug, Args)]
 #[command(after_help = ROLLOUT_HELP)]
 struct RolloutArgs {
-    /// A task of `dmprl tasks`, a Gymnasium id, or a class of your own.
+    /// A task of `dmprl tasks`, a Gymnasium id, or your own class.
     #[arg(long)]
     task: String,
     #[command(flatten)]
     configured: ConfiguredArgs,
-    /// How often each is measured.
+    /// Number of rounds.
     #[arg(long, value_name = "R", default_value_t = 15,
           value_parser = clap::value_parser!(u16).range(1..=1000))]
     rounds: u16,
-    /// How long each time [s].
+    /// Duration of each measurement [s].
     #[arg(long, value_name = "S", default_value_t = 0.4, value_parser = seconds)]
     seconds: f64,
-    /// What drives physics alone: what the policy decides, or random actions.
+    /// Controls for the physics alone: recorded from the policy, or random actions.
     #[arg(long, value_enum, default_value_t = Controls::Policy)]
     controls: Controls,
-    /// Python that has EnvPool or panda-gym [default: the one of .venv].
+    /// Python interpreter with EnvPool or panda-gym [default: that of .venv].
     #[arg(long, value_name = "PATH")]
     peer_python: Option<PathBuf>,
     /// Print one JSON object on standard output.
@@ -150,7 +152,8 @@ fn rollout(args: &RolloutArgs) -> anyhow::Result<Outcome> {
     Ok(Outcome::Done)
 }
 
-/// Absolute, and not resolved: a virtual environment's Python is a link that knows where it lies.
+/// Makes the path absolute without resolving links: a virtual environment's `python` is a link, and
+/// its location identifies the environment.
 pub(super) fn interpreter(path: &Path) -> anyhow::Result<PathBuf> {
     let refused = |what: &str| {
         wrong_use(format!(

@@ -1,4 +1,4 @@
-//! `dmprl bench learner`: from the command line to the benchmark.
+//! `dmprl bench learner`: builds the benchmark from the command line.
 
 use std::path::PathBuf;
 use std::time::Duration;
@@ -15,18 +15,18 @@ use crate::bench::{self, LearnerBench, PeerKind};
 use crate::failure::{Outcome, wrong_use};
 
 const HELP: &str = "\
-In every round each of these runs once for --seconds, the others asleep; the median counts.
-  ours            the update of a run, on a replay full of made-up segments of the task's sizes:
-                  it samples a batch and moves every network; no Python, no environment
-  floor, ours     its matrix products and nothing else, by our kernels; with several threads each
-                  has its share of the batch's rows
-  floor, library  the same by the gemm crate; the faster of the two is floor_ms
+In every round each of these runs once for --seconds while the others sleep; the median counts.
+  ours            the update of a run, on a replay full of synthetic segments of the task's sizes:
+                  it samples a batch and updates every network; no Python, no environment
+  floor, ours     only its matrix products, with our kernels; several threads share the rows of
+                  the batch
+  floor, library  the same with the gemm crate; floor_ms is the faster of the two
   torch, jax      the same update in eager PyTorch, or compiled by JAX, on as many cores, with
-                  batches at hand; asked for with --peer, run by tests/peers/learner_peer.py; then
-                  nobody's actor pays for changes of actions (algorithm.action_rate_penalty = 0)
-Sampling and optimiser are measured alone too: the shares of the time. peak_memory_mb is the
-learner's (VmHWM), its replay included. What is not to be had is null or `absent`, with the reason.
-Ctrl-C ends it and leaves nothing.
+                  prepared batches (--peer; tests/peers/learner_peer.py). With a peer, no actor
+                  has a penalty on changes of actions (algorithm.action_rate_penalty = 0)
+Sampling and optimiser are also measured alone, as shares of the time. peak_memory_mb is the
+learner's (VmHWM), including its replay. Unavailable figures are null or `absent`, with the reason.
+Ctrl-C stops the benchmark and leaves nothing behind.
 
 EXAMPLES
   dmprl bench learner --task pusher
@@ -38,25 +38,25 @@ EXAMPLES
 #[derive(Debug, Args)]
 #[command(after_help = HELP)]
 pub(super) struct LearnerArgs {
-    /// A task of `dmprl tasks`, for its sizes.
+    /// A task of `dmprl tasks`, which determines the sizes.
     #[arg(long)]
     task: String,
     #[command(flatten)]
     configured: ConfiguredArgs,
-    /// Threads of the update, and of whom it is compared with.
+    /// Threads of the update and of the peers.
     #[arg(long, value_name = "N")]
     threads: Option<u32>,
-    /// Who else does the update; repeatable.
+    /// Also measure the update in this library; repeatable.
     #[arg(long, value_enum)]
     peer: Vec<PeerKind>,
-    /// Python that has PyTorch or JAX [default: the one of .venv].
+    /// Python interpreter with PyTorch or JAX [default: that of .venv].
     #[arg(long, value_name = "PATH")]
     peer_python: Option<PathBuf>,
-    /// How often each is measured.
+    /// Number of rounds.
     #[arg(long, value_name = "R", default_value_t = 15,
           value_parser = clap::value_parser!(u16).range(1..=1000))]
     rounds: u16,
-    /// How long each time [s].
+    /// Duration of each measurement [s].
     #[arg(long, value_name = "S", default_value_t = 0.4, value_parser = seconds)]
     seconds: f64,
     /// Print one JSON object on standard output.
@@ -74,7 +74,7 @@ pub(super) fn run(args: &LearnerArgs) -> anyhow::Result<Outcome> {
         )));
     };
     let threads = args.threads.map(|threads| Value::Integer(threads.into()));
-    // A price of ours, which others do not know.
+    // The peers do not implement our penalty on changes of actions.
     let no_price = (!args.peer.is_empty()).then_some(Value::Float(0.0));
     let flags = [
         flag("--threads", "learner.threads", threads),

@@ -1,4 +1,4 @@
-//! `dmprl bench policy`: from the command line to the benchmark.
+//! `dmprl bench policy`: builds the benchmark from the command line.
 
 use std::path::PathBuf;
 
@@ -19,13 +19,13 @@ use crate::failure::{Outcome, wrong_use};
 use crate::run_directory::{PolicyChoice, RunDirectory};
 
 const HELP: &str = "\
-One observation at a time, on one core, as next to a robot. In every round each of these makes
---calls calls; all calls of all rounds count.
-  decision   observation to the actions of a segment, by dmprl_shared::runtime
-  action     one control step of the same; one in K of them decides
+One observation at a time, on one core, as on a robot. In every round each of these makes --calls
+calls; all calls of all rounds count.
+  decision   from an observation to the actions of a segment, with dmprl_shared::runtime
+  action     one control step of the same; one in K control steps makes a decision
   numpy      the decision by dmprl.Policy, from the file that `dmprl export` writes
-  onnx       the decision by onnxruntime, where the interpreter has it
-Ctrl-C ends it at once and leaves nothing.
+  onnx       the decision by onnxruntime, if the interpreter has it
+Ctrl-C stops the benchmark at once and leaves nothing behind.
 
 EXAMPLES
   dmprl bench policy runs/mine
@@ -37,23 +37,23 @@ EXAMPLES
 #[derive(Debug, Args)]
 #[command(after_help = HELP)]
 pub(super) struct PolicyArgs {
-    /// A run, of which the best policy, or a file of `dmprl export`.
+    /// A run directory, for its best policy, or a file of `dmprl export`.
     #[arg(required_unless_present = "task", conflicts_with = "task")]
     run: Option<PathBuf>,
-    /// Instead of a trained policy: a fresh one for a task of `dmprl tasks`.
+    /// Use an untrained policy for this task of `dmprl tasks`.
     #[arg(long)]
     task: Option<String>,
     #[command(flatten)]
     configured: ConfiguredArgs,
-    /// Decisions of a round.
+    /// Calls per round.
     #[arg(long, value_name = "N", default_value_t = 2_000,
           value_parser = clap::value_parser!(u32).range(10..=20_000))]
     calls: u32,
-    /// How often each is measured.
+    /// Number of rounds.
     #[arg(long, value_name = "R", default_value_t = 5,
           value_parser = clap::value_parser!(u16).range(1..=1000))]
     rounds: u16,
-    /// Python that has onnxruntime [default: the one of .venv].
+    /// Python interpreter with onnxruntime [default: that of .venv].
     #[arg(long, value_name = "PATH")]
     peer_python: Option<PathBuf>,
     /// Print one JSON object on standard output.
@@ -84,7 +84,7 @@ fn opened(args: &PolicyArgs) -> anyhow::Result<OpenedPolicy> {
     if let Some(path) = &args.run {
         if !args.configured.is_empty() {
             return Err(wrong_use(format!(
-                "{} is what it is: flags of a configuration go with --task",
+                "{}: the policy is already configured; flags of a configuration go with --task",
                 path.display()
             )));
         }

@@ -1,4 +1,4 @@
-//! `dmprl bench scale`: from the command line to the benchmark.
+//! `dmprl bench scale`: builds the benchmark from the command line.
 
 use std::time::Duration;
 
@@ -15,25 +15,25 @@ use crate::bench::{self, ScaleBench};
 use crate::failure::{Outcome, wrong_use};
 
 const HELP: &str = "\
-Three parts:
-  simulation  --synthetic-workers workers that only send, by the code of a run's workers, in a few
-              processes at full rate; this process has a real learner, which takes from a queue of
-              each in shared memory, checks, settles, inserts into its replay and acknowledges. It
-              is measured for --seconds once the replay is full. Shares are each worker's segments
-              over an equal share; jain_index is 1 when all have the same. Memory is the learner's
-              (VmRSS), the queues included
-  costs       processor time of real workers (--workers of them) for a segment; of the learner's
+Four parts:
+  simulation  --synthetic-workers synthetic workers, which use the sending code of a run's workers,
+              in a few processes at full rate. This process has a real learner, which reads each
+              worker's queue in shared memory, checks and settles segments, inserts them into its
+              replay and acknowledges them. It is measured for --seconds once the replay is full.
+              Shares are each worker's segments divided by an equal share; jain_index is 1 when all
+              are equal. Memory is the learner's (VmRSS), including the queues
+  costs       processor time per segment of real workers (--workers of them); of the learner's
               thread to take one from as many queues as in the simulation (transport) and to check,
-              settle and insert it (ingest); what delivery level `log` adds; the time of an update
-              on --learner-cores threads. Each for --cost-seconds
-  model       steps/s and the first bottleneck for 16 to 1024 workers, by these costs: the workers,
-              the learner's thread, which takes segments and does updates in turn, and the network,
-              if --link-gbps says what it carries. Each worker has a core; the learner's host has
-              no workers. For several machines it is a forecast
-  check       real systems (as `bench system`) of 1 to --check-workers workers on this machine
-              beside the model, in which learner and workers share its cores. A busy machine has
-              fewer; the processor time for a step, which it disturbs least, stands beside
-Ctrl-C ends it and leaves nothing.
+              settle and insert it (ingest); what delivery level `log` adds; and the time of an
+              update on --learner-cores threads. Each is measured for --cost-seconds
+  model       steps/s and the first bottleneck for 16 to 1024 workers, computed from these costs:
+              the workers, the learner's thread, which alternates between segments and updates, or
+              the network, if --link-gbps is given. Each worker has a core of its own; the
+              learner's host has no workers. For several machines it is a prediction
+  check       real systems (as in `bench system`) of 1 to --check-workers workers on this machine
+              next to the model, in which learner and workers share its cores. Other load on the
+              machine lowers the measured rates; it affects the processor time per step least
+Ctrl-C stops the benchmark and leaves nothing behind.
 
 EXAMPLES
   dmprl bench scale
@@ -45,43 +45,42 @@ EXAMPLES
 #[derive(Debug, Args)]
 #[command(after_help = HELP)]
 pub(super) struct ScaleArgs {
-    /// A task of `dmprl tasks`, a Gymnasium id, or a class of your own.
+    /// A task of `dmprl tasks`, a Gymnasium id, or your own class.
     #[arg(long, default_value = "reacher")]
     task: String,
     #[command(flatten)]
     configured: ConfiguredArgs,
-    /// Workers of the simulation.
+    /// Number of synthetic workers.
     #[arg(long, value_name = "N", default_value_t = 256,
           value_parser = clap::value_parser!(u16).range(1..=1024))]
     synthetic_workers: u16,
-    /// Processes that play them [default: cores].
+    /// Processes that run the synthetic workers [default: cores].
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u16).range(1..=256))]
     feeders: Option<u16>,
-    /// Bytes of their segments.
+    /// Size of the synthetic segments in bytes.
     #[arg(long, value_name = "N", default_value = "1024",
           value_parser = PossibleValuesParser::new(["1024", "10240"]))]
     segment_bytes: String,
-    /// How long the simulation is measured [s].
+    /// Duration of the simulation [s].
     #[arg(long, value_name = "S", default_value_t = 10.0, value_parser = seconds)]
     seconds: f64,
-    /// How long each cost is measured [s].
+    /// Duration of the measurement of each cost [s].
     #[arg(long, value_name = "S", default_value_t = 2.0, value_parser = seconds)]
     cost_seconds: f64,
-    /// Real systems of 1 to N workers are measured beside the model; 0: none.
+    /// Also measure real systems of 1 to N workers and compare them with the model; 0: none.
     #[arg(long, value_name = "N", default_value_t = 4,
           value_parser = clap::value_parser!(u16).range(0..=64))]
     check_workers: u16,
-    /// How long each of them [s].
+    /// Duration of the measurement of each real system [s].
     #[arg(long, value_name = "S", default_value_t = 10.0, value_parser = seconds)]
     check_seconds: f64,
-    /// Cores of the learner: threads of an update, on this machine's cores [default: as
-    /// configured].
+    /// Threads of an update, on this machine's cores [default: as configured].
     #[arg(long, value_name = "N")]
     learner_cores: Option<u32>,
-    /// Workers of each host in the model [default: this machine's cores].
+    /// Workers per host in the model [default: this machine's cores].
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u16).range(1..))]
     cores_per_host: Option<u16>,
-    /// What the network carries into the learner's host [Gbit/s; default: no bound].
+    /// Bandwidth of the network into the learner's host [Gbit/s; default: unlimited].
     #[arg(long, value_name = "G", value_parser = gigabits)]
     link_gbps: Option<f64>,
     /// Print one JSON object on standard output.
@@ -107,7 +106,7 @@ pub(super) fn run(args: &ScaleArgs) -> anyhow::Result<Outcome> {
         ));
     }
     if config.run.deterministic {
-        return Err(wrong_use("run.deterministic: such a run is one process, with one worker"));
+        return Err(wrong_use("run.deterministic: such a run is one process with one worker"));
     }
     if config.learner.threads > cores {
         return Err(wrong_use(format!(

@@ -1,4 +1,4 @@
-//! `dmprl bench system`: from the command line to the benchmark.
+//! `dmprl bench system`: builds the benchmark from the command line.
 
 use std::time::Duration;
 
@@ -14,16 +14,17 @@ use crate::failure::{Outcome, wrong_use};
 
 const HELP: &str = "\
 Starts a real `dmprl train` in a temporary folder and measures it for --seconds: its supervisor, its
-learner, its workers. The policy is not evaluated unless --evaluate says so; checkpoints are written
-as configured. Rates are differences between two lines of the run's metrics.jsonl, of which there is
-one every 500 steps at least. Left out is what comes before the first of the two: starting, the
-warm-up (exploration.warm_up_steps), in which nothing is learned, and one second after it.
-  updates_per_segment   as measured, beside what the pacing asks for (pacing.updates_per_segment)
-  policy_lag            newest policy version minus the one that acted: the median over the lines'
-                        medians, and the largest
-  busy, *_utilisation   processor time of the learner and of the workers, of a core for each thread;
-                        whichever is near 100 % bounds the rates, if the machine has cores for both
-Ctrl-C ends it and leaves nothing.
+learner, its workers. The policy is evaluated only with --evaluate; checkpoints are written as
+configured. Rates are differences between two lines of the run's metrics.jsonl, which has a line at
+least every 500 steps. The measurement excludes the start, the warm-up (exploration.warm_up_steps),
+during which nothing is learned, and one second after it.
+  updates_per_segment   as measured, next to the configured pacing (pacing.updates_per_segment)
+  policy_lag            newest policy version minus the version that acted: the median of the
+                        lines' medians, and the maximum
+  busy, *_utilisation   processor time of the learner and of the workers, as a fraction of one core
+                        per thread; the one near 100 % limits the rates, if the machine has enough
+                        cores for both
+Ctrl-C stops the benchmark at once and leaves nothing behind.
 
 EXAMPLES
   dmprl bench system --task reacher
@@ -35,15 +36,15 @@ EXAMPLES
 #[derive(Debug, Args)]
 #[command(after_help = HELP)]
 pub(super) struct SystemArgs {
-    /// A task of `dmprl tasks`, a Gymnasium id, or a class of your own.
+    /// A task of `dmprl tasks`, a Gymnasium id, or your own class.
     #[arg(long)]
     task: String,
     #[command(flatten)]
     configured: ConfiguredArgs,
-    /// How long it is measured, at least; starting and warm-up come on top [s].
+    /// Minimum duration of the measurement, without start and warm-up [s].
     #[arg(long, value_name = "S", default_value_t = 20.0, value_parser = seconds)]
     seconds: f64,
-    /// Evaluate the policy as the configuration says.
+    /// Evaluate the policy as configured.
     #[arg(long)]
     evaluate: bool,
     /// Print one JSON object on standard output.
@@ -53,7 +54,7 @@ pub(super) struct SystemArgs {
 
 pub(super) fn run(args: &SystemArgs) -> anyhow::Result<Outcome> {
     let config = whole_system(&args.configured, &args.task)?;
-    // Before the clock runs: making the environment takes minutes.
+    // Prepare Python before the clock starts: it can take minutes.
     prepare_python()?;
     let bench = SystemBench {
         program: this_program()?,
@@ -66,7 +67,7 @@ pub(super) fn run(args: &SystemArgs) -> anyhow::Result<Outcome> {
     Ok(Outcome::Done)
 }
 
-/// The configuration of a run of several processes.
+/// Merges the configuration of a run with several processes.
 pub(super) fn whole_system(
     configured: &ConfiguredArgs,
     task: &str,
@@ -75,7 +76,7 @@ pub(super) fn whole_system(
     let mut config = config.resolve(Limits { cores: cores() }).map_err(refuse)?;
     if config.run.deterministic {
         return Err(wrong_use(
-            "run.deterministic: such a run is one process, which has no system to measure",
+            "run.deterministic: such a run is one process, so there is no system to measure",
         ));
     }
     make_absolute(&mut config)?;

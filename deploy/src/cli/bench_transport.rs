@@ -1,4 +1,4 @@
-//! `dmprl bench transport`: from the command line to the benchmark.
+//! `dmprl bench transport`: builds the benchmark from the command line.
 
 use std::path::PathBuf;
 use std::time::Duration;
@@ -12,40 +12,41 @@ use crate::bench::{self, TransportBench};
 use crate::failure::{Outcome, wrong_use};
 
 const HELP: &str = "\
-For segments of 1024 and of 10240 bytes. In every round each of these runs once for --seconds, the
-others asleep; the median counts.
-  shared_memory          worker processes that only send, by the code of a run's workers: checksum,
-                         outbox, queue, acknowledgements; this process takes, checks, settles and
-                         acknowledges in the learner's place, at --level log after it has appended
-                         to a segment log in the folder for temporary files
-  pipe, unix_socket      one such process that writes each segment as a frame; read and checked
+For segments of 1024 and of 10240 bytes. In every round each of these runs once for --seconds while
+the others sleep; the median counts.
+  shared_memory          worker processes that only send, with the code of a run's workers:
+                         checksum, outbox, queue, acknowledgements. This process takes, checks,
+                         settles and acknowledges the segments instead of a learner; at --level log
+                         it first appends them to a segment log in the folder for temporary files
+  pipe, unix_socket      one such process, which writes each segment as a frame; read and checked
                          here, without acknowledgements
   multiprocessing_queue  Python's, between two processes; neither checked nor acknowledged
-  zeromq                 the same by pyzmq, PUSH to PULL over ipc://
-`peers` are those of 1024 bytes; each of `sizes` has its own. lost and duplicate are found by the
-sequence numbers and by what the workers say that they have sent. blocked_cpu_fraction is the share
-of a core that a worker uses while nobody takes: queue and outbox are full. What is not to be had is
-null or `absent`, with the reason. Ctrl-C ends it at once and leaves nothing.
+  zeromq                 the same with pyzmq, PUSH to PULL over ipc://
+`peers` are measured with 1024 bytes; each of `sizes` has its own. lost and duplicate come from the
+sequence numbers and from the number of segments that the workers report as sent.
+blocked_cpu_fraction is the share of a core that a worker uses while queue and outbox are full.
+Unavailable figures are null or `absent`, with the reason. Ctrl-C stops the benchmark at once and
+leaves nothing behind.
 
-BETWEEN HOSTS: one end listens, the other connects, both with this version. Segments are of 2048
-bytes, policies of half a megabyte. Who listens prints segments_per_s over --seconds, and
-policy_ms_median: from publishing a policy until the other host has said that its workers have it.
+BETWEEN HOSTS: one end listens, the other connects, both with this version. Segments have 2048
+bytes, policies half a megabyte. The listening end prints segments_per_s over --seconds, and
+policy_ms_median: from publishing a policy until the other host reports that its workers have it.
 
 EXAMPLES
   dmprl bench transport
   dmprl bench transport --workers 2 --rounds 9 --json
-  dmprl bench transport --level log        # what that level costs
+  dmprl bench transport --level log        # the cost of this level
   dmprl bench transport --listen tcp/0.0.0.0:7448 --seconds 10
   dmprl bench transport --connect tcp/10.0.0.1:7448 --workers 4
   dmprl bench transport --connect tcp/10.0.0.1:7448 --workers 4 --rate 20000
   dmprl bench transport --peer-python /opt/zeromq/bin/python";
 
-/// As `delivery.level`.
+/// Delivery level, as in `delivery.level`.
 #[derive(Debug, Clone, Copy, ValueEnum)]
 enum Level {
-    /// Acknowledged when it is taken.
+    /// Acknowledges a segment when it is taken.
     Memory,
-    /// Acknowledged when it is in the segment log too.
+    /// Acknowledges a segment when it is also in the segment log.
     Log,
 }
 
@@ -53,33 +54,34 @@ enum Level {
 #[derive(Debug, Args)]
 #[command(after_help = HELP)]
 pub(super) struct TransportArgs {
-    /// Processes that send [default: cores - 1]; with --connect 0 for policies alone [default: 1].
+    /// Sending processes [default: cores - 1]; with --connect 0 measures policies alone [default:
+    /// 1].
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(0..=64))]
     workers: Option<u32>,
-    /// Delivery level of ours.
+    /// Delivery level of the shared-memory transport.
     #[arg(long, value_enum, default_value_t = Level::Memory)]
     level: Level,
-    /// Python that has pyzmq [default: the one of .venv].
+    /// Python interpreter with pyzmq [default: that of .venv].
     #[arg(long, value_name = "PATH")]
     peer_python: Option<PathBuf>,
-    /// How often each is measured.
+    /// Number of rounds.
     #[arg(long, value_name = "R", default_value_t = 9,
           value_parser = clap::value_parser!(u16).range(1..=1000))]
     rounds: u16,
-    /// How long each time [s].
+    /// Duration of each measurement [s].
     #[arg(long, value_name = "S", default_value_t = 0.4, value_parser = seconds)]
     seconds: f64,
-    /// Measure between hosts: take the learner's place at this Zenoh endpoint.
+    /// Measure between hosts: act as the learner at this Zenoh endpoint.
     #[arg(long, value_name = "ENDPOINT", conflicts_with = "connect")]
     listen: Option<String>,
-    /// Measure between hosts: send to who listens at this Zenoh endpoint.
+    /// Measure between hosts: send to the listener at this Zenoh endpoint.
     #[arg(long, value_name = "ENDPOINT")]
     connect: Option<String>,
-    /// Segments a second that the workers make together, with --connect [default: what they can].
+    /// Total segments per second of all workers, with --connect [default: unlimited].
     #[arg(long, value_name = "N", requires = "connect",
           value_parser = clap::value_parser!(u32).range(1..))]
     rate: Option<u32>,
-    /// Zenoh's own configuration (JSON5), with --listen or --connect.
+    /// Zenoh configuration file (JSON5), with --listen or --connect.
     #[arg(long, value_name = "FILE")]
     zenoh_config: Option<PathBuf>,
     /// Print one JSON object on standard output.
@@ -92,7 +94,7 @@ pub(super) fn run(args: &TransportArgs) -> anyhow::Result<Outcome> {
         return between_hosts(args);
     }
     if args.workers == Some(0) {
-        return Err(wrong_use("--workers 0: nobody would send; 0 goes with --connect alone"));
+        return Err(wrong_use("--workers 0: no process would send; 0 needs --connect"));
     }
     let peer_python = args.peer_python.as_deref().map(interpreter).transpose()?;
     let (venv, package_path) = python_home()?;

@@ -1,4 +1,4 @@
-//! `dmprl bridge`: this host's workers for a run whose learner is on another.
+//! `dmprl bridge`: runs workers on this host for a run whose learner is on another.
 
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
@@ -21,22 +21,24 @@ use crate::run_directory::{
 };
 use crate::terminal::{ProgressStyle, say};
 
-/// Between two times that a host asks whether it may take part.
+/// Interval between two join requests.
 const ASK_AGAIN: Duration = Duration::from_millis(500);
 
-/// What a killed bridge had started ends with it: at once, unless the machine is very busy.
+/// Wait for the processes of a killed bridge to exit. They do so at once, unless the machine is
+/// very busy.
 const LEFT_OVER: Duration = Duration::from_secs(60);
-/// In a bridge's directory: the number by which the learner's host knows this one.
+/// File in a bridge's directory with the number by which the learner's host knows this one.
 const HOST_FILE: &str = "bridge.host";
 
 const HELP: &str = "\
-On the learner's host, open the run and give the other hosts its secret, bridge.token of the run's
-directory; the file must be readable by its owner alone:
+On the learner's host, start the run with bridge.listen. Copy its token, bridge.token in the run's
+directory, to the other hosts; only its owner may have access to the file:
   dmprl train reacher --set 'bridge.listen=[\"tcp/0.0.0.0:7447\"]' --run-dir runs/mine
-This host needs the same version of dmprl, and the run's environments. It gets configuration and
-policies from the learner's host, waits for it when it is away, and ends with the run. Ctrl-C lets
-the workers' last segments be handed over, and the others go on; twice: at once. Exit status: 0 the
-run has ended, 130 interrupted, 2 refused, 1 failed or waited longer than --patience.
+This host needs the same version of dmprl, and the run's environments. It receives configuration and
+policies from the learner's host, waits while it is unreachable, and exits when the run ends. On
+Ctrl-C the workers' last segments are delivered, and the other hosts continue; a second Ctrl-C exits
+at once. Exit status: 0 the run has ended, 130 interrupted, 2 rejected, 1 failed or waited longer
+than --patience.
 
 EXAMPLES
   dmprl bridge --connect tcp/10.0.0.1:7447 --token-file bridge.token
@@ -50,30 +52,30 @@ pub(super) struct BridgeArgs {
     /// Zenoh endpoint of the learner's host: tcp/ADDRESS:PORT or tls/ADDRESS:PORT.
     #[arg(long, value_name = "ENDPOINT")]
     connect: String,
-    /// File with the run's secret, of mode 0600.
+    /// File with the run's token, mode 0600.
     #[arg(long, value_name = "FILE")]
     token_file: PathBuf,
-    /// Workers of this host [default: one a core].
+    /// Workers on this host [default: one per core].
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u16).range(1..=1024))]
     workers: Option<u16>,
-    /// What the learner's host calls this one [default: the host's name].
+    /// Name of this host in the run's displays [default: the host's name].
     #[arg(long)]
     name: Option<String>,
-    /// Where this host's logs go; one that a bridge of the same run has used may be used again
-    /// [default: runs/bridge-NAME-TIME].
+    /// Directory for this host's logs; may be that of an earlier bridge of the same run [default:
+    /// runs/bridge-NAME-TIME].
     #[arg(long, value_name = "DIR")]
     run_dir: Option<PathBuf>,
-    /// Where the environments of your own are on this host; repeatable.
+    /// Directory of your own environment modules on this host; repeatable.
     #[arg(long, value_name = "DIR")]
     python_path: Vec<PathBuf>,
-    /// Zenoh's own configuration (JSON5), for certificates.
+    /// Zenoh configuration file (JSON5), for certificates.
     #[arg(long, value_name = "FILE")]
     zenoh_config: Option<PathBuf>,
-    /// How long the learner's host may be away [min].
+    /// How long to wait while the learner's host is unreachable [min].
     #[arg(long, value_name = "M", default_value_t = 60,
           value_parser = clap::value_parser!(u64).range(1..=1_000_000))]
     patience: u64,
-    /// Lines instead of a progress bar.
+    /// Print lines instead of a progress bar.
     #[arg(long)]
     no_progress: bool,
 }
@@ -119,8 +121,8 @@ pub(super) fn run(args: &BridgeArgs) -> anyhow::Result<Outcome> {
     launch::host(HostPlan { program, run, lock, config, venv, upstream, session, progress })
 }
 
-/// The directory of an earlier bridge, taken, and its number: started again, by systemd for one,
-/// this host has the places that it had, which would else be kept for it for minutes.
+/// Locks the directory of an earlier bridge and reads its number. With it a restarted bridge gets
+/// its places back at once; without it they would stay reserved for minutes.
 fn earlier(args: &BridgeArgs) -> anyhow::Result<Option<(RunLock, u64)>> {
     let Some(path) = args.run_dir.as_deref().filter(|path| path.join(HOST_FILE).is_file()) else {
         return Ok(None);
@@ -150,7 +152,7 @@ fn host_name() -> String {
     if name.is_empty() { "host".to_owned() } else { name }
 }
 
-/// Asks until the learner's host takes this one in; none when the user has enough.
+/// Asks the learner's host until it accepts this one; `None` on interrupt.
 fn wait_for_welcome(
     asking: &Asking,
     zenoh_file: Option<&Path>,
@@ -177,7 +179,7 @@ fn wait_for_welcome(
             Asked::Later(reason) => {
                 if reason != told {
                     let minutes = patience.as_secs() / 60;
-                    say(&format!("{reason}; waiting, for {minutes} min at most"));
+                    say(&format!("{reason}; waiting for at most {minutes} min"));
                     told = reason;
                 }
             }
@@ -186,7 +188,7 @@ fn wait_for_welcome(
     }
 }
 
-/// The run's configuration, as it is on this host.
+/// Adapts the run's configuration to this host.
 fn host_config(
     welcome: &HostWelcome,
     workers: usize,
@@ -198,7 +200,7 @@ fn host_config(
     config.actors.joined_max = 0;
     config.bridge.listen.clear();
     config.demonstrations.files.clear();
-    // What the learner's host keeps takes no memory here.
+    // This host has no replay.
     config.replay.capacity_steps = 1_000;
     config.run.max_minutes = f64::INFINITY;
     if !python_path.is_empty() {
@@ -219,7 +221,7 @@ fn host_config(
     config.resolve(Limits { cores: cores() }).map_err(refuse)
 }
 
-/// A directory of its own, or that of an earlier bridge of the same run.
+/// Creates this bridge's run directory, or opens that of an earlier bridge of the same run.
 fn run_directory(
     args: &BridgeArgs,
     name: &str,

@@ -1,4 +1,4 @@
-//! `dmprl chaos`: from the command line to the trial.
+//! `dmprl chaos`: builds the trial from the command line.
 
 use std::path::PathBuf;
 use std::time::Duration;
@@ -11,20 +11,20 @@ use crate::chaos::{TrialPlan, chaos};
 use crate::failure::Outcome;
 
 const HELP: &str = "\
-Starts a real `dmprl train` at delivery level `log` and, by a schedule that the seed decides, kills
-workers (one, all at once, while they start), the learner (also while it recovers and while it
-writes a checkpoint) and the evaluator with SIGKILL, and stops workers and the learner for a while.
-Workers and learner note every segment, so that in the end a checker can tell:
-  I1 nothing acknowledged is lost           I2 nothing is inserted twice
-  I3 sequences only increase                I4 payloads arrive as they were produced
-  I5 counters go back to a checkpoint only  I6 policies only become newer
-  I7 work goes on, all workers come back    I8 nothing is left behind
-  I9 produced = inserted + rejected + in flight with the killed
-worker_back_s, learner_back_s (from SIGKILL to the first segment inserted), fairness (most over
-fewest segments of a worker while nothing was broken) and the *_ratio (last third of the trial over
-the first, the larger of supervisor and learner) are measured and judge nothing: they depend on the
-machine. Ctrl-C ends it: the run heals, is stopped and judged. Exit status 1 if anything did not
-hold; everything is then kept.
+Starts a real `dmprl train` at delivery level `log`. By a schedule derived from the seed it kills
+workers (one, all at once, during their start), the learner (also while it recovers or writes a
+checkpoint) and the evaluator with SIGKILL, and suspends workers and the learner for a while.
+Workers and learner log every segment, and a checker finally verifies:
+  I1 no acknowledged segment is lost        I2 no segment is inserted twice
+  I3 sequence numbers only increase         I4 payloads arrive as produced
+  I5 counters go back to a checkpoint only  I6 policy versions never decrease
+  I7 work continues, all workers come back  I8 nothing is left behind
+  I9 produced = inserted + rejected + in flight with killed workers
+Reported but not checked, as they depend on the machine: worker_back_s, learner_back_s (from SIGKILL
+to the first segment inserted), fairness (most over fewest segments of a worker while no fault was
+active) and the *_ratio (last third of the trial over the first, the larger of supervisor and
+learner). Ctrl-C ends the trial: the run recovers, is stopped and checked. Exit status 1 if a check
+failed; the run is then kept.
 
 EXAMPLES
   dmprl chaos --seed 1 --seconds 60
@@ -35,29 +35,29 @@ EXAMPLES
 #[derive(Debug, Args)]
 #[command(after_help = HELP)]
 pub(super) struct ChaosArgs {
-    /// Decides which fault comes when, and whom it strikes.
+    /// Seed of the schedule of faults and their targets.
     #[arg(long, value_name = "S", default_value_t = 1,
           value_parser = clap::value_parser!(u64).range(..=i64::MAX as u64))]
     seed: u64,
-    /// How long the run is struck, at least; starting and healing come on top [s].
+    /// Minimum duration of the fault injection, without start and recovery [s].
     #[arg(long, value_name = "N", default_value_t = 60,
           value_parser = clap::value_parser!(u64).range(1..=86_400))]
     seconds: u64,
-    /// A task of `dmprl tasks`, or anything that `train` takes.
+    /// A task of `dmprl tasks`, or any other that `train` accepts.
     #[arg(long, default_value = "reacher")]
     task: String,
-    /// Worker processes.
+    /// Number of worker processes.
     #[arg(long, value_name = "W", default_value_t = 2,
           value_parser = clap::value_parser!(u32).range(1..=64))]
     workers: u32,
-    /// Go on beyond --seconds until so many workers have been killed.
+    /// Continue beyond --seconds until this many workers have been killed.
     #[arg(long, value_name = "N", default_value_t = 0)]
     worker_kills: u64,
-    /// Go on beyond --seconds until so many learners have been killed.
+    /// Continue beyond --seconds until this many learners have been killed.
     #[arg(long, value_name = "N", default_value_t = 0)]
     learner_kills: u64,
-    /// Where the run and its logs go, and stay; new or empty [default: a temporary folder that is
-    /// removed when all is well].
+    /// Directory to keep the run and its logs in, new or empty [default: a temporary folder,
+    /// removed if all checks pass].
     #[arg(long, value_name = "DIR")]
     output: Option<PathBuf>,
     /// Print one JSON object on standard output.
@@ -66,7 +66,7 @@ pub(super) struct ChaosArgs {
 }
 
 pub(super) fn run(args: &ChaosArgs) -> anyhow::Result<Outcome> {
-    // Before the clock runs: making the environment takes minutes.
+    // Prepare Python before the clock starts: it can take minutes.
     prepare_python()?;
     let plan = TrialPlan {
         program: this_program()?,
@@ -81,7 +81,7 @@ pub(super) fn run(args: &ChaosArgs) -> anyhow::Result<Outcome> {
     let report = chaos(&plan)?;
     emit(&if args.json { report.json().to_string() } else { report.text() })?;
     if !report.is_sound() {
-        bail!("the run broke what it promises; the report has the sentences");
+        bail!("the run violated its guarantees; the report describes each violation");
     }
     Ok(if report.is_interrupted() { Outcome::Interrupted } else { Outcome::Done })
 }

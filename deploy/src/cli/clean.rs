@@ -1,4 +1,4 @@
-//! `dmprl clean`: what dead runs have left in shared memory, removed.
+//! `dmprl clean`: removes the shared memory of dead runs.
 
 use clap::Args;
 
@@ -8,19 +8,19 @@ use crate::launch::Place;
 use crate::terminal::binary_bytes;
 
 const HELP: &str = "\
-A run that was killed leaves its shared memory behind. Removed is what has dmprl's marker, belongs
-to you, and whose supervisor and learner are dead: a live run holds a lock on its own. The next
-`train` does the same; run directories and checkpoints are never touched.
+A killed run leaves its shared memory behind. This removes shared memory that has dmprl's marker and
+belongs to you, if the run's supervisor and learner are dead: a live run holds a lock on its own.
+The next `train` does the same. Run directories and checkpoints are never touched.
 
 EXAMPLES
-  dmprl clean --dry-run    # only say what there is
+  dmprl clean --dry-run    # only list
   dmprl clean";
 
 /// Arguments of `dmprl clean`.
 #[derive(Debug, Args)]
 #[command(after_help = HELP)]
 pub(super) struct CleanArgs {
-    /// Remove nothing, only list.
+    /// List without removing.
     #[arg(long)]
     dry_run: bool,
     /// Print one JSON object on standard output.
@@ -49,7 +49,7 @@ pub(super) fn run(args: &CleanArgs) -> anyhow::Result<Outcome> {
         })
         .collect();
     lines.push(match (leftovers.len(), args.dry_run) {
-        (0, _) => format!("dead runs have left nothing in {}", place.base().display()),
+        (0, _) => format!("no shared memory of dead runs in {}", place.base().display()),
         (count, true) => format!("{} of {count} dead runs to remove", binary_bytes(bytes)),
         (count, false) => format!("{} of {count} dead runs removed", binary_bytes(bytes)),
     });

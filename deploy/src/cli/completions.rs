@@ -1,5 +1,5 @@
-//! `dmprl completions` and `dmprl man`: what a shell and `man` want to know of this program, made
-//! from the very definitions that parse its command line.
+//! `dmprl completions` and `dmprl man`: shell completions and manual pages, generated from the
+//! definitions that parse the command line.
 
 use std::path::{Path, PathBuf};
 
@@ -12,7 +12,7 @@ use crate::failure::Outcome;
 use crate::run_directory::replace_file;
 use crate::terminal::{say, shown};
 
-/// Section 1 of the manual: programs.
+/// Section 1 of the manual: commands.
 const SECTION: &str = "1";
 
 const COMPLETIONS_HELP: &str = "\
@@ -32,7 +32,7 @@ EXAMPLES
 #[derive(Debug, Args)]
 #[command(after_help = COMPLETIONS_HELP)]
 pub(super) struct CompletionsArgs {
-    /// Whose.
+    /// Shell for which to print completions.
     shell: Shell,
 }
 
@@ -40,14 +40,14 @@ pub(super) struct CompletionsArgs {
 #[derive(Debug, Args)]
 #[command(after_help = MAN_HELP)]
 pub(super) struct ManArgs {
-    /// Where the pages go; made if it is not there.
+    /// Directory for the pages; created if missing.
     #[arg(long, value_name = "DIR", default_value = "man")]
     output: PathBuf,
 }
 
 pub(super) fn completions(args: &CompletionsArgs) -> anyhow::Result<Outcome> {
     let program = Arguments::command();
-    // Roles are started by the program itself: nobody wants them completed.
+    // Leave the roles out: the program itself starts them.
     let shown: Vec<_> =
         program.get_subcommands().filter(|own| !own.is_hide_set()).cloned().collect();
     let mut program = clap::Command::new("dmprl").args(program.get_arguments()).subcommands(shown);
@@ -67,10 +67,10 @@ pub(super) fn man(args: &ManArgs) -> anyhow::Result<Outcome> {
     Ok(Outcome::Done)
 }
 
-/// The page of a command and those of its own commands; how many.
+/// Writes the page of a command and of its subcommands; returns their number.
 fn write_pages(command: &clap::Command, name: &str, folder: &Path) -> anyhow::Result<usize> {
     let mut page = Vec::new();
-    // A page names its command as `man` finds it: dmprl-bench-policy.
+    // A page has the name by which `man` finds it: dmprl-bench-policy.
     let named = command.clone().name(name.to_owned()).display_name(name.to_owned());
     clap_mangen::Man::new(named)
         .section(SECTION)

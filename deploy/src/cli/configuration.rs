@@ -1,5 +1,5 @@
-//! Stage 1 of 8, the command's side: from task, preset, file, environment and flags to one
-//! configuration.
+//! Stage 1 of 8, the command's side: merges task, preset, file, environment variables and flags
+//! into one configuration.
 
 use std::path::Path;
 
@@ -13,39 +13,39 @@ use toml::{Table, Value};
 use crate::failure::wrong_use;
 
 const PREFIX: &str = "DMPRL_";
-/// A configuration file is a few kilobytes.
+/// Size limit of a configuration file, which has a few kilobytes.
 const FILE_BYTES_MAX: u64 = 1 << 20;
 
-/// One key set by a flag of its own.
+/// A key that is set by its own flag.
 #[derive(Debug)]
 pub(super) struct Flag {
-    /// As typed.
+    /// The flag as typed, for error messages.
     pub(super) flag: &'static str,
-    /// The dotted key.
+    /// Dotted configuration key.
     pub(super) key: &'static str,
-    /// The value.
+    /// Value to set.
     pub(super) value: Value,
 }
 
-/// Everything that says something about the configuration, lowest precedence first.
+/// All sources of a configuration, lowest precedence first.
 #[derive(Debug)]
 pub(super) struct Sources<'a> {
     pub(super) task: &'a str,
     pub(super) preset: &'a str,
     pub(super) file: Option<&'a Path>,
-    /// All environment variables; those not ours are passed over.
+    /// All environment variables; those without our prefix are ignored.
     pub(super) environment: Vec<(String, String)>,
-    /// `key=value` each, in the order given.
+    /// `key=value` pairs of `--set`, in the order given.
     pub(super) set: &'a [String],
-    /// Flags say the same as `--set` and are laid over it.
+    /// Keys set by flags; they override `--set`.
     pub(super) flags: Vec<Flag>,
 }
 
-/// Merges the sources; every mistake in them is wrong use.
+/// Merges the sources. Every mistake in them is wrong use.
 ///
-/// Which policy and which algorithm it is is known only at the end. The policy's own defaults lie
-/// over the task's, the algorithm's over the preset: where there are some, the sources are merged
-/// once more with them.
+/// Policy and algorithm are known only after merging. The policy's own defaults override the
+/// task's, and the algorithm's override the preset: if there are any, the sources are merged once
+/// more with them.
 pub(super) fn merge(sources: &Sources<'_>) -> anyhow::Result<ExperimentConfig> {
     let config = merge_with(&Own::default(), sources)?;
     let own = Own {
@@ -58,7 +58,7 @@ pub(super) fn merge(sources: &Sources<'_>) -> anyhow::Result<ExperimentConfig> {
     }
 }
 
-/// What policy and algorithm bring with them.
+/// Defaults of the policy and of the algorithm.
 #[derive(Debug, Default)]
 struct Own {
     policy: Option<Table>,
@@ -106,7 +106,7 @@ fn merge_with(own: &Own, sources: &Sources<'_>) -> anyhow::Result<ExperimentConf
     Ok(config)
 }
 
-/// `ConfigError` is the user's mistake wherever it comes from.
+/// Reports a `ConfigError` as wrong use: it is the user's mistake, whatever its source.
 pub(super) fn refuse(error: ConfigError) -> anyhow::Error {
     wrong_use(error.to_string())
 }
@@ -136,7 +136,7 @@ fn task_table(name: &str) -> anyhow::Result<Table> {
     )))
 }
 
-/// `[module:][namespace/]Name-vN`.
+/// Matches `[module:][namespace/]Name-vN`.
 fn is_gymnasium_id(text: &str) -> bool {
     let (module, id) = text.split_once(':').map_or((None, text), |(module, id)| (Some(module), id));
     let word = |text: &str, also: &str| {
@@ -155,7 +155,7 @@ fn is_gymnasium_id(text: &str) -> bool {
         && version.chars().all(|letter| letter.is_ascii_digit())
 }
 
-/// `[package.]module:Class`: a `dmprl.segment_env.SegmentEnv` of the user's own.
+/// Matches `[package.]module:Class`, the user's own `dmprl.segment_env.SegmentEnv`.
 fn is_class(text: &str) -> bool {
     let identifier = |text: &str| {
         text.starts_with(|letter: char| letter.is_ascii_alphabetic() || letter == '_')
@@ -213,7 +213,7 @@ mod tests {
         error.to_string()
     }
 
-    /// One more source each time, each with a value of its own for the same key: the last wins.
+    /// Adds one source at a time, each with its own value for the same key: the last wins.
     #[test]
     fn each_layer_overrides_the_one_before() {
         let mut file = tempfile::NamedTempFile::new().unwrap();
@@ -222,7 +222,7 @@ mod tests {
         let mut merged = Vec::new();
         for layers in 0..5 {
             let mut sources = sources("pusher");
-            // The paper's preset does not set run.steps: its own key shows that it is below.
+            // The paper's preset does not set run.steps: a key of its own shows that it is below.
             sources.preset = if layers >= 1 { "paper" } else { "default" };
             sources.file = (layers >= 1).then_some(file.path());
             sources.environment = vec![variable("HOME", "/root")];

@@ -1,4 +1,4 @@
-//! The arguments that `train` and `bench rollout` share: what the configuration is made of.
+//! Arguments that determine the configuration, shared by `train` and the benchmarks.
 
 use std::path::PathBuf;
 
@@ -10,16 +10,16 @@ use toml::Value;
 use super::configuration::{Flag, Sources};
 use crate::failure::wrong_use;
 
-/// Arguments that say something about the configuration.
+/// Arguments that determine the configuration.
 #[derive(Debug, Args)]
 pub(super) struct ConfiguredArgs {
     /// Learning algorithm.
     #[arg(long, value_parser = PossibleValuesParser::new(["ddpg", "td3", "sac", "ndp"]))]
     algo: Option<String>,
-    /// What decides the actions: a DMP per segment, or a network per step.
+    /// Policy: a DMP per segment, or a network per step.
     #[arg(long, value_parser = PossibleValuesParser::new(["dmp", "mlp"]))]
     policy: Option<String>,
-    /// Named set of values.
+    /// Named set of configuration values.
     #[arg(long, default_value = "default",
           value_parser = PossibleValuesParser::new(PRESETS.iter().map(|preset| preset.name)))]
     preset: String,
@@ -32,7 +32,7 @@ pub(super) struct ConfiguredArgs {
     /// Seed of every random stream.
     #[arg(long, value_name = "S", value_parser = integer())]
     seed: Option<i64>,
-    /// Directory of your own environment modules; repeatable.
+    /// Folder with your own environment modules; repeatable.
     #[arg(long, value_name = "DIR")]
     python_path: Vec<PathBuf>,
     /// Configuration file, such as a run's config.toml.
@@ -44,7 +44,7 @@ pub(super) struct ConfiguredArgs {
 }
 
 impl ConfiguredArgs {
-    /// Whether nothing was said.
+    /// Returns true if no argument was given.
     pub(super) fn is_empty(&self) -> bool {
         let words = [&self.algo, &self.policy].into_iter().all(Option::is_none);
         let counts = [self.workers, self.envs_per_worker].into_iter().all(|count| count.is_none());
@@ -53,8 +53,7 @@ impl ConfiguredArgs {
         words && counts && lists && seed && self.preset == PRESETS[0].name
     }
 
-    /// Everything that is said about the configuration of `task`; `more`: by the command's own
-    /// flags.
+    /// Collects all sources of the configuration of `task`; `more` are the command's own flags.
     pub(super) fn sources<'a>(
         &'a self,
         task: &'a str,
@@ -81,18 +80,18 @@ impl ConfiguredArgs {
     }
 }
 
-/// A flag that sets `key`; none if it was not given.
+/// A flag that sets `key`, or `None` if it was not given.
 pub(super) fn flag(flag: &'static str, key: &'static str, value: Option<Value>) -> Option<Flag> {
     value.map(|value| Flag { flag, key, value })
 }
 
-/// TOML's integers have 64 bits with a sign.
+/// Parses a non-negative integer: TOML's integers are signed, with 64 bits.
 pub(super) fn integer() -> RangedI64ValueParser<i64> {
     clap::value_parser!(i64).range(0..)
 }
 
 /// Makes the paths of the user's modules and demonstrations absolute: other processes have other
-/// working directories, and a run is resumed from anywhere.
+/// working directories, and a run can be resumed from any directory.
 pub(super) fn make_absolute(config: &mut ExperimentConfig) -> anyhow::Result<()> {
     for path in &mut config.task.python_path {
         *path = absolute_folder(path)?;
@@ -103,7 +102,7 @@ pub(super) fn make_absolute(config: &mut ExperimentConfig) -> anyhow::Result<()>
     Ok(())
 }
 
-/// The value of a flag that names files or folders; none if it was not given.
+/// The value of a flag with file or folder names, or `None` if it was not given.
 pub(super) fn paths(flag: &str, paths: &[PathBuf]) -> anyhow::Result<Option<Value>> {
     let texts = paths.iter().map(|path| {
         let text = path.to_str().map(|text| Value::String(text.to_owned()));
@@ -136,7 +135,8 @@ fn text(absolute: PathBuf) -> anyhow::Result<String> {
     absolute.into_os_string().into_string().map_err(|_| wrong_use(format!("{shown}: no UTF-8")))
 }
 
-/// `DMPRL_` variables must be text; others may be anything and are none of our business.
+/// Collects environment variables. `DMPRL_` variables must be UTF-8; others that are not are
+/// skipped.
 fn environment() -> anyhow::Result<Vec<(String, String)>> {
     let mut texts = Vec::new();
     for (name, value) in std::env::vars_os() {

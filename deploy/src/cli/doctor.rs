@@ -1,4 +1,4 @@
-//! `dmprl doctor`: what this machine has, what it lacks, and what to do.
+//! `dmprl doctor`: checks this machine and suggests remedies.
 
 use anyhow::bail;
 use clap::Args;
@@ -10,8 +10,8 @@ use crate::doctor::{DefaultRun, Report};
 use crate::failure::Outcome;
 
 const HELP: &str = "\
-Looks only: nothing is installed, made or changed. A warning is something to know, a problem
-something that keeps runs from working; exit status 1 if there is a problem.
+Changes nothing: it neither installs nor creates anything. A warning is for information; a problem
+prevents runs from working. Exit status 1 if there is a problem.
 
 EXAMPLES
   dmprl doctor
@@ -35,12 +35,12 @@ pub(super) fn run(args: &DoctorArgs) -> anyhow::Result<Outcome> {
     emit(&if args.json { report.json().to_string() } else { report.text() })?;
     match report.problems() {
         0 => Ok(Outcome::Done),
-        1 => bail!("1 problem; what to do stands beside it"),
-        count => bail!("{count} problems; what to do stands beside each"),
+        1 => bail!("1 problem; its remedy is listed above"),
+        count => bail!("{count} problems; their remedies are listed above"),
     }
 }
 
-/// What `dmprl train TASK` without any flag would do here.
+/// The configuration of `dmprl train TASK` without flags on this machine.
 fn default_config(task: &TaskDefaults) -> anyhow::Result<ExperimentConfig> {
     let sources = Sources {
         task: task.name,

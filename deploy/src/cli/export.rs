@@ -1,4 +1,4 @@
-//! `dmprl export`: a run's policy as one file.
+//! `dmprl export`: writes a run's policy as one file.
 
 use std::path::{Path, PathBuf};
 
@@ -11,10 +11,10 @@ use crate::run_directory::{PolicyChoice, RunDirectory, replace_file};
 use crate::terminal::{binary_bytes, shown};
 
 const HELP: &str = "\
-The file holds all that it takes to act: observation normalisation, network, movement primitive,
-controller, start, action bounds, and where it comes from. safetensors is read by the crate
-dmprl-shared (dmprl_shared::runtime), without Python, and by dmprl.Policy in Python, with NumPy
-alone; onnx by every ONNX runtime: input `observation` (batch, O), output `actions` (batch, K, A).
+The file contains everything needed to act: observation normalisation, network, movement primitive,
+controller, start, action bounds, and its origin. safetensors is read by the crate dmprl-shared
+(dmprl_shared::runtime), without Python, and in Python by dmprl.Policy, which needs only NumPy. onnx
+is for any ONNX runtime: input `observation` (batch, O), output `actions` (batch, K, A).
 
 EXAMPLES
   dmprl export runs/mine                           # runs/mine/reacher.safetensors
@@ -27,10 +27,10 @@ EXAMPLES
 pub(super) struct ExportArgs {
     /// The run directory.
     run: PathBuf,
-    /// What to write [default: by the end of --output, else safetensors].
+    /// File format [default: by the extension of --output, else safetensors].
     #[arg(long)]
     format: Option<Format>,
-    /// The file; one that is there is replaced [default: the task's name, in the run directory].
+    /// Output file; an existing one is replaced [default: the task's name, in the run directory].
     #[arg(long, value_name = "PATH")]
     output: Option<PathBuf>,
     /// best, latest, or a policy version.
@@ -61,11 +61,11 @@ impl Format {
     }
 }
 
-/// What is replaced must be a file: no folder, and no device, which root could replace.
+/// Rejects an output that is no regular file: root could replace even a device.
 fn check_output(path: &Path) -> anyhow::Result<()> {
     let refused = |what: &str| Err(wrong_use(format!("--output {}: {what}", path.display())));
     if path.exists() && !path.is_file() {
-        return refused("expected a file or a new name, got what is no regular file");
+        return refused("expected a file or a new name, got something that is no regular file");
     }
     match path.parent().filter(|parent| !parent.as_os_str().is_empty()) {
         Some(folder) if !folder.is_dir() => refused("there is no such folder; make it first"),

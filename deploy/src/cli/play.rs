@@ -1,4 +1,4 @@
-//! `dmprl play`: a policy at work, live.
+//! `dmprl play`: shows a policy live.
 
 use std::path::PathBuf;
 use std::process::{Command, Stdio};
@@ -15,17 +15,17 @@ use crate::failure::Outcome;
 use crate::run_directory::{PolicyChoice, RunDirectory};
 use crate::terminal::say;
 
-/// Between two looks whether it has ended or is to end.
+/// Interval between checks for exit and interrupt.
 const LOOK: Duration = Duration::from_millis(50);
-/// A player that was asked to end has so long.
+/// Grace period after the interrupt, before the player is killed.
 const END: Duration = Duration::from_secs(5);
-/// The optional part of the Python package that makes pictures.
+/// Extra of the Python package for rendering.
 const EXTRA: &str = "video";
 
 const HELP: &str = "\
-Plays noise-free episodes at the robot's own pace, a seed each, until Ctrl-C: in a window where
-there is a display, otherwise as a page on loopback, whose address is printed. From another machine:
-ssh -L 8788:127.0.0.1:8788 HOST, then http://127.0.0.1:8788/.
+Plays noise-free episodes in real time, each with its own seed, until Ctrl-C. It opens a window if
+there is a display; otherwise it serves a page on loopback and prints its address. From another
+machine: ssh -L 8788:127.0.0.1:8788 HOST, then http://127.0.0.1:8788/.
 
 EXAMPLES
   dmprl play runs/mine
@@ -44,13 +44,13 @@ pub(super) struct PlayArgs {
     /// Seed of the first episode [default: evaluation.first_seed of the run].
     #[arg(long, value_name = "N")]
     seed: Option<u64>,
-    /// End after so many episodes [default: never].
+    /// Stop after this many episodes [default: never].
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u64).range(1..))]
     episodes: Option<u64>,
-    /// A page also where there is a display.
+    /// Serve a page even if there is a display.
     #[arg(long)]
     stream: bool,
-    /// Port of the page; 0: any that is free.
+    /// Port of the page; 0: any free port.
     #[arg(long, value_name = "PORT", default_value_t = 8788)]
     port: u16,
 }
@@ -78,12 +78,12 @@ pub(super) fn run(args: &PlayArgs) -> anyhow::Result<Outcome> {
     if window {
         command.arg("--window");
     } else {
-        say("no window; look at the page with a browser (Ctrl-C ends it):");
+        say("no window; open this page in a browser (Ctrl-C ends it):");
     }
     play(command)
 }
 
-/// X11 or Wayland.
+/// Detects X11 or Wayland.
 fn has_display() -> bool {
     ["DISPLAY", "WAYLAND_DISPLAY"]
         .into_iter()
@@ -93,7 +93,8 @@ fn has_display() -> bool {
 /// Runs the player until it ends or the user interrupts.
 fn play(mut command: Command) -> anyhow::Result<Outcome> {
     let watch = Watch::start()?;
-    // The terminal's interrupt comes to this process alone, which passes it on, once.
+    // A process group of its own keeps the terminal's interrupt from the player; this process
+    // passes it on once.
     std::os::unix::process::CommandExt::process_group(&mut command, 0);
     // SAFETY: `prctl` is async-signal-safe, allocates nothing and touches no lock.
     unsafe {
@@ -109,13 +110,13 @@ fn play(mut command: Command) -> anyhow::Result<Outcome> {
             return match status.code() {
                 _ if asked.is_some() => Ok(Outcome::Interrupted),
                 Some(0) => Ok(Outcome::Done),
-                _ => bail!("the player ended with {status}; what it said is above"),
+                _ => bail!("the player ended with {status}; its output is above"),
             };
         }
         match asked {
             None if watch.check().is_err() => {
                 asked = Some(Instant::now());
-                // One that has ended meanwhile needs none.
+                // Fails if the player has exited meanwhile, which is fine.
                 let _ = id.map(|id| kill_process(id, Signal::INT));
             }
             Some(at) if at.elapsed() > END => {

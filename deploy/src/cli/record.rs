@@ -1,4 +1,4 @@
-//! `dmprl record`: what a policy does, as a video, an animation and a strip of frames.
+//! `dmprl record`: records a policy's episodes as a video, an animation and a strip of frames.
 
 use std::path::PathBuf;
 
@@ -12,10 +12,11 @@ use crate::run_directory::{PolicyChoice, RunDirectory};
 use crate::terminal::{StagesProgress, say, shown};
 
 const HELP: &str = "\
-The episodes are those of `dmprl eval`: noise-free, a seed each. Written are an MP4, a GIF and a
-PNG with frames in a row, with time, return so far and, where the task says so, success. Needs no
-display: OpenGL by EGL or OSMesa; where there is none, the error names the packages. The tasks of
-`dmprl tasks` draw their goal, other environments whatever their render mode `rgb_array` draws.
+The episodes are those of `dmprl eval`: noise-free, each with its own seed. Writes an MP4, a GIF,
+and a PNG with a row of frames. They show the time, the return so far and, if the task reports it,
+success. Needs no display: it renders with OpenGL by EGL or OSMesa; if both are missing, the error
+names the packages. The tasks of `dmprl tasks` draw their goal; other environments are recorded as
+their render mode `rgb_array` draws them.
 
 EXAMPLES
   dmprl record runs/mine
@@ -23,7 +24,7 @@ EXAMPLES
   dmprl record runs/td3-dmp --compare runs/td3-mlp --seed 1004
   dmprl record runs/mine --output pictures --json";
 
-/// More episodes than anybody watches.
+/// More would be a video too long to watch.
 const EPISODES_MAX: u64 = 100;
 
 /// Arguments of `dmprl record`.
@@ -38,15 +39,15 @@ pub(super) struct RecordArgs {
     /// Seed of the first episode [default: evaluation.first_seed of the run].
     #[arg(long, value_name = "N")]
     seed: Option<u64>,
-    /// Episodes, one after the other, each with the next seed.
+    /// Number of episodes, each with the next seed.
     #[arg(long, value_name = "N", default_value_t = 1,
         value_parser = clap::value_parser!(u64).range(1..=EPISODES_MAX))]
     episodes: u64,
-    /// Show this run's episodes beside them: the same task, the same seeds. Of its policies the
-    /// best or the latest; the best where --policy is a version.
+    /// Show this run's episodes next to them, with the same task and seeds. It uses the same choice
+    /// of --policy, or its best if --policy is a version.
     #[arg(long, value_name = "RUN2")]
     compare: Option<PathBuf>,
-    /// Where the files go [default: videos in the run].
+    /// Output directory [default: videos in the run].
     #[arg(long, value_name = "DIR")]
     output: Option<PathBuf>,
     /// Print one JSON object on standard output.
@@ -59,7 +60,7 @@ pub(super) fn run(args: &RecordArgs) -> anyhow::Result<Outcome> {
     let other = args.compare.as_deref().map(RunDirectory::open).transpose()?;
     let mut sides = vec![(&run, run.choose_policy(args.policy)?)];
     if let Some(other) = &other {
-        // A version is of one run; the other shows its best.
+        // A version belongs to one run; the other shows its best policy.
         let choice = match args.policy {
             PolicyChoice::Version(_) => PolicyChoice::Best,
             choice => choice,
@@ -91,7 +92,7 @@ pub(super) fn run(args: &RecordArgs) -> anyhow::Result<Outcome> {
     } else {
         emit(&text(&recordings))?;
         if recordings.sides[0].robot.goal_in_pictures.is_empty() {
-            say("whether the pictures show a goal is the environment's business: it does not say");
+            say("the pictures may not show a goal: the environment does not declare it");
         }
     }
     Ok(Outcome::Done)

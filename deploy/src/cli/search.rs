@@ -1,4 +1,4 @@
-//! `dmprl sweep` of a file with `[search]`.
+//! `dmprl sweep` with a file that has `[search]`.
 
 use anyhow::{Context, bail};
 
@@ -9,7 +9,7 @@ use crate::sweep::search::{SearchSweep, Study, TUNING_SEED, Trial, search as run
 use crate::sweep::{Ledger, Search, Site, SweepFile};
 use crate::terminal::{say, shown};
 
-/// The optional part of the Python package with Optuna.
+/// Extra of the Python package with Optuna.
 const EXTRA: &str = "search";
 
 pub(super) fn run(
@@ -56,7 +56,7 @@ pub(super) fn run(
     Ok(Outcome::Done)
 }
 
-/// What a search looks for, and how far it is.
+/// Prints a search's space, trials and best values.
 struct Listing<'a> {
     site: &'a Site,
     search: &'a Search,
@@ -171,7 +171,7 @@ fn plural(count: usize, one: &str, many: &str) -> String {
     format!("{count} {}", if count == 1 { one } else { many })
 }
 
-/// A name of the file's.
+/// A value as written in the sweep file.
 fn word(value: &impl serde::Serialize) -> String {
     let json = serde_json::to_value(value).unwrap_or_default();
     json.as_str().unwrap_or_default().to_owned()

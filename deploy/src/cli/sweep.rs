@@ -1,4 +1,4 @@
-//! `dmprl sweep`: from a file to many runs.
+//! `dmprl sweep`: trains many runs from one file.
 
 use std::path::{Path, PathBuf};
 
@@ -14,49 +14,50 @@ use crate::sweep::{Ledger, Plan, PlannedRun, RunState, Site, Sweep, SweepFile, s
 use crate::terminal::{grouped, say, shown};
 
 const HELP: &str = "\
-FILE is TOML: every task with every method, at every point of the grid, with every seed.
+FILE is TOML. It trains every task with every method, at every point of the grid, with every seed.
   seeds = [1, 2, 3]
   set = { evaluation.episodes = 20 }      # any configuration key, for every run
   [[task]]
   name = \"reacher\"
   steps = 60_000
-  [[method]]                              # none: the defaults
+  [[method]]                              # optional; without: the defaults
   name = \"td3-mlp\"                        # part of the runs' paths
   label = \"TD3\"                           # in plots and tables
   algo = \"td3\"
   policy = \"mlp\"                          # also preset; set, as above
   [grid]
   algorithm.batch_size = [128, 256]
-Each run is a `dmprl train` in OUTPUT/TASK/METHOD[/VALUES]/seed-S. Stopped or killed, the same
-command goes on: what has finished is not done again, what was under way goes on from its
-checkpoint. A run that fails costs the others nothing; the next start tries it again.
-Ctrl-C once: the runs write a checkpoint; twice: at once.
+Each run is a `dmprl train` in OUTPUT/TASK/METHOD[/VALUES]/seed-S. After a stop or a crash, run the
+same command again: it skips finished runs and resumes the others from their checkpoints. A failed
+run does not affect the others; the next start tries it again.
+On Ctrl-C the runs write a checkpoint; a second Ctrl-C stops them at once.
 
-SEARCH, instead of [grid]: Optuna proposes the values, trial by trial.
+SEARCH, instead of [grid]: Optuna suggests the values of each trial.
   [search]
-  trials = 40                             # of each task and method
+  trials = 40                             # for each task and method
   objective = \"return\"                    # or success; of the last evaluation, maximised
   sampler = \"tpe\"                         # or random
   pruner = \"median\"                       # or hyperband, none
-  prune_after_trials = 5                  # finished ones, before median gives any up
+  prune_after_trials = 5                  # finished trials before the median pruner starts
   seed = 0                                # of the sampler
   [search.space]
   algorithm.critic_learning_rate = { low = 1e-4, high = 3e-3, log = true }
-  dmp.basis_count = { low = 3, high = 7 }    # the key holds an integer: whole numbers
+  dmp.basis_count = { low = 3, high = 7 }    # integers, because the key holds an integer
   exploration.kind = [\"gaussian\", \"pink\"]  # one of these
-  [[search.first]]                        # tried before any other; what is left out is proposed
+  [[search.first]]                        # tried first; missing values are suggested by Optuna
   dmp.basis_count = 5
 A trial is trained with each seed, one after the other, in OUTPUT/TASK/METHOD/trial-N/seed-S; its
-objective is the mean over them. The pruner sees each evaluation and compares it with that of the
-same number in other trials; a trial given up is interrupted and stays as it is. A trial that fails
-counts as one. The runs evaluate on episodes of seeds from 5000 on (evaluation.first_seed; less is
-refused), never on those of the evaluation, 1000 and on: train the best anew to know how good it is.
+objective is the mean over the seeds. The pruner compares each evaluation with the evaluation of the
+same number in other trials. A pruned trial is interrupted and not resumed. A failed trial counts as
+a trial. The runs evaluate on episodes with seeds from 5000 on (evaluation.first_seed; lower values
+are rejected), which the final evaluation, with seeds from 1000 on, does not use. Train the best
+configuration anew to measure its performance:
   dmprl train TASK --config OUTPUT/TASK/METHOD/best.toml
-Optuna is installed into .venv by the first search. OUTPUT/optuna.db is its storage, for its own
-tools too: optuna-dashboard sqlite:///OUTPUT/optuna.db
+The first search installs Optuna into .venv. OUTPUT/optuna.db is its storage, which its own tools
+can read too: optuna-dashboard sqlite:///OUTPUT/optuna.db
 
 EXAMPLES
-  dmprl sweep mine.toml --dry-run    # what it would run, and how far each is
+  dmprl sweep mine.toml --dry-run    # list the runs and their progress
   dmprl sweep mine.toml --jobs 4
   dmprl sweep deploy/experiments/search-reacher.toml";
 
@@ -66,17 +67,17 @@ EXAMPLES
 pub(super) struct SweepArgs {
     /// The sweep file.
     pub(super) file: PathBuf,
-    /// Where the runs go [default: runs/ and the file's name without .toml].
+    /// Output directory of the runs [default: runs/ and the file's name without .toml].
     #[arg(long, value_name = "DIR")]
     output: Option<PathBuf>,
-    /// Runs at once, in a search trials [default: as many as have cores for their workers and the
-    /// learner's threads].
+    /// Concurrent runs, or trials in a search [default: as many as fit the cores, with one per
+    /// worker and learner thread].
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u16).range(1..=1024))]
     pub(super) jobs: Option<u16>,
-    /// Train nothing, only list the runs, or space and trials of a search, and how far each is.
+    /// Only list the runs, or a search's space and trials, with their progress.
     #[arg(long)]
     pub(super) dry_run: bool,
-    /// Print one JSON object on standard output: each run, or trial, with directory and state.
+    /// Print one JSON object on standard output, with the directory and state of each run or trial.
     #[arg(long)]
     pub(super) json: bool,
 }
@@ -98,19 +99,19 @@ pub(super) fn run(args: &SweepArgs) -> anyhow::Result<Outcome> {
     }
     let _lock = take(&mut plan.site)?;
     plan.ledger = Ledger::open(&plan.site.output)?;
-    // Once, before several runs want it at the same time.
+    // Prepare Python once, before several runs need it at the same time.
     prepare_python()?;
     finish(plan, args)
 }
 
-/// Makes the sweep's directory and takes it for this process.
+/// Creates the sweep's directory and locks it.
 pub(super) fn take(site: &mut Site) -> anyhow::Result<RunLock> {
     let output = &mut site.output;
     std::fs::create_dir_all(&*output)
         .with_context(|| format!("cannot make {}", output.display()))?;
     *output = std::fs::canonicalize(&*output)
         .with_context(|| format!("cannot resolve {}", output.display()))?;
-    // Children inherit it: those of a sweep that was killed write their checkpoints first.
+    // Children inherit the lock: those of a killed sweep first write their checkpoints.
     RunLock::take(output, RESUME_WAIT)
 }
 
@@ -132,7 +133,8 @@ fn finish(mut plan: Sweep, args: &SweepArgs) -> anyhow::Result<Outcome> {
     }
 }
 
-/// The configuration of each run; the first mistake in the file is told before anything starts.
+/// Returns the configuration of each run; reports the first mistake in the file before any run
+/// starts.
 fn configured(plan: Plan) -> anyhow::Result<Vec<(PlannedRun, ExperimentConfig)>> {
     let configured = plan.runs.into_iter().map(|run| {
         let config = train_configuration(&run.arguments)
@@ -147,7 +149,8 @@ fn default_output(file: &Path) -> anyhow::Result<PathBuf> {
     Ok(Path::new("runs").join(name))
 }
 
-/// As many as the user says, else as have a core for each worker and each thread of the learner.
+/// Returns the number of concurrent runs: as given, or as many as have a core for each worker and
+/// each learner thread.
 pub(super) fn jobs<'a>(
     args: &SweepArgs,
     runs: impl Iterator<Item = &'a ExperimentConfig>,

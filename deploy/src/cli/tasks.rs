@@ -1,4 +1,4 @@
-//! `dmprl tasks`.
+//! `dmprl tasks`: lists the tasks with a short name.
 
 use clap::Args;
 use dmprl_shared::config::{TASKS, TaskDefaults};
