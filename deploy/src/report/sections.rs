@@ -213,11 +213,10 @@ fn statements(judged: &[Judged]) -> Section {
         "Rules applied to the runs' figures decide. \"Held\" and \"did not hold\" need at least \
          {SEEDS_MIN} seeds of each method, {EPISODES_MIN} episodes in each last evaluation, and \
          95 % intervals that do not overlap (of the interquartile mean, or of the median for \
-         steps). With fewer the verdict is \"too few seeds\" or \"too few episodes\". Statements about the \
-         course of training use the evaluations before the last, whatever their number of \
-         episodes. Overlapping intervals \
-         are \"no clear difference\". A statement that methods are alike, or that one does not \
-         improve, held where no difference is clear. \
+         steps). With fewer the verdict is \"too few seeds\" or \"too few episodes\". Statements \
+         about the course of training use the evaluations before the last, whatever their number \
+         of episodes. Overlapping intervals are \"no clear difference\". A statement that methods \
+         are alike, or that one does not improve, held where no difference is clear. \
          \"Cannot hold\": the paper's own figures contradict it. Fails: a success rate of at most \
          {NONE}; almost always: of at least {ALMOST_ALL}; loses again: more than {LOSS} of what it \
          had won, by moving means of five evaluations. The paper trained for about 200,000 steps; \
