@@ -34,7 +34,9 @@ fn main() {
         println!("cargo::rerun-if-changed=../{source}");
     }
     let commit = commit();
-    println!("cargo::rustc-env=DMPRL_GIT_COMMIT={}", commit.unwrap_or_default());
+    // Cargo also sets this for programs that it runs. A name with our own prefix would be taken for
+    // a configuration key.
+    println!("cargo::rustc-env=GIT_COMMIT_OF_BUILD={}", commit.unwrap_or_default());
 }
 
 /// The commit that is checked out, with `-dirty` where the sources differ from it; none outside a

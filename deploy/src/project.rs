@@ -31,5 +31,5 @@ fn is_root(path: &Path) -> bool {
 /// none if it was built outside a git repository. `build.rs` records it.
 #[must_use]
 pub fn git_commit() -> Option<String> {
-    Some(env!("DMPRL_GIT_COMMIT")).filter(|commit| !commit.is_empty()).map(str::to_owned)
+    Some(env!("GIT_COMMIT_OF_BUILD")).filter(|commit| !commit.is_empty()).map(str::to_owned)
 }
