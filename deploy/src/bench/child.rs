@@ -1,4 +1,4 @@
-//! A child process that speaks in lines and never outlives this one.
+//! A child process that communicates in lines and never outlives this process.
 
 use std::io::{BufRead, BufReader, Read, Write};
 use std::path::{Path, PathBuf};
@@ -13,17 +13,17 @@ use serde::Deserialize;
 use super::watch::Watch;
 use crate::launch::{describe, last_lines};
 
-/// Lines that were said and not asked for yet; full: the child waits.
+/// Received but unread lines. When the channel is full, the child blocks.
 const LINES_MAX: usize = 64;
-/// A longer line is none of ours.
+/// Limit of a line's length; no line of the protocol is that long.
 const LINE_BYTES_MAX: u64 = 1 << 20;
-/// A child that has closed its output, or does not read, has so long to end by itself: its own
+/// Grace period for a child that has closed its output or does not read its input. Its own exit
 /// status says more than that of a kill.
 const END: Duration = Duration::from_secs(1);
-/// Between two looks whether it has ended.
+/// Interval between checks for its exit.
 const END_LOOK: Duration = Duration::from_millis(5);
 
-/// The first line of one that a benchmark compares with.
+/// First line of a process with which a benchmark compares.
 #[derive(Debug, Deserialize)]
 #[serde(rename_all = "snake_case")]
 enum Greeting {
@@ -31,13 +31,14 @@ enum Greeting {
     Absent(String),
 }
 
-/// The most memory that a process has had at once [bytes]: `VmHWM`, when the system tells it.
-/// - `process`: its number, or `self`.
+/// Peak resident memory of a process in bytes (`VmHWM`), if the system reports it.
+/// - `process`: its id, or `self`.
 pub(super) fn resident_bytes_max(process: &str) -> Option<u64> {
     bytes_of(process, "VmHWM:")
 }
 
-/// The memory that this process has now [bytes], likewise: shared memory it has touched included.
+/// Current resident memory of this process in bytes (`VmRSS`), if the system reports it. It
+/// includes shared memory that this process has touched.
 pub(super) fn resident_bytes() -> Option<u64> {
     bytes_of("self", "VmRSS:")
 }
@@ -48,14 +49,14 @@ fn bytes_of(process: &str, field: &str) -> Option<u64> {
     line.trim().strip_suffix("kB")?.trim().parse::<u64>().ok().map(|kib| kib * 1024)
 }
 
-/// Processor time of the thread that a folder below `/proc` describes [s].
+/// Processor time of a thread, from its folder below `/proc` [s].
 fn cpu_s(folder: &Path) -> Option<f64> {
     let text = std::fs::read_to_string(folder.join("schedstat")).ok()?;
     text.split_whitespace().next()?.parse::<f64>().ok().map(|nanoseconds| nanoseconds * 1e-9)
 }
 
-/// A running child; dropped, it is killed and waited for. It holds nothing that a kill could
-/// damage, and its input ends with this process if that is killed.
+/// A running child, which is killed and reaped on drop. A kill can damage nothing that it holds. If
+/// this process is killed, the child's input ends.
 pub(super) struct LineChild {
     name: String,
     child: Child,
@@ -66,7 +67,7 @@ pub(super) struct LineChild {
 }
 
 impl LineChild {
-    /// Starts `command`, whose standard error goes to `log` already.
+    /// Starts `command`, whose standard error already goes to `log`.
     pub(super) fn start(name: String, mut command: Command, log: &Path) -> anyhow::Result<Self> {
         command.stdin(Stdio::piped()).stdout(Stdio::piped());
         let started = Instant::now();
@@ -76,32 +77,32 @@ impl LineChild {
         let (sender, lines) = mpsc::sync_channel(LINES_MAX);
         let streams = (child.stdin.take(), child.stdout.take());
         let (Some(input), Some(output)) = streams else {
-            // Unreachable: both are asked for above.
+            // Unreachable: both are piped above.
             let _ = child.kill();
             return Err(anyhow!("{name} has no standard input or output"));
         };
-        // A thread, because reading a line cannot time out. It ends with the child's output.
+        // A thread, because reading a line cannot time out. It exits when the child's output ends.
         thread::spawn(move || read_lines(output, &sender));
         Ok(Self { name, child, input, lines, log: log.to_owned(), started })
     }
 
-    /// Its name, for messages.
+    /// Name of the child, for messages.
     pub(super) fn name(&self) -> &str {
         &self.name
     }
 
-    /// When it was started.
+    /// Start time of the child.
     pub(super) fn started(&self) -> Instant {
         self.started
     }
 
-    /// Says one line to it.
+    /// Sends one line to the child.
     pub(super) fn say(&mut self, line: &str) -> anyhow::Result<()> {
         let result = writeln!(self.input, "{line}").and_then(|()| self.input.flush());
         result.map_err(|_| self.death())
     }
 
-    /// The next line that it says.
+    /// Receives the next line from the child.
     pub(super) fn next(
         &mut self,
         watch: &Watch,
@@ -111,7 +112,7 @@ impl LineChild {
         self.next_if_any(watch, limit, what)?.ok_or_else(|| self.death())
     }
 
-    /// The next line that it says; none if it has ended without one.
+    /// Receives the next line, or `None` if the child has exited without one.
     pub(super) fn next_if_any(
         &mut self,
         watch: &Watch,
@@ -122,9 +123,8 @@ impl LineChild {
         next.with_context(|| last_lines(&self.log).trim().to_owned())
     }
 
-    /// Its first line: what it is, or an error inside that says why it is not to be had here. One
-    /// that comes to nothing, because its interpreter lacks a package or is none, leaves the rest
-    /// of the benchmark as it is.
+    /// Receives the first line: a description, or the reason why this peer is unavailable here. An
+    /// interpreter that is missing or lacks a package only removes this peer from the benchmark.
     pub(super) fn greeting(
         &mut self,
         watch: &Watch,
@@ -140,12 +140,12 @@ impl LineChild {
         })
     }
 
-    /// What it said is none of the protocol.
+    /// The error for a line that is not part of the protocol.
     pub(super) fn no_answer(&self, line: &str) -> anyhow::Error {
-        anyhow!("{} said what is no answer: {line}", self.name)
+        anyhow!("{} sent an unexpected line: {line}", self.name)
     }
 
-    /// What it has said meanwhile.
+    /// Returns the lines received so far, without waiting.
     pub(super) fn said(&mut self) -> anyhow::Result<Vec<String>> {
         let mut said = Vec::new();
         loop {
@@ -157,31 +157,31 @@ impl LineChild {
         }
     }
 
-    /// The most memory that it has had at once [bytes]: `VmHWM`, when the system tells it.
+    /// Peak resident memory in bytes (`VmHWM`), if the system reports it.
     pub(super) fn resident_bytes_max(&self) -> Option<u64> {
         resident_bytes_max(&self.child.id().to_string())
     }
 
-    /// Processor time of its first thread so far [s], when the system tells it.
+    /// Processor time of its first thread so far [s], if the system reports it.
     pub(super) fn cpu_s(&self) -> Option<f64> {
         cpu_s(&PathBuf::from(format!("/proc/{}", self.child.id())))
     }
 
-    /// Processor time of all its threads so far [s], when the system tells it.
+    /// Processor time of all its threads so far [s], if the system reports it.
     pub(super) fn cpu_s_of_all_threads(&self) -> Option<f64> {
         let threads = std::fs::read_dir(format!("/proc/{}/task", self.child.id())).ok()?;
         threads.map(|thread| cpu_s(&thread.ok()?.path())).sum()
     }
 
-    /// Its end as an error, with the last lines of its log; the log itself is deleted when the
-    /// benchmark ends.
+    /// Ends the child and returns its exit as an error with the last lines of its log. The log
+    /// itself is deleted when the benchmark ends.
     fn death(&mut self) -> anyhow::Error {
         let how = self.end();
         let lines = last_lines(&self.log);
         anyhow!("{} died: {how}\n  last lines of its log:\n{lines}", self.name)
     }
 
-    /// Its end in one line: how, and the last word of its log.
+    /// Ends the child and describes its exit in one line, with the last line of its log.
     pub(super) fn last_word(&mut self) -> String {
         let how = self.end();
         let lines = last_lines(&self.log);
@@ -189,7 +189,7 @@ impl LineChild {
         format!("it died: {how}{}", last.map_or_else(String::new, |line| format!(", {line}")))
     }
 
-    /// How it has ended. Whatever it still does is of no more use, but how it ends may be.
+    /// Waits for the child's exit, kills it if necessary, and describes how it ended.
     fn end(&mut self) -> String {
         let deadline = Instant::now() + END;
         while Instant::now() < deadline {
@@ -205,7 +205,7 @@ impl LineChild {
 
 impl Drop for LineChild {
     fn drop(&mut self) {
-        // An error means that it has ended already.
+        // Fails if the child has already exited.
         let _ = self.child.kill();
         let _ = self.child.wait();
     }

@@ -1,4 +1,4 @@
-//! What `dmprl bench rollout` reports: for programs one JSON object, for people a table.
+//! The report of `dmprl bench rollout`: one JSON object for programs, a table for people.
 
 use dmprl_shared::config::{ExperimentConfig, PolicyKind};
 use dmprl_shared::spec::EnvSpec;
@@ -10,26 +10,27 @@ use super::rollout::RolloutBench;
 use super::statistics::{load_average, max, median, min};
 use crate::run_directory::Machine;
 
-/// The worker's name among those of its peers.
+/// The workers, in the report.
 pub(super) const WORKER: &str = "worker";
-/// One of several workers, the others asleep.
+/// One of several workers, measured while the others sleep.
 pub(super) const ONE_WORKER: &str = "one_worker";
-/// Everyone who may be measured, in the order of the report.
+/// All candidates, in the order of the report.
 pub(super) const NAMES: [&str; 7] =
     ["ceiling", "physics", WORKER, ONE_WORKER, "gymnasium", "envpool", PANDA_GYM];
-/// Those that the worker is compared with.
+/// The candidates with which the worker is compared.
 const COMPARED: [&str; 6] = ["ceiling", "physics", ONE_WORKER, "gymnasium", "envpool", PANDA_GYM];
 
 /// One measurement.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Round {
-    /// Environment steps a second, all processes together.
+    /// Environment steps per second of all processes.
     pub(super) steps_per_s: f64,
-    /// Processor time over time: how many cores they really had, when the system tells it.
+    /// Processor time divided by wall time, that is, the number of cores really used, if the system
+    /// reports it.
     pub(super) cores: Option<f64>,
 }
 
-/// Environment steps a second of each, by round, and what else is known.
+/// Environment steps per second of each candidate and round, with further figures.
 #[derive(Debug, Clone)]
 pub struct Figures {
     pub(super) config: ExperimentConfig,
@@ -38,25 +39,25 @@ pub struct Figures {
     controls: Controls,
     machine: Machine,
     load_average: Option<f64>,
-    /// (name, its rounds); no entry for one that is absent.
+    /// (name, rounds), without absent candidates.
     rounds: Vec<(&'static str, Vec<Round>)>,
-    /// (name, what it is or why it is absent).
+    /// (name, description or reason for absence).
     pub(super) notes: Vec<(&'static str, String)>,
     pub(super) workers: WorkerFigures,
 }
 
-/// What is known of the workers besides their rate.
+/// Figures of the workers besides their rate.
 #[derive(Debug, Clone, Default)]
 pub(super) struct WorkerFigures {
-    /// From a worker's start to its first delivered segment, the slowest worker's [s].
+    /// Time from a worker's start to its first delivered segment [s]; that of the slowest.
     pub(super) first_segment_s: f64,
-    /// The most memory that a worker has had at once.
+    /// Peak resident memory of the largest worker.
     pub(super) rss_bytes: Option<u64>,
-    /// Share of one core that the bench itself took while it drained the queues.
+    /// Fraction of one core that the benchmark itself used to drain the queues.
     pub(super) sink_cpu_share: f64,
-    /// Segments that did not fit.
+    /// Segments rejected for their content.
     pub(super) rejected: u64,
-    /// Segments missing in a sequence.
+    /// Segments missing from a sequence.
     pub(super) lost: u64,
 }
 
@@ -75,7 +76,7 @@ impl Figures {
         }
     }
 
-    /// One more round of `name`.
+    /// Adds a round of `name`.
     pub(super) fn add(&mut self, name: &'static str, round: Round) {
         match self.rounds.iter_mut().find(|(known, _)| *known == name) {
             Some((_, rounds)) => rounds.push(round),
@@ -83,7 +84,7 @@ impl Figures {
         }
     }
 
-    /// What `name` is, or why it is absent.
+    /// Describes `name`, or gives the reason for its absence.
     pub(super) fn note(&mut self, name: &'static str, text: &str) {
         self.notes.push((name, text.to_owned()));
     }
@@ -97,7 +98,7 @@ impl Figures {
         self.rounds(name).iter().map(|round| round.steps_per_s).collect()
     }
 
-    /// Processor time of a step, which other programs on the machine disturb least.
+    /// Processor time per step, which other programs on the machine affect least.
     pub(super) fn cpu_us_per_step(&self, name: &str) -> Option<f64> {
         let of = |round: &Round| round.cores.map(|cores| 1e6 * cores / round.steps_per_s);
         median(&self.rounds(name).iter().filter_map(of).collect::<Vec<_>>())
@@ -107,8 +108,8 @@ impl Figures {
         median(&self.rates(name))
     }
 
-    /// The worker's rate over that of `name`: the median of the rounds' own ratios, because within
-    /// a round a machine drifts less than over all of them.
+    /// The worker's rate divided by that of `name`. It is the median of the rounds' own ratios,
+    /// because a machine's speed drifts less within a round than over all of them.
     pub(super) fn ratio(&self, name: &str) -> Option<f64> {
         let (worker, other) = (self.rates(WORKER), self.rates(name));
         median(&worker.iter().zip(&other).map(|(a, b)| a / b).collect::<Vec<_>>())
@@ -121,7 +122,7 @@ impl Figures {
         }
     }
 
-    /// One object; a figure that is not to be had is null.
+    /// The figures as one JSON object; unavailable ones are null.
     #[must_use]
     pub fn json(&self) -> Value {
         let WorkerFigures { first_segment_s, rss_bytes, sink_cpu_share, rejected, lost } =

@@ -1,4 +1,4 @@
-//! Segments that nobody has lived, of a given size in bytes.
+//! Synthetic segments of a given size in bytes.
 
 use dmprl_shared::segment::{
     ActionBounds, Expected, LAYOUT_VERSION, Segment, SegmentHeader, SegmentLayout, TRUNCATED,
@@ -6,26 +6,26 @@ use dmprl_shared::segment::{
 };
 use dmprl_shared::transport::shared_memory::Plan;
 
-/// What is measured [bytes]: a segment's header and block.
+/// Segment sizes of the benchmark, header and block \[bytes\].
 pub(super) const SIZES: [Size; 2] =
     [Size { bytes: 1_024, layout: layout(36, 3) }, Size { bytes: 10_240, layout: layout(405, 21) }];
-/// What is measured between hosts.
+/// Segment size of the benchmark between hosts.
 pub(super) const BETWEEN_HOSTS: Size = Size { bytes: 2_048, layout: layout(77, 5) };
-/// Segments that a worker's queue holds, and its outbox too: a worker from whom nobody takes has
-/// both full.
+/// Capacity of a worker's queue and of its outbox. Both are full when the receiver stops taking
+/// segments.
 pub(super) const QUEUE_SEGMENTS: usize = 512;
 
-/// The run that the segments say they are from.
+/// Run id in the synthetic segments.
 pub(super) const RUN_ID: u64 = 1;
-/// Segments of an episode: its parts are linked in a replay.
+/// Segments per episode, so that a replay links them.
 const EPISODE_SEGMENTS: u64 = 10;
 const ARCHITECTURE_HASH: u64 = 1;
-/// Between two numbers; irrational to the sine's period.
+/// Phase between two values. It is not commensurable with the sine's period.
 const STRIDE: f32 = 0.37;
-/// Larger whole numbers have no f32.
+/// Larger integers have no exact f32.
 const STAMP_MAX: u64 = 1 << 24;
 
-/// A segment's size and what it is made of.
+/// A segment's size and its layout.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Size {
     pub(super) bytes: usize,
@@ -37,12 +37,12 @@ const fn layout(observation_len: usize, action_len: usize) -> SegmentLayout {
 }
 
 impl Size {
-    /// The size of so many bytes, if it is one of those that are measured.
+    /// Returns the benchmark's size with this number of bytes, if there is one.
     pub(super) fn of_bytes(bytes: usize) -> Option<Self> {
         SIZES.into_iter().find(|size| size.bytes == bytes)
     }
 
-    /// What the learner's place and the workers agree on.
+    /// The plan of the shared memory between the workers and the receiver.
     pub(super) fn plan(self, workers: usize) -> Plan {
         Plan {
             run_id: RUN_ID,
@@ -54,7 +54,7 @@ impl Size {
         }
     }
 
-    /// What a segment is checked against.
+    /// The values that a valid segment must have.
     pub(super) fn expected(self, workers: u32) -> Expected {
         Expected {
             run_id: RUN_ID,
@@ -67,17 +67,17 @@ impl Size {
     }
 }
 
-/// The segments of one worker, one after the other.
+/// Generates the segments of one worker.
 #[derive(Debug)]
 pub(super) struct MadeUp(Segment);
 
 impl MadeUp {
-    /// Before the first.
+    /// Creates the generator of a worker.
     pub(super) fn new(layout: SegmentLayout, worker_id: u32) -> Self {
         Self::of(layout, worker_id, ARCHITECTURE_HASH)
     }
 
-    /// The same for a learner that has an architecture.
+    /// Creates the generator for a learner with this architecture hash.
     pub(super) fn of(layout: SegmentLayout, worker_id: u32, architecture_hash: u64) -> Self {
         let mut segment = Segment::zeroed(layout);
         for (index, value) in segment.block.iter_mut().enumerate() {
@@ -97,7 +97,8 @@ impl MadeUp {
         Self(segment)
     }
 
-    /// The next: numbered, another than the one before, and with its checksum as a worker's has.
+    /// Generates the next segment. It has a new number, different values, and a checksum as from a
+    /// real worker.
     pub(super) fn next(&mut self) -> &Segment {
         let Segment { header, block } = &mut self.0;
         let (episode, place) =

@@ -1,13 +1,13 @@
-//! `dmprl bench`: how fast a part of the system is, beside what else could do the same work.
+//! `dmprl bench`: measures parts of the system and compares them with alternatives.
 //!
-//! `rollout` measures the workers of a run. It plays the learner for real `dmprl actor` processes
-//! (`workers`, `sink`) and, in turn with them, lets processes of `dmprl.bench_rollout` in Python do
-//! the same work (`peers`, `numpy_plan`); `figures` and `table` are what comes out. Everything
-//! waits in `watch` or in `child`, where an interrupt is seen. `learner` measures an update beside
-//! its matrix products and beside other libraries. `transport` measures what carries segments, with
-//! workers that only send, beside pipes, sockets and queues of Python. `system` measures a whole
-//! run, and `scale` what many workers would do: by a model of what each part costs, and by a
-//! learner that 256 synthetic workers feed. `made_up` are the segments of those that only send.
+//! `rollout` measures the workers of a run. It acts as the learner for real `dmprl actor` processes
+//! (`workers`, `sink`) and, in turn with them, runs processes of `dmprl.bench_rollout` in Python
+//! that do the same work (`peers`, `numpy_plan`). `figures` and `table` are its report. All waiting
+//! is in `watch` and `child`, which notice an interrupt. `learner` compares an update with its
+//! matrix products and with other libraries. `transport` compares the transport of segments with
+//! pipes, sockets and Python's queues; its workers only send. `system` measures a complete run.
+//! `scale` predicts the throughput of many workers from the cost of each part, and measures a
+//! learner with 256 synthetic workers. `made_up` generates the synthetic segments.
 
 mod child;
 mod figures;

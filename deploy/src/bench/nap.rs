@@ -1,13 +1,13 @@
-//! How long the sink sleeps when it has found every queue empty.
+//! Sleep of the sink when all queues are empty.
 
 use std::time::Duration;
 
-/// Bounds of a sleep.
+/// Minimum and maximum of a sleep.
 const NAP_MIN: Duration = Duration::from_micros(50);
 const NAP_MAX: Duration = Duration::from_millis(5);
 
-/// The sink's sleep, as long as the queues bear: each waking takes time from a worker on its core,
-/// and a worker whose queue is full loses more.
+/// Adapts the sink's sleep to the fill of the queues. Each wake-up takes time from a worker on its
+/// core, but a worker with a full queue loses more.
 #[derive(Debug)]
 pub(super) struct Nap {
     length: Duration,
@@ -15,12 +15,12 @@ pub(super) struct Nap {
 }
 
 impl Nap {
-    /// For queues that together hold `queued_max` segments.
+    /// Creates it for queues with a total capacity of `queued_max` segments.
     pub(super) fn new(queued_max: usize) -> Self {
         Self { length: NAP_MIN, queued_max }
     }
 
-    /// The next sleep; `taken`: what had queued up during the last.
+    /// Returns the next sleep; `taken` is the number of segments queued during the last one.
     pub(super) fn next(&mut self, taken: usize) -> Duration {
         if taken * 2 > self.queued_max {
             self.length = (self.length / 2).max(NAP_MIN);

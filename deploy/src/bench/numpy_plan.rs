@@ -1,4 +1,4 @@
-//! What the Python side must know to act as the workers do: `envs_py/dmprl/numpy_policy.py`.
+//! Tells the Python side how to act as the workers do: `envs_py/dmprl/numpy_policy.py`.
 
 use std::path::{Path, PathBuf};
 
@@ -12,11 +12,11 @@ use dmprl_shared::policy::Policy;
 use dmprl_shared::spec::EnvSpec;
 use serde::Serialize;
 
-/// What physics alone is driven by.
+/// Controls for the benchmark of physics alone.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, ValueEnum)]
 #[serde(rename_all = "snake_case")]
 pub enum Controls {
-    /// What the policy decides, with its noise.
+    /// Actions of the policy, with its exploration noise.
     Policy,
     /// Actions drawn uniformly within their bounds.
     Random,
@@ -32,28 +32,28 @@ pub struct NumpyPlan<'a> {
     spec: &'a EnvSpec,
     seed: u64,
     env_count: usize,
-    /// What draws the actions that lead to the controls of physics alone.
+    /// Origin of the actions that result in the controls of physics alone.
     controls: Controls,
-    /// Environment steps of one decision.
+    /// Environment steps per decision.
     decision_steps: usize,
-    /// Of the network, input first, output last.
+    /// Widths of the network, from input to output.
     widths: Vec<usize>,
-    /// From (y0, yd0, g, w) to the samples of one dimension, (3K, 3+N); empty without a DMP.
+    /// Linear map from (y0, yd0, g, w) to the samples of one dimension, (3K, 3+N); empty without a
+    /// DMP.
     segment_map: Vec<f32>,
     /// Standard deviations of the policy's own Gaussian, (A,); empty if it has none.
     gaussian_std: Vec<f32>,
-    /// Outputs of the network, its last ones, that are logarithmic standard deviations: K A or 0.
+    /// Number of the network's last outputs that are logarithmic standard deviations: K A or 0.
     log_stds_len: usize,
-    /// File of the network's flat parameters, 32-bit little-endian.
+    /// File with the network's flat parameters, 32-bit little-endian.
     parameters: PathBuf,
 }
 
 impl<'a> NumpyPlan<'a> {
-    /// Writes the parameters into `folder`, and the plan that names them beside; returns the
-    /// plan's path.
+    /// Writes the parameters and the plan that names them into `folder`; returns the plan's path.
     ///
     /// # Errors
-    /// The DMP does not fit, or what the file system refuses.
+    /// The DMP is invalid, or the file system fails.
     pub fn write(
         folder: &Path,
         (config, spec, controls): (&'a ExperimentConfig, &'a EnvSpec, Controls),

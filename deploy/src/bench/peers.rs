@@ -1,4 +1,4 @@
-//! What the workers are compared with: processes of `dmprl.bench_rollout`, one for each worker.
+//! Peers of the workers: processes of `dmprl.bench_rollout`, one for each worker.
 
 use std::fs::File;
 use std::path::{Path, PathBuf};
@@ -13,17 +13,18 @@ use super::figures::Round;
 use super::watch::Watch;
 use crate::run_directory::RunDirectory;
 
-/// From a start to the first line: many processes may start at once, with many environments each.
+/// Time limit from a start to the first line. Many processes may start at once, each with many
+/// environments.
 const READY: Duration = Duration::from_secs(300);
-/// Beyond what was asked for, a measurement may take so much longer.
+/// Extra time that a measurement may take.
 const MEASURE_SLACK: Duration = Duration::from_secs(60);
 
-/// One way to do the workers' work.
+/// An alternative to the workers.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum PeerKind {
-    /// `mujoco.batch` alone, as it is imported, on the model file that Gymnasium ships.
+    /// `mujoco.batch` alone, as imported, on the model file that Gymnasium ships.
     Ceiling,
-    /// `mujoco.batch` alone, on the worker's own model and process settings.
+    /// `mujoco.batch` alone, with the worker's own model and process settings.
     Physics,
     /// A plain Gymnasium loop with the policy in NumPy.
     Gymnasium,
@@ -35,21 +36,21 @@ pub(super) enum PeerKind {
 
 /// Name of [`PeerKind::PandaGym`].
 pub(super) const PANDA_GYM: &str = "panda_gym";
-/// The tasks that panda-gym has too; `dmprl.bench_peers` knows what it calls them.
+/// Tasks that panda-gym has too; `dmprl.bench_peers` has its names for them.
 const PANDA_GYM_TASKS: [&str; 2] = ["dmprl/PandaReach-v0", "dmprl/PandaReachJoints-v0"];
 
-/// Whether panda-gym has an environment to compare this one with.
+/// Returns true if panda-gym has an equivalent of this environment.
 pub(super) fn is_in_panda_gym(env_id: &str) -> bool {
     PANDA_GYM_TASKS.contains(&env_id)
 }
 
 impl PeerKind {
-    /// In the order of a round. The worker comes after its bounds, so that a machine that drifts
-    /// does so for both.
+    /// All peers, in the order of a round. The workers follow right after their bounds, so that
+    /// drift of the machine's speed affects both.
     pub(super) const ALL: [Self; 5] =
         [Self::PandaGym, Self::EnvPool, Self::Gymnasium, Self::Ceiling, Self::Physics];
 
-    /// As `dmprl.bench_rollout` calls it.
+    /// Name of the peer in `dmprl.bench_rollout`.
     pub(super) fn name(self) -> &'static str {
         match self {
             Self::Ceiling => "ceiling",
@@ -60,22 +61,22 @@ impl PeerKind {
         }
     }
 
-    /// Whether it runs in the interpreter of the user's choice: it is none of this project's
-    /// requirements, and has some that do not go with them.
+    /// Returns true if the peer runs in the interpreter given by the user. Such peers are no
+    /// requirement of this project, and their own requirements conflict with it.
     pub(super) fn is_foreign(self) -> bool {
         matches!(self, Self::EnvPool | Self::PandaGym)
     }
 }
 
-/// What every peer's command line is made of.
+/// The common parts of every peer's command line.
 pub(super) struct PeerStage<'a> {
-    /// Where logs go.
+    /// Run directory for logs.
     pub(super) run: &'a RunDirectory,
-    /// The folder with the package `dmprl`.
+    /// Folder with the package `dmprl`.
     pub(super) package_path: PathBuf,
-    /// What [`super::NumpyPlan`] has written.
+    /// File written by [`super::NumpyPlan`].
     pub(super) plan: PathBuf,
-    /// Processes of each peer.
+    /// Processes per peer.
     pub(super) workers: usize,
 }
 
@@ -109,11 +110,11 @@ impl Peer {
                 .args(["-m", "dmprl.bench_rollout", kind.name(), "--plan"])
                 .arg(&stage.plan)
                 .args(["--index", &index.to_string()])
-                // `-m` puts the working directory before everything else: one without modules.
+                // `-m` puts the working directory first on the path: use one without modules.
                 .current_dir(stage.run.path())
                 .env("PYTHONPATH", &stage.package_path)
                 .stderr(log);
-            // As in the worker: one thread of linear algebra in each process.
+            // One thread of linear algebra in each process, as in the worker.
             for name in ["OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"] {
                 command.env(name, "1");
             }
@@ -123,8 +124,8 @@ impl Peer {
         Ok(Self { kind, children })
     }
 
-    /// Waits until every process is ready, and returns what it measures; an error inside says why
-    /// it is not to be had here.
+    /// Waits until every process is ready. Returns a description, or the reason why the peer is
+    /// unavailable.
     pub(super) fn ready(&mut self, watch: &Watch) -> anyhow::Result<Result<String, String>> {
         let mut about = String::new();
         for child in &mut self.children {
@@ -136,7 +137,7 @@ impl Peer {
         Ok(Ok(about))
     }
 
-    /// What all processes together make in so much time.
+    /// Measures the rate of all processes together.
     pub(super) fn measure(&mut self, watch: &Watch, duration: Duration) -> anyhow::Result<Round> {
         let seconds = duration.as_secs_f64();
         for child in &mut self.children {

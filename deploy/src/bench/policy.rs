@@ -1,4 +1,4 @@
-//! `dmprl bench policy`: how long a decision takes next to a robot, beside other runtimes.
+//! `dmprl bench policy`: compares the time of a decision with other runtimes.
 
 use std::path::{Path, PathBuf};
 use std::process::Command;
@@ -14,44 +14,44 @@ use super::child::LineChild;
 use super::watch::{Interrupted, Watch};
 use crate::export;
 
-/// A peer that imports a runtime, on a busy machine.
+/// Time limit for a peer to import its runtime on a busy machine.
 const GREETING: Duration = Duration::from_secs(60);
-/// A round of a peer.
+/// Time limit of a peer's round.
 const ROUND: Duration = Duration::from_secs(60);
-/// Before the first round: caches, frequency, pages.
+/// Calls before the first round, to warm up caches, clock frequency and pages.
 const WARM_UP: usize = 500;
-/// Different observations, in turn.
+/// Number of different observations, used in turn.
 const OBSERVATIONS: usize = 256;
-/// What a robot at 1 kHz leaves for a policy, with ten times the room.
+/// A tenth of a control period at 1 kHz.
 pub const GOAL_US: f64 = 100.0;
 
-/// What to measure.
+/// Plan of the benchmark.
 pub struct PolicyBench {
-    /// The policy.
+    /// Policy to measure.
     pub opened: OpenedPolicy,
-    /// An interpreter that has NumPy, and onnxruntime where it is to be compared with.
+    /// Python interpreter with NumPy, and with onnxruntime for that peer.
     pub python: PathBuf,
-    /// The folder of the package `dmprl`.
+    /// Folder with the package `dmprl`.
     pub package_path: PathBuf,
-    /// How often each is measured.
+    /// Number of rounds.
     pub rounds: usize,
-    /// Decisions of a round.
+    /// Calls per round.
     pub calls: usize,
 }
 
-/// Microseconds of a call.
+/// Latency of a call in microseconds.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub struct Latency {
-    /// Half of the calls took no longer.
+    /// Median.
     pub p50_us: f64,
-    /// 99 of 100 took no longer.
+    /// 99th percentile.
     pub p99_us: f64,
-    /// The longest.
+    /// Maximum.
     pub max_us: f64,
 }
 
 impl Latency {
-    /// Of no calls there is none.
+    /// Computes the quantiles; `None` without calls.
     fn of(mut us: Vec<f64>) -> Option<Self> {
         us.sort_by(f64::total_cmp);
         let at = |share: f64| us.get(((us.len() as f64 * share).ceil() as usize).max(1) - 1);
@@ -66,26 +66,26 @@ impl Latency {
     }
 }
 
-/// What a peer is and how long its decisions take, or why it is not there.
+/// A peer's name and latency, or the reason for its absence.
 pub type Peer = Result<(String, Latency), String>;
 
-/// What came out.
+/// Report of the benchmark.
 #[derive(Debug)]
 pub struct PolicyFigures {
-    /// Environment and sizes of the network.
+    /// Environment and widths of the network.
     pub what: String,
-    /// Numbers of the policy.
+    /// Number of the policy's parameters.
     pub parameters: usize,
-    /// Observation to segment.
+    /// Latency from an observation to a segment.
     pub decision: Latency,
-    /// A control step, decisions included.
+    /// Latency of a control step, decisions included.
     pub action: Latency,
-    /// By runtime.
+    /// (runtime, its result).
     pub peers: Vec<(&'static str, Peer)>,
 }
 
 impl PolicyFigures {
-    /// As one JSON object.
+    /// The figures as one JSON object.
     #[must_use]
     pub fn json(&self) -> serde_json::Value {
         let peers = self.peers.iter().map(|(kind, found)| {
@@ -102,7 +102,7 @@ impl PolicyFigures {
         })
     }
 
-    /// For people.
+    /// The figures as text for people.
     #[must_use]
     pub fn text(&self) -> String {
         let mut lines = vec![format!("{}, {} parameters, one core", self.what, self.parameters)];
@@ -123,10 +123,10 @@ impl PolicyFigures {
     }
 }
 
-/// Measures; nothing if the user interrupts.
+/// Runs the benchmark; returns `None` if the user interrupts it.
 ///
 /// # Errors
-/// A peer dies or answers nonsense, or the file system refuses.
+/// A peer dies or sends an invalid answer, or the file system fails.
 pub fn policy(bench: &PolicyBench) -> anyhow::Result<Option<PolicyFigures>> {
     let watch = Watch::start()?;
     match measure(bench, &watch) {
@@ -189,10 +189,10 @@ fn start(bench: &PolicyBench, kind: &str, file: &Path, folder: &Path) -> anyhow:
     let stderr = std::fs::File::create(&log).context("cannot make a log")?;
     let mut command = Command::new(&bench.python);
     command.args(["-m", "dmprl.bench_policy", kind]).arg(file).stderr(stderr);
-    // `-m` puts the working directory before everything else: one without modules.
+    // `-m` puts the working directory first on the path: use one without modules.
     command.current_dir(folder);
     command.env("PYTHONPATH", &bench.package_path).env("PYTHONDONTWRITEBYTECODE", "1");
-    // As ours: one core.
+    // One core, as for our runtime.
     command.envs(["OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"].map(|name| (name, "1")));
     LineChild::start(format!("the policy in {kind}"), command, &log)
 }
@@ -214,7 +214,7 @@ enum Call {
     Action,
 }
 
-/// The runtime with observations.
+/// Our runtime, with the observations.
 struct Ours(PolicyRuntime, Vec<Vec<f64>>);
 
 impl Ours {
@@ -225,7 +225,7 @@ impl Ours {
         Ok(Self(runtime, (0..OBSERVATIONS).map(row).collect()))
     }
 
-    /// Microseconds of so many calls.
+    /// Times `count` calls, in microseconds each.
     fn calls(&mut self, count: usize, call: Call) -> anyhow::Result<Vec<f64>> {
         let Self(runtime, rows) = self;
         let mut took = Vec::with_capacity(count);

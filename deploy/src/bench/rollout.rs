@@ -1,8 +1,8 @@
-//! `dmprl bench rollout`: workers and what they are compared with, measured in turn.
+//! `dmprl bench rollout`: measures workers and their peers in turn.
 //!
-//! In turn, because a machine's speed drifts: in every round each of them runs once for the same
-//! time, the others asleep, and the median over the rounds counts. A worker sleeps because its
-//! queue is full, the others because nobody has asked them.
+//! A machine's speed drifts. Therefore in every round each candidate runs once for the same time
+//! while the others sleep, and the median over the rounds counts. A worker sleeps because its queue
+//! is full, the peers because they wait for a request.
 
 use std::path::PathBuf;
 use std::time::Duration;
@@ -17,30 +17,31 @@ use super::workers::{Stage, Workers};
 use crate::run_directory::RunDirectory;
 use crate::terminal::RoundsProgress;
 
-/// What to measure.
+/// Plan of the benchmark.
 pub struct RolloutBench {
-    /// The program that plays the workers: this one.
+    /// Program of the worker processes: this one.
     pub program: PathBuf,
     /// The resolved configuration.
     pub config: ExperimentConfig,
-    /// The Python virtual environment of the workers.
+    /// Python virtual environment of the workers.
     pub venv: PathBuf,
-    /// The folder with the Python package.
+    /// Folder with the Python package.
     pub package_path: PathBuf,
-    /// The interpreter that EnvPool and panda-gym run in.
+    /// Python interpreter for EnvPool and panda-gym.
     pub peer_python: PathBuf,
-    /// What drives physics alone.
+    /// Controls for physics alone.
     pub controls: Controls,
-    /// How often each is measured.
+    /// Number of rounds.
     pub rounds: usize,
-    /// How long each time.
+    /// Duration of each measurement.
     pub duration: Duration,
 }
 
-/// Measures; none when the user interrupted it. Leaves no process and no file behind.
+/// Runs the benchmark; returns `None` if the user interrupted it. Leaves no process and no file
+/// behind.
 ///
 /// # Errors
-/// A worker or a peer could not be started or has died.
+/// A worker or a peer cannot be started or dies.
 pub fn rollout(bench: RolloutBench) -> anyhow::Result<Option<Figures>> {
     match measure(bench) {
         Err(error) if error.is::<Interrupted>() => Ok(None),
@@ -55,7 +56,7 @@ fn measure(bench: RolloutBench) -> anyhow::Result<Figures> {
     let run = &stage.launcher.run;
     let progress = RoundsProgress::new(bench.rounds);
     progress.preparing("starting the workers");
-    // Alone, so that the time to the first segment is the workers' own.
+    // Start the workers alone, so that nothing else delays their first segments.
     let mut workers = Workers::start(&stage, &watch)?;
     progress.preparing("starting what they are compared with");
     let mut figures = Figures::new(&bench, &workers.spec, stage.manifest.machine.clone());
@@ -69,7 +70,7 @@ fn measure(bench: RolloutBench) -> anyhow::Result<Figures> {
             figures.add(peer.kind.name(), peer.measure(&watch, bench.duration)?);
         }
         progress.measuring(WORKER);
-        // First, while the others' queues are full of what they made in their peers' time.
+        // Measured first, while the other workers' queues are full from the peers' turns.
         if let Some(one) = workers.measure_first(&watch, bench.duration)? {
             figures.add(ONE_WORKER, one);
         }
@@ -89,7 +90,7 @@ fn measure(bench: RolloutBench) -> anyhow::Result<Figures> {
     Ok(figures)
 }
 
-/// Starts every peer; those that are not to be had here become a note.
+/// Starts all peers; unavailable ones become a note.
 fn start_peers(
     bench: &RolloutBench,
     run: &RunDirectory,
@@ -103,7 +104,7 @@ fn start_peers(
     let package_path = bench.package_path.clone();
     let stage = PeerStage { run, package_path, plan, workers: bench.config.actors.workers };
     let own = bench.venv.join("bin/python");
-    // All at once: most of a start is reading Python's packages.
+    // Start all at once: most of a start is importing Python packages.
     let suits = |kind: &PeerKind| *kind != PeerKind::PandaGym || is_in_panda_gym(&spec.id);
     if !is_in_panda_gym(&spec.id) {
         figures.note(PANDA_GYM, &format!("panda-gym has no {}", spec.id));
@@ -117,7 +118,7 @@ fn start_peers(
     for (kind, peer) in started {
         let mut peer = match peer {
             Ok(peer) => peer,
-            // Such as a --peer-python that is no program.
+            // For example, --peer-python is no program.
             Err(error) => {
                 figures.note(kind.name(), &format!("{error:#}"));
                 continue;

@@ -1,7 +1,7 @@
-//! The learner's place, taken by a thread that only takes segments, checks them and counts.
+//! A stand-in for the learner: a thread that only takes, checks and counts segments.
 //!
-//! Between two measurements it takes nothing: the workers' queues fill and the workers sleep, which
-//! leaves the machine to whatever is measured next.
+//! It takes nothing between two measurements. The workers' queues fill and the workers sleep, which
+//! leaves the machine to the next measurement.
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -22,75 +22,75 @@ use super::watch::Watch;
 use crate::control::Report;
 use crate::terminal::say;
 
-/// Between two cleanings of what dead workers left.
+/// Interval between two cleanups of dead workers' segments.
 const MAINTENANCE_INTERVAL: Duration = Duration::from_millis(250);
-/// Between two acknowledgements, as the learner's.
+/// Interval between two acknowledgements, as in the learner.
 const ACKNOWLEDGEMENT_INTERVAL: Duration = Duration::from_millis(10);
-/// Between two looks for new workers that have no policy yet, while workers start.
+/// Interval between checks for new workers without a policy, while workers start.
 const GREETING_INTERVAL: Duration = Duration::from_millis(5);
-/// Between two looks for the first segments.
+/// Interval between checks for the first segments.
 const FIRST_LOOK: Duration = Duration::from_micros(50);
-/// Taken before the clock starts: the stale segments of the full queues, and the workers' way back
-/// to their pace.
+/// Time before the clock starts, in which the stale segments of the full queues are taken and the
+/// workers return to full speed.
 const SETTLE: Duration = Duration::from_millis(100);
 
-/// How late a worker's death may be seen.
+/// Maximum delay until a worker's death is noticed.
 const ANSWER_LOOK: Duration = Duration::from_millis(20);
 
-/// What the sink is asked for.
+/// A request to the sink.
 #[derive(Debug, Clone, Copy)]
 pub(super) enum Request {
     /// Take segments until each worker has delivered one.
     FirstOfEach,
-    /// Take segments, and count those of so much time.
+    /// Take segments, and count those received during this time.
     Measure(Duration, From),
 }
 
-/// Whose segments are taken.
+/// Workers whose segments are taken.
 #[derive(Debug, Clone, Copy)]
 pub(super) enum From {
-    /// Each worker's in turn.
+    /// All workers, in turn.
     All,
-    /// The first worker's; the others sleep once their queues are full.
+    /// The first worker; the others sleep once their queues are full.
     First,
 }
 
-/// What the sink answers.
+/// An answer of the sink.
 #[derive(Debug)]
 pub(super) enum Answer {
-    /// When the first segment of each worker came.
+    /// Time of each worker's first segment.
     FirstOfEach(Vec<Instant>),
-    /// What was taken.
+    /// Result of the measurement.
     Measured(Window),
 }
 
-/// What came in during one measurement.
+/// Segments received during one measurement.
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
 pub(super) struct Window {
-    /// Sound segments taken.
+    /// Number of valid segments.
     pub(super) segments: u64,
-    /// Environment steps in them.
+    /// Number of environment steps in the valid segments.
     pub(super) env_steps: u64,
-    /// Its length [s].
+    /// Duration of the measurement [s].
     pub(super) seconds: f64,
     /// Processor time of the sink itself [s].
     pub(super) cpu_s: f64,
 }
 
-/// Segments that should not be, over all measurements.
+/// Rejected and lost segments over all measurements.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub(super) struct Discrepancies {
-    /// Refused for what they hold, or come twice.
+    /// Rejected for their content, or duplicate.
     pub(super) rejected: u64,
-    /// Of these, come twice.
+    /// Duplicate; included in `rejected`.
     pub(super) duplicate: u64,
-    /// Missing in their worker's sequence.
+    /// Missing from their worker's sequence.
     pub(super) lost: u64,
-    /// What came in all, refused or not: no discrepancy, but what others are found by.
+    /// All received segments, rejected or not, for comparison.
     pub(super) received: u64,
 }
 
-/// The sink's thread. Dropped, it is stopped and waited for.
+/// The sink's thread, which is stopped and joined on drop.
 pub(super) struct Sink {
     requests: Option<Sender<Request>>,
     answers: Receiver<anyhow::Result<(Answer, Discrepancies)>>,
@@ -99,7 +99,7 @@ pub(super) struct Sink {
 }
 
 impl Sink {
-    /// Begins; nothing is taken before the first request.
+    /// Starts the thread; it takes nothing before the first request.
     pub(super) fn start(
         end: LearnerEnd,
         expected: Expected,
@@ -125,7 +125,7 @@ impl Sink {
         Self { requests: Some(requests), answers, stop, thread: Some(thread) }
     }
 
-    /// Asks, and looks after the workers until the answer is there.
+    /// Sends a request, and checks on the workers until the answer arrives.
     pub(super) fn answer(
         &self,
         request: Request,
@@ -153,7 +153,7 @@ impl Sink {
     }
 
     fn ask(&self, request: Request) {
-        // A thread that has ended has said why, and the next look at the answers shows it.
+        // A thread that has exited has sent its error, which the next answer returns.
         let _ = self.requests.as_ref().map(|requests| requests.send(request));
     }
 }
@@ -162,12 +162,12 @@ impl Drop for Sink {
     fn drop(&mut self) {
         self.stop.store(true, Ordering::Release);
         self.requests = None;
-        // A panic of the thread was reported where it happened.
+        // A panic of the thread has already been reported.
         let _ = self.thread.take().map(JoinHandle::join);
     }
 }
 
-/// Shows the user what a worker warns of.
+/// Shows a worker's warning to the user.
 pub(super) fn show_warning(name: &str, line: &str) {
     if let Ok(Report::Warning { message }) = serde_json::from_str(line) {
         say(&format!("{name}: {message}"));
@@ -219,7 +219,7 @@ impl Taker {
         while !self.stop.load(Ordering::Acquire) && first.iter().any(Option::is_none) {
             match self.take(From::All)? {
                 Some(header) => {
-                    // A worker id out of range was refused, and belongs to nobody.
+                    // A worker id out of range was rejected.
                     if let Some(first) = first.get_mut(header.worker_id as usize) {
                         first.get_or_insert_with(Instant::now);
                     }
@@ -242,7 +242,7 @@ impl Taker {
         Ok(Window { cpu_s: thread_cpu_s() - cpu_s, ..taken })
     }
 
-    /// What is taken in so much time, and how much time it really was.
+    /// Takes segments for `duration`; also measures the actual time.
     fn take_for(&mut self, duration: Duration, from: From) -> anyhow::Result<Window> {
         let start = Instant::now();
         let (mut window, mut taken) = (Window::default(), 0);
@@ -268,8 +268,8 @@ impl Taker {
         Ok(window)
     }
 
-    /// Takes the next segment and does what a learner does first: check it and follow its worker's
-    /// sequence. One that is refused, or a copy of steps that were counted, counts no steps.
+    /// Takes the next segment and does the learner's first steps: it checks the segment and updates
+    /// its worker's sequence. Rejected segments and duplicates add no steps.
     fn take(&mut self, from: From) -> anyhow::Result<Option<SegmentHeader>> {
         self.make_room()?;
         let Self { end, segment, .. } = self;
@@ -307,7 +307,7 @@ impl Taker {
         Ok(self.end.acknowledgements.acknowledge(self.inbox.acknowledge()?)?)
     }
 
-    /// A log that is full is emptied, as by a checkpoint.
+    /// Clears a full log, as after a checkpoint.
     fn make_room(&mut self) -> anyhow::Result<()> {
         if self.inbox.is_full() {
             self.inbox.checkpointed(self.inbox.logged())?;

@@ -1,12 +1,13 @@
-//! What several measurements say together, and how busy the machine was meanwhile.
+//! Statistics of measurements, and the load of the machine during them.
 
-/// Processes that wanted a processor over the last minute; none where the system does not say.
+/// Average number of runnable processes over the last minute; `None` if the system does not report
+/// it.
 pub(super) fn load_average() -> Option<f64> {
     let text = std::fs::read_to_string("/proc/loadavg").ok()?;
     text.split_whitespace().next()?.parse().ok()
 }
 
-/// The middle value, or the mean of the two in the middle; none of none.
+/// The middle value, or the mean of the two in the middle; `None` if there are no values.
 pub(super) fn median(values: &[f64]) -> Option<f64> {
     let mut sorted = values.to_vec();
     sorted.sort_by(f64::total_cmp);

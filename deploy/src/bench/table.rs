@@ -1,4 +1,4 @@
-//! The figures of a benchmark as a table.
+//! Formats the figures of a benchmark as a table.
 
 use super::figures::{Figures, NAMES, ONE_WORKER, WORKER, WorkerFigures};
 use super::peers::{PANDA_GYM, is_in_panda_gym};
@@ -6,7 +6,7 @@ use super::statistics::{max, min};
 use crate::terminal::grouped;
 
 impl Figures {
-    /// What [`Figures::json`] holds, as a table.
+    /// Formats the figures as a table, like [`Figures::json`].
     #[must_use]
     pub fn text(&self) -> String {
         let actors = &self.config.actors;
@@ -51,7 +51,7 @@ impl Figures {
         lines.join("\n")
     }
 
-    /// Whether there is anything to say about `name` with these workers and this task.
+    /// Returns true if `name` applies to these workers and this task.
     fn is_listed(&self, name: &str) -> bool {
         match name {
             ONE_WORKER => self.config.actors.workers > 1,
@@ -99,7 +99,7 @@ mod tests {
             let line = text.lines().find(|line| line.trim_start().starts_with(name)).unwrap();
             line.split_whitespace().skip(1).collect::<Vec<_>>().join(" ")
         };
-        // Two workers at 180 steps a second together: 11.1 ms a step in each.
+        // Two workers with 180 steps per second together: 11.1 ms per step in each.
         assert_eq!(row("worker"), "180 11111.11 80 … 380");
         assert_eq!(row("ceiling"), "200 10000.00 10000.00 100 … 400 0.90 ×");
         assert_eq!(row("envpool"), "absent");

@@ -1,4 +1,4 @@
-//! Waiting for an answer with a limit, and giving up when the user interrupts.
+//! Waits for answers with a time limit, and until the user interrupts.
 
 use std::fmt::{self, Display, Formatter};
 use std::sync::Arc;
@@ -11,10 +11,10 @@ use signal_hook::consts::{SIGHUP, SIGINT, SIGTERM};
 
 use crate::launch;
 
-/// How late an interrupt may be seen.
+/// Maximum delay until an interrupt is noticed.
 const LOOK: Duration = Duration::from_millis(20);
 
-/// The user does not want the result any more.
+/// Error for an interrupt by the user.
 #[derive(Debug)]
 pub(super) struct Interrupted;
 
@@ -26,14 +26,14 @@ impl Display for Interrupted {
 
 impl std::error::Error for Interrupted {}
 
-/// Sees SIGINT, SIGTERM and SIGHUP, which do not kill this process any more.
+/// Catches SIGINT, SIGTERM and SIGHUP, which then no longer kill this process.
 pub(crate) struct Watch(Arc<AtomicBool>);
 
 impl Watch {
-    /// From now on.
+    /// Starts to catch the signals.
     pub(crate) fn start() -> anyhow::Result<Self> {
         let seen = Arc::new(AtomicBool::new(false));
-        // `nohup` has a hang-up ignored, and means that.
+        // `nohup` ignores SIGHUP on purpose, so leave it ignored.
         let hang_up = (!launch::is_ignored(SIGHUP)).then_some(SIGHUP);
         for signal in [SIGINT, SIGTERM].into_iter().chain(hang_up) {
             signal_hook::flag::register(signal, Arc::clone(&seen))
@@ -47,7 +47,7 @@ impl Watch {
         if self.0.load(Ordering::Acquire) { Err(Interrupted.into()) } else { Ok(()) }
     }
 
-    /// The next item; none when whoever sends them is gone.
+    /// Returns the next item, or `None` if the sender is gone.
     pub(super) fn next<T>(
         &self,
         items: &Receiver<T>,

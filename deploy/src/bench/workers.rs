@@ -1,4 +1,4 @@
-//! The workers of a run, with a sink in the learner's place.
+//! The workers of a run, with a sink as the learner.
 
 use std::path::PathBuf;
 use std::time::{Duration, Instant};
@@ -24,23 +24,23 @@ use crate::launch::{Launcher, Process, TimeLimits, create_domain};
 use crate::roles::Setup;
 use crate::run_directory::{Manifest, RunDirectory};
 
-/// Beyond what was asked for, a measurement may take so much longer.
+/// Extra time that a measurement may take.
 const MEASURE_SLACK: Duration = Duration::from_secs(30);
 
 /// A worker that waits for the next round is no reason for a warning [s].
 const SEND_DEADLINE_S: f64 = 1e6;
 
-/// A run that nobody trains: what workers need around them. Dropped, it leaves nothing.
+/// A run without a learner, as the environment of workers. Leaves nothing behind on drop.
 pub(super) struct Stage {
     pub(super) launcher: Launcher,
     pub(super) domain: Domain,
     pub(super) manifest: Manifest,
-    /// Last: removed when nobody is left who uses it.
+    /// Last: removed after all its users have been dropped.
     _folder: TempDir,
 }
 
 impl Stage {
-    /// Makes a folder and shared memory.
+    /// Creates a folder and shared memory.
     pub(super) fn new(
         program: PathBuf,
         venv: PathBuf,
@@ -48,7 +48,7 @@ impl Stage {
     ) -> anyhow::Result<Self> {
         let mut config = config.clone();
         config.actors.send_deadline_s = SEND_DEADLINE_S;
-        // Nobody joins a benchmark.
+        // No worker joins a benchmark.
         config.actors.joined_max = 0;
         let folder = tempfile::Builder::new().prefix("dmprl-bench-").tempdir();
         let folder = folder.context("cannot make a folder for the workers' run")?;
@@ -63,23 +63,23 @@ impl Stage {
     }
 }
 
-/// Running workers, each with a full queue, and what they run.
+/// Running workers, whose queues are full between two measurements.
 pub(super) struct Workers {
     children: Vec<LineChild>,
     sink: Sink,
     discrepancies: Discrepancies,
-    /// The environment, as a worker has reported it.
+    /// Environment spec that a worker reported.
     pub(super) spec: EnvSpec,
-    /// The architecture.
+    /// Policy architecture.
     pub(super) policy: Policy,
-    /// What the workers act with.
+    /// Parameters of the workers' policy.
     pub(super) parameters: Vec<f32>,
-    /// From a worker's start to its first delivered segment, the slowest worker's [s].
+    /// Time from a worker's start to its first delivered segment [s]; that of the slowest.
     pub(super) first_segment_s: f64,
 }
 
 impl Workers {
-    /// Starts them, and returns when each has delivered its first segment.
+    /// Starts the workers; returns when each has delivered its first segment.
     pub(super) fn start(stage: &Stage, watch: &Watch) -> anyhow::Result<Self> {
         let Stage { launcher, domain, .. } = stage;
         let setup = Setup::read(launcher.run.path())?;
@@ -124,7 +124,7 @@ impl Workers {
         Ok(workers)
     }
 
-    /// What all workers together deliver in so much time, and what the sink took for it.
+    /// Measures the rate of all workers together, and the sink's own load.
     pub(super) fn measure(
         &mut self,
         watch: &Watch,
@@ -133,10 +133,10 @@ impl Workers {
         self.measure_from(watch, duration, From::All)
     }
 
-    /// What the first of them delivers while the others sleep on their full queues; none where
-    /// there are no others. Before this, nobody may have taken from those queues for a while.
+    /// Measures the first worker while the others sleep on their full queues; `None` with one
+    /// worker. Requires that those queues have had time to fill.
     ///
-    /// Nothing is stopped for it: a stopped process would outlive a benchmark that is killed.
+    /// It stops no process: a stopped process would outlive a benchmark that is killed.
     pub(super) fn measure_first(
         &mut self,
         watch: &Watch,
@@ -159,7 +159,7 @@ impl Workers {
         let Answer::Measured(window) = answer else {
             bail!("the sink answered another question");
         };
-        // Over the time to settle too, in which the workers do the same.
+        // The time to settle is included, in which the workers do the same.
         let elapsed_s = start.elapsed().as_secs_f64();
         let cores = self.cpu_s(from).zip(cpu_s).map(|(now, then)| (now - then) / elapsed_s);
         let steps_per_s = window.env_steps as f64 / window.seconds;
@@ -174,12 +174,12 @@ impl Workers {
         self.children.iter().take(count).map(LineChild::cpu_s).sum()
     }
 
-    /// Refused and lost segments so far.
+    /// Rejected and lost segments so far.
     pub(super) fn discrepancies(&self) -> Discrepancies {
         self.discrepancies
     }
 
-    /// The most memory that any worker has had at once [bytes].
+    /// Peak resident memory of the largest worker [bytes].
     pub(super) fn resident_bytes_max(&self) -> Option<u64> {
         self.children.iter().filter_map(LineChild::resident_bytes_max).max()
     }
@@ -199,7 +199,7 @@ impl Workers {
         Ok(())
     }
 
-    /// Asks the sink, and looks after the workers until it answers.
+    /// Sends a request to the sink, and checks on the workers until it answers.
     fn ask(&mut self, request: Request, watch: &Watch, limit: Duration) -> anyhow::Result<Answer> {
         let (answer, discrepancies) =
             self.sink.answer(request, &mut self.children, watch, limit)?;
@@ -208,7 +208,7 @@ impl Workers {
     }
 }
 
-/// Waits until a worker has its environments; returns what they are.
+/// Waits until a worker has created its environments; returns their spec.
 fn environment(child: &mut LineChild, watch: &Watch, limit: Duration) -> anyhow::Result<EnvSpec> {
     let deadline = Instant::now() + limit;
     loop {

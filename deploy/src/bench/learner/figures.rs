@@ -1,4 +1,4 @@
-//! What `dmprl bench learner` reports: for programs one JSON object, for people a table.
+//! The report of `dmprl bench learner`: one JSON object for programs, a table for people.
 
 use dmprl_shared::config::ExperimentConfig;
 use serde_json::{Map, Value, json};
@@ -9,43 +9,43 @@ use crate::run_directory::{Machine, Manifest};
 
 /// The learner of a run.
 pub(super) const OURS: &str = "ours";
-/// The products by the `gemm` crate.
+/// The matrix products by the `gemm` crate.
 pub(super) const LIBRARY: &str = "floor_library";
-/// The products by our own kernels.
+/// The matrix products by our own kernels.
 pub(super) const KERNELS: &str = "floor_kernels";
 /// Sampling a batch, alone.
 pub(super) const SAMPLE: &str = "sample";
-/// The optimiser and the targets, alone.
+/// The optimiser and the target networks, alone.
 pub(super) const OPTIMISER: &str = "optimiser";
 
-/// The time of one update, or of one update's part.
+/// Duration of one update, or of a part of it.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(in crate::bench) struct Timed {
-    /// By the clock \[s\].
+    /// Wall time \[s\].
     pub(in crate::bench) wall_s: f64,
-    /// Of all threads together \[s\]: what other programs on the machine disturb least.
+    /// Processor time of all threads \[s\], which other programs on the machine affect least.
     pub(in crate::bench) cpu_s: f64,
 }
 
 impl Timed {
-    /// Of one of `count` updates that took this long together.
+    /// Divides the time of `count` updates by their number.
     pub(in crate::bench) fn over(self, count: f64) -> Self {
         Self { wall_s: self.wall_s / count, cpu_s: self.cpu_s / count }
     }
 }
 
-/// Times by round, and what else is known.
+/// Times of each round, with further figures.
 #[derive(Debug, Clone)]
 pub struct Figures {
     pub(super) config: ExperimentConfig,
     pub(super) seconds: f64,
     machine: Option<Machine>,
     load_average: Option<f64>,
-    /// (name, its rounds); no entry for one that is absent.
+    /// (name, rounds), without absent candidates.
     rounds: Vec<(&'static str, Vec<Timed>)>,
-    /// (name, what it is or why it is absent).
+    /// (name, description or reason for absence).
     pub(super) notes: Vec<(&'static str, String)>,
-    /// The most memory that the learner has had at once, its replay included.
+    /// Peak resident memory of the learner, including its replay.
     pub(super) peak_memory_bytes: Option<u64>,
 }
 
@@ -62,7 +62,7 @@ impl Figures {
         }
     }
 
-    /// One more round of `name`.
+    /// Adds a round of `name`.
     pub(super) fn add(&mut self, name: &'static str, timed: Timed) {
         match self.rounds.iter_mut().find(|(known, _)| *known == name) {
             Some((_, rounds)) => rounds.push(timed),
@@ -70,7 +70,7 @@ impl Figures {
         }
     }
 
-    /// What `name` is, or why it is absent.
+    /// Describes `name`, or gives the reason for its absence.
     pub(super) fn note(&mut self, name: &'static str, text: &str) {
         self.notes.push((name, text.to_owned()));
     }
@@ -84,7 +84,7 @@ impl Figures {
         self.rounds(OURS).len()
     }
 
-    /// Milliseconds of an update by the clock, in each round.
+    /// Wall time of an update in each round, in milliseconds.
     pub(super) fn all_ms(&self, name: &str) -> Vec<f64> {
         self.rounds(name).iter().map(|timed| 1e3 * timed.wall_s).collect()
     }
@@ -97,26 +97,26 @@ impl Figures {
         median(&self.rounds(name).iter().map(|timed| 1e3 * timed.cpu_s).collect::<Vec<_>>())
     }
 
-    /// The products by whichever is faster over the rounds.
+    /// Name of the faster implementation of the products, over all rounds.
     pub(super) fn floor(&self) -> &'static str {
         let kernels = self.ms(KERNELS) < self.ms(LIBRARY);
         if kernels { KERNELS } else { LIBRARY }
     }
 
-    /// The time of `a` over that of `b`: the median of the rounds' own ratios, because within a
-    /// round a machine drifts less than over all of them.
+    /// The time of `a` divided by that of `b`. It is the median of the rounds' own ratios, because
+    /// a machine's speed drifts less within a round than over all of them.
     pub(super) fn ratio(&self, a: &str, b: &str, of: impl Fn(&Timed) -> f64) -> Option<f64> {
         let pairs = self.rounds(a).iter().zip(self.rounds(b));
         median(&pairs.map(|(a, b)| of(a) / of(b)).collect::<Vec<_>>())
     }
 
-    /// Of ours, by the clock.
+    /// Wall time of `name` divided by that of our update.
     pub(super) fn ratio_to_ours(&self, name: &str) -> Option<f64> {
         self.ratio(name, OURS, |timed| timed.wall_s)
     }
 
-    /// (part, its share of an update). Each part was measured alone; what is left are activation
-    /// functions, the DMP, losses, noise and the threads' waiting for each other.
+    /// (part, its share of an update). Each part is measured alone. The rest are activation
+    /// functions, the DMP, losses, noise and synchronisation of the threads.
     pub(super) fn shares(&self) -> Option<[(&'static str, f64); 4]> {
         let sample = self.ratio_to_ours(SAMPLE)?;
         let products = self.ratio_to_ours(self.floor())?;
@@ -125,7 +125,7 @@ impl Figures {
         Some([("sample", sample), ("products", products), (OPTIMISER, optimiser), ("rest", rest)])
     }
 
-    /// One object; a figure that is not to be had is null.
+    /// The figures as one JSON object; unavailable ones are null.
     #[must_use]
     pub fn json(&self) -> Value {
         let floor = self.floor();
@@ -203,7 +203,7 @@ pub(super) mod tests {
         };
         figures.note("torch", "PyTorch, eager");
         figures.note("jax", "is not installed");
-        // A machine that becomes twice and four times as slow in the middle of it.
+        // The machine becomes four times, then twice as slow during the measurement.
         for slow in [1.0, 4.0, 2.0] {
             for (name, ms) in [
                 (OURS, 5.0),

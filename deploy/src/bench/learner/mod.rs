@@ -1,10 +1,11 @@
-//! `dmprl bench learner`: an update beside its floor and beside PyTorch's and JAX's, in turn.
+//! `dmprl bench learner`: compares an update with its matrix products, PyTorch and JAX.
 //!
-//! Ours is the learner of a run on a replay full of made-up segments (`synthetic`), so it needs
-//! neither Python nor an environment. The floor is the update's matrix products and nothing else
-//! (`work`); the peers do the same update in processes of their own (`peers`). In every round each
-//! runs once for the same time while the others sleep, because a machine's speed drifts; medians
-//! over the rounds, and of the rounds' own ratios, count (`figures`, `table`).
+//! `ours` is the learner of a run on a replay full of synthetic segments (`synthetic`), so it needs
+//! neither Python nor an environment. The floor consists of the update's matrix products only
+//! (`work`). The peers do the same update in their own processes (`peers`). In every round each
+//! candidate runs once for the same time while the others sleep, because a machine's speed drifts.
+//! The report has medians over the rounds, and medians of the rounds' own ratios (`figures`,
+//! `table`).
 
 mod figures;
 mod peers;
@@ -35,28 +36,29 @@ use figures::{KERNELS, LIBRARY, OPTIMISER, OURS, SAMPLE};
 use peers::Peer;
 use work::{FloorWork, OptimiserWork, SampleWork};
 
-/// What to measure.
+/// Plan of the benchmark.
 pub struct LearnerBench {
     /// The resolved configuration.
     pub config: ExperimentConfig,
-    /// The task's sizes.
+    /// Spec with the task's sizes.
     pub spec: EnvSpec,
-    /// Who else does the update.
+    /// Peers that do the same update.
     pub peers: Vec<PeerKind>,
-    /// The interpreter that they run in.
+    /// Python interpreter of the peers.
     pub peer_python: PathBuf,
-    /// The folder of their script.
+    /// Folder with the peers' script.
     pub peers_path: PathBuf,
-    /// How often each is measured.
+    /// Number of rounds.
     pub rounds: usize,
-    /// How long each time.
+    /// Duration of each measurement.
     pub duration: Duration,
 }
 
-/// Measures; none when the user interrupted it. Leaves no process and no file behind.
+/// Runs the benchmark; returns `None` if the user interrupted it. Leaves no process and no file
+/// behind.
 ///
 /// # Errors
-/// The learner cannot be built or diverges, or a peer has died in the middle.
+/// The learner cannot be built or diverges, or a peer dies during a measurement.
 pub fn learner(bench: LearnerBench) -> anyhow::Result<Option<Figures>> {
     match measure(&bench) {
         Err(error) if error.is::<Interrupted>() => Ok(None),
@@ -71,12 +73,12 @@ fn measure(bench: &LearnerBench) -> anyhow::Result<Figures> {
     let progress = RoundsProgress::new(bench.rounds);
     progress.preparing("filling the replay");
     let mut figures = Figures::new(bench);
-    // Before the replay is filled: reading their packages takes as long.
+    // Started before the replay is filled, because importing their packages takes as long.
     let mut peers = Vec::new();
     for kind in &bench.peers {
         match Peer::start(*kind, bench, folder.path()) {
             Ok(peer) => peers.push(peer),
-            // Such as a --peer-python that is no program.
+            // For example, --peer-python is no program.
             Err(error) => figures.note(kind.name(), &format!("{error:#}")),
         }
     }
@@ -84,7 +86,7 @@ fn measure(bench: &LearnerBench) -> anyhow::Result<Figures> {
     synthetic::fill(&mut learner, &bench.spec)?;
     watch.check()?;
     timed(bench.duration, || Ok(learner.update()?))?;
-    // Before the benchmark makes buffers of its own.
+    // Measured before the benchmark allocates its own buffers.
     figures.peak_memory_bytes = resident_bytes_max("self");
     let mut work = Work::new(&learner);
     progress.preparing("starting what it is compared with");
@@ -108,7 +110,7 @@ fn measure(bench: &LearnerBench) -> anyhow::Result<Figures> {
     Ok(figures)
 }
 
-/// What this process does itself in a round.
+/// The parts of a round that this process measures itself.
 struct Work {
     floor: FloorWork,
     sample: SampleWork,
@@ -133,13 +135,13 @@ impl Work {
     ) -> anyhow::Result<()> {
         use dmprl_learner::update::floor::Engine;
         let Self { floor, sample, optimiser } = self;
-        // Ours in the middle, so that a machine that drifts does so for both sides.
+        // Our update runs in the middle, so that drift of the machine's speed affects both sides.
         figures.add(LIBRARY, floor.measure(Engine::Library, duration)?);
         watch.check()?;
         figures.add(OURS, timed(duration, || Ok(learner.update()?))?);
         watch.check()?;
         figures.add(KERNELS, floor.measure(Engine::Kernels, duration)?);
-        // Small parts of an update: a shorter time will do.
+        // These are small parts of an update, so a shorter time is enough.
         figures.add(SAMPLE, sample.measure(learner, duration / 4)?);
         figures.add(OPTIMISER, optimiser.measure(duration / 4)?);
         watch.check()

@@ -17,12 +17,13 @@ use super::figures::Timed;
 use crate::bench::child::LineChild;
 use crate::bench::watch::Watch;
 
-/// From a start to the first line: PyTorch alone is read for half a minute from a cold disk.
+/// Time limit from a start to the first line. Importing PyTorch from a cold disk alone takes half a
+/// minute.
 const READY: Duration = Duration::from_secs(300);
-/// Beyond what was asked for, a measurement may take so much longer; the first compiles.
+/// Extra time that a measurement may take; the first one includes compilation.
 const MEASURE_SLACK: Duration = Duration::from_secs(120);
 
-/// Who does the same update.
+/// A library that does the same update.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, ValueEnum)]
 pub enum PeerKind {
     /// PyTorch, eager.
@@ -32,10 +33,10 @@ pub enum PeerKind {
 }
 
 impl PeerKind {
-    /// Both, as reports list them.
+    /// All peers, in the order of the report.
     pub(super) const ALL: [Self; 2] = [Self::Torch, Self::Jax];
 
-    /// As the script calls it.
+    /// Name of the peer in the script.
     pub(super) fn name(self) -> &'static str {
         match self {
             Self::Torch => "torch",
@@ -81,20 +82,19 @@ impl Peer {
             .arg(&settings)
             .args(["--threads", &bench.config.learner.threads.to_string()])
             .current_dir(folder)
-            // Nothing is written beside the sources.
+            // Keeps Python from writing next to the sources.
             .env("PYTHONDONTWRITEBYTECODE", "1")
             .stderr(log);
         let child = LineChild::start(kind.name().to_owned(), command, &log_path)?;
         Ok(Self { kind, child })
     }
 
-    /// Waits until it is ready, and returns what it is; an error inside says why it is not to be
-    /// had here.
+    /// Waits until the peer is ready. Returns its description, or the reason why it is unavailable.
     pub(super) fn ready(&mut self, watch: &Watch) -> anyhow::Result<Result<String, String>> {
         self.child.greeting(watch, READY)
     }
 
-    /// The time of one update.
+    /// Measures the time of one update.
     pub(super) fn measure(&mut self, watch: &Watch, duration: Duration) -> anyhow::Result<Timed> {
         self.child.say(&format!("run {}", duration.as_secs_f64()))?;
         let line = self.child.next(watch, duration + MEASURE_SLACK, "the measurement")?;
@@ -108,7 +108,7 @@ impl Peer {
     }
 }
 
-/// Why the script's update would be another one than this configuration's.
+/// Returns the reason if the script cannot do this configuration's update.
 fn cannot_do(config: &ExperimentConfig) -> Option<&'static str> {
     let algorithm = &config.algorithm;
     let otherwise = [
@@ -120,7 +120,8 @@ fn cannot_do(config: &ExperimentConfig) -> Option<&'static str> {
     otherwise.into_iter().find_map(|(differs, why)| differs.then_some(why))
 }
 
-/// `Settings` of `tests/golden/update/settings.py`: sizes, and what changes the amount of work.
+/// `Settings` of `tests/golden/update/settings.py`: sizes, and everything that changes the amount
+/// of work.
 fn settings_of(config: &ExperimentConfig, spec: &EnvSpec) -> Value {
     let (algorithm, policy, dmp) = (&config.algorithm, &config.policy, &config.dmp);
     json!({

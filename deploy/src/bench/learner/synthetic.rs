@@ -1,4 +1,4 @@
-//! A replay full of segments that nobody has lived: the sizes are a task's, the numbers anything.
+//! Fills a replay with synthetic segments of a task's sizes.
 
 use anyhow::Context;
 use dmprl_learner::learner::Learner;
@@ -6,16 +6,16 @@ use dmprl_shared::config::TaskDefaults;
 use dmprl_shared::segment::{LAYOUT_VERSION, Segment, SegmentHeader, TRUNCATED, block_checksum};
 use dmprl_shared::spec::EnvSpec;
 
-/// The run that the segments say they are from.
+/// Run id in the synthetic segments.
 pub(super) const RUN_ID: u64 = 1;
 
-/// Enough for a batch not to lie in the processor's cache.
+/// Enough steps that batches do not come from the processor's cache.
 const STEPS: usize = 100_000;
 
-/// Between two numbers; irrational to the sine's period.
+/// Phase between two values. It is not commensurable with the sine's period.
 const STRIDE: f32 = 0.37;
 
-/// What the table of tasks says of an environment.
+/// The spec of an environment, from the table of tasks.
 #[must_use]
 pub fn spec_of(task: &TaskDefaults) -> EnvSpec {
     EnvSpec {
@@ -30,7 +30,7 @@ pub fn spec_of(task: &TaskDefaults) -> EnvSpec {
     }
 }
 
-/// Inserts whole episodes, one environment after the other.
+/// Inserts complete episodes, one environment after the other.
 pub(in crate::bench) fn fill(learner: &mut Learner, spec: &EnvSpec) -> anyhow::Result<()> {
     let layout = learner.policy().layout();
     let mut segment = Segment::zeroed(layout);

@@ -6,7 +6,7 @@ use crate::bench::statistics::{max, min};
 use crate::terminal::grouped;
 
 impl Figures {
-    /// What [`Figures::json`] holds, as a table.
+    /// Formats the figures as a table, like [`Figures::json`].
     #[must_use]
     pub fn text(&self) -> String {
         let (algorithm, threads) = (&self.config.algorithm, self.config.learner.threads);

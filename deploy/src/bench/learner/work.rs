@@ -1,4 +1,4 @@
-//! The parts of an update alone: its matrix products, its batch, its optimiser.
+//! Measures parts of an update alone: matrix products, sampling, optimiser.
 
 use std::time::{Duration, Instant};
 
@@ -12,10 +12,11 @@ use rustix::time::{ClockId, clock_gettime};
 
 use super::figures::Timed;
 
-/// Run before the clock starts: caches and clock frequency then are those of a long run.
+/// Divisor for the warm-up before the clock starts. It brings caches and clock frequency to the
+/// state of a long run.
 const SETTLE_SHARE: u32 = 8;
 
-/// Calls `work` for so long and returns the time of one call.
+/// Calls `work` repeatedly for `duration` and returns the time of one call.
 pub(in crate::bench) fn timed(
     duration: Duration,
     mut work: impl FnMut() -> anyhow::Result<()>,
@@ -25,7 +26,7 @@ pub(in crate::bench) fn timed(
         work()?;
     }
     let (start, cpu, mut calls) = (Instant::now(), cpu_s(), 0.0);
-    // Once at least: on a busy machine the time may be over before it has begun.
+    // At least once: on a busy machine the time may be over before the first call.
     loop {
         work()?;
         calls += 1.0;
@@ -44,8 +45,8 @@ fn cpu_s() -> f64 {
     time.tv_sec as f64 + time.tv_nsec as f64 * 1e-9
 }
 
-/// The products of an update. With several threads each has its share of the rows: what the
-/// shares' parts of a weight's gradient add up to is no product.
+/// The matrix products of an update. Each thread has its share of the rows. Summing the shares'
+/// parts of a weight's gradient is no product and is not included.
 pub(super) struct FloorWork {
     crew: Crew,
     shares: Vec<Floor>,
@@ -110,7 +111,7 @@ impl SampleWork {
     }
 }
 
-/// The optimiser and the targets, without the gradients.
+/// The optimiser and the target networks, without the gradients.
 pub(super) struct OptimiserWork(OptimiserSteps);
 
 impl OptimiserWork {

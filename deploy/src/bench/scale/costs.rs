@@ -1,4 +1,4 @@
-//! What a segment costs each part of the system, and an update the learner.
+//! Measures the cost of a segment for each part of the system, and of an update for the learner.
 
 use std::path::{Path, PathBuf};
 use std::time::Duration;
@@ -17,32 +17,31 @@ use crate::bench::statistics::median;
 use crate::bench::watch::Watch;
 use crate::bench::workers::{Stage, Workers};
 
-/// Each cost is measured so often; of a worker's the median counts.
+/// Measurements of each cost. A worker's is their median.
 const ROUNDS: u32 = 5;
-/// A round too short for a busy machine to deliver anything in is repeated, so often at most.
+/// Limit of repetitions. A round is repeated if a busy machine delivered nothing during it.
 const TRIES_MAX: u32 = 20 * ROUNDS;
-/// Of each environment in a worker's queue: what is measured is the worker, and not the sleep of
-/// whoever takes from it.
+/// Queue length in segments per environment. It keeps the receiver's sleep out of the measurement.
 const QUEUED_SEGMENTS: usize = 4;
-/// Segments inserted in turn: more than a cache near the processor holds.
+/// Number of different segments inserted in turn: more than the processor's caches hold.
 const POOL_SEGMENTS: usize = 8_192;
-/// Between two looks at the clock, and acknowledgements.
+/// Segments between two checks of the clock, and between two acknowledgements.
 const TOGETHER: usize = 256;
-/// A full log is emptied, as by a checkpoint: a benchmark must not fill the disk.
+/// A full log is cleared, as after a checkpoint, so that the benchmark does not fill the disk.
 const LOG_BYTES_MAX: u64 = 256 << 20;
 
-/// What a worker of a run costs.
+/// Cost of a run's worker.
 #[derive(Debug, Clone)]
 pub(super) struct WorkerCost {
-    /// Processor time for a segment [s].
+    /// Processor time per segment [s].
     pub(super) cpu_s: f64,
-    /// Environment steps in one.
+    /// Environment steps per segment.
     pub(super) steps_per_segment: f64,
-    /// What it has told of its environment.
+    /// Environment spec that the worker reported.
     pub(super) spec: EnvSpec,
 }
 
-/// Of real workers, whose segments are taken as fast as they come.
+/// Measures real workers, whose segments are taken as fast as they arrive.
 pub(super) fn worker(
     program: PathBuf,
     venv: PathBuf,
@@ -76,16 +75,16 @@ pub(super) fn worker(
     })
 }
 
-/// Processor time of an insertion without any transport: checked, settled, stored.
+/// Processor time of an insertion without transport: checking, settling, storing.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) struct InsertCost {
     /// At delivery level `memory` [s].
     pub(super) memory_s: f64,
-    /// What level `log` adds [s].
+    /// Additional cost of level `log` [s].
     pub(super) log_s: f64,
 }
 
-/// Into a full replay, of as many workers as a feed has.
+/// Measures insertion into a full replay, with as many workers as in the feed.
 pub(super) fn insert(
     feed: &FeedPlan<'_>,
     folder: &Path,
@@ -112,7 +111,7 @@ pub(super) fn insert(
     Ok(InsertCost { memory_s, log_s: (with_log_s - memory_s).max(0.0) })
 }
 
-/// Segments of all workers, in turn, again and again under higher numbers.
+/// Segments of all workers, inserted in turn and repeatedly, each time with new numbers.
 struct Pool {
     segments: Vec<Segment>,
     of_each: u64,
@@ -134,7 +133,7 @@ impl Pool {
         for _ in 0..TOGETHER {
             let segment = &mut self.segments[self.next];
             learner.insert(segment).context("a made-up segment was refused")?;
-            // The checksum is of the block alone.
+            // The checksum covers only the block.
             segment.header.sequence += self.of_each;
             self.next = (self.next + 1) % self.segments.len();
         }
@@ -142,10 +141,10 @@ impl Pool {
     }
 }
 
-/// Of a run's learner, on a replay full of made-up segments.
+/// Measures an update of a run's learner, on a replay full of synthetic segments.
 ///
-/// The least of several rounds, and on one thread its processor time: what other programs on the
-/// machine take from it is none of its cost.
+/// Returns the minimum over several rounds. On one thread it uses processor time, which does not
+/// include the time that other programs take.
 pub(super) fn update(
     config: &ExperimentConfig,
     spec: &EnvSpec,

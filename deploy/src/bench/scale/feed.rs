@@ -1,9 +1,9 @@
 //! A real learner's ingest, fed by many synthetic workers at full rate.
 //!
-//! The learner's end is a run's: its session takes turns over all queues, checks, settles and
-//! inserts into the replay, acknowledges and cleans up as the learner process does. It never comes
-//! to an update, because its warm-up never ends. The other end are processes of this program with
-//! many workers each (`feeder`).
+//! The learner's end uses a run's code: its session takes turns over all queues, checks, settles
+//! and inserts into the replay, acknowledges and cleans up like the learner process. It never does
+//! an update, because its warm-up never ends. The other end consists of processes of this program
+//! with many workers each (`feeder`).
 
 use std::fs::File;
 use std::path::Path;
@@ -31,40 +31,41 @@ use crate::bench::watch::Watch;
 use crate::control::Report;
 use crate::launch::create_domain;
 
-/// Segments that a worker's queue holds: four of each of eight environments.
+/// Queue length of a worker: four segments for each of eight environments.
 const QUEUE_SEGMENTS: usize = 32;
-/// What an outbox has beyond its queue, as by default in a run.
+/// Capacity of an outbox beyond its queue, as by default in a run.
 const OUTBOX_BEYOND: usize = 1_024;
-/// Never reached.
+/// A number of steps that is never reached.
 const NEVER: u64 = 1_000_000_000_000;
-/// As the learner process: its sleep when it finds nothing to do, and what it does in time.
+/// The sleep when there is nothing to do, and the intervals of the learner process.
 const IDLE: Duration = Duration::from_micros(100);
 const ACKNOWLEDGEMENT_INTERVAL: Duration = Duration::from_millis(10);
 const MAINTENANCE_INTERVAL: Duration = Duration::from_millis(250);
-/// Between two looks after the feeders and for an interrupt.
+/// Interval between checks for dead feeders and for an interrupt.
 const LOOK: Duration = Duration::from_millis(20);
-/// From the start of the processes to the first segment of each worker, and a full replay.
+/// Time limit from the start of the processes until each worker has delivered a segment and the
+/// replay is full.
 const START: Duration = Duration::from_secs(300);
-/// Beyond what was asked for, anything may take so much longer.
+/// Extra time that anything may take.
 const SLACK: Duration = Duration::from_secs(60);
-/// With the replay full, caches and outboxes too are a long run's after so long.
+/// Wait after the replay is full, until caches and outboxes are as in a long run.
 const SETTLE: Duration = Duration::from_millis(500);
 
-/// Who feeds whom.
+/// Sizes of a feed.
 pub(super) struct FeedPlan<'a> {
-    /// The program that plays the workers: this one.
+    /// Program of the feeder processes: this one.
     pub(super) program: &'a Path,
-    /// Of the learner.
+    /// Configuration of the learner.
     pub(super) config: &'a ExperimentConfig,
     pub(super) spec: &'a EnvSpec,
-    /// Synthetic workers,
+    /// Number of synthetic workers.
     pub(super) workers: usize,
-    /// and the processes that play them.
+    /// Number of processes that run the synthetic workers.
     pub(super) processes: usize,
 }
 
 impl FeedPlan<'_> {
-    /// A learner that only takes segments.
+    /// Creates a learner that only takes segments.
     pub(super) fn learner(&self) -> anyhow::Result<Learner> {
         let mut config = self.config.clone();
         config.actors.workers = self.workers;
@@ -78,18 +79,18 @@ impl FeedPlan<'_> {
         Ok(Learner::new(config, self.spec, RUN_ID)?)
     }
 
-    /// Header and block of a segment.
+    /// Size of a segment's header and block.
     pub(super) fn segment_bytes(&self) -> anyhow::Result<usize> {
         let block_len = Policy::new(self.config, self.spec)?.layout().block_len();
         Ok(size_of::<SegmentHeader>() + block_len * size_of::<f32>())
     }
 }
 
-/// What came in while the replay was full.
+/// Segments received while the replay was full.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub(super) struct FeedWindow {
     pub(super) seconds: f64,
-    /// Of each worker.
+    /// Number of each worker's segments.
     pub(super) segments: Vec<u64>,
     /// Processor time of the learner's thread [s].
     pub(super) cpu_s: f64,
@@ -98,13 +99,13 @@ pub(super) struct FeedWindow {
 }
 
 impl FeedWindow {
-    /// Of all workers.
+    /// Number of all workers' segments.
     pub(super) fn total(&self) -> u64 {
         self.segments.iter().sum()
     }
 }
 
-/// The learner's end and whoever feeds it.
+/// The learner's end and its feeder processes.
 pub(super) struct Feed {
     children: Vec<LineChild>,
     session: Session<Receiver, Publisher>,
@@ -112,12 +113,12 @@ pub(super) struct Feed {
     acknowledged: Instant,
     maintained: Instant,
     looked: Instant,
-    /// Last: removed when nobody is left who uses it.
+    /// Last: removed after all its users have been dropped.
     _domain: Domain,
 }
 
 impl Feed {
-    /// Starts everybody; returns when each worker has delivered and the replay is full.
+    /// Starts all processes; returns when each worker has delivered and the replay is full.
     pub(super) fn start(
         feed: &FeedPlan<'_>,
         token: &str,
@@ -158,7 +159,7 @@ impl Feed {
         Ok(feed)
     }
 
-    /// What comes in in so much time.
+    /// Counts the segments received during `duration`.
     pub(super) fn measure(
         &mut self,
         watch: &Watch,
@@ -169,7 +170,7 @@ impl Feed {
         let (start, cpu_s) = (Instant::now(), thread_cpu_s());
         self.turns_for(watch, duration / 2)?;
         let middle_bytes = resident_bytes();
-        // Longer, if nothing has come: a busy machine may have let nobody send.
+        // Continues if nothing was received: on a busy machine no feeder may have run.
         let received = self.session.learner.counters.received;
         let end = Instant::now() + duration / 2;
         let over =
@@ -182,12 +183,13 @@ impl Feed {
         Ok(FeedWindow { seconds, segments, cpu_s, resident_bytes })
     }
 
-    /// Processor time of the feeders so far \[s\], when the system tells it.
+    /// Processor time of the feeders so far \[s\], if the system reports it.
     pub(super) fn feeders_cpu_s(&self) -> Option<f64> {
         self.children.iter().map(LineChild::cpu_s_of_all_threads).sum()
     }
 
-    /// Stops the feeders, takes what is left and compares it with what they say they have sent.
+    /// Stops the feeders, takes the remaining segments and compares their number with the feeders'
+    /// reports.
     pub(super) fn finish(mut self, watch: &Watch) -> anyhow::Result<Discrepancies> {
         for child in &mut self.children {
             child.say("\"stop\"")?;
@@ -202,7 +204,7 @@ impl Feed {
                 }
             }
         }
-        // They have ended, which is no death any more.
+        // The feeders have exited as requested; do not treat this as a death.
         self.children.clear();
         self.drain(watch)?;
         let counters = self.session.learner.counters;
@@ -210,14 +212,14 @@ impl Feed {
         Ok(Discrepancies {
             rejected: counters.rejected.total() + duplicate,
             duplicate,
-            // Missing in the middle of a sequence, or behind its end.
+            // Missing within a sequence, or at its end.
             lost: counters.lost.max(sent.sent.saturating_sub(counters.received)),
             received: counters.received,
         })
     }
 
-    /// Takes what still lies in the queues, which nobody fills any more: until all are empty,
-    /// however long that takes on a busy machine.
+    /// Takes the remaining segments until all queues are empty, up to a time limit for a busy
+    /// machine.
     fn drain(&mut self, watch: &Watch) -> anyhow::Result<()> {
         let deadline = Instant::now() + SLACK;
         loop {
@@ -235,8 +237,8 @@ impl Feed {
         self.turns(watch, duration + SLACK, |_| Instant::now() >= end).map(|_| ())
     }
 
-    /// Turns until something holds, which is looked at with everything else; false if it does not
-    /// come about in time.
+    /// Takes turns until a condition holds, which is checked together with everything else. Returns
+    /// false if it does not hold in time.
     fn turns(
         &mut self,
         watch: &Watch,
@@ -263,9 +265,9 @@ impl Feed {
         }
     }
 
-    /// One turn, as the learner process takes it.
+    /// Takes one turn, like the learner process.
     fn turn(&mut self) -> anyhow::Result<(Turn, Instant)> {
-        // Nothing is due before the run's end; lost and refused segments are counted.
+        // Nothing is due before the run's end; lost and rejected segments are only counted.
         let mut due = |_: Due, _: &mut Learner| Ok(());
         let turn = self.session.turn(&mut due)?;
         match turn {
@@ -289,7 +291,7 @@ impl Feed {
     }
 }
 
-/// Starts the processes, each with its part of the workers.
+/// Starts the processes, each with its share of the workers.
 fn feeders(
     feed: &FeedPlan<'_>,
     plan: &Plan,

@@ -1,8 +1,8 @@
-//! `dmprl segment-feeder`: a process that plays many workers, which only send made-up segments.
+//! `dmprl segment-feeder`: runs many synthetic workers, which only send, in one process.
 //!
-//! Each of its workers has what a run's worker has: its own queue and outbox, checksums,
-//! acknowledgements. One thread serves all of them in turn: with a thread or a process each, most
-//! of a small machine's time would go into waking those whose queues are full.
+//! Each of them has what a run's worker has: its own queue and outbox, checksums, acknowledgements.
+//! One thread serves all of them in turn. With a thread or a process each, a small machine would
+//! spend most of its time waking workers with full queues.
 
 use std::path::PathBuf;
 use std::thread;
@@ -19,10 +19,10 @@ use crate::bench::made_up::{MadeUp, RUN_ID};
 use crate::control::Report;
 use crate::roles::{ControlPipe, ORPHAN_LIMIT};
 
-/// A round through all queues that fills less than this part of them is followed by a pause: to ask
-/// a full queue takes as long as to send a segment.
+/// A round that fills less than this fraction of all queues is followed by a pause, because
+/// checking a full queue takes as long as sending a segment.
 const FILLED_PART: usize = 4;
-/// The learner empties a small part of the queues meanwhile.
+/// Pause, during which the learner empties a small part of the queues.
 const PAUSE: Duration = Duration::from_micros(500);
 
 const HELP: &str = "\
@@ -41,34 +41,34 @@ pub struct SegmentFeederArgs {
     /// The shared-memory directory.
     #[arg(long, value_name = "DIR")]
     shared_memory: PathBuf,
-    /// How many workers the learner has.
+    /// Total number of the learner's workers.
     #[arg(long, value_name = "N")]
     workers: usize,
-    /// The first that this process plays, from 0,
+    /// Index of this process's first worker, from 0.
     #[arg(long, value_name = "I")]
     first: u32,
-    /// and how many.
+    /// Number of workers in this process.
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=1024))]
     count: u32,
-    /// Segments that a queue holds.
+    /// Capacity of a queue in segments.
     #[arg(long, value_name = "N")]
     queue_segments: usize,
-    /// Segments that a worker keeps until they are acknowledged.
+    /// Segments that a worker retains until they are acknowledged.
     #[arg(long, value_name = "N")]
     outbox_segments: usize,
-    /// Steps of a segment.
+    /// Control steps per segment.
     #[arg(long, value_name = "K")]
     segment_steps: usize,
-    /// Numbers of an observation.
+    /// Length of an observation.
     #[arg(long, value_name = "O")]
     observation_len: usize,
-    /// Numbers of an action.
+    /// Length of an action.
     #[arg(long, value_name = "A")]
     action_len: usize,
-    /// Parameters of the policy.
+    /// Number of the policy's parameters.
     #[arg(long, value_name = "P")]
     parameters_len: usize,
-    /// What the learner calls its policy's architecture.
+    /// Hash of the learner's policy architecture.
     #[arg(long, value_name = "H")]
     architecture_hash: u64,
 }
@@ -89,7 +89,7 @@ impl SegmentFeederArgs {
         }
     }
 
-    /// The command line that says all this but the directory and which workers.
+    /// Command-line arguments for a plan, without the directory and the choice of workers.
     pub(super) fn words(plan: &Plan, outbox_segments: usize) -> Vec<String> {
         let numbers = [
             ("--workers", plan.worker_count),
@@ -107,10 +107,10 @@ impl SegmentFeederArgs {
     }
 }
 
-/// Sends until a stop is asked for; then each worker says what it has sent.
+/// Sends until a stop is requested; then reports the number of segments that each worker has sent.
 ///
 /// # Errors
-/// The learner is gone, or the transport is broken.
+/// The learner is gone, or the transport failed.
 pub fn segment_feeder(args: &SegmentFeederArgs) -> anyhow::Result<()> {
     let control = ControlPipe::open(ORPHAN_LIMIT)?;
     let plan = args.plan();
@@ -141,7 +141,7 @@ pub fn segment_feeder(args: &SegmentFeederArgs) -> anyhow::Result<()> {
     Ok(())
 }
 
-/// One of those that this process plays.
+/// A synthetic worker of this process.
 struct Worker {
     end: WorkerEnd,
     outbox: Outbox,
@@ -150,8 +150,8 @@ struct Worker {
 }
 
 impl Worker {
-    /// Sends until its queue is full, `segments_max` at most; returns how many. A worker of a run
-    /// would sleep on its full queue, where this one lets others have the processor.
+    /// Sends until its queue is full, at most `segments_max` segments; returns their number. It
+    /// does not sleep on its full queue as a run's worker would, but yields to the others.
     fn fill(&mut self, segments_max: usize) -> anyhow::Result<usize> {
         let Self { end, outbox, made_up, acknowledgements } = self;
         for sent in 0..segments_max {
@@ -160,7 +160,7 @@ impl Worker {
             {
                 outbox.acknowledge(acknowledgements);
             }
-            // What found no room the last time comes first.
+            // A segment that did not fit the last time comes first.
             if outbox.offer(&mut end.segments)? != SendOutcome::Delivered
                 || outbox.len() == outbox.capacity()
             {

@@ -1,4 +1,4 @@
-//! What `dmprl bench scale` reports, as one JSON object.
+//! The report of `dmprl bench scale`, as one JSON object.
 
 use dmprl_shared::config::ExperimentConfig;
 use serde_json::{Value, json};
@@ -11,17 +11,17 @@ use crate::bench::statistics::load_average;
 use crate::bench::system::Window;
 use crate::run_directory::Machine;
 
-/// Numbers of workers that the model is asked about.
+/// Numbers of workers for which the model predicts the throughput.
 pub(super) const WORKERS: [usize; 7] = [16, 32, 64, 128, 256, 512, 1_024];
 
-/// How a learner's ingest held.
+/// Result of the simulation of a learner's ingest.
 #[derive(Debug, Clone)]
 pub(super) struct Simulated {
     pub(super) window: FeedWindow,
-    /// Processor time of who fed it [s].
+    /// Processor time of the feeders [s].
     pub(super) feeders_cpu_s: Option<f64>,
     pub(super) discrepancies: Discrepancies,
-    /// Processor time of an insertion without any transport [s].
+    /// Processor time of an insertion without transport [s].
     pub(super) insert_s: f64,
 }
 
@@ -30,68 +30,68 @@ impl Simulated {
         self.window.total() as f64 / self.window.seconds
     }
 
-    /// Share of a core that the learner's thread had.
+    /// Fraction of a core that the learner's thread used.
     pub(super) fn learner_cores(&self) -> f64 {
         self.window.cpu_s / self.window.seconds
     }
 
-    /// Processor time of the learner's thread for a segment [s].
+    /// Processor time of the learner's thread per segment [s].
     pub(super) fn cpu_s(&self) -> f64 {
         self.window.cpu_s / self.window.total().max(1) as f64
     }
 
-    /// Each worker's segments over an equal share of all: least and most.
+    /// Each worker's segments divided by an equal share: minimum and maximum.
     pub(super) fn shares(&self) -> (f64, f64) {
         let equal = self.window.total() as f64 / self.window.segments.len().max(1) as f64;
         let shares = self.window.segments.iter().map(|&segments| segments as f64 / equal);
         shares.fold((f64::INFINITY, 0.0), |(least, most), it| (it.min(least), it.max(most)))
     }
 
-    /// (sum of x)^2 / (n sum of x^2) (Jain et al. 1984): 1 when all have the same, 1/n when one
-    /// has everything.
+    /// Jain's fairness index (sum of x)^2 / (n sum of x^2) (Jain et al. 1984): 1 when all have the
+    /// same, 1/n when one has everything.
     pub(super) fn jain_index(&self) -> f64 {
         let segments = || self.window.segments.iter().map(|&segments| segments as f64);
         let (sum, squares) = (segments().sum::<f64>(), segments().map(|it| it * it).sum::<f64>());
         sum * sum / (self.window.segments.len().max(1) as f64 * squares.max(1.0))
     }
 
-    /// The learner's memory at start, in the middle and at the end [MB].
+    /// The learner's memory at the start, in the middle and at the end [MB].
     pub(super) fn resident_mb(&self) -> [Option<f64>; 3] {
         self.window.resident_bytes.map(|bytes| bytes.map(|bytes| bytes as f64 / 1e6))
     }
 }
 
-/// What was measured of each part [s].
+/// Measured cost of each part [s].
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) struct CostFigures {
     pub(super) worker_s: f64,
-    /// With transport,
+    /// Ingest including transport.
     pub(super) ingest_s: f64,
-    /// and without.
+    /// Ingest without transport: check, settle, insert.
     pub(super) insert_s: f64,
-    /// What delivery level `log` would add.
+    /// Additional cost of delivery level `log`.
     pub(super) log_s: f64,
     pub(super) update_s: f64,
     pub(super) update_cpu_s: f64,
 }
 
 impl CostFigures {
-    /// What the queues between processes cost the learner: the rest of its ingest.
+    /// Cost of the queues between processes for the learner: ingest minus insertion.
     pub(super) fn transport_s(&self) -> f64 {
         (self.ingest_s - self.insert_s).max(0.0)
     }
 }
 
-/// A real system beside the model.
+/// A real system compared with the model.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Check {
     pub(super) predicted: Prediction,
     pub(super) measured_steps_per_s: f64,
-    /// Processor time of workers and learner for a step, by the model [s],
+    /// Processor time of workers and learner per step, as predicted by the model [s].
     pub(super) predicted_cpu_s: f64,
-    /// and as it was.
+    /// Processor time of workers and learner per step, as measured [s].
     pub(super) measured_cpu_s: f64,
-    /// That workers and learner had.
+    /// Cores that workers and learner used.
     pub(super) cores_used: f64,
 }
 
@@ -108,12 +108,12 @@ impl Check {
         }
     }
 
-    /// Measured over predicted.
+    /// Measured divided by predicted throughput.
     pub(super) fn ratio(&self) -> f64 {
         self.measured_steps_per_s / self.predicted.steps_per_s
     }
 
-    /// The same of the processor time for a step, which a busy machine disturbs least.
+    /// Measured divided by predicted processor time per step, which other load affects least.
     pub(super) fn cpu_ratio(&self) -> f64 {
         self.measured_cpu_s / self.predicted_cpu_s
     }
@@ -133,7 +133,7 @@ impl Check {
     }
 }
 
-/// Everything that was found.
+/// All results of the benchmark.
 #[derive(Debug, Clone)]
 pub struct Figures {
     pub(super) config: ExperimentConfig,
@@ -170,17 +170,17 @@ impl Figures {
         }
     }
 
-    /// What the model says of more workers than there are here.
+    /// The model's predictions for more workers than this machine has.
     pub(super) fn predictions(&self) -> [Prediction; WORKERS.len()] {
         WORKERS.map(|workers| self.model.predict(workers))
     }
 
-    /// What comes first, and with how many workers.
+    /// The first bottleneck, and the number of workers that reach it.
     pub(super) fn first_bottleneck(&self) -> (Bottleneck, usize) {
         self.model.first_bottleneck()
     }
 
-    /// One object; a figure that is not to be had is null.
+    /// The figures as one JSON object; unavailable ones are null.
     #[must_use]
     pub fn json(&self) -> Value {
         let Self { simulated, costs, model, .. } = self;
@@ -259,7 +259,7 @@ pub(super) mod tests {
         MetricsLine { env_steps, wall_s, ..line }
     }
 
-    /// Two workers of whom one has three quarters; costs in round numbers.
+    /// Two workers, one with three quarters of all segments; costs are round numbers.
     pub(in super::super) fn figures() -> Figures {
         let costs = CostFigures {
             worker_s: 1e-3,
@@ -329,7 +329,7 @@ pub(super) mod tests {
         assert_eq!(json["first_bottleneck"]["name"], "ingest");
         assert_eq!(json["first_bottleneck"]["workers"], 334);
         let check = &json["check"][0];
-        // 4,000 steps a second of the 5,000 that a worker can make.
+        // The system does 4,000 steps per second; the model predicts 5,000 for one worker.
         close(&check["predicted_steps_per_s"], 5_000.0);
         close(&check["ratio"], 0.8);
         close(&check["measured_cpu_us_per_step"], 225.75);

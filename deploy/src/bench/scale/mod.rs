@@ -1,14 +1,14 @@
-//! `dmprl bench scale`: what many workers would do, and a learner's ingest under 256 of them.
+//! `dmprl bench scale`: predicts the throughput of many workers, and measures a learner with 256.
 //!
 //! ```text
-//!   feed (feeder processes ─► real queues ─► session) ─► does ingest hold?
+//!   feed (feeder processes ─► real queues ─► session) ─► can ingest keep up?
 //!   costs: worker, transport, ingest, update ─► model ─► table for 16 to 1 024 workers
 //!                                                 └────► check: real runs of 1 to 4 workers here
 //! ```
-//! The simulation (`feed`, `feeder`) shows what one learner takes: segments a second, shares,
-//! memory. `costs` measures what a segment costs each part and an update the learner, `model` says
-//! what follows from it for other numbers of workers and hosts, and `bench system` measures the
-//! real thing beside it.
+//! The simulation (`feed`, `feeder`) measures the capacity of one learner: segments per second,
+//! shares, memory. `costs` measures the cost of a segment for each part, and of an update for the
+//! learner. `model` derives predictions for other numbers of workers and hosts, and `bench system`
+//! measures real systems for comparison.
 
 mod costs;
 mod feed;
@@ -37,40 +37,42 @@ use feed::{Feed, FeedPlan, FeedWindow};
 use figures::{Check, CostFigures, Simulated};
 use model::{Costs, Demand, Model, Place};
 
-/// What to measure.
+/// Plan of the benchmark.
 pub struct ScaleBench {
-    /// The program that plays every part: this one.
+    /// Program of all processes: this one.
     pub program: PathBuf,
-    /// The resolved configuration of a run; `actors.workers` of its workers are measured.
+    /// The resolved configuration of a run; the cost of a worker is measured with its
+    /// `actors.workers` workers.
     pub config: ExperimentConfig,
-    /// The Python virtual environment of the workers.
+    /// Python virtual environment of the workers.
     pub venv: PathBuf,
-    /// Synthetic workers of the simulation.
+    /// Number of synthetic workers in the simulation.
     pub synthetic_workers: usize,
-    /// Processes that play them.
+    /// Number of processes that run the synthetic workers.
     pub feeders: usize,
-    /// Bytes of their segments: one of those that `bench transport` has.
+    /// Size of the synthetic segments in bytes: one of the sizes of `bench transport`.
     pub segment_bytes: usize,
-    /// How long the simulation is measured.
+    /// Duration of the simulation.
     pub duration: Duration,
-    /// How long each cost is measured.
+    /// Duration of the measurement of each cost.
     pub cost_duration: Duration,
-    /// Real systems of 1 to so many workers are measured beside the model,
+    /// Real systems of 1 to this number of workers are compared with the model.
     pub check_workers: usize,
-    /// each for so long.
+    /// Duration of the measurement of each real system.
     pub check_duration: Duration,
     /// Cores of this machine.
     pub cores: usize,
-    /// Workers of each host.
+    /// Workers per host in the model.
     pub cores_per_host: usize,
-    /// Into the learner's host; none: no bound.
+    /// Bandwidth of the network into the learner's host; `None` for unlimited.
     pub link_bytes_per_s: Option<f64>,
 }
 
-/// Measures; none when the user interrupted it. Leaves no process and no file behind.
+/// Runs the benchmark; returns `None` if the user interrupted it. Leaves no process and no file
+/// behind.
 ///
 /// # Errors
-/// A process could not be started or has died, or the transport failed.
+/// A process cannot be started or dies, or the transport fails.
 pub fn scale(bench: &ScaleBench) -> anyhow::Result<Option<Figures>> {
     match measure(bench) {
         Err(error) if error.is::<Interrupted>() => Ok(None),
@@ -105,7 +107,7 @@ fn measure(bench: &ScaleBench) -> anyhow::Result<Figures> {
     Ok(Figures::new(bench, (simulated, costs, model, checks), machine))
 }
 
-/// The ingest of one learner under many workers.
+/// Measures the ingest of one learner with many workers.
 fn simulate(
     bench: &ScaleBench,
     watch: &Watch,
@@ -113,7 +115,7 @@ fn simulate(
 ) -> anyhow::Result<Simulated> {
     let size = Size::of_bytes(bench.segment_bytes).context("no such size")?;
     let spec = spec_of(size);
-    // A task's own policy may need more of an observation than these have.
+    // The task's own policy may need longer observations than these segments have.
     let mut config = ExperimentConfig::default().resolve(Limits { cores: bench.cores })?;
     config.replay.capacity_steps = bench.config.replay.capacity_steps;
     let feed = feed_plan(bench, &config, &spec);
@@ -173,7 +175,8 @@ fn feed_plan<'a>(
     }
 }
 
-/// A feed from start to end: what came, the feeders' processor time for it, what should not be.
+/// Runs a feed from start to end; returns its window, the feeders' processor time, and
+/// discrepancies.
 fn fed(
     plan: &FeedPlan<'_>,
     name: &str,
@@ -208,7 +211,7 @@ fn temporary() -> anyhow::Result<tempfile::TempDir> {
     folder.context("cannot make a folder for logs")
 }
 
-/// An environment whose segments have this size.
+/// The spec of an environment whose segments have this size.
 fn spec_of(size: Size) -> EnvSpec {
     let action_len = size.layout.action_len;
     EnvSpec {

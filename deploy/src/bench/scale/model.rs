@@ -1,89 +1,90 @@
-//! What a system of many workers would do, from what its parts cost: pure arithmetic.
+//! Predicts the throughput of many workers from the costs of each part, by pure arithmetic.
 //!
-//! Every environment step passes four stages, each with a bound of its own on segments a second.
-//! The smallest decides, and is called the bottleneck:
+//! Every environment step passes four stages. Each limits the number of segments per second, and
+//! the lowest limit is the bottleneck:
 //!
 //! ```text
-//!   workers   workers at work / worker_s            a worker is one thread: at most a core each
-//!   learner   1 / (ingest_s + u update_s)           one thread takes segments and does updates,
-//!                                                   in turn; u updates for each segment (pacing)
-//!   link      link_bytes_per_s / segment_bytes      into the learner's host, if it is given
-//!   cores     cores / (worker_s + ingest_s + u update_cpu_s)     only where all share one machine
+//!   workers   busy workers / worker_s                 a worker is one thread: at most one core each
+//!   learner   1 / (ingest_s + u update_s)             one thread takes segments and does updates,
+//!                                                     in turn; u updates per segment (pacing)
+//!   link      link_bytes_per_s / segment_bytes        into the learner's host, if it is given
+//!   cores     cores / (worker_s + ingest_s + u update_cpu_s)     only if all share one machine
 //! ```
-//! The learner's bound is called `ingest` where taking segments is most of it, else `updates`.
+//! The learner's limit is called `ingest` if taking segments is most of it, else `updates`.
 //!
-//! Assumed, and checked against a real system only on one machine:
-//! - Costs are constants: of a worker whatever the number of workers, of the learner whatever the
-//!   number of queues it takes from (they are measured with many), of an update whatever else goes
-//!   on. Cores are alike and have nothing else to do.
-//! - Queues are long enough that nobody waits but for the bottleneck.
-//! - Each worker host has `cores_per_host` workers, the learner has a host of its own, and its
-//!   threads have a core each.
-//! - A network costs its bytes and nothing else. dmprl has no transport between machines yet: what
-//!   it will cost the learner's thread a segment comes on top of `ingest_s`.
-//! - Publishing, metrics, checkpoints and evaluations cost nothing. They are rare beside updates.
+//! Assumptions, checked against a real system on one machine only:
+//! - Costs are constants: a worker's does not depend on the number of workers, the learner's not on
+//!   the number of queues (it is measured with many), and an update's not on other load. All cores
+//!   are alike and have nothing else to do.
+//! - Queues are long enough that only the bottleneck makes others wait.
+//! - Each worker host has `cores_per_host` workers. The learner has a host of its own, and each of
+//!   its threads a core.
+//! - A network limits only the number of bytes. The processor time of the gateway on the learner's
+//!   host is not included.
+//! - Publishing, metrics, checkpoints and evaluations cost nothing, as they are rare compared to
+//!   updates.
 
 use serde::Serialize;
 
-/// What one segment and one update cost [s].
+/// Costs of one segment and one update [s].
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) struct Costs {
-    /// Processor time of a worker for a segment.
+    /// Processor time of a worker per segment.
     pub(super) worker_s: f64,
-    /// Time of the learner's thread for a segment: to take, check, settle, insert and acknowledge.
+    /// Time of the learner's thread per segment: to take, check, settle, insert and acknowledge it.
     pub(super) ingest_s: f64,
-    /// Time of an update on the learner's threads,
+    /// Wall time of an update on the learner's threads.
     pub(super) update_s: f64,
-    /// and of all of them together.
+    /// Processor time of an update, of all threads together.
     pub(super) update_cpu_s: f64,
 }
 
-/// What a run asks for.
+/// Requirements of a run.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) struct Demand {
-    /// Environment steps in a segment, on average.
+    /// Average number of environment steps per segment.
     pub(super) steps_per_segment: f64,
-    /// Updates for each segment.
+    /// Updates per segment.
     pub(super) updates_per_segment: f64,
-    /// Header and block.
+    /// Size of header and block.
     pub(super) segment_bytes: usize,
 }
 
-/// Where it runs.
+/// Location of workers and learner.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) enum Place {
     /// Workers and learner share a machine.
     OneMachine {
-        /// That it has for them.
+        /// Number of cores available to them.
         cores: f64,
     },
-    /// The learner has a host of its own, the workers have others.
+    /// The learner has a host of its own, the workers have other hosts.
     Hosts {
-        /// Workers of each host.
+        /// Workers per host.
         cores_per_host: usize,
-        /// Into the learner's host; none: no bound.
+        /// Bandwidth into the learner's host; `None` for unlimited.
         link_bytes_per_s: Option<f64>,
     },
 }
 
-/// What bounds a system.
+/// The part that limits a system.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "snake_case")]
 pub(super) enum Bottleneck {
-    /// The workers, who can do no more.
+    /// The workers, all of which are busy.
     Workers,
-    /// The learner's thread, most of whose time goes into taking segments.
+    /// The learner's thread, mostly busy taking segments.
     Ingest,
-    /// The same, most of whose time goes into updates.
+    /// The learner's thread, mostly busy with updates.
     Updates,
     /// The network into the learner's host.
     Link,
-    /// The cores of the one machine.
+    /// The cores of the shared machine.
     Cores,
 }
 
 impl Bottleneck {
-    /// As reports call it.
+    /// Name of the bottleneck in reports.
     pub(super) fn name(self) -> &'static str {
         match self {
             Self::Workers => "workers",
@@ -95,19 +96,19 @@ impl Bottleneck {
     }
 }
 
-/// What is to be expected of so many workers.
+/// Predicted throughput of a number of workers.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub(super) struct Prediction {
     pub(super) workers: usize,
-    /// Machines, the learner's included.
+    /// Number of hosts, including the learner's.
     pub(super) hosts: usize,
     pub(super) steps_per_s: f64,
     pub(super) bottleneck: Bottleneck,
-    /// Share of its time in which the learner's thread works.
+    /// Fraction of its time that the learner's thread is busy.
     pub(super) learner_utilisation: f64,
 }
 
-/// Costs, a demand and a place.
+/// A model of costs, requirements and location.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) struct Model {
     pub(super) costs: Costs,
@@ -116,23 +117,23 @@ pub(super) struct Model {
 }
 
 impl Model {
-    /// Time of the learner's thread for a segment and the updates that it asks for [s].
+    /// Time of the learner's thread for a segment and its updates [s].
     fn learner_s(&self) -> f64 {
         self.costs.ingest_s + self.demand.updates_per_segment * self.costs.update_s
     }
 
-    /// Processor time of a worker and of the learner for an environment step [s].
+    /// Processor time of workers and learner per environment step [s].
     pub(super) fn cpu_s_per_step(&self) -> f64 {
         self.cpu_s() / self.demand.steps_per_segment
     }
 
-    /// The same for a segment.
+    /// Processor time of workers and learner per segment [s].
     fn cpu_s(&self) -> f64 {
         let Costs { worker_s, ingest_s, update_cpu_s, .. } = self.costs;
         worker_s + ingest_s + self.demand.updates_per_segment * update_cpu_s
     }
 
-    /// Segments a second that the workers alone would make.
+    /// Segments per second of the workers if nothing else limited them.
     fn workers_rate(&self, workers: usize) -> f64 {
         let at_work = match self.place {
             Place::OneMachine { cores } => (workers as f64).min(cores),
@@ -141,7 +142,7 @@ impl Model {
         at_work / self.costs.worker_s
     }
 
-    /// Everything else that bounds segments a second.
+    /// All other limits of segments per second.
     fn other_bounds(&self) -> [(Bottleneck, f64); 3] {
         let Self { costs, demand, place } = self;
         let updates_s = demand.updates_per_segment * costs.update_s;
@@ -155,7 +156,7 @@ impl Model {
         [(learner, 1.0 / self.learner_s()), (Bottleneck::Link, link), (Bottleneck::Cores, cores)]
     }
 
-    /// What so many workers would do.
+    /// Predicts the throughput of `workers` workers.
     pub(super) fn predict(&self, workers: usize) -> Prediction {
         let bounds = self.other_bounds().into_iter();
         let least = |a: (Bottleneck, f64), b: (Bottleneck, f64)| if b.1 < a.1 { b } else { a };
@@ -174,7 +175,7 @@ impl Model {
         }
     }
 
-    /// What the workers meet first as they become more, and how many of them reach it.
+    /// The lowest limit besides the workers' own, and the number of workers that reach it.
     pub(super) fn first_bottleneck(&self) -> (Bottleneck, usize) {
         let least = |a: (Bottleneck, f64), b: (Bottleneck, f64)| if b.1 < a.1 { b } else { a };
         let none = (Bottleneck::Workers, f64::INFINITY);
@@ -187,7 +188,7 @@ impl Model {
 mod tests {
     use super::*;
 
-    /// A worker makes 100 segments a second; the learner takes 10,000 or does 500 updates.
+    /// A worker makes 100 segments per second; the learner takes 10,000 or does 500 updates.
     const COSTS: Costs =
         Costs { worker_s: 1e-2, ingest_s: 1e-4, update_s: 2e-3, update_cpu_s: 2e-3 };
     const DEMAND: Demand =
@@ -254,7 +255,7 @@ mod tests {
         close(two.learner_utilisation, 2.0 * 6.1 / 16.1);
     }
 
-    /// Two threads halve the time of an update and not what it takes of the machine.
+    /// Two threads halve the wall time of an update, but not its processor time.
     #[test]
     fn threads_of_the_learner_count_as_cores() {
         let costs = Costs { update_s: 1e-3, ..COSTS };

@@ -1,4 +1,4 @@
-//! The figures of `bench scale` in lines.
+//! Formats the figures of `bench scale` as text.
 
 use super::figures::{Check, CostFigures, Figures, Simulated};
 use super::model::Prediction;
@@ -6,7 +6,7 @@ use crate::bench::sink::Discrepancies;
 use crate::terminal::grouped;
 
 impl Figures {
-    /// What [`Figures::json`] holds, as tables.
+    /// Formats the figures as tables, like [`Figures::json`].
     #[must_use]
     pub fn text(&self) -> String {
         let mut lines = self.simulation();

@@ -1,4 +1,4 @@
-//! What `dmprl bench system` reports: for programs one JSON object, for people a few lines.
+//! The report of `dmprl bench system`: one JSON object for programs, a few lines for people.
 
 use dmprl_shared::config::{AlgorithmName, ExperimentConfig};
 use serde_json::{Value, json};
@@ -9,7 +9,7 @@ use crate::bench::statistics::load_average;
 use crate::run_directory::Machine;
 use crate::terminal::grouped;
 
-/// A run's steady state, and what is known besides.
+/// The steady state of a run, with further figures.
 #[derive(Debug, Clone)]
 pub struct Figures {
     config: ExperimentConfig,
@@ -26,20 +26,20 @@ impl Figures {
         Self { config, evaluate, window, machine, load_average }
     }
 
-    /// Cores that learner, workers and the rest really had.
+    /// Number of cores that learner, workers and other processes used.
     fn cores(&self) -> [f64; 3] {
         let cpu = self.window.cpu;
         [cpu.learner_s, cpu.workers_s, cpu.others_s].map(|seconds| seconds / self.window.seen_s)
     }
 
-    /// Of what learner and workers could use at most: a core for each thread.
+    /// Utilisation of learner and workers, relative to one core per thread.
     fn utilisations(&self) -> [f64; 2] {
         let [learner, workers, _] = self.cores();
         let most = |threads: usize| threads.min(self.machine.cores).max(1) as f64;
         [learner / most(self.config.learner.threads), workers / most(self.config.actors.workers)]
     }
 
-    /// Updates for each segment; none where an algorithm has a rule of its own.
+    /// Measured and configured updates per segment; `None` for an algorithm with its own rule.
     fn updates_per_segment(&self) -> Option<(f64, f64)> {
         if self.config.algorithm.name == AlgorithmName::Ndp {
             return None;
@@ -52,7 +52,7 @@ impl Figures {
         self.window.per_s(|line| line.segments)
     }
 
-    /// The middle line's median.
+    /// Median of the lines' median policy lags.
     fn lag_p50(&self) -> Option<u64> {
         let mut medians: Vec<_> = self.window.lags.iter().map(|(median, _)| *median).collect();
         medians.sort_unstable();
@@ -63,7 +63,7 @@ impl Figures {
         self.window.lags.iter().map(|(_, max)| *max).max()
     }
 
-    /// One object; a figure that is not to be had is null.
+    /// The figures as one JSON object; unavailable ones are null.
     #[must_use]
     pub fn json(&self) -> Value {
         let Window { first, last, cpu, .. } = &self.window;
@@ -103,7 +103,7 @@ impl Figures {
         })
     }
 
-    /// What [`Figures::json`] holds, in lines.
+    /// Formats the figures as lines, like [`Figures::json`].
     #[must_use]
     pub fn text(&self) -> String {
         let Self { config, window, .. } = self;

@@ -1,9 +1,10 @@
-//! `dmprl bench system`: a real `dmprl train`, measured while it learns.
+//! `dmprl bench system`: measures a real `dmprl train` while it learns.
 //!
-//! The run is what a user starts: supervisor, learner, workers, in a folder that is removed
-//! afterwards. Its rates are differences between two lines of its own `metrics.jsonl` (`steady`),
-//! processor time is what `/proc` says when these lines appear. What comes before the first of the
-//! two is left out: starting, the warm-up, in which nothing is learned, and a second after it.
+//! The run is a normal one, with supervisor, learner and workers, in a folder that is removed
+//! afterwards. Its rates are differences between two lines of its own `metrics.jsonl` (`steady`).
+//! Processor time is read from `/proc` when these lines appear. The measurement excludes the time
+//! before the first line: the start, the warm-up, in which nothing is learned, and a second after
+//! it.
 
 mod figures;
 mod steady;
@@ -26,27 +27,29 @@ pub(super) use steady::CpuTime;
 use steady::Steady;
 pub(super) use steady::Window;
 
-/// Long beyond any measurement.
+/// More steps than any measurement reaches.
 const STEPS: u64 = 1_000_000_000_000;
-/// Environment steps between two lines of metrics, at most: the window begins and ends with one.
+/// Maximum number of environment steps between two lines of metrics, at which the measurement
+/// begins and ends.
 const METRICS_STEPS_MAX: u64 = 500;
 
-/// What to measure.
+/// Plan of the benchmark.
 pub struct SystemBench {
-    /// The program that plays every part: this one.
+    /// Program of all processes: this one.
     pub program: PathBuf,
     /// The resolved configuration.
     pub config: ExperimentConfig,
-    /// Whether the policy is evaluated as the configuration says, or never.
+    /// Evaluates the policy as configured if true, never if false.
     pub evaluate: bool,
-    /// How long it is measured, at least.
+    /// Minimum duration of the measurement.
     pub duration: Duration,
 }
 
-/// Measures; none when the user interrupted it. Leaves no process and no file behind.
+/// Runs the benchmark; returns `None` if the user interrupted it. Leaves no process and no file
+/// behind.
 ///
 /// # Errors
-/// The run could not be started, has ended by itself, or makes no progress.
+/// The run cannot be started, ends by itself, or makes no progress.
 pub fn system(bench: &SystemBench) -> anyhow::Result<Option<Figures>> {
     let watch = Watch::start()?;
     let progress = RoundsProgress::new(1);
@@ -61,7 +64,7 @@ pub fn system(bench: &SystemBench) -> anyhow::Result<Option<Figures>> {
     }
 }
 
-/// The steady state of a run of its own; `told` hears what goes on.
+/// Starts a run and measures its steady state; `told` receives progress messages.
 pub(super) fn measure(
     bench: &SystemBench,
     watch: &Watch,
@@ -74,7 +77,7 @@ pub(super) fn measure(
     let metrics = folder.path().join("run/metrics.jsonl");
     let measured =
         Steady::new(&metrics, train.pid()?, bench).until_measured(&mut train, watch, told);
-    // However it went: stopped as a user stops it, a run leaves no process and no shared memory.
+    // In any case, stop the run as a user would, so that it leaves no process and no shared memory.
     let wrong = if train.end()?.is_none() { train.stop()? } else { None };
     let window = measured?;
     match wrong {
@@ -83,12 +86,12 @@ pub(super) fn measure(
     }
 }
 
-/// `dmprl train` with the whole configuration as a file.
+/// `dmprl train` with the complete configuration as a file.
 fn command(bench: &SystemBench, folder: &Path) -> anyhow::Result<Command> {
     let mut config = bench.config.clone();
     config.run.steps = STEPS;
     config.metrics.interval_steps = config.metrics.interval_steps.min(METRICS_STEPS_MAX);
-    // Nobody joins a benchmark.
+    // No worker joins a benchmark.
     config.actors.joined_max = 0;
     if !bench.evaluate {
         config.evaluation.interval_steps = STEPS;

@@ -1,4 +1,4 @@
-//! The window of a run that is measured, between two lines of its metrics.
+//! Measures a run between two lines of its metrics.
 
 use std::path::Path;
 use std::thread;
@@ -14,20 +14,21 @@ use crate::dashboard::tail::Tail;
 use crate::launch::WholeRun;
 use crate::launch::members::{Role, cpu_s, members};
 
-/// Without a new line for so long the run makes no progress: a start reads Python's packages.
+/// Time without a new line after which the run counts as stuck. A start includes importing Python
+/// packages.
 const SILENCE: Duration = Duration::from_secs(300);
-/// After the first update: buffers have their size, caches and clock frequency are a long run's.
+/// Wait after the first update, until buffers, caches and clock frequency are as in a long run.
 const SETTLE_S: f64 = 1.0;
-/// Between two looks at the file.
+/// Interval between checks of the file.
 const LOOK: Duration = Duration::from_millis(5);
 
 /// Processor time so far [s].
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
 pub(in crate::bench) struct CpuTime {
     pub(in crate::bench) learner_s: f64,
-    /// All of them together.
+    /// Of all workers together.
     pub(in crate::bench) workers_s: f64,
-    /// Supervisor and evaluator.
+    /// Of supervisor and evaluator.
     pub(in crate::bench) others_s: f64,
 }
 
@@ -35,7 +36,7 @@ impl CpuTime {
     fn of(supervisor: Pid) -> anyhow::Result<Self> {
         let mut time = Self { others_s: cpu_s(supervisor).unwrap_or(0.0), ..Self::default() };
         for member in members(supervisor)? {
-            // One that has just ended has none.
+            // A process that has just exited has none.
             let seconds = cpu_s(member.pid()).unwrap_or(0.0);
             match member.role {
                 Role::Learner(_) => time.learner_s += seconds,
@@ -55,33 +56,33 @@ impl CpuTime {
     }
 }
 
-/// What was measured.
+/// Result of the measurement.
 #[derive(Debug, Clone)]
 pub(in crate::bench) struct Window {
-    /// The line that opens it: what came before is left out.
+    /// Line at the start of the measurement.
     pub(in crate::bench) first: MetricsLine,
-    /// The line that closes it.
+    /// Line at the end of the measurement.
     pub(in crate::bench) last: MetricsLine,
-    /// Policy lag of the lines within: each one's median, each one's largest.
+    /// Median and maximum of the policy lag, for each line in between.
     pub(in crate::bench) lags: Vec<(u64, u64)>,
-    /// Between the moments in which the two lines were seen,
+    /// Processor time between the moments at which the two lines were read.
     pub(in crate::bench) cpu: CpuTime,
-    /// which lie so far apart [s].
+    /// Time between these moments [s].
     pub(in crate::bench) seen_s: f64,
 }
 
 impl Window {
-    /// Its length by the learner's clock [s].
+    /// Duration by the learner's clock [s].
     pub(in crate::bench) fn wall_s(&self) -> f64 {
         self.last.wall_s - self.first.wall_s
     }
 
-    /// A count's growth per second.
+    /// Increase of a counter per second.
     pub(in crate::bench) fn per_s(&self, count: impl Fn(&MetricsLine) -> u64) -> f64 {
         count(&self.last).saturating_sub(count(&self.first)) as f64 / self.wall_s()
     }
 
-    /// Samples drawn for each environment step inserted.
+    /// Samples drawn per environment step inserted.
     pub(in crate::bench) fn samples_per_insert(&self) -> f64 {
         let samples = |line: &MetricsLine| line.samples_per_insert * line.env_steps as f64;
         let steps = self.last.env_steps.saturating_sub(self.first.env_steps).max(1);
@@ -89,7 +90,7 @@ impl Window {
     }
 }
 
-/// Follows a run's metrics.
+/// Follows the metrics of a run.
 pub(super) struct Steady {
     tail: Tail,
     supervisor: Pid,
@@ -100,7 +101,7 @@ pub(super) struct Steady {
     open: Option<Open>,
 }
 
-/// The window before it is closed.
+/// A measurement in progress.
 struct Open {
     first: MetricsLine,
     lags: Vec<(u64, u64)>,
@@ -148,7 +149,7 @@ impl Steady {
         }
     }
 
-    /// The window, if this line closes it.
+    /// Processes a line; returns the window if it ends the measurement.
     fn take(&mut self, line: MetricsLine, told: &dyn Fn(&str)) -> anyhow::Result<Option<Window>> {
         let Some(open) = &mut self.open else {
             let learns = line.updates > 0 && line.env_steps > self.warm_up_steps;

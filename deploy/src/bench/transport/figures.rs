@@ -1,4 +1,4 @@
-//! What `dmprl bench transport` reports: for programs one JSON object, for people a table.
+//! The report of `dmprl bench transport`: one JSON object for programs, a table for people.
 
 use dmprl_shared::config::DeliveryLevel;
 use serde_json::{Map, Value, json};
@@ -12,10 +12,10 @@ use crate::bench::statistics::{load_average, max, median, min};
 use crate::run_directory::Machine;
 use crate::terminal::grouped;
 
-/// Our transport's name among those of its peers.
+/// Our transport, in the report.
 pub(super) const OURS: &str = "shared_memory";
 
-/// Segments a second of each, by size and round, and what else is known.
+/// Segments per second of each transport, by size and round, with further figures.
 #[derive(Debug, Clone)]
 pub struct Figures {
     workers: u32,
@@ -23,15 +23,15 @@ pub struct Figures {
     seconds: f64,
     machine: Machine,
     load_average: Option<f64>,
-    /// (bytes, name, its rounds); no entry for one that is absent.
+    /// (bytes, name, rounds), without absent peers.
     rounds: Vec<(usize, &'static str, Vec<f64>)>,
-    /// (bytes, share of a core that the sink used in a round).
+    /// (bytes, fraction of a core that the sink used in a round).
     sink_shares: Vec<(usize, f64)>,
-    /// (name, what it is or why it is absent), once each.
+    /// (name, description or reason for absence), each name once.
     notes: Vec<(&'static str, String)>,
-    /// (bytes, what should not be).
+    /// (bytes, rejected and lost segments).
     pub(super) discrepancies: Vec<(usize, Discrepancies)>,
-    /// Share of a core that a worker uses whose queue and outbox are full.
+    /// Fraction of a core that a worker uses while queue and outbox are full.
     pub(super) blocked_cpu_fraction: Option<f64>,
 }
 
@@ -51,7 +51,7 @@ impl Figures {
         }
     }
 
-    /// One more round of `name`.
+    /// Adds a round of `name`.
     pub(super) fn add(&mut self, bytes: usize, name: &'static str, segments_per_s: f64) {
         let known = |entry: &&mut (usize, &str, Vec<f64>)| (entry.0, entry.1) == (bytes, name);
         match self.rounds.iter_mut().find(known) {
@@ -60,12 +60,12 @@ impl Figures {
         }
     }
 
-    /// What the sink took in a round.
+    /// Adds the sink's processor time of a round.
     pub(super) fn add_sink_share(&mut self, bytes: usize, share: f64) {
         self.sink_shares.push((bytes, share));
     }
 
-    /// What `name` is, or why it is absent; of several, the first.
+    /// Describes `name`, or gives the reason for its absence; keeps the first of several notes.
     pub(super) fn note(&mut self, name: &'static str, text: &str) {
         if self.notes.iter().all(|(noted, _)| *noted != name) {
             self.notes.push((name, text.to_owned()));
@@ -82,8 +82,8 @@ impl Figures {
         median(self.rates(bytes, name))
     }
 
-    /// Ours over that of `name`: the median of the rounds' own ratios, because within a round a
-    /// machine drifts less than over all of them.
+    /// Our rate divided by that of `name`. It is the median of the rounds' own ratios, because a
+    /// machine's speed drifts less within a round than over all of them.
     fn ratio(&self, bytes: usize, name: &str) -> Option<f64> {
         let pairs = self.rates(bytes, OURS).iter().zip(self.rates(bytes, name));
         median(&pairs.map(|(ours, other)| ours / other).collect::<Vec<_>>())
@@ -94,7 +94,7 @@ impl Figures {
         found.map(|(_, discrepancies)| *discrepancies).unwrap_or_default()
     }
 
-    /// One object; a figure that is not to be had is null.
+    /// The figures as one JSON object; unavailable ones are null.
     #[must_use]
     pub fn json(&self) -> Value {
         let notes: Map<_, _> =
@@ -102,7 +102,7 @@ impl Figures {
         json!({
             "sizes": SIZES.map(|size| self.size_json(size.bytes)),
             "blocked_cpu_fraction": self.blocked_cpu_fraction,
-            // Of the first size; each size has all of its own.
+            // For the first size; each size has its own `peers` too.
             "peers": self.each_peer(|name| self.segments_per_s(SIZES[0].bytes, name)),
             "workers": self.workers,
             "level": self.level,
@@ -139,7 +139,7 @@ impl Figures {
         peers().map(|name| (name.to_owned(), of(name).into())).collect()
     }
 
-    /// What [`Figures::json`] holds, as a table.
+    /// Formats the figures as a table, like [`Figures::json`].
     #[must_use]
     pub fn text(&self) -> String {
         let rounds = self.rates(SIZES[0].bytes, OURS).len();
@@ -198,7 +198,7 @@ impl Figures {
     }
 }
 
-/// Whoever may be measured beside ours, in the order of the report.
+/// All possible peers, in the order of the report.
 fn peers() -> impl Iterator<Item = &'static str> {
     StreamKind::ALL.map(StreamKind::name).into_iter().chain(python::NAMES)
 }
@@ -223,7 +223,7 @@ mod tests {
         };
         figures.note("zeromq", "is not installed");
         figures.note("zeromq", "again");
-        // A machine that becomes twice and four times as slow in the middle of it.
+        // The machine becomes four times, then twice as slow during the measurement.
         for slow in [1.0, 4.0, 2.0] {
             figures.add(1_024, OURS, 400_000.0 / slow);
             figures.add(1_024, "pipe", 100_000.0 / slow);

@@ -1,11 +1,11 @@
-//! `dmprl bench transport`: segments a second through shared memory, and through other things.
+//! `dmprl bench transport`: compares segments per second through shared memory and other channels.
 //!
-//! Processes of this program only send (`worker`, `made_up`); the learner's place is taken by the
-//! sink that `bench rollout` has, which checks, settles and acknowledges (`ours`). Beside them run
-//! pipes and sockets between the same processes (`streams`) and queues between processes in Python
-//! (`python`). In every round each runs once for the same time while the others sleep on what is
-//! full; medians over the rounds count (`figures`). At the end nobody takes from anybody, and what
-//! the workers still cost is measured.
+//! Processes of this program only send (`worker`, `made_up`). The sink of `bench rollout` acts as
+//! the learner: it checks, settles and acknowledges (`ours`). The peers are pipes and sockets
+//! between the same processes (`streams`) and queues between Python processes (`python`). In every
+//! round each runs once for the same time while the others sleep on a full channel; medians over
+//! the rounds count (`figures`). Finally the processor time of blocked workers is measured, while
+//! nothing takes their segments.
 
 mod figures;
 mod hosts;
@@ -35,35 +35,36 @@ use ours::Ours;
 use python::PythonPeer;
 use streams::{StreamKind, StreamPeer};
 
-/// A worker whose queue has just filled waits for longer and longer, up to this from then on.
+/// Time in which a blocked worker's wait grows to its maximum.
 const BLOCKED_SETTLE: Duration = Duration::from_millis(200);
-/// For so long the processor time of blocked workers is measured.
+/// Duration of the measurement of blocked workers.
 const BLOCKED: Duration = Duration::from_millis(1_500);
-/// How late an interrupt may be seen meanwhile.
+/// Maximum delay until an interrupt is noticed during that measurement.
 const BLOCKED_LOOK: Duration = Duration::from_millis(20);
 
-/// What to measure.
+/// Plan of the benchmark.
 pub struct TransportBench {
-    /// The program that plays the workers: this one.
+    /// Program of the worker processes: this one.
     pub program: PathBuf,
-    /// Processes that send through shared memory; a peer has one.
+    /// Number of processes that send through shared memory; a peer has one.
     pub workers: u32,
-    /// When our workers may forget a segment.
+    /// Delivery level, which determines when our workers may drop a segment.
     pub level: DeliveryLevel,
-    /// The interpreter of the peers in Python.
+    /// Python interpreter of the peers in Python.
     pub peer_python: PathBuf,
-    /// The folder with the Python package.
+    /// Folder with the Python package.
     pub package_path: PathBuf,
-    /// How often each is measured.
+    /// Number of rounds.
     pub rounds: usize,
-    /// How long each time.
+    /// Duration of each measurement.
     pub duration: Duration,
 }
 
-/// Measures; none when the user interrupted it. Leaves no process and no file behind.
+/// Runs the benchmark; returns `None` if the user interrupted it. Leaves no process and no file
+/// behind.
 ///
 /// # Errors
-/// A worker or a peer could not be started or has died.
+/// A worker or a peer cannot be started or dies.
 pub fn transport(bench: &TransportBench) -> anyhow::Result<Option<Figures>> {
     match measure(bench) {
         Err(error) if error.is::<Interrupted>() => Ok(None),
@@ -81,13 +82,13 @@ fn measure(bench: &TransportBench) -> anyhow::Result<Figures> {
     progress.preparing("starting workers and what they are compared with");
     let mut figures = Figures::new(bench, manifest.machine);
     let place = (folder.path(), &watch);
-    // All at once: reading Python's packages takes longest.
+    // Start all at once: importing Python packages takes longest.
     let mut pythons = Vec::new();
     for size in SIZES {
         for name in python::NAMES {
             match PythonPeer::start(name, size, bench, folder.path()) {
                 Ok(peer) => pythons.push((size, peer)),
-                // Such as a --peer-python that is no program.
+                // For example, --peer-python is no program.
                 Err(error) => figures.note(name, &format!("{error:#}")),
             }
         }
@@ -131,7 +132,7 @@ fn measure(bench: &TransportBench) -> anyhow::Result<Figures> {
     Ok(figures)
 }
 
-/// Everyone who carries segments of one size.
+/// All transports of segments of one size.
 struct Contest {
     ours: Ours,
     streams: Vec<StreamPeer>,
@@ -163,7 +164,7 @@ impl Contest {
     }
 }
 
-/// Share of a core that the busiest worker uses while nobody takes from any.
+/// Fraction of a core that the busiest worker uses while nothing takes its segments.
 fn blocked(sizes: &[Contest], watch: &Watch) -> anyhow::Result<Option<f64>> {
     wait(watch, BLOCKED_SETTLE)?;
     let cpu_s = || -> Option<Vec<f64>> {

@@ -1,4 +1,4 @@
-//! Our own transport: processes that only send, and the sink in the learner's place.
+//! Our own transport: processes that only send, and the sink as the learner.
 
 use std::fs::File;
 use std::path::Path;
@@ -17,27 +17,29 @@ use crate::bench::watch::Watch;
 use crate::control::Report;
 use crate::launch::create_domain;
 
-/// From the start of the processes to the first segment of each.
+/// Time limit from the start of the processes to the first segment of each.
 const START: Duration = Duration::from_secs(60);
-/// Beyond what was asked for, a measurement may take so much longer.
+/// Extra time that a measurement may take.
 const MEASURE_SLACK: Duration = Duration::from_secs(30);
-/// A worker that is stopped answers within milliseconds; one that waits, at its next look.
+/// Time limit for a worker to stop. It answers within milliseconds; a waiting one at its next
+/// check.
 const STOP: Duration = Duration::from_secs(30);
-/// What still lies in the queues is taken so long at a time, and is lost if it has not come after
-/// so long altogether: a busy machine may not let this process take.
+/// Duration of each attempt to take the remaining segments, and of all attempts together. On a busy
+/// machine this process may not run for a while; segments that are still missing at the end count
+/// as lost.
 const DRAIN: Duration = Duration::from_millis(100);
 const DRAIN_MAX: Duration = Duration::from_secs(10);
 
-/// A full log is emptied, as by a checkpoint: a benchmark must not fill the disk.
+/// A full log is cleared, as after a checkpoint, so that the benchmark does not fill the disk.
 const LOG_BYTES_MAX: u64 = 256 << 20;
 
-/// Running workers of one size, each with a full queue between two measurements.
+/// Running workers of one size, whose queues are full between two measurements.
 pub(super) struct Ours {
     pub(super) size: Size,
     children: Vec<LineChild>,
     sink: Sink,
     discrepancies: Discrepancies,
-    /// Last: removed when nobody is left who uses it.
+    /// Last: removed after all its users have been dropped.
     _domain: Domain,
 }
 
@@ -77,7 +79,7 @@ impl Ours {
         Ok(ours)
     }
 
-    /// What all workers together deliver in so much time.
+    /// Measures what all workers together deliver during `duration`.
     pub(super) fn measure(&mut self, watch: &Watch, duration: Duration) -> anyhow::Result<Window> {
         let request = Request::Measure(duration, From::All);
         match self.ask(request, watch, duration + MEASURE_SLACK)? {
@@ -86,19 +88,20 @@ impl Ours {
         }
     }
 
-    /// Processor time of each worker so far \[s\], when the system tells it.
+    /// Processor time of each worker so far \[s\], if the system reports it.
     pub(super) fn cpu_s(&self) -> Option<Vec<f64>> {
         self.children.iter().map(LineChild::cpu_s_of_all_threads).collect()
     }
 
-    /// Stops the workers, takes what is left and compares it with what they say they have sent.
+    /// Stops the workers, takes the remaining segments and compares their number with the workers'
+    /// reports.
     pub(super) fn finish(mut self, watch: &Watch) -> anyhow::Result<Discrepancies> {
         let mut sent = 0;
         for child in &mut self.children {
             child.say("\"stop\"")?;
             sent += last_report(child, watch)?.sent;
         }
-        // They have ended, which is no death any more.
+        // The workers have exited as requested; do not treat this as a death.
         self.children.clear();
         let began = Instant::now();
         loop {
@@ -108,7 +111,7 @@ impl Ours {
             }
         }
         let Discrepancies { received, lost, .. } = self.discrepancies;
-        // Missing in the middle of a sequence, or behind its end.
+        // Missing within a sequence, or at its end.
         let lost = lost.max(sent.saturating_sub(received));
         Ok(Discrepancies { lost, ..self.discrepancies })
     }
@@ -121,7 +124,7 @@ impl Ours {
     }
 }
 
-/// What a worker says that it has sent, before it ends.
+/// Receives a worker's final report of the segments that it has sent.
 fn last_report(child: &mut LineChild, watch: &Watch) -> anyhow::Result<Sent> {
     let deadline = Instant::now() + STOP;
     loop {

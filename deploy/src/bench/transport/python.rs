@@ -1,4 +1,4 @@
-//! Peers in Python: processes of `dmprl.bench_transport`, which has both ends of each.
+//! Peers in Python: processes of `dmprl.bench_transport`, each with both ends.
 
 use std::fs::File;
 use std::path::Path;
@@ -13,15 +13,15 @@ use crate::bench::child::LineChild;
 use crate::bench::made_up::Size;
 use crate::bench::watch::Watch;
 
-/// From a start to the first line.
+/// Time limit from a start to the first line.
 const READY: Duration = Duration::from_secs(120);
-/// Beyond what was asked for, a measurement may take so much longer.
+/// Extra time that a measurement may take.
 const MEASURE_SLACK: Duration = Duration::from_secs(30);
 
-/// As `dmprl.bench_transport` calls them.
+/// Names of the peers in `dmprl.bench_transport`.
 pub(super) const NAMES: [&str; 2] = ["multiprocessing_queue", "zeromq"];
 
-/// One process, which has the sender as its child.
+/// A peer's process, whose child is the sender.
 pub(super) struct PythonPeer {
     pub(super) name: &'static str,
     child: LineChild,
@@ -50,7 +50,7 @@ impl PythonPeer {
             .args(["--segment-bytes", &size.bytes.to_string()])
             .arg("--folder")
             .arg(folder)
-            // `-m` puts the working directory before everything else: one without modules.
+            // `-m` puts the working directory first on the path: use one without modules.
             .current_dir(folder)
             .env("PYTHONPATH", &bench.package_path)
             .env("PYTHONDONTWRITEBYTECODE", "1")
@@ -58,13 +58,12 @@ impl PythonPeer {
         Ok(Self { name, child: LineChild::start(label, command, &path)? })
     }
 
-    /// Waits until it is ready, and returns what it is; an error inside says why it is not to be
-    /// had here.
+    /// Waits until the peer is ready. Returns its description, or the reason why it is unavailable.
     pub(super) fn ready(&mut self, watch: &Watch) -> anyhow::Result<Result<String, String>> {
         self.child.greeting(watch, READY)
     }
 
-    /// Segments a second over so much time.
+    /// Measures segments per second.
     pub(super) fn measure(&mut self, watch: &Watch, duration: Duration) -> anyhow::Result<f64> {
         self.child.say(&format!("run {}", duration.as_secs_f64()))?;
         let line = self.child.next(watch, duration + MEASURE_SLACK, "the measurement")?;

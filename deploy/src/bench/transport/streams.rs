@@ -1,8 +1,8 @@
 //! Peers: the same segments as frames through a pipe or a Unix socket.
 //!
-//! One process writes, a thread here reads, checks and counts as the sink does for shared memory.
-//! There is no acknowledgement and nothing that could be sent again. Between two measurements the
-//! thread does not read, and the writer sleeps in the kernel.
+//! One process writes; a thread here reads, checks and counts like the sink for shared memory.
+//! There are no acknowledgements and no retransmits. Between two measurements the thread does not
+//! read, and the writer sleeps in the kernel.
 
 use std::fs::File;
 use std::io::{BufReader, Read};
@@ -22,16 +22,17 @@ use crate::bench::child::LineChild;
 use crate::bench::made_up::Size;
 use crate::bench::watch::Watch;
 
-/// From the start of a process to its connection.
+/// Time limit from the start of a process to its connection.
 const CONNECT: Duration = Duration::from_secs(30);
-/// Beyond what was asked for, a measurement may take so much longer.
+/// Extra time that a measurement may take.
 const MEASURE_SLACK: Duration = Duration::from_secs(30);
-/// Read before the clock starts: what lay in the pipe, and the writer's way back to its pace.
+/// Time before the clock starts, in which the pipe's old content is read and the writer returns to
+/// full speed.
 const SETTLE: Duration = Duration::from_millis(100);
-/// As much as a pipe holds.
+/// Capacity of a pipe.
 const BUFFER_BYTES: usize = 64 << 10;
 
-/// What a frame is sent through.
+/// Channel of a peer's frames.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum StreamKind {
     Pipe,
@@ -41,7 +42,7 @@ pub(super) enum StreamKind {
 impl StreamKind {
     pub(super) const ALL: [Self; 2] = [Self::Pipe, Self::Socket];
 
-    /// As reports call it.
+    /// Name of the channel in reports.
     pub(super) fn name(self) -> &'static str {
         match self {
             Self::Pipe => "pipe",
@@ -49,7 +50,7 @@ impl StreamKind {
         }
     }
 
-    /// What it is, for the report.
+    /// Description of the channel, for the report.
     pub(super) fn about(self) -> &'static str {
         match self {
             Self::Pipe => "one frame a write into a pipe, read in 64 KiB; no acknowledgement",
@@ -58,12 +59,12 @@ impl StreamKind {
     }
 }
 
-/// Bytes of a frame behind its length, for a block of so many numbers.
+/// Bytes of a frame after its length field, for a block of `block_len` values.
 pub(super) fn frame_bytes(block_len: usize) -> u32 {
     (size_of::<SegmentHeader>() + block_len * size_of::<f32>()) as u32
 }
 
-/// A writing process and the thread that reads.
+/// A writing process and the reading thread.
 pub(super) struct StreamPeer {
     pub(super) kind: StreamKind,
     child: LineChild,
@@ -86,11 +87,11 @@ impl StreamPeer {
         let (stream, child): (Box<dyn Read + Send>, _) = match kind {
             StreamKind::Pipe => {
                 let (reader, writer) = std::io::pipe().context("cannot make a pipe")?;
-                // The child opens it anew in our name, so that it is inherited by nobody.
+                // The child opens it by this path, so that no other process inherits it.
                 let path = format!("/proc/{}/fd/{}", std::process::id(), writer.as_raw_fd());
                 command.args(["--pipe", &path]);
                 let mut child = LineChild::start(name, command, &log_path)?;
-                // Ours is closed once the child has its own: then its death ends the stream.
+                // Close our end once the child has its own, so that its death ends the stream.
                 child.next(watch, CONNECT, "the connection")?;
                 drop(writer);
                 (Box::new(reader), child)
@@ -107,7 +108,7 @@ impl StreamPeer {
         };
         let (requests, asked) = mpsc::channel();
         let (answers, rates) = mpsc::channel();
-        // It ends with the child, whose death ends the stream, or with this peer.
+        // It exits when the stream ends with the child's death, or when this peer is dropped.
         thread::spawn(move || {
             let mut taker = Taker::new(stream, size);
             for duration in asked {
@@ -120,9 +121,9 @@ impl StreamPeer {
         Ok(Self { kind, child, requests, rates })
     }
 
-    /// Segments a second over so much time.
+    /// Measures segments per second.
     pub(super) fn measure(&mut self, watch: &Watch, duration: Duration) -> anyhow::Result<f64> {
-        // A thread that has ended has no answer either.
+        // If the thread has exited, there is no answer either.
         let _ = self.requests.send(duration);
         let what = format!("the measurement of {}", self.child.name());
         let rate = watch.next(&self.rates, duration + MEASURE_SLACK, &what)?;
@@ -165,7 +166,7 @@ impl Taker {
         Ok(segments as f64 / start.elapsed().as_secs_f64())
     }
 
-    /// A stream has no gaps: any is an error.
+    /// Takes a segment. A stream has no gaps: any gap is an error.
     fn take(&mut self) -> anyhow::Result<()> {
         let Self { stream, expected, inbox, segment } = self;
         let Segment { header, block } = segment;

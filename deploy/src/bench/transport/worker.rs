@@ -1,7 +1,7 @@
-//! `dmprl transport-worker`: a process that only sends made-up segments, as fast as they go.
+//! `dmprl transport-worker`: only sends synthetic segments, as fast as possible.
 //!
-//! Through shared memory it does what a worker of a run does with a finished segment, by the same
-//! code. Through a pipe or a socket it writes each segment as one frame: a length, header, block.
+//! Through shared memory it sends with the code of a run's worker. Through a pipe or a socket it
+//! writes each segment as one frame: a length, header, block.
 
 use std::fs::OpenOptions;
 use std::io::Write;
@@ -20,7 +20,7 @@ use crate::bench::made_up::{MadeUp, QUEUE_SEGMENTS, Size};
 use crate::control::Report;
 use crate::roles::{ControlPipe, ORPHAN_LIMIT};
 
-/// A worker from whom nobody takes waits for its turn: no reason for a warning.
+/// A blocked worker waits for its next round, which is no reason for a warning.
 const NO_WARNING: Duration = Duration::from_secs(1_000_000);
 
 const HELP: &str = "\
@@ -34,13 +34,13 @@ EXAMPLES
 #[derive(Debug, Clone, PartialEq, Eq, Args)]
 #[command(after_help = HELP)]
 pub struct TransportWorkerArgs {
-    /// Size of a segment: 1024 or 10240.
+    /// Size of a segment in bytes: 1024 or 10240.
     #[arg(long, value_name = "N", value_parser = size)]
     segment_bytes: usize,
-    /// How many workers there are.
+    /// Total number of workers.
     #[arg(long, value_name = "N", default_value_t = 1)]
     workers: usize,
-    /// Which of them this is, from 0.
+    /// Index of this worker, from 0.
     #[arg(long, value_name = "I", default_value_t = 0)]
     index: u32,
     #[command(flatten)]
@@ -50,13 +50,13 @@ pub struct TransportWorkerArgs {
 #[derive(Debug, Clone, PartialEq, Eq, Args)]
 #[group(required = true, multiple = false)]
 struct Route {
-    /// Through this shared-memory directory.
+    /// Send through this shared-memory directory.
     #[arg(long, value_name = "DIR")]
     shared_memory: Option<PathBuf>,
-    /// Into this pipe.
+    /// Send into this pipe.
     #[arg(long, value_name = "PATH")]
     pipe: Option<PathBuf>,
-    /// Through the Unix socket at this path.
+    /// Send through the Unix socket at this path.
     #[arg(long, value_name = "PATH")]
     socket: Option<PathBuf>,
 }
@@ -66,10 +66,10 @@ fn size(text: &str) -> Result<usize, String> {
     bytes.ok_or_else(|| "expected 1024 or 10240".to_owned())
 }
 
-/// Sends until a stop is asked for.
+/// Sends until a stop is requested.
 ///
 /// # Errors
-/// Whoever receives is gone, or the transport is broken.
+/// The receiver is gone, or the transport failed.
 pub fn transport_worker(args: &TransportWorkerArgs) -> anyhow::Result<()> {
     let control = ControlPipe::open(ORPHAN_LIMIT)?;
     let size = Size::of_bytes(args.segment_bytes).context("no such size")?;
@@ -115,7 +115,7 @@ fn through_stream(
     made_up: &mut MadeUp,
     control: &ControlPipe,
 ) -> anyhow::Result<()> {
-    // Nothing is sent yet, which says that it is connected.
+    // An empty report announces the connection.
     control.send(&Report::Sent(Sent::default()))?;
     let mut frame = Vec::new();
     while !control.stop_requested() {
@@ -124,8 +124,8 @@ fn through_stream(
         frame.extend_from_slice(&frame_bytes(block.len()).to_le_bytes());
         frame.extend_from_slice(bytemuck::bytes_of(header));
         frame.extend_from_slice(bytemuck::cast_slice(block));
-        // A full pipe blocks; one whose reader is gone is an error.
-        stream.write_all(&frame).context("whoever receives is gone")?;
+        // A full pipe blocks; a closed one is an error.
+        stream.write_all(&frame).context("the receiver is gone")?;
     }
     Ok(())
 }

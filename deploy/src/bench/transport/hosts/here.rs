@@ -1,4 +1,4 @@
-//! The learner's end.
+//! The learner's end of the benchmark between hosts.
 
 use std::collections::VecDeque;
 use std::path::Path;
@@ -27,15 +27,15 @@ use crate::terminal::say;
 
 const WORKERS_MAX: usize = 64;
 const PUBLISH_INTERVAL: Duration = Duration::from_millis(300);
-/// The clock starts so long after the first segment: the window grows first.
+/// Time from the first segment until the clock starts, in which the window grows.
 const SETTLE: Duration = Duration::from_secs(3);
-/// Times that the end is told: a message may meet a link that is full.
+/// Number of times that the end is announced, because a message can be lost on a full link.
 const GOODBYES: u32 = 10;
 
-/// Takes the learner's place for `duration`, at a Zenoh endpoint; none when interrupted.
+/// Acts as the learner for `duration`, at a Zenoh endpoint; returns `None` if interrupted.
 ///
 /// # Errors
-/// The endpoint is taken, nobody comes, or an end fails.
+/// The endpoint is in use, no host connects, or an end fails.
 pub fn listen(
     endpoint: &str,
     zenoh_file: Option<&Path>,
@@ -53,7 +53,7 @@ pub fn listen(
         }
         taker.turn(&policies)?;
         if policies.has_confirmed() {
-            // A host without workers only takes policies.
+            // A host without workers only receives policies.
             taker.first.get_or_insert_with(Instant::now);
         }
         if gateway.is_finished() {
@@ -85,13 +85,13 @@ pub fn listen(
     })))
 }
 
-/// Policies on their way, and how long they took.
+/// Policies in flight, and their latencies.
 #[derive(Default)]
 struct Policies {
     over: AtomicBool,
-    /// Version and time of those that no host has confirmed.
+    /// Version and time of each policy that no host has confirmed.
     under_way: Mutex<VecDeque<(u64, Instant)>>,
-    /// From publishing to the other host's confirmation, the way back included \[ms\].
+    /// Time from publishing to the other host's confirmation, including the way back \[ms\].
     ages_ms: Mutex<Vec<f64>>,
 }
 
@@ -105,7 +105,7 @@ impl Policies {
         !self.ages_ms.lock().unwrap_or_else(PoisonError::into_inner).is_empty()
     }
 
-    /// Those before it were replaced on the way.
+    /// Records a confirmation. It also covers earlier versions, which were replaced on the way.
     fn confirm(&self, version: u64) {
         let mut under_way = self.under_way.lock().unwrap_or_else(PoisonError::into_inner);
         let arrived = under_way.iter().take_while(|(first, _)| *first <= version).count();
@@ -116,7 +116,7 @@ impl Policies {
     }
 }
 
-/// Checks, settles and acknowledges, and publishes policies.
+/// Takes, checks, settles and acknowledges segments, and publishes policies.
 struct Taker {
     end: LearnerEnd,
     inbox: Inbox,
@@ -207,7 +207,7 @@ fn start_gateway(
         let facts = RunFacts {
             run_id: format!("{:016x}", plan(1).run_id),
             config: String::new(),
-            // Nobody asks for it.
+            // Never requested.
             spec: spec_of(&TASKS[0]),
             token: TOKEN.to_owned(),
         };

@@ -1,7 +1,7 @@
-//! The same between two hosts: relay and gateway of a run, with made-up segments and policies.
+//! `dmprl bench transport` between two hosts: a run's relay and gateway, with synthetic data.
 //!
-//! One end (`here`) takes the learner's place: it checks, settles and acknowledges, and publishes a
-//! policy now and then. The other (`there`) has workers that only send.
+//! One end (`here`) acts as the learner: it checks, settles and acknowledges segments, and
+//! publishes a policy at intervals. The other end (`there`) has workers that only send.
 
 mod here;
 mod there;
@@ -19,16 +19,17 @@ use crate::run_directory::random_u64;
 
 /// Values of a policy: half a megabyte.
 const PARAMETERS: usize = 131_072;
-/// What a worker keeps, and the gateway of each: more than any link here has under way.
+/// Segments that a worker retains, and the gateway for each worker: more than any link here has in
+/// flight.
 const KEPT: usize = 32_768;
-/// What a host may have under way \[bytes\]: likewise.
+/// Limit of a host's data in flight \[bytes\]: also more than any link needs.
 const UNDER_WAY_BYTES_MAX: u64 = 256 << 20;
-/// Made-up segments are no secret.
+/// Synthetic segments need no secret.
 const TOKEN: &str = "bench transport between hosts";
 const IDLE: Duration = Duration::from_micros(200);
-/// Between two acknowledgements, or looks for somebody who is not there yet.
+/// Interval between two acknowledgements, and between two attempts to reach the other end.
 const INTERVAL: Duration = Duration::from_millis(10);
-/// For the other end to come.
+/// Time limit for the other end to connect.
 const PATIENCE: Duration = Duration::from_secs(60);
 
 fn plan(workers: usize) -> Plan {

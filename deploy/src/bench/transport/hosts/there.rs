@@ -1,4 +1,4 @@
-//! The other end.
+//! The workers' end of the benchmark between hosts.
 
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -22,14 +22,14 @@ use crate::bridge::wire::Held;
 use crate::bridge::{Ends, Link};
 use crate::run_directory::random_u64;
 
-/// Segments made before the worker listens again.
+/// Segments generated between two checks for acknowledgements.
 const TOGETHER: usize = 32;
 
-/// Sends made-up segments to who listens at the endpoint until that has enough; none when
-/// interrupted. `rate`: what the workers make together \[segments/s\]; else as many as they can.
+/// Sends synthetic segments to the listener at the endpoint until it has enough; returns `None` if
+/// interrupted. `rate` is the total rate of all workers \[segments/s\]; `None` for the maximum.
 ///
 /// # Errors
-/// Nobody listens there, or an end fails.
+/// No process listens there, or an end fails.
 pub fn connect(
     endpoint: &str,
     zenoh_file: Option<&Path>,
@@ -101,7 +101,7 @@ fn welcomed(
     }
 }
 
-/// A worker that only sends, `rate` segments a second or as many as it can.
+/// A worker that only sends, at `rate` segments per second or as fast as possible.
 fn work(
     (index, rate): (u32, Option<f64>),
     (domain, plan): (&PathBuf, &Plan),
@@ -126,7 +126,7 @@ fn work(
         let room = outbox.capacity() - outbox.len();
         let due = rate.map_or(TOGETHER, |rate| {
             let due = (began.elapsed().as_secs_f64() * rate) as usize;
-            // Time in which nothing could be made is gone, as it is for a robot.
+            // Segments that could not be sent in time are skipped: a robot cannot catch up either.
             made = made.max(due.saturating_sub(TOGETHER));
             due - made
         });
