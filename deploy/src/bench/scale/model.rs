@@ -4,7 +4,7 @@
 //! the lowest limit is the bottleneck:
 //!
 //! ```text
-//!   workers   busy workers / worker_s                 a worker is one thread: at most one core each
+//!   workers   busy workers / worker_s                 a worker is one thread: at most a core each
 //!   learner   1 / (ingest_s + u update_s)             one thread takes segments and does updates,
 //!                                                     in turn; u updates per segment (pacing)
 //!   link      link_bytes_per_s / segment_bytes        into the learner's host, if it is given
