@@ -1,8 +1,8 @@
-//! What supervisor and roles say to each other: one JSON object a line, on the child's standard
-//! input and output. A child's standard error is its log file.
+//! Messages between supervisor and roles: one JSON object per line, on the child's standard input
+//! and output. A child's standard error is its log file.
 //!
-//! End of input means that the supervisor is gone: the child ends itself (the learner after a
-//! checkpoint), so no SIGKILL of the supervisor leaves an orphan.
+//! On end of input the supervisor is gone, and the child exits (the learner after a checkpoint). So
+//! even SIGKILL of the supervisor leaves no orphans.
 
 use std::fmt::{self, Display, Formatter};
 use std::path::PathBuf;
@@ -12,30 +12,30 @@ use dmprl_shared::spec::EnvSpec;
 use dmprl_shared::transport::delivery::Sent;
 use serde::{Deserialize, Serialize};
 
-/// Exit status of a process that has ended itself because an environment hung.
+/// Exit status of a process that exits because an environment call hung.
 pub const ENV_HUNG_STATUS: i32 = 75;
 
-/// What a terminal or a service manager sends to the whole process group. Only the supervisor
-/// listens; roles ignore it.
+/// Signals that a terminal or a service manager sends to the whole process group. Only the
+/// supervisor handles them; roles ignore them.
 pub const GROUP_SIGNALS: [i32; 3] = [libc::SIGINT, libc::SIGTERM, libc::SIGHUP];
 
-/// Where a run's supervisor takes in workers that join, below its private directory.
+/// Socket on which a run's supervisor accepts joining workers, in its private directory.
 pub const JOIN_SOCKET: &str = "join.sock";
-/// Version of what a supervisor and a worker that joins say to each other. Children are of the
-/// same build and need none.
+/// Version of the protocol between a supervisor and a joining worker. Children come from the same
+/// build and do not check it.
 const CONTROL_VERSION: u32 = 1;
 
-/// Which program speaks; the supervisor says so first.
+/// Version of a program and its protocol, sent first by the supervisor.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Greeting {
-    /// Of the program.
+    /// Version of the program.
     pub version: String,
-    /// Of this protocol.
+    /// Version of the protocol.
     pub control: u32,
 }
 
 impl Greeting {
-    /// This program.
+    /// The greeting of this program.
     #[must_use]
     pub fn this() -> Self {
         Self { version: env!("CARGO_PKG_VERSION").to_owned(), control: CONTROL_VERSION }
@@ -48,158 +48,158 @@ impl Display for Greeting {
     }
 }
 
-/// From a worker that asks to join.
+/// A worker's request to join.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct JoinRequest {
-    /// Which program it is.
+    /// Version of the worker.
     pub speaks: Greeting,
 }
 
-/// From the supervisor to a worker that has asked to join.
+/// The supervisor's answer to a request to join.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case", deny_unknown_fields)]
 pub enum JoinAnswer {
-    /// It may.
+    /// The worker is admitted.
     Welcome(Welcome),
-    /// It may not.
+    /// The worker is rejected.
     Refused {
-        /// Why, and what can be done.
+        /// The reason and a remedy.
         reason: String,
     },
 }
 
-/// What a worker that joins is from now on.
+/// Everything that an admitted worker needs to know.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Welcome {
-    /// Which of the run's workers.
+    /// Index of the worker in the run.
     pub index: u32,
-    /// Which start of it.
+    /// Incarnation of the worker.
     pub incarnation: u32,
     /// The run's Python virtual environment.
     pub venv: Option<PathBuf>,
-    /// How many workers there are, with it.
+    /// Number of workers, including this one.
     pub workers: usize,
 }
 
-/// From the supervisor to a role.
+/// A message from the supervisor to a role.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case", deny_unknown_fields)]
 pub enum Command {
-    /// To a worker: the learner is up, its services lie in this shared-memory directory.
+    /// To a worker: the learner is ready, and its services are in this shared-memory directory.
     Attach {
         /// The run's private shared-memory directory.
         domain: PathBuf,
     },
     /// To the evaluator: evaluate this policy.
     Evaluate(EvaluationRequest),
-    /// To the learner: so many failures of environments have been reported to the supervisor.
+    /// To the learner: number of failures of environments reported to the supervisor.
     EnvFailures {
-        /// In the whole run, all processes together.
+        /// Total of all processes in the whole run.
         total: u64,
     },
-    /// To the learner: what all workers have reported to the supervisor, in the whole run.
+    /// To the learner: total counts of segments that all workers have reported in the whole run.
     Sent(Sent),
-    /// To the learner: what the supervisor knows of the workers.
+    /// To the learner: state of the workers.
     Workers(WorkersNow),
-    /// To the learner: the run has reached its goal or its time; finish as at the last step, with a
-    /// last evaluation.
+    /// To the learner: the run has reached its goal or its time limit. Finish as after the last
+    /// step, with a final evaluation.
     Finish,
-    /// To any role: finish what must be finished and exit.
+    /// To any role: finish pending work and exit.
     Stop,
 }
 
-/// From a role to the supervisor.
+/// A message from a role to the supervisor.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case", deny_unknown_fields)]
 pub enum Report {
-    /// A worker or the evaluator has its environments.
+    /// A worker or the evaluator has created its environments.
     EnvironmentReady {
-        /// What they are.
+        /// Spec of the environments.
         spec: EnvSpec,
     },
-    /// The learner's services exist: workers may attach.
+    /// The learner's services exist, so workers may attach.
     LearnerReady,
     /// The first environment step of this run has reached the learner.
     FirstSegment,
-    /// Where the learner stands; a few times a second.
+    /// The learner's progress, sent several times per second.
     Progress(Progress),
-    /// The learner asks for an evaluation.
+    /// The learner requests an evaluation.
     Evaluate(EvaluationRequest),
-    /// The evaluator's answer: the row it appended to `evaluations.jsonl`.
+    /// The evaluator's result: the row it appended to `evaluations.jsonl`.
     Evaluated(EvaluationRow),
-    /// The evaluator's other answer: the episodes of this evaluation failed; the next may succeed.
+    /// The evaluator's failure: the episodes of this evaluation failed; the next may succeed.
     NotEvaluated {
-        /// Which policy was asked for.
+        /// Version of the requested policy.
         policy_version: u64,
-        /// What failed.
+        /// Description of the failure.
         reason: String,
     },
-    /// How far the observer is.
+    /// Progress of the observer.
     Observed {
-        /// Episodes written down.
+        /// Completed episodes.
         episodes: u64,
-        /// Steps of the next one; 0 when an episode has just ended.
+        /// Steps of the current episode; 0 if one has just ended.
         steps: u64,
     },
-    /// How far the video is.
+    /// Progress of the video.
     Filmed {
-        /// Frames in it.
+        /// Completed frames.
         done: u64,
-        /// How many there will be.
+        /// Total number of frames.
         of: u64,
     },
-    /// Environments failed and were made again.
+    /// Environments failed and were recreated.
     EnvFailures {
-        /// How many times since the last such report.
+        /// Number of failures since the last such report.
         count: u64,
-        /// The last of them: which, when and why.
+        /// The last failure: which environment, when and why.
         last: String,
     },
-    /// What a worker did since its last such report.
+    /// Counts of a worker's segments since its last such report.
     Sent(Sent),
-    /// A worker's sign of life, once a second.
+    /// A worker's heartbeat, once per second.
     Alive {
-        /// What it does.
+        /// Current activity.
         doing: Doing,
-        /// Segments that it keeps because the learner has not acknowledged them.
+        /// Retained segments that the learner has not acknowledged.
         kept: u64,
     },
-    /// A call into the environments does not return; the process ends itself after this.
+    /// A call into the environments does not return; the process exits after this message.
     EnvHung {
-        /// The sentence.
+        /// Message for the user.
         message: String,
     },
-    /// From the gateway, once a second: the hosts that take part.
+    /// From the gateway, once per second: the participating hosts.
     Hosts(Vec<HostNow>),
-    /// A worker that had joined leaves; it has handed over what it could.
+    /// A joined worker leaves, after delivering as many segments as possible.
     Left,
     /// The learner wrote a checkpoint.
     Checkpoint {
-        /// Its directory's name below `checkpoints/`.
+        /// Name of its directory below `checkpoints/`.
         name: String,
-        /// Environment steps in it.
+        /// Environment steps in the checkpoint.
         env_steps: u64,
     },
-    /// The learner has come to its end and written its last checkpoint.
+    /// The learner has finished the run and written its last checkpoint.
     Finished,
-    /// A role noticed something the user should read.
+    /// A warning for the user.
     Warning {
-        /// The sentence.
+        /// Message for the user.
         message: String,
     },
 }
 
-/// What the supervisor tells the learner of the workers, for its metrics.
+/// The state of the workers, for the learner's metrics.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct WorkersNow {
-    /// Attached: the run's own and those that have joined.
+    /// Attached workers, both the run's own and joined ones.
     pub count: u64,
-    /// Starts after a death, in the whole run.
+    /// Restarts after a death, in the whole run.
     pub restarts: u64,
-    /// Segments that they keep until the learner acknowledges them, all together.
+    /// Segments that all workers retain until the learner acknowledges them.
     pub queued_segments: u64,
 }
 
@@ -207,34 +207,34 @@ pub struct WorkersNow {
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct HostNow {
-    /// What people call it.
+    /// Name of the host, for display.
     pub name: String,
-    /// Whether it can be reached.
+    /// True if it is reachable.
     pub here: bool,
-    /// Workers that it has attached.
+    /// Number of its attached workers.
     pub workers: u64,
-    /// Segments that they keep until the learner acknowledges them.
+    /// Segments that its workers retain until the learner acknowledges them.
     pub kept: u64,
-    /// Segments of theirs that the learner has acknowledged.
+    /// Segments of its workers that the learner has acknowledged.
     pub acked: u64,
-    /// Starts of its workers after a death.
+    /// Restarts of its workers after a death.
     pub restarts: u64,
 }
 
-/// What a worker does when it gives a sign of life.
+/// Activity of a worker, in its heartbeat.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Doing {
-    /// It waits for a learner, or for its first policy.
+    /// Waits for a learner, or for its first policy.
     Attaching,
-    /// It steps environments; what a call into them does is the watchdog's business.
+    /// Steps environments; the watchdog detects calls that hang.
     Stepping,
-    /// It waits because its queue or its outbox is full.
+    /// Waits because its queue or its outbox is full.
     Waiting,
 }
 
 impl Doing {
-    /// As part of a sentence.
+    /// Description of the activity, as part of a sentence.
     #[must_use]
     pub fn name(self) -> &'static str {
         match self {
@@ -245,8 +245,8 @@ impl Doing {
     }
 }
 
-/// Where the learner stands. Every number is finite: JSON has no NaN, and a line with one is no
-/// report.
+/// Progress of the learner. All numbers are finite, because JSON has no NaN, and a line with one
+/// would be invalid.
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Progress {
@@ -256,29 +256,29 @@ pub struct Progress {
     pub updates: u64,
     /// Segments inserted.
     pub segments: u64,
-    /// Environment steps per second, lately.
+    /// Recent environment steps per second.
     pub env_steps_per_s: f64,
-    /// Updates per second, lately.
+    /// Recent updates per second.
     pub updates_per_s: f64,
     /// Mean return of the last training episodes (with noise); NaN is sent as null.
     pub return_mean: Option<f64>,
     /// Updates times batch size over environment steps inserted.
     pub samples_per_insert: f64,
-    /// Median over recent segments: policy versions between acting and insertion.
+    /// Median policy lag of recent segments, in policy versions between acting and insertion.
     pub policy_lag_p50: u64,
-    /// Largest of them.
+    /// Maximum policy lag of recent segments.
     pub policy_lag_max: u64,
-    /// Segments that workers keep until the learner acknowledges them.
+    /// Segments that workers retain until the learner acknowledges them.
     pub queued_segments: u64,
-    /// Starts of workers and of the learner after a death, over the whole run.
+    /// Restarts of workers and learner after a death, over the whole run.
     pub restarts: u64,
-    /// Segments refused, duplicates aside.
+    /// Rejected segments, without duplicates.
     pub rejected: u64,
-    /// Failures of environments.
+    /// Number of failures of environments.
     pub env_failures: u64,
 }
 
-/// One evaluation to be done.
+/// Request for an evaluation.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct EvaluationRequest {
@@ -310,16 +310,16 @@ pub struct EvaluationRow {
     pub policy_version: u64,
     /// Return of each episode.
     pub returns: Vec<f64>,
-    /// Their mean.
+    /// Mean of the returns.
     pub return_mean: f64,
-    /// Share of episodes that ended in success; null where the task does not report it.
+    /// Fraction of successful episodes; null if the task does not report success.
     pub success_rate: Option<f64>,
     /// Mean |u_t - u_{t-1}| over all steps and action dimensions.
     pub smoothness: f64,
 }
 
 impl EvaluationRow {
-    /// Refuses what JSON cannot say: neither `evaluations.jsonl` nor a report can hold it.
+    /// Rejects numbers that JSON cannot represent in `evaluations.jsonl` or in a report.
     ///
     /// # Errors
     /// A number is NaN or infinite.
