@@ -295,7 +295,7 @@ impl Gateway {
             .map_err(|_| never(format!("expected a request of {this}, got something else")))?;
         if speaks != this {
             let reason = format!("expected {this}, got {speaks}: start both from the same build");
-            self.tell_of_refusal(|| format!("a host of {speaks} may not take part"));
+            self.tell_of_refusal(|| format!("rejected a host with {speaks}"));
             return Err(never(reason));
         }
         let request: HostRequest = serde_json::from_slice(bytes)
@@ -303,7 +303,7 @@ impl Gateway {
         if !token::equal(&request.token, &self.facts.token) {
             self.tell_of_refusal(|| {
                 let name = request.name.escape_debug().take(NAME_MAX).collect::<String>();
-                format!("host {name} may not take part: its token is wrong")
+                format!("rejected host {name}: its token is wrong")
             });
             let reason = "its token is not the run's: copy bridge.token of the run's directory";
             return Err(never(reason.to_owned()));
@@ -312,7 +312,7 @@ impl Gateway {
             return Err(never(format!("its name has more than {NAME_MAX} characters (--name)")));
         }
         if self.heard.marks.is_empty() {
-            let reason = "the learner has not said yet how far its workers are".to_owned();
+            let reason = "the learner has not reported its workers' progress yet".to_owned();
             return Err(Refusal { reason, later: true });
         }
         let seat = random_u64().map_err(|error| never(format!("{error:#}")))?;

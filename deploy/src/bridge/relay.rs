@@ -234,7 +234,7 @@ impl Relay {
             maintained: now,
             told: now,
             tell_now: false,
-            away: Some((now, "it has not been asked yet".to_owned())),
+            away: Some((now, "no request has been sent yet".to_owned())),
             damaged: 0,
         })
     }

@@ -141,7 +141,7 @@ impl Seats {
                 let known = &mut self.hosts[at];
                 if known.workers != workers {
                     let reason = format!(
-                        "it took part with {} workers and asks now with {workers}: start it again",
+                        "it joined with {} workers and now asks for {workers}: start it again",
                         known.workers
                     );
                     return Err(Refusal { reason, later: false });
@@ -217,11 +217,11 @@ impl Seats {
         let silent = self.hosts.iter().filter(|host| now.duration_since(host.heard) >= SILENT);
         let silent = silent.map(|host| {
             let (name, minutes) = (host.name.escape_debug(), host.free_in(now).as_secs() / 60 + 1);
-            format!("; {name} is out of reach and keeps its own for {minutes} min")
+            format!("; {name} is out of reach and keeps its places for another {minutes} min")
         });
         format!(
-            "{taken} of {} places for workers of other hosts are taken (bridge.workers_max), it \
-             brings {workers} and they must lie side by side; a host that leaves makes room{}",
+            "{taken} of {} places for workers of other hosts are taken (bridge.workers_max), \
+             and this host needs {workers} adjacent ones; wait until a host leaves{}",
             self.places,
             silent.collect::<String>()
         )

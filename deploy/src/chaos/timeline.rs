@@ -171,7 +171,7 @@ impl Timeline {
                 let dead = before.map_or(0..0, |before| before..incarnation);
                 for dead in dead.filter(|dead| !worker.killed.contains(dead)) {
                     self.violations.add(format!(
-                        "I7: worker {index}, incarnation {dead}, has ended and nobody killed it"
+                        "I7: worker {index}, incarnation {dead}, has ended without being killed"
                     ));
                 }
             }
@@ -180,7 +180,7 @@ impl Timeline {
                 let dead = before.map_or(0..0, |before| before..deaths);
                 for dead in dead.filter(|dead| !self.learners_killed.contains(dead)) {
                     self.violations.add(format!(
-                        "I7: the learner after {dead} deaths has ended and nobody killed it"
+                        "I7: the learner after {dead} deaths has ended without being killed"
                     ));
                 }
             }
@@ -222,7 +222,7 @@ impl Timeline {
             self.silence_told = true;
             let seconds = silence as f64 / 1e6;
             self.violations
-                .add(format!("I7: nothing was inserted for {seconds:.0} s with all at work"));
+                .add(format!("I7: nothing was inserted for {seconds:.0} s without a fault"));
         }
         let workers = self.workers.iter_mut().enumerate();
         let faults = workers

@@ -122,9 +122,9 @@ impl<'a> Trial<'a> {
     fn turn(&mut self) -> anyhow::Result<()> {
         if let Some(how) = self.subject.end()? {
             if self.phase == Phase::Starting {
-                bail!("dmprl train has ended before it was struck: {how}");
+                bail!("dmprl train exited before the first fault: {how}");
             }
-            self.violations.add(format!("I7: dmprl train has ended by itself: {how}"));
+            self.violations.add(format!("I7: dmprl train exited unexpectedly: {how}"));
             self.phase = Phase::Over;
             return Ok(());
         }
@@ -234,7 +234,7 @@ impl<'a> Trial<'a> {
         let phase = match self.phase {
             Phase::Starting => "starting",
             Phase::Striking => "striking",
-            Phase::Healing => "letting it heal",
+            Phase::Healing => "recovering",
             Phase::Over => "stopping",
         };
         let violations = [&self.checker.violations, &self.timeline.violations, &self.violations];

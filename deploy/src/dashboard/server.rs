@@ -101,7 +101,7 @@ pub fn serve(
         let listener = TcpListener::bind(address).await.with_context(|| {
             format!("cannot listen on {address}; choose another --port, 0 for any that is free")
         })?;
-        listening(listener.local_addr().context("cannot tell the port")?)?;
+        listening(listener.local_addr().context("cannot determine the port")?)?;
         let (stop, stopped) = tokio::sync::oneshot::channel::<()>();
         let server = axum::serve(listener, router(Arc::new(Mutex::new(catalogue))))
             .with_graceful_shutdown(async { drop(stopped.await) });

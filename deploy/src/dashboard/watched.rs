@@ -221,7 +221,7 @@ impl Growing {
             }
             for line in look.lines.split(|&byte| byte == b'\n').filter(|line| !line.is_empty()) {
                 let row: Value = serde_json::from_slice(line).map_err(|error| {
-                    anyhow::anyhow!("{}: a line is no JSON: {error}", path.display())
+                    anyhow::anyhow!("{}: a line is not JSON: {error}", path.display())
                 })?;
                 if self.table.push(&row) {
                     self.number = next_number();

@@ -94,7 +94,7 @@ impl SweepFile {
             file.methods.push(MethodEntry { name: "default".to_owned(), ..Default::default() });
         }
         if file.search.is_some() && !file.grid.is_empty() {
-            return Err("[grid] and [search] stand there both; expected one of them".to_owned());
+            return Err("[grid] and [search] exclude each other; expected one of them".to_owned());
         }
         for (key, values) in flatten(&file.grid) {
             if values.as_array().is_none_or(Vec::is_empty) {

@@ -139,7 +139,7 @@ impl Writer {
         let (path, prefix) = (self.sources[index].path.clone(), self.sources[index].prefix);
         for line in lines.split(|&byte| byte == b'\n').filter(|line| !line.is_empty()) {
             let line: Value = serde_json::from_slice(line)
-                .with_context(|| format!("{}: a line is no JSON", path.display()))?;
+                .with_context(|| format!("{}: a line is not JSON", path.display()))?;
             self.write(&line, prefix)?;
         }
         Ok(())
@@ -213,7 +213,7 @@ fn begin(folder: &Path, wall_time: f64) -> anyhow::Result<(EventFile, PathBuf)> 
     Ok((file, path))
 }
 
-/// Every number of an object, also of objects in it, by its path.
+/// Collects every number of an object and of nested objects, by its path.
 fn flatten(value: &Value, tag: &str, scalars: &mut Vec<(String, f64)>) {
     match value {
         Value::Object(entries) => {

@@ -87,7 +87,7 @@ impl Checker {
         match (author, record.entry) {
             (Author::Worker(worker, incarnation), entry) => {
                 if worker as usize >= self.lives.len() {
-                    self.violations.add(format!("I9: a journal of worker {worker}, who is none"));
+                    self.violations.add(format!("I9: a journal of unknown worker {worker}"));
                 } else {
                     self.on_worker((worker, incarnation), entry);
                 }
@@ -106,7 +106,7 @@ impl Checker {
                 self.since_cut = 0;
             }
             (author, entry) => {
-                self.violations.add(format!("I9: {author:?} has noted {entry:?}"));
+                self.violations.add(format!("I9: {author:?} has logged {entry:?}"));
             }
         }
     }
@@ -167,14 +167,14 @@ impl Checker {
                 }
                 life.policy = (epoch, version);
             }
-            entry => self.violations.add(format!("I9: {name} has noted {entry:?}")),
+            entry => self.violations.add(format!("I9: {name} has logged {entry:?}")),
         }
     }
 
     /// Rolls the lineage back to a worker's mark in a checkpoint.
     fn on_restored(&mut self, worker: u32, mark: Mark) {
         let Some(settled) = self.settled.get_mut(worker as usize) else {
-            self.violations.add(format!("I1: a checkpoint knows of worker {worker}, who is none"));
+            self.violations.add(format!("I1: a checkpoint has unknown worker {worker}"));
             return;
         };
         if mark > *settled {
@@ -255,13 +255,13 @@ impl Checker {
             mark.sequence, mark.incarnation
         );
         let Some(last) = self.settled.get(worker as usize).copied() else {
-            self.violations.add(format!("I9: {name}, and there is no such worker"));
+            self.violations.add(format!("I9: {name}, but there is no such worker"));
             return None;
         };
         let life = self.lives[worker as usize].get(&mark.incarnation);
         let index = usize::try_from(mark.sequence).unwrap_or(usize::MAX).wrapping_sub(1);
         match life.and_then(|life| life.produced.get(index)) {
-            None => self.violations.add(format!("I9: {name}, and nobody had produced it")),
+            None => self.violations.add(format!("I9: {name}, but was never produced")),
             Some(produced) if *produced != checksum => self.violations.add(format!(
                 "I4: {name} with checksum {checksum:#010x}, produced with {produced:#010x}"
             )),

@@ -112,9 +112,9 @@ impl Optuna {
 
     async fn line(&mut self, limit: Duration) -> anyhow::Result<Value> {
         match timeout(limit, self.lines.next_line()).await {
-            Err(_) => Err(self.death(&format!("said nothing for {} s", limit.as_secs()))),
+            Err(_) => Err(self.death(&format!("did not answer for {} s", limit.as_secs()))),
             Ok(Ok(Some(line))) => {
-                serde_json::from_str(&line).with_context(|| format!("dmprl.search said: {line}"))
+                serde_json::from_str(&line).with_context(|| format!("dmprl.search sent: {line}"))
             }
             Ok(_) => Err(self.death("has ended")),
         }

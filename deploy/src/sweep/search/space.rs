@@ -188,7 +188,7 @@ fn choice(values: &[Value]) -> Result<Domain, String> {
     }
     for (index, value) in values.iter().enumerate() {
         if values[..index].contains(value) {
-            return Err(format!("{value} stands there twice"));
+            return Err(format!("{value} is listed twice"));
         }
     }
     Ok(Domain::Choice(values.to_vec()))
