@@ -1,7 +1,7 @@
 #!/usr/bin/env bash
-# What a release consists of, for one Python and this kind of machine: `deploy/release.sh FOLDER`.
-# A wheel, and an archive of the program with its Python package. The Python is PYO3_PYTHON, or
-# python3. Either runs wherever that minor version's libpython is found: the system's, a conda
+# Builds a release for one Python and this kind of machine: `deploy/release.sh FOLDER`.
+# It consists of a wheel, and an archive of the program with its Python package. The Python is
+# PYO3_PYTHON, or python3. Both need libpython of that minor version: the system's, a conda
 # environment's, or one in LD_LIBRARY_PATH.
 set -euo pipefail
 cd "$(dirname "${BASH_SOURCE[0]}")/.."
@@ -13,7 +13,7 @@ export PYO3_PYTHON=${PYO3_PYTHON:-$(command -v python3)}
 tools=target/release-tools
 "$PYO3_PYTHON" -m venv "$tools"
 "$tools/bin/pip" install --quiet --disable-pip-version-check "maturin>=1.9,<2"
-# Without auditwheel: it would put a libpython into the wheel, beside the one that runs it.
+# Without auditwheel, which would add a second libpython to the wheel.
 "$tools/bin/maturin" build --release --locked --interpreter "$PYO3_PYTHON" \
     --compatibility linux --auditwheel skip --out "$output"
 

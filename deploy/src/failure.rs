@@ -1,18 +1,18 @@
-//! How a command ends: its outcome, its exit status, and what a failure looks like on screen.
+//! How a command ends: its outcome, its exit status, and the text of its errors.
 
 use std::fmt::{self, Display, Formatter};
 use std::process::ExitCode;
 
-/// A command that did not fail.
+/// Result of a command that did not fail.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Outcome {
-    /// Everything asked for is done.
+    /// The command completed.
     Done,
-    /// The user stopped it.
+    /// The user interrupted it.
     Interrupted,
 }
 
-/// The user asked for something that cannot be: exit status 2 instead of 1.
+/// An invalid request of the user, with exit status 2 instead of 1.
 #[derive(Debug)]
 pub struct WrongUse(pub String);
 
@@ -24,12 +24,12 @@ impl Display for WrongUse {
 
 impl std::error::Error for WrongUse {}
 
-/// An error of the user's making.
+/// Creates a [`WrongUse`] error.
 pub fn wrong_use(message: impl Into<String>) -> anyhow::Error {
     WrongUse(message.into()).into()
 }
 
-/// The exit status that scripts rely on: 0 done, 1 failed, 2 wrong use, 130 interrupted.
+/// Returns the exit status for scripts: 0 done, 1 failed, 2 wrong use, 130 interrupted.
 #[must_use]
 pub fn exit_code(result: &anyhow::Result<Outcome>) -> ExitCode {
     ExitCode::from(match result {
@@ -40,11 +40,11 @@ pub fn exit_code(result: &anyhow::Result<Outcome>) -> ExitCode {
     })
 }
 
-/// `error: what`, then each cause on a line of its own.
+/// Formats `error: what`, then each cause on its own line.
 #[must_use]
 pub fn render(error: &anyhow::Error) -> String {
     let mut text = format!("error: {error}");
-    // A cause that its parent already quotes is no news.
+    // Skip a cause that the error above already includes.
     let mut last = error.to_string();
     for cause in error.chain().skip(1).map(ToString::to_string) {
         if !last.contains(&cause) {

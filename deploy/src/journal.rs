@@ -1,11 +1,11 @@
-//! What a worker and a learner note while `dmprl chaos` has them killed: one file a process, one
-//! record a moment.
+//! Journals of workers and learners during `dmprl chaos`: one file per process, one record per
+//! event.
 //!
 //! ```text
 //!   record: kind · worker · incarnation · checksum · three numbers · time · CRC-32 of all that
 //! ```
-//! Each record is one plain `write`, so that SIGKILL takes nothing that was written; the last one
-//! of a killed process may be torn. Nobody writes any without `--journal`.
+//! Each record is written by one plain `write`, so that SIGKILL loses no written record; the last
+//! record of a killed process may be incomplete. Without `--journal` no journal is written.
 
 use std::fs::{File, OpenOptions};
 use std::io::Write;
@@ -20,7 +20,7 @@ use dmprl_shared::segment::SegmentHeader;
 use dmprl_shared::transport::delivery::Mark;
 use rustix::time::{ClockId, clock_gettime};
 
-/// Where a learner stands.
+/// Counters of a learner.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct Standing {
     /// Environment steps inserted.
@@ -38,21 +38,21 @@ impl From<&Counters> for Standing {
     }
 }
 
-/// Which segment, and what is in it.
+/// Identity and checksum of a segment.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Piece {
-    /// Whose.
+    /// Index of the worker.
     pub worker: u32,
-    /// Which of it.
+    /// Incarnation and sequence number.
     pub mark: Mark,
     /// CRC-32 of header and block, computed at each end.
     pub checksum: u32,
-    /// Environment steps.
+    /// Environment steps in the segment.
     pub env_steps: u64,
 }
 
 impl Piece {
-    /// Of a segment as it lies here.
+    /// Describes a segment, computing its checksum.
     #[must_use]
     pub fn of(header: &SegmentHeader, block: &[f32]) -> Self {
         let mut checksum = crc32fast::Hasher::new();
@@ -67,44 +67,44 @@ impl Piece {
     }
 }
 
-/// A moment.
+/// An event.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Entry {
-    /// A worker has finished a segment, and has neither kept nor offered it yet.
+    /// A worker has finished a segment, but not yet retained or offered it.
     Produced(Piece),
-    /// A worker has forgotten its segments up to here.
+    /// A worker has dropped its segments up to this mark.
     Acknowledged(Mark),
-    /// A worker has taken over a policy.
+    /// A worker has taken a policy.
     Policy {
-        /// Of which learner of the session.
+        /// Number of the learner in the session.
         epoch: u64,
-        /// Which.
+        /// Version of the policy.
         version: u64,
     },
-    /// A learner begins, and has settled of a worker so much.
+    /// A learner starts; it has settled this worker's segments up to the mark.
     Restored(u32, Mark),
-    /// Where it stands, after one [`Entry::Restored`] a worker.
+    /// Its counters, after one [`Entry::Restored`] per worker.
     Started(Standing),
-    /// It has read its log, and takes segments from workers from now on.
+    /// It has read its log, and now takes segments from workers.
     Serving,
     /// A learner has inserted a segment, from a worker or from its log.
     Inserted(Piece),
-    /// It has refused one; true: because it had it.
+    /// It has rejected a segment; true if it was a duplicate.
     Refused(Piece, bool),
     /// It begins a checkpoint.
     Cut(Standing),
 }
 
-/// An entry and when it was written [us of the monotonic clock, which all processes share].
+/// An event and its time [us of the monotonic clock, which all processes share].
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Record {
-    /// What.
+    /// The event.
     pub entry: Entry,
-    /// When.
+    /// Time of the event.
     pub time_us: u64,
 }
 
-/// Bytes of a record.
+/// Size of a record in bytes.
 pub const RECORD_BYTES: usize = size_of::<Raw>();
 
 #[derive(Debug, Clone, Copy, Default, Pod, Zeroable)]
@@ -154,7 +154,7 @@ impl Raw {
 }
 
 impl Record {
-    /// As it lies in a file.
+    /// Encodes the record for a file.
     #[must_use]
     pub fn encode(&self) -> [u8; RECORD_BYTES] {
         let marked = |kind, worker, mark: &Mark| Raw {
@@ -184,7 +184,7 @@ impl Record {
         bytes
     }
 
-    /// Reads one; none if it is torn or no record.
+    /// Decodes a record; `None` if it is incomplete or invalid.
     #[must_use]
     pub fn decode(bytes: &[u8; RECORD_BYTES]) -> Option<Self> {
         let raw: Raw = bytemuck::pod_read_unaligned(bytes);
@@ -206,7 +206,7 @@ impl Record {
     }
 }
 
-/// Microseconds of the clock that a machine's processes share and nobody sets.
+/// Microseconds of the monotonic clock, which all processes of a machine share.
 #[must_use]
 pub fn now_us() -> u64 {
     let now = clock_gettime(ClockId::Monotonic);
@@ -214,7 +214,7 @@ pub fn now_us() -> u64 {
     (now.tv_sec * 1_000_000 + now.tv_nsec / 1_000).unsigned_abs()
 }
 
-/// Whose file it is.
+/// Process that writes a journal.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub enum Author {
     /// A worker, by index and incarnation.
@@ -224,7 +224,7 @@ pub enum Author {
 }
 
 impl Author {
-    /// Where its file lies.
+    /// Path of its journal.
     #[must_use]
     pub fn path(&self, folder: &Path) -> PathBuf {
         folder.join(match self {
@@ -233,7 +233,7 @@ impl Author {
         })
     }
 
-    /// Whose file has this name.
+    /// Returns the author of a journal with this name.
     #[must_use]
     pub fn of(name: &str) -> Option<Self> {
         let mut parts = name.split('-');
@@ -248,15 +248,15 @@ impl Author {
     }
 }
 
-/// A process's journal, to write.
+/// The journal of a process, for writing.
 #[derive(Debug, Clone)]
 pub struct Journal(Arc<File>);
 
 impl Journal {
-    /// An empty one in a folder; none where nobody wants any.
+    /// Creates an empty journal in a folder; returns `None` without a folder.
     ///
     /// # Errors
-    /// The file cannot be made, or is there already.
+    /// The file cannot be created, or already exists.
     pub fn open(folder: Option<&Path>, author: Author) -> anyhow::Result<Option<Self>> {
         let Some(folder) = folder else { return Ok(None) };
         let path = author.path(folder);
@@ -265,10 +265,10 @@ impl Journal {
         Ok(Some(Self(Arc::new(file))))
     }
 
-    /// Notes an entry.
+    /// Writes an entry.
     ///
     /// # Panics
-    /// If it cannot be written: whoever checks the journal would find faults that are none.
+    /// If it cannot be written, because the checker would report violations that never happened.
     pub fn note(&self, entry: Entry) {
         let written = (&*self.0).write_all(&Record { entry, time_us: now_us() }.encode());
         assert!(written.is_ok(), "cannot write the journal: {written:?}");

@@ -58,7 +58,7 @@ fn measure(bench: RolloutBench) -> anyhow::Result<Figures> {
     progress.preparing("starting the workers");
     // Start the workers alone, so that nothing else delays their first segments.
     let mut workers = Workers::start(&stage, &watch)?;
-    progress.preparing("starting what they are compared with");
+    progress.preparing("starting the peers");
     let mut figures = Figures::new(&bench, &workers.spec, stage.manifest.machine.clone());
     let mut peers = start_peers(&bench, run, &workers, &watch, &mut figures)?;
     let mut sink_cpu_s = 0.0;

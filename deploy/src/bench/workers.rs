@@ -217,7 +217,7 @@ fn environment(child: &mut LineChild, watch: &Watch, limit: Duration) -> anyhow:
         match serde_json::from_str(&line) {
             Ok(Report::EnvironmentReady { spec }) => return Ok(spec),
             Ok(_) => show_warning(child.name(), &line),
-            Err(_) => return Err(anyhow!("{} said what is no report: {line}", child.name())),
+            Err(_) => return Err(anyhow!("{} sent an invalid report: {line}", child.name())),
         }
     }
 }

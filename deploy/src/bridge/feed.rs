@@ -1,7 +1,7 @@
-//! Policies for one host, on a thread of their own: a host whose link is full waits alone.
+//! Sends policies to one host, on its own thread, so that a host with a full link delays no other.
 //!
-//! One is under way at a time, and the next is the newest of that moment: a long link would
-//! otherwise be full of policies that are old when they come.
+//! Only one policy is in flight at a time, and the next one is the newest at that moment. Otherwise
+//! a long link would be full of policies that are outdated on arrival.
 
 use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
 use std::thread;
@@ -11,24 +11,24 @@ use anyhow::Context;
 
 use super::link::Outlet;
 
-/// One that is not confirmed within this was lost with its link, and is sent again.
+/// Time after which an unconfirmed policy counts as lost with its link, and is sent again.
 const CONFIRMED_WITHIN: Duration = Duration::from_secs(2);
 
 #[derive(Debug, Default)]
 struct State {
     newest: Option<(u64, Arc<Vec<u8>>)>,
-    /// The version that the host has.
+    /// The version that the host has confirmed.
     confirmed: u64,
     sent: Option<(u64, Instant)>,
     closed: bool,
 }
 
-/// Sends a host the newest policy; ends with this.
+/// Sends a host the newest policy. The thread stops when this is dropped.
 #[derive(Debug)]
 pub struct Feed(Arc<(Mutex<State>, Condvar)>);
 
 fn lock(shared: &(Mutex<State>, Condvar)) -> MutexGuard<'_, State> {
-    // Plain numbers, sound after every statement.
+    // Plain numbers, consistent after every statement, so a poisoned lock is harmless.
     shared.0.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
@@ -36,7 +36,7 @@ impl Feed {
     /// Starts the thread.
     ///
     /// # Errors
-    /// The system gives none.
+    /// The system cannot start a thread.
     pub fn start(outlet: Outlet) -> anyhow::Result<Self> {
         let shared = Arc::new((Mutex::new(State::default()), Condvar::new()));
         let feeding = Arc::clone(&shared);
@@ -45,13 +45,13 @@ impl Feed {
         Ok(Self(shared))
     }
 
-    /// There is a newer policy.
+    /// Replaces the policy to send by a newer one.
     pub fn offer(&self, version: u64, message: &Arc<Vec<u8>>) {
         lock(&self.0).newest = Some((version, Arc::clone(message)));
         self.0.1.notify_one();
     }
 
-    /// The host has this one.
+    /// Records that the host has this version.
     pub fn confirm(&self, version: u64) {
         lock(&self.0).confirmed = version;
         self.0.1.notify_one();
@@ -71,7 +71,8 @@ fn feed(shared: &(Mutex<State>, Condvar), outlet: &Outlet) {
         match state.due(Instant::now()) {
             Some((version, message)) => {
                 drop(state);
-                // A closed session ends the gateway, and this with it.
+                // Sending fails only if the session is closed, which ends the gateway and this
+                // thread.
                 let _ = outlet.send(message.as_ref().clone());
                 state = lock(shared);
                 state.sent = Some((version, Instant::now()));
@@ -85,7 +86,7 @@ fn feed(shared: &(Mutex<State>, Condvar), outlet: &Outlet) {
 }
 
 impl State {
-    /// What is to be sent now.
+    /// Returns the policy to send now, if any.
     fn due(&self, now: Instant) -> Option<(u64, Arc<Vec<u8>>)> {
         let (version, message) = self.newest.as_ref()?;
         let under_way = self.sent.is_some_and(|(sent, at)| {

@@ -1,4 +1,4 @@
-//! The learner's end: to the learner it is the workers of all other hosts.
+//! The learner's end of the bridge, which acts as the workers of all other hosts.
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -25,59 +25,61 @@ use super::wire::{self, Course, Hearing, HostAnswer, HostRequest, HostStatus, Ho
 use crate::control::{Greeting, HostNow};
 use crate::run_directory::random_u64;
 
-/// Between two times that the hosts are told what was acknowledged, when it has changed,
+/// Interval of hearings if an acknowledgement has changed.
 const HEARING_INTERVAL: Duration = Duration::from_millis(5);
-/// and when it has not.
+/// Interval of hearings if nothing has changed.
 const ALIVE_INTERVAL: Duration = Duration::from_millis(250);
-/// Between two tries to take a worker's queue, whose last holder may not be cleaned up after yet.
+/// Interval between attempts to attach to a worker's queue. Its last user may not have been cleaned
+/// up yet.
 const ATTACH_INTERVAL: Duration = Duration::from_millis(50);
-/// Hosts of a gateway that died speak by their old seats for a while: longer than it takes them to
-/// notice.
+/// Time during which messages with seats of a previous gateway are tolerated. Hosts notice within
+/// it that the gateway has died.
 const FORMER: Duration = Duration::from_secs(15);
-/// Messages of a kind taken before anything else is looked at again.
+/// Maximum number of messages of one kind per turn.
 const MESSAGES_TOGETHER: usize = 64;
-/// Characters of a host's name.
+/// Maximum length of a host's name in characters.
 const NAME_MAX: usize = 64;
 
-/// What a host that joins is told of the run.
+/// Facts about the run that a joining host receives.
 #[derive(Debug, Clone)]
 pub struct RunFacts {
-    /// As in the manifest.
+    /// Run id, as in the manifest.
     pub run_id: String,
-    /// As in `config.toml`.
+    /// Configuration, as in `config.toml`.
     pub config: String,
-    /// The environment.
+    /// Spec of the environment.
     pub spec: EnvSpec,
-    /// The secret.
+    /// Token of the run.
     pub token: String,
 }
 
-/// The queue of one worker, and what is to go into it.
+/// The queue of one worker, and the segments to be put into it.
 struct Port {
     worker: usize,
     landing: Landing,
     queue: Option<Sender>,
 }
 
-/// What goes out to a host.
+/// Outgoing messages to a host.
 struct Outlets {
     hearings: Outlet,
-    /// From its first words on: before, it does not listen, and a policy would be lost.
+    /// Created when the host first reports its status. Earlier it does not listen, and a policy
+    /// would be lost.
     policies: Option<Feed>,
 }
 
-/// Something that the user should read, or the supervisor should count.
+/// A message for the user, or counts for the supervisor.
 #[derive(Debug, Clone, PartialEq)]
 pub enum News {
-    /// A sentence.
+    /// A message for the user.
     Told(String),
-    /// What the workers of other hosts did.
+    /// Counts of segments of the workers of other hosts.
     Sent(Sent),
-    /// Environments failed there.
+    /// Failures of environments on a host.
     EnvFailures {
-        /// How many times.
+        /// Number of failures.
         count: u64,
-        /// Where.
+        /// Name of the host.
         host: String,
     },
 }
@@ -105,11 +107,11 @@ pub struct Gateway {
     changed: bool,
     told: Instant,
     attached: Instant,
-    /// Messages of nobody, or damaged.
+    /// Messages that are damaged or have an unknown seat.
     refused: u64,
-    /// Questions of those that may not take part; the first is told of, then each doubling.
+    /// Rejected join requests. The user is told of the first, then at each power of two.
     refusals: u64,
-    /// When any host last was given another seat than it had, here or by a gateway before.
+    /// Last time that a host received a new seat from this gateway or its predecessor.
     reseated: Instant,
     id: u64,
     _token: Token,
@@ -117,11 +119,10 @@ pub struct Gateway {
 }
 
 impl Gateway {
-    /// Opens the run to other hosts; `first`: the first worker that is theirs, `session`: which of
-    /// the run's this is, from 0.
+    /// Opens session `session` (from 0) of the run to other hosts, whose first worker is `first`.
     ///
     /// # Errors
-    /// An endpoint cannot be listened at, or the learner's shared memory not be joined.
+    /// Cannot listen on an endpoint, or cannot attach to the learner's shared memory.
     pub fn open(
         (endpoints, zenoh_file): (&[String], Option<&Path>),
         (domain, plan): (&Path, Plan),
@@ -139,7 +140,7 @@ impl Gateway {
             segments: link.inlet(&all("segments"))?,
             statuses: link.inlet(&all("status"))?,
             tokens: link.tokens(&all("hosts"))?,
-            // Last: whoever asks finds everything else there.
+            // Last, so that everything else is ready when a request arrives.
             questions: link.questions(JOIN)?,
             domain: domain.to_owned(),
             buffer: Segment::zeroed(plan.layout),
@@ -167,10 +168,10 @@ impl Gateway {
         })
     }
 
-    /// One round; whether there was anything to do.
+    /// Runs one turn; returns true if there was anything to do.
     ///
     /// # Errors
-    /// Something is broken that does not mend.
+    /// The transport or the session has failed permanently.
     pub fn turn(&mut self) -> anyhow::Result<bool> {
         let now = Instant::now();
         for _ in 0..MESSAGES_TOGETHER {
@@ -202,36 +203,36 @@ impl Gateway {
         Ok(worked)
     }
 
-    /// What has happened since this was last asked.
+    /// Returns the news since the last call.
     pub fn news(&mut self) -> Vec<News> {
         std::mem::take(&mut self.news)
     }
 
-    /// All hosts, for whoever watches the run.
+    /// The state of all hosts, for display.
     #[must_use]
     pub fn hosts(&self) -> Vec<HostNow> {
         self.seats.hosts().iter().map(Host::shown).collect()
     }
 
-    /// The policy that each host has.
+    /// The policy version of each host.
     pub fn policy_versions(&self) -> impl Iterator<Item = u64> + '_ {
         let statuses = self.seats.hosts().iter().filter_map(|host| host.status.as_ref());
         statuses.map(|status| status.policy_version)
     }
 
-    /// Whether no host has been heard from for so long that has not left since.
+    /// Returns true if every host that has not left has been silent for `for_so_long`.
     #[must_use]
     pub fn is_alone(&self, for_so_long: Duration) -> bool {
         self.seats.hosts().iter().all(|host| host.heard.elapsed() >= for_so_long)
     }
 
-    /// The first session that no host was given yet: what the next gateway of the run begins with.
+    /// The first unused session number, with which the next gateway of the run starts.
     #[must_use]
     pub fn session(&self) -> u32 {
         self.seats.session()
     }
 
-    /// Tells all hosts where the run is on its way, and what was acknowledged.
+    /// Sends all hosts the course of the run and the acknowledgements.
     ///
     /// # Errors
     /// The session is closed.
@@ -250,7 +251,7 @@ impl Gateway {
         Ok(())
     }
 
-    /// Notes who comes and goes, and what the hosts tell of themselves.
+    /// Reads the hosts' liveliness tokens and status messages.
     ///
     /// # Errors
     /// The session is closed.
@@ -266,7 +267,7 @@ impl Gateway {
         Ok(())
     }
 
-    /// Whoever may not take part may ask as often as it likes: that fills no log.
+    /// Reports a rejected request, less and less often: repeated requests must not fill the log.
     fn tell_of_refusal(&mut self, what: impl FnOnce() -> String) {
         self.refusals += 1;
         if self.refusals.is_power_of_two() {
@@ -284,7 +285,7 @@ impl Gateway {
 
     fn admit(&mut self, bytes: &[u8], now: Instant) -> Result<HostWelcome, Refusal> {
         let never = |reason: String| Refusal { reason, later: false };
-        // The greeting first: the rest of another version may not fit.
+        // Parse the greeting first: another version's remaining fields may not parse.
         #[derive(serde::Deserialize)]
         struct Speaks {
             speaks: Greeting,
@@ -294,7 +295,7 @@ impl Gateway {
             .map_err(|_| never(format!("expected a request of {this}, got something else")))?;
         if speaks != this {
             let reason = format!("expected {this}, got {speaks}: start both from the same build");
-            self.tell_of_refusal(|| format!("a host of {speaks} may not take part"));
+            self.tell_of_refusal(|| format!("rejected a host with {speaks}"));
             return Err(never(reason));
         }
         let request: HostRequest = serde_json::from_slice(bytes)
@@ -302,7 +303,7 @@ impl Gateway {
         if !token::equal(&request.token, &self.facts.token) {
             self.tell_of_refusal(|| {
                 let name = request.name.escape_debug().take(NAME_MAX).collect::<String>();
-                format!("host {name} may not take part: its token is wrong")
+                format!("rejected host {name}: its token is wrong")
             });
             let reason = "its token is not the run's: copy bridge.token of the run's directory";
             return Err(never(reason.to_owned()));
@@ -311,13 +312,13 @@ impl Gateway {
             return Err(never(format!("its name has more than {NAME_MAX} characters (--name)")));
         }
         if self.heard.marks.is_empty() {
-            let reason = "the learner has not said yet how far its workers are".to_owned();
+            let reason = "the learner has not reported its workers' progress yet".to_owned();
             return Err(Refusal { reason, later: true });
         }
         let seat = random_u64().map_err(|error| never(format!("{error:#}")))?;
         let known = self.seats.hosts().iter().find(|host| host.host == request.host);
         let before = known.map(|host| host.seat);
-        // Its relay asks once more than its command line did: nothing that anybody should read.
+        // The command line has asked before; the relay's own request is no news for the user.
         let was_here = request.held.is_some() && known.is_some_and(|host| host.here);
         let held = self.seats.admit(&request, seat, (&self.heard.marks, now))?;
         if let Some(before) = before {
@@ -366,7 +367,8 @@ impl Gateway {
         Ok(())
     }
 
-    /// Whose message it is: the seat in its name is known to nobody else.
+    /// Finds the sender by the seat in the message's name, which only this host and the gateway
+    /// know.
     fn host(&mut self, message: &Message) -> Option<&mut Host> {
         let seat = u64::from_str_radix(message.last_name(), 16).ok()?;
         self.seats.of_seat(seat)
@@ -412,7 +414,7 @@ impl Gateway {
         if let Some(before) = &host.status {
             status.no_less_than(before);
         }
-        // A gateway that took over mid-way begins to count where the host is.
+        // After a takeover, start to count from the host's current state.
         let before = host.status.replace(status.clone());
         let before = before.unwrap_or_else(|| match host.counted_before {
             true => status.clone(),
@@ -439,7 +441,7 @@ impl Gateway {
         Ok(())
     }
 
-    /// Takes the queues of workers that have come.
+    /// Attaches to the queues of workers that have arrived.
     fn attach(&mut self, now: Instant) -> anyhow::Result<()> {
         if now.duration_since(self.attached) < ATTACH_INTERVAL {
             return Ok(());
@@ -449,7 +451,7 @@ impl Gateway {
             match attach_queue(&self.domain, &self.plan, port.worker) {
                 Ok(queue) => port.queue = Some(queue),
                 Err(error @ TransportError::Incompatible { .. }) => return Err(error.into()),
-                // The learner is being replaced, or the place of a killed gateway not free yet.
+                // The learner is being replaced, or the queue of a killed gateway is not free yet.
                 Err(_) => {}
             }
         }
@@ -475,7 +477,7 @@ impl Gateway {
                 self.policy = Some((self.snapshot.version, message));
             }
             Ok(false) => {}
-            // A damaged one: the next comes soon.
+            // The snapshot was damaged; another one follows soon.
             Err(TransportError::Snapshot(error)) => {
                 self.news.push(News::Told(format!("a policy snapshot is refused: {error}")));
             }
@@ -484,7 +486,7 @@ impl Gateway {
         Ok(())
     }
 
-    /// Messages and segments that were refused: of nobody, damaged, or not what they said.
+    /// Rejected messages and segments: damaged, of unknown senders, or inconsistent.
     #[must_use]
     pub fn refused(&self) -> u64 {
         self.refused + self.ports.values().map(|port| port.landing.misfits()).sum::<u64>()

@@ -1,8 +1,8 @@
-//! A worker's segments on their way over a link, from the learner's end.
+//! Receives a worker's segments from a link, at the learner's end.
 //!
-//! A [`Landing`] takes them in order and keeps them in an outbox of its own, which offers them to
-//! the worker's queue at the learner until that has acknowledged them: when the learner dies, they
-//! are here, and need not come over the link again.
+//! A [`Landing`] takes segments in order and retains them in its own outbox. It offers them to the
+//! worker's queue at the learner until the learner has acknowledged them. If the learner dies, they
+//! need not cross the link again.
 
 use dmprl_shared::segment::{Segment, SegmentLayout};
 use dmprl_shared::transport::delivery::{Mark, Outbox};
@@ -11,26 +11,26 @@ use dmprl_shared::transport::{SegmentSender, SendOutcome, TransportError};
 use super::lane;
 use super::wire::{Hearing, Stretch};
 
-/// One worker's.
+/// Receives the segments of one worker.
 #[derive(Debug)]
 pub struct Landing {
     worker: u32,
     layout: SegmentLayout,
     capacity: usize,
     outbox: Option<Outbox>,
-    /// What is kept of the start of the worker before: the learner takes nothing of it any more
-    /// once it knows the newer, so it goes first.
+    /// Segments retained of the worker's previous incarnation. They go first, because the learner
+    /// drops them once it knows the newer incarnation.
     older: Option<Outbox>,
-    /// The attempt in which something was missing.
+    /// The last rejected attempt, in which a segment was missing.
     refused: u32,
-    /// The segment that follows in the stretch that is being read; none: it is passed over.
+    /// Expected sequence number in the current stretch; `None` to skip the stretch.
     expected: Option<u64>,
     mark: Mark,
     misfits: u64,
 }
 
 impl Landing {
-    /// Nothing has come of the worker yet.
+    /// Creates the landing of a worker from which nothing has been received yet.
     #[must_use]
     pub fn new(worker: u32, layout: SegmentLayout, capacity: usize) -> Self {
         Self {
@@ -46,7 +46,7 @@ impl Landing {
         }
     }
 
-    /// Segments that were not what their stretch said, or that the learner will not take.
+    /// Segments that contradicted their stretch, or that the learner no longer takes.
     #[must_use]
     pub fn misfits(&self) -> u64 {
         self.misfits
@@ -58,8 +58,8 @@ impl Landing {
         self.older.iter().chain(&self.outbox).map(Outbox::len).sum()
     }
 
-    /// A stretch begins. Where something is missing before it, its attempt is refused, and the host
-    /// begins another.
+    /// Begins a stretch. If a segment before it is missing, its attempt is rejected, and the host
+    /// starts another.
     pub fn begin(&mut self, stretch: &Stretch) {
         self.expected = None;
         if stretch.attempt == self.refused || stretch.first == 0 {
@@ -67,7 +67,7 @@ impl Landing {
         }
         let starts = match &self.outbox {
             None => true,
-            // What lies between was acknowledged before it came to this gateway.
+            // The segments in between were acknowledged before they reached this gateway.
             Some(outbox) if stretch.incarnation == outbox.incarnation() => {
                 stretch.first > outbox.end()
             }
@@ -79,7 +79,8 @@ impl Landing {
             let newer = self.outbox.take_if(|outbox| outbox.incarnation() < incarnation);
             if let Some(outbox) = newer.filter(|outbox| !outbox.is_empty()) {
                 if self.older.is_some() {
-                    // Two starts in the time of a learner's absence are kept, a third comes later.
+                    // While the learner is away, two incarnations are retained; a third has to
+                    // wait.
                     self.outbox = Some(outbox);
                     self.refused = stretch.attempt;
                     return;
@@ -99,7 +100,7 @@ impl Landing {
         self.expected = Some(stretch.next);
     }
 
-    /// A segment of the stretch begun last.
+    /// Takes a segment of the current stretch.
     pub fn land(&mut self, stretch: &Stretch, segment: &Segment) {
         let (Some(expected), Some(outbox)) = (self.expected, &mut self.outbox) else { return };
         let header = &segment.header;
@@ -110,17 +111,17 @@ impl Landing {
             return;
         }
         self.expected = Some(expected + 1);
-        // One that is here already comes again when others were missing.
+        // A segment that is already here arrives again if another one was missing.
         if expected == outbox.end() && !outbox.put(header, &segment.block) {
             self.refused = stretch.attempt;
             self.expected = None;
         }
     }
 
-    /// Offers the learner what it has not taken.
+    /// Offers the learner the segments that it has not taken.
     ///
     /// # Errors
-    /// Those of the queue.
+    /// As the queue's `try_send`.
     pub fn offer(&mut self, queue: &mut impl SegmentSender) -> Result<SendOutcome, TransportError> {
         match self.older.as_mut().or(self.outbox.as_mut()) {
             Some(outbox) if !outbox.is_empty() => outbox.offer(queue),
@@ -128,21 +129,22 @@ impl Landing {
         }
     }
 
-    /// The learner has acknowledged so much.
+    /// Drops the segments that the learner has acknowledged.
     pub fn acknowledge(&mut self, mark: Mark) {
         self.mark = mark;
         for outbox in self.older.iter_mut().chain(&mut self.outbox) {
             lane::acknowledge(outbox, mark, (self.layout, self.capacity));
         }
         self.older.take_if(|outbox| outbox.is_empty());
-        // The learner knows a newer start, by whatever way: kept, these would bar that one's.
+        // The learner already knows a newer incarnation, so it will never take these; retaining
+        // them would block the newer one.
         if let Some(of_no_use) = self.older.take_if(|older| older.incarnation() < mark.incarnation)
         {
             self.misfits += of_no_use.len() as u64;
         }
     }
 
-    /// What the host is to know.
+    /// The state of this worker to report to its host.
     #[must_use]
     pub fn hearing(&self) -> Hearing {
         let Mark { incarnation, sequence } = self.mark;
@@ -162,7 +164,7 @@ mod tests {
     const LAYOUT: SegmentLayout =
         SegmentLayout { segment_steps: 1, observation_len: 1, action_len: 1 };
 
-    /// A queue that takes everything.
+    /// A queue that accepts every segment.
     #[derive(Default)]
     struct Queue {
         taken: Vec<(u32, u64)>,
@@ -195,7 +197,8 @@ mod tests {
         }
     }
 
-    /// Its relay and worker died together, so nobody else has them; they were thrown away once.
+    /// Regression test: after relay and worker have died together, only the gateway has these
+    /// segments. They were once dropped.
     #[test]
     fn what_a_dead_start_of_the_worker_left_goes_to_the_learner_before_the_next() {
         let mut landing = Landing::new(7, LAYOUT, 8);
@@ -206,7 +209,7 @@ mod tests {
         assert_eq!((landing.kept(), queue.taken.len()), (5, 3));
         landing.offer(&mut queue).unwrap();
         assert_eq!(queue.taken.len(), 3, "not before the learner has the first three");
-        // A third start has to wait.
+        // A third incarnation has to wait.
         land(&mut landing, 3, 2, [1, 1]);
         assert_eq!((landing.kept(), landing.hearing().refused), (5, 2));
         landing.acknowledge(Mark { incarnation: 1, sequence: 3 });

@@ -1,9 +1,10 @@
-//! A worker's segments on their way over a link, from the host's end.
+//! Sends a worker's segments over a link, at the host's end.
 //!
-//! A [`Lane`] is an outbox like the worker's own: it keeps what the learner has not acknowledged
-//! and offers it, in order, to the link. The link may lose what was under way when it breaks; the
-//! gateway finds the gap, refuses the attempt, and the lane sends everything it keeps once more as
-//! the next attempt. So nothing is lost, and what comes twice is left out where it arrives.
+//! A [`Lane`] is an outbox like the worker's own. It retains the segments that the learner has not
+//! acknowledged, and offers them to the link in order. A link that breaks may lose the segments in
+//! flight. The gateway then detects the gap and rejects the attempt, and the lane retransmits
+//! everything it retains as the next attempt. Thus no segment is lost, and the receiver drops
+//! duplicates.
 
 use std::time::Instant;
 
@@ -13,35 +14,35 @@ use dmprl_shared::transport::{SegmentSender, SendOutcome, TransportError};
 
 use super::wire::{Batch, Hearing, Stretch};
 
-/// One worker's.
+/// Sends the segments of one worker.
 #[derive(Debug)]
 pub struct Lane {
-    /// Which worker of the run; on its host it has another number.
+    /// Index of the worker in the run, which differs from its index on this host.
     worker: u32,
     layout: SegmentLayout,
     capacity: usize,
     outbox: Option<Outbox>,
-    /// The first segment of a new start of the worker: it waits until all of the one before is
-    /// acknowledged, because the learner takes nothing of an older start once it knows a newer.
+    /// First segment of the worker's new incarnation. It waits until the previous incarnation is
+    /// acknowledged completely, because the learner drops segments of older incarnations.
     pending: Option<Segment>,
     attempt: u32,
     anew: bool,
-    /// A segment whose landing is timed, and since when.
+    /// The segment whose round trip is being timed, and when it was sent.
     timed: Option<(u64, Instant)>,
     misfits: u64,
 }
 
-/// What an acknowledgement brought.
+/// Effect of an acknowledgement.
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
 pub struct Acked {
-    /// Segments.
+    /// Number of segments acknowledged.
     pub segments: u64,
-    /// From sending a segment until it was heard that it has landed, where one was timed \[s\].
+    /// Time from sending a segment to the news of its landing, if one was timed \[s\].
     pub round_trip_s: Option<f64>,
 }
 
 impl Lane {
-    /// Nothing has come of the worker yet.
+    /// Creates the lane of a worker from which nothing has been received yet.
     #[must_use]
     pub fn new(worker: u32, layout: SegmentLayout, capacity: usize) -> Self {
         let (outbox, pending, timed) = (None, None, None);
@@ -58,32 +59,33 @@ impl Lane {
         }
     }
 
-    /// Whether another of the worker's segments may be taken in: nothing waits to be sent.
+    /// Returns true if another segment of the worker can be taken, that is, none waits to be sent.
     #[must_use]
     pub fn has_room(&self) -> bool {
         let free = |outbox: &Outbox| outbox.unsent() == 0 && outbox.len() < outbox.capacity();
         self.pending.is_none() && !self.anew && self.outbox.as_ref().is_none_or(free)
     }
 
-    /// Segments under way.
+    /// Number of segments in flight.
     #[must_use]
     pub fn under_way(&self) -> usize {
         self.outbox.as_ref().map_or(0, Outbox::under_way)
     }
 
-    /// Segments that are kept.
+    /// Number of retained segments.
     #[must_use]
     pub fn kept(&self) -> usize {
         self.outbox.as_ref().map_or(0, Outbox::len) + usize::from(self.pending.is_some())
     }
 
-    /// Segments that followed on none that came before; a worker that keeps the rules sends none.
+    /// Segments that did not follow their predecessor. A correct worker sends none.
     #[must_use]
     pub fn misfits(&self) -> u64 {
         self.misfits
     }
 
-    /// Takes in what the worker sent. What it sends again, on a new connection, is kept already.
+    /// Takes a segment from the worker. After a reconnection it retransmits segments that are
+    /// already here.
     pub fn take(&mut self, segment: &Segment) {
         let header = SegmentHeader { worker_id: self.worker, ..segment.header };
         let newer = match &self.outbox {
@@ -117,7 +119,7 @@ impl Lane {
         self.timed = None;
     }
 
-    /// Puts what waits into the batch, as long as there is `room` \[segments\].
+    /// Moves waiting segments into the batch, up to `room` \[segments\].
     pub fn send(&mut self, batch: &mut Batch, room: &mut usize, now: Instant) {
         let Some(outbox) = &mut self.outbox else { return };
         let (first, incarnation) = (outbox.first(), outbox.incarnation());
@@ -130,16 +132,16 @@ impl Lane {
             count: 0,
         };
         let mut link = Boarding { batch, room, anew: &mut self.anew, stretch, begun: false };
-        // Boarding refuses nothing but for want of room.
+        // Boarding only fails for lack of room.
         let _ = outbox.offer(&mut link);
-        // What was sent in an earlier turn is older than it would seem.
+        // A segment sent in an earlier turn would seem to have a shorter round trip.
         if link.begun && self.timed.is_none() {
             self.timed = Some((first + outbox.under_way() as u64 - 1, now));
         }
     }
 
-    /// Tells the gateway how far the worker is: what was lost behind the last segment that came,
-    /// nothing else would tell.
+    /// Tells the gateway the worker's last sequence number. Otherwise a segment lost at the end
+    /// would not be noticed.
     pub fn say_how_far(&self, batch: &mut Batch) {
         let Some(outbox) = &self.outbox else { return };
         batch.begin(Stretch {
@@ -152,15 +154,16 @@ impl Lane {
         });
     }
 
-    /// Everything that is kept is to be sent once more: there is another gateway.
+    /// Retransmits all retained segments, because there is a new gateway.
     pub fn begin_anew(&mut self) {
         self.attempt = self.attempt.wrapping_add(1).max(1);
-        // What is not kept cannot be missing.
+        // If nothing is retained, nothing can be missing.
         self.anew = self.outbox.is_some();
         self.timed = None;
     }
 
-    /// Takes in what the gateway has heard and the learner acknowledged.
+    /// Processes a hearing: the segments that the gateway has and that the learner has
+    /// acknowledged.
     pub fn hear(&mut self, hearing: &Hearing, now: Instant) -> Acked {
         let mut acked = Acked::default();
         if let Some(outbox) = &mut self.outbox {
@@ -185,7 +188,7 @@ impl Lane {
         acked
     }
 
-    /// What the worker may forget.
+    /// The mark up to which the worker may drop segments.
     #[must_use]
     pub fn mark(&self) -> Mark {
         self.outbox.as_ref().map_or(Mark::default(), |outbox| Mark {
@@ -195,8 +198,8 @@ impl Lane {
     }
 }
 
-/// Forgets what the learner has. That may be more than came here yet, when the one who passed it on
-/// has died since: what the worker sends again of it is then left out.
+/// Drops the segments that the learner has. The mark may be beyond the outbox if the previous relay
+/// or gateway died after it passed them on. Then the worker's retransmits of them are skipped.
 pub(super) fn acknowledge(outbox: &mut Outbox, mark: Mark, room: (SegmentLayout, usize)) {
     let (worker, incarnation) = (outbox.worker_id(), outbox.incarnation());
     if mark.incarnation == incarnation && mark.sequence >= outbox.end() {
@@ -206,7 +209,7 @@ pub(super) fn acknowledge(outbox: &mut Outbox, mark: Mark, room: (SegmentLayout,
     }
 }
 
-/// A batch as the link of an outbox.
+/// Presents a batch as the queue of an outbox.
 struct Boarding<'a> {
     batch: &'a mut Batch,
     room: &'a mut usize,
@@ -252,7 +255,7 @@ mod tests {
         Segment { header, ..Segment::zeroed(LAYOUT) }
     }
 
-    /// Everything that a batch holds, taken in.
+    /// Lands everything that a batch holds.
     fn land(batch: &mut Batch, landing: &mut Landing) {
         let mut buffer = Segment::zeroed(LAYOUT);
         read_batch(&batch.take(), &mut buffer, |stretch, segment| match segment {
@@ -302,7 +305,7 @@ mod tests {
         ends.send(0, 3..=4);
         drop(ends.batch.take());
         assert_eq!(ends.landing.kept(), 2);
-        // Nothing follows that could be found out of order: the lane says how far it is.
+        // No later segment would reveal the gap: the lane reports its last sequence number.
         ends.lane.say_how_far(&mut ends.batch);
         ends.land();
         assert_ne!(ends.landing.hearing().refused, 0);
@@ -332,8 +335,9 @@ mod tests {
         assert_eq!(ends.landing.kept(), 4);
     }
 
-    /// Its worker sends again from where it last heard; the learner has more. That once kept the
-    /// lane waiting for ever for an acknowledgement of what it had not been sent yet.
+    /// Regression test: the worker retransmits from the last acknowledgement it heard, but the
+    /// learner has more. The lane once waited forever for an acknowledgement of segments it had not
+    /// received yet.
     #[test]
     fn a_lane_that_takes_over_believes_a_mark_beyond_what_it_has_seen() {
         let mut ends = Ends::new();
@@ -353,7 +357,7 @@ mod tests {
         assert_eq!((ends.lane.kept(), ends.landing.kept()), (2, 2));
     }
 
-    /// It once was: a long link seemed to make its segments wait, and the window stayed small.
+    /// Regression test: a long link once seemed to delay its segments, and the window stayed small.
     #[test]
     fn what_was_sent_before_is_not_timed_as_if_it_were_sent_now() {
         let mut ends = Ends::new();

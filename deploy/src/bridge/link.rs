@@ -1,9 +1,9 @@
-//! Zenoh, and nothing else: a session between hosts, and what is sent through it.
+//! The only module that uses Zenoh: a session between hosts and its messages.
 //!
-//! Endpoints are explicit and nobody is looked for, so nobody is found by accident. A session mends
-//! itself: it connects again as long as it lives. Messages between two ends that are there come in
-//! order and once; what was under way when a link broke is lost, and found missing by whoever
-//! numbers it.
+//! Endpoints are explicit and scouting is off, so hosts never find each other by accident. A
+//! session reconnects automatically as long as it lives. While both ends are connected, messages
+//! arrive once and in order. A link that breaks loses the messages in flight; receivers detect this
+//! by sequence numbers.
 
 use std::path::Path;
 use std::time::Duration;
@@ -19,26 +19,29 @@ use zenoh::{Config, Session, Wait};
 
 use crate::failure::wrong_use;
 
-/// Messages that wait to be taken; more, and the link is not read: its sender waits.
+/// Capacity of a queue of received messages. If it is full, the link is not read and its sender
+/// blocks.
 const WAITING_MAX: usize = 256;
-/// A peer of which nothing is heard for so long is gone \[ms\]; it speaks a few times in it.
+/// Time without any message after which a peer counts as gone \[ms\]. It sends keep-alives several
+/// times within this time.
 const LEASE_MS: u64 = 4_000;
-/// Between two tries to connect: at first, and at most \[ms\].
+/// Initial and maximum interval between attempts to connect \[ms\].
 const RETRY_FIRST_MS: u64 = 250;
 const RETRY_MAX_MS: u64 = 2_000;
-/// A longer message is nobody's \[bytes\]: to a host a policy of any size comes,
+/// Maximum size of a message to a host, which may be a policy \[bytes\].
 const POLICY_BYTES_MAX: usize = 256 << 20;
-/// to the learner's host a few hundred KiB of segments, or one that is longer.
+/// Maximum size of a message to the learner's host \[bytes\]: a few hundred KiB of segments, or one
+/// longer segment.
 const BATCH_BYTES_MAX: usize = 16 << 20;
-/// Other ends of the learner's host.
+/// Maximum number of sessions with the learner's host.
 const SESSIONS_MAX: usize = 256;
 
-/// Which end of a link.
+/// The two ends of a link.
 #[derive(Debug, Clone, Copy)]
 pub enum Ends<'a> {
-    /// The learner's host, at these endpoints.
+    /// The learner's host, which listens on these endpoints.
     Listen(&'a [String]),
-    /// Another host, to this endpoint.
+    /// Another host, which connects to this endpoint.
     Connect(&'a str),
 }
 
@@ -46,10 +49,10 @@ pub enum Ends<'a> {
 #[derive(Debug)]
 pub struct Link(Session);
 
-/// What goes first where a link is full.
+/// Priority of messages on a full link.
 #[derive(Debug, Clone, Copy)]
 pub enum Urgency {
-    /// Small and awaited.
+    /// Small messages that the other end waits for.
     First,
     /// Policies.
     Policies,
@@ -57,27 +60,27 @@ pub enum Urgency {
     Segments,
 }
 
-/// Where messages of one name go out.
+/// Sends messages under one name.
 #[derive(Debug)]
 pub struct Outlet(Publisher<'static>);
 
-/// Where messages come in.
+/// Receives messages under a name or pattern.
 #[derive(Debug)]
 pub struct Inlet(Subscriber<FifoChannelHandler<Sample>>);
 
-/// A message.
+/// A received message.
 #[derive(Debug)]
 pub struct Message(Sample);
 
-/// Where questions come in.
+/// Receives requests under a name.
 #[derive(Debug)]
 pub struct Questions(Queryable<FifoChannelHandler<Query>>);
 
-/// A question that waits for its answer.
+/// A request that awaits its answer.
 #[derive(Debug)]
 pub struct Question(Query);
 
-/// Says that this end lives, until it is dropped or the link is gone.
+/// Announces that this end lives, until it is dropped or the link is gone.
 #[derive(Debug)]
 pub struct Token(#[expect(dead_code, reason = "it is there as long as this is")] LivelinessToken);
 
@@ -106,7 +109,7 @@ fn config(ends: Ends<'_>, zenoh_file: Option<&Path>) -> anyhow::Result<Config> {
         ("listen/endpoints", listen),
         ("connect/endpoints", connect),
         ("connect/exit_on_failure", "false".to_owned()),
-        // It goes on trying behind our back, for ever: -1; who asks has a limit.
+        // Zenoh retries forever in the background (-1); callers have their own limit.
         ("connect/timeout_ms", "-1".to_owned()),
         ("connect/retry", retry),
         ("scouting/multicast/enabled", "false".to_owned()),
@@ -123,10 +126,10 @@ fn config(ends: Ends<'_>, zenoh_file: Option<&Path>) -> anyhow::Result<Config> {
 }
 
 impl Link {
-    /// Opens a session. Who connects need not be answered yet; who listens must be able to.
+    /// Opens a session. A connecting end need not reach its peer yet; a listening end must succeed.
     ///
     /// # Errors
-    /// Wrong use: the file is no configuration of Zenoh. An endpoint cannot be listened at.
+    /// Wrong use: the file is no configuration of Zenoh. Cannot listen on an endpoint.
     pub fn open(ends: Ends<'_>, zenoh_file: Option<&Path>) -> anyhow::Result<Self> {
         let what = match ends {
             Ends::Listen(at) => format!("cannot listen at {}", at.join(", ")),
@@ -135,7 +138,7 @@ impl Link {
         zenoh::open(config(ends, zenoh_file)?).wait().map(Self).map_err(failed(what))
     }
 
-    /// Messages of this name will go out. Where the link is full, whoever sends waits.
+    /// Declares that messages of this name will be sent. On a full link the sender blocks.
     ///
     /// # Errors
     /// The session is closed.
@@ -155,7 +158,7 @@ impl Link {
         publisher.map(Outlet).map_err(what)
     }
 
-    /// Messages of this name come in; `*` stands for any part of it.
+    /// Subscribes to messages of this name; `*` stands for any part of it.
     ///
     /// # Errors
     /// The session is closed.
@@ -165,7 +168,7 @@ impl Link {
         subscriber.map(Inlet).map_err(failed(format!("cannot receive {name}")))
     }
 
-    /// Questions of this name come in.
+    /// Declares that requests of this name will be answered.
     ///
     /// # Errors
     /// The session is closed.
@@ -175,7 +178,7 @@ impl Link {
         queryable.map(Questions).map_err(failed(format!("cannot answer {name}")))
     }
 
-    /// Asks, and waits so long for the answer; none when nobody is there.
+    /// Sends a request and waits for the answer, up to `limit`; `None` if no peer answers.
     ///
     /// # Errors
     /// The session is closed.
@@ -187,13 +190,13 @@ impl Link {
     ) -> anyhow::Result<Option<Vec<u8>>> {
         let asked = self.0.get(name).payload(question).timeout(limit).wait();
         let answers = asked.map_err(failed(format!("cannot ask {name}")))?;
-        // Zenoh's own limit is kept; this one is for when it is not.
+        // A safeguard: Zenoh normally observes its own limit.
         let answer = answers.recv_timeout(limit * 2);
         let Ok(Some(reply)) = answer else { return Ok(None) };
         Ok(reply.into_result().ok().map(|sample| sample.payload().to_bytes().into_owned()))
     }
 
-    /// Says that this end lives.
+    /// Announces that this end lives.
     ///
     /// # Errors
     /// The session is closed.
@@ -202,7 +205,7 @@ impl Link {
         self.0.liveliness().declare_token(name).wait().map(Token).map_err(what)
     }
 
-    /// Tells of other ends that come (with those that are there already) and go.
+    /// Subscribes to the arrival and departure of other ends, including those already present.
     ///
     /// # Errors
     /// The session is closed.
@@ -216,7 +219,7 @@ impl Link {
 }
 
 impl Outlet {
-    /// Sends, waiting where the link is full. To an end that is not there nothing is sent.
+    /// Sends a message; blocks on a full link. Without a connected peer the message is dropped.
     ///
     /// # Errors
     /// The session is closed.
@@ -226,7 +229,7 @@ impl Outlet {
 }
 
 impl Inlet {
-    /// The next message, if one is there.
+    /// Returns the next message, without waiting.
     ///
     /// # Errors
     /// The session is closed.
@@ -237,20 +240,20 @@ impl Inlet {
 }
 
 impl Message {
-    /// What stands behind the last `/` of its name.
+    /// The part of the message's name after the last `/`.
     #[must_use]
     pub fn last_name(&self) -> &str {
         let name = self.0.key_expr().as_str();
         name.rsplit_once('/').map_or(name, |(_, last)| last)
     }
 
-    /// What it says.
+    /// Payload of the message.
     #[must_use]
     pub fn bytes(&self) -> std::borrow::Cow<'_, [u8]> {
         self.0.payload().to_bytes()
     }
 
-    /// Of a token: whether it has come; it has gone otherwise.
+    /// For a token: true if the end has arrived, false if it is gone.
     #[must_use]
     pub fn has_come(&self) -> bool {
         self.0.kind() == SampleKind::Put
@@ -258,7 +261,7 @@ impl Message {
 }
 
 impl Questions {
-    /// The next question, if one is there.
+    /// Returns the next request, without waiting.
     ///
     /// # Errors
     /// The session is closed.
@@ -269,13 +272,13 @@ impl Questions {
 }
 
 impl Question {
-    /// What is asked.
+    /// Payload of the request.
     #[must_use]
     pub fn bytes(&self) -> Vec<u8> {
         self.0.payload().map(|payload| payload.to_bytes().into_owned()).unwrap_or_default()
     }
 
-    /// Answers; whoever asked may be gone.
+    /// Sends the answer; succeeds even if the requester is gone.
     ///
     /// # Errors
     /// The session is closed.
@@ -287,7 +290,7 @@ impl Question {
 
 impl Drop for Link {
     fn drop(&mut self) {
-        // What is still to be sent is sent; a link that is gone keeps nobody waiting.
+        // Flushes pending messages; a broken link does not block it.
         let _ = self.0.close().wait();
     }
 }

@@ -1,15 +1,16 @@
-//! Several hosts: the workers of one send their segments to the learner of another.
+//! Several hosts: workers send their segments to a learner on another host.
 //!
 //! ```text
 //!  learner's host                                    other hosts
 //!  learner ◄── queue, one a worker ── gateway ◄──── Zenoh ──── relay ◄── queues ── workers
 //!     └── policies, acknowledgements ──► gateway ── Zenoh ────► relay ── the same ──► workers
 //! ```
-//! To the workers of its host, a [`relay`] is the learner; to the learner, the [`gateway`] is the
-//! workers of all other hosts. Each hop keeps what the learner has not acknowledged, as a worker
-//! does: `lane` at the relay, `landing` at the gateway. So whoever dies, the one before sends
-//! again. `wire` is what they say, `window` how much may be under way, `feed` how policies go,
-//! `seats` who has which places, and `link` is the only file that names Zenoh.
+//! A [`relay`] acts as the learner for the workers of its host; the [`gateway`] acts as the workers
+//! of all other hosts for the learner. Like a worker, each hop retains the segments that the
+//! learner has not acknowledged: `lane` at the relay, `landing` at the gateway. So after any
+//! process has died, its predecessor in the chain retransmits. `wire` defines the messages,
+//! `window` limits the data in flight, `feed` sends policies, `seats` assigns places to hosts, and
+//! `link` is the only file that names Zenoh.
 
 mod feed;
 pub mod gateway;

@@ -1,8 +1,8 @@
-//! A host's end: to its workers it is the learner.
+//! A host's end of the bridge, which acts as the learner for its workers.
 //!
-//! It takes a segment only when the link has room for it, so that what waits, waits in the workers'
-//! queues, where they feel it. What it has under way it keeps until the learner has acknowledged
-//! it; a worker hears of an acknowledgement when the learner has given it, not before.
+//! It takes a segment only if the link has room for it, so that waiting segments stay in the
+//! workers' queues and cause back-pressure. It retains the segments in flight until the learner has
+//! acknowledged them. A worker receives an acknowledgement only after the learner has given it.
 
 use std::path::Path;
 use std::thread;
@@ -21,54 +21,55 @@ use super::window::Window;
 use super::wire::{self, Batch, Course, Held, HostAnswer, HostRequest, HostStatus, HostWelcome};
 use crate::control::{Greeting, WorkersNow};
 
-/// Name of the question by which a host asks to take part.
+/// Name of the request to join a run.
 pub(super) const JOIN: &str = "dmprl/join";
-/// An answer takes a round trip.
+/// Time limit for an answer, which takes one round trip.
 const ANSWER_LIMIT: Duration = Duration::from_secs(3);
-/// Between two times that a host asks.
+/// Interval between two requests to join.
 const ASK_AGAIN: Duration = Duration::from_millis(500);
-/// The gateway speaks a few times a second; so long a silence means that it, or the link, is gone.
+/// Silence after which the gateway or the link counts as gone. The gateway sends several messages
+/// per second.
 const SILENCE: Duration = Duration::from_secs(5);
-/// A batch of so many bytes is sent at once. The link cuts messages into pieces of 64 KiB.
+/// Size at which a batch is sent at once. The link splits messages into pieces of 64 KiB.
 const BATCH_BYTES: usize = 60_000;
-/// More is not sent before anything is heard again: what was lost with a link is sent piece by
-/// piece.
+/// Maximum number of bytes per turn, before messages are read again. Retransmits after a broken
+/// link are thus sent piece by piece.
 const TURN_BYTES: u64 = 262_144;
-/// Segments of one worker before it is the next one's turn.
+/// Maximum number of segments of one worker per turn.
 const TURN_SEGMENTS: usize = 16;
 const ACKNOWLEDGE_INTERVAL: Duration = Duration::from_millis(5);
 const MAINTENANCE_INTERVAL: Duration = Duration::from_millis(100);
 const STATUS_INTERVAL: Duration = Duration::from_millis(250);
-/// A host that leaves is heard within a round trip.
+/// Time limit to leave the run, which takes one round trip.
 const LEAVE_LIMIT: Duration = Duration::from_secs(2);
 
-/// Whom a host asks, and as whom.
+/// A host's request to join a run.
 #[derive(Debug, Clone)]
 pub struct Asking {
-    /// The learner's host.
+    /// Endpoint of the learner's host.
     pub endpoint: String,
-    /// The run's secret.
+    /// Token of the run.
     pub token: String,
-    /// Tells this start of the program from every other.
+    /// Random number that identifies this start of the program.
     pub host: u64,
-    /// What people call the host.
+    /// Name of the host, for display.
     pub name: String,
-    /// Workers that it brings.
+    /// Number of workers.
     pub workers: u32,
 }
 
-/// What came of asking once.
+/// Result of one request to join.
 #[derive(Debug)]
 pub enum Asked {
-    /// The host takes part.
+    /// The host has joined.
     Welcome(Box<HostWelcome>),
-    /// Nobody is there, or there is no room now.
+    /// No answer, or no room at present.
     Later(String),
-    /// Asking again is of no use.
+    /// Rejected; another request would be rejected too.
     Refused(String),
 }
 
-/// Asks to take part, once.
+/// Sends one request to join.
 ///
 /// # Errors
 /// The session is closed.
@@ -90,28 +91,28 @@ pub fn ask(link: &Link, asking: &Asking, held: Option<Held>) -> anyhow::Result<A
         Ok(HostAnswer::Welcome(welcome)) => Asked::Welcome(welcome),
         Ok(HostAnswer::Refused { reason, later: true }) => Asked::Later(reason),
         Ok(HostAnswer::Refused { reason, later: false }) => Asked::Refused(reason),
-        Err(error) => Asked::Refused(format!("{endpoint} answered what is no answer: {error}")),
+        Err(error) => Asked::Refused(format!("{endpoint} sent an invalid answer: {error}")),
     })
 }
 
-/// What the host's supervisor has told of it.
+/// Counts that the host's supervisor has reported.
 #[derive(Debug, Clone, Copy, Default)]
 pub struct HostCounts {
-    /// What its workers did.
+    /// Segments of its workers.
     pub sent: Sent,
-    /// Failures of environments.
+    /// Number of failures of environments.
     pub env_failures: u64,
-    /// Its workers.
+    /// State of its workers.
     pub workers: WorkersNow,
 }
 
-/// A session's names for one seat.
+/// The messages of one seat.
 struct Seat {
     segments: Outlet,
     status: Outlet,
     hearings: Inlet,
     policies: Inlet,
-    /// Gateways that come and go, and the one that gave this seat.
+    /// Arrival and departure of gateways, and the id of the gateway that assigned this seat.
     gateways: Inlet,
     gateway: u64,
     _token: Token,
@@ -131,7 +132,7 @@ impl Seat {
         })
     }
 
-    /// Whether the gateway that gave the seat is gone, or another has come.
+    /// Returns true if the gateway that assigned the seat is gone, or another has appeared.
     fn is_in_doubt(&self) -> anyhow::Result<bool> {
         let mut doubt = false;
         while let Some(message) = self.gateways.next()? {
@@ -142,22 +143,22 @@ impl Seat {
     }
 }
 
-/// What a turn brought.
+/// Result of a turn.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Turn {
-    /// There may be more.
+    /// There may be more to do.
     Worked,
-    /// Nothing was to be done.
+    /// There was nothing to do.
     Idle,
-    /// The run has come to its end.
+    /// The run is complete.
     Complete,
 }
 
-/// A host's relay.
+/// The relay of a host.
 pub struct Relay {
     link: Link,
     asking: Asking,
-    /// Its places.
+    /// The places of this host.
     given: Held,
     seat: Option<Seat>,
     end: LearnerEnd,
@@ -176,21 +177,21 @@ pub struct Relay {
     acked: u64,
     started: Instant,
     heard: Instant,
-    /// The gateway seems to be gone, or another.
+    /// Set if the gateway may be gone or may have been replaced.
     doubt: bool,
     asked: Option<Instant>,
     acknowledged: Instant,
     maintained: Instant,
     told: Instant,
     tell_now: bool,
-    /// Since when the learner's host does not answer, and why.
+    /// Time since which the learner's host does not answer, and the reason.
     away: Option<(Instant, String)>,
     /// Messages that could not be read.
     damaged: u64,
 }
 
 impl Relay {
-    /// Serves the host's workers; `held`: the places that it was given before.
+    /// Starts to serve the host's workers; `held` are the places assigned to it before.
     ///
     /// # Errors
     /// The session or the shared memory cannot be opened.
@@ -233,66 +234,67 @@ impl Relay {
             maintained: now,
             told: now,
             tell_now: false,
-            away: Some((now, "it has not been asked yet".to_owned())),
+            away: Some((now, "no request has been sent yet".to_owned())),
             damaged: 0,
         })
     }
 
-    /// Version of the newest policy that the host's workers have; 0: none.
+    /// Version of the newest policy that the host's workers have; 0 if none.
     #[must_use]
     pub fn version(&self) -> u64 {
         self.version
     }
 
-    /// Environment steps of the run when that was published.
+    /// Environment steps of the run when that policy was published.
     #[must_use]
     pub fn env_steps(&self) -> u64 {
         self.env_steps
     }
 
-    /// Environment steps of a segment.
+    /// Environment steps per segment.
     #[must_use]
     pub fn segment_steps(&self) -> usize {
         self.segment_steps
     }
 
-    /// Segments that the learner has acknowledged.
+    /// Number of segments that the learner has acknowledged.
     #[must_use]
     pub fn acked(&self) -> u64 {
         self.acked
     }
 
-    /// Bytes that may be under way now.
+    /// Current limit of bytes in flight.
     #[must_use]
     pub fn window_bytes(&self) -> u64 {
         self.window.bytes()
     }
 
-    /// Segments that the learner has not acknowledged.
+    /// Number of segments that the learner has not acknowledged.
     #[must_use]
     pub fn under_way(&self) -> u64 {
         self.lanes.iter().map(|lane| lane.under_way() as u64).sum()
     }
 
-    /// Since when the learner's host does not answer, and why.
+    /// Time since which the learner's host does not answer, and the reason.
     #[must_use]
     pub fn away(&self) -> Option<&(Instant, String)> {
         self.away.as_ref()
     }
 
-    /// Messages and segments that were not what they should be.
+    /// Number of damaged messages and invalid segments.
     #[must_use]
     pub fn damaged(&self) -> u64 {
         self.damaged + self.lanes.iter().map(Lane::misfits).sum::<u64>()
     }
 
-    /// One round: hears, takes, sends.
+    /// Runs one turn: reads messages, takes segments, sends them.
     ///
     /// # Errors
-    /// Its places are another host's now, or something is broken that does not mend.
+    /// Its places belong to another host now, or the transport has failed permanently.
     pub fn turn(&mut self, counts: &HostCounts) -> anyhow::Result<Turn> {
         let now = Instant::now();
-        // First: after a turn in which the link was full, words may wait that break the silence.
+        // First, because messages that end the silence may be waiting after a turn with a full
+        // link.
         let course = self.hear(now)?;
         self.stay_in_touch(now)?;
         let sent = self.send(now)?;
@@ -318,7 +320,8 @@ impl Relay {
         })
     }
 
-    /// Says that the host leaves, until it is heard: what is sent last a closing session may lose.
+    /// Announces the departure until the gateway confirms it: a closing session may lose its last
+    /// messages.
     ///
     /// # Errors
     /// The session is closed.
@@ -337,7 +340,7 @@ impl Relay {
         Ok(())
     }
 
-    /// Asks anew when the gateway is silent: it may be another, which knows nothing of this host.
+    /// Joins again if the gateway is silent: there may be a new one, which does not know this host.
     fn stay_in_touch(&mut self, now: Instant) -> anyhow::Result<()> {
         self.doubt |= self.seat.as_ref().map_or(Ok(false), Seat::is_in_doubt)?;
         let silent = now.duration_since(self.heard) >= SILENCE;
@@ -359,7 +362,7 @@ impl Relay {
                 self.seat = Some(Seat::take(&self.link, &welcome)?);
                 self.lanes.iter_mut().for_each(Lane::begin_anew);
                 self.heard = Instant::now();
-                // Its first words say that it listens.
+                // The first status message tells the gateway that this host listens.
                 (self.away, self.doubt, self.tell_now) = (None, false, true);
             }
             Asked::Later(reason) => {
@@ -404,10 +407,10 @@ impl Relay {
         Ok(course)
     }
 
-    /// Takes segments from the workers in turn as long as there is room, and sends them.
+    /// Takes segments from the workers in turn while there is room, and sends them.
     fn send(&mut self, now: Instant) -> anyhow::Result<bool> {
         let Some(seat) = &self.seat else { return Ok(false) };
-        // However long a segment is, one may be under way: without any nothing would be learned.
+        // Allows at least one segment of any size in flight; otherwise the run would stop.
         let window = (self.window.bytes() / self.segment_bytes).max(1);
         let together = (TURN_BYTES / self.segment_bytes).max(1);
         let room = window.saturating_sub(self.under_way()).min(together);
@@ -458,7 +461,7 @@ impl Relay {
             self.end.parameters.publish(&snapshot)?;
             (self.version, self.env_steps) = (snapshot.version, snapshot.env_steps);
         }
-        // The gateway sends the next when it knows that this one has come.
+        // The gateway sends the next policy after this one is confirmed.
         self.tell_now = true;
         Ok(())
     }
@@ -471,7 +474,7 @@ impl Relay {
 
     fn tell(&mut self, counts: &HostCounts, leaves: bool) -> anyhow::Result<()> {
         let Some(seat) = &self.seat else { return Ok(()) };
-        // In the order of the segments, or it would seem that some are missing.
+        // Send it after the segments; otherwise some would seem to be missing.
         self.lanes.iter().for_each(|lane| lane.say_how_far(&mut self.batch));
         if !self.batch.is_empty() {
             seat.segments.send(self.batch.take())?;

@@ -1,4 +1,4 @@
-//! Which host has which of the run's places.
+//! Assigns the run's places to hosts.
 
 use std::time::{Duration, Instant};
 
@@ -7,42 +7,43 @@ use dmprl_shared::transport::delivery::Mark;
 use super::wire::{Held, HostRequest, HostStatus};
 use crate::control::HostNow;
 
-/// A host that is silent keeps its places so long where somebody else asks for them: longer than a
-/// link is down, a switch restarted or a machine rebooted.
+/// Time for which a silent host keeps its places although another host needs them. It is longer
+/// than a broken link, the restart of a switch or the reboot of a machine takes.
 const KEPT: Duration = Duration::from_secs(600);
-/// One that was taken in and has never told anything of itself did not come to be.
+/// Time limit for an admitted host to send its first status.
 const BEGUN_WITHIN: Duration = Duration::from_secs(60);
-/// Who asks for places is told of hosts that have been silent for so long; the others tell of
-/// themselves a few times a second.
+/// Silence after which a host is reported as unreachable to a host that needs places. Others send a
+/// status several times per second.
 const SILENT: Duration = Duration::from_secs(10);
-/// Starts that each worker has in a session, of which the launcher makes incarnations.
+/// Bits of an incarnation that count a worker's starts within a session.
 const STARTS_BITS: u32 = 16;
 
-/// A host that takes part, or did.
+/// A host that takes part or has taken part.
 #[derive(Debug, Clone)]
 pub struct Host {
-    /// Part of its names since it last came.
+    /// Current seat: part of the names of its messages, renewed with each admission.
     pub seat: u64,
-    /// Which start of `dmprl bridge`.
+    /// Number that identifies the start of `dmprl bridge`.
     pub host: u64,
-    /// What people call it.
+    /// Name of the host, for display.
     pub name: String,
-    /// Its places.
+    /// Places of the host.
     pub held: Held,
-    /// How many.
+    /// Number of its workers.
     pub workers: u32,
-    /// When it last said anything.
+    /// Time of its last message.
     pub heard: Instant,
-    /// Whether its liveliness token is there.
+    /// True while its liveliness token exists.
     pub here: bool,
-    /// What it last told of itself.
+    /// Last status that it sent.
     pub status: Option<HostStatus>,
-    /// It took part before this gateway began: what it did by then is counted already.
+    /// True if it joined before this gateway started, so that its earlier counts are already
+    /// included.
     pub counted_before: bool,
 }
 
 impl Host {
-    /// What whoever watches the run is told of it.
+    /// The host's state, for display.
     #[must_use]
     pub fn shown(&self) -> HostNow {
         let status = self.status.as_ref();
@@ -56,77 +57,77 @@ impl Host {
         }
     }
 
-    /// How long its places are kept for it yet.
+    /// Time after which its places may be given to another host.
     fn free_in(&self, now: Instant) -> Duration {
         let kept = if self.status.is_some() { KEPT } else { BEGUN_WITHIN };
         kept.saturating_sub(now.duration_since(self.heard))
     }
 }
 
-/// The newest session of which the learner has seen segments of these workers.
+/// The newest session of these workers from which the learner has seen segments.
 fn seen(first: u32, workers: u32, marks: &[Mark]) -> Option<u32> {
     let of = marks.iter().skip(first as usize).take(workers as usize);
     of.filter(|mark| mark.sequence > 0).map(|mark| mark.incarnation >> STARTS_BITS).max()
 }
 
-/// Why a host is not taken in.
+/// Rejection of a host.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Refusal {
-    /// Why, and what can be done.
+    /// The reason and a remedy.
     pub reason: String,
-    /// Whether asking again may help.
+    /// True if a later request may succeed.
     pub later: bool,
 }
 
-/// All hosts of a run.
+/// The hosts of a run.
 #[derive(Debug)]
 pub struct Seats {
-    /// The first worker of other hosts, and how many there may be.
+    /// First worker of other hosts, and the number of their places.
     first: u32,
     places: u32,
-    /// The session that the next host gets: no two have the same, so that no start of a worker has
-    /// the number of another.
+    /// Session of the next host. Each host gets a different one, so that all incarnations are
+    /// distinct.
     session: u32,
-    /// The session that each place was last given in, as far as is known here.
+    /// The last known session of each place.
     newest: Vec<u32>,
     hosts: Vec<Host>,
 }
 
 impl Seats {
-    /// Nobody has come yet; `session`: the first that may be given.
+    /// Creates the list without hosts; `session` is the first unused session.
     #[must_use]
     pub fn new(first: u32, places: u32, session: u32) -> Self {
         Self { first, places, session, newest: vec![0; places as usize], hosts: Vec::new() }
     }
 
-    /// The first session that was not given yet.
+    /// The first unused session.
     #[must_use]
     pub fn session(&self) -> u32 {
         self.session
     }
 
-    /// Everybody.
+    /// All hosts.
     #[must_use]
     pub fn hosts(&self) -> &[Host] {
         &self.hosts
     }
 
-    /// Who speaks by this seat.
+    /// The host with this seat.
     pub fn of_seat(&mut self, seat: u64) -> Option<&mut Host> {
         self.hosts.iter_mut().find(|host| host.seat == seat)
     }
 
-    /// Forgets a host that has left.
+    /// Removes a host that has left.
     pub fn remove(&mut self, seat: u64) -> Option<Host> {
         let at = self.hosts.iter().position(|host| host.seat == seat)?;
         Some(self.hosts.remove(at))
     }
 
-    /// Gives a host its places: those it had, else the first that are free. `marks`: what the
-    /// learner knows of each worker of the run.
+    /// Assigns places to a host: its previous ones, or else the first free ones. `marks` is the
+    /// learner's last acknowledgement for each worker of the run.
     ///
     /// # Errors
-    /// There are none, or what it had is another's now.
+    /// No places are free, or its previous places belong to another host now.
     pub fn admit(
         &mut self,
         request: &HostRequest,
@@ -140,7 +141,7 @@ impl Seats {
                 let known = &mut self.hosts[at];
                 if known.workers != workers {
                     let reason = format!(
-                        "it took part with {} workers and asks now with {workers}: start it again",
+                        "it joined with {} workers and now asks for {workers}: start it again",
                         known.workers
                     );
                     return Err(Refusal { reason, later: false });
@@ -155,7 +156,7 @@ impl Seats {
                 return Err(Refusal { reason: reason.to_owned(), later: false });
             }
             (known, None) => {
-                // It was started again, and what it was before is no more.
+                // It was restarted, so its previous start no longer exists.
                 known.map(|at| self.hosts.remove(at));
                 self.place(workers, marks, now)?
             }
@@ -176,8 +177,8 @@ impl Seats {
         Ok(held)
     }
 
-    /// Whether a host may go on in the places that it had: of older starts than it knows the
-    /// learner takes nothing.
+    /// Returns true if a host may continue in its previous places. The learner drops segments of
+    /// incarnations older than those it knows.
     fn is_still(&mut self, held: Held, workers: u32, marks: &[Mark]) -> bool {
         self.is_free(held.first, workers)
             && seen(held.first, workers, marks).is_none_or(|seen| seen <= held.session)
@@ -216,11 +217,11 @@ impl Seats {
         let silent = self.hosts.iter().filter(|host| now.duration_since(host.heard) >= SILENT);
         let silent = silent.map(|host| {
             let (name, minutes) = (host.name.escape_debug(), host.free_in(now).as_secs() / 60 + 1);
-            format!("; {name} is out of reach and keeps its own for {minutes} min")
+            format!("; {name} is out of reach and keeps its places for another {minutes} min")
         });
         format!(
-            "{taken} of {} places for workers of other hosts are taken (bridge.workers_max), it \
-             brings {workers} and they must lie side by side; a host that leaves makes room{}",
+            "{taken} of {} places for workers of other hosts are taken (bridge.workers_max), \
+             and this host needs {workers} adjacent ones; wait until a host leaves{}",
             self.places,
             silent.collect::<String>()
         )
@@ -267,7 +268,7 @@ mod tests {
         let never = admit(4, 9, None).unwrap_err();
         assert!(!never.later && never.reason.contains("bridge.workers_max"));
         assert_eq!(admit(5, 1, None).unwrap().first, 10);
-        // A gateway that died has forgotten everybody.
+        // The successor of a dead gateway does not know any host.
         let mut next = Seats::new(3, 8, 0);
         let mut admit =
             |host, workers, held| next.admit(&request(host, workers, held), host, (&[], now));
@@ -297,21 +298,21 @@ mod tests {
         assert!(seats.of_seat(11).is_none());
     }
 
-    /// Its first start had once kept all places, though its relay never came to be.
+    /// Regression test: a start whose relay never ran once kept all places.
     #[test]
     fn a_host_that_was_taken_in_and_never_began_makes_room_soon() {
         let now = Instant::now();
         let mut seats = Seats::new(0, 2, 0);
         let held = seats.admit(&request(1, 2, None), 11, (&[], now)).unwrap();
         assert!(seats.admit(&request(2, 2, None), 12, (&[], now)).unwrap_err().later);
-        // The same host, started again, has them at once, and its workers count on.
+        // The same host, restarted, gets them at once, and its workers' incarnations continue.
         let again = seats.admit(&request(1, 2, None), 13, (&[], now)).unwrap();
         assert_eq!((again.first, again.session), (held.first, held.session + 1));
         let held = seats.admit(&request(2, 2, None), 12, (&[], now + BEGUN_WITHIN)).unwrap();
         assert_eq!((held.first, held.session), (0, again.session + 1));
     }
 
-    /// Its workers' segments would be passed over as those of an older start, without a word.
+    /// The learner would silently skip its workers' segments as those of an older incarnation.
     #[test]
     fn a_host_does_not_go_on_in_places_that_another_has_used_since() {
         let now = Instant::now();
@@ -323,7 +324,7 @@ mod tests {
         seats.remove(12);
         let refusal = seats.admit(&request(1, 2, Some(a)), 14, (&[], now)).unwrap_err();
         assert!(refusal.reason.contains("start it again"), "{}", refusal.reason);
-        // Another gateway knows it by what the learner has seen.
+        // A new gateway recognises it by the learner's marks.
         let marks = [Mark { incarnation: b.session << STARTS_BITS, sequence: 1 }];
         let mut next = Seats::new(0, 2, 0);
         assert!(next.admit(&request(1, 2, Some(a)), 15, (&marks, now)).is_err());

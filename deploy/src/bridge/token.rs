@@ -1,4 +1,4 @@
-//! The run's secret, which other hosts must know: a file that only its owner can read.
+//! The run's token, a secret that other hosts need: a file readable only by its owner.
 
 use std::fs::OpenOptions;
 use std::io::Write;
@@ -10,20 +10,21 @@ use anyhow::Context;
 use crate::failure::wrong_use;
 use crate::run_directory::random_u64;
 
-/// Shorter ones could be guessed.
+/// Shorter tokens could be guessed.
 const CHARACTERS_MIN: usize = 16;
 const CHARACTERS_MAX: usize = 1_024;
-/// Bits that nobody but the owner may have.
+/// Permission bits that only the owner may have.
 const OTHERS: u32 = 0o077;
-/// systemd gives a service its credentials by an access-control list, which shows as the group's.
+/// As `OTHERS`, for a credential of a systemd service, whose access-control list shows up as the
+/// group's read permission.
 const OTHERS_THAN_A_SERVICE: u32 = 0o037;
-/// Where they are.
+/// Environment variable with the folder of a service's credentials.
 const CREDENTIALS: &str = "CREDENTIALS_DIRECTORY";
 
-/// Reads a run's secret; makes it where there is none.
+/// Reads a run's token; creates it if it does not exist.
 ///
 /// # Errors
-/// The file can be read by others, is no secret, or cannot be made.
+/// The file can be read by others, contains no valid token, or cannot be created.
 pub fn ensure(path: &Path) -> anyhow::Result<String> {
     if !path.exists() {
         let mut random = String::new();
@@ -38,10 +39,11 @@ pub fn ensure(path: &Path) -> anyhow::Result<String> {
     read(path)
 }
 
-/// Reads a run's secret.
+/// Reads a run's token.
 ///
 /// # Errors
-/// Wrong use: there is none, others can read it, or it is too short or long to be one.
+/// Wrong use: the file does not exist, can be read by others, or its content is too short or too
+/// long.
 pub fn read(path: &Path) -> anyhow::Result<String> {
     read_as_service(path, std::env::var_os(CREDENTIALS).as_deref().map(Path::new))
 }
@@ -72,7 +74,7 @@ fn read_as_service(path: &Path, credentials: Option<&Path>) -> anyhow::Result<St
 
 const WHERE: &str = "copy bridge.token of the run's directory from the learner's host";
 
-/// Whether two secrets are equal, in a time that does not tell where they differ.
+/// Compares two secrets in constant time, which does not reveal where they differ.
 #[must_use]
 pub fn equal(one: &str, other: &str) -> bool {
     let pairs = one.bytes().zip(other.bytes());
@@ -97,7 +99,7 @@ mod tests {
         assert!(!equal(&token, &token[1..]) && !equal(&token, &token.replace(&token[..1], "x")));
         std::fs::set_permissions(&path, PermissionsExt::from_mode(0o640)).unwrap();
         assert!(read(&path).unwrap_err().to_string().contains("got 0640"));
-        // As a service's credential is shown.
+        // The mode of a service's credential.
         std::fs::set_permissions(&path, PermissionsExt::from_mode(0o440)).unwrap();
         assert!(read_as_service(&path, Some(Path::new("/other"))).is_err());
         assert_eq!(read_as_service(&path, Some(folder.path())).unwrap(), token);

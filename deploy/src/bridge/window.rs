@@ -1,32 +1,33 @@
-//! How much a host may have under way.
+//! Limits the data that a host may have in flight.
 //!
-//! Too little, and a long link is never filled; too much, and the segments of a fast host wait
-//! behind a slow learner, made by a policy that is long replaced. What fills the one and hardly
-//! waits for the other is what the learner acknowledges in one round trip, as BBR has it (Cardwell
-//! et al. 2016): the fastest rate of acknowledgements lately times the shortest round trip lately.
-//! The round trip is the link's alone, to the gateway and back, so that a learner that makes
-//! segments wait does not make the link seem longer.
+//! With too little, a long link is never filled. With too much, segments of a fast host queue for a
+//! slow learner and become outdated. The right amount is what the learner acknowledges in one round
+//! trip, as in BBR (Cardwell et al. 2016): the fastest recent rate of acknowledgements times the
+//! shortest recent round trip. Only the link's round trip to the gateway and back counts, so that a
+//! slow learner does not make the link seem longer.
 
-/// On top of a round trip: some intervals of acknowledgements, and what an update takes \[s\].
+/// Added to a round trip: some intervals of acknowledgements, and the time of an update \[s\].
 const SLACK_S: f64 = 0.05;
-/// A window so many times what is needed lets the rate show that it could be higher.
+/// Factor of the window, which lets a possible higher rate show.
 const GAIN: f64 = 2.0;
-/// The rate is taken over at least so long \[s\], and the fastest of so many times counts.
+/// Minimum time over which a rate is measured \[s\]. The window uses the fastest of the last
+/// `RATES` rates.
 const RATE_S: f64 = 0.1;
 const RATES: usize = 8;
-/// The shortest round trip is that of the last one or two of these intervals \[s\].
+/// The shortest round trip is taken over the last one or two intervals of this length \[s\].
 const MEMORY_S: f64 = 10.0;
-/// A window never is smaller \[bytes\]: some segments of each of some environments.
+/// Minimum window \[bytes\]: some segments of each of some environments.
 const WINDOW_MIN: f64 = 65_536.0;
 
-/// A host's window.
+/// The window of a host.
 #[derive(Debug, Clone)]
 pub struct Window {
     max: f64,
-    /// Shortest in this interval and in the one before \[s\], and when this began \[s\].
+    /// Shortest round trip in the current and in the previous interval \[s\], and the start of the
+    /// current one \[s\].
     round_trips: [f64; 2],
     began_s: f64,
-    /// The last rates \[bytes/s\], and what has been acknowledged since the newest.
+    /// The last rates \[bytes/s\], and the bytes acknowledged since the newest.
     rates: [f64; RATES],
     next: usize,
     acknowledged: u64,
@@ -34,7 +35,7 @@ pub struct Window {
 }
 
 impl Window {
-    /// The smallest, which may grow to `bytes_max`.
+    /// Creates the minimum window, which can grow to `bytes_max`.
     #[must_use]
     pub fn new(bytes_max: u64) -> Self {
         Self {
@@ -48,7 +49,7 @@ impl Window {
         }
     }
 
-    /// Bytes that may be under way.
+    /// Number of bytes that may be in flight.
     #[must_use]
     pub fn bytes(&self) -> u64 {
         let rate = self.rates.into_iter().fold(0.0, f64::max);
@@ -61,7 +62,7 @@ impl Window {
         shortest.is_finite().then_some(shortest)
     }
 
-    /// At the time `now_s` the gateway was heard to have a segment that was sent `round_trip_s`
+    /// Records, at time `now_s`, a round trip: the gateway confirmed a segment sent `round_trip_s`
     /// ago.
     pub fn time(&mut self, round_trip_s: f64, now_s: f64) {
         if now_s - self.began_s >= MEMORY_S {
@@ -71,7 +72,7 @@ impl Window {
         self.round_trips[0] = self.round_trips[0].min(round_trip_s);
     }
 
-    /// At the time `now_s` so many bytes more were heard to be acknowledged.
+    /// Records, at time `now_s`, that `bytes` more bytes have been acknowledged.
     pub fn acknowledge(&mut self, bytes: u64, now_s: f64) {
         self.acknowledged += bytes;
         let seconds = now_s - self.since_s;
@@ -89,13 +90,14 @@ mod tests {
 
     use super::*;
 
-    /// A link of `round_trip_s` to a learner that takes `bytes_per_s`, for a minute; what it took
-    /// in the second half \[bytes/s\], and the longest delay to an acknowledgement in it.
+    /// Simulates for a minute a link of `round_trip_s` to a learner that takes `bytes_per_s`.
+    /// Returns the learner's rate in the second half \[bytes/s\] and the longest delay of an
+    /// acknowledgement in it.
     fn run(round_trip_s: f64, bytes_per_s: f64) -> (f64, f64) {
         const STEP_S: f64 = 0.005;
         const STEPS: u32 = 12_000;
         let mut window = Window::new(64 << 20);
-        // When it arrives, when it was sent, how much it is.
+        // Arrival time, sending time, size.
         let (mut link, mut acks) = (VecDeque::new(), VecDeque::new());
         let mut landed: VecDeque<(f64, f64)> = VecDeque::new();
         let (mut under_way, mut taken, mut delay_max) = (0.0, 0.0, 0.0_f64);

@@ -1,10 +1,10 @@
-//! What relay and gateway say to each other, as bytes.
+//! Messages between relay and gateway, as bytes.
 //!
-//! Segments go as they lie in shared memory, header and block, in *stretches*: consecutive
-//! segments of one worker. The head tells another layout, another byte order or damage; a block's
-//! own checksum is the learner's to check, as with any worker.
+//! Segments are sent as they are in shared memory, header and block, in *stretches*: consecutive
+//! segments of one worker. The head reveals a different layout, a different byte order or damage.
+//! The learner verifies the checksum of each block, as with any worker.
 //!
-//! What is small and rare (joining, what a host tells of itself) is JSON.
+//! Small and rare messages (joining, a host's status) are JSON.
 
 use bytemuck::{Pod, Zeroable};
 use dmprl_shared::parameters::ParameterSnapshot;
@@ -16,30 +16,30 @@ use thiserror::Error;
 
 use crate::control::{Greeting, WorkersNow};
 
-/// First four bytes of every message; another byte order reads another number.
+/// First four bytes of every message, which also reveal a different byte order.
 const MAGIC: u32 = 0x4442_524d;
 const HEADER_BYTES: usize = size_of::<SegmentHeader>();
 
-/// Why a message is not read.
+/// Reason for which a message is rejected.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Error)]
 pub enum WireError {
-    /// It is no message of ours.
+    /// It does not begin with the protocol's magic number.
     #[error("expected a message of this protocol, got other bytes")]
     Foreign,
-    /// Its length is not what it says.
+    /// Its length contradicts its head.
     #[error("expected {expected} bytes, got {got}")]
     Length {
-        /// By what the message says.
+        /// Length according to the head.
         expected: usize,
-        /// What came.
+        /// Actual length.
         got: usize,
     },
-    /// Its checksum differs.
+    /// Its checksum is wrong.
     #[error("checksum {got:#010x}, expected {expected:#010x}")]
     Checksum {
-        /// What the message says.
+        /// Checksum in the head.
         expected: u32,
-        /// What its bytes have.
+        /// Checksum of the received bytes.
         got: u32,
     },
 }
@@ -48,68 +48,68 @@ pub enum WireError {
 #[repr(C)]
 struct Head {
     magic: u32,
-    /// Stretches, or workers.
+    /// Number of stretches or workers.
     count: u32,
-    /// CRC-32 of what follows, blocks of segments aside.
+    /// CRC-32 of the rest of the message, without the segments' blocks.
     checksum: u32,
-    /// Of a host to its learner 0; the other way [`Course`].
+    /// From a gateway a [`Course`]; from a host 0.
     course: u32,
 }
 
-/// Consecutive segments of one worker; none: it only says how far the worker is.
+/// Consecutive segments of one worker; without segments it only reports the worker's progress.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Pod, Zeroable)]
 #[repr(C)]
 pub struct Stretch {
-    /// The oldest that the host keeps: all before it are acknowledged.
+    /// The oldest segment that the host retains: all earlier ones are acknowledged.
     pub first: u64,
-    /// Sequence number of the first of these, or of the one that will be sent next.
+    /// Sequence number of the first segment of this stretch, or of the next one to be sent.
     pub next: u64,
-    /// Which worker of the run.
+    /// Index of the worker in the run.
     pub worker: u32,
-    /// Which start of it.
+    /// Incarnation of the worker.
     pub incarnation: u32,
-    /// Counts how often the worker's segments were sent anew.
+    /// Number of times that the worker's retained segments were sent again.
     pub attempt: u32,
-    /// Segments that follow.
+    /// Number of segments that follow.
     pub count: u32,
 }
 
-/// What a gateway has heard of one worker, and what the learner has acknowledged.
+/// The state of one worker at the gateway and at the learner.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Pod, Zeroable)]
 #[repr(C)]
 pub struct Hearing {
-    /// Acknowledged by the learner up to here,
+    /// The learner has acknowledged all segments up to this sequence number.
     pub sequence: u64,
-    /// The gateway has all up to here,
+    /// The gateway has received all segments up to this sequence number.
     pub landed: u64,
-    /// `sequence` is of this start of the worker,
+    /// Incarnation to which `sequence` belongs.
     pub incarnation: u32,
-    /// and `landed` of this.
+    /// Incarnation to which `landed` belongs.
     pub landed_incarnation: u32,
-    /// An attempt in which something was missing: the host sends what it keeps anew. 0: none.
+    /// Attempt in which a segment was missing, so that the host must retransmit; 0 if none.
     pub refused: u32,
-    /// Fills the last word.
+    /// Padding of the last word.
     pub reserved: u32,
 }
 
 impl Hearing {
-    /// The learner's mark.
+    /// The learner's last acknowledgement.
     #[must_use]
     pub fn mark(&self) -> Mark {
         Mark { incarnation: self.incarnation, sequence: self.sequence }
     }
 }
 
-/// Where a run is on its way, for the hosts.
+/// State of a run, as reported to the hosts.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Course {
-    /// It goes on.
+    /// The run continues.
     On,
-    /// It has come to its end.
+    /// The run is complete.
     Complete,
-    /// It was stopped, and may be resumed.
+    /// The run was stopped and may be resumed.
     Stopped,
-    /// It goes on without the host, which has left.
+    /// The run continues without this host, which has left.
     Left,
 }
 
@@ -133,7 +133,7 @@ impl Course {
     }
 }
 
-/// A message of segments that is being written.
+/// A message of segments under construction.
 #[derive(Debug, Default)]
 pub struct Batch {
     stretches: Vec<Stretch>,
@@ -142,15 +142,15 @@ pub struct Batch {
 }
 
 impl Batch {
-    /// Begins a stretch; its segments follow.
+    /// Begins a stretch, to which the next segments belong.
     pub fn begin(&mut self, stretch: Stretch) {
         self.stretches.push(Stretch { count: 0, ..stretch });
     }
 
-    /// Adds a segment to the stretch begun last.
+    /// Adds a segment to the current stretch.
     ///
     /// # Panics
-    /// If none has begun.
+    /// Without a current stretch.
     pub fn add(&mut self, header: &SegmentHeader, block: &[f32]) {
         let stretch = self.stretches.last_mut();
         stretch.expect("a segment belongs to a stretch").count += 1;
@@ -159,19 +159,19 @@ impl Batch {
         self.body.extend_from_slice(bytemuck::cast_slice(block));
     }
 
-    /// Bytes of segments in it.
+    /// Size of the segments so far in bytes.
     #[must_use]
     pub fn bytes(&self) -> usize {
         self.body.len()
     }
 
-    /// Whether nothing has been begun.
+    /// Returns true if no stretch has begun.
     #[must_use]
     pub fn is_empty(&self) -> bool {
         self.stretches.is_empty()
     }
 
-    /// The message; the batch is empty afterwards.
+    /// Finishes the message; the batch is empty afterwards.
     pub fn take(&mut self) -> Vec<u8> {
         let mut hasher = std::mem::take(&mut self.headers);
         hasher.update(bytemuck::cast_slice(&self.stretches));
@@ -202,12 +202,12 @@ fn check(expected: u32, hasher: crc32fast::Hasher) -> Result<(), WireError> {
     if got == expected { Ok(()) } else { Err(WireError::Checksum { expected, got }) }
 }
 
-/// Reads a message of segments, each of which has `block_len` numbers: `begin` hears of each
-/// stretch, `segment` of each of its segments, in `buffer`. Nothing is said before all of it is
-/// known to be sound.
+/// Reads a message of segments into `buffer`, whose layout determines their size. Calls `take` with
+/// `None` for each stretch, then with each of its segments. The message is verified first, except
+/// for the segments' blocks.
 ///
 /// # Errors
-/// It is none, or damaged.
+/// It is not a message of segments, or it is damaged.
 pub fn read_batch(
     message: &[u8],
     buffer: &mut Segment,
@@ -243,7 +243,7 @@ pub fn read_batch(
     Ok(())
 }
 
-/// What a gateway tells a host of its workers.
+/// Writes a message with the state of a host's workers.
 #[must_use]
 pub fn write_hearings(course: Course, hearings: &[Hearing]) -> Vec<u8> {
     let body: &[u8] = bytemuck::cast_slice(hearings);
@@ -253,10 +253,10 @@ pub fn write_hearings(course: Course, hearings: &[Hearing]) -> Vec<u8> {
     [bytemuck::bytes_of(&head), body].concat()
 }
 
-/// Reads it.
+/// Reads a message with the state of a host's workers.
 ///
 /// # Errors
-/// It is none, or damaged.
+/// It is not such a message, or it is damaged.
 pub fn read_hearings(message: &[u8]) -> Result<(Course, Vec<Hearing>), WireError> {
     let (head, body) = head(message)?;
     let expected = (head.count as usize).saturating_mul(size_of::<Hearing>());
@@ -271,7 +271,7 @@ pub fn read_hearings(message: &[u8]) -> Result<(Course, Vec<Hearing>), WireError
     Ok((Course::of(head.course), hearings.collect()))
 }
 
-/// A policy snapshot.
+/// Writes a policy snapshot.
 #[must_use]
 pub fn write_snapshot(snapshot: &ParameterSnapshot) -> Vec<u8> {
     let values: &[u8] = bytemuck::cast_slice(&snapshot.values);
@@ -284,7 +284,7 @@ pub fn write_snapshot(snapshot: &ParameterSnapshot) -> Vec<u8> {
 /// Reads a policy snapshot.
 ///
 /// # Errors
-/// It is none, or damaged.
+/// It is not a snapshot, or it is damaged.
 pub fn read_snapshot(message: &[u8]) -> Result<ParameterSnapshot, WireError> {
     const WORDS: usize = 3 * size_of::<u64>();
     let (head, rest) = head(message)?;
@@ -304,86 +304,86 @@ pub fn read_snapshot(message: &[u8]) -> Result<ParameterSnapshot, WireError> {
     Ok(snapshot)
 }
 
-/// A host asks to take part.
+/// A host's request to join.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct HostRequest {
-    /// Which program asks.
+    /// Program and version of the host.
     pub speaks: Greeting,
-    /// The run's secret.
+    /// Token of the run.
     pub token: String,
-    /// Tells this start of `dmprl bridge` from every other.
+    /// Random number that identifies this start of `dmprl bridge`.
     pub host: u64,
-    /// What people call it.
+    /// Name of the host, for display.
     pub name: String,
-    /// Workers that it brings.
+    /// Number of workers.
     pub workers: u32,
-    /// What it was given before, when it comes back.
+    /// Previous places, if the host returns.
     pub held: Option<Held>,
 }
 
-/// The places that a host has.
+/// The places of a host.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Held {
-    /// Which worker of the run its first is.
+    /// Index of its first worker in the run.
     pub first: u32,
-    /// Its workers' incarnations are counted as in this session of the run.
+    /// Session of the run from which its workers' incarnations are derived.
     pub session: u32,
 }
 
-/// What a host that asked is answered.
+/// Answer to a request to join.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case", deny_unknown_fields)]
 pub enum HostAnswer {
-    /// It takes part.
+    /// The host is admitted.
     Welcome(Box<HostWelcome>),
-    /// It does not.
+    /// The host is rejected.
     Refused {
-        /// Why, and what can be done.
+        /// The reason and a remedy.
         reason: String,
-        /// Whether asking again may help.
+        /// True if a later request may succeed.
         later: bool,
     },
 }
 
-/// What a host that takes part needs to know.
+/// Everything that an admitted host needs to know.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct HostWelcome {
-    /// Part of the names under which host and gateway speak from now on; nobody else knows it.
+    /// Secret part of the names of the messages between this host and the gateway.
     pub seat: u64,
-    /// Which gateway says so: its successor knows nothing of the seat.
+    /// Id of the gateway. Its successor does not know the seat.
     pub gateway: u64,
-    /// Which of the run's workers are its.
+    /// Places of the host.
     pub held: Held,
-    /// The run's number, as in its manifest.
+    /// Run id, as in the manifest.
     pub run_id: String,
-    /// The run's configuration, as in its `config.toml`.
+    /// Configuration, as in the run's `config.toml`.
     pub config: String,
-    /// The run's environment.
+    /// Spec of the run's environment.
     pub spec: EnvSpec,
 }
 
-/// What a host tells of itself, a few times a second.
+/// Status of a host, sent several times per second.
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct HostStatus {
-    /// The policy that it has.
+    /// Version of its policy.
     pub policy_version: u64,
-    /// What its workers did since the host began.
+    /// Counts of its workers' segments since the host began.
     pub sent: Sent,
-    /// Failures of environments since then.
+    /// Number of failures of environments since the host began.
     pub env_failures: u64,
-    /// Its workers.
+    /// State of its workers.
     pub workers: WorkersNow,
-    /// Whether it leaves.
+    /// True if it leaves.
     pub leaves: bool,
 }
 
 impl HostStatus {
-    /// Keeps the counts of the status before where these are less: a relay that was started again
-    /// knows none until its supervisor has spoken, and nobody may count backwards.
+    /// Raises counts to those of the previous status. A restarted relay reports none until its
+    /// supervisor has sent them, and counters must not decrease.
     pub fn no_less_than(&mut self, before: &Self) {
         let (now, then) = (&self.sent, &before.sent);
         let less = now.produced < then.produced
@@ -459,7 +459,7 @@ mod tests {
         for len in 0..message.len() {
             assert!(read(&message[..len]).is_err(), "cut at {len}");
         }
-        // A block's own damage is found by the learner: its last 12 bytes.
+        // The learner detects damage of a block: here the last 12 bytes.
         for at in 0..message.len() - 12 {
             let mut damaged = message.clone();
             damaged[at] ^= 1;

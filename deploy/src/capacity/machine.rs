@@ -1,4 +1,4 @@
-//! What this machine, or the container that it is, sets as limits.
+//! The limits of this machine, or of the container.
 
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -8,25 +8,25 @@ use rustix::process::{Resource, getrlimit};
 use crate::launch::Place;
 use crate::run_directory::Machine;
 
-/// Where the kernel shows the control groups that contain this process.
+/// Mount point of the control groups.
 const CONTROL_GROUPS: &str = "/sys/fs/cgroup";
 
-/// A file system and its room.
+/// A file system and its free space.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(crate) struct Space {
     /// A directory in it.
     pub(crate) path: PathBuf,
-    /// All of it [bytes].
+    /// Total size [bytes].
     pub(crate) size_bytes: u64,
-    /// What this user may still take [bytes].
+    /// Space available to this user [bytes].
     pub(crate) free_bytes: u64,
 }
 
 impl Space {
-    /// The file system that holds `path`.
+    /// Returns the file system of `path`.
     ///
     /// # Errors
-    /// It is not there, or does not tell.
+    /// It does not exist, or its size is unavailable.
     pub(crate) fn of(path: &Path) -> std::io::Result<Self> {
         let file_system = rustix::fs::statvfs(path)?;
         let bytes = |blocks: u64| blocks.saturating_mul(file_system.f_frsize);
@@ -38,23 +38,23 @@ impl Space {
     }
 }
 
-/// Limits of this machine; `None`: there is none, or it is not known.
+/// Limits of this machine; `None` means unlimited or unknown.
 #[derive(Debug, Clone)]
 pub(crate) struct MachineLimits {
-    /// Where runs put their shared memory.
+    /// File system of the runs' shared memory.
     pub(crate) shared_memory: Option<Space>,
-    /// Open files of one process.
+    /// Open files per process.
     pub(crate) open_files: Option<u64>,
-    /// Memory maps of one process.
+    /// Memory maps per process.
     pub(crate) maps: Option<u64>,
     /// Processes and threads of this user or container.
     pub(crate) tasks: Option<u64>,
-    /// Main memory, or the container's share of it [bytes].
+    /// Main memory, or the container's limit [bytes].
     pub(crate) memory_bytes: Option<u64>,
 }
 
 impl MachineLimits {
-    /// Those in force now.
+    /// Reads the current limits.
     pub(crate) fn this() -> Self {
         let group = |file| control_group_min(Path::new(CONTROL_GROUPS), &own_group(), file);
         let least = |limits: [Option<u64>; 2]| limits.into_iter().flatten().min();
@@ -68,15 +68,15 @@ impl MachineLimits {
     }
 }
 
-/// This process's group, of version 2; empty with version 1 only.
+/// This process's control group of version 2; empty with version 1 only.
 fn own_group() -> String {
     let text = fs::read_to_string("/proc/self/cgroup").unwrap_or_default();
     let own = text.lines().find_map(|line| line.strip_prefix("0::/"));
     own.unwrap_or_default().to_owned()
 }
 
-/// The smallest limit in `file` of the group and those around it. `max`, which is no number, sets
-/// none; inside a container its own group is the root.
+/// Returns the smallest limit in `file` of the group and its ancestors. `max` is no number and sets
+/// no limit. In a container the own group is the root.
 fn control_group_min(root: &Path, group: &str, file: &str) -> Option<u64> {
     let own = root.join(group);
     let groups = own.ancestors().take_while(|path| path.starts_with(root));

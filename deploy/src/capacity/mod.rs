@@ -1,5 +1,7 @@
-//! Whether this machine can hold a run: asked before anything of it is started, because what is
-//! missing would end it in the middle, and without a word of why.
+//! Checks that this machine has enough resources for a run.
+//!
+//! The check precedes the start of any process, because a shortage would end the run later, often
+//! without an explanation.
 
 mod machine;
 mod need;
@@ -13,13 +15,13 @@ pub(crate) use need::Need;
 
 use crate::terminal::binary_bytes;
 
-/// Refuses a run that this machine cannot hold.
+/// Rejects a run that exceeds this machine's resources.
 ///
-/// `spec`: none when only a worker will tell; then the smallest environment is assumed, and the
-/// learner refuses later what is too large.
+/// `spec` is `None` if only a worker can determine it. Then the smallest environment is assumed,
+/// and the learner later rejects one that is too large.
 ///
 /// # Errors
-/// What is short, with what the run needs, what there is, and what to do.
+/// The shortages, each with the required and the available amount and a remedy.
 pub(crate) fn check(config: &ExperimentConfig, spec: Option<&EnvSpec>) -> anyhow::Result<()> {
     let machine = MachineLimits::this();
     let shortages = Need::of(config, spec).shortages(&machine);
@@ -30,7 +32,7 @@ pub(crate) fn check(config: &ExperimentConfig, spec: Option<&EnvSpec>) -> anyhow
 }
 
 impl Need {
-    /// Its workers, as part of a sentence.
+    /// Counts its workers, as part of a sentence.
     pub(crate) fn counted(&self) -> String {
         let Self { workers, joined, remote, .. } = self;
         let mut counted = format!("{workers} worker{}", if *workers == 1 { "" } else { "s" });
@@ -43,7 +45,7 @@ impl Need {
         counted
     }
 
-    /// What the machine has too little of, one sentence each.
+    /// Describes each shortage of the machine in one sentence.
     pub(crate) fn shortages(&self, machine: &MachineLimits) -> Vec<String> {
         let mut shortages = Vec::new();
         let Self { shared_memory_bytes, replay_bytes, open_files, maps, tasks, .. } = *self;

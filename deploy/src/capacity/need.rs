@@ -1,4 +1,4 @@
-//! What a run needs of a machine, from its configuration.
+//! Computes the resources that a run needs from its configuration.
 
 use dmprl_shared::config::{AlgorithmName, ExperimentConfig, Hindsight};
 use dmprl_shared::policy::Policy;
@@ -6,45 +6,50 @@ use dmprl_shared::segment::SegmentLayout;
 use dmprl_shared::spec::EnvSpec;
 use dmprl_shared::transport::shared_memory::required_bytes;
 
-/// Open files of any process of a run: pipes, logs, what an environment reads [measured: 29].
+/// Open files of any process of a run: pipes, logs, files of an environment [measured: 29].
 const FILES: u64 = 64;
-/// The same for each worker in the learner, which holds its services [measured: 6].
+/// Additional open files in the learner per worker, for its services [measured: 6].
 const FILES_PER_WORKER: u64 = 12;
-/// Memory maps of any process: CPython with MuJoCo takes most [measured: 400].
+/// Memory maps of any process; CPython with MuJoCo needs most [measured: 400].
 const MAPS: u64 = 1_024;
-/// The same for each worker in the learner [measured: 4].
+/// Additional memory maps in the learner per worker [measured: 4].
 const MAPS_PER_WORKER: u64 = 12;
 /// Processes and threads besides workers and update: supervisor, learner, evaluator.
 const TASKS: u64 = 16;
-/// A worker, the thread that watches it, and the one that reads its commands [measured: 3].
+/// Tasks of a worker: itself, its watchdog thread, and the thread that reads commands [measured:
+/// 3].
 const TASKS_PER_WORKER: u64 = 4;
 
-/// Upper bounds, but for what depends on an environment that nobody has seen yet.
+/// Resources of a run. They are upper bounds, except for the parts that depend on an environment
+/// whose spec is still unknown.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) struct Need {
-    /// Rollout processes,
+    /// Workers of the run itself.
     pub(crate) workers: u64,
-    /// and those that may join.
+    /// Workers that may join.
     pub(crate) joined: u64,
-    /// Those of other hosts.
+    /// Workers of other hosts.
     pub(crate) remote: u64,
-    /// Shared memory of all processes together [bytes]; 0 where one process does everything.
+    /// Shared memory of all processes [bytes]; 0 for a run in one process.
     pub(crate) shared_memory_bytes: u64,
-    /// Replay at the end of the run [bytes].
+    /// Size of the replay at the end of the run [bytes].
     pub(crate) replay_bytes: u64,
-    /// Open files of the process that has most.
+    /// Open files of the process with the most.
     pub(crate) open_files: u64,
-    /// Memory maps of the process that has most.
+    /// Memory maps of the process with the most.
     pub(crate) maps: u64,
-    /// Processes and threads together.
+    /// Processes and threads in total.
     pub(crate) tasks: u64,
 }
 
 impl Need {
-    /// - `config`: resolved.
-    /// - `spec`: the environment; the smallest that there is, when it is not known.
+    /// Computes the resources of a run.
+    ///
+    /// - `config`: the resolved configuration.
+    /// - `spec`: the environment, or `None` to assume the smallest one.
     pub(crate) fn of(config: &ExperimentConfig, spec: Option<&EnvSpec>) -> Self {
-        // What does not fit the configuration is refused elsewhere, by name.
+        // An environment that contradicts the configuration is rejected elsewhere, with a specific
+        // error.
         let policy = spec.and_then(|spec| Policy::new(config, spec).ok());
         let smallest = SegmentLayout {
             segment_steps: config.policy.decision_steps(),
@@ -72,7 +77,7 @@ impl Need {
     }
 }
 
-/// The replay takes its memory as it fills: no more than the run has steps.
+/// The replay allocates memory as it fills, so at most for the run's number of steps.
 fn replay_bytes(config: &ExperimentConfig, layout: SegmentLayout) -> u64 {
     if config.algorithm.name == AlgorithmName::Ndp {
         return 0;

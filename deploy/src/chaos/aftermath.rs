@@ -1,4 +1,5 @@
-//! What a run leaves when it has been stopped: its last checkpoint, its metrics, and nothing else.
+//! Checks the state that a stopped run leaves behind: its last checkpoint, its metrics, no
+//! leftovers.
 
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
@@ -16,12 +17,12 @@ use crate::journal::Standing;
 use crate::launch::members::of_session;
 use crate::roles::Setup;
 
-/// Processes of a run that has ended are gone by then.
+/// Time within which the processes of a finished run must be gone.
 const GONE: Duration = Duration::from_secs(10);
-/// Between two looks.
+/// Interval between checks.
 const LOOK: Duration = Duration::from_millis(20);
 
-/// Compares what is on disk with what the journals say (I1, I5, I9).
+/// Compares the files on disk with the journals (I1, I5, I9).
 pub(super) fn check_files(run: &Path, checker: &Checker, sums: &Sums) -> Violations {
     let mut violations = Violations::default();
     let checked = check_checkpoint(run, checker, &mut violations)
@@ -44,7 +45,7 @@ fn check_checkpoint(
     violations
         .extend(loaded.refused.iter().map(|why| format!("I5: a checkpoint is refused: {why}")));
     let (found, expected) = (Standing::from(&learner.counters), checker.standing());
-    // Updates are only in metrics.jsonl: the journal counts what came.
+    // Updates are only in metrics.jsonl: the journal counts segments.
     if (found.env_steps, found.segments) != (expected.env_steps, expected.segments) {
         violations.add(format!(
             "I5: the last checkpoint is of {found:?}, the last learner came to {expected:?}"
@@ -104,7 +105,7 @@ fn check_metrics(
             sums.rejected
         ));
     }
-    // Workers tell once a second, and take what they had not told to the grave.
+    // Workers report once per second; counts not yet reported die with them.
     let delivery = last.delivery;
     if delivery.produced > sums.produced || delivery.acked > sums.acknowledged {
         violations.add(format!("I9: metrics.jsonl counts more than the journals: {delivery:?}"));
@@ -112,7 +113,7 @@ fn check_metrics(
     Ok(())
 }
 
-/// Looks for what should be gone (I8): processes of the run, its shared memory, temporary files.
+/// Looks for leftovers of the run (I8): processes, shared memory, temporary files.
 pub(super) fn check_leftovers(
     run: &Path,
     run_id: &str,
@@ -139,7 +140,7 @@ pub(super) fn check_leftovers(
     Ok(violations)
 }
 
-/// Files and folders below a folder that are written aside before they get their name.
+/// Lists files and folders below a folder that still have their temporary names.
 fn temporaries(folder: &Path) -> Vec<PathBuf> {
     let entries = folder.read_dir().into_iter().flatten().flatten();
     let mut found = Vec::new();
@@ -175,7 +176,7 @@ mod tests {
             std::fs::write(run.join(name), "").unwrap();
         }
         assert_eq!(temporaries(run).len(), 4);
-        // Nobody has a session of this number: process ids are smaller.
+        // No process has a session with this id: process ids are smaller.
         let nobody = Pid::from_raw(i32::MAX).unwrap();
         let violations = check_leftovers(run, "no such run", nobody).unwrap();
         assert_eq!(violations.count(), 4);
@@ -204,7 +205,7 @@ mod tests {
         violations.into_sentences()
     }
 
-    /// A line as a learner writes it.
+    /// A line as the learner writes it.
     fn line(env_steps: u64, updates: u64) -> Value {
         let mut config = ExperimentConfig::default();
         config.actors.workers = 1;

@@ -1,4 +1,4 @@
-//! Reads the journals of a run while they are written, and removes those of the dead.
+//! Reads a run's journals while they are written, and removes those of dead processes.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::fs::{self, File};
@@ -10,24 +10,24 @@ use anyhow::Context;
 use super::violations::Violations;
 use crate::journal::{Author, RECORD_BYTES, Record};
 
-/// All journals of a folder. Together they take what was written since the last look and what the
-/// living have written so far: those of the dead are removed when they have been read.
+/// The journals in a folder. Those of dead processes are removed once they have been read, so that
+/// the folder only holds unread records and the journals of live processes.
 pub(super) struct Journals {
     folder: PathBuf,
     open: BTreeMap<Author, Tail>,
-    /// Kept, and read to their ends: the dead's.
+    /// Journals of dead processes that have been read completely but are kept.
     read: BTreeSet<Author>,
-    /// Nothing is removed any more: somebody will want to read it.
+    /// If true, no journal is removed, so that the user can read them.
     keep: bool,
 }
 
-/// A file that may grow.
+/// A journal that may grow.
 struct Tail {
     file: File,
-    /// Bytes of a record that is not whole yet.
+    /// Bytes of an incomplete record.
     rest: Vec<u8>,
     records: Vec<Record>,
-    /// Records that are none.
+    /// Number of invalid records.
     damaged: u64,
 }
 
@@ -62,15 +62,14 @@ impl Journals {
         self.keep = true;
     }
 
-    /// Hands on every record that was written since the last time: all of the workers', which come
-    /// before what the learners say of them.
+    /// Passes on all new records, first those of the workers, to which the learners' records refer.
     pub(super) fn fold(
         &mut self,
         violations: &mut Violations,
         mut each: impl FnMut(Author, &Record),
     ) -> anyhow::Result<()> {
-        // What a learner has inserted by now its workers have noted before: so theirs are read, and
-        // listed, afterwards.
+        // The workers logged the segments before the learner inserted them. So read the learners'
+        // journals first, and the workers' afterwards.
         let learners = self.read(|author| matches!(author, Author::Learner(_)))?;
         let workers = self.read(|author| matches!(author, Author::Worker(..)))?;
         for author in workers.into_iter().chain(learners) {
@@ -85,7 +84,7 @@ impl Journals {
         Ok(())
     }
 
-    /// Reads the journals of some authors; returns them in order.
+    /// Reads the journals of some authors; returns the authors in order.
     fn read(&mut self, whose: impl Fn(&Author) -> bool) -> anyhow::Result<Vec<Author>> {
         let failed = || format!("cannot read the journals in {}", self.folder.display());
         let mut authors = Vec::new();
@@ -95,8 +94,8 @@ impl Journals {
             authors.extend(author.filter(|author| !self.read.contains(author)));
         }
         authors.sort_unstable();
-        // The newest first: when a successor has written something, its predecessor is dead, and
-        // what is then read of that is all.
+        // In reverse order: if a successor's journal has records, its predecessor is dead, so the
+        // predecessor's journal is complete when it is read next.
         for author in authors.iter().rev() {
             let tail = match self.open.entry(*author) {
                 std::collections::btree_map::Entry::Occupied(open) => open.into_mut(),
@@ -109,8 +108,8 @@ impl Journals {
         Ok(authors)
     }
 
-    /// Closes those that have a successor, which was there before they were read for the last time;
-    /// removes them unless they are to be kept.
+    /// Closes journals whose successor existed before their last read, and removes them unless they
+    /// are to be kept.
     fn remove_read(&mut self) {
         let authors: Vec<Author> = self.open.keys().copied().collect();
         for pair in authors.windows(2) {
@@ -124,7 +123,7 @@ impl Journals {
                 if self.keep {
                     self.read.insert(pair[0]);
                 } else {
-                    // One that cannot be removed now goes with the folder.
+                    // On failure it is removed with the folder.
                     let _ = fs::remove_file(pair[0].path(&self.folder));
                 }
             }

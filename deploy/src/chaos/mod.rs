@@ -1,15 +1,15 @@
-//! `dmprl chaos`: a real run whose processes are killed and stopped by a seeded schedule, and a
-//! checker that reads what they noted.
+//! `dmprl chaos`: kills and suspends the processes of a real run by a seeded schedule, and checks
+//! their journals.
 //!
 //! ```text
 //!   schedule ─► nemesis ──SIGKILL, SIGSTOP──► train (subject) ─► workers, learner
 //!                  │                                                  │ journals
 //!                  ▼                                                  ▼
-//!               timeline ◄──────────── when who came back ──────── journals ─► checker ─► report
+//!               timeline ◄────────── recovery of processes ─────── journals ─► checker ─► report
 //! ```
-//! One loop in one thread, every few milliseconds: read what was noted, strike if it is time, look
-//! whether work goes on. At the end everybody is let go, all workers must make progress, the run is
-//! stopped as a user stops it, and what it leaves on disk is compared with what was noted.
+//! One loop in one thread reads the journals, injects due faults and checks progress, every few
+//! milliseconds. At the end suspended processes are resumed, all workers must make progress, the
+//! run is stopped as by a user, and its files are compared with the journals.
 
 mod aftermath;
 mod checker;
@@ -34,30 +34,31 @@ pub use report::Report;
 use subject::Subject;
 use trial::Trial;
 
-/// What is to be tried.
+/// Plan of a trial.
 pub struct TrialPlan {
-    /// The program that plays every part: this one.
+    /// Program of all processes: this one.
     pub program: PathBuf,
-    /// What is trained.
+    /// Task to train.
     pub task: String,
-    /// Worker processes.
+    /// Number of worker processes.
     pub workers: u32,
-    /// Of the schedule, and of the run.
+    /// Seed of the schedule and of the run.
     pub seed: u64,
-    /// How long the run is struck, at least.
+    /// Minimum duration of the fault injection.
     pub duration: Duration,
-    /// How many workers are killed, at least.
+    /// Minimum number of worker kills.
     pub worker_kills: u64,
-    /// How many learners are killed, at least.
+    /// Minimum number of learner kills.
     pub learner_kills: u64,
-    /// Where everything goes and stays; none: a temporary folder, kept if something did not hold.
+    /// Folder for all files, which is kept. `None` for a temporary folder, which is kept only if a
+    /// check fails.
     pub output: Option<PathBuf>,
 }
 
-/// Tries a run and judges it.
+/// Runs a trial and checks it.
 ///
 /// # Errors
-/// The trial itself was not possible; what did not hold is in the report.
+/// The trial itself failed. Violations are in the report, not errors.
 pub fn chaos(plan: &TrialPlan) -> anyhow::Result<Report> {
     let watch = Watch::start()?;
     let (folder, temporary) = match &plan.output {
@@ -79,7 +80,7 @@ pub fn chaos(plan: &TrialPlan) -> anyhow::Result<Report> {
     let mut report = match tried {
         Ok(report) => report,
         Err(error) => {
-            // What it left says why.
+            // The files show the reason.
             let _ = temporary.map(tempfile::TempDir::keep);
             return Err(error.context(format!("the trial failed; see {}", folder.display())));
         }

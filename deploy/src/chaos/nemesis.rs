@@ -1,5 +1,5 @@
-//! Strikes the run as its schedule says, one fault after the other, and never waits for long:
-//! whoever holds it calls it again and again.
+//! Injects the faults of the schedule into the run, one after the other, without blocking for long:
+//! the trial's loop calls it repeatedly.
 
 use std::path::PathBuf;
 use std::time::Duration;
@@ -10,30 +10,31 @@ use super::schedule::{Fault, Schedule, Strike};
 use super::timeline::Timeline;
 use crate::launch::members::{Member, Role, members};
 
-/// A strike waits so long for its victim to be there and at work [us]; then it takes what is there,
-/// or is left out.
+/// Time that a strike waits for a suitable victim [us]. Afterwards it takes any victim, or is
+/// skipped.
 const VICTIM_WAIT_US: u64 = 20_000_000;
-/// Between two looks for a checkpoint, and how many before other work is seen to again.
+/// Interval between checks for a checkpoint, and number of checks before control returns to the
+/// loop.
 const CHECKPOINT_LOOK: Duration = Duration::from_micros(200);
 const CHECKPOINT_LOOKS_MAX: usize = 100;
-/// Between two looks for a victim [us]: each reads all of /proc.
+/// Interval between checks for a victim [us]: each one reads all of /proc.
 const LOOK_US: u64 = 20_000;
 
-/// What was done.
+/// Faults injected so far.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub(super) struct Done {
     pub(super) worker_kills: u64,
     pub(super) learner_kills: u64,
     pub(super) evaluator_kills: u64,
     pub(super) stops: u64,
-    /// Learners killed while they were starting, and while they wrote a checkpoint.
+    /// Learners killed during their start, and while writing a checkpoint.
     pub(super) learner_kills_in_recovery: u64,
     pub(super) learner_kills_in_checkpoint: u64,
-    /// Strikes that found nobody.
+    /// Strikes skipped for lack of a victim.
     pub(super) left_out: u64,
 }
 
-/// Where a strike is.
+/// Progress of a strike.
 #[derive(Debug, Clone, Copy)]
 enum Stage {
     Pause {
@@ -43,7 +44,7 @@ enum Stage {
         deadline_us: u64,
         look_us: u64,
     },
-    /// The successor of a learner is to be killed so long after it was first seen.
+    /// The successor of a killed learner is to be killed a given time after it first appeared.
     Again {
         deaths: u64,
         seen_us: Option<u64>,
@@ -53,21 +54,21 @@ enum Stage {
         member: Member,
         until_us: u64,
     },
-    /// Since the last fault is mended.
+    /// No fault for a while after the recovery from the last one.
     Rest {
         for_us: u64,
         deadline_us: u64,
     },
 }
 
-/// The one who strikes.
+/// Injects the faults.
 pub(super) struct Nemesis {
     schedule: Schedule,
     supervisor: Pid,
     checkpoints: PathBuf,
     strike: Strike,
     stage: Stage,
-    /// Half-written checkpoints that nobody writes any more.
+    /// Incomplete checkpoints of dead learners.
     left_behind: Vec<String>,
     pub(super) done: Done,
 }
@@ -80,7 +81,7 @@ impl Nemesis {
         Self { schedule, supervisor, checkpoints, strike, stage, left_behind, done }
     }
 
-    /// Does what is due.
+    /// Performs the due actions.
     pub(super) fn step(&mut self, now_us: u64, timeline: &mut Timeline) -> anyhow::Result<()> {
         match self.stage {
             Stage::Pause { until_us } if now_us >= until_us => {
@@ -118,7 +119,7 @@ impl Nemesis {
         Ok(())
     }
 
-    /// Strikes no more, and lets go of whom it holds.
+    /// Stops the injection and resumes a suspended process.
     pub(super) fn relent(&mut self, now_us: u64, timeline: &mut Timeline) {
         if let Stage::Held { member, .. } = self.stage {
             self.let_go(&member, now_us, timeline);
@@ -133,11 +134,11 @@ impl Nemesis {
         }
     }
 
-    /// Tries to strike; false if it is not the moment.
+    /// Tries to inject the fault; returns false if it is not the right moment.
     fn strike(&mut self, now_us: u64, late: bool, timeline: &mut Timeline) -> anyhow::Result<bool> {
         let fault = self.strike.fault;
-        // Two faults of the learner follow each other only where that is the fault. Its absence is
-        // seen here before the costly look at /proc.
+        // Two faults of the learner follow each other only if that is the fault itself. Check for
+        // its absence here, before the expensive scan of /proc.
         let of_learner = matches!(
             fault,
             Fault::KillLearner
@@ -149,7 +150,7 @@ impl Nemesis {
             return Ok(false);
         }
         let members = members(self.supervisor)?;
-        // Looked for with the victim in hand, as a checkpoint is written in milliseconds.
+        // Checked after the victim has been found, because a checkpoint takes only milliseconds.
         if fault == Fault::KillLearnerInCheckpoint && !late && !self.catch_checkpoint() {
             return Ok(false);
         }
@@ -169,7 +170,7 @@ impl Nemesis {
             Fault::KillLearner | Fault::KillLearnerInCheckpoint => {
                 let killed = self.kill_learner(&members, now_us, timeline).is_some();
                 if killed && fault == Fault::KillLearnerInCheckpoint && !late {
-                    // What it was writing is still there, unfinished.
+                    // Its incomplete checkpoint is still there.
                     self.done.learner_kills_in_checkpoint += u64::from(self.checkpoint_under_way());
                 }
                 killed && self.over(now_us)
@@ -238,9 +239,9 @@ impl Nemesis {
         Ok(())
     }
 
-    /// Waits a little for the learner to begin a checkpoint.
+    /// Waits briefly for the learner to begin a checkpoint.
     fn catch_checkpoint(&mut self) -> bool {
-        // A learner that was killed in one has left it behind.
+        // A learner that was killed while writing a checkpoint has left it behind.
         self.left_behind = self.half_written();
         (0..CHECKPOINT_LOOKS_MAX).any(|_| {
             std::thread::sleep(CHECKPOINT_LOOK);
@@ -248,7 +249,7 @@ impl Nemesis {
         })
     }
 
-    /// Whether the learner is writing a checkpoint, or was when it died.
+    /// Returns true if the learner is writing a checkpoint, or was when it died.
     fn checkpoint_under_way(&self) -> bool {
         self.half_written().iter().any(|name| !self.left_behind.contains(name))
     }
@@ -277,7 +278,7 @@ impl Nemesis {
         true
     }
 
-    /// Returns the deaths of learners before it.
+    /// Kills the learner; returns the number of learner deaths before it.
     fn kill_learner(
         &mut self,
         members: &[Member],
@@ -306,7 +307,7 @@ impl Nemesis {
     }
 
     fn let_go(&mut self, member: &Member, now_us: u64, timeline: &mut Timeline) {
-        // Nobody else kills it, so it is there.
+        // Only this trial kills it, so it still exists.
         let _ = member.signal(Signal::CONT);
         stopped(member, now_us, timeline);
     }
@@ -320,7 +321,8 @@ fn is_learner(member: &Member) -> bool {
     matches!(member.role, Role::Learner(_))
 }
 
-/// Until when it is stopped: what it had sent before says nothing of its being back.
+/// Records that a process was suspended until `until_us`: segments sent earlier do not prove its
+/// return.
 fn stopped(member: &Member, until_us: u64, timeline: &mut Timeline) {
     match member.role {
         Role::Worker(index, _) => timeline.worker_stopped(index, until_us),

@@ -1,4 +1,4 @@
-//! What a trial has shown, as JSON and as text.
+//! The report of a trial, as JSON and as text.
 
 use serde_json::{Value, json};
 
@@ -6,11 +6,11 @@ use super::checker::Sums;
 use super::nemesis::Done;
 use super::samples::{Samples, median};
 
-/// The outcome of a trial.
+/// Result of a trial.
 pub struct Report {
     pub(super) seed: u64,
     pub(super) workers: u32,
-    /// From the first strike to the last [s].
+    /// Time from the first to the last strike [s].
     pub(super) seconds: f64,
     pub(super) interrupted: bool,
     pub(super) done: Done,
@@ -20,34 +20,34 @@ pub struct Report {
     pub(super) checkpoints: u64,
     pub(super) worker_back_s: Vec<f64>,
     pub(super) learner_back_s: Vec<f64>,
-    /// Segments of each worker while nothing was broken, and for how long [s].
+    /// Segments of each worker while no fault was active, and the duration of that time [s].
     pub(super) undisturbed: Vec<u64>,
     pub(super) undisturbed_s: f64,
     pub(super) samples: Samples,
-    /// Where everything lies, if it is kept.
+    /// Path of the kept files, if any.
     pub(super) kept: Option<String>,
 }
 
 impl Report {
-    /// Whether everything held.
+    /// Returns true if there was no violation.
     #[must_use]
     pub fn is_sound(&self) -> bool {
         self.violations.is_empty()
     }
 
-    /// Whether the user ended it.
+    /// Returns true if the user ended the trial.
     #[must_use]
     pub fn is_interrupted(&self) -> bool {
         self.interrupted
     }
 
-    /// The most segments of a worker over the fewest, while nothing was broken.
+    /// Most over fewest segments of a worker while no fault was active.
     fn fairness(&self) -> Option<f64> {
         let (most, fewest) = (self.undisturbed.iter().max()?, self.undisturbed.iter().min()?);
         (*fewest > 0).then(|| *most as f64 / *fewest as f64)
     }
 
-    /// One object.
+    /// The report as one JSON object.
     #[must_use]
     pub fn json(&self) -> Value {
         let Sums { produced, inserted, rejected, in_flight, lost, duplicate, acknowledged } =
@@ -88,7 +88,7 @@ impl Report {
         object
     }
 
-    /// A few lines.
+    /// The report as text for people.
     #[must_use]
     pub fn text(&self) -> String {
         let Sums { produced, inserted, rejected, in_flight, lost, duplicate, .. } = self.sums;

@@ -1,4 +1,4 @@
-//! What the run holds as time goes by: memory, files, maps, shared memory.
+//! Samples the run's resources over time: memory, files, maps, shared memory.
 
 use std::fs;
 use std::os::unix::fs::MetadataExt;
@@ -10,17 +10,17 @@ use serde_json::{Value, json};
 use crate::launch::Place;
 use crate::launch::members::holdings;
 
-/// Between two samples [us].
+/// Interval between two samples [us].
 const INTERVAL_US: u64 = 1_000_000;
-/// With fewer there is no telling what grows.
+/// Minimum number of samples to judge growth.
 const SAMPLES_MIN: usize = 9;
 
-/// Numbers in the order in which they were taken; four hours are 14 400.
+/// Values in the order of sampling; four hours have 14 400.
 #[derive(Debug, Clone, Default)]
 struct Series(Vec<f64>);
 
 impl Series {
-    /// Median of the last third over that of the first.
+    /// Median of the last third divided by the median of the first.
     fn ratio(&self) -> Option<f64> {
         let third = self.0.len() / 3;
         if self.0.len() < SAMPLES_MIN {
@@ -37,14 +37,14 @@ impl Series {
     }
 }
 
-/// The middle of some numbers.
+/// The middle value; the upper of two.
 pub(super) fn median(numbers: &[f64]) -> Option<f64> {
     let mut sorted = numbers.to_vec();
     sorted.sort_by(f64::total_cmp);
     sorted.get(sorted.len() / 2).copied()
 }
 
-/// One kind of process.
+/// Samples of one kind of process.
 #[derive(Debug, Clone, Default)]
 struct Kind {
     rss: Series,
@@ -67,7 +67,7 @@ impl Kind {
     }
 }
 
-/// All of it.
+/// Samples of supervisor, learner and shared memory.
 #[derive(Debug, Clone)]
 pub(super) struct Samples {
     run_id: String,
@@ -83,12 +83,13 @@ impl Samples {
         Self { run_id, next_us: 0, supervisor, learner, shm: Series::default() }
     }
 
-    /// Whether it is time for the next.
+    /// Returns true if the next sample is due.
     pub(super) fn is_due(&self, now_us: u64) -> bool {
         now_us >= self.next_us
     }
 
-    /// Takes one: of the learner and its shared memory where one is at work whose replay is full.
+    /// Takes a sample. `learner` is `None` unless a learner is working and its replay is full; then
+    /// shared memory is sampled too.
     pub(super) fn take(&mut self, now_us: u64, supervisor: Pid, learner: Option<Pid>) {
         self.next_us = now_us + INTERVAL_US;
         self.supervisor.add(supervisor);
@@ -99,7 +100,7 @@ impl Samples {
         }
     }
 
-    /// The larger of supervisor's and learner's ratio, as both must not grow.
+    /// The larger of the supervisor's and the learner's ratio, since neither may grow.
     pub(super) fn ratios(&self) -> [(&'static str, Option<f64>); 4] {
         let larger = |of: fn(&Kind) -> &Series| {
             let both = [of(&self.supervisor).ratio(), of(&self.learner).ratio()];
@@ -119,7 +120,7 @@ impl Samples {
     }
 }
 
-/// What lies in shared memory for a run.
+/// Lists the shared memory of a run.
 pub(super) fn shared_memory(run_id: &str) -> Vec<PathBuf> {
     let (folder, _) = Place::new().standard();
     let entries = fs::read_dir(folder).into_iter().flatten().flatten();
@@ -127,7 +128,7 @@ pub(super) fn shared_memory(run_id: &str) -> Vec<PathBuf> {
     entries.map(|entry| entry.path()).filter(named).collect()
 }
 
-/// Bytes that a folder takes. What goes away meanwhile counts for nothing.
+/// Size of a folder in bytes. Files that disappear meanwhile do not count.
 fn bytes(path: &Path) -> u64 {
     let Ok(metadata) = path.symlink_metadata() else { return 0 };
     if !metadata.is_dir() {

@@ -1,56 +1,56 @@
-//! Which fault, when, and whom it strikes: all of it from the seed.
+//! Generates a schedule of faults, times and victims from a seed.
 
 use dmprl_shared::seeds::{self, Stream};
 use rand::RngExt;
 use rand::seq::SliceRandom;
 
-/// Between two strikes, at least and at most [ms].
+/// Minimum and maximum pause between two strikes [ms].
 const PAUSE_MS: (u64, u64) = (300, 1_500);
-/// How long a process is stopped [ms].
+/// Minimum and maximum time for which a process is suspended [ms].
 const STOP_MS: (u64, u64) = (200, 2_000);
-/// A learner that has just started is killed again after so long [ms].
+/// Minimum and maximum delay after which a newly started learner is killed again [ms].
 const AGAIN_MS: (u64, u64) = (0, 600);
-/// Nobody is struck for so long, so that undisturbed work can be looked at [ms].
+/// Time without faults, in which undisturbed work is measured [ms].
 const REST_MS: u64 = 4_000;
 
-/// What is done to the run.
+/// A fault to inject.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Fault {
-    /// SIGKILL to a worker; `early`: also to one that has only just started.
+    /// SIGKILL to a worker.
     KillWorker {
-        /// Which.
+        /// Index of the worker.
         worker: u32,
-        /// Whether it may still be starting.
+        /// True if it may still be starting.
         early: bool,
     },
     /// SIGKILL to all workers at once.
     KillWorkers,
     /// SIGKILL to the learner.
     KillLearner,
-    /// The same, and again while its successor starts.
+    /// SIGKILL to the learner, and again while its successor starts.
     KillLearnerTwice {
-        /// After the successor's start.
+        /// Delay after the successor's start.
         after_ms: u64,
     },
-    /// SIGKILL to the learner while a checkpoint is being written.
+    /// SIGKILL to the learner while it writes a checkpoint.
     KillLearnerInCheckpoint,
     /// SIGSTOP to a worker, then SIGCONT.
     StopWorker {
-        /// Which.
+        /// Index of the worker.
         worker: u32,
-        /// Between the two.
+        /// Time between the two signals.
         for_ms: u64,
     },
     /// SIGSTOP to the learner, then SIGCONT.
     StopLearner {
-        /// Between the two.
+        /// Time between the two signals.
         for_ms: u64,
     },
     /// SIGKILL to the evaluator.
     KillEvaluator,
-    /// Nothing.
+    /// No fault.
     Rest {
-        /// Since the last fault is mended.
+        /// Duration after the recovery from the last fault.
         for_ms: u64,
     },
 }
@@ -62,12 +62,12 @@ pub(super) struct Strike {
     pub(super) fault: Fault,
 }
 
-/// Strikes without end, in rounds that hold every kind of fault in a random order.
+/// Endless sequence of strikes, in rounds that contain every kind of fault in random order.
 #[derive(Debug)]
 pub(super) struct Schedule {
     random: Stream,
     workers: u32,
-    /// What is left of a round.
+    /// The remaining faults of the current round.
     round: Vec<Kind>,
 }
 
@@ -84,7 +84,7 @@ enum Kind {
     Rest,
 }
 
-/// A round: about ten workers are killed for each learner.
+/// Faults of a round: about ten workers are killed for each learner.
 const ROUND: [(Kind, usize); 10] = [
     (Kind::Worker { early: false }, 22),
     (Kind::Worker { early: true }, 8),
@@ -123,7 +123,7 @@ impl Iterator for Schedule {
 
     fn next(&mut self) -> Option<Strike> {
         let kind = self.kind();
-        // Drawn whether the fault needs them or not: a strike is always as many numbers.
+        // Always draws the same number of values, whether or not the fault needs them.
         let (pause_ms, worker) =
             (self.between(PAUSE_MS), self.random.random_range(0..self.workers));
         let (stop_ms, after_ms) = (self.between(STOP_MS), self.between(AGAIN_MS));

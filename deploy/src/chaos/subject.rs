@@ -1,4 +1,4 @@
-//! The run that is struck: a real `dmprl train`, with keys that make much happen in little time.
+//! The run under test: a real `dmprl train`, configured for many events in a short time.
 
 use std::path::{Path, PathBuf};
 use std::process::Command;
@@ -9,18 +9,20 @@ use rustix::process::Pid;
 use super::TrialPlan;
 use crate::launch::WholeRun;
 
-/// Environment steps between two checkpoints, of which there is then about one a second.
+/// Environment steps between two checkpoints; results in about one per second.
 pub(super) const CHECKPOINT_INTERVAL: u64 = 10_000;
-/// Environment steps that the replay holds: soon full, so that its memory grows no more.
+/// Capacity of the replay in environment steps. It fills quickly, after which its memory is
+/// constant.
 pub(super) const REPLAY_STEPS: u64 = 30_000;
-/// Long beyond any trial.
+/// More steps than any trial reaches.
 const STEPS: &str = "1000000000000";
-/// The longest pause before a restart: what is killed on purpose need not be spared.
+/// Maximum pause before a restart. It is short, because the processes are killed on purpose.
 const RESTART_PAUSE_MAX_MS: u32 = 100;
 
-/// Small networks and few updates: the processes are tried, not what they learn. Outboxes so small
-/// that workers soon forget what is acknowledged, and large enough that a learner's death finds
-/// them with segments whose acknowledgement they have not heard, which come twice then.
+/// Configuration of the run. Networks are small and updates few, because the test is about
+/// processes. The outboxes are small enough that workers soon drop acknowledged segments, but large
+/// enough that a learner's death leaves segments whose acknowledgement has not arrived, and which
+/// are then retransmitted.
 fn keys() -> Vec<String> {
     let mut keys: Vec<String> = [
         "delivery.level=log",
@@ -34,7 +36,7 @@ fn keys() -> Vec<String> {
         "evaluation.interval_steps=50000",
         "metrics.interval_steps=5000",
         "actors.restarts_max=1000000",
-        // The checker knows every worker there may be.
+        // The checker needs to know every worker.
         "actors.joined_max=0",
         "supervision.learner_restarts_max=1000000",
     ]
@@ -45,7 +47,7 @@ fn keys() -> Vec<String> {
     keys
 }
 
-/// A running `dmprl train`, and where it lies.
+/// A running `dmprl train` and its paths.
 pub(super) struct Subject {
     train: WholeRun,
     pub(super) run: PathBuf,
@@ -53,7 +55,7 @@ pub(super) struct Subject {
 }
 
 impl Subject {
-    /// Starts it in a folder.
+    /// Starts the run in a folder.
     pub(super) fn start(plan: &TrialPlan, folder: &Path) -> anyhow::Result<Self> {
         let (run, journal) = (folder.join("run"), folder.join("journal"));
         std::fs::create_dir(&journal)
@@ -71,17 +73,17 @@ impl Subject {
         Ok(Self { train, run, journal })
     }
 
-    /// The supervisor.
+    /// Process id of the supervisor.
     pub(super) fn pid(&self) -> anyhow::Result<Pid> {
         self.train.pid()
     }
 
-    /// How it has ended by itself, if it has.
+    /// Returns how the run ended by itself, if it has.
     pub(super) fn end(&mut self) -> anyhow::Result<Option<String>> {
         self.train.end()
     }
 
-    /// Stops it as Ctrl-C does; returns what was wrong about its end.
+    /// Stops the run like Ctrl-C; returns an error description if it did not end properly.
     pub(super) fn stop(&mut self) -> anyhow::Result<Option<String>> {
         self.train.stop()
     }

@@ -1,51 +1,52 @@
-//! Which faults are not mended yet, how long mending took, and whether work goes on meanwhile.
+//! Tracks active faults, recovery times, and progress.
 
 use std::collections::BTreeSet;
 
 use super::violations::Violations;
 use crate::journal::{Author, Entry, Record};
 
-/// With all at work nobody is without a segment for so long [us] (I7).
+/// Maximum time without any segment while all processes are working [us] (I7).
 const SILENCE_MAX_US: u64 = 15_000_000;
-/// A worker or learner that was killed or stopped is back by then [us], however busy the machine.
+/// Time limit for the return of a killed or suspended worker or learner [us], even on a busy
+/// machine.
 const BACK_MAX_US: u64 = 90_000_000;
-/// Undisturbed work counts from so long after the last fault is mended [us].
+/// Time after the last recovery from which work counts as undisturbed [us].
 const SETTLE_US: u64 = 500_000;
 
-/// A fault that is not mended.
+/// A fault from which the run has not recovered yet.
 #[derive(Debug, Clone, Copy)]
 struct Fault {
     since_us: u64,
-    /// Whether it is a death, and nothing else was broken since.
+    /// True if it is a death, and no other fault has occurred since.
     measured: bool,
-    /// A word was said about it.
+    /// True if a violation has been reported for it.
     told: bool,
 }
 
 #[derive(Debug, Default)]
 struct Worker {
     fault: Option<Fault>,
-    /// The newest that was seen, and the newest that was killed.
+    /// The newest incarnation seen, and the incarnations that were killed.
     incarnation: Option<u32>,
     killed: BTreeSet<u32>,
-    /// Segments inserted, all in all, and in undisturbed time.
+    /// Segments inserted in total, and in undisturbed time.
     inserted: u64,
     undisturbed: u64,
 }
 
-/// The state of repair of a run.
+/// Faults and recovery of a run.
 pub(super) struct Timeline {
     workers: Vec<Worker>,
     learner_fault: Option<Fault>,
     learner: Option<u64>,
     learners_killed: BTreeSet<u64>,
-    /// The learner has read its log.
+    /// True once the learner has read its log.
     serving: bool,
-    /// Since when all are at work.
+    /// Time since which all processes are working.
     clear_since_us: Option<u64>,
     inserted_us: u64,
     silence_told: bool,
-    /// From death to the first segment [s].
+    /// Times from a death to the first segment [s].
     pub(super) worker_back_s: Vec<f64>,
     pub(super) learner_back_s: Vec<f64>,
     /// Undisturbed time so far [us].
@@ -54,7 +55,7 @@ pub(super) struct Timeline {
 }
 
 impl Timeline {
-    /// Everybody is missing until the first segment of each.
+    /// Creates the timeline. Each process counts as missing until its first segment.
     pub(super) fn new(workers: u32, now_us: u64) -> Self {
         let missing = Fault { since_us: now_us, measured: false, told: false };
         let worker = || Worker { fault: Some(missing), ..Worker::default() };
@@ -74,34 +75,34 @@ impl Timeline {
         }
     }
 
-    /// Whether a worker is at work, as far as is known.
+    /// Returns true if a worker is working, as far as known.
     pub(super) fn is_back(&self, worker: u32) -> bool {
         self.workers.get(worker as usize).is_some_and(|worker| worker.fault.is_none())
     }
 
-    /// Whether the learner is.
+    /// Returns true if the learner is working.
     pub(super) fn is_learner_back(&self) -> bool {
         self.learner_fault.is_none()
     }
 
-    /// Since when all are at work; none if somebody is not.
+    /// Time since which all processes are working; `None` if one is not.
     pub(super) fn clear_since_us(&self) -> Option<u64> {
         self.clear_since_us
     }
 
-    /// Segments of each worker so far.
+    /// Number of segments of each worker so far.
     pub(super) fn inserted(&self) -> Vec<u64> {
         self.workers.iter().map(|worker| worker.inserted).collect()
     }
 
-    /// Segments of each worker in undisturbed time.
+    /// Number of segments of each worker in undisturbed time.
     pub(super) fn undisturbed(&self) -> Vec<u64> {
         self.workers.iter().map(|worker| worker.undisturbed).collect()
     }
 
-    /// A worker is killed.
+    /// Records that a worker is killed.
     pub(super) fn worker_killed(&mut self, worker: u32, incarnation: u32, now_us: u64) {
-        // Its return depends on the learner's then.
+        // Otherwise its return would also depend on the learner's.
         let measured = self.learner_fault.is_none();
         let Some(worker) = self.workers.get_mut(worker as usize) else { return };
         worker.killed.insert(incarnation);
@@ -109,14 +110,14 @@ impl Timeline {
         self.disturb(now_us);
     }
 
-    /// The learner is killed.
+    /// Records that the learner is killed.
     pub(super) fn learner_killed(&mut self, deaths: u64, now_us: u64) {
         self.learners_killed.insert(deaths);
         self.serving = false;
         self.break_learner(Fault { since_us: now_us, measured: true, told: false });
     }
 
-    /// A worker is stopped, or was until now.
+    /// Records that a worker is suspended, or was until now.
     pub(super) fn worker_stopped(&mut self, worker: u32, now_us: u64) {
         if let Some(worker) = self.workers.get_mut(worker as usize) {
             worker.fault = Some(Fault { since_us: now_us, measured: false, told: false });
@@ -124,7 +125,7 @@ impl Timeline {
         self.disturb(now_us);
     }
 
-    /// The learner is stopped, or was until now.
+    /// Records that the learner is suspended, or was until now.
     pub(super) fn learner_stopped(&mut self, now_us: u64) {
         self.break_learner(Fault { since_us: now_us, measured: false, told: false });
     }
@@ -143,7 +144,7 @@ impl Timeline {
         }
     }
 
-    /// Takes a record of a journal.
+    /// Processes a journal record.
     pub(super) fn take(&mut self, author: Author, record: &Record) {
         self.meet(author);
         match (author, record.entry) {
@@ -161,7 +162,7 @@ impl Timeline {
         }
     }
 
-    /// Notices that a process has replaced another, which somebody must have killed.
+    /// Notices a new process, whose predecessor must have been killed by the trial.
     fn meet(&mut self, author: Author) {
         match author {
             Author::Worker(index, incarnation) => {
@@ -170,7 +171,7 @@ impl Timeline {
                 let dead = before.map_or(0..0, |before| before..incarnation);
                 for dead in dead.filter(|dead| !worker.killed.contains(dead)) {
                     self.violations.add(format!(
-                        "I7: worker {index}, incarnation {dead}, has ended and nobody killed it"
+                        "I7: worker {index}, incarnation {dead}, has ended without being killed"
                     ));
                 }
             }
@@ -179,7 +180,7 @@ impl Timeline {
                 let dead = before.map_or(0..0, |before| before..deaths);
                 for dead in dead.filter(|dead| !self.learners_killed.contains(dead)) {
                     self.violations.add(format!(
-                        "I7: the learner after {dead} deaths has ended and nobody killed it"
+                        "I7: the learner after {dead} deaths has ended without being killed"
                     ));
                 }
             }
@@ -214,14 +215,14 @@ impl Timeline {
         }
     }
 
-    /// Looks whether somebody is away, or all are silent, for too long.
+    /// Checks whether a process has been missing, or all have been silent, for too long.
     pub(super) fn look(&mut self, now_us: u64) {
         let silence = now_us.saturating_sub(self.inserted_us);
         if self.clear_since_us.is_some() && silence > SILENCE_MAX_US && !self.silence_told {
             self.silence_told = true;
             let seconds = silence as f64 / 1e6;
             self.violations
-                .add(format!("I7: nothing was inserted for {seconds:.0} s with all at work"));
+                .add(format!("I7: nothing was inserted for {seconds:.0} s without a fault"));
         }
         let workers = self.workers.iter_mut().enumerate();
         let faults = workers
@@ -237,7 +238,7 @@ impl Timeline {
         }
     }
 
-    /// The run is to stop: what is undisturbed ends here.
+    /// Ends the undisturbed time, before the run is stopped.
     pub(super) fn close(&mut self, now_us: u64) {
         self.disturb(now_us);
     }
@@ -264,7 +265,7 @@ mod tests {
         timeline.take(Author::Learner(deaths), &record);
     }
 
-    /// Two workers and a learner at work since the first second.
+    /// Two workers and a learner, which have been working since the first second.
     fn at_work() -> Timeline {
         let mut timeline = Timeline::new(2, 0);
         serves(&mut timeline, 0);
@@ -283,7 +284,7 @@ mod tests {
     fn a_killed_worker_is_back_with_its_successors_first_segment() {
         let mut timeline = at_work();
         timeline.worker_killed(1, 0, 2 * SECOND);
-        // What it had sent before its death.
+        // A segment sent before its death.
         inserts(&mut timeline, 1, 0, 3 * SECOND);
         assert!(!timeline.is_back(1) && timeline.clear_since_us().is_none());
         inserts(&mut timeline, 1, 1, 4 * SECOND);
@@ -292,7 +293,7 @@ mod tests {
         assert_eq!(timeline.undisturbed_us, SECOND - SETTLE_US);
     }
 
-    /// What it reads from its log is no sign that workers reach it.
+    /// Segments from its log do not prove that workers reach it.
     #[test]
     fn a_killed_learner_is_back_with_a_segment_from_a_worker() {
         let mut timeline = at_work();

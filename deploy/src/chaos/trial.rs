@@ -1,4 +1,4 @@
-//! The loop: starting, striking, healing, stopping.
+//! The loop of a trial: start, inject faults, wait for recovery, stop.
 
 use std::path::Path;
 use std::time::Duration;
@@ -22,29 +22,29 @@ use crate::launch::members::{Member, Role, members};
 use crate::run_directory::RunDirectory;
 use crate::terminal::TrialProgress;
 
-/// From the start to the first segment of every worker [us].
+/// Time limit from the start to the first segment of every worker [us].
 const START_US: u64 = 120_000_000;
-/// From the last strike until every worker has made progress [us].
+/// Time limit from the last strike until every worker has made progress [us].
 const HEAL_US: u64 = 120_000_000;
-/// Progress: so many segments of each worker.
+/// Progress required for recovery: segments of each worker.
 const HEAL_SEGMENTS: u64 = 50;
-/// Between two turns: records come by the thousand a second, and a checkpoint is written in some
-/// milliseconds.
+/// Interval between two turns. Thousands of records are written per second, and a checkpoint takes
+/// some milliseconds.
 const TURN: Duration = Duration::from_millis(4);
-/// Between two lines of progress [us].
+/// Interval between two lines of progress [us].
 const TELL_US: u64 = 1_000_000;
 
-/// How a trial goes on.
+/// Phase of a trial.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Phase {
     Starting,
     Striking,
     Healing,
-    /// Over: nothing more is to be waited for.
+    /// There is nothing more to wait for.
     Over,
 }
 
-/// A trial under way.
+/// A running trial.
 pub(super) struct Trial<'a> {
     plan: &'a TrialPlan,
     subject: Subject,
@@ -57,7 +57,7 @@ pub(super) struct Trial<'a> {
     phase: Phase,
     since_us: u64,
     struck_us: u64,
-    /// Segments of each worker when it was to heal.
+    /// Number of each worker's segments when the recovery began.
     before: Vec<u64>,
     interrupted: bool,
 }
@@ -104,8 +104,8 @@ impl<'a> Trial<'a> {
         self.conclude()
     }
 
-    /// Strikes no more. What was struck heals before the run is stopped: only a learner that lives
-    /// writes the last checkpoint, by which the rest is judged.
+    /// Stops the injection. The run must recover before it is stopped: only a live learner writes
+    /// the last checkpoint, with which everything is compared.
     fn relent(&mut self) {
         match self.phase {
             Phase::Starting => self.enter(Phase::Over),
@@ -118,13 +118,13 @@ impl<'a> Trial<'a> {
         }
     }
 
-    /// Reads, strikes, looks.
+    /// Reads journals, injects faults, checks progress.
     fn turn(&mut self) -> anyhow::Result<()> {
         if let Some(how) = self.subject.end()? {
             if self.phase == Phase::Starting {
-                bail!("dmprl train has ended before it was struck: {how}");
+                bail!("dmprl train exited before the first fault: {how}");
             }
-            self.violations.add(format!("I7: dmprl train has ended by itself: {how}"));
+            self.violations.add(format!("I7: dmprl train exited unexpectedly: {how}"));
             self.phase = Phase::Over;
             return Ok(());
         }
@@ -204,7 +204,8 @@ impl<'a> Trial<'a> {
         self.timeline.clear_since_us().is_some() && now.iter().zip(&self.before).all(grown)
     }
 
-    /// From when the replay is full, and a learner at work.
+    /// Samples resources while faults are injected; the learner's once its replay is full and it is
+    /// working.
     fn sample(&mut self, now: u64) -> anyhow::Result<()> {
         if self.phase != Phase::Striking {
             return Ok(());
@@ -233,7 +234,7 @@ impl<'a> Trial<'a> {
         let phase = match self.phase {
             Phase::Starting => "starting",
             Phase::Striking => "striking",
-            Phase::Healing => "letting it heal",
+            Phase::Healing => "recovering",
             Phase::Over => "stopping",
         };
         let violations = [&self.checker.violations, &self.timeline.violations, &self.violations];
@@ -246,7 +247,7 @@ impl<'a> Trial<'a> {
         )
     }
 
-    /// Stops the run, unless it is gone, and judges.
+    /// Stops the run, if it still exists, and checks it.
     fn conclude(mut self) -> anyhow::Result<Report> {
         if self.subject.end()?.is_none()
             && let Some(how) = self.subject.stop()?
@@ -257,7 +258,7 @@ impl<'a> Trial<'a> {
         let sums = self.checker.conclude();
         let run = self.subject.run.clone();
         let mut samples = self.samples.take();
-        // An interrupt before anything was there is no fault of the run.
+        // If interrupted before the first segment, missing files are no violation.
         if self.checker.standing().segments > 0 {
             self.violations
                 .extend(aftermath::check_files(&run, &self.checker, &sums).into_sentences());

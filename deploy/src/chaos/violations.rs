@@ -1,9 +1,9 @@
-//! What did not hold, in sentences that begin with the invariant's name.
+//! Violations, as sentences that begin with the invariant's name.
 
-/// So many are kept word for word; one fault often brings thousands.
+/// Maximum number of stored sentences; one fault can cause thousands.
 const KEPT_MAX: usize = 50;
 
-/// A bounded list of sentences.
+/// A bounded list of violations.
 #[derive(Debug, Clone, Default)]
 pub(super) struct Violations {
     kept: Vec<String>,
@@ -11,7 +11,7 @@ pub(super) struct Violations {
 }
 
 impl Violations {
-    /// Adds one.
+    /// Adds a violation.
     pub(super) fn add(&mut self, violation: String) {
         if self.kept.len() < KEPT_MAX {
             self.kept.push(violation);
@@ -20,22 +20,22 @@ impl Violations {
         }
     }
 
-    /// Adds those of another list.
+    /// Adds the violations of another list.
     pub(super) fn extend(&mut self, others: impl IntoIterator<Item = String>) {
         others.into_iter().for_each(|violation| self.add(violation));
     }
 
-    /// Whether everything held.
+    /// Returns true if there are no violations.
     pub(super) fn is_empty(&self) -> bool {
         self.kept.is_empty()
     }
 
-    /// How many there are.
+    /// Number of violations, including those not stored.
     pub(super) fn count(&self) -> u64 {
         self.kept.len() as u64 + self.more
     }
 
-    /// All sentences, and one about those that are not kept.
+    /// All stored sentences, and one with the number of the others.
     pub(super) fn into_sentences(self) -> Vec<String> {
         let mut sentences = self.kept;
         if self.more > 0 {

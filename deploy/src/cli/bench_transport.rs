@@ -54,8 +54,8 @@ enum Level {
 #[derive(Debug, Args)]
 #[command(after_help = HELP)]
 pub(super) struct TransportArgs {
-    /// Sending processes [default: cores - 1]; with --connect 0 measures policies alone [default:
-    /// 1].
+    /// Sending processes [default: cores - 1, with --connect 1]; 0 with --connect sends none and
+    /// measures policies alone.
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(0..=64))]
     workers: Option<u32>,
     /// Delivery level of the shared-memory transport.

@@ -106,7 +106,7 @@ pub(super) fn make_absolute(config: &mut ExperimentConfig) -> anyhow::Result<()>
 pub(super) fn paths(flag: &str, paths: &[PathBuf]) -> anyhow::Result<Option<Value>> {
     let texts = paths.iter().map(|path| {
         let text = path.to_str().map(|text| Value::String(text.to_owned()));
-        text.ok_or_else(|| wrong_use(format!("{flag} {}: no UTF-8", path.display())))
+        text.ok_or_else(|| wrong_use(format!("{flag} {}: not UTF-8", path.display())))
     });
     let texts = texts.collect::<anyhow::Result<Vec<_>>>()?;
     Ok((!texts.is_empty()).then_some(Value::Array(texts)))
@@ -116,7 +116,7 @@ fn absolute_folder(path: &str) -> anyhow::Result<String> {
     let absolute = std::fs::canonicalize(path)
         .map_err(|error| wrong_use(format!("python path {path}: {error}")))?;
     if !absolute.is_dir() {
-        return Err(wrong_use(format!("python path {path} is no directory")));
+        return Err(wrong_use(format!("python path {path} is not a directory")));
     }
     text(absolute)
 }
@@ -132,7 +132,7 @@ fn absolute_file(path: &str) -> anyhow::Result<String> {
 
 fn text(absolute: PathBuf) -> anyhow::Result<String> {
     let shown = absolute.display().to_string();
-    absolute.into_os_string().into_string().map_err(|_| wrong_use(format!("{shown}: no UTF-8")))
+    absolute.into_os_string().into_string().map_err(|_| wrong_use(format!("{shown}: not UTF-8")))
 }
 
 /// Collects environment variables. `DMPRL_` variables must be UTF-8; others that are not are
@@ -144,7 +144,7 @@ fn environment() -> anyhow::Result<Vec<(String, String)>> {
         match value.into_string() {
             Ok(value) => texts.push((name, value)),
             Err(_) if name.starts_with("DMPRL_") => {
-                return Err(wrong_use(format!("environment variable {name} is no UTF-8")));
+                return Err(wrong_use(format!("environment variable {name} is not UTF-8")));
             }
             Err(_) => {}
         }

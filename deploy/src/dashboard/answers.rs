@@ -1,4 +1,4 @@
-//! What is answered, as JSON: made of the catalogue, without any HTTP.
+//! Builds the dashboard's JSON answers from the catalogue, independent of HTTP.
 
 use anyhow::Context;
 use serde::Serialize;
@@ -10,17 +10,17 @@ use super::watched::{Curves, Facts, Rows, State, Watched};
 use super::{configuration, episode, videos};
 use crate::plots::{colour, has_colour};
 
-/// Curves in one request: a page has a dozen.
+/// Maximum number of curves in one request; a page has a dozen.
 const CURVES_MAX: usize = 64;
-/// Evaluations in a table, the newest.
+/// Maximum number of evaluations in a table; the newest are kept.
 const EVALUATIONS_MAX: usize = 50;
 
-/// Why a request gets no answer.
+/// Reason for which a request is rejected.
 #[derive(Debug)]
 pub enum Refusal {
-    /// What it names is not there.
+    /// The requested item does not exist.
     Missing(String),
-    /// It does not make sense.
+    /// The request is invalid.
     Senseless(String),
     /// A file cannot be read.
     Failed(anyhow::Error),
@@ -38,7 +38,7 @@ struct Listed<'r> {
     name: &'r str,
     #[serde(flatten)]
     facts: &'r Facts,
-    /// As `#rrggbb`, the method's.
+    /// Colour of the method, as `#rrggbb`.
     colour: String,
     state: State,
     env_steps: Option<f64>,
@@ -50,7 +50,7 @@ struct Listed<'r> {
     fault: Option<&'r str>,
 }
 
-/// Every run with where it stands.
+/// Lists all runs with their state.
 pub fn runs(catalogue: &mut Catalogue) -> Value {
     refresh(catalogue);
     let mut others: Vec<&str> = Vec::new();
@@ -74,7 +74,7 @@ pub fn runs(catalogue: &mut Catalogue) -> Value {
     })
 }
 
-/// Looks for runs, and at each.
+/// Looks for new runs, and refreshes all runs.
 pub fn refresh(catalogue: &mut Catalogue) {
     catalogue.walk();
     catalogue.runs.values_mut().for_each(Watched::refresh);
@@ -85,7 +85,7 @@ fn listed<'r>(name: &'r str, watched: &'r Watched, index: usize) -> Listed<'r> {
     let newest = watched.evaluations.last();
     let best = watched.evaluations.iter().map(|row| row.return_mean).max_by(f64::total_cmp);
     let method = watched.facts.method.as_str();
-    // A preset's runs are drawn as the method's others are; dashes tell them apart.
+    // A preset's runs have the colour of the method's other runs; dashes distinguish them.
     let plain = method.split_once(" (").map_or(method, |(plain, _)| plain);
     let colour = colour(index, if has_colour(method) { method } else { plain });
     Listed {
@@ -103,10 +103,10 @@ fn listed<'r>(name: &'r str, watched: &'r Watched, index: usize) -> Listed<'r> {
     }
 }
 
-/// New points of the curves `names`, separated by commas.
+/// Returns new points of the curves in `names`, separated by commas.
 ///
 /// # Errors
-/// There is no such run or file of rows, or too many curves are asked for.
+/// The run or the file of rows does not exist, or too many curves are requested.
 pub fn curves(
     catalogue: &mut Catalogue,
     (run, file): (&str, &str),
@@ -131,10 +131,10 @@ pub fn curves(
     Ok(find(catalogue, run)?.curves(rows, &names, since)?)
 }
 
-/// The newest evaluations of a run, newest first, with the return of each episode.
+/// Returns the newest evaluations of a run, newest first, with the return of each episode.
 ///
 /// # Errors
-/// There is no such run.
+/// The run does not exist.
 pub fn evaluations(catalogue: &mut Catalogue, run: &str) -> Result<Value, Refusal> {
     let watched = find(catalogue, run)?;
     watched.refresh();
@@ -156,27 +156,27 @@ pub fn evaluations(catalogue: &mut Catalogue, run: &str) -> Result<Value, Refusa
     Ok(json!({"first_seed": first_seed, "count": watched.evaluations.len(), "rows": rows}))
 }
 
-/// How the run's policy moved in one episode; null if nobody has looked.
+/// Returns the motion of the run's policy in one episode; null if it was never recorded.
 ///
 /// # Errors
-/// There is no such run, or its file cannot be read.
+/// The run does not exist, or its file cannot be read.
 pub fn motion(catalogue: &mut Catalogue, run: &str) -> Result<Value, Refusal> {
     Ok(episode::read(&find(catalogue, run)?.directory)?)
 }
 
-/// What was recorded of a run.
+/// Lists the videos of a run.
 ///
 /// # Errors
-/// There is no such run, or its folder cannot be read.
+/// The run does not exist, or its folder cannot be read.
 pub fn videos(catalogue: &mut Catalogue, run: &str) -> Result<Value, Refusal> {
     let found = videos::list(&find(catalogue, run)?.directory)?;
     Ok(json!({ "videos": found }))
 }
 
-/// The file of a video.
+/// Returns the path of a video.
 ///
 /// # Errors
-/// There is no such run, or it has no such video.
+/// The run or the video does not exist.
 pub fn video(
     catalogue: &mut Catalogue,
     run: &str,
@@ -190,10 +190,10 @@ pub fn video(
     Ok(videos::folder(directory).join(name))
 }
 
-/// The processes of a run's last session; null where its supervisor wrote nothing down.
+/// Returns the processes of a run's last session; null if its supervisor wrote no file.
 ///
 /// # Errors
-/// There is no such run, or its file is damaged.
+/// The run does not exist, or its file is damaged.
 pub fn processes(catalogue: &mut Catalogue, run: &str) -> Result<Value, Refusal> {
     let watched = find(catalogue, run)?;
     watched.refresh();
@@ -201,10 +201,10 @@ pub fn processes(catalogue: &mut Catalogue, run: &str) -> Result<Value, Refusal>
     Ok(json!({"state": watched.state, "session": processes}))
 }
 
-/// Every configuration key of a run with its value.
+/// Returns every configuration key of a run with its value.
 ///
 /// # Errors
-/// There is no such run, or its file cannot be read.
+/// The run does not exist, or its file cannot be read.
 pub fn config(catalogue: &mut Catalogue, run: &str) -> Result<Value, Refusal> {
     let config = find(catalogue, run)?.directory.config()?;
     let keys = configuration::flat(&config).context("cannot write the configuration")?;

@@ -1,4 +1,4 @@
-//! The runs below a directory, found again and again: one may begin at any time.
+//! Finds the runs below a directory, repeatedly, because new runs can start at any time.
 
 use std::collections::BTreeMap;
 use std::fs;
@@ -9,32 +9,34 @@ use super::watched::Watched;
 use crate::failure::wrong_use;
 use crate::run_directory::RunDirectory;
 
-/// Between two looks for new runs, at least,
+/// Minimum interval between two searches for new runs.
 const WALK_INTERVAL: Duration = Duration::from_secs(2);
-/// and so many times what a look takes, where there is much to look through.
+/// Minimum interval as a multiple of the duration of a search, for large directories.
 const WALK_REST: u32 = 50;
-/// Folders between the directory and a run: a sweep has three.
+/// Maximum depth of a run below the directory; a sweep needs three.
 const DEPTH_MAX: usize = 6;
-/// Entries looked at in one walk: a directory with more is not one of runs.
+/// Maximum number of entries visited per search. A directory with more does not contain only runs.
 const ENTRIES_MAX: usize = 100_000;
-/// Runs that are shown; the rest is counted.
+/// Maximum number of runs shown; the others are counted.
 pub const RUNS_MAX: usize = 2_000;
 
-/// The runs of a directory, or the one run that it is, by their paths below it.
+/// The runs below a directory, or the one run in it, by their relative paths.
 #[derive(Debug)]
 pub struct Catalogue {
     root: PathBuf,
-    /// By what the page calls them; nothing else is ever opened for a request.
+    /// Runs by their names on the page. Requests can open only these.
     pub runs: BTreeMap<String, Watched>,
-    /// Runs beyond [`RUNS_MAX`].
+    /// Number of runs beyond [`RUNS_MAX`].
     pub left_out: usize,
-    /// When it is time to look again; none before the first.
+    /// Time of the next search; `None` before the first.
     due: Option<Instant>,
 }
 
 impl Catalogue {
+    /// Creates a catalogue of the runs below `root`.
+    ///
     /// # Errors
-    /// Wrong use: there is no such directory.
+    /// Wrong use: the directory does not exist.
     pub fn new(root: &Path) -> anyhow::Result<Self> {
         let resolved = fs::canonicalize(root).ok().filter(|path| path.is_dir());
         let root = resolved.ok_or_else(|| {
@@ -46,12 +48,12 @@ impl Catalogue {
         Ok(Self { root, runs: BTreeMap::new(), left_out: 0, due: None })
     }
 
-    /// The directory, absolute.
+    /// The directory, as an absolute path.
     pub fn root(&self) -> &Path {
         &self.root
     }
 
-    /// Looks for runs that have come or gone, if that was not done just now.
+    /// Searches for new and removed runs, unless the last search was recent.
     pub fn walk(&mut self) {
         let begun = Instant::now();
         if self.due.is_some_and(|due| begun < due) {
@@ -86,13 +88,13 @@ struct Walk {
 }
 
 impl Walk {
-    /// Links are not followed: what they lead to is not below the directory.
+    /// Visits a folder. Links are not followed: their targets are not below the directory.
     fn visit(&mut self, folder: &Path, depth: usize) {
         if folder.join("manifest.json").is_file() && folder.join("config.toml").is_file() {
             self.found.push(folder.to_owned());
             return;
         }
-        // One that cannot be read, or has just gone, holds no run for us.
+        // Skip folders that cannot be read or have just been removed.
         let Ok(entries) = fs::read_dir(folder) else { return };
         for entry in entries.flatten() {
             self.entries += 1;

@@ -1,4 +1,4 @@
-//! A configuration as keys and values, to be set beside another's.
+//! Flattens a configuration to keys and values, for comparison.
 
 use std::collections::BTreeMap;
 
@@ -7,7 +7,7 @@ use toml::Table;
 
 use crate::sweep::flatten;
 
-/// Every key as `section.key`, with its value as a file would have it.
+/// Returns every key as `section.key`, with its value in TOML.
 ///
 /// # Errors
 /// None is known: a configuration that was read can be written.

@@ -1,4 +1,4 @@
-//! One episode of a run's policy, joint by joint, out of `motion.json`.
+//! Reads one episode of a run's policy, joint by joint, from `motion.json`.
 
 use serde_json::{Value, json};
 
@@ -6,10 +6,10 @@ use super::table::rounded;
 use crate::motion::{self, Motion};
 use crate::run_directory::RunDirectory;
 
-/// Rows of a picture: an episode may have ten times as many.
+/// Maximum number of rows in a chart; an episode may have ten times as many.
 const ROWS_MAX: usize = 1_000;
 
-/// What a page draws; null if nobody has measured a policy of this run.
+/// Returns the data of the charts; null if the run's motion was never recorded.
 ///
 /// # Errors
 /// The file cannot be read.

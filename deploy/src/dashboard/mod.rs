@@ -1,13 +1,13 @@
-//! Stage 8 of 8, the page that shows runs while they are trained and afterwards.
+//! Stage 8 of 8: the web page that shows runs during and after training.
 //!
 //! ```text
 //!  browser ──HTTP──► server ──► answers ──► catalogue ──► watched runs ──► tail, table
 //!  Prometheus ─────────┘ └──► page/ (HTML, CSS, scripts in the binary)        run directories
 //! ```
-//! It only reads run directories and needs nothing of the processes that train. What has been read
-//! is kept, so a look at a long run costs what has been added since; a curve is sent as its new
-//! points only. A request names a run or a video, and is answered only if a listing has it: no
-//! path ever comes from outside.
+//! The dashboard only reads run directories and is independent of the training processes. It caches
+//! the data it has read, so that refreshing a long run costs only the added part, and it sends only
+//! the new points of a curve. A request names a run or a video and is answered only if it is
+//! listed: no path ever comes from a client.
 
 mod answers;
 mod catalogue;

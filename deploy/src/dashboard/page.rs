@@ -1,6 +1,6 @@
-//! The files of the page, part of the program: it needs no network and no installation.
+//! The files of the page, embedded in the program: it needs no network and no installation.
 
-/// Name, kind and content of every file; the first is the page itself.
+/// Name, type and content of every file; the first is the page itself.
 pub const FILES: [(&str, &str, &[u8]); 9] = [
     ("index.html", "text/html; charset=utf-8", include_bytes!("page/index.html")),
     ("style.css", CSS, include_bytes!("page/style.css")),

@@ -1,4 +1,4 @@
-//! The newest figures of every run for Prometheus, in the text format that OpenMetrics defines.
+//! Exports the newest figures of every run to Prometheus, in the OpenMetrics text format.
 
 use std::fmt;
 
@@ -14,10 +14,10 @@ use serde_json::Value;
 use super::catalogue::Catalogue;
 use super::watched::{State, Watched};
 
-/// What Prometheus is told the answer is.
+/// Content type of the response.
 pub const CONTENT_TYPE: &str = "application/openmetrics-text; version=1.0.0; charset=utf-8";
 
-/// One figure: its name, what it is, and its key in a line of `metrics.jsonl`.
+/// A figure: its name, its description, and its key in a line of `metrics.jsonl`.
 struct Figure {
     name: &'static str,
     help: &'static str,
@@ -27,7 +27,7 @@ struct Figure {
 
 #[derive(Clone, Copy, PartialEq, Eq)]
 enum Kind {
-    /// Over the whole run: grows, but for a resume that goes back to a checkpoint.
+    /// A total over the whole run. It only decreases if a resume goes back to a checkpoint.
     Total,
     Now,
 }
@@ -40,7 +40,7 @@ const fn now(name: &'static str, key: &'static str, help: &'static str) -> Figur
     Figure { name, help, key, kind: Kind::Now }
 }
 
-/// Of `metrics.jsonl`. Means that are null have no sample.
+/// Figures of `metrics.jsonl`. Means that are null have no sample.
 const FIGURES: [Figure; 28] = [
     total("dmprl_env_steps", "env_steps", "Environment steps inserted"),
     total("dmprl_updates", "updates", "Updates done"),
@@ -72,7 +72,7 @@ const FIGURES: [Figure; 28] = [
     now("dmprl_training_success_rate", "training_success_rate", "Of episodes with exploration"),
 ];
 
-/// One run at this moment.
+/// The current figures of one run.
 #[derive(Debug)]
 struct Sample {
     labels: Vec<(&'static str, String)>,
@@ -80,14 +80,14 @@ struct Sample {
     steps_wanted: u64,
     last: Value,
     rejected: Vec<(String, f64)>,
-    /// Return, success rate, smoothness of the newest evaluation.
+    /// Return, success rate and smoothness of the newest evaluation.
     evaluation: Option<(f64, Option<f64>, f64)>,
 }
 
 #[derive(Debug)]
 struct Samples(Vec<Sample>);
 
-/// The answer to a scrape.
+/// Returns the response to a scrape.
 ///
 /// # Errors
 /// None is known: it is written into memory.

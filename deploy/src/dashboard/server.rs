@@ -1,4 +1,4 @@
-//! HTTP on loopback: who may ask, what can be asked for, and how it ends.
+//! The HTTP server on loopback: routes, access checks and shutdown.
 
 use std::net::{Ipv4Addr, SocketAddr};
 use std::path::{Path, PathBuf};
@@ -26,32 +26,32 @@ use super::{page, prometheus};
 use crate::failure::Outcome;
 use crate::launch::interrupts;
 
-/// A request that takes longer is given up.
+/// Time limit of a request.
 const REQUEST_MAX: Duration = Duration::from_secs(30);
-/// After Ctrl-C, answers under way have so long.
+/// Time limit for responses in progress after Ctrl-C.
 const LAST_ANSWERS: Duration = Duration::from_millis(500);
-/// Names of this machine for itself. A page of another site that has its own name lead here (DNS
-/// rebinding) asks for that name.
+/// Names under which this machine accepts requests. They protect against DNS rebinding: a page
+/// whose domain resolves to this machine still sends its own name.
 const OWN_NAMES: [&str; 3] = ["localhost", "127.0.0.1", "[::1]"];
-/// Nothing from anywhere else, and nothing that is written into the page.
+/// Forbids resources of other origins and inline scripts.
 const POLICY: &str = "default-src 'none'; script-src 'self'; style-src 'self'; \
                       img-src 'self' data:; media-src 'self'; connect-src 'self'; \
                       base-uri 'none'; form-action 'none'; frame-ancestors 'none'";
-/// Of every answer.
+/// Headers of every response.
 const HEADERS: [(HeaderName, HeaderValue); 4] = [
     (header::CONTENT_SECURITY_POLICY, HeaderValue::from_static(POLICY)),
     (header::X_CONTENT_TYPE_OPTIONS, HeaderValue::from_static("nosniff")),
     (header::REFERRER_POLICY, HeaderValue::from_static("no-referrer")),
-    // A newer program at the same address must not be shown with an older one's page.
+    // The page of an older version must not be used with a newer program at the same address.
     (header::CACHE_CONTROL, HeaderValue::from_static("no-store")),
 ];
 
-/// What is shown, and where.
+/// What the dashboard shows, and on which port.
 #[derive(Debug)]
 pub struct Plan<'p> {
-    /// A run, or a directory with runs below it.
+    /// A run, or a directory that contains runs.
     pub root: &'p Path,
-    /// On 127.0.0.1; 0: any that is free.
+    /// Port on 127.0.0.1; 0 for any free port.
     pub port: u16,
 }
 
@@ -79,12 +79,12 @@ struct VideoQuery {
     name: String,
 }
 
-/// Serves the page until the user interrupts, which is its usual end.
+/// Serves the page until the user interrupts it, which is its normal end.
 ///
-/// - `listening`: told the address once somebody can ask.
+/// - `listening`: called with the address once the server accepts connections.
 ///
 /// # Errors
-/// Wrong use: there is no such directory. The port is taken.
+/// Wrong use: the directory does not exist. The port is in use.
 pub fn serve(
     plan: &Plan,
     listening: impl FnOnce(SocketAddr) -> anyhow::Result<()>,
@@ -101,7 +101,7 @@ pub fn serve(
         let listener = TcpListener::bind(address).await.with_context(|| {
             format!("cannot listen on {address}; choose another --port, 0 for any that is free")
         })?;
-        listening(listener.local_addr().context("cannot tell the port")?)?;
+        listening(listener.local_addr().context("cannot determine the port")?)?;
         let (stop, stopped) = tokio::sync::oneshot::channel::<()>();
         let server = axum::serve(listener, router(Arc::new(Mutex::new(catalogue))))
             .with_graceful_shutdown(async { drop(stopped.await) });
@@ -110,11 +110,11 @@ pub fn serve(
             ended = &mut server => return ended.context("the dashboard's server has ended"),
             _ = interrupts.recv() => drop(stop),
         }
-        // A connection that takes nothing may be open for ever; its end is no failure.
+        // A connection that reads nothing may stay open forever; cutting it is no failure.
         let _ = tokio::time::timeout(LAST_ANSWERS, server).await;
         Ok(())
     });
-    // A file that is being read is not waited for.
+    // Does not wait for a file that is being read.
     runtime.shutdown_background();
     served.map(|()| Outcome::Done)
 }
@@ -133,14 +133,14 @@ fn router(shared: Shared) -> Router {
     for one in &page::FILES[1..] {
         texts = texts.route(&format!("/page/{}", one.0), get(move || async move { file(one) }));
     }
-    // A video is small already, and a player asks for parts of it.
+    // Videos are already compressed, and players request parts of them.
     let texts = texts.layer(CompressionLayer::new());
     let all = texts.route("/video", get(video)).fallback(nothing);
     let timeout = TimeoutLayer::with_status_code(StatusCode::SERVICE_UNAVAILABLE, REQUEST_MAX);
     all.layer(timeout).layer(middleware::from_fn(guard)).with_state(shared)
 }
 
-/// Answers only to those who know that they ask this machine, and says how to use what it answers.
+/// Answers only requests that name this machine, and adds the headers to the response.
 async fn guard(request: Request, next: Next) -> Response {
     let host = request.headers().get(header::HOST).and_then(|host| host.to_str().ok());
     let mut response = match host {
@@ -158,7 +158,7 @@ async fn guard(request: Request, next: Next) -> Response {
     response
 }
 
-/// Any port: one may have been forwarded.
+/// Returns true if a host is this machine. Any port is accepted, since it may have been forwarded.
 fn is_own_name(host: &str) -> bool {
     let host = host.parse::<Authority>();
     host.is_ok_and(|host| OWN_NAMES.iter().any(|name| host.host().eq_ignore_ascii_case(name)))
@@ -173,7 +173,7 @@ async fn nothing(request: Request) -> Response {
     Refusal::Missing(message).into_response()
 }
 
-/// Reads files on a thread that may wait for them.
+/// Reads files on a blocking thread.
 async fn read<T: Send + 'static>(
     shared: Shared,
     work: impl FnOnce(&mut Catalogue) -> Result<T, Refusal> + Send + 'static,
@@ -243,7 +243,7 @@ async fn video(
 ) -> Result<Response, Refusal> {
     let find = move |catalogue: &mut Catalogue| answers::video(catalogue, &query.run, &query.name);
     let path: PathBuf = read(shared, find).await?;
-    // Parts of it, too, as players ask for them.
+    // Supports ranges, which players request.
     let served = ServeFile::new(&path).try_call(request).await;
     let served = served.with_context(|| format!("cannot read {}", path.display()))?;
     Ok(served.into_response())

@@ -1,40 +1,40 @@
-//! The numbers of a file of JSON lines as columns, and few points of many for a curve.
+//! Stores the numbers of a JSON Lines file as columns, and thins them out for curves.
 
 use std::collections::BTreeMap;
 
 use serde::Serialize;
 use serde_json::Value;
 
-/// Rows that are kept; beyond, every other one is dropped, and so on.
+/// Maximum number of rows. Beyond it every other row is dropped, repeatedly.
 const ROWS_MAX: usize = 50_000;
-/// Names that are kept: a line of `metrics.jsonl` has a third of it.
+/// Maximum number of columns: about three times as many as in a line of `metrics.jsonl`.
 const COLUMNS_MAX: usize = 128;
-/// Digits that a curve has; more are seen by nobody, and make an answer longer.
+/// Significant digits in a curve. More are invisible and lengthen the response.
 const DIGITS: i32 = 6;
 
-/// Columns of numbers; what a row lacks, or has as null, is NaN.
+/// Columns of numbers. Missing and null values are NaN.
 #[derive(Debug, Default)]
 pub struct Table {
     columns: BTreeMap<String, Vec<f64>>,
     rows: usize,
-    /// Of so many rows of the file one is kept.
+    /// Only every `stride`-th row of the file is kept.
     stride: usize,
     seen: usize,
 }
 
-/// A curve: its points by both axes.
+/// Points of a curve.
 #[derive(Debug, Default, PartialEq, Serialize)]
 pub struct Curve {
-    /// Environment steps.
+    /// Environment steps of the points.
     pub env_steps: Vec<f64>,
-    /// Seconds of training.
+    /// Training time of the points [s].
     pub wall_s: Vec<f64>,
-    /// The values; always finite.
+    /// Values of the points, always finite.
     pub values: Vec<f64>,
 }
 
 impl Table {
-    /// Adds a row; true when rows were dropped to make room, and those left have other numbers.
+    /// Adds a row; returns true if rows were dropped, so that the remaining ones have new indices.
     pub fn push(&mut self, row: &Value) -> bool {
         self.stride = self.stride.max(1);
         self.seen += 1;
@@ -60,14 +60,14 @@ impl Table {
         full
     }
 
-    /// Rows that are kept.
+    /// Number of rows kept.
     #[must_use]
     pub fn rows(&self) -> usize {
         self.rows
     }
 
-    /// The curve of a column from row `from` on, of at most `points_max` points: of each stretch
-    /// the lowest and the highest, so that no spike is lost.
+    /// Returns the curve of a column from row `from` on, with at most `points_max` points. It keeps
+    /// the minimum and the maximum of each stretch, so that no spike is lost.
     #[must_use]
     pub fn curve(&self, name: &str, from: usize, points_max: usize) -> Curve {
         let Some(column) = self.columns.get(name) else { return Curve::default() };
@@ -95,7 +95,7 @@ impl Table {
     }
 }
 
-/// The rows of the lowest and of the highest value, in their order.
+/// Rows of the minimum and the maximum, in order.
 fn extremes(rows: &[usize], column: &[f64]) -> Vec<usize> {
     let by_value = |a: &&usize, b: &&usize| column[**a].total_cmp(&column[**b]);
     let low = rows.iter().min_by(by_value).copied();
@@ -106,7 +106,7 @@ fn extremes(rows: &[usize], column: &[f64]) -> Vec<usize> {
     both
 }
 
-/// Every number of an object, those of objects within it as `outer.inner`.
+/// Collects every number of an object; those of nested objects as `outer.inner`.
 pub fn flatten(value: &Value, name: String, numbers: &mut Vec<(String, f64)>) {
     match value {
         Value::Number(number) => numbers.extend(number.as_f64().map(|number| (name, number))),
@@ -120,7 +120,7 @@ pub fn flatten(value: &Value, name: String, numbers: &mut Vec<(String, f64)>) {
     }
 }
 
-/// With [`DIGITS`] significant digits; whole numbers of steps stay what they are.
+/// Rounds to [`DIGITS`] significant digits; integers are unchanged.
 pub fn rounded(value: f64) -> f64 {
     if value == 0.0 || !value.is_finite() || value.fract() == 0.0 {
         return value;

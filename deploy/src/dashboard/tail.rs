@@ -1,4 +1,4 @@
-//! What has been appended to a file of lines since somebody looked last.
+//! Reads the lines that were appended to a file since the last read.
 
 use std::fs::File;
 use std::io::{ErrorKind, Read, Seek, SeekFrom};
@@ -6,12 +6,12 @@ use std::path::{Path, PathBuf};
 
 use anyhow::{Context, bail};
 
-/// Read at once; what is beyond comes with the next look.
+/// Maximum number of bytes per read; the rest follows with the next one.
 const BYTES_MAX: u64 = 8 << 20;
-/// What is remembered of the end of the last line read, to know it again.
+/// Length of the remembered end of the last line, by which a replaced file is recognised.
 const MARK_LEN: usize = 128;
 
-/// A file of lines, and how far it has been read.
+/// A file of lines and the position up to which it has been read.
 #[derive(Debug)]
 pub struct Tail {
     path: PathBuf,
@@ -19,29 +19,28 @@ pub struct Tail {
     mark: Vec<u8>,
 }
 
-/// What a look has found.
+/// Result of a read.
 #[derive(Debug, Default, PartialEq, Eq)]
 pub struct Look {
-    /// The file is not what it was: a resume has cut it, or the run has begun again. `lines` are
-    /// its first.
+    /// True if the file was cut by a resume or replaced; `lines` then starts at its beginning.
     pub begun_again: bool,
-    /// Whole lines with their ends.
+    /// Complete lines with their line ends.
     pub lines: Vec<u8>,
-    /// There is more to read.
+    /// True if there is more to read.
     pub more: bool,
 }
 
 impl Tail {
-    /// A file of which nothing has been read; it need not be there yet.
+    /// Creates the tail of a file, which need not exist yet.
     #[must_use]
     pub fn new(path: &Path) -> Self {
         Self { path: path.to_owned(), offset: 0, mark: Vec::new() }
     }
 
-    /// Reads on; a line that is not whole yet is left for the next look.
+    /// Reads the next lines; an incomplete line is left for the next read.
     ///
     /// # Errors
-    /// The file cannot be read, or holds a line that is too long to be one.
+    /// The file cannot be read, or a line is too long.
     pub fn look(&mut self) -> anyhow::Result<Look> {
         let cannot = || format!("cannot read {}", self.path.display());
         let mut file = match File::open(&self.path) {
@@ -78,7 +77,7 @@ impl Tail {
         Ok(look)
     }
 
-    /// Whether what was read last still stands where it stood.
+    /// Returns true if the last line read is still at its position.
     fn knows(&self, file: &mut File) -> std::io::Result<bool> {
         if file.metadata()?.len() < self.offset {
             return Ok(false);

@@ -1,4 +1,4 @@
-//! What `dmprl record` has made of a run.
+//! Lists the files that `dmprl record` has written for a run.
 
 use std::fs;
 use std::io::ErrorKind;
@@ -9,9 +9,9 @@ use serde::Serialize;
 
 use crate::run_directory::RunDirectory;
 
-/// What a browser shows.
+/// File types that a browser can show.
 const EXTENSIONS: [&str; 3] = ["mp4", "gif", "png"];
-/// Files that are listed.
+/// Maximum number of files in the list.
 const VIDEOS_MAX: usize = 200;
 
 /// A file in `videos/`.
@@ -21,12 +21,12 @@ pub struct Video {
     pub bytes: u64,
 }
 
-/// Where they lie.
+/// Folder of the videos.
 pub fn folder(run: &RunDirectory) -> PathBuf {
     run.path().join("videos")
 }
 
-/// Regular files of a kind that a browser shows, by name; links are none.
+/// Lists regular files that a browser can show, by name; links are skipped.
 ///
 /// # Errors
 /// The folder cannot be read.

@@ -1,4 +1,4 @@
-//! One run as the dashboard knows it: what is read once, and what is read on.
+//! Caches the data of one run, and reads additions.
 
 use std::os::unix::fs::MetadataExt;
 use std::path::Path;
@@ -14,32 +14,32 @@ use crate::control::EvaluationRow;
 use crate::report::method_label;
 use crate::run_directory::RunDirectory;
 
-/// A run whose supervisor is not to be found here is trained somewhere else if its metrics have
-/// grown within this time, as the dashboard saw it.
+/// A run whose supervisor is not on this machine counts as trained elsewhere if the dashboard has
+/// seen its metrics grow within this time.
 const GROWS_WITHIN: Duration = Duration::from_secs(60);
-/// Tables that nobody has asked for are forgotten after this time.
+/// Time after which unused tables are dropped.
 const TABLE_KEPT: Duration = Duration::from_secs(300);
-/// Points of a curve: no screen shows more side by side.
+/// Maximum number of points in a curve: no screen shows more side by side.
 const POINTS_MAX: usize = 1_000;
 
-/// What a run is; changes with its files only.
+/// Facts about a run, which change only with its files.
 #[derive(Debug, Clone, Default, Serialize)]
 pub struct Facts {
     pub task: String,
-    /// As a report calls it: `TD3-DMP`.
+    /// Name of the method in reports, such as `TD3-DMP`.
     pub method: String,
     pub algorithm: String,
     pub policy: String,
     pub seed: u64,
-    /// Environment steps that it was asked for.
+    /// Configured number of environment steps.
     pub steps: u64,
-    /// UTC, RFC 3339, of its first session.
+    /// Start of its first session, UTC in RFC 3339.
     pub started: String,
     until_return: f64,
     until_success: f64,
 }
 
-/// Where a run stands.
+/// State of a run.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "snake_case")]
 pub enum State {
@@ -48,7 +48,7 @@ pub enum State {
     Stopped,
 }
 
-/// Which file of rows.
+/// A file of rows.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Rows {
     Metrics,
@@ -58,11 +58,12 @@ pub enum Rows {
 /// New points of curves.
 #[derive(Debug, Serialize)]
 pub struct Curves {
-    /// Names the table that `next` is about; another means that everything is sent anew.
+    /// Identifies the table to which `next` refers. If it changes, the client must fetch everything
+    /// anew.
     pub table: u64,
-    /// Row to ask from the next time.
+    /// Row from which to request the next points.
     pub next: usize,
-    /// In the order asked for.
+    /// Curves in the order requested.
     pub curves: Vec<Curve>,
 }
 
@@ -74,32 +75,32 @@ struct Growing {
     asked: Instant,
 }
 
-/// Inode and length: every file of a run is appended to or replaced by another.
+/// Inode and length: a run's files are only appended to or replaced.
 type Stamp = (u64, u64);
 
-/// A run that is looked at.
+/// A run that the dashboard shows.
 #[derive(Debug)]
 pub struct Watched {
     pub directory: RunDirectory,
     pub facts: Facts,
-    /// Why its files cannot be used.
+    /// Reason for which its files cannot be used.
     pub fault: Option<String>,
-    /// The last line of `metrics.jsonl`.
+    /// Last line of `metrics.jsonl`.
     pub last: Value,
-    /// Newest last, of all evaluations.
+    /// All evaluations, newest last.
     pub evaluations: Vec<EvaluationRow>,
     pub state: State,
     facts_stamp: [Stamp; 2],
     metrics_stamp: Stamp,
     evaluations_stamp: Stamp,
     grown: Option<Instant>,
-    /// The supervisor that was last seen alive on this machine.
+    /// Process id of the supervisor that was last seen alive on this machine.
     seen_here: Option<u32>,
     tables: [Option<Growing>; 2],
 }
 
 impl Watched {
-    /// A run of which nothing has been read.
+    /// Creates the cache without reading anything.
     pub fn new(directory: RunDirectory) -> Self {
         Self {
             directory,
@@ -117,7 +118,8 @@ impl Watched {
         }
     }
 
-    /// Reads what has changed. A run that cannot be read says so, and the others are shown.
+    /// Reads the changed files. A run that cannot be read reports its fault and does not affect the
+    /// others.
     pub fn refresh(&mut self) {
         self.fault = self.read_changes().err().map(|error| format!("{error:#}"));
         self.state = self.state_now();
@@ -138,7 +140,7 @@ impl Watched {
         let metrics = stamp(&self.directory.metrics_path());
         if metrics != self.metrics_stamp {
             self.last = self.directory.last_metrics()?.unwrap_or_default();
-            // What was there at the first look says nothing about now.
+            // Rows present at the first look do not prove that the run is growing now.
             self.grown = (self.metrics_stamp != (0, 0)).then(Instant::now);
             self.metrics_stamp = metrics;
         }
@@ -162,7 +164,7 @@ impl Watched {
                 || row.success_rate.is_some_and(|rate| rate >= self.facts.until_success)
         });
         let grows = self.grown.is_some_and(|grown| grown.elapsed() < GROWS_WITHIN);
-        // Who was seen here and is not any more has died, and trains nowhere else.
+        // A supervisor that was seen here and is gone has died; the run is not trained elsewhere.
         let elsewhere = grows && holder != self.seen_here && self.has_not_ended();
         match (here, reached) {
             (true, _) => State::Training,
@@ -172,15 +174,15 @@ impl Watched {
         }
     }
 
-    /// Whether its files do not say that its session has ended.
+    /// Returns true unless the run's files say that its session has ended.
     fn has_not_ended(&self) -> bool {
         !matches!(self.directory.processes(), Ok(Some(processes)) if processes.ended)
     }
 
-    /// What is new of curves since row `from` of the table with number `table`.
+    /// Returns new points of curves, from row `from` of the table with number `table`.
     ///
     /// # Errors
-    /// The file cannot be read, or a whole line is no JSON.
+    /// The file cannot be read, or a complete line is no JSON.
     pub fn curves(
         &mut self,
         rows: Rows,
@@ -219,7 +221,7 @@ impl Growing {
             }
             for line in look.lines.split(|&byte| byte == b'\n').filter(|line| !line.is_empty()) {
                 let row: Value = serde_json::from_slice(line).map_err(|error| {
-                    anyhow::anyhow!("{}: a line is no JSON: {error}", path.display())
+                    anyhow::anyhow!("{}: a line is not JSON: {error}", path.display())
                 })?;
                 if self.table.push(&row) {
                     self.number = next_number();
@@ -232,7 +234,7 @@ impl Growing {
     }
 }
 
-/// No two tables of this process have the same.
+/// Returns a number that is unique within this process.
 fn next_number() -> u64 {
     static NUMBER: AtomicU64 = AtomicU64::new(1);
     NUMBER.fetch_add(1, Ordering::Relaxed)
@@ -274,8 +276,8 @@ mod tests {
         &curves.curves[0].env_steps
     }
 
-    /// A resume forgets what its checkpoint has not seen; a page that kept those points would draw
-    /// the curve twice.
+    /// A resume removes the rows after its checkpoint. A page that kept those points would draw the
+    /// curve twice.
     #[test]
     fn after_a_resume_has_cut_the_rows_a_curve_is_sent_anew() {
         let folder = tempfile::tempdir().unwrap();

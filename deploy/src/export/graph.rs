@@ -1,11 +1,11 @@
-//! Puts a graph together, operation by operation; values are known by name.
+//! Builds an ONNX graph, operation by operation; values are referenced by name.
 
 use super::onnx_format::{
     ATTRIBUTE_INT, ATTRIBUTE_INTS, AttributeProto, Dimension, DimensionProto, FLOAT, GraphProto,
     INT64, NodeProto, TensorProto, TensorShapeProto, TensorTypeProto, TypeProto, ValueInfoProto,
 };
 
-/// The first axis of inputs and outputs: any number of observations at a time.
+/// First axis of inputs and outputs: any number of observations.
 const BATCH: &str = "batch";
 
 /// A graph under construction.
@@ -21,13 +21,13 @@ impl Graph {
         self.0
     }
 
-    /// An input of shape (batch, len).
+    /// Adds an input of shape (batch, len).
     pub(super) fn input(&mut self, name: &str, len: usize, about: &str) -> String {
         self.0.input.push(value(name, &[len], about));
         name.to_owned()
     }
 
-    /// Calls `from` an output `name` of shape (batch, …`shape`).
+    /// Declares `from` as the output `name` of shape (batch, …`shape`).
     pub(super) fn output(&mut self, from: &str, name: &str, shape: &[usize], about: &str) {
         self.0.output.push(value(name, shape, about));
         self.0.node.push(NodeProto {
@@ -39,7 +39,7 @@ impl Graph {
         });
     }
 
-    /// One operation with one result.
+    /// Adds an operation with one result.
     pub(super) fn op(&mut self, op: &str, inputs: &[&str]) -> String {
         self.op_with(op, inputs, Vec::new())
     }
@@ -61,13 +61,13 @@ impl Graph {
         name
     }
 
-    /// Numbers that do not change.
+    /// Adds a constant tensor.
     pub(super) fn constant(&mut self, shape: &[usize], numbers: &[f32]) -> String {
         let bytes = numbers.iter().flat_map(|number| number.to_le_bytes()).collect();
         self.tensor(FLOAT, shape, bytes)
     }
 
-    /// A number that does not change.
+    /// Adds a constant scalar.
     pub(super) fn scalar(&mut self, number: f32) -> String {
         self.constant(&[], &[number])
     }
@@ -84,21 +84,21 @@ impl Graph {
         name
     }
 
-    /// `begin`..`end` of an axis.
+    /// Slices `begin`..`end` of an axis.
     pub(super) fn slice(&mut self, from: &str, axis: i64, begin: usize, end: usize) -> String {
         let parts = [begin as i64, end as i64, axis].map(|number| self.integers(&[number]));
         let [begin, end, axis] = &parts;
         self.op("Slice", &[from, begin, end, axis])
     }
 
-    /// The entries `indices` of axis 1.
+    /// Selects the entries `indices` of axis 1.
     pub(super) fn gather(&mut self, from: &str, indices: &[usize]) -> String {
         let indices: Vec<i64> = indices.iter().map(|&index| index as i64).collect();
         let indices = self.integers(&indices);
         self.op_with("Gather", &[from, &indices], vec![int("axis", 1)])
     }
 
-    /// Another shape; -1: what is left.
+    /// Reshapes a value; an axis of -1 is inferred.
     pub(super) fn reshape(&mut self, from: &str, shape: &[i64]) -> String {
         let shape = self.integers(shape);
         self.op("Reshape", &[from, &shape])

@@ -1,7 +1,7 @@
-//! A run's policy as one file that goes where the robot is.
+//! Exports a run's policy as one file, for use on a robot.
 //!
-//! `onnx` writes the whole policy as a graph, for every runtime of that format; `safetensors` is
-//! the project's own file (`dmprl_shared::policy_file`), for Rust and for `dmprl.Policy`.
+//! `onnx` writes the complete policy as a graph for any ONNX runtime. `safetensors` writes the
+//! project's own format (`dmprl_shared::policy_file`), for Rust and for `dmprl.Policy`.
 
 mod graph;
 mod onnx;
@@ -15,16 +15,16 @@ pub use onnx::onnx;
 
 use crate::run_directory::{ChosenPolicy, RunDirectory, Session};
 
-/// Reads a run's policy, with where it comes from.
+/// Reads a run's policy and its origin.
 ///
 /// # Errors
-/// The run says nothing of its environment yet, or the file is damaged.
+/// The run has no environment spec yet, or the file is damaged.
 pub fn read_policy(run: &RunDirectory, chosen: &ChosenPolicy) -> anyhow::Result<OpenedPolicy> {
     let (config, manifest) = (run.config()?, run.manifest()?);
     let spec = run.spec()?.with_context(|| {
         format!("run {} has not started an environment yet", run.path().display())
     })?;
-    // By the run's configuration: files of older versions do not say what they are.
+    // Use the run's configuration: files of older versions contain no description.
     let policy = Policy::new(&config, &spec)?;
     let snapshot = policy_file::load(&chosen.path, &policy, Match::Architecture)?;
     let this = Session::now();
@@ -40,10 +40,10 @@ pub fn read_policy(run: &RunDirectory, chosen: &ChosenPolicy) -> anyhow::Result<
     Ok(OpenedPolicy { policy, snapshot, origin: Some(origin) })
 }
 
-/// The project's own file, as bytes.
+/// Encodes a policy in the project's own format.
 ///
 /// # Errors
-/// None is known: the parameters are the policy's.
+/// None is known: the parameters belong to the policy.
 pub fn safetensors(opened: &OpenedPolicy) -> anyhow::Result<Vec<u8>> {
     Ok(policy_file::encode(&opened.policy, &opened.snapshot, opened.origin.as_ref())?)
 }

@@ -5,8 +5,8 @@
 //!                           ├─ Gemm, Relu … ─ Tanh ─ MatMul ─ … ────┤
 //!   state (batch, 2A) ──────┘  network        ranges  DMP's map     └─► next_state (batch, 2A)
 //! ```
-//! `state` and `next_state` are there for a policy that carries (y, yd) from segment to segment.
-//! The steps are those of `dmprl_shared::policy`, in the same order; a test holds the graph to it.
+//! `state` and `next_state` exist for a policy that carries (y, yd) from segment to segment. The
+//! steps are those of `dmprl_shared::policy`, in the same order; a test compares the two.
 
 use anyhow::Context;
 use dmprl_shared::config::{Controller, ForcingScaling, RhoKind, StartSource};
@@ -17,14 +17,14 @@ use prost::Message;
 use super::graph::{Graph, int, ints};
 use super::onnx_format::{ModelProto, OperatorSetIdProto, StringStringEntryProto};
 
-/// Version 17 of the operators and 8 of the format, of 2022: every runtime in use reads them.
+/// Version 17 of the operators and 8 of the format, of 2022: all runtimes in use support them.
 const OPERATORS: i64 = 17;
 const IR_VERSION: i64 = 8;
 
-/// The policy as the bytes of an ONNX file.
+/// Encodes a policy as an ONNX file.
 ///
 /// # Errors
-/// None is known: what describes the policy is written as JSON.
+/// None is known: the description of the policy can be written as JSON.
 pub fn onnx(opened: &OpenedPolicy) -> anyhow::Result<Vec<u8>> {
     let description = opened.policy.description();
     let json = serde_json::to_string(description).context("cannot write the description")?;
@@ -58,7 +58,7 @@ struct PolicyGraph<'a> {
     steps: usize,
 }
 
-/// What the DMP's samples are made of, (batch, A, 1) each.
+/// Start of the DMP, input of its samples, (batch, A, 1) each.
 struct Start {
     y: String,
     yd: String,
@@ -102,7 +102,8 @@ impl<'a> PolicyGraph<'a> {
         self.graph
     }
 
-    /// The decisions, (batch, D): what follows them is a Gaussian's spread.
+    /// The network's decisions, (batch, D). Outputs after them are a Gaussian's standard
+    /// deviations.
     fn network(&mut self, mut x: String) -> String {
         let (policy, values) = (&self.opened.policy, &self.opened.snapshot.values);
         for (index, layer) in policy.shape().layers().iter().enumerate() {
@@ -269,7 +270,7 @@ impl<'a> PolicyGraph<'a> {
         let u = graph.op("Clip", &[u, &least, &most]);
         let scaled = graph.op("Mul", &[&u, &half]);
         let scaled = graph.op("Add", &[&scaled, &mid]);
-        // Rounding must not lead out of them.
+        // Rounding must not exceed the bounds.
         let low = per_dimension(graph, spec.action_low.clone());
         let high = per_dimension(graph, spec.action_high.clone());
         let scaled = graph.op("Max", &[&scaled, &low]);
@@ -279,12 +280,13 @@ impl<'a> PolicyGraph<'a> {
     }
 }
 
-/// atan2(sin, cos), which ONNX does not have.
+/// atan2(sin, cos), for which ONNX has no operator.
 fn angle(graph: &mut Graph, sin: &str, cos: &str) -> String {
     let zero = graph.scalar(0.0);
     let [pi, minus_pi] = [std::f32::consts::PI, -std::f32::consts::PI].map(|pi| graph.scalar(pi));
     let one = graph.scalar(1.0);
-    // -0 counts as 0: it would lead to the other side. Runtimes leave out what adds 0.
+    // Replace -0 by 0, because it would select the other side. Runtimes optimise an addition of 0
+    // away.
     let [sin, cos] = &[sin, cos].map(|part| {
         let none = graph.op("Equal", &[part, &zero]);
         graph.op("Where", &[&none, &zero, part])
@@ -292,7 +294,7 @@ fn angle(graph: &mut Graph, sin: &str, cos: &str) -> String {
     let no_way = graph.op("Equal", &[cos, &zero]);
     let no_height = graph.op("Equal", &[sin, &zero]);
     let nowhere = graph.op("And", &[&no_way, &no_height]);
-    // 0/0 is no number; atan2(0, 0) is 0.
+    // 0/0 is NaN, but atan2(0, 0) is 0.
     let cos_or_one = graph.op("Where", &[&nowhere, &one, cos]);
     let ratio = graph.op("Div", &[sin, &cos_or_one]);
     let half = graph.op("Atan", &[&ratio]);

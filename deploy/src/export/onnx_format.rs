@@ -1,5 +1,5 @@
-//! The part of ONNX's format that a policy needs: messages of `onnx.proto`, IR version 8, with its
-//! field numbers.
+//! The part of the ONNX format that a policy needs: messages of `onnx.proto`, IR version 8, with
+//! their field numbers.
 
 use prost::Message;
 
@@ -12,7 +12,7 @@ pub(super) const ATTRIBUTE_INT: i32 = 2;
 /// `AttributeProto.AttributeType` INTS.
 pub(super) const ATTRIBUTE_INTS: i32 = 7;
 
-/// A file.
+/// An ONNX file.
 #[derive(Clone, PartialEq, Message)]
 pub(super) struct ModelProto {
     #[prost(int64, tag = "1")]
@@ -33,7 +33,7 @@ pub(super) struct ModelProto {
     pub metadata_props: Vec<StringStringEntryProto>,
 }
 
-/// Which version of the operators; the empty domain is ONNX's own.
+/// Version of the operators; the empty domain is ONNX's own.
 #[derive(Clone, PartialEq, Message)]
 pub(super) struct OperatorSetIdProto {
     #[prost(string, tag = "1")]
@@ -51,7 +51,7 @@ pub(super) struct StringStringEntryProto {
     pub value: String,
 }
 
-/// Nodes in an order in which they can be computed.
+/// A graph, whose nodes are in topological order.
 #[derive(Clone, PartialEq, Message)]
 pub(super) struct GraphProto {
     #[prost(message, repeated, tag = "1")]
@@ -81,7 +81,7 @@ pub(super) struct NodeProto {
     pub attribute: Vec<AttributeProto>,
 }
 
-/// A setting of an operation.
+/// An attribute of an operation.
 #[derive(Clone, PartialEq, Message)]
 pub(super) struct AttributeProto {
     #[prost(string, tag = "1")]
@@ -94,7 +94,7 @@ pub(super) struct AttributeProto {
     pub r#type: i32,
 }
 
-/// Numbers that are part of the file, little-endian.
+/// A constant tensor, little-endian.
 #[derive(Clone, PartialEq, Message)]
 pub(super) struct TensorProto {
     #[prost(int64, repeated, packed = "false", tag = "1")]
@@ -118,14 +118,14 @@ pub(super) struct ValueInfoProto {
     pub doc_string: String,
 }
 
-/// Its type; of the kinds there are, a tensor.
+/// Type of a value; here always a tensor.
 #[derive(Clone, PartialEq, Message)]
 pub(super) struct TypeProto {
     #[prost(message, optional, tag = "1")]
     pub tensor_type: Option<TensorTypeProto>,
 }
 
-/// Numbers and shape of a tensor.
+/// Element type and shape of a tensor.
 #[derive(Clone, PartialEq, Message)]
 pub(super) struct TensorTypeProto {
     #[prost(int32, tag = "1")]
@@ -134,14 +134,14 @@ pub(super) struct TensorTypeProto {
     pub shape: Option<TensorShapeProto>,
 }
 
-/// The axes.
+/// The axes of a tensor.
 #[derive(Clone, PartialEq, Message)]
 pub(super) struct TensorShapeProto {
     #[prost(message, repeated, tag = "1")]
     pub dim: Vec<DimensionProto>,
 }
 
-/// The length of an axis, or its name if it may be any.
+/// Length of an axis, or its name if the length is variable.
 #[derive(Clone, PartialEq, Message)]
 pub(super) struct DimensionProto {
     #[prost(oneof = "Dimension", tags = "1, 2")]
@@ -151,10 +151,10 @@ pub(super) struct DimensionProto {
 /// See [`DimensionProto`].
 #[derive(Clone, PartialEq, prost::Oneof)]
 pub(super) enum Dimension {
-    /// Its length.
+    /// Fixed length.
     #[prost(int64, tag = "1")]
     Value(i64),
-    /// Its name.
+    /// Name of a variable length.
     #[prost(string, tag = "2")]
     Name(String),
 }

@@ -1,4 +1,4 @@
-//! What every learning curve stands on: the two axes, their labels and a light grid.
+//! Axes of a learning curve, with labels and a light grid.
 
 use std::ops::Range;
 
@@ -8,29 +8,29 @@ use plotters::prelude::*;
 
 use crate::terminal::grouped;
 
-/// Share of the spread left free above and below.
+/// Margin above and below the values, as a fraction of their range.
 const MARGIN: f64 = 0.05;
 
-/// A drawing over environment steps.
+/// A chart over environment steps.
 pub(crate) type Chart<'a, 'b> =
     ChartContext<'a, SVGBackend<'b>, Cartesian2d<RangedCoordf64, RangedCoordf64>>;
 
-/// What the axes are to show.
+/// Labels and ranges of the axes.
 pub(crate) struct Axes<'t> {
-    /// Above the picture.
+    /// Title above the chart.
     pub(crate) title: &'t str,
-    /// Beside the vertical axis.
+    /// Label of the vertical axis.
     pub(crate) what: &'t str,
-    /// Environment steps, from 0.
+    /// Maximum of the environment steps, which start at 0.
     pub(crate) steps_max: f64,
-    /// The lowest and the highest value.
+    /// Minimum and maximum of the values.
     pub(crate) values: Range<f64>,
-    /// Left free to the right of them.
+    /// Space to the right of the chart, in pixels.
     pub(crate) beside: u32,
 }
 
 impl Axes<'_> {
-    /// Draws them.
+    /// Draws the axes.
     pub(crate) fn draw<'a, 'b>(
         &self,
         area: &'a DrawingArea<SVGBackend<'b>, Shift>,
@@ -60,7 +60,7 @@ impl Axes<'_> {
     }
 }
 
-/// `-4`, `-4.5`: no digits that say nothing.
+/// Formats `-4` or `-4.5`, without trailing zeros.
 fn tick(value: f64) -> String {
     // Adding zero turns -0 into 0.
     format!("{}", (value * 1e3).round() / 1e3 + 0.0)

@@ -1,9 +1,9 @@
-//! One colour a method, the same in every picture.
+//! Colours of methods, the same in every picture.
 
 use plotters::style::RGBColor;
 
-/// Okabe and Ito's palette, told apart with every common colour vision; the yellow, which is hard
-/// to see on white, darker.
+/// Okabe and Ito's palette, which is distinguishable with all common types of colour vision. The
+/// yellow is darker here, for a white background.
 const COLOURS: [RGBColor; 8] = [
     RGBColor(0, 114, 178),
     RGBColor(213, 94, 0),
@@ -14,16 +14,16 @@ const COLOURS: [RGBColor; 8] = [
     RGBColor(0, 0, 0),
     RGBColor(150, 140, 0),
 ];
-/// Methods that have the same colour in every report.
+/// Methods with the same colour in every report.
 const KNOWN: [&str; 8] =
     ["DDPG-DMP", "DDPG-DMP (paper)", "TD3-DMP", "SAC-DMP", "DDPG", "TD3", "SAC", "NDP"];
 
-/// Whether a method has a colour of its own.
+/// Returns true if a method has its own colour.
 pub(crate) fn has_colour(method: &str) -> bool {
     KNOWN.contains(&method)
 }
 
-/// The colour of a method, which is the report's `index`-th.
+/// Returns the colour of a method, which has the given index in the report.
 pub(crate) fn colour(index: usize, method: &str) -> RGBColor {
     let known = KNOWN.iter().position(|known| *known == method);
     COLOURS[known.unwrap_or(index) % COLOURS.len()]

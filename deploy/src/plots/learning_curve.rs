@@ -1,4 +1,4 @@
-//! Evaluation return over environment steps: mean, and one standard deviation over episodes.
+//! Draws evaluation return over environment steps: mean, and one standard deviation over episodes.
 
 use std::path::PathBuf;
 
@@ -11,16 +11,16 @@ use crate::control::EvaluationRow;
 use crate::run_directory::RunDirectory;
 use crate::terminal::std_of;
 
-/// Blue of the Okabe-Ito palette, told apart with every common colour vision.
+/// Blue of the Okabe-Ito palette, which suits all common types of colour vision.
 const BLUE: RGBColor = RGBColor(0, 114, 178);
 const SIZE: (u32, u32) = (800, 480);
-/// Half of the last step's label.
+/// Space for half of the last step's label.
 const BESIDE: u32 = 40;
 
-/// Draws `plots/learning_curve.svg`, and the same as PNG; nothing while there is no evaluation.
+/// Draws `plots/learning_curve.svg` and a PNG of it; returns `None` without evaluations.
 ///
 /// # Errors
-/// The rows cannot be read or the picture not be written.
+/// The rows cannot be read, or the picture cannot be written.
 pub fn learning_curve(run: &RunDirectory) -> anyhow::Result<Option<PathBuf>> {
     let rows = run.evaluations()?;
     if rows.is_empty() {

@@ -1,4 +1,4 @@
-//! Stage 8 of 8, the pictures of a run and of a report.
+//! Stage 8 of 8: the pictures of a run and of a report.
 
 mod axes;
 mod colours;

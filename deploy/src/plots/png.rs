@@ -1,17 +1,17 @@
-//! A picture's SVG as PNG, for slides, chats and viewers that draw no SVG.
+//! Converts an SVG to PNG, for slides, chats and viewers without SVG.
 
 use anyhow::{Context, anyhow};
 use resvg::tiny_skia::{Pixmap, Transform};
 use resvg::usvg::{Options, Tree};
 
-/// Apache-2.0, see the README beside it. With a font of ours the same runs give the same picture on
-/// every machine, also where no font is installed.
+/// Font under Apache-2.0, see the README next to it. With a bundled font the pictures are the same
+/// on every machine, even without installed fonts.
 const FONT: &[u8] = include_bytes!("roboto/Roboto-Regular.ttf");
 const FAMILY: &str = "Roboto";
-/// Pixels a unit of the SVG: sharp on a screen of high resolution and in print.
+/// Pixels per unit of the SVG, for high-resolution screens and print.
 const SCALE: f32 = 2.0;
 
-/// Draws an SVG of ours.
+/// Renders an SVG of this program.
 ///
 /// # Errors
 /// It is no SVG, or has no size.
@@ -19,7 +19,7 @@ pub(crate) fn png(svg: &str) -> anyhow::Result<Vec<u8>> {
     let mut options = Options { font_family: FAMILY.to_owned(), ..Options::default() };
     let fonts = options.fontdb_mut();
     fonts.load_font_data(FONT.to_vec());
-    // What our pictures ask for.
+    // The generic family that our pictures use.
     fonts.set_sans_serif_family(FAMILY);
     let tree = Tree::from_str(svg, &options).context("no picture can be made of an SVG")?;
     let size = tree.size().to_int_size().scale_by(SCALE);
@@ -34,7 +34,7 @@ pub(crate) fn png(svg: &str) -> anyhow::Result<Vec<u8>> {
 mod tests {
     use super::*;
 
-    /// White, with `text` in black.
+    /// Renders `text` in black on white.
     fn drawn(text: &str) -> Pixmap {
         let svg = format!(
             "<svg width='200' height='40' xmlns='http://www.w3.org/2000/svg'>\
@@ -53,10 +53,10 @@ mod tests {
         let empty = drawn("");
         assert_eq!((empty.width(), empty.height()), (400, 80));
         assert_eq!(dark(&empty), 0);
-        // Twice as many dark pixels for two letters, but for those that a stroke half covers.
+        // Two letters have twice as many dark pixels, except for partly covered ones.
         let (one, two) = (dark(&drawn("H")), dark(&drawn("HH")));
         assert!(one > 100 && two.abs_diff(2 * one) < one / 5, "{one} {two}");
-        // Signs that figures and units are written with.
+        // Characters used in figures and units.
         let missing = dark(&drawn("\u{1F600}"));
         for sign in ["−", "±", "²", "³", "°", "Δ", "≥", "–", "·", "é", "ж"] {
             let drawn = dark(&drawn(sign));

@@ -1,24 +1,24 @@
-//! Panels side by side on the same axes: what differs between them can be seen.
+//! Draws panels side by side on the same axes, for comparison.
 
 use plotters::prelude::*;
 
-/// Panels in a row.
+/// Maximum number of panels in a row.
 const COLUMNS_MAX: usize = 4;
-/// Of a panel, with the room for its labels.
+/// Size of a panel, including its labels.
 const PANEL: (u32, u32) = (270, 210);
-/// For the title above and the axis' name below all of them.
+/// Space for the title above and the axis name below all panels.
 const TITLE_HEIGHT: u32 = 44;
 const FOOT_HEIGHT: u32 = 40;
-/// For the vertical axis' name, and for the names of the lines.
+/// Space for the name of the vertical axis, and for the names of the lines.
 const LEFT: u32 = 34;
 const RIGHT: u32 = 190;
-/// Between two names of lines.
+/// Distance between two names of lines.
 const LINE_HEIGHT: i32 = 22;
-/// Share of the spread left free above and below.
+/// Margin above and below the values, as a fraction of their range.
 const MARGIN: f64 = 0.05;
 const INK: RGBAColor = RGBAColor(0, 0, 0, 0.85);
-/// Tol's "bright" scheme, told apart with every common colour vision and other than the methods'
-/// colours; the grey, which is pale on white, darker.
+/// Tol's "bright" scheme, which is distinguishable with all common types of colour vision and
+/// differs from the methods' colours. The grey is darker here, for a white background.
 const COLOURS: [RGBColor; 7] = [
     RGBColor(68, 119, 170),
     RGBColor(238, 102, 119),
@@ -29,30 +29,30 @@ const COLOURS: [RGBColor; 7] = [
     RGBColor(120, 120, 120),
 ];
 
-/// One of the panels.
+/// A panel.
 pub(crate) struct Panel {
-    /// Above it.
+    /// Title above the panel.
     pub(crate) title: String,
-    /// Its mark.
+    /// Colour that marks the panel.
     pub(crate) colour: RGBColor,
-    /// (x, y) of each point of each line.
+    /// Points (x, y) of each line.
     pub(crate) lines: Vec<Vec<(f64, f64)>>,
 }
 
-/// All of them.
+/// A figure with several panels.
 pub(crate) struct SmallMultiples<'t> {
-    /// Above all.
+    /// Title above all panels.
     pub(crate) title: &'t str,
     /// Names of the axes, with units.
     pub(crate) axes: [&'t str; 2],
     /// Names of the lines, the same in each panel.
     pub(crate) names: &'t [String],
-    /// At least one with a point.
+    /// Panels, at least one with a point.
     pub(crate) panels: Vec<Panel>,
 }
 
 impl SmallMultiples<'_> {
-    /// Draws them.
+    /// Draws the figure as SVG.
     pub(crate) fn draw(&self) -> Result<String, Box<dyn std::error::Error>> {
         let columns = self.panels.len().clamp(1, COLUMNS_MAX);
         let rows = self.panels.len().div_ceil(columns);
@@ -90,7 +90,9 @@ impl SmallMultiples<'_> {
         Ok(svg)
     }
 
-    /// - `outer`: whether it is leftmost, and lowest in its column: only there are numbers.
+    /// Draws a panel.
+    ///
+    /// - `outer`: whether it is leftmost, and lowest in its column. Only there it has tick labels.
     fn draw_panel<DB: DrawingBackend>(
         &self,
         place: &DrawingArea<DB, plotters::coord::Shift>,

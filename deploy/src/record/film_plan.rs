@@ -1,4 +1,4 @@
-//! What `envs_py/dmprl/film.py` is told, as one JSON object.
+//! Writes the input of `envs_py/dmprl/film.py`, as one JSON object.
 
 use std::path::{Path, PathBuf};
 
@@ -7,7 +7,7 @@ use serde::Serialize;
 
 use super::SideRecord;
 
-/// Frames a second where the environment does not say how long a step takes.
+/// Frames per second if the environment does not report the duration of a step.
 const RATE_UNKNOWN: f64 = 25.0;
 
 #[derive(Debug, Serialize)]

@@ -1,8 +1,8 @@
-//! Videos of a policy's episodes, of one run or of two side by side.
+//! Records videos of a policy's episodes, of one run or of two side by side.
 //!
-//! An observer for each run draws the episodes, then `envs_py/dmprl/film.py` makes video, animation
-//! and strip of the frames. Everything is made in a folder beside its place and moved there when it
-//! is whole.
+//! An observer for each run renders the episodes, then `envs_py/dmprl/film.py` makes video,
+//! animation and strip from the frames. All files are created in a temporary folder next to the
+//! output, and moved when they are complete.
 
 mod film_plan;
 
@@ -19,58 +19,58 @@ use crate::terminal::StagesProgress;
 
 use film_plan::write;
 
-/// What to record.
+/// Plan of a recording.
 pub struct RecordPlan<'a> {
-    /// The runs, side by side, and which policy of each.
+    /// The runs, side by side, with the policy of each.
     pub sides: Vec<(&'a RunDirectory, ChosenPolicy)>,
     /// Episode i is reset with seed `first_seed + i`.
     pub first_seed: u64,
-    /// How many, one after the other.
+    /// Number of episodes.
     pub episodes: u64,
-    /// Where the files go.
+    /// Output directory.
     pub output: PathBuf,
-    /// What observers are started with.
+    /// Program and environment of the observers.
     pub means: Means,
-    /// The interpreter that makes the video.
+    /// Python interpreter that makes the video.
     pub python: PathBuf,
 }
 
-/// What one side showed.
+/// Recording of one run.
 #[derive(Debug, Serialize)]
 pub struct SideRecord {
-    /// The run.
+    /// Run directory.
     pub run: PathBuf,
     /// Version of the policy.
     pub policy_version: u64,
-    /// What is written above the picture.
+    /// Title above the picture.
     #[serde(skip)]
     pub title: String,
-    /// What is known of the robot.
+    /// Description of the robot.
     #[serde(skip)]
     pub robot: Robot,
-    /// The episodes.
+    /// Recorded episodes.
     #[serde(skip)]
     pub episodes: Vec<RecordedEpisode>,
 }
 
-/// What was made.
+/// Result of a recording.
 #[derive(Debug, Serialize)]
 pub struct Recordings {
-    /// Whose.
+    /// Recordings of each run.
     pub sides: Vec<SideRecord>,
-    /// The video,
+    /// Path of the video.
     pub mp4: PathBuf,
-    /// the animation,
+    /// Path of the animation.
     pub gif: PathBuf,
-    /// and frames in a row.
+    /// Path of the strip of frames.
     pub strip: PathBuf,
 }
 
-/// Records; none when the user interrupted it.
+/// Records the episodes; returns `None` if the user interrupted it.
 ///
 /// # Errors
-/// Wrong use for runs that cannot be compared; an environment that cannot be drawn, for want of
-/// OpenGL too; what the file system refuses.
+/// Wrong use if the runs cannot be compared. An environment cannot be rendered, for instance
+/// without OpenGL. The file system fails.
 pub fn record(
     plan: &RecordPlan<'_>,
     progress: &StagesProgress,
@@ -121,7 +121,7 @@ pub fn record(
     Ok(Some(Recordings { sides, mp4, gif, strip }))
 }
 
-/// Draws the episodes of one side.
+/// Renders the episodes of one run.
 fn observe(
     plan: &RecordPlan<'_>,
     index: usize,
@@ -161,7 +161,8 @@ fn observe(
     Ok(Some(SideRecord { run, policy_version: chosen.version, title, robot, episodes }))
 }
 
-/// What tells the sides apart: the method, or the run's name where that is the same.
+/// Returns titles that distinguish the runs: the method, or the run's name if the methods are
+/// equal.
 fn titles(sides: &[(&RunDirectory, ChosenPolicy)]) -> anyhow::Result<Vec<String>> {
     let mut methods = Vec::new();
     for (run, _) in sides {
@@ -182,7 +183,7 @@ fn titles(sides: &[(&RunDirectory, ChosenPolicy)]) -> anyhow::Result<Vec<String>
     Ok(titled.collect())
 }
 
-/// A file's name that tells what it shows.
+/// Returns a file name that describes the recording.
 fn name(plan: &RecordPlan<'_>) -> String {
     let (_, chosen) = &plan.sides[0];
     let beside = plan.sides.iter().skip(1).map(|(run, chosen)| {

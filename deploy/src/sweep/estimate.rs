@@ -1,16 +1,16 @@
-//! How long a sweep will still take, from what its runs have taken so far.
+//! Estimates the remaining time of a sweep from the runs so far.
 
 use std::collections::BTreeMap;
 use std::time::Duration;
 
-/// Steps and seconds of the runs measured so far, by task and method: runs of the same kind cost
-/// about the same a step, runs of different kinds ten times as much.
+/// Steps and seconds of the runs measured so far, by task and method: the cost per step is similar
+/// for runs of the same kind, but differs tenfold between kinds.
 #[derive(Debug, Clone, Default)]
 pub(super) struct Estimate {
     measured: BTreeMap<(String, String), Cost>,
 }
 
-/// What has been measured.
+/// Measured steps and their duration.
 #[derive(Debug, Clone, Copy, Default)]
 struct Cost {
     env_steps: u64,
@@ -18,15 +18,15 @@ struct Cost {
 }
 
 impl Estimate {
-    /// So many steps of one kind took so long.
+    /// Adds a measurement: the steps of one kind of run and their duration.
     pub(super) fn add(&mut self, kind: (&str, &str), env_steps: u64, seconds: f64) {
         let cost = self.measured.entry((kind.0.to_owned(), kind.1.to_owned())).or_default();
         cost.env_steps += env_steps;
         cost.seconds += seconds;
     }
 
-    /// Seconds of a step: of the same task and method where there are any, else of the same
-    /// method, of the same task, of all.
+    /// Seconds per step: of the same task and method if measured, else of the same method, of the
+    /// same task, of all runs.
     fn seconds_per_step(&self, (task, method): (&str, &str)) -> Option<f64> {
         let of = |fits: &dyn Fn(&str, &str) -> bool| {
             let kinds = self.measured.iter().filter(|(kind, _)| fits(&kind.0, &kind.1));
@@ -42,8 +42,8 @@ impl Estimate {
             .or_else(|| of(&|_, _| true))
     }
 
-    /// Time until all of `left`, ((task, method), steps) each, are done by `jobs` side by side;
-    /// none before anything was measured.
+    /// Time until all runs in `left`, ((task, method), steps) each, are finished by `jobs` parallel
+    /// jobs; `None` before the first measurement.
     pub(super) fn remaining<'a>(
         &self,
         left: impl IntoIterator<Item = ((&'a str, &'a str), u64)>,
@@ -53,7 +53,7 @@ impl Estimate {
         for (kind, env_steps) in left {
             runs.push(env_steps as f64 * self.seconds_per_step(kind)?);
         }
-        // Neither before all are shared out evenly, nor before the longest is done.
+        // At least an even share of all work, and at least the longest run.
         let longest = runs.iter().copied().fold(0.0, f64::max);
         let even = runs.iter().sum::<f64>() / jobs.max(1) as f64;
         Duration::try_from_secs_f64(longest.max(even)).ok()

@@ -1,4 +1,4 @@
-//! The sweep file: TOML, strict.
+//! The sweep file: TOML, without unknown keys.
 
 use std::path::Path;
 
@@ -8,52 +8,52 @@ use toml::{Table, Value};
 use super::Search;
 use crate::failure::wrong_use;
 
-/// A sweep file is a few kilobytes.
+/// Size limit of a sweep file, which has a few kilobytes.
 const FILE_BYTES_MAX: u64 = 1 << 20;
 
-/// What to run: every task with every method, at every point of the grid or of a search, with every
+/// A sweep: every task with every method, at every point of the grid or of a search, with every
 /// seed.
 #[derive(Debug, Clone, PartialEq, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct SweepFile {
     /// `run.seed` of each repetition.
     pub seeds: Vec<i64>,
-    /// Configuration of every run.
+    /// Configuration of all runs.
     #[serde(default)]
     pub set: Table,
-    /// What is learned.
+    /// Tasks to learn.
     #[serde(rename = "task")]
     pub tasks: Vec<TaskEntry>,
-    /// How. None: the defaults of `train`.
+    /// Methods to use; if empty, the defaults of `train`.
     #[serde(rename = "method", default)]
     pub methods: Vec<MethodEntry>,
-    /// Configuration keys, each with the values that it takes in turn.
+    /// Configuration keys, each with its list of values.
     #[serde(default)]
     pub grid: Table,
-    /// Instead of the grid: keys whose values are searched for.
+    /// Search for values of keys, instead of the grid.
     pub search: Option<Search>,
 }
 
-/// One task.
+/// A task of the sweep.
 #[derive(Debug, Clone, PartialEq, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct TaskEntry {
-    /// As `train` takes it.
+    /// Name, as in `train TASK`.
     pub name: String,
     /// `run.steps` [environment steps].
     pub steps: Option<i64>,
-    /// Configuration of its runs, over that of all.
+    /// Configuration of its runs; overrides that of all runs.
     #[serde(default)]
     pub set: Table,
 }
 
-/// One method.
+/// A method of the sweep.
 #[derive(Debug, Clone, PartialEq, Default, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct MethodEntry {
     /// Part of the runs' paths.
     pub name: String,
-    /// What plots and tables say; the name where there is none.
+    /// Label in plots and tables; by default the name.
     pub label: Option<String>,
     /// As `train --algo`.
     pub algo: Option<String>,
@@ -61,7 +61,7 @@ pub struct MethodEntry {
     pub policy: Option<String>,
     /// As `train --preset`.
     pub preset: Option<String>,
-    /// Configuration of its runs, over that of the task.
+    /// Configuration of its runs; overrides that of the task.
     #[serde(default)]
     pub set: Table,
 }
@@ -70,7 +70,7 @@ impl SweepFile {
     /// Reads and checks a file.
     ///
     /// # Errors
-    /// Wrong use: no such file, no TOML, an unknown key, nothing to do, or a grid without values.
+    /// Wrong use: a missing file, invalid TOML, an unknown key, no runs, or a grid without values.
     pub fn read(path: &Path) -> anyhow::Result<(Self, String)> {
         let refused = |what: String| wrong_use(format!("sweep file {}: {what}", path.display()));
         let metadata = std::fs::metadata(path).map_err(|error| refused(error.to_string()))?;
@@ -94,7 +94,7 @@ impl SweepFile {
             file.methods.push(MethodEntry { name: "default".to_owned(), ..Default::default() });
         }
         if file.search.is_some() && !file.grid.is_empty() {
-            return Err("[grid] and [search] stand there both; expected one of them".to_owned());
+            return Err("[grid] and [search] exclude each other; expected one of them".to_owned());
         }
         for (key, values) in flatten(&file.grid) {
             if values.as_array().is_none_or(Vec::is_empty) {
@@ -105,8 +105,8 @@ impl SweepFile {
     }
 }
 
-/// The leaves of a tree of tables with their dotted keys: `[set.algorithm] batch_size = 64` and
-/// `"algorithm.batch_size" = 64` say the same.
+/// Returns the leaves of nested tables with their dotted keys: `[set.algorithm] batch_size = 64`
+/// and `"algorithm.batch_size" = 64` are equivalent.
 pub(crate) fn flatten(table: &Table) -> Vec<(String, Value)> {
     let mut leaves = Vec::new();
     for (key, value) in table {

@@ -1,4 +1,4 @@
-//! `finished.jsonl`: which runs of a sweep have finished, and how long each took.
+//! `finished.jsonl`: the finished runs of a sweep, and the duration of each.
 
 use std::fs::{File, OpenOptions};
 use std::io::{Read, Write};
@@ -7,36 +7,36 @@ use std::path::{Path, PathBuf};
 use anyhow::Context;
 use serde::{Deserialize, Serialize};
 
-/// A run that has come to its end.
+/// A finished run.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Finished {
-    /// Its directory, below the sweep's.
+    /// Its directory, relative to the sweep's.
     pub run: PathBuf,
-    /// Environment steps that it was asked for.
+    /// Configured number of environment steps.
     pub steps: u64,
-    /// Those it took: a run that reaches its goal ends sooner.
+    /// Actual number of environment steps, which is lower if the run reached its goal.
     pub env_steps: u64,
-    /// Of training, over all its sessions \[s\].
+    /// Training time over all its sessions \[s\].
     pub wall_s: f64,
-    /// Whether it came to its end or was given up.
+    /// Whether it finished or was pruned.
     #[serde(default, skip_serializing_if = "End::is_finished")]
     pub state: End,
 }
 
-/// How a run came to its end.
+/// How a run ended.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum End {
-    /// All its steps are done, or it reached what it was to reach.
+    /// It completed its steps or reached its goal.
     #[default]
     Finished,
-    /// A search has given its trial up.
+    /// A search has pruned its trial.
     Pruned,
 }
 
 impl End {
-    /// Whether it has come to its own end.
+    /// Returns true if the run finished by itself.
     #[must_use]
     pub fn is_finished(&self) -> bool {
         *self == Self::Finished
@@ -44,14 +44,14 @@ impl End {
 }
 
 impl Finished {
-    /// Whether it is all that a run of so many steps is asked for.
+    /// Returns true if the run finished with at least this number of configured steps.
     #[must_use]
     pub fn is_whole(&self, steps: u64) -> bool {
         self.state.is_finished() && self.steps >= steps
     }
 }
 
-/// The file and what it says.
+/// The file and its entries.
 #[derive(Debug)]
 pub struct Ledger {
     path: PathBuf,
@@ -59,11 +59,11 @@ pub struct Ledger {
 }
 
 impl Ledger {
-    /// Reads the ledger of a sweep's directory; there may be none yet. A last line that a kill has
-    /// torn is no entry.
+    /// Reads the ledger of a sweep's directory, if it exists. An incomplete last line, left by a
+    /// kill, is ignored.
     ///
     /// # Errors
-    /// A whole line is no entry, or the file system refuses.
+    /// A complete line is invalid, or the file system fails.
     pub fn open(sweep: &Path) -> anyhow::Result<Self> {
         let path = sweep.join("finished.jsonl");
         let mut text = String::new();
@@ -86,16 +86,16 @@ impl Ledger {
         Ok(Self { path, finished })
     }
 
-    /// The entry of a run; of several the newest, as one that was made longer has two.
+    /// Returns the newest entry of a run, which has several if it was extended.
     #[must_use]
     pub fn of(&self, run: &Path) -> Option<&Finished> {
         self.finished.iter().rev().find(|finished| finished.run == run)
     }
 
-    /// Adds an entry, on disk first.
+    /// Adds an entry, first on disk.
     ///
     /// # Errors
-    /// What the file system refuses.
+    /// The file system fails.
     pub fn add(&mut self, finished: Finished) -> anyhow::Result<()> {
         let write = || -> anyhow::Result<()> {
             let mut file =
@@ -103,7 +103,7 @@ impl Ledger {
             let mut text = Vec::new();
             file.read_to_end(&mut text)?;
             if text.last().is_some_and(|&byte| byte != b'\n') {
-                // Torn by a kill.
+                // An incomplete line, left by a kill.
                 let whole = text.iter().rposition(|&byte| byte == b'\n').map_or(0, |end| end + 1);
                 file.set_len(whole as u64)?;
             }

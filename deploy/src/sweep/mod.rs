@@ -1,14 +1,13 @@
-//! `dmprl sweep`: many runs from one file, side by side within the machine's cores.
+//! `dmprl sweep`: trains many runs from one file, in parallel within the machine's cores.
 //!
 //! ```text
 //!  FILE ─► plan: tasks × methods × grid × seeds ─► runner ─┬─ dmprl train, in OUTPUT/TASK/METHOD/
 //!                         ▲                                └─ dmprl resume, where one was stopped
 //!                     ledger: what has finished, and how long it took
 //! ```
-//! Each run is a `dmprl train` of its own, with the arguments that a person would type; nothing of
-//! a run depends on the sweep around it. What has finished stands in `finished.jsonl`: a sweep that
-//! was killed goes on where it was. With `[search]` instead of a grid, `search` takes the place of
-//! plan and runner.
+//! Each run is a separate `dmprl train`, with the arguments that a user would type, and does not
+//! depend on the sweep. Finished runs are recorded in `finished.jsonl`, so a killed sweep continues
+//! where it stopped. With `[search]` instead of a grid, `search` replaces plan and runner.
 
 mod estimate;
 mod file;

@@ -1,4 +1,4 @@
-//! From the sweep file to single runs.
+//! Expands a sweep file into single runs.
 
 use std::collections::BTreeSet;
 use std::path::PathBuf;
@@ -10,7 +10,7 @@ use super::file::{MethodEntry, TaskEntry, flatten};
 use crate::failure::wrong_use;
 use crate::run_directory::safe_name;
 
-/// More is a mistake in the file.
+/// Maximum number of runs. More is a mistake in the file.
 const RUNS_MAX: usize = 10_000;
 
 /// One run of a sweep.
@@ -20,18 +20,18 @@ pub struct PlannedRun {
     pub task: String,
     /// The method's label.
     pub method: String,
-    /// Where on the grid: `key=value` each.
+    /// Point of the grid, as `key=value` pairs.
     pub point: Vec<String>,
     /// `run.seed`.
     pub seed: i64,
-    /// The run directory, below the sweep's.
+    /// Run directory, relative to the sweep's.
     pub directory: PathBuf,
-    /// What `dmprl train` is given, the run directory aside.
+    /// Arguments of `dmprl train`, without the run directory.
     pub arguments: Vec<String>,
 }
 
 impl PlannedRun {
-    /// The run in a line.
+    /// One-line title of the run.
     #[must_use]
     pub fn title(&self) -> String {
         let point = self.point.iter().map(|value| format!(" · {value}")).collect::<String>();
@@ -39,19 +39,19 @@ impl PlannedRun {
     }
 }
 
-/// Every run, in the order in which they are started: seed by seed, so that each method has a
-/// first result early.
+/// All runs in the order of their start: seed by seed, so that each method has a first result
+/// early.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Plan {
-    /// The runs.
+    /// Runs in the order of their start.
     pub runs: Vec<PlannedRun>,
 }
 
 impl Plan {
-    /// Tasks × methods × grid × seeds.
+    /// Combines tasks × methods × grid × seeds.
     ///
     /// # Errors
-    /// Wrong use: too many runs, or two of them in the same place.
+    /// Wrong use: too many runs, or two of them with the same directory.
     pub fn new(file: &SweepFile) -> anyhow::Result<Self> {
         let points = points(file);
         let per_seed = file.tasks.len() * file.methods.len();
@@ -83,7 +83,7 @@ impl Plan {
 
 type Point = Vec<(String, Value)>;
 
-/// Every combination of the grid's values; one that is empty where there is no grid.
+/// Returns every combination of the grid's values; without a grid, a single empty one.
 fn points(file: &SweepFile) -> Vec<Point> {
     let mut points: Vec<Point> = vec![Vec::new()];
     for (key, values) in flatten(&file.grid) {
@@ -130,7 +130,7 @@ fn planned(
     }
 }
 
-/// What `dmprl train` is given, seed and run directory aside.
+/// Arguments of `dmprl train`, without seed and run directory.
 pub(super) fn arguments(
     file: &SweepFile,
     (task, method): (&TaskEntry, &MethodEntry),
@@ -150,7 +150,7 @@ pub(super) fn arguments(
     arguments
 }
 
-/// Where the runs of a task by a method lie, below the sweep's directory.
+/// Directory of the runs of a task with a method, relative to the sweep's.
 pub(super) fn method_directory(task: &TaskEntry, method: &MethodEntry) -> PathBuf {
     PathBuf::from(safe_name(&task.name)).join(safe_name(&method.name))
 }

@@ -1,4 +1,4 @@
-//! One run of a sweep: its directory, and the process that trains it.
+//! One run of a sweep: its directory and its process.
 
 use std::collections::BTreeMap;
 use std::fs::{File, OpenOptions};
@@ -18,42 +18,42 @@ use crate::launch::{describe, last_lines};
 use crate::run_directory::{RunDirectory, replace_file};
 use crate::terminal::shown;
 
-/// Where a sweep is made, and by what.
+/// Location and program of a sweep.
 #[derive(Debug, Clone)]
 pub struct Site {
-    /// The program that trains: this one.
+    /// Program that trains: this one.
     pub program: PathBuf,
-    /// Where everything goes.
+    /// Output directory of the sweep.
     pub output: PathBuf,
     /// The sweep file's text.
     pub text: String,
 }
 
-/// How far a run is.
+/// Progress of a run.
 #[derive(Debug, Clone, PartialEq)]
 pub enum RunState {
-    /// Not begun, or stopped at so many environment steps.
+    /// Not started, or stopped.
     Open {
-        /// In its newest checkpoint.
+        /// Environment steps in its newest checkpoint.
         env_steps: u64,
     },
-    /// At its end.
+    /// Completed.
     Finished,
     /// It ended with an error.
     Failed {
-        /// Why, with the last lines of its log.
+        /// Reason, with the last lines of its log.
         reason: String,
     },
 }
 
 impl Site {
-    /// Leaves the sweep's file for the report: what was asked for last. Only once all that lies
-    /// here is known to be of it, since the report calls the runs what the file calls them.
+    /// Copies the sweep file into the output directory for the report. Called only after all runs
+    /// there have been checked against it, because the report takes their names from the file.
     pub(super) fn keep_file(&self) -> anyhow::Result<()> {
         replace_file(&self.output.join("sweep.toml"), self.text.as_bytes())
     }
 
-    /// How far a run is, by what lies in its directory.
+    /// Returns the progress of a run from the files in its directory.
     pub(super) fn state(
         &self,
         ledger: &Ledger,
@@ -66,7 +66,7 @@ impl Site {
         }
         let directory = RunDirectory::open(&path)?;
         let mut found = directory.config()?;
-        // The one thing that may be asked for later.
+        // The only key that may be changed later.
         found.run.steps = config.run.steps;
         check_same(&path, config, &found)?;
         if ledger.of(&run.directory).is_some_and(|done| done.is_whole(config.run.steps)) {
@@ -77,25 +77,25 @@ impl Site {
         Ok(RunState::Open { env_steps })
     }
 
-    /// Environment steps by the newest line of its metrics; a run that cannot be read has none.
+    /// Environment steps in the newest line of its metrics; 0 if the run cannot be read.
     pub(super) fn reached(&self, run: &PlannedRun) -> u64 {
         let directory = RunDirectory::open(&self.output.join(&run.directory));
         directory.and_then(|directory| directory.measured_steps()).ok().flatten().unwrap_or(0)
     }
 
-    /// Its evaluations, oldest first; none before its directory is whole.
+    /// Evaluations of the run, oldest first; empty while its directory is incomplete.
     pub(super) fn evaluations(&self, run: &PlannedRun) -> anyhow::Result<Vec<EvaluationRow>> {
         let path = self.output.join(&run.directory);
         if is_whole(&path) { RunDirectory::open(&path)?.evaluations() } else { Ok(Vec::new()) }
     }
 
-    /// Seconds of training and the last evaluation of a run that has ended.
+    /// Returns the training time in seconds and the last evaluation of a finished run.
     pub(super) fn ended(&self, run: &PlannedRun) -> anyhow::Result<(f64, Option<EvaluationRow>)> {
         let directory = RunDirectory::open(&self.output.join(&run.directory))?;
         Ok((directory.wall_s_before()?, directory.latest_row()?))
     }
 
-    /// Why a run's process failed, with the last lines of its log.
+    /// Describes the failure of a run's process, with the last lines of its log.
     pub(super) fn failure(&self, run: &PlannedRun, status: ExitStatus) -> String {
         let log = self.log_path(run);
         format!("{}; {}:\n{}", describe(status), shown(&log), last_lines(&log))
@@ -107,7 +107,7 @@ impl Site {
         self.output.join("logs").join(format!("{}.log", name.join("-")))
     }
 
-    /// Begins a run, or goes on with it.
+    /// Starts or resumes a run.
     pub(super) fn start(
         &self,
         run: &PlannedRun,
@@ -131,50 +131,52 @@ impl Site {
     }
 }
 
-/// A child that gets no signals of the terminal's, and an interrupt when this process dies.
+/// Prepares a child that ignores the terminal's signals and receives SIGTERM when this process
+/// dies.
 pub(super) fn guarded(mut command: std::process::Command) -> Command {
-    // Our own interrupts go on to it; the terminal's would reach it a second time.
+    // This process forwards interrupts; the terminal's would reach the child a second time.
     std::os::unix::process::CommandExt::process_group(&mut command, 0);
     let mut command = Command::from(command);
     // SAFETY: `prctl` is async-signal-safe, allocates nothing and touches no lock.
     unsafe {
         command.pre_exec(|| {
-            // A sweep that is killed interrupts its runs: they write a checkpoint.
+            // If the sweep is killed, its runs are interrupted and write a checkpoint.
             rustix::process::set_parent_process_death_signal(Some(Signal::TERM)).map_err(Into::into)
         });
     }
     command
 }
 
-/// A run's process.
+/// The process of a run.
 pub(super) struct RunProcess {
     pub(super) child: Child,
     started: Instant,
-    /// Where it began.
+    /// Environment steps at its start.
     pub(super) env_steps: u64,
 }
 
 impl RunProcess {
-    /// Environment steps since its start and the seconds that they took, start-up and all: what
-    /// another run will take too.
+    /// Returns the environment steps since its start and their duration in seconds. The start-up
+    /// time is included, since another run will need it too.
     pub(super) fn measured(&self, reached: u64) -> (u64, f64) {
         (reached.saturating_sub(self.env_steps), self.started.elapsed().as_secs_f64())
     }
 
-    /// Once: it writes a checkpoint and ends; twice: it ends at once.
+    /// Interrupts the run: the first time it writes a checkpoint and exits; the second time it
+    /// exits at once.
     pub(super) fn interrupt(&self) {
         let id = self.child.id().and_then(|id| i32::try_from(id).ok()).and_then(Pid::from_raw);
-        // One that has ended meanwhile needs none.
+        // Fails if the process has exited meanwhile, which is fine.
         let _ = id.map(|id| kill_process(id, Signal::INT));
     }
 }
 
-/// Whether a run directory was made to its end: the manifest comes last.
+/// Returns true if a run directory is complete: the manifest is written last.
 fn is_whole(path: &Path) -> bool {
     path.join("manifest.json").is_file()
 }
 
-/// Results of two configurations must not stand in one table under one name.
+/// Rejects a run with another configuration: a table must not mix their results under one name.
 fn check_same(
     path: &Path,
     expected: &ExperimentConfig,
@@ -197,7 +199,7 @@ fn check_same(
     )
 }
 
-/// A directory whose making was cut short is nobody's run; what is in it stays, under another name.
+/// Renames a run directory whose creation was interrupted. Its content is kept.
 fn set_aside(path: &Path) -> anyhow::Result<()> {
     let name = |number: u32| path.with_extension(format!("unfinished-{number}"));
     let free = (0..).map(name).find(|name| !name.exists());
@@ -205,7 +207,7 @@ fn set_aside(path: &Path) -> anyhow::Result<()> {
     std::fs::rename(path, &aside).with_context(|| format!("cannot rename {}", path.display()))
 }
 
-/// A log that outlives this start.
+/// Opens a log for appending, so that it keeps the output of earlier starts.
 pub(super) fn open_log(path: &Path) -> anyhow::Result<File> {
     if let Some(folder) = path.parent() {
         std::fs::create_dir_all(folder)
@@ -215,7 +217,7 @@ pub(super) fn open_log(path: &Path) -> anyhow::Result<File> {
     file.with_context(|| format!("cannot open {}", path.display()))
 }
 
-/// An evaluation in a few words.
+/// Short description of an evaluation.
 pub(super) fn result(row: &EvaluationRow) -> String {
     let success =
         row.success_rate.map(|rate| format!(", success {:.0} %", rate * 100.0)).unwrap_or_default();

@@ -1,4 +1,4 @@
-//! Runs what a plan asks for, so many at once, until all is done or the user stops it.
+//! Trains the runs of a plan, several in parallel, until all have finished or the user stops it.
 
 use std::process::ExitStatus;
 use std::time::Duration;
@@ -13,46 +13,46 @@ use super::{End, Finished, Ledger, PlannedRun, RunState, Site};
 use crate::launch::interrupts;
 use crate::terminal::SweepProgress;
 
-/// Between two looks at how far the running ones are.
+/// Interval between checks of the progress of running runs.
 pub(super) const LOOK: Duration = Duration::from_secs(2);
-/// Between two looks whether a child has ended.
+/// Interval between checks for exited children.
 pub(super) const END_LOOK: Duration = Duration::from_millis(100);
 
-/// What to do.
+/// A sweep to run.
 pub struct Sweep {
-    /// Where it is made.
+    /// Location of the sweep.
     pub site: Site,
-    /// The runs, each with the configuration that it is to have.
+    /// Runs with their expected configurations.
     pub runs: Vec<(PlannedRun, ExperimentConfig)>,
-    /// Runs at once.
+    /// Number of parallel runs.
     pub jobs: usize,
-    /// How far the run in a directory may have come.
+    /// The finished runs in the output directory.
     pub ledger: Ledger,
 }
 
-/// How a sweep ended.
+/// Result of a sweep.
 #[derive(Debug)]
 pub struct SweepReport {
-    /// Of each run, in the plan's order.
+    /// State of each run, in the plan's order.
     pub states: Vec<RunState>,
-    /// Whether the user stopped it.
+    /// True if the user stopped it.
     pub interrupted: bool,
 }
 
-/// How far each run of a plan is, by what lies in the sweep's directory.
+/// Returns the progress of each run of a plan from the files in the sweep's directory.
 ///
 /// # Errors
-/// A run directory is of another configuration, or cannot be read.
+/// A run directory has another configuration, or cannot be read.
 pub fn states(sweep: &Sweep) -> anyhow::Result<Vec<RunState>> {
     let state = |(run, config): &_| sweep.site.state(&sweep.ledger, run, config);
     sweep.runs.iter().map(state).collect()
 }
 
-/// Does what is open.
+/// Trains all unfinished runs.
 ///
 /// # Errors
-/// A run directory is of another configuration, or the ledger cannot be written. A run that fails
-/// is no error of the sweep's: it goes on with the others.
+/// A run directory has another configuration, or the ledger cannot be written. A failed run is no
+/// error of the sweep, which continues with the others.
 pub fn sweep(sweep: &mut Sweep) -> anyhow::Result<SweepReport> {
     let states = states(sweep)?;
     sweep.site.keep_file()?;
@@ -66,7 +66,7 @@ pub fn sweep(sweep: &mut Sweep) -> anyhow::Result<SweepReport> {
     })
 }
 
-/// A run under way.
+/// A running run.
 struct Job {
     index: usize,
     process: RunProcess,
@@ -75,7 +75,7 @@ struct Job {
 struct Runner<'a> {
     sweep: &'a mut Sweep,
     states: Vec<RunState>,
-    /// Those to be started, the next last.
+    /// Runs that have not started, in reverse order.
     waiting: Vec<usize>,
     jobs: Vec<Job>,
     estimate: Estimate,
@@ -118,7 +118,8 @@ impl<'a> Runner<'a> {
         Ok(SweepReport { states: self.states, interrupted: self.interrupts > 0 })
     }
 
-    /// Each interrupt goes on to the runs: once, they write a checkpoint; twice, they end at once.
+    /// Forwards each interrupt to the runs: on the first they write a checkpoint, on the second
+    /// they exit at once.
     fn on_interrupt(&mut self) {
         self.interrupts += 1;
         if self.interrupts == 1 {
@@ -164,7 +165,7 @@ impl<'a> Runner<'a> {
         let (run, config) = self.sweep.runs[job.index].clone();
         if !status.success() {
             if self.interrupts > 0 {
-                // It has come further, if it wrote its checkpoint.
+                // The run has progressed if it wrote its checkpoint.
                 if let Ok(state) = self.sweep.site.state(&self.sweep.ledger, &run, &config) {
                     self.states[job.index] = state;
                 }
@@ -203,7 +204,7 @@ impl<'a> Runner<'a> {
         self.progress.ended(remaining);
     }
 
-    /// How long the rest will take.
+    /// Estimates the remaining time.
     fn remaining(&self) -> Option<Duration> {
         let mut estimate = self.estimate.clone();
         let mut left = Vec::new();

@@ -6,12 +6,12 @@ use std::path::Path;
 
 use prost::Message;
 
-/// `SessionLog.SessionStatus` START: whoever reads forgets what came at or after its step.
+/// `SessionLog.SessionStatus` START: readers drop earlier events at or after its step.
 const START: i32 = 1;
-/// Of the checksums, as TFRecord has it.
+/// Mask of the checksums in TFRecord.
 const MASK: u32 = 0xa282_ead8;
 
-/// A record.
+/// One record of an event file.
 #[derive(Clone, PartialEq, Message)]
 struct Event {
     #[prost(double, tag = "1")]
@@ -52,11 +52,11 @@ struct SessionLog {
     status: i32,
 }
 
-/// An event file that is being written.
+/// An event file, opened for writing.
 pub(super) struct EventFile(BufWriter<File>);
 
 impl EventFile {
-    /// Begins one.
+    /// Creates a file with its header.
     pub(super) fn create(path: &Path, wall_time: f64) -> std::io::Result<Self> {
         let mut file = Self(BufWriter::new(File::create(path)?));
         let version = What::FileVersion("brain.Event:2".into());
@@ -66,7 +66,7 @@ impl EventFile {
         Ok(file)
     }
 
-    /// Numbers of one moment, by tag.
+    /// Writes scalars of one step, by tag.
     pub(super) fn scalars(
         &mut self,
         wall_time: f64,
@@ -99,7 +99,7 @@ fn masked(bytes: &[u8]) -> u32 {
     crc32c::crc32c(bytes).rotate_right(15).wrapping_add(MASK)
 }
 
-/// (tag, step, number) of every scalar of a file whose checksums are right.
+/// Returns (tag, step, number) of every scalar of a file, after verifying the checksums.
 #[cfg(test)]
 pub(super) fn scalars_of(mut bytes: &[u8]) -> Vec<(String, i64, f32)> {
     let mut scalars = Vec::new();

@@ -1,9 +1,9 @@
-//! `RUN/tensorboard/`: the lines of `metrics.jsonl` and `evaluations.jsonl` once more, as an event
-//! file that TensorBoard and all that read its files understand.
+//! `RUN/tensorboard/`: mirrors `metrics.jsonl` and `evaluations.jsonl` as an event file for
+//! TensorBoard and compatible tools.
 //!
-//! The JSON lines are the truth and this is their mirror: whatever writes or rewinds them, in this
-//! process or another, the mirror follows, and where they were replaced it begins again. Tags are
-//! `training/` and `evaluation/` with the lines' own keys; the step is `env_steps`.
+//! The JSON lines are authoritative. The mirror follows them, no matter which process writes or
+//! rewinds them, and starts anew if they were replaced. Tags are `training/` and `evaluation/` with
+//! the lines' own keys; the step is `env_steps`.
 
 mod events;
 
@@ -22,26 +22,26 @@ use crate::run_directory::{RunDirectory, unix_s};
 use crate::terminal::say;
 use events::EventFile;
 
-/// Between two looks for new lines.
+/// Interval between checks for new lines.
 const LOOK: Duration = Duration::from_secs(2);
-/// Of new lines, at most so much is read at a time.
+/// Maximum number of bytes per read.
 const READ_BYTES_MAX: u64 = 64 << 20;
-/// The folder in the run directory.
+/// Folder in the run directory.
 const FOLDER: &str = "tensorboard";
-/// The step of a line.
+/// Key of a line's step.
 const STEP: &str = "env_steps";
-/// When a line was written, in seconds of training.
+/// Key of a line's training time in seconds.
 const WALL: &str = "wall_s";
 
-/// Follows a run's lines in a thread of its own, from [`Mirror::start`] until it is dropped, which
-/// waits for the last lines.
+/// Mirrors a run's lines in a thread of its own. Dropping it waits until the last lines have been
+/// written.
 pub struct Mirror {
     stop: Option<Sender<()>>,
     thread: Option<JoinHandle<()>>,
 }
 
 impl Mirror {
-    /// Begins. What cannot be written is told once; a mirror is no reason for a run to fail.
+    /// Starts the thread. An error is reported once and does not fail the run.
     #[must_use]
     pub fn start(run: &RunDirectory) -> Self {
         let (stop, stopped) = mpsc::channel::<()>();
@@ -65,11 +65,11 @@ impl Mirror {
 
 impl Drop for Mirror {
     fn drop(&mut self) {
-        // The thread sees it as the end and looks for a last time: its work is bounded by the lines
-        // that are there.
+        // Disconnecting stops the thread after a last check. Its work is bounded by the lines
+        // present.
         drop(self.stop.take());
         if let Some(thread) = self.thread.take() {
-            // It does not panic; if it did, there is nothing to be done about a mirror.
+            // The thread does not panic; if it did, the run would still not depend on it.
             let _ = thread.join();
         }
     }
@@ -80,21 +80,21 @@ pub struct Writer {
     folder: PathBuf,
     sources: [Source; 2],
     file: Option<(EventFile, PathBuf)>,
-    /// Unix time at which the run's seconds of training began, seen from now.
+    /// Unix time at which the run's training time began, computed from the current time.
     origin: f64,
 }
 
 struct Source {
     path: PathBuf,
     prefix: &'static str,
-    /// The file's identity, and how much of it was read.
+    /// Inode of the file, and number of bytes read.
     inode: u64,
     offset: u64,
     was_replaced: bool,
 }
 
 impl Writer {
-    /// For a run; nothing is written yet.
+    /// Creates the writer without writing anything.
     #[must_use]
     pub fn new(run: &RunDirectory) -> Self {
         let source =
@@ -111,15 +111,15 @@ impl Writer {
         }
     }
 
-    /// Takes over the lines that are new.
+    /// Copies new lines.
     ///
     /// # Errors
-    /// The file system refuses, or a whole line is no JSON object.
+    /// The file system fails, or a complete line is no JSON object.
     pub fn follow(&mut self) -> anyhow::Result<()> {
         for index in 0..self.sources.len() {
             while let Some(lines) = self.sources[index].new_lines()? {
                 if self.sources[index].was_replaced {
-                    // All of both, into a new file.
+                    // Copy both files completely into a new one.
                     self.file = None;
                     self.sources.iter_mut().for_each(Source::begin_again);
                     return self.follow();
@@ -139,7 +139,7 @@ impl Writer {
         let (path, prefix) = (self.sources[index].path.clone(), self.sources[index].prefix);
         for line in lines.split(|&byte| byte == b'\n').filter(|line| !line.is_empty()) {
             let line: Value = serde_json::from_slice(line)
-                .with_context(|| format!("{}: a line is no JSON", path.display()))?;
+                .with_context(|| format!("{}: a line is not JSON", path.display()))?;
             self.write(&line, prefix)?;
         }
         Ok(())
@@ -165,15 +165,15 @@ impl Source {
         self.was_replaced = false;
     }
 
-    /// The next whole lines that were not read yet; none when there are no more for now. Notes if
-    /// what was read is not what lies there now: a resume has gone back.
+    /// Returns the next complete unread lines; `None` if there are none. Detects that the file was
+    /// replaced, which a resume does.
     fn new_lines(&mut self) -> anyhow::Result<Option<Vec<u8>>> {
         let cannot = || format!("cannot read {}", self.path.display());
         let mut file = match File::open(&self.path) {
             Err(error) if error.kind() == std::io::ErrorKind::NotFound => return Ok(None),
             file => file.with_context(cannot)?,
         };
-        // Of the file that is open: another may take its name at any moment.
+        // Metadata of the open file, because another file may take its name at any time.
         let now = file.metadata().with_context(cannot)?;
         if self.offset > 0 && (now.ino() != self.inode || now.len() < self.offset) {
             self.was_replaced = true;
@@ -184,7 +184,7 @@ impl Source {
         file.seek(SeekFrom::Start(self.offset))
             .and_then(|_| file.take(READ_BYTES_MAX).read_to_end(&mut lines))
             .with_context(cannot)?;
-        // One that is being written comes whole the next time.
+        // An incomplete line is read the next time.
         let whole = lines.iter().rposition(|&byte| byte == b'\n').map_or(0, |at| at + 1);
         lines.truncate(whole);
         self.offset += whole as u64;
@@ -192,7 +192,7 @@ impl Source {
     }
 }
 
-/// A new file, in the place of those of earlier sessions: all their lines are in it.
+/// Creates a new file that replaces those of earlier sessions, whose lines it will contain.
 fn begin(folder: &Path, wall_time: f64) -> anyhow::Result<(EventFile, PathBuf)> {
     let refused = || format!("cannot make event files in {}", folder.display());
     std::fs::create_dir_all(folder).with_context(refused)?;
@@ -203,7 +203,7 @@ fn begin(folder: &Path, wall_time: f64) -> anyhow::Result<(EventFile, PathBuf)> 
         .map(|entry| entry.path())
         .filter(|path| path.to_string_lossy().contains("events.out.tfevents."))
         .collect();
-    // Whoever reads takes files in the order of their names.
+    // Readers process files in the order of their names.
     let now = (unix_s() * 1e9) as u64;
     let path = folder.join(format!("events.out.tfevents.{now}.{}", std::process::id()));
     let file = EventFile::create(&path, wall_time).with_context(refused)?;
@@ -213,7 +213,7 @@ fn begin(folder: &Path, wall_time: f64) -> anyhow::Result<(EventFile, PathBuf)> 
     Ok((file, path))
 }
 
-/// Every number of an object, also of objects in it, by its path.
+/// Collects every number of an object and of nested objects, by its path.
 fn flatten(value: &Value, tag: &str, scalars: &mut Vec<(String, f64)>) {
     match value {
         Value::Object(entries) => {
@@ -223,7 +223,7 @@ fn flatten(value: &Value, tag: &str, scalars: &mut Vec<(String, f64)>) {
             }
         }
         Value::Number(number) => scalars.extend(number.as_f64().map(|n| (tag.to_owned(), n))),
-        // Lists (an evaluation's returns) and what was not measured.
+        // Skips lists (an evaluation's returns) and null.
         _ => {}
     }
 }

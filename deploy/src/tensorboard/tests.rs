@@ -1,4 +1,5 @@
-//! The mirror against the lines. TensorBoard's own reader judges it in `envs_py/tests_extras`.
+//! Compares the mirror with the lines. `envs_py/tests_extras` checks it with TensorBoard's own
+//! reader.
 
 use std::fs::OpenOptions;
 use std::io::Write;
@@ -19,7 +20,7 @@ fn add(path: &Path, text: &str) {
     file.write_all(text.as_bytes()).unwrap();
 }
 
-/// (tag, step, number) of every scalar in the one event file, in its order.
+/// Returns (tag, step, number) of every scalar in the only event file, in order.
 fn mirrored(run: &RunDirectory) -> Vec<(String, i64, f32)> {
     let files: Vec<_> = run.path().join(FOLDER).read_dir().unwrap().flatten().collect();
     assert_eq!(files.len(), 1, "{files:?}");
@@ -67,8 +68,8 @@ fn a_resume_that_goes_back_leaves_nothing_of_what_it_took_back() {
         add(&run.metrics_path(), &line(step, 0.5));
     }
     writer.follow().unwrap();
-    // A learner that died comes back from its checkpoint while the mirror goes on, and the file is
-    // soon longer than it was.
+    // A restarted learner rewinds to its checkpoint while the mirror is running, and the file soon
+    // grows beyond its old length.
     run.rewind(1).unwrap();
     for step in [2, 3, 4] {
         add(&run.metrics_path(), &line(step, 0.25));
@@ -76,7 +77,7 @@ fn a_resume_that_goes_back_leaves_nothing_of_what_it_took_back() {
     writer.follow().unwrap();
     assert_eq!(mirrored(&run), expected(&[(1, 0.5), (2, 0.25), (3, 0.25), (4, 0.25)]));
 
-    // The next session begins with all that there is.
+    // The next session starts with all existing lines.
     let mut next = Writer::new(&run);
     run.rewind(2).unwrap();
     next.follow().unwrap();

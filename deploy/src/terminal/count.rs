@@ -1,4 +1,4 @@
-//! Progress through a known number of things: a bar in a terminal, a line now and then elsewhere.
+//! Progress through a known number of items: a bar in a terminal, occasional lines elsewhere.
 
 use std::cell::Cell;
 use std::io::IsTerminal;
@@ -8,12 +8,12 @@ use indicatif::{ProgressBar, ProgressStyle};
 
 use super::say;
 
-/// Between two lines where there is no terminal.
+/// Interval between two lines without a terminal.
 const LINE_EVERY: Duration = Duration::from_secs(10);
-/// Between two redraws.
+/// Interval between two redraws.
 const REDRAW_EVERY: Duration = Duration::from_millis(200);
 
-/// Shows how many are done and which one it is.
+/// Shows the number of completed items and the current one.
 pub struct CountProgress {
     bar: Option<ProgressBar>,
     what: &'static str,
@@ -22,13 +22,13 @@ pub struct CountProgress {
 }
 
 impl CountProgress {
-    /// On standard error.
+    /// Creates the display on standard error.
     #[must_use]
     pub fn new(what: &'static str, count: u64) -> Self {
         let bar = std::io::stderr().is_terminal().then(|| {
             let bar = ProgressBar::new(count);
             let template = "{spinner:.cyan} {bar:20.cyan/dim} {pos}/{len} {wide_msg}";
-            // The template is a constant; were it wrong, indicatif's own would do.
+            // The template is a constant; if it were invalid, indicatif's default would be used.
             if let Ok(style) = ProgressStyle::with_template(template) {
                 bar.set_style(style.progress_chars("━━╌"));
             }
@@ -38,7 +38,7 @@ impl CountProgress {
         Self { bar, what, count, told: Cell::new(None) }
     }
 
-    /// The one that begins, from 0.
+    /// Shows the item that begins, counted from 0.
     pub fn at(&self, index: u64, name: &str) {
         if let Some(bar) = &self.bar {
             bar.set_position(index);

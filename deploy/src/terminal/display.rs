@@ -1,5 +1,4 @@
-//! Progress while a run goes on: a bar with a panel below it in a terminal, a line every few
-//! seconds elsewhere.
+//! Progress of a run: a bar with a panel below it in a terminal, periodic lines elsewhere.
 
 use std::io::{IsTerminal, Write};
 use std::time::{Duration, Instant};
@@ -12,39 +11,39 @@ use super::panel::{
 };
 use crate::control::{EvaluationRow, Progress};
 
-/// Between two plain lines.
+/// Interval between two plain lines.
 const LINE_EVERY: Duration = Duration::from_secs(5);
-/// Between two redraws of the bar while nothing is reported.
+/// Interval between two redraws of the bar without new reports.
 const REDRAW_EVERY: Duration = Duration::from_millis(200);
-/// Bar, percentage and the blanks around them.
+/// Columns of the bar, the percentage and the spaces around them.
 const BAR_COLUMNS: usize = 27;
 
-/// Bar or lines.
+/// Style of the progress.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum ProgressStyle {
-    /// A bar when standard error is a terminal.
+    /// A bar if standard error is a terminal.
     Automatic,
-    /// Lines, always.
+    /// Always lines.
     Lines,
 }
 
 impl ProgressStyle {
-    /// What `--no-progress` means.
+    /// The style for the flag `--no-progress`.
     #[must_use]
     pub fn from_flag(no_progress: bool) -> Self {
         if no_progress { Self::Lines } else { Self::Automatic }
     }
 }
 
-/// What the user sees of a run.
+/// Display of a run's progress.
 pub struct Display {
     target: Target,
     scope: Scope,
     steps_total: u64,
     line_at: Option<Instant>,
-    /// Oldest first.
+    /// Evaluations, oldest first.
     evaluations: Vec<EvaluationRow>,
-    /// The last that was shown.
+    /// The last progress shown.
     last: Progress,
 }
 
@@ -54,12 +53,12 @@ enum Target {
 }
 
 impl Display {
-    /// The display on standard error.
+    /// Creates the display on standard error.
     #[must_use]
     pub fn new(style: ProgressStyle, steps_total: u64) -> Self {
         if style == ProgressStyle::Automatic && std::io::stderr().is_terminal() {
             let bar = ProgressBar::new(steps_total);
-            // The template is a constant; were it wrong, indicatif's own would do.
+            // The template is a constant; if it were invalid, indicatif's default would be used.
             if let Ok(style) = BarStyle::with_template("{bar:20.cyan/dim} {percent:>3}% {msg}") {
                 bar.set_style(style.progress_chars("━━╌"));
             }
@@ -70,13 +69,13 @@ impl Display {
         Self::lines(Box::new(std::io::stderr()), steps_total)
     }
 
-    /// Of a host whose learner is elsewhere: nothing that only the learner knows.
+    /// Restricts the display to a host without a learner.
     #[must_use]
     pub fn of_host(self) -> Self {
         Self { scope: Scope::Host, ..self }
     }
 
-    /// Plain lines to any writer.
+    /// Writes plain lines to any writer.
     #[must_use]
     pub fn lines(writer: Box<dyn Write + Send>, steps_total: u64) -> Self {
         Self::on(Target::Lines(writer), steps_total)
@@ -93,13 +92,13 @@ impl Display {
         }
     }
 
-    /// Whether there is a panel that tells of processes.
+    /// Returns true if there is a panel with the processes.
     #[must_use]
     pub fn is_live(&self) -> bool {
         matches!(self.target, Target::Bar(_))
     }
 
-    /// Shows what each process does now, between two reports of progress.
+    /// Updates the processes between two reports of progress.
     pub fn refresh(&mut self, processes: &[ProcessLine]) {
         if self.is_live() {
             let last = std::mem::take(&mut self.last);
@@ -107,12 +106,12 @@ impl Display {
         }
     }
 
-    /// A run that goes on has evaluations already; one that goes back has fewer than were shown.
+    /// Sets the evaluations of a resumed run, which replace those shown so far.
     pub fn begin_with(&mut self, evaluations: Vec<EvaluationRow>) {
         self.evaluations = evaluations;
     }
 
-    /// Says something, above the bar.
+    /// Prints a message above the bar.
     pub fn message(&mut self, text: &str) {
         match &mut self.target {
             Target::Bar(bar) => bar.suspend(|| super::say(text)),
@@ -120,7 +119,7 @@ impl Display {
         }
     }
 
-    /// Shows where the learner stands, and what each process does where there is room for it.
+    /// Shows the learner's progress and, if there is a panel, the processes.
     pub fn progress(&mut self, progress: &Progress, processes: &[ProcessLine]) {
         let (steps, figures) = (self.steps(progress), self.figures(progress));
         self.last = progress.clone();
@@ -140,7 +139,7 @@ impl Display {
                     return;
                 }
                 self.line_at = Some(now);
-                // The last segment may end beyond the last step.
+                // The last segment may end after the last step.
                 let done = progress.env_steps.min(self.steps_total);
                 let percent = done * 100 / self.steps_total.max(1);
                 write_line(writer, &format!("{percent:>3}% {steps}{SEPARATOR}{figures}"));
@@ -148,7 +147,7 @@ impl Display {
         }
     }
 
-    /// Shows an evaluation, and keeps it for the progress.
+    /// Shows an evaluation, and stores it for the progress.
     pub fn evaluation(&mut self, row: &EvaluationRow, best: bool) {
         let figure = plus_minus(&row.returns);
         let success = row
@@ -163,26 +162,27 @@ impl Display {
         self.evaluations.push(row.clone());
     }
 
-    /// Takes the bar away.
+    /// Removes the bar.
     pub fn close(&mut self) {
         if let Target::Bar(bar) = &self.target {
             bar.finish_and_clear();
         }
     }
 
-    /// How far it is, and how long the rest will take.
+    /// Formats steps and remaining time.
     fn steps(&self, progress: &Progress) -> String {
         let steps = format!("{}/{} steps", grouped(progress.env_steps), grouped(self.steps_total));
         let left = self.steps_total.saturating_sub(progress.env_steps) as f64;
         let eta = left / progress.env_steps_per_s;
-        // No figure from a rate of nothing, for a run of years, or by a part of the run's workers.
+        // No remaining time for a rate of zero, for more than some years, or for a host with only
+        // part of the run's workers.
         if self.scope == Scope::Run && (1e-9..1e8).contains(&eta) {
             return format!("{steps}{SEPARATOR}eta {}", duration(Duration::from_secs_f64(eta)));
         }
         steps
     }
 
-    /// The rest of a plain line.
+    /// Formats the rest of a plain line.
     fn figures(&self, progress: &Progress) -> String {
         let mut parts = Vec::new();
         match (self.evaluations.last(), progress.return_mean) {
@@ -196,7 +196,7 @@ impl Display {
     }
 }
 
-/// A user who closed standard error reads nothing: no reason to end the run.
+/// Writes a line. A closed standard error is no reason to end the run.
 fn write_line(writer: &mut Box<dyn Write + Send>, text: &str) {
     let _ = writeln!(writer, "{text}").and_then(|()| writer.flush());
 }

@@ -1,8 +1,8 @@
-//! Numbers as people read them.
+//! Formats numbers for people.
 
 use std::time::Duration;
 
-/// `1234567` as `1,234,567`.
+/// Formats `1234567` as `1,234,567`.
 #[must_use]
 pub fn grouped(number: u64) -> String {
     let digits = number.to_string();
@@ -16,7 +16,7 @@ pub fn grouped(number: u64) -> String {
     text
 }
 
-/// `42 s`, `3 min 05 s`, `2 h 07 min`.
+/// Formats a duration as `42 s`, `3 min 05 s`, `2 h 07 min`.
 #[must_use]
 pub fn duration(duration: Duration) -> String {
     let seconds = duration.as_secs();
@@ -27,7 +27,7 @@ pub fn duration(duration: Duration) -> String {
     }
 }
 
-/// `640 B`, `3.2 MiB`: binary units, as Docker and `ulimit` count.
+/// Formats bytes as `640 B` or `3.2 MiB`: binary units, as in Docker and `ulimit`.
 #[must_use]
 pub fn binary_bytes(bytes: u64) -> String {
     let units = [(1_u64 << 40, "TiB"), (1 << 30, "GiB"), (1 << 20, "MiB"), (1 << 10, "KiB")];
@@ -38,7 +38,7 @@ pub fn binary_bytes(bytes: u64) -> String {
     )
 }
 
-/// Standard deviation over the values (population); 0 for none.
+/// Population standard deviation of the values; 0 without values.
 #[must_use]
 pub fn std_of(values: &[f64]) -> f64 {
     let count = values.len().max(1) as f64;
@@ -46,7 +46,7 @@ pub fn std_of(values: &[f64]) -> f64 {
     (values.iter().map(|value| (value - mean).powi(2)).sum::<f64>() / count).sqrt()
 }
 
-/// `-4.41 ± 1.02`.
+/// Formats mean and standard deviation as `-4.41 ± 1.02`.
 #[must_use]
 pub fn plus_minus(values: &[f64]) -> String {
     let mean = values.iter().sum::<f64>() / values.len().max(1) as f64;

@@ -1,5 +1,6 @@
-//! Stage 8 of 8, the part on screen: progress, messages, the summary. All of it on standard
-//! error; standard output is for results.
+//! Stage 8 of 8, on screen: progress, messages and the summary.
+//!
+//! All of it goes to standard error; standard output is for results.
 
 mod count;
 mod display;
@@ -24,8 +25,8 @@ pub use summary::summary;
 pub use sweep::SweepProgress;
 pub use trial::TrialProgress;
 
-/// Prints a line on standard error. `eprintln!` would end the program when nobody reads any
-/// more: a terminal closed in mid-run, a log on a full disk.
+/// Prints a line on standard error. Unlike `eprintln!` it does not panic if writing fails, for
+/// instance after a terminal was closed or on a full disk.
 pub fn say(text: &str) {
     use std::io::Write;
     let _ = writeln!(std::io::stderr(), "{text}");

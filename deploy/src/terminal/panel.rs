@@ -1,59 +1,58 @@
-//! What stands below the bar of a live display: how well the policy does, how fast it learns, and
-//! a line for each process, as many as the terminal has room for.
+//! The panel below the bar: return, rates, and a line for each process, as many as fit.
 
 use super::format::{grouped, plus_minus};
 use crate::control::{EvaluationRow, Progress};
 
-/// Of a row of blocks: one a step of the way from the lowest to the highest.
+/// Characters of a sparkline, from the lowest to the highest value.
 const BLOCKS: [char; 8] = ['▁', '▂', '▃', '▄', '▅', '▆', '▇', '█'];
-/// Longer histories are drawn by their means.
+/// Maximum length of a sparkline; longer histories are averaged.
 const SPARKS_MAX: usize = 24;
 /// Width of a line's name.
 const NAME_COLUMNS: usize = 10;
-/// Lines of the display that are no process's, and the one below it, where the cursor stands.
+/// Lines of the display that are not processes, including the cursor's line below it.
 const OTHER_LINES: usize = 4;
-/// Columns and rows where the terminal does not say.
+/// Columns and rows if the terminal does not report them.
 const SIZE: (usize, usize) = (80, 24);
 
-/// A process of the run, as the supervisor sees it.
+/// A process of the run, as seen by the supervisor.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct ProcessLine {
-    /// `learner`, `actor-0`, …
+    /// Name, such as `learner` or `actor-0`.
     pub name: String,
-    /// What it does, in a few words.
+    /// Short description of its activity.
     pub state: String,
-    /// Its starts after the first.
+    /// Number of restarts.
     pub restarts: u32,
 }
 
-/// Whose figures are shown.
+/// Scope of the figures.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Scope {
-    /// The run's, by its learner.
+    /// The complete run, as reported by its learner.
     Run,
-    /// Those of a host whose learner, and evaluations, are elsewhere.
+    /// A host without learner and evaluator.
     Host,
 }
 
-/// What the lines are made of.
+/// Content of the panel.
 pub(super) struct Panel<'a> {
     pub(super) scope: Scope,
     pub(super) progress: &'a Progress,
-    /// Oldest first.
+    /// Evaluations, oldest first.
     pub(super) evaluations: &'a [EvaluationRow],
     pub(super) processes: &'a [ProcessLine],
 }
 
-/// Columns and rows of the terminal that standard error is.
+/// Columns and rows of the terminal of standard error.
 pub(super) fn terminal_size() -> (usize, usize) {
     let size = rustix::termios::tcgetwinsize(std::io::stderr()).ok();
-    // Many terminals that are none say 0 by 0.
+    // Many pseudo-terminals report 0 by 0.
     let said = |count: u16, otherwise| if count == 0 { otherwise } else { usize::from(count) };
     size.map_or(SIZE, |size| (said(size.ws_col, SIZE.0), said(size.ws_row, SIZE.1)))
 }
 
 impl Panel<'_> {
-    /// The lines, none of them longer than the terminal is wide.
+    /// Formats the lines, none of them wider than the terminal.
     pub(super) fn lines(&self, (columns, rows): (usize, usize)) -> Vec<String> {
         let mut lines = Vec::new();
         if self.scope == Scope::Run {
@@ -113,10 +112,10 @@ impl Panel<'_> {
     }
 }
 
-/// Between two figures.
+/// Separator between two figures.
 pub(super) const SEPARATOR: &str = " · ";
 
-/// The figures of speed and of trouble: two lines at most.
+/// Formats rates and failures: at most two lines.
 fn rates(progress: &Progress, scope: Scope) -> Vec<String> {
     let trouble = trouble(progress);
     let mut lines = vec![named("rates", &speed(progress, scope).join(SEPARATOR))];
@@ -126,7 +125,7 @@ fn rates(progress: &Progress, scope: Scope) -> Vec<String> {
     lines
 }
 
-/// How fast it goes.
+/// Formats the rates.
 pub(super) fn speed(progress: &Progress, scope: Scope) -> Vec<String> {
     let steps = format!("{:.0} steps/s", progress.env_steps_per_s);
     let queued = format!("{} queued", grouped(progress.queued_segments));
@@ -146,7 +145,7 @@ pub(super) fn speed(progress: &Progress, scope: Scope) -> Vec<String> {
     }
 }
 
-/// What went wrong and was put right; nothing on a good day.
+/// Formats counts of failures; empty if there were none.
 pub(super) fn trouble(progress: &Progress) -> Vec<String> {
     let counts = [
         (progress.restarts, "restarts"),
@@ -161,7 +160,7 @@ fn named(name: &str, text: &str) -> String {
     format!("  {name:<NAME_COLUMNS$} {text}")
 }
 
-/// One block a value, from the lowest to the highest of them or of `range`; all the same: flat.
+/// Draws one block per value, scaled to `range` or to the values' own range; equal values are flat.
 fn sparkline(values: &[f64], range: Option<(f64, f64)>) -> String {
     let per_spark = values.len().div_ceil(SPARKS_MAX).max(1);
     let means: Vec<f64> = values
@@ -174,13 +173,13 @@ fn sparkline(values: &[f64], range: Option<(f64, f64)>) -> String {
     let last = BLOCKS.len() - 1;
     let block = |mean: &f64| {
         let share = if high > low { (mean - low) / (high - low) } else { 0.0 };
-        // Casting clips, and takes what is no number for 0.
+        // The cast saturates, and maps NaN to 0.
         BLOCKS[((share * last as f64).round() as usize).min(last)]
     };
     means.iter().map(block).collect()
 }
 
-/// As many of the figures as fit, none of them cut but the first.
+/// Returns as many figures as fit. Only the first can be truncated.
 pub(super) fn whole_items(figures: &str, width: usize) -> String {
     let mut line = String::new();
     for item in figures.split(SEPARATOR) {
@@ -249,7 +248,8 @@ mod tests {
         assert!(narrow.iter().all(|line| line.chars().count() <= 40), "{narrow:?}");
     }
 
-    /// It once told of no updates a second, of a learner that it knows nothing of.
+    /// Regression test: a host once showed 0 updates per second for a learner it knows nothing
+    /// about.
     #[test]
     fn of_a_host_it_says_nothing_that_only_the_learner_knows() {
         let progress = Progress {

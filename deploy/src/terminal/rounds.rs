@@ -1,4 +1,4 @@
-//! Progress of a benchmark: a bar in a terminal, a line a round elsewhere.
+//! Progress of a benchmark: a bar in a terminal, a line per round elsewhere.
 
 use std::io::IsTerminal;
 use std::time::Duration;
@@ -7,23 +7,23 @@ use indicatif::{ProgressBar, ProgressStyle};
 
 use super::say;
 
-/// Between two redraws.
+/// Interval between two redraws.
 const REDRAW_EVERY: Duration = Duration::from_millis(200);
 
-/// Shows which round it is and what is measured.
+/// Shows the current round and measurement.
 pub struct RoundsProgress {
     bar: Option<ProgressBar>,
     rounds: usize,
 }
 
 impl RoundsProgress {
-    /// On standard error.
+    /// Creates the display on standard error.
     #[must_use]
     pub fn new(rounds: usize) -> Self {
         let bar = std::io::stderr().is_terminal().then(|| {
             let bar = ProgressBar::new(rounds as u64);
             let template = "{spinner:.cyan} {bar:20.cyan/dim} {pos}/{len} {wide_msg}";
-            // The template is a constant; were it wrong, indicatif's own would do.
+            // The template is a constant; if it were invalid, indicatif's default would be used.
             if let Ok(style) = ProgressStyle::with_template(template) {
                 bar.set_style(style.progress_chars("━━╌"));
             }
@@ -33,7 +33,7 @@ impl RoundsProgress {
         Self { bar, rounds }
     }
 
-    /// What goes on before the first round.
+    /// Shows the current preparation.
     pub fn preparing(&self, what: &str) {
         match &self.bar {
             Some(bar) => bar.set_message(what.to_owned()),
@@ -41,7 +41,7 @@ impl RoundsProgress {
         }
     }
 
-    /// The round that begins, from 0.
+    /// Shows the round that begins, counted from 0.
     pub fn round(&self, round: usize) {
         match &self.bar {
             Some(bar) => bar.set_position(round as u64),
@@ -49,7 +49,7 @@ impl RoundsProgress {
         }
     }
 
-    /// What is measured now; too much for lines.
+    /// Shows the current measurement; not printed as a line.
     pub fn measuring(&self, name: &str) {
         if let Some(bar) = &self.bar {
             bar.set_message(name.to_owned());

@@ -1,5 +1,4 @@
-//! Progress of the Python set-up: one line that changes in a terminal, a line now and then
-//! elsewhere.
+//! Progress of the Python set-up: a changing line in a terminal, occasional lines elsewhere.
 
 use std::cell::Cell;
 use std::io::IsTerminal;
@@ -9,10 +8,10 @@ use indicatif::{ProgressBar, ProgressStyle};
 
 use super::say;
 
-/// Between two plain lines.
+/// Interval between two plain lines.
 const LINE_EVERY: Duration = Duration::from_secs(5);
 
-/// Shows what the set-up says; it says nothing when there is nothing to do.
+/// Shows the messages of the set-up; silent if there is nothing to do.
 pub struct SetupProgress {
     spinner: Option<ProgressBar>,
     line_at: Cell<Option<Instant>>,
@@ -25,12 +24,12 @@ impl Default for SetupProgress {
 }
 
 impl SetupProgress {
-    /// On standard error.
+    /// Creates the display on standard error.
     #[must_use]
     pub fn new() -> Self {
         let spinner = std::io::stderr().is_terminal().then(|| {
             let spinner = ProgressBar::new_spinner();
-            // The template is a constant; were it wrong, indicatif's own would do.
+            // The template is a constant; if it were invalid, indicatif's default would be used.
             if let Ok(style) = ProgressStyle::with_template("{spinner:.cyan} {wide_msg}") {
                 spinner.set_style(style);
             }

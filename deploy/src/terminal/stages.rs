@@ -1,4 +1,4 @@
-//! Progress of work in stages: a bar in a terminal, a line a stage elsewhere.
+//! Progress of work in stages: a bar in a terminal, a line per stage elsewhere.
 
 use std::io::IsTerminal;
 use std::time::Duration;
@@ -7,10 +7,10 @@ use indicatif::{ProgressBar, ProgressStyle};
 
 use super::say;
 
-/// Between two redraws.
+/// Interval between two redraws.
 const REDRAW_EVERY: Duration = Duration::from_millis(200);
 
-/// Shows which stage it is and how far.
+/// Shows the current stage and its progress.
 pub struct StagesProgress {
     bar: Option<ProgressBar>,
 }
@@ -22,13 +22,13 @@ impl Default for StagesProgress {
 }
 
 impl StagesProgress {
-    /// On standard error.
+    /// Creates the display on standard error.
     #[must_use]
     pub fn new() -> Self {
         let bar = std::io::stderr().is_terminal().then(|| {
             let bar = ProgressBar::new(0);
             let template = "{spinner:.cyan} {bar:20.cyan/dim} {percent:>3}% {wide_msg}";
-            // The template is a constant; were it wrong, indicatif's own would do.
+            // The template is a constant; if it were invalid, indicatif's default would be used.
             if let Ok(style) = ProgressStyle::with_template(template) {
                 bar.set_style(style.progress_chars("━━╌"));
             }
@@ -38,7 +38,7 @@ impl StagesProgress {
         Self { bar }
     }
 
-    /// What goes on from now on.
+    /// Shows the stage that begins.
     pub fn stage(&self, what: &str) {
         match &self.bar {
             Some(bar) => {
@@ -49,7 +49,7 @@ impl StagesProgress {
         }
     }
 
-    /// How far it is; too much for lines.
+    /// Shows the progress of the stage; not printed as a line.
     pub fn at(&self, done: u64, of: u64) {
         if let Some(bar) = &self.bar {
             bar.set_length(of.max(1));

@@ -1,4 +1,4 @@
-//! The block that ends a run.
+//! The summary at the end of a run.
 
 use std::path::Path;
 use std::time::Duration;
@@ -6,7 +6,7 @@ use std::time::Duration;
 use super::format::{duration, grouped, plus_minus};
 use crate::launch::SessionReport;
 
-/// What the session did, where the results lie, and what to type next.
+/// Formats the session's results, their directory, and suggested next commands.
 #[must_use]
 pub fn summary(report: &SessionReport, title: &str, run: &Path, steps_total: u64) -> String {
     let mut lines = vec![("run", title.to_owned())];
@@ -21,7 +21,7 @@ pub fn summary(report: &SessionReport, title: &str, run: &Path, steps_total: u64
         let seconds = report.training.as_secs_f64();
         let line = |now: u64, then: u64| {
             let rate = now.saturating_sub(then) as f64 / seconds;
-            // A run shorter than the time between two reports has no rate.
+            // A session shorter than the interval between two reports has no rate.
             let rate = if seconds > 0.0 { format!(" ({rate:.0}/s)") } else { String::new() };
             format!("{}{rate}", grouped(now))
         };
@@ -40,7 +40,7 @@ pub fn summary(report: &SessionReport, title: &str, run: &Path, steps_total: u64
     let run = shown(run);
     lines.push(("results", run.clone()));
     lines.push(("next", format!("dmprl eval {run}")));
-    // Without its last checkpoint a run would not go on from here.
+    // Without its last checkpoint the run could not be resumed from here.
     if report.checkpointed {
         lines.push(("", format!("dmprl resume {run} --steps {}", steps_total.saturating_mul(2))));
     }
@@ -56,7 +56,7 @@ fn wall(wall: Duration) -> String {
     }
 }
 
-/// Relative to where the user is, when the run lies below.
+/// Formats a path relative to the working directory, if it is below.
 pub(crate) fn shown(path: &Path) -> String {
     let here = std::env::current_dir().unwrap_or_default();
     path.strip_prefix(here).unwrap_or(path).display().to_string()

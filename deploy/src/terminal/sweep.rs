@@ -1,4 +1,4 @@
-//! Progress of a sweep: a bar in a terminal, a line a run elsewhere.
+//! Progress of a sweep: a bar in a terminal, a line per run elsewhere.
 
 use std::io::IsTerminal;
 use std::time::Duration;
@@ -7,10 +7,10 @@ use indicatif::{ProgressBar, ProgressStyle};
 
 use super::{duration, say};
 
-/// Between two redraws.
+/// Interval between two redraws.
 const REDRAW_EVERY: Duration = Duration::from_millis(200);
 
-/// Shows how many runs, or trials, have ended and how long the others will take.
+/// Shows the number of ended runs or trials, and the remaining time.
 pub struct SweepProgress {
     bar: Option<ProgressBar>,
     what: &'static str,
@@ -19,8 +19,9 @@ pub struct SweepProgress {
 }
 
 impl SweepProgress {
-    /// On standard error; `ended` of so many were finished before.
-    /// - `what`: their plural.
+    /// Creates the display on standard error; `ended` of `count` items had already ended.
+    ///
+    /// - `what`: the items' plural, such as `runs`.
     #[must_use]
     pub fn new(what: &'static str, count: usize, ended: usize) -> Self {
         let bar = std::io::stderr().is_terminal().then(|| {
@@ -28,7 +29,7 @@ impl SweepProgress {
             let template = format!(
                 "{{spinner:.cyan}} {{bar:20.cyan/dim}} {{pos}}/{{len}} {what} {{wide_msg}}"
             );
-            // The template is a constant; were it wrong, indicatif's own would do.
+            // The template is a constant; if it were invalid, indicatif's default would be used.
             if let Ok(style) = ProgressStyle::with_template(&template) {
                 bar.set_style(style.progress_chars("━━╌"));
             }
@@ -39,7 +40,7 @@ impl SweepProgress {
         Self { bar, what, count, ended }
     }
 
-    /// So many had ended before.
+    /// Sets the number of items that had already ended.
     pub fn begin_at(&mut self, ended: usize) {
         self.ended = ended;
         if let Some(bar) = &self.bar {
@@ -47,7 +48,7 @@ impl SweepProgress {
         }
     }
 
-    /// Says something, above the bar.
+    /// Prints a message above the bar.
     pub fn message(&self, text: &str) {
         match &self.bar {
             Some(bar) => bar.suspend(|| say(text)),
@@ -55,7 +56,7 @@ impl SweepProgress {
         }
     }
 
-    /// One more has ended, and the others will take so long.
+    /// Counts an ended item and shows the remaining time.
     pub fn ended(&mut self, remaining: Option<Duration>) {
         self.ended += 1;
         match &self.bar {
@@ -69,14 +70,14 @@ impl SweepProgress {
         self.remaining(remaining);
     }
 
-    /// The others will take so long; nothing is known before the first has begun to step.
+    /// Shows the remaining time; unknown until the first run has made steps.
     pub fn remaining(&self, remaining: Option<Duration>) {
         if let Some(bar) = &self.bar {
             bar.set_message(left(remaining));
         }
     }
 
-    /// Takes the bar away.
+    /// Removes the bar.
     pub fn close(&self) {
         if let Some(bar) = &self.bar {
             bar.finish_and_clear();

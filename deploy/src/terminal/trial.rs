@@ -1,4 +1,4 @@
-//! Progress of a trial: a line in a terminal, a line every few seconds elsewhere.
+//! Progress of a chaos trial: a changing line in a terminal, periodic lines elsewhere.
 
 use std::cell::Cell;
 use std::io::IsTerminal;
@@ -9,12 +9,12 @@ use indicatif::{ProgressBar, ProgressStyle};
 use super::format::duration;
 use super::say;
 
-/// Between two lines where there is no terminal.
+/// Interval between two lines without a terminal.
 const LINE_EVERY: Duration = Duration::from_secs(10);
-/// Between two redraws.
+/// Interval between two redraws.
 const REDRAW_EVERY: Duration = Duration::from_millis(200);
 
-/// Shows how far a trial has come and what has happened.
+/// Shows the elapsed time and the events of a trial.
 pub struct TrialProgress {
     bar: Option<ProgressBar>,
     total: Duration,
@@ -22,12 +22,12 @@ pub struct TrialProgress {
 }
 
 impl TrialProgress {
-    /// On standard error.
+    /// Creates the display on standard error.
     #[must_use]
     pub fn new(total: Duration) -> Self {
         let bar = std::io::stderr().is_terminal().then(|| {
             let bar = ProgressBar::new(total.as_secs());
-            // The template is a constant; were it wrong, indicatif's own would do.
+            // The template is a constant; if it were invalid, indicatif's default would be used.
             if let Ok(style) = ProgressStyle::with_template("{spinner:.cyan} {wide_msg}") {
                 bar.set_style(style);
             }
@@ -37,7 +37,7 @@ impl TrialProgress {
         Self { bar, total, told: Cell::new(None) }
     }
 
-    /// Where it stands.
+    /// Shows the current state.
     pub fn tell(&self, done: Duration, what: &str) {
         let line = format!("{}/{} {what}", duration(done), duration(self.total));
         if let Some(bar) = &self.bar {

@@ -89,7 +89,7 @@ fn measure(bench: &LearnerBench) -> anyhow::Result<Figures> {
     // Measured before the benchmark allocates its own buffers.
     figures.peak_memory_bytes = resident_bytes_max("self");
     let mut work = Work::new(&learner);
-    progress.preparing("starting what it is compared with");
+    progress.preparing("starting the peers");
     let mut ready = Vec::new();
     for mut peer in peers {
         let greeting = peer.ready(&watch)?;

@@ -60,7 +60,7 @@ pub(in crate::bench) fn fill(learner: &mut Learner, spec: &EnvSpec) -> anyhow::R
                 checksum: block_checksum(&segment.block),
                 ..SegmentHeader::default()
             };
-            learner.insert(&segment).context("a made-up segment was refused")?;
+            learner.insert(&segment).context("a synthetic segment was rejected")?;
             episode_step += steps_len;
         }
         done += spec.episode_steps as usize;

@@ -59,7 +59,8 @@ pub(super) fn worker(
             continue;
         }
         let segments = window.segments as f64;
-        let cores = round.cores.context("the system tells no processor time of the workers")?;
+        let cores =
+            round.cores.context("the system does not report the workers' processor time")?;
         cpu_s.push(cores * window.seconds / segments);
         steps.push(window.env_steps as f64 / segments);
         if cpu_s.len() == ROUNDS as usize {
@@ -132,7 +133,7 @@ impl Pool {
     fn insert(&mut self, learner: &mut Learner) -> anyhow::Result<()> {
         for _ in 0..TOGETHER {
             let segment = &mut self.segments[self.next];
-            learner.insert(segment).context("a made-up segment was refused")?;
+            learner.insert(segment).context("a synthetic segment was rejected")?;
             // The checksum covers only the block.
             segment.header.sequence += self.of_each;
             self.next = (self.next + 1) % self.segments.len();

@@ -132,17 +132,17 @@ fn measure_costs(
     progress: &RoundsProgress,
 ) -> anyhow::Result<(CostFigures, Demand)> {
     let ScaleBench { config, cost_duration, .. } = bench;
-    progress.preparing("what a worker costs");
+    progress.preparing("cost of a worker");
     let (program, venv) = (bench.program.clone(), bench.venv.clone());
     let worker = costs::worker(program, venv, config, (watch, *cost_duration))?;
-    progress.preparing("what ingest costs");
+    progress.preparing("cost of ingest");
     let feed = feed_plan(bench, config, &worker.spec);
     let (window, _, _) = fed(&feed, "c", watch, *cost_duration)?;
     let ingest_s = window.cpu_s / window.total().max(1) as f64;
     let folder = temporary()?;
     let insert = costs::insert(&feed, folder.path(), *cost_duration)?;
     watch.check()?;
-    progress.preparing("what an update costs");
+    progress.preparing("cost of an update");
     let update = costs::update(config, &worker.spec, (watch, *cost_duration))?;
     let segment_bytes = feed.segment_bytes()?;
     let demand = Demand {

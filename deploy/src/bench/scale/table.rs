@@ -134,7 +134,10 @@ impl Figures {
 
     fn check_lines(&self) -> Vec<String> {
         let mut lines = vec![
-            format!("beside real systems on the {} cores of this machine", self.machine.cores),
+            format!(
+                "compared with real systems on the {} cores of this machine",
+                self.machine.cores
+            ),
             String::new(),
             "  workers   predicted   measured   ratio   CPU µs/step: predicted, measured, ratio"
                 .to_owned(),

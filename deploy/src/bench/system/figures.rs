@@ -138,9 +138,7 @@ impl Figures {
             format!("  samples per insert    {:>10.2}", window.samples_per_insert()),
         ];
         if let Some((measured, asked)) = self.updates_per_segment() {
-            lines.push(format!(
-                "  updates per segment   {measured:>10.3}   the pacing asks for {asked}"
-            ));
+            lines.push(format!("  updates per segment   {measured:>10.3}   configured: {asked}"));
         }
         lines.extend([
             format!(

@@ -140,7 +140,7 @@ impl Steady {
                 }
             }
             if let Some(how) = train.end()? {
-                bail!("dmprl train has ended by itself: {how}");
+                bail!("dmprl train exited unexpectedly: {how}");
             }
             if heard.elapsed() >= SILENCE {
                 bail!("the run wrote no metrics for {SILENCE:?}");

@@ -176,7 +176,7 @@ impl Figures {
             || "an unknown share".to_owned(),
             |fraction| format!("{:.1} %", 100.0 * fraction),
         );
-        lines.push(format!("  a worker from whom nobody takes uses {blocked} of one core"));
+        lines.push(format!("  a blocked worker uses {blocked} of one core"));
         lines.push(String::new());
         lines.extend(self.notes.iter().map(|(name, text)| format!("  {name}: {text}")));
         lines.join("\n")

@@ -79,7 +79,7 @@ fn measure(bench: &TransportBench) -> anyhow::Result<Figures> {
     let manifest = Manifest::new(None)?;
     let token = format!("{}-{}", &manifest.run_id[..8], std::process::id());
     let progress = RoundsProgress::new(bench.rounds);
-    progress.preparing("starting workers and what they are compared with");
+    progress.preparing("starting workers and peers");
     let mut figures = Figures::new(bench, manifest.machine);
     let place = (folder.path(), &watch);
     // Start all at once: importing Python packages takes longest.

@@ -133,7 +133,7 @@ fn last_report(child: &mut LineChild, watch: &Watch) -> anyhow::Result<Sent> {
         match serde_json::from_str(&line) {
             Ok(Report::Sent(sent)) => return Ok(sent),
             Ok(_) => show_warning(child.name(), &line),
-            Err(_) => return Err(anyhow!("{} said what is no report: {line}", child.name())),
+            Err(_) => return Err(anyhow!("{} sent an invalid report: {line}", child.name())),
         }
     }
 }

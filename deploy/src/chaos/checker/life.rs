@@ -1,32 +1,32 @@
-//! One start of a worker: what it produced, and what of it a learner's lineage has.
+//! One incarnation of a worker: the segments it produced, and those in the learner's lineage.
 
 use std::collections::BTreeSet;
 use std::ops::RangeInclusive;
 
-/// By sequence number, from 1.
+/// State of an incarnation's segments, by sequence number from 1.
 #[derive(Debug, Clone, Default)]
 pub(super) struct Life {
     /// Checksum of each segment when it was produced.
     pub(super) produced: Vec<u32>,
-    /// Up to here the worker has forgotten them.
+    /// Highest acknowledged sequence number: the worker has dropped the segments up to here.
     pub(super) acked: u64,
-    /// Refused for good.
+    /// Segments that were rejected permanently.
     pub(super) refused: BTreeSet<u64>,
-    /// Epoch and version of the policy taken last.
+    /// Epoch and version of the policy that the worker took last.
     pub(super) policy: (u64, u64),
-    /// The last that was settled: inserted or refused.
+    /// Highest settled sequence number. A segment is settled when it is inserted or rejected.
     through: u64,
-    /// Left out below it, in order: what came later says that they never will.
+    /// Gaps below `through`, in order. Later segments were settled, so these never will be.
     gaps: Vec<RangeInclusive<u64>>,
 }
 
 impl Life {
-    /// Whether the lineage has settled this one.
+    /// Returns true if the lineage has settled this segment.
     pub(super) fn holds(&self, sequence: u64) -> bool {
         sequence <= self.through && !self.gaps.iter().any(|gap| gap.contains(&sequence))
     }
 
-    /// Settles one beyond all before.
+    /// Settles a segment beyond all previous ones.
     pub(super) fn settle(&mut self, sequence: u64) {
         if sequence > self.through + 1 {
             self.gaps.push(self.through + 1..=sequence - 1);
@@ -34,7 +34,7 @@ impl Life {
         self.through = sequence;
     }
 
-    /// The lineage goes back to this one.
+    /// Rolls the lineage back to this segment.
     pub(super) fn forget_after(&mut self, sequence: u64) {
         self.through = self.through.min(sequence);
         self.refused.retain(|refused| *refused <= sequence);
@@ -44,17 +44,17 @@ impl Life {
         }
     }
 
-    /// Segments inserted.
+    /// Number of inserted segments.
     pub(super) fn inserted(&self) -> u64 {
         self.through - self.missing() - self.refused.len() as u64
     }
 
-    /// Segments that are gone: left out, or acknowledged and not there.
+    /// Number of lost segments: in a gap, or acknowledged but not settled.
     pub(super) fn lost(&self) -> u64 {
         self.missing() + self.acked.saturating_sub(self.through)
     }
 
-    /// Segments that never arrived and that nobody was promised.
+    /// Number of segments that never arrived and were never acknowledged.
     pub(super) fn in_flight(&self) -> u64 {
         (self.produced.len() as u64).saturating_sub(self.through.max(self.acked))
     }

@@ -1,9 +1,11 @@
-//! Judges what the journals say: is nothing lost, nothing twice, nothing torn, nothing backwards?
+//! Verifies from the journals that no segment is lost, duplicated or corrupted, and that nothing
+//! goes backwards.
 //!
-//! What a learner has is its *lineage*: what its checkpoint held, what it read from its log, what
-//! it inserted. A learner that starts is told by its checkpoint's marks how much of its
-//! predecessor's lineage is left; the log and the workers bring the rest. Of each segment four
-//! bytes are kept, its checksum at the worker; what was inserted is a number and the gaps below it.
+//! A learner's *lineage* consists of the segments in its checkpoint, those read from its log, and
+//! those it inserted. A starting learner reports, by its checkpoint's marks, how much of its
+//! predecessor's lineage is left; the log and the workers supply the rest. The checker stores four
+//! bytes per segment, its checksum at the worker. The inserted segments are stored as a number and
+//! the gaps below it.
 
 mod life;
 #[cfg(test)]
@@ -17,26 +19,26 @@ use super::violations::Violations;
 use crate::journal::{Author, Entry, Piece, Record, Standing};
 use life::Life;
 
-/// A learner may get so far beyond an interval before it begins its checkpoint: while one is being
-/// written the next waits for it, and a segment crosses the line in one step.
+/// Maximum distance between checkpoints, in intervals. A checkpoint being written delays the next,
+/// and a segment crosses the limit in one step.
 const INTERVALS_MAX: u64 = 2;
-/// Environment steps of a segment are fewer.
+/// Upper bound of the environment steps in a segment.
 const SEGMENT_STEPS: u64 = 100;
 
-/// What became of all segments.
+/// Fate of all segments.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub(super) struct Sums {
     /// Finished by workers.
     pub(super) produced: u64,
     /// In the last learner's lineage.
     pub(super) inserted: u64,
-    /// Refused for good, for another reason than that they came twice.
+    /// Rejected permanently, except duplicates.
     pub(super) rejected: u64,
-    /// Never sent, or never taken, by a worker that was killed or stopped.
+    /// Never sent or never taken, from a worker that was killed or stopped.
     pub(super) in_flight: u64,
-    /// Gone though acknowledged, or though later ones of their worker came.
+    /// Missing although acknowledged, or although later segments of the same worker arrived.
     pub(super) lost: u64,
-    /// Refused because they had come before: sent again to be safe.
+    /// Rejected as duplicates after a retransmit.
     pub(super) duplicate: u64,
     /// Acknowledged to workers.
     pub(super) acknowledged: u64,
@@ -44,18 +46,18 @@ pub(super) struct Sums {
 
 /// Follows a run by its journals.
 pub(super) struct Checker {
-    /// Of each worker, by incarnation.
+    /// For each worker, its lives by incarnation.
     lives: Vec<BTreeMap<u32, Life>>,
     /// The lineage's last segment of each worker.
     settled: Vec<Mark>,
     standing: Standing,
-    /// The beginning, and every checkpoint that was begun since, as far as they are still ahead of
-    /// nobody.
+    /// Counters at the start and at each checkpoint begun since, without those that a later learner
+    /// has rolled back.
     cuts: Vec<Standing>,
-    /// Environment steps since a checkpoint was begun, or a learner started to serve.
+    /// Environment steps since the last checkpoint began or the learner started to serve.
     since_cut: u64,
     checkpoint_interval: u64,
-    /// The newest learner that each worker has a policy of.
+    /// Epoch of the newest learner from which each worker has a policy.
     epochs: Vec<u64>,
     duplicate: u64,
     checkpoints: u64,
@@ -79,13 +81,13 @@ impl Checker {
         }
     }
 
-    /// Takes one record; all of one author come in order, and of a learner after those that were
-    /// written before.
+    /// Processes a record. The records of an author must come in order, and a learner's after the
+    /// worker records written before them.
     pub(super) fn take(&mut self, author: Author, record: &Record) {
         match (author, record.entry) {
             (Author::Worker(worker, incarnation), entry) => {
                 if worker as usize >= self.lives.len() {
-                    self.violations.add(format!("I9: a journal of worker {worker}, who is none"));
+                    self.violations.add(format!("I9: a journal of unknown worker {worker}"));
                 } else {
                     self.on_worker((worker, incarnation), entry);
                 }
@@ -104,22 +106,22 @@ impl Checker {
                 self.since_cut = 0;
             }
             (author, entry) => {
-                self.violations.add(format!("I9: {author:?} has noted {entry:?}"));
+                self.violations.add(format!("I9: {author:?} has logged {entry:?}"));
             }
         }
     }
 
-    /// Where the newest learner stands.
+    /// The newest learner's counters.
     pub(super) fn standing(&self) -> Standing {
         self.standing
     }
 
-    /// The last segment of each worker that the newest learner has.
+    /// The newest learner's last segment of each worker.
     pub(super) fn settled(&self) -> &[Mark] {
         &self.settled
     }
 
-    /// Checkpoints that were begun.
+    /// Number of checkpoints begun.
     pub(super) fn checkpoints(&self) -> u64 {
         self.checkpoints
     }
@@ -165,14 +167,14 @@ impl Checker {
                 }
                 life.policy = (epoch, version);
             }
-            entry => self.violations.add(format!("I9: {name} has noted {entry:?}")),
+            entry => self.violations.add(format!("I9: {name} has logged {entry:?}")),
         }
     }
 
-    /// The lineage goes back to what a checkpoint held.
+    /// Rolls the lineage back to a worker's mark in a checkpoint.
     fn on_restored(&mut self, worker: u32, mark: Mark) {
         let Some(settled) = self.settled.get_mut(worker as usize) else {
-            self.violations.add(format!("I1: a checkpoint knows of worker {worker}, who is none"));
+            self.violations.add(format!("I1: a checkpoint has unknown worker {worker}"));
             return;
         };
         if mark > *settled {
@@ -199,7 +201,7 @@ impl Checker {
                 standing.segments
             ));
         }
-        // The newest checkpoint may have been on its way to the disk; the one before was there.
+        // The newest checkpoint may have been incomplete on disk; the previous one was complete.
         match self.cuts.iter().rposition(|cut| *cut == standing) {
             Some(index) if index + 2 >= self.cuts.len() => self.cuts.truncate(index + 1),
             Some(index) => {
@@ -245,7 +247,7 @@ impl Checker {
         self.settled[piece.worker as usize] = mark;
     }
 
-    /// What holds for every segment that a learner settles; none if it is not the next.
+    /// Checks a segment that a learner settles; `None` if it is not the next one.
     fn arrive(&mut self, piece: &Piece, what: &str) -> Option<Mark> {
         let Piece { worker, mark, checksum, .. } = *piece;
         let name = format!(
@@ -253,13 +255,13 @@ impl Checker {
             mark.sequence, mark.incarnation
         );
         let Some(last) = self.settled.get(worker as usize).copied() else {
-            self.violations.add(format!("I9: {name}, and there is no such worker"));
+            self.violations.add(format!("I9: {name}, but there is no such worker"));
             return None;
         };
         let life = self.lives[worker as usize].get(&mark.incarnation);
         let index = usize::try_from(mark.sequence).unwrap_or(usize::MAX).wrapping_sub(1);
         match life.and_then(|life| life.produced.get(index)) {
-            None => self.violations.add(format!("I9: {name}, and nobody had produced it")),
+            None => self.violations.add(format!("I9: {name}, but was never produced")),
             Some(produced) if *produced != checksum => self.violations.add(format!(
                 "I4: {name} with checksum {checksum:#010x}, produced with {produced:#010x}"
             )),
@@ -280,7 +282,7 @@ impl Checker {
         self.lives.iter().flat_map(BTreeMap::values)
     }
 
-    /// Judges what is left at the end, when every journal has been read.
+    /// Checks the final state, after all journals have been read.
     pub(super) fn conclude(&mut self) -> Sums {
         let mut sums = Sums { duplicate: self.duplicate, ..Sums::default() };
         for (worker, lives) in self.lives.iter().enumerate() {

@@ -1,4 +1,5 @@
-//! Journals written by hand: a sound one, and one for each way in which a run can break a promise.
+//! Hand-written journals: a correct one, and one for each way in which a run can violate a
+//! guarantee.
 
 use dmprl_shared::transport::delivery::Mark;
 
@@ -7,7 +8,7 @@ use super::*;
 const INTERVAL: u64 = 100;
 const STEPS: u64 = 5;
 
-/// A run of two workers that journals as the real ones do.
+/// A run of two workers, which writes journals like a real one.
 struct Story {
     checker: Checker,
     learner: Author,
@@ -23,7 +24,7 @@ fn standing(segments: u64) -> Standing {
 }
 
 impl Story {
-    /// A learner that has just begun.
+    /// Creates a run with a new learner.
     fn new() -> Self {
         let mut story = Self { checker: Checker::new(2, INTERVAL), learner: Author::Learner(0) };
         story.begin(0, [(0, 0), (0, 0)], 0);
@@ -38,7 +39,7 @@ impl Story {
         self.note(self.learner, entry);
     }
 
-    /// Another learner takes over, from a checkpoint of so many segments with these marks.
+    /// Starts another learner from a checkpoint with this number of segments and these marks.
     fn begin(&mut self, deaths: u64, marks: [(u32, u64); 2], segments: u64) {
         self.learner = Author::Learner(deaths);
         for (worker, (incarnation, sequence)) in (0..).zip(marks) {
@@ -66,7 +67,7 @@ impl Story {
         self.note(Author::Worker(worker, incarnation), Entry::Acknowledged(mark));
     }
 
-    /// The first ten segments of both workers, inserted.
+    /// Creates a run that has inserted the first ten segments of both workers.
     fn with_ten_of_each() -> Self {
         let mut story = Self::new();
         for worker in [0, 1] {
@@ -81,7 +82,7 @@ impl Story {
         (sums, self.checker.violations.into_sentences())
     }
 
-    /// The one sentence, of this invariant.
+    /// Asserts that the run has exactly one violation, of this invariant.
     #[track_caller]
     fn breaks(self, invariant: &str, words: &str) -> Sums {
         let (sums, violations) = self.end();
@@ -92,8 +93,8 @@ impl Story {
     }
 }
 
-/// Deaths of a worker and of two learners, one with an unfinished checkpoint, cost nothing but
-/// what was never sent.
+/// The deaths of a worker and of two learners, one with an incomplete checkpoint, only lose
+/// segments that were never sent.
 #[test]
 fn a_run_that_keeps_its_promises_is_not_accused() {
     let mut story = Story::with_ten_of_each();
@@ -101,12 +102,12 @@ fn a_run_that_keeps_its_promises_is_not_accused() {
     story.says(Entry::Cut(standing(20)));
     story.produce(0, 0, 11..=14);
     story.insert(0, 0, 11..=12);
-    // Worker 0 dies with two segments unsent; its successor begins anew.
+    // Worker 0 dies with two unsent segments; its successor starts a new incarnation.
     story.produce(0, 1, 1..=3);
     story.insert(0, 1, 1..=2);
     story.says(Entry::Cut(standing(24)));
-    // The learner dies before that checkpoint is whole; the log brings back all but the last, which
-    // comes again from its worker with one more.
+    // The learner dies before that checkpoint is complete. The log restores all segments but the
+    // last, which the worker retransmits together with one more.
     story.begin(1, [(0, 10), (0, 10)], 20);
     story.insert(0, 0, 11..=12);
     story.insert(0, 1, 1..=1);
@@ -136,14 +137,15 @@ fn i1_a_lost_segment_that_was_acknowledged_is_found() {
     story.produce(0, 0, 11..=15);
     story.insert(0, 0, 11..=15);
     story.acknowledge(0, (0, 15));
-    // A log that lost its last two.
+    // The log has lost its last two segments.
     story.begin(1, [(0, 10), (0, 10)], 20);
     story.insert(0, 0, 11..=13);
     let sums = story.breaks("I1", "2 segments of worker 0, incarnation 0, are lost");
     assert_eq!((sums.lost, sums.inserted, sums.in_flight), (2, 23, 0));
 }
 
-/// Nobody had promised anything, but the worker sends in order and keeps what is not acknowledged.
+/// These segments were not acknowledged, but the worker sends in order and retains them, so none
+/// may be skipped.
 #[test]
 fn i1_a_segment_that_was_left_out_is_found() {
     let mut story = Story::with_ten_of_each();
@@ -179,7 +181,7 @@ fn i2_a_segment_inserted_twice_is_found() {
     story.breaks("I2", "segment 4 of worker 0");
 }
 
-/// What a checkpoint held counts as inserted.
+/// Segments in a checkpoint count as inserted.
 #[test]
 fn i2_a_segment_inserted_again_after_it_was_restored_is_found() {
     let mut story = Story::with_ten_of_each();
@@ -231,7 +233,7 @@ fn i5_a_learner_that_goes_back_too_far_is_found() {
     story.breaks("I5", "gone back 2 checkpoints");
 }
 
-/// A checkpoint whose counters are of another moment than its marks.
+/// A checkpoint whose counters and marks were taken at different times.
 #[test]
 fn i5_counters_that_do_not_fit_the_marks_are_found() {
     let mut story = Story::with_ten_of_each();
@@ -295,7 +297,7 @@ fn i9_a_number_that_was_left_out_at_its_source_is_found() {
     assert!(violations[0].starts_with("I9: worker 0, incarnation 0 has produced segment 12"));
 }
 
-/// A refusal for good is no loss, and is counted.
+/// A permanent rejection is counted, but is no loss.
 #[test]
 fn i9_a_refused_segment_is_counted_and_not_lost() {
     let mut story = Story::with_ten_of_each();

@@ -1,4 +1,4 @@
-// The curves: which there are, and how they are drawn.
+// Draws the charts of the page.
 
 import { compact, duration, element, figure, swatch } from "./format.js";
 
@@ -7,7 +7,7 @@ const DASHES = [[], [9, 4], [2, 3], [9, 3, 2, 3], [16, 4], [5, 2]];
 const SECONDS = [1, 2, 5, 10, 20, 30, 60, 120, 300, 600, 1200, 1800, 3600, 7200, 14400, 21600,
   43200, 86400, 172800, 432000, 864000];
 
-/** Every chart: title, unit, file of the run, key, and whether it may have a log scale. */
+/** All charts: title, unit, file of the run, key, and whether a log scale is possible. */
 export const GROUPS = [
   ["Evaluation, without noise", [
     ["Return", "mean over episodes", "evaluations", "return_mean"],
@@ -39,14 +39,14 @@ export const GROUPS = [
   ]],
 ];
 
-/** The keys of each file that any chart shows. */
+/** Returns the keys of each file that the charts show. */
 export function names() {
   const found = { metrics: [], evaluations: [] };
   for (const [, charts] of GROUPS) for (const [, , file, key] of charts) found[file].push(key);
   return found;
 }
 
-/** A line style for each run: the method's colour, and dashes where two have the same. */
+/** Assigns a line style to each run: the method's colour, with dashes if several share it. */
 export function styles(runs) {
   const seen = new Map();
   return new Map(runs.map((run) => {
@@ -56,7 +56,7 @@ export function styles(runs) {
   }));
 }
 
-/** Exponential mean, corrected for its beginning, so that it starts where the curve does. */
+/** Exponential moving average with bias correction, so that it starts at the first value. */
 export function smoothed(values, weight) {
   let [mean, mass] = [0, 0];
   return values.map((value) => {
@@ -67,7 +67,7 @@ export function smoothed(values, weight) {
   });
 }
 
-/** Axes of a plot. */
+/** Returns the axes of a plot. */
 function axes(axis) {
   const line = { stroke: "#595959", font: "12px system-ui", grid: { stroke: "#e8e8e8", width: 1 },
     ticks: { stroke: "#d4d4d4", width: 1, size: 4 } };
@@ -85,13 +85,13 @@ function axes(axis) {
   return [x, y];
 }
 
-/** How many points lines have, and where the last of them lies. */
+/** Returns the number of points of all lines, and the position of the last one. */
 function extent(lines) {
   const ends = lines.map(({ x }) => x[x.length - 1]);
   return { points: lines.reduce((sum, { x }) => sum + x.length, 0), end: Math.max(...ends) };
 }
 
-/** A plot with the figures at the pointer, or the last ones, written below it. */
+/** A plot with a legend, which shows the values at the pointer, or the last ones. */
 export class Plot {
   constructor(title, unit) {
     this.plot = element("div", { className: "plot" });
@@ -126,7 +126,7 @@ export class Plot {
     const data = uPlot.join(pairs);
     const shape = JSON.stringify([series, axis, log]);
     if (this.uplot && shape === this.shape) {
-      // A zoom stays as it is.
+      // Keeps the zoom.
       this.uplot.setData(data, !this.zoomed);
       if (this.zoomed) this.uplot.redraw();
     } else {
@@ -157,7 +157,7 @@ export class Plot {
     this.plot.firstElementChild.setAttribute("aria-hidden", "true");
   }
 
-  /** The figures at a point, or the last. */
+  /** Shows the values at a point, or the last ones. */
   write(index) {
     const data = this.uplot?.data;
     if (!data) return;
@@ -177,7 +177,7 @@ export class Plot {
   }
 }
 
-/** All charts, drawn when they come into view. */
+/** All charts, each drawn when it becomes visible. */
 export class Charts {
   constructor(place) {
     this.charts = [];
@@ -202,7 +202,7 @@ export class Charts {
     }
   }
 
-  /** Takes what is to be drawn: runs with labels and styles, the store, the settings. */
+  /** Sets the view: runs with labels and styles, the store, the settings. */
   show(view) {
     this.view = view;
     for (const chart of this.charts) {
@@ -224,7 +224,7 @@ export class Charts {
     const lines = runs.flatMap((run) => {
       const curve = store.curve(run.name, chart.file, chart.key);
       if (!curve) return [];
-      // A logarithm has no place for a rate of 0.
+      // A log scale cannot show 0.
       const y = log ? curve.values.map((value) => (value > 0 ? value : null)) : curve.values;
       return [{ label: run.label, style: known.get(run.name), x: curve[axis], y }];
     });

@@ -1,11 +1,11 @@
-// What the page knows of runs, and how it asks for more: only for what is new.
+// Caches the data of runs, and requests only additions.
 
-/** A request that takes longer is given up. */
+/** Time limit of a request. */
 const PATIENCE_MS = 15000;
-/** A curve with more new points than this is asked for anew: the server sends a thousand. */
+/** Number of cached points beyond which a curve is fetched anew, with at most a thousand points. */
 const POINTS_MAX = 4000;
 
-/** Asks for JSON; an error says what the server said. */
+/** Requests JSON; an error has the server's message. */
 export async function ask(path, query = {}) {
   const text = new URLSearchParams(query).toString();
   const answer = await fetch(text ? `${path}?${text}` : path,
@@ -15,14 +15,14 @@ export async function ask(path, query = {}) {
   return content;
 }
 
-/** The curves of one file of one run, which grow. */
+/** The growing curves of one file of one run. */
 class Curves {
   constructor(run, file, names) {
     Object.assign(this, { run, file, names, table: 0, next: 0, mark: null });
     this.curves = new Map();
   }
 
-  /** Asks for what is new; true if there was anything. */
+  /** Requests new points; returns true if there were any. */
   async update() {
     const longest = Math.max(0, ...[...this.curves.values()].map((curve) => curve.values.length));
     if (longest > POINTS_MAX) this.table = 0;
@@ -42,14 +42,14 @@ class Curves {
   }
 }
 
-/** The curves of every run that was shown. */
+/** The curves of all runs shown. */
 export class Store {
   constructor(names) {
     this.names = names;
     this.runs = new Map();
   }
 
-  /** Asks for what is new of a run, if its entry in the list says that there is something. */
+  /** Requests the new points of a run, if its entry in the list has changed. */
   async update(run) {
     const known = this.runs.get(run.name) ?? { mark: null, files: Object.keys(this.names).map(
       (file) => new Curves(run.name, file, this.names[file])) };
@@ -61,12 +61,12 @@ export class Store {
     return changed.some(Boolean);
   }
 
-  /** Forgets runs that are not shown any more. */
+  /** Drops runs that are no longer shown. */
   keep(names) {
     for (const name of this.runs.keys()) if (!names.includes(name)) this.runs.delete(name);
   }
 
-  /** A curve, none if the run has no value of it. */
+  /** Returns a curve, or nothing if the run has no values for it. */
   curve(run, file, name) {
     const known = this.runs.get(run)?.files.find((one) => one.file === file);
     const curve = known?.curves.get(name);

@@ -1,11 +1,11 @@
-// What is shown of one run, and how configurations differ.
+// Shows the details of one run, and differences between configurations.
 
 import { Plot } from "./charts.js";
 import { ask } from "./data.js";
 import { bytes, count, duration, element, figure, fill, share } from "./format.js";
 
 const get = (id) => document.getElementById(id);
-/** Okabe and Ito's palette, for joints. */
+/** Okabe and Ito's palette, used for joints. */
 const PALETTE = ["#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#000000",
   "#968c00"];
 const STATES = { starting: "starting", running: "running", restarting: "will be restarted",
@@ -15,7 +15,7 @@ const DOING = { attaching: "waits for a learner", stepping: "steps environments"
 
 const quoted = (text) => (/^[\w./-]+$/.test(text) ? text : `'${text.replaceAll("'", "'\\''")}'`);
 
-/** The part of the page about one run. */
+/** The section of the page about one run. */
 export class Details {
   constructor() {
     this.run = null;
@@ -27,7 +27,7 @@ export class Details {
     }
   }
 
-  /** Shows a run anew, or what has changed of it. */
+  /** Shows a run, or updates the parts that have changed. */
   async update(run, path) {
     const another = this.run?.name !== run.name;
     const moved = another || this.run.return_mean !== run.return_mean || run.env_steps !== this.run.env_steps;
@@ -38,7 +38,7 @@ export class Details {
     await Promise.all(parts);
   }
 
-  /** Asks for a part of the run; null when another was chosen meanwhile. */
+  /** Requests a part of the run; null if the user has chosen another run meanwhile. */
   async of(what) {
     const { name } = this.run;
     const answer = await ask(`/api/${what}`, { run: name });
@@ -83,7 +83,7 @@ export class Details {
     ];
   }
 
-  /** Processor time over time since the last look; since the start at the first. */
+  /** Processor time divided by time since the last update; at first, since the start. */
   cores({ name, cpu_s, up_s }) {
     if (cpu_s === null || !up_s) return null;
     const last = this.cpu.get(name);
@@ -170,7 +170,7 @@ export class Details {
     const { videos } = got.answer;
     const place = get("videos");
     const key = JSON.stringify([this.run.name, videos]);
-    // One that is being watched is not begun anew.
+    // Does not restart a video that is playing.
     if (place.dataset.key === key) return;
     place.dataset.key = key;
     const films = videos.filter((one) => one.name.endsWith(".mp4"));
@@ -190,7 +190,7 @@ export class Details {
   }
 }
 
-/** Does something once an element comes near the visible part of the page. */
+/** Calls `act` once an element is near the visible part of the page. */
 function near(target, act) {
   const watcher = new IntersectionObserver((entries) => {
     if (!entries.some((entry) => entry.isIntersecting)) return;
@@ -200,7 +200,7 @@ function near(target, act) {
   watcher.observe(target);
 }
 
-/** Configurations side by side. */
+/** A table that compares configurations. */
 export class Configuration {
   constructor() {
     this.known = new Map();

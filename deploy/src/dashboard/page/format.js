@@ -1,6 +1,6 @@
-// How figures, times and elements are written.
+// Formats figures and times, and creates elements.
 
-/** An element with properties and children; texts are never read as HTML. */
+/** Creates an element with properties and children; text is never parsed as HTML. */
 export function element(tag, properties = {}, ...children) {
   const made = document.createElement(tag);
   for (const [name, value] of Object.entries(properties)) {
@@ -15,7 +15,7 @@ const small = new Intl.NumberFormat("en", { maximumSignificantDigits: 4 });
 const whole = new Intl.NumberFormat("en", { maximumFractionDigits: 0 });
 const short = new Intl.NumberFormat("en", { notation: "compact", maximumSignificantDigits: 4 });
 
-/** A figure of at most four digits; a dash for none. */
+/** Formats a figure with at most four digits; a dash if there is none. */
 export function figure(value) {
   if (value === null || value === undefined || Number.isNaN(value)) return "–";
   const size = Math.abs(value);
@@ -23,17 +23,17 @@ export function figure(value) {
   return Number.isInteger(value) || size >= 1000 ? whole.format(value) : small.format(value);
 }
 
-/** A count at an axis: 20k, 1.5M. */
+/** Formats a count for an axis: 20k, 1.5M. */
 export const compact = (value) => short.format(value).toLowerCase().replace("m", "M");
 
-/** A count in full. */
+/** Formats a count with all digits. */
 export const count = (value) => (value === null || value === undefined ? "–" : whole.format(value));
 
-/** A share as per cent. */
+/** Formats a fraction in per cent. */
 export const share = (value) => (value === null || value === undefined ? "–"
   : `${small.format(100 * value)}\u00a0%`);
 
-/** A duration: 42 s, 12 min, 3.5 h. */
+/** Formats a duration: 42 s, 12 min, 3.5 h. */
 export function duration(seconds) {
   if (seconds === null || seconds === undefined) return "–";
   if (seconds < 120) return `${small.format(Math.round(seconds * 10) / 10)}\u00a0s`;
@@ -41,14 +41,14 @@ export function duration(seconds) {
   return `${small.format(Math.round(seconds / 360) / 10)}\u00a0h`;
 }
 
-/** Bytes, as MiB or GiB. */
+/** Formats bytes as MiB or GiB. */
 export function bytes(value) {
   if (value === null || value === undefined) return "–";
   const mebi = value / 1048576;
   return mebi < 1024 ? `${small.format(mebi)}\u00a0MiB` : `${small.format(mebi / 1024)}\u00a0GiB`;
 }
 
-/** A piece of the line that a run is drawn with. */
+/** Creates a sample of a run's line style. */
 export function swatch(colour, dash) {
   const space = "http://www.w3.org/2000/svg";
   const picture = document.createElementNS(space, "svg");

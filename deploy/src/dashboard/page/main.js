@@ -1,16 +1,16 @@
-// The page: which runs are shown, and when it looks again.
+// The page: selects the runs to show, and refreshes them.
 
 import { Charts, names, styles } from "./charts.js";
 import { ask, Store } from "./data.js";
 import { Configuration, Details } from "./details.js";
 import { count, duration, element, figure, share, swatch } from "./format.js";
 
-/** A look costs the browser a few hundredths of a second of a core that training may want.
- * Between two of them while something is trained, and while nothing is. */
+/** Interval between two refreshes, during training and otherwise. A refresh takes some hundredths
+ * of a second of processor time, which training may need. */
 const LOOK_MS = { training: 4000, still: 6000 };
-/** Runs that are drawn at once: more lines nobody tells apart. */
+/** Maximum number of runs drawn at once: more lines are indistinguishable. */
 const SHOWN_MAX = 12;
-/** Of these so many are shown at first. */
+/** Number of runs shown initially. */
 const SHOWN_FIRST = 4;
 const STATES = { training: "training", finished: "finished", stopped: "stopped" };
 
@@ -20,17 +20,17 @@ const charts = new Charts(get("curves"));
 const details = new Details();
 const configuration = new Configuration();
 
-/** What the address says after #, so that a view can be kept and passed on. */
+/** The settings after # in the address, so that a view can be bookmarked and shared. */
 const chosen = readAddress();
 let listed = [];
 let root = "";
 let leftOut = 0;
-/** What the page shows already: nothing is drawn twice. */
+/** Content already shown, which is not drawn again. */
 const drawn = { list: "", labels: "" };
 let timer = 0;
 let looking = false;
 let again = false;
-/** A click on an entry of the list ends where it began only if the entry is still there. */
+/** While a button is pressed the list is not redrawn; otherwise a click would miss its entry. */
 let pressed = false;
 
 function readAddress() {
@@ -55,7 +55,7 @@ function writeAddress() {
   history.replaceState(null, "", `#${says}`);
 }
 
-/** Those that train, then the newest. */
+/** Chooses the runs shown initially: those being trained, or else the newest. */
 function firstChoice() {
   const newest = [...listed].filter((run) => !run.fault)
     .sort((a, b) => b.started.localeCompare(a.started));
@@ -63,7 +63,7 @@ function firstChoice() {
   return (training.length ? training : newest).slice(0, SHOWN_FIRST).map((run) => run.name);
 }
 
-/** The runs that are shown, each with a label that no other of them has. */
+/** Returns the runs to show, each with a unique label. */
 function shownRuns() {
   const runs = listed.filter((run) => chosen.runs?.includes(run.name)).slice(0, SHOWN_MAX);
   const tasks = new Set(runs.map((run) => run.task)).size > 1;
@@ -91,7 +91,7 @@ async function look() {
   }
   looking = false;
   const soon = listed.some((run) => run.state === "training");
-  // A page that nobody sees asks for nothing.
+  // A hidden page sends no requests.
   if (!document.hidden) timer = setTimeout(look, soon ? LOOK_MS.training : LOOK_MS.still);
   if (again) {
     again = false;

@@ -1,4 +1,4 @@
-//! How trials and their runs end, and who is told.
+//! Ends trials and their runs, and reports the results.
 
 use anyhow::Context;
 
@@ -9,11 +9,11 @@ use crate::control::EvaluationRow;
 use crate::sweep::run::result;
 use crate::sweep::{End, Finished, PlannedRun};
 
-/// So many failed trials without one that did not: it is not their values that are wrong.
+/// Number of consecutive failed trials after which the search stops: the cause is not their values.
 const FAILED_IN_A_ROW_MAX: u32 = 5;
 
 impl Runner<'_> {
-    /// Enters a run into the ledger; its last evaluation.
+    /// Adds a run to the ledger; returns its last evaluation.
     pub(super) fn close_run(
         &mut self,
         run: &PlannedRun,
@@ -35,7 +35,7 @@ impl Runner<'_> {
         Ok(row)
     }
 
-    /// All runs of a trial are at their end.
+    /// Finishes a trial after all its runs have finished.
     pub(super) async fn finish(&mut self, place: Place) -> anyhow::Result<()> {
         let (study, trial) = self.at(place);
         let mut sum = 0.0;
@@ -102,7 +102,7 @@ impl Runner<'_> {
         Ok(())
     }
 
-    /// Ends a trial: in the storage first, which has the last word.
+    /// Ends a trial, first in the storage, which is authoritative.
     pub(super) async fn end(
         &mut self,
         place: Place,

@@ -6,24 +6,24 @@ use toml::Table;
 use super::space::{self, Parameter};
 use crate::control::EvaluationRow;
 
-/// More is a mistake in the file.
+/// Maximum number of trials. More is a mistake in the file.
 const TRIALS_MAX: u32 = 10_000;
-/// As Optuna's own default.
+/// The same as Optuna's default.
 const PRUNE_AFTER_TRIALS: u32 = 5;
 
-/// What a trial's runs are compared by: the mean of their last evaluations, as large as can be.
+/// Objective of a search: the mean over a trial's last evaluations, which is maximised.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Objective {
     /// Mean return of the evaluation's episodes.
     #[default]
     Return,
-    /// Share of them that succeeded.
+    /// Fraction of successful episodes.
     Success,
 }
 
 impl Objective {
-    /// Of one evaluation; none where the task knows no success.
+    /// Value of one evaluation; `None` if the task does not report success.
     #[must_use]
     pub fn of(self, row: &EvaluationRow) -> Option<f64> {
         match self {
@@ -32,7 +32,7 @@ impl Objective {
         }
     }
 
-    /// As the file has it.
+    /// Name of the objective in the file.
     #[must_use]
     pub fn name(self) -> &'static str {
         match self {
@@ -42,49 +42,49 @@ impl Objective {
     }
 }
 
-/// Who proposes the values of the next trial.
+/// Strategy that suggests the values of the next trial.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Sampler {
-    /// Tree-structured Parzen estimator: near what did well so far.
+    /// Tree-structured Parzen estimator: values close to the best so far.
     #[default]
     Tpe,
-    /// Anything in the space.
+    /// Random values within the space.
     Random,
 }
 
-/// Who gives trials up.
+/// Strategy that stops trials early.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Pruner {
-    /// A trial that is worse than the median of the others at the same evaluation.
+    /// Stops a trial that is worse than the median of the others at the same evaluation.
     #[default]
     Median,
-    /// Those that lose a round of successive halving.
+    /// Stops the trials that lose a round of successive halving.
     Hyperband,
-    /// Nobody: each is trained to its end.
+    /// Stops no trial.
     None,
 }
 
-/// A checked `[search]`.
+/// A checked `[search]` table.
 #[derive(Debug, Clone, PartialEq, Deserialize)]
 #[serde(try_from = "Entry")]
 pub struct Search {
-    /// Of each task and method.
+    /// Number of trials for each task and method.
     pub trials: u32,
-    /// What is maximised.
+    /// Objective to maximise.
     pub objective: Objective,
-    /// Who proposes.
+    /// Strategy for suggestions.
     pub sampler: Sampler,
-    /// Who gives up.
+    /// Strategy for pruning.
     pub pruner: Pruner,
-    /// Trials that must have finished before `median` gives one up.
+    /// Number of finished trials before `median` prunes any.
     pub prune_after_trials: u32,
-    /// Of the sampler.
+    /// Seed of the sampler.
     pub seed: u32,
-    /// What may be tried.
+    /// Search space.
     pub space: Vec<Parameter>,
-    /// Values to try before any others, `key = value` each; keys that are left out are proposed.
+    /// Points to try first, as `key = value`; missing keys are suggested by the sampler.
     pub first: Vec<Table>,
 }
 

@@ -1,14 +1,15 @@
-//! `[search]`: values of configuration keys that Optuna proposes, trial by trial.
+//! `[search]`: Optuna suggests values of configuration keys, trial by trial.
 //!
 //! ```text
 //!  runner ── ask ──► dmprl.search (Optuna) ─► values ─► a trial: dmprl train, seed after seed
 //!    │  ◄─ give up? ─┘     │                                │
 //!    └── report, tell ─────┘ ◄────── evaluations.jsonl ─────┘
 //! ```
-//! Optuna's storage, `optuna.db`, has the last word on what was tried and what came of it: a search
-//! that was killed goes on with the trials that it finds under way there, from their runs'
-//! checkpoints. `trial.json` in each trial's folder says the same for listings and reports, which
-//! need no Python. A trial's runs are trained seed after seed, so that a bad one costs part of one.
+//! Optuna's storage, `optuna.db`, is authoritative for trials and their results: a killed search
+//! continues the trials that are running there, from their runs' checkpoints. `trial.json` in each
+//! trial's folder has the same data for listings and reports, which need no Python. A trial's runs
+//! are trained one seed after the other, so that a bad trial can be pruned before all of them have
+//! run.
 
 mod endings;
 mod file;

@@ -1,4 +1,4 @@
-//! The child that asks Optuna: `dmprl.search`, one request and one answer a line.
+//! The child process that calls Optuna: `dmprl.search`, one line per request and answer.
 
 use std::path::{Path, PathBuf};
 use std::process::Stdio;
@@ -16,24 +16,24 @@ use crate::launch::last_lines;
 use crate::sweep::run::{guarded, open_log};
 use crate::terminal::shown;
 
-/// The storage, in the sweep's directory. SQLite, which a kill in the middle of a write does not
-/// harm and every tool of Optuna's opens.
+/// Storage file in the sweep's directory. SQLite survives a kill during a write, and all of
+/// Optuna's tools can open it.
 pub(super) const STORAGE: &str = "optuna.db";
-/// Optuna is imported and the storage made within this time.
+/// Time limit for importing Optuna and creating the storage.
 const START_WAIT: Duration = Duration::from_secs(120);
-/// A proposal after ten thousand trials takes seconds.
+/// Time limit for an answer. A suggestion after ten thousand trials takes seconds.
 const ANSWER_WAIT: Duration = Duration::from_secs(120);
 
-/// The child. Dropped, it is killed; all that it was told is in the storage.
+/// The child process, which is killed on drop. The storage has everything that was sent to it.
 pub(super) struct Optuna {
-    // Never read: it lives as long as this does.
+    // Never read: kept so that the child lives as long as this.
     _child: Child,
     input: ChildStdin,
     lines: Lines<BufReader<ChildStdout>>,
     log: PathBuf,
 }
 
-/// A trial as the storage has it.
+/// A trial in the storage.
 #[derive(Debug, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(super) struct Stored {
@@ -41,15 +41,15 @@ pub(super) struct Stored {
     pub(super) state: TrialState,
     pub(super) values: Map<String, Value>,
     pub(super) objective: Option<f64>,
-    /// Evaluations that it has values of.
+    /// Numbers of the evaluations reported so far.
     pub(super) reported: Vec<u64>,
 }
 
-/// What an opened study holds.
+/// Content of an opened study.
 #[derive(Debug, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(super) struct Opened {
-    /// What the trials have in common.
+    /// The settings that all its trials share.
     pub(super) identity: Value,
     pub(super) trials: Vec<Stored>,
 }
@@ -63,15 +63,16 @@ pub(super) struct Asked {
 }
 
 impl Optuna {
-    /// Starts it with the interpreter of `.venv`; the storage is in `output`.
+    /// Starts the child with the interpreter of `.venv`; the storage is in `output`.
     pub(super) async fn start(python: &Path, output: &Path) -> anyhow::Result<Self> {
         let log = output.join("logs").join("search.log");
         let mut command = std::process::Command::new(python);
         command
-            // Without the working directory among the places where modules are looked for.
+            // Without the working directory in the module path.
             .args(["-P", "-m", "dmprl.search"])
             .arg(format!("sqlite:///{STORAGE}"))
-            // SQLite's address is no path: one with a `?` in it would be cut there.
+            // SQLite's address is a URL, in which a `?` of a path would start the query. So use a
+            // relative path.
             .current_dir(output)
             .stdin(Stdio::piped())
             .stdout(Stdio::piped())
@@ -95,7 +96,7 @@ impl Optuna {
         Ok(optuna)
     }
 
-    /// Asks, and waits for the answer.
+    /// Sends a request and waits for the answer.
     async fn request(&mut self, request: &Value) -> anyhow::Result<Value> {
         let line = format!("{request}\n");
         let written = self.input.write_all(line.as_bytes()).await;
@@ -111,9 +112,9 @@ impl Optuna {
 
     async fn line(&mut self, limit: Duration) -> anyhow::Result<Value> {
         match timeout(limit, self.lines.next_line()).await {
-            Err(_) => Err(self.death(&format!("said nothing for {} s", limit.as_secs()))),
+            Err(_) => Err(self.death(&format!("did not answer for {} s", limit.as_secs()))),
             Ok(Ok(Some(line))) => {
-                serde_json::from_str(&line).with_context(|| format!("dmprl.search said: {line}"))
+                serde_json::from_str(&line).with_context(|| format!("dmprl.search sent: {line}"))
             }
             Ok(_) => Err(self.death("has ended")),
         }
@@ -123,18 +124,18 @@ impl Optuna {
         anyhow!("dmprl.search {what}; {}:\n{}", shown(&self.log), last_lines(&self.log))
     }
 
-    /// Opens a study, or makes it; `request` has all that `dmprl.search` names.
+    /// Opens or creates a study; `request` has all fields that `dmprl.search` needs.
     pub(super) async fn open(&mut self, request: &Value) -> anyhow::Result<Opened> {
         Ok(serde_json::from_value(self.request(request).await?)?)
     }
 
-    /// The next trial of a study.
+    /// Asks for the next trial of a study.
     pub(super) async fn ask(&mut self, study: &str) -> anyhow::Result<Asked> {
         let answer = self.request(&json!({ "op": "ask", "study": study })).await?;
         Ok(serde_json::from_value(answer)?)
     }
 
-    /// An intermediate value; whether the trial is to be given up.
+    /// Reports an intermediate value; returns true if the trial should be pruned.
     pub(super) async fn report(
         &mut self,
         (study, trial): (&str, u32),
@@ -147,7 +148,7 @@ impl Optuna {
         Ok(self.request(&request).await?["prune"] == json!(true))
     }
 
-    /// How a trial ended; `objective` where it finished.
+    /// Reports the end of a trial; `objective` is `None` unless it finished.
     pub(super) async fn tell(
         &mut self,
         (study, trial): (&str, u32),

@@ -1,4 +1,4 @@
-//! How long a search will still take.
+//! Estimates the remaining time of a search.
 
 use std::time::Duration;
 
@@ -7,14 +7,14 @@ use super::study::Study;
 use crate::sweep::PlannedRun;
 
 impl Runner<'_> {
-    /// One more trial has ended.
+    /// Counts an ended trial.
     pub(super) fn count(&mut self) {
         let remaining = self.remaining();
         self.progress.ended(remaining);
     }
 
-    /// How long the rest will take: trials under way to their end, others as long as those that
-    /// have ended took, pruned ones too.
+    /// Estimates the remaining time. Running trials are assumed to finish, later ones to take as
+    /// long as the average ended trial, including pruned ones.
     pub(super) fn remaining(&self) -> Option<Duration> {
         let mut estimate = self.estimate.clone();
         let mut left = Vec::new();
@@ -42,7 +42,7 @@ impl Runner<'_> {
         estimate.remaining(left, self.sweep.jobs)
     }
 
-    /// A trial has ended, and was not cut short by an error.
+    /// Measures a trial that ended without an error.
     pub(super) fn measure_trial(&mut self, place: Place) {
         let env_steps = self.stepped(place);
         let ended = &mut self.ended[place.0];
@@ -57,7 +57,7 @@ impl Runner<'_> {
     }
 }
 
-/// What the trials of a study took that have ended.
+/// Number and environment steps of a study's ended trials.
 #[derive(Debug, Clone, Copy, Default)]
 pub(super) struct Ended {
     trials: u64,

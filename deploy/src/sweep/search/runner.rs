@@ -1,4 +1,4 @@
-//! Asks for trials and trains them, so many at once, until all are done or the user stops it.
+//! Runs trials, several in parallel, until all have ended or the user stops the search.
 
 use std::collections::{BTreeMap, BTreeSet, VecDeque};
 use std::path::PathBuf;
@@ -22,41 +22,41 @@ use crate::sweep::runner::{END_LOOK, LOOK};
 use crate::sweep::{End, Ledger, PlannedRun, RunState, Site};
 use crate::terminal::SweepProgress;
 
-/// Between two looks for new evaluations.
+/// Interval between checks for new evaluations.
 const EVALUATION_LOOK: Duration = Duration::from_millis(500);
 
-/// What to do.
+/// A search to run.
 pub struct SearchSweep {
-    /// Where it is made.
+    /// Location of the sweep.
     pub site: Site,
-    /// What the file asks for.
+    /// The `[search]` table of the sweep file.
     pub search: Search,
-    /// Every task with every method.
+    /// A study for every task with every method.
     pub studies: Vec<Study>,
-    /// Trials at once.
+    /// Number of parallel trials.
     pub jobs: usize,
-    /// How far the run in a directory may have come.
+    /// The finished runs in the output directory.
     pub ledger: Ledger,
-    /// The interpreter that has Optuna.
+    /// Python interpreter with Optuna.
     pub python: PathBuf,
-    /// What `dmprl train` makes of arguments.
+    /// Function that returns the configuration for arguments of `dmprl train`.
     pub configure: fn(&[String]) -> anyhow::Result<ExperimentConfig>,
 }
 
-/// How a search ended. The trials stand in its studies.
+/// Result of a search. Its trials are in the studies.
 #[derive(Debug)]
 pub struct SearchReport {
-    /// Whether the user stopped it.
+    /// True if the user stopped it.
     pub interrupted: bool,
-    /// Why it gave up.
+    /// Reason for which the search stopped early.
     pub gave_up: Option<String>,
 }
 
-/// Goes on with the trials under way, and asks for others until there are enough.
+/// Continues the running trials, and asks for others until there are enough.
 ///
 /// # Errors
-/// The storage or a run directory is of another search, or Optuna or the ledger cannot go on. A
-/// trial that fails is no error of the search's.
+/// The storage or a run directory belongs to another search, or Optuna or the ledger fails. A
+/// failed trial is no error of the search.
 pub fn search(sweep: &mut SearchSweep) -> anyhow::Result<SearchReport> {
     let runtime = tokio::runtime::Builder::new_current_thread()
         .enable_all()
@@ -72,13 +72,13 @@ pub fn search(sweep: &mut SearchSweep) -> anyhow::Result<SearchReport> {
     })
 }
 
-/// A trial, by its study's place and its own.
+/// A trial, by the index of its study and its own index.
 pub(super) type Place = (usize, usize);
 
-/// A run under way.
+/// A running run.
 pub(super) struct Job {
     pub(super) place: Place,
-    /// Place of its seed in the list.
+    /// Index of its seed in the list.
     pub(super) seed: usize,
     pub(super) run: PlannedRun,
     pub(super) process: RunProcess,
@@ -88,12 +88,12 @@ pub(super) struct Job {
 pub(super) struct Runner<'a> {
     pub(super) sweep: &'a mut SearchSweep,
     pub(super) optuna: Optuna,
-    /// Trials under way whose next run waits for a place.
+    /// Running trials whose next run waits for a free job.
     pub(super) open: VecDeque<Place>,
     pub(super) jobs: Vec<Job>,
-    /// Evaluations that Optuna knows, of trials under way.
+    /// Evaluations of running trials that have been reported to Optuna.
     pub(super) reported: BTreeMap<Place, BTreeSet<u64>>,
-    /// By study.
+    /// Ended trials of each study.
     pub(super) ended: Vec<Ended>,
     pub(super) estimate: Estimate,
     pub(super) progress: SweepProgress,
@@ -121,7 +121,7 @@ impl<'a> Runner<'a> {
         }
     }
 
-    /// Finds out what the storage knows.
+    /// Reads the trials in the storage.
     async fn open(&mut self) -> anyhow::Result<()> {
         let mut ended = 0;
         for index in 0..self.sweep.studies.len() {
@@ -142,14 +142,14 @@ impl<'a> Runner<'a> {
         Ok(())
     }
 
-    /// Takes in a trial that the storage has; whether it has ended.
+    /// Adds a trial from the storage; returns true if it has ended.
     fn found(&mut self, place: Place) -> anyhow::Result<bool> {
         self.write(place)?;
         let (study, trial) = self.at(place);
         let (study, trial) = (study.clone(), trial.clone());
         for &seed in study.seeds.iter().filter(|_| !trial.values.is_empty()) {
             let run = study.run(&trial, seed);
-            // Made by the file as it is now, or not at all.
+            // Check that it matches the current file, if it exists.
             let config = (self.sweep.configure)(&run.arguments);
             let state =
                 config.and_then(|config| self.sweep.site.state(&self.sweep.ledger, &run, &config));
@@ -159,7 +159,7 @@ impl<'a> Runner<'a> {
             if let Some(done) = self.sweep.ledger.of(&run.directory) {
                 self.estimate.add(kind(&run), done.env_steps, done.wall_s);
             } else if trial.state == TrialState::Pruned && self.sweep.site.reached(&run) > 0 {
-                // Killed between the decision and the end of its run.
+                // The search was killed after the pruning and before the end of the run.
                 self.close_run(&run, &study, End::Pruned)?;
             }
         }
@@ -195,7 +195,8 @@ impl<'a> Runner<'a> {
         Ok(SearchReport { interrupted, gave_up: self.gave_up })
     }
 
-    /// Each interrupt goes on to the runs: once, they write a checkpoint; twice, they end at once.
+    /// Forwards each interrupt to the runs: on the first they write a checkpoint, on the second
+    /// they exit at once.
     fn on_interrupt(&mut self) {
         self.interrupts += 1;
         if self.interrupts == 1 {
@@ -211,8 +212,8 @@ impl<'a> Runner<'a> {
         (study, &study.trials[trial])
     }
 
-    /// The trial whose next run is to be started: one under way, or a new one of the study that has
-    /// fewest.
+    /// Returns the next trial to advance: a running one, or a new one of the study with the fewest
+    /// trials.
     async fn next(&mut self) -> anyhow::Result<Option<Place>> {
         if let Some(place) = self.open.pop_front() {
             return Ok(Some(place));
@@ -231,7 +232,7 @@ impl<'a> Runner<'a> {
         Ok(Some(place))
     }
 
-    /// Starts the trial's next run, or ends the trial when there is none.
+    /// Starts the trial's next run, or ends the trial if there is none.
     async fn advance(&mut self, place: Place) -> anyhow::Result<()> {
         let (study, trial) = self.at(place);
         let (study, trial) = (study.clone(), trial.clone());
@@ -244,7 +245,8 @@ impl<'a> Runner<'a> {
             let state = self.sweep.site.state(&self.sweep.ledger, &run, &config)?;
             let rows = self.sweep.site.evaluations(&run)?;
             let is_last = seed + 1 == study.seeds.len();
-            // The last evaluation comes when a run has ended, or a killed search goes on.
+            // The last evaluation is reported here, after a run has ended or a killed search
+            // continues.
             let prune = self.report(place, seed, &rows).await?;
             match state {
                 RunState::Finished if is_last => return self.finish(place).await,
@@ -265,7 +267,7 @@ impl<'a> Runner<'a> {
         Ok(())
     }
 
-    /// Tells Optuna of evaluations that it does not know; whether it would give the trial up.
+    /// Reports new evaluations to Optuna; returns true if the trial should be pruned.
     async fn report(
         &mut self,
         place: Place,
@@ -306,9 +308,9 @@ impl<'a> Runner<'a> {
                 continue;
             }
             let run = run.clone();
-            // A run that is being made, or whose rows are being cut back, has none to read.
+            // A run whose directory is being created or rewound has no rows to read.
             let mut rows = self.sweep.site.evaluations(&run).unwrap_or_default();
-            // The last one comes when the run has ended, and decides about the next.
+            // The last evaluation is reported after the run has ended.
             let steps = self.sweep.studies[place.0].base.run.steps;
             rows.retain(|row| row.env_steps < steps);
             if self.report(place, seed, &rows).await? {
@@ -358,7 +360,8 @@ impl<'a> Runner<'a> {
                 self.progress.message(&format!("{}: {}", job.run.title(), result(&row)));
                 self.failed_in_a_row = 0;
                 if self.interrupts == 0 {
-                    // Before new trials, and with the last evaluations reported.
+                    // First in the queue, so that it precedes new trials; its last evaluation is
+                    // then reported.
                     self.open.push_front(job.place);
                 }
                 Ok(())

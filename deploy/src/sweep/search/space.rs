@@ -1,4 +1,4 @@
-//! What a search may try: configuration keys, each with a range or a choice of values.
+//! The search space: configuration keys, each with a range or a choice of values.
 
 use dmprl_shared::config::{ExperimentConfig, Layers};
 use serde_json::json;
@@ -6,47 +6,48 @@ use toml::{Table, Value};
 
 use crate::sweep::file::flatten;
 
-/// What a trial is measured by must be the same for all.
+/// Sections that must be the same for all trials, so that their results are comparable.
 const NOT_SEARCHED: [&str; 3] = ["run", "task", "evaluation"];
-/// Of a range.
+/// Keys of a range.
 const RANGE_KEYS: [&str; 3] = ["low", "high", "log"];
 
-/// A configuration key and the values that it may take.
+/// A configuration key and its possible values.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Parameter {
-    /// Dotted.
+    /// Dotted configuration key.
     pub key: String,
-    /// Its values.
+    /// Possible values.
     pub domain: Domain,
 }
 
-/// The values of a parameter.
+/// Possible values of a parameter.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Domain {
-    /// Numbers from `low` to `high`, both included.
+    /// Numbers from `low` to `high`, inclusive.
     Float {
-        /// The least.
+        /// Lower bound.
         low: f64,
-        /// The greatest.
+        /// Upper bound.
         high: f64,
-        /// Equally likely by their logarithm.
+        /// Samples the logarithm uniformly if true.
         log: bool,
     },
-    /// The same, for a key that holds an integer.
+    /// Integers from `low` to `high`, inclusive, for a key that holds an integer.
     Integer {
-        /// The least.
+        /// Lower bound.
         low: i64,
-        /// The greatest.
+        /// Upper bound.
         high: i64,
-        /// Equally likely by their logarithm.
+        /// Samples the logarithm uniformly if true.
         log: bool,
     },
-    /// One of these, which have no order.
+    /// One of these values, without an order.
     Choice(Vec<Value>),
 }
 
 impl Domain {
-    /// The values that are refused if any is: the ends of a range, each of a choice.
+    /// The extreme values: the ends of a range, or each value of a choice. If these are valid, all
+    /// values are.
     #[must_use]
     pub fn extremes(&self) -> Vec<Value> {
         match self {
@@ -56,7 +57,7 @@ impl Domain {
         }
     }
 
-    /// In a few words.
+    /// Short description of the values.
     #[must_use]
     pub fn words(&self) -> String {
         let scale = |log: bool| if log { ", logarithmic" } else { "" };
@@ -71,7 +72,7 @@ impl Domain {
         }
     }
 
-    /// The value that Optuna means by `json`.
+    /// Converts a value of Optuna.
     pub(super) fn value(&self, json: &serde_json::Value) -> Option<Value> {
         match self {
             Self::Float { .. } => json.as_f64().map(Value::Float),
@@ -80,7 +81,7 @@ impl Domain {
         }
     }
 
-    /// The same value as the user wrote it, if it is one of these.
+    /// Returns the value in the type of this domain if it is one of its values.
     fn contains(&self, value: &Value) -> Option<Value> {
         let within = match (self, value) {
             (Self::Float { low, high, .. }, Value::Float(x)) => (low..=high).contains(&x),
@@ -97,7 +98,7 @@ impl Domain {
 }
 
 impl Parameter {
-    /// As `dmprl.search` takes it.
+    /// The parameter in the format of `dmprl.search`.
     pub(super) fn json(&self) -> serde_json::Value {
         let key = &self.key;
         match &self.domain {
@@ -114,7 +115,7 @@ impl Parameter {
     }
 }
 
-/// Optuna's choices are scalars: a list stands for itself as text.
+/// Converts a value to JSON. Optuna's choices are scalars, so a list becomes text.
 pub(super) fn as_json(value: &Value) -> serde_json::Value {
     match value {
         Value::String(text) => json!(text),
@@ -125,7 +126,7 @@ pub(super) fn as_json(value: &Value) -> serde_json::Value {
     }
 }
 
-/// The parameters of `[search.space]`, by key.
+/// Parses `[search.space]` into parameters, sorted by key.
 pub(super) fn parse(space: &Table) -> Result<Vec<Parameter>, String> {
     let defaults =
         Table::try_from(ExperimentConfig::default()).map_err(|error| error.to_string())?;
@@ -157,7 +158,7 @@ pub(super) fn parse(space: &Table) -> Result<Vec<Parameter>, String> {
     Ok(parameters)
 }
 
-/// As [`flatten`], but that a table with the keys of a range is one value.
+/// Like [`flatten`], but a table with the keys of a range is one value.
 fn entries(table: &Table) -> Vec<(String, Value)> {
     let is_range = |inner: &Table| RANGE_KEYS.iter().any(|key| inner.contains_key(*key));
     let mut entries = Vec::new();
@@ -187,7 +188,7 @@ fn choice(values: &[Value]) -> Result<Domain, String> {
     }
     for (index, value) in values.iter().enumerate() {
         if values[..index].contains(value) {
-            return Err(format!("{value} stands there twice"));
+            return Err(format!("{value} is listed twice"));
         }
     }
     Ok(Domain::Choice(values.to_vec()))
@@ -231,7 +232,7 @@ fn range(range: &Table, default: &Value) -> Result<Domain, String> {
     }
 }
 
-/// A point of `[[search.first]]`.
+/// Parses a point of `[[search.first]]`.
 pub(super) fn point(parameters: &[Parameter], table: &Table) -> Result<Table, String> {
     let mut point = Table::new();
     for (key, value) in flatten(table) {

@@ -1,4 +1,4 @@
-//! One task with one method, of which a search tries values.
+//! A study: one task with one method, and the trials of a search.
 
 use std::path::{Path, PathBuf};
 
@@ -16,39 +16,39 @@ use crate::run_directory::replace_file;
 use crate::sweep::plan::{arguments, method_directory};
 use crate::sweep::{PlannedRun, SweepFile};
 
-/// `evaluation.first_seed` of a search: what was chosen by the episodes of the evaluation's own
-/// seeds, 1000 and on, would look better on them than it is.
+/// `evaluation.first_seed` of a search. If it used the final evaluation's own seeds, from 1000 on,
+/// the selected values would overfit to their episodes.
 pub const TUNING_SEED: u64 = 5_000;
-/// The key that says so.
+/// Key of the first seed.
 const FIRST_SEED: &str = "evaluation.first_seed";
 
-/// A task with a method, and the trials of it.
+/// A task with a method, and its trials.
 #[derive(Debug, Clone)]
 pub struct Study {
     /// The task's name.
     pub task: String,
     /// The method's label.
     pub method: String,
-    /// Its directory, below the sweep's, and the study's name in Optuna's storage.
+    /// Directory relative to the sweep's; also the study's name in Optuna's storage.
     pub directory: PathBuf,
     /// `run.seed` of each run of a trial.
     pub seeds: Vec<i64>,
-    /// Of a run without the searched keys; all trials have the same length.
+    /// Configuration of a run without the searched keys; all trials have the same length.
     pub base: ExperimentConfig,
-    /// By number.
+    /// Trials, by number.
     pub trials: Vec<Trial>,
     arguments: Vec<String>,
 }
 
 impl Study {
-    /// Every task with every method, each value of the space checked with the others left as they
-    /// are.
+    /// Creates a study for every task with every method. Checks each extreme value of the space,
+    /// with the other keys unchanged.
     ///
-    /// - `configure`: what `dmprl train` makes of arguments.
+    /// - `configure`: returns the configuration for arguments of `dmprl train`.
     ///
     /// # Errors
-    /// What `train` would refuse, with the searched key; evaluation on seeds of the evaluation's
-    /// own; two studies in one place.
+    /// Errors of `train`, with the searched key; evaluation on the final evaluation's seeds; two
+    /// studies with the same directory.
     pub fn all(
         file: &SweepFile,
         search: &Search,
@@ -58,7 +58,7 @@ impl Study {
         for task in &file.tasks {
             for method in &file.methods {
                 let mut words = arguments(file, (task, method), &[]);
-                // First, so that the file may name others.
+                // First, so that the file can override it.
                 words.splice(1..1, set(FIRST_SEED, &(TUNING_SEED as i64).into()));
                 let method_name = method.label.clone().unwrap_or_else(|| method.name.clone());
                 let title = format!("{} · {method_name}", task.name);
@@ -106,19 +106,19 @@ impl Study {
         Ok(studies)
     }
 
-    /// What Optuna calls it.
+    /// Name of the study in Optuna's storage.
     #[must_use]
     pub fn name(&self) -> String {
         self.directory.display().to_string()
     }
 
-    /// In a few words.
+    /// Short title.
     #[must_use]
     pub fn title(&self) -> String {
         format!("{} · {}", self.task, self.method)
     }
 
-    /// A trial's run with one seed.
+    /// Plans a trial's run with one seed.
     #[must_use]
     pub fn run(&self, trial: &Trial, seed: i64) -> PlannedRun {
         let settings = trial.values.iter().flat_map(|(key, value)| set(key, value));
@@ -135,20 +135,21 @@ impl Study {
         }
     }
 
-    /// Environment steps of a trial.
+    /// Environment steps of a complete trial.
     #[must_use]
     pub fn trial_steps(&self) -> u64 {
         self.base.run.steps.saturating_mul(self.seeds.len() as u64)
     }
 
-    /// Evaluations of one run; the last one follows the last step.
+    /// Number of evaluations of one run; the last one follows the last step.
     fn evaluations_max(&self) -> u64 {
         self.base.run.steps.div_ceil(self.base.evaluation.interval_steps.max(1)).max(1)
     }
 
-    /// Which of a trial's evaluations a row is. Workers cross the interval at slightly different
-    /// steps each time; the pruner compares what has the same number.
-    /// - `seed`: place of the run's seed in the list.
+    /// Returns the number of an evaluation within its trial. Workers cross the interval at slightly
+    /// different steps, so the pruner compares evaluations by number.
+    ///
+    /// - `seed`: index of the run's seed in the list.
     pub(super) fn evaluation_number(&self, seed: usize, row: &EvaluationRow) -> u64 {
         let count = self.evaluations_max();
         let within = row.env_steps / self.base.evaluation.interval_steps.max(1);
@@ -157,7 +158,7 @@ impl Study {
         seed as u64 * count + number
     }
 
-    /// What its trials have in common; with another they could not be compared.
+    /// The settings that all its trials share, without which they are not comparable.
     fn identity(&self, search: &Search) -> serde_json::Value {
         json!({
             "space": space_json(&search.space), "objective": search.objective,
@@ -165,7 +166,7 @@ impl Study {
         })
     }
 
-    /// What opens it in `dmprl.search`.
+    /// The request that opens this study in `dmprl.search`.
     pub(super) fn opening(&self, search: &Search) -> serde_json::Value {
         let first = |table: &Table| {
             let value = |(key, value)| (key, super::space::as_json(&value));
@@ -180,7 +181,7 @@ impl Study {
         })
     }
 
-    /// Refuses a storage that was made for something else.
+    /// Rejects a storage that was created for other settings.
     pub(super) fn check_identity(
         &self,
         search: &Search,
@@ -199,29 +200,30 @@ impl Study {
         Ok(())
     }
 
-    /// Reads what the files in its directory tell of its trials.
+    /// Reads the trials from the files in the study's directory.
     ///
     /// # Errors
-    /// A file cannot be read, or is of another space.
+    /// A file cannot be read, or belongs to another space.
     pub fn read_trials(&mut self, search: &Search, output: &Path) -> anyhow::Result<()> {
         self.trials = Trial::read_all(&search.space, &output.join(&self.directory))?;
         Ok(())
     }
 
-    /// The finished trial with the greatest objective; of equals the first.
+    /// The finished trial with the greatest objective; the first of equals.
     #[must_use]
     pub fn best(&self) -> Option<&Trial> {
         best_of(&self.trials)
     }
 
-    /// Where `Study::write_best` writes.
+    /// Path of the file that `Study::write_best` writes.
     #[must_use]
     pub fn best_path(&self, output: &Path) -> PathBuf {
         output.join(&self.directory).join("best.toml")
     }
 
-    /// Writes the best trial's configuration for `dmprl train --config`. Its seed and the seeds of
-    /// its evaluations are left out: what was found is to be trained anew and judged by others.
+    /// Writes the best trial's configuration for `dmprl train --config`. It omits the seed and the
+    /// evaluation's seeds, because the configuration should be trained anew and evaluated on other
+    /// seeds.
     pub(super) fn write_best(
         &self,
         output: &Path,
@@ -253,21 +255,22 @@ fn best_of(trials: &[Trial]) -> Option<&Trial> {
     finished.reduce(|best, trial| if objective(trial) > objective(best) { trial } else { best })
 }
 
-/// What a search has found for one task and method.
+/// Result of a search for one task and method.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Found {
     /// The task's name.
     pub task: String,
     /// The method's label.
     pub method: String,
-    /// The runs of the best trial, below the sweep's directory; none before one has finished.
+    /// Runs of the best trial, relative to the sweep's directory; empty before a trial has
+    /// finished.
     pub runs: Vec<PathBuf>,
 }
 
-/// What a search in `output` has found, by its files; for reports.
+/// Reads the results of a search in `output` from its files, for reports.
 ///
 /// # Errors
-/// A trial's file cannot be read, or is of another space.
+/// A trial's file cannot be read, or belongs to another space.
 pub fn found(file: &SweepFile, search: &Search, output: &Path) -> anyhow::Result<Vec<Found>> {
     let mut all = Vec::new();
     for task in &file.tasks {
@@ -292,7 +295,7 @@ fn space_json(space: &[Parameter]) -> Vec<serde_json::Value> {
     space.iter().map(Parameter::json).collect()
 }
 
-/// Each value that is refused if any is, one at a time.
+/// All extreme values, one at a time.
 fn values(search: &Search) -> impl Iterator<Item = (&Parameter, Value)> {
     let extremes = |parameter: &Parameter| parameter.domain.extremes();
     search
@@ -325,7 +328,7 @@ mod tests {
         space = { dmp.alpha_y = { low = 1, high = 9 }, exploration.kind = ['gaussian', 'pink'] }
     ";
 
-    /// As `train`, of the words that these tests use.
+    /// Like `train`, for the arguments used in these tests.
     fn configure(words: &[String]) -> anyhow::Result<ExperimentConfig> {
         let mut layers = Layers::new();
         for pair in words.windows(2) {

@@ -1,4 +1,4 @@
-//! One trial of a search, and its file: `trial.json`, for who has no Optuna at hand.
+//! A trial of a search, and its file `trial.json`, which can be read without Optuna.
 
 use std::path::Path;
 
@@ -12,22 +12,22 @@ use super::space::{Parameter, as_json};
 use crate::run_directory::replace_file;
 use crate::terminal::shown;
 
-/// How a trial is.
+/// State of a trial.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum TrialState {
-    /// Asked for and not at its end.
+    /// Not ended yet.
     Running,
-    /// All its runs are at their end.
+    /// All its runs have finished.
     Finished,
-    /// Given up for what its evaluations showed.
+    /// Stopped early because of its evaluations.
     Pruned,
-    /// One of its runs ended with an error.
+    /// One of its runs failed.
     Failed,
 }
 
 impl TrialState {
-    /// In a word.
+    /// Name of the state.
     #[must_use]
     pub fn name(self) -> &'static str {
         match self {
@@ -39,14 +39,14 @@ impl TrialState {
     }
 }
 
-/// Values of the searched keys, and what came of them.
+/// Values of the searched keys, and their result.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Trial {
-    /// Optuna's number of it, from 0.
+    /// Optuna's number of the trial, from 0.
     pub number: u32,
-    /// By key.
+    /// Values by key.
     pub values: Vec<(String, Value)>,
-    /// How it is.
+    /// State of the trial.
     pub state: TrialState,
     /// Mean over the seeds, once it has finished.
     pub objective: Option<f64>,
@@ -61,7 +61,7 @@ struct File {
 }
 
 impl Trial {
-    /// A new one.
+    /// Creates a new trial.
     pub(super) fn new(
         space: &[Parameter],
         number: u32,
@@ -77,11 +77,11 @@ impl Trial {
         Ok(Self { number, values, state: TrialState::Running, objective: None })
     }
 
-    /// One that the storage has.
+    /// Converts a trial of the storage.
     pub(super) fn stored(space: &[Parameter], stored: &Stored) -> anyhow::Result<Self> {
         let Stored { trial, state, objective, ref values, .. } = *stored;
         if state == TrialState::Failed && values.len() < space.len() {
-            // Somebody else ended it before it had all its values.
+            // Another tool failed the trial before it had all its values.
             return Ok(Self { number: trial, values: Vec::new(), state, objective });
         }
         Ok(Self { state, objective, ..Self::new(space, trial, values)? })
@@ -93,24 +93,24 @@ impl Trial {
         format!("trial-{:03}", self.number)
     }
 
-    /// `key=value` each.
+    /// Values as `key=value`.
     #[must_use]
     pub fn point(&self) -> Vec<String> {
         self.values.iter().map(|(key, value)| format!("{key}={value}")).collect()
     }
 
-    /// Its values in JSON, by key.
+    /// Values as JSON, by key.
     #[must_use]
     pub fn json_values(&self) -> Map<String, serde_json::Value> {
         self.values.iter().map(|(key, value)| (key.clone(), as_json(value))).collect()
     }
 
-    /// What `dmprl train` needs to do the same, as a shell takes it.
+    /// Arguments for `dmprl train` with these values, quoted for a shell.
     #[must_use]
     pub fn set_line(&self) -> String {
         let plain = |letter: char| letter.is_ascii_alphanumeric() || "._-+=/".contains(letter);
         let setting = |(key, value): &(String, Value)| {
-            // `--set` takes what is no TOML for a string.
+            // `--set` reads a value that is no TOML as a string.
             let text = value.as_str().map_or_else(|| value.to_string(), str::to_owned);
             let pair = format!("{key}={text}");
             let quoted = format!("'{}'", pair.replace('\'', r"'\''"));
@@ -119,7 +119,7 @@ impl Trial {
         self.values.iter().map(setting).collect::<Vec<_>>().join(" ")
     }
 
-    /// Writes `trial.json` into its folder below that of the study.
+    /// Writes `trial.json` into the trial's folder below the study's.
     pub(super) fn write(&self, study: &Path) -> anyhow::Result<()> {
         let folder = study.join(self.folder());
         std::fs::create_dir_all(&folder)
@@ -131,7 +131,7 @@ impl Trial {
         replace_file(&folder.join("trial.json"), format!("{text:#}\n").as_bytes())
     }
 
-    /// Every `trial.json` below a study's directory, by number; there may be none.
+    /// Reads every `trial.json` below a study's directory, by number; an absent directory has none.
     pub(super) fn read_all(space: &[Parameter], study: &Path) -> anyhow::Result<Vec<Self>> {
         let Ok(entries) = std::fs::read_dir(study) else { return Ok(Vec::new()) };
         let mut trials = Vec::new();

@@ -63,7 +63,7 @@ pub fn listen(
             Some(first) if first.elapsed() >= SETTLE + duration => {
                 break Some((first.elapsed() - SETTLE).as_secs_f64());
             }
-            None if began.elapsed() >= PATIENCE => bail!("no host came to {endpoint}"),
+            None if began.elapsed() >= PATIENCE => bail!("no host connected to {endpoint}"),
             _ => {}
         }
     };

@@ -69,7 +69,7 @@ pub fn connect(
             break true;
         }
         if relay.away().is_some_and(|(since, _)| since.elapsed() >= PATIENCE) {
-            bail!("{endpoint} does not answer any more");
+            bail!("{endpoint} no longer answers");
         }
     };
     over.store(true, Ordering::Release);
