@@ -66,7 +66,7 @@ fn ctrl_c_ends_the_run_and_leaves_nothing() {
 fn a_run_that_cannot_start_is_named_with_its_own_words() {
     let place = Workplace::new();
     let more = ["--set", "task.id=Reachr-v5"];
-    bench(&place, &more).wait().with_status(1).saying("dmprl train has ended").saying("Reachr");
+    bench(&place, &more).wait().with_status(1).saying("dmprl train exited").saying("Reachr");
     assert_nothing_left(&place);
 }
 
