@@ -3,18 +3,20 @@
 #![allow(clippy::unwrap_used)] // helpers of tests fail as tests do
 
 use std::net::TcpListener;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::sync::{Arc, Mutex};
 use std::thread;
 use std::time::{Duration, Instant};
 
 use dmprl::bench::spec_of;
-use dmprl::bridge::gateway::{Gateway, RunFacts};
-use dmprl::bridge::relay::{Asked, Asking, HostCounts, Relay, ask};
-use dmprl::bridge::wire::{Course, Held};
-use dmprl::bridge::{Ends, Link};
-use dmprl_shared::config::{ExperimentConfig, task_defaults};
+use dmprl::bridge::gateway::{Gateway, GatewaySettings, RunFacts};
+use dmprl::bridge::host_messages::Lease;
+use dmprl::bridge::join::{JoinOutcome, JoinSettings, request_join};
+use dmprl::bridge::relay::{HostCounts, Relay, RelaySettings};
+use dmprl::bridge::wire::RunState;
+use dmprl::bridge::{Link, LinkMode};
+use dmprl_shared::config::task_defaults;
 use dmprl_shared::parameters::ParameterSnapshot;
 use dmprl_shared::segment::{
     LAYOUT_VERSION, Segment, SegmentHeader, SegmentLayout, block_checksum,
@@ -39,14 +41,7 @@ const LAYOUT: SegmentLayout =
 /// What an end keeps of each worker.
 const KEPT: usize = 512;
 
-fn config() -> ExperimentConfig {
-    let mut config = ExperimentConfig::default();
-    config.delivery.unacknowledged_segments = KEPT;
-    config.bridge.under_way_bytes_max = 1 << 20;
-    config
-}
-
-/// An endpoint on loopback that nobody has.
+/// An unused endpoint on loopback.
 fn endpoint() -> String {
     let free = TcpListener::bind("127.0.0.1:0").unwrap();
     format!("tcp/{}", free.local_addr().unwrap())
@@ -61,9 +56,9 @@ fn facts() -> RunFacts {
     }
 }
 
-fn asking(endpoint: &str, workers: usize) -> Asking {
+fn join_settings(endpoint: &str, workers: usize) -> JoinSettings {
     let (endpoint, token) = (endpoint.to_owned(), facts().token);
-    Asking { endpoint, token, host: 1, name: "b".into(), workers: workers as u32 }
+    JoinSettings { endpoint, token, host: 1, name: "b".into(), workers: workers as u32 }
 }
 
 /// What everybody shares.
@@ -76,7 +71,7 @@ struct Stage {
     settled: AtomicU64,
     gaps: AtomicU64,
     refused: AtomicU64,
-    /// Ends that were replaced.
+    /// LinkMode that were replaced.
     replaced: AtomicU64,
     /// How often each end is to be replaced in all: grows as the test goes on.
     replacements: [AtomicU64; 3],
@@ -175,29 +170,38 @@ fn learner(stage: &Stage, domain: PathBuf) {
     }
 }
 
+/// Opens a gateway, again and again while the learner is being replaced.
+fn open_gateway(stage: &Stage, domain: &Path, endpoints: &[String]) -> Gateway {
+    let deadline = Instant::now() + PATIENCE;
+    loop {
+        let settings = GatewaySettings {
+            endpoints,
+            zenoh_file: None,
+            domain,
+            plan: stage.whole_plan(),
+            first_worker: FIRST,
+            session: 0,
+            segments_max: KEPT,
+        };
+        match Gateway::open(settings, facts()) {
+            Ok(gateway) => return gateway,
+            Err(error) => assert!(Instant::now() < deadline, "{error:#}"),
+        }
+        thread::sleep(Duration::from_millis(5));
+    }
+}
+
 fn gateway(stage: &Stage, domain: PathBuf, endpoint: String) {
     for times in 1.. {
         let endpoints = [endpoint.clone()];
-        let open = || {
-            let places = (FIRST, 0, KEPT);
-            Gateway::open((&endpoints, None), (&domain, stage.whole_plan()), places, facts())
-        };
-        let deadline = Instant::now() + PATIENCE;
-        // The learner may just be being replaced.
-        let mut gateway = loop {
-            match open() {
-                Ok(gateway) => break gateway,
-                Err(error) => assert!(Instant::now() < deadline, "{error:#}"),
-            }
-            thread::sleep(Duration::from_millis(5));
-        };
+        let mut gateway = open_gateway(stage, &domain, &endpoints);
         while !stage.is_over() && !stage.is_replaced(1, times) {
             if !gateway.turn().unwrap() {
                 thread::sleep(Duration::from_micros(200));
             }
         }
         if stage.is_over() {
-            gateway.tell(Course::Complete).unwrap();
+            gateway.send_acks(RunState::Complete).unwrap();
             return;
         }
         stage.replaced.fetch_add(1, Ordering::AcqRel);
@@ -206,10 +210,16 @@ fn gateway(stage: &Stage, domain: PathBuf, endpoint: String) {
 
 fn relay(stage: &Stage, domain: PathBuf, endpoint: String) {
     for times in 1.. {
-        let held = Held { first: FIRST as u32, session: 0 };
-        let at = (domain.as_path(), &stage.plan(stage.workers));
-        let asking = asking(&endpoint, stage.workers);
-        let mut relay = Relay::start(asking, (held, None), at, &config()).unwrap();
+        let settings = RelaySettings {
+            join: join_settings(&endpoint, stage.workers),
+            lease: Lease { first: FIRST as u32, session: 0 },
+            zenoh_file: None,
+            domain: &domain,
+            plan: &stage.plan(stage.workers),
+            segments_max: KEPT,
+            in_flight_bytes_max: 1 << 20,
+        };
+        let mut relay = Relay::start(settings).unwrap();
         while !stage.is_over() && !stage.is_replaced(2, times) {
             relay.turn(&HostCounts::default()).unwrap();
             thread::sleep(Duration::from_micros(100));
@@ -332,10 +342,10 @@ fn all_arrives_once_and_in_order_while_learner_gateway_and_relay_are_replaced() 
     assert!(versions.iter().all(|version| *version > 10), "{versions:?}");
 }
 
-/// Somebody who has not been let in, and guesses: what it sends is counted.
+/// Sends messages on a channel that was not given to any host; the gateway counts them.
 fn speak_nonsense(link: &Link, stage: &Stage) {
     let name = "dmprl/0000000000000007/segments/00000000000000aa".to_owned();
-    let stranger = link.outlet(name, dmprl::bridge::Urgency::Segments).unwrap();
+    let stranger = link.sender(name, dmprl::bridge::Urgency::Segments).unwrap();
     stage.until("the stranger's messages counted", || {
         stranger.send(b"nonsense".to_vec()).unwrap();
         stage.refused.load(Ordering::Acquire) > 0
@@ -343,7 +353,7 @@ fn speak_nonsense(link: &Link, stage: &Stage) {
 }
 
 #[test]
-fn who_has_another_token_or_version_is_told_so_and_who_speaks_nonsense_is_passed_over() {
+fn hosts_with_another_token_or_version_and_nonsense_are_rejected() {
     let folder = tempfile::tempdir().unwrap();
     let domain = Domain::create(&folder.path().join("p"), "a").unwrap();
     let path = domain.path().to_owned();
@@ -356,47 +366,37 @@ fn who_has_another_token_or_version_is_told_so_and_who_speaks_nonsense_is_passed
     let gateway = {
         let (stage, news, endpoint) = (Arc::clone(&stage), Arc::clone(&news), endpoint.clone());
         thread::spawn(move || {
-            let deadline = Instant::now() + PATIENCE;
-            let open = || {
-                let at = ([endpoint.clone()], (&*path, stage.whole_plan()));
-                Gateway::open((&at.0, None), at.1, (FIRST, 0, KEPT), facts())
-            };
-            let mut gateway = loop {
-                match open() {
-                    Ok(gateway) => break gateway,
-                    Err(error) => assert!(Instant::now() < deadline, "{error:#}"),
-                }
-            };
+            let mut gateway = open_gateway(&stage, &path, &[endpoint]);
             while !stage.is_over() {
                 gateway.turn().unwrap();
-                news.lock().unwrap().extend(gateway.news());
-                stage.refused.store(gateway.refused(), Ordering::Release);
+                news.lock().unwrap().extend(gateway.take_events());
+                stage.refused.store(gateway.rejected(), Ordering::Release);
                 thread::sleep(POLL);
             }
         })
     };
-    let link = Link::open(Ends::Connect(&endpoint), None).unwrap();
-    let answered = |asking: &Asking, held| {
+    let link = Link::open(LinkMode::Connect(&endpoint), None).unwrap();
+    let answered = |settings: &JoinSettings, lease| {
         let deadline = Instant::now() + PATIENCE;
         loop {
-            match ask(&link, asking, held).unwrap() {
-                Asked::Later(why) => assert!(Instant::now() < deadline, "{why}"),
+            match request_join(&link, settings, lease).unwrap() {
+                JoinOutcome::Later(why) => assert!(Instant::now() < deadline, "{why}"),
                 answer => return answer,
             }
         }
     };
-    let refused = |asking: &Asking, held| match answered(asking, held) {
-        Asked::Refused(reason) => reason,
+    let refused = |settings: &JoinSettings, lease| match answered(settings, lease) {
+        JoinOutcome::Refused(reason) => reason,
         other => panic!("{other:?}"),
     };
-    let right = asking(&endpoint, WORKERS);
-    let wrong = Asking { token: "another secret of some length".into(), ..right.clone() };
+    let right = join_settings(&endpoint, WORKERS);
+    let wrong = JoinSettings { token: "another secret of some length".into(), ..right.clone() };
     assert!(refused(&wrong, None).contains("token"));
-    let many = Asking { workers: 99, ..right.clone() };
+    let many = JoinSettings { workers: 99, ..right.clone() };
     assert!(refused(&many, None).contains("bridge.workers_max"));
-    assert!(matches!(answered(&right, None), Asked::Welcome(_)));
+    assert!(matches!(answered(&right, None), JoinOutcome::Welcome(_)));
     let other = serde_json::json!({"speaks": {"version": "9.9.9", "control": 77}, "new": 1});
-    let answer = link.ask("dmprl/join", other.to_string().into(), PATIENCE).unwrap().unwrap();
+    let answer = link.request("dmprl/join", other.to_string().into(), PATIENCE).unwrap().unwrap();
     let answer = String::from_utf8(answer).unwrap();
     assert!(answer.contains("9.9.9") && answer.contains("\"later\":false"), "{answer}");
     speak_nonsense(&link, &stage);

@@ -22,8 +22,8 @@ use crate::failure::wrong_use;
 /// Capacity of a queue of received messages. If it is full, the link is not read and its sender
 /// blocks.
 const WAITING_MAX: usize = 256;
-/// Time without any message after which a peer counts as gone \[ms\]. It sends keep-alives several
-/// times within this time.
+/// Time without any message after which a peer counts as gone \[ms\]. It sends several keep-alives
+/// within this time.
 const LEASE_MS: u64 = 4_000;
 /// Initial and maximum interval between attempts to connect \[ms\].
 const RETRY_FIRST_MS: u64 = 250;
@@ -36,9 +36,9 @@ const BATCH_BYTES_MAX: usize = 16 << 20;
 /// Maximum number of sessions with the learner's host.
 const SESSIONS_MAX: usize = 256;
 
-/// The two ends of a link.
+/// How an end of a link makes its connection.
 #[derive(Debug, Clone, Copy)]
-pub enum Ends<'a> {
+pub enum LinkMode<'a> {
     /// The learner's host, which listens on these endpoints.
     Listen(&'a [String]),
     /// Another host, which connects to this endpoint.
@@ -62,11 +62,11 @@ pub enum Urgency {
 
 /// Sends messages under one name.
 #[derive(Debug)]
-pub struct Outlet(Publisher<'static>);
+pub struct MessageSender(Publisher<'static>);
 
 /// Receives messages under a name or pattern.
 #[derive(Debug)]
-pub struct Inlet(Subscriber<FifoChannelHandler<Sample>>);
+pub struct MessageReceiver(Subscriber<FifoChannelHandler<Sample>>);
 
 /// A received message.
 #[derive(Debug)]
@@ -74,21 +74,23 @@ pub struct Message(Sample);
 
 /// Receives requests under a name.
 #[derive(Debug)]
-pub struct Questions(Queryable<FifoChannelHandler<Query>>);
+pub struct Requests(Queryable<FifoChannelHandler<Query>>);
 
-/// A request that awaits its answer.
+/// A request that has not been answered yet.
 #[derive(Debug)]
-pub struct Question(Query);
+pub struct Request(Query);
 
-/// Announces that this end lives, until it is dropped or the link is gone.
+/// Announces to the peers that this end is alive, until it is dropped or the link breaks.
 #[derive(Debug)]
-pub struct Token(#[expect(dead_code, reason = "it is there as long as this is")] LivelinessToken);
+pub struct Presence(
+    #[expect(dead_code, reason = "dropping it ends the announcement")] LivelinessToken,
+);
 
 fn failed(what: impl std::fmt::Display) -> impl FnOnce(zenoh::Error) -> anyhow::Error {
     move |error| anyhow!("{what}: {error}")
 }
 
-fn config(ends: Ends<'_>, zenoh_file: Option<&Path>) -> anyhow::Result<Config> {
+fn config(mode: LinkMode<'_>, zenoh_file: Option<&Path>) -> anyhow::Result<Config> {
     let mut config = match zenoh_file {
         None => Config::default(),
         Some(path) => Config::from_file(path).map_err(|error| {
@@ -96,9 +98,9 @@ fn config(ends: Ends<'_>, zenoh_file: Option<&Path>) -> anyhow::Result<Config> {
         })?,
     };
     let endpoints = |endpoints: &[String]| serde_json::to_string(endpoints);
-    let (listen, connect, bytes_max) = match ends {
-        Ends::Listen(at) => (endpoints(at)?, endpoints(&[])?, BATCH_BYTES_MAX),
-        Ends::Connect(to) => (endpoints(&[])?, endpoints(&[to.to_owned()])?, POLICY_BYTES_MAX),
+    let (listen, connect, bytes_max) = match mode {
+        LinkMode::Listen(at) => (endpoints(at)?, endpoints(&[])?, BATCH_BYTES_MAX),
+        LinkMode::Connect(to) => (endpoints(&[])?, endpoints(&[to.to_owned()])?, POLICY_BYTES_MAX),
     };
     let retry = format!(
         "{{period_init_ms: {RETRY_FIRST_MS}, period_max_ms: {RETRY_MAX_MS}, \
@@ -130,19 +132,19 @@ impl Link {
     ///
     /// # Errors
     /// Wrong use: the file is no configuration of Zenoh. Cannot listen on an endpoint.
-    pub fn open(ends: Ends<'_>, zenoh_file: Option<&Path>) -> anyhow::Result<Self> {
-        let what = match ends {
-            Ends::Listen(at) => format!("cannot listen at {}", at.join(", ")),
-            Ends::Connect(to) => format!("cannot connect to {to}"),
+    pub fn open(mode: LinkMode<'_>, zenoh_file: Option<&Path>) -> anyhow::Result<Self> {
+        let what = match mode {
+            LinkMode::Listen(at) => format!("cannot listen at {}", at.join(", ")),
+            LinkMode::Connect(to) => format!("cannot connect to {to}"),
         };
-        zenoh::open(config(ends, zenoh_file)?).wait().map(Self).map_err(failed(what))
+        zenoh::open(config(mode, zenoh_file)?).wait().map(Self).map_err(failed(what))
     }
 
     /// Declares that messages of this name will be sent. On a full link the sender blocks.
     ///
     /// # Errors
     /// The session is closed.
-    pub fn outlet(&self, name: String, urgency: Urgency) -> anyhow::Result<Outlet> {
+    pub fn sender(&self, name: String, urgency: Urgency) -> anyhow::Result<MessageSender> {
         let priority = match urgency {
             Urgency::First => Priority::InteractiveHigh,
             Urgency::Policies => Priority::DataHigh,
@@ -155,70 +157,70 @@ impl Link {
             .congestion_control(CongestionControl::Block)
             .priority(priority)
             .wait();
-        publisher.map(Outlet).map_err(what)
+        publisher.map(MessageSender).map_err(what)
     }
 
     /// Subscribes to messages of this name; `*` stands for any part of it.
     ///
     /// # Errors
     /// The session is closed.
-    pub fn inlet(&self, name: &str) -> anyhow::Result<Inlet> {
+    pub fn receiver(&self, name: &str) -> anyhow::Result<MessageReceiver> {
         let channel = FifoChannel::new(WAITING_MAX);
         let subscriber = self.0.declare_subscriber(name.to_owned()).with(channel).wait();
-        subscriber.map(Inlet).map_err(failed(format!("cannot receive {name}")))
+        subscriber.map(MessageReceiver).map_err(failed(format!("cannot receive {name}")))
     }
 
     /// Declares that requests of this name will be answered.
     ///
     /// # Errors
     /// The session is closed.
-    pub fn questions(&self, name: &str) -> anyhow::Result<Questions> {
+    pub fn requests(&self, name: &str) -> anyhow::Result<Requests> {
         let channel = FifoChannel::new(WAITING_MAX);
         let queryable = self.0.declare_queryable(name.to_owned()).with(channel).wait();
-        queryable.map(Questions).map_err(failed(format!("cannot answer {name}")))
+        queryable.map(Requests).map_err(failed(format!("cannot answer {name}")))
     }
 
     /// Sends a request and waits for the answer, up to `limit`; `None` if no peer answers.
     ///
     /// # Errors
     /// The session is closed.
-    pub fn ask(
+    pub fn request(
         &self,
         name: &str,
-        question: Vec<u8>,
+        payload: Vec<u8>,
         limit: Duration,
     ) -> anyhow::Result<Option<Vec<u8>>> {
-        let asked = self.0.get(name).payload(question).timeout(limit).wait();
-        let answers = asked.map_err(failed(format!("cannot ask {name}")))?;
-        // A safeguard: Zenoh normally observes its own limit.
+        let sent = self.0.get(name).payload(payload).timeout(limit).wait();
+        let answers = sent.map_err(failed(format!("cannot request {name}")))?;
+        // A safeguard: Zenoh normally applies its own limit.
         let answer = answers.recv_timeout(limit * 2);
         let Ok(Some(reply)) = answer else { return Ok(None) };
         Ok(reply.into_result().ok().map(|sample| sample.payload().to_bytes().into_owned()))
     }
 
-    /// Announces that this end lives.
+    /// Announces to the peers that this end is alive.
     ///
     /// # Errors
     /// The session is closed.
-    pub fn token(&self, name: String) -> anyhow::Result<Token> {
-        let what = failed(format!("cannot show {name}"));
-        self.0.liveliness().declare_token(name).wait().map(Token).map_err(what)
+    pub fn announce(&self, name: String) -> anyhow::Result<Presence> {
+        let what = failed(format!("cannot announce {name}"));
+        self.0.liveliness().declare_token(name).wait().map(Presence).map_err(what)
     }
 
     /// Subscribes to the arrival and departure of other ends, including those already present.
     ///
     /// # Errors
     /// The session is closed.
-    pub fn tokens(&self, name: &str) -> anyhow::Result<Inlet> {
+    pub fn presences(&self, name: &str) -> anyhow::Result<MessageReceiver> {
         let channel = FifoChannel::new(WAITING_MAX);
         let liveliness = self.0.liveliness();
         let subscriber =
             liveliness.declare_subscriber(name.to_owned()).history(true).with(channel).wait();
-        subscriber.map(Inlet).map_err(failed(format!("cannot look for {name}")))
+        subscriber.map(MessageReceiver).map_err(failed(format!("cannot watch {name}")))
     }
 }
 
-impl Outlet {
+impl MessageSender {
     /// Sends a message; blocks on a full link. Without a connected peer the message is dropped.
     ///
     /// # Errors
@@ -228,7 +230,7 @@ impl Outlet {
     }
 }
 
-impl Inlet {
+impl MessageReceiver {
     /// Returns the next message, without waiting.
     ///
     /// # Errors
@@ -253,25 +255,25 @@ impl Message {
         self.0.payload().to_bytes()
     }
 
-    /// For a token: true if the end has arrived, false if it is gone.
+    /// For a presence: true if the end has arrived, false if it is gone.
     #[must_use]
-    pub fn has_come(&self) -> bool {
+    pub fn is_arrival(&self) -> bool {
         self.0.kind() == SampleKind::Put
     }
 }
 
-impl Questions {
+impl Requests {
     /// Returns the next request, without waiting.
     ///
     /// # Errors
     /// The session is closed.
-    pub fn next(&self) -> anyhow::Result<Option<Question>> {
+    pub fn next(&self) -> anyhow::Result<Option<Request>> {
         let next = self.0.try_recv().map_err(|error| anyhow!("{error}"));
-        Ok(next.context("cannot take questions")?.map(Question))
+        Ok(next.context("cannot receive requests")?.map(Request))
     }
 }
 
-impl Question {
+impl Request {
     /// Payload of the request.
     #[must_use]
     pub fn bytes(&self) -> Vec<u8> {

@@ -1,4 +1,4 @@
-//! Several hosts: workers send their segments to a learner on another host.
+//! The bridge between hosts: workers send their segments to a learner on another host.
 //!
 //! ```text
 //!  learner's host                                    other hosts
@@ -7,20 +7,23 @@
 //! ```
 //! A [`relay`] acts as the learner for the workers of its host; the [`gateway`] acts as the workers
 //! of all other hosts for the learner. Like a worker, each hop retains the segments that the
-//! learner has not acknowledged: `lane` at the relay, `landing` at the gateway. So after any
-//! process has died, its predecessor in the chain retransmits. `wire` defines the messages,
-//! `window` limits the data in flight, `feed` sends policies, `seats` assigns places to hosts, and
-//! `link` is the only file that names Zenoh.
+//! learner has not acknowledged: `link_sender` at the relay, `link_receiver` at the gateway. So
+//! after any process has died, its predecessor in the chain retransmits. [`wire`] and
+//! [`host_messages`] define the messages, `congestion_window` limits the data in flight,
+//! `policy_sender` sends policies, [`join`] requests places, `host_registry` leases them, and `link`
+//! is the only file that names Zenoh.
 
-mod feed;
+mod congestion_window;
 pub mod gateway;
-pub mod landing;
-pub mod lane;
+pub mod host_messages;
+mod host_registry;
+pub mod join;
 mod link;
+mod link_receiver;
+mod link_sender;
+mod policy_sender;
 pub mod relay;
-pub mod seats;
 pub mod token;
-pub mod window;
 pub mod wire;
 
-pub use link::{Ends, Link, Urgency};
+pub use link::{Link, LinkMode, Urgency};

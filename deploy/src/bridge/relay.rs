@@ -9,24 +9,21 @@ use std::thread;
 use std::time::{Duration, Instant};
 
 use anyhow::{Context, bail, ensure};
-use dmprl_shared::config::ExperimentConfig;
 use dmprl_shared::segment::Segment;
 use dmprl_shared::transport::delivery::{Mark, Sent};
 use dmprl_shared::transport::shared_memory::{LearnerEnd, Plan, serve};
 use dmprl_shared::transport::{AcknowledgementPublisher, ParameterPublisher, SegmentReceiver};
 
-use super::lane::Lane;
-use super::link::{Ends, Inlet, Link, Outlet, Token, Urgency};
-use super::window::Window;
-use super::wire::{self, Batch, Course, Held, HostAnswer, HostRequest, HostStatus, HostWelcome};
-use crate::control::{Greeting, WorkersNow};
+use super::congestion_window::CongestionWindow;
+use super::host_messages::{HostStatus, HostWelcome, Lease};
+use super::join::{JoinOutcome, JoinSettings, request_join};
+use super::link::{Link, LinkMode, MessageReceiver, MessageSender, Presence, Urgency};
+use super::link_sender::LinkSender;
+use super::wire::{self, Batch, RunState};
+use crate::control::WorkersNow;
 
-/// Name of the request to join a run.
-pub(super) const JOIN: &str = "dmprl/join";
-/// Time limit for an answer, which takes one round trip.
-const ANSWER_LIMIT: Duration = Duration::from_secs(3);
 /// Interval between two requests to join.
-const ASK_AGAIN: Duration = Duration::from_millis(500);
+const JOIN_INTERVAL: Duration = Duration::from_millis(500);
 /// Silence after which the gateway or the link counts as gone. The gateway sends several messages
 /// per second.
 const SILENCE: Duration = Duration::from_secs(5);
@@ -37,63 +34,11 @@ const BATCH_BYTES: usize = 60_000;
 const TURN_BYTES: u64 = 262_144;
 /// Maximum number of segments of one worker per turn.
 const TURN_SEGMENTS: usize = 16;
-const ACKNOWLEDGE_INTERVAL: Duration = Duration::from_millis(5);
+const ACK_INTERVAL: Duration = Duration::from_millis(5);
 const MAINTENANCE_INTERVAL: Duration = Duration::from_millis(100);
 const STATUS_INTERVAL: Duration = Duration::from_millis(250);
 /// Time limit to leave the run, which takes one round trip.
 const LEAVE_LIMIT: Duration = Duration::from_secs(2);
-
-/// A host's request to join a run.
-#[derive(Debug, Clone)]
-pub struct Asking {
-    /// Endpoint of the learner's host.
-    pub endpoint: String,
-    /// Token of the run.
-    pub token: String,
-    /// Random number that identifies this start of the program.
-    pub host: u64,
-    /// Name of the host, for display.
-    pub name: String,
-    /// Number of workers.
-    pub workers: u32,
-}
-
-/// Result of one request to join.
-#[derive(Debug)]
-pub enum Asked {
-    /// The host has joined.
-    Welcome(Box<HostWelcome>),
-    /// No answer, or no room at present.
-    Later(String),
-    /// Rejected; another request would be rejected too.
-    Refused(String),
-}
-
-/// Sends one request to join.
-///
-/// # Errors
-/// The session is closed.
-pub fn ask(link: &Link, asking: &Asking, held: Option<Held>) -> anyhow::Result<Asked> {
-    let Asking { endpoint, token, host, name, workers } = asking;
-    let request = HostRequest {
-        speaks: Greeting::this(),
-        token: token.clone(),
-        host: *host,
-        name: name.clone(),
-        workers: *workers,
-        held,
-    };
-    let question = serde_json::to_vec(&request).context("cannot write a request")?;
-    let Some(answer) = link.ask(JOIN, question, ANSWER_LIMIT)? else {
-        return Ok(Asked::Later(format!("no learner's host answers at {endpoint}")));
-    };
-    Ok(match serde_json::from_slice(&answer) {
-        Ok(HostAnswer::Welcome(welcome)) => Asked::Welcome(welcome),
-        Ok(HostAnswer::Refused { reason, later: true }) => Asked::Later(reason),
-        Ok(HostAnswer::Refused { reason, later: false }) => Asked::Refused(reason),
-        Err(error) => Asked::Refused(format!("{endpoint} sent an invalid answer: {error}")),
-    })
-}
 
 /// Counts that the host's supervisor has reported.
 #[derive(Debug, Clone, Copy, Default)]
@@ -106,41 +51,60 @@ pub struct HostCounts {
     pub workers: WorkersNow,
 }
 
-/// The messages of one seat.
-struct Seat {
-    segments: Outlet,
-    status: Outlet,
-    hearings: Inlet,
-    policies: Inlet,
-    /// Arrival and departure of gateways, and the id of the gateway that assigned this seat.
-    gateways: Inlet,
+/// The messages between this host and the gateway that admitted it.
+struct Channel {
+    segments: MessageSender,
+    status: MessageSender,
+    acks: MessageReceiver,
+    policies: MessageReceiver,
+    /// Arrival and departure of gateways, and the id of the gateway that opened this channel.
+    gateways: MessageReceiver,
     gateway: u64,
-    _token: Token,
+    _presence: Presence,
 }
 
-impl Seat {
-    fn take(link: &Link, welcome: &HostWelcome) -> anyhow::Result<Self> {
-        let name = |what: &str| format!("dmprl/{}/{what}/{:016x}", welcome.run_id, welcome.seat);
+impl Channel {
+    fn open(link: &Link, welcome: &HostWelcome) -> anyhow::Result<Self> {
+        let name = |what: &str| format!("dmprl/{}/{what}/{:016x}", welcome.run_id, welcome.channel);
         Ok(Self {
-            gateways: link.tokens(&format!("dmprl/{}/gateway/*", welcome.run_id))?,
+            gateways: link.presences(&format!("dmprl/{}/gateway/*", welcome.run_id))?,
             gateway: welcome.gateway,
-            hearings: link.inlet(&name("hearings"))?,
-            policies: link.inlet(&name("policies"))?,
-            segments: link.outlet(name("segments"), Urgency::Segments)?,
-            status: link.outlet(name("status"), Urgency::First)?,
-            _token: link.token(name("hosts"))?,
+            acks: link.receiver(&name("hearings"))?,
+            policies: link.receiver(&name("policies"))?,
+            segments: link.sender(name("segments"), Urgency::Segments)?,
+            status: link.sender(name("status"), Urgency::First)?,
+            _presence: link.announce(name("hosts"))?,
         })
     }
 
-    /// Returns true if the gateway that assigned the seat is gone, or another has appeared.
+    /// Returns true if the gateway that opened the channel is gone, or another has appeared.
     fn is_in_doubt(&self) -> anyhow::Result<bool> {
         let mut doubt = false;
         while let Some(message) = self.gateways.next()? {
             let ours = u64::from_str_radix(message.last_name(), 16) == Ok(self.gateway);
-            doubt |= ours != message.has_come();
+            doubt |= ours != message.is_arrival();
         }
         Ok(doubt)
     }
+}
+
+/// Where a relay connects and which workers it serves.
+#[derive(Debug)]
+pub struct RelaySettings<'a> {
+    /// The run to join.
+    pub join: JoinSettings,
+    /// Places that this host was given when it joined.
+    pub lease: Lease,
+    /// Zenoh's own configuration file.
+    pub zenoh_file: Option<&'a Path>,
+    /// This host's shared-memory directory.
+    pub domain: &'a Path,
+    /// The plan of this host's workers.
+    pub plan: &'a Plan,
+    /// Maximum number of retained segments of each worker.
+    pub segments_max: usize,
+    /// Maximum number of bytes in flight.
+    pub in_flight_bytes_max: u64,
 }
 
 /// Result of a turn.
@@ -157,16 +121,18 @@ pub enum Turn {
 /// The relay of a host.
 pub struct Relay {
     link: Link,
-    asking: Asking,
+    join: JoinSettings,
     /// The places of this host.
-    given: Held,
-    seat: Option<Seat>,
-    end: LearnerEnd,
-    lanes: Vec<Lane>,
+    lease: Lease,
+    /// Open once the host has joined.
+    channel: Option<Channel>,
+    learner_end: LearnerEnd,
+    /// One for each worker.
+    senders: Vec<LinkSender>,
     marks: Vec<Mark>,
     /// The worker whose turn is next.
     next: usize,
-    window: Window,
+    window: CongestionWindow,
     segment_bytes: u64,
     segment_steps: usize,
     architecture_hash: u64,
@@ -176,14 +142,15 @@ pub struct Relay {
     env_steps: u64,
     acked: u64,
     started: Instant,
-    heard: Instant,
+    last_heard: Instant,
     /// Set if the gateway may be gone or may have been replaced.
-    doubt: bool,
-    asked: Option<Instant>,
-    acknowledged: Instant,
+    in_doubt: bool,
+    join_requested: Option<Instant>,
+    acks_sent: Instant,
     maintained: Instant,
-    told: Instant,
-    tell_now: bool,
+    status_sent: Instant,
+    /// Set if a status is due before the regular interval has passed.
+    status_due: bool,
     /// Time since which the learner's host does not answer, and the reason.
     away: Option<(Instant, String)>,
     /// Messages that could not be read.
@@ -191,33 +158,30 @@ pub struct Relay {
 }
 
 impl Relay {
-    /// Starts to serve the host's workers; `held` are the places assigned to it before.
+    /// Starts to serve the host's workers.
     ///
     /// # Errors
     /// The session or the shared memory cannot be opened.
-    pub fn start(
-        asking: Asking,
-        (held, zenoh_file): (Held, Option<&Path>),
-        (domain, plan): (&Path, &Plan),
-        config: &ExperimentConfig,
-    ) -> anyhow::Result<Self> {
-        let link = Link::open(Ends::Connect(&asking.endpoint), zenoh_file)?;
-        let end = serve(domain, plan)?;
-        let capacity = config.delivery.unacknowledged_segments;
-        let lane = |index: u32| Lane::new(held.first + index, plan.layout, capacity);
+    pub fn start(settings: RelaySettings<'_>) -> anyhow::Result<Self> {
+        let RelaySettings { join, lease, zenoh_file, domain, plan, .. } = settings;
+        let link = Link::open(LinkMode::Connect(&join.endpoint), zenoh_file)?;
+        let learner_end = serve(domain, plan)?;
+        let workers = lease.first..lease.first + join.workers;
+        let senders =
+            workers.map(|index| LinkSender::new(index, plan.layout, settings.segments_max));
         let buffer = Segment::zeroed(plan.layout);
         let segment_bytes = size_of_val(&buffer.header) + size_of_val(buffer.block.as_slice());
         let now = Instant::now();
         Ok(Self {
             link,
-            lanes: (0..asking.workers).map(lane).collect(),
-            marks: vec![Mark::default(); asking.workers as usize],
-            asking,
-            given: held,
-            seat: None,
-            end,
+            senders: senders.collect(),
+            marks: vec![Mark::default(); join.workers as usize],
+            join,
+            lease,
+            channel: None,
+            learner_end,
             next: 0,
-            window: Window::new(config.bridge.under_way_bytes_max),
+            window: CongestionWindow::new(settings.in_flight_bytes_max),
             segment_bytes: segment_bytes as u64,
             segment_steps: plan.layout.segment_steps,
             architecture_hash: plan.architecture_hash,
@@ -227,13 +191,13 @@ impl Relay {
             env_steps: 0,
             acked: 0,
             started: now,
-            heard: now,
-            doubt: false,
-            asked: None,
-            acknowledged: now,
+            last_heard: now,
+            in_doubt: false,
+            join_requested: None,
+            acks_sent: now,
             maintained: now,
-            told: now,
-            tell_now: false,
+            status_sent: now,
+            status_due: false,
             away: Some((now, "no request has been sent yet".to_owned())),
             damaged: 0,
         })
@@ -269,10 +233,10 @@ impl Relay {
         self.window.bytes()
     }
 
-    /// Number of segments that the learner has not acknowledged.
+    /// Number of segments that were sent and that the learner has not acknowledged.
     #[must_use]
-    pub fn under_way(&self) -> u64 {
-        self.lanes.iter().map(|lane| lane.under_way() as u64).sum()
+    pub fn in_flight(&self) -> u64 {
+        self.senders.iter().map(|sender| sender.in_flight() as u64).sum()
     }
 
     /// Time since which the learner's host does not answer, and the reason.
@@ -284,7 +248,7 @@ impl Relay {
     /// Number of damaged messages and invalid segments.
     #[must_use]
     pub fn damaged(&self) -> u64 {
-        self.damaged + self.lanes.iter().map(Lane::misfits).sum::<u64>()
+        self.damaged + self.senders.iter().map(LinkSender::rejected).sum::<u64>()
     }
 
     /// Runs one turn: reads messages, takes segments, sends them.
@@ -295,26 +259,26 @@ impl Relay {
         let now = Instant::now();
         // First, because messages that end the silence may be waiting after a turn with a full
         // link.
-        let course = self.hear(now)?;
-        self.stay_in_touch(now)?;
-        let sent = self.send(now)?;
+        let state = self.read_acks(now)?;
+        self.rejoin_if_silent(now)?;
+        let sent = self.send_segments(now)?;
         self.take_policy()?;
-        if now.duration_since(self.acknowledged) >= ACKNOWLEDGE_INTERVAL {
-            self.acknowledged = now;
+        if now.duration_since(self.acks_sent) >= ACK_INTERVAL {
+            self.acks_sent = now;
             self.acknowledge()?;
         }
         if now.duration_since(self.maintained) >= MAINTENANCE_INTERVAL {
             self.maintained = now;
-            self.end.segments.maintain()?;
-            self.end.parameters.maintain()?;
-            self.end.acknowledgements.maintain()?;
+            self.learner_end.segments.maintain()?;
+            self.learner_end.parameters.maintain()?;
+            self.learner_end.acknowledgements.maintain()?;
         }
-        if self.tell_now || now.duration_since(self.told) >= STATUS_INTERVAL {
-            (self.told, self.tell_now) = (now, false);
-            self.tell(counts, false)?;
+        if self.status_due || now.duration_since(self.status_sent) >= STATUS_INTERVAL {
+            (self.status_sent, self.status_due) = (now, false);
+            self.send_status(counts, false)?;
         }
-        Ok(match course {
-            Course::Complete => Turn::Complete,
+        Ok(match state {
+            RunState::Complete => Turn::Complete,
             _ if sent => Turn::Worked,
             _ => Turn::Idle,
         })
@@ -328,125 +292,127 @@ impl Relay {
     pub fn leave(&mut self, counts: &HostCounts) -> anyhow::Result<()> {
         let deadline = Instant::now() + LEAVE_LIMIT;
         while self.away.is_none() && Instant::now() < deadline {
-            self.tell(counts, true)?;
+            self.send_status(counts, true)?;
             let again = Instant::now() + STATUS_INTERVAL;
             while Instant::now() < again {
-                if self.hear(Instant::now())? == Course::Left {
+                if self.read_acks(Instant::now())? == RunState::Left {
                     return Ok(());
                 }
-                thread::sleep(ACKNOWLEDGE_INTERVAL);
+                thread::sleep(ACK_INTERVAL);
             }
         }
         Ok(())
     }
 
     /// Joins again if the gateway is silent: there may be a new one, which does not know this host.
-    fn stay_in_touch(&mut self, now: Instant) -> anyhow::Result<()> {
-        self.doubt |= self.seat.as_ref().map_or(Ok(false), Seat::is_in_doubt)?;
-        let silent = now.duration_since(self.heard) >= SILENCE;
-        let silent = self.seat.is_none() || self.doubt || silent;
-        let due = self.asked.is_none_or(|asked| now.duration_since(asked) >= ASK_AGAIN);
-        if !silent || !due {
+    fn rejoin_if_silent(&mut self, now: Instant) -> anyhow::Result<()> {
+        self.in_doubt |= self.channel.as_ref().map_or(Ok(false), Channel::is_in_doubt)?;
+        let silent = now.duration_since(self.last_heard) >= SILENCE;
+        let needed = self.channel.is_none() || self.in_doubt || silent;
+        let due = self.join_requested.is_none_or(|at| now.duration_since(at) >= JOIN_INTERVAL);
+        if !needed || !due {
             return Ok(());
         }
-        let asked = ask(&self.link, &self.asking, Some(self.given))?;
-        self.asked = Some(Instant::now());
-        match asked {
-            Asked::Welcome(welcome) => {
+        let outcome = request_join(&self.link, &self.join, Some(self.lease))?;
+        self.join_requested = Some(Instant::now());
+        match outcome {
+            JoinOutcome::Welcome(welcome) => {
                 ensure!(
-                    welcome.held == self.given,
+                    welcome.lease == self.lease,
                     "expected the places {:?} of its workers, got {:?}: start the bridge again",
-                    self.given,
-                    welcome.held
+                    self.lease,
+                    welcome.lease
                 );
-                self.seat = Some(Seat::take(&self.link, &welcome)?);
-                self.lanes.iter_mut().for_each(Lane::begin_anew);
-                self.heard = Instant::now();
+                self.channel = Some(Channel::open(&self.link, &welcome)?);
+                self.senders.iter_mut().for_each(LinkSender::begin_retransmit);
+                self.last_heard = Instant::now();
                 // The first status message tells the gateway that this host listens.
-                (self.away, self.doubt, self.tell_now) = (None, false, true);
+                (self.away, self.in_doubt, self.status_due) = (None, false, true);
             }
-            Asked::Later(reason) => {
-                let since = self.away.as_ref().map_or(now, |(since, _)| *since);
-                self.away = Some((since, reason));
-            }
-            Asked::Refused(reason) => bail!("the learner's host refuses: {reason}"),
+            JoinOutcome::Later(reason) => self.set_away(now, reason),
+            JoinOutcome::Refused(reason) => bail!("the learner's host refuses: {reason}"),
         }
         Ok(())
     }
 
-    fn hear(&mut self, now: Instant) -> anyhow::Result<Course> {
-        let Some(seat) = &self.seat else { return Ok(Course::On) };
-        let mut course = Course::On;
-        while let Some(message) = seat.hearings.next()? {
-            let (said, hearings) = match wire::read_hearings(&message.bytes()) {
-                Ok(read) if read.1.len() == self.lanes.len() => read,
+    /// Records why the learner's host does not answer, since `now` or the time noted before.
+    fn set_away(&mut self, now: Instant, reason: String) {
+        let since = self.away.as_ref().map_or(now, |(since, _)| *since);
+        self.away = Some((since, reason));
+    }
+
+    fn read_acks(&mut self, now: Instant) -> anyhow::Result<RunState> {
+        let Some(channel) = &self.channel else { return Ok(RunState::Running) };
+        let mut state = RunState::Running;
+        while let Some(message) = channel.acks.next()? {
+            let (newest, acks) = match wire::read_acks(&message.bytes()) {
+                Ok(read) if read.1.len() == self.senders.len() => read,
                 _ => {
                     self.damaged += 1;
                     continue;
                 }
             };
-            self.heard = now;
+            self.last_heard = now;
             self.away = None;
-            course = said;
+            state = newest;
             let now_s = now.duration_since(self.started).as_secs_f64();
             let mut segments = 0;
-            for (lane, hearing) in self.lanes.iter_mut().zip(&hearings) {
-                let acked = lane.hear(hearing, now);
+            for (sender, ack) in self.senders.iter_mut().zip(&acks) {
+                let acked = sender.acknowledge(ack, now);
                 segments += acked.segments;
                 if let Some(round_trip_s) = acked.round_trip_s {
-                    self.window.time(round_trip_s, now_s);
+                    self.window.record_round_trip(round_trip_s, now_s);
                 }
             }
             self.acked += segments;
             self.window.acknowledge(segments * self.segment_bytes, now_s);
         }
-        if course == Course::Stopped {
-            let since = self.away.as_ref().map_or(now, |(since, _)| *since);
-            self.away = Some((since, "the run was stopped; it may be resumed".to_owned()));
+        if state == RunState::Stopped {
+            self.set_away(now, "the run was stopped; it may be resumed".to_owned());
         }
-        Ok(course)
+        Ok(state)
     }
 
     /// Takes segments from the workers in turn while there is room, and sends them.
-    fn send(&mut self, now: Instant) -> anyhow::Result<bool> {
-        let Some(seat) = &self.seat else { return Ok(false) };
+    fn send_segments(&mut self, now: Instant) -> anyhow::Result<bool> {
+        let Some(channel) = &self.channel else { return Ok(false) };
         // Allows at least one segment of any size in flight; otherwise the run would stop.
         let window = (self.window.bytes() / self.segment_bytes).max(1);
         let together = (TURN_BYTES / self.segment_bytes).max(1);
-        let room = window.saturating_sub(self.under_way()).min(together);
+        let room = window.saturating_sub(self.in_flight()).min(together);
         let mut room = usize::try_from(room).unwrap_or(0);
-        let count = self.lanes.len();
+        let count = self.senders.len();
         let mut sent = false;
         for turn in 0..count {
             let worker = (self.next + turn) % count;
-            let lane = &mut self.lanes[worker];
-            lane.send(&mut self.batch, &mut room, now);
+            let sender = &mut self.senders[worker];
+            sender.send(&mut self.batch, &mut room, now);
             for _ in 0..TURN_SEGMENTS.min(room) {
-                if !lane.has_room()
-                    || !self.end.segments.try_receive_from(worker, &mut self.buffer)?
+                if !sender.has_room()
+                    || !self.learner_end.segments.try_receive_from(worker, &mut self.buffer)?
                 {
                     break;
                 }
-                lane.take(&self.buffer);
-                lane.send(&mut self.batch, &mut room, now);
+                sender.take(&self.buffer);
+                sender.send(&mut self.batch, &mut room, now);
             }
             if self.batch.bytes() >= BATCH_BYTES {
-                seat.segments.send(self.batch.take())?;
+                channel.segments.send(self.batch.take())?;
                 sent = true;
             }
         }
         self.next = (self.next + 1) % count.max(1);
         if !self.batch.is_empty() {
-            seat.segments.send(self.batch.take())?;
+            channel.segments.send(self.batch.take())?;
             sent = true;
         }
         Ok(sent)
     }
 
     fn take_policy(&mut self) -> anyhow::Result<()> {
-        let Some(seat) = &self.seat else { return Ok(()) };
+        let Some(channel) = &self.channel else { return Ok(()) };
         let mut newest = None;
-        while let Some(message) = seat.policies.next()? {
+        while let Some(message) = channel.policies.next()? {
             newest = Some(message);
         }
         let Some(message) = newest else { return Ok(()) };
@@ -458,30 +424,30 @@ impl Relay {
             }
         };
         if snapshot.version > self.version {
-            self.end.parameters.publish(&snapshot)?;
+            self.learner_end.parameters.publish(&snapshot)?;
             (self.version, self.env_steps) = (snapshot.version, snapshot.env_steps);
         }
         // The gateway sends the next policy after this one is confirmed.
-        self.tell_now = true;
+        self.status_due = true;
         Ok(())
     }
 
     fn acknowledge(&mut self) -> anyhow::Result<()> {
         self.marks.clear();
-        self.marks.extend(self.lanes.iter().map(Lane::mark));
-        Ok(self.end.acknowledgements.acknowledge(&self.marks)?)
+        self.marks.extend(self.senders.iter().map(LinkSender::mark));
+        Ok(self.learner_end.acknowledgements.acknowledge(&self.marks)?)
     }
 
-    fn tell(&mut self, counts: &HostCounts, leaves: bool) -> anyhow::Result<()> {
-        let Some(seat) = &self.seat else { return Ok(()) };
-        // Send it after the segments; otherwise some would seem to be missing.
-        self.lanes.iter().for_each(|lane| lane.say_how_far(&mut self.batch));
+    fn send_status(&mut self, counts: &HostCounts, leaves: bool) -> anyhow::Result<()> {
+        let Some(channel) = &self.channel else { return Ok(()) };
+        // After the segments: otherwise some would seem to be missing.
+        self.senders.iter().for_each(|sender| sender.report_progress(&mut self.batch));
         if !self.batch.is_empty() {
-            seat.segments.send(self.batch.take())?;
+            channel.segments.send(self.batch.take())?;
         }
         let HostCounts { sent, env_failures, workers } = *counts;
         let policy_version = self.version;
         let status = HostStatus { policy_version, sent, env_failures, workers, leaves };
-        seat.status.send(serde_json::to_vec(&status).context("cannot write a status")?)
+        channel.status.send(serde_json::to_vec(&status).context("cannot write a status")?)
     }
 }

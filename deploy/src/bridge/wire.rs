@@ -1,20 +1,16 @@
-//! Messages between relay and gateway, as bytes.
+//! Binary messages between relay and gateway: segments, acknowledgements and policies.
 //!
-//! Segments are sent as they are in shared memory, header and block, in *stretches*: consecutive
-//! segments of one worker. The head reveals a different layout, a different byte order or damage.
-//! The learner verifies the checksum of each block, as with any worker.
+//! Segments are sent as they are in shared memory, header and block, in ranges of consecutive
+//! segments of one worker. A message's head reveals a different layout, a different byte order or
+//! damage. The learner verifies the checksum of each block, as with any worker.
 //!
-//! Small and rare messages (joining, a host's status) are JSON.
+//! Small and rare messages are JSON (`host_messages.rs`).
 
 use bytemuck::{Pod, Zeroable};
 use dmprl_shared::parameters::ParameterSnapshot;
 use dmprl_shared::segment::{Segment, SegmentHeader};
-use dmprl_shared::spec::EnvSpec;
-use dmprl_shared::transport::delivery::{Mark, Sent};
-use serde::{Deserialize, Serialize};
+use dmprl_shared::transport::delivery::Mark;
 use thiserror::Error;
-
-use crate::control::{Greeting, WorkersNow};
 
 /// First four bytes of every message, which also reveal a different byte order.
 const MAGIC: u32 = 0x4442_524d;
@@ -48,51 +44,52 @@ pub enum WireError {
 #[repr(C)]
 struct Head {
     magic: u32,
-    /// Number of stretches or workers.
+    /// Number of ranges or workers.
     count: u32,
     /// CRC-32 of the rest of the message, without the segments' blocks.
     checksum: u32,
-    /// From a gateway a [`Course`]; from a host 0.
-    course: u32,
+    /// From a gateway a [`RunState`]; from a host 0.
+    run_state: u32,
 }
 
 /// Consecutive segments of one worker; without segments it only reports the worker's progress.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Pod, Zeroable)]
 #[repr(C)]
-pub struct Stretch {
+pub struct SegmentRange {
     /// The oldest segment that the host retains: all earlier ones are acknowledged.
-    pub first: u64,
-    /// Sequence number of the first segment of this stretch, or of the next one to be sent.
-    pub next: u64,
+    pub oldest: u64,
+    /// Sequence number of the first segment of this range, or of the next one to send.
+    pub start: u64,
     /// Index of the worker in the run.
     pub worker: u32,
     /// Incarnation of the worker.
     pub incarnation: u32,
-    /// Number of times that the worker's retained segments were sent again.
-    pub attempt: u32,
+    /// Counts how often all retained segments of the worker were sent again, from 1.
+    pub retransmit_epoch: u32,
     /// Number of segments that follow.
     pub count: u32,
 }
 
-/// The state of one worker at the gateway and at the learner.
+/// The gateway's acknowledgement to one worker: the state at the gateway and at the learner.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Pod, Zeroable)]
 #[repr(C)]
-pub struct Hearing {
+pub struct LinkAck {
     /// The learner has acknowledged all segments up to this sequence number.
     pub sequence: u64,
     /// The gateway has received all segments up to this sequence number.
-    pub landed: u64,
+    pub received: u64,
     /// Incarnation to which `sequence` belongs.
     pub incarnation: u32,
-    /// Incarnation to which `landed` belongs.
-    pub landed_incarnation: u32,
-    /// Attempt in which a segment was missing, so that the host must retransmit; 0 if none.
-    pub refused: u32,
+    /// Incarnation to which `received` belongs.
+    pub received_incarnation: u32,
+    /// Retransmit epoch in which a segment was missing, so that the host must begin the next one;
+    /// 0 if none.
+    pub rejected_epoch: u32,
     /// Padding of the last word.
     pub reserved: u32,
 }
 
-impl Hearing {
+impl LinkAck {
     /// The learner's last acknowledgement.
     #[must_use]
     pub fn mark(&self) -> Mark {
@@ -102,9 +99,9 @@ impl Hearing {
 
 /// State of a run, as reported to the hosts.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Course {
+pub enum RunState {
     /// The run continues.
-    On,
+    Running,
     /// The run is complete.
     Complete,
     /// The run was stopped and may be resumed.
@@ -113,19 +110,19 @@ pub enum Course {
     Left,
 }
 
-impl Course {
+impl RunState {
     fn of(number: u32) -> Self {
         match number {
             1 => Self::Complete,
             2 => Self::Stopped,
             3 => Self::Left,
-            _ => Self::On,
+            _ => Self::Running,
         }
     }
 
     fn number(self) -> u32 {
         match self {
-            Self::On => 0,
+            Self::Running => 0,
             Self::Complete => 1,
             Self::Stopped => 2,
             Self::Left => 3,
@@ -136,24 +133,24 @@ impl Course {
 /// A message of segments under construction.
 #[derive(Debug, Default)]
 pub struct Batch {
-    stretches: Vec<Stretch>,
+    ranges: Vec<SegmentRange>,
     body: Vec<u8>,
     headers: crc32fast::Hasher,
 }
 
 impl Batch {
-    /// Begins a stretch, to which the next segments belong.
-    pub fn begin(&mut self, stretch: Stretch) {
-        self.stretches.push(Stretch { count: 0, ..stretch });
+    /// Begins a range, to which the next segments belong.
+    pub fn begin(&mut self, range: SegmentRange) {
+        self.ranges.push(SegmentRange { count: 0, ..range });
     }
 
-    /// Adds a segment to the current stretch.
+    /// Adds a segment to the current range.
     ///
     /// # Panics
-    /// Without a current stretch.
+    /// Without a current range.
     pub fn add(&mut self, header: &SegmentHeader, block: &[f32]) {
-        let stretch = self.stretches.last_mut();
-        stretch.expect("a segment belongs to a stretch").count += 1;
+        let range = self.ranges.last_mut();
+        range.expect("a segment belongs to a range").count += 1;
         self.headers.update(bytemuck::bytes_of(header));
         self.body.extend_from_slice(bytemuck::bytes_of(header));
         self.body.extend_from_slice(bytemuck::cast_slice(block));
@@ -165,24 +162,24 @@ impl Batch {
         self.body.len()
     }
 
-    /// Returns true if no stretch has begun.
+    /// Returns true if no range has begun.
     #[must_use]
     pub fn is_empty(&self) -> bool {
-        self.stretches.is_empty()
+        self.ranges.is_empty()
     }
 
     /// Finishes the message; the batch is empty afterwards.
     pub fn take(&mut self) -> Vec<u8> {
         let mut hasher = std::mem::take(&mut self.headers);
-        hasher.update(bytemuck::cast_slice(&self.stretches));
-        let count = u32::try_from(self.stretches.len()).unwrap_or(u32::MAX);
-        let head = Head { magic: MAGIC, count, checksum: hasher.finalize(), course: 0 };
-        let table = size_of_val(self.stretches.as_slice());
+        hasher.update(bytemuck::cast_slice(&self.ranges));
+        let count = u32::try_from(self.ranges.len()).unwrap_or(u32::MAX);
+        let head = Head { magic: MAGIC, count, checksum: hasher.finalize(), run_state: 0 };
+        let table = size_of_val(self.ranges.as_slice());
         let mut message = Vec::with_capacity(size_of::<Head>() + table + self.body.len());
         message.extend_from_slice(bytemuck::bytes_of(&head));
-        message.extend_from_slice(bytemuck::cast_slice(&self.stretches));
+        message.extend_from_slice(bytemuck::cast_slice(&self.ranges));
         message.extend_from_slice(&self.body);
-        self.stretches.clear();
+        self.ranges.clear();
         self.body.clear();
         message
     }
@@ -203,7 +200,7 @@ fn check(expected: u32, hasher: crc32fast::Hasher) -> Result<(), WireError> {
 }
 
 /// Reads a message of segments into `buffer`, whose layout determines their size. Calls `take` with
-/// `None` for each stretch, then with each of its segments. The message is verified first, except
+/// `None` for each range, then with each of its segments. The message is verified first, except
 /// for the segments' blocks.
 ///
 /// # Errors
@@ -211,16 +208,17 @@ fn check(expected: u32, hasher: crc32fast::Hasher) -> Result<(), WireError> {
 pub fn read_batch(
     message: &[u8],
     buffer: &mut Segment,
-    mut take: impl FnMut(&Stretch, Option<&Segment>),
+    mut take: impl FnMut(&SegmentRange, Option<&Segment>),
 ) -> Result<(), WireError> {
     let (head, rest) = head(message)?;
     let length = |expected: usize| WireError::Length { expected, got: message.len() };
-    let table = (head.count as usize).saturating_mul(size_of::<Stretch>());
+    let table = (head.count as usize).saturating_mul(size_of::<SegmentRange>());
     let (table, body) = rest.split_at_checked(table).ok_or_else(|| length(table))?;
-    let stretches =
-        table.chunks_exact(size_of::<Stretch>()).map(bytemuck::pod_read_unaligned::<Stretch>);
+    let ranges = table
+        .chunks_exact(size_of::<SegmentRange>())
+        .map(bytemuck::pod_read_unaligned::<SegmentRange>);
     let each = HEADER_BYTES + size_of_val(buffer.block.as_slice());
-    let segments: u64 = stretches.clone().map(|stretch| u64::from(stretch.count)).sum();
+    let segments: u64 = ranges.clone().map(|range| u64::from(range.count)).sum();
     let expected = usize::try_from(segments).unwrap_or(usize::MAX).saturating_mul(each);
     if expected != body.len() {
         let around = message.len() - body.len();
@@ -231,35 +229,35 @@ pub fn read_batch(
     hasher.update(table);
     check(head.checksum, hasher)?;
     let mut segments = body.chunks_exact(each);
-    for stretch in stretches {
-        take(&stretch, None);
-        for bytes in segments.by_ref().take(stretch.count as usize) {
+    for range in ranges {
+        take(&range, None);
+        for bytes in segments.by_ref().take(range.count as usize) {
             let (header, block) = bytes.split_at(HEADER_BYTES);
             buffer.header = bytemuck::pod_read_unaligned(header);
             bytemuck::cast_slice_mut(&mut buffer.block).copy_from_slice(block);
-            take(&stretch, Some(buffer));
+            take(&range, Some(buffer));
         }
     }
     Ok(())
 }
 
-/// Writes a message with the state of a host's workers.
+/// Writes a message with the acknowledgements to a host's workers.
 #[must_use]
-pub fn write_hearings(course: Course, hearings: &[Hearing]) -> Vec<u8> {
-    let body: &[u8] = bytemuck::cast_slice(hearings);
-    let count = u32::try_from(hearings.len()).unwrap_or(u32::MAX);
-    let (checksum, course) = (crc32fast::hash(body), course.number());
-    let head = Head { magic: MAGIC, count, checksum, course };
+pub fn write_acks(run_state: RunState, acks: &[LinkAck]) -> Vec<u8> {
+    let body: &[u8] = bytemuck::cast_slice(acks);
+    let count = u32::try_from(acks.len()).unwrap_or(u32::MAX);
+    let (checksum, run_state) = (crc32fast::hash(body), run_state.number());
+    let head = Head { magic: MAGIC, count, checksum, run_state };
     [bytemuck::bytes_of(&head), body].concat()
 }
 
-/// Reads a message with the state of a host's workers.
+/// Reads a message with the acknowledgements to a host's workers.
 ///
 /// # Errors
 /// It is not such a message, or it is damaged.
-pub fn read_hearings(message: &[u8]) -> Result<(Course, Vec<Hearing>), WireError> {
+pub fn read_acks(message: &[u8]) -> Result<(RunState, Vec<LinkAck>), WireError> {
     let (head, body) = head(message)?;
-    let expected = (head.count as usize).saturating_mul(size_of::<Hearing>());
+    let expected = (head.count as usize).saturating_mul(size_of::<LinkAck>());
     if expected != body.len() {
         let expected = expected.saturating_add(size_of::<Head>());
         return Err(WireError::Length { expected, got: message.len() });
@@ -267,8 +265,8 @@ pub fn read_hearings(message: &[u8]) -> Result<(Course, Vec<Hearing>), WireError
     let mut hasher = crc32fast::Hasher::new();
     hasher.update(body);
     check(head.checksum, hasher)?;
-    let hearings = body.chunks_exact(size_of::<Hearing>()).map(bytemuck::pod_read_unaligned);
-    Ok((Course::of(head.course), hearings.collect()))
+    let acks = body.chunks_exact(size_of::<LinkAck>()).map(bytemuck::pod_read_unaligned);
+    Ok((RunState::of(head.run_state), acks.collect()))
 }
 
 /// Writes a policy snapshot.
@@ -276,7 +274,7 @@ pub fn read_hearings(message: &[u8]) -> Result<(Course, Vec<Hearing>), WireError
 pub fn write_snapshot(snapshot: &ParameterSnapshot) -> Vec<u8> {
     let values: &[u8] = bytemuck::cast_slice(&snapshot.values);
     let count = u32::try_from(snapshot.values.len()).unwrap_or(u32::MAX);
-    let head = Head { magic: MAGIC, count, checksum: snapshot.checksum(), course: 0 };
+    let head = Head { magic: MAGIC, count, checksum: snapshot.checksum(), run_state: 0 };
     let words = [snapshot.version, snapshot.env_steps, snapshot.architecture_hash];
     [bytemuck::bytes_of(&head), bytemuck::cast_slice(&words), values].concat()
 }
@@ -304,118 +302,9 @@ pub fn read_snapshot(message: &[u8]) -> Result<ParameterSnapshot, WireError> {
     Ok(snapshot)
 }
 
-/// A host's request to join.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub struct HostRequest {
-    /// Program and version of the host.
-    pub speaks: Greeting,
-    /// Token of the run.
-    pub token: String,
-    /// Random number that identifies this start of `dmprl bridge`.
-    pub host: u64,
-    /// Name of the host, for display.
-    pub name: String,
-    /// Number of workers.
-    pub workers: u32,
-    /// Previous places, if the host returns.
-    pub held: Option<Held>,
-}
-
-/// The places of a host.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub struct Held {
-    /// Index of its first worker in the run.
-    pub first: u32,
-    /// Session of the run from which its workers' incarnations are derived.
-    pub session: u32,
-}
-
-/// Answer to a request to join.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-#[serde(rename_all = "snake_case", deny_unknown_fields)]
-pub enum HostAnswer {
-    /// The host is admitted.
-    Welcome(Box<HostWelcome>),
-    /// The host is rejected.
-    Refused {
-        /// The reason and a remedy.
-        reason: String,
-        /// True if a later request may succeed.
-        later: bool,
-    },
-}
-
-/// Everything that an admitted host needs to know.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub struct HostWelcome {
-    /// Secret part of the names of the messages between this host and the gateway.
-    pub seat: u64,
-    /// Id of the gateway. Its successor does not know the seat.
-    pub gateway: u64,
-    /// Places of the host.
-    pub held: Held,
-    /// Run id, as in the manifest.
-    pub run_id: String,
-    /// Configuration, as in the run's `config.toml`.
-    pub config: String,
-    /// Spec of the run's environment.
-    pub spec: EnvSpec,
-}
-
-/// Status of a host, sent several times per second.
-#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub struct HostStatus {
-    /// Version of its policy.
-    pub policy_version: u64,
-    /// Counts of its workers' segments since the host began.
-    pub sent: Sent,
-    /// Number of failures of environments since the host began.
-    pub env_failures: u64,
-    /// State of its workers.
-    pub workers: WorkersNow,
-    /// True if it leaves.
-    pub leaves: bool,
-}
-
-impl HostStatus {
-    /// Raises counts to those of the previous status. A restarted relay reports none until its
-    /// supervisor has sent them, and counters must not decrease.
-    pub fn no_less_than(&mut self, before: &Self) {
-        let (now, then) = (&self.sent, &before.sent);
-        let less = now.produced < then.produced
-            || now.sent < then.sent
-            || now.resent < then.resent
-            || now.acked < then.acked
-            || self.env_failures < before.env_failures;
-        if less {
-            (self.sent, self.env_failures) = (before.sent, before.env_failures);
-        }
-    }
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
-
-    #[test]
-    fn counts_of_a_host_never_fall() {
-        let of = |produced, env_failures| HostStatus {
-            sent: Sent { produced, sent: 2, ..Sent::default() },
-            env_failures,
-            ..HostStatus::default()
-        };
-        let before = of(5, 1);
-        let mut status = HostStatus { policy_version: 9, ..HostStatus::default() };
-        status.no_less_than(&before);
-        assert_eq!(status, HostStatus { policy_version: 9, ..before.clone() });
-        let mut more = of(6, 1);
-        more.no_less_than(&before);
-        assert_eq!(more, of(6, 1));
-    }
 
     fn segment(sequence: u64) -> Segment {
         let header = SegmentHeader { sequence, worker_id: 3, ..SegmentHeader::default() };
@@ -424,28 +313,34 @@ mod tests {
 
     fn batch() -> Vec<u8> {
         let mut batch = Batch::default();
-        batch.begin(Stretch { worker: 2, first: 7, next: 9, ..Stretch::default() });
-        batch.begin(Stretch { worker: 3, first: 1, next: 4, attempt: 5, ..Stretch::default() });
+        batch.begin(SegmentRange { worker: 2, oldest: 7, start: 9, ..SegmentRange::default() });
+        batch.begin(SegmentRange {
+            worker: 3,
+            oldest: 1,
+            start: 4,
+            retransmit_epoch: 5,
+            ..SegmentRange::default()
+        });
         [4, 5].map(segment).iter().for_each(|segment| batch.add(&segment.header, &segment.block));
         let message = batch.take();
         assert!(batch.is_empty());
         message
     }
 
-    fn read(message: &[u8]) -> Result<Vec<(Stretch, Option<Segment>)>, WireError> {
+    fn read(message: &[u8]) -> Result<Vec<(SegmentRange, Option<Segment>)>, WireError> {
         let mut buffer = segment(0);
         let mut read = Vec::new();
-        read_batch(message, &mut buffer, |stretch, segment| {
-            read.push((*stretch, segment.cloned()));
+        read_batch(message, &mut buffer, |range, segment| {
+            read.push((*range, segment.cloned()));
         })?;
         Ok(read)
     }
 
     #[test]
-    fn segments_come_out_as_they_went_in_wherever_the_message_lies() {
+    fn segments_round_trip_at_any_alignment() {
         let message = batch();
         let read_well = read(&message).unwrap();
-        let counts: Vec<_> = read_well.iter().map(|(stretch, _)| stretch.count).collect();
+        let counts: Vec<_> = read_well.iter().map(|(range, _)| range.count).collect();
         assert_eq!(counts, [0, 2, 2, 2]);
         assert_eq!(read_well[2].1, Some(segment(4)));
         assert_eq!(read_well[3].1, Some(segment(5)));
@@ -454,7 +349,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_cut_damaged_or_foreign_is_refused_before_anything_is_taken() {
+    fn a_truncated_damaged_or_foreign_message_is_rejected_as_a_whole() {
         let message = batch();
         for len in 0..message.len() {
             assert!(read(&message[..len]).is_err(), "cut at {len}");
@@ -471,12 +366,17 @@ mod tests {
     }
 
     #[test]
-    fn hearings_and_snapshots_come_out_as_they_went_in_or_not_at_all() {
-        let first =
-            Hearing { sequence: 9, landed: 11, incarnation: 2, refused: 1, ..Hearing::default() };
-        let hearings = [first, Hearing::default()];
-        let message = write_hearings(Course::Stopped, &hearings);
-        assert_eq!(read_hearings(&message), Ok((Course::Stopped, hearings.to_vec())));
+    fn acks_and_snapshots_round_trip_or_are_rejected() {
+        let first = LinkAck {
+            sequence: 9,
+            received: 11,
+            incarnation: 2,
+            rejected_epoch: 1,
+            ..LinkAck::default()
+        };
+        let acks = [first, LinkAck::default()];
+        let message = write_acks(RunState::Stopped, &acks);
+        assert_eq!(read_acks(&message), Ok((RunState::Stopped, acks.to_vec())));
         let snapshot = ParameterSnapshot {
             version: 4,
             env_steps: 100,
@@ -487,7 +387,7 @@ mod tests {
         assert_eq!(read_snapshot(&written), Ok(snapshot));
         for message in [&message, &written] {
             for len in 0..message.len() {
-                assert!(read_hearings(&message[..len]).is_err());
+                assert!(read_acks(&message[..len]).is_err());
                 assert!(read_snapshot(&message[..len]).is_err());
             }
         }

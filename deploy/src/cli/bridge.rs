@@ -10,9 +10,9 @@ use dmprl_shared::config::{ExperimentConfig, Limits};
 use super::configuration::refuse;
 use super::{cores, prepare_python, this_program};
 use crate::bench::Watch;
-use crate::bridge::relay::{Asked, Asking, ask};
-use crate::bridge::wire::HostWelcome;
-use crate::bridge::{Ends, Link, token};
+use crate::bridge::host_messages::HostWelcome;
+use crate::bridge::join::{JoinOutcome, JoinSettings, request_join};
+use crate::bridge::{Link, LinkMode, token};
 use crate::capacity;
 use crate::failure::{Outcome, wrong_use};
 use crate::launch::{self, HostPlan, Upstream};
@@ -22,7 +22,7 @@ use crate::run_directory::{
 use crate::terminal::{ProgressStyle, say};
 
 /// Interval between two join requests.
-const ASK_AGAIN: Duration = Duration::from_millis(500);
+const JOIN_INTERVAL: Duration = Duration::from_millis(500);
 
 /// Wait for the processes of a killed bridge to exit. They do so at once, unless the machine is
 /// very busy.
@@ -88,7 +88,7 @@ pub(super) fn run(args: &BridgeArgs) -> anyhow::Result<Outcome> {
     let token_file = absolute(&args.token_file)?;
     let workers = args.workers.map_or_else(cores, usize::from);
     let earlier = earlier(args)?;
-    let asking = Asking {
+    let join = JoinSettings {
         endpoint: endpoint(&args.connect)?,
         token: token::read(&token_file)?,
         host: earlier.as_ref().map_or_else(random_u64, |(_, host)| Ok(*host))?,
@@ -97,27 +97,27 @@ pub(super) fn run(args: &BridgeArgs) -> anyhow::Result<Outcome> {
     };
     let patience = Duration::from_secs(args.patience * 60);
     let venv = prepare_python()?;
-    let asked = wait_for_welcome(&asking, zenoh_file.as_deref(), patience);
+    let asked = wait_for_welcome(&join, zenoh_file.as_deref(), patience);
     let Some(welcome) = asked? else { return Ok(Outcome::Interrupted) };
     let config = host_config(&welcome, workers, &args.python_path)?;
     capacity::check(&config, Some(&welcome.spec))?;
-    let run = run_directory(args, &asking.name, &welcome, &config)?;
+    let run = run_directory(args, &join.name, &welcome, &config)?;
     let lock = match earlier {
         Some((lock, _)) => lock,
         None => run.lock(Duration::ZERO)?,
     };
-    replace_file(&run.path().join(HOST_FILE), format!("{:016x}", asking.host).as_bytes())?;
+    replace_file(&run.path().join(HOST_FILE), format!("{:016x}", join.host).as_bytes())?;
     let upstream = Upstream {
-        endpoint: asking.endpoint,
+        endpoint: join.endpoint,
         token_file,
-        host: asking.host,
-        name: asking.name,
-        first: welcome.held.first,
+        host: join.host,
+        name: join.name,
+        first: welcome.lease.first,
         zenoh_file,
         patience_s: patience.as_secs(),
     };
     let progress = ProgressStyle::from_flag(args.no_progress);
-    let (program, session) = (this_program()?, welcome.held.session);
+    let (program, session) = (this_program()?, welcome.lease.session);
     launch::host(HostPlan { program, run, lock, config, venv, upstream, session, progress })
 }
 
@@ -154,29 +154,29 @@ fn host_name() -> String {
 
 /// Asks the learner's host until it accepts this one; `None` on interrupt.
 fn wait_for_welcome(
-    asking: &Asking,
+    join: &JoinSettings,
     zenoh_file: Option<&Path>,
     patience: Duration,
 ) -> anyhow::Result<Option<HostWelcome>> {
     let watch = Watch::start()?;
-    let link = Link::open(Ends::Connect(&asking.endpoint), zenoh_file)?;
+    let link = Link::open(LinkMode::Connect(&join.endpoint), zenoh_file)?;
     let (began, mut told) = (Instant::now(), String::new());
     loop {
         if watch.check().is_err() {
             return Ok(None);
         }
-        match ask(&link, asking, None)? {
-            Asked::Welcome(welcome) => return Ok(Some(*welcome)),
-            Asked::Refused(reason) => {
+        match request_join(&link, join, None)? {
+            JoinOutcome::Welcome(welcome) => return Ok(Some(*welcome)),
+            JoinOutcome::Refused(reason) => {
                 return Err(wrong_use(format!(
                     "the learner's host at {} refuses: {reason}",
-                    asking.endpoint
+                    join.endpoint
                 )));
             }
-            Asked::Later(reason) if began.elapsed() >= patience => {
+            JoinOutcome::Later(reason) if began.elapsed() >= patience => {
                 bail!("waited {} min: {reason}", patience.as_secs() / 60)
             }
-            Asked::Later(reason) => {
+            JoinOutcome::Later(reason) => {
                 if reason != told {
                     let minutes = patience.as_secs() / 60;
                     say(&format!("{reason}; waiting for at most {minutes} min"));
@@ -184,7 +184,7 @@ fn wait_for_welcome(
                 }
             }
         }
-        std::thread::sleep(ASK_AGAIN);
+        std::thread::sleep(JOIN_INTERVAL);
     }
 }
 

@@ -9,9 +9,9 @@ use dmprl_shared::transport::shared_memory::Plan;
 
 use super::setup::Setup;
 use super::{ControlPipe, GatewayArgs};
-use crate::bridge::gateway::{Gateway, News, RunFacts};
+use crate::bridge::gateway::{Gateway, GatewayEvent, GatewaySettings, RunFacts};
 use crate::bridge::token;
-use crate::bridge::wire::Course;
+use crate::bridge::wire::RunState;
 use crate::control::Report;
 use crate::run_directory::{RunDirectory, TOKEN_FILE, replace_file};
 
@@ -54,24 +54,24 @@ pub fn run(args: &GatewayArgs, control: &ControlPipe) -> anyhow::Result<()> {
             given = gateway.session();
             replace_file(&sessions, given.to_string().as_bytes())?;
         }
-        for news in gateway.news() {
+        for event in gateway.take_events() {
             // A supervisor that is gone is noticed as a stop.
-            let _ = control.send(&match news {
-                News::Told(message) => {
+            let _ = control.send(&match event {
+                GatewayEvent::Notice(message) => {
                     eprintln!("{message}");
                     Report::Warning { message }
                 }
-                News::Sent(sent) => Report::Sent(sent),
-                News::EnvFailures { count, host } => {
+                GatewayEvent::Sent(sent) => Report::Sent(sent),
+                GatewayEvent::EnvFailures { count, host } => {
                     Report::EnvFailures { count, last: format!("on host {host}") }
                 }
             });
         }
-        if gateway.refused() >= refused_told {
-            let message = format!("{} messages of nobody, or damaged, refused", gateway.refused());
+        if gateway.rejected() >= refused_told {
+            let message = format!("{} messages of nobody, or damaged, refused", gateway.rejected());
             eprintln!("{message}");
             let _ = control.send(&Report::Warning { message });
-            refused_told = gateway.refused().saturating_mul(2);
+            refused_told = gateway.rejected().saturating_mul(2);
         }
         if reported.is_none_or(|at| at.elapsed() >= REPORT_INTERVAL) {
             reported = Some(Instant::now());
@@ -98,12 +98,18 @@ fn open(args: &GatewayArgs, control: &ControlPipe) -> anyhow::Result<Option<Gate
     let zenoh_file =
         Some(Path::new(&bridge.zenoh_file)).filter(|path| !path.as_os_str().is_empty());
     let session = args.session.max(sessions_given(&args.run.join(SESSIONS_FILE))?);
-    let places = (config.actors.places(), session, config.delivery.unacknowledged_segments);
     let deadline = Instant::now() + JOIN_LIMIT;
     loop {
-        let plan = Plan::new(&setup.config, setup.run_id, &policy);
-        let at = (bridge.listen.as_slice(), zenoh_file);
-        match Gateway::open(at, (&args.domain, plan), places, facts.clone()) {
+        let settings = GatewaySettings {
+            endpoints: &bridge.listen,
+            zenoh_file,
+            domain: &args.domain,
+            plan: Plan::new(config, setup.run_id, &policy),
+            first_worker: config.actors.places(),
+            session,
+            segments_max: config.delivery.unacknowledged_segments,
+        };
+        match Gateway::open(settings, facts.clone()) {
             Ok(gateway) => return Ok(Some(gateway)),
             // Only the learner comes back by itself.
             Err(error) if !is_transport(&error) || Instant::now() >= deadline => return Err(error),
@@ -130,14 +136,18 @@ fn is_transport(error: &anyhow::Error) -> bool {
 
 /// Tells the hosts whether the run is complete or only stops.
 fn say_goodbye(gateway: &mut Gateway, control: &ControlPipe) -> anyhow::Result<()> {
-    let course = if control.finish_requested() { Course::Complete } else { Course::Stopped };
+    let state = if control.finish_requested() { RunState::Complete } else { RunState::Stopped };
     let began = Instant::now();
     loop {
-        gateway.tell(course)?;
-        gateway.watch(Instant::now())?;
+        gateway.send_acks(state)?;
+        gateway.read_statuses(Instant::now())?;
         // A run that was stopped has hosts that wait for it.
-        let heard = course == Course::Stopped && began.elapsed() >= GOODBYE_INTERVAL * 2;
-        if heard || gateway.is_alone(GONE) || began.elapsed() >= GOODBYE || control.orphaned() {
+        let heard = state == RunState::Stopped && began.elapsed() >= GOODBYE_INTERVAL * 2;
+        if heard
+            || gateway.all_silent_for(GONE, Instant::now())
+            || began.elapsed() >= GOODBYE
+            || control.orphaned()
+        {
             return Ok(());
         }
         std::thread::sleep(GOODBYE_INTERVAL);

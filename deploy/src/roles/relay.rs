@@ -8,9 +8,10 @@ use dmprl_shared::transport::shared_memory::Plan;
 
 use super::setup::Setup;
 use super::{ControlPipe, RelayArgs};
-use crate::bridge::relay::{Asking, HostCounts, Relay, Turn};
+use crate::bridge::host_messages::Lease;
+use crate::bridge::join::JoinSettings;
+use crate::bridge::relay::{HostCounts, Relay, RelaySettings, Turn};
 use crate::bridge::token;
-use crate::bridge::wire::Held;
 use crate::control::{Progress, Report};
 
 /// Sleep of a turn that found nothing to do.
@@ -49,16 +50,22 @@ fn start(args: &RelayArgs) -> anyhow::Result<Relay> {
     let spec = setup.run.spec()?.context("the run has no spec.json: start the bridge again")?;
     let policy = Policy::new(&setup.config, &spec)?;
     let plan = Plan::new(&setup.config, setup.run_id, &policy);
-    let asking = Asking {
+    let join = JoinSettings {
         endpoint: args.connect.clone(),
         token: token::read(&args.token_file)?,
         host: args.host,
         name: args.name.clone(),
         workers: u32::try_from(setup.config.actors.workers).context("too many workers")?,
     };
-    let held = Held { first: args.first, session: args.session };
-    let zenoh_file = args.zenoh_config.as_deref();
-    Relay::start(asking, (held, zenoh_file), (&args.domain, &plan), &setup.config)
+    Relay::start(RelaySettings {
+        join,
+        lease: Lease { first: args.first, session: args.session },
+        zenoh_file: args.zenoh_config.as_deref(),
+        domain: &args.domain,
+        plan: &plan,
+        segments_max: setup.config.delivery.unacknowledged_segments,
+        in_flight_bytes_max: setup.config.bridge.under_way_bytes_max,
+    })
 }
 
 fn counts(control: &ControlPipe) -> HostCounts {
@@ -71,21 +78,21 @@ fn counts(control: &ControlPipe) -> HostCounts {
 fn leave(relay: &mut Relay, control: &ControlPipe) -> anyhow::Result<()> {
     let deadline = Instant::now() + HAND_OVER;
     while relay.away().is_none() && !control.orphaned() && Instant::now() < deadline {
-        // Asked before the turn: a worker that is gone has sent all that it ever will.
+        // JoinOutcome before the turn: a worker that is gone has sent all that it ever will.
         let gone = control.workers().count == 0;
         let turn = relay.turn(&counts(control))?;
-        if turn == Turn::Complete || turn == Turn::Idle && gone && relay.under_way() == 0 {
+        if turn == Turn::Complete || turn == Turn::Idle && gone && relay.in_flight() == 0 {
             break;
         }
         if turn == Turn::Idle {
             std::thread::sleep(IDLE);
         }
     }
-    if relay.under_way() > 0 {
+    if relay.in_flight() > 0 {
         let message = format!(
             "{} segments are not acknowledged yet: those that have come to the learner's host will \
              be learned, the others are lost",
-            relay.under_way()
+            relay.in_flight()
         );
         warn(control, message);
     }

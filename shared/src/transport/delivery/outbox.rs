@@ -51,8 +51,8 @@ pub struct Outbox {
     headers: Vec<SegmentHeader>,
     /// (ring, block). Zeroed pages take no memory until a segment is written to them.
     blocks: Vec<f32>,
-    /// Sequence numbers: the oldest kept, the next to be offered, the next to be put in, and the
-    /// highest that any queue has accepted. first <= next <= end.
+    /// Sequence numbers: the oldest kept, the next to offer, the next to put in, and the highest
+    /// that any queue has accepted. first <= next <= end.
     first: u64,
     next: u64,
     end: u64,
@@ -74,18 +74,19 @@ impl Outbox {
         worker_id: u32,
         incarnation: u32,
     ) -> Self {
-        Self::starting_at(1, (layout, segments_max), worker_id, incarnation)
+        Self::starting_at(1, layout, segments_max, worker_id, incarnation)
     }
 
     /// Creates an empty outbox that continues a sequence: all segments before `first` are
     /// acknowledged.
     ///
     /// # Panics
-    /// If the capacity is 0, or `first` is 0: sequences start at 1.
+    /// If `segments_max` is 0, or `first` is 0: sequences start at 1.
     #[must_use]
     pub fn starting_at(
         first: u64,
-        (layout, segments_max): (SegmentLayout, usize),
+        layout: SegmentLayout,
+        segments_max: usize,
         worker_id: u32,
         incarnation: u32,
     ) -> Self {
@@ -137,7 +138,7 @@ impl Outbox {
         self.first
     }
 
-    /// Sequence number of the next segment to be put in.
+    /// Sequence number of the next segment to put in.
     #[must_use]
     pub fn end(&self) -> u64 {
         self.end
@@ -145,7 +146,7 @@ impl Outbox {
 
     /// Number of unacknowledged segments that a queue has accepted.
     #[must_use]
-    pub fn under_way(&self) -> usize {
+    pub fn in_flight(&self) -> usize {
         (self.next - self.first) as usize
     }
 
@@ -232,6 +233,17 @@ impl Outbox {
             self.first = mark.sequence + 1;
             self.next = self.next.max(self.first);
         }
+    }
+
+    /// Discards all segments and continues at `first`, for a learner that already has the segments
+    /// in between.
+    ///
+    /// # Panics
+    /// If `first` is before the end of the sequence.
+    pub fn skip_to(&mut self, first: u64) {
+        assert!(first >= self.end, "an outbox does not go back");
+        (self.first, self.next, self.end) = (first, first, first);
+        self.highest_sent = first - 1;
     }
 
     fn slot(&self, sequence: u64) -> usize {

@@ -21,8 +21,8 @@ use crate::bench::learner::spec_of;
 use crate::bench::made_up::BETWEEN_HOSTS;
 use crate::bench::statistics::{max, median};
 use crate::bench::watch::Watch;
-use crate::bridge::gateway::{Gateway, News, RunFacts};
-use crate::bridge::wire::Course;
+use crate::bridge::gateway::{Gateway, GatewayEvent, GatewaySettings, RunFacts};
+use crate::bridge::wire::RunState;
 use crate::terminal::say;
 
 const WORKERS_MAX: usize = 64;
@@ -211,21 +211,29 @@ fn start_gateway(
             spec: spec_of(&TASKS[0]),
             token: TOKEN.to_owned(),
         };
-        let at = (endpoints.as_slice(), zenoh_file.as_deref());
-        let mut gateway = Gateway::open(at, (&domain, plan(WORKERS_MAX)), (0, 0, KEPT), facts)?;
+        let settings = GatewaySettings {
+            endpoints: &endpoints,
+            zenoh_file: zenoh_file.as_deref(),
+            domain: &domain,
+            plan: plan(WORKERS_MAX),
+            first_worker: 0,
+            session: 0,
+            segments_max: KEPT,
+        };
+        let mut gateway = Gateway::open(settings, facts)?;
         while !policies.over.load(Ordering::Acquire) {
             if !gateway.turn()? {
                 thread::sleep(IDLE);
             }
             gateway.policy_versions().for_each(|version| policies.confirm(version));
-            for news in gateway.news() {
-                if let News::Told(what) = news {
-                    say(&what);
+            for event in gateway.take_events() {
+                if let GatewayEvent::Notice(notice) = event {
+                    say(&notice);
                 }
             }
         }
         for _ in 0..GOODBYES {
-            gateway.tell(Course::Complete)?;
+            gateway.send_acks(RunState::Complete)?;
             thread::sleep(INTERVAL);
         }
         Ok(())

@@ -7,7 +7,6 @@ use std::thread::{self, JoinHandle};
 use std::time::Instant;
 
 use anyhow::{Context, anyhow, bail};
-use dmprl_shared::config::ExperimentConfig;
 use dmprl_shared::segment::Segment;
 use dmprl_shared::transport::AcknowledgementSubscriber;
 use dmprl_shared::transport::delivery::{Acknowledgements, Outbox};
@@ -17,9 +16,10 @@ use serde_json::{Value, json};
 use super::{IDLE, INTERVAL, KEPT, PATIENCE, TOKEN, UNDER_WAY_BYTES_MAX, domain, plan};
 use crate::bench::made_up::MadeUp;
 use crate::bench::watch::Watch;
-use crate::bridge::relay::{Asked, Asking, HostCounts, Relay, Turn, ask};
-use crate::bridge::wire::Held;
-use crate::bridge::{Ends, Link};
+use crate::bridge::host_messages::Lease;
+use crate::bridge::join::{JoinOutcome, JoinSettings, request_join};
+use crate::bridge::relay::{HostCounts, Relay, RelaySettings, Turn};
+use crate::bridge::{Link, LinkMode};
 use crate::run_directory::random_u64;
 
 /// Segments generated between two checks for acknowledgements.
@@ -36,21 +36,25 @@ pub fn connect(
     (workers, rate): (u32, Option<u32>),
 ) -> anyhow::Result<Option<Value>> {
     let watch = Watch::start()?;
-    let asking = Asking {
+    let join = JoinSettings {
         endpoint: endpoint.to_owned(),
         token: TOKEN.to_owned(),
         host: random_u64()?,
         name: "bench".to_owned(),
         workers,
     };
-    let Some(held) = welcomed(&asking, zenoh_file, &watch)? else { return Ok(None) };
-    let mut config = ExperimentConfig::default();
-    config.delivery.unacknowledged_segments = KEPT;
-    config.bridge.under_way_bytes_max = UNDER_WAY_BYTES_MAX;
+    let Some(lease) = welcomed(&join, zenoh_file, &watch)? else { return Ok(None) };
     let domain = domain()?;
     let plan = plan(workers as usize);
-    let at = (domain.path(), &plan);
-    let mut relay = Relay::start(asking, (held, zenoh_file), at, &config)?;
+    let mut relay = Relay::start(RelaySettings {
+        join,
+        lease,
+        zenoh_file,
+        domain: domain.path(),
+        plan: &plan,
+        segments_max: KEPT,
+        in_flight_bytes_max: UNDER_WAY_BYTES_MAX,
+    })?;
     let over = Arc::new(AtomicBool::new(false));
     let each = rate.map(|rate| f64::from(rate) / f64::from(workers));
     let threads: Vec<JoinHandle<anyhow::Result<()>>> = (0..workers)
@@ -84,19 +88,19 @@ pub fn connect(
 }
 
 fn welcomed(
-    asking: &Asking,
+    join: &JoinSettings,
     zenoh_file: Option<&Path>,
     watch: &Watch,
-) -> anyhow::Result<Option<Held>> {
-    let (began, endpoint) = (Instant::now(), &asking.endpoint);
-    let link = Link::open(Ends::Connect(endpoint), zenoh_file)?;
+) -> anyhow::Result<Option<Lease>> {
+    let (began, endpoint) = (Instant::now(), &join.endpoint);
+    let link = Link::open(LinkMode::Connect(endpoint), zenoh_file)?;
     loop {
-        match ask(&link, asking, None)? {
-            Asked::Welcome(welcome) => return Ok(Some(welcome.held)),
-            Asked::Refused(why) => bail!("{endpoint} refuses: {why}"),
-            Asked::Later(why) if began.elapsed() >= PATIENCE => bail!("{why}"),
-            Asked::Later(_) if watch.check().is_err() => return Ok(None),
-            Asked::Later(_) => thread::sleep(INTERVAL),
+        match request_join(&link, join, None)? {
+            JoinOutcome::Welcome(welcome) => return Ok(Some(welcome.lease)),
+            JoinOutcome::Refused(why) => bail!("{endpoint} refuses: {why}"),
+            JoinOutcome::Later(why) if began.elapsed() >= PATIENCE => bail!("{why}"),
+            JoinOutcome::Later(_) if watch.check().is_err() => return Ok(None),
+            JoinOutcome::Later(_) => thread::sleep(INTERVAL),
         }
     }
 }

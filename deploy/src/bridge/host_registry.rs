@@ -1,40 +1,40 @@
-//! Assigns the run's places to hosts.
+//! Leases the run's places for workers to hosts.
 
 use std::time::{Duration, Instant};
 
 use dmprl_shared::transport::delivery::Mark;
 
-use super::wire::{Held, HostRequest, HostStatus};
+use super::host_messages::{HostRequest, HostStatus, Lease};
 use crate::control::HostNow;
 
 /// Time for which a silent host keeps its places although another host needs them. It is longer
 /// than a broken link, the restart of a switch or the reboot of a machine takes.
-const KEPT: Duration = Duration::from_secs(600);
+const LEASE_TIME: Duration = Duration::from_secs(600);
 /// Time limit for an admitted host to send its first status.
-const BEGUN_WITHIN: Duration = Duration::from_secs(60);
+const FIRST_STATUS_LIMIT: Duration = Duration::from_secs(60);
 /// Silence after which a host is reported as unreachable to a host that needs places. Others send a
 /// status several times per second.
-const SILENT: Duration = Duration::from_secs(10);
+const UNREACHABLE_AFTER: Duration = Duration::from_secs(10);
 /// Bits of an incarnation that count a worker's starts within a session.
 const STARTS_BITS: u32 = 16;
 
-/// A host that takes part or has taken part.
+/// A host that takes part in the run, or did so recently.
 #[derive(Debug, Clone)]
 pub struct Host {
-    /// Current seat: part of the names of its messages, renewed with each admission.
-    pub seat: u64,
+    /// Part of the names of its messages, renewed with each admission.
+    pub channel: u64,
     /// Number that identifies the start of `dmprl bridge`.
     pub host: u64,
     /// Name of the host, for display.
     pub name: String,
-    /// Places of the host.
-    pub held: Held,
+    /// Places of its workers.
+    pub lease: Lease,
     /// Number of its workers.
     pub workers: u32,
     /// Time of its last message.
-    pub heard: Instant,
+    pub last_heard: Instant,
     /// True while its liveliness token exists.
-    pub here: bool,
+    pub is_present: bool,
     /// Last status that it sent.
     pub status: Option<HostStatus>,
     /// True if it joined before this gateway started, so that its earlier counts are already
@@ -49,7 +49,7 @@ impl Host {
         let status = self.status.as_ref();
         HostNow {
             name: self.name.clone(),
-            here: self.here,
+            here: self.is_present,
             workers: status.map_or(0, |status| status.workers.count),
             kept: status.map_or(0, |status| status.workers.queued_segments),
             acked: status.map_or(0, |status| status.sent.acked),
@@ -59,13 +59,13 @@ impl Host {
 
     /// Time after which its places may be given to another host.
     fn free_in(&self, now: Instant) -> Duration {
-        let kept = if self.status.is_some() { KEPT } else { BEGUN_WITHIN };
-        kept.saturating_sub(now.duration_since(self.heard))
+        let lease_time = if self.status.is_some() { LEASE_TIME } else { FIRST_STATUS_LIMIT };
+        lease_time.saturating_sub(now.duration_since(self.last_heard))
     }
 }
 
-/// The newest session of these workers from which the learner has seen segments.
-fn seen(first: u32, workers: u32, marks: &[Mark]) -> Option<u32> {
+/// The newest session of these workers from which the learner has acknowledged segments.
+fn newest_acknowledged(first: u32, workers: u32, marks: &[Mark]) -> Option<u32> {
     let of = marks.iter().skip(first as usize).take(workers as usize);
     of.filter(|mark| mark.sequence > 0).map(|mark| mark.incarnation >> STARTS_BITS).max()
 }
@@ -79,9 +79,9 @@ pub struct Refusal {
     pub later: bool,
 }
 
-/// The hosts of a run.
+/// The hosts of a run and their leases.
 #[derive(Debug)]
-pub struct Seats {
+pub struct HostRegistry {
     /// First worker of other hosts, and the number of their places.
     first: u32,
     places: u32,
@@ -89,15 +89,15 @@ pub struct Seats {
     /// distinct.
     session: u32,
     /// The last known session of each place.
-    newest: Vec<u32>,
+    last_sessions: Vec<u32>,
     hosts: Vec<Host>,
 }
 
-impl Seats {
-    /// Creates the list without hosts; `session` is the first unused session.
+impl HostRegistry {
+    /// Creates a registry without hosts; `session` is the first unused session.
     #[must_use]
     pub fn new(first: u32, places: u32, session: u32) -> Self {
-        Self { first, places, session, newest: vec![0; places as usize], hosts: Vec::new() }
+        Self { first, places, session, last_sessions: vec![0; places as usize], hosts: Vec::new() }
     }
 
     /// The first unused session.
@@ -112,18 +112,18 @@ impl Seats {
         &self.hosts
     }
 
-    /// The host with this seat.
-    pub fn of_seat(&mut self, seat: u64) -> Option<&mut Host> {
-        self.hosts.iter_mut().find(|host| host.seat == seat)
+    /// The host with this channel.
+    pub fn by_channel(&mut self, channel: u64) -> Option<&mut Host> {
+        self.hosts.iter_mut().find(|host| host.channel == channel)
     }
 
     /// Removes a host that has left.
-    pub fn remove(&mut self, seat: u64) -> Option<Host> {
-        let at = self.hosts.iter().position(|host| host.seat == seat)?;
+    pub fn remove(&mut self, channel: u64) -> Option<Host> {
+        let at = self.hosts.iter().position(|host| host.channel == channel)?;
         Some(self.hosts.remove(at))
     }
 
-    /// Assigns places to a host: its previous ones, or else the first free ones. `marks` is the
+    /// Leases places to a host: its previous ones, or else the first free ones. `marks` is the
     /// learner's last acknowledgement for each worker of the run.
     ///
     /// # Errors
@@ -131,12 +131,13 @@ impl Seats {
     pub fn admit(
         &mut self,
         request: &HostRequest,
-        seat: u64,
-        (marks, now): (&[Mark], Instant),
-    ) -> Result<Held, Refusal> {
+        channel: u64,
+        marks: &[Mark],
+        now: Instant,
+    ) -> Result<Lease, Refusal> {
         let HostRequest { host, workers, .. } = *request;
         let known = self.hosts.iter().position(|known| known.host == host);
-        let held = match (known, request.held) {
+        let lease = match (known, request.lease) {
             (Some(at), Some(_)) => {
                 let known = &mut self.hosts[at];
                 if known.workers != workers {
@@ -146,10 +147,10 @@ impl Seats {
                     );
                     return Err(Refusal { reason, later: false });
                 }
-                (known.seat, known.heard, known.here) = (seat, now, true);
-                return Ok(known.held);
+                (known.channel, known.last_heard, known.is_present) = (channel, now, true);
+                return Ok(known.lease);
             }
-            (None, Some(held)) if self.is_still(held, workers, marks) => held,
+            (None, Some(lease)) if self.is_valid(lease, workers, marks) => lease,
             (None, Some(_)) => {
                 let reason = "the places of its workers were given to another host while it was \
                               away: start it again";
@@ -161,36 +162,37 @@ impl Seats {
                 self.place(workers, marks, now)?
             }
         };
-        self.session = self.session.max(held.session.saturating_add(1));
-        self.newest_of(held.first, workers).fill(held.session);
+        self.session = self.session.max(lease.session.saturating_add(1));
+        self.sessions_of(lease.first, workers).fill(lease.session);
         self.hosts.push(Host {
-            seat,
+            channel,
             host,
             name: request.name.clone(),
-            held,
+            lease,
             workers,
-            heard: now,
-            here: true,
+            last_heard: now,
+            is_present: true,
             status: None,
-            counted_before: request.held.is_some(),
+            counted_before: request.lease.is_some(),
         });
-        Ok(held)
+        Ok(lease)
     }
 
     /// Returns true if a host may continue in its previous places. The learner drops segments of
     /// incarnations older than those it knows.
-    fn is_still(&mut self, held: Held, workers: u32, marks: &[Mark]) -> bool {
-        self.is_free(held.first, workers)
-            && seen(held.first, workers, marks).is_none_or(|seen| seen <= held.session)
-            && self.newest_of(held.first, workers).iter().all(|newest| *newest <= held.session)
+    fn is_valid(&mut self, lease: Lease, workers: u32, marks: &[Mark]) -> bool {
+        self.is_free(lease.first, workers)
+            && newest_acknowledged(lease.first, workers, marks)
+                .is_none_or(|newest| newest <= lease.session)
+            && self.sessions_of(lease.first, workers).iter().all(|last| *last <= lease.session)
     }
 
-    fn newest_of(&mut self, first: u32, workers: u32) -> &mut [u32] {
+    fn sessions_of(&mut self, first: u32, workers: u32) -> &mut [u32] {
         let at = (first - self.first) as usize;
-        &mut self.newest[at..at + workers as usize]
+        &mut self.last_sessions[at..at + workers as usize]
     }
 
-    fn place(&mut self, workers: u32, marks: &[Mark], now: Instant) -> Result<Held, Refusal> {
+    fn place(&mut self, workers: u32, marks: &[Mark], now: Instant) -> Result<Lease, Refusal> {
         if workers > self.places {
             let reason = format!(
                 "it brings {workers} workers, the run has places for {} of other hosts \
@@ -201,8 +203,9 @@ impl Seats {
         }
         loop {
             if let Some(first) = self.free(workers) {
-                let after = seen(first, workers, marks).map_or(0, |seen| seen.saturating_add(1));
-                return Ok(Held { first, session: self.session.max(after) });
+                let after = newest_acknowledged(first, workers, marks)
+                    .map_or(0, |newest| newest.saturating_add(1));
+                return Ok(Lease { first, session: self.session.max(after) });
             }
             match self.hosts.iter().position(|host| host.free_in(now).is_zero()) {
                 Some(at) => drop(self.hosts.remove(at)),
@@ -214,7 +217,10 @@ impl Seats {
 
     fn full(&self, workers: u32, now: Instant) -> String {
         let taken: u32 = self.hosts.iter().map(|host| host.workers).sum();
-        let silent = self.hosts.iter().filter(|host| now.duration_since(host.heard) >= SILENT);
+        let silent = self
+            .hosts
+            .iter()
+            .filter(|host| now.duration_since(host.last_heard) >= UNREACHABLE_AFTER);
         let silent = silent.map(|host| {
             let (name, minutes) = (host.name.escape_debug(), host.free_in(now).as_secs() / 60 + 1);
             format!("; {name} is out of reach and keeps its places for another {minutes} min")
@@ -236,7 +242,7 @@ impl Seats {
         let inside = first >= self.first && first.checked_add(workers).is_some_and(|to| to <= end);
         inside
             && self.hosts.iter().all(|host| {
-                host.held.first + host.workers <= first || first + workers <= host.held.first
+                host.lease.first + host.workers <= first || first + workers <= host.lease.first
             })
     }
 }
@@ -246,17 +252,17 @@ mod tests {
     use super::*;
     use crate::control::Greeting;
 
-    fn request(host: u64, workers: u32, held: Option<Held>) -> HostRequest {
+    fn request(host: u64, workers: u32, lease: Option<Lease>) -> HostRequest {
         let (speaks, token, name) = (Greeting::this(), String::new(), format!("host{host}"));
-        HostRequest { speaks, token, host, name, workers, held }
+        HostRequest { speaks, token, host, name, workers, lease }
     }
 
     #[test]
-    fn a_host_that_comes_back_has_its_places_and_two_never_share_one() {
+    fn a_returning_host_gets_its_places_and_no_two_hosts_share_one() {
         let now = Instant::now();
-        let mut seats = Seats::new(3, 8, 0);
-        let mut admit = |host, workers, held| {
-            seats.admit(&request(host, workers, held), host + 100, (&[], now))
+        let mut registry = HostRegistry::new(3, 8, 0);
+        let mut admit = |host, workers, lease| {
+            registry.admit(&request(host, workers, lease), host + 100, &[], now)
         };
         let (a, b) = (admit(1, 4, None).unwrap(), admit(2, 3, None).unwrap());
         assert_eq!((a.first, b.first), (3, 7));
@@ -269,65 +275,66 @@ mod tests {
         assert!(!never.later && never.reason.contains("bridge.workers_max"));
         assert_eq!(admit(5, 1, None).unwrap().first, 10);
         // The successor of a dead gateway does not know any host.
-        let mut next = Seats::new(3, 8, 0);
+        let mut next = HostRegistry::new(3, 8, 0);
         let mut admit =
-            |host, workers, held| next.admit(&request(host, workers, held), host, (&[], now));
+            |host, workers, lease| next.admit(&request(host, workers, lease), host, &[], now);
         assert_eq!(admit(2, 3, Some(b)).unwrap(), b);
         let other = admit(6, 4, None).unwrap();
         assert_eq!(other.first, a.first);
         assert!(other.session > b.session, "no two have the same");
         let gone = admit(1, 4, Some(a)).unwrap_err();
         assert!(!gone.later && gone.reason.contains("another host"), "{}", gone.reason);
-        assert!(admit(7, 4, Some(Held { first: u32::MAX, session: 0 })).is_err());
+        assert!(admit(7, 4, Some(Lease { first: u32::MAX, session: 0 })).is_err());
     }
 
     #[test]
-    fn a_silent_host_makes_room_when_somebody_needs_it_and_its_successor_counts_on() {
+    fn places_of_a_silent_host_go_to_another_with_a_later_session() {
         let now = Instant::now();
-        let mut seats = Seats::new(0, 2, 1);
-        let held = seats.admit(&request(1, 2, None), 11, (&[], now)).unwrap();
-        assert_eq!(held, Held { first: 0, session: 1 });
-        seats.of_seat(11).unwrap().status = Some(HostStatus::default());
+        let mut registry = HostRegistry::new(0, 2, 1);
+        let lease = registry.admit(&request(1, 2, None), 11, &[], now).unwrap();
+        assert_eq!(lease, Lease { first: 0, session: 1 });
+        registry.by_channel(11).unwrap().status = Some(HostStatus::default());
         let marks = [Mark { incarnation: 5 << STARTS_BITS, sequence: 7 }, Mark::default()];
-        let soon = now + KEPT / 2;
-        let refusal = seats.admit(&request(2, 2, None), 12, (&marks, soon)).unwrap_err();
+        let soon = now + LEASE_TIME / 2;
+        let refusal = registry.admit(&request(2, 2, None), 12, &marks, soon).unwrap_err();
         assert!(refusal.later && refusal.reason.contains("host1 is out of reach"), "{refusal:?}");
-        let late = now + KEPT;
-        let held = seats.admit(&request(2, 2, None), 12, (&marks, late)).unwrap();
-        assert_eq!(held, Held { first: 0, session: 6 });
-        assert!(seats.of_seat(11).is_none());
+        let late = now + LEASE_TIME;
+        let lease = registry.admit(&request(2, 2, None), 12, &marks, late).unwrap();
+        assert_eq!(lease, Lease { first: 0, session: 6 });
+        assert!(registry.by_channel(11).is_none());
     }
 
     /// Regression test: a start whose relay never ran once kept all places.
     #[test]
-    fn a_host_that_was_taken_in_and_never_began_makes_room_soon() {
+    fn a_host_that_never_sends_a_status_loses_its_places_soon() {
         let now = Instant::now();
-        let mut seats = Seats::new(0, 2, 0);
-        let held = seats.admit(&request(1, 2, None), 11, (&[], now)).unwrap();
-        assert!(seats.admit(&request(2, 2, None), 12, (&[], now)).unwrap_err().later);
+        let mut registry = HostRegistry::new(0, 2, 0);
+        let lease = registry.admit(&request(1, 2, None), 11, &[], now).unwrap();
+        assert!(registry.admit(&request(2, 2, None), 12, &[], now).unwrap_err().later);
         // The same host, restarted, gets them at once, and its workers' incarnations continue.
-        let again = seats.admit(&request(1, 2, None), 13, (&[], now)).unwrap();
-        assert_eq!((again.first, again.session), (held.first, held.session + 1));
-        let held = seats.admit(&request(2, 2, None), 12, (&[], now + BEGUN_WITHIN)).unwrap();
-        assert_eq!((held.first, held.session), (0, again.session + 1));
+        let again = registry.admit(&request(1, 2, None), 13, &[], now).unwrap();
+        assert_eq!((again.first, again.session), (lease.first, lease.session + 1));
+        let lease =
+            registry.admit(&request(2, 2, None), 12, &[], now + FIRST_STATUS_LIMIT).unwrap();
+        assert_eq!((lease.first, lease.session), (0, again.session + 1));
     }
 
     /// The learner would silently skip its workers' segments as those of an older incarnation.
     #[test]
-    fn a_host_does_not_go_on_in_places_that_another_has_used_since() {
+    fn a_host_does_not_return_to_places_that_another_has_used_since() {
         let now = Instant::now();
-        let mut seats = Seats::new(0, 2, 0);
-        let a = seats.admit(&request(1, 2, None), 11, (&[], now)).unwrap();
-        seats.remove(11);
-        let b = seats.admit(&request(2, 2, None), 12, (&[], now)).unwrap();
+        let mut registry = HostRegistry::new(0, 2, 0);
+        let a = registry.admit(&request(1, 2, None), 11, &[], now).unwrap();
+        registry.remove(11);
+        let b = registry.admit(&request(2, 2, None), 12, &[], now).unwrap();
         assert!(b.session > a.session, "nothing of the first need be acknowledged for it");
-        seats.remove(12);
-        let refusal = seats.admit(&request(1, 2, Some(a)), 14, (&[], now)).unwrap_err();
+        registry.remove(12);
+        let refusal = registry.admit(&request(1, 2, Some(a)), 14, &[], now).unwrap_err();
         assert!(refusal.reason.contains("start it again"), "{}", refusal.reason);
         // A new gateway recognises it by the learner's marks.
         let marks = [Mark { incarnation: b.session << STARTS_BITS, sequence: 1 }];
-        let mut next = Seats::new(0, 2, 0);
-        assert!(next.admit(&request(1, 2, Some(a)), 15, (&marks, now)).is_err());
-        assert_eq!(next.admit(&request(2, 2, Some(b)), 16, (&marks, now)).unwrap(), b);
+        let mut next = HostRegistry::new(0, 2, 0);
+        assert!(next.admit(&request(1, 2, Some(a)), 15, &marks, now).is_err());
+        assert_eq!(next.admit(&request(2, 2, Some(b)), 16, &marks, now).unwrap(), b);
     }
 }

@@ -1,4 +1,4 @@
-//! Limits the data that a host may have in flight.
+//! Congestion window: limits the data that a host may have in flight.
 //!
 //! With too little, a long link is never filled. With too much, segments of a fast host queue for a
 //! slow learner and become outdated. The right amount is what the learner acknowledges in one round
@@ -8,7 +8,7 @@
 
 /// Added to a round trip: some intervals of acknowledgements, and the time of an update \[s\].
 const SLACK_S: f64 = 0.05;
-/// Factor of the window, which lets a possible higher rate show.
+/// Factor of the window, so that a higher rate can be measured if the link allows it.
 const GAIN: f64 = 2.0;
 /// Minimum time over which a rate is measured \[s\]. The window uses the fastest of the last
 /// `RATES` rates.
@@ -19,9 +19,9 @@ const MEMORY_S: f64 = 10.0;
 /// Minimum window \[bytes\]: some segments of each of some environments.
 const WINDOW_MIN: f64 = 65_536.0;
 
-/// The window of a host.
+/// The congestion window of a host.
 #[derive(Debug, Clone)]
-pub struct Window {
+pub struct CongestionWindow {
     max: f64,
     /// Shortest round trip in the current and in the previous interval \[s\], and the start of the
     /// current one \[s\].
@@ -34,7 +34,7 @@ pub struct Window {
     since_s: f64,
 }
 
-impl Window {
+impl CongestionWindow {
     /// Creates the minimum window, which can grow to `bytes_max`.
     #[must_use]
     pub fn new(bytes_max: u64) -> Self {
@@ -64,7 +64,7 @@ impl Window {
 
     /// Records, at time `now_s`, a round trip: the gateway confirmed a segment sent `round_trip_s`
     /// ago.
-    pub fn time(&mut self, round_trip_s: f64, now_s: f64) {
+    pub fn record_round_trip(&mut self, round_trip_s: f64, now_s: f64) {
         if now_s - self.began_s >= MEMORY_S {
             self.round_trips = [f64::INFINITY, self.round_trips[0]];
             self.began_s = now_s;
@@ -96,17 +96,17 @@ mod tests {
     fn run(round_trip_s: f64, bytes_per_s: f64) -> (f64, f64) {
         const STEP_S: f64 = 0.005;
         const STEPS: u32 = 12_000;
-        let mut window = Window::new(64 << 20);
+        let mut window = CongestionWindow::new(64 << 20);
         // Arrival time, sending time, size.
         let (mut link, mut acks) = (VecDeque::new(), VecDeque::new());
-        let mut landed: VecDeque<(f64, f64)> = VecDeque::new();
-        let (mut under_way, mut taken, mut delay_max) = (0.0, 0.0, 0.0_f64);
+        let mut received: VecDeque<(f64, f64)> = VecDeque::new();
+        let (mut in_flight, mut taken, mut delay_max) = (0.0, 0.0, 0.0_f64);
         for step in 0..STEPS {
             let now_s = f64::from(step) * STEP_S;
-            let sent = (window.bytes() as f64 - under_way).max(0.0);
-            under_way += sent;
+            let sent = (window.bytes() as f64 - in_flight).max(0.0);
+            in_flight += sent;
             link.push_back((now_s + round_trip_s / 2.0, now_s, sent));
-            landed.push_back((now_s + round_trip_s + STEP_S, now_s));
+            received.push_back((now_s + round_trip_s + STEP_S, now_s));
             let mut room = bytes_per_s * STEP_S;
             while let Some((_, sent_s, bytes)) = link.front_mut().filter(|(at, ..)| *at <= now_s) {
                 let part = f64::min(*bytes, room);
@@ -117,15 +117,15 @@ mod tests {
                 }
                 link.pop_front();
             }
-            while let Some((_, sent_s)) = landed.front().filter(|(at, _)| *at <= now_s) {
-                window.time(now_s - sent_s, now_s);
-                landed.pop_front();
+            while let Some((_, sent_s)) = received.front().filter(|(at, _)| *at <= now_s) {
+                window.record_round_trip(now_s - sent_s, now_s);
+                received.pop_front();
             }
             while let Some((_, sent_s, bytes)) = acks.front().copied().filter(|ack| ack.0 <= now_s)
             {
                 acks.pop_front();
                 window.acknowledge(bytes as u64, now_s);
-                under_way -= bytes;
+                in_flight -= bytes;
                 if step >= STEPS / 2 {
                     taken += bytes;
                     delay_max = delay_max.max(now_s - sent_s);
@@ -142,7 +142,7 @@ mod tests {
     }
 
     #[test]
-    fn a_slow_learner_is_not_run_ahead_of_over_a_short_link_or_a_long_one() {
+    fn segments_do_not_queue_up_for_a_slow_learner() {
         for (round_trip_s, longest_s) in [(0.001, 0.25), (0.2, 0.8)] {
             let (taken, delay_s) = run(round_trip_s, 2e6);
             assert!(taken > 0.95 * 2e6, "{taken}");

@@ -9,10 +9,16 @@ use std::time::{Duration, Instant};
 
 use anyhow::Context;
 
-use super::link::Outlet;
+use super::link::MessageSender;
 
 /// Time after which an unconfirmed policy counts as lost with its link, and is sent again.
 const CONFIRMED_WITHIN: Duration = Duration::from_secs(2);
+
+#[derive(Debug, Default)]
+struct Shared {
+    state: Mutex<State>,
+    changed: Condvar,
+}
 
 #[derive(Debug, Default)]
 struct State {
@@ -25,60 +31,64 @@ struct State {
 
 /// Sends a host the newest policy. The thread stops when this is dropped.
 #[derive(Debug)]
-pub struct Feed(Arc<(Mutex<State>, Condvar)>);
+pub struct PolicySender(Arc<Shared>);
 
-fn lock(shared: &(Mutex<State>, Condvar)) -> MutexGuard<'_, State> {
-    // Plain numbers, consistent after every statement, so a poisoned lock is harmless.
-    shared.0.lock().unwrap_or_else(PoisonError::into_inner)
+impl Shared {
+    fn lock(&self) -> MutexGuard<'_, State> {
+        // The state is consistent after every statement, so a poisoned lock is harmless.
+        self.state.lock().unwrap_or_else(PoisonError::into_inner)
+    }
 }
 
-impl Feed {
+impl PolicySender {
     /// Starts the thread.
     ///
     /// # Errors
     /// The system cannot start a thread.
-    pub fn start(outlet: Outlet) -> anyhow::Result<Self> {
-        let shared = Arc::new((Mutex::new(State::default()), Condvar::new()));
-        let feeding = Arc::clone(&shared);
+    pub fn start(sender: MessageSender) -> anyhow::Result<Self> {
+        let shared = Arc::new(Shared::default());
+        let of_thread = Arc::clone(&shared);
         let thread = thread::Builder::new().name("policies".into());
-        thread.spawn(move || feed(&feeding, &outlet)).context("cannot start a thread")?;
+        thread
+            .spawn(move || send_policies(&of_thread, &sender))
+            .context("cannot start a thread")?;
         Ok(Self(shared))
     }
 
     /// Replaces the policy to send by a newer one.
     pub fn offer(&self, version: u64, message: &Arc<Vec<u8>>) {
-        lock(&self.0).newest = Some((version, Arc::clone(message)));
-        self.0.1.notify_one();
+        self.0.lock().newest = Some((version, Arc::clone(message)));
+        self.0.changed.notify_one();
     }
 
     /// Records that the host has this version.
     pub fn confirm(&self, version: u64) {
-        lock(&self.0).confirmed = version;
-        self.0.1.notify_one();
+        self.0.lock().confirmed = version;
+        self.0.changed.notify_one();
     }
 }
 
-impl Drop for Feed {
+impl Drop for PolicySender {
     fn drop(&mut self) {
-        lock(&self.0).closed = true;
-        self.0.1.notify_one();
+        self.0.lock().closed = true;
+        self.0.changed.notify_one();
     }
 }
 
-fn feed(shared: &(Mutex<State>, Condvar), outlet: &Outlet) {
-    let mut state = lock(shared);
+fn send_policies(shared: &Shared, sender: &MessageSender) {
+    let mut state = shared.lock();
     while !state.closed {
         match state.due(Instant::now()) {
             Some((version, message)) => {
                 drop(state);
                 // Sending fails only if the session is closed, which ends the gateway and this
                 // thread.
-                let _ = outlet.send(message.as_ref().clone());
-                state = lock(shared);
+                let _ = sender.send(message.as_ref().clone());
+                state = shared.lock();
                 state.sent = Some((version, Instant::now()));
             }
             None => {
-                let waited = shared.1.wait_timeout(state, CONFIRMED_WITHIN);
+                let waited = shared.changed.wait_timeout(state, CONFIRMED_WITHIN);
                 state = waited.unwrap_or_else(PoisonError::into_inner).0;
             }
         }
@@ -89,10 +99,10 @@ impl State {
     /// Returns the policy to send now, if any.
     fn due(&self, now: Instant) -> Option<(u64, Arc<Vec<u8>>)> {
         let (version, message) = self.newest.as_ref()?;
-        let under_way = self.sent.is_some_and(|(sent, at)| {
+        let is_in_flight = self.sent.is_some_and(|(sent, at)| {
             sent > self.confirmed && now.duration_since(at) < CONFIRMED_WITHIN
         });
-        let wanted = *version > self.confirmed && !under_way;
+        let wanted = *version > self.confirmed && !is_in_flight;
         wanted.then(|| (*version, Arc::clone(message)))
     }
 }
@@ -102,7 +112,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn one_policy_is_under_way_at_a_time_and_a_lost_one_is_sent_again() {
+    fn one_policy_is_in_flight_at_a_time_and_a_lost_one_is_sent_again() {
         let now = Instant::now();
         let mut state = State::default();
         assert!(state.due(now).is_none());
