@@ -6,6 +6,7 @@ use std::os::unix::fs::{MetadataExt, OpenOptionsExt};
 use std::path::Path;
 
 use anyhow::Context;
+use subtle::ConstantTimeEq;
 
 use crate::failure::wrong_use;
 use crate::run_directory::random_u64;
@@ -15,7 +16,7 @@ const CHARACTERS_MIN: usize = 16;
 const CHARACTERS_MAX: usize = 1_024;
 /// Permission bits that only the owner may have.
 const OTHERS: u32 = 0o077;
-/// As `OTHERS`, for a credential of a systemd service, whose access-control list shows up as the
+/// The same for a credential of a systemd service, whose access-control list appears as the
 /// group's read permission.
 const OTHERS_THAN_A_SERVICE: u32 = 0o037;
 /// Environment variable with the folder of a service's credentials.
@@ -27,14 +28,14 @@ const CREDENTIALS: &str = "CREDENTIALS_DIRECTORY";
 /// The file can be read by others, contains no valid token, or cannot be created.
 pub fn ensure(path: &Path) -> anyhow::Result<String> {
     if !path.exists() {
-        let mut random = String::new();
+        let mut token = String::new();
         for _ in 0..4 {
-            random += &format!("{:016x}", random_u64()?);
+            token += &format!("{:016x}", random_u64()?);
         }
-        let failed = || format!("cannot make {}", path.display());
+        let failed = || format!("cannot create {}", path.display());
         let mut options = OpenOptions::new();
         let file = options.write(true).create_new(true).mode(0o600).open(path);
-        file.and_then(|mut file| writeln!(file, "{random}")).with_context(failed)?;
+        file.and_then(|mut file| writeln!(file, "{token}")).with_context(failed)?;
     }
     read(path)
 }
@@ -74,12 +75,10 @@ fn read_as_service(path: &Path, credentials: Option<&Path>) -> anyhow::Result<St
 
 const WHERE: &str = "copy bridge.token of the run's directory from the learner's host";
 
-/// Compares two secrets in constant time, which does not reveal where they differ.
+/// Compares two secrets in constant time, so that the time does not reveal where they differ.
 #[must_use]
 pub fn equal(one: &str, other: &str) -> bool {
-    let pairs = one.bytes().zip(other.bytes());
-    let differ = pairs.fold(0, |bits, (one, other)| bits | (one ^ other));
-    one.len() == other.len() && std::hint::black_box(differ) == 0
+    one.as_bytes().ct_eq(other.as_bytes()).into()
 }
 
 #[cfg(test)]
@@ -89,7 +88,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_secret_is_made_once_and_read_by_its_owner_alone() {
+    fn a_token_is_created_once_and_must_be_private_to_its_owner() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("bridge.token");
         let token = ensure(&path).unwrap();
