@@ -9,8 +9,8 @@ use std::time::{Duration, Instant};
 
 use dmprl_shared::parameters::ParameterSnapshot;
 use dmprl_shared::segment::SegmentHeader;
-use dmprl_shared::supervision::{Command, Doing, Report, Supervisor};
-use dmprl_shared::transport::delivery::{Acknowledgements, Mark, Outbox, Sent};
+use dmprl_shared::supervision::{Activity, Command, Report, Supervisor};
+use dmprl_shared::transport::delivery::{Acknowledgements, Outbox, Sent, Watermark};
 use dmprl_shared::transport::shared_memory::{self, Plan};
 use dmprl_shared::transport::{
     AcknowledgementSubscriber, ParameterSubscriber, SendOutcome, TransportError, WorkerEnd,
@@ -66,7 +66,7 @@ pub fn await_learner(
         if supervisor.stop_requested() {
             return Ok(None);
         }
-        supervisor.heartbeat(Doing::Attaching);
+        supervisor.heartbeat(Activity::Attaching);
         if let Some(Command::Attach { domain }) = supervisor.next_command(COMMAND_WAIT) {
             return attach(supervisor, &domain, plan, index);
         }
@@ -85,7 +85,7 @@ pub fn attach(
 ) -> Result<Option<shared_memory::WorkerEnd>, DeliveryError> {
     let deadline = Instant::now() + ATTACH_LIMIT;
     loop {
-        supervisor.heartbeat(Doing::Attaching);
+        supervisor.heartbeat(Activity::Attaching);
         match shared_memory::attach(domain, plan, index as usize) {
             Ok(end) => return Ok(Some(end)),
             Err(error @ TransportError::Incompatible { .. }) => return Err(error.into()),
@@ -110,7 +110,7 @@ pub enum DeliveryEvent<'a> {
         block: &'a [f32],
     },
     /// The learner has acknowledged the segments up to this one, and the outbox dropped them.
-    Acknowledged(Mark),
+    Acknowledged(Watermark),
     /// A newer policy was taken over.
     PolicyTaken {
         /// Which learner of the session published it.
@@ -121,7 +121,7 @@ pub enum DeliveryEvent<'a> {
 }
 
 /// Called synchronously at each [`DeliveryEvent`].
-pub type Witness = Box<dyn FnMut(DeliveryEvent<'_>)>;
+pub type DeliveryObserver = Box<dyn FnMut(DeliveryEvent<'_>)>;
 
 /// An attached worker's outbox and its ends of the transport.
 pub struct Delivery<'a, T: WorkerTransport> {
@@ -129,7 +129,7 @@ pub struct Delivery<'a, T: WorkerTransport> {
     deadline: Duration,
     end: WorkerEnd<T>,
     outbox: Outbox,
-    witness: Option<Witness>,
+    observer: Option<DeliveryObserver>,
     /// Buffer for the newest acknowledgements.
     acknowledgements: Acknowledgements,
     /// What the supervisor has been told, and when.
@@ -151,16 +151,16 @@ impl<'a, T: WorkerTransport> Delivery<'a, T> {
             deadline,
             end,
             outbox,
-            witness: None,
+            observer: None,
             acknowledgements: Acknowledgements::default(),
             reported: Sent::default(),
             reported_at: Instant::now(),
         }
     }
 
-    /// Calls `witness` at each event from now on, if there is one.
-    pub fn set_witness(&mut self, witness: Option<Witness>) {
-        self.witness = witness;
+    /// Calls `observer` at each event from now on, if there is one.
+    pub fn set_observer(&mut self, observer: Option<DeliveryObserver>) {
+        self.observer = observer;
     }
 
     /// The worker's index.
@@ -192,9 +192,9 @@ impl<'a, T: WorkerTransport> Delivery<'a, T> {
             }
             taken => taken?,
         };
-        if let Some(witness) = self.witness.as_mut().filter(|_| taken) {
+        if let Some(observer) = self.observer.as_mut().filter(|_| taken) {
             let (epoch, version) = (self.end.parameters.epoch(), snapshot.version);
-            witness(DeliveryEvent::PolicyTaken { epoch, version });
+            observer(DeliveryEvent::PolicyTaken { epoch, version });
         }
         Ok(taken)
     }
@@ -208,8 +208,8 @@ impl<'a, T: WorkerTransport> Delivery<'a, T> {
         let mut waiting: Option<(Instant, u32)> = None;
         let mut pause = FULL_QUEUE_PAUSE;
         let mut kept = false;
-        if let Some(witness) = &mut self.witness {
-            witness(DeliveryEvent::Produced { header, block });
+        if let Some(observer) = &mut self.observer {
+            observer(DeliveryEvent::Produced { header, block });
         }
         loop {
             if 2 * self.outbox.len() >= self.outbox.capacity() {
@@ -235,7 +235,7 @@ impl<'a, T: WorkerTransport> Delivery<'a, T> {
                 self.warn(format!("worker {} has waited {seconds} s: {why}", self.index()));
             }
             self.take_acknowledgements()?;
-            self.supervisor.heartbeat(Doing::Waiting);
+            self.supervisor.heartbeat(Activity::Waiting);
             std::thread::sleep(pause);
             pause = (pause * 2).min(FULL_QUEUE_PAUSE_MAX);
         }
@@ -254,7 +254,7 @@ impl<'a, T: WorkerTransport> Delivery<'a, T> {
                 return Ok(());
             }
             self.outbox.offer(&mut self.end.segments)?;
-            self.supervisor.heartbeat(Doing::Waiting);
+            self.supervisor.heartbeat(Activity::Waiting);
             std::thread::sleep(FULL_QUEUE_PAUSE_MAX);
         }
     }
@@ -265,9 +265,9 @@ impl<'a, T: WorkerTransport> Delivery<'a, T> {
             let before = self.outbox.sent().acked;
             self.outbox.acknowledge(&self.acknowledgements);
             let sequence = self.outbox.sent().acked;
-            if let Some(witness) = self.witness.as_mut().filter(|_| sequence > before) {
+            if let Some(observer) = self.observer.as_mut().filter(|_| sequence > before) {
                 let incarnation = self.outbox.incarnation();
-                witness(DeliveryEvent::Acknowledged(Mark { incarnation, sequence }));
+                observer(DeliveryEvent::Acknowledged(Watermark { incarnation, sequence }));
             }
         }
         self.supervisor.note_unacknowledged(self.outbox.len());
@@ -350,7 +350,7 @@ mod tests {
         let warnings = supervisor.warnings();
         assert_eq!(warnings.len(), 1, "{warnings:?}");
         assert!(warnings[0].contains("the learner takes nothing from its full queue"));
-        assert!(supervisor.heartbeats().iter().all(|doing| *doing == Doing::Waiting));
+        assert!(supervisor.heartbeats().iter().all(|doing| *doing == Activity::Waiting));
         let sent = delivery.sent();
         assert_eq!((sent.produced, sent.sent, sent.acked), (3, 2, 0));
     }
@@ -365,7 +365,7 @@ mod tests {
             deliver(&mut delivery, sequence).unwrap();
             assert!(receiver.try_receive(&mut segment).unwrap());
         }
-        acknowledger.acknowledge(&[Mark { incarnation: 0, sequence: 3 }]).unwrap();
+        acknowledger.acknowledge(&[Watermark { incarnation: 0, sequence: 3 }]).unwrap();
         deliver(&mut delivery, 5).unwrap();
         assert_eq!(delivery.sent().acked, 3);
         assert_eq!(supervisor.unacknowledged(), 1, "before the fifth");
@@ -378,7 +378,7 @@ mod tests {
         let (mut delivery, _receiver, mut acknowledger) =
             delivery(&supervisor, Duration::from_secs(60));
         let (events, seen) = std::sync::mpsc::channel();
-        delivery.set_witness(Some(Box::new(move |event| {
+        delivery.set_observer(Some(Box::new(move |event| {
             let sequence = match event {
                 DeliveryEvent::Produced { header, .. } => Ok(header.sequence),
                 DeliveryEvent::Acknowledged(mark) => Err(mark.sequence),
@@ -387,7 +387,7 @@ mod tests {
             events.send(sequence).unwrap();
         })));
         deliver(&mut delivery, 1).unwrap();
-        acknowledger.acknowledge(&[Mark { incarnation: 0, sequence: 1 }]).unwrap();
+        acknowledger.acknowledge(&[Watermark { incarnation: 0, sequence: 1 }]).unwrap();
         delivery.report().unwrap();
         delivery.report().unwrap();
         assert_eq!(seen.try_iter().collect::<Vec<_>>(), [Ok(1), Err(1)]);

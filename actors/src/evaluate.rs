@@ -5,8 +5,8 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use dmprl_shared::config::ExperimentConfig;
 use dmprl_shared::policy::{Policy, PolicyError};
 
-use crate::acting::Acting;
 use crate::faults::Faults;
+use crate::policy_runner::PolicyRunner;
 use crate::python_env::{PythonEnvironments, SUCCESS_NOT_REPORTED, SUCCESS_YES};
 use crate::rollout::RolloutError;
 
@@ -53,7 +53,7 @@ impl Evaluation {
 /// Evaluates policies of one architecture.
 pub struct Evaluator {
     environments: PythonEnvironments,
-    acting: Acting,
+    runner: PolicyRunner,
     faults: Faults,
     envs: usize,
     trace: Option<Trace>,
@@ -99,7 +99,7 @@ impl Evaluator {
         let faults = Faults::new(envs, u32::MAX);
         Ok(Self {
             environments,
-            acting: Acting::new(policy, envs),
+            runner: PolicyRunner::new(policy, envs),
             faults,
             envs,
             trace: None,
@@ -140,7 +140,7 @@ impl Evaluator {
     /// The policy's architecture.
     #[must_use]
     pub fn policy(&self) -> &Policy {
-        &self.acting.policy
+        &self.runner.policy
     }
 
     /// One line about each failure of an environment since the last call.
@@ -158,7 +158,7 @@ impl Evaluator {
         parameters: &[f32],
         episodes: Episodes<'_>,
     ) -> Result<Option<Evaluation>, RolloutError> {
-        self.acting.take_policy(parameters);
+        self.runner.take_policy(parameters);
         let mut returns = Vec::with_capacity(episodes.count);
         let mut success = Vec::with_capacity(episodes.count);
         let (mut jumps, mut jump_count) = (0.0, 0);
@@ -186,7 +186,7 @@ impl Evaluator {
         &mut self,
         Episodes { count, first_seed, stop }: Episodes<'_>,
     ) -> Result<Option<Wave>, RolloutError> {
-        let layout = self.acting.policy.layout();
+        let layout = self.runner.policy.layout();
         let dims = layout.action_len;
         let actions_len = self.envs * layout.segment_steps * dims;
         let mut wave = Wave {
@@ -203,24 +203,24 @@ impl Evaluator {
         drop(self.take_trace());
         let all = vec![true; self.envs];
         self.environments.reset(&all, &wave.seeds)?;
-        self.faults.look_at_reset(&mut self.environments, &all)?;
-        (0..self.envs).for_each(|env| self.acting.carry_on(env, true));
+        self.faults.inspect_reset(&mut self.environments, &all)?;
+        (0..self.envs).for_each(|env| self.runner.carry_state(env, true));
         while wave.running.iter().any(|&running| running) {
             if stop.load(Ordering::Acquire) {
                 return Ok(None);
             }
-            self.acting.observe(&self.environments);
-            self.acting.run_network();
-            self.acting.decode();
-            self.environments.step_segment(&self.acting.actions()[..actions_len])?;
-            let failed = self.faults.look(&mut self.environments)?;
+            self.runner.observe(&self.environments);
+            self.runner.run_network();
+            self.runner.decode();
+            self.environments.step_segment(&self.runner.actions()[..actions_len])?;
+            let failed = self.faults.inspect_segment(&mut self.environments)?;
             for env in 0..self.envs {
                 if wave.running[env] && !self.faults.failed()[env] {
-                    self.book(&mut wave, env);
+                    self.add_segment(&mut wave, env);
                 }
             }
             if failed {
-                self.begin_again(&mut wave)?;
+                self.restart_episodes(&mut wave)?;
             }
         }
         Ok(Some(wave))
@@ -228,11 +228,11 @@ impl Evaluator {
 
     /// Begins the episodes of failed environments again. Those that have their episode behind them
     /// only keep the others company, but must go on too.
-    fn begin_again(&mut self, wave: &mut Wave) -> Result<(), RolloutError> {
-        let dims = self.acting.policy.layout().action_len;
+    fn restart_episodes(&mut self, wave: &mut Wave) -> Result<(), RolloutError> {
+        let dims = self.runner.policy.layout().action_len;
         let mask = self.faults.failed().to_vec();
         for env in (0..self.envs).filter(|&env| mask[env]) {
-            self.acting.carry_on(env, true);
+            self.runner.carry_state(env, true);
             if !wave.running[env] {
                 continue;
             }
@@ -248,17 +248,17 @@ impl Evaluator {
             drop(self.take_trace());
         }
         self.environments.reset(&mask, &wave.seeds)?;
-        Ok(self.faults.look_at_reset(&mut self.environments, &mask)?)
+        Ok(self.faults.inspect_reset(&mut self.environments, &mask)?)
     }
 
     /// Adds environment `env`'s segment to the wave.
-    fn book(&mut self, wave: &mut Wave, env: usize) {
-        let layout = self.acting.policy.layout();
+    fn add_segment(&mut self, wave: &mut Wave, env: usize) {
+        let layout = self.runner.policy.layout();
         let (k_max, dims) = (layout.segment_steps, layout.action_len);
         let steps = self.environments.steps()[env] as usize;
         let rewards = &self.environments.rewards()[env * k_max..][..steps];
         wave.returns[env] += rewards.iter().sum::<f64>();
-        let u = &self.acting.u[env * k_max * dims..][..steps * dims];
+        let u = &self.runner.u[env * k_max * dims..][..steps * dims];
         if let Some(trace) = &mut self.trace {
             trace.u.extend(u);
             trace.rewards.extend(rewards);
@@ -278,7 +278,7 @@ impl Evaluator {
         wave.success[env] = self.environments.success()[env];
         let ended =
             self.environments.terminated()[env] == 1 || self.environments.truncated()[env] == 1;
-        self.acting.carry_on(env, ended);
+        self.runner.carry_state(env, ended);
         wave.running[env] = !ended && wave.steps[env] < EPISODE_STEPS_MAX;
     }
 }

@@ -8,7 +8,7 @@ use rand::{Rng, RngExt};
 use rand_distr::StandardNormal;
 use rand_xoshiro::Xoshiro256PlusPlus;
 
-use crate::acting::Acting;
+use crate::policy_runner::PolicyRunner;
 
 /// The departure, with its random stream.
 #[derive(Debug)]
@@ -27,7 +27,8 @@ impl Exploration {
     pub fn new(
         config: ExplorationConfig,
         random: Xoshiro256PlusPlus,
-        (envs, dims): (usize, usize),
+        envs: usize,
+        dims: usize,
     ) -> Self {
         let pink = match config.kind {
             ExplorationKind::Pink => vec![PinkNoise::default(); envs * dims],
@@ -37,15 +38,15 @@ impl Exploration {
     }
 
     /// Draws the segment's `u` without the policy.
-    pub fn warm_up(&mut self, acting: &mut Acting) {
+    pub fn warm_up(&mut self, runner: &mut PolicyRunner) {
         let range = self.config.warm_up_range as f32;
         let random = &mut self.random;
         let mut draw = |values: &mut [f32]| {
             values.iter_mut().for_each(|value| *value = random.random_range(-range..=range));
         };
         match self.config.warm_up_kind {
-            WarmUpKind::Uniform => draw(&mut acting.u),
-            WarmUpKind::DmpParameters => acting.decode_drawn(&mut draw),
+            WarmUpKind::Uniform => draw(&mut runner.u),
+            WarmUpKind::DmpParameters => runner.decode_drawn(&mut draw),
         }
     }
 
@@ -53,29 +54,29 @@ impl Exploration {
     ///
     /// A Gaussian policy draws from itself; kind and std of the noise then mean nothing. One with
     /// standard deviations of its own is not bounded by a tanh, and its draws not by [-1, 1].
-    pub fn explore(&mut self, acting: &mut Acting) {
-        if !acting.std.is_empty() {
-            acting.decode();
-            self.draw_unbounded(acting);
+    pub fn explore(&mut self, runner: &mut PolicyRunner) {
+        if !runner.std.is_empty() {
+            runner.decode();
+            self.draw_unbounded(runner);
             return;
         }
-        if let Some(columns) = acting.policy.log_stds() {
-            acting.decode();
-            self.draw(acting, columns);
+        if let Some(columns) = runner.policy.log_stds() {
+            runner.decode();
+            self.draw(runner, columns);
             return;
         }
         let std = self.config.std as f32;
         if self.config.kind == ExplorationKind::DmpParameters {
-            let envs = acting.observations.len() / acting.policy.layout().observation_len;
-            let outputs = acting.work.activations.output_mut(acting.policy.shape(), envs);
+            let envs = runner.observations.len() / runner.policy.layout().observation_len;
+            let outputs = runner.work.activations.output_mut(runner.policy.shape(), envs);
             outputs.iter_mut().for_each(|output| *output += std * normal(&mut self.random));
-            acting.decode();
+            runner.decode();
             return;
         }
-        acting.decode();
+        runner.decode();
         let dims = self.held.len();
-        let segment = acting.policy.layout().segment_steps * dims;
-        for (env, u) in acting.u.chunks_exact_mut(segment).enumerate() {
+        let segment = runner.policy.layout().segment_steps * dims;
+        for (env, u) in runner.u.chunks_exact_mut(segment).enumerate() {
             for step in 0..segment / dims {
                 for d in 0..dims {
                     let noise = self.noise(env, step, d);
@@ -87,8 +88,8 @@ impl Exploration {
     }
 
     /// u = mean + std noise, std the policy's own.
-    fn draw_unbounded(&mut self, acting: &mut Acting) {
-        let Acting { u, std, work, .. } = acting;
+    fn draw_unbounded(&mut self, runner: &mut PolicyRunner) {
+        let PolicyRunner { u, std, work, .. } = runner;
         let means = work.actions.chunks_exact(std.len());
         for (u, mean) in u.chunks_exact_mut(std.len()).zip(means) {
             for ((u, mean), std) in u.iter_mut().zip(mean).zip(std.iter()) {
@@ -98,16 +99,16 @@ impl Exploration {
     }
 
     /// u = tanh(mean + std noise), std from the network's outputs at `columns`.
-    fn draw(&mut self, acting: &mut Acting, columns: Range<usize>) {
-        let len = acting.policy.layout().actions_len();
-        let envs = acting.u.len() / len;
-        let outputs = acting.work.activations.output(acting.policy.shape(), envs);
-        let rows = outputs.chunks_exact(acting.policy.shape().outputs());
+    fn draw(&mut self, runner: &mut PolicyRunner, columns: Range<usize>) {
+        let len = runner.policy.layout().actions_len();
+        let envs = runner.u.len() / len;
+        let outputs = runner.work.activations.output(runner.policy.shape(), envs);
+        let rows = outputs.chunks_exact(runner.policy.shape().outputs());
         for (env, row) in rows.enumerate() {
             for (index, raw_log_std) in row[columns.clone()].iter().enumerate() {
                 let at = env * len + index;
                 let noise = normal(&mut self.random);
-                acting.u[at] = gaussian::draw(acting.work.means[at], *raw_log_std, noise).action;
+                runner.u[at] = gaussian::draw(runner.work.means[at], *raw_log_std, noise).action;
             }
         }
     }
@@ -187,7 +188,7 @@ mod tests {
     }
 
     /// A fresh policy before some observations, and the departure from it.
-    fn scene(keys: &[(&str, &str)]) -> (Acting, Exploration) {
+    fn scene(keys: &[(&str, &str)]) -> (PolicyRunner, Exploration) {
         let config = config(keys);
         let spec = EnvSpec {
             id: "Test-v0".into(),
@@ -201,23 +202,23 @@ mod tests {
         };
         let policy = Policy::new(&config, &spec).unwrap();
         let parameters = policy.initial_parameters(&mut seeds::stream(1, "test", 0));
-        let mut acting = Acting::new(policy, ENVS);
-        acting.take_policy(&parameters);
-        for (index, value) in acting.observations.iter_mut().enumerate() {
+        let mut runner = PolicyRunner::new(policy, ENVS);
+        runner.take_policy(&parameters);
+        for (index, value) in runner.observations.iter_mut().enumerate() {
             *value = (index as f32 * 0.7).sin();
         }
-        acting.run_network();
+        runner.run_network();
         let random = seeds::stream(2, "test", 0);
-        (acting, Exploration::new(config.exploration, random, (ENVS, DIMS)))
+        (runner, Exploration::new(config.exploration, random, ENVS, DIMS))
     }
 
     /// What exploration adds to each action, (E, K, A); none of these meets a bound.
     fn noise(keys: &[(&str, &str)]) -> Vec<f32> {
-        let (mut acting, mut exploration) = scene(keys);
-        acting.decode();
-        let clean = acting.u.clone();
-        exploration.explore(&mut acting);
-        acting.u.iter().zip(&clean).map(|(noisy, clean)| noisy - clean).collect()
+        let (mut runner, mut exploration) = scene(keys);
+        runner.decode();
+        let clean = runner.u.clone();
+        exploration.explore(&mut runner);
+        runner.u.iter().zip(&clean).map(|(noisy, clean)| noisy - clean).collect()
     }
 
     fn std(values: &[f32]) -> f32 {
@@ -250,24 +251,24 @@ mod tests {
     #[test]
     fn noise_stays_within_the_bounds() {
         let keys = [("exploration.kind", "gaussian"), ("exploration.std", "2.0")];
-        let (mut acting, mut exploration) = scene(&keys);
-        exploration.explore(&mut acting);
-        assert!(acting.u.iter().all(|u| u.abs() <= 1.0));
-        assert!(acting.u.contains(&1.0) && acting.u.contains(&-1.0));
+        let (mut runner, mut exploration) = scene(&keys);
+        exploration.explore(&mut runner);
+        assert!(runner.u.iter().all(|u| u.abs() <= 1.0));
+        assert!(runner.u.contains(&1.0) && runner.u.contains(&-1.0));
     }
 
     #[test]
     fn noise_on_parameters_goes_through_the_movement_primitive() {
         let keys = [("exploration.kind", "dmp_parameters"), ("exploration.std", "0.3")];
-        let (mut acting, mut exploration) = scene(&keys);
-        acting.decode();
-        let clean = acting.u.clone();
-        exploration.explore(&mut acting);
-        let explored = acting.u.clone();
+        let (mut runner, mut exploration) = scene(&keys);
+        runner.decode();
+        let clean = runner.u.clone();
+        exploration.explore(&mut runner);
+        let explored = runner.u.clone();
         assert!(explored.iter().zip(&clean).filter(|(a, b)| a != b).count() > clean.len() / 2);
         // Nothing was added behind the decoder.
-        acting.decode();
-        assert_eq!(acting.u, explored);
+        runner.decode();
+        assert_eq!(runner.u, explored);
     }
 
     #[test]
@@ -276,20 +277,20 @@ mod tests {
             let text = range.to_string();
             let keys =
                 [("exploration.warm_up_kind", kind), ("exploration.warm_up_range", text.as_str())];
-            let (mut acting, mut exploration) = scene(&keys);
-            exploration.warm_up(&mut acting);
-            let largest = acting.u.iter().fold(0.0_f32, |largest, u| largest.max(u.abs()));
+            let (mut runner, mut exploration) = scene(&keys);
+            exploration.warm_up(&mut runner);
+            let largest = runner.u.iter().fold(0.0_f32, |largest, u| largest.max(u.abs()));
             assert!(largest <= range && largest > 0.95 * range, "{kind}: {largest} of {range}");
-            assert!(acting.u.windows(2).all(|pair| pair[0] != pair[1]));
+            assert!(runner.u.windows(2).all(|pair| pair[0] != pair[1]));
         }
     }
 
     #[test]
     fn warm_up_on_parameters_draws_movement_primitives() {
         let keys = [("exploration.warm_up_kind", "dmp_parameters")];
-        let (mut acting, mut exploration) = scene(&keys);
-        exploration.warm_up(&mut acting);
-        let first = acting.u.clone();
+        let (mut runner, mut exploration) = scene(&keys);
+        exploration.warm_up(&mut runner);
+        let first = runner.u.clone();
         assert!(std(&first) > 0.01 && first.iter().all(|u| u.abs() <= 1.0));
         // Actions of one segment are of one motion: they differ less than those of two.
         let jump = |from: usize, to: usize| {
@@ -299,19 +300,19 @@ mod tests {
                 .collect::<Vec<_>>())
         };
         assert!(jump(K - 2, K - 1) < jump(K - 1, K), "not smooth");
-        exploration.warm_up(&mut acting);
-        assert_ne!(acting.u, first);
+        exploration.warm_up(&mut runner);
+        assert_ne!(runner.u, first);
     }
 
     #[test]
     fn a_gaussian_policy_draws_from_itself() {
         // Squashed: inside the bounds, whatever the noise is set to.
-        let (mut acting, mut exploration) =
+        let (mut runner, mut exploration) =
             scene(&[("algorithm.name", "sac"), ("exploration.std", "0.0")]);
-        acting.decode();
-        let mean = acting.u.clone();
-        exploration.explore(&mut acting);
-        assert!(acting.u.iter().zip(&mean).all(|(u, mean)| u != mean && u.abs() <= 1.0));
+        runner.decode();
+        let mean = runner.u.clone();
+        exploration.explore(&mut runner);
+        assert!(runner.u.iter().zip(&mean).all(|(u, mean)| u != mean && u.abs() <= 1.0));
         // With a spread of its own: beyond them, too.
         let ndp = [
             ("algorithm.name", "ndp"),
@@ -320,19 +321,19 @@ mod tests {
             ("algorithm.action_rate_penalty", "0.0"),
             ("algorithm.ndp.initial_log_std", "0.0"),
         ];
-        let (mut acting, mut exploration) = scene(&ndp);
-        acting.decode();
-        let mean = acting.work.actions.clone();
-        exploration.explore(&mut acting);
-        let drawn: Vec<f32> = acting.u.iter().zip(&mean).map(|(u, mean)| u - mean).collect();
+        let (mut runner, mut exploration) = scene(&ndp);
+        runner.decode();
+        let mean = runner.work.actions.clone();
+        exploration.explore(&mut runner);
+        let drawn: Vec<f32> = runner.u.iter().zip(&mean).map(|(u, mean)| u - mean).collect();
         assert!((std(&drawn) - 1.0).abs() < 0.1, "{}", std(&drawn));
-        assert!(acting.u.iter().any(|u| u.abs() > 1.0));
+        assert!(runner.u.iter().any(|u| u.abs() > 1.0));
     }
 
     #[test]
     fn pink_noise_starts_anew_where_an_episode_ended() {
-        let (mut acting, mut exploration) = scene(&[("exploration.kind", "pink")]);
-        exploration.explore(&mut acting);
+        let (mut runner, mut exploration) = scene(&[("exploration.kind", "pink")]);
+        exploration.explore(&mut runner);
         exploration.episode_ended(3);
         let sources = |env: usize| &exploration.pink[env * DIMS..(env + 1) * DIMS];
         assert!(sources(3).iter().all(|source| source.step == 0));

@@ -20,26 +20,26 @@ pub struct Faults {
     /// (E,): whose last call cannot be used.
     failed: Vec<bool>,
     /// (E,): those of them that cannot go on as they are.
-    unmade: Vec<bool>,
+    needs_reset: Vec<bool>,
     /// (E,): failures that nothing has made up for, and how many are too many.
-    records: Vec<Record>,
+    records: Vec<FailureRecord>,
     failures_max: u32,
     /// (E,): the newest failure of each; empty before the first.
     causes: Vec<String>,
     total: u64,
-    untold: Vec<String>,
+    unreported: Vec<String>,
 }
 
 /// What counts against one environment.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
-struct Record {
+struct FailureRecord {
     /// Since it last completed an episode or ran [`SOUND_SEGMENTS`].
     failures: u32,
     /// Since the first of them.
     sound_segments: u32,
 }
 
-impl Record {
+impl FailureRecord {
     fn failed(&mut self) {
         if self.failures == 0 {
             self.sound_segments = 0;
@@ -57,7 +57,7 @@ impl Record {
 
 /// An environment that fails whatever is done.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub struct Hopeless {
+pub struct FailureBudgetExceeded {
     /// Which.
     pub env_index: usize,
     /// Failures since it last completed an episode, or a thousand segments.
@@ -73,12 +73,12 @@ impl Faults {
     pub fn new(envs: usize, failures_max: u32) -> Self {
         Self {
             failed: vec![false; envs],
-            unmade: vec![false; envs],
-            records: vec![Record::default(); envs],
+            needs_reset: vec![false; envs],
+            records: vec![FailureRecord::default(); envs],
             failures_max,
             causes: vec![String::new(); envs],
             total: 0,
-            untold: Vec::new(),
+            unreported: Vec::new(),
         }
     }
 
@@ -86,7 +86,10 @@ impl Faults {
     ///
     /// # Errors
     /// If the Python side cannot say what happened.
-    pub fn look(&mut self, environments: &mut PythonEnvironments) -> Result<bool, PythonError> {
+    pub fn inspect_segment(
+        &mut self,
+        environments: &mut PythonEnvironments,
+    ) -> Result<bool, PythonError> {
         let told = environments.failed().iter().any(|&failed| failed != 0);
         let mut sentences = if told { environments.take_failures()? } else { Vec::new() };
         let environments = &*environments;
@@ -100,7 +103,7 @@ impl Faults {
             self.failed[env] = cause.is_some();
             // One that was made again may still begin with what is no finite 32-bit number.
             let sound = made && start_fault(environments, env).is_none();
-            self.unmade[env] = cause.is_some() && !sound;
+            self.needs_reset[env] = cause.is_some() && !sound;
             if let Some(cause) = cause {
                 any = true;
                 self.note(&cause);
@@ -118,7 +121,7 @@ impl Faults {
     ///
     /// # Errors
     /// `ObservationNotFinite`: a reset is all that could have helped.
-    pub fn look_at_reset(
+    pub fn inspect_reset(
         &mut self,
         environments: &mut PythonEnvironments,
         mask: &[bool],
@@ -141,22 +144,22 @@ impl Faults {
 
     /// (E,): those of them that cannot go on as they are: they must be reset.
     #[must_use]
-    pub fn unmade(&self) -> &[bool] {
-        &self.unmade
+    pub fn needs_reset(&self) -> &[bool] {
+        &self.needs_reset
     }
 
     /// Environment `env` has completed an episode.
     pub fn completed(&mut self, env: usize) {
-        self.records[env] = Record::default();
+        self.records[env] = FailureRecord::default();
     }
 
     /// The environment that has failed too often, if there is one.
     #[must_use]
-    pub fn hopeless(&self) -> Option<Hopeless> {
-        let too_many = |record: &Record| record.failures > self.failures_max;
+    pub fn budget_exceeded(&self) -> Option<FailureBudgetExceeded> {
+        let too_many = |record: &FailureRecord| record.failures > self.failures_max;
         let env_index = self.records.iter().position(too_many)?;
         let (count, cause) = (self.records[env_index].failures, self.cause(env_index).to_owned());
-        Some(Hopeless { env_index, count, cause })
+        Some(FailureBudgetExceeded { env_index, count, cause })
     }
 
     /// The newest failure of environment `env`.
@@ -173,12 +176,12 @@ impl Faults {
 
     /// One line about each failure since the last call.
     pub fn take(&mut self) -> Vec<String> {
-        std::mem::take(&mut self.untold)
+        std::mem::take(&mut self.unreported)
     }
 
     fn note(&mut self, cause: &str) {
         self.total += 1;
-        self.untold.push(plain(cause));
+        self.unreported.push(plain(cause));
     }
 }
 
@@ -246,7 +249,7 @@ mod tests {
         let mut faults = Faults::new(1, 2);
         for _ in 0..10 {
             (0..2).for_each(|_| faults.records[0].failed());
-            assert_eq!(faults.hopeless(), None);
+            assert_eq!(faults.budget_exceeded(), None);
             sound(&mut faults, SOUND_SEGMENTS);
         }
     }
@@ -259,8 +262,8 @@ mod tests {
         faults.records[0].failed();
         sound(&mut faults, 1);
         (0..2).for_each(|_| faults.records[0].failed());
-        assert_eq!(faults.hopeless().unwrap().count, 3);
+        assert_eq!(faults.budget_exceeded().unwrap().count, 3);
         faults.completed(0);
-        assert_eq!(faults.hopeless(), None);
+        assert_eq!(faults.budget_exceeded(), None);
     }
 }

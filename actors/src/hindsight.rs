@@ -18,7 +18,7 @@ use dmprl_shared::segment::{HINDSIGHT, SegmentLayout, TERMINATED};
 use rand::RngExt;
 
 use crate::python_env::{Goals, PythonEnvironments, PythonError, Relabelling};
-use crate::rollout::Outline;
+use crate::rollout::SegmentMeta;
 
 /// The episodes under way, and copies of the one that has just ended. All buffers are made once.
 pub(crate) struct Hindsight {
@@ -68,7 +68,7 @@ struct Draw {
 
 /// What a segment adds to its episode.
 #[derive(Debug, Clone, Copy)]
-pub(crate) struct Addition<'a> {
+pub(crate) struct EpisodeSegment<'a> {
     /// Steps really run.
     pub(crate) steps: usize,
     /// The segment's block.
@@ -132,8 +132,12 @@ impl Hindsight {
     ///
     /// # Errors
     /// `Interface` if the episode is longer than the specification says.
-    pub(crate) fn add(&mut self, env: usize, addition: Addition<'_>) -> Result<(), PythonError> {
-        let Addition { steps, block, observations, policy_version } = addition;
+    pub(crate) fn add(
+        &mut self,
+        env: usize,
+        segment: EpisodeSegment<'_>,
+    ) -> Result<(), PythonError> {
+        let EpisodeSegment { steps, block, observations, policy_version } = segment;
         let SegmentLayout { observation_len: o, action_len: a, segment_steps } = self.layout;
         let (g, episode) = (self.goals.len, &mut self.episodes[env]);
         let first = episode.steps;
@@ -204,7 +208,7 @@ impl Hindsight {
     ///
     /// # Panics
     /// If `index` is not below what [`Hindsight::relabel`] has returned.
-    pub(crate) fn write(&self, env: usize, index: usize, block: &mut [f32]) -> Option<Outline> {
+    pub(crate) fn write(&self, env: usize, index: usize, block: &mut [f32]) -> Option<SegmentMeta> {
         let SegmentLayout { segment_steps, observation_len: o, action_len: a } = self.layout;
         let (draw, episode) = (self.drawn[index], &self.episodes[env]);
         let ends = &self.relabelling.terminated()[draw.row..][..draw.len];
@@ -225,7 +229,7 @@ impl Hindsight {
         actions[..len * a].copy_from_slice(&episode.actions[draw.first * a..][..len * a]);
         let from = &self.relabelling.rewards()[draw.row..];
         rewards[..len].iter_mut().zip(from).for_each(|(reward, value)| *reward = *value as f32);
-        Some(Outline {
+        Some(SegmentMeta {
             flags: HINDSIGHT | if end.is_some() { TERMINATED } else { 0 },
             policy_version: draw.policy_version,
             episode_step: draw.first as u32,

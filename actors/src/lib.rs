@@ -8,8 +8,6 @@
 //!
 //! Without the feature `python` only [`delivery`] is built: a learner-only build.
 
-#[cfg(feature = "python")]
-mod acting;
 pub mod delivery;
 #[cfg(feature = "python")]
 pub mod environments;
@@ -23,6 +21,8 @@ mod exploration;
 mod faults;
 #[cfg(feature = "python")]
 mod hindsight;
+#[cfg(feature = "python")]
+mod policy_runner;
 #[cfg(feature = "python")]
 pub mod python_env;
 #[cfg(feature = "python")]

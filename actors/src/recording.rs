@@ -6,7 +6,7 @@ use dmprl_shared::config::ExperimentConfig;
 use dmprl_shared::policy::Policy;
 
 use crate::evaluate::{Episodes, Evaluator, Trace};
-use crate::python_env::{Joints, PythonEnvironments, WrittenDown};
+use crate::python_env::{Joints, PythonEnvironments, StepRecording};
 use crate::rollout::RolloutError;
 
 /// One episode of T steps.
@@ -21,7 +21,7 @@ pub struct EpisodeRecord {
     /// Actions and rewards.
     pub trace: Trace,
     /// Joints, and success after each step.
-    pub written_down: WrittenDown,
+    pub recording: StepRecording,
 }
 
 /// Records episodes of policies of one architecture.
@@ -85,13 +85,13 @@ impl Recorder {
             return Ok(None);
         };
         let trace = self.evaluator.take_trace();
-        let written_down = self.evaluator.environments().written_down(trace.rewards.len())?;
+        let recording = self.evaluator.environments().recording(trace.rewards.len())?;
         Ok(Some(EpisodeRecord {
             seed,
             return_: evaluation.return_mean(),
             success: evaluation.success_rate.map(|rate| rate > 0.0),
             trace,
-            written_down,
+            recording,
         }))
     }
 }

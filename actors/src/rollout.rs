@@ -13,10 +13,10 @@ use dmprl_shared::segment::{
 };
 use thiserror::Error;
 
-use crate::acting::Acting;
 use crate::exploration::Exploration;
-use crate::faults::{Faults, Hopeless};
-use crate::hindsight::{Addition, Hindsight};
+use crate::faults::{FailureBudgetExceeded, Faults};
+use crate::hindsight::{EpisodeSegment, Hindsight};
+use crate::policy_runner::PolicyRunner;
 use crate::python_env::{PythonEnvironments, PythonError, SUCCESS_NOT_REPORTED, SUCCESS_YES};
 
 /// Why a rollout stopped.
@@ -33,7 +33,7 @@ pub enum RolloutError {
         "environment {env_index} has failed {count} times without completing an episode, more \
          often than actors.env_failures_max; the last time: {cause}"
     )]
-    Hopeless {
+    FailureBudgetExceeded {
         /// Which environment of the worker.
         env_index: usize,
         /// Failures since its last completed episode, or a thousand sound segments.
@@ -80,7 +80,7 @@ impl Identity {
 
 /// What the header of a segment says beside who made it.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(crate) struct Outline {
+pub(crate) struct SegmentMeta {
     /// As in the header.
     pub(crate) flags: u32,
     /// Version of the policy that acted.
@@ -102,7 +102,7 @@ pub struct Rollout {
     identity: Identity,
     warm_up_steps: u64,
     environments: PythonEnvironments,
-    acting: Acting,
+    runner: PolicyRunner,
     exploration: Exploration,
     episodes: Vec<Episode>,
     faults: Faults,
@@ -113,7 +113,7 @@ pub struct Rollout {
     segment: Segment,
     sequence: u64,
     /// Version of the policy that `acting` has taken over.
-    acting_version: u64,
+    loaded_version: u64,
     /// The newest policy; version 0 until the first one has come.
     pub snapshot: ParameterSnapshot,
 }
@@ -138,7 +138,7 @@ impl Rollout {
         let mut faults = Faults::new(envs, config.actors.env_failures_max);
         let all = vec![true; envs];
         environments.reset(&all, &env_seeds)?;
-        faults.look_at_reset(&mut environments, &all)?;
+        faults.inspect_reset(&mut environments, &all)?;
         let hindsight = Hindsight::start(config, &environments, layout, worker)?;
         Ok(Self {
             hindsight,
@@ -147,7 +147,8 @@ impl Rollout {
             exploration: Exploration::new(
                 config.exploration.clone(),
                 random,
-                (envs, layout.action_len),
+                envs,
+                layout.action_len,
             ),
             episodes: vec![Episode::default(); envs],
             faults,
@@ -155,9 +156,9 @@ impl Rollout {
             env_seeds,
             segment: Segment::zeroed(layout),
             sequence: 0,
-            acting_version: 0,
+            loaded_version: 0,
             snapshot: ParameterSnapshot::default(),
-            acting: Acting::new(policy, envs),
+            runner: PolicyRunner::new(policy, envs),
             environments,
         })
     }
@@ -165,7 +166,7 @@ impl Rollout {
     /// The policy's architecture.
     #[must_use]
     pub fn policy(&self) -> &Policy {
-        &self.acting.policy
+        &self.runner.policy
     }
 
     /// Decides and runs one segment in every environment with `self.snapshot`, and hands each
@@ -177,21 +178,22 @@ impl Rollout {
     /// # Errors
     /// If an environment fails for good or too often, or whatever `deliver` returns.
     pub fn segment<E: From<RolloutError>>(&mut self, deliver: Deliver<'_, E>) -> Result<(), E> {
-        self.acting.observe(&self.environments);
+        self.runner.observe(&self.environments);
         let warming_up = self.snapshot.version == 0 || self.snapshot.env_steps < self.warm_up_steps;
         if warming_up {
-            self.exploration.warm_up(&mut self.acting);
+            self.exploration.warm_up(&mut self.runner);
         } else {
-            if self.acting_version != self.snapshot.version {
-                self.acting.take_policy(&self.snapshot.values);
-                self.acting_version = self.snapshot.version;
+            if self.loaded_version != self.snapshot.version {
+                self.runner.take_policy(&self.snapshot.values);
+                self.loaded_version = self.snapshot.version;
             }
-            self.acting.run_network();
-            self.exploration.explore(&mut self.acting);
+            self.runner.run_network();
+            self.exploration.explore(&mut self.runner);
         }
         let policy_version = if warming_up { 0 } else { self.snapshot.version };
-        self.environments.step_segment(self.acting.actions()).map_err(RolloutError::from)?;
-        let failed = self.faults.look(&mut self.environments).map_err(RolloutError::from)?;
+        self.environments.step_segment(self.runner.actions()).map_err(RolloutError::from)?;
+        let failed =
+            self.faults.inspect_segment(&mut self.environments).map_err(RolloutError::from)?;
         for env in 0..self.episodes.len() {
             let mut ended = self.faults.failed()[env];
             if !ended {
@@ -205,7 +207,7 @@ impl Rollout {
             }
         }
         // Last: what the others did is sound, and delivered.
-        if failed { Ok(self.make_up()?) } else { Ok(()) }
+        if failed { Ok(self.reset_failed()?) } else { Ok(()) }
     }
 
     /// Segments that one call may deliver.
@@ -227,8 +229,8 @@ impl Rollout {
         for index in 0..copies {
             let Some(hindsight) = &self.hindsight else { break };
             let copy = hindsight.write(env, index, &mut self.segment.block);
-            let Some(outline) = copy else { continue };
-            self.write_header(env, outline);
+            let Some(meta) = copy else { continue };
+            self.write_header(env, meta);
             deliver(&self.segment.header, &self.segment.block)?;
         }
         Ok(())
@@ -240,17 +242,19 @@ impl Rollout {
     }
 
     /// Resets the failed environments that cannot go on as they are.
-    fn make_up(&mut self) -> Result<(), RolloutError> {
-        if let Some(Hopeless { env_index, count, cause }) = self.faults.hopeless() {
-            return Err(RolloutError::Hopeless { env_index, count, cause });
+    fn reset_failed(&mut self) -> Result<(), RolloutError> {
+        if let Some(FailureBudgetExceeded { env_index, count, cause }) =
+            self.faults.budget_exceeded()
+        {
+            return Err(RolloutError::FailureBudgetExceeded { env_index, count, cause });
         }
-        if self.faults.unmade().contains(&true) {
+        if self.faults.needs_reset().contains(&true) {
             for (new, first) in self.new_seeds.iter_mut().zip(&self.env_seeds) {
                 *new = seeds::derive(*first, "failure", self.faults.total()) >> 33;
             }
-            let mask = self.faults.unmade().to_vec();
+            let mask = self.faults.needs_reset().to_vec();
             self.environments.reset(&mask, &self.new_seeds)?;
-            self.faults.look_at_reset(&mut self.environments, &mask)?;
+            self.faults.inspect_reset(&mut self.environments, &mask)?;
         }
         Ok(())
     }
@@ -259,7 +263,7 @@ impl Rollout {
         if let Some(hindsight) = &mut self.hindsight {
             hindsight.begin_episode(env);
         }
-        self.acting.carry_on(env, true);
+        self.runner.carry_state(env, true);
         self.exploration.episode_ended(env);
         self.episodes[env] = Episode { number: self.episodes[env].number + 1, steps: 0 };
     }
@@ -274,39 +278,39 @@ impl Rollout {
             | flag(self.environments.success()[env] == SUCCESS_YES, SUCCESS)
             | flag(self.environments.success()[env] != SUCCESS_NOT_REPORTED, SUCCESS_REPORTED);
         let episode_step = self.episodes[env].steps;
-        self.write_header(env, Outline { flags, policy_version, episode_step, steps });
+        self.write_header(env, SegmentMeta { flags, policy_version, episode_step, steps });
         if let Some(hindsight) = &mut self.hindsight {
             let len = self.environments.observations().len() / self.episodes.len();
             let observations = &self.environments.observations()[env * len..(env + 1) * len];
             let block = self.segment.block.as_slice();
-            hindsight.add(env, Addition { steps, block, observations, policy_version })?;
+            hindsight.add(env, EpisodeSegment { steps, block, observations, policy_version })?;
         }
         if flags & (TERMINATED | TRUNCATED) != 0 {
             self.faults.completed(env);
         } else {
-            self.acting.carry_on(env, false);
+            self.runner.carry_state(env, false);
             self.episodes[env].steps += steps as u32;
         }
         Ok(())
     }
 
     /// Numbers the segment whose block is written, and says what it is.
-    fn write_header(&mut self, env: usize, outline: Outline) {
-        let layout = self.acting.policy.layout();
+    fn write_header(&mut self, env: usize, meta: SegmentMeta) {
+        let layout = self.runner.policy.layout();
         self.sequence += 1;
         self.segment.header = SegmentHeader {
             layout_version: LAYOUT_VERSION,
-            flags: outline.flags,
+            flags: meta.flags,
             run_id: self.identity.run_id,
-            architecture_hash: self.acting.policy.architecture_hash(),
-            policy_version: outline.policy_version,
+            architecture_hash: self.runner.policy.architecture_hash(),
+            policy_version: meta.policy_version,
             sequence: self.sequence,
             worker_id: self.identity.worker_id,
             incarnation: self.identity.incarnation,
             env_index: env as u32,
             episode: self.episodes[env].number,
-            episode_step: outline.episode_step,
-            steps_len: outline.steps as u32,
+            episode_step: meta.episode_step,
+            steps_len: meta.steps as u32,
             segment_steps: layout.segment_steps as u32,
             observation_len: layout.observation_len as u32,
             action_len: layout.action_len as u32,
@@ -315,9 +319,9 @@ impl Rollout {
     }
 
     fn fill_block(&mut self, env: usize, steps: usize) {
-        let layout = self.acting.policy.layout();
+        let layout = self.runner.policy.layout();
         let (k_max, o, a) = (layout.segment_steps, layout.observation_len, layout.action_len);
-        let env_len = self.acting.policy.env_observation_len();
+        let env_len = self.runner.policy.env_observation_len();
         let (observations, actions, rewards) = layout.split_mut(&mut self.segment.block);
         let from = &self.environments.observations()[env * (k_max + 1) * env_len..];
         for k in 0..=steps {
@@ -325,10 +329,10 @@ impl Rollout {
             for (out, value) in row.iter_mut().zip(&from[k * env_len..(k + 1) * env_len]) {
                 *out = *value as f32;
             }
-            self.acting.state_at(env, k, &mut row[env_len..]);
+            self.runner.state_at(env, k, &mut row[env_len..]);
         }
         observations[(steps + 1) * o..].fill(0.0);
-        let u = &self.acting.u[env * k_max * a..(env + 1) * k_max * a];
+        let u = &self.runner.u[env * k_max * a..(env + 1) * k_max * a];
         actions[..steps * a].copy_from_slice(&u[..steps * a]);
         actions[steps * a..].fill(0.0);
         let from = &self.environments.rewards()[env * k_max..];

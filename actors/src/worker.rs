@@ -10,13 +10,13 @@ use std::time::{Duration, Instant};
 
 use dmprl_shared::config::{ExperimentConfig, Hindsight};
 use dmprl_shared::seeds;
-use dmprl_shared::supervision::{Doing, Report, ReportError, Supervisor};
+use dmprl_shared::supervision::{Activity, Report, ReportError, Supervisor};
 use dmprl_shared::transport::delivery::{Outbox, Sent};
 use dmprl_shared::transport::shared_memory::Plan;
 use dmprl_shared::transport::{WorkerEnd, WorkerTransport};
 use thiserror::Error;
 
-use crate::delivery::{ATTACH_LIMIT, ATTACH_PAUSE, Delivery, DeliveryError, Witness};
+use crate::delivery::{ATTACH_LIMIT, ATTACH_PAUSE, Delivery, DeliveryError, DeliveryObserver};
 use crate::environments::{self, EnvironmentsError};
 use crate::python_env::{Interpreter, PythonEnvironments};
 use crate::rollout::{Identity, Rollout, RolloutError};
@@ -53,17 +53,17 @@ pub struct Worker<'a> {
     /// Its environments, made by [`environments()`].
     pub environments: PythonEnvironments,
     /// Called for everything that is produced, acknowledged or taken over.
-    pub witness: Option<Witness>,
+    pub observer: Option<DeliveryObserver>,
     /// Set for a worker that a user started beside a running training.
-    pub guest: Option<Guest<'a>>,
+    pub joined: Option<JoinedWorker<'a>>,
 }
 
 /// What differs for a worker that joined a run.
-pub struct Guest<'a> {
+pub struct JoinedWorker<'a> {
     /// Set once the worker was asked to leave a run that goes on.
     pub leaving: &'a AtomicBool,
     /// Called about once a second with what was sent so far.
-    pub tell: &'a dyn Fn(Sent),
+    pub report_sent: &'a dyn Fn(Sent),
 }
 
 /// Seeds Python's generators and makes a worker's environments. `on_hang` is called if a call into
@@ -94,7 +94,7 @@ pub fn run<T: WorkerTransport>(
     supervisor: &dyn Supervisor,
     attach: impl FnOnce(&Plan) -> Result<Option<WorkerEnd<T>>, DeliveryError>,
 ) -> Result<(), WorkerError> {
-    let Worker { config, identity, environments, witness, guest } = worker;
+    let Worker { config, identity, environments, observer, joined } = worker;
     supervisor.report(&Report::EnvironmentReady { spec: environments.spec().clone() })?;
     if identity.seed_index == 0 && identity.incarnation == 0 {
         hint_at_hindsight(config, &environments, supervisor);
@@ -106,15 +106,15 @@ pub fn run<T: WorkerTransport>(
     let outbox = Outbox::new(plan.layout, kept_max, identity.worker_id, identity.incarnation);
     let deadline = Duration::from_secs_f64(config.actors.send_deadline_s);
     let mut delivery = Delivery::new(supervisor, deadline, end, outbox);
-    delivery.set_witness(witness);
+    delivery.set_observer(observer);
     await_first_policy(&mut delivery, &mut rollout, supervisor)?;
-    work(&mut delivery, &mut rollout, supervisor, guest.as_ref())?;
-    if guest.as_ref().is_some_and(|guest| guest.leaving.load(Ordering::Acquire)) {
+    work(&mut delivery, &mut rollout, supervisor, joined.as_ref())?;
+    if joined.as_ref().is_some_and(|joined| joined.leaving.load(Ordering::Acquire)) {
         delivery.hand_over(HAND_OVER_LIMIT)?;
     }
     delivery.report()?;
-    if let Some(guest) = &guest {
-        (guest.tell)(delivery.sent());
+    if let Some(joined) = &joined {
+        (joined.report_sent)(delivery.sent());
     }
     Ok(())
 }
@@ -124,19 +124,19 @@ fn work<T: WorkerTransport>(
     delivery: &mut Delivery<'_, T>,
     rollout: &mut Rollout,
     supervisor: &dyn Supervisor,
-    guest: Option<&Guest<'_>>,
+    joined: Option<&JoinedWorker<'_>>,
 ) -> Result<(), WorkerError> {
     while !supervisor.stop_requested() {
-        supervisor.heartbeat(Doing::Stepping);
+        supervisor.heartbeat(Activity::Stepping);
         delivery.take_newest_policy(&mut rollout.snapshot)?;
         let stepped = rollout.segment::<WorkerError>(&mut |header, block| {
             delivery.deliver(header, block).map_err(Into::into)
         });
         environments::report_failures(&rollout.take_failures(), supervisor);
         if delivery.report_in_time()?
-            && let Some(guest) = guest
+            && let Some(joined) = joined
         {
-            (guest.tell)(delivery.sent());
+            (joined.report_sent)(delivery.sent());
         }
         match stepped {
             Err(WorkerError::Delivery(DeliveryError::StopRequested)) => break,
@@ -171,7 +171,7 @@ fn await_first_policy<T: WorkerTransport>(
         if Instant::now() >= deadline {
             return Err(WorkerError::NoPolicy { index: delivery.index() });
         }
-        supervisor.heartbeat(Doing::Attaching);
+        supervisor.heartbeat(Activity::Attaching);
         std::thread::sleep(ATTACH_PAUSE);
     }
     Ok(())

@@ -17,7 +17,7 @@ use anyhow::Context;
 use bytemuck::{Pod, Zeroable};
 use dmprl_learner::learner::Counters;
 use dmprl_shared::segment::SegmentHeader;
-use dmprl_shared::transport::delivery::Mark;
+use dmprl_shared::transport::delivery::Watermark;
 use rustix::time::{ClockId, clock_gettime};
 
 /// Counters of a learner.
@@ -44,7 +44,7 @@ pub struct Piece {
     /// Index of the worker.
     pub worker: u32,
     /// Incarnation and sequence number.
-    pub mark: Mark,
+    pub mark: Watermark,
     /// CRC-32 of header and block, computed at each end.
     pub checksum: u32,
     /// Environment steps in the segment.
@@ -60,7 +60,7 @@ impl Piece {
         checksum.update(bytemuck::cast_slice(block));
         Self {
             worker: header.worker_id,
-            mark: Mark { incarnation: header.incarnation, sequence: header.sequence },
+            mark: Watermark { incarnation: header.incarnation, sequence: header.sequence },
             checksum: checksum.finalize(),
             env_steps: header.steps_len.into(),
         }
@@ -73,7 +73,7 @@ pub enum Entry {
     /// A worker has finished a segment, but not yet retained or offered it.
     Produced(Piece),
     /// A worker has dropped its segments up to this mark.
-    Acknowledged(Mark),
+    Acknowledged(Watermark),
     /// A worker has taken a policy.
     Policy {
         /// Number of the learner in the session.
@@ -82,7 +82,7 @@ pub enum Entry {
         version: u64,
     },
     /// A learner starts; it has settled this worker's segments up to the mark.
-    Restored(u32, Mark),
+    Restored(u32, Watermark),
     /// Its counters, after one [`Entry::Restored`] per worker.
     Started(Standing),
     /// It has read its log, and now takes segments from workers.
@@ -138,8 +138,8 @@ impl Raw {
         Self { kind, numbers: [env_steps, updates, segments], ..Self::default() }
     }
 
-    fn as_mark(&self) -> Mark {
-        Mark { incarnation: self.incarnation, sequence: self.numbers[0] }
+    fn as_mark(&self) -> Watermark {
+        Watermark { incarnation: self.incarnation, sequence: self.numbers[0] }
     }
 
     fn as_piece(&self) -> Piece {
@@ -157,7 +157,7 @@ impl Record {
     /// Encodes the record for a file.
     #[must_use]
     pub fn encode(&self) -> [u8; RECORD_BYTES] {
-        let marked = |kind, worker, mark: &Mark| Raw {
+        let marked = |kind, worker, mark: &Watermark| Raw {
             kind,
             worker,
             incarnation: mark.incarnation,
@@ -281,7 +281,7 @@ mod tests {
 
     #[test]
     fn every_entry_is_read_as_it_was_written_and_a_torn_one_is_not_read() {
-        let mark = Mark { incarnation: 3, sequence: 1 << 40 };
+        let mark = Watermark { incarnation: 3, sequence: 1 << 40 };
         let piece = Piece { worker: 7, mark, checksum: 0xdead_beef, env_steps: 5 };
         let standing = Standing { env_steps: 1, updates: 2, segments: 3 };
         let entries = [

@@ -10,7 +10,7 @@ use std::time::{Duration, Instant};
 
 use dmprl_shared::policy_file;
 use dmprl_shared::supervision::{EvaluationRequest, Progress, Report, Supervisor};
-use dmprl_shared::transport::delivery::Mark;
+use dmprl_shared::transport::delivery::Watermark;
 
 use crate::checkpoint::{CheckpointError, Ended, Writer};
 use crate::learner::{Counters, Learner};
@@ -172,7 +172,7 @@ impl<'a> Recorder<'a> {
 
     /// The marks up to which segments may be acknowledged; none while the segment log cannot be
     /// written. Workers then wait as soon as their outboxes are full.
-    pub fn acknowledge<'l>(&mut self, learner: &'l mut Learner) -> Option<&'l [Mark]> {
+    pub fn acknowledge<'l>(&mut self, learner: &'l mut Learner) -> Option<&'l [Watermark]> {
         match learner.inbox.acknowledge() {
             Ok(marks) => {
                 self.log_failing = false;

@@ -7,7 +7,7 @@ use dmprl_shared::config::{DeliveryLevel, ExperimentConfig};
 use dmprl_shared::policy_file::{self, Match, PolicyFileError};
 use dmprl_shared::spec::EnvSpec;
 use dmprl_shared::supervision::{Report, ReportError, Supervisor};
-use dmprl_shared::transport::delivery::{LogError, Replayed, SegmentLog};
+use dmprl_shared::transport::delivery::{LogError, LogIdentity, Replayed, SegmentLog};
 use thiserror::Error;
 
 use crate::checkpoint::{self, CheckpointError};
@@ -142,7 +142,8 @@ pub fn recover(
     if delivery.level == DeliveryLevel::Memory {
         return Ok(());
     }
-    let identity = (run_id, learner.policy().architecture_hash());
+    let architecture_hash = learner.policy().architecture_hash();
+    let identity = LogIdentity { run_id, architecture_hash };
     let log = SegmentLog::open(path, identity, learner.policy().layout(), delivery.log_bytes_max);
     let replayed = log.and_then(|log| learner.recover(log));
     let replayed = replayed.map_err(|cause| StartError::Log { path: path.to_owned(), cause })?;

@@ -14,7 +14,7 @@ use dmprl_learner::learner::{Learner, LearnerError};
 use dmprl_shared::config::Layers;
 use dmprl_shared::segment::{LAYOUT_VERSION, Segment, SegmentHeader, TRUNCATED, block_checksum};
 use dmprl_shared::spec::EnvSpec;
-use dmprl_shared::transport::delivery::SegmentLog;
+use dmprl_shared::transport::delivery::{LogIdentity, SegmentLog};
 use serde_json::Value;
 
 const ENTRY: &str = "another_process_plays_the_learner";
@@ -101,7 +101,8 @@ fn recovered(folder: &Path) -> Learner {
         true => fresh().unwrap(),
         false => load_newest(&checkpoints(folder), &fresh).unwrap().0,
     };
-    let identity = (RUN_ID, learner.policy().architecture_hash());
+    let architecture_hash = learner.policy().architecture_hash();
+    let identity = LogIdentity { run_id: RUN_ID, architecture_hash };
     let layout = learner.policy().layout();
     let log = SegmentLog::open(&log_path(folder), identity, layout, 1 << 24).unwrap();
     learner.recover(log).unwrap();

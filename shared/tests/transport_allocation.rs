@@ -7,7 +7,7 @@ mod transport_support;
 
 use counting_allocator::allocations_of;
 use dmprl_shared::segment::Segment;
-use dmprl_shared::transport::delivery::{Acknowledgements, Inbox, Outbox, SegmentLog};
+use dmprl_shared::transport::delivery::{Acknowledgements, Inbox, LogIdentity, Outbox, SegmentLog};
 use dmprl_shared::transport::shared_memory::{attach, serve};
 use dmprl_shared::transport::{
     AcknowledgementPublisher, AcknowledgementSubscriber, ParameterPublisher, ParameterSubscriber,
@@ -16,7 +16,8 @@ use dmprl_shared::transport::{
 use transport_support::{LAYOUT, Parent, header, plan, snapshot};
 
 fn log(parent: &Parent) -> SegmentLog {
-    SegmentLog::open(&parent.path().join("log"), (7, 1), LAYOUT, 1 << 30).unwrap()
+    let identity = LogIdentity { run_id: 7, architecture_hash: 1 };
+    SegmentLog::open(&parent.path().join("log"), identity, LAYOUT, 1 << 30).unwrap()
 }
 
 /// The only test in its binary, because the counter counts every thread. iceoryx2 0.10 allocates

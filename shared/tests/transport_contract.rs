@@ -6,7 +6,7 @@ mod transport_support;
 
 use dmprl_shared::parameters::{ParameterSnapshot, SnapshotError};
 use dmprl_shared::segment::Segment;
-use dmprl_shared::transport::delivery::{Acknowledgements, Mark};
+use dmprl_shared::transport::delivery::{Acknowledgements, Watermark};
 use dmprl_shared::transport::shared_memory::{Domain, attach, hear, serve, subscribe};
 use dmprl_shared::transport::{
     AcknowledgementPublisher, AcknowledgementSubscriber, ParameterPublisher, ParameterSubscriber,
@@ -221,7 +221,7 @@ fn a_snapshot_of_another_architecture_is_refused(mut transport: Transport) {
 }
 
 fn the_newest_acknowledgements_replace_the_ones_before(mut transport: Transport) {
-    let marks = |sequence| [1, 2].map(|incarnation| Mark { incarnation, sequence });
+    let marks = |sequence| [1, 2].map(|incarnation| Watermark { incarnation, sequence });
     let mut listener = (transport.listen)();
     let mut taken = Acknowledgements::default();
     assert!(!listener.newest(&mut taken).unwrap());

@@ -78,7 +78,10 @@ fn a_failed_segment_is_left_out_and_the_next_one_begins_another_episode() {
         // The first failure is one too many here; what was delivered stays.
         let (headers, error) = delivered(&mut rollout, 1);
         assert!(headers.is_empty());
-        assert!(matches!(error, Some(RolloutError::Hopeless { count: 1, .. })), "{error:?}");
+        assert!(
+            matches!(error, Some(RolloutError::FailureBudgetExceeded { count: 1, .. })),
+            "{error:?}"
+        );
 
         let mut rollout = started(&format!("tiny_envs:Faulty{fault}-v0"), 1);
         let (headers, error) = delivered(&mut rollout, 3 * 7);

@@ -107,14 +107,15 @@ impl PythonEnvironments {
                 .and_then(|module| module.getattr("SegmentBuffers"))
                 .and_then(|new| new.call1((env_count, segment_steps, observation_len, action_len)))
                 .map_err(exception)?;
-            Self::connect(&env, &buffers, (env_count, segment_steps), spec)
+            Self::connect(&env, &buffers, env_count, segment_steps, spec)
         })
     }
 
     fn connect(
         env: &Bound<'_, PyAny>,
         buffers: &Bound<'_, PyAny>,
-        (e, k): (usize, usize),
+        e: usize,
+        k: usize,
         spec: EnvSpec,
     ) -> Result<Self, PythonError> {
         let (o, a, id) = (spec.observation_len, spec.action_len, spec.id.as_str());

@@ -18,4 +18,4 @@ pub use error::PythonError;
 pub use goals::{Goals, Relabelling};
 pub use interpreter::{Interpreter, InterpreterOptions};
 pub use linked::{LINKED_PYTHON, LinkedPython, loaded_python_version};
-pub use recording::{JointKind, Joints, WrittenDown};
+pub use recording::{JointKind, Joints, StepRecording};

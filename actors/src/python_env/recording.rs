@@ -26,7 +26,7 @@ pub struct Joints {
 
 /// What the Python side wrote down of an episode of T steps.
 #[derive(Debug, Clone, PartialEq)]
-pub struct WrittenDown {
+pub struct StepRecording {
     /// (T+1, J) [rad or m]: before the first step, and after each; empty without joints.
     pub joint_positions: Vec<Vec<f64>>,
     /// (T+1, J) [rad/s or m/s].
@@ -47,7 +47,8 @@ impl PythonEnvironments {
     /// As [`PythonEnvironments::start`]; `Exception` if nothing can draw it.
     pub fn start_recording(
         _interpreter: &Interpreter,
-        (task_id, segment_steps): (&str, usize),
+        task_id: &str,
+        segment_steps: usize,
         pictures: Option<&Path>,
     ) -> Result<Self, PythonError> {
         Self::start_with(1, segment_steps, |py| {
@@ -90,10 +91,10 @@ impl PythonEnvironments {
     ///
     /// # Errors
     /// `Exception` or `Interface` when the installed package does not fit.
-    pub fn written_down(&self, steps: usize) -> Result<WrittenDown, PythonError> {
+    pub fn recording(&self, steps: usize) -> Result<StepRecording, PythonError> {
         let recording = self.ask(|env| -> PyResult<_> {
             let recording = env.call_method0("recording")?;
-            Ok(WrittenDown {
+            Ok(StepRecording {
                 joint_positions: recording.get_item("joint_positions")?.extract()?,
                 joint_velocities: recording.get_item("joint_velocities")?.extract()?,
                 success: recording.get_item("success")?.extract()?,

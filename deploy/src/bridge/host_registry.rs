@@ -2,7 +2,7 @@
 
 use std::time::{Duration, Instant};
 
-use dmprl_shared::transport::delivery::Mark;
+use dmprl_shared::transport::delivery::Watermark;
 
 use super::host_messages::{HostRequest, HostStatus, Lease};
 use crate::control::HostNow;
@@ -65,7 +65,7 @@ impl Host {
 }
 
 /// The newest session of these workers from which the learner has acknowledged segments.
-fn newest_acknowledged(first: u32, workers: u32, marks: &[Mark]) -> Option<u32> {
+fn newest_acknowledged(first: u32, workers: u32, marks: &[Watermark]) -> Option<u32> {
     let of = marks.iter().skip(first as usize).take(workers as usize);
     of.filter(|mark| mark.sequence > 0).map(|mark| mark.incarnation >> STARTS_BITS).max()
 }
@@ -132,7 +132,7 @@ impl HostRegistry {
         &mut self,
         request: &HostRequest,
         channel: u64,
-        marks: &[Mark],
+        marks: &[Watermark],
         now: Instant,
     ) -> Result<Lease, Refusal> {
         let HostRequest { host, workers, .. } = *request;
@@ -180,7 +180,7 @@ impl HostRegistry {
 
     /// Returns true if a host may continue in its previous places. The learner drops segments of
     /// incarnations older than those it knows.
-    fn is_valid(&mut self, lease: Lease, workers: u32, marks: &[Mark]) -> bool {
+    fn is_valid(&mut self, lease: Lease, workers: u32, marks: &[Watermark]) -> bool {
         self.is_free(lease.first, workers)
             && newest_acknowledged(lease.first, workers, marks)
                 .is_none_or(|newest| newest <= lease.session)
@@ -192,7 +192,7 @@ impl HostRegistry {
         &mut self.last_sessions[at..at + workers as usize]
     }
 
-    fn place(&mut self, workers: u32, marks: &[Mark], now: Instant) -> Result<Lease, Refusal> {
+    fn place(&mut self, workers: u32, marks: &[Watermark], now: Instant) -> Result<Lease, Refusal> {
         if workers > self.places {
             let reason = format!(
                 "it brings {workers} workers, the run has places for {} of other hosts \
@@ -294,7 +294,8 @@ mod tests {
         let lease = registry.admit(&request(1, 2, None), 11, &[], now).unwrap();
         assert_eq!(lease, Lease { first: 0, session: 1 });
         registry.by_channel(11).unwrap().status = Some(HostStatus::default());
-        let marks = [Mark { incarnation: 5 << STARTS_BITS, sequence: 7 }, Mark::default()];
+        let marks =
+            [Watermark { incarnation: 5 << STARTS_BITS, sequence: 7 }, Watermark::default()];
         let soon = now + LEASE_TIME / 2;
         let refusal = registry.admit(&request(2, 2, None), 12, &marks, soon).unwrap_err();
         assert!(refusal.later && refusal.reason.contains("host1 is out of reach"), "{refusal:?}");
@@ -332,7 +333,7 @@ mod tests {
         let refusal = registry.admit(&request(1, 2, Some(a)), 14, &[], now).unwrap_err();
         assert!(refusal.reason.contains("start it again"), "{}", refusal.reason);
         // A new gateway recognises it by the learner's marks.
-        let marks = [Mark { incarnation: b.session << STARTS_BITS, sequence: 1 }];
+        let marks = [Watermark { incarnation: b.session << STARTS_BITS, sequence: 1 }];
         let mut next = HostRegistry::new(0, 2, 0);
         assert!(next.admit(&request(1, 2, Some(a)), 15, &marks, now).is_err());
         assert_eq!(next.admit(&request(2, 2, Some(b)), 16, &marks, now).unwrap(), b);

@@ -5,7 +5,7 @@
 //! they need not cross the link again.
 
 use dmprl_shared::segment::{Segment, SegmentLayout};
-use dmprl_shared::transport::delivery::{Mark, Outbox};
+use dmprl_shared::transport::delivery::{Outbox, Watermark};
 use dmprl_shared::transport::{SegmentSender, SendOutcome, TransportError};
 
 use super::link_sender::drop_acknowledged;
@@ -25,7 +25,7 @@ pub struct LinkReceiver {
     rejected_epoch: u32,
     /// Expected sequence number in the current range; `None` to skip the range.
     expected: Option<u64>,
-    mark: Mark,
+    mark: Watermark,
     rejected: u64,
 }
 
@@ -41,7 +41,7 @@ impl LinkReceiver {
             older: None,
             rejected_epoch: 0,
             expected: None,
-            mark: Mark::default(),
+            mark: Watermark::default(),
             rejected: 0,
         }
     }
@@ -136,7 +136,7 @@ impl LinkReceiver {
     }
 
     /// Drops the segments that the learner has acknowledged.
-    pub fn acknowledge(&mut self, mark: Mark) {
+    pub fn acknowledge(&mut self, mark: Watermark) {
         self.mark = mark;
         for outbox in self.older.iter_mut().chain(&mut self.outbox) {
             drop_acknowledged(outbox, mark);
@@ -232,11 +232,11 @@ mod tests {
         // A third incarnation has to wait.
         receive(&mut receiver, 3, 2, [1, 1]);
         assert_eq!((receiver.retained(), receiver.ack().rejected_epoch), (5, 2));
-        receiver.acknowledge(Mark { incarnation: 1, sequence: 3 });
+        receiver.acknowledge(Watermark { incarnation: 1, sequence: 3 });
         receiver.offer(&mut queue).unwrap();
         assert_eq!(queue.taken, [(1, 1), (1, 2), (1, 3), (2, 1), (2, 2)]);
         receive(&mut receiver, 3, 3, [1, 1]);
-        receiver.acknowledge(Mark { incarnation: 2, sequence: 2 });
+        receiver.acknowledge(Watermark { incarnation: 2, sequence: 2 });
         receiver.offer(&mut queue).unwrap();
         assert_eq!((receiver.retained(), queue.taken.last()), (1, Some(&(3, 1))));
     }
@@ -247,7 +247,7 @@ mod tests {
         let mut queue = Queue::default();
         receive(&mut receiver, 1, 1, [1, 3]);
         receive(&mut receiver, 2, 1, [1, 2]);
-        receiver.acknowledge(Mark { incarnation: 2, sequence: 0 });
+        receiver.acknowledge(Watermark { incarnation: 2, sequence: 0 });
         receiver.offer(&mut queue).unwrap();
         assert_eq!(queue.taken, [(2, 1), (2, 2)]);
         assert_eq!(receiver.rejected(), 3, "and they are counted");

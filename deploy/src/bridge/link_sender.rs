@@ -8,7 +8,7 @@
 use std::time::Instant;
 
 use dmprl_shared::segment::{Segment, SegmentHeader, SegmentLayout};
-use dmprl_shared::transport::delivery::{Mark, Outbox};
+use dmprl_shared::transport::delivery::{Outbox, Watermark};
 use dmprl_shared::transport::{SegmentSender, SendOutcome, TransportError};
 
 use super::wire::{Batch, LinkAck, SegmentRange};
@@ -196,8 +196,8 @@ impl LinkSender {
 
     /// The mark up to which the worker may drop segments.
     #[must_use]
-    pub fn mark(&self) -> Mark {
-        self.outbox.as_ref().map_or(Mark::default(), |outbox| Mark {
+    pub fn mark(&self) -> Watermark {
+        self.outbox.as_ref().map_or(Watermark::default(), |outbox| Watermark {
             incarnation: outbox.incarnation(),
             sequence: outbox.first() - 1,
         })
@@ -206,7 +206,7 @@ impl LinkSender {
 
 /// Drops the segments that the learner has. The mark is beyond the outbox if the previous relay or
 /// gateway died after it passed segments on. The worker's retransmits of these are then skipped.
-pub(super) fn drop_acknowledged(outbox: &mut Outbox, mark: Mark) {
+pub(super) fn drop_acknowledged(outbox: &mut Outbox, mark: Watermark) {
     if mark.incarnation == outbox.incarnation() && mark.sequence >= outbox.end() {
         outbox.skip_to(mark.sequence + 1);
     } else {
@@ -299,7 +299,7 @@ mod tests {
         }
 
         fn acknowledge(&mut self, incarnation: u32, sequence: u64) -> Acked {
-            self.receiver.acknowledge(Mark { incarnation, sequence });
+            self.receiver.acknowledge(Watermark { incarnation, sequence });
             self.sender.acknowledge(&self.receiver.ack(), self.now)
         }
     }
@@ -326,7 +326,7 @@ mod tests {
             (ends.sender.retained(), ends.receiver.retained(), ends.sender.rejected()),
             (0, 0, 0)
         );
-        assert_eq!(ends.sender.mark(), Mark { incarnation: 0, sequence: 4 });
+        assert_eq!(ends.sender.mark(), Watermark { incarnation: 0, sequence: 4 });
     }
 
     #[test]
@@ -353,14 +353,14 @@ mod tests {
         let mut ends = Ends::new();
         ends.send(0, 1..=8);
         ends.deliver();
-        ends.receiver.acknowledge(Mark { incarnation: 0, sequence: 7 });
+        ends.receiver.acknowledge(Watermark { incarnation: 0, sequence: 7 });
         ends.sender = LinkSender::new(7, LAYOUT, 8);
         ends.sender.begin_retransmit();
         ends.send(0, 3..=5);
         assert_eq!(ends.sender.in_flight(), 3);
         ends.deliver();
         ends.acknowledge(0, 7);
-        assert_eq!(ends.sender.mark(), Mark { incarnation: 0, sequence: 7 });
+        assert_eq!(ends.sender.mark(), Watermark { incarnation: 0, sequence: 7 });
         assert_eq!(ends.sender.in_flight(), 0);
         ends.send(0, 6..=9);
         ends.deliver();
@@ -395,6 +395,6 @@ mod tests {
         ends.deliver();
         assert_eq!(ends.receiver.retained(), 2);
         ends.acknowledge(4, 2);
-        assert_eq!(ends.sender.mark(), Mark { incarnation: 4, sequence: 2 });
+        assert_eq!(ends.sender.mark(), Watermark { incarnation: 4, sequence: 2 });
     }
 }

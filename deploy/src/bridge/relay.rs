@@ -10,7 +10,7 @@ use std::time::{Duration, Instant};
 
 use anyhow::{Context, bail, ensure};
 use dmprl_shared::segment::Segment;
-use dmprl_shared::transport::delivery::{Mark, Sent};
+use dmprl_shared::transport::delivery::{Sent, Watermark};
 use dmprl_shared::transport::shared_memory::{LearnerEnd, Plan, serve};
 use dmprl_shared::transport::{AcknowledgementPublisher, ParameterPublisher, SegmentReceiver};
 
@@ -129,7 +129,7 @@ pub struct Relay {
     learner_end: LearnerEnd,
     /// One for each worker.
     senders: Vec<LinkSender>,
-    marks: Vec<Mark>,
+    marks: Vec<Watermark>,
     /// The worker whose turn is next.
     next: usize,
     window: CongestionWindow,
@@ -175,7 +175,7 @@ impl Relay {
         Ok(Self {
             link,
             senders: senders.collect(),
-            marks: vec![Mark::default(); join.workers as usize],
+            marks: vec![Watermark::default(); join.workers as usize],
             join,
             lease,
             channel: None,

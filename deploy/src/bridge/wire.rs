@@ -9,7 +9,7 @@
 use bytemuck::{Pod, Zeroable};
 use dmprl_shared::parameters::ParameterSnapshot;
 use dmprl_shared::segment::{Segment, SegmentHeader};
-use dmprl_shared::transport::delivery::Mark;
+use dmprl_shared::transport::delivery::Watermark;
 use thiserror::Error;
 
 /// First four bytes of every message, which also reveal a different byte order.
@@ -92,8 +92,8 @@ pub struct LinkAck {
 impl LinkAck {
     /// The learner's last acknowledgement.
     #[must_use]
-    pub fn mark(&self) -> Mark {
-        Mark { incarnation: self.incarnation, sequence: self.sequence }
+    pub fn mark(&self) -> Watermark {
+        Watermark { incarnation: self.incarnation, sequence: self.sequence }
     }
 }
 

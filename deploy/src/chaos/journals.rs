@@ -135,7 +135,7 @@ impl Journals {
 mod tests {
     use std::io::Write;
 
-    use dmprl_shared::transport::delivery::Mark;
+    use dmprl_shared::transport::delivery::Watermark;
 
     use super::*;
     use crate::journal::{Entry, Journal};
@@ -145,7 +145,7 @@ mod tests {
     }
 
     fn acknowledged(sequence: u64) -> Entry {
-        Entry::Acknowledged(Mark { incarnation: 0, sequence })
+        Entry::Acknowledged(Watermark { incarnation: 0, sequence })
     }
 
     fn fold(journals: &mut Journals) -> (Vec<(Author, Entry)>, Violations) {

@@ -246,7 +246,7 @@ impl Timeline {
 
 #[cfg(test)]
 mod tests {
-    use dmprl_shared::transport::delivery::Mark;
+    use dmprl_shared::transport::delivery::Watermark;
 
     use super::*;
     use crate::journal::Piece;
@@ -254,7 +254,7 @@ mod tests {
     const SECOND: u64 = 1_000_000;
 
     fn inserts(timeline: &mut Timeline, worker: u32, incarnation: u32, time_us: u64) {
-        let mark = Mark { incarnation, sequence: 1 };
+        let mark = Watermark { incarnation, sequence: 1 };
         let piece = Piece { worker, mark, checksum: 0, env_steps: 5 };
         let author = Author::Learner(timeline.learner.unwrap_or(0));
         timeline.take(author, &Record { entry: Entry::Inserted(piece), time_us });

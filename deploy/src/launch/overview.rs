@@ -4,7 +4,7 @@ use std::time::{Duration, Instant};
 
 use super::Process;
 use super::supervisor::{Slot, Supervisor};
-use crate::control::{Doing, HostNow};
+use crate::control::{Activity, HostNow};
 use crate::run_directory::ProcessState;
 use crate::terminal::ProcessLine;
 
@@ -72,7 +72,7 @@ impl Supervisor {
             (ProcessState::Running, Process::Actor(_)) => {
                 // Its first sign of life is still to come.
                 let doing = running.and_then(|running| running.doing);
-                doing.unwrap_or(Doing::Attaching).name()
+                doing.unwrap_or(Activity::Attaching).name()
             }
         };
         words.to_owned()

@@ -15,7 +15,7 @@ use super::child::{Child, EVENTS_MAX, Event};
 use super::deaths::Death;
 use super::evaluations::EvaluationQueue;
 use super::{Launcher, Process, TimeLimits, joining};
-use crate::control::{Command, Doing, EvaluationRow, HostNow, Progress};
+use crate::control::{Activity, Command, EvaluationRow, HostNow, Progress};
 use crate::terminal::Display;
 
 /// What the supervisor needs to know.
@@ -102,7 +102,7 @@ pub(super) struct Running {
     pub(super) attached: bool,
     /// When it last said anything, and what it then did.
     pub(super) heard: Instant,
-    pub(super) doing: Option<Doing>,
+    pub(super) doing: Option<Activity>,
     /// Segments that it keeps, as it then said.
     pub(super) kept: u64,
     /// When it first and last told of work: a worker of segments sent, a learner of checkpoints.

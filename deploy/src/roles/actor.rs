@@ -4,11 +4,11 @@
 use std::path::Path;
 
 use anyhow::Context;
-use dmprl_actors::delivery::{self, DeliveryEvent, Witness};
+use dmprl_actors::delivery::{self, DeliveryEvent, DeliveryObserver};
 use dmprl_actors::environments::interpreter;
 use dmprl_actors::python_env::Interpreter;
 use dmprl_actors::rollout::Identity;
-use dmprl_actors::worker::{self, Guest, Worker};
+use dmprl_actors::worker::{self, JoinedWorker, Worker};
 use dmprl_shared::config::ExperimentConfig;
 
 use super::environments::on_hang;
@@ -25,8 +25,8 @@ pub fn start_interpreter(
     Ok(interpreter(venv, config)?)
 }
 
-/// Which worker of which run.
-pub struct Seat<'a> {
+/// Which worker of which run to start.
+pub struct WorkerStart<'a> {
     pub setup: &'a Setup,
     pub index: u32,
     /// Which of the run's workers the first of this host is.
@@ -44,16 +44,16 @@ pub fn run(args: &ActorArgs, control: &ControlPipe) -> anyhow::Result<()> {
     let (incarnation, venv) = (args.incarnation, args.venv.as_deref());
     let journal = args.journal.as_deref();
     let first = args.first;
-    work(&Seat { setup: &setup, index, first, incarnation, venv, journal }, control, None)
+    work(&WorkerStart { setup: &setup, index, first, incarnation, venv, journal }, control, None)
 }
 
 /// Steps environments until a stop is asked for.
 pub fn work(
-    seat: &Seat<'_>,
+    start: &WorkerStart<'_>,
     control: &ControlPipe,
-    guest: Option<Guest<'_>>,
+    joined: Option<JoinedWorker<'_>>,
 ) -> anyhow::Result<()> {
-    let Seat { setup, index, first, incarnation, venv, journal } = *seat;
+    let WorkerStart { setup, index, first, incarnation, venv, journal } = *start;
     let config = &setup.config;
     let seed_index = first + index;
     let identity = Identity { run_id: setup.run_id, worker_id: index, incarnation, seed_index };
@@ -61,14 +61,14 @@ pub fn work(
     let environments =
         worker::environments(&interpreter, config, identity.stream(), on_hang(control))?;
     heartbeat::start(control, environments.calls())?;
-    let witness = Journal::open(journal, Author::Worker(index, incarnation))?.map(note_in);
-    let worker = Worker { config, identity, environments, witness, guest };
+    let observer = Journal::open(journal, Author::Worker(index, incarnation))?.map(note_in);
+    let worker = Worker { config, identity, environments, observer, joined };
     let attach = |plan: &_| delivery::await_learner(control, plan, index);
     Ok(worker::run(worker, control, attach)?)
 }
 
 /// Notes everything in a journal.
-fn note_in(journal: Journal) -> Witness {
+fn note_in(journal: Journal) -> DeliveryObserver {
     Box::new(move |event| {
         journal.note(match event {
             DeliveryEvent::Produced { header, block } => Entry::Produced(Piece::of(header, block)),

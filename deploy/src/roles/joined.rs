@@ -15,11 +15,11 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
 use anyhow::{Context, bail};
-use dmprl_actors::worker::Guest;
+use dmprl_actors::worker::JoinedWorker;
 use dmprl_shared::transport::delivery::Sent;
 use signal_hook::flag;
 
-use super::actor::{self, Seat};
+use super::actor::{self, WorkerStart};
 use super::setup::Setup;
 use super::{ControlPipe, ORPHAN_LIMIT, control_pipe};
 use crate::control::{
@@ -35,7 +35,7 @@ const ANSWER_LIMIT: Duration = Duration::from_secs(10);
 /// A longer line is no answer.
 const ANSWER_BYTES_MAX: u64 = 1 << 16;
 /// Between two lines about what was sent.
-const TELL_INTERVAL: Duration = Duration::from_secs(5);
+const PRINT_INTERVAL: Duration = Duration::from_secs(5);
 /// Exit status of a second Ctrl-C.
 const INTERRUPTED_STATUS: i32 = 130;
 
@@ -58,13 +58,13 @@ pub fn join(run: &Path) -> anyhow::Result<Outcome> {
     let Welcome { index, incarnation, venv, workers } = welcome;
     let counted = format!("{workers} worker{}", if workers == 1 { "" } else { "s" });
     say(&format!("joined {} as actor-{index}: {counted}", shown(setup.run.path())));
-    let teller = Teller::new();
-    let tell = |sent| teller.tell(sent);
+    let printer = ProgressPrinter::new();
+    let report_sent = |sent| printer.print(sent);
     let venv = venv.as_deref();
-    let seat = Seat { setup: &setup, index, first: 0, incarnation, venv, journal: None };
-    let guest = Guest { leaving: &leaving, tell: &tell };
-    actor::work(&seat, &control, Some(guest))?;
-    let sent = teller.sent.get();
+    let start = WorkerStart { setup: &setup, index, first: 0, incarnation, venv, journal: None };
+    let joined = JoinedWorker { leaving: &leaving, report_sent: &report_sent };
+    actor::work(&start, &control, Some(joined))?;
+    let sent = printer.sent.get();
     let acknowledged = format!("{} of {}", grouped(sent.acked), grouped(sent.produced));
     let segments = format!("{acknowledged} segments acknowledged");
     if leaving.load(Ordering::Acquire) {
@@ -178,22 +178,26 @@ fn leave_on_signals(leaving: &Arc<AtomicBool>, control: &ControlPipe) -> anyhow:
 }
 
 /// Says now and then what was sent.
-struct Teller {
+struct ProgressPrinter {
     started: Instant,
-    told: Cell<Option<Instant>>,
+    printed_at: Cell<Option<Instant>>,
     sent: Cell<Sent>,
 }
 
-impl Teller {
+impl ProgressPrinter {
     fn new() -> Self {
-        Self { started: Instant::now(), told: Cell::new(None), sent: Cell::new(Sent::default()) }
+        Self {
+            started: Instant::now(),
+            printed_at: Cell::new(None),
+            sent: Cell::new(Sent::default()),
+        }
     }
 
-    fn tell(&self, sent: Sent) {
+    fn print(&self, sent: Sent) {
         let first = self.sent.replace(sent).sent == 0 && sent.sent > 0;
-        let due = self.told.get().is_none_or(|at| at.elapsed() >= TELL_INTERVAL);
+        let due = self.printed_at.get().is_none_or(|at| at.elapsed() >= PRINT_INTERVAL);
         if sent.sent > 0 && (first || due) {
-            self.told.set(Some(Instant::now()));
+            self.printed_at.set(Some(Instant::now()));
             say(&format!(
                 "after {:.1} s: {} segments sent, {} acknowledged",
                 self.started.elapsed().as_secs_f64(),

@@ -24,9 +24,12 @@ use crate::motion::{Joint, JointKind, RecordedEpisode, Robot};
 pub fn run(args: &ObserverArgs, control: &ControlPipe) -> anyhow::Result<()> {
     let setup = Setup::read(&args.run)?;
     let interpreter = super::actor::start_interpreter(args.venv.as_deref(), &setup.config)?;
-    let task = (setup.config.task.id.as_str(), setup.config.policy.decision_steps());
-    let environment =
-        PythonEnvironments::start_recording(&interpreter, task, args.pictures.as_deref())?;
+    let environment = PythonEnvironments::start_recording(
+        &interpreter,
+        &setup.config.task.id,
+        setup.config.policy.decision_steps(),
+        args.pictures.as_deref(),
+    )?;
     environments::watch(&environment, &setup.config, on_hang(control))?;
     let spec = environment.spec().clone();
     let done = Arc::new(AtomicU64::new(0));
@@ -87,10 +90,10 @@ fn episode(record: EpisodeRecord, dims: usize) -> RecordedEpisode {
         success: record.success,
         rewards: record.trace.rewards,
         actions: record.trace.u.chunks_exact(dims).map(<[f32]>::to_vec).collect(),
-        joint_positions: record.written_down.joint_positions,
-        joint_velocities: record.written_down.joint_velocities,
-        success_by_step: record.written_down.success.iter().map(success).collect(),
-        frames: record.written_down.frames.into_iter().map(PathBuf::from).collect(),
-        frame_steps: record.written_down.frame_steps,
+        joint_positions: record.recording.joint_positions,
+        joint_velocities: record.recording.joint_velocities,
+        success_by_step: record.recording.success.iter().map(success).collect(),
+        frames: record.recording.frames.into_iter().map(PathBuf::from).collect(),
+        frame_steps: record.recording.frame_steps,
     }
 }

@@ -64,9 +64,15 @@ pub fn run(args: &LearnerArgs, control: &ControlPipe) -> anyhow::Result<()> {
     let policy_path = |version| setup.run.policy_path(version);
     let failures = Cell::new(session.learner.counters.env_failures);
     let evaluations = Evaluations { config, policy_path: &policy_path, stop };
-    let mut judge =
-        Judge { evaluator, evaluations, setup, control, reached: &reached, failures: &failures };
-    let mut evaluate = |request: EvaluationRequest| judge.evaluate(&request).map_err(Into::into);
+    let mut inline = InlineEvaluator {
+        evaluator,
+        evaluations,
+        setup,
+        control,
+        reached: &reached,
+        failures: &failures,
+    };
+    let mut evaluate = |request: EvaluationRequest| inline.evaluate(&request).map_err(Into::into);
     catch_up(&mut session, &mut recorder, &mut evaluate)?;
     let mut first = true;
     let is_complete = loop {
@@ -104,8 +110,8 @@ pub fn run(args: &LearnerArgs, control: &ControlPipe) -> anyhow::Result<()> {
     Ok(close(&mut session, &mut recorder, control, ending)?)
 }
 
-/// Evaluates where an evaluation falls due.
-struct Judge<'a> {
+/// Evaluates a policy in this process when an evaluation is due.
+struct InlineEvaluator<'a> {
     evaluator: Evaluator,
     evaluations: Evaluations<'a>,
     setup: &'a Setup,
@@ -115,7 +121,7 @@ struct Judge<'a> {
     failures: &'a Cell<u64>,
 }
 
-impl Judge<'_> {
+impl InlineEvaluator<'_> {
     fn evaluate(&mut self, request: &EvaluationRequest) -> anyhow::Result<()> {
         let answer = evaluator::evaluate(&mut self.evaluator, &self.evaluations, request);
         count(self.failures, report_failures(&self.evaluator.take_failures(), self.control));

@@ -18,7 +18,7 @@ use crate::control::{Progress, Report};
 const IDLE: Duration = Duration::from_micros(300);
 const REPORT_INTERVAL: Duration = Duration::from_millis(500);
 /// The learner's host is said to be away when it has not answered for so long.
-const AWAY_TOLD: Duration = Duration::from_secs(2);
+const AWAY_REPORTED: Duration = Duration::from_secs(2);
 /// A host that leaves waits so long for its segments to be acknowledged.
 const HAND_OVER: Duration = Duration::from_secs(5);
 
@@ -26,12 +26,12 @@ const HAND_OVER: Duration = Duration::from_secs(5);
 /// a stop is asked for.
 pub fn run(args: &RelayArgs, control: &ControlPipe) -> anyhow::Result<()> {
     let mut relay = start(args)?;
-    let mut teller = Teller::new(args);
+    let mut reporter = RelayReporter::new(args);
     loop {
         let turn = relay.turn(&counts(control))?;
-        teller.tell(&relay, control)?;
+        reporter.report(&relay, control)?;
         if turn == Turn::Complete {
-            teller.ready(&relay, control);
+            reporter.report_ready(&relay, control);
             // The gateway waits until all hosts have heard.
             relay.leave(&counts(control))?;
             return control.send(&Report::Finished);
@@ -100,7 +100,7 @@ fn leave(relay: &mut Relay, control: &ControlPipe) -> anyhow::Result<()> {
 }
 
 /// What the host's supervisor is told.
-struct Teller {
+struct RelayReporter {
     patience: Duration,
     endpoint: String,
     ready: bool,
@@ -111,7 +111,7 @@ struct Teller {
     acked: u64,
 }
 
-impl Teller {
+impl RelayReporter {
     fn new(args: &RelayArgs) -> Self {
         Self {
             patience: Duration::from_secs(args.patience),
@@ -125,7 +125,7 @@ impl Teller {
         }
     }
 
-    fn ready(&mut self, relay: &Relay, control: &ControlPipe) {
+    fn report_ready(&mut self, relay: &Relay, control: &ControlPipe) {
         // Workers that attach wait for a policy, and not for ever.
         if !self.ready && relay.version() > 0 {
             self.ready = true;
@@ -134,13 +134,13 @@ impl Teller {
         }
     }
 
-    fn tell(&mut self, relay: &Relay, control: &ControlPipe) -> anyhow::Result<()> {
-        self.ready(relay, control);
+    fn report(&mut self, relay: &Relay, control: &ControlPipe) -> anyhow::Result<()> {
+        self.report_ready(relay, control);
         if !self.first && relay.acked() > 0 {
             self.first = true;
             let _ = control.send(&Report::FirstSegment);
         }
-        self.tell_of_absence(relay, control)?;
+        self.report_absence(relay, control)?;
         if relay.damaged() > self.damaged {
             self.damaged = relay.damaged();
             warn(control, format!("{} messages or segments are no such, refused", self.damaged));
@@ -164,7 +164,7 @@ impl Teller {
     }
 
     /// Says when the learner's host is away, why, and when it is back; gives up after a while.
-    fn tell_of_absence(&mut self, relay: &Relay, control: &ControlPipe) -> anyhow::Result<()> {
+    fn report_absence(&mut self, relay: &Relay, control: &ControlPipe) -> anyhow::Result<()> {
         match (relay.away(), &self.away) {
             (Some((since, reason)), told) => {
                 let elapsed = since.elapsed();
@@ -176,7 +176,7 @@ impl Teller {
                     );
                 }
                 let new = told.as_ref().is_none_or(|(_, before)| before != reason);
-                if new && elapsed >= AWAY_TOLD {
+                if new && elapsed >= AWAY_REPORTED {
                     let patience = self.patience.as_secs();
                     warn(control, format!("{reason}; workers wait, for {patience} s at most"));
                     self.away = Some((*since, reason.clone()));

@@ -20,7 +20,7 @@ use std::io::{BufReader, BufWriter, Read, Write};
 use std::path::{Path, PathBuf};
 
 use dmprl_shared::config::CheckpointConfig;
-use dmprl_shared::transport::delivery::{LogError, Mark};
+use dmprl_shared::transport::delivery::{LogError, Watermark};
 use rand_xoshiro::Xoshiro256PlusPlus;
 use serde::{Deserialize, Serialize};
 use thiserror::Error;
@@ -113,7 +113,7 @@ struct State {
     sampler_random: Xoshiro256PlusPlus,
     /// Up to where segments are in the replay. Checkpoints of older versions have none.
     #[serde(default)]
-    settled: Vec<Mark>,
+    settled: Vec<Watermark>,
     #[serde(default, skip_serializing_if = "Option::is_none")]
     normaliser: Option<Normaliser>,
     files: Vec<FileSum>,

@@ -4,7 +4,7 @@ use dmprl_shared::config::Layers;
 use dmprl_shared::segment::{
     LAYOUT_VERSION, Rejection, Segment, SegmentHeader, TRUNCATED, block_checksum,
 };
-use dmprl_shared::transport::delivery::{Replayed, SegmentLog};
+use dmprl_shared::transport::delivery::{LogIdentity, Replayed, SegmentLog};
 use rand::RngExt;
 
 use super::*;
@@ -216,7 +216,7 @@ fn segments_that_a_checkpoint_holds_are_refused_and_those_that_nobody_has_are_co
     save(folder.path(), &mut learner).unwrap();
     train(&mut learner, 60..70);
     let (mut learner, _) = load_newest(folder.path(), &fresh).unwrap();
-    assert_eq!(learner.inbox.settled()[0], Mark { incarnation: 0, sequence: 60 });
+    assert_eq!(learner.inbox.settled()[0], Watermark { incarnation: 0, sequence: 60 });
     let again = segment(&learner, 59);
     assert_eq!(learner.insert(&again), Err(Rejection::Duplicate));
     // The worker forgot ten that the dead learner had acknowledged.
@@ -233,7 +233,8 @@ fn at_level_log_what_was_acknowledged_outlives_the_learner() {
     fs::create_dir(&checkpoints).unwrap();
     let fresh = || fresh_with(&[("delivery.level", "log")]);
     let open = |learner: &Learner| {
-        let identity = (RUN_ID, learner.policy().architecture_hash());
+        let architecture_hash = learner.policy().architecture_hash();
+        let identity = LogIdentity { run_id: RUN_ID, architecture_hash };
         SegmentLog::open(&path, identity, learner.policy().layout(), 1 << 20).unwrap()
     };
     let mut learner = fresh().unwrap();
@@ -242,7 +243,7 @@ fn at_level_log_what_was_acknowledged_outlives_the_learner() {
     save(&checkpoints, &mut learner).unwrap();
     train(&mut learner, 60..80);
     let marks = learner.inbox.acknowledge().unwrap();
-    assert_eq!(marks[0], Mark { incarnation: 0, sequence: 80 });
+    assert_eq!(marks[0], Watermark { incarnation: 0, sequence: 80 });
     let mut replay = Vec::new();
     learner.replay.write(&mut replay).unwrap();
     train(&mut learner, 80..85);

@@ -6,7 +6,7 @@
 use std::collections::VecDeque;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
-use super::delivery::{Acknowledgements, Mark};
+use super::delivery::{Acknowledgements, Watermark};
 use super::{
     AcknowledgementPublisher, AcknowledgementSubscriber, ParameterPublisher, ParameterSubscriber,
     SegmentReceiver, SegmentSender, SendOutcome, TransportError, WorkerTransport,
@@ -183,7 +183,7 @@ impl ParameterSubscriber for Subscriber {
 /// The newest acknowledgements and how many there have been.
 #[derive(Debug)]
 struct Acknowledged {
-    marks: Vec<Mark>,
+    marks: Vec<Watermark>,
     count: u64,
 }
 
@@ -201,13 +201,13 @@ pub struct AcknowledgementReader {
 /// A channel for the acknowledgements of `workers` workers.
 #[must_use]
 pub fn acknowledgement_channel(workers: usize) -> (Acknowledger, AcknowledgementReader) {
-    let newest = Acknowledged { marks: vec![Mark::default(); workers], count: 0 };
+    let newest = Acknowledged { marks: vec![Watermark::default(); workers], count: 0 };
     let newest = Arc::new(Mutex::new(newest));
     (Acknowledger(newest.clone()), AcknowledgementReader { newest, taken: 0 })
 }
 
 impl AcknowledgementPublisher for Acknowledger {
-    fn acknowledge(&mut self, marks: &[Mark]) -> Result<(), TransportError> {
+    fn acknowledge(&mut self, marks: &[Watermark]) -> Result<(), TransportError> {
         let mut newest = lock(&self.0);
         let (expected, got) = (newest.marks.len(), marks.len());
         if got != expected {

@@ -9,7 +9,7 @@ pub mod delivery;
 pub mod in_process;
 pub mod shared_memory;
 
-use delivery::{Acknowledgements, Mark};
+use delivery::{Acknowledgements, Watermark};
 use thiserror::Error;
 
 use crate::parameters::{ParameterSnapshot, SnapshotError};
@@ -146,7 +146,7 @@ pub trait AcknowledgementPublisher {
     ///
     /// # Errors
     /// `Length` if there is not one mark a worker, `Middleware` if publishing failed.
-    fn acknowledge(&mut self, marks: &[Mark]) -> Result<(), TransportError>;
+    fn acknowledge(&mut self, marks: &[Watermark]) -> Result<(), TransportError>;
 
     /// Lets workers in that have joined since; to be called a few times a second.
     ///

@@ -5,7 +5,9 @@ use std::path::{Path, PathBuf};
 use dmprl_shared::config::DeliveryLevel;
 use dmprl_shared::seeds;
 use dmprl_shared::segment::{Rejection, Segment, SegmentHeader, SegmentLayout};
-use dmprl_shared::transport::delivery::{Acknowledgements, Inbox, Mark, Outbox, SegmentLog};
+use dmprl_shared::transport::delivery::{
+    Acknowledgements, Inbox, LogIdentity, Outbox, SegmentLog, Watermark,
+};
 use rand::RngExt;
 use rand_xoshiro::Xoshiro256PlusPlus;
 
@@ -96,7 +98,7 @@ struct Worker {
 
 /// State that survives a learner's death: per worker, its mark and the number of inserted segments.
 struct Checkpoint {
-    marks: Vec<Mark>,
+    marks: Vec<Watermark>,
     inserted: [usize; WORKERS],
 }
 
@@ -110,11 +112,11 @@ pub struct World {
     inbox: Option<Inbox>,
     epoch: u64,
     /// The model's replay: the learner's segments of each worker, in order.
-    inserted: [Vec<Mark>; WORKERS],
+    inserted: [Vec<Watermark>; WORKERS],
     /// Segments that were inserted by learners that died before storing them.
-    forgotten: [Vec<Mark>; WORKERS],
+    forgotten: [Vec<Watermark>; WORKERS],
     /// The last acknowledged segment of each incarnation of each worker.
-    acked: [Vec<Mark>; WORKERS],
+    acked: [Vec<Watermark>; WORKERS],
     checkpoint: Checkpoint,
     /// A checkpoint in progress, and the size of the log at its start.
     saving: Option<(Checkpoint, u64)>,
@@ -123,7 +125,7 @@ pub struct World {
     tally: Tally,
 }
 
-fn value(mark: Mark, worker: usize) -> f32 {
+fn value(mark: Watermark, worker: usize) -> f32 {
     (mark.sequence * 10 + u64::from(mark.incarnation) * 1_000 + worker as u64) as f32
 }
 
@@ -150,7 +152,7 @@ impl World {
             epoch: 0,
             inserted: Default::default(),
             forgotten: Default::default(),
-            acked: std::array::from_fn(|_| vec![Mark::default()]),
+            acked: std::array::from_fn(|_| vec![Watermark::default()]),
             checkpoint: Checkpoint { marks: Vec::new(), inserted: [0; WORKERS] },
             saving: None,
             published: Vec::new(),
@@ -211,7 +213,7 @@ impl World {
             let outbox = &worker.outbox;
             assert!(outbox.is_empty(), "worker {index} still keeps {}", outbox.len());
             assert_eq!(outbox.sent().acked, outbox.sent().produced, "worker {index}");
-            let last = Mark { incarnation: worker.incarnation, sequence: worker.sequence - 1 };
+            let last = Watermark { incarnation: worker.incarnation, sequence: worker.sequence - 1 };
             assert!(last.sequence > 0, "worker {index} has produced nothing");
             assert_eq!(self.inserted[index].last(), Some(&last), "worker {index}");
         }
@@ -244,7 +246,7 @@ impl World {
 
     fn produce(&mut self, index: usize) {
         let worker = &mut self.workers[index];
-        let mark = Mark { incarnation: worker.incarnation, sequence: worker.sequence };
+        let mark = Watermark { incarnation: worker.incarnation, sequence: worker.sequence };
         let header = SegmentHeader {
             worker_id: index as u32,
             incarnation: mark.incarnation,
@@ -321,13 +323,13 @@ impl World {
     fn insert(&mut self, segment: &Segment, lost: u64) {
         let header = &segment.header;
         let index = header.worker_id as usize;
-        let mark = Mark { incarnation: header.incarnation, sequence: header.sequence };
+        let mark = Watermark { incarnation: header.incarnation, sequence: header.sequence };
         assert_eq!(segment.block, vec![value(mark, index); LAYOUT.block_len()], "{mark:?}");
         let last = self.inserted[index].last().copied().unwrap_or_default();
         assert!(mark > last, "worker {index}: {mark:?} after {last:?}");
         for sequence in mark.sequence - lost..mark.sequence {
             // Only a dead learner may have lost it, and only at level `memory`.
-            let missing = Mark { sequence, ..mark };
+            let missing = Watermark { sequence, ..mark };
             assert_eq!(self.level, DeliveryLevel::Memory, "worker {index}: {missing:?} is lost");
             assert!(self.forgotten[index].contains(&missing), "{missing:?} never came");
             self.tally.lost_at_level_memory += 1;
@@ -398,7 +400,8 @@ impl World {
         let mut inbox = Inbox::new(WORKERS);
         inbox.restore(&self.checkpoint.marks);
         if self.level == DeliveryLevel::Log {
-            let log = SegmentLog::open(&self.log_path, (1, 1), LAYOUT, LOG_BYTES_MAX);
+            let identity = LogIdentity { run_id: 1, architecture_hash: 1 };
+            let log = SegmentLog::open(&self.log_path, identity, LAYOUT, LOG_BYTES_MAX);
             let mut log = log.unwrap();
             // As in `Learner::recover`.
             log.replay(|segment| {
@@ -429,6 +432,6 @@ impl World {
         if with_queue {
             worker.link.queue.clear();
         }
-        self.acked[index].push(Mark { incarnation, sequence: 0 });
+        self.acked[index].push(Watermark { incarnation, sequence: 0 });
     }
 }

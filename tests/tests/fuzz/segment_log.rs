@@ -4,7 +4,7 @@ use std::fs;
 
 use dmprl_learner::learner::Learner;
 use dmprl_shared::segment::{Segment, SegmentHeader};
-use dmprl_shared::transport::delivery::{LogError, SegmentLog};
+use dmprl_shared::transport::delivery::{LogError, LogIdentity, SegmentLog};
 
 use crate::fixture::{self, RUN_ID};
 use crate::mutate::{self, Random};
@@ -17,7 +17,9 @@ const BYTES_MAX: u64 = 1 << 20;
 
 fn open(path: &std::path::Path, learner: &Learner) -> Result<SegmentLog, LogError> {
     let policy = learner.policy();
-    SegmentLog::open(path, (RUN_ID, policy.architecture_hash()), policy.layout(), BYTES_MAX)
+    let architecture_hash = policy.architecture_hash();
+    let identity = LogIdentity { run_id: RUN_ID, architecture_hash };
+    SegmentLog::open(path, identity, policy.layout(), BYTES_MAX)
 }
 
 /// A valid log's bytes.

@@ -8,7 +8,7 @@ use dmprl_learner::learner::Learner;
 use dmprl_shared::config::ExperimentConfig;
 use dmprl_shared::segment::Segment;
 use dmprl_shared::spec::EnvSpec;
-use dmprl_shared::transport::delivery::SegmentLog;
+use dmprl_shared::transport::delivery::{LogIdentity, SegmentLog};
 
 use super::feed::FeedPlan;
 use crate::bench::learner::{Timed, fill, timed};
@@ -99,7 +99,8 @@ pub(super) fn insert(
     let memory = timed(duration, || pool.insert(&mut learner))?;
     let (hash, layout) = (learner.policy().architecture_hash(), learner.policy().layout());
     let path = folder.join("segments.log");
-    learner.inbox.log_to(SegmentLog::open(&path, (RUN_ID, hash), layout, LOG_BYTES_MAX)?);
+    let identity = LogIdentity { run_id: RUN_ID, architecture_hash: hash };
+    learner.inbox.log_to(SegmentLog::open(&path, identity, layout, LOG_BYTES_MAX)?);
     let log = timed(duration, || {
         pool.insert(&mut learner)?;
         learner.inbox.acknowledge()?;

@@ -18,7 +18,7 @@ use dmprl_shared::policy::Policy;
 use dmprl_shared::segment::SegmentHeader;
 use dmprl_shared::spec::EnvSpec;
 use dmprl_shared::transport::AcknowledgementPublisher;
-use dmprl_shared::transport::delivery::{Mark, Sent};
+use dmprl_shared::transport::delivery::{Sent, Watermark};
 use dmprl_shared::transport::shared_memory::{
     Acknowledger, Domain, LearnerEnd, Plan, Publisher, Receiver, serve,
 };
@@ -177,7 +177,7 @@ impl Feed {
             |learner: &Learner| learner.counters.received > received && Instant::now() >= end;
         ensure!(self.turns(watch, duration + SLACK, over)?, "nothing came within {SLACK:?}");
         let (seconds, cpu_s) = (start.elapsed().as_secs_f64(), thread_cpu_s() - cpu_s);
-        let came = |(now, before): (&Mark, &Mark)| now.sequence - before.sequence;
+        let came = |(now, before): (&Watermark, &Watermark)| now.sequence - before.sequence;
         let segments = self.session.learner.inbox.settled().iter().zip(&before).map(came).collect();
         let resident_bytes = [start_bytes, middle_bytes, resident_bytes()];
         Ok(FeedWindow { seconds, segments, cpu_s, resident_bytes })

@@ -7,7 +7,7 @@ use std::time::{Duration, Instant};
 
 use anyhow::{Context, anyhow, bail};
 use dmprl_shared::config::DeliveryLevel;
-use dmprl_shared::transport::delivery::{Inbox, SegmentLog, Sent};
+use dmprl_shared::transport::delivery::{Inbox, LogIdentity, SegmentLog, Sent};
 use dmprl_shared::transport::shared_memory::{Domain, serve};
 
 use crate::bench::child::LineChild;
@@ -58,8 +58,9 @@ impl Ours {
         let mut inbox = Inbox::new(workers as usize);
         if level == DeliveryLevel::Log {
             let path = folder.join(format!("segments-{}.log", size.bytes));
-            let run = (plan.run_id, plan.architecture_hash);
-            inbox.log_to(SegmentLog::open(&path, run, plan.layout, LOG_BYTES_MAX)?);
+            let (run_id, architecture_hash) = (plan.run_id, plan.architecture_hash);
+            let identity = LogIdentity { run_id, architecture_hash };
+            inbox.log_to(SegmentLog::open(&path, identity, plan.layout, LOG_BYTES_MAX)?);
         }
         let sink = Sink::start(end, size.expected(workers), plan.queue_segments, inbox);
         let mut children = Vec::new();

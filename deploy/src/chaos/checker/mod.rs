@@ -13,7 +13,7 @@ mod tests;
 
 use std::collections::BTreeMap;
 
-use dmprl_shared::transport::delivery::Mark;
+use dmprl_shared::transport::delivery::Watermark;
 
 use super::violations::Violations;
 use crate::journal::{Author, Entry, Piece, Record, Standing};
@@ -49,7 +49,7 @@ pub(super) struct Checker {
     /// For each worker, its lives by incarnation.
     lives: Vec<BTreeMap<u32, Life>>,
     /// The lineage's last segment of each worker.
-    settled: Vec<Mark>,
+    settled: Vec<Watermark>,
     standing: Standing,
     /// Counters at the start and at each checkpoint begun since, without those that a later learner
     /// has rolled back.
@@ -69,7 +69,7 @@ impl Checker {
         let count = workers as usize;
         Self {
             lives: vec![BTreeMap::new(); count],
-            settled: vec![Mark::default(); count],
+            settled: vec![Watermark::default(); count],
             standing: Standing::default(),
             cuts: vec![Standing::default()],
             since_cut: 0,
@@ -117,7 +117,7 @@ impl Checker {
     }
 
     /// The newest learner's last segment of each worker.
-    pub(super) fn settled(&self) -> &[Mark] {
+    pub(super) fn settled(&self) -> &[Watermark] {
         &self.settled
     }
 
@@ -131,7 +131,7 @@ impl Checker {
         let name = format!("worker {worker}, incarnation {incarnation}");
         match entry {
             Entry::Produced(piece) => {
-                let expected = Mark { incarnation, sequence: life.produced.len() as u64 + 1 };
+                let expected = Watermark { incarnation, sequence: life.produced.len() as u64 + 1 };
                 life.produced.push(piece.checksum);
                 if (piece.worker, piece.mark) != (worker, expected) {
                     self.violations.add(format!(
@@ -172,7 +172,7 @@ impl Checker {
     }
 
     /// Rolls the lineage back to a worker's mark in a checkpoint.
-    fn on_restored(&mut self, worker: u32, mark: Mark) {
+    fn on_restored(&mut self, worker: u32, mark: Watermark) {
         let Some(settled) = self.settled.get_mut(worker as usize) else {
             self.violations.add(format!("I1: a checkpoint has unknown worker {worker}"));
             return;
@@ -248,7 +248,7 @@ impl Checker {
     }
 
     /// Checks a segment that a learner settles; `None` if it is not the next one.
-    fn arrive(&mut self, piece: &Piece, what: &str) -> Option<Mark> {
+    fn arrive(&mut self, piece: &Piece, what: &str) -> Option<Watermark> {
         let Piece { worker, mark, checksum, .. } = *piece;
         let name = format!(
             "segment {} of worker {worker}, incarnation {}, was {what}",

@@ -1,7 +1,7 @@
 //! Hand-written journals: a correct one, and one for each way in which a run can violate a
 //! guarantee.
 
-use dmprl_shared::transport::delivery::Mark;
+use dmprl_shared::transport::delivery::Watermark;
 
 use super::*;
 
@@ -15,7 +15,7 @@ struct Story {
 }
 
 fn piece(worker: u32, (incarnation, sequence): (u32, u64)) -> Piece {
-    let mark = Mark { incarnation, sequence };
+    let mark = Watermark { incarnation, sequence };
     Piece { worker, mark, checksum: worker ^ sequence as u32, env_steps: STEPS }
 }
 
@@ -43,7 +43,7 @@ impl Story {
     fn begin(&mut self, deaths: u64, marks: [(u32, u64); 2], segments: u64) {
         self.learner = Author::Learner(deaths);
         for (worker, (incarnation, sequence)) in (0..).zip(marks) {
-            self.says(Entry::Restored(worker, Mark { incarnation, sequence }));
+            self.says(Entry::Restored(worker, Watermark { incarnation, sequence }));
         }
         self.says(Entry::Started(standing(segments)));
         self.says(Entry::Serving);
@@ -63,7 +63,7 @@ impl Story {
     }
 
     fn acknowledge(&mut self, worker: u32, (incarnation, sequence): (u32, u64)) {
-        let mark = Mark { incarnation, sequence };
+        let mark = Watermark { incarnation, sequence };
         self.note(Author::Worker(worker, incarnation), Entry::Acknowledged(mark));
     }
 
@@ -248,7 +248,7 @@ fn i5_counters_that_no_checkpoint_had_are_found() {
     let mut story = Story::with_ten_of_each();
     story.says(Entry::Cut(standing(20)));
     story.learner = Author::Learner(1);
-    let mark = Mark { incarnation: 0, sequence: 10 };
+    let mark = Watermark { incarnation: 0, sequence: 10 };
     story.says(Entry::Restored(0, mark));
     story.says(Entry::Restored(1, mark));
     story.says(Entry::Started(Standing { updates: 7, ..standing(20) }));

@@ -1,6 +1,6 @@
 //! The learner's side of the delivery: which segments of each worker have been settled.
 
-use super::{LogError, Mark, SegmentLog};
+use super::{LogError, SegmentLog, Watermark};
 use crate::segment::{Rejection, SegmentHeader};
 
 /// Settled segments after which an acknowledgement is due, because an acknowledgement costs far
@@ -11,7 +11,7 @@ const ACKNOWLEDGED_TOGETHER: u64 = 256;
 /// Settled segments of each worker, and the log of those that no checkpoint contains yet.
 #[derive(Debug)]
 pub struct Inbox {
-    settled: Vec<Mark>,
+    settled: Vec<Watermark>,
     /// Segments settled since the last acknowledgement.
     unacknowledged: u64,
     /// At level `log`, every settled segment is appended.
@@ -22,11 +22,11 @@ impl Inbox {
     /// Creates an inbox without settled segments and without a log.
     #[must_use]
     pub fn new(worker_count: usize) -> Self {
-        Self { settled: vec![Mark::default(); worker_count], unacknowledged: 0, log: None }
+        Self { settled: vec![Watermark::default(); worker_count], unacknowledged: 0, log: None }
     }
 
     /// Continues from a checkpoint's marks. Workers without a mark start from zero.
-    pub fn restore(&mut self, marks: &[Mark]) {
+    pub fn restore(&mut self, marks: &[Watermark]) {
         for (index, settled) in self.settled.iter_mut().enumerate() {
             *settled = marks.get(index).copied().unwrap_or_default();
         }
@@ -40,14 +40,14 @@ impl Inbox {
     /// Last settled segment of each worker, as stored in a checkpoint. Settled means inserted or
     /// finally rejected.
     #[must_use]
-    pub fn settled(&self) -> &[Mark] {
+    pub fn settled(&self) -> &[Watermark] {
         &self.settled
     }
 
     /// Whether a segment has been settled, or belongs to an incarnation before the newest.
     #[must_use]
     pub fn has(&self, header: &SegmentHeader) -> bool {
-        let mark = Mark { incarnation: header.incarnation, sequence: header.sequence };
+        let mark = Watermark { incarnation: header.incarnation, sequence: header.sequence };
         self.settled.get(header.worker_id as usize).is_some_and(|last| mark <= *last)
     }
 
@@ -68,7 +68,7 @@ impl Inbox {
             return Err(Rejection::Duplicate);
         }
         let last = &mut self.settled[header.worker_id as usize];
-        let mark = Mark { incarnation: header.incarnation, sequence: header.sequence };
+        let mark = Watermark { incarnation: header.incarnation, sequence: header.sequence };
         let before = if mark.incarnation == last.incarnation { last.sequence } else { 0 };
         *last = mark;
         self.unacknowledged += 1;
@@ -83,7 +83,7 @@ impl Inbox {
     ///
     /// # Errors
     /// If writing fails. Nothing new may be acknowledged then, and the workers wait.
-    pub fn acknowledge(&mut self) -> Result<&[Mark], LogError> {
+    pub fn acknowledge(&mut self) -> Result<&[Watermark], LogError> {
         // Reset first, so that a failed write is retried at the regular interval and not on every
         // turn.
         self.unacknowledged = 0;

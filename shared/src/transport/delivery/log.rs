@@ -47,6 +47,15 @@ pub struct Replayed {
     pub cut_bytes: u64,
 }
 
+/// The run and the architecture to which a log belongs.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct LogIdentity {
+    /// Run id.
+    pub run_id: u64,
+    /// Hash of the policy's architecture.
+    pub architecture_hash: u64,
+}
+
 /// An open segment log. Only one process opens it.
 #[derive(Debug)]
 pub struct SegmentLog {
@@ -69,12 +78,13 @@ impl SegmentLog {
     /// `Foreign` if it belongs to another run, `Io` if the file system returns an error.
     pub fn open(
         path: &Path,
-        (run_id, architecture_hash): (u64, u64),
+        identity: LogIdentity,
         layout: SegmentLayout,
         bytes_max: u64,
     ) -> Result<Self, LogError> {
         let mut head = [0; HEAD_BYTES];
         head[..8].copy_from_slice(MAGIC);
+        let LogIdentity { run_id, architecture_hash } = identity;
         let numbers = [run_id, architecture_hash, layout.block_len() as u64];
         for (bytes, number) in head[8..].chunks_exact_mut(8).zip(numbers) {
             bytes.copy_from_slice(&number.to_le_bytes());
@@ -263,7 +273,8 @@ mod tests {
     }
 
     fn open(path: &Path) -> SegmentLog {
-        SegmentLog::open(path, (1, 2), LAYOUT, BYTES_MAX).unwrap()
+        let identity = LogIdentity { run_id: 1, architecture_hash: 2 };
+        SegmentLog::open(path, identity, LAYOUT, BYTES_MAX).unwrap()
     }
 
     fn append(log: &mut SegmentLog, sequences: std::ops::RangeInclusive<u64>) {
@@ -353,7 +364,8 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("log");
         drop(open(&path));
-        for identity in [(2, 2), (1, 3)] {
+        for (run_id, architecture_hash) in [(2, 2), (1, 3)] {
+            let identity = LogIdentity { run_id, architecture_hash };
             let refused = SegmentLog::open(&path, identity, LAYOUT, BYTES_MAX).unwrap_err();
             assert!(matches!(refused, LogError::Foreign), "{refused}");
         }

@@ -9,7 +9,7 @@
 //! A queue in shared memory dies with its learner. The worker's [`Outbox`] therefore keeps every
 //! unacknowledged segment and retransmits all of them, oldest first, after each reconnection. The
 //! learner's [`Inbox`] stores the last settled segment of each worker, rejects duplicates and
-//! acknowledges settled segments. Its [`Mark`]s are part of a checkpoint and always match the
+//! acknowledges settled segments. Its [`Watermark`]s are part of a checkpoint and always match the
 //! replay in it.
 //!
 //! The delivery level decides when a segment is acknowledged. `memory`: when it is in the replay; a
@@ -28,13 +28,13 @@ mod outbox;
 use serde::{Deserialize, Serialize};
 
 pub use inbox::Inbox;
-pub use log::{LogError, Replayed, SegmentLog};
+pub use log::{LogError, LogIdentity, Replayed, SegmentLog};
 pub use outbox::{Outbox, Sent};
 
 /// The last segment of a worker up to which all segments are settled.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, PartialOrd, Ord, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
-pub struct Mark {
+pub struct Watermark {
     /// Number of the worker's start.
     pub incarnation: u32,
     /// Sequence number of the segment; 0 before the first.
@@ -48,5 +48,5 @@ pub struct Acknowledgements {
     /// Number of the learner within the domain; a restarted learner has a higher one.
     pub epoch: u64,
     /// One mark per worker.
-    pub marks: Vec<Mark>,
+    pub marks: Vec<Watermark>,
 }

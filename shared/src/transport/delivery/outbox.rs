@@ -2,7 +2,7 @@
 
 use serde::{Deserialize, Serialize};
 
-use super::{Acknowledgements, Mark};
+use super::{Acknowledgements, Watermark};
 use crate::segment::{SegmentHeader, SegmentLayout};
 use crate::transport::{SegmentSender, SendOutcome, TransportError};
 
@@ -226,7 +226,7 @@ impl Outbox {
 
     /// Discards segments up to `mark`. The caller ensures that the mark belongs to this worker and
     /// is the newest.
-    pub fn acknowledge_to(&mut self, mark: Mark) {
+    pub fn acknowledge_to(&mut self, mark: Watermark) {
         let ours = mark.incarnation == self.incarnation && mark.sequence < self.end;
         if ours && mark.sequence >= self.first {
             self.sent.acked += mark.sequence + 1 - self.first;

@@ -16,7 +16,7 @@ use super::domain::Domain;
 use super::generation::Membership;
 use super::latest::{ReaderPort, SAMPLES_MAX, Writer, subscribe};
 use super::service::{PrivateIpc, refused};
-use crate::transport::delivery::{Acknowledgements, Mark};
+use crate::transport::delivery::{Acknowledgements, Watermark};
 use crate::transport::{AcknowledgementPublisher, AcknowledgementSubscriber, TransportError};
 
 /// Incarnation and sequence of a worker's mark.
@@ -64,13 +64,13 @@ impl Acknowledger {
         learner: Arc<File>,
     ) -> Result<Self, TransportError> {
         let len = sample_len(plan.worker_count);
-        let writer = Writer::serve(node, channel(plan), (len, plan.worker_count), learner)?;
+        let writer = Writer::serve(node, channel(plan), len, plan.worker_count, learner)?;
         Ok(Self { writer, epoch, numbers: vec![0; len] })
     }
 }
 
 impl AcknowledgementPublisher for Acknowledger {
-    fn acknowledge(&mut self, marks: &[Mark]) -> Result<(), TransportError> {
+    fn acknowledge(&mut self, marks: &[Watermark]) -> Result<(), TransportError> {
         let (expected, got) = (self.numbers.len(), sample_len(marks.len()));
         if got != expected {
             return Err(TransportError::Length { expected, got });
@@ -119,11 +119,12 @@ impl AcknowledgementSubscriber for AcknowledgementReader {
             }
             acknowledgements.epoch = sample.user_header().epoch;
             acknowledgements.marks.clear();
-            let marks = sample.payload().chunks_exact(NUMBERS_PER_WORKER).map(|numbers| Mark {
-                // No worker has an incarnation this large, so the mark matches none.
-                incarnation: u32::try_from(numbers[0]).unwrap_or(u32::MAX),
-                sequence: numbers[1],
-            });
+            let marks =
+                sample.payload().chunks_exact(NUMBERS_PER_WORKER).map(|numbers| Watermark {
+                    // No worker has an incarnation this large, so the mark matches none.
+                    incarnation: u32::try_from(numbers[0]).unwrap_or(u32::MAX),
+                    sequence: numbers[1],
+                });
             acknowledgements.marks.extend(marks);
             taken = true;
         }

@@ -59,7 +59,8 @@ where
     pub(super) fn serve(
         node: &Node<PrivateIpc>,
         channel: Channel,
-        (len, worker_count): (usize, usize),
+        len: usize,
+        worker_count: usize,
         learner: Arc<File>,
     ) -> Result<Self, TransportError> {
         let subscribers_max = worker_count + SPARE_SUBSCRIBERS;

@@ -76,8 +76,8 @@ impl Publisher {
         // The file is empty before the first publication.
         let newest_version =
             version_file.read_exact_at(&mut bytes, 0).map_or(0, |()| u64::from_le_bytes(bytes));
-        let len = (plan.parameters_len, plan.worker_count);
-        let writer = Writer::serve(node, channel(plan), len, learner)?;
+        let (len, worker_count) = (plan.parameters_len, plan.worker_count);
+        let writer = Writer::serve(node, channel(plan), len, worker_count, learner)?;
         Ok(Self { writer, version_file, newest_version })
     }
 

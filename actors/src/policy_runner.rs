@@ -6,7 +6,7 @@ use crate::python_env::PythonEnvironments;
 
 /// The policy's side of E environments, with buffers made once.
 #[derive(Debug)]
-pub struct Acting {
+pub struct PolicyRunner {
     /// The architecture.
     pub policy: Policy,
     network: SmallBatchNetwork,
@@ -25,7 +25,7 @@ pub struct Acting {
     actions: Vec<f64>,
 }
 
-impl Acting {
+impl PolicyRunner {
     /// For `envs` environments.
     #[must_use]
     pub fn new(policy: Policy, envs: usize) -> Self {
@@ -115,7 +115,7 @@ impl Acting {
 
     /// Lets environment `env`'s DMP continue from the segment's end, or from rest if its episode
     /// has ended.
-    pub fn carry_on(&mut self, env: usize, ended: bool) {
+    pub fn carry_state(&mut self, env: usize, ended: bool) {
         let len = self.policy.layout().observation_len - self.policy.env_observation_len();
         if len == 0 {
             return;
