@@ -6,13 +6,14 @@
 //! drops duplicates.
 
 pub mod delivery;
+mod error;
 pub mod in_process;
 pub mod shared_memory;
 
 use delivery::{Acknowledgements, Watermark};
-use thiserror::Error;
+pub use error::TransportError;
 
-use crate::parameters::{ParameterSnapshot, SnapshotError};
+use crate::parameters::ParameterSnapshot;
 use crate::segment::{Segment, SegmentHeader};
 
 /// Result of offering a segment.
@@ -24,51 +25,6 @@ pub enum SendOutcome {
     Full,
     /// No learner is attached (not yet, or no longer); retry later.
     Detached,
-}
-
-/// Why the transport failed.
-#[derive(Debug, Error)]
-pub enum TransportError {
-    /// The middleware returned an error.
-    #[error("{operation} on {name}: {cause}")]
-    Middleware {
-        /// The attempted operation.
-        operation: &'static str,
-        /// The service or directory.
-        name: String,
-        /// The middleware's error message.
-        cause: String,
-    },
-    /// The peer has another version or another configuration.
-    #[error("{name}: peers disagree, {cause}; start both from the same build and configuration")]
-    Incompatible {
-        /// The service.
-        name: String,
-        /// The difference.
-        cause: String,
-    },
-    /// The slot belongs to a live process, or to a dead one that has not been cleaned up yet.
-    #[error("{name} is taken ({cause}): try again when the process that holds it has ended")]
-    Taken {
-        /// The service.
-        name: String,
-        /// The middleware's error message.
-        cause: String,
-    },
-    /// A segment or snapshot of the wrong length was offered or received.
-    #[error("{got} numbers, this channel carries {expected}")]
-    Length {
-        /// Length that the channel was created for.
-        expected: usize,
-        /// Length that was offered or received.
-        got: usize,
-    },
-    /// The run's shared-memory directory is unusable.
-    #[error(transparent)]
-    Domain(#[from] shared_memory::DomainError),
-    /// A damaged snapshot, or one of another architecture.
-    #[error(transparent)]
-    Snapshot(#[from] SnapshotError),
 }
 
 /// The worker's end of its segment queue.

@@ -10,11 +10,11 @@ use iceoryx2::node::Node;
 use iceoryx2::prelude::PayloadHeader;
 use iceoryx2_bb_elementary_traits::zero_copy_send::ZeroCopySend;
 
-use super::Plan;
 use super::channel::Channel;
 use super::domain::Domain;
 use super::generation::Membership;
 use super::latest::{ReaderPort, SAMPLES_MAX, Writer, subscribe};
+use super::plan::Plan;
 use super::service::{PrivateIpc, refused};
 use crate::transport::delivery::{Acknowledgements, Watermark};
 use crate::transport::{AcknowledgementPublisher, AcknowledgementSubscriber, TransportError};

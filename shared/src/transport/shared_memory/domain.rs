@@ -11,17 +11,19 @@
 //! is abandoned. Directories are created and removed under a lock on the parent, so that a
 //! directory between `mkdir` and its lock never looks abandoned.
 
+mod error;
 mod leftovers;
 
 use std::fs::{DirBuilder, File, OpenOptions, TryLockError};
-use std::io::{self, ErrorKind, Write};
+use std::io::{ErrorKind, Write};
 use std::os::unix::fs::{DirBuilderExt, MetadataExt, OpenOptionsExt};
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
 use rustix::fs::{CWD, OFlags, RenameFlags, renameat_with, statvfs};
-use thiserror::Error;
 
+pub use error::DomainError;
+use error::{ROOT_BYTES_MAX, TOKEN_BYTES_MAX, failed};
 pub use leftovers::{Leftover, abandoned, remove_abandoned};
 
 use super::generation::DIRECTORY_BYTES;
@@ -30,83 +32,15 @@ use super::service::PREFIX;
 const MARKER_FILE: &str = "domain";
 const MARKER_TEXT: &str = "dmprl shared-memory domain, version 1\n";
 const LOCK_FILE: &str = "owner.lock";
+/// The learner holds this lock as long as it lives.
+pub(super) const LEARNER_LOCK: &str = "learner.lock";
 /// Prefix of directories under construction; complete ones are renamed.
 const UNFINISHED: &str = ".dmprl-unfinished-";
 /// Prefix of directories under removal; they are renamed first, so that no process can join them.
 const CONDEMNED: &str = ".dmprl-condemned-";
-/// Maximum length of a generation's path with iceoryx2's prefix [bytes]: iceoryx2 appends up to 38
-/// bytes for Unix sockets, whose paths are limited to 108.
-const ROOT_BYTES_MAX: usize = 70;
-const TOKEN_BYTES_MAX: usize = 32;
 /// Attempts to take the parent's lock, which is held for milliseconds.
 const PARENT_LOCK_ATTEMPTS: usize = 500;
 const PARENT_LOCK_PAUSE: Duration = Duration::from_millis(10);
-
-/// Why a domain could not be created, opened or removed.
-#[derive(Debug, Error)]
-pub enum DomainError {
-    /// The operating system returned an error.
-    #[error("{operation} {path}: {cause}")]
-    Io {
-        /// The attempted operation.
-        operation: &'static str,
-        /// The file or directory.
-        path: PathBuf,
-        /// The error.
-        cause: io::Error,
-    },
-    /// The directory is not private to this user, or is not a domain.
-    #[error("{path}: expected {expected}, got {got}")]
-    Untrusted {
-        /// The directory.
-        path: PathBuf,
-        /// Required properties.
-        expected: &'static str,
-        /// Actual properties.
-        got: String,
-    },
-    /// The path leaves too little space for the names of sockets.
-    #[error(
-        "shared-memory path {path} takes {got} bytes with what is added, at most {ROOT_BYTES_MAX} \
-         fit: choose a shorter directory or token"
-    )]
-    TooLong {
-        /// The directory.
-        path: PathBuf,
-        /// Length of the path with the generation's directory and iceoryx2's prefix \[bytes\].
-        got: usize,
-    },
-    /// The token is empty, too long or contains invalid characters.
-    #[error("token {got:?}: expected 1 to {TOKEN_BYTES_MAX} characters a-z, A-Z, 0-9, - or _")]
-    Token {
-        /// The token.
-        got: String,
-    },
-    /// Another process holds a lock.
-    #[error("{path} is locked by a live process")]
-    Locked {
-        /// The locked file or directory.
-        path: PathBuf,
-    },
-    /// Too little shared memory is free. Processes would later be killed by SIGBUS.
-    #[error(
-        "{path}: {needed} bytes of shared memory needed, {available} available: use fewer \
-         workers, shorter queues, or enlarge it (Docker: --shm-size)"
-    )]
-    Space {
-        /// The directory.
-        path: PathBuf,
-        /// Required shared memory \[bytes\].
-        needed: u64,
-        /// Available shared memory \[bytes\].
-        available: u64,
-    },
-}
-
-fn failed(operation: &'static str, path: &Path) -> impl FnOnce(io::Error) -> DomainError {
-    let path = path.to_owned();
-    move |cause| DomainError::Io { operation, path, cause }
-}
 
 /// The run's shared-memory directory. Its creator owns it and removes it on drop.
 #[derive(Debug)]

@@ -1,7 +1,8 @@
 //! Segments and snapshots between processes of one host, over iceoryx2.
 //!
 //! `domain` is the run's directory, and `generation` the part of it that belongs to one learner.
-//! `service`, `channel`, `cleaning` and `latest` wrap the middleware. `segments` and `parameters`
+//! `plan` holds what all processes must agree on, and `space` the memory that it needs. `service`,
+//! `channel`, `cleaning` and `latest` wrap the middleware. `segments` and `parameters`
 //! implement the traits; `acknowledgements` is the third channel, for `delivery`. No other module
 //! uses iceoryx2.
 //!
@@ -21,106 +22,24 @@ mod domain;
 mod generation;
 mod latest;
 mod parameters;
+mod plan;
 mod segments;
 mod service;
+mod space;
 
 use std::path::Path;
 use std::sync::Arc;
 
 pub use acknowledgements::{AcknowledgementReader, Acknowledger};
+use domain::LEARNER_LOCK;
 pub use domain::{Domain, DomainError, Leftover, abandoned, remove_abandoned};
 use generation::Generation;
-use iceoryx2::service::header::publish_subscribe::Header;
 pub use parameters::{Publisher, Subscriber};
+pub use plan::Plan;
 pub use segments::{Receiver, Sender};
+pub use space::required_bytes;
 
 use super::{TransportError, WorkerTransport};
-use crate::config::ExperimentConfig;
-use crate::policy::Policy;
-use crate::segment::SegmentLayout;
-
-/// Version of the protocol between the processes of a run; other versions are rejected.
-const PROTOCOL: u32 = 2;
-/// The learner holds this lock as long as it lives.
-const LEARNER_LOCK: &str = "learner.lock";
-/// Queues, registries and descriptions of one service, without its chunks [bytes]. Measured: see
-/// the test `the_space_asked_for_covers_what_is_used`.
-const SERVICE_BYTES: usize = 64 * 1024;
-/// The same per segment of a queue's capacity [bytes].
-const QUEUE_ENTRY_BYTES: usize = 64;
-
-/// Parameters that must be equal in the learner and the workers of a run.
-#[derive(Debug, Clone, PartialEq, Eq)]
-pub struct Plan {
-    /// Run; workers of another run are rejected.
-    pub run_id: u64,
-    /// Hash of the architecture; workers with another one are rejected.
-    pub architecture_hash: u64,
-    /// Sizes of a segment.
-    pub layout: SegmentLayout,
-    /// Number of worker slots, each with its own queue.
-    pub worker_count: usize,
-    /// Capacity of each worker's queue in segments.
-    pub queue_segments: usize,
-    /// Length of a snapshot's values.
-    pub parameters_len: usize,
-}
-
-impl Plan {
-    /// The plan of a run whose policy is known.
-    #[must_use]
-    pub fn new(config: &ExperimentConfig, run_id: u64, policy: &Policy) -> Self {
-        Self {
-            run_id,
-            architecture_hash: policy.architecture_hash(),
-            layout: policy.layout(),
-            worker_count: config.places(),
-            queue_segments: config.actors.queue_segments,
-            parameters_len: policy.parameters_len(),
-        }
-    }
-
-    fn identity(&self) -> Vec<(&'static str, String)> {
-        vec![
-            ("protocol", PROTOCOL.to_string()),
-            ("run_id", format!("{:#018x}", self.run_id)),
-            ("architecture_hash", format!("{:#018x}", self.architecture_hash)),
-        ]
-    }
-
-    /// Maximum shared memory of the run \[bytes\].
-    #[must_use]
-    pub fn required_bytes(&self) -> u64 {
-        let Self { worker_count, queue_segments, layout, parameters_len, .. } = *self;
-        required_bytes(worker_count, queue_segments, layout, parameters_len)
-    }
-}
-
-/// Maximum shared memory of a run \[bytes\].
-#[must_use]
-pub fn required_bytes(
-    worker_count: usize,
-    queue_segments: usize,
-    layout: SegmentLayout,
-    parameters_len: usize,
-) -> u64 {
-    let chunk = |header: usize, len: usize| {
-        len.saturating_mul(size_of::<f32>()).saturating_add(size_of::<Header>() + header)
-    };
-    let segment = chunk(size_of::<segments::WireHeader>(), layout.block_len());
-    let queue = segments::chunk_count(queue_segments)
-        .saturating_mul(segment.saturating_add(QUEUE_ENTRY_BYTES))
-        .saturating_add(SERVICE_BYTES);
-    let snapshots = chunk(size_of::<parameters::WireHeader>(), parameters_len)
-        .saturating_mul(latest::chunk_count(worker_count));
-    // Two numbers per worker, each as large as two f32.
-    let marks = chunk(0, acknowledgements::sample_len(worker_count).saturating_mul(2))
-        .saturating_mul(latest::chunk_count(worker_count));
-    // Each worker also has a connection on the channels for snapshots and acknowledgements.
-    let services = worker_count.saturating_add(1).saturating_mul(2 * SERVICE_BYTES);
-    let bytes = worker_count.saturating_mul(queue).saturating_add(snapshots).saturating_add(marks);
-    u64::try_from(bytes.saturating_add(services)).unwrap_or(u64::MAX)
-}
 
 /// The learner's ends of all channels.
 ///

@@ -13,11 +13,11 @@ use iceoryx2::port::{BackpressureAction, BackpressureInfo, SendError};
 use iceoryx2::prelude::PayloadHeader;
 use iceoryx2_bb_elementary_traits::zero_copy_send::ZeroCopySend;
 
-use super::Plan;
 use super::channel::{Channel, ChannelBuilder, Disconnected, Factory};
 use super::cleaning::{Cleaning, sender_died};
 use super::domain::Domain;
 use super::generation::Membership;
+use super::plan::Plan;
 use super::service::{PrivateIpc, refused};
 use crate::segment::{LAYOUT_VERSION, Segment, SegmentHeader};
 use crate::transport::{SegmentReceiver, SegmentSender, SendOutcome, TransportError};

@@ -5,9 +5,9 @@ use std::os::unix::ffi::OsStrExt;
 use std::os::unix::fs::MetadataExt;
 use std::path::{Path, PathBuf};
 
-use super::super::LEARNER_LOCK;
+use super::error::{DomainError, failed};
 use super::{
-    CONDEMNED, DomainError, LOCK_FILE, UNFINISHED, check_private, condemn, failed, has_marker,
+    CONDEMNED, LEARNER_LOCK, LOCK_FILE, UNFINISHED, check_private, condemn, has_marker,
     lock_parent, remove_parent_if_empty, remove_tree,
 };
 
