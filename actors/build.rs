@@ -1,10 +1,9 @@
-//! Finds out which CPython this build links against and passes it on.
+//! Finds the CPython that this build links against, for the linker and for the code.
 //!
-//! A machine often has several Pythons of one version, each with its own `libpython3.11.so`.
-//! The program must run on the one that makes `.venv`, so: its library directory goes into the
-//! executables' rpath, and its version and prefix go into the code, which compares them with what
-//! it finds at start. The build scripts of `deploy` and `tests` get the linker's argument as
-//! `DEP_DMPRL_PYTHON_LINK_ARG`; they ask no interpreter themselves.
+//! A machine often has several Pythons of one version, each with its own `libpython3.11.so`. The
+//! program must use the one that makes `.venv`. Its library directory therefore goes into the
+//! executables' rpath, and its version and prefix into the code, which compares them at start. The
+//! build scripts of `deploy` and `tests` get the linker's argument as `DEP_DMPRL_PYTHON_LINK_ARG`.
 //!
 //! pyo3 chooses the interpreter: `PYO3_PYTHON`, else an active virtual or conda environment, else
 //! `python`, else `python3` on `PATH`.
@@ -19,12 +18,12 @@ fn main() {
 mod python {
     use std::{path::Path, process::Command};
 
-    /// Oldest Python whose syntax and packages `envs_py` is written for.
+    /// Oldest supported Python 3.x: `envs_py` needs its syntax.
     const MINOR_VERSION_MIN: u8 = 11;
 
-    /// One fact a line. `_base_executable` because a virtual environment may be active: `.venv`
-    /// must not depend on it.
-    const QUESTIONS: &str = "\
+    /// Prints one fact per line. Uses `_base_executable`, because `.venv` must not depend on a
+    /// virtual environment that is active.
+    const FACTS_SCRIPT: &str = "\
 import os, sys, sysconfig
 base = getattr(sys, '_base_executable', None) or sys.executable
 print(base if os.path.exists(base) else sys.executable)
@@ -32,7 +31,7 @@ print(' '.join(sys.version.split()))
 print(sys.base_prefix)
 print(sysconfig.get_config_var('Py_ENABLE_SHARED') or 0)";
 
-    /// What the interpreter answered.
+    /// Facts about the interpreter.
     struct Facts {
         executable: String,
         version: String,
@@ -55,7 +54,7 @@ print(sysconfig.get_config_var('Py_ENABLE_SHARED') or 0)";
         }
         let facts = ask(executable);
         let library_dir = config.lib_dir().unwrap_or_else(|| {
-            stop(&format!("{executable} does not say where its libpython lies (LIBDIR)"))
+            stop(&format!("{executable} does not report the directory of its libpython (LIBDIR)"))
         });
         let library = format!("lib{}.so", config.lib_name().unwrap_or("python3"));
         check_library(&facts, library_dir, &library, &version.to_string());
@@ -71,20 +70,23 @@ print(sysconfig.get_config_var('Py_ENABLE_SHARED') or 0)";
             println!("cargo::rustc-env=DMPRL_PYTHON_{name}={value}");
         }
         println!("cargo::rustc-env=DMPRL_PYTHON_LIBRARY_DIR={library_dir}");
-        // An upgrade in place (apt) keeps the paths but changes the version: look again.
+        // Detects an upgrade in place (apt), which keeps the paths but changes the version.
         println!("cargo::rerun-if-changed={}", facts.executable);
         println!("cargo::rerun-if-changed={}", Path::new(library_dir).join(&library).display());
     }
 
-    /// pyo3's own argument yields DT_RUNPATH, which `LD_LIBRARY_PATH` (a cluster's modules set it)
-    /// overrides with another installation's library of the same name. DT_RPATH comes first; only
-    /// a directory of the system must not, it holds libraries that are not Python's.
+    /// Returns the linker's argument for the library directory.
+    ///
+    /// pyo3's own argument sets DT_RUNPATH. `LD_LIBRARY_PATH`, as set by a cluster's modules, takes
+    /// precedence over it and may contain another installation's library of the same name. DT_RPATH
+    /// precedes `LD_LIBRARY_PATH`. System directories use DT_RUNPATH, because they contain other
+    /// libraries as well.
     fn rpath(library_dir: &str) -> String {
         let is_system =
             ["/lib", "/usr/lib"].iter().any(|dir| Path::new(library_dir).starts_with(dir));
         let tags = if is_system { "--enable-new-dtags" } else { "--disable-new-dtags" };
-        // Last, the library beside a program that was brought to another machine: a conda
-        // environment has its own.
+        // Last, the library next to a program that was copied to another machine, such as in a
+        // conda environment.
         format!("-Wl,{tags},-rpath,{library_dir}:$ORIGIN/../lib")
     }
 
@@ -96,7 +98,7 @@ print(sysconfig.get_config_var('Py_ENABLE_SHARED') or 0)";
         if facts.shared {
             stop(&format!(
                 "{python} has no {library} in {library_dir}. Debian, Ubuntu: apt install \
-                 python3-dev (or libpython{version}-dev, for this very version)"
+                 python3-dev (or libpython{version}-dev, for this version)"
             ));
         }
         stop(&format!(
@@ -108,14 +110,14 @@ print(sysconfig.get_config_var('Py_ENABLE_SHARED') or 0)";
 
     fn ask(executable: &str) -> Facts {
         let output = Command::new(executable)
-            .args(["-I", "-c", QUESTIONS])
+            .args(["-I", "-c", FACTS_SCRIPT])
             .output()
             .unwrap_or_else(|error| stop(&format!("cannot run {executable}: {error}")));
         let text = String::from_utf8_lossy(&output.stdout);
         let lines: Vec<&str> = text.lines().collect();
         let [base_executable, version, base_prefix, shared] = lines[..] else {
             let message = String::from_utf8_lossy(&output.stderr);
-            stop(&format!("{executable} does not answer ({}): {message}", output.status));
+            stop(&format!("{executable} gave an unexpected answer ({}): {message}", output.status));
         };
         Facts {
             executable: base_executable.to_owned(),
@@ -125,7 +127,7 @@ print(sysconfig.get_config_var('Py_ENABLE_SHARED') or 0)";
         }
     }
 
-    /// Ends the build with one line instead of a panic's backtrace.
+    /// Ends the build with a one-line message.
     fn stop(message: &str) -> ! {
         println!("cargo::error={message}");
         std::process::exit(1);

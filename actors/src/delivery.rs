@@ -1,8 +1,8 @@
-//! Stage 3 of 8, its end: a worker's finished segments on their way to the learner.
+//! Stage 3 of 8, its end: sends a worker's finished segments to the learner.
 //!
 //! [`Delivery`] keeps each segment in an outbox until the learner has acknowledged it, offers it to
-//! the worker's queue, and waits where the queue or the outbox is full. Built without Python too:
-//! benchmarks send synthetic segments through it.
+//! the worker's queue, and waits while the queue or the outbox is full. It is also built without
+//! Python, because benchmarks send synthetic segments through it.
 
 use std::path::Path;
 use std::time::{Duration, Instant};
@@ -20,16 +20,15 @@ use thiserror::Error;
 
 /// Maximum wait for one command, so that a stop is noticed.
 const COMMAND_WAIT: Duration = Duration::from_millis(100);
-/// Pause between two attempts to attach, or two looks for the first policy.
+/// Pause between two attempts to attach, or between two checks for the first policy.
 pub(crate) const ATTACH_PAUSE: Duration = Duration::from_millis(2);
-/// A learner that is ready answers at once; after this long it is gone.
+/// Time limit to attach. A learner that is ready answers at once.
 pub(crate) const ATTACH_LIMIT: Duration = Duration::from_secs(30);
 /// Pause after the first offer to a full queue; it doubles with each retry.
 const FULL_QUEUE_PAUSE: Duration = Duration::from_micros(200);
-/// Maximum pause. A worker often waits for milliseconds, and rarely for longer, which then costs
-/// little. The segments that are still queued keep the learner busy for more.
+/// Maximum pause. The segments still in the queue keep the learner busy for longer than this.
 const FULL_QUEUE_PAUSE_MAX: Duration = Duration::from_millis(3);
-/// Interval between two reports of what was sent.
+/// Interval between two reports of the counts.
 const REPORT_INTERVAL: Duration = Duration::from_secs(1);
 
 /// Why a segment was not delivered.
@@ -46,14 +45,14 @@ pub enum DeliveryError {
     Attach {
         /// The worker.
         index: u32,
-        /// The last attempt's failure.
+        /// Failure of the last attempt.
         #[source]
         cause: TransportError,
     },
 }
 
-/// Waits for the command to attach, then attaches to that learner. None if a stop is requested
-/// first. The supervisor limits how long a start may take.
+/// Waits for the command to attach, then attaches to that learner. Returns `None` if a stop is
+/// requested first. The supervisor limits the time of a start.
 ///
 /// # Errors
 /// As [`attach`].
@@ -73,7 +72,7 @@ pub fn await_learner(
     }
 }
 
-/// Attaches worker `index` to the learner of a domain; none if a stop is requested first.
+/// Attaches worker `index` to the learner of a domain. Returns `None` if a stop is requested first.
 ///
 /// # Errors
 /// `Transport` if the learner follows another plan; `Attach` if it does not answer in time.
@@ -93,13 +92,13 @@ pub fn attach(
                 return Err(DeliveryError::Attach { index, cause });
             }
             Err(_) if supervisor.stop_requested() => return Ok(None),
-            // The learner frees the place of a killed predecessor a few times a second.
+            // The slot of a killed predecessor is free once the learner has cleaned it up.
             Err(_) => std::thread::sleep(ATTACH_PAUSE),
         }
     }
 }
 
-/// A moment in the life of a worker's segments or policies.
+/// An event in the delivery of a worker's segments and policies.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum DeliveryEvent<'a> {
     /// A segment is finished; it is neither kept nor offered yet.
@@ -109,11 +108,11 @@ pub enum DeliveryEvent<'a> {
         /// Its block.
         block: &'a [f32],
     },
-    /// The learner has acknowledged the segments up to this one, and the outbox dropped them.
+    /// The learner has acknowledged the segments up to this one; the outbox has dropped them.
     Acknowledged(Watermark),
     /// A newer policy was taken over.
     PolicyTaken {
-        /// Which learner of the session published it.
+        /// Number of the learner that published it.
         epoch: u64,
         /// Its version.
         version: u64,
@@ -123,7 +122,7 @@ pub enum DeliveryEvent<'a> {
 /// Called synchronously at each [`DeliveryEvent`].
 pub type DeliveryObserver = Box<dyn FnMut(DeliveryEvent<'_>)>;
 
-/// An attached worker's outbox and its ends of the transport.
+/// The outbox of an attached worker and its ends of the transport.
 pub struct Delivery<'a, T: WorkerTransport> {
     supervisor: &'a dyn Supervisor,
     deadline: Duration,
@@ -132,14 +131,14 @@ pub struct Delivery<'a, T: WorkerTransport> {
     observer: Option<DeliveryObserver>,
     /// Buffer for the newest acknowledgements.
     acknowledgements: Acknowledgements,
-    /// What the supervisor has been told, and when.
+    /// Counts in the last report, and its time.
     reported: Sent,
     reported_at: Instant,
 }
 
 impl<'a, T: WorkerTransport> Delivery<'a, T> {
-    /// A delivery that has sent nothing. It warns each time a segment has waited for another
-    /// `deadline`.
+    /// Creates a delivery that has sent nothing. It warns each time a segment has waited for
+    /// another `deadline`.
     pub fn new(
         supervisor: &'a dyn Supervisor,
         deadline: Duration,
@@ -158,7 +157,7 @@ impl<'a, T: WorkerTransport> Delivery<'a, T> {
         }
     }
 
-    /// Calls `observer` at each event from now on, if there is one.
+    /// Sets the function to call at each event.
     pub fn set_observer(&mut self, observer: Option<DeliveryObserver>) {
         self.observer = observer;
     }
@@ -169,14 +168,14 @@ impl<'a, T: WorkerTransport> Delivery<'a, T> {
         self.outbox.worker_id()
     }
 
-    /// What the worker has produced, sent and had acknowledged so far.
+    /// Counts of the worker's segments so far.
     #[must_use]
     pub fn sent(&self) -> Sent {
         self.outbox.sent()
     }
 
-    /// Copies the learner's newest snapshot into `snapshot` if it is newer. Rejects a damaged one
-    /// with a warning; the next one comes soon.
+    /// Copies the learner's newest snapshot into `snapshot` if it is newer; returns whether it did.
+    /// Rejects a damaged snapshot with a warning; another one follows soon.
     ///
     /// # Errors
     /// If the transport fails.
@@ -186,8 +185,7 @@ impl<'a, T: WorkerTransport> Delivery<'a, T> {
     ) -> Result<bool, DeliveryError> {
         let taken = match self.end.parameters.newest(snapshot) {
             Err(TransportError::Snapshot(error)) => {
-                eprintln!("a policy snapshot is refused: {error}");
-                self.warn(format!("worker {} refused a policy snapshot: {error}", self.index()));
+                self.warn(format!("worker {} rejected a policy snapshot: {error}", self.index()));
                 false
             }
             taken => taken?,
@@ -199,8 +197,8 @@ impl<'a, T: WorkerTransport> Delivery<'a, T> {
         Ok(taken)
     }
 
-    /// Keeps a segment until the learner has acknowledged it, and offers it until a queue has taken
-    /// it. Drops nothing: a full queue is how the learner slows its workers down.
+    /// Puts a segment into the outbox and waits until the queue has taken it. Drops nothing: by a
+    /// full queue the learner slows its workers down.
     ///
     /// # Errors
     /// `StopRequested` if a stop is requested while the segment waits, or if the transport fails.
@@ -274,7 +272,7 @@ impl<'a, T: WorkerTransport> Delivery<'a, T> {
         Ok(())
     }
 
-    /// Reports what was sent, once a second; returns whether it was time to.
+    /// Reports the counts once per second; returns whether a report was due.
     ///
     /// # Errors
     /// If the transport fails.
@@ -286,14 +284,14 @@ impl<'a, T: WorkerTransport> Delivery<'a, T> {
         Ok(due)
     }
 
-    /// Reports what was sent since the last report.
+    /// Reports the counts since the last report.
     ///
     /// # Errors
     /// If the transport fails.
     pub fn report(&mut self) -> Result<(), DeliveryError> {
         self.take_acknowledgements()?;
         let sent = self.outbox.sent();
-        // The loop notices a supervisor that is gone as a stop.
+        // If the supervisor is gone, the loop notices it as a stop.
         let _ = self.supervisor.report(&Report::Sent(sent.since(&self.reported)));
         (self.reported, self.reported_at) = (sent, Instant::now());
         Ok(())
@@ -373,7 +371,7 @@ mod tests {
     }
 
     #[test]
-    fn a_witness_sees_segments_before_they_are_sent_and_each_new_acknowledgement() {
+    fn an_observer_sees_segments_before_they_are_sent_and_each_new_acknowledgement() {
         let supervisor = FakeSupervisor::default();
         let (mut delivery, _receiver, mut acknowledger) =
             delivery(&supervisor, Duration::from_secs(60));

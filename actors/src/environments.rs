@@ -1,4 +1,5 @@
-//! Environments of a process: made, watched for calls that hang, and their failures reported.
+//! Stage 3 of 8: makes the environments of a process, watches calls into them, reports failures.
+//! Called by worker and evaluator.
 
 use std::io::{self, Write};
 use std::path::Path;
@@ -11,7 +12,7 @@ use thiserror::Error;
 use crate::python_env::{Interpreter, InterpreterOptions, PythonEnvironments, PythonError};
 use crate::watchdog;
 
-/// Why there are no environments.
+/// Why environments could not be made.
 #[derive(Debug, Error)]
 pub enum EnvironmentsError {
     /// Python failed.
@@ -34,7 +35,7 @@ pub fn interpreter(venv: &Path, config: &ExperimentConfig) -> Result<Interpreter
 /// Makes `count` environments of the run's task and watches every call into them.
 ///
 /// # Errors
-/// If they cannot be made, or the watchdog not be started.
+/// If the environments cannot be made or the watchdog cannot be started.
 pub fn make(
     interpreter: &Interpreter,
     config: &ExperimentConfig,
@@ -47,9 +48,9 @@ pub fn make(
     Ok(environments)
 }
 
-/// Calls `on_hang` with a message, on the watchdog's thread, when a call into the environments does
-/// not return in time. The thread that hangs may hold the interpreter for ever, so that only a new
-/// process helps.
+/// Watches calls into the environments: if one does not return in time, calls `on_hang` with a
+/// message on the watchdog's thread. The hanging thread may hold the interpreter forever, so only a
+/// new process helps.
 ///
 /// # Errors
 /// The watchdog cannot be started.
@@ -59,7 +60,7 @@ pub fn watch(
     on_hang: impl FnOnce(String) + Send + 'static,
 ) -> Result<(), EnvironmentsError> {
     let seconds = config.actors.env_call_timeout_s;
-    // A limit beyond what a clock can hold is none.
+    // A limit that a clock cannot represent is no limit.
     let timeout = Duration::try_from_secs_f64(seconds).unwrap_or(Duration::MAX);
     let id = environments.spec().id.clone();
     let hung = move |hang: watchdog::Hang| {
@@ -73,15 +74,15 @@ pub fn watch(
     watchdog::watch(environments.calls(), timeout, hung).map_err(EnvironmentsError::Watchdog)
 }
 
-/// Logs each failure of an environment and reports their number, which it returns.
+/// Logs each failure of an environment and reports their number to the supervisor; returns it.
 pub fn report_failures(failures: &[String], supervisor: &dyn Supervisor) -> u64 {
     let count = failures.len() as u64;
     let Some(last) = failures.last() else { return count };
     for failure in failures {
-        // `eprintln!` would end the process when nobody reads the log any more.
+        // `eprintln!` would panic if the log's reader is gone.
         let _ = writeln!(io::stderr(), "environment failure: {failure}");
     }
-    // The loop notices a supervisor that is gone as a stop.
+    // If the supervisor is gone, the loop notices it as a stop.
     let _ = supervisor.report(&Report::EnvFailures { count, last: last.clone() });
     count
 }

@@ -1,4 +1,5 @@
-//! Stage 8 of 8, its first half: noise-free episodes on fixed seeds, in environments of their own.
+//! Stage 8 of 8, its first half: runs episodes on fixed seeds without noise, in separate
+//! environments. Called by the evaluator's loop.
 
 use std::sync::atomic::{AtomicBool, Ordering};
 
@@ -13,30 +14,30 @@ use crate::rollout::RolloutError;
 /// Steps after which an episode of an environment without a time limit is cut off.
 const EPISODE_STEPS_MAX: u32 = 10_000;
 
-/// An episode in which its environment fails begins again, with the same seed, so often.
+/// Maximum number of repeats of an episode, with the same seed, after a failure of its environment.
 const EPISODE_REPEATS_MAX: u32 = 1;
 
-/// Environments that an evaluation runs side by side. Each episode begins with a reset of its own
-/// seed, so the number does not change a result.
+/// Maximum number of environments that an evaluation runs in parallel. Each episode begins with a
+/// reset of its own seed, so the number does not change the result.
 pub const ENVIRONMENTS_MAX: usize = 10;
 
-/// Which episodes, and whether anybody still wants to know.
+/// Which episodes to run, and a flag that aborts them.
 #[derive(Debug, Clone, Copy)]
 pub struct Episodes<'a> {
-    /// How many.
+    /// Number of episodes.
     pub count: usize,
     /// Episode i is reset with seed `first_seed + i`.
     pub first_seed: u64,
-    /// Looked at before every segment: episodes of a slow environment take minutes.
+    /// Aborts the evaluation. Checked before each segment, because slow episodes take minutes.
     pub stop: &'a AtomicBool,
 }
 
-/// What a set of episodes showed.
+/// Result of a set of episodes.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Evaluation {
     /// Sum of rewards of each episode, in the order of the seeds.
     pub returns: Vec<f64>,
-    /// Share of episodes that reported success at their last step; none if the task reports none.
+    /// Share of episodes that reported success at their last step; `None` if the task reports none.
     pub success_rate: Option<f64>,
     /// Mean |u_t - u_{t-1}| over all steps and action dimensions.
     pub smoothness: f64,
@@ -50,27 +51,27 @@ impl Evaluation {
     }
 }
 
-/// Evaluates policies of one architecture.
+/// Runs evaluation episodes of policies of one architecture.
 pub struct Evaluator {
     environments: PythonEnvironments,
     runner: PolicyRunner,
     faults: Faults,
     envs: usize,
     trace: Option<Trace>,
-    /// Told after each segment how many steps the traced episode has.
+    /// Called after each segment with the number of steps of the traced episode.
     on_steps: Box<dyn FnMut(usize)>,
 }
 
-/// What an evaluator of one environment notes of an episode, step by step.
+/// Actions and rewards of an episode of T steps.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct Trace {
-    /// The policy's actions, in [-1, 1], (T, A).
+    /// Actions u of the policy in [-1, 1], (T, A).
     pub u: Vec<f32>,
-    /// (T,).
+    /// Rewards, (T,).
     pub rewards: Vec<f64>,
 }
 
-/// What accumulates over one wave of episodes.
+/// Sums over episodes that run in parallel, one in each environment.
 struct Wave {
     returns: Vec<f64>,
     success: Vec<u8>,
@@ -80,22 +81,23 @@ struct Wave {
     failures: Vec<u32>,
     /// Last u of each environment, (E, A); NaN before the first step.
     last_u: Vec<f32>,
+    /// Sum and number of the differences |u_t - u_{t-1}|.
     jumps: Vec<f64>,
     jump_count: Vec<u64>,
 }
 
 impl Evaluator {
-    /// An evaluator on `envs` environments.
+    /// Creates an evaluator for `envs` environments.
     ///
     /// # Errors
-    /// If the policy does not fit them.
+    /// If the policy does not fit the environments.
     pub fn new(
         config: &ExperimentConfig,
         environments: PythonEnvironments,
         envs: usize,
     ) -> Result<Self, PolicyError> {
         let policy = Policy::new(config, environments.spec())?;
-        // The repeats of an episode have a limit of their own.
+        // Repeats of an episode have their own limit.
         let faults = Faults::new(envs, u32::MAX);
         Ok(Self {
             environments,
@@ -107,11 +109,11 @@ impl Evaluator {
         })
     }
 
-    /// One on a single environment, which notes each step of an episode; `on_steps` is told after
-    /// each segment how many there are.
+    /// Creates an evaluator for a single environment that records each step of an episode.
+    /// `on_steps` is called after each segment with the number of steps so far.
     ///
-    /// The network still sees as many rows as in an evaluation: the product of a single row is
-    /// rounded differently, and a bounce of a ball makes much of the last bit.
+    /// The network still gets as many rows as in an evaluation. The product of a single row is
+    /// rounded differently, and chaotic dynamics such as a bouncing ball amplify the last bit.
     ///
     /// # Errors
     /// As [`Evaluator::new`].
@@ -126,12 +128,12 @@ impl Evaluator {
         Ok(Self { envs: 1, faults, trace, on_steps, ..evaluator })
     }
 
-    /// The steps of the last episode; empty of an evaluator that notes none.
+    /// Takes the trace of the last episode; empty if this evaluator records none.
     pub fn take_trace(&mut self) -> Trace {
         self.trace.as_mut().map(std::mem::take).unwrap_or_default()
     }
 
-    /// Its environments.
+    /// The environments.
     #[must_use]
     pub fn environments(&self) -> &PythonEnvironments {
         &self.environments
@@ -143,16 +145,17 @@ impl Evaluator {
         &self.runner.policy
     }
 
-    /// One line about each failure of an environment since the last call.
+    /// Returns one line for each failure of an environment since the last call.
     pub fn take_failures(&mut self) -> Vec<String> {
         self.faults.take()
     }
 
-    /// Runs the episodes; none if a stop was asked for. An episode in which its environment fails
-    /// is repeated once, with the same seed.
+    /// Runs the episodes; returns `None` if a stop was requested. If an environment fails, its
+    /// episode is repeated once, with the same seed.
     ///
     /// # Errors
-    /// `Episode` if it fails again: the next evaluation may succeed. Anything else is for good.
+    /// `Episode` if an episode fails again; the next evaluation may succeed. Other errors are
+    /// permanent.
     pub fn evaluate(
         &mut self,
         parameters: &[f32],
@@ -226,8 +229,8 @@ impl Evaluator {
         Ok(Some(wave))
     }
 
-    /// Begins the episodes of failed environments again. Those that have their episode behind them
-    /// only keep the others company, but must go on too.
+    /// Restarts the episodes of failed environments. A failed environment whose episode is complete
+    /// is reset, too, because all environments step together.
     fn restart_episodes(&mut self, wave: &mut Wave) -> Result<(), RolloutError> {
         let dims = self.runner.policy.layout().action_len;
         let mask = self.faults.failed().to_vec();
@@ -251,7 +254,7 @@ impl Evaluator {
         Ok(self.faults.inspect_reset(&mut self.environments, &mask)?)
     }
 
-    /// Adds environment `env`'s segment to the wave.
+    /// Adds environment `env`'s segment to the sums.
     fn add_segment(&mut self, wave: &mut Wave, env: usize) {
         let layout = self.runner.policy.layout();
         let (k_max, dims) = (layout.segment_steps, layout.action_len);

@@ -1,7 +1,7 @@
-//! Stage 8 of 8, its loop: evaluates the policies that the supervisor asks for.
+//! Stage 8 of 8, the evaluator's loop: evaluates the policies that the supervisor requests.
 //!
-//! The evaluator's process answers one request after the other ([`run`]); the one-process run
-//! evaluates where an evaluation falls due ([`evaluate`]).
+//! The evaluator's process answers one request at a time ([`run`]). The one-process run calls
+//! [`evaluate`] when an evaluation is due.
 
 use std::error::Error;
 use std::path::PathBuf;
@@ -62,20 +62,20 @@ pub fn evaluator(
     Ok(Evaluator::new(config, environments, envs)?)
 }
 
-/// What all evaluations of a run have in common.
+/// Settings of all evaluations of a run.
 pub struct Evaluations<'a> {
-    /// The experiment.
+    /// The run's configuration.
     pub config: &'a ExperimentConfig,
-    /// Path of a saved policy, by version.
+    /// Returns the path of a saved policy, by version.
     pub policy_path: &'a dyn Fn(u64) -> PathBuf,
-    /// Aborts the evaluation that is running.
+    /// Aborts the current evaluation.
     pub stop: &'a AtomicBool,
 }
 
 /// Outcome of an evaluation.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Answer {
-    /// It is complete.
+    /// The evaluation is complete.
     Row(EvaluationRow),
     /// An episode failed twice; the next evaluation may succeed.
     Failed(String),
@@ -83,14 +83,15 @@ pub enum Answer {
     Stopped,
 }
 
-/// Keeps a row; an error ends the evaluator.
+/// Stores a row; an error ends the evaluator.
 pub type Keep<'a> = &'a mut dyn FnMut(&EvaluationRow) -> Result<(), Box<dyn Error + Send + Sync>>;
 
-/// Answers evaluation requests until a stop is requested. Each row goes to `keep` before it is
-/// reported.
+/// Answers evaluation requests until a stop is requested. Passes each row to `keep` before it
+/// reports it.
 ///
 /// # Errors
-/// Whatever keeps the evaluator from going on; a new process may help.
+/// If the environments fail, a policy cannot be loaded, `keep` fails or the supervisor is gone. A
+/// new process may succeed.
 pub fn run(
     evaluator: &mut Evaluator,
     evaluations: &Evaluations<'_>,
@@ -122,7 +123,7 @@ pub fn run(
 /// Evaluates a saved policy.
 ///
 /// # Errors
-/// If the policy cannot be loaded, or the environments fail for good.
+/// If the policy cannot be loaded, or the environments fail permanently.
 pub fn evaluate(
     evaluator: &mut Evaluator,
     evaluations: &Evaluations<'_>,

@@ -1,4 +1,5 @@
-//! How a rollout departs from its policy: warm-up draws, and noise on actions or DMP parameters.
+//! Stage 3 of 8, exploration: random warm-up actions, and noise on actions or DMP parameters. Called
+//! by the rollout.
 
 use std::ops::Range;
 
@@ -10,19 +11,19 @@ use rand_xoshiro::Xoshiro256PlusPlus;
 
 use crate::policy_runner::PolicyRunner;
 
-/// The departure, with its random stream.
+/// Exploration noise with its random stream.
 #[derive(Debug)]
 pub struct Exploration {
     config: ExplorationConfig,
     random: Xoshiro256PlusPlus,
-    /// One source a (environment, action dimension), for `pink`.
+    /// One source for each (environment, action dimension), for `pink`.
     pink: Vec<PinkNoise>,
-    /// One draw a dimension, for `segment`.
+    /// One draw for each dimension, for `segment`.
     held: Vec<f32>,
 }
 
 impl Exploration {
-    /// For `envs` environments of `dims` action dimensions.
+    /// Creates the noise for `envs` environments of `dims` action dimensions.
     #[must_use]
     pub fn new(
         config: ExplorationConfig,
@@ -37,7 +38,7 @@ impl Exploration {
         Self { config, random, pink, held: vec![0.0; dims] }
     }
 
-    /// Draws the segment's `u` without the policy.
+    /// Draws the actions `u` of a segment without the policy.
     pub fn warm_up(&mut self, runner: &mut PolicyRunner) {
         let range = self.config.warm_up_range as f32;
         let random = &mut self.random;
@@ -50,10 +51,10 @@ impl Exploration {
         }
     }
 
-    /// Turns the network's outputs into `u` with noise, within [-1, 1].
+    /// Converts the network's outputs to `u` with noise, within [-1, 1].
     ///
-    /// A Gaussian policy draws from itself; kind and std of the noise then mean nothing. One with
-    /// standard deviations of its own is not bounded by a tanh, and its draws not by [-1, 1].
+    /// A Gaussian policy draws from its own distribution, and kind and std of the noise have no
+    /// effect. If its standard deviations are learned parameters, no tanh bounds its draws.
     pub fn explore(&mut self, runner: &mut PolicyRunner) {
         if !runner.std.is_empty() {
             runner.decode();
@@ -87,7 +88,7 @@ impl Exploration {
         }
     }
 
-    /// u = mean + std noise, std the policy's own.
+    /// Draws u = mean + std noise with the policy's learned std.
     fn draw_unbounded(&mut self, runner: &mut PolicyRunner) {
         let PolicyRunner { u, std, work, .. } = runner;
         let means = work.actions.chunks_exact(std.len());
@@ -98,7 +99,7 @@ impl Exploration {
         }
     }
 
-    /// u = tanh(mean + std noise), std from the network's outputs at `columns`.
+    /// Draws u = tanh(mean + std noise) with std from the network's outputs at `columns`.
     fn draw(&mut self, runner: &mut PolicyRunner, columns: Range<usize>) {
         let len = runner.policy.layout().actions_len();
         let envs = runner.u.len() / len;
@@ -128,7 +129,7 @@ impl Exploration {
         }
     }
 
-    /// An episode of environment `env` has ended: its noise starts anew.
+    /// Resets the noise of environment `env`, whose episode has ended.
     pub fn episode_ended(&mut self, env: usize) {
         let dims = self.held.len();
         if let Some(sources) = self.pink.get_mut(env * dims..(env + 1) * dims) {
@@ -141,10 +142,11 @@ fn normal(random: &mut impl Rng) -> f32 {
     random.sample(StandardNormal)
 }
 
-/// Octaves of the pink noise: 2^8 steps is longer than the episodes it is meant for.
+/// Number of octaves of the pink noise. 2^8 steps are longer than typical episodes.
 const OCTAVES: usize = 8;
 
-/// Pink noise of unit variance: Voss's sum of held white sources, source i renewed every 2^i steps.
+/// Pink noise of unit variance (Voss): the sum of white sources, of which source i is drawn again
+/// every 2^i steps.
 #[derive(Debug, Clone, Copy, Default)]
 struct PinkNoise {
     sources: [f32; OCTAVES],
@@ -187,7 +189,7 @@ mod tests {
         layers.finish().unwrap().resolve(Limits { cores: 1 }).unwrap()
     }
 
-    /// A fresh policy before some observations, and the departure from it.
+    /// A new policy with some observations, and exploration for it.
     fn scene(keys: &[(&str, &str)]) -> (PolicyRunner, Exploration) {
         let config = config(keys);
         let spec = EnvSpec {
@@ -212,7 +214,7 @@ mod tests {
         (runner, Exploration::new(config.exploration, random, ENVS, DIMS))
     }
 
-    /// What exploration adds to each action, (E, K, A); none of these meets a bound.
+    /// Noise that exploration adds to each action, (E, K, A). No action reaches a bound.
     fn noise(keys: &[(&str, &str)]) -> Vec<f32> {
         let (mut runner, mut exploration) = scene(keys);
         runner.decode();
@@ -266,13 +268,13 @@ mod tests {
         exploration.explore(&mut runner);
         let explored = runner.u.clone();
         assert!(explored.iter().zip(&clean).filter(|(a, b)| a != b).count() > clean.len() / 2);
-        // Nothing was added behind the decoder.
+        // The decoder adds no noise.
         runner.decode();
         assert_eq!(runner.u, explored);
     }
 
     #[test]
-    fn warm_up_draws_within_its_range_whatever_the_policy_says() {
+    fn warm_up_draws_within_its_range_regardless_of_the_policy() {
         for (kind, range) in [("uniform", 0.3), ("uniform", 1.0)] {
             let text = range.to_string();
             let keys =
@@ -292,7 +294,7 @@ mod tests {
         exploration.warm_up(&mut runner);
         let first = runner.u.clone();
         assert!(std(&first) > 0.01 && first.iter().all(|u| u.abs() <= 1.0));
-        // Actions of one segment are of one motion: they differ less than those of two.
+        // Actions of one segment belong to one motion, so they differ less than those of two.
         let jump = |from: usize, to: usize| {
             let all = first.chunks_exact(K * DIMS).zip(first.chunks_exact(K * DIMS).skip(1));
             std(&all
@@ -305,15 +307,15 @@ mod tests {
     }
 
     #[test]
-    fn a_gaussian_policy_draws_from_itself() {
-        // Squashed: inside the bounds, whatever the noise is set to.
+    fn a_gaussian_policy_draws_from_its_own_distribution() {
+        // Squashed: within the bounds, whatever the configured noise.
         let (mut runner, mut exploration) =
             scene(&[("algorithm.name", "sac"), ("exploration.std", "0.0")]);
         runner.decode();
         let mean = runner.u.clone();
         exploration.explore(&mut runner);
         assert!(runner.u.iter().zip(&mean).all(|(u, mean)| u != mean && u.abs() <= 1.0));
-        // With a spread of its own: beyond them, too.
+        // With learned standard deviations: also outside them.
         let ndp = [
             ("algorithm.name", "ndp"),
             ("policy.controller", "position"),
@@ -331,7 +333,7 @@ mod tests {
     }
 
     #[test]
-    fn pink_noise_starts_anew_where_an_episode_ended() {
+    fn pink_noise_is_reset_at_the_end_of_an_episode() {
         let (mut runner, mut exploration) = scene(&[("exploration.kind", "pink")]);
         exploration.explore(&mut runner);
         exploration.episode_ended(3);
@@ -341,7 +343,7 @@ mod tests {
     }
 
     #[test]
-    fn pink_noise_has_unit_variance_and_a_memory_that_fades() {
+    fn pink_noise_has_unit_variance_and_decaying_correlation() {
         let mut random = dmprl_shared::seeds::stream(1, "test", 0);
         let episodes: Vec<Vec<f32>> = (0..4_000)
             .map(|_| {

@@ -1,41 +1,42 @@
-//! Environments that failed in the last call: found, described, counted.
+//! Stage 3 of 8: finds, describes and counts environments that failed in the last call. Called by the
+//! rollout and the evaluator.
 //!
-//! A failed environment costs its own segment and nothing else. The Python side makes it again and
-//! says so ([`PythonEnvironments::failed`]); a `SegmentEnv` that hands out numbers that are not
-//! finite without noticing is found here, and reset by the caller.
+//! A failed environment loses only its own segment. The Python side makes it again and reports it
+//! ([`PythonEnvironments::failed`]). If a `SegmentEnv` returns numbers that are not finite, this
+//! module detects it, and the caller resets the environment.
 
 use dmprl_shared::spec::EnvSpec;
 
 use crate::python_env::{PythonEnvironments, PythonError};
 
-/// Longer descriptions are cut: an exception may carry a whole model file.
+/// Maximum length of a description. An exception may contain a whole model file.
 const SENTENCE_CHARS_MAX: usize = 500;
-/// Segments without a fault that make up for failures as a completed episode does: an environment
-/// without a time limit may never complete one, and failures far apart are no reason to give up.
+/// Number of segments without a fault after which the failures no longer count, as after a completed
+/// episode. An environment without a time limit may never complete an episode.
 const SOUND_SEGMENTS: u32 = 1_000;
 
 /// The failures of a set of environments.
 #[derive(Debug)]
 pub struct Faults {
-    /// (E,): whose last call cannot be used.
+    /// Environments that failed in the last call, (E,).
     failed: Vec<bool>,
-    /// (E,): those of them that cannot go on as they are.
+    /// Failed environments that cannot continue without a reset, (E,).
     needs_reset: Vec<bool>,
-    /// (E,): failures that nothing has made up for, and how many are too many.
+    /// Failures that still count, (E,), and their limit.
     records: Vec<FailureRecord>,
     failures_max: u32,
-    /// (E,): the newest failure of each; empty before the first.
+    /// Newest failure of each environment, (E,); empty before the first.
     causes: Vec<String>,
     total: u64,
     unreported: Vec<String>,
 }
 
-/// What counts against one environment.
+/// Failures of one environment that still count.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 struct FailureRecord {
-    /// Since it last completed an episode or ran [`SOUND_SEGMENTS`].
+    /// Failures since the last completed episode, or since [`SOUND_SEGMENTS`] without a fault.
     failures: u32,
-    /// Since the first of them.
+    /// Segments without a fault since the first of these failures.
     sound_segments: u32,
 }
 
@@ -55,20 +56,20 @@ impl FailureRecord {
     }
 }
 
-/// An environment that fails whatever is done.
+/// An environment that has failed too often.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct FailureBudgetExceeded {
-    /// Which.
+    /// Index of the environment.
     pub env_index: usize,
-    /// Failures since it last completed an episode, or a thousand segments.
+    /// Failures that still count.
     pub count: u32,
-    /// The last one.
+    /// The last failure.
     pub cause: String,
 }
 
 impl Faults {
-    /// For `envs` environments; more than `failures_max` failures without a completed episode, or
-    /// a thousand sound segments, in between are hopeless.
+    /// Creates the record for `envs` environments. The budget is exceeded by more than `failures_max`
+    /// failures with neither a completed episode nor a thousand sound segments in between.
     #[must_use]
     pub fn new(envs: usize, failures_max: u32) -> Self {
         Self {
@@ -82,10 +83,10 @@ impl Faults {
         }
     }
 
-    /// Looks at what a segment left; true if any environment failed.
+    /// Inspects the results of a segment; returns true if any environment failed.
     ///
     /// # Errors
-    /// If the Python side cannot say what happened.
+    /// If the Python side cannot describe the failures.
     pub fn inspect_segment(
         &mut self,
         environments: &mut PythonEnvironments,
@@ -101,7 +102,7 @@ impl Faults {
                 false => segment_fault(environments, env),
             };
             self.failed[env] = cause.is_some();
-            // One that was made again may still begin with what is no finite 32-bit number.
+            // A remade environment may still begin with a number that is not finite in 32 bits.
             let sound = made && start_fault(environments, env).is_none();
             self.needs_reset[env] = cause.is_some() && !sound;
             if let Some(cause) = cause {
@@ -117,10 +118,10 @@ impl Faults {
         Ok(any)
     }
 
-    /// Looks at what a reset of the environments in `mask` left.
+    /// Inspects the results of a reset of the environments in `mask`.
     ///
     /// # Errors
-    /// `ObservationNotFinite`: a reset is all that could have helped.
+    /// `ObservationNotFinite` if an observation is still not finite.
     pub fn inspect_reset(
         &mut self,
         environments: &mut PythonEnvironments,
@@ -136,24 +137,24 @@ impl Faults {
         Ok(())
     }
 
-    /// (E,): whose last call cannot be used.
+    /// Environments that failed in the last call, (E,).
     #[must_use]
     pub fn failed(&self) -> &[bool] {
         &self.failed
     }
 
-    /// (E,): those of them that cannot go on as they are: they must be reset.
+    /// Failed environments that must be reset to continue, (E,).
     #[must_use]
     pub fn needs_reset(&self) -> &[bool] {
         &self.needs_reset
     }
 
-    /// Environment `env` has completed an episode.
+    /// Records that environment `env` has completed an episode.
     pub fn completed(&mut self, env: usize) {
         self.records[env] = FailureRecord::default();
     }
 
-    /// The environment that has failed too often, if there is one.
+    /// Returns the first environment that has failed too often, if any.
     #[must_use]
     pub fn budget_exceeded(&self) -> Option<FailureBudgetExceeded> {
         let too_many = |record: &FailureRecord| record.failures > self.failures_max;
@@ -168,13 +169,13 @@ impl Faults {
         &self.causes[env]
     }
 
-    /// All failures so far.
+    /// Number of failures so far.
     #[must_use]
     pub fn total(&self) -> u64 {
         self.total
     }
 
-    /// One line about each failure since the last call.
+    /// Returns one line for each failure since the last call.
     pub fn take(&mut self) -> Vec<String> {
         std::mem::take(&mut self.unreported)
     }
@@ -185,28 +186,28 @@ impl Faults {
     }
 }
 
-/// One line that steers no terminal.
+/// Replaces control characters and limits the length.
 fn plain(cause: &str) -> String {
     let plain = cause.chars().map(|letter| if letter.is_control() { ' ' } else { letter });
     plain.take(SENTENCE_CHARS_MAX).collect()
 }
 
-/// The sentence about environment `env`; a `SegmentEnv` of somebody's own may have none.
+/// Takes the description of environment `env`'s failure. A user's `SegmentEnv` may give none.
 fn taken(sentences: &mut Vec<String>, spec: &EnvSpec, env: usize) -> String {
     let name = format!("environment {env},");
     match sentences.iter().position(|sentence| sentence.contains(&name)) {
         Some(at) => sentences.remove(at),
-        None => format!("{}, environment {env}: it failed and does not say how", spec.id),
+        None => format!("{}, environment {env}: it failed without a description", spec.id),
     }
 }
 
-/// The first number of a row that is not finite in 32 bits, in which the learner gets it.
+/// Index of the first number that is not finite in 32 bits, which the learner uses.
 fn not_finite(row: &[f64]) -> Option<usize> {
     row.iter().position(|value| !(*value as f32).is_finite())
 }
 
 fn segment_fault(environments: &PythonEnvironments, env: usize) -> Option<String> {
-    const WHAT: &str = "which is no finite 32-bit number";
+    const WHAT: &str = "expected a finite 32-bit number";
     let spec = environments.spec();
     let steps = environments.steps()[env] as usize;
     let rewards = environments.rewards();
@@ -228,7 +229,7 @@ fn segment_fault(environments: &PythonEnvironments, env: usize) -> Option<String
     Some(format!("{}: {name} is {value}, {WHAT}", where_("reset")))
 }
 
-/// Name and value of what is not finite in the observation to act on next.
+/// Name and value of the first entry of the next observation that is not finite.
 fn start_fault(environments: &PythonEnvironments, env: usize) -> Option<(String, f64)> {
     let spec = environments.spec();
     let row = &environments.next_observations()[env * spec.observation_len..];
@@ -245,7 +246,7 @@ mod tests {
     }
 
     #[test]
-    fn an_environment_that_never_completes_an_episode_makes_up_with_sound_segments() {
+    fn sound_segments_reset_the_budget_of_an_environment_without_episodes() {
         let mut faults = Faults::new(1, 2);
         for _ in 0..10 {
             (0..2).for_each(|_| faults.records[0].failed());
@@ -255,9 +256,9 @@ mod tests {
     }
 
     #[test]
-    fn fewer_sound_segments_between_too_many_failures_make_up_for_nothing() {
+    fn too_few_sound_segments_do_not_reset_the_budget() {
         let mut faults = Faults::new(1, 2);
-        // Sound segments before a failure are none of its reasons.
+        // Sound segments before the first failure do not count.
         sound(&mut faults, SOUND_SEGMENTS - 1);
         faults.records[0].failed();
         sound(&mut faults, 1);

@@ -1,16 +1,16 @@
-//! Stage 3 of 8: an episode's segments once more, with goals that it reached: hindsight
-//! (Andrychowicz et al. 2017), strategy `future`.
+//! Stage 3 of 8, hindsight: copies an episode's segments with goals that the episode reached
+//! (Andrychowicz et al. 2017, strategy `future`).
 //!
-//! Only the environment knows what a goal rewards, so copies are made here, where it is, at the end
-//! of each episode, with one call into Python. A copy is one decision: up to K steps with one goal,
-//! a goal that the episode reached in or after them.
+//! Called by the rollout at the end of each episode. Only the environment can compute the rewards
+//! of another goal, so the worker makes the copies, with one call into Python. A copy is one
+//! decision: up to K steps with one goal, which the episode reached in or after these steps.
 //!
 //! Differences from Andrychowicz et al., Algorithm 1:
 //! 1. A goal is drawn for a segment of K steps, not for a step; K = 1 is the published algorithm.
-//! 2. With sliding windows a copy begins at a step drawn from the segment's, but not so late that
-//!    the episode's end would cut it short: the last whole window is drawn for all that follow.
-//! 3. A copy ends where the task would have ended the episode at its goal. One that is then left
-//!    with fewer than K steps for another reason is none: a missing action is no zero action.
+//! 2. With sliding windows, a copy begins at a step drawn from the segment's, but at the latest at
+//!    the last step that leaves K steps until the episode's end.
+//! 3. A copy ends where the task would have ended the episode at its goal. A copy with fewer than K
+//!    steps for another reason is dropped, because a missing action is not a zero action.
 
 use dmprl_shared::config::{ExperimentConfig, Hindsight as Strategy, Windows};
 use dmprl_shared::seeds::{self, Stream};
@@ -20,29 +20,29 @@ use rand::RngExt;
 use crate::python_env::{Goals, PythonEnvironments, PythonError, Relabelling};
 use crate::rollout::SegmentMeta;
 
-/// The episodes under way, and copies of the one that has just ended. All buffers are made once.
+/// The current episodes, and copies of the last one to end. All buffers are allocated once.
 pub(crate) struct Hindsight {
     layout: SegmentLayout,
     goals: Goals,
     copies: usize,
     sliding: bool,
     random: Stream,
-    /// One for each environment.
+    /// One episode for each environment.
     episodes: Vec<Episode>,
     drawn: Vec<Draw>,
     relabelling: Relabelling,
     task_id: String,
 }
 
-/// What has happened in an episode, T steps of at most `steps_max`.
+/// Record of an episode of T steps.
 #[derive(Debug)]
 struct Episode {
     steps: usize,
-    /// As the policy saw them, (T+1, O).
+    /// Observations of the policy, (T+1, O).
     observations: Vec<f32>,
-    /// (T, A).
+    /// Actions u, (T, A).
     actions: Vec<f32>,
-    /// The goals reached, (T+1, G), 64-bit: a threshold is compared as the environment would.
+    /// Goals reached, (T+1, G). 64-bit, so that thresholds are compared as in the environment.
     achieved: Vec<f64>,
     segments: Vec<Decision>,
 }
@@ -55,35 +55,35 @@ struct Decision {
     policy_version: u64,
 }
 
-/// A copy that is to be made: steps `first` to `first + len`, with the goal reached in row `goal`.
+/// A planned copy: steps `first` to `first + len`, with the goal reached in row `goal`.
 #[derive(Debug, Clone, Copy)]
 struct Draw {
     first: usize,
     len: usize,
     goal: usize,
     policy_version: u64,
-    /// Its first row in the call to the environment.
+    /// First row in the call to the environment.
     row: usize,
 }
 
-/// What a segment adds to its episode.
+/// A segment to be added to its episode.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct EpisodeSegment<'a> {
-    /// Steps really run.
+    /// Number of steps run, 1 to K.
     pub(crate) steps: usize,
     /// The segment's block.
     pub(crate) block: &'a [f32],
-    /// The environment's own observations, (K+1, its O).
+    /// Observations of the environment in 64 bits, (K+1, O without the policy's additions).
     pub(crate) observations: &'a [f64],
     /// Version of the policy that acted.
     pub(crate) policy_version: u64,
 }
 
 impl Hindsight {
-    /// None if the configuration wants none.
+    /// Creates the records; returns `None` if the configuration disables hindsight.
     ///
     /// # Errors
-    /// `NoGoals` if the environments cannot be asked, or episodes have no known length.
+    /// `NoGoals` if the environments have no goals, or their episodes no time limit.
     pub(crate) fn start(
         config: &ExperimentConfig,
         environments: &PythonEnvironments,
@@ -123,12 +123,12 @@ impl Hindsight {
         }))
     }
 
-    /// Copies that one episode may lead to.
+    /// Maximum number of copies of one episode.
     pub(crate) fn copies_max(&self) -> usize {
         self.drawn.capacity()
     }
 
-    /// Remembers what environment `env` has just done.
+    /// Adds the last segment of environment `env` to its episode.
     ///
     /// # Errors
     /// `Interface` if the episode is longer than the specification says.
@@ -162,11 +162,11 @@ impl Hindsight {
         Ok(())
     }
 
-    /// The episode of environment `env` is over: draws its copies, asks for their rewards and
+    /// Plans the copies of environment `env`'s episode, which has ended, computes their rewards and
     /// returns their number.
     ///
     /// # Errors
-    /// If the environments cannot say what a goal rewards.
+    /// If the environments cannot compute the rewards.
     pub(crate) fn relabel(&mut self, env: usize) -> Result<usize, PythonError> {
         self.draw(env);
         let (g, episode) = (self.goals.len, &self.episodes[env]);
@@ -192,7 +192,7 @@ impl Hindsight {
                 let mut first = segment.first;
                 if self.sliding {
                     first += self.random.random_range(0..segment.len);
-                    // Later ones would be cut short by the episode's end.
+                    // A later copy would be cut short by the episode's end.
                     first = first.min(episode.steps.saturating_sub(steps_max));
                 }
                 let len = (episode.steps - first).min(steps_max);
@@ -204,10 +204,11 @@ impl Hindsight {
         }
     }
 
-    /// Writes copy `index` of environment `env`'s episode into `block`, if it is one.
+    /// Writes copy `index` of environment `env`'s episode into `block`. Returns `None` if the copy
+    /// is dropped.
     ///
     /// # Panics
-    /// If `index` is not below what [`Hindsight::relabel`] has returned.
+    /// If `index` is not below the number that [`Hindsight::relabel`] returned.
     pub(crate) fn write(&self, env: usize, index: usize, block: &mut [f32]) -> Option<SegmentMeta> {
         let SegmentLayout { segment_steps, observation_len: o, action_len: a } = self.layout;
         let (draw, episode) = (self.drawn[index], &self.episodes[env]);
@@ -237,7 +238,7 @@ impl Hindsight {
         })
     }
 
-    /// The next episode of environment `env` begins.
+    /// Begins the next episode of environment `env`.
     pub(crate) fn begin_episode(&mut self, env: usize) {
         self.episodes[env].steps = 0;
         self.episodes[env].segments.clear();

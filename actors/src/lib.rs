@@ -1,12 +1,13 @@
 //! Stage 3 of 8 and the first half of stage 8: rollout workers and evaluation.
 //!
-//! A worker is one process with one Python interpreter and E environments. Its life, in reading
-//! order: [`environments`] makes them, [`worker`] is the loop, [`rollout`] runs a segment in all of
-//! them with one Python call, [`delivery`] gets the segments to the learner. [`evaluator`] is the
-//! evaluator's loop and [`evaluate`] its episodes. Neither knows the learner; both know their
-//! supervisor by `dmprl_shared::supervision` only.
+//! A worker is one process with one Python interpreter and E environments. In reading order:
+//! [`environments`] makes the environments, [`worker`] is the loop, [`rollout`] runs a segment in
+//! all environments with one Python call, [`delivery`] sends the segments to the learner.
+//! [`evaluator`] is the evaluator's loop and [`evaluate`] runs its episodes. Worker and evaluator
+//! talk to their supervisor only through `dmprl_shared::supervision`, and never to the learner's
+//! code.
 //!
-//! Without the feature `python` only [`delivery`] is built: a learner-only build.
+//! A build without the feature `python`, for a learner only, contains just [`delivery`].
 
 pub mod delivery;
 #[cfg(feature = "python")]

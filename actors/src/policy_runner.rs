@@ -1,32 +1,33 @@
-//! A policy acting on a set of environments: what rollout and evaluation have in common.
+//! Stage 3 of 8, deciding: runs a policy for E environments. Called by the rollout and the
+//! evaluator.
 
 use dmprl_shared::policy::{Head, LearnedStd, Policy, PolicyWorkspace, SmallBatchNetwork};
 
 use crate::python_env::PythonEnvironments;
 
-/// The policy's side of E environments, with buffers made once.
+/// A policy for E environments and the state of their DMPs. All buffers are allocated once.
 #[derive(Debug)]
 pub struct PolicyRunner {
-    /// The architecture.
+    /// The policy's architecture.
     pub policy: Policy,
     network: SmallBatchNetwork,
     /// Buffers of the forward pass.
     pub work: PolicyWorkspace,
-    /// What the policy sees now, (E, O).
+    /// Current observations, (E, O).
     pub observations: Vec<f32>,
-    /// u of the segment, (E, K, A), exploration included; beyond [-1, 1] only as drawn from a
-    /// policy's own Gaussian.
+    /// Actions u of the segment with exploration, (E, K, A). They are within [-1, 1] unless drawn
+    /// from a Gaussian of the policy that is not bounded.
     pub u: Vec<f32>,
-    /// Standard deviations of the policy's own Gaussian, (A,); empty if it has none.
+    /// Learned standard deviations of the policy, (A,); empty if it has none.
     pub std: Vec<f32>,
-    /// (y, yd) that each environment's DMP continues from, (E, 2A); empty if not carried.
+    /// (y, yd) from which each environment's DMP continues, (E, 2A); empty if not carried.
     carried: Vec<f32>,
     /// The segment's actions in the environments' units, (E, K, A).
     actions: Vec<f64>,
 }
 
 impl PolicyRunner {
-    /// For `envs` environments.
+    /// Creates a runner for `envs` environments, without parameters.
     #[must_use]
     pub fn new(policy: Policy, envs: usize) -> Self {
         let layout = policy.layout();
@@ -44,7 +45,7 @@ impl PolicyRunner {
         }
     }
 
-    /// Takes the observations to act on from the environments.
+    /// Copies the observations from the environments, in 32 bits.
     pub fn observe(&mut self, environments: &PythonEnvironments) {
         let env_len = self.policy.env_observation_len();
         let len = self.policy.layout().observation_len;
@@ -58,7 +59,7 @@ impl PolicyRunner {
         }
     }
 
-    /// Takes over the policy's parameters.
+    /// Loads the policy's parameters.
     pub fn take_policy(&mut self, parameters: &[f32]) {
         self.network.load(&parameters[..self.policy.shape().parameters_len()]);
         if let Some(gaussian) = self.policy.learned_std() {
@@ -68,25 +69,26 @@ impl PolicyRunner {
         }
     }
 
-    /// Runs the network; the outputs lie in `work.activations`.
+    /// Runs the network; the outputs are in `work.activations`.
     pub fn run_network(&mut self) {
         self.network.forward(&self.observations, &mut self.work.activations);
     }
 
-    /// From the network's outputs to `u`, without exploration.
+    /// Converts the network's outputs to `u`, without exploration.
     pub fn decode(&mut self) {
         self.policy.decode(&self.observations, &mut self.work);
         self.take_u();
     }
 
-    /// The mean of a Gaussian may lie out of bounds; it is what the environment gets of it.
+    /// Copies the actions to `u` within [-1, 1]: the mean of a Gaussian may lie outside.
     fn take_u(&mut self) {
         for (u, action) in self.u.iter_mut().zip(&self.work.actions) {
             *u = action.clamp(-1.0, 1.0);
         }
     }
 
-    /// From squashed DMP parameters that `draw` fills, (A (1+N+4)) a row, to `u`.
+    /// Converts squashed DMP parameters to `u`. `draw` fills one row of A (1+N+4) for each
+    /// environment.
     pub fn decode_drawn(&mut self, draw: &mut dyn FnMut(&mut [f32])) {
         if let (Head::Dmp(head), Some(dmp)) = (self.policy.head(), &mut self.work.dmp) {
             let rows = self.observations.len() / self.policy.layout().observation_len;
@@ -97,14 +99,14 @@ impl PolicyRunner {
         }
     }
 
-    /// `u` in the environments' units, (E, K, A).
+    /// Returns `u` in the environments' units, (E, K, A).
     pub fn actions(&mut self) -> &[f64] {
         self.policy.scaling().apply(&self.u, &mut self.actions);
         &self.actions
     }
 
-    /// (y, yd) of environment `env` after step `k` of the segment, into `state`; nothing if it is
-    /// not carried.
+    /// Writes (y, yd) of environment `env` after step `k` of the segment to `state`. Does nothing
+    /// if the state is not carried.
     pub fn state_at(&self, env: usize, k: usize, state: &mut [f32]) {
         if self.policy.carries_state()
             && let (Head::Dmp(head), Some(dmp)) = (self.policy.head(), &self.work.dmp)
@@ -113,8 +115,8 @@ impl PolicyRunner {
         }
     }
 
-    /// Lets environment `env`'s DMP continue from the segment's end, or from rest if its episode
-    /// has ended.
+    /// Sets the state from which environment `env`'s DMP continues: that at the segment's end, or
+    /// rest if its episode has ended.
     pub fn carry_state(&mut self, env: usize, ended: bool) {
         let len = self.policy.layout().observation_len - self.policy.env_observation_len();
         if len == 0 {

@@ -1,4 +1,5 @@
-//! Stage 8 of 8, beside evaluation: noise-free episodes, one at a time, written down step by step.
+//! Stage 8 of 8, recording: runs episodes of a saved policy without noise and records each step.
+//! Called by the observer's process.
 
 use std::sync::atomic::AtomicBool;
 
@@ -12,11 +13,11 @@ use crate::rollout::RolloutError;
 /// One episode of T steps.
 #[derive(Debug, Clone, PartialEq)]
 pub struct EpisodeRecord {
-    /// What it was reset with.
+    /// Seed of its reset.
     pub seed: u64,
-    /// Sum of its rewards, as an evaluation has it.
+    /// Sum of its rewards, as in an evaluation.
     pub return_: f64,
-    /// Whether its last step reported success; none if the task reports none.
+    /// Whether its last step reported success; `None` if the task reports none.
     pub success: Option<bool>,
     /// Actions and rewards.
     pub trace: Trace,
@@ -32,11 +33,11 @@ pub struct Recorder {
 }
 
 impl Recorder {
-    /// On the environment of [`PythonEnvironments::start_recording`]; `on_steps` is told after each
-    /// segment how many steps its episode has.
+    /// Creates a recorder for an environment of [`PythonEnvironments::start_recording`]. `on_steps`
+    /// is called after each segment with the number of steps of the episode.
     ///
     /// # Errors
-    /// If the policy does not fit it, or it cannot tell its joints.
+    /// If the policy does not fit the environment, or its joints cannot be read.
     pub fn new(
         config: &ExperimentConfig,
         environment: PythonEnvironments,
@@ -47,13 +48,13 @@ impl Recorder {
         Ok(Self { evaluator, joints, goal_in_pictures })
     }
 
-    /// The robot's.
+    /// Joints of the robot.
     #[must_use]
     pub fn joints(&self) -> &Joints {
         &self.joints
     }
 
-    /// What the goal looks like in a picture; empty if nobody knows.
+    /// Description of the goal's appearance in pictures; empty if unknown.
     #[must_use]
     pub fn goal_in_pictures(&self) -> &str {
         &self.goal_in_pictures
@@ -65,12 +66,12 @@ impl Recorder {
         self.evaluator.policy()
     }
 
-    /// One line about each failure of the environment since the last call.
+    /// Returns one line for each failure of the environment since the last call.
     pub fn take_failures(&mut self) -> Vec<String> {
         self.evaluator.take_failures()
     }
 
-    /// Runs the episode of a seed; none if a stop was asked for.
+    /// Runs the episode of a seed; returns `None` if a stop was requested.
     ///
     /// # Errors
     /// As [`Evaluator::evaluate`].

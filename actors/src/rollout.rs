@@ -1,7 +1,7 @@
-//! Stage 3 of 8: newest policy, observe, decide a segment, step the environments, send.
+//! Stage 3 of 8, the rollout: observes, decides a segment, steps the environments, delivers.
 //!
-//! One call into Python a segment for all E environments; between two calls everything is Rust on
-//! buffers made once.
+//! Called by the worker's loop. A segment takes one call into Python for all E environments; the
+//! rest is Rust on buffers that are allocated once.
 
 use dmprl_shared::config::ExperimentConfig;
 use dmprl_shared::parameters::ParameterSnapshot;
@@ -25,69 +25,69 @@ pub enum RolloutError {
     /// The policy does not fit the environment.
     #[error(transparent)]
     Policy(#[from] PolicyError),
-    /// The environments failed for good.
+    /// The environments failed permanently.
     #[error(transparent)]
     Python(#[from] PythonError),
-    /// One of them fails again and again.
+    /// One environment has failed more often than `actors.env_failures_max`.
     #[error(
         "environment {env_index} has failed {count} times without completing an episode, more \
          often than actors.env_failures_max; the last time: {cause}"
     )]
     FailureBudgetExceeded {
-        /// Which environment of the worker.
+        /// Index of the environment in the worker.
         env_index: usize,
-        /// Failures since its last completed episode, or a thousand sound segments.
+        /// Failures since its last completed episode or its last thousand sound segments.
         count: u32,
-        /// The last of them.
+        /// The last failure.
         cause: String,
     },
-    /// An episode of an evaluation failed, and failed again.
+    /// An episode of an evaluation failed twice.
     #[error("the episode of seed {seed} has failed {count} times; the last time: {cause}")]
     Episode {
-        /// The seed that it is reset with.
+        /// Seed of its reset.
         seed: u64,
-        /// How often.
+        /// Number of failures.
         count: u32,
         /// The last failure.
         cause: String,
     },
 }
 
-/// Takes a finished segment and keeps it until the learner has it.
+/// Takes a finished segment and keeps it until the learner has acknowledged it.
 pub type Deliver<'a, E> = &'a mut dyn FnMut(&SegmentHeader, &[f32]) -> Result<(), E>;
 
-/// Who this worker is.
+/// Identity of one start of a worker.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Identity {
-    /// The run.
+    /// Run id.
     pub run_id: u64,
-    /// The worker's slot.
+    /// Slot of the worker.
     pub worker_id: u32,
-    /// Counts the starts of this slot.
+    /// Number of the start of this slot, from 0.
     pub incarnation: u32,
-    /// Which of the whole run's workers it is: a host that has no learner numbers its own from 0,
-    /// and no two workers may draw the same random numbers.
+    /// Index of the worker in the whole run, for its random numbers. A host without a learner
+    /// numbers its slots from 0, but no two workers may draw the same numbers.
     pub seed_index: u32,
 }
 
 impl Identity {
-    /// Number of this start's random streams: no two starts of workers of a run share one.
+    /// Number of this start's random streams. No two starts of workers of a run share one.
     #[must_use]
     pub fn stream(&self) -> u64 {
         u64::from(self.seed_index) << 32 | u64::from(self.incarnation)
     }
 }
 
-/// What the header of a segment says beside who made it.
+/// The part of a segment's header that describes its content.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) struct SegmentMeta {
-    /// As in the header.
+    /// Flags, as in the header.
     pub(crate) flags: u32,
     /// Version of the policy that acted.
     pub(crate) policy_version: u64,
-    /// Steps of the episode before it.
+    /// Number of steps of the episode before the segment.
     pub(crate) episode_step: u32,
-    /// Steps, 1 to K.
+    /// Number of steps, 1 to K.
     pub(crate) steps: usize,
 }
 
@@ -97,7 +97,7 @@ struct Episode {
     steps: u32,
 }
 
-/// A rollout worker.
+/// A worker's environments, policy and exploration.
 pub struct Rollout {
     identity: Identity,
     warm_up_steps: u64,
@@ -107,22 +107,22 @@ pub struct Rollout {
     episodes: Vec<Episode>,
     faults: Faults,
     hindsight: Option<Hindsight>,
-    /// (E,): of the first reset, and of a reset after a failure.
+    /// Seeds of the first reset and of the next reset after a failure, (E,).
     env_seeds: Vec<u64>,
     new_seeds: Vec<u64>,
     segment: Segment,
     sequence: u64,
-    /// Version of the policy that `acting` has taken over.
+    /// Version of the policy that `runner` has loaded.
     loaded_version: u64,
-    /// The newest policy; version 0 until the first one has come.
+    /// The newest policy; version 0 until the first one arrives.
     pub snapshot: ParameterSnapshot,
 }
 
 impl Rollout {
-    /// Resets the environments, each with a seed of its own.
+    /// Creates the policy and resets the environments, each with its own seed.
     ///
     /// # Errors
-    /// If policy or environments cannot be made.
+    /// If the policy does not fit the environments, or a reset fails.
     pub fn start(
         config: &ExperimentConfig,
         mut environments: PythonEnvironments,
@@ -131,7 +131,7 @@ impl Rollout {
         let envs = config.actors.envs_per_worker;
         let policy = Policy::new(config, environments.spec())?;
         let layout = policy.layout();
-        // A restarted worker continues no episode, and must not repeat those of its predecessor.
+        // A restarted worker begins new episodes, which must differ from its predecessor's.
         let worker = identity.stream();
         let random = seeds::stream(config.run.seed, "exploration", worker);
         let env_seeds = environment_seeds(config.run.seed, worker, envs);
@@ -169,14 +169,14 @@ impl Rollout {
         &self.runner.policy
     }
 
-    /// Decides and runs one segment in every environment with `self.snapshot`, and hands each
-    /// segment to `deliver`, which keeps it until the learner has it.
+    /// Decides and runs one segment in every environment with `self.snapshot`, and passes each
+    /// segment to `deliver`.
     ///
-    /// A failed environment's segment is not delivered, so the sequence has no gap for it; its
-    /// next episode begins with the next call. [`Rollout::take_failures`] tells of it.
+    /// A failed environment's segment is not delivered and uses no sequence number. Its next
+    /// episode begins with the next call. [`Rollout::take_failures`] returns the failure.
     ///
     /// # Errors
-    /// If an environment fails for good or too often, or whatever `deliver` returns.
+    /// If an environment fails permanently or too often, and errors of `deliver`.
     pub fn segment<E: From<RolloutError>>(&mut self, deliver: Deliver<'_, E>) -> Result<(), E> {
         self.runner.observe(&self.environments);
         let warming_up = self.snapshot.version == 0 || self.snapshot.env_steps < self.warm_up_steps;
@@ -206,19 +206,18 @@ impl Rollout {
                 self.begin_episode(env);
             }
         }
-        // Last: what the others did is sound, and delivered.
+        // Last, because the segments of the other environments are valid.
         if failed { Ok(self.reset_failed()?) } else { Ok(()) }
     }
 
-    /// Segments that one call may deliver.
+    /// Maximum number of segments that one call delivers.
     #[must_use]
     pub fn segments_max(&self) -> usize {
         let copies = self.hindsight.as_ref().map_or(0, Hindsight::copies_max);
         self.episodes.len() * (1 + copies)
     }
 
-    /// The episode of environment `env` is over: hands on its copies with other goals, if it
-    /// makes any.
+    /// Delivers the hindsight copies of environment `env`'s episode, which has ended.
     fn deliver_copies<E: From<RolloutError>>(
         &mut self,
         env: usize,
@@ -236,12 +235,12 @@ impl Rollout {
         Ok(())
     }
 
-    /// One line about each failure of an environment since the last call.
+    /// Returns one line for each failure of an environment since the last call.
     pub fn take_failures(&mut self) -> Vec<String> {
         self.faults.take()
     }
 
-    /// Resets the failed environments that cannot go on as they are.
+    /// Resets the failed environments that cannot continue.
     fn reset_failed(&mut self) -> Result<(), RolloutError> {
         if let Some(FailureBudgetExceeded { env_index, count, cause }) =
             self.faults.budget_exceeded()
@@ -268,7 +267,7 @@ impl Rollout {
         self.episodes[env] = Episode { number: self.episodes[env].number + 1, steps: 0 };
     }
 
-    /// Fills `self.segment` with what environment `env` has just done.
+    /// Fills `self.segment` with the last segment of environment `env`.
     fn record(&mut self, env: usize, policy_version: u64) -> Result<(), RolloutError> {
         let steps = self.environments.steps()[env] as usize;
         self.fill_block(env, steps);
@@ -294,7 +293,7 @@ impl Rollout {
         Ok(())
     }
 
-    /// Numbers the segment whose block is written, and says what it is.
+    /// Writes the header of the segment whose block is complete.
     fn write_header(&mut self, env: usize, meta: SegmentMeta) {
         let layout = self.runner.policy.layout();
         self.sequence += 1;
@@ -343,7 +342,7 @@ impl Rollout {
     }
 }
 
-/// One seed for each environment of a worker, 31 bits: some environments take no more.
+/// One seed for each environment of a worker. 31 bits, because some environments accept no more.
 fn environment_seeds(master: u64, worker: u64, envs: usize) -> Vec<u64> {
     let seed = |env| seeds::derive(master, "environment", worker << 16 | env) >> 33;
     (0..envs as u64).map(seed).collect()
@@ -354,7 +353,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn every_environment_of_every_worker_and_restart_has_a_seed_of_its_own() {
+    fn environments_of_all_workers_and_restarts_have_distinct_seeds() {
         let workers = (0..16_u64).flat_map(|id| (0..4).map(move |start| id << 32 | start));
         let all: Vec<u64> = workers.flat_map(|worker| environment_seeds(1, worker, 16)).collect();
         let distinct: std::collections::HashSet<_> = all.iter().collect();

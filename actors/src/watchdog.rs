@@ -1,21 +1,21 @@
-//! Notices a call into the environments that does not return.
+//! Stage 3 of 8, the watchdog: detects a call into the environments that does not return.
 //!
-//! An environment that hangs may hold the interpreter's lock for ever, so nothing that needs the
-//! lock can notice it and no exception can end it. This thread needs nothing of Python: the caller
-//! notes when a call begins and ends, and the thread looks now and then whether it is still the
-//! same one.
+//! A hanging environment may hold the interpreter's lock forever, so code that needs the lock cannot
+//! detect it, and no exception can end it. This thread does not use Python: the caller records when
+//! a call begins and ends, and the thread checks periodically whether the same call still runs.
+//! Started by `environments::watch`.
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::thread;
 use std::time::Duration;
 
-/// Looks at one call, a pause between each two, before it counts as hanging. Looks are counted and
-/// no clock is read: while the whole process stands still (Ctrl-Z, a paused container) one pause
-/// passes at most.
+/// Number of checks, with a pause between them, after which a call counts as hanging. The thread
+/// counts checks and reads no clock, so a process that was suspended (Ctrl-Z, a paused container)
+/// does not look as if it hung.
 const LOOKS_MAX: u32 = 4;
 
-/// What a call asks for.
+/// Kind of a call.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum CallKind {
     /// `reset`.
@@ -38,25 +38,25 @@ impl CallKind {
     }
 }
 
-/// The call that is under way: its number and, in the two lowest bits, its kind or none. One thread
-/// makes the calls.
+/// The current call: its number and, in the two lowest bits, its kind or 0. One thread makes all
+/// calls.
 #[derive(Debug, Default)]
 pub struct CallState(AtomicU64);
 
-/// A call; dropped, it has returned.
+/// A call that is running; dropping it records that the call has returned.
 #[derive(Debug)]
 pub struct RunningCall<'a>(&'a CallState);
 
 impl CallState {
-    /// Notes that a call begins.
+    /// Records that a call begins.
     pub fn enter(&self, kind: CallKind) -> RunningCall<'_> {
-        // The thread compares numbers and reads no other memory: no order is needed.
+        // Relaxed, because the thread reads no other memory.
         let number = (self.0.load(Ordering::Relaxed) >> 2) + 1;
         self.0.store(number << 2 | kind as u64, Ordering::Relaxed);
         RunningCall(self)
     }
 
-    /// Whether a call is under way.
+    /// Returns true if a call is running.
     #[must_use]
     pub fn is_running(&self) -> bool {
         self.0.load(Ordering::Relaxed) & 3 != 0
@@ -73,17 +73,17 @@ impl Drop for RunningCall<'_> {
 /// A call that does not return.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Hang {
-    /// What it was to do.
+    /// Kind of the call.
     pub kind: CallKind,
-    /// It has lasted so long at least.
+    /// Minimum time that it has lasted.
     pub lasted: Duration,
 }
 
-/// Starts the thread. It calls `hung` once, when a call has lasted for `timeout` or up to a quarter
-/// longer, and ends when nobody makes calls any more.
+/// Starts the thread. It calls `hung` once, after a call has lasted for `timeout` to 1.25 `timeout`.
+/// It ends when `calls` is dropped.
 ///
 /// # Errors
-/// The thread cannot be started.
+/// If the thread cannot be started.
 pub fn watch(
     calls: &Arc<CallState>,
     timeout: Duration,
@@ -105,7 +105,7 @@ pub fn watch(
     thread.spawn(run).map(drop)
 }
 
-/// The state seen last, and how often since it was new.
+/// The last state, and the number of checks since it changed.
 #[derive(Debug, Default)]
 struct Looks {
     state: u64,
@@ -113,7 +113,7 @@ struct Looks {
 }
 
 impl Looks {
-    /// The kind of a call that hangs.
+    /// Checks the state; returns the kind of a call that hangs.
     fn look(&mut self, state: u64) -> Option<CallKind> {
         let kind = match state & 3 {
             1 => CallKind::Reset,
@@ -138,12 +138,12 @@ mod tests {
     const PATIENCE: Duration = Duration::from_secs(60);
 
     #[test]
-    fn a_call_that_stays_the_same_hangs_and_one_that_is_followed_by_another_does_not() {
+    fn a_call_hangs_if_it_stays_the_same_and_not_if_another_follows() {
         let calls = CallState::default();
         let mut looks = Looks::default();
         let mut look = || looks.look(calls.0.load(Ordering::Relaxed));
         for _ in 0..10 {
-            assert_eq!(look(), None, "no call is under way");
+            assert_eq!(look(), None, "no call is running");
         }
         for _ in 0..10 {
             let call = calls.enter(CallKind::StepSegment);
@@ -151,7 +151,7 @@ mod tests {
             assert_eq!(seen, [None; LOOKS_MAX as usize], "it returns in time");
             drop(call);
         }
-        // `relabel` was once not looked at: a reward that never returned held its worker for ever.
+        // `relabel` was once not watched: a reward that never returned blocked its worker forever.
         for kind in [CallKind::Reset, CallKind::StepSegment, CallKind::Relabel] {
             let _call = calls.enter(kind);
             assert_eq!((0..LOOKS_MAX).filter_map(|_| look()).count(), 0);
@@ -160,7 +160,7 @@ mod tests {
     }
 
     #[test]
-    fn the_thread_tells_of_a_call_that_does_not_return() {
+    fn the_thread_reports_a_call_that_does_not_return() {
         let calls = Arc::new(CallState::default());
         let (sender, hangs) = mpsc::channel();
         let timeout = Duration::from_millis(40);
@@ -171,12 +171,12 @@ mod tests {
     }
 
     #[test]
-    fn the_thread_ends_with_what_it_watches() {
+    fn the_thread_ends_when_the_call_state_is_dropped() {
         let calls = Arc::new(CallState::default());
         let (sender, ended) = mpsc::channel::<()>();
         watch(&calls, Duration::from_millis(4), move |_| drop(sender)).unwrap();
         drop(calls);
-        // Its end drops the closure, and with it the sender.
+        // The thread drops the closure, and with it the sender.
         assert_eq!(ended.recv_timeout(PATIENCE), Err(mpsc::RecvTimeoutError::Disconnected));
     }
 }

@@ -1,9 +1,9 @@
-//! Stage 3 of 8, its loop: a worker's life, from its environments to its last report.
+//! Stage 3 of 8, the worker's loop, from its environments to its last report.
 //!
-//! The program around it reads the arguments, opens the conversation with the supervisor and makes
-//! the environments ([`environments()`]). [`run`] does the rest: it reports the environments, waits
-//! for the learner, then takes the newest policy, runs one segment in each environment and delivers
-//! it, until a stop is requested.
+//! The program `dmprl` reads the arguments, connects to the supervisor and makes the environments
+//! ([`environments()`]). [`run`] does the rest: it reports the environments, waits for the learner,
+//! then takes the newest policy, runs one segment in each environment and delivers it, until a stop
+//! is requested.
 
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
@@ -21,7 +21,7 @@ use crate::environments::{self, EnvironmentsError};
 use crate::python_env::{Interpreter, PythonEnvironments};
 use crate::rollout::{Identity, Rollout, RolloutError};
 
-/// Maximum wait for acknowledgements of a worker that leaves a run that goes on.
+/// Maximum wait for acknowledgements when a worker leaves a run that continues.
 const HAND_OVER_LIMIT: Duration = Duration::from_secs(5);
 
 /// Why a worker ended early.
@@ -36,7 +36,7 @@ pub enum WorkerError {
     /// The supervisor is gone.
     #[error(transparent)]
     Report(#[from] ReportError),
-    /// The learner is there, but has nothing to act with.
+    /// The learner runs, but has not published a policy.
     #[error("worker {index}: the learner published no policy within {ATTACH_LIMIT:?}")]
     NoPolicy {
         /// The worker.
@@ -46,23 +46,23 @@ pub enum WorkerError {
 
 /// One worker of a run.
 pub struct Worker<'a> {
-    /// The experiment.
+    /// The run's configuration.
     pub config: &'a ExperimentConfig,
     /// Which worker of which run it is.
     pub identity: Identity,
     /// Its environments, made by [`environments()`].
     pub environments: PythonEnvironments,
-    /// Called for everything that is produced, acknowledged or taken over.
+    /// Called synchronously at each event of its delivery.
     pub observer: Option<DeliveryObserver>,
     /// Set for a worker that a user started beside a running training.
     pub joined: Option<JoinedWorker<'a>>,
 }
 
-/// What differs for a worker that joined a run.
+/// Connections of a worker that joined a run to the program that a user started.
 pub struct JoinedWorker<'a> {
-    /// Set once the worker was asked to leave a run that goes on.
+    /// Set once the user has asked the worker to leave the run.
     pub leaving: &'a AtomicBool,
-    /// Called about once a second with what was sent so far.
+    /// Called about once per second with the counts so far.
     pub report_sent: &'a dyn Fn(Sent),
 }
 
@@ -88,7 +88,7 @@ pub fn environments(
 /// requested first; in the program it is [`crate::delivery::await_learner`].
 ///
 /// # Errors
-/// Whatever keeps the worker from going on; a new process may help.
+/// If the environments, the transport or the supervisor fail. A new process may succeed.
 pub fn run<T: WorkerTransport>(
     worker: Worker<'_>,
     supervisor: &dyn Supervisor,
@@ -146,8 +146,8 @@ fn work<T: WorkerTransport>(
     Ok(())
 }
 
-/// Random exploration hardly ever reaches the goal of a sparse reward: names the setting that
-/// helps, where it can be used.
+/// Warns that random exploration rarely reaches the goal of a sparse reward, and names the setting
+/// that helps.
 fn hint_at_hindsight(
     config: &ExperimentConfig,
     environments: &PythonEnvironments,

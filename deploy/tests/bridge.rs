@@ -1,6 +1,6 @@
-//! Relay and gateway between real shared memory, over real Zenoh on loopback, while each of the
-//! three ends is replaced again and again: everything arrives, once, in order.
-#![allow(clippy::unwrap_used)] // helpers of tests fail as tests do
+//! Relay and gateway over shared memory and Zenoh on loopback, while learner, gateway and relay are
+//! replaced repeatedly: every segment arrives once and in order.
+#![allow(clippy::unwrap_used)] // a helper that panics fails its test
 
 use std::net::TcpListener;
 use std::path::{Path, PathBuf};
@@ -29,16 +29,16 @@ use dmprl_shared::transport::{
 };
 
 const PATIENCE: Duration = Duration::from_secs(120);
-/// Between two looks at a condition.
+/// Interval between two checks of a condition.
 const POLL: Duration = Duration::from_millis(1);
 const WORKERS: usize = 3;
 const SEGMENTS: u64 = 20_000;
-/// Workers of the learner's own host come first.
+/// Index of the first worker of another host.
 const FIRST: usize = 1;
 const ARCHITECTURE: u64 = 9;
 const LAYOUT: SegmentLayout =
     SegmentLayout { segment_steps: 5, observation_len: 20, action_len: 4 };
-/// What an end keeps of each worker.
+/// Maximum number of retained segments of each worker.
 const KEPT: usize = 512;
 
 /// An unused endpoint on loopback.
@@ -61,19 +61,19 @@ fn join_settings(endpoint: &str, workers: usize) -> JoinSettings {
     JoinSettings { endpoint, token, host: 1, name: "b".into(), workers: workers as u32 }
 }
 
-/// What everybody shares.
+/// State shared by all threads.
 struct Stage {
     layout: SegmentLayout,
-    /// Of the other host, and how many segments each of them sends.
+    /// Number of workers of the other host, and of segments that each of them sends.
     workers: usize,
     segments: u64,
     over: AtomicBool,
     settled: AtomicU64,
     gaps: AtomicU64,
     refused: AtomicU64,
-    /// LinkMode that were replaced.
+    /// Number of replacements so far.
     replaced: AtomicU64,
-    /// How often each end is to be replaced in all: grows as the test goes on.
+    /// Requested number of replacements of learner, gateway and relay; it grows during the test.
     replacements: [AtomicU64; 3],
 }
 
@@ -103,7 +103,7 @@ impl Stage {
         }
     }
 
-    /// The learner's.
+    /// The learner's plan.
     fn whole_plan(&self) -> Plan {
         self.plan(FIRST + self.workers)
     }
@@ -112,7 +112,7 @@ impl Stage {
         self.over.load(Ordering::Acquire)
     }
 
-    /// Whether the end that was begun `times` times is to be replaced now.
+    /// Returns true if the end that was started `times` times must be replaced now.
     fn is_replaced(&self, end: usize, times: u64) -> bool {
         self.replacements[end].load(Ordering::Acquire) >= times
     }
@@ -126,7 +126,7 @@ impl Stage {
     }
 }
 
-/// A learner that remembers what it has settled, as one with a segment log does.
+/// A learner that keeps its inbox when it is replaced, like one with a segment log.
 fn learner(stage: &Stage, domain: PathBuf) {
     let mut inbox = Inbox::new(FIRST + stage.workers);
     let mut version = 0;
@@ -232,8 +232,8 @@ fn relay(stage: &Stage, domain: PathBuf, endpoint: String) {
     }
 }
 
-/// A worker that sends as fast as it may, until the learner has acknowledged all of it; returns the
-/// newest policy that it has seen.
+/// A worker that sends as fast as possible until the learner has acknowledged all segments. Returns
+/// the version of its newest policy.
 fn worker(stage: &Stage, index: u32, domain: PathBuf) -> u64 {
     let deadline = Instant::now() + PATIENCE;
     let mut end = loop {
@@ -272,7 +272,7 @@ fn worker(stage: &Stage, index: u32, domain: PathBuf) -> u64 {
     snapshot.version
 }
 
-/// Learner, gateway and relay, then workers, each on a thread.
+/// Threads of learner, gateway and relay.
 type Replaced = [thread::JoinHandle<()>; 3];
 
 fn start(stage: &Arc<Stage>, domains: &[Domain; 2]) -> (Replaced, Vec<thread::JoinHandle<u64>>) {
@@ -298,7 +298,7 @@ fn two_domains(folder: &std::path::Path) -> [Domain; 2] {
     ["a", "b"].map(|name| Domain::create(&folder.join("p"), name).unwrap())
 }
 
-/// Longer than the window is at first: it once was never opened for the first of them.
+/// Regression test: a segment longer than the initial window was once never sent.
 #[test]
 fn segments_of_any_length_arrive() {
     let layout = SegmentLayout { segment_steps: 5, observation_len: 5_000, action_len: 4 };
@@ -316,7 +316,7 @@ fn segments_of_any_length_arrive() {
 }
 
 #[test]
-fn all_arrives_once_and_in_order_while_learner_gateway_and_relay_are_replaced() {
+fn segments_arrive_once_and_in_order_while_processes_are_replaced() {
     let folder = tempfile::tempdir().unwrap();
     let domains = two_domains(folder.path());
     let stage = Stage::new(LAYOUT, WORKERS, SEGMENTS);

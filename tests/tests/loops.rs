@@ -139,7 +139,7 @@ fn a_worker_refuses_a_foreign_policy_with_one_warning_a_look_and_waits_for_the_n
     assert_eq!(sequences, Vec::<u64>::new());
     let warnings = supervisor.warnings();
     assert_eq!(warnings.len(), 2, "{warnings:?}");
-    assert!(warnings[0].contains("worker 0 refused a policy snapshot"), "{warnings:?}");
+    assert!(warnings[0].contains("worker 0 rejected a policy snapshot"), "{warnings:?}");
 }
 
 #[test]

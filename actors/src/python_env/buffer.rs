@@ -1,4 +1,4 @@
-//! An array that Python allocated and Rust sees too.
+//! Arrays that Python allocates and Rust reads and writes.
 
 use std::ptr::NonNull;
 
@@ -9,14 +9,14 @@ use pyo3::{
 
 use super::PythonError;
 
-/// A C-contiguous array behind the buffer protocol.
+/// A C-contiguous array, accessed through the buffer protocol.
 ///
-/// The protocol rather than the `numpy` crate: the standard library of Python defines it, pyo3
-/// checks type and layout, and one dependency less has to follow pyo3's versions.
+/// The protocol is part of Python, and pyo3 checks type and layout. The `numpy` crate would be
+/// another dependency that must follow pyo3's versions.
 ///
-/// Holding the buffer forbids Python to move or resize its memory, so the pointer taken once stays
-/// valid. Python writes only inside the calls that [`super::PythonEnvironments`] makes, all through
-/// `&mut self`; the slices borrow it, so none is alive meanwhile.
+/// While the buffer is held, Python cannot move or resize the memory, so the pointer stays valid.
+/// Python writes only during the calls of [`super::PythonEnvironments`], which take `&mut self`.
+/// The slices borrow from it, so no slice exists during a call.
 pub(super) struct SharedBuffer<T> {
     slice: NonNull<[T]>,
     _owner: PyBuffer<T>,
@@ -29,7 +29,7 @@ unsafe impl<T: Send> Send for SharedBuffer<T> {}
 unsafe impl<T: Sync> Sync for SharedBuffer<T> {}
 
 impl<T: Element> SharedBuffer<T> {
-    /// Takes hold of the attribute `name` of `buffers`, which must have `len` elements.
+    /// Acquires the buffer of attribute `name` of `buffers`, which must have `len` elements.
     pub(super) fn new(
         buffers: &Bound<'_, PyAny>,
         name: &'static str,

@@ -1,4 +1,4 @@
-//! E environments of one task: one Python call per segment.
+//! E environments of one task, stepped by one Python call per segment.
 
 use std::sync::Arc;
 
@@ -12,14 +12,14 @@ use crate::watchdog::{CallKind, CallState};
 pub const SUCCESS_NO: u8 = 0;
 /// The environment reported success at the last step run.
 pub const SUCCESS_YES: u8 = 1;
-/// The environment does not say whether it succeeded.
+/// The environment does not report success.
 pub const SUCCESS_NOT_REPORTED: u8 = 2;
 
-/// The environments of a worker (`SegmentEnv` of `envs_py`), E of them, K steps a segment.
+/// E environments (`SegmentEnv` of `envs_py`) with K steps per segment.
 ///
-/// Slices are in C order, of the shape named at each. They show the last call's results and are
-/// valid until the next call, which the borrow checker enforces. After an error the environments'
-/// state is undefined: reset all of them or end the process.
+/// Slices are in C order; each method names the shape. They hold the results of the last call and
+/// are valid until the next call, which the borrow checker enforces. After an error the state of
+/// the environments is undefined: reset all of them or end the process.
 pub struct PythonEnvironments {
     spec: EnvSpec,
     segment_steps: usize,
@@ -40,7 +40,8 @@ pub struct PythonEnvironments {
     next_observations: SharedBuffer<f64>,
 }
 
-/// A bound method and its arguments, built once: the arrays stay the same, their content changes.
+/// A bound method and its arguments. They are built once, because only the content of the arrays
+/// changes.
 pub(super) struct Call {
     method: Py<PyAny>,
     arguments: Py<PyTuple>,
@@ -71,13 +72,12 @@ impl Call {
 }
 
 impl PythonEnvironments {
-    /// Makes the environments of `task_id` (a Gymnasium id, `module:Id` or `module:Class`); they
-    /// must be reset before the first step.
+    /// Makes environments of `task_id` (a Gymnasium id, `module:Id` or `module:Class`). They must be
+    /// reset before the first step.
     ///
     /// # Errors
-    /// `Exception` with Gymnasium's own words for an unknown id (and its suggestion) or a space
-    /// that is not supported; `Spec` for bounds that cannot be used; `Interface` or `Length` when
-    /// the installed package does not fit.
+    /// `Exception` with Gymnasium's message for an unknown id or an unsupported space, `Spec` for
+    /// unusable bounds, `Interface` or `Length` if the installed package does not fit.
     pub fn start(
         _interpreter: &Interpreter,
         task_id: &str,
@@ -90,7 +90,7 @@ impl PythonEnvironments {
         })
     }
 
-    /// The environments that `make` makes.
+    /// Connects to the `SegmentEnv` that `make` returns.
     pub(super) fn start_with(
         env_count: usize,
         segment_steps: usize,
@@ -144,16 +144,16 @@ impl PythonEnvironments {
         })
     }
 
-    /// Sizes, bounds and timing.
+    /// Sizes, bounds and timing of an environment.
     pub fn spec(&self) -> &EnvSpec {
         &self.spec
     }
 
-    /// Starts a new episode in every environment with `mask[e]`, from `seeds[e]`. Writes the rows
-    /// of [`Self::next_observations`].
+    /// Starts a new episode, with seed `seeds[e]`, in every environment with `mask[e]`, and updates
+    /// its row of [`Self::next_observations`].
     ///
     /// # Errors
-    /// `Length` if an argument has not E entries; `Exception` from an environment.
+    /// `Length` if an argument does not have E entries; `Exception` if an environment raises.
     pub fn reset(&mut self, mask: &[bool], seeds: &[u64]) -> Result<(), PythonError> {
         self.check_len("mask", mask.len(), self.mask.get().len())?;
         self.check_len("seeds", seeds.len(), self.mask.get().len())?;
@@ -165,12 +165,13 @@ impl PythonEnvironments {
         self.reset.run()
     }
 
-    /// Runs `actions` (E, K, A), in environment units; an environment stops at the end of its
-    /// episode, and has begun its next one when this returns (see [`Self::next_observations`]).
+    /// Runs `actions` (E, K, A), in environment units. An environment stops at the end of its
+    /// episode and begins the next one before this returns (see [`Self::next_observations`]).
+    /// [`Self::failed`] marks environments that failed and were made again.
     ///
     /// # Errors
-    /// `Length`, `ActionNotFinite`, or `Exception` naming environment and step when one could not
-    /// be made again after a failure. Of failures that were made up for, [`Self::failed`] tells.
+    /// `Length`, `ActionNotFinite`, or `Exception` with environment and step if an environment
+    /// could not be made again after a failure.
     pub fn step_segment(&mut self, actions: &[f64]) -> Result<(), PythonError> {
         self.check_len("actions", actions.len(), self.actions.get().len())?;
         if let Some(index) = actions.iter().position(|action| !action.is_finite()) {
@@ -188,7 +189,7 @@ impl PythonEnvironments {
         drop(call);
         let steps_max = self.segment_steps;
         for (&steps, &failed) in self.steps.get().iter().zip(self.failed.get()) {
-            // A foreign SegmentEnv may be wrong, and `steps` becomes an index.
+            // A user's `SegmentEnv` may be wrong, and `steps` is used as an index.
             if failed != 0
                 || usize::try_from(steps).is_ok_and(|steps| (1..=steps_max).contains(&steps))
             {
@@ -203,15 +204,15 @@ impl PythonEnvironments {
         Ok(())
     }
 
-    /// What a [`crate::watchdog`] looks at.
+    /// State of the current call, for [`crate::watchdog`].
     pub fn calls(&self) -> &Arc<CallState> {
         &self.calls
     }
 
-    /// Sentences about the failures since the last call, each with environment, step and cause.
+    /// Descriptions of the failures since the last call, with environment, step and cause.
     ///
     /// # Errors
-    /// `Exception` from a foreign `SegmentEnv`.
+    /// `Exception` if a user's `SegmentEnv` raises.
     pub fn take_failures(&mut self) -> Result<Vec<String>, PythonError> {
         Python::attach(|py| {
             let told = self.env.bind(py).call_method0("take_failures");
@@ -220,43 +221,43 @@ impl PythonEnvironments {
         })
     }
 
-    /// (E, K+1, O): row k preceded step k; row `steps` followed the last step really run.
+    /// Observations, (E, K+1, O). Row k precedes step k, and row `steps` follows the last step run.
     pub fn observations(&self) -> &[f64] {
         self.observations.get()
     }
 
-    /// (E, K): zero from `steps` on.
+    /// Rewards, (E, K); zero from `steps` on.
     pub fn rewards(&self) -> &[f64] {
         self.rewards.get()
     }
 
-    /// (E,): 1 where the episode ended by the task's own rule.
+    /// 1 where the task's own rule ended the episode, (E,).
     pub fn terminated(&self) -> &[u8] {
         self.terminated.get()
     }
 
-    /// (E,): 1 where it ended by a time limit.
+    /// 1 where a time limit ended the episode, (E,).
     pub fn truncated(&self) -> &[u8] {
         self.truncated.get()
     }
 
-    /// (E,): [`SUCCESS_NO`], [`SUCCESS_YES`] or [`SUCCESS_NOT_REPORTED`] at the last step run.
+    /// [`SUCCESS_NO`], [`SUCCESS_YES`] or [`SUCCESS_NOT_REPORTED`] at the last step run, (E,).
     pub fn success(&self) -> &[u8] {
         self.success.get()
     }
 
-    /// (E,): 1 where the environment failed in the last segment and was made again: its other
-    /// rows mean nothing, and its next observation begins an episode.
+    /// 1 where the environment failed in the last segment and was made again, (E,). Its other rows
+    /// are meaningless, and its next observation begins an episode.
     pub fn failed(&self) -> &[u8] {
         self.failed.get()
     }
 
-    /// (E,): steps really run, 1 to K.
+    /// Number of steps run, 1 to K, (E,).
     pub fn steps(&self) -> &[i32] {
         self.steps.get()
     }
 
-    /// (E, O): what to act on next: the new episode's first observation where one ended.
+    /// Observations for the next actions, (E, O). Where an episode ended, the first of the next.
     pub fn next_observations(&self) -> &[f64] {
         self.next_observations.get()
     }

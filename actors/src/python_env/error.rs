@@ -1,4 +1,4 @@
-//! What can go wrong between Rust and Python.
+//! Errors of the interpreter and the environments.
 
 use std::path::PathBuf;
 
@@ -6,19 +6,19 @@ use dmprl_shared::spec::SpecError;
 use pyo3::{prelude::*, types::PyTracebackMethods};
 use thiserror::Error;
 
-/// Lines of a traceback that are kept: the innermost frames and the exception's own line.
+/// Maximum number of lines of a traceback: the innermost frames and the exception's own line.
 const TRACEBACK_LINES_MAX: usize = 12;
 
-/// Why the interpreter or an environment could not do what was asked.
+/// Why the interpreter or an environment failed.
 #[derive(Debug, Error)]
 pub enum PythonError {
     /// `.venv` has no interpreter.
-    #[error("{} does not exist; it is made by the first `train`", executable.display())]
+    #[error("{} does not exist; the first `train` creates it", executable.display())]
     NoVenv {
-        /// The interpreter that was looked for.
+        /// Expected path of the interpreter.
         executable: PathBuf,
     },
-    /// The libpython that was loaded is not the linked one.
+    /// The loaded libpython is not the linked one.
     #[error(
         "this program was built for Python {expected} but loaded Python {got}. Is LD_LIBRARY_PATH \
          set? If the Python of this machine was upgraded, build again"
@@ -29,7 +29,7 @@ pub enum PythonError {
         /// `sys.version` of the loaded one.
         got: String,
     },
-    /// `.venv` belongs to another installation than the linked one.
+    /// `.venv` belongs to another installation than the linked libpython.
     #[error(
         "{} was made by the Python in {got}, but this program is linked against the one in \
          {expected}; remove it and start again", venv.display()
@@ -39,85 +39,86 @@ pub enum PythonError {
         venv: PathBuf,
         /// `sys.base_prefix` of the linked Python.
         expected: String,
-        /// `sys.base_prefix` as found.
+        /// `sys.base_prefix` of the virtual environment.
         got: String,
     },
-    /// CPython refused to start.
-    #[error("Python does not start ({function}): {message}")]
+    /// CPython could not be initialised.
+    #[error("cannot start Python ({function}): {message}")]
     Initialise {
-        /// Which function of CPython said so; empty when it does not say.
+        /// Function of CPython that failed; empty if unknown.
         function: String,
-        /// Its message.
+        /// CPython's message.
         message: String,
     },
-    /// A process has one interpreter, and it runs with other options.
-    #[error("Python already runs in this process with {running}; asked for {asked}")]
+    /// The process's only interpreter already runs with other options.
+    #[error("Python already runs in this process with {running}; requested {asked}")]
     AlreadyStarted {
-        /// Options it was started with.
+        /// Options of the running interpreter.
         running: String,
-        /// Options now asked for.
+        /// Requested options.
         asked: String,
     },
-    /// A path that cannot be handed to Python.
+    /// A path cannot be passed to Python.
     #[error("{} cannot be a Python path: {reason}", path.display())]
     Path {
         /// The path.
         path: PathBuf,
-        /// What is wrong with it.
+        /// The reason.
         reason: &'static str,
     },
-    /// Python code raised.
+    /// Python code raised an exception.
     #[error("{kind}: {message}{}", indented(traceback))]
     Exception {
         /// The exception's type.
         kind: String,
-        /// Its message; for a failing environment its id, its index and the step.
+        /// Its message; for a failed environment with id, index and step.
         message: String,
         /// The last lines of the traceback.
         traceback: Vec<String>,
     },
-    /// The environment's sizes or bounds cannot be used.
+    /// The environment's sizes or bounds are unusable.
     #[error(transparent)]
     Spec(#[from] SpecError),
-    /// An argument has another length than the environments need.
+    /// An argument or buffer has the wrong length.
     #[error("{task_id}: {name} has {got} entries, expected {expected}")]
     Length {
         /// Task.
         task_id: String,
-        /// Which argument or buffer.
+        /// Name of the argument or buffer.
         name: &'static str,
-        /// Length it must have.
+        /// Required length.
         expected: usize,
-        /// Length it has.
+        /// Actual length.
         got: usize,
     },
-    /// A policy that has diverged: MuJoCo would silently reset its state.
+    /// An action is not finite, because the policy has diverged. MuJoCo would silently reset its
+    /// state.
     #[error("{task_id}, environment {env_index}, step {step} of the segment: action is {value}")]
     ActionNotFinite {
         /// Task.
         task_id: String,
-        /// Which environment.
+        /// Index of the environment.
         env_index: usize,
-        /// Which step.
+        /// Step of the segment.
         step: usize,
         /// The value.
         value: f64,
     },
-    /// An environment that nothing is left to be done about: it was reset.
+    /// An observation is not finite after a reset.
     #[error(
-        "{task_id}, environment {env}, reset: {name} is {value}, which is no finite 32-bit number"
+        "{task_id}, environment {env}, reset: {name} is {value}, expected a finite 32-bit number"
     )]
     ObservationNotFinite {
         /// Task.
         task_id: String,
-        /// Which environment.
+        /// Index of the environment.
         env: usize,
-        /// Which entry of the observation.
+        /// Name of the entry of the observation.
         name: String,
         /// The value.
         value: f64,
     },
-    /// The environment cannot say what a goal would have been rewarded with.
+    /// The environment returned a reward for another goal that is not finite.
     #[error(
         "{task_id}: compute_reward returned {value} for goals that an episode reached; expected a \
          finite 32-bit number"
@@ -128,7 +129,7 @@ pub enum PythonError {
         /// The value.
         value: f64,
     },
-    /// Hindsight cannot be had here.
+    /// The environment does not support hindsight.
     #[error(
         "replay.hindsight needs a goal-conditioned environment: {reason}. Its observation must be \
          a Dict with two Boxes of one shape, achieved_goal and desired_goal, its method \
@@ -136,7 +137,7 @@ pub enum PythonError {
          episodes must have a time limit; without those, train with replay.hindsight = \"none\""
     )]
     NoGoals {
-        /// What is missing, in the environment's words.
+        /// The environment's message.
         reason: String,
     },
     /// The package `dmprl` in `.venv` does not fit this program.
@@ -144,15 +145,15 @@ pub enum PythonError {
     Interface {
         /// Task.
         task_id: String,
-        /// Which attribute.
+        /// Name of the attribute.
         name: &'static str,
-        /// What is wrong with it.
+        /// The reason.
         reason: String,
     },
 }
 
 impl PythonError {
-    /// Takes an exception apart while Python is at hand; the result needs no interpreter.
+    /// Converts an exception. The result can be used without the interpreter.
     pub(super) fn exception(py: Python<'_>, error: &PyErr) -> Self {
         let kind = error.get_type(py).name().map_or_else(|_| "exception".into(), |n| n.to_string());
         let message = error.value(py).str().map_or_else(|_| String::new(), |m| m.to_string());
@@ -160,8 +161,8 @@ impl PythonError {
     }
 }
 
-/// The last frames of an exception and, before them, of the one that caused it: the cause is the
-/// line in the user's environment.
+/// The last lines of a traceback: of the exception's cause if it has one, because that is in the
+/// user's environment.
 fn traceback_end(py: Python<'_>, error: &PyErr) -> Vec<String> {
     let cause = error.cause(py);
     let innermost = cause.as_ref().unwrap_or(error);

@@ -1,4 +1,4 @@
-//! Goals in an observation, and what steps with other goals would have been rewarded with.
+//! Goals in an observation, and rewards of steps for other goals.
 
 use std::sync::Arc;
 
@@ -7,20 +7,21 @@ use pyo3::prelude::*;
 use super::{PythonEnvironments, PythonError, buffer::SharedBuffer, environments::Call};
 use crate::watchdog::{CallKind, CallState};
 
-/// Where an observation holds the goal that was reached, and the one that is wanted.
+/// Positions of the achieved and the desired goal in an observation.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Goals {
-    /// First entry of the one,
+    /// First entry of the achieved goal.
     pub achieved: usize,
-    /// and of the other.
+    /// First entry of the desired goal.
     pub desired: usize,
-    /// Entries G of each.
+    /// Number of entries G of each.
     pub len: usize,
-    /// Whether the reward says no more than reached or not.
+    /// Whether the reward only tells if the goal is reached.
     pub is_sparse: bool,
 }
 
-/// Asks the environments about up to M steps in one call. The slices are shared with Python.
+/// Computes the rewards of up to M steps for other goals in one call. The slices are shared with
+/// Python.
 pub struct Relabelling {
     task_id: String,
     relabel: Call,
@@ -34,10 +35,10 @@ pub struct Relabelling {
 }
 
 impl PythonEnvironments {
-    /// Where the goals stand in an observation.
+    /// Returns the positions of the goals in an observation.
     ///
     /// # Errors
-    /// `NoGoals` with the reason if there are none, or nobody knows what they reward.
+    /// `NoGoals` with the reason if the environment has no goals or cannot compute their rewards.
     pub fn goals(&self) -> Result<Goals, PythonError> {
         let goals = Python::attach(|py| {
             let goals = self.env.bind(py).call_method0("goals");
@@ -65,10 +66,10 @@ impl PythonEnvironments {
         })
     }
 
-    /// What is needed to ask about `rows_max` steps at once, with goals of `goal_len` entries.
+    /// Creates the buffers for up to `rows_max` steps with goals of `goal_len` entries.
     ///
     /// # Errors
-    /// `Interface` or `Length` when the installed package does not fit.
+    /// `Interface` or `Length` if the installed package does not fit.
     pub fn relabelling(
         &self,
         rows_max: usize,
@@ -98,20 +99,20 @@ impl PythonEnvironments {
 }
 
 impl Relabelling {
-    /// Sets row `row`: the goal that the step reached, (G,), and the one wanted of it, (G,).
+    /// Sets row `row`: the achieved goal of the step, (G,), and the desired goal, (G,).
     ///
     /// # Panics
-    /// If the row is beyond M.
+    /// If `row` is not below M.
     pub fn set(&mut self, row: usize, achieved: &[f64], desired: &[f64]) {
         let entries = row * self.goal_len..(row + 1) * self.goal_len;
         self.achieved.get_mut()[entries.clone()].copy_from_slice(achieved);
         self.desired.get_mut()[entries].copy_from_slice(desired);
     }
 
-    /// Asks about the first `rows` rows.
+    /// Computes the rewards of the first `rows` rows.
     ///
     /// # Errors
-    /// `Exception` from the environment; `GoalRewardNotFinite`.
+    /// `Exception` if the environment raises; `GoalRewardNotFinite`.
     pub fn run(&mut self, rows: usize) -> Result<(), PythonError> {
         self.count.get_mut()[0] = rows as u64;
         let call = self.calls.enter(CallKind::Relabel);
@@ -126,12 +127,12 @@ impl Relabelling {
         }
     }
 
-    /// (M,): the rewards.
+    /// Rewards, (M,).
     pub fn rewards(&self) -> &[f64] {
         self.rewards.get()
     }
 
-    /// (M,): not 0 where the step would have ended its episode.
+    /// Not 0 where the step would have ended its episode, (M,).
     pub fn terminated(&self) -> &[u8] {
         self.terminated.get()
     }

@@ -1,4 +1,4 @@
-//! The one interpreter of this process: isolated, in the virtual environment, checked.
+//! Starts and checks the only interpreter of this process, isolated in its virtual environment.
 
 use std::{
     ffi::{CStr, CString},
@@ -12,12 +12,15 @@ use pyo3::{ffi, prelude::*, types::PyDict};
 
 use super::{LINKED_PYTHON, PythonError, loaded_python_version};
 
-/// Runs once after start. `stdout` carries the supervisor's protocol, so an environment's `print`
-/// must not reach it, nor its `input` the supervisor's commands. A BLAS pool of its own per worker
-/// would only fight with the other workers; whoever wants one sets the variable. Importing
-/// `signal`, which half of the standard library does, takes SIGINT over even where CPython was told
-/// to install no handlers, so it is imported here and SIGINT given back; a handler or an "ignore"
-/// that the role set before is left alone by CPython.
+/// Runs once after the start.
+///
+/// - `stdout` and `stdin` carry the supervisor's protocol, so `print` and `input` of an environment
+///   must not use them.
+/// - A BLAS thread pool in each worker would compete with the other workers. A user can set the
+///   variables to override this.
+/// - Importing `signal`, as much of the standard library does, installs a handler for SIGINT even
+///   if CPython is configured without signal handlers. Import it here and restore the default;
+///   CPython keeps handlers that the role has installed.
 const PREPARE: &CStr = c"\
 import os, signal, sys
 if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
@@ -31,10 +34,10 @@ base_prefix = os.path.realpath(sys.base_prefix)
 expected = os.path.realpath(expected)
 ";
 
-/// Options of the first start, which hold for the life of the process.
+/// Options of the first start, which stay valid until the process exits.
 static RUNNING: Mutex<Option<InterpreterOptions>> = Mutex::new(None);
 
-/// Where the interpreter finds its packages.
+/// Locations of the interpreter's packages.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct InterpreterOptions {
     /// The virtual environment; becomes `sys.prefix`.
@@ -44,21 +47,21 @@ pub struct InterpreterOptions {
 }
 
 /// Proof that CPython runs in this process and was checked. The calling thread does not hold the
-/// GIL. It is never shut down: NumPy and MuJoCo cannot be loaded twice in one process.
+/// GIL. CPython is never shut down, because NumPy and MuJoCo cannot be loaded twice in one process.
 #[derive(Debug, Clone, Copy)]
 pub struct Interpreter(());
 
 impl Interpreter {
-    /// Starts CPython, isolated: no `PYTHON*` variables, no user site directory, nothing of the
-    /// working directory on `sys.path`, no signal handlers (the roles have their own), and a
-    /// fixed hash seed, so that the order of a set does not differ between two runs.
+    /// Starts CPython in isolated mode: without `PYTHON*` variables, user site directory, working
+    /// directory on `sys.path` and signal handlers, which the roles install. The hash seed is
+    /// fixed, so that the order of a set is the same in every run.
     ///
     /// A second call with the same options returns the running interpreter.
     ///
     /// # Errors
-    /// `NoVenv`; `OtherVersion` or `OtherInstallation` when the loaded libpython or the virtual
-    /// environment is not of the linked installation; `Initialise`; `AlreadyStarted` with other
-    /// options; `Path` for a python path that is no directory.
+    /// `NoVenv`; `OtherVersion` or `OtherInstallation` if the loaded libpython or the virtual
+    /// environment belongs to another installation; `Initialise`; `AlreadyStarted` with other
+    /// options; `Path` if a Python path is not a directory.
     pub fn start(options: &InterpreterOptions) -> Result<Self, PythonError> {
         let mut running = RUNNING.lock().unwrap_or_else(PoisonError::into_inner);
         if let Some(running) = &*running {
@@ -78,14 +81,14 @@ impl Interpreter {
         let python_path = absolute_paths(&options.python_path)?;
         check_version()?;
         initialise(&executable)?;
-        // From here on Python runs, for better or worse: another start could not help.
+        // Python runs from here on, so a later start cannot succeed after an error below.
         *running = Some(options.clone());
         prepare(&options.venv, python_path)?;
         Ok(Self(()))
     }
 }
 
-/// Compares the loaded libpython with the linked one; callable before CPython starts.
+/// Compares the loaded libpython with the linked one. Works before CPython starts.
 fn check_version() -> Result<(), PythonError> {
     let got = loaded_python_version();
     if got == LINKED_PYTHON.version {
@@ -128,7 +131,7 @@ fn initialise(executable: &Path) -> Result<(), PythonError> {
     Ok(())
 }
 
-/// Prepares `sys` and compares prefixes.
+/// Prepares `sys` and compares the installation's prefix with the linked one.
 fn prepare(venv: &Path, python_path: Vec<String>) -> Result<(), PythonError> {
     Python::attach(|py| {
         let globals = PyDict::new(py);
@@ -179,7 +182,7 @@ fn check(status: ffi::PyStatus) -> Result<(), PythonError> {
     Err(PythonError::Initialise { function: text(status.func), message: text(status.err_msg) })
 }
 
-/// Absolute, because `sys.path` must not depend on a later change of directory.
+/// Converts to absolute paths: `sys.path` must not depend on a later change of directory.
 fn absolute_paths(paths: &[PathBuf]) -> Result<Vec<String>, PythonError> {
     let absolute = |path: &PathBuf| {
         let wrong = |reason| PythonError::Path { path: path.clone(), reason };

@@ -1,4 +1,4 @@
-//! Which CPython installation this program works with.
+//! Finds the CPython installation that this program uses.
 
 use std::ffi::{CStr, OsStr, c_void};
 use std::os::unix::ffi::OsStrExt;
@@ -10,19 +10,19 @@ use pyo3::ffi;
 /// A CPython installation.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct LinkedPython {
-    /// Its interpreter, outside of any virtual environment: the one that makes `.venv`.
+    /// Its interpreter outside of any virtual environment, which makes `.venv`.
     pub executable: &'static str,
-    /// `sys.version`, blanks normalised: number, build date and compiler.
+    /// `sys.version` with single blanks: number, build date and compiler.
     pub version: &'static str,
-    /// `sys.base_prefix`: two installations of one version differ in it.
+    /// `sys.base_prefix`, which distinguishes installations of one version.
     pub base_prefix: &'static str,
-    /// Where its libpython lies; the program's rpath.
+    /// Directory of its libpython; the program's rpath.
     pub library_dir: &'static str,
 }
 
-/// The installation that this program was linked against, as its build found it. On a machine that
-/// has none at that place, where somebody else's build was brought to: the one whose libpython the
-/// program was given at its start.
+/// The installation that this program was linked against, as found by its build. If it does not
+/// exist, because the program was built on another machine: the installation whose libpython this
+/// process has loaded.
 pub static LINKED_PYTHON: LazyLock<LinkedPython> = LazyLock::new(|| {
     let at_build = LinkedPython {
         executable: env!("DMPRL_PYTHON_EXECUTABLE"),
@@ -38,14 +38,14 @@ pub static LINKED_PYTHON: LazyLock<LinkedPython> = LazyLock::new(|| {
 });
 
 impl LinkedPython {
-    /// The version's number alone, for instance `3.11.7`.
+    /// Version number, for instance `3.11.7`.
     pub fn version_number(&self) -> &'static str {
         self.version.split(' ').next().unwrap_or(self.version)
     }
 }
 
-/// `sys.version` of the libpython that this process has loaded, blanks normalised as in
-/// [`LINKED_PYTHON`]. Starts nothing.
+/// `sys.version` of the libpython that this process has loaded, with single blanks as in
+/// [`LINKED_PYTHON`]. Works before CPython starts.
 #[must_use]
 pub fn loaded_python_version() -> String {
     // SAFETY: Py_GetVersion needs no interpreter and returns a static string.
@@ -69,7 +69,7 @@ fn loaded_library() -> Option<PathBuf> {
     Path::new(OsStr::from_bytes(path.to_bytes())).canonicalize().ok()
 }
 
-/// The installation that a `libpython3.11.so.1.0` is part of: the nearest folder above that has a
+/// The installation of a `libpython3.11.so.1.0`: the nearest folder above it with a
 /// `bin/python3.11`.
 fn of_library(library: &Path, version: String) -> Option<LinkedPython> {
     let name = library.file_name()?.to_str()?.strip_prefix("lib")?.split(".so").next()?;
@@ -99,7 +99,7 @@ mod tests {
         fs::create_dir_all(&libraries).unwrap();
         fs::create_dir(prefix.join("bin")).unwrap();
         fs::write(prefix.join("bin/python3.11"), "").unwrap();
-        assert_eq!(of_library(&library, "3.12.3 (main)".into()), None, "another version's");
+        assert_eq!(of_library(&library, "3.12.3 (main)".into()), None, "of another version");
         fs::write(prefix.join("bin/python3.12"), "").unwrap();
         let found = of_library(&library, "3.12.3 (main)".into()).unwrap();
         assert_eq!(Path::new(found.executable), prefix.join("bin/python3.12"));

@@ -1,9 +1,8 @@
-//! Stage 3 of 8: environments in an embedded CPython; called by the rollout and the evaluator.
+//! Stage 3 of 8: environments in an embedded CPython. Called by the rollout and the evaluator.
 //!
-//! The only folder that names pyo3. One process has one interpreter ([`Interpreter`]); a worker's
-//! E environments are stepped by one Python call per segment ([`PythonEnvironments`]), which
-//! fills arrays that both sides see. MuJoCo's own bindings release the GIL inside `mj_step`, so
-//! physics does not block other threads that want Python; the rollout has none.
+//! This is the only folder that names pyo3. A process has one interpreter ([`Interpreter`]). One
+//! Python call per segment steps the E environments of a worker ([`PythonEnvironments`]) and fills
+//! arrays that Rust reads.
 
 mod buffer;
 mod environments;

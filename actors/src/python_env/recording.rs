@@ -1,4 +1,4 @@
-//! One environment that writes down what its robot does (`envs_py/dmprl/recording.py`).
+//! One environment that records each step of its robot (`envs_py/dmprl/recording.py`).
 
 use std::path::Path;
 
@@ -6,45 +6,47 @@ use pyo3::prelude::*;
 
 use super::{Interpreter, PythonEnvironments, PythonError};
 
-/// What a joint's position is a measure of.
+/// Kind of a joint.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum JointKind {
-    /// An angle \[rad\].
+    /// A hinge, whose position is an angle \[rad\].
     Hinge,
-    /// A length \[m\].
+    /// A slider, whose position is a length \[m\].
     Slide,
 }
 
-/// The robot's joints; of an environment that does not show them there are none.
+/// The robot's joints; none if the environment does not expose them.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Joints {
-    /// Name and kind of each.
+    /// Name and kind of each joint.
     pub joints: Vec<(String, JointKind)>,
     /// Why there are none; empty if there are some.
     pub why_none: String,
 }
 
-/// What the Python side wrote down of an episode of T steps.
+/// The Python side's record of an episode of T steps.
 #[derive(Debug, Clone, PartialEq)]
 pub struct StepRecording {
-    /// (T+1, J) [rad or m]: before the first step, and after each; empty without joints.
+    /// Joint positions before the first step and after each step, (T+1, J) [rad or m]; empty
+    /// without joints.
     pub joint_positions: Vec<Vec<f64>>,
-    /// (T+1, J) [rad/s or m/s].
+    /// Joint velocities, (T+1, J) [rad/s or m/s].
     pub joint_velocities: Vec<Vec<f64>>,
-    /// (T,): after each step, as [`PythonEnvironments::success`]; empty if only a segment's is
-    /// known.
+    /// Success after each step as in [`PythonEnvironments::success`], (T,); empty if it is only known
+    /// for segments.
     pub success: Vec<u8>,
-    /// Files of pictures, if they were asked for,
+    /// Files of pictures, if requested.
     pub frames: Vec<String>,
-    /// and the number of steps done at each.
+    /// Number of steps done at each picture.
     pub frame_steps: Vec<usize>,
 }
 
 impl PythonEnvironments {
-    /// Makes one environment of `task_id` whose steps are written down, and drawn into a folder.
+    /// Makes one environment of `task_id` that records its steps and draws them into the folder
+    /// `pictures`, if given.
     ///
     /// # Errors
-    /// As [`PythonEnvironments::start`]; `Exception` if nothing can draw it.
+    /// As [`PythonEnvironments::start`]; `Exception` if the environment cannot be drawn.
     pub fn start_recording(
         _interpreter: &Interpreter,
         task_id: &str,
@@ -57,18 +59,18 @@ impl PythonEnvironments {
         })
     }
 
-    /// What the goal looks like in a picture; empty if nobody knows.
+    /// Description of the goal's appearance in pictures; empty if unknown.
     ///
     /// # Errors
-    /// `Exception` when the installed package does not fit.
+    /// `Exception` if the installed package does not fit.
     pub fn goal_in_pictures(&self) -> Result<String, PythonError> {
         self.ask(|env| env.call_method0("goal_in_pictures")?.extract())
     }
 
-    /// The robot's joints; only of [`PythonEnvironments::start_recording`].
+    /// The robot's joints. Only for environments of [`PythonEnvironments::start_recording`].
     ///
     /// # Errors
-    /// `Exception` or `Interface` when the installed package does not fit.
+    /// `Exception` or `Interface` if the installed package does not fit.
     pub fn joints(&self) -> Result<Joints, PythonError> {
         let read = |env: &Bound<'_, PyAny>| -> PyResult<_> {
             let joints: Vec<(String, String)> = env.call_method0("joints")?.extract()?;
@@ -87,10 +89,10 @@ impl PythonEnvironments {
         Ok(Joints { joints, why_none })
     }
 
-    /// What was written down since the last reset by a seed.
+    /// The record of the `steps` steps since the last reset by a seed.
     ///
     /// # Errors
-    /// `Exception` or `Interface` when the installed package does not fit.
+    /// `Exception` or `Interface` if the installed package does not fit.
     pub fn recording(&self, steps: usize) -> Result<StepRecording, PythonError> {
         let recording = self.ask(|env| -> PyResult<_> {
             let recording = env.call_method0("recording")?;

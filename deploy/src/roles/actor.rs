@@ -1,4 +1,4 @@
-//! The worker's process: arguments, interpreter and environments for the loop in
+//! The worker's process: prepares interpreter, environments and journal for the loop in
 //! `dmprl_actors::worker`.
 
 use std::path::Path;
@@ -25,19 +25,19 @@ pub fn start_interpreter(
     Ok(interpreter(venv, config)?)
 }
 
-/// Which worker of which run to start.
+/// Which worker of which run to run.
 pub struct WorkerStart<'a> {
     pub setup: &'a Setup,
     pub index: u32,
-    /// Which of the run's workers the first of this host is.
+    /// Index in the run of this host's first worker.
     pub first: u32,
     pub incarnation: u32,
     pub venv: Option<&'a Path>,
-    /// Where everything that is sent is noted, for `dmprl chaos`.
+    /// Folder of the journal, for `dmprl chaos`.
     pub journal: Option<&'a Path>,
 }
 
-/// Steps environments until a stop is asked for.
+/// Runs the worker that the arguments name, until a stop is requested.
 pub fn run(args: &ActorArgs, control: &ControlPipe) -> anyhow::Result<()> {
     let setup = Setup::read(args.run.as_deref().context("--run is missing")?)?;
     let index = args.index.context("--index is missing")?;
@@ -47,7 +47,7 @@ pub fn run(args: &ActorArgs, control: &ControlPipe) -> anyhow::Result<()> {
     work(&WorkerStart { setup: &setup, index, first, incarnation, venv, journal }, control, None)
 }
 
-/// Steps environments until a stop is asked for.
+/// Runs a worker until a stop is requested. `joined` is set if a user started it.
 pub fn work(
     start: &WorkerStart<'_>,
     control: &ControlPipe,
@@ -67,7 +67,7 @@ pub fn work(
     Ok(worker::run(worker, control, attach)?)
 }
 
-/// Notes everything in a journal.
+/// Writes each event of the delivery to a journal.
 fn note_in(journal: Journal) -> DeliveryObserver {
     Box::new(move |event| {
         journal.note(match event {

@@ -1,4 +1,4 @@
-//! A role's end of the conversation with its supervisor.
+//! The control pipe: a role's connection to its supervisor.
 
 use std::fs::File;
 use std::io::{BufRead, BufReader, Read, Write};
@@ -16,15 +16,15 @@ use super::heartbeat::Pulse;
 use crate::control::{Activity, Command, GROUP_SIGNALS, Report, WorkersNow};
 use crate::terminal::say;
 
-/// A worker or evaluator whose supervisor is gone has so long to end before it is killed.
+/// Time limit for a worker or evaluator to exit after its supervisor is gone.
 pub const ORPHAN_LIMIT: Duration = Duration::from_secs(5);
-/// The learner's limit: it writes a last checkpoint.
+/// The same for the learner, which writes a last checkpoint.
 pub const ORPHANED_LEARNER_LIMIT: Duration = Duration::from_secs(60);
 
-/// Commands not yet taken. The supervisor sends a handful in a run, one evaluation at a time;
-/// one that does not fit is refused in the log.
+/// Maximum number of commands in the queue. The supervisor sends few, and one evaluation at a time.
+/// A command that does not fit is dropped with a log line.
 const COMMANDS_MAX: usize = 64;
-/// A longer line is no command.
+/// Maximum length of a line in bytes.
 const LINE_BYTES_MAX: u64 = 1 << 20;
 
 #[derive(Debug, Default)]
@@ -37,12 +37,12 @@ struct Flags {
     sent: Mutex<Sent>,
 }
 
-/// Commands come in, reports go out; shareable between threads.
+/// Receives commands and sends reports, from any thread.
 ///
-/// A thread reads the commands, so `stop` is seen while the role computes. When the supervisor
-/// dies, whatever the manner, the input ends: the role is then orphaned and asked to stop, and
-/// the thread kills the process if it is still there after the limit. No parent-death signal
-/// is needed, and none is used: it would take the learner's last checkpoint away.
+/// A thread reads the commands, so `stop` takes effect while the role computes. When the supervisor
+/// dies for any reason, the input ends. The role is then orphaned and must stop, and the thread
+/// kills the process after a time limit. A parent-death signal would kill the learner before its
+/// last checkpoint.
 pub struct ControlPipe {
     commands: Mutex<Receiver<Command>>,
     flags: Arc<Flags>,
@@ -69,16 +69,16 @@ impl Reporter {
 }
 
 impl ControlPipe {
-    /// Takes over standard input and output and ignores the signals that a terminal or service
+    /// Takes over standard input and output, and ignores the signals that a terminal or service
     /// manager sends to the whole process group: only the supervisor decides when a role ends.
     ///
-    /// What anything else in this process prints, a user's environment above all, goes to
-    /// standard error from now on: the log. What it reads is empty.
+    /// From now on, output of other code in this process, such as a user's environment, goes to
+    /// standard error, the log, and its input is empty.
     ///
     /// # Errors
     /// The descriptors cannot be moved.
     pub fn open(orphan_limit: Duration) -> anyhow::Result<Self> {
-        // Registering a handler that sets a flag nobody reads is ignoring, without `unsafe`.
+        // Ignores the signal without `unsafe`: the handler sets a flag that is never read.
         for signal in GROUP_SIGNALS {
             signal_hook::flag::register(signal, Arc::default())
                 .with_context(|| format!("cannot ignore signal {signal}"))?;
@@ -87,7 +87,8 @@ impl ControlPipe {
         Ok(Self::over(input, output, move || end_process_after(orphan_limit)))
     }
 
-    /// The same over any pair of streams; `orphaned` runs on the reading thread at end of input.
+    /// Creates a pipe over any pair of streams. Calls `orphaned` on the reading thread at end of
+    /// input.
     pub fn over(
         input: impl Read + Send + 'static,
         output: impl Write + Send + 'static,
@@ -108,50 +109,50 @@ impl ControlPipe {
         Self { commands: Mutex::new(commands), flags, reporter, pulse }
     }
 
-    /// Whether to finish and exit: on `stop`, or because the supervisor is gone.
+    /// Returns true if the role must finish and exit: after `stop`, or if the supervisor is gone.
     #[must_use]
     pub fn stop_requested(&self) -> bool {
         self.flags.stop.load(Ordering::Acquire)
     }
 
-    /// Whether to end the run as if it had all its steps.
+    /// Returns true if the run must end as if it had completed all steps.
     #[must_use]
     pub fn finish_requested(&self) -> bool {
         self.flags.finish.load(Ordering::Acquire)
     }
 
-    /// The flag behind [`ControlPipe::stop_requested`], for handlers of signals.
+    /// The flag of [`ControlPipe::stop_requested`], for signal handlers.
     #[must_use]
     pub fn shared_stop_flag(&self) -> Arc<AtomicBool> {
         Arc::clone(&self.flags.stop)
     }
 
-    /// Failures of environments in the whole run; 0 before the supervisor has told of any.
+    /// Number of failures of environments in the whole run, as last sent by the supervisor.
     #[must_use]
     pub fn env_failures(&self) -> u64 {
         self.flags.env_failures.load(Ordering::Acquire)
     }
 
-    /// What the supervisor knows of the workers; nothing before it has told of any.
+    /// State of the workers, as last sent by the supervisor.
     #[must_use]
     pub fn workers(&self) -> WorkersNow {
         *self.flags.workers.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// What the workers did in the whole run; nothing before the supervisor has told of it.
+    /// Counts of the workers' segments in the whole run, as last sent by the supervisor.
     #[must_use]
     pub fn sent(&self) -> Sent {
         *self.flags.sent.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// Whether the supervisor is gone; reports then go nowhere.
+    /// Returns true if the supervisor is gone. Reports then fail.
     #[must_use]
     pub fn orphaned(&self) -> bool {
         self.flags.orphaned.load(Ordering::Acquire)
     }
 
-    /// The next command, waiting so long for it; none when the wait or the input has ended. `stop`,
-    /// `finish`, `env_failures`, `workers` and `sent` are no commands here: each has a method.
+    /// Waits up to `wait` for the next command; returns `None` at the time limit or at end of input.
+    /// `stop`, `finish`, `env_failures`, `workers` and `sent` are not returned: each has a method.
     #[must_use]
     pub fn next_within(&self, wait: Duration) -> Option<Command> {
         self.commands.lock().unwrap_or_else(PoisonError::into_inner).recv_timeout(wait).ok()
@@ -165,13 +166,13 @@ impl ControlPipe {
         self.reporter.send(report)
     }
 
-    /// What the loop's heartbeats leave for the thread that sends them.
+    /// State of the loop, for the thread that sends heartbeats.
     #[must_use]
     pub fn pulse(&self) -> Arc<Pulse> {
         Arc::clone(&self.pulse)
     }
 
-    /// Sends reports too, for threads of their own.
+    /// Another sender of reports, for a separate thread.
     #[must_use]
     pub fn reporter(&self) -> Reporter {
         self.reporter.clone()
@@ -205,7 +206,7 @@ impl Supervisor for ControlPipe {
     }
 
     fn note_unacknowledged(&self, segments: usize) {
-        self.pulse.keep(segments as u64);
+        self.pulse.set_kept(segments as u64);
     }
 
     fn report(&self, report: &Report) -> Result<(), ReportError> {
@@ -213,11 +214,11 @@ impl Supervisor for ControlPipe {
     }
 }
 
-/// Ends this process, whose supervisor is gone, unless it has ended by itself by then.
+/// Kills this process after `limit`, because its supervisor is gone.
 pub fn end_process_after(limit: Duration) {
     thread::sleep(limit);
-    say("error: the supervisor is gone and this process did not end: killing it");
-    // Not `exit`: destructors of a stuck library could hold it up for ever.
+    say("error: the supervisor is gone and this process did not exit in time: killing it");
+    // Not `exit`, because destructors of a hanging library could block forever.
     let _ = rustix::process::kill_process(rustix::process::getpid(), rustix::process::Signal::KILL);
 }
 
@@ -229,13 +230,13 @@ fn take_standard_streams() -> std::io::Result<(File, File)> {
     Ok((input.into(), output.into()))
 }
 
-/// From now on there is nothing to read, and what is printed goes to standard error.
+/// Redirects standard input from `/dev/null` and standard output to standard error.
 pub fn detach_standard_streams() -> std::io::Result<()> {
     rustix::stdio::dup2_stdin(File::open("/dev/null")?)?;
     Ok(rustix::stdio::dup2_stdout(rustix::stdio::stderr())?)
 }
 
-/// Until the input ends or is broken, which is the same: nobody is there to be understood.
+/// Returns at end of input or on a read error: either way the supervisor is gone.
 fn read_commands(input: impl Read, sender: &SyncSender<Command>, flags: &Flags) {
     let mut reader = BufReader::new(input);
     let mut line = Vec::new();
@@ -261,11 +262,11 @@ fn read_commands(input: impl Read, sender: &SyncSender<Command>, flags: &Flags) 
                 Ok(()) | Err(TrySendError::Disconnected(_)) => {}
                 Err(TrySendError::Full(command)) => {
                     say(&format!(
-                        "error: {COMMANDS_MAX} commands wait already, refused: {command:?}"
+                        "error: dropped a command, {COMMANDS_MAX} are waiting already: {command:?}"
                     ));
                 }
             },
-            Err(error) => say(&format!("error: the supervisor sent what is no command: {error}")),
+            Err(error) => say(&format!("error: the supervisor sent an invalid command: {error}")),
         }
     }
 }
@@ -288,7 +289,7 @@ mod tests {
     fn until(condition: impl Fn() -> bool) {
         let deadline = Instant::now() + PATIENCE;
         while !condition() {
-            assert!(Instant::now() < deadline, "waited {PATIENCE:?} in vain");
+            assert!(Instant::now() < deadline, "not within {PATIENCE:?}");
             thread::yield_now();
         }
     }
@@ -318,7 +319,7 @@ mod tests {
     }
 
     #[test]
-    fn a_report_is_one_line_and_fails_when_nobody_reads() {
+    fn a_report_is_one_line_and_fails_if_the_reader_is_gone() {
         let (pipe, _commands, mut reports) = pipe(mpsc::channel().0);
         pipe.send(&Report::LearnerReady).unwrap();
         let mut line = String::new();

@@ -1,18 +1,18 @@
-//! What a role does when a call into its environments hangs.
+//! Handles a call into the environments that hangs.
 
 use super::ControlPipe;
 use crate::control::{ENV_HUNG_STATUS, Report};
 use crate::terminal::say;
 
-/// Ends this process: nothing but another process could help, and the supervisor starts one.
+/// Returns a handler that reports the hang and exits, so that the supervisor starts a new process.
 pub fn on_hang(control: &ControlPipe) -> impl FnOnce(String) + Send + 'static {
     let reporter = control.reporter();
     move |message| {
         say(&format!("error: {message}"));
-        // A supervisor that is gone changes nothing.
+        // Exit even if the supervisor is gone.
         let _ = reporter.send(&Report::EnvHung { message });
-        // SAFETY: `_exit` takes a number and does not return. Not `exit`, whose handlers and
-        // destructors would wait for the thread that hangs.
+        // SAFETY: `_exit` takes a number and does not return. Handlers and destructors that `exit`
+        // runs would wait for the hanging thread.
         unsafe { libc::_exit(ENV_HUNG_STATUS) }
     }
 }

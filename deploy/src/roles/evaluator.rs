@@ -1,5 +1,5 @@
-//! The evaluator's process: arguments, environments and the rows of `evaluations.jsonl` around the
-//! loop in `dmprl_actors::evaluator`.
+//! The evaluator's process: prepares environments for the loop in `dmprl_actors::evaluator` and
+//! writes the rows of `evaluations.jsonl`.
 
 use dmprl_actors::evaluator::{self, Evaluations};
 use dmprl_learner::checkpoint;
@@ -11,7 +11,7 @@ use super::{ControlPipe, EvaluatorArgs};
 use crate::control::{EvaluationRow, Report};
 use crate::terminal::say;
 
-/// Answers requests until a stop is asked for.
+/// Answers requests until a stop is requested.
 pub fn run(args: &EvaluatorArgs, control: &ControlPipe) -> anyhow::Result<()> {
     let setup = Setup::read(&args.run)?;
     let mut config = setup.config.clone();
@@ -31,28 +31,29 @@ pub fn run(args: &EvaluatorArgs, control: &ControlPipe) -> anyhow::Result<()> {
     Ok(evaluator::run(&mut evaluator, &evaluations, control, &mut kept)?)
 }
 
-/// Appends the row and drops the policies that no row needs any more.
-///
-/// A full disk must not end a run: what cannot be written is told, the row still reported.
+/// Appends the row and removes policies that no row needs any longer. If writing fails, it sends a
+/// warning: a full disk must not end a run.
 ///
 /// # Errors
 /// A number of the row is not finite.
 pub fn keep(setup: &Setup, row: &EvaluationRow, control: &ControlPipe) -> anyhow::Result<()> {
     row.check_finite()?;
     let steps =
-        [("is not in evaluations.jsonl", append(setup, row)), ("did not tidy up", tidy(setup))];
-    for (what, result) in steps {
+        [("append to evaluations.jsonl", append(setup, row)), ("remove old policies", tidy(setup))];
+    for (step, result) in steps {
         if let Err(error) = result {
-            let message = format!("evaluation of policy {} {what}: {error:#}", row.policy_version);
+            let version = row.policy_version;
+            let message = format!("evaluation of policy {version}: cannot {step}: {error:#}");
             say(&format!("warning: {message}"));
-            // A supervisor that is gone is noticed by the loop.
+            // If the supervisor is gone, the loop notices it as a stop.
             let _ = control.send(&Report::Warning { message });
         }
     }
     Ok(())
 }
 
-/// An evaluator that was killed between row and report is asked again: one row is enough.
+/// Appends the row unless the last row is of the same policy: an evaluator that was killed between
+/// row and report gets the same request again.
 fn append(setup: &Setup, row: &EvaluationRow) -> anyhow::Result<()> {
     let latest = setup.run.latest_row()?;
     if latest.is_some_and(|latest| latest.policy_version == row.policy_version) {
@@ -61,8 +62,8 @@ fn append(setup: &Setup, row: &EvaluationRow) -> anyhow::Result<()> {
     setup.run.append_evaluation(row)
 }
 
-/// A resume goes back to a checkpoint and forgets later rows: the policies that would then be
-/// best and latest must still be there.
+/// Removes policies that are no longer needed. A resume from a checkpoint drops later rows, so the
+/// policies that would then be best and latest are kept for each checkpoint.
 fn tidy(setup: &Setup) -> anyhow::Result<()> {
     let rows = setup.run.evaluations()?;
     let mut versions = Vec::new();
@@ -104,9 +105,9 @@ mod tests {
         ControlPipe::over(std::io::empty(), std::io::sink(), || {})
     }
 
-    /// An evaluator killed between its row and its report answers the same request once more.
+    /// An evaluator killed between row and report answers the same request again.
     #[test]
-    fn a_policy_evaluated_twice_in_a_row_has_one_row() {
+    fn a_policy_evaluated_twice_has_one_row() {
         let parent = tempfile::tempdir().unwrap();
         let setup = setup(&parent);
         keep(&setup, &ROW, &control()).unwrap();
@@ -115,7 +116,7 @@ mod tests {
     }
 
     #[test]
-    fn a_row_that_cannot_be_written_is_no_failure_and_one_that_is_not_finite_is() {
+    fn a_row_that_cannot_be_written_is_tolerated_and_one_that_is_not_finite_is_an_error() {
         let parent = tempfile::tempdir().unwrap();
         let setup = setup(&parent);
         let path = setup.run.evaluations_path();

@@ -1,4 +1,4 @@
-//! The gateway process: the workers of all other hosts, to the learner.
+//! The gateway's process: runs the bridge's gateway and reports to the supervisor.
 
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
@@ -15,25 +15,25 @@ use crate::bridge::wire::RunState;
 use crate::control::Report;
 use crate::run_directory::{RunDirectory, TOKEN_FILE, replace_file};
 
-/// In a run's directory: the first session that no host was given yet.
+/// File in the run directory with the first unused session number.
 const SESSIONS_FILE: &str = "bridge.session";
-/// Sleep of a turn that found nothing to do.
+/// Sleep after a turn without work.
 const IDLE: Duration = Duration::from_micros(300);
-/// Between two reports of the hosts.
+/// Interval between two reports of the hosts.
 const REPORT_INTERVAL: Duration = Duration::from_millis(500);
-/// A learner that is being replaced can be joined again after as long as a checkpoint takes.
-const JOIN_LIMIT: Duration = Duration::from_secs(60);
-const JOIN_PAUSE: Duration = Duration::from_millis(20);
-/// Hosts are told so long how the run has ended, less than their supervisor waits for this process;
-/// those that hear it leave.
+/// Time limit to attach to the learner. A learner that is being replaced first loads a checkpoint.
+const ATTACH_LIMIT: Duration = Duration::from_secs(60);
+const ATTACH_PAUSE: Duration = Duration::from_millis(20);
+/// Maximum time to tell the hosts that the run has ended, after which they leave. It is less than
+/// the supervisor waits for this process.
 const GOODBYE: Duration = Duration::from_secs(8);
-/// One that was not heard from for so long is not waited for.
+/// Silence after which a host is no longer waited for.
 const GONE: Duration = Duration::from_secs(60);
 const GOODBYE_INTERVAL: Duration = Duration::from_millis(100);
-/// The first refusals of what nobody should have sent are told, then each doubling.
-const REFUSED_FIRST: u64 = 1;
+/// Number of rejected messages at the first warning; the next ones follow at each doubling.
+const REJECTED_FIRST: u64 = 1;
 
-/// Where a run's secret is.
+/// Path of a run's token.
 pub(crate) fn token_path(run: &RunDirectory, token_file: &str) -> PathBuf {
     match token_file {
         "" => run.path().join(TOKEN_FILE),
@@ -41,21 +41,21 @@ pub(crate) fn token_path(run: &RunDirectory, token_file: &str) -> PathBuf {
     }
 }
 
-/// Passes on what other hosts send until a stop is asked for.
+/// Runs the gateway until a stop is requested.
 pub fn run(args: &GatewayArgs, control: &ControlPipe) -> anyhow::Result<()> {
     let Some(mut gateway) = open(args, control)? else { return Ok(()) };
     let mut reported: Option<Instant> = None;
-    let mut refused_told = REFUSED_FIRST;
+    let mut rejected_next = REJECTED_FIRST;
     let sessions = args.run.join(SESSIONS_FILE);
-    let mut given = gateway.session();
+    let mut session = gateway.session();
     while !control.stop_requested() && !control.finish_requested() {
         let worked = gateway.turn()?;
-        if given != gateway.session() {
-            given = gateway.session();
-            replace_file(&sessions, given.to_string().as_bytes())?;
+        if session != gateway.session() {
+            session = gateway.session();
+            replace_file(&sessions, session.to_string().as_bytes())?;
         }
         for event in gateway.take_events() {
-            // A supervisor that is gone is noticed as a stop.
+            // If the supervisor is gone, the loop notices it as a stop.
             let _ = control.send(&match event {
                 GatewayEvent::Notice(message) => {
                     eprintln!("{message}");
@@ -67,11 +67,11 @@ pub fn run(args: &GatewayArgs, control: &ControlPipe) -> anyhow::Result<()> {
                 }
             });
         }
-        if gateway.rejected() >= refused_told {
-            let message = format!("{} messages of nobody, or damaged, refused", gateway.rejected());
+        if gateway.rejected() >= rejected_next {
+            let message = format!("rejected {} damaged or unexpected messages", gateway.rejected());
             eprintln!("{message}");
             let _ = control.send(&Report::Warning { message });
-            refused_told = gateway.rejected().saturating_mul(2);
+            rejected_next = gateway.rejected().saturating_mul(2);
         }
         if reported.is_none_or(|at| at.elapsed() >= REPORT_INTERVAL) {
             reported = Some(Instant::now());
@@ -97,8 +97,8 @@ fn open(args: &GatewayArgs, control: &ControlPipe) -> anyhow::Result<Option<Gate
     };
     let zenoh_file =
         Some(Path::new(&bridge.zenoh_file)).filter(|path| !path.as_os_str().is_empty());
-    let session = args.session.max(sessions_given(&args.run.join(SESSIONS_FILE))?);
-    let deadline = Instant::now() + JOIN_LIMIT;
+    let session = args.session.max(sessions_used(&args.run.join(SESSIONS_FILE))?);
+    let deadline = Instant::now() + ATTACH_LIMIT;
     loop {
         let settings = GatewaySettings {
             endpoints: &bridge.listen,
@@ -111,17 +111,17 @@ fn open(args: &GatewayArgs, control: &ControlPipe) -> anyhow::Result<Option<Gate
         };
         match Gateway::open(settings, facts.clone()) {
             Ok(gateway) => return Ok(Some(gateway)),
-            // Only the learner comes back by itself.
+            // Only errors of the transport pass: the learner may be restarting.
             Err(error) if !is_transport(&error) || Instant::now() >= deadline => return Err(error),
             Err(_) if control.stop_requested() => return Ok(None),
-            Err(_) => std::thread::sleep(JOIN_PAUSE),
+            Err(_) => std::thread::sleep(ATTACH_PAUSE),
         }
     }
 }
 
-/// How many sessions the gateways before this one have given to hosts; a worker's start has the
-/// number of none of them again.
-fn sessions_given(path: &Path) -> anyhow::Result<u32> {
+/// Number of sessions that earlier gateways gave to hosts. New hosts get later ones, so that no
+/// incarnation is used twice.
+fn sessions_used(path: &Path) -> anyhow::Result<u32> {
     if !path.exists() {
         return Ok(0);
     }
@@ -134,14 +134,14 @@ fn is_transport(error: &anyhow::Error) -> bool {
     error.is::<dmprl_shared::transport::TransportError>()
 }
 
-/// Tells the hosts whether the run is complete or only stops.
+/// Tells the hosts whether the run is complete or was stopped.
 fn say_goodbye(gateway: &mut Gateway, control: &ControlPipe) -> anyhow::Result<()> {
     let state = if control.finish_requested() { RunState::Complete } else { RunState::Stopped };
     let began = Instant::now();
     loop {
         gateway.send_acks(state)?;
         gateway.read_statuses(Instant::now())?;
-        // A run that was stopped has hosts that wait for it.
+        // Hosts of a stopped run do not leave: they wait for it to resume.
         let heard = state == RunState::Stopped && began.elapsed() >= GOODBYE_INTERVAL * 2;
         if heard
             || gateway.all_silent_for(GONE, Instant::now())

@@ -1,40 +1,39 @@
-//! A worker's signs of life.
+//! A worker's heartbeats.
 //!
-//! A thread of its own sends one each second in which the worker's loop has come round, or in which
-//! a call into the environments is under way: how long that may take is the watchdog's business.
-//! So a worker that waits for its learner, however long, lives, and so does one with a slow
-//! environment. One that is stopped, or whose loop stands still anywhere else, falls silent, and
-//! the supervisor notices.
+//! A thread sends a heartbeat in each second in which the worker's loop completed a round or a call
+//! into the environments was running; the watchdog limits the duration of such a call. So a worker
+//! that waits for its learner, or has a slow environment, still sends heartbeats. A worker that is
+//! suspended, or whose loop hangs anywhere else, sends none, and the supervisor detects it.
 
 use std::sync::atomic::{AtomicU64, Ordering};
 
 use crate::control::Activity;
 
-/// What a loop tells the thread.
+/// State of a loop, which the thread reads.
 #[derive(Debug)]
 pub struct Pulse {
-    /// How often it has come round, and in the two lowest bits what it did then.
+    /// Number of rounds and, in the two lowest bits, the activity.
     state: AtomicU64,
     /// Segments that the learner has not acknowledged.
     kept: AtomicU64,
 }
 
 impl Pulse {
-    /// A loop that has not begun.
+    /// Creates the state of a loop that has not begun.
     #[must_use]
     pub fn new(doing: Activity) -> Self {
         Self { state: AtomicU64::new(bits(doing)), kept: AtomicU64::new(0) }
     }
 
-    /// The loop has come round; from its thread only.
+    /// Records a round of the loop. Call it only from the loop's thread.
     pub fn beat(&self, doing: Activity) {
-        // The other thread compares numbers and reads no other memory: no order is needed.
+        // Relaxed, because the other thread reads no other memory.
         let number = (self.state.load(Ordering::Relaxed) >> 2).wrapping_add(1);
         self.state.store(number << 2 | bits(doing), Ordering::Relaxed);
     }
 
-    /// So many segments are kept.
-    pub fn keep(&self, segments: u64) {
+    /// Records the number of retained segments.
+    pub fn set_kept(&self, segments: u64) {
         self.kept.store(segments, Ordering::Relaxed);
     }
 
@@ -72,10 +71,10 @@ mod thread {
     use crate::control::{Activity, Report};
     use crate::roles::ControlPipe;
 
-    /// Between two signs of life.
+    /// Interval between two heartbeats.
     const BEAT: Duration = Duration::from_secs(1);
 
-    /// Starts the thread. It ends when nobody makes calls any more, or nobody listens.
+    /// Starts the thread. It ends when `calls` is dropped or the supervisor is gone.
     pub fn start(control: &ControlPipe, calls: &Arc<CallState>) -> anyhow::Result<()> {
         let (pulse, reporter) = (control.pulse(), control.reporter());
         let calls = Arc::downgrade(calls);
@@ -106,7 +105,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn each_round_is_another_state_and_says_what_was_done() {
+    fn each_round_changes_the_state_and_records_the_activity() {
         let pulse = Pulse::new(Activity::Attaching);
         let mut seen = vec![pulse.state()];
         for doing in

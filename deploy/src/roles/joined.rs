@@ -1,8 +1,8 @@
-//! A worker that somebody starts beside a run that is being trained: `dmprl actor --join RUN`.
+//! A worker that joins a running training: `dmprl actor --join RUN`.
 //!
-//! It asks the run's supervisor for a place (`launch/joining.rs`), and is then a worker like the
-//! others, but for its ends: a first Ctrl-C lets it hand over what the learner has not
-//! acknowledged, a second does not.
+//! It requests a place from the run's supervisor (`launch/joining.rs`) and then works like the
+//! others. On the first Ctrl-C it delivers its segments before it leaves; a second Ctrl-C ends it at
+//! once.
 
 use std::cell::Cell;
 use std::fs;
@@ -30,23 +30,23 @@ use crate::launch::{Place, is_ignored};
 use crate::run_directory::RunDirectory;
 use crate::terminal::{grouped, say, shown};
 
-/// The supervisor answers at once; one that is stopped does not.
+/// Time limit for an answer. A supervisor answers at once unless it is suspended.
 const ANSWER_LIMIT: Duration = Duration::from_secs(10);
-/// A longer line is no answer.
+/// Maximum length of an answer in bytes.
 const ANSWER_BYTES_MAX: u64 = 1 << 16;
-/// Between two lines about what was sent.
+/// Interval between two lines of progress.
 const PRINT_INTERVAL: Duration = Duration::from_secs(5);
-/// Exit status of a second Ctrl-C.
+/// Exit status after a second Ctrl-C.
 const INTERRUPTED_STATUS: i32 = 130;
 
-/// Joins a run and steps environments for it until the run ends or the user stops it.
+/// Joins a run and works for it until the run ends or the user stops the worker.
 ///
 /// # Errors
-/// The run takes nobody in, or what ends any worker.
+/// The run accepts no worker, or the worker fails.
 pub fn join(run: &Path) -> anyhow::Result<Outcome> {
     check_owner(run)?;
     let setup = Setup::read(run)?;
-    check_takes_in(&setup)?;
+    check_accepts_workers(&setup)?;
     let leaving = Arc::new(AtomicBool::new(false));
     let stream = connect(&setup.run)?;
     let welcome = ask(&stream, &setup.run)?;
@@ -68,7 +68,7 @@ pub fn join(run: &Path) -> anyhow::Result<Outcome> {
     let acknowledged = format!("{} of {}", grouped(sent.acked), grouped(sent.produced));
     let segments = format!("{acknowledged} segments acknowledged");
     if leaving.load(Ordering::Acquire) {
-        // A supervisor that is gone needs no word.
+        // The supervisor may be gone.
         let _ = control.send(&Report::Left);
         say(&format!("left the run: {segments}"));
         return Ok(Outcome::Interrupted);
@@ -81,7 +81,7 @@ pub fn join(run: &Path) -> anyhow::Result<Outcome> {
 }
 
 fn check_owner(run: &Path) -> anyhow::Result<()> {
-    // What is not there is refused by whoever opens it.
+    // If the directory does not exist, opening it will report that.
     let Ok(metadata) = fs::metadata(run) else { return Ok(()) };
     let user = rustix::process::geteuid().as_raw();
     if metadata.uid() != user {
@@ -94,25 +94,25 @@ fn check_owner(run: &Path) -> anyhow::Result<()> {
     Ok(())
 }
 
-fn check_takes_in(setup: &Setup) -> anyhow::Result<()> {
+fn check_accepts_workers(setup: &Setup) -> anyhow::Result<()> {
     let (config, run) = (&setup.config, shown(setup.run.path()));
     if config.run.deterministic {
         return Err(wrong_use(format!(
-            "run {run} is deterministic: one process does everything, and nobody can join it"
+            "run {run} is deterministic: it has one process, and no worker can join it"
         )));
     }
     if config.actors.joined_max == 0 {
-        return Err(wrong_use(format!("run {run} takes nobody in: its actors.joined_max is 0")));
+        return Err(wrong_use(format!("run {run} accepts no workers: its actors.joined_max is 0")));
     }
     Ok(())
 }
 
-/// The supervisor's number stands in the run's lock, and names its directory together with the
-/// run's.
+/// Connects to the supervisor. The run's lock contains the supervisor's process id, and this and the
+/// run id determine the shared-memory directory, which contains the socket.
 fn connect(run: &RunDirectory) -> anyhow::Result<UnixStream> {
     let not_trained = || {
         format!(
-            "run {} is not being trained on this machine; go on with it first: dmprl resume {}",
+            "run {} is not training on this machine; resume it first: dmprl resume {}",
             shown(run.path()),
             shown(run.path())
         )
@@ -128,7 +128,7 @@ fn connect(run: &RunDirectory) -> anyhow::Result<UnixStream> {
 fn ask(mut stream: &UnixStream, run: &RunDirectory) -> anyhow::Result<Welcome> {
     let answer = || -> anyhow::Result<Vec<u8>> {
         let (mut line, mut input, mut byte) = (Vec::new(), stream.take(ANSWER_BYTES_MAX), [0]);
-        // Byte by byte: what follows the line is for the control pipe.
+        // Byte by byte, because the control pipe reads what follows the line.
         while !line.ends_with(b"\n") {
             let read = input.read(&mut byte);
             if read.with_context(|| format!("no answer within {ANSWER_LIMIT:?}"))? == 0 {
@@ -139,7 +139,7 @@ fn ask(mut stream: &UnixStream, run: &RunDirectory) -> anyhow::Result<Welcome> {
         Ok(line)
     };
     let asked = || format!("the supervisor of {} did not answer", shown(run.path()));
-    // Of another version, it may say no more than that.
+    // A supervisor of another version may send nothing else that can be parsed.
     let greeting: Greeting =
         serde_json::from_slice(&answer().with_context(asked)?).with_context(asked)?;
     let this = Greeting::this();
@@ -155,19 +155,19 @@ fn ask(mut stream: &UnixStream, run: &RunDirectory) -> anyhow::Result<Welcome> {
     let welcome = match serde_json::from_slice(&answer().with_context(asked)?)? {
         JoinAnswer::Welcome(welcome) => welcome,
         JoinAnswer::Refused { reason } => {
-            bail!("run {} takes no worker in now: {reason}", shown(run.path()))
+            bail!("run {} accepts no worker now: {reason}", shown(run.path()))
         }
     };
     stream.set_read_timeout(None).context("cannot wait for commands")?;
     Ok(welcome)
 }
 
-/// The first signal asks the worker to leave, the second ends it at once.
+/// Installs signal handlers: the first signal makes the worker leave, the second ends it at once.
 fn leave_on_signals(leaving: &Arc<AtomicBool>, control: &ControlPipe) -> anyhow::Result<()> {
-    // `nohup` has a hang-up ignored, and means that; a script that puts a worker into the
-    // background has the interrupt ignored, and means only the terminal's.
-    let meant = |signal: &i32| *signal != libc::SIGHUP || !is_ignored(*signal);
-    for signal in GROUP_SIGNALS.into_iter().filter(meant) {
+    // A hang-up that is ignored, as by `nohup`, stays ignored. An interrupt does not: shells ignore it
+    // for background jobs only to shield them from the terminal's Ctrl-C.
+    let handled = |signal: &i32| *signal != libc::SIGHUP || !is_ignored(*signal);
+    for signal in GROUP_SIGNALS.into_iter().filter(handled) {
         // In this order: the first signal must not count as the second.
         flag::register_conditional_shutdown(signal, INTERRUPTED_STATUS, Arc::clone(leaving))
             .and_then(|_| flag::register(signal, Arc::clone(leaving)))
@@ -177,7 +177,7 @@ fn leave_on_signals(leaving: &Arc<AtomicBool>, control: &ControlPipe) -> anyhow:
     Ok(())
 }
 
-/// Says now and then what was sent.
+/// Prints the counts of segments at intervals.
 struct ProgressPrinter {
     started: Instant,
     printed_at: Cell<Option<Instant>>,
@@ -215,8 +215,8 @@ mod tests {
     use super::*;
     use crate::run_directory::Manifest;
 
-    /// What comes of asking a supervisor that says these lines.
-    fn ask_one_that_says(lines: &[&str]) -> anyhow::Result<Welcome> {
+    /// Joins at a supervisor that sends these lines.
+    fn join_at(lines: &[&str]) -> anyhow::Result<Welcome> {
         let lines: Vec<String> = lines.iter().map(ToString::to_string).collect();
         let folder = tempfile::tempdir().unwrap();
         let manifest = Manifest::new(None).unwrap();
@@ -224,7 +224,7 @@ mod tests {
         let (ours, mut theirs) = UnixStream::pair().unwrap();
         let supervisor = thread::spawn(move || {
             lines.iter().for_each(|line| writeln!(theirs, "{line}").unwrap());
-            // Until the other end is closed.
+            // Returns when the other end is closed.
             theirs.read_to_end(&mut Vec::new()).unwrap();
         });
         let answer = ask(&ours, &run.unwrap());
@@ -234,18 +234,18 @@ mod tests {
     }
 
     #[test]
-    fn a_supervisor_of_another_version_is_named_with_it() {
-        let error = ask_one_that_says(&[r#"{"version":"9.9.9","control":7,"new":1}"#]);
+    fn an_error_names_the_version_of_another_supervisor() {
+        let error = join_at(&[r#"{"version":"9.9.9","control":7,"new":1}"#]);
         let error = error.unwrap_err().to_string();
         assert!(error.contains("is trained by dmprl 9.9.9 (protocol 7)"), "{error}");
         assert!(error.contains(env!("CARGO_PKG_VERSION")), "{error}");
     }
 
     #[test]
-    fn a_refusal_is_handed_on() {
+    fn a_rejection_is_reported_with_its_reason() {
         let greeting = concat!(r#"{"version":""#, env!("CARGO_PKG_VERSION"), r#"","control":1}"#);
         let lines = &[greeting, r#"{"refused":{"reason":"it is full"}}"#];
-        let error = ask_one_that_says(lines).unwrap_err().to_string();
-        assert!(error.contains("takes no worker in now: it is full"), "{error}");
+        let error = join_at(lines).unwrap_err().to_string();
+        assert!(error.contains("accepts no worker now: it is full"), "{error}");
     }
 }

@@ -1,4 +1,4 @@
-//! The learner's process: arguments, run directory and journal for the loop in
+//! The learner's process: prepares run directory and journal for the loop in
 //! `dmprl_learner::serve`.
 
 use anyhow::Context;
@@ -16,7 +16,7 @@ use super::setup::Setup;
 use super::{ControlPipe, LearnerArgs};
 use crate::journal::{Author, Entry, Journal, Piece};
 
-/// Serves the run's workers until the run is over or a stop is asked for.
+/// Serves the run's workers until the run is complete or a stop is requested.
 pub fn run(args: &LearnerArgs, control: &ControlPipe) -> anyhow::Result<()> {
     let setup = Setup::read(&args.run)?;
     let spec = setup.run.spec()?.context("the run has no spec.json; a worker writes it first")?;
@@ -43,7 +43,7 @@ pub fn run(args: &LearnerArgs, control: &ControlPipe) -> anyhow::Result<()> {
     Ok(server.run()?)
 }
 
-/// Notes where the learner begins and, from now on, every segment that comes.
+/// Writes the learner's initial state to the journal and, from now on, every segment that arrives.
 fn note_all(learner: &mut Learner, journal: &Journal) {
     for (worker, mark) in (0..).zip(learner.inbox.settled()) {
         journal.note(Entry::Restored(worker, *mark));
@@ -59,8 +59,8 @@ fn note_all(learner: &mut Learner, journal: &Journal) {
     }));
 }
 
-/// Makes the learner as the arguments say. The rows of a resumed run that its checkpoint has not
-/// seen are forgotten.
+/// Creates the learner that the arguments describe. For a resumed run, removes evaluation rows that
+/// are newer than the checkpoint.
 pub fn make(
     setup: &Setup,
     spec: &EnvSpec,

@@ -1,4 +1,4 @@
-//! The learner's records in the run directory.
+//! Writes the learner's records to the run directory.
 
 use std::fs::File;
 use std::io::{self, Write};
@@ -12,7 +12,7 @@ use dmprl_learner::session::DueError;
 use crate::journal::{Entry, Journal};
 use crate::run_directory::{RunDirectory, replace_file};
 
-/// Where the run's earlier sessions ended, as its rows tell.
+/// Reads from the run's rows where its earlier sessions ended.
 pub fn past(run: &RunDirectory) -> anyhow::Result<Past> {
     Ok(Past {
         wall_s: run.wall_s_before()?,
@@ -21,7 +21,7 @@ pub fn past(run: &RunDirectory) -> anyhow::Result<Past> {
     })
 }
 
-/// A run directory, and the journal of a learner that has one.
+/// The learner's files in a run directory, and its journal, if any.
 pub struct LearnerFiles<'a> {
     run: &'a RunDirectory,
     metrics: File,
@@ -42,7 +42,7 @@ impl RunFiles for LearnerFiles<'_> {
     fn append_metrics(&mut self, line: &[u8]) -> io::Result<()> {
         let before = self.metrics.metadata().map(|metadata| metadata.len());
         self.metrics.write_all(line).inspect_err(|_| {
-            // Half a line would spoil the next one.
+            // Remove a partial line, which would corrupt the next one.
             let _ = before.and_then(|len| self.metrics.set_len(len));
         })
     }

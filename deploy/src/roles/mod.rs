@@ -1,8 +1,9 @@
-//! The parts that `dmprl train` starts as processes of their own: learner, actor, evaluator.
+//! Roles: the processes that other commands start. Learner, worker (`dmprl actor`), evaluator,
+//! gateway, relay and observer.
 //!
-//! A role opens its [`ControlPipe`] first, then its run directory, and answers every
-//! [`crate::control::Command`]. Its standard error is its log; what it returns as an error ends
-//! up there too, and the supervisor shows the last lines to the user.
+//! A role opens its [`ControlPipe`] first, then its run directory, and handles every
+//! [`crate::control::Command`]. Its standard error is its log. It also logs the error that ends it,
+//! and the supervisor shows the last lines to the user.
 
 #[cfg(feature = "python")]
 mod actor;
@@ -34,11 +35,10 @@ pub use arguments::{ActorArgs, EvaluatorArgs, GatewayArgs, LearnerArgs, Observer
 pub use control_pipe::{ControlPipe, ORPHAN_LIMIT, ORPHANED_LEARNER_LIMIT};
 pub(crate) use setup::Setup;
 
-/// Replays, updates, publishes, writes checkpoints; with `--one-process` also steps and
-/// evaluates.
+/// Runs the learner; with `--one-process` also the worker and the evaluator.
 ///
 /// # Errors
-/// Whatever keeps it from going on; the run then ends.
+/// The learner has failed; the run then ends.
 pub fn learner(args: &LearnerArgs) -> anyhow::Result<()> {
     harden()?;
     let control = ControlPipe::open(ORPHANED_LEARNER_LIMIT)?;
@@ -51,10 +51,10 @@ pub fn learner(args: &LearnerArgs) -> anyhow::Result<()> {
     anyhow::bail!("{WITHOUT_PYTHON}")
 }
 
-/// Steps environments with the newest policy and sends the segments.
+/// Runs a worker.
 ///
 /// # Errors
-/// Whatever keeps it from going on; the supervisor starts it again, unless it had joined.
+/// The worker has failed. The supervisor restarts it, unless it joined the run.
 #[cfg(feature = "python")]
 pub fn actor(args: &ActorArgs) -> anyhow::Result<Outcome> {
     harden()?;
@@ -64,38 +64,38 @@ pub fn actor(args: &ActorArgs) -> anyhow::Result<Outcome> {
     actor::run(args, &ControlPipe::open(ORPHAN_LIMIT)?).map(|()| Outcome::Done)
 }
 
-/// Stands for the workers of other hosts.
+/// Runs the gateway, which acts as the workers of other hosts.
 ///
 /// # Errors
-/// Whatever keeps it from going on; the supervisor starts it again.
+/// The gateway has failed; the supervisor restarts it.
 pub fn gateway(args: &GatewayArgs) -> anyhow::Result<()> {
     harden()?;
     gateway::run(args, &ControlPipe::open(ORPHAN_LIMIT)?)
 }
 
-/// Stands for the learner on a host that has none.
+/// Runs the relay, which acts as the learner on a host without one.
 ///
 /// # Errors
-/// Whatever keeps it from going on; the supervisor starts it again if it crashed.
+/// The relay has failed; the supervisor restarts it if it crashed.
 pub fn relay(args: &RelayArgs) -> anyhow::Result<()> {
     harden()?;
     relay::run(args, &ControlPipe::open(ORPHAN_LIMIT)?)
 }
 
-/// Evaluates saved policies without noise.
+/// Runs the evaluator, which evaluates saved policies without noise.
 ///
 /// # Errors
-/// Whatever keeps it from going on; the supervisor starts it again.
+/// The evaluator has failed; the supervisor restarts it.
 #[cfg(feature = "python")]
 pub fn evaluator(args: &EvaluatorArgs) -> anyhow::Result<()> {
     harden()?;
     evaluator::run(args, &ControlPipe::open(ORPHAN_LIMIT)?)
 }
 
-/// Rolls a saved policy out and writes down what the robot does.
+/// Runs the observer, which records episodes of a saved policy.
 ///
 /// # Errors
-/// Whatever keeps it from going on.
+/// The observer has failed.
 #[cfg(feature = "python")]
 pub fn observer(args: &ObserverArgs) -> anyhow::Result<()> {
     harden()?;
@@ -105,7 +105,7 @@ pub fn observer(args: &ObserverArgs) -> anyhow::Result<()> {
 #[cfg(not(feature = "python"))]
 const WITHOUT_PYTHON: &str = "this program was built without the feature `python`";
 
-/// Stands in for the worker in a learner-only build.
+/// Reports that this build has no worker.
 ///
 /// # Errors
 /// Always.
@@ -114,7 +114,7 @@ pub fn actor(_args: &ActorArgs) -> anyhow::Result<Outcome> {
     anyhow::bail!("{WITHOUT_PYTHON}")
 }
 
-/// Stands in for the evaluator in a learner-only build.
+/// Reports that this build has no evaluator.
 ///
 /// # Errors
 /// Always.
@@ -123,7 +123,7 @@ pub fn evaluator(_args: &EvaluatorArgs) -> anyhow::Result<()> {
     anyhow::bail!("{WITHOUT_PYTHON}")
 }
 
-/// Stands in for the observer in a learner-only build.
+/// Reports that this build has no observer.
 ///
 /// # Errors
 /// Always.

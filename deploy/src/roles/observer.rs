@@ -1,4 +1,4 @@
-//! The observer process: rolls a saved policy out and writes down what the robot does.
+//! The observer's process: records episodes of a saved policy.
 
 use std::fs::File;
 use std::io::{BufWriter, Write};
@@ -20,7 +20,7 @@ use super::{ControlPipe, ObserverArgs};
 use crate::control::Report;
 use crate::motion::{Joint, JointKind, RecordedEpisode, Robot};
 
-/// Writes the episodes that its arguments name, and reports after each.
+/// Records the episodes that the arguments name, and reports each one.
 pub fn run(args: &ObserverArgs, control: &ControlPipe) -> anyhow::Result<()> {
     let setup = Setup::read(&args.run)?;
     let interpreter = super::actor::start_interpreter(args.venv.as_deref(), &setup.config)?;
@@ -35,7 +35,7 @@ pub fn run(args: &ObserverArgs, control: &ControlPipe) -> anyhow::Result<()> {
     let done = Arc::new(AtomicU64::new(0));
     let (episodes, reporter) = (Arc::clone(&done), control.reporter());
     let on_steps = Box::new(move |steps| {
-        // Whoever is gone is noticed as a stop.
+        // If the supervisor is gone, the loop notices it as a stop.
         let episodes = episodes.load(Ordering::Relaxed);
         let _ = reporter.send(&Report::Observed { episodes, steps: steps as u64 });
     });
@@ -61,7 +61,7 @@ pub fn run(args: &ObserverArgs, control: &ControlPipe) -> anyhow::Result<()> {
     Ok(())
 }
 
-/// Whole before the report: whoever reads it may end this process.
+/// Appends a line and flushes it, because the reader of the report may end this process.
 fn append(lines: &mut BufWriter<File>, object: &impl Serialize) -> anyhow::Result<()> {
     serde_json::to_writer(&mut *lines, object).context("cannot write an episode")?;
     lines.write_all(b"\n").and_then(|()| lines.flush()).context("cannot write an episode")

@@ -1,9 +1,9 @@
-//! The one-process run behind `--deterministic`: worker, learner and evaluator in lock-step.
+//! The one-process run of `--deterministic`: worker, learner and evaluator in lock-step.
 //!
-//! Schedule: the worker runs one segment in each environment with the newest policy; the learner
-//! takes them in order and does every update that is then owed; an evaluation happens where it
-//! falls due. Nothing depends on a clock, so the same seed gives the same bytes in `metrics.jsonl`
-//! (its time keys aside), `evaluations.jsonl` and every checkpoint.
+//! The worker runs one segment in each environment with the newest policy. Then the learner takes
+//! the segments in order and does all updates that are due. An evaluation runs when it is due.
+//! Nothing depends on a clock, so the same seed gives the same bytes in `metrics.jsonl` (except its
+//! time keys), `evaluations.jsonl` and every checkpoint.
 
 use std::cell::Cell;
 
@@ -36,7 +36,7 @@ impl From<RolloutError> for Delivery {
     }
 }
 
-/// Trains in this process until the run is over or a stop is asked for.
+/// Trains in this process until the run is complete or a stop is requested.
 pub fn run(args: &LearnerArgs, control: &ControlPipe) -> anyhow::Result<()> {
     let setup = &Setup::read(&args.run)?;
     let config = &setup.config;
@@ -47,7 +47,7 @@ pub fn run(args: &LearnerArgs, control: &ControlPipe) -> anyhow::Result<()> {
     control.send(&Report::EnvironmentReady { spec: spec.clone() })?;
 
     let learner = super::learner::make(setup, &spec, args, control)?;
-    // A resumed run continues no episode: its worker counts as started again.
+    // A resumed run begins new episodes, so its worker gets a new incarnation.
     let incarnation = u32::try_from(learner.counters.segments)?;
     let identity = Identity { run_id: setup.run_id, worker_id: 0, incarnation, seed_index: 0 };
     let mut rollout = Rollout::start(config, made, identity)?;
@@ -92,7 +92,7 @@ pub fn run(args: &LearnerArgs, control: &ControlPipe) -> anyhow::Result<()> {
         if control.stop_requested() {
             break false;
         }
-        // The goal ends the run here, at the same step every time, not when the supervisor says so.
+        // The goal ends the run here, so that it ends at the same step every time.
         if turn == Turn::Finished || reached.get() || control.finish_requested() {
             break true;
         }
@@ -116,7 +116,7 @@ struct InlineEvaluator<'a> {
     evaluations: Evaluations<'a>,
     setup: &'a Setup,
     control: &'a ControlPipe,
-    /// Set once an evaluation has reached the run's goal.
+    /// Set after an evaluation has reached the run's goal.
     reached: &'a Cell<bool>,
     failures: &'a Cell<u64>,
 }
@@ -138,7 +138,7 @@ impl InlineEvaluator<'_> {
         let RunConfig { until_return, until_success, .. } = self.evaluations.config.run;
         let success = row.success_rate.is_some_and(|rate| rate >= until_success);
         self.reached.set(self.reached.get() || success || row.return_mean >= until_return);
-        // A supervisor that is gone is noticed as a stop, which ends with a checkpoint.
+        // If the supervisor is gone, the loop notices it as a stop.
         let _ = self.control.send(&Report::Evaluated(row));
         Ok(())
     }
@@ -148,7 +148,7 @@ fn count(sum: &Cell<u64>, more: u64) {
     sum.set(sum.get() + more);
 }
 
-/// Runs one segment in each environment; the schedule has emptied the queue, so each has room.
+/// Runs one segment in each environment. The learner has emptied the queue, so all segments fit.
 fn act(rollout: &mut Rollout, sender: &mut in_process::Sender) -> anyhow::Result<()> {
     rollout
         .segment(&mut |header, block| match sender.try_send(header, block) {

@@ -1,4 +1,4 @@
-//! The relay process: the learner, to the workers of a host that has none.
+//! The relay's process: runs the bridge's relay and reports to the host's supervisor.
 
 use std::time::{Duration, Instant};
 
@@ -14,16 +14,15 @@ use crate::bridge::relay::{HostCounts, Relay, RelaySettings, Turn};
 use crate::bridge::token;
 use crate::control::{Progress, Report};
 
-/// Sleep of a turn that found nothing to do.
+/// Sleep after a turn without work.
 const IDLE: Duration = Duration::from_micros(300);
 const REPORT_INTERVAL: Duration = Duration::from_millis(500);
-/// The learner's host is said to be away when it has not answered for so long.
+/// Silence of the learner's host after which it is reported.
 const AWAY_REPORTED: Duration = Duration::from_secs(2);
-/// A host that leaves waits so long for its segments to be acknowledged.
+/// Maximum wait of a leaving host for the acknowledgement of its segments.
 const HAND_OVER: Duration = Duration::from_secs(5);
 
-/// Passes on what the host's workers send, and the learner's policies, until the run is complete or
-/// a stop is asked for.
+/// Runs the relay until the run is complete or a stop is requested.
 pub fn run(args: &RelayArgs, control: &ControlPipe) -> anyhow::Result<()> {
     let mut relay = start(args)?;
     let mut reporter = RelayReporter::new(args);
@@ -32,7 +31,7 @@ pub fn run(args: &RelayArgs, control: &ControlPipe) -> anyhow::Result<()> {
         reporter.report(&relay, control)?;
         if turn == Turn::Complete {
             reporter.report_ready(&relay, control);
-            // The gateway waits until all hosts have heard.
+            // The gateway waits until all hosts have left.
             relay.leave(&counts(control))?;
             return control.send(&Report::Finished);
         }
@@ -73,12 +72,12 @@ fn counts(control: &ControlPipe) -> HostCounts {
     HostCounts { sent, env_failures, workers: control.workers() }
 }
 
-/// Hands over what the workers have sent, as far as the learner's host takes it, and what those in
-/// mid-segment still send.
+/// Delivers the segments of the workers, including those that they are still finishing, and leaves
+/// the run. Gives up after `HAND_OVER`, or if the learner's host is unreachable.
 fn leave(relay: &mut Relay, control: &ControlPipe) -> anyhow::Result<()> {
     let deadline = Instant::now() + HAND_OVER;
     while relay.away().is_none() && !control.orphaned() && Instant::now() < deadline {
-        // JoinOutcome before the turn: a worker that is gone has sent all that it ever will.
+        // Before the turn: workers that are gone have sent all their segments.
         let gone = control.workers().count == 0;
         let turn = relay.turn(&counts(control))?;
         if turn == Turn::Complete || turn == Turn::Idle && gone && relay.in_flight() == 0 {
@@ -90,8 +89,8 @@ fn leave(relay: &mut Relay, control: &ControlPipe) -> anyhow::Result<()> {
     }
     if relay.in_flight() > 0 {
         let message = format!(
-            "{} segments are not acknowledged yet: those that have come to the learner's host will \
-             be learned, the others are lost",
+            "{} segments are not acknowledged yet: those that have reached the learner's host will \
+             be used, the others are lost",
             relay.in_flight()
         );
         warn(control, message);
@@ -99,7 +98,7 @@ fn leave(relay: &mut Relay, control: &ControlPipe) -> anyhow::Result<()> {
     relay.leave(&counts(control))
 }
 
-/// What the host's supervisor is told.
+/// Reports the relay's state to the host's supervisor.
 struct RelayReporter {
     patience: Duration,
     endpoint: String,
@@ -126,10 +125,10 @@ impl RelayReporter {
     }
 
     fn report_ready(&mut self, relay: &Relay, control: &ControlPipe) {
-        // Workers that attach wait for a policy, and not for ever.
+        // Workers that attach wait for a policy only for a limited time.
         if !self.ready && relay.version() > 0 {
             self.ready = true;
-            // A supervisor that is gone is noticed as a stop, here and below.
+            // If the supervisor is gone, the loop notices it as a stop.
             let _ = control.send(&Report::LearnerReady);
         }
     }
@@ -143,7 +142,7 @@ impl RelayReporter {
         self.report_absence(relay, control)?;
         if relay.damaged() > self.damaged {
             self.damaged = relay.damaged();
-            warn(control, format!("{} messages or segments are no such, refused", self.damaged));
+            warn(control, format!("rejected {} damaged messages or segments", self.damaged));
         }
         let since = self.reported.elapsed();
         if since >= REPORT_INTERVAL {
@@ -163,7 +162,8 @@ impl RelayReporter {
         Ok(())
     }
 
-    /// Says when the learner's host is away, why, and when it is back; gives up after a while.
+    /// Reports when and why the learner's host is unreachable, and when it is back. Fails after
+    /// `patience`.
     fn report_absence(&mut self, relay: &Relay, control: &ControlPipe) -> anyhow::Result<()> {
         match (relay.away(), &self.away) {
             (Some((since, reason)), told) => {
@@ -178,7 +178,7 @@ impl RelayReporter {
                 let new = told.as_ref().is_none_or(|(_, before)| before != reason);
                 if new && elapsed >= AWAY_REPORTED {
                     let patience = self.patience.as_secs();
-                    warn(control, format!("{reason}; workers wait, for {patience} s at most"));
+                    warn(control, format!("{reason}; workers wait for at most {patience} s"));
                     self.away = Some((*since, reason.clone()));
                 }
             }

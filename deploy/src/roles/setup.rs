@@ -1,11 +1,11 @@
-//! What every role reads from the run directory before it begins.
+//! Reads the files of the run directory that every role needs.
 
 use anyhow::Context;
 use dmprl_shared::config::ExperimentConfig;
 
 use crate::run_directory::RunDirectory;
 
-/// A run as a role finds it.
+/// A run directory with its configuration and id.
 pub struct Setup {
     pub run: RunDirectory,
     pub config: ExperimentConfig,

@@ -212,7 +212,7 @@ fn a_run_that_cannot_take_a_worker_in_says_why() {
     };
     refused(&run, 2, "there is no run directory");
     place.run(&train("reacher", &run, &["--steps", "500"])).with_status(0);
-    refused(&run, 1, "is not being trained on this machine");
+    refused(&run, 1, "is not training on this machine");
     if rustix::process::geteuid().is_root() {
         chown(&run, Some(65_534), None).unwrap();
         refused(&run, 2, "belongs to user 65534");
