@@ -1,5 +1,5 @@
-//! Stage 3 of 8, exploration: random warm-up actions, and noise on actions or DMP parameters. Called
-//! by the rollout.
+//! Stage 3 of 8, exploration: random warm-up actions, and noise on actions or DMP parameters.
+//! Called by the rollout.
 
 use std::ops::Range;
 

@@ -1,5 +1,5 @@
-//! Stage 3 of 8: finds, describes and counts environments that failed in the last call. Called by the
-//! rollout and the evaluator.
+//! Stage 3 of 8: finds, describes and counts environments that failed in the last call. Called by
+//! the rollout and the evaluator.
 //!
 //! A failed environment loses only its own segment. The Python side makes it again and reports it
 //! ([`PythonEnvironments::failed`]). If a `SegmentEnv` returns numbers that are not finite, this
@@ -11,8 +11,8 @@ use crate::python_env::{PythonEnvironments, PythonError};
 
 /// Maximum length of a description. An exception may contain a whole model file.
 const SENTENCE_CHARS_MAX: usize = 500;
-/// Number of segments without a fault after which the failures no longer count, as after a completed
-/// episode. An environment without a time limit may never complete an episode.
+/// Number of segments without a fault after which the failures no longer count, as after a
+/// completed episode. An environment without a time limit may never complete an episode.
 const SOUND_SEGMENTS: u32 = 1_000;
 
 /// The failures of a set of environments.
@@ -68,8 +68,9 @@ pub struct FailureBudgetExceeded {
 }
 
 impl Faults {
-    /// Creates the record for `envs` environments. The budget is exceeded by more than `failures_max`
-    /// failures with neither a completed episode nor a thousand sound segments in between.
+    /// Creates the record for `envs` environments. The budget is exceeded by more than
+    /// `failures_max` failures with neither a completed episode nor a thousand sound segments in
+    /// between.
     #[must_use]
     pub fn new(envs: usize, failures_max: u32) -> Self {
         Self {

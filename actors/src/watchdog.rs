@@ -1,9 +1,9 @@
 //! Stage 3 of 8, the watchdog: detects a call into the environments that does not return.
 //!
-//! A hanging environment may hold the interpreter's lock forever, so code that needs the lock cannot
-//! detect it, and no exception can end it. This thread does not use Python: the caller records when
-//! a call begins and ends, and the thread checks periodically whether the same call still runs.
-//! Started by `environments::watch`.
+//! A hanging environment may hold the interpreter's lock forever, so code that needs the lock
+//! cannot detect it, and no exception can end it. This thread does not use Python: the caller
+//! records when a call begins and ends, and the thread checks periodically whether the same call
+//! still runs. Started by `environments::watch`.
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
@@ -79,8 +79,8 @@ pub struct Hang {
     pub lasted: Duration,
 }
 
-/// Starts the thread. It calls `hung` once, after a call has lasted for `timeout` to 1.25 `timeout`.
-/// It ends when `calls` is dropped.
+/// Starts the thread. It calls `hung` once, after a call has lasted for `timeout` to 1.25
+/// `timeout`. It ends when `calls` is dropped.
 ///
 /// # Errors
 /// If the thread cannot be started.

@@ -1,4 +1,4 @@
-//! Types and code that actor and learner share.
+//! Types and code that workers and learner share.
 //!
 //! This crate does not depend on Python, an async runtime or an optimiser. It reads no clock, no
 //! environment variable and no global source of randomness: all three are passed in. `config` is

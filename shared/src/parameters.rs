@@ -1,4 +1,4 @@
-//! Policy snapshots, which the learner publishes and the workers act with.
+//! Stage 7 of 8, its record: policy snapshots, which the learner publishes and the workers use.
 
 use thiserror::Error;
 

@@ -1,4 +1,5 @@
-//! The K-step record that a worker sends to the learner: a fixed header and one block of f32.
+//! Stage 4 of 8, its record: K steps that a worker sends to the learner, as a fixed header and one
+//! block of f32.
 //!
 //! Block of a segment with K steps, observation length O and action length A:
 //! ```text

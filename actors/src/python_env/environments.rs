@@ -72,8 +72,8 @@ impl Call {
 }
 
 impl PythonEnvironments {
-    /// Makes environments of `task_id` (a Gymnasium id, `module:Id` or `module:Class`). They must be
-    /// reset before the first step.
+    /// Makes environments of `task_id` (a Gymnasium id, `module:Id` or `module:Class`). They must
+    /// be reset before the first step.
     ///
     /// # Errors
     /// `Exception` with Gymnasium's message for an unknown id or an unsupported space, `Spec` for

@@ -32,8 +32,8 @@ pub struct StepRecording {
     pub joint_positions: Vec<Vec<f64>>,
     /// Joint velocities, (T+1, J) [rad/s or m/s].
     pub joint_velocities: Vec<Vec<f64>>,
-    /// Success after each step as in [`PythonEnvironments::success`], (T,); empty if it is only known
-    /// for segments.
+    /// Success after each step as in [`PythonEnvironments::success`], (T,); empty if it is only
+    /// known for segments.
     pub success: Vec<u8>,
     /// Files of pictures, if requested.
     pub frames: Vec<String>,

@@ -132,7 +132,7 @@ pub struct Gateway {
     attach_tried: Instant,
     /// Messages that are damaged or come on an unknown channel.
     rejected: u64,
-    /// Rejected join requests. The user is told of the first, then at each power of two.
+    /// Rejected join requests. The first is reported to the user, then each power of two.
     refusals: u64,
     /// Last time that a host received a new channel from this gateway or its predecessor.
     channels_changed: Instant,

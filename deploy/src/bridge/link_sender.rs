@@ -168,7 +168,7 @@ impl LinkSender {
         self.timed = None;
     }
 
-    /// Processes the gateway's acknowledgement: drops what the learner has, and begins a
+    /// Processes the gateway's acknowledgement: drops acknowledged segments, and begins a
     /// retransmit epoch if a segment is missing.
     pub fn acknowledge(&mut self, ack: &LinkAck, now: Instant) -> Acked {
         let mut acked = Acked::default();
@@ -346,8 +346,8 @@ mod tests {
     }
 
     /// Regression test: the worker retransmits from the last acknowledgement it heard, but the
-    /// learner has more. The sender once waited forever for an acknowledgement of segments it had not
-    /// received yet.
+    /// learner has more. The sender once waited forever for an acknowledgement of segments it had
+    /// not received yet.
     #[test]
     fn a_new_sender_accepts_a_mark_beyond_the_segments_it_has_seen() {
         let mut ends = Ends::new();

@@ -1,17 +1,16 @@
-//! The bridge between hosts: workers send their segments to a learner on another host.
+//! Stages 4 and 7 of 8 between hosts: workers send their segments to a learner on another host.
 //!
 //! ```text
 //!  learner's host                                    other hosts
 //!  learner ◄── queue, one a worker ── gateway ◄──── Zenoh ──── relay ◄── queues ── workers
 //!     └── policies, acknowledgements ──► gateway ── Zenoh ────► relay ── the same ──► workers
-//! ```
-//! A [`relay`] acts as the learner for the workers of its host; the [`gateway`] acts as the workers
-//! of all other hosts for the learner. Like a worker, each hop retains the segments that the
-//! learner has not acknowledged: `link_sender` at the relay, `link_receiver` at the gateway. So
+//! ``` A [`relay`] acts as the learner for the workers of its host; the [`gateway`] acts as the
+//! workers of all other hosts for the learner. Like a worker, each hop retains the segments that
+//! the learner has not acknowledged: `link_sender` at the relay, `link_receiver` at the gateway. So
 //! after any process has died, its predecessor in the chain retransmits. [`wire`] and
 //! [`host_messages`] define the messages, `congestion_window` limits the data in flight,
-//! `policy_sender` sends policies, [`join`] requests places, `host_registry` leases them, and `link`
-//! is the only file that names Zenoh.
+//! `policy_sender` sends policies, [`join`] requests places, `host_registry` leases them, and
+//! `link` is the only file that names Zenoh.
 
 mod congestion_window;
 pub mod gateway;

@@ -151,8 +151,9 @@ impl ControlPipe {
         self.flags.orphaned.load(Ordering::Acquire)
     }
 
-    /// Waits up to `wait` for the next command; returns `None` at the time limit or at end of input.
-    /// `stop`, `finish`, `env_failures`, `workers` and `sent` are not returned: each has a method.
+    /// Waits up to `wait` for the next command; returns `None` at the time limit or at end of
+    /// input. `stop`, `finish`, `env_failures`, `workers` and `sent` are not returned: each has a
+    /// method.
     #[must_use]
     pub fn next_within(&self, wait: Duration) -> Option<Command> {
         self.commands.lock().unwrap_or_else(PoisonError::into_inner).recv_timeout(wait).ok()

@@ -1,8 +1,8 @@
 //! A worker that joins a running training: `dmprl actor --join RUN`.
 //!
 //! It requests a place from the run's supervisor (`launch/joining.rs`) and then works like the
-//! others. On the first Ctrl-C it delivers its segments before it leaves; a second Ctrl-C ends it at
-//! once.
+//! others. On the first Ctrl-C it delivers its segments before it leaves; a second Ctrl-C ends it
+//! at once.
 
 use std::cell::Cell;
 use std::fs;
@@ -107,8 +107,8 @@ fn check_accepts_workers(setup: &Setup) -> anyhow::Result<()> {
     Ok(())
 }
 
-/// Connects to the supervisor. The run's lock contains the supervisor's process id, and this and the
-/// run id determine the shared-memory directory, which contains the socket.
+/// Connects to the supervisor. The run's lock contains the supervisor's process id, and this and
+/// the run id determine the shared-memory directory, which contains the socket.
 fn connect(run: &RunDirectory) -> anyhow::Result<UnixStream> {
     let not_trained = || {
         format!(
@@ -164,8 +164,8 @@ fn ask(mut stream: &UnixStream, run: &RunDirectory) -> anyhow::Result<Welcome> {
 
 /// Installs signal handlers: the first signal makes the worker leave, the second ends it at once.
 fn leave_on_signals(leaving: &Arc<AtomicBool>, control: &ControlPipe) -> anyhow::Result<()> {
-    // A hang-up that is ignored, as by `nohup`, stays ignored. An interrupt does not: shells ignore it
-    // for background jobs only to shield them from the terminal's Ctrl-C.
+    // A hang-up that is ignored, as by `nohup`, stays ignored. An interrupt does not: shells ignore
+    // it for background jobs only to shield them from the terminal's Ctrl-C.
     let handled = |signal: &i32| *signal != libc::SIGHUP || !is_ignored(*signal);
     for signal in GROUP_SIGNALS.into_iter().filter(handled) {
         // In this order: the first signal must not count as the second.

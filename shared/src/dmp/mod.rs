@@ -1,9 +1,10 @@
-//! Dynamic movement primitives, which turn a decision (g, w, rho) into the actions of a segment.
+//! Stages 3 and 6 of 8: dynamic movement primitives, which turn a decision (g, w, rho) into the
+//! actions of a segment.
 //!
-//! Stages 3 (rollout) and 6 (update) of the data flow; `policy` calls this module once per action
-//! dimension. "The paper" is "Efficient Robot Manipulation via Reinforcement Learning with Dynamic
-//! Movement Primitives-Based Policy" (Appl. Sci. 2024, 14, 10665), with equations 8 to 14. Each
-//! item names its differences from the paper and its interpretation of ambiguous passages.
+//! `policy` calls this module once per action dimension. "The paper" is "Efficient Robot
+//! Manipulation via Reinforcement Learning with Dynamic Movement Primitives-Based Policy" (Appl.
+//! Sci. 2024, 14, 10665), with equations 8 to 14. Each item names its differences from the paper
+//! and its interpretation of ambiguous passages.
 //!
 //! | symbol | meaning | unit (DMP time, tau = 1) |
 //! |---|---|---|

@@ -1,4 +1,4 @@
-//! Policies, which map an observation to the actions of a segment.
+//! Stages 3 and 6 of 8: policies, which map an observation to the actions of a segment.
 //!
 //! Rollout, evaluation and update share this forward pass.
 //!

@@ -1,4 +1,4 @@
-//! What a supervisor and the processes that it starts say to each other.
+//! Messages between a supervisor and the processes that it starts.
 
 use std::path::PathBuf;
 
@@ -8,158 +8,158 @@ use thiserror::Error;
 use crate::spec::EnvSpec;
 use crate::transport::delivery::Sent;
 
-/// From the supervisor to a role.
+/// A command of the supervisor to a process.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case", deny_unknown_fields)]
 pub enum Command {
-    /// To a worker: the learner is up, its services lie in this shared-memory directory.
+    /// To a worker: attach to the learner of this shared-memory directory.
     Attach {
         /// The run's private shared-memory directory.
         domain: PathBuf,
     },
     /// To the evaluator: evaluate this policy.
     Evaluate(EvaluationRequest),
-    /// To the learner: so many failures of environments have been reported to the supervisor.
+    /// To the learner: number of failures of environments.
     EnvFailures {
-        /// In the whole run, all processes together.
+        /// Failures in the whole run, of all processes.
         total: u64,
     },
-    /// To the learner: what all workers have reported to the supervisor, in the whole run.
+    /// To the learner: counts of the segments of all workers in the whole run.
     Sent(Sent),
-    /// To the learner: what the supervisor knows of the workers.
+    /// To the learner: state of the workers.
     Workers(WorkersNow),
-    /// To the learner: the run has reached its goal or its time; finish as at the last step, with a
-    /// last evaluation.
+    /// To the learner: the run has reached its goal or its time limit; finish as after the last
+    /// step, with a last evaluation.
     Finish,
-    /// To any role: finish what must be finished and exit.
+    /// To any process: save what must be saved and exit.
     Stop,
 }
 
-/// From a role to the supervisor.
+/// A report of a process to the supervisor.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case", deny_unknown_fields)]
 pub enum Report {
-    /// A worker or the evaluator has its environments.
+    /// The environments of a worker or evaluator are ready.
     EnvironmentReady {
-        /// What they are.
+        /// Properties of the environments.
         spec: EnvSpec,
     },
-    /// The learner's services exist: workers may attach.
+    /// The learner is ready: workers may attach.
     LearnerReady,
     /// The first environment step of this run has reached the learner.
     FirstSegment,
-    /// Where the learner stands; a few times a second.
+    /// Progress of the learner, sent a few times per second.
     Progress(Progress),
-    /// The learner asks for an evaluation.
+    /// The learner requests an evaluation.
     Evaluate(EvaluationRequest),
-    /// The evaluator's answer: the row it appended to `evaluations.jsonl`.
+    /// The evaluator has appended this row to `evaluations.jsonl`.
     Evaluated(EvaluationRow),
-    /// The evaluator's other answer: the episodes of this evaluation failed; the next may succeed.
+    /// The episodes of an evaluation failed; the next evaluation may succeed.
     NotEvaluated {
-        /// Which policy was asked for.
+        /// Version of the policy.
         policy_version: u64,
-        /// What failed.
+        /// Description of the failure.
         reason: String,
     },
-    /// How far the observer is.
+    /// Progress of the observer.
     Observed {
-        /// Episodes written down.
+        /// Episodes recorded.
         episodes: u64,
-        /// Steps of the next one; 0 when an episode has just ended.
+        /// Steps of the next episode; 0 at the end of an episode.
         steps: u64,
     },
-    /// How far the video is.
+    /// Progress of a video.
     Filmed {
-        /// Frames in it.
+        /// Frames done.
         done: u64,
-        /// How many there will be.
+        /// Total number of frames.
         of: u64,
     },
     /// Environments failed and were made again.
     EnvFailures {
-        /// How many times since the last such report.
+        /// Number of failures since the last such report.
         count: u64,
-        /// The last of them: which, when and why.
+        /// Description of the last failure.
         last: String,
     },
-    /// What a worker did since its last such report.
+    /// Counts of a worker's segments since its last such report.
     Sent(Sent),
-    /// A worker's sign of life, once a second.
+    /// A worker's heartbeat, once per second.
     Alive {
-        /// What it does.
+        /// Activity of the worker's loop.
         doing: Activity,
-        /// Segments that it keeps because the learner has not acknowledged them.
+        /// Segments that the learner has not acknowledged.
         kept: u64,
     },
-    /// A call into the environments does not return; the process ends itself after this.
+    /// A call into the environments does not return. The process exits after this report.
     EnvHung {
-        /// The sentence.
+        /// The message.
         message: String,
     },
-    /// From the gateway, once a second: the hosts that take part.
+    /// From the gateway, twice per second: the hosts that take part.
     Hosts(Vec<HostNow>),
-    /// A worker that had joined leaves; it has handed over what it could.
+    /// A worker that joined the run leaves. It has delivered its segments as far as possible.
     Left,
     /// The learner wrote a checkpoint.
     Checkpoint {
-        /// Its directory's name below `checkpoints/`.
+        /// Name of its directory in `checkpoints/`.
         name: String,
         /// Environment steps in it.
         env_steps: u64,
     },
-    /// The learner has come to its end and written its last checkpoint.
+    /// The learner has finished and written its last checkpoint.
     Finished,
-    /// A role noticed something the user should read.
+    /// A warning for the user.
     Warning {
-        /// The sentence.
+        /// The message.
         message: String,
     },
 }
 
-/// What the supervisor tells the learner of the workers, for its metrics.
+/// State of all workers, for the learner's metrics.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct WorkersNow {
-    /// Attached: the run's own and those that have joined.
+    /// Attached workers, including those that joined.
     pub count: u64,
-    /// Starts after a death, in the whole run.
+    /// Restarts after a death in the whole run.
     pub restarts: u64,
-    /// Segments that they keep until the learner acknowledges them, all together.
+    /// Segments that the learner has not acknowledged, of all workers.
     pub queued_segments: u64,
 }
 
-/// Another host that takes part in the run.
+/// State of another host that takes part in the run.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct HostNow {
-    /// What people call it.
+    /// Name of the host.
     pub name: String,
-    /// Whether it can be reached.
+    /// True if the host is reachable.
     pub here: bool,
-    /// Workers that it has attached.
+    /// Attached workers of the host.
     pub workers: u64,
-    /// Segments that they keep until the learner acknowledges them.
+    /// Segments of its workers that the learner has not acknowledged.
     pub kept: u64,
-    /// Segments of theirs that the learner has acknowledged.
+    /// Segments of its workers that the learner has acknowledged.
     pub acked: u64,
-    /// Starts of its workers after a death.
+    /// Restarts of its workers after a death.
     pub restarts: u64,
 }
 
-/// What a worker does when it gives a sign of life.
+/// Activity of a worker at a heartbeat.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Activity {
-    /// It waits for a learner, or for its first policy.
+    /// The worker waits for a learner or for its first policy.
     Attaching,
-    /// It steps environments; what a call into them does is the watchdog's business.
+    /// The worker steps environments. The watchdog limits the duration of a call.
     Stepping,
-    /// It waits because its queue or its outbox is full.
+    /// The worker waits because its queue or its outbox is full.
     Waiting,
 }
 
 impl Activity {
-    /// As part of a sentence.
+    /// Name of the activity, for messages.
     #[must_use]
     pub fn name(self) -> &'static str {
         match self {
@@ -170,8 +170,7 @@ impl Activity {
     }
 }
 
-/// Where the learner stands. Every number is finite: JSON has no NaN, and a line with one is no
-/// report.
+/// Progress of the learner. All numbers are finite, because JSON has no NaN.
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Progress {
@@ -181,39 +180,39 @@ pub struct Progress {
     pub updates: u64,
     /// Segments inserted.
     pub segments: u64,
-    /// Environment steps per second, lately.
+    /// Recent rate of environment steps \[1/s\].
     pub env_steps_per_s: f64,
-    /// Updates per second, lately.
+    /// Recent rate of updates \[1/s\].
     pub updates_per_s: f64,
-    /// Mean return of the last training episodes (with noise); NaN is sent as null.
+    /// Mean return of the last training episodes, with noise; null if there are none.
     pub return_mean: Option<f64>,
     /// Updates times batch size over environment steps inserted.
     pub samples_per_insert: f64,
-    /// Median over recent segments: policy versions between acting and insertion.
+    /// Median policy lag of recent segments: policy versions between acting and insertion.
     pub policy_lag_p50: u64,
-    /// Largest of them.
+    /// Maximum policy lag of recent segments.
     pub policy_lag_max: u64,
-    /// Segments that workers keep until the learner acknowledges them.
+    /// Segments of all workers that the learner has not acknowledged.
     pub queued_segments: u64,
-    /// Starts of workers and of the learner after a death, over the whole run.
+    /// Restarts of workers and learner after a death in the whole run.
     pub restarts: u64,
-    /// Segments refused, duplicates aside.
+    /// Segments rejected, without duplicates.
     pub rejected: u64,
     /// Failures of environments.
     pub env_failures: u64,
 }
 
-/// One evaluation to be done.
+/// A request to evaluate a policy.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct EvaluationRequest {
     /// Environment steps inserted when the policy was saved.
     pub env_steps: u64,
-    /// Updates done by then.
+    /// Updates done when the policy was saved.
     pub updates: u64,
-    /// Segments inserted by then.
+    /// Segments inserted when the policy was saved.
     pub segments: u64,
-    /// Seconds of training by then, over all sessions of the run.
+    /// Training time when the policy was saved, over all sessions of the run \[s\].
     pub wall_s: f64,
     /// Version of the policy, saved as `policies/<version>.safetensors`.
     pub policy_version: u64,
@@ -225,19 +224,19 @@ pub struct EvaluationRequest {
 pub struct EvaluationRow {
     /// Environment steps inserted when the policy was saved.
     pub env_steps: u64,
-    /// Updates done by then.
+    /// Updates done when the policy was saved.
     pub updates: u64,
-    /// Segments inserted by then.
+    /// Segments inserted when the policy was saved.
     pub segments: u64,
-    /// Seconds of training by then, over all sessions of the run.
+    /// Training time when the policy was saved, over all sessions of the run \[s\].
     pub wall_s: f64,
     /// Version of the policy.
     pub policy_version: u64,
     /// Return of each episode.
     pub returns: Vec<f64>,
-    /// Their mean.
+    /// Mean of the returns.
     pub return_mean: f64,
-    /// Share of episodes that ended in success; null where the task does not report it.
+    /// Share of episodes that ended in success; null if the task does not report success.
     pub success_rate: Option<f64>,
     /// Mean |u_t - u_{t-1}| over all steps and action dimensions.
     pub smoothness: f64,
@@ -254,10 +253,10 @@ pub struct EvaluationNotFinite {
 }
 
 impl EvaluationRow {
-    /// Rejects a row that JSON cannot represent: neither `evaluations.jsonl` nor a report holds it.
+    /// Rejects a row that JSON cannot represent.
     ///
     /// # Errors
-    /// A number is NaN or infinite.
+    /// If a number is NaN or infinite.
     pub fn check_finite(&self) -> Result<(), EvaluationNotFinite> {
         let numbers = [self.wall_s, self.return_mean, self.smoothness];
         let mut numbers = numbers.iter().chain(&self.returns).chain(&self.success_rate);

@@ -1,7 +1,7 @@
-//! How a process talks to its supervisor.
+//! The trait by which a process talks to its supervisor.
 //!
 //! The loops in `actors` and `learner` know their supervisor only through the trait [`Supervisor`].
-//! In the program the control pipe implements it, one JSON object a line; [`FakeSupervisor`]
+//! In the program the control pipe implements it, with one JSON object per line; [`FakeSupervisor`]
 //! implements it for tests, which run a loop without starting a process.
 
 mod fake;
@@ -19,17 +19,17 @@ pub use messages::{
 
 use crate::transport::delivery::Sent;
 
-/// Why a report was not delivered; as a rule, the supervisor is gone.
+/// Why a report was not delivered. Usually the supervisor is gone.
 #[derive(Debug, thiserror::Error)]
 #[error(transparent)]
 pub struct ReportError(#[from] pub Box<dyn Error + Send + Sync>);
 
-/// What the supervisor has counted in the whole run, all processes together.
+/// Counts of the whole run, over all processes.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct RunTotals {
     /// Failures of environments.
     pub env_failures: u64,
-    /// How many workers there are, and how they fare.
+    /// State of the workers.
     pub workers: WorkersNow,
     /// Segments that workers have produced, sent and had acknowledged.
     pub sent: Sent,
@@ -50,11 +50,11 @@ pub trait Supervisor {
     /// Whether the run must end as if it had all its steps.
     fn finish_requested(&self) -> bool;
 
-    /// Whether the supervisor is gone. Nobody receives reports any more, and a stop is requested.
+    /// Whether the supervisor is gone. Then reports fail, and a stop is requested.
     fn is_gone(&self) -> bool;
 
-    /// Waits up to `wait` for the next command and returns it. Stop, finish and totals are no
-    /// commands here: each has a method of its own.
+    /// Waits up to `wait` for the next command and returns it. Stop, finish and totals are not
+    /// returned: each has its own method.
     fn next_command(&self, wait: Duration) -> Option<Command>;
 
     /// The newest totals; all zero before the supervisor has sent any.

@@ -198,7 +198,7 @@ pub struct AcknowledgementReader {
     taken: u64,
 }
 
-/// A channel for the acknowledgements of `workers` workers.
+/// Creates a channel for the acknowledgements of `workers` workers.
 #[must_use]
 pub fn acknowledgement_channel(workers: usize) -> (Acknowledger, AcknowledgementReader) {
     let newest = Acknowledged { marks: vec![Watermark::default(); workers], count: 0 };

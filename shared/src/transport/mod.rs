@@ -59,7 +59,7 @@ pub trait SegmentReceiver {
     /// `Middleware` if a queue is broken.
     fn try_receive(&mut self, segment: &mut Segment) -> Result<bool, TransportError>;
 
-    /// Frees the resources of dead workers. Call it a few times a second.
+    /// Frees the resources of dead workers. Call it a few times per second.
     ///
     /// # Errors
     /// `Middleware` if the cleanup failed.
@@ -74,7 +74,7 @@ pub trait ParameterPublisher {
     /// `Length` if its length is wrong, `Middleware` if publishing failed.
     fn publish(&mut self, snapshot: &ParameterSnapshot) -> Result<(), TransportError>;
 
-    /// Sends the newest snapshot to workers that have joined since. Call it a few times a second.
+    /// Sends the newest snapshot to workers that have joined since. Call it a few times per second.
     ///
     /// # Errors
     /// `Middleware` if the channel is broken.
@@ -98,13 +98,14 @@ pub trait ParameterSubscriber {
 /// The learner's end of the acknowledgement channel. Acknowledgements are cumulative: the newest
 /// replace the ones before.
 pub trait AcknowledgementPublisher {
-    /// Tells every worker how far its segments have arrived; to be called a hundred times a second.
+    /// Sends every worker its newest mark. Call it about a hundred times per second.
     ///
     /// # Errors
-    /// `Length` if there is not one mark a worker, `Middleware` if publishing failed.
+    /// `Length` if there is not one mark per worker, `Middleware` if publishing failed.
     fn acknowledge(&mut self, marks: &[Watermark]) -> Result<(), TransportError>;
 
-    /// Lets workers in that have joined since; to be called a few times a second.
+    /// Sends the newest acknowledgements to workers that have joined since. Call it a few times per
+    /// second.
     ///
     /// # Errors
     /// `Middleware` if the channel is broken.
@@ -116,7 +117,7 @@ pub trait AcknowledgementSubscriber {
     /// Copies the newest acknowledgements into `acknowledgements` if they have not been taken yet.
     ///
     /// # Errors
-    /// `Length` if there is not one mark a worker, `Middleware` if the channel is broken.
+    /// `Length` if there is not one mark per worker, `Middleware` if the channel is broken.
     fn newest(&mut self, acknowledgements: &mut Acknowledgements) -> Result<bool, TransportError>;
 }
 
@@ -124,9 +125,9 @@ pub trait AcknowledgementSubscriber {
 pub trait WorkerTransport {
     /// Offers segments to the learner.
     type Segments: SegmentSender;
-    /// Takes the learner's newest snapshot.
+    /// Receives the learner's newest snapshot.
     type Parameters: ParameterSubscriber;
-    /// Takes what the learner says has arrived for good.
+    /// Receives the learner's acknowledgements.
     type Acknowledgements: AcknowledgementSubscriber;
 }
 
@@ -135,8 +136,8 @@ pub trait WorkerTransport {
 pub struct WorkerEnd<T: WorkerTransport> {
     /// Offers segments to the learner.
     pub segments: T::Segments,
-    /// Takes the learner's newest snapshot.
+    /// Receives the learner's newest snapshot.
     pub parameters: T::Parameters,
-    /// Takes what the learner says has arrived for good.
+    /// Receives the learner's acknowledgements.
     pub acknowledgements: T::Acknowledgements,
 }

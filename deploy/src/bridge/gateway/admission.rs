@@ -41,7 +41,8 @@ impl Gateway {
         let channel = random_u64().map_err(|error| never(format!("{error:#}")))?;
         let known = self.registry.hosts().iter().find(|host| host.host == request.host);
         let before = known.map(|host| host.channel);
-        // `dmprl bridge` has joined already, and its relay joins again: that is no news to the user.
+        // `dmprl bridge` has joined already, and its relay joins again: that is no news to the
+        // user.
         let was_present = request.lease.is_some() && known.is_some_and(|host| host.is_present);
         let lease = self.registry.admit(&request, channel, &self.acknowledged.marks, now)?;
         if let Some(before) = before {

@@ -1,4 +1,5 @@
-//! Reliable delivery: a worker keeps each segment until the learner has acknowledged it.
+//! Stage 4 of 8, reliable delivery: a worker keeps each segment until the learner has acknowledged
+//! it.
 //!
 //! ```text
 //!   worker                                    learner

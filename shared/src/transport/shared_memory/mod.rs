@@ -1,10 +1,10 @@
-//! Segments and snapshots between processes of one host, over iceoryx2.
+//! Stages 4 and 7 of 8: segments and snapshots between processes of one host, over iceoryx2.
 //!
 //! `domain` is the run's directory, and `generation` the part of it that belongs to one learner.
-//! `plan` holds what all processes must agree on, and `space` the memory that it needs. `service`,
-//! `channel`, `cleaning` and `latest` wrap the middleware. `segments` and `parameters`
-//! implement the traits; `acknowledgements` is the third channel, for `delivery`. No other module
-//! uses iceoryx2.
+//! `plan` holds parameters that all processes share, and `space` computes the memory that they
+//! need. `service`, `channel`, `cleaning` and `latest` wrap the middleware. `segments` and
+//! `parameters` implement the traits; `acknowledgements` is the third channel, for `delivery`. No
+//! other module uses iceoryx2.
 //!
 //! Guarantees when processes die:
 //! - A worker never creates a service and never cleans up, so its death at any point blocks no

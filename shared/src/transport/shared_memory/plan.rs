@@ -1,4 +1,4 @@
-//! The plan: what the learner and the workers of a run must agree on.
+//! The plan: parameters that must be equal in the learner and the workers of a run.
 
 use crate::config::ExperimentConfig;
 use crate::policy::Policy;
