@@ -60,18 +60,12 @@ pub fn run(args: &LearnerArgs, control: &ControlPipe) -> anyhow::Result<()> {
     let mut recorder = Recorder::new(&mut files, past(&setup.run)?, control, &learner);
     let mut session = Session::start(learner, receiver, publisher)?;
     control.send(&Report::LearnerReady)?;
-    let (reached, stop) = (Cell::new(false), control.stop_flag());
     let policy_path = |version| setup.run.policy_path(version);
-    let failures = Cell::new(session.learner.counters.env_failures);
+    let (reached, failures) =
+        (&Cell::new(false), &Cell::new(session.learner.counters.env_failures));
+    let stop = control.stop_flag();
     let evaluations = Evaluations { config, policy_path: &policy_path, stop };
-    let mut inline = InlineEvaluator {
-        evaluator,
-        evaluations,
-        setup,
-        control,
-        reached: &reached,
-        failures: &failures,
-    };
+    let mut inline = InlineEvaluator { evaluator, evaluations, setup, control, reached, failures };
     let mut evaluate = |request: EvaluationRequest| inline.evaluate(&request).map_err(Into::into);
     catch_up(&mut session, &mut recorder, &mut evaluate)?;
     let mut first = true;
@@ -98,7 +92,7 @@ pub fn run(args: &LearnerArgs, control: &ControlPipe) -> anyhow::Result<()> {
         }
         parameters.newest(&mut rollout.snapshot)?;
         let acted = act(&mut rollout, &mut senders[0]);
-        count(&failures, report_failures(&rollout.take_failures(), control));
+        count(failures, report_failures(&rollout.take_failures(), control));
         session.learner.counters.env_failures = failures.get();
         acted?;
         if std::mem::take(&mut first) {
