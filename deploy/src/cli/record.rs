@@ -6,8 +6,8 @@ use clap::Args;
 
 use super::{emit, prepare_python_with, this_program};
 use crate::failure::{Outcome, wrong_use};
-use crate::motion::{Means, RecordedEpisode};
-use crate::record::{RecordPlan, Recordings, record};
+use crate::motion::RecordedEpisode;
+use crate::record::{Observer, RecordPlan, Recordings, record};
 use crate::run_directory::{PolicyChoice, RunDirectory};
 use crate::terminal::{StagesProgress, say, shown};
 
@@ -80,7 +80,7 @@ pub(super) fn run(args: &RecordArgs) -> anyhow::Result<Outcome> {
         first_seed,
         episodes: args.episodes,
         output: args.output.clone().unwrap_or_else(|| run.path().join("videos")),
-        means: Means { program: this_program()?, venv },
+        observer: Observer { program: this_program()?, venv },
         python,
     };
     let progress = StagesProgress::new();

@@ -3,11 +3,11 @@
 use std::path::PathBuf;
 
 use anyhow::{Context, anyhow};
+use dmprl_shared::supervision::EvaluationRow;
 use plotters::prelude::*;
 
 use super::axes::Axes;
 use super::png::png;
-use crate::control::EvaluationRow;
 use crate::run_directory::RunDirectory;
 use crate::terminal::std_of;
 
@@ -21,14 +21,13 @@ const BESIDE: u32 = 40;
 ///
 /// # Errors
 /// The rows cannot be read, or the picture cannot be written.
-pub fn learning_curve(run: &RunDirectory) -> anyhow::Result<Option<PathBuf>> {
+pub fn learning_curve(run: &RunDirectory, title: &str) -> anyhow::Result<Option<PathBuf>> {
     let rows = run.evaluations()?;
     if rows.is_empty() {
         return Ok(None);
     }
-    let title = crate::launch::title(&run.config()?);
     let svg =
-        draw(&rows, &title).map_err(|error| anyhow!("cannot draw the learning curve: {error}"))?;
+        draw(&rows, title).map_err(|error| anyhow!("cannot draw the learning curve: {error}"))?;
     let path = run.path().join("plots").join("learning_curve.svg");
     let pictures = [(path.with_extension("png"), png(&svg)?), (path.clone(), svg.into_bytes())];
     for (path, picture) in pictures {

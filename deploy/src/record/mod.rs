@@ -1,23 +1,36 @@
-//! Records videos of a policy's episodes, of one run or of two side by side.
+//! Rolls saved policies out in observer processes: records videos of their episodes, and measures
+//! their motion.
 //!
-//! An observer for each run renders the episodes, then `envs_py/dmprl/film.py` makes video,
-//! animation and strip from the frames. All files are created in a temporary folder next to the
-//! output, and moved when they are complete.
+//! For a video of one run, or of two side by side, an observer for each run renders the episodes.
+//! Then `envs_py/dmprl/film.py` makes video, animation and filmstrip from the frames. All files are
+//! created in a temporary folder next to the output, and moved when they are complete. `motion`
+//! renders nothing and hands the episodes to [`crate::motion`].
 
 mod film_plan;
+mod motion;
 
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 
 use anyhow::{Context, ensure};
 use serde::Serialize;
 
 use crate::failure::{Outcome, wrong_use};
 use crate::launch::{self, ObservationPlan};
-use crate::motion::{Means, Recorded, RecordedEpisode, Robot};
+use crate::motion::{Recorded, RecordedEpisode, Robot};
 use crate::run_directory::{ChosenPolicy, RunDirectory};
 use crate::terminal::StagesProgress;
 
 use film_plan::write;
+pub use motion::measure_motion;
+
+/// How to start an observer process.
+#[derive(Debug, Clone)]
+pub struct Observer {
+    /// The program that plays the observer: this one.
+    pub program: PathBuf,
+    /// The Python virtual environment.
+    pub venv: PathBuf,
+}
 
 /// Plan of a recording.
 pub struct RecordPlan<'a> {
@@ -29,8 +42,8 @@ pub struct RecordPlan<'a> {
     pub episodes: u64,
     /// Output directory.
     pub output: PathBuf,
-    /// Program and environment of the observers.
-    pub means: Means,
+    /// The observers.
+    pub observer: Observer,
     /// Python interpreter that makes the video.
     pub python: PathBuf,
 }
@@ -96,7 +109,7 @@ pub fn record(
     let mut sides = Vec::new();
     for (index, title) in titles.into_iter().enumerate() {
         let folder = workshop.path().join(index.to_string());
-        let Some(side) = observe(plan, index, (title, &folder), progress)? else {
+        let Some(side) = observe(plan, SidePlan { index, title, folder }, progress)? else {
             return Ok(None);
         };
         sides.push(side);
@@ -121,13 +134,23 @@ pub fn record(
     Ok(Some(Recordings { sides, mp4, gif, strip }))
 }
 
+/// Plan of the recording of one run.
+struct SidePlan {
+    /// Index of the run in the recording.
+    index: usize,
+    /// Title above the picture.
+    title: String,
+    /// Folder for the observer's files.
+    folder: PathBuf,
+}
+
 /// Renders the episodes of one run.
 fn observe(
     plan: &RecordPlan<'_>,
-    index: usize,
-    (title, folder): (String, &Path),
+    side: SidePlan,
     progress: &StagesProgress,
 ) -> anyhow::Result<Option<SideRecord>> {
+    let SidePlan { index, title, folder } = side;
     let (run, chosen) = &plan.sides[index];
     let pictures = folder.join("pictures");
     std::fs::create_dir_all(&pictures)
@@ -139,9 +162,9 @@ fn observe(
         progress.at(episodes * episode_steps + steps, plan.episodes * episode_steps);
     };
     let observation = ObservationPlan {
-        program: plan.means.program.clone(),
+        program: plan.observer.program.clone(),
         run,
-        venv: Some(plan.means.venv.clone()),
+        venv: Some(plan.observer.venv.clone()),
         policy_version: chosen.version,
         first_seed: plan.first_seed,
         episodes: plan.episodes,

@@ -1,17 +1,28 @@
-//! What is measured of a run, each with how to read it.
+//! The measures of a run, with their descriptions.
+
+use dmprl_shared::supervision::EvaluationRow;
 
 use super::paper::Figure;
 use super::run::Run;
-use super::tables::TableKind;
 use super::thresholds::threshold;
-use crate::control::EvaluationRow;
 
-/// One figure a run.
+/// Groups of measures, in the order of a report.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum MeasureKind {
+    /// How well the policy solves the task.
+    Result,
+    /// How smoothly it moves.
+    Smoothness,
+    /// The cost of training.
+    Cost,
+}
+
+/// A measure with one value per run.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 pub enum Measure {
     /// Mean return of the last evaluation.
     Return,
-    /// Share of its episodes that end in success.
+    /// Share of the last evaluation's episodes that end in success.
     Success,
     /// Mean absolute change of an action.
     ActionChange,
@@ -19,20 +30,21 @@ pub enum Measure {
     JointJerk,
     /// Spectral arc length of the joints' speed.
     Sparc,
-    /// Segments decided upon.
+    /// Segments decided in training.
     Decisions,
     /// Updates of the learner.
     Updates,
-    /// Wall clock \[s\].
+    /// Wall-clock time of training \[s\].
     TrainingTime,
-    /// Updates an environment step.
+    /// Updates per environment step.
     UpdateRate,
-    /// Environment steps to the task's threshold; infinite for a run that ended below it.
+    /// Environment steps until the task's threshold is reached; infinite for a finished run that
+    /// never reached it.
     StepsToThreshold,
 }
 
 impl Measure {
-    /// Those that have a table of means.
+    /// Measures that have a table of means.
     pub const TABLES: [Self; 8] = [
         Self::Return,
         Self::Success,
@@ -44,7 +56,7 @@ impl Measure {
         Self::TrainingTime,
     ];
 
-    /// Its heading.
+    /// Returns the heading.
     #[must_use]
     pub fn title(self) -> &'static str {
         match self {
@@ -61,7 +73,7 @@ impl Measure {
         }
     }
 
-    /// How it was measured.
+    /// Describes how it is measured.
     #[must_use]
     pub fn about(self) -> &'static str {
         match self {
@@ -99,7 +111,7 @@ impl Measure {
         }
     }
 
-    /// Digits behind the point.
+    /// Returns the number of decimals to show.
     #[must_use]
     pub fn digits(self) -> usize {
         match self {
@@ -110,7 +122,7 @@ impl Measure {
         }
     }
 
-    /// The paper's figure of the same.
+    /// Returns the corresponding figure of the paper, if it has one.
     #[must_use]
     pub fn in_paper(self) -> Option<Figure> {
         match self {
@@ -120,31 +132,31 @@ impl Measure {
         }
     }
 
-    /// Whether more is better.
+    /// Returns whether a higher value is better.
     #[must_use]
     pub fn higher_is_better(self) -> bool {
         matches!(self, Self::Return | Self::Success | Self::Sparc)
     }
 
-    /// Whether it is measured after training.
+    /// Returns whether it needs a rollout after training.
     #[must_use]
     pub fn is_of_motion(self) -> bool {
         matches!(self, Self::JointJerk | Self::Sparc)
     }
 
-    /// What it is about.
+    /// Returns the group of the measure.
     #[must_use]
-    pub fn kind(self) -> TableKind {
+    pub fn kind(self) -> MeasureKind {
         match self {
-            Self::Return | Self::Success | Self::StepsToThreshold => TableKind::Result,
-            Self::ActionChange | Self::JointJerk | Self::Sparc => TableKind::Smoothness,
+            Self::Return | Self::Success | Self::StepsToThreshold => MeasureKind::Result,
+            Self::ActionChange | Self::JointJerk | Self::Sparc => MeasureKind::Smoothness,
             Self::Decisions | Self::Updates | Self::TrainingTime | Self::UpdateRate => {
-                TableKind::Cost
+                MeasureKind::Cost
             }
         }
     }
 
-    /// The run's figure; none while it is not known.
+    /// Returns the value of a run; `None` while it is unknown.
     #[must_use]
     pub fn of(self, run: &Run) -> Option<f64> {
         if self == Self::StepsToThreshold {
@@ -165,7 +177,7 @@ impl Measure {
         }
     }
 
-    /// The same of an evaluation, where each has it.
+    /// Returns the value of one evaluation; `None` for measures of whole runs.
     #[must_use]
     pub fn of_row(self, row: &EvaluationRow) -> Option<f64> {
         match self {
@@ -183,7 +195,7 @@ fn steps_to_threshold(run: &Run) -> Option<f64> {
     };
     match run.rows.iter().find(reached) {
         Some(row) => Some(row.env_steps as f64),
-        // It may still come there.
+        // An unfinished run may still reach it.
         None => run.ended.then_some(f64::INFINITY),
     }
 }

@@ -1,16 +1,16 @@
-//! What was run: how much of it, by which program, on which machine, when.
+//! Summarises the runs: how many are finished, when they started and on which machines.
 
-use super::collect::Results;
+use super::layout::Grid;
+use super::results::Results;
 use super::run::Run;
-use super::sections::Grid;
 use crate::terminal::grouped;
 
-/// The sentences at the top of a report.
+/// Returns the sentences at the top of a report.
 #[must_use]
 pub fn sentences(results: &Results) -> Vec<String> {
     let ended = results.runs.iter().filter(|run| run.ended).count();
     let begun = results.runs.len() - ended;
-    let waiting = results.waiting.len();
+    let waiting = results.not_started.len();
     let planned = results.runs.len() + waiting;
     let mut runs = format!("Of {planned} runs {ended} have come to their end");
     for (count, what) in [(begun, "under way or stopped"), (waiting, "not begun")] {
@@ -43,7 +43,7 @@ pub fn sentences(results: &Results) -> Vec<String> {
     sentences
 }
 
-/// Each once, in order; with "; " between.
+/// Joins the distinct values, in order, with "; ".
 fn distinct(values: impl Iterator<Item = String>) -> String {
     let mut known: Vec<String> = Vec::new();
     for value in values {
@@ -54,7 +54,7 @@ fn distinct(values: impl Iterator<Item = String>) -> String {
     known.join("; ")
 }
 
-/// Seeds and steps by task and method.
+/// Returns the seeds and steps by task and method.
 #[must_use]
 pub fn runs_table(results: &Results) -> Grid {
     let cell = |task: &str, method: &str| {
@@ -89,20 +89,20 @@ pub fn runs_table(results: &Results) -> Grid {
 
 #[cfg(test)]
 mod tests {
-    use super::super::planted::{Planted, planted};
+    use super::super::fixtures::{FixtureRun, fixture_results};
     use super::*;
 
     #[test]
-    fn what_ended_what_began_and_what_did_not_are_told_apart() {
-        let run = |seed, ended| Planted {
+    fn finished_started_and_missing_runs_are_counted_separately() {
+        let run = |seed, ended| FixtureRun {
             task: "reacher-v1",
             method: "DDPG",
             seed,
             rows: vec![-9.0, -8.0],
             ended,
         };
-        let mut results = planted(&[run(2, true), run(1, true), run(3, false)]);
-        results.waiting = vec![results.runs[0].key(); 7];
+        let mut results = fixture_results(&[run(2, true), run(1, true), run(3, false)]);
+        results.not_started = vec![results.runs[0].key(); 7];
         for (run, machine) in results.runs.iter_mut().zip(["a", "b", "a"]) {
             run.origin.machine = machine.to_owned();
         }

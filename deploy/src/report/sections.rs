@@ -1,75 +1,54 @@
-//! A report's contents in reading order, the same for the page and for Markdown.
+//! The sections of a report in reading order, for the page and for Markdown.
 
 use serde::Serialize;
 
-use super::collect::Results;
-use super::efficiency::EfficiencyRow;
+use super::contents::Report;
+use super::efficiency::{EfficiencyCell, EfficiencyRow};
+use super::filmstrips::Filmstrip;
+use super::layout::{Grid, Picture};
+use super::measures::MeasureKind;
 use super::overview::{runs_table, sentences};
-use super::page::Report;
 use super::paper;
 use super::provenance::Provenance;
+use super::results::Results;
 use super::statements::{
-    ALMOST_ALL, EPISODES_MIN, Judged, LOSS, NONE, SEEDS_MIN, SUBJECTS, counts,
+    ALMOST_ALL, ClaimResult, EPISODES_MIN, LOSS, NONE, SEEDS_MIN, SUBJECTS, counts,
 };
-use super::strips::Strip;
-use super::tables::{Table, TableKind};
+use super::tables::Table;
+use crate::run_directory::safe_name;
 
-/// A drawing.
-#[derive(Debug, Clone, Serialize)]
-pub struct Picture {
-    /// In the report's folder, without the ending.
-    pub path: String,
-    /// For those who do not see it.
-    pub alt: String,
-    /// The drawing itself.
-    pub svg: String,
-}
+/// Explains the cells of the tables.
+pub(super) const READING: &str = "mean ± standard deviation over seeds. From four seeds \
+    on, IQM is the interquartile mean with its 95 % interval by stratified bootstrap; below four, \
+    the range from the lowest seed to the highest is given instead. Only finished runs count. † \
+    marks seeds that different programs or package versions made, or that did not record them; \
+    Provenance lists them.";
 
-/// Cells of some lines each, by task and method.
-#[derive(Debug, Clone, Default, Serialize)]
-pub struct Grid {
-    /// Above the cells.
-    pub columns: Vec<String>,
-    /// (task, its cells).
-    pub rows: Vec<(String, Vec<Vec<String>>)>,
-}
-
-impl Grid {
-    /// A cell for each task and method.
-    pub fn of(results: &Results, cell: impl Fn(&str, &str) -> Vec<String>) -> Self {
-        let rows = results.tasks.iter().map(|task| {
-            let cells = results.methods.iter().map(|method| cell(task, method));
-            (task.clone(), cells.collect())
-        });
-        Self { columns: results.methods.clone(), rows: rows.collect() }
-    }
-}
-
-/// One heading and what stands below it.
+/// A section with its heading.
 #[derive(Debug, Clone, Default, Serialize)]
 pub struct Section {
-    /// What a link names.
+    /// Target of links.
     pub id: String,
-    /// The heading.
+    /// Heading.
     pub title: String,
     /// Paragraphs.
     pub about: Vec<String>,
-    /// Figures.
+    /// Table.
     pub grid: Option<Grid>,
     /// Drawings.
     pub pictures: Vec<Picture>,
-    /// Photographs.
-    pub strips: Vec<Strip>,
+    /// Frames of rollouts.
+    pub filmstrips: Vec<Filmstrip>,
     /// Statements of the paper.
-    pub statements: Vec<Judged>,
-    /// Files, by name.
+    pub statements: Vec<ClaimResult>,
+    /// Names and texts of files.
     pub files: Vec<(String, String)>,
 }
 
 impl Section {
     fn new(title: &str, about: &[&str]) -> Self {
         Self {
-            id: crate::run_directory::safe_name(&title.to_lowercase().replace(' ', "-")),
+            id: safe_name(&title.to_lowercase().replace(' ', "-")),
             title: title.to_owned(),
             about: about.iter().map(|&text| text.to_owned()).collect(),
             ..Self::default()
@@ -77,15 +56,15 @@ impl Section {
     }
 }
 
-/// All sections of a report; none is empty.
+/// Returns the sections of a report, without empty ones.
 #[must_use]
 pub fn sections(report: &Report) -> Vec<Section> {
     let mut sections = vec![overview(report)];
-    let of_kind = |kind: TableKind| {
+    let of_kind = |kind: MeasureKind| {
         let tables = report.tables.iter().filter(move |table| table.kind == kind);
         tables.map(|table| of_table(report, table))
     };
-    sections.extend(of_kind(TableKind::Result));
+    sections.extend(of_kind(MeasureKind::Result));
     if !report.curves.is_empty() {
         let mut curves = Section::new(
             "Learning curves",
@@ -99,14 +78,14 @@ pub fn sections(report: &Report) -> Vec<Section> {
     if !report.efficiency.is_empty() {
         sections.push(efficiency(report));
     }
-    sections.extend(of_kind(TableKind::Smoothness));
-    if !report.strips.is_empty() {
+    sections.extend(of_kind(MeasureKind::Smoothness));
+    if !report.filmstrips.is_empty() {
         let mut frames = Section::new(
             "Frames of a rollout",
             &["One noise-free episode at the end of training of the best method with a dmp \
                  policy, and of DDPG: the same episode for both. As the paper's figure 5."],
         );
-        frames.strips = report.strips.clone();
+        frames.filmstrips = report.filmstrips.clone();
         sections.push(frames);
     }
     if !report.trajectories.is_empty() {
@@ -118,9 +97,9 @@ pub fn sections(report: &Report) -> Vec<Section> {
         joints.pictures = report.trajectories.clone();
         sections.push(joints);
     }
-    sections.extend(of_kind(TableKind::Cost));
-    if !report.judged.is_empty() {
-        sections.push(statements(&report.judged));
+    sections.extend(of_kind(MeasureKind::Cost));
+    if !report.claims.is_empty() {
+        sections.push(statements(&report.claims));
     }
     if report.results.methods.iter().any(|method| method == paper::READING_METHOD) {
         sections.iter_mut().for_each(mark_reading);
@@ -129,7 +108,7 @@ pub fn sections(report: &Report) -> Vec<Section> {
     sections
 }
 
-/// Marks the column of the paper's method, and says below it what was read into the paper.
+/// Marks the column of the paper's method, and explains its interpretation in a footnote.
 fn mark_reading(section: &mut Section) {
     let has_figures =
         section.grid.is_some() || !section.pictures.is_empty() || !section.statements.is_empty();
@@ -162,13 +141,13 @@ fn overview(report: &Report) -> Section {
     section.about.push(sentences(&report.results).join(" "));
     for subject in SUBJECTS {
         let named = report.results.methods.iter().any(|method| method == subject);
-        if named && !report.judged.is_empty() {
-            let counts = counts(&report.judged, subject).into_iter();
+        if named && !report.claims.is_empty() {
+            let counts = counts(&report.claims, subject).into_iter();
             let counts: Vec<_> =
                 counts.map(|(verdict, count)| format!("{count} {}", verdict.text())).collect();
             section.about.push(format!(
                 "Of {} statements of the paper, with {subject} as its DDPG-DMP: {}.",
-                report.judged.len(),
+                report.claims.len(),
                 counts.join(", ")
             ));
         }
@@ -201,14 +180,14 @@ fn efficiency(report: &Report) -> Section {
         });
     section.about.push(format!("Thresholds: {}.", sources.collect::<Vec<_>>().join("; ")));
     let rows = report.efficiency.iter().map(|row| {
-        let cells = row.cells.iter().map(super::efficiency::EfficiencyCell::lines);
+        let cells = row.cells.iter().map(EfficiencyCell::lines);
         (format!("{}, {}", row.task, row.threshold), cells.collect())
     });
     section.grid = Some(Grid { columns: report.results.methods.clone(), rows: rows.collect() });
     section
 }
 
-fn statements(judged: &[Judged]) -> Section {
+fn statements(claims: &[ClaimResult]) -> Section {
     let rule = format!(
         "Rules applied to the runs' figures decide. \"Held\" and \"did not hold\" need at least \
          {SEEDS_MIN} seeds of each method, {EPISODES_MIN} episodes in each last evaluation, and \
@@ -223,6 +202,6 @@ fn statements(judged: &[Judged]) -> Section {
          nothing is extrapolated."
     );
     let mut section = Section::new("What held of the paper's statements", &[&rule]);
-    section.statements = judged.to_vec();
+    section.statements = claims.to_vec();
     section
 }

@@ -67,9 +67,9 @@ fn a_sweep_is_reported_with_what_was_run_and_what_was_not() {
     assert!(read("curves/reacher-v1-evaluation-return.svg").starts_with("<svg"));
     let png = fs::read(place.path("two/report/curves/reacher-v1-evaluation-return.png")).unwrap();
     assert_eq!(&png[1..4], b"PNG");
-    let curves: serde_json::Value = serde_json::from_str(&read("curves.json")).unwrap();
-    assert_eq!(curves["runs"].as_array().unwrap().len(), 2);
-    assert!(!curves["runs"][0]["return_mean"].as_array().unwrap().is_empty());
+    let data: serde_json::Value = serde_json::from_str(&read("report-data.json")).unwrap();
+    assert_eq!(data["runs"].as_array().unwrap().len(), 2);
+    assert!(!data["runs"][0]["return_mean"].as_array().unwrap().is_empty());
     // One line an evaluation of each seed, and a head.
     assert!(read("runs.csv").lines().count() > 2);
     assert!(read("figures.csv").contains("Average return,reacher-v1,NDP,0,,,,,,-15.56,1.47"));
@@ -80,7 +80,7 @@ fn a_sweep_is_reported_with_what_was_run_and_what_was_not() {
 /// Written over itself: all of it is read first.
 fn its_report_says_the_same_once_the_runs_are_gone(place: &Workplace, json: &serde_json::Value) {
     let read = |name| fs::read_to_string(place.path(&format!("two/report/{name}"))).unwrap();
-    let files = ["curves.json", "runs.csv", "figures.csv", "joints/reacher-v1-velocity.svg"];
+    let files = ["report-data.json", "runs.csv", "figures.csv", "joints/reacher-v1-velocity.svg"];
     let before = files.map(read);
     fs::remove_dir_all(place.path("two/reacher-v1")).unwrap();
     let landed = ["report", "two/report", "--output", "two/report", "--json"];

@@ -13,7 +13,7 @@ use serde::Serialize;
 pub use self::list::{ALMOST_ALL, LOSS, NONE};
 use self::list::{STATEMENTS, Statement};
 use self::rules::Judge;
-use super::collect::Results;
+use super::results::Results;
 
 /// What the paper calls its method; two of ours are held to what it says of it.
 const PROPOSED: &str = "DDPG-DMP of the paper";
@@ -86,7 +86,7 @@ pub struct Finding {
 
 /// A statement of the paper and what became of it.
 #[derive(Debug, Clone, PartialEq, Serialize)]
-pub struct Judged {
+pub struct ClaimResult {
     /// Of which task.
     pub task: &'static str,
     /// Where it stands.
@@ -101,15 +101,15 @@ pub struct Judged {
 
 /// Every statement, if the runs are of any task of the paper.
 #[must_use]
-pub fn judge(results: &Results) -> Vec<Judged> {
+pub fn evaluate_statements(results: &Results) -> Vec<ClaimResult> {
     if !STATEMENTS.iter().any(|statement| results.tasks.iter().any(|task| task == statement.task)) {
         return Vec::new();
     }
     let judge = Judge::of(results);
-    STATEMENTS.iter().map(|statement| judged(&judge, results, statement)).collect()
+    STATEMENTS.iter().map(|statement| evaluate(&judge, results, statement)).collect()
 }
 
-fn judged(judge: &Judge<'_>, results: &Results, statement: &Statement) -> Judged {
+fn evaluate(judge: &Judge<'_>, results: &Results, statement: &Statement) -> ClaimResult {
     let contradiction = contradictions::of(statement);
     let named = |subject: &&&str| results.methods.iter().any(|method| method == **subject);
     let mut subjects: Vec<Option<&'static str>> =
@@ -126,15 +126,15 @@ fn judged(judge: &Judge<'_>, results: &Results, statement: &Statement) -> Judged
     });
     let findings = findings.collect();
     let Statement { place, claim, task, .. } = *statement;
-    Judged { task, place, claim, contradiction, findings }
+    ClaimResult { task, place, claim, contradiction, findings }
 }
 
 /// How many statements have each verdict, for one of [`SUBJECTS`].
 #[must_use]
-pub fn counts(judged: &[Judged], subject: &str) -> Vec<(Verdict, usize)> {
+pub fn counts(claims: &[ClaimResult], subject: &str) -> Vec<(Verdict, usize)> {
     let of = |finding: &&Finding| finding.subject.is_none_or(|other| other == subject);
     let verdicts: Vec<Verdict> =
-        judged.iter().flat_map(|judged| &judged.findings).filter(of).map(|it| it.verdict).collect();
+        claims.iter().flat_map(|claim| &claim.findings).filter(of).map(|it| it.verdict).collect();
     Verdict::ALL
         .into_iter()
         .map(|verdict| (verdict, verdicts.iter().filter(|other| **other == verdict).count()))

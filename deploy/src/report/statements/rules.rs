@@ -5,10 +5,10 @@ use std::collections::BTreeMap;
 
 use super::list::{Methods, Rule, Statement};
 use super::{EPISODES_MIN, PROPOSED, SEEDS_MIN, Verdict, series};
-use crate::report::collect::Results;
 use crate::report::measures::Measure;
 use crate::report::paper::{Figure, reported};
-use crate::report::provenance::Makers;
+use crate::report::provenance::SoftwareCounts;
+use crate::report::results::Results;
 use crate::report::run::Run;
 use crate::report::statistics::{INTERVAL_SCORES_MIN, Summary, median_with_bounds};
 use crate::report::thresholds::threshold;
@@ -160,7 +160,7 @@ impl On<'_> {
     fn figure(&self, measure: Measure, method: &str) -> String {
         let name = self.name(method);
         let measured = self.runs(method).into_iter().filter(|run| measure.of(run).is_some());
-        let mark = Makers::of(measured).mark();
+        let mark = SoftwareCounts::of(measured).mark();
         match self.estimate(measure, method) {
             None if self.runs(method).is_empty() => format!("{name}: not run"),
             // Only motion can be unknown of a run at its end.

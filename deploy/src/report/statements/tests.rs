@@ -2,16 +2,16 @@
 
 use super::list::{Rule, STATEMENTS};
 use super::*;
-use crate::report::planted::{Planted, planted, planted_moves};
+use crate::report::fixtures::{FixtureRun, fixture_motion, fixture_results};
 
 /// Seeds 1, 2, ... of a method, each with its evaluations. Three rows stand for the five seeds that
 /// a verdict needs: the first and the last are planted twice.
-fn seeds<R: AsRef<[f64]>>(task: &'static str, method: &'static str, rows: &[R]) -> Vec<Planted> {
+fn seeds<R: AsRef<[f64]>>(task: &'static str, method: &'static str, rows: &[R]) -> Vec<FixtureRun> {
     let rows: Vec<&R> = match rows {
         [first, middle, last] => vec![first, first, middle, last, last],
         rows => rows.iter().collect(),
     };
-    let run = |(seed, rows): (u64, &R)| Planted {
+    let run = |(seed, rows): (u64, &R)| FixtureRun {
         task,
         method,
         seed,
@@ -21,13 +21,13 @@ fn seeds<R: AsRef<[f64]>>(task: &'static str, method: &'static str, rows: &[R]) 
     (1..).zip(rows).map(run).collect()
 }
 
-fn together(methods: Vec<Vec<Planted>>) -> Results {
-    planted(&methods.concat())
+fn together(methods: Vec<Vec<FixtureRun>>) -> Results {
+    fixture_results(&methods.concat())
 }
 
 /// The findings of the one statement whose claim begins so.
 fn found(results: &Results, task: &str, claim: &str) -> Vec<Finding> {
-    let judged = judge(results);
+    let judged = evaluate_statements(results);
     let mut of_task =
         judged.into_iter().filter(|it| it.task == task && it.claim.starts_with(claim));
     let found = of_task.next().unwrap_or_else(|| panic!("no statement {claim:?} on {task}"));
@@ -118,7 +118,7 @@ fn our_method_is_held_to_the_same_statements_beside_the_papers() {
     let verdicts: Vec<_> = findings.iter().map(|it| (it.subject.unwrap(), it.verdict)).collect();
     let expected = [("DDPG-DMP (paper)", Verdict::DidNotHold), ("DDPG-DMP", Verdict::Held)];
     assert_eq!(verdicts, expected);
-    let counted = counts(&judge(&results), "DDPG-DMP");
+    let counted = counts(&evaluate_statements(&results), "DDPG-DMP");
     let of = |verdict| counted.iter().find(|it| it.0 == verdict).map_or(0, |it| it.1);
     assert_eq!(counted.iter().map(|it| it.1).sum::<usize>(), STATEMENTS.len());
     // It comes above -40 in time, too.
@@ -305,11 +305,12 @@ fn motion_is_smoother_only_by_every_measure() {
     for run in &mut results.runs {
         let ours = run.method == OURS;
         run.rows[0].smoothness = if ours { 0.1 } else { 0.3 };
-        run.motion = Some(if ours { planted_moves(5.0, -1.7) } else { planted_moves(50.0, -3.0) });
+        run.motion =
+            Some(if ours { fixture_motion(5.0, -1.7) } else { fixture_motion(50.0, -3.0) });
     }
     assert_eq!(verdict(&results, PUSHER, claim), Verdict::Held);
     for run in results.runs.iter_mut().filter(|run| run.method == OURS) {
-        run.motion = Some(planted_moves(50.0, -1.7));
+        run.motion = Some(fixture_motion(50.0, -1.7));
     }
     assert_eq!(verdict(&results, PUSHER, claim), Verdict::NoClearDifference);
 }
@@ -317,7 +318,7 @@ fn motion_is_smoother_only_by_every_measure() {
 #[test]
 fn runs_of_other_tasks_are_not_held_to_the_paper() {
     let results = together(vec![seeds("reacher", OURS, &[&[-3.0]; 3])]);
-    assert!(judge(&results).is_empty());
+    assert!(evaluate_statements(&results).is_empty());
 }
 
 #[test]
