@@ -78,12 +78,12 @@ pub(super) fn run(args: &ReportArgs) -> anyhow::Result<Outcome> {
         (None, _) => PathBuf::from("report"),
     };
     let tables = tables(&results);
-    let (efficiency, claims) = (efficiency(&results), evaluate_statements(&results));
+    let (efficiency, claims) = (efficiency(&results), evaluate_statements(&results)?);
     let json = serde_json::json!({
         "methods": results.methods,
         "tables": tables,
         "efficiency": efficiency,
-        "statements": claims,
+        "statements": claims.results,
     });
     let names: Vec<_> = args.runs.iter().map(|path| path.display().to_string()).collect();
     let title = match results.tasks.as_slice() {

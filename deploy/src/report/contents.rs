@@ -4,7 +4,7 @@ use super::efficiency::EfficiencyRow;
 use super::filmstrips::Filmstrip;
 use super::layout::Picture;
 use super::results::Results;
-use super::statements::ClaimResult;
+use super::statements::PaperClaims;
 use super::tables::Table;
 
 /// Everything that a report shows.
@@ -23,8 +23,8 @@ pub struct Report {
     pub tables: Vec<Table>,
     /// Environment steps until a threshold is reached.
     pub efficiency: Vec<EfficiencyRow>,
-    /// The paper's statements with their verdicts; empty if the runs are of other tasks.
-    pub claims: Vec<ClaimResult>,
+    /// The paper's statements with their verdicts.
+    pub claims: PaperClaims,
     /// Learning curves.
     pub curves: Vec<Picture>,
     /// Frames of a rollout.

@@ -64,7 +64,7 @@ fn grid_text(grid: &Grid) -> String {
 
 fn statements_text(claims: &[ClaimResult]) -> String {
     let mut text = String::from("\n| Statement | What became of it |\n|---|---|\n");
-    for ClaimResult { task, place, claim, contradiction, findings } in claims {
+    for ClaimResult { task, place, claim, contradiction, findings, .. } in claims {
         let mut lines: Vec<String> = findings
             .iter()
             .map(|finding| format!("**{}**: {}", finding.verdict_text, finding.evidence))

@@ -1,6 +1,7 @@
 //! The measures of a run, with their descriptions.
 
 use dmprl_shared::supervision::EvaluationRow;
+use serde::Deserialize;
 
 use super::paper::Figure;
 use super::run::Run;
@@ -18,7 +19,8 @@ pub enum MeasureKind {
 }
 
 /// A measure with one value per run.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Deserialize)]
+#[serde(rename_all = "snake_case")]
 pub enum Measure {
     /// Mean return of the last evaluation.
     Return,

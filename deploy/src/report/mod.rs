@@ -58,7 +58,7 @@ pub use motion::{UnmeasuredRun, measure_motions, unmeasured};
 pub use motion_metrics::{MotionMetrics, Rollout};
 pub use results::Results;
 pub use run::{Origin, Run, RunKey, Source};
-pub use statements::{ClaimResult, Finding, Verdict, evaluate_statements};
+pub use statements::{ClaimResult, Finding, Limits, PaperClaims, Verdict, evaluate_statements};
 pub use statistics::Summary;
 pub use tables::{Cell, Table, tables};
 pub use trajectories::{missing_trajectories, trajectories};

@@ -12,7 +12,7 @@ use super::paper;
 use super::provenance::Provenance;
 use super::results::Results;
 use super::statements::{
-    ALMOST_ALL, ClaimResult, EPISODES_MIN, LOSS, NONE, SEEDS_MIN, SUBJECTS, counts,
+    ClaimResult, EPISODES_MIN, Limits, PaperClaims, SEEDS_MIN, SUBJECTS, counts,
 };
 use super::tables::Table;
 use crate::run_directory::safe_name;
@@ -98,7 +98,7 @@ pub fn sections(report: &Report) -> Vec<Section> {
         sections.push(joints);
     }
     sections.extend(of_kind(MeasureKind::Cost));
-    if !report.claims.is_empty() {
+    if !report.claims.results.is_empty() {
         sections.push(statements(&report.claims));
     }
     if report.results.methods.iter().any(|method| method == paper::READING_METHOD) {
@@ -141,13 +141,13 @@ fn overview(report: &Report) -> Section {
     section.about.push(sentences(&report.results).join(" "));
     for subject in SUBJECTS {
         let named = report.results.methods.iter().any(|method| method == subject);
-        if named && !report.claims.is_empty() {
-            let counts = counts(&report.claims, subject).into_iter();
+        if named && !report.claims.results.is_empty() {
+            let counts = counts(&report.claims.results, subject).into_iter();
             let counts: Vec<_> =
                 counts.map(|(verdict, count)| format!("{count} {}", verdict.text())).collect();
             section.about.push(format!(
                 "Of {} statements of the paper, with {subject} as its DDPG-DMP: {}.",
-                report.claims.len(),
+                report.claims.results.len(),
                 counts.join(", ")
             ));
         }
@@ -187,7 +187,8 @@ fn efficiency(report: &Report) -> Section {
     section
 }
 
-fn statements(claims: &[ClaimResult]) -> Section {
+fn statements(claims: &PaperClaims) -> Section {
+    let Limits { failure, almost_always, loss, .. } = claims.limits;
     let rule = format!(
         "Rules applied to the runs' figures decide. \"Held\" and \"did not hold\" need at least \
          {SEEDS_MIN} seeds of each method, {EPISODES_MIN} episodes in each last evaluation, and \
@@ -197,11 +198,11 @@ fn statements(claims: &[ClaimResult]) -> Section {
          of episodes. Overlapping intervals are \"no clear difference\". A statement that methods \
          are alike, or that one does not improve, held where no difference is clear. \
          \"Cannot hold\": the paper's own figures contradict it. Fails: a success rate of at most \
-         {NONE}; almost always: of at least {ALMOST_ALL}; loses again: more than {LOSS} of what it \
+         {failure}; almost always: of at least {almost_always}; loses again: more than {loss} of what it \
          had won, by moving means of five evaluations. The paper trained for about 200,000 steps; \
          nothing is extrapolated."
     );
     let mut section = Section::new("What held of the paper's statements", &[&rule]);
-    section.statements = claims.to_vec();
+    section.statements = claims.results.clone();
     section
 }
