@@ -1,4 +1,4 @@
-//! `dmprl report`: runs and sweeps side by side.
+//! `dmprl report`: compares runs and sweeps.
 
 use std::path::{Path, PathBuf};
 use std::time::SystemTime;
@@ -6,6 +6,7 @@ use std::time::SystemTime;
 use anyhow::Context;
 use clap::Args;
 
+use super::record::show;
 use super::{emit, prepare_python, prepare_python_with, this_program};
 use crate::failure::Outcome;
 use crate::record::{Observer, RecordPlan, measure_motion, record};
@@ -18,17 +19,16 @@ use crate::run_directory::{PolicyChoice, RunDirectory, rfc3339};
 use crate::terminal::{CountProgress, StagesProgress, say, shown};
 
 const HELP: &str = "\
-Writes index.html (one page that needs nothing else), report.md, figures.csv, runs.csv,
-report-data.json and every picture as SVG and PNG. Tables give mean and standard deviation over seeds, and from four
-seeds on the interquartile mean with a 95 % interval by stratified bootstrap (Agarwal et al. 2021);
-below four seeds they give the range. The paper's figures stand beside them for its own tasks and
-methods. Only finished runs count. Figures over runs of different programs or package versions are
-marked.
-Motion is measured once per run, by rolling out its last policy, and kept in the run directory. So
-are the frames of a rollout, which need an environment that can render.
-The folder of an earlier report replaces runs that are elsewhere or deleted: its runs count where
-no given run or sweep has a finished run of the same task, method and seed. It may be the output
-folder itself.
+Writes index.html (one self-contained page), report.md, figures.csv, runs.csv, report-data.json and
+every picture as SVG and PNG. Tables show mean and standard deviation over seeds. With four or more
+seeds they also show the interquartile mean with a 95 % interval by stratified bootstrap (Agarwal
+et al. 2021), with fewer the range. On the paper's tasks they show the paper's figures, too. Only
+finished runs count. Figures over runs of different programs or package versions are marked.
+Motion is measured once per run, by rolling out its last policy, and kept in the run directory. The
+frames of a rollout are also recorded once; they need an environment that can render.
+The folder of an earlier report replaces run directories that are elsewhere or deleted: a run of the
+report counts unless a given run or sweep has a finished run of the same task, method and seed. The
+folder may be the output folder.
 
 EXAMPLES
   dmprl report runs/paper
@@ -43,13 +43,13 @@ pub(super) struct ReportArgs {
     /// Run directories, directories of sweeps, and folders of earlier reports.
     #[arg(required = true, value_name = "RUN|SWEEP|REPORT")]
     runs: Vec<PathBuf>,
-    /// Where the report goes [default: SWEEP/report for one sweep, else report].
+    /// Output folder [default: SWEEP/report for one sweep, else report].
     #[arg(long, value_name = "DIR")]
     output: Option<PathBuf>,
-    /// Roll nothing out; what was measured and drawn before is shown.
+    /// Do not roll policies out; show only motion and frames that exist already.
     #[arg(long)]
     no_motion: bool,
-    /// Print the tables as one JSON object on standard output, too.
+    /// Also print the tables as one JSON object on standard output.
     #[arg(long)]
     json: bool,
 }
@@ -103,7 +103,9 @@ pub(super) fn run(args: &ReportArgs) -> anyhow::Result<Outcome> {
         efficiency,
         claims,
     };
-    report.write(&output).with_context(|| format!("no report in {}", output.display()))?;
+    report
+        .write(&output)
+        .with_context(|| format!("cannot write the report into {}", output.display()))?;
     if args.json {
         emit(&json.to_string())?;
     }
@@ -120,7 +122,7 @@ fn measure(results: &mut Results) -> anyhow::Result<Outcome> {
     let venv = match prepare_python() {
         Ok(venv) => venv,
         Err(error) => {
-            results.unmeasured.push(format!("all of them: {error:#}"));
+            results.unmeasured.push(format!("all runs: {error:#}"));
             return Ok(Outcome::Done);
         }
     };
@@ -140,7 +142,7 @@ fn draw(filmstrips: &[PlannedFilmstrip], results: &mut Results) -> anyhow::Resul
     let (venv, python) = match prepare_python_with("video") {
         Ok(prepared) => prepared,
         Err(error) => {
-            results.undrawn.push(format!("anything: {error:#}"));
+            results.undrawn.push(format!("frames: {error:#}"));
             return Ok(Outcome::Done);
         }
     };
@@ -148,7 +150,8 @@ fn draw(filmstrips: &[PlannedFilmstrip], results: &mut Results) -> anyhow::Resul
     let progress = StagesProgress::new();
     Ok(record_filmstrips(filmstrips, &mut results.undrawn, |run| {
         let plan = first_episode(run, &observer, &python)?;
-        Ok(record(&plan, &progress)?.map_or(Outcome::Interrupted, |_| Outcome::Done))
+        let made = record(&plan, &|at| show(&progress, at))?;
+        Ok(made.map_or(Outcome::Interrupted, |_| Outcome::Done))
     }))
 }
 

@@ -10,7 +10,8 @@ fn joint(name: &str, kind: JointKind) -> Joint {
     Joint { name: name.to_owned(), kind }
 }
 
-/// Velocities that rise by one more each step have a jerk of 1 / dt²; a slide's do not count.
+/// Writes episodes whose hinges have a jerk of 1 / dt²: their velocities are half the square of the
+/// step. The velocities of slides differ, and must not be measured next to hinges.
 fn written(folder: &Path, robot: &Robot, lengths: &[usize]) -> PathBuf {
     let mut lines = vec![serde_json::to_string(robot).unwrap()];
     for (index, &steps) in lengths.iter().enumerate() {
@@ -95,7 +96,7 @@ fn without_joints_only_actions_are_measured() {
 }
 
 #[test]
-fn an_episode_that_does_not_fit_its_robot_is_refused() {
+fn an_inconsistent_episode_is_refused() {
     let folder = tempfile::tempdir().unwrap();
     let robot = |joints| Robot {
         joints,
@@ -112,5 +113,5 @@ fn an_episode_that_does_not_fit_its_robot_is_refused() {
     assert!(error.contains("0 positions, 0 velocities of 1 joints"), "{error}");
     let torn = text.trim_end();
     std::fs::write(&none, torn).unwrap();
-    assert!(measure(&none, POLICY).unwrap_err().to_string().contains("not whole"));
+    assert!(measure(&none, POLICY).unwrap_err().to_string().contains("incomplete"));
 }

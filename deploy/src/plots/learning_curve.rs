@@ -19,6 +19,8 @@ const BESIDE: u32 = 40;
 
 /// Draws `plots/learning_curve.svg` and a PNG of it; returns `None` without evaluations.
 ///
+/// - `title`: above the curve.
+///
 /// # Errors
 /// The rows cannot be read, or the picture cannot be written.
 pub fn learning_curve(run: &RunDirectory, title: &str) -> anyhow::Result<Option<PathBuf>> {
@@ -86,7 +88,7 @@ mod tests {
     }
 
     #[test]
-    fn the_picture_names_its_axes_and_has_one_dot_an_evaluation() {
+    fn the_picture_names_its_axes_and_has_one_dot_per_evaluation() {
         let rows = [row(0, &[-12.0, -8.0]), row(5_000, &[-7.0, -6.0]), row(10_000, &[-5.0, -5.0])];
         let svg = draw(&rows, "reacher").unwrap();
         for text in ["environment steps", "evaluation return", "reacher", "10,000", "± 1 std"] {

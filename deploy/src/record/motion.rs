@@ -2,7 +2,7 @@
 
 use anyhow::{Context, ensure};
 
-use super::Observer;
+use super::observer::Observer;
 use crate::failure::Outcome;
 use crate::launch::{self, ObservationPlan};
 use crate::motion::{self, Motion, RecordedPolicy};

@@ -57,9 +57,8 @@ pub fn curves(results: &Results) -> anyhow::Result<Vec<Picture>> {
     Ok(curves)
 }
 
-/// Averages the n-th evaluations of all seeds, which were made after the same number of steps except
-/// for the rest of a segment. The line ends with the shortest run, so all means are over the same
-/// seeds.
+/// Averages the n-th evaluations of all seeds. They were made after the same number of steps, up to
+/// the rest of a segment. The line ends with the shortest run, so all means are over the same seeds.
 fn points(runs: &[&Run], measure: Measure) -> Vec<Point> {
     let rows = runs.iter().map(|run| run.rows.len()).min().unwrap_or(0);
     let at = |index: usize| {
@@ -91,7 +90,7 @@ impl MethodLine {
     /// Averages the finished runs of a method, so that a seed that has just started does not cut
     /// the line short. Without finished runs, averages the unfinished ones.
     ///
-    /// - `index`: of the method in the report.
+    /// - `index`: index of the method in the report.
     fn new(results: &Results, task: &str, index: usize, measure: Measure) -> Self {
         let method = &results.methods[index];
         let mut runs: Vec<&Run> = results.of(task, method).filter(|run| run.ended).collect();
@@ -155,7 +154,7 @@ fn draw(
         }
         if papers().next().is_some() {
             area.draw(&triangle(right + 34, y + 7, RGBColor(90, 90, 90)))?;
-            words("the paper's end", (right + 56, y))?;
+            words("result in the paper", (right + 56, y))?;
         }
         area.present()?;
     }

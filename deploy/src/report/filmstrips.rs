@@ -1,5 +1,5 @@
-//! Frames of a rollout, as in the paper's figure 5: for each task the best method with a dmp policy,
-//! and DDPG for comparison.
+//! Frames of a rollout, as in the paper's Figure 5: for each task, those of the best method with a
+//! dmp policy, and those of DDPG for comparison.
 
 use std::path::PathBuf;
 

@@ -70,7 +70,7 @@ impl Measure {
             Self::Decisions => "Decisions",
             Self::Updates => "Updates",
             Self::TrainingTime => "Training time [s]",
-            Self::UpdateRate => "Updates an environment step",
+            Self::UpdateRate => "Updates per environment step",
             Self::StepsToThreshold => "Environment steps to a threshold",
         }
     }
@@ -80,35 +80,34 @@ impl Measure {
     pub fn about(self) -> &'static str {
         match self {
             Self::Return => {
-                "Of the evaluation at the end of each run, without noise. The paper's Table 3."
+                "Mean return of the last evaluation, without noise, as in the paper's Table 3."
             }
             Self::Success => {
-                "Share of the last evaluation's episodes that end in success. The paper's Table 4."
+                "Share of the last evaluation's episodes that end in success, as in the paper's \
+                 Table 4."
             }
             Self::ActionChange => {
-                "Mean absolute change of an action between two steps in the last evaluation, \
+                "Mean absolute change of an action between two steps of the last evaluation, with \
                  actions scaled to [-1, 1]; lower is smoother."
             }
             Self::JointJerk => {
-                "Mean absolute jerk of a joint, from its velocity in each step, over the first \
-                 evaluation.episodes episodes of the last evaluation; lower is smoother. Joints \
-                 that only slide: m/s³."
+                "Mean absolute jerk of a joint, computed from its velocity at each step, over the \
+                 first evaluation.episodes episodes of the last evaluation; lower is smoother. In \
+                 m/s³ for robots with sliding joints only."
             }
             Self::Sparc => {
-                "Spectral arc length of the joints' speed (Balasubramanian et al. 2015), mean over \
-                 the same episodes as joint jerk; nearer to zero is smoother."
+                "Spectral arc length of the joints' speed (Balasubramanian et al. 2015), averaged \
+                 over the same episodes as joint jerk; closer to zero is smoother."
             }
-            Self::Decisions => {
-                "Segments decided upon in training; an mlp policy decides in every step."
-            }
-            Self::Updates => "Of the learner, in training.",
+            Self::Decisions => "Segments decided in training; an mlp policy decides at every step.",
+            Self::Updates => "Updates of the learner in training.",
             Self::TrainingTime => {
-                "Wall clock of a run; several ran side by side where the machine had cores."
+                "Wall-clock time of a run; runs of a sweep share the cores of the machine."
             }
             Self::UpdateRate => "Updates of the learner for each environment step.",
             Self::StepsToThreshold => {
-                "Until the evaluation's mean first reaches the threshold; only as fine as the \
-                 evaluations are apart."
+                "Environment steps until an evaluation's mean first reaches the threshold; the \
+                 resolution is the interval between evaluations."
             }
         }
     }

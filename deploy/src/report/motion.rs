@@ -26,7 +26,11 @@ pub(super) fn read_motions(results: &mut Results) -> anyhow::Result<()> {
             }
             Source::Report(report) if run.motion.is_none() => {
                 let file = snapshot::find(report).unwrap_or_else(|| report.clone());
-                results.unmeasured.push(format!("{}: {} has none", run.key(), file.display()));
+                results.unmeasured.push(format!(
+                    "{}: {} has no motion of it",
+                    run.key(),
+                    file.display()
+                ));
             }
             Source::Report(_) => {}
         }
@@ -70,7 +74,7 @@ pub fn measure_motions(
         let name = run.key().to_string();
         let failed = failures.iter().position(|(task, _)| *task == run.task);
         if failed.is_some_and(|at| failures[at].1 >= FAILURES_MAX) {
-            results.unmeasured.push(format!("{name}: not tried after those before it"));
+            results.unmeasured.push(format!("{name}: not tried after {FAILURES_MAX} failures"));
             continue;
         }
         let measured = RunDirectory::open(path).and_then(|directory| {

@@ -79,8 +79,8 @@ impl Rollout {
         (0..self.positions.len()).map(|index| index as f64 * step).collect()
     }
 
-    /// Returns whether the other rollout is of the same episode and robot, so that a figure may show
-    /// both.
+    /// Returns whether the other rollout is of the same episode and robot, so that the panels of a
+    /// figure may show both.
     #[must_use]
     pub fn is_comparable(&self, other: &Self) -> bool {
         (self.seed, self.control_dt_s, &self.unit, &self.joints)

@@ -9,11 +9,11 @@ use crate::terminal::grouped;
 #[must_use]
 pub fn sentences(results: &Results) -> Vec<String> {
     let ended = results.runs.iter().filter(|run| run.ended).count();
-    let begun = results.runs.len() - ended;
-    let waiting = results.not_started.len();
-    let planned = results.runs.len() + waiting;
-    let mut runs = format!("Of {planned} runs {ended} have come to their end");
-    for (count, what) in [(begun, "under way or stopped"), (waiting, "not begun")] {
+    let unfinished = results.runs.len() - ended;
+    let not_started = results.not_started.len();
+    let planned = results.runs.len() + not_started;
+    let mut runs = format!("{ended} of {planned} runs are finished");
+    for (count, what) in [(unfinished, "unfinished"), (not_started, "not started")] {
         if count > 0 {
             runs.push_str(&format!(", {count} {what}"));
         }
@@ -24,18 +24,22 @@ pub fn sentences(results: &Results) -> Vec<String> {
         results.runs.iter().map(|run| run.origin.started.as_str()).collect();
     started.sort_unstable();
     if let (Some(first), Some(last)) = (started.first(), started.last()) {
-        let span =
-            if first == last { (*first).to_owned() } else { format!("between {first} and {last}") };
-        sentences.push(format!("Begun {span}."));
+        let span = if first == last {
+            format!("at {first}")
+        } else {
+            format!("between {first} and {last}")
+        };
+        sentences.push(format!("Started {span}."));
     }
     let machines = results.runs.iter().map(|run| run.origin.machine.clone());
-    sentences.push(format!("On {}.", distinct(machines)));
+    sentences.push(format!("Trained on {}.", distinct(machines)));
     if let Some(first) = results.unmeasured.first() {
         let count = match results.unmeasured.len() {
             1 => "1 run".to_owned(),
             count => format!("{count} runs"),
         };
-        sentences.push(format!("Motion is not measured of {count}; the first: {first}."));
+        sentences
+            .push(format!("The motion of {count} was not measured; the first reason: {first}."));
     }
     if !results.undrawn.is_empty() {
         sentences.push(format!("Not drawn: {}.", results.undrawn.join("; ")));
@@ -73,7 +77,7 @@ pub fn runs_table(results: &Results) -> Grid {
             lines.push(seeds_of(true));
         }
         if runs.iter().any(|run| !run.ended) {
-            lines.push(format!("begun: {}", seeds_of(false)));
+            lines.push(format!("unfinished: {}", seeds_of(false)));
         }
         let mut steps: Vec<u64> = runs.iter().map(|run| run.steps).collect();
         steps.sort_unstable();
@@ -107,12 +111,9 @@ mod tests {
             run.origin.machine = machine.to_owned();
         }
         let sentences = sentences(&results);
-        assert_eq!(
-            sentences[0],
-            "Of 10 runs 2 have come to their end, 1 under way or stopped, 7 not begun."
-        );
-        assert_eq!(sentences[2], "On a; b.");
+        assert_eq!(sentences[0], "2 of 10 runs are finished, 1 unfinished, 7 not started.");
+        assert_eq!(sentences[2], "Trained on a; b.");
         let grid = runs_table(&results);
-        assert_eq!(grid.rows[0].1[0], ["seeds 1, 2", "begun: seed 3", "2,000 steps each"]);
+        assert_eq!(grid.rows[0].1[0], ["seeds 1, 2", "unfinished: seed 3", "2,000 steps each"]);
     }
 }

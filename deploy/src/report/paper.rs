@@ -22,10 +22,10 @@ const SUCCESS: [Row; 2] = [
 /// The method that follows this project's first interpretation of the paper.
 pub const READING_METHOD: &str = "DDPG-DMP (paper)";
 /// Footnote about the interpretation, beside the figures of that method.
-pub const READING: &str = "¹ DDPG-DMP (paper) is one reading of the paper, which leaves these \
-    choices open: goal, weights and rho are bounded by tanh; the controller sees velocity and \
-    acceleration divided by omega and omega²; the target takes s' = s_{t+1} after the sum of K \
-    rewards; forcing-term widths follow NDP's code. Other readings are methods of \
+pub const READING: &str = "¹ DDPG-DMP (paper) is one interpretation of the paper, which leaves \
+    these choices open: goal, weights and rho are bounded by tanh; the controller sees velocity \
+    and acceleration divided by omega and omega²; the target takes s' = s_{t+1} after the sum of K \
+    rewards; forcing-term widths follow NDP's code. Other interpretations are methods of \
     deploy/experiments/paper.toml.";
 
 /// Number of seeds behind each figure of the paper.

@@ -18,11 +18,31 @@ use super::tables::Table;
 use crate::run_directory::safe_name;
 
 /// Explains the cells of the tables.
-pub(super) const READING: &str = "mean ± standard deviation over seeds. From four seeds \
-    on, IQM is the interquartile mean with its 95 % interval by stratified bootstrap; below four, \
-    the range from the lowest seed to the highest is given instead. Only finished runs count. † \
-    marks seeds that different programs or package versions made, or that did not record them; \
-    Provenance lists them.";
+pub(super) const READING: &str = "mean ± standard deviation over seeds. With four or more \
+    seeds, IQM is the interquartile mean with its 95 % interval by stratified bootstrap; with \
+    fewer, the range from the lowest seed to the highest is given instead. Only finished runs \
+    count. † marks figures over runs of different programs or package versions, or over runs \
+    that did not record them; see Provenance.";
+
+/// Explains the learning curves.
+const CURVES: &str = "Evaluations without noise: mean over the seeds (n), and a band from the \
+    lowest seed to the highest. Triangles at the right edge mark the final results in the paper \
+    (its Tables 3 and 4), which may be after another number of steps.";
+/// Explains the steps to the thresholds.
+const EFFICIENCY: &str = "Environment steps until an evaluation's mean first reaches the \
+    threshold: median over the seeds, with its 95 % interval by bootstrap (the range for fewer \
+    than four seeds), and the number of finished seeds that reached it. A seed that never \
+    reached it counts as later than all others. The resolution is the interval between \
+    evaluations.";
+/// Explains the filmstrips.
+const FRAMES: &str = "One noise-free episode after training, of the best method with a dmp policy \
+    and of DDPG, reset with the same seed, as in the paper's Figure 5.";
+/// Explains the pictures of the joints.
+const JOINTS: &str = "One noise-free episode of each method's policy after training, reset with \
+    the same seed. All panels have the same axes, as in the paper's Figures 6 and 7.";
+/// Explains the provenance.
+const PROVENANCE: &str = "Program and packages that made the runs of each cell, by number, and \
+    the seeds whose motion was measured and whose rollout was recorded.";
 
 /// A section with its heading.
 #[derive(Debug, Clone, Default, Serialize)]
@@ -66,12 +86,7 @@ pub fn sections(report: &Report) -> Vec<Section> {
     };
     sections.extend(of_kind(MeasureKind::Result));
     if !report.curves.is_empty() {
-        let mut curves = Section::new(
-            "Learning curves",
-            &["Evaluations without noise: mean over the seeds (n), the band from the lowest to \
-                 the highest. Triangles at the right edge are what each method ended at in the \
-                 paper (its Tables 3 and 4), after as many steps as that trained for."],
-        );
+        let mut curves = Section::new("Learning curves", &[CURVES]);
         curves.pictures = report.curves.clone();
         sections.push(curves);
     }
@@ -80,20 +95,12 @@ pub fn sections(report: &Report) -> Vec<Section> {
     }
     sections.extend(of_kind(MeasureKind::Smoothness));
     if !report.filmstrips.is_empty() {
-        let mut frames = Section::new(
-            "Frames of a rollout",
-            &["One noise-free episode at the end of training of the best method with a dmp \
-                 policy, and of DDPG: the same episode for both. As the paper's figure 5."],
-        );
+        let mut frames = Section::new("Frames of a rollout", &[FRAMES]);
         frames.filmstrips = report.filmstrips.clone();
         sections.push(frames);
     }
     if !report.trajectories.is_empty() {
-        let mut joints = Section::new(
-            "Joints over a rollout",
-            &["One noise-free episode of each method's policy at the end of training, all reset \
-               with the same seed; every panel has the same axes. As the paper's figures 6 and 7."],
-        );
+        let mut joints = Section::new("Joints over a rollout", &[JOINTS]);
         joints.pictures = report.trajectories.clone();
         sections.push(joints);
     }
@@ -124,14 +131,7 @@ fn mark_reading(section: &mut Section) {
 
 fn provenance(results: &Results) -> Section {
     let provenance = Provenance::of(results);
-    let mut section = Section::new(
-        "Provenance",
-        &[
-            "Which program and packages made the runs of each cell, by number, and of which seeds \
-           this report has measures of motion and a recorded rollout.",
-            &provenance.legend(),
-        ],
-    );
+    let mut section = Section::new("Provenance", &[PROVENANCE, &provenance.legend()]);
     section.grid = Some(provenance.grid);
     section
 }
@@ -146,7 +146,7 @@ fn overview(report: &Report) -> Section {
             let counts: Vec<_> =
                 counts.map(|(verdict, count)| format!("{count} {}", verdict.text())).collect();
             section.about.push(format!(
-                "Of {} statements of the paper, with {subject} as its DDPG-DMP: {}.",
+                "The paper's {} statements, with {subject} as its DDPG-DMP: {}.",
                 report.claims.results.len(),
                 counts.join(", ")
             ));
@@ -167,13 +167,7 @@ fn of_table(report: &Report, table: &Table) -> Section {
 }
 
 fn efficiency(report: &Report) -> Section {
-    let mut section = Section::new(
-        "Sample efficiency",
-        &["Environment steps until an evaluation's mean first reaches the threshold: median over \
-           the seeds, with its 95 % interval by bootstrap from four seeds on and the range below \
-           four, and how many of the finished seeds reached it. A seed that did not reach it \
-           counts as later than all others. The resolution is the interval between evaluations."],
-    );
+    let mut section = Section::new("Sample efficiency", &[EFFICIENCY]);
     let sources =
         report.efficiency.iter().map(|EfficiencyRow { task, threshold, source, .. }| {
             format!("{task}: {threshold} ({source})")
@@ -189,20 +183,21 @@ fn efficiency(report: &Report) -> Section {
 
 fn statements(claims: &PaperClaims) -> Section {
     let Limits { failure, almost_always, loss, .. } = claims.limits;
-    let rule = format!(
-        "Rules applied to the runs' figures decide. \"Held\" and \"did not hold\" need at least \
-         {SEEDS_MIN} seeds of each method, {EPISODES_MIN} episodes in each last evaluation, and \
-         95 % intervals that do not overlap (of the interquartile mean, or of the median for \
-         steps). With fewer the verdict is \"too few seeds\" or \"too few episodes\". Statements \
-         about the course of training use the evaluations before the last, whatever their number \
-         of episodes. Overlapping intervals are \"no clear difference\". A statement that methods \
-         are alike, or that one does not improve, held where no difference is clear. \
-         \"Cannot hold\": the paper's own figures contradict it. Fails: a success rate of at most \
-         {failure}; almost always: of at least {almost_always}; loses again: more than {loss} of what it \
-         had won, by moving means of five evaluations. The paper trained for about 200,000 steps; \
-         nothing is extrapolated."
+    let about = format!(
+        "Rules judge the paper's statements by the figures of the runs. \"Held\" and \"did not \
+         hold\" need at least {SEEDS_MIN} seeds of each method, {EPISODES_MIN} episodes in each \
+         last evaluation, and 95 % intervals that do not overlap (of the interquartile mean, or \
+         of the median for steps). With fewer, the verdict is \"too few seeds\" or \"too few \
+         episodes\". Statements about the course of training also use the earlier evaluations, \
+         with any number of episodes. If intervals overlap, the verdict is \"no clear \
+         difference\". Statements that methods are alike, or that a method does not improve, \
+         hold if there is no clear difference. \"Cannot hold\": the paper's own figures \
+         contradict the statement. Failure is a success rate of at most {failure}; almost always \
+         is a rate of at least {almost_always}; a loss is more than {loss} of the gain, by moving \
+         means of five evaluations. The paper trained for about 200,000 steps; nothing is \
+         extrapolated."
     );
-    let mut section = Section::new("What held of the paper's statements", &[&rule]);
+    let mut section = Section::new("Statements of the paper", &[&about]);
     section.statements = claims.results.clone();
     section
 }

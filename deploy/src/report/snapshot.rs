@@ -205,12 +205,13 @@ pub(super) fn read(path: &Path) -> anyhow::Result<Results> {
     match format_version {
         FORMAT_VERSION_MIN..=FORMAT_VERSION => {}
         ..FORMAT_VERSION_MIN => bail!(
-            "{name} has format {format_version}, expected {FORMAT_VERSION_MIN} to {FORMAT_VERSION}: \
-             it contains only curves; make that report again from its runs with this program"
+            "{name} has format {format_version}, expected {FORMAT_VERSION_MIN} to \
+             {FORMAT_VERSION}: it contains only curves; make that report again from its runs with \
+             this program"
         ),
         _ => bail!(
-            "{name} has format {format_version}, expected {FORMAT_VERSION_MIN} to {FORMAT_VERSION}: \
-             a newer program made it; use that program"
+            "{name} has format {format_version}, expected {FORMAT_VERSION_MIN} to \
+             {FORMAT_VERSION}: a newer program made it; use that program"
         ),
     }
     let document: Document =

@@ -1,5 +1,5 @@
-//! Statistics over seeds: mean and standard deviation, and from four seeds on interquartile mean and
-//! median with bootstrap intervals. With fewer seeds, the interquartile mean is the mean and a
+//! Statistics over seeds: mean and standard deviation, and from four seeds on interquartile mean
+//! and median with bootstrap intervals. With fewer seeds, the interquartile mean is the mean and a
 //! bootstrap interval is the range of the scores, so only the range is given.
 //!
 //! Interquartile mean and stratified bootstrap follow Agarwal et al. 2021, "Deep Reinforcement
@@ -160,11 +160,11 @@ mod tests {
         interval: [f64; 2],
     }
 
-    /// tests/golden/statistics/make_golden.py
+    /// Made by tests/golden/statistics/make_golden.py.
     const GOLDEN: &str = include_str!("../../../tests/golden/statistics/golden.json");
 
     #[test]
-    fn interquartile_means_and_intervals_are_those_of_rliable() {
+    fn interquartile_means_and_intervals_match_rliable() {
         let golden: Golden = serde_json::from_str(GOLDEN).unwrap();
         assert_eq!(golden.cases.len(), 5);
         for Case { scores, interquartile_mean, interval } in golden.cases {

@@ -1,4 +1,4 @@
-//! Draws the joints over a rollout of each method, as in the paper's figures 6 and 7.
+//! Draws the joints over a rollout of each method, as in the paper's Figures 6 and 7.
 
 use anyhow::anyhow;
 
@@ -57,7 +57,9 @@ pub fn missing_trajectories(results: &Results) -> Vec<String> {
             };
             let is_shown = shown.iter().any(|shown| shown.run.method == *method);
             if !is_shown && results.of(task, method).any(had_joints) {
-                missing.push(format!("joints of {task} · {method}: no rollout was landed"));
+                missing.push(format!(
+                    "joints of {task} · {method}: the earlier report has no rollout"
+                ));
             }
         }
     }
@@ -161,7 +163,7 @@ mod tests {
         results.runs[3].motion.as_mut().unwrap().joint_jerk = None;
         assert_eq!(
             missing_trajectories(&results),
-            ["joints of pusher-v0 · TD3: no rollout was landed"]
+            ["joints of pusher-v0 · TD3: the earlier report has no rollout"]
         );
         let drawn = [0, 1, 2].map(|index| results.is_shown(&results.runs[index]));
         assert_eq!(drawn, [false, true, false]);

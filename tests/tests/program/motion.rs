@@ -1,4 +1,4 @@
-//! How a trained policy moves, measured by a real observer.
+//! Measures the motion of trained policies with real observer processes.
 
 use std::path::Path;
 
@@ -19,8 +19,8 @@ fn measured(run: &str) -> motion::Motion {
     measure_motion(&run, &observer()).unwrap().expect("no interrupt")
 }
 
-/// The recorded episodes are those of `eval`: a table of motion must be about the policy whose
-/// return stands beside it.
+/// The recorded episodes are those of the evaluation: a report shows motion and return of the same
+/// policy.
 #[test]
 fn the_episodes_measured_are_those_evaluated_also_where_the_controls_follow_the_state() {
     let place = Workplace::new();
@@ -68,9 +68,9 @@ fn a_policy_is_measured_once_and_the_next_one_again() {
     assert_eq!(written(), before);
 
     place.run(&["resume", &run, "--steps", "2000"]).with_status(0);
-    assert_eq!(motion::read(&directory).unwrap(), None, "another policy is the latest now");
+    assert_eq!(motion::read(&directory).unwrap(), None, "the resumed run has a newer policy");
     assert_eq!(measured(&run).env_steps, 2000);
-    // One that is damaged is measured again.
+    // A damaged file is replaced.
     std::fs::write(directory.motion_path(), "{").unwrap();
     assert_eq!(measured(&run).env_steps, 2000);
 }

@@ -104,7 +104,7 @@ impl Context<'_> {
         let runs = self.runs(method);
         let scores: Vec<f64> = runs.iter().filter_map(|run| measure.of(run)).collect();
         let estimate = if measure == Measure::StepsToThreshold {
-            // Without the unfinished runs, which will need more steps, the estimate would be too low.
+            // Unfinished runs will need more steps: without them the estimate would be too low.
             (!scores.is_empty() && scores.len() == runs.len()).then(|| {
                 let (point, [low, high]) = median_with_bounds(&scores);
                 Estimate { count: scores.len(), point, low, high }

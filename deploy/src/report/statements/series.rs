@@ -82,7 +82,7 @@ pub(super) fn unimproved(context: &Context<'_>, methods: &[String]) -> Judgement
     };
     Judgement::all(methods.iter().map(|method| {
         over_seeds(context, method, gain, |estimate| {
-            let text = format!("last less first evaluation {}", estimate.text(measure.digits()));
+            let text = format!("last minus first evaluation {}", estimate.text(measure.digits()));
             Judgement::new(clear(estimate.low <= 0.0, estimate.low > 0.0), text)
         })
     }))
@@ -101,14 +101,14 @@ pub(super) fn falls(context: &Context<'_>, methods: &[String], steps: u64) -> Ju
     };
     Judgement::all(methods.iter().map(|method| {
         over_seeds(context, method, loss, |estimate| {
-            let text = format!("share lost of what was won {}", estimate.text(2));
+            let text = format!("share of the gain that is lost {}", estimate.text(2));
             Judgement::new(clear(estimate.low > share, estimate.high < share), text)
         })
     }))
 }
 
-/// Returns the share of the gain over the first evaluation that is lost at the end, by moving means;
-/// `None` if there is no gain, or there are too few evaluations.
+/// Returns the share of the gain over the first evaluation that is lost at the end, by moving
+/// means; `None` if there is no gain, or if there are too few evaluations.
 fn lost_share(values: &[f64]) -> Option<f64> {
     let first = *values.first()?;
     let means: Vec<f64> =
@@ -132,7 +132,7 @@ fn over_seeds(
         let longest = runs.iter().map(|run| last_step(run)).max();
         let state = longest.map_or_else(
             || "not run".to_owned(),
-            |steps| format!("nothing to judge by in {} steps", grouped(steps)),
+            |steps| format!("cannot be judged after {} steps", grouped(steps)),
         );
         return Judgement::new(Verdict::NotRun, format!("{label}: {state}"));
     };

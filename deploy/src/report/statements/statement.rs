@@ -24,8 +24,10 @@ pub(super) struct PaperStatements {
 }
 
 impl PaperStatements {
+    /// Parses the compiled-in file.
+    ///
     /// # Errors
-    /// The file that was compiled in is invalid, which a test excludes.
+    /// None is known: a test parses the file.
     pub(super) fn read() -> anyhow::Result<Self> {
         toml::from_str(FILE).context("cannot read the paper's statements")
     }
