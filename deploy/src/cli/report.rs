@@ -86,9 +86,10 @@ pub(super) fn run(args: &ReportArgs) -> anyhow::Result<Outcome> {
         "statements": claims.results,
     });
     let names: Vec<_> = args.runs.iter().map(|path| path.display().to_string()).collect();
-    let title = match results.tasks.as_slice() {
-        [task] => format!("{task}: {}", results.methods.join(", ")),
-        tasks => format!("{} methods on {} tasks", results.methods.len(), tasks.len()),
+    let title = match (results.tasks.as_slice(), results.methods.as_slice()) {
+        ([task], methods) => format!("{task}: {}", methods.join(", ")),
+        (tasks, [method]) => format!("{method} on {} tasks", tasks.len()),
+        (tasks, methods) => format!("{} methods on {} tasks", methods.len(), tasks.len()),
     };
     let report = Report {
         title,

@@ -58,7 +58,8 @@ pub fn curves(results: &Results) -> anyhow::Result<Vec<Picture>> {
 }
 
 /// Averages the n-th evaluations of all seeds. They were made after the same number of steps, up to
-/// the rest of a segment. The line ends with the shortest run, so all means are over the same seeds.
+/// the rest of a segment. The line ends with the shortest run, so that all means are over the same
+/// seeds.
 fn points(runs: &[&Run], measure: Measure) -> Vec<Point> {
     let rows = runs.iter().map(|run| run.rows.len()).min().unwrap_or(0);
     let at = |index: usize| {

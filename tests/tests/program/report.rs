@@ -46,6 +46,11 @@ fn a_report_of_a_sweep_shows_runs_and_missing_runs() {
     assert!(verdicts.contains(&"cannot_hold") && verdicts.contains(&"not_run"), "{verdicts:?}");
     assert!(!verdicts.contains(&"held"), "{verdicts:?}");
 
+    its_files_show_the_same(&place);
+    its_report_is_the_same_without_the_runs(&place, &json);
+}
+
+fn its_files_show_the_same(place: &Workplace) {
     let read = |name: &str| fs::read_to_string(place.path(&format!("two/report/{name}"))).unwrap();
     let page = read("index.html");
     for text in ["reacher-v1", "TD3-DMP", "not run", "paper -15.56 ± 1.47", "2 seeds", "<svg"] {
@@ -77,8 +82,6 @@ fn a_report_of_a_sweep_shows_runs_and_missing_runs() {
     // A header, and a line per evaluation of each seed.
     assert!(read("runs.csv").lines().count() > 2);
     assert!(read("figures.csv").contains("Average return,reacher-v1,NDP,0,,,,,,-15.56,1.47"));
-
-    its_report_is_the_same_without_the_runs(&place, &json);
 }
 
 /// Writes the report over the one that it reads.
