@@ -6,8 +6,8 @@ use clap::Args;
 
 use super::{emit, prepare_python_with, this_program};
 use crate::failure::{Outcome, wrong_use};
-use crate::motion::{Means, RecordedEpisode};
-use crate::record::{RecordPlan, Recordings, record};
+use crate::motion::RecordedEpisode;
+use crate::record::{Observer, RecordPlan, RecordProgress, Recordings, record};
 use crate::run_directory::{PolicyChoice, RunDirectory};
 use crate::terminal::{StagesProgress, say, shown};
 
@@ -80,11 +80,11 @@ pub(super) fn run(args: &RecordArgs) -> anyhow::Result<Outcome> {
         first_seed,
         episodes: args.episodes,
         output: args.output.clone().unwrap_or_else(|| run.path().join("videos")),
-        means: Means { program: this_program()?, venv },
+        observer: Observer { program: this_program()?, venv },
         python,
     };
     let progress = StagesProgress::new();
-    let made = record(&plan, &progress);
+    let made = record(&plan, &|at| show(&progress, at));
     drop(progress);
     let Some(recordings) = made? else { return Ok(Outcome::Interrupted) };
     if args.json {
@@ -96,6 +96,14 @@ pub(super) fn run(args: &RecordArgs) -> anyhow::Result<Outcome> {
         }
     }
     Ok(Outcome::Done)
+}
+
+/// Shows the progress of a recording.
+pub(super) fn show(display: &StagesProgress, progress: RecordProgress<'_>) {
+    match progress {
+        RecordProgress::Stage(what) => display.stage(what),
+        RecordProgress::At { done, of } => display.at(done, of),
+    }
 }
 
 fn json(recordings: &Recordings) -> String {

@@ -1,33 +1,34 @@
-//! `dmprl report`: runs and sweeps side by side.
+//! `dmprl report`: compares runs and sweeps.
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::time::SystemTime;
 
 use anyhow::Context;
 use clap::Args;
 
+use super::record::show;
 use super::{emit, prepare_python, prepare_python_with, this_program};
 use crate::failure::Outcome;
-use crate::motion::Means;
+use crate::record::{Observer, RecordPlan, measure_motion, record};
 use crate::report::{
-    Report, Results, Wanted, curves, draw, efficiency, judge, lost_strips, lost_trajectories,
-    measure_motions, strips, tables, trajectories, undrawn, unmeasured, wanted,
+    PlannedFilmstrip, Report, Results, curves, efficiency, evaluate_statements, measure_motions,
+    missing_filmstrips, missing_trajectories, needs_recording, plan_filmstrips, read_filmstrips,
+    record_filmstrips, tables, trajectories, unmeasured,
 };
-use crate::run_directory::rfc3339;
-use crate::terminal::{say, shown};
+use crate::run_directory::{PolicyChoice, RunDirectory, rfc3339};
+use crate::terminal::{CountProgress, StagesProgress, say, shown};
 
 const HELP: &str = "\
-Writes index.html (one page that needs nothing else), report.md, figures.csv, runs.csv, curves.json
-and every picture as SVG and PNG. Tables give mean and standard deviation over seeds, and from four
-seeds on the interquartile mean with a 95 % interval by stratified bootstrap (Agarwal et al. 2021);
-below four seeds they give the range. The paper's figures stand beside them for its own tasks and
-methods. Only finished runs count. Figures over runs of different programs or package versions are
-marked.
-Motion is measured once per run, by rolling out its last policy, and kept in the run directory. So
-are the frames of a rollout, which need an environment that can render.
-The folder of an earlier report replaces runs that are elsewhere or deleted: its runs count where
-no given run or sweep has a finished run of the same task, method and seed. It may be the output
-folder itself.
+Writes index.html (one self-contained page), report.md, figures.csv, runs.csv, report-data.json and
+every picture as SVG and PNG. Tables show mean and standard deviation over seeds. With four or more
+seeds they also show the interquartile mean with a 95 % interval by stratified bootstrap (Agarwal
+et al. 2021), with fewer the range. On the paper's tasks they show the paper's figures, too. Only
+finished runs count. Figures over runs of different programs or package versions are marked.
+Motion is measured once per run, by rolling out its last policy, and kept in the run directory. The
+frames of a rollout are also recorded once; they need an environment that can render.
+The folder of an earlier report replaces run directories that are elsewhere or deleted: a run of the
+report counts unless a given run or sweep has a finished run of the same task, method and seed. The
+folder may be the output folder.
 
 EXAMPLES
   dmprl report runs/paper
@@ -42,13 +43,13 @@ pub(super) struct ReportArgs {
     /// Run directories, directories of sweeps, and folders of earlier reports.
     #[arg(required = true, value_name = "RUN|SWEEP|REPORT")]
     runs: Vec<PathBuf>,
-    /// Where the report goes [default: SWEEP/report for one sweep, else report].
+    /// Output folder [default: SWEEP/report for one sweep, else report].
     #[arg(long, value_name = "DIR")]
     output: Option<PathBuf>,
-    /// Roll nothing out; what was measured and drawn before is shown.
+    /// Do not roll policies out; show only motion and frames that exist already.
     #[arg(long)]
     no_motion: bool,
-    /// Print the tables as one JSON object on standard output, too.
+    /// Also print the tables as one JSON object on standard output.
     #[arg(long)]
     json: bool,
 }
@@ -58,13 +59,12 @@ pub(super) fn run(args: &ReportArgs) -> anyhow::Result<Outcome> {
     if !args.no_motion && measure(&mut results)? == Outcome::Interrupted {
         return Ok(Outcome::Interrupted);
     }
-    let wanted = wanted(&results)?;
-    if !args.no_motion && drawn(&wanted, &mut results)? == Outcome::Interrupted {
+    let filmstrips = plan_filmstrips(&results)?;
+    if !args.no_motion && draw(&filmstrips, &mut results)? == Outcome::Interrupted {
         return Ok(Outcome::Interrupted);
     }
-    let lost = lost_strips(&wanted).into_iter().chain(lost_trajectories(&results));
-    let lost: Vec<String> = lost.collect();
-    results.undrawn.extend(lost);
+    results.undrawn.extend(missing_filmstrips(&filmstrips));
+    results.undrawn.extend(missing_trajectories(&results));
     for reason in &results.unmeasured {
         say(&format!("motion not measured: {reason}"));
     }
@@ -78,17 +78,18 @@ pub(super) fn run(args: &ReportArgs) -> anyhow::Result<Outcome> {
         (None, _) => PathBuf::from("report"),
     };
     let tables = tables(&results);
-    let (efficiency, judged) = (efficiency(&results), judge(&results));
+    let (efficiency, claims) = (efficiency(&results), evaluate_statements(&results)?);
     let json = serde_json::json!({
         "methods": results.methods,
         "tables": tables,
         "efficiency": efficiency,
-        "statements": judged,
+        "statements": claims.results,
     });
     let names: Vec<_> = args.runs.iter().map(|path| path.display().to_string()).collect();
-    let title = match results.tasks.as_slice() {
-        [task] => format!("{task}: {}", results.methods.join(", ")),
-        tasks => format!("{} methods on {} tasks", results.methods.len(), tasks.len()),
+    let title = match (results.tasks.as_slice(), results.methods.as_slice()) {
+        ([task], methods) => format!("{task}: {}", methods.join(", ")),
+        (tasks, [method]) => format!("{method} on {} tasks", tasks.len()),
+        (tasks, methods) => format!("{} methods on {} tasks", methods.len(), tasks.len()),
     };
     let report = Report {
         title,
@@ -96,14 +97,16 @@ pub(super) fn run(args: &ReportArgs) -> anyhow::Result<Outcome> {
         made: rfc3339(SystemTime::now()),
         commit: crate::project::git_commit(),
         curves: curves(&results)?,
-        strips: strips(&wanted)?,
+        filmstrips: read_filmstrips(&filmstrips)?,
         trajectories: trajectories(&results)?,
         results,
         tables,
         efficiency,
-        judged,
+        claims,
     };
-    report.write(&output).with_context(|| format!("no report in {}", output.display()))?;
+    report
+        .write(&output)
+        .with_context(|| format!("cannot write the report into {}", output.display()))?;
     if args.json {
         emit(&json.to_string())?;
     }
@@ -111,33 +114,60 @@ pub(super) fn run(args: &ReportArgs) -> anyhow::Result<Outcome> {
     Ok(Outcome::Done)
 }
 
-/// Rolls out what nobody has; a report without motion is better than none.
+/// Measures the runs that were not measured yet. Without Python, continues without motion.
 fn measure(results: &mut Results) -> anyhow::Result<Outcome> {
-    if unmeasured(results) == 0 {
+    let count = unmeasured(results);
+    if count == 0 {
         return Ok(Outcome::Done);
     }
-    Ok(match prepare_python() {
-        Ok(venv) => measure_motions(results, &Means { program: this_program()?, venv }),
+    let venv = match prepare_python() {
+        Ok(venv) => venv,
         Err(error) => {
-            results.unmeasured.push(format!("all of them: {error:#}"));
-            Outcome::Done
+            results.unmeasured.push(format!("all runs: {error:#}"));
+            return Ok(Outcome::Done);
         }
-    })
+    };
+    let observer = Observer { program: this_program()?, venv };
+    let progress = CountProgress::new("measuring motion", count as u64);
+    Ok(measure_motions(results, |run| {
+        progress.at(run.index, run.name);
+        measure_motion(run.directory, &observer)
+    }))
 }
 
-/// Draws frames that nobody has drawn; a report without pictures is better than none.
-fn drawn(wanted: &[Wanted], results: &mut Results) -> anyhow::Result<Outcome> {
-    if !undrawn(wanted) {
+/// Records the frames that were not recorded yet. Without Python, continues without frames.
+fn draw(filmstrips: &[PlannedFilmstrip], results: &mut Results) -> anyhow::Result<Outcome> {
+    if !needs_recording(filmstrips) {
         return Ok(Outcome::Done);
     }
-    Ok(match prepare_python_with("video") {
-        Ok((venv, python)) => {
-            let means = Means { program: this_program()?, venv };
-            draw(wanted, (&means, &python), &mut results.undrawn)
-        }
+    let (venv, python) = match prepare_python_with("video") {
+        Ok(prepared) => prepared,
         Err(error) => {
-            results.undrawn.push(format!("anything: {error:#}"));
-            Outcome::Done
+            results.undrawn.push(format!("frames: {error:#}"));
+            return Ok(Outcome::Done);
         }
+    };
+    let observer = Observer { program: this_program()?, venv };
+    let progress = StagesProgress::new();
+    Ok(record_filmstrips(filmstrips, &mut results.undrawn, |run| {
+        let plan = first_episode(run, &observer, &python)?;
+        let made = record(&plan, &|at| show(&progress, at))?;
+        Ok(made.map_or(Outcome::Interrupted, |_| Outcome::Done))
+    }))
+}
+
+/// Plans the recording of the first evaluation episode of a run's latest policy.
+fn first_episode<'r>(
+    run: &'r RunDirectory,
+    observer: &Observer,
+    python: &Path,
+) -> anyhow::Result<RecordPlan<'r>> {
+    Ok(RecordPlan {
+        sides: vec![(run, run.choose_policy(PolicyChoice::Latest)?)],
+        first_seed: run.config()?.evaluation.first_seed,
+        episodes: 1,
+        output: run.path().join("videos"),
+        observer: observer.clone(),
+        python: python.to_owned(),
     })
 }

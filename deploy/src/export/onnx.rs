@@ -164,14 +164,14 @@ impl<'a> PolicyGraph<'a> {
                 let source = if bounded { &squashed } else { &raw };
                 let range = if bounded { policy.rho_range as f32 } else { 1.0 };
                 let rho = graph.slice(source, 2, 1 + basis_count, per_dimension as usize);
-                self.inverse(&rho, range, [&y, &samples])
+                self.inverse(&rho, range, &y, &samples)
             }
         };
         self.graph.op_with("Transpose", &[&u], vec![ints("perm", &[0, 2, 1])])
     }
 
     /// u = tanh(rho_0 y + rho_1 yd + rho_2 ydd + rho_3), rho = (1, 0, 0, 0) + range · `rho`.
-    fn inverse(&mut self, rho: &str, range: f32, [y, samples]: [&str; 2]) -> String {
+    fn inverse(&mut self, rho: &str, range: f32, y: &str, samples: &str) -> String {
         let (graph, steps) = (&mut self.graph, self.steps);
         let centre = graph.constant(&[1, 1, 4], &[1.0, 0.0, 0.0, 0.0]);
         let range = graph.scalar(range);

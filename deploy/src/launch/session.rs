@@ -132,7 +132,7 @@ fn conclude(
     title: &str,
     steps_total: u64,
 ) -> anyhow::Result<Outcome> {
-    if let Err(error) = plots::learning_curve(run) {
+    if let Err(error) = plots::learning_curve(run, title) {
         // The results are there; a picture is no reason to fail.
         say(&format!("warning: {error:#}"));
     }

@@ -1,5 +1,5 @@
-//! What the observer writes for whoever has it observe: one JSON object a line, the robot first,
-//! then an episode each.
+//! Reads and writes the observer's file: one JSON object per line, first the robot, then each
+//! episode.
 
 use std::fs::File;
 use std::io::{BufRead, BufReader, Read};
@@ -9,21 +9,21 @@ use anyhow::{Context, ensure};
 use serde::de::DeserializeOwned;
 use serde::{Deserialize, Serialize};
 
-/// A longer line is no episode: 10,000 steps of a humanoid take a tenth.
+/// Maximum length of a line. An episode of 10,000 steps of a humanoid needs a tenth of it.
 const LINE_BYTES_MAX: u64 = 256 << 20;
 
-/// Of what a joint's position is a measure.
+/// Kind of a joint.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum JointKind {
-    /// An angle \[rad\].
+    /// Its position is an angle \[rad\].
     Hinge,
-    /// A length \[m\].
+    /// Its position is a length \[m\].
     Slide,
 }
 
 impl JointKind {
-    /// `rad` or `m`.
+    /// Returns the unit, `rad` or `m`.
     #[must_use]
     pub fn unit(self) -> &'static str {
         match self {
@@ -37,69 +37,69 @@ impl JointKind {
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Joint {
-    /// Its name in the model.
+    /// Name in the model.
     pub name: String,
-    /// What it measures.
+    /// Kind of the joint.
     pub kind: JointKind,
 }
 
-/// Whose episodes these are.
+/// Description of the robot.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Robot {
-    /// Those that actuators move; none if the environment does not show them.
+    /// Joints that actuators move; empty if the environment does not report them.
     pub joints: Vec<Joint>,
-    /// Why there are none; empty if there are some.
+    /// Reason why there are no joints; empty if there are.
     pub why_no_joints: String,
-    /// What the goal looks like in a picture; empty if nobody knows.
+    /// Appearance of the goal in pictures; empty if the environment does not declare it.
     #[serde(default, skip_serializing_if = "String::is_empty")]
     pub goal_in_pictures: String,
-    /// Duration of a step \[s\]; 0 if the environment does not say.
+    /// Duration of a step \[s\]; 0 if the environment does not report it.
     pub control_dt_s: f64,
 }
 
-/// One noise-free episode of T steps. Rows are time.
+/// A noise-free episode of T steps. Rows are points in time.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct RecordedEpisode {
-    /// What it was reset with.
+    /// Seed with which it was reset.
     pub seed: u64,
-    /// Sum of its rewards.
+    /// Sum of the rewards.
     #[serde(rename = "return")]
     pub return_: f64,
-    /// Whether it ended in success; none where the task does not say.
+    /// Whether it ended in success; null if the task does not report it.
     pub success: Option<bool>,
-    /// (T,).
+    /// Rewards, (T,).
     pub rewards: Vec<f64>,
-    /// The policy's actions in [-1, 1], (T, A).
+    /// Actions of the policy in [-1, 1], (T, A).
     pub actions: Vec<Vec<f32>>,
-    /// (T+1, J) [rad or m]: before the first step, and after each; empty without joints.
+    /// Positions before the first step and after each, (T+1, J) [rad or m]; empty without joints.
     pub joint_positions: Vec<Vec<f64>>,
-    /// (T+1, J) [rad/s or m/s].
+    /// Velocities at the same times, (T+1, J) [rad/s or m/s].
     pub joint_velocities: Vec<Vec<f64>>,
-    /// (T,): whether each step reported success; empty where that is not known.
+    /// Whether each step reported success, (T,); empty if unknown.
     pub success_by_step: Vec<Option<bool>>,
-    /// Files of pictures, if they were asked for,
+    /// Files of rendered frames; empty if none were requested.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub frames: Vec<PathBuf>,
-    /// and the number of steps done at each.
+    /// Number of steps done at each frame.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub frame_steps: Vec<usize>,
 }
 
-/// Episodes, read one at a time.
+/// Reads a recording one episode at a time.
 #[derive(Debug)]
 pub struct Recorded {
-    /// Whose they are.
+    /// The robot.
     pub robot: Robot,
     lines: Lines,
 }
 
 impl Recorded {
-    /// Opens what an observer wrote.
+    /// Opens a file that an observer wrote.
     ///
     /// # Errors
-    /// The file cannot be read, or does not begin with a robot.
+    /// The file cannot be read, or does not begin with a robot's description.
     pub fn open(path: &Path) -> anyhow::Result<Self> {
         let file = File::open(path).with_context(|| format!("cannot open {}", path.display()))?;
         let mut lines = Lines { reader: BufReader::new(file), name: path.display().to_string() };
@@ -107,10 +107,10 @@ impl Recorded {
         Ok(Self { robot, lines })
     }
 
-    /// The next episode; none after the last.
+    /// Returns the next episode; `None` after the last.
     ///
     /// # Errors
-    /// The file cannot be read, or the line is no episode of this robot.
+    /// The file cannot be read, or the line is not an episode of this robot.
     pub fn next_episode(&mut self) -> anyhow::Result<Option<RecordedEpisode>> {
         let Some(episode) = self.lines.next::<RecordedEpisode>()? else { return Ok(None) };
         let (steps, joints) = (episode.rewards.len(), self.robot.joints.len());
@@ -124,7 +124,7 @@ impl Recorded {
                 && episode.frame_steps.iter().all(|&step| step <= steps)
                 && fits(&episode.joint_positions)
                 && fits(&episode.joint_velocities),
-            "{}: the episode of seed {} does not fit together: {steps} rewards, {} actions, {} \
+            "{}: the episode of seed {} is inconsistent: {steps} rewards, {} actions, {} \
              positions, {} velocities of {joints} joints",
             self.lines.name,
             episode.seed,
@@ -149,8 +149,8 @@ impl Lines {
         if read.with_context(|| format!("cannot read {}", self.name))? == 0 {
             return Ok(None);
         }
-        ensure!(line.ends_with(b"\n"), "{}: a line is not whole", self.name);
+        ensure!(line.ends_with(b"\n"), "{}: the last line is incomplete", self.name);
         let parsed = serde_json::from_slice(&line);
-        parsed.map(Some).with_context(|| format!("{}: a line is no episode", self.name))
+        parsed.map(Some).with_context(|| format!("{}: a line is not an episode", self.name))
     }
 }

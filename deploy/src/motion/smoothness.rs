@@ -1,16 +1,16 @@
-//! How smooth a motion is: three measures, each a pure function of an episode.
+//! Three measures of smoothness, each a pure function of an episode.
 
 use rustfft::FftPlanner;
 use rustfft::num_complex::Complex64;
 
-/// Padding of the spectrum: 2^4 times the profile's length, rounded up to a power of two.
+/// The profile is padded to 2^4 times its length, which is rounded up to a power of two.
 const PAD_LEVEL: u32 = 4;
-/// Frequencies above are not of a movement [Hz].
+/// Maximum frequency of a movement [Hz]; higher ones are ignored.
 const CUTOFF_HZ: f64 = 10.0;
-/// Share of the spectrum's maximum below which its end is cut off.
+/// The spectrum is cut where it falls below this share of its maximum.
 const AMPLITUDE_THRESHOLD: f64 = 0.05;
 
-/// A mean under way.
+/// Accumulates a mean.
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
 pub struct Mean {
     sum: f64,
@@ -18,20 +18,20 @@ pub struct Mean {
 }
 
 impl Mean {
-    /// One more value.
+    /// Adds a value.
     pub fn add(&mut self, value: f64) {
         self.sum += value;
         self.count += 1;
     }
 
-    /// The mean; none of nothing.
+    /// Returns the mean; `None` without values.
     #[must_use]
     pub fn value(self) -> Option<f64> {
         (self.count > 0).then(|| self.sum / self.count as f64)
     }
 }
 
-/// Adds |u_t - u_{t-1}| of each dimension to its mean.
+/// Adds |u_t - u_{t-1}| to the mean of each dimension.
 ///
 /// - `u`: (T, A). `means`: (A,).
 pub fn add_action_changes(u: &[Vec<f32>], means: &mut [Mean]) {
@@ -42,8 +42,8 @@ pub fn add_action_changes(u: &[Vec<f32>], means: &mut [Mean]) {
     }
 }
 
-/// Adds the absolute jerk of each joint to its mean: the second difference of velocities at control
-/// rate, `(qd_{t+1} - 2 qd_t + qd_{t-1}) / dt²`, which needs no model and no filter.
+/// Adds the absolute jerk of each joint to its mean. Jerk is the second difference of velocities at
+/// the control rate, `(qd_{t+1} - 2 qd_t + qd_{t-1}) / dt²`, without a model or a filter.
 ///
 /// - `velocities`: (T+1, J) [rad/s]. `dt`: \[s\]. `means`: (J,) [rad/s³].
 pub fn add_jerks(velocities: &[Vec<f64>], dt: f64, means: &mut [Mean]) {
@@ -55,13 +55,13 @@ pub fn add_jerks(velocities: &[Vec<f64>], dt: f64, means: &mut [Mean]) {
     }
 }
 
-/// The spectral arc length of a speed profile, in which -1.6 is smooth and less is less so
-/// (Balasubramanian et al. 2015, "On the analysis of movement smoothness", with its parameters).
+/// Returns the spectral arc length of a speed profile: about -1.6 for a smooth movement, lower for
+/// others (Balasubramanian et al. 2015, "On the analysis of movement smoothness", with the paper's
+/// parameters). `None` if nothing moves, or the profile is too short for a spectrum.
 ///
-/// - `speed`: (T,), not negative. `rate_hz`: samples a second.
-/// - Returns none of a profile that does not move, or is too short to have a spectrum.
+/// - `speed`: (T,), not negative. `rate_hz`: samples per second.
 ///
-/// Differs from the paper: where half the rate is below 10 Hz, that is the cutoff.
+/// Difference from the paper: the cutoff is at most half the sampling rate.
 #[must_use]
 pub fn sparc(speed: &[f64], rate_hz: f64) -> Option<f64> {
     if speed.len() < 2 || rate_hz.is_nan() || rate_hz <= 0.0 {
@@ -106,11 +106,11 @@ mod tests {
         sparc: f64,
     }
 
-    /// tests/golden/sparc/make_golden.py
+    /// Made by tests/golden/sparc/make_golden.py.
     const GOLDEN: &str = include_str!("../../../tests/golden/sparc/golden.json");
 
     #[test]
-    fn arc_lengths_are_those_of_the_authors_package() {
+    fn arc_lengths_match_the_authors_package() {
         let golden: Golden = serde_json::from_str(GOLDEN).unwrap();
         assert_eq!(golden.cases.len(), 27);
         for Case { rate_hz, speed, sparc: expected } in golden.cases {
@@ -120,7 +120,7 @@ mod tests {
     }
 
     #[test]
-    fn what_does_not_move_has_no_arc_length() {
+    fn a_profile_without_movement_has_no_arc_length() {
         assert_eq!(sparc(&[0.0; 50], 50.0), None);
         assert_eq!(sparc(&[1.0], 50.0), None);
         assert_eq!(sparc(&[0.0, f64::NAN, 1.0], 50.0), None);

@@ -1,10 +1,17 @@
+//! Measures recordings whose jerk and action change are known.
+
+use std::path::{Path, PathBuf};
+
 use super::*;
+
+const POLICY: RecordedPolicy = RecordedPolicy { version: 3, env_steps: 500, first_seed: 7 };
 
 fn joint(name: &str, kind: JointKind) -> Joint {
     Joint { name: name.to_owned(), kind }
 }
 
-/// Velocities that rise by one more each step have a jerk of 1 / dt²; a slide's do not count.
+/// Writes episodes whose hinges have a jerk of 1 / dt²: their velocities are half the square of the
+/// step. The velocities of slides differ, and must not be measured next to hinges.
 fn written(folder: &Path, robot: &Robot, lengths: &[usize]) -> PathBuf {
     let mut lines = vec![serde_json::to_string(robot).unwrap()];
     for (index, &steps) in lengths.iter().enumerate() {
@@ -45,7 +52,7 @@ fn all_episodes_are_measured_and_the_first_is_kept() {
         goal_in_pictures: String::new(),
         control_dt_s: 0.1,
     };
-    let motion = of_recorded(&written(folder.path(), &robot, &[20, 30]), (3, 500, 7)).unwrap();
+    let motion = measure(&written(folder.path(), &robot, &[20, 30]), POLICY).unwrap();
     assert_eq!(motion.returns, [-20.0, -30.0]);
     assert_eq!((motion.episode.seed, motion.times().len()), (7, 21));
     assert_eq!(motion.action_change_by_dimension, [Some(1.0), Some(0.0)]);
@@ -68,7 +75,7 @@ fn a_robot_of_slides_is_measured_in_metres() {
         goal_in_pictures: String::new(),
         control_dt_s: 0.1,
     };
-    let motion = of_recorded(&written(folder.path(), &robot, &[20]), (3, 500, 7)).unwrap();
+    let motion = measure(&written(folder.path(), &robot, &[20]), POLICY).unwrap();
     assert_eq!(motion.unit, "m");
     assert!((motion.joint_jerk.unwrap() - 200_000.0).abs() < 1e-3, "{:?}", motion.joint_jerk);
 }
@@ -83,13 +90,13 @@ fn without_joints_only_actions_are_measured() {
         goal_in_pictures: String::new(),
         control_dt_s: 0.0,
     };
-    let motion = of_recorded(&written(folder.path(), &robot, &[5]), (3, 500, 7)).unwrap();
+    let motion = measure(&written(folder.path(), &robot, &[5]), POLICY).unwrap();
     assert_eq!((motion.joint_jerk, motion.sparc, motion.action_change), (None, None, Some(0.5)));
     assert_eq!(motion.times(), [0.0, 1.0, 2.0, 3.0, 4.0, 5.0]);
 }
 
 #[test]
-fn an_episode_that_does_not_fit_its_robot_is_refused() {
+fn an_inconsistent_episode_is_refused() {
     let folder = tempfile::tempdir().unwrap();
     let robot = |joints| Robot {
         joints,
@@ -102,9 +109,9 @@ fn an_episode_that_does_not_fit_its_robot_is_refused() {
     let (_, episode) = text.split_once('\n').unwrap();
     let head = serde_json::to_string(&robot(vec![joint("elbow", JointKind::Hinge)])).unwrap();
     std::fs::write(&none, format!("{head}\n{episode}")).unwrap();
-    let error = of_recorded(&none, (3, 500, 7)).unwrap_err().to_string();
+    let error = measure(&none, POLICY).unwrap_err().to_string();
     assert!(error.contains("0 positions, 0 velocities of 1 joints"), "{error}");
     let torn = text.trim_end();
     std::fs::write(&none, torn).unwrap();
-    assert!(of_recorded(&none, (3, 500, 7)).unwrap_err().to_string().contains("not whole"));
+    assert!(measure(&none, POLICY).unwrap_err().to_string().contains("incomplete"));
 }

@@ -3,11 +3,11 @@
 use std::path::PathBuf;
 
 use anyhow::{Context, anyhow};
+use dmprl_shared::supervision::EvaluationRow;
 use plotters::prelude::*;
 
 use super::axes::Axes;
 use super::png::png;
-use crate::control::EvaluationRow;
 use crate::run_directory::RunDirectory;
 use crate::terminal::std_of;
 
@@ -19,16 +19,17 @@ const BESIDE: u32 = 40;
 
 /// Draws `plots/learning_curve.svg` and a PNG of it; returns `None` without evaluations.
 ///
+/// - `title`: above the curve.
+///
 /// # Errors
 /// The rows cannot be read, or the picture cannot be written.
-pub fn learning_curve(run: &RunDirectory) -> anyhow::Result<Option<PathBuf>> {
+pub fn learning_curve(run: &RunDirectory, title: &str) -> anyhow::Result<Option<PathBuf>> {
     let rows = run.evaluations()?;
     if rows.is_empty() {
         return Ok(None);
     }
-    let title = crate::launch::title(&run.config()?);
     let svg =
-        draw(&rows, &title).map_err(|error| anyhow!("cannot draw the learning curve: {error}"))?;
+        draw(&rows, title).map_err(|error| anyhow!("cannot draw the learning curve: {error}"))?;
     let path = run.path().join("plots").join("learning_curve.svg");
     let pictures = [(path.with_extension("png"), png(&svg)?), (path.clone(), svg.into_bytes())];
     for (path, picture) in pictures {
@@ -87,7 +88,7 @@ mod tests {
     }
 
     #[test]
-    fn the_picture_names_its_axes_and_has_one_dot_an_evaluation() {
+    fn the_picture_names_its_axes_and_has_one_dot_per_evaluation() {
         let rows = [row(0, &[-12.0, -8.0]), row(5_000, &[-7.0, -6.0]), row(10_000, &[-5.0, -5.0])];
         let svg = draw(&rows, "reacher").unwrap();
         for text in ["environment steps", "evaluation return", "reacher", "10,000", "± 1 std"] {

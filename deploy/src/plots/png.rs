@@ -14,18 +14,18 @@ const SCALE: f32 = 2.0;
 /// Renders an SVG of this program.
 ///
 /// # Errors
-/// It is no SVG, or has no size.
+/// The text is not an SVG, or has no size.
 pub(crate) fn png(svg: &str) -> anyhow::Result<Vec<u8>> {
     let mut options = Options { font_family: FAMILY.to_owned(), ..Options::default() };
     let fonts = options.fontdb_mut();
     fonts.load_font_data(FONT.to_vec());
     // The generic family that our pictures use.
     fonts.set_sans_serif_family(FAMILY);
-    let tree = Tree::from_str(svg, &options).context("no picture can be made of an SVG")?;
+    let tree = Tree::from_str(svg, &options).context("cannot render an SVG")?;
     let size = tree.size().to_int_size().scale_by(SCALE);
     let mut pixels = size
         .and_then(|size| Pixmap::new(size.width(), size.height()))
-        .ok_or_else(|| anyhow!("an SVG of no size"))?;
+        .ok_or_else(|| anyhow!("an SVG has no size"))?;
     resvg::render(&tree, Transform::from_scale(SCALE, SCALE), &mut pixels.as_mut());
     pixels.encode_png().context("cannot write a PNG")
 }
@@ -65,7 +65,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_no_svg_is_refused() {
+    fn a_text_that_is_not_an_svg_is_refused() {
         assert!(png("<p>").is_err());
     }
 }

@@ -39,6 +39,13 @@ pub(crate) struct Panel {
     pub(crate) lines: Vec<Vec<(f64, f64)>>,
 }
 
+/// Axes of a panel that have tick labels: only those at the border of the figure.
+#[derive(Debug, Clone, Copy)]
+struct TickLabels {
+    x: bool,
+    y: bool,
+}
+
 /// A figure with several panels.
 pub(crate) struct SmallMultiples<'t> {
     /// Title above all panels.
@@ -75,8 +82,9 @@ impl SmallMultiples<'_> {
             let panels = area.margin(TITLE_HEIGHT, FOOT_HEIGHT, LEFT, RIGHT);
             let places = panels.split_evenly((rows, columns));
             for (index, (panel, place)) in self.panels.iter().zip(&places).enumerate() {
-                let outer = (index % columns == 0, index + columns >= self.panels.len());
-                self.draw_panel(place, panel, outer)?;
+                let tick_labels =
+                    TickLabels { x: index + columns >= self.panels.len(), y: index % columns == 0 };
+                self.draw_panel(place, panel, tick_labels)?;
             }
             let x = (LEFT + inner.0 + 16) as i32;
             for (index, name) in self.names.iter().enumerate() {
@@ -90,14 +98,11 @@ impl SmallMultiples<'_> {
         Ok(svg)
     }
 
-    /// Draws a panel.
-    ///
-    /// - `outer`: whether it is leftmost, and lowest in its column. Only there it has tick labels.
     fn draw_panel<DB: DrawingBackend>(
         &self,
         place: &DrawingArea<DB, plotters::coord::Shift>,
         panel: &Panel,
-        (leftmost, lowest): (bool, bool),
+        tick_labels: TickLabels,
     ) -> Result<(), Box<dyn std::error::Error>>
     where
         DB::ErrorType: 'static,
@@ -117,8 +122,8 @@ impl SmallMultiples<'_> {
             .configure_mesh()
             .x_labels(4)
             .y_labels(5)
-            .x_label_formatter(&|value| tick(lowest, *value))
-            .y_label_formatter(&|value| tick(leftmost, *value))
+            .x_label_formatter(&|value| tick(tick_labels.x, *value))
+            .y_label_formatter(&|value| tick(tick_labels.y, *value))
             .label_style(("sans-serif", 13))
             .light_line_style(WHITE)
             .bold_line_style(BLACK.mix(0.12))

@@ -5,19 +5,26 @@ use std::path::{Path, PathBuf};
 use anyhow::{Context, ensure};
 use serde::Serialize;
 
-use super::SideRecord;
+use super::video::SideRecord;
 
 /// Frames per second if the environment does not report the duration of a step.
 const RATE_UNKNOWN: f64 = 25.0;
+
+/// Files of a recording.
+#[derive(Debug, Clone, Serialize)]
+pub(super) struct FilmFiles {
+    pub(super) mp4: PathBuf,
+    pub(super) gif: PathBuf,
+    pub(super) strip: PathBuf,
+}
 
 #[derive(Debug, Serialize)]
 struct FilmPlan<'a> {
     episodes: Vec<Vec<Side<'a>>>,
     control_dt_s: f64,
     rate: f64,
-    mp4: &'a Path,
-    gif: &'a Path,
-    strip: &'a Path,
+    #[serde(flatten)]
+    files: &'a FilmFiles,
 }
 
 #[derive(Debug, Serialize)]
@@ -32,9 +39,11 @@ struct Side<'a> {
 }
 
 /// Writes the plan into `folder`; returns its path.
+///
+/// - `files`: the files that the program will write.
 pub(super) fn write(
     sides: &[SideRecord],
-    [mp4, gif, strip]: &[PathBuf; 3],
+    files: &FilmFiles,
     folder: &Path,
 ) -> anyhow::Result<PathBuf> {
     let first = &sides[0];
@@ -42,7 +51,7 @@ pub(super) fn write(
     for side in sides {
         ensure!(
             side.episodes.len() == first.episodes.len() && side.robot.control_dt_s == dt,
-            "{} and {} do not go side by side: {} and {} episodes, steps of {dt} and {} s",
+            "cannot show {} next to {}: {} and {} episodes, steps of {dt} and {} s",
             first.run.display(),
             side.run.display(),
             first.episodes.len(),
@@ -62,9 +71,7 @@ pub(super) fn write(
         episodes: episodes.collect(),
         control_dt_s: dt,
         rate: if dt > 0.0 { 1.0 / (dt * frame_steps as f64) } else { RATE_UNKNOWN },
-        mp4,
-        gif,
-        strip,
+        files,
     };
     let path = folder.join("plan.json");
     let text = serde_json::to_vec(&plan).context("cannot write a plan as JSON")?;

@@ -1,82 +1,64 @@
-//! The runs that a report is made of.
+//! Reads the runs of a report.
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
 use anyhow::Context;
-use dmprl_shared::config::{AlgorithmName, ExperimentConfig, PRESETS, PolicyKind};
+use dmprl_shared::config::ExperimentConfig;
 
-use super::landed;
-use super::run::{Key, Origin, Run, Source};
+use super::method_label::method_label;
+use super::motion::read_motions;
+use super::results::Results;
+use super::run::{Origin, Run, RunKey, Source};
+use super::snapshot;
 use crate::failure::wrong_use;
 use crate::run_directory::RunDirectory;
 use crate::sweep::search::found;
 use crate::sweep::{Ledger, Plan, SweepFile, flatten};
 
-/// All runs of a report; tasks and methods in the order in which they were named.
-#[derive(Debug, Clone, Default)]
-pub struct Results {
-    /// Rows of the tables.
-    pub tasks: Vec<String>,
-    /// Their columns.
-    pub methods: Vec<String>,
-    /// Those that have begun.
-    pub runs: Vec<Run>,
-    /// Those that are to be.
-    pub waiting: Vec<Key>,
-    /// The files of the sweeps, by the names of their directories.
-    pub sweeps: Vec<(String, String)>,
-    /// Runs whose motion could not be measured, and why.
-    pub unmeasured: Vec<String>,
-    /// Runs that could not be drawn, and why.
-    pub undrawn: Vec<String>,
+/// A directory of a sweep and its record of finished runs.
+struct Sweep<'s> {
+    directory: &'s Path,
+    ledger: Ledger,
 }
 
 impl Results {
     /// Reads runs, sweeps and the folders of earlier reports.
     ///
     /// # Errors
-    /// Wrong use: a path is none of these, or nothing has begun. A run that cannot be read.
+    /// Wrong use if a path is none of these, or if no run has an evaluation. A run cannot be read.
     pub fn read(paths: &[PathBuf]) -> anyhow::Result<Self> {
         let mut results = Self::default();
         for path in paths {
             if path.join("sweep.toml").is_file() {
                 results.add_sweep(path)?;
-            } else if path.join(landed::FILE).is_file() {
-                results.add_landed(path)?;
+            } else if let Some(file) = snapshot::find(path) {
+                results.add_snapshot(&file)?;
             } else {
                 results.add_run(path)?;
             }
         }
-        results.settle();
+        results.remove_duplicates();
         if results.runs.iter().all(|run| run.rows.is_empty()) {
             return Err(wrong_use("no run has an evaluation yet: there is nothing to report"));
         }
-        super::motion::read_motions(&mut results)?;
+        read_motions(&mut results)?;
         Ok(results)
     }
 
-    /// The runs of one task by one method.
-    pub fn of<'a>(
-        &'a self,
-        task: &'a str,
-        method: &'a str,
-    ) -> impl Iterator<Item = &'a Run> + Clone {
-        self.runs.iter().filter(move |run| run.task == task && run.method == method)
-    }
-
-    fn add_sweep(&mut self, sweep: &Path) -> anyhow::Result<()> {
-        let (file, text) = SweepFile::read(&sweep.join("sweep.toml"))?;
-        let name = sweep.file_name().map(|name| name.to_string_lossy().into_owned());
+    fn add_sweep(&mut self, directory: &Path) -> anyhow::Result<()> {
+        let (file, text) = SweepFile::read(&directory.join("sweep.toml"))?;
+        let name = directory.file_name().map(|name| name.to_string_lossy().into_owned());
         self.sweeps.push((name.unwrap_or_default(), text));
-        let ledger = Ledger::open(sweep)?;
+        let sweep = Sweep { directory, ledger: Ledger::open(directory)? };
         if let Some(search) = &file.search {
-            // What it found: dozens of trials side by side would be no comparison of methods.
-            for found in found(&file, search, sweep)? {
+            // Only the best trial: a column for each of dozens of trials would compare no methods.
+            for found in found(&file, search, directory)? {
                 let method = format!("{}, best trial", found.method);
                 self.add_planned(&found.task, &method);
                 for (run, seed) in found.runs.iter().zip(&file.seeds) {
-                    self.add_begun((sweep, &ledger), run, (&found.task, &method, *seed))?;
+                    let key = run_key(&found.task, &method, *seed, run)?;
+                    self.add_sweep_run(&sweep, run, key)?;
                 }
             }
             return Ok(());
@@ -85,90 +67,89 @@ impl Results {
             let point = planned.point.iter().map(|value| format!(", {value}"));
             let method = format!("{}{}", planned.method, point.collect::<String>());
             self.add_planned(&planned.task, &method);
-            let which = (planned.task.as_str(), method.as_str(), planned.seed);
-            self.add_begun((sweep, &ledger), &planned.directory, which)?;
+            let key = run_key(&planned.task, &method, planned.seed, &planned.directory)?;
+            self.add_sweep_run(&sweep, &planned.directory, key)?;
         }
         Ok(())
     }
 
-    /// A cell that was not run stands in the tables too.
+    /// Adds a row and a column, so that tables show planned cells without runs.
     fn add_planned(&mut self, task: &str, method: &str) {
         add_new(&mut self.tasks, task);
         add_new(&mut self.methods, method);
     }
 
-    /// A run of a sweep; one that has not begun waits.
-    fn add_begun(
+    /// Adds a run of a sweep.
+    ///
+    /// - `place`: its directory, relative to that of the sweep.
+    fn add_sweep_run(
         &mut self,
-        (sweep, ledger): (&Path, &Ledger),
+        sweep: &Sweep<'_>,
         place: &Path,
-        (task, method, seed): (&str, &str, i64),
+        key: RunKey,
     ) -> anyhow::Result<()> {
-        let path = sweep.join(place);
-        // The manifest is the last that is written when a directory is made.
+        let path = sweep.directory.join(place);
+        // The manifest is the last file that is written when a run directory is created.
         if !path.join("manifest.json").is_file() {
-            let (task, method) = (task.to_owned(), method.to_owned());
-            let seed =
-                u64::try_from(seed).with_context(|| format!("seed of {}", path.display()))?;
-            self.waiting.push(Key { task, method, seed });
+            self.not_started.push(key);
             return Ok(());
         }
         let directory = RunDirectory::open(&path)?;
         let config = directory.config()?;
-        let mut run = run(&directory, &config, method.to_owned())?;
-        let finished = ledger.of(place);
+        let mut run = run(&directory, &config, key.method)?;
+        let finished = sweep.ledger.of(place);
         run.ended |= finished.is_some_and(|finished| finished.is_whole(config.run.steps));
         self.runs.push(run);
         Ok(())
     }
 
-    /// What an earlier report knew.
-    fn add_landed(&mut self, report: &Path) -> anyhow::Result<()> {
-        let landed = landed::read(report)?;
-        landed.tasks.iter().for_each(|task| add_new(&mut self.tasks, task));
-        landed.methods.iter().for_each(|method| add_new(&mut self.methods, method));
-        for sweep in landed.sweeps {
+    /// Adds the runs of an earlier report.
+    fn add_snapshot(&mut self, file: &Path) -> anyhow::Result<()> {
+        let earlier = snapshot::read(file)?;
+        earlier.tasks.iter().for_each(|task| add_new(&mut self.tasks, task));
+        earlier.methods.iter().for_each(|method| add_new(&mut self.methods, method));
+        for sweep in earlier.sweeps {
             if !self.sweeps.contains(&sweep) {
                 self.sweeps.push(sweep);
             }
         }
-        self.runs.extend(landed.runs);
-        self.waiting.extend(landed.waiting);
+        self.runs.extend(earlier.runs);
+        self.not_started.extend(earlier.not_started);
         Ok(())
     }
 
-    /// Of a run that was landed and lies here too, or was landed by two reports, one stays: before
-    /// others one that has come to its end, then one in a directory, then the one named first.
-    /// Runs of directories, or of one report, are never set against each other.
-    fn settle(&mut self) {
+    /// Keeps one of several copies of a run: a finished one before an unfinished one, then one in
+    /// a run directory before one of an earlier report, then the one named first. Two directories
+    /// are never copies of one run, nor are two runs of one report.
+    fn remove_duplicates(&mut self) {
         let rank = |index: usize, run: &Run| (!run.ended, run.directory().is_none(), index);
-        let beaten = |(index, run): &(usize, &Run)| {
+        let is_replaced = |(index, run): &(usize, &Run)| {
             self.runs.iter().enumerate().any(|(other_index, other)| {
-                let landed = other.directory().is_none() || run.directory().is_none();
-                landed
+                let is_copy = other.directory().is_none() || run.directory().is_none();
+                is_copy
                     && other.source != run.source
                     && other.is(&run.key())
                     && rank(other_index, other) < rank(*index, run)
             })
         };
-        let stay = self.runs.iter().enumerate().filter(|run| !beaten(run));
-        self.runs = stay.map(|(_, run)| run.clone()).collect();
-        let mut waiting: Vec<Key> = Vec::new();
-        for key in std::mem::take(&mut self.waiting) {
-            if !waiting.contains(&key) && !self.runs.iter().any(|run| run.is(&key)) {
-                waiting.push(key);
+        let kept = self.runs.iter().enumerate().filter(|run| !is_replaced(run));
+        self.runs = kept.map(|(_, run)| run.clone()).collect();
+        let mut not_started: Vec<RunKey> = Vec::new();
+        for key in std::mem::take(&mut self.not_started) {
+            if !not_started.contains(&key) && !self.runs.iter().any(|run| run.is(&key)) {
+                not_started.push(key);
             }
         }
-        self.waiting = waiting;
+        self.not_started = not_started;
     }
 
-    /// The label, with the first value that differs where another run of the task has it and learns
-    /// otherwise: whatever they were begun with, they are no seeds of one method.
-    fn own_label(&self, label: String, config: &ExperimentConfig) -> anyhow::Result<String> {
-        let own = learning(config)?;
+    /// Returns the label, extended by the first differing key if another run of the task has the
+    /// same label and another learning configuration: such runs are not seeds of one method.
+    fn distinct_label(&self, label: String, config: &ExperimentConfig) -> anyhow::Result<String> {
+        let own = learning_keys(config)?;
         let others = self.of(&config.task.name, &label).filter_map(Run::directory);
         for other in others {
-            let others = learning(&RunDirectory::open(other)?.config()?)?;
+            let others = learning_keys(&RunDirectory::open(other)?.config()?)?;
             if let Some((key, value)) =
                 own.iter().find(|(key, value)| others.get(*key) != Some(value))
             {
@@ -182,7 +163,7 @@ impl Results {
         let directory = RunDirectory::open(path)?;
         let config = directory.config()?;
         let manifest = directory.manifest()?;
-        let label = self.own_label(label(&config, manifest.preset()), &config)?;
+        let label = self.distinct_label(method_label(&config, manifest.preset()), &config)?;
         let run = run(&directory, &config, label)?;
         add_new(&mut self.tasks, &run.task);
         add_new(&mut self.methods, &run.method);
@@ -191,14 +172,20 @@ impl Results {
     }
 }
 
-/// What is learned, and how: runs that differ in nothing else are seeds of one method.
-const LEARNING: [&str; 7] =
+fn run_key(task: &str, method: &str, seed: i64, place: &Path) -> anyhow::Result<RunKey> {
+    let seed = u64::try_from(seed).with_context(|| format!("seed of {}", place.display()))?;
+    Ok(RunKey { task: task.to_owned(), method: method.to_owned(), seed })
+}
+
+/// Sections of the configuration that define a method: runs that differ only elsewhere are seeds
+/// of one method.
+const LEARNING_SECTIONS: [&str; 7] =
     ["policy", "dmp", "algorithm", "exploration", "replay", "demonstrations", "pacing"];
 
-/// Every key that says what is learned and how, with its value.
-fn learning(config: &ExperimentConfig) -> anyhow::Result<BTreeMap<String, toml::Value>> {
+/// Returns every key of the sections that define a method, with its value.
+fn learning_keys(config: &ExperimentConfig) -> anyhow::Result<BTreeMap<String, toml::Value>> {
     let mut table = toml::Table::try_from(config).context("cannot compare configurations")?;
-    table.retain(|section, _| LEARNING.contains(&section));
+    table.retain(|section, _| LEARNING_SECTIONS.contains(&section));
     Ok(flatten(&table).into_iter().collect())
 }
 
@@ -235,74 +222,60 @@ fn run(directory: &RunDirectory, config: &ExperimentConfig, method: String) -> a
     })
 }
 
-/// What a run is called that no sweep has named: a preset's runs are no seeds of the default's.
-pub(crate) fn label(config: &ExperimentConfig, preset: Option<&str>) -> String {
-    let method = method(config);
-    match preset.filter(|&name| name != PRESETS[0].name) {
-        Some(name) => format!("{method} ({name})"),
-        None => method,
-    }
-}
-
-fn method(config: &ExperimentConfig) -> String {
-    let algorithm = match config.algorithm.name {
-        AlgorithmName::Ddpg => "DDPG",
-        AlgorithmName::Td3 => "TD3",
-        AlgorithmName::Sac => "SAC",
-        // It has no other policy.
-        AlgorithmName::Ndp => return "NDP".to_owned(),
-    };
-    match config.policy.kind {
-        PolicyKind::Dmp => format!("{algorithm}-DMP"),
-        PolicyKind::Mlp => algorithm.to_owned(),
-    }
-}
-
 #[cfg(test)]
 mod tests {
-    use super::super::planted::{Planted, planted};
+    use super::super::fixtures::{FixtureRun, fixture_results};
     use super::*;
 
-    /// Runs of one task and method: seed, whether it lies here, whether it has ended, its return.
-    fn settled(runs: &[(u64, bool, bool, f64)]) -> Vec<(u64, f64)> {
-        let run = |(seed, _, ended, value): &(u64, bool, bool, f64)| Planted {
+    /// Returns seed and return of the runs that are kept, of runs given by seed, whether they have
+    /// a directory, whether they are finished, and return.
+    fn kept(runs: &[(u64, bool, bool, f64)]) -> Vec<(u64, f64)> {
+        let run = |(seed, _, ended, value): &(u64, bool, bool, f64)| FixtureRun {
             task: "reacher-v1",
             method: "TD3",
             seed: *seed,
             rows: vec![*value],
             ended: *ended,
         };
-        let mut results = planted(&runs.iter().map(run).collect::<Vec<_>>());
-        for (index, (run, (_, here, ..))) in results.runs.iter_mut().zip(runs).enumerate() {
-            if !here {
+        let mut results = fixture_results(&runs.iter().map(run).collect::<Vec<_>>());
+        for (index, (run, (_, has_directory, ..))) in results.runs.iter_mut().zip(runs).enumerate()
+        {
+            if !has_directory {
                 run.source = Source::Report(format!("report-{index}").into());
             }
         }
-        results.waiting = [1, 8, 8].map(|seed| Key { seed, ..results.runs[0].key() }).to_vec();
-        results.settle();
-        assert_eq!(results.waiting.iter().filter(|key| key.seed == 8).count(), 1);
-        assert!(results.waiting.iter().all(|key| key.seed != 1), "it has begun");
+        let key = results.runs[0].key();
+        results.not_started = [1, 8, 8].map(|seed| RunKey { seed, ..key.clone() }).to_vec();
+        results.remove_duplicates();
+        assert_eq!(results.not_started.iter().filter(|key| key.seed == 8).count(), 1);
+        assert!(results.not_started.iter().all(|key| key.seed != 1), "it has started");
         results.runs.iter().map(|run| (run.seed, run.rows[0].return_mean)).collect()
     }
 
     #[test]
-    fn a_landed_run_stands_where_none_that_lies_here_has_come_to_its_end() {
-        let (here, landed, ended, begun) = (true, false, true, false);
+    fn a_run_of_an_earlier_report_counts_where_no_directory_has_a_finished_one() {
+        let (directory, report, ended, begun) = (true, false, true, false);
         let cases = [
-            // In whichever order they are named.
-            (vec![(1, here, ended, -1.0), (1, landed, ended, -2.0)], vec![(1, -1.0)]),
-            (vec![(1, landed, ended, -2.0), (1, here, ended, -1.0)], vec![(1, -1.0)]),
-            (vec![(1, here, begun, -1.0), (1, landed, ended, -2.0)], vec![(1, -2.0)]),
-            (vec![(1, landed, begun, -2.0), (1, here, begun, -1.0)], vec![(1, -1.0)]),
-            // Two reports: the first that has its end.
-            (vec![(1, landed, ended, -1.0), (1, landed, ended, -2.0)], vec![(1, -1.0)]),
-            (vec![(1, landed, begun, -1.0), (1, landed, ended, -2.0)], vec![(1, -2.0)]),
-            // Other seeds are other runs; two directories are never set against each other.
-            (vec![(1, here, ended, -1.0), (2, landed, ended, -2.0)], vec![(1, -1.0), (2, -2.0)]),
-            (vec![(1, here, ended, -1.0), (1, here, ended, -2.0)], vec![(1, -1.0), (1, -2.0)]),
+            // The order of the arguments does not matter.
+            (vec![(1, directory, ended, -1.0), (1, report, ended, -2.0)], vec![(1, -1.0)]),
+            (vec![(1, report, ended, -2.0), (1, directory, ended, -1.0)], vec![(1, -1.0)]),
+            (vec![(1, directory, begun, -1.0), (1, report, ended, -2.0)], vec![(1, -2.0)]),
+            (vec![(1, report, begun, -2.0), (1, directory, begun, -1.0)], vec![(1, -1.0)]),
+            // Two reports: the first in which the run is finished.
+            (vec![(1, report, ended, -1.0), (1, report, ended, -2.0)], vec![(1, -1.0)]),
+            (vec![(1, report, begun, -1.0), (1, report, ended, -2.0)], vec![(1, -2.0)]),
+            // Other seeds are other runs, and two directories are never copies of one run.
+            (
+                vec![(1, directory, ended, -1.0), (2, report, ended, -2.0)],
+                vec![(1, -1.0), (2, -2.0)],
+            ),
+            (
+                vec![(1, directory, ended, -1.0), (1, directory, ended, -2.0)],
+                vec![(1, -1.0), (1, -2.0)],
+            ),
         ];
         for (runs, expected) in cases {
-            assert_eq!(settled(&runs), expected, "{runs:?}");
+            assert_eq!(kept(&runs), expected, "{runs:?}");
         }
     }
 }

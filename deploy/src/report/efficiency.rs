@@ -1,52 +1,53 @@
-//! Sample efficiency: environment steps until a task counts as learnt, by task and method.
+//! Sample efficiency: environment steps until a threshold is reached, by task and method.
 
 use serde::Serialize;
 
-use super::collect::Results;
 use super::measures::Measure;
-use super::provenance::Makers;
+use super::provenance::SoftwareCounts;
+use super::results::Results;
 use super::run::Run;
 use super::statistics::{INTERVAL_SCORES_MIN, median_with_bounds, range};
-use super::thresholds::{mark, threshold};
+use super::thresholds::{reported_steps, threshold};
 use crate::terminal::grouped;
 
-/// One task's row.
+/// The row of a task.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct EfficiencyRow {
     /// The task.
     pub task: String,
-    /// `return ≥ -10`.
+    /// The threshold, such as `return ≥ -10`.
     pub threshold: String,
-    /// Who says so.
+    /// Source of the threshold.
     pub source: &'static str,
-    /// In the order of the methods.
+    /// Cells in the order of the methods.
     pub cells: Vec<EfficiencyCell>,
 }
 
-/// When the seeds of one task and method were there.
+/// Environment steps until the seeds of a method reached the threshold.
 #[derive(Debug, Clone, Default, PartialEq, Serialize)]
 pub struct EfficiencyCell {
-    /// Environment steps of each seed that is there or has ended; null for one that ended without.
+    /// Environment steps of each seed; null for a finished one that never reached the threshold.
+    /// Does not contain unfinished seeds that have not reached it.
     pub steps: Vec<Option<f64>>,
-    /// Seeds that are under way and not there.
+    /// Number of unfinished seeds that have not reached the threshold.
     pub unfinished: usize,
-    /// Null where half of the seeds or more ended without.
+    /// Median; null if half of the seeds or more never reached the threshold.
     pub median: Option<f64>,
-    /// Its 95 % interval by bootstrap from four seeds on. An end is null if it lies beyond every
-    /// run; both are null below four seeds.
+    /// Its 95 % interval by bootstrap. An end is null if it lies beyond every run; both are null
+    /// with fewer than four seeds.
     pub interval: [Option<f64>; 2],
-    /// Fewest and most steps; null for a seed that ended without.
+    /// Minimum and maximum; null for a seed that never reached the threshold.
     pub range: [Option<f64>; 2],
-    /// What the paper says.
+    /// The paper's statement.
     pub paper: Option<&'static str>,
-    /// Programs and packages behind the figure.
+    /// Number of programs and sets of packages.
     #[serde(flatten)]
-    pub makers: Makers,
+    pub software: SoftwareCounts,
 }
 
 impl EfficiencyCell {
     fn of<'r>(task: &str, method: &str, runs: impl Iterator<Item = &'r Run> + Clone) -> Self {
-        let makers = Makers::of(runs.clone());
+        let software = SoftwareCounts::of(runs.clone());
         let (mut steps, mut unfinished) = (Vec::new(), 0);
         for run in runs {
             match Measure::StepsToThreshold.of(run) {
@@ -54,12 +55,8 @@ impl EfficiencyCell {
                 None => unfinished += 1,
             }
         }
-        let mut cell = Self {
-            unfinished,
-            paper: mark(task, method).map(|mark| mark.0),
-            makers,
-            ..Self::default()
-        };
+        let mut cell =
+            Self { unfinished, paper: reported_steps(task, method), software, ..Self::default() };
         if !steps.is_empty() {
             let (median, bounds) = median_with_bounds(&steps);
             cell.median = finite(median);
@@ -72,7 +69,7 @@ impl EfficiencyCell {
         cell
     }
 
-    /// The cell's lines, for people.
+    /// Formats the lines of the cell.
     #[must_use]
     pub fn lines(&self) -> Vec<String> {
         let mut lines = Vec::new();
@@ -88,7 +85,7 @@ impl EfficiencyCell {
                 let name = if is_range { "range " } else { "" };
                 lines.push(format!("{name}[{low} – {high}]"));
             }
-            let mark = self.makers.mark();
+            let mark = self.software.mark();
             lines.push(format!("{reached} of {} seeds{mark}", self.steps.len()));
             if self.unfinished > 0 {
                 lines.push(format!("{} under way", self.unfinished));
@@ -107,7 +104,7 @@ fn number(steps: Option<f64>) -> String {
     steps.map_or_else(|| "not reached".to_owned(), |steps| grouped(steps.round() as u64))
 }
 
-/// A row for each task that has a threshold and a run.
+/// Returns a row for each task that has a threshold and a run.
 #[must_use]
 pub fn efficiency(results: &Results) -> Vec<EfficiencyRow> {
     let row = |task: &String| {
@@ -128,19 +125,19 @@ pub fn efficiency(results: &Results) -> Vec<EfficiencyRow> {
 
 #[cfg(test)]
 mod tests {
-    use super::super::planted::{Planted, planted};
+    use super::super::fixtures::{FixtureRun, fixture_results};
     use super::*;
 
     #[test]
-    fn a_seed_that_ended_without_counts_as_later_than_all_and_one_under_way_does_not_count() {
-        let run = |seed, rows: Vec<f64>, ended| Planted {
+    fn a_seed_that_never_reached_it_counts_as_infinite_and_an_unfinished_one_does_not_count() {
+        let run = |seed, rows: Vec<f64>, ended| FixtureRun {
             task: "reacher-v1",
             method: "DDPG",
             seed,
             rows,
             ended,
         };
-        let results = planted(&[
+        let results = fixture_results(&[
             run(1, vec![-12.0, -9.5, -11.0], true),
             run(2, vec![-12.0, -11.0, -10.0], true),
             run(3, vec![-12.0, -11.0, -10.1], true),
@@ -165,16 +162,29 @@ mod tests {
     }
 
     #[test]
-    fn a_method_without_runs_is_not_run_and_one_that_never_came_there_says_so() {
-        let never =
-            Planted { task: "reacher-v1", method: "NDP", seed: 1, rows: vec![-15.0], ended: true };
-        let mut results = planted(&[never]);
+    fn a_method_without_runs_and_one_that_never_reached_it_are_distinguished() {
+        let never = FixtureRun {
+            task: "reacher-v1",
+            method: "NDP",
+            seed: 1,
+            rows: vec![-15.0],
+            ended: true,
+        };
+        let mut results = fixture_results(&[never]);
         results.methods.push("SAC".to_owned());
         let rows = efficiency(&results);
         assert_eq!(rows[0].cells[0].lines(), ["not reached", "0 of 1 seeds"]);
         assert_eq!(rows[0].cells[1].lines(), ["not run"]);
-        let own =
-            Planted { task: "point-reach", method: "TD3", seed: 1, rows: vec![-1.0], ended: true };
-        assert!(efficiency(&planted(&[own])).is_empty(), "a user's own task has no threshold");
+        let own = FixtureRun {
+            task: "point-reach",
+            method: "TD3",
+            seed: 1,
+            rows: vec![-1.0],
+            ended: true,
+        };
+        assert!(
+            efficiency(&fixture_results(&[own])).is_empty(),
+            "a user's own task has no threshold"
+        );
     }
 }

@@ -1,10 +1,11 @@
-//! The report as Markdown.
+//! Writes a report as Markdown.
 
-use super::page::Report;
-use super::sections::{Grid, Section, sections};
-use super::statements::Judged;
+use super::contents::Report;
+use super::layout::Grid;
+use super::sections::{READING, Section, sections};
+use super::statements::ClaimResult;
 
-/// The whole text.
+/// Returns the text of `report.md`.
 #[must_use]
 pub fn markdown(report: &Report) -> String {
     let mut text = format!("# {}\n\nMade by `{}` at {}", report.title, report.command, report.made);
@@ -12,30 +13,30 @@ pub fn markdown(report: &Report) -> String {
         text.push_str(&format!(", commit {commit}"));
     }
     text.push_str(".\n\nIn the tables: ");
-    text.push_str(super::page::READING);
+    text.push_str(READING);
     text.push('\n');
     for section in sections(report) {
-        text.push_str(&of_section(&section));
+        text.push_str(&section_text(&section));
     }
     text
 }
 
-fn of_section(section: &Section) -> String {
+fn section_text(section: &Section) -> String {
     let mut text = format!("\n## {}\n", section.title);
     for paragraph in &section.about {
         text.push_str(&format!("\n{paragraph}\n"));
     }
     if let Some(grid) = &section.grid {
-        text.push_str(&of_grid(grid));
+        text.push_str(&grid_text(grid));
     }
     if !section.statements.is_empty() {
-        text.push_str(&of_statements(&section.statements));
+        text.push_str(&statements_text(&section.statements));
     }
     for picture in &section.pictures {
         text.push_str(&format!("\n![{}]({}.svg)\n", picture.alt, picture.path));
     }
-    for strip in &section.strips {
-        text.push_str(&format!("\n![{}]({}.png)\n", strip.alt, strip.path));
+    for filmstrip in &section.filmstrips {
+        text.push_str(&format!("\n![{}]({}.png)\n", filmstrip.alt, filmstrip.path));
     }
     for (name, file) in &section.files {
         text.push_str(&format!(
@@ -47,7 +48,7 @@ fn of_section(section: &Section) -> String {
     text
 }
 
-fn of_grid(grid: &Grid) -> String {
+fn grid_text(grid: &Grid) -> String {
     let cells = |cells: Vec<String>| format!("{}|\n", cells.concat());
     let cell = |text: &str| format!("| {} ", text.replace('|', "\\|"));
     let mut text = String::from("\n");
@@ -61,9 +62,9 @@ fn of_grid(grid: &Grid) -> String {
     text
 }
 
-fn of_statements(judged: &[Judged]) -> String {
+fn statements_text(claims: &[ClaimResult]) -> String {
     let mut text = String::from("\n| Statement | What became of it |\n|---|---|\n");
-    for Judged { task, place, claim, contradiction, findings } in judged {
+    for ClaimResult { task, place, claim, contradiction, findings, .. } in claims {
         let mut lines: Vec<String> = findings
             .iter()
             .map(|finding| format!("**{}**: {}", finding.verdict_text, finding.evidence))

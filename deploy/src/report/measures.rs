@@ -1,17 +1,30 @@
-//! What is measured of a run, each with how to read it.
+//! The measures of a run, with their descriptions.
+
+use dmprl_shared::supervision::EvaluationRow;
+use serde::Deserialize;
 
 use super::paper::Figure;
 use super::run::Run;
-use super::tables::TableKind;
 use super::thresholds::threshold;
-use crate::control::EvaluationRow;
 
-/// One figure a run.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+/// Groups of measures, in the order of a report.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum MeasureKind {
+    /// How well the policy solves the task.
+    Result,
+    /// How smoothly it moves.
+    Smoothness,
+    /// The cost of training.
+    Cost,
+}
+
+/// A measure with one value per run.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Deserialize)]
+#[serde(rename_all = "snake_case")]
 pub enum Measure {
     /// Mean return of the last evaluation.
     Return,
-    /// Share of its episodes that end in success.
+    /// Share of the last evaluation's episodes that end in success.
     Success,
     /// Mean absolute change of an action.
     ActionChange,
@@ -19,20 +32,21 @@ pub enum Measure {
     JointJerk,
     /// Spectral arc length of the joints' speed.
     Sparc,
-    /// Segments decided upon.
+    /// Segments decided in training.
     Decisions,
     /// Updates of the learner.
     Updates,
-    /// Wall clock \[s\].
+    /// Wall-clock time of training \[s\].
     TrainingTime,
-    /// Updates an environment step.
+    /// Updates per environment step.
     UpdateRate,
-    /// Environment steps to the task's threshold; infinite for a run that ended below it.
+    /// Environment steps until the task's threshold is reached; infinite for a finished run that
+    /// never reached it.
     StepsToThreshold,
 }
 
 impl Measure {
-    /// Those that have a table of means.
+    /// Measures that have a table of means.
     pub const TABLES: [Self; 8] = [
         Self::Return,
         Self::Success,
@@ -44,7 +58,7 @@ impl Measure {
         Self::TrainingTime,
     ];
 
-    /// Its heading.
+    /// Returns the heading.
     #[must_use]
     pub fn title(self) -> &'static str {
         match self {
@@ -56,50 +70,49 @@ impl Measure {
             Self::Decisions => "Decisions",
             Self::Updates => "Updates",
             Self::TrainingTime => "Training time [s]",
-            Self::UpdateRate => "Updates an environment step",
+            Self::UpdateRate => "Updates per environment step",
             Self::StepsToThreshold => "Environment steps to a threshold",
         }
     }
 
-    /// How it was measured.
+    /// Describes how it is measured.
     #[must_use]
     pub fn about(self) -> &'static str {
         match self {
             Self::Return => {
-                "Of the evaluation at the end of each run, without noise. The paper's Table 3."
+                "Mean return of the last evaluation, without noise, as in the paper's Table 3."
             }
             Self::Success => {
-                "Share of the last evaluation's episodes that end in success. The paper's Table 4."
+                "Share of the last evaluation's episodes that end in success, as in the paper's \
+                 Table 4."
             }
             Self::ActionChange => {
-                "Mean absolute change of an action between two steps in the last evaluation, \
+                "Mean absolute change of an action between two steps of the last evaluation, with \
                  actions scaled to [-1, 1]; lower is smoother."
             }
             Self::JointJerk => {
-                "Mean absolute jerk of a joint, from its velocity in each step, over the first \
-                 evaluation.episodes episodes of the last evaluation; lower is smoother. Joints \
-                 that only slide: m/s³."
+                "Mean absolute jerk of a joint, computed from its velocity at each step, over the \
+                 first evaluation.episodes episodes of the last evaluation; lower is smoother. In \
+                 m/s³ for robots with sliding joints only."
             }
             Self::Sparc => {
-                "Spectral arc length of the joints' speed (Balasubramanian et al. 2015), mean over \
-                 the same episodes as joint jerk; nearer to zero is smoother."
+                "Spectral arc length of the joints' speed (Balasubramanian et al. 2015), averaged \
+                 over the same episodes as joint jerk; closer to zero is smoother."
             }
-            Self::Decisions => {
-                "Segments decided upon in training; an mlp policy decides in every step."
-            }
-            Self::Updates => "Of the learner, in training.",
+            Self::Decisions => "Segments decided in training; an mlp policy decides at every step.",
+            Self::Updates => "Updates of the learner in training.",
             Self::TrainingTime => {
-                "Wall clock of a run; several ran side by side where the machine had cores."
+                "Wall-clock time of a run; runs of a sweep share the cores of the machine."
             }
             Self::UpdateRate => "Updates of the learner for each environment step.",
             Self::StepsToThreshold => {
-                "Until the evaluation's mean first reaches the threshold; only as fine as the \
-                 evaluations are apart."
+                "Environment steps until an evaluation's mean first reaches the threshold; the \
+                 resolution is the interval between evaluations."
             }
         }
     }
 
-    /// Digits behind the point.
+    /// Returns the number of decimals to show.
     #[must_use]
     pub fn digits(self) -> usize {
         match self {
@@ -110,7 +123,7 @@ impl Measure {
         }
     }
 
-    /// The paper's figure of the same.
+    /// Returns the corresponding figure of the paper, if it has one.
     #[must_use]
     pub fn in_paper(self) -> Option<Figure> {
         match self {
@@ -120,31 +133,31 @@ impl Measure {
         }
     }
 
-    /// Whether more is better.
+    /// Returns whether a higher value is better.
     #[must_use]
     pub fn higher_is_better(self) -> bool {
         matches!(self, Self::Return | Self::Success | Self::Sparc)
     }
 
-    /// Whether it is measured after training.
+    /// Returns whether it needs a rollout after training.
     #[must_use]
     pub fn is_of_motion(self) -> bool {
         matches!(self, Self::JointJerk | Self::Sparc)
     }
 
-    /// What it is about.
+    /// Returns the group of the measure.
     #[must_use]
-    pub fn kind(self) -> TableKind {
+    pub fn kind(self) -> MeasureKind {
         match self {
-            Self::Return | Self::Success | Self::StepsToThreshold => TableKind::Result,
-            Self::ActionChange | Self::JointJerk | Self::Sparc => TableKind::Smoothness,
+            Self::Return | Self::Success | Self::StepsToThreshold => MeasureKind::Result,
+            Self::ActionChange | Self::JointJerk | Self::Sparc => MeasureKind::Smoothness,
             Self::Decisions | Self::Updates | Self::TrainingTime | Self::UpdateRate => {
-                TableKind::Cost
+                MeasureKind::Cost
             }
         }
     }
 
-    /// The run's figure; none while it is not known.
+    /// Returns the value of a run; `None` while it is unknown.
     #[must_use]
     pub fn of(self, run: &Run) -> Option<f64> {
         if self == Self::StepsToThreshold {
@@ -165,7 +178,7 @@ impl Measure {
         }
     }
 
-    /// The same of an evaluation, where each has it.
+    /// Returns the value of one evaluation; `None` for measures of whole runs.
     #[must_use]
     pub fn of_row(self, row: &EvaluationRow) -> Option<f64> {
         match self {
@@ -183,7 +196,7 @@ fn steps_to_threshold(run: &Run) -> Option<f64> {
     };
     match run.rows.iter().find(reached) {
         Some(row) => Some(row.env_steps as f64),
-        // It may still come there.
+        // An unfinished run may still reach it.
         None => run.ended.then_some(f64::INFINITY),
     }
 }

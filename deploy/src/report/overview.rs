@@ -1,19 +1,19 @@
-//! What was run: how much of it, by which program, on which machine, when.
+//! Summarises the runs: how many are finished, when they started and on which machines.
 
-use super::collect::Results;
+use super::layout::Grid;
+use super::results::Results;
 use super::run::Run;
-use super::sections::Grid;
 use crate::terminal::grouped;
 
-/// The sentences at the top of a report.
+/// Returns the sentences at the top of a report.
 #[must_use]
 pub fn sentences(results: &Results) -> Vec<String> {
     let ended = results.runs.iter().filter(|run| run.ended).count();
-    let begun = results.runs.len() - ended;
-    let waiting = results.waiting.len();
-    let planned = results.runs.len() + waiting;
-    let mut runs = format!("Of {planned} runs {ended} have come to their end");
-    for (count, what) in [(begun, "under way or stopped"), (waiting, "not begun")] {
+    let unfinished = results.runs.len() - ended;
+    let not_started = results.not_started.len();
+    let planned = results.runs.len() + not_started;
+    let mut runs = format!("{ended} of {planned} runs are finished");
+    for (count, what) in [(unfinished, "unfinished"), (not_started, "not started")] {
         if count > 0 {
             runs.push_str(&format!(", {count} {what}"));
         }
@@ -24,18 +24,22 @@ pub fn sentences(results: &Results) -> Vec<String> {
         results.runs.iter().map(|run| run.origin.started.as_str()).collect();
     started.sort_unstable();
     if let (Some(first), Some(last)) = (started.first(), started.last()) {
-        let span =
-            if first == last { (*first).to_owned() } else { format!("between {first} and {last}") };
-        sentences.push(format!("Begun {span}."));
+        let span = if first == last {
+            format!("at {first}")
+        } else {
+            format!("between {first} and {last}")
+        };
+        sentences.push(format!("Started {span}."));
     }
     let machines = results.runs.iter().map(|run| run.origin.machine.clone());
-    sentences.push(format!("On {}.", distinct(machines)));
+    sentences.push(format!("Trained on {}.", distinct(machines)));
     if let Some(first) = results.unmeasured.first() {
         let count = match results.unmeasured.len() {
             1 => "1 run".to_owned(),
             count => format!("{count} runs"),
         };
-        sentences.push(format!("Motion is not measured of {count}; the first: {first}."));
+        sentences
+            .push(format!("The motion of {count} was not measured; the first reason: {first}."));
     }
     if !results.undrawn.is_empty() {
         sentences.push(format!("Not drawn: {}.", results.undrawn.join("; ")));
@@ -43,7 +47,7 @@ pub fn sentences(results: &Results) -> Vec<String> {
     sentences
 }
 
-/// Each once, in order; with "; " between.
+/// Joins the distinct values, in order, with "; ".
 fn distinct(values: impl Iterator<Item = String>) -> String {
     let mut known: Vec<String> = Vec::new();
     for value in values {
@@ -54,7 +58,7 @@ fn distinct(values: impl Iterator<Item = String>) -> String {
     known.join("; ")
 }
 
-/// Seeds and steps by task and method.
+/// Returns the seeds and steps by task and method.
 #[must_use]
 pub fn runs_table(results: &Results) -> Grid {
     let cell = |task: &str, method: &str| {
@@ -73,7 +77,7 @@ pub fn runs_table(results: &Results) -> Grid {
             lines.push(seeds_of(true));
         }
         if runs.iter().any(|run| !run.ended) {
-            lines.push(format!("begun: {}", seeds_of(false)));
+            lines.push(format!("unfinished: {}", seeds_of(false)));
         }
         let mut steps: Vec<u64> = runs.iter().map(|run| run.steps).collect();
         steps.sort_unstable();
@@ -89,30 +93,27 @@ pub fn runs_table(results: &Results) -> Grid {
 
 #[cfg(test)]
 mod tests {
-    use super::super::planted::{Planted, planted};
+    use super::super::fixtures::{FixtureRun, fixture_results};
     use super::*;
 
     #[test]
-    fn what_ended_what_began_and_what_did_not_are_told_apart() {
-        let run = |seed, ended| Planted {
+    fn finished_started_and_missing_runs_are_counted_separately() {
+        let run = |seed, ended| FixtureRun {
             task: "reacher-v1",
             method: "DDPG",
             seed,
             rows: vec![-9.0, -8.0],
             ended,
         };
-        let mut results = planted(&[run(2, true), run(1, true), run(3, false)]);
-        results.waiting = vec![results.runs[0].key(); 7];
+        let mut results = fixture_results(&[run(2, true), run(1, true), run(3, false)]);
+        results.not_started = vec![results.runs[0].key(); 7];
         for (run, machine) in results.runs.iter_mut().zip(["a", "b", "a"]) {
             run.origin.machine = machine.to_owned();
         }
         let sentences = sentences(&results);
-        assert_eq!(
-            sentences[0],
-            "Of 10 runs 2 have come to their end, 1 under way or stopped, 7 not begun."
-        );
-        assert_eq!(sentences[2], "On a; b.");
+        assert_eq!(sentences[0], "2 of 10 runs are finished, 1 unfinished, 7 not started.");
+        assert_eq!(sentences[2], "Trained on a; b.");
         let grid = runs_table(&results);
-        assert_eq!(grid.rows[0].1[0], ["seeds 1, 2", "begun: seed 3", "2,000 steps each"]);
+        assert_eq!(grid.rows[0].1[0], ["seeds 1, 2", "unfinished: seed 3", "2,000 steps each"]);
     }
 }

@@ -1,6 +1,6 @@
-//! What the paper reports, to stand beside what was measured: its Tables 3 and 4.
+//! The results that the paper reports in its Tables 3 and 4.
 
-/// The minus signs of Table 3 were lost in the paper's print; its figures have them.
+/// Returns of Table 3. The printed table lacks the minus signs, which the paper's figures show.
 const RETURNS: [Row; 3] = [
     Row("reacher-v1", [(-7.36, 0.54), (-6.58, 0.54), (-7.89, 0.57), (-6.10, 0.61), (-15.56, 1.47)]),
     Row(
@@ -13,40 +13,40 @@ const RETURNS: [Row; 3] = [
     ),
 ];
 
-/// Share of episodes that succeed.
+/// Success rates of Table 4.
 const SUCCESS: [Row; 2] = [
     Row("panda-reach", [(0.99, 0.00), (0.41, 0.24), (0.99, 0.00), (0.99, 0.01), (0.0, 0.0)]),
     Row("panda-reach-joints", [(0.99, 0.01), (0.0, 0.0), (0.92, 0.01), (0.85, 0.41), (0.0, 0.0)]),
 ];
 
-/// The method that follows the paper by this project's first reading of it.
+/// The method that follows this project's first interpretation of the paper.
 pub const READING_METHOD: &str = "DDPG-DMP (paper)";
-/// What that method reads into the paper, for a footnote beside its figures.
-pub const READING: &str = "¹ DDPG-DMP (paper) is one reading of the paper, which leaves these \
-    choices open: goal, weights and rho are bounded by tanh; the controller sees velocity and \
-    acceleration divided by omega and omega²; the target takes s' = s_{t+1} after the sum of K \
-    rewards; forcing-term widths follow NDP's code. Other readings are methods of \
+/// Footnote about the interpretation, beside the figures of that method.
+pub const READING: &str = "¹ DDPG-DMP (paper) is one interpretation of the paper, which leaves \
+    these choices open: goal, weights and rho are bounded by tanh; the controller sees velocity \
+    and acceleration divided by omega and omega²; the target takes s' = s_{t+1} after the sum of K \
+    rewards; forcing-term widths follow NDP's code. Other interpretations are methods of \
     deploy/experiments/paper.toml.";
 
-/// Trials behind each of its figures.
+/// Number of seeds behind each figure of the paper.
 pub const SEEDS: usize = 5;
 
-/// The columns of both.
+/// Columns of both tables.
 const METHODS: [&str; 5] = ["DDPG-DMP (paper)", "DDPG", "TD3", "SAC", "NDP"];
 
 struct Row(&'static str, [(f64, f64); 5]);
 
-/// Which figure of a task.
+/// Selects a table of the paper.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Figure {
-    /// Table 3.
+    /// Return: Table 3.
     Return,
-    /// Table 4.
+    /// Success rate: Table 4.
     Success,
 }
 
-/// Mean and spread that the paper gives for a method on a task, by the names of
-/// `deploy/experiments/paper.toml`; none where it has none.
+/// Returns mean and standard deviation that the paper reports for a method on a task, by the names
+/// of `deploy/experiments/paper.toml`; `None` if it reports none.
 #[must_use]
 pub fn reported(figure: Figure, task: &str, method: &str) -> Option<(f64, f64)> {
     let table: &[Row] = match figure {

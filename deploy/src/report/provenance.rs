@@ -1,26 +1,26 @@
-//! Where the figures of a report come from: which program and packages made the runs of each cell,
-//! and which data of theirs is at hand.
+//! Provenance of the figures: program and packages that made the runs of each cell, and the data
+//! that is available of them.
 
 use std::collections::BTreeSet;
 
 use serde::Serialize;
 
-use super::collect::Results;
+use super::layout::Grid;
+use super::results::Results;
 use super::run::{Origin, Run};
-use super::sections::Grid;
 
-/// How many programs and sets of package versions made the runs behind a figure.
+/// Number of different programs and sets of package versions that made the runs behind a figure.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize)]
-pub struct Makers {
-    /// Programs, by version and commit. A run whose sources are not known counts as made by a
-    /// program of its own.
+pub struct SoftwareCounts {
+    /// Programs, by version and commit. A run whose sources are unknown counts as a program of its
+    /// own.
     pub programs: usize,
     /// Sets of package versions, counted in the same way.
     pub package_sets: usize,
 }
 
-impl Makers {
-    /// Of the sessions of some runs.
+impl SoftwareCounts {
+    /// Counts over all sessions of the runs.
     pub fn of<'r>(runs: impl Iterator<Item = &'r Run>) -> Self {
         let runs: Vec<&Run> = runs.collect();
         let count = |known: fn(&Origin) -> Option<&[String]>| {
@@ -34,7 +34,7 @@ impl Makers {
         }
     }
 
-    /// The mark behind a figure over several of either.
+    /// Returns the mark behind a figure that covers several programs or sets of packages.
     #[must_use]
     pub fn mark(self) -> &'static str {
         if self.programs > 1 || self.package_sets > 1 { " †" } else { "" }
@@ -44,13 +44,13 @@ impl Makers {
 /// Programs and package versions of a report's runs, numbered for its cells.
 #[derive(Debug, Clone)]
 pub struct Provenance {
-    /// Each program and the packages it ran with.
+    /// Each program with its packages.
     sources: Vec<String>,
-    /// What each cell's runs were made by, and what is known of them.
+    /// Programs and available data of the runs in each cell.
     pub grid: Grid,
 }
 
-/// What a run was made by, as one text.
+/// Describes program and packages of a run.
 fn source(run: &Run) -> String {
     let programs = distinct(&run.origin.programs);
     let packages = if run.origin.packages.is_empty() {
@@ -61,7 +61,7 @@ fn source(run: &Run) -> String {
     format!("dmprl {programs}; {packages}")
 }
 
-/// Each text once, in order, with "; then " between.
+/// Joins the distinct texts, in order, with "; then ".
 fn distinct(texts: &[String]) -> String {
     let mut known: Vec<&str> = Vec::new();
     for text in texts {
@@ -73,7 +73,7 @@ fn distinct(texts: &[String]) -> String {
 }
 
 impl Provenance {
-    /// Of all runs that have begun.
+    /// Collects the provenance of all runs that have started.
     #[must_use]
     pub fn of(results: &Results) -> Self {
         let mut sources: Vec<String> = Vec::new();
@@ -87,7 +87,7 @@ impl Provenance {
         Self { sources, grid }
     }
 
-    /// The numbered programs as one paragraph.
+    /// Returns the numbered programs as one paragraph.
     #[must_use]
     pub fn legend(&self) -> String {
         let numbered =
@@ -96,7 +96,7 @@ impl Provenance {
     }
 }
 
-/// `[1]: seeds 1, 2`, then which data the report has of which seeds.
+/// Formats `[1]: seeds 1, 2`, then the seeds whose motion and rollout are available.
 fn cell(results: &Results, task: &str, method: &str, sources: &[String]) -> Vec<String> {
     let mut runs: Vec<&Run> = results.of(task, method).collect();
     runs.sort_by_key(|run| run.seed);
@@ -124,26 +124,27 @@ fn cell(results: &Results, task: &str, method: &str, sources: &[String]) -> Vec<
 
 #[cfg(test)]
 mod tests {
-    use super::super::planted::{Planted, planted, planted_moves};
+    use super::super::fixtures::{FixtureRun, fixture_motion, fixture_results};
     use super::*;
 
     #[test]
-    fn each_cell_names_the_programs_of_its_seeds_and_the_data_at_hand() {
-        let run = |method, seed| Planted {
+    fn each_cell_names_the_programs_and_the_available_data_of_its_seeds() {
+        let run = |method, seed| FixtureRun {
             task: "pusher-v0",
             method,
             seed,
             rows: vec![-40.0],
             ended: true,
         };
-        let mut results = planted(&[run("SAC", 2), run("SAC", 1), run("SAC", 3), run("TD3", 1)]);
+        let mut results =
+            fixture_results(&[run("SAC", 2), run("SAC", 1), run("SAC", 3), run("TD3", 1)]);
         for run in &mut results.runs {
             run.origin.packages.clear();
             run.origin.programs = vec!["0.1.0 (commit 1)".to_owned(); 2];
         }
         results.runs[2].origin.programs.push("0.1.0 (commit 2)".to_owned());
         results.runs[3].origin.packages = vec!["Python 3.11.7".to_owned()];
-        results.runs[0].motion = Some(planted_moves(1.0, -1.0));
+        results.runs[0].motion = Some(fixture_motion(1.0, -1.0));
         results.tasks.push("thrower-v0".to_owned());
         let provenance = Provenance::of(&results);
         assert_eq!(

@@ -1,17 +1,17 @@
-//! One run of a report, wherever it was read.
+//! One run of a report, read from its directory or from an earlier report.
 
 use std::fmt::{self, Display, Formatter};
 use std::path::{Path, PathBuf};
 
 use dmprl_shared::config::PolicyKind;
+use dmprl_shared::supervision::EvaluationRow;
 use serde::{Deserialize, Serialize};
 
-use super::moves::Moves;
-use crate::control::EvaluationRow;
+use super::motion_metrics::MotionMetrics;
 use crate::run_directory::{Machine, Manifest, Packages, Session};
 use crate::terminal::binary_bytes;
 
-/// Of a commit's hash, enough to find it.
+/// Digits of a hash that are shown.
 const HASH_LEN: usize = 12;
 
 /// One run and its evaluations.
@@ -21,39 +21,39 @@ pub struct Run {
     pub task: String,
     /// The method's label.
     pub method: String,
-    /// What its method plans with.
+    /// Kind of its policy.
     pub policy: PolicyKind,
     /// `run.seed`.
     pub seed: u64,
-    /// Where it was read.
+    /// Where it was read from.
     pub source: Source,
-    /// Whether it has come to its end.
+    /// Whether it is finished.
     pub ended: bool,
-    /// Environment steps that it was asked for.
+    /// Configured environment steps.
     pub steps: u64,
-    /// Who made it, where and when.
+    /// Program, packages and machine of its sessions.
     pub origin: Origin,
-    /// Oldest first.
+    /// Evaluations, oldest first.
     pub rows: Vec<EvaluationRow>,
-    /// Episodes of its last evaluation; none where an older report does not say.
+    /// Number of episodes in the last evaluation; `None` if an older report does not contain it.
     pub final_episodes: Option<u64>,
-    /// How its last policy moves, where that was measured.
-    pub motion: Option<Moves>,
+    /// Motion of the last policy, if it was measured.
+    pub motion: Option<MotionMetrics>,
 }
 
-/// Where a run was read.
+/// Where a run was read from.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum Source {
     /// Its own directory.
     Directory(PathBuf),
-    /// The folder of an earlier report: all that is left of it here.
+    /// The folder of an earlier report; the run directory is not available.
     Report(PathBuf),
 }
 
-/// Which of the runs of a comparison.
+/// Identifies a run of a comparison.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
-pub struct Key {
+pub struct RunKey {
     /// The task's name.
     pub task: String,
     /// The method's label.
@@ -62,27 +62,27 @@ pub struct Key {
     pub seed: u64,
 }
 
-impl Display for Key {
+impl Display for RunKey {
     fn fmt(&self, formatter: &mut Formatter<'_>) -> fmt::Result {
         write!(formatter, "{} · {} · seed {}", self.task, self.method, self.seed)
     }
 }
 
-/// Who made a run, where and when.
+/// Program, packages and machine that made a run.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Origin {
-    /// UTC, RFC 3339, of its first session.
+    /// Start of the first session (UTC, RFC 3339).
     pub started: String,
-    /// Versions of the program, with the commit where it is known; one a session.
+    /// Program version of each session, with the commit if it was recorded.
     pub programs: Vec<String>,
-    /// Versions of Python, MuJoCo, Gymnasium and NumPy; one a session that recorded them.
+    /// Versions of Python, MuJoCo, Gymnasium and NumPy, of each session that recorded them.
     #[serde(default)]
     pub packages: Vec<String>,
     /// SHA-256 of the resolved configuration of the last session that recorded it.
     #[serde(default)]
     pub config_sha256: Option<String>,
-    /// Processor, cores and memory.
+    /// Processor, cores, memory and operating system.
     pub machine: String,
 }
 
@@ -119,8 +119,8 @@ impl Origin {
 }
 
 impl Origin {
-    /// The programs of its sessions; none if the sources of one are not known: no commit was
-    /// recorded, or they differed from it.
+    /// Returns the programs of the sessions; `None` if the sources of one are unknown, because no
+    /// commit was recorded or the sources differed from it.
     pub(super) fn known_programs(&self) -> Option<&[String]> {
         let is_known = |program: &String| {
             let commit = program.split_once("(commit ").map_or("", |(_, rest)| rest);
@@ -131,14 +131,15 @@ impl Origin {
         all.then_some(self.programs.as_slice())
     }
 
-    /// The packages of its sessions; none if one did not record them.
+    /// Returns the packages of the sessions; `None` if a session did not record them.
     pub(super) fn known_packages(&self) -> Option<&[String]> {
         let all = !self.packages.is_empty() && self.packages.len() == self.programs.len();
         all.then_some(self.packages.as_slice())
     }
 }
 
-/// `Python 3.11.7, MuJoCo 4.0.0, Gymnasium 1.4.0, NumPy 2.4.6, dmprl's Python package c4b5c29b`.
+/// Formats `Python 3.11.7, MuJoCo 4.0.0, Gymnasium 1.4.0, NumPy 2.4.6, dmprl's Python package
+/// c4b5c29b`.
 fn packages(session: &Session) -> Option<String> {
     let Packages { python, mujoco, gymnasium, numpy, dmprl_sha256 } = session.packages.as_ref()?;
     let version = |version: &Option<String>| version.clone().unwrap_or_else(|| "none".to_owned());
@@ -153,13 +154,13 @@ fn packages(session: &Session) -> Option<String> {
 }
 
 impl Run {
-    /// The evaluation at its end; none while it has not come there.
+    /// Returns the last evaluation of a finished run; `None` while it is unfinished.
     #[must_use]
     pub fn last(&self) -> Option<&EvaluationRow> {
         self.rows.last().filter(|_| self.ended)
     }
 
-    /// Its directory; none of a landed run.
+    /// Returns the run directory; `None` if the run was read from an earlier report.
     #[must_use]
     pub fn directory(&self) -> Option<&Path> {
         match &self.source {
@@ -168,13 +169,14 @@ impl Run {
         }
     }
 
-    /// Which it is.
+    /// Returns task, method and seed.
     #[must_use]
-    pub fn key(&self) -> Key {
-        Key { task: self.task.clone(), method: self.method.clone(), seed: self.seed }
+    pub fn key(&self) -> RunKey {
+        RunKey { task: self.task.clone(), method: self.method.clone(), seed: self.seed }
     }
 
-    pub(super) fn is(&self, key: &Key) -> bool {
+    /// Returns whether the run has this task, method and seed.
+    pub(super) fn is(&self, key: &RunKey) -> bool {
         (&self.task, &self.method, self.seed) == (&key.task, &key.method, key.seed)
     }
 }

@@ -1,75 +1,74 @@
-//! A report's contents in reading order, the same for the page and for Markdown.
+//! The sections of a report in reading order, for the page and for Markdown.
 
 use serde::Serialize;
 
-use super::collect::Results;
-use super::efficiency::EfficiencyRow;
+use super::contents::Report;
+use super::efficiency::{EfficiencyCell, EfficiencyRow};
+use super::filmstrips::Filmstrip;
+use super::layout::{Grid, Picture};
+use super::measures::MeasureKind;
 use super::overview::{runs_table, sentences};
-use super::page::Report;
 use super::paper;
 use super::provenance::Provenance;
+use super::results::Results;
 use super::statements::{
-    ALMOST_ALL, EPISODES_MIN, Judged, LOSS, NONE, SEEDS_MIN, SUBJECTS, counts,
+    ClaimResult, EPISODES_MIN, Limits, PaperClaims, SEEDS_MIN, SUBJECTS, counts,
 };
-use super::strips::Strip;
-use super::tables::{Table, TableKind};
+use super::tables::Table;
+use crate::run_directory::safe_name;
 
-/// A drawing.
-#[derive(Debug, Clone, Serialize)]
-pub struct Picture {
-    /// In the report's folder, without the ending.
-    pub path: String,
-    /// For those who do not see it.
-    pub alt: String,
-    /// The drawing itself.
-    pub svg: String,
-}
+/// Explains the cells of the tables.
+pub(super) const READING: &str = "mean ± standard deviation over seeds. With four or more \
+    seeds, IQM is the interquartile mean with its 95 % interval by stratified bootstrap; with \
+    fewer, the range from the lowest seed to the highest is given instead. Only finished runs \
+    count. † marks figures over runs of different programs or package versions, or over runs \
+    that did not record them; see Provenance.";
 
-/// Cells of some lines each, by task and method.
-#[derive(Debug, Clone, Default, Serialize)]
-pub struct Grid {
-    /// Above the cells.
-    pub columns: Vec<String>,
-    /// (task, its cells).
-    pub rows: Vec<(String, Vec<Vec<String>>)>,
-}
+/// Explains the learning curves.
+const CURVES: &str = "Evaluations without noise: mean over the seeds (n), and a band from the \
+    lowest seed to the highest. Triangles at the right edge mark the final results in the paper \
+    (its Tables 3 and 4), which may be after another number of steps.";
+/// Explains the steps to the thresholds.
+const EFFICIENCY: &str = "Environment steps until an evaluation's mean first reaches the \
+    threshold: median over the seeds, with its 95 % interval by bootstrap (the range for fewer \
+    than four seeds), and the number of finished seeds that reached it. A seed that never \
+    reached it counts as later than all others. The resolution is the interval between \
+    evaluations.";
+/// Explains the filmstrips.
+const FRAMES: &str = "One noise-free episode after training, of the best method with a dmp policy \
+    and of DDPG, reset with the same seed, as in the paper's Figure 5.";
+/// Explains the pictures of the joints.
+const JOINTS: &str = "One noise-free episode of each method's policy after training, reset with \
+    the same seed. All panels have the same axes, as in the paper's Figures 6 and 7.";
+/// Explains the provenance.
+const PROVENANCE: &str = "Program and packages that made the runs of each cell, by number, and \
+    the seeds whose motion was measured and whose rollout was recorded.";
 
-impl Grid {
-    /// A cell for each task and method.
-    pub fn of(results: &Results, cell: impl Fn(&str, &str) -> Vec<String>) -> Self {
-        let rows = results.tasks.iter().map(|task| {
-            let cells = results.methods.iter().map(|method| cell(task, method));
-            (task.clone(), cells.collect())
-        });
-        Self { columns: results.methods.clone(), rows: rows.collect() }
-    }
-}
-
-/// One heading and what stands below it.
+/// A section with its heading.
 #[derive(Debug, Clone, Default, Serialize)]
 pub struct Section {
-    /// What a link names.
+    /// Target of links.
     pub id: String,
-    /// The heading.
+    /// Heading.
     pub title: String,
     /// Paragraphs.
     pub about: Vec<String>,
-    /// Figures.
+    /// Table.
     pub grid: Option<Grid>,
     /// Drawings.
     pub pictures: Vec<Picture>,
-    /// Photographs.
-    pub strips: Vec<Strip>,
+    /// Frames of rollouts.
+    pub filmstrips: Vec<Filmstrip>,
     /// Statements of the paper.
-    pub statements: Vec<Judged>,
-    /// Files, by name.
+    pub statements: Vec<ClaimResult>,
+    /// Names and texts of files.
     pub files: Vec<(String, String)>,
 }
 
 impl Section {
     fn new(title: &str, about: &[&str]) -> Self {
         Self {
-            id: crate::run_directory::safe_name(&title.to_lowercase().replace(' ', "-")),
+            id: safe_name(&title.to_lowercase().replace(' ', "-")),
             title: title.to_owned(),
             about: about.iter().map(|&text| text.to_owned()).collect(),
             ..Self::default()
@@ -77,50 +76,37 @@ impl Section {
     }
 }
 
-/// All sections of a report; none is empty.
+/// Returns the sections of a report, without empty ones.
 #[must_use]
 pub fn sections(report: &Report) -> Vec<Section> {
     let mut sections = vec![overview(report)];
-    let of_kind = |kind: TableKind| {
+    let of_kind = |kind: MeasureKind| {
         let tables = report.tables.iter().filter(move |table| table.kind == kind);
         tables.map(|table| of_table(report, table))
     };
-    sections.extend(of_kind(TableKind::Result));
+    sections.extend(of_kind(MeasureKind::Result));
     if !report.curves.is_empty() {
-        let mut curves = Section::new(
-            "Learning curves",
-            &["Evaluations without noise: mean over the seeds (n), the band from the lowest to \
-                 the highest. Triangles at the right edge are what each method ended at in the \
-                 paper (its Tables 3 and 4), after as many steps as that trained for."],
-        );
+        let mut curves = Section::new("Learning curves", &[CURVES]);
         curves.pictures = report.curves.clone();
         sections.push(curves);
     }
     if !report.efficiency.is_empty() {
         sections.push(efficiency(report));
     }
-    sections.extend(of_kind(TableKind::Smoothness));
-    if !report.strips.is_empty() {
-        let mut frames = Section::new(
-            "Frames of a rollout",
-            &["One noise-free episode at the end of training of the best method with a dmp \
-                 policy, and of DDPG: the same episode for both. As the paper's figure 5."],
-        );
-        frames.strips = report.strips.clone();
+    sections.extend(of_kind(MeasureKind::Smoothness));
+    if !report.filmstrips.is_empty() {
+        let mut frames = Section::new("Frames of a rollout", &[FRAMES]);
+        frames.filmstrips = report.filmstrips.clone();
         sections.push(frames);
     }
     if !report.trajectories.is_empty() {
-        let mut joints = Section::new(
-            "Joints over a rollout",
-            &["One noise-free episode of each method's policy at the end of training, all reset \
-               with the same seed; every panel has the same axes. As the paper's figures 6 and 7."],
-        );
+        let mut joints = Section::new("Joints over a rollout", &[JOINTS]);
         joints.pictures = report.trajectories.clone();
         sections.push(joints);
     }
-    sections.extend(of_kind(TableKind::Cost));
-    if !report.judged.is_empty() {
-        sections.push(statements(&report.judged));
+    sections.extend(of_kind(MeasureKind::Cost));
+    if !report.claims.results.is_empty() {
+        sections.push(statements(&report.claims));
     }
     if report.results.methods.iter().any(|method| method == paper::READING_METHOD) {
         sections.iter_mut().for_each(mark_reading);
@@ -129,7 +115,7 @@ pub fn sections(report: &Report) -> Vec<Section> {
     sections
 }
 
-/// Marks the column of the paper's method, and says below it what was read into the paper.
+/// Marks the column of the paper's method, and explains its interpretation in a footnote.
 fn mark_reading(section: &mut Section) {
     let has_figures =
         section.grid.is_some() || !section.pictures.is_empty() || !section.statements.is_empty();
@@ -145,14 +131,7 @@ fn mark_reading(section: &mut Section) {
 
 fn provenance(results: &Results) -> Section {
     let provenance = Provenance::of(results);
-    let mut section = Section::new(
-        "Provenance",
-        &[
-            "Which program and packages made the runs of each cell, by number, and of which seeds \
-           this report has measures of motion and a recorded rollout.",
-            &provenance.legend(),
-        ],
-    );
+    let mut section = Section::new("Provenance", &[PROVENANCE, &provenance.legend()]);
     section.grid = Some(provenance.grid);
     section
 }
@@ -162,13 +141,13 @@ fn overview(report: &Report) -> Section {
     section.about.push(sentences(&report.results).join(" "));
     for subject in SUBJECTS {
         let named = report.results.methods.iter().any(|method| method == subject);
-        if named && !report.judged.is_empty() {
-            let counts = counts(&report.judged, subject).into_iter();
+        if named && !report.claims.results.is_empty() {
+            let counts = counts(&report.claims.results, subject).into_iter();
             let counts: Vec<_> =
                 counts.map(|(verdict, count)| format!("{count} {}", verdict.text())).collect();
             section.about.push(format!(
-                "Of {} statements of the paper, with {subject} as its DDPG-DMP: {}.",
-                report.judged.len(),
+                "The paper's {} statements, with {subject} as its DDPG-DMP: {}.",
+                report.claims.results.len(),
                 counts.join(", ")
             ));
         }
@@ -188,41 +167,37 @@ fn of_table(report: &Report, table: &Table) -> Section {
 }
 
 fn efficiency(report: &Report) -> Section {
-    let mut section = Section::new(
-        "Sample efficiency",
-        &["Environment steps until an evaluation's mean first reaches the threshold: median over \
-           the seeds, with its 95 % interval by bootstrap from four seeds on and the range below \
-           four, and how many of the finished seeds reached it. A seed that did not reach it \
-           counts as later than all others. The resolution is the interval between evaluations."],
-    );
+    let mut section = Section::new("Sample efficiency", &[EFFICIENCY]);
     let sources =
         report.efficiency.iter().map(|EfficiencyRow { task, threshold, source, .. }| {
             format!("{task}: {threshold} ({source})")
         });
     section.about.push(format!("Thresholds: {}.", sources.collect::<Vec<_>>().join("; ")));
     let rows = report.efficiency.iter().map(|row| {
-        let cells = row.cells.iter().map(super::efficiency::EfficiencyCell::lines);
+        let cells = row.cells.iter().map(EfficiencyCell::lines);
         (format!("{}, {}", row.task, row.threshold), cells.collect())
     });
     section.grid = Some(Grid { columns: report.results.methods.clone(), rows: rows.collect() });
     section
 }
 
-fn statements(judged: &[Judged]) -> Section {
-    let rule = format!(
-        "Rules applied to the runs' figures decide. \"Held\" and \"did not hold\" need at least \
-         {SEEDS_MIN} seeds of each method, {EPISODES_MIN} episodes in each last evaluation, and \
-         95 % intervals that do not overlap (of the interquartile mean, or of the median for \
-         steps). With fewer the verdict is \"too few seeds\" or \"too few episodes\". Statements \
-         about the course of training use the evaluations before the last, whatever their number \
-         of episodes. Overlapping intervals are \"no clear difference\". A statement that methods \
-         are alike, or that one does not improve, held where no difference is clear. \
-         \"Cannot hold\": the paper's own figures contradict it. Fails: a success rate of at most \
-         {NONE}; almost always: of at least {ALMOST_ALL}; loses again: more than {LOSS} of what it \
-         had won, by moving means of five evaluations. The paper trained for about 200,000 steps; \
-         nothing is extrapolated."
+fn statements(claims: &PaperClaims) -> Section {
+    let Limits { failure, almost_always, loss, .. } = claims.limits;
+    let about = format!(
+        "Rules judge the paper's statements by the figures of the runs. \"Held\" and \"did not \
+         hold\" need at least {SEEDS_MIN} seeds of each method, {EPISODES_MIN} episodes in each \
+         last evaluation, and 95 % intervals that do not overlap (of the interquartile mean, or \
+         of the median for steps). With fewer, the verdict is \"too few seeds\" or \"too few \
+         episodes\". Statements about the course of training also use the earlier evaluations, \
+         with any number of episodes. If intervals overlap, the verdict is \"no clear \
+         difference\". Statements that methods are alike, or that a method does not improve, \
+         hold if there is no clear difference. \"Cannot hold\": the paper's own figures \
+         contradict the statement. Failure is a success rate of at most {failure}; almost always \
+         is a rate of at least {almost_always}; a loss is more than {loss} of the gain, by moving \
+         means of five evaluations. The paper trained for about 200,000 steps; nothing is \
+         extrapolated."
     );
-    let mut section = Section::new("What held of the paper's statements", &[&rule]);
-    section.statements = judged.to_vec();
+    let mut section = Section::new("Statements of the paper", &[&about]);
+    section.statements = claims.results.clone();
     section
 }

@@ -1,43 +1,43 @@
-//! Statistics over seeds: mean and spread, and from four seeds on the interquartile mean and median
-//! with their bootstrap intervals. Below four, an interquartile mean is the mean, and a bootstrap
-//! interval is the range of the scores: only that range is given.
+//! Statistics over seeds: mean and standard deviation, and from four seeds on interquartile mean
+//! and median with bootstrap intervals. With fewer seeds, the interquartile mean is the mean and a
+//! bootstrap interval is the range of the scores, so only the range is given.
 //!
-//! Interquartile mean and stratified bootstrap are those of Agarwal et al. 2021, "Deep
-//! Reinforcement Learning at the Edge of the Statistical Precipice" (arXiv 2108.13264), as their
-//! package rliable computes them.
+//! Interquartile mean and stratified bootstrap follow Agarwal et al. 2021, "Deep Reinforcement
+//! Learning at the Edge of the Statistical Precipice" (arXiv 2108.13264), as implemented in their
+//! package rliable.
 
 use dmprl_shared::seeds;
 use rand::RngExt;
 use serde::Serialize;
 
-/// Fewest scores that have an interquartile mean and an interval.
+/// Minimum number of scores for an interquartile mean and an interval.
 pub const INTERVAL_SCORES_MIN: usize = 4;
-/// Resamplings of a bootstrap, as many as rliable's default.
+/// Number of resamples of a bootstrap; rliable's default.
 const REPETITIONS: usize = 50_000;
-/// Share of values cut off at either end of an interquartile mean.
+/// Share of scores that an interquartile mean drops at each end.
 const CUT: f64 = 0.25;
-/// Ends of the interval: 95 % lie between.
+/// Quantiles at the ends of a 95 % interval.
 const QUANTILES: [f64; 2] = [0.025, 0.975];
 
-/// What a few scores say together.
+/// Summary of the scores of several seeds.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub struct Summary {
-    /// How many.
+    /// Number of scores.
     pub count: usize,
     /// Mean.
     pub mean: f64,
-    /// Standard deviation over the scores (of the sample: n - 1); 0 for one.
+    /// Sample standard deviation (n - 1); 0 for one score.
     pub std: f64,
     /// Lowest and highest score.
     pub range: [f64; 2],
-    /// Interquartile mean; none below four scores.
+    /// Interquartile mean; `None` with fewer than four scores.
     pub iqm: Option<f64>,
-    /// Its 95 % interval by bootstrap; none below four scores.
+    /// Its 95 % interval by bootstrap; `None` with fewer than four scores.
     pub interval: Option<[f64; 2]>,
 }
 
 impl Summary {
-    /// Of the scores of one task, one a seed; none for none.
+    /// Summarises the scores of one task, one per seed; `None` without scores.
     #[must_use]
     pub fn of(scores: &[f64]) -> Option<Self> {
         if scores.is_empty() {
@@ -55,21 +55,21 @@ impl Summary {
         Some(Self { count, mean, std, range, iqm: Some(iqm), interval: Some(interval) })
     }
 
-    /// Interquartile mean with its interval, or mean with range where there are too few scores.
+    /// Returns the interquartile mean with its interval, or mean with range for too few scores.
     #[must_use]
     pub fn point_and_bounds(&self) -> (f64, [f64; 2]) {
         (self.iqm.unwrap_or(self.mean), self.interval.unwrap_or(self.range))
     }
 }
 
-/// Lowest and highest of at least one score.
+/// Returns the lowest and the highest of at least one score.
 pub(super) fn range(scores: &[f64]) -> [f64; 2] {
     let low = scores.iter().copied().fold(f64::INFINITY, f64::min);
     let high = scores.iter().copied().fold(f64::NEG_INFINITY, f64::max);
     [low, high]
 }
 
-/// The mean of the middle half.
+/// Returns the mean of the middle half of the scores.
 #[must_use]
 pub fn interquartile_mean(scores: &mut [f64]) -> f64 {
     scores.sort_by(f64::total_cmp);
@@ -78,7 +78,7 @@ pub fn interquartile_mean(scores: &mut [f64]) -> f64 {
     middle.iter().sum::<f64>() / middle.len() as f64
 }
 
-/// The interquartile mean over all scores, and its 95 % interval by [`bootstrap`].
+/// Returns the interquartile mean over all scores, and its 95 % interval by [`bootstrap`].
 ///
 /// - `scores`: (task, run), at least one.
 #[must_use]
@@ -86,10 +86,10 @@ pub fn interquartile_mean_with_interval(scores: &[Vec<f64>]) -> (f64, [f64; 2]) 
     bootstrap(scores, interquartile_mean)
 }
 
-/// The median, and its 95 % interval by [`bootstrap`], or the range below four scores.
-/// Unlike a mean it stays a number while fewer than half of the scores are infinite.
+/// Returns the median, and its 95 % interval by [`bootstrap`], or the range for fewer than four
+/// scores. Unlike a mean, it is finite while fewer than half of the scores are infinite.
 ///
-/// - `scores`: at least one; infinite for what never came.
+/// - `scores`: at least one; infinite for a seed that never reached a threshold.
 #[must_use]
 pub fn median_with_bounds(scores: &[f64]) -> (f64, [f64; 2]) {
     if scores.len() < INTERVAL_SCORES_MIN {
@@ -105,15 +105,15 @@ fn median(scores: &mut [f64]) -> f64 {
     f64::midpoint(scores[lower], scores[upper])
 }
 
-/// A statistic of all scores, and the interval in which 95 % of its resamplings lie.
+/// Returns a statistic of all scores, and the interval that contains 95 % of its resamples.
 ///
-/// The bootstrap is stratified: the runs of each task are drawn anew from those of the same task.
-/// Its random numbers are always the same.
+/// The bootstrap is stratified: the runs of each task are resampled from those of the same task.
+/// Its seed is fixed.
 fn bootstrap(scores: &[Vec<f64>], statistic: fn(&mut [f64]) -> f64) -> (f64, [f64; 2]) {
     let mut drawn: Vec<f64> = scores.concat();
     let point = statistic(&mut drawn);
     if scores.iter().all(|runs| runs.iter().all(|score| *score == runs[0])) {
-        // Nothing else can be drawn.
+        // All resamples are equal.
         return (point, [point; 2]);
     }
     let mut random = seeds::stream(0, "bootstrap", 0);
@@ -130,13 +130,13 @@ fn bootstrap(scores: &[Vec<f64>], statistic: fn(&mut [f64]) -> f64) -> (f64, [f6
     (point, QUANTILES.map(|quantile| quantile_of(&values, quantile)))
 }
 
-/// Between two sorted values linearly, as numpy's default.
+/// Interpolates linearly between two sorted values, like NumPy's default.
 fn quantile_of(sorted: &[f64], quantile: f64) -> f64 {
     let place = quantile * (sorted.len() - 1) as f64;
     let (below, share) = (place.floor() as usize, place.fract());
     let above = (below + 1).min(sorted.len() - 1);
     if sorted[below] == sorted[above] {
-        // Two infinite ones have no difference.
+        // The difference of two infinite values is NaN.
         return sorted[below];
     }
     sorted[below] + share * (sorted[above] - sorted[below])
@@ -160,17 +160,17 @@ mod tests {
         interval: [f64; 2],
     }
 
-    /// tests/golden/statistics/make_golden.py
+    /// Made by tests/golden/statistics/make_golden.py.
     const GOLDEN: &str = include_str!("../../../tests/golden/statistics/golden.json");
 
     #[test]
-    fn interquartile_means_and_intervals_are_those_of_rliable() {
+    fn interquartile_means_and_intervals_match_rliable() {
         let golden: Golden = serde_json::from_str(GOLDEN).unwrap();
         assert_eq!(golden.cases.len(), 5);
         for Case { scores, interquartile_mean, interval } in golden.cases {
             let (point, ours) = interquartile_mean_with_interval(&scores);
             assert!((point - interquartile_mean).abs() < 1e-12, "{point} {interquartile_mean}");
-            // Both draw at random, and quantiles of so few values lie on steps.
+            // Both sample at random, and quantiles of so few values lie on steps.
             let tolerance = 0.04 * (interval[1] - interval[0]);
             for (ours, theirs) in ours.into_iter().zip(interval) {
                 assert!((ours - theirs).abs() <= tolerance, "{ours} {theirs} of {scores:?}");
@@ -201,7 +201,7 @@ mod tests {
     }
 
     #[test]
-    fn a_median_takes_what_never_came_for_later_than_everything() {
+    fn a_median_treats_infinite_scores_as_the_largest() {
         let never = f64::INFINITY;
         assert_eq!(median_with_bounds(&[3.0, 1.0, 2.0]), (2.0, [1.0, 3.0]));
         assert_eq!(median_with_bounds(&[1.0, 2.0]).0, 1.5);

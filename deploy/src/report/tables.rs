@@ -1,59 +1,48 @@
-//! The figures of a report, by task and method.
+//! Tables of a report: each measure by task and method.
 
 use serde::Serialize;
 
-use super::collect::Results;
-use super::measures::Measure;
+use super::measures::{Measure, MeasureKind};
 use super::paper::reported;
-use super::provenance::Makers;
+use super::provenance::SoftwareCounts;
+use super::results::Results;
 use super::statistics::Summary;
 use crate::terminal::grouped;
-
-/// What a table is about.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum TableKind {
-    /// What was learnt.
-    Result,
-    /// How it moves.
-    Smoothness,
-    /// What training took.
-    Cost,
-}
 
 /// One table: a cell for each task and method.
 #[derive(Debug, Clone, Serialize)]
 pub struct Table {
-    /// What it shows.
+    /// Heading.
     pub title: &'static str,
-    /// How it was measured.
+    /// Description of the measure.
     pub about: &'static str,
-    /// Digits behind the point.
+    /// Number of decimals.
     pub digits: usize,
-    /// Where it stands in the report.
+    /// Group of the measure, which decides the table's place in the report.
     #[serde(skip)]
-    pub kind: TableKind,
-    /// (task, its cells in the order of the methods).
+    pub kind: MeasureKind,
+    /// Rows: a task and its cells in the order of the methods.
     pub rows: Vec<(String, Vec<Cell>)>,
 }
 
-/// What is known of one task and method.
+/// The values of one task and method.
 #[derive(Debug, Clone, Default, PartialEq, Serialize)]
 pub struct Cell {
-    /// Over the seeds; none where nothing has come to its end.
+    /// Summary over the seeds; `None` if no value is known.
     pub summary: Option<Summary>,
-    /// Seeds that are not at their end.
+    /// Number of unfinished seeds.
     pub unfinished: usize,
-    /// Seeds at their end of which the figure is not known.
+    /// Number of finished seeds whose value is unknown.
     pub unknown: usize,
-    /// Mean and spread in the paper.
+    /// Mean and standard deviation in the paper.
     pub paper: Option<(f64, f64)>,
-    /// Programs and packages behind the figure.
+    /// Number of programs and sets of packages.
     #[serde(flatten)]
-    pub makers: Makers,
+    pub software: SoftwareCounts,
 }
 
 impl Cell {
-    /// The cell's lines, for people.
+    /// Formats the lines of the cell.
     #[must_use]
     pub fn lines(&self, digits: usize) -> Vec<String> {
         let mut lines = Vec::new();
@@ -61,9 +50,9 @@ impl Cell {
             None if self.unknown > 0 => lines.push("not measured".to_owned()),
             None if self.unfinished > 0 => lines.push("not finished".to_owned()),
             None => lines.push("not run".to_owned()),
-            // One seed has no spread: zeros would claim that it is known.
+            // The spread of one seed is unknown, not zero.
             Some(Summary { count: 1, mean, .. }) => {
-                lines.extend([number(*mean, digits), format!("1 seed{}", self.makers.mark())]);
+                lines.extend([number(*mean, digits), format!("1 seed{}", self.software.mark())]);
             }
             Some(summary) => {
                 let Summary { count, mean, std, .. } = *summary;
@@ -75,7 +64,7 @@ impl Cell {
                     Some(_) => format!("IQM {point} [{low}, {high}]"),
                     None => format!("range [{low}, {high}]"),
                 });
-                lines.push(format!("{count} seeds{}", self.makers.mark()));
+                lines.push(format!("{count} seeds{}", self.software.mark()));
             }
         }
         if self.summary.is_some() && self.unknown > 0 {
@@ -88,7 +77,7 @@ impl Cell {
     }
 }
 
-/// Whole ones, which are counts, by thousands.
+/// Formats a number; a count, which has no decimals, with separators of thousands.
 fn number(value: f64, digits: usize) -> String {
     if digits == 0 && value >= 0.0 {
         grouped(value.round() as u64)
@@ -97,7 +86,7 @@ fn number(value: f64, digits: usize) -> String {
     }
 }
 
-/// Every table that the runs have something for.
+/// Returns the table of each measure for which a value is known.
 #[must_use]
 pub fn tables(results: &Results) -> Vec<Table> {
     let shows = |table: &Table| {
@@ -111,7 +100,7 @@ fn table(results: &Results, measure: Measure) -> Table {
         let runs = || results.of(task, method);
         let scores: Vec<f64> = runs().filter_map(|run| measure.of(run)).collect();
         Cell {
-            makers: Makers::of(runs().filter(|run| measure.of(run).is_some())),
+            software: SoftwareCounts::of(runs().filter(|run| measure.of(run).is_some())),
             summary: Summary::of(&scores),
             unfinished: runs().filter(|run| run.last().is_none()).count(),
             unknown: runs().filter(|run| run.last().is_some() && measure.of(run).is_none()).count(),
@@ -122,8 +111,8 @@ fn table(results: &Results, measure: Measure) -> Table {
         let cells = results.methods.iter().map(|method| cell(task, method));
         (task.clone(), cells.collect::<Vec<_>>())
     });
-    // A task that knows no success, say, has no row of it.
-    let tells = |(_, cells): &(String, Vec<Cell>)| {
+    // Omit tasks without the measure, for instance tasks that do not report success.
+    let has_measure = |(_, cells): &(String, Vec<Cell>)| {
         cells.iter().any(|cell| cell.summary.is_some())
             || cells.iter().all(|cell| cell.unknown == 0)
     };
@@ -132,18 +121,18 @@ fn table(results: &Results, measure: Measure) -> Table {
         about: measure.about(),
         digits: measure.digits(),
         kind: measure.kind(),
-        rows: rows.filter(tells).collect(),
+        rows: rows.filter(has_measure).collect(),
     }
 }
 
 #[cfg(test)]
 mod tests {
-    use super::super::planted::{Planted, planted};
+    use super::super::fixtures::{FixtureRun, fixture_results};
     use super::*;
 
     #[test]
-    fn a_cell_says_its_range_below_four_seeds_and_that_its_runs_are_of_several_programs() {
-        let run = |seed| Planted {
+    fn a_cell_shows_the_range_below_four_seeds_and_marks_several_programs() {
+        let run = |seed| FixtureRun {
             task: "point-reach",
             method: "TD3",
             seed,
@@ -152,7 +141,7 @@ mod tests {
         };
         let runs: Vec<_> = (1..=4).map(run).collect();
         let lines = |results: &Results| tables(results)[0].rows[0].1[0].lines(1);
-        let mut three = planted(&runs[..3]);
+        let mut three = fixture_results(&runs[..3]);
         assert_eq!(lines(&three), ["-2.0 ± 1.0", "range [-3.0, -1.0]", "3 seeds"]);
         three.runs[0].origin.programs = vec!["0.1.0 (commit 1234)".to_owned()];
         assert_eq!(lines(&three)[2], "3 seeds †");
@@ -163,12 +152,12 @@ mod tests {
         three.runs[0].origin.programs = vec![known(), known()];
         three.runs[0].origin.packages.push("Python 3.11.7".to_owned());
         assert_eq!(lines(&three)[2], "3 seeds", "one was resumed by the same program");
-        let mut one = planted(&runs[..1]);
+        let mut one = fixture_results(&runs[..1]);
         assert_eq!(lines(&one), ["-1.0", "1 seed"]);
         one.runs[0].origin.programs = vec![known(), "0.1.0 (commit 5678)".to_owned()];
         one.runs[0].origin.packages.push("Python 3.11.7".to_owned());
         assert_eq!(lines(&one), ["-1.0", "1 seed †"]);
-        let four = planted(&runs);
+        let four = fixture_results(&runs);
         assert!(lines(&four)[1].starts_with("IQM -2.5 ["), "{:?}", lines(&four));
         let mut packages = four;
         packages.runs[3].origin.packages = vec!["Python 3.12.1".to_owned()];
@@ -176,9 +165,10 @@ mod tests {
     }
 
     #[test]
-    fn a_task_without_success_has_no_row_of_it_and_what_was_not_run_says_so() {
-        let run = |task, method, ended| Planted { task, method, seed: 1, rows: vec![0.5], ended };
-        let results = planted(&[
+    fn a_task_without_success_has_no_row_in_its_table() {
+        let run =
+            |task, method, ended| FixtureRun { task, method, seed: 1, rows: vec![0.5], ended };
+        let results = fixture_results(&[
             run("reacher-v1", "TD3", true),
             run("panda-reach", "TD3", true),
             run("panda-reach", "SAC", false),

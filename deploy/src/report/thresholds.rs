@@ -1,20 +1,20 @@
-//! Marks that learning is timed by: what counts as learnt, and when the paper says it was.
+//! Thresholds that define when a task counts as learnt, and when the paper reports reaching them.
 
 use super::measures::Measure;
 
-/// What a task's evaluation has to reach.
+/// Value that an evaluation of a task must reach.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Threshold {
-    /// Of an evaluation.
+    /// Measure of the evaluation.
     pub measure: Measure,
-    /// At least this.
+    /// Its minimum.
     pub value: f64,
-    /// Who says so.
+    /// Source of the threshold.
     pub source: &'static str,
 }
 
 impl Threshold {
-    /// `return ≥ -10`.
+    /// Formats `return ≥ -10`.
     #[must_use]
     pub fn text(&self) -> String {
         let what = if self.measure == Measure::Success { "success" } else { "return" };
@@ -22,7 +22,7 @@ impl Threshold {
     }
 }
 
-/// The thresholds of every task that has one; a user's own tasks have none.
+/// The thresholds by task; other tasks have none.
 const THRESHOLDS: [(&[&str], Threshold); 4] = [
     (
         &["reacher-v1", "reacher"],
@@ -50,28 +50,28 @@ const THRESHOLDS: [(&[&str], Threshold); 4] = [
     ),
 ];
 
-/// When the paper says that a method is there (section 4.2; it gives no more than these):
-/// task, method, words, steps.
-const MARKS: [(&str, &str, &str, f64); 5] = [
-    ("reacher-v1", "DDPG-DMP (paper)", "about 26,000", 26_000.0),
-    ("reacher-v1", "DDPG", "about 33,000", 33_000.0),
-    ("pusher-v0", "DDPG-DMP (paper)", "within 30,000", 30_000.0),
-    ("thrower-v0", "NDP", "about 150,000", 150_000.0),
-    ("thrower-v0", "DDPG-DMP (paper)", "a third of NDP's", 50_000.0),
+/// Environment steps at which methods reach the threshold, in the words of the paper's section 4.2:
+/// task, method, steps. The paper reports no others.
+const REPORTED_STEPS: [(&str, &str, &str); 5] = [
+    ("reacher-v1", "DDPG-DMP (paper)", "about 26,000"),
+    ("reacher-v1", "DDPG", "about 33,000"),
+    ("pusher-v0", "DDPG-DMP (paper)", "within 30,000"),
+    ("thrower-v0", "NDP", "about 150,000"),
+    ("thrower-v0", "DDPG-DMP (paper)", "a third of NDP's"),
 ];
 
-/// The threshold of a task.
+/// Returns the threshold of a task.
 #[must_use]
 pub fn threshold(task: &str) -> Option<&'static Threshold> {
     let of_task = THRESHOLDS.iter().find(|(tasks, _)| tasks.contains(&task));
     of_task.map(|(_, threshold)| threshold)
 }
 
-/// What the paper says of a method's steps there, in words and as a number.
+/// Returns the steps that the paper reports for a method, in its words.
 #[must_use]
-pub fn mark(task: &str, method: &str) -> Option<(&'static str, f64)> {
-    let of_both = MARKS.iter().find(|mark| (mark.0, mark.1) == (task, method));
-    of_both.map(|mark| (mark.2, mark.3))
+pub fn reported_steps(task: &str, method: &str) -> Option<&'static str> {
+    let reported = REPORTED_STEPS.iter().find(|entry| (entry.0, entry.1) == (task, method));
+    reported.map(|entry| entry.2)
 }
 
 #[cfg(test)]
@@ -79,7 +79,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn both_versions_of_a_task_share_a_threshold_and_a_users_own_has_none() {
+    fn both_versions_of_a_task_share_a_threshold() {
         assert_eq!(threshold("reacher").unwrap().text(), "return ≥ -10");
         assert_eq!(threshold("reacher"), threshold("reacher-v1"));
         assert_eq!(threshold("panda-reach-joints").unwrap().text(), "success ≥ 0.95");
@@ -87,9 +87,9 @@ mod tests {
     }
 
     #[test]
-    fn the_papers_marks_are_of_its_own_tasks() {
-        assert_eq!(mark("reacher-v1", "DDPG"), Some(("about 33,000", 33_000.0)));
-        assert_eq!(mark("reacher", "DDPG"), None);
-        assert_eq!(mark("reacher-v1", "DDPG-DMP"), None);
+    fn the_paper_reports_steps_on_its_own_tasks_only() {
+        assert_eq!(reported_steps("reacher-v1", "DDPG"), Some("about 33,000"));
+        assert_eq!(reported_steps("reacher", "DDPG"), None);
+        assert_eq!(reported_steps("reacher-v1", "DDPG-DMP"), None);
     }
 }

@@ -1,30 +1,23 @@
-//! Joint positions and velocities of one rollout a method, as the paper's figures 6 and 7.
+//! Draws the joints over a rollout of each method, as in the paper's Figures 6 and 7.
 
 use anyhow::anyhow;
 
-use super::collect::Results;
-use super::moves::Rollout;
+use super::layout::Picture;
+use super::motion_metrics::Rollout;
+use super::results::{Results, ShownRollout};
 use super::run::Run;
-use super::sections::Picture;
 use crate::plots::{Panel, SmallMultiples, colour};
 use crate::run_directory::safe_name;
 
-/// One method's rollout.
-struct Shown<'r> {
-    /// The method's place in the report.
-    index: usize,
-    run: &'r Run,
-    rollout: &'r Rollout,
-}
-
-/// Two pictures a task whose joints are known: the same episode for every method.
+/// Draws positions and velocities for each task whose joints are known, with the same episode for
+/// every method.
 ///
 /// # Errors
 /// A picture cannot be drawn.
 pub fn trajectories(results: &Results) -> anyhow::Result<Vec<Picture>> {
     let mut pictures = Vec::new();
     for task in &results.tasks {
-        let shown = shown(results, task);
+        let shown = results.shown_rollouts(task);
         let Some(first) = shown.first().map(|shown| shown.rollout) else { continue };
         let unit = &first.unit;
         for (what, unit, rows) in [
@@ -50,19 +43,13 @@ pub fn trajectories(results: &Results) -> anyhow::Result<Vec<Picture>> {
     Ok(pictures)
 }
 
-/// Whether the run is the one that stands for its method.
+/// Names the methods without a panel although an earlier report measured the joints of a run: a
+/// report keeps only the rollouts that it draws.
 #[must_use]
-pub fn is_drawn(results: &Results, run: &Run) -> bool {
-    shown(results, &run.task).iter().any(|shown| std::ptr::eq(shown.run, run))
-}
-
-/// Methods that have no panel though a landed run of theirs once had joints: an earlier report
-/// keeps the rollout of no run but the one that it drew.
-#[must_use]
-pub fn lost_trajectories(results: &Results) -> Vec<String> {
-    let mut lost = Vec::new();
+pub fn missing_trajectories(results: &Results) -> Vec<String> {
+    let mut missing = Vec::new();
     for task in &results.tasks {
-        let shown = shown(results, task);
+        let shown = results.shown_rollouts(task);
         for method in &results.methods {
             let had_joints = |run: &Run| {
                 let jerk = run.motion.as_ref().and_then(|motion| motion.joint_jerk);
@@ -70,11 +57,13 @@ pub fn lost_trajectories(results: &Results) -> Vec<String> {
             };
             let is_shown = shown.iter().any(|shown| shown.run.method == *method);
             if !is_shown && results.of(task, method).any(had_joints) {
-                lost.push(format!("joints of {task} · {method}: no rollout was landed"));
+                missing.push(format!(
+                    "joints of {task} · {method}: the earlier report has no rollout"
+                ));
             }
         }
     }
-    lost
+    missing
 }
 
 fn positions(rollout: &Rollout) -> &[Vec<f64>] {
@@ -85,57 +74,45 @@ fn velocities(rollout: &Rollout) -> &[Vec<f64>] {
     &rollout.velocities
 }
 
-/// Of each method the first run whose rollout is at hand; of the same robot and episode as the
-/// first method's.
-fn shown<'r>(results: &'r Results, task: &str) -> Vec<Shown<'r>> {
-    let mut all: Vec<Shown<'r>> = Vec::new();
-    for (index, method) in results.methods.iter().enumerate() {
-        let mut runs: Vec<&Run> =
-            results.runs.iter().filter(|run| run.task == task && run.method == *method).collect();
-        runs.sort_by_key(|run| run.seed);
-        let measured = runs.into_iter().find_map(|run| {
-            let rollout = run.motion.as_ref()?.rollout.as_ref()?;
-            let comparable = all.first().is_none_or(|first| first.rollout.is_beside(rollout));
-            comparable.then_some((run, rollout))
-        });
-        all.extend(measured.map(|(run, rollout)| Shown { index, run, rollout }));
-    }
-    all
-}
-
-fn panel(Shown { index, run, rollout }: &Shown<'_>, rows: fn(&Rollout) -> &[Vec<f64>]) -> Panel {
+fn panel(shown: &ShownRollout<'_>, rows: fn(&Rollout) -> &[Vec<f64>]) -> Panel {
+    let ShownRollout { method_index, run, rollout } = shown;
     let (times, rows) = (rollout.times(), rows(rollout));
     let line = |joint: usize| -> Vec<(f64, f64)> {
         times.iter().copied().zip(rows.iter().map(|row| row[joint])).collect()
     };
     Panel {
         title: format!("{}, seed {}", run.method, run.seed),
-        colour: colour(*index, &run.method),
+        colour: colour(*method_index, &run.method),
         lines: (0..rollout.joints.len()).map(line).collect(),
     }
 }
 
 #[cfg(test)]
 mod tests {
-    use super::super::planted::{Planted, planted, planted_moves};
+    use super::super::fixtures::{FixtureRun, fixture_motion, fixture_results};
     use super::super::run::Source;
     use super::*;
 
     #[test]
-    fn every_method_has_a_panel_of_the_same_episode_and_slides_stand_in_none() {
-        let run = |method, seed| Planted {
+    fn every_method_has_a_panel_of_the_same_episode_without_sliding_joints() {
+        let run = |method, seed| FixtureRun {
             task: "pusher-v0",
             method,
             seed,
             rows: vec![-40.0],
             ended: true,
         };
-        let mut results =
-            planted(&[run("DDPG", 2), run("DDPG", 1), run("SAC", 3), run("TD3", 1), run("NDP", 1)]);
+        let mut results = fixture_results(&[
+            run("DDPG", 2),
+            run("DDPG", 1),
+            run("SAC", 3),
+            run("TD3", 1),
+            run("NDP", 1),
+        ]);
         for run in results.runs.iter_mut().take(4) {
-            run.motion = Some(planted_moves(3.0, -2.0));
+            run.motion = Some(fixture_motion(3.0, -2.0));
         }
-        // Of another episode, and never measured.
+        // TD3's rollout is of another episode, and NDP was never measured.
         let other = results.runs[3].motion.as_mut().unwrap();
         other.rollout.as_mut().unwrap().seed += 1;
         let pictures = trajectories(&results).unwrap();
@@ -153,35 +130,42 @@ mod tests {
 
     #[test]
     fn without_motion_there_is_no_picture() {
-        let run =
-            Planted { task: "pusher-v0", method: "SAC", seed: 1, rows: vec![-40.0], ended: true };
-        assert!(trajectories(&planted(&[run])).unwrap().is_empty());
+        let run = FixtureRun {
+            task: "pusher-v0",
+            method: "SAC",
+            seed: 1,
+            rows: vec![-40.0],
+            ended: true,
+        };
+        assert!(trajectories(&fixture_results(&[run])).unwrap().is_empty());
     }
+
     #[test]
-    fn a_landed_run_whose_rollout_was_not_kept_is_told_and_one_of_another_seed_stands_in() {
-        let run = |method, seed| Planted {
+    fn another_seed_replaces_a_rollout_that_was_not_kept_or_the_loss_is_reported() {
+        let run = |method, seed| FixtureRun {
             task: "pusher-v0",
             method,
             seed,
             rows: vec![-40.0],
             ended: true,
         };
-        let mut results = planted(&[run("SAC", 1), run("SAC", 2), run("TD3", 1), run("NDP", 1)]);
+        let mut results =
+            fixture_results(&[run("SAC", 1), run("SAC", 2), run("TD3", 1), run("NDP", 1)]);
         for (index, run) in results.runs.iter_mut().enumerate() {
-            let mut moves = planted_moves(3.0, -2.0);
+            let mut motion = fixture_motion(3.0, -2.0);
             if index != 1 {
-                moves.rollout = None;
+                motion.rollout = None;
             }
-            run.motion = Some(moves);
+            run.motion = Some(motion);
             run.source = Source::Report("earlier".into());
         }
-        // Of an environment that shows no joints.
+        // NDP's environment does not report its joints.
         results.runs[3].motion.as_mut().unwrap().joint_jerk = None;
         assert_eq!(
-            lost_trajectories(&results),
-            ["joints of pusher-v0 · TD3: no rollout was landed"]
+            missing_trajectories(&results),
+            ["joints of pusher-v0 · TD3: the earlier report has no rollout"]
         );
-        let drawn = [0, 1, 2].map(|index| is_drawn(&results, &results.runs[index]));
+        let drawn = [0, 1, 2].map(|index| results.is_shown(&results.runs[index]));
         assert_eq!(drawn, [false, true, false]);
     }
 }

@@ -1,26 +1,26 @@
-//! How a trained policy moves, measured by a real observer.
+//! Measures the motion of trained policies with real observer processes.
 
-use std::cell::RefCell;
 use std::path::Path;
 
-use dmprl::motion::{self, Means};
+use dmprl::motion;
+use dmprl::record::{Observer, measure_motion};
 use dmprl::run_directory::RunDirectory;
 use dmprl_tests::program::{Workplace, executable, rows};
 use dmprl_tests::venv;
 
 use crate::train;
 
-fn means() -> Means {
-    Means { program: executable().to_owned(), venv: venv().venv.clone() }
+fn observer() -> Observer {
+    Observer { program: executable().to_owned(), venv: venv().venv.clone() }
 }
 
 fn measured(run: &str) -> motion::Motion {
     let run = RunDirectory::open(Path::new(run)).unwrap();
-    motion::measure(&run, &means(), &|_, _| ()).unwrap().expect("nobody interrupts")
+    measure_motion(&run, &observer()).unwrap().expect("no interrupt")
 }
 
-/// The recorded episodes are those of `eval`: a table of motion must be about the policy whose
-/// return stands beside it.
+/// The recorded episodes are those of the evaluation: a report shows motion and return of the same
+/// policy.
 #[test]
 fn the_episodes_measured_are_those_evaluated_also_where_the_controls_follow_the_state() {
     let place = Workplace::new();
@@ -61,17 +61,16 @@ fn a_policy_is_measured_once_and_the_next_one_again() {
     place.run(&train("reacher", &run, &["--steps", "1000"])).with_status(0);
     let directory = RunDirectory::open(Path::new(&run)).unwrap();
     assert_eq!(motion::read(&directory).unwrap(), None);
-    let told = RefCell::new(Vec::new());
-    let tell = |done, of| told.borrow_mut().push((done, of));
-    let first = motion::measure(&directory, &means(), &tell).unwrap().unwrap();
-    assert_eq!(told.take(), [(1, 4), (2, 4), (3, 4), (4, 4)]);
-    assert_eq!(motion::measure(&directory, &means(), &tell).unwrap().unwrap(), first);
-    assert_eq!(told.take(), []);
+    let first = measured(&run);
+    let written = || std::fs::metadata(directory.motion_path()).unwrap().modified().unwrap();
+    let before = written();
+    assert_eq!(measured(&run), first);
+    assert_eq!(written(), before);
 
     place.run(&["resume", &run, "--steps", "2000"]).with_status(0);
-    assert_eq!(motion::read(&directory).unwrap(), None, "another policy is the latest now");
+    assert_eq!(motion::read(&directory).unwrap(), None, "the resumed run has a newer policy");
     assert_eq!(measured(&run).env_steps, 2000);
-    // One that is damaged is measured again.
+    // A damaged file is replaced.
     std::fs::write(directory.motion_path(), "{").unwrap();
     assert_eq!(measured(&run).env_steps, 2000);
 }

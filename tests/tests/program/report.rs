@@ -1,4 +1,4 @@
-//! `dmprl report` over runs and a sweep that were really trained.
+//! Tests `dmprl report` with trained runs and a trained sweep.
 
 use std::fs;
 use std::path::Path;
@@ -8,16 +8,16 @@ use dmprl_tests::program::Workplace;
 use crate::{ENDLESS, SMALL, train};
 
 #[test]
-fn a_sweep_is_reported_with_what_was_run_and_what_was_not() {
+fn a_report_of_a_sweep_shows_runs_and_missing_runs() {
     let place = Workplace::new();
     let file = place.path("two.toml");
     let method = "[[method]]\nname = 'td3-dmp'\nlabel = 'TD3-DMP'\n";
     let head = "seeds = [1, 2]\n[[task]]\nname = 'reacher-v1'\nsteps = 50000\n";
-    // Any return will do: the runs end with their first evaluation, and have come to their end.
+    // Every return reaches the target, so the runs are finished after their first evaluation.
     let set = format!("[set]\nrun.until_return = -1000\n{}", SMALL.join("\n"));
     fs::write(&file, format!("{head}{method}{set}")).unwrap();
     place.run(&["sweep", &file, "--output", "two"]).with_status(0);
-    // Asked for since, and not run: the paper's figures stand beside nothing.
+    // Add a method that was not run: its cells show only the paper's figures.
     let paper = "[[method]]\nname = 'ndp'\nlabel = 'NDP'\nalgo = 'ndp'\n";
     fs::write(place.path("two/sweep.toml"), format!("{head}{method}{paper}{set}")).unwrap();
 
@@ -36,7 +36,7 @@ fn a_sweep_is_reported_with_what_was_run_and_what_was_not() {
     assert_eq!(cells[0]["summary"]["count"], 2);
     assert!(cells[1]["summary"].is_null());
     assert_eq!(cells[1]["paper"], serde_json::json!([-15.56, 1.47]));
-    // Two seeds that ended before they learnt anything: told, and nothing made of it.
+    // Both seeds are finished and did not reach the threshold.
     let efficiency = &json["efficiency"][0];
     assert_eq!(efficiency["threshold"], "return ≥ -10");
     assert_eq!(efficiency["cells"][0]["steps"].as_array().unwrap().len(), 2);
@@ -46,52 +46,59 @@ fn a_sweep_is_reported_with_what_was_run_and_what_was_not() {
     assert!(verdicts.contains(&"cannot_hold") && verdicts.contains(&"not_run"), "{verdicts:?}");
     assert!(!verdicts.contains(&"held"), "{verdicts:?}");
 
+    its_files_show_the_same(&place);
+    its_report_is_the_same_without_the_runs(&place, &json);
+}
+
+fn its_files_show_the_same(place: &Workplace) {
     let read = |name: &str| fs::read_to_string(place.path(&format!("two/report/{name}"))).unwrap();
     let page = read("index.html");
     for text in ["reacher-v1", "TD3-DMP", "not run", "paper -15.56 ± 1.47", "2 seeds", "<svg"] {
         assert!(page.contains(text), "{text} is not on the page");
     }
     for (link, own) in [("src=\"", "src=\"data:"), ("href=\"", "href=\"#")] {
-        assert_eq!(page.matches(link).count(), page.matches(own).count(), "it needs nothing else");
+        assert_eq!(
+            page.matches(link).count(),
+            page.matches(own).count(),
+            "the page is self-contained"
+        );
     }
     for seed in [1, 2] {
         let motion = place.path(&format!("two/reacher-v1/td3-dmp/seed-{seed}/motion.json"));
-        assert!(Path::new(&motion).is_file(), "{motion}: measured once, and kept");
+        assert!(Path::new(&motion).is_file(), "{motion}: the motion is kept in the run");
     }
     assert!(read("joints/reacher-v1-velocity.svg").contains("joint velocity [rad/s]"));
     assert!(Path::new(&place.path("two/report/joints/reacher-v1-position.png")).is_file());
-    for heading in ["What was run", "Sample efficiency", "What held of the paper"] {
+    for heading in ["What was run", "Sample efficiency", "Statements of the paper"] {
         assert!(page.contains(heading), "{heading} is not on the page");
     }
     assert!(read("report.md").contains("| reacher-v1 |"));
     assert!(read("curves/reacher-v1-evaluation-return.svg").starts_with("<svg"));
     let png = fs::read(place.path("two/report/curves/reacher-v1-evaluation-return.png")).unwrap();
     assert_eq!(&png[1..4], b"PNG");
-    let curves: serde_json::Value = serde_json::from_str(&read("curves.json")).unwrap();
-    assert_eq!(curves["runs"].as_array().unwrap().len(), 2);
-    assert!(!curves["runs"][0]["return_mean"].as_array().unwrap().is_empty());
-    // One line an evaluation of each seed, and a head.
+    let data: serde_json::Value = serde_json::from_str(&read("report-data.json")).unwrap();
+    assert_eq!(data["runs"].as_array().unwrap().len(), 2);
+    assert!(!data["runs"][0]["return_mean"].as_array().unwrap().is_empty());
+    // A header, and a line per evaluation of each seed.
     assert!(read("runs.csv").lines().count() > 2);
     assert!(read("figures.csv").contains("Average return,reacher-v1,NDP,0,,,,,,-15.56,1.47"));
-
-    its_report_says_the_same_once_the_runs_are_gone(&place, &json);
 }
 
-/// Written over itself: all of it is read first.
-fn its_report_says_the_same_once_the_runs_are_gone(place: &Workplace, json: &serde_json::Value) {
+/// Writes the report over the one that it reads.
+fn its_report_is_the_same_without_the_runs(place: &Workplace, json: &serde_json::Value) {
     let read = |name| fs::read_to_string(place.path(&format!("two/report/{name}"))).unwrap();
-    let files = ["curves.json", "runs.csv", "figures.csv", "joints/reacher-v1-velocity.svg"];
+    let files = ["report-data.json", "runs.csv", "figures.csv", "joints/reacher-v1-velocity.svg"];
     let before = files.map(read);
     fs::remove_dir_all(place.path("two/reacher-v1")).unwrap();
-    let landed = ["report", "two/report", "--output", "two/report", "--json"];
-    let again = place.run(&landed).with_status(0).json();
+    let arguments = ["report", "two/report", "--output", "two/report", "--json"];
+    let again = place.run(&arguments).with_status(0).json();
     assert_eq!(again, *json);
     assert_eq!(files.map(read), before);
-    assert!(read("report.md").contains("Of 4 runs 2 have come to their end, 2 not begun."));
+    assert!(read("report.md").contains("2 of 4 runs are finished, 2 not started."));
 }
 
 #[test]
-fn what_is_no_run_or_has_no_evaluation_is_refused() {
+fn a_path_without_a_run_and_a_run_without_an_evaluation_are_errors() {
     let place = Workplace::new();
     place.run(&["report", "nowhere"]).with_status(2).saying("nowhere");
     let run = place.path("run");
@@ -103,7 +110,7 @@ fn what_is_no_run_or_has_no_evaluation_is_refused() {
 }
 
 #[test]
-fn runs_of_another_preset_have_a_column_of_their_own() {
+fn runs_of_another_preset_have_their_own_column() {
     let place = Workplace::new();
     let runs = [("ours", "default"), ("theirs", "paper")].map(|(name, preset)| {
         let run = place.path(name);
@@ -113,7 +120,7 @@ fn runs_of_another_preset_have_a_column_of_their_own() {
     });
     let json = place.run(&["report", &runs[0], &runs[1], "--no-motion", "--json"]).json();
     assert_eq!(json["methods"], serde_json::json!(["DDPG-DMP", "DDPG-DMP (paper)"]));
-    // However it was said: another seed is one of the method's, another value another method.
+    // A run with another seed belongs to the same method, one with another value does not.
     let [seed, value] =
         [("seed", "run.seed=3"), ("value", "dmp.alpha_y=9.0")].map(|(name, set)| {
             let run = place.path(name);
@@ -141,6 +148,6 @@ fn a_run_whose_environment_is_gone_is_reported_without_its_motion() {
         .saying("motion not measured: point_reach:PointReach-v0")
         .saying("cannot be a Python path");
     let page = fs::read_to_string(place.path("report/index.html")).unwrap();
-    assert!(page.contains("Motion is not measured of 1 run"), "the page says so too");
-    assert!(!page.contains("What held of the paper"), "a task of one's own is not the paper's");
+    assert!(page.contains("The motion of 1 run was not measured"), "the page says so");
+    assert!(!page.contains("Statements of the paper"), "the task is not the paper's");
 }

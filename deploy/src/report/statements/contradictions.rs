@@ -1,34 +1,33 @@
-//! Statements that the paper's own figures contradict: recomputed, not listed.
+//! Finds the statements that the paper's own figures contradict, by computing with these figures.
 
-use super::PROPOSED;
-use super::list::{Rule, Statement};
+use super::statement::{Margin, PROPOSED, ReportedSteps, Rule, Statement};
 use crate::report::measures::Measure;
 use crate::report::paper::{Figure, SEEDS, reported};
 
-/// Percentages are printed with one digit, of figures that are rounded too.
+/// Tolerance for the paper's percentages, which have one decimal and are of rounded figures.
 const ROUNDING_PERCENT: f64 = 0.15;
-/// What the paper calls its method in its tables.
+/// Label of the paper's method in [`reported`].
 const IN_TABLES: &str = "DDPG-DMP (paper)";
 
-/// How the paper contradicts the statement; none where it does not.
+/// Describes how the paper contradicts the statement; `None` if it does not.
 pub(super) fn of(statement: &Statement) -> Option<String> {
-    let task = statement.task;
-    match statement.rule {
+    let task = statement.task.as_str();
+    match &statement.rule {
         Rule::Better { measures, method, than } => {
             measures.iter().find_map(|measure| surpassed(task, *measure, method, than))
         }
-        Rule::BetterBy { method, than } => {
-            let wrong = than.iter().filter_map(|(other, percent)| {
-                let [ours, theirs] = [method, other].map(|name| figure(Figure::Return, task, name));
+        Rule::BetterBy { method, margins } => {
+            let wrong = margins.iter().filter_map(|Margin { than, percent }| {
+                let [ours, theirs] = [method, than].map(|name| figure(Figure::Return, task, name));
                 let real = 100.0 * (ours? - theirs?) / theirs?.abs();
                 let differs = (real - percent).abs() > ROUNDING_PERCENT;
-                differs.then(|| format!("{real:.1} % over {other}, not {percent:.1} %"))
+                differs.then(|| format!("{real:.1} % over {than}, not {percent:.1} %"))
             });
             let wrong: Vec<_> = wrong.collect();
             (!wrong.is_empty()).then(|| format!("by its Table 3 it is {}", wrong.join(" and ")))
         }
-        Rule::Sooner { share, steps: Some((ours, theirs)), .. } => {
-            let (said, real) = (100.0 * (1.0 - share), 100.0 * (1.0 - ours / theirs));
+        Rule::Sooner { share, reported_steps: Some(ReportedSteps { method, than }), .. } => {
+            let (said, real) = (100.0 * (1.0 - share), 100.0 * (1.0 - method / than));
             let differs = (real - said).abs() > ROUNDING_PERCENT;
             differs.then(|| format!("of these steps it is {real:.1} % fewer, not {said:.1} %"))
         }
@@ -46,8 +45,8 @@ pub(super) fn of(statement: &Statement) -> Option<String> {
     }
 }
 
-/// Methods that the paper's own table has above the one that is to be best.
-fn surpassed(task: &str, measure: Measure, method: &str, than: &[&str]) -> Option<String> {
+/// Names the methods above the allegedly best one in the paper's own table.
+fn surpassed(task: &str, measure: Measure, method: &str, than: &[String]) -> Option<String> {
     let of = measure.in_paper()?;
     let ours = figure(of, task, method)?;
     let above = than.iter().filter_map(|other| {
@@ -68,7 +67,7 @@ fn in_tables(method: &str) -> &str {
     if method == PROPOSED { IN_TABLES } else { method }
 }
 
-/// The largest standard deviation of a sample of rates: all of them at 0 or at 1.
+/// Returns the largest standard deviation of rates with this mean: each of them is 0 or 1.
 fn spread_max(mean: f64, count: usize) -> f64 {
     let count = count as f64;
     (mean * (1.0 - mean) * count / (count - 1.0)).sqrt()
@@ -76,12 +75,14 @@ fn spread_max(mean: f64, count: usize) -> f64 {
 
 #[cfg(test)]
 mod tests {
-    use super::super::list::STATEMENTS;
+    use super::super::statement::PaperStatements;
     use super::*;
 
     #[test]
     fn the_papers_inconsistencies_are_found_and_no_others() {
-        let found: Vec<String> = STATEMENTS
+        let found: Vec<String> = PaperStatements::read()
+            .unwrap()
+            .statements
             .iter()
             .filter_map(|statement| Some(format!("{}: {}", statement.task, of(statement)?)))
             .collect();

@@ -1,140 +1,116 @@
-//! What of the paper's statements held. A verdict is never typed in: `list` has the statements as
-//! rules, `rules` applies them to the runs' figures, `contradictions` to the paper's own.
+//! Compares the runs with the paper's statements about its results.
+//!
+//! `statement` reads the statements as rules from `deploy/experiments/paper-statements.toml`.
+//! `rules` and `series` apply them to `estimates` of the runs' measures, and `contradictions` to
+//! the paper's own figures. `verdict` has the possible results.
 
 mod contradictions;
-mod list;
+mod estimates;
 mod rules;
 mod series;
+mod statement;
 #[cfg(test)]
 mod tests;
+mod verdict;
 
 use serde::Serialize;
 
-pub use self::list::{ALMOST_ALL, LOSS, NONE};
-use self::list::{STATEMENTS, Statement};
-use self::rules::Judge;
-use super::collect::Results;
+use self::estimates::{Context, Estimates};
+pub use self::statement::{Limits, SUBJECTS};
+use self::statement::{PROPOSED, PaperStatements, Statement};
+pub use self::verdict::{EPISODES_MIN, SEEDS_MIN, Verdict};
+use super::results::Results;
 
-/// What the paper calls its method; two of ours are held to what it says of it.
-const PROPOSED: &str = "DDPG-DMP of the paper";
-/// The paper's method with the paper's values, and with ours.
-pub const SUBJECTS: [&str; 2] = ["DDPG-DMP (paper)", "DDPG-DMP"];
-/// Fewest seeds of a method that a statement is judged by.
-pub const SEEDS_MIN: usize = 5;
-/// Fewest episodes of a run's last evaluation that a statement is judged by.
-pub const EPISODES_MIN: u64 = 100;
-
-/// What became of a statement.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize)]
-#[serde(rename_all = "snake_case")]
-pub enum Verdict {
-    /// The figures say the same, beyond their intervals.
-    Held,
-    /// They say the opposite, beyond their intervals.
-    DidNotHold,
-    /// A difference within the intervals.
-    NoClearDifference,
-    /// There are runs, but fewer than `SEEDS_MIN` of a method.
-    TooFewSeeds,
-    /// There are seeds enough, but a last evaluation has fewer than `EPISODES_MIN` episodes.
-    TooFewEpisodes,
-    /// Nothing to judge by.
-    NotRun,
-    /// The paper contradicts itself.
-    CannotHold,
-}
-
-impl Verdict {
-    /// For people.
-    #[must_use]
-    pub fn text(self) -> &'static str {
-        match self {
-            Self::Held => "held",
-            Self::DidNotHold => "did not hold",
-            Self::NoClearDifference => "no clear difference",
-            Self::TooFewSeeds => "too few seeds",
-            Self::TooFewEpisodes => "too few episodes",
-            Self::NotRun => "not run",
-            Self::CannotHold => "cannot hold",
-        }
-    }
-
-    /// All, in the order in which they are counted.
-    pub const ALL: [Self; 7] = [
-        Self::Held,
-        Self::DidNotHold,
-        Self::NoClearDifference,
-        Self::TooFewSeeds,
-        Self::TooFewEpisodes,
-        Self::NotRun,
-        Self::CannotHold,
-    ];
-}
-
-/// A verdict and the figures behind it.
+/// A verdict and the figures that support it.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct Finding {
-    /// Of our methods, the one that stands for the paper's; none where the statement is not of it.
+    /// Our method that represents the paper's; null if the statement is not about it.
     pub subject: Option<&'static str>,
-    /// What became of it.
+    /// The verdict.
     pub verdict: Verdict,
-    /// The same for people.
+    /// The verdict as a text.
     pub verdict_text: &'static str,
-    /// What the runs show, or lack.
+    /// Figures of the runs, or what is missing.
     pub evidence: String,
 }
 
-/// A statement of the paper and what became of it.
+/// A statement of the paper with its verdicts.
 #[derive(Debug, Clone, PartialEq, Serialize)]
-pub struct Judged {
-    /// Of which task.
-    pub task: &'static str,
-    /// Where it stands.
-    pub place: &'static str,
-    /// What it says, in our words.
-    pub claim: &'static str,
-    /// How the paper contradicts itself.
+pub struct ClaimResult {
+    /// Identifies the statement.
+    pub id: String,
+    /// The task.
+    pub task: String,
+    /// Place in the paper.
+    pub place: String,
+    /// The claim, in our words.
+    pub claim: String,
+    /// How the paper contradicts it; null if it does not.
     pub contradiction: Option<String>,
-    /// One a method that stands for the paper's.
+    /// A finding for each method that represents the paper's.
     pub findings: Vec<Finding>,
 }
 
-/// Every statement, if the runs are of any task of the paper.
-#[must_use]
-pub fn judge(results: &Results) -> Vec<Judged> {
-    if !STATEMENTS.iter().any(|statement| results.tasks.iter().any(|task| task == statement.task)) {
-        return Vec::new();
-    }
-    let judge = Judge::of(results);
-    STATEMENTS.iter().map(|statement| judged(&judge, results, statement)).collect()
+/// The paper's statements with their verdicts.
+#[derive(Debug, Clone)]
+pub struct PaperClaims {
+    /// Limits that the rules use.
+    pub limits: Limits,
+    /// The statements, in the paper's order; empty if no task is one of the paper's.
+    pub results: Vec<ClaimResult>,
 }
 
-fn judged(judge: &Judge<'_>, results: &Results, statement: &Statement) -> Judged {
-    let contradiction = contradictions::of(statement);
-    let named = |subject: &&&str| results.methods.iter().any(|method| method == **subject);
-    let mut subjects: Vec<Option<&'static str>> =
-        SUBJECTS.iter().filter(named).map(|subject| Some(*subject)).collect();
-    if !statement.rule.is_of_proposed() {
-        subjects = vec![None];
-    } else if subjects.is_empty() {
-        subjects.push(Some(SUBJECTS[0]));
+/// Evaluates every statement if a task is one of the paper's.
+///
+/// # Errors
+/// None is known: the statements are compiled in.
+pub fn evaluate_statements(results: &Results) -> anyhow::Result<PaperClaims> {
+    let PaperStatements { limits, statements } = PaperStatements::read()?;
+    if !statements.iter().any(|statement| results.tasks.contains(&statement.task)) {
+        return Ok(PaperClaims { limits, results: Vec::new() });
     }
+    let estimates = Estimates::new(results);
+    let labels: Vec<&'static str> =
+        SUBJECTS.into_iter().filter(|label| results.methods.iter().any(|it| it == label)).collect();
+    let evaluate = |statement| evaluate(statement, &estimates, limits, &labels);
+    Ok(PaperClaims { limits, results: statements.into_iter().map(evaluate).collect() })
+}
+
+/// Evaluates a statement.
+///
+/// - `labels`: of our versions of the paper's method that have runs.
+fn evaluate(
+    statement: Statement,
+    estimates: &Estimates<'_>,
+    limits: Limits,
+    labels: &[&'static str],
+) -> ClaimResult {
+    let contradiction = contradictions::of(&statement);
+    let subjects: Vec<Option<&'static str>> = if !statement.rule.is_about_proposed() {
+        vec![None]
+    } else if labels.is_empty() {
+        vec![Some(SUBJECTS[0])]
+    } else {
+        labels.iter().copied().map(Some).collect()
+    };
     let findings = subjects.into_iter().map(|subject| {
-        let (verdict, evidence) = judge.verdict(statement, subject);
-        let verdict = if contradiction.is_some() { Verdict::CannotHold } else { verdict };
-        Finding { subject, verdict, verdict_text: verdict.text(), evidence }
+        let task = &statement.task;
+        let context = Context { estimates, limits, task, subject: subject.unwrap_or(PROPOSED) };
+        let judgement = rules::judge(&context, &statement.rule);
+        let verdict = if contradiction.is_some() { Verdict::CannotHold } else { judgement.verdict };
+        Finding { subject, verdict, verdict_text: verdict.text(), evidence: judgement.evidence }
     });
     let findings = findings.collect();
-    let Statement { place, claim, task, .. } = *statement;
-    Judged { task, place, claim, contradiction, findings }
+    let Statement { id, place, claim, task, .. } = statement;
+    ClaimResult { id, task, place, claim, contradiction, findings }
 }
 
-/// How many statements have each verdict, for one of [`SUBJECTS`].
+/// Counts the statements with each verdict, for one of [`SUBJECTS`].
 #[must_use]
-pub fn counts(judged: &[Judged], subject: &str) -> Vec<(Verdict, usize)> {
-    let of = |finding: &&Finding| finding.subject.is_none_or(|other| other == subject);
-    let verdicts: Vec<Verdict> =
-        judged.iter().flat_map(|judged| &judged.findings).filter(of).map(|it| it.verdict).collect();
+pub fn counts(claims: &[ClaimResult], subject: &str) -> Vec<(Verdict, usize)> {
+    let is_counted = |finding: &&Finding| finding.subject.is_none_or(|other| other == subject);
+    let findings = claims.iter().flat_map(|claim| &claim.findings).filter(is_counted);
+    let verdicts: Vec<Verdict> = findings.map(|finding| finding.verdict).collect();
     Verdict::ALL
         .into_iter()
         .map(|verdict| (verdict, verdicts.iter().filter(|other| **other == verdict).count()))

@@ -1,46 +1,46 @@
-//! How a run moves, as far as a report shows it: what is left of a `motion.json` where only figures
-//! and one rollout are looked at, small enough to stay in `curves.json`.
+//! The part of a `motion.json` that a report shows: two figures and one rollout, small enough for
+//! `report-data.json`.
 
 use anyhow::ensure;
 use serde::{Deserialize, Serialize};
 
 use crate::motion::Motion;
 
-/// Decimals of a joint's position and velocity: less than a point of a picture.
-const DECIMALS: f64 = 1e4;
+/// Positions and velocities keep four decimals, which is finer than a pixel of a plot.
+const ROUNDING: f64 = 1e4;
 
-/// Of a run's last policy.
+/// Motion of a run's last policy.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
-pub struct Moves {
-    /// Mean |jerk| over steps and joints [rad/s³, or m/s³ where nothing turns].
+pub struct MotionMetrics {
+    /// Mean |jerk| over steps and joints [rad/s³; m/s³ for a robot without hinges].
     pub joint_jerk: Option<f64>,
     /// Spectral arc length of the joints' speed.
     pub sparc: Option<f64>,
-    /// Its first episode, where the joints are known and the picture of it is at hand.
+    /// The first episode; `None` if the joints are unknown, or an earlier report did not keep it.
     pub rollout: Option<Rollout>,
 }
 
-/// The joints over one episode of T steps; those that are measured in the same unit.
+/// Joint positions and velocities of an episode of T steps. All joints have the same unit.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Rollout {
-    /// What the episode was reset with.
+    /// Seed of the episode.
     pub seed: u64,
-    /// Duration of a step \[s\]; 0 if the environment does not say.
+    /// Duration of a step \[s\]; 0 if the environment does not report it.
     pub control_dt_s: f64,
     /// `rad` or `m`.
     pub unit: String,
-    /// Their names, (J,).
+    /// Names of the joints, (J,).
     pub joints: Vec<String>,
-    /// (T+1, J) [unit].
+    /// Positions, (T+1, J) [unit].
     pub positions: Vec<Vec<f64>>,
-    /// (T+1, J) [unit/s].
+    /// Velocities, (T+1, J) [unit/s].
     pub velocities: Vec<Vec<f64>>,
 }
 
-impl Moves {
-    /// What a report shows of a motion.
+impl MotionMetrics {
+    /// Selects the data that a report shows.
     #[must_use]
     pub fn of(motion: &Motion) -> Self {
         let Motion { joint_jerk, sparc, .. } = *motion;
@@ -49,15 +49,15 @@ impl Moves {
 }
 
 impl Rollout {
-    /// Rounded here and not where it is written, so that a picture does not change when its run is
-    /// landed. None without joints.
+    /// Returns `None` without joints. Rounds the values here rather than when they are written, so
+    /// that a picture of an earlier report's data is the same.
     fn of(motion: &Motion) -> Option<Self> {
         let joints = motion.robot.joints.iter().enumerate();
         let counted: Vec<usize> = joints
             .filter(|(_, joint)| joint.kind.unit() == motion.unit)
             .map(|(index, _)| index)
             .collect();
-        let rounded = |value: f64| (value * DECIMALS).round() / DECIMALS;
+        let rounded = |value: f64| (value * ROUNDING).round() / ROUNDING;
         let pick = |rows: &[Vec<f64>]| -> Vec<Vec<f64>> {
             let row = |row: &Vec<f64>| counted.iter().map(|&joint| rounded(row[joint])).collect();
             rows.iter().map(row).collect()
@@ -72,22 +72,25 @@ impl Rollout {
         })
     }
 
-    /// When each row is \[s\], (T+1,); steps where the environment does not say how long one takes.
+    /// Returns the time of each row \[s\], (T+1,); in steps if their duration is unknown.
     #[must_use]
     pub fn times(&self) -> Vec<f64> {
         let step = if self.control_dt_s > 0.0 { self.control_dt_s } else { 1.0 };
         (0..self.positions.len()).map(|index| index as f64 * step).collect()
     }
 
-    /// Whether the same episode of the same robot is shown: only then are two panels comparable.
+    /// Returns whether the other rollout is of the same episode and robot, so that the panels of a
+    /// figure may show both.
     #[must_use]
-    pub fn is_beside(&self, other: &Self) -> bool {
+    pub fn is_comparable(&self, other: &Self) -> bool {
         (self.seed, self.control_dt_s, &self.unit, &self.joints)
             == (other.seed, other.control_dt_s, &other.unit, &other.joints)
     }
 
+    /// Checks the lengths of all rows.
+    ///
     /// # Errors
-    /// It does not fit together.
+    /// The lengths do not match, or there are no joints or rows.
     pub fn check(&self) -> anyhow::Result<()> {
         let (joints, rows) = (self.joints.len(), self.positions.len());
         let fit = |rows: &[Vec<f64>]| rows.iter().all(|row| row.len() == joints);

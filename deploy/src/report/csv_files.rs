@@ -1,9 +1,9 @@
-//! The report's figures for spreadsheets, as CSV.
+//! Writes the figures of a report as CSV files.
 
-use super::page::Report;
+use super::contents::Report;
 use super::run::Run;
 
-/// One line a figure, task and method.
+/// Encodes `figures.csv`: a line per table, task and method.
 ///
 /// # Errors
 /// None is known: it is written into memory.
@@ -33,7 +33,7 @@ pub fn figures_csv(report: &Report) -> anyhow::Result<Vec<u8>> {
                     |value: Option<f64>| value.map(|value| value.to_string()).unwrap_or_default();
                 let summary = cell.summary;
                 let count = summary.map_or(0, |summary| summary.count).to_string();
-                let of = [
+                let numbers = [
                     summary.map(|summary| summary.mean),
                     summary.map(|summary| summary.std),
                     summary.and_then(|summary| summary.iqm),
@@ -46,16 +46,16 @@ pub fn figures_csv(report: &Report) -> anyhow::Result<Vec<u8>> {
                 ];
                 let words = [table.title, task, method, count.as_str()];
                 let words = words.into_iter().map(str::to_owned);
-                let makers = [cell.makers.programs, cell.makers.package_sets];
-                let makers = makers.map(|count| count.to_string());
-                csv.write_record(words.chain(of.map(number)).chain(makers))?;
+                let software = [cell.software.programs, cell.software.package_sets];
+                let software = software.map(|count| count.to_string());
+                csv.write_record(words.chain(numbers.map(number)).chain(software))?;
             }
         }
     }
     Ok(csv.into_inner()?)
 }
 
-/// One line an evaluation of a run.
+/// Encodes `runs.csv`: a line per evaluation of a run.
 ///
 /// # Errors
 /// None is known: it is written into memory.

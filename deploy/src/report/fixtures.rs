@@ -1,29 +1,29 @@
-//! Results made up for tests.
+//! Results for the tests of a report.
 
 use dmprl_shared::config::PolicyKind;
+use dmprl_shared::supervision::EvaluationRow;
 
-use super::collect::Results;
-use super::moves::Moves;
+use super::motion_metrics::MotionMetrics;
+use super::results::Results;
 use super::run::{Origin, Run, Source};
-use crate::control::EvaluationRow;
 use crate::motion::{Joint, JointKind, Motion, RecordedEpisode, Robot};
 
-/// Between two evaluations.
+/// Environment steps between two evaluations.
 const INTERVAL: u64 = 1_000;
 
-/// One run.
+/// Description of a run.
 #[derive(Debug, Clone)]
-pub(super) struct Planted {
+pub(super) struct FixtureRun {
     pub(super) task: &'static str,
     pub(super) method: &'static str,
     pub(super) seed: u64,
-    /// Return, or on a Panda task success, of each evaluation; one every 1 000 steps.
+    /// Return of each evaluation, or success on a Panda task; one every 1,000 steps.
     pub(super) rows: Vec<f64>,
     pub(super) ended: bool,
 }
 
-/// What these runs are together.
-pub(super) fn planted(runs: &[Planted]) -> Results {
+/// Builds the results of runs.
+pub(super) fn fixture_results(runs: &[FixtureRun]) -> Results {
     let mut results = Results::default();
     for run in runs {
         for (names, name) in [(&mut results.tasks, run.task), (&mut results.methods, run.method)] {
@@ -71,10 +71,15 @@ fn row(task: &str, value: f64, index: u64) -> EvaluationRow {
     }
 }
 
-/// Of an arm with an elbow and a finger that slides; two steps.
-pub(super) fn planted_moves(jerk: f64, sparc: f64) -> Moves {
+/// Returns the metrics of [`motion_of`].
+pub(super) fn fixture_motion(jerk: f64, sparc: f64) -> MotionMetrics {
+    MotionMetrics::of(&motion_of(jerk, sparc))
+}
+
+/// Returns the motion of an arm with an elbow and a sliding finger, over two steps.
+pub(super) fn motion_of(jerk: f64, sparc: f64) -> Motion {
     let joint = |name: &str, kind| Joint { name: name.to_owned(), kind };
-    Moves::of(&Motion {
+    Motion {
         format: 1,
         policy_version: 1,
         env_steps: INTERVAL,
@@ -105,5 +110,5 @@ pub(super) fn planted_moves(jerk: f64, sparc: f64) -> Moves {
             frames: Vec::new(),
             frame_steps: Vec::new(),
         },
-    })
+    }
 }

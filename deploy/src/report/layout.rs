@@ -1,0 +1,36 @@
+//! Parts that the sections of a report consist of.
+
+use serde::Serialize;
+
+use super::results::Results;
+
+/// A drawing.
+#[derive(Debug, Clone, Serialize)]
+pub struct Picture {
+    /// Path in the folder of the report, without the extension.
+    pub path: String,
+    /// Alternative text.
+    pub alt: String,
+    /// The drawing.
+    pub svg: String,
+}
+
+/// A table with cells of several lines, by task and method.
+#[derive(Debug, Clone, Default, Serialize)]
+pub struct Grid {
+    /// Headings of the columns.
+    pub columns: Vec<String>,
+    /// Rows: a task and its cells.
+    pub rows: Vec<(String, Vec<Vec<String>>)>,
+}
+
+impl Grid {
+    /// Makes a cell for each task and method.
+    pub fn of(results: &Results, cell: impl Fn(&str, &str) -> Vec<String>) -> Self {
+        let rows = results.tasks.iter().map(|task| {
+            let cells = results.methods.iter().map(|method| cell(task, method));
+            (task.clone(), cells.collect())
+        });
+        Self { columns: results.methods.clone(), rows: rows.collect() }
+    }
+}
