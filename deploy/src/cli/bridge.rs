@@ -15,11 +15,11 @@ use crate::bridge::wire::HostWelcome;
 use crate::bridge::{Ends, Link, token};
 use crate::capacity;
 use crate::failure::{Outcome, wrong_use};
-use crate::launch::{self, HostPlan, Upstream};
+use crate::launch::{self, Ending, HostPlan, SessionReport, Upstream};
 use crate::run_directory::{
     Manifest, RunDirectory, RunLock, Session, compact_now, random_u64, replace_file, safe_name,
 };
-use crate::terminal::{ProgressStyle, say};
+use crate::terminal::{Display, ProgressStyle, grouped, say};
 
 /// Interval between two join requests.
 const ASK_AGAIN: Duration = Duration::from_millis(500);
@@ -118,7 +118,27 @@ pub(super) fn run(args: &BridgeArgs) -> anyhow::Result<Outcome> {
     };
     let progress = ProgressStyle::from_flag(args.no_progress);
     let (program, session) = (this_program()?, welcome.held.session);
-    launch::host(HostPlan { program, run, lock, config, venv, upstream, session, progress })
+    let mut display = Display::new(progress, config.run.steps).of_host();
+    let plan = HostPlan { program, run, config, venv, upstream, session };
+    let report = launch::host(plan, &mut display)?;
+    drop(lock);
+    conclude(report)
+}
+
+fn conclude(report: SessionReport) -> anyhow::Result<Outcome> {
+    let segments = report.last.as_ref().map_or(0, |progress| progress.segments);
+    let acknowledged = format!("{} segments acknowledged", grouped(segments));
+    match report.ending {
+        Ending::Failed(error) => Err(error),
+        Ending::Interrupted => {
+            say(&format!("left the run: {acknowledged}"));
+            Ok(Outcome::Interrupted)
+        }
+        Ending::Completed => {
+            say(&format!("the run has ended: {acknowledged}"));
+            Ok(Outcome::Done)
+        }
+    }
 }
 
 /// Locks the directory of an earlier bridge and reads its number. With it a restarted bridge gets

@@ -21,6 +21,7 @@ mod record;
 mod report;
 mod resume;
 mod search;
+mod session;
 mod sweep;
 mod tasks;
 mod train;
@@ -42,6 +43,7 @@ use crate::roles::{
 };
 use crate::run_directory::Session;
 use crate::terminal::say;
+pub use session::{TrainingPlan, train_session};
 
 const EXAMPLES: &str = "\
 EXAMPLES

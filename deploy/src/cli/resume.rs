@@ -7,10 +7,10 @@ use dmprl_learner::checkpoint;
 use dmprl_shared::config::Limits;
 
 use super::configuration::refuse;
-use super::{cores, prepare_python, this_program, training_session};
+use super::{TrainingPlan, cores, prepare_python, this_program, train_session, training_session};
 use crate::capacity;
 use crate::failure::{Outcome, wrong_use};
-use crate::launch::{self, SessionPlan, Trial};
+use crate::launch::{self, Trial};
 use crate::run_directory::RunDirectory;
 use crate::terminal::ProgressStyle;
 
@@ -76,7 +76,7 @@ pub(super) fn run(args: &ResumeArgs) -> anyhow::Result<Outcome> {
     if config != written {
         run.write_config(&config)?;
     }
-    launch::session(SessionPlan {
+    train_session(TrainingPlan {
         trial: Trial::default(),
         program: this_program()?,
         run,

@@ -1,4 +1,4 @@
-//! `dmprl train`: from the command line to a run directory, then over to `launch`.
+//! `dmprl train`: from the command line to a run directory, then over to `session`.
 
 use std::io::Read;
 use std::path::{Path, PathBuf};
@@ -15,9 +15,9 @@ use toml::Value;
 
 use super::configuration::{Flag, merge, refuse};
 use super::configured::{ConfiguredArgs, flag, integer, make_absolute, paths};
-use super::{cores, prepare_python, this_program, training_session};
+use super::{TrainingPlan, cores, prepare_python, this_program, train_session, training_session};
 use crate::failure::{Outcome, wrong_use};
-use crate::launch::{self, SessionPlan, Trial};
+use crate::launch::Trial;
 use crate::run_directory::{Manifest, PolicyChoice, RunDirectory, compact, safe_name};
 use crate::terminal::ProgressStyle;
 use crate::{bench, capacity};
@@ -117,7 +117,7 @@ pub(super) fn run(args: &TrainArgs) -> anyhow::Result<Outcome> {
     let manifest = Manifest::begin(init_from.map(|path| path.display().to_string()), session)?;
     let run = RunDirectory::create(&path, &config, &manifest)?;
     let lock = run.lock(Duration::ZERO)?;
-    launch::session(SessionPlan {
+    train_session(TrainingPlan {
         program: this_program()?,
         run,
         lock,

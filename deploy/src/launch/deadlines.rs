@@ -17,7 +17,7 @@ const STANDSTILL: Duration = Duration::from_secs(5);
 /// A supervisor that is so late cannot tell a worker that hangs from one that stood still with it.
 const LATE: Duration = Duration::from_secs(1);
 
-impl Supervisor {
+impl Supervisor<'_> {
     pub(super) fn next_deadline(&self) -> Instant {
         let mut deadlines = vec![Instant::now() + IDLE];
         match self.phase {
@@ -132,7 +132,7 @@ impl Supervisor {
         if !self.finished {
             bail!("{} did not come to its end within {limit:?}: killed it", self.hub());
         }
-        self.display.message(&format!("{} did not exit within {limit:?}: killed it", self.hub()));
+        self.message(&format!("{} did not exit within {limit:?}: killed it", self.hub()));
         // Its exit follows; until then no second message.
         self.phase = Phase::Finishing { deadline: now + self.limits.kill };
         Ok(())
@@ -192,7 +192,7 @@ impl Supervisor {
             }
             // Its exit counts as one more death. Until that event, it is late only once.
             running.spawned = now;
-            self.display.message(&format!("{process} was not ready within {limit:?}: killed it"));
+            self.message(&format!("{process} was not ready within {limit:?}: killed it"));
         }
         Ok(())
     }
@@ -203,7 +203,7 @@ impl Supervisor {
         }
         // Sent again when the evaluator is back, with a deadline of its own.
         self.evaluations.send_again();
-        self.display.message("the evaluation takes too long: killing the evaluator");
+        self.message("the evaluation takes too long: killing the evaluator");
         let evaluator = self.slots.get_mut(&Process::Evaluator);
         if let Some(running) = evaluator.and_then(|slot| slot.running.as_mut()) {
             running.kill_for(Death::too_slow("an evaluation took too long".to_owned()));

@@ -61,7 +61,7 @@ impl Display for Death {
     }
 }
 
-impl Supervisor {
+impl Supervisor<'_> {
     pub(super) fn on_exit(&mut self, process: Process, status: ExitStatus) -> anyhow::Result<()> {
         let ended = self.slots.get_mut(&process).and_then(|slot| slot.running.take());
         let was_ready = ended.as_ref().is_some_and(|running| running.ready);
@@ -69,7 +69,7 @@ impl Supervisor {
             if process == Process::Learner && was_ready && !self.finished {
                 let cause = if killed { String::new() } else { format!(": {}", describe(status)) };
                 let what = "learner ended without its last checkpoint";
-                self.display.message(&format!("{what}{cause}"));
+                self.message(&format!("{what}{cause}"));
             }
             if self.hub() == Process::Relay {
                 // It stays until the last worker is gone, whose last segment may come yet.
@@ -85,7 +85,7 @@ impl Supervisor {
         match process {
             Process::Learner | Process::Relay if self.finished => {
                 if !status.success() {
-                    self.display.message(&format!("{process} ended with {}", describe(status)));
+                    self.message(&format!("{process} ended with {}", describe(status)));
                 }
                 self.complete_if_done();
                 Ok(())
@@ -142,7 +142,7 @@ impl Supervisor {
         self.hosts.clear();
         let restarts_max = self.config.supervision.learner_restarts_max;
         if self.phase == Phase::Training && !self.restart(Process::Gateway, death, restarts_max) {
-            self.display.message(&format!(
+            self.message(&format!(
                 "gateway {death}: giving up on it after {restarts_max} restarts; the run goes on \
                  without other hosts{}",
                 log_tail(&self.log_path(Process::Gateway))
@@ -184,7 +184,7 @@ impl Supervisor {
                 .context("no worker is left: each has died more often than actors.restarts_max"));
         }
         let restarts = self.slots.get(&process).map_or(0, |slot| slot.restarts);
-        self.display.message(&format!(
+        self.message(&format!(
             "{process} {death} again: giving up on it after {restarts} restarts, going on with \
              {left} of {} workers{}",
             self.config.actors.workers + self.joined(),
@@ -214,10 +214,10 @@ impl Supervisor {
         let wait = self.limits.back_off(slot.restarts);
         slot.restarts += 1;
         slot.restart_at = Some(Instant::now() + wait);
+        let restarts = slot.restarts;
         self.worker_restarts += u64::from(matches!(process, Process::Actor(_)));
-        self.display.message(&format!(
-            "{process} {death}: restart {} of {restarts_max} in {:.1} s; log: {log}",
-            slot.restarts,
+        self.message(&format!(
+            "{process} {death}: restart {restarts} of {restarts_max} in {:.1} s; log: {log}",
             wait.as_secs_f64(),
         ));
         true

@@ -15,7 +15,7 @@ use crate::terminal::shown;
 /// The directory is looked for at least so often, and whenever something is heard: one `stat`.
 const DOMAIN_LOOK: Duration = Duration::from_secs(1);
 
-impl Supervisor {
+impl Supervisor<'_> {
     /// When to look again, while there is anything to look for.
     pub(super) fn next_look_at_domain(&self, now: Instant) -> Option<Instant> {
         self.launcher.domain.as_ref().filter(|_| self.needs_domain()).map(|_| now + DOMAIN_LOOK)

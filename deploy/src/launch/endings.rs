@@ -11,7 +11,7 @@ use crate::control::Command;
 /// Two interrupts so close together count as one.
 const INTERRUPT_GAP: Duration = Duration::from_millis(100);
 
-impl Supervisor {
+impl Supervisor<'_> {
     /// Turns an error into the end of the run.
     pub(super) fn check(&mut self, result: anyhow::Result<()>) {
         if let Err(error) = result {
@@ -22,7 +22,7 @@ impl Supervisor {
     /// Ends the run because it cannot go on; the learner, if it lives, writes a checkpoint.
     fn fail(&mut self, error: Error) {
         if self.failure.is_some() || self.interrupts > 0 {
-            self.display.message(&format!("while stopping: {error:#}"));
+            self.message(&format!("while stopping: {error:#}"));
             return;
         }
         self.failure = Some(error);
@@ -33,7 +33,7 @@ impl Supervisor {
     /// Asks the learner to come to its end before its time.
     pub(super) fn drain(&mut self, reason: &str) {
         if self.phase == Phase::Training {
-            self.display.message(&format!("{reason}: coming to an end"));
+            self.message(&format!("{reason}: coming to an end"));
             self.phase = Phase::Draining { deadline: Instant::now() + self.limits.drain };
             self.send(self.hub(), Command::Finish);
         }
@@ -80,7 +80,7 @@ impl Supervisor {
                     _ if self.finished => "skipping evaluations",
                     _ => "writing a checkpoint",
                 };
-                self.display.message(&format!("interrupted: {what} (once more: stop at once)"));
+                self.message(&format!("interrupted: {what} (once more: stop at once)"));
                 self.stop(self.limits.stop);
             }
             2 => self.kill_all("interrupted twice"),
@@ -112,7 +112,7 @@ impl Supervisor {
         let names: Vec<String> =
             self.all_running().map(|(process, _)| process.to_string()).collect();
         if !names.is_empty() {
-            self.display.message(&format!("{reason}: killed {}", names.join(", ")));
+            self.message(&format!("{reason}: killed {}", names.join(", ")));
         }
         self.all_running().for_each(|(_, running)| running.child.kill());
         self.phase = Phase::Stopping { deadline: Instant::now() + self.limits.kill, killed: true };

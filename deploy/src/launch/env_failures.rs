@@ -6,14 +6,14 @@ use super::supervisor::Supervisor;
 use crate::control::{Command, HostNow, WorkersNow};
 use crate::terminal::grouped;
 
-impl Supervisor {
+impl Supervisor<'_> {
     /// Shows the first failure and then whenever their number has doubled: an environment that
     /// fails now and then must not fill the terminal. The process's log has each.
     pub(super) fn on_env_failures(&mut self, process: Process, count: u64, last: &str) {
         let before = self.env_failures;
         self.env_failures = before.saturating_add(count);
         if is_told(before, self.env_failures) {
-            self.display.message(&format!(
+            self.message(&format!(
                 "{process}: environment failure {}: {last}; its segment is not used; {}",
                 grouped(self.env_failures),
                 self.log_of(process)
@@ -25,7 +25,7 @@ impl Supervisor {
     /// Its process has said so with its last words; its exit follows.
     pub(super) fn on_env_hung(&mut self, process: Process, message: &str) {
         self.env_failures = self.env_failures.saturating_add(1);
-        self.display.message(&format!("{process}: {message}"));
+        self.message(&format!("{process}: {message}"));
         self.tell_learner_of_counts();
     }
 
@@ -39,15 +39,15 @@ impl Supervisor {
         // A learner that takes no commands is stuck or dying; its deadline or its exit follows.
         let _ = learner
             .child
-            .send(Command::EnvFailures { total: self.before.env_failures + self.env_failures });
-        let mut sent = self.before.sent;
+            .send(Command::EnvFailures { total: self.earlier.env_failures + self.env_failures });
+        let mut sent = self.earlier.sent;
         sent += self.sent;
         let _ = learner.child.send(Command::Sent(sent));
         let of_hosts = |of: fn(&HostNow) -> u64| self.hosts.iter().map(of).sum::<u64>();
         let _ = learner.child.send(Command::Workers(WorkersNow {
             count: self.workers() as u64
                 + of_hosts(|host| if host.here { host.workers } else { 0 }),
-            restarts: self.before.worker_restarts
+            restarts: self.earlier.worker_restarts
                 + self.worker_restarts
                 + of_hosts(|host| host.restarts),
             queued_segments: self.all_running().map(|(_, running)| running.kept).sum::<u64>()

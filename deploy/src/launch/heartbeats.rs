@@ -12,7 +12,7 @@ use super::deaths::Death;
 use super::supervisor::{Phase, Supervisor};
 use crate::control::Report;
 
-impl Supervisor {
+impl Supervisor<'_> {
     /// Notes a sign of life.
     pub(super) fn heard(&mut self, process: Process, report: &Report) {
         let slot = self.slots.get_mut(&process);

@@ -117,7 +117,7 @@ async fn write(stream: &mut UnixStream, line: &impl serde::Serialize) -> anyhow:
     Ok(stream.write_all(&line).await?)
 }
 
-impl Supervisor {
+impl Supervisor<'_> {
     /// Workers that join have the numbers after the run's own.
     pub(super) fn is_joined(&self, process: Process) -> bool {
         matches!(process, Process::Actor(index) if index as usize >= self.config.actors.workers)
@@ -129,7 +129,7 @@ impl Supervisor {
         match self.place_for(&newcomer.request) {
             Ok(welcome) => self.take_in(newcomer, welcome),
             Err(reason) => {
-                self.display.message(&format!("process {id} may not join: {reason}"));
+                self.message(&format!("process {id} may not join: {reason}"));
                 newcomer.refuse(reason);
             }
         }
@@ -144,7 +144,7 @@ impl Supervisor {
                 slot.running = Some(Running::new(child));
             }
             Err(error) => {
-                self.display.message(&format!("process {id} could not join: {error:#}"));
+                self.message(&format!("process {id} could not join: {error:#}"));
             }
         }
     }
@@ -222,7 +222,7 @@ impl Supervisor {
             None if left => "has left".to_owned(),
             None => "died (its own terminal may say why)".to_owned(),
         };
-        self.display.message(&format!("{process}, which had joined, {how}: {}", self.counted()));
+        self.message(&format!("{process}, which had joined, {how}: {}", self.counted()));
         ensure!(
             self.workers_left() > 0,
             "no worker is left: those that had joined are gone too{}",

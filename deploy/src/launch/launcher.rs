@@ -9,7 +9,7 @@ use std::time::SystemTime;
 
 use anyhow::Context;
 
-use crate::roles::ObserverArgs;
+use super::ObservationPlan;
 use crate::run_directory::{RunDirectory, rfc3339};
 
 /// Incarnations that one session of the run has for each worker; a segment's sender is thus
@@ -184,18 +184,18 @@ impl Launcher {
     ///
     /// # Errors
     /// The log cannot be opened.
-    pub fn observe(&self, args: &ObserverArgs) -> anyhow::Result<Command> {
+    pub fn observe(&self, plan: &ObservationPlan<'_>) -> anyhow::Result<Command> {
         let mut command = Command::new(&self.program);
-        command.arg("observer").arg("--run").arg(&args.run);
+        command.arg("observer").arg("--run").arg(plan.run.path());
         for (flag, number) in [
-            ("--policy", args.policy),
-            ("--first-seed", args.first_seed),
-            ("--episodes", args.episodes),
+            ("--policy", plan.policy_version),
+            ("--first-seed", plan.first_seed),
+            ("--episodes", plan.episodes),
         ] {
             command.args([flag, &number.to_string()]);
         }
-        command.arg("--output").arg(&args.output);
-        if let Some(pictures) = &args.pictures {
+        command.arg("--output").arg(&plan.output);
+        if let Some(pictures) = &plan.pictures {
             command.arg("--pictures").arg(pictures);
         }
         if let Some(venv) = &self.venv {

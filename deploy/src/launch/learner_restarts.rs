@@ -10,7 +10,7 @@ use super::supervisor::Supervisor;
 /// Exit status of a program that panicked.
 const PANIC_STATUS: i32 = 101;
 
-impl Supervisor {
+impl Supervisor<'_> {
     /// Starts another after a pause: from the newest usable checkpoint, or else from the beginning.
     /// Workers wait meanwhile and keep what they have sent. A learner that ended by itself gave a
     /// reason that another start does not mend.
@@ -57,7 +57,7 @@ impl Supervisor {
         if self.hub() == Process::Relay {
             return Ok(());
         }
-        self.launcher.learner_restarts = self.before.learner_restarts + self.learner_restarts;
+        self.launcher.learner_restarts = self.earlier.learner_restarts + self.learner_restarts;
         self.launcher.resume = self.launcher.run.has_checkpoint()?;
         if !self.launcher.resume {
             self.launcher.run.begin_again()?;

@@ -7,7 +7,6 @@ use super::conversation::{Conversation, Turn};
 use super::{Launcher, TimeLimits};
 use crate::control::Report;
 use crate::failure::Outcome;
-use crate::roles::ObserverArgs;
 use crate::run_directory::RunDirectory;
 
 /// What to observe.
@@ -24,7 +23,7 @@ pub struct ObservationPlan<'a> {
     pub first_seed: u64,
     /// How many.
     pub episodes: u64,
-    /// The file to write, which [`crate::motion::Recorded`] reads.
+    /// The file of episodes that the observer writes.
     pub output: PathBuf,
     /// A folder for frames, if they are wanted.
     pub pictures: Option<PathBuf>,
@@ -36,16 +35,9 @@ pub struct ObservationPlan<'a> {
 /// # Errors
 /// The observer died or took too long.
 pub fn observe(plan: ObservationPlan<'_>, progress: &dyn Fn(u64, u64)) -> anyhow::Result<Outcome> {
-    let launcher = Launcher::outside_training(plan.program, plan.run, plan.venv);
-    let command = launcher.observe(&ObserverArgs {
-        run: plan.run.path().to_owned(),
-        policy: plan.policy_version,
-        first_seed: plan.first_seed,
-        episodes: plan.episodes,
-        output: plan.output,
-        pictures: plan.pictures,
-        venv: None,
-    })?;
+    let program = plan.program.clone();
+    let launcher = Launcher::outside_training(program, plan.run, plan.venv.clone());
+    let command = launcher.observe(&plan)?;
     // A report follows each call into the environment, over which the watchdog watches.
     let seconds = plan.run.config()?.actors.env_call_timeout_s;
     let call = Duration::try_from_secs_f64(seconds).unwrap_or(Duration::MAX);

@@ -2,23 +2,22 @@
 
 use std::time::{Duration, Instant};
 
-use super::Process;
 use super::supervisor::{Slot, Supervisor};
+use super::{Process, ProcessLine, RunEvent};
 use crate::control::{Doing, HostNow};
 use crate::run_directory::ProcessState;
-use crate::terminal::ProcessLine;
 
 /// Between two redraws; a worker gives a sign of life a second, so that each is an occasion.
 const REDRAW_EVERY: Duration = Duration::from_millis(500);
 
-impl Supervisor {
+impl Supervisor<'_> {
     /// Redraws the live display: what dies, starts or waits is no progress, and is seen all the
     /// same.
     pub(super) fn refresh(&mut self, now: Instant) {
-        if self.display.is_live() && now.duration_since(self.drawn) >= REDRAW_EVERY {
+        if self.shows_processes() && now.duration_since(self.drawn) >= REDRAW_EVERY {
             self.drawn = now;
             let processes = self.overview(now);
-            self.display.refresh(&processes);
+            self.tell(RunEvent::Processes(processes));
         }
     }
 
@@ -82,12 +81,13 @@ impl Supervisor {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::launch::reports::tests::supervisor;
+    use crate::launch::reports::tests::{Unwatched, supervisor};
 
     #[test]
     fn what_is_dead_says_when_it_comes_back() {
         let folder = tempfile::tempdir().unwrap();
-        let mut supervisor = supervisor(folder.path());
+        let mut observer = Unwatched;
+        let mut supervisor = supervisor(folder.path(), &mut observer);
         let now = Instant::now();
         let dead =
             Slot { starts: 3, restart_at: Some(now + Duration::from_secs(4)), ..Slot::default() };

@@ -10,7 +10,7 @@ use crate::run_directory::{ProcessRow, ProcessState, Processes};
 /// Between two times that the table is written. Workers speak once a second.
 const INTERVAL: Duration = Duration::from_secs(2);
 
-impl Supervisor {
+impl Supervisor<'_> {
     /// Writes the table when it is due. A run without one is not watched as well, and goes on.
     pub(super) fn tell_processes(&mut self, now: Instant) {
         if self.processes_due.is_none_or(|due| now < due) {
@@ -32,7 +32,7 @@ impl Supervisor {
         let rows = rows.chain(self.hosts.iter().map(host_row));
         let table = Processes::new(ended, self.started.elapsed().as_secs_f64(), rows.collect());
         if let Err(error) = self.launcher.run.write_processes(&table) {
-            self.display.message(&format!("warning: {error:#}; the run goes on without this file"));
+            self.message(&format!("warning: {error:#}; the run goes on without this file"));
             self.processes_due = None;
         }
     }

@@ -5,16 +5,16 @@ use std::time::Instant;
 use anyhow::{bail, ensure};
 use dmprl_shared::spec::EnvSpec;
 
-use super::Process;
 use super::child::Event;
 use super::supervisor::{Phase, Supervisor};
+use super::{Process, RunEvent};
 use crate::control::{Command, EvaluationRequest, EvaluationRow, Progress, Report};
 use crate::terminal::{grouped, shown};
 
 /// Lines that are no reports, shown to the user; the rest is only counted.
 const GARBAGE_SHOWN_MAX: u32 = 3;
 
-impl Supervisor {
+impl Supervisor<'_> {
     pub(super) fn on_event(&mut self, event: Event) -> anyhow::Result<()> {
         match event {
             Event::Report(process, report) => {
@@ -35,7 +35,7 @@ impl Supervisor {
                 self.garbage += 1;
                 if self.garbage <= GARBAGE_SHOWN_MAX {
                     let line: String = line.escape_debug().take(200).collect();
-                    self.display.message(&format!("{process} wrote what is no report: {line}"));
+                    self.message(&format!("{process} wrote what is no report: {line}"));
                 }
                 Ok(())
             }
@@ -58,7 +58,7 @@ impl Supervisor {
                         format!("first environment step after {seconds:.1} s")
                     }
                 };
-                self.display.message(&message);
+                self.message(&message);
             }
             Report::Progress(progress) => self.on_progress(progress),
             Report::Evaluate(request) => self.on_evaluate(request),
@@ -91,14 +91,14 @@ impl Supervisor {
                 self.checkpointed = true;
                 self.worked(process);
                 let steps = grouped(env_steps);
-                self.display.message(&format!("checkpoint {name} at {steps} steps"));
+                self.message(&format!("checkpoint {name} at {steps} steps"));
             }
             Report::Finished => {
                 let regular = process == self.hub() && self.learner_ready;
                 ensure!(regular, "{process} reported `finished` before `learner_ready`");
                 self.on_finished();
             }
-            Report::Warning { message } => self.display.message(&format!("{process}: {message}")),
+            Report::Warning { message } => self.message(&format!("{process}: {message}")),
         }
         Ok(())
     }
@@ -169,7 +169,7 @@ impl Supervisor {
         let rows = self.launcher.run.evaluations()?;
         let returns = rows.iter().map(|row| row.return_mean);
         self.best_return = returns.fold(f64::NEG_INFINITY, f64::max);
-        self.display.begin_with(rows);
+        self.tell(RunEvent::Rewound { evaluations: rows });
         Ok(())
     }
 
@@ -188,7 +188,7 @@ impl Supervisor {
                 running.attached = true;
             }
             if self.is_joined(process) {
-                self.display.message(&format!("{process} has joined: {}", self.counted()));
+                self.message(&format!("{process} has joined: {}", self.counted()));
             }
             self.tell_learner_of_counts();
         }
@@ -202,9 +202,9 @@ impl Supervisor {
         }
         self.checkpointed = false;
         self.tell_learner_of_counts();
-        let processes = if self.display.is_live() { self.overview(now) } else { Vec::new() };
+        let processes = if self.shows_processes() { self.overview(now) } else { Vec::new() };
         self.drawn = now;
-        self.display.progress(&progress, &processes);
+        self.tell(RunEvent::Progress { progress: progress.clone(), processes });
         if self.first.is_none() {
             self.first = Some((now, progress.clone()));
         }
@@ -217,7 +217,7 @@ impl Supervisor {
             return;
         }
         if let Some(skipped) = self.evaluations.push(request) {
-            self.display.message(&format!(
+            self.message(&format!(
                 "the evaluator is too far behind: skipping the evaluation at {} steps",
                 grouped(skipped.env_steps)
             ));
@@ -240,9 +240,9 @@ impl Supervisor {
             return Ok(());
         }
         self.on_answer(process, row.policy_version)?;
-        let best = row.return_mean > self.best_return;
+        let is_best = row.return_mean > self.best_return;
         self.best_return = self.best_return.max(row.return_mean);
-        self.display.evaluation(&row, best);
+        self.tell(RunEvent::Evaluated { row: row.clone(), is_best });
         let run = &self.config.run;
         let reached = if row.return_mean >= run.until_return {
             Some(format!("the return has reached {}", run.until_return))
@@ -270,7 +270,7 @@ impl Supervisor {
             return Ok(());
         }
         self.on_answer(process, policy_version)?;
-        self.display.message(&format!(
+        self.message(&format!(
             "no evaluation of policy {policy_version}, the run goes on: {reason}; log: {}",
             shown(&self.log_path(process))
         ));
@@ -306,11 +306,19 @@ pub(super) mod tests {
     use tokio::sync::mpsc;
 
     use super::*;
-    use crate::launch::{Launcher, TimeLimits};
+    use crate::launch::{EarlierSessions, Launcher, RunObserver, SupervisorPlan, TimeLimits};
     use crate::run_directory::{Manifest, RunDirectory};
-    use crate::terminal::Display;
 
-    pub(in crate::launch) fn supervisor(folder: &std::path::Path) -> Supervisor {
+    pub(in crate::launch) struct Unwatched;
+
+    impl RunObserver for Unwatched {
+        fn on_event(&mut self, _event: RunEvent) {}
+    }
+
+    pub(in crate::launch) fn supervisor<'a>(
+        folder: &std::path::Path,
+        observer: &'a mut dyn RunObserver,
+    ) -> Supervisor<'a> {
         let config = ExperimentConfig::default();
         let manifest = Manifest::new(None).unwrap();
         let launcher = Launcher {
@@ -325,15 +333,22 @@ pub(super) mod tests {
             journal: None,
             upstream: None,
         };
-        let display = Display::lines(Box::new(std::io::sink()), 1);
-        Supervisor::new((launcher, config, TimeLimits::default()), display, mpsc::channel(1).0)
+        let plan = SupervisorPlan {
+            launcher,
+            config,
+            limits: TimeLimits::default(),
+            earlier: EarlierSessions::default(),
+            interrupts: mpsc::channel(1).1,
+        };
+        Supervisor::new(plan, observer, mpsc::channel(1).0)
     }
 
     /// Killed with the learner, an evaluator may have answered already; that once ended the run.
     #[test]
     fn an_answer_to_a_dead_learner_is_passed_over_and_one_that_nobody_asked_for_is_a_fault() {
         let folder = tempfile::tempdir().unwrap();
-        let mut supervisor = supervisor(folder.path());
+        let mut observer = Unwatched;
+        let mut supervisor = supervisor(folder.path(), &mut observer);
         let not_evaluated =
             || Report::NotEvaluated { policy_version: 7, reason: "a broken arm".to_owned() };
         let answer = || Event::Report(Process::Evaluator, not_evaluated());

@@ -4,8 +4,6 @@ use std::collections::BTreeMap;
 use std::time::{Duration, Instant};
 
 use anyhow::{Context, Error};
-use dmprl_learner::checkpoint;
-use dmprl_learner::learner::Counters;
 use dmprl_shared::config::ExperimentConfig;
 use dmprl_shared::spec::EnvSpec;
 use dmprl_shared::transport::delivery::Sent;
@@ -14,9 +12,8 @@ use tokio::sync::mpsc;
 use super::child::{Child, EVENTS_MAX, Event};
 use super::deaths::Death;
 use super::evaluations::EvaluationQueue;
-use super::{Launcher, Process, TimeLimits, joining};
+use super::{Launcher, Process, RunEvent, RunObserver, TimeLimits, joining};
 use crate::control::{Command, Doing, EvaluationRow, HostNow, Progress};
-use crate::terminal::Display;
 
 /// What the supervisor needs to know.
 pub struct SupervisorPlan {
@@ -26,10 +23,24 @@ pub struct SupervisorPlan {
     pub config: ExperimentConfig,
     /// How long it waits for what.
     pub limits: TimeLimits,
-    /// What the user sees.
-    pub display: Display,
+    /// Counts of earlier sessions of the run.
+    pub earlier: EarlierSessions,
     /// One item an interrupt.
     pub interrupts: mpsc::Receiver<()>,
+}
+
+/// Counts of a run's earlier sessions, as its newest checkpoint has them. The supervisor adds those
+/// of its own session.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub struct EarlierSessions {
+    /// Failures of environments.
+    pub env_failures: u64,
+    /// Segments that workers have produced, sent and had acknowledged.
+    pub sent: Sent,
+    /// Restarts of the learner after a death.
+    pub learner_restarts: u64,
+    /// Restarts of workers after a death.
+    pub worker_restarts: u64,
 }
 
 /// How a session ended.
@@ -137,11 +148,11 @@ impl Running {
     }
 }
 
-pub(super) struct Supervisor {
+pub(super) struct Supervisor<'a> {
     pub(super) launcher: Launcher,
     pub(super) config: ExperimentConfig,
     pub(super) limits: TimeLimits,
-    pub(super) display: Display,
+    observer: &'a mut dyn RunObserver,
     pub(super) events: mpsc::Sender<Event>,
     pub(super) slots: BTreeMap<Process, Slot>,
     pub(super) phase: Phase,
@@ -171,8 +182,7 @@ pub(super) struct Supervisor {
     pub(super) drawn: Instant,
     pub(super) best_return: f64,
     pub(super) last_row: Option<EvaluationRow>,
-    /// Where the run stood when this session began.
-    pub(super) before: Counters,
+    pub(super) earlier: EarlierSessions,
     /// Other hosts that take part, as the gateway says.
     pub(super) hosts: Vec<HostNow>,
     /// Failures of environments in this session, and what its workers did.
@@ -192,11 +202,12 @@ enum Wake {
 }
 
 /// Runs the processes of one session until all of them have ended.
-pub async fn supervise(plan: SupervisorPlan) -> SessionReport {
-    let SupervisorPlan { launcher, config, limits, display, mut interrupts } = plan;
+pub async fn supervise(mut plan: SupervisorPlan, observer: &mut dyn RunObserver) -> SessionReport {
+    let (_, unused) = mpsc::channel(1);
+    let mut interrupts = std::mem::replace(&mut plan.interrupts, unused);
     let (events, mut incoming) = mpsc::channel(EVENTS_MAX);
     let mut woke = Instant::now();
-    let mut supervisor = Supervisor::new((launcher, config, limits), display, events);
+    let mut supervisor = Supervisor::new(plan, observer, events);
     let started = supervisor.start();
     supervisor.check(started);
     while !supervisor.is_over() {
@@ -232,20 +243,21 @@ pub async fn supervise(plan: SupervisorPlan) -> SessionReport {
     supervisor.report()
 }
 
-impl Supervisor {
+impl<'a> Supervisor<'a> {
     /// Nothing is started yet. What happens to children comes through the other end of `events`.
     pub(super) fn new(
-        (launcher, config, limits): (Launcher, ExperimentConfig, TimeLimits),
-        display: Display,
+        plan: SupervisorPlan,
+        observer: &'a mut dyn RunObserver,
         events: mpsc::Sender<Event>,
     ) -> Self {
+        let SupervisorPlan { launcher, config, limits, earlier, .. } = plan;
         let now = Instant::now();
         let limit = limits.evaluation_of(config.evaluation.episodes_max());
         Self {
             launcher,
             config,
             limits,
-            display,
+            observer,
             events,
             slots: BTreeMap::new(),
             phase: Phase::Training,
@@ -269,13 +281,27 @@ impl Supervisor {
             drawn: now,
             best_return: f64::NEG_INFINITY,
             last_row: None,
-            before: Counters::default(),
+            earlier,
             hosts: Vec::new(),
             env_failures: 0,
             sent: Sent::default(),
             worker_restarts: 0,
             processes_due: Some(now),
         }
+    }
+
+    /// Passes an event to the observer.
+    pub(super) fn tell(&mut self, event: RunEvent) {
+        self.observer.on_event(event);
+    }
+
+    /// Passes a message for the user to the observer.
+    pub(super) fn message(&mut self, text: &str) {
+        self.tell(RunEvent::Message(text.to_owned()));
+    }
+
+    pub(super) fn shows_processes(&self) -> bool {
+        self.observer.shows_processes()
     }
 
     fn take(&mut self, event: Event) {
@@ -287,7 +313,6 @@ impl Supervisor {
     fn start(&mut self) -> anyhow::Result<()> {
         let run = &self.launcher.run;
         self.spec = run.spec()?;
-        self.before = checkpoint::counters(&run.checkpoints_path())?.pop().unwrap_or_default();
         self.best_return = run.best_row()?.map_or(f64::NEG_INFINITY, |row| row.return_mean);
         if self.is_one_process() || self.spec.is_some() {
             self.spawn(self.hub())?;
@@ -295,13 +320,13 @@ impl Supervisor {
         if self.is_one_process() {
             return Ok(());
         }
-        let actors = &self.config.actors;
-        if let Some(domain) = self.launcher.domain.as_ref().filter(|_| actors.joined_max > 0)
+        let workers = u32::try_from(self.config.actors.workers).context("too many workers")?;
+        let joined_max = self.config.actors.joined_max;
+        if let Some(domain) = self.launcher.domain.as_ref().filter(|_| joined_max > 0)
             && let Err(error) = joining::listen(domain, self.events.clone())
         {
-            self.display.message(&format!("warning: nobody can join this run: {error:#}"));
+            self.message(&format!("warning: nobody can join this run: {error:#}"));
         }
-        let workers = u32::try_from(actors.workers).context("too many workers")?;
         (0..workers).try_for_each(|index| self.spawn(Process::Actor(index)))
     }
 
@@ -344,7 +369,7 @@ impl Supervisor {
     pub(super) fn send(&mut self, process: Process, command: Command) {
         let sent = self.running(process).is_none_or(|running| running.child.send(command));
         if !sent {
-            self.display.message(&format!("{process} takes no commands"));
+            self.message(&format!("{process} takes no commands"));
         }
     }
 
@@ -354,7 +379,7 @@ impl Supervisor {
     }
 
     fn report(mut self) -> SessionReport {
-        self.display.close();
+        self.tell(RunEvent::Ended);
         let ending = match self.failure {
             Some(error) => Ending::Failed(error),
             None if self.interrupts > 0 => Ending::Interrupted,

@@ -6,10 +6,10 @@ use std::time::{Duration, Instant};
 use indicatif::{ProgressBar, ProgressStyle as BarStyle};
 
 use super::format::{duration, grouped, plus_minus};
-use super::panel::{
-    Panel, ProcessLine, SEPARATOR, Scope, speed, terminal_size, trouble, whole_items,
-};
+use super::panel::{Panel, SEPARATOR, Scope, speed, terminal_size, trouble, whole_items};
+use super::summary::shown;
 use crate::control::{EvaluationRow, Progress};
+use crate::launch::{ProcessLine, RunEvent, RunObserver};
 
 /// Interval between two plain lines.
 const LINE_EVERY: Duration = Duration::from_secs(5);
@@ -93,26 +93,20 @@ impl Display {
     }
 
     /// Returns true if there is a panel with the processes.
-    #[must_use]
-    pub fn is_live(&self) -> bool {
+    fn is_live(&self) -> bool {
         matches!(self.target, Target::Bar(_))
     }
 
     /// Updates the processes between two reports of progress.
-    pub fn refresh(&mut self, processes: &[ProcessLine]) {
+    fn refresh(&mut self, processes: &[ProcessLine]) {
         if self.is_live() {
             let last = std::mem::take(&mut self.last);
             self.progress(&last, processes);
         }
     }
 
-    /// Sets the evaluations of a resumed run, which replace those shown so far.
-    pub fn begin_with(&mut self, evaluations: Vec<EvaluationRow>) {
-        self.evaluations = evaluations;
-    }
-
     /// Prints a message above the bar.
-    pub fn message(&mut self, text: &str) {
+    fn message(&mut self, text: &str) {
         match &mut self.target {
             Target::Bar(bar) => bar.suspend(|| super::say(text)),
             Target::Lines(writer) => write_line(writer, text),
@@ -120,7 +114,7 @@ impl Display {
     }
 
     /// Shows the learner's progress and, if there is a panel, the processes.
-    pub fn progress(&mut self, progress: &Progress, processes: &[ProcessLine]) {
+    fn progress(&mut self, progress: &Progress, processes: &[ProcessLine]) {
         let (steps, figures) = (self.steps(progress), self.figures(progress));
         self.last = progress.clone();
         match &mut self.target {
@@ -148,7 +142,7 @@ impl Display {
     }
 
     /// Shows an evaluation, and stores it for the progress.
-    pub fn evaluation(&mut self, row: &EvaluationRow, best: bool) {
+    fn evaluation(&mut self, row: &EvaluationRow, best: bool) {
         let figure = plus_minus(&row.returns);
         let success = row
             .success_rate
@@ -163,7 +157,7 @@ impl Display {
     }
 
     /// Removes the bar.
-    pub fn close(&mut self) {
+    fn close(&mut self) {
         if let Target::Bar(bar) = &self.target {
             bar.finish_and_clear();
         }
@@ -193,6 +187,31 @@ impl Display {
         parts.extend(speed(progress, self.scope));
         parts.extend(trouble(progress));
         parts.join(SEPARATOR)
+    }
+}
+
+impl RunObserver for Display {
+    fn on_event(&mut self, event: RunEvent) {
+        match event {
+            RunEvent::Started { title, run, learner, evaluations } => {
+                self.evaluations = evaluations;
+                let run = shown(&run);
+                self.message(&match learner {
+                    None => format!("training {title} in {run}"),
+                    Some(endpoint) => format!("{title} for the learner at {endpoint}, in {run}"),
+                });
+            }
+            RunEvent::Rewound { evaluations } => self.evaluations = evaluations,
+            RunEvent::Message(text) => self.message(&text),
+            RunEvent::Progress { progress, processes } => self.progress(&progress, &processes),
+            RunEvent::Processes(processes) => self.refresh(&processes),
+            RunEvent::Evaluated { row, is_best } => self.evaluation(&row, is_best),
+            RunEvent::Ended => self.close(),
+        }
+    }
+
+    fn shows_processes(&self) -> bool {
+        self.is_live()
     }
 }
 

@@ -16,7 +16,6 @@ mod trial;
 pub use count::CountProgress;
 pub use display::{Display, ProgressStyle};
 pub use format::{binary_bytes, duration, grouped, plus_minus, std_of};
-pub use panel::ProcessLine;
 pub use rounds::RoundsProgress;
 pub use setup::SetupProgress;
 pub use stages::StagesProgress;
