@@ -9,7 +9,7 @@ use std::time::{Duration, Instant};
 
 use dmprl_shared::parameters::ParameterSnapshot;
 use dmprl_shared::segment::SegmentHeader;
-use dmprl_shared::supervision::{Command, Doing, Report, Supervisor};
+use dmprl_shared::supervision::{Activity, Command, Report, Supervisor};
 use dmprl_shared::transport::delivery::{Acknowledgements, Mark, Outbox, Sent};
 use dmprl_shared::transport::shared_memory::{self, Plan};
 use dmprl_shared::transport::{
@@ -66,7 +66,7 @@ pub fn await_learner(
         if supervisor.stop_requested() {
             return Ok(None);
         }
-        supervisor.heartbeat(Doing::Attaching);
+        supervisor.heartbeat(Activity::Attaching);
         if let Some(Command::Attach { domain }) = supervisor.next_command(COMMAND_WAIT) {
             return attach(supervisor, &domain, plan, index);
         }
@@ -85,7 +85,7 @@ pub fn attach(
 ) -> Result<Option<shared_memory::WorkerEnd>, DeliveryError> {
     let deadline = Instant::now() + ATTACH_LIMIT;
     loop {
-        supervisor.heartbeat(Doing::Attaching);
+        supervisor.heartbeat(Activity::Attaching);
         match shared_memory::attach(domain, plan, index as usize) {
             Ok(end) => return Ok(Some(end)),
             Err(error @ TransportError::Incompatible { .. }) => return Err(error.into()),
@@ -235,7 +235,7 @@ impl<'a, T: WorkerTransport> Delivery<'a, T> {
                 self.warn(format!("worker {} has waited {seconds} s: {why}", self.index()));
             }
             self.take_acknowledgements()?;
-            self.supervisor.heartbeat(Doing::Waiting);
+            self.supervisor.heartbeat(Activity::Waiting);
             std::thread::sleep(pause);
             pause = (pause * 2).min(FULL_QUEUE_PAUSE_MAX);
         }
@@ -254,7 +254,7 @@ impl<'a, T: WorkerTransport> Delivery<'a, T> {
                 return Ok(());
             }
             self.outbox.offer(&mut self.end.segments)?;
-            self.supervisor.heartbeat(Doing::Waiting);
+            self.supervisor.heartbeat(Activity::Waiting);
             std::thread::sleep(FULL_QUEUE_PAUSE_MAX);
         }
     }
@@ -350,7 +350,7 @@ mod tests {
         let warnings = supervisor.warnings();
         assert_eq!(warnings.len(), 1, "{warnings:?}");
         assert!(warnings[0].contains("the learner takes nothing from its full queue"));
-        assert!(supervisor.heartbeats().iter().all(|doing| *doing == Doing::Waiting));
+        assert!(supervisor.heartbeats().iter().all(|doing| *doing == Activity::Waiting));
         let sent = delivery.sent();
         assert_eq!((sent.produced, sent.sent, sent.acked), (3, 2, 0));
     }

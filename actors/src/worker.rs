@@ -10,7 +10,7 @@ use std::time::{Duration, Instant};
 
 use dmprl_shared::config::{ExperimentConfig, Hindsight};
 use dmprl_shared::seeds;
-use dmprl_shared::supervision::{Doing, Report, ReportError, Supervisor};
+use dmprl_shared::supervision::{Activity, Report, ReportError, Supervisor};
 use dmprl_shared::transport::delivery::{Outbox, Sent};
 use dmprl_shared::transport::shared_memory::Plan;
 use dmprl_shared::transport::{WorkerEnd, WorkerTransport};
@@ -127,7 +127,7 @@ fn work<T: WorkerTransport>(
     guest: Option<&Guest<'_>>,
 ) -> Result<(), WorkerError> {
     while !supervisor.stop_requested() {
-        supervisor.heartbeat(Doing::Stepping);
+        supervisor.heartbeat(Activity::Stepping);
         delivery.take_newest_policy(&mut rollout.snapshot)?;
         let stepped = rollout.segment::<WorkerError>(&mut |header, block| {
             delivery.deliver(header, block).map_err(Into::into)
@@ -171,7 +171,7 @@ fn await_first_policy<T: WorkerTransport>(
         if Instant::now() >= deadline {
             return Err(WorkerError::NoPolicy { index: delivery.index() });
         }
-        supervisor.heartbeat(Doing::Attaching);
+        supervisor.heartbeat(Activity::Attaching);
         std::thread::sleep(ATTACH_PAUSE);
     }
     Ok(())

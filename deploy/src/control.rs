@@ -8,7 +8,7 @@ use std::fmt::{self, Display, Formatter};
 use std::path::PathBuf;
 
 pub use dmprl_shared::supervision::{
-    Command, Doing, EvaluationRequest, EvaluationRow, HostNow, Progress, Report, WorkersNow,
+    Activity, Command, EvaluationRequest, EvaluationRow, HostNow, Progress, Report, WorkersNow,
 };
 use serde::{Deserialize, Serialize};
 

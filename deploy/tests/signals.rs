@@ -10,7 +10,7 @@ use std::os::unix::process::ExitStatusExt;
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Stdio};
 
-use dmprl::launch::{EarlierSessions, Ending, SupervisorPlan, TimeLimits, interrupts, supervise};
+use dmprl::launch::{Ending, SupervisorPlan, TimeLimits, Totals, interrupts, supervise};
 use dmprl::run_directory::RunDirectory;
 use dmprl::terminal::{Display, ProgressStyle};
 use fakes::{Fixture, living_children, until};
@@ -30,7 +30,7 @@ fn supervisor_process() {
         let (launcher, config, limits) = fakes::plan(&run, &config, TimeLimits::default(), false);
         let mut display = Display::new(ProgressStyle::Lines, config.run.steps);
         let interrupts = interrupts().unwrap();
-        let earlier = EarlierSessions::default();
+        let earlier = Totals::default();
         let plan = SupervisorPlan { launcher, config, limits, earlier, interrupts };
         supervise(plan, &mut display).await
     });

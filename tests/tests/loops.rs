@@ -18,7 +18,7 @@ use dmprl_shared::config::{ExperimentConfig, Layers};
 use dmprl_shared::parameters::ParameterSnapshot;
 use dmprl_shared::policy_file;
 use dmprl_shared::segment::Segment;
-use dmprl_shared::supervision::{Command, Doing, EvaluationRequest, FakeSupervisor, Report};
+use dmprl_shared::supervision::{Activity, Command, EvaluationRequest, FakeSupervisor, Report};
 use dmprl_shared::transport::delivery::Sent;
 use dmprl_shared::transport::in_process::{self, InProcess};
 use dmprl_shared::transport::shared_memory::Plan;
@@ -117,7 +117,7 @@ fn a_worker_gives_a_heartbeat_a_round_and_delivers_the_round_in_which_it_is_stop
     let supervisor = FakeSupervisor::stopping_after_heartbeats(3);
     let (sequences, ended) = run(&supervisor, |plan| snapshot(plan, plan.architecture_hash));
     ended.unwrap();
-    assert_eq!(supervisor.heartbeats(), [Doing::Stepping; 3]);
+    assert_eq!(supervisor.heartbeats(), [Activity::Stepping; 3]);
     assert_eq!(sequences, (1..=3 * ENVS as u64).collect::<Vec<_>>());
     let reports = supervisor.reports();
     assert!(matches!(&reports[0], Report::EnvironmentReady { spec } if spec.action_len == 1));
@@ -135,7 +135,7 @@ fn a_worker_refuses_a_foreign_policy_with_one_warning_a_look_and_waits_for_the_n
     let supervisor = FakeSupervisor::stopping_after_heartbeats(1);
     let (sequences, ended) = run(&supervisor, |plan| snapshot(plan, plan.architecture_hash + 1));
     ended.unwrap();
-    assert_eq!(supervisor.heartbeats(), [Doing::Attaching]);
+    assert_eq!(supervisor.heartbeats(), [Activity::Attaching]);
     assert_eq!(sequences, Vec::<u64>::new());
     let warnings = supervisor.warnings();
     assert_eq!(warnings.len(), 2, "{warnings:?}");

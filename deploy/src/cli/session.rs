@@ -8,7 +8,7 @@ use dmprl_shared::config::ExperimentConfig;
 
 use crate::failure::Outcome;
 use crate::launch::{
-    self, EarlierSessions, Ending, RunEvent, RunObserver, SessionPlan, SessionReport, Trial, title,
+    self, Ending, RunEvent, RunObserver, SessionPlan, SessionReport, Totals, Trial, title,
 };
 use crate::plots;
 use crate::run_directory::{RunDirectory, RunLock};
@@ -79,9 +79,9 @@ pub fn train_session(plan: TrainingPlan) -> anyhow::Result<Outcome> {
     conclude(report, &run, &title, steps_total)
 }
 
-fn earlier_sessions(run: &RunDirectory) -> anyhow::Result<EarlierSessions> {
+fn earlier_sessions(run: &RunDirectory) -> anyhow::Result<Totals> {
     let counters = checkpoint::counters(&run.checkpoints_path())?;
-    Ok(counters.last().map_or_else(EarlierSessions::default, |counters| EarlierSessions {
+    Ok(counters.last().map_or_else(Totals::default, |counters| Totals {
         env_failures: counters.env_failures,
         sent: counters.sent,
         learner_restarts: counters.learner_restarts,

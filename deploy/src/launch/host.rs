@@ -5,10 +5,14 @@ use std::path::PathBuf;
 use anyhow::Context;
 use dmprl_shared::config::ExperimentConfig;
 
-use super::{
-    EarlierSessions, Launcher, RunEvent, RunObserver, SessionReport, SupervisorPlan, TimeLimits,
-    Upstream, domain, interrupts, supervise, title,
-};
+use super::domain;
+use super::launcher::{Launcher, Upstream};
+use super::limits::TimeLimits;
+use super::observer::{RunEvent, RunObserver};
+use super::session::title;
+use super::signals::interrupts;
+use super::supervisor::{SessionReport, SupervisorPlan, supervise};
+use super::totals::Totals;
 use crate::run_directory::RunDirectory;
 
 /// A host whose workers take part in the run of another host.
@@ -60,7 +64,7 @@ pub fn host(plan: HostPlan, observer: &mut dyn RunObserver) -> anyhow::Result<Se
         upstream: Some(upstream),
     };
     let limits = TimeLimits::default();
-    let earlier = EarlierSessions::default();
+    let earlier = Totals::default();
     let plan = SupervisorPlan { launcher, config, limits, earlier, interrupts };
     let report = runtime.block_on(supervise(plan, observer));
     // The runtime kills children that remain, which must not outlive their shared memory.

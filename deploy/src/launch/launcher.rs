@@ -1,47 +1,19 @@
 //! The command lines of the children.
 
-use std::fmt::{self, Display, Formatter};
 use std::fs::OpenOptions;
 use std::io::Write;
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 use std::process::{Command, Stdio};
 use std::time::SystemTime;
 
 use anyhow::Context;
 
-use super::ObservationPlan;
+use super::process::Process;
 use crate::run_directory::{RunDirectory, rfc3339};
 
 /// Incarnations that one session of the run has for each worker; a segment's sender is thus
 /// never mistaken for one of an earlier session.
 pub(super) const INCARNATIONS_PER_SESSION: u32 = 1 << 16;
-
-/// One of a run's children.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
-pub enum Process {
-    /// The learner.
-    Learner,
-    /// What stands for the learner on another host.
-    Relay,
-    /// A worker, by its index.
-    Actor(u32),
-    /// The evaluator.
-    Evaluator,
-    /// What stands for the workers of other hosts.
-    Gateway,
-}
-
-impl Display for Process {
-    fn fmt(&self, formatter: &mut Formatter<'_>) -> fmt::Result {
-        match self {
-            Self::Learner => formatter.write_str("learner"),
-            Self::Relay => formatter.write_str("relay"),
-            Self::Gateway => formatter.write_str("gateway"),
-            Self::Actor(index) => write!(formatter, "actor-{index}"),
-            Self::Evaluator => formatter.write_str("evaluator"),
-        }
-    }
-}
 
 /// Everything that goes into the children's command lines.
 #[derive(Debug, Clone)]
@@ -166,54 +138,6 @@ impl Launcher {
         self.streams(command, &process.to_string())
     }
 
-    /// The command of `dmprl eval`: an evaluator that leaves the run as it is.
-    ///
-    /// # Errors
-    /// The log cannot be opened.
-    pub fn evaluate(&self, episodes: u64) -> anyhow::Result<Command> {
-        let mut command = Command::new(&self.program);
-        command.args(["evaluator", "--print-only", "--episodes", &episodes.to_string()]);
-        command.arg("--run").arg(self.run.path());
-        if let Some(venv) = &self.venv {
-            command.arg("--venv").arg(venv);
-        }
-        self.streams(command, "eval")
-    }
-
-    /// The command of an observer, which leaves the run as it is too.
-    ///
-    /// # Errors
-    /// The log cannot be opened.
-    pub fn observe(&self, plan: &ObservationPlan<'_>) -> anyhow::Result<Command> {
-        let mut command = Command::new(&self.program);
-        command.arg("observer").arg("--run").arg(plan.run.path());
-        for (flag, number) in [
-            ("--policy", plan.policy_version),
-            ("--first-seed", plan.first_seed),
-            ("--episodes", plan.episodes),
-        ] {
-            command.args([flag, &number.to_string()]);
-        }
-        command.arg("--output").arg(&plan.output);
-        if let Some(pictures) = &plan.pictures {
-            command.arg("--pictures").arg(pictures);
-        }
-        if let Some(venv) = &self.venv {
-            command.arg("--venv").arg(venv);
-        }
-        self.streams(command, "observer")
-    }
-
-    /// The command of the process that makes a video of a plan.
-    ///
-    /// # Errors
-    /// The log cannot be opened.
-    pub fn film(&self, plan: &Path) -> anyhow::Result<Command> {
-        let mut command = Command::new(&self.program);
-        command.args(["-I", "-m", "dmprl.film"]).arg(plan);
-        self.streams(command, "film")
-    }
-
     fn learner(&self, command: &mut Command) {
         command.arg("learner").arg("--run").arg(self.run.path());
         match &self.domain {
@@ -254,7 +178,12 @@ impl Launcher {
         }
     }
 
-    fn streams(&self, mut command: Command, name: &str) -> anyhow::Result<Command> {
+    /// Connects a command's standard streams: pipes for input and output, and the log of `name` for
+    /// errors.
+    ///
+    /// # Errors
+    /// The log cannot be opened.
+    pub(super) fn streams(&self, mut command: Command, name: &str) -> anyhow::Result<Command> {
         let path = self.run.log_path(name);
         let mut log = OpenOptions::new()
             .append(true)

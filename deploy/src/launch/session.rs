@@ -6,10 +6,13 @@ use std::time::Duration;
 use anyhow::Context;
 use dmprl_shared::config::ExperimentConfig;
 
-use super::{
-    EarlierSessions, Launcher, RunEvent, RunObserver, SessionReport, SupervisorPlan, TimeLimits,
-    domain, interrupts, supervise,
-};
+use super::domain;
+use super::launcher::Launcher;
+use super::limits::TimeLimits;
+use super::observer::{RunEvent, RunObserver};
+use super::signals::interrupts;
+use super::supervisor::{SessionReport, SupervisorPlan, supervise};
+use super::totals::Totals;
 use crate::run_directory::RunDirectory;
 
 /// How long `resume` waits for the learner of a killed supervisor to write its checkpoint.
@@ -28,7 +31,7 @@ pub struct SessionPlan {
     /// Whether the run has been trained before.
     pub resume: bool,
     /// Counts of earlier sessions of the run.
-    pub earlier: EarlierSessions,
+    pub earlier: Totals,
     /// Differences for `dmprl chaos`.
     pub trial: Trial,
 }
@@ -92,8 +95,8 @@ fn can_resume(run: &RunDirectory, observer: &mut dyn RunObserver) -> anyhow::Res
     if run.has_checkpoint()? {
         return Ok(true);
     }
-    let message = "the run has no checkpoint yet: it begins again";
-    observer.on_event(RunEvent::Message(message.to_owned()));
+    let message = "the run has no checkpoint yet: it begins again".to_owned();
+    observer.on_event(RunEvent::Warning { process: None, message });
     run.begin_again()?;
     Ok(false)
 }

@@ -9,7 +9,8 @@ use std::time::{Duration, Instant};
 use anyhow::Context;
 use rustix::process::{Pid, Signal, kill_process};
 
-use super::{describe, last_lines};
+use super::child::describe;
+use super::logs::last_lines;
 
 /// From SIGINT to the end; the supervisor has limits of its own.
 const END: Duration = Duration::from_secs(90);

@@ -13,7 +13,7 @@ use dmprl_shared::supervision::{ReportError, RunTotals, Supervisor};
 use dmprl_shared::transport::delivery::Sent;
 
 use super::heartbeat::Pulse;
-use crate::control::{Command, Doing, GROUP_SIGNALS, Report, WorkersNow};
+use crate::control::{Activity, Command, GROUP_SIGNALS, Report, WorkersNow};
 use crate::terminal::say;
 
 /// A worker or evaluator whose supervisor is gone has so long to end before it is killed.
@@ -104,7 +104,7 @@ impl ControlPipe {
             orphaned();
         });
         let reporter = Reporter(Arc::new(Mutex::new(Box::new(output))));
-        let pulse = Arc::new(Pulse::new(Doing::Attaching));
+        let pulse = Arc::new(Pulse::new(Activity::Attaching));
         Self { commands: Mutex::new(commands), flags, reporter, pulse }
     }
 
@@ -200,7 +200,7 @@ impl Supervisor for ControlPipe {
         RunTotals { env_failures, workers, sent }
     }
 
-    fn heartbeat(&self, doing: Doing) {
+    fn heartbeat(&self, doing: Activity) {
         self.pulse.beat(doing);
     }
 

@@ -8,7 +8,7 @@
 
 use std::sync::atomic::{AtomicU64, Ordering};
 
-use crate::control::Doing;
+use crate::control::Activity;
 
 /// What a loop tells the thread.
 #[derive(Debug)]
@@ -22,12 +22,12 @@ pub struct Pulse {
 impl Pulse {
     /// A loop that has not begun.
     #[must_use]
-    pub fn new(doing: Doing) -> Self {
+    pub fn new(doing: Activity) -> Self {
         Self { state: AtomicU64::new(bits(doing)), kept: AtomicU64::new(0) }
     }
 
     /// The loop has come round; from its thread only.
-    pub fn beat(&self, doing: Doing) {
+    pub fn beat(&self, doing: Activity) {
         // The other thread compares numbers and reads no other memory: no order is needed.
         let number = (self.state.load(Ordering::Relaxed) >> 2).wrapping_add(1);
         self.state.store(number << 2 | bits(doing), Ordering::Relaxed);
@@ -38,22 +38,22 @@ impl Pulse {
         self.kept.store(segments, Ordering::Relaxed);
     }
 
-    fn state(&self) -> (u64, Doing) {
+    fn state(&self) -> (u64, Activity) {
         let state = self.state.load(Ordering::Relaxed);
         let doing = match state & 3 {
-            1 => Doing::Stepping,
-            2 => Doing::Waiting,
-            _ => Doing::Attaching,
+            1 => Activity::Stepping,
+            2 => Activity::Waiting,
+            _ => Activity::Attaching,
         };
         (state, doing)
     }
 }
 
-fn bits(doing: Doing) -> u64 {
+fn bits(doing: Activity) -> u64 {
     match doing {
-        Doing::Attaching => 0,
-        Doing::Stepping => 1,
-        Doing::Waiting => 2,
+        Activity::Attaching => 0,
+        Activity::Stepping => 1,
+        Activity::Waiting => 2,
     }
 }
 
@@ -69,7 +69,7 @@ mod thread {
     use anyhow::Context;
     use dmprl_actors::watchdog::CallState;
 
-    use crate::control::{Doing, Report};
+    use crate::control::{Activity, Report};
     use crate::roles::ControlPipe;
 
     /// Between two signs of life.
@@ -86,7 +86,7 @@ mod thread {
                 let calling = calls.is_running();
                 drop(calls);
                 if calling || last != Some(state) {
-                    let doing = if calling { Doing::Stepping } else { doing };
+                    let doing = if calling { Activity::Stepping } else { doing };
                     let kept = pulse.kept.load(Ordering::Relaxed);
                     if reporter.send(&Report::Alive { doing, kept }).is_err() {
                         return;
@@ -107,9 +107,11 @@ mod tests {
 
     #[test]
     fn each_round_is_another_state_and_says_what_was_done() {
-        let pulse = Pulse::new(Doing::Attaching);
+        let pulse = Pulse::new(Activity::Attaching);
         let mut seen = vec![pulse.state()];
-        for doing in [Doing::Stepping, Doing::Stepping, Doing::Waiting, Doing::Attaching] {
+        for doing in
+            [Activity::Stepping, Activity::Stepping, Activity::Waiting, Activity::Attaching]
+        {
             pulse.beat(doing);
             assert_eq!(pulse.state().1, doing);
             seen.push(pulse.state());

@@ -5,7 +5,7 @@ use anyhow::Context;
 use serde::{Deserialize, Serialize};
 
 use super::{RunDirectory, atomic, read_small};
-use crate::control::Doing;
+use crate::control::Activity;
 
 /// Of this file; raised when what it holds changes.
 const FORMAT: u32 = 1;
@@ -32,7 +32,7 @@ pub struct ProcessRow {
     /// Where it is in its life.
     pub state: ProcessState,
     /// What a worker did when it last gave a sign of life.
-    pub doing: Option<Doing>,
+    pub doing: Option<Activity>,
     /// Segments that a worker keeps until the learner acknowledges them.
     pub kept_segments: u64,
     /// Segments of a worker that the learner has acknowledged in this session.

@@ -7,7 +7,6 @@ use indicatif::{ProgressBar, ProgressStyle as BarStyle};
 
 use super::format::{duration, grouped, plus_minus};
 use super::panel::{Panel, SEPARATOR, Scope, speed, terminal_size, trouble, whole_items};
-use super::summary::shown;
 use crate::control::{EvaluationRow, Progress};
 use crate::launch::{ProcessLine, RunEvent, RunObserver};
 
@@ -141,21 +140,6 @@ impl Display {
         }
     }
 
-    /// Shows an evaluation, and stores it for the progress.
-    fn evaluation(&mut self, row: &EvaluationRow, best: bool) {
-        let figure = plus_minus(&row.returns);
-        let success = row
-            .success_rate
-            .map(|rate| format!(", success {:.0} %", rate * 100.0))
-            .unwrap_or_default();
-        self.message(&format!(
-            "evaluation at {} steps: return {figure}{success}{}",
-            grouped(row.env_steps),
-            if best { "  (best)" } else { "" }
-        ));
-        self.evaluations.push(row.clone());
-    }
-
     /// Removes the bar.
     fn close(&mut self) {
         if let Target::Bar(bar) = &self.target {
@@ -192,21 +176,19 @@ impl Display {
 
 impl RunObserver for Display {
     fn on_event(&mut self, event: RunEvent) {
+        let message = event.to_string();
+        if !message.is_empty() {
+            self.message(&message);
+        }
         match event {
-            RunEvent::Started { title, run, learner, evaluations } => {
+            RunEvent::Started { evaluations, .. } | RunEvent::Rewound { evaluations } => {
                 self.evaluations = evaluations;
-                let run = shown(&run);
-                self.message(&match learner {
-                    None => format!("training {title} in {run}"),
-                    Some(endpoint) => format!("{title} for the learner at {endpoint}, in {run}"),
-                });
             }
-            RunEvent::Rewound { evaluations } => self.evaluations = evaluations,
-            RunEvent::Message(text) => self.message(&text),
             RunEvent::Progress { progress, processes } => self.progress(&progress, &processes),
             RunEvent::Processes(processes) => self.refresh(&processes),
-            RunEvent::Evaluated { row, is_best } => self.evaluation(&row, is_best),
+            RunEvent::Evaluated { row, .. } => self.evaluations.push(row),
             RunEvent::Ended => self.close(),
+            _ => {}
         }
     }
 

@@ -7,9 +7,7 @@ use std::path::{Path, PathBuf};
 use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
 
-use dmprl::launch::{
-    EarlierSessions, Launcher, SessionReport, SupervisorPlan, TimeLimits, supervise,
-};
+use dmprl::launch::{Launcher, SessionReport, SupervisorPlan, TimeLimits, Totals, supervise};
 use dmprl::run_directory::{Manifest, RunDirectory};
 use dmprl::terminal::Display;
 use dmprl_shared::config::ExperimentConfig;
@@ -120,7 +118,7 @@ impl Fixture {
                 launcher: plan.0,
                 config: plan.1,
                 limits: plan.2,
-                earlier: EarlierSessions::default(),
+                earlier: Totals::default(),
                 interrupts,
             };
             let ended = tokio::select! {

@@ -5,7 +5,7 @@ use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::sync::{Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
 
-use super::{Command, Doing, Report, ReportError, RunTotals, Supervisor};
+use super::{Activity, Command, Report, ReportError, RunTotals, Supervisor};
 
 /// A supervisor that a test controls: it hands out the commands that it was given, records
 /// heartbeats and reports, and can request a stop at a chosen heartbeat or report.
@@ -21,7 +21,7 @@ pub struct FakeSupervisor {
     stop_on: Option<fn(&Report) -> bool>,
     totals: Mutex<RunTotals>,
     commands: Mutex<VecDeque<Command>>,
-    heartbeats: Mutex<Vec<Doing>>,
+    heartbeats: Mutex<Vec<Activity>>,
     reports: Mutex<Vec<Report>>,
     unacknowledged: AtomicU64,
 }
@@ -55,7 +55,7 @@ impl FakeSupervisor {
 
     /// All heartbeats so far, in order.
     #[must_use]
-    pub fn heartbeats(&self) -> Vec<Doing> {
+    pub fn heartbeats(&self) -> Vec<Activity> {
         lock(&self.heartbeats).clone()
     }
 
@@ -104,7 +104,7 @@ impl Supervisor for FakeSupervisor {
         *lock(&self.totals)
     }
 
-    fn heartbeat(&self, doing: Doing) {
+    fn heartbeat(&self, doing: Activity) {
         let mut heartbeats = lock(&self.heartbeats);
         heartbeats.push(doing);
         if self.stop_after_heartbeats == Some(heartbeats.len()) {

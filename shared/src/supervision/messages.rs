@@ -87,7 +87,7 @@ pub enum Report {
     /// A worker's sign of life, once a second.
     Alive {
         /// What it does.
-        doing: Doing,
+        doing: Activity,
         /// Segments that it keeps because the learner has not acknowledged them.
         kept: u64,
     },
@@ -149,7 +149,7 @@ pub struct HostNow {
 /// What a worker does when it gives a sign of life.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
-pub enum Doing {
+pub enum Activity {
     /// It waits for a learner, or for its first policy.
     Attaching,
     /// It steps environments; what a call into them does is the watchdog's business.
@@ -158,7 +158,7 @@ pub enum Doing {
     Waiting,
 }
 
-impl Doing {
+impl Activity {
     /// As part of a sentence.
     #[must_use]
     pub fn name(self) -> &'static str {

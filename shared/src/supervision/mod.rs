@@ -13,7 +13,7 @@ use std::time::Duration;
 
 pub use fake::FakeSupervisor;
 pub use messages::{
-    Command, Doing, EvaluationNotFinite, EvaluationRequest, EvaluationRow, HostNow, Progress,
+    Activity, Command, EvaluationNotFinite, EvaluationRequest, EvaluationRow, HostNow, Progress,
     Report, WorkersNow,
 };
 
@@ -62,7 +62,7 @@ pub trait Supervisor {
 
     /// Records that the loop has completed another round. A loop that completes none for too long
     /// counts as hanging.
-    fn heartbeat(&self, doing: Doing);
+    fn heartbeat(&self, doing: Activity);
 
     /// Records how many segments the learner has not acknowledged; sent along with heartbeats.
     fn note_unacknowledged(&self, segments: usize);

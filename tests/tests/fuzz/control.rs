@@ -5,7 +5,7 @@ use std::sync::mpsc;
 use std::time::Duration;
 
 use dmprl::control::{
-    Command, Doing, EvaluationRequest, Greeting, JoinAnswer, JoinRequest, Progress, Report,
+    Activity, Command, EvaluationRequest, Greeting, JoinAnswer, JoinRequest, Progress, Report,
     Welcome, WorkersNow,
 };
 use dmprl::roles::ControlPipe;
@@ -41,7 +41,7 @@ fn reports() -> Vec<Value> {
         Report::Evaluate(request()),
         Report::EnvFailures { count: 1, last: "why".into() },
         Report::Checkpoint { name: "000001".into(), env_steps: 5 },
-        Report::Alive { doing: Doing::Waiting, kept: 8 },
+        Report::Alive { doing: Activity::Waiting, kept: 8 },
         Report::Finished,
     ];
     reports.iter().map(|report| serde_json::to_value(report).unwrap()).collect()
