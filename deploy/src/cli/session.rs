@@ -6,6 +6,7 @@ use std::path::PathBuf;
 use dmprl_learner::checkpoint;
 use dmprl_shared::config::ExperimentConfig;
 
+use super::output::observer;
 use crate::failure::Outcome;
 use crate::launch::{
     self, Ending, RunEvent, RunObserver, SessionPlan, SessionReport, Totals, Trial, title,
@@ -13,7 +14,7 @@ use crate::launch::{
 use crate::plots;
 use crate::run_directory::{RunDirectory, RunLock};
 use crate::tensorboard::Mirror;
-use crate::terminal::{Display, ProgressStyle, say, shown, summary};
+use crate::terminal::{ProgressStyle, events, say, shown, summary, write_line};
 
 /// A run directory that is ready for training.
 pub struct TrainingPlan {
@@ -37,7 +38,7 @@ pub struct TrainingPlan {
 
 /// Shows a session, and mirrors the run's rows from its begin to its end.
 struct SessionObserver {
-    display: Display,
+    display: Box<dyn RunObserver>,
     mirrored: RunDirectory,
     mirror: Option<Mirror>,
 }
@@ -63,20 +64,30 @@ impl RunObserver for SessionObserver {
 pub fn train_session(plan: TrainingPlan) -> anyhow::Result<Outcome> {
     let TrainingPlan { program, run, lock, config, venv, resume, progress, trial } = plan;
     let (title, steps_total) = (title(&config), config.run.steps);
-    let mut observer = SessionObserver {
-        display: Display::new(progress, steps_total),
+    let mut session_observer = SessionObserver {
+        display: observer(progress, steps_total),
         mirrored: run.clone(),
         mirror: None,
     };
     let earlier = earlier_sessions(&run)?;
     let plan = SessionPlan { program, run: run.clone(), config, venv, resume, earlier, trial };
-    let report = launch::session(plan, &mut observer)?;
-    drop(observer);
+    let report = launch::session(plan, &mut session_observer)?;
+    drop(session_observer);
     if let Err(error) = run.remove_half_written() {
         say(&format!("warning: {error:#}"));
     }
     drop(lock);
-    conclude(report, &run, &title, steps_total)
+    if let Err(error) = plots::learning_curve(&run) {
+        // The results exist without the picture.
+        say(&format!("warning: {error:#}"));
+    }
+    match progress {
+        ProgressStyle::Events => {
+            write_line(&events::finished(&report));
+            outcome(report.ending)
+        }
+        _ => conclude(report, &run, &title, steps_total),
+    }
 }
 
 fn earlier_sessions(run: &RunDirectory) -> anyhow::Result<Totals> {
@@ -89,28 +100,32 @@ fn earlier_sessions(run: &RunDirectory) -> anyhow::Result<Totals> {
     }))
 }
 
+fn outcome(ending: Ending) -> anyhow::Result<Outcome> {
+    match ending {
+        Ending::Failed(error) => Err(error),
+        Ending::Interrupted => Ok(Outcome::Interrupted),
+        Ending::Completed => Ok(Outcome::Done),
+    }
+}
+
+/// Tells the user how the session ended and what can follow.
 fn conclude(
     mut report: SessionReport,
     run: &RunDirectory,
     title: &str,
     steps_total: u64,
 ) -> anyhow::Result<Outcome> {
-    if let Err(error) = plots::learning_curve(run) {
-        // The results exist without the picture.
-        say(&format!("warning: {error:#}"));
-    }
     let lost = match run.has_checkpoint() {
         Ok(true) => "the last checkpoint is missing: a resume goes back to the one before it",
         Ok(false) => "there is no checkpoint: a resume begins again",
         Err(_) => "the checkpoints cannot be read",
     };
-    match report.ending {
-        Ending::Failed(error) => Err(error),
+    match &report.ending {
+        Ending::Failed(_) => {}
         Ending::Interrupted => {
             let path = shown(run.path());
             say(if report.checkpointed { "checkpoint written" } else { lost });
             say(&format!("go on with: dmprl resume {path}"));
-            Ok(Outcome::Interrupted)
         }
         Ending::Completed => {
             // A session that had nothing to do shows the newest result of the run.
@@ -121,7 +136,7 @@ fn conclude(
             if !report.checkpointed {
                 say(&format!("warning: {lost}"));
             }
-            Ok(Outcome::Done)
         }
     }
+    outcome(report.ending)
 }

@@ -15,11 +15,11 @@ use toml::Value;
 
 use super::configuration::{Flag, merge, refuse};
 use super::configured::{ConfiguredArgs, flag, integer, make_absolute, paths};
+use super::output::OutputArgs;
 use super::{TrainingPlan, cores, prepare_python, this_program, train_session, training_session};
 use crate::failure::{Outcome, wrong_use};
 use crate::launch::Trial;
 use crate::run_directory::{Manifest, PolicyChoice, RunDirectory, compact, safe_name};
-use crate::terminal::ProgressStyle;
 use crate::{bench, capacity};
 
 /// A second run of the same second gets a number; more than this is a stuck clock.
@@ -83,9 +83,8 @@ pub(super) struct TrainArgs {
     /// Stop after so many minutes of this session.
     #[arg(long, value_name = "M")]
     max_minutes: Option<f64>,
-    /// Lines instead of a progress bar.
-    #[arg(long)]
-    no_progress: bool,
+    #[command(flatten)]
+    pub(super) output: OutputArgs,
     /// Have worker and learner note in files of this folder what they do; for `chaos`.
     #[arg(long, value_name = "DIR", hide = true)]
     journal: Option<PathBuf>,
@@ -124,7 +123,7 @@ pub(super) fn run(args: &TrainArgs) -> anyhow::Result<Outcome> {
         config,
         venv: Some(venv),
         resume: false,
-        progress: ProgressStyle::from_flag(args.no_progress),
+        progress: args.output.style(),
         trial: Trial {
             journal: args.journal.clone(),
             restart_max: args.restart_pause_max.map(Duration::from_millis),

@@ -24,14 +24,8 @@ pub enum ProgressStyle {
     Automatic,
     /// Always lines.
     Lines,
-}
-
-impl ProgressStyle {
-    /// The style for the flag `--no-progress`.
-    #[must_use]
-    pub fn from_flag(no_progress: bool) -> Self {
-        if no_progress { Self::Lines } else { Self::Automatic }
-    }
+    /// Events as JSON, one object a line, instead of a display.
+    Events,
 }
 
 /// Display of a run's progress.
