@@ -7,8 +7,8 @@
 //!      welcome or refusal ◄──       an index and an incarnation of its own
 //! ```
 //! From then on the connection replaces a child's standard input and output, and its end means the
-//! worker's exit. The descriptor of the worker's process tells whether the process has ended; unlike
-//! a process id, it never refers to another process.
+//! worker's exit. The descriptor of the worker's process tells whether the process has ended;
+//! unlike a process id, it never refers to another process.
 
 use std::path::Path;
 use std::sync::Arc;

@@ -1,4 +1,4 @@
-//! Stage 2 of 8: the processes of a run, from the first start to the last exit.
+//! Stage 2 of 8: supervises the processes of a run, from the first start to the last exit.
 //!
 //! ```text
 //!  train ─► session ─► supervisor ─┬─ actor × N      environment_ready … attach
@@ -7,13 +7,13 @@
 //! ```
 //! With `run.deterministic` there is one child, `learner --one-process`, which does everything.
 //!
-//! Who ends whom: a child ignores terminal signals and ends on `stop` or at the end of its
-//! standard input, which the death of the supervisor brings about, whatever killed it. No
-//! parent-death signal is used: it would kill the learner before its last checkpoint. The run's
-//! lock is inherited, so a `resume` waits for such an orphan.
+//! A child ignores terminal signals. It ends on `stop` or at the end of its standard input, which
+//! also follows from the death of the supervisor. A parent-death signal would kill the learner
+//! before its last checkpoint. Children inherit the run's lock, so `resume` waits for such orphans.
 //!
-//! Every wait has a limit in [`TimeLimits`]. The supervisor itself is one loop over events,
-//! interrupts and the next deadline; it never waits anywhere else.
+//! The supervisor is a state machine (`machine.rs`) and a loop around it (`supervisor.rs`) that
+//! waits for events, interrupts and the next deadline, and nowhere else. Every wait has a limit in
+//! [`TimeLimits`]. A [`RunObserver`] receives everything that happens; nothing here draws.
 
 mod child;
 mod children;

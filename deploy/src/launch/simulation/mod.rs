@@ -12,8 +12,8 @@
 //! 6. Time passes: no deadline remains due after its step.
 //!
 //! After a while all faults stop. Then the session must end within a bounded number of steps; after
-//! a stop, within its time limits. A failure names its seed, and `DMPRL_SIMULATION_SEED=<seed>` runs
-//! only that one.
+//! a stop, within its time limits. A failure names its seed, and `DMPRL_SIMULATION_SEED=<seed>`
+//! runs only that one.
 
 mod fakes;
 mod scenario;

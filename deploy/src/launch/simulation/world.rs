@@ -21,8 +21,8 @@ use crate::launch::state::Phase;
 use crate::launch::step::{Action, Event};
 use crate::run_directory::RunDirectory;
 
-/// Maximum delay of an output. It is less than the limit from SIGKILL to the exit, which follows all
-/// outputs.
+/// Maximum delay of an output. It is less than the limit from SIGKILL to the exit, which follows
+/// all outputs.
 const LATE_MS: u64 = 4_000;
 /// Time with faults.
 const FAULTS_S: u64 = 120;
