@@ -1,4 +1,4 @@
-//! Asks another program a question, within a time limit.
+//! Runs another program for its output, within a time limit.
 
 use std::ffi::OsStr;
 use std::process::Stdio;
@@ -6,13 +6,13 @@ use std::time::Duration;
 
 use tokio::process::Command;
 
-/// Importing MuJoCo from a cold disk takes seconds; no answer needs so long.
+/// Maximum duration. Importing MuJoCo from a cold disk takes seconds.
 const ANSWER_MAX: Duration = Duration::from_secs(60);
 
-/// Standard output of `program`; why there is none, otherwise.
+/// Runs `program` and returns its standard output.
 ///
 /// # Errors
-/// It cannot be run, fails (with its last line), or takes too long.
+/// The reason: the program cannot be run, fails (with its last line), or takes too long.
 pub(crate) fn answer(program: impl AsRef<OsStr>, arguments: &[&str]) -> Result<String, String> {
     let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build();
     let runtime = runtime.map_err(|error| error.to_string())?;
@@ -35,7 +35,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_failure_is_told_by_its_last_line() {
+    fn a_failure_has_the_last_line_of_standard_error() {
         assert_eq!(answer("sh", &["-c", "echo a; echo b"]).unwrap(), "a\nb");
         let failed = answer("sh", &["-c", "echo one >&2; echo two >&2; exit 3"]).unwrap_err();
         assert_eq!(failed, "two");

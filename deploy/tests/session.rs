@@ -3,14 +3,15 @@
 
 mod fakes;
 
+use dmprl::cli::{TrainingPlan, train_session};
 use dmprl::control::EvaluationRow;
 use dmprl::failure::Outcome;
-use dmprl::launch::{SessionPlan, Trial, session};
+use dmprl::launch::Trial;
 use dmprl::terminal::ProgressStyle;
 use fakes::{Fixture, PATIENCE, fake_role};
 
-fn plan(fixture: &Fixture, resume: bool) -> SessionPlan {
-    SessionPlan {
+fn plan(fixture: &Fixture, resume: bool) -> TrainingPlan {
+    TrainingPlan {
         trial: Trial::default(),
         program: fake_role(),
         run: fixture.run.clone(),
@@ -50,7 +51,7 @@ fn domains(fixture: &Fixture) -> Vec<String> {
 fn a_session_leaves_a_picture_and_neither_shared_memory_nor_a_lock() {
     let fixture = Fixture::new(&[]);
     fixture.run.append_evaluation(&row(1)).unwrap();
-    assert_eq!(session(plan(&fixture, false)).unwrap(), Outcome::Done);
+    assert_eq!(train_session(plan(&fixture, false)).unwrap(), Outcome::Done);
     assert!(fixture.run.path().join("plots/learning_curve.svg").is_file());
     assert_eq!(domains(&fixture), Vec::<String>::new());
     fixture.assert_no_child_lives();
@@ -60,7 +61,7 @@ fn a_session_leaves_a_picture_and_neither_shared_memory_nor_a_lock() {
 #[test]
 fn while_children_live_nobody_else_trains_the_run() {
     let fixture = Fixture::new(&[("learner", "asks-for-the-lock")]);
-    assert_eq!(session(plan(&fixture, false)).unwrap(), Outcome::Done);
+    assert_eq!(train_session(plan(&fixture, false)).unwrap(), Outcome::Done);
     assert!(fixture.seen("learner").contains("locked"), "{}", fixture.seen("learner"));
 }
 
@@ -69,7 +70,7 @@ fn a_run_without_a_checkpoint_begins_again_without_its_old_rows() {
     let fixture = Fixture::new(&[]);
     fixture.run.append_evaluation(&row(1)).unwrap();
     fixture.run.point_best().unwrap();
-    assert_eq!(session(plan(&fixture, true)).unwrap(), Outcome::Done);
+    assert_eq!(train_session(plan(&fixture, true)).unwrap(), Outcome::Done);
     assert_eq!(fixture.run.evaluations().unwrap(), []);
     assert!(fixture.run.checkpoints_path().join("best").symlink_metadata().is_err());
     assert!(!fixture.seen("learner").contains("resumed"));
@@ -81,7 +82,7 @@ fn a_run_with_a_checkpoint_goes_on_from_it() {
     fixture.run.append_evaluation(&row(1)).unwrap();
     // No `latest`: a run may have been copied without its symbolic links.
     std::fs::create_dir(fixture.run.checkpoints_path().join("000001")).unwrap();
-    assert_eq!(session(plan(&fixture, true)).unwrap(), Outcome::Done);
+    assert_eq!(train_session(plan(&fixture, true)).unwrap(), Outcome::Done);
     assert!(fixture.seen("learner").contains("resumed"));
     assert_eq!(fixture.run.evaluations().unwrap(), [row(1)]);
 }
@@ -89,7 +90,7 @@ fn a_run_with_a_checkpoint_goes_on_from_it() {
 #[test]
 fn a_failed_session_says_why_and_leaves_nothing_either() {
     let fixture = Fixture::new(&[("learner", "dies")]);
-    let error = session(plan(&fixture, false)).unwrap_err();
+    let error = train_session(plan(&fixture, false)).unwrap_err();
     assert!(error.to_string().contains("learner died"), "{error}");
     assert_eq!(domains(&fixture), Vec::<String>::new());
 }

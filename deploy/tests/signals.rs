@@ -10,7 +10,7 @@ use std::os::unix::process::ExitStatusExt;
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Stdio};
 
-use dmprl::launch::{Ending, SupervisorPlan, TimeLimits, interrupts, supervise};
+use dmprl::launch::{Ending, SupervisorPlan, TimeLimits, Totals, interrupts, supervise};
 use dmprl::run_directory::RunDirectory;
 use dmprl::terminal::{Display, ProgressStyle};
 use fakes::{Fixture, living_children, until};
@@ -28,9 +28,11 @@ fn supervisor_process() {
     let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().unwrap();
     let report = runtime.block_on(async {
         let (launcher, config, limits) = fakes::plan(&run, &config, TimeLimits::default(), false);
-        let display = Display::new(ProgressStyle::Lines, config.run.steps);
+        let mut display = Display::new(ProgressStyle::Lines, config.run.steps);
         let interrupts = interrupts().unwrap();
-        supervise(SupervisorPlan { launcher, config, limits, display, interrupts }).await
+        let earlier = Totals::default();
+        let plan = SupervisorPlan { launcher, config, limits, earlier, interrupts };
+        supervise(plan, &mut display).await
     });
     std::process::exit(match report.ending {
         Ending::Completed => 0,

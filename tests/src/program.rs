@@ -321,6 +321,22 @@ impl Running {
         self.until(words, |running| running.said().contains(words));
     }
 
+    /// Its events so far, with `--events json`.
+    ///
+    /// # Panics
+    /// When a line on standard error is no JSON.
+    pub fn events(&self) -> Vec<Value> {
+        events(&self.said())
+    }
+
+    /// Waits for an event that has these keys and values, among others.
+    ///
+    /// # Panics
+    /// As [`Running::until`].
+    pub fn until_event(&mut self, keys: &Value) {
+        self.until(&format!("event {keys}"), |running| has_event(&running.events(), keys));
+    }
+
     /// Waits until `metrics.jsonl` of `run` tells of so many environment steps.
     ///
     /// # Panics
@@ -408,6 +424,15 @@ impl Finished {
         self
     }
 
+    /// Insists on an event that has these keys and values, among others, with `--events json`.
+    ///
+    /// # Panics
+    /// With all it has said, when there is none.
+    pub fn with_event(self, keys: &Value) -> Self {
+        assert!(has_event(&events(&self.said), keys), "{}\n{keys}:\n{}", self.line, self.said);
+        self
+    }
+
     /// The JSON object on standard output.
     ///
     /// # Panics
@@ -416,6 +441,18 @@ impl Finished {
         serde_json::from_str(&self.printed)
             .unwrap_or_else(|error| panic!("{}\n{error}: {}", self.line, self.printed))
     }
+}
+
+/// The events in whole lines of standard error.
+fn events(said: &str) -> Vec<Value> {
+    let whole = said.rfind('\n').map_or("", |end| &said[..end]);
+    let parse = |line| serde_json::from_str(line).unwrap_or_else(|error| panic!("{error}: {line}"));
+    whole.lines().map(parse).collect()
+}
+
+fn has_event(events: &[Value], keys: &Value) -> bool {
+    let Value::Object(keys) = keys else { return false };
+    events.iter().any(|event| keys.iter().all(|(key, value)| event[key] == *value))
 }
 
 /// Every whole line of a `.jsonl` file of a run.

@@ -8,6 +8,7 @@ use clap::Args;
 use dmprl_shared::config::{ExperimentConfig, Limits};
 
 use super::configuration::refuse;
+use super::output::{OutputArgs, host_observer};
 use super::{cores, prepare_python, this_program};
 use crate::bench::Watch;
 use crate::bridge::host_messages::HostWelcome;
@@ -15,11 +16,11 @@ use crate::bridge::join::{JoinOutcome, JoinSettings, request_join};
 use crate::bridge::{Link, LinkMode, token};
 use crate::capacity;
 use crate::failure::{Outcome, wrong_use};
-use crate::launch::{self, HostPlan, Upstream};
+use crate::launch::{self, Ending, HostPlan, SessionReport, Upstream};
 use crate::run_directory::{
     Manifest, RunDirectory, RunLock, Session, compact_now, random_u64, replace_file, safe_name,
 };
-use crate::terminal::{ProgressStyle, say};
+use crate::terminal::{ProgressStyle, events, grouped, say, write_line};
 
 /// Interval between two join requests.
 const JOIN_INTERVAL: Duration = Duration::from_millis(500);
@@ -75,9 +76,8 @@ pub(super) struct BridgeArgs {
     #[arg(long, value_name = "M", default_value_t = 60,
           value_parser = clap::value_parser!(u64).range(1..=1_000_000))]
     patience: u64,
-    /// Print lines instead of a progress bar.
-    #[arg(long)]
-    no_progress: bool,
+    #[command(flatten)]
+    pub(super) output: OutputArgs,
 }
 
 pub(super) fn run(args: &BridgeArgs) -> anyhow::Result<Outcome> {
@@ -116,9 +116,29 @@ pub(super) fn run(args: &BridgeArgs) -> anyhow::Result<Outcome> {
         zenoh_file,
         patience_s: patience.as_secs(),
     };
-    let progress = ProgressStyle::from_flag(args.no_progress);
     let (program, session) = (this_program()?, welcome.lease.session);
-    launch::host(HostPlan { program, run, lock, config, venv, upstream, session, progress })
+    let style = args.output.style();
+    let mut observer = host_observer(style, config.run.steps);
+    let plan = HostPlan { program, run, config, venv, upstream, session };
+    let report = launch::host(plan, observer.as_mut())?;
+    drop(lock);
+    conclude(report, style)
+}
+
+fn conclude(report: SessionReport, style: ProgressStyle) -> anyhow::Result<Outcome> {
+    if style == ProgressStyle::Events {
+        write_line(&events::finished(&report));
+    }
+    let segments = report.last.as_ref().map_or(0, |progress| progress.segments);
+    let (outcome, what) = match report.ending {
+        Ending::Failed(error) => return Err(error),
+        Ending::Interrupted => (Outcome::Interrupted, "left the run"),
+        Ending::Completed => (Outcome::Done, "the run has ended"),
+    };
+    if style != ProgressStyle::Events {
+        say(&format!("{what}: {} segments acknowledged", grouped(segments)));
+    }
+    Ok(outcome)
 }
 
 /// Locks the directory of an earlier bridge and reads its number. With it a restarted bridge gets

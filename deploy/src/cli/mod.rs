@@ -16,11 +16,13 @@ mod dashboard;
 mod doctor;
 mod eval;
 mod export;
+mod output;
 mod play;
 mod record;
 mod report;
 mod resume;
 mod search;
+mod session;
 mod sweep;
 mod tasks;
 mod train;
@@ -41,7 +43,8 @@ use crate::roles::{
     self, ActorArgs, EvaluatorArgs, GatewayArgs, LearnerArgs, ObserverArgs, RelayArgs,
 };
 use crate::run_directory::Session;
-use crate::terminal::say;
+use crate::terminal::{ProgressStyle, events, say_json, says_json, write_line};
+pub use session::{TrainingPlan, train_session};
 
 const EXAMPLES: &str = "\
 EXAMPLES
@@ -148,11 +151,28 @@ fn long_help() -> String {
 pub fn main() -> ExitCode {
     // Prints help and version, refuses wrong use with the nearest names and exits with 2.
     let arguments = Arguments::parse();
+    if arguments.command.writes_events() {
+        say_json();
+    }
     let result = run(arguments.command);
     if let Err(error) = &result {
-        say(&render(error));
+        let text = render(error);
+        write_line(&if says_json() { events::error(&text) } else { text });
     }
     exit_code(&result)
+}
+
+impl Command {
+    /// Whether standard error is for events as JSON.
+    fn writes_events(&self) -> bool {
+        let output = match self {
+            Self::Train(args) => args.output,
+            Self::Resume(args) => args.output,
+            Self::Bridge(args) => args.output,
+            _ => return false,
+        };
+        output.style() == ProgressStyle::Events
+    }
 }
 
 /// What `dmprl train` with these arguments would train.

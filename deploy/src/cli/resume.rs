@@ -7,12 +7,12 @@ use dmprl_learner::checkpoint;
 use dmprl_shared::config::Limits;
 
 use super::configuration::refuse;
-use super::{cores, prepare_python, this_program, training_session};
+use super::output::OutputArgs;
+use super::{TrainingPlan, cores, prepare_python, this_program, train_session, training_session};
 use crate::capacity;
 use crate::failure::{Outcome, wrong_use};
-use crate::launch::{self, SessionPlan, Trial};
+use crate::launch::{self, Trial};
 use crate::run_directory::RunDirectory;
-use crate::terminal::ProgressStyle;
 
 const HELP: &str = "\
 Goes on from the last checkpoint with the run's own config.toml; environment variables and
@@ -31,9 +31,8 @@ pub(super) struct ResumeArgs {
     /// New length of the whole run [environment steps].
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(i64).range(1..))]
     steps: Option<i64>,
-    /// Lines instead of a progress bar.
-    #[arg(long)]
-    no_progress: bool,
+    #[command(flatten)]
+    pub(super) output: OutputArgs,
 }
 
 pub(super) fn run(args: &ResumeArgs) -> anyhow::Result<Outcome> {
@@ -76,7 +75,7 @@ pub(super) fn run(args: &ResumeArgs) -> anyhow::Result<Outcome> {
     if config != written {
         run.write_config(&config)?;
     }
-    launch::session(SessionPlan {
+    train_session(TrainingPlan {
         trial: Trial::default(),
         program: this_program()?,
         run,
@@ -84,6 +83,6 @@ pub(super) fn run(args: &ResumeArgs) -> anyhow::Result<Outcome> {
         config,
         venv: Some(venv),
         resume: true,
-        progress: ProgressStyle::from_flag(args.no_progress),
+        progress: args.output.style(),
     })
 }

@@ -1,4 +1,4 @@
-//! `dmprl train`: from the command line to a run directory, then over to `launch`.
+//! `dmprl train`: from the command line to a run directory, then over to `session`.
 
 use std::io::Read;
 use std::path::{Path, PathBuf};
@@ -15,11 +15,11 @@ use toml::Value;
 
 use super::configuration::{Flag, merge, refuse};
 use super::configured::{ConfiguredArgs, flag, integer, make_absolute, paths};
-use super::{cores, prepare_python, this_program, training_session};
+use super::output::OutputArgs;
+use super::{TrainingPlan, cores, prepare_python, this_program, train_session, training_session};
 use crate::failure::{Outcome, wrong_use};
-use crate::launch::{self, SessionPlan, Trial};
+use crate::launch::Trial;
 use crate::run_directory::{Manifest, PolicyChoice, RunDirectory, compact, safe_name};
-use crate::terminal::ProgressStyle;
 use crate::{bench, capacity};
 
 /// A second run of the same second gets a number; more than this is a stuck clock.
@@ -83,9 +83,8 @@ pub(super) struct TrainArgs {
     /// Stop after so many minutes of this session.
     #[arg(long, value_name = "M")]
     max_minutes: Option<f64>,
-    /// Lines instead of a progress bar.
-    #[arg(long)]
-    no_progress: bool,
+    #[command(flatten)]
+    pub(super) output: OutputArgs,
     /// Have worker and learner note in files of this folder what they do; for `chaos`.
     #[arg(long, value_name = "DIR", hide = true)]
     journal: Option<PathBuf>,
@@ -117,14 +116,14 @@ pub(super) fn run(args: &TrainArgs) -> anyhow::Result<Outcome> {
     let manifest = Manifest::begin(init_from.map(|path| path.display().to_string()), session)?;
     let run = RunDirectory::create(&path, &config, &manifest)?;
     let lock = run.lock(Duration::ZERO)?;
-    launch::session(SessionPlan {
+    train_session(TrainingPlan {
         program: this_program()?,
         run,
         lock,
         config,
         venv: Some(venv),
         resume: false,
-        progress: ProgressStyle::from_flag(args.no_progress),
+        progress: args.output.style(),
         trial: Trial {
             journal: args.journal.clone(),
             restart_max: args.restart_pause_max.map(Duration::from_millis),

@@ -1,4 +1,4 @@
-//! One child process: its commands go in, its reports and its end come out as events.
+//! A child process: takes commands, and returns its reports and its exit as events.
 
 use std::os::fd::OwnedFd;
 use std::os::unix::process::{CommandExt, ExitStatusExt};
@@ -11,54 +11,85 @@ use rustix::process::{Signal, pidfd_send_signal};
 use tokio::io::Interest;
 use tokio::io::unix::AsyncFd;
 use tokio::io::{AsyncBufReadExt, AsyncRead, AsyncReadExt, AsyncWrite, AsyncWriteExt, BufReader};
+use tokio::net::UnixStream;
 use tokio::sync::{Notify, mpsc};
 
-use super::Process;
-use super::joining::Newcomer;
-use crate::control::{Command, ENV_HUNG_STATUS, GROUP_SIGNALS, JoinAnswer, Report};
+use super::process::Process;
+use crate::control::{Command, ENV_HUNG_STATUS, GROUP_SIGNALS, Greeting, JoinAnswer, Report};
 
-/// Events not yet handled; full: children wait, their pipes fill.
+/// Maximum number of events in the queue. If it is full, children wait and their pipes fill.
 pub(super) const EVENTS_MAX: usize = 1_024;
-/// Commands not yet written; a child that takes none of so many is stuck.
+/// Maximum number of commands in a child's queue. A child whose queue is full is stuck.
 const COMMANDS_MAX: usize = 64;
-/// A longer line is no report.
+/// Maximum length of a report.
 const LINE_BYTES_MAX: u64 = 1 << 20;
-/// After a child's exit its last reports are read for so long: a grandchild may hold the pipe.
+/// Maximum time for reading the last reports after a child's exit: a grandchild may hold the pipe
+/// open.
 const LAST_REPORTS: Duration = Duration::from_secs(1);
-/// A worker that had joined and has closed its connection has so long to end by itself.
+/// Maximum time from the end of a joined worker's connection to its exit, before it is killed.
 const SILENT_EXIT: Duration = Duration::from_secs(10);
+/// Maximum time for writing a refusal.
+const REFUSAL: Duration = Duration::from_secs(5);
 
-/// What a child did.
+/// An event from outside the supervisor.
 #[derive(Debug)]
-pub(super) enum Event {
-    Report(Process, Report),
-    /// It wrote a line that is no report.
-    Garbage(Process, String),
-    /// It is gone, and everything it reported has been handed over.
-    Exited(Process, ExitStatus),
+pub(super) enum Incoming {
+    Child(Process, ChildEvent),
     /// A worker asks to join.
-    Asked(Newcomer),
-    /// A worker that had joined is gone, as `Exited`; its status is another's business.
-    Gone(Process),
+    Join(PendingJoin),
 }
 
-/// A running child. Dropping it kills the process when the runtime ends.
+/// An event of a child.
+#[derive(Debug)]
+pub(super) enum ChildEvent {
+    Report(Report),
+    /// It wrote a line that is no report.
+    Garbage(String),
+    /// It ended, and all its reports have been sent.
+    Exited(ExitStatus),
+    /// As `Exited` for a worker that had joined. Only its parent knows its exit status.
+    Gone,
+}
+
+/// A worker that waits for the answer to its request to join.
+#[derive(Debug)]
+pub(super) struct PendingJoin {
+    pub(super) stream: UnixStream,
+    /// Descriptor of the process, which never refers to another process.
+    pub(super) process: OwnedFd,
+    /// Process id, for messages.
+    pub(super) id: i32,
+    /// Version of the worker's program.
+    pub(super) speaks: Greeting,
+}
+
+impl PendingJoin {
+    /// Sends the reason and closes the connection.
+    pub(super) fn refuse(mut self, reason: String) {
+        tokio::spawn(async move {
+            let answer = JoinAnswer::Refused { reason };
+            // A worker that has gone needs no answer.
+            let _ = tokio::time::timeout(REFUSAL, write_line(&mut self.stream, &answer)).await;
+        });
+    }
+}
+
+/// A running child. The runtime kills it when it shuts down.
 #[derive(Debug)]
 pub(super) struct Child {
     commands: mpsc::Sender<Command>,
     kill: Arc<Notify>,
-    /// The process's number.
     id: Option<u32>,
 }
 
 impl Child {
-    /// Starts the command, whose three streams the launcher has set.
+    /// Starts the command, whose standard streams the launcher has set.
     pub(super) fn spawn(
         mut command: std::process::Command,
         process: Process,
-        events: mpsc::Sender<Event>,
+        events: mpsc::Sender<Incoming>,
     ) -> anyhow::Result<Self> {
-        start_deaf(&mut command);
+        ignore_group_signals(&mut command);
         let mut command = tokio::process::Command::from(command);
         command.kill_on_drop(true);
         let mut child = command.spawn().with_context(|| {
@@ -83,32 +114,31 @@ impl Child {
             if tokio::time::timeout(LAST_REPORTS, &mut reader).await.is_err() {
                 reader.abort();
             }
-            // Waiting fails only for a process that is no child of ours any more.
+            // Waiting fails only for a process that is no longer a child of this one.
             let status = status.unwrap_or_else(|_| ExitStatus::from_raw(0xff00));
-            // Nobody listens when the supervisor has given up: nothing left to tell.
-            let _ = events.send(Event::Exited(process, status)).await;
+            // The channel is closed if the supervisor has given up.
+            let _ = events.send(Incoming::Child(process, ChildEvent::Exited(status))).await;
         });
         Ok(Self { commands, kill, id })
     }
 
-    /// Goes on with a worker that joins, which is told `answer` first. Its process is watched by
-    /// its descriptor: a connection may be held open by what it has forked.
+    /// Admits a worker that joins, and sends it `answer`. The descriptor of its process tells when
+    /// it ends: a process that it has forked may hold the connection open.
     pub(super) fn join(
-        newcomer: Newcomer,
+        pending: PendingJoin,
         answer: &JoinAnswer,
         process: Process,
-        events: mpsc::Sender<Event>,
+        events: mpsc::Sender<Incoming>,
     ) -> anyhow::Result<Self> {
-        let Newcomer { stream, process: descriptor, id, .. } = newcomer;
-        // SAFETY: an owned descriptor is the same until it is dropped, and nobody else has it.
+        let PendingJoin { stream, process: descriptor, id, .. } = pending;
+        // SAFETY: an owned descriptor stays the same until it is dropped, and has no other owner.
         let descriptor = unsafe { AsyncFd::register_with_interest(descriptor, Interest::READABLE) };
         let descriptor = descriptor.context("cannot watch its process")?;
-        let mut answer = serde_json::to_vec(answer).context("cannot write an answer")?;
-        answer.push(b'\n');
+        let answer = answer.clone();
         let (input, mut output) = stream.into_split();
         let (commands, receiver) = mpsc::channel(COMMANDS_MAX);
         tokio::spawn(async move {
-            if output.write_all(&answer).await.is_ok() {
+            if write_line(&mut output, &answer).await.is_ok() {
                 write_commands(output, receiver).await;
             }
         });
@@ -126,7 +156,7 @@ impl Child {
                         listening = false;
                         grace = Box::pin(tokio::time::sleep(SILENT_EXIT));
                     }
-                    // Without a connection it can only end.
+                    // A worker without a connection must end.
                     () = &mut grace, if !listening => {
                         kill_by(&descriptor);
                         grace = Box::pin(tokio::time::sleep(SILENT_EXIT));
@@ -136,32 +166,32 @@ impl Child {
             if listening && tokio::time::timeout(LAST_REPORTS, &mut reader).await.is_err() {
                 reader.abort();
             }
-            let _ = events.send(Event::Gone(process)).await;
+            let _ = events.send(Incoming::Child(process, ChildEvent::Gone)).await;
         });
         Ok(Self { commands, kill, id: u32::try_from(id).ok() })
     }
 
-    /// The process's number; another's once it has ended and somebody needs a number.
+    /// The process id. After the exit, the system may assign it to another process.
     pub(super) fn id(&self) -> Option<u32> {
         self.id
     }
 
-    /// Sends a command without waiting; false when the child takes none.
+    /// Sends a command without waiting; returns false if the queue is full or the child is gone.
     pub(super) fn send(&self, command: Command) -> bool {
         self.commands.try_send(command).is_ok()
     }
 
-    /// SIGKILL; the exit comes as an event.
+    /// Sends SIGKILL; the exit arrives as an event.
     pub(super) fn kill(&self) {
         self.kill.notify_one();
     }
 }
 
-/// Has the child ignore from its first instruction on what a terminal or a service manager sends to
-/// the whole group: only the supervisor decides when a role ends, and a Ctrl-C that meets a child
-/// before it has set its own handlers must not look like the child's failure.
-fn start_deaf(command: &mut std::process::Command) {
-    let deafen = || {
+/// Makes the child ignore, from its first instruction, the signals that a terminal or a service
+/// manager sends to the whole group. Only the supervisor decides when a role ends. A Ctrl-C before
+/// the child sets its own handlers must not look like a failure of the child.
+fn ignore_group_signals(command: &mut std::process::Command) {
+    let ignore = || {
         for signal in GROUP_SIGNALS {
             // SAFETY: `signal` is async-signal-safe and takes plain numbers.
             if unsafe { libc::signal(signal, libc::SIG_IGN) } == libc::SIG_ERR {
@@ -171,20 +201,29 @@ fn start_deaf(command: &mut std::process::Command) {
         Ok(())
     };
     // SAFETY: between fork and exec the closure only calls `signal` and reads `errno`.
-    unsafe { command.pre_exec(deafen) };
+    unsafe { command.pre_exec(ignore) };
 }
 
-/// SIGKILL to the process of a descriptor; one that has ended already needs none.
+/// Sends SIGKILL to the process of a descriptor; does nothing if it has ended.
 fn kill_by(descriptor: &AsyncFd<OwnedFd>) {
     let _ = pidfd_send_signal(descriptor.get_ref(), Signal::KILL);
 }
 
-/// Until nobody sends commands or nobody reads them, of which the exit event tells.
+/// Writes a value as a line of JSON.
+pub(super) async fn write_line<W: AsyncWrite + Unpin>(
+    output: &mut W,
+    value: &impl serde::Serialize,
+) -> anyhow::Result<()> {
+    let mut line = serde_json::to_vec(value)?;
+    line.push(b'\n');
+    Ok(output.write_all(&line).await?)
+}
+
+/// Writes commands until the supervisor drops the sender or the child closes its input. The exit
+/// event follows the latter.
 async fn write_commands(mut input: impl AsyncWrite + Unpin, mut commands: mpsc::Receiver<Command>) {
     while let Some(command) = commands.recv().await {
-        let Ok(mut line) = serde_json::to_vec(&command) else { return };
-        line.push(b'\n');
-        if input.write_all(&line).await.is_err() {
+        if write_line(&mut input, &command).await.is_err() {
             return;
         }
     }
@@ -193,7 +232,7 @@ async fn write_commands(mut input: impl AsyncWrite + Unpin, mut commands: mpsc::
 async fn read_reports(
     output: impl AsyncRead + Unpin,
     process: Process,
-    events: mpsc::Sender<Event>,
+    events: mpsc::Sender<Incoming>,
 ) {
     let mut reader = BufReader::new(output);
     let mut line = Vec::new();
@@ -204,16 +243,17 @@ async fn read_reports(
             _ => return,
         }
         let event = match serde_json::from_slice(&line) {
-            Ok(report) => Event::Report(process, report),
-            Err(_) => Event::Garbage(process, String::from_utf8_lossy(&line).trim().to_owned()),
+            Ok(report) => ChildEvent::Report(report),
+            Err(_) => ChildEvent::Garbage(String::from_utf8_lossy(&line).trim().to_owned()),
         };
-        if events.send(event).await.is_err() {
+        if events.send(Incoming::Child(process, event)).await.is_err() {
             return;
         }
     }
 }
 
-/// `exit status 3`, `signal 9 (SIGKILL), perhaps for want of memory`.
+/// Describes an exit status, such as `exit status 3` or `signal 9 (SIGKILL), perhaps for want of
+/// memory`.
 pub(crate) fn describe(status: ExitStatus) -> String {
     let signal = match (status.code(), status.signal()) {
         (Some(ENV_HUNG_STATUS), _) => {
@@ -240,16 +280,17 @@ mod tests {
     use super::*;
 
     #[test]
-    fn an_end_is_described_with_its_likely_cause() {
+    fn an_exit_is_described_with_its_likely_cause() {
         assert_eq!(describe(ExitStatus::from_raw(3 << 8)), "exit status 3");
         assert!(describe(ExitStatus::from_raw(75 << 8)).contains("an environment hung"));
         assert!(describe(ExitStatus::from_raw(9)).contains("SIGKILL"));
         assert!(describe(ExitStatus::from_raw(7)).contains("/dev/shm"));
     }
 
-    /// A learner that Ctrl-C met in its first milliseconds was once reported as dead.
+    /// Regression test: a learner that received Ctrl-C in its first milliseconds was once reported
+    /// as dead.
     #[tokio::test]
-    async fn the_signals_of_a_group_do_not_end_a_child_that_has_only_just_started() {
+    async fn group_signals_do_not_end_a_child_that_has_just_started() {
         let mut shell = std::process::Command::new("sh");
         shell.args(["-c", "kill -INT $$; kill -TERM $$; kill -HUP $$; exit 3"]);
         shell.stdin(std::process::Stdio::piped()).stdout(std::process::Stdio::piped());
@@ -257,7 +298,9 @@ mod tests {
         let _child = Child::spawn(shell, Process::Learner, sender).unwrap();
         let exited = tokio::time::timeout(Duration::from_secs(10), events.recv()).await;
         match exited.expect("an exit within 10 s") {
-            Some(Event::Exited(Process::Learner, status)) => assert_eq!(status.code(), Some(3)),
+            Some(Incoming::Child(Process::Learner, ChildEvent::Exited(status))) => {
+                assert_eq!(status.code(), Some(3));
+            }
             other => panic!("expected its exit, got {other:?}"),
         }
     }

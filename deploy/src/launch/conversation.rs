@@ -1,4 +1,5 @@
-//! One child outside training, from its start to its answer: for `dmprl eval` and whoever observes.
+//! Runs one child outside training, from its start to its answer. Evaluations, observations and
+//! videos use it.
 
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
@@ -6,72 +7,74 @@ use std::time::{Duration, Instant};
 use anyhow::{Context, bail};
 use tokio::sync::mpsc;
 
-use super::child::{Child, EVENTS_MAX, Event, describe};
-use super::deaths::log_tail;
-use super::{Process, TimeLimits, interrupts};
+use super::child::{Child, ChildEvent, EVENTS_MAX, Incoming, describe};
+use super::limits::TimeLimits;
+use super::logs::log_tail;
+use super::process::Process;
+use super::signals::interrupts;
 use crate::control::{Command, Report};
 use crate::terminal::{say, shown};
 
-/// What a report of the child means.
+/// What follows from a report of the child.
 pub(super) enum Turn<T> {
-    /// Nothing for this conversation.
-    GoOn,
-    /// It is on its way: what comes next may take so long.
-    Wait(&'static str, Duration),
-    /// Send this, whose answer may take so long.
-    Ask(Command, &'static str, Duration),
-    /// It has answered.
-    Over(T),
+    /// Nothing.
+    Continue,
+    /// The child works; the next turn must come within this time.
+    Wait(Duration),
+    /// Send this command; the next turn must come within this time.
+    Ask(Command, Duration),
+    /// The child has answered.
+    Done(T),
 }
 
-/// Whom one speaks with.
+/// A child outside training.
 pub(super) struct Conversation {
-    /// As the subject of a sentence.
+    /// Name of the child in messages.
     pub who: &'static str,
-    /// Its standard error.
+    /// Log of its standard error.
     pub log: PathBuf,
 }
 
 impl Conversation {
-    /// Starts the child and lets `hear` answer its reports; none when the user interrupted it. In
-    /// either case the child is killed: it holds nothing that this could damage.
+    /// Starts the child and passes its reports to `on_report` until an answer; returns `None` if
+    /// the user interrupts. Then kills the child, which has no state to lose.
     ///
     /// # Errors
-    /// It died, took too long, or `hear` refuses.
+    /// The child died or took too long, or `on_report` failed.
     pub(super) fn hold<T>(
         &self,
         command: std::process::Command,
-        hear: impl FnMut(Report) -> anyhow::Result<Turn<T>>,
+        on_report: impl FnMut(Report) -> anyhow::Result<Turn<T>>,
     ) -> anyhow::Result<Option<T>> {
         let runtime = tokio::runtime::Builder::new_current_thread()
             .enable_all()
             .build()
             .context("cannot start a runtime")?;
-        runtime.block_on(async { self.run(command, interrupts()?, hear).await })
+        runtime.block_on(async { self.run(command, interrupts()?, on_report).await })
     }
 
     async fn run<T>(
         &self,
         command: std::process::Command,
         mut interrupts: mpsc::Receiver<()>,
-        hear: impl FnMut(Report) -> anyhow::Result<Turn<T>>,
+        on_report: impl FnMut(Report) -> anyhow::Result<Turn<T>>,
     ) -> anyhow::Result<Option<T>> {
         let limits = TimeLimits::default();
         let (sender, mut events) = mpsc::channel(EVENTS_MAX);
         let child = Child::spawn(command, Process::Evaluator, sender)?;
         let answer = tokio::select! {
             Some(()) = interrupts.recv() => Ok(None),
-            answer = self.answer(&child, &mut events, (limits.ready, hear)) => answer.map(Some),
+            answer = self.answer(&child, &mut events, on_report) => answer.map(Some),
         };
         child.kill();
         let exited = async {
             while let Some(event) = events.recv().await {
-                if matches!(event, Event::Exited(..)) {
+                if matches!(event, Incoming::Child(_, ChildEvent::Exited(_))) {
                     return;
                 }
             }
         };
-        // One that has exited already has no second exit to wait for.
+        // After an error the child may have exited already.
         if answer.is_ok() {
             tokio::time::timeout(limits.kill, exited).await.with_context(|| {
                 format!("{} did not end {:?} after SIGKILL", self.who, limits.kill)
@@ -83,47 +86,45 @@ impl Conversation {
     async fn answer<T>(
         &self,
         child: &Child,
-        events: &mut mpsc::Receiver<Event>,
-        (ready, mut hear): (Duration, impl FnMut(Report) -> anyhow::Result<Turn<T>>),
+        events: &mut mpsc::Receiver<Incoming>,
+        mut on_report: impl FnMut(Report) -> anyhow::Result<Turn<T>>,
     ) -> anyhow::Result<T> {
-        let mut deadline = Instant::now() + ready;
-        let mut waiting_for = "ready";
+        let mut deadline = Instant::now() + TimeLimits::default().ready;
+        let mut expected = "ready";
         loop {
             let Ok(event) = tokio::time::timeout_at(deadline.into(), events.recv()).await else {
-                bail!("{} was not {waiting_for} in time{}", self.who, log_tail(&self.log));
+                bail!("{} was not {expected} in time{}", self.who, log_tail(&self.log));
             };
             let report = match event {
-                Some(Event::Report(_, report)) => report,
-                Some(Event::Garbage(..)) => continue,
-                // Nobody joins such a child.
-                Some(Event::Asked(_) | Event::Gone(_)) => continue,
-                Some(Event::Exited(_, status)) => {
+                Some(Incoming::Child(_, ChildEvent::Report(report))) => report,
+                Some(Incoming::Child(_, ChildEvent::Exited(status))) => {
                     bail!("{} died: {}{}", self.who, describe(status), log_tail(&self.log))
                 }
+                Some(_) => continue,
                 None => bail!("{} is gone", self.who),
             };
-            tell(&report, &self.log);
-            let (what, limit) = match hear(report)? {
-                Turn::GoOn => continue,
-                Turn::Over(answer) => return Ok(answer),
-                Turn::Wait(what, limit) => (what, limit),
-                Turn::Ask(command, what, limit) => {
+            show(&report, &self.log);
+            let limit = match on_report(report)? {
+                Turn::Continue => continue,
+                Turn::Done(answer) => return Ok(answer),
+                Turn::Wait(limit) => limit,
+                Turn::Ask(command, limit) => {
                     child.send(command);
-                    (what, limit)
+                    limit
                 }
             };
-            (waiting_for, deadline) = (what, Instant::now() + limit);
+            (expected, deadline) = ("done", Instant::now() + limit);
         }
     }
 
-    /// The last lines of its log, to end an error with.
+    /// The last lines of its log, to be appended to an error.
     pub(super) fn log_tail(&self) -> String {
         log_tail(&self.log)
     }
 }
 
-/// What the user should read, whatever the conversation is about.
-fn tell(report: &Report, log: &Path) {
+/// Shows warnings and failures to the user.
+fn show(report: &Report, log: &Path) {
     match report {
         Report::EnvFailures { last, .. } => {
             say(&format!("environment failure: {last}; log: {}", shown(log)));

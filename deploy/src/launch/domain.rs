@@ -1,7 +1,7 @@
-//! The run's private shared-memory directory: the one place that makes, finds and removes it.
+//! Creates, finds and removes the run's private shared-memory directory, its domain.
 //!
-//! A user's domains lie in `dmprl-<uid>`. Where shared memory is everybody's, somebody else can
-//! take that name first; then they lie in `dmprl-<uid>-<random>`, which nobody can guess.
+//! A user's domains are in `dmprl-<uid>`. Shared memory is writable for all users, so another user
+//! can take that name first. Then they are in `dmprl-<uid>-<random>`, which is hard to guess.
 
 use std::fs::Metadata;
 use std::os::unix::fs::MetadataExt;
@@ -13,10 +13,10 @@ use dmprl_shared::transport::shared_memory::{Domain, Leftover, abandoned, remove
 use crate::run_directory::{Manifest, random_u64};
 use crate::terminal::say;
 
-/// Digits of the random part of a name: the domain's path must stay short.
+/// Number of random digits in a name. Paths of domains must stay short.
 const RANDOM_DIGITS: usize = 8;
 
-/// A file system for shared memory, and whose domains are looked for in it.
+/// The directories of a user's domains in a file system for shared memory.
 #[derive(Debug, Clone)]
 pub(crate) struct Place {
     base: PathBuf,
@@ -24,7 +24,7 @@ pub(crate) struct Place {
 }
 
 impl Place {
-    /// This user's: memory-backed when the system has it.
+    /// Domains of this user, in a memory-backed file system if there is one.
     pub(crate) fn new() -> Self {
         let shared_memory = Path::new("/dev/shm");
         let base =
@@ -37,30 +37,31 @@ impl Place {
         &self.base
     }
 
-    /// The directory of this user's domains, and another user's id if that one has it.
+    /// Returns the standard directory of this user's domains, and the id of its owner if that is
+    /// another user.
     pub(crate) fn standard(&self) -> (PathBuf, Option<u32>) {
         let path = self.base.join(format!("dmprl-{}", self.user));
         let owner = path.symlink_metadata().ok().map(|metadata| metadata.uid());
         (path, owner.filter(|&owner| owner != self.user))
     }
 
-    /// What dead runs of this user have left. Changes nothing.
+    /// Lists the leftovers of this user's dead runs. Changes nothing.
     ///
     /// # Errors
-    /// A directory of this user's is open to others, or cannot be read.
+    /// A directory of this user is open to others, or cannot be read.
     pub(crate) fn leftovers(&self) -> anyhow::Result<Vec<Leftover>> {
         self.of_each_parent(abandoned, "look for")
     }
 
-    /// Removes what dead runs of this user have left.
+    /// Removes the leftovers of this user's dead runs.
     ///
     /// # Errors
-    /// A directory of this user's is open to others, or something cannot be removed.
+    /// A directory of this user is open to others, or a leftover cannot be removed.
     pub(crate) fn remove_leftovers(&self) -> anyhow::Result<Vec<Leftover>> {
         self.of_each_parent(remove_abandoned, "remove")
     }
 
-    /// The domain of this user that has this token.
+    /// Finds this user's domain with this token.
     pub(crate) fn find(&self, token: &str) -> Option<PathBuf> {
         let (standard, taken_by) = self.standard();
         let parents = taken_by.is_none().then_some(standard).into_iter().chain(self.others());
@@ -82,7 +83,7 @@ impl Place {
         Ok(leftovers)
     }
 
-    /// The directories of random name that are this user's alone.
+    /// Lists this user's private directories with random names.
     fn others(&self) -> Vec<PathBuf> {
         let prefix = format!("dmprl-{}-", self.user);
         let private = |metadata: Metadata| {
@@ -100,7 +101,7 @@ impl Place {
         paths
     }
 
-    /// Where a new domain goes.
+    /// Chooses the directory of a new domain.
     fn parent(&self) -> anyhow::Result<PathBuf> {
         let (standard, taken_by) = self.standard();
         let Some(other) = taken_by else { return Ok(standard) };
@@ -127,15 +128,15 @@ impl Place {
     }
 }
 
-/// The name of a run's domain: its number and its supervisor's.
+/// Returns the name of a run's domain: the run's id and its supervisor's process id.
 pub(crate) fn token(manifest: &Manifest, supervisor: u32) -> String {
     format!("{}-{supervisor}", manifest.run_id)
 }
 
-/// Removes what dead runs have left, then makes a directory for this one.
+/// Removes leftovers of dead runs, then creates the directory of this one.
 ///
 /// # Errors
-/// The directory cannot be made, or is open to others.
+/// The directory cannot be created, or is open to others.
 pub(crate) fn create(token: &str) -> anyhow::Result<Domain> {
     Place::new().create(token)
 }
@@ -157,9 +158,9 @@ mod tests {
         (base, place)
     }
 
-    /// Whoever may write to shared memory can take a name before its owner does.
+    /// Any user who can write to shared memory can take the name first.
     #[test]
-    fn a_name_that_another_user_has_taken_blocks_nobody() {
+    fn a_name_taken_by_another_user_is_avoided() {
         let (_base, place) = place();
         let (squatted, _) = place.standard();
         std::fs::create_dir(&squatted).unwrap();
@@ -171,13 +172,13 @@ mod tests {
         let parent = first.path().parent().unwrap().to_owned();
         assert_ne!(parent, squatted);
         assert_eq!(place.others(), std::slice::from_ref(&parent));
-        // The next one finds it; nothing is left of it in the end.
+        // The next domain uses the same directory, which is removed with the last.
         let second = place.create("second").unwrap();
         assert_eq!(second.path().parent(), Some(parent.as_path()));
         assert_eq!(place.leftovers().unwrap(), []);
         drop((first, second));
         assert_eq!(place.others(), Vec::<PathBuf>::new());
-        assert!(squatted.is_dir(), "what is another's stays");
+        assert!(squatted.is_dir(), "another user's directory stays");
     }
 
     #[test]
@@ -209,7 +210,7 @@ mod tests {
     }
 
     #[test]
-    fn two_runs_of_one_user_have_a_directory_each() {
+    fn runs_of_a_user_have_separate_directories() {
         let (_base, place) = place();
         let (one, two) = (place.create("one").unwrap(), place.create("two").unwrap());
         assert_ne!(one.path(), two.path());

@@ -1,48 +1,56 @@
-//! One evaluation outside training, for `dmprl eval`: an evaluator, one request, one answer.
+//! One evaluation outside training, for `dmprl eval`.
 
 use std::path::PathBuf;
+use std::process::Command;
 
 use anyhow::bail;
 
 use super::conversation::{Conversation, Turn};
-use super::{Launcher, TimeLimits};
-use crate::control::{Command, EvaluationRequest, EvaluationRow, Report};
+use super::launcher::Launcher;
+use super::limits::TimeLimits;
+use crate::control::{self, EvaluationRequest, EvaluationRow, Report};
 use crate::run_directory::RunDirectory;
 
-/// What to evaluate.
+/// An evaluation to run.
 pub struct EvaluationPlan<'a> {
-    /// The program that plays the evaluator: this one; tests put a fake here.
+    /// The program that plays the evaluator: this one, or a fake in tests.
     pub program: PathBuf,
     /// The run.
     pub run: &'a RunDirectory,
     /// The Python virtual environment.
     pub venv: Option<PathBuf>,
-    /// The policy, and where it stood in training.
+    /// The policy and its place in training.
     pub request: EvaluationRequest,
-    /// How many episodes.
+    /// Number of episodes.
     pub episodes: u64,
 }
 
-/// Evaluates one saved policy; none when the user interrupted it.
+/// Evaluates a saved policy; returns `None` if the user interrupts.
 ///
 /// # Errors
-/// The evaluator died or took too long.
+/// The evaluator died, failed or took too long.
 pub fn evaluate(plan: EvaluationPlan<'_>) -> anyhow::Result<Option<EvaluationRow>> {
+    let mut command = Command::new(&plan.program);
+    command.args(["evaluator", "--print-only", "--episodes", &plan.episodes.to_string()]);
+    command.arg("--run").arg(plan.run.path());
+    if let Some(venv) = &plan.venv {
+        command.arg("--venv").arg(venv);
+    }
     let launcher = Launcher::outside_training(plan.program, plan.run, plan.venv);
-    let command = launcher.evaluate(plan.episodes)?;
+    let command = launcher.streams(command, "eval")?;
     let episodes = usize::try_from(plan.episodes).unwrap_or(usize::MAX);
-    let answer_limit = TimeLimits::default().evaluation_of(episodes);
+    let limit = TimeLimits::default().evaluation_of(episodes);
     let evaluator = Conversation { who: "the evaluator", log: plan.run.log_path("eval") };
     evaluator.hold(command, |report| {
         Ok(match report {
             Report::EnvironmentReady { .. } => {
-                Turn::Ask(Command::Evaluate(plan.request.clone()), "done", answer_limit)
+                Turn::Ask(control::Command::Evaluate(plan.request.clone()), limit)
             }
-            Report::Evaluated(row) => Turn::Over(row),
+            Report::Evaluated(row) => Turn::Done(row),
             Report::NotEvaluated { reason, .. } => {
                 bail!("the evaluation failed: {reason}{}", evaluator.log_tail())
             }
-            _ => Turn::GoOn,
+            _ => Turn::Continue,
         })
     })
 }

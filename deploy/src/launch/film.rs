@@ -1,22 +1,23 @@
-//! A video of episodes that an observer has drawn, made by `envs_py/dmprl/film.py`.
+//! Makes a video of recorded episodes with `envs_py/dmprl/film.py`.
 
 use std::path::Path;
+use std::process::Command;
 use std::time::Duration;
 
-use super::Launcher;
 use super::conversation::{Conversation, Turn};
+use super::launcher::Launcher;
 use crate::control::Report;
 use crate::failure::Outcome;
 use crate::run_directory::RunDirectory;
 
-/// From one frame to the next, and for the end of the animation, which is written at once.
+/// Maximum time between two frames, and for the end of the animation, which is written at once.
 const FRAME: Duration = Duration::from_secs(120);
 
-/// Makes what `plan`, a file, asks for; `progress` is called with the number of frames done, and of
-/// how many.
+/// Makes the video that the file `plan` describes. Calls `progress` with the number of completed
+/// frames and of all frames.
 ///
 /// # Errors
-/// It died or took too long.
+/// The process died or took too long.
 pub fn film(
     run: &RunDirectory,
     python: &Path,
@@ -24,14 +25,17 @@ pub fn film(
     progress: &dyn Fn(u64, u64),
 ) -> anyhow::Result<Outcome> {
     let launcher = Launcher::outside_training(python.to_owned(), run, None);
+    let mut command = Command::new(python);
+    command.args(["-I", "-m", "dmprl.film"]).arg(plan);
+    let command = launcher.streams(command, "film")?;
     let maker = Conversation { who: "the maker of the video", log: run.log_path("film") };
-    let answer = maker.hold(launcher.film(plan)?, |report| {
+    let answer = maker.hold(command, |report| {
         Ok(match report {
             Report::Filmed { done, of } => {
                 progress(done, of);
-                if done < of { Turn::Wait("done", FRAME) } else { Turn::Over(()) }
+                if done < of { Turn::Wait(FRAME) } else { Turn::Done(()) }
             }
-            _ => Turn::GoOn,
+            _ => Turn::Continue,
         })
     })?;
     Ok(answer.map_or(Outcome::Interrupted, |()| Outcome::Done))

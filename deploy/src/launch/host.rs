@@ -1,60 +1,59 @@
-//! One host's part in a run whose learner is on another: its workers and their relay.
+//! Supervises a host without a learner: its workers and the relay to the learner's host.
 
 use std::path::PathBuf;
 
 use anyhow::Context;
 use dmprl_shared::config::ExperimentConfig;
 
-use super::{
-    Ending, Launcher, SupervisorPlan, TimeLimits, Upstream, domain, interrupts, supervise, title,
-};
-use crate::failure::Outcome;
-use crate::run_directory::{RunDirectory, RunLock};
-use crate::terminal::{Display, ProgressStyle, grouped, say, shown};
+use super::domain;
+use super::launcher::{Launcher, Upstream};
+use super::limits::TimeLimits;
+use super::observer::{RunEvent, RunObserver};
+use super::session::title;
+use super::signals::interrupts;
+use super::supervisor::{SessionReport, SupervisorPlan, supervise};
+use super::totals::Totals;
+use crate::run_directory::RunDirectory;
 
-/// A host that takes part.
+/// A host whose workers take part in the run of another host.
 pub struct HostPlan {
     /// The program that plays the roles: this one.
     pub program: PathBuf,
-    /// This host's directory of the run.
+    /// This host's directory of the run. The caller holds its lock until the session has ended, and
+    /// children inherit it.
     pub run: RunDirectory,
-    /// Held until the end, and by every child.
-    pub lock: RunLock,
-    /// The run's configuration, as it is on this host.
+    /// The run's configuration, adapted to this host.
     pub config: ExperimentConfig,
     /// The Python virtual environment.
     pub venv: PathBuf,
     /// The learner's host.
     pub upstream: Upstream,
-    /// The session as which its workers' incarnations are counted.
+    /// Number of the session, from which its workers' incarnations are derived.
     pub session: u32,
-    /// Bar or lines.
-    pub progress: ProgressStyle,
 }
 
-/// Steps environments for the run until it ends or the user stops it.
+/// Steps environments for the run until it ends or the user stops this host.
 ///
 /// # Errors
-/// Whatever kept the host from going on.
-pub fn host(plan: HostPlan) -> anyhow::Result<Outcome> {
-    let HostPlan { program, run, lock, config, venv, upstream, session, progress } = plan;
+/// The session could not begin. How it ended is in the report.
+pub fn host(plan: HostPlan, observer: &mut dyn RunObserver) -> anyhow::Result<SessionReport> {
+    let HostPlan { program, run, config, venv, upstream, session } = plan;
     let runtime = tokio::runtime::Builder::new_current_thread()
         .enable_all()
         .build()
         .context("cannot start the supervisor's runtime")?;
-    // Before the shared memory: a signal that still kills would leave it behind.
+    // Catch signals before making shared memory: a fatal signal would leave it behind.
     let interrupts = runtime.block_on(async { interrupts() })?;
     let domain = domain::create(&domain::token(&run.manifest()?, std::process::id()))?;
-    let mut display = Display::new(progress, config.run.steps).of_host();
-    display.message(&format!(
-        "{} for the learner at {}, in {}",
-        title(&config),
-        upstream.endpoint,
-        shown(run.path())
-    ));
+    observer.on_event(RunEvent::Started {
+        title: title(&config),
+        run: run.path().to_owned(),
+        learner: Some(upstream.endpoint.clone()),
+        evaluations: Vec::new(),
+    });
     let launcher = Launcher {
         program,
-        run: run.clone(),
+        run,
         venv: Some(venv),
         domain: Some(domain.path().to_owned()),
         resume: false,
@@ -65,24 +64,11 @@ pub fn host(plan: HostPlan) -> anyhow::Result<Outcome> {
         upstream: Some(upstream),
     };
     let limits = TimeLimits::default();
-    let report = runtime.block_on(async {
-        supervise(SupervisorPlan { launcher, config, limits, display, interrupts }).await
-    });
-    // In this order: no child, then nothing half-made, then no lock.
+    let earlier = Totals::default();
+    let plan = SupervisorPlan { launcher, config, limits, earlier, interrupts };
+    let report = runtime.block_on(supervise(plan, observer));
+    // The runtime kills children that remain, which must not outlive their shared memory.
     drop(runtime);
     drop(domain);
-    drop(lock);
-    let segments = report.last.as_ref().map_or(0, |progress| progress.segments);
-    let acknowledged = format!("{} segments acknowledged", grouped(segments));
-    match report.ending {
-        Ending::Failed(error) => Err(error),
-        Ending::Interrupted => {
-            say(&format!("left the run: {acknowledged}"));
-            Ok(Outcome::Interrupted)
-        }
-        Ending::Completed => {
-            say(&format!("the run has ended: {acknowledged}"));
-            Ok(Outcome::Done)
-        }
-    }
+    Ok(report)
 }

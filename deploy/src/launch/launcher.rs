@@ -1,70 +1,42 @@
-//! The command lines of the children.
+//! Builds the command lines of the children.
 
-use std::fmt::{self, Display, Formatter};
 use std::fs::OpenOptions;
 use std::io::Write;
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 use std::process::{Command, Stdio};
 use std::time::SystemTime;
 
 use anyhow::Context;
 
-use crate::roles::ObserverArgs;
+use super::process::Process;
 use crate::run_directory::{RunDirectory, rfc3339};
 
-/// Incarnations that one session of the run has for each worker; a segment's sender is thus
-/// never mistaken for one of an earlier session.
+/// Number of incarnations of each worker in a session of the run. Sessions use disjoint ranges, so
+/// the learner can distinguish a segment's sender from those of earlier sessions.
 pub(super) const INCARNATIONS_PER_SESSION: u32 = 1 << 16;
 
-/// One of a run's children.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
-pub enum Process {
-    /// The learner.
-    Learner,
-    /// What stands for the learner on another host.
-    Relay,
-    /// A worker, by its index.
-    Actor(u32),
-    /// The evaluator.
-    Evaluator,
-    /// What stands for the workers of other hosts.
-    Gateway,
-}
-
-impl Display for Process {
-    fn fmt(&self, formatter: &mut Formatter<'_>) -> fmt::Result {
-        match self {
-            Self::Learner => formatter.write_str("learner"),
-            Self::Relay => formatter.write_str("relay"),
-            Self::Gateway => formatter.write_str("gateway"),
-            Self::Actor(index) => write!(formatter, "actor-{index}"),
-            Self::Evaluator => formatter.write_str("evaluator"),
-        }
-    }
-}
-
-/// Everything that goes into the children's command lines.
+/// Parameters of the children's command lines.
 #[derive(Debug, Clone)]
 pub struct Launcher {
-    /// This program; tests put a fake here.
+    /// This program, or a fake in tests.
     pub program: PathBuf,
     /// The run.
     pub run: RunDirectory,
     /// The Python virtual environment.
     pub venv: Option<PathBuf>,
-    /// The shared-memory directory; none: learner, worker and evaluator are one process.
+    /// The shared-memory directory; `None` if learner, worker and evaluator are one process.
     pub domain: Option<PathBuf>,
-    /// Whether the learner goes on from a checkpoint.
+    /// Whether the learner resumes from a checkpoint.
     pub resume: bool,
     /// The policy file of a warm start.
     pub init_from: Option<PathBuf>,
-    /// Starts of the learner after a death, over the whole run.
+    /// Restarts of the learner after a death, in the whole run.
     pub learner_restarts: u64,
     /// Sessions of this run before this one.
     pub sessions_before: u32,
-    /// Where worker and learner note what they do, for `dmprl chaos`.
+    /// Directory of the journals of workers and learner, for `dmprl chaos`.
     pub journal: Option<PathBuf>,
-    /// Where the learner is, on a host that has none.
+    /// The learner's host, on a host without a learner.
     pub upstream: Option<Upstream>,
 }
 
@@ -75,26 +47,26 @@ pub struct Upstream {
     pub endpoint: String,
     /// The file with the run's secret.
     pub token_file: PathBuf,
-    /// Tells this start of `dmprl bridge` from every other.
+    /// Random number that identifies this host to the learner's host.
     pub host: u64,
-    /// What people call this host.
+    /// Name of this host in displays.
     pub name: String,
-    /// The first of the run's workers that is this host's.
+    /// Index in the run of this host's first worker.
     pub first: u32,
-    /// Zenoh's own configuration.
+    /// Zenoh configuration file.
     pub zenoh_file: Option<PathBuf>,
-    /// How long the learner's host may be away \[s\].
+    /// Maximum time for which the learner's host may be unreachable \[s\].
     pub patience_s: u64,
 }
 
 impl Launcher {
-    /// What workers send to.
+    /// The process to which workers send: the learner, or the relay on a host without one.
     #[must_use]
     pub fn hub(&self) -> Process {
         if self.upstream.is_some() { Process::Relay } else { Process::Learner }
     }
 
-    /// For a single child of a run that nobody trains.
+    /// A launcher of single children outside training.
     #[must_use]
     pub fn outside_training(program: PathBuf, run: &RunDirectory, venv: Option<PathBuf>) -> Self {
         Self {
@@ -111,11 +83,11 @@ impl Launcher {
         }
     }
 
-    /// The number of a worker's start, of this session's the `start`th from 0: no start of the
-    /// run has had it before, and all of them rise.
+    /// Computes a worker's incarnation from the number of its start in this session, from 0.
+    /// Incarnations of a worker increase over all sessions of the run.
     ///
     /// # Errors
-    /// The run has had too many sessions, or the session of the worker's starts.
+    /// The run has had too many sessions, or the worker too many starts.
     pub fn incarnation(&self, start: u32) -> anyhow::Result<u32> {
         let first = self.sessions_before.checked_mul(INCARNATIONS_PER_SESSION);
         let first = first.filter(|_| start < INCARNATIONS_PER_SESSION);
@@ -128,8 +100,8 @@ impl Launcher {
         })
     }
 
-    /// The command that starts `process`, of this session's starts the `start`th from 0, its
-    /// standard error appended to its log.
+    /// Builds the command that starts `process`, with standard error appended to its log. `start`
+    /// is the number of the start in this session, from 0.
     ///
     /// # Errors
     /// The log cannot be opened, or a worker has been started too often.
@@ -166,54 +138,6 @@ impl Launcher {
         self.streams(command, &process.to_string())
     }
 
-    /// The command of `dmprl eval`: an evaluator that leaves the run as it is.
-    ///
-    /// # Errors
-    /// The log cannot be opened.
-    pub fn evaluate(&self, episodes: u64) -> anyhow::Result<Command> {
-        let mut command = Command::new(&self.program);
-        command.args(["evaluator", "--print-only", "--episodes", &episodes.to_string()]);
-        command.arg("--run").arg(self.run.path());
-        if let Some(venv) = &self.venv {
-            command.arg("--venv").arg(venv);
-        }
-        self.streams(command, "eval")
-    }
-
-    /// The command of an observer, which leaves the run as it is too.
-    ///
-    /// # Errors
-    /// The log cannot be opened.
-    pub fn observe(&self, args: &ObserverArgs) -> anyhow::Result<Command> {
-        let mut command = Command::new(&self.program);
-        command.arg("observer").arg("--run").arg(&args.run);
-        for (flag, number) in [
-            ("--policy", args.policy),
-            ("--first-seed", args.first_seed),
-            ("--episodes", args.episodes),
-        ] {
-            command.args([flag, &number.to_string()]);
-        }
-        command.arg("--output").arg(&args.output);
-        if let Some(pictures) = &args.pictures {
-            command.arg("--pictures").arg(pictures);
-        }
-        if let Some(venv) = &self.venv {
-            command.arg("--venv").arg(venv);
-        }
-        self.streams(command, "observer")
-    }
-
-    /// The command of the process that makes a video of a plan.
-    ///
-    /// # Errors
-    /// The log cannot be opened.
-    pub fn film(&self, plan: &Path) -> anyhow::Result<Command> {
-        let mut command = Command::new(&self.program);
-        command.args(["-I", "-m", "dmprl.film"]).arg(plan);
-        self.streams(command, "film")
-    }
-
     fn learner(&self, command: &mut Command) {
         command.arg("learner").arg("--run").arg(self.run.path());
         match &self.domain {
@@ -226,7 +150,7 @@ impl Launcher {
         if self.learner_restarts > 0 {
             command.args(["--restarts", &self.learner_restarts.to_string()]);
         }
-        // A checkpoint holds all that the warm start gave.
+        // A checkpoint includes the result of the warm start.
         if let Some(file) = self.init_from.as_ref().filter(|_| !self.resume) {
             command.arg("--init-from").arg(file);
         }
@@ -254,14 +178,19 @@ impl Launcher {
         }
     }
 
-    fn streams(&self, mut command: Command, name: &str) -> anyhow::Result<Command> {
+    /// Connects a command's standard streams: pipes for input and output, and the log of `name` for
+    /// errors.
+    ///
+    /// # Errors
+    /// The log cannot be opened.
+    pub(super) fn streams(&self, mut command: Command, name: &str) -> anyhow::Result<Command> {
         let path = self.run.log_path(name);
         let mut log = OpenOptions::new()
             .append(true)
             .create(true)
             .open(&path)
             .with_context(|| format!("cannot open {}", path.display()))?;
-        // One log for all starts of a process: say where each begins.
+        // All starts of a process share a log: mark where each begins.
         writeln!(log, "--- {name}, {} ---", rfc3339(SystemTime::now()))
             .with_context(|| format!("cannot write {}", path.display()))?;
         command.stdin(Stdio::piped()).stdout(Stdio::piped()).stderr(log);
@@ -275,7 +204,7 @@ mod tests {
     use crate::run_directory::Manifest;
 
     #[test]
-    fn no_start_of_a_run_has_the_number_of_another() {
+    fn incarnations_of_a_run_are_unique() {
         let folder = tempfile::tempdir().unwrap();
         let manifest = Manifest::new(None).unwrap();
         let run = RunDirectory::create(&folder.path().join("run"), &Default::default(), &manifest);

@@ -1,31 +1,33 @@
-//! How long the supervisor waits for what.
+//! Time limits of the supervisor.
 
 use std::time::Duration;
 
-/// Every wait of the supervisor, named. Tests shorten them; users get the defaults.
+/// Every wait of the supervisor. Tests shorten them; users get the defaults.
 #[derive(Debug, Clone, Copy)]
 pub struct TimeLimits {
     /// From a child's start to its report that it is ready.
     pub ready: Duration,
-    /// More for a learner, for each update in which it imitates demonstrations first.
+    /// Added for a learner, for each update of its imitation of demonstrations.
     pub cloning_update: Duration,
-    /// From an interrupt to the last exit; the rest of ten seconds is for SIGKILL.
+    /// From an interrupt to the last exit. The rest of ten seconds is for SIGKILL.
     pub stop: Duration,
-    /// For a learner that comes to a regular end: it drains, writes a checkpoint, exits.
+    /// For a learner that finishes: it drains the queues, writes a checkpoint and exits.
     pub drain: Duration,
-    /// From SIGKILL to the exit.
+    /// From SIGKILL to the exit when the run stops.
     pub kill: Duration,
-    /// One evaluation whatever its length,
+    /// From SIGKILL to the exit while the run continues: freeing a large memory takes time.
+    pub killed: Duration,
+    /// For an evaluation, whatever its number of episodes.
     pub evaluation: Duration,
-    /// and for each of its episodes.
+    /// Added for each episode of an evaluation.
     pub evaluation_episode: Duration,
-    /// Without a step or an update a run is stuck.
+    /// Maximum time without a step or an update.
     pub stall: Duration,
-    /// Before the first restart of a child; doubles with each further one,
+    /// Back-off before the first restart of a child; it doubles with each retry.
     pub restart_first: Duration,
-    /// up to this.
+    /// Maximum back-off.
     pub restart_max: Duration,
-    /// A child that did its work for so long is no crash loop: its next death is its first.
+    /// A child that has worked for this long is not in a crash loop.
     pub proven: Duration,
 }
 
@@ -37,6 +39,7 @@ impl Default for TimeLimits {
             stop: Duration::from_secs(9),
             drain: Duration::from_secs(60),
             kill: Duration::from_secs(5),
+            killed: Duration::from_secs(60),
             evaluation: Duration::from_secs(60),
             evaluation_episode: Duration::from_secs(30),
             stall: Duration::from_secs(600),
@@ -49,14 +52,14 @@ impl Default for TimeLimits {
 }
 
 impl TimeLimits {
-    /// The wait before restart number `restarts`, from 0.
+    /// Back-off before restart number `restarts`, from 0.
     #[must_use]
     pub fn back_off(&self, restarts: u32) -> Duration {
         let doubled = 2_u32.checked_pow(restarts).unwrap_or(u32::MAX);
         self.restart_first.saturating_mul(doubled).min(self.restart_max)
     }
 
-    /// The limit of an evaluation of so many episodes.
+    /// Limit of an evaluation with this number of episodes.
     #[must_use]
     pub fn evaluation_of(&self, episodes: usize) -> Duration {
         let episodes = u32::try_from(episodes).unwrap_or(u32::MAX);

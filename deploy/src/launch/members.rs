@@ -1,16 +1,17 @@
-//! The processes of a run that somebody else supervises, as /proc shows them.
+//! Finds the processes of a run that another process supervises, in /proc. `chaos` and `bench
+//! system` use it.
 
 use std::fs;
 
 use anyhow::Context;
 use rustix::process::{Pid, Signal, kill_process};
 
-/// Which part of the run a process plays.
+/// Role of a process in its run.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum Role {
     /// A worker, by index and incarnation.
     Worker(u32, u32),
-    /// A learner, by the number of deaths before it.
+    /// A learner, by its number of restarts.
     Learner(u64),
     /// The evaluator.
     Evaluator,
@@ -24,24 +25,24 @@ pub(crate) struct Member {
 }
 
 impl Member {
-    /// Sends it a signal; false if it is gone.
+    /// Sends a signal; returns false if the process is gone.
     pub(crate) fn signal(&self, signal: Signal) -> bool {
         kill_process(self.pid, signal).is_ok()
     }
 
-    /// Its id.
+    /// Process id.
     pub(crate) fn pid(&self) -> Pid {
         self.pid
     }
 }
 
-/// The supervisor's children that have told their command line already.
+/// Lists the supervisor's children whose command line is visible already.
 pub(crate) fn members(supervisor: Pid) -> anyhow::Result<Vec<Member>> {
     let entries = fs::read_dir("/proc").context("cannot list /proc")?;
     let child = |name: &str| {
         let pid = Pid::from_raw(name.parse().ok()?)?;
         let stat = fs::read_to_string(format!("/proc/{name}/stat")).ok()?;
-        // The name in parentheses may hold anything; state and parent follow it.
+        // The name in parentheses may contain anything; state and parent follow it.
         let mut fields = stat.rsplit_once(')')?.1.split_whitespace();
         let (state, parent) = (fields.next()?, fields.next()?);
         let is_ours = parent == supervisor.as_raw_nonzero().to_string();
@@ -69,7 +70,8 @@ fn role(command_line: &str) -> Option<Role> {
     }
 }
 
-/// Ids of the processes, but this one, of a session: whatever the run has started is in its own.
+/// Lists the process ids of a session, except this process. A run started by [`super::WholeRun`]
+/// has a session of its own.
 pub(crate) fn of_session(session: Pid) -> anyhow::Result<Vec<String>> {
     let (session, own) = (session.as_raw_nonzero().to_string(), std::process::id().to_string());
     let entries = fs::read_dir("/proc").context("cannot list /proc")?;
@@ -84,17 +86,17 @@ pub(crate) fn of_session(session: Pid) -> anyhow::Result<Vec<String>> {
     Ok(names.filter_map(member).collect())
 }
 
-/// Processor time of a process so far, ended threads included [s]; none if it is gone.
+/// Reads a process's processor time, including that of ended threads [s]; `None` if it is gone.
 pub(crate) fn cpu_s(pid: Pid) -> Option<f64> {
     let stat = fs::read_to_string(format!("/proc/{}/stat", pid.as_raw_nonzero())).ok()?;
-    // The name in parentheses may hold anything; utime and stime are the twelfth and thirteenth
-    // field behind it.
+    // The name in parentheses may contain anything; utime and stime are the twelfth and thirteenth
+    // field after it.
     let fields: Vec<&str> = stat.rsplit_once(')')?.1.split_whitespace().collect();
     let ticks = fields.get(11)?.parse::<u64>().ok()? + fields.get(12)?.parse::<u64>().ok()?;
     Some(ticks as f64 / rustix::param::clock_ticks_per_second() as f64)
 }
 
-/// What a process holds.
+/// Resources of a process.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) struct Holdings {
     /// Memory [KiB].
@@ -105,7 +107,7 @@ pub(crate) struct Holdings {
     pub(crate) maps: u64,
 }
 
-/// What a process holds now; none if it is gone.
+/// Reads a process's resources; `None` if it is gone.
 pub(crate) fn holdings(pid: Pid) -> Option<Holdings> {
     let folder = format!("/proc/{}", pid.as_raw_nonzero());
     let status = fs::read_to_string(format!("{folder}/status")).ok()?;
@@ -121,7 +123,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_role_is_read_from_the_command_line_that_the_launcher_writes() {
+    fn roles_are_read_from_the_launchers_command_lines() {
         let read = |line: &str| role(&line.replace(' ', "\0"));
         let worker = "dmprl actor --index 1 --incarnation 65538 --run /r --venv /v";
         assert_eq!(read(worker), Some(Role::Worker(1, 65_538)));
@@ -134,7 +136,7 @@ mod tests {
     }
 
     #[test]
-    fn this_process_holds_something() {
+    fn this_process_has_resources() {
         let held = holdings(rustix::process::getpid()).unwrap();
         assert!(held.rss_kib > 0 && held.fds > 2 && held.maps > 2, "{held:?}");
     }
@@ -143,7 +145,7 @@ mod tests {
     fn processor_time_is_counted_in_seconds() {
         let clock = rustix::time::clock_gettime(rustix::time::ClockId::ProcessCPUTime);
         let told = cpu_s(rustix::process::getpid()).unwrap();
-        // The clock was read first, and /proc rounds down to ticks of a hundredth.
+        // The clock was read first, and /proc rounds down to hundredths of a second.
         assert!(told >= clock.tv_sec as f64 - 1.0 && told < clock.tv_sec as f64 + 60.0, "{told}");
     }
 }

@@ -1,4 +1,4 @@
-//! Stage 2 of 8: the processes of a run, from the first start to the last exit.
+//! Stage 2 of 8: supervises the processes of a run, from the first start to the last exit.
 //!
 //! ```text
 //!  train ─► session ─► supervisor ─┬─ actor × N      environment_ready … attach
@@ -7,52 +7,61 @@
 //! ```
 //! With `run.deterministic` there is one child, `learner --one-process`, which does everything.
 //!
-//! Who ends whom: a child ignores terminal signals and ends on `stop` or at the end of its
-//! standard input, which the death of the supervisor brings about, whatever killed it. No
-//! parent-death signal is used: it would kill the learner before its last checkpoint. The run's
-//! lock is inherited, so a `resume` waits for such an orphan.
+//! A child ignores terminal signals. It ends on `stop` or at the end of its standard input, which
+//! also follows from the death of the supervisor. A parent-death signal would kill the learner
+//! before its last checkpoint. Children inherit the run's lock, so `resume` waits for such orphans.
 //!
-//! Every wait has a limit in [`TimeLimits`]. The supervisor itself is one loop over events,
-//! interrupts and the next deadline; it never waits anywhere else.
+//! The supervisor is a state machine (`machine.rs`) and a loop around it (`supervisor.rs`) that
+//! waits for events, interrupts and the next deadline, and nowhere else. Every wait has a limit in
+//! [`TimeLimits`]. A [`RunObserver`] receives everything that happens; nothing here draws.
 
 mod child;
+mod children;
 mod conversation;
-mod deadlines;
-mod deaths;
 mod domain;
-mod domain_watch;
-mod endings;
-mod env_failures;
 mod evaluate;
 mod evaluations;
 mod film;
-mod heartbeats;
 mod host;
+mod hosts;
 mod joining;
 mod launcher;
-mod learner_restarts;
 mod limits;
+mod logs;
+mod machine;
 pub(crate) mod members;
 mod observe;
-mod overview;
-mod process_table;
+mod observer;
+mod process;
 mod reports;
+mod restart_policy;
 mod session;
+mod shutdown;
 mod signals;
+#[cfg(test)]
+mod simulation;
+mod state;
+mod step;
 mod supervisor;
+mod totals;
+mod views;
 mod whole_run;
 
 pub(crate) use child::describe;
-pub(crate) use deaths::last_lines;
 pub(crate) use domain::{Place, create as create_domain, token as domain_token};
 pub use evaluate::{EvaluationPlan, evaluate};
 pub use film::film;
 pub use host::{HostPlan, host};
-pub use launcher::{Launcher, Process, Upstream};
+pub use launcher::{Launcher, Upstream};
 pub use limits::TimeLimits;
+pub(crate) use logs::last_lines;
 pub use observe::{ObservationPlan, observe};
+pub use observer::{AfterDeath, NotEvaluated, ProcessLine, RunEvent, RunObserver};
+pub use process::Process;
+pub use restart_policy::Death;
 pub use session::{RESUME_WAIT, SessionPlan, Trial, session, title};
 pub use signals::interrupts;
 pub(crate) use signals::is_ignored;
 pub use supervisor::{Ending, SessionReport, SupervisorPlan, supervise};
+pub use totals::Totals;
 pub(crate) use whole_run::WholeRun;

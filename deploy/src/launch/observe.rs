@@ -1,16 +1,17 @@
-//! Episodes of a saved policy outside training, written down step by step.
+//! Records episodes of a saved policy step by step, outside training.
 
 use std::path::PathBuf;
+use std::process::Command;
 use std::time::Duration;
 
 use super::conversation::{Conversation, Turn};
-use super::{Launcher, TimeLimits};
+use super::launcher::Launcher;
+use super::limits::TimeLimits;
 use crate::control::Report;
 use crate::failure::Outcome;
-use crate::roles::ObserverArgs;
 use crate::run_directory::RunDirectory;
 
-/// What to observe.
+/// Episodes to record.
 pub struct ObservationPlan<'a> {
     /// The program that plays the observer: this one.
     pub program: PathBuf,
@@ -18,50 +19,64 @@ pub struct ObservationPlan<'a> {
     pub run: &'a RunDirectory,
     /// The Python virtual environment.
     pub venv: Option<PathBuf>,
-    /// Which of its saved policies.
+    /// Version of the saved policy.
     pub policy_version: u64,
-    /// Episode i is reset with seed `first_seed + i`.
+    /// Seed of the first episode; episode i is reset with `first_seed + i`.
     pub first_seed: u64,
-    /// How many.
+    /// Number of episodes.
     pub episodes: u64,
-    /// The file to write, which [`crate::motion::Recorded`] reads.
+    /// File that the observer writes.
     pub output: PathBuf,
-    /// A folder for frames, if they are wanted.
+    /// Folder for frames, if they are wanted.
     pub pictures: Option<PathBuf>,
 }
 
-/// Observes; `progress` is called with the number of episodes done, and of steps of the next one: 0
-/// when an episode has just ended.
+impl ObservationPlan<'_> {
+    fn command(&self) -> Command {
+        let mut command = Command::new(&self.program);
+        command.arg("observer").arg("--run").arg(self.run.path());
+        for (flag, number) in [
+            ("--policy", self.policy_version),
+            ("--first-seed", self.first_seed),
+            ("--episodes", self.episodes),
+        ] {
+            command.args([flag, &number.to_string()]);
+        }
+        command.arg("--output").arg(&self.output);
+        if let Some(pictures) = &self.pictures {
+            command.arg("--pictures").arg(pictures);
+        }
+        if let Some(venv) = &self.venv {
+            command.arg("--venv").arg(venv);
+        }
+        command
+    }
+}
+
+/// Records the episodes. Calls `progress` with the number of completed episodes and of steps of the
+/// next one, which is 0 when an episode has just ended.
 ///
 /// # Errors
 /// The observer died or took too long.
 pub fn observe(plan: ObservationPlan<'_>, progress: &dyn Fn(u64, u64)) -> anyhow::Result<Outcome> {
-    let launcher = Launcher::outside_training(plan.program, plan.run, plan.venv);
-    let command = launcher.observe(&ObserverArgs {
-        run: plan.run.path().to_owned(),
-        policy: plan.policy_version,
-        first_seed: plan.first_seed,
-        episodes: plan.episodes,
-        output: plan.output,
-        pictures: plan.pictures,
-        venv: None,
-    })?;
-    // A report follows each call into the environment, over which the watchdog watches.
+    let launcher = Launcher::outside_training(plan.program.clone(), plan.run, plan.venv.clone());
+    let command = launcher.streams(plan.command(), "observer")?;
+    // A report follows each call into the environment, whose duration the watchdog limits.
     let seconds = plan.run.config()?.actors.env_call_timeout_s;
     let call = Duration::try_from_secs_f64(seconds).unwrap_or(Duration::MAX);
     let limit = TimeLimits::default().evaluation_of(1).saturating_add(call);
     let observer = Conversation { who: "the observer", log: plan.run.log_path("observer") };
     let answer = observer.hold(command, |report| {
         Ok(match report {
-            Report::EnvironmentReady { .. } => Turn::Wait("done", limit),
+            Report::EnvironmentReady { .. } => Turn::Wait(limit),
             Report::Observed { episodes, steps } => {
                 progress(episodes, steps);
                 match episodes < plan.episodes {
-                    true => Turn::Wait("done", limit),
-                    false => Turn::Over(()),
+                    true => Turn::Wait(limit),
+                    false => Turn::Done(()),
                 }
             }
-            _ => Turn::GoOn,
+            _ => Turn::Continue,
         })
     })?;
     Ok(answer.map_or(Outcome::Interrupted, |()| Outcome::Done))

@@ -1,249 +1,272 @@
-//! What the supervisor does about what its children say.
+//! What the state machine does about reports of children and requests to join.
 
-use std::time::Instant;
-
-use anyhow::{bail, ensure};
 use dmprl_shared::spec::EnvSpec;
 
-use super::Process;
-use super::child::Event;
-use super::supervisor::{Phase, Supervisor};
-use crate::control::{Command, EvaluationRequest, EvaluationRow, Progress, Report};
-use crate::terminal::{grouped, shown};
+use super::launcher::INCARNATIONS_PER_SESSION;
+use super::machine::Machine;
+use super::observer::{NotEvaluated, RunEvent};
+use super::process::Process;
+use super::restart_policy::Death;
+use super::state::{Milestone, Phase};
+use super::step::{Action, Admission, Failure};
+use crate::control::{Command, EvaluationRequest, EvaluationRow, Greeting, Progress, Report};
 
-/// Lines that are no reports, shown to the user; the rest is only counted.
+/// Maximum number of shown lines that are no reports. The rest is counted.
 const GARBAGE_SHOWN_MAX: u32 = 3;
+/// Maximum number of characters of such a line.
+const GARBAGE_CHARS: usize = 200;
 
-impl Supervisor {
-    pub(super) fn on_event(&mut self, event: Event) -> anyhow::Result<()> {
-        match event {
-            Event::Report(process, report) => {
-                let handled = self.on_report(process, report);
-                match handled {
-                    Err(error) if self.is_joined(process) => self.send_away(process, &error),
-                    handled => return handled,
-                }
-                Ok(())
-            }
-            Event::Asked(newcomer) => {
-                self.on_asked(newcomer);
-                Ok(())
-            }
-            Event::Gone(process) => self.on_gone(process),
-            Event::Exited(process, status) => self.on_exit(process, status),
-            Event::Garbage(process, line) => {
-                self.garbage += 1;
-                if self.garbage <= GARBAGE_SHOWN_MAX {
-                    let line: String = line.escape_debug().take(200).collect();
-                    self.display.message(&format!("{process} wrote what is no report: {line}"));
-                }
-                Ok(())
-            }
+impl Machine {
+    pub(super) fn on_garbage(&mut self, process: Process, line: &str) {
+        self.garbage += 1;
+        if self.garbage <= GARBAGE_SHOWN_MAX {
+            let line: String = line.escape_debug().take(GARBAGE_CHARS).collect();
+            self.warn(process, format!("{process} wrote what is no report: {line}"));
         }
     }
 
-    fn on_report(&mut self, process: Process, report: Report) -> anyhow::Result<()> {
+    /// Handles a report. A worker that joined cannot end the run by an invalid one.
+    pub(super) fn on_report(&mut self, process: Process, report: Report) -> Result<(), Failure> {
+        match self.handle_report(process, report) {
+            Err(failure) if self.is_joined(process) => {
+                self.kill(process, Death::sent_away(format!("{:#}", failure.error)));
+                Ok(())
+            }
+            handled => handled,
+        }
+    }
+
+    fn handle_report(&mut self, process: Process, report: Report) -> Result<(), Failure> {
+        let counts =
+            matches!(report, Report::Sent(_) | Report::EnvFailures { .. } | Report::EnvHung { .. });
+        if self.children.running(process).is_none() && !counts {
+            // The process has ended, so only its counts still matter.
+            return Ok(());
+        }
         self.heard(process, &report);
         match report {
             Report::EnvironmentReady { spec } => return self.on_environment(process, spec),
             Report::LearnerReady => return self.on_learner_ready(process),
-            Report::FirstSegment => {
-                let message = match self.learner_died.take() {
-                    Some(died) => {
-                        let seconds = died.elapsed().as_secs_f64();
-                        format!("the learner is back: first segment {seconds:.1} s after its death")
-                    }
-                    None => {
-                        let seconds = self.started.elapsed().as_secs_f64();
-                        format!("first environment step after {seconds:.1} s")
-                    }
-                };
-                self.display.message(&message);
-            }
+            Report::FirstSegment => self.on_first_segment(),
             Report::Progress(progress) => self.on_progress(progress),
             Report::Evaluate(request) => self.on_evaluate(request),
             Report::Evaluated(row) => return self.on_evaluated(process, row),
             Report::NotEvaluated { policy_version, reason } => {
-                return self.on_not_evaluated(process, policy_version, &reason);
+                return self.on_not_evaluated(process, policy_version, reason);
             }
-            Report::EnvFailures { count, last } => self.on_env_failures(process, count, &last),
+            Report::EnvFailures { count, last } => self.on_env_failures(process, count, last),
             Report::Sent(sent) => {
-                self.sent += sent;
-                if let Some(slot) = self.slots.get_mut(&process) {
+                self.totals.sent += sent;
+                if let Some(slot) = self.children.slots.get_mut(&process) {
                     slot.sent += sent;
                 }
                 if sent.sent > 0 {
-                    self.worked(process);
+                    self.children.worked(process, self.now);
                 }
             }
-            // Observing and filming are none of a training's children's business.
+            // Observers and video processes are not supervised here.
             Report::Alive { .. } | Report::Observed { .. } | Report::Filmed { .. } => {}
             Report::Hosts(hosts) => {
-                // Its first words: it has opened its endpoints.
+                // The gateway's first report means that its endpoints are open.
                 self.set_ready(process);
-                self.hosts = hosts;
-                self.worked(process);
-                self.tell_learner_of_counts();
+                self.hosts.0 = hosts;
+                self.children.worked(process, self.now);
+                self.send_totals();
             }
-            Report::Left => self.on_left(process),
-            Report::EnvHung { message } => self.on_env_hung(process, &message),
+            Report::Left => {
+                if let Some(running) = self.children.running_mut(process) {
+                    running.left = true;
+                }
+            }
+            Report::EnvHung { message } => {
+                // The process exits after this report.
+                self.totals.env_failures = self.totals.env_failures.saturating_add(1);
+                self.warn(process, format!("{process}: {message}"));
+                self.send_totals();
+            }
             Report::Checkpoint { name, env_steps } => {
-                self.checkpointed = true;
-                self.worked(process);
-                let steps = grouped(env_steps);
-                self.display.message(&format!("checkpoint {name} at {steps} steps"));
+                self.learner.checkpointed = true;
+                self.children.worked(process, self.now);
+                self.tell(RunEvent::Checkpoint { name, env_steps });
             }
             Report::Finished => {
-                let regular = process == self.hub() && self.learner_ready;
-                ensure!(regular, "{process} reported `finished` before `learner_ready`");
+                if process != self.settings.hub || !self.learner.ready {
+                    let message = format!("{process} reported `finished` before `learner_ready`");
+                    return Err(Failure::new(message));
+                }
                 self.on_finished();
             }
-            Report::Warning { message } => self.display.message(&format!("{process}: {message}")),
+            Report::Warning { message } => self.warn(process, format!("{process}: {message}")),
         }
         Ok(())
     }
 
-    fn on_environment(&mut self, process: Process, spec: EnvSpec) -> anyhow::Result<()> {
+    fn heard(&mut self, process: Process, report: &Report) {
+        let now = self.now;
+        if let Some(running) = self.children.running_mut(process) {
+            running.heard = now;
+            if let Report::Alive { doing, kept } = report {
+                running.activity = Some(*doing);
+                running.kept = *kept;
+            }
+        }
+    }
+
+    fn on_environment(&mut self, process: Process, spec: EnvSpec) -> Result<(), Failure> {
         match &self.spec {
             None => {
-                self.launcher.run.write_spec(&spec)?;
+                self.actions.push(Action::WriteSpec(spec.clone()));
                 self.spec = Some(spec);
             }
-            Some(known) if !known.is_same(&spec) => bail!(
-                "the environment of {process} is not the run's: expected {}, got {}",
-                serde_json::to_string(known)?,
-                serde_json::to_string(&spec)?
-            ),
+            Some(known) if !known.is_same(&spec) => {
+                let json = |spec| serde_json::to_string(spec).unwrap_or_default();
+                return Err(Failure::new(format!(
+                    "the environment of {process} is not the run's: expected {}, got {}",
+                    json(known),
+                    json(&spec)
+                )));
+            }
             Some(_) => {}
         }
-        if process == self.hub() || matches!(self.phase, Phase::Stopping { .. }) {
+        let hub = self.settings.hub;
+        if process == hub || matches!(self.phase, Phase::Stopping { .. }) {
             return Ok(());
         }
         self.set_ready(process);
         match process {
             Process::Evaluator => self.send_evaluation(),
-            _ if self.learner_ready => self.attach(process),
-            _ if !self.slots.contains_key(&self.hub()) => self.spawn(self.hub())?,
+            _ if self.learner.ready => self.attach(process),
+            _ if !self.children.knows(hub) => self.start(hub),
             _ => {}
         }
         Ok(())
     }
 
-    fn on_learner_ready(&mut self, process: Process) -> anyhow::Result<()> {
-        ensure!(process == self.hub(), "{process} reported `learner_ready`");
-        self.set_ready(process);
-        self.learner_ready = true;
-        if self.learner_restarts > 0 {
-            self.forget_what_was_taken_back()?;
+    fn on_learner_ready(&mut self, process: Process) -> Result<(), Failure> {
+        let hub = self.settings.hub;
+        if process != hub {
+            return Err(Failure::new(format!("{process} reported `learner_ready`")));
         }
-        self.advanced = Instant::now();
-        self.tell_learner_of_counts();
+        self.set_ready(process);
+        self.learner.ready = true;
+        if self.totals.learner_restarts > 0 {
+            self.actions.push(Action::Rewind);
+        }
+        self.advanced = self.now;
+        self.send_totals();
         if matches!(self.phase, Phase::Draining { .. }) {
             // Its predecessor was asked, and died of something else.
-            self.send(self.hub(), Command::Finish);
+            self.send(hub, Command::Finish);
         }
-        if self.is_one_process() || self.phase != Phase::Training {
+        if self.settings.one_process || self.phase != Phase::Training {
             return Ok(());
         }
-        let waiting: Vec<Process> = self
+        let waiting = self
+            .children
             .all_running()
-            .filter(|(process, running)| {
-                matches!(process, Process::Actor(_)) && running.ready && !running.attached
-            })
-            .map(|(process, _)| process)
-            .collect();
+            .filter(|(process, running)| process.is_worker() && running.ready && !running.attached);
+        let waiting: Vec<Process> = waiting.map(|(process, _)| process).collect();
         waiting.into_iter().for_each(|process| self.attach(process));
-        if self.hub() == Process::Relay {
+        if hub == Process::Relay {
             return Ok(());
         }
-        let mut missing = vec![Process::Evaluator];
-        if self.config.bridge.is_open() {
-            missing.push(Process::Gateway);
+        if !self.children.knows(Process::Evaluator) {
+            self.start(Process::Evaluator);
         }
-        missing.retain(|process| !self.slots.contains_key(process));
-        missing.into_iter().try_for_each(|process| self.spawn(process))
-    }
-
-    /// A learner that came back has gone back to a checkpoint, and its run's rows with it.
-    fn forget_what_was_taken_back(&mut self) -> anyhow::Result<()> {
-        let rows = self.launcher.run.evaluations()?;
-        let returns = rows.iter().map(|row| row.return_mean);
-        self.best_return = returns.fold(f64::NEG_INFINITY, f64::max);
-        self.display.begin_with(rows);
+        if self.settings.config.bridge.is_open() && !self.children.knows(Process::Gateway) {
+            self.start(Process::Gateway);
+        }
         Ok(())
     }
 
+    fn on_first_segment(&mut self) {
+        let died = self.learner.died.take();
+        let after = self.now.duration_since(died.unwrap_or(self.started));
+        self.tell(RunEvent::FirstStep { after, is_successor: died.is_some() });
+    }
+
     fn set_ready(&mut self, process: Process) {
-        if let Some(running) = self.slots.get_mut(&process).and_then(|slot| slot.running.as_mut()) {
+        if let Some(running) = self.children.running_mut(process) {
             running.ready = true;
         }
     }
 
     fn attach(&mut self, process: Process) {
-        if let Some(domain) = self.launcher.domain.clone() {
-            self.send(process, Command::Attach { domain });
-            if let Some(running) =
-                self.slots.get_mut(&process).and_then(|slot| slot.running.as_mut())
-            {
-                running.attached = true;
-            }
-            if self.is_joined(process) {
-                self.display.message(&format!("{process} has joined: {}", self.counted()));
-            }
-            self.tell_learner_of_counts();
+        self.actions.push(Action::Attach(process));
+        if let Some(running) = self.children.running_mut(process) {
+            running.attached = true;
         }
+        if self.is_joined(process) {
+            self.tell(RunEvent::Joined { process, workers: self.children.workers() });
+        }
+        self.send_totals();
     }
 
     fn on_progress(&mut self, progress: Progress) {
-        let now = Instant::now();
         let marks = |progress: &Progress| (progress.env_steps, progress.updates);
-        if self.last.as_ref().is_none_or(|(_, last)| marks(last) != marks(&progress)) {
-            self.advanced = now;
+        if self.last.as_ref().is_none_or(|last| marks(&last.progress) != marks(&progress)) {
+            self.advanced = self.now;
         }
-        self.checkpointed = false;
-        self.tell_learner_of_counts();
-        let processes = if self.display.is_live() { self.overview(now) } else { Vec::new() };
-        self.drawn = now;
-        self.display.progress(&progress, &processes);
+        self.learner.checkpointed = false;
+        self.send_totals();
+        self.tell(RunEvent::Progress { progress: progress.clone(), processes: Vec::new() });
+        let milestone = |progress| Some(Milestone { at: self.now, progress });
         if self.first.is_none() {
-            self.first = Some((now, progress.clone()));
+            self.first = milestone(progress.clone());
         }
-        self.last = Some((now, progress));
+        self.last = milestone(progress);
+    }
+
+    /// Shows the first failure, and then the last one whenever the count has doubled. The process's
+    /// log has each.
+    fn on_env_failures(&mut self, process: Process, count: u64, last: String) {
+        if self.totals.add_env_failures(count) {
+            let log = (!self.is_joined(process)).then(|| self.log_path(process));
+            let count = self.totals.env_failures;
+            self.tell(RunEvent::EnvFailure { process, count, last, log });
+        }
+        self.send_totals();
     }
 
     fn on_evaluate(&mut self, request: EvaluationRequest) {
         if matches!(self.phase, Phase::Stopping { .. }) {
-            // An interrupted run skips what is not yet evaluated.
-            return;
+            return self.give_up_evaluation(&request, NotEvaluated::Stopping);
         }
         if let Some(skipped) = self.evaluations.push(request) {
-            self.display.message(&format!(
-                "the evaluator is too far behind: skipping the evaluation at {} steps",
-                grouped(skipped.env_steps)
-            ));
+            let env_steps = skipped.env_steps;
+            self.give_up_evaluation(&skipped, NotEvaluated::TooFarBehind { env_steps });
         }
         self.send_evaluation();
     }
 
+    fn give_up_evaluation(&mut self, request: &EvaluationRequest, reason: NotEvaluated) {
+        self.tell(RunEvent::NotEvaluated { policy_version: request.policy_version, reason });
+    }
+
+    /// Gives up all evaluations that are waiting or in flight.
+    pub(super) fn give_up_evaluations(&mut self, reason: &NotEvaluated) {
+        for request in self.evaluations.clear() {
+            self.give_up_evaluation(&request, reason.clone());
+        }
+    }
+
     /// Sends the next request, if the evaluator is ready and idle.
     fn send_evaluation(&mut self) {
-        if !self.running(Process::Evaluator).is_some_and(|running| running.ready) {
+        let evaluator = self.children.running(Process::Evaluator);
+        if !evaluator.is_some_and(|running| running.ready && running.killed_for.is_none()) {
             return;
         }
-        if let Some(request) = self.evaluations.start(Instant::now()) {
+        if let Some(request) = self.evaluations.start(self.now) {
             self.send(Process::Evaluator, Command::Evaluate(request));
         }
     }
 
-    fn on_evaluated(&mut self, process: Process, row: EvaluationRow) -> anyhow::Result<()> {
-        if self.wants_no_answer() {
+    fn on_evaluated(&mut self, process: Process, row: EvaluationRow) -> Result<(), Failure> {
+        if self.expects_no_answer() {
             return Ok(());
         }
         self.on_answer(process, row.policy_version)?;
-        let best = row.return_mean > self.best_return;
-        self.best_return = self.best_return.max(row.return_mean);
-        self.display.evaluation(&row, best);
-        let run = &self.config.run;
+        let run = &self.settings.config.run;
         let reached = if row.return_mean >= run.until_return {
             Some(format!("the return has reached {}", run.until_return))
         } else if row.success_rate.is_some_and(|rate| rate >= run.until_success) {
@@ -251,95 +274,110 @@ impl Supervisor {
         } else {
             None
         };
+        // The shell knows the best row of the run.
+        self.tell(RunEvent::Evaluated { row: row.clone(), is_best: false });
         self.last_row = Some(row);
         if let Some(reason) = reached {
-            self.drain(&reason);
+            self.drain(reason);
         }
         self.complete_if_done();
         Ok(())
     }
 
-    /// A curve with a point less is no reason to end a run.
+    /// The run continues: its curve has one point less.
     fn on_not_evaluated(
         &mut self,
         process: Process,
         policy_version: u64,
-        reason: &str,
-    ) -> anyhow::Result<()> {
-        if self.wants_no_answer() {
+        reason: String,
+    ) -> Result<(), Failure> {
+        if self.expects_no_answer() {
             return Ok(());
         }
         self.on_answer(process, policy_version)?;
-        self.display.message(&format!(
-            "no evaluation of policy {policy_version}, the run goes on: {reason}; log: {}",
-            shown(&self.log_path(process))
-        ));
+        let reason = NotEvaluated::Failed { reason, log: self.log_path(process) };
+        self.tell(RunEvent::NotEvaluated { policy_version, reason });
         self.complete_if_done();
         Ok(())
     }
 
-    /// Everything stops; or the learner has died, and an answer that was on its way is to a
-    /// question that its successor will ask anew.
-    fn wants_no_answer(&self) -> bool {
-        self.evaluator_ends || matches!(self.phase, Phase::Stopping { .. })
+    /// Whether an answer belongs to a request that was given up: the run stops, or the learner
+    /// died, whose successor requests the evaluation again.
+    fn expects_no_answer(&self) -> bool {
+        self.learner.waits_for_evaluator || matches!(self.phase, Phase::Stopping { .. })
     }
 
-    /// The evaluator has answered and takes the next request.
-    fn on_answer(&mut self, process: Process, policy_version: u64) -> anyhow::Result<()> {
-        if self.is_one_process() {
+    fn on_answer(&mut self, process: Process, policy_version: u64) -> Result<(), Failure> {
+        if self.settings.one_process {
             return Ok(());
         }
-        ensure!(
-            process == Process::Evaluator && self.evaluations.finish(policy_version),
-            "{process} evaluated policy {policy_version}, which nobody asked for"
-        );
-        // One that answers now and then is worth each restart.
-        self.forgive(Process::Evaluator);
+        let killed = self.children.running(process).is_some_and(|it| it.killed_for.is_some());
+        if killed && self.evaluations.finish_late(policy_version) {
+            return Ok(());
+        }
+        if process != Process::Evaluator || !self.evaluations.finish(policy_version) {
+            return Err(Failure::new(format!(
+                "{process} evaluated policy {policy_version}, which nobody asked for"
+            )));
+        }
+        // An evaluator that answers from time to time is worth its restarts.
+        self.children.forgive(Process::Evaluator);
         self.send_evaluation();
         Ok(())
     }
-}
 
-#[cfg(test)]
-pub(super) mod tests {
-    use dmprl_shared::config::ExperimentConfig;
-    use tokio::sync::mpsc;
-
-    use super::*;
-    use crate::launch::{Launcher, TimeLimits};
-    use crate::run_directory::{Manifest, RunDirectory};
-    use crate::terminal::Display;
-
-    pub(in crate::launch) fn supervisor(folder: &std::path::Path) -> Supervisor {
-        let config = ExperimentConfig::default();
-        let manifest = Manifest::new(None).unwrap();
-        let launcher = Launcher {
-            program: "none".into(),
-            run: RunDirectory::create(&folder.join("run"), &config, &manifest).unwrap(),
-            venv: None,
-            domain: Some(folder.to_owned()),
-            resume: false,
-            init_from: None,
-            learner_restarts: 0,
-            sessions_before: 0,
-            journal: None,
-            upstream: None,
-        };
-        let display = Display::lines(Box::new(std::io::sink()), 1);
-        Supervisor::new((launcher, config, TimeLimits::default()), display, mpsc::channel(1).0)
+    /// Workers that join have the indices after the run's own.
+    pub(super) fn is_joined(&self, process: Process) -> bool {
+        let workers = self.settings.config.actors.workers;
+        matches!(process, Process::Actor(index) if index as usize >= workers)
     }
 
-    /// Killed with the learner, an evaluator may have answered already; that once ended the run.
-    #[test]
-    fn an_answer_to_a_dead_learner_is_passed_over_and_one_that_nobody_asked_for_is_a_fault() {
-        let folder = tempfile::tempdir().unwrap();
-        let mut supervisor = supervisor(folder.path());
-        let not_evaluated =
-            || Report::NotEvaluated { policy_version: 7, reason: "a broken arm".to_owned() };
-        let answer = || Event::Report(Process::Evaluator, not_evaluated());
-        let fault = supervisor.on_event(answer()).unwrap_err().to_string();
-        assert!(fault.contains("policy 7, which nobody asked for"), "{fault}");
-        supervisor.evaluator_ends = true;
-        supervisor.on_event(answer()).unwrap();
+    /// Workers that have joined and run.
+    pub(super) fn joined(&self) -> usize {
+        self.children.all_running().filter(|(process, _)| self.is_joined(*process)).count()
+    }
+
+    /// Admits a worker, or says why not.
+    pub(super) fn on_join_request(&mut self, request: u64, id: i32, speaks: &Greeting) {
+        match self.free_place(speaks) {
+            Ok(index) => {
+                let process = Process::Actor(index);
+                let start = self.children.start(process, self.now);
+                let workers = self.children.workers() + 1;
+                self.actions.push(Action::Admit(Admission { request, index, start, workers }));
+                self.tell(RunEvent::ChildStarted { process, start });
+            }
+            Err(reason) => {
+                let message = format!("process {id} may not join: {reason}");
+                self.tell(RunEvent::Warning { process: None, message });
+                self.actions.push(Action::Refuse { request, reason });
+            }
+        }
+    }
+
+    fn free_place(&self, speaks: &Greeting) -> Result<u32, String> {
+        if *speaks != Greeting::this() {
+            return Err(format!("expected {}, got {speaks}", Greeting::this()));
+        }
+        if self.phase != Phase::Training {
+            return Err("the run is coming to its end".to_owned());
+        }
+        if !self.children.knows(self.settings.hub) {
+            return Err("the run is still starting; try again in a moment".to_owned());
+        }
+        let actors = &self.settings.config.actors;
+        let free = |index: &u32| {
+            let slot = self.children.slots.get(&Process::Actor(*index));
+            slot.is_none_or(|slot| slot.running.is_none() && slot.starts < INCARNATIONS_PER_SESSION)
+        };
+        // The configuration limits both to about a thousand.
+        let mut places = actors.workers as u32..actors.places() as u32;
+        let count = places.len();
+        places.find(free).ok_or_else(|| {
+            format!(
+                "{count} of {count} places for workers that join are taken (actors.joined_max); \
+                 one that leaves makes room"
+            )
+        })
     }
 }

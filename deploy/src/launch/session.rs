@@ -1,4 +1,4 @@
-//! One session of a run: what stands around the supervisor, and what the user is told at the end.
+//! One session of a run: the shared memory around the supervisor and the children's command lines.
 
 use std::path::PathBuf;
 use std::time::Duration;
@@ -6,62 +6,59 @@ use std::time::Duration;
 use anyhow::Context;
 use dmprl_shared::config::ExperimentConfig;
 
-use super::{
-    Ending, Launcher, SessionReport, SupervisorPlan, TimeLimits, domain, interrupts, supervise,
-};
-use crate::failure::Outcome;
-use crate::plots;
-use crate::run_directory::{RunDirectory, RunLock};
-use crate::tensorboard::Mirror;
-use crate::terminal::{Display, ProgressStyle, say, shown, summary};
+use super::domain;
+use super::launcher::Launcher;
+use super::limits::TimeLimits;
+use super::observer::{RunEvent, RunObserver};
+use super::signals::interrupts;
+use super::supervisor::{SessionReport, SupervisorPlan, supervise};
+use super::totals::Totals;
+use crate::run_directory::RunDirectory;
 
 /// How long `resume` waits for the learner of a killed supervisor to write its checkpoint.
 pub const RESUME_WAIT: Duration = Duration::from_secs(70);
 
-/// A run directory, ready to be trained in.
+/// A run directory that is ready for training.
 pub struct SessionPlan {
-    /// The program that plays the roles: this one; tests put a fake here.
+    /// The program that plays the roles: this one, or a fake in tests.
     pub program: PathBuf,
-    /// The run.
+    /// The run. The caller holds its lock until the session has ended, and children inherit it.
     pub run: RunDirectory,
-    /// Held until the end, and by every child.
-    pub lock: RunLock,
     /// The resolved configuration.
     pub config: ExperimentConfig,
     /// The Python virtual environment.
     pub venv: Option<PathBuf>,
     /// Whether the run has been trained before.
     pub resume: bool,
-    /// Bar or lines.
-    pub progress: ProgressStyle,
-    /// What `dmprl chaos` wants to be otherwise.
+    /// Counts of earlier sessions of the run.
+    pub earlier: Totals,
+    /// Differences for `dmprl chaos`.
     pub trial: Trial,
 }
 
-/// What differs in a run whose processes are killed on purpose.
+/// Settings of a run whose processes are killed on purpose.
 #[derive(Debug, Default)]
 pub struct Trial {
-    /// Where worker and learner note what they do.
+    /// Directory of the journals of workers and learner.
     pub journal: Option<PathBuf>,
-    /// The longest pause before a restart: a death on purpose is no sign of more to come.
+    /// Maximum back-off before a restart: a deliberate kill does not predict another one.
     pub restart_max: Option<Duration>,
 }
 
-/// Trains until the run ends, is stopped or fails; then draws and tells.
+/// Trains until the run ends, is stopped or fails.
 ///
 /// # Errors
-/// Whatever kept the run from going on.
-pub fn session(plan: SessionPlan) -> anyhow::Result<Outcome> {
-    let SessionPlan { program, run, lock, config, venv, resume, progress, trial } = plan;
+/// The session could not begin. How it ended is in the report.
+pub fn session(plan: SessionPlan, observer: &mut dyn RunObserver) -> anyhow::Result<SessionReport> {
+    let SessionPlan { program, run, config, venv, resume, earlier, trial } = plan;
     let manifest = run.manifest()?;
-    let mut display = Display::new(progress, config.run.steps);
-    let resume = resume && can_resume(&run, &mut display)?;
-    display.begin_with(run.evaluations()?);
+    let resume = resume && can_resume(&run, observer)?;
+    let evaluations = run.evaluations()?;
     let runtime = tokio::runtime::Builder::new_current_thread()
         .enable_all()
         .build()
         .context("cannot start the supervisor's runtime")?;
-    // Before the shared memory: a signal that still kills would leave it behind.
+    // Catch signals before making shared memory: a fatal signal would leave it behind.
     let interrupts = runtime.block_on(async { interrupts() })?;
     let domain = match config.run.deterministic {
         true => None,
@@ -80,38 +77,31 @@ pub fn session(plan: SessionPlan) -> anyhow::Result<Outcome> {
         journal: trial.journal,
         upstream: None,
     };
-    let title = title(&config);
-    display.message(&format!("training {title} in {}", shown(run.path())));
+    let (title, path) = (title(&config), run.path().to_owned());
+    observer.on_event(RunEvent::Started { title, run: path, learner: None, evaluations });
     let mut limits = TimeLimits::default();
     limits.restart_max = trial.restart_max.unwrap_or(limits.restart_max);
-    let steps_total = config.run.steps;
-    let mirror = Mirror::start(&run);
-    let report = runtime.block_on(async {
-        let plan = SupervisorPlan { launcher, config, limits, display, interrupts };
-        supervise(plan).await
-    });
-    // In this order: no child, then nothing half-made, then no lock.
+    let plan = SupervisorPlan { launcher, config, limits, earlier, interrupts };
+    let report = runtime.block_on(supervise(plan, observer));
+    // The runtime kills children that remain, which must not outlive their shared memory.
     drop(runtime);
     drop(domain);
-    drop(mirror);
-    if let Err(error) = run.remove_half_written() {
-        say(&format!("warning: {error:#}"));
-    }
-    drop(lock);
-    conclude(report, &run, &title, steps_total)
+    Ok(report)
 }
 
-/// A run without a checkpoint begins again, without the rows of the first attempt.
-fn can_resume(run: &RunDirectory, display: &mut Display) -> anyhow::Result<bool> {
+/// Returns whether the run has a checkpoint. A run without one begins again, without the rows of
+/// the first attempt.
+fn can_resume(run: &RunDirectory, observer: &mut dyn RunObserver) -> anyhow::Result<bool> {
     if run.has_checkpoint()? {
         return Ok(true);
     }
-    display.message("the run has no checkpoint yet: it begins again");
+    let message = "the run has no checkpoint yet: it begins again".to_owned();
+    observer.on_event(RunEvent::Warning { process: None, message });
     run.begin_again()?;
     Ok(false)
 }
 
-/// What is trained, in one line.
+/// Describes a run in one line.
 #[must_use]
 pub fn title(config: &ExperimentConfig) -> String {
     let policy = format!("{:?}", config.policy.kind).to_lowercase();
@@ -124,43 +114,6 @@ pub fn title(config: &ExperimentConfig) -> String {
     let hands = format!("{process}{workers} × {}", count(actors.envs_per_worker, "environment"));
     let (task, seed) = (&config.task.name, config.run.seed);
     format!("{task} · {algorithm} · {policy} · seed {seed} · {hands}")
-}
-
-fn conclude(
-    mut report: SessionReport,
-    run: &RunDirectory,
-    title: &str,
-    steps_total: u64,
-) -> anyhow::Result<Outcome> {
-    if let Err(error) = plots::learning_curve(run, title) {
-        // The results are there; a picture is no reason to fail.
-        say(&format!("warning: {error:#}"));
-    }
-    let lost = match run.has_checkpoint() {
-        Ok(true) => "the last checkpoint is missing: a resume goes back to the one before it",
-        Ok(false) => "there is no checkpoint: a resume begins again",
-        Err(_) => "the checkpoints cannot be read",
-    };
-    match report.ending {
-        Ending::Failed(error) => Err(error),
-        Ending::Interrupted => {
-            let path = shown(run.path());
-            say(if report.checkpointed { "checkpoint written" } else { lost });
-            say(&format!("go on with: dmprl resume {path}"));
-            Ok(Outcome::Interrupted)
-        }
-        Ending::Completed => {
-            // A session that had nothing to do shows what the run has reached.
-            if report.last_row.is_none() {
-                report.last_row = run.latest_row()?;
-            }
-            say(&format!("\n{}", summary(&report, title, run.path(), steps_total)));
-            if !report.checkpointed {
-                say(&format!("warning: {lost}"));
-            }
-            Ok(Outcome::Done)
-        }
-    }
 }
 
 #[cfg(test)]

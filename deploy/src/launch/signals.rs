@@ -1,20 +1,20 @@
-//! SIGINT, SIGTERM and SIGHUP as one stream of interrupts.
+//! Merges SIGINT, SIGTERM and SIGHUP into one stream of interrupts.
 
 use anyhow::Context;
 use tokio::signal::unix::{SignalKind, signal};
 use tokio::sync::mpsc;
 
-/// More than two interrupts mean no more than two.
+/// Maximum number of waiting interrupts; the third and later ones have no effect.
 const INTERRUPTS_MAX: usize = 4;
 
-/// One item for each signal from now on. Call it inside the runtime.
+/// Returns a stream with one item per signal from now on. Must be called inside the runtime.
 ///
 /// # Errors
 /// A signal cannot be caught.
 pub fn interrupts() -> anyhow::Result<mpsc::Receiver<()>> {
     let (sender, receiver) = mpsc::channel(INTERRUPTS_MAX);
     let mut kinds = vec![SignalKind::interrupt(), SignalKind::terminate()];
-    // `nohup` has it ignored, and means that.
+    // `nohup` ignores SIGHUP deliberately.
     if !is_ignored(SignalKind::hangup().as_raw_value()) {
         kinds.push(SignalKind::hangup());
     }
@@ -24,7 +24,7 @@ pub fn interrupts() -> anyhow::Result<mpsc::Receiver<()>> {
         let sender = sender.clone();
         tokio::spawn(async move {
             while signals.recv().await.is_some() {
-                // Full: more interrupts than mean anything wait already.
+                // If the queue is full, enough interrupts are waiting.
                 let _ = sender.try_send(());
             }
         });
@@ -32,7 +32,7 @@ pub fn interrupts() -> anyhow::Result<mpsc::Receiver<()>> {
     Ok(receiver)
 }
 
-/// Whether whoever started us had this signal ignored, as the kernel tells it.
+/// Whether the parent process made this one ignore a signal, according to the kernel.
 pub(crate) fn is_ignored(signal: i32) -> bool {
     let status = std::fs::read_to_string("/proc/self/status").unwrap_or_default();
     let mask = status

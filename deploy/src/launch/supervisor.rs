@@ -1,379 +1,494 @@
-//! The supervisor: its state, its loop, and how children are started.
+//! The supervisor's shell: waits for events, passes them to the state machine, and performs the
+//! actions that it decides.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, VecDeque};
 use std::time::{Duration, Instant};
 
-use anyhow::{Context, Error};
-use dmprl_learner::checkpoint;
-use dmprl_learner::learner::Counters;
+use anyhow::Error;
 use dmprl_shared::config::ExperimentConfig;
 use dmprl_shared::spec::EnvSpec;
-use dmprl_shared::transport::delivery::Sent;
 use tokio::sync::mpsc;
 
-use super::child::{Child, EVENTS_MAX, Event};
-use super::deaths::Death;
-use super::evaluations::EvaluationQueue;
-use super::{Launcher, Process, TimeLimits, joining};
-use crate::control::{Activity, Command, EvaluationRow, HostNow, Progress};
-use crate::terminal::Display;
+use super::child::{Child, ChildEvent, EVENTS_MAX, Incoming, PendingJoin};
+use super::launcher::Launcher;
+use super::limits::TimeLimits;
+use super::logs::log_tail;
+use super::machine::Machine;
+use super::observer::{RunEvent, RunObserver};
+use super::process::Process;
+use super::state::Settings;
+use super::step::{Action, Admission, Event, Failure, ResumeAdvice, Successor};
+use super::totals::Totals;
+use super::{joining, views};
+use crate::control::{Command, EvaluationRow, JoinAnswer, Progress, Welcome};
+use crate::run_directory::{Processes, RunDirectory};
+use crate::terminal::shown;
 
-/// What the supervisor needs to know.
+/// The supervisor was stopped, not late, if it wakes this long after its own deadline: by Ctrl-Z
+/// and `fg`, or a paused container.
+const STANDSTILL: Duration = Duration::from_secs(5);
+/// A supervisor this late cannot tell a worker that hangs from one that was stopped with it.
+const LATE: Duration = Duration::from_secs(1);
+/// Maximum interval between checks for the shared-memory directory: each is one `stat`.
+const DOMAIN_LOOK: Duration = Duration::from_secs(1);
+/// Interval between redraws of the live display. Workers send a heartbeat a second, so events are
+/// frequent enough.
+const REDRAW_EVERY: Duration = Duration::from_millis(500);
+/// Interval between writes of `processes.json`.
+const PROCESSES_EVERY: Duration = Duration::from_secs(2);
+
+/// What the supervisor needs.
 pub struct SupervisorPlan {
-    /// How children are started, and for which run.
+    /// How to start children, and the run.
     pub launcher: Launcher,
     /// The resolved configuration.
     pub config: ExperimentConfig,
-    /// How long it waits for what.
+    /// Time limits.
     pub limits: TimeLimits,
-    /// What the user sees.
-    pub display: Display,
-    /// One item an interrupt.
+    /// Counts of earlier sessions of the run.
+    pub earlier: Totals,
+    /// One item per interrupt.
     pub interrupts: mpsc::Receiver<()>,
 }
 
 /// How a session ended.
 #[derive(Debug)]
 pub enum Ending {
-    /// The learner came to its end and every evaluation was answered.
+    /// The learner finished, and every evaluation was answered.
     Completed,
     /// The user stopped it.
     Interrupted,
-    /// It could not go on.
+    /// It could not continue.
     Failed(Error),
 }
 
-/// What a session did.
+/// Results of a session.
 #[derive(Debug)]
 pub struct SessionReport {
     /// How it ended.
     pub ending: Ending,
-    /// Whether the learner's last moment is in a checkpoint.
+    /// Whether a checkpoint has the learner's last state.
     pub checkpointed: bool,
-    /// The first progress reported.
+    /// The first progress.
     pub first: Option<Progress>,
-    /// The last progress reported.
+    /// The last progress.
     pub last: Option<Progress>,
-    /// Between the two.
+    /// Time between the two.
     pub training: Duration,
     /// The last evaluation.
     pub last_row: Option<EvaluationRow>,
-    /// Failures of environments that were reported.
+    /// Failures of environments.
     pub env_failures: u64,
-    /// Starts of the learner after a death.
+    /// Restarts of the learner after a death.
     pub learner_restarts: u64,
-    /// From the first start to the last exit.
+    /// Time from the first start to the last exit.
     pub wall: Duration,
 }
 
-/// Where a session is on its way.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) enum Phase {
-    /// Starting and learning.
-    Training,
-    /// The learner was asked to come to its end.
-    Draining { deadline: Instant },
-    /// It has, and exits; evaluations are outstanding.
-    Finishing { deadline: Instant },
-    /// Everything is to end.
-    Stopping { deadline: Instant, killed: bool },
+struct Supervisor<'a> {
+    machine: Machine,
+    launcher: Launcher,
+    observer: &'a mut dyn RunObserver,
+    events: mpsc::Sender<Incoming>,
+    children: BTreeMap<Process, Child>,
+    /// Workers that wait for an answer, by number of their request.
+    joining: BTreeMap<u64, PendingJoin>,
+    join_requests: u64,
+    best_return: f64,
+    started: Instant,
+    /// Last redraw of the live display.
+    drawn: Instant,
+    /// Next write of `processes.json`; `None` after a failure.
+    processes_due: Option<Instant>,
 }
 
-/// A child's place: the child may be dead and its restart due.
-#[derive(Debug, Default)]
-pub(super) struct Slot {
-    pub(super) running: Option<Running>,
-    /// All starts of this session: each has a number of its own.
-    pub(super) starts: u32,
-    /// Restarts since it was last known to do its work.
-    pub(super) restarts: u32,
-    pub(super) restart_at: Option<Instant>,
-    /// What a worker did in this session.
-    pub(super) sent: Sent,
-}
-
-/// A child that lives.
-#[derive(Debug)]
-pub(super) struct Running {
-    pub(super) child: Child,
-    pub(super) spawned: Instant,
-    pub(super) ready: bool,
-    /// A worker that knows where the learner is, and finds the next by itself.
-    pub(super) attached: bool,
-    /// When it last said anything, and what it then did.
-    pub(super) heard: Instant,
-    pub(super) doing: Option<Activity>,
-    /// Segments that it keeps, as it then said.
-    pub(super) kept: u64,
-    /// When it first and last told of work: a worker of segments sent, a learner of checkpoints.
-    pub(super) worked: Option<(Instant, Instant)>,
-    /// A worker that had joined has said that it leaves.
-    pub(super) left: bool,
-    /// Why the supervisor has killed it.
-    pub(super) killed_for: Option<Death>,
-}
-
-impl Running {
-    pub(super) fn new(child: Child) -> Self {
-        let now = Instant::now();
-        Self {
-            child,
-            spawned: now,
-            ready: false,
-            attached: false,
-            heard: now,
-            doing: None,
-            kept: 0,
-            worked: None,
-            left: false,
-            killed_for: None,
-        }
-    }
-
-    /// SIGKILL; the exit, which comes as an event, is then told as this.
-    pub(super) fn kill_for(&mut self, death: Death) {
-        self.child.kill();
-        self.killed_for = Some(death);
-    }
-}
-
-pub(super) struct Supervisor {
-    pub(super) launcher: Launcher,
-    pub(super) config: ExperimentConfig,
-    pub(super) limits: TimeLimits,
-    pub(super) display: Display,
-    pub(super) events: mpsc::Sender<Event>,
-    pub(super) slots: BTreeMap<Process, Slot>,
-    pub(super) phase: Phase,
-    pub(super) spec: Option<EnvSpec>,
-    pub(super) learner_ready: bool,
-    /// Starts of the learner after a death in this session.
-    pub(super) learner_restarts: u64,
-    /// Since when nothing has been learned.
-    pub(super) learner_died: Option<Instant>,
-    /// The evaluator was killed with its learner, and has not ended yet.
-    pub(super) evaluator_ends: bool,
-    pub(super) finished: bool,
-    /// Whether the newest report of progress was followed by a checkpoint.
-    pub(super) checkpointed: bool,
-    pub(super) evaluations: EvaluationQueue,
-    pub(super) interrupts: u32,
-    pub(super) interrupted_at: Option<Instant>,
-    pub(super) failure: Option<Error>,
-    pub(super) abandoned: bool,
-    pub(super) garbage: u32,
-    pub(super) started: Instant,
-    /// When steps or updates last grew.
-    pub(super) advanced: Instant,
-    pub(super) first: Option<(Instant, Progress)>,
-    pub(super) last: Option<(Instant, Progress)>,
-    /// When the live display was last drawn.
-    pub(super) drawn: Instant,
-    pub(super) best_return: f64,
-    pub(super) last_row: Option<EvaluationRow>,
-    /// Where the run stood when this session began.
-    pub(super) before: Counters,
-    /// Other hosts that take part, as the gateway says.
-    pub(super) hosts: Vec<HostNow>,
-    /// Failures of environments in this session, and what its workers did.
-    pub(super) env_failures: u64,
-    pub(super) sent: Sent,
-    /// Starts of workers after a death in this session.
-    pub(super) worker_restarts: u64,
-    /// When `processes.json` is to be written next; none once that has failed.
-    pub(super) processes_due: Option<Instant>,
-}
-
-/// What ended the supervisor's wait.
+/// Why the supervisor woke.
 enum Wake {
     Interrupt,
-    Event(Event),
+    Incoming(Incoming),
     Time,
 }
 
-/// Runs the processes of one session until all of them have ended.
-pub async fn supervise(plan: SupervisorPlan) -> SessionReport {
-    let SupervisorPlan { launcher, config, limits, display, mut interrupts } = plan;
+/// Runs the processes of a session until all have ended.
+pub async fn supervise(plan: SupervisorPlan, observer: &mut dyn RunObserver) -> SessionReport {
+    let SupervisorPlan { launcher, config, limits, earlier, mut interrupts } = plan;
     let (events, mut incoming) = mpsc::channel(EVENTS_MAX);
     let mut woke = Instant::now();
-    let mut supervisor = Supervisor::new((launcher, config, limits), display, events);
-    let started = supervisor.start();
-    supervisor.check(started);
-    while !supervisor.is_over() {
-        // A terminal that takes nothing (Ctrl-S) may have held it up.
+    let (known, unreadable) = match Known::read(&launcher.run) {
+        Ok(known) => (known, None),
+        Err(error) => (Known::default(), Some(error)),
+    };
+    let settings = Settings {
+        config,
+        limits,
+        hub: launcher.hub(),
+        one_process: launcher.domain.is_none(),
+        patience: launcher.upstream.as_ref().map(|it| Duration::from_secs(it.patience_s)),
+        run: launcher.run.clone(),
+        earlier,
+        spec: known.spec,
+    };
+    let machine = Machine::new(settings, woke);
+    let mut supervisor = Supervisor::new(machine, launcher, observer, events);
+    supervisor.best_return = known.best_return.unwrap_or(f64::NEG_INFINITY);
+    supervisor.step(unreadable.map_or(Event::Begin, Event::ActionFailed));
+    while !supervisor.machine.is_over() {
+        // A blocked terminal (Ctrl-S) may have delayed this turn.
         let looked = Instant::now();
         supervisor.on_wake(woke, woke, looked);
         let due = supervisor.next_deadline();
         let wake = tokio::select! {
             biased;
             Some(()) = interrupts.recv() => Wake::Interrupt,
-            Some(event) = incoming.recv() => Wake::Event(event),
+            Some(event) = incoming.recv() => Wake::Incoming(event),
             () = tokio::time::sleep_until(due.into()) => Wake::Time,
         };
         woke = Instant::now();
         supervisor.on_wake(looked, due, woke);
         match wake {
-            Wake::Interrupt => supervisor.on_interrupt(),
-            Wake::Event(event) => supervisor.take(event),
+            Wake::Interrupt => supervisor.step(Event::Interrupt),
+            Wake::Incoming(event) => supervisor.take(event),
             Wake::Time => {
-                // Whoever has spoken meanwhile is heard first.
+                // Reports that arrived meanwhile come first.
                 tokio::task::yield_now().await;
-                if incoming.is_empty() {
-                    supervisor.check_heartbeats(woke);
-                }
+                supervisor.step(Event::Tick { all_heard: incoming.is_empty() });
             }
         }
-        let handled = supervisor.on_time(woke);
-        supervisor.check(handled);
+        supervisor.check_domain();
         supervisor.refresh(woke);
-        supervisor.tell_processes(woke);
+        supervisor.write_processes_if_due(woke);
     }
-    supervisor.tell_end();
+    supervisor.write_processes(true);
     supervisor.report()
 }
 
-impl Supervisor {
-    /// Nothing is started yet. What happens to children comes through the other end of `events`.
-    pub(super) fn new(
-        (launcher, config, limits): (Launcher, ExperimentConfig, TimeLimits),
-        display: Display,
-        events: mpsc::Sender<Event>,
+/// Results of earlier sessions.
+#[derive(Default)]
+struct Known {
+    spec: Option<EnvSpec>,
+    best_return: Option<f64>,
+}
+
+impl Known {
+    fn read(run: &RunDirectory) -> anyhow::Result<Self> {
+        let best_return = run.best_row()?.map(|row| row.return_mean);
+        Ok(Self { spec: run.spec()?, best_return })
+    }
+}
+
+impl<'a> Supervisor<'a> {
+    fn new(
+        machine: Machine,
+        launcher: Launcher,
+        observer: &'a mut dyn RunObserver,
+        events: mpsc::Sender<Incoming>,
     ) -> Self {
         let now = Instant::now();
-        let limit = limits.evaluation_of(config.evaluation.episodes_max());
         Self {
+            machine,
             launcher,
-            config,
-            limits,
-            display,
+            observer,
             events,
-            slots: BTreeMap::new(),
-            phase: Phase::Training,
-            spec: None,
-            learner_ready: false,
-            learner_restarts: 0,
-            learner_died: None,
-            evaluator_ends: false,
-            finished: false,
-            checkpointed: false,
-            evaluations: EvaluationQueue::new(limit),
-            interrupts: 0,
-            interrupted_at: None,
-            failure: None,
-            abandoned: false,
-            garbage: 0,
-            started: now,
-            advanced: now,
-            first: None,
-            last: None,
-            drawn: now,
+            children: BTreeMap::new(),
+            joining: BTreeMap::new(),
+            join_requests: 0,
             best_return: f64::NEG_INFINITY,
-            last_row: None,
-            before: Counters::default(),
-            hosts: Vec::new(),
-            env_failures: 0,
-            sent: Sent::default(),
-            worker_restarts: 0,
+            started: now,
+            drawn: now,
             processes_due: Some(now),
         }
     }
 
-    fn take(&mut self, event: Event) {
-        let handled = self.on_event(event);
-        self.check(handled);
-    }
-
-    /// Workers first: the learner needs to know the environment. A resumed run knows it.
-    fn start(&mut self) -> anyhow::Result<()> {
-        let run = &self.launcher.run;
-        self.spec = run.spec()?;
-        self.before = checkpoint::counters(&run.checkpoints_path())?.pop().unwrap_or_default();
-        self.best_return = run.best_row()?.map_or(f64::NEG_INFINITY, |row| row.return_mean);
-        if self.is_one_process() || self.spec.is_some() {
-            self.spawn(self.hub())?;
+    /// Passes an event to the machine and performs its actions, and so on with the events that
+    /// follow from them.
+    fn step(&mut self, event: Event) {
+        let mut events = VecDeque::from([event]);
+        while let Some(event) = events.pop_front() {
+            for action in self.machine.step(event, Instant::now()) {
+                events.extend(self.perform(action));
+            }
         }
-        if self.is_one_process() {
-            return Ok(());
+    }
+
+    fn take(&mut self, incoming: Incoming) {
+        let event = match incoming {
+            Incoming::Child(process, ChildEvent::Report(report)) => Event::Report(process, report),
+            Incoming::Child(process, ChildEvent::Garbage(line)) => Event::Garbage(process, line),
+            Incoming::Child(process, ChildEvent::Exited(status)) => {
+                self.children.remove(&process);
+                Event::Exited(process, status)
+            }
+            Incoming::Child(process, ChildEvent::Gone) => {
+                self.children.remove(&process);
+                Event::Gone(process)
+            }
+            Incoming::Join(pending) => {
+                self.join_requests += 1;
+                let (request, id) = (self.join_requests, pending.id);
+                let speaks = pending.speaks.clone();
+                self.joining.insert(request, pending);
+                Event::JoinRequested { request, id, speaks }
+            }
+        };
+        self.step(event);
+    }
+
+    /// Performs an action; returns the event of its failure.
+    fn perform(&mut self, action: Action) -> Option<Event> {
+        match action {
+            Action::Start { process, start, successor } => {
+                let started = self.start(process, start, successor);
+                return started.err().map(|error| Event::StartFailed(process, error));
+            }
+            Action::Attach(process) => {
+                if let Some(domain) = self.launcher.domain.clone() {
+                    self.send(process, Command::Attach { domain });
+                }
+            }
+            Action::Send(process, command) => self.send(process, command),
+            Action::Kill(process) => {
+                if let Some(child) = self.children.get(&process) {
+                    child.kill();
+                }
+            }
+            Action::Listen => self.listen(),
+            Action::Admit(admission) => {
+                let process = Process::Actor(admission.index);
+                return self.admit(admission).err().map(|it| Event::StartFailed(process, it));
+            }
+            Action::Refuse { request, reason } => {
+                if let Some(pending) = self.joining.remove(&request) {
+                    pending.refuse(reason);
+                }
+            }
+            Action::WriteSpec(spec) => {
+                return self.launcher.run.write_spec(&spec).err().map(Event::ActionFailed);
+            }
+            Action::Rewind => return self.rewind().err().map(Event::ActionFailed),
+            Action::Tell(event) => self.tell(event),
+            Action::TellFailure(failure) => {
+                let message = format!("while stopping: {:#}", self.render(failure));
+                self.warn(message);
+            }
         }
-        let actors = &self.config.actors;
-        if let Some(domain) = self.launcher.domain.as_ref().filter(|_| actors.joined_max > 0)
-            && let Err(error) = joining::listen(domain, self.events.clone())
-        {
-            self.display.message(&format!("warning: nobody can join this run: {error:#}"));
+        None
+    }
+
+    fn start(
+        &mut self,
+        process: Process,
+        start: u32,
+        successor: Option<Successor>,
+    ) -> anyhow::Result<()> {
+        if let Some(Successor { restarts }) = successor {
+            self.launcher.learner_restarts = restarts;
+            self.launcher.resume = self.launcher.run.has_checkpoint()?;
+            if !self.launcher.resume {
+                self.launcher.run.begin_again()?;
+            }
         }
-        let workers = u32::try_from(actors.workers).context("too many workers")?;
-        (0..workers).try_for_each(|index| self.spawn(Process::Actor(index)))
-    }
-
-    /// What workers send to: the learner, or what stands for it on this host.
-    pub(super) fn hub(&self) -> Process {
-        self.launcher.hub()
-    }
-
-    pub(super) fn is_one_process(&self) -> bool {
-        self.launcher.domain.is_none()
-    }
-
-    pub(super) fn spawn(&mut self, process: Process) -> anyhow::Result<()> {
-        let slot = self.slots.entry(process).or_default();
-        slot.restart_at = None;
-        let command = self.launcher.command(process, slot.starts)?;
-        slot.starts += 1;
-        slot.running = Some(Running::new(Child::spawn(command, process, self.events.clone())?));
+        let command = self.launcher.command(process, start)?;
+        let child = Child::spawn(command, process, self.events.clone())?;
+        self.children.insert(process, child);
         Ok(())
     }
 
-    pub(super) fn running(&self, process: Process) -> Option<&Running> {
-        self.slots.get(&process)?.running.as_ref()
-    }
-
-    pub(super) fn all_running(&self) -> impl Iterator<Item = (Process, &Running)> {
-        self.slots.iter().filter_map(|(process, slot)| Some((*process, slot.running.as_ref()?)))
-    }
-
-    /// Workers that are attached: the run's own, and those that have joined.
-    pub(super) fn workers(&self) -> usize {
-        let attached = self.all_running().filter(|(process, running)| {
-            matches!(process, Process::Actor(_)) && running.attached && running.killed_for.is_none()
-        });
-        attached.count()
-    }
-
-    /// Sends a command to a child. One that takes none is stuck or dying; its deadline or its
-    /// exit follows.
-    pub(super) fn send(&mut self, process: Process, command: Command) {
-        let sent = self.running(process).is_none_or(|running| running.child.send(command));
-        if !sent {
-            self.display.message(&format!("{process} takes no commands"));
+    /// Sends a command without waiting. A child that takes none is stuck or dying: its deadline or
+    /// its exit follows, so only a command that it cannot do without is worth a warning.
+    fn send(&mut self, process: Process, command: Command) {
+        let matters = !matches!(
+            command,
+            Command::Stop | Command::EnvFailures { .. } | Command::Sent(_) | Command::Workers(_)
+        );
+        let sent = self.children.get(&process).is_none_or(|child| child.send(command));
+        if !sent && matters {
+            let message = format!("{process} takes no commands");
+            self.tell(RunEvent::Warning { process: Some(process), message });
         }
     }
 
-    fn is_over(&self) -> bool {
-        let stopping = matches!(self.phase, Phase::Stopping { .. });
-        stopping && (self.abandoned || self.all_running().next().is_none())
+    fn listen(&mut self) {
+        let Some(domain) = &self.launcher.domain else { return };
+        if let Err(error) = joining::listen(domain, self.events.clone()) {
+            self.warn(format!("warning: nobody can join this run: {error:#}"));
+        }
+    }
+
+    fn admit(&mut self, admission: Admission) -> anyhow::Result<()> {
+        let Admission { request, index, start, workers } = admission;
+        let Some(pending) = self.joining.remove(&request) else { return Ok(()) };
+        let incarnation = self.launcher.incarnation(start)?;
+        let welcome = Welcome { index, incarnation, venv: self.launcher.venv.clone(), workers };
+        let (process, answer) = (Process::Actor(index), JoinAnswer::Welcome(welcome));
+        let child = Child::join(pending, &answer, process, self.events.clone())?;
+        self.children.insert(process, child);
+        Ok(())
+    }
+
+    fn rewind(&mut self) -> anyhow::Result<()> {
+        let evaluations = self.launcher.run.evaluations()?;
+        let returns = evaluations.iter().map(|row| row.return_mean);
+        self.best_return = returns.fold(f64::NEG_INFINITY, f64::max);
+        self.observer.on_event(RunEvent::Rewound { evaluations });
+        Ok(())
+    }
+
+    fn warn(&mut self, message: String) {
+        self.tell(RunEvent::Warning { process: None, message });
+    }
+
+    /// Passes an event to the observer, completed by what the machine does not know.
+    fn tell(&mut self, mut event: RunEvent) {
+        match &mut event {
+            RunEvent::Evaluated { row, is_best } => {
+                *is_best = row.return_mean > self.best_return;
+                self.best_return = self.best_return.max(row.return_mean);
+            }
+            RunEvent::Progress { processes, .. } if self.observer.shows_processes() => {
+                self.drawn = Instant::now();
+                *processes = views::process_lines(&self.machine, self.drawn);
+            }
+            _ => {}
+        }
+        self.observer.on_event(event);
+    }
+
+    /// Reports to the machine if the supervisor itself did not run: it last looked at `looked`, was
+    /// to wake at `due` at the latest, and woke at `now`.
+    fn on_wake(&mut self, looked: Instant, due: Instant, now: Instant) {
+        if let Some(lost) = stood_still(looked, due, now) {
+            self.step(Event::StoodStill(lost));
+        } else if lateness(looked, due, now) >= LATE {
+            self.step(Event::Late);
+        }
+    }
+
+    fn next_deadline(&self) -> Instant {
+        let now = Instant::now();
+        let deadline = self.machine.next_deadline(now);
+        let watches_domain = self.machine.needs_domain() && self.launcher.domain.is_some();
+        if watches_domain { deadline.min(now + DOMAIN_LOOK) } else { deadline }
+    }
+
+    /// Ends the run if its shared-memory directory was removed.
+    ///
+    /// Mapped memory remains, so segments continue to arrive. But no process can attach any more,
+    /// so the next death would be the last one, and nothing could be cleaned up. The run ends
+    /// while a checkpoint is still possible.
+    fn check_domain(&mut self) {
+        let domain = self.launcher.domain.as_ref().filter(|_| self.machine.needs_domain());
+        if let Some(domain) = domain.filter(|domain| !domain.is_dir()) {
+            self.step(Event::DomainLost(domain.clone()));
+        }
+    }
+
+    /// Redraws the live display between two reports of progress: deaths and restarts are visible
+    /// without progress.
+    fn refresh(&mut self, now: Instant) {
+        if self.observer.shows_processes() && now.duration_since(self.drawn) >= REDRAW_EVERY {
+            self.drawn = now;
+            let processes = views::process_lines(&self.machine, now);
+            self.observer.on_event(RunEvent::Processes(processes));
+        }
+    }
+
+    fn write_processes_if_due(&mut self, now: Instant) {
+        if self.processes_due.is_some_and(|due| now >= due) {
+            self.processes_due = now.checked_add(PROCESSES_EVERY);
+            self.write_processes(false);
+        }
+    }
+
+    /// Writes `processes.json`. The run continues without this file if that fails.
+    fn write_processes(&mut self, ended: bool) {
+        if self.processes_due.is_none() {
+            return;
+        }
+        let usage = |process| {
+            let id = self.children.get(&process).and_then(Child::id);
+            id.map(views::usage_of).unwrap_or_default()
+        };
+        let rows = views::process_rows(&self.machine, usage, Instant::now());
+        let table = Processes::new(ended, self.started.elapsed().as_secs_f64(), rows);
+        if let Err(error) = self.launcher.run.write_processes(&table) {
+            self.warn(format!("warning: {error:#}; the run goes on without this file"));
+            self.processes_due = None;
+        }
+    }
+
+    /// Completes a failure with the last lines of a log and advice.
+    fn render(&self, failure: Failure) -> Error {
+        let Failure { mut error, log, advice, context } = failure;
+        let run = &self.launcher.run;
+        let tail = log.map(|process| log_tail(&run.log_path(&process.to_string())));
+        let resumable = match advice {
+            ResumeAdvice::Never => false,
+            ResumeAdvice::IfCheckpoint => run.has_checkpoint().unwrap_or(false),
+            ResumeAdvice::Always => true,
+        };
+        let advice = resumable.then(|| {
+            format!("\n  go on from the last checkpoint: dmprl resume {}", shown(run.path()))
+        });
+        if tail.is_some() || advice.is_some() {
+            let (tail, advice) = (tail.unwrap_or_default(), advice.unwrap_or_default());
+            error = anyhow::anyhow!("{error}{tail}{advice}");
+        }
+        match context {
+            Some(context) => error.context(context),
+            None => error,
+        }
     }
 
     fn report(mut self) -> SessionReport {
-        self.display.close();
-        let ending = match self.failure {
+        self.observer.on_event(RunEvent::Ended);
+        let failure = self.machine.failure.take().map(|failure| self.render(failure));
+        let Machine { interrupts, learner, first, last, last_row, totals, .. } = self.machine;
+        let ending = match failure {
             Some(error) => Ending::Failed(error),
-            None if self.interrupts > 0 => Ending::Interrupted,
+            None if interrupts > 0 => Ending::Interrupted,
             None => Ending::Completed,
         };
-        let training = match (&self.first, &self.last) {
-            (Some((first, _)), Some((last, _))) => last.duration_since(*first),
+        let training = match (&first, &last) {
+            (Some(first), Some(last)) => last.at.duration_since(first.at),
             _ => Duration::ZERO,
         };
         SessionReport {
             ending,
-            checkpointed: self.finished && self.checkpointed,
-            first: self.first.map(|(_, progress)| progress),
-            last: self.last.map(|(_, progress)| progress),
+            checkpointed: learner.finished && learner.checkpointed,
+            first: first.map(|milestone| milestone.progress),
+            last: last.map(|milestone| milestone.progress),
             training,
-            last_row: self.last_row,
-            env_failures: self.env_failures,
-            learner_restarts: self.learner_restarts,
+            last_row,
+            env_failures: totals.env_failures,
+            learner_restarts: totals.learner_restarts,
             wall: self.started.elapsed(),
         }
+    }
+}
+
+/// For how long a supervisor was stopped that last looked at `looked`, was to wake at `due` at the
+/// latest and woke at `now`; `None` if it was on time.
+fn stood_still(looked: Instant, due: Instant, now: Instant) -> Option<Duration> {
+    (lateness(looked, due, now) >= STANDSTILL).then(|| now.duration_since(looked))
+}
+
+fn lateness(looked: Instant, due: Instant, now: Instant) -> Duration {
+    now.saturating_duration_since(due.max(looked))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Regression test: Ctrl-Z for an hour was once taken for an hour without progress.
+    #[test]
+    fn a_standstill_is_told_from_a_wait() {
+        let looked = Instant::now();
+        let due = looked + Duration::from_secs(60);
+        assert_eq!(stood_still(looked, due, looked), None, "a report came at once");
+        assert_eq!(stood_still(looked, due, due + Duration::from_millis(20)), None, "a timer");
+        let hour = Duration::from_secs(3_600);
+        assert_eq!(stood_still(looked, due, looked + hour), Some(hour));
+        assert_eq!(stood_still(due, looked, due), None, "overdue and handled at once");
     }
 }

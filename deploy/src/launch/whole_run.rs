@@ -1,4 +1,4 @@
-//! A whole `dmprl train` as a child: what `dmprl chaos` strikes and `dmprl bench system` measures.
+//! Runs a whole `dmprl train` as a child, for `dmprl chaos` and `dmprl bench system`.
 
 use std::fs::File;
 use std::os::unix::process::CommandExt;
@@ -9,22 +9,23 @@ use std::time::{Duration, Instant};
 use anyhow::Context;
 use rustix::process::{Pid, Signal, kill_process};
 
-use super::{describe, last_lines};
+use super::child::describe;
+use super::logs::last_lines;
 
-/// From SIGINT to the end; the supervisor has limits of its own.
+/// Maximum time from SIGINT to the exit. The supervisor's own limits are shorter.
 const END: Duration = Duration::from_secs(90);
-/// Between two looks for the end.
+/// Interval between checks for the exit.
 const LOOK: Duration = Duration::from_millis(10);
 
-/// A running `dmprl train`. Dropped, it is killed, and its children end by themselves.
+/// A running `dmprl train`. Dropping it kills the supervisor, and its children end by themselves.
 pub(crate) struct WholeRun {
     child: Child,
     log: PathBuf,
 }
 
 impl WholeRun {
-    /// Starts it. `command` says everything: variables of the caller's environment that would
-    /// configure a run are not passed on.
+    /// Starts it. Variables of the caller's environment that would configure a run are not passed
+    /// on.
     pub(crate) fn start(mut command: Command, log: &Path) -> anyhow::Result<Self> {
         let file = File::create(log).with_context(|| format!("cannot make {}", log.display()))?;
         for (name, _) in std::env::vars_os() {
@@ -33,12 +34,12 @@ impl WholeRun {
             }
         }
         command.stdin(Stdio::null()).stdout(Stdio::null()).stderr(file);
-        // A session of its own: Ctrl-C is for us, and the kernel must not wake its stopped members.
-        // SAFETY: both are system calls, allocate nothing and touch no lock.
+        // In a session of its own it does not receive Ctrl-C, and the kernel does not wake its
+        // stopped members. SAFETY: both are system calls that neither allocate nor take a lock.
         unsafe {
             command.pre_exec(|| {
                 rustix::process::setsid()?;
-                // When this program is killed the run comes to its end by itself.
+                // The run is interrupted if this program is killed.
                 rustix::process::set_parent_process_death_signal(Some(Signal::INT))?;
                 Ok(())
             });
@@ -47,24 +48,24 @@ impl WholeRun {
         Ok(Self { child, log: log.to_owned() })
     }
 
-    /// The supervisor.
+    /// Process id of the supervisor.
     pub(crate) fn pid(&self) -> anyhow::Result<Pid> {
         let pid = i32::try_from(self.child.id()).ok().and_then(Pid::from_raw);
         pid.context("a child without an id")
     }
 
-    /// How it has ended by itself, if it has.
+    /// Describes its exit, if it has exited by itself.
     pub(crate) fn end(&mut self) -> anyhow::Result<Option<String>> {
         let status = self.child.try_wait().context("cannot wait for dmprl train")?;
-        Ok(status.map(|status| self.told(status)))
+        Ok(status.map(|status| self.describe(status)))
     }
 
-    fn told(&self, status: ExitStatus) -> String {
+    fn describe(&self, status: ExitStatus) -> String {
         let (how, lines) = (describe(status), last_lines(&self.log));
         format!("{how}; the last lines of {}:\n{lines}", self.log.display())
     }
 
-    /// Stops it as Ctrl-C does; returns what was wrong about its end.
+    /// Stops it with SIGINT; describes an irregular exit.
     pub(crate) fn stop(&mut self) -> anyhow::Result<Option<String>> {
         let pid = self.pid()?;
         kill_process(pid, Signal::INT).context("cannot interrupt dmprl train")?;
@@ -72,12 +73,15 @@ impl WholeRun {
         loop {
             if let Some(status) = self.child.try_wait().context("cannot wait for dmprl train")? {
                 let regular = status.code() == Some(130);
-                return Ok((!regular).then(|| self.told(status)));
+                return Ok((!regular).then(|| self.describe(status)));
             }
             if Instant::now() >= deadline {
                 self.child.kill().context("cannot kill dmprl train")?;
                 let status = self.child.wait().context("cannot wait for dmprl train")?;
-                return Ok(Some(format!("not within {END:?} of SIGINT; {}", self.told(status))));
+                return Ok(Some(format!(
+                    "not within {END:?} of SIGINT; {}",
+                    self.describe(status)
+                )));
             }
             std::thread::sleep(LOOK);
         }
@@ -86,7 +90,7 @@ impl WholeRun {
 
 impl Drop for WholeRun {
     fn drop(&mut self) {
-        // An error means that it has ended already.
+        // An error means that it has exited already.
         let _ = self.child.kill();
         let _ = self.child.wait();
     }

@@ -1,8 +1,8 @@
-//! What to do when `venv` or `pip` fails, from what they print.
+//! Derives a remedy from the output of a failed `venv` or `pip`.
 
 use dmprl_actors::python_env::LINKED_PYTHON;
 
-/// Phrase in the output, and what it means for the user. The first that occurs counts.
+/// Phrases in the output and their causes. The first match counts.
 const CAUSES: [(&str, Cause); 14] = [
     ("ensurepip is not available", Cause::NoVenv),
     ("No module named venv", Cause::NoVenv),
@@ -29,7 +29,7 @@ enum Cause {
     NoPackage,
 }
 
-/// A sentence that begins the error's message, ending in a line break; empty when unknown.
+/// Returns the first sentence of the error message, with a line break; empty for unknown causes.
 pub(super) fn advice(output: &str) -> String {
     let Some((_, cause)) = CAUSES.iter().find(|(phrase, _)| output.contains(phrase)) else {
         return String::new();

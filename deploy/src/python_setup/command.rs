@@ -1,4 +1,4 @@
-//! The two commands that fill `.venv`, with their progress and their failures.
+//! Runs `venv` and `pip`, with progress, and reports their failures.
 
 use std::{
     collections::VecDeque,
@@ -17,25 +17,25 @@ use dmprl_actors::python_env::LINKED_PYTHON;
 
 use super::{PythonEnvironment, advice::advice, stamp};
 
-/// Lines of a failed command that are shown.
+/// Maximum number of lines of a failed command in its error.
 const LAST_LINES_MAX: usize = 20;
-/// Between two progress lines of a command that prints nothing.
+/// Interval between progress lines of a command that prints nothing.
 const PROGRESS_INTERVAL: Duration = Duration::from_secs(1);
-/// Lines that the reading thread may be ahead; beyond, the command waits in its write.
+/// Maximum number of lines between the reading thread and the progress. Beyond, the command blocks.
 const LINES_AHEAD_MAX: usize = 256;
 
-/// What making `.venv` needs.
+/// A set-up of `.venv` in progress.
 pub(super) struct Setup<'a> {
-    /// What is made.
+    /// The environment to create.
     pub environment: &'a PythonEnvironment,
-    /// Held until the last command that writes into `.venv` has ended.
+    /// The lock, held until the last command that writes into `.venv` has ended.
     pub lock: &'a File,
-    /// Takes one line at a time.
+    /// Called with each progress line.
     pub progress: &'a dyn Fn(&str),
 }
 
 impl Setup<'_> {
-    /// Makes the virtual environment, with the interpreter that this program is linked against.
+    /// Creates the virtual environment with the interpreter against which this program is linked.
     pub fn create(&self) -> Result<()> {
         stamp::begin(&self.environment.venv)?;
         let mut command = Command::new(LINKED_PYTHON.executable);
@@ -44,19 +44,18 @@ impl Setup<'_> {
         self.run(&phase, command)
     }
 
-    /// Installs the package and what it requires.
+    /// Installs the package and its requirements.
     ///
-    /// Editable, that is by reference to `envs_py`: a change there holds at the next start, without
-    /// an installation, which is what who adds a task wants; only a change of requirements installs
-    /// again.
+    /// The installation is editable, a reference to `envs_py`. So a changed or added task takes
+    /// effect at the next start, and only changed requirements are installed again.
     pub fn install(&self, package: &Path) -> Result<()> {
         let package: [&OsStr; 2] = ["--editable".as_ref(), package.as_ref()];
         self.pip("installing packages", &package)
     }
 
-    /// Installs what an optional part of the package requires, as `pip` writes requirements. Not
-    /// by the package's name with the extra in brackets: that would make the package again, which
-    /// asks the network for its build tool even where all requirements are met.
+    /// Installs the requirements of an optional part of the package, in pip's syntax. Installing
+    /// `dmprl[extra]` instead would build the package again, which needs its build tool from the
+    /// network even if all requirements are met.
     pub fn install_extra(&self, requirements: &[String]) -> Result<()> {
         let arguments: Vec<&OsStr> = requirements.iter().map(AsRef::as_ref).collect();
         self.pip(&format!("installing {}", requirements.join(" ")), &arguments)
@@ -68,7 +67,7 @@ impl Setup<'_> {
             .args(["-I", "-m", "pip", "install", "--disable-pip-version-check", "--no-input"])
             .args(["--progress-bar", "off"])
             .args(arguments)
-            // A user's pip.conf may ask for these; in a virtual environment they fail or miss it.
+            // Settings of a user's pip.conf that fail in a virtual environment or bypass it.
             .env("PIP_USER", "0")
             .env_remove("PIP_TARGET")
             .env_remove("PIP_PREFIX");
@@ -80,8 +79,8 @@ impl Setup<'_> {
         let line = command_line(&command);
         let (output, input) = io::pipe().context("no pipe")?;
         command
-            // The lock file is empty, so it serves as an empty input, and the lock lasts until
-            // the command itself has ended: if this program is killed, the next start waits.
+            // The empty lock file serves as empty input, and the command holds the lock until its
+            // own exit: if this program is killed, the next start waits.
             .stdin(Stdio::from(self.lock.try_clone().context("cannot share the lock")?))
             .stdout(input.try_clone().context("no pipe")?)
             .stderr(input);
@@ -92,7 +91,7 @@ impl Setup<'_> {
         check(&line, status, &last_lines)
     }
 
-    /// Shows a command's output as progress until it closes it; returns its end.
+    /// Shows a command's output as progress until the command closes it; returns the last lines.
     fn follow(
         &self,
         phase: &str,
@@ -100,7 +99,7 @@ impl Setup<'_> {
         output: impl BufRead + Send + 'static,
     ) -> VecDeque<String> {
         let (sender, receiver) = mpsc::sync_channel(LINES_AHEAD_MAX);
-        // A thread, because reading a line cannot time out.
+        // A thread reads, because reading a line has no timeout.
         let reader = thread::spawn(move || {
             for line in output.split(b'\n').map_while(Result::ok) {
                 if sender.send(String::from_utf8_lossy(&line).trim_end().to_owned()).is_err() {
@@ -125,7 +124,7 @@ impl Setup<'_> {
             let seconds = started.elapsed().as_secs();
             (self.progress)(&format!("python environment: {phase} ({seconds} s) {last}"));
         }
-        // It has dropped its sender, so it has ended or is about to.
+        // The thread has dropped its sender, so it ends.
         let _ = reader.join();
         last_lines
     }

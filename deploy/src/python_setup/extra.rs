@@ -1,4 +1,4 @@
-//! Optional parts of the Python package, which are installed when a command first needs them.
+//! Installs optional parts of the Python package when a command first needs them.
 
 use std::{ffi::OsStr, fs, path::Path};
 
@@ -7,14 +7,14 @@ use toml::Table;
 
 use super::{Home, PythonEnvironment, command::Setup, locked};
 
-/// Makes sure that the environment of `home` holds the package, as [`Home::ensure`] does, and what
-/// its optional part `extra` requires.
+/// Ensures that the environment of `home` has the package, as [`Home::ensure`] does, and the
+/// requirements of its optional part `extra`.
 ///
-/// A file in the environment says which requirements were met, so that later starts neither run
-/// pip nor need a network; it goes with a `.venv` that is made anew.
+/// A file in the environment records the installed requirements, so that later starts neither run
+/// pip nor need a network.
 ///
 /// # Errors
-/// As [`Home::ensure`]; the package has no such part.
+/// As [`Home::ensure`], or the package has no such part.
 pub fn ensure_extra(
     home: &Home,
     extra: &str,
@@ -29,7 +29,7 @@ pub fn ensure_extra(
         return Ok(environment);
     }
     let lock = locked(&home.lock(), progress)?;
-    // Another start may have been faster.
+    // A concurrent start may have been faster.
     if !is_ready() {
         let setup = Setup { environment: &environment, lock: &lock, progress };
         setup
@@ -41,7 +41,7 @@ pub fn ensure_extra(
     Ok(environment)
 }
 
-/// From `pyproject.toml`, or from the METADATA of an installed package.
+/// Reads the requirements of a part from `pyproject.toml` or an installed package's METADATA.
 fn requirements(file: &Path, extra: &str) -> Result<Vec<String>> {
     let text =
         fs::read_to_string(file).with_context(|| format!("cannot read {}", file.display()))?;
@@ -59,7 +59,7 @@ fn of_project(project: &Table, extra: &str) -> Option<Vec<String>> {
     Some(listed.iter().filter_map(|text| text.as_str().map(str::to_owned)).collect())
 }
 
-/// `Requires-Dist: av>=18,<19 ; extra == 'video'`
+/// Reads lines such as `Requires-Dist: av>=18,<19 ; extra == 'video'`.
 fn of_metadata(metadata: &str, extra: &str) -> Option<Vec<String>> {
     let headers = metadata.lines().take_while(|line| !line.is_empty());
     let required = headers.filter_map(|line| line.strip_prefix("Requires-Dist:"));
@@ -79,7 +79,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn both_kinds_of_files_say_what_an_optional_part_requires() {
+    fn requirements_are_read_from_both_kinds_of_files() {
         let metadata = "Name: dmprl\nRequires-Dist: numpy>=2\n\
                         Requires-Dist: av>=18,<19 ; extra == 'video'\n\
                         Requires-Dist: pillow>=12 ; extra == \"video\"\n\

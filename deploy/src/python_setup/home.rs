@@ -1,4 +1,4 @@
-//! Where this program's Python package lies: in a clone of the project, or where pip put both.
+//! Finds this program's Python package: in a clone of the project, or where pip installed both.
 
 use std::path::{Path, PathBuf};
 
@@ -8,21 +8,23 @@ use dmprl_actors::python_env::LINKED_PYTHON;
 use super::{LOCK, PACKAGE, PythonEnvironment, State, VENV, ensure, state};
 use crate::project;
 
-/// A place with the package `dmprl`, and an environment in which it can be imported.
+/// Location of the package `dmprl` and of an environment that can import it.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum Home {
-    /// The project's directory: `envs_py`, and `.venv`, which refers to it and is made when needed.
+    /// The project's directory, with `envs_py` and `.venv`, which refers to it and is created on
+    /// demand.
     Clone(PathBuf),
-    /// The environment that `pip install` put program and package into. It is its owner's: nothing
-    /// but what optional parts require is ever installed there.
+    /// The environment into which pip installed program and package. Only requirements of optional
+    /// parts are installed there.
     Installed(PythonEnvironment),
 }
 
 impl Home {
-    /// The environment that this program was installed into; else the project's directory.
+    /// Finds the environment into which this program was installed, or else the project's
+    /// directory.
     ///
     /// # Errors
-    /// Neither is there; this program's own file cannot be found.
+    /// Neither exists, or this program's own file cannot be found.
     pub fn find() -> Result<Self> {
         let program = std::env::current_exe().context("cannot find this program's own file")?;
         match installed(&program) {
@@ -31,7 +33,7 @@ impl Home {
         }
     }
 
-    /// Makes sure that there is an environment in which the package can be imported.
+    /// Ensures that there is an environment that can import the package.
     ///
     /// # Errors
     /// As [`ensure`].
@@ -42,7 +44,7 @@ impl Home {
         }
     }
 
-    /// Looks at the environment. Changes nothing, waits for nobody.
+    /// Inspects the environment, without changes and without waiting.
     #[must_use]
     pub fn state(&self) -> State {
         match self {
@@ -51,7 +53,7 @@ impl Home {
         }
     }
 
-    /// The directory of the environment, made or not.
+    /// Directory of the environment, which may not exist yet.
     #[must_use]
     pub fn venv(&self) -> PathBuf {
         match self {
@@ -60,7 +62,7 @@ impl Home {
         }
     }
 
-    /// What `import dmprl` needs on its path, for an interpreter that is not the environment's.
+    /// Directory that other interpreters need on their path for `import dmprl`.
     #[must_use]
     pub fn package_path(&self) -> PathBuf {
         match self {
@@ -69,7 +71,7 @@ impl Home {
         }
     }
 
-    /// Held by who changes the environment.
+    /// Path of the lock for changes of the environment.
     pub(super) fn lock(&self) -> PathBuf {
         match self {
             Self::Clone(root) => root.join(LOCK),
@@ -77,7 +79,7 @@ impl Home {
         }
     }
 
-    /// The file that says what the package requires.
+    /// Path of the file with the package's requirements.
     pub(super) fn requirements(&self) -> PathBuf {
         match self {
             Self::Clone(root) => root.join(PACKAGE).join("pyproject.toml"),
@@ -86,8 +88,8 @@ impl Home {
     }
 }
 
-/// The environment whose `bin` holds `program`, if pip put it there with the package of its own
-/// version.
+/// Returns the environment whose `bin` contains `program`, if pip installed it there with the
+/// package of the same version.
 fn installed(program: &Path) -> Option<PythonEnvironment> {
     let bin = program.parent()?;
     let environment = PythonEnvironment::of(bin.parent()?.to_owned());
@@ -113,7 +115,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn program_is_installed_where_pip_put_the_package_beside_it() {
+    fn program_is_installed_beside_the_package_of_its_version() {
         let directory = tempfile::tempdir().unwrap();
         let (prefix, bin) = (directory.path(), directory.path().join("bin"));
         let program = bin.join("dmprl");

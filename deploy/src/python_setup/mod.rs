@@ -1,11 +1,11 @@
-//! Stage 2 of 8: makes `.venv` and installs `envs_py` into it; called by every command that needs
-//! environments.
+//! Stage 2 of 8: creates `.venv` and installs `envs_py` into it. Every command that needs
+//! environments calls it.
 //!
-//! The virtual environment is made by the very interpreter that the program is linked against: a
-//! package built for another Python's `libpython` may crash this one. A stamp written last says
-//! what was made; where it fits, [`ensure`] reads two small files and is done. Two starts at once
-//! are kept apart by a lock file. Where pip has installed the program, it is in an environment
-//! already ([`Home`]).
+//! The interpreter against which the program is linked creates the virtual environment: a package
+//! built for another Python may crash this one. A stamp, which is written last, records from what
+//! the environment was made. If it fits, [`ensure`] only reads two small files. A lock file
+//! serialises concurrent starts. A program that pip has installed is in an environment already
+//! ([`Home`]).
 
 mod advice;
 mod command;
@@ -32,11 +32,11 @@ pub use self::{extra::ensure_extra, home::Home, packages::packages};
 
 /// Name of the virtual environment in the project's root.
 const VENV: &str = ".venv";
-/// Beside it, not in it: the lock must outlive a `.venv` that is made anew.
+/// Lock file beside `.venv`: it must outlive an environment that is created again.
 const LOCK: &str = ".venv.lock";
-/// Longer than an installation takes over a slow line.
+/// Maximum wait for the lock; an installation over a slow connection takes less.
 const LOCK_WAIT_MAX: Duration = Duration::from_secs(30 * 60);
-/// Between two looks at the lock, each with a progress line.
+/// Interval between attempts to take the lock, each with a progress line.
 const LOCK_INTERVAL: Duration = Duration::from_millis(500);
 /// The Python package, relative to the project's root.
 const PACKAGE: &str = "envs_py";
@@ -56,27 +56,27 @@ impl PythonEnvironment {
     }
 }
 
-/// Makes sure that `.venv` in `project_root` holds `envs_py` and what it needs.
+/// Ensures that `.venv` in `project_root` has `envs_py` and its requirements.
 ///
 /// - `project_root`: the directory with `envs_py`, where the program was built.
-/// - `progress`: called with one line about what is going on, at least once a second while
-///   something is; not at all when everything is there.
+/// - `progress`: called with a line at least once a second during the work, and not at all if there
+///   is nothing to do.
 ///
 /// # Errors
-/// With the last lines of the command that failed, and what to do about it: which Debian package
-/// is missing, or that the network is. A `.venv` that is no virtual environment is not touched.
+/// The last lines of the command that failed, and a remedy: which Debian package is missing, or
+/// that the package index is unreachable. A `.venv` that is no virtual environment is not touched.
 pub fn ensure(project_root: &Path, progress: &dyn Fn(&str)) -> Result<PythonEnvironment> {
     let (root, wanted) = wanted(project_root)?;
     let package = root.join(PACKAGE);
     let environment = PythonEnvironment::of(root.join(VENV));
-    // Without the lock: the stamp is the last thing written and the first removed.
+    // No lock is needed to read the stamp, which is written last and removed first.
     if wanted.compare(&environment.venv) == Fit::Ready {
         return Ok(environment);
     }
     let lock = locked(&root.join(LOCK), progress)?;
     let setup = Setup { environment: &environment, lock: &lock, progress };
     match wanted.compare(&environment.venv) {
-        Fit::Ready => return Ok(environment), // another start was faster
+        Fit::Ready => return Ok(environment), // a concurrent start was faster
         Fit::OtherPackages => {
             progress("python environment: envs_py/pyproject.toml has changed, installing again");
             stamp::remove(&environment.venv)?;
@@ -94,18 +94,18 @@ pub fn ensure(project_root: &Path, progress: &dyn Fn(&str)) -> Result<PythonEnvi
     Ok(environment)
 }
 
-/// How `.venv` is found.
+/// State of `.venv`.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum State {
-    /// [`ensure`] would use it as it is.
+    /// [`ensure`] uses it as it is.
     Ready,
-    /// [`ensure`] would make it.
+    /// [`ensure`] creates it.
     Missing,
-    /// [`ensure`] would change it or make it anew, because …
+    /// [`ensure`] changes or recreates it, for this reason.
     Stale(String),
 }
 
-/// Looks at `.venv` in `project_root`. Changes nothing, waits for nobody.
+/// Inspects `.venv` in `project_root`, without changes and without waiting.
 #[must_use]
 pub fn state(project_root: &Path) -> State {
     let (root, wanted) = match wanted(project_root) {
@@ -120,7 +120,7 @@ pub fn state(project_root: &Path) -> State {
     }
 }
 
-/// The project's directory, resolved, and what its `.venv` has to be made from.
+/// Returns the resolved project directory and the stamp that its `.venv` must have.
 fn wanted(project_root: &Path) -> Result<(PathBuf, Stamp)> {
     let root = fs::canonicalize(project_root)
         .with_context(|| format!("project directory {}", project_root.display()))?;
@@ -131,8 +131,8 @@ fn wanted(project_root: &Path) -> Result<(PathBuf, Stamp)> {
     Ok((root, wanted))
 }
 
-/// Waits for another start that is making the same `.venv`. The lock ends with its last holder,
-/// however that ends, so nothing stale is left by a crash.
+/// Waits for a concurrent start that creates the same `.venv`. The system releases the lock with
+/// its last holder, so a crash leaves no stale lock.
 fn locked(path: &Path, progress: &dyn Fn(&str)) -> Result<File> {
     let lock = File::options()
         .create(true)
@@ -142,7 +142,7 @@ fn locked(path: &Path, progress: &dyn Fn(&str)) -> Result<File> {
         .open(path)
         .with_context(|| format!("cannot write {}", path.display()))?;
     let started = Instant::now();
-    // Asking again and again, not `File::lock`: that could neither give up nor say how long.
+    // `File::lock` has no time limit and reports no progress.
     while started.elapsed() < LOCK_WAIT_MAX {
         match lock.try_lock() {
             Ok(()) => return Ok(lock),
@@ -161,7 +161,7 @@ fn locked(path: &Path, progress: &dyn Fn(&str)) -> Result<File> {
     )
 }
 
-/// Removes a virtual environment, and nothing else that may have that name.
+/// Removes a virtual environment; refuses to remove anything else of that name.
 fn remove(venv: &Path) -> Result<()> {
     let is_ours = venv.join("pyvenv.cfg").exists() || venv.join(stamp::MAKING).exists();
     let is_empty = || fs::read_dir(venv).is_ok_and(|mut entries| entries.next().is_none());
@@ -171,7 +171,8 @@ fn remove(venv: &Path) -> Result<()> {
             venv.display()
         );
     }
-    // First: a removal that is interrupted must not leave something that looks complete.
+    // The stamp goes first, so that an interrupted removal leaves no environment that looks
+    // complete.
     stamp::remove(venv)?;
     fs::remove_dir_all(venv).with_context(|| format!("cannot remove {}", venv.display()))
 }
@@ -181,7 +182,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn directory_that_is_no_virtual_environment_is_not_removed() {
+    fn directory_without_a_virtual_environment_is_not_removed() {
         let directory = tempfile::tempdir().unwrap();
         fs::write(directory.path().join("thesis.tex"), "").unwrap();
         let error = remove(directory.path()).unwrap_err().to_string();
@@ -190,7 +191,7 @@ mod tests {
     }
 
     #[test]
-    fn other_directory_than_the_project_is_refused() {
+    fn directory_without_the_project_is_rejected() {
         let directory = tempfile::tempdir().unwrap();
         let error = format!("{:#}", ensure(directory.path(), &|_| ()).unwrap_err());
         assert!(error.contains("is this the project's directory?"), "{error}");

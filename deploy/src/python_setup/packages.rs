@@ -1,11 +1,11 @@
-//! Which versions an environment's packages have, for the manifest of a run.
+//! Reads the versions of an environment's packages, for the manifest of a run.
 
 use anyhow::{Context, Result, anyhow};
 
 use crate::answer::answer;
 use crate::run_directory::Packages;
 
-/// Prints the fields of [`Packages`] as JSON. Imports none of the packages, which takes seconds.
+/// Prints the fields of [`Packages`] as JSON. It imports none of the packages: that takes seconds.
 const QUESTION: &str = "\
 import hashlib, json, platform
 from importlib.metadata import PackageNotFoundError, version
@@ -38,7 +38,7 @@ print(json.dumps({
     'dmprl_sha256': sources(),
 }))";
 
-/// Asks the interpreter of an environment.
+/// Reads the versions from the interpreter of an environment.
 ///
 /// # Errors
 /// The interpreter does not run, or does not answer in time.
@@ -56,7 +56,7 @@ mod tests {
     use dmprl_actors::python_env::LINKED_PYTHON;
 
     #[test]
-    fn the_interpreter_names_its_version_and_a_missing_one_is_an_error() {
+    fn versions_are_read_and_a_missing_interpreter_is_an_error() {
         let packages = packages(LINKED_PYTHON.executable.as_ref()).unwrap();
         assert_eq!(packages.python, LINKED_PYTHON.version_number());
         assert!(super::packages("/no/such/python".as_ref()).is_err());

@@ -1,4 +1,4 @@
-//! What `.venv` was made from, in a file inside it, written last.
+//! Records in `.venv` from what it was made. The file is written last.
 
 use std::{
     fs, io,
@@ -8,35 +8,37 @@ use std::{
 use anyhow::{Context, Result};
 use dmprl_actors::python_env::LinkedPython;
 
-/// Raised when what [`super::ensure`] puts into `.venv` changes other than by `pyproject.toml`.
+/// Raised if the content of `.venv` changes for another reason than `pyproject.toml`.
 const FORMAT: u32 = 1;
 const FILE: &str = "dmprl-stamp.txt";
-/// Written first, so that a `.venv` whose making was killed is known as ours.
+/// File that is written first. It marks a `.venv` whose creation was interrupted.
 pub(super) const MAKING: &str = "dmprl-making.txt";
 const MANIFEST_BEGINS: &str = "--- envs_py/pyproject.toml ---";
 
-/// Everything that `.venv` depends on, as text: compared whole, readable by whoever wonders.
+/// Everything on which `.venv` depends, as readable text.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(super) struct Stamp {
     python: String,
     manifest: String,
 }
 
-/// How what is on disk fits what is wanted.
+/// Result of comparing `.venv` with the wanted stamp.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(super) enum Fit {
-    /// Use it.
+    /// It can be used.
     Ready,
     /// The right Python, but the package's requirements have changed.
     OtherPackages,
-    /// There is nothing.
+    /// It does not exist.
     Absent,
-    /// It must be made anew, because …
+    /// It must be recreated, for this reason.
     Unusable(String),
 }
 
 impl Stamp {
-    /// - `root`: the project's directory; packages and scripts in `.venv` hold absolute paths.
+    /// A stamp for these inputs.
+    ///
+    /// - `root`: the project's directory; packages and scripts in `.venv` contain absolute paths.
     /// - `manifest`: content of `envs_py/pyproject.toml`.
     pub(super) fn new(linked: &LinkedPython, root: &Path, manifest: &str) -> Self {
         let python = format!(
@@ -53,7 +55,7 @@ impl Stamp {
         format!("{}\n{MANIFEST_BEGINS}\n{}", self.python, self.manifest)
     }
 
-    /// Looks at a virtual environment without running anything.
+    /// Compares a virtual environment, without running anything.
     pub(super) fn compare(&self, venv: &Path) -> Fit {
         if fs::symlink_metadata(venv).is_err() {
             return Fit::Absent;
@@ -66,7 +68,7 @@ impl Stamp {
             };
             return Fit::Unusable(why.to_owned());
         };
-        // Follows the link: false when that Python was uninstalled.
+        // `exists` follows the link, so it is false if that Python was uninstalled.
         if !venv.join("bin/python").exists() {
             return Fit::Unusable("its interpreter is gone".to_owned());
         }
@@ -82,7 +84,7 @@ impl Stamp {
         Fit::Unusable(format!("it was made for {was}, needed is {wanted}"))
     }
 
-    /// Declares a virtual environment complete.
+    /// Marks a virtual environment as complete.
     pub(super) fn write(&self, venv: &Path) -> Result<()> {
         let temporary = venv.join(format!("{FILE}.part"));
         fs::write(&temporary, self.text())
@@ -92,14 +94,14 @@ impl Stamp {
     }
 }
 
-/// Makes the directory, marked as being worked on.
+/// Creates the directory, marked as incomplete.
 pub(super) fn begin(venv: &Path) -> Result<()> {
     fs::create_dir(venv)
         .and_then(|()| fs::write(venv.join(MAKING), "dmprl is making this directory\n"))
         .with_context(|| format!("cannot make {}", venv.display()))
 }
 
-/// Declares a virtual environment incomplete.
+/// Marks a virtual environment as incomplete.
 pub(super) fn remove(venv: &Path) -> Result<()> {
     let path: PathBuf = venv.join(FILE);
     fs::write(venv.join(MAKING), "dmprl is changing this directory\n")
@@ -141,7 +143,7 @@ mod tests {
     }
 
     #[test]
-    fn half_made_environment_is_not_ready() {
+    fn incomplete_environment_is_not_ready() {
         let (_directory, venv, stamp) = made();
         assert_eq!(why(stamp.compare(&venv)), "the last attempt did not finish");
         stamp.write(&venv).unwrap();
@@ -151,7 +153,7 @@ mod tests {
     }
 
     #[test]
-    fn absent_and_foreign_environments_are_told_apart() {
+    fn absent_and_foreign_environments_differ() {
         let (_directory, venv, stamp) = made();
         assert_eq!(stamp.compare(&venv.join("none")), Fit::Absent);
         fs::remove_file(venv.join(MAKING)).unwrap();

@@ -6,10 +6,9 @@ use std::time::{Duration, Instant};
 use indicatif::{ProgressBar, ProgressStyle as BarStyle};
 
 use super::format::{duration, grouped, plus_minus};
-use super::panel::{
-    Panel, ProcessLine, SEPARATOR, Scope, speed, terminal_size, trouble, whole_items,
-};
+use super::panel::{Panel, SEPARATOR, Scope, speed, terminal_size, trouble, whole_items};
 use crate::control::{EvaluationRow, Progress};
+use crate::launch::{ProcessLine, RunEvent, RunObserver};
 
 /// Interval between two plain lines.
 const LINE_EVERY: Duration = Duration::from_secs(5);
@@ -25,14 +24,8 @@ pub enum ProgressStyle {
     Automatic,
     /// Always lines.
     Lines,
-}
-
-impl ProgressStyle {
-    /// The style for the flag `--no-progress`.
-    #[must_use]
-    pub fn from_flag(no_progress: bool) -> Self {
-        if no_progress { Self::Lines } else { Self::Automatic }
-    }
+    /// Events as JSON, one object a line, instead of a display.
+    Events,
 }
 
 /// Display of a run's progress.
@@ -93,26 +86,20 @@ impl Display {
     }
 
     /// Returns true if there is a panel with the processes.
-    #[must_use]
-    pub fn is_live(&self) -> bool {
+    fn is_live(&self) -> bool {
         matches!(self.target, Target::Bar(_))
     }
 
     /// Updates the processes between two reports of progress.
-    pub fn refresh(&mut self, processes: &[ProcessLine]) {
+    fn refresh(&mut self, processes: &[ProcessLine]) {
         if self.is_live() {
             let last = std::mem::take(&mut self.last);
             self.progress(&last, processes);
         }
     }
 
-    /// Sets the evaluations of a resumed run, which replace those shown so far.
-    pub fn begin_with(&mut self, evaluations: Vec<EvaluationRow>) {
-        self.evaluations = evaluations;
-    }
-
     /// Prints a message above the bar.
-    pub fn message(&mut self, text: &str) {
+    fn message(&mut self, text: &str) {
         match &mut self.target {
             Target::Bar(bar) => bar.suspend(|| super::say(text)),
             Target::Lines(writer) => write_line(writer, text),
@@ -120,7 +107,7 @@ impl Display {
     }
 
     /// Shows the learner's progress and, if there is a panel, the processes.
-    pub fn progress(&mut self, progress: &Progress, processes: &[ProcessLine]) {
+    fn progress(&mut self, progress: &Progress, processes: &[ProcessLine]) {
         let (steps, figures) = (self.steps(progress), self.figures(progress));
         self.last = progress.clone();
         match &mut self.target {
@@ -147,23 +134,8 @@ impl Display {
         }
     }
 
-    /// Shows an evaluation, and stores it for the progress.
-    pub fn evaluation(&mut self, row: &EvaluationRow, best: bool) {
-        let figure = plus_minus(&row.returns);
-        let success = row
-            .success_rate
-            .map(|rate| format!(", success {:.0} %", rate * 100.0))
-            .unwrap_or_default();
-        self.message(&format!(
-            "evaluation at {} steps: return {figure}{success}{}",
-            grouped(row.env_steps),
-            if best { "  (best)" } else { "" }
-        ));
-        self.evaluations.push(row.clone());
-    }
-
     /// Removes the bar.
-    pub fn close(&mut self) {
+    fn close(&mut self) {
         if let Target::Bar(bar) = &self.target {
             bar.finish_and_clear();
         }
@@ -193,6 +165,29 @@ impl Display {
         parts.extend(speed(progress, self.scope));
         parts.extend(trouble(progress));
         parts.join(SEPARATOR)
+    }
+}
+
+impl RunObserver for Display {
+    fn on_event(&mut self, event: RunEvent) {
+        let message = event.to_string();
+        if !message.is_empty() {
+            self.message(&message);
+        }
+        match event {
+            RunEvent::Started { evaluations, .. } | RunEvent::Rewound { evaluations } => {
+                self.evaluations = evaluations;
+            }
+            RunEvent::Progress { progress, processes } => self.progress(&progress, &processes),
+            RunEvent::Processes(processes) => self.refresh(&processes),
+            RunEvent::Evaluated { row, .. } => self.evaluations.push(row),
+            RunEvent::Ended => self.close(),
+            _ => {}
+        }
+    }
+
+    fn shows_processes(&self) -> bool {
+        self.is_live()
     }
 }
 

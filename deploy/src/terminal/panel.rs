@@ -2,6 +2,7 @@
 
 use super::format::{grouped, plus_minus};
 use crate::control::{EvaluationRow, Progress};
+use crate::launch::ProcessLine;
 
 /// Characters of a sparkline, from the lowest to the highest value.
 const BLOCKS: [char; 8] = ['▁', '▂', '▃', '▄', '▅', '▆', '▇', '█'];
@@ -13,17 +14,6 @@ const NAME_COLUMNS: usize = 10;
 const OTHER_LINES: usize = 4;
 /// Columns and rows if the terminal does not report them.
 const SIZE: (usize, usize) = (80, 24);
-
-/// A process of the run, as seen by the supervisor.
-#[derive(Debug, Clone, PartialEq, Eq)]
-pub struct ProcessLine {
-    /// Name, such as `learner` or `actor-0`.
-    pub name: String,
-    /// Short description of its activity.
-    pub state: String,
-    /// Number of restarts.
-    pub restarts: u32,
-}
 
 /// Scope of the figures.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]

@@ -6,7 +6,7 @@ use std::time::{Duration, Instant};
 
 use indicatif::{ProgressBar, ProgressStyle};
 
-use super::say;
+use super::{say, says_json};
 
 /// Interval between two plain lines.
 const LINE_EVERY: Duration = Duration::from_secs(5);
@@ -27,7 +27,8 @@ impl SetupProgress {
     /// Creates the display on standard error.
     #[must_use]
     pub fn new() -> Self {
-        let spinner = std::io::stderr().is_terminal().then(|| {
+        let draws = std::io::stderr().is_terminal() && !says_json();
+        let spinner = draws.then(|| {
             let spinner = ProgressBar::new_spinner();
             // The template is a constant; if it were invalid, indicatif's default would be used.
             if let Ok(style) = ProgressStyle::with_template("{spinner:.cyan} {wide_msg}") {

@@ -7,7 +7,7 @@ use std::path::{Path, PathBuf};
 use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
 
-use dmprl::launch::{Launcher, SessionReport, SupervisorPlan, TimeLimits, supervise};
+use dmprl::launch::{Launcher, SessionReport, SupervisorPlan, TimeLimits, Totals, supervise};
 use dmprl::run_directory::{Manifest, RunDirectory};
 use dmprl::terminal::Display;
 use dmprl_shared::config::ExperimentConfig;
@@ -98,7 +98,7 @@ impl Fixture {
         let mut watched = screen.clone();
         writeln!(watched, "training").unwrap();
         let plan = plan(&self.run, &self.config, self.limits, self.one_process);
-        let display = Display::lines(Box::new(screen.clone()), self.config.run.steps);
+        let mut display = Display::lines(Box::new(screen.clone()), self.config.run.steps);
         let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().unwrap();
         runtime.block_on(async {
             let watch = async {
@@ -118,11 +118,11 @@ impl Fixture {
                 launcher: plan.0,
                 config: plan.1,
                 limits: plan.2,
-                display,
+                earlier: Totals::default(),
                 interrupts,
             };
             let ended = tokio::select! {
-                report = tokio::time::timeout(PATIENCE, supervise(plan)) => report,
+                report = tokio::time::timeout(PATIENCE, supervise(plan, &mut display)) => report,
                 () = watch => unreachable!(),
             };
             let report = ended.unwrap_or_else(|_| panic!("no end:\n{}", screen.text()));

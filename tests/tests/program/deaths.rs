@@ -8,6 +8,7 @@ use dmprl_tests::program::{
     until,
 };
 use rustix::process::Signal;
+use serde_json::{Value, json};
 
 use crate::{ENDLESS, train};
 
@@ -15,7 +16,7 @@ use crate::{ENDLESS, train};
 const CHECKPOINT_INTERVAL: u64 = 1_000 + 5;
 
 fn training(place: &Workplace, run: &str, more: &[&str]) -> Running {
-    let more = [&["--steps", ENDLESS][..], more].concat();
+    let more = [&["--steps", ENDLESS, "--events", "json"][..], more].concat();
     let mut running = place.start(&train("reacher", run, &more));
     running.until_steps(run, 2_500);
     running
@@ -25,6 +26,11 @@ fn signal_role(place: &Workplace, role: &str, signal: Signal) {
     let processes = place.processes();
     let process = processes.iter().find(|process| process.role == role);
     process.unwrap_or_else(|| panic!("no {role} in {processes:#?}")).signal(signal);
+}
+
+/// The first death of a process, which is restarted.
+fn death(process: &str, how: &str) -> Value {
+    json!({ "event": "child_died", "process": process, "how": how, "restart": 1 })
 }
 
 /// Resumes for some steps and looks at the whole curve.
@@ -140,8 +146,7 @@ fn a_killed_worker_is_announced_and_replaced() {
     let run = place.path("run");
     let mut running = training(&place, &run, &[]);
     signal_role(&place, "actor", Signal::KILL);
-    running.until_said("actor-0 died (signal 9 (SIGKILL)");
-    running.until_said("restart 1 of 5");
+    running.until_event(&death("actor-0", "died"));
     let steps = env_steps_of(&run).unwrap();
     running.until_steps(&run, steps + 1_500);
     running.signal_group(Signal::INT);
@@ -158,8 +163,7 @@ fn a_worker_that_somebody_stopped_is_said_to_hang_and_replaced() {
     let run = place.path("run");
     let mut running = training(&place, &run, &["--set", "supervision.heartbeat_timeout_s=5"]);
     signal_role(&place, "actor", Signal::STOP);
-    running.until_said("actor-0 hung (no sign of life for 5.");
-    running.until_said("restart 1 of 5");
+    running.until_event(&death("actor-0", "hung"));
     let steps = env_steps_of(&run).unwrap();
     running.until_steps(&run, steps + 1_500);
     running.signal_group(Signal::INT);
@@ -196,8 +200,8 @@ fn workers_that_are_killed_all_at_once_are_replaced() {
         place.processes().into_iter().filter(|process| process.role == "actor").collect();
     assert_eq!(workers.len(), 2);
     workers.iter().for_each(|worker| worker.signal(Signal::KILL));
-    running.until_said("actor-0 died (signal 9 (SIGKILL)");
-    running.until_said("actor-1 died (signal 9 (SIGKILL)");
+    running.until_event(&death("actor-0", "died"));
+    running.until_event(&death("actor-1", "died"));
     let steps = env_steps_of(&run).unwrap();
     running.until_steps(&run, steps + 2_000);
     assert_eq!(ids(&place, "actor").len(), 2);
@@ -215,7 +219,7 @@ fn a_killed_evaluator_answers_after_its_restart() {
     let run = place.path("run");
     let mut running = training(&place, &run, &[]);
     signal_role(&place, "evaluator", Signal::KILL);
-    running.until_said("evaluator died");
+    running.until_event(&death("evaluator", "died"));
     let rows_before = rows(&run, "evaluations.jsonl").len();
     running.until("another row", |_| rows(&run, "evaluations.jsonl").len() > rows_before);
     running.signal_group(Signal::INT);
@@ -234,7 +238,8 @@ fn ids(place: &Workplace, role: &str) -> Vec<i32> {
 fn replace_learner(place: &Workplace, run: &str, running: &mut Running, deaths: usize) {
     signal_role(place, "learner", Signal::KILL);
     let back = |running: &Running| {
-        running.said().matches("the learner is back: first segment").count() == deaths
+        let events = running.events();
+        events.iter().filter(|event| event["after_restart"] == true).count() == deaths
     };
     running.until("a new learner", back);
     let steps = env_steps_of(run).unwrap_or(0);
@@ -299,6 +304,7 @@ fn a_learner_killed_once_too_often_ends_the_run_with_its_log_and_advice() {
     running
         .wait()
         .with_status(1)
+        .with_event(&json!({ "event": "finished", "outcome": "failed" }))
         .saying("error: learner died: signal 9")
         .saying("learner.log")
         .saying("dmprl resume");

@@ -6,11 +6,20 @@ use dmprl_tests::program::{
     Running, Workplace, env_steps, env_steps_of_checkpoint, rows, shared_memory_of,
 };
 use rustix::process::Signal;
+use serde_json::{Value, json};
 
 use crate::{ENDLESS, train};
 
+/// Flags of a run that only an interrupt ends.
+const EVENTS: [&str; 4] = ["--steps", ENDLESS, "--events", "json"];
+
+/// The last event of an interrupted run whose checkpoint is of its last moment.
+fn interrupted() -> Value {
+    json!({ "event": "finished", "outcome": "interrupted", "checkpointed": true })
+}
+
 fn training(place: &Workplace, run: &str) -> Running {
-    let mut running = place.start(&train("reacher", run, &["--steps", ENDLESS]));
+    let mut running = place.start(&train("reacher", run, &EVENTS));
     running.until_steps(run, 1_500);
     running
 }
@@ -32,7 +41,7 @@ fn ctrl_c_once_writes_a_checkpoint_that_the_run_goes_on_from() {
     let run = place.path("run");
     let running = training(&place, &run);
     running.signal_group(Signal::INT);
-    running.wait().with_status(130).saying("checkpoint written").saying("dmprl resume");
+    running.wait().with_status(130).with_event(&interrupted());
     assert_nothing_left(&place, &run);
     let steps = env_steps_of_checkpoint(&run).unwrap();
     let metrics = rows(&run, "metrics.jsonl");
@@ -52,7 +61,7 @@ fn sigterm_is_an_interrupt_too() {
     let running = training(&place, &run);
     // As a service manager does: the supervisor alone.
     running.signal(Signal::TERM);
-    running.wait().with_status(130).saying("checkpoint written");
+    running.wait().with_status(130).with_event(&interrupted());
     assert_nothing_left(&place, &run);
 }
 
@@ -60,8 +69,8 @@ fn sigterm_is_an_interrupt_too() {
 fn ctrl_c_before_the_first_step_leaves_nothing_running() {
     let place = Workplace::new();
     let run = place.path("run");
-    let mut running = place.start(&train("reacher", &run, &["--steps", ENDLESS]));
-    running.until_said("training reacher");
+    let mut running = place.start(&train("reacher", &run, &EVENTS));
+    running.until_event(&json!({ "event": "started" }));
     running.signal_group(Signal::INT);
     running.wait().with_status(130);
     assert_nothing_left(&place, &run);
@@ -77,13 +86,14 @@ fn ctrl_c_twice_ends_a_run_whose_learner_hangs() {
     let before = env_steps_of_checkpoint(&run);
     stop_role(&place, "learner");
     running.signal_group(Signal::INT);
-    running.until_said("once more: stop at once");
+    running.until_event(&json!({ "event": "interrupted" }));
     // Two signals at almost the same moment are one wish, so the second is repeated.
     running.until("the second interrupt", |running| {
         running.signal_group(Signal::INT);
-        running.said().contains("interrupted twice")
+        running.events().iter().any(|event| event["event"] == "killed")
     });
-    running.wait().with_status(130).saying("interrupted twice: killed");
+    let killed = json!({ "event": "killed", "reason": "interrupted twice" });
+    running.wait().with_status(130).with_event(&killed);
     assert_nothing_left(&place, &run);
     assert_eq!(env_steps_of_checkpoint(&run), before, "the checkpoint before is still there");
 }
@@ -95,7 +105,8 @@ fn ctrl_c_once_ends_a_run_whose_worker_hangs_and_writes_the_checkpoint() {
     let running = training(&place, &run);
     stop_role(&place, "actor");
     running.signal_group(Signal::INT);
-    running.wait().with_status(130).saying("killed actor-0").saying("checkpoint written");
+    let killed = json!({ "event": "killed", "processes": ["actor-0"] });
+    running.wait().with_status(130).with_event(&killed).with_event(&interrupted());
     assert_nothing_left(&place, &run);
 }
 
