@@ -2,8 +2,8 @@
 //!
 //!     cargo bench -p dmprl-learner --bench checkpoint [-- --gigabytes 1 --folder DIR]
 //!
-//! The replay is full of segments with Pusher's sizes. Segments are inserted while the checkpoint is
-//! written. The longest insertion is one that copies a chunk of the replay.
+//! The replay is full of segments with Pusher's sizes. Segments are inserted while the checkpoint
+//! is written. The longest insertion is one that copies a chunk of the replay.
 
 use std::path::PathBuf;
 use std::time::{Duration, Instant};

@@ -4,8 +4,8 @@
 //!
 //! The update is that of DDPG-DMP with Pusher's sizes (actor 23-256-256-70, critic 58-256-256-1,
 //! batch 256). All candidates alternate in one process, because on a shared machine only ratios of
-//! medians are meaningful. Times are CPU times of the calling thread, so that other processes do not
-//! count, except for updates on two threads, whose times are wall times. `dmprl bench learner`
+//! medians are meaningful. Times are CPU times of the calling thread, so that other processes do
+//! not count, except for updates on two threads, whose times are wall times. `dmprl bench learner`
 //! compares the update with all of its products.
 
 use std::hint::black_box;

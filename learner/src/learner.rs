@@ -1,7 +1,7 @@
 //! The learner's state and its operations: insert a segment, update, publish.
 //!
-//! It reads no clock and uses no transport, and no file except the segment log that it is given. The
-//! loop around it ([`crate::session`]) provides these.
+//! It reads no clock and uses no transport, and no file except the segment log that it is given.
+//! The loop around it ([`crate::session`]) provides these.
 
 mod arrival;
 

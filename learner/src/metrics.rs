@@ -74,7 +74,8 @@ pub struct MetricsLine {
     /// NDP: mean (V - return)^2.
     #[serde(default)]
     pub value_loss: Option<f64>,
-    /// NDP: mean (ratio - 1) - log ratio, which estimates the divergence from the policy that acted.
+    /// NDP: mean (ratio - 1) - log ratio, which estimates the divergence from the policy that
+    /// acted.
     #[serde(default)]
     pub approx_kl: Option<f64>,
     /// NDP: share of steps whose ratio is outside the clipping interval.

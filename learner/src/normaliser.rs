@@ -1,9 +1,9 @@
 //! Observation normalisation (`policy.normalise_observations`): networks in training get
 //! (x - mean) / scale, which is folded into the first layer of published policies.
 //!
-//! A published policy therefore takes plain observations. When mean and scale are updated, the first
-//! layers are rewritten so that every network remains the same function of plain observations.
-//! Normalisation changes the steps of the optimiser, never the policy.
+//! A published policy therefore takes plain observations. When mean and scale are updated, the
+//! first layers are rewritten so that every network remains the same function of plain
+//! observations. Normalisation changes the steps of the optimiser, never the policy.
 
 use std::borrow::Cow;
 
@@ -12,8 +12,8 @@ use serde::{Deserialize, Serialize};
 
 use crate::update::network::TrainableNetwork;
 
-/// Minimum standard deviation of a dimension that is scaled. Dividing by a smaller one would magnify
-/// the first deviation.
+/// Minimum standard deviation of a dimension that is scaled. Dividing by a smaller one would
+/// magnify the first deviation.
 const SCALE_MIN: f64 = 1e-4;
 
 /// Current mean and scale, with the running statistics of each dimension.
@@ -136,9 +136,9 @@ pub struct NormalisationChange<'a> {
 }
 
 impl NormalisationChange<'_> {
-    /// Rewrites a network in training and its target, so that they remain the same functions of plain
-    /// observations. The observations are the network's first inputs. Moments are scaled like the
-    /// gradients of the new weights, without the effect of a shifted mean.
+    /// Rewrites a network in training and its target, so that they remain the same functions of
+    /// plain observations. The observations are the network's first inputs. Moments are scaled like
+    /// the gradients of the new weights, without the effect of a shifted mean.
     pub fn apply(&self, network: &mut TrainableNetwork) {
         let TrainableNetwork { shape, parameters, target, adam, .. } = network;
         self.rewrite(shape, parameters.values_mut());

@@ -1,7 +1,7 @@
 //! Keeps the ratio of updates to segments. Each segment adds to the updates that the learner owes.
 //!
-//! The learner waits when it owes no update. The workers wait, on full queues, when the learner owes
-//! the updates of more than `tolerance_segments` segments and takes no more segments.
+//! The learner waits when it owes no update. The workers wait, on full queues, when the learner
+//! owes the updates of more than `tolerance_segments` segments and takes no more segments.
 
 use dmprl_shared::config::PacingConfig;
 use serde::{Deserialize, Serialize};

@@ -165,8 +165,8 @@ impl<'a> Recorder<'a> {
             }
             Due::Rejection(why) => {
                 self.warn(format!(
-                    "a segment was rejected ({why}); further ones of this kind are only counted, as \
-                     `rejected` in metrics.jsonl"
+                    "a segment was rejected ({why}); further ones of this kind are only counted, \
+                     as `rejected` in metrics.jsonl"
                 ));
                 Ok(())
             }
@@ -203,8 +203,8 @@ impl<'a> Recorder<'a> {
         self.previous.measured != Some(learner.counters.env_steps)
     }
 
-    /// Returns whether an evaluation that was due before the learner's checkpoint is missing, because
-    /// the run was stopped before the evaluator answered.
+    /// Returns whether an evaluation that was due before the learner's checkpoint is missing,
+    /// because the run was stopped before the evaluator answered.
     #[must_use]
     pub fn is_owed_an_evaluation(&self, learner: &Learner) -> bool {
         let interval = learner.config().evaluation.interval_steps;
@@ -257,9 +257,9 @@ impl<'a> Recorder<'a> {
         })
     }
 
-    /// Begins a checkpoint, which is written in the background. A deterministic run waits until it is
-    /// written. If the previous checkpoint is still being written, because the disk is too slow for
-    /// the interval, this waits for it first.
+    /// Begins a checkpoint, which is written in the background. A deterministic run waits until it
+    /// is written. If the previous checkpoint is still being written, because the disk is too slow
+    /// for the interval, this waits for it first.
     fn begin_checkpoint(&mut self, learner: &mut Learner) {
         self.finish_checkpoint(learner);
         self.files.checkpoint_begins(&learner.counters);

@@ -138,8 +138,8 @@ impl RolloutBuffer {
     }
 
     /// Links a segment to its predecessor. A gap in an episode, from a lost segment or a restarted
-    /// worker, is never bridged: the chain ends there with the value of its last observation, like an
-    /// unfinished episode.
+    /// worker, is never bridged: the chain ends there with the value of its last observation, like
+    /// an unfinished episode.
     fn link(&mut self, header: &SegmentHeader, entry: usize) {
         let env = header.worker_id as usize * self.envs_per_worker + header.env_index as usize;
         if let Some(tail) = self.tails[env]
@@ -221,12 +221,12 @@ mod tests {
         buffer.insert(&header, &[0.0, 0.0, last, 0.0, 0.0, rewards[0], rewards[1]]);
     }
 
-    /// Returns the advantages of three segments with lambda = 0.5, and V = 1 except 8 after the third
-    /// segment. With discount 0.5 a segment's reward is r_0 + r_1 / 2 and its bootstrap 1/4.
+    /// Returns the advantages of three segments with lambda = 0.5, and V = 1 except 8 after the
+    /// third segment. With discount 0.5 a segment's reward is r_0 + r_1 / 2 and its bootstrap 1/4.
     ///
-    /// The rewards (1, 2), (0, 4), (2, 2) give the deltas 2 + 1/4 - 1 = 1.25, 2 + 1/4 - 1 = 1.25 and,
-    /// for the third, 3 + 8/4 - 1 = 4 or, if it terminated, 3 - 1 = 2. The third advantage is its
-    /// delta, the second 1.25 + 1/8 of the third, the first 1.25 + 1/8 of the second.
+    /// The rewards (1, 2), (0, 4), (2, 2) give the deltas 2 + 1/4 - 1 = 1.25, 2 + 1/4 - 1 = 1.25
+    /// and, for the third, 3 + 8/4 - 1 = 4 or, if it terminated, 3 - 1 = 2. The third advantage is
+    /// its delta, the second 1.25 + 1/8 of the third, the first 1.25 + 1/8 of the second.
     fn advantages_of_three(flags: u32) -> [f32; 3] {
         let mut buffer = buffer(3);
         for (number, rewards) in [[1.0, 2.0], [0.0, 4.0], [2.0, 2.0]].into_iter().enumerate() {

@@ -1,11 +1,11 @@
 //! Stages 5 to 7 of 8 as a process: serves the run's workers from the first policy to the last
 //! checkpoint.
 //!
-//! [`Server::run`] is the learner's loop. It takes turns of a [`Session`], acknowledges segments and
-//! writes records with a [`Recorder`], until the run is complete or a stop is requested. The program
-//! around it parses the arguments and makes the learner ([`crate::start`]) and its ends of the
-//! transport. The one-process run has its own schedule, but shares [`request_missed_evaluation`] and
-//! [`close`].
+//! [`Server::run`] is the learner's loop. It takes turns of a [`Session`], acknowledges segments
+//! and writes records with a [`Recorder`], until the run is complete or a stop is requested. The
+//! program around it parses the arguments and makes the learner ([`crate::start`]) and its ends of
+//! the transport. The one-process run has its own schedule, but shares
+//! [`request_missed_evaluation`] and [`close`].
 
 use std::time::{Duration, Instant};
 
@@ -68,7 +68,8 @@ where
     P: ParameterPublisher,
     A: AcknowledgementPublisher,
 {
-    /// Serves the workers until the run is complete or a stop is requested, then writes a checkpoint.
+    /// Serves the workers until the run is complete or a stop is requested, then writes a
+    /// checkpoint.
     ///
     /// # Errors
     /// If the learner, the transport, a record or a report fails.
@@ -135,8 +136,8 @@ where
         }
     }
 
-    /// Copies the supervisor's totals. A checkpoint may have higher ones than the supervisor has sent
-    /// so far.
+    /// Copies the supervisor's totals. A checkpoint may have higher ones than the supervisor has
+    /// sent so far.
     fn take_totals(&mut self) {
         let (counters, totals) = (&mut self.session.learner.counters, self.supervisor.totals());
         counters.env_failures = counters.env_failures.max(totals.env_failures);

@@ -112,8 +112,8 @@ impl<R: SegmentReceiver, P: ParameterPublisher> Session<R, P> {
         self.publisher.maintain()
     }
 
-    /// Takes at most one segment or does at most one update. If the segment log is full, a checkpoint
-    /// is due; until it is written, no segment is taken and workers wait.
+    /// Takes at most one segment or does at most one update. If the segment log is full, a
+    /// checkpoint is due; until it is written, no segment is taken and workers wait.
     ///
     /// # Errors
     /// If the learner, the transport or `due` fails.

@@ -149,8 +149,8 @@ pub fn recover(
     if replayed != Replayed::default() {
         let Replayed { records, cut_bytes } = replayed;
         let message = format!(
-            "{records} segments read from the segment log, {cut_bytes} bytes of an incomplete one cut \
-             off"
+            "{records} segments read from the segment log, {cut_bytes} bytes of an incomplete \
+             record cut off"
         );
         eprintln!("{message}");
         supervisor.report(&Report::Warning { message })?;

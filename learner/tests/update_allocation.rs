@@ -158,7 +158,8 @@ fn no_update_allocates_once_its_buffers_are_made() {
             let what = Case { algorithm, policy, layer_norm };
             assert_eq!(allocations(what, "f32", "2"), 0, "{what:?}");
             if has_bf16 {
-                // On one thread, because each thread allocates its buffer for pairs at its first part.
+                // On one thread, because each thread allocates its buffer for pairs at its first
+                // part.
                 assert_eq!(allocations(what, "bf16", "1"), 0, "{what:?} bf16");
             }
         }

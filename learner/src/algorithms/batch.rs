@@ -163,10 +163,10 @@ impl Batch {
 
     /// Samples windows into the batch. `omega` is the DMP's.
     ///
-    /// With target `n_step`, rewards are discounted per step and bootstrap is
-    /// discount^n (1 - terminated) from s_{t+n}. With `literal`, rewards are summed without discount
-    /// and bootstrap is discount (1 - terminated) from s_{t+1}. A truncated episode bootstraps like
-    /// any other step.
+    /// With target `n_step`, rewards are discounted per step and bootstrap is discount^n (1 -
+    /// terminated) from s_{t+n}. With `literal`, rewards are summed without discount and bootstrap
+    /// is discount (1 - terminated) from s_{t+1}. A truncated episode bootstraps like any other
+    /// step.
     ///
     /// # Errors
     /// [`NoWindow`] if there is nothing to sample.

@@ -165,8 +165,8 @@ impl BatchShard {
         }
     }
 
-    /// Runs the forward and backward passes of each critic's loss mean (Q - target)², on the batch's
-    /// own actions.
+    /// Runs the forward and backward passes of each critic's loss mean (Q - target)², on the
+    /// batch's own actions.
     pub fn critic_backward(&mut self, critics: &[NetworkView<'_>], batch: &Batch) {
         let inputs = self.part(&batch.critic_inputs);
         let rows = self.rows_len();
@@ -189,9 +189,9 @@ impl BatchShard {
         }
     }
 
-    /// Sums the gradients of `weight(shard, row, critic) * Q_critic` with respect to actions and end
-    /// state over the critics. Call it after [`BatchShard::evaluate_critics`]. It skips the gradients
-    /// of the critics' parameters, which the actor does not need.
+    /// Sums the gradients of `weight(shard, row, critic) * Q_critic` with respect to actions and
+    /// end state over the critics. Call it after [`BatchShard::evaluate_critics`]. It skips the
+    /// gradients of the critics' parameters, which the actor does not need.
     pub fn actions_gradient(
         &mut self,
         critics: &[NetworkView<'_>],
@@ -214,8 +214,8 @@ impl BatchShard {
         }
     }
 
-    /// Runs the backward passes of the loss -mean Q of one critic, plus the penalty on action changes.
-    /// Call it after [`BatchShard::act`] and [`BatchShard::evaluate_critics`].
+    /// Runs the backward passes of the loss -mean Q of one critic, plus the penalty on action
+    /// changes. Call it after [`BatchShard::act`] and [`BatchShard::evaluate_critics`].
     pub fn deterministic_policy_gradient(
         &mut self,
         policy: &Policy,
@@ -232,8 +232,8 @@ impl BatchShard {
         self.actor_backward(policy, actor);
     }
 
-    /// Runs the passes of the loss mean (pi(s) - u)², where u are the `actions` to imitate, (B, K A).
-    /// Sets `sums.actor` to the sum of squares.
+    /// Runs the passes of the loss mean (pi(s) - u)², where u, (B, K A), are the `actions` to
+    /// imitate. Sets `sums.actor` to the sum of squares.
     pub fn imitation_backward(
         &mut self,
         policy: &Policy,
@@ -268,16 +268,16 @@ impl BatchShard {
         }
     }
 
-    /// Turns the gradient with respect to u, from [`BatchShard::actions_gradient`], into the gradient
-    /// with respect to the means before their tanh.
+    /// Turns the gradient with respect to u, from [`BatchShard::actions_gradient`], into the
+    /// gradient with respect to the means before their tanh.
     pub fn unsquash(&mut self) {
         for (gradient, action) in self.actions_gradient.iter_mut().zip(&self.policy.actions) {
             *gradient *= 1.0 - action * action;
         }
     }
 
-    /// Adds the penalty on changes of tanh(means) to the actor's loss and its gradient. Call it after
-    /// [`BatchShard::unsquash`]. Sets the actions to tanh(means).
+    /// Adds the penalty on changes of tanh(means) to the actor's loss and its gradient. Call it
+    /// after [`BatchShard::unsquash`]. Sets the actions to tanh(means).
     pub fn penalise(&mut self, policy: &Policy, rate: ActionRate<'_>) {
         let ActionRate { penalty, batch } = rate;
         if penalty == 0.0 {

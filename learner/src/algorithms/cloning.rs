@@ -5,8 +5,8 @@
 //!
 //! With policy `dmp` the gradient runs through inverse controller and movement primitive, so that
 //! goal, weights and controller of a segment are fitted together. The least squares of Kim et al.
-//! (eqs. 11-12, `dmprl_shared::dmp`) fit the weights of one known trajectory of positions. Here only
-//! the actions are known, and one network must fit all observations.
+//! (eqs. 11-12, `dmprl_shared::dmp`) fit the weights of one known trajectory of positions. Here
+//! only the actions are known, and one network must fit all observations.
 
 use candle_core::Result;
 use dmprl_shared::config::ExperimentConfig;

@@ -11,19 +11,20 @@
 //!    without batch normalisation or weight decay; PyTorch's initialisation in every layer.
 //! 3. Exploration noise is Gaussian (uncorrelated by default), not Ornstein-Uhlenbeck.
 //! 4. A time limit is not a termination: truncated episodes bootstrap.
-//! 5. Learning rates, polyak, batch size and warm-up come from the configuration. The preset `paper`
-//!    has those of Table 2 of the DDPG-DMP paper.
+//! 5. Learning rates, polyak, batch size and warm-up come from the configuration. The preset
+//!    `paper` has those of Table 2 of the DDPG-DMP paper.
 //!
-//! Differences between DDPG-DMP with the preset `default` and the paper (the preset `paper` has none
-//! of 6 to 11):
+//! Differences between DDPG-DMP with the preset `default` and the paper (the preset `paper` has
+//! none of 6 to 11):
 //! 6. The critic sees the whole segment; windows slide; the target is the n-step return.
 //! 7. The DMP starts at zero, has alpha_y 10 and a semi-implicit integrator.
 //! 8. Observations are normalised; both learning rates are 1e-3.
-//! 9. Two updates per segment; 3 000 warm-up steps within 0.3 of the range; 8 environments per worker.
+//! 9. Two updates per segment; 3 000 warm-up steps within 0.3 of the range; 8 environments per
+//!    worker.
 //! 10. Tasks have their own defaults (`shared/src/config/tasks.rs`).
 //! 11. The actor's loss has a penalty on action changes (`action_rate_penalty`).
-//! 12. rho stays within `rho_range` of (1, 0, 0, 0), because the paper does not specify it. This also
-//!     holds for `paper`.
+//! 12. rho stays within `rho_range` of (1, 0, 0, 0), because the paper does not specify it. This
+//!     also holds for `paper`.
 
 use candle_core::Result;
 use dmprl_shared::config::ExperimentConfig;

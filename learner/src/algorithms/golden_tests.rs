@@ -1,7 +1,7 @@
 //! Compares complete updates with an independent implementation in PyTorch.
 //!
-//! The numbers in tests/golden/update/*.safetensors come from make_golden.py in the same folder. Its
-//! README lists the versions and the tensors.
+//! The numbers in tests/golden/update/*.safetensors come from make_golden.py in the same folder.
+//! Its README lists the versions and the tensors.
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};

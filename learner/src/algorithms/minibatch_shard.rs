@@ -165,8 +165,8 @@ impl MinibatchShard {
         }
     }
 
-    /// Computes V of `observations`, (rows, O), into `out`, (rows,). Overwrites the gathered network
-    /// inputs.
+    /// Computes V of `observations`, (rows, O), into `out`, (rows,). Overwrites the gathered
+    /// network inputs.
     pub fn evaluate_values(
         &mut self,
         value: &NetworkView<'_>,

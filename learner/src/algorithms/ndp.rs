@@ -12,9 +12,9 @@
 //! are not learned from. Neither side waits for the other.
 //!
 //! Differences from Schulman et al.:
-//! 1. Advantages and values belong to decisions of K steps: a segment's reward is the discounted sum
-//!    of its steps' rewards, the value after it is discounted by discount^steps, and `gae_lambda`
-//!    applies per segment.
+//! 1. Advantages and values belong to decisions of K steps: a segment's reward is the discounted
+//!    sum of its steps' rewards, the value after it is discounted by discount^steps, and
+//!    `gae_lambda` applies per segment.
 //! 2. Actor and value are two networks with separate optimisers and gradient norms, so that neither
 //!    loss needs a weight. Values are not clipped (as in the paper).
 //! 3. A rollout has a number of segments from all environments together, not from each. Episodes
@@ -29,16 +29,16 @@
 //!    observations only with `policy.normalise_observations`. Rewards are not scaled.
 //! 8. g = goal_range tanh(.), w = weight_range omega² tanh(.); theirs are 100 times a linear
 //!    output.
-//! 9. ReLU layers (`policy.hidden`, `algorithm.critic_hidden`) with PyTorch's initialisation instead
-//!    of tanh layers of 100 and 300 units with orthogonal initialisation of the last. Adam's epsilon
-//!    is 1e-8 instead of 1e-5.
+//! 9. ReLU layers (`policy.hidden`, `algorithm.critic_hidden`) with PyTorch's initialisation
+//!    instead of tanh layers of 100 and 300 units with orthogonal initialisation of the last.
+//!    Adam's epsilon is 1e-8 instead of 1e-5.
 //! 10. Minibatches consist of whole segments, not of single steps.
 //! 11. Values are not clipped. The reward is computed at every step; their environments compute it
 //!     only at every fifth step (`reward_delay`).
 //! 12. If no velocity is observed, yd0 is 0 instead of 0.05. alpha_y and N are the same for all
 //!     tasks; theirs are 5 to 15, depending on the task.
-//! 13. Actions are `position_scale` times the differences of y, clipped to the environment's bounds.
-//!     Theirs are scaled by each environment (0.05) and become joint positions.
+//! 13. Actions are `position_scale` times the differences of y, clipped to the environment's
+//!     bounds. Theirs are scaled by each environment (0.05) and become joint positions.
 
 use candle_core::Result;
 use dmprl_shared::config::{ExperimentConfig, LearningRateDecay, NdpConfig, Precision};
@@ -239,8 +239,8 @@ impl Ndp {
         self.minibatch
     }
 
-    /// Learns from one minibatch. After the last one of the last epoch, the rollout is discarded and
-    /// the policy must be published. `random` shuffles the segments.
+    /// Learns from one minibatch. After the last one of the last epoch, the rollout is discarded
+    /// and the policy must be published. `random` shuffles the segments.
     pub fn update(&mut self, context: UpdateContext<'_>, random: &mut Stream) -> NdpLosses {
         if (self.epoch, self.first) == (0, 0) {
             self.evaluate_rollout(context);
@@ -266,8 +266,8 @@ impl Ndp {
         losses
     }
 
-    /// Computes values and log densities of the whole rollout. The parameters are still the published
-    /// ones.
+    /// Computes values and log densities of the whole rollout. The parameters are still the
+    /// published ones.
     fn evaluate_rollout(&mut self, context: UpdateContext<'_>) {
         let UpdateContext { policy, normaliser, .. } = context;
         self.log_std_values.copy_from_slice(self.log_std.parameters.values());

@@ -3,13 +3,13 @@
 //! entropy near its target.
 //!
 //! With policy `dmp` the Gaussian's mean is the inverse controller's value before its tanh at each
-//! of the K steps. Its log-std comes from K A more outputs of the network. The entropy is that of the
-//! whole segment.
+//! of the K steps. Its log-std comes from K A more outputs of the network. The entropy is that of
+//! the whole segment.
 //!
 //! Differences from Haarnoja et al. (2018b):
 //! 1. An action may be a segment of K actions with one entropy term. The target is the K-step
-//!    return (`target = "n_step"`), without entropy for the steps in between. K = 1 is the published
-//!    algorithm.
+//!    return (`target = "n_step"`), without entropy for the steps in between. K = 1 is the
+//!    published algorithm.
 //! 2. The target entropy of segments is -K A / 2. The published -1 per number is too low for
 //!    actions that come from one movement.
 //! 3. The temperature's loss is linear in its logarithm, as in their code.

@@ -1,6 +1,6 @@
 //! Twin delayed deep deterministic policy gradient (Fujimoto et al. 2018, Algorithm 1) over
-//! segments: two critics, of whose targets the smaller is used, noise on the target policy's actions,
-//! and an actor that is updated every second time.
+//! segments: two critics, of whose targets the smaller is used, noise on the target policy's
+//! actions, and an actor that is updated every second time.
 //!
 //! Differences from Fujimoto et al.:
 //! 1. With policy `dmp` an action is a segment of K actions, which the critics evaluate as a whole.
@@ -55,8 +55,8 @@ impl Td3 {
         })
     }
 
-    /// Update number `update`, counted from 1, of the critics; every `actor_interval`-th also of
-    /// actor and targets.
+    /// Does update number `update`, counted from 1. It updates the critics, and every
+    /// `actor_interval`-th time also actor and targets.
     ///
     /// # Errors
     /// If a network has no target.

@@ -62,15 +62,15 @@ impl Writer {
         Ok(())
     }
 
-    /// Returns the outcome of the checkpoint that was being written, if it is finished. Then removes
-    /// its segments from the segment log.
+    /// Returns the outcome of the checkpoint that was being written, if it is finished. Then
+    /// removes its segments from the segment log.
     pub fn poll(&mut self, learner: &mut Learner) -> Option<WriteOutcome> {
         let finished = self.in_progress.as_ref().is_some_and(|it| it.thread.is_finished());
         if finished { self.wait(learner) } else { None }
     }
 
-    /// Waits for the checkpoint that is being written, if any, and returns its outcome. Then removes
-    /// its segments from the segment log.
+    /// Waits for the checkpoint that is being written, if any, and returns its outcome. Then
+    /// removes its segments from the segment log.
     pub fn wait(&mut self, learner: &mut Learner) -> Option<WriteOutcome> {
         let InProgress { env_steps, logged, thread } = self.in_progress.take()?;
         let written = thread.join().unwrap_or_else(|panic| std::panic::resume_unwind(panic));

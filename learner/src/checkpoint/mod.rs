@@ -5,9 +5,9 @@
 //!   checkpoints/000012/   networks.safetensors · replay.bin · state.json
 //!   checkpoints/latest -> 000012
 //! ```
-//! A checkpoint is written under a temporary name, synced and renamed, so an incomplete one never has
-//! a number. `state.json` is written last and has length and CRC-32 of the other files. A damaged
-//! checkpoint is rejected with the reason, and the previous one is used.
+//! A checkpoint is written under a temporary name, synced and renamed, so an incomplete one never
+//! has a number. `state.json` is written last and has length and CRC-32 of the other files. A
+//! damaged checkpoint is rejected with the reason, and the previous one is used.
 
 mod background;
 mod networks_file;
@@ -144,16 +144,17 @@ fn io_error(path: &Path) -> impl FnOnce(std::io::Error) -> CheckpointError + '_ 
     |cause| CheckpointError::Io { path: path.to_owned(), cause }
 }
 
-/// The contents of a checkpoint from one moment. Later training does not change them. They share the
-/// replay's blocks with the learner, so capturing takes milliseconds and little more memory than the
-/// networks.
+/// The contents of a checkpoint from one moment. Later training does not change them. They share
+/// the replay's blocks with the learner, so capturing takes milliseconds and little more memory
+/// than the networks.
 #[derive(Debug)]
 pub struct CheckpointContents {
     networks: Vec<u8>,
     replay: Replay,
     state: State,
     config: CheckpointConfig,
-    /// Length of the segment log at that moment \[bytes\]. That part is removed once this is written.
+    /// Length of the segment log at that moment \[bytes\]. That part is removed once this is
+    /// written.
     logged: u64,
 }
 
@@ -228,8 +229,8 @@ impl CheckpointContents {
     }
 }
 
-/// Returns the counters of each readable checkpoint in a folder, oldest first. A resume may go back to
-/// any of them.
+/// Returns the counters of each readable checkpoint in a folder, oldest first. A resume may go back
+/// to any of them.
 ///
 /// # Errors
 /// If the folder cannot be read.

@@ -58,8 +58,8 @@ pub(super) fn point_latest(folder: &Path, name: &str) -> Result<(), CheckpointEr
         .map_err(io_error(&link))
 }
 
-/// Deletes the oldest checkpoints until at most `keep` remain with at most `bytes_max` in total. The
-/// newest always stays.
+/// Deletes the oldest checkpoints until at most `keep` remain with at most `bytes_max` in total.
+/// The newest always stays.
 pub(super) fn rotate(folder: &Path, keep: usize, bytes_max: u64) -> Result<(), CheckpointError> {
     let names = names(folder)?;
     let sizes: Vec<u64> =

@@ -210,7 +210,7 @@ fn a_number_that_was_changed_in_the_state_is_noticed() {
 }
 
 #[test]
-fn segments_that_a_checkpoint_holds_are_refused_and_those_that_nobody_has_are_counted() {
+fn segments_of_a_checkpoint_are_rejected_and_missing_ones_are_counted() {
     let folder = tempfile::tempdir().unwrap();
     let mut learner = fresh().unwrap();
     train(&mut learner, 0..60);

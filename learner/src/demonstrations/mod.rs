@@ -1,7 +1,7 @@
 //! Demonstrations: recorded steps, read from files before a run begins.
 //!
-//! They are inserted into the replay as segments that are never replaced, and the actor imitates them
-//! before the first update (`algorithms::cloning`). docs/demonstrations.md describes the file.
+//! They are inserted into the replay as segments that are never replaced, and the actor imitates
+//! them before the first update (`algorithms::cloning`). docs/demonstrations.md describes the file.
 
 mod file;
 
@@ -123,8 +123,8 @@ impl Demonstration {
         (0..self.len()).filter(|&row| self.is_end(row))
     }
 
-    /// Cuts each episode into segments from its first step on, and inserts them into a replay that has
-    /// only demonstrations.
+    /// Cuts each episode into segments from its first step on, and inserts them into a replay that
+    /// has only demonstrations.
     ///
     /// # Errors
     /// [`DemonstrationError::TooMany`] if they would fill more than half of the replay.

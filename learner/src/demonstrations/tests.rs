@@ -10,8 +10,8 @@ use crate::learner::Learner;
 use crate::off_policy::CloningLosses;
 use crate::replay::Replay;
 
-/// Returns two episodes of seven and three steps. The recording ends before the second episode does.
-/// Step t has observation (t, 0, 0, episode), action (t / 5 - 1, 0) and reward -t.
+/// Returns two episodes of seven and three steps. The recording ends before the second episode
+/// does. Step t has observation (t, 0, 0, episode), action (t / 5 - 1, 0) and reward -t.
 pub(crate) fn steps() -> Demonstration {
     let mut steps = Demonstration::default();
     for (episode, len) in [(0.0, 7), (1.0, 3)] {

@@ -1,8 +1,8 @@
 //! The update as a graph of candle tensors with automatic differentiation. It runs on a GPU.
 //!
-//! On the CPU, the kernels of `update` do the same several times faster. Tests in `algorithms` compare
-//! the losses, gradients and parameters of both. Unlike the kernels, candle's operations allocate
-//! their outputs.
+//! On the CPU, the kernels of `update` do the same several times faster. Tests in `algorithms`
+//! compare the losses, gradients and parameters of both. Unlike the kernels, candle's operations
+//! allocate their outputs.
 
 mod policy;
 

@@ -96,8 +96,8 @@ impl Learner {
         }
     }
 
-    /// Inserts the logged segments that this learner's checkpoint does not contain, and writes to the
-    /// log from now on.
+    /// Inserts the logged segments that this learner's checkpoint does not contain, and writes to
+    /// the log from now on.
     ///
     /// # Errors
     /// If the log cannot be read.

@@ -9,8 +9,8 @@
 //! ```
 //! `kept` is the number of demonstrated segments. "DMPRLRP1", of older versions, has no such field.
 //!
-//! Nothing in the file is trusted: counts are compared with the configuration before anything else is
-//! read, and every slot number must be below `filled`.
+//! Nothing in the file is trusted: counts are compared with the configuration before anything else
+//! is read, and every slot number must be below `filled`.
 
 use std::io::{self, Read, Write};
 
@@ -100,8 +100,8 @@ impl Replay {
     /// Reads a file into this replay, which must be new.
     ///
     /// # Errors
-    /// If the file is not a replay file, is truncated or does not match the configuration. The replay
-    /// is then unusable.
+    /// If the file is not a replay file, is truncated or does not match the configuration. The
+    /// replay is then unusable.
     pub fn read(&mut self, input: &mut impl Read) -> Result<(), ReplayFileError> {
         let mut magic = [0; 8];
         input.read_exact(&mut magic)?;
@@ -141,8 +141,8 @@ impl Replay {
                 self.slots[next as usize].previous = index as u32;
             }
         }
-        // The number of workers may have changed. Tails of workers that no longer exist are ignored,
-        // because their episodes do not continue.
+        // The number of workers may have changed. Tails of workers that no longer exist are
+        // ignored, because their episodes do not continue.
         for index in 0..tail_count as usize {
             let tail = self.read_tail(input, index)?;
             if let Some(own) = self.tails.get_mut(index) {

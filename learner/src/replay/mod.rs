@@ -1,9 +1,9 @@
 //! Stage 5 of 8: stores the experience of off-policy algorithms and samples windows from it.
 //!
-//! The replay is a ring of slots with one segment each. A slot refers to the slot that continues its
-//! episode, so a window of K steps can begin at any step and end in the next slot
-//! (`windows = "sliding"`), although the segments of many environments arrive interleaved. When the
-//! ring is full, the oldest slot is replaced.
+//! The replay is a ring of slots with one segment each. A slot refers to the slot that continues
+//! its episode, so a window of K steps can begin at any step and end in the next slot (`windows =
+//! "sliding"`), although the segments of many environments arrive interleaved. When the ring is
+//! full, the oldest slot is replaced.
 
 mod block_store;
 mod file;
@@ -23,8 +23,8 @@ const NONE: u32 = u32::MAX;
 struct Slot {
     /// The slot that continues this one's episode, or [`NONE`].
     next: u32,
-    /// The slot that this one continued when it was inserted, or [`NONE`]. If that slot's segment has
-    /// been replaced since, its `next` differs.
+    /// The slot that this one continued when it was inserted, or [`NONE`]. If that slot's segment
+    /// has been replaced since, its `next` differs.
     previous: u32,
     /// Steps that were run, 1 to K; 0 in a slot that was never filled.
     steps_len: u8,

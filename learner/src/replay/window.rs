@@ -8,8 +8,8 @@ use super::{NONE, Replay};
 
 /// K steps from step `offset` of `slot` on, which continue in the next slot if `offset` > 0.
 ///
-/// A window has fewer than K steps only if the episode terminated. Steps that a time limit cut short
-/// are no window, because a missing action is not a zero action.
+/// A window has fewer than K steps only if the episode terminated. Steps that a time limit cut
+/// short are no window, because a missing action is not a zero action.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Window {
     slot: u32,
@@ -110,8 +110,8 @@ impl Replay {
         out[first.len() + second.len()..].fill(0.0);
     }
 
-    /// Returns the action before the window's first, (A,), or `None` if the episode began there or the
-    /// replay no longer has the segment.
+    /// Returns the action before the window's first, (A,), or `None` if the episode began there or
+    /// the replay no longer has the segment.
     #[must_use]
     pub fn previous_action(&self, window: &Window) -> Option<&[f32]> {
         let dims = self.layout.action_len;
@@ -185,9 +185,9 @@ impl Sampler {
 
     /// Draws one window, or returns `None` after `TRIES_MAX` draws without one.
     ///
-    /// Steps that start no window are drawn again, so every window of an episode is equally likely. A
-    /// hindsight copy is one window, which is drawn as often as the K windows of a segment. The share
-    /// of copies among the samples therefore does not depend on `windows`.
+    /// Steps that start no window are drawn again, so every window of an episode is equally likely.
+    /// A hindsight copy is one window, which is drawn as often as the K windows of a segment. The
+    /// share of copies among the samples therefore does not depend on `windows`.
     pub fn draw(&mut self, replay: &Replay) -> Option<Window> {
         self.draw_from(replay, replay.len())
     }

@@ -82,8 +82,8 @@ impl PackedWeights {
         self.arithmetic.instructions
     }
 
-    /// Computes outputs = activation(inputs weightsᵀ + bias) of layer `index`. The bias is read from
-    /// the flat `parameters`.
+    /// Computes outputs = activation(inputs weightsᵀ + bias) of layer `index`. The bias is read
+    /// from the flat `parameters`.
     pub fn forward(
         &self,
         index: usize,

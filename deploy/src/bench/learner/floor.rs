@@ -1,8 +1,8 @@
 //! The floor of an update: computes its matrix products (`products`) and nothing else.
 //!
-//! [`Floor`] has the operands of the products. Products of the same shape share their operands, as a
-//! network's passes share its weights. It uses the library's product or the learner's kernels; the
-//! faster of the two is the floor.
+//! [`Floor`] has the operands of the products. Products of the same shape share their operands, as
+//! a network's passes share its weights. It uses the library's product or the learner's kernels;
+//! the faster of the two is the floor.
 
 use dmprl_learner::update::SHARD_ROWS;
 use dmprl_learner::update::kernels::{

@@ -2,10 +2,10 @@
 //!
 //! `ours` is the learner of a run on a replay full of synthetic segments (`synthetic`), so it needs
 //! neither Python nor an environment. The floor consists of the update's matrix products only
-//! (`products`, `floor`). Other parts of the update are measured alone (`work`, `optimiser`). The peers do the same update in their own processes (`peers`). In every round each
-//! candidate runs once for the same time while the others sleep, because a machine's speed drifts.
-//! The report has medians over the rounds, and medians of the rounds' own ratios (`figures`,
-//! `table`).
+//! (`products`, `floor`). Other parts of the update are measured alone (`work`, `optimiser`). The
+//! peers do the same update in their own processes (`peers`). In every round each candidate runs
+//! once for the same time while the others sleep, because a machine's speed drifts. The report has
+//! medians over the rounds, and medians of the rounds' own ratios (`figures`, `table`).
 
 mod figures;
 mod floor;

@@ -128,8 +128,8 @@ impl Networks<'_> {
         passes.chain([Product::input_gradient(shape, rows, first)]).collect()
     }
 
-    /// Returns the products of a step of the critics: the actor on the next observations, each target
-    /// critic, then each critic's passes.
+    /// Returns the products of a step of the critics: the actor on the next observations, each
+    /// target critic, then each critic's passes.
     fn critics_step(&self, critics: usize) -> Vec<Product> {
         let each = [self.forward(self.critic), self.learn(self.critic)].concat();
         [self.forward(self.actor), each.repeat(critics)].concat()
@@ -168,8 +168,9 @@ mod tests {
 
     #[test]
     fn an_updates_products_are_those_counted_by_hand() {
-        // Actor 4-10-2 (SAC 4-10-4), critic 6-100-1. The passes are forward, back to the hidden layer,
-        // gradient of the weights, and back to the actions, which are 2 of the critic's 6 inputs.
+        // Actor 4-10-2 (SAC 4-10-4), critic 6-100-1. The passes are forward, back to the hidden
+        // layer, gradient of the weights, and back to the actions, which are 2 of the critic's 6
+        // inputs.
         let (forward, back) = (600 + 100, 100);
         let learn = forward + back + (600 + 100);
         let actions_gradient = forward + back + 200;

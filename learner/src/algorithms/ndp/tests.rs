@@ -170,8 +170,8 @@ impl Case {
         normal.broadcast_sub(log_std)?.sum(2)
     }
 
-    /// Computes the gradients of the policy's loss at `now` with respect to network and log std. The
-    /// rollout was made with the parameters `before`.
+    /// Computes the gradients of the policy's loss at `now` with respect to network and log std.
+    /// The rollout was made with the parameters `before`.
     fn policy_gradients(&self, before: &[f32], now: &[f32]) -> Result<[Vec<f32>; 2]> {
         let len = self.policy.shape().parameters_len();
         let part = |values: &[f32]| Tensor::from_slice(values, values.len(), &Device::Cpu);
@@ -268,7 +268,8 @@ fn only_segments_of_the_policy_as_it_is_are_learned_from() {
     case.update();
     assert!(case.ndp.update_due(), "one of two minibatches is left");
     case.update();
-    // The policy has changed: segments are stale until the new one has been published and has acted.
+    // The policy has changed: segments are stale until the new one has been published and has
+    // acted.
     assert!(!case.ndp.update_due() && !case.ndp.try_insert(&segment));
     case.ndp.policy_published(3);
     assert!(!case.ndp.try_insert(&segment));

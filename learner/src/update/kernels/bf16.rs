@@ -1,5 +1,5 @@
-//! The three products with 16-bit operands (bfloat16, the upper half of an f32) and 32-bit sums, for
-//! processors with AVX512-BF16.
+//! The three products with 16-bit operands (bfloat16, the upper half of an f32) and 32-bit sums,
+//! for processors with AVX512-BF16.
 //!
 //! `VDPBF16PS` multiplies pairs of neighbours in depth and adds both products to a sum, which is
 //! twice the operations of an f32 instruction. It reads [`Bf16Pair`]s. Parameters, gradients and
@@ -195,8 +195,8 @@ impl Bf16 {
         });
     }
 
-    /// Computes the gradient of the weights of `outputs`, (outputs.len(), inputs), from pairs of rows
-    /// of the whole batch: `gradient`, (pairs, outputs_len), and `inputs`, (pairs, inputs).
+    /// Computes the gradient of the weights of `outputs`, (outputs.len(), inputs), from pairs of
+    /// rows of the whole batch: `gradient`, (pairs, outputs_len), and `inputs`, (pairs, inputs).
     ///
     /// # Panics
     /// If the lengths are inconsistent.

@@ -12,8 +12,8 @@ pub fn packed_len(inputs: usize, outputs: usize) -> usize {
 }
 
 /// Packs `weights`, (outputs, inputs), into panels of [`PANEL`] outputs, input by input. The last
-/// panel is padded with zeros. A layer of `outputs_len` outputs can be packed in parts that begin at
-/// multiples of [`PANEL`]; the part from output o on begins at o * inputs.
+/// panel is padded with zeros. A layer of `outputs_len` outputs can be packed in parts that begin
+/// at multiples of [`PANEL`]; the part from output o on begins at o * inputs.
 ///
 /// # Panics
 /// If the lengths are inconsistent.

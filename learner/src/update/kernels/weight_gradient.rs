@@ -7,8 +7,8 @@ use pulp::{Simd, WithSimd};
 use super::tile::{Broadcast, Tiled, Wide, accumulate, for_rows, load, store};
 use super::{InstructionSet, PANEL};
 
-/// Shards that a tile sums before it stores the result. They are collected first, because calling an
-/// iterator in the middle of a tile would spill the tile's registers.
+/// Shards that a tile sums before it stores the result. They are collected first, because calling
+/// an iterator in the middle of a tile would spill the tile's registers.
 const SHARDS_AT_ONCE: usize = 32;
 
 /// Operands from one shard.

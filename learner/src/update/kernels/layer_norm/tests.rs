@@ -1,4 +1,5 @@
-//! Compares the kernels with their definition in f64, and the backward pass with central differences.
+//! Compares the kernels with their definition in f64, and the backward pass with central
+//! differences.
 
 use super::super::tests::numbers;
 use super::*;
