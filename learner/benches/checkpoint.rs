@@ -1,9 +1,9 @@
-//! How long a checkpoint keeps training waiting, and how long it takes to be written.
+//! Measures how long a checkpoint delays training, and how long it takes to write.
 //!
 //!     cargo bench -p dmprl-learner --bench checkpoint [-- --gigabytes 1 --folder DIR]
 //!
-//! A replay of Pusher's segments, full; while the checkpoint is written segments go on coming, and
-//! the longest that one of them waits is told: it copies the piece of the replay that it meets.
+//! The replay is full of segments with Pusher's sizes. Segments are inserted while the checkpoint
+//! is written. The longest insertion is one that copies a chunk of the replay.
 
 use std::path::PathBuf;
 use std::time::{Duration, Instant};
@@ -79,15 +79,15 @@ fn main() {
         writer.begin(&mut learner).expect("a checkpoint");
         let stall = begun.elapsed();
         let mut longest = Duration::ZERO;
-        let ended = loop {
+        let outcome = loop {
             longest = longest.max(insert(&mut learner));
-            if let Some(ended) = writer.poll(&mut learner) {
-                break ended;
+            if let Some(outcome) = writer.poll(&mut learner) {
+                break outcome;
             }
-            // As many as a fast run inserts: far more would copy all of the replay.
+            // About the rate of a fast run. A much higher rate would copy the whole replay.
             std::thread::sleep(Duration::from_micros(200));
         };
-        ended.written.expect("a checkpoint");
+        outcome.result.expect("a checkpoint");
         println!(
             "training waits {:.1} ms; written after {:.0} ms; longest insertion meanwhile {:.2} ms",
             ms(stall),

@@ -1,4 +1,4 @@
-//! Every scalar that a run writes to `metrics.jsonl`, with how it is computed.
+//! The scalars that a run writes to `metrics.jsonl`, and how they are computed.
 
 use dmprl_shared::segment::{
     Rejection, SUCCESS, SUCCESS_REPORTED, Segment, SegmentLayout, TERMINATED, TRUNCATED,
@@ -8,8 +8,8 @@ use serde::{Deserialize, Serialize};
 use crate::algorithms::Losses;
 use crate::algorithms::ndp::NdpLosses;
 
-/// One line of `metrics.jsonl`. "Since the last line" is meant where nothing else is said; a mean
-/// over nothing is null.
+/// One line of `metrics.jsonl`. Unless stated otherwise, a value covers the time since the previous
+/// line. A mean over nothing is null.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct MetricsLine {
@@ -19,41 +19,41 @@ pub struct MetricsLine {
     pub updates: u64,
     /// Segments inserted, over the whole run.
     pub segments: u64,
-    /// Copies of segments with other goals inserted, over the whole run.
+    /// Hindsight copies inserted, over the whole run.
     #[serde(default)]
     pub hindsight_segments: u64,
     /// Version of the newest published policy.
     pub policy_version: u64,
-    /// Segments held by the replay.
+    /// Segments in the replay, or in the rollout of an on-policy algorithm.
     pub replay_segments: u64,
-    /// updates * batch_size / env_steps, over the whole run.
+    /// updates * batch_size / env_steps, over the whole run; on-policy, the segments of a minibatch
+    /// instead of batch_size.
     pub samples_per_insert: f64,
-    /// Segments refused, over the whole run, by reason.
+    /// Segments rejected, over the whole run, by reason.
     pub rejected: Rejected,
-    /// Segments missing in the sequences of the workers that the learner has heard from, over the
-    /// whole run.
+    /// Segments missing in the workers' sequences, over the whole run.
     pub lost: u64,
-    /// On the way from workers to learner, over the whole run.
+    /// Segments on the way from workers to learner, over the whole run.
     #[serde(default)]
     pub delivery: DeliveryLine,
-    /// Workers that are attached, those that have joined included.
+    /// Attached workers, including those that joined.
     #[serde(default)]
     pub workers: u64,
-    /// Segments that they keep until the learner acknowledges them, as they told last.
+    /// Segments that the workers keep until the learner acknowledges them, by their last reports.
     #[serde(default)]
     pub queued_segments: u64,
-    /// Starts of workers after a death, over the whole run.
+    /// Restarts of workers after a crash, over the whole run.
     #[serde(default)]
     pub worker_restarts: u64,
-    /// Starts of the learner after a death within a session, over the whole run.
+    /// Restarts of the learner after a crash, over the whole run.
     #[serde(default)]
     pub learner_restarts: u64,
-    /// NDP: segments of another policy than the one that was to be learned from, over the whole
-    /// run: environment steps that taught nothing.
+    /// NDP: segments that were not learned from because an older policy had made them, over the
+    /// whole run.
     #[serde(default)]
     pub stale_segments: u64,
-    /// Failures of environments, over the whole run: each cost a segment, or an episode of an
-    /// evaluation, and the environment was made again.
+    /// Failures of environments, over the whole run. Each costs a segment, or an episode of an
+    /// evaluation, and the environment is made again.
     #[serde(default)]
     pub env_failures: u64,
     /// mean (Q - target)^2.
@@ -65,7 +65,7 @@ pub struct MetricsLine {
     /// SAC: mean weight of the entropy.
     #[serde(default)]
     pub temperature: Option<f64>,
-    /// SAC: mean -log pi of the actor's draws; NDP: the policy's in one step \[nat\].
+    /// SAC: mean -log pi of the sampled actions. NDP: entropy of the policy in one step \[nat\].
     #[serde(default)]
     pub entropy: Option<f64>,
     /// NDP: mean -min(ratio advantage, clipped ratio advantage).
@@ -74,25 +74,26 @@ pub struct MetricsLine {
     /// NDP: mean (V - return)^2.
     #[serde(default)]
     pub value_loss: Option<f64>,
-    /// NDP: mean (ratio - 1) - log ratio, a divergence from the policy that acted.
+    /// NDP: mean (ratio - 1) - log ratio, which estimates the divergence from the policy that
+    /// acted.
     #[serde(default)]
     pub approx_kl: Option<f64>,
-    /// NDP: share of steps whose ratio lies beyond the clip.
+    /// NDP: share of steps whose ratio is outside the clipping interval.
     #[serde(default)]
     pub clip_fraction: Option<f64>,
-    /// Training episodes (with exploration) that ended.
+    /// Finished training episodes (with exploration).
     pub episodes: u64,
     /// Mean of their returns.
     pub training_return_mean: Option<f64>,
-    /// Share of them that ended in success; null if the task does not report it.
+    /// Share of them that ended in success; null if the task does not report success.
     pub training_success_rate: Option<f64>,
-    /// Median over segments: newest policy version minus the one that acted.
+    /// Median policy lag of the segments: newest policy version minus the version that acted.
     pub policy_lag_p50: Option<u64>,
-    /// Largest of them.
+    /// Largest policy lag.
     pub policy_lag_max: Option<u64>,
-    /// Updates owed by the pacing.
+    /// Updates that the learner owes.
     pub updates_owed: f64,
-    /// Seconds of training, over all sessions of the run.
+    /// Training time, over all sessions of the run \[s\].
     pub wall_s: f64,
     /// Environment steps per second.
     pub env_steps_per_s: f64,
@@ -100,57 +101,57 @@ pub struct MetricsLine {
     pub updates_per_s: f64,
 }
 
-/// Segments on the way from workers to learner. The first four are counted by the workers, which
-/// report them once a second: what one had not reported when it was killed is missing.
+/// Segments on the way from workers to learner. Workers count the first four and report them once a
+/// second, so the last counts of a killed worker are missing.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct DeliveryLine {
     /// Finished by a worker.
     pub produced: u64,
-    /// Taken by a queue, those that were sent again included.
+    /// Accepted by a queue, including retransmitted ones.
     pub sent: u64,
-    /// Of these, sent again.
+    /// Retransmitted.
     pub resent: u64,
-    /// Acknowledged by the learner, and heard by the worker.
+    /// Acknowledged by the learner, as received by the worker.
     pub acked: u64,
-    /// Taken from a queue by the learner: inserted or refused.
+    /// Taken from a queue by the learner: inserted or rejected.
     pub received: u64,
-    /// Bytes behind the last whole record of the segment log, cut off when a learner started.
+    /// Bytes of incomplete records that a starting learner cut off the end of the segment log.
     pub log_bytes_cut: u64,
 }
 
-/// Keys of a [`MetricsLine`] that depend on the clock: two deterministic runs differ in these only.
+/// Keys of a [`MetricsLine`] that depend on the clock. Two deterministic runs differ only in these.
 pub const TIME_KEYS: [&str; 3] = ["wall_s", "env_steps_per_s", "updates_per_s"];
 
-/// Counts refused segments by reason.
+/// Numbers of rejected segments by reason.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Rejected {
-    /// Another layout version.
+    /// Wrong layout version.
     pub layout_version: u64,
-    /// Another run.
+    /// Wrong run.
     pub run: u64,
-    /// Another architecture.
+    /// Wrong architecture.
     pub architecture: u64,
-    /// Sizes differ.
+    /// Wrong sizes.
     pub sizes: u64,
     /// A header field out of range.
     pub field: u64,
-    /// The checksum differs.
+    /// Wrong checksum.
     pub checksum: u64,
     /// A value that is not finite or out of bounds.
     pub value: u64,
-    /// A sequence number used before: sent again to a learner that had it.
+    /// A known sequence number, from a retransmission.
     pub duplicate: u64,
 }
 
 impl Rejected {
-    /// Counts one.
+    /// Counts one rejection.
     pub fn count(&mut self, why: Rejection) {
         *self.counter(why) += 1;
     }
 
-    /// How many were refused for this reason.
+    /// Returns the number of rejections for this reason.
     #[must_use]
     pub fn of(mut self, why: Rejection) -> u64 {
         *self.counter(why)
@@ -169,7 +170,7 @@ impl Rejected {
         }
     }
 
-    /// All together but duplicates, which belong to sending again what may be lost: faults.
+    /// Returns the number of all rejections except duplicates, which are no faults.
     #[must_use]
     pub fn total(&self) -> u64 {
         let Self { layout_version, run, architecture, sizes, field, checksum, value, .. } = self;
@@ -177,24 +178,24 @@ impl Rejected {
     }
 }
 
-/// Lags kept for the median between two lines; beyond it the oldest make room.
+/// Maximum lags kept for the median of a line; newer ones then replace the oldest.
 const LAGS_MAX: usize = 4_096;
 
-/// Collects between two lines. Buffers are made once.
+/// Collects the values of a line. Its buffers are allocated once.
 #[derive(Debug)]
-pub struct Collector {
+pub struct MetricsCollector {
     layout: SegmentLayout,
     envs_per_worker: usize,
-    /// Return so far of every environment's episode.
+    /// Return so far of each environment's episode.
     returns: Vec<f64>,
     /// Whether the environment's episode was seen from its first step.
     whole: Vec<bool>,
-    window: Sums,
+    window: WindowSums,
     lags: Vec<u64>,
     lag_next: usize,
 }
 
-/// A mean in the making.
+/// Sum and count of a mean.
 #[derive(Debug, Default)]
 struct Mean {
     sum: f64,
@@ -209,14 +210,14 @@ impl Mean {
         }
     }
 
-    /// None over nothing.
+    /// Returns the mean, or `None` without values.
     fn value(&self) -> Option<f64> {
         (self.count > 0).then(|| self.sum / self.count as f64)
     }
 }
 
 #[derive(Debug, Default)]
-struct Sums {
+struct WindowSums {
     critic_loss: Mean,
     actor_loss: Mean,
     q_mean: Mean,
@@ -228,45 +229,54 @@ struct Sums {
     clip_fraction: Mean,
     episodes: u64,
     returns: f64,
-    /// Ended episodes that said whether they succeeded, and those that did.
-    judged: u64,
+    /// Finished episodes that report success or failure.
+    success_reported: u64,
     successes: u64,
     lag_max: u64,
 }
 
-/// What a line takes from a [`Collector`].
+/// The values of a line that come from a [`MetricsCollector`].
 #[derive(Debug, Clone, PartialEq)]
-pub struct Collected {
+pub struct CollectedMetrics {
     /// Mean (Q - target)^2.
     pub critic_loss: Option<f64>,
-    /// Mean of what the actor descends.
+    /// Mean loss of the actor.
     pub actor_loss: Option<f64>,
     /// Mean Q of the batches' actions.
     pub q_mean: Option<f64>,
     /// Mean weight of the entropy.
     pub temperature: Option<f64>,
-    /// Mean -log pi of the actor's draws, or entropy of the policy.
+    /// Mean -log pi of the sampled actions, or entropy of the policy.
     pub entropy: Option<f64>,
-    /// Mean of what an on-policy algorithm's policy descends.
+    /// Mean loss of an on-policy algorithm's policy.
     pub policy_loss: Option<f64>,
-    /// Mean of what its value descends.
+    /// Mean loss of an on-policy algorithm's value.
     pub value_loss: Option<f64>,
     /// Mean divergence from the policy that acted.
     pub approx_kl: Option<f64>,
-    /// Share of steps beyond the clip.
+    /// Share of steps whose ratio is outside the clipping interval.
     pub clip_fraction: Option<f64>,
-    /// Training episodes that ended.
+    /// Finished training episodes.
     pub episodes: u64,
     /// Mean of their returns.
     pub return_mean: Option<f64>,
-    /// Share of successes among those that say whether they succeeded.
+    /// Share of successes among the episodes that report success or failure.
     pub success_rate: Option<f64>,
-    /// Median and largest policy lag.
-    pub lag: Option<(u64, u64)>,
+    /// Policy lag of the segments, if any acted with a policy.
+    pub lag: Option<PolicyLag>,
 }
 
-impl Collector {
-    /// For `workers * envs_per_worker` environments.
+/// Newest policy version minus the version that acted, over some segments.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub struct PolicyLag {
+    /// Median.
+    pub median: u64,
+    /// Largest lag.
+    pub max: u64,
+}
+
+impl MetricsCollector {
+    /// Makes a collector for `workers * envs_per_worker` environments.
     #[must_use]
     pub fn new(layout: SegmentLayout, workers: usize, envs_per_worker: usize) -> Self {
         let envs = workers * envs_per_worker;
@@ -275,13 +285,13 @@ impl Collector {
             envs_per_worker,
             returns: vec![0.0; envs],
             whole: vec![false; envs],
-            window: Sums::default(),
+            window: WindowSums::default(),
             lags: Vec::with_capacity(LAGS_MAX),
             lag_next: 0,
         }
     }
 
-    /// Books an update.
+    /// Adds an update.
     pub fn updated(&mut self, losses: Losses) {
         self.window.critic_loss.add(losses.critic_loss);
         self.window.actor_loss.add(losses.actor_loss);
@@ -290,7 +300,7 @@ impl Collector {
         self.window.entropy.add(losses.entropy);
     }
 
-    /// Books an update of an on-policy algorithm.
+    /// Adds an update of an on-policy algorithm.
     pub fn updated_on_policy(&mut self, losses: NdpLosses) {
         self.window.policy_loss.add(losses.policy_loss);
         self.window.value_loss.add(losses.value_loss);
@@ -299,7 +309,7 @@ impl Collector {
         self.window.clip_fraction.add(losses.clip_fraction);
     }
 
-    /// Books an inserted segment; `newest` is the newest policy's version.
+    /// Adds an inserted segment; `newest` is the newest policy's version.
     pub fn inserted(&mut self, segment: &Segment, newest: u64) {
         let header = &segment.header;
         if header.policy_version > 0 {
@@ -324,22 +334,23 @@ impl Collector {
             if self.whole[env] {
                 self.window.episodes += 1;
                 self.window.returns += self.returns[env];
-                self.window.judged += u64::from(header.flags & SUCCESS_REPORTED != 0);
+                self.window.success_reported += u64::from(header.flags & SUCCESS_REPORTED != 0);
                 self.window.successes += u64::from(header.flags & SUCCESS != 0);
             }
             self.whole[env] = false;
         }
     }
 
-    /// Closes the window and opens the next.
-    pub fn take(&mut self) -> Collected {
+    /// Returns the collected values and starts again.
+    pub fn take(&mut self) -> CollectedMetrics {
         let window = std::mem::take(&mut self.window);
         let episodes = window.episodes as f64;
         self.lags.sort_unstable();
-        let lag = (!self.lags.is_empty()).then(|| (self.lags[self.lags.len() / 2], window.lag_max));
+        let median = self.lags.get(self.lags.len() / 2).copied();
+        let lag = median.map(|median| PolicyLag { median, max: window.lag_max });
         self.lags.clear();
         self.lag_next = 0;
-        Collected {
+        CollectedMetrics {
             critic_loss: window.critic_loss.value(),
             actor_loss: window.actor_loss.value(),
             q_mean: window.q_mean.value(),
@@ -351,8 +362,8 @@ impl Collector {
             clip_fraction: window.clip_fraction.value(),
             episodes: window.episodes,
             return_mean: (window.episodes > 0).then(|| window.returns / episodes),
-            success_rate: (window.judged > 0)
-                .then(|| window.successes as f64 / window.judged as f64),
+            success_rate: (window.success_reported > 0)
+                .then(|| window.successes as f64 / window.success_reported as f64),
             lag,
         }
     }

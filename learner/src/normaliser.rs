@@ -1,37 +1,39 @@
-//! Observation normalisation (`policy.normalise_observations`): the networks in training see
-//! (x - mean) / scale, and the published policy has that folded into its first layer.
+//! Observation normalisation (`policy.normalise_observations`): networks in training get
+//! (x - mean) / scale, which is folded into the first layer of published policies.
 //!
-//! So a policy is a network of plain observations whoever runs it, and normalisation is part of it.
-//! When mean and scale are taken anew, the first layers are rewritten so that every network stays
-//! the function that it was: normalisation changes the steps of the optimiser, never the policy.
+//! A published policy therefore takes plain observations. When mean and scale are updated, the
+//! first layers are rewritten so that every network remains the same function of plain
+//! observations. Normalisation changes the steps of the optimiser, never the policy.
 
 use std::borrow::Cow;
 
 use dmprl_shared::policy::MlpShape;
 use serde::{Deserialize, Serialize};
 
-use crate::update::trained::Trained;
+use crate::update::network::TrainableNetwork;
 
-/// A dimension that varies less is left as it is: dividing by next to nothing would blow up the
-/// first departure from it.
+/// Minimum standard deviation of a dimension that is scaled. Dividing by a smaller one would
+/// magnify the first deviation.
 const SCALE_MIN: f64 = 1e-4;
 
-/// Mean and scale in use, and what was seen of each dimension so far.
+/// Current mean and scale, with the running statistics of each dimension.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Normaliser {
     mean: Vec<f32>,
     scale: Vec<f32>,
+    /// Observations so far.
     count: u64,
-    /// Mean, and sum of squared differences from it (Welford 1962).
+    /// Mean of the observations so far (Welford 1962).
     seen_mean: Vec<f64>,
+    /// Sum of squared differences from the mean (Welford 1962).
     seen_squares: Vec<f64>,
-    /// Mean and scale are taken anew when so many observations have been seen.
+    /// Number of observations at which mean and scale are updated.
     refresh_at: u64,
 }
 
 impl Normaliser {
-    /// One that has seen nothing and changes nothing; `first` observations make it begin.
+    /// Makes a normaliser that is the identity until its first update, after `first` observations.
     #[must_use]
     pub fn new(observation_len: usize, first: u64) -> Self {
         Self {
@@ -44,15 +46,16 @@ impl Normaliser {
         }
     }
 
-    /// Length O of the observations.
+    /// Returns the length O of the observations.
     #[must_use]
     pub fn observation_len(&self) -> usize {
         self.mean.len()
     }
 
-    /// Whether all parts, read from a file, have the same length, and none blows anything up.
+    /// Returns whether the statistics, after reading them from a file, have consistent lengths and
+    /// values in range.
     #[must_use]
-    pub fn is_sound(&self) -> bool {
+    pub fn is_valid(&self) -> bool {
         let len = self.mean.len();
         let seen = [&self.seen_mean, &self.seen_squares];
         self.scale.len() == len
@@ -64,7 +67,7 @@ impl Normaliser {
             && self.count.checked_mul(4).is_some()
     }
 
-    /// Books observations, (rows, O).
+    /// Adds observations, (rows, O), to the statistics.
     pub fn observe(&mut self, observations: &[f32]) {
         for row in observations.chunks_exact(self.mean.len()) {
             self.count += 1;
@@ -78,7 +81,7 @@ impl Normaliser {
         }
     }
 
-    /// (x - mean) / scale of each row of `observations`, (rows, O), into rows of `out`.
+    /// Computes (x - mean) / scale of `observations`, (rows, O), into `out`.
     pub fn apply(&self, observations: &[f32], out: &mut [f32]) {
         let o = self.mean.len();
         for (row, out) in observations.chunks_exact(o).zip(out.chunks_exact_mut(o)) {
@@ -86,70 +89,67 @@ impl Normaliser {
         }
     }
 
-    /// The same for one row, (O,).
+    /// Computes (x - mean) / scale of one observation, (O,), into `out`.
     pub fn apply_row(&self, observation: &[f32], out: &mut [f32]) {
         for (index, out) in out.iter_mut().enumerate() {
             *out = (observation[index] - self.mean[index]) / self.scale[index];
         }
     }
 
-    /// Whether as many observations have come as a refresh waits for.
+    /// Returns whether mean and scale are to be updated.
     #[must_use]
     pub fn is_due(&self) -> bool {
         self.count >= self.refresh_at
     }
 
-    /// Takes mean and scale anew and returns the change; due again at twice as many observations.
-    pub fn refresh(&mut self) -> Change<'static> {
+    /// Updates mean and scale and returns the change. The next update is due at twice as many
+    /// observations.
+    pub fn update(&mut self) -> NormalisationChange<'static> {
         self.refresh_at = 2 * self.count.max(1);
-        let before = self.in_use();
+        let before = self.mean_and_scale();
         for (index, squares) in self.seen_squares.iter().enumerate() {
             let scale = (squares / self.count.max(1) as f64).sqrt();
             self.mean[index] = self.seen_mean[index] as f32;
             self.scale[index] = if scale < SCALE_MIN { 1.0 } else { scale as f32 };
         }
-        Change { before, after: Some(self.in_use()) }
+        NormalisationChange { before, after: Some(self.mean_and_scale()) }
     }
 
-    fn in_use(&self) -> [Cow<'static, [f32]>; 2] {
+    fn mean_and_scale(&self) -> [Cow<'static, [f32]>; 2] {
         [self.mean.clone(), self.scale.clone()].map(Cow::Owned)
     }
 
-    /// Rewrites flat parameters of a network of normalised observations as those of the same
-    /// function of plain ones.
+    /// Rewrites the flat parameters of a network of normalised observations, so that it is the same
+    /// function of plain observations.
     pub fn fold(&self, shape: &MlpShape, parameters: &mut [f32]) {
         let before = [&self.mean, &self.scale].map(|values| Cow::Borrowed(values.as_slice()));
-        Change { before, after: None }.rewrite(shape, parameters);
+        NormalisationChange { before, after: None }.rewrite(shape, parameters);
     }
 }
 
-/// From one mean and scale to another.
+/// A change of mean and scale.
 #[derive(Debug)]
-pub struct Change<'a> {
+pub struct NormalisationChange<'a> {
     before: [Cow<'a, [f32]>; 2],
-    /// None: to plain observations.
+    /// `None` for plain observations.
     after: Option<[Cow<'a, [f32]>; 2]>,
 }
 
-impl Change<'_> {
-    /// Keeps a network in training, and its target, the functions of plain observations that they
-    /// were; the observations are its first inputs. Moments are scaled as the gradients of the new
-    /// weights are; what a shift of the mean adds to these is left out.
-    ///
-    /// # Errors
-    /// If candle refuses access to a variable.
-    pub fn apply(&self, trained: &mut Trained) -> candle_core::Result<()> {
-        let Trained { shape, network, target, adam, .. } = trained;
-        self.rewrite(shape, network.values_mut());
+impl NormalisationChange<'_> {
+    /// Rewrites a network in training and its target, so that they remain the same functions of
+    /// plain observations. The observations are the network's first inputs. Moments are scaled like
+    /// the gradients of the new weights, without the effect of a shifted mean.
+    pub fn apply(&self, network: &mut TrainableNetwork) {
+        let TrainableNetwork { shape, parameters, target, adam, .. } = network;
+        self.rewrite(shape, parameters.values_mut());
         if let Some(target) = target {
             self.rewrite(shape, target.values_mut());
         }
-        self.each_weight(shape, |at, input| {
+        self.for_each_weight(shape, |at, input| {
             let factor = self.before[1][input] / self.new_scale(input);
             adam.moments.first[at] *= factor;
             adam.moments.second[at] *= factor * factor;
         });
-        Ok(())
     }
 
     fn new_mean(&self, input: usize) -> f32 {
@@ -160,7 +160,7 @@ impl Change<'_> {
         self.after.as_ref().map_or(1.0, |[_, scale]| scale[input])
     }
 
-    /// W (x - m) / s + b = W' (x - m') / s' + b' for every x.
+    /// Rewrites the first layer: W (x - m) / s + b = W' (x - m') / s' + b' for every x.
     fn rewrite(&self, shape: &MlpShape, parameters: &mut [f32]) {
         let layer = &shape.layers()[0];
         let [mean, scale] = &self.before;
@@ -175,12 +175,12 @@ impl Change<'_> {
             let bias = &mut parameters[layer.bias.start + output];
             *bias = (f64::from(*bias) + moved) as f32;
         }
-        self.each_weight(shape, |at, input| {
+        self.for_each_weight(shape, |at, input| {
             parameters[at] *= self.new_scale(input) / scale[input];
         });
     }
 
-    fn each_weight(&self, shape: &MlpShape, mut f: impl FnMut(usize, usize)) {
+    fn for_each_weight(&self, shape: &MlpShape, mut f: impl FnMut(usize, usize)) {
         let layer = &shape.layers()[0];
         for output in 0..layer.outputs {
             let from = layer.weights.start + output * layer.inputs;
@@ -215,11 +215,11 @@ mod tests {
         assert!(!normaliser.is_due());
         normaliser.observe(&seen);
         assert!(normaliser.is_due());
-        normaliser.refresh();
+        normaliser.update();
         assert!(!normaliser.is_due());
         let mut out = [0.0; 8];
         normaliser.apply(&seen, &mut out);
-        // Mean 4, standard deviation sqrt(5); the second never varies.
+        // Mean 4, standard deviation sqrt(5); the second dimension is constant.
         let unit = 5.0_f32.sqrt();
         assert_close(&out, &[-3.0 / unit, 0.0, -1.0 / unit, 0.0, 1.0 / unit, 0.0, 3.0 / unit, 0.0]);
     }
@@ -229,7 +229,7 @@ mod tests {
         let shape = MlpShape::new(vec![5, 16, 2]);
         let mut random = dmprl_shared::seeds::stream(1, "test", 0);
         let initial = initial_parameters(&shape, &mut random);
-        // Three observations and two actions, as a critic has.
+        // Three observations and two actions, like a critic.
         let rows: Vec<f32> = (0..40).map(|_| random.random_range(-3.0..9.0)).collect();
         let with = |normaliser: &Normaliser| {
             let mut inputs = rows.clone();
@@ -238,19 +238,20 @@ mod tests {
             }
             inputs
         };
-        let mut trained = Trained::new(shape.clone(), initial, 1e-3, true, Precision::F32).unwrap();
-        let plain = output(&shape, trained.network.values(), &rows);
+        let mut network =
+            TrainableNetwork::new(shape.clone(), initial, 1e-3, true, Precision::F32).unwrap();
+        let plain = output(&shape, network.parameters.values(), &rows);
         let mut normaliser = Normaliser::new(3, 1);
         for _ in 0..3 {
             let seen: Vec<f32> = (0..30).map(|_| random.random_range(-2.0..10.0)).collect();
             normaliser.observe(&seen);
-            normaliser.refresh().apply(&mut trained).unwrap();
+            normaliser.update().apply(&mut network);
             let inputs = with(&normaliser);
             assert!(inputs[..3] != rows[..3]);
-            assert_close(&output(&shape, trained.network.values(), &inputs), &plain);
-            let target = trained.target.as_ref().unwrap();
+            assert_close(&output(&shape, network.parameters.values(), &inputs), &plain);
+            let target = network.target.as_ref().unwrap();
             assert_close(&output(&shape, target.values(), &inputs), &plain);
-            let mut folded = trained.network.values().to_vec();
+            let mut folded = network.parameters.values().to_vec();
             normaliser.fold(&shape, &mut folded);
             assert_close(&output(&shape, &folded, &rows), &plain);
         }

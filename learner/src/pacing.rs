@@ -1,23 +1,23 @@
-//! How many updates the learner owes for the segments it took, and when it may take more.
+//! Keeps the ratio of updates to segments. Each segment adds to the updates that the learner owes.
 //!
-//! Both sides can wait: the learner when it owes nothing, the workers (on their full queues) when
-//! the learner owes more than `tolerance_segments` segments' worth and takes no more.
+//! The learner waits when it owes no update. The workers wait, on full queues, when the learner
+//! owes the updates of more than `tolerance_segments` segments and takes no more segments.
 
 use dmprl_shared::config::PacingConfig;
 use serde::{Deserialize, Serialize};
 
-/// The account.
+/// The account of updates owed.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Pacing {
     updates_per_segment: f64,
     tolerance_segments: u64,
-    /// Updates owed.
+    /// Updates owed, including fractions.
     owed: f64,
 }
 
 impl Pacing {
-    /// An account that owes nothing.
+    /// Makes an empty account.
     #[must_use]
     pub fn new(config: &PacingConfig) -> Self {
         Self {
@@ -27,36 +27,36 @@ impl Pacing {
         }
     }
 
-    /// Books one segment inserted after the warm-up.
+    /// Adds the updates owed for one segment.
     pub fn inserted(&mut self) {
         self.owed += self.updates_per_segment;
     }
 
-    /// Books one update.
+    /// Subtracts one update.
     pub fn updated(&mut self) {
         self.owed -= 1.0;
     }
 
-    /// Whether an update is owed.
+    /// Returns whether an update is owed.
     #[must_use]
     pub fn update_due(&self) -> bool {
         self.owed >= 1.0
     }
 
-    /// Whether another segment may be taken before updating: always when no update is due, so
-    /// that no setting can make both sides wait.
+    /// Returns whether another segment may be taken before the next update. This always holds if no
+    /// update is due, so that no configuration makes both sides wait.
     #[must_use]
     pub fn may_take(&self) -> bool {
         !self.update_due() || self.owed < self.tolerance_segments as f64 * self.updates_per_segment
     }
 
-    /// Updates owed, fractions included.
+    /// Returns the updates owed, including fractions.
     #[must_use]
     pub fn owed(&self) -> f64 {
         self.owed
     }
 
-    /// Takes over what a checkpoint owed; ratio and tolerance stay as configured now.
+    /// Restores the updates owed from a checkpoint. Ratio and tolerance stay as configured.
     pub fn restore(&mut self, owed: f64) {
         self.owed = owed;
     }

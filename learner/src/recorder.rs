@@ -1,7 +1,7 @@
-//! What a learner records as it goes: metrics, policies to be evaluated, checkpoints, progress.
+//! Writes a learner's records: metrics, policies to evaluate, checkpoints and progress.
 //!
-//! Called by [`crate::serve`] and by the one-process run for everything that falls due. Where the
-//! records lie is the caller's business ([`RunFiles`]).
+//! Called by [`crate::serve`] and by the one-process run when a record is due. The caller decides
+//! where the records are stored ([`RunFiles`]).
 
 use std::error::Error;
 use std::io;
@@ -12,94 +12,102 @@ use dmprl_shared::policy_file;
 use dmprl_shared::supervision::{EvaluationRequest, Progress, Report, Supervisor};
 use dmprl_shared::transport::delivery::Watermark;
 
-use crate::checkpoint::{CheckpointError, Ended, Writer};
+use crate::checkpoint::{CheckpointError, WriteOutcome, Writer};
 use crate::learner::{Counters, Learner};
-use crate::metrics::MetricsLine;
+use crate::metrics::{MetricsLine, PolicyLag};
 use crate::session::{Due, DueError};
 
 /// Interval between two progress reports.
 const PROGRESS_INTERVAL: Duration = Duration::from_millis(500);
 
-/// Has a saved policy evaluated.
+/// Requests the evaluation of a saved policy.
 pub type Evaluate<'a> = &'a mut dyn FnMut(EvaluationRequest) -> Result<(), DueError>;
 
-/// Where a learner's records lie: the run directory in the program, memory in a test.
+/// Storage of a learner's records: the run directory in the program, memory in tests.
 pub trait RunFiles {
-    /// Appends a whole line to `metrics.jsonl`, or nothing.
+    /// Appends a line to `metrics.jsonl`, completely or not at all.
     ///
     /// # Errors
-    /// What the file system refuses.
+    /// If the file system fails.
     fn append_metrics(&mut self, line: &[u8]) -> io::Result<()>;
 
-    /// Saves a policy file under its version.
+    /// Saves a policy file under its version number.
     ///
     /// # Errors
-    /// What the file system refuses.
+    /// If the file system fails.
     fn save_policy(&mut self, version: u64, bytes: &[u8]) -> Result<(), DueError>;
 
-    /// The folder of the checkpoints.
+    /// Returns the folder of the checkpoints.
     fn checkpoints(&self) -> PathBuf;
 
-    /// Called when a checkpoint of this moment begins.
+    /// Called when a checkpoint with these counters begins.
     fn checkpoint_begins(&mut self, counters: &Counters);
 }
 
-/// Where the run's earlier sessions ended.
+/// The state of the run's records at the end of its previous sessions.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
-pub struct Past {
-    /// Seconds of training.
+pub struct PreviousSessions {
+    /// Training time \[s\].
     pub wall_s: f64,
-    /// Environment steps at the newest metrics line and at the newest evaluation: a run that ends
-    /// at one of them gets no second one.
+    /// Environment steps at the newest metrics line. A run that ends there gets no second line.
     pub measured: Option<u64>,
-    /// As above, of the newest evaluation.
+    /// Environment steps at the newest evaluation. A run that ends there gets no second evaluation.
     pub evaluated: Option<u64>,
 }
 
-/// Does what falls due in a session.
+/// Writes the records of a session.
 pub struct Recorder<'a> {
     files: &'a mut dyn RunFiles,
     supervisor: &'a dyn Supervisor,
-    past: Past,
+    previous: PreviousSessions,
     started: Instant,
-    line: Rate,
-    progress: Rate,
+    line: CounterSample,
+    progress: CounterSample,
     return_mean: Option<f64>,
-    /// Median and largest, in the newest metrics line that had some.
-    policy_lag: (u64, u64),
+    /// From the newest metrics line that had any.
+    policy_lag: PolicyLag,
     checkpoints: Writer,
-    /// Disk trouble is reported once until it is over: a full disk must not fill the terminal too.
+    /// A failing disk is reported once until it recovers, so that it does not fill the terminal.
     checkpoint_failing: bool,
     log_failing: bool,
 }
 
-/// Counts at a moment.
+/// Counters at a point in time.
 #[derive(Clone, Copy)]
-struct Rate {
+struct CounterSample {
     at: Instant,
     env_steps: u64,
     updates: u64,
 }
 
-impl Rate {
+impl CounterSample {
     fn now(learner: &Learner) -> Self {
         let counters = learner.counters;
         Self { at: Instant::now(), env_steps: counters.env_steps, updates: counters.updates }
     }
 
-    /// Environment steps and updates per second since `self`.
-    fn until(self, now: Self) -> (f64, f64) {
+    /// Returns the rates since `self`.
+    fn rates_until(self, now: Self) -> Rates {
         let seconds = now.at.duration_since(self.at).as_secs_f64().max(1e-6);
         let per_second = |from: u64, to: u64| to.saturating_sub(from) as f64 / seconds;
-        (per_second(self.env_steps, now.env_steps), per_second(self.updates, now.updates))
+        Rates {
+            env_steps_per_s: per_second(self.env_steps, now.env_steps),
+            updates_per_s: per_second(self.updates, now.updates),
+        }
     }
 }
 
+/// Speed between two points in time.
+struct Rates {
+    env_steps_per_s: f64,
+    updates_per_s: f64,
+}
+
 impl<'a> Recorder<'a> {
-    /// A recorder of a session that begins now.
+    /// Makes the recorder of a session that begins now.
     pub fn new(
         files: &'a mut dyn RunFiles,
-        past: Past,
+        previous: PreviousSessions,
         supervisor: &'a dyn Supervisor,
         learner: &Learner,
     ) -> Self {
@@ -107,26 +115,26 @@ impl<'a> Recorder<'a> {
             checkpoints: Writer::new(files.checkpoints()),
             files,
             supervisor,
-            past,
+            previous,
             started: Instant::now(),
-            line: Rate::now(learner),
-            progress: Rate::now(learner),
+            line: CounterSample::now(learner),
+            progress: CounterSample::now(learner),
             return_mean: None,
-            policy_lag: (0, 0),
+            policy_lag: PolicyLag::default(),
             checkpoint_failing: false,
             log_failing: false,
         }
     }
 
-    /// Seconds of training, over all sessions.
+    /// Returns the training time, over all sessions \[s\].
     fn wall_s(&self) -> f64 {
-        self.past.wall_s + self.started.elapsed().as_secs_f64()
+        self.previous.wall_s + self.started.elapsed().as_secs_f64()
     }
 
-    /// Does what is due. `evaluate` is called for an evaluation.
+    /// Writes the record that is due. Calls `evaluate` for an evaluation.
     ///
     /// # Errors
-    /// Whatever `evaluate` returns. A full disk is no error: it is reported, and training goes on.
+    /// Errors of `evaluate`. A full disk is only reported; training continues.
     pub fn due(
         &mut self,
         due: Due,
@@ -136,15 +144,17 @@ impl<'a> Recorder<'a> {
         match due {
             Due::Metrics => self.write_metrics(learner),
             Due::Evaluation => {
-                // A policy that cannot be saved is not evaluated; the training goes on.
+                // A policy that cannot be saved is not evaluated; training continues.
                 match self.save_policy(learner) {
                     Ok(request) => {
-                        self.past.evaluated = Some(learner.counters.env_steps);
+                        self.previous.evaluated = Some(learner.counters.env_steps);
                         evaluate(request)
                     }
                     Err(error) => {
                         let (steps, why) = (learner.counters.env_steps, with_causes(&*error));
-                        self.warn(format!("no evaluation at {steps} steps: {why}"));
+                        self.warn(format!(
+                            "no evaluation at {steps} steps: cannot save the policy: {why}"
+                        ));
                         Ok(())
                     }
                 }
@@ -153,25 +163,25 @@ impl<'a> Recorder<'a> {
                 self.begin_checkpoint(learner);
                 Ok(())
             }
-            Due::Refusal(why) => {
+            Due::Rejection(why) => {
                 self.warn(format!(
-                    "a segment was refused ({why}); more of this kind are only counted, as \
-                     `rejected` in metrics.jsonl"
+                    "a segment was rejected ({why}); further ones of this kind are only counted, \
+                     as `rejected` in metrics.jsonl"
                 ));
                 Ok(())
             }
             Due::Lost(count) => {
                 self.warn(format!(
-                    "{count} segments that a learner had acknowledged before it died are lost; \
-                     delivery.level = \"log\" keeps them"
+                    "{count} segments are lost that a crashed learner had acknowledged; \
+                     delivery.level = \"log\" keeps such segments"
                 ));
                 Ok(())
             }
         }
     }
 
-    /// The marks up to which segments may be acknowledged; none while the segment log cannot be
-    /// written. Workers then wait as soon as their outboxes are full.
+    /// Returns the marks up to which segments may be acknowledged, or `None` while the segment log
+    /// cannot be written. Workers then wait as soon as their outboxes are full.
     pub fn acknowledge<'l>(&mut self, learner: &'l mut Learner) -> Option<&'l [Watermark]> {
         match learner.inbox.acknowledge() {
             Ok(marks) => {
@@ -187,30 +197,30 @@ impl<'a> Recorder<'a> {
         }
     }
 
-    /// Whether the learner has come further than the newest metrics line.
+    /// Returns whether the newest metrics line is outdated.
     #[must_use]
     pub fn is_unmeasured(&self, learner: &Learner) -> bool {
-        self.past.measured != Some(learner.counters.env_steps)
+        self.previous.measured != Some(learner.counters.env_steps)
     }
 
-    /// Whether an evaluation that fell due before the learner's checkpoint has no row: the run was
-    /// stopped before its evaluator answered.
+    /// Returns whether an evaluation that was due before the learner's checkpoint is missing,
+    /// because the run was stopped before the evaluator answered.
     #[must_use]
     pub fn is_owed_an_evaluation(&self, learner: &Learner) -> bool {
         let interval = learner.config().evaluation.interval_steps;
-        learner.counters.env_steps / interval > self.past.evaluated.unwrap_or(0) / interval
+        learner.counters.env_steps / interval > self.previous.evaluated.unwrap_or(0) / interval
     }
 
-    /// Whether the learner has come further than the newest evaluation.
+    /// Returns whether the newest evaluation is outdated.
     #[must_use]
     pub fn is_unevaluated(&self, learner: &Learner) -> bool {
-        self.past.evaluated != Some(learner.counters.env_steps)
+        self.previous.evaluated != Some(learner.counters.env_steps)
     }
 
     fn write_metrics(&mut self, learner: &mut Learner) -> Result<(), DueError> {
-        self.past.measured = Some(learner.counters.env_steps);
-        let now = Rate::now(learner);
-        let (env_steps_per_s, updates_per_s) = self.line.until(now);
+        self.previous.measured = Some(learner.counters.env_steps);
+        let now = CounterSample::now(learner);
+        let Rates { env_steps_per_s, updates_per_s } = self.line.rates_until(now);
         self.line = now;
         let workers = self.supervisor.totals().workers;
         let line = MetricsLine {
@@ -222,12 +232,14 @@ impl<'a> Recorder<'a> {
             ..learner.metrics_line()
         };
         self.return_mean = line.training_return_mean.or(self.return_mean);
-        self.policy_lag = line.policy_lag_p50.zip(line.policy_lag_max).unwrap_or(self.policy_lag);
+        if let (Some(median), Some(max)) = (line.policy_lag_p50, line.policy_lag_max) {
+            self.policy_lag = PolicyLag { median, max };
+        }
         let mut text = serde_json::to_vec(&line)?;
         text.push(b'\n');
-        // A full disk must not end a run: the line is lost, the training is not.
+        // A full disk must not end a run, so the line is dropped.
         if let Err(error) = self.files.append_metrics(&text) {
-            self.warn(format!("a line of metrics.jsonl is lost: {error}"));
+            self.warn(format!("cannot write a line of metrics.jsonl: {error}"));
         }
         Ok(())
     }
@@ -245,49 +257,49 @@ impl<'a> Recorder<'a> {
         })
     }
 
-    /// Begins a checkpoint of this moment, which is written while training goes on; only a
-    /// deterministic run waits for it. Waits first for the one before if that is still being
-    /// written: the disk is then slower than the run's interval.
+    /// Begins a checkpoint, which is written in the background. A deterministic run waits until it
+    /// is written. If the previous checkpoint is still being written, because the disk is too slow
+    /// for the interval, this waits for it first.
     fn begin_checkpoint(&mut self, learner: &mut Learner) {
-        self.end_checkpoint(learner);
+        self.finish_checkpoint(learner);
         self.files.checkpoint_begins(&learner.counters);
         if let Err(error) = self.checkpoints.begin(learner) {
             self.report_checkpoint(learner.counters.env_steps, Err(error));
         } else if learner.config().run.deterministic {
-            self.end_checkpoint(learner);
+            self.finish_checkpoint(learner);
         }
     }
 
-    /// Reports the checkpoint that was being written if it is complete, or failed.
+    /// Reports the checkpoint that was being written, once it is complete or has failed.
     pub fn poll_checkpoint(&mut self, learner: &mut Learner) {
-        if let Some(Ended { env_steps, written }) = self.checkpoints.poll(learner) {
-            self.report_checkpoint(env_steps, written);
+        if let Some(WriteOutcome { env_steps, result }) = self.checkpoints.poll(learner) {
+            self.report_checkpoint(env_steps, result);
         }
     }
 
-    fn end_checkpoint(&mut self, learner: &mut Learner) {
-        if let Some(Ended { env_steps, written }) = self.checkpoints.wait(learner) {
-            self.report_checkpoint(env_steps, written);
+    fn finish_checkpoint(&mut self, learner: &mut Learner) {
+        if let Some(WriteOutcome { env_steps, result }) = self.checkpoints.wait(learner) {
+            self.report_checkpoint(env_steps, result);
         }
     }
 
-    /// Writes the session's last checkpoint.
+    /// Writes the session's last checkpoint and waits for it.
     pub fn write_checkpoint(&mut self, learner: &mut Learner) {
         self.begin_checkpoint(learner);
-        self.end_checkpoint(learner);
+        self.finish_checkpoint(learner);
     }
 
-    /// After a failure the previous checkpoint stays, and training goes on.
-    fn report_checkpoint(&mut self, env_steps: u64, written: Result<String, CheckpointError>) {
-        match written {
+    /// Reports a checkpoint. After a failure the previous checkpoint stays, and training continues.
+    fn report_checkpoint(&mut self, env_steps: u64, result: Result<String, CheckpointError>) {
+        match result {
             Ok(name) => {
                 self.checkpoint_failing = false;
-                // The loop notices a supervisor that is gone.
+                // The loop notices when the supervisor is gone.
                 let _ = self.supervisor.report(&Report::Checkpoint { name, env_steps });
             }
             Err(error) if !self.checkpoint_failing => {
                 self.checkpoint_failing = true;
-                self.warn(format!("no checkpoint could be written, training goes on: {error}"));
+                self.warn(format!("no checkpoint could be written, training continues: {error}"));
             }
             Err(error) => eprintln!("checkpoint: {error}"),
         }
@@ -298,7 +310,7 @@ impl<'a> Recorder<'a> {
         self.supervisor.warn(message);
     }
 
-    /// Reports progress if it is time to.
+    /// Reports progress if the interval has passed.
     pub fn progress(&mut self, learner: &Learner) {
         if self.progress.at.elapsed() >= PROGRESS_INTERVAL {
             self.report_progress(learner);
@@ -307,8 +319,8 @@ impl<'a> Recorder<'a> {
 
     /// Reports progress.
     pub fn report_progress(&mut self, learner: &Learner) {
-        let now = Rate::now(learner);
-        let (env_steps_per_s, updates_per_s) = self.progress.until(now);
+        let now = CounterSample::now(learner);
+        let Rates { env_steps_per_s, updates_per_s } = self.progress.rates_until(now);
         self.progress = now;
         let counters = learner.counters;
         let _ = self.supervisor.report(&Report::Progress(Progress {
@@ -319,8 +331,8 @@ impl<'a> Recorder<'a> {
             updates_per_s,
             return_mean: self.return_mean,
             samples_per_insert: learner.samples_per_insert(),
-            policy_lag_p50: self.policy_lag.0,
-            policy_lag_max: self.policy_lag.1,
+            policy_lag_p50: self.policy_lag.median,
+            policy_lag_max: self.policy_lag.max,
             queued_segments: self.supervisor.totals().workers.queued_segments,
             restarts: counters.worker_restarts + counters.learner_restarts,
             rejected: counters.rejected.total(),
@@ -329,7 +341,7 @@ impl<'a> Recorder<'a> {
     }
 }
 
-/// An error and its causes on one line.
+/// Formats an error and its causes on one line.
 fn with_causes(error: &dyn Error) -> String {
     let mut text = error.to_string();
     let mut cause = error.source();

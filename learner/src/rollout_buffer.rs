@@ -1,8 +1,8 @@
-//! Stage 5 of 8 for on-policy algorithms: the segments of one policy, in the place of the replay,
-//! and what each was worth.
+//! Stage 5 of 8 for on-policy algorithms: stores the segments of one policy, instead of the replay,
+//! and estimates their advantages.
 //!
-//! One entry a segment. The segments of many environments arrive interleaved; an entry knows the
-//! one that continues its episode, so that advantages run along each environment's own chain.
+//! Each segment is one entry. The segments of many environments arrive interleaved. An entry refers
+//! to the one that continues its episode, so that advantages follow each environment's own chain.
 
 use dmprl_shared::segment::{SegmentHeader, SegmentLayout, TERMINATED, TRUNCATED};
 
@@ -12,46 +12,46 @@ struct Tail {
     entry: usize,
     incarnation: u32,
     episode: u32,
-    /// Steps of the episode up to the end of the segment.
+    /// Steps of the episode until the end of the segment.
     episode_steps: u32,
 }
 
-/// Up to N segments, each with its decision, its reward and its worth.
+/// Up to N segments with their rewards, values and advantages.
 #[derive(Debug)]
 pub struct RolloutBuffer {
     layout: SegmentLayout,
     discount: f32,
     envs_per_worker: usize,
     capacity: usize,
-    /// The observation that each segment was decided on, (N, O).
+    /// Observation on which each segment was decided, (N, O).
     pub observations: Vec<f32>,
-    /// The observation after each segment's last step, (N, O).
+    /// Observation after each segment's last step, (N, O).
     pub last_observations: Vec<f32>,
-    /// Actions as drawn, (N, K, A); zero after a segment's steps.
+    /// Actions as drawn, (N, K, A); zero after a segment's last step.
     pub actions: Vec<f32>,
-    /// Steps really run, (N,).
+    /// Steps that were run, (N,).
     pub steps_len: Vec<usize>,
     /// Sum of discount^i r_i over a segment's steps, (N,).
     rewards: Vec<f32>,
-    /// What multiplies the value after the segment: discount^steps (1 - terminated), (N,).
+    /// Factor of the value after the segment, discount^steps (1 - terminated), (N,).
     bootstrap: Vec<f32>,
-    /// The entry that continues the episode, (N,).
+    /// Entry that continues the episode, (N,).
     next: Vec<Option<usize>>,
-    /// V of `observations`, (N,); for whoever estimates values to fill.
+    /// V of `observations`, (N,); the caller fills it before [`RolloutBuffer::estimate`].
     pub values: Vec<f32>,
-    /// V of `last_observations`, (N,); likewise.
+    /// V of `last_observations`, (N,); the caller fills it before [`RolloutBuffer::estimate`].
     pub last_values: Vec<f32>,
-    /// How much better than its value each segment was, (N,); of mean 0 and deviation 1.
+    /// Advantage of each segment, (N,), scaled to mean 0 and deviation 1.
     pub advantages: Vec<f32>,
-    /// What the value regresses on, (N,).
+    /// Targets of the value, (N,).
     pub returns: Vec<f32>,
     tails: Vec<Option<Tail>>,
 }
 
-/// What decides a buffer's size and the discounting in it.
+/// Sizes and discount of a rollout buffer.
 #[derive(Debug, Clone, Copy)]
 pub struct RolloutShape {
-    /// Sizes of the segments.
+    /// Sizes of a segment.
     pub layout: SegmentLayout,
     /// Segments of a rollout, N.
     pub segments: usize,
@@ -59,12 +59,12 @@ pub struct RolloutShape {
     pub discount: f32,
     /// Workers of the run.
     pub workers: usize,
-    /// Environments of each.
+    /// Environments per worker.
     pub envs_per_worker: usize,
 }
 
 impl RolloutBuffer {
-    /// An empty one.
+    /// Makes an empty buffer.
     #[must_use]
     pub fn new(shape: RolloutShape) -> Self {
         let RolloutShape { layout, segments, discount, workers, envs_per_worker } = shape;
@@ -89,32 +89,32 @@ impl RolloutBuffer {
         }
     }
 
-    /// Segments held.
+    /// Returns the number of segments.
     #[must_use]
     pub fn len(&self) -> usize {
         self.steps_len.len()
     }
 
-    /// Whether nothing is held.
+    /// Returns whether the buffer has no segments.
     #[must_use]
     pub fn is_empty(&self) -> bool {
         self.steps_len.is_empty()
     }
 
-    /// Whether a rollout is complete.
+    /// Returns whether the rollout is complete.
     #[must_use]
     pub fn is_full(&self) -> bool {
         self.len() == self.capacity
     }
 
-    /// Forgets everything.
+    /// Removes all segments.
     pub fn clear(&mut self) {
         self.steps_len.clear();
         self.next.fill(None);
         self.tails.fill(None);
     }
 
-    /// Takes a segment that has passed `segment::check`.
+    /// Inserts a segment that has passed `segment::check`.
     ///
     /// # Panics
     /// If the buffer is full.
@@ -137,8 +137,9 @@ impl RolloutBuffer {
         self.link(header, entry);
     }
 
-    /// A gap in an episode (a lost segment, a restarted worker) is never bridged: the chain ends
-    /// there with the value of its last observation, as an unfinished episode's does.
+    /// Links a segment to its predecessor. A gap in an episode, from a lost segment or a restarted
+    /// worker, is never bridged: the chain ends there with the value of its last observation, like
+    /// an unfinished episode.
     fn link(&mut self, header: &SegmentHeader, entry: usize) {
         let env = header.worker_id as usize * self.envs_per_worker + header.env_index as usize;
         if let Some(tail) = self.tails[env]
@@ -157,13 +158,13 @@ impl RolloutBuffer {
         });
     }
 
-    /// Generalised advantage estimation (Schulman et al. 2016, equation 16) over segments, from
-    /// `values` and `last_values`.
+    /// Estimates advantages over segments from `values` and `last_values` (generalised advantage
+    /// estimation, Schulman et al. 2016, equation 16).
     ///     delta_i = reward_i + bootstrap_i V(last_i) - V_i
     ///     advantage_i = delta_i + bootstrap_i lambda advantage_{next of i}
-    /// Fills `returns` with advantage + value, then scales `advantages` to mean 0, deviation 1.
+    /// Sets `returns` to advantage + value, then scales `advantages` to mean 0 and deviation 1.
     pub fn estimate(&mut self, lambda: f32) {
-        // The entry that continues another one came later.
+        // Backwards, because an entry that continues another has a higher index.
         for entry in (0..self.len()).rev() {
             let bootstrap = self.bootstrap[entry];
             let delta =
@@ -177,14 +178,14 @@ impl RolloutBuffer {
     }
 }
 
-/// Added to the deviation, so that equal advantages become zero and not infinite.
+/// Added to the deviation, so that equal advantages become zero instead of infinite.
 const DEVIATION_MIN: f64 = 1e-5;
 
 fn normalise(values: &mut [f32]) {
     let len = values.len() as f64;
     let mean = values.iter().map(|value| f64::from(*value)).sum::<f64>() / len;
     let squares = values.iter().map(|value| (f64::from(*value) - mean).powi(2)).sum::<f64>();
-    // Of one segment alone there is no deviation.
+    // A single segment has no deviation.
     let deviation = (squares / (len - 1.0).max(1.0)).sqrt() + DEVIATION_MIN;
     for value in values {
         *value = ((f64::from(*value) - mean) / deviation) as f32;
@@ -208,7 +209,7 @@ mod tests {
         })
     }
 
-    /// Segment `number` of an episode, with its two rewards; the last observation is its number.
+    /// Inserts segment `number` of an episode with two rewards. Its last observation is its number.
     fn insert(buffer: &mut RolloutBuffer, number: u32, rewards: [f32; 2], flags: u32) {
         let header = SegmentHeader {
             steps_len: 2,
@@ -220,13 +221,13 @@ mod tests {
         buffer.insert(&header, &[0.0, 0.0, last, 0.0, 0.0, rewards[0], rewards[1]]);
     }
 
-    /// lambda = 0.5, V = 1 everywhere but 8 after the third segment. With discount 0.5 a segment's
-    /// reward is r_0 + r_1 / 2 and its bootstrap 1/4.
+    /// Returns the advantages of three segments with lambda = 0.5, and V = 1 except 8 after the
+    /// third segment. With discount 0.5 a segment's reward is r_0 + r_1 / 2 and its bootstrap 1/4.
     ///
-    /// Rewards (1, 2), (0, 4), (2, 2): deltas 2 + 1/4 - 1 = 1.25, 2 + 1/4 - 1 = 1.25 and, for the
-    /// third, 3 + 8/4 - 1 = 4 or, terminated, 3 - 1 = 2. Advantages: the third's is its delta, the
-    /// second's 1.25 + 1/8 of that, the first's 1.25 + 1/8 of the second's.
-    fn worth_of_three(flags: u32) -> [f32; 3] {
+    /// The rewards (1, 2), (0, 4), (2, 2) give the deltas 2 + 1/4 - 1 = 1.25, 2 + 1/4 - 1 = 1.25
+    /// and, for the third, 3 + 8/4 - 1 = 4 or, if it terminated, 3 - 1 = 2. The third advantage is
+    /// its delta, the second 1.25 + 1/8 of the third, the first 1.25 + 1/8 of the second.
+    fn advantages_of_three(flags: u32) -> [f32; 3] {
         let mut buffer = buffer(3);
         for (number, rewards) in [[1.0, 2.0], [0.0, 4.0], [2.0, 2.0]].into_iter().enumerate() {
             let last = number == 2;
@@ -241,20 +242,20 @@ mod tests {
     #[test]
     fn a_truncated_or_unfinished_episode_is_worth_its_last_value() {
         let expected = [1.25 + 1.75 / 8.0, 1.75, 4.0];
-        assert_eq!(worth_of_three(TRUNCATED), expected);
-        assert_eq!(worth_of_three(0), expected);
+        assert_eq!(advantages_of_three(TRUNCATED), expected);
+        assert_eq!(advantages_of_three(0), expected);
     }
 
     #[test]
     fn a_terminated_episode_is_worth_no_value_after_it() {
-        assert_eq!(worth_of_three(TERMINATED), [1.25 + 1.5 / 8.0, 1.5, 2.0]);
+        assert_eq!(advantages_of_three(TERMINATED), [1.25 + 1.5 / 8.0, 1.5, 2.0]);
     }
 
     #[test]
     fn a_gap_of_stale_segments_ends_the_chain_with_the_value_before_it() {
         let mut buffer = buffer(2);
         insert(&mut buffer, 0, [1.0, 2.0], 0);
-        // The second was another policy's.
+        // The second segment came from another policy.
         insert(&mut buffer, 2, [2.0, 2.0], 0);
         buffer.values.fill(1.0);
         buffer.last_values.copy_from_slice(&[1.0, 8.0]);

@@ -1,10 +1,11 @@
-//! Stages 5 to 7 of 8 as a process: serves the run's workers, from the first policy to the last
+//! Stages 5 to 7 of 8 as a process: serves the run's workers from the first policy to the last
 //! checkpoint.
 //!
-//! [`Server::run`] is the learner's loop: it takes turns of a [`Session`], acknowledges segments,
-//! and does what falls due by a [`Recorder`], until the run is complete or a stop is requested. The
-//! program around it reads the arguments, makes the learner ([`crate::start`]) and its ends of the
-//! transport. The one-process run has a schedule of its own and shares [`catch_up`] and [`close`].
+//! [`Server::run`] is the learner's loop. It takes turns of a [`Session`], acknowledges segments
+//! and writes records with a [`Recorder`], until the run is complete or a stop is requested. The
+//! program around it parses the arguments and makes the learner ([`crate::start`]) and its ends of
+//! the transport. The one-process run has its own schedule, but shares
+//! [`request_missed_evaluation`] and [`close`].
 
 use std::time::{Duration, Instant};
 
@@ -18,16 +19,16 @@ use crate::learner::Learner;
 use crate::recorder::{Evaluate, Recorder};
 use crate::session::{Due, DueError, Session, SessionError, Turn};
 
-/// Pause after an idle turn: short beside a worker's segment of about 1 ms.
+/// Pause after an idle turn; short compared to a worker's segment of about 1 ms.
 const IDLE_PAUSE: Duration = Duration::from_micros(100);
-/// Interval between two cleanings of what dead workers left.
+/// Interval between two clean-ups of resources of dead workers.
 const MAINTENANCE_INTERVAL: Duration = Duration::from_millis(250);
 /// Maximum interval between two acknowledgements.
 const ACKNOWLEDGEMENT_INTERVAL: Duration = Duration::from_millis(10);
-/// Environment steps after which the first segment is reported, on its own for the start-up time.
+/// Environment steps after which the first segment is reported, to measure the start-up time.
 const FIRST_STEPS: u64 = 1;
 
-/// Why a learner ended early.
+/// Why a learner stopped early.
 #[derive(Debug, Error)]
 pub enum ServeError {
     /// The learner or its transport failed.
@@ -36,28 +37,28 @@ pub enum ServeError {
     /// The acknowledgement channel failed.
     #[error(transparent)]
     Transport(#[from] TransportError),
-    /// What was due could not be done.
+    /// A record could not be written.
     #[error(transparent)]
     Due(#[from] DueError),
     /// A report could not be sent.
     #[error(transparent)]
     Report(#[from] ReportError),
     /// The supervisor is gone.
-    #[error("the supervisor is gone; the run ended after a checkpoint")]
+    #[error("the supervisor is gone; the learner wrote a checkpoint and stopped")]
     SupervisorGone,
 }
 
-/// A learner among its workers.
+/// A learner that serves workers.
 pub struct Server<'a, R, P, A> {
     /// The learner and its ends of the transport.
     pub session: Session<R, P>,
-    /// Its end of the acknowledgement channel.
+    /// The learner's end of the acknowledgement channel.
     pub acknowledgements: A,
     /// Segments that the queues of all workers can hold.
     pub queued_segments_max: usize,
-    /// Does what falls due.
+    /// Writes the records.
     pub recorder: Recorder<'a>,
-    /// Requests the end.
+    /// Requests stop or finish.
     pub supervisor: &'a dyn Supervisor,
 }
 
@@ -67,30 +68,31 @@ where
     P: ParameterPublisher,
     A: AcknowledgementPublisher,
 {
-    /// Serves the workers until the run is complete or a stop is requested; either ends with a
+    /// Serves the workers until the run is complete or a stop is requested, then writes a
     /// checkpoint.
     ///
     /// # Errors
-    /// Whatever keeps the learner from going on.
+    /// If the learner, the transport, a record or a report fails.
     pub fn run(mut self) -> Result<(), ServeError> {
         let supervisor = self.supervisor;
         supervisor.report(&Report::LearnerReady)?;
-        // The loop notices a supervisor that is gone as a stop, which ends with a checkpoint; a
-        // report that fails must not come before that.
+        // If the supervisor is gone, the loop sees a stop and writes a checkpoint. A failed report
+        // must not end the learner before that.
         let mut request = |request| {
             let _ = supervisor.report(&Report::Evaluate(request));
             Ok(())
         };
-        catch_up(&mut self.session, &mut self.recorder, &mut request)?;
+        request_missed_evaluation(&mut self.session, &mut self.recorder, &mut request)?;
         let is_complete = self.turns(&mut request)?;
         let Self { mut session, mut recorder, queued_segments_max, .. } = self;
         if !is_complete {
-            // What the workers had already sent is in the checkpoint; they are not waited for.
+            // The checkpoint includes the queued segments. It does not wait for more.
             session.drain(&mut |_, _| Ok(()), queued_segments_max)?;
         }
         let before = session.learner.counters.env_failures;
         let env_failures = || before.max(supervisor.totals().env_failures);
-        let ending = Ending { is_complete, evaluate: &mut request, env_failures: &env_failures };
+        let ending =
+            SessionEnd { is_complete, evaluate: &mut request, env_failures: &env_failures };
         close(&mut session, &mut recorder, supervisor, ending)
     }
 
@@ -134,8 +136,8 @@ where
         }
     }
 
-    /// Takes over what was counted elsewhere. A checkpoint may know of more than the supervisor has
-    /// sent yet.
+    /// Copies the supervisor's totals. A checkpoint may have higher ones than the supervisor has
+    /// sent so far.
     fn take_totals(&mut self) {
         let (counters, totals) = (&mut self.session.learner.counters, self.supervisor.totals());
         counters.env_failures = counters.env_failures.max(totals.env_failures);
@@ -146,11 +148,11 @@ where
     }
 }
 
-/// Evaluates what an earlier session was stopped before it had evaluated.
+/// Requests the evaluation that is missing because an earlier session was stopped.
 ///
 /// # Errors
 /// If publishing or `evaluate` fails.
-pub fn catch_up<R: SegmentReceiver, P: ParameterPublisher>(
+pub fn request_missed_evaluation<R: SegmentReceiver, P: ParameterPublisher>(
     session: &mut Session<R, P>,
     recorder: &mut Recorder<'_>,
     evaluate: Evaluate<'_>,
@@ -162,35 +164,36 @@ pub fn catch_up<R: SegmentReceiver, P: ParameterPublisher>(
     Ok(())
 }
 
-/// What the end of a session needs.
-pub struct Ending<'a> {
-    /// Whether the run is complete; it was stopped otherwise.
+/// How a session ends.
+pub struct SessionEnd<'a> {
+    /// Whether the run is complete, or was stopped.
     pub is_complete: bool,
-    /// Has a saved policy evaluated.
+    /// Requests the evaluation of a saved policy.
     pub evaluate: Evaluate<'a>,
-    /// Failures of environments so far: their number grows while the session ends.
+    /// Returns the failures of environments so far. The last evaluation may add some.
     pub env_failures: &'a dyn Fn() -> u64,
 }
 
-/// Ends a session: the last evaluation if the run is complete, the last metrics and checkpoint.
+/// Ends a session with the last evaluation, if the run is complete, and the last metrics and
+/// checkpoint.
 ///
 /// # Errors
-/// If the last evaluation fails, or the supervisor is gone; after the checkpoint in both cases.
+/// If the last evaluation fails, or the supervisor is gone. The checkpoint is written first.
 pub fn close<R: SegmentReceiver, P: ParameterPublisher>(
     session: &mut Session<R, P>,
     recorder: &mut Recorder<'_>,
     supervisor: &dyn Supervisor,
-    ending: Ending<'_>,
+    ending: SessionEnd<'_>,
 ) -> Result<(), ServeError> {
-    let Ending { is_complete, evaluate, env_failures } = ending;
+    let SessionEnd { is_complete, evaluate, env_failures } = ending;
     let mut evaluation = Ok(());
     session.learner.counters.env_failures = env_failures();
     recorder.report_progress(&session.learner);
     if is_complete && recorder.is_unevaluated(&session.learner) {
         session.publish()?;
-        // Whatever becomes of the evaluation, the checkpoint comes first.
+        // Even if the evaluation fails, the checkpoint is written first.
         evaluation = recorder.due(Due::Evaluation, &mut session.learner, evaluate);
-        // With one process, the evaluation is over by now, and its failures are counted.
+        // In a one-process run the evaluation is finished now, and its failures count.
         session.learner.counters.env_failures = env_failures();
     }
     if recorder.is_unmeasured(&session.learner) {

@@ -1,8 +1,8 @@
-//! The learner's loop, one turn at a time: take segments, update, publish, and at their steps ask
-//! for evaluations, write metrics and checkpoints.
+//! One turn of the learner's loop: take a segment or update, publish, and report which evaluations,
+//! metrics and checkpoints are due.
 //!
-//! A turn never waits, so the same loop serves the learner process (which sleeps when a turn was
-//! idle) and the one-process run (which lets the worker act instead).
+//! A turn never waits. The learner process sleeps after an idle turn; the one-process run lets the
+//! worker act instead.
 
 use dmprl_shared::segment::{Rejection, Segment};
 use dmprl_shared::transport::{ParameterPublisher, SegmentReceiver, TransportError};
@@ -10,36 +10,36 @@ use thiserror::Error;
 
 use crate::learner::{Learner, LearnerError};
 
-/// What a turn did.
+/// The result of a turn.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Turn {
-    /// Something.
+    /// The learner took a segment or did an update.
     Worked,
-    /// Nothing: it waits for segments.
+    /// There was nothing to do until more segments arrive.
     Idle,
-    /// The run has all its steps and all the updates owed for them.
+    /// The run has all its environment steps and has done all updates.
     Finished,
 }
 
-/// What falls due as environment steps come in.
+/// An event that the caller must handle.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Due {
-    /// A line of `metrics.jsonl`.
+    /// A line of `metrics.jsonl` is due.
     Metrics,
-    /// An evaluation of the policy that has just been published.
+    /// An evaluation of the newly published policy is due.
     Evaluation,
-    /// A checkpoint.
+    /// A checkpoint is due.
     Checkpoint,
-    /// A word about the first segment that was refused for this reason.
-    Refusal(Rejection),
-    /// A word about so many segments that will never come.
+    /// The first segment was rejected for this reason.
+    Rejection(Rejection),
+    /// This many segments are lost.
     Lost(u64),
 }
 
-/// What kept something that was due from being done, in the caller's words.
+/// The error of a handler.
 pub type DueError = Box<dyn std::error::Error + Send + Sync>;
 
-/// Does what is due.
+/// Handles an event.
 pub type DueHandler<'a> = &'a mut dyn FnMut(Due, &mut Learner) -> Result<(), DueError>;
 
 /// Why the session ended early.
@@ -51,7 +51,7 @@ pub enum SessionError {
     /// The transport failed.
     #[error(transparent)]
     Transport(#[from] TransportError),
-    /// What was due could not be done.
+    /// The handler failed.
     #[error(transparent)]
     Due(DueError),
 }
@@ -66,12 +66,12 @@ pub struct Session<R, P> {
     segment: Segment,
     updates_published: u64,
     warm_up_published: bool,
-    /// Whether a checkpoint has been asked for since the log is full, lately.
-    room_asked: bool,
+    /// Whether a checkpoint was requested recently because the segment log is full.
+    checkpoint_requested: bool,
 }
 
 impl<R: SegmentReceiver, P: ParameterPublisher> Session<R, P> {
-    /// Publishes the first snapshot.
+    /// Starts a session by publishing the first snapshot.
     ///
     /// # Errors
     /// If publishing fails.
@@ -80,7 +80,7 @@ impl<R: SegmentReceiver, P: ParameterPublisher> Session<R, P> {
         let mut session = Self {
             updates_published: learner.counters.updates,
             warm_up_published: false,
-            room_asked: false,
+            checkpoint_requested: false,
             learner,
             receiver,
             publisher,
@@ -90,7 +90,7 @@ impl<R: SegmentReceiver, P: ParameterPublisher> Session<R, P> {
         Ok(session)
     }
 
-    /// Publishes the actor as it is.
+    /// Publishes the current policy.
     ///
     /// # Errors
     /// If publishing fails.
@@ -102,24 +102,24 @@ impl<R: SegmentReceiver, P: ParameterPublisher> Session<R, P> {
         Ok(())
     }
 
-    /// Frees what dead workers left; to be called a few times a second.
+    /// Frees the resources of dead workers. Call it a few times a second.
     ///
     /// # Errors
     /// If the transport fails.
     pub fn maintain(&mut self) -> Result<(), TransportError> {
-        self.room_asked = false;
+        self.checkpoint_requested = false;
         self.receiver.maintain()?;
         self.publisher.maintain()
     }
 
-    /// Takes at most one segment, or does at most one update. A full segment log makes a
-    /// checkpoint due; as long as none can be written nothing is taken, and workers wait.
+    /// Takes at most one segment or does at most one update. If the segment log is full, a
+    /// checkpoint is due; until it is written, no segment is taken and workers wait.
     ///
     /// # Errors
-    /// If learner or transport fail, or `due` does.
+    /// If the learner, the transport or `due` fails.
     pub fn turn(&mut self, due: DueHandler<'_>) -> Result<Turn, SessionError> {
-        if self.learner.inbox.is_full() && !self.room_asked {
-            self.room_asked = true;
+        if self.learner.inbox.is_full() && !self.checkpoint_requested {
+            self.checkpoint_requested = true;
             due(Due::Checkpoint, &mut self.learner).map_err(SessionError::Due)?;
         }
         if self.learner.may_take() && self.receiver.try_receive(&mut self.segment)? {
@@ -136,10 +136,10 @@ impl<R: SegmentReceiver, P: ParameterPublisher> Session<R, P> {
         Ok(if self.learner.has_all_steps() { Turn::Finished } else { Turn::Idle })
     }
 
-    /// Takes at most `segments_max` segments that are queued already, without updating.
+    /// Takes at most `segments_max` queued segments without updating.
     ///
     /// # Errors
-    /// As [`Session::turn`].
+    /// If the learner, the transport or `due` fails.
     pub fn drain(&mut self, due: DueHandler<'_>, segments_max: usize) -> Result<(), SessionError> {
         for _ in 0..segments_max {
             if self.learner.has_all_steps() || !self.receiver.try_receive(&mut self.segment)? {
@@ -159,9 +159,9 @@ impl<R: SegmentReceiver, P: ParameterPublisher> Session<R, P> {
             due(Due::Lost(lost), &mut self.learner).map_err(SessionError::Due)?;
         }
         if let Err(why) = inserted {
-            // Each is counted; the first of a kind is told aloud. Duplicates are no fault.
+            // Only the first rejection of each kind is reported. Duplicates are no fault.
             if why != Rejection::Duplicate && self.learner.counters.rejected.of(why) == 1 {
-                due(Due::Refusal(why), &mut self.learner).map_err(SessionError::Due)?;
+                due(Due::Rejection(why), &mut self.learner).map_err(SessionError::Due)?;
             }
             return Ok(());
         }
@@ -171,7 +171,7 @@ impl<R: SegmentReceiver, P: ParameterPublisher> Session<R, P> {
             self.publish()?;
         }
         let config = self.learner.config();
-        // The last evaluation, metrics line and checkpoint follow the last update.
+        // At the end of the run, these follow the last update instead.
         let crossed =
             |every: u64| before / every != after / every && after < self.learner.config().run.steps;
         let due_now = [
@@ -310,7 +310,7 @@ mod tests {
         assert_eq!(run.turn(), Turn::Worked);
         let taken = |run: &Run| run.session.learner.counters.segments;
         assert_eq!((taken(&run), run.session.learner.counters.updates), (1, 0));
-        // Two updates are owed for the first; one of them makes room for the next.
+        // Two updates are owed for the first segment; one of them makes room for the next.
         assert_eq!(run.turn(), Turn::Worked);
         assert_eq!((taken(&run), run.session.learner.counters.updates), (1, 1));
         assert_eq!(run.turn(), Turn::Worked);
@@ -344,7 +344,7 @@ mod tests {
         run.segment.header.policy_version = 1;
         (0..CAPACITY).for_each(|_| assert_eq!(run.send(), SendOutcome::Delivered));
         assert_eq!(run.turns(), Turn::Idle);
-        // Two epochs of two minibatches of the first three; the fourth came too late.
+        // Two epochs of two minibatches of the first three segments; the fourth came too late.
         let counters = run.session.learner.counters;
         assert_eq!((counters.segments, counters.stale_segments), (4, 1));
         assert_eq!((counters.env_steps, counters.updates), (20, 4));
@@ -366,7 +366,7 @@ mod tests {
         run.segment.header.run_id = 2;
         run.send();
         assert_eq!(run.turns(), Turn::Idle);
-        assert_eq!(run.due, [(Due::Refusal(Rejection::Run), 0)]);
+        assert_eq!(run.due, [(Due::Rejection(Rejection::Run), 0)]);
         run.send();
         assert_eq!(run.turns(), Turn::Idle);
         assert_eq!(run.due.len(), 1, "the second of a kind is only counted");
@@ -409,7 +409,7 @@ mod tests {
         let line = run.session.learner.metrics_line();
         assert_eq!((line.episodes, line.hindsight_segments, line.lost), (1, 3, 0));
         assert_eq!(line.updates_owed, 0.0);
-        // Their numbers count as any: one used before is refused, one left out is missed.
+        // Their sequence numbers count: a used one is rejected, a missing one is lost.
         run.segment.header.sequence -= 1;
         run.send();
         run.segment.header.sequence += 1;

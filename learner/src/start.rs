@@ -1,4 +1,4 @@
-//! How a learner begins: new, with another policy's parameters, from demonstrations, or from a
+//! Makes a run's learner: new, with another policy's parameters, from demonstrations, or from a
 //! checkpoint and the segments logged since.
 
 use std::path::{Path, PathBuf};
@@ -11,36 +11,37 @@ use dmprl_shared::transport::delivery::{LogError, LogIdentity, Replayed, Segment
 use thiserror::Error;
 
 use crate::checkpoint::{self, CheckpointError};
-use crate::demonstrations::{DemonstrationError, Steps, Summary};
+use crate::demonstrations::{Demonstration, DemonstrationError, DemonstrationSummary};
 use crate::learner::{Learner, LearnerError};
+use crate::off_policy::CloningLosses;
 
-/// Why a learner could not begin.
+/// Why a learner could not start.
 #[derive(Debug, Error)]
 pub enum StartError {
-    /// It cannot be made.
+    /// The learner cannot be made.
     #[error(transparent)]
     Learner(#[from] LearnerError),
-    /// No checkpoint can be used.
+    /// No checkpoint is usable.
     #[error(transparent)]
     Checkpoint(#[from] CheckpointError),
     /// The demonstrations cannot be used.
     #[error(transparent)]
     Demonstrations(#[from] DemonstrationError),
     /// The policy file to start from cannot be used.
-    #[error("cannot start from {}", path.display())]
+    #[error("cannot start from the policy file {}", path.display())]
     Policy {
         /// The file.
         path: PathBuf,
-        /// Why not.
+        /// The reason.
         #[source]
         cause: PolicyFileError,
     },
     /// The segment log cannot be used.
-    #[error("cannot use {}", path.display())]
+    #[error("cannot use the segment log {}", path.display())]
     Log {
         /// The file.
         path: PathBuf,
-        /// Why not.
+        /// The reason.
         #[source]
         cause: LogError,
     },
@@ -49,30 +50,30 @@ pub enum StartError {
     Report(#[from] ReportError),
 }
 
-/// What a learner begins from.
+/// What a learner starts from.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Origin<'a> {
-    /// Nothing, or the parameters of this policy file; and the configuration's demonstrations.
+    /// New networks or the parameters of this policy file, and the configured demonstrations.
     New(Option<&'a Path>),
     /// The newest usable checkpoint in this folder.
     Checkpoint(&'a Path),
 }
 
-/// A run, as far as its learner must know it.
+/// A run, as its learner needs it.
 #[derive(Debug, Clone, Copy)]
 pub struct Run<'a> {
     /// The experiment.
     pub config: &'a ExperimentConfig,
-    /// What the environments are.
+    /// Properties of the environments.
     pub spec: &'a EnvSpec,
-    /// The run's number.
+    /// The run's id, which its segments carry.
     pub run_id: u64,
 }
 
-/// Makes the learner of a run. Warns of each checkpoint that it had to reject.
+/// Makes the learner of a run. Warns about each rejected checkpoint.
 ///
 /// # Errors
-/// If it cannot be made from `origin`, or the supervisor is gone.
+/// If the learner cannot be made from `origin`, or the supervisor is gone.
 pub fn learner(
     run: Run<'_>,
     origin: Origin<'_>,
@@ -83,8 +84,8 @@ pub fn learner(
         Origin::New(policy) => policy,
         Origin::Checkpoint(folder) => {
             let (learner, loaded) = checkpoint::load_newest(folder, &fresh)?;
-            for error in loaded.refused {
-                let message = format!("a checkpoint is refused, an older one is used: {error}");
+            for error in loaded.rejected {
+                let message = format!("a checkpoint was rejected, an older one is used: {error}");
                 eprintln!("{message}");
                 supervisor.report(&Report::Warning { message })?;
             }
@@ -104,14 +105,14 @@ pub fn learner(
     Ok(learner)
 }
 
-/// Starts from the configuration's demonstrations; returns a sentence about them.
+/// Trains the learner on the configured demonstrations. Returns a summary for the user.
 fn demonstrate(learner: &mut Learner, run: Run<'_>) -> Result<String, StartError> {
     let files = &run.config.demonstrations.files;
-    let read = |file| Steps::read(Path::new(file), run.spec, learner.policy());
+    let read = |file| Demonstration::read(Path::new(file), run.spec, learner.policy());
     let demonstrations = files.iter().map(read).collect::<Result<Vec<_>, _>>()?;
-    let loss = learner.demonstrate(&demonstrations)?;
-    let summaries = demonstrations.iter().map(Steps::summary);
-    let all = summaries.fold(Summary::default(), |sum, more| Summary {
+    let losses = learner.demonstrate(&demonstrations)?;
+    let summaries = demonstrations.iter().map(Demonstration::summary);
+    let all = summaries.fold(DemonstrationSummary::default(), |sum, more| DemonstrationSummary {
         episodes: sum.episodes + more.episodes,
         steps: sum.steps + more.steps,
         rewards: sum.rewards + more.rewards,
@@ -119,19 +120,18 @@ fn demonstrate(learner: &mut Learner, run: Run<'_>) -> Result<String, StartError
     let mean = all.rewards / all.episodes as f64;
     let shown =
         format!("{} demonstrated steps in {} episodes, return {mean:.2}", all.steps, all.episodes);
-    Ok(match loss {
+    Ok(match losses {
         None => shown,
-        Some((first, last)) => format!(
-            "{shown}; the policy imitates them (mean squared error {first:.3}, then {last:.3})"
+        Some(CloningLosses { first, last }) => format!(
+            "{shown}; the policy imitates them (mean squared error from {first:.3} to {last:.3})"
         ),
     })
 }
 
-/// At delivery level `log`, inserts the segments that came after the checkpoint, from the log at
-/// `path`.
+/// Inserts the segments that were logged at `path` after the checkpoint, at delivery level `log`.
 ///
 /// # Errors
-/// If the log cannot be used, or the supervisor is gone.
+/// If the log is unusable, or the supervisor is gone.
 pub fn recover(
     learner: &mut Learner,
     run_id: u64,
@@ -150,7 +150,8 @@ pub fn recover(
     if replayed != Replayed::default() {
         let Replayed { records, cut_bytes } = replayed;
         let message = format!(
-            "{records} segments read from the segment log, {cut_bytes} bytes of a torn one cut off"
+            "{records} segments read from the segment log, {cut_bytes} bytes of an incomplete \
+             record cut off"
         );
         eprintln!("{message}");
         supervisor.report(&Report::Warning { message })?;

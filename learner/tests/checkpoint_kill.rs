@@ -1,5 +1,4 @@
-//! A learner killed while it writes checkpoints, at every point at which it can be: real processes,
-//! real SIGKILLs, and what they leave.
+//! Kills a learner with SIGKILL at every point of writing a checkpoint, and checks what remains.
 
 #![allow(clippy::unwrap_used, reason = "a test's helpers fail the test")]
 
@@ -22,20 +21,21 @@ const FOLDER: &str = "DMPRL_TEST_FOLDER";
 const RUN_ID: u64 = 5;
 /// Segments between two checkpoints.
 const INTERVAL: u64 = 16;
-/// Kills at least, and until every point has been met, but no more than [`KILLS_MAX`].
+/// Minimum number of kills. The test goes on until every point was hit, up to [`KILLS_MAX`].
 const KILLS_MIN: u32 = 40;
 const KILLS_MAX: u32 = 2_000;
-/// Files below `latest`, where it is a folder: the writer removes them between renaming the
-/// checkpoint and pointing to it.
-const CROWD: u32 = 1_000;
-/// A learner is killed within this time after it has begun to work.
+/// Files in `latest` if it is a folder. The writer deletes them between renaming the checkpoint and
+/// pointing `latest` at it, which takes long enough to be hit.
+const LATEST_FILES: u32 = 1_000;
+/// A learner is killed at a random time within this limit after its first acknowledgement.
 const KILLED_WITHIN_US: u64 = 3_000;
-/// What a learner is to be killed at the sight of comes within this time, or has been missed.
+/// Maximum wait for the file whose appearance triggers a kill; after that it has been missed.
 const LOOKED_FOR: Duration = Duration::from_millis(50);
-/// No test waits longer, on any machine.
-const PATIENCE: Duration = Duration::from_secs(60);
-/// Head of the segment log, and of a record, before the segment's header [bytes].
+/// Maximum wait for a learner's first acknowledgement.
+const ACKNOWLEDGED_WITHIN: Duration = Duration::from_secs(60);
+/// Length of the segment log's header [bytes].
 const LOG_HEAD: usize = 32;
+/// Length of a record before the segment's header [bytes].
 const RECORD_HEAD: usize = 8;
 
 fn fresh() -> Result<Learner, LearnerError> {
@@ -65,7 +65,7 @@ fn fresh() -> Result<Learner, LearnerError> {
     Learner::new(layers.finish().unwrap(), &spec, RUN_ID)
 }
 
-/// The segment of this number, always the same.
+/// Returns the segment with this sequence number, always the same.
 fn segment(learner: &Learner, sequence: u64) -> Segment {
     let layout = learner.policy().layout();
     let mut segment = Segment::zeroed(layout);
@@ -95,7 +95,7 @@ fn log_path(folder: &Path) -> PathBuf {
     folder.join("segments.log")
 }
 
-/// As the learner's role recovers: the newest usable checkpoint, then the log.
+/// Recovers like the program's learner: the newest usable checkpoint, then the log.
 fn recovered(folder: &Path) -> Learner {
     let mut learner = match names(&checkpoints(folder)).unwrap().is_empty() {
         true => fresh().unwrap(),
@@ -124,8 +124,8 @@ fn another_process_plays_the_learner() {
         learner.insert(&segment(&learner, next)).unwrap();
         let mark = learner.inbox.acknowledge().unwrap()[0].sequence;
         acknowledged.write_all_at(&mark.to_le_bytes(), 0).unwrap();
-        if let Some(ended) = writer.poll(&mut learner) {
-            ended.written.unwrap();
+        if let Some(outcome) = writer.poll(&mut learner) {
+            outcome.result.unwrap();
         }
         if !writer.is_busy() && next.is_multiple_of(INTERVAL) {
             writer.begin(&mut learner).unwrap();
@@ -145,7 +145,7 @@ impl Process {
 }
 
 impl Drop for Process {
-    /// SIGKILL, and gone.
+    /// Kills the process and waits for it.
     fn drop(&mut self) {
         let _ = self.0.kill();
         let _ = self.0.wait();
@@ -157,16 +157,16 @@ fn acknowledged(folder: &Path) -> u64 {
     u64::from_le_bytes(bytes.try_into().unwrap())
 }
 
-/// At which points learners were killed, as what they left says.
+/// Numbers of kills at each point, inferred from the files that remained.
 #[derive(Debug, Default)]
-struct Met {
+struct PointsHit {
     in_the_middle: u32,
     before_the_rename: u32,
     before_latest: u32,
     before_the_log_forgot: u32,
 }
 
-impl Met {
+impl PointsHit {
     fn all(&self) -> bool {
         let counts = [
             self.in_the_middle,
@@ -177,7 +177,7 @@ impl Met {
         counts.iter().all(|&count| count > 0)
     }
 
-    fn look(&mut self, folder: &Path) {
+    fn inspect(&mut self, folder: &Path) {
         let checkpoints = checkpoints(folder);
         let state = |name: &str| -> Option<Value> {
             serde_json::from_slice(&fs::read(checkpoints.join(name).join("state.json")).ok()?).ok()
@@ -200,7 +200,7 @@ impl Met {
     }
 }
 
-/// A folder whose files cost no disk, where the system has one.
+/// Makes a folder in memory, if the system has one.
 fn folder() -> tempfile::TempDir {
     let memory = Path::new("/dev/shm");
     let parent = if memory.is_dir() { memory.to_owned() } else { std::env::temp_dir() };
@@ -212,8 +212,8 @@ fn folder() -> tempfile::TempDir {
     folder
 }
 
-/// What a learner is killed at the sight of; none: at any moment.
-fn moment(folder: &Path, kill: u32) -> Option<PathBuf> {
+/// Returns the file whose appearance triggers the kill, or `None` for a random time.
+fn trigger(folder: &Path, kill: u32) -> Option<PathBuf> {
     let checkpoints = checkpoints(folder);
     let newest = names(&checkpoints).unwrap().pop().map_or(0, |name| name.parse().unwrap());
     let next: u64 = newest + 1;
@@ -223,17 +223,17 @@ fn moment(folder: &Path, kill: u32) -> Option<PathBuf> {
         1 => Some(written.join("replay.bin")),
         2 => Some(written.join("state.json")),
         _ => {
-            crowd(&checkpoints.join("latest"));
+            fill_latest(&checkpoints.join("latest"));
             Some(checkpoints.join(format!("{next:06}")))
         }
     }
 }
 
-/// Makes `latest` a folder with many files, as in a copy made without symbolic links.
-fn crowd(latest: &Path) {
+/// Replaces `latest` by a folder with many files, like a copy made without symbolic links.
+fn fill_latest(latest: &Path) {
     let _ = fs::remove_file(latest).or_else(|_| fs::remove_dir_all(latest));
     fs::create_dir(latest).unwrap();
-    (0..CROWD).for_each(|index| fs::write(latest.join(index.to_string()), "").unwrap());
+    (0..LATEST_FILES).for_each(|index| fs::write(latest.join(index.to_string()), "").unwrap());
 }
 
 fn replay_bytes(learner: &Learner) -> Vec<u8> {
@@ -246,36 +246,36 @@ fn replay_bytes(learner: &Learner) -> Vec<u8> {
 fn killed_at_any_point_of_a_checkpoint_it_has_everything_once() {
     let folder = folder();
     let folder = folder.path();
-    // Never killed: what each of the others must be.
+    // Never killed; every recovered learner must equal it.
     let mut reference = fresh().unwrap();
-    let mut met = Met::default();
+    let mut hit = PointsHit::default();
     let mut kills = 0;
-    while kills < KILLS_MIN || !met.all() && kills < KILLS_MAX {
+    while kills < KILLS_MIN || !hit.all() && kills < KILLS_MAX {
         let before = acknowledged(folder);
-        let moment = moment(folder, kills);
+        let trigger = trigger(folder, kills);
         let mut process = Process::start(folder);
         let started = Instant::now();
         while acknowledged(folder) == before {
-            assert_eq!(process.0.try_wait().unwrap(), None, "it ended by itself");
-            assert!(started.elapsed() < PATIENCE, "it acknowledged nothing");
+            assert_eq!(process.0.try_wait().unwrap(), None, "the learner exited");
+            assert!(started.elapsed() < ACKNOWLEDGED_WITHIN, "the learner acknowledged nothing");
             std::thread::yield_now();
         }
-        match &moment {
+        match &trigger {
             Some(path) => {
-                // It may have come and gone already: then it is any moment.
+                // The file may be gone already; then this kills at a random time.
                 let begun = Instant::now();
                 while path.symlink_metadata().is_err() && begun.elapsed() < LOOKED_FOR {
                     std::hint::spin_loop();
                 }
             }
-            // The moment is the fault that is injected, not what the test relies on.
+            // The time of the kill is the injected fault; the test does not depend on it.
             None => std::thread::sleep(Duration::from_micros(
                 u64::from(kills) * 7_919 % KILLED_WITHIN_US,
             )),
         }
         drop(process);
         kills += 1;
-        met.look(folder);
+        hit.inspect(folder);
         let learner = recovered(folder);
         let has = settled(&learner);
         assert!(has >= acknowledged(folder), "{has} of {}", acknowledged(folder));
@@ -286,6 +286,6 @@ fn killed_at_any_point_of_a_checkpoint_it_has_everything_once() {
         assert_eq!((settled(&reference), counters.segments, counters.lost), (has, has, 0));
         assert!(replay_bytes(&learner) == replay_bytes(&reference), "after {kills} kills");
     }
-    println!("{kills} kills: {met:?}");
-    assert!(met.all(), "a point was never met in {kills} kills: {met:?}");
+    println!("{kills} kills: {hit:?}");
+    assert!(hit.all(), "a point was never hit in {kills} kills: {hit:?}");
 }

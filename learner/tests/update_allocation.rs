@@ -1,4 +1,4 @@
-//! What an update allocates after the first ones.
+//! Checks that an update allocates nothing once its buffers exist.
 
 #![allow(clippy::unwrap_used, reason = "a test's helpers fail the test")]
 
@@ -9,7 +9,7 @@ mod skipped;
 
 use counting_allocator::allocations_of;
 use dmprl_learner::algorithms::{Algorithm, Batch};
-use dmprl_learner::demonstrations::Steps;
+use dmprl_learner::demonstrations::Demonstration;
 use dmprl_learner::learner::Learner;
 use dmprl_learner::update::kernels::bf16::Bf16;
 use dmprl_shared::config::{Layers, Limits};
@@ -31,16 +31,25 @@ fn spec() -> EnvSpec {
     }
 }
 
-/// Allocations of twenty updates, after some.
-fn allocations([algorithm, policy, norm]: [&str; 3], precision: &str, threads: &str) -> u64 {
+/// What an update computes.
+#[derive(Debug, Clone, Copy)]
+struct Case {
+    algorithm: &'static str,
+    policy: &'static str,
+    layer_norm: &'static str,
+}
+
+/// Returns the allocations of twenty updates, after the first four.
+fn allocations(case: Case, precision: &str, threads: &str) -> u64 {
+    let Case { algorithm, policy, layer_norm } = case;
     let mut layers = Layers::new();
     let keys = [
         ("algorithm.name", algorithm),
         ("policy.kind", policy),
-        ("algorithm.critic_layer_norm", norm),
+        ("algorithm.critic_layer_norm", layer_norm),
         ("learner.precision", precision),
         ("learner.threads", threads),
-        // Three blocks, the last short and of an odd number of rows.
+        // Three shards; the last is short and has an odd number of rows.
         ("algorithm.batch_size", "133"),
     ];
     for (key, value) in keys {
@@ -61,11 +70,11 @@ fn allocations([algorithm, policy, norm]: [&str; 3], precision: &str, threads: &
     allocations_of(|| (5..25).for_each(&mut update))
 }
 
-/// Allocations of twenty segments and the updates that they make due, sampling and normalising
-/// included, after as many as make every buffer.
+/// Returns the allocations of twenty segments and the updates owed for them, including sampling and
+/// normalisation, after enough segments that all buffers exist.
 fn allocations_of_a_learner(algorithm: &str) -> u64 {
     let mut layers = Layers::new();
-    // On-policy there is no price on changes.
+    // On-policy algorithms have no penalty on action changes.
     let penalty = if algorithm == "ndp" { "0.0" } else { "0.2" };
     let keys = [
         ("algorithm.name", algorithm),
@@ -109,20 +118,20 @@ fn allocations_of_a_learner(algorithm: &str) -> u64 {
             updates += 1;
         }
     };
-    // Mean and scale are taken anew at each doubling of what was seen, the last time before 40.
+    // The normalisation is updated at each doubling of the observations, last before segment 40.
     (1..=40).for_each(&mut turn);
     let allocated = allocations_of(|| (41..=60).for_each(&mut turn));
     assert!(updates >= 60, "{algorithm}: {updates} updates show nothing");
     allocated
 }
 
-/// Allocations of twenty updates of an actor that imitates beside them, after some.
+/// Returns the allocations of twenty updates of an actor that also imitates, after the first four.
 fn allocations_of_imitation() -> u64 {
     let mut layers = Layers::new();
     layers.set("test", "demonstrations.files", "['some.npz']").unwrap();
     layers.set("test", "demonstrations.cloning_updates", "1").unwrap();
     let mut learner = Learner::new(layers.finish().unwrap(), &spec(), 1).unwrap();
-    let mut steps = Steps {
+    let mut steps = Demonstration {
         observations: vec![0.1; 30 * 9],
         actions: vec![0.2; 30 * 2],
         rewards: vec![0.3; 30],
@@ -136,7 +145,7 @@ fn allocations_of_imitation() -> u64 {
     allocations_of(|| (5..25).for_each(|_| learner.update().unwrap()))
 }
 
-/// Alone in its binary: the counter sees every thread.
+/// The only test of its binary, because the counter covers all threads.
 #[test]
 fn no_update_allocates_once_its_buffers_are_made() {
     let has_bf16 = Bf16::detect().is_some();
@@ -145,11 +154,12 @@ fn no_update_allocates_once_its_buffers_are_made() {
         assert_eq!(allocations_of_a_learner(algorithm), 0, "a learner of {algorithm}");
     }
     for algorithm in ["ddpg", "td3", "sac"] {
-        for (policy, norm) in [("dmp", "false"), ("mlp", "false"), ("mlp", "true")] {
-            let what = [algorithm, policy, norm];
+        for (policy, layer_norm) in [("dmp", "false"), ("mlp", "false"), ("mlp", "true")] {
+            let what = Case { algorithm, policy, layer_norm };
             assert_eq!(allocations(what, "f32", "2"), 0, "{what:?}");
             if has_bf16 {
-                // On one thread: each has a buffer for pairs, made when it first has work.
+                // On one thread, because each thread allocates its buffer for pairs at its first
+                // part.
                 assert_eq!(allocations(what, "bf16", "1"), 0, "{what:?} bf16");
             }
         }

@@ -43,7 +43,7 @@ fn check_checkpoint(
     let fresh = || Learner::new(setup.config.clone(), &spec, setup.run_id);
     let (learner, loaded) = checkpoint::load_newest(&setup.run.checkpoints_path(), &fresh)?;
     violations
-        .extend(loaded.refused.iter().map(|why| format!("I5: a checkpoint is refused: {why}")));
+        .extend(loaded.rejected.iter().map(|why| format!("I5: a checkpoint is refused: {why}")));
     let (found, expected) = (Standing::from(&learner.counters), checker.standing());
     // Updates are only in metrics.jsonl: the journal counts segments.
     if (found.env_steps, found.segments) != (expected.env_steps, expected.segments) {

@@ -2,7 +2,7 @@
 //! `dmprl_learner::serve`.
 
 use anyhow::Context;
-use dmprl_learner::learner::Learner;
+use dmprl_learner::learner::{InsertObserver, Learner};
 use dmprl_learner::recorder::Recorder;
 use dmprl_learner::serve::Server;
 use dmprl_learner::session::Session;
@@ -50,13 +50,13 @@ fn note_all(learner: &mut Learner, journal: &Journal) {
     }
     journal.note(Entry::Started((&learner.counters).into()));
     let journal = journal.clone();
-    learner.witness.0 = Some(Box::new(move |segment, inserted| {
+    learner.insert_observer = InsertObserver::new(move |segment, inserted| {
         let piece = Piece::of(&segment.header, &segment.block);
         journal.note(match inserted {
             Ok(()) => Entry::Inserted(piece),
             Err(why) => Entry::Refused(piece, why == Rejection::Duplicate),
         });
-    }));
+    });
 }
 
 /// Creates the learner that the arguments describe. For a resumed run, removes evaluation rows that

@@ -6,15 +6,15 @@ use std::path::PathBuf;
 
 use anyhow::Context;
 use dmprl_learner::learner::Counters;
-use dmprl_learner::recorder::{Past, RunFiles};
+use dmprl_learner::recorder::{PreviousSessions, RunFiles};
 use dmprl_learner::session::DueError;
 
 use crate::journal::{Entry, Journal};
 use crate::run_directory::{RunDirectory, replace_file};
 
-/// Reads from the run's rows where its earlier sessions ended.
-pub fn past(run: &RunDirectory) -> anyhow::Result<Past> {
-    Ok(Past {
+/// Reads from the run\'s rows where its earlier sessions ended.
+pub fn past(run: &RunDirectory) -> anyhow::Result<PreviousSessions> {
+    Ok(PreviousSessions {
         wall_s: run.wall_s_before()?,
         measured: run.measured_steps()?,
         evaluated: run.latest_row()?.map(|row| row.env_steps),

@@ -14,7 +14,7 @@ use dmprl_actors::rollout::{Identity, Rollout, RolloutError};
 use dmprl_actors::worker;
 use dmprl_learner::learner::Learner;
 use dmprl_learner::recorder::Recorder;
-use dmprl_learner::serve::{Ending, catch_up, close};
+use dmprl_learner::serve::{SessionEnd, close, request_missed_evaluation};
 use dmprl_learner::session::{Due, Session, Turn};
 use dmprl_shared::config::RunConfig;
 use dmprl_shared::supervision::Supervisor;
@@ -67,7 +67,7 @@ pub fn run(args: &LearnerArgs, control: &ControlPipe) -> anyhow::Result<()> {
     let evaluations = Evaluations { config, policy_path: &policy_path, stop };
     let mut inline = InlineEvaluator { evaluator, evaluations, setup, control, reached, failures };
     let mut evaluate = |request: EvaluationRequest| inline.evaluate(&request).map_err(Into::into);
-    catch_up(&mut session, &mut recorder, &mut evaluate)?;
+    request_missed_evaluation(&mut session, &mut recorder, &mut evaluate)?;
     let mut first = true;
     let is_complete = loop {
         let mut due = |due: Due, learner: &mut Learner| {
@@ -100,7 +100,7 @@ pub fn run(args: &LearnerArgs, control: &ControlPipe) -> anyhow::Result<()> {
         }
     };
     let env_failures = || failures.get();
-    let ending = Ending { is_complete, evaluate: &mut evaluate, env_failures: &env_failures };
+    let ending = SessionEnd { is_complete, evaluate: &mut evaluate, env_failures: &env_failures };
     Ok(close(&mut session, &mut recorder, control, ending)?)
 }
 

@@ -1,4 +1,4 @@
-//! A batch of windows, sampled straight into the buffers that the update reads.
+//! A batch of windows, sampled directly into the buffers that the update reads.
 
 use dmprl_shared::config::{AlgorithmConfig, AlgorithmName, CriticInput, Target};
 use dmprl_shared::policy::Policy;
@@ -9,42 +9,42 @@ use thiserror::Error;
 use crate::normaliser::Normaliser;
 use crate::replay::{Replay, Sampler};
 
-/// The replay holds no window to learn from.
+/// The replay has no window to learn from.
 #[derive(Debug, Error)]
 #[error(
     "the replay holds {segments} segments but no window of {steps} steps; episodes that a time \
-     limit ends sooner cannot be learned from: lower policy.segment_steps"
+     limit ends earlier cannot be used: lower policy.segment_steps"
 )]
 pub struct NoWindow {
-    /// Segments held.
+    /// Segments in the replay.
     pub segments: usize,
-    /// K.
+    /// Steps of a window, K.
     pub steps: usize,
 }
 
-/// What the critic's input is made of.
+/// Sizes of a batch and of the critic's input.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct BatchShape {
-    /// B.
+    /// Rows of the batch, B.
     pub rows: usize,
-    /// O, the DMP state included when carried.
+    /// Length O of an observation, including the DMP state if it is carried.
     pub observation_len: usize,
-    /// Actions the critic sees: A times K or 1.
+    /// Numbers of the actions that the critic sees: A times K or 1.
     pub actions_len: usize,
-    /// (y_K, yd_K/omega) behind the actions when the DMP state is carried: 2A or 0.
+    /// Length of (y_K, yd_K/omega), which follows the actions if the DMP state is carried: 2A or 0.
     pub end_state_len: usize,
-    /// A whole segment's actions, K A.
+    /// Numbers of a whole segment's actions, K A.
     pub segment_actions_len: usize,
-    /// A.
+    /// Length A of an action.
     pub action_len: usize,
-    /// Whether the target draws noise: TD3 and SAC.
+    /// Whether the target needs noise (TD3 and SAC).
     pub next_noise: bool,
-    /// Whether the actor's step does: SAC.
+    /// Whether the actor's step needs noise (SAC).
     pub noise: bool,
 }
 
 impl BatchShape {
-    /// The shape that algorithm and policy imply.
+    /// Derives the sizes from algorithm and policy.
     #[must_use]
     pub fn new(config: &AlgorithmConfig, policy: &Policy) -> Self {
         let layout = policy.layout();
@@ -55,7 +55,7 @@ impl BatchShape {
             rows: config.batch_size,
             observation_len: layout.observation_len,
             actions_len: if whole { segment_actions_len } else { layout.action_len },
-            // A critic of the first action alone judges nothing that comes after it.
+            // A critic of the first action only does not evaluate the rest of the segment.
             end_state_len: if whole { carried } else { 0 },
             segment_actions_len,
             action_len: layout.action_len,
@@ -64,7 +64,7 @@ impl BatchShape {
         }
     }
 
-    /// Width of the critic's input: observation, actions, end state.
+    /// Returns the width of the critic's input: observation, actions, end state.
     #[must_use]
     pub fn critic_inputs(&self) -> usize {
         self.observation_len + self.actions_len + self.end_state_len
@@ -74,54 +74,73 @@ impl BatchShape {
 /// A sampled batch.
 #[derive(Debug)]
 pub struct Batch {
-    /// s_t as the environment and the DMP know it, (B, O).
+    /// s_t in the units of environment and DMP, (B, O).
     pub observations: Vec<f32>,
-    /// s_t as the networks see it: normalised, where that is asked for, (B, O).
+    /// s_t as network input, normalised if configured, (B, O).
     pub inputs: Vec<f32>,
-    /// [s_t as the networks see it, actions, end state], (B, critic inputs).
+    /// Critic inputs: s_t as network input, actions, end state, (B, critic inputs).
     pub critic_inputs: Vec<f32>,
-    /// Sum of the window's rewards, discounted or not as the target wants it, (B,).
+    /// Sum of the window's rewards, discounted if the target is `n_step`, (B,).
     pub rewards: Vec<f32>,
-    /// What multiplies Q' in the target: 0 where the episode terminated, (B,).
+    /// Factor of Q' in the target, 0 where the episode terminated, (B,).
     pub bootstrap: Vec<f32>,
-    /// The observation that the target bootstraps from, (B, O).
+    /// Observation from which the target bootstraps, (B, O).
     pub next_observations: Vec<f32>,
-    /// The same as the networks see it, (B, O).
+    /// The same observation as network input, (B, O).
     pub next_inputs: Vec<f32>,
-    /// Standard normal noise for the actions after the window, (B, K A), or none.
+    /// Standard normal noise for the actions after the window, (B, K A), or empty.
     pub next_noise: Vec<f32>,
-    /// Standard normal noise for the actor's own actions, (B, K A), or none.
+    /// Standard normal noise for the actor's own actions, (B, K A), or empty.
     pub noise: Vec<f32>,
-    /// u_{t-1}, (B, A), where there was one; only filled where an action's change has a price.
+    /// u_{t-1}, (B, A), if it exists. Filled only with `algorithm.action_rate_penalty`.
     pub previous_actions: Vec<f32>,
-    /// 1 where there was one, 0 where the episode began or the replay no longer has it, (B,).
+    /// 1 if u_{t-1} exists, 0 if the episode began or the replay no longer has it, (B,).
     pub has_previous: Vec<f32>,
     actions: Vec<f32>,
 }
 
-/// The same states as the DMP knows them and as the networks see them, (B, O) each.
+/// The same states in the units of the DMP and as network inputs, (B, O) each.
 #[derive(Debug, Clone, Copy)]
 pub struct States<'a> {
-    /// As they are.
+    /// In the units of environment and DMP.
     pub observations: &'a [f32],
-    /// Normalised, where that is asked for.
+    /// As network inputs, normalised if configured.
     pub inputs: &'a [f32],
 }
 
+/// What a batch is sampled from.
+#[derive(Debug)]
+pub struct SampleSource<'a> {
+    /// The experience.
+    pub replay: &'a Replay,
+    /// Draws the windows.
+    pub sampler: &'a mut Sampler,
+    /// Normalises network inputs, if configured.
+    pub normaliser: Option<&'a Normaliser>,
+}
+
+impl SampleSource<'_> {
+    /// Borrows the source again, for one of several samples.
+    pub fn reborrow(&mut self) -> SampleSource<'_> {
+        let Self { replay, sampler, normaliser } = self;
+        SampleSource { replay, sampler, normaliser: *normaliser }
+    }
+}
+
 impl Batch {
-    /// s_t.
+    /// Returns the states s_t.
     #[must_use]
     pub fn states(&self) -> States<'_> {
         States { observations: &self.observations, inputs: &self.inputs }
     }
 
-    /// What the target bootstraps from.
+    /// Returns the states from which the target bootstraps.
     #[must_use]
     pub fn next_states(&self) -> States<'_> {
         States { observations: &self.next_observations, inputs: &self.next_inputs }
     }
 
-    /// Buffers for one batch.
+    /// Allocates the buffers of one batch.
     #[must_use]
     pub fn new(shape: BatchShape) -> Self {
         let actions_len = shape.rows * shape.segment_actions_len;
@@ -142,11 +161,12 @@ impl Batch {
         }
     }
 
-    /// Fills the batch.
+    /// Samples windows into the batch. `omega` is the DMP's.
     ///
-    /// `n_step`: rewards are discounted per step and bootstrap is discount^n (1 - terminated)
-    /// from s_{t+n}. `literal`: the plain sum of the rewards, and discount (1 - terminated) from
-    /// s_{t+1}. A truncated episode bootstraps like any other step.
+    /// With target `n_step`, rewards are discounted per step and bootstrap is discount^n (1 -
+    /// terminated) from s_{t+n}. With `literal`, rewards are summed without discount and bootstrap
+    /// is discount (1 - terminated) from s_{t+1}. A truncated episode bootstraps like any other
+    /// step.
     ///
     /// # Errors
     /// [`NoWindow`] if there is nothing to sample.
@@ -155,9 +175,10 @@ impl Batch {
         shape: BatchShape,
         config: &AlgorithmConfig,
         omega: f32,
-        normaliser: Option<&Normaliser>,
-        (replay, sampler): (&Replay, &mut Sampler),
+        source: &mut SampleSource<'_>,
     ) -> Result<(), NoWindow> {
+        let SampleSource { replay, sampler, normaliser } = source;
+        let (replay, normaliser) = (*replay, *normaliser);
         let discount = config.discount as f32;
         let o = shape.observation_len;
         for row in 0..shape.rows {
@@ -199,7 +220,7 @@ impl Batch {
                 }
             }
             if shape.end_state_len > 0 {
-                // The carried state is the tail of the observation after the window.
+                // The carried state is the end of the observation after the window.
                 let dims = shape.end_state_len / 2;
                 let state = &replay.last_observation(&window)[o - 2 * dims..];
                 let end = &mut input[o + shape.actions_len..];
@@ -238,7 +259,7 @@ mod tests {
         noise: false,
     };
 
-    /// An episode of three steps: s_t = 10 e + t, u_t = (t + 1) / 10, r_t = 1, 10, 100.
+    /// Inserts an episode e of three steps: s_t = 10 e + t, u_t = (t + 1) / 10, r_t = 1, 10, 100.
     fn episode(replay: &mut Replay, episode: u32, flag: u32) {
         let first = 10.0 * episode as f32;
         let whole = [first, first + 1.0, first + 2.0, 0.1, 0.2, 1.0, 10.0];
@@ -255,14 +276,16 @@ mod tests {
         }
     }
 
-    /// (s_t, u of the window, reward, bootstrap, s to bootstrap from) of everything drawn, once.
+    /// (s_t, actions of the window, reward, bootstrap, state to bootstrap from).
     type Row = (f32, [f32; 2], f32, f32, f32);
 
+    /// Returns the distinct rows of a batch.
     fn rows(replay: &Replay, windows: Windows, target: Target) -> Vec<Row> {
         let config = AlgorithmConfig { target, discount: 0.5, ..AlgorithmConfig::default() };
         let mut sampler = Sampler::new(windows, dmprl_shared::seeds::stream(1, "test", 0));
         let mut batch = Batch::new(SHAPE);
-        batch.sample(SHAPE, &config, 1.0, None, (replay, &mut sampler)).unwrap();
+        let mut source = SampleSource { replay, sampler: &mut sampler, normaliser: None };
+        batch.sample(SHAPE, &config, 1.0, &mut source).unwrap();
         let mut rows: Vec<Row> = (0..SHAPE.rows)
             .map(|row| {
                 let input = &batch.critic_inputs[3 * row..3 * row + 3];
@@ -313,7 +336,7 @@ mod tests {
 
     #[test]
     fn a_wrapped_ring_learns_from_what_it_holds_and_mixes_no_episodes() {
-        // Three slots: the second episode took the place of the first one's whole segment.
+        // With three slots, the second episode replaces the whole segment of the first.
         let replay = replay(3, &[(0, TERMINATED), (1, TRUNCATED)]);
         let expected = [
             (2.0, [0.3, 0.0], 100.0, 0.0, 3.0),
@@ -329,7 +352,8 @@ mod tests {
         let replay = replay(9, &[(0, TERMINATED)]);
         let mut sampler = Sampler::new(Windows::Sliding, dmprl_shared::seeds::stream(1, "test", 0));
         let mut batch = Batch::new(SHAPE);
-        batch.sample(SHAPE, &config, 1.0, None, (&replay, &mut sampler)).unwrap();
+        let mut source = SampleSource { replay: &replay, sampler: &mut sampler, normaliser: None };
+        batch.sample(SHAPE, &config, 1.0, &mut source).unwrap();
         let mut seen = [false; 3];
         for row in 0..SHAPE.rows {
             let step = batch.observations[row] as usize;
@@ -345,13 +369,14 @@ mod tests {
     fn networks_see_normalised_observations_and_the_dmp_plain_ones() {
         let mut normaliser = Normaliser::new(1, 1);
         normaliser.observe(&[-1.0, 3.0]); // mean 1, standard deviation 2
-        normaliser.refresh();
+        normaliser.update();
         let replay = replay(9, &[(0, TERMINATED)]);
         let mut sampler = Sampler::new(Windows::Segment, dmprl_shared::seeds::stream(1, "test", 0));
         let mut batch = Batch::new(SHAPE);
         let config = AlgorithmConfig::default();
-        let source = (&replay, &mut sampler);
-        batch.sample(SHAPE, &config, 1.0, Some(&normaliser), source).unwrap();
+        let normaliser = Some(&normaliser);
+        let mut source = SampleSource { replay: &replay, sampler: &mut sampler, normaliser };
+        batch.sample(SHAPE, &config, 1.0, &mut source).unwrap();
         assert!(batch.observations.contains(&0.0) && batch.observations.contains(&2.0));
         for row in 0..SHAPE.rows {
             let (s, next) = (batch.observations[row], batch.next_observations[row]);
@@ -382,12 +407,13 @@ mod tests {
         let mut sampler = Sampler::new(Windows::Sliding, random);
         let mut batch = Batch::new(shape);
         let config = AlgorithmConfig::default();
-        batch.sample(shape, &config, 2.0, None, (&replay, &mut sampler)).unwrap();
+        let mut source = SampleSource { replay: &replay, sampler: &mut sampler, normaliser: None };
+        batch.sample(shape, &config, 2.0, &mut source).unwrap();
         let mut ends = [None; 3];
         for input in batch.critic_inputs.chunks_exact(7) {
             ends[input[0] as usize] = Some([input[5], input[6]]);
         }
-        // From step 1 the window reads over its slot's border; from step 2 it is short.
+        // From step 1 the window continues in the next slot; from step 2 it is short.
         assert_eq!(ends, [Some([0.25, 4.0]), Some([0.375, 6.0]), Some([0.375, 6.0])]);
     }
 }

@@ -10,65 +10,72 @@
 //! 2. Actions enter the critic at its first layer, not the second; ReLU layers of 256 units
 //!    without batch normalisation or weight decay; PyTorch's initialisation in every layer.
 //! 3. Exploration noise is Gaussian (uncorrelated by default), not Ornstein-Uhlenbeck.
-//! 4. A time limit is no termination: truncated episodes bootstrap.
-//! 5. Step sizes, polyak, batch and warm-up are the configuration's; `paper` has Table 2's of the
-//!    DDPG-DMP paper.
+//! 4. A time limit is not a termination: truncated episodes bootstrap.
+//! 5. Learning rates, polyak, batch size and warm-up come from the configuration. The preset
+//!    `paper` has those of Table 2 of the DDPG-DMP paper.
 //!
-//! Differences of DDPG-DMP with the preset `default` from the paper (`paper` has none of 6 to 11):
-//! 6. Critic of the whole segment, sliding windows, n-step target.
+//! Differences between DDPG-DMP with the preset `default` and the paper (the preset `paper` has
+//! none of 6 to 11):
+//! 6. The critic sees the whole segment; windows slide; the target is the n-step return.
 //! 7. The DMP starts at zero, has alpha_y 10 and a semi-implicit integrator.
-//! 8. Observations are normalised; both step sizes are 1e-3.
-//! 9. Two updates a segment; 3 000 warm-up steps within 0.3 of the range; 8 environments a worker.
-//! 10. What a task's own defaults say (`shared/src/config/tasks.rs`).
-//! 11. The actor pays for changes of its actions (`action_rate_penalty`).
-//! 12. rho stays within `rho_range` of (1, 0, 0, 0): our reading of what the paper leaves open,
-//!     also in `paper`.
+//! 8. Observations are normalised; both learning rates are 1e-3.
+//! 9. Two updates per segment; 3 000 warm-up steps within 0.3 of the range; 8 environments per
+//!    worker.
+//! 10. Tasks have their own defaults (`shared/src/config/tasks.rs`).
+//! 11. The actor's loss has a penalty on action changes (`action_rate_penalty`).
+//! 12. rho stays within `rho_range` of (1, 0, 0, 0), because the paper does not specify it. This
+//!     also holds for `paper`.
 
 use candle_core::Result;
 use dmprl_shared::config::ExperimentConfig;
 use dmprl_shared::policy::Policy;
 
-use super::block::{ActionRate, Block, blocks, total};
+use super::batch_shard::{ActionRate, BatchShard, shards, total};
 use super::{Batch, BatchShape, Losses, new_actor, new_critic};
-use crate::update::crew::Crew;
-use crate::update::trained::Trained;
+use crate::update::network::TrainableNetwork;
+use crate::update::thread_pool::ThreadPool;
 
 /// Networks and buffers of DDPG.
 #[derive(Debug)]
 pub struct Ddpg {
-    /// pi, and its target pi'.
-    pub actor: Trained,
-    /// Q, and its target Q'.
-    pub critic: Trained,
+    /// The actor pi and its target pi'.
+    pub actor: TrainableNetwork,
+    /// The critic Q and its target Q'.
+    pub critic: TrainableNetwork,
     polyak: f32,
     action_rate_penalty: f32,
-    pub(super) blocks: Vec<Block>,
+    pub(super) shards: Vec<BatchShard>,
 }
 
 impl Ddpg {
-    /// Freshly drawn networks.
+    /// Makes newly drawn networks.
     ///
     /// # Errors
-    /// If candle cannot make the variables.
+    /// If the processor does not support the configured precision.
     pub fn new(config: &ExperimentConfig, policy: &Policy, shape: BatchShape) -> Result<Self> {
         let actor = new_actor(config, policy, true)?;
         let critic = new_critic(config, shape, "critic parameters")?;
         let polyak = config.algorithm.polyak as f32;
-        let blocks = blocks(policy, shape, std::slice::from_ref(&critic));
+        let shards = shards(policy, shape, std::slice::from_ref(&critic));
         let action_rate_penalty = config.algorithm.action_rate_penalty as f32;
-        Ok(Self { blocks, actor, critic, polyak, action_rate_penalty })
+        Ok(Self { shards, actor, critic, polyak, action_rate_penalty })
     }
 
-    /// One update of critic, actor and both targets.
+    /// Updates critic, actor and both targets.
     ///
     /// # Errors
-    /// If a network lacks its target.
-    pub fn update(&mut self, policy: &Policy, batch: &Batch, crew: &Crew) -> Result<Losses> {
-        self.critic_step(policy, batch, crew)?;
-        let critic = total(&self.blocks);
+    /// If a network has no target.
+    pub fn update(
+        &mut self,
+        policy: &Policy,
+        batch: &Batch,
+        pool: &mut ThreadPool,
+    ) -> Result<Losses> {
+        self.critic_step(policy, batch, pool)?;
+        let critic = total(&self.shards);
         let rows = batch.rewards.len() as f32;
-        self.actor_step(policy, batch, crew, self.action_rate_penalty * critic.q_size / rows);
-        let actor = total(&self.blocks);
+        self.actor_step(policy, batch, pool, self.action_rate_penalty * critic.q_size / rows);
+        let actor = total(&self.shards);
         Ok(Losses {
             critic_loss: critic.squared_error / rows,
             actor_loss: Some(actor.actor / rows),
@@ -77,36 +84,47 @@ impl Ddpg {
         })
     }
 
-    /// Descends mean (Q(s, u) - target)², target = reward + bootstrap Q'(s', pi'(s')).
-    fn critic_step(&mut self, policy: &Policy, batch: &Batch, crew: &Crew) -> Result<()> {
-        let (actor_target, critic_target) = (self.actor.lend_target()?, self.critic.lend_target()?);
-        let critic = self.critic.lend();
+    /// Does a critic step on the loss mean (Q(s, u) - target)², where
+    /// target = reward + bootstrap Q'(s', pi'(s')).
+    fn critic_step(&mut self, policy: &Policy, batch: &Batch, pool: &mut ThreadPool) -> Result<()> {
+        let (actor_target, critic_target) = (self.actor.target_view()?, self.critic.target_view()?);
+        let critic = self.critic.view();
         let (critic_target, critic) = ([critic_target], [critic]);
-        crew.each(&mut self.blocks, |block| {
-            block.act(policy, &actor_target, batch.next_states());
-            block.judge(policy, &critic_target, batch.next_states());
-            block.set_targets(batch, |block, row| block.q(0)[row]);
-            block.regress(&critic, batch);
+        pool.for_each(&mut self.shards, |shard| {
+            shard.act(policy, &actor_target, batch.next_states());
+            shard.evaluate_critics(policy, &critic_target, batch.next_states());
+            shard.set_targets(batch, |shard, row| shard.q(0)[row]);
+            shard.critic_backward(&critic, batch);
         });
         drop((actor_target, critic_target, critic));
-        self.critic.descend(
-            crew,
-            &self.blocks,
-            |block| block.critic_trace(0, batch),
+        self.critic.adam_step(
+            pool,
+            &self.shards,
+            |shard| shard.critic_record(0, batch),
             Some(self.polyak),
         );
         Ok(())
     }
 
-    /// Descends -mean Q(s, pi(s)), and what changes of pi(s) cost.
-    fn actor_step(&mut self, policy: &Policy, batch: &Batch, crew: &Crew, penalty: f32) {
-        let (actor, critic) = (self.actor.lend(), [self.critic.lend()]);
-        crew.each(&mut self.blocks, |block| {
-            block.act(policy, &actor, batch.states());
-            block.judge(policy, &critic, batch.states());
-            block.ascend_q(policy, &actor, &critic, ActionRate { penalty, batch });
+    /// Does an actor step on the loss -mean Q(s, pi(s)), plus the penalty on action changes.
+    fn actor_step(&mut self, policy: &Policy, batch: &Batch, pool: &mut ThreadPool, penalty: f32) {
+        let (actor, critic) = (self.actor.view(), [self.critic.view()]);
+        pool.for_each(&mut self.shards, |shard| {
+            shard.act(policy, &actor, batch.states());
+            shard.evaluate_critics(policy, &critic, batch.states());
+            shard.deterministic_policy_gradient(
+                policy,
+                &actor,
+                &critic,
+                ActionRate { penalty, batch },
+            );
         });
         drop((actor, critic));
-        self.actor.descend(crew, &self.blocks, |block| block.actor_trace(batch), Some(self.polyak));
+        self.actor.adam_step(
+            pool,
+            &self.shards,
+            |shard| shard.actor_record(batch),
+            Some(self.polyak),
+        );
     }
 }

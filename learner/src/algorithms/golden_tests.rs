@@ -1,7 +1,7 @@
-//! Whole updates against an independent implementation in PyTorch.
+//! Compares complete updates with an independent implementation in PyTorch.
 //!
-//! The numbers are those of tests/golden/update/*.safetensors, which make_golden.py beside them
-//! computed; the README there says with which versions and what the tensors are.
+//! The numbers in tests/golden/update/*.safetensors come from make_golden.py in the same folder.
+//! Its README lists the versions and the tensors.
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -13,15 +13,16 @@ use serde_json::Value;
 use super::*;
 use crate::learner::tests::spec;
 
-/// Of a tensor's norm, after an update or two and after all.
+/// Maximum difference after the first updates, relative to a tensor's norm.
 pub(super) const FIRST: f64 = 1e-5;
+/// Maximum difference after all updates, relative to a tensor's norm.
 const LAST: f64 = 1e-4;
 
 pub(super) fn folder() -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("../tests/golden/update")
 }
 
-/// Of the algorithms that learn from a replay.
+/// Returns the files of the algorithms that learn from a replay.
 fn files() -> Vec<PathBuf> {
     let entries = std::fs::read_dir(folder()).unwrap().map(|entry| entry.unwrap().path());
     let learns_from_batches = |path: &PathBuf| {
@@ -34,11 +35,11 @@ fn files() -> Vec<PathBuf> {
     files
 }
 
-/// A file of one case.
+/// The file of one case.
 pub(super) struct Golden {
     name: String,
     about: Value,
-    /// By their names there; what has been compared is taken out.
+    /// Tensors by name. Compared tensors are removed.
     pub(super) tensors: BTreeMap<String, Vec<f32>>,
 }
 
@@ -65,7 +66,7 @@ impl Golden {
 
     pub(super) fn config(&self) -> ExperimentConfig {
         let mut layers = Layers::new();
-        // A price of ours, which what the files were made with does not know.
+        // The penalty is not part of the implementation that made the files.
         layers.set("golden file", "algorithm.action_rate_penalty", "0.0").unwrap();
         for (key, value) in self.about["configuration"].as_object().unwrap() {
             layers.set("golden file", key, value.as_str().unwrap()).unwrap();
@@ -73,7 +74,7 @@ impl Golden {
         layers.finish().unwrap()
     }
 
-    /// Copies update `index`'s share of a tensor that has one for each update.
+    /// Copies the part of a batch tensor that belongs to update `index`.
     fn fill(&self, name: &str, index: usize, out: &mut [f32]) {
         let all = &self.tensors[&format!("batch.{name}")];
         let len = all.len() / self.updates();
@@ -85,11 +86,11 @@ impl Golden {
         self.fill("rewards", index, &mut batch.rewards);
         self.fill("bootstrap", index, &mut batch.bootstrap);
         self.fill("next_observations", index, &mut batch.next_observations);
-        // They are the first columns of the critic's inputs.
+        // The observations are the first columns of the critic inputs.
         let inputs = batch.critic_inputs.chunks_exact(shape.critic_inputs());
         let rows = batch.observations.chunks_exact_mut(shape.observation_len).zip(inputs);
         rows.for_each(|(row, input)| row.copy_from_slice(&input[..row.len()]));
-        // Nothing is normalised.
+        // Normalisation is off.
         batch.inputs.copy_from_slice(&batch.observations);
         batch.next_inputs.copy_from_slice(&batch.next_observations);
         for (name, out) in [
@@ -102,13 +103,13 @@ impl Golden {
         }
     }
 
-    /// Gives every network and target the parameters that the file begins with.
+    /// Sets every network and target to the file's initial parameters.
     fn start(&self, algorithm: &mut Algorithm) {
         let initial = |name: &str| &self.tensors[&format!("initial.{name}")];
         algorithm
-            .each_network(|name, trained| {
-                trained.network.set(initial(name))?;
-                match &mut trained.target {
+            .for_each_network(|name, network| {
+                network.parameters.set(initial(name))?;
+                match &mut network.target {
                     Some(target) => target.set(initial(&format!("{name}_target"))),
                     None => Ok(()),
                 }
@@ -116,7 +117,7 @@ impl Golden {
             .unwrap();
     }
 
-    /// Runs all updates and compares everything that the file holds of them.
+    /// Runs all updates and compares them with the file.
     fn check(mut self) {
         let config = self.config();
         let policy = Policy::new(&config, &spec()).unwrap();
@@ -135,19 +136,19 @@ impl Golden {
         self.assert_all_compared();
     }
 
-    /// Nothing that the file holds of updates may be left.
+    /// Fails if a tensor of an update was not compared.
     pub(super) fn assert_all_compared(&self) {
         let left: Vec<_> = self.tensors.keys().filter(|name| name.starts_with("update_")).collect();
         assert!(left.is_empty(), "{}: nothing was compared with {left:?}", self.name);
     }
 
-    /// Compares with what the file has of this update, and takes it out.
+    /// Compares with the file's tensors of this update and removes them.
     pub(super) fn compare(&mut self, update: usize, ours: &BTreeMap<String, Vec<f32>>) {
         let tolerance = if update == self.updates() { LAST } else { FIRST };
         self.compare_with(&format!("update_{update}."), ours, tolerance);
     }
 
-    /// As [`Golden::compare`], with the tensors whose names begin with `prefix`.
+    /// Compares with the tensors whose names begin with `prefix` and removes them.
     pub(super) fn compare_with(
         &mut self,
         prefix: &str,
@@ -163,24 +164,23 @@ impl Golden {
 
 fn log_temperature(algorithm: &Algorithm) -> Option<f32> {
     let networks = algorithm.networks();
-    let (_, trained) = networks.into_iter().find(|(name, _)| *name == "log_temperature")?;
-    trained.network.values().first().copied()
+    let (_, network) = networks.into_iter().find(|(name, _)| *name == "log_temperature")?;
+    network.parameters.values().first().copied()
 }
 
-/// What an update has left, by the names that the files use.
+/// Returns the results of an update under the names that the files use.
 fn ours(
     algorithm: &Algorithm,
     losses: Losses,
     log_temperature: Option<f32>,
     config: &ExperimentConfig,
 ) -> BTreeMap<String, Vec<f32>> {
-    let blocks = match &algorithm.kind {
-        Kind::Ddpg(ddpg) => &ddpg.blocks,
-        Kind::Td3(td3) => &td3.blocks,
-        Kind::Sac(sac) => &sac.blocks,
-        Kind::Ndp(_) => panic!("an on-policy algorithm has no blocks of a batch"),
+    let shards = match &algorithm.kind {
+        Kind::Ddpg(ddpg) => &ddpg.shards,
+        Kind::Td3(td3) => &td3.shards,
+        Kind::Sac(sac) => &sac.shards,
     };
-    let targets = blocks.iter().flat_map(|block| block.targets.iter().copied()).collect();
+    let targets = shards.iter().flat_map(|shard| shard.targets.iter().copied()).collect();
     let mut ours = BTreeMap::from([
         ("targets".to_owned(), targets),
         ("loss.critic".to_owned(), vec![losses.critic_loss]),
@@ -193,10 +193,10 @@ fn ours(
         let target = per_action * algorithm.shape.segment_actions_len as f32;
         ours.insert("loss.temperature".into(), vec![log_temperature * (entropy - target)]);
     }
-    for (name, trained) in algorithm.networks() {
-        ours.insert(format!("gradient.{name}"), trained.gradient().to_vec());
-        ours.insert(format!("parameters.{name}"), trained.network.values().to_vec());
-        if let Some(target) = &trained.target {
+    for (name, network) in algorithm.networks() {
+        ours.insert(format!("gradient.{name}"), network.gradient().to_vec());
+        ours.insert(format!("parameters.{name}"), network.parameters.values().to_vec());
+        if let Some(target) = &network.target {
             ours.insert(format!("parameters.{name}_target"), target.values().to_vec());
         }
     }

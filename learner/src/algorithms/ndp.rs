@@ -7,37 +7,38 @@
 //! learned standard deviation per action dimension. The ratio of probabilities is formed for each
 //! of the K steps, the value and the advantage for the segment.
 //!
-//! On-policy through the same workers as the rest: segments of the policy published last fill a
-//! rollout; those of older ones, in flight when it came, are counted as environment steps and as
-//! stale, and not learned from. Nobody waits for anybody.
+//! It uses the same workers as the other algorithms: segments of the newest policy fill a rollout.
+//! Segments of older policies, which were in flight, count as environment steps and as stale, and
+//! are not learned from. Neither side waits for the other.
 //!
 //! Differences from Schulman et al.:
-//! 1. Advantage and value belong to decisions of K steps: a segment's reward is the discounted sum
-//!    of its steps', the value after it counts discount^steps, `gae_lambda` fades per segment.
-//! 2. Actor and value are two networks with optimisers and gradient norms of their own, so that
-//!    neither loss needs a weight; values are regressed without a clip (as in the paper).
-//! 3. A rollout is a number of segments of all environments together, not of each; episodes go on
-//!    over its border. A time limit bootstraps from the observation after it.
+//! 1. Advantages and values belong to decisions of K steps: a segment's reward is the discounted
+//!    sum of its steps' rewards, the value after it is discounted by discount^steps, and
+//!    `gae_lambda` applies per segment.
+//! 2. Actor and value are two networks with separate optimisers and gradient norms, so that neither
+//!    loss needs a weight. Values are not clipped (as in the paper).
+//! 3. A rollout has a number of segments from all environments together, not from each. Episodes
+//!    continue across rollouts. A time limit bootstraps from the observation after it.
 //! 4. Advantages are scaled to mean 0 and deviation 1 over a rollout, as in most implementations.
 //!
 //! Differences from Bahl et al. and their released code:
-//! 5. All K drawn actions are executed. Their code draws the first and executes it K times, while
-//!    its ratios are formed with the mean of each step.
-//! 6. The critic has one output. Theirs is named for K, and repeats one value K times.
-//! 7. y0 and yd0 are measured, not taken from normalised observations, which the networks see only
-//!    with `policy.normalise_observations`. Rewards are not scaled.
+//! 5. All K drawn actions are executed. Their code draws the first action and executes it K times,
+//!    but computes ratios with the mean of each step.
+//! 6. The critic has one output. Theirs repeats one value K times.
+//! 7. y0 and yd0 come from the observations before normalisation. Networks get normalised
+//!    observations only with `policy.normalise_observations`. Rewards are not scaled.
 //! 8. g = goal_range tanh(.), w = weight_range omega² tanh(.); theirs are 100 times a linear
 //!    output.
-//! 9. ReLU layers (`policy.hidden`, `algorithm.critic_hidden`) with PyTorch's initialisation for
-//!    their tanh layers of 100 and 300, of which the last is orthogonal. Adam's epsilon 1e-8, not
-//!    1e-5.
-//! 10. Minibatches are made of whole segments, not of single steps.
-//! 11. Values are regressed without their clip. A reward is every step's; their environments
-//!     compute it anew at every fifth step only (`reward_delay`).
-//! 12. Where no velocity is observed yd0 is 0, theirs 0.05; alpha_y and N are the same for all
-//!     tasks, theirs 5 to 15 by task.
-//! 13. Actions are `position_scale` times the differences of y and clipped to the environment's
-//!     bounds; theirs are scaled by each environment (0.05) and become joint positions.
+//! 9. ReLU layers (`policy.hidden`, `algorithm.critic_hidden`) with PyTorch's initialisation
+//!    instead of tanh layers of 100 and 300 units with orthogonal initialisation of the last.
+//!    Adam's epsilon is 1e-8 instead of 1e-5.
+//! 10. Minibatches consist of whole segments, not of single steps.
+//! 11. Values are not clipped. The reward is computed at every step; their environments compute it
+//!     only at every fifth step (`reward_delay`).
+//! 12. If no velocity is observed, yd0 is 0 instead of 0.05. alpha_y and N are the same for all
+//!     tasks; theirs are 5 to 15, depending on the task.
+//! 13. Actions are `position_scale` times the differences of y, clipped to the environment's
+//!     bounds. Theirs are scaled by each environment (0.05) and become joint positions.
 
 use candle_core::Result;
 use dmprl_shared::config::{ExperimentConfig, LearningRateDecay, NdpConfig, Precision};
@@ -46,24 +47,24 @@ use dmprl_shared::seeds::{self, Stream};
 use dmprl_shared::segment::Segment;
 use rand::seq::SliceRandom;
 
-use super::minibatch::{Block, Objective, Source, Sums};
+use super::minibatch_shard::{LossSums, MinibatchShard, Objective, RolloutSource};
 use super::ppo::entropy;
 use crate::normaliser::Normaliser;
 use crate::rollout_buffer::{RolloutBuffer, RolloutShape};
-use crate::update::BLOCK_ROWS;
-use crate::update::crew::Crew;
-use crate::update::trained::{Scaling, Trained};
+use crate::update::SHARD_ROWS;
+use crate::update::network::{StepScale, TrainableNetwork};
+use crate::update::thread_pool::ThreadPool;
 
-/// Losses of one step of the optimisers, means over its minibatch.
+/// Losses of one step of the optimisers, as means over its minibatch.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct NdpLosses {
     /// -min(ratio advantage, clipped ratio advantage).
     pub policy_loss: f32,
     /// (V - return)².
     pub value_loss: f32,
-    /// Of the policy in one step \[nat\].
+    /// Entropy of the policy in one step \[nat\].
     pub entropy: f32,
-    /// Divergence from the policy that acted, (ratio - 1) - log ratio.
+    /// Estimated divergence from the policy that acted, (ratio - 1) - log ratio.
     pub approx_kl: f32,
     /// Share of steps whose ratio lies outside 1 - clip .. 1 + clip.
     pub clip_fraction: f32,
@@ -72,57 +73,56 @@ pub struct NdpLosses {
 /// Networks, rollout and buffers.
 #[derive(Debug)]
 pub struct Ndp {
-    /// From observation to DMP parameters.
-    pub actor: Trained,
-    /// Logarithms of the standard deviations, (A,): a network of biases alone.
-    pub log_std: Trained,
-    /// From observation to V.
-    pub critic: Trained,
-    /// The segments of the policy that acts.
+    /// Maps observations to DMP parameters.
+    pub actor: TrainableNetwork,
+    /// Logarithms of the standard deviations, (A,), as a network of biases only.
+    pub log_std: TrainableNetwork,
+    /// Maps observations to V.
+    pub critic: TrainableNetwork,
+    /// Segments of the current policy.
     pub rollout: RolloutBuffer,
     config: NdpConfig,
     published: Published,
-    /// Of every step of the rollout under the policy that acted, (N, K).
+    /// Log densities of the rollout's steps under the policy that acted, (N, K).
     log_densities: Vec<f32>,
     /// The rollout's entries in this epoch's order.
     order: Vec<usize>,
     /// Segments in a minibatch.
     minibatch: usize,
     epoch: usize,
-    /// Where in `order` the next minibatch begins.
+    /// Index in `order` of the next minibatch.
     first: usize,
-    /// The present `log_std`, copied.
+    /// A copy of the current `log_std`, (A,).
     log_std_values: Vec<f32>,
-    blocks: Vec<Block>,
+    shards: Vec<MinibatchShard>,
+    pool: ThreadPool,
 }
 
-/// What an update happens in.
+/// What an update reads besides the rollout.
 #[derive(Debug, Clone, Copy)]
-pub struct Scene<'a> {
+pub struct UpdateContext<'a> {
     /// The policy's architecture.
     pub policy: &'a Policy,
-    /// Threads.
-    pub crew: &'a Crew,
-    /// What networks see observations through.
+    /// Normalises network inputs, if configured.
     pub normaliser: Option<&'a Normaliser>,
-    /// Share of the run that is over, 0 to 1.
+    /// Completed share of the run, 0 to 1.
     pub progress: f64,
 }
 
-/// Which segments are the present policy's.
+/// The versions under which the current policy was published.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Published {
-    /// The policy has changed and is not published: no segment is.
+    /// The policy has changed since it was last published.
     NotYet,
-    /// Those of this version and later ones, which differ in number only.
+    /// This version and later ones, which have the same parameters.
     Since(u64),
 }
 
 impl Ndp {
-    /// Freshly drawn networks and an empty rollout.
+    /// Makes newly drawn networks and an empty rollout.
     ///
     /// # Errors
-    /// If candle cannot make the variables.
+    /// If the processor does not support the configured precision.
     pub fn new(config: &ExperimentConfig, policy: &Policy) -> Result<Self> {
         let settings = config.algorithm.ndp.clone();
         let mut random = seeds::stream(config.run.seed, "actor parameters", 0);
@@ -141,13 +141,19 @@ impl Ndp {
         let value = initial_parameters(&value_shape, &mut random);
         let segments = settings.rollout_segments;
         let minibatch = segments.div_ceil(settings.minibatches);
-        let block_rows = minibatch.min(BLOCK_ROWS);
-        let block = |_| Block::new(policy, &value_shape, block_rows);
+        let shard_rows = minibatch.min(SHARD_ROWS);
+        let shard = |_| MinibatchShard::new(policy, &value_shape, shard_rows);
         Ok(Self {
-            blocks: (0..minibatch.div_ceil(block_rows)).map(block).collect(),
-            actor: Trained::new(policy.shape().clone(), initial, rate, false, precision)?,
-            log_std: Trained::new(log_std_shape, initial_log_std, rate, false, Precision::F32)?,
-            critic: Trained::new(value_shape, value, critic_rate, false, precision)?,
+            shards: (0..minibatch.div_ceil(shard_rows)).map(shard).collect(),
+            actor: TrainableNetwork::new(policy.shape().clone(), initial, rate, false, precision)?,
+            log_std: TrainableNetwork::new(
+                log_std_shape,
+                initial_log_std,
+                rate,
+                false,
+                Precision::F32,
+            )?,
+            critic: TrainableNetwork::new(value_shape, value, critic_rate, false, precision)?,
             rollout: RolloutBuffer::new(RolloutShape {
                 layout: policy.layout(),
                 segments,
@@ -163,72 +169,92 @@ impl Ndp {
             epoch: 0,
             first: 0,
             log_std_values: vec![0.0; dims],
+            pool: ThreadPool::new(config.learner.threads),
         })
     }
 
-    /// Copies the policy's flat parameters out.
+    /// Copies the policy's flat parameters, (P,), into `values`.
     pub fn read_policy(&self, values: &mut [f32]) {
         let (network, log_std) = values.split_at_mut(values.len() - self.log_std_values.len());
-        network.copy_from_slice(self.actor.network.values());
-        log_std.copy_from_slice(self.log_std.network.values());
+        network.copy_from_slice(self.actor.parameters.values());
+        log_std.copy_from_slice(self.log_std.parameters.values());
     }
 
-    /// Starts from another policy's flat parameters.
+    /// Sets the policy to another policy's flat parameters, (P,).
     ///
     /// # Errors
     /// If the lengths differ.
     pub fn set_policy(&mut self, values: &[f32]) -> Result<()> {
         let (network, log_std) = values.split_at(values.len() - self.log_std_values.len());
-        self.actor.network.set(network)?;
-        self.log_std.network.set(log_std)
+        self.actor.parameters.set(network)?;
+        self.log_std.parameters.set(log_std)
     }
 
-    /// Hears that the policy as it is has been published.
-    pub fn published(&mut self, version: u64) {
+    /// Calls `f` with every network and its name in a checkpoint. `f` may change the network.
+    ///
+    /// # Errors
+    /// The first error that `f` returns.
+    pub fn for_each_network<E>(
+        &mut self,
+        mut f: impl FnMut(&'static str, &mut TrainableNetwork) -> std::result::Result<(), E>,
+    ) -> std::result::Result<(), E> {
+        f("actor", &mut self.actor)?;
+        f("log_std", &mut self.log_std)?;
+        f("critic", &mut self.critic)
+    }
+
+    /// Returns every network with its name in a checkpoint.
+    #[must_use]
+    pub fn networks(&self) -> Vec<(&'static str, &TrainableNetwork)> {
+        vec![("actor", &self.actor), ("log_std", &self.log_std), ("critic", &self.critic)]
+    }
+
+    /// Takes note of the version under which the current policy was published.
+    pub fn policy_published(&mut self, version: u64) {
         if self.published == Published::NotYet {
             self.published = Published::Since(version);
         }
     }
 
-    /// Takes a segment into the rollout; false, and nothing else, if it is stale: another policy's,
-    /// or one that came while the rollout before was learned from.
-    pub fn take(&mut self, segment: &Segment) -> bool {
+    /// Inserts a segment into the rollout. Returns false if the segment is stale: it comes from an
+    /// older policy, or arrived while the previous rollout was learned from.
+    pub fn try_insert(&mut self, segment: &Segment) -> bool {
         let Published::Since(version) = self.published else { return false };
-        let own = segment.header.policy_version >= version && !self.rollout.is_full();
-        if own {
+        let is_current = segment.header.policy_version >= version && !self.rollout.is_full();
+        if is_current {
             self.rollout.insert(&segment.header, &segment.block);
         }
-        own
+        is_current
     }
 
-    /// Whether a rollout is complete and not yet learned from to the end.
+    /// Returns whether a complete rollout waits for updates.
     #[must_use]
     pub fn update_due(&self) -> bool {
         self.rollout.is_full()
     }
 
-    /// Segments in a minibatch.
+    /// Returns the number of segments in a minibatch.
     #[must_use]
     pub fn minibatch(&self) -> usize {
         self.minibatch
     }
 
-    /// One minibatch. After the last of the last epoch the rollout is forgotten, and the policy is
-    /// to be published. `random` shuffles the segments.
-    pub fn update(&mut self, scene: Scene<'_>, random: &mut Stream) -> NdpLosses {
+    /// Learns from one minibatch. After the last one of the last epoch, the rollout is discarded
+    /// and the policy must be published. `random` shuffles the segments.
+    pub fn update(&mut self, context: UpdateContext<'_>, random: &mut Stream) -> NdpLosses {
         if (self.epoch, self.first) == (0, 0) {
-            self.judge(scene);
+            self.evaluate_rollout(context);
             self.rollout.estimate(self.config.gae_lambda as f32);
         }
         if self.first == 0 {
             self.order.shuffle(random);
         }
         let end = (self.first + self.minibatch).min(self.rollout.len());
-        let share = match self.config.learning_rate_decay {
+        let learning_rate = match self.config.learning_rate_decay {
             LearningRateDecay::None => 1.0,
-            LearningRateDecay::Linear => (1.0 - scene.progress).max(0.0) as f32,
+            LearningRateDecay::Linear => (1.0 - context.progress).max(0.0) as f32,
         };
-        let losses = self.descend(scene, self.first..end, share);
+        let losses = self.minibatch_step(context, self.first..end, learning_rate);
         self.first = end % self.rollout.len();
         if self.first == 0 {
             self.epoch = (self.epoch + 1) % self.config.epochs;
@@ -240,69 +266,70 @@ impl Ndp {
         losses
     }
 
-    /// Values and log densities of the whole rollout: from the parameters that were published, as
-    /// they have not changed since.
-    fn judge(&mut self, scene: Scene<'_>) {
-        let Scene { policy, normaliser, .. } = scene;
-        self.log_std_values.copy_from_slice(self.log_std.network.values());
-        let (actor, value) = (self.actor.lend(), self.critic.lend());
+    /// Computes values and log densities of the whole rollout. The parameters are still the
+    /// published ones.
+    fn evaluate_rollout(&mut self, context: UpdateContext<'_>) {
+        let UpdateContext { policy, normaliser, .. } = context;
+        self.log_std_values.copy_from_slice(self.log_std.parameters.values());
+        let (actor, value) = (self.actor.view(), self.critic.view());
         let layout = policy.layout();
         let (o, k) = (layout.observation_len, layout.segment_steps);
-        let Self { rollout, log_densities, blocks, .. } = self;
-        let block = &mut blocks[0];
-        // Entries that stand together, whatever the epochs before left.
+        let Self { rollout, log_densities, shards, .. } = self;
+        let shard = &mut shards[0];
+        // Sorted, so that each shard gets adjacent entries; earlier epochs have shuffled them.
         self.order.sort_unstable();
-        for entries in self.order.chunks(self.minibatch.min(BLOCK_ROWS)) {
+        for entries in self.order.chunks(self.minibatch.min(SHARD_ROWS)) {
             let (first, end) = (entries[0], entries[0] + entries.len());
-            block.gather(Source { rollout, log_densities, normaliser }, entries);
+            shard.gather(RolloutSource { rollout, log_densities, normaliser }, entries);
             let out = &mut log_densities[first * k..end * k];
-            block.judge(policy, &actor, &self.log_std_values, out);
-            let seen = &rollout.observations[first * o..end * o];
-            block.appraise(&value, normaliser, seen, &mut rollout.values[first..end]);
-            let last = &rollout.last_observations[first * o..end * o];
-            block.appraise(&value, normaliser, last, &mut rollout.last_values[first..end]);
+            shard.evaluate_log_densities(policy, &actor, &self.log_std_values, out);
+            let before = &rollout.observations[first * o..end * o];
+            shard.evaluate_values(&value, normaliser, before, &mut rollout.values[first..end]);
+            let after = &rollout.last_observations[first * o..end * o];
+            shard.evaluate_values(&value, normaliser, after, &mut rollout.last_values[first..end]);
         }
     }
 
-    /// One step of all optimisers on the entries at `places` of the order.
-    fn descend(
+    /// Does one step of all optimisers on a range of the shuffled entries.
+    fn minibatch_step(
         &mut self,
-        scene: Scene<'_>,
-        places: std::ops::Range<usize>,
-        share: f32,
+        context: UpdateContext<'_>,
+        range: std::ops::Range<usize>,
+        learning_rate: f32,
     ) -> NdpLosses {
-        let Scene { policy, crew, normaliser, .. } = scene;
-        self.log_std_values.copy_from_slice(self.log_std.network.values());
-        let entries = &self.order[places];
-        let block_rows = self.minibatch.min(BLOCK_ROWS);
-        let blocks = &mut self.blocks[..entries.len().div_ceil(block_rows)];
-        for (block, entries) in blocks.iter_mut().zip(entries.chunks(block_rows)) {
+        let UpdateContext { policy, normaliser, .. } = context;
+        self.log_std_values.copy_from_slice(self.log_std.parameters.values());
+        let entries = &self.order[range];
+        let shard_rows = self.minibatch.min(SHARD_ROWS);
+        let shards = &mut self.shards[..entries.len().div_ceil(shard_rows)];
+        for (shard, entries) in shards.iter_mut().zip(entries.chunks(shard_rows)) {
             let (rollout, log_densities) = (&self.rollout, &self.log_densities);
-            block.gather(Source { rollout, log_densities, normaliser }, entries);
+            shard.gather(RolloutSource { rollout, log_densities, normaliser }, entries);
         }
         let objective = Objective {
             log_std: &self.log_std_values,
             clip: self.config.clip as f32,
-            steps: blocks.iter().map(Block::steps).sum::<usize>() as f32,
+            steps: shards.iter().map(MinibatchShard::steps).sum::<usize>() as f32,
             segments: entries.len() as f32,
         };
-        let (actor, value) = (self.actor.lend(), self.critic.lend());
-        crew.each(blocks, |block| {
-            block.improve(policy, &actor, objective);
-            block.regress(&value, objective);
+        let (actor, value) = (self.actor.view(), self.critic.view());
+        let pool = &mut self.pool;
+        pool.for_each(shards, |shard| {
+            shard.policy_backward(policy, &actor, objective);
+            shard.value_backward(&value, objective);
         });
         drop((actor, value));
-        self.actor.sum_gradient(crew, blocks, Block::actor_trace);
-        self.critic.sum_gradient(crew, blocks, Block::value_trace);
-        // The entropy of a Gaussian grows with each log std at slope 1.
-        let of_log_std = self.log_std.gradient_mut();
-        of_log_std.fill(-self.config.entropy_coefficient as f32);
-        for block in &*blocks {
-            for (sum, part) in of_log_std.iter_mut().zip(&block.log_std_gradient) {
+        self.actor.sum_gradient(pool, shards, MinibatchShard::actor_record);
+        self.critic.sum_gradient(pool, shards, MinibatchShard::value_record);
+        // The derivative of a Gaussian's entropy with respect to each log std is 1.
+        let log_std_gradient = self.log_std.gradient_mut();
+        log_std_gradient.fill(-self.config.entropy_coefficient as f32);
+        for shard in &*shards {
+            for (sum, part) in log_std_gradient.iter_mut().zip(&shard.log_std_gradient) {
                 *sum += part;
             }
         }
-        let sums = total(blocks);
+        let sums = total(shards);
         let losses = NdpLosses {
             policy_loss: sums.policy / objective.steps,
             value_loss: sums.value / objective.segments,
@@ -312,20 +339,20 @@ impl Ndp {
         };
         let policy_norm = (self.actor.gradient_square() + self.log_std.gradient_square()).sqrt();
         let value_norm = self.critic.gradient_square().sqrt();
-        let scaling = |norm: f64| Scaling {
-            factor: (self.config.gradient_norm_max / norm).min(1.0) as f32,
-            share,
+        let scaled = |norm: f64| StepScale {
+            gradient: (self.config.gradient_norm_max / norm).min(1.0) as f32,
+            learning_rate,
         };
-        self.actor.step(scaling(policy_norm));
-        self.log_std.step(scaling(policy_norm));
-        self.critic.step(scaling(value_norm));
+        self.actor.apply_gradient(scaled(policy_norm));
+        self.log_std.apply_gradient(scaled(policy_norm));
+        self.critic.apply_gradient(scaled(value_norm));
         losses
     }
 }
 
-/// The sums of all blocks, in their order.
-fn total(blocks: &[Block]) -> Sums {
-    blocks.iter().map(|block| block.sums).fold(Sums::default(), |a, b| Sums {
+/// Adds the sums of all shards, in their order.
+fn total(shards: &[MinibatchShard]) -> LossSums {
+    shards.iter().map(|shard| shard.sums).fold(LossSums::default(), |a, b| LossSums {
         policy: a.policy + b.policy,
         value: a.value + b.value,
         divergence: a.divergence + b.divergence,

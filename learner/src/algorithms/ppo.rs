@@ -1,9 +1,9 @@
-//! What proximal policy optimisation (Schulman et al. 2017) does with one action: its probability
-//! and the clipped objective.
+//! Proximal policy optimisation (Schulman et al. 2017) for one action: its log density and the
+//! clipped objective.
 
 use std::f32::consts::PI;
 
-/// log of the density of `action` under independent Gaussians, (A,) each.
+/// Returns the log density of `action` under independent Gaussians, (A,) each.
 #[must_use]
 pub fn log_density(action: &[f32], mean: &[f32], log_std: &[f32]) -> f32 {
     let terms = action.iter().zip(mean).zip(log_std).map(|((action, mean), log_std)| {
@@ -13,7 +13,7 @@ pub fn log_density(action: &[f32], mean: &[f32], log_std: &[f32]) -> f32 {
     terms.sum()
 }
 
-/// Entropy of independent Gaussians [nat].
+/// Returns the entropy of independent Gaussians \[nat\].
 #[must_use]
 pub fn entropy(log_std: &[f32]) -> f32 {
     log_std.iter().map(|log_std| log_std + 0.5 * (1.0 + (2.0 * PI).ln())).sum()
@@ -34,7 +34,7 @@ pub struct Surrogate {
 
 /// Computes the objective.
 ///
-/// - `log_ratio`: log density now minus that of the policy which acted.
+/// - `log_ratio`: log density under the current policy minus that under the policy that acted.
 /// - `clip`: half-width of the interval around 1.
 #[must_use]
 pub fn surrogate(log_ratio: f32, advantage: f32, clip: f32) -> Surrogate {
@@ -43,7 +43,7 @@ pub fn surrogate(log_ratio: f32, advantage: f32, clip: f32) -> Surrogate {
     let clipped = ratio.clamp(1.0 - clip, 1.0 + clip) * advantage;
     Surrogate {
         loss: -plain.min(clipped),
-        // Where the clipped one is smaller it does not depend on the ratio.
+        // The clipped objective does not depend on the ratio.
         slope: if plain <= clipped { -plain } else { 0.0 },
         outside: (ratio - 1.0).abs() > clip,
         divergence: ratio - 1.0 - log_ratio,

@@ -3,52 +3,63 @@
 //! entropy near its target.
 //!
 //! With policy `dmp` the Gaussian's mean is the inverse controller's value before its tanh at each
-//! of the K steps, and its log-std comes from K A more outputs of the network; the entropy is that
-//! of the whole segment.
+//! of the K steps. Its log-std comes from K A more outputs of the network. The entropy is that of
+//! the whole segment.
 //!
 //! Differences from Haarnoja et al. (2018b):
-//! 1. An action may be a segment of K actions with one entropy term; the target is the K-step
-//!    return (`target = "n_step"`), whose rewards in between carry no entropy. K = 1 is the
+//! 1. An action may be a segment of K actions with one entropy term. The target is the K-step
+//!    return (`target = "n_step"`), without entropy for the steps in between. K = 1 is the
 //!    published algorithm.
-//! 2. Target entropy -K A / 2 for segments, for whose actions, made by one movement, the published
-//!    -1 an action is too little.
+//! 2. The target entropy of segments is -K A / 2. The published -1 per number is too low for
+//!    actions that come from one movement.
 //! 3. The temperature's loss is linear in its logarithm, as in their code.
 //! 4. Squared errors without the factor one half; PyTorch's initialisation.
-//! 5. A time limit is no termination: truncated episodes bootstrap.
-//! 6. With policy `dmp` the actor pays for changes of its means (`action_rate_penalty`).
-//! 7. Step sizes of networks are the configuration's (1e-3; theirs 3e-4), the temperature's 3e-4;
-//!    two updates a segment are 0.4 an environment step (theirs: 1); observations are normalised.
+//! 5. A time limit is not a termination: truncated episodes bootstrap.
+//! 6. With policy `dmp` the actor's loss has a penalty on changes of its means
+//!    (`action_rate_penalty`).
+//! 7. Learning rates of networks come from the configuration (1e-3 instead of 3e-4); that of the
+//!    temperature is 3e-4. Two updates per segment are 0.4 per environment step instead of 1.
+//!    Observations are normalised.
 
 use candle_core::Result;
 use dmprl_shared::config::ExperimentConfig;
 use dmprl_shared::policy::{Policy, gaussian};
 
 use super::batch::States;
-use super::block::{ActionRate, Block, blocks, total};
+use super::batch_shard::{ActionRate, BatchShard, LossSums, shards, total};
 use super::{Batch, BatchShape, Losses, new_actor, new_critic};
-use crate::update::crew::Crew;
-use crate::update::trained::{Lent, Trained};
+use crate::update::network::{NetworkView, TrainableNetwork};
+use crate::update::thread_pool::ThreadPool;
 
 /// Networks and buffers of SAC.
 #[derive(Debug)]
 pub struct Sac {
-    /// pi; it has no target.
-    pub actor: Trained,
-    /// Q_1 and Q_2, and their targets.
-    pub critics: [Trained; 2],
-    /// One number: the temperature's logarithm.
-    pub log_temperature: Trained,
+    /// The actor pi, without a target.
+    pub actor: TrainableNetwork,
+    /// The critics Q_1 and Q_2 with their targets.
+    pub critics: [TrainableNetwork; 2],
+    /// Logarithm of the temperature, a single number.
+    pub log_temperature: TrainableNetwork,
     target_entropy: f32,
     polyak: f32,
     action_rate_penalty: f32,
-    pub(super) blocks: Vec<Block>,
+    pub(super) shards: Vec<BatchShard>,
+}
+
+/// Weights of the terms of the actor's loss.
+#[derive(Debug, Clone, Copy)]
+struct ActorWeights {
+    /// Weight of the entropy.
+    temperature: f32,
+    /// Weight of the squared changes of the means.
+    penalty: f32,
 }
 
 impl Sac {
-    /// Freshly drawn networks.
+    /// Makes newly drawn networks.
     ///
     /// # Errors
-    /// If candle cannot make the variables.
+    /// If the processor does not support the configured precision.
     pub fn new(config: &ExperimentConfig, policy: &Policy, shape: BatchShape) -> Result<Self> {
         let critics = [
             new_critic(config, shape, "critic parameters")?,
@@ -59,9 +70,9 @@ impl Sac {
         let rate = sac.temperature_learning_rate;
         Ok(Self {
             actor: new_actor(config, policy, false)?,
-            blocks: blocks(policy, shape, &critics),
+            shards: shards(policy, shape, &critics),
             critics,
-            log_temperature: Trained::scalar(log_temperature, rate)?,
+            log_temperature: TrainableNetwork::scalar(log_temperature, rate)?,
             target_entropy: (sac.target_entropy_per_action * shape.segment_actions_len as f64)
                 as f32,
             polyak: config.algorithm.polyak as f32,
@@ -69,21 +80,26 @@ impl Sac {
         })
     }
 
-    /// One update of critics, actor, temperature and targets.
+    /// Updates critics, actor, temperature and targets.
     ///
     /// # Errors
-    /// If a network lacks its target.
-    pub fn update(&mut self, policy: &Policy, batch: &Batch, crew: &Crew) -> Result<Losses> {
+    /// If a network has no target.
+    pub fn update(
+        &mut self,
+        policy: &Policy,
+        batch: &Batch,
+        pool: &mut ThreadPool,
+    ) -> Result<Losses> {
         let rows = batch.rewards.len() as f32;
-        let temperature = self.log_temperature.network.values()[0].exp();
-        self.critics_step(policy, batch, crew, temperature)?;
-        let critic = total(&self.blocks);
+        let temperature = self.log_temperature.parameters.values()[0].exp();
+        self.critics_step(policy, batch, pool, temperature)?;
+        let critic = total(&self.shards);
         let penalty = self.action_rate_penalty * critic.q_size / rows;
-        self.actor_step(policy, batch, crew, (temperature, penalty));
-        let actor = total(&self.blocks);
+        self.actor_step(policy, batch, pool, ActorWeights { temperature, penalty });
+        let actor = total(&self.shards);
         let entropy = -actor.log_density / rows;
-        // Of -log temperature (mean log pi + target entropy).
-        self.log_temperature.descend_scalar(entropy - self.target_entropy);
+        // The gradient of -log temperature (mean log pi + target entropy).
+        self.log_temperature.adam_step_scalar(entropy - self.target_entropy);
         Ok(Losses {
             critic_loss: critic.squared_error / rows,
             actor_loss: Some(actor.actor / rows),
@@ -93,112 +109,119 @@ impl Sac {
         })
     }
 
-    /// Descends the sum over both critics of mean (Q_i(s, u) - target)²,
+    /// Does a step of both critics on the loss mean (Q_i(s, u) - target)², where
     /// target = reward + bootstrap (min_i Q_i'(s', u') - temperature log pi(u'|s')), u' ~ pi(s').
     fn critics_step(
         &mut self,
         policy: &Policy,
         batch: &Batch,
-        crew: &Crew,
+        pool: &mut ThreadPool,
         temperature: f32,
     ) -> Result<()> {
         let [first, second] = &self.critics;
-        let actor = self.actor.lend();
-        let targets = [first.lend_target()?, second.lend_target()?];
-        let critics = [first.lend(), second.lend()];
-        crew.each(&mut self.blocks, |block| {
-            draw(block, policy, &actor, batch.next_states(), &batch.next_noise);
-            block.judge(policy, &targets, batch.next_states());
-            block.set_targets(batch, |block, row| {
-                let q = block.q(0)[row].min(block.q(1)[row]);
-                q - temperature * block.log_densities[row]
+        let actor = self.actor.view();
+        let targets = [first.target_view()?, second.target_view()?];
+        let critics = [first.view(), second.view()];
+        pool.for_each(&mut self.shards, |shard| {
+            draw(shard, policy, &actor, batch.next_states(), &batch.next_noise);
+            shard.evaluate_critics(policy, &targets, batch.next_states());
+            shard.set_targets(batch, |shard, row| {
+                let q = shard.q(0)[row].min(shard.q(1)[row]);
+                q - temperature * shard.log_densities[row]
             });
-            block.regress(&critics, batch);
+            shard.critic_backward(&critics, batch);
         });
         drop((actor, targets, critics));
         for (index, critic) in self.critics.iter_mut().enumerate() {
-            critic.descend(
-                crew,
-                &self.blocks,
-                |block| block.critic_trace(index, batch),
+            critic.adam_step(
+                pool,
+                &self.shards,
+                |shard| shard.critic_record(index, batch),
                 Some(self.polyak),
             );
         }
         Ok(())
     }
 
-    /// Descends mean (temperature log pi(u|s) - min_i Q_i(s, u)), u ~ pi(s), by the path of u, and
-    /// what changes of the means' u cost.
+    /// Does an actor step on the loss mean (temperature log pi(u|s) - min_i Q_i(s, u)), u ~ pi(s),
+    /// with the reparametrised gradient of u, plus the penalty on changes of the means.
     fn actor_step(
         &mut self,
         policy: &Policy,
         batch: &Batch,
-        crew: &Crew,
-        (temperature, penalty): (f32, f32),
+        pool: &mut ThreadPool,
+        weights: ActorWeights,
     ) {
+        let ActorWeights { temperature, penalty } = weights;
         let [first, second] = &self.critics;
-        let (actor, critics) = (self.actor.lend(), [first.lend(), second.lend()]);
-        crew.each(&mut self.blocks, |block| {
-            draw(block, policy, &actor, batch.states(), &batch.noise);
-            block.judge(policy, &critics, batch.states());
+        let (actor, critics) = (self.actor.view(), [first.view(), second.view()]);
+        pool.for_each(&mut self.shards, |shard| {
+            draw(shard, policy, &actor, batch.states(), &batch.noise);
+            shard.evaluate_critics(policy, &critics, batch.states());
             let smaller =
-                |block: &Block, row: usize| usize::from(block.q(1)[row] < block.q(0)[row]);
-            block.sums = super::block::Sums::default();
-            for row in 0..block.log_densities.len() {
+                |shard: &BatchShard, row: usize| usize::from(shard.q(1)[row] < shard.q(0)[row]);
+            shard.sums = LossSums::default();
+            for row in 0..shard.log_densities.len() {
                 let (q, log_density) =
-                    (block.q(smaller(block, row))[row], block.log_densities[row]);
-                block.sums.actor += temperature * log_density - q;
-                block.sums.log_density += log_density;
+                    (shard.q(smaller(shard, row))[row], shard.log_densities[row]);
+                shard.sums.actor += temperature * log_density - q;
+                shard.sums.log_density += log_density;
             }
-            let rows = block.batch_rows();
-            block.actions_gradient(&critics, |block, row, index| {
-                if smaller(block, row) == index { -1.0 / rows } else { 0.0 }
+            let rows = shard.batch_rows();
+            shard.actions_gradient(&critics, |shard, row, index| {
+                if smaller(shard, row) == index { -1.0 / rows } else { 0.0 }
             });
-            block.unsquash();
-            // d log pi / d x = 2 u at x = mean + std noise: only the tanh's correction moves.
+            shard.unsquash();
+            // d log pi / d x = 2 u at x = mean + std noise, from the correction for tanh alone.
             let share = temperature / rows;
-            for (gradient, u) in block.actions_gradient.iter_mut().zip(&block.policy.actions) {
+            for (gradient, u) in shard.actions_gradient.iter_mut().zip(&shard.policy.actions) {
                 *gradient += share * 2.0 * u;
             }
-            let noise = block.part(&batch.noise);
-            block.log_stds_backward(policy, |block, row, index| {
+            let noise = shard.part(&batch.noise);
+            shard.log_stds_backward(policy, |shard, row, index| {
                 let at = row * policy.layout().actions_len() + index;
-                let drawn = drawn(block, policy, noise, at);
-                // log std moves x by std noise, and log pi by -1 directly.
-                let gradient = block.actions_gradient[at] * drawn.shift - share;
+                let drawn = drawn(shard, policy, noise, at);
+                // d x / d log std = std noise, and d log pi / d log std = -1 directly.
+                let gradient = shard.actions_gradient[at] * drawn.shift - share;
                 if drawn.in_range { gradient } else { 0.0 }
             });
-            // Of the means, which act where nothing is drawn: noise is not to be smooth.
-            block.penalise(policy, ActionRate { penalty, batch });
-            block.act_backward(policy, &actor);
+            // The penalty is on the means, which act without exploration: noise need not be smooth.
+            shard.penalise(policy, ActionRate { penalty, batch });
+            shard.actor_backward(policy, &actor);
         });
         drop((actor, critics));
-        self.actor.descend(crew, &self.blocks, |block| block.actor_trace(batch), None);
+        self.actor.adam_step(pool, &self.shards, |shard| shard.actor_record(batch), None);
     }
 }
 
-/// u ~ pi(states) into the block's actions, log pi(u) into its log densities.
-fn draw(block: &mut Block, policy: &Policy, actor: &Lent<'_>, states: States<'_>, noise: &[f32]) {
-    block.act(policy, actor, states);
-    let noise = block.part(noise);
+/// Draws u ~ pi(states) into the shard's actions, and log pi(u) into its log densities.
+fn draw(
+    shard: &mut BatchShard,
+    policy: &Policy,
+    actor: &NetworkView<'_>,
+    states: States<'_>,
+    noise: &[f32],
+) {
+    shard.act(policy, actor, states);
+    let noise = shard.part(noise);
     let len = policy.layout().actions_len();
-    for row in 0..block.log_densities.len() {
+    for row in 0..shard.log_densities.len() {
         let mut log_density = 0.0;
         for at in row * len..(row + 1) * len {
-            let drawn = drawn(block, policy, noise, at);
-            block.policy.actions[at] = drawn.action;
+            let drawn = drawn(shard, policy, noise, at);
+            shard.policy.actions[at] = drawn.action;
             log_density += drawn.log_density;
         }
-        block.log_densities[row] = log_density;
+        shard.log_densities[row] = log_density;
     }
 }
 
-/// What noise makes of action `at` of the block's (rows, K A).
-fn drawn(block: &Block, policy: &Policy, noise: &[f32], at: usize) -> gaussian::Draw {
+/// Returns the draw of number `at` of the shard's actions, (rows, K A).
+fn drawn(shard: &BatchShard, policy: &Policy, noise: &[f32], at: usize) -> gaussian::Draw {
     let len = policy.layout().actions_len();
     let columns = policy.log_stds().unwrap_or_default();
-    let rows = block.log_densities.len();
-    let outputs = block.policy.activations.output(policy.shape(), rows);
+    let rows = shard.log_densities.len();
+    let outputs = shard.policy.activations.output(policy.shape(), rows);
     let raw = outputs[at / len * policy.shape().outputs() + columns.start + at % len];
-    gaussian::draw(block.policy.means[at], raw, noise[at])
+    gaussian::draw(shard.policy.means[at], raw, noise[at])
 }

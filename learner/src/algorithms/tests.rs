@@ -1,12 +1,12 @@
-//! The hand-derived update against candle's automatic differentiation of the same losses, which
-//! uses none of our kernels.
+//! Compares the hand-derived updates with candle's automatic differentiation of the same losses,
+//! which uses none of our kernels.
 
 use dmprl_shared::config::Layers;
 use rand::RngExt;
 
 use super::*;
 use crate::learner::tests::spec;
-use crate::networks::Parameters;
+use crate::parameters::Parameters;
 
 struct Case {
     config: ExperimentConfig,
@@ -20,7 +20,7 @@ fn case(keys: &[(&str, &str)]) -> Case {
     let common = [
         ("policy.hidden", "[24, 16]"),
         ("algorithm.critic_hidden", "[20, 12]"),
-        // More than one block of rows, the last not full.
+        // More than one shard of rows, the last not full.
         ("algorithm.batch_size", "80"),
         ("algorithm.td3.actor_interval", "1"),
         ("algorithm.sac.initial_temperature", "0.3"),
@@ -32,21 +32,21 @@ fn case(keys: &[(&str, &str)]) -> Case {
     let config = layers.finish().unwrap();
     let policy = Policy::new(&config, &spec()).unwrap();
     let mut algorithm = Algorithm::new(&config, &policy).unwrap();
-    // Targets that differ from their networks, so that mixing them up shows; gains and shifts that
-    // are not one and zero.
+    // Targets differ from their networks, so that confusing them fails the test. Gains and shifts
+    // differ from one and zero.
     let mut random = seeds::stream(3, "test", 0);
-    let disturb = |_, trained: &mut Trained| {
-        let networks = [Some(&mut trained.network), trained.target.as_mut()];
+    let disturb = |_, network: &mut TrainableNetwork| {
+        let networks = [Some(&mut network.parameters), network.target.as_mut()];
         let values = networks.into_iter().flatten().flat_map(Parameters::values_mut);
         values.for_each(|value| *value += random.random_range(-0.05..0.05));
         Ok::<(), ()>(())
     };
-    algorithm.each_network(disturb).unwrap();
+    algorithm.for_each_network(disturb).unwrap();
     let mut batch = Batch::new(algorithm.batch_shape());
     let mut fill = |values: &mut [f32]| {
         values.iter_mut().for_each(|value| *value = random.random_range(-1.0..1.0));
     };
-    // What the networks see is normalised, what the DMP starts from is not: mixing them up shows.
+    // Network inputs differ from the states of the DMP, so that confusing them fails the test.
     fill(&mut batch.observations);
     fill(&mut batch.inputs);
     fill(&mut batch.critic_inputs);
@@ -62,14 +62,14 @@ fn case(keys: &[(&str, &str)]) -> Case {
 }
 
 impl Case {
-    /// One update by our kernels and one by candle's graph, from the same state.
+    /// Compares one update by our kernels with one by candle's graph from the same state.
     fn check(&mut self, what: &str) {
         let (shape, networks) = (self.algorithm.batch_shape(), self.algorithm.networks());
         let device = &Device::Cpu;
         let mut graph = Graph::new(&self.config, &self.policy, shape, device, &networks).unwrap();
         let expected_losses = graph.update(&self.policy, &self.batch, 1).unwrap();
-        let mut judge = Algorithm::new(&self.config, &self.policy).unwrap();
-        judge.each_network(|name, trained| graph.fetch(name, trained)).unwrap();
+        let mut reference = Algorithm::new(&self.config, &self.policy).unwrap();
+        reference.for_each_network(|name, network| graph.fetch(name, network)).unwrap();
 
         let losses = self.algorithm.update(&self.policy, &self.batch, 1).unwrap();
         let numbers = |losses: Losses| {
@@ -79,13 +79,14 @@ impl Case {
         };
         assert_close(&format!("losses, {what}"), &numbers(losses), &numbers(expected_losses));
         let read = |network: &Parameters| network.values().to_vec();
-        for ((name, got), (_, want)) in self.algorithm.networks().into_iter().zip(judge.networks())
+        for ((name, got), (_, want)) in
+            self.algorithm.networks().into_iter().zip(reference.networks())
         {
             let check = |part: &str, got: &[f32], want: &[f32]| {
                 assert_close(&format!("{part} of {name}, {what}"), got, want);
             };
             check("gradient", got.gradient(), want.gradient());
-            check("parameters", &read(&got.network), &read(&want.network));
+            check("parameters", &read(&got.parameters), &read(&want.parameters));
             if let (Some(got), Some(want)) = (&got.target, &want.target) {
                 check("target", &read(got), &read(want));
             }
@@ -136,7 +137,7 @@ fn an_update_equals_automatic_differentiation() {
     }
 }
 
-/// Networks here are those that another device has learned, after `what`.
+/// Checks that the networks on the host equal those fetched from another device, after `what`.
 fn assert_fetched(here: &mut Case, there: &mut Case, what: &str) {
     let mut newest = vec![0.0; here.policy.parameters_len()];
     there.algorithm.read_policy(&mut newest).unwrap();
@@ -147,9 +148,9 @@ fn assert_fetched(here: &mut Case, there: &mut Case, what: &str) {
             assert_within(1e-4, &format!("{part} of {name} {what}"), got, want);
         };
         if name == "actor" {
-            assert_eq!(got.network.values(), &newest[..got.network.values().len()], "{what}");
+            assert_eq!(got.parameters.values(), &newest[..got.parameters.values().len()], "{what}");
         }
-        check("parameters", got.network.values(), want.network.values());
+        check("parameters", got.parameters.values(), want.parameters.values());
         check("moments", &got.adam.moments.first, &want.adam.moments.first);
         check("moments", &got.adam.moments.second, &want.adam.moments.second);
         if let (Some(got), Some(want)) = (&got.target, &want.target) {
@@ -158,14 +159,14 @@ fn assert_fetched(here: &mut Case, there: &mut Case, what: &str) {
     }
 }
 
-/// What `--device cuda` does, on candle's CPU: the graph's updates, fetched, changed here and gone
-/// on with there.
+/// Does the same as `--device cuda` on candle's CPU: updates by the graph, fetch, change on the
+/// host, and more updates by the graph.
 #[test]
 fn another_device_learns_the_same_and_hands_it_back() {
     for algorithm in ["ddpg", "td3", "sac"] {
         let keys = [("algorithm.name", algorithm), ("algorithm.td3.actor_interval", "2")];
         let (mut here, mut there) = (case(&keys), case(&keys));
-        there.algorithm.remote = Some(Remote::new(&there.config, Device::Cpu));
+        there.algorithm.replica = Some(DeviceReplica::new(&there.config, Device::Cpu));
         let run = |case: &mut Case, updates: std::ops::RangeInclusive<u64>| {
             for update in updates {
                 case.algorithm.update(&case.policy, &case.batch, update).unwrap();
@@ -175,14 +176,14 @@ fn another_device_learns_the_same_and_hands_it_back() {
             run(case, 1..=20);
         }
         assert_fetched(&mut here, &mut there, &format!("{algorithm}, 20 updates"));
-        // As a new mean and scale of the observations do.
+        // Networks change on the host when the observation normalisation is updated.
         for case in [&mut here, &mut there] {
             case.algorithm.fetch().unwrap();
-            let halve = |_, trained: &mut Trained| {
-                trained.network.values_mut().iter_mut().for_each(|value| *value *= 0.9);
+            let shrink = |_, network: &mut TrainableNetwork| {
+                network.parameters.values_mut().iter_mut().for_each(|value| *value *= 0.9);
                 Ok::<(), ()>(())
             };
-            case.algorithm.each_network(halve).unwrap();
+            case.algorithm.for_each_network(shrink).unwrap();
             run(case, 21..=23);
         }
         assert_fetched(&mut here, &mut there, &format!("{algorithm}, changed between"));
@@ -194,12 +195,12 @@ fn the_switch_normalises_critics_and_no_other_network() {
     for algorithm in ["ddpg", "td3", "sac"] {
         for norm in ["false", "true"] {
             let keys = [("algorithm.name", algorithm), ("algorithm.critic_layer_norm", norm)];
-            for (name, trained) in case(&keys).algorithm.networks() {
+            for (name, network) in case(&keys).algorithm.networks() {
                 let want = norm == "true" && name.starts_with("critic");
-                assert_eq!(trained.layer_norm.is_some(), want, "{name} of {algorithm}");
-                // Two numbers for each of the 20 and 12 hidden units.
-                let behind = trained.network.values().len() - trained.shape.parameters_len();
-                assert_eq!(behind, if want { 64 } else { 0 }, "{name} of {algorithm}");
+                assert_eq!(network.layer_norm.is_some(), want, "{name} of {algorithm}");
+                // Gain and shift for each of the 20 and 12 hidden units.
+                let additional = network.parameters.values().len() - network.shape.parameters_len();
+                assert_eq!(additional, if want { 64 } else { 0 }, "{name} of {algorithm}");
             }
         }
     }
@@ -207,8 +208,8 @@ fn the_switch_normalises_critics_and_no_other_network() {
 
 #[test]
 fn updates_fit_a_known_value_and_follow_its_gradient() {
-    // Reward = 1 - |first action - 0.5|², no bootstrap: Q is that bowl, and the best first action
-    // is 0.5 in both dimensions whatever the observation.
+    // Reward = 1 - |first action - 0.5|² without bootstrap, so Q is a paraboloid and the best first
+    // action is 0.5 in both dimensions for every observation.
     let mut case = case(&[
         ("policy.kind", "mlp"),
         ("algorithm.batch_size", "128"),
@@ -232,7 +233,7 @@ fn updates_fit_a_known_value_and_follow_its_gradient() {
     assert!(losses.critic_loss < 0.01, "{losses:?}");
     let mut work = case.policy.workspace(128);
     let observations = &case.batch.inputs;
-    let parameters = case.algorithm.networks()[0].1.network.values();
+    let parameters = case.algorithm.networks()[0].1.parameters.values();
     case.policy.act(parameters, observations, &mut work);
     let errors = work.actions.iter().map(|u| (u - 0.5).abs());
     let mean = errors.sum::<f32>() / work.actions.len() as f32;
@@ -260,7 +261,7 @@ fn the_number_of_threads_changes_no_bit_of_an_update() {
             let networks = case.algorithm.networks().into_iter();
             let read = |network: &Parameters| network.values().to_vec();
             networks
-                .map(|(_, t)| (read(&t.network), t.target.as_ref().map(read)))
+                .map(|(_, t)| (read(&t.parameters), t.target.as_ref().map(read)))
                 .collect::<Vec<_>>()
         };
         let one = run("1");

@@ -1,91 +1,92 @@
-//! Checkpoints written while training goes on: one at a time, by a thread of its own.
+//! Writes checkpoints in the background, one at a time, on its own thread.
 
 use std::path::PathBuf;
 use std::thread::JoinHandle;
 
-use super::{CheckpointError, Cut};
+use super::{CheckpointContents, CheckpointError};
 use crate::learner::Learner;
 
-/// What became of a checkpoint.
+/// The outcome of writing a checkpoint.
 #[derive(Debug)]
-pub struct Ended {
-    /// Environment steps of its moment.
+pub struct WriteOutcome {
+    /// Environment steps when the checkpoint began.
     pub env_steps: u64,
-    /// Its name, or why there is none.
-    pub written: Result<String, CheckpointError>,
+    /// Name of the checkpoint, or the error.
+    pub result: Result<String, CheckpointError>,
 }
 
 /// Writes checkpoints into a folder.
 #[derive(Debug)]
 pub struct Writer {
     folder: PathBuf,
-    under_way: Option<UnderWay>,
+    in_progress: Option<InProgress>,
 }
 
 #[derive(Debug)]
-struct UnderWay {
+struct InProgress {
     env_steps: u64,
     logged: u64,
     thread: JoinHandle<Result<String, CheckpointError>>,
 }
 
 impl Writer {
-    /// One that writes nothing yet.
+    /// Makes an idle writer.
     #[must_use]
     pub fn new(folder: PathBuf) -> Self {
-        Self { folder, under_way: None }
+        Self { folder, in_progress: None }
     }
 
-    /// Whether one is being written.
+    /// Returns whether a checkpoint is being written.
     #[must_use]
     pub fn is_busy(&self) -> bool {
-        self.under_way.is_some()
+        self.in_progress.is_some()
     }
 
-    /// Begins to write a checkpoint of this moment.
+    /// Captures the learner's state and begins to write it.
     ///
     /// # Errors
-    /// If there can be none: the networks cannot be fetched, or no thread be started.
+    /// If the networks cannot be copied from the device, or no thread can be started.
     ///
     /// # Panics
-    /// If one is being written.
+    /// If a checkpoint is being written.
     pub fn begin(&mut self, learner: &mut Learner) -> Result<(), CheckpointError> {
         assert!(!self.is_busy(), "one checkpoint at a time");
-        let cut = Cut::of(learner)?;
-        let (env_steps, logged) = (cut.state.counters.env_steps, cut.logged);
+        let contents = CheckpointContents::capture(learner)?;
+        let (env_steps, logged) = (contents.state.counters.env_steps, contents.logged);
         let folder = self.folder.clone();
         let thread = std::thread::Builder::new().name("checkpoint".into());
         let thread = thread
-            .spawn(move || cut.write(&folder))
+            .spawn(move || contents.write(&folder))
             .map_err(|cause| CheckpointError::Io { path: self.folder.clone(), cause })?;
-        self.under_way = Some(UnderWay { env_steps, logged, thread });
+        self.in_progress = Some(InProgress { env_steps, logged, thread });
         Ok(())
     }
 
-    /// What became of the one that was being written, if it is over. The segment log forgets what
-    /// it holds.
-    pub fn poll(&mut self, learner: &mut Learner) -> Option<Ended> {
-        let over = self.under_way.as_ref().is_some_and(|it| it.thread.is_finished());
-        if over { self.wait(learner) } else { None }
+    /// Returns the outcome of the checkpoint that was being written, if it is finished. Then
+    /// removes its segments from the segment log.
+    pub fn poll(&mut self, learner: &mut Learner) -> Option<WriteOutcome> {
+        let finished = self.in_progress.as_ref().is_some_and(|it| it.thread.is_finished());
+        if finished { self.wait(learner) } else { None }
     }
 
-    /// The same, and waits for it.
-    pub fn wait(&mut self, learner: &mut Learner) -> Option<Ended> {
-        let UnderWay { env_steps, logged, thread } = self.under_way.take()?;
+    /// Waits for the checkpoint that is being written, if any, and returns its outcome. Then
+    /// removes its segments from the segment log.
+    pub fn wait(&mut self, learner: &mut Learner) -> Option<WriteOutcome> {
+        let InProgress { env_steps, logged, thread } = self.in_progress.take()?;
         let written = thread.join().unwrap_or_else(|panic| std::panic::resume_unwind(panic));
-        let written = written.and_then(|name| {
-            let forgotten = learner.inbox.checkpointed(logged);
-            forgotten.map(|()| name).map_err(|cause| CheckpointError::Log { cause })
+        let result = written.and_then(|name| {
+            let emptied = learner.inbox.checkpointed(logged);
+            emptied.map(|()| name).map_err(|cause| CheckpointError::Log { cause })
         });
-        Some(Ended { env_steps, written })
+        Some(WriteOutcome { env_steps, result })
     }
 }
 
 impl Drop for Writer {
-    /// A learner that fails leaves the checkpoint that it has begun.
+    /// Waits for the checkpoint that is being written, so that a failing learner completes it.
     fn drop(&mut self) {
-        if let Some(UnderWay { thread, .. }) = self.under_way.take() {
-            // What became of it is in the folder.
+        if let Some(InProgress { thread, .. }) = self.in_progress.take() {
+            // The outcome is not needed: an incomplete checkpoint is never loaded.
             let _ = thread.join();
         }
     }

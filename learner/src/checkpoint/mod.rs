@@ -1,13 +1,13 @@
-//! Everything a run needs to go on exactly: networks, targets, optimisers, replay, counters,
-//! random states and how far each worker's segments had come, from one moment.
+//! Writes and loads checkpoints: networks, targets, optimisers, replay, counters, random states and
+//! the newest sequence number of each worker, all from one moment. A resumed run continues exactly.
 //!
 //! ```text
 //!   checkpoints/000012/   networks.safetensors · replay.bin · state.json
 //!   checkpoints/latest -> 000012
 //! ```
-//! A checkpoint is written under a temporary name, synced and renamed, so a half-written one never
-//! carries a number. `state.json` is written last and holds length and CRC-32 of the others: a
-//! torn or damaged checkpoint is refused with the reason, and the one before it is used.
+//! A checkpoint is written under a temporary name, synced and renamed, so an incomplete one never
+//! has a number. `state.json` is written last and has length and CRC-32 of the other files. A
+//! damaged checkpoint is rejected with the reason, and the previous one is used.
 
 mod background;
 mod networks_file;
@@ -28,18 +28,18 @@ use thiserror::Error;
 use crate::learner::{Counters, Learner};
 use crate::normaliser::Normaliser;
 use crate::replay::{Replay, ReplayFileError, Sampler};
-use crate::update::adam::AdamStep;
+use crate::update::adam::StepCount;
 
-pub use background::{Ended, Writer};
+pub use background::{WriteOutcome, Writer};
 pub use rotation::names;
 
-/// Version of this format.
+/// Version of the format.
 const FORMAT_VERSION: u32 = 3;
 const NETWORKS: &str = "networks.safetensors";
 const REPLAY: &str = "replay.bin";
 const STATE: &str = "state.json";
 
-/// Why a checkpoint could not be written or was refused.
+/// Why a checkpoint could not be written or was rejected.
 #[derive(Debug, Error)]
 pub enum CheckpointError {
     /// Reading or writing failed.
@@ -47,60 +47,60 @@ pub enum CheckpointError {
     Io {
         /// File or directory.
         path: PathBuf,
-        /// Why.
+        /// The reason.
         cause: std::io::Error,
     },
-    /// The checkpoint was written; the segment log could not be emptied.
+    /// The checkpoint was written, but the segment log could not be emptied.
     #[error("a checkpoint was written, but the segment log could not be emptied: {cause}")]
     Log {
-        /// Why.
+        /// The reason.
         cause: LogError,
     },
-    /// What the device has learned could not be brought back.
-    #[error("cannot bring the networks back from the device: {cause}")]
+    /// The networks could not be copied from the device.
+    #[error("cannot copy the networks from the device: {cause}")]
     Device {
-        /// Why.
+        /// The reason.
         cause: candle_core::Error,
     },
-    /// A file whose length or checksum differs from what `state.json` says.
+    /// The length or checksum of a file differs from `state.json`.
     #[error("{path}: {name} is {got}, expected {expected}")]
     Damaged {
         /// The file.
         path: PathBuf,
         /// Length or checksum.
         name: &'static str,
-        /// What `state.json` says.
+        /// Value in `state.json`.
         expected: u64,
-        /// What the file has.
+        /// Value of the file.
         got: u64,
     },
-    /// A file that is not what its name says.
+    /// A file has the wrong format.
     #[error("{path}: {cause}")]
     Format {
         /// The file.
         path: PathBuf,
-        /// Why.
+        /// The reason.
         cause: String,
     },
-    /// The replay does not fit.
+    /// The replay file is unusable.
     #[error("{path}: {cause}")]
     Replay {
         /// The file.
         path: PathBuf,
-        /// Why.
+        /// The reason.
         cause: ReplayFileError,
     },
-    /// None of the checkpoints can be used.
-    #[error("{path}: no usable checkpoint{refused}")]
+    /// No checkpoint is usable.
+    #[error("{path}: no usable checkpoint{rejected}")]
     None {
         /// The folder.
         path: PathBuf,
-        /// Why each was refused.
-        refused: String,
+        /// The reason for each checkpoint, one per line.
+        rejected: String,
     },
 }
 
-/// A small file's content: where the run stands.
+/// Contents of `state.json`.
 #[derive(Debug, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 struct State {
@@ -108,16 +108,17 @@ struct State {
     architecture_hash: u64,
     counters: Counters,
     updates_owed: f64,
-    /// By the network's name.
-    adam_steps: BTreeMap<String, AdamStep>,
+    /// Optimiser steps by network name.
+    adam_steps: BTreeMap<String, StepCount>,
     sampler_random: Xoshiro256PlusPlus,
-    /// Up to where segments are in the replay. Checkpoints of older versions have none.
+    /// Marks up to which the replay has segments. Checkpoints of older versions do not have this
+    /// field.
     #[serde(default)]
     settled: Vec<Watermark>,
     #[serde(default, skip_serializing_if = "Option::is_none")]
     normaliser: Option<Normaliser>,
     files: Vec<FileSum>,
-    /// CRC-32 of this state without this field. Formats 1 and 2 have none.
+    /// CRC-32 of the state without this field. Formats 1 and 2 do not have it.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     crc32: Option<u32>,
 }
@@ -130,39 +131,40 @@ struct FileSum {
     crc32: u32,
 }
 
-/// A checkpoint that was loaded, and the newer ones that had to be passed over.
+/// A loaded checkpoint, with the newer ones that were rejected.
 #[derive(Debug)]
 pub struct Loaded {
-    /// Its directory's name.
+    /// Name of the checkpoint's directory.
     pub name: String,
-    /// Why newer ones were refused.
-    pub refused: Vec<CheckpointError>,
+    /// Why newer checkpoints were rejected.
+    pub rejected: Vec<CheckpointError>,
 }
 
 fn io_error(path: &Path) -> impl FnOnce(std::io::Error) -> CheckpointError + '_ {
     |cause| CheckpointError::Io { path: path.to_owned(), cause }
 }
 
-/// Everything that a checkpoint holds, from one moment: what training does afterwards does not
-/// change it. It shares the replay's numbers with the learner, so it costs little more memory than
-/// the networks do, and milliseconds.
+/// The contents of a checkpoint from one moment. Later training does not change them. They share
+/// the replay's blocks with the learner, so capturing takes milliseconds and little more memory
+/// than the networks.
 #[derive(Debug)]
-pub struct Cut {
+pub struct CheckpointContents {
     networks: Vec<u8>,
     replay: Replay,
     state: State,
     config: CheckpointConfig,
-    /// What the segment log had of that moment [bytes]: forgotten once this is written.
+    /// Length of the segment log at that moment \[bytes\]. That part is removed once this is
+    /// written.
     logged: u64,
 }
 
-impl Cut {
-    /// Of this moment.
+impl CheckpointContents {
+    /// Captures the learner's current state.
     ///
     /// # Errors
-    /// If the networks cannot be brought back from the device.
-    pub fn of(learner: &mut Learner) -> Result<Self, CheckpointError> {
-        let fetched = learner.algorithm.fetch();
+    /// If the networks cannot be copied from the device.
+    pub fn capture(learner: &mut Learner) -> Result<Self, CheckpointError> {
+        let fetched = learner.regime.fetch();
         fetched.map_err(|cause| CheckpointError::Device { cause })?;
         let networks = networks_file::bytes(learner)
             .map_err(|cause| CheckpointError::Format { path: NETWORKS.into(), cause })?;
@@ -171,8 +173,8 @@ impl Cut {
             format_version: FORMAT_VERSION,
             architecture_hash: learner.policy().architecture_hash(),
             counters: learner.counters,
-            updates_owed: learner.pacing.owed(),
-            adam_steps: steps.map(|(name, t)| (name.to_owned(), t.adam.step)).collect(),
+            updates_owed: learner.regime.updates_owed(),
+            adam_steps: steps.map(|(name, network)| (name.to_owned(), network.adam.step)).collect(),
             sampler_random: learner.sampler.random().clone(),
             settled: learner.inbox.settled().to_vec(),
             normaliser: learner.normaliser.clone(),
@@ -188,10 +190,10 @@ impl Cut {
         })
     }
 
-    /// Writes it into `folder` and drops the oldest there; returns its name.
+    /// Writes the checkpoint into `folder` and deletes the oldest ones. Returns its name.
     ///
     /// # Errors
-    /// If writing fails; the checkpoints that were there are then untouched.
+    /// If writing fails. Existing checkpoints are then unchanged.
     pub fn write(self, folder: &Path) -> Result<String, CheckpointError> {
         let CheckpointConfig { keep, disk_bytes_max, .. } = self.config;
         rotation::remove_temporaries(folder)?;
@@ -199,7 +201,7 @@ impl Cut {
         let temporary = folder.join(format!(".{name}.tmp"));
         fs::create_dir(&temporary).map_err(io_error(&temporary))?;
         if let Err(error) = self.write_files(&temporary) {
-            // The disk may be full: the half-written one must not keep it so.
+            // The disk may be full, so the incomplete checkpoint must not stay.
             let _ = fs::remove_dir_all(&temporary);
             return Err(error);
         }
@@ -227,8 +229,8 @@ impl Cut {
     }
 }
 
-/// Where the run stood at each readable checkpoint of a folder, oldest first: where a resume may go
-/// back to.
+/// Returns the counters of each readable checkpoint in a folder, oldest first. A resume may go back
+/// to any of them.
 ///
 /// # Errors
 /// If the folder cannot be read.
@@ -240,7 +242,7 @@ pub fn counters(folder: &Path) -> Result<Vec<Counters>, CheckpointError> {
     Ok(names(folder)?.into_iter().filter_map(read).collect())
 }
 
-/// Counts and sums what passes through.
+/// A writer that counts bytes and computes their CRC-32.
 struct Summing<W> {
     inner: W,
     bytes: u64,
@@ -277,17 +279,16 @@ fn write_summed(
     run().map_err(io_error(&path))
 }
 
-/// Loads the newest usable checkpoint of `folder` into a `learner` freshly made from the run's
-/// configuration. One that is refused leaves no trace in `learner`'s successor: the caller makes
-/// a fresh learner for every try through `fresh`.
+/// Loads the newest usable checkpoint of `folder` into a learner made by `fresh`. Each attempt uses
+/// another learner, so that a rejected checkpoint has no effect.
 ///
 /// # Errors
-/// `None` if no checkpoint can be used, with the reason for each.
+/// [`CheckpointError::None`] if no checkpoint is usable, with the reason for each.
 pub fn load_newest(
     folder: &Path,
     fresh: &dyn Fn() -> Result<Learner, crate::learner::LearnerError>,
 ) -> Result<(Learner, Loaded), CheckpointError> {
-    let mut refused = Vec::new();
+    let mut rejected = Vec::new();
     for name in names(folder)?.into_iter().rev() {
         let path = folder.join(&name);
         let learner = fresh().map_err(|cause| CheckpointError::Format {
@@ -295,12 +296,12 @@ pub fn load_newest(
             cause: cause.to_string(),
         });
         match learner.and_then(|mut learner| load(&path, &mut learner).map(|()| learner)) {
-            Ok(learner) => return Ok((learner, Loaded { name, refused })),
-            Err(error) => refused.push(error),
+            Ok(learner) => return Ok((learner, Loaded { name, rejected })),
+            Err(error) => rejected.push(error),
         }
     }
-    let refused: String = refused.iter().map(|error| format!("\n  {error}")).collect();
-    Err(CheckpointError::None { path: folder.to_owned(), refused })
+    let rejected: String = rejected.iter().map(|error| format!("\n  {error}")).collect();
+    Err(CheckpointError::None { path: folder.to_owned(), rejected })
 }
 
 fn load(folder: &Path, learner: &mut Learner) -> Result<(), CheckpointError> {
@@ -312,12 +313,13 @@ fn load(folder: &Path, learner: &mut Learner) -> Result<(), CheckpointError> {
     let own = learner.policy().architecture_hash();
     if state.architecture_hash != own {
         let got = state.architecture_hash;
-        let cause = format!("architecture {got:016x}, the configuration gives {own:016x}");
+        let cause =
+            format!("architecture is {got:016x}, expected {own:016x} from the configuration");
         return Err(format(&path, cause));
     }
     for name in [NETWORKS, REPLAY] {
         let sum = state.files.iter().find(|sum| sum.name == name);
-        let sum = sum.ok_or_else(|| format(&path, format!("lists no {name}")))?;
+        let sum = sum.ok_or_else(|| format(&path, format!("does not list {name}")))?;
         verify(&folder.join(name), sum)?;
     }
     let networks = folder.join(NETWORKS);
@@ -330,26 +332,29 @@ fn load(folder: &Path, learner: &mut Learner) -> Result<(), CheckpointError> {
         .replay
         .read(&mut input)
         .map_err(|cause| CheckpointError::Replay { path: replay, cause })?;
-    learner.each_network(|name, trained| match state.adam_steps.get(name) {
+    learner.for_each_network(|name, network| match state.adam_steps.get(name) {
         Some(step) => {
-            trained.adam.step = *step;
+            network.adam.step = *step;
             Ok(())
         }
-        None => Err(format(&path, format!("has no optimiser step of {name}"))),
+        None => Err(format(&path, format!("has no optimiser steps of {name}"))),
     })?;
-    if state.normaliser.as_ref().is_some_and(|normaliser| !normaliser.is_sound()) {
-        return Err(format(&path, "observation normalisation contradicts itself".into()));
+    if state.normaliser.as_ref().is_some_and(|normaliser| !normaliser.is_valid()) {
+        return Err(format(
+            &path,
+            "the statistics of the observation normalisation are invalid".into(),
+        ));
     }
     if state.normaliser.as_ref().map(Normaliser::observation_len)
         != learner.normaliser.as_ref().map(Normaliser::observation_len)
     {
-        let cause = "observation normalisation differs from policy.normalise_observations";
+        let cause = "observation normalisation does not match policy.normalise_observations";
         return Err(format(&path, cause.into()));
     }
     learner.normaliser = state.normaliser;
     learner.counters = state.counters;
     learner.inbox.restore(&state.settled);
-    learner.pacing.restore(state.updates_owed);
+    learner.regime.restore_updates_owed(state.updates_owed);
     let windows = learner.config().algorithm.windows;
     learner.sampler = Sampler::new(windows, state.sampler_random);
     Ok(())

@@ -1,13 +1,13 @@
-//! Networks, targets and optimiser moments as one safetensors file.
+//! Reads and writes networks, targets and optimiser moments as one safetensors file.
 
 use std::borrow::Cow;
 
 use safetensors::tensor::{Dtype, SafeTensors, View};
 
 use crate::learner::Learner;
-use crate::networks::Parameters;
+use crate::parameters::Parameters;
 
-/// A flat tensor on its way to the file.
+/// A flat tensor to be written.
 struct Flat {
     len: usize,
     values: Vec<f32>,
@@ -31,14 +31,15 @@ impl View for Flat {
     }
 }
 
+/// Returns the file's contents.
 pub(super) fn bytes(learner: &Learner) -> Result<Vec<u8>, String> {
     let mut tensors = Vec::new();
-    for (name, trained) in learner.networks() {
-        let network = trained.network.values().to_vec();
-        let target = trained.target.as_ref().map(|target| target.values().to_vec());
-        let moments = &trained.adam.moments;
+    for (name, network) in learner.networks() {
+        let parameters = network.parameters.values().to_vec();
+        let target = network.target.as_ref().map(|target| target.values().to_vec());
+        let moments = &network.adam.moments;
         let parts =
-            [Some(network), target, Some(moments.first.clone()), Some(moments.second.clone())];
+            [Some(parameters), target, Some(moments.first.clone()), Some(moments.second.clone())];
         for (part, values) in PARTS.iter().zip(parts) {
             let Some(values) = values else { continue };
             tensors.push((format!("{name}.{part}"), Flat { len: values.len(), values }));
@@ -47,8 +48,10 @@ pub(super) fn bytes(learner: &Learner) -> Result<Vec<u8>, String> {
     safetensors::serialize(tensors, None).map_err(|error| error.to_string())
 }
 
+/// Suffixes of a network's tensors.
 const PARTS: [&str; 4] = ["network", "target", "adam_first", "adam_second"];
 
+/// Restores the networks from a file's contents.
 pub(super) fn restore(bytes: &[u8], learner: &mut Learner) -> Result<(), String> {
     let tensors = SafeTensors::deserialize(bytes).map_err(|error| error.to_string())?;
     let read = |name: &str, part: &str, len: usize| -> Result<Vec<f32>, String> {
@@ -58,21 +61,21 @@ pub(super) fn restore(bytes: &[u8], learner: &mut Learner) -> Result<(), String>
             let (dtype, shape) = (tensor.dtype(), tensor.shape());
             return Err(format!("{name} is {dtype:?} {shape:?}, expected F32 [{len}]"));
         }
-        // The file's bytes need not be aligned for f32.
+        // The bytes may not be aligned for f32.
         let chunks = tensor.data().as_chunks::<4>().0;
         Ok(chunks.iter().map(|bytes| f32::from_le_bytes(*bytes)).collect())
     };
-    learner.each_network(|name, trained| {
-        let len = trained.adam.moments.first.len();
-        let set = |network: &mut Parameters, part| {
-            network.set(&read(name, part, len)?).map_err(|error| error.to_string())
+    learner.for_each_network(|name, network| {
+        let len = network.adam.moments.first.len();
+        let set = |parameters: &mut Parameters, part| {
+            parameters.set(&read(name, part, len)?).map_err(|error| error.to_string())
         };
-        set(&mut trained.network, PARTS[0])?;
-        if let Some(target) = &mut trained.target {
+        set(&mut network.parameters, PARTS[0])?;
+        if let Some(target) = &mut network.target {
             set(target, PARTS[1])?;
         }
-        trained.adam.moments.first = read(name, PARTS[2], len)?;
-        trained.adam.moments.second = read(name, PARTS[3], len)?;
+        network.adam.moments.first = read(name, PARTS[2], len)?;
+        network.adam.moments.second = read(name, PARTS[3], len)?;
         Ok(())
     })
 }

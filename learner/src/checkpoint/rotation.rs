@@ -1,4 +1,4 @@
-//! Names of checkpoints, `latest`, and dropping the oldest.
+//! Names of checkpoints, the link `latest`, and the deletion of the oldest.
 
 use std::fs;
 use std::path::Path;
@@ -7,7 +7,7 @@ use super::{CheckpointError, io_error};
 
 const LATEST: &str = "latest";
 
-/// The complete checkpoints of a folder, oldest first.
+/// Returns the names of a folder's complete checkpoints, oldest first.
 ///
 /// # Errors
 /// If the folder cannot be read.
@@ -24,12 +24,13 @@ pub fn names(folder: &Path) -> Result<Vec<String>, CheckpointError> {
     Ok(numbered.into_iter().map(|(_, name)| name).collect())
 }
 
+/// Returns the name of the next checkpoint.
 pub(super) fn next_name(folder: &Path) -> Result<String, CheckpointError> {
     let newest = names(folder)?.last().and_then(|name| name.parse::<u64>().ok()).unwrap_or(0);
     Ok(format!("{:06}", newest + 1))
 }
 
-/// What a killed writer left.
+/// Deletes what a killed writer left.
 pub(super) fn remove_temporaries(folder: &Path) -> Result<(), CheckpointError> {
     for entry in fs::read_dir(folder).map_err(io_error(folder))? {
         let path = entry.map_err(io_error(folder))?.path();
@@ -43,11 +44,11 @@ pub(super) fn remove_temporaries(folder: &Path) -> Result<(), CheckpointError> {
     Ok(())
 }
 
-/// Points `latest` at a checkpoint, in one step.
+/// Points `latest` at a checkpoint, atomically.
 pub(super) fn point_latest(folder: &Path, name: &str) -> Result<(), CheckpointError> {
     let temporary = folder.join(".latest.tmp");
     let link = folder.join(LATEST);
-    // A copy made without symbolic links has the checkpoint itself under this name.
+    // In a copy made without symbolic links, `latest` is a directory.
     if link.symlink_metadata().is_ok_and(|there| there.is_dir()) {
         fs::remove_dir_all(&link).map_err(io_error(&link))?;
     }
@@ -57,8 +58,8 @@ pub(super) fn point_latest(folder: &Path, name: &str) -> Result<(), CheckpointEr
         .map_err(io_error(&link))
 }
 
-/// Drops the oldest checkpoints until at most `keep` are left and they take at most `bytes_max`;
-/// the newest always stays.
+/// Deletes the oldest checkpoints until at most `keep` remain with at most `bytes_max` in total.
+/// The newest always stays.
 pub(super) fn rotate(folder: &Path, keep: usize, bytes_max: u64) -> Result<(), CheckpointError> {
     let names = names(folder)?;
     let sizes: Vec<u64> =

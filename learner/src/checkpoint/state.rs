@@ -1,22 +1,22 @@
-//! `state.json`: read, with nothing in it trusted.
+//! Reads and checks `state.json`. Nothing in it is trusted.
 
 use super::{FORMAT_VERSION, State};
 
-/// No run counts so far, and nothing that is added to such a number overflows.
+/// Larger counts are rejected. Additions to smaller ones cannot overflow.
 const COUNT_MAX: u64 = 1 << 62;
-/// A learner that owed so many updates would never take a segment again.
+/// Larger numbers of updates are rejected, because the learner would never take a segment again.
 const UPDATES_OWED_MAX: f64 = 4e9;
 
-/// Reads `state.json` of this version or one before.
+/// Reads `state.json` of this or an earlier format version.
 pub(super) fn read(text: &[u8]) -> Result<State, String> {
     let mut state: serde_json::Map<String, serde_json::Value> =
         serde_json::from_slice(text).map_err(|error| error.to_string())?;
     let version = state.get("format_version").and_then(serde_json::Value::as_u64);
     match version {
-        // Two had no sum of its own.
+        // Version 2 has no CRC-32 of the state.
         Some(2) => {}
         Some(version) if version == u64::from(FORMAT_VERSION) => {}
-        // Only DDPG existed, and its two optimisers had a field each.
+        // Version 1 has only DDPG, with one field for each of its two optimisers.
         Some(1) => {
             let mut steps = serde_json::Map::new();
             for name in ["actor", "critic"] {
@@ -37,13 +37,13 @@ pub(super) fn read(text: &[u8]) -> Result<State, String> {
     Ok(state)
 }
 
-/// Refuses what is damaged, or could not have come from a run.
+/// Rejects a state that is damaged or impossible.
 fn check(state: &mut State) -> Result<(), String> {
     let expected = state.crc32;
     let got = sum(state).map_err(|error| error.to_string())?;
-    // Of a format without one there may be none; one that is there is held to.
-    let is_due = state.format_version == FORMAT_VERSION || expected.is_some();
-    if is_due && expected != Some(got) {
+    // Earlier formats may lack the CRC-32, but it must be correct if present.
+    let is_required = state.format_version == FORMAT_VERSION || expected.is_some();
+    if is_required && expected != Some(got) {
         let expected = expected.map_or("one".into(), |expected| expected.to_string());
         return Err(format!("CRC-32 is {got}, expected {expected}"));
     }
@@ -52,7 +52,10 @@ fn check(state: &mut State) -> Result<(), String> {
         return Err(format!("a counter is {count}, expected at most {COUNT_MAX}"));
     }
     if let Some((name, step)) = state.adam_steps.iter().find(|(_, step)| step.0 > COUNT_MAX) {
-        return Err(format!("optimiser steps of {name} are {}, expected fewer", step.0));
+        return Err(format!(
+            "optimiser steps of {name} are {}, expected at most {COUNT_MAX}",
+            step.0
+        ));
     }
     let owed = state.updates_owed;
     if !(0.0..=UPDATES_OWED_MAX).contains(&owed) {
@@ -61,7 +64,7 @@ fn check(state: &mut State) -> Result<(), String> {
     Ok(())
 }
 
-/// The largest count in a tree of them.
+/// Returns the largest count in a tree of counts.
 fn largest(counters: &serde_json::Value) -> Option<u64> {
     match counters {
         serde_json::Value::Object(fields) => fields.values().filter_map(largest).max(),
@@ -69,7 +72,7 @@ fn largest(counters: &serde_json::Value) -> Option<u64> {
     }
 }
 
-/// CRC-32 of the state without its own field for it, which is empty afterwards.
+/// Returns the CRC-32 of the state without its field `crc32`, which is cleared.
 pub(super) fn sum(state: &mut State) -> serde_json::Result<u32> {
     state.crc32 = None;
     Ok(crc32fast::hash(&serde_json::to_vec(state)?))

@@ -10,6 +10,7 @@ use rand::RngExt;
 use super::*;
 use crate::learner::LearnerError;
 use crate::learner::tests::spec;
+use crate::regime::Regime;
 
 const RUN_ID: u64 = 5;
 
@@ -62,7 +63,7 @@ fn segment(learner: &Learner, round: u32) -> Segment {
     segment
 }
 
-/// Feeds `rounds` segments of two interleaved environments and does the updates owed for them.
+/// Inserts `rounds` segments of two interleaved environments and does the updates owed for them.
 fn train(learner: &mut Learner, rounds: std::ops::Range<u32>) {
     if learner.replay.is_empty() && learner.config().demonstrations.are_cloned() {
         learner.demonstrate(&[crate::demonstrations::tests::steps()]).unwrap();
@@ -73,7 +74,7 @@ fn train(learner: &mut Learner, rounds: std::ops::Range<u32>) {
         while learner.update_due() {
             learner.update().unwrap();
         }
-        if learner.algorithm.as_on_policy().is_some() && learner.counters.updates > updates {
+        if matches!(learner.regime, Regime::OnPolicy(_)) && learner.counters.updates > updates {
             learner.next_snapshot().unwrap();
         }
     }
@@ -83,7 +84,7 @@ fn train(learner: &mut Learner, rounds: std::ops::Range<u32>) {
 fn save(folder: &Path, learner: &mut Learner) -> Result<String, CheckpointError> {
     let mut writer = Writer::new(folder.to_owned());
     writer.begin(learner)?;
-    writer.wait(learner).unwrap().written
+    writer.wait(learner).unwrap().result
 }
 
 fn checkpoint_bytes(folder: &Path, name: &str) -> Vec<(String, Vec<u8>)> {
@@ -115,7 +116,7 @@ fn a_resumed_learner_goes_on_to_the_same_bytes_as_one_that_never_stopped() {
         assert!(learner.counters.updates > 400);
 
         let (mut learner, loaded) = load_newest(&resumed, &fresh).unwrap();
-        assert!(loaded.refused.is_empty());
+        assert!(loaded.rejected.is_empty());
         train(&mut learner, 60..300);
         let again = save(&resumed, &mut learner).unwrap();
         let both = [(&straight, &name), (&resumed, &again)];
@@ -131,11 +132,11 @@ fn a_checkpoint_is_of_its_moment_however_far_training_goes_while_it_is_written()
     [&at_once, &later].into_iter().for_each(|path| fs::create_dir(path).unwrap());
     let mut learner = fresh_with(&[("policy.normalise_observations", "true")]).unwrap();
     train(&mut learner, 0..150);
-    let cut = Cut::of(&mut learner).unwrap();
+    let contents = CheckpointContents::capture(&mut learner).unwrap();
     let name = save(&at_once, &mut learner).unwrap();
-    // All 200 slots of the ring are written anew.
+    // This overwrites all 200 slots of the ring.
     train(&mut learner, 150..400);
-    assert_eq!(cut.write(&later).unwrap(), name);
+    assert_eq!(contents.write(&later).unwrap(), name);
     assert!(checkpoint_bytes(&at_once, &name) == checkpoint_bytes(&later, &name));
 }
 
@@ -170,7 +171,7 @@ fn a_checkpoint_of_the_format_before_is_read_and_one_of_a_later_is_refused() {
     fs::write(&path, state.to_string()).unwrap();
     let (loaded, _) = load_newest(folder, &fresh).unwrap();
     assert_eq!(loaded.counters, learner.counters);
-    assert_eq!(loaded.algorithm.networks()[0].1.adam, learner.algorithm.networks()[0].1.adam);
+    assert_eq!(loaded.networks()[0].1.adam, learner.networks()[0].1.adam);
 
     state["format_version"] = 4.into();
     fs::write(&path, state.to_string()).unwrap();
@@ -178,7 +179,7 @@ fn a_checkpoint_of_the_format_before_is_read_and_one_of_a_later_is_refused() {
     assert!(error.contains("format version 4, this build reads 1 to 3"), "{error}");
 }
 
-/// The other files' checksums stand in `state.json`; what stood there itself was once believed.
+/// Earlier versions did not check `state.json` itself, only the files that it lists.
 #[test]
 fn a_number_that_was_changed_in_the_state_is_noticed() {
     let folder = tempfile::tempdir().unwrap();
@@ -197,7 +198,7 @@ fn a_number_that_was_changed_in_the_state_is_noticed() {
     refused(&other, "CRC-32");
     other.as_object_mut().unwrap().remove("crc32");
     refused(&other, "CRC-32");
-    // One of a format without a sum is still held to what a run can be.
+    // A format without CRC-32 is still checked for impossible values.
     other["format_version"] = 2.into();
     for (key, value) in [("updates_owed", 1e300.into()), ("updates_owed", (-1.0).into())] {
         let mut other = other.clone();
@@ -209,7 +210,7 @@ fn a_number_that_was_changed_in_the_state_is_noticed() {
 }
 
 #[test]
-fn segments_that_a_checkpoint_holds_are_refused_and_those_that_nobody_has_are_counted() {
+fn segments_of_a_checkpoint_are_rejected_and_missing_ones_are_counted() {
     let folder = tempfile::tempdir().unwrap();
     let mut learner = fresh().unwrap();
     train(&mut learner, 0..60);
@@ -219,7 +220,7 @@ fn segments_that_a_checkpoint_holds_are_refused_and_those_that_nobody_has_are_co
     assert_eq!(learner.inbox.settled()[0], Watermark { incarnation: 0, sequence: 60 });
     let again = segment(&learner, 59);
     assert_eq!(learner.insert(&again), Err(Rejection::Duplicate));
-    // The worker forgot ten that the dead learner had acknowledged.
+    // The worker no longer has ten segments that the crashed learner had acknowledged.
     train(&mut learner, 70..71);
     let counters = learner.counters;
     assert_eq!((counters.segments, counters.lost, counters.received), (61, 10, 62));
@@ -257,7 +258,7 @@ fn at_level_log_what_was_acknowledged_outlives_the_learner() {
     let mut recovered = Vec::new();
     learner.replay.write(&mut recovered).unwrap();
     assert!(recovered == replay, "the same segments in the same order");
-    // The worker still keeps the five, and sends them again.
+    // The worker still has the last five and retransmits them.
     train(&mut learner, 80..85);
     assert_eq!(learner.counters.lost, 0);
     save(&checkpoints, &mut learner).unwrap();
@@ -294,16 +295,14 @@ fn an_on_policy_learner_goes_on_from_its_networks_with_an_empty_rollout() {
     learner.next_snapshot().unwrap();
     train(&mut learner, 0..20);
     assert_eq!((learner.counters.updates, learner.counters.stale_segments), (8, 0));
-    let rollout = |learner: &Learner| learner.algorithm.as_on_policy().unwrap().rollout.len();
+    let rollout = |learner: &Learner| learner.regime.segments_held(&learner.replay);
     assert_eq!(rollout(&learner), 4);
     save(folder.path(), &mut learner).unwrap();
 
     let resume = || load_newest(folder.path(), &fresh).unwrap().0;
     let mut resumed = resume();
     assert_eq!((resumed.counters, rollout(&resumed)), (learner.counters, 0));
-    for ((name, old), (_, new)) in
-        learner.algorithm.networks().iter().zip(resumed.algorithm.networks())
-    {
+    for ((name, old), (_, new)) in learner.networks().iter().zip(resumed.networks()) {
         assert_eq!(old.adam, new.adam, "{name}");
     }
     assert_eq!(policy(&mut resumed), policy(&mut learner));
@@ -342,7 +341,7 @@ fn a_damaged_checkpoint_is_refused_with_the_reason_and_the_one_before_is_used() 
         fs::write(&path, bytes).unwrap();
         let (_, loaded) = load_newest(folder, &fresh).unwrap();
         assert_eq!(loaded.name, older);
-        let refused = loaded.refused[0].to_string();
+        let refused = loaded.rejected[0].to_string();
         assert!(refused.contains(reason), "{file}: {refused}");
         fs::write(&path, sound).unwrap();
     }
@@ -371,7 +370,7 @@ fn the_oldest_make_room_and_latest_points_at_the_newest() {
     let saved: Vec<String> = (0..4).map(|_| save(folder, &mut learner).unwrap()).collect();
     assert_eq!(names(folder).unwrap(), saved[2..]);
     assert_eq!(fs::read_link(folder.join("latest")).unwrap(), Path::new(&saved[3]));
-    // A copy without symbolic links.
+    // In a copy made without symbolic links, `latest` is a directory.
     fs::remove_file(folder.join("latest")).unwrap();
     fs::create_dir(folder.join("latest")).unwrap();
     rotation::point_latest(folder, &saved[3]).unwrap();
@@ -385,11 +384,11 @@ fn a_folder_that_cannot_be_written_keeps_its_old_checkpoint() {
     let folder = tempfile::tempdir().unwrap();
     let mut learner = fresh().unwrap();
     let name = save(folder.path(), &mut learner).unwrap();
-    // A file where the temporary directory must go fails for root too, unlike permissions.
+    // A missing folder fails for root, too, unlike permissions.
     let blocked = folder.path().join(".000002.tmp");
     fs::create_dir(&blocked).unwrap();
-    let cut = Cut::of(&mut learner).unwrap();
-    let failed = cut.write_files(&folder.path().join("missing")).unwrap_err();
+    let contents = CheckpointContents::capture(&mut learner).unwrap();
+    let failed = contents.write_files(&folder.path().join("missing")).unwrap_err();
     assert!(failed.to_string().contains("missing"), "{failed}");
     assert_eq!(load_newest(folder.path(), &fresh).unwrap().1.name, name);
 }

@@ -1,4 +1,4 @@
-//! Reads a NumPy archive of steps and checks every number.
+//! Reads a NumPy archive of recorded steps and checks every number.
 
 use std::collections::BTreeSet;
 use std::path::Path;
@@ -8,11 +8,11 @@ use candle_core::{DType, Tensor};
 use dmprl_shared::policy::ActionScaling;
 use dmprl_shared::spec::EnvSpec;
 
-use super::{DemonstrationError, Steps};
+use super::{Demonstration, DemonstrationError};
 
-/// An action written with 32 bits may lie so far outside of its bounds, as a share of their range.
+/// Tolerance of actions beyond their bounds, as a share of their range, for rounding to 32 bits.
 const ROUNDING: f64 = 1e-5;
-/// Rows of a file: a slip of a header must not ask for all memory.
+/// Maximum rows of a file, so that a damaged header does not exhaust the memory.
 const ROWS_MAX: usize = 1 << 31;
 
 const KEYS: [&str; 6] =
@@ -29,11 +29,12 @@ struct Archive<'a> {
     tensors: NpzTensors,
 }
 
+/// Reads and checks the file at `path`.
 pub(super) fn read(
     path: &Path,
     spec: &EnvSpec,
     scaling: &ActionScaling,
-) -> Result<Steps, DemonstrationError> {
+) -> Result<Demonstration, DemonstrationError> {
     let unreadable = |error: candle_core::Error| DemonstrationError::Unreadable {
         file: path.to_owned(),
         reason: plain(&error),
@@ -47,7 +48,7 @@ pub(super) fn read(
     let next_observations = archive.finite("next_observations", rows, Some(o), &name)?;
     let actions = archive.finite("actions", rows, Some(a), &|index| format!("entry {index}"))?;
     let rewards = archive.finite("rewards", rows, None, &|_| String::new())?;
-    let steps = Steps {
+    let steps = Demonstration {
         actions: archive.scaled(&actions, spec, scaling)?,
         observations: narrow(&observations),
         rewards: narrow(&rewards),
@@ -59,7 +60,7 @@ pub(super) fn read(
     Ok(steps)
 }
 
-/// The error without the backtrace that candle may add.
+/// Returns the error without the backtrace that candle may add.
 fn plain(error: &candle_core::Error) -> String {
     error.to_string().lines().next().unwrap_or_default().to_owned()
 }
@@ -69,7 +70,7 @@ fn narrow(array: &Array) -> Vec<f32> {
 }
 
 impl Archive<'_> {
-    fn refuse(&self, key: String, expected: String, got: String) -> DemonstrationError {
+    fn invalid(&self, key: String, expected: String, got: String) -> DemonstrationError {
         DemonstrationError::Array { file: self.path.to_owned(), key, expected, got }
     }
 
@@ -80,7 +81,7 @@ impl Archive<'_> {
             Some(key) => {
                 let got = names.into_iter().collect::<Vec<_>>().join(", ");
                 let expected = format!("arrays {}", KEYS.join(", "));
-                Err(self.refuse((*key).to_owned(), expected, got))
+                Err(self.invalid((*key).to_owned(), expected, got))
             }
         }
     }
@@ -94,12 +95,12 @@ impl Archive<'_> {
         DemonstrationError::Unreadable { file: self.path.to_owned(), reason: plain(error) }
     }
 
-    /// N, which `rewards` says.
+    /// Returns N, the length of `rewards`.
     fn rows(&self) -> Result<usize, DemonstrationError> {
         match self.shape("rewards")?[..] {
             [rows] if (1..=ROWS_MAX).contains(&rows) => Ok(rows),
             ref other => {
-                Err(self.refuse("rewards".into(), "shape (N,), N > 0".into(), shown(other)))
+                Err(self.invalid("rewards".into(), "shape (N,), N > 0".into(), shown(other)))
             }
         }
     }
@@ -114,7 +115,7 @@ impl Archive<'_> {
         let expected: Vec<usize> = expected.into_iter().flatten().collect();
         if got != expected {
             let expected = format!("shape {}", shown(&expected));
-            return Err(self.refuse(key.to_owned(), expected, shown(&got)));
+            return Err(self.invalid(key.to_owned(), expected, shown(&got)));
         }
         let values = self.tensors.get(key).and_then(|tensor| {
             let wide = |tensor: Tensor| tensor.to_dtype(DType::F64)?.flatten_all()?.to_vec1();
@@ -124,7 +125,7 @@ impl Archive<'_> {
         Ok(Array { values, width: width.unwrap_or(1) })
     }
 
-    /// An array of numbers that are finite in 32 bits, in which the learner keeps them.
+    /// Reads an array whose numbers must be finite in 32 bits, as the learner stores them.
     fn finite(
         &self,
         key: &str,
@@ -137,7 +138,7 @@ impl Archive<'_> {
         let Some(at) = wrong else { return Ok(array) };
         let (row, entry) = (at / array.width, name(at % array.width));
         let place = format!("{key}, row {row} {entry}").trim_end().to_owned();
-        Err(self.refuse(place, "a finite 32-bit number".into(), array.values[at].to_string()))
+        Err(self.invalid(place, "a finite 32-bit number".into(), array.values[at].to_string()))
     }
 
     fn flags(&self, key: &str, rows: usize) -> Result<Vec<bool>, DemonstrationError> {
@@ -146,12 +147,12 @@ impl Archive<'_> {
             None => Ok(array.values.iter().map(|&flag| flag == 1.0).collect()),
             Some(row) => {
                 let got = array.values[row].to_string();
-                Err(self.refuse(format!("{key}, row {row}"), "0 or 1".into(), got))
+                Err(self.invalid(format!("{key}, row {row}"), "0 or 1".into(), got))
             }
         }
     }
 
-    /// From the environment's units to u.
+    /// Converts actions from the environment's units to u.
     fn scaled(
         &self,
         actions: &Array,
@@ -165,7 +166,7 @@ impl Archive<'_> {
             if !(low - slack..=high + slack).contains(&action) {
                 let place = format!("actions, row {row} entry {dimension}");
                 let bounds = format!("the environment's own units, {low} to {high}");
-                return Err(self.refuse(place, bounds, action.to_string()));
+                return Err(self.invalid(place, bounds, action.to_string()));
             }
         }
         let mut u = vec![0.0; actions.values.len()];
@@ -173,8 +174,8 @@ impl Archive<'_> {
         Ok(u)
     }
 
-    /// Inside an episode the observation after a step is the one before the next.
-    fn check_continuity(&self, steps: &Steps, o: usize) -> Result<(), DemonstrationError> {
+    /// Checks that the observation after a step is the one before the next, within an episode.
+    fn check_continuity(&self, steps: &Demonstration, o: usize) -> Result<(), DemonstrationError> {
         for row in 0..steps.len() - 1 {
             if steps.is_end(row) {
                 continue;
@@ -183,20 +184,20 @@ impl Archive<'_> {
             let before = &steps.observations[(row + 1) * o..(row + 2) * o];
             if let Some(at) = (0..o).find(|&at| after[at] != before[at]) {
                 let expected = format!(
-                    "observations of row {}, as neither terminated nor truncated ends the episode \
-                     in row {row}; entry {at} is {} there",
+                    "observations of row {}, because the episode does not end in row {row} \
+                     (neither terminated nor truncated); entry {at} is {} there",
                     row + 1,
                     before[at]
                 );
                 let key = format!("next_observations, row {row}");
-                return Err(self.refuse(key, expected, after[at].to_string()));
+                return Err(self.invalid(key, expected, after[at].to_string()));
             }
         }
         Ok(())
     }
 }
 
-/// As Python writes a shape.
+/// Formats a shape like Python.
 fn shown(shape: &[usize]) -> String {
     let numbers: Vec<String> = shape.iter().map(usize::to_string).collect();
     match numbers.as_slice() {

@@ -1,7 +1,7 @@
-//! Demonstrations: steps that somebody recorded, read from files before a run begins.
+//! Demonstrations: recorded steps, read from files before a run begins.
 //!
-//! They enter the replay as segments that are never replaced, and the actor imitates them before
-//! anything else is learned (`algorithms::cloning`). docs/demonstrations.md describes the file.
+//! They are inserted into the replay as segments that are never replaced, and the actor imitates
+//! them before the first update (`algorithms::cloning`). docs/demonstrations.md describes the file.
 
 mod file;
 
@@ -14,21 +14,21 @@ use thiserror::Error;
 
 use crate::replay::Replay;
 
-/// Why demonstrations were refused.
+/// Why demonstrations were rejected.
 #[derive(Debug, Error)]
 pub enum DemonstrationError {
-    /// Not a file of arrays.
+    /// The file is not a NumPy archive.
     #[error(
-        "{}: {reason}; expected a file written with numpy.savez (not savez_compressed), as \
+        "{}: {reason}; expected a file written with numpy.savez (not savez_compressed); \
          docs/demonstrations.md describes it", file.display()
     )]
     Unreadable {
         /// The file.
         file: PathBuf,
-        /// What reading it ended with.
+        /// Why it could not be read.
         reason: String,
     },
-    /// An array, or a row of one, that does not fit.
+    /// An array or one of its rows is invalid.
     #[error(
         "{}: {key}: expected {expected}, got {got}; docs/demonstrations.md describes the file",
         file.display()
@@ -36,79 +36,79 @@ pub enum DemonstrationError {
     Array {
         /// The file.
         file: PathBuf,
-        /// Name of the array, with row and entry where one is to blame.
+        /// Name of the array, with row and entry if one is invalid.
         key: String,
-        /// What must hold.
+        /// The expected value.
         expected: String,
-        /// What is there.
+        /// The value in the file.
         got: String,
     },
-    /// More than a replay that must also hold what is learned from.
+    /// The demonstrations would leave too little room in the replay.
     #[error(
         "demonstrations of {segments} segments would fill more than half of the replay's {slots}; \
-         give fewer, or raise replay.capacity_steps"
+         use fewer, or raise replay.capacity_steps"
     )]
     TooMany {
-        /// Segments they make.
+        /// Segments of the demonstrations.
         segments: usize,
-        /// Segments the replay holds.
+        /// Capacity of the replay in segments.
         slots: usize,
     },
 }
 
-/// N steps in the order in which they happened, episode after episode.
+/// N recorded steps in order, episode after episode.
 #[derive(Debug, Clone, PartialEq, Default)]
-pub struct Steps {
-    /// Before each step, (N, O).
+pub struct Demonstration {
+    /// Observations before each step, (N, O).
     pub observations: Vec<f32>,
-    /// u in [-1, 1], (N, A).
+    /// Actions u in [-1, 1], (N, A).
     pub actions: Vec<f32>,
-    /// (N,).
+    /// Rewards, (N,).
     pub rewards: Vec<f32>,
-    /// After each step, (N, O).
+    /// Observations after each step, (N, O).
     pub next_observations: Vec<f32>,
-    /// Whether the step ended its episode by the task's own rule, (N,).
+    /// Whether the task terminated the episode at the step, (N,).
     pub terminated: Vec<bool>,
-    /// Whether a time limit, or the end of the recording, did, (N,).
+    /// Whether a time limit or the end of the recording ended the episode at the step, (N,).
     pub truncated: Vec<bool>,
 }
 
-/// What was read, in a few figures.
+/// Figures that summarise demonstrations.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
-pub struct Summary {
-    /// Episodes, the last of a file possibly cut short.
+pub struct DemonstrationSummary {
+    /// Number of episodes. The last one of a file may be cut short.
     pub episodes: usize,
-    /// Steps.
+    /// Number of steps.
     pub steps: usize,
     /// Sum of all rewards.
     pub rewards: f64,
 }
 
-impl Steps {
+impl Demonstration {
     /// Reads and checks a file.
     ///
     /// # Errors
-    /// What does not fit, with file, array, row, expected and got.
+    /// If the file is unreadable or an array is invalid.
     pub fn read(path: &Path, spec: &EnvSpec, policy: &Policy) -> Result<Self, DemonstrationError> {
         file::read(path, spec, policy.scaling())
     }
 
-    /// Number N.
+    /// Returns the number of steps, N.
     #[must_use]
     pub fn len(&self) -> usize {
         self.rewards.len()
     }
 
-    /// Whether there are none.
+    /// Returns whether there are no steps.
     #[must_use]
     pub fn is_empty(&self) -> bool {
         self.rewards.is_empty()
     }
 
-    /// In a few figures.
+    /// Returns figures that summarise the steps.
     #[must_use]
-    pub fn summary(&self) -> Summary {
-        Summary {
+    pub fn summary(&self) -> DemonstrationSummary {
+        DemonstrationSummary {
             episodes: self.ends().count(),
             steps: self.len(),
             rewards: self.rewards.iter().map(|reward| f64::from(*reward)).sum(),
@@ -123,12 +123,12 @@ impl Steps {
         (0..self.len()).filter(|&row| self.is_end(row))
     }
 
-    /// Inserts everything into a replay that holds nothing but demonstrations, cut into segments
-    /// from each episode's first step on.
+    /// Cuts each episode into segments from its first step on, and inserts them into a replay that
+    /// has only demonstrations.
     ///
     /// # Errors
-    /// `TooMany`.
-    pub fn enter(&self, replay: &mut Replay) -> Result<(), DemonstrationError> {
+    /// [`DemonstrationError::TooMany`] if they would fill more than half of the replay.
+    pub fn insert_into(&self, replay: &mut Replay) -> Result<(), DemonstrationError> {
         let layout = replay.layout();
         let (k_max, o, a) = (layout.segment_steps, layout.observation_len, layout.action_len);
         let mut lengths = Vec::new();
@@ -166,7 +166,7 @@ impl Steps {
                     steps_len: steps as u32,
                     ..SegmentHeader::default()
                 };
-                replay.keep(&header, &block);
+                replay.insert_demonstration(&header, &block);
             }
         }
         Ok(())

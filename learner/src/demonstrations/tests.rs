@@ -7,12 +7,13 @@ use tempfile::TempDir;
 
 use super::*;
 use crate::learner::Learner;
+use crate::off_policy::CloningLosses;
 use crate::replay::Replay;
 
-/// Two episodes, of seven steps and of three; the file ends before the second does. The observation
-/// before step t is (t, 0, 0, episode), its action (t / 5 - 1, 0), its reward -t.
-pub(crate) fn steps() -> Steps {
-    let mut steps = Steps::default();
+/// Returns two episodes of seven and three steps. The recording ends before the second episode
+/// does. Step t has observation (t, 0, 0, episode), action (t / 5 - 1, 0) and reward -t.
+pub(crate) fn steps() -> Demonstration {
+    let mut steps = Demonstration::default();
     for (episode, len) in [(0.0, 7), (1.0, 3)] {
         for t in 0..len {
             let at = t as f32;
@@ -29,9 +30,9 @@ pub(crate) fn steps() -> Steps {
 
 type Arrays = HashMap<&'static str, Tensor>;
 
-/// As NumPy writes them: numbers in 64 bits, flags in one byte.
+/// Returns the arrays as NumPy writes them: numbers in 64 bits, flags in one byte.
 fn arrays() -> Arrays {
-    let Steps { observations, actions, rewards, next_observations, terminated, truncated } =
+    let Demonstration { observations, actions, rewards, next_observations, terminated, truncated } =
         steps();
     let wide = |values: Vec<f32>, width: usize| {
         let shape = (values.len() / width, width);
@@ -72,23 +73,23 @@ fn learner(keys: &[(&str, &str)]) -> Learner {
     Learner::new(config(keys), &crate::learner::tests::spec(), 1).unwrap()
 }
 
-fn read(arrays: &Arrays) -> Result<Steps, DemonstrationError> {
+fn read(arrays: &Arrays) -> Result<Demonstration, DemonstrationError> {
     let folder = TempDir::new().unwrap();
     let path = folder.path().join("demos.npz");
     let named: Vec<_> = arrays.iter().map(|(name, tensor)| (*name, tensor)).collect();
     Tensor::write_npz(&named, &path).unwrap();
-    Steps::read(&path, &crate::learner::tests::spec(), learner(&[]).policy())
+    Demonstration::read(&path, &crate::learner::tests::spec(), learner(&[]).policy())
 }
 
 #[test]
 fn a_file_is_read_as_it_was_written() {
     let read = read(&arrays()).unwrap();
     assert_eq!(read, steps());
-    let summary = Summary { episodes: 2, steps: 10, rewards: -24.0 };
+    let summary = DemonstrationSummary { episodes: 2, steps: 10, rewards: -24.0 };
     assert_eq!(read.summary(), summary);
 }
 
-/// Each array spoilt in turn: the message names it, what it must be and what it is.
+/// Damages each array in turn. The message names the array, the expected and the actual value.
 #[test]
 fn what_does_not_fit_is_refused_by_name_with_expected_and_got() {
     let at = |values: &mut Arrays, key: &'static str, index: usize, value: f64| {
@@ -145,13 +146,13 @@ fn what_is_no_archive_is_refused_with_how_to_write_one() {
     let path = folder.path().join("demos.npz");
     std::fs::write(&path, b"PK no archive").unwrap();
     let spec = crate::learner::tests::spec();
-    let error = Steps::read(&path, &spec, learner(&[]).policy()).unwrap_err().to_string();
+    let error = Demonstration::read(&path, &spec, learner(&[]).policy()).unwrap_err().to_string();
     assert!(error.contains("numpy.savez"), "{error}");
 }
 
 const LAYOUT: SegmentLayout = SegmentLayout { segment_steps: 5, observation_len: 4, action_len: 2 };
 
-/// First observation, length, and whether the episode terminated, of every window.
+/// Returns first observation, length and termination of every window.
 fn windows(replay: &Replay) -> Vec<([f32; 2], usize, bool)> {
     let all = (0..replay.len()).flat_map(|slot| (0..5).map(move |offset| (slot, offset)));
     let windows = all.filter_map(|(slot, offset)| replay.window(slot, offset));
@@ -166,8 +167,8 @@ fn windows(replay: &Replay) -> Vec<([f32; 2], usize, bool)> {
 #[test]
 fn episodes_become_windows_and_one_cut_short_gives_none_that_is_short() {
     let mut replay = Replay::new(LAYOUT, 100, 1, 1);
-    steps().enter(&mut replay).unwrap();
-    // Two segments and one; the second episode has three steps, which are no window of five.
+    steps().insert_into(&mut replay).unwrap();
+    // Two segments and one. The three steps of the second episode are too few for a window of five.
     assert_eq!(replay.len(), 3);
     let expected: Vec<_> =
         (0..7_usize).map(|t| ([0.0, t as f32], (7 - t).min(5), t + 5 >= 7)).collect();
@@ -177,7 +178,7 @@ fn episodes_become_windows_and_one_cut_short_gives_none_that_is_short() {
 #[test]
 fn demonstrations_stay_when_all_else_is_replaced_also_through_a_checkpoint() {
     let mut replay = Replay::new(LAYOUT, 40, 1, 1); // 8 slots
-    steps().enter(&mut replay).unwrap();
+    steps().insert_into(&mut replay).unwrap();
     let kept = windows(&replay);
     let insert = |replay: &mut Replay, number: u32| {
         let block = vec![9.0 + number as f32; LAYOUT.block_len()];
@@ -194,7 +195,7 @@ fn demonstrations_stay_when_all_else_is_replaced_also_through_a_checkpoint() {
         (13..21).for_each(|number| insert(replay, number));
         let now = windows(replay);
         assert_eq!(now[..kept.len()], kept);
-        // Five slots remain for the newest, whose chain the ring's seam does not break.
+        // Five slots remain for the newest segments, whose chain continues across the ring's end.
         let newest: Vec<f32> =
             now.iter().map(|window| window.0[0]).filter(|&seen| seen >= 9.0).collect();
         assert_eq!(newest.len(), 4 * 5 + 1);
@@ -205,7 +206,7 @@ fn demonstrations_stay_when_all_else_is_replaced_also_through_a_checkpoint() {
 #[test]
 fn more_than_half_of_a_replay_is_refused() {
     let mut replay = Replay::new(LAYOUT, 25, 1, 1);
-    let message = steps().enter(&mut replay).unwrap_err().to_string();
+    let message = steps().insert_into(&mut replay).unwrap_err().to_string();
     assert!(message.contains("3 segments") && message.contains("the replay's 5"), "{message}");
 }
 
@@ -219,7 +220,7 @@ fn a_cloned_policy_does_what_was_demonstrated() {
     ] {
         let updates = [("demonstrations.cloning_updates", "400")];
         let mut learner = learner(&[keys, &updates].concat());
-        let (first, last) = learner.demonstrate(&[steps()]).unwrap().unwrap();
+        let CloningLosses { first, last } = learner.demonstrate(&[steps()]).unwrap().unwrap();
         assert!(last < 0.1 * first, "{keys:?}: {first}, then {last}");
         let steps = learner.policy().layout().segment_steps;
         let mut work = learner.policy().workspace(1);
@@ -236,7 +237,7 @@ fn a_cloned_policy_does_what_was_demonstrated() {
     }
 }
 
-/// Two learners whose critics differ: their actors do not while they imitate.
+/// Compares two learners whose critics differ. Their actors are equal while they only imitate.
 #[test]
 fn an_actor_follows_its_critic_after_the_warm_up_and_then_more_and_more() {
     let distance = |env_steps: u64| {

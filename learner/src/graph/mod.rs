@@ -1,8 +1,8 @@
-//! The update as a graph of candle tensors with automatic differentiation: what runs on a GPU.
+//! The update as a graph of candle tensors with automatic differentiation. It runs on a GPU.
 //!
-//! On the processor the kernels of `update` do the same several times faster; tests there hold the
-//! two to each other, losses, gradients and parameters. Unlike theirs, candle's operations allocate
-//! their outputs.
+//! On the CPU, the kernels of `update` do the same several times faster. Tests in `algorithms`
+//! compare the losses, gradients and parameters of both. Unlike the kernels, candle's operations
+//! allocate their outputs.
 
 mod policy;
 
@@ -13,47 +13,58 @@ use dmprl_shared::policy::{Head, MlpShape, Policy};
 use crate::algorithms::{Batch, BatchShape, Losses};
 use crate::update::kernels::{BETA1, BETA2, EPSILON};
 use crate::update::layer_norm::LayerNorm;
-use crate::update::trained::Trained;
-use policy::{PolicyGraph, StatesOn, network};
+use crate::update::network::TrainableNetwork;
+use policy::{DeviceStates, PolicyGraph, mlp};
 
-/// A network with target and optimiser on the device.
+/// A network with its target and optimiser on the device.
 #[derive(Debug)]
-struct Remote {
+struct DeviceNetwork {
     name: &'static str,
     shape: MlpShape,
     layer_norm: Option<LayerNorm>,
-    network: Var,
+    parameters: Var,
     target: Option<Var>,
     moments: [Tensor; 2],
     step: u64,
     learning_rate: f64,
-    /// Of the last step.
+    /// Gradient of the last step.
     gradient: Option<Tensor>,
 }
 
-/// The networks of an algorithm and its update on a device.
+/// Losses of a critic step, as means over the batch.
+struct CriticLosses {
+    /// (Q - target)², summed over the critics.
+    critic_loss: f32,
+    /// Q of the first critic.
+    q_mean: f32,
+    /// |Q| of the first critic.
+    q_size: f64,
+}
+
+/// The networks of an algorithm on a device, with its update.
 #[derive(Debug)]
 pub struct Graph {
     config: ExperimentConfig,
     shape: BatchShape,
     device: Device,
     policy: PolicyGraph,
-    networks: Vec<Remote>,
+    networks: Vec<DeviceNetwork>,
 }
 
 impl Graph {
-    /// Takes the networks over from the host.
+    /// Copies the networks from the host.
     ///
     /// # Errors
-    /// If the device refuses something.
+    /// If a device operation fails.
     pub fn new(
         config: &ExperimentConfig,
         policy: &Policy,
         shape: BatchShape,
         device: &Device,
-        networks: &[(&'static str, &Trained)],
+        networks: &[(&'static str, &TrainableNetwork)],
     ) -> Result<Self> {
-        let networks = networks.iter().map(|(name, trained)| Remote::new(name, trained, device));
+        let networks =
+            networks.iter().map(|(name, network)| DeviceNetwork::new(name, network, device));
         Ok(Self {
             config: config.clone(),
             shape,
@@ -63,21 +74,21 @@ impl Graph {
         })
     }
 
-    /// Brings one network, its target and its optimiser back to the host.
+    /// Copies one network, its target and its optimiser back to the host.
     ///
     /// # Errors
-    /// If the device refuses something.
-    pub fn fetch(&self, name: &str, trained: &mut Trained) -> Result<()> {
-        let remote = self.remote(name)?;
-        trained.network.set(&remote.network.to_vec1::<f32>()?)?;
-        if let (Some(own), Some(target)) = (&mut trained.target, &remote.target) {
+    /// If a device operation fails.
+    pub fn fetch(&self, name: &str, network: &mut TrainableNetwork) -> Result<()> {
+        let ours = self.device_network(name)?;
+        network.parameters.set(&ours.parameters.to_vec1::<f32>()?)?;
+        if let (Some(own), Some(target)) = (&mut network.target, &ours.target) {
             own.set(&target.to_vec1::<f32>()?)?;
         }
-        trained.adam.moments.first = remote.moments[0].to_vec1()?;
-        trained.adam.moments.second = remote.moments[1].to_vec1()?;
-        trained.adam.step.0 = remote.step;
-        if let Some(gradient) = &remote.gradient {
-            trained.set_gradient(&gradient.to_vec1::<f32>()?);
+        network.adam.moments.first = ours.moments[0].to_vec1()?;
+        network.adam.moments.second = ours.moments[1].to_vec1()?;
+        network.adam.step.0 = ours.step;
+        if let Some(gradient) = &ours.gradient {
+            network.set_gradient(&gradient.to_vec1::<f32>()?);
         }
         Ok(())
     }
@@ -85,31 +96,31 @@ impl Graph {
     /// Copies the actor's parameters into `out`.
     ///
     /// # Errors
-    /// If the device refuses.
+    /// If a device operation fails.
     pub fn read_actor(&self, out: &mut [f32]) -> Result<()> {
-        out.copy_from_slice(&self.remote("actor")?.network.to_vec1::<f32>()?);
+        out.copy_from_slice(&self.device_network("actor")?.parameters.to_vec1::<f32>()?);
         Ok(())
     }
 
-    fn remote(&self, name: &str) -> Result<&Remote> {
-        match self.networks.iter().find(|remote| remote.name == name) {
-            Some(remote) => Ok(remote),
-            None => candle_core::bail!("no network {name} on the device"),
+    fn device_network(&self, name: &str) -> Result<&DeviceNetwork> {
+        match self.networks.iter().find(|network| network.name == name) {
+            Some(network) => Ok(network),
+            None => candle_core::bail!("the device has no network {name}"),
         }
     }
 
     fn q(&self, name: &str, of_target: bool, inputs: &Tensor) -> Result<Tensor> {
-        let remote = self.remote(name)?;
-        let layer_norm = remote.layer_norm.as_ref();
-        match (&remote.target, of_target) {
+        let network = self.device_network(name)?;
+        let layer_norm = network.layer_norm.as_ref();
+        match (&network.target, of_target) {
             (Some(target), true) => {
-                network(&remote.shape, layer_norm, &target.as_detached_tensor(), inputs)
+                mlp(&network.shape, layer_norm, &target.as_detached_tensor(), inputs)
             }
-            _ => network(&remote.shape, layer_norm, &remote.network, inputs),
+            _ => mlp(&network.shape, layer_norm, &network.parameters, inputs),
         }
     }
 
-    /// Critics of the algorithm, the first first.
+    /// Returns the names of the algorithm's critics, the first one first.
     fn critics(&self) -> &'static [&'static str] {
         match self.config.algorithm.name {
             AlgorithmName::Ddpg => &["critic"],
@@ -117,20 +128,20 @@ impl Graph {
         }
     }
 
-    /// Update number `update`, counted from 1, as the file of the algorithm describes it.
+    /// Does update number `update`, counted from 1, like the algorithm of the same name.
     ///
     /// # Errors
-    /// If the device refuses something.
+    /// If a device operation fails.
     pub fn update(&mut self, policy: &Policy, batch: &Batch, update: u64) -> Result<Losses> {
         let td3 = &self.config.algorithm.td3;
-        let whole = self.config.algorithm.name != AlgorithmName::Td3
+        let updates_actor = self.config.algorithm.name != AlgorithmName::Td3
             || update.is_multiple_of(td3.actor_interval);
         let states = self.states(policy, &batch.observations, &batch.inputs)?;
         let temperature = self.temperature()?;
-        let (critic_loss, q_mean, q_size) =
-            self.critics_step(policy, batch, &temperature, whole)?;
+        let CriticLosses { critic_loss, q_mean, q_size } =
+            self.critics_step(policy, batch, &temperature, updates_actor)?;
         let mut losses = Losses { critic_loss, q_mean, ..Losses::default() };
-        if whole {
+        if updates_actor {
             let penalty = self.config.algorithm.action_rate_penalty * q_size;
             let (loss, entropy) = self.actor_step(&states, batch, &temperature, penalty)?;
             losses.actor_loss = Some(loss);
@@ -151,9 +162,9 @@ impl Graph {
 
     fn temperature(&self) -> Result<Option<Tensor>> {
         match self.config.algorithm.name {
-            AlgorithmName::Sac => {
-                Ok(Some(self.remote("log_temperature")?.network.as_detached_tensor().exp()?))
-            }
+            AlgorithmName::Sac => Ok(Some(
+                self.device_network("log_temperature")?.parameters.as_detached_tensor().exp()?,
+            )),
             _ => Ok(None),
         }
     }
@@ -162,29 +173,34 @@ impl Graph {
         Tensor::from_slice(values, (self.shape.rows, values.len() / self.shape.rows), &self.device)
     }
 
-    fn states(&self, policy: &Policy, observations: &[f32], inputs: &[f32]) -> Result<StatesOn> {
+    fn states(
+        &self,
+        policy: &Policy,
+        observations: &[f32],
+        inputs: &[f32],
+    ) -> Result<DeviceStates> {
         let starts = match policy.head() {
             Head::Dmp(head) => head.starts(observations),
             Head::Mlp => Vec::new(),
         };
         let rows = starts.len() / 2;
-        Ok(StatesOn {
+        Ok(DeviceStates {
             inputs: self.on_device(inputs)?,
             starts: Tensor::from_vec(starts, (rows, 2), &self.device)?,
         })
     }
 
-    /// The critic's input: states and what it sees of the actions.
-    fn critic_inputs(&self, states: &StatesOn, acts: &Tensor) -> Result<Tensor> {
+    /// Returns the critic inputs: states and the actions that the critic sees.
+    fn critic_inputs(&self, states: &DeviceStates, actions: &Tensor) -> Result<Tensor> {
         let BatchShape { actions_len, segment_actions_len, .. } = self.shape;
         let seen = match actions_len < segment_actions_len {
-            true => acts.narrow(1, 0, actions_len)?,
-            false => acts.clone(),
+            true => actions.narrow(1, 0, actions_len)?,
+            false => actions.clone(),
         };
         Tensor::cat(&[&states.inputs, &seen], D::Minus1)
     }
 
-    /// The smallest Q of the algorithm's critics.
+    /// Returns the smallest Q of the algorithm's critics.
     fn smallest_q(&self, of_target: bool, inputs: &Tensor) -> Result<Tensor> {
         let critics = self.critics();
         let mut q = self.q(critics[0], of_target, inputs)?;
@@ -201,9 +217,9 @@ impl Graph {
         temperature: &Option<Tensor>,
     ) -> Result<Tensor> {
         let states = self.states(policy, &batch.next_observations, &batch.next_inputs)?;
-        let actor = self.remote("actor")?;
-        let of_target = actor.target.as_ref().unwrap_or(&actor.network).as_detached_tensor();
-        let means = self.policy.means(&of_target, &states)?;
+        let actor = self.device_network("actor")?;
+        let parameters = actor.target.as_ref().unwrap_or(&actor.parameters).as_detached_tensor();
+        let means = self.policy.means(&parameters, &states)?;
         let mut bonus = None;
         let u = match temperature {
             Some(temperature) => {
@@ -234,8 +250,8 @@ impl Graph {
         policy: &Policy,
         batch: &Batch,
         temperature: &Option<Tensor>,
-        follow: bool,
-    ) -> Result<(f32, f32, f64)> {
+        target_step: bool,
+    ) -> Result<CriticLosses> {
         let targets = self.targets(policy, batch, temperature)?;
         let inputs = self.on_device(&batch.critic_inputs)?;
         let (mut sum, mut q_mean, mut q_size) = (0.0, 0.0, 0.0);
@@ -247,19 +263,19 @@ impl Graph {
             }
             let loss = (q - &targets)?.sqr()?.mean_all()?;
             sum += loss.to_scalar::<f32>()?;
-            self.descend(critic, &loss, follow)?;
+            self.descend(critic, &loss, target_step)?;
         }
-        Ok((sum, q_mean, q_size))
+        Ok(CriticLosses { critic_loss: sum, q_mean, q_size })
     }
 
     fn actor_step(
         &mut self,
-        states: &StatesOn,
+        states: &DeviceStates,
         batch: &Batch,
         temperature: &Option<Tensor>,
         penalty: f64,
     ) -> Result<(f32, Option<f32>)> {
-        let means = self.policy.means(&self.remote("actor")?.network, states)?;
+        let means = self.policy.means(&self.device_network("actor")?.parameters, states)?;
         let cost = |u: &Tensor| self.squared_changes(u, batch)? * penalty;
         let (loss, entropy) = match temperature {
             Some(temperature) => {
@@ -281,7 +297,7 @@ impl Graph {
         Ok((loss.to_scalar()?, entropy))
     }
 
-    /// Sum of the squared changes of u, (B, K A): a mean over the batch.
+    /// Returns the sum of the squared changes of u, (B, K A), as a mean over the batch.
     fn squared_changes(&self, u: &Tensor, batch: &Batch) -> Result<Tensor> {
         let BatchShape { action_len, segment_actions_len, .. } = self.shape;
         let previous = self.on_device(&batch.previous_actions)?;
@@ -295,58 +311,59 @@ impl Graph {
         changes.sqr()?.sum(1)?.mean_all()
     }
 
-    fn descend(&mut self, name: &str, loss: &Tensor, follow: bool) -> Result<()> {
+    /// Does one step of network `name` on `loss`.
+    fn descend(&mut self, name: &str, loss: &Tensor, target_step: bool) -> Result<()> {
         let gradients = loss.backward()?;
-        let Some(gradient) = gradients.get(&self.remote(name)?.network) else {
-            candle_core::bail!("a loss that does not depend on {name}");
+        let Some(gradient) = gradients.get(&self.device_network(name)?.parameters) else {
+            candle_core::bail!("the loss does not depend on {name}");
         };
-        self.step(name, gradient.detach(), follow)
+        self.step(name, gradient.detach(), target_step)
     }
 
-    /// One step of Adam; the target follows, if that is asked for and there is one.
-    fn step(&mut self, name: &str, gradient: Tensor, follow: bool) -> Result<()> {
+    /// Does one step of Adam. With `target_step`, it also moves the target, if there is one.
+    fn step(&mut self, name: &str, gradient: Tensor, target_step: bool) -> Result<()> {
         let polyak = self.config.algorithm.polyak;
-        let Some(remote) = self.networks.iter_mut().find(|remote| remote.name == name) else {
-            candle_core::bail!("no network {name} on the device");
+        let Some(network) = self.networks.iter_mut().find(|network| network.name == name) else {
+            candle_core::bail!("the device has no network {name}");
         };
-        remote.step += 1;
-        let correction = |beta: f32| 1.0 - f64::from(beta).powf(remote.step as f64);
-        let [first, second] = &remote.moments;
+        network.step += 1;
+        let correction = |beta: f32| 1.0 - f64::from(beta).powf(network.step as f64);
+        let [first, second] = &network.moments;
         let (beta1, beta2) = (f64::from(BETA1), f64::from(BETA2));
         let first = ((first * beta1)? + (&gradient * (1.0 - beta1))?)?;
         let second = ((second * beta2)? + (gradient.sqr()? * (1.0 - beta2))?)?;
         let root = (second.sqrt()? / correction(BETA2).sqrt())?;
         let change = (&first / (root + f64::from(EPSILON))?)?;
-        let change = (change * (remote.learning_rate / correction(BETA1)))?;
-        let network = (remote.network.as_detached_tensor() - change)?.detach();
-        remote.network.set(&network)?;
-        if let Some(target) = remote.target.as_ref().filter(|_| follow) {
+        let change = (change * (network.learning_rate / correction(BETA1)))?;
+        let parameters = (network.parameters.as_detached_tensor() - change)?.detach();
+        network.parameters.set(&parameters)?;
+        if let Some(target) = network.target.as_ref().filter(|_| target_step) {
             let old = target.as_detached_tensor();
-            target.set(&(&old + ((network - &old)? * polyak)?)?.detach())?;
+            target.set(&(&old + ((parameters - &old)? * polyak)?)?.detach())?;
         }
-        remote.moments = [first.detach(), second.detach()];
-        remote.gradient = Some(gradient);
+        network.moments = [first.detach(), second.detach()];
+        network.gradient = Some(gradient);
         Ok(())
     }
 }
 
-impl Remote {
-    fn new(name: &'static str, trained: &Trained, device: &Device) -> Result<Self> {
+impl DeviceNetwork {
+    fn new(name: &'static str, network: &TrainableNetwork, device: &Device) -> Result<Self> {
         let to = |values: &[f32]| Tensor::from_slice(values, values.len(), device);
         let var = |values: &[f32]| Var::from_tensor(&to(values)?);
-        let moments = &trained.adam.moments;
+        let moments = &network.adam.moments;
         Ok(Self {
             name,
-            shape: trained.shape.clone(),
-            layer_norm: trained.layer_norm.clone(),
-            network: var(trained.network.values())?,
-            target: match &trained.target {
+            shape: network.shape.clone(),
+            layer_norm: network.layer_norm.clone(),
+            parameters: var(network.parameters.values())?,
+            target: match &network.target {
                 Some(target) => Some(var(target.values())?),
                 None => None,
             },
             moments: [to(&moments.first)?, to(&moments.second)?],
-            step: trained.adam.step.0,
-            learning_rate: trained.adam.learning_rate(),
+            step: network.adam.step.0,
+            learning_rate: network.adam.learning_rate(),
             gradient: None,
         })
     }

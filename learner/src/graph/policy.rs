@@ -1,4 +1,4 @@
-//! The policy as a graph of candle tensors: network, DMP, inverse controller, and SAC's Gaussian.
+//! The policy as a graph of candle tensors: network, DMP, inverse controller and SAC's Gaussian.
 
 use candle_core::{D, Device, Result, Tensor};
 use dmprl_shared::config::{ExperimentConfig, ForcingScaling, RhoKind};
@@ -21,9 +21,9 @@ pub(super) struct PolicyGraph {
 
 #[derive(Debug)]
 struct DmpGraph {
-    /// Of the segment map, (3 + N, 3K).
+    /// Matrix of the segment map, (3 + N, 3K).
     matrix: Tensor,
-    /// (1, 0, 0, 0).
+    /// Centre of rho's range, (1, 0, 0, 0).
     rho_centre: Tensor,
     dims: usize,
     steps: usize,
@@ -35,27 +35,27 @@ struct DmpGraph {
     carries_state: bool,
 }
 
-/// What a policy makes of a batch of states.
+/// A policy's decisions for a batch of states.
 pub(super) struct Means {
-    /// Before tanh, (B, K A).
+    /// Means before tanh, (B, K A).
     pub means: Tensor,
-    /// (y_K, yd_K / omega), (B, 2A), where the critic sees it.
+    /// (y_K, yd_K / omega), (B, 2A), if the critic sees it.
     pub end_state: Option<Tensor>,
-    /// SAC's, (B, K A).
+    /// SAC's log-stds before clamping, (B, K A).
     raw_log_stds: Option<Tensor>,
 }
 
 /// A batch of states on the device.
 #[derive(Debug)]
-pub(super) struct StatesOn {
-    /// What networks see, (B, O).
+pub(super) struct DeviceStates {
+    /// Network inputs, (B, O).
     pub inputs: Tensor,
     /// (y0, yd0) of every row and dimension, (B A, 2); empty without a DMP.
     pub starts: Tensor,
 }
 
-/// A multilayer perceptron over flat parameters, with layer normalisation if `layer_norm`.
-pub(super) fn network(
+/// Computes a multilayer perceptron with flat parameters, with layer normalisation if given.
+pub(super) fn mlp(
     shape: &MlpShape,
     layer_norm: Option<&LayerNorm>,
     flat: &Tensor,
@@ -67,8 +67,8 @@ pub(super) fn network(
         let weights = weights.reshape((layer.outputs, layer.inputs))?;
         let bias = flat.narrow(0, layer.bias.start, layer.bias.len())?;
         x = x.matmul(&weights.t()?)?.broadcast_add(&bias)?;
-        if let Some(places) = layer_norm.and_then(|norm| norm.layer(index)) {
-            x = normalise(&x, places, flat)?;
+        if let Some(gain_shift) = layer_norm.and_then(|norm| norm.layer(index)) {
+            x = normalise(&x, gain_shift, flat)?;
         }
         if index + 1 < shape.layers().len() {
             x = x.relu()?;
@@ -77,10 +77,10 @@ pub(super) fn network(
     Ok(x)
 }
 
-/// Layer normalisation of every row with the layer's gain and shift.
-fn normalise(x: &Tensor, places: &GainShift, flat: &Tensor) -> Result<Tensor> {
-    let gain = flat.narrow(0, places.gain.start, places.gain.len())?;
-    let shift = flat.narrow(0, places.shift.start, places.shift.len())?;
+/// Normalises every row, then applies the layer's gain and shift.
+fn normalise(x: &Tensor, gain_shift: &GainShift, flat: &Tensor) -> Result<Tensor> {
+    let gain = flat.narrow(0, gain_shift.gain.start, gain_shift.gain.len())?;
+    let shift = flat.narrow(0, gain_shift.shift.start, gain_shift.shift.len())?;
     let centred = x.broadcast_sub(&x.mean_keepdim(D::Minus1)?)?;
     let variance = centred.sqr()?.mean_keepdim(D::Minus1)?;
     let std = (variance + f64::from(VARIANCE_EPSILON))?.sqrt()?;
@@ -97,9 +97,9 @@ impl PolicyGraph {
         Ok(Self { shape: policy.shape().clone(), log_std_columns, dmp })
     }
 
-    /// The means that the network of parameters `flat` decides on.
-    pub(super) fn means(&self, flat: &Tensor, states: &StatesOn) -> Result<Means> {
-        let outputs = network(&self.shape, None, flat, &states.inputs)?;
+    /// Computes the decisions of a network with parameters `flat`.
+    pub(super) fn means(&self, flat: &Tensor, states: &DeviceStates) -> Result<Means> {
+        let outputs = mlp(&self.shape, None, flat, &states.inputs)?;
         let columns = self.log_std_columns.clone();
         let raw_log_stds = columns.map(|c| outputs.narrow(1, c.start, c.len())).transpose()?;
         let head_len = self.log_std_columns.as_ref().map_or(self.shape.outputs(), |c| c.start);
@@ -133,7 +133,7 @@ impl DmpGraph {
         })
     }
 
-    /// From the network's outputs, (B, A (1+N+4)), to means and end state.
+    /// Computes means and end state from the network's outputs, (B, A (1+N+4)).
     fn segment(&self, outputs: &Tensor, starts: &Tensor) -> Result<(Tensor, Option<Tensor>)> {
         let (dims, k, n) = (self.dims, self.steps, self.basis_count);
         let rows = outputs.dim(0)?;
@@ -165,7 +165,7 @@ impl DmpGraph {
 }
 
 impl Means {
-    /// What the critic gets of u, (B, K A) in [-1, 1]: u, and the end state where it sees it.
+    /// Returns u, (B, K A) in [-1, 1], followed by the end state if the critic sees it.
     pub(super) fn with_end_state(&self, u: &Tensor) -> Result<Tensor> {
         match &self.end_state {
             Some(end) => Tensor::cat(&[u, end], 1),
@@ -173,10 +173,11 @@ impl Means {
         }
     }
 
-    /// u of SAC's Gaussian for standard normal noise, (B, K A), and its log density, (B, 1).
+    /// Draws u of SAC's Gaussian with standard normal `noise`, (B, K A). Returns u and its log
+    /// density, (B, 1).
     pub(super) fn draw(&self, noise: &Tensor) -> Result<(Tensor, Tensor)> {
         let Some(raw) = &self.raw_log_stds else {
-            candle_core::bail!("a draw from a policy without a distribution");
+            candle_core::bail!("the policy has no distribution to draw from");
         };
         let log_std = raw.clamp(LOG_STD.0, LOG_STD.1)?;
         let x = (&self.means + (log_std.exp()? * noise)?)?;

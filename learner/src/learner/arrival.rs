@@ -1,4 +1,5 @@
-//! How segments come in: checked, settled and stored, or recovered from the log.
+//! Inserts segments: checks them, updates the worker's sequence and stores them. Also recovers them
+//! from the log.
 
 use std::fmt;
 
@@ -6,18 +7,26 @@ use dmprl_shared::segment::{HINDSIGHT, Rejection, Segment, check};
 use dmprl_shared::transport::delivery::{LogError, Replayed, SegmentLog};
 
 use super::Learner;
+use crate::regime::Regime;
 
-/// Is told of a segment in the moment in which it is inserted or refused, before anybody else can
-/// see the difference.
-pub type Told = Box<dyn FnMut(&Segment, Result<(), Rejection>)>;
-
-/// Who is told, if anybody: `dmprl chaos` checks what the learner says by it.
+/// Called synchronously when a segment is inserted or rejected. `dmprl chaos` checks the learner's
+/// counters with it.
 #[derive(Default)]
-pub struct Witness(pub Option<Told>);
+pub struct InsertObserver(Option<Box<InsertCallback>>);
 
-impl fmt::Debug for Witness {
+type InsertCallback = dyn FnMut(&Segment, Result<(), Rejection>);
+
+impl InsertObserver {
+    /// Makes an observer that calls `callback`.
+    #[must_use]
+    pub fn new(callback: impl FnMut(&Segment, Result<(), Rejection>) + 'static) -> Self {
+        Self(Some(Box::new(callback)))
+    }
+}
+
+impl fmt::Debug for InsertObserver {
     fn fmt(&self, formatter: &mut fmt::Formatter<'_>) -> fmt::Result {
-        formatter.write_str(if self.0.is_some() { "Witness(somebody)" } else { "Witness(nobody)" })
+        formatter.write_str(if self.0.is_some() { "InsertObserver(..)" } else { "InsertObserver" })
     }
 }
 
@@ -25,23 +34,24 @@ impl Learner {
     /// Inserts a segment.
     ///
     /// # Errors
-    /// The reason if it does not fit; it is counted and changes nothing else.
+    /// The reason if the segment is rejected. A rejection is counted and changes nothing else.
     pub fn insert(&mut self, segment: &Segment) -> Result<(), Rejection> {
-        let inserted = self.take(segment);
-        if let Some(told) = &mut self.witness.0 {
-            told(segment, inserted);
+        let inserted = self.try_insert(segment);
+        if let Some(callback) = &mut self.insert_observer.0 {
+            callback(segment, inserted);
         }
         inserted
     }
 
-    fn take(&mut self, segment: &Segment) -> Result<(), Rejection> {
+    fn try_insert(&mut self, segment: &Segment) -> Result<(), Rejection> {
         self.counters.received += 1;
-        let sound = check(&segment.header, &segment.block, &self.expected);
-        // A header that fits says whose segment it is, so that its worker need not keep a block
-        // that nobody will take.
-        let is_known = matches!(sound, Ok(()) | Err(Rejection::Checksum | Rejection::Value));
-        let settled = if is_known { self.settle(segment) } else { Ok(()) };
-        if let Err(why) = sound.and(settled) {
+        let checked = check(&segment.header, &segment.block, &self.expected);
+        // With a valid header the segment is acknowledged even if its block is damaged, so that the
+        // worker does not keep a block that the learner will never accept.
+        let has_valid_header =
+            matches!(checked, Ok(()) | Err(Rejection::Checksum | Rejection::Value));
+        let settled = if has_valid_header { self.settle(segment) } else { Ok(()) };
+        if let Err(why) = checked.and(settled) {
             self.counters.rejected.count(why);
             return Err(why);
         }
@@ -51,7 +61,7 @@ impl Learner {
 
     fn settle(&mut self, segment: &Segment) -> Result<(), Rejection> {
         let lost = self.inbox.settle(&segment.header, &segment.block)?;
-        // A worker may claim any number.
+        // A damaged worker may send any sequence number, so the sum must not overflow.
         self.counters.lost = self.counters.lost.saturating_add(lost);
         Ok(())
     }
@@ -59,11 +69,11 @@ impl Learner {
     fn store(&mut self, segment: &Segment) {
         if let Some(normaliser) = &mut self.normaliser {
             let (observations, _, _) = self.expected.layout.split(&segment.block);
-            let seen = segment.header.steps_len as usize * normaliser.observation_len();
-            normaliser.observe(&observations[..seen]);
+            let len = segment.header.steps_len as usize * normaliser.observation_len();
+            normaliser.observe(&observations[..len]);
         }
         if segment.header.flags & HINDSIGHT != 0 {
-            // Experience, and nothing that an environment or an episode did.
+            // A hindsight copy is experience, but no step of an environment.
             self.replay.insert(&segment.header, &segment.block);
             self.counters.hindsight_segments += 1;
             return;
@@ -71,30 +81,31 @@ impl Learner {
         self.collector.inserted(segment, self.counters.policy_version);
         self.counters.segments += 1;
         self.counters.env_steps += u64::from(segment.header.steps_len);
-        if let Some((ndp, _)) = self.algorithm.on_policy() {
-            self.counters.stale_segments += u64::from(!ndp.take(segment));
-            return;
-        }
-        self.replay.insert(&segment.header, &segment.block);
-        // While the actor imitates the critic learns from the first step on.
-        if !self.is_warming_up() || self.config.demonstrations.are_cloned() {
-            self.pacing.inserted();
+        let is_warming_up = self.counters.env_steps <= self.config.exploration.warm_up_steps;
+        match &mut self.regime {
+            Regime::OffPolicy(off_policy) => {
+                self.replay.insert(&segment.header, &segment.block);
+                // While the actor imitates, the critic learns from the first step on.
+                if !is_warming_up || off_policy.is_cloning() {
+                    off_policy.pacing.inserted();
+                }
+            }
+            Regime::OnPolicy(ndp) => {
+                self.counters.stale_segments += u64::from(!ndp.try_insert(segment));
+            }
         }
     }
 
-    fn is_warming_up(&self) -> bool {
-        self.counters.env_steps <= self.config.exploration.warm_up_steps
-    }
-
-    /// Inserts what a log holds beyond this learner's checkpoint, and logs to it from now on.
+    /// Inserts the logged segments that this learner's checkpoint does not contain, and writes to
+    /// the log from now on.
     ///
     /// # Errors
     /// If the log cannot be read.
     pub fn recover(&mut self, mut log: SegmentLog) -> Result<Replayed, LogError> {
         let replayed = log.replay(|segment| {
-            // Written before the checkpoint, whose writer died before it had emptied the log.
+            // The checkpoint contains a segment if its writer died before it emptied the log.
             if !self.inbox.has(&segment.header) {
-                // One that is refused now was refused and counted so before.
+                // A rejected segment was rejected and counted in the same way before.
                 let _ = self.insert(segment);
             }
         })?;

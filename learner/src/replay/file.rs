@@ -1,4 +1,4 @@
-//! The replay in a checkpoint: a length-checked binary of our own.
+//! Reads and writes the replay of a checkpoint, a binary file with checked lengths.
 //!
 //! ```text
 //!   magic "DMPRLRP2" · u64 K, O, A, slot count, filled, head, inserted, tail count, kept
@@ -7,10 +7,10 @@
 //!   tail: u32 slot, incarnation, episode, episode_steps, u64 number; slot = 2^32 - 1: none
 //!   block: f32 × block_len (filled ones)                                 all little-endian
 //! ```
-//! "DMPRLRP1", of older versions, has no `kept`: it is 0.
+//! `kept` is the number of demonstrated segments. "DMPRLRP1", of older versions, has no such field.
 //!
-//! Nothing in the file is trusted: counts are compared with what the configuration gives before
-//! anything is read, and every slot number must be below `filled`.
+//! Nothing in the file is trusted: counts are compared with the configuration before anything else
+//! is read, and every slot number must be below `filled`.
 
 use std::io::{self, Read, Write};
 
@@ -21,34 +21,34 @@ use super::{NONE, Replay, Slot, Tail};
 
 const MAGIC: &[u8; 8] = b"DMPRLRP2";
 const MAGIC_WITHOUT_KEPT: &[u8; 8] = b"DMPRLRP1";
-/// No run inserts so many.
+/// Larger counts of insertions are rejected.
 const INSERTED_MAX: u64 = 1 << 62;
 
-/// Why a replay file was refused.
+/// Why a replay file was rejected.
 #[derive(Debug, Error)]
 pub enum ReplayFileError {
     /// Reading or writing failed, or the file ends early.
     #[error("replay file: {0}")]
     Io(#[from] io::Error),
-    /// Not a replay file.
-    #[error("replay file: begins with {0:?}, expected DMPRLRP2")]
+    /// The file is not a replay file.
+    #[error("replay file: expected DMPRLRP2 at the start, got {0:?}")]
     Magic([u8; 8]),
-    /// A count that does not fit the configuration.
+    /// A count does not match the configuration.
     #[error("replay file: {name} is {got}, the configuration gives {expected}")]
     Count {
-        /// Which count.
+        /// Name of the count.
         name: &'static str,
-        /// What the configuration gives.
+        /// Value from the configuration.
         expected: u64,
-        /// What the file says.
+        /// Value in the file.
         got: u64,
     },
-    /// A slot or tail whose fields contradict each other.
+    /// The fields of a slot or tail contradict each other.
     #[error("replay file: {name} {index} is inconsistent")]
     Inconsistent {
         /// Slot or tail.
         name: &'static str,
-        /// Which.
+        /// Its index.
         index: usize,
     },
 }
@@ -64,14 +64,14 @@ impl Replay {
         ]
     }
 
-    /// Writes everything that [`Replay::read`] needs.
+    /// Writes the replay for [`Replay::read`].
     ///
     /// # Errors
     /// If writing fails.
     pub fn write(&self, out: &mut impl Write) -> Result<(), ReplayFileError> {
         out.write_all(MAGIC)?;
         let sizes = [self.filled as u64, self.head as u64, self.inserted, self.tails.len() as u64];
-        let sizes = sizes.into_iter().chain([self.kept as u64]);
+        let sizes = sizes.into_iter().chain([self.demonstrations as u64]);
         for count in self.counts().iter().map(|(_, count)| *count).chain(sizes) {
             out.write_all(&count.to_le_bytes())?;
         }
@@ -90,17 +90,18 @@ impl Replay {
             }
             out.write_all(&number.to_le_bytes())?;
         }
-        // f32 in memory is little-endian on every supported processor.
+        // Every supported processor is little-endian.
         for numbers in self.blocks.first(self.filled) {
             out.write_all(bytemuck::cast_slice(numbers))?;
         }
         Ok(())
     }
 
-    /// Fills this replay, freshly made from the configuration, from a file.
+    /// Reads a file into this replay, which must be new.
     ///
     /// # Errors
-    /// If the file is not ours, is cut short or does not fit; the replay is then unusable.
+    /// If the file is not a replay file, is truncated or does not match the configuration. The
+    /// replay is then unusable.
     pub fn read(&mut self, input: &mut impl Read) -> Result<(), ReplayFileError> {
         let mut magic = [0; 8];
         input.read_exact(&mut magic)?;
@@ -120,7 +121,7 @@ impl Replay {
             fits.then_some(got as usize).ok_or(ReplayFileError::Count { name, expected: max, got })
         });
         (self.filled, self.head) = (filled?, head?);
-        // Until it is full, it is filled from the front.
+        // A ring that is not full is filled from the front.
         if (self.filled as u64) < max && self.head != self.filled {
             return Err(ReplayFileError::Inconsistent { name: "head", index: self.head });
         }
@@ -130,7 +131,7 @@ impl Replay {
             return Err(ReplayFileError::Inconsistent { name: "count of insertions at", index });
         }
         let tail_count = read_u64(input)?;
-        self.kept = if &magic == MAGIC { self.read_kept(input)? } else { 0 };
+        self.demonstrations = if &magic == MAGIC { self.read_demonstrations(input)? } else { 0 };
         for index in 0..self.filled {
             self.slots[index] = self.read_slot(input, index)?;
         }
@@ -140,12 +141,12 @@ impl Replay {
                 self.slots[next as usize].previous = index as u32;
             }
         }
-        // There may be more or fewer places for workers than when it was written. The first are
-        // the same, and what another's episode was is of no use: nobody continues it.
+        // The number of workers may have changed. Tails of workers that no longer exist are
+        // ignored, because their episodes do not continue.
         for index in 0..tail_count as usize {
             let tail = self.read_tail(input, index)?;
-            if let Some(place) = self.tails.get_mut(index) {
-                *place = tail;
+            if let Some(own) = self.tails.get_mut(index) {
+                *own = tail;
             }
         }
         for numbers in self.blocks.first_mut(self.filled) {
@@ -154,8 +155,8 @@ impl Replay {
         Ok(())
     }
 
-    /// Demonstrations lie at the front; the next segment goes behind them.
-    fn read_kept(&self, input: &mut impl Read) -> Result<usize, ReplayFileError> {
+    /// Reads the number of demonstrated segments, which are at the front of the ring.
+    fn read_demonstrations(&self, input: &mut impl Read) -> Result<usize, ReplayFileError> {
         let (expected, got) = (self.filled.min(self.head) as u64, read_u64(input)?);
         if got > expected {
             return Err(ReplayFileError::Count { name: "kept", expected, got });

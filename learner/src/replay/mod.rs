@@ -1,36 +1,36 @@
-//! Stage 5 of 8: experience, stored per environment step in the order of each episode.
+//! Stage 5 of 8: stores the experience of off-policy algorithms and samples windows from it.
 //!
-//! A ring of slots, one slot a segment. A slot knows the slot of the segment that continues its
-//! episode, so a window of K steps may begin at any step and run over into the next slot
-//! (`windows = "sliding"`), although the segments of many environments arrive interleaved.
-//! The oldest slot is replaced when the ring is full.
+//! The replay is a ring of slots with one segment each. A slot refers to the slot that continues
+//! its episode, so a window of K steps can begin at any step and end in the next slot (`windows =
+//! "sliding"`), although the segments of many environments arrive interleaved. When the ring is
+//! full, the oldest slot is replaced.
 
-mod blocks;
+mod block_store;
 mod file;
 mod window;
 
 use dmprl_shared::segment::{HINDSIGHT, SegmentHeader, SegmentLayout, TERMINATED, TRUNCATED};
 
-use blocks::Blocks;
+use block_store::BlockStore;
 pub use file::ReplayFileError;
 pub use window::{Sampler, Window};
 
 /// Marks the end of a chain of slots.
 const NONE: u32 = u32::MAX;
 
-/// What a slot holds besides its numbers.
+/// A slot without its segment's block.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 struct Slot {
     /// The slot that continues this one's episode, or [`NONE`].
     next: u32,
-    /// The slot that this one continued when it came, or [`NONE`]; its segment may have been
-    /// replaced since, and then continues elsewhere or nowhere.
+    /// The slot that this one continued when it was inserted, or [`NONE`]. If that slot's segment
+    /// has been replaced since, its `next` differs.
     previous: u32,
-    /// Steps really run, 1 to K; 0 in a slot that was never filled.
+    /// Steps that were run, 1 to K; 0 in a slot that was never filled.
     steps_len: u8,
     terminated: bool,
     truncated: bool,
-    /// A copy with a goal of its own: a sample by itself, and a part of no episode.
+    /// Whether this is a hindsight copy, which belongs to no episode.
     hindsight: bool,
 }
 
@@ -38,38 +38,39 @@ struct Slot {
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 struct Tail {
     slot: u32,
-    /// Insertions before it: tells whether its slot has been replaced since.
+    /// Segments inserted before it; shows whether its slot has been replaced since.
     number: u64,
     incarnation: u32,
     episode: u32,
-    /// Steps of the episode up to the end of the segment.
+    /// Steps of the episode until the end of the segment.
     episode_steps: u32,
 }
 
-/// The ring. A clone shares the numbers, which are most of it, until one of the two writes to them.
+/// The ring. A clone shares the blocks, which are most of its memory, until either side writes.
 #[derive(Debug, Clone)]
 pub struct Replay {
     layout: SegmentLayout,
     slots: Vec<Slot>,
-    blocks: Blocks,
-    /// Where the next segment goes.
+    blocks: BlockStore,
+    /// Slot of the next segment.
     head: usize,
-    /// Slots filled.
+    /// Number of filled slots.
     filled: usize,
-    /// Slots at the front that are never replaced: demonstrations.
-    kept: usize,
+    /// Number of slots at the front with demonstrations, which are never replaced.
+    demonstrations: usize,
     /// Segments ever inserted.
     inserted: u64,
-    /// Per worker and environment.
+    /// Newest segment of each environment of each worker.
     tails: Vec<Option<Tail>>,
     envs_per_worker: usize,
 }
 
 impl Replay {
-    /// Room for `capacity_steps` environment steps from `workers * envs_per_worker` environments.
+    /// Makes a replay for `capacity_steps` environment steps from `workers * envs_per_worker`
+    /// environments.
     ///
     /// # Panics
-    /// If K exceeds 255, which the configuration's check excludes.
+    /// If K exceeds 255, which the configuration excludes.
     #[must_use]
     pub fn new(
         layout: SegmentLayout,
@@ -77,57 +78,60 @@ impl Replay {
         workers: usize,
         envs_per_worker: usize,
     ) -> Self {
-        assert!(layout.segment_steps <= 255, "a slot counts its steps in a byte");
+        assert!(layout.segment_steps <= 255, "a slot stores its steps in one byte");
         let count = (capacity_steps / layout.segment_steps).max(1);
         Self {
             layout,
             slots: vec![Slot { next: NONE, previous: NONE, ..Slot::default() }; count],
-            blocks: Blocks::new(count, layout.block_len()),
+            blocks: BlockStore::new(count, layout.block_len()),
             head: 0,
             filled: 0,
-            kept: 0,
+            demonstrations: 0,
             inserted: 0,
             tails: vec![None; workers * envs_per_worker],
             envs_per_worker,
         }
     }
 
-    /// Sizes of the segments.
+    /// Returns the sizes of a segment.
     #[must_use]
     pub fn layout(&self) -> SegmentLayout {
         self.layout
     }
 
-    /// Segments held.
+    /// Returns the number of segments.
     #[must_use]
     pub fn len(&self) -> usize {
         self.filled
     }
 
-    /// Whether nothing is held.
+    /// Returns whether the replay has no segments.
     #[must_use]
     pub fn is_empty(&self) -> bool {
         self.filled == 0
     }
 
-    /// Segments it has room for.
+    /// Returns the maximum number of segments.
     #[must_use]
     pub fn capacity(&self) -> usize {
         self.slots.len()
     }
 
-    /// Inserts a demonstrated segment, which is never replaced. One that does not begin its episode
-    /// continues the one kept before it.
+    /// Inserts a demonstrated segment, which is never replaced. A segment that does not begin its
+    /// episode continues the previous one.
     ///
     /// # Panics
-    /// If anything else has been inserted, or no room were left for more.
-    pub fn keep(&mut self, header: &SegmentHeader, block: &[f32]) {
-        assert!(self.kept == self.filled && self.kept + 1 < self.slots.len(), "no room to keep it");
+    /// If other segments have been inserted, or no slot would remain for them.
+    pub fn insert_demonstration(&mut self, header: &SegmentHeader, block: &[f32]) {
+        assert!(
+            self.demonstrations == self.filled && self.demonstrations + 1 < self.slots.len(),
+            "no room for a demonstration"
+        );
         let at = self.store(header, block);
         if header.episode_step > 0 && at > 0 {
             self.chain(at as u32 - 1, at as u32);
         }
-        self.kept = at + 1;
+        self.demonstrations = at + 1;
         self.inserted += 1;
     }
 
@@ -140,7 +144,7 @@ impl Replay {
         self.inserted += 1;
     }
 
-    /// Puts a segment where the oldest is, or nothing yet.
+    /// Writes a segment to the next slot, which is empty or has the oldest segment.
     fn store(&mut self, header: &SegmentHeader, block: &[f32]) -> usize {
         let at = self.head;
         self.blocks.get_mut(at).copy_from_slice(block);
@@ -152,19 +156,20 @@ impl Replay {
             truncated: header.flags & TRUNCATED != 0,
             hindsight: header.flags & HINDSIGHT != 0,
         };
-        self.head = if at + 1 == self.slots.len() { self.kept } else { at + 1 };
+        self.head = if at + 1 == self.slots.len() { self.demonstrations } else { at + 1 };
         self.filled = (self.filled + 1).min(self.slots.len());
         at
     }
 
-    /// A gap in an episode (a lost segment, a restarted worker) is never bridged.
+    /// Links a segment to its predecessor. A gap in an episode, from a lost segment or a restarted
+    /// worker, is never bridged.
     fn link(&mut self, header: &SegmentHeader, slot: u32) {
         let env = header.worker_id as usize * self.envs_per_worker + header.env_index as usize;
         if let Some(tail) = self.tails[env] {
             let continues = tail.incarnation == header.incarnation
                 && tail.episode == header.episode
                 && tail.episode_steps == header.episode_step
-                && self.inserted - tail.number < (self.slots.len() - self.kept) as u64;
+                && self.inserted - tail.number < (self.slots.len() - self.demonstrations) as u64;
             if continues {
                 self.chain(tail.slot, slot);
             }

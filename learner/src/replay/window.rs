@@ -1,4 +1,4 @@
-//! Windows of up to K consecutive steps, and drawing them uniformly.
+//! Windows of up to K consecutive steps, drawn uniformly.
 
 use dmprl_shared::config::Windows;
 use rand::RngExt;
@@ -6,10 +6,10 @@ use rand_xoshiro::Xoshiro256PlusPlus;
 
 use super::{NONE, Replay};
 
-/// K steps from step `offset` of `slot` on, running over into the next slot if `offset` > 0.
+/// K steps from step `offset` of `slot` on, which continue in the next slot if `offset` > 0.
 ///
-/// A window may hold fewer than K steps only where the episode terminated; one cut short by a
-/// time limit is no window, because a missing action is not a zero action.
+/// A window has fewer than K steps only if the episode terminated. Steps that a time limit cut
+/// short are no window, because a missing action is not a zero action.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Window {
     slot: u32,
@@ -24,13 +24,13 @@ pub struct Window {
 }
 
 impl Window {
-    /// Steps n, 1 to K.
+    /// Returns the number of steps n, 1 to K.
     #[must_use]
     pub fn len(&self) -> usize {
         usize::from(self.first_len) + usize::from(self.second_len)
     }
 
-    /// Never: a window has at least one step.
+    /// Returns false, because a window has at least one step.
     #[must_use]
     pub fn is_empty(&self) -> bool {
         false
@@ -38,7 +38,7 @@ impl Window {
 }
 
 impl Replay {
-    /// The window that starts at step `offset` of `slot`, if that is one.
+    /// Returns the window that starts at step `offset` of `slot`, if there is one.
     #[must_use]
     pub fn window(&self, slot: usize, offset: usize) -> Option<Window> {
         let steps = self.layout.segment_steps;
@@ -73,19 +73,19 @@ impl Replay {
         }
     }
 
-    /// The window's first observation, (O,).
+    /// Returns the window's first observation, (O,).
     #[must_use]
     pub fn observation(&self, window: &Window) -> &[f32] {
         self.observation_row(window.slot, usize::from(window.offset))
     }
 
-    /// The observation one step after the window's first, (O,).
+    /// Returns the observation one step after the first, (O,).
     #[must_use]
     pub fn second_observation(&self, window: &Window) -> &[f32] {
         self.observation_row(window.slot, usize::from(window.offset) + 1)
     }
 
-    /// The observation after the window's last step, (O,).
+    /// Returns the observation after the window's last step, (O,).
     #[must_use]
     pub fn last_observation(&self, window: &Window) -> &[f32] {
         if window.second_len > 0 {
@@ -101,7 +101,7 @@ impl Replay {
         &observations[row * len..(row + 1) * len]
     }
 
-    /// Copies the window's actions, (n, A), into the front of `out`, (K, A); the rest is zero.
+    /// Copies the window's actions, (n, A), to the front of `out`, (K, A), and zeros the rest.
     pub fn actions(&self, window: &Window, out: &mut [f32]) {
         let dims = self.layout.action_len;
         let (first, second) = self.parts(window, |(_, actions, _)| actions, dims);
@@ -110,8 +110,8 @@ impl Replay {
         out[first.len() + second.len()..].fill(0.0);
     }
 
-    /// The action before the window's first, (A,); none where the episode began or the replay does
-    /// not hold the segment any more.
+    /// Returns the action before the window's first, (A,), or `None` if the episode began there or
+    /// the replay no longer has the segment.
     #[must_use]
     pub fn previous_action(&self, window: &Window) -> Option<&[f32]> {
         let dims = self.layout.action_len;
@@ -120,7 +120,7 @@ impl Replay {
             None => {
                 let previous = self.slots[window.slot as usize].previous;
                 let before = self.slots.get(previous as usize)?;
-                // One that has been replaced since continues somewhere else.
+                // A slot that has been replaced since does not continue here.
                 (before.next == window.slot)
                     .then(|| (previous, usize::from(before.steps_len).saturating_sub(1)))?
             }
@@ -129,14 +129,15 @@ impl Replay {
         Some(&actions[step * dims..(step + 1) * dims])
     }
 
-    /// sum over the window's n steps of discount^i r_i.
+    /// Returns the sum of discount^i r_i over the window's n steps.
     #[must_use]
     pub fn discounted_reward(&self, window: &Window, discount: f32) -> f32 {
         let (first, second) = self.parts(window, |(_, _, rewards)| rewards, 1);
         second.iter().rev().chain(first.iter().rev()).fold(0.0, |sum, r| r + discount * sum)
     }
 
-    /// The window's rows of one of the block's parts, `width` numbers a step.
+    /// Returns the window's rows of one part of the blocks, with `width` numbers per step, from the
+    /// first and from the second slot.
     fn parts<'a>(
         &'a self,
         window: &Window,
@@ -154,7 +155,7 @@ impl Replay {
     }
 }
 
-/// Tries before the sampler concludes that the replay holds hardly any window.
+/// Draws after which the sampler concludes that the replay has no window.
 const TRIES_MAX: usize = 100_000;
 
 /// Draws windows uniformly, with replacement.
@@ -165,35 +166,35 @@ pub struct Sampler {
 }
 
 impl Sampler {
-    /// A sampler with a random stream of its own.
+    /// Makes a sampler with its own random stream.
     #[must_use]
     pub fn new(windows: Windows, random: Xoshiro256PlusPlus) -> Self {
         Self { windows, random }
     }
 
-    /// The random stream, for a checkpoint.
+    /// Returns the random stream, for a checkpoint.
     #[must_use]
     pub fn random(&self) -> &Xoshiro256PlusPlus {
         &self.random
     }
 
-    /// The same, to draw what else a batch needs.
+    /// Returns the random stream, to draw a batch's noise.
     pub fn random_mut(&mut self) -> &mut Xoshiro256PlusPlus {
         &mut self.random
     }
 
-    /// Draws one window, or `None` if `TRIES_MAX` draws met none.
+    /// Draws one window, or returns `None` after `TRIES_MAX` draws without one.
     ///
-    /// Steps that start no window are redrawn, so every window of an episode is equally likely. A
-    /// copy with another goal is one window: it is drawn as often as the K windows of a segment,
-    /// so that copies have the same share of samples whatever `windows` says.
+    /// Steps that start no window are drawn again, so every window of an episode is equally likely.
+    /// A hindsight copy is one window, which is drawn as often as the K windows of a segment. The
+    /// share of copies among the samples therefore does not depend on `windows`.
     pub fn draw(&mut self, replay: &Replay) -> Option<Window> {
         self.draw_from(replay, replay.len())
     }
 
-    /// The same among the demonstrations.
-    pub fn draw_kept(&mut self, replay: &Replay) -> Option<Window> {
-        self.draw_from(replay, replay.kept)
+    /// Draws one window from the demonstrations.
+    pub fn draw_demonstration(&mut self, replay: &Replay) -> Option<Window> {
+        self.draw_from(replay, replay.demonstrations)
     }
 
     fn draw_from(&mut self, replay: &Replay, slots: usize) -> Option<Window> {
@@ -223,7 +224,7 @@ mod tests {
     const LAYOUT: SegmentLayout =
         SegmentLayout { segment_steps: 3, observation_len: 1, action_len: 1 };
 
-    /// Inserts an episode in which step t has observation 100 e + t, action t / 100, reward t.
+    /// Inserts an episode e in which step t has observation 100 e + t, action t / 100 and reward t.
     fn episode(replay: &mut Replay, episode: u32, steps: u32, flag: u32) {
         for start in (0..steps).step_by(3) {
             let len = (steps - start).min(3);
@@ -320,7 +321,7 @@ mod tests {
         assert_eq!(firsts, [6.0, 100.0, 101.0, 102.0, 103.0, 104.0, 105.0, 106.0]);
     }
 
-    /// (observation, action before) of every window.
+    /// Returns (observation, previous action) of every window.
     fn previous(replay: &Replay) -> Vec<(f32, Option<f32>)> {
         let windows = (0..replay.len()).flat_map(|slot| (0..3).map(move |at| (slot, at)));
         let windows = windows.filter_map(|(slot, offset)| replay.window(slot, offset));
@@ -403,7 +404,7 @@ mod tests {
         assert!((0..4).all(|slot| replay.window(slot, 2).is_some_and(|window| window.len() == 3)));
     }
 
-    /// A copy of steps 3 to 5 of the episode that is under way.
+    /// Inserts a hindsight copy.
     fn copy(replay: &mut Replay, episode_step: u32) {
         let header = SegmentHeader {
             flags: HINDSIGHT,
@@ -422,7 +423,7 @@ mod tests {
             let header =
                 SegmentHeader { episode_step: start, steps_len: 3, ..SegmentHeader::default() };
             replay.insert(&header, &block);
-            // Where the next segment of the episode is expected.
+            // At the step at which the episode's next segment is expected.
             copy(&mut replay, start + 3);
         }
         for (slot, real) in [true, false, true, false].into_iter().enumerate() {
@@ -444,7 +445,7 @@ mod tests {
         let random = dmprl_shared::seeds::stream(1, "test", 0);
         let mut sampler = Sampler::new(Windows::Sliding, random);
         let drawn = (0..9_000).filter(|_| sampler.draw(&replay).unwrap().slot == 2).count();
-        // Binomial(9000, 1/3): standard deviation 45; five of them.
+        // Binomial(9000, 1/3) has standard deviation 45; five of them are allowed.
         assert!(drawn.abs_diff(3_000) < 225, "{drawn}");
     }
 
@@ -459,7 +460,7 @@ mod tests {
             let window = sampler.draw(&replay).unwrap();
             counts[replay.observation(&window)[0] as usize] += 1;
         }
-        // Binomial(8000, 1/8): standard deviation 30; five of them.
+        // Binomial(8000, 1/8) has standard deviation 30; five of them are allowed.
         assert!(counts.iter().all(|&count| count.abs_diff(1_000) < 150), "{counts:?}");
     }
 }

@@ -19,12 +19,12 @@ use super::*;
 use crate::checkpoint;
 use crate::learner::Counters;
 use crate::learner::tests::spec;
-use crate::recorder::{Past, RunFiles};
+use crate::recorder::{PreviousSessions, RunFiles};
 
 const QUEUE_SEGMENTS: usize = 8;
 const RUN_ID: u64 = 1;
 
-/// Metrics and policies in memory, checkpoints in a folder.
+/// Keeps metrics and policies in memory, and checkpoints in a folder.
 struct Files {
     folder: TempDir,
     metrics: Vec<String>,
@@ -54,7 +54,7 @@ impl Files {
         Self { folder: tempfile::tempdir().unwrap(), metrics: Vec::new(), policies: Vec::new() }
     }
 
-    /// Counters of the only checkpoint.
+    /// Returns the counters of the only checkpoint.
     fn checkpoint(&self) -> Counters {
         let counters = checkpoint::counters(self.folder.path()).unwrap();
         assert_eq!(counters.len(), 1);
@@ -62,7 +62,7 @@ impl Files {
     }
 }
 
-/// A learner to be served, and its only worker's ends.
+/// A learner and the transport of its only worker.
 struct Run {
     session: Session<Receiver, Publisher>,
     acknowledger: Acknowledger,
@@ -123,7 +123,8 @@ impl Run {
         files: &mut Files,
         supervisor: &FakeSupervisor,
     ) -> (AcknowledgementReader, Result<(), ServeError>) {
-        let recorder = Recorder::new(files, Past::default(), supervisor, &self.session.learner);
+        let recorder =
+            Recorder::new(files, PreviousSessions::default(), supervisor, &self.session.learner);
         let server = Server {
             session: self.session,
             acknowledgements: self.acknowledger,
@@ -153,7 +154,7 @@ fn a_stop_leads_to_a_checkpoint_of_what_was_queued_and_a_final_report() {
     assert_eq!(last, [Report::Checkpoint { name, env_steps: 15 }, Report::Finished]);
     let counters = files.checkpoint();
     assert_eq!((counters.segments, counters.env_steps, counters.updates), (3, 15, 0));
-    // A run that goes on is not evaluated where it was stopped.
+    // A stopped run is not evaluated.
     assert_eq!((files.metrics.len(), files.policies.len()), (1, 0));
     assert_eq!(supervisor.warnings(), Vec::<String>::new());
 }
@@ -189,7 +190,7 @@ fn the_first_refused_segment_of_a_kind_is_a_warning_and_the_others_are_counted()
     ended.unwrap();
     let warnings = supervisor.warnings();
     assert_eq!(warnings.len(), 1, "{warnings:?}");
-    assert!(warnings[0].contains("a segment was refused"), "{warnings:?}");
+    assert!(warnings[0].contains("a segment was rejected"), "{warnings:?}");
     let counters = files.checkpoint();
     assert_eq!((counters.rejected.run, counters.segments), (3, 1));
 }
@@ -213,7 +214,7 @@ fn the_totals_of_the_supervisor_are_in_the_checkpoint() {
 fn a_learner_acknowledges_what_it_has_inserted() {
     let (mut run, mut files) = (Run::new(), Files::new());
     (1..=3).for_each(|sequence| run.send(RUN_ID, sequence));
-    // Acknowledged in time: the run ends at its first progress report, after several of them.
+    // The run ends at its first progress report, after several acknowledgements.
     let supervisor = FakeSupervisor::stopping_on(|report| matches!(report, Report::Progress(_)));
     let (mut reader, ended) = run.serve(&mut files, &supervisor);
     ended.unwrap();
@@ -228,9 +229,10 @@ fn a_learner_without_a_supervisor_fails_after_its_checkpoint() {
     let Run { session, acknowledger, .. } = run;
     let mut session = session;
     supervisor.gone.store(true, Ordering::Release);
-    let mut recorder = Recorder::new(&mut files, Past::default(), &supervisor, &session.learner);
+    let mut recorder =
+        Recorder::new(&mut files, PreviousSessions::default(), &supervisor, &session.learner);
     let mut evaluate = |_| Ok(());
-    let ending = Ending { is_complete: false, evaluate: &mut evaluate, env_failures: &|| 0 };
+    let ending = SessionEnd { is_complete: false, evaluate: &mut evaluate, env_failures: &|| 0 };
     let error = close(&mut session, &mut recorder, &supervisor, ending).unwrap_err();
     assert!(matches!(error, ServeError::SupervisorGone), "{error}");
     drop((recorder, acknowledger));

@@ -1,32 +1,32 @@
-//! In which arithmetic a layer's products are computed.
+//! The instructions and the precision with which a layer's products are computed.
 
 use candle_core::Result;
 use dmprl_shared::config::Precision;
 use dmprl_shared::policy::Layer;
 
 use super::kernels::InstructionSet;
-use super::kernels::bf16::{Bf16, suits};
+use super::kernels::bf16::{Bf16, is_wide_enough};
 
-/// The processor's instructions and the precision of the products.
+/// Vector instructions and precision of the products.
 #[derive(Debug, Clone, Copy)]
 pub struct Arithmetic {
-    /// For everything but products of 16 bits.
+    /// Vector instructions of everything except 16-bit products.
     pub instructions: InstructionSet,
     bf16: Option<Bf16>,
 }
 
 impl Arithmetic {
-    /// What `precision` asks for on this processor.
+    /// Selects the arithmetic for `precision` on this processor.
     ///
     /// # Errors
-    /// If the processor cannot do it.
+    /// If the processor does not support `precision`.
     pub fn new(precision: Precision) -> Result<Self> {
         let bf16 = match precision {
             Precision::F32 => None,
             Precision::Bf16 => match Bf16::detect() {
                 None => candle_core::bail!(
                     "learner.precision = \"bf16\" needs a processor with AVX512-BF16, which this \
-                     one lacks; \"f32\" runs everywhere"
+                     one lacks; set it to \"f32\""
                 ),
                 found => found,
             },
@@ -34,9 +34,9 @@ impl Arithmetic {
         Ok(Self { instructions: InstructionSet::detect(), bf16 })
     }
 
-    /// The instructions of 16 bits, if this layer's products use them.
+    /// Returns the 16-bit instructions if this layer's products use them.
     #[must_use]
     pub fn bf16(self, layer: &Layer) -> Option<Bf16> {
-        self.bf16.filter(|_| suits(layer.outputs) && layer.inputs > 0)
+        self.bf16.filter(|_| is_wide_enough(layer.outputs) && layer.inputs > 0)
     }
 }

@@ -1,52 +1,52 @@
-//! Layer normalisation (Ba et al. 2016) of a network's hidden layers, before their ReLU: where its
-//! parameters stand, and what its passes leave.
+//! Layer normalisation (Ba et al. 2016) of a network's hidden layers, before their ReLU: the layout
+//! of its parameters and the buffers of its passes.
 //!
-//! It is for critics: whatever an action is, the last layer sees hidden values of a bounded size,
-//! so that Q beyond the data stays bounded by the norm of its weights (Ball et al. 2023, "Efficient
-//! online reinforcement learning with offline data"). Policies do not have it.
+//! Only critics use it. It bounds the hidden values that the last layer sees, whatever the action,
+//! so that Q outside the data is bounded by the norm of the last layer's weights (Ball et al. 2023,
+//! "Efficient online reinforcement learning with offline data").
 
 use std::ops::Range;
 
 use dmprl_shared::policy::MlpShape;
 
-/// Where gains and shifts of all hidden layers stand: behind the layers' weights and biases in the
+/// Ranges of the gains and shifts of all hidden layers. They follow the weights and biases in the
 /// flat parameters.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct LayerNorm {
     layers: Vec<GainShift>,
 }
 
-/// One layer's gain and shift in the flat parameters, (outputs,) each.
+/// Ranges of gain and shift in the flat parameters, (outputs,) each.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct GainShift {
-    /// What a normalised value is multiplied by.
+    /// Multiplies the normalised values.
     pub gain: Range<usize>,
-    /// What is added to it then.
+    /// Is added to the product.
     pub shift: Range<usize>,
 }
 
 impl LayerNorm {
-    /// After every layer of `shape` but the last.
+    /// Normalises every layer of `shape` except the last.
     #[must_use]
     pub fn new(shape: &MlpShape) -> Self {
         let mut at = shape.parameters_len();
         let hidden = &shape.layers()[..shape.layers().len() - 1];
-        let place = |width: usize| {
+        let gain_shift = |width: usize| {
             let gain = at..at + width;
             let shift = gain.end..gain.end + width;
             at = shift.end;
             GainShift { gain, shift }
         };
-        Self { layers: hidden.iter().map(|layer| layer.outputs).map(place).collect() }
+        Self { layers: hidden.iter().map(|layer| layer.outputs).map(gain_shift).collect() }
     }
 
-    /// Gain and shift of layer `index`; the last layer has none.
+    /// Returns the ranges of layer `index`; the last layer has none.
     #[must_use]
     pub fn layer(&self, index: usize) -> Option<&GainShift> {
         self.layers.get(index)
     }
 
-    /// Puts gains of one and shifts of zero behind a network's other parameters.
+    /// Appends gains of one and shifts of zero to a network's other parameters.
     pub fn extend(&self, parameters: &mut Vec<f32>) {
         for GainShift { gain, shift } in &self.layers {
             parameters.resize(gain.end, 1.0);
@@ -55,8 +55,7 @@ impl LayerNorm {
     }
 }
 
-/// What the forward pass leaves of every hidden layer for the backward pass, for up to `rows_max`
-/// rows.
+/// Normalised values of all hidden layers, which the forward pass keeps for the backward pass.
 #[derive(Debug)]
 pub struct Normalised {
     layers: Vec<NormalisedLayer>,
@@ -68,8 +67,26 @@ struct NormalisedLayer {
     inverse_std: Vec<f32>,
 }
 
+/// Some rows of one normalised layer.
+#[derive(Debug, Clone, Copy)]
+pub struct NormalisedRows<'a> {
+    /// The normalised values, (rows, outputs).
+    pub values: &'a [f32],
+    /// 1 / standard deviation of each row, (rows,).
+    pub inverse_std: &'a [f32],
+}
+
+/// Some rows of one normalised layer, for writing.
+#[derive(Debug)]
+pub struct NormalisedRowsMut<'a> {
+    /// The normalised values, (rows, outputs).
+    pub values: &'a mut [f32],
+    /// 1 / standard deviation of each row, (rows,).
+    pub inverse_std: &'a mut [f32],
+}
+
 impl Normalised {
-    /// Buffers for up to `rows_max` rows.
+    /// Allocates buffers for up to `rows_max` rows.
     #[must_use]
     pub fn new(shape: &MlpShape, rows_max: usize) -> Self {
         let hidden = &shape.layers()[..shape.layers().len() - 1];
@@ -80,17 +97,24 @@ impl Normalised {
         Self { layers: hidden.iter().map(|l| layer(l.outputs)).collect() }
     }
 
-    /// Normalised values of layer `index`, (rows, outputs), and 1 / std of their rows, (rows,).
+    /// Returns the first `rows` rows of layer `index`.
     #[must_use]
-    pub fn layer(&self, shape: &MlpShape, index: usize, rows: usize) -> [&[f32]; 2] {
+    pub fn layer(&self, shape: &MlpShape, index: usize, rows: usize) -> NormalisedRows<'_> {
         let NormalisedLayer { values, inverse_std } = &self.layers[index];
-        [&values[..rows * shape.layers()[index].outputs], &inverse_std[..rows]]
+        let len = rows * shape.layers()[index].outputs;
+        NormalisedRows { values: &values[..len], inverse_std: &inverse_std[..rows] }
     }
 
-    /// As [`Normalised::layer`], to write them.
-    pub fn layer_mut(&mut self, shape: &MlpShape, index: usize, rows: usize) -> [&mut [f32]; 2] {
+    /// Returns the first `rows` rows of layer `index` for writing.
+    pub fn layer_mut(
+        &mut self,
+        shape: &MlpShape,
+        index: usize,
+        rows: usize,
+    ) -> NormalisedRowsMut<'_> {
         let NormalisedLayer { values, inverse_std } = &mut self.layers[index];
-        [&mut values[..rows * shape.layers()[index].outputs], &mut inverse_std[..rows]]
+        let len = rows * shape.layers()[index].outputs;
+        NormalisedRowsMut { values: &mut values[..len], inverse_std: &mut inverse_std[..rows] }
     }
 }
 

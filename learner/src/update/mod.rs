@@ -1,25 +1,24 @@
 //! Stage 6 of 8: the arithmetic of an update, on buffers made once.
 //!
-//! The batch is cut into blocks of rows. A block goes through all forward and backward passes of
-//! a step on one thread (`crew`, `pass`), its numbers staying in that core's cache; then the
-//! gradient of every parameter is summed over the blocks in their order, and Adam and the target
-//! follow at once (`trained`), shared out by rows of the weights. Neither the blocks nor the order
-//! depend on the number of threads.
+//! The batch is cut into shards of [`SHARD_ROWS`] rows. One thread takes a shard through all
+//! forward and backward passes of a step (`thread_pool`, `backward_pass`), so that it stays in that
+//! core's cache. Then the threads share the weights, in tiles of some outputs each (`step`): for
+//! each tile, one thread sums the gradient over the shards in their order and updates parameters
+//! and target network at once. Neither the shards nor the order depend on the number of threads.
 
 pub mod adam;
 mod arithmetic;
-mod batch_pairs;
-pub mod crew;
-pub mod floor;
+pub mod backward_pass;
+mod bf16_operands;
 pub mod kernels;
 pub mod layer_norm;
-mod packed;
-pub mod pass;
+pub mod network;
+mod packed_weights;
 mod step;
-pub mod trained;
+pub mod thread_pool;
 
-/// Rows of a block.
-pub const BLOCK_ROWS: usize = 64;
+/// Rows of the batch in one shard.
+pub const SHARD_ROWS: usize = 64;
 
 #[cfg(test)]
 #[path = "../../../tests/src/skipped.rs"]

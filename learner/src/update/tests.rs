@@ -1,28 +1,28 @@
-//! A network's whole step in both precisions.
+//! A network's complete step in both precisions.
 
 use dmprl_shared::config::Precision;
 use dmprl_shared::policy::{Activations, MlpShape, initial_parameters};
 use dmprl_shared::seeds;
 
-use super::crew::Crew;
+use super::backward_pass::Gradients;
 use super::kernels::bf16::Bf16;
 use super::layer_norm::Normalised;
-use super::pass::Gradients;
+use super::network::{PassRecord, TrainableNetwork};
 use super::skipped::skipped;
-use super::trained::{Trace, Trained};
+use super::thread_pool::ThreadPool;
 use super::*;
 
-struct Block {
+struct Shard {
     inputs: Vec<f32>,
     activations: Activations,
     normalised: Option<Normalised>,
     gradients: Gradients,
 }
 
-impl Block {
-    fn trace(&self) -> Trace<'_> {
+impl Shard {
+    fn record(&self) -> PassRecord<'_> {
         let Self { inputs, activations, normalised, gradients } = self;
-        Trace { inputs, activations, normalised: normalised.as_ref(), gradients }
+        PassRecord { inputs, activations, normalised: normalised.as_ref(), gradients }
     }
 }
 
@@ -32,40 +32,40 @@ enum Hidden {
     Normalised,
 }
 
-/// Gradient and parameters, of network and target, after three steps towards zero outputs.
+/// Returns gradient, parameters and target after three steps towards zero outputs.
 fn steps(hidden: Hidden, precision: Precision, threads: usize) -> [Vec<f32>; 3] {
     let shape = MlpShape::new(vec![23, 96, 64, 7]);
     let initial = initial_parameters(&shape, &mut seeds::stream(1, "test", 0));
-    let mut trained = Trained::new(shape.clone(), initial, 1e-3, true, precision).unwrap();
+    let mut network = TrainableNetwork::new(shape.clone(), initial, 1e-3, true, precision).unwrap();
     if hidden == Hidden::Normalised {
-        trained = trained.with_layer_norm();
+        network = network.with_layer_norm();
     }
-    let crew = Crew::new(threads);
-    // The last block is short and has an odd number of rows.
-    let block = |rows: usize| Block {
+    let mut pool = ThreadPool::new(threads);
+    // The last shard is short and has an odd number of rows.
+    let shard = |rows: usize| Shard {
         inputs: (0..rows * 23).map(|i| (i as f32 * 0.37).sin()).collect(),
         activations: Activations::new(&shape, rows),
         normalised: Some(Normalised::new(&shape, rows)),
         gradients: Gradients::with_layer_norm(&shape, rows),
     };
-    let mut blocks = [BLOCK_ROWS, BLOCK_ROWS, 13].map(block);
+    let mut shards = [SHARD_ROWS, SHARD_ROWS, 13].map(shard);
     for _ in 0..3 {
-        let network = trained.lend();
-        crew.each(&mut blocks, |Block { inputs, activations, normalised, gradients }| {
+        let view = network.view();
+        pool.for_each(&mut shards, |Shard { inputs, activations, normalised, gradients }| {
             let rows = inputs.len() / 23;
-            network.forward(inputs, activations, normalised.as_mut());
+            view.forward(inputs, activations, normalised.as_mut());
             let out = gradients.output_mut(&shape, rows);
             out.copy_from_slice(activations.output(&shape, rows));
-            network.pass(activations, normalised.as_ref(), rows).backward(gradients);
+            view.backward_pass(activations, normalised.as_ref(), rows).run(gradients);
         });
-        drop(network);
-        trained.descend(&crew, &blocks, Block::trace, Some(0.1));
+        drop(view);
+        network.adam_step(&mut pool, &shards, Shard::record, Some(0.1));
     }
-    let target = trained.target.as_ref().unwrap().values();
-    [trained.gradient(), trained.network.values(), target].map(<[f32]>::to_vec)
+    let target = network.target.as_ref().unwrap().values();
+    [network.gradient(), network.parameters.values(), target].map(<[f32]>::to_vec)
 }
 
-/// 16-bit arithmetic; none, and the test is skipped, on a processor without it.
+/// Returns the 16-bit arithmetic, or reports the test as skipped if the processor has none.
 pub(super) fn bf16() -> Option<Bf16> {
     let bf16 = Bf16::detect();
     if bf16.is_none() {
@@ -87,7 +87,7 @@ fn sixteen_bits_change_a_gradient_by_no_more_than_a_hundredth() {
             let apart = norm(&mut exact.iter().zip(rounded).map(|(a, b)| a - b));
             let ratio = apart / norm(&mut exact.iter().copied());
             assert!(ratio < 1e-2, "{hidden:?}: {ratio}");
-            // That it is another arithmetic at all.
+            // The arithmetic must really be another one.
             assert!(ratio > 1e-6, "{hidden:?}: {ratio}");
         }
     }

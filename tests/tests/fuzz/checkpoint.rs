@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 use std::fs;
 use std::path::Path;
 
-use dmprl_learner::checkpoint::{Cut, load_newest};
+use dmprl_learner::checkpoint::{CheckpointContents, load_newest};
 use dmprl_learner::learner::Learner;
 use serde_json::Value;
 
@@ -31,7 +31,7 @@ const RUNS: [Keys; 2] = [
 type Files = BTreeMap<String, Vec<u8>>;
 
 fn write(learner: &mut Learner, folder: &Path) -> Files {
-    let name = Cut::of(learner).unwrap().write(folder).unwrap();
+    let name = CheckpointContents::capture(learner).unwrap().write(folder).unwrap();
     let entries = fs::read_dir(folder.join(name)).unwrap().flatten();
     let read = |path: &Path| fs::read(path).unwrap();
     entries.map(|entry| (entry.file_name().into_string().unwrap(), read(&entry.path()))).collect()

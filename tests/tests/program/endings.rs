@@ -58,7 +58,7 @@ fn a_full_disk_costs_the_checkpoints_and_not_the_run() {
         .start_command(train_on_a_full_disk(&run, &["--steps", "9000"]))
         .wait()
         .with_status(0)
-        .saying("no checkpoint could be written, training goes on")
+        .saying("no checkpoint could be written, training continues")
         .saying("the last checkpoint is missing");
     assert_eq!(finished.said.matches("no checkpoint could be written").count(), 1, "told once");
     assert_eq!(env_steps(&rows(&run, "evaluations.jsonl")).last(), Some(&9000));

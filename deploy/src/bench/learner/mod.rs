@@ -2,13 +2,16 @@
 //!
 //! `ours` is the learner of a run on a replay full of synthetic segments (`synthetic`), so it needs
 //! neither Python nor an environment. The floor consists of the update's matrix products only
-//! (`work`). The peers do the same update in their own processes (`peers`). In every round each
-//! candidate runs once for the same time while the others sleep, because a machine's speed drifts.
-//! The report has medians over the rounds, and medians of the rounds' own ratios (`figures`,
-//! `table`).
+//! (`products`, `floor`). Other parts of the update are measured alone (`work`, `optimiser`). The
+//! peers do the same update in their own processes (`peers`). In every round each candidate runs
+//! once for the same time while the others sleep, because a machine's speed drifts. The report has
+//! medians over the rounds, and medians of the rounds' own ratios (`figures`, `table`).
 
 mod figures;
+mod floor;
+mod optimiser;
 mod peers;
+mod products;
 mod synthetic;
 mod table;
 mod work;
@@ -33,7 +36,9 @@ pub use synthetic::spec_of;
 pub(super) use work::timed;
 
 use figures::{KERNELS, LIBRARY, OPTIMISER, OURS, SAMPLE};
+use floor::Engine;
 use peers::Peer;
+use products::Cycle;
 use work::{FloorWork, OptimiserWork, SampleWork};
 
 /// Plan of the benchmark.
@@ -88,7 +93,7 @@ fn measure(bench: &LearnerBench) -> anyhow::Result<Figures> {
     timed(bench.duration, || Ok(learner.update()?))?;
     // Measured before the benchmark allocates its own buffers.
     figures.peak_memory_bytes = resident_bytes_max("self");
-    let mut work = Work::new(&learner);
+    let mut work = Work::new(&learner)?;
     progress.preparing("starting the peers");
     let mut ready = Vec::new();
     for mut peer in peers {
@@ -118,12 +123,13 @@ struct Work {
 }
 
 impl Work {
-    fn new(learner: &Learner) -> Self {
-        Self {
-            floor: FloorWork::new(learner),
-            sample: SampleWork::new(learner),
-            optimiser: OptimiserWork::new(learner),
-        }
+    fn new(learner: &Learner) -> anyhow::Result<Self> {
+        let cycle = Cycle::of(learner);
+        Ok(Self {
+            floor: FloorWork::new(learner, &cycle),
+            sample: SampleWork::new(learner)?,
+            optimiser: OptimiserWork::new(learner, &cycle),
+        })
     }
 
     fn round(
@@ -133,7 +139,6 @@ impl Work {
         duration: Duration,
         figures: &mut Figures,
     ) -> anyhow::Result<()> {
-        use dmprl_learner::update::floor::Engine;
         let Self { floor, sample, optimiser } = self;
         // Our update runs in the middle, so that drift of the machine's speed affects both sides.
         figures.add(LIBRARY, floor.measure(Engine::Library, duration)?);

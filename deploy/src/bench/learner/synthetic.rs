@@ -68,3 +68,22 @@ pub(in crate::bench) fn fill(learner: &mut Learner, spec: &EnvSpec) -> anyhow::R
     }
     Ok(())
 }
+
+#[cfg(test)]
+pub(super) mod tests {
+    use super::*;
+
+    /// Returns the spec of a small environment.
+    pub(in super::super) fn small_spec() -> EnvSpec {
+        EnvSpec {
+            id: "Test-v0".into(),
+            observation_len: 4,
+            action_len: 2,
+            action_low: vec![-1.0; 2],
+            action_high: vec![1.0; 2],
+            control_dt_s: 0.02,
+            episode_steps: 10,
+            observation_names: Vec::new(),
+        }
+    }
+}

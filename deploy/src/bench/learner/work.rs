@@ -2,15 +2,18 @@
 
 use std::time::{Duration, Instant};
 
-use anyhow::ensure;
-use dmprl_learner::algorithms::{Batch, Cycle, OptimiserSteps};
+use anyhow::{bail, ensure};
+use dmprl_learner::algorithms::{Batch, BatchShape, SampleSource};
 use dmprl_learner::learner::Learner;
-use dmprl_learner::update::crew::Crew;
-use dmprl_learner::update::floor::{Engine, Floor, Product};
+use dmprl_learner::regime::Regime;
+use dmprl_learner::update::thread_pool::ThreadPool;
 use dmprl_shared::policy::Head;
 use rustix::time::{ClockId, clock_gettime};
 
 use super::figures::Timed;
+use super::floor::{Engine, Floor};
+use super::optimiser::OptimiserSteps;
+use super::products::{Cycle, Product};
 
 /// Divisor for the warm-up before the clock starts. It brings caches and clock frequency to the
 /// state of a long run.
@@ -48,15 +51,15 @@ fn cpu_s() -> f64 {
 /// The matrix products of an update. Each thread has its share of the rows. Summing the shares'
 /// parts of a weight's gradient is no product and is not included.
 pub(super) struct FloorWork {
-    crew: Crew,
+    pool: ThreadPool,
     shares: Vec<Floor>,
     updates: f64,
 }
 
 impl FloorWork {
-    pub(super) fn new(learner: &Learner) -> Self {
+    pub(super) fn new(learner: &Learner, cycle: &Cycle) -> Self {
         let threads = learner.config().learner.threads;
-        let Cycle { products, updates } = learner.algorithm.products();
+        let Cycle { products, updates } = cycle;
         let share = |index: usize| {
             let of = |product: &Product| {
                 let rows = product.rows * (index + 1) / threads - product.rows * index / threads;
@@ -65,16 +68,16 @@ impl FloorWork {
             Floor::new(products.iter().filter_map(of))
         };
         Self {
-            crew: Crew::new(threads),
+            pool: ThreadPool::new(threads),
             shares: (0..threads).map(share).collect(),
-            updates: updates as f64,
+            updates: *updates as f64,
         }
     }
 
     pub(super) fn measure(&mut self, engine: Engine, duration: Duration) -> anyhow::Result<Timed> {
-        let Self { crew, shares, updates } = self;
+        let Self { pool, shares, updates } = self;
         let cycle = timed(duration, || {
-            crew.each(shares, |floor| floor.run(engine));
+            pool.for_each(shares, |floor| floor.run(engine));
             Ok(())
         })?;
         Ok(cycle.over(*updates))
@@ -84,16 +87,21 @@ impl FloorWork {
 /// Sampling a batch.
 pub(super) struct SampleWork {
     batch: Batch,
+    shape: BatchShape,
     omega: f32,
 }
 
 impl SampleWork {
-    pub(super) fn new(learner: &Learner) -> Self {
+    pub(super) fn new(learner: &Learner) -> anyhow::Result<Self> {
+        let Regime::OffPolicy(off_policy) = &learner.regime else {
+            bail!("an on-policy algorithm samples no batch")
+        };
+        let shape = off_policy.algorithm.batch_shape();
         let omega = match learner.policy().head() {
             Head::Dmp(head) => head.omega(),
             Head::Mlp => 1.0,
         };
-        Self { batch: Batch::new(learner.algorithm.batch_shape()), omega }
+        Ok(Self { batch: Batch::new(shape), shape, omega })
     }
 
     pub(super) fn measure(
@@ -101,12 +109,13 @@ impl SampleWork {
         learner: &mut Learner,
         duration: Duration,
     ) -> anyhow::Result<Timed> {
-        let shape = learner.algorithm.batch_shape();
         let config = learner.config().algorithm.clone();
-        let Self { batch, omega } = self;
+        let Self { batch, shape, omega } = self;
         timed(duration, || {
-            let source = (&learner.replay, &mut learner.sampler);
-            Ok(batch.sample(shape, &config, *omega, learner.normaliser.as_ref(), source)?)
+            let Learner { replay, sampler, normaliser, .. } = &mut *learner;
+            let normaliser = normaliser.as_ref();
+            let mut source = SampleSource { replay, sampler, normaliser };
+            Ok(batch.sample(*shape, &config, *omega, &mut source)?)
         })
     }
 }
@@ -115,10 +124,8 @@ impl SampleWork {
 pub(super) struct OptimiserWork(OptimiserSteps);
 
 impl OptimiserWork {
-    pub(super) fn new(learner: &Learner) -> Self {
-        let config = learner.config();
-        let (threads, polyak) = (config.learner.threads, config.algorithm.polyak as f32);
-        Self(OptimiserSteps::new(&learner.algorithm, threads, polyak))
+    pub(super) fn new(learner: &Learner, cycle: &Cycle) -> Self {
+        Self(OptimiserSteps::new(learner, cycle.updates))
     }
 
     pub(super) fn measure(&mut self, duration: Duration) -> anyhow::Result<Timed> {

@@ -1,5 +1,5 @@
-//! A rollout and twenty passes over it against an independent implementation in PyTorch:
-//! tests/golden/update/ndp.safetensors, by make_golden_ndp.py beside it.
+//! Compares a rollout and twenty updates with an independent implementation in PyTorch. The numbers
+//! in tests/golden/update/ndp.safetensors come from make_golden_ndp.py in the same folder.
 
 use std::collections::BTreeMap;
 
@@ -9,7 +9,7 @@ use super::super::golden_tests::{FIRST, Golden, folder};
 use super::*;
 use crate::learner::tests::spec;
 
-/// Segment `index` of the file's rollout.
+/// Returns segment `index` of the file's rollout.
 fn segment(golden: &Golden, policy: &Policy, index: usize) -> Segment {
     let part = |name: &str, width: usize| {
         &golden.tensors[&format!("rollout.{name}")][index * width..(index + 1) * width]
@@ -34,8 +34,8 @@ fn segment(golden: &Golden, policy: &Policy, index: usize) -> Segment {
     segment
 }
 
-/// What the rollout was worth.
-fn judged(ndp: &Ndp) -> BTreeMap<String, Vec<f32>> {
+/// Returns the evaluation of the rollout.
+fn evaluation(ndp: &Ndp) -> BTreeMap<String, Vec<f32>> {
     let RolloutBuffer { values, last_values, advantages, returns, .. } = &ndp.rollout;
     [
         ("values", values),
@@ -51,25 +51,25 @@ fn judged(ndp: &Ndp) -> BTreeMap<String, Vec<f32>> {
 #[test]
 fn a_rollout_and_its_updates_equal_those_of_an_independent_implementation() {
     let mut golden = Golden::read(&folder().join("ndp.safetensors"));
-    let config = golden.config();
+    let mut config = golden.config();
+    config.learner.threads = 2;
     let policy = Policy::new(&config, &spec()).unwrap();
     let mut ndp = Ndp::new(&config, &policy).unwrap();
     let networks =
         [("actor", &mut ndp.actor), ("log_std", &mut ndp.log_std), ("critic", &mut ndp.critic)];
-    for (name, trained) in networks {
-        trained.network.set(&golden.tensors[&format!("initial.{name}")]).unwrap();
+    for (name, network) in networks {
+        network.parameters.set(&golden.tensors[&format!("initial.{name}")]).unwrap();
     }
-    ndp.published(1);
+    ndp.policy_published(1);
     for index in 0..config.algorithm.ndp.rollout_segments {
-        assert!(ndp.take(&segment(&golden, &policy, index)));
+        assert!(ndp.try_insert(&segment(&golden, &policy, index)));
     }
-    let crew = Crew::new(2);
     let mut random = seeds::stream(1, "test", 0);
     for update in 1..=golden.updates() {
-        let scene = Scene { policy: &policy, crew: &crew, normaliser: None, progress: 0.5 };
-        let losses = ndp.update(scene, &mut random);
+        let context = UpdateContext { policy: &policy, normaliser: None, progress: 0.5 };
+        let losses = ndp.update(context, &mut random);
         if update == 1 {
-            golden.compare_with("judged.", &judged(&ndp), FIRST);
+            golden.compare_with("judged.", &evaluation(&ndp), FIRST);
             let left = golden.tensors.keys().filter(|name| name.starts_with("judged."));
             assert_eq!(left.count(), 0);
         }
@@ -79,9 +79,9 @@ fn a_rollout_and_its_updates_equal_those_of_an_independent_implementation() {
             ("loss.entropy".to_owned(), vec![losses.entropy]),
         ]);
         let networks = [("actor", &ndp.actor), ("log_std", &ndp.log_std), ("critic", &ndp.critic)];
-        for (name, trained) in networks {
-            ours.insert(format!("gradient.{name}"), trained.gradient().to_vec());
-            ours.insert(format!("parameters.{name}"), trained.network.values().to_vec());
+        for (name, network) in networks {
+            ours.insert(format!("gradient.{name}"), network.gradient().to_vec());
+            ours.insert(format!("parameters.{name}"), network.parameters.values().to_vec());
         }
         golden.compare(update, &ours);
     }

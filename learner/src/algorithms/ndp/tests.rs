@@ -1,5 +1,5 @@
-//! The gradients against candle's automatic differentiation of the same losses, written out as a
-//! graph with none of our kernels; and that the whole finds a known optimum.
+//! Compares the gradients with candle's automatic differentiation of the same losses, written as a
+//! graph without our kernels, and checks that the algorithm finds a known optimum.
 
 use candle_core::{Device, Tensor, Var};
 use dmprl_shared::config::{Controller, ForcingScaling, Layers};
@@ -15,7 +15,7 @@ use crate::learner::tests::spec;
 
 const SEGMENTS: usize = 12;
 
-/// A multilayer perceptron over a flat variable, as a graph.
+/// Computes a multilayer perceptron with flat parameters as a graph.
 fn network(shape: &MlpShape, flat: &Tensor, inputs: &Tensor) -> Result<Tensor> {
     let mut x = inputs.clone();
     for (index, layer) in shape.layers().iter().enumerate() {
@@ -62,7 +62,7 @@ fn case(keys: &[(&str, &str)]) -> Case {
     let config = layers.finish().unwrap();
     let policy = Policy::new(&config, &spec()).unwrap();
     let mut ndp = Ndp::new(&config, &policy).unwrap();
-    ndp.published(1);
+    ndp.policy_published(1);
     Case { config, policy, ndp, random: seeds::stream(3, "test", 0) }
 }
 
@@ -74,15 +74,16 @@ impl Case {
     }
 
     fn update(&mut self) -> NdpLosses {
-        self.update_in(&Crew::new(1), 0.0)
+        self.update_at(0.0)
     }
 
-    fn update_in(&mut self, crew: &Crew, progress: f64) -> NdpLosses {
-        let scene = Scene { policy: &self.policy, crew, normaliser: None, progress };
-        self.ndp.update(scene, &mut self.random)
+    fn update_at(&mut self, progress: f64) -> NdpLosses {
+        let context = UpdateContext { policy: &self.policy, normaliser: None, progress };
+        self.ndp.update(context, &mut self.random)
     }
 
-    /// An episode of one segment: what the policy does on `observation`, paid by `reward`.
+    /// Runs the policy for an episode of one segment on a random observation, with `reward` of its
+    /// actions.
     fn segment(
         &mut self,
         work: &mut PolicyWorkspace,
@@ -109,7 +110,7 @@ impl Case {
         segment
     }
 
-    /// Fills the rollout; every third segment is cut short.
+    /// Fills the rollout. Every third segment is cut short.
     fn fill(&mut self) {
         let mut work = self.policy.workspace(1);
         for number in 0..SEGMENTS {
@@ -117,11 +118,11 @@ impl Case {
                 std::array::from_fn(|step| actions[2 * step] - actions[2 * step + 1].abs())
             });
             segment.header.steps_len = if number % 3 == 0 { 2 } else { 5 };
-            assert!(self.ndp.take(&segment));
+            assert!(self.ndp.try_insert(&segment));
         }
     }
 
-    /// Means of u, (N, K A), of the rollout's observations.
+    /// Computes the means of u, (N, K A), for the rollout's observations.
     fn means_graph(&self, flat: &Tensor) -> Result<Tensor> {
         let (k, n, dims) = (5, self.config.dmp.basis_count, 2);
         let observations = &self.ndp.rollout.observations;
@@ -159,7 +160,7 @@ impl Case {
         u.reshape((SEGMENTS, dims, k))?.transpose(1, 2)?.reshape((SEGMENTS, k * dims))
     }
 
-    /// Log densities of the rollout's steps, (N, K).
+    /// Computes the log densities of the rollout's steps, (N, K).
     fn densities_graph(&self, flat: &Tensor, log_std: &Tensor) -> Result<Tensor> {
         let actions = &self.ndp.rollout.actions;
         let actions = Tensor::from_slice(actions, (SEGMENTS, 5, 2), &Device::Cpu)?;
@@ -169,8 +170,8 @@ impl Case {
         normal.broadcast_sub(log_std)?.sum(2)
     }
 
-    /// Gradients of the policy's loss at `now`, with respect to network and log std; the rollout
-    /// was made at `before`. Also the share of steps that the clip leaves without one.
+    /// Computes the gradients of the policy's loss at `now` with respect to network and log std.
+    /// The rollout was made with the parameters `before`.
     fn policy_gradients(&self, before: &[f32], now: &[f32]) -> Result<[Vec<f32>; 2]> {
         let len = self.policy.shape().parameters_len();
         let part = |values: &[f32]| Tensor::from_slice(values, values.len(), &Device::Cpu);
@@ -219,7 +220,7 @@ fn gradients_equal_automatic_differentiation_before_and_after_the_policy_has_mov
         case.fill();
         let mut beyond = 0.0;
         for step in 0..4 {
-            let (now, value) = (case.parameters(), case.ndp.critic.network.values().to_vec());
+            let (now, value) = (case.parameters(), case.ndp.critic.parameters.values().to_vec());
             let losses = case.update();
             let [actor, log_std] = case.policy_gradients(&before, &now).unwrap();
             let name = |part| format!("{part}, step {step}, {keys:?}");
@@ -228,7 +229,7 @@ fn gradients_equal_automatic_differentiation_before_and_after_the_policy_has_mov
             let value = case.value_gradient(&value).unwrap();
             assert_close(&name("value"), case.ndp.critic.gradient(), &value);
             if step == 0 {
-                // The policy is the one that acted.
+                // The policy is still the one that acted.
                 assert!(losses.approx_kl.abs() < 1e-6 && losses.clip_fraction == 0.0, "{losses:?}");
             }
             beyond = losses.clip_fraction.max(beyond);
@@ -253,26 +254,27 @@ fn only_segments_of_the_policy_as_it_is_are_learned_from() {
     let mut case = case(&[("algorithm.ndp.epochs", "1"), ("algorithm.ndp.minibatches", "2")]);
     let mut work = case.policy.workspace(1);
     let mut segment = case.segment(&mut work, |_| [0.0; 5]);
-    // Drawn before the first policy had arrived.
+    // Drawn before the worker had received the first policy.
     segment.header.policy_version = 0;
-    assert!(!case.ndp.take(&segment));
+    assert!(!case.ndp.try_insert(&segment));
     segment.header.policy_version = 1;
-    assert!(case.ndp.take(&segment));
-    // Published once more for an evaluation: the same policy under another number.
-    case.ndp.published(2);
+    assert!(case.ndp.try_insert(&segment));
+    // Published again for an evaluation: the same policy under another version.
+    case.ndp.policy_published(2);
     segment.header.policy_version = 2;
-    assert!(case.ndp.take(&segment));
-    (2..SEGMENTS).for_each(|_| assert!(case.ndp.take(&segment)));
-    assert!(case.ndp.update_due() && !case.ndp.take(&segment));
+    assert!(case.ndp.try_insert(&segment));
+    (2..SEGMENTS).for_each(|_| assert!(case.ndp.try_insert(&segment)));
+    assert!(case.ndp.update_due() && !case.ndp.try_insert(&segment));
     case.update();
     assert!(case.ndp.update_due(), "one of two minibatches is left");
     case.update();
-    // The policy has changed: nothing fits until the new one has been published and has acted.
-    assert!(!case.ndp.update_due() && !case.ndp.take(&segment));
-    case.ndp.published(3);
-    assert!(!case.ndp.take(&segment));
+    // The policy has changed: segments are stale until the new one has been published and has
+    // acted.
+    assert!(!case.ndp.update_due() && !case.ndp.try_insert(&segment));
+    case.ndp.policy_published(3);
+    assert!(!case.ndp.try_insert(&segment));
     segment.header.policy_version = 3;
-    assert!(case.ndp.take(&segment));
+    assert!(case.ndp.try_insert(&segment));
     assert_eq!(case.ndp.rollout.len(), 1);
 }
 
@@ -281,29 +283,29 @@ fn the_learning_rate_falls_to_zero_with_the_run() {
     let mut case = case(&[("algorithm.ndp.learning_rate_decay", "linear")]);
     case.fill();
     let before = case.parameters();
-    case.update_in(&Crew::new(1), 1.0);
+    case.update_at(1.0);
     assert_eq!(case.parameters(), before);
-    case.update_in(&Crew::new(1), 0.5);
+    case.update_at(0.5);
     assert_ne!(case.parameters(), before);
 }
 
 #[test]
 fn the_number_of_threads_changes_no_bit_of_an_update() {
-    let run = |threads: usize| {
-        // More than one block, the last not full.
-        let mut case = case(&[("algorithm.ndp.rollout_segments", "150")]);
+    let run = |threads: &str| {
+        // More than one shard, the last not full.
+        let keys = [("algorithm.ndp.rollout_segments", "150"), ("learner.threads", threads)];
+        let mut case = case(&keys);
         let mut work = case.policy.workspace(1);
         for _ in 0..150 {
             let segment = case.segment(&mut work, |actions| [actions[0]; 5]);
-            assert!(case.ndp.take(&segment));
+            assert!(case.ndp.try_insert(&segment));
         }
-        let crew = Crew::new(threads);
         for _ in 0..3 {
-            case.update_in(&crew, 0.0);
+            case.update();
         }
         case.parameters()
     };
-    assert_eq!(run(1), run(3));
+    assert_eq!(run("1"), run("3"));
 }
 
 #[test]
@@ -328,7 +330,7 @@ fn it_finds_the_best_first_action_of_a_bandit() {
                 [-off, 0.0, 0.0, 0.0, 0.0]
             });
             sum += (work.actions[0] - 0.4).abs() + (work.actions[1] + 0.3).abs();
-            assert!(case.ndp.take(&Segment {
+            assert!(case.ndp.try_insert(&Segment {
                 header: SegmentHeader { policy_version: rollout, ..segment.header },
                 ..segment
             }));
@@ -337,9 +339,9 @@ fn it_finds_the_best_first_action_of_a_bandit() {
         while case.ndp.update_due() {
             case.update();
         }
-        case.ndp.published(rollout + 1);
+        case.ndp.policy_published(rollout + 1);
     }
     assert!(error < 0.08, "means are {error} away from the best on average");
-    let log_std = case.ndp.log_std.network.values();
+    let log_std = case.ndp.log_std.parameters.values();
     assert!(log_std.iter().all(|value| *value < -1.2), "still explores: {log_std:?}");
 }

@@ -1,25 +1,25 @@
-//! A layer's gradient with respect to its inputs.
+//! The gradient with respect to a layer's inputs.
 
 use pulp::{Simd, WithSimd};
 
 use super::tile::{Broadcast, Tiled, Wide, accumulate, for_rows, load, store};
 use super::{InstructionSet, PANEL};
 
-/// inputs' gradient = outputs' gradient weights, from column `first` on, for a block of rows.
+/// The product gradient * weights for the rows of a shard, from column `first` of the inputs on.
 #[derive(Debug)]
 pub struct Backward<'a> {
-    /// Gradient with respect to the layer's outputs, (rows, outputs).
+    /// Gradient with respect to the layer's sums, (rows, outputs).
     pub gradient: &'a [f32],
-    /// The layer's weights, (outputs, inputs) row-major as in the flat parameters.
+    /// The layer's weights, (outputs, inputs), row-major as in the flat parameters.
     pub weights: &'a [f32],
     /// Width of the layer's output.
     pub outputs_len: usize,
-    /// The first input whose gradient is wanted.
+    /// First input whose gradient is computed.
     pub first: usize,
-    /// The ReLU activations that the layer had as inputs, (rows, inputs - first): where one is
-    /// zero, so is the gradient. None: the inputs come from no ReLU.
+    /// The layer's inputs, (rows, inputs - first), if they are outputs of a ReLU. The gradient is
+    /// zero where they are.
     pub activations: Option<&'a [f32]>,
-    /// (rows, inputs - first), overwritten.
+    /// The result, (rows, inputs - first).
     pub inputs_gradient: &'a mut [f32],
 }
 
@@ -27,7 +27,7 @@ impl Backward<'_> {
     /// Computes the inputs' gradient.
     ///
     /// # Panics
-    /// If the lengths do not fit.
+    /// If the lengths are inconsistent.
     pub fn run(self, instructions: InstructionSet) {
         let depth = self.outputs_len;
         let rows = self.gradient.len() / depth;
@@ -48,7 +48,7 @@ struct Job<'a> {
     rows: usize,
     width: usize,
     inputs_len: usize,
-    /// Where the panel at work begins, counted from `first`.
+    /// First column of the current panel, relative to `first`.
     column: usize,
 }
 
@@ -93,7 +93,7 @@ impl<S: Simd> Tiled<S> for Job<'_> {
             if let Some(activations) = self.layer.activations {
                 let activations = load::<S, V>(simd, &activations[columns.clone()]);
                 for (sum, activation) in sums.iter_mut().zip(activations) {
-                    // A select, not a branch: activations are as good as random.
+                    // A select instead of a branch, which would be mispredicted often.
                     let passed = simd.less_than_f32s(zero, activation);
                     *sum = simd.select_f32s(passed, *sum, zero);
                 }

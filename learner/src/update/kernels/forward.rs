@@ -6,27 +6,27 @@ use super::pack::{NARROW, packed_len};
 use super::tile::{Broadcast, Tiled, Wide, accumulate, for_rows, load, store};
 use super::{InstructionSet, PANEL};
 
-/// What a layer does to its sums.
+/// The activation function of a layer.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Activation {
-    /// Nothing: the last layer.
+    /// The identity, in the last layer.
     Linear,
-    /// max(0, sum): a hidden layer.
+    /// max(0, sum), in hidden layers.
     Relu,
 }
 
-/// outputs = activation(inputs weightsᵀ + bias) for a block of rows.
+/// Computes outputs = activation(inputs weightsᵀ + bias) for the rows of a shard.
 #[derive(Debug)]
 pub struct Forward<'a> {
-    /// (rows, inputs).
+    /// The layer's inputs, (rows, inputs).
     pub inputs: &'a [f32],
-    /// The layer's weights as [`super::pack`] leaves them.
+    /// The layer's weights, packed by [`super::pack`].
     pub packed: &'a [f32],
-    /// (outputs,).
+    /// The layer's bias, (outputs,).
     pub bias: &'a [f32],
-    /// What is done to the sums.
+    /// The layer's activation function.
     pub activation: Activation,
-    /// (rows, outputs), overwritten.
+    /// The result, (rows, outputs).
     pub outputs: &'a mut [f32],
 }
 
@@ -34,7 +34,7 @@ impl Forward<'_> {
     /// Computes the outputs.
     ///
     /// # Panics
-    /// If the lengths do not fit.
+    /// If the lengths are inconsistent.
     pub fn run(self, instructions: InstructionSet) {
         let width = self.bias.len();
         let rows = self.outputs.len() / width;
@@ -51,7 +51,7 @@ struct Job<'a> {
     rows: usize,
     depth: usize,
     width: usize,
-    /// Where the panel at work begins.
+    /// First column of the current panel.
     column: usize,
 }
 
@@ -63,7 +63,7 @@ impl WithSimd for Job<'_> {
         if self.width <= NARROW {
             return self.narrow(simd);
         }
-        // A panel stays in the first-level cache while all rows pass by.
+        // A panel stays in the first-level cache for all rows.
         while self.column < self.width {
             for_rows(simd, 0..self.rows, &mut self);
             self.column += PANEL;
@@ -72,7 +72,7 @@ impl WithSimd for Job<'_> {
 }
 
 impl Job<'_> {
-    /// Few outputs: dot products, since a panel would be mostly padding.
+    /// Computes few outputs as dot products, because a panel would be mostly padding.
     #[inline(always)]
     fn narrow<S: Simd>(self, simd: S) {
         let Forward { inputs, packed, bias, activation, outputs } = self.layer;

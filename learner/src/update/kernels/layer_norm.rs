@@ -1,9 +1,9 @@
 //! Layer normalisation (Ba et al. 2016) between a layer's sums and its ReLU, row by row:
 //!
-//! normalised = (x - mean) / sqrt(variance + epsilon), output = max(0, gain normalised + shift),
+//! normalised = (x - mean) / sqrt(variance + epsilon), output = max(0, gain normalised + shift)
 //!
-//! mean and variance over the row's n sums, the variance over n, not n - 1, as in PyTorch's
-//! `LayerNorm`. A row is small beside a core's first cache, so passes over it cost little.
+//! Mean and variance are over the row's n sums. The variance is divided by n, not n - 1, as in
+//! PyTorch's `LayerNorm`. A row fits into the first-level cache, so passes over it cost little.
 
 use std::ops::Range;
 
@@ -11,21 +11,21 @@ use pulp::{Simd, WithSimd};
 
 use super::InstructionSet;
 
-/// Added to a row's variance; PyTorch's default.
+/// Added to a row's variance, as by default in PyTorch.
 pub(crate) const VARIANCE_EPSILON: f32 = 1e-5;
 
-/// Normalises a block of rows, scales and shifts it, and takes the ReLU.
+/// Normalises, scales and shifts the rows of a shard and applies the ReLU.
 #[derive(Debug)]
 pub struct Normalise<'a> {
-    /// The layer's sums, (rows, width); overwritten by what they are once normalised.
+    /// The layer's sums, (rows, width), which are replaced by the normalised values.
     pub values: &'a mut [f32],
-    /// 1 / sqrt(variance + epsilon), (rows,), overwritten.
+    /// Receives 1 / sqrt(variance + epsilon), (rows,).
     pub inverse_std: &'a mut [f32],
-    /// (width,).
+    /// The layer's gain, (width,).
     pub gain: &'a [f32],
-    /// (width,).
+    /// The layer's shift, (width,).
     pub shift: &'a [f32],
-    /// (rows, width), overwritten.
+    /// Receives the outputs, (rows, width).
     pub outputs: &'a mut [f32],
 }
 
@@ -33,7 +33,7 @@ impl Normalise<'_> {
     /// Computes normalised values and outputs.
     ///
     /// # Panics
-    /// If the lengths do not fit.
+    /// If the lengths are inconsistent.
     pub fn run(self, instructions: InstructionSet) {
         let (width, len) = (self.gain.len(), self.outputs.len());
         assert_eq!(self.shift.len(), width, "shift");
@@ -55,32 +55,33 @@ impl WithSimd for Normalise<'_> {
             let mean = sum(simd, row) * share;
             let variance = centre(simd, row, mean) * share;
             *inverse_std = 1.0 / (variance + VARIANCE_EPSILON).sqrt();
-            finish(simd, row, *inverse_std, (self.gain, self.shift), out);
+            let (gain, shift) = (self.gain, self.shift);
+            ScaleShiftRelu { row, inverse_std: *inverse_std, gain, shift, out }.run(simd);
         }
     }
 }
 
-/// From the gradient at the outputs to the one at the sums before normalisation.
+/// Computes the gradient at a layer's sums from the gradient after normalisation.
 #[derive(Debug)]
 pub struct NormaliseBackward<'a> {
-    /// With respect to the outputs, masked by their ReLU, (rows, width).
+    /// Gradient with respect to the scaled and shifted values, masked by the ReLU, (rows, width).
     pub gradient: &'a [f32],
-    /// As [`Normalise`] leaves them, (rows, width).
+    /// Normalised values from [`Normalise`], (rows, width).
     pub normalised: &'a [f32],
-    /// (rows,).
+    /// 1 / sqrt(variance + epsilon) from [`Normalise`], (rows,).
     pub inverse_std: &'a [f32],
-    /// (width,).
+    /// The layer's gain, (width,).
     pub gain: &'a [f32],
-    /// With respect to the sums, (rows, width), overwritten.
+    /// Receives the gradient with respect to the sums, (rows, width).
     pub sums_gradient: &'a mut [f32],
 }
 
 impl NormaliseBackward<'_> {
-    /// Computes, with s = gradient gain and z the normalised values,
-    /// inverse_std (s - mean(s) - z mean(s z)).
+    /// Computes inverse_std (s - mean(s) - z mean(s z)), where s = gradient gain and z are the
+    /// normalised values.
     ///
     /// # Panics
-    /// If the lengths do not fit.
+    /// If the lengths are inconsistent.
     pub fn run(self, instructions: InstructionSet) {
         let (width, len) = (self.gain.len(), self.gradient.len());
         assert_eq!(self.normalised.len(), len, "normalised values");
@@ -100,59 +101,64 @@ impl WithSimd for NormaliseBackward<'_> {
         let rows = self.gradient.chunks_exact(width).zip(self.normalised.chunks_exact(width));
         let rows = rows.zip(self.sums_gradient.chunks_exact_mut(width));
         for (((gradient, normalised), out), inverse_std) in rows.zip(self.inverse_std) {
-            let [mean, along] = scale(simd, gradient, self.gain, normalised, out);
-            project(simd, normalised, [mean * share, along * share, *inverse_std], out);
+            let sums = scale(simd, gradient, self.gain, normalised, out);
+            let projection = Projection {
+                mean: sums.plain * share,
+                slope: sums.with_normalised * share,
+                inverse_std: *inverse_std,
+            };
+            projection.apply(simd, normalised, out);
         }
     }
 }
 
-/// What one block of rows contributes to the gradients of gain and shift.
+/// Operands of the gradients of gain and shift from one shard.
 #[derive(Debug, Clone, Copy)]
-pub struct NormalisedBlock<'a> {
-    /// With respect to the layer's outputs, masked by their ReLU, (rows, width).
+pub struct NormalisedShard<'a> {
+    /// Gradient with respect to the scaled and shifted values, masked by the ReLU, (rows, width).
     pub gradient: &'a [f32],
-    /// (rows, width).
+    /// Normalised values, (rows, width).
     pub normalised: &'a [f32],
 }
 
-/// gain's gradient = Σ gradient normalised, shift's = Σ gradient, over the rows of all blocks in
-/// their order, for some of the layer's outputs.
+/// Sums the gradients of gain, Σ gradient normalised, and shift, Σ gradient, over the rows of all
+/// shards in their order, for some of the layer's outputs.
 #[derive(Debug)]
 pub struct GainGradient<'a, I> {
-    /// The blocks, in their order.
-    pub blocks: I,
+    /// The shards, in their order.
+    pub shards: I,
     /// Width of the layer's output.
     pub width: usize,
-    /// The outputs whose gradient is wanted.
+    /// Outputs whose gradient is computed.
     pub outputs: Range<usize>,
-    /// (outputs.len(),), overwritten.
+    /// Receives the gradient of the gain, (outputs.len(),).
     pub gain: &'a mut [f32],
-    /// (outputs.len(),), overwritten.
+    /// Receives the gradient of the shift, (outputs.len(),).
     pub shift: &'a mut [f32],
 }
 
-impl<'b, I: Iterator<Item = NormalisedBlock<'b>>> GainGradient<'_, I> {
+impl<'b, I: Iterator<Item = NormalisedShard<'b>>> GainGradient<'_, I> {
     /// Computes both gradients.
     ///
     /// # Panics
-    /// If the lengths do not fit.
+    /// If the lengths are inconsistent.
     pub fn run(self, instructions: InstructionSet) {
-        let Self { blocks, width, outputs, gain, shift } = self;
+        let Self { shards, width, outputs, gain, shift } = self;
         assert!(outputs.end <= width, "outputs {outputs:?} of {width}");
         assert_eq!([gain.len(), shift.len()], [outputs.len(); 2], "gradients of gain and shift");
         gain.fill(0.0);
         shift.fill(0.0);
-        for block in blocks {
-            assert_eq!(block.gradient.len(), block.normalised.len(), "a block");
+        for shard in shards {
+            assert_eq!(shard.gradient.len(), shard.normalised.len(), "a shard");
             let first = outputs.start;
-            instructions.run(Job { block, width, first, gain: &mut *gain, shift: &mut *shift });
+            instructions.run(Job { shard, width, first, gain: &mut *gain, shift: &mut *shift });
         }
     }
 }
 
-/// Adds the part of one block.
+/// Adds one shard to the gradients.
 struct Job<'a> {
-    block: NormalisedBlock<'a>,
+    shard: NormalisedShard<'a>,
     width: usize,
     first: usize,
     gain: &'a mut [f32],
@@ -170,8 +176,8 @@ impl WithSimd for Job<'_> {
             let columns = self.first + from..self.first + to;
             let mut gain = simd.partial_load_f32s(&self.gain[from..to]);
             let mut shift = simd.partial_load_f32s(&self.shift[from..to]);
-            let rows = self.block.gradient.chunks_exact(self.width);
-            for (gradient, normalised) in rows.zip(self.block.normalised.chunks_exact(self.width)) {
+            let rows = self.shard.gradient.chunks_exact(self.width);
+            for (gradient, normalised) in rows.zip(self.shard.normalised.chunks_exact(self.width)) {
                 let gradient = simd.partial_load_f32s(&gradient[columns.clone()]);
                 let normalised = simd.partial_load_f32s(&normalised[columns.clone()]);
                 gain = simd.mul_add_e_f32s(gradient, normalised, gain);
@@ -183,7 +189,7 @@ impl WithSimd for Job<'_> {
     }
 }
 
-/// Σ row; in four parts, so that no addition waits for the one before.
+/// Returns Σ row, summed in four parts so that no addition waits for the previous one.
 #[inline(always)]
 fn sum<S: Simd>(simd: S, row: &[f32]) -> f32 {
     let (vectors, tail) = S::as_simd_f32s(row);
@@ -201,7 +207,7 @@ fn sum<S: Simd>(simd: S, row: &[f32]) -> f32 {
     total(simd, sums)
 }
 
-/// row -= mean; the sum of its squares afterwards.
+/// Subtracts `mean` from the row and returns the sum of its squares.
 #[inline(always)]
 fn centre<S: Simd>(simd: S, row: &mut [f32], mean: f32) -> f32 {
     let mean = simd.splat_f32s(mean);
@@ -220,7 +226,7 @@ fn centre<S: Simd>(simd: S, row: &mut [f32], mean: f32) -> f32 {
     }
     let centred = simd.sub_f32s(simd.partial_load_f32s(tail), mean);
     simd.partial_store_f32s(tail, centred);
-    // Read again: beyond the tail stand zeros now, not the mean.
+    // Loaded again, because the lanes beyond the tail must be zero instead of -mean.
     let centred = simd.partial_load_f32s(tail);
     sums[3] = simd.mul_add_e_f32s(centred, centred, sums[3]);
     total(simd, sums)
@@ -231,32 +237,44 @@ fn total<S: Simd>(simd: S, [a, b, c, d]: [S::f32s; 4]) -> f32 {
     simd.reduce_sum_f32s(simd.add_f32s(simd.add_f32s(a, b), simd.add_f32s(c, d)))
 }
 
-/// row *= inverse_std, out = max(0, gain row + shift).
-#[inline(always)]
-fn finish<S: Simd>(
-    simd: S,
-    row: &mut [f32],
+/// Computes row *= inverse_std, then out = max(0, gain row + shift).
+struct ScaleShiftRelu<'a> {
+    row: &'a mut [f32],
     inverse_std: f32,
-    (gain, shift): (&[f32], &[f32]),
-    out: &mut [f32],
-) {
-    let (factor, zero) = (simd.splat_f32s(inverse_std), simd.splat_f32s(0.0));
-    let (row, row_tail) = S::as_mut_simd_f32s(row);
-    let (gain, gain_tail) = S::as_simd_f32s(gain);
-    let (shift, shift_tail) = S::as_simd_f32s(shift);
-    let (out, out_tail) = S::as_mut_simd_f32s(out);
-    for (((x, gain), shift), out) in row.iter_mut().zip(gain).zip(shift).zip(out) {
-        *x = simd.mul_f32s(*x, factor);
-        *out = simd.max_f32s(simd.mul_add_e_f32s(*gain, *x, *shift), zero);
-    }
-    let x = simd.mul_f32s(simd.partial_load_f32s(row_tail), factor);
-    simd.partial_store_f32s(row_tail, x);
-    let (gain, shift) = (simd.partial_load_f32s(gain_tail), simd.partial_load_f32s(shift_tail));
-    let last = simd.max_f32s(simd.mul_add_e_f32s(gain, x, shift), zero);
-    simd.partial_store_f32s(out_tail, last);
+    gain: &'a [f32],
+    shift: &'a [f32],
+    out: &'a mut [f32],
 }
 
-/// out = gradient gain; Σ out and Σ out normalised.
+impl ScaleShiftRelu<'_> {
+    #[inline(always)]
+    fn run<S: Simd>(self, simd: S) {
+        let Self { row, inverse_std, gain, shift, out } = self;
+        let (factor, zero) = (simd.splat_f32s(inverse_std), simd.splat_f32s(0.0));
+        let (row, row_tail) = S::as_mut_simd_f32s(row);
+        let (gain, gain_tail) = S::as_simd_f32s(gain);
+        let (shift, shift_tail) = S::as_simd_f32s(shift);
+        let (out, out_tail) = S::as_mut_simd_f32s(out);
+        for (((x, gain), shift), out) in row.iter_mut().zip(gain).zip(shift).zip(out) {
+            *x = simd.mul_f32s(*x, factor);
+            *out = simd.max_f32s(simd.mul_add_e_f32s(*gain, *x, *shift), zero);
+        }
+        let x = simd.mul_f32s(simd.partial_load_f32s(row_tail), factor);
+        simd.partial_store_f32s(row_tail, x);
+        let (gain, shift) = (simd.partial_load_f32s(gain_tail), simd.partial_load_f32s(shift_tail));
+        let last = simd.max_f32s(simd.mul_add_e_f32s(gain, x, shift), zero);
+        simd.partial_store_f32s(out_tail, last);
+    }
+}
+
+/// Sums over a row of the scaled gradient.
+struct ScaledSums {
+    plain: f32,
+    /// Each term multiplied by its normalised value.
+    with_normalised: f32,
+}
+
+/// Computes out = gradient gain, and returns its sums.
 #[inline(always)]
 fn scale<S: Simd>(
     simd: S,
@@ -264,7 +282,7 @@ fn scale<S: Simd>(
     gain: &[f32],
     normalised: &[f32],
     out: &mut [f32],
-) -> [f32; 2] {
+) -> ScaledSums {
     let (gradient, gradient_tail) = S::as_simd_f32s(gradient);
     let (gain, gain_tail) = S::as_simd_f32s(gain);
     let (normalised, normalised_tail) = S::as_simd_f32s(normalised);
@@ -279,28 +297,31 @@ fn scale<S: Simd>(
         sum = simd.add_f32s(sum, *out);
         along = simd.mul_add_e_f32s(*out, *z, along);
     }
-    [simd.reduce_sum_f32s(sum), simd.reduce_sum_f32s(along)]
+    ScaledSums { plain: simd.reduce_sum_f32s(sum), with_normalised: simd.reduce_sum_f32s(along) }
 }
 
-/// out = inverse_std (out - mean - along normalised).
-#[inline(always)]
-fn project<S: Simd>(
-    simd: S,
-    normalised: &[f32],
-    [mean, along, inverse_std]: [f32; 3],
-    out: &mut [f32],
-) {
-    let factor = simd.splat_f32s(inverse_std);
-    let (mean, along) = (simd.splat_f32s(-mean), simd.splat_f32s(-along));
-    let (normalised, normalised_tail) = S::as_simd_f32s(normalised);
-    let (out, out_tail) = S::as_mut_simd_f32s(out);
-    for (z, out) in normalised.iter().zip(out) {
-        let apart = simd.mul_add_e_f32s(along, *z, simd.add_f32s(*out, mean));
-        *out = simd.mul_f32s(factor, apart);
+/// Computes out = inverse_std (out - mean - slope normalised).
+struct Projection {
+    mean: f32,
+    slope: f32,
+    inverse_std: f32,
+}
+
+impl Projection {
+    #[inline(always)]
+    fn apply<S: Simd>(self, simd: S, normalised: &[f32], out: &mut [f32]) {
+        let factor = simd.splat_f32s(self.inverse_std);
+        let (mean, slope) = (simd.splat_f32s(-self.mean), simd.splat_f32s(-self.slope));
+        let (normalised, normalised_tail) = S::as_simd_f32s(normalised);
+        let (out, out_tail) = S::as_mut_simd_f32s(out);
+        for (z, out) in normalised.iter().zip(out) {
+            let difference = simd.mul_add_e_f32s(slope, *z, simd.add_f32s(*out, mean));
+            *out = simd.mul_f32s(factor, difference);
+        }
+        let last = simd.add_f32s(simd.partial_load_f32s(out_tail), mean);
+        let last = simd.mul_add_e_f32s(slope, simd.partial_load_f32s(normalised_tail), last);
+        simd.partial_store_f32s(out_tail, simd.mul_f32s(factor, last));
     }
-    let last = simd.add_f32s(simd.partial_load_f32s(out_tail), mean);
-    let last = simd.mul_add_e_f32s(along, simd.partial_load_f32s(normalised_tail), last);
-    simd.partial_store_f32s(out_tail, simd.mul_f32s(factor, last));
 }
 
 #[cfg(test)]

@@ -1,20 +1,20 @@
 //! The arithmetic of an update on the CPU, on plain slices.
 //!
-//! Every product of a network's forward and backward pass has one wide operand that is read as
-//! whole vectors and one of which single numbers are broadcast:
+//! Every product of a network's forward and backward pass reads one operand as whole vectors and
+//! broadcasts single numbers of the other:
 //!
 //! | product                           | broadcast   | vectors                      |
 //! |-----------------------------------|-------------|------------------------------|
 //! | [`Forward`]   Y = act(X Wᵀ + b)   | X, by rows  | Wᵀ, in panels ([`pack`])     |
-//! | [`Backward`]  dX = dY W, masked   | dY, by rows | W as it stands               |
-//! | [`WeightGradient`] dW = Σ dYᵀ X   | dY, by columns | X as it stands            |
+//! | [`Backward`]  dX = dY W, masked   | dY, by rows | W, not copied                |
+//! | [`WeightGradient`] dW = Σ dYᵀ X   | dY, by columns | X, not copied             |
 //!
-//! so one register tile (`tile`) does them all, and the panels of Wᵀ are the only copy. A tile
-//! holds its outputs from the first product to the last: bias, ReLU and its mask cost no pass over
-//! memory, and every output is a sum in a fixed order whatever the number of threads.
+//! Therefore one register tile (`tile`) computes all of them, and only Wᵀ is copied. A tile keeps
+//! its outputs in registers from the first product to the last, so bias, ReLU and its mask need no
+//! pass over memory. Every output is summed in a fixed order, whatever the number of threads.
 //!
-//! The source is generic over the vectors of `pulp` and compiled for each instruction set that
-//! matters (AVX-512, AVX2 with FMA, NEON, plain); [`InstructionSet::detect`] picks at start.
+//! The source is generic over the vectors of `pulp` and compiled for AVX-512, AVX2 with FMA, NEON
+//! and plain code. [`InstructionSet::detect`] selects one at start.
 
 mod backward;
 pub mod bf16;
@@ -30,30 +30,30 @@ mod weight_gradient;
 pub use backward::Backward;
 pub use forward::{Activation, Forward};
 pub(crate) use layer_norm::VARIANCE_EPSILON;
-pub use layer_norm::{GainGradient, Normalise, NormaliseBackward, NormalisedBlock};
-pub use optimizer::{AdamPass, Follow, StepSizes, adam, polyak};
+pub use layer_norm::{GainGradient, Normalise, NormaliseBackward, NormalisedShard};
+pub use optimizer::{AdamPass, PolyakStep, StepSizes, adam};
 pub(crate) use optimizer::{BETA1, BETA2, EPSILON};
 pub use pack::{pack, packed_len};
-pub use weight_gradient::{GradientBlock, WeightGradient};
+pub use weight_gradient::{GradientShard, WeightGradient};
 
 use pulp::{Arch, WithSimd};
 
-/// Outputs of a layer that stand side by side in a packed panel, and the width of every tile.
+/// Outputs of a layer in one packed panel, and the width of every tile.
 pub const PANEL: usize = 16;
 
-/// The vector instructions that the kernels use. The choice changes results by rounding, so all
-/// threads of a run use the same.
+/// The vector instructions that the kernels use. They affect rounding, so all threads of a run use
+/// the same ones.
 #[derive(Debug, Clone, Copy)]
 pub struct InstructionSet(Arch);
 
 impl InstructionSet {
-    /// The best that this processor has.
+    /// Returns the widest instructions of this processor.
     #[must_use]
     pub fn detect() -> Self {
         Self(Arch::new())
     }
 
-    /// All that this processor has, for tests and comparisons.
+    /// Returns all instruction sets of this processor, for tests and comparisons.
     #[must_use]
     pub fn all() -> Vec<Self> {
         let mut all = vec![Self(Arch::Scalar)];
@@ -67,7 +67,7 @@ impl InstructionSet {
         all
     }
 
-    /// Whether vectors of 16 numbers are at hand.
+    /// Returns whether vectors have 16 numbers.
     fn has_avx512(self) -> bool {
         #[cfg(target_arch = "x86_64")]
         return matches!(self.0, Arch::V4(_));

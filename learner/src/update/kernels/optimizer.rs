@@ -1,5 +1,5 @@
-//! One pass of Adam (Kingma & Ba 2015, Algorithm 1), with the target network's step in the same
-//! pass while the parameters are in registers.
+//! One pass of Adam (Kingma & Ba 2015, Algorithm 1). The target network's step is part of the same
+//! pass, while the parameters are in registers.
 
 use pulp::{Simd, WithSimd};
 
@@ -7,7 +7,7 @@ use super::InstructionSet;
 
 pub(crate) const BETA1: f32 = 0.9;
 pub(crate) const BETA2: f32 = 0.999;
-/// Added to the root of the second moment, as PyTorch does.
+/// Added to the root of the second moment, as in PyTorch.
 pub(crate) const EPSILON: f32 = 1e-8;
 
 /// The bias-corrected factors of one step.
@@ -18,15 +18,15 @@ pub struct StepSizes {
 }
 
 impl StepSizes {
-    /// Those of step `step`, the first being 1.
+    /// Computes the factors of step number `step`, counted from 1.
     ///
-    /// parameters -= learning_rate m̂ / (sqrt(v̂) + epsilon) with m̂ = m / (1 - beta1^t) and
-    /// v̂ = v / (1 - beta2^t) is step m / (sqrt(v) + epsilon') with root = sqrt(1 - beta2^t),
-    /// step = learning_rate root / (1 - beta1^t), epsilon' = epsilon root: one division a number
-    /// instead of two.
+    /// Adam subtracts learning_rate m̂ / (sqrt(v̂) + epsilon) with m̂ = m / (1 - beta1^t) and
+    /// v̂ = v / (1 - beta2^t). This equals step m / (sqrt(v) + epsilon') with
+    /// root = sqrt(1 - beta2^t), step = learning_rate root / (1 - beta1^t) and
+    /// epsilon' = epsilon root, which needs one division per parameter instead of two.
     #[must_use]
     pub fn new(learning_rate: f64, step: u64) -> Self {
-        // In f64: 1 - beta2^t loses its digits in f32 at small t.
+        // In f64, because 1 - beta2^t would lose its digits in f32 at small t.
         let correction = |beta: f32| 1.0 - f64::from(beta).powf(step as f64);
         let root = correction(BETA2).sqrt();
         Self {
@@ -35,40 +35,40 @@ impl StepSizes {
         }
     }
 
-    /// The same with the learning rate multiplied by `share`.
+    /// Returns the factors with the learning rate multiplied by `factor`.
     #[must_use]
-    pub fn scaled(self, share: f32) -> Self {
-        Self { step: self.step * share, ..self }
+    pub fn scaled(self, factor: f32) -> Self {
+        Self { step: self.step * factor, ..self }
     }
 }
 
-/// target <- polyak * network + (1 - polyak) * target.
+/// Moves a target network: target <- polyak * network + (1 - polyak) * target.
 #[derive(Debug)]
-pub struct Follow<'a> {
+pub struct PolyakStep<'a> {
     /// The target's parameters, (P,).
     pub target: &'a mut [f32],
-    /// Its share of the network per step.
+    /// Share of the way to the network.
     pub polyak: f32,
 }
 
-/// Some parameters and what Adam keeps of them, (P,) each.
+/// Some parameters with Adam's state, (P,) each.
 #[derive(Debug)]
 pub struct AdamPass<'a> {
     /// The parameters.
     pub parameters: &'a mut [f32],
     /// Running mean of the gradient.
     pub first: &'a mut [f32],
-    /// Running mean of its square.
+    /// Running mean of the gradient's square.
     pub second: &'a mut [f32],
     /// The gradient.
     pub gradient: &'a [f32],
-    /// The target that follows in the same pass.
-    pub follow: Option<Follow<'a>>,
+    /// The target network's step, done in the same pass.
+    pub target_step: Option<PolyakStep<'a>>,
     /// The factors of this step.
     pub sizes: StepSizes,
 }
 
-/// One step of Adam, then of the target if there is one.
+/// Does one step of Adam, then the target's step if there is one.
 ///
 /// # Panics
 /// If the lengths differ.
@@ -76,19 +76,10 @@ pub fn adam(pass: AdamPass<'_>, instructions: InstructionSet) {
     let len = pass.parameters.len();
     let others = [pass.first.len(), pass.second.len(), pass.gradient.len()];
     assert_eq!(others, [len; 3], "moments and gradient");
-    if let Some(follow) = &pass.follow {
-        assert_eq!(follow.target.len(), len, "target parameters");
+    if let Some(step) = &pass.target_step {
+        assert_eq!(step.target.len(), len, "target parameters");
     }
     instructions.run(pass);
-}
-
-/// The target's step alone.
-///
-/// # Panics
-/// If the lengths differ.
-pub fn polyak(follow: Follow<'_>, network: &[f32], instructions: InstructionSet) {
-    assert_eq!(follow.target.len(), network.len(), "target parameters");
-    instructions.run(FollowJob { follow, network });
 }
 
 impl WithSimd for AdamPass<'_> {
@@ -96,7 +87,7 @@ impl WithSimd for AdamPass<'_> {
 
     #[inline(always)]
     fn with_simd<S: Simd>(self, simd: S) {
-        let Self { parameters, first, second, gradient, follow, sizes } = self;
+        let Self { parameters, first, second, gradient, target_step, sizes } = self;
         let rule = Rule::new(simd, sizes);
         let (parameters, parameters_tail) = S::as_mut_simd_f32s(parameters);
         let (first, first_tail) = S::as_mut_simd_f32s(first);
@@ -112,21 +103,24 @@ impl WithSimd for AdamPass<'_> {
         let tail_gradient = simd.partial_load_f32s(gradient_tail);
         let [p, m, v] = &mut tail;
         rule.step(simd, p, m, v, tail_gradient);
-        match follow {
+        match target_step {
             None => {
                 for (p, ((m, v), g)) in numbers {
                     rule.step(simd, p, m, v, *g);
                 }
             }
-            Some(Follow { target, polyak }) => {
+            Some(PolyakStep { target, polyak }) => {
                 let share = simd.splat_f32s(polyak);
                 let (target, target_tail) = S::as_mut_simd_f32s(target);
                 for ((p, ((m, v), g)), target) in numbers.zip(target) {
                     rule.step(simd, p, m, v, *g);
-                    *target = follow_by(simd, *target, *p, share);
+                    *target = polyak_average(simd, *target, *p, share);
                 }
                 let followed = simd.partial_load_f32s(target_tail);
-                simd.partial_store_f32s(target_tail, follow_by(simd, followed, tail[0], share));
+                simd.partial_store_f32s(
+                    target_tail,
+                    polyak_average(simd, followed, tail[0], share),
+                );
             }
         }
         simd.partial_store_f32s(parameters_tail, tail[0]);
@@ -135,34 +129,12 @@ impl WithSimd for AdamPass<'_> {
     }
 }
 
-struct FollowJob<'a> {
-    follow: Follow<'a>,
-    network: &'a [f32],
-}
-
-impl WithSimd for FollowJob<'_> {
-    type Output = ();
-
-    #[inline(always)]
-    fn with_simd<S: Simd>(self, simd: S) {
-        let share = simd.splat_f32s(self.follow.polyak);
-        let (target, target_tail) = S::as_mut_simd_f32s(self.follow.target);
-        let (network, network_tail) = S::as_simd_f32s(self.network);
-        for (target, network) in target.iter_mut().zip(network) {
-            *target = follow_by(simd, *target, *network, share);
-        }
-        let followed = simd.partial_load_f32s(target_tail);
-        let network = simd.partial_load_f32s(network_tail);
-        simd.partial_store_f32s(target_tail, follow_by(simd, followed, network, share));
-    }
-}
-
 #[inline(always)]
-fn follow_by<S: Simd>(simd: S, target: S::f32s, network: S::f32s, share: S::f32s) -> S::f32s {
+fn polyak_average<S: Simd>(simd: S, target: S::f32s, network: S::f32s, share: S::f32s) -> S::f32s {
     simd.mul_add_e_f32s(share, simd.sub_f32s(network, target), target)
 }
 
-/// Adam's constants, one in every lane.
+/// Adam's constants, broadcast to all lanes.
 struct Rule<S: Simd> {
     beta1: S::f32s,
     rest1: S::f32s,

@@ -1,22 +1,22 @@
-//! The forward pass's copy of a layer's weights.
+//! Packs a layer's weights for the forward pass.
 
 use super::{InstructionSet, PANEL};
 
-/// Layers with at most so many outputs are not packed: their outputs are dot products.
+/// Maximum outputs of a layer whose weights are not packed; its outputs are dot products.
 pub(super) const NARROW: usize = 2;
 
-/// Length of the packed weights of a layer.
+/// Returns the length of a layer's packed weights.
 #[must_use]
 pub fn packed_len(inputs: usize, outputs: usize) -> usize {
     if outputs <= NARROW { inputs * outputs } else { inputs * outputs.next_multiple_of(PANEL) }
 }
 
-/// Packs (outputs, inputs) `weights` into panels of [`PANEL`] outputs, input by input, the last
-/// panel filled with zeros. A layer of `outputs_len` outputs may be packed in pieces that begin at
-/// multiples of [`PANEL`]: the piece from output o on begins at o * inputs.
+/// Packs `weights`, (outputs, inputs), into panels of [`PANEL`] outputs, input by input. The last
+/// panel is padded with zeros. A layer of `outputs_len` outputs can be packed in parts that begin
+/// at multiples of [`PANEL`]; the part from output o on begins at o * inputs.
 ///
 /// # Panics
-/// If the lengths do not fit.
+/// If the lengths are inconsistent.
 pub fn pack(
     weights: &[f32],
     inputs: usize,
@@ -42,7 +42,7 @@ pub fn pack(
         if instructions.has_avx512() && weights.len() == panel.len() {
             done = inputs / PANEL * PANEL;
             for input in (0..done).step_by(PANEL) {
-                // SAFETY: `has_avx512` says that the processor has these instructions.
+                // SAFETY: `has_avx512` checked that the processor has these instructions.
                 unsafe { transpose(&weights[input..], inputs, &mut panel[input * PANEL..]) };
             }
         }
@@ -67,26 +67,26 @@ pub(super) fn transpose(rows: &[f32], stride: usize, out: &mut [f32]) {
     assert!(rows.len() >= (PANEL - 1) * stride + PANEL && out.len() >= PANEL * PANEL);
     let mut at = [_mm512_setzero_ps(); PANEL];
     for (i, row) in at.iter_mut().enumerate() {
-        // SAFETY: row i reaches to i * stride + 16 of `rows`, whose length was asserted.
+        // SAFETY: row i ends at i * stride + 16, within `rows` (asserted above).
         *row = unsafe { _mm512_loadu_ps(rows.as_ptr().add(i * stride)) };
     }
-    exchange::<8>(&mut at);
-    exchange::<4>(&mut at);
-    exchange::<2>(&mut at);
-    exchange::<1>(&mut at);
+    swap_blocks::<8>(&mut at);
+    swap_blocks::<4>(&mut at);
+    swap_blocks::<2>(&mut at);
+    swap_blocks::<1>(&mut at);
     for (i, row) in at.iter().enumerate() {
         // SAFETY: `out` has 256 numbers (asserted above).
         unsafe { _mm512_storeu_ps(out.as_mut_ptr().add(i * PANEL), *row) };
     }
 }
 
-/// Exchanges, in every pair of rows D apart, the off-diagonal blocks of D x D numbers.
+/// Swaps the off-diagonal blocks of D x D numbers in every pair of rows that are D apart.
 #[cfg(target_arch = "x86_64")]
 #[inline]
 #[target_feature(enable = "avx512f")]
-fn exchange<const D: usize>(at: &mut [std::arch::x86_64::__m512; PANEL]) {
+fn swap_blocks<const D: usize>(at: &mut [std::arch::x86_64::__m512; PANEL]) {
     use std::arch::x86_64::{_mm512_loadu_si512, _mm512_permutex2var_ps};
-    let tables = const { &exchanged(D) };
+    let tables = const { &swap_tables(D) };
     // SAFETY: each table is 64 bytes.
     let upper = unsafe { _mm512_loadu_si512(tables[0].as_ptr().cast()) };
     // SAFETY: as above.
@@ -100,10 +100,10 @@ fn exchange<const D: usize>(at: &mut [std::arch::x86_64::__m512; PANEL]) {
     }
 }
 
-/// From which place of two rows, the second's counted from 16, each number of the exchanged rows
-/// comes.
+/// Returns the source index of each number of the two swapped rows. Indices of the second row begin
+/// at 16.
 #[cfg(target_arch = "x86_64")]
-const fn exchanged(distance: usize) -> [[i32; PANEL]; 2] {
+const fn swap_tables(distance: usize) -> [[i32; PANEL]; 2] {
     let mut tables = [[0; PANEL]; 2];
     let mut i = 0;
     while i < PANEL {

@@ -1,4 +1,4 @@
-//! The register tile that all products share.
+//! The register tile that computes all products.
 
 use std::ops::Range;
 
@@ -6,7 +6,7 @@ use pulp::{MemMask, Simd};
 
 use super::PANEL;
 
-/// The operand of which single numbers are broadcast: row `m` and depth `k` at
+/// The operand whose single numbers are broadcast. Row `m` and depth `k` are at
 /// `m * row_stride + k * depth_stride`.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Broadcast<'a> {
@@ -15,31 +15,30 @@ pub(super) struct Broadcast<'a> {
     pub depth_stride: usize,
 }
 
-/// The operand that is read as vectors: at depth `k`, the `width` numbers from `k * stride` on.
+/// The operand that is read as vectors: `width` numbers from `k * stride` on at depth `k`.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Wide<'a> {
     pub data: &'a [f32],
     pub stride: usize,
     /// At most [`PANEL`].
     pub width: usize,
-    /// Where, counted from a depth's numbers, those stand that the next tiles read at that depth,
-    /// if they are to be fetched ahead: a network's weights do not stay in a core's caches from one
-    /// block of rows to the next.
+    /// Offset to the numbers that the next tiles read at the same depth, if they are to be
+    /// prefetched: a network's weights do not stay in a core's caches from one shard to the next.
     pub next: Option<usize>,
 }
 
 /// The sums of `M` rows and [`PANEL`] = `V` * lanes columns.
 pub(super) type Sums<S, const M: usize, const V: usize> = [[<S as Simd>::f32s; V]; M];
 
-/// Depths between two computations of all addresses: with 16 rows they cost as many instructions as
-/// the products.
+/// Depths between two computations of all addresses. With 16 rows, addresses cost as many
+/// instructions as the products.
 const UNROLLED: usize = 4;
 
-/// Adds Σ_k left(m, k) right(k, ·), k < `depth`, to every row m of `sums`. `MASKED` says that
-/// `right.width` may be less than a panel; the columns beyond keep their sums.
+/// Adds Σ_k left(m, k) right(k, ·), k < `depth`, to every row m of `sums`. With `MASKED`,
+/// `right.width` may be less than a panel; the other columns keep their sums.
 ///
 /// # Panics
-/// If an operand does not reach that far.
+/// If an operand is too short.
 #[inline(always)]
 pub(super) fn accumulate<S: Simd, const M: usize, const V: usize, const MASKED: bool>(
     simd: S,
@@ -77,8 +76,8 @@ pub(super) fn accumulate<S: Simd, const M: usize, const V: usize, const MASKED: 
 /// Adds left(m, k) right(k, ·) to every row m of `sums`.
 ///
 /// # Safety
-/// `right` has, at depth k, a panel or, if `MASKED`, what `masks` leaves of one; `left` has M rows
-/// at that depth.
+/// At depth k, `right` must have a panel or, if `MASKED`, the columns that `masks` select, and
+/// `left` must have M rows.
 #[inline(always)]
 unsafe fn multiply<S: Simd, const M: usize, const V: usize, const MASKED: bool>(
     simd: S,
@@ -91,7 +90,7 @@ unsafe fn multiply<S: Simd, const M: usize, const V: usize, const MASKED: bool>(
     let mut vectors = [simd.splat_f32s(0.0); V];
     let right_at = right.data.as_ptr();
     for (v, vector) in vectors.iter_mut().enumerate() {
-        // SAFETY: the caller's promise about `right`.
+        // SAFETY: the caller guarantees the length of `right`.
         *vector = unsafe {
             let at = right_at.add(k * right.stride).wrapping_add(v * S::F32_LANES);
             if MASKED {
@@ -106,7 +105,7 @@ unsafe fn multiply<S: Simd, const M: usize, const V: usize, const MASKED: bool>(
     }
     let left_at = left.data.as_ptr();
     for (m, sums) in sums.iter_mut().enumerate() {
-        // SAFETY: the caller's promise about `left`.
+        // SAFETY: the caller guarantees the length of `left`.
         let number = unsafe { *left_at.add(m * left.row_stride + k * left.depth_stride) };
         let number = simd.splat_f32s(number);
         for (sum, vector) in sums.iter_mut().zip(vectors) {
@@ -116,11 +115,11 @@ unsafe fn multiply<S: Simd, const M: usize, const V: usize, const MASKED: bool>(
     sums
 }
 
-/// Asks for a line to be brought into the second-level cache; a hint, for any address.
+/// Prefetches a cache line into the second-level cache. Any address is allowed.
 #[inline(always)]
 fn prefetch(at: *const f32) {
     #[cfg(target_arch = "x86_64")]
-    // SAFETY: a prefetch of an address that is not ours does nothing.
+    // SAFETY: prefetching an invalid address has no effect.
     unsafe {
         use std::arch::x86_64::{_MM_HINT_T1, _mm_prefetch};
         _mm_prefetch::<_MM_HINT_T1>(at.cast());
@@ -129,7 +128,7 @@ fn prefetch(at: *const f32) {
     let _ = at;
 }
 
-/// Masks of the first `width` columns of a tile.
+/// Returns masks that select the first `width` columns of a tile.
 #[inline(always)]
 fn masks<S: Simd, const V: usize>(simd: S, width: usize) -> [MemMask<S::m32s>; V] {
     let mut masks = [MemMask::new(simd.mask_between_m32s(0, 0).mask()); V];
@@ -140,7 +139,7 @@ fn masks<S: Simd, const V: usize>(simd: S, width: usize) -> [MemMask<S::m32s>; V
     masks
 }
 
-/// The first `row.len()` of a tile's row; the rest is zero.
+/// Loads the first `row.len()` columns of a tile's row; the others are zero.
 ///
 /// # Panics
 /// If `row` is longer than a panel.
@@ -151,13 +150,13 @@ pub(super) fn load<S: Simd, const V: usize>(simd: S, row: &[f32]) -> [S::f32s; V
     let mut values = [simd.splat_f32s(0.0); V];
     for (v, values) in values.iter_mut().enumerate() {
         let at = row.as_ptr().wrapping_add(v * S::F32_LANES);
-        // SAFETY: the masks leave exactly the numbers of `row`.
+        // SAFETY: the masks select exactly the numbers of `row`.
         *values = unsafe { simd.mask_load_ptr_f32s(masks[v], at) };
     }
     values
 }
 
-/// Writes the first `row.len()` columns of a tile's row.
+/// Stores the first `row.len()` columns of a tile's row.
 ///
 /// # Panics
 /// If `row` is longer than a panel.
@@ -167,41 +166,41 @@ pub(super) fn store<S: Simd, const V: usize>(simd: S, row: &mut [f32], values: [
     let masks = masks::<S, V>(simd, row.len());
     for (v, values) in values.into_iter().enumerate() {
         let at = row.as_mut_ptr().wrapping_add(v * S::F32_LANES);
-        // SAFETY: the masks leave exactly the numbers of `row`.
+        // SAFETY: the masks select exactly the numbers of `row`.
         unsafe { simd.mask_store_ptr_f32s(masks[v], at, values) };
     }
 }
 
-/// What a kernel does with one tile of `M` rows, the first of which is `row`.
+/// A kernel that computes a tile of `M` rows, beginning at `row`.
 pub(super) trait Tiled<S: Simd> {
     /// Computes and stores the tile.
     fn tile<const M: usize, const V: usize>(&mut self, simd: S, row: usize);
 }
 
-/// Cuts `rows` into tiles of as many rows as the registers hold: 16 of one vector of 16 numbers,
-/// 4 of two vectors of 8 or four of 4.
+/// Cuts `rows` into tiles of as many rows as the registers hold: 16 rows of one vector of 16
+/// numbers, or 4 rows of two vectors of 8 or four vectors of 4.
 #[inline(always)]
 pub(super) fn for_rows<S: Simd, K: Tiled<S>>(simd: S, rows: Range<usize>, kernel: &mut K) {
     let mut row = rows.start;
     while row < rows.end {
         row += match (S::F32_LANES, rows.end - row) {
-            (16, 16..) => one::<S, K, 16, 1>(simd, row, kernel),
-            (16, 8..) => one::<S, K, 8, 1>(simd, row, kernel),
-            (16, 4..) => one::<S, K, 4, 1>(simd, row, kernel),
-            (16, 2..) => one::<S, K, 2, 1>(simd, row, kernel),
-            (16, _) => one::<S, K, 1, 1>(simd, row, kernel),
-            (8, 4..) => one::<S, K, 4, 2>(simd, row, kernel),
-            (8, 2..) => one::<S, K, 2, 2>(simd, row, kernel),
-            (8, _) => one::<S, K, 1, 2>(simd, row, kernel),
-            (4, 4..) => one::<S, K, 4, 4>(simd, row, kernel),
-            (4, _) => one::<S, K, 1, 4>(simd, row, kernel),
-            _ => one::<S, K, 1, PANEL>(simd, row, kernel),
+            (16, 16..) => run_tile::<S, K, 16, 1>(simd, row, kernel),
+            (16, 8..) => run_tile::<S, K, 8, 1>(simd, row, kernel),
+            (16, 4..) => run_tile::<S, K, 4, 1>(simd, row, kernel),
+            (16, 2..) => run_tile::<S, K, 2, 1>(simd, row, kernel),
+            (16, _) => run_tile::<S, K, 1, 1>(simd, row, kernel),
+            (8, 4..) => run_tile::<S, K, 4, 2>(simd, row, kernel),
+            (8, 2..) => run_tile::<S, K, 2, 2>(simd, row, kernel),
+            (8, _) => run_tile::<S, K, 1, 2>(simd, row, kernel),
+            (4, 4..) => run_tile::<S, K, 4, 4>(simd, row, kernel),
+            (4, _) => run_tile::<S, K, 1, 4>(simd, row, kernel),
+            _ => run_tile::<S, K, 1, PANEL>(simd, row, kernel),
         };
     }
 }
 
 #[inline(always)]
-fn one<S: Simd, K: Tiled<S>, const M: usize, const V: usize>(
+fn run_tile<S: Simd, K: Tiled<S>, const M: usize, const V: usize>(
     simd: S,
     row: usize,
     kernel: &mut K,

@@ -1,9 +1,9 @@
-//! Where AVX512-BF16 is used, and what stands there on processors of another kind.
+//! The AVX512-BF16 code, with a placeholder for other processor architectures.
 
 #[cfg(target_arch = "x86_64")]
-pub(super) use avx512::Proof;
+pub(super) use avx512::Avx512Bf16;
 #[cfg(not(target_arch = "x86_64"))]
-pub(super) use nowhere::Proof;
+pub(super) use unsupported::Avx512Bf16;
 
 #[cfg(target_arch = "x86_64")]
 mod avx512 {
@@ -16,13 +16,13 @@ mod avx512 {
     };
 
     use super::super::super::{Activation, PANEL, pack::transpose};
-    use super::super::{Broadcast, Finish, Pair, Product, Wide, pairs};
+    use super::super::{Bf16Pair, Broadcast, Epilogue, Product, Wide, pair_count};
 
-    /// Made only where the processor has the instructions.
+    /// Exists only if the processor has the instructions.
     #[derive(Debug, Clone, Copy)]
-    pub(in super::super) struct Proof(());
+    pub(in super::super) struct Avx512Bf16(());
 
-    impl Proof {
+    impl Avx512Bf16 {
         pub fn new() -> Option<Self> {
             let has = is_x86_feature_detected!("avx512f")
                 && is_x86_feature_detected!("avx512bw")
@@ -32,22 +32,23 @@ mod avx512 {
         }
 
         pub fn run(self, mut product: Product<'_>) {
-            // SAFETY: `Proof` says that the processor has the instructions.
+            // SAFETY: `Self` exists only if the processor has the instructions.
             unsafe { run(&mut product) }
         }
 
-        pub fn pair_columns(self, numbers: &[f32], width: usize, out: &mut [Pair]) {
+        pub fn pair_columns(self, numbers: &[f32], width: usize, out: &mut [Bf16Pair]) {
             // SAFETY: as above.
             unsafe { pair_columns(numbers, width, out) }
         }
 
-        pub fn pair_rows(self, numbers: &[f32], width: usize, out: &mut [Pair]) {
+        pub fn pair_rows(self, numbers: &[f32], width: usize, out: &mut [Bf16Pair]) {
             // SAFETY: as above.
             unsafe { pair_rows(numbers, width, out) }
         }
 
-        /// Up to [`PANEL`] rows of `depth` pairs become `depth` rows of [`PANEL`], zero-filled.
-        pub fn transpose(self, rows: &[Pair], depth: usize, panel: &mut [Pair]) {
+        /// Transposes up to [`PANEL`] rows of `depth` pairs into `depth` rows of [`PANEL`], padded
+        /// with zeros.
+        pub fn transpose(self, rows: &[Bf16Pair], depth: usize, panel: &mut [Bf16Pair]) {
             let whole = if rows.len() == panel.len() { depth / PANEL * PANEL } else { 0 };
             for at in (0..whole).step_by(PANEL) {
                 let rows = bytemuck::cast_slice(&rows[at..]);
@@ -66,12 +67,12 @@ mod avx512 {
         }
     }
 
-    /// The numbers of a row from `first` on, at most a vector's; zero where there are none.
+    /// Loads up to one vector of a row from `first` on, padded with zeros.
     #[inline]
     #[target_feature(enable = "avx512f")]
     fn load(row: &[f32], first: usize) -> __m512 {
         let row = &row[first..];
-        // SAFETY: the mask leaves what the row has.
+        // SAFETY: the mask selects only numbers of the row.
         unsafe { _mm512_maskz_loadu_ps(mask(row.len()), row.as_ptr()) }
     }
 
@@ -79,7 +80,7 @@ mod avx512 {
         if len < PANEL { (1 << len) - 1 } else { u16::MAX }
     }
 
-    /// Numbers as bfloat16, side by side.
+    /// Rounds to bfloat16, packed side by side.
     #[inline]
     #[target_feature(enable = "avx512f,avx512bw,avx512vl,avx512bf16")]
     fn rounded(numbers: __m512) -> __m256i {
@@ -87,10 +88,10 @@ mod avx512 {
         unsafe { std::mem::transmute::<__m256bh, __m256i>(_mm512_cvtneps_pbh(numbers)) }
     }
 
-    /// Pairs of neighbouring columns.
+    /// Packs pairs of neighbouring columns.
     #[target_feature(enable = "avx512f,avx512bw,avx512vl,avx512bf16")]
-    fn pair_columns(numbers: &[f32], width: usize, out: &mut [Pair]) {
-        let rows = numbers.chunks_exact(width).zip(out.chunks_exact_mut(pairs(width)));
+    fn pair_columns(numbers: &[f32], width: usize, out: &mut [Bf16Pair]) {
+        let rows = numbers.chunks_exact(width).zip(out.chunks_exact_mut(pair_count(width)));
         for (row, out) in rows {
             let mut whole = 0;
             for out in out.chunks_exact_mut(PANEL / 2).take(width / PANEL) {
@@ -114,16 +115,16 @@ mod avx512 {
         }
     }
 
-    /// Numbers as bfloat16 in the lower halves.
+    /// Rounds to bfloat16 in the lower halves of 32-bit lanes.
     #[inline]
     #[target_feature(enable = "avx512f,avx512bw,avx512vl,avx512bf16")]
     fn halves(numbers: __m512) -> __m512i {
         _mm512_cvtepu16_epi32(rounded(numbers))
     }
 
-    /// Pairs of neighbouring rows.
+    /// Packs pairs of neighbouring rows.
     #[target_feature(enable = "avx512f,avx512bw,avx512vl,avx512bf16")]
-    fn pair_rows(numbers: &[f32], width: usize, out: &mut [Pair]) {
+    fn pair_rows(numbers: &[f32], width: usize, out: &mut [Bf16Pair]) {
         let rows = numbers.chunks(2 * width).zip(out.chunks_exact_mut(width));
         for (rows, out) in rows {
             let (upper, lower) = rows.split_at(width);
@@ -152,7 +153,7 @@ mod avx512 {
         }
     }
 
-    /// All rows of V panels: the panels stay in the first-level cache while the rows pass by.
+    /// Computes all rows of V panels, which stay in the first-level cache meanwhile.
     #[inline]
     #[target_feature(enable = "avx512f,avx512bw,avx512vl,avx512bf16")]
     fn panel<const V: usize>(product: &mut Product<'_>, col: usize) {
@@ -189,32 +190,32 @@ mod avx512 {
                 let begin = col + v * PANEL;
                 let end = cols.min(begin + PANEL);
                 let at = first + begin..first + end;
-                let sum = match &product.finish {
-                    Finish::Layer { bias, activation } => {
+                let sum = match &product.epilogue {
+                    Epilogue::Layer { bias, activation } => {
                         let sum = _mm512_add_ps(*sum, load(&bias[..end], begin));
                         match activation {
                             Activation::Relu => _mm512_max_ps(sum, _mm512_setzero_ps()),
                             Activation::Linear => sum,
                         }
                     }
-                    Finish::Masked(activations) => {
+                    Epilogue::Masked(activations) => {
                         let activations = load(&activations[..at.end], at.start);
                         let zero = _mm512_setzero_ps();
                         let passed = _mm512_cmp_ps_mask::<_CMP_GT_OQ>(activations, zero);
                         _mm512_maskz_mov_ps(passed, *sum)
                     }
-                    Finish::Plain => *sum,
+                    Epilogue::Plain => *sum,
                 };
                 let out = &mut product.out[at];
-                // SAFETY: the mask leaves what `out` has.
+                // SAFETY: the mask selects only numbers of `out`.
                 unsafe { _mm512_mask_storeu_ps(out.as_mut_ptr(), mask(out.len()), sum) };
             }
         }
         M
     }
 
-    /// Sums over the depth of M rows and V panels, the last of which has, if `MASKED`, only
-    /// `last_width` columns.
+    /// Sums M rows and V panels over the depth. If `MASKED`, the last panel has only `last_width`
+    /// columns.
     #[inline]
     #[target_feature(enable = "avx512f,avx512bw,avx512vl,avx512bf16")]
     fn sums<const M: usize, const V: usize, const MASKED: bool>(
@@ -235,8 +236,8 @@ mod avx512 {
         for k in 0..depth {
             let mut vectors = [_mm512_setzero_ps(); V];
             for (v, vector) in vectors.iter_mut().enumerate() {
-                // SAFETY: the largest end of what is read was checked above; the mask leaves the
-                // last panel's columns.
+                // SAFETY: the end of the last read was checked above, and the mask selects the
+                // columns of the last panel.
                 *vector = unsafe {
                     let at = right.data.as_ptr().add(k * right.stride + v * right.panel).cast();
                     if MASKED && v == V - 1 {
@@ -270,14 +271,14 @@ mod avx512 {
 }
 
 #[cfg(not(target_arch = "x86_64"))]
-mod nowhere {
-    use super::super::{Pair, Product};
+mod unsupported {
+    use super::super::{Bf16Pair, Product};
 
-    /// There is none.
+    /// Never exists.
     #[derive(Debug, Clone, Copy)]
-    pub(in super::super) enum Proof {}
+    pub(in super::super) enum Avx512Bf16 {}
 
-    impl Proof {
+    impl Avx512Bf16 {
         pub fn new() -> Option<Self> {
             None
         }
@@ -286,15 +287,15 @@ mod nowhere {
             match self {}
         }
 
-        pub fn pair_columns(self, _: &[f32], _: usize, _: &mut [Pair]) {
+        pub fn pair_columns(self, _: &[f32], _: usize, _: &mut [Bf16Pair]) {
             match self {}
         }
 
-        pub fn pair_rows(self, _: &[f32], _: usize, _: &mut [Pair]) {
+        pub fn pair_rows(self, _: &[f32], _: usize, _: &mut [Bf16Pair]) {
             match self {}
         }
 
-        pub fn transpose(self, _: &[Pair], _: usize, _: &mut [Pair]) {
+        pub fn transpose(self, _: &[Bf16Pair], _: usize, _: &mut [Bf16Pair]) {
             match self {}
         }
     }

@@ -1,11 +1,11 @@
-//! Against f64 products of the same rounded numbers, which leaves only the sums' rounding, and of
-//! the numbers themselves.
+//! Compares the products with f64 products of the same rounded numbers, where only the sums are
+//! rounded, and with f64 products of the original numbers.
 
 use super::super::tests::{SHAPES, numbers, product};
 use super::*;
 use crate::update::tests::bf16;
 
-/// To the nearest bfloat16, ties to even.
+/// Rounds to the nearest bfloat16, ties to even.
 fn rounded(number: f32) -> f64 {
     let bits = number.to_bits();
     let up = 0x7fff + ((bits >> 16) & 1);
@@ -45,7 +45,7 @@ fn products_of_rounded_numbers_are_exact_and_of_others_within_a_hundredth() {
             [inputs[r * inputs_len + k], weights[c * inputs_len + k]]
         });
 
-        let mut packed = vec![9; pairs(outputs_len) * inputs_len];
+        let mut packed = vec![9; pair_count(outputs_len) * inputs_len];
         bf16.pack_rows(&weights, inputs_len, &mut packed);
         let first = inputs_len / 3;
         let mut out = vec![9.0; rows * (inputs_len - first)];
@@ -54,9 +54,9 @@ fn products_of_rounded_numbers_are_exact_and_of_others_within_a_hundredth() {
             [gradient[r * outputs_len + k], weights[k * inputs_len + first + c]]
         });
 
-        let mut gradient_pairs = vec![9; pairs(rows) * outputs_len];
+        let mut gradient_pairs = vec![9; pair_count(rows) * outputs_len];
         bf16.pack_rows(&gradient, outputs_len, &mut gradient_pairs);
-        let mut input_pairs = vec![9; pairs(rows) * inputs_len];
+        let mut input_pairs = vec![9; pair_count(rows) * inputs_len];
         bf16.pack_rows(&inputs, inputs_len, &mut input_pairs);
         let outputs = outputs_len / 2..outputs_len;
         let mut out = vec![9.0; outputs.len() * inputs_len];
@@ -77,7 +77,7 @@ fn bias_activation_and_mask_are_those_of_f32() {
     let mut out = [9.0; 3];
     bf16.forward(&inputs, &packed, &[0.5, 1.0, -1.0], Activation::Relu, &mut out);
     assert_eq!(out, [1.5, 0.0, 3.0]);
-    let mut packed = vec![0; pairs(3) * 3];
+    let mut packed = vec![0; pair_count(3) * 3];
     bf16.pack_rows(&weights, 3, &mut packed);
     bf16.backward(&inputs, 3, &packed, 0, Some(&[1.0, 0.0, -1.0]), &mut out);
     assert_eq!(out, [1.0, 0.0, 0.0]);
@@ -92,7 +92,7 @@ fn a_layer_packed_in_pieces_is_the_layer_packed_at_once() {
     bf16.pack_forward(&weights, inputs, &mut whole);
     let mut pieces = vec![9; whole.len()];
     let cut = 3 * PANEL;
-    bf16.pack_forward(&weights[..cut * inputs], inputs, &mut pieces[..cut * pairs(inputs)]);
-    bf16.pack_forward(&weights[cut * inputs..], inputs, &mut pieces[cut * pairs(inputs)..]);
+    bf16.pack_forward(&weights[..cut * inputs], inputs, &mut pieces[..cut * pair_count(inputs)]);
+    bf16.pack_forward(&weights[cut * inputs..], inputs, &mut pieces[cut * pair_count(inputs)..]);
     assert_eq!(whole, pieces);
 }

@@ -1,9 +1,10 @@
-//! Against the definition in f64, and the backward pass against its central differences.
+//! Compares the kernels with their definition in f64, and the backward pass with central
+//! differences.
 
 use super::super::tests::numbers;
 use super::*;
 
-/// Widths without a whole vector, with and without a rest.
+/// Widths of less than a vector, and of whole vectors with and without a remainder.
 const WIDTHS: [usize; 6] = [1, 2, 12, 64, 75, 256];
 const ROWS: usize = 5;
 
@@ -11,7 +12,7 @@ fn as_f64(x: &[f32]) -> Vec<f64> {
     x.iter().copied().map(f64::from).collect()
 }
 
-/// One row once normalised, and 1 / std.
+/// Returns the normalised row, and 1 / std.
 fn normalised(row: &[f64]) -> (Vec<f64>, f64) {
     let n = row.len() as f64;
     let mean = row.iter().sum::<f64>() / n;
@@ -34,7 +35,7 @@ fn rows_are_normalised_scaled_shifted_and_cut_at_zero() {
         .into_iter()
         .flat_map(|width| InstructionSet::all().into_iter().map(move |i| (width, i)))
     {
-        // Far from zero: a variance from a mean of squares would lose its digits.
+        // Far from zero, where a variance computed from a mean of squares would lose its digits.
         let sums: Vec<f32> = numbers(ROWS * width, 1).iter().map(|x| 0.5 * x + 20.0).collect();
         let (gain, shift) = (numbers(width, 2), numbers(width, 3));
         let mut values = sums.clone();
@@ -52,7 +53,7 @@ fn rows_are_normalised_scaled_shifted_and_cut_at_zero() {
             let (want, want_inverse) = normalised(&as_f64(sums));
             let what = format!("{width} {instructions:?}");
             assert!((f64::from(inverse_std[row]) / want_inverse - 1.0).abs() < 1e-4, "{what}");
-            // The inputs' own rounding, of 20 in f32, seen through 1 / std.
+            // The rounding of the inputs (20 in f32), magnified by 1 / std.
             let close = |got: &[f32], want: &[f64]| {
                 let scale = 1e-5_f64.max(want_inverse * 4e-6);
                 got.iter().zip(want).all(|(g, w)| (f64::from(*g) - w).abs() < scale)
@@ -116,14 +117,14 @@ fn gradients_of_gain_and_shift_are_sums_over_all_rows_also_in_pieces() {
         let want_shift: Vec<f64> = (0..width).map(|c| column(&of_shift, c)).collect();
         for instructions in InstructionSet::all() {
             let run = |outputs: Range<usize>| {
-                // Two blocks, of two rows and of three.
-                let blocks = [0..2 * width, 2 * width..ROWS * width].map(|at| NormalisedBlock {
+                // Two shards, of two rows and of three.
+                let shards = [0..2 * width, 2 * width..ROWS * width].map(|at| NormalisedShard {
                     gradient: &gradient[at.clone()],
                     normalised: &normalised[at],
                 });
                 let (mut gain, mut shift) = (vec![9.0; outputs.len()], vec![9.0; outputs.len()]);
-                let blocks = blocks.into_iter();
-                GainGradient { blocks, width, outputs, gain: &mut gain, shift: &mut shift }
+                let shards = shards.into_iter();
+                GainGradient { shards, width, outputs, gain: &mut gain, shift: &mut shift }
                     .run(instructions);
                 (gain, shift)
             };

@@ -1,31 +1,30 @@
-//! Some segments of a rollout on their way through policy and value: the passes that on-policy
-//! updates are made of.
+//! A shard of a rollout's minibatch, with the forward and backward passes of on-policy updates.
 
 use dmprl_shared::policy::{Activations, Head, HeadGradient, MlpShape, Policy, PolicyWorkspace};
 
 use super::ppo::{log_density, surrogate};
 use crate::normaliser::Normaliser;
 use crate::rollout_buffer::RolloutBuffer;
-use crate::update::pass::Gradients;
-use crate::update::trained::{Lent, Trace};
+use crate::update::backward_pass::Gradients;
+use crate::update::network::{NetworkView, PassRecord};
 
-/// What all blocks of a minibatch share.
+/// Quantities of the loss that all shards of a minibatch share.
 #[derive(Debug, Clone, Copy)]
 pub struct Objective<'a> {
     /// Logarithms of the policy's standard deviations, (A,).
     pub log_std: &'a [f32],
-    /// Half-width of the interval of ratios.
+    /// Half-width of the interval to which ratios are clipped.
     pub clip: f32,
-    /// Environment steps of the minibatch, over which the policy's loss is a mean.
+    /// Environment steps of the minibatch, over which the policy's loss is averaged.
     pub steps: f32,
-    /// Segments of the minibatch, over which the value's is.
+    /// Segments of the minibatch, over which the value's loss is averaged.
     pub segments: f32,
 }
 
-/// Sums over a block's segments, for the losses.
+/// Terms of the losses, summed over a shard's segments.
 #[derive(Debug, Clone, Copy, Default)]
-pub struct Sums {
-    /// The clipped objective, negative, of every step.
+pub struct LossSums {
+    /// The negative clipped objective of every step.
     pub policy: f32,
     /// (V - return)² of every segment.
     pub value: f32,
@@ -35,14 +34,14 @@ pub struct Sums {
     pub outside: usize,
 }
 
-/// Where a block's segments come from.
+/// What a shard's segments are copied from.
 #[derive(Debug, Clone, Copy)]
-pub struct Source<'a> {
+pub struct RolloutSource<'a> {
     /// The rollout.
     pub rollout: &'a RolloutBuffer,
-    /// Of all its steps under the policy that acted, (N, K).
+    /// Log densities of all its steps under the policy that acted, (N, K).
     pub log_densities: &'a [f32],
-    /// What networks see observations through.
+    /// Normalises network inputs, if configured.
     pub normaliser: Option<&'a Normaliser>,
 }
 
@@ -54,23 +53,23 @@ fn normalise(normaliser: Option<&Normaliser>, observations: &[f32], out: &mut [f
     }
 }
 
-/// Up to R segments with all buffers of an update.
+/// Up to R segments, with all buffers of an update.
 #[derive(Debug)]
-pub struct Block {
+pub struct MinibatchShard {
     observation_len: usize,
     action_len: usize,
-    /// K A.
+    /// Numbers of a segment's actions, K A.
     actions_len: usize,
     value_shape: MlpShape,
-    /// s as the environment and the DMP know it, (R, O).
+    /// s in the units of environment and DMP, (R, O).
     observations: Vec<f32>,
-    /// s as the networks see it: normalised, where that is asked for, (R, O).
+    /// s as network input, normalised if configured, (R, O).
     inputs: Vec<f32>,
-    /// As drawn, (R, K, A).
+    /// Actions as drawn, (R, K, A).
     actions: Vec<f32>,
-    /// Steps really run, (R,).
+    /// Steps that were run, (R,).
     steps_len: Vec<usize>,
-    /// Of the policy that acted, (R, K).
+    /// Log densities under the policy that acted, (R, K).
     log_densities: Vec<f32>,
     advantages: Vec<f32>,
     returns: Vec<f32>,
@@ -78,16 +77,16 @@ pub struct Block {
     actor_gradients: Gradients,
     value: Activations,
     value_gradients: Gradients,
-    /// With respect to u, then to the head's means, (R, K, A).
+    /// Gradient with respect to u, later to the head's means, (R, K, A).
     means_gradient: Vec<f32>,
-    /// With respect to the logarithms of the standard deviations, (A,).
+    /// Gradient with respect to the logarithms of the standard deviations, (A,).
     pub log_std_gradient: Vec<f32>,
-    /// What the block adds to the losses.
-    pub sums: Sums,
+    /// Terms of the losses.
+    pub sums: LossSums,
 }
 
-impl Block {
-    /// Buffers for up to `rows` segments.
+impl MinibatchShard {
+    /// Allocates buffers for up to `rows` segments.
     #[must_use]
     pub fn new(policy: &Policy, value_shape: &MlpShape, rows: usize) -> Self {
         let layout = policy.layout();
@@ -110,7 +109,7 @@ impl Block {
             value_gradients: Gradients::new(value_shape, rows),
             means_gradient: vec![0.0; rows * actions_len],
             log_std_gradient: vec![0.0; layout.action_len],
-            sums: Sums::default(),
+            sums: LossSums::default(),
         }
     }
 
@@ -118,15 +117,15 @@ impl Block {
         self.steps_len.len()
     }
 
-    /// Environment steps of its segments.
+    /// Returns the environment steps of the segments.
     #[must_use]
     pub fn steps(&self) -> usize {
         self.steps_len.iter().sum()
     }
 
-    /// Takes these entries of a rollout.
-    pub fn gather(&mut self, source: Source<'_>, entries: &[usize]) {
-        let Source { rollout, log_densities, normaliser } = source;
+    /// Copies these entries of a rollout.
+    pub fn gather(&mut self, source: RolloutSource<'_>, entries: &[usize]) {
+        let RolloutSource { rollout, log_densities, normaliser } = source;
         let (o, a) = (self.observation_len, self.actions_len);
         let k = a / self.action_len;
         for buffer in [&mut self.observations, &mut self.actions, &mut self.log_densities] {
@@ -146,12 +145,18 @@ impl Block {
         normalise(normaliser, &self.observations, &mut self.inputs);
     }
 
-    fn seen(&self) -> &[f32] {
+    fn network_inputs(&self) -> &[f32] {
         &self.inputs[..self.observations.len()]
     }
 
-    /// log densities of the gathered steps under the policy, (rows, K), into `out`.
-    pub fn judge(&mut self, policy: &Policy, actor: &Lent<'_>, log_std: &[f32], out: &mut [f32]) {
+    /// Computes the log densities of the gathered steps under the policy, (rows, K), into `out`.
+    pub fn evaluate_log_densities(
+        &mut self,
+        policy: &Policy,
+        actor: &NetworkView<'_>,
+        log_std: &[f32],
+        out: &mut [f32],
+    ) {
         self.act(policy, actor);
         let steps = self.actions.chunks_exact(self.action_len);
         let means = self.policy.actions.chunks_exact(self.action_len);
@@ -160,10 +165,11 @@ impl Block {
         }
     }
 
-    /// V of observations, (rows, O), into `out`, (rows,); what was gathered is forgotten.
-    pub fn appraise(
+    /// Computes V of `observations`, (rows, O), into `out`, (rows,). Overwrites the gathered
+    /// network inputs.
+    pub fn evaluate_values(
         &mut self,
-        value: &Lent<'_>,
+        value: &NetworkView<'_>,
         normaliser: Option<&Normaliser>,
         observations: &[f32],
         out: &mut [f32],
@@ -173,22 +179,27 @@ impl Block {
         out.copy_from_slice(self.value.output(&self.value_shape, out.len()));
     }
 
-    fn act(&mut self, policy: &Policy, actor: &Lent<'_>) {
+    fn act(&mut self, policy: &Policy, actor: &NetworkView<'_>) {
         actor.forward(&self.inputs[..self.observations.len()], &mut self.policy.activations, None);
         policy.decode(&self.observations, &mut self.policy);
     }
 
-    /// Passes of the policy's clipped loss.
-    pub fn improve(&mut self, policy: &Policy, actor: &Lent<'_>, objective: Objective<'_>) {
+    /// Runs the passes of the policy's clipped loss.
+    pub fn policy_backward(
+        &mut self,
+        policy: &Policy,
+        actor: &NetworkView<'_>,
+        objective: Objective<'_>,
+    ) {
         self.act(policy, actor);
-        self.sums = Sums::default();
+        self.sums = LossSums::default();
         self.log_std_gradient.fill(0.0);
         let used = self.rows() * self.actions_len;
         self.means_gradient[..used].fill(0.0);
         let k = self.actions_len / self.action_len;
         for row in 0..self.rows() {
             for step in row * k..row * k + self.steps_len[row] {
-                self.improve_step(step, self.advantages[row], objective);
+                self.policy_step_backward(step, self.advantages[row], objective);
             }
         }
         if policy.squashes() {
@@ -202,13 +213,14 @@ impl Block {
             let gradient = HeadGradient { means: &self.means_gradient[..used], end_state: &[] };
             head.backward(dmp, gradient, outputs, policy.shape().outputs());
         }
-        actor.pass(&self.policy.activations, None, rows).backward(&mut self.actor_gradients);
+        let pass = actor.backward_pass(&self.policy.activations, None, rows);
+        pass.run(&mut self.actor_gradients);
     }
 
-    /// One step's part in the loss and its gradients.
+    /// Adds one step's terms to the loss and its gradients.
     ///     d log density / d mean = z / std,   d log density / d log std = z² - 1,
     ///     z = (action - mean) / std
-    fn improve_step(&mut self, step: usize, advantage: f32, objective: Objective<'_>) {
+    fn policy_step_backward(&mut self, step: usize, advantage: f32, objective: Objective<'_>) {
         let Objective { log_std, clip, steps, .. } = objective;
         let at = step * self.action_len..(step + 1) * self.action_len;
         let (action, mean) = (&self.actions[at.clone()], &self.policy.actions[at.clone()]);
@@ -227,8 +239,8 @@ impl Block {
         }
     }
 
-    /// Passes of mean (V - return)².
-    pub fn regress(&mut self, value: &Lent<'_>, objective: Objective<'_>) {
+    /// Runs the passes of the value's loss, mean (V - return)².
+    pub fn value_backward(&mut self, value: &NetworkView<'_>, objective: Objective<'_>) {
         let rows = self.rows();
         value.forward(&self.inputs[..self.observations.len()], &mut self.value, None);
         let values = self.value.output(&self.value_shape, rows);
@@ -238,25 +250,25 @@ impl Block {
             *out = 2.0 * error / objective.segments;
             self.sums.value += error * error;
         }
-        value.pass(&self.value, None, rows).backward(&mut self.value_gradients);
+        value.backward_pass(&self.value, None, rows).run(&mut self.value_gradients);
     }
 
-    /// This block's part in the gradient of the actor after [`Block::improve`].
+    /// Returns the record for the actor. Call it after [`MinibatchShard::policy_backward`].
     #[must_use]
-    pub fn actor_trace(&self) -> Trace<'_> {
-        Trace {
-            inputs: self.seen(),
+    pub fn actor_record(&self) -> PassRecord<'_> {
+        PassRecord {
+            inputs: self.network_inputs(),
             activations: &self.policy.activations,
             gradients: &self.actor_gradients,
             normalised: None,
         }
     }
 
-    /// This block's part in the gradient of the value after [`Block::regress`].
+    /// Returns the record for the value. Call it after [`MinibatchShard::value_backward`].
     #[must_use]
-    pub fn value_trace(&self) -> Trace<'_> {
-        Trace {
-            inputs: self.seen(),
+    pub fn value_record(&self) -> PassRecord<'_> {
+        PassRecord {
+            inputs: self.network_inputs(),
             activations: &self.value,
             gradients: &self.value_gradients,
             normalised: None,

@@ -1,5 +1,4 @@
-//! One block of a batch's rows on its way through actor and critics: the passes that DDPG, TD3 and
-//! SAC are made of.
+//! A shard of a batch, with the forward and backward passes of DDPG, TD3 and SAC.
 
 use std::ops::Range;
 
@@ -7,21 +6,21 @@ use dmprl_shared::policy::{Activations, Head, HeadGradient, MlpShape, Policy, Po
 
 use super::batch::States;
 use super::{Batch, BatchShape};
-use crate::update::BLOCK_ROWS;
+use crate::update::SHARD_ROWS;
+use crate::update::backward_pass::Gradients;
 use crate::update::layer_norm::Normalised;
-use crate::update::pass::Gradients;
-use crate::update::trained::{Lent, Trace, Trained};
+use crate::update::network::{NetworkView, PassRecord, TrainableNetwork};
 
-/// A critic's buffers for one block.
+/// A critic's buffers for one shard.
 #[derive(Debug)]
-struct Buffers {
+struct CriticBuffers {
     activations: Activations,
     normalised: Option<Normalised>,
     gradients: Gradients,
 }
 
-impl Buffers {
-    fn new(critic: &Trained, rows: usize) -> Self {
+impl CriticBuffers {
+    fn new(critic: &TrainableNetwork, rows: usize) -> Self {
         let shape = &critic.shape;
         let activations = Activations::new(shape, rows);
         match critic.layer_norm {
@@ -35,86 +34,87 @@ impl Buffers {
     }
 }
 
-/// Sums over a block's rows, for the losses.
+/// Terms of the losses, summed over a shard's rows.
 #[derive(Debug, Clone, Copy, Default)]
-pub struct Sums {
-    /// (Q - target)², all critics.
+pub struct LossSums {
+    /// (Q - target)² of all critics.
     pub squared_error: f32,
-    /// Q of the batch's actions, first critic.
+    /// Q of the batch's actions, from the first critic.
     pub q: f32,
-    /// |Q| of the batch's actions, first critic.
+    /// |Q| of the batch's actions, from the first critic.
     pub q_size: f32,
-    /// Whatever the actor descends.
+    /// The actor's loss.
     pub actor: f32,
-    /// log pi of the actor's own draws.
+    /// log pi of the actions that the actor drew.
     pub log_density: f32,
 }
 
-/// The price of an action's change, and the batch that knows what was done before.
+/// The penalty on action changes, with the batch that has the previous actions.
 #[derive(Debug, Clone, Copy)]
 pub struct ActionRate<'a> {
-    /// Of a squared change, in units of Q.
+    /// Weight of a squared change, in units of Q.
     pub penalty: f32,
-    /// Whose windows the policy acts on.
+    /// The batch that the policy acts on.
     pub batch: &'a Batch,
 }
 
-/// Some rows of the batch with all buffers of an update.
+/// Some rows of a batch, with all buffers of an update.
 #[derive(Debug)]
-pub struct Block {
+pub struct BatchShard {
     rows: Range<usize>,
     shape: BatchShape,
     critic_shape: MlpShape,
-    /// Rows of the whole batch, over which losses are means.
+    /// Rows of the whole batch, over which the losses are averaged.
     batch_rows: f32,
-    /// What actor or target actor does.
+    /// Actions of actor or target actor.
     pub policy: PolicyWorkspace,
     actor_gradients: Gradients,
-    critics: Vec<Buffers>,
-    /// The critic's input with the policy's own actions, (rows, critic inputs).
+    critics: Vec<CriticBuffers>,
+    /// Critic inputs with the policy's own actions, (rows, critic inputs).
     critic_inputs: Vec<f32>,
-    /// What the critics regress on, (rows,).
+    /// Targets of the critics, (rows,).
     pub targets: Vec<f32>,
-    /// log pi of the policy's draws, (rows,).
+    /// log pi of the actions that the policy drew, (rows,).
     pub log_densities: Vec<f32>,
-    /// With respect to actions and end state, (rows, actions + end state), of one critic.
+    /// Gradient of one critic with respect to actions and end state, (rows, actions + end state).
     input_gradient: Vec<f32>,
-    /// With respect to u, then to the means before tanh, (rows, K A); all critics.
+    /// Gradient with respect to u, later to the means before tanh, (rows, K A), from all critics.
     pub actions_gradient: Vec<f32>,
+    /// Gradient with respect to the end state, (rows, 2A) or empty, from all critics.
     end_gradient: Vec<f32>,
-    /// What the block adds to the losses.
-    pub sums: Sums,
+    /// Terms of the losses.
+    pub sums: LossSums,
 }
 
-/// The blocks of a batch, for critics of one shape.
+/// Cuts a batch into shards, with buffers for critics of one shape.
 #[must_use]
-pub fn blocks(policy: &Policy, shape: BatchShape, critics: &[Trained]) -> Vec<Block> {
-    let block = |first: usize| {
-        let rows = first..(first + BLOCK_ROWS).min(shape.rows);
+pub fn shards(policy: &Policy, shape: BatchShape, critics: &[TrainableNetwork]) -> Vec<BatchShard> {
+    let shard = |first: usize| {
+        let rows = first..(first + SHARD_ROWS).min(shape.rows);
         let count = rows.len();
-        Block {
+        BatchShard {
             rows,
             shape,
-            // Without a critic nobody asks for its shape.
+            // Unused without a critic.
             critic_shape: critics.first().map_or(policy.shape(), |it| &it.shape).clone(),
             batch_rows: shape.rows as f32,
             policy: policy.workspace(count),
             actor_gradients: Gradients::new(policy.shape(), count),
-            critics: critics.iter().map(|critic| Buffers::new(critic, count)).collect(),
+            critics: critics.iter().map(|critic| CriticBuffers::new(critic, count)).collect(),
             critic_inputs: vec![0.0; count * shape.critic_inputs()],
             targets: vec![0.0; count],
             log_densities: vec![0.0; count],
             input_gradient: vec![0.0; count * (shape.actions_len + shape.end_state_len)],
             actions_gradient: vec![0.0; count * shape.segment_actions_len],
             end_gradient: vec![0.0; count * shape.end_state_len],
-            sums: Sums::default(),
+            sums: LossSums::default(),
         }
     };
-    (0..shape.rows).step_by(BLOCK_ROWS).map(block).collect()
+    (0..shape.rows).step_by(SHARD_ROWS).map(shard).collect()
 }
 
-impl Block {
-    /// This block's part of one of the batch's buffers.
+impl BatchShard {
+    /// Returns this shard's part of one of the batch's buffers.
     #[must_use]
     pub fn part<'a>(&self, buffer: &'a [f32]) -> &'a [f32] {
         let width = buffer.len() / self.shape.rows;
@@ -125,34 +125,39 @@ impl Block {
         self.rows.len()
     }
 
-    /// Rows of the whole batch.
+    /// Returns the number of rows of the whole batch.
     #[must_use]
     pub fn batch_rows(&self) -> f32 {
         self.batch_rows
     }
 
-    /// u = pi(states), of an actor or its target.
-    pub fn act(&mut self, policy: &Policy, actor: &Lent<'_>, states: States<'_>) {
+    /// Computes u = pi(states) of an actor or its target.
+    pub fn act(&mut self, policy: &Policy, actor: &NetworkView<'_>, states: States<'_>) {
         actor.forward(self.part(states.inputs), &mut self.policy.activations, None);
         policy.decode(self.part(states.observations), &mut self.policy);
     }
 
-    /// Q(states, u) of the policy's own actions for each of the critics.
-    pub fn judge(&mut self, policy: &Policy, critics: &[Lent<'_>], states: States<'_>) {
-        self.assemble(policy, self.part(states.inputs));
+    /// Computes Q(states, u) of the policy's own actions with each critic.
+    pub fn evaluate_critics(
+        &mut self,
+        policy: &Policy,
+        critics: &[NetworkView<'_>],
+        states: States<'_>,
+    ) {
+        self.assemble_critic_inputs(policy, self.part(states.inputs));
         for (critic, buffers) in critics.iter().zip(&mut self.critics) {
-            let Buffers { activations, normalised, .. } = buffers;
+            let CriticBuffers { activations, normalised, .. } = buffers;
             critic.forward(&self.critic_inputs, activations, normalised.as_mut());
         }
     }
 
-    /// Q of critic `index` after [`Block::judge`], (rows,).
+    /// Returns Q of critic `index`, (rows,). Call it after [`BatchShard::evaluate_critics`].
     #[must_use]
     pub fn q(&self, index: usize) -> &[f32] {
         self.critics[index].activations.output(&self.critic_shape, self.rows_len())
     }
 
-    /// targets = reward + bootstrap * value.
+    /// Sets targets = reward + bootstrap * value.
     pub fn set_targets(&mut self, batch: &Batch, value: impl Fn(&Self, usize) -> f32) {
         for row in 0..self.rows_len() {
             let at = self.rows.start + row;
@@ -160,13 +165,14 @@ impl Block {
         }
     }
 
-    /// Passes of mean (Q - target)² for each critic, on the batch's own actions.
-    pub fn regress(&mut self, critics: &[Lent<'_>], batch: &Batch) {
+    /// Runs the forward and backward passes of each critic's loss mean (Q - target)², on the
+    /// batch's own actions.
+    pub fn critic_backward(&mut self, critics: &[NetworkView<'_>], batch: &Batch) {
         let inputs = self.part(&batch.critic_inputs);
         let rows = self.rows_len();
-        self.sums = Sums::default();
+        self.sums = LossSums::default();
         for (index, (critic, buffers)) in critics.iter().zip(&mut self.critics).enumerate() {
-            let Buffers { activations, normalised, gradients } = buffers;
+            let CriticBuffers { activations, normalised, gradients } = buffers;
             critic.forward(inputs, activations, normalised.as_mut());
             let q = activations.output(&self.critic_shape, rows);
             let out = gradients.output_mut(&self.critic_shape, rows);
@@ -179,16 +185,16 @@ impl Block {
                     self.sums.q_size += q.abs();
                 }
             }
-            critic.pass(activations, normalised.as_ref(), rows).backward(gradients);
+            critic.backward_pass(activations, normalised.as_ref(), rows).run(gradients);
         }
     }
 
-    /// After [`Block::judge`]: sums the gradient of `weight(row, critic) Q_critic` with respect to
-    /// actions and end state over the critics; none of the critics' own parameters, which the actor
-    /// does not need.
+    /// Sums the gradients of `weight(shard, row, critic) * Q_critic` with respect to actions and
+    /// end state over the critics. Call it after [`BatchShard::evaluate_critics`]. It skips the
+    /// gradients of the critics' parameters, which the actor does not need.
     pub fn actions_gradient(
         &mut self,
-        critics: &[Lent<'_>],
+        critics: &[NetworkView<'_>],
         weight: impl Fn(&Self, usize, usize) -> f32,
     ) {
         self.actions_gradient.fill(0.0);
@@ -199,45 +205,46 @@ impl Block {
                 let weight = weight(self, row, index);
                 self.critics[index].gradients.output_mut(&self.critic_shape, rows)[row] = weight;
             }
-            let Buffers { activations, normalised, gradients } = &mut self.critics[index];
-            let pass = critic.pass(activations, normalised.as_ref(), rows);
-            pass.backward(gradients);
+            let CriticBuffers { activations, normalised, gradients } = &mut self.critics[index];
+            let pass = critic.backward_pass(activations, normalised.as_ref(), rows);
+            pass.run(gradients);
             let first = self.shape.observation_len;
             pass.input_gradient(gradients, first, &mut self.input_gradient);
             self.add_input_gradient();
         }
     }
 
-    /// Passes of -mean Q of the one critic, after [`Block::act`] and [`Block::judge`].
-    pub fn ascend_q(
+    /// Runs the backward passes of the loss -mean Q of one critic, plus the penalty on action
+    /// changes. Call it after [`BatchShard::act`] and [`BatchShard::evaluate_critics`].
+    pub fn deterministic_policy_gradient(
         &mut self,
         policy: &Policy,
-        actor: &Lent<'_>,
-        critic: &[Lent<'_>; 1],
+        actor: &NetworkView<'_>,
+        critic: &[NetworkView<'_>; 1],
         rate: ActionRate<'_>,
     ) {
-        self.sums = Sums { actor: -self.q(0).iter().sum::<f32>(), ..Sums::default() };
+        self.sums = LossSums { actor: -self.q(0).iter().sum::<f32>(), ..LossSums::default() };
         let weight = -1.0 / self.batch_rows;
         self.actions_gradient(critic, |_, _, _| weight);
         self.unsquash();
         self.penalise(policy, rate);
         self.log_stds_backward(policy, |_, _, _| 0.0);
-        self.act_backward(policy, actor);
+        self.actor_backward(policy, actor);
     }
 
-    /// Passes of mean (pi(s) - u)², `actions` (B, K A) being the u to imitate; leaves the sum of
-    /// squares in `sums.actor`.
-    pub fn imitate(
+    /// Runs the passes of the loss mean (pi(s) - u)², where u, (B, K A), are the `actions` to
+    /// imitate. Sets `sums.actor` to the sum of squares.
+    pub fn imitation_backward(
         &mut self,
         policy: &Policy,
-        actor: &Lent<'_>,
+        actor: &NetworkView<'_>,
         states: States<'_>,
         actions: &[f32],
     ) {
         self.act(policy, actor, states);
         let factor = 2.0 / actions.len() as f32;
         let wanted = &actions[self.rows.start * self.shape.segment_actions_len..];
-        self.sums = Sums::default();
+        self.sums = LossSums::default();
         let errors = self.policy.actions.iter().zip(wanted).map(|(action, wanted)| action - wanted);
         for (gradient, error) in self.actions_gradient.iter_mut().zip(errors) {
             *gradient = factor * error;
@@ -246,14 +253,14 @@ impl Block {
         self.end_gradient.fill(0.0);
         self.unsquash();
         self.log_stds_backward(policy, |_, _, _| 0.0);
-        self.act_backward(policy, actor);
+        self.actor_backward(policy, actor);
     }
 
     fn add_input_gradient(&mut self) {
         let BatchShape { actions_len, end_state_len, segment_actions_len, .. } = self.shape;
         let width = actions_len + end_state_len;
         for (row, input) in self.input_gradient.chunks_exact(width).enumerate() {
-            // Actions that the critic does not see have no gradient.
+            // Actions that the critic does not see have a gradient of zero.
             let actions = &mut self.actions_gradient[row * segment_actions_len..][..actions_len];
             actions.iter_mut().zip(input).for_each(|(sum, gradient)| *sum += gradient);
             let end = &mut self.end_gradient[row * end_state_len..][..end_state_len];
@@ -261,17 +268,18 @@ impl Block {
         }
     }
 
-    /// From the gradient with respect to u, as [`Block::actions_gradient`] left it, to the one with
-    /// respect to the means before their tanh.
+    /// Turns the gradient with respect to u, from [`BatchShard::actions_gradient`], into the
+    /// gradient with respect to the means before their tanh.
     pub fn unsquash(&mut self) {
         for (gradient, action) in self.actions_gradient.iter_mut().zip(&self.policy.actions) {
             *gradient *= 1.0 - action * action;
         }
     }
 
-    /// Adds what the changes of tanh(means) cost to `sums.actor`, and its gradient to that with
-    /// respect to the means, as [`Block::unsquash`] left it. Leaves tanh(means) as the actions.
-    pub fn penalise(&mut self, policy: &Policy, ActionRate { penalty, batch }: ActionRate<'_>) {
+    /// Adds the penalty on changes of tanh(means) to the actor's loss and its gradient. Call it
+    /// after [`BatchShard::unsquash`]. Sets the actions to tanh(means).
+    pub fn penalise(&mut self, policy: &Policy, rate: ActionRate<'_>) {
+        let ActionRate { penalty, batch } = rate;
         if penalty == 0.0 {
             return;
         }
@@ -298,8 +306,8 @@ impl Block {
         }
     }
 
-    /// Gradient to the raw log-stds, which `log_std(block, row, action)` gives, if the policy has
-    /// any; before [`Block::act_backward`].
+    /// Sets the gradient with respect to the raw log-stds to `log_std(shard, row, action)`, if the
+    /// policy has any. Call it before [`BatchShard::actor_backward`].
     pub fn log_stds_backward(
         &mut self,
         policy: &Policy,
@@ -315,9 +323,9 @@ impl Block {
         }
     }
 
-    /// Passes of the actor, from the gradient with respect to the means in `actions_gradient`, and
-    /// what [`Block::log_stds_backward`] left.
-    pub fn act_backward(&mut self, policy: &Policy, actor: &Lent<'_>) {
+    /// Runs the actor's backward pass from the gradient with respect to the means, in
+    /// `actions_gradient`, and to the log-stds.
+    pub fn actor_backward(&mut self, policy: &Policy, actor: &NetworkView<'_>) {
         let rows = self.rows_len();
         let stride = policy.shape().outputs();
         let outputs = self.actor_gradients.output_mut(policy.shape(), rows);
@@ -335,28 +343,28 @@ impl Block {
                 }
             }
         }
-        let pass = actor.pass(&self.policy.activations, None, rows);
-        pass.backward(&mut self.actor_gradients);
+        let pass = actor.backward_pass(&self.policy.activations, None, rows);
+        pass.run(&mut self.actor_gradients);
     }
 
-    /// This block's part in the gradient of critic `index` after [`Block::regress`].
+    /// Returns the record for critic `index`. Call it after [`BatchShard::critic_backward`].
     #[must_use]
-    pub fn critic_trace<'a>(&'a self, index: usize, batch: &'a Batch) -> Trace<'a> {
-        let Buffers { activations, normalised, gradients } = &self.critics[index];
+    pub fn critic_record<'a>(&'a self, index: usize, batch: &'a Batch) -> PassRecord<'a> {
+        let CriticBuffers { activations, normalised, gradients } = &self.critics[index];
         let inputs = self.part(&batch.critic_inputs);
-        Trace { inputs, activations, normalised: normalised.as_ref(), gradients }
+        PassRecord { inputs, activations, normalised: normalised.as_ref(), gradients }
     }
 
-    /// This block's part in the gradient of the actor after [`Block::act_backward`].
+    /// Returns the record for the actor. Call it after [`BatchShard::actor_backward`].
     #[must_use]
-    pub fn actor_trace<'a>(&'a self, batch: &'a Batch) -> Trace<'a> {
-        self.trace(&batch.inputs)
+    pub fn actor_record<'a>(&'a self, batch: &'a Batch) -> PassRecord<'a> {
+        self.record(&batch.inputs)
     }
 
-    /// The same for an actor that has seen `inputs`, (B, O).
+    /// Returns the record for an actor whose network inputs were `inputs`, (B, O).
     #[must_use]
-    pub fn trace<'a>(&'a self, inputs: &'a [f32]) -> Trace<'a> {
-        Trace {
+    pub fn record<'a>(&'a self, inputs: &'a [f32]) -> PassRecord<'a> {
+        PassRecord {
             inputs: self.part(inputs),
             activations: &self.policy.activations,
             normalised: None,
@@ -364,9 +372,8 @@ impl Block {
         }
     }
 
-    /// Builds the critic's input from what networks see of the states and the actions that
-    /// `policy` holds.
-    fn assemble(&mut self, policy: &Policy, inputs: &[f32]) {
+    /// Builds the critic inputs from the network inputs of the states and the policy's actions.
+    fn assemble_critic_inputs(&mut self, policy: &Policy, inputs: &[f32]) {
         let BatchShape { observation_len, actions_len, segment_actions_len, .. } = self.shape;
         let width = self.shape.critic_inputs();
         for (row, input) in self.critic_inputs.chunks_exact_mut(width).enumerate() {
@@ -385,10 +392,10 @@ impl Block {
     }
 }
 
-/// The sums of all blocks, in their order.
+/// Adds the sums of all shards, in their order.
 #[must_use]
-pub fn total(blocks: &[Block]) -> Sums {
-    blocks.iter().map(|block| block.sums).fold(Sums::default(), |a, b| Sums {
+pub fn total(shards: &[BatchShard]) -> LossSums {
+    shards.iter().map(|shard| shard.sums).fold(LossSums::default(), |a, b| LossSums {
         squared_error: a.squared_error + b.squared_error,
         q: a.q + b.q,
         q_size: a.q_size + b.q_size,

@@ -1,0 +1,37 @@
+//! The error with which a learner stops.
+
+use dmprl_shared::policy::PolicyError;
+use thiserror::Error;
+
+use crate::algorithms::NoWindow;
+use crate::demonstrations::DemonstrationError;
+
+/// Why the learner stopped.
+#[derive(Debug, Error)]
+pub enum LearnerError {
+    /// The policy cannot be built.
+    #[error(transparent)]
+    Policy(#[from] PolicyError),
+    /// A tensor operation failed.
+    #[error("tensor operation: {0}")]
+    Tensor(#[from] candle_core::Error),
+    /// The replay has no window to learn from.
+    #[error(transparent)]
+    NoWindow(#[from] NoWindow),
+    /// The demonstrations do not fit the run.
+    #[error(transparent)]
+    Demonstrations(#[from] DemonstrationError),
+    /// A loss or parameter is NaN or infinite.
+    #[error(
+        "update {update}: {name} is {value}; the run has diverged. The last checkpoint is valid: \
+         lower algorithm.critic_learning_rate or pacing.updates_per_segment"
+    )]
+    NotFinite {
+        /// Number of the update.
+        update: u64,
+        /// Name of the quantity.
+        name: &'static str,
+        /// Its value.
+        value: f32,
+    },
+}

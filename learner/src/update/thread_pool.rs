@@ -1,0 +1,268 @@
+//! The threads of an update. A job consists of independent parts, which the threads share.
+//!
+//! Any thread may compute any part. What a part computes depends only on its index, and no two
+//! parts write the same result, so the number of threads does not change a single bit.
+
+use std::sync::atomic::{AtomicBool, AtomicU32, AtomicUsize, Ordering};
+use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
+use std::thread::{self, JoinHandle};
+
+/// Polls for a new job before a thread sleeps. They last about as long as the pauses between the
+/// jobs of an update.
+const SPINS_MAX: u32 = 2_000;
+
+/// A closure that computes one part, borrowed for the duration of one job.
+type Work = *const (dyn Fn(usize) + Sync);
+
+/// A fixed set of threads that run one job at a time.
+///
+/// Running a job needs `&mut self`, so the borrow checker rules out two jobs at once and a job
+/// started from inside another. Neither starting nor finishing a job allocates.
+#[derive(Debug)]
+pub struct ThreadPool {
+    shared: Arc<Shared>,
+    helpers: Vec<JoinHandle<()>>,
+}
+
+#[derive(Debug)]
+struct Shared {
+    /// Number of jobs started; each helper takes part in each job once.
+    jobs_started: AtomicU32,
+    job: Mutex<Job>,
+    job_available: Condvar,
+    next_part: AtomicUsize,
+    /// Helpers that have not finished the current job.
+    busy: AtomicUsize,
+    panicked: AtomicBool,
+}
+
+#[derive(Debug)]
+struct Job {
+    work: Option<Work>,
+    parts: usize,
+    shutdown: bool,
+}
+
+// SAFETY: helpers dereference the pointer only while `ThreadPool::run` waits for them, and `run`
+// borrows the closure for that long. The closure itself is `Sync`.
+unsafe impl Send for Job {}
+
+impl ThreadPool {
+    /// Starts a pool of `threads` threads, including the calling thread.
+    ///
+    /// # Panics
+    /// If the operating system cannot start a thread.
+    #[must_use]
+    pub fn new(threads: usize) -> Self {
+        let shared = Arc::new(Shared {
+            jobs_started: AtomicU32::new(0),
+            job: Mutex::new(Job { work: None, parts: 0, shutdown: false }),
+            job_available: Condvar::new(),
+            next_part: AtomicUsize::new(0),
+            busy: AtomicUsize::new(0),
+            panicked: AtomicBool::new(false),
+        });
+        let helper = |index: usize| {
+            let shared = Arc::clone(&shared);
+            let name = format!("update-{index}");
+            let spawned = thread::Builder::new().name(name).spawn(move || shared.run_helper());
+            spawned.expect("cannot start a thread of the update")
+        };
+        let helpers = (1..threads).map(helper).collect();
+        Self { shared, helpers }
+    }
+
+    /// Calls `work` once with each index below `parts`, in any order and on any thread. Returns
+    /// when all calls have returned.
+    ///
+    /// # Panics
+    /// If `work` panics; the other threads finish their parts first.
+    pub fn run(&mut self, parts: usize, work: &(dyn Fn(usize) + Sync)) {
+        if self.helpers.is_empty() || parts < 2 {
+            return (0..parts).for_each(work);
+        }
+        let shared = &*self.shared;
+        shared.next_part.store(0, Ordering::Relaxed);
+        shared.busy.store(self.helpers.len(), Ordering::Relaxed);
+        // Set by a helper if the previous job panicked on the calling thread as well.
+        shared.panicked.store(false, Ordering::Relaxed);
+        // SAFETY: this changes only the lifetime. `&mut self` excludes a second job. When this
+        // function returns or unwinds, `busy` is zero: no helper holds the pointer any more, and
+        // none reads it again before the next job replaces it.
+        let work_for_helpers: &'static (dyn Fn(usize) + Sync) =
+            unsafe { std::mem::transmute(work) };
+        let mut job = shared.lock();
+        (job.work, job.parts) = (Some(std::ptr::from_ref(work_for_helpers)), parts);
+        shared.jobs_started.fetch_add(1, Ordering::Release);
+        drop(job);
+        shared.job_available.notify_all();
+        let wait = WaitForHelpers(shared);
+        shared.take_parts(parts, work);
+        drop(wait);
+        assert!(!shared.panicked.load(Ordering::Acquire), "a thread of the update panicked");
+    }
+
+    /// Calls `work` once with each item.
+    pub fn for_each<T: Send>(&mut self, items: &mut [T], work: impl Fn(&mut T) + Sync) {
+        let items = DisjointSlice::new(items);
+        self.run(items.len(), &|index| {
+            // SAFETY: `run` passes each index once.
+            let item = unsafe { items.slice(index..index + 1) };
+            work(&mut item[0]);
+        });
+    }
+}
+
+/// Waits for the helpers when it is dropped. A job must not return before that, even if the calling
+/// thread's own part panics, because the helpers still borrow the closure.
+struct WaitForHelpers<'a>(&'a Shared);
+
+impl Drop for WaitForHelpers<'_> {
+    fn drop(&mut self) {
+        let mut spins = 0;
+        while self.0.busy.load(Ordering::Acquire) > 0 {
+            spins += 1;
+            if spins < SPINS_MAX {
+                std::hint::spin_loop();
+            } else {
+                // With more threads than free cores, the helper may need this core.
+                thread::yield_now();
+            }
+        }
+    }
+}
+
+impl Drop for ThreadPool {
+    fn drop(&mut self) {
+        self.shared.lock().shutdown = true;
+        self.shared.jobs_started.fetch_add(1, Ordering::Release);
+        self.shared.job_available.notify_all();
+        for helper in self.helpers.drain(..) {
+            // `run` has already reported a panic.
+            let _ = helper.join();
+        }
+    }
+}
+
+impl Shared {
+    fn lock(&self) -> MutexGuard<'_, Job> {
+        self.job.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    fn take_parts(&self, parts: usize, work: &(dyn Fn(usize) + Sync)) {
+        loop {
+            let part = self.next_part.fetch_add(1, Ordering::Relaxed);
+            if part >= parts {
+                return;
+            }
+            work(part);
+        }
+    }
+
+    /// Takes part in every job until the pool is dropped.
+    fn run_helper(&self) {
+        let mut seen = 0;
+        loop {
+            let mut spins = 0;
+            while self.jobs_started.load(Ordering::Acquire) == seen && spins < SPINS_MAX {
+                spins += 1;
+                std::hint::spin_loop();
+            }
+            let mut job = self.lock();
+            while self.jobs_started.load(Ordering::Acquire) == seen {
+                job = self.job_available.wait(job).unwrap_or_else(PoisonError::into_inner);
+            }
+            seen = self.jobs_started.load(Ordering::Acquire);
+            let (work, parts, shutdown) = (job.work, job.parts, job.shutdown);
+            drop(job);
+            if shutdown {
+                return;
+            }
+            if let Some(work) = work {
+                // SAFETY: `run` waits until `busy` is zero, so the closure is still borrowed.
+                let work = unsafe { &*work };
+                let done = std::panic::catch_unwind(std::panic::AssertUnwindSafe(|| {
+                    self.take_parts(parts, work);
+                }));
+                if done.is_err() {
+                    self.panicked.store(true, Ordering::Release);
+                }
+            }
+            self.busy.fetch_sub(1, Ordering::Release);
+        }
+    }
+}
+
+/// A mutable slice of which several threads write disjoint ranges.
+pub struct DisjointSlice<'a, T> {
+    pointer: *mut T,
+    len: usize,
+    borrowed: std::marker::PhantomData<&'a mut [T]>,
+}
+
+// SAFETY: it hands out `&mut T` to several threads, which `T: Send` permits. Callers of `slice`
+// guarantee that no two ranges overlap.
+unsafe impl<T: Send> Sync for DisjointSlice<'_, T> {}
+
+impl<'a, T> DisjointSlice<'a, T> {
+    /// Borrows the slice.
+    pub fn new(slice: &'a mut [T]) -> Self {
+        let (pointer, len) = (slice.as_mut_ptr(), slice.len());
+        Self { pointer, len, borrowed: std::marker::PhantomData }
+    }
+
+    /// Returns the length of the whole slice.
+    #[must_use]
+    pub fn len(&self) -> usize {
+        self.len
+    }
+
+    /// Returns whether the whole slice is empty.
+    #[must_use]
+    pub fn is_empty(&self) -> bool {
+        self.len == 0
+    }
+
+    /// Returns one range of the slice.
+    ///
+    /// # Safety
+    /// No two ranges that are in use at the same time may overlap.
+    ///
+    /// # Panics
+    /// If the range is out of bounds.
+    #[must_use]
+    #[expect(clippy::mut_from_ref, reason = "that is its purpose; see Safety")]
+    pub unsafe fn slice(&self, range: std::ops::Range<usize>) -> &mut [T] {
+        assert!(range.start <= range.end && range.end <= self.len, "{range:?} of {}", self.len);
+        // SAFETY: the range is within the borrowed slice, and the caller guarantees that it
+        // overlaps with no other.
+        unsafe { std::slice::from_raw_parts_mut(self.pointer.add(range.start), range.len()) }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn every_part_is_done_once_whatever_the_number_of_threads() {
+        for threads in [1, 2, 3, 9] {
+            let mut pool = ThreadPool::new(threads);
+            let mut counts = vec![0_u32; 37];
+            (0..200).for_each(|_| pool.for_each(&mut counts, |count| *count += 1));
+            assert!(counts.iter().all(|&count| count == 200), "{threads}: {counts:?}");
+        }
+    }
+
+    #[test]
+    fn a_panic_in_a_part_reaches_the_caller_and_the_pool_remains_usable() {
+        let mut pool = ThreadPool::new(3);
+        let mut run = |work: &(dyn Fn(usize) + Sync)| {
+            std::panic::catch_unwind(std::panic::AssertUnwindSafe(|| pool.run(8, work)))
+        };
+        assert!((0..8).all(|bad| run(&|part| assert_ne!(part, bad)).is_err()));
+        // The panic of a helper must not be reported for the next job.
+        assert!(run(&|_| panic!("every thread")).is_err());
+        assert!(run(&|_| ()).is_ok());
+    }
+}
