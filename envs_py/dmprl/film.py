@@ -1,7 +1,7 @@
 """Makes a video, an animation and a strip of frames of episodes; started by ``dmprl record``.
 
-``python -m dmprl.film PLAN``: PLAN is a JSON file, written by ``deploy/src/record/film.rs``.
-Progress is reported on standard output, in the format that ``deploy/src/control.rs`` reads.
+``python -m dmprl.film PLAN``: PLAN is a JSON file, which ``deploy/sweep/src/record`` writes.
+Progress is reported on standard output, in the format that ``dmprl-control`` defines.
 """
 
 from __future__ import annotations

@@ -24,7 +24,7 @@ LOG_STD_RANGE = (-20.0, 2.0)
 
 
 class NumpyPolicy:
-    """The policy that ``plan`` describes (written by ``deploy/src/bench/numpy_plan.rs``).
+    """The policy that ``plan`` describes (written by ``deploy/bench/src/numpy_plan.rs``).
 
     ``parameters`` are the network's, flat. By default they are read from the plan's file.
     """

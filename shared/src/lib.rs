@@ -5,6 +5,7 @@
 //! stage 1 of the data flow, `transport` is stages 4 and 7. Both the rollout (stage 3) and the
 //! update (stage 6) use `dmp` and `policy`.
 
+pub mod checkpoint;
 pub mod config;
 pub mod dmp;
 pub mod parameters;

@@ -9,7 +9,7 @@
 use std::fs;
 use std::path::{Path, PathBuf};
 
-use dmprl::export;
+use dmprl_analysis::export;
 use dmprl_shared::config::{ExperimentConfig, Layers, Limits, task_defaults};
 use dmprl_shared::parameters::ParameterSnapshot;
 use dmprl_shared::policy::Policy;

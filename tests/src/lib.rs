@@ -3,6 +3,7 @@
 pub mod exported;
 pub mod hosts;
 pub mod program;
+mod run_files;
 pub mod skip_list;
 pub mod skipped;
 
@@ -24,10 +25,10 @@ pub fn tiny_envs_dir() -> PathBuf {
 /// # Panics
 /// When it cannot be made, with the reason.
 #[cfg(feature = "python")]
-pub fn venv() -> &'static dmprl::python_setup::PythonEnvironment {
+pub fn venv() -> &'static dmprl_supervisor::python_setup::PythonEnvironment {
     use std::sync::OnceLock;
 
-    use dmprl::python_setup::{PythonEnvironment, ensure};
+    use dmprl_supervisor::python_setup::{PythonEnvironment, ensure};
 
     static VENV: OnceLock<PythonEnvironment> = OnceLock::new();
     VENV.get_or_init(|| {

@@ -5,7 +5,6 @@
 
 use std::ffi::OsStr;
 use std::fs::{self, File};
-use std::os::unix::fs::MetadataExt;
 use std::os::unix::process::{CommandExt, ExitStatusExt};
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, ExitStatus, Stdio};
@@ -16,6 +15,11 @@ use std::time::{Duration, Instant, SystemTime};
 use rustix::process::{Pid, Signal, kill_process, kill_process_group};
 use serde_json::Value;
 use tempfile::TempDir;
+
+pub use crate::run_files::{
+    env_steps, env_steps_of, env_steps_of_checkpoint, json_file, rows, shared_memory_named,
+    shared_memory_of,
+};
 
 /// No test waits longer for anything: far beyond what a loaded machine needs.
 pub const PATIENCE: Duration = Duration::from_secs(120);
@@ -453,56 +457,4 @@ fn events(said: &str) -> Vec<Value> {
 fn has_event(events: &[Value], keys: &Value) -> bool {
     let Value::Object(keys) = keys else { return false };
     events.iter().any(|event| keys.iter().all(|(key, value)| event[key] == *value))
-}
-
-/// Every whole line of a `.jsonl` file of a run.
-///
-/// # Panics
-/// When a line is no JSON.
-pub fn rows(run: &str, file: &str) -> Vec<Value> {
-    let text = fs::read_to_string(Path::new(run).join(file)).unwrap_or_default();
-    let whole = text.rfind('\n').map_or("", |end| &text[..end]);
-    let parse = |line| {
-        serde_json::from_str(line).unwrap_or_else(|error| panic!("{run}/{file}: {error}: {line}"))
-    };
-    whole.lines().map(parse).collect()
-}
-
-/// `env_steps` of each row.
-pub fn env_steps(rows: &[Value]) -> Vec<u64> {
-    rows.iter().filter_map(|row| row["env_steps"].as_u64()).collect()
-}
-
-/// Where the last line of `metrics.jsonl` stands.
-pub fn env_steps_of(run: &str) -> Option<u64> {
-    env_steps(&rows(run, "metrics.jsonl")).last().copied()
-}
-
-/// A JSON file of a run, null when it is not there or not whole.
-pub fn json_file(run: &str, file: &str) -> Value {
-    let bytes = fs::read(Path::new(run).join(file)).unwrap_or_default();
-    serde_json::from_slice(&bytes).unwrap_or(Value::Null)
-}
-
-/// Environment steps of the checkpoint that a resume goes on from.
-pub fn env_steps_of_checkpoint(run: &str) -> Option<u64> {
-    json_file(run, "checkpoints/latest/state.json")["counters"]["env_steps"].as_u64()
-}
-
-/// What lies in shared memory for a run: its domains, whole or half-made or half-removed.
-///
-/// # Panics
-/// When the run has no manifest.
-pub fn shared_memory_of(run: &str) -> Vec<PathBuf> {
-    let manifest = json_file(run, "manifest.json");
-    shared_memory_named(manifest["run_id"].as_str().expect("a manifest with a run_id"))
-}
-
-/// What lies in this user's shared memory with `text` in its name: a run's id is, and at the name's
-/// end the id of the process that made it.
-pub fn shared_memory_named(text: &str) -> Vec<PathBuf> {
-    let user = fs::metadata("/proc/self").map_or(0, |metadata| metadata.uid());
-    let Ok(entries) = fs::read_dir(format!("/dev/shm/dmprl-{user}")) else { return Vec::new() };
-    let named = |path: &PathBuf| path.to_string_lossy().contains(text);
-    entries.flatten().map(|entry| entry.path()).filter(named).collect()
 }

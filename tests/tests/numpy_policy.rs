@@ -8,7 +8,7 @@
 use std::path::Path;
 use std::process::Command;
 
-use dmprl::bench::{Controls, NumpyPlan};
+use dmprl_bench::{Controls, NumpyPlan};
 use dmprl_shared::config::{ExperimentConfig, Layers, Limits, task_defaults};
 use dmprl_shared::policy::Policy;
 use dmprl_shared::seeds;

@@ -13,7 +13,7 @@ use std::{
     thread,
 };
 
-use dmprl::python_setup::{Home, PythonEnvironment, ensure, ensure_extra};
+use dmprl_supervisor::python_setup::{Home, PythonEnvironment, ensure, ensure_extra};
 
 const MANIFEST: &str = "\
 [build-system]

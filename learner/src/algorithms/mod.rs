@@ -3,10 +3,11 @@
 //! [`Algorithm`] is one of those that learn from a replay: DDPG, TD3 and SAC. NDP ([`ndp`]) learns
 //! from rollouts. [`crate::regime`] selects between the two.
 
-mod batch;
+pub(crate) mod batch;
 mod batch_shard;
 pub mod cloning;
 pub mod ddpg;
+pub(crate) mod losses;
 mod minibatch_shard;
 pub mod ndp;
 mod ppo;
@@ -19,6 +20,7 @@ use dmprl_shared::policy::{MlpShape, Policy, initial_parameters};
 use dmprl_shared::seeds;
 
 pub use batch::{Batch, BatchShape, NoWindow, SampleSource};
+pub use losses::Losses;
 
 use crate::graph::Graph;
 use crate::update::network::TrainableNetwork;
@@ -26,21 +28,6 @@ use crate::update::thread_pool::ThreadPool;
 use ddpg::Ddpg;
 use sac::Sac;
 use td3::Td3;
-
-/// Losses of one update, as means over the batch.
-#[derive(Debug, Clone, Copy, PartialEq, Default)]
-pub struct Losses {
-    /// (Q - target)², summed over the critics.
-    pub critic_loss: f32,
-    /// The actor's loss; `None` if the update does not change the actor.
-    pub actor_loss: Option<f32>,
-    /// Q of the batch's actions, from the first critic.
-    pub q_mean: f32,
-    /// SAC: weight of the entropy.
-    pub temperature: Option<f32>,
-    /// SAC: -log pi of the sampled actions \[nat\].
-    pub entropy: Option<f32>,
-}
 
 /// An algorithm that learns from batches of a replay, with its networks and threads.
 #[derive(Debug)]

@@ -12,16 +12,7 @@ const LATEST: &str = "latest";
 /// # Errors
 /// If the folder cannot be read.
 pub fn names(folder: &Path) -> Result<Vec<String>, CheckpointError> {
-    let mut numbered = Vec::new();
-    for entry in fs::read_dir(folder).map_err(io_error(folder))? {
-        let name = entry.map_err(io_error(folder))?.file_name();
-        let name = name.to_string_lossy().into_owned();
-        if let Ok(number) = name.parse::<u64>() {
-            numbered.push((number, name));
-        }
-    }
-    numbered.sort_unstable();
-    Ok(numbered.into_iter().map(|(_, name)| name).collect())
+    dmprl_shared::checkpoint::names(folder).map_err(io_error(folder))
 }
 
 /// Returns the name of the next checkpoint.

@@ -10,7 +10,8 @@ use candle_core::{D, Device, Result, Tensor, Var};
 use dmprl_shared::config::{AlgorithmName, ExperimentConfig};
 use dmprl_shared::policy::{Head, MlpShape, Policy};
 
-use crate::algorithms::{Batch, BatchShape, Losses};
+use crate::algorithms::batch::{Batch, BatchShape};
+use crate::algorithms::losses::Losses;
 use crate::update::kernels::{BETA1, BETA2, EPSILON};
 use crate::update::layer_norm::LayerNorm;
 use crate::update::network::TrainableNetwork;

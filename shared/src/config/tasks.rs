@@ -3,6 +3,8 @@
 use serde::Serialize;
 use toml::Table;
 
+use crate::spec::EnvSpec;
+
 /// A task with a short name.
 ///
 /// `dmprl tasks` prints these fields, so that it needs no Python. A test compares them with the
@@ -235,6 +237,21 @@ capacity_steps = 100000
 "#];
 
 impl TaskDefaults {
+    /// The spec that the environment will report; without names of observations.
+    #[must_use]
+    pub fn spec(&self) -> EnvSpec {
+        EnvSpec {
+            id: self.id.into(),
+            observation_len: self.observation_len,
+            action_len: self.action_low.len(),
+            action_low: self.action_low.to_vec(),
+            action_high: self.action_high.to_vec(),
+            control_dt_s: self.control_dt_s,
+            episode_steps: self.episode_steps,
+            observation_names: Vec::new(),
+        }
+    }
+
     /// The task's values, name and id included.
     ///
     /// # Panics

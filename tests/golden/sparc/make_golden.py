@@ -1,7 +1,7 @@
 """Writes golden.json: spectral arc lengths of speed profiles by the package monalysa.
 
 Its authors are those of the measure (Balasubramanian et al. 2015). Run by hand in an environment of
-its own (requirements.txt); the test that reads the file is in deploy/src/motion/smoothness.rs.
+its own (requirements.txt). deploy/analysis/src/motion/smoothness.rs reads the file.
 """
 
 import json

@@ -1,7 +1,7 @@
 """Writes golden.json: interquartile means and their intervals by the package rliable.
 
 Run by hand in an environment of its own (requirements.txt); the test that reads the file is in
-deploy/src/report/statistics.rs.
+deploy/analysis/src/report/statistics.rs.
 """
 
 import json

@@ -4,11 +4,11 @@ use std::io::{Cursor, Read};
 use std::sync::mpsc;
 use std::time::Duration;
 
-use dmprl::control::{
+use dmprl_control::ControlPipe;
+use dmprl_control::{
     Activity, Command, EvaluationRequest, Greeting, JoinAnswer, JoinRequest, Progress, Report,
     Welcome, WorkersNow,
 };
-use dmprl::roles::ControlPipe;
 use serde_json::Value;
 
 use crate::mutate::{self, Random};

@@ -80,7 +80,7 @@ fn a_container_with_too_little_shared_memory_is_told_before_it_starts() {
     let script = format!("exec {} {line}", executable().display());
     let Some(command) = with_shared_memory_of(256, &script) else { return };
     let words =
-        ["needed for 2 workers and 4 that may join", "256.0 KiB free in /dev/shm", "--shm-size"];
+        ["needed for 2 workers and 4 that may join", "256 KiB free in /dev/shm", "--shm-size"];
     refused_by_its_size(command, &place, &words);
 }
 
@@ -98,7 +98,7 @@ fn dockers_shared_memory_is_enough_and_worth_a_warning() {
     let warning = |line: &str| {
         line.contains(" shared memory ")
             && line.contains("needs")
-            && line.contains("64.0 MiB in /dev/shm")
+            && line.contains("64 MiB in /dev/shm")
             && !line.starts_with("ok")
     };
     assert!(finished.printed.lines().any(warning), "{}", finished.printed);

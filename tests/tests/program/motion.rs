@@ -2,9 +2,9 @@
 
 use std::path::Path;
 
-use dmprl::motion;
-use dmprl::record::{Observer, measure_motion};
-use dmprl::run_directory::RunDirectory;
+use dmprl_analysis::motion;
+use dmprl_run::RunDirectory;
+use dmprl_sweep::record::{Observer, measure_motion};
 use dmprl_tests::program::{Workplace, executable, rows};
 use dmprl_tests::venv;
 

@@ -1,0 +1,49 @@
+//! Exports a run's policy as one file, for use on a robot.
+//!
+//! `onnx` writes the complete policy as a graph for any ONNX runtime. `safetensors` writes the
+//! project's own format (`dmprl_shared::policy_file`), for Rust and for `dmprl.Policy`.
+
+mod graph;
+mod onnx;
+mod onnx_format;
+
+use anyhow::Context;
+use dmprl_shared::policy::Policy;
+use dmprl_shared::policy_file::{self, Match, OpenedPolicy, Origin};
+
+pub use onnx::onnx;
+
+use dmprl_run::{ChosenPolicy, RunDirectory, Session};
+
+/// Reads a run's policy and its origin.
+///
+/// # Errors
+/// The run has no environment spec yet, or the file is damaged.
+pub fn read_policy(run: &RunDirectory, chosen: &ChosenPolicy) -> anyhow::Result<OpenedPolicy> {
+    let (config, manifest) = (run.config()?, run.manifest()?);
+    let spec = run.spec()?.with_context(|| {
+        format!("run {} has not started an environment yet", run.path().display())
+    })?;
+    // Use the run's configuration: files of older versions contain no description.
+    let policy = Policy::new(&config, &spec)?;
+    let snapshot = policy_file::load(&chosen.path, &policy, Match::Architecture)?;
+    let this = Session::now();
+    let origin = Origin {
+        run_id: manifest.run_id,
+        task: config.task.name,
+        seed: config.run.seed,
+        dmprl_version: this.dmprl_version,
+        git_commit: this.git_commit,
+        return_mean: chosen.row.as_ref().map(|row| row.return_mean),
+        success_rate: chosen.row.as_ref().and_then(|row| row.success_rate),
+    };
+    Ok(OpenedPolicy { policy, snapshot, origin: Some(origin) })
+}
+
+/// Encodes a policy in the project's own format.
+///
+/// # Errors
+/// None is known: the parameters belong to the policy.
+pub fn safetensors(opened: &OpenedPolicy) -> anyhow::Result<Vec<u8>> {
+    Ok(policy_file::encode(&opened.policy, &opened.snapshot, opened.origin.as_ref())?)
+}

@@ -1,0 +1,32 @@
+//! Colours of methods, the same in every picture.
+
+use plotters::style::RGBColor;
+
+/// Okabe and Ito's palette, which is distinguishable with all common types of colour vision. The
+/// yellow is darker here, for a white background.
+const COLOURS: [RGBColor; 8] = [
+    RGBColor(0, 114, 178),
+    RGBColor(213, 94, 0),
+    RGBColor(0, 158, 115),
+    RGBColor(204, 121, 167),
+    RGBColor(230, 159, 0),
+    RGBColor(86, 180, 233),
+    RGBColor(0, 0, 0),
+    RGBColor(150, 140, 0),
+];
+/// Methods with the same colour in every report.
+const KNOWN: [&str; 8] =
+    ["DDPG-DMP", "DDPG-DMP (paper)", "TD3-DMP", "SAC-DMP", "DDPG", "TD3", "SAC", "NDP"];
+
+/// Returns true if a method has its own colour.
+#[must_use]
+pub fn has_colour(method: &str) -> bool {
+    KNOWN.contains(&method)
+}
+
+/// Returns the colour of a method, which has the given index in the report.
+#[must_use]
+pub fn colour(index: usize, method: &str) -> RGBColor {
+    let known = KNOWN.iter().position(|known| *known == method);
+    COLOURS[known.unwrap_or(index) % COLOURS.len()]
+}

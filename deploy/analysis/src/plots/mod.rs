@@ -1,0 +1,13 @@
+//! Stage 8 of 8: the pictures of a run and of a report.
+
+mod axes;
+mod colours;
+mod learning_curve;
+mod png;
+mod small_multiples;
+
+pub(crate) use axes::{Axes, Chart};
+pub use colours::{colour, has_colour};
+pub use learning_curve::learning_curve;
+pub(crate) use png::png;
+pub(crate) use small_multiples::{Panel, SmallMultiples};

@@ -1,0 +1,120 @@
+//! Summarises the runs: how many are finished, when they started and on which machines.
+
+use dmprl_run::format::grouped;
+
+use super::layout::Grid;
+use super::results::Results;
+use super::run::Run;
+
+/// Returns the sentences at the top of a report.
+#[must_use]
+pub fn sentences(results: &Results) -> Vec<String> {
+    let ended = results.runs.iter().filter(|run| run.ended).count();
+    let unfinished = results.runs.len() - ended;
+    let not_started = results.not_started.len();
+    let planned = results.runs.len() + not_started;
+    let mut runs = format!("{ended} of {planned} runs are finished");
+    for (count, what) in [(unfinished, "unfinished"), (not_started, "not started")] {
+        if count > 0 {
+            runs.push_str(&format!(", {count} {what}"));
+        }
+    }
+    runs.push('.');
+    let mut sentences = vec![runs];
+    let mut started: Vec<&str> =
+        results.runs.iter().map(|run| run.origin.started.as_str()).collect();
+    started.sort_unstable();
+    if let (Some(first), Some(last)) = (started.first(), started.last()) {
+        let span = if first == last {
+            format!("at {first}")
+        } else {
+            format!("between {first} and {last}")
+        };
+        sentences.push(format!("Started {span}."));
+    }
+    let machines = results.runs.iter().map(|run| run.origin.machine.clone());
+    sentences.push(format!("Trained on {}.", distinct(machines)));
+    if let Some(first) = results.unmeasured.first() {
+        let count = match results.unmeasured.len() {
+            1 => "1 run".to_owned(),
+            count => format!("{count} runs"),
+        };
+        sentences
+            .push(format!("The motion of {count} was not measured; the first reason: {first}."));
+    }
+    if !results.undrawn.is_empty() {
+        sentences.push(format!("Not drawn: {}.", results.undrawn.join("; ")));
+    }
+    sentences
+}
+
+/// Joins the distinct values, in order, with "; ".
+fn distinct(values: impl Iterator<Item = String>) -> String {
+    let mut known: Vec<String> = Vec::new();
+    for value in values {
+        if !known.contains(&value) {
+            known.push(value);
+        }
+    }
+    known.join("; ")
+}
+
+/// Returns the seeds and steps by task and method.
+#[must_use]
+pub fn runs_table(results: &Results) -> Grid {
+    let cell = |task: &str, method: &str| {
+        let mut runs: Vec<&Run> = results.of(task, method).collect();
+        runs.sort_by_key(|run| run.seed);
+        let seeds_of = |ended: bool| {
+            let seeds = runs.iter().filter(|run| run.ended == ended);
+            let seeds: Vec<_> = seeds.map(|run| run.seed.to_string()).collect();
+            format!("{} {}", if seeds.len() == 1 { "seed" } else { "seeds" }, seeds.join(", "))
+        };
+        let mut lines = Vec::new();
+        if runs.is_empty() {
+            lines.push("not run".to_owned());
+        }
+        if runs.iter().any(|run| run.ended) {
+            lines.push(seeds_of(true));
+        }
+        if runs.iter().any(|run| !run.ended) {
+            lines.push(format!("unfinished: {}", seeds_of(false)));
+        }
+        let mut steps: Vec<u64> = runs.iter().map(|run| run.steps).collect();
+        steps.sort_unstable();
+        steps.dedup();
+        let steps: Vec<_> = steps.into_iter().map(grouped).collect();
+        if !steps.is_empty() {
+            lines.push(format!("{} steps each", steps.join(" or ")));
+        }
+        lines
+    };
+    Grid::of(results, cell)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::fixtures::{FixtureRun, fixture_results};
+    use super::*;
+
+    #[test]
+    fn finished_started_and_missing_runs_are_counted_separately() {
+        let run = |seed, ended| FixtureRun {
+            task: "reacher-v1",
+            method: "DDPG",
+            seed,
+            rows: vec![-9.0, -8.0],
+            ended,
+        };
+        let mut results = fixture_results(&[run(2, true), run(1, true), run(3, false)]);
+        results.not_started = vec![results.runs[0].key(); 7];
+        for (run, machine) in results.runs.iter_mut().zip(["a", "b", "a"]) {
+            run.origin.machine = machine.to_owned();
+        }
+        let sentences = sentences(&results);
+        assert_eq!(sentences[0], "2 of 10 runs are finished, 1 unfinished, 7 not started.");
+        assert_eq!(sentences[2], "Trained on a; b.");
+        let grid = runs_table(&results);
+        assert_eq!(grid.rows[0].1[0], ["seeds 1, 2", "unfinished: seed 3", "2,000 steps each"]);
+    }
+}

@@ -1,0 +1,209 @@
+//! The paper's statements about its results, as rules: the contents of
+//! `deploy/experiments/paper-statements.toml`, which explains them.
+
+use anyhow::Context;
+use serde::Deserialize;
+
+use crate::report::measures::Measure;
+
+/// Compiled in, because the program may run without its repository.
+const FILE: &str = include_str!("../../../../experiments/paper-statements.toml");
+
+/// The paper's own method. A statement about it is evaluated with each of [`SUBJECTS`].
+pub(super) const PROPOSED: &str = "DDPG-DMP of the paper";
+/// Our versions of the paper's method: with the paper's values, and with the defaults.
+pub const SUBJECTS: [&str; 2] = ["DDPG-DMP (paper)", "DDPG-DMP"];
+
+/// All statements, in the paper's order.
+#[derive(Debug, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(super) struct PaperStatements {
+    pub(super) limits: Limits,
+    #[serde(rename = "statement")]
+    pub(super) statements: Vec<Statement>,
+}
+
+impl PaperStatements {
+    /// Parses the compiled-in file.
+    ///
+    /// # Errors
+    /// None is known: a test parses the file.
+    pub(super) fn read() -> anyhow::Result<Self> {
+        toml::from_str(FILE).context("cannot read the paper's statements")
+    }
+}
+
+/// Limits that give the paper's words a meaning.
+#[derive(Debug, Clone, Copy, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Limits {
+    /// Highest success rate that counts as failure.
+    pub failure: f64,
+    /// Lowest success rate that counts as "almost 100 %".
+    pub almost_always: f64,
+    /// Success rate above which a method succeeds more often than not.
+    pub mostly: f64,
+    /// Share of the gain; a smaller loss is noise.
+    pub loss: f64,
+}
+
+/// A statement.
+#[derive(Debug, Clone, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(super) struct Statement {
+    /// Identifies it in the JSON output.
+    pub(super) id: String,
+    /// The task.
+    pub(super) task: String,
+    /// Place in the paper.
+    pub(super) place: String,
+    /// The claim, in our words.
+    pub(super) claim: String,
+    pub(super) rule: Rule,
+}
+
+/// Condition under which a statement holds. `method` is compared with each of `than`.
+#[derive(Debug, Clone, Deserialize)]
+#[serde(tag = "kind", rename_all = "snake_case", deny_unknown_fields)]
+pub(super) enum Rule {
+    /// Better in each of `measures`.
+    Better { measures: Vec<Measure>, method: String, than: Vec<String> },
+    /// A return that is higher by a margin.
+    BetterBy { method: String, margins: Vec<Margin> },
+    /// No two of `methods` clearly differ.
+    Alike { measure: Measure, methods: Vec<String> },
+    /// Reaches the threshold in less than a share of the other's steps.
+    Sooner {
+        method: String,
+        than: Vec<String>,
+        #[serde(default = "whole")]
+        share: f64,
+        reported_steps: Option<ReportedSteps>,
+    },
+    /// Reaches the threshold within `steps`.
+    Within { method: String, steps: u64 },
+    /// None of `methods` succeeds more often than not within `steps`.
+    NoneWithin { methods: Vec<String>, steps: u64 },
+    /// Each of `methods` ends at a success rate of almost 100 %.
+    Succeeds { methods: Vec<String> },
+    /// Ends with failure, after at least `steps`.
+    Fails {
+        method: String,
+        #[serde(default)]
+        steps: u64,
+    },
+    /// Each of `methods` ends no better than its first evaluation.
+    Unimproved { methods: Vec<String> },
+    /// Each of `methods` loses more than a share of its gain, after at least `steps`.
+    Falls {
+        methods: Vec<String>,
+        #[serde(default)]
+        steps: u64,
+    },
+    /// The standard deviation that the paper reports is one that success rates can have.
+    Spread { method: String },
+}
+
+fn whole() -> f64 {
+    1.0
+}
+
+/// Margin by which a return is higher than another method's.
+#[derive(Debug, Clone, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(super) struct Margin {
+    /// The other method.
+    pub(super) than: String,
+    /// Margin in percent of the other method's return.
+    pub(super) percent: f64,
+}
+
+/// Environment steps that the paper reports for both methods.
+#[derive(Debug, Clone, Copy, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(super) struct ReportedSteps {
+    pub(super) method: f64,
+    pub(super) than: f64,
+}
+
+impl Rule {
+    /// Returns whether the rule involves the paper's own method.
+    pub(super) fn is_about_proposed(&self) -> bool {
+        match self {
+            Self::Better { method, than, .. } | Self::Sooner { method, than, .. } => {
+                method == PROPOSED || names_proposed(than)
+            }
+            Self::BetterBy { method, .. }
+            | Self::Within { method, .. }
+            | Self::Fails { method, .. }
+            | Self::Spread { method } => method == PROPOSED,
+            Self::Alike { methods, .. }
+            | Self::NoneWithin { methods, .. }
+            | Self::Succeeds { methods }
+            | Self::Unimproved { methods }
+            | Self::Falls { methods, .. } => names_proposed(methods),
+        }
+    }
+}
+
+fn names_proposed(methods: &[String]) -> bool {
+    methods.iter().any(|method| method == PROPOSED)
+}
+
+#[cfg(test)]
+mod tests {
+    use std::collections::BTreeSet;
+
+    use super::*;
+    use crate::report::thresholds::threshold;
+
+    #[test]
+    fn every_statement_has_an_id_a_place_and_the_threshold_that_it_needs() {
+        let statements = PaperStatements::read().unwrap().statements;
+        assert_eq!(statements.len(), 34);
+        let ids: BTreeSet<&str> = statements.iter().map(|it| it.id.as_str()).collect();
+        assert_eq!(ids.len(), statements.len(), "an id occurs twice");
+        for statement in &statements {
+            assert!(statement.place.starts_with("section 4."), "{}", statement.id);
+            if let Rule::Sooner { .. } | Rule::Within { .. } = statement.rule {
+                assert!(threshold(&statement.task).is_some(), "{}", statement.id);
+            }
+        }
+    }
+
+    #[test]
+    fn every_method_has_a_label_of_the_papers_sweep() {
+        const SWEEP: &str = include_str!("../../../../experiments/paper.toml");
+        let is_known =
+            |method: &str| method == PROPOSED || SWEEP.contains(&format!("label = \"{method}\""));
+        for Statement { id, rule, .. } in PaperStatements::read().unwrap().statements {
+            let methods: Vec<String> = match rule {
+                Rule::Better { method, than, .. } | Rule::Sooner { method, than, .. } => {
+                    [vec![method], than].concat()
+                }
+                Rule::BetterBy { method, margins } => {
+                    let others = margins.into_iter().map(|margin| margin.than);
+                    std::iter::once(method).chain(others).collect()
+                }
+                Rule::Within { method, .. }
+                | Rule::Fails { method, .. }
+                | Rule::Spread { method } => {
+                    vec![method]
+                }
+                Rule::Alike { methods, .. }
+                | Rule::NoneWithin { methods, .. }
+                | Rule::Succeeds { methods }
+                | Rule::Unimproved { methods }
+                | Rule::Falls { methods, .. } => methods,
+            };
+            let unknown: Vec<_> = methods.iter().filter(|method| !is_known(method)).collect();
+            assert!(unknown.is_empty(), "{id}: {unknown:?}");
+        }
+    }
+
+    #[test]
+    fn a_misspelt_key_is_an_error() {
+        let text = FILE.replacen("than = [\"DDPG\"]", "then = [\"DDPG\"]", 1);
+        assert!(toml::from_str::<PaperStatements>(&text).is_err());
+    }
+}

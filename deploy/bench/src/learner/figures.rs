@@ -1,0 +1,255 @@
+//! The report of `dmprl bench learner`: one JSON object for programs, a table for people.
+
+use dmprl_run::{Machine, Manifest};
+use dmprl_shared::config::ExperimentConfig;
+use serde_json::{Map, Value, json};
+
+use super::{LearnerBench, PeerKind};
+use crate::statistics::{load_average, max, median, min};
+
+/// The learner of a run.
+pub(super) const OURS: &str = "ours";
+/// The matrix products by the `gemm` crate.
+pub(super) const LIBRARY: &str = "floor_library";
+/// The matrix products by our own kernels.
+pub(super) const KERNELS: &str = "floor_kernels";
+/// Sampling a batch, alone.
+pub(super) const SAMPLE: &str = "sample";
+/// The optimiser and the target networks, alone.
+pub(super) const OPTIMISER: &str = "optimiser";
+
+/// Duration of one update, or of a part of it.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(crate) struct Timed {
+    /// Wall time \[s\].
+    pub(crate) wall_s: f64,
+    /// Processor time of all threads \[s\], which other programs on the machine affect least.
+    pub(crate) cpu_s: f64,
+}
+
+impl Timed {
+    /// Divides the time of `count` updates by their number.
+    pub(crate) fn over(self, count: f64) -> Self {
+        Self { wall_s: self.wall_s / count, cpu_s: self.cpu_s / count }
+    }
+}
+
+/// Times of each round, with further figures.
+#[derive(Debug, Clone)]
+pub struct Figures {
+    pub(super) config: ExperimentConfig,
+    pub(super) seconds: f64,
+    machine: Option<Machine>,
+    load_average: Option<f64>,
+    /// (name, rounds), without absent candidates.
+    rounds: Vec<(&'static str, Vec<Timed>)>,
+    /// (name, description or reason for absence).
+    pub(super) notes: Vec<(&'static str, String)>,
+    /// Peak resident memory of the learner, including its replay.
+    pub(super) peak_memory_bytes: Option<u64>,
+}
+
+impl Figures {
+    pub(super) fn new(bench: &LearnerBench) -> Self {
+        Self {
+            config: bench.config.clone(),
+            seconds: bench.duration.as_secs_f64(),
+            machine: Manifest::new(None).ok().map(|manifest| manifest.machine),
+            load_average: load_average(),
+            rounds: Vec::new(),
+            notes: Vec::new(),
+            peak_memory_bytes: None,
+        }
+    }
+
+    /// Adds a round of `name`.
+    pub(super) fn add(&mut self, name: &'static str, timed: Timed) {
+        match self.rounds.iter_mut().find(|(known, _)| *known == name) {
+            Some((_, rounds)) => rounds.push(timed),
+            None => self.rounds.push((name, vec![timed])),
+        }
+    }
+
+    /// Describes `name`, or gives the reason for its absence.
+    pub(super) fn note(&mut self, name: &'static str, text: &str) {
+        self.notes.push((name, text.to_owned()));
+    }
+
+    fn rounds(&self, name: &str) -> &[Timed] {
+        let rounds = self.rounds.iter().find(|(known, _)| *known == name);
+        rounds.map_or(&[], |(_, rounds)| rounds)
+    }
+
+    pub(super) fn rounds_len(&self) -> usize {
+        self.rounds(OURS).len()
+    }
+
+    /// Wall time of an update in each round, in milliseconds.
+    pub(super) fn all_ms(&self, name: &str) -> Vec<f64> {
+        self.rounds(name).iter().map(|timed| 1e3 * timed.wall_s).collect()
+    }
+
+    pub(super) fn ms(&self, name: &str) -> Option<f64> {
+        median(&self.all_ms(name))
+    }
+
+    pub(super) fn cpu_ms(&self, name: &str) -> Option<f64> {
+        median(&self.rounds(name).iter().map(|timed| 1e3 * timed.cpu_s).collect::<Vec<_>>())
+    }
+
+    /// Name of the faster implementation of the products, over all rounds.
+    pub(super) fn floor(&self) -> &'static str {
+        let kernels = self.ms(KERNELS) < self.ms(LIBRARY);
+        if kernels { KERNELS } else { LIBRARY }
+    }
+
+    /// The time of `a` divided by that of `b`. It is the median of the rounds' own ratios, because
+    /// a machine's speed drifts less within a round than over all of them.
+    pub(super) fn ratio(&self, a: &str, b: &str, of: impl Fn(&Timed) -> f64) -> Option<f64> {
+        let pairs = self.rounds(a).iter().zip(self.rounds(b));
+        median(&pairs.map(|(a, b)| of(a) / of(b)).collect::<Vec<_>>())
+    }
+
+    /// Wall time of `name` divided by that of our update.
+    pub(super) fn ratio_to_ours(&self, name: &str) -> Option<f64> {
+        self.ratio(name, OURS, |timed| timed.wall_s)
+    }
+
+    /// (part, its share of an update). Each part is measured alone. The rest are activation
+    /// functions, the DMP, losses, noise and synchronisation of the threads.
+    pub(super) fn shares(&self) -> Option<[(&'static str, f64); 4]> {
+        let sample = self.ratio_to_ours(SAMPLE)?;
+        let products = self.ratio_to_ours(self.floor())?;
+        let optimiser = self.ratio_to_ours(OPTIMISER)?;
+        let rest = 1.0 - sample - products - optimiser;
+        Some([("sample", sample), ("products", products), (OPTIMISER, optimiser), ("rest", rest)])
+    }
+
+    /// The figures as one JSON object; unavailable ones are null.
+    #[must_use]
+    pub fn json(&self) -> Value {
+        let floor = self.floor();
+        let (ms, batch_size) = (self.ms(OURS), self.config.algorithm.batch_size);
+        let updates_per_s = ms.map(|ms| 1e3 / ms);
+        let mut object = Map::new();
+        for kind in PeerKind::ALL {
+            let name = kind.name();
+            object.insert(format!("peer_{name}_ms"), self.ms(name).into());
+            object.insert(format!("peer_{name}_to_ours"), self.ratio_to_ours(name).into());
+        }
+        let each = |of: &dyn Fn(&str) -> Value| -> Map<String, Value> {
+            self.rounds.iter().map(|(name, _)| ((*name).to_owned(), of(name))).collect()
+        };
+        let spread = |name: &str| {
+            let all = self.all_ms(name);
+            json!({ "min": min(&all), "max": max(&all) })
+        };
+        let notes: Map<_, _> =
+            self.notes.iter().map(|(name, text)| ((*name).to_owned(), json!(text))).collect();
+        let shares = self
+            .shares()
+            .map(|shares| shares.into_iter().map(|(part, share)| (part.to_owned(), json!(share))));
+        let more = json!({
+            "ms_per_update": ms,
+            "floor_ms": self.ms(floor),
+            "floor": floor.trim_start_matches("floor_"),
+            "floor_library_ms": self.ms(LIBRARY),
+            "floor_kernels_ms": self.ms(KERNELS),
+            "ratio_to_floor": self.ratio(OURS, floor, |timed| timed.wall_s),
+            "cpu_ratio_to_floor": self.ratio(OURS, floor, |timed| timed.cpu_s),
+            "updates_per_s": updates_per_s,
+            "samples_per_s": updates_per_s.map(|rate| rate * batch_size as f64),
+            "batch_size": batch_size,
+            "threads": self.config.learner.threads,
+            "algorithm": self.config.algorithm.name,
+            "policy": self.config.policy.kind,
+            "task": self.config.task.name,
+            "precision": self.config.learner.precision,
+            "critic_layer_norm": self.config.algorithm.critic_layer_norm,
+            "share_of_time": shares.map(|shares| shares.collect::<Map<_, _>>()),
+            "peak_memory_mb": self.peak_memory_bytes.map(|bytes| bytes as f64 / 1e6),
+            "seconds": self.seconds,
+            "rounds": each(&|name| self.all_ms(name).into()),
+            "spread": each(&spread),
+            "cpu_ms_per_update": each(&|name| self.cpu_ms(name).into()),
+            "notes": notes,
+            "cpu": self.machine.as_ref().and_then(|machine| machine.cpu.clone()),
+            "cores": self.machine.as_ref().map(|machine| machine.cores),
+            "load_average": self.load_average,
+        });
+        if let Value::Object(more) = more {
+            object.extend(more);
+        }
+        Value::Object(object)
+    }
+}
+
+#[cfg(test)]
+pub(super) mod tests {
+    use dmprl_shared::config::Limits;
+
+    use super::*;
+
+    pub(in super::super) fn figures() -> Figures {
+        let config = ExperimentConfig::default().resolve(Limits { cores: 2 }).unwrap();
+        let mut figures = Figures {
+            config,
+            seconds: 0.4,
+            machine: None,
+            load_average: None,
+            rounds: Vec::new(),
+            notes: Vec::new(),
+            peak_memory_bytes: Some(50_000_000),
+        };
+        figures.note("torch", "PyTorch, eager");
+        figures.note("jax", "is not installed");
+        // The machine becomes four times, then twice as slow during the measurement.
+        for slow in [1.0, 4.0, 2.0] {
+            for (name, ms) in [
+                (OURS, 5.0),
+                (LIBRARY, 4.5),
+                (KERNELS, 4.0),
+                (SAMPLE, 0.25),
+                (OPTIMISER, 0.5),
+                ("torch", 8.0),
+            ] {
+                let wall_s = 1e-3 * ms * slow;
+                figures.add(name, Timed { wall_s, cpu_s: 0.5 * wall_s });
+            }
+        }
+        figures
+    }
+
+    #[test]
+    fn the_object_has_medians_ratios_shares_and_null_for_what_is_absent() {
+        let json = figures().json();
+        let close = |key: &str, expected: f64| {
+            let got = json[key].as_f64().unwrap();
+            assert!((got - expected).abs() < 1e-9, "{key}: {got}");
+        };
+        close("ms_per_update", 10.0);
+        close("floor_ms", 8.0);
+        close("ratio_to_floor", 1.25);
+        close("cpu_ratio_to_floor", 1.25);
+        close("updates_per_s", 100.0);
+        close("samples_per_s", 25_600.0);
+        close("peer_torch_ms", 16.0);
+        close("peer_torch_to_ours", 1.6);
+        close("peak_memory_mb", 50.0);
+        assert_eq!(json["floor"], "kernels");
+        assert_eq!((&json["batch_size"], &json["threads"]), (&256.into(), &1.into()));
+        for absent in ["peer_jax_ms", "peer_jax_to_ours"] {
+            assert!(json[absent].is_null() && json.get(absent).is_some(), "{absent}");
+        }
+        assert_eq!(json["notes"]["jax"], "is not installed");
+    }
+
+    #[test]
+    fn the_shares_of_an_update_add_up_to_it() {
+        let shares = figures().shares().unwrap();
+        let expected = [0.05, 0.8, 0.1, 0.05];
+        for ((part, got), expected) in shares.iter().zip(expected) {
+            assert!((got - expected).abs() < 1e-9, "{part}: {got}");
+        }
+    }
+}

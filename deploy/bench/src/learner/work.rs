@@ -1,0 +1,138 @@
+//! Measures parts of an update alone: matrix products, sampling, optimiser.
+
+use std::time::{Duration, Instant};
+
+use anyhow::{bail, ensure};
+use dmprl_learner::algorithms::{Batch, BatchShape, SampleSource};
+use dmprl_learner::learner::Learner;
+use dmprl_learner::regime::Regime;
+use dmprl_learner::update::thread_pool::ThreadPool;
+use dmprl_shared::policy::Head;
+use rustix::time::{ClockId, clock_gettime};
+
+use super::figures::Timed;
+use super::floor::{Engine, Floor};
+use super::optimiser::OptimiserSteps;
+use super::products::{Cycle, Product};
+
+/// Divisor for the warm-up before the clock starts. It brings caches and clock frequency to the
+/// state of a long run.
+const SETTLE_SHARE: u32 = 8;
+
+/// Calls `work` repeatedly for `duration` and returns the time of one call.
+pub(crate) fn timed(
+    duration: Duration,
+    mut work: impl FnMut() -> anyhow::Result<()>,
+) -> anyhow::Result<Timed> {
+    let end = Instant::now() + duration / SETTLE_SHARE;
+    while Instant::now() < end {
+        work()?;
+    }
+    let (start, cpu, mut calls) = (Instant::now(), cpu_s(), 0.0);
+    // At least once: on a busy machine the time may be over before the first call.
+    loop {
+        work()?;
+        calls += 1.0;
+        if start.elapsed() >= duration {
+            break;
+        }
+    }
+    let wall_s = start.elapsed().as_secs_f64() / calls;
+    ensure!(wall_s > 0.0, "the clock stood still for {duration:?}");
+    Ok(Timed { wall_s, cpu_s: (cpu_s() - cpu) / calls })
+}
+
+/// Processor time of all threads of this process so far [s].
+fn cpu_s() -> f64 {
+    let time = clock_gettime(ClockId::ProcessCPUTime);
+    time.tv_sec as f64 + time.tv_nsec as f64 * 1e-9
+}
+
+/// The matrix products of an update. Each thread has its share of the rows. Summing the shares'
+/// parts of a weight's gradient is no product and is not included.
+pub(super) struct FloorWork {
+    pool: ThreadPool,
+    shares: Vec<Floor>,
+    updates: f64,
+}
+
+impl FloorWork {
+    pub(super) fn new(learner: &Learner, cycle: &Cycle) -> Self {
+        let threads = learner.config().learner.threads;
+        let Cycle { products, updates } = cycle;
+        let share = |index: usize| {
+            let of = |product: &Product| {
+                let rows = product.rows * (index + 1) / threads - product.rows * index / threads;
+                (rows > 0).then_some(Product { rows, ..*product })
+            };
+            Floor::new(products.iter().filter_map(of))
+        };
+        Self {
+            pool: ThreadPool::new(threads),
+            shares: (0..threads).map(share).collect(),
+            updates: *updates as f64,
+        }
+    }
+
+    pub(super) fn measure(&mut self, engine: Engine, duration: Duration) -> anyhow::Result<Timed> {
+        let Self { pool, shares, updates } = self;
+        let cycle = timed(duration, || {
+            pool.for_each(shares, |floor| floor.run(engine));
+            Ok(())
+        })?;
+        Ok(cycle.over(*updates))
+    }
+}
+
+/// Sampling a batch.
+pub(super) struct SampleWork {
+    batch: Batch,
+    shape: BatchShape,
+    omega: f32,
+}
+
+impl SampleWork {
+    pub(super) fn new(learner: &Learner) -> anyhow::Result<Self> {
+        let Regime::OffPolicy(off_policy) = &learner.regime else {
+            bail!("an on-policy algorithm samples no batch")
+        };
+        let shape = off_policy.algorithm.batch_shape();
+        let omega = match learner.policy().head() {
+            Head::Dmp(head) => head.omega(),
+            Head::Mlp => 1.0,
+        };
+        Ok(Self { batch: Batch::new(shape), shape, omega })
+    }
+
+    pub(super) fn measure(
+        &mut self,
+        learner: &mut Learner,
+        duration: Duration,
+    ) -> anyhow::Result<Timed> {
+        let config = learner.config().algorithm.clone();
+        let Self { batch, shape, omega } = self;
+        timed(duration, || {
+            let Learner { replay, sampler, normaliser, .. } = &mut *learner;
+            let normaliser = normaliser.as_ref();
+            let mut source = SampleSource { replay, sampler, normaliser };
+            Ok(batch.sample(*shape, &config, *omega, &mut source)?)
+        })
+    }
+}
+
+/// The optimiser and the target networks, without the gradients.
+pub(super) struct OptimiserWork(OptimiserSteps);
+
+impl OptimiserWork {
+    pub(super) fn new(learner: &Learner, cycle: &Cycle) -> Self {
+        Self(OptimiserSteps::new(learner, cycle.updates))
+    }
+
+    pub(super) fn measure(&mut self, duration: Duration) -> anyhow::Result<Timed> {
+        let cycle = timed(duration, || {
+            self.0.run();
+            Ok(())
+        })?;
+        Ok(cycle.over(self.0.updates as f64))
+    }
+}

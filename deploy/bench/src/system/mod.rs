@@ -1,0 +1,104 @@
+//! `dmprl bench system`: measures a real `dmprl train` while it learns.
+//!
+//! The run is a normal one, with supervisor, learner and workers, in a folder that is removed
+//! afterwards. Its rates are differences between two lines of its own `metrics.jsonl` (`steady`).
+//! Processor time is read from `/proc` when these lines appear. The measurement excludes the time
+//! before the first line: the start, the warm-up, in which nothing is learned, and a second after
+//! it.
+
+mod figures;
+mod steady;
+
+use std::path::{Path, PathBuf};
+use std::process::Command;
+use std::time::Duration;
+
+use anyhow::{Context, bail};
+use dmprl_run::Manifest;
+use dmprl_run::Progress;
+use dmprl_run::{Interrupted, Watch};
+use dmprl_shared::config::ExperimentConfig;
+use dmprl_supervisor::WholeRun;
+
+pub use figures::Figures;
+#[cfg(test)]
+pub(super) use steady::CpuTime;
+use steady::Steady;
+pub(super) use steady::Window;
+
+/// More steps than any measurement reaches.
+const STEPS: u64 = 1_000_000_000_000;
+/// Maximum number of environment steps between two lines of metrics, at which the measurement
+/// begins and ends.
+const METRICS_STEPS_MAX: u64 = 500;
+
+/// Plan of the benchmark.
+pub struct SystemBench {
+    /// Program of all processes: this one.
+    pub program: PathBuf,
+    /// The resolved configuration.
+    pub config: ExperimentConfig,
+    /// Evaluates the policy as configured if true, never if false.
+    pub evaluate: bool,
+    /// Minimum duration of the measurement.
+    pub duration: Duration,
+}
+
+/// Runs the benchmark; returns `None` if the user interrupted it. Leaves no process and no file
+/// behind.
+///
+/// # Errors
+/// The run cannot be started, ends by itself, or makes no progress.
+pub fn system(bench: &SystemBench, progress: &dyn Progress) -> anyhow::Result<Option<Figures>> {
+    let watch = Watch::start()?;
+    progress.stage("starting the run");
+    let told = |what: &str| progress.stage(what);
+    match measure(bench, &watch, &told) {
+        Err(error) if error.is::<Interrupted>() => Ok(None),
+        result => {
+            let machine = Manifest::new(None)?.machine;
+            Ok(Some(Figures::new(bench, result?, machine)))
+        }
+    }
+}
+
+/// Starts a run and measures its steady state; `told` receives progress messages.
+pub(super) fn measure(
+    bench: &SystemBench,
+    watch: &Watch,
+    told: &dyn Fn(&str),
+) -> anyhow::Result<Window> {
+    let folder = tempfile::Builder::new().prefix("dmprl-bench-").tempdir();
+    let folder = folder.context("cannot make a folder for the run")?;
+    let log = folder.path().join("train.log");
+    let mut train = WholeRun::start(command(bench, folder.path())?, &log)?;
+    let metrics = folder.path().join("run/metrics.jsonl");
+    let measured =
+        Steady::new(&metrics, train.pid()?, bench).until_measured(&mut train, watch, told);
+    // In any case, stop the run as a user would, so that it leaves no process and no shared memory.
+    let wrong = if train.end()?.is_none() { train.stop()? } else { None };
+    let window = measured?;
+    match wrong {
+        Some(how) => bail!("dmprl train did not end as it should: {how}"),
+        None => Ok(window),
+    }
+}
+
+/// `dmprl train` with the complete configuration as a file.
+fn command(bench: &SystemBench, folder: &Path) -> anyhow::Result<Command> {
+    let mut config = bench.config.clone();
+    config.run.steps = STEPS;
+    config.metrics.interval_steps = config.metrics.interval_steps.min(METRICS_STEPS_MAX);
+    // No worker joins a benchmark.
+    config.actors.joined_max = 0;
+    if !bench.evaluate {
+        config.evaluation.interval_steps = STEPS;
+    }
+    let file = folder.join("config.toml");
+    let text = toml::to_string(&config).context("cannot write the configuration as TOML")?;
+    std::fs::write(&file, text).with_context(|| format!("cannot write {}", file.display()))?;
+    let mut command = Command::new(&bench.program);
+    command.arg("train").arg(&config.task.name).arg("--config").arg(&file);
+    command.arg("--run-dir").arg(folder.join("run")).arg("--no-progress");
+    Ok(command)
+}

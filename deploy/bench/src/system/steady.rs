@@ -1,0 +1,179 @@
+//! Measures a run between two lines of its metrics.
+
+use std::path::Path;
+use std::thread;
+use std::time::{Duration, Instant};
+
+use anyhow::{Context, bail};
+use dmprl_learner::metrics::MetricsLine;
+use dmprl_run::Watch;
+use dmprl_run::tail::Tail;
+use dmprl_supervisor::WholeRun;
+use dmprl_supervisor::members::{Role, cpu_s, members};
+use rustix::process::Pid;
+
+use super::SystemBench;
+
+/// Time without a new line after which the run counts as stuck. A start includes importing Python
+/// packages.
+const SILENCE: Duration = Duration::from_secs(300);
+/// Wait after the first update, until buffers, caches and clock frequency are as in a long run.
+const SETTLE_S: f64 = 1.0;
+/// Interval between checks of the file.
+const LOOK: Duration = Duration::from_millis(5);
+
+/// Processor time so far [s].
+#[derive(Debug, Clone, Copy, Default, PartialEq)]
+pub(crate) struct CpuTime {
+    pub(crate) learner_s: f64,
+    /// Of all workers together.
+    pub(crate) workers_s: f64,
+    /// Of supervisor and evaluator.
+    pub(crate) others_s: f64,
+}
+
+impl CpuTime {
+    fn of(supervisor: Pid) -> anyhow::Result<Self> {
+        let mut time = Self { others_s: cpu_s(supervisor).unwrap_or(0.0), ..Self::default() };
+        for member in members(supervisor)? {
+            // A process that has just exited has none.
+            let seconds = cpu_s(member.pid()).unwrap_or(0.0);
+            match member.role {
+                Role::Learner(_) => time.learner_s += seconds,
+                Role::Worker(..) => time.workers_s += seconds,
+                Role::Evaluator => time.others_s += seconds,
+            }
+        }
+        Ok(time)
+    }
+
+    fn since(self, before: Self) -> Self {
+        Self {
+            learner_s: self.learner_s - before.learner_s,
+            workers_s: self.workers_s - before.workers_s,
+            others_s: self.others_s - before.others_s,
+        }
+    }
+}
+
+/// Result of the measurement.
+#[derive(Debug, Clone)]
+pub(crate) struct Window {
+    /// Line at the start of the measurement.
+    pub(crate) first: MetricsLine,
+    /// Line at the end of the measurement.
+    pub(crate) last: MetricsLine,
+    /// Median and maximum of the policy lag, for each line in between.
+    pub(crate) lags: Vec<(u64, u64)>,
+    /// Processor time between the moments at which the two lines were read.
+    pub(crate) cpu: CpuTime,
+    /// Time between these moments [s].
+    pub(crate) seen_s: f64,
+}
+
+impl Window {
+    /// Duration by the learner's clock [s].
+    pub(crate) fn wall_s(&self) -> f64 {
+        self.last.wall_s - self.first.wall_s
+    }
+
+    /// Increase of a counter per second.
+    pub(crate) fn per_s(&self, count: impl Fn(&MetricsLine) -> u64) -> f64 {
+        count(&self.last).saturating_sub(count(&self.first)) as f64 / self.wall_s()
+    }
+
+    /// Samples drawn per environment step inserted.
+    pub(crate) fn samples_per_insert(&self) -> f64 {
+        let samples = |line: &MetricsLine| line.samples_per_insert * line.env_steps as f64;
+        let steps = self.last.env_steps.saturating_sub(self.first.env_steps).max(1);
+        (samples(&self.last) - samples(&self.first)) / steps as f64
+    }
+}
+
+/// Follows the metrics of a run.
+pub(super) struct Steady {
+    tail: Tail,
+    supervisor: Pid,
+    workers: u64,
+    warm_up_steps: u64,
+    duration_s: f64,
+    settled_from: Option<f64>,
+    open: Option<Open>,
+}
+
+/// A measurement in progress.
+struct Open {
+    first: MetricsLine,
+    lags: Vec<(u64, u64)>,
+    cpu: CpuTime,
+    seen: Instant,
+}
+
+impl Steady {
+    pub(super) fn new(metrics: &Path, supervisor: Pid, bench: &SystemBench) -> Self {
+        Self {
+            tail: Tail::new(metrics),
+            supervisor,
+            workers: bench.config.actors.workers as u64,
+            warm_up_steps: bench.config.exploration.warm_up_steps,
+            duration_s: bench.duration.as_secs_f64(),
+            settled_from: None,
+            open: None,
+        }
+    }
+
+    pub(super) fn until_measured(
+        mut self,
+        train: &mut WholeRun,
+        watch: &Watch,
+        told: &dyn Fn(&str),
+    ) -> anyhow::Result<Window> {
+        let mut heard = Instant::now();
+        loop {
+            watch.check()?;
+            let look = self.tail.look()?;
+            for line in look.lines.split(|&byte| byte == b'\n').filter(|line| !line.is_empty()) {
+                heard = Instant::now();
+                let line = serde_json::from_slice(line).context("a damaged line of metrics")?;
+                if let Some(window) = self.take(line, told)? {
+                    return Ok(window);
+                }
+            }
+            if let Some(how) = train.end()? {
+                bail!("dmprl train exited unexpectedly: {how}");
+            }
+            if heard.elapsed() >= SILENCE {
+                bail!("the run wrote no metrics for {SILENCE:?}");
+            }
+            thread::sleep(LOOK);
+        }
+    }
+
+    /// Processes a line; returns the window if it ends the measurement.
+    fn take(&mut self, line: MetricsLine, told: &dyn Fn(&str)) -> anyhow::Result<Option<Window>> {
+        let Some(open) = &mut self.open else {
+            let learns = line.updates > 0 && line.env_steps > self.warm_up_steps;
+            if learns && line.workers >= self.workers {
+                let from = *self.settled_from.get_or_insert_with(|| {
+                    told("the warm-up is over");
+                    line.wall_s
+                });
+                if line.wall_s >= from + SETTLE_S {
+                    told(&format!("measuring for {} s", self.duration_s));
+                    let cpu = CpuTime::of(self.supervisor)?;
+                    let seen = Instant::now();
+                    self.open = Some(Open { first: line, lags: Vec::new(), cpu, seen });
+                }
+            }
+            return Ok(None);
+        };
+        open.lags.extend(line.policy_lag_p50.zip(line.policy_lag_max));
+        if line.wall_s < open.first.wall_s + self.duration_s {
+            return Ok(None);
+        }
+        let cpu = CpuTime::of(self.supervisor)?.since(open.cpu);
+        let seen_s = open.seen.elapsed().as_secs_f64();
+        let (first, lags) = (open.first.clone(), std::mem::take(&mut open.lags));
+        Ok(Some(Window { first, last: line, lags, cpu, seen_s }))
+    }
+}

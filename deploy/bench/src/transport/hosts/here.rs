@@ -1,0 +1,240 @@
+//! The learner's end of the benchmark between hosts.
+
+use std::collections::VecDeque;
+use std::path::Path;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::{Arc, Mutex, PoisonError};
+use std::thread::{self, JoinHandle};
+use std::time::{Duration, Instant};
+
+use anyhow::{anyhow, bail};
+use dmprl_bridge::gateway::{Gateway, GatewayEvent, GatewaySettings, RunFacts};
+use dmprl_bridge::wire::RunState;
+use dmprl_run::Watch;
+use dmprl_run::say;
+use dmprl_shared::config::TASKS;
+use dmprl_shared::parameters::ParameterSnapshot;
+use dmprl_shared::segment::{Segment, check};
+use dmprl_shared::transport::delivery::Inbox;
+use dmprl_shared::transport::shared_memory::{LearnerEnd, serve};
+use dmprl_shared::transport::{AcknowledgementPublisher, ParameterPublisher, SegmentReceiver};
+use serde_json::{Value, json};
+
+use super::{IDLE, INTERVAL, KEPT, PARAMETERS, PATIENCE, TOKEN, domain, plan};
+use crate::statistics::{max, median};
+use crate::synthetic_segments::BETWEEN_HOSTS;
+
+const WORKERS_MAX: usize = 64;
+const PUBLISH_INTERVAL: Duration = Duration::from_millis(300);
+/// Time from the first segment until the clock starts, in which the window grows.
+const SETTLE: Duration = Duration::from_secs(3);
+/// Number of times that the end is announced, because a message can be lost on a full link.
+const GOODBYES: u32 = 10;
+
+/// Acts as the learner for `duration`, at a Zenoh endpoint; returns `None` if interrupted.
+///
+/// # Errors
+/// The endpoint is in use, no host connects, or an end fails.
+pub fn listen(
+    endpoint: &str,
+    zenoh_file: Option<&Path>,
+    duration: Duration,
+) -> anyhow::Result<Option<Value>> {
+    let watch = Watch::start()?;
+    let domain = domain()?;
+    let mut taker = Taker::new(serve(domain.path(), &plan(WORKERS_MAX))?);
+    let policies = Arc::new(Policies::default());
+    let gateway = start_gateway(&policies, (endpoint, zenoh_file), domain.path());
+    let began = Instant::now();
+    let ended = loop {
+        if watch.check().is_err() {
+            break None;
+        }
+        taker.turn(&policies)?;
+        if policies.has_confirmed() {
+            // A host without workers only receives policies.
+            taker.first.get_or_insert_with(Instant::now);
+        }
+        if gateway.is_finished() {
+            break Some(0.0);
+        }
+        match taker.first {
+            Some(first) if first.elapsed() >= SETTLE + duration => {
+                break Some((first.elapsed() - SETTLE).as_secs_f64());
+            }
+            None if began.elapsed() >= PATIENCE => bail!("no host connected to {endpoint}"),
+            _ => {}
+        }
+    };
+    policies.over.store(true, Ordering::Release);
+    gateway.join().map_err(|_| anyhow!("the gateway has panicked"))??;
+    let Some(seconds) = ended else { return Ok(None) };
+    let ages_ms = policies.ages_ms.lock().unwrap_or_else(PoisonError::into_inner).clone();
+    Ok(Some(json!({
+        "segment_bytes": BETWEEN_HOSTS.bytes,
+        "segments_per_s": taker.taken as f64 / seconds,
+        "lost": taker.lost,
+        "sent_again": taker.repeated,
+        "refused": taker.refused,
+        "seconds": seconds,
+        "policy_bytes": PARAMETERS * size_of::<f32>(),
+        "policies": ages_ms.len(),
+        "policy_ms_median": median(&ages_ms),
+        "policy_ms_max": (!ages_ms.is_empty()).then(|| max(&ages_ms)),
+    })))
+}
+
+/// Policies in flight, and their latencies.
+#[derive(Default)]
+struct Policies {
+    over: AtomicBool,
+    /// Version and time of each policy that no host has confirmed.
+    under_way: Mutex<VecDeque<(u64, Instant)>>,
+    /// Time from publishing to the other host's confirmation, including the way back \[ms\].
+    ages_ms: Mutex<Vec<f64>>,
+}
+
+impl Policies {
+    fn publish(&self, version: u64) {
+        let mut under_way = self.under_way.lock().unwrap_or_else(PoisonError::into_inner);
+        under_way.push_back((version, Instant::now()));
+    }
+
+    fn has_confirmed(&self) -> bool {
+        !self.ages_ms.lock().unwrap_or_else(PoisonError::into_inner).is_empty()
+    }
+
+    /// Records a confirmation. It also covers earlier versions, which were replaced on the way.
+    fn confirm(&self, version: u64) {
+        let mut under_way = self.under_way.lock().unwrap_or_else(PoisonError::into_inner);
+        let arrived = under_way.iter().take_while(|(first, _)| *first <= version).count();
+        if let Some((_, since)) = under_way.drain(..arrived).next_back() {
+            let age_ms = since.elapsed().as_secs_f64() * 1e3;
+            self.ages_ms.lock().unwrap_or_else(PoisonError::into_inner).push(age_ms);
+        }
+    }
+}
+
+/// Takes, checks, settles and acknowledges segments, and publishes policies.
+struct Taker {
+    end: LearnerEnd,
+    inbox: Inbox,
+    segment: Segment,
+    told: Instant,
+    published: Option<Instant>,
+    first: Option<Instant>,
+    version: u64,
+    taken: u64,
+    lost: u64,
+    repeated: u64,
+    refused: u64,
+}
+
+impl Taker {
+    fn new(end: LearnerEnd) -> Self {
+        Self {
+            end,
+            inbox: Inbox::new(WORKERS_MAX),
+            segment: Segment::zeroed(BETWEEN_HOSTS.layout),
+            told: Instant::now(),
+            published: None,
+            first: None,
+            version: 0,
+            taken: 0,
+            lost: 0,
+            repeated: 0,
+            refused: 0,
+        }
+    }
+
+    fn turn(&mut self, policies: &Policies) -> anyhow::Result<()> {
+        if self.end.segments.try_receive(&mut self.segment)? {
+            self.take();
+        } else {
+            thread::sleep(IDLE);
+        }
+        let due = self.told.elapsed() >= INTERVAL;
+        if due || self.inbox.owes_acknowledgement() {
+            self.end.acknowledgements.acknowledge(self.inbox.acknowledge()?)?;
+        }
+        if due {
+            self.told = Instant::now();
+            self.end.segments.maintain()?;
+            self.end.parameters.maintain()?;
+            self.end.acknowledgements.maintain()?;
+        }
+        if self.published.is_none_or(|at| at.elapsed() >= PUBLISH_INTERVAL) {
+            self.published = Some(Instant::now());
+            self.version += 1;
+            let version = self.version;
+            policies.publish(version);
+            let values = vec![version as f32; PARAMETERS];
+            let architecture_hash = plan(1).architecture_hash;
+            let env_steps = self.taken;
+            let snapshot = ParameterSnapshot { version, env_steps, architecture_hash, values };
+            self.end.parameters.publish(&snapshot)?;
+        }
+        Ok(())
+    }
+
+    fn take(&mut self) {
+        let since = *self.first.get_or_insert_with(Instant::now);
+        let Segment { header, block } = &self.segment;
+        if check(header, block, &BETWEEN_HOSTS.expected(WORKERS_MAX as u32)).is_err() {
+            self.refused += 1;
+            return;
+        }
+        match self.inbox.settle(header, block) {
+            Ok(gap) => {
+                self.lost += gap;
+                self.taken += u64::from(since.elapsed() >= SETTLE);
+            }
+            Err(_) => self.repeated += 1,
+        }
+    }
+}
+
+fn start_gateway(
+    policies: &Arc<Policies>,
+    (endpoint, zenoh_file): (&str, Option<&Path>),
+    domain: &Path,
+) -> JoinHandle<anyhow::Result<()>> {
+    let policies = Arc::clone(policies);
+    let (endpoints, domain) = ([endpoint.to_owned()], domain.to_owned());
+    let zenoh_file = zenoh_file.map(Path::to_owned);
+    thread::spawn(move || {
+        let facts = RunFacts {
+            run_id: format!("{:016x}", plan(1).run_id),
+            config: String::new(),
+            // Never requested.
+            spec: TASKS[0].spec(),
+            token: TOKEN.to_owned(),
+        };
+        let settings = GatewaySettings {
+            endpoints: &endpoints,
+            zenoh_file: zenoh_file.as_deref(),
+            domain: &domain,
+            plan: plan(WORKERS_MAX),
+            first_worker: 0,
+            session: 0,
+            segments_max: KEPT,
+        };
+        let mut gateway = Gateway::open(settings, facts)?;
+        while !policies.over.load(Ordering::Acquire) {
+            if !gateway.turn()? {
+                thread::sleep(IDLE);
+            }
+            gateway.policy_versions().for_each(|version| policies.confirm(version));
+            for event in gateway.take_events() {
+                if let GatewayEvent::Notice(notice) = event {
+                    say(&notice);
+                }
+            }
+        }
+        for _ in 0..GOODBYES {
+            gateway.send_acks(RunState::Complete)?;
+            thread::sleep(INTERVAL);
+        }
+        Ok(())
+    })
+}

@@ -1,0 +1,192 @@
+//! `dmprl bench transport`: compares segments per second through shared memory and other channels.
+//!
+//! Processes of this program only send (`worker`, `synthetic_segments`). The receiver of `bench
+//! rollout` acts as the learner: it checks, settles and acknowledges (`ours`). The peers are pipes
+//! and sockets between the same processes (`streams`) and queues between Python processes
+//! (`python`). In every round each runs once for the same time while the others sleep on a full
+//! channel; medians over the rounds count (`figures`). Finally the processor time of blocked
+//! workers is measured, while nothing takes their segments.
+
+mod figures;
+mod hosts;
+mod ours;
+mod python;
+mod streams;
+mod worker;
+
+use std::path::PathBuf;
+use std::process::Command;
+use std::time::{Duration, Instant};
+
+use anyhow::Context;
+use dmprl_run::Manifest;
+use dmprl_run::Progress;
+use dmprl_run::{Interrupted, Watch};
+use dmprl_shared::config::DeliveryLevel;
+
+use crate::announce_round;
+
+pub use figures::Figures;
+pub use hosts::{connect, listen};
+pub use worker::{TransportWorkerArgs, transport_worker};
+
+use super::synthetic_segments::{SIZES, Size};
+use figures::OURS;
+use ours::Ours;
+use python::PythonPeer;
+use streams::{StreamKind, StreamPeer};
+
+/// Time in which a blocked worker's wait grows to its maximum.
+const BLOCKED_SETTLE: Duration = Duration::from_millis(200);
+/// Duration of the measurement of blocked workers.
+const BLOCKED: Duration = Duration::from_millis(1_500);
+/// Maximum delay until an interrupt is noticed during that measurement.
+const BLOCKED_LOOK: Duration = Duration::from_millis(20);
+
+/// Plan of the benchmark.
+pub struct TransportBench {
+    /// Program of the worker processes: this one.
+    pub program: PathBuf,
+    /// Number of processes that send through shared memory; a peer has one.
+    pub workers: u32,
+    /// Delivery level, which determines when our workers may drop a segment.
+    pub level: DeliveryLevel,
+    /// Python interpreter of the peers in Python.
+    pub peer_python: PathBuf,
+    /// Folder with the Python package.
+    pub package_path: PathBuf,
+    /// Number of rounds.
+    pub rounds: usize,
+    /// Duration of each measurement.
+    pub duration: Duration,
+}
+
+/// Runs the benchmark; returns `None` if the user interrupted it. Leaves no process and no file
+/// behind.
+///
+/// # Errors
+/// A worker or a peer cannot be started or dies.
+pub fn transport(
+    bench: &TransportBench,
+    progress: &dyn Progress,
+) -> anyhow::Result<Option<Figures>> {
+    match measure(bench, progress) {
+        Err(error) if error.is::<Interrupted>() => Ok(None),
+        result => result.map(Some),
+    }
+}
+
+fn measure(bench: &TransportBench, progress: &dyn Progress) -> anyhow::Result<Figures> {
+    let watch = Watch::start()?;
+    let folder = tempfile::Builder::new().prefix("dmprl-bench-").tempdir();
+    let folder = folder.context("cannot make a folder for logs and sockets")?;
+    let manifest = Manifest::new(None)?;
+    let token = format!("{}-{}", &manifest.run_id[..8], std::process::id());
+    progress.stage("starting workers and peers");
+    let mut figures = Figures::new(bench, manifest.machine);
+    let place = (folder.path(), &watch);
+    // Start all at once: importing Python packages takes longest.
+    let mut pythons = Vec::new();
+    for size in SIZES {
+        for name in python::NAMES {
+            match PythonPeer::start(name, size, bench, folder.path()) {
+                Ok(peer) => pythons.push((size, peer)),
+                // For example, --peer-python is no program.
+                Err(error) => figures.note(name, &format!("{error:#}")),
+            }
+        }
+    }
+    let mut sizes = Vec::new();
+    for (number, size) in SIZES.into_iter().enumerate() {
+        let command = || {
+            let mut command = Command::new(&bench.program);
+            command.args(["transport-worker", "--segment-bytes", &size.bytes.to_string()]);
+            command
+        };
+        let token = format!("{number}{token}");
+        let ours = Ours::start(size, (bench.workers, &token), &command, bench.level, place)?;
+        let start = |kind| StreamPeer::start(kind, size, command(), place);
+        let streams = StreamKind::ALL.map(start).into_iter().collect::<anyhow::Result<Vec<_>>>()?;
+        sizes.push(Contest { ours, streams, pythons: Vec::new() });
+    }
+    for kind in StreamKind::ALL {
+        figures.note(kind.name(), kind.about());
+    }
+    for (size, mut peer) in pythons {
+        let ready = peer.ready(&watch)?;
+        figures.note(peer.name, ready.as_ref().unwrap_or_else(|why| why));
+        let contest = sizes.iter_mut().find(|contest| contest.ours.size.bytes == size.bytes);
+        if let (Ok(_), Some(contest)) = (ready, contest) {
+            contest.pythons.push(peer);
+        }
+    }
+    for round in 0..bench.rounds {
+        announce_round(progress, round, bench.rounds);
+        for contest in &mut sizes {
+            contest.round(&watch, bench.duration, progress, &mut figures)?;
+        }
+    }
+    progress.detail("blocked workers");
+    figures.blocked_cpu_fraction = blocked(&sizes, &watch)?;
+    for contest in sizes {
+        let bytes = contest.ours.size.bytes;
+        figures.discrepancies.push((bytes, contest.ours.finish(&watch)?));
+    }
+    Ok(figures)
+}
+
+/// All transports of segments of one size.
+struct Contest {
+    ours: Ours,
+    streams: Vec<StreamPeer>,
+    pythons: Vec<PythonPeer>,
+}
+
+impl Contest {
+    fn round(
+        &mut self,
+        watch: &Watch,
+        duration: Duration,
+        progress: &dyn Progress,
+        figures: &mut Figures,
+    ) -> anyhow::Result<()> {
+        let Size { bytes, .. } = self.ours.size;
+        for peer in &mut self.pythons {
+            progress.detail(peer.name);
+            figures.add(bytes, peer.name, peer.measure(watch, duration)?);
+        }
+        for peer in &mut self.streams {
+            progress.detail(peer.kind.name());
+            figures.add(bytes, peer.kind.name(), peer.measure(watch, duration)?);
+        }
+        progress.detail(OURS);
+        let window = self.ours.measure(watch, duration)?;
+        figures.add(bytes, OURS, window.segments as f64 / window.seconds);
+        figures.add_sink_share(bytes, window.cpu_s / window.seconds);
+        Ok(())
+    }
+}
+
+/// Fraction of a core that the busiest worker uses while nothing takes its segments.
+fn blocked(sizes: &[Contest], watch: &Watch) -> anyhow::Result<Option<f64>> {
+    wait(watch, BLOCKED_SETTLE)?;
+    let cpu_s = || -> Option<Vec<f64>> {
+        let each: Option<Vec<_>> = sizes.iter().map(|contest| contest.ours.cpu_s()).collect();
+        each.map(|each| each.concat())
+    };
+    let (start, before) = (Instant::now(), cpu_s());
+    wait(watch, BLOCKED)?;
+    let (seconds, after) = (start.elapsed().as_secs_f64(), cpu_s());
+    let Some((before, after)) = before.zip(after) else { return Ok(None) };
+    let shares = before.iter().zip(&after).map(|(before, after)| (after - before) / seconds);
+    Ok(shares.reduce(f64::max))
+}
+
+fn wait(watch: &Watch, duration: Duration) -> anyhow::Result<()> {
+    let end = Instant::now() + duration;
+    while Instant::now() < end {
+        watch.check()?;
+        std::thread::sleep(BLOCKED_LOOK);
+    }
+    Ok(())
+}

@@ -1,0 +1,277 @@
+//! `dmprl bridge`: runs workers on this host for a run whose learner is on another.
+
+use std::path::{Path, PathBuf};
+use std::time::{Duration, Instant};
+
+use anyhow::{Context, bail};
+use clap::Args;
+use dmprl_bridge::host_messages::HostWelcome;
+use dmprl_bridge::join::{JoinOutcome, JoinSettings, request_join};
+use dmprl_bridge::{Link, LinkMode, token};
+use dmprl_run::Watch;
+use dmprl_run::failure::{Outcome, wrong_use};
+use dmprl_run::format::grouped;
+use dmprl_run::say;
+use dmprl_run::write_line;
+use dmprl_run::{
+    Manifest, RunDirectory, RunLock, Session, compact_now, random_u64, replace_file, safe_name,
+};
+use dmprl_shared::config::{ExperimentConfig, Limits};
+use dmprl_supervisor::capacity;
+use dmprl_supervisor::{self as launch, Ending, HostPlan, SessionReport, Upstream};
+
+use super::configuration::refuse;
+use super::output::{OutputArgs, host_observer};
+use super::{cores, prepare_python, this_program};
+use crate::terminal::{ProgressStyle, events};
+
+/// Interval between two join requests.
+const JOIN_INTERVAL: Duration = Duration::from_millis(500);
+
+/// Wait for the processes of a killed bridge to exit. They do so at once, unless the machine is
+/// very busy.
+const LEFT_OVER: Duration = Duration::from_secs(60);
+/// File in a bridge's directory with the number by which the learner's host knows this one.
+const HOST_FILE: &str = "bridge.host";
+
+const HELP: &str = "\
+On the learner's host, start the run with bridge.listen. Copy its token, bridge.token in the run's
+directory, to the other hosts; only its owner may have access to the file:
+  dmprl train reacher --set 'bridge.listen=[\"tcp/0.0.0.0:7447\"]' --run-dir runs/mine
+This host needs the same version of dmprl, and the run's environments. It receives configuration and
+policies from the learner's host, waits while it is unreachable, and exits when the run ends. On
+Ctrl-C the workers' last segments are delivered, and the other hosts continue; a second Ctrl-C exits
+at once. Exit status: 0 the run has ended, 130 interrupted, 2 rejected, 1 failed or waited longer
+than --patience.
+
+EXAMPLES
+  dmprl bridge --connect tcp/10.0.0.1:7447 --token-file bridge.token
+  dmprl bridge --connect tcp/10.0.0.1:7447 --token-file bridge.token --workers 16 --name gpu3
+  dmprl bridge --connect tls/learner.lab:7447 --token-file bridge.token --zenoh-config tls.json5";
+
+/// Arguments of `dmprl bridge`.
+#[derive(Debug, Args)]
+#[command(after_help = HELP)]
+pub(super) struct BridgeArgs {
+    /// Zenoh endpoint of the learner's host: tcp/ADDRESS:PORT or tls/ADDRESS:PORT.
+    #[arg(long, value_name = "ENDPOINT")]
+    connect: String,
+    /// File with the run's token, mode 0600.
+    #[arg(long, value_name = "FILE")]
+    token_file: PathBuf,
+    /// Workers on this host [default: one per core].
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u16).range(1..=1024))]
+    workers: Option<u16>,
+    /// Name of this host in the run's displays [default: the host's name].
+    #[arg(long)]
+    name: Option<String>,
+    /// Directory for this host's logs; may be that of an earlier bridge of the same run [default:
+    /// runs/bridge-NAME-TIME].
+    #[arg(long, value_name = "DIR")]
+    run_dir: Option<PathBuf>,
+    /// Directory of your own environment modules on this host; repeatable.
+    #[arg(long, value_name = "DIR")]
+    python_path: Vec<PathBuf>,
+    /// Zenoh configuration file (JSON5), for certificates.
+    #[arg(long, value_name = "FILE")]
+    zenoh_config: Option<PathBuf>,
+    /// How long to wait while the learner's host is unreachable [min].
+    #[arg(long, value_name = "M", default_value_t = 60,
+          value_parser = clap::value_parser!(u64).range(1..=1_000_000))]
+    patience: u64,
+    #[command(flatten)]
+    pub(super) output: OutputArgs,
+}
+
+pub(super) fn run(args: &BridgeArgs) -> anyhow::Result<Outcome> {
+    let absolute = |path: &PathBuf| {
+        std::path::absolute(path).with_context(|| format!("cannot resolve {}", path.display()))
+    };
+    let zenoh_file = args.zenoh_config.as_ref().map(absolute).transpose()?;
+    let token_file = absolute(&args.token_file)?;
+    let workers = args.workers.map_or_else(cores, usize::from);
+    let earlier = earlier(args)?;
+    let join = JoinSettings {
+        endpoint: endpoint(&args.connect)?,
+        token: token::read(&token_file)?,
+        host: earlier.as_ref().map_or_else(random_u64, |(_, host)| Ok(*host))?,
+        name: args.name.clone().unwrap_or_else(host_name),
+        workers: u32::try_from(workers).context("too many workers")?,
+    };
+    let patience = Duration::from_secs(args.patience * 60);
+    let venv = prepare_python()?;
+    let asked = wait_for_welcome(&join, zenoh_file.as_deref(), patience);
+    let Some(welcome) = asked? else { return Ok(Outcome::Interrupted) };
+    let config = host_config(&welcome, workers, &args.python_path)?;
+    capacity::check(&config, Some(&welcome.spec))?;
+    let run = run_directory(args, &join.name, &welcome, &config)?;
+    let lock = match earlier {
+        Some((lock, _)) => lock,
+        None => run.lock(Duration::ZERO)?,
+    };
+    replace_file(&run.path().join(HOST_FILE), format!("{:016x}", join.host).as_bytes())?;
+    let upstream = Upstream {
+        endpoint: join.endpoint,
+        token_file,
+        host: join.host,
+        name: join.name,
+        first: welcome.lease.first,
+        zenoh_file,
+        patience_s: patience.as_secs(),
+    };
+    let (program, session) = (this_program()?, welcome.lease.session);
+    let style = args.output.style();
+    let mut observer = host_observer(style, config.run.steps);
+    let plan = HostPlan { program, run, config, venv, upstream, session };
+    let report = launch::host(plan, observer.as_mut())?;
+    drop(lock);
+    conclude(report, style)
+}
+
+fn conclude(report: SessionReport, style: ProgressStyle) -> anyhow::Result<Outcome> {
+    if style == ProgressStyle::Events {
+        write_line(&events::finished(&report));
+    }
+    let segments = report.last.as_ref().map_or(0, |progress| progress.segments);
+    let (outcome, what) = match report.ending {
+        Ending::Failed(error) => return Err(error),
+        Ending::Interrupted => (Outcome::Interrupted, "left the run"),
+        Ending::Completed => (Outcome::Done, "the run has ended"),
+    };
+    if style != ProgressStyle::Events {
+        say(&format!("{what}: {} segments acknowledged", grouped(segments)));
+    }
+    Ok(outcome)
+}
+
+/// Locks the directory of an earlier bridge and reads its number. With it a restarted bridge gets
+/// its places back at once; without it they would stay reserved for minutes.
+fn earlier(args: &BridgeArgs) -> anyhow::Result<Option<(RunLock, u64)>> {
+    let Some(path) = args.run_dir.as_deref().filter(|path| path.join(HOST_FILE).is_file()) else {
+        return Ok(None);
+    };
+    let lock = RunDirectory::open(path)?.lock(LEFT_OVER)?;
+    let file = path.join(HOST_FILE);
+    let read = || format!("cannot read {}", file.display());
+    let text = std::fs::read_to_string(&file).with_context(read)?;
+    Ok(Some((lock, u64::from_str_radix(text.trim(), 16).with_context(read)?)))
+}
+
+fn endpoint(text: &str) -> anyhow::Result<String> {
+    let known = text.split_once('/').is_some_and(|(protocol, address)| {
+        ["tcp", "tls"].contains(&protocol) && address.contains(':')
+    });
+    if known {
+        return Ok(text.to_owned());
+    }
+    Err(wrong_use(format!(
+        "--connect {text}: expected tcp/ADDRESS:PORT or tls/ADDRESS:PORT, such as \
+         tcp/10.0.0.1:7447"
+    )))
+}
+
+fn host_name() -> String {
+    let name = rustix::system::uname().nodename().to_string_lossy().into_owned();
+    if name.is_empty() { "host".to_owned() } else { name }
+}
+
+/// Asks the learner's host until it accepts this one; `None` on interrupt.
+fn wait_for_welcome(
+    join: &JoinSettings,
+    zenoh_file: Option<&Path>,
+    patience: Duration,
+) -> anyhow::Result<Option<HostWelcome>> {
+    let watch = Watch::start()?;
+    let link = Link::open(LinkMode::Connect(&join.endpoint), zenoh_file)?;
+    let (began, mut told) = (Instant::now(), String::new());
+    loop {
+        if watch.check().is_err() {
+            return Ok(None);
+        }
+        match request_join(&link, join, None)? {
+            JoinOutcome::Welcome(welcome) => return Ok(Some(*welcome)),
+            JoinOutcome::Refused(reason) => {
+                return Err(wrong_use(format!(
+                    "the learner's host at {} refuses: {reason}",
+                    join.endpoint
+                )));
+            }
+            JoinOutcome::Later(reason) if began.elapsed() >= patience => {
+                bail!("waited {} min: {reason}", patience.as_secs() / 60)
+            }
+            JoinOutcome::Later(reason) => {
+                if reason != told {
+                    let minutes = patience.as_secs() / 60;
+                    say(&format!("{reason}; waiting for at most {minutes} min"));
+                    told = reason;
+                }
+            }
+        }
+        std::thread::sleep(JOIN_INTERVAL);
+    }
+}
+
+/// Adapts the run's configuration to this host.
+fn host_config(
+    welcome: &HostWelcome,
+    workers: usize,
+    python_path: &[PathBuf],
+) -> anyhow::Result<ExperimentConfig> {
+    let mut config: ExperimentConfig =
+        toml::from_str(&welcome.config).context("the learner's host sent no configuration")?;
+    config.actors.workers = workers;
+    config.actors.joined_max = 0;
+    config.bridge.listen.clear();
+    config.demonstrations.files.clear();
+    // This host has no replay.
+    config.replay.capacity_steps = 1_000;
+    config.run.max_minutes = f64::INFINITY;
+    if !python_path.is_empty() {
+        let absolute = |path: &PathBuf| {
+            let path = std::fs::canonicalize(path)
+                .map_err(|error| wrong_use(format!("--python-path {}: {error}", path.display())))?;
+            Ok(path.display().to_string())
+        };
+        config.task.python_path =
+            python_path.iter().map(absolute).collect::<anyhow::Result<_>>()?;
+    }
+    if let Some(gone) = config.task.python_path.iter().find(|path| !Path::new(path).is_dir()) {
+        return Err(wrong_use(format!(
+            "the run's environments are in {gone} on the learner's host, which is not here: say \
+             with --python-path where they are on this host"
+        )));
+    }
+    config.resolve(Limits { cores: cores() }).map_err(refuse)
+}
+
+/// Creates this bridge's run directory, or opens that of an earlier bridge of the same run.
+fn run_directory(
+    args: &BridgeArgs,
+    name: &str,
+    welcome: &HostWelcome,
+    config: &ExperimentConfig,
+) -> anyhow::Result<RunDirectory> {
+    let named = format!("bridge-{}-{}", safe_name(name), compact_now());
+    let path = args.run_dir.clone().unwrap_or_else(|| Path::new("runs").join(named));
+    let run = if path.join("manifest.json").is_file() {
+        let run = RunDirectory::open(&path)?;
+        let mut manifest = run.manifest()?;
+        if manifest.run_id != welcome.run_id {
+            return Err(wrong_use(format!(
+                "{} is of run {}, the learner's host trains run {}: choose another --run-dir",
+                path.display(),
+                manifest.run_id,
+                welcome.run_id
+            )));
+        }
+        manifest.sessions.push(Session::now());
+        run.write_manifest(&manifest)?;
+        run.write_config(config)?;
+        run
+    } else {
+        let manifest = Manifest { run_id: welcome.run_id.clone(), ..Manifest::new(None)? };
+        RunDirectory::create(&path, config, &manifest)?
+    };
+    run.write_spec(&welcome.spec)?;
+    Ok(run)
+}

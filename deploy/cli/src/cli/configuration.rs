@@ -1,0 +1,356 @@
+//! Stage 1 of 8, the command's side: merges task, preset, file, environment variables and flags
+//! into one configuration.
+
+use std::path::Path;
+
+use anyhow::Context;
+use dmprl_run::failure::wrong_use;
+use dmprl_shared::config::{
+    ConfigError, ExperimentConfig, Layers, PRESETS, TASKS, algorithm_defaults, nearest,
+    policy_defaults, task_defaults,
+};
+use toml::{Table, Value};
+
+const PREFIX: &str = "DMPRL_";
+/// Size limit of a configuration file, which has a few kilobytes.
+const FILE_BYTES_MAX: u64 = 1 << 20;
+
+/// A key that is set by its own flag.
+#[derive(Debug)]
+pub(super) struct Flag {
+    /// The flag as typed, for error messages.
+    pub(super) flag: &'static str,
+    /// Dotted configuration key.
+    pub(super) key: &'static str,
+    /// Value to set.
+    pub(super) value: Value,
+}
+
+/// All sources of a configuration, lowest precedence first.
+#[derive(Debug)]
+pub(super) struct Sources<'a> {
+    pub(super) task: &'a str,
+    pub(super) preset: &'a str,
+    pub(super) file: Option<&'a Path>,
+    /// All environment variables; those without our prefix are ignored.
+    pub(super) environment: Vec<(String, String)>,
+    /// `key=value` pairs of `--set`, in the order given.
+    pub(super) set: &'a [String],
+    /// Keys set by flags; they override `--set`.
+    pub(super) flags: Vec<Flag>,
+}
+
+/// Merges the sources. Every mistake in them is wrong use.
+///
+/// Policy and algorithm are known only after merging. The policy's own defaults override the
+/// task's, and the algorithm's override the preset: if there are any, the sources are merged once
+/// more with them.
+pub(super) fn merge(sources: &Sources<'_>) -> anyhow::Result<ExperimentConfig> {
+    let config = merge_with(&Own::default(), sources)?;
+    let own = Own {
+        policy: policy_defaults(config.policy.kind),
+        algorithm: algorithm_defaults(config.algorithm.name),
+    };
+    match own {
+        Own { policy: None, algorithm: None } => Ok(config),
+        own => merge_with(&own, sources),
+    }
+}
+
+/// Defaults of the policy and of the algorithm.
+#[derive(Debug, Default)]
+struct Own {
+    policy: Option<Table>,
+    algorithm: Option<Table>,
+}
+
+fn merge_with(own: &Own, sources: &Sources<'_>) -> anyhow::Result<ExperimentConfig> {
+    let mut layers = Layers::new();
+    add(&mut layers, sources.task, task_table(sources.task)?)?;
+    add(&mut layers, "policy defaults", own.policy.clone().unwrap_or_default())?;
+    let preset = PRESETS.iter().find(|preset| preset.name == sources.preset);
+    let preset = preset.with_context(|| format!("no preset {}", sources.preset))?;
+    add(&mut layers, preset.name, preset.table())?;
+    if let Some(task) = task_defaults(sources.task) {
+        add(&mut layers, preset.name, task.over_preset(preset.name))?;
+    }
+    add(&mut layers, "algorithm defaults", own.algorithm.clone().unwrap_or_default())?;
+    if let Some(file) = sources.file {
+        add(&mut layers, &file.display().to_string(), read_table(file)?)?;
+    }
+    let mut ours: Vec<_> =
+        sources.environment.iter().filter(|(name, _)| name.starts_with(PREFIX)).collect();
+    ours.sort();
+    for (name, text) in ours {
+        let key = name[PREFIX.len()..].to_ascii_lowercase().replace("__", ".");
+        layers.set(&format!("environment variable {name}"), &key, text).map_err(refuse)?;
+    }
+    for pair in sources.set {
+        let (key, text) = pair.split_once('=').ok_or_else(|| {
+            wrong_use(format!("--set {pair}: expected KEY=VALUE, as in algorithm.batch_size=64"))
+        })?;
+        layers.set("--set", key.trim(), text.trim()).map_err(refuse)?;
+    }
+    for Flag { flag, key, value } in &sources.flags {
+        add(&mut layers, flag, nested(key, value.clone()))?;
+    }
+    let config = layers.finish().map_err(refuse)?;
+    if config.task.name != sources.task {
+        return Err(wrong_use(format!(
+            "the configuration is for task `{}`, the command line says `{}`; name the same task \
+             or remove task.name",
+            config.task.name, sources.task
+        )));
+    }
+    Ok(config)
+}
+
+/// Reports a `ConfigError` as wrong use: it is the user's mistake, whatever its source.
+pub(super) fn refuse(error: ConfigError) -> anyhow::Error {
+    wrong_use(error.to_string())
+}
+
+fn add(layers: &mut Layers, origin: &str, table: Table) -> anyhow::Result<()> {
+    layers.add(origin, table).map_err(refuse)
+}
+
+fn task_table(name: &str) -> anyhow::Result<Table> {
+    if let Some(task) = task_defaults(name) {
+        return Ok(task.table());
+    }
+    if is_gymnasium_id(name) || is_class(name) {
+        let mut task = Table::new();
+        task.insert("name".into(), name.into());
+        task.insert("id".into(), name.into());
+        return Ok(Table::from_iter([("task".to_owned(), Value::Table(task))]));
+    }
+    let near = nearest(&name.to_ascii_lowercase(), TASKS.iter().map(|task| task.name));
+    let advice = near.map_or_else(
+        || "`dmprl tasks` lists those with a short name".to_owned(),
+        |near| format!("did you mean `{near}`?"),
+    );
+    Err(wrong_use(format!(
+        "unknown task `{name}`, {advice}\n  A Gymnasium id ends in its version, as Pendulum-v1 or \
+         my_module:MyArm-v0; a class is my_module:MyClass"
+    )))
+}
+
+/// Matches `[module:][namespace/]Name-vN`.
+fn is_gymnasium_id(text: &str) -> bool {
+    let (module, id) = text.split_once(':').map_or((None, text), |(module, id)| (Some(module), id));
+    let word = |text: &str, also: &str| {
+        text.starts_with(|letter: char| letter.is_ascii_alphanumeric() || letter == '_')
+            && text.chars().all(|letter| {
+                letter.is_ascii_alphanumeric() || letter == '_' || also.contains(letter)
+            })
+    };
+    let (namespace, versioned) =
+        id.split_once('/').map_or((None, id), |(namespace, name)| (Some(namespace), name));
+    let Some((name, version)) = versioned.rsplit_once("-v") else { return false };
+    module.is_none_or(|module| word(module, "."))
+        && namespace.is_none_or(|namespace| word(namespace, "-"))
+        && word(name, ".-")
+        && !version.is_empty()
+        && version.chars().all(|letter| letter.is_ascii_digit())
+}
+
+/// Matches `[package.]module:Class`, the user's own `dmprl.segment_env.SegmentEnv`.
+fn is_class(text: &str) -> bool {
+    let identifier = |text: &str| {
+        text.starts_with(|letter: char| letter.is_ascii_alphabetic() || letter == '_')
+            && text.chars().all(|letter| letter.is_ascii_alphanumeric() || letter == '_')
+    };
+    text.split_once(':')
+        .is_some_and(|(module, class)| module.split('.').all(identifier) && identifier(class))
+}
+
+fn read_table(path: &Path) -> anyhow::Result<Table> {
+    let refused = |what: String| wrong_use(format!("--config {}: {what}", path.display()));
+    let metadata = std::fs::metadata(path).map_err(|error| refused(error.to_string()))?;
+    if !metadata.is_file() || metadata.len() > FILE_BYTES_MAX {
+        return Err(refused(format!("expected a file of at most {FILE_BYTES_MAX} bytes")));
+    }
+    let text = std::fs::read_to_string(path).map_err(|error| refused(error.to_string()))?;
+    text.parse().map_err(|error: toml::de::Error| refused(error.to_string()))
+}
+
+fn nested(key: &str, value: Value) -> Table {
+    let mut names: Vec<&str> = key.split('.').collect();
+    let last = names.pop().unwrap_or_default();
+    let leaf = Table::from_iter([(last.to_owned(), value)]);
+    names
+        .into_iter()
+        .rev()
+        .fold(leaf, |inner, name| Table::from_iter([(name.to_owned(), Value::Table(inner))]))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use dmprl_run::failure::WrongUse;
+    use dmprl_shared::config::{Controller, ForcingScaling, Integrator, Limits, Start};
+    use std::io::Write;
+
+    fn sources(task: &str) -> Sources<'_> {
+        Sources {
+            task,
+            preset: "default",
+            file: None,
+            environment: Vec::new(),
+            set: &[],
+            flags: Vec::new(),
+        }
+    }
+
+    fn variable(name: &str, value: &str) -> (String, String) {
+        (name.to_owned(), value.to_owned())
+    }
+
+    fn refused(sources: Sources<'_>) -> String {
+        let error = merge(&sources).unwrap_err();
+        assert!(error.downcast_ref::<WrongUse>().is_some(), "{error:#}");
+        error.to_string()
+    }
+
+    /// Adds one source at a time, each with its own value for the same key: the last wins.
+    #[test]
+    fn each_layer_overrides_the_one_before() {
+        let mut file = tempfile::NamedTempFile::new().unwrap();
+        writeln!(file, "[run]\nsteps = 3").unwrap();
+        let set = ["run.steps=5".to_owned()];
+        let mut merged = Vec::new();
+        for layers in 0..5 {
+            let mut sources = sources("pusher");
+            // The paper's preset does not set run.steps: a key of its own shows that it is below.
+            sources.preset = if layers >= 1 { "paper" } else { "default" };
+            sources.file = (layers >= 1).then_some(file.path());
+            sources.environment = vec![variable("HOME", "/root")];
+            if layers >= 2 {
+                sources.environment.push(variable("DMPRL_RUN__STEPS", "4"));
+            }
+            sources.set = if layers >= 3 { &set } else { &[] };
+            if layers >= 4 {
+                let value = Value::Integer(6);
+                sources.flags.push(Flag { flag: "--steps", key: "run.steps", value });
+            }
+            merged.push(merge(&sources).unwrap().run.steps);
+        }
+        assert_eq!(merged, [200_000, 3, 4, 5, 6]);
+    }
+
+    #[test]
+    fn a_file_overrides_the_preset_and_the_preset_the_task() {
+        let mut file = tempfile::NamedTempFile::new().unwrap();
+        writeln!(file, "[dmp]\nalpha_y = 12").unwrap();
+        let mut paper = sources("reacher");
+        paper.preset = "paper";
+        assert_eq!(merge(&paper).unwrap().dmp.alpha_y, 25.0);
+        let mut with_file = sources("reacher");
+        with_file.preset = "paper";
+        with_file.file = Some(file.path());
+        assert_eq!(merge(&with_file).unwrap().dmp.alpha_y, 12.0);
+    }
+
+    #[test]
+    fn an_environment_variable_that_is_no_key_is_refused_with_the_nearest() {
+        let mut sources = sources("reacher");
+        sources.environment = vec![variable("DMPRL_ALGORITHM__BACH_SIZE", "64")];
+        let message = refused(sources);
+        assert!(message.contains("DMPRL_ALGORITHM__BACH_SIZE"), "{message}");
+        assert!(message.contains("did you mean `algorithm.batch_size`"), "{message}");
+    }
+
+    #[test]
+    fn an_unknown_task_is_refused_with_the_nearest_name() {
+        for name in ["reachr", "Reacher", "pushr"] {
+            assert!(refused(sources(name)).contains("did you mean `"), "{name}");
+        }
+        for name in [
+            "",
+            "zzz",
+            "../etc-v1",
+            "a b-v1",
+            "os;x:Y-v1",
+            "Y-v",
+            "Y-v1.0",
+            "m:",
+            ":C",
+            "m..n:C",
+            "m:C.D",
+        ] {
+            assert!(refused(sources(name)).contains("unknown task"), "{name}");
+        }
+    }
+
+    #[test]
+    fn gymnasium_ids_and_classes_are_tasks() {
+        let ids = ["Pendulum-v1", "my.module:Arm-v0", "ALE/Pong-v5", "a:b/C.d-e-v12"];
+        for name in ids.into_iter().chain(["my_module:MyArm", "my.module:_Arm2"]) {
+            let config = merge(&sources(name)).unwrap();
+            assert_eq!((config.task.id.as_str(), config.task.name.as_str()), (name, name));
+        }
+    }
+
+    #[test]
+    fn a_configuration_for_another_task_is_refused() {
+        let mut file = tempfile::NamedTempFile::new().unwrap();
+        writeln!(file, "[task]\nname = 'pusher'\nid = 'Pusher-v5'").unwrap();
+        let mut sources = sources("reacher");
+        sources.file = Some(file.path());
+        assert!(refused(sources).contains("`pusher`"));
+    }
+
+    #[test]
+    fn a_runs_own_configuration_gives_the_same_run_again() {
+        let parent = tempfile::tempdir().unwrap();
+        let limits = dmprl_shared::config::Limits { cores: 4 };
+        let mut first = sources("pusher");
+        first.preset = "paper";
+        let config = merge(&first).unwrap().resolve(limits).unwrap();
+        let manifest = dmprl_run::Manifest::new(None).unwrap();
+        let path = parent.path().join("run");
+        dmprl_run::RunDirectory::create(&path, &config, &manifest).unwrap();
+        let file = path.join("config.toml");
+        let mut second = sources("pusher");
+        second.file = Some(&file);
+        assert_eq!(merge(&second).unwrap().resolve(limits).unwrap(), config);
+    }
+
+    #[test]
+    fn ndp_brings_its_own_dmp_over_any_preset_and_below_what_the_user_says() {
+        for preset in ["default", "paper"] {
+            let set = ["algorithm.name=ndp".to_owned(), "policy.start=zero".to_owned()];
+            let ndp = Sources { preset, set: &set[..1], ..sources("panda-reach") };
+            let config = merge(&ndp).unwrap().resolve(Limits { cores: 2 }).unwrap();
+            assert_eq!(config.policy.controller, Controller::Position);
+            assert_eq!(
+                (config.policy.start, config.policy.position_scale),
+                (Start::Observed, 20.0)
+            );
+            assert_eq!(config.dmp.integrator, Integrator::Explicit);
+            assert_eq!(config.dmp.forcing_scaling, ForcingScaling::Goal);
+            assert_eq!(config.exploration.warm_up_steps, 0);
+            let told = Sources { preset, set: &set, ..sources("panda-reach") };
+            assert_eq!(merge(&told).unwrap().policy.start, Start::Zero);
+        }
+    }
+
+    #[test]
+    fn set_needs_an_equals_sign() {
+        let set = ["run.steps".to_owned()];
+        let mut sources = sources("reacher");
+        sources.set = &set;
+        assert!(refused(sources).contains("KEY=VALUE"));
+    }
+
+    #[test]
+    fn an_mlp_does_one_update_a_step_unless_told_otherwise() {
+        let kind = [String::from("policy.kind=mlp")];
+        let mlp = Sources { set: &kind, ..sources("reacher") };
+        assert_eq!(merge(&mlp).unwrap().pacing.updates_per_segment, 1.0);
+        let both = [kind[0].clone(), String::from("pacing.updates_per_segment=3")];
+        let told = Sources { set: &both, ..sources("reacher") };
+        assert_eq!(merge(&told).unwrap().pacing.updates_per_segment, 3.0);
+        assert_eq!(merge(&sources("reacher")).unwrap().pacing.updates_per_segment, 2.0);
+    }
+}

@@ -1,0 +1,153 @@
+//! Arguments that determine the configuration, shared by `train` and the benchmarks.
+
+use std::path::PathBuf;
+
+use clap::Args;
+use clap::builder::{PossibleValuesParser, RangedI64ValueParser};
+use dmprl_run::failure::wrong_use;
+use dmprl_shared::config::{ExperimentConfig, PRESETS};
+use toml::Value;
+
+use super::configuration::{Flag, Sources};
+
+/// Arguments that determine the configuration.
+#[derive(Debug, Args)]
+pub(super) struct ConfiguredArgs {
+    /// Learning algorithm.
+    #[arg(long, value_parser = PossibleValuesParser::new(["ddpg", "td3", "sac", "ndp"]))]
+    algo: Option<String>,
+    /// Policy: a DMP per segment, or a network per step.
+    #[arg(long, value_parser = PossibleValuesParser::new(["dmp", "mlp"]))]
+    policy: Option<String>,
+    /// Named set of configuration values.
+    #[arg(long, default_value = "default",
+          value_parser = PossibleValuesParser::new(PRESETS.iter().map(|preset| preset.name)))]
+    preset: String,
+    /// Rollout processes [default: cores - 1].
+    #[arg(long, value_name = "N")]
+    pub(super) workers: Option<u32>,
+    /// Environments in each worker.
+    #[arg(long, value_name = "E")]
+    envs_per_worker: Option<u32>,
+    /// Seed of every random stream.
+    #[arg(long, value_name = "S", value_parser = integer())]
+    seed: Option<i64>,
+    /// Folder with your own environment modules; repeatable.
+    #[arg(long, value_name = "DIR")]
+    python_path: Vec<PathBuf>,
+    /// Configuration file, such as a run's config.toml.
+    #[arg(long, value_name = "FILE")]
+    config: Option<PathBuf>,
+    /// Set any configuration key; repeatable.
+    #[arg(long, value_name = "KEY=VALUE")]
+    set: Vec<String>,
+}
+
+impl ConfiguredArgs {
+    /// Returns true if no argument was given.
+    pub(super) fn is_empty(&self) -> bool {
+        let words = [&self.algo, &self.policy].into_iter().all(Option::is_none);
+        let counts = [self.workers, self.envs_per_worker].into_iter().all(|count| count.is_none());
+        let lists = self.python_path.is_empty() && self.set.is_empty();
+        let seed = self.seed.is_none() && self.config.is_none();
+        words && counts && lists && seed && self.preset == PRESETS[0].name
+    }
+
+    /// Collects all sources of the configuration of `task`; `more` are the command's own flags.
+    pub(super) fn sources<'a>(
+        &'a self,
+        task: &'a str,
+        more: impl IntoIterator<Item = Option<Flag>>,
+    ) -> anyhow::Result<Sources<'a>> {
+        let text = |value: &Option<String>| value.clone().map(Value::String);
+        let count = |value: Option<u32>| value.map(|value| Value::Integer(value.into()));
+        let flags = [
+            flag("--algo", "algorithm.name", text(&self.algo)),
+            flag("--policy", "policy.kind", text(&self.policy)),
+            flag("--workers", "actors.workers", count(self.workers)),
+            flag("--envs-per-worker", "actors.envs_per_worker", count(self.envs_per_worker)),
+            flag("--seed", "run.seed", self.seed.map(Value::Integer)),
+            flag("--python-path", "task.python_path", paths("--python-path", &self.python_path)?),
+        ];
+        Ok(Sources {
+            task,
+            preset: &self.preset,
+            file: self.config.as_deref(),
+            environment: environment()?,
+            set: &self.set,
+            flags: flags.into_iter().chain(more).flatten().collect(),
+        })
+    }
+}
+
+/// A flag that sets `key`, or `None` if it was not given.
+pub(super) fn flag(flag: &'static str, key: &'static str, value: Option<Value>) -> Option<Flag> {
+    value.map(|value| Flag { flag, key, value })
+}
+
+/// Parses a non-negative integer: TOML's integers are signed, with 64 bits.
+pub(super) fn integer() -> RangedI64ValueParser<i64> {
+    clap::value_parser!(i64).range(0..)
+}
+
+/// Makes the paths of the user's modules and demonstrations absolute: other processes have other
+/// working directories, and a run can be resumed from any directory.
+pub(super) fn make_absolute(config: &mut ExperimentConfig) -> anyhow::Result<()> {
+    for path in &mut config.task.python_path {
+        *path = absolute_folder(path)?;
+    }
+    for path in &mut config.demonstrations.files {
+        *path = absolute_file(path)?;
+    }
+    Ok(())
+}
+
+/// The value of a flag with file or folder names, or `None` if it was not given.
+pub(super) fn paths(flag: &str, paths: &[PathBuf]) -> anyhow::Result<Option<Value>> {
+    let texts = paths.iter().map(|path| {
+        let text = path.to_str().map(|text| Value::String(text.to_owned()));
+        text.ok_or_else(|| wrong_use(format!("{flag} {}: not UTF-8", path.display())))
+    });
+    let texts = texts.collect::<anyhow::Result<Vec<_>>>()?;
+    Ok((!texts.is_empty()).then_some(Value::Array(texts)))
+}
+
+fn absolute_folder(path: &str) -> anyhow::Result<String> {
+    let absolute = std::fs::canonicalize(path)
+        .map_err(|error| wrong_use(format!("python path {path}: {error}")))?;
+    if !absolute.is_dir() {
+        return Err(wrong_use(format!("python path {path} is not a directory")));
+    }
+    text(absolute)
+}
+
+fn absolute_file(path: &str) -> anyhow::Result<String> {
+    let absolute = std::fs::canonicalize(path)
+        .map_err(|error| wrong_use(format!("demonstrations {path}: {error}")))?;
+    if !absolute.is_file() {
+        return Err(wrong_use(format!("demonstrations {path}: no file")));
+    }
+    text(absolute)
+}
+
+fn text(absolute: PathBuf) -> anyhow::Result<String> {
+    let shown = absolute.display().to_string();
+    absolute.into_os_string().into_string().map_err(|_| wrong_use(format!("{shown}: not UTF-8")))
+}
+
+/// Collects environment variables. `DMPRL_` variables must be UTF-8; others that are not are
+/// skipped.
+fn environment() -> anyhow::Result<Vec<(String, String)>> {
+    let mut texts = Vec::new();
+    for (name, value) in std::env::vars_os() {
+        let Ok(name) = name.into_string() else { continue };
+        match value.into_string() {
+            Ok(value) => texts.push((name, value)),
+            Err(_) if name.starts_with("DMPRL_") => {
+                return Err(wrong_use(format!("environment variable {name} is not UTF-8")));
+            }
+            Err(_) => {}
+        }
+    }
+    Ok(texts)
+}

@@ -1,0 +1,131 @@
+//! `dmprl export`: writes a run's policy as one file.
+
+use std::path::{Path, PathBuf};
+
+use clap::{Args, ValueEnum};
+use dmprl_analysis::export::{onnx, read_policy, safetensors};
+use dmprl_run::failure::{Outcome, wrong_use};
+use dmprl_run::format::{binary_bytes, shown};
+use dmprl_run::{PolicyChoice, RunDirectory, replace_file};
+
+use super::emit;
+
+const HELP: &str = "\
+The file contains everything needed to act: observation normalisation, network, movement primitive,
+controller, start, action bounds, and its origin. safetensors is read by the crate dmprl-shared
+(dmprl_shared::runtime), without Python, and in Python by dmprl.Policy, which needs only NumPy. onnx
+is for any ONNX runtime: input `observation` (batch, O), output `actions` (batch, K, A).
+
+EXAMPLES
+  dmprl export runs/mine                           # runs/mine/reacher.safetensors
+  dmprl export runs/mine --format onnx --output reacher.onnx
+  dmprl export runs/mine --policy latest --json";
+
+/// Arguments of `dmprl export`.
+#[derive(Debug, Args)]
+#[command(after_help = HELP)]
+pub(super) struct ExportArgs {
+    /// The run directory.
+    run: PathBuf,
+    /// File format [default: by the extension of --output, else safetensors].
+    #[arg(long)]
+    format: Option<Format>,
+    /// Output file; an existing one is replaced [default: the task's name, in the run directory].
+    #[arg(long, value_name = "PATH")]
+    output: Option<PathBuf>,
+    /// best, latest, or a policy version.
+    #[arg(long, default_value_t = PolicyChoice::Best, value_name = "best|latest|VERSION")]
+    policy: PolicyChoice,
+    /// Print one JSON object on standard output.
+    #[arg(long)]
+    json: bool,
+}
+
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+enum Format {
+    Safetensors,
+    Onnx,
+}
+
+impl Format {
+    fn extension(self) -> &'static str {
+        match self {
+            Self::Safetensors => "safetensors",
+            Self::Onnx => "onnx",
+        }
+    }
+
+    fn of(output: &Path) -> Option<Self> {
+        let end = output.extension()?.to_str()?;
+        [Self::Safetensors, Self::Onnx].into_iter().find(|format| format.extension() == end)
+    }
+}
+
+/// Rejects an output that is no regular file: root could replace even a device.
+fn check_output(path: &Path) -> anyhow::Result<()> {
+    let refused = |what: &str| Err(wrong_use(format!("--output {}: {what}", path.display())));
+    if path.exists() && !path.is_file() {
+        return refused("expected a file or a new name, got something that is no regular file");
+    }
+    match path.parent().filter(|parent| !parent.as_os_str().is_empty()) {
+        Some(folder) if !folder.is_dir() => refused("there is no such folder; make it first"),
+        _ => Ok(()),
+    }
+}
+
+pub(super) fn run(args: &ExportArgs) -> anyhow::Result<Outcome> {
+    let named = args.output.as_deref().and_then(Format::of);
+    let format = args.format.or(named).unwrap_or(Format::Safetensors);
+    if let (Some(named), Some(output)) = (named, &args.output)
+        && named != format
+    {
+        return Err(wrong_use(format!(
+            "--output {} ends like the other format; expected .{}, or leave --format out",
+            output.display(),
+            format.extension()
+        )));
+    }
+    let run = RunDirectory::open(&args.run)?;
+    let chosen = run.choose_policy(args.policy)?;
+    let opened = read_policy(&run, &chosen)?;
+    let task = run.config()?.task.name;
+    let path = args.output.clone().unwrap_or_else(|| {
+        let name = dmprl_run::safe_name(&task);
+        run.path().join(format!("{name}.{}", format.extension()))
+    });
+    check_output(&path)?;
+    let file = match format {
+        Format::Safetensors => safetensors(&opened)?,
+        Format::Onnx => onnx(&opened)?,
+    };
+    replace_file(&path, &file)?;
+    let bytes = file.len() as u64;
+    let (layout, row) = (opened.policy.layout(), chosen.row.as_ref());
+    emit(&if args.json {
+        serde_json::json!({
+            "path": path, "format": format.extension(), "bytes": bytes,
+            "task": task, "policy_version": chosen.version,
+            "return_mean": row.map(|row| row.return_mean),
+            "success_rate": row.and_then(|row| row.success_rate),
+            "observation_len": opened.policy.env_observation_len(),
+            "segment_steps": layout.segment_steps, "action_len": layout.action_len,
+        })
+        .to_string()
+    } else {
+        let did = row.map(|row| format!(", return {:.2}", row.return_mean)).unwrap_or_default();
+        let head = format!(
+            "{} ({}): policy {} of {task}{did}",
+            shown(&path),
+            binary_bytes(bytes),
+            chosen.version
+        );
+        match format {
+            Format::Safetensors => format!(
+                "{head}\nin Python: dmprl.Policy.load({:?}).segment(observation)",
+                path.display().to_string()
+            ),
+            Format::Onnx => head,
+        }
+    })?;
+    Ok(Outcome::Done)
+}

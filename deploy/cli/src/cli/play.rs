@@ -1,0 +1,129 @@
+//! `dmprl play`: shows a policy live.
+
+use std::path::PathBuf;
+use std::process::{Command, Stdio};
+use std::time::{Duration, Instant};
+
+use anyhow::{Context, bail};
+use clap::Args;
+use dmprl_analysis::export::{read_policy, safetensors};
+use dmprl_run::Watch;
+use dmprl_run::failure::Outcome;
+use dmprl_run::say;
+use dmprl_run::{PolicyChoice, RunDirectory};
+use rustix::process::{Pid, Signal, kill_process};
+
+use super::prepare_python_with;
+
+/// Interval between checks for exit and interrupt.
+const LOOK: Duration = Duration::from_millis(50);
+/// Grace period after the interrupt, before the player is killed.
+const END: Duration = Duration::from_secs(5);
+/// Extra of the Python package for rendering.
+const EXTRA: &str = "video";
+
+const HELP: &str = "\
+Plays noise-free episodes in real time, each with its own seed, until Ctrl-C. It opens a window if
+there is a display; otherwise it serves a page on loopback and prints its address. From another
+machine: ssh -L 8788:127.0.0.1:8788 HOST, then http://127.0.0.1:8788/.
+
+EXAMPLES
+  dmprl play runs/mine
+  dmprl play runs/mine --policy latest --seed 1004 --episodes 3
+  dmprl play runs/mine --stream --port 8788";
+
+/// Arguments of `dmprl play`.
+#[derive(Debug, Args)]
+#[command(after_help = HELP)]
+pub(super) struct PlayArgs {
+    /// The run directory.
+    run: PathBuf,
+    /// best, latest, or a policy version.
+    #[arg(long, default_value_t = PolicyChoice::Best, value_name = "best|latest|VERSION")]
+    policy: PolicyChoice,
+    /// Seed of the first episode [default: evaluation.first_seed of the run].
+    #[arg(long, value_name = "N")]
+    seed: Option<u64>,
+    /// Stop after this many episodes [default: never].
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u64).range(1..))]
+    episodes: Option<u64>,
+    /// Serve a page even if there is a display.
+    #[arg(long)]
+    stream: bool,
+    /// Port of the page; 0: any free port.
+    #[arg(long, value_name = "PORT", default_value_t = 8788)]
+    port: u16,
+}
+
+pub(super) fn run(args: &PlayArgs) -> anyhow::Result<Outcome> {
+    let run = RunDirectory::open(&args.run)?;
+    let config = run.config()?;
+    let opened = read_policy(&run, &run.choose_policy(args.policy)?)?;
+    let (_, python) = prepare_python_with(EXTRA)?;
+    let folder = tempfile::tempdir().context("cannot make a folder for the policy")?;
+    let file = folder.path().join("policy.safetensors");
+    std::fs::write(&file, safetensors(&opened)?).context("cannot write the policy")?;
+    let window = !args.stream && has_display();
+    let mut command = Command::new(python);
+    command.args(["-I", "-m", "dmprl.play"]).arg(&file);
+    command.args(["--task", &config.task.id]);
+    let title = format!("{} · policy {}", config.task.name, opened.snapshot.version);
+    command.args(["--title", &title, "--port", &args.port.to_string()]);
+    let seed = args.seed.unwrap_or(config.evaluation.first_seed);
+    command.args(["--seed", &seed.to_string()]);
+    command.args(["--episodes", &args.episodes.unwrap_or(0).to_string()]);
+    config.task.python_path.iter().for_each(|path| {
+        command.arg("--python-path").arg(path);
+    });
+    if window {
+        command.arg("--window");
+    } else {
+        say("no window; open this page in a browser (Ctrl-C ends it):");
+    }
+    play(command)
+}
+
+/// Detects X11 or Wayland.
+fn has_display() -> bool {
+    ["DISPLAY", "WAYLAND_DISPLAY"]
+        .into_iter()
+        .any(|name| std::env::var_os(name).is_some_and(|value| !value.is_empty()))
+}
+
+/// Runs the player until it ends or the user interrupts.
+fn play(mut command: Command) -> anyhow::Result<Outcome> {
+    let watch = Watch::start()?;
+    // A process group of its own keeps the terminal's interrupt from the player; this process
+    // passes it on once.
+    std::os::unix::process::CommandExt::process_group(&mut command, 0);
+    // SAFETY: `prctl` is async-signal-safe, allocates nothing and touches no lock.
+    unsafe {
+        std::os::unix::process::CommandExt::pre_exec(&mut command, || {
+            rustix::process::set_parent_process_death_signal(Some(Signal::TERM)).map_err(Into::into)
+        });
+    }
+    let mut player = command.stdin(Stdio::null()).spawn().context("cannot start the player")?;
+    let id = i32::try_from(player.id()).ok().and_then(Pid::from_raw);
+    let mut asked: Option<Instant> = None;
+    loop {
+        if let Some(status) = player.try_wait().context("cannot wait for the player")? {
+            return match status.code() {
+                _ if asked.is_some() => Ok(Outcome::Interrupted),
+                Some(0) => Ok(Outcome::Done),
+                _ => bail!("the player ended with {status}; its output is above"),
+            };
+        }
+        match asked {
+            None if watch.check().is_err() => {
+                asked = Some(Instant::now());
+                // Fails if the player has exited meanwhile, which is fine.
+                let _ = id.map(|id| kill_process(id, Signal::INT));
+            }
+            Some(at) if at.elapsed() > END => {
+                let _ = player.kill();
+            }
+            _ => {}
+        }
+        std::thread::sleep(LOOK);
+    }
+}

@@ -1,0 +1,88 @@
+//! `dmprl resume`: go on with a run, from its last checkpoint.
+
+use std::path::PathBuf;
+
+use clap::Args;
+use dmprl_learner::checkpoint;
+use dmprl_run::RunDirectory;
+use dmprl_run::failure::{Outcome, wrong_use};
+use dmprl_shared::config::Limits;
+use dmprl_supervisor::capacity;
+use dmprl_supervisor::{self as launch, Trial};
+
+use super::configuration::refuse;
+use super::output::OutputArgs;
+use super::{TrainingPlan, cores, prepare_python, this_program, train_session, training_session};
+
+const HELP: &str = "\
+Goes on from the last checkpoint with the run's own config.toml; environment variables and
+presets have no say. A run that has no checkpoint yet begins again.
+
+EXAMPLES
+  dmprl resume runs/reacher-td3-dmp-s1-20260131-120000
+  dmprl resume runs/mine --steps 120000    # longer than first asked for";
+
+/// Arguments of `dmprl resume`.
+#[derive(Debug, Args)]
+#[command(after_help = HELP)]
+pub(super) struct ResumeArgs {
+    /// The run directory.
+    run: PathBuf,
+    /// New length of the whole run [environment steps].
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(i64).range(1..))]
+    steps: Option<i64>,
+    #[command(flatten)]
+    pub(super) output: OutputArgs,
+}
+
+pub(super) fn run(args: &ResumeArgs) -> anyhow::Result<Outcome> {
+    let run = RunDirectory::open(&args.run)?;
+    let written = run.config()?;
+    let mut config = written.clone().resolve(Limits { cores: cores() }).map_err(refuse)?;
+    let steps_before = config.run.steps;
+    if let Some(steps) = args.steps {
+        config.run.steps = steps.unsigned_abs();
+    }
+    let folder = run.checkpoints_path();
+    let counters = checkpoint::counters(&folder)?;
+    let reached = counters.iter().map(|counters| counters.env_steps).max().unwrap_or(0);
+    // A run may end some steps beyond its length, in mid-segment: the same length is no mistake.
+    if config.run.steps < reached.min(steps_before) {
+        return Err(wrong_use(format!(
+            "--steps {}: the run has {reached} steps already; --steps is the length of the whole \
+             run",
+            config.run.steps
+        )));
+    }
+    for path in &config.task.python_path {
+        if !std::path::Path::new(path).is_dir() {
+            return Err(wrong_use(format!(
+                "the run's environments were in {path}, which is gone; put it back or change \
+                 task.python_path in {}",
+                run.path().join("config.toml").display()
+            )));
+        }
+    }
+    capacity::check(&config, run.spec()?.as_ref())?;
+    let venv = prepare_python()?;
+    // Before the lock, which children inherit: the interpreter that names its packages is one.
+    let session = training_session(&config, &venv)?;
+    let lock = run.lock(launch::RESUME_WAIT)?;
+    let mut manifest = run.manifest()?;
+    manifest.sessions.push(session);
+    run.write_manifest(&manifest)?;
+    // Of an older version, it lacks what has been added since and depends on the machine.
+    if config != written {
+        run.write_config(&config)?;
+    }
+    train_session(TrainingPlan {
+        trial: Trial::default(),
+        program: this_program()?,
+        run,
+        lock,
+        config,
+        venv: Some(venv),
+        resume: true,
+        progress: args.output.style(),
+    })
+}

@@ -1,0 +1,224 @@
+//! `dmprl train`: from the command line to a run directory, then over to `session`.
+
+use std::io::Read;
+use std::path::{Path, PathBuf};
+use std::time::{Duration, SystemTime};
+
+use anyhow::Context;
+use clap::Args;
+use clap::builder::PossibleValuesParser;
+use dmprl_run::failure::{Outcome, wrong_use};
+use dmprl_run::{Manifest, PolicyChoice, RunDirectory, compact, safe_name};
+use dmprl_shared::config::{
+    AlgorithmName, Device, ExperimentConfig, Limits, PolicyKind, TaskDefaults, task_defaults,
+};
+use dmprl_shared::dmp::Dmp;
+use dmprl_supervisor::Trial;
+use dmprl_supervisor::capacity;
+use toml::Value;
+
+use super::configuration::{Flag, merge, refuse};
+use super::configured::{ConfiguredArgs, flag, integer, make_absolute, paths};
+use super::output::OutputArgs;
+use super::{TrainingPlan, cores, prepare_python, this_program, train_session, training_session};
+
+/// A second run of the same second gets a number; more than this is a stuck clock.
+const SAME_SECOND_MAX: usize = 100;
+
+const HELP: &str = "\
+PRECEDENCE, lowest first: the policy's and the task's defaults, --preset, the algorithm's own values
+(ndp), --config, environment variables (DMPRL_ALGORITHM__BATCH_SIZE=64 sets algorithm.batch_size),
+--set, the flags above.
+Ctrl-C once: checkpoint and a clean end within 10 s; twice: at once.
+
+EXAMPLES
+  dmprl train reacher
+  dmprl train pusher --steps 100000 --workers 4 --seed 2
+  dmprl train reacher --policy mlp --run-dir runs/baseline
+  dmprl train reacher --preset paper --set exploration.std=0.2
+  dmprl train panda-reach --algo ndp
+  dmprl train reacher --until-return -5 --max-minutes 30
+  dmprl train reacher --config runs/baseline/config.toml --deterministic
+  dmprl train reacher --init-from runs/baseline --seed 3
+  dmprl train panda-reach --demos demos.npz
+  dmprl train my_module:MyArm-v0 --python-path ./envs";
+
+/// Arguments of `dmprl train`.
+#[derive(Debug, Args)]
+#[command(after_help = HELP)]
+pub(super) struct TrainArgs {
+    /// A task of `dmprl tasks`, or any Gymnasium id: Pendulum-v1, my_module:MyArm-v0; or a class
+    /// of your own, a gymnasium.Env or a SegmentEnv: my_module:MyClass.
+    task: String,
+    #[command(flatten)]
+    configured: ConfiguredArgs,
+    /// Environment steps, all workers together.
+    #[arg(long, value_name = "N", value_parser = integer())]
+    steps: Option<i64>,
+    /// Where the results go; new or empty [default: runs/TASK-ALGO-POLICY-sSEED-TIME].
+    #[arg(long, value_name = "DIR")]
+    run_dir: Option<PathBuf>,
+    /// One worker, in one process with the learner and in lock-step with it: the same seed gives
+    /// the same bytes.
+    #[arg(long)]
+    deterministic: bool,
+    /// Where the update runs; `cuda` needs a build with that feature.
+    #[arg(long, value_parser = PossibleValuesParser::new(["cpu", "cuda"]))]
+    device: Option<String>,
+    /// Threads of the update.
+    #[arg(long, value_name = "N")]
+    threads: Option<u32>,
+    /// Start from a run's best policy, or from a policy file.
+    #[arg(long, value_name = "RUN|FILE")]
+    init_from: Option<PathBuf>,
+    /// Demonstrations to start from, a file of steps (docs/demonstrations.md); repeatable.
+    #[arg(long, value_name = "FILE")]
+    demos: Vec<PathBuf>,
+    /// Stop at this mean evaluation return.
+    #[arg(long, value_name = "X", allow_negative_numbers = true)]
+    until_return: Option<f64>,
+    /// Stop at this evaluation success rate, 0 to 1.
+    #[arg(long, value_name = "X")]
+    until_success: Option<f64>,
+    /// Stop after so many minutes of this session.
+    #[arg(long, value_name = "M")]
+    max_minutes: Option<f64>,
+    #[command(flatten)]
+    pub(super) output: OutputArgs,
+    /// Have worker and learner note in files of this folder what they do; for `chaos`.
+    #[arg(long, value_name = "DIR", hide = true)]
+    journal: Option<PathBuf>,
+    /// The longest pause before a restart [ms]; for `chaos`.
+    #[arg(long, value_name = "MS", hide = true)]
+    restart_pause_max: Option<u64>,
+}
+
+/// What these arguments make of the configuration, checked.
+pub(super) fn configuration(args: &TrainArgs) -> anyhow::Result<ExperimentConfig> {
+    let sources = args.configured.sources(&args.task, flags(args)?)?;
+    let mut config = merge(&sources)?.resolve(Limits { cores: cores() }).map_err(refuse)?;
+    check(&config, args)?;
+    make_absolute(&mut config)?;
+    Ok(config)
+}
+
+pub(super) fn run(args: &TrainArgs) -> anyhow::Result<Outcome> {
+    let config = configuration(args)?;
+    let spec = task_defaults(&args.task).map(TaskDefaults::spec);
+    capacity::check(&config, spec.as_ref())?;
+    let init_from = args.init_from.as_deref().map(policy_file).transpose()?;
+    if let Some(path) = &args.run_dir {
+        RunDirectory::check_free(path)?;
+    }
+    let venv = prepare_python()?;
+    let path = args.run_dir.clone().map_or_else(|| default_path(&config), Ok)?;
+    let session = training_session(&config, &venv)?;
+    let manifest = Manifest::begin(init_from.map(|path| path.display().to_string()), session)?;
+    let run = RunDirectory::create(&path, &config, &manifest)?;
+    let lock = run.lock(Duration::ZERO)?;
+    train_session(TrainingPlan {
+        program: this_program()?,
+        run,
+        lock,
+        config,
+        venv: Some(venv),
+        resume: false,
+        progress: args.output.style(),
+        trial: Trial {
+            journal: args.journal.clone(),
+            restart_max: args.restart_pause_max.map(Duration::from_millis),
+        },
+    })
+}
+
+/// What is wrong before any process or environment is needed.
+fn check(config: &ExperimentConfig, args: &TrainArgs) -> anyhow::Result<()> {
+    if config.policy.kind == PolicyKind::Dmp {
+        Dmp::new(&config.dmp, config.policy.segment_steps)
+            .map_err(|error| wrong_use(error.to_string()))?;
+    }
+    if config.learner.device == Device::Cuda && !cfg!(feature = "cuda") {
+        return Err(wrong_use(
+            "learner.device = \"cuda\": this build has no CUDA; on a machine with an NVIDIA GPU \
+             and the CUDA toolkit, build with: cargo build --release --features cuda",
+        ));
+    }
+    if let Some(workers) = args.configured.workers.filter(|&n| n > 1 && config.run.deterministic) {
+        return Err(wrong_use(format!(
+            "--workers {workers}: a deterministic run has one worker, in one process with the \
+             learner; leave out --workers, or run.deterministic"
+        )));
+    }
+    Ok(())
+}
+
+fn flags(args: &TrainArgs) -> anyhow::Result<[Option<Flag>; 8]> {
+    let number = |value: Option<f64>| value.map(Value::Float);
+    Ok([
+        flag("--demos", "demonstrations.files", paths("--demos", &args.demos)?),
+        flag("--steps", "run.steps", args.steps.map(Value::Integer)),
+        flag("--deterministic", "run.deterministic", args.deterministic.then_some(true.into())),
+        flag("--device", "learner.device", args.device.clone().map(Value::String)),
+        flag(
+            "--threads",
+            "learner.threads",
+            args.threads.map(|count| Value::Integer(count.into())),
+        ),
+        flag("--until-return", "run.until_return", number(args.until_return)),
+        flag("--until-success", "run.until_success", number(args.until_success)),
+        flag("--max-minutes", "run.max_minutes", number(args.max_minutes)),
+    ])
+}
+
+/// The policy that a run or a file stands for.
+fn policy_file(path: &Path) -> anyhow::Result<PathBuf> {
+    let file = if path.is_dir() {
+        RunDirectory::open(path)?.choose_policy(PolicyChoice::Best)?.path
+    } else if path.is_file() {
+        path.to_owned()
+    } else {
+        return Err(wrong_use(format!(
+            "--init-from {}: expected a run directory or a policy file",
+            path.display()
+        )));
+    };
+    if !is_safetensors(&file).unwrap_or(false) {
+        return Err(wrong_use(format!("--init-from {}: no readable policy file", file.display())));
+    }
+    std::fs::canonicalize(&file).with_context(|| format!("cannot resolve {}", file.display()))
+}
+
+/// Whether a file begins as safetensors do: the header's length in 8 bytes, the header in JSON.
+/// The learner reads the rest, when the environment has said how large the policy is.
+fn is_safetensors(path: &Path) -> std::io::Result<bool> {
+    let mut head = [0; 9];
+    let mut file = std::fs::File::open(path)?;
+    let bytes = file.metadata()?.len();
+    file.read_exact(&mut head)?;
+    let [a, b, c, d, e, f, g, h, brace] = head;
+    let header = u64::from_le_bytes([a, b, c, d, e, f, g, h]);
+    Ok(header.checked_add(8).is_some_and(|end| end <= bytes) && brace == b'{')
+}
+
+fn default_path(config: &ExperimentConfig) -> anyhow::Result<PathBuf> {
+    let algorithm = match config.algorithm.name {
+        AlgorithmName::Ddpg => "ddpg",
+        AlgorithmName::Td3 => "td3",
+        AlgorithmName::Sac => "sac",
+        AlgorithmName::Ndp => "ndp",
+    };
+    let policy = match config.policy.kind {
+        PolicyKind::Dmp => "dmp",
+        PolicyKind::Mlp => "mlp",
+    };
+    let (task, seed) = (safe_name(&config.task.name), config.run.seed);
+    let name = format!("{task}-{algorithm}-{policy}-s{seed}-{}", compact(SystemTime::now()));
+    let candidates = (1..=SAME_SECOND_MAX).map(|number| match number {
+        1 => Path::new("runs").join(&name),
+        _ => Path::new("runs").join(format!("{name}-{number}")),
+    });
+    candidates
+        .into_iter()
+        .find(|path| !path.exists())
+        .with_context(|| format!("{SAME_SECOND_MAX} runs named {name} exist; give --run-dir"))
+}

@@ -1,0 +1,190 @@
+//! The run directory's promises: refusals, torn lines, choices, the lock.
+
+use std::fs;
+use std::io::Write;
+use std::time::Duration;
+
+use dmprl_shared::supervision::EvaluationRow;
+
+use super::*;
+use crate::PolicyChoice;
+use crate::failure::WrongUse;
+
+fn new_run(parent: &tempfile::TempDir) -> RunDirectory {
+    let manifest = Manifest::new(None).unwrap();
+    RunDirectory::create(&parent.path().join("run"), &ExperimentConfig::default(), &manifest)
+        .unwrap()
+}
+
+fn row(policy_version: u64, return_mean: f64) -> EvaluationRow {
+    EvaluationRow {
+        env_steps: policy_version * 100,
+        updates: 1,
+        segments: 1,
+        wall_s: policy_version as f64,
+        policy_version,
+        returns: vec![return_mean, 0.1 + 0.2],
+        return_mean,
+        success_rate: None,
+        smoothness: 0.5,
+    }
+}
+
+#[test]
+fn what_is_written_is_read_back_by_a_second_process_in_time() {
+    let parent = tempfile::tempdir().unwrap();
+    let run = new_run(&parent);
+    let opened = RunDirectory::open(run.path()).unwrap();
+    assert_eq!(opened.config().unwrap(), ExperimentConfig::default());
+    assert_eq!(opened.manifest().unwrap(), run.manifest().unwrap());
+    assert_eq!(opened.spec().unwrap(), None);
+    run.append_evaluation(&row(3, -1.5)).unwrap();
+    assert_eq!(opened.evaluations().unwrap(), [row(3, -1.5)]);
+}
+
+#[test]
+fn a_directory_that_holds_something_is_refused_with_advice() {
+    let parent = tempfile::tempdir().unwrap();
+    let run = new_run(&parent);
+    let error = RunDirectory::check_free(run.path()).unwrap_err();
+    assert!(error.downcast_ref::<WrongUse>().is_some());
+    assert!(error.to_string().contains("dmprl resume"), "{error}");
+    let empty = parent.path().join("empty");
+    fs::create_dir(&empty).unwrap();
+    RunDirectory::check_free(&empty).unwrap();
+}
+
+#[test]
+fn names_that_lead_elsewhere_or_surprise_tools_are_refused() {
+    let long = "x".repeat(NAME_LEN_MAX + 1);
+    for name in ["..", "runs/..", "/", "", ".hidden", "-flag", "a b", "a\nb", "a:b", "ü", &long] {
+        let error = RunDirectory::check_free(Path::new(name)).unwrap_err();
+        assert!(error.downcast_ref::<WrongUse>().is_some(), "{name:?}: {error}");
+    }
+    assert_eq!(safe_name("my.module:Arm-v0"), "my.module_Arm-v0");
+    assert_eq!(safe_name("../_x/etc"), "x_etc");
+}
+
+#[test]
+fn a_newer_format_is_refused_with_its_version() {
+    let parent = tempfile::tempdir().unwrap();
+    let run = new_run(&parent);
+    let text = r#"{"format_version": 7, "shape": "unheard of"}"#;
+    fs::write(run.path().join("manifest.json"), text).unwrap();
+    let error = format!("{:#}", RunDirectory::open(run.path()).unwrap_err());
+    assert!(error.contains("format version 7 is newer than 1"), "{error}");
+}
+
+#[test]
+fn a_torn_last_line_is_no_row_and_the_next_append_replaces_it() {
+    let parent = tempfile::tempdir().unwrap();
+    let run = new_run(&parent);
+    run.append_evaluation(&row(1, -3.0)).unwrap();
+    let mut file = fs::OpenOptions::new().append(true).open(run.evaluations_path()).unwrap();
+    file.write_all(br#"{"env_steps": 200, "upd"#).unwrap();
+    assert_eq!(run.evaluations().unwrap(), [row(1, -3.0)]);
+    assert_eq!(run.wall_s_before().unwrap(), 1.0);
+    run.append_evaluation(&row(2, -2.0)).unwrap();
+    assert_eq!(run.evaluations().unwrap(), [row(1, -3.0), row(2, -2.0)]);
+}
+
+#[test]
+fn a_whole_line_that_is_no_row_is_reported_with_its_number() {
+    let parent = tempfile::tempdir().unwrap();
+    let run = new_run(&parent);
+    run.append_evaluation(&row(1, -3.0)).unwrap();
+    let mut file = fs::OpenOptions::new().append(true).open(run.evaluations_path()).unwrap();
+    file.write_all(b"{}\n").unwrap();
+    assert!(run.evaluations().unwrap_err().to_string().contains("line 2"));
+}
+
+#[test]
+fn a_row_that_json_cannot_hold_is_refused_before_it_is_written() {
+    let parent = tempfile::tempdir().unwrap();
+    let run = new_run(&parent);
+    assert!(run.append_evaluation(&row(1, f64::NAN)).is_err());
+    assert_eq!(run.evaluations().unwrap(), []);
+}
+
+#[test]
+fn best_is_the_highest_mean_return_and_latest_the_last_row() {
+    let parent = tempfile::tempdir().unwrap();
+    let run = new_run(&parent);
+    let none = run.choose_policy(PolicyChoice::Best).unwrap_err();
+    assert!(none.to_string().contains("no evaluation yet"), "{none}");
+    for (version, return_mean) in [(1, -3.0), (2, -1.0), (3, -2.0)] {
+        fs::write(run.policy_path(version), "").unwrap();
+        run.append_evaluation(&row(version, return_mean)).unwrap();
+    }
+    assert_eq!(run.choose_policy(PolicyChoice::Best).unwrap().version, 2);
+    assert_eq!(run.choose_policy(PolicyChoice::Latest).unwrap().version, 3);
+    assert_eq!(run.choose_policy(PolicyChoice::Version(1)).unwrap().row, Some(row(1, -3.0)));
+    let missing = run.choose_policy(PolicyChoice::Version(9)).unwrap_err();
+    assert!(missing.to_string().contains("kept: 1, 2, 3"), "{missing}");
+}
+
+#[test]
+fn pruning_keeps_best_latest_named_and_not_yet_evaluated_policies() {
+    let parent = tempfile::tempdir().unwrap();
+    let run = new_run(&parent);
+    for version in 1..=6 {
+        fs::write(run.policy_path(version), "").unwrap();
+    }
+    run.prune_policies(&[]).unwrap();
+    assert_eq!(run.saved_policies().unwrap().len(), 6, "nothing evaluated, nothing removed");
+    for (version, return_mean) in [(1, -3.0), (2, -1.0), (3, -2.0), (4, -2.0)] {
+        run.append_evaluation(&row(version, return_mean)).unwrap();
+    }
+    run.prune_policies(&[3]).unwrap();
+    assert_eq!(run.saved_policies().unwrap().into_iter().collect::<Vec<_>>(), [2, 3, 4, 5, 6]);
+}
+
+#[test]
+fn rewinding_forgets_what_came_after_the_checkpoint_and_keeps_the_rest_byte_for_byte() {
+    let parent = tempfile::tempdir().unwrap();
+    let run = new_run(&parent);
+    fs::write(
+        run.metrics_path(),
+        "{\"env_steps\": 100,  \"loss\": 0.10}\n{\"env_steps\": 300}\n{\"env_st",
+    )
+    .unwrap();
+    run.append_evaluation(&row(1, -3.0)).unwrap();
+    run.append_evaluation(&row(2, -3.0)).unwrap();
+    run.rewind(150).unwrap();
+    let metrics = fs::read_to_string(run.metrics_path()).unwrap();
+    assert_eq!(metrics, "{\"env_steps\": 100,  \"loss\": 0.10}\n");
+    assert_eq!(run.evaluations().unwrap(), [row(1, -3.0)]);
+}
+
+/// Learners that were killed while they cut the curve back left their half of it for good.
+#[test]
+fn what_killed_writers_left_beside_their_files_is_removed_and_nothing_else() {
+    let parent = tempfile::tempdir().unwrap();
+    let run = new_run(&parent);
+    let checkpoints = run.checkpoints_path();
+    fs::create_dir(checkpoints.join(".000002.tmp")).unwrap();
+    let left = ["evaluations.tmp21405", "segments.tmp", "policies/12.tmp", "checkpoints/best.tmp7"];
+    let kept = ["policies/12.safetensors", "evaluations.jsonl", "segments.log", "my.tmpfile"];
+    for name in left.iter().chain(&kept) {
+        fs::write(run.path().join(name), "").unwrap();
+    }
+    std::os::unix::fs::symlink("nowhere", checkpoints.join(".latest.tmp")).unwrap();
+    run.remove_half_written().unwrap();
+    let is_there = |name: &&&str| run.path().join(name).symlink_metadata().is_ok();
+    assert_eq!(left.iter().filter(is_there).count(), 0);
+    assert_eq!(kept.iter().filter(is_there).count(), kept.len());
+    assert!(checkpoints.join(".latest.tmp").symlink_metadata().is_err());
+    assert!(checkpoints.join(".000002.tmp").is_dir());
+}
+
+#[test]
+fn two_trainers_of_one_run_are_one_too_many() {
+    let parent = tempfile::tempdir().unwrap();
+    let run = new_run(&parent);
+    let held = run.lock(Duration::ZERO).unwrap();
+    let error = run.lock(Duration::ZERO).unwrap_err().to_string();
+    assert!(error.contains(&format!("process {}", std::process::id())), "{error}");
+    drop(held);
+    // A process that another test starts at this moment may hold the descriptor a while longer.
+    run.lock(Duration::from_secs(60)).unwrap();
+}

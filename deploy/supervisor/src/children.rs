@@ -1,0 +1,176 @@
+//! The supervisor's record of its children.
+
+use std::collections::BTreeMap;
+use std::time::{Duration, Instant};
+
+use dmprl_control::Activity;
+use dmprl_shared::transport::delivery::Sent;
+
+use super::process::Process;
+use super::restart_policy::Death;
+
+/// All processes of the session, by name.
+#[derive(Debug, Default)]
+pub(super) struct Children {
+    pub(super) slots: BTreeMap<Process, Slot>,
+}
+
+/// A process of the session, running or not.
+#[derive(Debug, Default)]
+pub(super) struct Slot {
+    pub(super) running: Option<Running>,
+    /// Starts in this session; each is an incarnation of its own.
+    pub(super) starts: u32,
+    /// Restarts since the process was last proven.
+    pub(super) restarts: u32,
+    pub(super) restart_at: Option<Instant>,
+    /// Segments of a worker in this session.
+    pub(super) sent: Sent,
+}
+
+/// A running process.
+#[derive(Debug)]
+pub(super) struct Running {
+    pub(super) spawned: Instant,
+    pub(super) ready: bool,
+    /// The worker has the shared-memory directory, in which it also finds the next learner.
+    pub(super) attached: bool,
+    /// Time of the last report.
+    pub(super) heard: Instant,
+    /// Activity in the last heartbeat.
+    pub(super) activity: Option<Activity>,
+    /// Unacknowledged segments in the last heartbeat.
+    pub(super) kept: u64,
+    pub(super) worked: Option<Worked>,
+    /// A worker that had joined has announced that it leaves.
+    pub(super) left: bool,
+    /// Why the supervisor killed it.
+    pub(super) killed_for: Option<Death>,
+    /// When a process that was killed must have ended.
+    pub(super) ends_by: Option<Instant>,
+}
+
+/// When a process first and last reported work: a worker segments, a learner checkpoints.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Worked {
+    pub(super) first: Instant,
+    pub(super) last: Instant,
+}
+
+impl Running {
+    pub(super) fn new(now: Instant) -> Self {
+        Self {
+            spawned: now,
+            ready: false,
+            attached: false,
+            heard: now,
+            activity: None,
+            kept: 0,
+            worked: None,
+            left: false,
+            killed_for: None,
+            ends_by: None,
+        }
+    }
+}
+
+impl Children {
+    /// Records a start; returns its number in this session, from 0.
+    pub(super) fn start(&mut self, process: Process, now: Instant) -> u32 {
+        let slot = self.slots.entry(process).or_default();
+        slot.restart_at = None;
+        slot.starts += 1;
+        slot.running = Some(Running::new(now));
+        slot.starts - 1
+    }
+
+    /// Whether the process was started in this session.
+    pub(super) fn knows(&self, process: Process) -> bool {
+        self.slots.contains_key(&process)
+    }
+
+    pub(super) fn running(&self, process: Process) -> Option<&Running> {
+        self.slots.get(&process)?.running.as_ref()
+    }
+
+    pub(super) fn running_mut(&mut self, process: Process) -> Option<&mut Running> {
+        self.slots.get_mut(&process)?.running.as_mut()
+    }
+
+    /// Records the end of a process.
+    pub(super) fn take(&mut self, process: Process) -> Option<Running> {
+        self.slots.get_mut(&process)?.running.take()
+    }
+
+    pub(super) fn all_running(&self) -> impl Iterator<Item = (Process, &Running)> {
+        self.slots.iter().filter_map(|(process, slot)| Some((*process, slot.running.as_ref()?)))
+    }
+
+    pub(super) fn each_running(&mut self) -> impl Iterator<Item = &mut Running> {
+        self.slots.values_mut().filter_map(|slot| slot.running.as_mut())
+    }
+
+    /// Names of all running processes.
+    pub(super) fn names(&self) -> Vec<Process> {
+        self.all_running().map(|(process, _)| process).collect()
+    }
+
+    /// Attached workers: the run's own, and those that have joined.
+    pub(super) fn workers(&self) -> usize {
+        let attached = self.all_running().filter(|(process, running)| {
+            process.is_worker() && running.attached && running.killed_for.is_none()
+        });
+        attached.count()
+    }
+
+    /// Workers that run or will be restarted.
+    pub(super) fn workers_left(&self) -> usize {
+        let remains = |(process, slot): &(&Process, &Slot)| {
+            process.is_worker() && (slot.running.is_some() || slot.restart_at.is_some())
+        };
+        self.slots.iter().filter(remains).count()
+    }
+
+    /// Unacknowledged segments of all workers.
+    pub(super) fn kept(&self) -> u64 {
+        self.all_running().map(|(_, running)| running.kept).sum()
+    }
+
+    /// Resets a process's restart budget and back-off.
+    pub(super) fn forgive(&mut self, process: Process) {
+        if let Some(slot) = self.slots.get_mut(&process) {
+            slot.restarts = 0;
+        }
+    }
+
+    /// Records that a process has reported work.
+    pub(super) fn worked(&mut self, process: Process, now: Instant) {
+        if let Some(running) = self.running_mut(process) {
+            let first = running.worked.map_or(now, |worked| worked.first);
+            running.worked = Some(Worked { first, last: now });
+        }
+    }
+
+    /// Cancels all scheduled restarts that `of` selects.
+    pub(super) fn cancel_restarts(&mut self, of: impl Fn(Process) -> bool) {
+        let slots = self.slots.iter_mut().filter(|(process, _)| of(**process));
+        slots.for_each(|(_, slot)| slot.restart_at = None);
+    }
+
+    /// Counts the silence of every process from `now`.
+    pub(super) fn hear_anew(&mut self, now: Instant) {
+        self.each_running().for_each(|running| running.heard = now);
+    }
+
+    /// The process whose silence will first exceed `limit`, and when. Only workers, gateway and
+    /// relay send heartbeats, once they are ready.
+    pub(super) fn first_silent(&self, limit: Duration) -> Option<(Instant, Process)> {
+        let watched = self.all_running().filter(|(process, running)| {
+            let beats = !matches!(process, Process::Learner | Process::Evaluator);
+            beats && running.ready && running.killed_for.is_none()
+        });
+        watched
+            .filter_map(|(process, running)| Some((running.heard.checked_add(limit)?, process)))
+            .min()
+    }
+}

@@ -1,0 +1,145 @@
+//! Runs `venv` and `pip`, with progress, and reports their failures.
+
+use std::{
+    collections::VecDeque,
+    ffi::OsStr,
+    fs::File,
+    io::{self, BufRead, BufReader},
+    path::Path,
+    process::{Command, ExitStatus, Stdio},
+    sync::mpsc::{self, RecvTimeoutError},
+    thread,
+    time::{Duration, Instant},
+};
+
+use anyhow::{Context, Result, bail};
+use dmprl_actors::python_env::LINKED_PYTHON;
+
+use super::{advice::advice, environment::PythonEnvironment, stamp};
+
+/// Maximum number of lines of a failed command in its error.
+const LAST_LINES_MAX: usize = 20;
+/// Interval between progress lines of a command that prints nothing.
+const PROGRESS_INTERVAL: Duration = Duration::from_secs(1);
+/// Maximum number of lines between the reading thread and the progress. Beyond, the command blocks.
+const LINES_AHEAD_MAX: usize = 256;
+
+/// A set-up of `.venv` in progress.
+pub(super) struct Setup<'a> {
+    /// The environment to create.
+    pub environment: &'a PythonEnvironment,
+    /// The lock, held until the last command that writes into `.venv` has ended.
+    pub lock: &'a File,
+    /// Called with each progress line.
+    pub progress: &'a dyn Fn(&str),
+}
+
+impl Setup<'_> {
+    /// Creates the virtual environment with the interpreter against which this program is linked.
+    pub fn create(&self) -> Result<()> {
+        stamp::begin(&self.environment.venv)?;
+        let mut command = Command::new(LINKED_PYTHON.executable);
+        command.args(["-I", "-m", "venv"]).arg(&self.environment.venv);
+        let phase = format!("making .venv with Python {}", LINKED_PYTHON.version_number());
+        self.run(&phase, command)
+    }
+
+    /// Installs the package and its requirements.
+    ///
+    /// The installation is editable, a reference to `envs_py`. So a changed or added task takes
+    /// effect at the next start, and only changed requirements are installed again.
+    pub fn install(&self, package: &Path) -> Result<()> {
+        let package: [&OsStr; 2] = ["--editable".as_ref(), package.as_ref()];
+        self.pip("installing packages", &package)
+    }
+
+    /// Installs the requirements of an optional part of the package, in pip's syntax. Installing
+    /// `dmprl[extra]` instead would build the package again, which needs its build tool from the
+    /// network even if all requirements are met.
+    pub fn install_extra(&self, requirements: &[String]) -> Result<()> {
+        let arguments: Vec<&OsStr> = requirements.iter().map(AsRef::as_ref).collect();
+        self.pip(&format!("installing {}", requirements.join(" ")), &arguments)
+    }
+
+    fn pip(&self, phase: &str, arguments: &[&OsStr]) -> Result<()> {
+        let mut command = Command::new(&self.environment.executable);
+        command
+            .args(["-I", "-m", "pip", "install", "--disable-pip-version-check", "--no-input"])
+            .args(["--progress-bar", "off"])
+            .args(arguments)
+            // Settings of a user's pip.conf that fail in a virtual environment or bypass it.
+            .env("PIP_USER", "0")
+            .env_remove("PIP_TARGET")
+            .env_remove("PIP_PREFIX");
+        self.run(phase, command)
+    }
+
+    fn run(&self, phase: &str, mut command: Command) -> Result<()> {
+        let started = Instant::now();
+        let line = command_line(&command);
+        let (output, input) = io::pipe().context("no pipe")?;
+        command
+            // The empty lock file serves as empty input, and the command holds the lock until its
+            // own exit: if this program is killed, the next start waits.
+            .stdin(Stdio::from(self.lock.try_clone().context("cannot share the lock")?))
+            .stdout(input.try_clone().context("no pipe")?)
+            .stderr(input);
+        let mut child = command.spawn().with_context(|| format!("cannot run {line}"))?;
+        drop(command); // it holds the pipe's writing end
+        let last_lines = self.follow(phase, started, BufReader::new(output));
+        let status = child.wait().with_context(|| format!("cannot wait for {line}"))?;
+        check(&line, status, &last_lines)
+    }
+
+    /// Shows a command's output as progress until the command closes it; returns the last lines.
+    fn follow(
+        &self,
+        phase: &str,
+        started: Instant,
+        output: impl BufRead + Send + 'static,
+    ) -> VecDeque<String> {
+        let (sender, receiver) = mpsc::sync_channel(LINES_AHEAD_MAX);
+        // A thread reads, because reading a line has no timeout.
+        let reader = thread::spawn(move || {
+            for line in output.split(b'\n').map_while(Result::ok) {
+                if sender.send(String::from_utf8_lossy(&line).trim_end().to_owned()).is_err() {
+                    return;
+                }
+            }
+        });
+        let mut last_lines = VecDeque::with_capacity(LAST_LINES_MAX);
+        loop {
+            match receiver.recv_timeout(PROGRESS_INTERVAL) {
+                Ok(line) if line.is_empty() => continue,
+                Ok(line) => {
+                    if last_lines.len() == LAST_LINES_MAX {
+                        last_lines.pop_front();
+                    }
+                    last_lines.push_back(line);
+                }
+                Err(RecvTimeoutError::Timeout) => {}
+                Err(RecvTimeoutError::Disconnected) => break,
+            }
+            let last = last_lines.back().map_or("", |line: &String| line.trim_start());
+            let seconds = started.elapsed().as_secs();
+            (self.progress)(&format!("python environment: {phase} ({seconds} s) {last}"));
+        }
+        // The thread has dropped its sender, so it ends.
+        let _ = reader.join();
+        last_lines
+    }
+}
+
+fn check(line: &str, status: ExitStatus, last_lines: &VecDeque<String>) -> Result<()> {
+    if status.success() {
+        return Ok(());
+    }
+    let output: Vec<&str> = last_lines.iter().map(String::as_str).collect();
+    let output = output.join("\n");
+    bail!("{}{line} failed ({status}):\n{output}", advice(&output))
+}
+
+fn command_line(command: &Command) -> String {
+    let words = std::iter::once(command.get_program()).chain(command.get_args());
+    words.map(|word| word.to_string_lossy()).collect::<Vec<_>>().join(" ")
+}

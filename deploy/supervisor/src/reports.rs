@@ -1,0 +1,383 @@
+//! What the state machine does about reports of children and requests to join.
+
+use dmprl_control::{Command, EvaluationRequest, EvaluationRow, Greeting, Progress, Report};
+use dmprl_shared::spec::EnvSpec;
+
+use super::launcher::INCARNATIONS_PER_SESSION;
+use super::machine::Machine;
+use super::observer::{NotEvaluated, RunEvent};
+use super::process::Process;
+use super::restart_policy::Death;
+use super::state::{Milestone, Phase};
+use super::step::{Action, Admission, Failure};
+
+/// Maximum number of shown lines that are no reports. The rest is counted.
+const GARBAGE_SHOWN_MAX: u32 = 3;
+/// Maximum number of characters of such a line.
+const GARBAGE_CHARS: usize = 200;
+
+impl Machine {
+    pub(super) fn on_garbage(&mut self, process: Process, line: &str) {
+        self.garbage += 1;
+        if self.garbage <= GARBAGE_SHOWN_MAX {
+            let line: String = line.escape_debug().take(GARBAGE_CHARS).collect();
+            self.warn(process, format!("{process} wrote what is no report: {line}"));
+        }
+    }
+
+    /// Handles a report. A worker that joined cannot end the run by an invalid one.
+    pub(super) fn on_report(&mut self, process: Process, report: Report) -> Result<(), Failure> {
+        match self.handle_report(process, report) {
+            Err(failure) if self.is_joined(process) => {
+                self.kill(process, Death::sent_away(format!("{:#}", failure.error)));
+                Ok(())
+            }
+            handled => handled,
+        }
+    }
+
+    fn handle_report(&mut self, process: Process, report: Report) -> Result<(), Failure> {
+        let counts =
+            matches!(report, Report::Sent(_) | Report::EnvFailures { .. } | Report::EnvHung { .. });
+        if self.children.running(process).is_none() && !counts {
+            // The process has ended, so only its counts still matter.
+            return Ok(());
+        }
+        self.heard(process, &report);
+        match report {
+            Report::EnvironmentReady { spec } => return self.on_environment(process, spec),
+            Report::LearnerReady => return self.on_learner_ready(process),
+            Report::FirstSegment => self.on_first_segment(),
+            Report::Progress(progress) => self.on_progress(progress),
+            Report::Evaluate(request) => self.on_evaluate(request),
+            Report::Evaluated(row) => return self.on_evaluated(process, row),
+            Report::NotEvaluated { policy_version, reason } => {
+                return self.on_not_evaluated(process, policy_version, reason);
+            }
+            Report::EnvFailures { count, last } => self.on_env_failures(process, count, last),
+            Report::Sent(sent) => {
+                self.totals.sent += sent;
+                if let Some(slot) = self.children.slots.get_mut(&process) {
+                    slot.sent += sent;
+                }
+                if sent.sent > 0 {
+                    self.children.worked(process, self.now);
+                }
+            }
+            // Observers and video processes are not supervised here.
+            Report::Alive { .. } | Report::Observed { .. } | Report::Filmed { .. } => {}
+            Report::Hosts(hosts) => {
+                // The gateway's first report means that its endpoints are open.
+                self.set_ready(process);
+                self.hosts.0 = hosts;
+                self.children.worked(process, self.now);
+                self.send_totals();
+            }
+            Report::Left => {
+                if let Some(running) = self.children.running_mut(process) {
+                    running.left = true;
+                }
+            }
+            Report::EnvHung { message } => {
+                // The process exits after this report.
+                self.totals.env_failures = self.totals.env_failures.saturating_add(1);
+                self.warn(process, format!("{process}: {message}"));
+                self.send_totals();
+            }
+            Report::Checkpoint { name, env_steps } => {
+                self.learner.checkpointed = true;
+                self.children.worked(process, self.now);
+                self.tell(RunEvent::Checkpoint { name, env_steps });
+            }
+            Report::Finished => {
+                if process != self.settings.hub || !self.learner.ready {
+                    let message = format!("{process} reported `finished` before `learner_ready`");
+                    return Err(Failure::new(message));
+                }
+                self.on_finished();
+            }
+            Report::Warning { message } => self.warn(process, format!("{process}: {message}")),
+        }
+        Ok(())
+    }
+
+    fn heard(&mut self, process: Process, report: &Report) {
+        let now = self.now;
+        if let Some(running) = self.children.running_mut(process) {
+            running.heard = now;
+            if let Report::Alive { doing, kept } = report {
+                running.activity = Some(*doing);
+                running.kept = *kept;
+            }
+        }
+    }
+
+    fn on_environment(&mut self, process: Process, spec: EnvSpec) -> Result<(), Failure> {
+        match &self.spec {
+            None => {
+                self.actions.push(Action::WriteSpec(spec.clone()));
+                self.spec = Some(spec);
+            }
+            Some(known) if !known.is_same(&spec) => {
+                let json = |spec| serde_json::to_string(spec).unwrap_or_default();
+                return Err(Failure::new(format!(
+                    "the environment of {process} is not the run's: expected {}, got {}",
+                    json(known),
+                    json(&spec)
+                )));
+            }
+            Some(_) => {}
+        }
+        let hub = self.settings.hub;
+        if process == hub || matches!(self.phase, Phase::Stopping { .. }) {
+            return Ok(());
+        }
+        self.set_ready(process);
+        match process {
+            Process::Evaluator => self.send_evaluation(),
+            _ if self.learner.ready => self.attach(process),
+            _ if !self.children.knows(hub) => self.start(hub),
+            _ => {}
+        }
+        Ok(())
+    }
+
+    fn on_learner_ready(&mut self, process: Process) -> Result<(), Failure> {
+        let hub = self.settings.hub;
+        if process != hub {
+            return Err(Failure::new(format!("{process} reported `learner_ready`")));
+        }
+        self.set_ready(process);
+        self.learner.ready = true;
+        if self.totals.learner_restarts > 0 {
+            self.actions.push(Action::Rewind);
+        }
+        self.advanced = self.now;
+        self.send_totals();
+        if matches!(self.phase, Phase::Draining { .. }) {
+            // Its predecessor was asked, and died of something else.
+            self.send(hub, Command::Finish);
+        }
+        if self.settings.one_process || self.phase != Phase::Training {
+            return Ok(());
+        }
+        let waiting = self
+            .children
+            .all_running()
+            .filter(|(process, running)| process.is_worker() && running.ready && !running.attached);
+        let waiting: Vec<Process> = waiting.map(|(process, _)| process).collect();
+        waiting.into_iter().for_each(|process| self.attach(process));
+        if hub == Process::Relay {
+            return Ok(());
+        }
+        if !self.children.knows(Process::Evaluator) {
+            self.start(Process::Evaluator);
+        }
+        if self.settings.config.bridge.is_open() && !self.children.knows(Process::Gateway) {
+            self.start(Process::Gateway);
+        }
+        Ok(())
+    }
+
+    fn on_first_segment(&mut self) {
+        let died = self.learner.died.take();
+        let after = self.now.duration_since(died.unwrap_or(self.started));
+        self.tell(RunEvent::FirstStep { after, is_successor: died.is_some() });
+    }
+
+    fn set_ready(&mut self, process: Process) {
+        if let Some(running) = self.children.running_mut(process) {
+            running.ready = true;
+        }
+    }
+
+    fn attach(&mut self, process: Process) {
+        self.actions.push(Action::Attach(process));
+        if let Some(running) = self.children.running_mut(process) {
+            running.attached = true;
+        }
+        if self.is_joined(process) {
+            self.tell(RunEvent::Joined { process, workers: self.children.workers() });
+        }
+        self.send_totals();
+    }
+
+    fn on_progress(&mut self, progress: Progress) {
+        let marks = |progress: &Progress| (progress.env_steps, progress.updates);
+        if self.last.as_ref().is_none_or(|last| marks(&last.progress) != marks(&progress)) {
+            self.advanced = self.now;
+        }
+        self.learner.checkpointed = false;
+        self.send_totals();
+        self.tell(RunEvent::Progress { progress: progress.clone(), processes: Vec::new() });
+        let milestone = |progress| Some(Milestone { at: self.now, progress });
+        if self.first.is_none() {
+            self.first = milestone(progress.clone());
+        }
+        self.last = milestone(progress);
+    }
+
+    /// Shows the first failure, and then the last one whenever the count has doubled. The process's
+    /// log has each.
+    fn on_env_failures(&mut self, process: Process, count: u64, last: String) {
+        if self.totals.add_env_failures(count) {
+            let log = (!self.is_joined(process)).then(|| self.log_path(process));
+            let count = self.totals.env_failures;
+            self.tell(RunEvent::EnvFailure { process, count, last, log });
+        }
+        self.send_totals();
+    }
+
+    fn on_evaluate(&mut self, request: EvaluationRequest) {
+        if matches!(self.phase, Phase::Stopping { .. }) {
+            return self.give_up_evaluation(&request, NotEvaluated::Stopping);
+        }
+        if let Some(skipped) = self.evaluations.push(request) {
+            let env_steps = skipped.env_steps;
+            self.give_up_evaluation(&skipped, NotEvaluated::TooFarBehind { env_steps });
+        }
+        self.send_evaluation();
+    }
+
+    fn give_up_evaluation(&mut self, request: &EvaluationRequest, reason: NotEvaluated) {
+        self.tell(RunEvent::NotEvaluated { policy_version: request.policy_version, reason });
+    }
+
+    /// Gives up all evaluations that are waiting or in flight.
+    pub(super) fn give_up_evaluations(&mut self, reason: &NotEvaluated) {
+        for request in self.evaluations.clear() {
+            self.give_up_evaluation(&request, reason.clone());
+        }
+    }
+
+    /// Sends the next request, if the evaluator is ready and idle.
+    fn send_evaluation(&mut self) {
+        let evaluator = self.children.running(Process::Evaluator);
+        if !evaluator.is_some_and(|running| running.ready && running.killed_for.is_none()) {
+            return;
+        }
+        if let Some(request) = self.evaluations.start(self.now) {
+            self.send(Process::Evaluator, Command::Evaluate(request));
+        }
+    }
+
+    fn on_evaluated(&mut self, process: Process, row: EvaluationRow) -> Result<(), Failure> {
+        if self.expects_no_answer() {
+            return Ok(());
+        }
+        self.on_answer(process, row.policy_version)?;
+        let run = &self.settings.config.run;
+        let reached = if row.return_mean >= run.until_return {
+            Some(format!("the return has reached {}", run.until_return))
+        } else if row.success_rate.is_some_and(|rate| rate >= run.until_success) {
+            Some(format!("the success rate has reached {}", run.until_success))
+        } else {
+            None
+        };
+        // The shell knows the best row of the run.
+        self.tell(RunEvent::Evaluated { row: row.clone(), is_best: false });
+        self.last_row = Some(row);
+        if let Some(reason) = reached {
+            self.drain(reason);
+        }
+        self.complete_if_done();
+        Ok(())
+    }
+
+    /// The run continues: its curve has one point less.
+    fn on_not_evaluated(
+        &mut self,
+        process: Process,
+        policy_version: u64,
+        reason: String,
+    ) -> Result<(), Failure> {
+        if self.expects_no_answer() {
+            return Ok(());
+        }
+        self.on_answer(process, policy_version)?;
+        let reason = NotEvaluated::Failed { reason, log: self.log_path(process) };
+        self.tell(RunEvent::NotEvaluated { policy_version, reason });
+        self.complete_if_done();
+        Ok(())
+    }
+
+    /// Whether an answer belongs to a request that was given up: the run stops, or the learner
+    /// died, whose successor requests the evaluation again.
+    fn expects_no_answer(&self) -> bool {
+        self.learner.waits_for_evaluator || matches!(self.phase, Phase::Stopping { .. })
+    }
+
+    fn on_answer(&mut self, process: Process, policy_version: u64) -> Result<(), Failure> {
+        if self.settings.one_process {
+            return Ok(());
+        }
+        let killed = self.children.running(process).is_some_and(|it| it.killed_for.is_some());
+        if killed && self.evaluations.finish_late(policy_version) {
+            return Ok(());
+        }
+        if process != Process::Evaluator || !self.evaluations.finish(policy_version) {
+            return Err(Failure::new(format!(
+                "{process} evaluated policy {policy_version}, which nobody asked for"
+            )));
+        }
+        // An evaluator that answers from time to time is worth its restarts.
+        self.children.forgive(Process::Evaluator);
+        self.send_evaluation();
+        Ok(())
+    }
+
+    /// Workers that join have the indices after the run's own.
+    pub(super) fn is_joined(&self, process: Process) -> bool {
+        let workers = self.settings.config.actors.workers;
+        matches!(process, Process::Actor(index) if index as usize >= workers)
+    }
+
+    /// Workers that have joined and run.
+    pub(super) fn joined(&self) -> usize {
+        self.children.all_running().filter(|(process, _)| self.is_joined(*process)).count()
+    }
+
+    /// Admits a worker, or says why not.
+    pub(super) fn on_join_request(&mut self, request: u64, id: i32, speaks: &Greeting) {
+        match self.free_place(speaks) {
+            Ok(index) => {
+                let process = Process::Actor(index);
+                let start = self.children.start(process, self.now);
+                let workers = self.children.workers() + 1;
+                self.actions.push(Action::Admit(Admission { request, index, start, workers }));
+                self.tell(RunEvent::ChildStarted { process, start });
+            }
+            Err(reason) => {
+                let message = format!("process {id} may not join: {reason}");
+                self.tell(RunEvent::Warning { process: None, message });
+                self.actions.push(Action::Refuse { request, reason });
+            }
+        }
+    }
+
+    fn free_place(&self, speaks: &Greeting) -> Result<u32, String> {
+        if *speaks != Greeting::this() {
+            return Err(format!("expected {}, got {speaks}", Greeting::this()));
+        }
+        if self.phase != Phase::Training {
+            return Err("the run is coming to its end".to_owned());
+        }
+        if !self.children.knows(self.settings.hub) {
+            return Err("the run is still starting; try again in a moment".to_owned());
+        }
+        let actors = &self.settings.config.actors;
+        let free = |index: &u32| {
+            let slot = self.children.slots.get(&Process::Actor(*index));
+            slot.is_none_or(|slot| slot.running.is_none() && slot.starts < INCARNATIONS_PER_SESSION)
+        };
+        // The configuration limits both to about a thousand.
+        let mut places = actors.workers as u32..actors.places() as u32;
+        let count = places.len();
+        places.find(free).ok_or_else(|| {
+            format!(
+                "{count} of {count} places for workers that join are taken (actors.joined_max); \
+                 one that leaves makes room"
+            )
+        })
+    }
+}

@@ -1,0 +1,497 @@
+//! A simulated machine room: time, children, messages under way, and the invariants.
+
+use std::collections::{BTreeMap, BTreeSet, VecDeque};
+use std::os::unix::process::ExitStatusExt;
+use std::process::ExitStatus;
+use std::time::{Duration, Instant};
+
+use anyhow::anyhow;
+use dmprl_control::{Command, Greeting, Report};
+use dmprl_run::RunDirectory;
+use dmprl_shared::seeds::{self, Stream};
+use dmprl_shared::transport::delivery::Sent;
+use rand::RngExt;
+
+use super::fakes::{Fake, Mode, Output};
+use super::scenario::{EARLIER_FAILURES, settings};
+use super::tally::Tally;
+use crate::machine::Machine;
+use crate::observer::{AfterDeath, NotEvaluated, RunEvent};
+use crate::process::Process;
+use crate::state::Phase;
+use crate::step::{Action, Event};
+
+/// Maximum delay of an output. It is less than the limit from SIGKILL to the exit, which follows
+/// all outputs.
+const LATE_MS: u64 = 4_000;
+/// Time with faults.
+const FAULTS_S: u64 = 120;
+/// A session without faults ends within this time.
+const SESSION: Duration = Duration::from_secs(4 * 3_600);
+/// Steps of a whole session.
+const STEPS_MAX: u32 = 50_000;
+
+/// Something that happens at a time.
+#[derive(Debug)]
+enum Happening {
+    /// A process acts; the number is that of its start in the world.
+    Turn(Process, u64),
+    /// Its output arrives.
+    Arrival(Process, Output),
+    JoinRequest,
+    Interrupt,
+    /// The supervisor is stopped.
+    Standstill,
+    DomainLost,
+    /// Faults end.
+    Heal,
+}
+
+/// What the invariants compare with the machine.
+#[derive(Debug, Default)]
+struct Model {
+    env_failures: u64,
+    sent: Sent,
+    /// Versions of requested evaluations without an answer.
+    requests: BTreeSet<u64>,
+    /// Those that were sent to an evaluator.
+    sent_requests: BTreeSet<u64>,
+    given_up: BTreeSet<Process>,
+    /// By when a session that stops must have ended.
+    stops_by: Option<Instant>,
+}
+
+pub struct World {
+    random: Stream,
+    mode: Mode,
+    machine: Machine,
+    began: Instant,
+    now: Instant,
+    /// Living processes.
+    fakes: BTreeMap<Process, Fake>,
+    /// Number of each process's last start.
+    serials: BTreeMap<Process, u64>,
+    agenda: BTreeMap<(Instant, u64), Happening>,
+    order: u64,
+    version: u64,
+    join_requests: u64,
+    /// A process that survives SIGKILL.
+    immortal: Option<Process>,
+    model: Model,
+    tally: Tally,
+}
+
+impl World {
+    pub fn new(seed: u64, run: &RunDirectory) -> Self {
+        let mut random = seeds::stream(seed, "supervisor", 0);
+        let settings = settings(&mut random, run);
+        let now = Instant::now();
+        let mut tally = Tally::default();
+        if settings.one_process {
+            tally.count("one process");
+        }
+        if settings.hub == Process::Relay {
+            tally.count("hosts without a learner");
+        }
+        let mut world = Self {
+            mode: Mode { faults: true, one_process: settings.one_process },
+            machine: Machine::new(settings, now),
+            began: now,
+            now,
+            fakes: BTreeMap::new(),
+            serials: BTreeMap::new(),
+            agenda: BTreeMap::new(),
+            order: 0,
+            version: 0,
+            join_requests: 0,
+            immortal: None,
+            model: Model::default(),
+            tally,
+            random,
+        };
+        world.plan_faults();
+        world
+    }
+
+    fn chance(&mut self, one_in: u32) -> bool {
+        self.mode.faults && self.random.random_range(0..one_in) == 0
+    }
+
+    fn plan_faults(&mut self) {
+        let at = |world: &mut Self, happening| {
+            let after = world.random.random_range(0..FAULTS_S * 1_000);
+            world.plan(world.began + Duration::from_millis(after), happening);
+        };
+        for _ in 0..self.random.random_range(0..5) {
+            at(self, Happening::JoinRequest);
+        }
+        if self.chance(3) {
+            at(self, Happening::Interrupt);
+            at(self, Happening::Interrupt);
+        }
+        if self.chance(4) {
+            at(self, Happening::Standstill);
+        }
+        if self.chance(40) {
+            at(self, Happening::DomainLost);
+        }
+        if self.chance(40) {
+            let candidates = [Process::Actor(0), Process::Learner, Process::Evaluator];
+            self.immortal = Some(candidates[self.random.random_range(0..3)]);
+        }
+        self.plan(self.began + Duration::from_secs(FAULTS_S), Happening::Heal);
+    }
+
+    fn plan(&mut self, at: Instant, happening: Happening) {
+        self.order += 1;
+        self.agenda.insert((at, self.order), happening);
+    }
+
+    /// Runs the session to its end.
+    pub fn run(mut self) -> Tally {
+        self.step(Event::Begin);
+        let mut steps = 0;
+        while !self.machine.is_over() {
+            steps += 1;
+            assert!(steps < STEPS_MAX, "no end after {steps} steps");
+            let is_late = self.now >= self.began + SESSION;
+            assert!(!is_late, "no end after {SESSION:?}: {:#?}", self.machine);
+            let deadline = self.machine.next_deadline(self.now).max(self.now);
+            match self.agenda.first_key_value() {
+                Some(((at, _), _)) if *at <= deadline => self.happen(),
+                _ => self.tick(deadline),
+            }
+        }
+        self.check_end();
+        self.tally
+    }
+
+    fn tick(&mut self, deadline: Instant) {
+        self.now = deadline;
+        let all_heard = !self.chance(10);
+        self.step(Event::Tick { all_heard });
+        if all_heard && !self.machine.is_over() {
+            let next = self.machine.next_deadline(self.now);
+            assert!(next > self.now, "a deadline remains due: {:#?}", self.machine);
+        }
+    }
+
+    fn happen(&mut self) {
+        let Some(((at, _), happening)) = self.agenda.pop_first() else { return };
+        self.now = self.now.max(at);
+        match happening {
+            Happening::Turn(process, serial) => self.turn(process, serial),
+            Happening::Arrival(process, output) => self.arrive(process, output),
+            Happening::JoinRequest => {
+                self.join_requests += 1;
+                let (request, id) = (self.join_requests, 1_000);
+                let mut speaks = Greeting::this();
+                if self.chance(8) {
+                    speaks.version = "0.0.0".to_owned();
+                }
+                self.step(Event::JoinRequested { request, id, speaks });
+            }
+            Happening::Interrupt => self.step(Event::Interrupt),
+            Happening::Standstill => {
+                let lost = Duration::from_secs(self.random.random_range(5..10_000));
+                self.now += lost;
+                self.began += lost;
+                if let Some(stops_by) = &mut self.model.stops_by {
+                    *stops_by += lost;
+                }
+                self.step(Event::StoodStill(lost));
+                self.step(Event::Late);
+            }
+            Happening::DomainLost if self.machine.needs_domain() => {
+                self.tally.count("domain lost");
+                self.step(Event::DomainLost("/dev/shm/gone".into()));
+            }
+            Happening::DomainLost => {}
+            Happening::Heal => {
+                self.mode.faults = false;
+                self.fakes.values_mut().for_each(Fake::heal);
+            }
+        }
+    }
+
+    /// A living process acts.
+    fn turn(&mut self, process: Process, serial: u64) {
+        if self.serials.get(&process) != Some(&serial) {
+            return;
+        }
+        let Some(fake) = self.fakes.get_mut(&process) else { return };
+        let outputs = fake.turn(self.mode, &mut self.random, &mut self.version);
+        let next = self.now + fake.turn_after(&mut self.random);
+        self.emit(process, outputs);
+        self.plan(next, Happening::Turn(process, serial));
+    }
+
+    /// Sends outputs on their way. They may be late, but stay in order.
+    fn emit(&mut self, process: Process, outputs: Vec<Output>) {
+        for output in outputs {
+            let late = self.chance(4);
+            let delay = self.random.random_range(0..if late { LATE_MS } else { 50 });
+            let Some(fake) = self.fakes.get_mut(&process) else { return };
+            let at = fake.last_output.max(self.now + Duration::from_millis(delay));
+            fake.last_output = at;
+            if matches!(output, Output::Exit(_) | Output::Gone) {
+                self.fakes.remove(&process);
+            }
+            self.plan(at, Happening::Arrival(process, output));
+        }
+    }
+
+    fn arrive(&mut self, process: Process, output: Output) {
+        let event = match output {
+            Output::Report(report) => {
+                self.expect(process, &report);
+                Event::Report(process, report)
+            }
+            Output::Garbage => Event::Garbage(process, "hello".to_owned()),
+            Output::Exit(status) => Event::Exited(process, status),
+            Output::Gone => Event::Gone(process),
+        };
+        self.step(event);
+    }
+
+    /// Enters a report into the model.
+    fn expect(&mut self, process: Process, report: &Report) {
+        match report {
+            Report::Sent(sent) => self.model.sent += *sent,
+            Report::EnvFailures { count, .. } => {
+                self.model.env_failures += count;
+                self.tally.count("environment failures");
+            }
+            Report::EnvHung { .. } => self.model.env_failures += 1,
+            Report::Evaluate(request) => {
+                assert!(self.machine.children.running(process).is_some());
+                self.model.requests.insert(request.policy_version);
+            }
+            Report::Evaluated(_) => {
+                let evaluator = self.machine.children.running(Process::Evaluator);
+                if evaluator.is_some_and(|evaluator| evaluator.killed_for.is_some()) {
+                    self.tally.count("late answers");
+                }
+            }
+            _ => {}
+        }
+    }
+
+    /// Passes an event to the machine, performs its actions, and checks the invariants.
+    fn step(&mut self, event: Event) {
+        let mut events = VecDeque::from([event]);
+        while let Some(event) = events.pop_front() {
+            for action in self.machine.step(event, self.now) {
+                events.extend(self.perform(action));
+            }
+        }
+        self.check();
+    }
+
+    fn perform(&mut self, action: Action) -> Option<Event> {
+        match action {
+            Action::Start { process, .. } => {
+                if self.chance(400) {
+                    return Some(Event::StartFailed(process, anyhow!("no more processes")));
+                }
+                self.start(process, false);
+            }
+            Action::Admit(admission) => {
+                self.tally.count("joined");
+                self.start(Process::Actor(admission.index), true);
+            }
+            Action::Attach(process) => {
+                self.deliver(process, Command::Attach { domain: "/dev/shm/run".into() });
+            }
+            Action::Send(process, command) => self.deliver(process, command),
+            Action::Kill(process) => self.kill(process),
+            Action::Refuse { .. } => self.tally.count("refused"),
+            Action::Rewind if self.chance(50) => {
+                return Some(Event::ActionFailed(anyhow!("a damaged file")));
+            }
+            Action::Tell(event) => self.hear(&event),
+            Action::TellFailure(_) => self.tally.count("failures while stopping"),
+            Action::Listen | Action::WriteSpec(_) | Action::Rewind => {}
+        }
+        None
+    }
+
+    fn start(&mut self, process: Process, joined: bool) {
+        assert!(!self.fakes.contains_key(&process), "{process} is started twice");
+        let mut fake = Fake::new(process, self.mode, &mut self.random, self.now);
+        fake.joined = joined;
+        self.order += 1;
+        let serial = self.order;
+        self.serials.insert(process, serial);
+        let first = self.now + fake.turn_after(&mut self.random);
+        self.fakes.insert(process, fake);
+        self.plan(first, Happening::Turn(process, serial));
+    }
+
+    fn deliver(&mut self, process: Process, command: Command) {
+        match &command {
+            Command::Evaluate(request) => {
+                let version = request.policy_version;
+                assert!(self.model.requests.contains(&version), "{version} was not requested");
+                if !self.model.sent_requests.insert(version) {
+                    self.tally.count("evaluations repeated");
+                }
+            }
+            Command::EnvFailures { total } => {
+                let expected = EARLIER_FAILURES + self.model.env_failures;
+                assert_eq!(*total, expected, "failures told to the learner");
+            }
+            Command::Sent(sent) => assert_eq!(*sent, self.model.sent, "segments told"),
+            _ => {}
+        }
+        if let Some(fake) = self.fakes.get_mut(&process) {
+            fake.command(command);
+        }
+    }
+
+    fn kill(&mut self, process: Process) {
+        if self.immortal == Some(process) {
+            return;
+        }
+        self.tally.count("kills");
+        let Some(fake) = self.fakes.get(&process) else { return };
+        let exit = if fake.joined { Output::Gone } else { Output::Exit(ExitStatus::from_raw(9)) };
+        self.emit(process, vec![exit]);
+    }
+
+    /// Enters what the observer would see into the model.
+    fn hear(&mut self, event: &RunEvent) {
+        // Each event has a text or none, but formatting never fails.
+        let _ = event.to_string();
+        match event {
+            RunEvent::Evaluated { row, .. } => {
+                self.model.requests.remove(&row.policy_version);
+                self.tally.count("answers");
+            }
+            RunEvent::NotEvaluated { policy_version, reason } => {
+                assert!(self.model.requests.remove(policy_version), "{policy_version}");
+                self.tally.count(match reason {
+                    NotEvaluated::Failed { .. } => "evaluations failed",
+                    NotEvaluated::TooFarBehind { .. } => "evaluations skipped",
+                    NotEvaluated::LearnerDied => "evaluations given up with a learner",
+                    NotEvaluated::Stopping => "evaluations given up with the run",
+                });
+            }
+            RunEvent::ChildDied { process, death, next, .. } => {
+                if !matches!(next, AfterDeath::Restart { .. }) {
+                    self.model.given_up.insert(*process);
+                    self.tally.count("workers given up");
+                }
+                if death.verb == "hung" {
+                    self.tally.count("hangs");
+                }
+                self.tally.count(match process {
+                    Process::Learner | Process::Relay => "deaths of learners",
+                    Process::Actor(_) => "deaths of workers",
+                    Process::Evaluator => "deaths of evaluators",
+                    Process::Gateway => "deaths of gateways",
+                });
+            }
+            RunEvent::Left { .. } => self.tally.count("left"),
+            RunEvent::Draining { .. } => self.tally.count("drained"),
+            _ => {}
+        }
+    }
+
+    fn check(&mut self) {
+        self.check_needed();
+        self.check_children();
+        let totals = &self.machine.totals;
+        assert_eq!(totals.env_failures, self.model.env_failures, "failures of environments");
+        assert_eq!(totals.sent, self.model.sent, "segments");
+        if !self.mode.one_process {
+            let versions = self.machine.evaluations.versions();
+            let requests: Vec<u64> = self.model.requests.iter().copied().collect();
+            let outstanding: BTreeSet<u64> = versions.iter().copied().collect();
+            assert_eq!(outstanding.len(), versions.len(), "a request is there twice");
+            assert_eq!(outstanding.into_iter().collect::<Vec<_>>(), requests, "evaluations");
+        }
+        if let Phase::Stopping { .. } = self.machine.phase {
+            let limits = &self.machine.settings.limits;
+            let latest = self.now + limits.drain.max(limits.stop) + limits.kill;
+            let stops_by = *self.model.stops_by.get_or_insert(latest);
+            assert!(self.now <= stops_by, "a stop that takes too long: {:#?}", self.machine);
+        }
+    }
+
+    /// Every process that the run needs is running or has a restart due, in time.
+    fn check_needed(&self) {
+        let machine = &self.machine;
+        let hub = machine.settings.hub;
+        let needed: Vec<Process> = match machine.phase {
+            Phase::Stopping { .. } => Vec::new(),
+            Phase::Finishing { .. } if machine.evaluations.outstanding() > 0 => {
+                vec![Process::Evaluator]
+            }
+            Phase::Finishing { .. } => Vec::new(),
+            Phase::Draining { .. } => vec![hub, Process::Evaluator],
+            Phase::Training => {
+                let workers = machine.settings.config.actors.workers as u32;
+                let workers = if self.mode.one_process { 0 } else { workers };
+                let workers = (0..workers).map(Process::Actor);
+                workers.chain([hub, Process::Evaluator, Process::Gateway]).collect()
+            }
+        };
+        for process in needed {
+            let Some(slot) = machine.children.slots.get(&process) else {
+                assert!(!process.is_worker(), "{process} was never started");
+                continue;
+            };
+            let waits = slot.running.is_none() && slot.restart_at.is_some();
+            let is_there = slot.running.is_some() || waits;
+            assert!(
+                is_there || self.model.given_up.contains(&process),
+                "{process} is needed and neither runs nor restarts: {machine:#?}"
+            );
+            let blocked = process == Process::Learner && machine.learner.waits_for_evaluator;
+            if blocked {
+                assert!(machine.children.running(Process::Evaluator).is_some(), "{process}");
+            } else if let Some(at) = slot.restart_at {
+                assert!(machine.next_deadline(self.now) <= at.max(self.now), "{process}");
+            }
+        }
+    }
+
+    /// The machine's children are those of the world, apart from exits under way.
+    fn check_children(&self) {
+        let learners = self.fakes.keys().filter(|process| **process == Process::Learner);
+        assert!(learners.count() <= 1);
+        for process in self.fakes.keys() {
+            assert!(self.machine.children.running(*process).is_some(), "{process} is unknown");
+        }
+        for process in self.machine.children.names() {
+            let exits = || {
+                self.agenda.values().any(|happening| match happening {
+                    Happening::Arrival(of, Output::Exit(_) | Output::Gone) => *of == process,
+                    _ => false,
+                })
+            };
+            assert!(self.fakes.contains_key(&process) || exits(), "{process} does not exist");
+        }
+    }
+
+    fn check_end(&mut self) {
+        let machine = &self.machine;
+        if machine.abandoned {
+            assert!(self.immortal.is_some(), "abandoned without need");
+            self.tally.count("abandoned");
+        } else {
+            assert!(self.fakes.is_empty(), "left running: {:?}", self.fakes.keys());
+        }
+        let unanswered = &self.model.requests;
+        assert!(self.mode.one_process || unanswered.is_empty(), "unanswered: {unanswered:?}");
+        self.tally.count(match (&machine.failure, machine.interrupts) {
+            (Some(_), _) => "failed",
+            (None, 0) => {
+                assert!(machine.learner.finished, "completed, but the learner has not finished");
+                "completed"
+            }
+            (None, _) => "interrupted",
+        });
+    }
+}

@@ -1,0 +1,494 @@
+//! The supervisor's shell: waits for events, passes them to the state machine, and performs the
+//! actions that it decides.
+
+use std::collections::{BTreeMap, VecDeque};
+use std::time::{Duration, Instant};
+
+use anyhow::Error;
+use dmprl_control::{Command, EvaluationRow, JoinAnswer, Progress, Welcome};
+use dmprl_run::format::shown;
+use dmprl_run::{Processes, RunDirectory};
+use dmprl_shared::config::ExperimentConfig;
+use dmprl_shared::spec::EnvSpec;
+use tokio::sync::mpsc;
+
+use super::child::{Child, ChildEvent, EVENTS_MAX, Incoming, PendingJoin};
+use super::launcher::Launcher;
+use super::limits::TimeLimits;
+use super::logs::log_tail;
+use super::machine::Machine;
+use super::observer::{RunEvent, RunObserver};
+use super::process::Process;
+use super::state::Settings;
+use super::step::{Action, Admission, Event, Failure, ResumeAdvice, Successor};
+use super::totals::Totals;
+use super::{joining, views};
+
+/// The supervisor was stopped, not late, if it wakes this long after its own deadline: by Ctrl-Z
+/// and `fg`, or a paused container.
+const STANDSTILL: Duration = Duration::from_secs(5);
+/// A supervisor this late cannot tell a worker that hangs from one that was stopped with it.
+const LATE: Duration = Duration::from_secs(1);
+/// Maximum interval between checks for the shared-memory directory: each is one `stat`.
+const DOMAIN_LOOK: Duration = Duration::from_secs(1);
+/// Interval between redraws of the live display. Workers send a heartbeat a second, so events are
+/// frequent enough.
+const REDRAW_EVERY: Duration = Duration::from_millis(500);
+/// Interval between writes of `processes.json`.
+const PROCESSES_EVERY: Duration = Duration::from_secs(2);
+
+/// What the supervisor needs.
+pub struct SupervisorPlan {
+    /// How to start children, and the run.
+    pub launcher: Launcher,
+    /// The resolved configuration.
+    pub config: ExperimentConfig,
+    /// Time limits.
+    pub limits: TimeLimits,
+    /// Counts of earlier sessions of the run.
+    pub earlier: Totals,
+    /// One item per interrupt.
+    pub interrupts: mpsc::Receiver<()>,
+}
+
+/// How a session ended.
+#[derive(Debug)]
+pub enum Ending {
+    /// The learner finished, and every evaluation was answered.
+    Completed,
+    /// The user stopped it.
+    Interrupted,
+    /// It could not continue.
+    Failed(Error),
+}
+
+/// Results of a session.
+#[derive(Debug)]
+pub struct SessionReport {
+    /// How it ended.
+    pub ending: Ending,
+    /// Whether a checkpoint has the learner's last state.
+    pub checkpointed: bool,
+    /// The first progress.
+    pub first: Option<Progress>,
+    /// The last progress.
+    pub last: Option<Progress>,
+    /// Time between the two.
+    pub training: Duration,
+    /// The last evaluation.
+    pub last_row: Option<EvaluationRow>,
+    /// Failures of environments.
+    pub env_failures: u64,
+    /// Restarts of the learner after a death.
+    pub learner_restarts: u64,
+    /// Time from the first start to the last exit.
+    pub wall: Duration,
+}
+
+struct Supervisor<'a> {
+    machine: Machine,
+    launcher: Launcher,
+    observer: &'a mut dyn RunObserver,
+    events: mpsc::Sender<Incoming>,
+    children: BTreeMap<Process, Child>,
+    /// Workers that wait for an answer, by number of their request.
+    joining: BTreeMap<u64, PendingJoin>,
+    join_requests: u64,
+    best_return: f64,
+    started: Instant,
+    /// Last redraw of the live display.
+    drawn: Instant,
+    /// Next write of `processes.json`; `None` after a failure.
+    processes_due: Option<Instant>,
+}
+
+/// Why the supervisor woke.
+enum Wake {
+    Interrupt,
+    Incoming(Incoming),
+    Time,
+}
+
+/// Runs the processes of a session until all have ended.
+pub async fn supervise(plan: SupervisorPlan, observer: &mut dyn RunObserver) -> SessionReport {
+    let SupervisorPlan { launcher, config, limits, earlier, mut interrupts } = plan;
+    let (events, mut incoming) = mpsc::channel(EVENTS_MAX);
+    let mut woke = Instant::now();
+    let (known, unreadable) = match Known::read(&launcher.run) {
+        Ok(known) => (known, None),
+        Err(error) => (Known::default(), Some(error)),
+    };
+    let settings = Settings {
+        config,
+        limits,
+        hub: launcher.hub(),
+        one_process: launcher.domain.is_none(),
+        patience: launcher.upstream.as_ref().map(|it| Duration::from_secs(it.patience_s)),
+        run: launcher.run.clone(),
+        earlier,
+        spec: known.spec,
+    };
+    let machine = Machine::new(settings, woke);
+    let mut supervisor = Supervisor::new(machine, launcher, observer, events);
+    supervisor.best_return = known.best_return.unwrap_or(f64::NEG_INFINITY);
+    supervisor.step(unreadable.map_or(Event::Begin, Event::ActionFailed));
+    while !supervisor.machine.is_over() {
+        // A blocked terminal (Ctrl-S) may have delayed this turn.
+        let looked = Instant::now();
+        supervisor.on_wake(woke, woke, looked);
+        let due = supervisor.next_deadline();
+        let wake = tokio::select! {
+            biased;
+            Some(()) = interrupts.recv() => Wake::Interrupt,
+            Some(event) = incoming.recv() => Wake::Incoming(event),
+            () = tokio::time::sleep_until(due.into()) => Wake::Time,
+        };
+        woke = Instant::now();
+        supervisor.on_wake(looked, due, woke);
+        match wake {
+            Wake::Interrupt => supervisor.step(Event::Interrupt),
+            Wake::Incoming(event) => supervisor.take(event),
+            Wake::Time => {
+                // Reports that arrived meanwhile come first.
+                tokio::task::yield_now().await;
+                supervisor.step(Event::Tick { all_heard: incoming.is_empty() });
+            }
+        }
+        supervisor.check_domain();
+        supervisor.refresh(woke);
+        supervisor.write_processes_if_due(woke);
+    }
+    supervisor.write_processes(true);
+    supervisor.report()
+}
+
+/// Results of earlier sessions.
+#[derive(Default)]
+struct Known {
+    spec: Option<EnvSpec>,
+    best_return: Option<f64>,
+}
+
+impl Known {
+    fn read(run: &RunDirectory) -> anyhow::Result<Self> {
+        let best_return = run.best_row()?.map(|row| row.return_mean);
+        Ok(Self { spec: run.spec()?, best_return })
+    }
+}
+
+impl<'a> Supervisor<'a> {
+    fn new(
+        machine: Machine,
+        launcher: Launcher,
+        observer: &'a mut dyn RunObserver,
+        events: mpsc::Sender<Incoming>,
+    ) -> Self {
+        let now = Instant::now();
+        Self {
+            machine,
+            launcher,
+            observer,
+            events,
+            children: BTreeMap::new(),
+            joining: BTreeMap::new(),
+            join_requests: 0,
+            best_return: f64::NEG_INFINITY,
+            started: now,
+            drawn: now,
+            processes_due: Some(now),
+        }
+    }
+
+    /// Passes an event to the machine and performs its actions, and so on with the events that
+    /// follow from them.
+    fn step(&mut self, event: Event) {
+        let mut events = VecDeque::from([event]);
+        while let Some(event) = events.pop_front() {
+            for action in self.machine.step(event, Instant::now()) {
+                events.extend(self.perform(action));
+            }
+        }
+    }
+
+    fn take(&mut self, incoming: Incoming) {
+        let event = match incoming {
+            Incoming::Child(process, ChildEvent::Report(report)) => Event::Report(process, report),
+            Incoming::Child(process, ChildEvent::Garbage(line)) => Event::Garbage(process, line),
+            Incoming::Child(process, ChildEvent::Exited(status)) => {
+                self.children.remove(&process);
+                Event::Exited(process, status)
+            }
+            Incoming::Child(process, ChildEvent::Gone) => {
+                self.children.remove(&process);
+                Event::Gone(process)
+            }
+            Incoming::Join(pending) => {
+                self.join_requests += 1;
+                let (request, id) = (self.join_requests, pending.id);
+                let speaks = pending.speaks.clone();
+                self.joining.insert(request, pending);
+                Event::JoinRequested { request, id, speaks }
+            }
+        };
+        self.step(event);
+    }
+
+    /// Performs an action; returns the event of its failure.
+    fn perform(&mut self, action: Action) -> Option<Event> {
+        match action {
+            Action::Start { process, start, successor } => {
+                let started = self.start(process, start, successor);
+                return started.err().map(|error| Event::StartFailed(process, error));
+            }
+            Action::Attach(process) => {
+                if let Some(domain) = self.launcher.domain.clone() {
+                    self.send(process, Command::Attach { domain });
+                }
+            }
+            Action::Send(process, command) => self.send(process, command),
+            Action::Kill(process) => {
+                if let Some(child) = self.children.get(&process) {
+                    child.kill();
+                }
+            }
+            Action::Listen => self.listen(),
+            Action::Admit(admission) => {
+                let process = Process::Actor(admission.index);
+                return self.admit(admission).err().map(|it| Event::StartFailed(process, it));
+            }
+            Action::Refuse { request, reason } => {
+                if let Some(pending) = self.joining.remove(&request) {
+                    pending.refuse(reason);
+                }
+            }
+            Action::WriteSpec(spec) => {
+                return self.launcher.run.write_spec(&spec).err().map(Event::ActionFailed);
+            }
+            Action::Rewind => return self.rewind().err().map(Event::ActionFailed),
+            Action::Tell(event) => self.tell(event),
+            Action::TellFailure(failure) => {
+                let message = format!("while stopping: {:#}", self.render(failure));
+                self.warn(message);
+            }
+        }
+        None
+    }
+
+    fn start(
+        &mut self,
+        process: Process,
+        start: u32,
+        successor: Option<Successor>,
+    ) -> anyhow::Result<()> {
+        if let Some(Successor { restarts }) = successor {
+            self.launcher.learner_restarts = restarts;
+            self.launcher.resume = self.launcher.run.has_checkpoint()?;
+            if !self.launcher.resume {
+                self.launcher.run.begin_again()?;
+            }
+        }
+        let command = self.launcher.command(process, start)?;
+        let child = Child::spawn(command, process, self.events.clone())?;
+        self.children.insert(process, child);
+        Ok(())
+    }
+
+    /// Sends a command without waiting. A child that takes none is stuck or dying: its deadline or
+    /// its exit follows, so only a command that it cannot do without is worth a warning.
+    fn send(&mut self, process: Process, command: Command) {
+        let matters = !matches!(
+            command,
+            Command::Stop | Command::EnvFailures { .. } | Command::Sent(_) | Command::Workers(_)
+        );
+        let sent = self.children.get(&process).is_none_or(|child| child.send(command));
+        if !sent && matters {
+            let message = format!("{process} takes no commands");
+            self.tell(RunEvent::Warning { process: Some(process), message });
+        }
+    }
+
+    fn listen(&mut self) {
+        let Some(domain) = &self.launcher.domain else { return };
+        if let Err(error) = joining::listen(domain, self.events.clone()) {
+            self.warn(format!("warning: nobody can join this run: {error:#}"));
+        }
+    }
+
+    fn admit(&mut self, admission: Admission) -> anyhow::Result<()> {
+        let Admission { request, index, start, workers } = admission;
+        let Some(pending) = self.joining.remove(&request) else { return Ok(()) };
+        let incarnation = self.launcher.incarnation(start)?;
+        let welcome = Welcome { index, incarnation, venv: self.launcher.venv.clone(), workers };
+        let (process, answer) = (Process::Actor(index), JoinAnswer::Welcome(welcome));
+        let child = Child::join(pending, &answer, process, self.events.clone())?;
+        self.children.insert(process, child);
+        Ok(())
+    }
+
+    fn rewind(&mut self) -> anyhow::Result<()> {
+        let evaluations = self.launcher.run.evaluations()?;
+        let returns = evaluations.iter().map(|row| row.return_mean);
+        self.best_return = returns.fold(f64::NEG_INFINITY, f64::max);
+        self.observer.on_event(RunEvent::Rewound { evaluations });
+        Ok(())
+    }
+
+    fn warn(&mut self, message: String) {
+        self.tell(RunEvent::Warning { process: None, message });
+    }
+
+    /// Passes an event to the observer, completed by what the machine does not know.
+    fn tell(&mut self, mut event: RunEvent) {
+        match &mut event {
+            RunEvent::Evaluated { row, is_best } => {
+                *is_best = row.return_mean > self.best_return;
+                self.best_return = self.best_return.max(row.return_mean);
+            }
+            RunEvent::Progress { processes, .. } if self.observer.shows_processes() => {
+                self.drawn = Instant::now();
+                *processes = views::process_lines(&self.machine, self.drawn);
+            }
+            _ => {}
+        }
+        self.observer.on_event(event);
+    }
+
+    /// Reports to the machine if the supervisor itself did not run: it last looked at `looked`, was
+    /// to wake at `due` at the latest, and woke at `now`.
+    fn on_wake(&mut self, looked: Instant, due: Instant, now: Instant) {
+        if let Some(lost) = stood_still(looked, due, now) {
+            self.step(Event::StoodStill(lost));
+        } else if lateness(looked, due, now) >= LATE {
+            self.step(Event::Late);
+        }
+    }
+
+    fn next_deadline(&self) -> Instant {
+        let now = Instant::now();
+        let deadline = self.machine.next_deadline(now);
+        let watches_domain = self.machine.needs_domain() && self.launcher.domain.is_some();
+        if watches_domain { deadline.min(now + DOMAIN_LOOK) } else { deadline }
+    }
+
+    /// Ends the run if its shared-memory directory was removed.
+    ///
+    /// Mapped memory remains, so segments continue to arrive. But no process can attach any more,
+    /// so the next death would be the last one, and nothing could be cleaned up. The run ends
+    /// while a checkpoint is still possible.
+    fn check_domain(&mut self) {
+        let domain = self.launcher.domain.as_ref().filter(|_| self.machine.needs_domain());
+        if let Some(domain) = domain.filter(|domain| !domain.is_dir()) {
+            self.step(Event::DomainLost(domain.clone()));
+        }
+    }
+
+    /// Redraws the live display between two reports of progress: deaths and restarts are visible
+    /// without progress.
+    fn refresh(&mut self, now: Instant) {
+        if self.observer.shows_processes() && now.duration_since(self.drawn) >= REDRAW_EVERY {
+            self.drawn = now;
+            let processes = views::process_lines(&self.machine, now);
+            self.observer.on_event(RunEvent::Processes(processes));
+        }
+    }
+
+    fn write_processes_if_due(&mut self, now: Instant) {
+        if self.processes_due.is_some_and(|due| now >= due) {
+            self.processes_due = now.checked_add(PROCESSES_EVERY);
+            self.write_processes(false);
+        }
+    }
+
+    /// Writes `processes.json`. The run continues without this file if that fails.
+    fn write_processes(&mut self, ended: bool) {
+        if self.processes_due.is_none() {
+            return;
+        }
+        let usage = |process| {
+            let id = self.children.get(&process).and_then(Child::id);
+            id.map(views::usage_of).unwrap_or_default()
+        };
+        let rows = views::process_rows(&self.machine, usage, Instant::now());
+        let table = Processes::new(ended, self.started.elapsed().as_secs_f64(), rows);
+        if let Err(error) = self.launcher.run.write_processes(&table) {
+            self.warn(format!("warning: {error:#}; the run goes on without this file"));
+            self.processes_due = None;
+        }
+    }
+
+    /// Completes a failure with the last lines of a log and advice.
+    fn render(&self, failure: Failure) -> Error {
+        let Failure { mut error, log, advice, context } = failure;
+        let run = &self.launcher.run;
+        let tail = log.map(|process| log_tail(&run.log_path(&process.to_string())));
+        let resumable = match advice {
+            ResumeAdvice::Never => false,
+            ResumeAdvice::IfCheckpoint => run.has_checkpoint().unwrap_or(false),
+            ResumeAdvice::Always => true,
+        };
+        let advice = resumable.then(|| {
+            format!("\n  go on from the last checkpoint: dmprl resume {}", shown(run.path()))
+        });
+        if tail.is_some() || advice.is_some() {
+            let (tail, advice) = (tail.unwrap_or_default(), advice.unwrap_or_default());
+            error = anyhow::anyhow!("{error}{tail}{advice}");
+        }
+        match context {
+            Some(context) => error.context(context),
+            None => error,
+        }
+    }
+
+    fn report(mut self) -> SessionReport {
+        self.observer.on_event(RunEvent::Ended);
+        let failure = self.machine.failure.take().map(|failure| self.render(failure));
+        let Machine { interrupts, learner, first, last, last_row, totals, .. } = self.machine;
+        let ending = match failure {
+            Some(error) => Ending::Failed(error),
+            None if interrupts > 0 => Ending::Interrupted,
+            None => Ending::Completed,
+        };
+        let training = match (&first, &last) {
+            (Some(first), Some(last)) => last.at.duration_since(first.at),
+            _ => Duration::ZERO,
+        };
+        SessionReport {
+            ending,
+            checkpointed: learner.finished && learner.checkpointed,
+            first: first.map(|milestone| milestone.progress),
+            last: last.map(|milestone| milestone.progress),
+            training,
+            last_row,
+            env_failures: totals.env_failures,
+            learner_restarts: totals.learner_restarts,
+            wall: self.started.elapsed(),
+        }
+    }
+}
+
+/// For how long a supervisor was stopped that last looked at `looked`, was to wake at `due` at the
+/// latest and woke at `now`; `None` if it was on time.
+fn stood_still(looked: Instant, due: Instant, now: Instant) -> Option<Duration> {
+    (lateness(looked, due, now) >= STANDSTILL).then(|| now.duration_since(looked))
+}
+
+fn lateness(looked: Instant, due: Instant, now: Instant) -> Duration {
+    now.saturating_duration_since(due.max(looked))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Regression test: Ctrl-Z for an hour was once taken for an hour without progress.
+    #[test]
+    fn a_standstill_is_told_from_a_wait() {
+        let looked = Instant::now();
+        let due = looked + Duration::from_secs(60);
+        assert_eq!(stood_still(looked, due, looked), None, "a report came at once");
+        assert_eq!(stood_still(looked, due, due + Duration::from_millis(20)), None, "a timer");
+        let hour = Duration::from_secs(3_600);
+        assert_eq!(stood_still(looked, due, looked + hour), Some(hour));
+        assert_eq!(stood_still(due, looked, due), None, "overdue and handled at once");
+    }
+}

@@ -1,0 +1,19 @@
+//! `[search]`: Optuna suggests values of configuration keys, trial by trial.
+//!
+//! ```text
+//!  runner ── ask ──► dmprl.search (Optuna) ─► values ─► a trial: dmprl train, seed after seed
+//!    │  ◄─ give up? ─┘     │                                │
+//!    └── report, tell ─────┘ ◄────── evaluations.jsonl ─────┘
+//! ```
+//! Optuna's storage, `optuna.db`, is authoritative for trials and their results: a killed search
+//! continues the trials that are running there, from their runs' checkpoints. `trial.json` in each
+//! trial's folder has the same data for listings and reports, which need no Python. A trial's runs
+//! are trained one seed after the other, so that a bad trial can be pruned before all of them have
+//! run.
+
+mod endings;
+mod optuna;
+mod remaining;
+mod runner;
+
+pub use runner::{SearchReport, SearchSweep, search};
