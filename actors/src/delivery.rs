@@ -17,6 +17,7 @@ use dmprl_shared::transport::{
     WorkerTransport,
 };
 use thiserror::Error;
+use tracing::warn;
 
 /// Maximum wait for one command, so that a stop is noticed.
 const COMMAND_WAIT: Duration = Duration::from_millis(100);
@@ -298,7 +299,7 @@ impl<'a, T: WorkerTransport> Delivery<'a, T> {
     }
 
     fn warn(&self, message: String) {
-        eprintln!("warning: {message}");
+        warn!("{message}");
         self.supervisor.warn(message);
     }
 }

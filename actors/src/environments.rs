@@ -1,13 +1,14 @@
 //! Stage 3 of 8: makes the environments of a process, watches calls into them, reports failures.
 //! Called by worker and evaluator.
 
-use std::io::{self, Write};
+use std::io;
 use std::path::Path;
 use std::time::Duration;
 
 use dmprl_shared::config::ExperimentConfig;
 use dmprl_shared::supervision::{Report, Supervisor};
 use thiserror::Error;
+use tracing::info;
 
 use crate::python_env::{Interpreter, InterpreterOptions, PythonEnvironments, PythonError};
 use crate::watchdog;
@@ -79,8 +80,7 @@ pub fn report_failures(failures: &[String], supervisor: &dyn Supervisor) -> u64 
     let count = failures.len() as u64;
     let Some(last) = failures.last() else { return count };
     for failure in failures {
-        // `eprintln!` would panic if the log's reader is gone.
-        let _ = writeln!(io::stderr(), "environment failure: {failure}");
+        info!("environment failure: {failure}");
     }
     // If the supervisor is gone, the loop notices it as a stop.
     let _ = supervisor.report(&Report::EnvFailures { count, last: last.clone() });

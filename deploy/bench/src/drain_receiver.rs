@@ -12,12 +12,12 @@ use std::time::{Duration, Instant};
 use anyhow::{Context, bail};
 use dmprl_control::Report;
 use dmprl_run::Watch;
-use dmprl_run::say;
 use dmprl_shared::segment::{Expected, HINDSIGHT, Rejection, Segment, SegmentHeader, check};
 use dmprl_shared::transport::delivery::Inbox;
 use dmprl_shared::transport::shared_memory::LearnerEnd;
 use dmprl_shared::transport::{AcknowledgementPublisher, ParameterPublisher, SegmentReceiver};
 use rustix::time::{ClockId, clock_gettime};
+use tracing::info;
 
 use super::adaptive_sleep::AdaptiveSleep;
 use super::child::LineChild;
@@ -170,7 +170,7 @@ impl Drop for DrainReceiver {
 /// Shows a worker's warning to the user.
 pub(super) fn show_warning(name: &str, line: &str) {
     if let Ok(Report::Warning { message }) = serde_json::from_str(line) {
-        say(&format!("{name}: {message}"));
+        info!("{name}: {message}");
     }
 }
 

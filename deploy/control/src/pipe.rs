@@ -9,9 +9,9 @@ use std::thread;
 use std::time::Duration;
 
 use anyhow::{Context, ensure};
-use dmprl_run::say;
 use dmprl_shared::supervision::{ReportError, RunTotals, Supervisor};
 use dmprl_shared::transport::delivery::Sent;
+use tracing::error;
 
 use super::heartbeat::Pulse;
 use crate::{Activity, Command, GROUP_SIGNALS, Report, WorkersNow};
@@ -218,7 +218,7 @@ impl Supervisor for ControlPipe {
 /// Kills this process after `limit`, because its supervisor is gone.
 pub fn end_process_after(limit: Duration) {
     thread::sleep(limit);
-    say("error: the supervisor is gone and this process did not exit in time: killing it");
+    error!("the supervisor is gone and this process did not exit in time: killing it");
     // Not `exit`, because destructors of a hanging library could block forever.
     let _ = rustix::process::kill_process(rustix::process::getpid(), rustix::process::Signal::KILL);
 }
@@ -262,12 +262,10 @@ fn read_commands(input: impl Read, sender: &SyncSender<Command>, flags: &Flags) 
             Ok(command) => match sender.try_send(command) {
                 Ok(()) | Err(TrySendError::Disconnected(_)) => {}
                 Err(TrySendError::Full(command)) => {
-                    say(&format!(
-                        "error: dropped a command, {COMMANDS_MAX} are waiting already: {command:?}"
-                    ));
+                    error!("dropped a command, {COMMANDS_MAX} are waiting already: {command:?}");
                 }
             },
-            Err(error) => say(&format!("error: the supervisor sent an invalid command: {error}")),
+            Err(error) => error!("the supervisor sent an invalid command: {error}"),
         }
     }
 }

@@ -205,7 +205,7 @@ impl RunDirectory {
         self.path.join("evaluations.jsonl")
     }
 
-    /// How the latest policy moves; read and written by [`dmprl_analysis::motion`].
+    /// How the latest policy moves; read and written by `dmprl_analysis::motion`.
     #[must_use]
     pub fn motion_path(&self) -> PathBuf {
         self.path.join("motion.json")

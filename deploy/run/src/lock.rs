@@ -9,7 +9,7 @@ use std::time::{Duration, Instant};
 
 use anyhow::{Context, bail};
 
-use crate::say;
+use tracing::info;
 
 /// How often a waiting process looks again.
 const POLL: Duration = Duration::from_millis(50);
@@ -55,10 +55,10 @@ impl RunLock {
                     }
                     if !told {
                         told = true;
-                        say(&format!(
+                        info!(
                             "process {holder} has died; waiting up to {wait:?} for the last \
                              checkpoint of its learner"
-                        ));
+                        );
                     }
                     thread::sleep(POLL);
                 }

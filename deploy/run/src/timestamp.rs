@@ -16,6 +16,12 @@ pub fn rfc3339(time: SystemTime) -> String {
     format(time, "%Y-%m-%dT%H:%M:%SZ")
 }
 
+/// Formats the current time as [`rfc3339`] does.
+#[must_use]
+pub fn now_rfc3339() -> String {
+    rfc3339(SystemTime::now())
+}
+
 /// Formats a time as `20260131-235958`, for names that sort by time.
 #[must_use]
 pub fn compact(time: SystemTime) -> String {

@@ -8,8 +8,8 @@ use anyhow::{Context, bail};
 use dmprl_control::{Command, Report};
 use dmprl_run::describe;
 use dmprl_run::format::shown;
-use dmprl_run::say;
 use tokio::sync::mpsc;
+use tracing::info;
 
 use super::child::{Child, ChildEvent, EVENTS_MAX, Incoming};
 use super::limits::TimeLimits;
@@ -129,9 +129,9 @@ impl Conversation {
 fn show(report: &Report, log: &Path) {
     match report {
         Report::EnvFailures { last, .. } => {
-            say(&format!("environment failure: {last}; log: {}", shown(log)));
+            info!("environment failure: {last}; log: {}", shown(log));
         }
-        Report::Warning { message } | Report::EnvHung { message } => say(message),
+        Report::Warning { message } | Report::EnvHung { message } => info!("{message}"),
         _ => {}
     }
 }

@@ -8,9 +8,9 @@ use std::os::unix::fs::MetadataExt;
 use std::path::{Path, PathBuf};
 
 use anyhow::Context;
-use dmprl_run::say;
 use dmprl_run::{Manifest, random_u64};
 use dmprl_shared::transport::shared_memory::{Domain, Leftover, abandoned, remove_abandoned};
+use tracing::warn;
 
 /// Number of random digits in a name. Paths of domains must stay short.
 const RANDOM_DIGITS: usize = 8;
@@ -111,11 +111,11 @@ impl Place {
                 self.base.join(format!("dmprl-{}-{}", self.user, &random[..RANDOM_DIGITS]))
             }
         };
-        say(&format!(
-            "warning: {} belongs to user {other}; shared memory is in {} instead",
+        warn!(
+            "{} belongs to user {other}; shared memory is in {} instead",
             standard.display(),
             parent.display()
-        ));
+        );
         Ok(parent)
     }
 

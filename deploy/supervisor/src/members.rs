@@ -87,7 +87,7 @@ pub fn of_session(session: Pid) -> anyhow::Result<Vec<String>> {
     Ok(names.filter_map(member).collect())
 }
 
-/// Reads a process's processor time, including that of ended threads [s]; `None` if it is gone.
+/// Reads a process's processor time, including that of ended threads \[s\]; `None` if it is gone.
 pub fn cpu_s(pid: Pid) -> Option<f64> {
     let stat = fs::read_to_string(format!("/proc/{}/stat", pid.as_raw_nonzero())).ok()?;
     // The name in parentheses may contain anything; utime and stime are the twelfth and thirteenth
@@ -100,7 +100,7 @@ pub fn cpu_s(pid: Pid) -> Option<f64> {
 /// Resources of a process.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Holdings {
-    /// Memory [KiB].
+    /// Memory \[KiB\].
     pub rss_kib: u64,
     /// Open files.
     pub fds: u64,

@@ -38,10 +38,11 @@ const SMALL: [(&str, &str); 8] = [
 ];
 
 macro_rules! pages {
-    ($($test:ident: $path:literal,)*) => {
+    ($($(#[$attribute:meta])* $test:ident: $path:literal,)*) => {
         /// Pages with blocks, which are run.
         const PAGES: &[&str] = &[$($path),*];
         $(
+            $(#[$attribute])*
             #[test]
             fn $test() {
                 follow($path);
@@ -65,6 +66,7 @@ pages! {
     every_block_about_robots_runs: "docs/robot.md",
     every_block_about_python_runs: "docs/python.md",
     every_block_about_workers_runs: "docs/workers.md",
+    #[cfg(feature = "hosts")]
     every_block_about_several_hosts_runs: "docs/several-hosts.md",
     every_block_about_trouble_runs: "docs/troubleshooting.md",
     every_block_about_results_runs: "docs/results.md",

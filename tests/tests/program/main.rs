@@ -14,6 +14,7 @@ mod bench_policy;
 mod bench_scale;
 mod bench_system;
 mod bench_transport;
+#[cfg(feature = "hosts")]
 mod bridge;
 mod browser;
 mod chaos;
@@ -29,6 +30,7 @@ mod environments;
 mod export;
 mod fairness;
 mod faults;
+#[cfg(feature = "hosts")]
 mod hosts;
 mod http;
 mod interrupts;

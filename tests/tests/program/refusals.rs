@@ -32,6 +32,25 @@ fn wrong_use_names_the_right_word_and_creates_nothing() {
     }
 }
 
+/// The tests of workers on other hosts are not part of this build either.
+#[cfg(not(feature = "hosts"))]
+#[test]
+fn a_build_without_other_hosts_names_the_command_that_adds_them() {
+    let what = "runs on several hosts";
+    let remedy = "cargo test --release --features hosts";
+    dmprl_tests::skipped::skipped("TEST_BRIDGE_REQUIRED", what, remedy);
+    let (place, expected) = (Workplace::new(), "cargo build --release --features hosts");
+    let token = place.path("token");
+    fs::write(&token, "").unwrap();
+    for arguments in [
+        &["train", "reacher", "--set", "bridge.listen=[\"tcp/127.0.0.1:7447\"]"][..],
+        &["bridge", "--connect", "tcp/127.0.0.1:7447", "--token-file", &token],
+        &["bench", "transport", "--listen", "tcp/127.0.0.1:7447"],
+    ] {
+        place.run(arguments).with_status(2).saying(expected);
+    }
+}
+
 /// A worker that reported it would write `null`, which is no number to whoever reads the report.
 #[test]
 fn an_environment_whose_step_lasts_no_time_is_refused_by_its_worker() {

@@ -16,10 +16,10 @@ use std::thread::JoinHandle;
 use std::time::Duration;
 
 use anyhow::Context;
-use dmprl_run::say;
 use dmprl_run::{RunDirectory, unix_s};
 use events::EventFile;
 use serde_json::Value;
+use tracing::warn;
 
 /// Interval between checks for new lines.
 const LOOK: Duration = Duration::from_secs(2);
@@ -50,7 +50,7 @@ impl Mirror {
             loop {
                 let last = stopped.recv_timeout(LOOK) != Err(RecvTimeoutError::Timeout);
                 if let Err(error) = writer.follow() {
-                    say(&format!("warning: no more TensorBoard files: {error:#}"));
+                    warn!("no more TensorBoard files: {error:#}");
                     return;
                 }
                 if last {

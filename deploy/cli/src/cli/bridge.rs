@@ -11,8 +11,6 @@ use dmprl_bridge::{Link, LinkMode, token};
 use dmprl_run::Watch;
 use dmprl_run::failure::{Outcome, wrong_use};
 use dmprl_run::format::grouped;
-use dmprl_run::say;
-use dmprl_run::write_line;
 use dmprl_run::{
     Manifest, RunDirectory, RunLock, Session, compact_now, random_u64, replace_file, safe_name,
 };
@@ -23,7 +21,7 @@ use dmprl_supervisor::{self as launch, Ending, HostPlan, SessionReport, Upstream
 use super::configuration::refuse;
 use super::output::{OutputArgs, host_observer};
 use super::{cores, prepare_python, this_program};
-use crate::terminal::{ProgressStyle, events};
+use crate::terminal::{ProgressStyle, events, say, write_line};
 
 /// Interval between two join requests.
 const JOIN_INTERVAL: Duration = Duration::from_millis(500);
@@ -35,6 +33,7 @@ const LEFT_OVER: Duration = Duration::from_secs(60);
 const HOST_FILE: &str = "bridge.host";
 
 const HELP: &str = "\
+Both hosts need a program that was built with: cargo build --release --features hosts
 On the learner's host, start the run with bridge.listen. Copy its token, bridge.token in the run's
 directory, to the other hosts; only its owner may have access to the file:
   dmprl train reacher --set 'bridge.listen=[\"tcp/0.0.0.0:7447\"]' --run-dir runs/mine
@@ -84,6 +83,7 @@ pub(super) struct BridgeArgs {
 }
 
 pub(super) fn run(args: &BridgeArgs) -> anyhow::Result<Outcome> {
+    dmprl_bridge::check_available()?;
     let absolute = |path: &PathBuf| {
         std::path::absolute(path).with_context(|| format!("cannot resolve {}", path.display()))
     };

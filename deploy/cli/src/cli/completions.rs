@@ -9,9 +9,9 @@ use clap_complete::Shell;
 use dmprl_run::failure::Outcome;
 use dmprl_run::format::shown;
 use dmprl_run::replace_file;
-use dmprl_run::say;
 
 use super::{Arguments, emit};
+use crate::terminal::say;
 
 /// Section 1 of the manual: commands.
 const SECTION: &str = "1";

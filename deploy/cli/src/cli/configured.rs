@@ -2,10 +2,11 @@
 
 use std::path::PathBuf;
 
+use anyhow::Context;
 use clap::Args;
 use clap::builder::{PossibleValuesParser, RangedI64ValueParser};
 use dmprl_run::failure::wrong_use;
-use dmprl_shared::config::{ExperimentConfig, PRESETS};
+use dmprl_shared::config::{Device, ExperimentConfig, PRESETS};
 use toml::Value;
 
 use super::configuration::{Flag, Sources};
@@ -88,6 +89,20 @@ pub(super) fn flag(flag: &'static str, key: &'static str, value: Option<Value>) 
 /// Parses a non-negative integer: TOML's integers are signed, with 64 bits.
 pub(super) fn integer() -> RangedI64ValueParser<i64> {
     clap::value_parser!(i64).range(0..)
+}
+
+/// Checks that this program was built with what the configuration asks for.
+pub(super) fn check_build(config: &ExperimentConfig) -> anyhow::Result<()> {
+    if config.learner.device == Device::Cuda && !cfg!(feature = "cuda") {
+        return Err(wrong_use(
+            "learner.device = \"cuda\": this build has no CUDA; on a machine with an NVIDIA GPU \
+             and the CUDA toolkit, build with: cargo build --release --features cuda",
+        ));
+    }
+    if config.bridge.listen.is_empty() {
+        return Ok(());
+    }
+    dmprl_bridge::check_available().context("bridge.listen is set")
 }
 
 /// Makes the paths of the user's modules and demonstrations absolute: other processes have other

@@ -5,9 +5,9 @@ use std::path::PathBuf;
 use clap::Args;
 use dmprl_dashboard::{Plan, serve};
 use dmprl_run::failure::Outcome;
-use dmprl_run::say;
 
 use super::emit;
+use crate::terminal::say;
 
 const HELP: &str = "\
 Prints the address of a page that shows every run below the directory: learning curves, also of

@@ -35,15 +35,16 @@ use std::process::ExitCode;
 use anyhow::Context;
 use clap::{Parser, Subcommand};
 use dmprl_bench::{SegmentFeederArgs, TransportWorkerArgs, segment_feeder, transport_worker};
+use dmprl_run::Progress;
 use dmprl_run::Session;
 use dmprl_run::failure::{Outcome, exit_code, render, wrong_use};
-use dmprl_run::{Progress, say_json, says_json, write_line};
 use dmprl_shared::config::ExperimentConfig;
 
 use crate::roles::{
     self, ActorArgs, EvaluatorArgs, GatewayArgs, LearnerArgs, ObserverArgs, RelayArgs,
 };
-use crate::terminal::{ProgressStyle, TerminalProgress, events};
+use crate::terminal::messages::{self, MessageStyle};
+use crate::terminal::{ProgressStyle, TerminalProgress};
 #[cfg(feature = "python")]
 use dmprl_supervisor::python_setup::{Home, ensure_extra};
 pub use session::{TrainingPlan, train_session};
@@ -154,27 +155,31 @@ pub fn main() -> ExitCode {
     dmprl_run::project::set_git_commit(env!("GIT_COMMIT_OF_BUILD"));
     // Prints help and version, refuses wrong use with the nearest names and exits with 2.
     let arguments = Arguments::parse();
-    if arguments.command.writes_events() {
-        say_json();
-    }
+    messages::install(arguments.command.message_style());
     let result = run(arguments.command);
     if let Err(error) = &result {
-        let text = render(error);
-        write_line(&if says_json() { events::error(&text) } else { text });
+        messages::show_error(&render(error));
     }
     exit_code(&result)
 }
 
 impl Command {
-    /// Whether standard error is for events as JSON.
-    fn writes_events(&self) -> bool {
+    /// How messages appear on standard error.
+    fn message_style(&self) -> MessageStyle {
         let output = match self {
             Self::Train(args) => args.output,
             Self::Resume(args) => args.output,
             Self::Bridge(args) => args.output,
-            _ => return false,
+            Self::Learner(_) | Self::Evaluator(_) | Self::Gateway(_) | Self::Relay(_) => {
+                return MessageStyle::Log;
+            }
+            Self::Actor(args) if args.join.is_none() => return MessageStyle::Log,
+            _ => return MessageStyle::Text,
         };
-        output.style() == ProgressStyle::Events
+        match output.style() {
+            ProgressStyle::Events => MessageStyle::Json,
+            _ => MessageStyle::Text,
+        }
     }
 }
 

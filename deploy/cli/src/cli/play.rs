@@ -9,11 +9,11 @@ use clap::Args;
 use dmprl_analysis::export::{read_policy, safetensors};
 use dmprl_run::Watch;
 use dmprl_run::failure::Outcome;
-use dmprl_run::say;
 use dmprl_run::{PolicyChoice, RunDirectory};
 use rustix::process::{Pid, Signal, kill_process};
 
 use super::prepare_python_with;
+use crate::terminal::say;
 
 /// Interval between checks for exit and interrupt.
 const LOOK: Duration = Duration::from_millis(50);

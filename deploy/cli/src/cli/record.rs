@@ -6,12 +6,11 @@ use clap::Args;
 use dmprl_analysis::motion::RecordedEpisode;
 use dmprl_run::failure::{Outcome, wrong_use};
 use dmprl_run::format::shown;
-use dmprl_run::say;
 use dmprl_run::{PolicyChoice, RunDirectory};
 use dmprl_sweep::record::{Observer, RecordPlan, Recordings, record};
 
 use super::{emit, prepare_python_with, this_program};
-use crate::terminal::TerminalProgress;
+use crate::terminal::{TerminalProgress, say};
 
 const HELP: &str = "\
 The episodes are those of `dmprl eval`: noise-free, each with its own seed. Writes an MP4, a GIF,

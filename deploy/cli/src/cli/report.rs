@@ -12,12 +12,11 @@ use dmprl_analysis::report::{
 };
 use dmprl_run::failure::Outcome;
 use dmprl_run::format::shown;
-use dmprl_run::say;
 use dmprl_run::{PolicyChoice, Progress, RunDirectory, rfc3339};
 use dmprl_sweep::record::{Observer, RecordPlan, measure_motion, record};
 
 use super::{emit, prepare_python, prepare_python_with, this_program};
-use crate::terminal::TerminalProgress;
+use crate::terminal::{TerminalProgress, say};
 
 const HELP: &str = "\
 Writes index.html (one self-contained page), report.md, figures.csv, runs.csv, report-data.json and

@@ -11,6 +11,7 @@ use dmprl_supervisor::capacity;
 use dmprl_supervisor::{self as launch, Trial};
 
 use super::configuration::refuse;
+use super::configured::check_build;
 use super::output::OutputArgs;
 use super::{TrainingPlan, cores, prepare_python, this_program, train_session, training_session};
 
@@ -63,6 +64,7 @@ pub(super) fn run(args: &ResumeArgs) -> anyhow::Result<Outcome> {
             )));
         }
     }
+    check_build(&config)?;
     capacity::check(&config, run.spec()?.as_ref())?;
     let venv = prepare_python()?;
     // Before the lock, which children inherit: the interpreter that names its packages is one.

@@ -3,7 +3,6 @@
 use anyhow::{Context, bail};
 use dmprl_run::failure::{Outcome, wrong_use};
 use dmprl_run::format::shown;
-use dmprl_run::say;
 use dmprl_run::sweep_files::{Ledger, Search, SweepFile};
 use dmprl_run::sweep_files::{Study, TUNING_SEED, Trial};
 use dmprl_sweep::Site;
@@ -11,7 +10,7 @@ use dmprl_sweep::search::{SearchSweep, search as run_search};
 
 use super::sweep::{SweepArgs, jobs, take};
 use super::{emit, prepare_python_with, train_configuration};
-use crate::terminal::TerminalProgress;
+use crate::terminal::{TerminalProgress, say};
 
 /// Extra of the Python package with Optuna.
 const EXTRA: &str = "search";

@@ -9,16 +9,15 @@ use dmprl_analysis::tensorboard::Mirror;
 use dmprl_learner::checkpoint;
 use dmprl_run::failure::Outcome;
 use dmprl_run::format::shown;
-use dmprl_run::say;
+use dmprl_run::title;
 use dmprl_run::{RunDirectory, RunLock};
-use dmprl_run::{title, write_line};
 use dmprl_shared::config::ExperimentConfig;
 use dmprl_supervisor::{
     self as launch, Ending, RunEvent, RunObserver, SessionPlan, SessionReport, Totals, Trial,
 };
 
 use super::output::observer;
-use crate::terminal::{ProgressStyle, events, summary};
+use crate::terminal::{ProgressStyle, events, say, summary, write_line};
 
 /// A run directory that is ready for training.
 pub struct TrainingPlan {

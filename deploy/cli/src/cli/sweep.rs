@@ -4,17 +4,17 @@ use std::path::{Path, PathBuf};
 
 use anyhow::{Context, bail};
 use clap::Args;
+use dmprl_run::RunDirectory;
 use dmprl_run::RunLock;
 use dmprl_run::failure::{Outcome, wrong_use};
 use dmprl_run::format::{grouped, shown};
 use dmprl_run::sweep_files::{Ledger, Plan, PlannedRun, SweepFile};
-use dmprl_run::{RunDirectory, say};
 use dmprl_shared::config::ExperimentConfig;
 use dmprl_supervisor::RESUME_WAIT;
 use dmprl_sweep::{RunState, Site, Sweep, states, sweep};
 
 use super::{cores, emit, prepare_python, search, this_program, train_configuration};
-use crate::terminal::TerminalProgress;
+use crate::terminal::{TerminalProgress, say};
 
 const HELP: &str = "\
 FILE is TOML. It trains every task with every method, at every point of the grid, with every seed.

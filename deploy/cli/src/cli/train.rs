@@ -10,7 +10,7 @@ use clap::builder::PossibleValuesParser;
 use dmprl_run::failure::{Outcome, wrong_use};
 use dmprl_run::{Manifest, PolicyChoice, RunDirectory, compact, safe_name};
 use dmprl_shared::config::{
-    AlgorithmName, Device, ExperimentConfig, Limits, PolicyKind, TaskDefaults, task_defaults,
+    AlgorithmName, ExperimentConfig, Limits, PolicyKind, TaskDefaults, task_defaults,
 };
 use dmprl_shared::dmp::Dmp;
 use dmprl_supervisor::Trial;
@@ -18,7 +18,7 @@ use dmprl_supervisor::capacity;
 use toml::Value;
 
 use super::configuration::{Flag, merge, refuse};
-use super::configured::{ConfiguredArgs, flag, integer, make_absolute, paths};
+use super::configured::{ConfiguredArgs, check_build, flag, integer, make_absolute, paths};
 use super::output::OutputArgs;
 use super::{TrainingPlan, cores, prepare_python, this_program, train_session, training_session};
 
@@ -137,12 +137,7 @@ fn check(config: &ExperimentConfig, args: &TrainArgs) -> anyhow::Result<()> {
         Dmp::new(&config.dmp, config.policy.segment_steps)
             .map_err(|error| wrong_use(error.to_string()))?;
     }
-    if config.learner.device == Device::Cuda && !cfg!(feature = "cuda") {
-        return Err(wrong_use(
-            "learner.device = \"cuda\": this build has no CUDA; on a machine with an NVIDIA GPU \
-             and the CUDA toolkit, build with: cargo build --release --features cuda",
-        ));
-    }
+    check_build(config)?;
     if let Some(workers) = args.configured.workers.filter(|&n| n > 1 && config.run.deterministic) {
         return Err(wrong_use(format!(
             "--workers {workers}: a deterministic run has one worker, in one process with the \

@@ -12,6 +12,7 @@ use dmprl_run::Setup;
 use dmprl_run::{RunDirectory, TOKEN_FILE, replace_file};
 use dmprl_shared::policy::Policy;
 use dmprl_shared::transport::shared_memory::Plan;
+use tracing::warn;
 
 use super::{ControlPipe, GatewayArgs};
 
@@ -58,7 +59,7 @@ pub fn run(args: &GatewayArgs, control: &ControlPipe) -> anyhow::Result<()> {
             // If the supervisor is gone, the loop notices it as a stop.
             let _ = control.send(&match event {
                 GatewayEvent::Notice(message) => {
-                    eprintln!("{message}");
+                    warn!("{message}");
                     Report::Warning { message }
                 }
                 GatewayEvent::Sent(sent) => Report::Sent(sent),
@@ -69,7 +70,7 @@ pub fn run(args: &GatewayArgs, control: &ControlPipe) -> anyhow::Result<()> {
         }
         if gateway.rejected() >= rejected_next {
             let message = format!("rejected {} damaged or unexpected messages", gateway.rejected());
-            eprintln!("{message}");
+            warn!("{message}");
             let _ = control.send(&Report::Warning { message });
             rejected_next = gateway.rejected().saturating_mul(2);
         }

@@ -25,12 +25,12 @@ use dmprl_run::Setup;
 use dmprl_run::failure::{Outcome, wrong_use};
 use dmprl_run::format::{grouped, shown};
 use dmprl_run::is_ignored;
-use dmprl_run::say;
 use dmprl_shared::transport::delivery::Sent;
 use dmprl_supervisor::Place;
 use signal_hook::flag;
 
 use super::actor::{self, WorkerStart};
+use crate::terminal::say;
 
 /// Time limit for an answer. A supervisor answers at once unless it is suspended.
 const ANSWER_LIMIT: Duration = Duration::from_secs(10);

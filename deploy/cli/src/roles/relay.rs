@@ -194,6 +194,6 @@ impl RelayReporter {
 }
 
 fn warn(control: &ControlPipe, message: String) {
-    eprintln!("{message}");
+    tracing::warn!("{message}");
     let _ = control.send(&Report::Warning { message });
 }

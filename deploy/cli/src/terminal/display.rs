@@ -101,7 +101,7 @@ impl Display {
     /// Prints a message above the bar.
     fn message(&mut self, text: &str) {
         match &mut self.target {
-            Target::Bar(bar) => bar.suspend(|| dmprl_run::say(text)),
+            Target::Bar(bar) => bar.suspend(|| super::say(text)),
             Target::Lines(writer) => write_line(writer, text),
         }
     }

@@ -5,10 +5,12 @@
 
 mod display;
 pub mod events;
+pub mod messages;
 mod panel;
 mod progress;
 mod summary;
 
 pub use display::{Display, ProgressStyle};
+pub use messages::{say, write_line};
 pub use progress::TerminalProgress;
 pub use summary::summary;

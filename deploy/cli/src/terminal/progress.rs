@@ -4,8 +4,10 @@ use std::cell::{Cell, OnceCell};
 use std::io::IsTerminal;
 use std::time::{Duration, Instant};
 
-use dmprl_run::{Progress, say, says_json};
+use dmprl_run::Progress;
 use indicatif::{ProgressBar, ProgressStyle};
+
+use super::messages::{say, says_json};
 
 /// Interval between two lines of [`Progress::state`] without a terminal.
 const LINE_EVERY: Duration = Duration::from_secs(10);

@@ -16,9 +16,9 @@ const CONTROL_GROUPS: &str = "/sys/fs/cgroup";
 pub struct Space {
     /// A directory in it.
     pub path: PathBuf,
-    /// Total size [bytes].
+    /// Total size \[bytes\].
     pub size_bytes: u64,
-    /// Space available to this user [bytes].
+    /// Space available to this user \[bytes\].
     pub free_bytes: u64,
 }
 
@@ -49,7 +49,7 @@ pub struct MachineLimits {
     pub maps: Option<u64>,
     /// Processes and threads of this user or container.
     pub tasks: Option<u64>,
-    /// Main memory, or the container's limit [bytes].
+    /// Main memory, or the container's limit \[bytes\].
     pub memory_bytes: Option<u64>,
 }
 

@@ -30,9 +30,9 @@ pub struct Need {
     pub joined: u64,
     /// Workers of other hosts.
     pub remote: u64,
-    /// Shared memory of all processes [bytes]; 0 for a run in one process.
+    /// Shared memory of all processes \[bytes\]; 0 for a run in one process.
     pub shared_memory_bytes: u64,
-    /// Size of the replay at the end of the run [bytes].
+    /// Size of the replay at the end of the run \[bytes\].
     pub replay_bytes: u64,
     /// Open files of the process with the most.
     pub open_files: u64,

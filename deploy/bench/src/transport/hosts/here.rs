@@ -11,7 +11,6 @@ use anyhow::{anyhow, bail};
 use dmprl_bridge::gateway::{Gateway, GatewayEvent, GatewaySettings, RunFacts};
 use dmprl_bridge::wire::RunState;
 use dmprl_run::Watch;
-use dmprl_run::say;
 use dmprl_shared::config::TASKS;
 use dmprl_shared::parameters::ParameterSnapshot;
 use dmprl_shared::segment::{Segment, check};
@@ -19,6 +18,7 @@ use dmprl_shared::transport::delivery::Inbox;
 use dmprl_shared::transport::shared_memory::{LearnerEnd, serve};
 use dmprl_shared::transport::{AcknowledgementPublisher, ParameterPublisher, SegmentReceiver};
 use serde_json::{Value, json};
+use tracing::info;
 
 use super::{IDLE, INTERVAL, KEPT, PARAMETERS, PATIENCE, TOKEN, domain, plan};
 use crate::statistics::{max, median};
@@ -227,7 +227,7 @@ fn start_gateway(
             gateway.policy_versions().for_each(|version| policies.confirm(version));
             for event in gateway.take_events() {
                 if let GatewayEvent::Notice(notice) = event {
-                    say(&notice);
+                    info!("{notice}");
                 }
             }
         }
