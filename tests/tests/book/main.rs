@@ -5,6 +5,7 @@
     reason = "helpers of tests; clippy.toml covers only the tests themselves"
 )]
 
+mod equations;
 mod keys;
 mod pages;
 
@@ -12,6 +13,7 @@ use std::fs;
 use std::path::Path;
 
 use dmprl_tests::project_root;
+use equations::{Equations, with_mathml};
 use mdbook_driver::MDBook;
 use pages::{Page, built_pages};
 
@@ -41,9 +43,10 @@ fn the_list_of_configuration_keys_is_what_the_types_say() {
 
 #[test]
 fn the_book_builds_reads_without_a_network_and_every_link_in_it_leads_somewhere() {
-    let book = MDBook::load(project_root().join("docs")).unwrap();
+    let mut book = MDBook::load(project_root().join("docs")).unwrap();
+    book.with_preprocessor(Equations);
     let mathjax = book.config.html_config().is_some_and(|html| html.mathjax_support);
-    assert!(!mathjax, "MathJax comes from the network, the book is read without: write MathML");
+    assert!(!mathjax, "MathJax comes from the network, which the book must not need");
     book.build().unwrap();
     let pages = built_pages(&book.build_dir_for("html"));
     assert!(pages.len() > 15, "only {} pages were built", pages.len());
@@ -60,6 +63,15 @@ fn the_book_builds_reads_without_a_network_and_every_link_in_it_leads_somewhere(
         }));
     }
     assert!(wrong.is_empty(), "links in the book:\n  {}\n", wrong.join("\n  "));
+}
+
+#[test]
+fn an_invalid_equation_is_an_error_that_shows_it() {
+    let page = with_mathml("a\n```math\n\\frac{1}{2}\n```\nb\n").unwrap();
+    assert!(page.contains("<mfrac>") && page.ends_with("b\n"), "{page}");
+    let error = with_mathml("```math\n\\frac{1\n```\n").unwrap_err().to_string();
+    assert!(error.contains("\\\\frac{1"), "{error}");
+    assert!(with_mathml("```math\nx\n").is_err());
 }
 
 /// What is wrong with a link, if anything is.
