@@ -1,8 +1,8 @@
 """Counts phrases that make technical English hard to read, and lists where they are.
 
-`tests/tests/tidy.rs` runs this script and limits the
-count. By hand: `python3 tests/prose.py` prints the count of each pattern, `--list` every match as
-FILE:LINE, and `--root DIR` reads another checkout.
+`tests/tests/tidy/language.rs` runs this script and limits the count. By hand, `python3 tests/prose.py`
+prints the count of each pattern, `--list` every match as FILE:LINE, and `--root DIR` reads another
+checkout, which must be a Git repository.
 """
 
 import argparse

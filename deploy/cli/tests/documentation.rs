@@ -106,8 +106,13 @@ fn section<'a>(text: &'a str, heading: &str) -> &'a str {
 
 /// Code spans in the first cell of every row of a table.
 fn first_cells(section: &str) -> BTreeSet<String> {
-    let rows = section.lines().filter(|line| line.starts_with("| `"));
-    rows.flat_map(|row| spans(row.split('|').nth(1).unwrap())).collect()
+    cells(section, 1)
+}
+
+/// Code spans in a column of the tables, the first being 1.
+fn cells(section: &str, column: usize) -> BTreeSet<String> {
+    let rows = section.lines().filter(|line| line.starts_with("| "));
+    rows.filter_map(|row| row.split('|').nth(column)).flat_map(spans).collect()
 }
 
 /// As `train` merges them: the task's defaults, then the file.
@@ -150,9 +155,14 @@ fn every_example_is_named_and_every_configuration_among_them_accepted() {
 #[test]
 fn the_table_of_commands_is_what_the_program_has() {
     let readme = read("README.md");
-    let cells = first_cells(section(&readme, "## Commands"));
-    let documented: BTreeSet<_> =
-        cells.iter().map(|cell| cell.split(' ').next().unwrap().to_owned()).collect();
+    // The first column groups the commands.
+    let commands = cells(section(&readme, "## Commands"), 2);
+    let page = read("docs/commands.md");
+    let roles = first_cells(section(&page, "## Roles"));
+    let documented: BTreeSet<_> = commands
+        .union(&roles)
+        .map(|cell| cell.split(' ').next().unwrap().to_owned())
+        .collect();
     let help = help(&[]);
     let listed = |heading: &str| {
         let below = help.split_once(heading).unwrap_or_else(|| panic!("no {heading} in help")).1;
@@ -162,7 +172,10 @@ fn the_table_of_commands_is_what_the_program_has() {
     let mut existing: BTreeSet<_> = listed("Commands:").into_iter().collect();
     existing.extend(listed("ROLES"));
     existing.remove("help");
-    assert_eq!(documented, existing, "README, `## Commands`, against `dmprl --help`");
+    assert_eq!(
+        documented, existing,
+        "README, `## Commands`, and docs/commands.md, `## Roles`, against `dmprl --help`"
+    );
 }
 
 #[test]

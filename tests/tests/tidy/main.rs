@@ -5,6 +5,9 @@
     reason = "helpers of tests; clippy.toml covers only the tests themselves"
 )]
 
+mod language;
+mod structure;
+
 use std::fs;
 use std::path::Path;
 

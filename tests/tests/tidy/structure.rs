@@ -1,9 +1,4 @@
 //! Which crate may use which, and which modules may use each other.
-#![allow(
-    clippy::unwrap_used,
-    reason = "helpers of tests; clippy.toml covers only the tests themselves"
-)]
-
 use std::collections::{BTreeMap, BTreeSet};
 use std::fs;
 use std::path::Path;
