@@ -90,13 +90,13 @@ pub fn session(plan: SessionPlan, observer: &mut dyn RunObserver) -> anyhow::Res
     Ok(report)
 }
 
-/// Returns whether the run has a checkpoint. A run without one begins again, without the rows of
+/// Returns whether the run has a checkpoint. A run without one starts over, without the rows of
 /// the first attempt.
 fn can_resume(run: &RunDirectory, observer: &mut dyn RunObserver) -> anyhow::Result<bool> {
     if run.has_checkpoint()? {
         return Ok(true);
     }
-    let message = "the run has no checkpoint yet: it begins again".to_owned();
+    let message = "the run has no checkpoint yet: it starts from the beginning".to_owned();
     observer.on_event(RunEvent::Warning { process: None, message });
     run.begin_again()?;
     Ok(false)
