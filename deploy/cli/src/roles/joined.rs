@@ -1,6 +1,6 @@
 //! A worker that joins a running training: `dmprl actor --join RUN`.
 //!
-//! It requests a place from the run's supervisor (`deploy/supervisor/src/joining.rs`) and then works
+//! It requests a place from the supervisor (`deploy/supervisor/src/joining.rs`) and then works
 //! like the others. On the first Ctrl-C it delivers its segments before it leaves; a second Ctrl-C
 //! ends it at once.
 
