@@ -236,7 +236,7 @@ impl Display for RunEvent {
                     None if *announced => "left the run".to_owned(),
                     None => "died (see its terminal)".to_owned(),
                 };
-                write!(out, "joined worker {process} {how}: {} remain", counted(*workers))
+                write!(out, "joined worker {process} {how}: {}", counted(*workers))
             }
             Self::FirstStep { after, is_successor } => {
                 let seconds = after.as_secs_f64();

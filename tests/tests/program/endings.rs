@@ -35,7 +35,7 @@ fn a_return_that_is_reached_ends_a_deterministic_run_too() {
 
 #[test]
 fn minutes_that_are_over_end_the_run_with_a_last_evaluation() {
-    ends(&["--max-minutes", "0.05"], "run.max_minutes are over");
+    ends(&["--max-minutes", "0.05"], "run.max_minutes has elapsed");
 }
 
 /// Largest file that a run here may write, in blocks of 512 bytes: the replay of some 6000 steps
