@@ -4,7 +4,7 @@
 //!  dmprl actor --join RUN ──► join.sock, in the run's private directory
 //!      greeting ◄── supervisor      its version
 //!      request  ──►                 the worker's version
-//!      welcome or refusal ◄──       an index and an incarnation of its own
+//!      welcome or refusal ◄──       the worker's index and incarnation, or a reason
 //! ```
 //! Afterwards the connection replaces a child's standard input and output. A worker that closes it
 //! must exit. The supervisor detects the exit by a descriptor of the process: unlike a process id,

@@ -71,8 +71,8 @@ fn role(command_line: &str) -> Option<Role> {
     }
 }
 
-/// Lists the process ids of a session, except this process. A run started by [`super::WholeRun`]
-/// has a session of its own.
+/// Lists the process ids of a session, except this process. Each [`super::WholeRun`] has its own
+/// session.
 pub fn of_session(session: Pid) -> anyhow::Result<Vec<String>> {
     let (session, own) = (session.as_raw_nonzero().to_string(), std::process::id().to_string());
     let entries = fs::read_dir("/proc").context("cannot list /proc")?;

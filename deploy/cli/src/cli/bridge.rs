@@ -29,7 +29,7 @@ const JOIN_INTERVAL: Duration = Duration::from_millis(500);
 /// Wait for the processes of a killed bridge to exit. They do so at once, unless the machine is
 /// very busy.
 const LEFT_OVER: Duration = Duration::from_secs(60);
-/// File in a bridge's directory with the number by which the learner's host knows this one.
+/// File in a bridge's directory with the number that identifies this host to the learner's host.
 const HOST_FILE: &str = "bridge.host";
 
 const HELP: &str = "\
@@ -100,8 +100,8 @@ pub(super) fn run(args: &BridgeArgs) -> anyhow::Result<Outcome> {
     };
     let patience = Duration::from_secs(args.patience * 60);
     let venv = prepare_python()?;
-    let asked = wait_for_welcome(&join, zenoh_file.as_deref(), patience);
-    let Some(welcome) = asked? else { return Ok(Outcome::Interrupted) };
+    let welcome = wait_for_welcome(&join, zenoh_file.as_deref(), patience)?;
+    let Some(welcome) = welcome else { return Ok(Outcome::Interrupted) };
     let config = host_config(&welcome, workers, &args.python_path)?;
     capacity::check(&config, Some(&welcome.spec))?;
     let run = run_directory(args, &join.name, &welcome, &config)?;

@@ -60,7 +60,7 @@ pub(super) fn run(args: &PlayArgs) -> anyhow::Result<Outcome> {
     let config = run.config()?;
     let opened = read_policy(&run, &run.choose_policy(args.policy)?)?;
     let (_, python) = prepare_python_with(EXTRA)?;
-    let folder = tempfile::tempdir().context("cannot make a folder for the policy")?;
+    let folder = tempfile::tempdir().context("cannot create a folder for the policy")?;
     let file = folder.path().join("policy.safetensors");
     std::fs::write(&file, safetensors(&opened)?).context("cannot write the policy")?;
     let window = !args.stream && has_display();

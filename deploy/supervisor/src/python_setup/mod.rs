@@ -57,7 +57,7 @@ pub fn ensure(project_root: &Path, progress: &dyn Fn(&str)) -> Result<PythonEnvi
     let (root, wanted) = wanted(project_root)?;
     let package = root.join(PACKAGE);
     let environment = PythonEnvironment::of(root.join(VENV));
-    // No lock is needed to read the stamp, which is written last and removed first.
+    // Reading the stamp needs no lock: it is written last and removed first.
     if wanted.compare(&environment.venv) == Fit::Ready {
         return Ok(environment);
     }
