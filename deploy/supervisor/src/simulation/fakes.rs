@@ -21,7 +21,7 @@ pub struct Fake {
     pub process: Process,
     /// The process has joined, so it ends with [`Output::Gone`].
     pub joined: bool,
-    behavior: Behavior,
+    behaviour: Behaviour,
     /// Commands not yet handled.
     commands: VecDeque<Command>,
     ready: bool,
@@ -33,9 +33,9 @@ pub struct Fake {
     pub last_output: Instant,
 }
 
-/// Behavior of a process.
+/// Behaviour of a process.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-enum Behavior {
+enum Behaviour {
     Healthy,
     /// Dies or becomes silent at a random turn.
     Dying,
@@ -76,16 +76,16 @@ pub fn spec() -> EnvSpec {
 
 impl Fake {
     pub fn new(process: Process, mode: Mode, random: &mut Stream, now: Instant) -> Self {
-        let behavior = match random.random_range(0..20) {
-            0..4 if mode.faults => Behavior::Dying,
-            4 if mode.faults => Behavior::Silent,
-            5 if mode.faults => Behavior::IgnoresStop,
-            _ => Behavior::Healthy,
+        let behaviour = match random.random_range(0..20) {
+            0..4 if mode.faults => Behaviour::Dying,
+            4 if mode.faults => Behaviour::Silent,
+            5 if mode.faults => Behaviour::IgnoresStop,
+            _ => Behaviour::Healthy,
         };
         Self {
             process,
             joined: false,
-            behavior,
+            behaviour,
             commands: VecDeque::new(),
             ready: false,
             attached: false,
@@ -102,8 +102,8 @@ impl Fake {
     /// Makes a process healthy that would die at a random turn. A process that is silent or ignores
     /// commands stays so.
     pub fn heal(&mut self) {
-        if self.behavior == Behavior::Dying {
-            self.behavior = Behavior::Healthy;
+        if self.behaviour == Behaviour::Dying {
+            self.behaviour = Behaviour::Healthy;
         }
     }
 
@@ -113,17 +113,17 @@ impl Fake {
 
     /// Takes a turn and returns its outputs; the last one may be the exit.
     pub fn turn(&mut self, mode: Mode, random: &mut Stream, version: &mut u64) -> Vec<Output> {
-        match self.behavior {
-            Behavior::Silent => return Vec::new(),
-            Behavior::Dying => match random.random_range(0..12) {
+        match self.behaviour {
+            Behaviour::Silent => return Vec::new(),
+            Behaviour::Dying => match random.random_range(0..12) {
                 0 | 1 => return vec![self.death(random)],
                 2 => {
-                    self.behavior = Behavior::Silent;
+                    self.behaviour = Behaviour::Silent;
                     return Vec::new();
                 }
                 _ => {}
             },
-            Behavior::Healthy | Behavior::IgnoresStop => {}
+            Behaviour::Healthy | Behaviour::IgnoresStop => {}
         }
         let mut outputs = Vec::new();
         if !self.ready {
@@ -160,7 +160,7 @@ impl Fake {
 
     /// Handles a command; returns true if it ends the process.
     fn obey(&mut self, command: Command, random: &mut Stream, out: &mut Vec<Output>) -> bool {
-        let ignores_stop = self.behavior == Behavior::IgnoresStop;
+        let ignores_stop = self.behaviour == Behaviour::IgnoresStop;
         match command {
             Command::Attach { .. } => self.attached = true,
             Command::Stop | Command::Finish if ignores_stop => {}
@@ -219,7 +219,7 @@ impl Fake {
         let sent = random.random_range(0..4);
         let sent = Sent { produced: sent, sent, resent: 0, acked: sent / 2 };
         out.push(Output::Report(Report::Sent(sent)));
-        if self.behavior == Behavior::Healthy {
+        if self.behaviour == Behaviour::Healthy {
             return;
         }
         match random.random_range(0..12) {
