@@ -263,7 +263,7 @@ impl Display for RunEvent {
             Self::EnvFailure { process, count, last, log } => {
                 let count = grouped(*count);
                 write!(out, "{process}: environment failure {count}: {last}; ")?;
-                out.write_str("its segment is dropped; ")?;
+                out.write_str("its segment is discarded; ")?;
                 match log {
                     Some(log) => write!(out, "log: {}", shown(log)),
                     None => out.write_str("see its terminal"),

@@ -154,7 +154,7 @@ impl Machine {
         let workers = self.children.workers();
         self.notify(RunEvent::Left { process, death, announced, workers });
         if self.children.workers_left() == 0 {
-            let message = "no worker is left: all joined workers have left".to_owned();
+            let message = "no worker is left: all workers that joined are gone".to_owned();
             return Err(Failure::new(message).advice(self.resume_advice()));
         }
         Ok(())
