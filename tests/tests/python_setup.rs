@@ -118,7 +118,7 @@ fn failed_or_killed_installation_is_reported_and_then_made_anew() {
     let (installed, lines) = ensured(project.path());
     assert!(imports_dmprl(&installed.unwrap()));
     assert!(lines[0].contains("pyproject.toml has changed"), "{lines:#?}");
-    assert!(!lines.iter().any(|line| line.contains("making .venv")), "{lines:#?}");
+    assert!(!lines.iter().any(|line| line.contains("creating .venv")), "{lines:#?}");
 }
 
 #[test]

@@ -237,7 +237,7 @@ fn a_host_that_leaves_hands_over_the_segment_that_its_worker_was_in() {
     host.until("the worker in mid-segment", |_| Path::new(&held).is_file());
     let steps: u64 = fs::read_to_string(&held).unwrap().parse().unwrap();
     host.signal_group(Signal::INT);
-    host.until_said("handing over what the workers have sent");
+    host.until_said("delivering the workers' segments");
     fs::remove_file(place.path("hold")).unwrap();
     host.wait().with_status(130).saying("left the run");
     training.until_said("host far has left");

@@ -35,7 +35,7 @@ fn a_return_that_is_reached_ends_a_deterministic_run_too() {
 
 #[test]
 fn minutes_that_are_over_end_the_run_with_a_last_evaluation() {
-    ends(&["--max-minutes", "0.05"], "run.max_minutes are over");
+    ends(&["--max-minutes", "0.05"], "run.max_minutes has elapsed");
 }
 
 /// Largest file that a run here may write, in blocks of 512 bytes: the replay of some 6000 steps
@@ -59,7 +59,7 @@ fn a_full_disk_costs_the_checkpoints_and_not_the_run() {
         .wait()
         .with_status(0)
         .saying("no checkpoint could be written, training continues")
-        .saying("the last checkpoint is missing");
+        .saying("the last checkpoint was not written");
     assert_eq!(finished.said.matches("no checkpoint could be written").count(), 1, "told once");
     assert_eq!(env_steps(&rows(&run, "evaluations.jsonl")).last(), Some(&9000));
     let kept = env_steps_of_checkpoint(&run).unwrap();
@@ -77,7 +77,7 @@ fn ctrl_c_on_a_full_disk_does_not_claim_a_checkpoint() {
     let mut running = place.start_command(train_on_a_full_disk(&run, &["--steps", ENDLESS]));
     running.until_said("no checkpoint could be written");
     running.signal_group(Signal::INT);
-    let finished = running.wait().with_status(130).saying("the last checkpoint is missing");
+    let finished = running.wait().with_status(130).saying("the last checkpoint was not written");
     assert!(!finished.said.contains("checkpoint written"), "{}", finished.said);
     place.assert_no_process();
 }

@@ -60,12 +60,13 @@ fn what_cannot_be_exported_is_told_and_leaves_no_file() {
     place
         .run(&["export", &run, "--format", "safetensors", "--output", &output])
         .with_status(2)
-        .saying("ends like the other format");
+        .saying("has the extension of the other format");
     assert!(!Path::new(&output).exists());
     let trained = place.path("trained");
     place.run(&train("reacher", &trained, &["--steps", "1000"])).with_status(0);
     let before = fs::read_dir(place.path("")).unwrap().count();
-    for (output, words) in [("/dev/null", "no regular file"), ("no/such/p.onnx", "no such folder")]
+    for (output, words) in
+        [("/dev/null", "not a regular file"), ("no/such/p.onnx", "does not exist")]
     {
         place.run(&["export", &trained, "--output", output]).with_status(2).saying(words);
     }

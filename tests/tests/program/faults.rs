@@ -104,7 +104,7 @@ fn survives(task: &str, words: &[&str]) -> (Workplace, String) {
     let keys = ["actors.env_call_timeout_s=10", "supervision.heartbeat_timeout_s=5"];
     let more = ["--steps", "1500", "--set", keys[0], "--set", keys[1]];
     let (run, finished) = train_tiny(&place, task, &more);
-    assert!(!finished.said.contains("no sign of life"), "{}", finished.said);
+    assert!(!finished.said.contains("no heartbeat"), "{}", finished.said);
     let mut finished = finished.with_status(0).saying("actor-0 died").saying("restart 1 of 5");
     for words in words {
         finished = finished.saying(words);

@@ -74,7 +74,10 @@ fn ctrl_c_before_the_first_step_leaves_nothing_running() {
     running.signal_group(Signal::INT);
     running.wait().with_status(130);
     assert_nothing_left(&place, &run);
-    place.run(&["resume", &run, "--steps", "1000"]).with_status(0).saying("begins again");
+    place
+        .run(&["resume", &run, "--steps", "1000"])
+        .with_status(0)
+        .saying("starts from the beginning");
 }
 
 /// The learner hangs, so that only the second interrupt can end the run at once.

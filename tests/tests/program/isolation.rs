@@ -28,7 +28,7 @@ fn tree(path: &Path) -> Vec<PathBuf> {
 
 fn refused_by_its_size(command: Command, place: &Workplace, words: &[&str]) {
     let mut finished = place.start_command(command).wait().with_status(1);
-    for word in ["this machine cannot hold the run"].iter().chain(words) {
+    for word in ["the run exceeds this machine's resources"].iter().chain(words) {
         finished = finished.saying(word);
     }
     assert_eq!(fs::read_dir(place.folder()).unwrap().count(), 0, "it was refused before it began");

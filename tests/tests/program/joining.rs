@@ -79,13 +79,13 @@ fn a_worker_joins_is_learned_from_and_makes_room_when_it_leaves_or_dies() {
     let counts = said.split("left the run: ").nth(1).unwrap();
     let (acknowledged, rest) = counts.split_once(" of ").unwrap();
     assert_eq!(Some(acknowledged), rest.split(' ').next(), "all of them: {said}");
-    running.until_said("actor-1, which had joined, has left: 1 worker");
+    running.until_said("joined worker actor-1 left the run: 1 worker");
 
     // The next is killed, and the one after that has its place too.
     let killed = join(&place, &run);
     until_learned_from(&mut running, &run, 1);
     killed.signal_group(Signal::KILL);
-    running.until_said("actor-1, which had joined, died");
+    running.until_said("joined worker actor-1 died");
     let mut last = join(&place, &run);
     until_learned_from(&mut running, &run, 2);
     last.until_said("segments sent");
@@ -121,7 +121,7 @@ fn a_worker_that_has_joined_and_is_stopped_loses_its_place() {
     let joined = join(&place, &run);
     running.until_said("actor-1 has joined");
     joined.signal_group(Signal::STOP);
-    running.until_said("actor-1, which had joined, hung (no sign of life for 5.");
+    running.until_said("joined worker actor-1 hung (no heartbeat for 5.");
     assert_eq!(joined.wait().status.code(), None);
     let joined = join(&place, &run);
     until_learned_from(&mut running, &run, 1);
@@ -181,8 +181,9 @@ fn joining_and_leaving_all_the_time_leaks_nothing() {
         joined.wait();
         let gone = |running: &Running| {
             let said = running.said();
-            let of = |words: &str| said.matches(&format!("which had joined, {words}")).count();
-            of("has left") + of("died") == round + 1
+            let joined = said.lines().filter(|line| line.contains("joined worker actor-"));
+            let ended = |line: &&str| line.contains(" left the run") || line.contains(" died");
+            joined.filter(ended).count() == round + 1
         };
         running.until("its end is noticed", gone);
         if before.is_none() {

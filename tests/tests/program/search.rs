@@ -132,7 +132,7 @@ fn a_search_that_is_killed_goes_on_with_the_trials_under_way() {
         running.signal(signal);
         let finished = running.wait();
         if signal == Signal::INT {
-            let json = finished.with_status(130).saying("go on with: dmprl sweep").json();
+            let json = finished.with_status(130).saying("resume with: dmprl sweep").json();
             asked.extend([0, 1].map(|number| trial(&json, number)["values"].clone()));
             assert_eq!(trial(&json, 1)["state"], "running");
         }

@@ -92,7 +92,7 @@ fn a_sweep_that_is_interrupted_or_killed_goes_on_where_it_was() {
         running.signal(signal);
         let finished = running.wait();
         if signal == Signal::INT {
-            let finished = finished.with_status(130).saying("go on with: dmprl sweep");
+            let finished = finished.with_status(130).saying("resume with: dmprl sweep");
             let (state, env_steps) = states(&finished.json()).swap_remove(0);
             assert!(state == "open" && env_steps > before, "{state} at {env_steps}");
         }

@@ -39,7 +39,7 @@ pub(super) fn run(args: &DashboardArgs) -> anyhow::Result<Outcome> {
     let plan = Plan { root: &args.directory, port: args.port };
     serve(&plan, dmprl_supervisor::interrupts, |address| {
         emit(&format!("http://{address}"))?;
-        say("the dashboard is at this address until Ctrl-C");
+        say("open this address in a browser (Ctrl-C to stop)");
         Ok(())
     })
 }

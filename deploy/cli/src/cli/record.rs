@@ -25,7 +25,7 @@ EXAMPLES
   dmprl record runs/td3-dmp --compare runs/td3-mlp --seed 1004
   dmprl record runs/mine --output pictures --json";
 
-/// More would be a video too long to watch.
+/// Maximum number of episodes; more would make the video too long to watch.
 const EPISODES_MAX: u64 = 100;
 
 /// Arguments of `dmprl record`.

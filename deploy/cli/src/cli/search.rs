@@ -47,10 +47,10 @@ pub(super) fn run(
     listing.print(args)?;
     let again = format!("dmprl sweep {}", args.file.display());
     if let Some(reason) = ended.gave_up {
-        bail!("{reason}\ngo on with: {again}");
+        bail!("{reason}\nresume with: {again}");
     }
     if ended.interrupted {
-        say(&format!("go on with: {again}"));
+        say(&format!("resume with: {again}"));
         return Ok(Outcome::Interrupted);
     }
     if let Some(study) = studies.iter().find(|study| study.best().is_none()) {
@@ -75,8 +75,8 @@ impl Listing<'_> {
     fn text(&self) -> String {
         let Search { trials, objective, sampler, pruner, seed, .. } = self.search;
         let mut lines = vec![format!(
-            "  {trials} trials of each task and method for the greatest {}; sampler {}, seed \
-             {seed}; pruner {}",
+            "  {trials} trials for each task and method, maximising {}; sampler {}, seed {seed}; \
+             pruner {}",
             objective.name(),
             word(sampler),
             word(pruner),
@@ -87,7 +87,7 @@ impl Listing<'_> {
         for study in self.studies {
             let base = &study.base;
             lines.push(format!(
-                "  {}: {} of {trials} trials begun, each {} steps with {}; evaluated on seeds \
+                "  {}: {} of {trials} trials started, each {} steps with {}; evaluated on seeds \
                  from {}",
                 study.title(),
                 study.trials.len(),

@@ -1,4 +1,4 @@
-//! Command lines of the roles. The supervisor writes them; a user may, to inspect one process.
+//! Command lines of the roles. The supervisor starts the roles; a user can start one to inspect it.
 
 use std::path::PathBuf;
 

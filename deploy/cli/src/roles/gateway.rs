@@ -25,10 +25,10 @@ const REPORT_INTERVAL: Duration = Duration::from_millis(500);
 /// Time limit to attach to the learner. A learner that is being replaced first loads a checkpoint.
 const ATTACH_LIMIT: Duration = Duration::from_secs(60);
 const ATTACH_PAUSE: Duration = Duration::from_millis(20);
-/// Maximum time to tell the hosts that the run has ended, after which they leave. It is less than
-/// the supervisor waits for this process.
+/// Maximum time to announce the end of the run to the hosts, which then leave. Shorter than the
+/// supervisor's time limit for the exit of this process.
 const GOODBYE: Duration = Duration::from_secs(8);
-/// Silence after which a host is no longer waited for.
+/// Silence after which the gateway no longer waits for a host.
 const GONE: Duration = Duration::from_secs(60);
 const GOODBYE_INTERVAL: Duration = Duration::from_millis(100);
 /// Number of rejected messages at the first warning; the next ones follow at each doubling.
@@ -112,7 +112,7 @@ fn open(args: &GatewayArgs, control: &ControlPipe) -> anyhow::Result<Option<Gate
         };
         match Gateway::open(settings, facts.clone()) {
             Ok(gateway) => return Ok(Some(gateway)),
-            // Only errors of the transport pass: the learner may be restarting.
+            // Errors of the transport can be temporary: the learner may be restarting.
             Err(error) if !is_transport(&error) || Instant::now() >= deadline => return Err(error),
             Err(_) if control.stop_requested() => return Ok(None),
             Err(_) => std::thread::sleep(ATTACH_PAUSE),

@@ -1,4 +1,4 @@
-//! Events of a run as JSON, one object a line: `--events json`.
+//! Events of a run as JSON, one object per line: `--events json`.
 //!
 //! `docs/runs.md` lists the kinds and their keys. `FORMAT` is raised if a key changes its
 //! meaning or disappears; new kinds and keys do not raise it.
@@ -9,7 +9,7 @@ use std::time::{Duration, Instant};
 use dmprl_supervisor::{AfterDeath, Ending, NotEvaluated, RunEvent, RunObserver, SessionReport};
 use serde_json::{Map, Value, json};
 
-/// Version of the format, in every line.
+/// Version of the format; written in every line.
 const FORMAT: u32 = 1;
 
 /// Writes events to any writer.
@@ -97,7 +97,7 @@ fn seconds(duration: Duration) -> f64 {
     (duration.as_secs_f64() * 1e3).round() / 1e3
 }
 
-/// The kind of an event and its keys; `None` for those that only draw.
+/// Returns the kind of an event and its keys; `None` for events that only update the display.
 fn object(event: &RunEvent) -> Option<(&'static str, Value)> {
     let named = |process: &dmprl_supervisor::Process| process.to_string();
     Some(match event {
@@ -167,7 +167,7 @@ fn object(event: &RunEvent) -> Option<(&'static str, Value)> {
     })
 }
 
-/// The reason for which a policy is not evaluated, and the evaluator's message.
+/// Returns the reason why a policy is not evaluated, and the evaluator's message.
 fn skipped(reason: &NotEvaluated) -> (&'static str, Option<&String>) {
     match reason {
         NotEvaluated::Failed { reason, .. } => ("failed", Some(reason)),
@@ -203,7 +203,7 @@ mod tests {
     use dmprl_supervisor::{Death, Process};
 
     #[test]
-    fn a_death_says_how_why_and_what_follows() {
+    fn a_death_has_its_cause_and_its_consequence() {
         let event = RunEvent::ChildDied {
             process: Process::Actor(1),
             death: Death { verb: "died", cause: "exit status 3".to_owned() },

@@ -15,15 +15,15 @@ use tracing_subscriber::registry;
 
 use super::events;
 
-/// Beginning of the targets of our own crates. Messages of libraries are not shown.
+/// Prefix of the targets of our own crates. Messages of other libraries are not shown.
 const OWN_TARGETS: &str = "dmprl";
 
-/// Form of the messages.
+/// Format of the messages.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum MessageStyle {
     /// Lines for people.
     Text,
-    /// Events of the kind `message`, so that `--events json` leaves no other line on standard error.
+    /// Events of the kind `message`: with `--events json`, every line on standard error is JSON.
     Json,
     /// Lines with the time, for the log file of a role.
     Log,
@@ -31,9 +31,9 @@ pub enum MessageStyle {
 
 static STYLE: OnceLock<MessageStyle> = OnceLock::new();
 
-/// Shows the messages of all our crates in this style. Called once, before the command begins.
+/// Shows the messages of all our crates in this style. Called once, before the command runs.
 pub fn install(style: MessageStyle) {
-    // A second call, in tests, changes nothing.
+    // A second call, as in tests, has no effect.
     if STYLE.set(style).is_ok() {
         let _ = tracing::subscriber::set_global_default(registry().with(Messages));
     }
@@ -45,7 +45,7 @@ pub fn says_json() -> bool {
     style() == MessageStyle::Json
 }
 
-/// Shows text of a command, such as the next command to use.
+/// Shows a command's text, such as a suggestion of the next command.
 pub fn say(text: &str) {
     show(Level::INFO, text);
 }
