@@ -1,5 +1,5 @@
 //! Checks README, the book, ARCHITECTURE and the example configurations against the program.
-//! `tests/tests/program/documents.rs` runs their code, and `tests/tests/book/main.rs` builds the
+//! `tests/tests/program/documents.rs` runs their code, and `tests/book` builds the
 //! book and checks its links.
 #![allow(clippy::unwrap_used)] // helpers of tests fail as tests do
 

@@ -5,6 +5,7 @@
     reason = "helpers of tests; clippy.toml covers only the tests themselves"
 )]
 
+mod configuration_keys;
 mod language;
 mod structure;
 
@@ -19,7 +20,7 @@ const COLUMNS_MAX: usize = 100;
 const STAGES: u32 = 8;
 /// Built, downloaded or left by runs: nobody's source.
 const FOREIGN_FOLDERS: [&str; 5] = ["target", "runs", "__pycache__", ".git", ".venv"];
-const MEMBERS: [&str; 15] = [
+const MEMBERS: [&str; 16] = [
     "actors",
     "deploy/analysis",
     "deploy/bench",
@@ -34,6 +35,7 @@ const MEMBERS: [&str; 15] = [
     "learner",
     "shared",
     "tests",
+    "tests/book",
     "tests/manifests",
 ];
 

@@ -3,11 +3,13 @@
 
 use std::collections::BTreeMap;
 use std::fmt::Write;
+use std::fs;
 
 use dmprl_shared::config::{
     AlgorithmName, ExperimentConfig, PRESETS, PolicyKind, TASKS, algorithm_defaults,
     policy_defaults,
 };
+use dmprl_tests::project_root;
 use schemars::schema_for;
 use serde_json::Value;
 use toml::Table;
@@ -17,11 +19,15 @@ const VALUE_LETTERS_MAX: usize = 40;
 /// With more, nobody reads the line.
 const VALUES_MAX: usize = 6;
 
+const PAGE: &str = "docs/configuration-keys.md";
+/// Set to generate the page instead of comparing it.
+const WRITE: &str = "WRITE_CONFIGURATION_KEYS";
+
 const HEAD: &str = "\
 # Every configuration key
 
-<!-- Made from the types in shared/src/config by the test `book`. To write it anew:
-     WRITE_CONFIGURATION_KEYS=1 cargo test --release --test book -->
+<!-- Made from the types in shared/src/config by the test `tidy`. To generate it again:
+     WRITE_CONFIGURATION_KEYS=1 cargo test --release --test tidy -->
 
 Each key can stand in a file for `--config`, in `--set KEY=VALUE`, and in an environment variable;
 [Configuration](configuration.md) says how these are laid over each other. Where a preset, a kind of
@@ -29,8 +35,28 @@ policy, an algorithm or a task brings another value, it stands below the default
 algorithm wins over a preset, a preset over a kind of policy, and that over a task.
 ";
 
-/// The page.
-pub fn page() -> String {
+#[test]
+fn the_page_of_configuration_keys_matches_the_types() {
+    let path = project_root().join(PAGE);
+    let made = page();
+    if std::env::var_os(WRITE).is_some() {
+        fs::write(&path, made).unwrap();
+        return;
+    }
+    let written = fs::read_to_string(&path).unwrap_or_default();
+    let same = written.lines().zip(made.lines()).take_while(|(a, b)| a == b).count();
+    assert!(
+        written == made,
+        "{PAGE} differs from the types in shared/src/config at line {}:\n  found    {:?}\n  \
+         expected {:?}\ngenerate it again: {WRITE}=1 cargo test --release --test tidy",
+        same + 1,
+        written.lines().nth(same),
+        made.lines().nth(same),
+    );
+}
+
+/// Returns the page.
+fn page() -> String {
     let schema = schema_for!(ExperimentConfig).to_value();
     let defaults = Table::try_from(ExperimentConfig::default()).unwrap();
     let others = others();

@@ -1,5 +1,5 @@
 //! A preprocessor of the book that turns TeX equations into MathML, which browsers render without
-//! a script or a network. Called by main.rs.
+//! a script or a network. Called by lib.rs.
 
 use anyhow::anyhow;
 use math_core::{LatexToMathML, MathCoreConfig, MathDisplay};
@@ -11,7 +11,7 @@ const OPENING: &str = "```math";
 const CLOSING: &str = "```";
 
 /// Replaces each fenced block of the language `math` by a block of MathML.
-pub struct Equations;
+pub(crate) struct Equations;
 
 impl Preprocessor for Equations {
     fn name(&self) -> &'static str {
@@ -40,7 +40,7 @@ impl Preprocessor for Equations {
 ///
 /// # Errors
 /// An equation is not valid TeX or has no end.
-pub fn with_mathml(page: &str) -> anyhow::Result<String> {
+fn with_mathml(page: &str) -> anyhow::Result<String> {
     let converter = LatexToMathML::new(MathCoreConfig::default())
         .map_err(|error| anyhow!("math-core refuses its own default: {error:?}"))?;
     let mut converted = String::with_capacity(page.len());
@@ -66,4 +66,18 @@ pub fn with_mathml(page: &str) -> anyhow::Result<String> {
         converted.push_str(&format!("<div class=\"equation\">\n{mathml}\n</div>\n"));
     }
     Ok(converted)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn an_invalid_equation_is_an_error_that_shows_it() {
+        let page = with_mathml("a\n```math\n\\frac{1}{2}\n```\nb\n").unwrap();
+        assert!(page.contains("<mfrac>") && page.ends_with("b\n"), "{page}");
+        let error = with_mathml("```math\n\\frac{1\n```\n").unwrap_err().to_string();
+        assert!(error.contains("\\\\frac{1"), "{error}");
+        assert!(with_mathml("```math\nx\n").is_err());
+    }
 }

@@ -1,10 +1,10 @@
 //! `deploy/kubernetes/jobset.yaml` in the types that are made from the published schemas.
 
-use dmprl_manifests::check;
 use serde::Deserialize;
 use serde_json::{Value, json};
 
 use super::read;
+use super::schema::check;
 
 const MANIFEST: &str = "deploy/kubernetes/jobset.yaml";
 /// In `deploy/Dockerfile`.
