@@ -29,11 +29,11 @@ class GoalsTest(unittest.TestCase):
 
     def test_who_cannot_be_asked_is_told_why(self):
         for task_id, reason in [
-            ("tiny_envs:Long-v0", "its observation is no Dict"),
+            ("tiny_envs:Long-v0", "its observation is not a Dict"),
             ("tiny_envs:Goal-v0", "no Box named achieved_goal"),
             ("tiny_envs:ReachAlone-v0", "takes one goal at a time"),
-            ("tiny_envs:Batch", "its observation holds no goals"),
-            ("Reacher-v5", "its observation holds no goals"),
+            ("tiny_envs:Batch", "its observation has no goals"),
+            ("Reacher-v5", "its observation has no goals"),
         ]:
             self.assertIn(reason, refusal(task_id), task_id)
 

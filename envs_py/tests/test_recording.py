@@ -109,7 +109,7 @@ class PicturesTest(unittest.TestCase):
         env = gymnasium.make("Reacher-v5")
         for dt, steps in [(0.0, 1), (0.05, 1), (0.02, 1), (0.01, 2), (0.002, 10)]:
             env.unwrapped.frame_skip = dt / env.unwrapped.model.opt.timestep
-            self.assertEqual(recording.steps_a_frame(env), steps, dt)
+            self.assertEqual(recording.steps_per_frame(env), steps, dt)
 
 
 class FilmTest(unittest.TestCase):

@@ -385,7 +385,7 @@ class BatchTest(unittest.TestCase):
             if step == 0:
                 (message,) = env.take_failures()
                 self.assertIn(
-                    "Pusher-v5, environment 1, this segment: MuJoCo warned (mjWARN_BADQVEL)",
+                    "Pusher-v5, environment 1, this segment: MuJoCo warning (mjWARN_BADQVEL)",
                     message,
                 )
                 self.assertEqual(out.steps.tolist(), [5, 0, 5])

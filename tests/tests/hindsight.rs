@@ -189,7 +189,7 @@ fn the_same_seed_draws_the_same_goals() {
 #[test]
 fn an_environment_without_goals_or_time_limit_is_refused_with_what_helps() {
     for (task, reason) in [
-        ("Long", "its observation is no Dict"),
+        ("Long", "its observation is not a Dict"),
         ("ReachAlone", "takes one goal at a time"),
         ("ReachTimeless", "its episodes have no time limit"),
     ] {

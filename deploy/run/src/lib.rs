@@ -1,6 +1,7 @@
-//! The run directory, and what every command shares: errors, number formats, progress, sweep files.
+//! The run directory, and code that all commands share: errors, number formats, progress and sweep
+//! files.
 //!
-//! Each crate of `deploy` builds on this one. It starts no process and draws nothing.
+//! The other crates of `deploy` build on this one. It starts no process and draws nothing.
 
 mod atomic;
 mod directory;

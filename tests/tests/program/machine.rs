@@ -159,7 +159,7 @@ fn a_learner_killed_for_want_of_memory_is_told_so_and_replaced() {
     if memory.take(role(&place, "learner").id).is_err() {
         return skip();
     }
-    running.until_said("learner died (signal 9 (SIGKILL), perhaps for want of memory): restart 1");
+    running.until_said("learner died (signal 9 (SIGKILL), perhaps out of memory): restart 1");
     running.until_said("the learner is back");
     let steps = env_steps_of(&run).unwrap_or(0);
     running.until_steps(&run, steps + 1_000);

@@ -143,7 +143,7 @@ fn hindsight_is_recommended_for_a_sparse_goal_and_refused_where_there_is_none() 
     let place = Workplace::new();
     let more = [&path[..], &["--set", "replay.hindsight=future"]].concat();
     let end = place.run(&train("tiny_envs:Long-v0", &place.path("run"), &more)).with_status(1);
-    assert!(end.said.contains("its observation is no Dict"), "{}", end.said);
+    assert!(end.said.contains("its observation is not a Dict"), "{}", end.said);
     place.assert_no_process();
 }
 

@@ -1,4 +1,4 @@
-//! Expands a sweep file into single runs.
+//! Expands a sweep file into its runs.
 
 use std::collections::BTreeSet;
 use std::path::PathBuf;
@@ -10,7 +10,7 @@ use super::file::{MethodEntry, TaskEntry, flatten};
 use crate::failure::wrong_use;
 use crate::safe_name;
 
-/// Maximum number of runs. More is a mistake in the file.
+/// Maximum number of runs. A larger number is a mistake in the file.
 const RUNS_MAX: usize = 10_000;
 
 /// One run of a sweep.
@@ -67,13 +67,13 @@ impl Plan {
                 }
             }
         }
-        let mut places = BTreeSet::new();
+        let mut directories = BTreeSet::new();
         for run in &runs {
-            if !places.insert(&run.directory) {
-                let place = run.directory.display();
+            if !directories.insert(&run.directory) {
+                let directory = run.directory.display();
                 return Err(wrong_use(format!(
-                    "two runs of the sweep have the path {place}: give each task, method, seed \
-                     and value once"
+                    "two runs of the sweep have the path {directory}: list each task, method, \
+                     seed and value only once"
                 )));
             }
         }
@@ -186,7 +186,7 @@ mod tests {
     }
 
     #[test]
-    fn every_combination_is_there_once_and_first_seeds_come_first() {
+    fn each_combination_runs_once_ordered_by_seed() {
         let runs = plan(FILE).unwrap().runs;
         assert_eq!(runs.len(), 2 * 2 * 2 * 2);
         assert!(runs[..8].iter().all(|run| run.seed == 1));
@@ -209,7 +209,7 @@ mod tests {
     }
 
     #[test]
-    fn runs_in_the_same_place_are_refused() {
+    fn runs_with_the_same_directory_are_rejected() {
         let error = plan(&FILE.replace("[1, 2]", "[1, 1]")).unwrap_err().to_string();
         assert!(error.contains("seed-1"), "{error}");
         let error = plan(&FILE.replace("'mlp'\n        policy", "'paper'\n        policy"));
@@ -217,7 +217,7 @@ mod tests {
     }
 
     #[test]
-    fn a_grid_without_end_is_refused() {
+    fn a_grid_that_is_too_large_is_rejected() {
         let many: Vec<String> = (0..200).map(|value| value.to_string()).collect();
         let grid = format!("a.b = [{0}]\nc.d = [{0}]", many.join(","));
         let error = plan(&FILE.replace("algorithm.batch_size = [64, 128]", &grid));
