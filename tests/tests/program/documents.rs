@@ -84,7 +84,7 @@ struct Block {
 
 impl Block {
     fn is_run(&self) -> bool {
-        !self.has("not-run") && !["text", "json"].contains(&self.language.as_str())
+        !self.has("not-run") && !["text", "json", "math"].contains(&self.language.as_str())
     }
 
     fn has(&self, attribute: &str) -> bool {

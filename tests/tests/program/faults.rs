@@ -62,7 +62,7 @@ fn goes_on_and_counts(task: &str, words: &str) {
     // The supervisor passes the number on: on a busy machine the learner's last line lags behind.
     let at_least = (steps / LIFE - ENVS) / 2;
     assert!((at_least..=total).contains(&counted), "{counted} of {total}, {at_least} at least");
-    let summary = format!("failures   {total} of environments");
+    let summary = format!("failures   {total} in environments");
     assert!(finished.said.contains(&summary), "{summary}\n{}", finished.said);
     // Each doubling of the number at most.
     let told = finished.said.matches(": environment failure ").count() as u32;

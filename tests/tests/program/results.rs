@@ -167,7 +167,7 @@ fn resume_with_more_steps_extends_a_finished_run() {
     assert!(clock.is_sorted(), "time goes on where it stopped: {clock:?}");
     assert_eq!(json_file(&run, "manifest.json")["sessions"].as_array().unwrap().len(), 2);
 
-    place.run(&["resume", &run, "--steps", "2000"]).with_status(2).saying("has 3000 steps already");
+    place.run(&["resume", &run, "--steps", "2000"]).with_status(2).saying("the run already has 3000 steps");
 
     // Nothing is left to do: said, not done again.
     place.run(&["resume", &run]).with_status(0).saying("  return ");
