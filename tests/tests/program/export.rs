@@ -1,4 +1,4 @@
-//! `dmprl export`: a run's policy as one file that acts without the run.
+//! `dmprl export`: a policy as one file that acts without its run.
 
 use std::fs;
 use std::path::Path;
@@ -30,7 +30,7 @@ fn a_runs_policy_leaves_as_one_file() {
         ("reacher", json["return_mean"].as_f64())
     );
 
-    // It goes where the run does not, and begins another run as well.
+    // The file moves without the run, and can start another run.
     let moved = place.path("elsewhere.safetensors");
     fs::rename(&own, &moved).unwrap();
     let mut policy = PolicyRuntime::load(Path::new(&moved)).unwrap();
@@ -38,7 +38,7 @@ fn a_runs_policy_leaves_as_one_file() {
     let warm = ["--steps", "600", "--init-from", &moved];
     place.run(&train("reacher", &place.path("warm"), &warm)).with_status(0);
 
-    // As --help shows it: a name in the folder where one is.
+    // As in --help: a name in an existing folder.
     let onnx = place.path("reacher.onnx");
     let said = place.run(&["export", "run", "--format", "onnx", "--output", "reacher.onnx"]);
     let said = said.with_status(0);

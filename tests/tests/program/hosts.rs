@@ -1,5 +1,5 @@
-//! A run over real hosts of its own: three network namespaces, each with its address, on a wire
-//! that is long, lossy and cut.
+//! A run over three hosts: network namespaces with their own addresses, on a wire with delay, loss
+//! and interruptions.
 
 use std::fs;
 use std::path::Path;
@@ -16,13 +16,13 @@ use rustix::process::Signal;
 
 use crate::{ENDLESS, train};
 
-/// As much as a connection of these tests has under way.
+/// Bytes in transit of a connection of these tests.
 const TCP_BYTES_MAX: usize = 16 << 20;
-/// The workers of other hosts come after the run's own and the four that may join.
+/// The workers of other hosts follow the run's own, and the four that may join.
 const REMOTE: usize = 5;
 const PORT: u16 = 7447;
 
-/// Three hosts; none, and the test is skipped, where they cannot be made.
+/// Makes three hosts; `None`, and the test is skipped, if that is impossible.
 fn three_hosts(seed: u64) -> Option<Hosts> {
     match Hosts::new(3, TCP_BYTES_MAX, seed) {
         Ok(hosts) => Some(hosts),
@@ -48,13 +48,13 @@ fn strike(run: &str, role: &str) {
     process.unwrap_or_else(|| panic!("no {role} in {processes:#?}")).signal(Signal::KILL);
 }
 
-/// Segments of each other host's worker that are in the newest checkpoint.
+/// Returns the segments of each other host's worker in the newest checkpoint.
 fn learned(run: &str) -> [u64; 2] {
     let state = json_file(run, "checkpoints/latest/state.json");
     [0, 1].map(|host| state["settled"][REMOTE + host]["sequence"].as_u64().unwrap_or(0))
 }
 
-/// Waits until more has been learned from each of these hosts.
+/// Waits until segments of each of these hosts were learned from.
 fn until_more(running: &mut Running, run: &str, hosts: &[usize], what: &str) {
     let before = learned(run);
     running.until(what, |_| {
@@ -89,7 +89,7 @@ fn three_hosts_lose_nothing_on_a_long_lossy_wire_that_is_cut_while_processes_die
         let name = ["near", "far"][host];
         let arguments = bridge_arguments(&token, &endpoint, (name, &far[host]));
         let bridge = start(&place, (&hosts, host + 1), &arguments);
-        // Who comes first has the first place, by which its segments are told from the other's.
+        // Started first, it gets the first place, which identifies its segments.
         training.until_said(&format!("host {name} takes part"));
         bridge
     });
@@ -123,7 +123,7 @@ fn three_hosts_lose_nothing_on_a_long_lossy_wire_that_is_cut_while_processes_die
     assert!(shared_memory_of(&run).is_empty());
 }
 
-/// Cuts the second of the other hosts off for so long; the run goes on with the first meanwhile.
+/// Cuts the second of the other hosts off for this time, while the run continues with the first.
 fn cut(hosts: &Hosts, training: &mut Running, run: &str, seconds: u64) {
     hosts.cut(2, true);
     let began = Instant::now();
@@ -133,7 +133,7 @@ fn cut(hosts: &Hosts, training: &mut Running, run: &str, seconds: u64) {
     until_more(training, run, &[1], "segments of the host that was cut off");
 }
 
-/// The examples of the documentation, as they stand there.
+/// The examples of the documentation, unchanged.
 #[test]
 fn with_mutual_tls_a_host_takes_part_whose_certificate_is_named_and_no_other() {
     let Some(hosts) = three_hosts(2) else { return };
@@ -163,7 +163,7 @@ fn with_mutual_tls_a_host_takes_part_whose_certificate_is_named_and_no_other() {
     training.until("a token", |_| Path::new(&token).is_file());
     let (near, far) = (place.path("near"), place.path("far"));
     let mut strangers = [
-        // Of the authority, but not named.
+        // Signed by the authority, but not named.
         [&bridge_arguments(&token, &endpoint, ("c", &far))[..], &["--zenoh-config", "other.json5"]]
             .concat(),
         // Without any certificate.

@@ -1,5 +1,5 @@
-//! What a machine may do to a run that goes on: too little memory, shared memory that fills up or
-//! is removed, and a learner for which everybody waits.
+//! Failures of the machine: little memory, full or removed shared memory, and a learner that keeps
+//! all workers waiting.
 
 use std::fs;
 use std::io::Write;
@@ -22,7 +22,7 @@ fn role(place: &Workplace, role: &str) -> Process {
     found.unwrap_or_else(|| panic!("no {role} in {processes:#?}")).clone()
 }
 
-/// Processor time that a process uses a second while something happens [clock ticks].
+/// Processor time of a process per second while a closure runs [clock ticks].
 fn ticks_per_s(process: &Process, meanwhile: impl FnOnce()) -> f64 {
     let ticks = || process.cpu_ticks().expect("a living process") as f64;
     let (before, started) = (ticks(), Instant::now());
@@ -30,7 +30,7 @@ fn ticks_per_s(process: &Process, meanwhile: impl FnOnce()) -> f64 {
     (ticks() - before) / started.elapsed().as_secs_f64()
 }
 
-/// How little exactly is measured by `bench transport`; here only that it does not spin.
+/// Only checks that it does not spin; `bench transport` measures the exact share.
 #[test]
 fn a_worker_whose_learner_takes_nothing_sleeps() {
     let place = Workplace::new();
@@ -59,8 +59,8 @@ fn end(running: Running, run: &str) {
     assert!(refused.values().all(|count| count == 0), "{last}");
 }
 
-/// Pages of shared memory that nobody has written to yet are not there when somebody else has taken
-/// all; who then writes is killed by the kernel.
+/// Unwritten pages of shared memory are not allocated. If another process has used all memory, the
+/// kernel kills the writer.
 #[test]
 fn a_worker_killed_by_full_shared_memory_is_told_the_cause_and_replaced() {
     let place = Workplace::new();
@@ -68,7 +68,7 @@ fn a_worker_killed_by_full_shared_memory_is_told_the_cause_and_replaced() {
     let keys = ["actors.queue_segments=8192"].into_iter().flat_map(|key| ["--set", key]);
     let more = ["--steps", ENDLESS, "--workers", "1"].into_iter().chain(keys).collect::<Vec<_>>();
     let line = train("reacher", &run, &more).join(" ");
-    // Somebody else on the machine, when he is asked to, for two minutes at most.
+    // Another process on the machine, on request, for at most two minutes.
     let waiting =
         |file: &str| format!("for i in $(seq 2400); do [ -e {file} ] && break; sleep 0.05; done");
     let other = format!(
@@ -82,7 +82,8 @@ fn a_worker_killed_by_full_shared_memory_is_told_the_cause_and_replaced() {
     let mut running = place.start_command(command);
     running.until_steps(&run, 1_000);
     let learner = role(&place, "learner");
-    // The worker comes to pages that it has never used: its queue is long, and nobody takes.
+    // The worker reaches pages that it has never used: its queue is long, and the learner takes
+    // nothing.
     learner.signal(Signal::STOP);
     let ask = |file: &str, answer: &str| {
         fs::write(place.path(file), "").unwrap();
@@ -98,13 +99,14 @@ fn a_worker_killed_by_full_shared_memory_is_told_the_cause_and_replaced() {
     place.assert_no_process();
 }
 
-/// A group of processes with little memory, below the test's own; removed when dropped.
+/// A cgroup with little memory, below the test's own; dropping it removes it.
 struct Memory {
     group: PathBuf,
 }
 
 impl Memory {
-    /// Cgroups of version 2 where they have memory, or else of version 1; none where we may not.
+    /// Makes a cgroup of version 2 if memory is controlled there, else of version 1; `None` without
+    /// the right.
     fn new(bytes: u64) -> Option<Self> {
         let own = fs::read_to_string("/proc/self/cgroup").ok()?;
         let below = |base: &str, path: &str| Path::new(base).join(path.trim_start_matches('/'));
@@ -119,7 +121,7 @@ impl Memory {
             let group = parent.join(format!("dmprl-test-{}", std::process::id()));
             fs::create_dir(&group).ok()?;
             let memory = Self { group };
-            // Dropped, and so removed, where it is not one of memory.
+            // Dropped, and so removed, because it does not control memory.
             fs::OpenOptions::new()
                 .write(true)
                 .open(memory.group.join(limit))
@@ -136,7 +138,7 @@ impl Memory {
 
 impl Drop for Memory {
     fn drop(&mut self) {
-        // Not before its last process has gone.
+        // Only after its last process has ended.
         let gone = || fs::remove_dir(&self.group).is_ok() || !self.group.exists();
         if !std::thread::panicking() {
             until("an empty group of processes", gone);
@@ -144,7 +146,7 @@ impl Drop for Memory {
     }
 }
 
-/// The kernel itself kills it. What a run then says names the likely cause.
+/// The kernel kills the process. The run's message names the likely cause.
 #[test]
 fn a_learner_killed_for_want_of_memory_is_told_so_and_replaced() {
     let place = Workplace::new();

@@ -7,7 +7,7 @@ use dmprl_tests::program::{Finished, Workplace};
 use dmprl_tests::{project_root, venv};
 use rustix::process::Signal;
 
-/// Of every script: small networks, few updates.
+/// Settings of every script: small networks, few updates.
 const SMALL: &str = "dict(
     policy__hidden=[32], algorithm__critic_hidden=[32], exploration__warm_up_steps=500,
     evaluation__episodes=2, evaluation__interval_steps=500, checkpoint__interval_steps=500,
