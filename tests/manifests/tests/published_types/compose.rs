@@ -1,4 +1,4 @@
-//! `deploy/compose.yaml`: what its services must say.
+//! Checks the services of `deploy/compose.yaml`.
 
 use serde_yaml_ng::Value;
 
