@@ -108,7 +108,7 @@ fn what_cannot_be_recorded_is_said() {
         .run(&["record", &own])
         .with_status(1)
         .saying("cannot be drawn")
-        .saying("has the render mode 'rgb_array'");
+        .saying("with the render mode 'rgb_array'");
     assert_eq!(fs::read_dir(format!("{own}/videos")).unwrap().count(), 0);
     place.assert_no_process();
 }
