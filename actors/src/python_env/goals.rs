@@ -61,7 +61,10 @@ impl PythonEnvironments {
         Err(PythonError::Interface {
             task_id: spec.id.clone(),
             name: "goals",
-            reason: format!("{goals:?} in observations of {} entries", spec.observation_len),
+            reason: format!(
+                "{goals:?} do not fit observations of {} entries",
+                spec.observation_len
+            ),
         })
     }
 

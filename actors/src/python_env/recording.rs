@@ -83,7 +83,10 @@ impl PythonEnvironments {
             let kind = match kind.as_str() {
                 "hinge" => JointKind::Hinge,
                 "slide" => JointKind::Slide,
-                other => return Err(self.interface_error(format!("joint {name} is a {other}"))),
+                other => {
+                    let reason = format!("joint {name} is a {other}; expected hinge or slide");
+                    return Err(self.interface_error(reason));
+                }
             };
             joints.push((name, kind));
         }
