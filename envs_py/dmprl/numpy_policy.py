@@ -55,7 +55,7 @@ class NumpyPolicy:
     def u(self, observations: NDArray, noise: Noise | None = None) -> Floats:
         """Computes actions u, (E, K, A), for the environments' observations, (E, O).
 
-        They are in [-1, 1], unless the policy itself is a Gaussian (SAC, NDP).
+        They may be outside [-1, 1]; :meth:`scaled` clips them.
         """
         self._seen[:] = observations
         x = self._observations
@@ -205,7 +205,8 @@ class Noise:
     def disturb_u(self, u: Floats) -> None:
         """Adds noise to actions, (E, K, A), and clips them to [-1, 1].
 
-        If the policy itself is a Gaussian, adds only its noise, unclipped.
+        A Gaussian policy has no other noise. Its learned standard deviations, if any, are applied
+        here without clipping.
         """
         if self._gaussian.size > 0:
             u += self._gaussian * self._normal(u.shape)

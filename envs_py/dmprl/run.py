@@ -30,9 +30,7 @@ class Run:
         """:raises FileNotFoundError: if there is no run at ``path``."""
         self.path = Path(path)
         if not (self.path / "manifest.json").is_file():
-            raise FileNotFoundError(
-                f"{self.path} is not a run directory: it has no manifest.json"
-            )
+            raise FileNotFoundError(f"{self.path} is not a run directory: it has no manifest.json")
 
     def __repr__(self) -> str:
         return f"Run({str(self.path)!r})"

@@ -49,7 +49,7 @@ class Goals(TypedDict):
     length: int
     """Number of entries of each goal."""
     sparse: bool
-    """Whether the reward only says whether the goal was reached."""
+    """Whether the reward only depends on whether the goal was reached."""
 
 
 class EnvSpec(TypedDict):

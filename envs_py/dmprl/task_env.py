@@ -39,7 +39,10 @@ class TaskEnv(gymnasium.Env[NDArray[np.float64], NDArray[np.float32]]):
         height: int = 480,
         task: Callable[[int], MujocoTask] | None = None,
     ) -> None:
-        """Creates the task; ``task``, if given, creates it for a number of environments instead."""
+        """Creates the environment.
+
+        ``task``, if given, creates a user's own task for a number of environments.
+        """
         if render_mode not in (None, *self.metadata["render_modes"]):
             modes = ", ".join(self.metadata["render_modes"])
             raise ValueError(f"{task_id}: render_mode {render_mode!r}; expected one of {modes}")

@@ -151,7 +151,7 @@ fn an_episode_that_fails_in_an_evaluation_is_repeated_with_its_seed() {
 fn an_episode_that_fails_again_ends_the_evaluation_and_says_which() {
     let (mut evaluator, evaluation) = evaluated("tiny_envs:Hopeless-v0");
     let message = evaluation.unwrap_err().to_string();
-    assert!(message.contains("the episode of seed 50 has failed 2 times"), "{message}");
+    assert!(message.contains("the episode with seed 50 has failed 2 times"), "{message}");
     assert!(message.contains("environment 0, step 0 of the segment: ValueError"), "{message}");
     assert_eq!(evaluator.take_failures().len(), 2 * ENVS);
 }

@@ -1,8 +1,9 @@
-//! Messages between the supervisor and its roles: one JSON object per line, on the child's standard
-//! input and output. A child's standard error is its log file.
+//! Messages with which a worker joins a run. The messages of `dmprl_shared::supervision` follow.
 //!
-//! End of input means that the supervisor is gone. The child then exits (the learner after a
-//! checkpoint), so a supervisor killed by SIGKILL leaves no orphans.
+//! All messages are JSON objects, one per line. A worker that joins uses a socket; a child uses its
+//! standard input and output, and its standard error is its log file. End of input means that the
+//! supervisor is gone. The process then exits (the learner after a checkpoint), so a supervisor
+//! killed by SIGKILL leaves no orphans.
 
 use std::fmt::{self, Display, Formatter};
 use std::path::PathBuf;
@@ -69,7 +70,7 @@ pub enum JoinAnswer {
 pub struct Welcome {
     /// Index of the worker in the run.
     pub index: u32,
-    /// Number of starts of this index.
+    /// Number of this start of the worker, unique for its index in the run.
     pub incarnation: u32,
     /// The run's Python virtual environment.
     pub venv: Option<PathBuf>,

@@ -61,7 +61,11 @@ impl Reporter {
     /// The supervisor is gone.
     pub fn send(&self, report: &Report) -> anyhow::Result<()> {
         let mut line = serde_json::to_vec(report).context("cannot write a report as JSON")?;
-        ensure!((line.len() as u64) < LINE_BYTES_MAX, "a report of {} bytes", line.len());
+        ensure!(
+            (line.len() as u64) < LINE_BYTES_MAX,
+            "a report has {} bytes; expected fewer than {LINE_BYTES_MAX}",
+            line.len()
+        );
         line.push(b'\n');
         let mut output = self.0.lock().unwrap_or_else(PoisonError::into_inner);
         output.write_all(&line).and_then(|()| output.flush()).context("the supervisor is gone")

@@ -65,7 +65,7 @@ impl Domain {
             Self::Float { low, high, log } => {
                 format!("{} to {}{}", Value::Float(*low), Value::Float(*high), scale(*log))
             }
-            Self::Integer { low, high, log } => format!("{low} to {high}, whole{}", scale(*log)),
+            Self::Integer { low, high, log } => format!("{low} to {high}, integers{}", scale(*log)),
             Self::Choice(values) => {
                 values.iter().map(ToString::to_string).collect::<Vec<_>>().join(" or ")
             }
