@@ -11,7 +11,7 @@ use dmprl_shared::runtime::PolicyRuntime;
 use dmprl_shared::seeds;
 use dmprl_shared::spec::EnvSpec;
 
-/// The only test in its binary, because the counter counts every thread.
+/// The only test in its binary, because the counter counts all threads.
 #[test]
 fn decisions_steps_and_holds_allocate_nothing() {
     let spec = EnvSpec {

@@ -20,7 +20,7 @@ fn log(parent: &Parent) -> SegmentLog {
     SegmentLog::open(&parent.path().join("log"), identity, LAYOUT, 1 << 30).unwrap()
 }
 
-/// The only test in its binary, because the counter counts every thread. iceoryx2 0.10 allocates
+/// The only test in its binary, because the counter counts all threads. iceoryx2 0.10 allocates
 /// about 100 bytes for each sample that is filled, and 0 for each that is read; dmprl adds none.
 #[test]
 fn the_steady_state_allocates_only_what_iceoryx2_does_for_a_sample() {

@@ -16,8 +16,9 @@ const LIMITS: Limits = Limits { cores: 2 };
 /// Commands that call the program in the documents.
 const CALLS: [&str; 3] = ["cargo run --release -- ", "target/release/dmprl ", "dmprl "];
 /// Flags of other programs: cargo's, TensorBoard's, docker's, and those of Slurm's sbatch.
-const FOREIGN: [&str; 16] = [
+const FOREIGN: [&str; 17] = [
     "--bench",
+    "--package",
     "--features",
     "--release",
     "--check",
