@@ -29,8 +29,8 @@ EXCLUDED = ("docs/configuration-keys.md", "docs/results/", "tests/prose.py")
 
 VERBS = (
     "is|was|are|were|has|have|had|can|cannot|could|does|do|did|would|will|must|may|belongs|comes|"
-    "lies|stands|makes|remains|holds|waits|runs|takes|falls|differs|became|becomes|needs|lacks|goes|"
-    "gives"
+    "lies|stands|makes|remains|holds|waits|runs|takes|falls|differs|became|becomes|needs|lacks|"
+    "goes|gives"
 )
 PRONOUNS_AND_ARTICLES = "it|they|he|she|one|a|an|the|no|that|this|there|those|these|we|its|each|all"
 PATTERNS = {

@@ -1,9 +1,9 @@
 //! Hosts for a test: network namespaces with their own addresses, and the network between them.
 //!
-//! Each namespace has one interface, a TUN device. A thread of this process is the wire: it reads IP
-//! packets from one device and writes them to another, with a delay, or drops them. The test thus
-//! sets delay, loss and failed links, from a seed, without a queueing discipline of the kernel. A
-//! namespace ends with its last process, so nothing is left behind.
+//! Each namespace has one interface, a TUN device. A thread of this process is the wire: it reads
+//! IP packets from one device and writes them to another, with a delay, or drops them. The test
+//! thus sets delay, loss and failed links, from a seed, without a queueing discipline of the
+//! kernel. A namespace ends with its last process, so nothing is left behind.
 use std::collections::VecDeque;
 use std::fs::{self, File, OpenOptions};
 use std::io::{self, ErrorKind, Read, Write};

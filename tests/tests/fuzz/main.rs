@@ -2,8 +2,8 @@
 //! checkpoints, policies, configurations, lines of the control protocol.
 //!
 //! No input may cause a panic, a hang, or more memory than its limit. Rejected input changes
-//! nothing, and accepted input is sound. Inputs are valid ones with small changes, most with corrected
-//! checksums, so that they pass the first check.
+//! nothing, and accepted input is sound. Inputs are valid ones with small changes, most with
+//! corrected checksums, so that they pass the first check.
 //!
 //! A failure prints its target and seed. `DMPRL_FUZZ_SEED=<seed>` runs that case alone, and
 //! `DMPRL_FUZZ_SECONDS=<seconds>` runs each target for this time instead of its number of cases.

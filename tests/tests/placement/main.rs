@@ -1,6 +1,6 @@
-//! Files that start dmprl on many machines: the Slurm script against an imitation of Slurm, units and
-//! the Compose file against their own programs where these are installed. `tests/manifests` checks
-//! the Kubernetes manifests.
+//! Files that start dmprl on many machines: the Slurm script against an imitation of Slurm, units
+//! and the Compose file against their own programs where these are installed. `tests/manifests`
+//! checks the Kubernetes manifests.
 #![allow(
     clippy::unwrap_used,
     reason = "helpers of tests; clippy.toml covers only the tests themselves"

@@ -7,8 +7,8 @@ use serde::Serialize;
 use serde::de::DeserializeOwned;
 use serde_json::Value;
 
-/// Checks an object against the type of its `kind`. Unlike the types themselves it rejects fields that
-/// are not in the schema.
+/// Checks an object against the type of its `kind`. Unlike the types themselves it rejects fields
+/// that are not in the schema.
 ///
 /// # Errors
 /// A field has another type, is missing, or is not in the schema.

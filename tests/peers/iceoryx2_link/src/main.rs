@@ -1,9 +1,9 @@
 //! Measures the losses of iceoryx2's own link over Zenoh between two hosts, both in this process.
 //!
 //! `iceoryx2-link RATE SECONDS [still|cut AFTER FOR]` sends segments of 2 KB with sequence numbers
-//! at a rate \[1/s\] through a wire that stalls, or is cut and reconnected, after `AFTER` seconds for
-//! `FOR` seconds. The two hosts see each other only over the link: their services have different
-//! prefixes.
+//! at a rate \[1/s\] through a wire that stalls, or is cut and reconnected, after `AFTER` seconds
+//! for `FOR` seconds. The two hosts see each other only over the link: their services have
+//! different prefixes.
 
 mod wire;
 
