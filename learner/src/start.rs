@@ -51,7 +51,7 @@ pub enum StartError {
     Report(#[from] ReportError),
 }
 
-/// What a learner starts from.
+/// The initial state of a learner.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Origin<'a> {
     /// New networks or the parameters of this policy file, and the configured demonstrations.

@@ -11,7 +11,7 @@ use std::path::{Path, PathBuf};
 
 /// Returns the project's directory.
 pub fn project_root() -> &'static Path {
-    Path::new(env!("CARGO_MANIFEST_DIR")).parent().expect("tests/ lies in the project")
+    Path::new(env!("CARGO_MANIFEST_DIR")).parent().expect("the parent of tests/")
 }
 
 /// Returns the folder with the tiny environments (`tiny_envs:Id`), for `--python-path`.

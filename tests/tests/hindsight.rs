@@ -106,7 +106,7 @@ fn assert_faithful(segments: &[Segment], ends: bool) {
         }
         let terminated = ends && reached[len - 1];
         assert_eq!(header.flags & TERMINATED != 0, terminated);
-        assert!(!ends || !reached[..len - 1].contains(&true), "it went on after its end");
+        assert!(!ends || !reached[..len - 1].contains(&true), "it continued after its end");
         assert!(terminated || len == 5);
     }
 }

@@ -162,7 +162,7 @@ fn the_robot_holds_when_observations_stop_and_goes_on_when_they_come_again() {
     runtime.action(Some(&now)).unwrap();
     for _ in 0..2 {
         runtime.action(None).unwrap();
-        assert!(!runtime.is_holding(), "the segment goes on for so many steps");
+        assert!(!runtime.is_holding(), "the segment continues for this many steps");
     }
     let mut actions = Vec::new();
     for _ in 0..10 {

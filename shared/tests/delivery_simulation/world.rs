@@ -335,7 +335,7 @@ impl World {
             self.tally.lost_at_level_memory += 1;
         }
         let gap = if mark.incarnation == last.incarnation { last.sequence } else { 0 };
-        assert_eq!(mark.sequence - gap - 1, lost, "worker {index}: a gap that nobody counted");
+        assert_eq!(mark.sequence - gap - 1, lost, "worker {index}: an uncounted gap");
         self.inserted[index].push(mark);
     }
 

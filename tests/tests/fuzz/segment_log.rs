@@ -77,7 +77,7 @@ fn read(path: &std::path::Path, log: &[u8], plain: &Learner) -> Verdict {
     let mut opened = match open(path, plain) {
         Ok(opened) => opened,
         Err(LogError::Foreign) => {
-            assert_eq!(fs::read(path).unwrap(), log, "what is another's stays");
+            assert_eq!(fs::read(path).unwrap(), log, "the log of another run is unchanged");
             return Verdict::Refused;
         }
         Err(error) => panic!("{error}"),
@@ -104,7 +104,7 @@ fn read(path: &std::path::Path, log: &[u8], plain: &Learner) -> Verdict {
     for record in left[HEAD_BYTES..].chunks_exact(records.max(1)) {
         let (frame, payload) = record.split_at(FRAME_BYTES);
         let expected = [payload.len() as u32, crc32fast::hash(payload)].map(u32::to_le_bytes);
-        assert_eq!(frame, expected.as_flattened(), "what is handed over is whole");
+        assert_eq!(frame, expected.as_flattened(), "delivered records are complete");
     }
     // The learner accepts the sound records once each, and continues.
     let mut learner = fixture::learner(&[]).unwrap();

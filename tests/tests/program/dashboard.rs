@@ -68,7 +68,7 @@ fn a_run_that_begins_later_appears_grows_and_stays_when_it_has_ended() {
     let more = curves(&address, &query);
     assert_eq!(more["table"], first["table"]);
     let last = *steps(&first).last().unwrap();
-    assert!(steps(&more).iter().all(|step| *step > last), "only what is new: {more}");
+    assert!(steps(&more).iter().all(|step| *step > last), "only new rows: {more}");
     let running = |name: &str| {
         let answer = get(&address, "/api/processes?run=one").json();
         let rows = answer["session"]["processes"].as_array().cloned().unwrap_or_default();

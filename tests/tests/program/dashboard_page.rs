@@ -106,7 +106,7 @@ fn a_browser_watches_a_run_grow_beside_another() {
 fn compare_with(browser: &Browser, other: &str) {
     assert_eq!(browser.evaluate("document.querySelectorAll('#keys td.differs').length"), 0);
     let chosen = format!("document.querySelector('input[value={other}]').checked");
-    assert_eq!(browser.evaluate(&chosen), false, "only what is being trained is shown at first");
+    assert_eq!(browser.evaluate(&chosen), false, "only running runs are shown at first");
     browser.click(&format!("input[value={other}]"));
     // Charts outside the view are not drawn.
     browser.evaluate("document.querySelector('figure[data-key=return_mean]').scrollIntoView()");

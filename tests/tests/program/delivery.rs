@@ -170,6 +170,6 @@ fn a_learner_killed_in_the_middle_of_a_checkpoint_goes_on_from_the_one_before() 
         });
     }
     end_without_loss(running, &run);
-    assert_eq!(half_written(), 0, "what a killed writer left is swept away");
+    assert_eq!(half_written(), 0, "partial files are removed");
     assert_eq!(last_metrics(&run)["learner_restarts"], KILLS);
 }

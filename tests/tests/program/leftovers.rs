@@ -37,7 +37,7 @@ fn clean_removes_what_a_killed_run_left_and_nothing_of_a_living_one() {
 
     // It still exists, unless the start of another test was faster. A start that is removing it
     // holds its locks.
-    until("what the killed run left is listed or gone", || {
+    until("the killed run's files are listed or gone", || {
         let listed = place.run(&["clean", "--dry-run", "--json"]).with_status(0);
         assert!(!names(&listed, &alive[0]), "{}", listed.printed);
         names(&listed, &dead[0]) || shared_memory_of(&run).is_empty()
@@ -45,7 +45,7 @@ fn clean_removes_what_a_killed_run_left_and_nothing_of_a_living_one() {
     let removed = place.run(&["clean"]).with_status(0);
     assert!(removed.printed.contains("dead runs"), "{}", removed.printed);
     assert_eq!(shared_memory_of(&run), Vec::<PathBuf>::new());
-    assert!(Path::new(&run).join("manifest.json").is_file(), "results are nobody's leftovers");
+    assert!(Path::new(&run).join("manifest.json").is_file(), "results stay");
 
     assert_eq!(shared_memory_of(&other), alive);
     let steps = dmprl_tests::program::env_steps_of(&other).unwrap();

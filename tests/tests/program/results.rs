@@ -161,11 +161,11 @@ fn resume_with_more_steps_extends_a_finished_run() {
     let first = rows(&run, "metrics.jsonl");
     place.run(&["resume", &run, "--steps", "3000"]).with_status(0).saying("evaluation at 3,000");
     let metrics = rows(&run, "metrics.jsonl");
-    assert_eq!(metrics[..first.len()], first, "what was written stays");
+    assert_eq!(metrics[..first.len()], first, "earlier rows stay");
     assert_eq!(env_steps(&metrics), [500, 1000, 1500, 2000, 2500, 3000]);
     assert_eq!(env_steps(&rows(&run, "evaluations.jsonl")), [1000, 1500, 2000, 3000]);
     let clock: Vec<f64> = metrics.iter().map(|row| number(row, "wall_s")).collect();
-    assert!(clock.is_sorted(), "time goes on where it stopped: {clock:?}");
+    assert!(clock.is_sorted(), "time continues where it stopped: {clock:?}");
     assert_eq!(json_file(&run, "manifest.json")["sessions"].as_array().unwrap().len(), 2);
 
     place

@@ -104,7 +104,7 @@ fn a_search_gives_up_the_bad_trial_and_hands_over_the_best() {
     // Nothing is left to do; it prints the trials and reports the best.
     let again = place.run(&["sweep", &file, "--json"]).with_status(0).json();
     assert_eq!(again["trials"], json["trials"]);
-    assert_eq!(sessions(&run(good, 0)), 1, "what has finished is not done again");
+    assert_eq!(sessions(&run(good, 0)), 1, "a finished run is not repeated");
     let listed = place.run(&["sweep", &file, "--dry-run"]).with_status(0);
     assert!(listed.printed.contains("pruned"), "{}", listed.printed);
     let report = place.run(&["report", "runs/small", "--json"]).with_status(0).json();
@@ -152,7 +152,7 @@ fn a_search_that_is_killed_goes_on_with_the_trials_under_way() {
     let kept = place.path("runs/small/sweep.toml");
     let before = fs::read_to_string(&kept).unwrap();
     place.run(&["sweep", &other]).with_status(1).saying("space").saying("--output");
-    assert_eq!(fs::read_to_string(&kept).unwrap(), before, "it still says what was searched");
+    assert_eq!(fs::read_to_string(&kept).unwrap(), before, "the file is unchanged");
 }
 
 #[test]

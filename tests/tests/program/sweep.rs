@@ -63,7 +63,7 @@ fn every_run_of_a_sweep_is_trained_once_and_a_longer_one_goes_on() {
 
     let again = place.run(&["sweep", &file, "--json"]).with_status(0).json();
     assert_eq!(states(&again), states(&json));
-    assert_eq!(sessions(&again, 0), 1, "what has finished is not done again");
+    assert_eq!(sessions(&again, 0), 1, "a finished run is not repeated");
 
     // With more steps, each run continues. With another configuration, the sweep is refused and
     // nothing changes.
@@ -75,7 +75,7 @@ fn every_run_of_a_sweep_is_trained_once_and_a_longer_one_goes_on() {
     let refused = place.run(&["sweep", &other]).with_status(1);
     refused.saying("dmp.alpha_y").saying("another configuration");
     let kept = fs::read_to_string(place.path("runs/small/sweep.toml")).unwrap();
-    assert!(!kept.contains("alpha_y"), "what lies there is of the file before");
+    assert!(!kept.contains("alpha_y"), "the folder belongs to the earlier file");
     place.assert_no_process();
 }
 

@@ -29,10 +29,10 @@ const HEAD: &str = "\
 <!-- Made from the types in shared/src/config by the test `tidy`. To generate it again:
      WRITE_CONFIGURATION_KEYS=1 cargo test --release --test tidy -->
 
-Each key can stand in a file for `--config`, in `--set KEY=VALUE`, and in an environment variable;
-[Configuration](configuration.md) says how these are laid over each other. Where a preset, a kind of
-policy, an algorithm or a task brings another value, it stands below the default. Of several, an
-algorithm wins over a preset, a preset over a kind of policy, and that over a task.
+Set a key in a file for `--config`, with `--set KEY=VALUE`, or in an environment variable;
+[Configuration](configuration.md) describes their precedence. Values that a preset, a kind of
+policy, an algorithm or a task sets are listed below the default. An algorithm takes precedence over
+a preset, a preset over a kind of policy, and this over a task.
 ";
 
 #[test]

@@ -8,7 +8,7 @@ use super::{none, sources};
 /// Maximum number of matches that `tests/prose.py` counts. There were 2,172 before the texts were
 /// rewritten.
 #[cfg(feature = "python")]
-const PROSE_MATCHES_MAX: u64 = 217;
+const PROSE_MATCHES_MAX: u64 = 80;
 
 #[cfg(feature = "python")]
 #[test]

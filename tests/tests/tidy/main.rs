@@ -153,7 +153,7 @@ fn actors_and_learner_do_not_know_each_other() {
     }
     none(
         &places,
-        "actors and learner share only what lies in `shared`; deploy brings them together",
+        "actors and learner share only `shared`; deploy connects them",
     );
 }
 
@@ -287,7 +287,7 @@ fn files_functions_and_lines_are_short() {
             }
         }
     }
-    none(&places, "what does not fit on a screen or two is two things");
+    none(&places, "a file fits on a few screens, a function on one");
 }
 
 /// Returns line number and length of every function, with brace and attributes. Both languages are
@@ -347,7 +347,7 @@ fn nothing_is_left_undone() {
             places.extend(left.map(|mark| format!("{}:{}: {mark}", source.path, index + 1)));
         }
     }
-    none(&places, "what is not done yet is an issue, not a mark in the code; no test is skipped");
+    none(&places, "unfinished work is an issue, not a mark in the code; no test is ignored");
 }
 
 #[test]
@@ -403,7 +403,7 @@ fn a_files_name_says_what_is_in_it() {
         let empty = stems.filter(|stem| NAMES_OF_NOTHING.contains(stem));
         places.extend(empty.map(|stem| format!("{}: {stem}", source.path)));
     }
-    none(&places, "a name that fits everything says nothing");
+    none(&places, "a file's name describes its content");
 }
 
 #[test]
@@ -417,7 +417,7 @@ fn the_workspace_decides_versions_and_lints_once() {
         let versions = manifest.lines().filter(|line| line.contains("version = \""));
         places.extend(versions.map(|line| format!("{member}/Cargo.toml: {line}")));
     }
-    none(&places, "versions and lints stand in the workspace's Cargo.toml");
+    none(&places, "versions and lints are in the workspace's Cargo.toml");
 }
 
 /// No test runs after the list of skipped tests.

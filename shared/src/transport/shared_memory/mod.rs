@@ -64,7 +64,7 @@ impl WorkerTransport for SharedMemory {
     type Acknowledgements = AcknowledgementReader;
 }
 
-/// What a worker holds.
+/// A worker's ends of the transport.
 pub type WorkerEnd = super::WorkerEnd<SharedMemory>;
 
 /// Makes this process the run's learner and creates all services. Workers of a previous learner

@@ -142,7 +142,7 @@ pub(super) fn clean(
             looked += 1;
             if let NodeState::Dead(dead) = state {
                 found_dead();
-                // The next call finds what could not be removed.
+                // The next call finds the files that could not be removed.
                 let _ = dead.try_remove_stale_resources();
             }
             CallbackProgression::Continue

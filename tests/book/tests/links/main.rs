@@ -47,7 +47,7 @@ fn fault(page: &Page, link: &str, pages: &[Page]) -> Option<String> {
     let (path, anchor) = link.split_once('#').unwrap_or((link, ""));
     let folder = page.path.parent().unwrap();
     let target = if path.is_empty() { page.path.clone() } else { folder.join(path) };
-    let Ok(target) = target.canonicalize() else { return Some("there is no such file".into()) };
+    let Ok(target) = target.canonicalize() else { return Some("the file does not exist".into()) };
     if anchor.is_empty() {
         return None;
     }
