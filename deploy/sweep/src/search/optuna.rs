@@ -14,7 +14,7 @@ use tokio::io::{AsyncBufReadExt, AsyncWriteExt, BufReader, Lines};
 use tokio::process::{Child, ChildStdin, ChildStdout};
 use tokio::time::timeout;
 
-use crate::run::{guarded, open_log};
+use crate::run::{background_command, open_log};
 
 /// Storage file in the sweep's directory. An SQLite file survives a kill during a write, and
 /// Optuna's own tools can open it.
@@ -69,7 +69,7 @@ impl Optuna {
         for name in ["OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"] {
             command.env(name, "1");
         }
-        let mut command = guarded(command);
+        let mut command = background_command(command);
         let child = command.kill_on_drop(true).spawn();
         let mut child = child.with_context(|| format!("cannot start {}", python.display()))?;
         let (input, output) = (child.stdin.take(), child.stdout.take());
@@ -94,7 +94,7 @@ impl Optuna {
         }
         let answer = self.read_line(ANSWER_WAIT).await?;
         match answer.get("error").and_then(Value::as_str) {
-            Some(error) => bail!("Optuna failed to {}: {error}", request["op"]),
+            Some(error) => bail!("the Optuna request {} failed: {error}", request["op"]),
             None => Ok(answer),
         }
     }
