@@ -9,7 +9,7 @@ pub struct PageFile {
 }
 
 /// All files; the first is the page itself.
-pub const FILES: [PageFile; 9] = [
+pub static FILES: [PageFile; 9] = [
     file("index.html", HTML, include_bytes!("page/index.html")),
     file("style.css", CSS, include_bytes!("page/style.css")),
     file("main.js", SCRIPT, include_bytes!("page/main.js")),
@@ -25,10 +25,6 @@ const HTML: &str = "text/html; charset=utf-8";
 const CSS: &str = "text/css; charset=utf-8";
 const SCRIPT: &str = "text/javascript; charset=utf-8";
 
-const fn file(
-    name: &'static str,
-    content_type: &'static str,
-    content: &'static [u8],
-) -> PageFile {
+const fn file(name: &'static str, content_type: &'static str, content: &'static [u8]) -> PageFile {
     PageFile { name, content_type, content }
 }

@@ -11,8 +11,8 @@ use prometheus_client::metrics::gauge::ConstGauge;
 use prometheus_client::registry::Registry;
 use serde_json::Value;
 
-use super::catalogue::Catalogue;
 use super::cached_run::{CachedRun, State};
+use super::catalogue::Catalogue;
 
 /// Content type of the response.
 pub const CONTENT_TYPE: &str = "application/openmetrics-text; version=1.0.0; charset=utf-8";
