@@ -68,7 +68,7 @@ fn a_search_gives_up_the_bad_trial_and_hands_over_the_best() {
 
     let finished = place.run(&["sweep", &file, "--jobs", "1", "--json"]).with_status(0);
     let finished = finished.saying("trial 1 · algorithm.actor_learning_rate=10.0");
-    let json = finished.saying("given up at").json();
+    let json = finished.saying("pruned at").json();
     assert_eq!(states(&json), ["finished", "pruned"]);
     let (good, bad) = (trial(&json, 0), trial(&json, 1));
     let run = |trial: &Value, index: usize| trial["runs"][index].as_str().unwrap().to_owned();

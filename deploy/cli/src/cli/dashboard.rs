@@ -3,7 +3,7 @@
 use std::path::PathBuf;
 
 use clap::Args;
-use dmprl_dashboard::{Plan, serve};
+use dmprl_dashboard::{Options, serve};
 use dmprl_run::failure::Outcome;
 
 use super::emit;
@@ -36,8 +36,8 @@ pub(super) struct DashboardArgs {
 }
 
 pub(super) fn run(args: &DashboardArgs) -> anyhow::Result<Outcome> {
-    let plan = Plan { root: &args.directory, port: args.port };
-    serve(&plan, dmprl_supervisor::interrupts, |address| {
+    let options = Options { root: &args.directory, port: args.port };
+    serve(&options, dmprl_supervisor::interrupts, |address| {
         emit(&format!("http://{address}"))?;
         say("open this address in a browser (Ctrl-C to stop)");
         Ok(())

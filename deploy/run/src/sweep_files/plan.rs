@@ -63,7 +63,8 @@ impl Plan {
         for &seed in &file.seeds {
             for task in &file.tasks {
                 for method in &file.methods {
-                    runs.extend(points.iter().map(|at| planned(file, (task, method), at, seed)));
+                    let run = |point| planned(file, task, method, point, seed);
+                    runs.extend(points.iter().map(run));
                 }
             }
         }
@@ -107,11 +108,12 @@ fn points(file: &SweepFile) -> Vec<Point> {
 
 fn planned(
     file: &SweepFile,
-    (task, method): (&TaskEntry, &MethodEntry),
+    task: &TaskEntry,
+    method: &MethodEntry,
     point: &Point,
     seed: i64,
 ) -> PlannedRun {
-    let mut arguments = arguments(file, (task, method), point);
+    let mut arguments = arguments(file, task, method, point);
     arguments.extend(["--seed".to_owned(), seed.to_string()]);
     let mut directory = method_directory(task, method);
     if !point.is_empty() {
@@ -133,7 +135,8 @@ fn planned(
 /// Arguments of `dmprl train`, without seed and run directory.
 pub(super) fn arguments(
     file: &SweepFile,
-    (task, method): (&TaskEntry, &MethodEntry),
+    task: &TaskEntry,
+    method: &MethodEntry,
     point: &[(String, Value)],
 ) -> Vec<String> {
     let mut arguments = vec![task.name.clone()];

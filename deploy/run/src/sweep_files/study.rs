@@ -56,7 +56,7 @@ impl Study {
         let mut studies: Vec<Self> = Vec::new();
         for task in &file.tasks {
             for method in &file.methods {
-                let mut words = arguments(file, (task, method), &[]);
+                let mut words = arguments(file, task, method, &[]);
                 // First, so that the file can override it.
                 words.splice(1..1, set(FIRST_SEED, &(TUNING_SEED as i64).into()));
                 let method_name = method.label.clone().unwrap_or_else(|| method.name.clone());
