@@ -237,7 +237,7 @@ fn carry(wire: &Wire, mut tuns: Vec<File>, mut random: Xoshiro256PlusPlus) {
                     free.push(bytes);
                     break;
                 };
-                let to = receiver(wire, (from, tuns.len()), &bytes[..len]);
+                let to = receiver(wire, from, tuns.len(), &bytes[..len]);
                 let loss = wire.loss_per_million.load(Ordering::Acquire);
                 let is_lost = random.random_range(0..PER_MILLION) < loss;
                 let full = under_way_bytes + len > UNDER_WAY_BYTES_MAX;
@@ -267,7 +267,7 @@ fn carry(wire: &Wire, mut tuns: Vec<File>, mut random: Xoshiro256PlusPlus) {
 }
 
 /// Returns the destination of a packet if it is one of our hosts and neither end is cut off.
-fn receiver(wire: &Wire, (from, hosts): (usize, usize), packet: &[u8]) -> Option<usize> {
+fn receiver(wire: &Wire, from: usize, hosts: usize, packet: &[u8]) -> Option<usize> {
     let is_ours = packet.len() >= 20 && packet[0] >> 4 == 4 && packet[16..19] == NETWORK;
     let to = usize::from(packet.get(19)?.checked_sub(1)?);
     let down = wire.down.load(Ordering::Acquire);

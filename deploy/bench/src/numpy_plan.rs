@@ -56,7 +56,9 @@ impl<'a> NumpyPlan<'a> {
     /// The DMP is invalid, or the file system fails.
     pub fn write(
         folder: &Path,
-        (config, spec, controls): (&'a ExperimentConfig, &'a EnvSpec, Controls),
+        config: &'a ExperimentConfig,
+        spec: &'a EnvSpec,
+        controls: Controls,
         policy: &Policy,
         parameters: &[f32],
     ) -> anyhow::Result<PathBuf> {

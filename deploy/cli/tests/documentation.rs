@@ -159,10 +159,8 @@ fn the_table_of_commands_is_complete() {
     let commands = cells(section(&readme, "## Commands"), 2);
     let page = read("docs/commands.md");
     let roles = first_cells(section(&page, "## Roles"));
-    let documented: BTreeSet<_> = commands
-        .union(&roles)
-        .map(|cell| cell.split(' ').next().unwrap().to_owned())
-        .collect();
+    let documented: BTreeSet<_> =
+        commands.union(&roles).map(|cell| cell.split(' ').next().unwrap().to_owned()).collect();
     let help = help(&[]);
     let listed = |heading: &str| {
         let below = help.split_once(heading).unwrap_or_else(|| panic!("no {heading} in help")).1;

@@ -20,15 +20,10 @@ fn endpoint() -> String {
 
 /// Starts a run that accepts workers of other hosts.
 fn learner(place: &Workplace, run: &str, endpoint: &str, more: &[&str]) -> Running {
-    learner_of("reacher", place, (run, endpoint), more)
+    learner_of("reacher", place, run, endpoint, more)
 }
 
-fn learner_of(
-    task: &str,
-    place: &Workplace,
-    (run, endpoint): (&str, &str),
-    more: &[&str],
-) -> Running {
+fn learner_of(task: &str, place: &Workplace, run: &str, endpoint: &str, more: &[&str]) -> Running {
     let listen = format!("bridge.listen=[\"{endpoint}\"]");
     let open = ["--workers", "1", "--set", &listen, "--set", "bridge.workers_max=2"];
     let more = [&open[..], &["--set", "delivery.level=log"], more].concat();
@@ -224,7 +219,7 @@ fn a_host_that_leaves_hands_over_the_segment_that_its_worker_was_in() {
     let (run, endpoint) = (place.path("run"), endpoint());
     fs::write(place.path("held.py"), HELD).unwrap();
     let more = ["--python-path", &place.path(""), "--envs-per-worker", "1", "--steps", ENDLESS];
-    let mut training = learner_of("held:Held-v0", &place, (&run, &endpoint), &more);
+    let mut training = learner_of("held:Held-v0", &place, &run, &endpoint, &more);
     let mut host = bridge(&place, &run, &endpoint, "far");
     training.until_said("host far takes part: 1 worker");
     let far = place.path("far");

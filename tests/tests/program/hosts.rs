@@ -35,7 +35,7 @@ fn three_hosts(seed: u64) -> Option<Hosts> {
     }
 }
 
-fn start(place: &Workplace, (hosts, host): (&Hosts, usize), arguments: &[&str]) -> Running {
+fn start(place: &Workplace, hosts: &Hosts, host: usize, arguments: &[&str]) -> Running {
     let mut command = Command::new(executable());
     command.args(arguments);
     hosts.place(host, &mut command);
@@ -66,7 +66,8 @@ fn until_more(running: &mut Running, run: &str, hosts: &[usize], what: &str) {
 fn bridge_arguments<'a>(
     token: &'a str,
     endpoint: &'a str,
-    (name, run): (&'a str, &'a str),
+    name: &'a str,
+    run: &'a str,
 ) -> Vec<&'a str> {
     let asks = ["bridge", "--connect", endpoint, "--token-file", token];
     let own = ["--workers", "1", "--name", name, "--run-dir", run];
@@ -82,13 +83,13 @@ fn three_hosts_lose_nothing_on_a_long_lossy_wire_that_is_cut_while_processes_die
     let listen = format!("bridge.listen=[\"{endpoint}\"]");
     let open = ["--workers", "1", "--set", &listen, "--set", "delivery.level=log"];
     let more = [&open[..], &["--steps", ENDLESS]].concat();
-    let mut training = start(&place, (&hosts, 0), &train("reacher", &run, &more));
+    let mut training = start(&place, &hosts, 0, &train("reacher", &run, &more));
     let token = format!("{run}/bridge.token");
     training.until("a token", |_| Path::new(&token).is_file());
     let mut bridges = [0, 1].map(|host| {
         let name = ["near", "far"][host];
-        let arguments = bridge_arguments(&token, &endpoint, (name, &far[host]));
-        let bridge = start(&place, (&hosts, host + 1), &arguments);
+        let arguments = bridge_arguments(&token, &endpoint, name, &far[host]);
+        let bridge = start(&place, &hosts, host + 1, &arguments);
         // Started first, it gets the first place, which identifies its segments.
         training.until_said(&format!("host {name} takes part"));
         bridge
@@ -158,21 +159,21 @@ fn with_mutual_tls_a_host_takes_part_whose_certificate_is_named_and_no_other() {
     let open = ["--workers", "1", "--set", &listen];
     let secured = ["--set", "bridge.zenoh_file=zenoh-learner.json5", "--steps", ENDLESS];
     let arguments = [&open[..], &secured].concat();
-    let mut training = start(&place, (&hosts, 0), &train("reacher", &run, &arguments));
+    let mut training = start(&place, &hosts, 0, &train("reacher", &run, &arguments));
     let token = format!("{run}/bridge.token");
     training.until("a token", |_| Path::new(&token).is_file());
     let (near, far) = (place.path("near"), place.path("far"));
     let mut strangers = [
         // Signed by the authority, but not named.
-        [&bridge_arguments(&token, &endpoint, ("c", &far))[..], &["--zenoh-config", "other.json5"]]
+        [&bridge_arguments(&token, &endpoint, "c", &far)[..], &["--zenoh-config", "other.json5"]]
             .concat(),
         // Without any certificate.
-        bridge_arguments(&token, &endpoint, ("d", &far)),
+        bridge_arguments(&token, &endpoint, "d", &far),
     ]
-    .map(|arguments| start(&place, (&hosts, 2), &arguments));
-    let named = bridge_arguments(&token, &endpoint, ("a", &near));
+    .map(|arguments| start(&place, &hosts, 2, &arguments));
+    let named = bridge_arguments(&token, &endpoint, "a", &near);
     let named = [&named[..], &["--zenoh-config", "zenoh-host.json5"]].concat();
-    let bridge = start(&place, (&hosts, 1), &named);
+    let bridge = start(&place, &hosts, 1, &named);
     until_more(&mut training, &run, &[0], "segments of the host that is named");
     for stranger in &mut strangers {
         stranger.until_said("no learner's host answers");

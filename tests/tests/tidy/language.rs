@@ -33,7 +33,9 @@ fn the_text_is_plain_english() {
 #[test]
 fn parameters_are_not_anonymous_tuples() {
     let mut places = Vec::new();
-    for source in sources(&["rs"]) {
+    // This file has examples.
+    let others = sources(&["rs"]).into_iter().filter(|it| !it.path.ends_with("tidy/language.rs"));
+    for source in others {
         for (at, _) in source.text.match_indices("fn ") {
             let begins_word =
                 !source.text[..at].ends_with(|it: char| it.is_alphanumeric() || it == '_');

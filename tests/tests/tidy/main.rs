@@ -151,10 +151,7 @@ fn actors_and_learner_do_not_know_each_other() {
             places.push(format!("{member}/Cargo.toml depends on actors or learner"));
         }
     }
-    none(
-        &places,
-        "actors and learner share only `shared`; deploy connects them",
-    );
+    none(&places, "actors and learner share only `shared`; deploy connects them");
 }
 
 #[test]

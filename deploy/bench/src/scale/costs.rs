@@ -46,7 +46,8 @@ pub(super) fn worker(
     program: PathBuf,
     venv: PathBuf,
     config: &ExperimentConfig,
-    (watch, duration): (&Watch, Duration),
+    watch: &Watch,
+    duration: Duration,
 ) -> anyhow::Result<WorkerCost> {
     let mut config = config.clone();
     config.actors.queue_segments = QUEUED_SEGMENTS * config.actors.envs_per_worker;
@@ -151,7 +152,8 @@ impl Pool {
 pub(super) fn update(
     config: &ExperimentConfig,
     spec: &EnvSpec,
-    (watch, duration): (&Watch, Duration),
+    watch: &Watch,
+    duration: Duration,
 ) -> anyhow::Result<Timed> {
     let mut config = config.clone();
     config.actors.joined_max = 0;

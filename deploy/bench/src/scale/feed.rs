@@ -122,7 +122,8 @@ impl Feed {
     pub(super) fn start(
         feed: &FeedPlan<'_>,
         token: &str,
-        (folder, watch): (&Path, &Watch),
+        folder: &Path,
+        watch: &Watch,
     ) -> anyhow::Result<Self> {
         let learner = feed.learner()?;
         let policy = learner.policy();

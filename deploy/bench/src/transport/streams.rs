@@ -78,7 +78,8 @@ impl StreamPeer {
         kind: StreamKind,
         size: Size,
         mut command: Command,
-        (folder, watch): (&Path, &Watch),
+        folder: &Path,
+        watch: &Watch,
     ) -> anyhow::Result<Self> {
         let name = format!("{}-{}", kind.name(), size.bytes);
         let log_path = folder.join(format!("{name}.log"));
