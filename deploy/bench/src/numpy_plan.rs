@@ -56,9 +56,7 @@ impl<'a> NumpyPlan<'a> {
     /// The DMP is invalid, or the file system fails.
     pub fn write(
         folder: &Path,
-        config: &'a ExperimentConfig,
-        spec: &'a EnvSpec,
-        controls: Controls,
+        (config, spec, controls): (&'a ExperimentConfig, &'a EnvSpec, Controls),
         policy: &Policy,
         parameters: &[f32],
     ) -> anyhow::Result<PathBuf> {

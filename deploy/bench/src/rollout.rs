@@ -100,7 +100,7 @@ fn start_peers(
 ) -> anyhow::Result<Vec<Peer>> {
     let Workers { spec, policy, parameters, .. } = workers;
     let plan =
-        NumpyPlan::write(run.path(), &bench.config, spec, bench.controls, policy, parameters)?;
+        NumpyPlan::write(run.path(), (&bench.config, spec, bench.controls), policy, parameters)?;
     let package_path = bench.package_path.clone();
     let stage = PeerStage { run, package_path, plan, workers: bench.config.actors.workers };
     let own = bench.venv.join("bin/python");

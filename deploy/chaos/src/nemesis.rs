@@ -102,7 +102,7 @@ impl Nemesis {
                 }
             }
             Stage::Again { deaths, seen_us, deadline_us } => {
-                self.strike_again(deaths, seen_us, deadline_us, now_us, timeline)?;
+                self.strike_again((deaths, seen_us), deadline_us, now_us, timeline)?;
             }
             Stage::Held { member, until_us } if now_us >= until_us => {
                 self.let_go(&member, now_us, timeline);
@@ -185,11 +185,11 @@ impl Nemesis {
             }
             Fault::StopWorker { worker, for_ms } => {
                 let victim = members.iter().find(|it| is_worker(it, worker));
-                victim.is_some_and(|victim| self.suspend(victim, now_us, for_ms, timeline))
+                victim.is_some_and(|victim| self.hold(victim, (now_us, for_ms), timeline))
             }
             Fault::StopLearner { for_ms } => {
                 let victim = members.iter().find(|it| is_learner(it));
-                victim.is_some_and(|victim| self.suspend(victim, now_us, for_ms, timeline))
+                victim.is_some_and(|victim| self.hold(victim, (now_us, for_ms), timeline))
             }
             Fault::KillEvaluator => {
                 let victim = members.iter().find(|it| it.role == Role::Evaluator);
@@ -205,12 +205,9 @@ impl Nemesis {
         true
     }
 
-    /// Kills the successor of the learner that died as number `deaths`, some time after it was first
-    /// seen at `seen_us`; gives up at `deadline_us`.
     fn strike_again(
         &mut self,
-        deaths: u64,
-        seen_us: Option<u64>,
+        (deaths, seen_us): (u64, Option<u64>),
         deadline_us: u64,
         now_us: u64,
         timeline: &mut Timeline,
@@ -293,11 +290,10 @@ impl Nemesis {
         self.kill(victim, now_us, timeline).then_some(deaths)
     }
 
-    fn suspend(
+    fn hold(
         &mut self,
         victim: &Member,
-        now_us: u64,
-        for_ms: u64,
+        (now_us, for_ms): (u64, u64),
         timeline: &mut Timeline,
     ) -> bool {
         if !victim.signal(Signal::STOP) {

@@ -1,17 +1,15 @@
 //! Generates a schedule of faults, times and victims from a seed.
 
-use std::ops::RangeInclusive;
-
 use dmprl_shared::seeds::{self, Stream};
 use rand::RngExt;
 use rand::seq::SliceRandom;
 
 /// Minimum and maximum pause between two strikes [ms].
-const PAUSE_MS: RangeInclusive<u64> = 300..=1_500;
+const PAUSE_MS: (u64, u64) = (300, 1_500);
 /// Minimum and maximum time for which a process is suspended [ms].
-const STOP_MS: RangeInclusive<u64> = 200..=2_000;
+const STOP_MS: (u64, u64) = (200, 2_000);
 /// Minimum and maximum delay after which a newly started learner is killed again [ms].
-const AGAIN_MS: RangeInclusive<u64> = 0..=600;
+const AGAIN_MS: (u64, u64) = (0, 600);
 /// Time without faults, in which undisturbed work is measured [ms].
 const REST_MS: u64 = 4_000;
 
@@ -115,8 +113,8 @@ impl Schedule {
         self.round.pop().unwrap_or(Kind::Learner)
     }
 
-    fn draw(&mut self, range: RangeInclusive<u64>) -> u64 {
-        self.random.random_range(range)
+    fn between(&mut self, (least, most): (u64, u64)) -> u64 {
+        self.random.random_range(least..=most)
     }
 }
 
@@ -126,8 +124,9 @@ impl Iterator for Schedule {
     fn next(&mut self) -> Option<Strike> {
         let kind = self.kind();
         // Always draws the same number of values, whether or not the fault needs them.
-        let (pause_ms, worker) = (self.draw(PAUSE_MS), self.random.random_range(0..self.workers));
-        let (stop_ms, after_ms) = (self.draw(STOP_MS), self.draw(AGAIN_MS));
+        let (pause_ms, worker) =
+            (self.between(PAUSE_MS), self.random.random_range(0..self.workers));
+        let (stop_ms, after_ms) = (self.between(STOP_MS), self.between(AGAIN_MS));
         let fault = match kind {
             Kind::Worker { early } => Fault::KillWorker { worker, early },
             Kind::Workers => Fault::KillWorkers,

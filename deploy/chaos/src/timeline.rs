@@ -153,8 +153,9 @@ impl Timeline {
             }
             (Author::Learner(deaths), Entry::Inserted(piece)) => {
                 let alive = !self.learners_killed.contains(&deaths);
+                let worker = (piece.worker, piece.mark.incarnation);
                 if alive && self.serving {
-                    self.on_segment(piece.worker, piece.mark.incarnation, record.time_us);
+                    self.on_segment(worker, record.time_us);
                 }
             }
             _ => {}
@@ -186,7 +187,7 @@ impl Timeline {
         }
     }
 
-    fn on_segment(&mut self, index: u32, incarnation: u32, time_us: u64) {
+    fn on_segment(&mut self, (index, incarnation): (u32, u32), time_us: u64) {
         let seconds = |since: u64| time_us.saturating_sub(since) as f64 / 1e6;
         if let Some(fault) = self.learner_fault.filter(|fault| time_us > fault.since_us) {
             self.learner_fault = None;

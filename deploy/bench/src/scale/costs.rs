@@ -46,8 +46,7 @@ pub(super) fn worker(
     program: PathBuf,
     venv: PathBuf,
     config: &ExperimentConfig,
-    watch: &Watch,
-    duration: Duration,
+    (watch, duration): (&Watch, Duration),
 ) -> anyhow::Result<WorkerCost> {
     let mut config = config.clone();
     config.actors.queue_segments = QUEUED_SEGMENTS * config.actors.envs_per_worker;
@@ -152,8 +151,7 @@ impl Pool {
 pub(super) fn update(
     config: &ExperimentConfig,
     spec: &EnvSpec,
-    watch: &Watch,
-    duration: Duration,
+    (watch, duration): (&Watch, Duration),
 ) -> anyhow::Result<Timed> {
     let mut config = config.clone();
     config.actors.joined_max = 0;

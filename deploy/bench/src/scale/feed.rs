@@ -122,8 +122,7 @@ impl Feed {
     pub(super) fn start(
         feed: &FeedPlan<'_>,
         token: &str,
-        folder: &Path,
-        watch: &Watch,
+        (folder, watch): (&Path, &Watch),
     ) -> anyhow::Result<Self> {
         let learner = feed.learner()?;
         let policy = learner.policy();

@@ -133,15 +133,7 @@ impl Check {
     }
 }
 
-/// The results of the benchmark's parts.
-pub(super) struct Results {
-    pub(super) simulated: Simulated,
-    pub(super) costs: CostFigures,
-    pub(super) model: Model,
-    pub(super) checks: Vec<Check>,
-}
-
-/// All results of the benchmark, with its settings and machine.
+/// All results of the benchmark.
 #[derive(Debug, Clone)]
 pub struct Figures {
     pub(super) config: ExperimentConfig,
@@ -158,8 +150,11 @@ pub struct Figures {
 }
 
 impl Figures {
-    pub(super) fn new(bench: &ScaleBench, results: Results, machine: Machine) -> Self {
-        let Results { simulated, costs, model, checks } = results;
+    pub(super) fn new(
+        bench: &ScaleBench,
+        (simulated, costs, model, checks): (Simulated, CostFigures, Model, Vec<Check>),
+        machine: Machine,
+    ) -> Self {
         Self {
             config: bench.config.clone(),
             segment_bytes: bench.segment_bytes,

@@ -34,7 +34,7 @@ pub use feeder::{SegmentFeederArgs, segment_feeder};
 pub use figures::Figures;
 
 use feed::{Feed, FeedPlan, FeedWindow};
-use figures::{Check, CostFigures, Results, Simulated};
+use figures::{Check, CostFigures, Simulated};
 use model::{Costs, Demand, Model, Place};
 
 /// Plan of the benchmark.
@@ -103,7 +103,7 @@ fn measure(bench: &ScaleBench, progress: &dyn Progress) -> anyhow::Result<Figure
         checks.push(Check::new(&here, workers, &window));
     }
     let machine = Manifest::new(None)?.machine;
-    Ok(Figures::new(bench, Results { simulated, costs, model, checks }, machine))
+    Ok(Figures::new(bench, (simulated, costs, model, checks), machine))
 }
 
 /// Measures the ingest of one learner with many workers.
@@ -133,7 +133,7 @@ fn measure_costs(
     let ScaleBench { config, cost_duration, .. } = bench;
     progress.stage("cost of a worker");
     let (program, venv) = (bench.program.clone(), bench.venv.clone());
-    let worker = costs::worker(program, venv, config, watch, *cost_duration)?;
+    let worker = costs::worker(program, venv, config, (watch, *cost_duration))?;
     progress.stage("cost of ingest");
     let feed = feed_plan(bench, config, &worker.spec);
     let (window, _, _) = fed(&feed, "c", watch, *cost_duration)?;
@@ -142,7 +142,7 @@ fn measure_costs(
     let insert = costs::insert(&feed, folder.path(), *cost_duration)?;
     watch.check()?;
     progress.stage("cost of an update");
-    let update = costs::update(config, &worker.spec, watch, *cost_duration)?;
+    let update = costs::update(config, &worker.spec, (watch, *cost_duration))?;
     let segment_bytes = feed.segment_bytes()?;
     let demand = Demand {
         steps_per_segment: worker.steps_per_segment,
@@ -185,7 +185,7 @@ fn fed(
     let folder = temporary()?;
     let run_id = Manifest::new(None)?.run_id;
     let token = format!("{name}{}-{}", &run_id[..8], std::process::id());
-    let mut feed = Feed::start(plan, &token, folder.path(), watch)?;
+    let mut feed = Feed::start(plan, &token, (folder.path(), watch))?;
     let before = feed.feeders_cpu_s();
     let window = feed.measure(watch, duration)?;
     let after = feed.feeders_cpu_s();

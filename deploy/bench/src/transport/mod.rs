@@ -1,16 +1,16 @@
 //! `dmprl bench transport`: compares segments per second through shared memory and other channels.
 //!
 //! Processes of this program only send (`worker`, `synthetic_segments`). The receiver of `bench
-//! rollout` acts as the learner: it checks, settles and acknowledges (`shared_memory`). The peers
-//! are pipes and sockets between the same processes (`streams`) and queues between Python processes
+//! rollout` acts as the learner: it checks, settles and acknowledges (`ours`). The peers are pipes
+//! and sockets between the same processes (`streams`) and queues between Python processes
 //! (`python`). In every round each runs once for the same time while the others sleep on a full
 //! channel; medians over the rounds count (`figures`). Finally the processor time of blocked
 //! workers is measured, while nothing takes their segments.
 
 mod figures;
 mod hosts;
+mod ours;
 mod python;
-mod shared_memory;
 mod streams;
 mod worker;
 
@@ -32,8 +32,8 @@ pub use worker::{TransportWorkerArgs, transport_worker};
 
 use super::synthetic_segments::{SIZES, Size};
 use figures::OURS;
+use ours::Ours;
 use python::PythonPeer;
-use shared_memory::SharedMemory;
 use streams::{StreamKind, StreamPeer};
 
 /// Time in which a blocked worker's wait grows to its maximum.
@@ -84,6 +84,7 @@ fn measure(bench: &TransportBench, progress: &dyn Progress) -> anyhow::Result<Fi
     let token = format!("{}-{}", &manifest.run_id[..8], std::process::id());
     progress.stage("starting workers and peers");
     let mut figures = Figures::new(bench, manifest.machine);
+    let place = (folder.path(), &watch);
     // Start all at once: importing Python packages takes longest.
     let mut pythons = Vec::new();
     for size in SIZES {
@@ -103,16 +104,8 @@ fn measure(bench: &TransportBench, progress: &dyn Progress) -> anyhow::Result<Fi
             command
         };
         let token = format!("{number}{token}");
-        let ours = SharedMemory::start(
-            size,
-            bench.workers,
-            bench.level,
-            &token,
-            &command,
-            folder.path(),
-            &watch,
-        )?;
-        let start = |kind| StreamPeer::start(kind, size, command(), folder.path(), &watch);
+        let ours = Ours::start(size, (bench.workers, &token), &command, bench.level, place)?;
+        let start = |kind| StreamPeer::start(kind, size, command(), place);
         let streams = StreamKind::ALL.map(start).into_iter().collect::<anyhow::Result<Vec<_>>>()?;
         sizes.push(Contest { ours, streams, pythons: Vec::new() });
     }
@@ -144,7 +137,7 @@ fn measure(bench: &TransportBench, progress: &dyn Progress) -> anyhow::Result<Fi
 
 /// All transports of segments of one size.
 struct Contest {
-    ours: SharedMemory,
+    ours: Ours,
     streams: Vec<StreamPeer>,
     pythons: Vec<PythonPeer>,
 }

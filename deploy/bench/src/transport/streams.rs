@@ -78,8 +78,7 @@ impl StreamPeer {
         kind: StreamKind,
         size: Size,
         mut command: Command,
-        folder: &Path,
-        watch: &Watch,
+        (folder, watch): (&Path, &Watch),
     ) -> anyhow::Result<Self> {
         let name = format!("{}-{}", kind.name(), size.bytes);
         let log_path = folder.join(format!("{name}.log"));

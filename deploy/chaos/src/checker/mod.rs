@@ -89,7 +89,7 @@ impl Checker {
                 if worker as usize >= self.lives.len() {
                     self.violations.add(format!("I9: a journal of unknown worker {worker}"));
                 } else {
-                    self.on_worker(worker, incarnation, entry);
+                    self.on_worker((worker, incarnation), entry);
                 }
             }
             (Author::Learner(_), Entry::Restored(worker, mark)) => self.on_restored(worker, mark),
@@ -126,7 +126,7 @@ impl Checker {
         self.checkpoints
     }
 
-    fn on_worker(&mut self, worker: u32, incarnation: u32, entry: Entry) {
+    fn on_worker(&mut self, (worker, incarnation): (u32, u32), entry: Entry) {
         let life = self.lives[worker as usize].entry(incarnation).or_default();
         let name = format!("worker {worker}, incarnation {incarnation}");
         match entry {

@@ -14,7 +14,7 @@ struct Story {
     learner: Author,
 }
 
-fn piece(worker: u32, incarnation: u32, sequence: u64) -> Piece {
+fn piece(worker: u32, (incarnation, sequence): (u32, u64)) -> Piece {
     let mark = Watermark { incarnation, sequence };
     Piece { worker, mark, checksum: worker ^ sequence as u32, env_steps: STEPS }
 }
@@ -51,18 +51,18 @@ impl Story {
 
     fn produce(&mut self, worker: u32, incarnation: u32, sequences: std::ops::RangeInclusive<u64>) {
         for sequence in sequences {
-            let piece = piece(worker, incarnation, sequence);
+            let piece = piece(worker, (incarnation, sequence));
             self.note(Author::Worker(worker, incarnation), Entry::Produced(piece));
         }
     }
 
     fn insert(&mut self, worker: u32, incarnation: u32, sequences: std::ops::RangeInclusive<u64>) {
         for sequence in sequences {
-            self.says(Entry::Inserted(piece(worker, incarnation, sequence)));
+            self.says(Entry::Inserted(piece(worker, (incarnation, sequence))));
         }
     }
 
-    fn acknowledge(&mut self, worker: u32, incarnation: u32, sequence: u64) {
+    fn acknowledge(&mut self, worker: u32, (incarnation, sequence): (u32, u64)) {
         let mark = Watermark { incarnation, sequence };
         self.note(Author::Worker(worker, incarnation), Entry::Acknowledged(mark));
     }
@@ -98,7 +98,7 @@ impl Story {
 #[test]
 fn a_run_that_keeps_its_promises_is_not_accused() {
     let mut story = Story::with_ten_of_each();
-    story.acknowledge(0, 0, 8);
+    story.acknowledge(0, (0, 8));
     story.says(Entry::Cut(standing(20)));
     story.produce(0, 0, 11..=14);
     story.insert(0, 0, 11..=12);
@@ -111,10 +111,10 @@ fn a_run_that_keeps_its_promises_is_not_accused() {
     story.begin(1, [(0, 10), (0, 10)], 20);
     story.insert(0, 0, 11..=12);
     story.insert(0, 1, 1..=1);
-    story.says(Entry::Refused(piece(0, 1, 1), true));
+    story.says(Entry::Refused(piece(0, (1, 1)), true));
     story.insert(0, 1, 2..=3);
-    story.acknowledge(0, 1, 3);
-    story.says(Entry::Refused(piece(0, 0, 13), true));
+    story.acknowledge(0, (1, 3));
+    story.says(Entry::Refused(piece(0, (0, 13)), true));
     story.begin(2, [(0, 10), (0, 10)], 20);
     story.insert(0, 0, 11..=12);
     story.insert(0, 1, 1..=3);
@@ -136,7 +136,7 @@ fn i1_a_lost_segment_that_was_acknowledged_is_found() {
     story.says(Entry::Cut(standing(20)));
     story.produce(0, 0, 11..=15);
     story.insert(0, 0, 11..=15);
-    story.acknowledge(0, 0, 15);
+    story.acknowledge(0, (0, 15));
     // The log has lost its last two segments.
     story.begin(1, [(0, 10), (0, 10)], 20);
     story.insert(0, 0, 11..=13);
@@ -169,8 +169,8 @@ fn i1_marks_beyond_what_was_inserted_are_found() {
 #[test]
 fn i1_an_acknowledgement_that_goes_back_is_found() {
     let mut story = Story::with_ten_of_each();
-    story.acknowledge(0, 0, 8);
-    story.acknowledge(0, 0, 7);
+    story.acknowledge(0, (0, 8));
+    story.acknowledge(0, (0, 7));
     story.breaks("I1", "acknowledged after 8");
 }
 
@@ -215,7 +215,7 @@ fn i3_a_segment_of_a_dead_worker_after_one_of_its_successor_is_found() {
 fn i4_a_payload_that_changed_on_its_way_is_found() {
     let mut story = Story::with_ten_of_each();
     story.produce(0, 0, 11..=11);
-    let torn = Piece { checksum: 0xbad, ..piece(0, 0, 11) };
+    let torn = Piece { checksum: 0xbad, ..piece(0, (0, 11)) };
     story.says(Entry::Inserted(torn));
     story.breaks("I4", "checksum 0x00000bad");
 }
@@ -302,9 +302,9 @@ fn i9_a_number_that_was_left_out_at_its_source_is_found() {
 fn i9_a_refused_segment_is_counted_and_not_lost() {
     let mut story = Story::with_ten_of_each();
     story.produce(0, 0, 11..=12);
-    story.says(Entry::Refused(piece(0, 0, 11), false));
+    story.says(Entry::Refused(piece(0, (0, 11)), false));
     story.insert(0, 0, 12..=12);
-    story.acknowledge(0, 0, 12);
+    story.acknowledge(0, (0, 12));
     let (sums, violations) = story.end();
     assert_eq!((sums.rejected, sums.inserted, sums.lost), (1, 21, 0), "{violations:?}");
     assert_eq!(violations, Vec::<String>::new());

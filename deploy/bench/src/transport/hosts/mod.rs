@@ -1,17 +1,17 @@
 //! `dmprl bench transport` between two hosts: a run's relay and gateway, with synthetic data.
 //!
-//! One end (`learner_host`) acts as the learner: it checks, settles and acknowledges segments, and
-//! publishes a policy at intervals. The other end (`worker_host`) has workers that only send.
+//! One end (`here`) acts as the learner: it checks, settles and acknowledges segments, and
+//! publishes a policy at intervals. The other end (`there`) has workers that only send.
 
-mod learner_host;
-mod worker_host;
+mod here;
+mod there;
 
 use std::time::Duration;
 
 use dmprl_shared::transport::shared_memory::{Domain, Plan};
 
-pub use learner_host::listen;
-pub use worker_host::connect;
+pub use here::listen;
+pub use there::connect;
 
 use crate::synthetic_segments::BETWEEN_HOSTS;
 use dmprl_run::random_u64;

@@ -44,7 +44,7 @@ pub fn listen(
     let domain = domain()?;
     let mut taker = Taker::new(serve(domain.path(), &plan(WORKERS_MAX))?);
     let policies = Arc::new(Policies::default());
-    let gateway = start_gateway(&policies, endpoint, zenoh_file, domain.path());
+    let gateway = start_gateway(&policies, (endpoint, zenoh_file), domain.path());
     let began = Instant::now();
     let ended = loop {
         if watch.check().is_err() {
@@ -196,8 +196,7 @@ impl Taker {
 
 fn start_gateway(
     policies: &Arc<Policies>,
-    endpoint: &str,
-    zenoh_file: Option<&Path>,
+    (endpoint, zenoh_file): (&str, Option<&Path>),
     domain: &Path,
 ) -> JoinHandle<anyhow::Result<()>> {
     let policies = Arc::clone(policies);

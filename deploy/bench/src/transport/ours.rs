@@ -36,7 +36,7 @@ const DRAIN_MAX: Duration = Duration::from_secs(10);
 const LOG_BYTES_MAX: u64 = 256 << 20;
 
 /// Running workers of one size, whose queues are full between two measurements.
-pub(super) struct SharedMemory {
+pub(super) struct Ours {
     pub(super) size: Size,
     children: Vec<LineChild>,
     receiver: DrainReceiver,
@@ -45,16 +45,14 @@ pub(super) struct SharedMemory {
     _domain: Domain,
 }
 
-impl SharedMemory {
+impl Ours {
     /// Starts the workers; `command` is a `transport-worker` of this size without its route.
     pub(super) fn start(
         size: Size,
-        workers: u32,
-        level: DeliveryLevel,
-        token: &str,
+        (workers, token): (u32, &str),
         command: &dyn Fn() -> Command,
-        folder: &Path,
-        watch: &Watch,
+        level: DeliveryLevel,
+        (folder, watch): (&Path, &Watch),
     ) -> anyhow::Result<Self> {
         let domain = create_domain(token)?;
         let plan = size.plan(workers as usize);

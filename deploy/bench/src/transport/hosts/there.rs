@@ -33,8 +33,7 @@ const TOGETHER: usize = 32;
 pub fn connect(
     endpoint: &str,
     zenoh_file: Option<&Path>,
-    workers: u32,
-    rate: Option<u32>,
+    (workers, rate): (u32, Option<u32>),
 ) -> anyhow::Result<Option<Value>> {
     let watch = Watch::start()?;
     let join = JoinSettings {
@@ -61,7 +60,7 @@ pub fn connect(
     let threads: Vec<JoinHandle<anyhow::Result<()>>> = (0..workers)
         .map(|index| {
             let (over, path, plan) = (Arc::clone(&over), domain.path().to_owned(), plan.clone());
-            thread::spawn(move || work(index, each, &path, &plan, &over))
+            thread::spawn(move || work((index, each), (&path, &plan), &over))
         })
         .collect();
     let interrupted = loop {
@@ -108,10 +107,8 @@ fn welcomed(
 
 /// A worker that only sends, at `rate` segments per second or as fast as possible.
 fn work(
-    index: u32,
-    rate: Option<f64>,
-    domain: &Path,
-    plan: &Plan,
+    (index, rate): (u32, Option<f64>),
+    (domain, plan): (&PathBuf, &Plan),
     over: &AtomicBool,
 ) -> anyhow::Result<()> {
     let began = Instant::now();
