@@ -28,7 +28,8 @@ const IR_VERSION: i64 = 8;
 /// The policy's description cannot be serialized, which is not expected.
 pub fn onnx(opened: &OpenedPolicy) -> anyhow::Result<Vec<u8>> {
     let description = opened.policy.description();
-    let json = serde_json::to_string(description).context("cannot serialize the policy's description")?;
+    let json =
+        serde_json::to_string(description).context("cannot serialize the policy's description")?;
     let entry = |key: &str, value: String| StringStringEntryProto { key: key.to_owned(), value };
     let mut metadata_props = vec![entry("description", json)];
     if let Some(origin) = &opened.origin {

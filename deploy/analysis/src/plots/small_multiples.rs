@@ -66,10 +66,8 @@ impl SmallMultiples<'_> {
         let columns = self.panels.len().clamp(1, COLUMNS_MAX);
         let rows = self.panels.len().div_ceil(columns);
         let inner = (PANEL.0 * columns as u32, PANEL.1 * rows as u32);
-        let size = (
-            Y_LABEL_WIDTH + inner.0 + LEGEND_WIDTH,
-            TITLE_HEIGHT + inner.1 + X_LABEL_HEIGHT,
-        );
+        let size =
+            (Y_LABEL_WIDTH + inner.0 + LEGEND_WIDTH, TITLE_HEIGHT + inner.1 + X_LABEL_HEIGHT);
         let mut svg = String::new();
         {
             let area = SVGBackend::with_string(&mut svg, size).into_drawing_area();
