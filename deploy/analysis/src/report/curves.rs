@@ -111,7 +111,7 @@ impl MethodLine {
 
 fn draw(
     task: &str,
-    what: &str,
+    y_label: &str,
     lines: &[MethodLine],
 ) -> Result<String, Box<dyn std::error::Error>> {
     let points = || lines.iter().flat_map(|line| &line.points);
@@ -122,10 +122,10 @@ fn draw(
     let mut svg = String::new();
     {
         let letters = lines.iter().map(|line| line.label.chars().count()).max().unwrap_or(0);
-        let beside = (LEGEND_MARGIN + LEGEND_LETTER * letters as u32).min(LEGEND_MAX);
-        let size = (SIZE.0 + beside, SIZE.1);
+        let right_margin = (LEGEND_MARGIN + LEGEND_LETTER * letters as u32).min(LEGEND_MAX);
+        let size = (SIZE.0 + right_margin, SIZE.1);
         let area = SVGBackend::with_string(&mut svg, size).into_drawing_area();
-        let axes = Axes { title: task, what, steps_max, values: low..high, beside };
+        let axes = Axes { title: task, y_label, steps_max, values: low..high, right_margin };
         let mut chart = axes.draw(&area)?;
         // Lines last: a band on top of another method's line would change its colour.
         for line in lines {
