@@ -196,7 +196,7 @@ fn an_environment_without_goals_or_time_limit_is_refused_with_what_helps() {
     ] {
         let error = started(task, &[]).err().unwrap().to_string();
         assert!(error.contains(reason), "{error}");
-        assert!(error.contains("train with replay.hindsight = \"none\""), "{error}");
+        assert!(error.contains("set replay.hindsight = \"none\""), "{error}");
     }
     assert!(started("Long", &[("replay.hindsight", "none")]).is_ok());
 }

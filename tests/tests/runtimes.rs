@@ -168,7 +168,7 @@ refused(lambda: dmprl.Policy.load(folder), 'checkpoints/best')
 refused(lambda: dmprl.Policy.load(folder / 'none'), kind=OSError)
 whole = (folder / 'dmp/policy.safetensors').read_bytes()
 for damaged, word in [
-    (whole[:1000], 'cut short'),
+    (whole[:1000], 'truncated'),
     (b'', 'safetensors'),
     (whole.replace(b'dmprl-policy-1', b'dmprl-policy-9'), 'dmprl-policy-9'),
     (whole.replace(b'\"description\"', b'\"descripti--\"'), 'dmprl export'),

@@ -129,7 +129,7 @@ fn a_run_whose_learner_sleeps_for_a_while_goes_on() {
     let mut running = training(&place, &run, &keys);
     let workers = ids(&place, "actor");
     signal_role(&place, "learner", Signal::STOP);
-    running.until_said("waited 7 s: the learner takes nothing from its full queue");
+    running.until_said("waited 7 s: its queue is full");
     signal_role(&place, "learner", Signal::CONT);
     let steps = env_steps_of(&run).unwrap();
     running.until_steps(&run, steps + 2_000);

@@ -84,7 +84,7 @@ fn a_disk_too_full_for_checkpoint_and_log_stops_the_acknowledging_and_loses_noth
     let mut running = place.start_command(command);
     running.until_said("no checkpoint could be written");
     running.until_said("no segment can be acknowledged");
-    running.until_said("the learner acknowledges nothing that it has taken");
+    running.until_said("the learner acknowledges none of its segments");
     running.signal_group(Signal::INT);
     let finished = running.wait().with_status(130).saying("the last checkpoint was not written");
     assert_eq!(finished.said.matches("no segment can be acknowledged").count(), 1, "told once");

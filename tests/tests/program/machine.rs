@@ -41,7 +41,7 @@ fn a_worker_whose_learner_takes_nothing_sleeps() {
     let (worker, learner) = (role(&place, "actor"), role(&place, "learner"));
     let stepping = ticks_per_s(&worker, || running.until_steps(&run, 2_500 + 10_000));
     learner.signal(Signal::STOP);
-    running.until_said("has waited 1 s: the learner takes nothing");
+    running.until_said("has waited 1 s: its queue is full");
     let blocked = ticks_per_s(&worker, || running.until_said("has waited 4 s"));
     learner.signal(Signal::CONT);
     println!("{stepping:.1} ticks a second while it steps, {blocked:.1} while it waits");
