@@ -52,8 +52,8 @@ pub struct Motion {
 
 impl Motion {
     /// Returns the time of each row of joint positions \[s\], (T+1,). Row t of actions and rewards
-    /// covers the interval from time t to t+1. Times are in steps if the environment does not report
-    /// the duration of a step.
+    /// covers the interval from time t to t+1. Times are in steps if the environment does not
+    /// report the duration of a step.
     #[must_use]
     pub fn times(&self) -> Vec<f64> {
         let dt = self.robot.control_dt_s;
@@ -78,8 +78,8 @@ pub fn read(run: &RunDirectory) -> anyhow::Result<Option<Motion>> {
     Ok(is_current.then_some(motion))
 }
 
-/// Reads the last measured motion, of any policy of the run; `None` if the file is missing or cannot
-/// be parsed.
+/// Reads the last measured motion, of any policy of the run; `None` if the file is missing or
+/// cannot be parsed.
 ///
 /// # Errors
 /// The file cannot be read.

@@ -1,6 +1,6 @@
-//! The results that the paper reports in its Tables 3 and 4.
+//! The results of the paper's Tables 3 and 4.
 
-/// Returns of Table 3. The printed table lacks the minus signs, which the paper's figures show.
+/// Returns of Table 3. The printed table has no minus signs; the paper's figures show them.
 const RETURNS: [Row; 3] = [
     Row("reacher-v1", [(-7.36, 0.54), (-6.58, 0.54), (-7.89, 0.57), (-6.10, 0.61), (-15.56, 1.47)]),
     Row(
@@ -20,15 +20,15 @@ const SUCCESS: [Row; 2] = [
 ];
 
 /// The method that follows this project's first interpretation of the paper.
-pub const READING_METHOD: &str = "DDPG-DMP (paper)";
-/// Footnote about the interpretation, beside the figures of that method.
-pub const READING: &str = "¹ DDPG-DMP (paper) is one interpretation of the paper, which leaves \
-    these choices open: goal, weights and rho are bounded by tanh; the controller sees velocity \
-    and acceleration divided by omega and omega²; the target takes s' = s_{t+1} after the sum of K \
-    rewards; forcing-term widths follow NDP's code. Other interpretations are methods of \
-    deploy/experiments/paper.toml.";
+pub const INTERPRETED_METHOD: &str = "DDPG-DMP (paper)";
+/// Footnote about the interpretation, next to the figures of that method.
+pub const INTERPRETATION_NOTE: &str = "¹ DDPG-DMP (paper) is one interpretation of the paper, \
+    which does not specify these choices: goal, weights and rho are bounded by tanh; the inputs of \
+    the controller are velocity and acceleration divided by omega and omega²; the target takes \
+    s' = s_{t+1} after the sum of K rewards; forcing-term widths follow NDP's code. \
+    deploy/experiments/paper.toml has other interpretations.";
 
-/// Number of seeds behind each figure of the paper.
+/// Number of seeds of each result in the paper.
 pub const SEEDS: usize = 5;
 
 /// Columns of both tables.
@@ -45,8 +45,9 @@ pub enum Figure {
     Success,
 }
 
-/// Returns mean and standard deviation that the paper reports for a method on a task, by the names
-/// of `deploy/experiments/paper.toml`; `None` if it reports none.
+/// Returns the mean and standard deviation that the paper reports; `None` if it reports none.
+///
+/// - `task`, `method`: names in `deploy/experiments/paper.toml`.
 #[must_use]
 pub fn reported(figure: Figure, task: &str, method: &str) -> Option<(f64, f64)> {
     let table: &[Row] = match figure {
