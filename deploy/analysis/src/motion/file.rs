@@ -70,7 +70,7 @@ impl Motion {
 pub fn read(run: &RunDirectory) -> anyhow::Result<Option<Motion>> {
     let Some(row) = run.latest_row()? else { return Ok(None) };
     let settings = run.config()?.evaluation;
-    let Some(motion) = stored(run)? else { return Ok(None) };
+    let Some(motion) = read_any(run)? else { return Ok(None) };
     let is_current = motion.format == FORMAT
         && motion.policy_version == row.policy_version
         && motion.first_seed == settings.first_seed
@@ -83,7 +83,7 @@ pub fn read(run: &RunDirectory) -> anyhow::Result<Option<Motion>> {
 ///
 /// # Errors
 /// The file cannot be read.
-pub fn stored(run: &RunDirectory) -> anyhow::Result<Option<Motion>> {
+pub fn read_any(run: &RunDirectory) -> anyhow::Result<Option<Motion>> {
     let path = run.motion_path();
     let file = match File::open(&path) {
         Ok(file) => file,

@@ -100,7 +100,7 @@ impl MethodLine {
         if runs.is_empty() {
             runs = results.of(task, method).filter(|run| !run.rows.is_empty()).collect();
         }
-        let paper = measure.in_paper().and_then(|figure| reported(figure, task, method));
+        let paper = measure.in_paper().and_then(|table| reported(table, task, method));
         let software = SoftwareCounts::of(runs.iter().copied());
         Self {
             label: format!("{method} · n = {}{}", runs.len(), software.mark()),

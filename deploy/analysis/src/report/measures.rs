@@ -3,7 +3,7 @@
 use dmprl_shared::supervision::EvaluationRow;
 use serde::Deserialize;
 
-use super::paper::Figure;
+use super::paper::PaperTable;
 use super::run::Run;
 use super::thresholds::threshold;
 
@@ -129,10 +129,10 @@ impl Measure {
 
     /// Returns the paper's table for the measure, if it has one.
     #[must_use]
-    pub fn in_paper(self) -> Option<Figure> {
+    pub fn in_paper(self) -> Option<PaperTable> {
         match self {
-            Self::Return => Some(Figure::Return),
-            Self::Success => Some(Figure::Success),
+            Self::Return => Some(PaperTable::Return),
+            Self::Success => Some(PaperTable::Success),
             _ => None,
         }
     }

@@ -36,9 +36,9 @@ const METHODS: [&str; 5] = ["DDPG-DMP (paper)", "DDPG", "TD3", "SAC", "NDP"];
 
 struct Row(&'static str, [(f64, f64); 5]);
 
-/// Selects a table of the paper.
+/// A table of the paper.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Figure {
+pub enum PaperTable {
     /// Return: Table 3.
     Return,
     /// Success rate: Table 4.
@@ -49,12 +49,12 @@ pub enum Figure {
 ///
 /// - `task`, `method`: names in `deploy/experiments/paper.toml`.
 #[must_use]
-pub fn reported(figure: Figure, task: &str, method: &str) -> Option<(f64, f64)> {
-    let table: &[Row] = match figure {
-        Figure::Return => &RETURNS,
-        Figure::Success => &SUCCESS,
+pub fn reported(table: PaperTable, task: &str, method: &str) -> Option<(f64, f64)> {
+    let rows: &[Row] = match table {
+        PaperTable::Return => &RETURNS,
+        PaperTable::Success => &SUCCESS,
     };
-    let Row(_, row) = table.iter().find(|Row(name, _)| *name == task)?;
+    let Row(_, row) = rows.iter().find(|Row(name, _)| *name == task)?;
     let column = METHODS.iter().position(|name| *name == method)?;
     Some(row[column])
 }
@@ -65,10 +65,10 @@ mod tests {
 
     #[test]
     fn figures_are_found_by_task_and_method() {
-        assert_eq!(reported(Figure::Return, "pusher-v0", "SAC"), Some((-31.87, 4.01)));
-        assert_eq!(reported(Figure::Success, "panda-reach", "DDPG"), Some((0.41, 0.24)));
-        assert_eq!(reported(Figure::Return, "panda-reach", "DDPG"), None);
-        assert_eq!(reported(Figure::Return, "reacher", "SAC"), None);
-        assert_eq!(reported(Figure::Return, "reacher-v1", "TD3-DMP"), None);
+        assert_eq!(reported(PaperTable::Return, "pusher-v0", "SAC"), Some((-31.87, 4.01)));
+        assert_eq!(reported(PaperTable::Success, "panda-reach", "DDPG"), Some((0.41, 0.24)));
+        assert_eq!(reported(PaperTable::Return, "panda-reach", "DDPG"), None);
+        assert_eq!(reported(PaperTable::Return, "reacher", "SAC"), None);
+        assert_eq!(reported(PaperTable::Return, "reacher-v1", "TD3-DMP"), None);
     }
 }

@@ -104,7 +104,7 @@ fn table(results: &Results, measure: Measure) -> Table {
             summary: Summary::of(&scores),
             unfinished: runs().filter(|run| run.last().is_none()).count(),
             unknown: runs().filter(|run| run.last().is_some() && measure.of(run).is_none()).count(),
-            paper: measure.in_paper().and_then(|figure| reported(figure, task, method)),
+            paper: measure.in_paper().and_then(|table| reported(table, task, method)),
         }
     };
     let rows = results.tasks.iter().map(|task| {

@@ -2,7 +2,7 @@
 
 use super::statement::{Margin, PROPOSED, ReportedSteps, Rule, Statement};
 use crate::report::measures::Measure;
-use crate::report::paper::{Figure, SEEDS, reported};
+use crate::report::paper::{PaperTable, SEEDS, reported};
 
 /// Tolerance for the paper's percentages, which have one decimal and come from rounded figures.
 const ROUNDING_PERCENT: f64 = 0.15;
@@ -18,7 +18,8 @@ pub(super) fn of(statement: &Statement) -> Option<String> {
         }
         Rule::BetterBy { method, margins } => {
             let wrong = margins.iter().filter_map(|Margin { than, percent }| {
-                let [ours, theirs] = [method, than].map(|name| figure(Figure::Return, task, name));
+                let [ours, theirs] =
+                    [method, than].map(|name| reported_mean(PaperTable::Return, task, name));
                 let real = 100.0 * (ours? - theirs?) / theirs?.abs();
                 let differs = (real - percent).abs() > ROUNDING_PERCENT;
                 differs.then(|| format!("{real:.1} % over {than}, not {percent:.1} %"))
@@ -32,7 +33,7 @@ pub(super) fn of(statement: &Statement) -> Option<String> {
             differs.then(|| format!("of these steps it is {real:.1} % fewer, not {said:.1} %"))
         }
         Rule::Spread { method } => {
-            let (mean, std) = reported(Figure::Success, task, table_label(method))?;
+            let (mean, std) = reported(PaperTable::Success, task, table_label(method))?;
             let max = std_max(mean, SEEDS);
             (std > max).then(|| {
                 format!(
@@ -48,19 +49,20 @@ pub(super) fn of(statement: &Statement) -> Option<String> {
 /// Describes the methods that have higher figures in the paper's table than the allegedly best one.
 fn surpassed(task: &str, measure: Measure, method: &str, than: &[String]) -> Option<String> {
     let of = measure.in_paper()?;
-    let ours = figure(of, task, method)?;
+    let ours = reported_mean(of, task, method)?;
     let above = than.iter().filter_map(|other| {
-        let theirs = figure(of, task, other)?;
+        let theirs = reported_mean(of, task, other)?;
         (theirs > ours).then(|| format!("{other} at {theirs:.2}"))
     });
     let above: Vec<_> = above.collect();
-    let table = if of == Figure::Return { 3 } else { 4 };
+    let table = if of == PaperTable::Return { 3 } else { 4 };
     (!above.is_empty())
         .then(|| format!("its Table {table} has {} above {ours:.2}", above.join(" and ")))
 }
 
-fn figure(figure: Figure, task: &str, method: &str) -> Option<f64> {
-    reported(figure, task, table_label(method)).map(|(mean, _)| mean)
+/// Returns the mean in a table of the paper.
+fn reported_mean(table: PaperTable, task: &str, method: &str) -> Option<f64> {
+    reported(table, task, table_label(method)).map(|(mean, _)| mean)
 }
 
 fn table_label(method: &str) -> &str {

@@ -9,7 +9,7 @@ use super::series;
 use super::statement::{Margin, Rule};
 use super::verdict::{Judgement, Verdict, all, clear};
 use crate::report::measures::Measure;
-use crate::report::paper::{Figure, reported};
+use crate::report::paper::{PaperTable, reported};
 use crate::report::run::Run;
 
 /// Judges whether a rule holds for the runs.
@@ -166,7 +166,7 @@ fn fails(context: &Context<'_>, method: &str, steps: u64) -> Judgement {
 
 fn as_in_paper(context: &Context<'_>, method: &str) -> Judgement {
     let evidence = context.figure(Measure::Success, method);
-    let Some((mean, _)) = reported(Figure::Success, context.task, context.label(method)) else {
+    let Some((mean, _)) = reported(PaperTable::Success, context.task, context.label(method)) else {
         return Judgement::new(Verdict::NotRun, evidence);
     };
     let verdict = judge_success(context, method, |of| {
