@@ -14,7 +14,7 @@ const ROWS_MAX: usize = 1_000;
 /// # Errors
 /// The file cannot be read.
 pub fn read(run: &RunDirectory) -> anyhow::Result<Value> {
-    Ok(motion::stored(run)?.map_or(Value::Null, |motion| chart_data(&motion)))
+    Ok(motion::read_any(run)?.map_or(Value::Null, |motion| chart_data(&motion)))
 }
 
 fn chart_data(motion: &Motion) -> Value {

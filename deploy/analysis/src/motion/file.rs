@@ -52,8 +52,8 @@ pub struct Motion {
 
 impl Motion {
     /// Returns the time of each row of joint positions \[s\], (T+1,). Row t of actions and rewards
-    /// covers the interval from time t to t+1. Times are in steps if the environment does not report
-    /// the duration of a step.
+    /// covers the interval from time t to t+1. Times are in steps if the environment does not
+    /// report the duration of a step.
     #[must_use]
     pub fn times(&self) -> Vec<f64> {
         let dt = self.robot.control_dt_s;
@@ -70,7 +70,7 @@ impl Motion {
 pub fn read(run: &RunDirectory) -> anyhow::Result<Option<Motion>> {
     let Some(row) = run.latest_row()? else { return Ok(None) };
     let settings = run.config()?.evaluation;
-    let Some(motion) = stored(run)? else { return Ok(None) };
+    let Some(motion) = read_any(run)? else { return Ok(None) };
     let is_current = motion.format == FORMAT
         && motion.policy_version == row.policy_version
         && motion.first_seed == settings.first_seed
@@ -78,12 +78,12 @@ pub fn read(run: &RunDirectory) -> anyhow::Result<Option<Motion>> {
     Ok(is_current.then_some(motion))
 }
 
-/// Reads the last measured motion, of any policy of the run; `None` if the file is missing or cannot
-/// be parsed.
+/// Reads the last measured motion, of any policy of the run; `None` if the file is missing or
+/// cannot be parsed.
 ///
 /// # Errors
 /// The file cannot be read.
-pub fn stored(run: &RunDirectory) -> anyhow::Result<Option<Motion>> {
+pub fn read_any(run: &RunDirectory) -> anyhow::Result<Option<Motion>> {
     let path = run.motion_path();
     let file = match File::open(&path) {
         Ok(file) => file,

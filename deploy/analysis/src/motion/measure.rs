@@ -5,7 +5,7 @@ use std::path::Path;
 use anyhow::Context;
 
 use super::file::{FORMAT, Motion};
-use super::recorded::{JointKind, Recorded, RecordedEpisode, Robot};
+use super::recorded::{JointKind, RecordedEpisode, RecordingReader, Robot};
 use super::smoothness::{Mean, add_action_changes, add_jerks, sparc};
 
 /// The policy of a recording.
@@ -25,7 +25,7 @@ pub struct RecordedPolicy {
 /// # Errors
 /// The file cannot be read, is invalid, or contains no episode.
 pub fn measure(path: &Path, policy: RecordedPolicy) -> anyhow::Result<Motion> {
-    let mut recorded = Recorded::open(path)?;
+    let mut recorded = RecordingReader::open(path)?;
     let mut first = None;
     let mut sums = Sums::new(&recorded.robot);
     while let Some(episode) = recorded.next_episode()? {

@@ -13,6 +13,6 @@ mod smoothness;
 #[cfg(test)]
 mod tests;
 
-pub use file::{Motion, read, stored};
+pub use file::{Motion, read, read_any};
 pub use measure::{RecordedPolicy, measure};
-pub use recorded::{Joint, JointKind, Recorded, RecordedEpisode, Robot};
+pub use recorded::{Joint, JointKind, RecordedEpisode, RecordingReader, Robot};

@@ -88,13 +88,13 @@ pub struct RecordedEpisode {
 
 /// Reads a recording one episode at a time.
 #[derive(Debug)]
-pub struct Recorded {
+pub struct RecordingReader {
     /// Description of the robot.
     pub robot: Robot,
     lines: Lines,
 }
 
-impl Recorded {
+impl RecordingReader {
     /// Opens a file that an observer wrote.
     ///
     /// # Errors

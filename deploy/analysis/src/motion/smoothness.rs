@@ -58,9 +58,9 @@ pub fn add_jerks(velocities: &[Vec<f64>], dt: f64, means: &mut [Mean]) {
 /// Returns the spectral arc length of a speed profile; `None` if nothing moves, or the profile is
 /// too short for a spectrum.
 ///
-/// It is about -1.6 for a smooth movement and lower for others (Balasubramanian et al. 2015, "On the
-/// analysis of movement smoothness", with the paper's parameters). Difference from the paper: the
-/// cutoff is at most half the sampling rate.
+/// It is about -1.6 for a smooth movement and lower for others (Balasubramanian et al. 2015, "On
+/// the analysis of movement smoothness", with the paper's parameters). Difference from the paper:
+/// the cutoff is at most half the sampling rate.
 ///
 /// - `speed`: (T,), not negative. `rate_hz`: samples per second.
 #[must_use]

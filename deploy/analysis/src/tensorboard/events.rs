@@ -7,8 +7,8 @@ use std::path::Path;
 
 use prost::Message;
 
-/// `SessionLog.SessionStatus` START: readers drop earlier events whose step is not less than that of
-/// this event.
+/// `SessionLog.SessionStatus` START: readers drop earlier events whose step is not less than that
+/// of this event.
 const START: i32 = 1;
 /// Constant that TFRecord adds to its checksums.
 const MASK: u32 = 0xa282_ead8;

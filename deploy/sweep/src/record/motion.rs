@@ -9,7 +9,8 @@ use dmprl_supervisor::{self as launch, ObservationPlan};
 use super::observer::Observer;
 
 /// Measures the run's latest policy over as many episodes as an evaluation has, and writes
-/// `motion.json`. Reads the file instead if it is up to date. Returns `None` if the user interrupts.
+/// `motion.json`. Reads the file instead if it is up to date. Returns `None` if the user
+/// interrupts.
 ///
 /// # Errors
 /// The run has no evaluation yet, the observer dies, or a file cannot be read or written.

@@ -3,7 +3,7 @@
 use std::path::PathBuf;
 
 use anyhow::{Context, ensure};
-use dmprl_analysis::motion::{Recorded, RecordedEpisode, Robot};
+use dmprl_analysis::motion::{RecordedEpisode, RecordingReader, Robot};
 use dmprl_run::failure::{Outcome, wrong_use};
 use dmprl_run::format::grouped;
 use dmprl_run::{ChosenPolicy, Progress, RunDirectory, safe_name};
@@ -158,7 +158,7 @@ fn observe(
     if launch::observe(observation, &on_steps)? == Outcome::Interrupted {
         return Ok(None);
     }
-    let mut recorded = Recorded::open(&output)?;
+    let mut recorded = RecordingReader::open(&output)?;
     let mut episodes = Vec::new();
     while let Some(episode) = recorded.next_episode()? {
         ensure!(!episode.frames.is_empty(), "the episode of seed {} has no frame", episode.seed);
