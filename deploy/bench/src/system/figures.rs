@@ -6,7 +6,7 @@ use dmprl_shared::config::{AlgorithmName, ExperimentConfig};
 use serde_json::{Value, json};
 
 use super::SystemBench;
-use super::steady::Window;
+use super::steady::SteadyWindow;
 use crate::statistics::load_average;
 
 /// The steady state of a run, with further figures.
@@ -14,13 +14,13 @@ use crate::statistics::load_average;
 pub struct Figures {
     config: ExperimentConfig,
     evaluate: bool,
-    window: Window,
+    window: SteadyWindow,
     machine: Machine,
     load_average: Option<f64>,
 }
 
 impl Figures {
-    pub(super) fn new(bench: &SystemBench, window: Window, machine: Machine) -> Self {
+    pub(super) fn new(bench: &SystemBench, window: SteadyWindow, machine: Machine) -> Self {
         let load_average = load_average();
         let (config, evaluate) = (bench.config.clone(), bench.evaluate);
         Self { config, evaluate, window, machine, load_average }
@@ -66,7 +66,7 @@ impl Figures {
     /// The figures as one JSON object; unavailable ones are null.
     #[must_use]
     pub fn json(&self) -> Value {
-        let Window { first, last, cpu, .. } = &self.window;
+        let SteadyWindow { first, last, cpu, .. } = &self.window;
         let ([learner, workers, others], actors) = (self.cores(), &self.config.actors);
         let [learner_utilisation, workers_utilisation] = self.utilisations();
         let pacing = self.updates_per_segment();

@@ -23,8 +23,8 @@ use dmprl_supervisor::WholeRun;
 pub use figures::Figures;
 #[cfg(test)]
 pub(super) use steady::CpuTime;
-use steady::Steady;
-pub(super) use steady::Window;
+use steady::MetricsMonitor;
+pub(super) use steady::SteadyWindow;
 
 /// More steps than any measurement reaches.
 const STEPS: u64 = 1_000_000_000_000;
@@ -52,8 +52,8 @@ pub struct SystemBench {
 pub fn system(bench: &SystemBench, progress: &dyn Progress) -> anyhow::Result<Option<Figures>> {
     let watch = Watch::start()?;
     progress.stage("starting the run");
-    let told = |what: &str| progress.stage(what);
-    match measure(bench, &watch, &told) {
+    let report = |what: &str| progress.stage(what);
+    match measure(bench, &watch, &report) {
         Err(error) if error.is::<Interrupted>() => Ok(None),
         result => {
             let machine = Manifest::new(None)?.machine;
@@ -62,19 +62,19 @@ pub fn system(bench: &SystemBench, progress: &dyn Progress) -> anyhow::Result<Op
     }
 }
 
-/// Starts a run and measures its steady state; `told` receives progress messages.
+/// Starts a run and measures its steady state; `report` receives progress messages.
 pub(super) fn measure(
     bench: &SystemBench,
     watch: &Watch,
-    told: &dyn Fn(&str),
-) -> anyhow::Result<Window> {
+    report: &dyn Fn(&str),
+) -> anyhow::Result<SteadyWindow> {
     let folder = tempfile::Builder::new().prefix("dmprl-bench-").tempdir();
     let folder = folder.context("cannot make a folder for the run")?;
     let log = folder.path().join("train.log");
     let mut train = WholeRun::start(command(bench, folder.path())?, &log)?;
     let metrics = folder.path().join("run/metrics.jsonl");
     let measured =
-        Steady::new(&metrics, train.pid()?, bench).until_measured(&mut train, watch, told);
+        MetricsMonitor::new(&metrics, train.pid()?, bench).until_measured(&mut train, watch, report);
     // In any case, stop the run as a user would, so that it leaves no process and no shared memory.
     let wrong = if train.end()?.is_none() { train.stop()? } else { None };
     let window = measured?;

@@ -20,7 +20,7 @@ const SILENCE: Duration = Duration::from_secs(300);
 /// Wait after the first update, until buffers, caches and clock frequency are as in a long run.
 const SETTLE_S: f64 = 1.0;
 /// Interval between checks of the file.
-const LOOK: Duration = Duration::from_millis(5);
+const POLL_INTERVAL: Duration = Duration::from_millis(5);
 
 /// Processor time so far [s].
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
@@ -58,7 +58,7 @@ impl CpuTime {
 
 /// Result of the measurement.
 #[derive(Debug, Clone)]
-pub(crate) struct Window {
+pub(crate) struct SteadyWindow {
     /// Line at the start of the measurement.
     pub(crate) first: MetricsLine,
     /// Line at the end of the measurement.
@@ -71,7 +71,7 @@ pub(crate) struct Window {
     pub(crate) seen_s: f64,
 }
 
-impl Window {
+impl SteadyWindow {
     /// Duration by the learner's clock [s].
     pub(crate) fn wall_s(&self) -> f64 {
         self.last.wall_s - self.first.wall_s
@@ -91,25 +91,25 @@ impl Window {
 }
 
 /// Follows the metrics of a run.
-pub(super) struct Steady {
+pub(super) struct MetricsMonitor {
     tail: Tail,
     supervisor: Pid,
     workers: u64,
     warm_up_steps: u64,
     duration_s: f64,
     settled_from: Option<f64>,
-    open: Option<Open>,
+    measuring: Option<Measuring>,
 }
 
 /// A measurement in progress.
-struct Open {
+struct Measuring {
     first: MetricsLine,
     lags: Vec<(u64, u64)>,
     cpu: CpuTime,
     seen: Instant,
 }
 
-impl Steady {
+impl MetricsMonitor {
     pub(super) fn new(metrics: &Path, supervisor: Pid, bench: &SystemBench) -> Self {
         Self {
             tail: Tail::new(metrics),
@@ -118,7 +118,7 @@ impl Steady {
             warm_up_steps: bench.config.exploration.warm_up_steps,
             duration_s: bench.duration.as_secs_f64(),
             settled_from: None,
-            open: None,
+            measuring: None,
         }
     }
 
@@ -126,54 +126,54 @@ impl Steady {
         mut self,
         train: &mut WholeRun,
         watch: &Watch,
-        told: &dyn Fn(&str),
-    ) -> anyhow::Result<Window> {
-        let mut heard = Instant::now();
+        report: &dyn Fn(&str),
+    ) -> anyhow::Result<SteadyWindow> {
+        let mut last_line = Instant::now();
         loop {
             watch.check()?;
             let look = self.tail.look()?;
             for line in look.lines.split(|&byte| byte == b'\n').filter(|line| !line.is_empty()) {
-                heard = Instant::now();
+                last_line = Instant::now();
                 let line = serde_json::from_slice(line).context("a damaged line of metrics")?;
-                if let Some(window) = self.take(line, told)? {
+                if let Some(window) = self.take(line, report)? {
                     return Ok(window);
                 }
             }
             if let Some(how) = train.end()? {
                 bail!("dmprl train exited unexpectedly: {how}");
             }
-            if heard.elapsed() >= SILENCE {
+            if last_line.elapsed() >= SILENCE {
                 bail!("the run wrote no metrics for {SILENCE:?}");
             }
-            thread::sleep(LOOK);
+            thread::sleep(POLL_INTERVAL);
         }
     }
 
     /// Processes a line; returns the window if it ends the measurement.
-    fn take(&mut self, line: MetricsLine, told: &dyn Fn(&str)) -> anyhow::Result<Option<Window>> {
-        let Some(open) = &mut self.open else {
+    fn take(&mut self, line: MetricsLine, report: &dyn Fn(&str)) -> anyhow::Result<Option<SteadyWindow>> {
+        let Some(measuring) = &mut self.measuring else {
             let learns = line.updates > 0 && line.env_steps > self.warm_up_steps;
             if learns && line.workers >= self.workers {
                 let from = *self.settled_from.get_or_insert_with(|| {
-                    told("the warm-up is over");
+                    report("the warm-up is over");
                     line.wall_s
                 });
                 if line.wall_s >= from + SETTLE_S {
-                    told(&format!("measuring for {} s", self.duration_s));
+                    report(&format!("measuring for {} s", self.duration_s));
                     let cpu = CpuTime::of(self.supervisor)?;
                     let seen = Instant::now();
-                    self.open = Some(Open { first: line, lags: Vec::new(), cpu, seen });
+                    self.measuring = Some(Measuring { first: line, lags: Vec::new(), cpu, seen });
                 }
             }
             return Ok(None);
         };
-        open.lags.extend(line.policy_lag_p50.zip(line.policy_lag_max));
-        if line.wall_s < open.first.wall_s + self.duration_s {
+        measuring.lags.extend(line.policy_lag_p50.zip(line.policy_lag_max));
+        if line.wall_s < measuring.first.wall_s + self.duration_s {
             return Ok(None);
         }
-        let cpu = CpuTime::of(self.supervisor)?.since(open.cpu);
-        let seen_s = open.seen.elapsed().as_secs_f64();
-        let (first, lags) = (open.first.clone(), std::mem::take(&mut open.lags));
-        Ok(Some(Window { first, last: line, lags, cpu, seen_s }))
+        let cpu = CpuTime::of(self.supervisor)?.since(measuring.cpu);
+        let seen_s = measuring.seen.elapsed().as_secs_f64();
+        let (first, lags) = (measuring.first.clone(), std::mem::take(&mut measuring.lags));
+        Ok(Some(SteadyWindow { first, last: line, lags, cpu, seen_s }))
     }
 }

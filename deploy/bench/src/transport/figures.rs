@@ -13,7 +13,7 @@ use crate::statistics::{load_average, max, median, min};
 use crate::synthetic_segments::{QUEUE_SEGMENTS, SIZES};
 
 /// Our transport, in the report.
-pub(super) const OURS: &str = "shared_memory";
+pub(super) const SHARED_MEMORY: &str = "shared_memory";
 
 /// Segments per second of each transport, by size and round, with further figures.
 #[derive(Debug, Clone)]
@@ -85,7 +85,7 @@ impl Figures {
     /// Our rate divided by that of `name`. It is the median of the rounds' own ratios, because a
     /// machine's speed drifts less within a round than over all of them.
     fn ratio(&self, bytes: usize, name: &str) -> Option<f64> {
-        let pairs = self.rates(bytes, OURS).iter().zip(self.rates(bytes, name));
+        let pairs = self.rates(bytes, SHARED_MEMORY).iter().zip(self.rates(bytes, name));
         median(&pairs.map(|(ours, other)| ours / other).collect::<Vec<_>>())
     }
 
@@ -117,7 +117,7 @@ impl Figures {
 
     fn size_json(&self, bytes: usize) -> Value {
         let Discrepancies { rejected, duplicate, lost, received } = self.discrepancies(bytes);
-        let rates = self.rates(bytes, OURS);
+        let rates = self.rates(bytes, SHARED_MEMORY);
         let shares = self.sink_shares.iter().filter(|(of, _)| *of == bytes);
         json!({
             "segment_bytes": bytes,
@@ -142,7 +142,7 @@ impl Figures {
     /// Formats the figures as a table, like [`Figures::json`].
     #[must_use]
     pub fn text(&self) -> String {
-        let rounds = self.rates(SIZES[0].bytes, OURS).len();
+        let rounds = self.rates(SIZES[0].bytes, SHARED_MEMORY).len();
         let mut lines = vec![
             format!(
                 "{} worker{} · level {} · queues of {QUEUE_SEGMENTS} segments · median of \
@@ -162,7 +162,7 @@ impl Figures {
                 "MB/s",
                 "from … to"
             ));
-            lines.push(self.row(size.bytes, OURS));
+            lines.push(self.row(size.bytes, SHARED_MEMORY));
             lines.extend(peers().map(|name| self.row(size.bytes, name)));
             let Discrepancies { rejected, duplicate, lost, received } =
                 self.discrepancies(size.bytes);
@@ -189,7 +189,7 @@ impl Figures {
         };
         let whole = |rate: f64| grouped(rate.round() as u64);
         let spread = format!("{} … {}", whole(min(rates)), whole(max(rates)));
-        let ratio = self.ratio(bytes, name).filter(|_| name != OURS);
+        let ratio = self.ratio(bytes, name).filter(|_| name != SHARED_MEMORY);
         let ratio = ratio.map_or_else(String::new, |ratio| format!("{ratio:.2} ×"));
         let mb_per_s = rate * bytes as f64 / 1e6;
         let rate = whole(rate);
@@ -225,9 +225,9 @@ mod tests {
         figures.note("zeromq", "again");
         // The machine becomes four times, then twice as slow during the measurement.
         for slow in [1.0, 4.0, 2.0] {
-            figures.add(1_024, OURS, 400_000.0 / slow);
+            figures.add(1_024, SHARED_MEMORY, 400_000.0 / slow);
             figures.add(1_024, "pipe", 100_000.0 / slow);
-            figures.add(10_240, OURS, 200_000.0 / slow);
+            figures.add(10_240, SHARED_MEMORY, 200_000.0 / slow);
         }
         figures
     }
@@ -261,7 +261,7 @@ mod tests {
             let line = text.lines().find(|line| line.trim_start().starts_with(name)).unwrap();
             line.split_whitespace().skip(1).collect::<Vec<_>>().join(" ")
         };
-        assert_eq!(row(OURS), "200,000 205 100,000 … 400,000");
+        assert_eq!(row(SHARED_MEMORY), "200,000 205 100,000 … 400,000");
         assert_eq!(row("pipe"), "50,000 51 25,000 … 100,000 4.00 ×");
         assert_eq!(row("zeromq"), "absent");
         assert!(text.contains("0 lost, 3 duplicate"), "{text}");

@@ -1,7 +1,7 @@
 //! `dmprl bench transport`: compares segments per second through shared memory and other channels.
 //!
 //! Processes of this program only send (`worker`, `synthetic_segments`). The receiver of `bench
-//! rollout` acts as the learner: it checks, settles and acknowledges (`ours`). The peers are pipes
+//! rollout` acts as the learner: it checks, settles and acknowledges (`shared_memory`). The peers are pipes
 //! and sockets between the same processes (`streams`) and queues between Python processes
 //! (`python`). In every round each runs once for the same time while the others sleep on a full
 //! channel; medians over the rounds count (`figures`). Finally the processor time of blocked
@@ -9,7 +9,7 @@
 
 mod figures;
 mod hosts;
-mod ours;
+mod shared_memory;
 mod python;
 mod streams;
 mod worker;
@@ -31,8 +31,8 @@ pub use hosts::{connect, listen};
 pub use worker::{TransportWorkerArgs, transport_worker};
 
 use super::synthetic_segments::{SIZES, Size};
-use figures::OURS;
-use ours::Ours;
+use figures::SHARED_MEMORY;
+use shared_memory::SharedMemory;
 use python::PythonPeer;
 use streams::{StreamKind, StreamPeer};
 
@@ -104,10 +104,10 @@ fn measure(bench: &TransportBench, progress: &dyn Progress) -> anyhow::Result<Fi
             command
         };
         let token = format!("{number}{token}");
-        let ours = Ours::start(size, (bench.workers, &token), &command, bench.level, place)?;
+        let shared_memory = SharedMemory::start(size, (bench.workers, &token), &command, bench.level, place)?;
         let start = |kind| StreamPeer::start(kind, size, command(), place);
         let streams = StreamKind::ALL.map(start).into_iter().collect::<anyhow::Result<Vec<_>>>()?;
-        sizes.push(Contest { ours, streams, pythons: Vec::new() });
+        sizes.push(Transports { shared_memory, streams, pythons: Vec::new() });
     }
     for kind in StreamKind::ALL {
         figures.note(kind.name(), kind.about());
@@ -115,34 +115,34 @@ fn measure(bench: &TransportBench, progress: &dyn Progress) -> anyhow::Result<Fi
     for (size, mut peer) in pythons {
         let ready = peer.ready(&watch)?;
         figures.note(peer.name, ready.as_ref().unwrap_or_else(|why| why));
-        let contest = sizes.iter_mut().find(|contest| contest.ours.size.bytes == size.bytes);
-        if let (Ok(_), Some(contest)) = (ready, contest) {
-            contest.pythons.push(peer);
+        let transports = sizes.iter_mut().find(|transports| transports.shared_memory.size.bytes == size.bytes);
+        if let (Ok(_), Some(transports)) = (ready, transports) {
+            transports.pythons.push(peer);
         }
     }
     for round in 0..bench.rounds {
         announce_round(progress, round, bench.rounds);
-        for contest in &mut sizes {
-            contest.round(&watch, bench.duration, progress, &mut figures)?;
+        for transports in &mut sizes {
+            transports.round(&watch, bench.duration, progress, &mut figures)?;
         }
     }
     progress.detail("blocked workers");
     figures.blocked_cpu_fraction = blocked(&sizes, &watch)?;
-    for contest in sizes {
-        let bytes = contest.ours.size.bytes;
-        figures.discrepancies.push((bytes, contest.ours.finish(&watch)?));
+    for transports in sizes {
+        let bytes = transports.shared_memory.size.bytes;
+        figures.discrepancies.push((bytes, transports.shared_memory.finish(&watch)?));
     }
     Ok(figures)
 }
 
 /// All transports of segments of one size.
-struct Contest {
-    ours: Ours,
+struct Transports {
+    shared_memory: SharedMemory,
     streams: Vec<StreamPeer>,
     pythons: Vec<PythonPeer>,
 }
 
-impl Contest {
+impl Transports {
     fn round(
         &mut self,
         watch: &Watch,
@@ -150,7 +150,7 @@ impl Contest {
         progress: &dyn Progress,
         figures: &mut Figures,
     ) -> anyhow::Result<()> {
-        let Size { bytes, .. } = self.ours.size;
+        let Size { bytes, .. } = self.shared_memory.size;
         for peer in &mut self.pythons {
             progress.detail(peer.name);
             figures.add(bytes, peer.name, peer.measure(watch, duration)?);
@@ -159,19 +159,19 @@ impl Contest {
             progress.detail(peer.kind.name());
             figures.add(bytes, peer.kind.name(), peer.measure(watch, duration)?);
         }
-        progress.detail(OURS);
-        let window = self.ours.measure(watch, duration)?;
-        figures.add(bytes, OURS, window.segments as f64 / window.seconds);
+        progress.detail(SHARED_MEMORY);
+        let window = self.shared_memory.measure(watch, duration)?;
+        figures.add(bytes, SHARED_MEMORY, window.segments as f64 / window.seconds);
         figures.add_sink_share(bytes, window.cpu_s / window.seconds);
         Ok(())
     }
 }
 
 /// Fraction of a core that the busiest worker uses while nothing takes its segments.
-fn blocked(sizes: &[Contest], watch: &Watch) -> anyhow::Result<Option<f64>> {
+fn blocked(sizes: &[Transports], watch: &Watch) -> anyhow::Result<Option<f64>> {
     wait(watch, BLOCKED_SETTLE)?;
     let cpu_s = || -> Option<Vec<f64>> {
-        let each: Option<Vec<_>> = sizes.iter().map(|contest| contest.ours.cpu_s()).collect();
+        let each: Option<Vec<_>> = sizes.iter().map(|transports| transports.shared_memory.cpu_s()).collect();
         each.map(|each| each.concat())
     };
     let (start, before) = (Instant::now(), cpu_s());

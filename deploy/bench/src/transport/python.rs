@@ -65,10 +65,10 @@ impl PythonPeer {
 
     /// Measures segments per second.
     pub(super) fn measure(&mut self, watch: &Watch, duration: Duration) -> anyhow::Result<f64> {
-        self.child.say(&format!("run {}", duration.as_secs_f64()))?;
-        let line = self.child.next(watch, duration + MEASURE_SLACK, "the measurement")?;
+        self.child.send_line(&format!("run {}", duration.as_secs_f64()))?;
+        let line = self.child.next_line(watch, duration + MEASURE_SLACK, "the measurement")?;
         let Ok(Measured { segments, seconds }) = serde_json::from_str(&line) else {
-            return Err(self.child.no_answer(&line));
+            return Err(self.child.unexpected_line(&line));
         };
         ensure!(seconds > 0.0, "{}: {segments} segments in {seconds} s", self.name);
         Ok(segments as f64 / seconds)

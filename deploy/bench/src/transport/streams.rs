@@ -92,7 +92,7 @@ impl StreamPeer {
                 command.args(["--pipe", &path]);
                 let mut child = LineChild::start(name, command, &log_path)?;
                 // Close our end once the child has its own, so that its death ends the stream.
-                child.next(watch, CONNECT, "the connection")?;
+                child.next_line(watch, CONNECT, "the connection")?;
                 drop(writer);
                 (Box::new(reader), child)
             }
@@ -102,7 +102,7 @@ impl StreamPeer {
                     .with_context(|| format!("cannot listen at {}", path.display()))?;
                 command.arg("--socket").arg(&path);
                 let mut child = LineChild::start(name, command, &log_path)?;
-                child.next(watch, CONNECT, "the connection")?;
+                child.next_line(watch, CONNECT, "the connection")?;
                 (Box::new(listener.accept().context("cannot accept a connection")?.0), child)
             }
         };
@@ -110,9 +110,9 @@ impl StreamPeer {
         let (answers, rates) = mpsc::channel();
         // It exits when the stream ends with the child's death, or when this peer is dropped.
         thread::spawn(move || {
-            let mut taker = Taker::new(stream, size);
+            let mut reader = FrameReader::new(stream, size);
             for duration in asked {
-                let rate = taker.measure(duration);
+                let rate = reader.measure(duration);
                 if answers.send(rate).is_err() {
                     return;
                 }
@@ -129,19 +129,19 @@ impl StreamPeer {
         let rate = watch.next(&self.rates, duration + MEASURE_SLACK, &what)?;
         match rate.ok_or_else(|| anyhow!("the reader of {} has ended", self.child.name()))? {
             Ok(rate) => Ok(rate),
-            Err(error) => Err(error.context(self.child.last_word())),
+            Err(error) => Err(error.context(self.child.exit_summary())),
         }
     }
 }
 
-struct Taker {
+struct FrameReader {
     stream: BufReader<Box<dyn Read + Send>>,
     expected: Expected,
     inbox: Inbox,
     segment: Segment,
 }
 
-impl Taker {
+impl FrameReader {
     fn new(stream: Box<dyn Read + Send>, size: Size) -> Self {
         Self {
             stream: BufReader::with_capacity(BUFFER_BYTES, stream),

@@ -15,7 +15,7 @@ use dmprl_supervisor::create_domain;
 
 use crate::child::LineChild;
 use crate::drain_receiver::{
-    Answer, Discrepancies, DrainReceiver, From, Request, Window, show_warning,
+    Answer, Discrepancies, DrainReceiver, Source, Request, DrainWindow, show_warning,
 };
 use crate::synthetic_segments::Size;
 
@@ -36,7 +36,7 @@ const DRAIN_MAX: Duration = Duration::from_secs(10);
 const LOG_BYTES_MAX: u64 = 256 << 20;
 
 /// Running workers of one size, whose queues are full between two measurements.
-pub(super) struct Ours {
+pub(super) struct SharedMemory {
     pub(super) size: Size,
     children: Vec<LineChild>,
     receiver: DrainReceiver,
@@ -45,7 +45,7 @@ pub(super) struct Ours {
     _domain: Domain,
 }
 
-impl Ours {
+impl SharedMemory {
     /// Starts the workers; `command` is a `transport-worker` of this size without its route.
     pub(super) fn start(
         size: Size,
@@ -78,14 +78,14 @@ impl Ours {
             children.push(LineChild::start(name, command, &path)?);
         }
         let discrepancies = Discrepancies::default();
-        let mut ours = Self { size, children, receiver, discrepancies, _domain: domain };
+        let mut workers_end = Self { size, children, receiver, discrepancies, _domain: domain };
         ours.ask(Request::FirstOfEach, watch, START)?;
         Ok(ours)
     }
 
     /// Measures what all workers together deliver during `duration`.
-    pub(super) fn measure(&mut self, watch: &Watch, duration: Duration) -> anyhow::Result<Window> {
-        let request = Request::Measure(duration, From::All);
+    pub(super) fn measure(&mut self, watch: &Watch, duration: Duration) -> anyhow::Result<DrainWindow> {
+        let request = Request::Measure(duration, Source::All);
         match self.ask(request, watch, duration + MEASURE_SLACK)? {
             Answer::Measured(window) => Ok(window),
             Answer::FirstOfEach(_) => bail!("the receiver answered another question"),
@@ -102,14 +102,14 @@ impl Ours {
     pub(super) fn finish(mut self, watch: &Watch) -> anyhow::Result<Discrepancies> {
         let mut sent = 0;
         for child in &mut self.children {
-            child.say("\"stop\"")?;
+            child.send_line("\"stop\"")?;
             sent += last_report(child, watch)?.sent;
         }
         // The workers have exited as requested; do not treat this as a death.
         self.children.clear();
         let began = Instant::now();
         loop {
-            self.ask(Request::Measure(DRAIN, From::All), watch, DRAIN + MEASURE_SLACK)?;
+            self.ask(Request::Measure(DRAIN, Source::All), watch, DRAIN + MEASURE_SLACK)?;
             if self.discrepancies.received >= sent || began.elapsed() >= DRAIN_MAX {
                 break;
             }
@@ -133,7 +133,7 @@ fn last_report(child: &mut LineChild, watch: &Watch) -> anyhow::Result<Sent> {
     let deadline = Instant::now() + STOP;
     loop {
         let left = deadline.saturating_duration_since(Instant::now());
-        let line = child.next(watch, left, "the last report")?;
+        let line = child.next_line(watch, left, "the last report")?;
         match serde_json::from_str(&line) {
             Ok(Report::Sent(sent)) => return Ok(sent),
             Ok(_) => show_warning(child.name(), &line),

@@ -19,11 +19,11 @@ use dmprl_shared::transport::delivery::{Acknowledgements, Outbox};
 use dmprl_shared::transport::shared_memory::{Plan, attach};
 use serde_json::{Value, json};
 
-use super::{IDLE, INTERVAL, KEPT, PATIENCE, TOKEN, UNDER_WAY_BYTES_MAX, domain, plan};
+use super::{IDLE_SLEEP, INTERVAL, RETAINED_SEGMENTS_MAX, CONNECT_TIMEOUT, TOKEN, IN_FLIGHT_BYTES_MAX, domain, plan};
 use crate::synthetic_segments::SyntheticSegments;
 
 /// Segments generated between two checks for acknowledgements.
-const TOGETHER: usize = 32;
+const BATCH_SEGMENTS: usize = 32;
 
 /// Sends synthetic segments to the listener at the endpoint until it has enough; returns `None` if
 /// interrupted. `rate` is the total rate of all workers \[segments/s\]; `None` for the maximum.
@@ -52,8 +52,8 @@ pub fn connect(
         zenoh_file,
         domain: domain.path(),
         plan: &plan,
-        segments_max: KEPT,
-        in_flight_bytes_max: UNDER_WAY_BYTES_MAX,
+        segments_max: RETAINED_SEGMENTS_MAX,
+        in_flight_bytes_max: IN_FLIGHT_BYTES_MAX,
     })?;
     let over = Arc::new(AtomicBool::new(false));
     let each = rate.map(|rate| f64::from(rate) / f64::from(workers));
@@ -66,13 +66,13 @@ pub fn connect(
     let interrupted = loop {
         match relay.turn(&HostCounts::default())? {
             Turn::Complete => break false,
-            Turn::Idle => thread::sleep(IDLE),
+            Turn::Idle => thread::sleep(IDLE_SLEEP),
             Turn::Worked => {}
         }
         if watch.check().is_err() || threads.iter().any(JoinHandle::is_finished) {
             break true;
         }
-        if relay.away().is_some_and(|(since, _)| since.elapsed() >= PATIENCE) {
+        if relay.away().is_some_and(|(since, _)| since.elapsed() >= CONNECT_TIMEOUT) {
             bail!("{endpoint} no longer answers");
         }
     };
@@ -98,7 +98,7 @@ fn welcomed(
         match request_join(&link, join, None)? {
             JoinOutcome::Welcome(welcome) => return Ok(Some(welcome.lease)),
             JoinOutcome::Refused(why) => bail!("{endpoint} refuses: {why}"),
-            JoinOutcome::Later(why) if began.elapsed() >= PATIENCE => bail!("{why}"),
+            JoinOutcome::Later(why) if began.elapsed() >= CONNECT_TIMEOUT => bail!("{why}"),
             JoinOutcome::Later(_) if watch.check().is_err() => return Ok(None),
             JoinOutcome::Later(_) => thread::sleep(INTERVAL),
         }
@@ -115,11 +115,11 @@ fn work(
     let mut end = loop {
         match attach(domain, plan, index as usize) {
             Ok(end) => break end,
-            Err(error) if began.elapsed() >= PATIENCE => return Err(error.into()),
+            Err(error) if began.elapsed() >= CONNECT_TIMEOUT => return Err(error.into()),
             Err(_) => thread::sleep(INTERVAL),
         }
     };
-    let mut outbox = Outbox::new(plan.layout, KEPT, index, 0);
+    let mut outbox = Outbox::new(plan.layout, RETAINED_SEGMENTS_MAX, index, 0);
     let mut synthetic_segments = SyntheticSegments::new(plan.layout, index);
     let mut heard = Acknowledgements::default();
     let (began, mut made) = (Instant::now(), 0_usize);
@@ -128,13 +128,13 @@ fn work(
             outbox.acknowledge(&heard);
         }
         let room = outbox.capacity() - outbox.len();
-        let due = rate.map_or(TOGETHER, |rate| {
+        let due = rate.map_or(BATCH_SEGMENTS, |rate| {
             let due = (began.elapsed().as_secs_f64() * rate) as usize;
             // Segments that could not be sent in time are skipped: a robot cannot catch up either.
-            made = made.max(due.saturating_sub(TOGETHER));
+            made = made.max(due.saturating_sub(BATCH_SEGMENTS));
             due - made
         });
-        let together = if outbox.unsent() == 0 { room.min(TOGETHER).min(due) } else { 0 };
+        let together = if outbox.unsent() == 0 { room.min(BATCH_SEGMENTS).min(due) } else { 0 };
         made += together;
         for _ in 0..together {
             let Segment { header, block } = synthetic_segments.next();
@@ -142,7 +142,7 @@ fn work(
         }
         outbox.offer(&mut end.segments)?;
         if outbox.unsent() > 0 || together == 0 {
-            thread::sleep(IDLE);
+            thread::sleep(IDLE_SLEEP);
         }
     }
     Ok(())
