@@ -99,14 +99,8 @@ fn start_peers(
     figures: &mut Figures,
 ) -> anyhow::Result<Vec<Peer>> {
     let Workers { spec, policy, parameters, .. } = workers;
-    let plan = NumpyPlan::write(
-        run.path(),
-        &bench.config,
-        spec,
-        bench.controls,
-        policy,
-        parameters,
-    )?;
+    let plan =
+        NumpyPlan::write(run.path(), &bench.config, spec, bench.controls, policy, parameters)?;
     let package_path = bench.package_path.clone();
     let setup = PeerSetup { run, package_path, plan, workers: bench.config.actors.workers };
     let own_python = bench.venv.join("bin/python");

@@ -22,7 +22,7 @@ use tempfile::TempDir;
 
 use super::child::LineChild;
 use super::drain_receiver::{
-    Answer, Discrepancies, DrainReceiver, Source, Request, DrainWindow, show_warning,
+    Answer, Discrepancies, DrainReceiver, DrainWindow, Request, Source, show_warning,
 };
 use super::round::Round;
 

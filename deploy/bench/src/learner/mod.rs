@@ -31,15 +31,15 @@ use crate::announce_round;
 
 pub use figures::Figures;
 pub(super) use figures::Timed;
+pub(super) use parts::timed;
 pub use peers::PeerKind;
 pub(super) use synthetic::fill;
-pub(super) use parts::timed;
 
 use figures::{KERNELS, LIBRARY, OPTIMISER, OURS, SAMPLE};
 use floor::Engine;
+use parts::{FloorWork, OptimiserWork, SampleWork};
 use peers::Peer;
 use products::Cycle;
-use parts::{FloorWork, OptimiserWork, SampleWork};
 
 /// Settings of the benchmark.
 pub struct LearnerBench {

@@ -112,7 +112,10 @@ fn unsupported(config: &ExperimentConfig) -> Option<&'static str> {
     let algorithm = &config.algorithm;
     let differences = [
         (algorithm.critic_layer_norm, "tests/peers has no layer normalisation"),
-        (algorithm.td3.actor_interval != 2, "tests/peers updates TD3's actor at every second update"),
+        (
+            algorithm.td3.actor_interval != 2,
+            "tests/peers updates TD3's actor at every second update",
+        ),
         (config.policy.rho == RhoKind::Free, "tests/peers has only a bounded rho"),
         (algorithm.action_rate_penalty > 0.0, "tests/peers has no action rate penalty"),
     ];

@@ -98,7 +98,9 @@ impl Cycle {
             AlgorithmName::Ddpg => {
                 one_update([networks.critics_step(1), networks.actor_step(1)].concat())
             }
-            AlgorithmName::Sac => one_update([networks.critics_step(2), networks.actor_step(2)].concat()),
+            AlgorithmName::Sac => {
+                one_update([networks.critics_step(2), networks.actor_step(2)].concat())
+            }
             AlgorithmName::Td3 => {
                 let updates = config.td3.actor_interval;
                 let critics = networks.critics_step(2).repeat(updates as usize);

@@ -23,10 +23,7 @@ impl Figures {
             .to_lowercase(),
             format!("median of {} rounds of {} s", self.rounds_len(), self.seconds),
             String::new(),
-            format!(
-                "  {:<15} {:>9} {:>9}   {:<19} ours",
-                "", "ms/update", "CPU ms", "from … to"
-            ),
+            format!("  {:<15} {:>9} {:>9}   {:<19} ours", "", "ms/update", "CPU ms", "from … to"),
         ];
         let rows = [(OURS, "ours"), (KERNELS, "floor, ours"), (LIBRARY, "floor, library")];
         lines.extend(rows.iter().map(|(name, label)| self.row(name, label)));

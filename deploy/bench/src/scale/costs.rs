@@ -127,8 +127,9 @@ impl SegmentPool {
     fn new(learner: &Learner, workers: usize) -> Self {
         let (layout, hash) = (learner.policy().layout(), learner.policy().architecture_hash());
         let per_worker = POOL_SEGMENTS.div_ceil(workers);
-        let mut synthetic_segments: Vec<_> =
-            (0..workers).map(|worker| SyntheticSegments::with_hash(layout, worker as u32, hash)).collect();
+        let mut synthetic_segments: Vec<_> = (0..workers)
+            .map(|worker| SyntheticSegments::with_hash(layout, worker as u32, hash))
+            .collect();
         let rounds = (0..per_worker).flat_map(|_| {
             synthetic_segments.iter_mut().map(|it| it.next().clone()).collect::<Vec<_>>()
         });

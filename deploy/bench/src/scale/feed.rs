@@ -155,7 +155,10 @@ impl Feed {
             all && learner.replay.len() == learner.replay.capacity()
         };
         let full = feed.run_until(watch, START_TIMEOUT, is_full)?;
-        ensure!(full, "not every worker delivered, or the replay was not full, within {START_TIMEOUT:?}");
+        ensure!(
+            full,
+            "not every worker delivered, or the replay was not full, within {START_TIMEOUT:?}"
+        );
         feed.run_for(watch, SETTLE)?;
         Ok(feed)
     }
@@ -176,10 +179,14 @@ impl Feed {
         let end = Instant::now() + duration / 2;
         let done =
             |learner: &Learner| learner.counters.received > received && Instant::now() >= end;
-        ensure!(self.run_until(watch, duration + SLACK, done)?, "no segment arrived within {SLACK:?}");
+        ensure!(
+            self.run_until(watch, duration + SLACK, done)?,
+            "no segment arrived within {SLACK:?}"
+        );
         let (seconds, cpu_s) = (start.elapsed().as_secs_f64(), thread_cpu_s() - cpu_s);
         let increase = |(now, before): (&Watermark, &Watermark)| now.sequence - before.sequence;
-        let segments = self.session.learner.inbox.settled().iter().zip(&before).map(increase).collect();
+        let segments =
+            self.session.learner.inbox.settled().iter().zip(&before).map(increase).collect();
         let resident_bytes = [start_bytes, middle_bytes, resident_bytes()];
         Ok(FeedWindow { seconds, segments, cpu_s, resident_bytes })
     }

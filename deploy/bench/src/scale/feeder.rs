@@ -103,7 +103,8 @@ impl SegmentFeederArgs {
         ];
         let mut arguments = vec!["segment-feeder".to_owned()];
         arguments.extend(["--architecture-hash".to_owned(), plan.architecture_hash.to_string()]);
-        arguments.extend(numbers.into_iter().flat_map(|(flag, it)| [flag.to_owned(), it.to_string()]));
+        arguments
+            .extend(numbers.into_iter().flat_map(|(flag, it)| [flag.to_owned(), it.to_string()]));
         arguments
     }
 }
@@ -122,7 +123,11 @@ pub fn segment_feeder(args: &SegmentFeederArgs) -> anyhow::Result<()> {
         workers.push(Worker {
             end,
             outbox: Outbox::new(plan.layout, args.outbox_segments, index, 0),
-            synthetic_segments: SyntheticSegments::with_hash(plan.layout, index, plan.architecture_hash),
+            synthetic_segments: SyntheticSegments::with_hash(
+                plan.layout,
+                index,
+                plan.architecture_hash,
+            ),
             acknowledgements: Acknowledgements::default(),
         });
     }

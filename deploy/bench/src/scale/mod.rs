@@ -29,7 +29,7 @@ use dmprl_shared::spec::EnvSpec;
 
 use super::drain_receiver::Discrepancies;
 use super::synthetic_segments::Size;
-use super::system::{self, SystemBench, SteadyWindow};
+use super::system::{self, SteadyWindow, SystemBench};
 
 pub use feeder::{SegmentFeederArgs, segment_feeder};
 pub use figures::Figures;
@@ -96,7 +96,8 @@ fn measure(bench: &ScaleBench, progress: &dyn Progress) -> anyhow::Result<Figure
         link_bytes_per_s: bench.link_bytes_per_s,
     };
     let model = Model { costs: costs_for_model, demand, topology };
-    let this_machine = Model { topology: Topology::OneMachine { cores: bench.cores as f64 }, ..model };
+    let this_machine =
+        Model { topology: Topology::OneMachine { cores: bench.cores as f64 }, ..model };
     let mut checks = Vec::new();
     for workers in 1..=bench.check_workers {
         progress.stage(&format!("real system with {workers} workers"));

@@ -14,21 +14,21 @@ use rustix::process::Pid;
 
 use super::SystemBench;
 
-/// Time without a new line after which the run counts as stuck. A start includes importing Python
+/// Time without a new line after which the run counts as stuck. Start-up includes importing Python
 /// packages.
 const SILENCE: Duration = Duration::from_secs(300);
-/// Wait after the first update, until buffers, caches and clock frequency are as in a long run.
+/// Time after the warm-up for buffers, caches and clock frequency to reach a steady state.
 const SETTLE_S: f64 = 1.0;
-/// Interval between checks of the file.
+/// Interval between checks for new lines.
 const POLL_INTERVAL: Duration = Duration::from_millis(5);
 
 /// Processor time so far [s].
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
 pub(crate) struct CpuTime {
     pub(crate) learner_s: f64,
-    /// Of all workers together.
+    /// All workers together.
     pub(crate) workers_s: f64,
-    /// Of supervisor and evaluator.
+    /// Supervisor and evaluator.
     pub(crate) others_s: f64,
 }
 
@@ -36,7 +36,7 @@ impl CpuTime {
     fn of(supervisor: Pid) -> anyhow::Result<Self> {
         let mut time = Self { others_s: cpu_s(supervisor).unwrap_or(0.0), ..Self::default() };
         for member in members(supervisor)? {
-            // A process that has just exited has none.
+            // `None` if the process has just exited.
             let seconds = cpu_s(member.pid()).unwrap_or(0.0);
             match member.role {
                 Role::Learner(_) => time.learner_s += seconds,
@@ -56,18 +56,18 @@ impl CpuTime {
     }
 }
 
-/// Result of the measurement.
+/// The steady state of a run, between two lines of its metrics.
 #[derive(Debug, Clone)]
 pub(crate) struct SteadyWindow {
     /// Line at the start of the measurement.
     pub(crate) first: MetricsLine,
     /// Line at the end of the measurement.
     pub(crate) last: MetricsLine,
-    /// Median and maximum of the policy lag, for each line in between.
+    /// Median and maximum of the policy lag, for each line after the first.
     pub(crate) lags: Vec<(u64, u64)>,
-    /// Processor time between the moments at which the two lines were read.
+    /// Processor time between the readings of the two lines.
     pub(crate) cpu: CpuTime,
-    /// Time between these moments [s].
+    /// Time between these readings [s].
     pub(crate) seen_s: f64,
 }
 
@@ -77,12 +77,12 @@ impl SteadyWindow {
         self.last.wall_s - self.first.wall_s
     }
 
-    /// Increase of a counter per second.
+    /// Returns the increase of a counter per second.
     pub(crate) fn per_s(&self, count: impl Fn(&MetricsLine) -> u64) -> f64 {
         count(&self.last).saturating_sub(count(&self.first)) as f64 / self.wall_s()
     }
 
-    /// Samples drawn per environment step inserted.
+    /// Returns the number of samples drawn per environment step inserted.
     pub(crate) fn samples_per_insert(&self) -> f64 {
         let samples = |line: &MetricsLine| line.samples_per_insert * line.env_steps as f64;
         let steps = self.last.env_steps.saturating_sub(self.first.env_steps).max(1);
@@ -122,6 +122,7 @@ impl MetricsMonitor {
         }
     }
 
+    /// Waits for the end of the measurement, and returns its result.
     pub(super) fn until_measured(
         mut self,
         train: &mut WholeRun,
@@ -134,8 +135,8 @@ impl MetricsMonitor {
             let look = self.tail.look()?;
             for line in look.lines.split(|&byte| byte == b'\n').filter(|line| !line.is_empty()) {
                 last_line = Instant::now();
-                let line = serde_json::from_slice(line).context("a damaged line of metrics")?;
-                if let Some(window) = self.take(line, report)? {
+                let line = serde_json::from_slice(line).context("invalid line of metrics")?;
+                if let Some(window) = self.process(line, report)? {
                     return Ok(window);
                 }
             }
@@ -149,8 +150,12 @@ impl MetricsMonitor {
         }
     }
 
-    /// Processes a line; returns the window if it ends the measurement.
-    fn take(&mut self, line: MetricsLine, report: &dyn Fn(&str)) -> anyhow::Result<Option<SteadyWindow>> {
+    /// Processes a line. Returns the result if the line ends the measurement.
+    fn process(
+        &mut self,
+        line: MetricsLine,
+        report: &dyn Fn(&str),
+    ) -> anyhow::Result<Option<SteadyWindow>> {
         let Some(measuring) = &mut self.measuring else {
             let learns = line.updates > 0 && line.env_steps > self.warm_up_steps;
             if learns && line.workers >= self.workers {

@@ -1,4 +1,4 @@
-//! The learner's end of the benchmark between hosts.
+//! The learner's side of the benchmark between hosts.
 
 use std::collections::VecDeque;
 use std::path::Path;
@@ -20,21 +20,24 @@ use dmprl_shared::transport::{AcknowledgementPublisher, ParameterPublisher, Segm
 use serde_json::{Value, json};
 use tracing::info;
 
-use super::{IDLE_SLEEP, INTERVAL, RETAINED_SEGMENTS_MAX, PARAMETERS, CONNECT_TIMEOUT, TOKEN, domain, plan};
+use super::{
+    CONNECT_TIMEOUT, IDLE_SLEEP, INTERVAL, PARAMETERS, RETAINED_SEGMENTS_MAX, TOKEN, domain, plan,
+};
 use crate::statistics::{max, median};
 use crate::synthetic_segments::SIZE_BETWEEN_HOSTS;
 
 const WORKERS_MAX: usize = 64;
 const PUBLISH_INTERVAL: Duration = Duration::from_millis(300);
-/// Time from the first segment until the clock starts, in which the window grows.
+/// Time from the first segment to the start of the measurement, in which the sender's window grows.
 const SETTLE: Duration = Duration::from_secs(3);
-/// Number of times that the end is announced, because a message can be lost on a full link.
+/// Number of messages that announce the end, because a full link can lose some.
 const END_MESSAGES: u32 = 10;
 
-/// Acts as the learner for `duration`, at a Zenoh endpoint; returns `None` if interrupted.
+/// Receives segments at a Zenoh endpoint for `duration`, and returns the figures. Returns `None` if
+/// the user interrupted it.
 ///
 /// # Errors
-/// The endpoint is in use, no host connects, or an end fails.
+/// The endpoint is in use, no host connects, or the transport fails.
 pub fn listen(
     endpoint: &str,
     zenoh_file: Option<&Path>,
@@ -44,15 +47,15 @@ pub fn listen(
     let domain = domain()?;
     let mut ingest = Ingest::new(serve(domain.path(), &plan(WORKERS_MAX))?);
     let policies = Arc::new(Policies::default());
-    let gateway = start_gateway(&policies, (endpoint, zenoh_file), domain.path());
-    let began = Instant::now();
-    let ended = loop {
+    let gateway = start_gateway(&policies, endpoint, zenoh_file, domain.path());
+    let start = Instant::now();
+    let measured_s = loop {
         if watch.check().is_err() {
             break None;
         }
         ingest.turn(&policies)?;
         if policies.has_confirmed() {
-            // A host without workers only receives policies.
+            // A host without workers sends no segments.
             ingest.first_segment.get_or_insert_with(Instant::now);
         }
         if gateway.is_finished() {
@@ -62,13 +65,13 @@ pub fn listen(
             Some(first) if first.elapsed() >= SETTLE + duration => {
                 break Some((first.elapsed() - SETTLE).as_secs_f64());
             }
-            None if began.elapsed() >= CONNECT_TIMEOUT => bail!("no host connected to {endpoint}"),
+            None if start.elapsed() >= CONNECT_TIMEOUT => bail!("no host connected to {endpoint}"),
             _ => {}
         }
     };
-    policies.over.store(true, Ordering::Release);
+    policies.stop.store(true, Ordering::Release);
     gateway.join().map_err(|_| anyhow!("the gateway has panicked"))??;
-    let Some(seconds) = ended else { return Ok(None) };
+    let Some(seconds) = measured_s else { return Ok(None) };
     let latencies_ms = policies.latencies_ms.lock().unwrap_or_else(PoisonError::into_inner).clone();
     Ok(Some(json!({
         "segment_bytes": SIZE_BETWEEN_HOSTS.bytes,
@@ -84,13 +87,14 @@ pub fn listen(
     })))
 }
 
-/// Policies in flight, and their latencies.
+/// The policies in flight and their latencies, shared with the gateway's thread.
 #[derive(Default)]
 struct Policies {
-    over: AtomicBool,
-    /// Version and time of each policy that no host has confirmed.
+    /// Stops the gateway's thread.
+    stop: AtomicBool,
+    /// Version and publication time of each policy that no host has confirmed.
     unconfirmed: Mutex<VecDeque<(u64, Instant)>>,
-    /// Time from publishing to the other host's confirmation, including the way back \[ms\].
+    /// Time from publication to the receipt of the other host's confirmation \[ms\].
     latencies_ms: Mutex<Vec<f64>>,
 }
 
@@ -104,18 +108,19 @@ impl Policies {
         !self.latencies_ms.lock().unwrap_or_else(PoisonError::into_inner).is_empty()
     }
 
-    /// Records a confirmation. It also covers earlier versions, which were replaced on the way.
+    /// Records a confirmation, which also covers earlier versions: newer policies replace them.
     fn confirm(&self, version: u64) {
         let mut unconfirmed = self.unconfirmed.lock().unwrap_or_else(PoisonError::into_inner);
-        let arrived = unconfirmed.iter().take_while(|(first, _)| *first <= version).count();
-        if let Some((_, since)) = unconfirmed.drain(..arrived).next_back() {
+        let confirmed =
+            unconfirmed.iter().take_while(|(published, _)| *published <= version).count();
+        if let Some((_, since)) = unconfirmed.drain(..confirmed).next_back() {
             let latency_ms = since.elapsed().as_secs_f64() * 1e3;
             self.latencies_ms.lock().unwrap_or_else(PoisonError::into_inner).push(latency_ms);
         }
     }
 }
 
-/// Takes, checks, settles and acknowledges segments, and publishes policies.
+/// Receives, checks, settles and acknowledges segments, and publishes policies.
 struct Ingest {
     end: LearnerEnd,
     inbox: Inbox,
@@ -196,7 +201,8 @@ impl Ingest {
 
 fn start_gateway(
     policies: &Arc<Policies>,
-    (endpoint, zenoh_file): (&str, Option<&Path>),
+    endpoint: &str,
+    zenoh_file: Option<&Path>,
     domain: &Path,
 ) -> JoinHandle<anyhow::Result<()>> {
     let policies = Arc::clone(policies);
@@ -220,7 +226,7 @@ fn start_gateway(
             segments_max: RETAINED_SEGMENTS_MAX,
         };
         let mut gateway = Gateway::open(settings, facts)?;
-        while !policies.over.load(Ordering::Acquire) {
+        while !policies.stop.load(Ordering::Acquire) {
             if !gateway.turn()? {
                 thread::sleep(IDLE_SLEEP);
             }
