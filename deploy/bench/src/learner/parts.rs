@@ -15,8 +15,8 @@ use super::floor::{Engine, Floor};
 use super::optimiser::OptimiserSteps;
 use super::products::{Cycle, Product};
 
-/// The warm-up takes 1 / `WARM_UP_DIVISOR` of the measurement's duration. It brings caches and clock
-/// frequency to the state of a long run.
+/// The warm-up takes 1 / `WARM_UP_DIVISOR` of the measurement's duration. It brings caches and
+/// clock frequency to the state of a long run.
 const WARM_UP_DIVISOR: u32 = 8;
 
 /// Calls `work` repeatedly for `duration`, after a warm-up, and returns the mean time of a call.

@@ -13,8 +13,8 @@
 //!
 //! Assumptions, checked against a real system on one machine only:
 //! - Costs are constant: a worker's is independent of the number of workers, the learner's of the
-//!   number of queues (it is measured with many), and an update's of other load. All cores are equal
-//!   and otherwise idle.
+//!   number of queues (it is measured with many), and an update's of other load. All cores are
+//!   equal and otherwise idle.
 //! - Queues are long enough that only the bottleneck makes the other parts wait.
 //! - Each worker host has `cores_per_host` workers. The learner has its own host, with a core for
 //!   each of its threads.

@@ -43,7 +43,8 @@ impl Figures {
             String::new(),
             format!("  segments/s       {:>11}", whole(simulated.segments_per_s())),
             format!(
-                "  learner's thread {:>11.2} cores, {:.2} µs per segment, {:.2} µs without transport",
+                "  learner's thread {:>11.2} cores, {:.2} µs per segment, {:.2} µs without \
+                 transport",
                 simulated.learner_cores(),
                 1e6 * simulated.cpu_s(),
                 1e6 * simulated.insert_s

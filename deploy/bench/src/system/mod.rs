@@ -27,8 +27,8 @@ pub(super) use steady::SteadyWindow;
 
 /// More steps than any measurement reaches.
 const STEPS: u64 = 1_000_000_000_000;
-/// Maximum number of environment steps between two lines of metrics. The measurement starts and ends
-/// at a line.
+/// Maximum number of environment steps between two lines of metrics. The measurement starts and
+/// ends at a line.
 const METRICS_STEPS_MAX: u64 = 500;
 
 /// Settings of the benchmark.

@@ -176,7 +176,8 @@ impl Transports {
     }
 }
 
-/// Measures the fraction of a core that the busiest worker uses while its queue and outbox are full.
+/// Measures the fraction of a core that the busiest worker uses while its queue and outbox are
+/// full.
 fn blocked(sizes: &[Transports], watch: &Watch) -> anyhow::Result<Option<f64>> {
     wait(watch, BLOCKED_SETTLE)?;
     let cpu_s = || -> Option<Vec<f64>> {

@@ -169,7 +169,7 @@ impl FrameReader {
         Ok(segments as f64 / start.elapsed().as_secs_f64())
     }
 
-    /// Reads a segment and checks it. A gap in the sequence is an error, because streams lose nothing.
+    /// Reads a segment and checks it. A gap in the sequence is an error: streams lose nothing.
     fn read_segment(&mut self) -> anyhow::Result<()> {
         let Self { stream, expected, inbox, segment } = self;
         let Segment { header, block } = segment;
