@@ -55,7 +55,7 @@ struct Successor {
     deaths: u64,
     /// Time at which the successor was first seen.
     seen_us: Option<u64>,
-    /// Time at which the fault is skipped.
+    /// Time after which the fault is skipped.
     deadline_us: u64,
 }
 
@@ -134,7 +134,7 @@ impl FaultInjector {
         }
     }
 
-    /// Tries to inject the current fault. Returns false if there is no suitable victim at this moment.
+    /// Tries to inject the current fault. Returns false if there is no suitable victim yet.
     fn try_inject(
         &mut self,
         now_us: u64,
@@ -207,7 +207,7 @@ impl FaultInjector {
         })
     }
 
-    /// Moves on to the next fault, and returns true.
+    /// Moves on to the next fault, and returns true as the result of an injection.
     fn finish(&mut self, now_us: u64) -> bool {
         self.next(now_us);
         true
@@ -332,8 +332,8 @@ fn is_learner(member: &Member) -> bool {
     matches!(member.role, Role::Learner(_))
 }
 
-/// Records that a process is suspended until `until_us`. Segments sent before that time do not prove
-/// its recovery.
+/// Records that a process is suspended until `until_us`. Segments sent before that time do not
+/// prove its recovery.
 fn record_suspension(member: &Member, until_us: u64, timeline: &mut Timeline) {
     match member.role {
         Role::Worker(index, _) => timeline.worker_stopped(index, until_us),

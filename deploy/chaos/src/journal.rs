@@ -153,7 +153,7 @@ impl RawRecord {
         SegmentDigest { worker, mark: self.as_mark(), checksum, env_steps }
     }
 
-    fn as_standing(&self) -> LearnerCounters {
+    fn as_counters(&self) -> LearnerCounters {
         let [env_steps, updates, segments] = self.numbers;
         LearnerCounters { env_steps, updates, segments }
     }
@@ -202,12 +202,12 @@ impl Record {
             2 => Entry::Acknowledged(raw.as_mark()),
             3 => Entry::Policy { epoch: raw.numbers[0], version: raw.numbers[1] },
             4 => Entry::Restored(raw.worker, raw.as_mark()),
-            5 => Entry::Started(raw.as_standing()),
+            5 => Entry::Started(raw.as_counters()),
             6 => Entry::Serving,
             7 => Entry::Inserted(raw.as_segment()),
             8 => Entry::Rejected { segment: raw.as_segment(), is_duplicate: false },
             9 => Entry::Rejected { segment: raw.as_segment(), is_duplicate: true },
-            10 => Entry::CheckpointBegun(raw.as_standing()),
+            10 => Entry::CheckpointBegun(raw.as_counters()),
             _ => return None,
         };
         Some(Self { entry, time_us: raw.time_us })

@@ -62,8 +62,8 @@ impl Journals {
         self.keep = true;
     }
 
-    /// Calls `each` with every new record: first those of the workers, to which the learners' records
-    /// refer.
+    /// Calls `each` with every new record. Those of the workers come first, because the learners'
+    /// records refer to them.
     pub(super) fn for_each_new(
         &mut self,
         violations: &mut Violations,

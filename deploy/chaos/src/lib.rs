@@ -3,9 +3,12 @@
 //!
 //! ```text
 //!   schedule ─► fault_injector ──SIGKILL, SIGSTOP──► run_under_test ─► workers, learner
-//!                     │                                                    │ journal
-//!                     ▼                                                    ▼
-//!                  timeline ◄────────── recovery of processes ───────── journals ─► checker ─► report
+//!                    │                                                     │ journal
+//!                    ▼                                                     ▼
+//!                 timeline ◄────────── recovery of processes ────────── journals ─► checker
+//!                                                                                     │
+//!                                                                                     ▼
+//!                                                                                   report
 //! ```
 //! One loop in one thread (`trial`) reads the journals, injects due faults and checks progress,
 //! every few milliseconds. At the end it resumes suspended processes, waits until all workers make
@@ -51,8 +54,8 @@ pub struct TrialPlan {
     pub worker_kills: u64,
     /// Minimum number of learner kills.
     pub learner_kills: u64,
-    /// Folder for all files, which is kept. With `None`, a temporary folder is used and kept only if
-    /// a check fails.
+    /// Folder for all files, which is kept. With `None`, a temporary folder is used, which is kept
+    /// only if a check fails.
     pub output: Option<PathBuf>,
 }
 

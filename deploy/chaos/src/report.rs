@@ -41,8 +41,8 @@ impl Report {
         self.interrupted
     }
 
-    /// Returns the largest number of segments of a worker divided by the smallest, while no fault was
-    /// active.
+    /// Returns the largest number of segments of a worker divided by the smallest, counted while no
+    /// fault was active.
     fn fairness(&self) -> Option<f64> {
         let (most, fewest) = (self.undisturbed.iter().max()?, self.undisturbed.iter().min()?);
         (*fewest > 0).then(|| *most as f64 / *fewest as f64)

@@ -17,7 +17,7 @@ const SETTLE_US: u64 = 500_000;
 #[derive(Debug, Clone, Copy)]
 struct ActiveFault {
     since_us: u64,
-    /// True if its recovery time is measured: it is a death, and no other fault affects the recovery.
+    /// True if the recovery time is measured: after a death, if no other fault affects it.
     measured: bool,
     /// True if a violation has been reported for this fault.
     reported: bool,

@@ -109,8 +109,8 @@ impl<'a> Trial<'a> {
         format!("{elapsed}/{total} {what}")
     }
 
-    /// Stops the injection of faults. The run must then recover before it is stopped, because only a
-    /// live learner writes the last checkpoint, with which the journals are compared.
+    /// Stops the injection of faults. The run must then recover before it is stopped, because only
+    /// a live learner writes the last checkpoint, with which the journals are compared.
     fn stop_injection(&mut self) {
         match self.phase {
             Phase::Starting => self.enter(Phase::Done),
@@ -160,8 +160,8 @@ impl<'a> Trial<'a> {
                 } else if now - self.phase_since_us > RECOVERY_US {
                     let seconds = RECOVERY_US / 1_000_000;
                     self.violations.add(format!(
-                        "I7: in {seconds} s after the last fault, the workers went from {:?} segments \
-                         to {:?}",
+                        "I7: in {seconds} s after the last fault, the workers went from {:?} \
+                         segments to {:?}",
                         self.inserted_before,
                         self.timeline.inserted()
                     ));
@@ -197,10 +197,10 @@ impl<'a> Trial<'a> {
     }
 
     fn is_injection_complete(&self) -> bool {
-        let done = self.injector.counts;
+        let faults = self.injector.counts;
         self.injected() >= self.plan.duration
-            && done.worker_kills >= self.plan.worker_kills
-            && done.learner_kills >= self.plan.learner_kills
+            && faults.worker_kills >= self.plan.worker_kills
+            && faults.learner_kills >= self.plan.learner_kills
     }
 
     fn has_recovered(&self) -> bool {
@@ -210,8 +210,8 @@ impl<'a> Trial<'a> {
             && now.iter().zip(&self.inserted_before).all(grown)
     }
 
-    /// Samples resources while faults are injected, those of the learner only while it works and its
-    /// replay is full.
+    /// Samples resources while faults are injected, those of the learner only while it works and
+    /// its replay is full.
     fn sample(&mut self, now: u64) -> anyhow::Result<()> {
         if self.phase != Phase::Injecting {
             return Ok(());
@@ -236,7 +236,7 @@ impl<'a> Trial<'a> {
     }
 
     fn status(&self) -> String {
-        let done = self.injector.counts;
+        let faults = self.injector.counts;
         let phase = match self.phase {
             Phase::Starting => "starting",
             Phase::Injecting => "injecting faults",
@@ -247,8 +247,8 @@ impl<'a> Trial<'a> {
         let violations: u64 = violations.iter().map(|violations| violations.count()).sum();
         format!(
             "{phase} · killed {} workers, {} learners · {} segments · {violations} violations",
-            done.worker_kills,
-            done.learner_kills,
+            faults.worker_kills,
+            faults.learner_kills,
             self.checker.counters().segments
         )
     }

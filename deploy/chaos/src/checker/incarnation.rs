@@ -60,7 +60,7 @@ impl IncarnationState {
         (self.produced.len() as u64).saturating_sub(self.settled_to.max(self.acked))
     }
 
-    fn missing(&self) -> u64 {
+    fn gaps_len(&self) -> u64 {
         self.gaps.iter().map(|gap| gap.end() + 1 - gap.start()).sum()
     }
 }

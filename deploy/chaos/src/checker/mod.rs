@@ -19,8 +19,8 @@ use incarnation::IncarnationState;
 use super::violations::Violations;
 use crate::journal::{Author, Entry, LearnerCounters, Record, SegmentDigest};
 
-/// Maximum distance between checkpoints, in intervals. While a checkpoint is being written, the next
-/// one is delayed.
+/// Maximum distance between checkpoints, in intervals. While a checkpoint is being written, the
+/// next one is delayed.
 const INTERVALS_MAX: u64 = 2;
 /// Upper bound on the environment steps in a segment, by which the distance may be exceeded.
 const SEGMENT_STEPS: u64 = 100;
@@ -52,8 +52,8 @@ pub(super) struct Checker {
     settled: Vec<Watermark>,
     /// Counters of the newest learner.
     counters: LearnerCounters,
-    /// Counters at the start of the run and of each checkpoint begun since, except those that a later
-    /// learner has rolled back.
+    /// Counters at the start of the run and of each checkpoint begun since, except those that a
+    /// later learner has rolled back.
     checkpoint_counters: Vec<LearnerCounters>,
     /// Environment steps since the last checkpoint was begun or the learner started to serve.
     steps_since_checkpoint: u64,
@@ -82,8 +82,8 @@ impl Checker {
         }
     }
 
-    /// Processes a record. An author's records must come in order, and a learner's records after all
-    /// earlier records of the workers.
+    /// Processes a record. An author's records must come in order, and a learner's records after
+    /// all earlier records of the workers.
     pub(super) fn process(&mut self, author: Author, record: &Record) {
         match (author, record.entry) {
             (Author::Worker(worker, incarnation), entry) => {
@@ -101,7 +101,7 @@ impl Checker {
             (Author::Learner(_), Entry::Inserted(segment)) => self.on_inserted(&segment),
             (Author::Learner(_), Entry::Rejected { is_duplicate: true, .. }) => self.duplicate += 1,
             (Author::Learner(_), Entry::Rejected { segment, is_duplicate: false }) => {
-                self.on_rejected(&segment)
+                self.on_rejected(&segment);
             }
             (Author::Learner(_), Entry::CheckpointBegun(counters)) => {
                 self.checkpoint_counters.push(counters);
@@ -185,8 +185,8 @@ impl Checker {
         };
         if mark > *settled {
             self.violations.add(format!(
-                "I1: a learner resumes at {mark:?} of worker {worker}, but {settled:?} was inserted \
-                 last"
+                "I1: a learner resumes at {mark:?} of worker {worker}, but {settled:?} was \
+                 inserted last"
             ));
         }
         *settled = mark.min(*settled);
@@ -209,11 +209,12 @@ impl Checker {
         // The newest checkpoint may be incomplete on disk, but the previous one must be complete.
         match self.checkpoint_counters.iter().rposition(|earlier| *earlier == counters) {
             Some(index) if index + 2 >= self.checkpoint_counters.len() => {
-                self.checkpoint_counters.truncate(index + 1)
+                self.checkpoint_counters.truncate(index + 1);
             }
             Some(index) => {
                 self.violations.add(format!(
-                    "I5: the learner after {deaths} deaths went back {} checkpoints, to {counters:?}",
+                    "I5: the learner after {deaths} deaths went back {} checkpoints, to \
+                     {counters:?}",
                     self.checkpoint_counters.len() - 1 - index
                 ));
                 self.checkpoint_counters.truncate(index + 1);
@@ -291,16 +292,16 @@ impl Checker {
 
     /// Checks the final state after all journals have been read.
     pub(super) fn conclude(&mut self) -> SegmentTotals {
-        let mut sums = SegmentTotals { duplicate: self.duplicate, ..SegmentTotals::default() };
+        let mut totals = SegmentTotals { duplicate: self.duplicate, ..SegmentTotals::default() };
         for (worker, incarnations) in self.incarnations.iter().enumerate() {
             for (incarnation, state) in incarnations {
                 let lost = state.lost();
-                sums.produced += state.produced.len() as u64;
-                sums.inserted += state.inserted();
-                sums.rejected += state.rejected.len() as u64;
-                sums.in_flight += state.in_flight();
-                sums.acknowledged += state.acked;
-                sums.lost += lost;
+                totals.produced += state.produced.len() as u64;
+                totals.inserted += state.inserted();
+                totals.rejected += state.rejected.len() as u64;
+                totals.in_flight += state.in_flight();
+                totals.acknowledged += state.acked;
+                totals.lost += lost;
                 if lost > 0 {
                     self.violations.add(format!(
                         "I1: {lost} segments of worker {worker}, incarnation {incarnation}, are \
@@ -311,13 +312,13 @@ impl Checker {
                 }
             }
         }
-        let SegmentTotals { produced, inserted, rejected, in_flight, lost, .. } = sums;
+        let SegmentTotals { produced, inserted, rejected, in_flight, lost, .. } = totals;
         if produced != inserted + rejected + in_flight + lost {
             self.violations.add(format!(
                 "I9: {produced} segments were produced, and {inserted} inserted, {rejected} \
                  rejected, {in_flight} in flight, {lost} lost"
             ));
         }
-        sums
+        totals
     }
 }
