@@ -197,8 +197,8 @@ impl Drain {
         loop {
             let answer = match requests.recv_timeout(MAINTENANCE_INTERVAL) {
                 Ok(Request::FirstOfEach) => self.first_of_each().map(Answer::FirstOfEach),
-                Ok(Request::Measure(duration, from)) => {
-                    self.measure(duration, from).map(Answer::Measured)
+                Ok(Request::Measure(duration, source)) => {
+                    self.measure(duration, source).map(Answer::Measured)
                 }
                 Err(RecvTimeoutError::Timeout) => match self.maintain() {
                     Ok(()) => continue,
@@ -236,19 +236,19 @@ impl Drain {
         Ok(first.into_iter().flatten().collect())
     }
 
-    fn measure(&mut self, duration: Duration, from: Source) -> anyhow::Result<DrainWindow> {
-        self.take_for(SETTLE, from)?;
+    fn measure(&mut self, duration: Duration, source: Source) -> anyhow::Result<DrainWindow> {
+        self.take_for(SETTLE, source)?;
         let cpu_s = thread_cpu_s();
-        let taken = self.take_for(duration, from)?;
+        let taken = self.take_for(duration, source)?;
         Ok(DrainWindow { cpu_s: thread_cpu_s() - cpu_s, ..taken })
     }
 
     /// Receives segments for `duration`. The result has the actual time.
-    fn take_for(&mut self, duration: Duration, from: Source) -> anyhow::Result<DrainWindow> {
+    fn take_for(&mut self, duration: Duration, source: Source) -> anyhow::Result<DrainWindow> {
         let start = Instant::now();
         let (mut window, mut taken) = (DrainWindow::default(), 0);
         while start.elapsed() < duration && !self.stop.load(Ordering::Acquire) {
-            match self.take(from)? {
+            match self.take(source)? {
                 Some(header) => {
                     window.segments += u64::from(header.steps_len > 0);
                     window.env_steps += u64::from(header.steps_len);
@@ -256,7 +256,7 @@ impl Drain {
                 }
                 None => {
                     self.maintain_if_due()?;
-                    let sleep = match from {
+                    let sleep = match source {
                         Source::All => &mut self.sleep,
                         Source::First => &mut self.sleep_of_first,
                     };
@@ -271,10 +271,10 @@ impl Drain {
 
     /// Receives the next segment, checks it and updates its worker's sequence, as the learner does.
     /// Rejected segments and duplicates count no steps.
-    fn take(&mut self, from: Source) -> anyhow::Result<Option<SegmentHeader>> {
+    fn take(&mut self, source: Source) -> anyhow::Result<Option<SegmentHeader>> {
         self.make_room()?;
         let Self { end, segment, .. } = self;
-        let received = match from {
+        let received = match source {
             Source::All => end.segments.try_receive(segment)?,
             Source::First => end.segments.try_receive_from(0, segment)?,
         };

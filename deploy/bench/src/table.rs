@@ -22,7 +22,7 @@ impl Figures {
                 actors.envs_per_worker,
                 self.config.policy.decision_steps()
             ),
-            format!("median of {rounds} rounds of {} s; times are per worker", self.seconds),
+            format!("median of {rounds} rounds of {} s; step times are per worker", self.seconds),
             String::new(),
             format!(
                 "  {:<10} {:>11} {:>9} {:>9}   {:<21} worker/this",

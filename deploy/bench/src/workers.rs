@@ -131,7 +131,7 @@ impl Workers {
         watch: &Watch,
         duration: Duration,
     ) -> anyhow::Result<(Round, DrainWindow)> {
-        self.measure_from(watch, duration, Source::All)
+        self.measure_source(watch, duration, Source::All)
     }
 
     /// Measures the first worker while the others sleep because their queues are full. Returns
@@ -146,29 +146,30 @@ impl Workers {
         if self.children.len() == 1 {
             return Ok(None);
         }
-        Ok(Some(self.measure_from(watch, duration, Source::First)?.0))
+        Ok(Some(self.measure_source(watch, duration, Source::First)?.0))
     }
 
-    fn measure_from(
+    fn measure_source(
         &mut self,
         watch: &Watch,
         duration: Duration,
-        from: Source,
+        source: Source,
     ) -> anyhow::Result<(Round, DrainWindow)> {
-        let (start, cpu_s) = (Instant::now(), self.cpu_s(from));
-        let answer = self.ask(Request::Measure(duration, from), watch, duration + MEASURE_SLACK)?;
+        let (start, cpu_s) = (Instant::now(), self.cpu_s(source));
+        let answer =
+            self.ask(Request::Measure(duration, source), watch, duration + MEASURE_SLACK)?;
         let Answer::Measured(window) = answer else {
             bail!("the receiver sent an unexpected answer");
         };
         // Includes the settling time, during which the workers run in the same way.
         let elapsed_s = start.elapsed().as_secs_f64();
-        let cores = self.cpu_s(from).zip(cpu_s).map(|(now, then)| (now - then) / elapsed_s);
+        let cores = self.cpu_s(source).zip(cpu_s).map(|(now, then)| (now - then) / elapsed_s);
         let steps_per_s = window.env_steps as f64 / window.seconds;
         Ok((Round { steps_per_s, cores }, window))
     }
 
-    fn cpu_s(&self, from: Source) -> Option<f64> {
-        let count = match from {
+    fn cpu_s(&self, source: Source) -> Option<f64> {
+        let count = match source {
             Source::All => self.children.len(),
             Source::First => 1,
         };

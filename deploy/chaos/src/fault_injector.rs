@@ -144,14 +144,7 @@ impl FaultInjector {
         let fault = self.scheduled.fault;
         // A learner must recover before its next fault, except in `KillLearnerTwice`. This check
         // comes before the expensive scan of /proc.
-        let is_learner_fault = matches!(
-            fault,
-            Fault::KillLearner
-                | Fault::KillLearnerTwice { .. }
-                | Fault::KillLearnerInCheckpoint
-                | Fault::StopLearner { .. }
-        );
-        if is_learner_fault && !overdue && !timeline.is_learner_working() {
+        if fault.targets_learner() && !overdue && !timeline.is_learner_working() {
             return Ok(false);
         }
         let members = members(self.supervisor)?;

@@ -57,6 +57,19 @@ pub(super) enum Fault {
     },
 }
 
+impl Fault {
+    /// Returns true if the fault kills or suspends the learner.
+    pub(super) fn targets_learner(self) -> bool {
+        matches!(
+            self,
+            Self::KillLearner
+                | Self::KillLearnerTwice { .. }
+                | Self::KillLearnerInCheckpoint
+                | Self::StopLearner { .. }
+        )
+    }
+}
+
 /// A fault and the pause before it.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) struct ScheduledFault {

@@ -15,7 +15,7 @@ pub(super) struct Cycle {
     pub(super) updates: u64,
 }
 
-/// What a product computes for a layer.
+/// Kind of a product, by its result for a layer.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum ProductKind {
     /// Y = X Wᵀ.

@@ -51,7 +51,7 @@ const SLACK: Duration = Duration::from_secs(60);
 /// Time for caches and outboxes to reach a steady state once the replay is full.
 const SETTLE: Duration = Duration::from_millis(500);
 
-/// Sizes of a feed.
+/// Settings of a feed.
 pub(super) struct FeedPlan<'a> {
     /// Path of this program, which also runs the feeders.
     pub(super) program: &'a Path,
@@ -297,7 +297,7 @@ impl Feed {
     }
 }
 
-/// Starts the feeder processes, each with an equal share of the workers.
+/// Starts the feeder processes, each with a share of the workers.
 fn start_feeders(
     feed: &FeedPlan<'_>,
     plan: &Plan,

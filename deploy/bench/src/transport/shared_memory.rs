@@ -80,8 +80,8 @@ impl SharedMemory {
         }
         let discrepancies = Discrepancies::default();
         let mut shared_memory = Self { size, children, receiver, discrepancies, _domain: domain };
-        ours.ask(Request::FirstOfEach, watch, START)?;
-        Ok(ours)
+        shared_memory.ask(Request::FirstOfEach, watch, START)?;
+        Ok(shared_memory)
     }
 
     /// Counts the segments of all workers during `duration`.
