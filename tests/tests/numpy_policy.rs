@@ -90,8 +90,9 @@ fn assert_same(task: &str, keys: &[(&str, &str)]) {
 
     let folder = tempfile::tempdir().unwrap();
     let path = |name: &str| folder.path().join(name);
-    let settings = (&config, &spec, Controls::Policy);
-    let plan = NumpyPlan::write(folder.path(), settings, &policy, &parameters).unwrap();
+    let controls = Controls::Policy;
+    let plan =
+        NumpyPlan::write(folder.path(), &config, &spec, controls, &policy, &parameters).unwrap();
     let bytes: Vec<u8> = observations.iter().flat_map(|value| value.to_le_bytes()).collect();
     std::fs::write(path("observations"), bytes).unwrap();
     let output = Command::new(&venv().executable)

@@ -56,7 +56,7 @@ impl RunFiles for LearnerFiles<'_> {
 
     fn checkpoint_begins(&mut self, counters: &Counters) {
         if let Some(journal) = &self.journal {
-            journal.note(Entry::Cut(counters.into()));
+            journal.note(Entry::CheckpointBegun(counters.into()));
         }
     }
 }
