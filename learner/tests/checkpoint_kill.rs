@@ -1,4 +1,5 @@
-//! Kills a learner with SIGKILL at every point of writing a checkpoint, and checks the remaining files.
+//! Kills a learner with SIGKILL at every point of writing a checkpoint, and checks the remaining
+//! files.
 
 #![allow(clippy::unwrap_used, reason = "a test's helpers fail the test")]
 

@@ -18,7 +18,7 @@ pub struct Preset {
 pub const PRESETS: [Preset; 3] = [
     Preset {
         name: "default",
-        about: "segment critic, sliding windows, n-step target: which learned best in our measurements",
+        about: "segment critic, sliding windows, n-step target: best in our measurements",
         text: "",
     },
     Preset {
