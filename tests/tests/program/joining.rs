@@ -11,17 +11,23 @@ use dmprl_tests::program::{
 };
 use dmprl_tests::skipped::skipped;
 use rustix::process::Signal;
-use serde_json::Value;
+use serde_json::{Value, json};
 
 use crate::{ENDLESS, train};
 
 /// Starts a run with one worker of its own and `places` for joining workers.
 fn training(place: &Workplace, run: &str, places: &str, more: &[&str]) -> Running {
     let places = format!("actors.joined_max={places}");
-    let more = [&["--steps", ENDLESS, "--workers", "1", "--set", &places], more].concat();
+    let own = ["--steps", ENDLESS, "--workers", "1", "--events", "json", "--set", &places];
+    let more = [&own[..], more].concat();
     let mut running = place.start(&train("reacher", run, &more));
     running.until_steps(run, 1_000);
     running
+}
+
+/// The event of a joined worker that died or hung.
+fn lost() -> Value {
+    json!({ "event": "left", "process": "actor-1", "announced": false, "workers": 1 })
 }
 
 fn join(place: &Workplace, run: &str) -> Running {
@@ -66,7 +72,7 @@ fn a_worker_joins_is_learned_from_and_makes_room_when_it_leaves_or_dies() {
     let run = place.path("run");
     let mut running = training(&place, &run, "1", &[]);
     let joined = join(&place, &run);
-    running.until_said("actor-1 has joined: 2 workers");
+    running.until_event(&json!({ "event": "joined", "process": "actor-1", "workers": 2 }));
     until_learned_from(&mut running, &run, 0);
     running.until("a line that counts both", |_| {
         rows(&run, "metrics.jsonl").pop().is_some_and(|last| last["workers"] == 2)
@@ -79,13 +85,14 @@ fn a_worker_joins_is_learned_from_and_makes_room_when_it_leaves_or_dies() {
     let counts = said.split("left the run: ").nth(1).unwrap();
     let (acknowledged, rest) = counts.split_once(" of ").unwrap();
     assert_eq!(Some(acknowledged), rest.split(' ').next(), "all of them: {said}");
-    running.until_said("joined worker actor-1 left the run: 1 worker");
+    let left = json!({ "event": "left", "process": "actor-1", "announced": true, "workers": 1 });
+    running.until_event(&left);
 
     // The next one is killed, and the one after it gets its place too.
     let killed = join(&place, &run);
     until_learned_from(&mut running, &run, 1);
     killed.signal_group(Signal::KILL);
-    running.until_said("joined worker actor-1 died");
+    running.until_event(&lost());
     let mut last = join(&place, &run);
     until_learned_from(&mut running, &run, 2);
     last.until_said("segments sent");
@@ -103,7 +110,7 @@ fn a_worker_that_has_joined_stays_when_the_learner_is_replaced() {
     let learner = processes(&place, "learner").pop().unwrap();
     let before = newest_state(&run)["settled"][1]["sequence"].as_u64().unwrap();
     learner.signal(Signal::KILL);
-    running.until_said("the learner is back: first segment");
+    running.until_event(&json!({ "event": "first_step", "after_restart": true }));
     running.until("more of its segments", |_| {
         newest_state(&run)["settled"][1]["sequence"].as_u64() > Some(before + 100)
     });
@@ -119,9 +126,9 @@ fn a_worker_that_has_joined_and_is_stopped_loses_its_place() {
     let more = ["--set", "supervision.heartbeat_timeout_s=5"];
     let mut running = training(&place, &run, "1", &more);
     let joined = join(&place, &run);
-    running.until_said("actor-1 has joined");
+    running.until_event(&json!({ "event": "joined", "process": "actor-1" }));
     joined.signal_group(Signal::STOP);
-    running.until_said("joined worker actor-1 hung (no heartbeat for 5.");
+    running.until_event(&lost());
     assert_eq!(joined.wait().status.code(), None);
     let joined = join(&place, &run);
     until_learned_from(&mut running, &run, 1);
@@ -180,10 +187,7 @@ fn joining_and_leaving_all_the_time_leaks_nothing() {
         }
         joined.wait();
         let gone = |running: &Running| {
-            let said = running.said();
-            let joined = said.lines().filter(|line| line.contains("joined worker actor-"));
-            let ended = |line: &&str| line.contains(" left the run") || line.contains(" died");
-            joined.filter(ended).count() == round + 1
+            running.events().iter().filter(|event| event["event"] == "left").count() == round + 1
         };
         running.until("its end is noticed", gone);
         if before.is_none() {

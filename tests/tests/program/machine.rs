@@ -12,6 +12,7 @@ use dmprl_tests::program::{
 };
 use dmprl_tests::skipped::skipped;
 use rustix::process::{Pid, Signal};
+use serde_json::json;
 
 use crate::isolation::with_shared_memory_of;
 use crate::{ENDLESS, train};
@@ -50,6 +51,18 @@ fn a_worker_whose_learner_takes_nothing_sleeps() {
     running.wait().with_status(130);
 }
 
+/// Waits until a process has died of this cause and is restarted.
+fn until_death(running: &mut Running, process: &str, cause: &str) {
+    running.until(&format!("the death of {process}"), |running| {
+        running.events().iter().any(|event| {
+            event["event"] == "child_died"
+                && event["process"] == process
+                && event["next"] == "restart"
+                && event["cause"].as_str().is_some_and(|found| found.starts_with(cause))
+        })
+    });
+}
+
 fn end(running: Running, run: &str) {
     running.signal_group(Signal::INT);
     running.wait().with_status(130);
@@ -66,7 +79,8 @@ fn a_worker_killed_by_full_shared_memory_is_told_the_cause_and_replaced() {
     let place = Workplace::new();
     let run = place.path("run");
     let keys = ["actors.queue_segments=8192"].into_iter().flat_map(|key| ["--set", key]);
-    let more = ["--steps", ENDLESS, "--workers", "1"].into_iter().chain(keys).collect::<Vec<_>>();
+    let own = ["--steps", ENDLESS, "--workers", "1", "--events", "json"];
+    let more = own.into_iter().chain(keys).collect::<Vec<_>>();
     let line = train("reacher", &run, &more).join(" ");
     // Another process on the machine, on request, for at most two minutes.
     let waiting =
@@ -90,7 +104,7 @@ fn a_worker_killed_by_full_shared_memory_is_told_the_cause_and_replaced() {
         until(answer, || Path::new(&place.path(answer)).exists());
     };
     ask("fill", "filled");
-    running.until_said("actor-0 died (signal 7 (SIGBUS), perhaps because shared memory");
+    until_death(&mut running, "actor-0", "signal 7 (SIGBUS), perhaps because shared memory");
     ask("free", "freed");
     learner.signal(Signal::CONT);
     let steps = env_steps_of(&run).unwrap();
@@ -156,13 +170,14 @@ fn a_learner_killed_for_want_of_memory_is_told_so_and_replaced() {
         skipped("TEST_CGROUP_REQUIRED", "a learner that the kernel kills for memory", remedy);
     };
     let Some(memory) = Memory::new(512 << 10) else { return skip() };
-    let mut running = place.start(&train("reacher", &run, &["--steps", ENDLESS]));
+    let mut running =
+        place.start(&train("reacher", &run, &["--steps", ENDLESS, "--events", "json"]));
     running.until_steps(&run, 2_500);
     if memory.take(role(&place, "learner").id).is_err() {
         return skip();
     }
-    running.until_said("learner died (signal 9 (SIGKILL), perhaps out of memory): restart 1");
-    running.until_said("the learner is back");
+    until_death(&mut running, "learner", "signal 9 (SIGKILL), perhaps out of memory");
+    running.until_event(&json!({ "event": "first_step", "after_restart": true }));
     let steps = env_steps_of(&run).unwrap_or(0);
     running.until_steps(&run, steps + 1_000);
     end(running, &run);

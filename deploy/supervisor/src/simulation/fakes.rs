@@ -26,7 +26,6 @@ pub struct Fake {
     commands: VecDeque<Command>,
     ready: bool,
     attached: bool,
-    stopping: bool,
     /// Number of progress reports until it finishes.
     work_left: u32,
     /// Time of its last output, which later outputs must follow.
@@ -89,7 +88,6 @@ impl Fake {
             commands: VecDeque::new(),
             ready: false,
             attached: false,
-            stopping: false,
             work_left: random.random_range(1..40),
             last_output: now,
         }
@@ -168,7 +166,6 @@ impl Fake {
                 self.work_left = 0;
             }
             Command::Stop | Command::Finish => {
-                self.stopping = true;
                 out.extend(self.regular_end());
                 return true;
             }
