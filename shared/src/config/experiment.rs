@@ -210,9 +210,9 @@ pub struct ActorsConfig {
     /// Maximum number of restarts of one worker; after that the run continues without it. The count
     /// is reset once the worker has delivered segments for five minutes.
     pub restarts_max: u32,
-    /// Maximum number of consecutive failures of one environment. Up to this number, the worker
-    /// recreates the environment; on one more, the worker exits and is restarted. The count is
-    /// reset after a completed episode or 1 000 valid segments.
+    /// Maximum number of failures of one environment. Up to this number, the worker recreates the
+    /// environment; on one more, the worker exits and is restarted. A completed episode or 1 000
+    /// valid segments in a row reset the count.
     pub env_failures_max: u32,
     /// Timeout of one call into the environments, which runs or resets all environments of a worker
     /// \[s\]. On a timeout the worker or evaluator exits and is restarted.
