@@ -251,8 +251,8 @@ impl Policy {
         }
     }
 
-    /// Computes u for every observation into `work.actions`. A stochastic policy uses its mean. If
-    /// its standard deviations are learned parameters, that mean is not bounded.
+    /// Computes u for every observation into `work.actions`. For a stochastic policy u is computed
+    /// from the mean. With the position controller u is not bounded.
     ///
     /// - `parameters`: (P,). `observations`: (rows, O).
     ///
