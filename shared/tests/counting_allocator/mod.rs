@@ -1,5 +1,5 @@
-//! Counts the allocations of a whole test binary, so its tests must be alone in it or run one after
-//! another.
+//! An allocator that counts the allocations of all threads. A test binary that uses it must have
+//! only one test.
 
 use std::alloc::{GlobalAlloc, Layout, System};
 use std::sync::atomic::{AtomicU64, Ordering};
@@ -8,7 +8,7 @@ struct Counting;
 
 static ALLOCATIONS: AtomicU64 = AtomicU64::new(0);
 
-// SAFETY: the system allocator does all work, and the counter does not touch the memory.
+// SAFETY: all calls are forwarded to the system allocator; the counter does not touch the memory.
 unsafe impl GlobalAlloc for Counting {
     unsafe fn alloc(&self, layout: Layout) -> *mut u8 {
         ALLOCATIONS.fetch_add(1, Ordering::Relaxed);
@@ -25,7 +25,7 @@ unsafe impl GlobalAlloc for Counting {
 #[global_allocator]
 static ALLOCATOR: Counting = Counting;
 
-/// Number of allocations during `work`.
+/// Runs `work` and returns the number of allocations in the meantime.
 pub fn allocations_of(work: impl FnOnce()) -> u64 {
     let before = ALLOCATIONS.load(Ordering::Relaxed);
     work();
