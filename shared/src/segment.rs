@@ -291,7 +291,7 @@ mod tests {
     }
 
     #[test]
-    fn each_invalid_field_is_rejected_with_its_reason() {
+    fn every_misfit_is_refused_with_its_reason() {
         assert_eq!(check_changed(|s| s.header.layout_version = 2), Err(Rejection::LayoutVersion));
         assert_eq!(check_changed(|s| s.header.run_id = 8), Err(Rejection::Run));
         assert_eq!(check_changed(|s| s.header.architecture_hash = 8), Err(Rejection::Architecture));

@@ -23,7 +23,7 @@ fn log(parent: &Parent) -> SegmentLog {
 /// The only test in its binary, because the counter counts every thread. iceoryx2 0.10 allocates
 /// about 100 bytes for each sample that is written and nothing for reading; dmprl adds none.
 #[test]
-fn steady_state_allocates_once_per_written_sample_and_never_when_reading() {
+fn the_steady_state_allocates_only_what_iceoryx2_does_for_a_sample() {
     const ROUNDS: u64 = 1000;
     let parent = Parent::new();
     let domain = parent.domain("run");

@@ -110,7 +110,7 @@ fn slow_reader_loses_and_duplicates_no_segment(mut transport: Transport) {
     assert!(!transport.receiver.try_receive(&mut segment).unwrap());
 }
 
-fn full_queue_rejects_segments_and_keeps_its_content(mut transport: Transport) {
+fn a_full_queue_says_so_and_keeps_what_it_has(mut transport: Transport) {
     for sequence in 1..=4 {
         assert_eq!(offer(&mut transport, 0, sequence), SendOutcome::Delivered);
     }
@@ -253,7 +253,7 @@ macro_rules! contract {
 
 contract! {
     slow_reader_loses_and_duplicates_no_segment(1, 64);
-    full_queue_rejects_segments_and_keeps_its_content(1, 4);
+    a_full_queue_says_so_and_keeps_what_it_has(1, 4);
     full_queues_are_drained_in_turn(4, 16);
     sending_without_a_learner_returns_detached(1, 8);
     segment_of_the_wrong_length_is_rejected(1, 4);

@@ -101,7 +101,7 @@ fn only_domains_of_dead_owners_are_removed() {
 }
 
 #[test]
-fn partly_created_and_partly_removed_domains_are_removed() {
+fn domains_half_made_or_half_removed_are_removed() {
     let parent = Parent::new();
     let live = parent.domain("live");
     for name in [".dmprl-unfinished-a", ".dmprl-condemned-b"] {
@@ -223,7 +223,7 @@ fn invalid_tokens_and_long_paths_are_rejected() {
 }
 
 #[test]
-fn second_learner_is_rejected() {
+fn a_second_learner_is_refused() {
     let parent = Parent::new();
     let domain = parent.domain("run");
     let plan = plan(1, 8);
@@ -262,7 +262,7 @@ fn worker_cannot_attach_before_its_learner_and_creates_nothing() {
 }
 
 #[test]
-fn peer_with_another_plan_is_rejected_and_the_difference_is_named() {
+fn a_peer_of_another_plan_is_refused_by_name() {
     let parent = Parent::new();
     let domain = parent.domain("run");
     let ours = plan(1, 8);
@@ -291,7 +291,7 @@ fn peer_with_another_plan_is_rejected_and_the_difference_is_named() {
 }
 
 #[test]
-fn worker_does_not_join_a_new_learner_with_another_plan() {
+fn workers_of_another_plan_do_not_follow_a_new_learner() {
     let parent = Parent::new();
     let domain = parent.domain("run");
     let old = plan(1, 8);

@@ -119,7 +119,7 @@ fn take(learner: &mut LearnerEnd, last: &mut [(u32, u64); WORKERS]) -> bool {
 }
 
 #[test]
-fn segments_of_a_killed_worker_arrive_and_its_successor_continues() {
+fn a_killed_worker_loses_nothing_delivered_and_its_successor_continues() {
     const ROUNDS: u32 = 12;
     let parent = Parent::new();
     let domain = parent.domain("run");
@@ -144,7 +144,7 @@ fn segments_of_a_killed_worker_arrive_and_its_successor_continues() {
 
 /// There are more deaths than slots in the queue, so loans that are not returned would fill it.
 #[test]
-fn sample_loaned_by_a_dead_worker_is_returned() {
+fn a_worker_that_dies_with_a_loaned_sample_takes_no_place_with_it() {
     const DEATHS: u32 = QUEUE_SEGMENTS as u32 + 8;
     let parent = Parent::new();
     let domain = parent.domain("run");
@@ -168,7 +168,7 @@ fn sample_loaned_by_a_dead_worker_is_returned() {
 }
 
 #[test]
-fn workers_killed_while_they_start_do_not_block_others() {
+fn workers_killed_while_they_start_block_nobody() {
     const KILLS: u32 = 40;
     let parent = Parent::new();
     let domain = parent.domain("run");
@@ -192,7 +192,7 @@ fn workers_killed_while_they_start_do_not_block_others() {
 
 /// Starts and kills other workers continuously, which must not affect the first one.
 #[test]
-fn worker_is_not_affected_by_the_deaths_of_others() {
+fn a_worker_is_not_disturbed_by_the_deaths_of_others() {
     const KILLS: u32 = 60;
     let parent = Parent::new();
     let domain = parent.domain("run");
@@ -224,7 +224,7 @@ fn offer(worker: &mut WorkerEnd, sequence: &mut u64) -> SendOutcome {
 }
 
 #[test]
-fn worker_survives_a_killed_learner_and_reconnects_to_its_successor() {
+fn a_killed_learner_stops_no_worker_and_its_successor_takes_over() {
     const ROUNDS: u32 = 5;
     let parent = Parent::new();
     let domain = parent.domain("run");
@@ -275,7 +275,7 @@ fn learners_killed_while_they_start_do_not_block_their_successors() {
 
 /// Like the previous test, but with an attached worker, which must survive.
 #[test]
-fn learners_killed_while_they_take_over_do_not_block_others() {
+fn learners_killed_while_they_take_over_leave_nothing_that_hangs() {
     const KILLS: u32 = 40;
     let parent = Parent::new();
     let domain = parent.domain("run");

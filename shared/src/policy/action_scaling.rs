@@ -48,7 +48,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn bounds_of_u_map_to_bounds_of_symmetric_and_asymmetric_boxes() {
+    fn the_ends_of_u_are_the_ends_of_each_box_also_an_asymmetric_one() {
         let spec = EnvSpec {
             id: "test".into(),
             observation_len: 1,

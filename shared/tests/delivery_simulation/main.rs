@@ -45,7 +45,7 @@ fn folder() -> tempfile::TempDir {
 }
 
 #[test]
-fn faults_lose_no_acknowledged_segment_and_duplicate_none() {
+fn nothing_acknowledged_is_lost_and_nothing_comes_twice_whatever_dies() {
     let folder = folder();
     if let Ok(seed) = std::env::var(ONE_SEED) {
         println!("{:#?}", run(seed.parse().unwrap(), &folder.path().join("log")));

@@ -189,7 +189,7 @@ mod tests {
     use crate::transport::shared_memory::{Domain, serve, subscribe};
 
     #[test]
-    fn corrupted_snapshot_is_rejected_and_changes_nothing() {
+    fn a_damaged_snapshot_is_refused_and_changes_nothing() {
         let directory = tempfile::tempdir().unwrap();
         let domain = Domain::create(&directory.path().join("p"), "run").unwrap();
         let plan = Plan {

@@ -319,7 +319,7 @@ mod tests {
     }
 
     #[test]
-    fn receiving_from_one_worker_leaves_the_other_queues_full() {
+    fn one_worker_is_taken_from_while_the_others_wait_on_their_full_queues() {
         let directory = tempfile::tempdir().unwrap();
         let domain = Domain::create(&directory.path().join("p"), "run").unwrap();
         let plan = plan(2);
@@ -353,7 +353,7 @@ mod tests {
     }
 
     #[test]
-    fn segment_of_the_wrong_length_is_rejected_before_it_is_read() {
+    fn a_segment_whose_length_the_peer_got_wrong_is_refused_before_it_is_read() {
         let directory = tempfile::tempdir().unwrap();
         let domain = Domain::create(&directory.path().join("p"), "run").unwrap();
         let plan = plan(1);
