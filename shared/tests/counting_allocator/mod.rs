@@ -1,5 +1,10 @@
+<<<<<<< HEAD
 //! Counts the allocations of all threads but the test harness's, so the tests of a binary that uses
 //! it must be alone in it or run one after another.
+=======
+//! An allocator that counts the allocations of all threads. A test binary that uses it must have
+//! only one test.
+>>>>>>> docs2
 
 use std::alloc::{GlobalAlloc, Layout, System};
 use std::cell::Cell;
@@ -16,7 +21,7 @@ thread_local! {
     static IS_MAIN_THREAD: Cell<Option<bool>> = const { Cell::new(None) };
 }
 
-// SAFETY: the system allocator does all work, and the counter does not touch the memory.
+// SAFETY: all calls are forwarded to the system allocator; the counter does not touch the memory.
 unsafe impl GlobalAlloc for Counting {
     unsafe fn alloc(&self, layout: Layout) -> *mut u8 {
         if COUNTS_MAIN_THREAD.load(Ordering::Relaxed) || !is_main_thread() {
@@ -35,6 +40,7 @@ unsafe impl GlobalAlloc for Counting {
 #[global_allocator]
 static ALLOCATOR: Counting = Counting;
 
+<<<<<<< HEAD
 fn is_main_thread() -> bool {
     IS_MAIN_THREAD.with(|cached| {
         cached.get().unwrap_or_else(|| {
@@ -47,6 +53,9 @@ fn is_main_thread() -> bool {
 }
 
 /// Returns the number of allocations during `work`.
+=======
+/// Runs `work` and returns the number of allocations in the meantime.
+>>>>>>> docs2
 pub fn allocations_of(work: impl FnOnce()) -> u64 {
     COUNTS_MAIN_THREAD.store(is_main_thread(), Ordering::Relaxed);
     let before = ALLOCATIONS.load(Ordering::Relaxed);
