@@ -18,11 +18,7 @@ pub struct Preset {
 pub const PRESETS: [Preset; 3] = [
     Preset {
         name: "default",
-<<<<<<< HEAD
         about: "segment critic, sliding windows, n-step target: best in our measurements",
-=======
-        about: "segment critic, sliding windows, n-step target: the best in our measurements",
->>>>>>> docs2
         text: "",
     },
     Preset {

@@ -162,11 +162,7 @@ fn robot_holds_when_observations_stop_and_continues_when_they_return() {
     runtime.action(Some(&now)).unwrap();
     for _ in 0..2 {
         runtime.action(None).unwrap();
-<<<<<<< HEAD
         assert!(!runtime.is_holding(), "the segment continues for this many steps");
-=======
-        assert!(!runtime.is_holding(), "the segment continues for `hold_after` steps");
->>>>>>> docs2
     }
     let mut actions = Vec::new();
     for _ in 0..10 {

@@ -1,10 +1,5 @@
-<<<<<<< HEAD
 //! Counts the allocations of all threads but the test harness's, so the tests of a binary that uses
 //! it must be alone in it or run one after another.
-=======
-//! An allocator that counts the allocations of all threads. A test binary that uses it must have
-//! only one test.
->>>>>>> docs2
 
 use std::alloc::{GlobalAlloc, Layout, System};
 use std::cell::Cell;
@@ -40,7 +35,6 @@ unsafe impl GlobalAlloc for Counting {
 #[global_allocator]
 static ALLOCATOR: Counting = Counting;
 
-<<<<<<< HEAD
 fn is_main_thread() -> bool {
     IS_MAIN_THREAD.with(|cached| {
         cached.get().unwrap_or_else(|| {
@@ -53,9 +47,6 @@ fn is_main_thread() -> bool {
 }
 
 /// Returns the number of allocations during `work`.
-=======
-/// Runs `work` and returns the number of allocations in the meantime.
->>>>>>> docs2
 pub fn allocations_of(work: impl FnOnce()) -> u64 {
     COUNTS_MAIN_THREAD.store(is_main_thread(), Ordering::Relaxed);
     let before = ALLOCATIONS.load(Ordering::Relaxed);

@@ -340,11 +340,7 @@ impl World {
             self.tally.lost_at_level_memory += 1;
         }
         let gap = if mark.incarnation == last.incarnation { last.sequence } else { 0 };
-<<<<<<< HEAD
         assert_eq!(mark.sequence - gap - 1, lost, "worker {index}: an uncounted gap");
-=======
-        assert_eq!(mark.sequence - gap - 1, lost, "worker {index}: wrong number of lost segments");
->>>>>>> docs2
         self.inserted[index].push(mark);
     }
 

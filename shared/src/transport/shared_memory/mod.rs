@@ -63,11 +63,7 @@ impl WorkerTransport for SharedMemory {
     type Acknowledgements = AcknowledgementReader;
 }
 
-<<<<<<< HEAD
 /// A worker's ends of the transport.
-=======
-/// A worker's ends of the three channels.
->>>>>>> docs2
 pub type WorkerEnd = super::WorkerEnd<SharedMemory>;
 
 /// Makes this process the run's learner and creates all services. Workers of a previous learner

@@ -143,11 +143,7 @@ pub(super) fn clean(
             scanned += 1;
             if let NodeState::Dead(dead) = state {
                 found_dead();
-<<<<<<< HEAD
                 // The next call finds the files that could not be removed.
-=======
-                // The next call retries resources that could not be removed.
->>>>>>> docs2
                 let _ = dead.try_remove_stale_resources();
             }
             CallbackProgression::Continue
