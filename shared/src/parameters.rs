@@ -1,4 +1,4 @@
-//! Record of stage 7 of 8: policy snapshots, published by the learner and used by the workers.
+//! Stage 7 of 8, its record: policy snapshots, published by the learner and used by the workers.
 
 use thiserror::Error;
 

@@ -1,4 +1,4 @@
-//! Record of stage 4 of 8: the segment, K steps that a worker sends to the learner as a fixed
+//! Stage 4 of 8, its record: the segment, K steps that a worker sends to the learner as a fixed
 //! header and one block of f32.
 //!
 //! Block of a segment with K steps, observation length O and action length A:

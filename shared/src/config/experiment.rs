@@ -97,7 +97,7 @@ pub struct TaskConfig {
     pub name: String,
     /// Gymnasium id (`Name-vN` or `module:Name-vN`), or a class (`module:Class`).
     pub id: String,
-    /// Directories that are searched for environment modules, such as your own.
+    /// Directories that are searched for your own environment modules.
     pub python_path: Vec<String>,
     /// Entries of the observation from which y0 and yd0 are read, one source per action dimension;
     /// empty: unknown.
@@ -211,8 +211,8 @@ pub struct ActorsConfig {
     /// is reset once the worker has delivered segments for five minutes.
     pub restarts_max: u32,
     /// Maximum number of failures of one environment. Up to this number, the worker recreates the
-    /// environment; on one more, the worker exits and is restarted. A completed episode or 1 000
-    /// valid segments in a row reset the count.
+    /// environment; on one more, the worker exits and is restarted. The count is reset after a
+    /// completed episode, or after 1 000 valid segments since the first counted failure.
     pub env_failures_max: u32,
     /// Timeout of one call into the environments, which runs or resets all environments of a worker
     /// \[s\]. On a timeout the worker or evaluator exits and is restarted.

@@ -273,7 +273,7 @@ impl ExperimentConfig {
         let sources = self.task.start_sources.len();
         range("policy.start", "observed", !observed || sources > 0, || {
             format!(
-                "zero or carry, because task `{}` has no task.start_sources to read y0 from",
+                "zero or carry; task `{}` has no task.start_sources to read y0 from",
                 self.task.name
             )
         })

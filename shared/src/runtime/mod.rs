@@ -125,8 +125,7 @@ impl PolicyRuntime {
     ///   segments (`policy.start = "carry"`). The default is 0, as in training.
     ///
     /// # Errors
-    /// `Start` if y0 does not consist of A finite numbers, or if the policy does not carry its
-    /// state.
+    /// `Start` if y0 is not A finite numbers, or if the policy does not carry its state.
     pub fn reset(&mut self, y0: Option<&[f32]>) -> Result<(), RuntimeError> {
         if let Some(y0) = y0 {
             let dims = self.policy.layout().action_len;
