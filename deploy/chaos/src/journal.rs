@@ -214,7 +214,7 @@ impl Record {
     }
 }
 
-/// Returns the time of the monotonic clock [us], which all processes of a machine share.
+/// Returns the time of the monotonic clock \[us\], which all processes of a machine share.
 #[must_use]
 pub fn now_us() -> u64 {
     let now = clock_gettime(ClockId::Monotonic);
