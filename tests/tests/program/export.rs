@@ -6,6 +6,7 @@ use std::path::Path;
 use dmprl_shared::policy_file;
 use dmprl_shared::runtime::PolicyRuntime;
 use dmprl_tests::program::Workplace;
+use serde_json::json;
 
 use crate::{ENDLESS, train};
 
@@ -51,8 +52,9 @@ fn what_cannot_be_exported_is_told_and_leaves_no_file() {
     let place = Workplace::new();
     place.run(&["export", "nowhere"]).with_status(2).saying("nowhere");
     let run = place.path("run");
-    let mut training = place.start(&train("reacher", &run, &["--steps", ENDLESS]));
-    training.until("a run directory", |_| Path::new(&run).join("manifest.json").is_file());
+    let more = ["--steps", ENDLESS, "--events", "json"];
+    let mut training = place.start(&train("reacher", &run, &more));
+    training.until_event(&json!({ "event": "started" }));
     training.signal_group(rustix::process::Signal::INT);
     training.wait();
     place.run(&["export", &run]).with_status(2).saying("no evaluation yet");
