@@ -1,7 +1,7 @@
-//! Finds the CPython that this build links against, for the linker and for the code.
+//! Finds the CPython that this build links against, for the linker and the code.
 //!
 //! A machine often has several Pythons of one version, each with its own `libpython3.11.so`. The
-//! program must use the one that makes `.venv`. Its library directory therefore goes into the
+//! program must use the one that creates `.venv`. So its library directory goes into the
 //! executables' rpath, and its version and prefix into the code, which compares them at start. The
 //! build scripts of `deploy` and `tests` get the linker's argument as `DEP_DMPRL_PYTHON_LINK_ARG`.
 //!
@@ -31,7 +31,7 @@ print(' '.join(sys.version.split()))
 print(sys.base_prefix)
 print(sysconfig.get_config_var('Py_ENABLE_SHARED') or 0)";
 
-    /// Facts about the interpreter.
+    /// Properties of the interpreter.
     struct Facts {
         executable: String,
         version: String,
@@ -48,11 +48,11 @@ print(sysconfig.get_config_var('Py_ENABLE_SHARED') or 0)";
         if (version.major, version.minor) < (3, MINOR_VERSION_MIN) {
             stop(&format!(
                 "{executable} is Python {version}, but 3.{MINOR_VERSION_MIN} or newer is needed. \
-                 Install one (Debian, Ubuntu: apt install python3 python3-dev python3-venv) and \
-                 set PYO3_PYTHON to it"
+                 Install one (on Debian and Ubuntu: apt install python3 python3-dev python3-venv) \
+                 and set PYO3_PYTHON to it"
             ));
         }
-        let facts = ask(executable);
+        let facts = query(executable);
         let library_dir = config.lib_dir().unwrap_or_else(|| {
             stop(&format!("{executable} does not report the directory of its libpython (LIBDIR)"))
         });
@@ -70,7 +70,7 @@ print(sysconfig.get_config_var('Py_ENABLE_SHARED') or 0)";
             println!("cargo::rustc-env=DMPRL_PYTHON_{name}={value}");
         }
         println!("cargo::rustc-env=DMPRL_PYTHON_LIBRARY_DIR={library_dir}");
-        // Detects an upgrade in place (apt), which keeps the paths but changes the version.
+        // Detects an in-place upgrade (apt), which changes the version but not the paths.
         println!("cargo::rerun-if-changed={}", facts.executable);
         println!("cargo::rerun-if-changed={}", Path::new(library_dir).join(&library).display());
     }
@@ -85,8 +85,8 @@ print(sysconfig.get_config_var('Py_ENABLE_SHARED') or 0)";
         let is_system =
             ["/lib", "/usr/lib"].iter().any(|dir| Path::new(library_dir).starts_with(dir));
         let tags = if is_system { "--enable-new-dtags" } else { "--disable-new-dtags" };
-        // Last, the library next to a program that was copied to another machine, such as in a
-        // conda environment.
+        // Last comes the library beside a program that was copied to another machine, for example
+        // in a conda environment.
         format!("-Wl,{tags},-rpath,{library_dir}:$ORIGIN/../lib")
     }
 
@@ -97,18 +97,18 @@ print(sysconfig.get_config_var('Py_ENABLE_SHARED') or 0)";
         let python = &facts.executable;
         if facts.shared {
             stop(&format!(
-                "{python} has no {library} in {library_dir}. Debian, Ubuntu: apt install \
+                "{python} has no {library} in {library_dir}. On Debian and Ubuntu: apt install \
                  python3-dev (or libpython{version}-dev, for this version)"
             ));
         }
         stop(&format!(
             "{python} was built without a shared libpython (--enable-shared), so it cannot be \
-             embedded. Set PYO3_PYTHON to another, for instance /usr/bin/python3 (apt install \
-             python3-dev python3-venv)"
+             embedded. Set PYO3_PYTHON to another Python, for example /usr/bin/python3 (apt \
+             install python3-dev python3-venv)"
         ));
     }
 
-    fn ask(executable: &str) -> Facts {
+    fn query(executable: &str) -> Facts {
         let output = Command::new(executable)
             .args(["-I", "-c", FACTS_SCRIPT])
             .output()
@@ -117,7 +117,7 @@ print(sysconfig.get_config_var('Py_ENABLE_SHARED') or 0)";
         let lines: Vec<&str> = text.lines().collect();
         let [base_executable, version, base_prefix, shared] = lines[..] else {
             let message = String::from_utf8_lossy(&output.stderr);
-            stop(&format!("{executable} gave an unexpected answer ({}): {message}", output.status));
+            stop(&format!("unexpected output of {executable} ({}): {message}", output.status));
         };
         Facts {
             executable: base_executable.to_owned(),

@@ -1,8 +1,8 @@
 #!/usr/bin/env bash
 # Builds a release for one Python and this kind of machine: `deploy/release.sh FOLDER`.
 # It consists of a wheel, and an archive of the program with its Python package. The Python is
-# PYO3_PYTHON, or python3. Both need libpython of that minor version: the system's, a conda
-# environment's, or one in LD_LIBRARY_PATH.
+# PYO3_PYTHON, or else python3. Both files need the libpython of that minor version: the system's, a
+# conda environment's, or one in LD_LIBRARY_PATH.
 set -euo pipefail
 cd "$(dirname "${BASH_SOURCE[0]}")/.."
 [ $# -eq 1 ] || { sed -n 2,5p "$0" >&2; exit 2; }

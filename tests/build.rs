@@ -1,6 +1,6 @@
-//! Lets this crate's executables find libpython where the linked interpreter keeps it.
+//! Sets the path of libpython in the executables of this crate.
 //!
-//! `actors/build.rs` asked the interpreter; its answer arrives in the environment because
+//! `actors/build.rs` asks the interpreter; its answer arrives in the environment because
 //! `dmprl-actors` has a `links` key.
 
 fn main() {

@@ -1,4 +1,4 @@
-//! Stage 3 of 8, its end: sends a worker's finished segments to the learner.
+//! Stage 3 of 8, delivery: sends a worker's finished segments to the learner.
 //!
 //! [`Delivery`] keeps each segment in an outbox until the learner has acknowledged it, offers it to
 //! the worker's queue, and waits while the queue or the outbox is full. It is also built without
@@ -17,16 +17,17 @@ use dmprl_shared::transport::{
     WorkerTransport,
 };
 use thiserror::Error;
+use tracing::warn;
 
-/// Maximum wait for one command, so that a stop is noticed.
+/// Maximum wait for a command; a stop request is checked in between.
 const COMMAND_WAIT: Duration = Duration::from_millis(100);
 /// Pause between two attempts to attach, or between two checks for the first policy.
 pub(crate) const ATTACH_PAUSE: Duration = Duration::from_millis(2);
-/// Time limit to attach. A learner that is ready answers at once.
+/// Time limit to attach. A learner that is ready answers immediately.
 pub(crate) const ATTACH_LIMIT: Duration = Duration::from_secs(30);
 /// Pause after the first offer to a full queue; it doubles with each retry.
 const FULL_QUEUE_PAUSE: Duration = Duration::from_micros(200);
-/// Maximum pause. The segments still in the queue keep the learner busy for longer than this.
+/// Maximum pause. The segments in the queue keep the learner busy for longer than this.
 const FULL_QUEUE_PAUSE_MAX: Duration = Duration::from_millis(3);
 /// Interval between two reports of the counts.
 const REPORT_INTERVAL: Duration = Duration::from_secs(1);
@@ -40,7 +41,7 @@ pub enum DeliveryError {
     /// The transport failed.
     #[error(transparent)]
     Transport(#[from] TransportError),
-    /// The learner did not answer.
+    /// The worker could not attach in time.
     #[error("worker {index} could not attach to the learner within {ATTACH_LIMIT:?}")]
     Attach {
         /// The worker.
@@ -92,7 +93,7 @@ pub fn attach(
                 return Err(DeliveryError::Attach { index, cause });
             }
             Err(_) if supervisor.stop_requested() => return Ok(None),
-            // The slot of a killed predecessor is free once the learner has cleaned it up.
+            // The slot of a killed predecessor is free after the learner has cleaned it up.
             Err(_) => std::thread::sleep(ATTACH_PAUSE),
         }
     }
@@ -101,7 +102,7 @@ pub fn attach(
 /// An event in the delivery of a worker's segments and policies.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum DeliveryEvent<'a> {
-    /// A segment is finished; it is neither kept nor offered yet.
+    /// A segment is finished, but not in the outbox yet.
     Produced {
         /// Its header.
         header: &'a SegmentHeader,
@@ -110,9 +111,9 @@ pub enum DeliveryEvent<'a> {
     },
     /// The learner has acknowledged the segments up to this one; the outbox has dropped them.
     Acknowledged(Watermark),
-    /// A newer policy was taken over.
+    /// A newer policy was received.
     PolicyTaken {
-        /// Number of the learner that published it.
+        /// Epoch of the learner that published it.
         epoch: u64,
         /// Its version.
         version: u64,
@@ -137,8 +138,8 @@ pub struct Delivery<'a, T: WorkerTransport> {
 }
 
 impl<'a, T: WorkerTransport> Delivery<'a, T> {
-    /// Creates a delivery that has sent nothing. It warns each time a segment has waited for
-    /// another `deadline`.
+    /// Creates a delivery that has sent nothing. It logs a warning whenever a segment has waited
+    /// for another `deadline`.
     pub fn new(
         supervisor: &'a dyn Supervisor,
         deadline: Duration,
@@ -197,8 +198,8 @@ impl<'a, T: WorkerTransport> Delivery<'a, T> {
         Ok(taken)
     }
 
-    /// Puts a segment into the outbox and waits until the queue has taken it. Drops nothing: by a
-    /// full queue the learner slows its workers down.
+    /// Puts a segment into the outbox and waits until the queue has accepted it. No segment is
+    /// dropped: a full queue is the learner's back-pressure on its workers.
     ///
     /// # Errors
     /// `StopRequested` if a stop is requested while the segment waits, or if the transport fails.
@@ -227,8 +228,8 @@ impl<'a, T: WorkerTransport> Delivery<'a, T> {
                 let seconds = since.elapsed().as_secs();
                 let why = match outcome {
                     SendOutcome::Detached => "no learner is attached to its queue",
-                    SendOutcome::Full => "the learner takes nothing from its full queue",
-                    SendOutcome::Delivered => "the learner acknowledges nothing that it has taken",
+                    SendOutcome::Full => "its queue is full and the learner does not read from it",
+                    SendOutcome::Delivered => "the learner acknowledges none of its segments",
                 };
                 self.warn(format!("worker {} has waited {seconds} s: {why}", self.index()));
             }
@@ -239,8 +240,8 @@ impl<'a, T: WorkerTransport> Delivery<'a, T> {
         }
     }
 
-    /// Offers the kept segments until the learner has acknowledged all of them, for at most
-    /// `limit`.
+    /// Offers the segments in the outbox until the learner has acknowledged all of them, for at
+    /// most `limit`.
     ///
     /// # Errors
     /// If the transport fails.
@@ -272,7 +273,7 @@ impl<'a, T: WorkerTransport> Delivery<'a, T> {
         Ok(())
     }
 
-    /// Reports the counts once per second; returns whether a report was due.
+    /// Reports the counts if the last report is a second old; returns whether it did.
     ///
     /// # Errors
     /// If the transport fails.
@@ -291,14 +292,14 @@ impl<'a, T: WorkerTransport> Delivery<'a, T> {
     pub fn report(&mut self) -> Result<(), DeliveryError> {
         self.take_acknowledgements()?;
         let sent = self.outbox.sent();
-        // If the supervisor is gone, the loop notices it as a stop.
+        // If the supervisor is gone, a stop is requested, which ends the loop.
         let _ = self.supervisor.report(&Report::Sent(sent.since(&self.reported)));
         (self.reported, self.reported_at) = (sent, Instant::now());
         Ok(())
     }
 
     fn warn(&self, message: String) {
-        eprintln!("warning: {message}");
+        warn!("{message}");
         self.supervisor.warn(message);
     }
 }
@@ -338,7 +339,7 @@ mod tests {
     }
 
     #[test]
-    fn a_segment_that_waits_for_a_full_queue_is_kept_and_named_in_a_warning() {
+    fn a_segment_that_waits_for_a_full_queue_is_kept_and_causes_a_warning() {
         let supervisor =
             FakeSupervisor::stopping_on(|report| matches!(report, Report::Warning { .. }));
         let (mut delivery, _receiver, _) = delivery(&supervisor, Duration::from_millis(2));
@@ -347,7 +348,7 @@ mod tests {
         assert!(matches!(refused, DeliveryError::StopRequested), "{refused}");
         let warnings = supervisor.warnings();
         assert_eq!(warnings.len(), 1, "{warnings:?}");
-        assert!(warnings[0].contains("the learner takes nothing from its full queue"));
+        assert!(warnings[0].contains("its queue is full"));
         assert!(supervisor.heartbeats().iter().all(|doing| *doing == Activity::Waiting));
         let sent = delivery.sent();
         assert_eq!((sent.produced, sent.sent, sent.acked), (3, 2, 0));

@@ -1,18 +1,19 @@
-//! Stage 3 of 8: makes the environments of a process, watches calls into them, reports failures.
-//! Called by worker and evaluator.
+//! Stage 3 of 8: creates the environments of a process, watches calls into them and reports
+//! failures. Called by worker and evaluator.
 
-use std::io::{self, Write};
+use std::io;
 use std::path::Path;
 use std::time::Duration;
 
 use dmprl_shared::config::ExperimentConfig;
 use dmprl_shared::supervision::{Report, Supervisor};
 use thiserror::Error;
+use tracing::info;
 
 use crate::python_env::{Interpreter, InterpreterOptions, PythonEnvironments, PythonError};
 use crate::watchdog;
 
-/// Why environments could not be made.
+/// Why environments could not be created.
 #[derive(Debug, Error)]
 pub enum EnvironmentsError {
     /// Python failed.
@@ -32,10 +33,10 @@ pub fn interpreter(venv: &Path, config: &ExperimentConfig) -> Result<Interpreter
     Interpreter::start(&InterpreterOptions { venv: venv.to_owned(), python_path })
 }
 
-/// Makes `count` environments of the run's task and watches every call into them.
+/// Creates `count` environments of the run's task and watches every call into them.
 ///
 /// # Errors
-/// If the environments cannot be made or the watchdog cannot be started.
+/// If the environments cannot be created or the watchdog cannot be started.
 pub fn make(
     interpreter: &Interpreter,
     config: &ExperimentConfig,
@@ -48,9 +49,9 @@ pub fn make(
     Ok(environments)
 }
 
-/// Watches calls into the environments: if one does not return in time, calls `on_hang` with a
-/// message on the watchdog's thread. The hanging thread may hold the interpreter forever, so only a
-/// new process helps.
+/// Starts a watchdog: if a call into the environments does not return in time, it calls `on_hang`
+/// with a message, on its own thread. The hanging thread may hold the GIL forever, so only a new
+/// process can continue.
 ///
 /// # Errors
 /// The watchdog cannot be started.
@@ -60,7 +61,7 @@ pub fn watch(
     on_hang: impl FnOnce(String) + Send + 'static,
 ) -> Result<(), EnvironmentsError> {
     let seconds = config.actors.env_call_timeout_s;
-    // A limit that a clock cannot represent is no limit.
+    // A timeout that `Duration` cannot represent means no timeout.
     let timeout = Duration::try_from_secs_f64(seconds).unwrap_or(Duration::MAX);
     let id = environments.spec().id.clone();
     let hung = move |hang: watchdog::Hang| {
@@ -74,15 +75,14 @@ pub fn watch(
     watchdog::watch(environments.calls(), timeout, hung).map_err(EnvironmentsError::Watchdog)
 }
 
-/// Logs each failure of an environment and reports their number to the supervisor; returns it.
+/// Logs each failure of an environment, reports their number to the supervisor and returns it.
 pub fn report_failures(failures: &[String], supervisor: &dyn Supervisor) -> u64 {
     let count = failures.len() as u64;
     let Some(last) = failures.last() else { return count };
     for failure in failures {
-        // `eprintln!` would panic if the log's reader is gone.
-        let _ = writeln!(io::stderr(), "environment failure: {failure}");
+        info!("environment failure: {failure}");
     }
-    // If the supervisor is gone, the loop notices it as a stop.
+    // If the supervisor is gone, a stop is requested, which ends the loop.
     let _ = supervisor.report(&Report::EnvFailures { count, last: last.clone() });
     count
 }

@@ -1,4 +1,4 @@
-//! Stage 8 of 8, its first half: runs episodes on fixed seeds without noise, in separate
+//! Stage 8 of 8, evaluation: runs episodes with fixed seeds and without noise, in separate
 //! environments. Called by the evaluator's loop.
 
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -17,8 +17,8 @@ const EPISODE_STEPS_MAX: u32 = 10_000;
 /// Maximum number of repeats of an episode, with the same seed, after a failure of its environment.
 const EPISODE_REPEATS_MAX: u32 = 1;
 
-/// Maximum number of environments that an evaluation runs in parallel. Each episode begins with a
-/// reset of its own seed, so the number does not change the result.
+/// Maximum number of environments that an evaluation runs in parallel. Each episode starts with a
+/// reset with its own seed, so this number does not affect the result.
 pub const ENVIRONMENTS_MAX: usize = 10;
 
 /// Which episodes to run, and a flag that aborts them.
@@ -37,14 +37,15 @@ pub struct Episodes<'a> {
 pub struct Evaluation {
     /// Sum of rewards of each episode, in the order of the seeds.
     pub returns: Vec<f64>,
-    /// Share of episodes that reported success at their last step; `None` if the task reports none.
+    /// Fraction of episodes that reported success at their last step; `None` if the task does not
+    /// report success.
     pub success_rate: Option<f64>,
     /// Mean |u_t - u_{t-1}| over all steps and action dimensions.
     pub smoothness: f64,
 }
 
 impl Evaluation {
-    /// Mean of the returns.
+    /// Returns the mean of the returns.
     #[must_use]
     pub fn return_mean(&self) -> f64 {
         self.returns.iter().sum::<f64>() / self.returns.len().max(1) as f64
@@ -71,7 +72,7 @@ pub struct Trace {
     pub rewards: Vec<f64>,
 }
 
-/// Sums over episodes that run in parallel, one in each environment.
+/// Sums of episodes that run in parallel, one per environment.
 struct Wave {
     returns: Vec<f64>,
     success: Vec<u8>,
@@ -97,7 +98,7 @@ impl Evaluator {
         envs: usize,
     ) -> Result<Self, PolicyError> {
         let policy = Policy::new(config, environments.spec())?;
-        // Repeats of an episode have their own limit.
+        // The number of repeats of an episode has its own limit.
         let faults = Faults::new(envs, u32::MAX);
         Ok(Self {
             environments,
@@ -112,8 +113,9 @@ impl Evaluator {
     /// Creates an evaluator for a single environment that records each step of an episode.
     /// `on_steps` is called after each segment with the number of steps so far.
     ///
-    /// The network still gets as many rows as in an evaluation. The product of a single row is
-    /// rounded differently, and chaotic dynamics such as a bouncing ball amplify the last bit.
+    /// The network still processes as many rows as in an evaluation. With a single row, matrix
+    /// products are rounded differently, and chaotic dynamics such as a bouncing ball amplify the
+    /// difference.
     ///
     /// # Errors
     /// As [`Evaluator::new`].
@@ -128,18 +130,19 @@ impl Evaluator {
         Ok(Self { envs: 1, faults, trace, on_steps, ..evaluator })
     }
 
-    /// Takes the trace of the last episode; empty if this evaluator records none.
+    /// Returns the trace of the last episode and clears it; empty if this evaluator does not record
+    /// traces.
     pub fn take_trace(&mut self) -> Trace {
         self.trace.as_mut().map(std::mem::take).unwrap_or_default()
     }
 
-    /// The environments.
+    /// Returns the environments.
     #[must_use]
     pub fn environments(&self) -> &PythonEnvironments {
         &self.environments
     }
 
-    /// The policy's architecture.
+    /// Returns the policy's architecture.
     #[must_use]
     pub fn policy(&self) -> &Policy {
         &self.runner.policy
@@ -185,6 +188,7 @@ impl Evaluator {
         }))
     }
 
+    /// Runs up to E episodes in parallel; returns `None` if a stop was requested.
     fn wave(
         &mut self,
         Episodes { count, first_seed, stop }: Episodes<'_>,
@@ -230,7 +234,7 @@ impl Evaluator {
     }
 
     /// Restarts the episodes of failed environments. A failed environment whose episode is complete
-    /// is reset, too, because all environments step together.
+    /// is also reset, because all environments are stepped together.
     fn restart_episodes(&mut self, wave: &mut Wave) -> Result<(), RolloutError> {
         let dims = self.runner.policy.layout().action_len;
         let mask = self.faults.failed().to_vec();

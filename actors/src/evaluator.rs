@@ -21,13 +21,13 @@ use crate::evaluate::{ENVIRONMENTS_MAX, Episodes, Evaluator};
 use crate::python_env::Interpreter;
 use crate::rollout::RolloutError;
 
-/// Maximum wait for one command, so that a stop is noticed.
+/// Maximum wait for a command; a stop request is checked in between.
 const COMMAND_WAIT: Duration = Duration::from_millis(100);
 
 /// Why evaluations ended.
 #[derive(Debug, Error)]
 pub enum EvaluationError {
-    /// The environments cannot be made.
+    /// The environments cannot be created.
     #[error(transparent)]
     Environments(#[from] EnvironmentsError),
     /// The policy does not fit the environments.
@@ -47,11 +47,11 @@ pub enum EvaluationError {
     Row(Box<dyn Error + Send + Sync>),
 }
 
-/// Makes environments and policy of a run's evaluations. `on_hang` is called if a call into the
-/// environments does not return (see [`environments::watch`]).
+/// Creates the environments and the policy for a run's evaluations. `on_hang` is called if a call
+/// into the environments does not return (see [`environments::watch`]).
 ///
 /// # Errors
-/// If the environments cannot be made, or the policy does not fit them.
+/// If the environments cannot be created, or the policy does not fit them.
 pub fn evaluator(
     interpreter: &Interpreter,
     config: &ExperimentConfig,
@@ -62,7 +62,7 @@ pub fn evaluator(
     Ok(Evaluator::new(config, environments, envs)?)
 }
 
-/// Settings of all evaluations of a run.
+/// Settings for all evaluations of a run.
 pub struct Evaluations<'a> {
     /// The run's configuration.
     pub config: &'a ExperimentConfig,
@@ -86,8 +86,8 @@ pub enum Answer {
 /// Stores a row; an error ends the evaluator.
 pub type Keep<'a> = &'a mut dyn FnMut(&EvaluationRow) -> Result<(), Box<dyn Error + Send + Sync>>;
 
-/// Answers evaluation requests until a stop is requested. Passes each row to `keep` before it
-/// reports it.
+/// Answers evaluation requests until a stop is requested. Each row is passed to `keep` before it is
+/// reported.
 ///
 /// # Errors
 /// If the environments fail, a policy cannot be loaded, `keep` fails or the supervisor is gone. A

@@ -23,7 +23,7 @@ pub struct Exploration {
 }
 
 impl Exploration {
-    /// Creates the noise for `envs` environments of `dims` action dimensions.
+    /// Creates the noise for `envs` environments with `dims` action dimensions.
     #[must_use]
     pub fn new(
         config: ExplorationConfig,
@@ -38,7 +38,7 @@ impl Exploration {
         Self { config, random, pink, held: vec![0.0; dims] }
     }
 
-    /// Draws the actions `u` of a segment without the policy.
+    /// Draws random actions `u` for a segment, without the policy.
     pub fn warm_up(&mut self, runner: &mut PolicyRunner) {
         let range = self.config.warm_up_range as f32;
         let random = &mut self.random;
@@ -53,8 +53,8 @@ impl Exploration {
 
     /// Converts the network's outputs to `u` with noise, within [-1, 1].
     ///
-    /// A Gaussian policy draws from its own distribution, and kind and std of the noise have no
-    /// effect. If its standard deviations are learned parameters, no tanh bounds its draws.
+    /// A Gaussian policy draws from its own distribution; the configured noise then has no effect.
+    /// If its standard deviations are learned parameters, its actions are not bounded.
     pub fn explore(&mut self, runner: &mut PolicyRunner) {
         if !runner.std.is_empty() {
             runner.decode();
@@ -129,7 +129,7 @@ impl Exploration {
         }
     }
 
-    /// Resets the noise of environment `env`, whose episode has ended.
+    /// Resets the noise of environment `env` at the end of its episode.
     pub fn episode_ended(&mut self, env: usize) {
         let dims = self.held.len();
         if let Some(sources) = self.pink.get_mut(env * dims..(env + 1) * dims) {
@@ -145,8 +145,8 @@ fn normal(random: &mut impl Rng) -> f32 {
 /// Number of octaves of the pink noise. 2^8 steps are longer than typical episodes.
 const OCTAVES: usize = 8;
 
-/// Pink noise of unit variance (Voss): the sum of white sources, of which source i is drawn again
-/// every 2^i steps.
+/// Pink noise of unit variance (Voss's method): the sum of white sources, where source i is drawn
+/// again every 2^i steps.
 #[derive(Debug, Clone, Copy, Default)]
 struct PinkNoise {
     sources: [f32; OCTAVES],
@@ -189,7 +189,7 @@ mod tests {
         layers.finish().unwrap().resolve(Limits { cores: 1 }).unwrap()
     }
 
-    /// A new policy with some observations, and exploration for it.
+    /// Creates a new policy with some observations, and exploration for it.
     fn scene(keys: &[(&str, &str)]) -> (PolicyRunner, Exploration) {
         let config = config(keys);
         let spec = EnvSpec {
@@ -214,7 +214,7 @@ mod tests {
         (runner, Exploration::new(config.exploration, random, ENVS, DIMS))
     }
 
-    /// Noise that exploration adds to each action, (E, K, A). No action reaches a bound.
+    /// Returns the noise that exploration adds to each action, (E, K, A). No action is clipped.
     fn noise(keys: &[(&str, &str)]) -> Vec<f32> {
         let (mut runner, mut exploration) = scene(keys);
         runner.decode();
@@ -231,7 +231,7 @@ mod tests {
     fn noise_on_actions_has_the_configured_spread() {
         for kind in ["gaussian", "segment", "pink"] {
             let noise = noise(&[("exploration.kind", kind), ("exploration.std", "0.1")]);
-            // 400 independent numbers at least: standard error 0.0035; four of them.
+            // At least 400 independent numbers; the tolerance is four standard errors of 0.0035.
             assert!((std(&noise) - 0.1).abs() < 0.014, "{kind}: {}", std(&noise));
         }
     }
@@ -247,7 +247,7 @@ mod tests {
         };
         assert_eq!((held("segment"), held("gaussian"), held("pink")), (ENVS, 0, 0));
         let noise = noise(&[("exploration.kind", "segment")]);
-        assert!(noise[0] != noise[1] && noise[0] != noise[K * DIMS], "one for all dimensions");
+        assert!(noise[0] != noise[1] && noise[0] != noise[K * DIMS], "one draw for all dimensions");
     }
 
     #[test]
@@ -294,7 +294,8 @@ mod tests {
         exploration.warm_up(&mut runner);
         let first = runner.u.clone();
         assert!(std(&first) > 0.01 && first.iter().all(|u| u.abs() <= 1.0));
-        // Actions of one segment belong to one motion, so they differ less than those of two.
+        // Actions within a segment belong to one motion, so successive ones differ less than across
+        // segments.
         let jump = |from: usize, to: usize| {
             let all = first.chunks_exact(K * DIMS).zip(first.chunks_exact(K * DIMS).skip(1));
             std(&all
@@ -308,14 +309,14 @@ mod tests {
 
     #[test]
     fn a_gaussian_policy_draws_from_its_own_distribution() {
-        // Squashed: within the bounds, whatever the configured noise.
+        // Squashed: within the bounds, regardless of the configured noise.
         let (mut runner, mut exploration) =
             scene(&[("algorithm.name", "sac"), ("exploration.std", "0.0")]);
         runner.decode();
         let mean = runner.u.clone();
         exploration.explore(&mut runner);
         assert!(runner.u.iter().zip(&mean).all(|(u, mean)| u != mean && u.abs() <= 1.0));
-        // With learned standard deviations: also outside them.
+        // With learned standard deviations: also outside the bounds.
         let ndp = [
             ("algorithm.name", "ndp"),
             ("policy.controller", "position"),
@@ -355,8 +356,8 @@ mod tests {
             let products = episodes.iter().map(|e| e[16] * e[16 + lag]).sum::<f32>();
             products / episodes.len() as f32
         };
-        // Standard error of each about 0.02. Expected: the share of sources not renewed in between;
-        // at step 32 those of 1, 2, 4, 8, 16 and 32 steps are.
+        // The standard error of each is about 0.02. The expected value is the fraction of sources
+        // that are not drawn again in between; at step 32 those of 1, 2, 4, 8, 16 and 32 steps are.
         assert!((correlation(0) - 1.0).abs() < 0.1, "{}", correlation(0));
         assert!((correlation(1) - 7.0 / 8.0).abs() < 0.1, "{}", correlation(1));
         assert!((correlation(16) - 2.0 / 8.0).abs() < 0.1, "{}", correlation(16));

@@ -1,7 +1,7 @@
 //! Stage 3 of 8: finds, describes and counts environments that failed in the last call. Called by
 //! the rollout and the evaluator.
 //!
-//! A failed environment loses only its own segment. The Python side makes it again and reports it
+//! A failed environment loses only its own segment. The Python side recreates it and reports it
 //! ([`PythonEnvironments::failed`]). If a `SegmentEnv` returns numbers that are not finite, this
 //! module detects it, and the caller resets the environment.
 
@@ -10,10 +10,10 @@ use dmprl_shared::spec::EnvSpec;
 use crate::python_env::{PythonEnvironments, PythonError};
 
 /// Maximum length of a description. An exception may contain a whole model file.
-const SENTENCE_CHARS_MAX: usize = 500;
-/// Number of segments without a fault after which the failures no longer count, as after a
-/// completed episode. An environment without a time limit may never complete an episode.
-const SOUND_SEGMENTS: u32 = 1_000;
+const DESCRIPTION_CHARS_MAX: usize = 500;
+/// Number of fault-free segments after which earlier failures no longer count, as after a completed
+/// episode. An environment without a time limit may never complete an episode.
+const FAULT_FREE_SEGMENTS: u32 = 1_000;
 
 /// The failures of a set of environments.
 #[derive(Debug)]
@@ -34,23 +34,23 @@ pub struct Faults {
 /// Failures of one environment that still count.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 struct FailureRecord {
-    /// Failures since the last completed episode, or since [`SOUND_SEGMENTS`] without a fault.
+    /// Failures since the last completed episode, or since [`FAULT_FREE_SEGMENTS`].
     failures: u32,
-    /// Segments without a fault since the first of these failures.
-    sound_segments: u32,
+    /// Fault-free segments since the first of these failures.
+    fault_free_segments: u32,
 }
 
 impl FailureRecord {
     fn failed(&mut self) {
         if self.failures == 0 {
-            self.sound_segments = 0;
+            self.fault_free_segments = 0;
         }
         self.failures = self.failures.saturating_add(1);
     }
 
-    fn ran_soundly(&mut self) {
-        self.sound_segments += 1;
-        if self.sound_segments >= SOUND_SEGMENTS {
+    fn ran_without_fault(&mut self) {
+        self.fault_free_segments += 1;
+        if self.fault_free_segments >= FAULT_FREE_SEGMENTS {
             *self = Self::default();
         }
     }
@@ -68,9 +68,9 @@ pub struct FailureBudgetExceeded {
 }
 
 impl Faults {
-    /// Creates the record for `envs` environments. The budget is exceeded by more than
-    /// `failures_max` failures with neither a completed episode nor a thousand sound segments in
-    /// between.
+    /// Creates the records of `envs` environments. The budget of an environment is exceeded by more
+    /// than `failures_max` failures without a completed episode or a thousand fault-free segments
+    /// in between.
     #[must_use]
     pub fn new(envs: usize, failures_max: u32) -> Self {
         Self {
@@ -92,30 +92,30 @@ impl Faults {
         &mut self,
         environments: &mut PythonEnvironments,
     ) -> Result<bool, PythonError> {
-        let told = environments.failed().iter().any(|&failed| failed != 0);
-        let mut sentences = if told { environments.take_failures()? } else { Vec::new() };
+        let reported = environments.failed().iter().any(|&failed| failed != 0);
+        let mut descriptions = if reported { environments.take_failures()? } else { Vec::new() };
         let environments = &*environments;
         let mut any = false;
         for env in 0..self.failed.len() {
-            let made = environments.failed()[env] != 0;
-            let cause = match made {
-                true => Some(taken(&mut sentences, environments.spec(), env)),
+            let recreated = environments.failed()[env] != 0;
+            let cause = match recreated {
+                true => Some(take_description(&mut descriptions, environments.spec(), env)),
                 false => segment_fault(environments, env),
             };
             self.failed[env] = cause.is_some();
-            // A remade environment may still begin with a number that is not finite in 32 bits.
-            let sound = made && start_fault(environments, env).is_none();
-            self.needs_reset[env] = cause.is_some() && !sound;
+            // A recreated environment may still start with a number that is not finite in 32 bits.
+            let can_continue = recreated && start_fault(environments, env).is_none();
+            self.needs_reset[env] = cause.is_some() && !can_continue;
             if let Some(cause) = cause {
                 any = true;
                 self.note(&cause);
                 self.records[env].failed();
                 self.causes[env] = plain(&cause);
             } else {
-                self.records[env].ran_soundly();
+                self.records[env].ran_without_fault();
             }
         }
-        sentences.iter().for_each(|sentence| self.note(sentence));
+        descriptions.iter().for_each(|description| self.note(description));
         Ok(any)
     }
 
@@ -128,7 +128,7 @@ impl Faults {
         environments: &mut PythonEnvironments,
         mask: &[bool],
     ) -> Result<(), PythonError> {
-        environments.take_failures()?.iter().for_each(|sentence| self.note(sentence));
+        environments.take_failures()?.iter().for_each(|description| self.note(description));
         for env in (0..mask.len()).filter(|&env| mask[env]) {
             if let Some((name, value)) = start_fault(environments, env) {
                 let task_id = environments.spec().id.clone();
@@ -164,7 +164,7 @@ impl Faults {
         Some(FailureBudgetExceeded { env_index, count, cause })
     }
 
-    /// The newest failure of environment `env`.
+    /// Returns the newest failure of environment `env`.
     #[must_use]
     pub fn cause(&self, env: usize) -> &str {
         &self.causes[env]
@@ -190,47 +190,49 @@ impl Faults {
 /// Replaces control characters and limits the length.
 fn plain(cause: &str) -> String {
     let plain = cause.chars().map(|letter| if letter.is_control() { ' ' } else { letter });
-    plain.take(SENTENCE_CHARS_MAX).collect()
+    plain.take(DESCRIPTION_CHARS_MAX).collect()
 }
 
-/// Takes the description of environment `env`'s failure. A user's `SegmentEnv` may give none.
-fn taken(sentences: &mut Vec<String>, spec: &EnvSpec, env: usize) -> String {
+/// Removes and returns the description of environment `env`'s failure. A user's `SegmentEnv` may
+/// not provide one.
+fn take_description(descriptions: &mut Vec<String>, spec: &EnvSpec, env: usize) -> String {
     let name = format!("environment {env},");
-    match sentences.iter().position(|sentence| sentence.contains(&name)) {
-        Some(at) => sentences.remove(at),
+    match descriptions.iter().position(|description| description.contains(&name)) {
+        Some(at) => descriptions.remove(at),
         None => format!("{}, environment {env}: it failed without a description", spec.id),
     }
 }
 
-/// Index of the first number that is not finite in 32 bits, which the learner uses.
+/// Returns the index of the first number that is not finite in 32 bits, the learner's precision.
 fn not_finite(row: &[f64]) -> Option<usize> {
     row.iter().position(|value| !(*value as f32).is_finite())
 }
 
+/// Describes the first number of environment `env`'s segment that is not finite.
 fn segment_fault(environments: &PythonEnvironments, env: usize) -> Option<String> {
-    const WHAT: &str = "expected a finite 32-bit number";
+    const EXPECTED: &str = "expected a finite 32-bit number";
     let spec = environments.spec();
     let steps = environments.steps()[env] as usize;
     let rewards = environments.rewards();
     let k_max = rewards.len() / environments.steps().len();
-    let where_ = |what: &str| format!("{}, environment {env}, {what}", spec.id);
+    let place = |when: &str| format!("{}, environment {env}, {when}", spec.id);
     let rewards = &rewards[env * k_max..][..steps];
     if let Some(step) = not_finite(rewards) {
-        let place = where_(&format!("step {step} of the segment"));
-        return Some(format!("{place}: reward is {}, {WHAT}", rewards[step]));
+        let place = place(&format!("step {step} of the segment"));
+        return Some(format!("{place}: reward is {}, {EXPECTED}", rewards[step]));
     }
     let o = spec.observation_len;
     let rows = &environments.observations()[env * (k_max + 1) * o..][..(steps + 1) * o];
     if let Some(at) = not_finite(rows) {
-        let place = where_(&format!("step {} of the segment", (at / o).saturating_sub(1)));
+        let place = place(&format!("step {} of the segment", (at / o).saturating_sub(1)));
         let name = spec.observation_name(at % o);
-        return Some(format!("{place}: {name} is {}, {WHAT}", rows[at]));
+        return Some(format!("{place}: {name} is {}, {EXPECTED}", rows[at]));
     }
     let (name, value) = start_fault(environments, env)?;
-    Some(format!("{}: {name} is {value}, {WHAT}", where_("reset")))
+    Some(format!("{}: {name} is {value}, {EXPECTED}", place("reset")))
 }
 
-/// Name and value of the first entry of the next observation that is not finite.
+/// Returns name and value of the first entry of the next observation that is not finite.
 fn start_fault(environments: &PythonEnvironments, env: usize) -> Option<(String, f64)> {
     let spec = environments.spec();
     let row = &environments.next_observations()[env * spec.observation_len..];
@@ -242,27 +244,27 @@ fn start_fault(environments: &PythonEnvironments, env: usize) -> Option<(String,
 mod tests {
     use super::*;
 
-    fn sound(faults: &mut Faults, segments: u32) {
-        (0..segments).for_each(|_| faults.records[0].ran_soundly());
+    fn run_without_fault(faults: &mut Faults, segments: u32) {
+        (0..segments).for_each(|_| faults.records[0].ran_without_fault());
     }
 
     #[test]
-    fn sound_segments_reset_the_budget_of_an_environment_without_episodes() {
+    fn fault_free_segments_reset_the_budget_of_an_environment_without_episodes() {
         let mut faults = Faults::new(1, 2);
         for _ in 0..10 {
             (0..2).for_each(|_| faults.records[0].failed());
             assert_eq!(faults.budget_exceeded(), None);
-            sound(&mut faults, SOUND_SEGMENTS);
+            run_without_fault(&mut faults, FAULT_FREE_SEGMENTS);
         }
     }
 
     #[test]
-    fn too_few_sound_segments_do_not_reset_the_budget() {
+    fn too_few_fault_free_segments_do_not_reset_the_budget() {
         let mut faults = Faults::new(1, 2);
-        // Sound segments before the first failure do not count.
-        sound(&mut faults, SOUND_SEGMENTS - 1);
+        // Segments before the first failure do not count.
+        run_without_fault(&mut faults, FAULT_FREE_SEGMENTS - 1);
         faults.records[0].failed();
-        sound(&mut faults, 1);
+        run_without_fault(&mut faults, 1);
         (0..2).for_each(|_| faults.records[0].failed());
         assert_eq!(faults.budget_exceeded().unwrap().count, 3);
         faults.completed(0);

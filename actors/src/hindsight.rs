@@ -2,13 +2,13 @@
 //! (Andrychowicz et al. 2017, strategy `future`).
 //!
 //! Called by the rollout at the end of each episode. Only the environment can compute the rewards
-//! of another goal, so the worker makes the copies, with one call into Python. A copy is one
+//! for another goal, so the worker creates the copies, with one call into Python. A copy is one
 //! decision: up to K steps with one goal, which the episode reached in or after these steps.
 //!
 //! Differences from Andrychowicz et al., Algorithm 1:
 //! 1. A goal is drawn for a segment of K steps, not for a step; K = 1 is the published algorithm.
-//! 2. With sliding windows, a copy begins at a step drawn from the segment's, but at the latest at
-//!    the last step that leaves K steps until the episode's end.
+//! 2. With sliding windows, a copy starts at a random step of the segment, but no later than K
+//!    steps before the episode's end.
 //! 3. A copy ends where the task would have ended the episode at its goal. A copy with fewer than K
 //!    steps for another reason is dropped, because a missing action is not a zero action.
 
@@ -20,7 +20,8 @@ use rand::RngExt;
 use crate::python_env::{Goals, PythonEnvironments, PythonError, Relabelling};
 use crate::rollout::SegmentMeta;
 
-/// The current episodes, and copies of the last one to end. All buffers are allocated once.
+/// Records of the current episodes, and planned copies of the last episode that ended. All buffers
+/// are allocated once.
 pub(crate) struct Hindsight {
     layout: SegmentLayout,
     goals: Goals,
@@ -29,6 +30,7 @@ pub(crate) struct Hindsight {
     random: Stream,
     /// One episode for each environment.
     episodes: Vec<Episode>,
+    /// Planned copies.
     drawn: Vec<Draw>,
     relabelling: Relabelling,
     task_id: String,
@@ -42,12 +44,12 @@ struct Episode {
     observations: Vec<f32>,
     /// Actions u, (T, A).
     actions: Vec<f32>,
-    /// Goals reached, (T+1, G). 64-bit, so that thresholds are compared as in the environment.
+    /// Achieved goals, (T+1, G), in 64 bits, so that thresholds are compared as in the environment.
     achieved: Vec<f64>,
     segments: Vec<Decision>,
 }
 
-/// A segment of an episode.
+/// A segment of an episode: `len` steps from step `first`.
 #[derive(Debug, Clone, Copy)]
 struct Decision {
     first: usize,
@@ -55,21 +57,21 @@ struct Decision {
     policy_version: u64,
 }
 
-/// A planned copy: steps `first` to `first + len`, with the goal reached in row `goal`.
+/// A planned copy: `len` steps from step `first`, with the goal that was achieved in row `goal`.
 #[derive(Debug, Clone, Copy)]
 struct Draw {
     first: usize,
     len: usize,
     goal: usize,
     policy_version: u64,
-    /// First row in the call to the environment.
+    /// Its first row in the call into the environment.
     row: usize,
 }
 
 /// A segment to be added to its episode.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct EpisodeSegment<'a> {
-    /// Number of steps run, 1 to K.
+    /// Number of executed steps, 1 to K.
     pub(crate) steps: usize,
     /// The segment's block.
     pub(crate) block: &'a [f32],
@@ -83,7 +85,7 @@ impl Hindsight {
     /// Creates the records; returns `None` if the configuration disables hindsight.
     ///
     /// # Errors
-    /// `NoGoals` if the environments have no goals, or their episodes no time limit.
+    /// `NoGoals` if the environments have no goals, or their episodes have no time limit.
     pub(crate) fn start(
         config: &ExperimentConfig,
         environments: &PythonEnvironments,
@@ -131,7 +133,7 @@ impl Hindsight {
     /// Adds the last segment of environment `env` to its episode.
     ///
     /// # Errors
-    /// `Interface` if the episode is longer than the specification says.
+    /// `Interface` if the episode is longer than its specified limit.
     pub(crate) fn add(
         &mut self,
         env: usize,
@@ -145,7 +147,7 @@ impl Hindsight {
             return Err(PythonError::Interface {
                 task_id: self.task_id.clone(),
                 name: "episode_steps",
-                reason: format!("an episode is longer than that, {} steps", first + steps),
+                reason: format!("an episode is longer, at least {} steps", first + steps),
             });
         }
         let (seen, actions, _) = self.layout.split(block);
@@ -192,7 +194,7 @@ impl Hindsight {
                 let mut first = segment.first;
                 if self.sliding {
                     first += self.random.random_range(0..segment.len);
-                    // A later copy would be cut short by the episode's end.
+                    // The episode's end would truncate a later copy.
                     first = first.min(episode.steps.saturating_sub(steps_max));
                 }
                 let len = (episode.steps - first).min(steps_max);
@@ -238,7 +240,7 @@ impl Hindsight {
         })
     }
 
-    /// Begins the next episode of environment `env`.
+    /// Starts the next episode of environment `env`.
     pub(crate) fn begin_episode(&mut self, env: usize) {
         self.episodes[env].steps = 0;
         self.episodes[env].segments.clear();

@@ -1,13 +1,13 @@
 //! Stage 3 of 8 and the first half of stage 8: rollout workers and evaluation.
 //!
-//! A worker is one process with one Python interpreter and E environments. In reading order:
-//! [`environments`] makes the environments, [`worker`] is the loop, [`rollout`] runs a segment in
+//! A worker is a process with one Python interpreter and E environments. In reading order:
+//! [`environments`] creates the environments, [`worker`] is the loop, [`rollout`] runs a segment in
 //! all environments with one Python call, [`delivery`] sends the segments to the learner.
 //! [`evaluator`] is the evaluator's loop and [`evaluate`] runs its episodes. Worker and evaluator
-//! talk to their supervisor only through `dmprl_shared::supervision`, and never to the learner's
-//! code.
+//! communicate with their supervisor only through `dmprl_shared::supervision`, and do not use the
+//! learner's code.
 //!
-//! A build without the feature `python`, for a learner only, contains just [`delivery`].
+//! A build without the feature `python`, for a learner only, contains only [`delivery`].
 
 pub mod delivery;
 #[cfg(feature = "python")]

@@ -1,4 +1,4 @@
-//! Stage 3 of 8, deciding: runs a policy for E environments. Called by the rollout and the
+//! Stage 3 of 8, decisions: runs a policy for E environments. Called by the rollout and the
 //! evaluator.
 
 use dmprl_shared::policy::{Head, LearnedStd, Policy, PolicyWorkspace, SmallBatchNetwork};
@@ -15,10 +15,10 @@ pub struct PolicyRunner {
     pub work: PolicyWorkspace,
     /// Current observations, (E, O).
     pub observations: Vec<f32>,
-    /// Actions u of the segment with exploration, (E, K, A). They are within [-1, 1] unless drawn
-    /// from a Gaussian of the policy that is not bounded.
+    /// Actions u of the segment with exploration, (E, K, A). They are in [-1, 1], unless they are
+    /// draws of a policy with an unbounded Gaussian.
     pub u: Vec<f32>,
-    /// Learned standard deviations of the policy, (A,); empty if it has none.
+    /// Learned standard deviations of the policy, (A,); empty if they are not learned.
     pub std: Vec<f32>,
     /// (y, yd) from which each environment's DMP continues, (E, 2A); empty if not carried.
     carried: Vec<f32>,
@@ -80,15 +80,15 @@ impl PolicyRunner {
         self.take_u();
     }
 
-    /// Copies the actions to `u` within [-1, 1]: the mean of a Gaussian may lie outside.
+    /// Copies the actions to `u`, clipped to [-1, 1]: the mean of a Gaussian may be outside.
     fn take_u(&mut self) {
         for (u, action) in self.u.iter_mut().zip(&self.work.actions) {
             *u = action.clamp(-1.0, 1.0);
         }
     }
 
-    /// Converts squashed DMP parameters to `u`. `draw` fills one row of A (1+N+4) for each
-    /// environment.
+    /// Converts squashed DMP parameters to `u`. `draw` fills the row of each environment, with
+    /// A (1+N+4) entries.
     pub fn decode_drawn(&mut self, draw: &mut dyn FnMut(&mut [f32])) {
         if let (Head::Dmp(head), Some(dmp)) = (self.policy.head(), &mut self.work.dmp) {
             let rows = self.observations.len() / self.policy.layout().observation_len;
@@ -115,8 +115,8 @@ impl PolicyRunner {
         }
     }
 
-    /// Sets the state from which environment `env`'s DMP continues: that at the segment's end, or
-    /// rest if its episode has ended.
+    /// Sets the state from which environment `env`'s DMP continues: its state at the segment's end,
+    /// or zero if the episode has ended.
     pub fn carry_state(&mut self, env: usize, ended: bool) {
         let len = self.policy.layout().observation_len - self.policy.env_observation_len();
         if len == 0 {

@@ -13,11 +13,11 @@ use crate::rollout::RolloutError;
 /// One episode of T steps.
 #[derive(Debug, Clone, PartialEq)]
 pub struct EpisodeRecord {
-    /// Seed of its reset.
+    /// Seed of the reset.
     pub seed: u64,
-    /// Sum of its rewards, as in an evaluation.
+    /// Sum of the rewards, as in an evaluation.
     pub return_: f64,
-    /// Whether its last step reported success; `None` if the task reports none.
+    /// Success at the last step; `None` if the task does not report success.
     pub success: Option<bool>,
     /// Actions and rewards.
     pub trace: Trace,
@@ -48,19 +48,19 @@ impl Recorder {
         Ok(Self { evaluator, joints, goal_in_pictures })
     }
 
-    /// Joints of the robot.
+    /// Returns the joints of the robot.
     #[must_use]
     pub fn joints(&self) -> &Joints {
         &self.joints
     }
 
-    /// Description of the goal's appearance in pictures; empty if unknown.
+    /// Returns the goal's appearance in pictures, such as `red ball`; empty if unknown.
     #[must_use]
     pub fn goal_in_pictures(&self) -> &str {
         &self.goal_in_pictures
     }
 
-    /// The policy's architecture.
+    /// Returns the policy's architecture.
     #[must_use]
     pub fn policy(&self) -> &Policy {
         self.evaluator.policy()
@@ -71,7 +71,7 @@ impl Recorder {
         self.evaluator.take_failures()
     }
 
-    /// Runs the episode of a seed; returns `None` if a stop was requested.
+    /// Runs and records the episode of a seed; returns `None` if a stop was requested.
     ///
     /// # Errors
     /// As [`Evaluator::evaluate`].

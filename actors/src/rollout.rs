@@ -1,4 +1,4 @@
-//! Stage 3 of 8, the rollout: observes, decides a segment, steps the environments, delivers.
+//! Stage 3 of 8, the rollout: observes, decides a segment, steps the environments and delivers.
 //!
 //! Called by the worker's loop. A segment takes one call into Python for all E environments; the
 //! rest is Rust on buffers that are allocated once.
@@ -31,18 +31,18 @@ pub enum RolloutError {
     /// One environment has failed more often than `actors.env_failures_max`.
     #[error(
         "environment {env_index} has failed {count} times without completing an episode, more \
-         often than actors.env_failures_max; the last time: {cause}"
+         than actors.env_failures_max allows; last failure: {cause}"
     )]
     FailureBudgetExceeded {
         /// Index of the environment in the worker.
         env_index: usize,
-        /// Failures since its last completed episode or its last thousand sound segments.
+        /// Failures since its last completed episode or its last thousand fault-free segments.
         count: u32,
         /// The last failure.
         cause: String,
     },
     /// An episode of an evaluation failed twice.
-    #[error("the episode of seed {seed} has failed {count} times; the last time: {cause}")]
+    #[error("the episode with seed {seed} has failed {count} times; last failure: {cause}")]
     Episode {
         /// Seed of its reset.
         seed: u64,
@@ -53,7 +53,7 @@ pub enum RolloutError {
     },
 }
 
-/// Takes a finished segment and keeps it until the learner has acknowledged it.
+/// Accepts a finished segment and keeps it until the learner has acknowledged it.
 pub type Deliver<'a, E> = &'a mut dyn FnMut(&SegmentHeader, &[f32]) -> Result<(), E>;
 
 /// Identity of one start of a worker.
@@ -65,13 +65,15 @@ pub struct Identity {
     pub worker_id: u32,
     /// Number of the start of this slot, from 0.
     pub incarnation: u32,
-    /// Index of the worker in the whole run, for its random numbers. A host without a learner
-    /// numbers its slots from 0, but no two workers may draw the same numbers.
+    /// Index of the worker in the whole run, for its random numbers. It differs from `worker_id` on
+    /// a host without a learner, whose slots are numbered from 0: no two workers may draw the same
+    /// numbers.
     pub seed_index: u32,
 }
 
 impl Identity {
-    /// Number of this start's random streams. No two starts of workers of a run share one.
+    /// Returns the number of this start's random streams, unique among all starts of a run's
+    /// workers.
     #[must_use]
     pub fn stream(&self) -> u64 {
         u64::from(self.seed_index) << 32 | u64::from(self.incarnation)
@@ -131,7 +133,7 @@ impl Rollout {
         let envs = config.actors.envs_per_worker;
         let policy = Policy::new(config, environments.spec())?;
         let layout = policy.layout();
-        // A restarted worker begins new episodes, which must differ from its predecessor's.
+        // A restarted worker starts new episodes, which must differ from its predecessor's.
         let worker = identity.stream();
         let random = seeds::stream(config.run.seed, "exploration", worker);
         let env_seeds = environment_seeds(config.run.seed, worker, envs);
@@ -163,7 +165,7 @@ impl Rollout {
         })
     }
 
-    /// The policy's architecture.
+    /// Returns the policy's architecture.
     #[must_use]
     pub fn policy(&self) -> &Policy {
         &self.runner.policy
@@ -173,7 +175,7 @@ impl Rollout {
     /// segment to `deliver`.
     ///
     /// A failed environment's segment is not delivered and uses no sequence number. Its next
-    /// episode begins with the next call. [`Rollout::take_failures`] returns the failure.
+    /// episode starts with the next call. [`Rollout::take_failures`] returns the failure.
     ///
     /// # Errors
     /// If an environment fails permanently or too often, and errors of `deliver`.
@@ -206,18 +208,18 @@ impl Rollout {
                 self.begin_episode(env);
             }
         }
-        // Last, because the segments of the other environments are valid.
+        // Last, because the segments of the other environments are valid even if this fails.
         if failed { Ok(self.reset_failed()?) } else { Ok(()) }
     }
 
-    /// Maximum number of segments that one call delivers.
+    /// Returns the maximum number of segments that one call of [`Rollout::segment`] delivers.
     #[must_use]
     pub fn segments_max(&self) -> usize {
         let copies = self.hindsight.as_ref().map_or(0, Hindsight::copies_max);
         self.episodes.len() * (1 + copies)
     }
 
-    /// Delivers the hindsight copies of environment `env`'s episode, which has ended.
+    /// Delivers the hindsight copies of the episode of environment `env` that has ended.
     fn deliver_copies<E: From<RolloutError>>(
         &mut self,
         env: usize,
@@ -342,7 +344,8 @@ impl Rollout {
     }
 }
 
-/// One seed for each environment of a worker. 31 bits, because some environments accept no more.
+/// Derives a seed for each environment of a worker, of 31 bits because some environments accept no
+/// more.
 fn environment_seeds(master: u64, worker: u64, envs: usize) -> Vec<u64> {
     let seed = |env| seeds::derive(master, "environment", worker << 16 | env) >> 33;
     (0..envs as u64).map(seed).collect()
@@ -353,7 +356,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn environments_of_all_workers_and_restarts_have_distinct_seeds() {
+    fn seeds_differ_between_environments_workers_and_restarts() {
         let workers = (0..16_u64).flat_map(|id| (0..4).map(move |start| id << 32 | start));
         let all: Vec<u64> = workers.flat_map(|worker| environment_seeds(1, worker, 16)).collect();
         let distinct: std::collections::HashSet<_> = all.iter().collect();

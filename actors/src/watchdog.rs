@@ -1,19 +1,19 @@
 //! Stage 3 of 8, the watchdog: detects a call into the environments that does not return.
 //!
-//! A hanging environment may hold the interpreter's lock forever, so code that needs the lock
-//! cannot detect it, and no exception can end it. This thread does not use Python: the caller
-//! records when a call begins and ends, and the thread checks periodically whether the same call
-//! still runs. Started by `environments::watch`.
+//! A hanging environment may hold the GIL forever, so code that needs the GIL cannot detect it, and
+//! no exception can end it. The watchdog's thread does not use Python: the caller records when a
+//! call starts and ends, and the thread checks periodically whether the same call is still running.
+//! Started by `environments::watch`.
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::thread;
 use std::time::Duration;
 
-/// Number of checks, with a pause between them, after which a call counts as hanging. The thread
-/// counts checks and reads no clock, so a process that was suspended (Ctrl-Z, a paused container)
-/// does not look as if it hung.
-const LOOKS_MAX: u32 = 4;
+/// Number of checks after which a call counts as hanging. The thread counts checks instead of
+/// reading a clock, so that a suspended process (Ctrl-Z, a paused container) is not mistaken for a
+/// hanging one.
+const CHECKS_MAX: u32 = 4;
 
 /// Kind of a call.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -43,14 +43,14 @@ impl CallKind {
 #[derive(Debug, Default)]
 pub struct CallState(AtomicU64);
 
-/// A call that is running; dropping it records that the call has returned.
+/// A running call; dropping it records that the call has returned.
 #[derive(Debug)]
 pub struct RunningCall<'a>(&'a CallState);
 
 impl CallState {
-    /// Records that a call begins.
+    /// Records the start of a call.
     pub fn enter(&self, kind: CallKind) -> RunningCall<'_> {
-        // Relaxed, because the thread reads no other memory.
+        // Relaxed, because this value does not guard any other memory.
         let number = (self.0.load(Ordering::Relaxed) >> 2) + 1;
         self.0.store(number << 2 | kind as u64, Ordering::Relaxed);
         RunningCall(self)
@@ -79,8 +79,8 @@ pub struct Hang {
     pub lasted: Duration,
 }
 
-/// Starts the thread. It calls `hung` once, after a call has lasted for `timeout` to 1.25
-/// `timeout`. It ends when `calls` is dropped.
+/// Starts the watchdog's thread. It calls `hung` once, after a call has lasted for `timeout` to
+/// 1.25 `timeout`. It ends when `calls` is dropped.
 ///
 /// # Errors
 /// If the thread cannot be started.
@@ -90,15 +90,15 @@ pub fn watch(
     hung: impl FnOnce(Hang) + Send + 'static,
 ) -> std::io::Result<()> {
     let calls = Arc::downgrade(calls);
-    let pause = timeout / LOOKS_MAX;
+    let pause = timeout / CHECKS_MAX;
     let thread = thread::Builder::new().name("watchdog".into());
     let run = move || {
-        let mut looks = Looks::default();
+        let mut checks = Checks::default();
         loop {
             thread::sleep(pause);
             let Some(calls) = calls.upgrade() else { return };
-            if let Some(kind) = looks.look(calls.0.load(Ordering::Relaxed)) {
-                return hung(Hang { kind, lasted: pause * LOOKS_MAX });
+            if let Some(kind) = checks.check(calls.0.load(Ordering::Relaxed)) {
+                return hung(Hang { kind, lasted: pause * CHECKS_MAX });
             }
         }
     };
@@ -107,14 +107,14 @@ pub fn watch(
 
 /// The last state, and the number of checks since it changed.
 #[derive(Debug, Default)]
-struct Looks {
+struct Checks {
     state: u64,
     count: u32,
 }
 
-impl Looks {
-    /// Checks the state; returns the kind of a call that hangs.
-    fn look(&mut self, state: u64) -> Option<CallKind> {
+impl Checks {
+    /// Checks the state; returns the kind of the current call if it hangs.
+    fn check(&mut self, state: u64) -> Option<CallKind> {
         let kind = match state & 3 {
             1 => CallKind::Reset,
             2 => CallKind::StepSegment,
@@ -126,7 +126,7 @@ impl Looks {
         };
         self.count = if state == self.state { self.count + 1 } else { 0 };
         self.state = state;
-        (self.count >= LOOKS_MAX).then_some(kind)
+        (self.count >= CHECKS_MAX).then_some(kind)
     }
 }
 
@@ -138,24 +138,24 @@ mod tests {
     const PATIENCE: Duration = Duration::from_secs(60);
 
     #[test]
-    fn a_call_hangs_if_it_stays_the_same_and_not_if_another_follows() {
+    fn a_call_hangs_if_it_does_not_change_between_checks() {
         let calls = CallState::default();
-        let mut looks = Looks::default();
-        let mut look = || looks.look(calls.0.load(Ordering::Relaxed));
+        let mut checks = Checks::default();
+        let mut check = || checks.check(calls.0.load(Ordering::Relaxed));
         for _ in 0..10 {
-            assert_eq!(look(), None, "no call is running");
+            assert_eq!(check(), None, "no call is running");
         }
         for _ in 0..10 {
             let call = calls.enter(CallKind::StepSegment);
-            let seen: Vec<_> = (0..LOOKS_MAX).map(|_| look()).collect();
-            assert_eq!(seen, [None; LOOKS_MAX as usize], "it returns in time");
+            let seen: Vec<_> = (0..CHECKS_MAX).map(|_| check()).collect();
+            assert_eq!(seen, [None; CHECKS_MAX as usize], "it returns in time");
             drop(call);
         }
-        // `relabel` was once not watched: a reward that never returned blocked its worker forever.
+        // `relabel` was not watched once, so a reward that never returned blocked its worker.
         for kind in [CallKind::Reset, CallKind::StepSegment, CallKind::Relabel] {
             let _call = calls.enter(kind);
-            assert_eq!((0..LOOKS_MAX).filter_map(|_| look()).count(), 0);
-            assert_eq!(look(), Some(kind));
+            assert_eq!((0..CHECKS_MAX).filter_map(|_| check()).count(), 0);
+            assert_eq!(check(), Some(kind));
         }
     }
 

@@ -1,9 +1,9 @@
 //! Stage 3 of 8, the worker's loop, from its environments to its last report.
 //!
-//! The program `dmprl` reads the arguments, connects to the supervisor and makes the environments
-//! ([`environments()`]). [`run`] does the rest: it reports the environments, waits for the learner,
-//! then takes the newest policy, runs one segment in each environment and delivers it, until a stop
-//! is requested.
+//! The program `dmprl` reads the arguments, connects to the supervisor and creates the environments
+//! ([`environments()`]). [`run`] reports the environments and waits for the learner. Then it takes
+//! the newest policy, runs one segment in each environment and delivers it, until a stop is
+//! requested.
 
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
@@ -36,7 +36,7 @@ pub enum WorkerError {
     /// The supervisor is gone.
     #[error(transparent)]
     Report(#[from] ReportError),
-    /// The learner runs, but has not published a policy.
+    /// The learner is running, but has not published a policy.
     #[error("worker {index}: the learner published no policy within {ATTACH_LIMIT:?}")]
     NoPolicy {
         /// The worker.
@@ -48,30 +48,32 @@ pub enum WorkerError {
 pub struct Worker<'a> {
     /// The run's configuration.
     pub config: &'a ExperimentConfig,
-    /// Which worker of which run it is.
+    /// The worker's identity in the run.
     pub identity: Identity,
-    /// Its environments, made by [`environments()`].
+    /// Its environments, created by [`environments()`].
     pub environments: PythonEnvironments,
     /// Called synchronously at each event of its delivery.
     pub observer: Option<DeliveryObserver>,
-    /// Set for a worker that a user started beside a running training.
+    /// Set for a worker that joined a running training.
     pub joined: Option<JoinedWorker<'a>>,
 }
 
-/// Connections of a worker that joined a run to the program that a user started.
+/// Connects a worker that joined a run to the program that the user started.
 pub struct JoinedWorker<'a> {
-    /// Set once the user has asked the worker to leave the run.
+    /// Set when the user makes the worker leave the run.
     pub leaving: &'a AtomicBool,
     /// Called about once per second with the counts so far.
     pub report_sent: &'a dyn Fn(Sent),
 }
 
-/// Seeds Python's generators and makes a worker's environments. `on_hang` is called if a call into
-/// them does not return (see [`environments::watch`]). `stream` numbers the seeds: no two starts of
-/// workers may share one.
+/// Seeds Python's generators and creates a worker's environments.
+///
+/// - `stream`: as [`Identity::stream`], from which the seed is derived.
+/// - `on_hang`: called if a call into the environments does not return (see
+///   [`environments::watch`]).
 ///
 /// # Errors
-/// If the environments cannot be made or watched.
+/// If the environments cannot be created or watched.
 pub fn environments(
     interpreter: &Interpreter,
     config: &ExperimentConfig,
@@ -84,8 +86,8 @@ pub fn environments(
 
 /// Runs a worker until a stop is requested.
 ///
-/// `attach` connects it to the learner that follows the same plan, or returns none if a stop is
-/// requested first; in the program it is [`crate::delivery::await_learner`].
+/// `attach` connects it to the learner with the same plan, or returns `None` if a stop is requested
+/// first; the program uses [`crate::delivery::await_learner`].
 ///
 /// # Errors
 /// If the environments, the transport or the supervisor fail. A new process may succeed.
@@ -97,7 +99,7 @@ pub fn run<T: WorkerTransport>(
     let Worker { config, identity, environments, observer, joined } = worker;
     supervisor.report(&Report::EnvironmentReady { spec: environments.spec().clone() })?;
     if identity.seed_index == 0 && identity.incarnation == 0 {
-        hint_at_hindsight(config, &environments, supervisor);
+        suggest_hindsight(config, &environments, supervisor);
     }
     let mut rollout = Rollout::start(config, environments, identity)?;
     let plan = Plan::new(config, identity.run_id, rollout.policy());
@@ -146,17 +148,17 @@ fn work<T: WorkerTransport>(
     Ok(())
 }
 
-/// Warns that random exploration rarely reaches the goal of a sparse reward, and names the setting
-/// that helps.
-fn hint_at_hindsight(
+/// Suggests hindsight if the reward is sparse, because random exploration rarely reaches the goal.
+fn suggest_hindsight(
     config: &ExperimentConfig,
     environments: &PythonEnvironments,
     supervisor: &dyn Supervisor,
 ) {
     let is_off = config.replay.hindsight == Hindsight::None;
     if is_off && environments.goals().is_ok_and(|goals| goals.is_sparse) {
-        let message = "the reward only says whether the goal is reached; --set \
-                       replay.hindsight=future learns from goals reached by chance";
+        let message = "the reward is sparse: it only depends on whether the goal is reached. With \
+                       --set replay.hindsight=future the run also learns from goals reached by \
+                       chance";
         supervisor.warn(message.to_owned());
     }
 }

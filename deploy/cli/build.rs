@@ -1,7 +1,7 @@
-//! Records which commit the program is built from, and lets its executables find libpython where
-//! the linked interpreter keeps it.
+//! Records the commit that the program is built from, and links libpython of the chosen interpreter
+//! with a run path.
 //!
-//! `actors/build.rs` asked the interpreter; its answer arrives in the environment because
+//! `actors/build.rs` finds libpython. Cargo passes its result in an environment variable, because
 //! `dmprl-actors` has a `links` key.
 
 use std::path::Path;
@@ -10,8 +10,8 @@ use std::process::{Command, Stdio};
 /// The project's root, relative to this crate.
 const ROOT: &str = "../..";
 
-/// What the program is compiled from, relative to the project's root. Documents and tests are no
-/// part of it. The Python package is read when a run starts: a manifest has its hash.
+/// Sources of the program, relative to the project's root, without documentation and tests. The
+/// Python package is not compiled in; a run's manifest has its hash.
 const SOURCES: [&str; 20] = [
     "Cargo.toml",
     "Cargo.lock",
@@ -45,23 +45,23 @@ fn main() {
         println!("cargo::rerun-if-changed={ROOT}/{source}");
     }
     let commit = commit();
-    // Cargo also sets this for programs that it runs. A name with our own prefix would be taken for
-    // a configuration key.
+    // Without our prefix `DMPRL_`: Cargo also sets the variable for programs that it runs, and they
+    // would take it for a configuration key.
     println!("cargo::rustc-env=GIT_COMMIT_OF_BUILD={}", commit.unwrap_or_default());
 }
 
-/// The commit that is checked out, with `-dirty` where the sources differ from it; none outside a
-/// git repository. A new commit makes Cargo run this again.
+/// Returns the checked-out commit, with the suffix `-dirty` if the sources differ from it; `None`
+/// outside a git repository. Cargo runs this again after a new commit.
 fn commit() -> Option<String> {
-    // A folder inside another project's repository has that project's commits.
+    // Ignore the repository of another project that contains this directory.
     if !git(&["rev-parse", "--show-prefix"])?.is_empty() {
         return None;
     }
-    // `logs/HEAD` grows with every commit and checkout, also where refs are packed.
+    // `logs/HEAD` changes with every commit and checkout, even if refs are packed.
     let mut heads = ["HEAD", "logs/HEAD", "packed-refs"].map(str::to_owned).to_vec();
     heads.extend(git(&["symbolic-ref", "--quiet", "HEAD"]));
     for head in heads {
-        // A path that is not there would count as changed in every build.
+        // Cargo counts a missing path as changed in every build.
         if let Some(path) = git(&["rev-parse", "--git-path", &head])
             && Path::new(ROOT).join(&path).exists()
         {
@@ -75,12 +75,12 @@ fn commit() -> Option<String> {
     Some(if changes.is_empty() { hash } else { format!("{hash}-dirty") })
 }
 
-/// Standard output of a git command in the project's root.
+/// Returns the standard output of a git command in the project's root; `None` if it fails.
 fn git(arguments: &[&str]) -> Option<String> {
     let output = Command::new("git")
         .args(arguments)
         .current_dir(ROOT)
-        // Takes no lock that a commit at the same time would wait for.
+        // Takes no lock that would block a concurrent commit.
         .env("GIT_OPTIONAL_LOCKS", "0")
         .stdin(Stdio::null())
         .stderr(Stdio::null())

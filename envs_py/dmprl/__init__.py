@@ -1,13 +1,13 @@
 """Environments and trained policies of dmprl.
 
-Run a trained policy with NumPy alone::
+Run a trained policy, with NumPy only::
 
     import dmprl
 
     policy = dmprl.Policy.load("policy.safetensors")
     actions = policy.segment(observation)
 
-Train, read a run's figures, and make an environment::
+Train, read a run's evaluations, and create an environment::
 
     run = dmprl.train("reacher", steps=20_000)
     run.evaluations().plot(x="env_steps", y="return_mean")
@@ -52,7 +52,7 @@ SHORT_NAMES = {
 
 
 def make(task: str, **options: Any) -> "gymnasium.Env":
-    """Makes a task as a Gymnasium environment, by its short name or any Gymnasium id.
+    """Creates the Gymnasium environment of a task, by its short name or any Gymnasium id.
 
     :param options: arguments of ``gymnasium.make``, such as ``render_mode="rgb_array"``.
     """
@@ -65,7 +65,7 @@ def _register() -> None:
     try:
         from gymnasium import register
     except ModuleNotFoundError:
-        return  # loading a policy needs no environments
+        return  # a policy can be used without Gymnasium
 
     from dmprl.tasks import TASKS
 

@@ -2,7 +2,7 @@
 
 Each class has ``segment()``, which runs one segment in all E environments and returns the number of
 environment steps, and ``about``, its description. The constructor raises :class:`AbsentError` if
-the peer is unavailable. ``bench_physics`` has the upper bounds, with the same interface.
+the peer is unavailable. ``bench_physics`` defines upper bounds with the same interface.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ class RandomActor:
 
 
 def gymnasium_env(plan: dict) -> Any:
-    """Makes the environment with Gymnasium, or raises :class:`AbsentError` with the reason."""
+    """Creates the environment with Gymnasium, or raises :class:`AbsentError` with the reason."""
     task_id = plan["task"]["id"]
     module_name, _, name = task_id.rpartition(":")
     try:
@@ -65,13 +65,13 @@ def gymnasium_env(plan: dict) -> Any:
             )
             return flattened(gymnasium.make(spec))
     except Exception as error:  # for any error, the rest of the benchmark continues
-        words = f"{type(error).__name__}: {error}"
-        raise AbsentError(f"Gymnasium cannot make {task_id}: {words}") from None
-    raise AbsentError(f"{task_id} is no environment of Gymnasium")
+        reason = f"{type(error).__name__}: {error}"
+        raise AbsentError(f"Gymnasium cannot create {task_id}: {reason}") from None
+    raise AbsentError(f"{task_id} is not a Gymnasium environment")
 
 
 def flattened(env: Any) -> Any:
-    """Adds Gymnasium's wrapper where :func:`flat` is not enough: tuples and nested spaces."""
+    """Adds Gymnasium's wrapper for tuples and nested spaces, which :func:`flat` cannot convert."""
     from gymnasium import spaces, wrappers
 
     space = env.observation_space
@@ -89,7 +89,7 @@ class GymnasiumLoop:
         self._actor = Actor(plan, seed)
         self._dtype = self._envs[0].action_space.dtype
         shape = (plan["env_count"], plan["decision_steps"])
-        # The data for a learner are stored here too, as in the worker.
+        # Like a worker, this loop stores the data for a learner.
         self._observations = np.zeros((*shape, plan["spec"]["observation_len"]))
         self._rewards = np.zeros(shape)
         self._current = np.zeros((plan["env_count"], plan["spec"]["observation_len"]))
@@ -128,8 +128,8 @@ def flat(observation) -> np.ndarray:
 class EnvPoolLoop:
     """Runs EnvPool in its synchronous mode on one thread, with the policy in NumPy.
 
-    EnvPool spends a step on each reset; that step is not counted. If an episode ends inside a
-    segment, the rest of that segment runs in the next episode.
+    EnvPool uses a step for each reset, which is not counted. If an episode ends within a segment,
+    the rest of that segment runs in the next episode.
     """
 
     def __init__(self, plan: dict, seed: int) -> None:
@@ -145,7 +145,8 @@ class EnvPoolLoop:
         expected = (env_count, plan["spec"]["observation_len"])
         if self._current.shape != expected:
             raise AbsentError(
-                f"EnvPool's {task_id} observes {self._current.shape}, the worker {expected}"
+                f"EnvPool's {task_id} has observations of shape {self._current.shape}, the worker "
+                f"of {expected}"
             )
         self._dtype = self._env.action_space.dtype
         shape = (plan["decision_steps"], env_count)
@@ -174,7 +175,7 @@ class EnvPoolLoop:
 class PandaGymLoop:
     """Runs panda-gym's environments one after the other, with random actions and no policy.
 
-    This is a panda-gym user's setup: PyBullet instead of MuJoCo, and everything in Python.
+    This is the usual setup with panda-gym: PyBullet instead of MuJoCo, and everything in Python.
     """
 
     def __init__(self, plan: dict, seed: int) -> None:
@@ -210,12 +211,12 @@ def imported(module_name: str, package: str | None = None) -> ModuleType:
     except ImportError as error:
         raise AbsentError(
             f"{sys.executable} cannot import {package or module_name} ({error}); install it there, "
-            "or name an interpreter that has it with --peer-python"
+            "or choose another interpreter with --peer-python"
         ) from None
 
 
 def envpool_id(task_id: str, known: list[str]) -> str:
-    """Finds EnvPool's id of a Gymnasium task: the same one, or its newest version there."""
+    """Finds EnvPool's id of a Gymnasium task: the same one, or EnvPool's newest version of it."""
     if task_id in known:
         return task_id
     name = task_id.rpartition("-v")[0]

@@ -1,4 +1,4 @@
-"""Physics alone, as an upper bound for the worker in ``dmprl bench rollout``.
+"""Runs only the physics, as an upper bound for the worker in ``dmprl bench rollout``.
 
 The classes have the same interface as the loops of ``bench_peers``.
 """
@@ -24,10 +24,10 @@ EPISODE_STEPS = 100
 
 @dataclass(frozen=True)
 class Episode:
-    """An episode in each of E environments, which physics alone repeats."""
+    """An episode in each of E environments, for replaying only its physics."""
 
     model: Any
-    """Model of MuJoCo."""
+    """MuJoCo's model."""
     frame_skip: int
     """Simulation steps per environment step."""
     starts: NDArray[np.float64]
@@ -38,7 +38,7 @@ class Episode:
 
 @dataclass(frozen=True)
 class Stage:
-    """Environments at the start of an episode, with access to their controls."""
+    """Environments at the start of an episode, and a function that steps them."""
 
     model: Any
     frame_skip: int
@@ -49,7 +49,7 @@ class Stage:
 
 
 class BatchPeer:
-    """Runs ``mujoco.batch.Batch`` without a policy and without recording: physics alone.
+    """Runs ``mujoco.batch.Batch`` without a policy and without recording.
 
     It repeats the same episode in each environment.
     """
@@ -80,7 +80,7 @@ class BatchPeer:
 class Physics(BatchPeer):
     """Runs physics with the worker's model and process settings.
 
-    No worker can be faster; the difference is the worker's own time.
+    No worker can be faster; the difference is the overhead of the worker.
     """
 
     def __init__(self, plan: dict, seed: int) -> None:
@@ -98,14 +98,14 @@ class Ceiling(BatchPeer):
         path = gymnasium_model_path(plan)
         if path is not None:
             episode = gymnasium_episode(plan, seed, path)
-            self.about = f"{about}, {Path(path).name} as Gymnasium ships it"
+            self.about = f"{about}, {Path(path).name} of Gymnasium"
         else:
             from dmprl.mujoco_batch import mujoco_hook
 
             clock = mujoco_hook("mjcb_time").value
             episode = worker_episode(plan, seed)  # removes the clock
             mujoco_hook("mjcb_time").value = clock
-            self.about = f"{about} as it is imported"
+            self.about = f"{about} with its default settings"
         super().__init__(episode, plan["decision_steps"])
 
 
@@ -117,8 +117,8 @@ def worker_episode(plan: dict, seed: int) -> Episode:
     try:
         env = make(task_id, env_count, 1)
     except Exception as error:
-        raise AbsentError(f"{task_id} cannot be made: {error}") from None
-    # Not by class: everything that steps a Batch has a bound of this kind.
+        raise AbsentError(f"cannot create {task_id}: {error}") from None
+    # Duck typing, because this works for every environment that steps a Batch.
     task, batch = getattr(env, "task", None), getattr(env, "batch", None)
     if task is None or not hasattr(batch, "rollout"):
         raise AbsentError(f"{task_id} does not run on mujoco.batch")
@@ -144,7 +144,7 @@ def gymnasium_episode(plan: dict, seed: int, path: str) -> Episode:
     model, env_count = mujoco.MjModel.from_xml_path(path), plan["env_count"]
     envs = [gymnasium_env(plan).unwrapped for _ in range(env_count)]
     batch = Batch(model, env_count, nthread=1)
-    seen = [flat(env.reset(seed=seed + index)[0]) for index, env in enumerate(envs)]
+    observed = [flat(env.reset(seed=seed + index)[0]) for index, env in enumerate(envs)]
     for index, env in enumerate(envs):
         batch.qpos[index], batch.qvel[index] = env.data.qpos, env.data.qvel
     frame_skip, dtype = envs[0].frame_skip, envs[0].action_space.dtype
@@ -155,7 +155,7 @@ def gymnasium_episode(plan: dict, seed: int, path: str) -> Episode:
         return observations, np.stack([env.data.ctrl for env in envs])
 
     starts = batch.state.copy()
-    stage = Stage(model, frame_skip, np.stack(seen), step)
+    stage = Stage(model, frame_skip, np.stack(observed), step)
     return Episode(model, frame_skip, starts, episode_controls(plan, seed, stage))
 
 
@@ -171,25 +171,25 @@ def gymnasium_model_path(plan: dict) -> str | None:
 def episode_controls(plan: dict, seed: int, stage: Stage) -> NDArray[np.float64]:
     """Draws the controls of an episode, (steps, E, nu), before the measurement.
 
-    They come from the worker's own policy, unless the plan asks for random actions. The cost of
-    physics depends on the states that a policy visits: pushing against a joint's limit is
+    They come from the worker's own policy, unless the plan has random actions. The cost of physics
+    depends on the states that a policy visits: pushing against a joint's limit, for example, is
     expensive.
     """
     actor = (Actor if plan["controls"] == "policy" else RandomActor)(plan, seed)
     steps = episode_steps(plan, stage)
-    nobody, controls = np.zeros(plan["env_count"], np.bool_), []
+    none_ended, controls = np.zeros(plan["env_count"], np.bool_), []
     observations = stage.observations
     while len(controls) < steps:
         actions = actor.actions(observations)
         for k in range(min(actions.shape[1], steps - len(controls))):
             observations, control = stage.step(actions[:, k])
             controls.append(control.copy())
-        actor.carry_on(nobody)
+        actor.carry_on(none_ended)
     return np.stack(controls)
 
 
 def episode_steps(plan: dict, stage: Stage) -> int:
-    """Steps of an episode without its last, after which the environments are reset."""
-    bytes_a_step = plan["env_count"] * stage.frame_skip * max(1, stage.model.nu) * 8
-    fits = CONTROLS_BYTES_MAX // bytes_a_step
-    return max(1, min(fits, (plan["spec"]["episode_steps"] or EPISODE_STEPS) - 1))
+    """Returns the number of steps to replay: all but an episode's last, after which it is reset."""
+    bytes_per_step = plan["env_count"] * stage.frame_skip * max(1, stage.model.nu) * 8
+    steps_max = CONTROLS_BYTES_MAX // bytes_per_step
+    return max(1, min(steps_max, (plan["spec"]["episode_steps"] or EPISODE_STEPS) - 1))

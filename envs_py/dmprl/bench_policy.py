@@ -19,7 +19,7 @@ from pathlib import Path
 import numpy as np
 
 OBSERVATIONS = 256
-"""Number of different observations, which are used in turn."""
+"""Number of different observations, used in turn."""
 
 
 class AbsentError(Exception):

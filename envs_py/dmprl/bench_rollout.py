@@ -22,7 +22,7 @@ from dmprl.bench_peers import AbsentError, EnvPoolLoop, GymnasiumLoop, PandaGymL
 from dmprl.bench_physics import Ceiling, Physics
 
 SETTLE_S = 0.1
-"""Time stepped before the measurement, so that caches and clock frequency settle."""
+"""Warm-up time before the measurement, for caches and clock frequency [s]."""
 
 KINDS = {
     "ceiling": Ceiling,
@@ -55,9 +55,9 @@ def main() -> None:
     parser.add_argument("--plan", type=Path, required=True)
     parser.add_argument("--index", type=int, required=True)
     arguments = parser.parse_args()
-    # Ctrl-C reaches the whole process group; the program that reads our output decides.
+    # Ctrl-C reaches the whole process group; the program that started this one handles it.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    # Output of an environment must not become a line of the protocol.
+    # Environments may print; only answers may reach the caller.
     lines = os.fdopen(os.dup(1), "w", buffering=1)
     os.dup2(2, 1)
     plan = json.loads(arguments.plan.read_text())

@@ -1,4 +1,4 @@
-"""Python peers of ``dmprl bench transport``: a queue with a process at either end.
+"""Python peers of ``dmprl bench transport``: a queue between two processes.
 
 ``python -m dmprl.bench_transport KIND --segment-bytes N --folder DIR`` writes one JSON object per
 line. The first is ``{"ready": "description"}``, or ``{"absent": "reason"}`` if the peer is
@@ -25,15 +25,15 @@ from pathlib import Path
 from typing import Any
 
 SETTLE_S = 0.1
-"""Time received before the measurement: the queue drains and the sender reaches its pace."""
+"""Warm-up time before the measurement, in which the queue drains [s]."""
 QUEUE_SEGMENTS = 512
-"""Capacity, equal to that of the queue under comparison."""
-PARENT_LOOK_S = 0.05
-"""Interval between checks whether the receiver is alive."""
+"""Capacity of the queue, equal to that of dmprl's."""
+PARENT_POLL_S = 0.05
+"""Interval between checks whether the receiver is alive [s]."""
 CONTEXT = get_context("fork")
 """Other start methods create named semaphores, which a killed process leaves behind."""
 RECEIVE_S = 20.0
-"""Timeout after which the sender counts as dead."""
+"""Time without a segment after which the sender is assumed dead [s]."""
 
 
 class AbsentError(Exception):
@@ -41,18 +41,18 @@ class AbsentError(Exception):
 
 
 def end_with(parent: int) -> None:
-    """Ends this process as soon as its parent is gone, from a thread."""
+    """Starts a thread that ends this process when its parent has ended."""
 
-    def look() -> None:
+    def poll() -> None:
         while os.getppid() == parent:
-            time.sleep(PARENT_LOOK_S)
+            time.sleep(PARENT_POLL_S)
         os._exit(1)
 
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    threading.Thread(target=look, daemon=True).start()
+    threading.Thread(target=poll, daemon=True).start()
 
 
-def started(send: Callable[..., None], target: Any, payload: bytes) -> Any:
+def start_sender(send: Callable[..., None], target: Any, payload: bytes) -> Any:
     """Starts the sender's process."""
     sender = CONTEXT.Process(target=send, args=(target, payload, os.getpid()), daemon=True)
     sender.start()
@@ -79,13 +79,13 @@ def push_all(address: str, payload: bytes, parent: int) -> None:
 
 
 class MultiprocessingQueue:
-    """``multiprocessing.Queue``, which pickles into a pipe from a thread of the sender."""
+    """``multiprocessing.Queue``, in which a thread of the sender pickles into a pipe."""
 
-    about = "multiprocessing.Queue of bytes, as long as ours; neither checked nor acknowledged"
+    about = "multiprocessing.Queue of bytes, same capacity as dmprl; not checked or acknowledged"
 
     def __init__(self, segment_bytes: int, folder: Path) -> None:
         self._queue = CONTEXT.Queue(QUEUE_SEGMENTS)
-        self.sender = started(put_all, self._queue, os.urandom(segment_bytes))
+        self.sender = start_sender(put_all, self._queue, os.urandom(segment_bytes))
 
     def receive(self) -> bytes:
         """Returns the next segment."""
@@ -99,15 +99,15 @@ class ZeroMq:
         try:
             import zmq
         except ImportError as error:
-            words = f"pyzmq is not installed in {sys.executable} ({error})"
-            raise AbsentError(words) from None
+            reason = f"pyzmq is not installed in {sys.executable} ({error})"
+            raise AbsentError(reason) from None
         self.about = (
-            f"ZeroMQ {zmq.zmq_version()} by pyzmq {zmq.__version__}, PUSH to PULL over ipc://, "
-            f"queues as long as ours; neither checked nor acknowledged"
+            f"ZeroMQ {zmq.zmq_version()} with pyzmq {zmq.__version__}, PUSH to PULL over ipc://, "
+            f"same capacity as dmprl; not checked or acknowledged"
         )
         address = f"ipc://{folder}/zeromq-{segment_bytes}"
-        # Before this process has a context, whose threads the fork would lack.
-        self.sender = started(push_all, address, os.urandom(segment_bytes))
+        # Forks before this process has a context, because a fork does not copy its threads.
+        self.sender = start_sender(push_all, address, os.urandom(segment_bytes))
         self._socket = zmq.Context().socket(zmq.PULL)
         self._socket.set_hwm(QUEUE_SEGMENTS)
         self._socket.setsockopt(zmq.RCVTIMEO, int(1000 * RECEIVE_S))
@@ -146,7 +146,7 @@ def main() -> None:
     parser.add_argument("--segment-bytes", type=int, required=True)
     parser.add_argument("--folder", type=Path, required=True)
     arguments = parser.parse_args()
-    # Ctrl-C reaches the whole process group; the program that reads our output decides.
+    # Ctrl-C reaches the whole process group; the program that started this one handles it.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     try:
         peer = KINDS[arguments.kind](arguments.segment_bytes, arguments.folder)

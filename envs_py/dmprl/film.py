@@ -1,7 +1,7 @@
-"""Makes a video, an animation and a strip of frames of episodes; started by ``dmprl record``.
+"""Writes a video, an animation and a strip of frames of episodes; started by ``dmprl record``.
 
-``python -m dmprl.film PLAN``: PLAN is a JSON file, which ``deploy/sweep/src/record`` writes.
-Progress is reported on standard output, in the format that ``dmprl-control`` defines.
+``python -m dmprl.film PLAN``: PLAN is a JSON file that ``deploy/sweep/src/record`` writes. Progress
+is reported on standard output, in the format of ``dmprl_shared::supervision``.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ STRIP_FRAMES = 6
 STRIP_HEIGHT = 240
 PAPER, INK, SOFT = "#ffffff", "#1a1a1a", "#5a5a5a"
 GOOD, BAD = "#00704d", "#b04a00"
-"""Distinguishable with colour blindness; the words beside them give the same information."""
+"""Distinguishable with colour blindness; the captions also contain the outcome as text."""
 
 
 class Side(TypedDict):
@@ -50,10 +50,10 @@ class Side(TypedDict):
 
 
 class Plan(TypedDict):
-    """The files to make, and the episodes in them."""
+    """The files to write, and the episodes in them."""
 
     episodes: list[list[Side]]
-    """Episodes in order, each with one side or two."""
+    """Episodes in order, each with one or two sides."""
     control_dt_s: float
     """Duration of a step [s]; 0 if the environment does not report it."""
     rate: float
@@ -64,7 +64,7 @@ class Plan(TypedDict):
 
 
 def font(size: int) -> ImageFont.FreeTypeFont | ImageFont.ImageFont:
-    """Pillow's own font."""
+    """Returns Pillow's built-in font."""
     return ImageFont.load_default(size)
 
 
@@ -97,11 +97,11 @@ class Scenes:
     def succeeded(self, frame: int) -> bool | None:
         """Returns whether the last step up to this frame reported success."""
         step, flags = self.side["steps"][frame], self.side["success_by_step"]
-        # Before the first step there is no report, even if later steps have one.
+        # Nothing is reported before the first step.
         return flags[step - 1] if flags and step > 0 else None
 
     def picture(self, frame: int) -> Image.Image:
-        """Draws a frame between its title and its captions; after the end, the last frame."""
+        """Draws a frame with its title and captions; past the end, the last frame."""
         frame = min(frame, len(self) - 1)
         scene = self.scene(frame, HEIGHT)
         picture = Image.new("RGB", (scene.width, HEIGHT + 2 * BAR), PAPER)
@@ -153,7 +153,7 @@ def pictures(episodes: list[list[Scenes]]) -> Iterator[Image.Image]:
 
 
 def padded(picture: Image.Image, size: tuple[int, int]) -> Image.Image:
-    """Pads a picture to the size of the first, because a video has one size."""
+    """Pads a picture to the size of the first, because all frames of a video have one size."""
     if picture.size == size:
         return picture
     whole = Image.new("RGB", size, PAPER)
@@ -165,7 +165,7 @@ class Film:
     """A video and an animation in progress."""
 
     def __init__(self, plan: Plan, size: tuple[int, int]) -> None:
-        import av  # not installed everywhere; the strip does not need it
+        import av  # may not be installed; the strip does not need it
 
         self._av = av
         self._size = size
@@ -250,7 +250,7 @@ def row(scenes: Scenes) -> Image.Image:
 
 
 def main() -> None:
-    """Makes the files that the plan asks for."""
+    """Writes the files of the plan."""
     with open(sys.argv[1], encoding="utf-8") as file:
         plan: Plan = json.load(file)
     episodes = [
@@ -264,7 +264,7 @@ def main() -> None:
             film = Film(plan, picture.size)
         film.add(picture)
         print(json.dumps({"filmed": {"done": done - (done == total), "of": total}}), flush=True)
-    assert film is not None, "a plan has an episode, and an episode a frame"
+    assert film is not None, "a plan has at least one episode, with at least one frame"
     film.close(plan["gif"])
     print(json.dumps({"filmed": {"done": total, "of": total}}), flush=True)
 

@@ -1,8 +1,8 @@
-"""Any Gymnasium environment as a :class:`~dmprl.segment_env.SegmentEnv`.
+"""Wraps any Gymnasium environment as a :class:`~dmprl.segment_env.SegmentEnv`.
 
-The environments of a worker step one after the other in one thread. MuJoCo releases the GIL inside
-``mj_step``, so threads could overlap their physics. But workers, each a process, already use all
-cores, and half of a step is Python code that threads cannot overlap.
+The environments of a worker are stepped one after the other, in one thread. MuJoCo releases the GIL
+in ``mj_step``, so threads could run their physics in parallel. But the worker processes already use
+all cores, and half of a step is Python code, which threads cannot run in parallel.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ from dmprl.segment_env import (
 
 SUPPORTED_SPACES = (
     "supported are a Box observation with one dimension (or a Dict or Tuple that Gymnasium can "
-    "flatten) and a bounded Box action of floats with one dimension"
+    "flatten), and a bounded Box action with one dimension and a floating-point type"
 )
 
 FAILURES_KEPT_MAX = 10_000
@@ -53,10 +53,10 @@ FAILURES = (Exception, SystemExit)
 
 
 class GymnasiumSegmentEnv(SegmentEnv):
-    """E copies of one Gymnasium environment, with all wrappers of its registration.
+    """E copies of one Gymnasium environment, with all wrappers of its registration except two.
 
-    Two wrappers are left out, because they only check the caller and cost time in every step: the
-    passive checker and the order enforcer (:meth:`step_segment` checks the order itself).
+    The passive checker and the order enforcer are omitted: they only check the caller, which costs
+    time in every step, and :meth:`step_segment` checks the order itself.
 
     - ``named``: the object that ``task_id`` names if it is ``module:Name``. A ``gymnasium.Env``
       class is created without arguments; its optional attribute ``max_episode_steps`` limits its
@@ -89,7 +89,7 @@ class GymnasiumSegmentEnv(SegmentEnv):
         self._failure_counts = [0] * env_count
         self._failed_now: list[int] = []
         self._failure_total = 0
-        self._untold: deque[str] = deque(maxlen=FAILURES_KEPT_MAX)
+        self._failures: deque[str] = deque(maxlen=FAILURES_KEPT_MAX)
 
     def _registration(self, named: object) -> registration.EnvSpec:
         if "gymnasium_robotics" in sys.modules:
@@ -104,10 +104,10 @@ class GymnasiumSegmentEnv(SegmentEnv):
                 order_enforce=False,
             )
         registered = gymnasium.registry.get(self.task_id.rpartition(":")[2])
-        if registered is None:  # without version, or unknown
-            made = self._make_unregistered()
-            registered = gymnasium.registry[made.unwrapped.spec.id]
-            made.close()
+        if registered is None:  # an id without a version, or an unknown one
+            env = self._make_unregistered()
+            registered = gymnasium.registry[env.unwrapped.spec.id]
+            env.close()
         registered = copy.copy(registered)
         registered.order_enforce = False
         return registered
@@ -120,8 +120,8 @@ class GymnasiumSegmentEnv(SegmentEnv):
             if not module:
                 raise
             raise gymnasium.error.NameNotFound(
-                f"{self.task_id}: the module {module} was found, but it has no class or function "
-                f"{name} and registers no environment of that name ({error})"
+                f"{self.task_id}: the module {module} exists, but has no class or function {name} "
+                f"and registers no environment with that name ({error})"
             ) from None
 
     def _make(self, options: Mapping[str, object] = MappingProxyType({})) -> gymnasium.Env:
@@ -129,7 +129,7 @@ class GymnasiumSegmentEnv(SegmentEnv):
         observation, action = env.observation_space, env.action_space
         self._observation_space = observation
         if isinstance(observation, spaces.Dict | spaces.Tuple) and observation.is_np_flattenable:
-            # A Dict's entries have the order of its space, which Gymnasium sorts by key.
+            # The entries of a Dict are in the order of its space, which Gymnasium sorts by key.
             env = gymnasium.wrappers.FlattenObservation(env)
             observation = env.observation_space
         if not isinstance(observation, spaces.Box) or len(observation.shape) != 1:
@@ -187,8 +187,8 @@ class GymnasiumSegmentEnv(SegmentEnv):
             )
         if actions.shape != self._action_shape:
             raise ValueError(f"actions {actions.shape}, expected (E, K, A) = {self._action_shape}")
-        # A new array for each call, in the space's own type. An environment may keep an action (to
-        # penalise its change, for example), so its memory must not be reused.
+        # A new array for each call, in the space's type. An environment may keep an action, for
+        # example to penalise its change, so its memory must not be reused.
         actions = actions.astype(self._action_dtype)
         out.failed.fill(0)
         out.observations[:, 0] = self._current
@@ -210,8 +210,8 @@ class GymnasiumSegmentEnv(SegmentEnv):
             self._replace(index, seed, out)
 
     def take_failures(self) -> list[str]:  # noqa: D102 - inherited
-        failures = list(self._untold)
-        self._untold.clear()
+        failures = list(self._failures)
+        self._failures.clear()
         return failures
 
     def goals(self) -> Goals:  # noqa: D102 - inherited
@@ -262,7 +262,7 @@ class GymnasiumSegmentEnv(SegmentEnv):
         out.next_observations[index] = self._current[index]
 
     def _check_finite(self, out: SegmentBuffers) -> None:
-        """Checks the whole segment at once, which is several times as fast as step by step."""
+        """Checks a whole segment at once, which is several times faster than step by step."""
         if not np.isfinite(out.rewards, out=self._finite_rewards).all():
             for index in np.flatnonzero(~self._finite_rewards.all(axis=1)).tolist():
                 step = int(self._finite_rewards[index].argmin())
@@ -286,20 +286,20 @@ class GymnasiumSegmentEnv(SegmentEnv):
         out.success[index], out.steps[index] = SUCCESS_NOT_REPORTED, 0
 
     def _note(self, failure: SegmentEnvError) -> None:
-        self._untold.append(str(failure))
+        self._failures.append(str(failure))
         self._failure_total += 1
-        # The worker's log: tracebacks are long, and usually the next one is the same.
+        # Only some tracebacks go to the worker's log: they are long and mostly identical.
         if failure.__cause__ is not None and self._failure_total.bit_count() == 1:
             traceback.print_exception(failure.__cause__)
 
     def _replace(self, index: int, seed: int, out: SegmentBuffers) -> None:
         """Closes a failed environment, recreates it and resets it."""
-        with contextlib.suppress(*FAILURES):  # it is already broken
+        with contextlib.suppress(*FAILURES):  # it has failed already
             self._envs[index].close()
         try:
             self._envs[index] = self._make()
         except FAILURES as error:
-            raise self._failure(index, "made again after a failure", error) from error
+            raise self._failure(index, "recreated after a failure", error) from error
         self._reset(index, seed, out)
 
     def _not_finite(self, index: int, when: str, row: NDArray[np.float64]) -> SegmentEnvError:
@@ -317,7 +317,7 @@ class GymnasiumSegmentEnv(SegmentEnv):
 
 
 def success_of(info: dict) -> int:
-    """Converts ``info["is_success"]`` or ``["success"]`` for ``SegmentBuffers.success``."""
+    """Converts ``info["is_success"]`` or ``info["success"]`` for ``SegmentBuffers.success``."""
     success = info.get("is_success", info.get("success"))
     if success is None or math.isnan(success):
         return SUCCESS_NOT_REPORTED

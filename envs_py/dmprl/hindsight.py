@@ -1,8 +1,8 @@
 """Goals in the observations of a Gymnasium environment, and rewards for other goals.
 
-Hindsight (Andrychowicz et al. 2017) repeats experience with another goal. Only the environment can
-compute the reward for that goal, with ``compute_reward``, the method that Gymnasium-Robotics and
-panda-gym introduced.
+Hindsight experience replay (Andrychowicz et al. 2017) stores copies of an episode with other goals.
+Only the environment can compute the rewards for them, with the method ``compute_reward`` that
+Gymnasium-Robotics and panda-gym introduced.
 """
 
 from __future__ import annotations
@@ -25,10 +25,12 @@ PROBES = 32
 class GymnasiumGoals:
     """The goals of one kind of environment, independent of its instances.
 
-    - ``env``: has the ``Dict`` observation or any wrapper around it; ``space``: that ``Dict``.
+    - ``env``: an environment with a ``Dict`` observation, or any wrapper around it.
+    - ``space``: that ``Dict``.
 
     Raises:
-        NotGoalConditionedError: the observation has no goals, or rewards for them are unavailable.
+        NotGoalConditionedError: if the observation has no goals, or rewards for other goals are
+            unavailable.
     """
 
     def __init__(self, task_id: str, env: gymnasium.Env, space: spaces.Space) -> None:
@@ -54,7 +56,7 @@ class GymnasiumGoals:
 
     def _spaces(self, space: spaces.Space) -> tuple[spaces.Box, spaces.Box]:
         if not isinstance(space, spaces.Dict):
-            raise self._refused(f"its observation is no Dict but {space}")
+            raise self._refused(f"its observation is not a Dict, but {space}")
         found = []
         for name in ("achieved_goal", "desired_goal"):
             part = space.spaces.get(name)
@@ -76,7 +78,7 @@ class GymnasiumGoals:
     def _is_sparse(self, env: gymnasium.Env, achieved: spaces.Box, desired: spaces.Box) -> bool:
         """Returns whether the reward is sparse, after checking that it can be computed.
 
-        A reward by distance differs between random pairs; one by threshold has two values.
+        A reward by distance differs for random pairs; one by threshold has at most two values.
         """
         if not env.has_wrapper_attr("compute_reward"):
             raise self._refused(
@@ -96,8 +98,8 @@ class GymnasiumGoals:
         rewards = np.asarray(env.get_wrapper_attr("compute_reward")(achieved, desired, infos))
         if rewards.shape != (len(achieved),):
             raise self._refused(
-                f"its compute_reward takes one goal at a time: for goals {achieved.shape} it "
-                f"returned {rewards.shape}, expected {(len(achieved),)}"
+                f"its compute_reward takes one goal at a time: for goals of shape "
+                f"{achieved.shape} it returned shape {rewards.shape}, expected {(len(achieved),)}"
             )
         return rewards
 
@@ -110,10 +112,10 @@ class GymnasiumGoals:
 
 
 def terminated_at(env: gymnasium.Env, achieved: NDArray, desired: NDArray) -> Any:
-    """Returns where a step with these goals would have ended its episode.
+    """Returns for each pair of goals whether the step would have ended its episode.
 
-    ``compute_terminated``, if there is one, takes one goal at a time. panda-gym has none: its
-    episodes end at success.
+    ``compute_terminated``, if the environment has it, takes one goal at a time. panda-gym does not
+    have it; its episodes end at success.
     """
     if env.has_wrapper_attr("compute_terminated"):
         ends = env.get_wrapper_attr("compute_terminated")

@@ -1,9 +1,9 @@
-"""dmprl's own tasks on MuJoCo's batched simulation: one call per segment for E environments.
+"""Runs dmprl's own tasks on MuJoCo's batched simulation, with one call per segment.
 
-A :class:`MujocoTask` defines the task: model, start states, observation, reward. Its methods get
+A :class:`MujocoTask` defines a task: model, start states, observation, reward. Its methods receive
 all environments and all steps at once, as arrays. :class:`BatchSegmentEnv` runs it on
 :class:`mujoco.batch.Batch`, which steps E simulations in C without the GIL. It uses one thread,
-because workers, each a process, already use all cores.
+because the worker processes already use all cores.
 
 Shapes: E environments, K steps of a segment, O observation, A action.
 """
@@ -31,7 +31,7 @@ from dmprl.segment_env import (
 )
 
 Fields = Mapping[str, NDArray]
-"""Arrays of MjData by name; the dimensions of the call precede MjData's own."""
+"""Arrays of MjData by name. Dimensions such as (E,) or (E, K) precede those of MjData."""
 
 
 class Start(NamedTuple):
@@ -71,7 +71,7 @@ class MujocoTask(ABC):
         )
 
     def batch(self, segment_steps: int, episode_steps: int | None) -> BatchSegmentEnv:
-        """Creates the environments; with ``episode_steps`` None the caller limits the time."""
+        """Creates the environments; if ``episode_steps`` is None, their episodes have no limit."""
         return BatchSegmentEnv(self, segment_steps, episode_steps)
 
     @abstractmethod
@@ -79,7 +79,7 @@ class MujocoTask(ABC):
         """Compiles the model."""
 
     def picture_model(self) -> mujoco.MjModel:
-        """Returns the model for pictures; its states are those of :attr:`model`."""
+        """Returns the model for pictures, with the same states as :attr:`model`."""
         return self.model
 
     @abstractmethod
@@ -104,7 +104,7 @@ class MujocoTask(ABC):
         return np.sum(squares, axis=-1, out=self.scratch("effort", actions.shape[:-1], dtype))
 
     def episodes_began(self, indices: NDArray[np.int32]) -> None:  # noqa: B027 - most keep nothing
-        """Discards the task's data of the last episode of these environments."""
+        """Discards the task's data about the last episode of these environments."""
 
     @abstractmethod
     def observe(self, fields: Fields, out: NDArray[np.float64]) -> None:
@@ -123,7 +123,7 @@ class MujocoTask(ABC):
         """
 
     def successes(self, observations: NDArray[np.float64], out: NDArray[np.uint8]) -> None:
-        """Writes whether each state (E, O) is a success; the default reports none."""
+        """Writes whether each state (E, O) is a success; by default this is not reported."""
         out[:] = SUCCESS_NOT_REPORTED
 
 
@@ -140,7 +140,7 @@ class BatchSegmentEnv(SegmentEnv):
         self._actions = np.zeros((self.env_count, segment_steps, len(task.action_low)), np.float32)
         self._rows = np.arange(self.env_count)
         self._limit = np.iinfo(np.int32).max if episode_steps is None else episode_steps
-        # Steps until truncation; 0 before the first reset.
+        # Number of steps until truncation; 0 before the first reset.
         self._remaining = np.zeros(self.env_count, np.int32)
         self._all_began = False
         self._generators: list[np.random.Generator | None] = [None] * self.env_count
@@ -149,7 +149,7 @@ class BatchSegmentEnv(SegmentEnv):
         self._messages: list[str] = []
         self._starts = Start(*(self.batch.bind(name) for name in Start._fields))
         self._fields = {name: self.batch.bind(name) for name in task.recorded}
-        # The state that mj_resetData would leave. Copying it is cheaper; the forward pass
+        # The state after mj_resetData. Copying it is cheaper than that call, and the forward pass
         # recomputes everything else that mj_resetData clears.
         self._new_state = self.batch.state[0].copy()
         self._prepare()
@@ -193,7 +193,7 @@ class BatchSegmentEnv(SegmentEnv):
         self.begin(indices, out)
 
     def begin(self, indices: NDArray[np.int32], out: SegmentBuffers) -> None:
-        """Starts an episode in each of these environments, drawn by its generator."""
+        """Starts an episode in each of these environments, with its own generator."""
         self._begin(indices)
         out.next_observations[indices] = self._current[indices]
 
@@ -218,7 +218,8 @@ class BatchSegmentEnv(SegmentEnv):
         self.task.rewards(observations, self._actions[:, :steps], out.rewards[:, :steps])
         self._current[:] = observations[:, -1]
         np.minimum(remaining, steps, out=out.steps)
-        # An episode that ended earlier ran on with the others; only its end counts.
+        # The simulation continues after the end of a shorter episode; only the state at its end
+        # counts.
         self.task.successes(observations[self._rows, out.steps], out.success)
         remaining -= out.steps
         out.terminated[:] = 0
@@ -246,19 +247,19 @@ class BatchSegmentEnv(SegmentEnv):
         """Returns the environments with an error or a warning, and stores a message for each."""
         if raised is None and not self.batch.warning.any():
             return None
-        # MuJoCo stops simulations that it warns about.
+        # MuJoCo stops a simulation after a warning.
         warnings = self.batch.warning[:, :, 1]
         failed = np.flatnonzero(warnings.any(axis=1))
         if raised is not None:
             failed = np.union1d(failed, raised)
         for index in failed.tolist():
             kinds = [mujoco.mjtWarning(kind).name for kind in np.flatnonzero(warnings[index])]
-            reason = self.batch.error(index) or f"MuJoCo warned ({', '.join(kinds)})"
+            reason = self.batch.error(index) or f"MuJoCo warning ({', '.join(kinds)})"
             self._messages.append(f"{self.task.id}, environment {index}, this segment: {reason}")
         return failed.astype(np.int32)
 
     def _end_episodes(self, failed: NDArray[np.int32] | None, out: SegmentBuffers) -> None:
-        """Clears rows after the episodes' ends and starts new ones."""
+        """Clears the rows after the end of each episode and starts a new one."""
         for index in np.flatnonzero(out.steps < self.segment_steps).tolist():
             out.observations[index, out.steps[index] + 1 :] = 0.0
             out.rewards[index, out.steps[index] :] = 0.0
@@ -300,18 +301,18 @@ class BatchSegmentEnv(SegmentEnv):
 
 
 def generator(seed: int) -> np.random.Generator:
-    """Creates the generator that Gymnasium would create from a seed."""
+    """Creates a generator as Gymnasium does from the same seed."""
     return np.random.Generator(np.random.PCG64(np.random.SeedSequence(seed)))
 
 
 def quieten_mujoco() -> None:
-    """Removes the clock and the log file from MuJoCo, in a worker's process.
+    """Disables MuJoCo's timer and its log file, in a worker's process.
 
-    MuJoCo's Python bindings install a timer that every stage of a step reads twice, which takes a
-    quarter of a step's time on Reacher. Only ``MjData.timer`` is lost. Warnings, which become
-    failures with a message here, would be written to MUJOCO_LOG.TXT in the working directory. The
-    hook must be a C function, so that a simulation's thread does not need the GIL; strlen takes a
-    string and does nothing.
+    MuJoCo's Python bindings install a clock that each stage of a step reads twice, which takes a
+    quarter of a step's time on Reacher. Without it, only ``MjData.timer`` is missing. MuJoCo would
+    also write its warnings to MUJOCO_LOG.TXT in the working directory; here they become failures
+    with a message. The replaced hook must be a C function, so that the simulation does not need the
+    GIL; strlen takes a string and has no effect.
     """
     mujoco_hook("mjcb_time").value = None
     strlen = ctypes.cast(ctypes.CDLL(None).strlen, ctypes.c_void_p)

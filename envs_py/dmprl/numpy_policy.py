@@ -1,9 +1,9 @@
-"""The policy in NumPy, for use without Rust and as a peer in benchmarks.
+"""Computes the policy in NumPy, for use without Rust and as a peer in benchmarks.
 
 It computes the same function as ``shared/src/policy`` and the same noise as
 ``actors/src/exploration.rs``, for E environments at once; a test compares its actions with Rust's.
-:class:`dmprl.Policy` adds a file and a robot's safety limits. Shapes: E environments, K steps, O
-observation, A action, N basis functions.
+:class:`dmprl.Policy` adds the policy file and a robot's safety limits. Shapes: E environments, K
+steps, O observation, A action, N basis functions.
 """
 
 from __future__ import annotations
@@ -26,7 +26,8 @@ LOG_STD_RANGE = (-20.0, 2.0)
 class NumpyPolicy:
     """The policy that ``plan`` describes (written by ``deploy/bench/src/numpy_plan.rs``).
 
-    ``parameters`` are the network's, flat. By default they are read from the plan's file.
+    ``parameters`` are the network's, as a flat array; by default they are read from the plan's
+    file.
     """
 
     def __init__(self, plan: dict, parameters: Floats | None = None) -> None:
@@ -54,7 +55,7 @@ class NumpyPolicy:
     def u(self, observations: NDArray, noise: Noise | None = None) -> Floats:
         """Computes actions u, (E, K, A), for the environments' observations, (E, O).
 
-        They are in [-1, 1], except for a policy's own Gaussian.
+        They may be outside [-1, 1]; :meth:`scaled` clips them.
         """
         self._seen[:] = observations
         x = self._observations
@@ -94,7 +95,9 @@ def layers(widths: list[int], parameters: Floats) -> list[tuple[Floats, Floats]]
     """Splits the flat parameters into weights, (inputs, outputs), and bias of each layer."""
     expected = sum((before + 1) * after for before, after in pairwise(widths))
     if len(parameters) != expected:
-        raise ValueError(f"{len(parameters)} parameters, a network {widths} has {expected}")
+        raise ValueError(
+            f"{len(parameters)} parameters, expected {expected} for layers of widths {widths}"
+        )
     found, at = [], 0
     for before, after in pairwise(widths):
         end = at + before * after
@@ -176,7 +179,7 @@ class DmpHead:
 
 
 class Noise:
-    """Exploration noise of the same kinds as in Rust, from its own generator."""
+    """Exploration noise of the same kinds as in Rust, from another random generator."""
 
     def __init__(self, plan: dict, seed: int) -> None:
         exploration = plan["exploration"]
@@ -200,7 +203,11 @@ class Noise:
         return np.exp(np.clip(log_std, *LOG_STD_RANGE)) * self._normal(log_std.shape)
 
     def disturb_u(self, u: Floats) -> None:
-        """Adds noise to actions, (E, K, A), clipped to [-1, 1]; or the policy's own Gaussian."""
+        """Adds noise to actions, (E, K, A), and clips them to [-1, 1].
+
+        A Gaussian policy has no other noise. Its learned standard deviations, if any, are applied
+        here without clipping.
+        """
         if self._gaussian.size > 0:
             u += self._gaussian * self._normal(u.shape)
         if self._own or self._kind == "dmp_parameters":
@@ -215,11 +222,14 @@ class Noise:
         np.clip(u, -1.0, 1.0, out=u)
 
     def episodes_ended(self, ended: NDArray[np.bool_]) -> None:
-        """Resets noise that has a memory in these environments."""
+        """Restarts the pink noise in these environments."""
         self._step[ended] = 0
 
     def _pink(self) -> Floats:
-        """Voss's sum of held white sources; source i is renewed every 2^i steps."""
+        """Draws pink noise by Voss's method.
+
+        It is the sum of white sources that hold their values; source i is renewed every 2^i steps.
+        """
         renewed = self._step[:, None] % self._periods == 0
         fresh = self._normal(self._sources.shape)
         np.copyto(self._sources, fresh, where=renewed[:, None, :])
@@ -231,7 +241,7 @@ class Noise:
 
 
 class Actor:
-    """A policy with its noise, for E environments that run one segment after the other."""
+    """A policy with its noise, for E environments that run segment after segment."""
 
     def __init__(self, plan: dict, seed: int) -> None:
         self._policy, self._noise = NumpyPolicy(plan), Noise(plan, seed)

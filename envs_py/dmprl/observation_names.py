@@ -1,4 +1,4 @@
-"""Names of the entries of a flattened observation."""
+"""Names the entries of a flattened observation."""
 
 from __future__ import annotations
 
@@ -9,8 +9,9 @@ from gymnasium import spaces
 def names_of(space: spaces.Space, path: str = "") -> list[str]:
     """Returns the name of each entry of ``gymnasium.spaces.flatten`` for ``space``, in order.
 
-    ``achieved_goal[0]`` in a Dict, ``arm.position[0]`` in a Dict of Dicts, ``observation.0[2]`` in
-    a Tuple, ``observation[0]`` elsewhere. A Discrete has one entry per value.
+    Examples: ``achieved_goal[0]`` in a Dict, ``arm.position[0]`` in a Dict of Dicts,
+    ``observation.0[2]`` in a Tuple, ``observation[0]`` elsewhere. A Discrete has one entry per
+    value.
     """
     if isinstance(space, spaces.Dict):
         parts = [

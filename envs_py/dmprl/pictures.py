@@ -1,7 +1,8 @@
-"""Pictures of a MuJoCo state, without a display.
+"""Draws pictures of a MuJoCo state, without a display.
 
-MuJoCo's own ``Renderer`` uses the OpenGL that the environment variable ``MUJOCO_GL`` named when
-``mujoco`` was first imported; the default needs a display. This module uses the first that works.
+MuJoCo's own ``Renderer`` uses the OpenGL implementation that the environment variable ``MUJOCO_GL``
+named when ``mujoco`` was first imported; the default needs a display. This module uses the first
+implementation that works.
 """
 
 from __future__ import annotations
@@ -16,12 +17,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 OFFSCREEN = ("egl", "osmesa")
-"""OpenGL without a display: first on a graphics card or Mesa's CPU driver, then in memory."""
+"""OpenGL without a display: EGL, on a graphics card or Mesa's CPU driver, and OSMesa, in memory."""
 MAX_GEOMS = 1000
 
 
 class NoOpenGLError(RuntimeError):
-    """Raised if no OpenGL on this machine works."""
+    """Raised if no OpenGL implementation works on this machine."""
 
 
 class PictureMaker:
@@ -30,11 +31,11 @@ class PictureMaker:
     def __init__(
         self, model: mujoco.MjModel, width: int, height: int, camera: Mapping[str, Any]
     ) -> None:
-        """Opens OpenGL; ``camera`` contains settings of MuJoCo's free camera."""
+        """Opens an OpenGL context; ``camera`` contains settings of MuJoCo's free camera."""
         self._model = model
         self._gl = _context(width, height)
         self._gl.make_current()
-        # The buffer only grows, because another picture may be larger.
+        # A setting of the model, never reduced, because another maker may need a larger buffer.
         scale = model.vis.global_
         scale.offwidth = max(scale.offwidth, width)
         scale.offheight = max(scale.offheight, height)
@@ -52,7 +53,7 @@ class PictureMaker:
                 setattr(self._camera, name, value)
 
     def _draw(self, data: mujoco.MjData) -> None:
-        # Another maker may have drawn in the meantime.
+        # Another maker's context may be current.
         self._gl.make_current()
         mujoco.mjv_updateScene(
             self._model,
@@ -73,27 +74,27 @@ class PictureMaker:
         return np.ascontiguousarray(picture[::-1])
 
     def depth(self, data: mujoco.MjData) -> NDArray[np.float32]:
-        """Draws OpenGL's depth of each pixel (height, width): 0 near, 1 far."""
+        """Draws OpenGL's depth of each pixel (height, width), from 0 (near) to 1 (far)."""
         self._draw(data)
         depth = np.zeros((self._viewport.height, self._viewport.width), np.float32)
         mujoco.mjr_readPixels(None, depth, self._viewport, self._context)
         return np.ascontiguousarray(depth[::-1])
 
     def close(self) -> None:
-        """Frees OpenGL's memory."""
+        """Frees the OpenGL context."""
         self._gl.make_current()
         self._context.free()
         self._gl.free()
 
 
 def name_opengl() -> None:
-    """Sets ``MUJOCO_GL``, which Gymnasium's own pictures use, to the first OpenGL that works."""
+    """Sets ``MUJOCO_GL``, which Gymnasium's renderer reads, to the first OpenGL that works."""
     if os.environ.get("MUJOCO_GL"):
         return
     for name in OFFSCREEN:
         try:
             importlib.import_module(f"mujoco.{name}").GLContext(8, 8).free()
-        # As below. If none works, drawing reports it; not every environment needs OpenGL.
+        # If none works, drawing reports it; not every environment needs OpenGL.
         except Exception:
             continue
         os.environ["MUJOCO_GL"] = name
@@ -102,15 +103,15 @@ def name_opengl() -> None:
 
 def _context(width: int, height: int) -> Any:
     """Opens the OpenGL that ``MUJOCO_GL`` names, or the first that works."""
-    asked = os.environ.get("MUJOCO_GL", "").lower()
+    requested = os.environ.get("MUJOCO_GL", "").lower()
     failures = []
-    for name in (asked,) if asked else OFFSCREEN:
+    for name in (requested,) if requested else OFFSCREEN:
         try:
             return importlib.import_module(f"mujoco.{name}").GLContext(width, height)
-        # Each fails differently: a missing library, no device, no function of the library.
+        # The exception differs: a missing library, no device, a missing function.
         except Exception as error:
             failures.append(f"{name}: {type(error).__name__}: {error}")
     raise NoOpenGLError(
-        f"no OpenGL to draw with ({'; '.join(failures)}). Debian, Ubuntu: apt install libegl1 "
-        "libgl1-mesa-dri, or libosmesa6; a set MUJOCO_GL names the only one that is tried"
+        f"no OpenGL to draw with ({'; '.join(failures)}). On Debian and Ubuntu: apt install "
+        "libegl1 libgl1-mesa-dri, or libosmesa6. If MUJOCO_GL is set, no other one is tried"
     )

@@ -1,8 +1,8 @@
 """Shows a policy in its environment, live; started by ``dmprl play``.
 
-``python -m dmprl.play POLICY --task ID`` serves a web page on loopback, for any browser on this
-machine or at the other end of ``ssh -L``. With ``--window`` it opens a window of the environment
-instead.
+``python -m dmprl.play POLICY --task ID`` serves a web page on the loopback interface, for a browser
+on this machine or on one connected with ``ssh -L``. With ``--window`` it opens the environment's
+own window instead.
 """
 
 from __future__ import annotations
@@ -33,16 +33,16 @@ INTERRUPTED = 130
 DEFAULT_DT = 0.05
 """Duration of a step if the environment does not report it [s]."""
 PAUSE_S = 0.8
-"""Pause after an episode, to show how it ended [s]."""
+"""Pause after an episode, to show its outcome [s]."""
 BETWEEN_FRAMES_S = 1 / 50
-"""Minimum time between frames; most screens show no more."""
+"""Minimum time between frames [s]; most screens cannot show more."""
 QUALITY = 85
 """JPEG quality of the pictures."""
 WAIT_S = 5.0
-"""Time after which a browser gets the last picture again [s]."""
+"""Time after which the last picture is sent again [s]."""
 BOUNDARY = "frame"
 LOCAL_NAMES = ("127.0.0.1", "localhost", "[::1]")
-"""Host names for this machine. Others are rejected, because of DNS rebinding."""
+"""Host names of this machine. Others are rejected, to prevent DNS rebinding."""
 PAGE = """<!doctype html>
 <html lang="en"><head><meta charset="utf-8"><title>{title}</title>
 <meta name="viewport" content="width=device-width, initial-scale=1"><style>
@@ -50,7 +50,7 @@ body {{ font: 16px system-ui, sans-serif; margin: 1.5rem auto; max-width: 46rem;
 color: #1a1a1a; background: #fff }}
 img {{ width: 100%; height: auto; border: 1px solid #ddd }}
 </style></head><body><h1 style="font-size: 1.2rem">{title}</h1>
-<img src="stream" alt="The policy at work, live: time, return so far, and the scene"></body></html>
+<img src="stream" alt="Live view of the policy: time, return so far, and the scene"></body></html>
 """
 
 
@@ -89,7 +89,7 @@ class Handler(BaseHTTPRequestHandler):
         """Answers a browser's request."""
         host = self.headers.get("Host", "").rsplit(":", 1)[0]
         if host not in LOCAL_NAMES:
-            self.send_error(403, "this page is for this machine alone")
+            self.send_error(403, "this page is available only on this machine")
         elif self.path == "/":
             page = PAGE.format(title=self.server.show.title).encode()
             self.send_response(200)
@@ -116,7 +116,7 @@ class Handler(BaseHTTPRequestHandler):
             pass  # the browser has closed the connection
 
     def log_message(self, format: str, *arguments: Any) -> None:
-        """Suppresses the log line of every request."""
+        """Suppresses the log line that the base class prints for each request."""
 
 
 class Server(ThreadingHTTPServer):
@@ -143,8 +143,8 @@ class Painter:
         frame = self._environment.render()
         if not isinstance(frame, np.ndarray) or frame.ndim != 3:
             raise SystemExit(
-                f"{self._environment.spec.id} cannot be drawn: its render mode "
-                f"'rgb_array' returned {type(frame).__name__}"
+                f"{self._environment.spec.id} cannot be drawn: in render mode 'rgb_array', "
+                f"render() returned {type(frame).__name__}"
             )
         picture = self._image.fromarray(frame[..., :3].astype(np.uint8))
         whole = self._image.new("RGB", (picture.width, picture.height + 36), "#ffffff")
@@ -168,7 +168,10 @@ class Shown(GymnasiumSegmentEnv):
         super().__init__(gymnasium_id(task_id), 1, 1, named)
 
     def _make(self) -> gymnasium.Env:
-        why = f"{self.task_id} cannot be shown; one that can be has the render mode {self._mode!r}"
+        why = (
+            f"{self.task_id} cannot be shown; expected an environment with the render mode "
+            f"{self._mode!r}"
+        )
         try:
             made = super()._make({"render_mode": self._mode})
         except TypeError as error:
@@ -184,7 +187,7 @@ class Shown(GymnasiumSegmentEnv):
 
 
 def play(policy: Policy, made: gymnasium.Env, seeds: Iterator[int], paint) -> None:
-    """Plays one episode after the other at the robot's own pace; ``paint`` shows each step."""
+    """Plays one episode after the other in real time; ``paint`` shows a frame with its caption."""
     dt = policy.spec["control_dt_s"] or DEFAULT_DT
     every = max(1, round(BETWEEN_FRAMES_S / dt))
     for seed in seeds:
@@ -208,7 +211,7 @@ def play(policy: Policy, made: gymnasium.Env, seeds: Iterator[int], paint) -> No
 
 
 def main() -> int:
-    """Plays until the episodes are over or the program is interrupted."""
+    """Plays the episodes until their end or an interrupt."""
     parser = argparse.ArgumentParser(prog="dmprl play")
     parser.add_argument("policy")
     parser.add_argument("--task", required=True)
@@ -238,8 +241,8 @@ def main() -> int:
             server = Server(arguments.port, show)
         except OSError as error:
             raise SystemExit(
-                f"cannot serve on port {arguments.port}: {error}; name another "
-                "--port, or 0 for any that is free"
+                f"cannot serve on port {arguments.port}: {error}; choose another --port, or 0 for "
+                "any free one"
             ) from error
         threading.Thread(target=server.serve_forever, daemon=True).start()
         print(f"http://127.0.0.1:{server.server_address[1]}/", flush=True)

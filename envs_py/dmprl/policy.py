@@ -1,4 +1,4 @@
-"""Runs a trained policy on a robot with NumPy alone: no Rust, no simulator, no run.
+"""Runs a trained policy on a robot. It needs only NumPy and the policy file.
 
 ::
 
@@ -6,7 +6,7 @@
     policy.reset()
     action = policy.action(observation)  # once per control step
 
-It behaves like ``shared/src/runtime`` in Rust; a test compares them. Shapes: K steps of a decision,
+It behaves like ``shared/src/runtime`` in Rust; a test compares them. Shapes: K steps of a segment,
 O observation, A action.
 """
 
@@ -60,25 +60,26 @@ class Policy:
             run, path = path, path / "checkpoints" / "best"
             if not path.exists():
                 raise PolicyFileError(
-                    f"{run}: a directory without checkpoints/best: no run that "
-                    "has an evaluated policy"
+                    f"{run}: has no checkpoints/best; expected the directory of a run with an "
+                    "evaluated policy"
                 )
         file = read(path)
         try:
             return cls(file)
         except (AttributeError, IndexError, KeyError, TypeError, ValueError) as error:
-            raise PolicyFileError(f"{path}: its parts do not fit: {error!r}") from error
+            raise PolicyFileError(f"{path}: inconsistent contents: {error!r}") from error
 
     def __repr__(self) -> str:
-        spec, every = self.spec, self.spec["control_dt_s"]
+        spec = self.spec
         return (
-            f"<Policy for {spec['id']}: {spec['observation_len']} numbers observed, "
-            f"{self.segment_steps} actions of {self.low.size} decided, one every {every:g} s>"
+            f"<Policy for {spec['id']}: observation of {spec['observation_len']} values, "
+            f"{self.segment_steps} actions of {self.low.size} values per decision, "
+            f"{spec['control_dt_s']:g} s per action>"
         )
 
     @property
     def is_holding(self) -> bool:
-        """Whether the last action was the hold: observations had stopped, or by request."""
+        """Whether the last action was the hold, for lack of observations or by request."""
         return self._holding
 
     def limit(
@@ -124,7 +125,7 @@ class Policy:
         """
         if y0 is not None:
             if not self._carries:
-                raise ValueError("this policy's start comes from the observation: leave y0 out")
+                raise ValueError("y0 must be None: this policy does not carry the DMP's state")
             y0 = np.asarray(y0, np.float32)
             if y0.shape != self.low.shape or not np.isfinite(y0).all():
                 raise ValueError(f"y0 is {y0}: expected {self.low.size} finite numbers")
@@ -148,7 +149,7 @@ class Policy:
         """
         self._decide(self._checked(observation))
         self._missed, self._holding = 0, False
-        return np.stack([self._give() for _ in range(self.segment_steps)])
+        return np.stack([self._next_action() for _ in range(self.segment_steps)])
 
     def action(self, observation: ArrayLike | None = None) -> Actions:
         """Returns the next control step's action, (A,), in the environment's units.
@@ -158,7 +159,7 @@ class Policy:
 
         :param observation: (O,); None if there is no new one since the last call. After
             ``hold_after`` calls without one, or if a decision is due without one, the action is the
-            hold, and the next observation starts a new segment.
+            hold; the next observation then starts a new segment.
         :raises ValueError: as :meth:`segment`, at every step.
         """
         if observation is not None:
@@ -172,10 +173,10 @@ class Policy:
             self._holding = self._holding or due or self._missed > self._hold_after
         if self._holding:
             return self._limited(self._hold)
-        return self._give()
+        return self._next_action()
 
     def hold(self) -> Actions:
-        """Returns a control step towards the hold, as far as the rate allows, (A,).
+        """Returns an action towards the hold, as far as the rate limit allows, (A,).
 
         Use it after an error, and whenever the policy must not act. The next observation starts a
         new segment.
@@ -183,8 +184,8 @@ class Policy:
         self._holding = True
         return self._limited(self._hold)
 
-    def _give(self) -> Actions:
-        """Executes the segment's next action."""
+    def _next_action(self) -> Actions:
+        """Returns the segment's next action, limited."""
         action = self._limited(self._decided[self._step])
         self._step += 1
         self._network.carry_from(self._step)
@@ -198,14 +199,14 @@ class Policy:
         return self._previous.copy()
 
     def _decide(self, seen: NDArray[np.float32]) -> None:
-        # Far outside the training data, sums of large numbers can be NaN.
+        # Far outside the training data, the network can overflow to infinity and NaN.
         with np.errstate(over="ignore", invalid="ignore"):
             u = self._network.u(seen[None])
         if np.isnan(u).any():
             self._step = self.segment_steps
             raise ValueError(
-                "the policy makes no finite action of this observation: it is far beyond what it "
-                "was trained on"
+                "the policy's actions for this observation are not finite: it is far outside the "
+                "training data"
             )
         self._decided = self._network.scaled(u)[0]
         self._step = 0
@@ -216,10 +217,10 @@ class Policy:
             seen = np.asarray(observation, np.float64).astype(np.float32)
         expected = (self.spec["observation_len"],)
         if seen.shape != expected:
-            raise ValueError(f"an observation of shape {seen.shape}, expected {expected}")
-        unfit = np.flatnonzero(~np.isfinite(seen))
-        if unfit.size > 0:
-            index = int(unfit[0])
+            raise ValueError(f"observation has shape {seen.shape}, expected {expected}")
+        not_finite = np.flatnonzero(~np.isfinite(seen))
+        if not_finite.size > 0:
+            index = int(not_finite[0])
             names = self.spec["observation_names"]
             name = f", {names[index]}," if names else ""
             value = np.asarray(observation)[index]
@@ -231,7 +232,7 @@ def _broadcast(what: str, values: ArrayLike, shape: tuple[int, ...]) -> Actions:
     """Returns one value per action dimension; rejects NaN."""
     array = np.asarray(values, np.float64)
     if array.shape not in ((), shape) or np.isnan(array).any():
-        raise ValueError(f"{what} is {values}: expected one number, or {shape[0]}")
+        raise ValueError(f"{what} is {values}: expected one number or {shape[0]} numbers")
     return np.broadcast_to(array, shape).copy()
 
 
@@ -244,17 +245,21 @@ def _plan(file: PolicyFile) -> dict[str, Any]:
     if is_dmp:
         expected = (3 * steps, 3 + description["dmp"]["basis_count"])
         if file.segment_map is None or file.segment_map.shape != expected:
-            raise ValueError(f"segment_map, expected {expected}")
+            found = None if file.segment_map is None else file.segment_map.shape
+            raise ValueError(f"segment_map has shape {found}, expected {expected}")
     carried = 2 * spec["action_len"] if is_dmp and policy["start"] == "carry" else 0
     widths = [file.layers[0][0].shape[1], *(len(bias) for _, bias in file.layers)]
-    if widths[0] != spec["observation_len"] + carried:
-        raise ValueError(f"actor.0.weight of {widths[0]} inputs")
-    # After its decisions SAC's network outputs their log-stds.
+    inputs = spec["observation_len"] + carried
+    if widths[0] != inputs:
+        raise ValueError(f"actor.0.weight has {widths[0]} inputs, expected {inputs}")
+    # SAC's network outputs the log-stds after the decisions.
     log_stds_len = steps * spec["action_len"] if description["algorithm"] == "sac" else 0
     controlled = 4 if policy["controller"] == "inverse" else 0
     decided = 1 + description["dmp"]["basis_count"] + controlled if is_dmp else 1
-    if widths[-1] != decided * spec["action_len"] + log_stds_len:
-        raise ValueError(f"actor.{len(file.layers) - 1}.weight of {widths[-1]} outputs")
+    outputs = decided * spec["action_len"] + log_stds_len
+    if widths[-1] != outputs:
+        name = f"actor.{len(file.layers) - 1}.weight"
+        raise ValueError(f"{name} has {widths[-1]} outputs, expected {outputs}")
     return {
         "env_count": 1,
         "decision_steps": steps,

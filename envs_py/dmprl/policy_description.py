@@ -14,7 +14,7 @@ WORDS = {
     "policy.start_velocity": ("measured", "zero"),
     "dmp.forcing_scaling": ("none", "goal"),
 }
-"""Known values of every key that changes the policy's function; newer files may have others."""
+"""Known values of each key that changes the policy's function. Newer files may have others."""
 POSITIVE = ("policy.goal_range", "policy.rho_range", "policy.position_scale", "dmp.alpha_y")
 COUNTS = ("policy.segment_steps", "dmp.basis_count", "spec.observation_len", "spec.action_len")
 
@@ -32,7 +32,7 @@ def check(description: dict[str, Any]) -> None:
         expect(key, found, is_finite(found) and found > 0, "a positive number")
     for key in COUNTS:
         found = value(description, key)
-        expect(key, found, isinstance(found, int) and found > 0, "a whole number, 1 or more")
+        expect(key, found, isinstance(found, int) and found > 0, "an integer, 1 or more")
     spec = description["spec"]
     low, high, length = spec["action_low"], spec["action_high"], spec["action_len"]
     for key, bounds in (("spec.action_low", low), ("spec.action_high", high)):
@@ -44,19 +44,19 @@ def check(description: dict[str, Any]) -> None:
     expect("spec.control_dt_s", duration, is_finite(duration) and duration >= 0, "0 or more [s]")
     names = spec["observation_names"]
     fits = len(names) in (0, spec["observation_len"])
-    expect("spec.observation_names", names, fits, f"{spec['observation_len']} names, or none")
+    expect("spec.observation_names", names, fits, f"0 or {spec['observation_len']} names")
     if description["policy"]["kind"] == "dmp" and description["policy"]["start"] == "observed":
         check_sources(description["start_sources"], length, spec["observation_len"])
 
 
 def check_sources(sources: list[dict[str, Any]], count: int, observation_len: int) -> None:
-    """Rejects starts that are not in the observation."""
+    """Rejects sources of the DMP's start that are not in the observation."""
     expect("start_sources", sources, len(sources) == count, f"{count} entries")
     for source in sources:
         keys = ("cos", "sin", "velocity") if "cos" in source else ("index", "velocity")
-        places = [source[key] for key in keys]
-        fits = all(isinstance(at, int) and 0 <= at < observation_len for at in places)
-        expect("start_sources", source, fits, f"places within {observation_len} observations")
+        indices = [source[key] for key in keys]
+        fits = all(isinstance(index, int) and 0 <= index < observation_len for index in indices)
+        expect("start_sources", source, fits, f"indices below {observation_len}")
         expect("start_sources", source, is_finite(source.get("scale", 1.0)), "a finite scale")
 
 
@@ -68,7 +68,7 @@ def value(description: dict[str, Any], key: str) -> Any:
 
 
 def is_finite(number: Any) -> bool:
-    """Returns whether it is a finite number."""
+    """Returns whether ``number`` is a finite number."""
     return isinstance(number, int | float) and math.isfinite(number)
 
 

@@ -1,8 +1,8 @@
 """Reads a policy file: safetensors with the policy's description in its metadata.
 
-The files are written by ``dmprl export`` and into a run's ``policies/``
-(``shared/src/policy_file.rs``). Only NumPy is needed: the container is a length, a header in JSON,
-and the numbers.
+``dmprl export`` and training (in a run's ``policies/``) write the files, with
+``shared/src/policy_file.rs``. Reading one needs only NumPy: the format is the header's length, the
+header in JSON, and the numbers.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 FORMAT = "dmprl-policy-1"
 HEADER_BYTES_MAX = 100_000_000
-"""Limit of the safetensors library: a longer header means damage."""
+"""Limit of the safetensors library. A file with a longer header is damaged."""
 
 
 class PolicyFileError(ValueError):
@@ -31,7 +31,7 @@ class PolicyFile:
 
     path: Path
     description: dict[str, Any]
-    """Environment, algorithm, policy, DMP and start, as ``PolicyDescription`` in Rust."""
+    """Environment, algorithm, policy, DMP and start; ``PolicyDescription`` in Rust."""
     origin: dict[str, Any] | None
     """Run, task, seed and return of the policy; None in a run's own files."""
     version: int
@@ -53,7 +53,8 @@ def read(path: Path) -> PolicyFile:
         raise PolicyFileError(f"{path}: format is {found or 'missing'}, expected {FORMAT}")
     if "description" not in fields:
         raise PolicyFileError(
-            f"{path}: no description: an older dmprl wrote it; write it anew with dmprl export RUN"
+            f"{path}: has no description, because an older dmprl wrote it; write it again with "
+            "dmprl export RUN"
         )
     layers = []
     while (name := f"actor.{len(layers)}.weight") in tensors:
@@ -61,7 +62,9 @@ def read(path: Path) -> PolicyFile:
         before = layers[-1][0].shape[0] if layers else None
         fits = weight.ndim == 2 and bias is not None and bias.shape == weight.shape[:1]
         if not fits or (before is not None and weight.shape[1] != before):
-            raise PolicyFileError(f"{path}: {name} does not fit its bias or the layer before")
+            raise PolicyFileError(
+                f"{path}: the shape of {name} does not fit its bias or the previous layer"
+            )
         layers.append((weight, bias))
     if not layers:
         raise PolicyFileError(f"{path}: no tensor actor.0.weight")
@@ -97,19 +100,19 @@ def _contents(path: Path) -> tuple[dict[str, str], dict[str, NDArray[np.float32]
     data = path.read_bytes()
     length = int.from_bytes(data[:8], "little")
     if len(data) < 8 or length > min(HEADER_BYTES_MAX, len(data) - 8):
-        raise PolicyFileError(f"{path}: not a safetensors file, or cut short")
+        raise PolicyFileError(f"{path}: not a safetensors file, or truncated")
     numbers = memoryview(data)[8 + length :]
     tensors: dict[str, NDArray[np.float32]] = {}
     try:
         header = json.loads(data[8 : 8 + length])
         fields = header.pop("__metadata__", {})
         if not all(isinstance(field, str) for field in fields.values()):
-            raise PolicyFileError(f"{path}: metadata that are no text")
+            raise PolicyFileError(f"{path}: metadata is not text")
         for name, entry in header.items():
             begin, end = entry["data_offsets"]
             if entry["dtype"] != "F32" or not 0 <= begin <= end <= len(numbers):
                 raise PolicyFileError(f"{path}: {name} is damaged")
-            # Copied, because the data may be unaligned and the file's bytes can then be freed.
+            # Copied, because the data may be unaligned, and so that the file's bytes can be freed.
             tensor = np.frombuffer(numbers[begin:end], "<f4").astype(np.float32)
             tensors[name] = tensor.reshape(entry["shape"])
     except PolicyFileError:

@@ -1,7 +1,7 @@
-"""One environment that records its robot's motion at control rate.
+"""An environment that records its robot's motion at control rate.
 
-For ``dmprl record`` and the measurement of motion (``actors/src/python_env/recording.rs``). The
-episodes equal those of an evaluation with the same seeds: the same actions, one step at a time.
+``dmprl record`` and the measurement of motion use it (``actors/src/python_env/recording.rs``). Its
+episodes equal those of an evaluation with the same seeds; they run one step at a time.
 """
 
 from __future__ import annotations
@@ -18,12 +18,13 @@ from numpy.typing import NDArray
 
 try:
     import mujoco
-except Exception as error:  # any error of the OpenGL that MUJOCO_GL names
+except Exception as error:  # raised by the OpenGL that MUJOCO_GL names
     if not os.environ.get("MUJOCO_GL"):
         raise
     raise RuntimeError(
         f"no OpenGL to draw with (MUJOCO_GL={os.environ['MUJOCO_GL']}: {error}). Unset MUJOCO_GL, "
-        "or Debian, Ubuntu: apt install libegl1 libgl1-mesa-dri for egl, libosmesa6 for osmesa"
+        "or install OpenGL; on Debian and Ubuntu: apt install libegl1 libgl1-mesa-dri for egl, "
+        "libosmesa6 for osmesa"
     ) from None
 
 from dmprl.gymnasium_env import GymnasiumSegmentEnv, success_of
@@ -35,9 +36,9 @@ from dmprl.task_env import TaskEnv
 from dmprl.tasks import registered
 
 RENDER_MODE = "rgb_array"
-DRAWABLE = f"a Gymnasium environment that can be has the render mode {RENDER_MODE!r}"
+DRAWABLE = f"expected a Gymnasium environment with the render mode {RENDER_MODE!r}"
 FRAME_RATE_MAX = 50.0
-"""Maximum frames per second of an episode; most screens show no more."""
+"""Maximum frames per second of an episode; most screens cannot show more."""
 
 
 class NoPicturesError(RuntimeError):
@@ -60,7 +61,7 @@ class Recording(TypedDict):
 
 
 class State(NamedTuple):
-    """State of a MuJoCo model, as arrays that change with it."""
+    """State of a MuJoCo simulation, as arrays that change with it."""
 
     model: mujoco.MjModel
     qpos: NDArray[np.float64]
@@ -68,21 +69,21 @@ class State(NamedTuple):
 
 
 class Log:
-    """Record of the episode that started with the last seeded reset."""
+    """Records the episode that started with the last reset with a seed."""
 
     def __init__(self, pictures: Path | None) -> None:
         self.joints: Joints | None = None
-        self.recording = nothing()
+        self.recording = empty_recording()
         self._pictures = pictures
         self._open = False
         self._seed = 0
 
     def begin(self, env: Watched, seed: int | None) -> None:
-        """Starts an episode; one without a seed follows automatically and is not recorded."""
+        """Starts an episode. An automatic reset has no seed, and its episode is not recorded."""
         self._open = seed is not None
         if seed is not None:
             self._seed = seed
-            self.recording = nothing()
+            self.recording = empty_recording()
             self._note_state(env)
             self._draw(env)
 
@@ -92,7 +93,7 @@ class Log:
             return
         self.recording["success"].append(success_of(info))
         self._note_state(env)
-        if ended or len(self.recording["success"]) % steps_a_frame(env) == 0:
+        if ended or len(self.recording["success"]) % steps_per_frame(env) == 0:
             self._draw(env)
 
     def _draw(self, env: Watched) -> None:
@@ -119,14 +120,14 @@ class Log:
 
 
 class Watched(gymnasium.Wrapper):
-    """Records every step."""
+    """Records every step in a :class:`Log`."""
 
     def __init__(self, env: gymnasium.Env, log: Log) -> None:
         super().__init__(env)
         self._log = log
 
     def state(self) -> State | None:
-        """Returns the simulation's state; None if it is not MuJoCo's."""
+        """Returns the simulation's state; None if the environment does not use MuJoCo."""
         env = self.unwrapped
         if isinstance(env, TaskEnv):
             return State(env.task.model, *env.positions_and_velocities)
@@ -196,16 +197,16 @@ class RecordingEnv(GymnasiumSegmentEnv):
     def why_no_joints(self) -> str:
         """Returns why there are no joints; empty if there are some."""
         if self._log.joints is None:
-            return "not a MuJoCo environment: nobody knows where its joints stand"
+            return "not a MuJoCo environment, so its joints are unknown"
         return "" if self._log.joints.names else "no actuator of its model moves a joint"
 
     def recording(self) -> Recording:
-        """Returns the record of the episode that started with the last seeded reset."""
+        """Returns the record of the episode that started with the last reset with a seed."""
         return self._log.recording
 
 
 class OpaqueEnv(SegmentEnv):
-    """A user's own :class:`SegmentEnv`, of which only rewards are known."""
+    """A user's own :class:`SegmentEnv`, of which only rewards can be recorded."""
 
     def __init__(self, env: SegmentEnv) -> None:
         self._env = env
@@ -236,7 +237,7 @@ class OpaqueEnv(SegmentEnv):
 
     def why_no_joints(self) -> str:
         """Returns the reason."""
-        return "a SegmentEnv runs a whole segment at once: what its robot does within is not seen"
+        return "a SegmentEnv runs a whole segment at once, so the motion within is not recorded"
 
     def goal_in_pictures(self) -> str:
         """Returns an empty string: there are no pictures."""
@@ -244,10 +245,10 @@ class OpaqueEnv(SegmentEnv):
 
     def recording(self) -> Recording:
         """Returns an empty record."""
-        return nothing()
+        return empty_recording()
 
 
-def nothing() -> Recording:
+def empty_recording() -> Recording:
     """Returns the record of an episode that has not started."""
     return {
         "joint_positions": [],
@@ -258,16 +259,17 @@ def nothing() -> Recording:
     }
 
 
-def steps_a_frame(env: gymnasium.Env) -> int:
+def steps_per_frame(env: gymnasium.Env) -> int:
     """Returns the number of environment steps per frame."""
     dt = getattr(env.unwrapped, "dt", 0.0)
     return max(1, round(1.0 / (FRAME_RATE_MAX * dt))) if np.isscalar(dt) and dt > 0 else 1
 
 
 def make(task_id: str, segment_steps: int, pictures: str | None = None) -> RecordingEnv | OpaqueEnv:
-    """Makes one environment of a task, named as for :func:`dmprl.segment_env.make`.
+    """Creates one environment of a task.
 
-    ``pictures`` is a folder for pictures.
+    - ``task_id``: as for :func:`dmprl.segment_env.make`.
+    - ``pictures``: folder for pictures; None to make no pictures.
     """
     if pictures is not None:
         name_opengl()
@@ -293,7 +295,7 @@ def task_maker(task_id: str, task: type[MujocoTask]) -> Callable[..., TaskEnv]:
 
 
 def gymnasium_id(task_id: str) -> str:
-    """Prefers dmprl's task to an equal one of Gymnasium, as a worker does."""
+    """Returns the id of dmprl's task in place of an equal one of Gymnasium, as a worker does."""
     ours = task_id.removeprefix("dmprl:")
     if registered(ours) is None or ours.startswith("dmprl/"):
         return ours

@@ -30,8 +30,8 @@ class Joints(NamedTuple):
 def robot_joints(model: mujoco.MjModel) -> Joints:
     """Finds the joints that actuators move, directly or by a tendon.
 
-    A robot may also hang on a body that the program drags (Gymnasium-Robotics' Fetch). All joints
-    between that body and the world then belong to the robot.
+    A robot may also be welded to a body that the program moves (Gymnasium-Robotics' Fetch). All
+    joints between that body and the world then belong to the robot.
     """
     moved = _actuated(model) | _dragged(model)
     kept = [joint for joint in sorted(moved) if model.jnt_type[joint] in KINDS]

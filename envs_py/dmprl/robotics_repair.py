@@ -1,8 +1,8 @@
 """Makes Gymnasium-Robotics work with MuJoCo 4.
 
-Its newest version, 1.4.2, tests whether a joint's type, a NumPy integer, is in a tuple of MuJoCo's
-enumerators. In MuJoCo 4 an enumerator on the left equals no NumPy integer, so FetchReach and
-everything that sets a joint by name end in an AssertionError without a message.
+Version 1.4.2 of Gymnasium-Robotics, the newest, tests whether a joint's type, a NumPy integer, is
+in a tuple of MuJoCo's enumerators. In MuJoCo 4 an enumerator is never equal to a NumPy integer on
+its right, so FetchReach and all code that sets a joint by name fail with an AssertionError.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import numpy as np
 
 
 def repair() -> None:
-    """Gives one module of Gymnasium-Robotics joint types that compare as before."""
+    """Replaces the joint types in a module of Gymnasium-Robotics by integers that compare equal."""
     from gymnasium_robotics.utils import mujoco_utils
 
     seen = mujoco_utils.mujoco

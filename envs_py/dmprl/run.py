@@ -1,4 +1,4 @@
-"""A run directory in Python: configuration, metrics as data frames, policies.
+"""Reads a run directory: its configuration, metrics as data frames, and policies.
 
 ::
 
@@ -24,13 +24,13 @@ LIBRARIES = ("pandas", "polars")
 
 
 class Run:
-    """A run of ``dmprl train``. Every call reads the files again, because the run may be active."""
+    """A run of ``dmprl train``. Each call reads the files again, because training may continue."""
 
     def __init__(self, path: str | Path) -> None:
         """:raises FileNotFoundError: if there is no run at ``path``."""
         self.path = Path(path)
         if not (self.path / "manifest.json").is_file():
-            raise FileNotFoundError(f"{self.path}: no run directory, it has no manifest.json")
+            raise FileNotFoundError(f"{self.path} is not a run directory: it has no manifest.json")
 
     def __repr__(self) -> str:
         return f"Run({str(self.path)!r})"
@@ -55,7 +55,10 @@ class Run:
         return _frame(self._lines("metrics.jsonl"), library)
 
     def evaluations(self, library: str = "pandas") -> Any:
-        """Returns ``evaluations.jsonl`` likewise; ``returns`` lists the episodes' returns."""
+        """Returns ``evaluations.jsonl`` as a data frame, like :meth:`metrics`.
+
+        The column ``returns`` contains lists, with the return of each episode.
+        """
         return _frame(self._lines("evaluations.jsonl"), library)
 
     def policy(self, which: str | int = "best") -> Policy:
@@ -67,7 +70,7 @@ class Run:
         if not rows and isinstance(which, str):
             raise PolicyFileError(f"{self.path}: no evaluation yet, so no {which} policy")
         if which == "best":
-            # The latest of equals, as elsewhere.
+            # Of equal ones the latest, as in Rust.
             version = max(reversed(rows), key=lambda row: row["return_mean"])["policy_version"]
         elif which == "latest":
             version = rows[-1]["policy_version"]
@@ -77,11 +80,11 @@ class Run:
             raise ValueError(f"policy {which!r}: expected best, latest or a version")
         file = self.path / "policies" / f"{version}.safetensors"
         if not file.is_file():
-            raise PolicyFileError(f"{self.path} has not kept policy {version}")
+            raise PolicyFileError(f"{self.path} has no saved policy {version}")
         return Policy.load(file)
 
     def record(self, *, quiet: bool = True, **flags: Any) -> Path:
-        """Makes a video of a policy's episodes, headless, and returns the path of the MP4.
+        """Makes a video of a policy's episodes and returns the path of the MP4; needs no display.
 
         A GIF and a strip of frames are written beside it.
 
@@ -94,7 +97,7 @@ class Run:
         return Path(json.loads(program.call("record", *arguments, quiet=quiet))["mp4"])
 
     def _lines(self, name: str) -> list[dict[str, Any]]:
-        """Reads the complete lines of a file; the last one may still be in progress."""
+        """Reads the complete lines of a file; training may still be writing the last one."""
         file = self.path / name
         text = file.read_text() if file.is_file() else ""
         return [json.loads(line) for line in text.splitlines(keepends=True) if line.endswith("\n")]

@@ -1,8 +1,8 @@
-"""The search of ``dmprl sweep``: proposes the next values, and prunes trials.
+"""Proposes the values of the next trial and prunes trials, for ``dmprl sweep``.
 
-``python -m dmprl.search STORAGE`` answers each JSON object on standard input, one per line, with
-one on standard output. The first output line is ``{"ready": "optuna 5.0.0"}``, or
-``{"absent": "reason"}``.
+``python -m dmprl.search STORAGE`` reads requests from standard input and writes one answer to each
+on standard output; both are JSON objects, one per line. The first output line is
+``{"ready": "optuna 5.0.0"}``, or ``{"absent": "reason"}``.
 
 ================================================= =============================================
 ``{"op": "open", "study": …, "identity": …, …}``  ``{"identity": …, "trials": [{"trial", "state",
@@ -13,8 +13,8 @@ one on standard output. The first output line is ``{"ready": "optuna 5.0.0"}``, 
 ================================================= =============================================
 
 A failed request is answered by ``{"error": "reason"}``. The process exits at the end of its input,
-and thus with the program that started it. All data are in an Optuna storage and are written before
-the answer. Reopening it gives all trials, including active ones.
+and thus with the program that started it. All data are in an Optuna storage, and are written before
+the answer. Reopening the storage returns all trials, including active ones.
 """
 
 from __future__ import annotations
@@ -33,9 +33,9 @@ except ModuleNotFoundError as error:
     optuna, ABSENT = None, str(error)
 
 IDENTITY = "dmprl"
-"""Attribute of the study with the common properties of its trials."""
+"""Attribute of the Optuna study with the settings that all its trials share."""
 STATES = {"running": "RUNNING", "finished": "COMPLETE", "pruned": "PRUNED", "failed": "FAIL"}
-"""Our names of Optuna's states. A waiting trial has not been asked for."""
+"""Optuna's states by dmprl's names. A trial in Optuna's state WAITING has not been requested."""
 
 
 class RefusedError(Exception):
@@ -60,16 +60,16 @@ class Study:
             self.study.set_user_attr(IDENTITY, self.identity)
 
     def asked(self) -> list[FrozenTrial]:
-        """Returns every trial that has been asked for, in order."""
+        """Returns every trial that has been requested, in order."""
         return [trial for trial in self.study.trials if trial.state != TrialState.WAITING]
 
     def opened(self) -> dict:
         """Returns all stored data.
 
-        A killed process may have left a trial with some of its values; the others are added.
+        If a process was killed while it created a trial, this adds the trial's missing values.
         """
         identity = self.study.user_attrs[IDENTITY]
-        # Otherwise the caller rejects the study, and nothing may change.
+        # If they differ, the caller rejects the study, and nothing may change.
         if identity == self.identity:
             for values in self.first:
                 self.study.enqueue_trial(values, skip_if_exists=True)
@@ -80,7 +80,7 @@ class Study:
 
     def ask(self) -> dict:
         """Creates the next trial."""
-        # A different seed for each trial: with a common one, a resumed study would repeat its first
+        # A different seed for each trial. With a common one, a resumed study would repeat its first
         # values.
         seed = np.random.SeedSequence([self.seed, len(self.asked())]).generate_state(1)[0]
         self.study.sampler = sampler(self.sampler, int(seed))
@@ -100,14 +100,14 @@ class Study:
         return values
 
     def running(self, number: int) -> Trial:
-        """Returns an active trial; any other state is an error of the caller."""
+        """Returns a trial that is running; raises RefusedError if it is not."""
         frozen = self.study.trials[number]
         if frozen.state != TrialState.RUNNING:
             raise RefusedError(f"trial {number} is {frozen.state.name}, expected RUNNING")
         return Trial(self.study, frozen._trial_id)
 
     def report(self, number: int, step: int, value: float) -> dict:
-        """Reports an intermediate value, the first of a step only; returns whether to prune."""
+        """Reports an intermediate value, once per step; returns whether to prune the trial."""
         trial = self.running(number)
         if step not in self.study.trials[number].intermediate_values:
             trial.report(value, step)
@@ -173,9 +173,9 @@ class Search:
 
 def main() -> None:
     """Answers requests, as described in the module's docstring."""
-    # Ctrl-C may reach the whole process group; the program that reads our output decides.
+    # Ctrl-C may reach the whole process group; the program that started this one handles it.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    # Output of a library must not become a line of the protocol.
+    # Libraries may print; only answers may reach the caller.
     lines = os.fdopen(os.dup(1), "w", buffering=1)
     os.dup2(2, 1)
 

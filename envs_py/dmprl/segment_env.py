@@ -1,8 +1,8 @@
-"""Several environments behind one call per segment.
+"""The interface between a worker and its environments: one call per segment for all of them.
 
-A policy decides once per *segment*: K actions, applied open loop. The worker therefore calls Python
-only once per segment, for all its E environments together, through this module. Shapes: E
-environments, K steps of a segment, O observation, A action.
+A policy decides once per *segment* of K actions, which are applied open loop. So the worker calls
+Python only once per segment, for all its E environments together. Shapes: E environments, K steps
+of a segment, O observation, A action.
 """
 
 from __future__ import annotations
@@ -21,14 +21,14 @@ SUCCESS_NO, SUCCESS_YES, SUCCESS_NOT_REPORTED = 0, 1, 2
 
 
 EXTRAS = {"panda_gym": "panda-gym", "gymnasium_robotics": "robotics"}
-"""Packages that are known to work, and dmprl's extra that installs each."""
+"""Supported packages, with the extra of dmprl that installs each."""
 
 OBSERVATION_NAMES_MAX = 10_000
-"""Longer observations have no names, because a specification is stored and sent as one line."""
+"""Maximum length of an observation with names, because a specification is sent as one line."""
 
 
 class SegmentEnvError(RuntimeError):
-    """Raised if an environment fails permanently. The message names its id, index and step."""
+    """Raised if an environment fails permanently. The message has its id, index and step."""
 
 
 class UnsupportedSpaceError(TypeError):
@@ -36,7 +36,7 @@ class UnsupportedSpaceError(TypeError):
 
 
 class NotGoalConditionedError(TypeError):
-    """Raised if hindsight is used without goals in the environment, or without rewards for them."""
+    """Raised if hindsight is used, but the environment has no goals, or no rewards for them."""
 
 
 class Goals(TypedDict):
@@ -49,7 +49,7 @@ class Goals(TypedDict):
     length: int
     """Number of entries of each goal."""
     sparse: bool
-    """Whether the reward only says whether the goal was reached."""
+    """Whether the reward only depends on whether the goal was reached."""
 
 
 class EnvSpec(TypedDict):
@@ -63,13 +63,13 @@ class EnvSpec(TypedDict):
     control_dt_s: float
     """Duration of one environment step [s]; 0.0 if the environment does not report it."""
     episode_steps: int
-    """Steps after which an episode is truncated; 0 if it never is."""
+    """Steps after which an episode is truncated; 0 if there is no limit."""
     observation_names: NotRequired[list[str]]
-    """Name of each entry of an observation, such as ``achieved_goal[0]``; empty: no names."""
+    """Name of each entry of an observation, such as ``achieved_goal[0]``; empty if unknown."""
 
 
 class SegmentBuffers:
-    """Results of a :class:`SegmentEnv`: the caller's arrays, allocated once, C-contiguous.
+    """Results of a :class:`SegmentEnv`, in C-contiguous arrays of the caller, allocated once.
 
     The worker reads them through the buffer protocol, without a copy. After ``step_segment``:
 
@@ -80,11 +80,11 @@ class SegmentBuffers:
     - ``terminated``, ``truncated`` uint8 (E,): of the last executed step. Both may be set.
     - ``success`` uint8 (E,): 0 no, 1 yes, 2 not reported; of the last executed step.
     - ``steps`` int32 (E,): executed steps, 1 to K.
-    - ``failed`` uint8 (E,): 1 where the environment raised an exception, or returned NaN or
-      infinity, during this call. All its other rows of this call, including ``steps``, are zero and
+    - ``failed`` uint8 (E,): 1 if the environment raised an exception, or returned NaN or infinity,
+      during this call. All its other rows of this call, including ``steps``, are then zero and
       invalid.
-    - ``next_observations`` float64 (E, O): the observation for the next action: of the new episode
-      if the old one ended, else the last one. ``reset`` writes only this array.
+    - ``next_observations`` float64 (E, O): the observation for the next action: the first one of
+      the new episode if the old one ended, else the last one. ``reset`` writes only this array.
     """
 
     def __init__(
@@ -107,8 +107,8 @@ class SegmentBuffers:
 class GoalRows:
     """Steps with other goals, for :meth:`SegmentEnv.relabel`; allocated once.
 
-    Only the first ``count[0]`` of M rows are used. The caller writes ``achieved`` and ``desired``
-    float64 (M, G); the results are ``rewards`` float64 (M,) and ``terminated`` uint8 (M,).
+    Only the first ``count[0]`` of M rows are used. The caller writes ``achieved`` and ``desired``,
+    float64 (M, G). The results are ``rewards``, float64 (M,), and ``terminated``, uint8 (M,).
     """
 
     def __init__(self, rows_max: int, goal_len: int) -> None:
@@ -122,10 +122,10 @@ class GoalRows:
 class SegmentEnv(ABC):
     """E environments that step a whole segment in one call.
 
-    Subclass this for a simulator that is faster than a loop over Gymnasium environments, and name
-    it ``module:Class``; it is constructed as ``Class(env_count, segment_steps)``. An implementation
-    keeps no reference to the buffers beyond a call, and writes every row of every array that the
-    call is documented to write.
+    Subclass this for a simulator that is faster than a loop over Gymnasium environments. Its task
+    id is ``module:Class``, and it is constructed as ``Class(env_count, segment_steps)``. An
+    implementation must not keep a reference to the buffers after a call, and must write every row
+    of every array that the call is documented to write.
     """
 
     env_count: int
@@ -133,7 +133,7 @@ class SegmentEnv(ABC):
 
     @abstractmethod
     def spec(self) -> EnvSpec:
-        """Returns sizes, bounds and timing; constant and equal for all E environments."""
+        """Returns sizes, bounds and timing. They are constant and equal for all E environments."""
 
     @abstractmethod
     def reset(
@@ -156,22 +156,22 @@ class SegmentEnv(ABC):
         - ``actions`` float64 (E, K, A), in environment units.
         - An environment stops at its first terminated or truncated step. It is then reset at the
           end of this call, without a seed: its own random generator continues, so a run depends
-          only on the first seeds. The caller thus never has to reset between episodes.
+          only on the first seeds. The caller does not reset between episodes.
         - An environment that raises an exception or returns NaN or infinity, in a step or in that
-          reset, only loses its own segment. It is closed, recreated and reset with
+          reset, loses only its own segment. It is closed, recreated and reset with
           :func:`seed_after_failure`; ``out.failed`` is set, and its row of
           ``out.next_observations`` starts the new episode. The other environments are not affected.
 
         Raises:
             SegmentEnvError: if it could not be recreated. An implementation that cannot recreate
-                its environments may raise at the first failure: the worker then ends, and a new
-                one is started.
+                its environments may raise this at the first failure. The worker then exits and is
+                restarted.
         """
 
     def take_failures(self) -> list[str]:
         """Returns messages about the failures since the last call.
 
-        Each names id, environment index, step and cause, as in :class:`SegmentEnvError`.
+        Each has the id, environment index, step and cause, as in :class:`SegmentEnvError`.
         """
         return []
 
@@ -181,13 +181,13 @@ class SegmentEnv(ABC):
         Raises:
             NotGoalConditionedError: if there are none, or rewards for them are unavailable.
         """
-        raise NotGoalConditionedError(f"{self.spec()['id']}: its observation holds no goals")
+        raise NotGoalConditionedError(f"{self.spec()['id']}: its observation has no goals")
 
     def relabel(self, rows: GoalRows) -> None:
-        """Writes the rewards that steps would have had with other goals.
+        """Computes the rewards that steps would have had with other goals, for hindsight.
 
-        For hindsight. Called at an episode's end with all its copies, and only if :meth:`goals`
-        returns.
+        Called at the end of an episode with the rows of all its copies, and only if :meth:`goals`
+        does not raise an exception.
         """
         raise NotImplementedError
 
@@ -198,24 +198,28 @@ class SegmentEnv(ABC):
 def seed_after_failure(first_seed: int, failures: int) -> int:
     """Derives the seed of an environment that was recreated.
 
-    Equal failures give equal episodes, and an episode that led to a failure is not repeated.
+    The seed is reproducible, but differs from the previous one, so an episode that led to a failure
+    is not repeated.
 
-    - ``first_seed``: of the caller's last ``reset``; ``failures``: since then, including this one.
+    - ``first_seed``: seed of the caller's last ``reset``.
+    - ``failures``: number of failures since then, including this one.
     - Returns 31 bits, because some environments accept no more.
     """
     return int(np.random.SeedSequence([first_seed, failures]).generate_state(1)[0]) >> 1
 
 
 def make(task_id: str, env_count: int, segment_steps: int) -> SegmentEnv:
-    """Makes the environments of a task.
+    """Creates the environments of a task.
 
-    - ``task_id``: a Gymnasium id; ``module:Id`` for one that ``module`` registers when imported;
-      ``module:name`` with a class that is a :class:`SegmentEnv`, a
-      ``dmprl.mujoco_batch.MujocoTask`` or a ``gymnasium.Env``, or with a function that makes a
+    - ``task_id``: a Gymnasium id; ``module:Id`` if ``module`` registers the id when it is imported;
+      or ``module:name``, where ``name`` is a subclass of :class:`SegmentEnv`,
+      ``dmprl.mujoco_batch.MujocoTask`` or ``gymnasium.Env``, or a function that returns a
       ``gymnasium.Env``.
     """
     if env_count < 1 or segment_steps < 1:
-        raise ValueError(f"{env_count} environments, {segment_steps} steps: both must be 1 or more")
+        raise ValueError(
+            f"{env_count} environments, {segment_steps} steps; expected 1 or more of both"
+        )
     candidate = named_object(task_id)
     if isinstance(candidate, type) and issubclass(candidate, SegmentEnv):
         return candidate(env_count, segment_steps)
@@ -230,13 +234,13 @@ def make(task_id: str, env_count: int, segment_steps: int) -> SegmentEnv:
     if batch is not None:
         return batch
 
-    from dmprl.gymnasium_env import GymnasiumSegmentEnv  # a SegmentEnv does not need Gymnasium
+    from dmprl.gymnasium_env import GymnasiumSegmentEnv  # a SegmentEnv works without Gymnasium
 
     return GymnasiumSegmentEnv(task_id, env_count, segment_steps, candidate)
 
 
 def named_object(task_id: str) -> object:
-    """Returns the object that ``module:name`` names; None without a module or such an object."""
+    """Returns the object that ``module:name`` names; None without a module, or if it is missing."""
     module_name, _, name = task_id.rpartition(":")
     return getattr(_import(task_id, module_name), name, None) if module_name else None
 
@@ -246,7 +250,7 @@ def _import(task_id: str, module_name: str) -> ModuleType:
         return importlib.import_module(module_name)
     except ModuleNotFoundError as error:
         if error.name is None or not f"{module_name}.".startswith(f"{error.name}."):
-            raise  # found, but one of its imports is missing
+            raise  # the module exists, but one of its imports is missing
         extra = EXTRAS.get(module_name)
         raise ModuleNotFoundError(
             f"{task_id}: no module {error.name!r} among the installed packages or in the "

@@ -1,7 +1,7 @@
-"""Tasks on MuJoCo's batched simulation whose controls depend on the state of each step.
+"""Tasks on MuJoCo's batched simulation whose controls depend on the state at each step.
 
-A displacement is relative to the robot's state at the start of a step. The controls of a segment
-are therefore not known in advance, and it is simulated step by step.
+For example, a displacement is relative to the robot's state at the start of a step. So the controls
+of a segment are not known in advance, and it is simulated step by step.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from dmprl.mujoco_batch import BatchSegmentEnv, Fields, MujocoTask
 from dmprl.segment_env import SegmentBuffers
 
 VELOCITY_STAGE = mujoco.mjtStage.mjSTAGE_VEL.value
-"""Computes positions, velocities and sensors of the state after a step, which ``mj_step`` leaves
+"""Computes positions, velocities and sensors for the state after a step; ``mj_step`` leaves them
 one simulation step behind."""
 
 
@@ -53,7 +53,7 @@ class StepwiseSegmentEnv(BatchSegmentEnv):
             try:
                 batch.step(nstep=task.frame_skip, stage=VELOCITY_STAGE)
             except mujoco.batch.SimulationError as error:
-                # The others continue; results of the failed ones are discarded.
+                # The others continue; the results of the failed ones are discarded.
                 failed = error.ids if failed is None else np.union1d(failed, error.ids)
             task.observe(self._fields, out.observations[:, step + 1])
         return self._failed(failed)

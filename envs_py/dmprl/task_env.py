@@ -1,4 +1,4 @@
-"""One of dmprl's tasks as a Gymnasium environment."""
+"""Wraps one of dmprl's tasks as a Gymnasium environment."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ from dmprl.mujoco_batch import MujocoTask
 from dmprl.segment_env import SUCCESS_NOT_REPORTED, SegmentBuffers, SegmentEnvError
 from dmprl.tasks import make_task
 
-# Opening a window without a display ends the whole process inside GLFW.
+# Without a display, GLFW would end the whole process when it opens a window.
 HAS_DISPLAY = any(os.environ.get(name) for name in ("DISPLAY", "WAYLAND_DISPLAY"))
 
 
 class TaskEnv(gymnasium.Env[NDArray[np.float64], NDArray[np.float32]]):
-    """A batch of one environment with segments of one step, and thus equal to a worker's.
+    """A batch of one environment with segments of one step, so it behaves as in a worker.
 
-    ``gymnasium.make`` adds Gymnasium's own wrapper for the time limit. ``render_mode``:
+    ``gymnasium.make`` adds Gymnasium's own wrapper for the time limit. The render modes
     ``rgb_array`` and ``depth_array`` need no display (:mod:`dmprl.pictures`).
     """
 
@@ -39,10 +39,13 @@ class TaskEnv(gymnasium.Env[NDArray[np.float64], NDArray[np.float32]]):
         height: int = 480,
         task: Callable[[int], MujocoTask] | None = None,
     ) -> None:
-        """Use ``task``, if given, to make a user's own task for a number of environments."""
+        """Creates the environment.
+
+        ``task``, if given, creates a user's own task for a number of environments.
+        """
         if render_mode not in (None, *self.metadata["render_modes"]):
             modes = ", ".join(self.metadata["render_modes"])
-            raise ValueError(f"{task_id}: render_mode {render_mode!r}; here there are {modes}")
+            raise ValueError(f"{task_id}: render_mode {render_mode!r}; expected one of {modes}")
         made = make_task(task_id, 1) if task is None else task(1)
         if made is None:
             raise ValueError(f"{task_id} is not a task of dmprl; `dmprl tasks` lists them")

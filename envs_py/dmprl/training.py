@@ -1,4 +1,4 @@
-"""``dmprl.train``, which trains a policy from Python."""
+"""Defines ``dmprl.train``, which trains a policy from Python."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ from dmprl import program
 from dmprl.run import Run
 
 NAME_MAX = 60
-"""Maximum letters of the task in a run's name."""
+"""Maximum length of the task's part of a run's name."""
 
 
 class TrainingError(program.ProgramError):
-    """Raised if training failed; the message is the program's own."""
+    """Raised if training failed, with the program's message."""
 
 
 def train(
@@ -31,12 +31,12 @@ def train(
     :param task: a task of ``dmprl tasks``, a Gymnasium id, or ``module:Class``.
     :param run_dir: directory for the results, new or empty. By default a new folder in ``runs/``.
     :param python_path: directory of your own environment modules.
-    :param deterministic: one worker, in one process with the learner and in lock-step with it:
-        the same seed gives the same bytes.
+    :param deterministic: runs one worker in the learner's process and in lock-step with it, so that
+        the same seed gives bit-identical results.
     :param quiet: suppresses progress.
     :param overrides: flags of ``dmprl train`` (``steps=20_000``, ``algo="sac"``, ``seed=2``) and
-        configuration keys with two underscores for the dot (``algorithm__batch_size=64``). None is
-        omitted.
+        configuration keys with two underscores for the dot (``algorithm__batch_size=64``). A flag
+        that is None is omitted.
     :raises TrainingError: if the run failed, or a value was rejected. The message gives the reason;
         in a terminal the program has already printed it.
     :raises KeyboardInterrupt: if it was interrupted, after writing a checkpoint.
@@ -53,6 +53,6 @@ def train(
 
 
 def _safe(task: str) -> str:
-    """Derives a name that every file system accepts."""
+    """Converts a task's id to a name that all file systems accept."""
     letters = (it if it.isascii() and it.isalnum() else "-" for it in task)
     return "".join(letters).strip("-").lower()[:NAME_MAX] or "run"

@@ -11,7 +11,7 @@ from dmprl.segment_env import GoalRows, NotGoalConditionedError, make
 sys.path.append(str(Path(__file__).parent))  # for the tiny environments' module
 
 
-def refusal(task_id):
+def rejection(task_id):
     try:
         make(task_id, 1, 5).goals()
     except NotGoalConditionedError as error:
@@ -20,22 +20,22 @@ def refusal(task_id):
 
 
 class GoalsTest(unittest.TestCase):
-    def test_goals_are_where_the_flattened_observation_has_them(self):
+    def test_goals_are_found_in_the_flattened_observation(self):
         goals = make("tiny_envs:Reach-v0", 1, 5).goals()
         self.assertEqual(goals, {"achieved": 0, "desired": 1, "length": 1, "sparse": True})
 
-    def test_a_reward_that_tells_every_distance_apart_is_not_sparse(self):
+    def test_a_reward_by_distance_is_not_sparse(self):
         self.assertFalse(make("tiny_envs:ReachFar-v0", 1, 5).goals()["sparse"])
 
-    def test_who_cannot_be_asked_is_told_why(self):
+    def test_unsuitable_environments_are_rejected_with_a_reason(self):
         for task_id, reason in [
-            ("tiny_envs:Long-v0", "its observation is no Dict"),
+            ("tiny_envs:Long-v0", "its observation is not a Dict"),
             ("tiny_envs:Goal-v0", "no Box named achieved_goal"),
             ("tiny_envs:ReachAlone-v0", "takes one goal at a time"),
-            ("tiny_envs:Batch", "its observation holds no goals"),
-            ("Reacher-v5", "its observation holds no goals"),
+            ("tiny_envs:Batch", "its observation has no goals"),
+            ("Reacher-v5", "its observation has no goals"),
         ]:
-            self.assertIn(reason, refusal(task_id), task_id)
+            self.assertIn(reason, rejection(task_id), task_id)
 
 
 class RelabelTest(unittest.TestCase):
@@ -49,16 +49,16 @@ class RelabelTest(unittest.TestCase):
         env.relabel(rows)
         return rows
 
-    def test_rewards_are_those_of_the_goals_given(self):
+    def test_rewards_are_computed_for_the_given_goals(self):
         rows = self.rows("tiny_envs:Reach-v0")
         self.assertEqual(rows.rewards.tolist(), [0.0, -1.0, 0.0, -1.0, 9.0, 9.0])
         self.assertEqual(rows.terminated.tolist(), [0, 0, 0, 0, 9, 9])
 
-    def test_an_episode_that_would_have_ended_says_so(self):
+    def test_steps_that_would_have_ended_the_episode_are_marked(self):
         rows = self.rows("tiny_envs:ReachEnds-v0")
         self.assertEqual(rows.terminated.tolist(), [1, 0, 1, 0, 9, 9])
 
-    def test_a_goal_keeps_shape_and_type_of_its_space(self):
+    def test_goals_have_the_shape_and_type_of_their_space(self):
         env = make("tiny_envs:Reach-v0", 1, 5)
         env.goals()
         seen = []

@@ -1,4 +1,4 @@
-"""The two Panda tasks, against MuJoCo's own kinematics and measurements on panda-gym."""
+"""The two Panda tasks, compared with MuJoCo's kinematics and with measurements of panda-gym."""
 
 import unittest
 
@@ -14,7 +14,7 @@ EPISODE_STEPS = 50
 
 
 def started(task_id, env_count=1, segment_steps=1, seed=7):
-    """The environments of a task, reset with seeds `seed`, `seed` + 1, …, and their buffers."""
+    """Returns a task's environments, reset with seeds `seed`, `seed` + 1, …, and their buffers."""
     env = make(task_id, env_count, segment_steps)
     out = SegmentBuffers(env_count, segment_steps, 20, env.spec()["action_len"])
     env.reset(np.ones(env_count, np.uint8), np.arange(seed, seed + env_count).astype("u8"), out)
@@ -22,7 +22,10 @@ def started(task_id, env_count=1, segment_steps=1, seed=7):
 
 
 def run_episodes(task_id, env_count, act):
-    """Runs one episode each: observations (E, 51, 20), rewards (E, 50), success at the end (E,)."""
+    """Runs an episode in each environment.
+
+    Returns observations (E, 51, 20), rewards (E, 50) and success at the end (E,).
+    """
     env, out = started(task_id, env_count)
     observations, rewards = [out.next_observations.copy()], []
     for _ in range(EPISODE_STEPS):
@@ -48,7 +51,7 @@ def goals_of(env):
 
 
 class StartTest(unittest.TestCase):
-    def test_end_effector_starts_where_panda_gyms_does(self):
+    def test_end_effector_starts_as_in_panda_gym(self):
         for task_id in (REACH, REACH_JOINTS):
             env, out = started(task_id, env_count=5)
             end_effector = goals_of(env) - out.next_observations[:, 14:17]
@@ -73,7 +76,7 @@ class StartTest(unittest.TestCase):
 
 
 class ObservationTest(unittest.TestCase):
-    def test_observation_is_that_of_the_state_after_the_step(self):
+    def test_observation_describes_the_state_after_the_step(self):
         model = own_model(MODEL)
         data, jacobian = mujoco.MjData(model), np.zeros((3, 7))
         site = model.site("ee").id
@@ -93,7 +96,7 @@ class ObservationTest(unittest.TestCase):
                 state = env.batch.bind("qpos"), env.batch.bind("qvel")
                 np.testing.assert_array_equal(observations[:, :14], np.hstack(state))
 
-    def test_names_say_what_the_entries_are(self):
+    def test_observation_entries_have_names(self):
         names = make(REACH, 1, 5).spec()["observation_names"]
         self.assertEqual(names[0], "angle_joint1")
         self.assertEqual(names[7], "velocity_joint1")
@@ -101,7 +104,7 @@ class ObservationTest(unittest.TestCase):
         self.assertEqual(names[17:], [f"velocity_end_effector_{axis}" for axis in "xyz"])
         self.assertEqual(make(REACH_JOINTS, 1, 5).spec()["observation_names"], names)
 
-    def test_reward_and_success_are_those_of_the_state_after_the_step(self):
+    def test_reward_and_success_depend_on_the_state_after_the_step(self):
         observations, rewards, success = run_episodes(
             REACH, 40, lambda row: proportional(row) * (np.arange(len(row)) < 20)[:, None]
         )
@@ -110,7 +113,7 @@ class ObservationTest(unittest.TestCase):
         np.testing.assert_array_equal(success, distances[:, -1] < 0.05)
         self.assertTrue(20 <= success.sum() < 40, "not both outcomes")
 
-    def test_success_is_that_of_the_last_step_run(self):
+    def test_success_depends_on_the_last_executed_step(self):
         """An episode may end within a segment, while other environments continue."""
         env, out = started(REACH, env_count=40, segment_steps=7)
         for segment in range(10):
@@ -186,7 +189,7 @@ class EndEffectorTest(unittest.TestCase):
 
 class JointsTest(unittest.TestCase):
     def test_displacement_of_each_joint_is_reached_as_in_panda_gym(self):
-        """From rest, one joint moves four fifths within the step, and the rest in the next ones."""
+        """From rest, a joint moves four fifths of the way in the first step."""
         env, out = started(REACH_JOINTS, env_count=14)
         signs = np.concatenate([np.eye(7), -np.eye(7)])
         env.step_segment(signs[:, None], out)
@@ -205,9 +208,9 @@ class JointsTest(unittest.TestCase):
             return actions[-1]
 
         observations, _, _ = run_episodes(REACH_JOINTS, 50, record)
-        asked = 0.05 * np.stack(actions, 1)
+        requested = 0.05 * np.stack(actions, 1)
         moved = np.diff(observations[:, :, :7], axis=1)
-        slope = (asked * moved).sum((0, 1)) / np.square(asked).sum((0, 1))
+        slope = (requested * moved).sum((0, 1)) / np.square(requested).sum((0, 1))
         # panda-gym 3.0.7, 30 episodes. Gravity, which loads its joint 2, has no effect here.
         panda_gym = [0.594, 0.518, 0.844, 0.821, 0.853, 0.878, 0.878]
         np.testing.assert_allclose(slope, panda_gym, atol=0.13)
@@ -245,7 +248,7 @@ class PhysicsTest(unittest.TestCase):
                     self.assertGreater(data.contact.dist.min(), -0.01)
         self.assertGreater(touched, 100)
 
-    def test_the_model_of_pictures_moves_like_that_of_the_simulation(self):
+    def test_the_model_for_pictures_has_the_dynamics_of_the_simulated_one(self):
         model = make(REACH, 1, 5).task.model
         shown = own_model(MODEL)
         self.assertLess(model.ngeom, shown.ngeom)

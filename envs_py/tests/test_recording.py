@@ -1,4 +1,4 @@
-"""The record of an episode, and the joints that belong to the robot."""
+"""Recordings of episodes, their pictures, and the joints that belong to the robot."""
 
 import os
 import sys
@@ -37,7 +37,7 @@ def episode(env, seed=1000):
 
 
 class EpisodeTest(unittest.TestCase):
-    def test_an_episode_is_that_of_the_batched_task(self):
+    def test_a_recorded_episode_equals_the_workers(self):
         tasks = ["Reacher-v5", "dmprl/Pusher-v0", "dmprl/Thrower-v0", "dmprl/PandaReach-v0"]
         for task_id in [*tasks, "tiny_mujoco:SlowReacher", "InvertedPendulum-v5"]:
             with self.subTest(task_id):
@@ -45,26 +45,27 @@ class EpisodeTest(unittest.TestCase):
                 self.assertEqual(env.spec(), {**make(task_id, 1, STEPS).spec(), "id": task_id})
                 rewards = episode(env)
                 self.assertEqual(rewards, episode(make(task_id, 1, STEPS)))
-                written, joints = env.recording(), env.joints()
-                self.assertEqual(len(written["success"]), len(rewards))
+                recorded, joints = env.recording(), env.joints()
+                self.assertEqual(len(recorded["success"]), len(rewards))
                 for name in ("joint_positions", "joint_velocities"):
-                    self.assertEqual(np.shape(written[name]), (len(rewards) + 1, len(joints)), name)
+                    shape = (len(rewards) + 1, len(joints))
+                    self.assertEqual(np.shape(recorded[name]), shape, name)
 
-    def test_the_state_written_down_is_that_after_each_step(self):
+    def test_the_state_after_each_step_is_recorded(self):
         env = recording.make("Reacher-v5", STEPS)
         spec = env.spec()
         out = SegmentBuffers(1, STEPS, spec["observation_len"], spec["action_len"])
         env.reset(np.ones(1, np.uint8), np.array([7], np.uint64), out)
         env.step_segment(np.full((1, STEPS, 2), 0.5), out)
-        written = env.recording()
+        recorded = env.recording()
         np.testing.assert_allclose(
-            np.cos(written["joint_positions"]), out.observations[0, :, :2], atol=1e-12
+            np.cos(recorded["joint_positions"]), out.observations[0, :, :2], atol=1e-12
         )
         np.testing.assert_allclose(
-            written["joint_velocities"], out.observations[0, :, 6:8], atol=1e-12
+            recorded["joint_velocities"], out.observations[0, :, 6:8], atol=1e-12
         )
 
-    def test_the_next_episode_which_begins_by_itself_is_not_written_down(self):
+    def test_the_episode_after_an_automatic_reset_is_not_recorded(self):
         env = recording.make("tiny_envs:Long-v0", STEPS)
         first = len(episode(env))
         out = SegmentBuffers(1, STEPS, 2, 1)
@@ -73,7 +74,7 @@ class EpisodeTest(unittest.TestCase):
         self.assertEqual(len(episode(env)), first)
         self.assertEqual(len(env.recording()["success"]), first)
 
-    def test_what_shows_no_joints_says_why(self):
+    def test_environments_without_joints_have_a_reason(self):
         for task_id, reason in [
             ("point_reach:PointReach-v0", "not a MuJoCo environment"),
             ("point_reach_batch:PointReachBatch", "runs a whole segment at once"),
@@ -95,21 +96,21 @@ class PicturesTest(unittest.TestCase):
                 if os.environ.get("TEST_OPENGL_REQUIRED"):
                     raise
                 self.skipTest(str(error))
-            written = env.recording()
-            self.assertEqual(written["frame_steps"], list(range(51)))
-            self.assertEqual(sorted(os.listdir(folder)), [Path(f).name for f in written["frames"]])
+            recorded = env.recording()
+            self.assertEqual(recorded["frame_steps"], list(range(51)))
+            self.assertEqual(sorted(os.listdir(folder)), [Path(f).name for f in recorded["frames"]])
             self.assertEqual(env.goal_in_pictures(), "red ball")
 
-    def test_what_cannot_be_drawn_says_so(self):
+    def test_environments_that_cannot_be_drawn_are_rejected(self):
         for task_id in ("point_reach:PointReach-v0", "point_reach_batch:PointReachBatch"):
-            with self.assertRaisesRegex(recording.NoPicturesError, "has the render mode"):
+            with self.assertRaisesRegex(recording.NoPicturesError, "with the render mode"):
                 recording.make(task_id, STEPS, "/nowhere")
 
     def test_a_fast_environment_is_not_drawn_at_every_step(self):
         env = gymnasium.make("Reacher-v5")
         for dt, steps in [(0.0, 1), (0.05, 1), (0.02, 1), (0.01, 2), (0.002, 10)]:
             env.unwrapped.frame_skip = dt / env.unwrapped.model.opt.timestep
-            self.assertEqual(recording.steps_a_frame(env), steps, dt)
+            self.assertEqual(recording.steps_per_frame(env), steps, dt)
 
 
 class FilmTest(unittest.TestCase):
@@ -142,7 +143,7 @@ class FilmTest(unittest.TestCase):
                 ["goal: red ball", "not at the goal (red ball)", "at the goal (red ball)"],
             )
 
-    def test_a_side_that_ends_first_waits_and_all_frames_have_one_size(self):
+    def test_a_side_that_ends_first_repeats_its_last_frame_and_all_frames_have_one_size(self):
         with tempfile.TemporaryDirectory() as one, tempfile.TemporaryDirectory() as other:
             sides = [self.side(one, 3, []), self.side(other, 8, [])]
             made = list(film.pictures([sides]))
@@ -150,15 +151,15 @@ class FilmTest(unittest.TestCase):
             self.assertEqual({picture.size for picture in made}, {(2 * 640 + 8, 568)})
             left = [picture.crop((0, 44, 640, 524)).tobytes() for picture in made]
             self.assertEqual([a == b for a, b in pairwise(left)], [False] * 2 + [True] * 5)
-            # One row per side, one of which has fewer frames than a strip shows.
+            # One row per side. The first has fewer frames than a row of the strip can show.
             self.assertEqual(film.strip([sides]).size, (6 * 320 + 5 * 8, 2 * (240 + 88)))
 
 
 class JointsTest(unittest.TestCase):
-    def test_only_the_arms_joints_are_the_robots(self):
+    def test_only_the_arms_joints_belong_to_the_robot(self):
         for task_id, count in [
             ("dmprl/Reacher-v1", 2),  # the target is on slides
-            ("dmprl/Pusher-v0", 7),  # and so are cylinder and goal
+            ("dmprl/Pusher-v0", 7),  # the cylinder and the goal are on slides
             ("dmprl/Thrower-v0", 7),  # the ball moves freely
             ("dmprl/PandaReachJoints-v0", 7),
         ]:

@@ -25,7 +25,7 @@ EXAMPLES = Path(__file__).resolve().parents[2] / "docs" / "examples"
 
 
 def started(task_id, env_count=1, segment_steps=5, seed=7):
-    """The environments of a task, reset with seeds `seed`, `seed` + 1, …, and their buffers."""
+    """Returns a task's environments, reset with seeds `seed`, `seed` + 1, …, and their buffers."""
     return started_on(make(task_id, env_count, segment_steps), seed)
 
 
@@ -38,7 +38,7 @@ def started_on(env, seed=7):
 
 
 class ResetTest(unittest.TestCase):
-    def test_actions_of_another_shape_are_refused(self):
+    def test_actions_of_another_shape_are_rejected(self):
         env, out = started("tiny_envs:Long-v0")
         with self.assertRaisesRegex(ValueError, r"expected \(E, K, A\) = \(1, 5, 1\)"):
             env.step_segment(np.zeros((1, 4, 1)), out)
@@ -57,7 +57,7 @@ class ResetTest(unittest.TestCase):
         env.step_segment(np.zeros((2, 5, 1)), out)
         self.assertEqual(out.steps.tolist(), [2, 5])
 
-    def test_step_before_reset_is_refused(self):
+    def test_step_before_reset_is_rejected(self):
         env = make("tiny_envs:Long-v0", 2, 5)
         out = SegmentBuffers(2, 5, 2, 1)
         env.reset(np.array([1, 0], np.uint8), np.zeros(2, np.uint64), out)
@@ -68,7 +68,7 @@ class ResetTest(unittest.TestCase):
 class SegmentTest(unittest.TestCase):
     def test_any_environment_equals_a_plain_gymnasium_loop(self):
         # Gymnasium's Reacher; `make` would return dmprl's.
-        env_count, segments = 3, 23  # two ends of an episode (50 steps), not at a segment's end
+        env_count, segments = 3, 23  # two episodes (50 steps each) end within a segment
         env, out = started_on(GymnasiumSegmentEnv("Reacher-v5", env_count, 6))
         plain = [gymnasium.make("Reacher-v5") for _ in range(env_count)]
         now = [plain[index].reset(seed=7 + index)[0] for index in range(env_count)]
@@ -91,7 +91,7 @@ class SegmentTest(unittest.TestCase):
                 else:
                     self.assertEqual(out.steps[index], 6)
 
-    def test_segment_ends_with_its_episode_and_the_next_begins(self):
+    def test_a_segment_ends_with_its_episode_and_the_next_episode_starts(self):
         env, out = started("tiny_envs:Countdown-v0", env_count=2)
         draw = out.next_observations[:, 1].copy()
         out.observations[:], out.rewards[:] = 9, 9
@@ -103,7 +103,7 @@ class SegmentTest(unittest.TestCase):
         self.assertEqual((out.terminated.tolist(), out.truncated.tolist()), ([1, 1], [0, 0]))
         self.assertEqual(out.success.tolist(), [SUCCESS_YES, SUCCESS_NO])
         self.assertEqual(out.next_observations[:, 0].tolist(), [0, 0])
-        self.assertTrue((out.next_observations[:, 1] != draw).all(), "a new draw, not the seed's")
+        self.assertTrue((out.next_observations[:, 1] != draw).all(), "reset with the same seed")
         expected = out.next_observations.copy()
         env.step_segment(np.zeros((2, 5, 1)), out)
         np.testing.assert_array_equal(out.observations[:, 0], expected)
@@ -134,41 +134,41 @@ class SegmentTest(unittest.TestCase):
         env.step_segment(actions, out)
         self.assertEqual(out.rewards.tolist(), [[1.0, 0.0]])
 
-    def test_a_module_may_bring_its_own_segment_env(self):
+    def test_a_module_may_define_a_segment_env(self):
         env, out = started("tiny_envs:Batch", env_count=2)
         self.assertEqual(out.next_observations.tolist(), [[7], [8]])
         self.assertEqual(env.spec()["control_dt_s"], 0.5)
 
-    def test_a_function_may_make_the_environment(self):
+    def test_a_function_may_create_the_environment(self):
         env, out = started("tiny_envs:short_countdown", env_count=2)
         env.step_segment(np.zeros((2, 5, 1)), out)
         self.assertEqual((out.steps.tolist(), out.terminated.tolist()), ([2, 2], [1, 1]))
 
-    def test_a_success_that_is_no_yes_or_no_is_a_failure_of_its_environment(self):
+    def test_an_invalid_success_is_a_failure_of_its_environment(self):
         env, out = started("tiny_envs:StrangeInfo", env_count=1)
         env.step_segment(np.zeros((1, 5, 1)), out)
         self.assertEqual(out.failed.tolist(), [1])
         self.assertIn("only 0-dimensional", env.take_failures()[0])
 
-    def test_success_that_is_not_a_number_is_not_reported(self):
+    def test_a_success_of_nan_is_not_reported(self):
         for nan in (float("nan"), np.float32("nan")):
             self.assertEqual(success_of({"success": nan}), SUCCESS_NOT_REPORTED)
         self.assertEqual(success_of({"is_success": np.True_}), SUCCESS_YES)
         self.assertEqual(success_of({"is_success": np.float32(0)}), SUCCESS_NO)
 
-    def test_a_module_may_bring_its_own_mujoco_task(self):
+    def test_a_module_may_define_a_mujoco_task(self):
         env, out = started("tiny_mujoco:SlowReacher", env_count=2)
         self.assertEqual(env.spec()["control_dt_s"], 0.04)
         env.step_segment(np.zeros((2, 5, 2)), out)
         self.assertTrue(out.observations.any())
 
-    def test_the_batched_example_is_the_plain_one(self):
+    def test_the_batched_example_equals_the_plain_one(self):
         sys.path.append(str(EXAMPLES))
         plain, of_plain = started("point_reach:PointReach-v0", 3, 7)
         batch, of_batch = started("point_reach_batch:PointReachBatch", 3, 7)
         generator = np.random.default_rng(0)
         for _ in range(30):
-            # Drawn by equal generators from equal seeds.
+            # Both draw from equal generators with equal seeds.
             np.testing.assert_allclose(of_batch.next_observations, of_plain.next_observations)
             actions = generator.uniform(-2, 2, (3, 7, 2))
             for env, out in ((plain, of_plain), (batch, of_batch)):
@@ -243,7 +243,7 @@ class SpecTest(unittest.TestCase):
         spec = make("tiny_envs:Limited", 1, 5).spec()
         self.assertEqual((spec["action_low"], spec["action_high"]), ([-15.0, 0.0], [5.0, 4.0]))
 
-    def test_unsupported_spaces_are_refused_with_the_space(self):
+    def test_unsupported_spaces_are_rejected_and_named(self):
         for name, space in [
             ("Discrete", r"action space Discrete\(3\)"),
             ("Unbounded", r"action space Box\(-inf, inf, \(2,\), float32\)"),
@@ -253,12 +253,12 @@ class SpecTest(unittest.TestCase):
                 make(f"tiny_envs:{name}-v0", 1, 5)
             self.assertIn("supported are a Box", str(raised.exception))
 
-    def test_unknown_names_are_refused_with_a_suggestion(self):
+    def test_unknown_names_are_rejected_with_advice(self):
         with self.assertRaisesRegex(gymnasium.error.Error, "Reacher"):
             make("Reachr-v5", 1, 5)
         with self.assertRaisesRegex(ModuleNotFoundError, "--python-path"):
             make("no_such_module:Task-v0", 1, 5)
-        with self.assertRaisesRegex(gymnasium.error.Error, "the module tiny_envs was found, but"):
+        with self.assertRaisesRegex(gymnasium.error.Error, "the module tiny_envs exists, but"):
             make("tiny_envs:Missing", 1, 5)
 
 

@@ -16,7 +16,7 @@ from dmprl.tasks import SAME_AS_GYMNASIUM, TASKS
 
 
 def started(task_id, env_count=1, segment_steps=5, seed=7):
-    """The environments of a task, reset with seeds `seed`, `seed` + 1, …, and their buffers."""
+    """Returns a task's environments, reset with seeds `seed`, `seed` + 1, …, and their buffers."""
     env = make(task_id, env_count, segment_steps)
     spec = env.spec()
     out = SegmentBuffers(env_count, segment_steps, spec["observation_len"], spec["action_len"])
@@ -30,7 +30,7 @@ def random_actions(rng, spec, env_count, segment_steps):
 
 
 class GymnasiumTest(unittest.TestCase):
-    """Reacher-v5 and Pusher-v5 are bit-identical to Gymnasium's."""
+    """Reacher-v5 and Pusher-v5 must be bit-identical to Gymnasium's."""
 
     def assert_equal_over(self, task_id, episodes, env_count, segment_steps):
         env, out = started(task_id, env_count, segment_steps)
@@ -100,7 +100,7 @@ class GymnasiumTest(unittest.TestCase):
 
 
 class Contract:
-    """The contract of every registered task."""
+    """Tests that every registered task must pass."""
 
     task_id: str
 
@@ -116,7 +116,7 @@ class Contract:
         same = self.task_id.removeprefix("dmprl/") in SAME_AS_GYMNASIUM
         self.assertEqual(spec["id"], self.task_id.removeprefix("dmprl/") if same else self.task_id)
 
-    def test_two_episodes_of_random_actions_are_finite_and_never_rewarded_above_zero(self):
+    def test_random_actions_give_finite_observations_and_no_positive_rewards(self):
         env, out = started(self.task_id, env_count=4)
         rng, truncated, steps = np.random.default_rng(0), np.zeros(4), np.zeros(4)
         while not (truncated == 2).all():
@@ -129,7 +129,7 @@ class Contract:
             steps += out.steps
         self.assertEqual(steps.tolist(), [2 * TASKS[self.task_id].episode_steps] * 4)
 
-    def test_a_segment_keeps_no_memory_and_needs_little(self):
+    def test_a_segment_leaks_no_memory_and_needs_little(self):
         env, out = started(self.task_id, env_count=16)
         actions = np.zeros((16, 5, len(env.spec()["action_low"])))
         tracemalloc.start()
@@ -140,10 +140,10 @@ class Contract:
         after, peak = tracemalloc.get_traced_memory()
         tracemalloc.stop()
         self.assertLess(after - before, 1000)
-        # NumPy's own buffers of a call and, with end-effector actions, the inverse kinematics'.
+        # NumPy's temporary buffers and, for end-effector actions, those of the inverse kinematics.
         self.assertLess(peak - before, 30_000)
 
-    def test_the_same_seed_gives_the_same_bytes(self):
+    def test_the_same_seed_gives_bit_identical_results(self):
         runs = []
         for _ in range(2):
             env, out = started(self.task_id, env_count=3)
@@ -169,9 +169,9 @@ class Contract:
         _, out = started(self.task_id, env_count=32)
         self.assertEqual(len({row.tobytes() for row in out.next_observations}), 32)
 
-    def test_the_gymnasium_environment_is_the_batch(self):
+    def test_the_gymnasium_environment_equals_the_batch(self):
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # "out of date": true of the paper's versions
+            warnings.simplefilter("ignore")  # Gymnasium warns that the paper's versions are old
             plain = gymnasium.make(self.task_id)
         batch, out = started(self.task_id)
         now, _ = plain.reset(seed=7)
@@ -191,7 +191,7 @@ class Contract:
             if truncated:
                 now, _ = plain.reset()
 
-    def test_gymnasiums_checker_is_content(self):
+    def test_gymnasiums_checker_passes(self):
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always")
             check_env(gymnasium.make(self.task_id).unwrapped, skip_render_check=True)
@@ -221,7 +221,7 @@ class Contract:
 
 
 for task_id in TASKS:
-    # One class per task, so that a failure names it.
+    # One class per task, so that its name is in the report of a failure.
     name = re.sub(r"\W", "", task_id) + "ContractTest"
     globals()[name] = type(name, (Contract, unittest.TestCase), {"task_id": task_id})
 
@@ -241,12 +241,12 @@ class ThrowerTest(unittest.TestCase):
         error = np.sqrt(std**2 / count + returns.var(ddof=1) / returns.size)
         self.assertLess(abs(returns.mean() - mean), 2 * error, f"{returns.mean()} ± {error}")
 
-    def test_return_without_torque_is_that_of_the_original(self):
+    def test_return_without_torque_agrees_with_the_original(self):
         # 20 episodes of gym 0.9.4's model and semantics in MuJoCo 4.0.0: -136 ± 16.
         self.assert_agree(self.returns(lambda _, envs: np.zeros((envs, 5, 7))), -136, 16, 20)
 
-    def test_return_of_random_torques_is_that_of_the_original(self):
-        rng = np.random.default_rng(0)  # as above: -185 ± 40
+    def test_return_of_random_torques_agrees_with_the_original(self):
+        rng = np.random.default_rng(0)  # from the same source: -185 ± 40
         self.assert_agree(
             self.returns(lambda spec, envs: random_actions(rng, spec, envs, 5)), -185, 40, 20
         )
@@ -271,7 +271,7 @@ class ThrowerTest(unittest.TestCase):
         self.assertEqual(spec["action_high"], [10, 10, 10, 10, 15, 15, 15])
         self.assertEqual(spec["action_low"], [-10, -10, -10, -10, -15, -15, -15])
 
-    def test_reward_is_that_of_the_state_before_the_step(self):
+    def test_reward_depends_on_the_state_before_the_step(self):
         env, out = started("dmprl/Thrower-v0")
         actions = np.full((1, 5, 7), 2.0)
         env.step_segment(actions, out)
@@ -279,7 +279,7 @@ class ThrowerTest(unittest.TestCase):
         expected = -np.linalg.norm(row[:5, 17:19] - row[:5, 20:22], axis=1) - 0.002 * 28.0
         np.testing.assert_allclose(out.rewards[0], expected, rtol=1e-12)
 
-    def test_after_the_ball_has_hit_the_ground_the_place_of_the_hit_counts(self):
+    def test_after_the_ball_has_hit_the_ground_the_reward_depends_on_the_point_of_impact(self):
         env, out = started("dmprl/Thrower-v0", env_count=20)
         rng, hits = np.random.default_rng(3), {}
         for episode in range(2):
@@ -299,7 +299,7 @@ class ThrowerTest(unittest.TestCase):
 
 
 class OlderVersionsTest(unittest.TestCase):
-    def test_reacher_v1_draws_targets_beyond_reach_and_observes_a_third_coordinate(self):
+    def test_reacher_v1_has_targets_out_of_reach_and_a_third_coordinate(self):
         _, out = started("dmprl/Reacher-v1", env_count=1000)
         distances = np.linalg.norm(out.next_observations[:, 4:6], axis=1)
         # The part of a square of side 0.4 outside the circle of radius 0.2: 1 - pi/4.
@@ -314,7 +314,7 @@ class OlderVersionsTest(unittest.TestCase):
         expected = -np.linalg.norm(out.observations[0, :5, 8:], axis=1) - 0.5
         np.testing.assert_allclose(out.rewards[0], expected, rtol=1e-12)
 
-    def test_pusher_v0_measures_between_the_prongs_and_pushes_a_light_cylinder(self):
+    def test_pusher_v0_observes_the_point_between_the_prongs_and_has_a_light_cylinder(self):
         old, out = started("dmprl/Pusher-v0")
         # Centre of mass of the prongs, 0.1 m ahead of the wrist.
         np.testing.assert_allclose(out.next_observations[0, 14:17], [0.921, -0.6, 0], atol=1e-3)
@@ -323,8 +323,8 @@ class OlderVersionsTest(unittest.TestCase):
         mass = [env.task.model.body("object").mass[0] for env in (old, new)]
         self.assertLess(mass[0], 0.01 * mass[1])
 
-    def test_pusher_v0_pushes_as_it_did_with_mujoco_2(self):
-        """Without its armature the cylinder stays at -0.45, and the arm passes through it."""
+    def test_pusher_v0_pushes_as_with_mujoco_2(self):
+        """If the armature is ignored, the cylinder stays at -0.45 and the arm passes through it."""
         env, _ = started("dmprl/Pusher-v0")
         model = env.task.model
         # Constants of MuJoCo 2.3.7: arm, cylinder and goal.
@@ -355,19 +355,19 @@ class OlderVersionsTest(unittest.TestCase):
 
 
 class BatchTest(unittest.TestCase):
-    def test_step_before_reset_is_refused(self):
+    def test_step_before_reset_is_rejected(self):
         env = make("Reacher-v5", 2, 5)
         out = SegmentBuffers(2, 5, 10, 2)
         env.reset(np.array([1, 0], np.uint8), np.zeros(2, np.uint64), out)
         with self.assertRaisesRegex(SegmentEnvError, "environment 1: step before reset"):
             env.step_segment(np.zeros((2, 5, 2)), out)
 
-    def test_actions_of_another_shape_are_refused(self):
+    def test_actions_of_another_shape_are_rejected(self):
         env, out = started("Reacher-v5")
         with self.assertRaisesRegex(ValueError, r"expected \(E, K, A\) = \(1, 5, 2\)"):
             env.step_segment(np.zeros((1, 4, 2)), out)
 
-    def test_a_simulation_that_diverges_is_reported_and_begins_anew(self):
+    def test_a_simulation_that_diverges_is_reported_and_restarts(self):
         env, out = started("Pusher-v5", env_count=3)
         twin, out_of_twin = started("Pusher-v5", env_count=3)
         rng = np.random.default_rng(0)
@@ -385,7 +385,7 @@ class BatchTest(unittest.TestCase):
             if step == 0:
                 (message,) = env.take_failures()
                 self.assertIn(
-                    "Pusher-v5, environment 1, this segment: MuJoCo warned (mjWARN_BADQVEL)",
+                    "Pusher-v5, environment 1, this segment: MuJoCo warning (mjWARN_BADQVEL)",
                     message,
                 )
                 self.assertEqual(out.steps.tolist(), [5, 0, 5])
@@ -395,7 +395,7 @@ class BatchTest(unittest.TestCase):
 
 
 class ImportTest(unittest.TestCase):
-    def test_only_a_worker_takes_the_clock_and_the_warnings_out_of_mujoco(self):
+    def test_only_a_worker_replaces_mujocos_hooks(self):
         import subprocess
         import sys
 
@@ -410,7 +410,7 @@ class ImportTest(unittest.TestCase):
         )
         self.assertEqual(result.stdout.split(), ["True", "None"])
 
-    def test_worker_path_does_without_gymnasium(self):
+    def test_a_worker_runs_dmprls_tasks_without_gymnasium(self):
         import subprocess
         import sys
 

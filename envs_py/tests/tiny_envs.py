@@ -22,9 +22,9 @@ ACTION = spaces.Box(-2.0, 2.0, (1,), np.float64)
 
 
 class Countdown(gymnasium.Env):
-    """Observes (number of steps, a number drawn at reset); terminates after ``length`` steps.
+    """Observes (number of steps, a random number of the episode); ends after ``length`` steps.
 
-    The reward is the action. The fault ``fault`` occurs in the step whose action is 2.
+    The reward is the action. An action of 2 causes the fault ``fault``.
     """
 
     observation_space = spaces.Box(-np.inf, np.inf, (2,), np.float64)
@@ -53,7 +53,7 @@ class Countdown(gymnasium.Env):
 
 
 class Forking(Countdown):
-    """Forks a process that draws at every reset."""
+    """Forks a process at every reset."""
 
     def reset(self, *, seed=None, options=None):
         observation, info = super().reset(seed=seed)
@@ -65,19 +65,20 @@ class Forking(Countdown):
 
 
 class Faulty(Countdown):
-    """Fails in step ``life`` of this object's life, counted over all its episodes.
+    """Fails in step ``failing_step`` of this object, counted over all its episodes.
 
     With ``once``, only if no file in the working directory marks an earlier failure.
     """
 
-    def __init__(self, fault, life=23, once=False, render_mode=None):
+    def __init__(self, fault, failing_step=23, once=False, render_mode=None):
         super().__init__(length=10**9)
-        self.kind, self.life, self.once, self.lived = fault, life, once, 0
+        self.kind, self.failing_step, self.once = fault, failing_step, once
+        self.steps_total = 0
 
     def step(self, action):
-        self.lived += 1
+        self.steps_total += 1
         observation, reward, *rest = super().step(action)
-        if self.lived == self.life and (not self.once or mark("broken")):
+        if self.steps_total == self.failing_step and (not self.once or mark("broken")):
             if self.kind == "raise":
                 raise ValueError("the gripper fell off")
             if self.kind == "exit":
@@ -89,7 +90,7 @@ class Faulty(Countdown):
             if self.kind == "hang":
                 threading.Event().wait()
             if self.kind == "hang-with-lock":
-                ctypes.PyDLL(None).pause()  # PyDLL keeps the interpreter's lock
+                ctypes.PyDLL(None).pause()  # PyDLL does not release the GIL
             if self.kind == "segfault":
                 ctypes.string_at(0)
         return observation, reward, *rest
@@ -105,7 +106,7 @@ def mark(name):
 
 
 class FaultyReset(Countdown):
-    """Raises in reset number ``last`` of its life, and when it is closed."""
+    """Raises an exception in reset number ``last`` of this object, and when it is closed."""
 
     made, made_max = 0, 10**9
 
@@ -127,7 +128,7 @@ class FaultyReset(Countdown):
 
 
 class Limited(Countdown):
-    """Named as a class: ``tiny_envs:Limited``, without registration."""
+    """An unregistered class, named as ``tiny_envs:Limited``."""
 
     max_episode_steps = 8
     action_space = spaces.Box(np.array([-15.0, 0.0], "f"), np.array([5.0, 4.0], "f"))
@@ -137,7 +138,7 @@ class Limited(Countdown):
 
 
 def short_countdown(**kwargs):
-    """A function that makes an environment."""
+    """Creates an environment; an entry point that is a function."""
     return Countdown(length=2, **kwargs)
 
 
@@ -156,7 +157,7 @@ class Timeless(Countdown):
 
 
 class Remembering(Countdown):
-    """Keeps its last action, as environments do that penalise its change."""
+    """Keeps its last action, like environments that penalise its change."""
 
     def reset(self, *, seed=None, options=None):
         self.last = np.zeros(1)
@@ -213,10 +214,11 @@ class Goal(Countdown):
 
 
 class Reach(gymnasium.Env):
-    """A point on a line that an action moves by half of it; rewarded only near a drawn goal.
+    """A point on a line, moved by half of the action; the reward is 0 near a random goal, else -1.
 
-    - ``ends``: whether an episode ends there. ``alone``: whether ``compute_reward`` takes only one
-      goal at a time. ``fault``: the reward of a goal other than the current one is NaN.
+    - ``ends``: an episode ends at its goal.
+    - ``alone``: ``compute_reward`` takes only one goal at a time.
+    - ``fault``: the reward of any goal but the current one is NaN.
     """
 
     observation_space = spaces.Dict(
@@ -259,26 +261,26 @@ class Reach(gymnasium.Env):
 
 
 class ReachFar(Reach):
-    """Rewarded by the distance, at any time."""
+    """Like :class:`Reach`, but the reward is minus the distance."""
 
     def compute_reward(self, achieved_goal, desired_goal, info):
         return -np.abs(achieved_goal - desired_goal)[..., 0]
 
 
 class FaultyReach(Reach):
-    """Fails in its 12th step, and is recreated."""
+    """Fails in its 12th step, and is then recreated."""
 
-    lived = 0
+    steps_total = 0
 
     def step(self, action):
-        self.lived += 1
-        if self.lived == 12:
+        self.steps_total += 1
+        if self.steps_total == 12:
             raise ValueError("the line broke")
         return super().step(action)
 
 
 class Nested(Goal):
-    """Dictionaries in a tuple in a dictionary; a number that fails like :class:`Countdown`."""
+    """Observes a Dict with a Dict and a Tuple in it; one of its numbers is NaN after two steps."""
 
     observation_space = spaces.Dict(
         arm=spaces.Dict(q=spaces.Box(-1, 1, (2,)), grip=spaces.Discrete(2)),
@@ -317,7 +319,7 @@ class Batch(SegmentEnv):
 
 
 class Timed(Batch):
-    """Every episode is one segment, ended by the time limit."""
+    """Truncates every episode after one segment."""
 
     def step_segment(self, actions, out: SegmentBuffers):
         super().step_segment(actions, out)
@@ -325,7 +327,7 @@ class Timed(Batch):
 
 
 class BatchOfNan(Batch):
-    """Cannot recreate its environments: in the second call all rewards of the first row are NaN."""
+    """Returns NaN for all rewards of the first row in the second call, and recreates nothing."""
 
     calls = 0
 
@@ -337,7 +339,7 @@ class BatchOfNan(Batch):
 
 
 class Interpreter(Batch):
-    """Checks the embedded interpreter; the Rust tests run it."""
+    """Checks the embedded interpreter it runs in; the Rust tests use it."""
 
     def step_segment(self, actions, out: SegmentBuffers):
         assert sys.prefix != sys.base_prefix, "sys.prefix is not the virtual environment"
@@ -366,7 +368,7 @@ for kind in ("raise", "exit", "observation", "reward"):
 for kind in ("hang", "hang-with-lock", "segfault"):
     name = "".join(word.title() for word in kind.split("-"))
     register(f"{name}Once", Faulty, kwargs={"fault": kind, "once": True}, max_episode_steps=7)
-register("Hopeless", Faulty, kwargs={"fault": "raise", "life": 1}, max_episode_steps=7)
+register("Hopeless", Faulty, kwargs={"fault": "raise", "failing_step": 1}, max_episode_steps=7)
 register("FaultyReset", FaultyReset)
 register("Nested", Nested)
 for dtype in ("int8", "uint16", "int64", "float16", "float32"):

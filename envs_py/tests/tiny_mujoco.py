@@ -1,4 +1,4 @@
-"""A user's own MujocoTask, in a module of its own."""
+"""A user-defined MujocoTask in its own module."""
 
 from dmprl.tasks.reacher import Reacher
 

@@ -1,6 +1,6 @@
 """A run's rows as data frames.
 
-``tests/tests/python_extras.rs`` trains it and says where (``TEST_RUN``).
+``tests/tests/python_extras.rs`` trains the run and sets ``TEST_RUN`` to its directory.
 """
 
 import os
@@ -13,7 +13,7 @@ class Frames(unittest.TestCase):
     def setUp(self) -> None:
         self.run_directory = dmprl.Run(os.environ["TEST_RUN"])
 
-    def test_pandas_and_polars_hold_the_same_rows(self) -> None:
+    def test_pandas_and_polars_return_the_same_rows(self) -> None:
         for name in ("metrics", "evaluations"):
             with self.subTest(name):
                 pandas = getattr(self.run_directory, name)()
@@ -23,14 +23,14 @@ class Frames(unittest.TestCase):
                 self.assertTrue(pandas["env_steps"].is_monotonic_increasing)
                 self.assertGreater(len(pandas), 1)
 
-    def test_numbers_are_numbers_and_objects_are_columns(self) -> None:
+    def test_nested_objects_become_numeric_columns(self) -> None:
         metrics = self.run_directory.metrics()
         self.assertEqual(metrics["rejected/duplicate"].sum(), 0)
         self.assertGreater(metrics["critic_loss"].mean(), 0.0)
         evaluations = self.run_directory.evaluations("polars")
         self.assertEqual(evaluations["returns"].list.len().to_list(), [2] * len(evaluations))
 
-    def test_the_best_policy_acts(self) -> None:
+    def test_the_best_policy_is_loaded_and_invalid_names_are_rejected(self) -> None:
         policy = self.run_directory.policy()
         actions = policy.segment([0.1] * policy.spec["observation_len"])
         self.assertEqual(actions.shape, (5, 2))

@@ -1,6 +1,6 @@
-"""Exported graphs in onnxruntime, beside what Rust makes of the same observations.
+"""Exported graphs in onnxruntime, compared with Rust's actions for the same observations.
 
-``tests/tests/python_extras.rs`` writes them and says where (``TEST_EXPORTED``).
+``tests/tests/python_extras.rs`` writes both to the folder ``TEST_EXPORTED``.
 """
 
 import json
@@ -19,7 +19,7 @@ class ExportedGraphs(unittest.TestCase):
         folder = pathlib.Path(os.environ["TEST_EXPORTED"])
         self.folders = sorted(folder.iterdir())
 
-    def test_each_decides_what_rust_decides(self) -> None:
+    def test_each_graph_returns_rusts_actions(self) -> None:
         self.assertGreaterEqual(len(self.folders), 9)
         for folder in self.folders:
             with self.subTest(folder.name):
@@ -32,12 +32,12 @@ class ExportedGraphs(unittest.TestCase):
                 expected = np.fromfile(folder / "segments.f64")
                 expected = expected.reshape(-1, steps, action_len)
                 if "state" in inputs:
-                    got = carried_on(session, observations, inputs["state"][1])
+                    got = run_in_sequence(session, observations, inputs["state"][1])
                 else:
                     got = session.run(["actions"], {"observation": observations})[0]
                 self.assertLess(np.abs(got - expected).max(), TOLERANCE)
 
-    def test_each_says_what_it_is(self) -> None:
+    def test_each_graph_contains_its_description(self) -> None:
         for folder in self.folders:
             session = onnxruntime.InferenceSession(folder / "policy.onnx")
             metadata = session.get_modelmeta().custom_metadata_map
@@ -46,10 +46,10 @@ class ExportedGraphs(unittest.TestCase):
             self.assertEqual(description["spec"]["observation_len"], observation.shape[1])
 
 
-def carried_on(
+def run_in_sequence(
     session: onnxruntime.InferenceSession, observations: np.ndarray, state_len: int
 ) -> np.ndarray:
-    """The segments of decisions one after the other, each with the state of the one before."""
+    """Returns the segments of successive decisions, each with the state after the previous one."""
     state, segments = np.zeros((1, state_len), np.float32), []
     for row in observations:
         feeds = {"observation": row[None], "state": state}

@@ -1,10 +1,10 @@
-"""panda-gym's own tasks in a worker's hands (extra `panda-gym`)."""
+"""panda-gym's own tasks, run as in a worker (extra `panda-gym`)."""
 
 import unittest
 
 import gymnasium
 import numpy as np
-import panda_gym  # noqa: F401 - registers them
+import panda_gym  # noqa: F401 - registers its tasks
 
 from dmprl.segment_env import GoalRows, SegmentBuffers, make
 
@@ -20,7 +20,7 @@ def started(task_id, env_count, segment_steps):
 
 
 class PandaGymTest(unittest.TestCase):
-    def test_sizes_and_bounds_are_panda_gyms(self):
+    def test_sizes_and_bounds_are_those_of_panda_gym(self):
         for task_id in REACH:
             env, _ = started(task_id, 1, 5)
             spec = env.spec()
@@ -56,7 +56,7 @@ class PandaGymTest(unittest.TestCase):
                 env.step_segment(rng.uniform(-1, 1, (2, 5, env.spec()["action_len"])), out)
                 self.assertTrue(np.isfinite(out.observations).all())
                 self.assertTrue(((out.rewards <= 0) & (out.rewards > -2)).all())
-                # Version 3 ends an episode where the goal is reached.
+                # In version 3 an episode ends when the goal is reached.
                 np.testing.assert_array_equal(out.terminated, out.success)
                 ends += (out.terminated | out.truncated) != 0
             env.close()
@@ -73,7 +73,7 @@ class PandaGymTest(unittest.TestCase):
             self.assertLess(steps.max(), 10)
         env.close()
 
-    def test_relabelled_with_its_own_goals_an_episode_is_what_it_was(self):
+    def test_relabelling_with_the_same_goals_does_not_change_an_episode(self):
         env, out = started("PandaReach-v3", 2, 5)
         goals = env.goals()
         self.assertEqual(goals, {"achieved": 0, "desired": 3, "length": 3, "sparse": True})

@@ -1,4 +1,4 @@
-"""Our Panda against the one that PyBullet ships (extra `panda-gym`)."""
+"""dmprl's Panda compared with the one in PyBullet's package (extra `panda-gym`)."""
 
 import unittest
 from pathlib import Path
@@ -29,7 +29,7 @@ class KinematicsTest(unittest.TestCase):
         self.data = mujoco.MjData(self.model)
 
     def theirs(self, angles):
-        """Position and rotation matrix of the end effector in PyBullet."""
+        """Returns position and rotation matrix of the end effector in PyBullet."""
         for joint, angle in zip(ARM, angles, strict=True):
             pybullet.resetJointState(self.arm, joint, angle, physicsClientId=self.client)
         state = pybullet.getLinkState(
@@ -43,7 +43,7 @@ class KinematicsTest(unittest.TestCase):
         site = self.model.site("ee").id
         return self.data.site_xpos[site], self.data.site_xmat[site]
 
-    def test_end_effector_is_pybullets_at_1000_random_poses(self):
+    def test_end_effector_agrees_with_pybullets_at_1000_random_poses(self):
         rng = np.random.default_rng(0)
         poses = [NEUTRAL, *rng.uniform(*self.model.jnt_range.T, (1000, 7))]
         position_error = rotation_error = 0.0
@@ -57,7 +57,7 @@ class KinematicsTest(unittest.TestCase):
         self.assertLess(position_error, 1e-3)
         self.assertLess(rotation_error, 1e-3)
 
-    def test_masses_are_pybullets(self):
+    def test_masses_agree_with_pybullets(self):
         theirs = [pybullet.getDynamicsInfo(self.arm, link)[0] for link in range(11)]
         np.testing.assert_allclose(self.model.body_mass[-7:-1], theirs[:6], rtol=1e-9)
         # Link 7 carries flange, hand and fingers.

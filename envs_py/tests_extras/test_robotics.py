@@ -1,4 +1,4 @@
-"""Gymnasium-Robotics' Fetch in a worker's hands (extra `robotics`)."""
+"""Gymnasium-Robotics' Fetch, run as in a worker (extra `robotics`)."""
 
 import subprocess
 import sys
@@ -18,7 +18,7 @@ def started(task_id, env_count, segment_steps):
 
 
 class FetchTest(unittest.TestCase):
-    def test_sizes_and_timing_are_fetchs(self):
+    def test_sizes_and_timing_are_those_of_fetch(self):
         env, _ = started("FetchReach-v4", 1, 5)
         spec = env.spec()
         self.assertEqual((spec["observation_len"], spec["action_len"]), (16, 4))
@@ -47,7 +47,7 @@ class FetchTest(unittest.TestCase):
         self.assertTrue((out.rewards[:, -1] > -0.05).all())
 
     def test_an_id_without_a_version_works_in_a_fresh_process(self):
-        """As a worker starts: nothing has imported Gymnasium-Robotics before."""
+        """As in a worker, Gymnasium-Robotics has not been imported before."""
         code = (
             "from dmprl.segment_env import make; "
             "print(make('gymnasium_robotics:FetchReach', 1, 5).spec()['observation_len'])"
@@ -57,7 +57,7 @@ class FetchTest(unittest.TestCase):
         )
         self.assertEqual(result.stdout.strip(), "16")
 
-    def test_relabelled_with_its_own_goals_an_episode_is_what_it_was(self):
+    def test_relabelling_with_the_same_goals_does_not_change_an_episode(self):
         env, out = started("FetchReach-v4", 2, 5)
         goals = env.goals()
         self.assertEqual(goals, {"achieved": 0, "desired": 3, "length": 3, "sparse": True})

@@ -29,7 +29,7 @@ OPENING = {
 
 
 class SearchTest(unittest.TestCase):
-    """One storage in a folder. What is opened anew knows only what was written there."""
+    """Tests with one storage in a folder; a search that is started again only has this storage."""
 
     def setUp(self):
         optuna.logging.set_verbosity(optuna.logging.WARNING)
@@ -39,12 +39,12 @@ class SearchTest(unittest.TestCase):
         self.storage = f"sqlite:///{self.folder}/optuna.db"
 
     def start(self, **changes):
-        """Another search of this storage; what it knows of the study."""
+        """Starts another search with this storage; returns its data about the study."""
         self.search = Search(self.storage)
         return self.say({**OPENING, **changes})
 
     def say(self, request):
-        """As the process takes and gives it."""
+        """Answers a request, with JSON as between the processes."""
         return json.loads(json.dumps(self.search.answer(json.loads(json.dumps(request)))))
 
     def do(self, op, **more):
@@ -56,7 +56,7 @@ class SearchTest(unittest.TestCase):
         self.do("tell", trial=trial["trial"], state="finished", objective=objective)
         return trial
 
-    def test_values_have_their_keys_types_and_lie_in_the_space(self):
+    def test_values_have_the_types_and_ranges_of_their_keys(self):
         self.start()
         for number in range(10):
             asked = self.do("ask")
@@ -67,7 +67,7 @@ class SearchTest(unittest.TestCase):
             self.assertTrue(isinstance(values["count"], int) and 3 <= values["count"] <= 7)
             self.assertIn(values["noise"], ["gaussian", "pink"])
 
-    def test_a_killed_process_costs_nothing_and_the_next_one_goes_on(self):
+    def test_after_a_kill_the_next_process_continues_without_loss(self):
         self.start()
         finished = self.finish(-4.5)
         running = self.do("ask")
@@ -80,12 +80,12 @@ class SearchTest(unittest.TestCase):
                 {**running, "state": "running", "objective": None, "reported": [2]},
             ],
         )
-        # A step that is known already is no error: the run came by there twice.
+        # A step may be reported twice, because the run may have been resumed before it.
         self.assertEqual(self.do("report", trial=1, step=2, value=-8.0), {"prune": False})
         self.assertEqual(self.do("tell", trial=1, state="finished", objective=-3.0), {})
         self.assertEqual(self.do("ask")["trial"], 2)
 
-    def test_a_trial_depends_on_its_number_and_not_on_how_often_the_search_was_killed(self):
+    def test_a_trials_values_do_not_depend_on_restarts_of_the_search(self):
         self.start()
         whole = [self.finish(-float(number)) for number in range(4)]
         self.assertEqual(len({trial["values"]["rate"] for trial in whole}), 4)
@@ -96,7 +96,7 @@ class SearchTest(unittest.TestCase):
             broken.append(self.finish(-float(number)))
         self.assertEqual(whole, broken)
 
-    def test_a_trial_that_a_kill_left_without_values_gets_them(self):
+    def test_a_trial_without_all_values_after_a_kill_is_completed(self):
         self.start()
         study = optuna.load_study(study_name=OPENING["study"], storage=self.storage)
         half = study.ask()
@@ -105,7 +105,7 @@ class SearchTest(unittest.TestCase):
         self.assertEqual(list(trial["values"]), ["rate", "count", "noise"])
         self.assertEqual(trial["values"]["rate"], half.params["rate"])
 
-    def test_the_median_gives_up_what_is_worse_and_keeps_what_is_better(self):
+    def test_the_median_pruner_prunes_worse_trials_and_keeps_better_ones(self):
         self.start(pruner="median")
         self.finish(-5.0)
         for value, prune in [(-100.0, True), (-1.0, False)]:
@@ -116,7 +116,7 @@ class SearchTest(unittest.TestCase):
         states = [trial["state"] for trial in self.start(pruner="median")["trials"]]
         self.assertEqual(states, ["finished", "pruned", "running"])
 
-    def test_hyperband_gives_up_losers_and_never_the_best(self):
+    def test_hyperband_prunes_some_trials_and_never_the_best(self):
         self.start(pruner="hyperband", sampler="tpe", steps_max=9)
         pruned = []
         for number in range(12):
@@ -141,7 +141,7 @@ class SearchTest(unittest.TestCase):
         self.assertEqual((values["count"], values["noise"]), (4, "pink"))
         self.assertNotEqual(self.do("ask")["values"]["rate"], 0.01)
 
-    def test_another_identity_is_told_and_changes_nothing(self):
+    def test_a_different_identity_is_returned_and_changes_nothing(self):
         self.start()
         self.do("ask")
         opened = self.start(identity={"seeds": [2]}, first=[{"count": 5}])
@@ -149,7 +149,7 @@ class SearchTest(unittest.TestCase):
         study = optuna.load_study(study_name=OPENING["study"], storage=self.storage)
         self.assertEqual(len(study.trials), 1)
 
-    def test_what_has_ended_is_not_ended_again(self):
+    def test_a_finished_trial_cannot_be_finished_again(self):
         self.start()
         self.finish(-1.0)
         with self.assertRaisesRegex(RefusedError, "trial 0 is COMPLETE"):
@@ -157,7 +157,7 @@ class SearchTest(unittest.TestCase):
         with self.assertRaisesRegex(RefusedError, "unknown operation"):
             self.do("sing")
 
-    def test_the_process_answers_mistakes_ignores_ctrl_c_and_ends_with_its_input(self):
+    def test_the_process_answers_invalid_requests_ignores_ctrl_c_and_ends_with_its_input(self):
         process = subprocess.Popen(
             [sys.executable, "-P", "-m", "dmprl.search", self.storage],
             stdin=subprocess.PIPE,

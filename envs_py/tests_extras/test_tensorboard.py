@@ -1,6 +1,6 @@
-"""A run's event file in TensorBoard's own reader, beside the run's JSON lines.
+"""A run's event file in TensorBoard's own reader, compared with the run's JSON lines.
 
-``tests/tests/python_extras.rs`` trains it and says where (``TEST_RUN``).
+``tests/tests/python_extras.rs`` trains the run and sets ``TEST_RUN`` to its directory.
 """
 
 import json
@@ -28,7 +28,7 @@ class EventFile(unittest.TestCase):
         for scalar, (_, number) in zip(scalars, expected, strict=True):
             self.assertAlmostEqual(scalar.value, number, places=3)
 
-    def test_it_has_every_line_of_the_run_and_none_that_was_taken_back(self) -> None:
+    def test_it_has_all_rows_of_the_run_and_none_that_a_resume_removed(self) -> None:
         metrics = lines(self.run_directory / "metrics.jsonl")
         evaluations = lines(self.run_directory / "evaluations.jsonl")
         self.assertGreater(len(metrics), 1)
@@ -39,7 +39,7 @@ class EventFile(unittest.TestCase):
         nested = "training/rejected/duplicate"
         self.assert_same(nested, metrics, lambda row: row["rejected"]["duplicate"])
 
-    def test_its_clock_is_the_runs(self) -> None:
+    def test_wall_times_are_those_of_the_run(self) -> None:
         rows = lines(self.run_directory / "evaluations.jsonl")
         scalars = self.events.Scalars("evaluation/return_mean")
         passed = scalars[-1].wall_time - scalars[0].wall_time

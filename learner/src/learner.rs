@@ -173,7 +173,7 @@ impl Learner {
         self.regime.update_due()
     }
 
-    /// Returns whether the policy is to be published, `updates` updates after the last time.
+    /// Returns true if the policy must be published, `updates` updates after the last publication.
     #[must_use]
     pub fn publish_due(&self, updates: u64) -> bool {
         self.regime.publish_due(updates, self.config.learner.publish_every_updates)

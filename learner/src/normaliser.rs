@@ -96,7 +96,7 @@ impl Normaliser {
         }
     }
 
-    /// Returns whether mean and scale are to be updated.
+    /// Returns true if mean and scale must be updated.
     #[must_use]
     pub fn is_due(&self) -> bool {
         self.count >= self.refresh_at

@@ -11,6 +11,7 @@ use std::time::{Duration, Instant};
 use dmprl_shared::policy_file;
 use dmprl_shared::supervision::{EvaluationRequest, Progress, Report, Supervisor};
 use dmprl_shared::transport::delivery::Watermark;
+use tracing::warn;
 
 use crate::checkpoint::{CheckpointError, WriteOutcome, Writer};
 use crate::learner::{Counters, Learner};
@@ -301,12 +302,12 @@ impl<'a> Recorder<'a> {
                 self.checkpoint_failing = true;
                 self.warn(format!("no checkpoint could be written, training continues: {error}"));
             }
-            Err(error) => eprintln!("checkpoint: {error}"),
+            Err(error) => warn!("no checkpoint: {error}"),
         }
     }
 
     fn warn(&self, message: String) {
-        eprintln!("warning: {message}");
+        warn!("{message}");
         self.supervisor.warn(message);
     }
 

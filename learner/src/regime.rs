@@ -60,7 +60,7 @@ impl Regime {
         }
     }
 
-    /// Returns whether the policy is to be published, `updates` updates after the last time.
+    /// Returns true if the policy must be published, `updates` updates after the last publication.
     #[must_use]
     pub fn publish_due(&self, updates: u64, publish_every_updates: u64) -> bool {
         match self {

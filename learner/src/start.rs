@@ -9,6 +9,7 @@ use dmprl_shared::spec::EnvSpec;
 use dmprl_shared::supervision::{Report, ReportError, Supervisor};
 use dmprl_shared::transport::delivery::{LogError, LogIdentity, Replayed, SegmentLog};
 use thiserror::Error;
+use tracing::warn;
 
 use crate::checkpoint::{self, CheckpointError};
 use crate::demonstrations::{Demonstration, DemonstrationError, DemonstrationSummary};
@@ -50,7 +51,7 @@ pub enum StartError {
     Report(#[from] ReportError),
 }
 
-/// What a learner starts from.
+/// The initial state of a learner.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Origin<'a> {
     /// New networks or the parameters of this policy file, and the configured demonstrations.
@@ -86,7 +87,7 @@ pub fn learner(
             let (learner, loaded) = checkpoint::load_newest(folder, &fresh)?;
             for error in loaded.rejected {
                 let message = format!("a checkpoint was rejected, an older one is used: {error}");
-                eprintln!("{message}");
+                warn!("{message}");
                 supervisor.report(&Report::Warning { message })?;
             }
             return Ok(learner);

@@ -1,4 +1,5 @@
-//! Kills a learner with SIGKILL at every point of writing a checkpoint, and checks what remains.
+//! Kills a learner with SIGKILL at every point of writing a checkpoint, and checks the remaining
+//! files.
 
 #![allow(clippy::unwrap_used, reason = "a test's helpers fail the test")]
 
@@ -21,7 +22,7 @@ const FOLDER: &str = "DMPRL_TEST_FOLDER";
 const RUN_ID: u64 = 5;
 /// Segments between two checkpoints.
 const INTERVAL: u64 = 16;
-/// Minimum number of kills. The test goes on until every point was hit, up to [`KILLS_MAX`].
+/// Minimum number of kills. The test continues until every point was hit, up to [`KILLS_MAX`].
 const KILLS_MIN: u32 = 40;
 const KILLS_MAX: u32 = 2_000;
 /// Files in `latest` if it is a folder. The writer deletes them between renaming the checkpoint and

@@ -31,7 +31,7 @@ fn spec() -> EnvSpec {
     }
 }
 
-/// What an update computes.
+/// The configuration of an update.
 #[derive(Debug, Clone, Copy)]
 struct Case {
     algorithm: &'static str,

@@ -1,14 +1,14 @@
-//! Names of checkpoints, which the learner writes and the supervisor looks for.
+//! Names of checkpoints, for the learner, which writes them, and the supervisor, which lists them.
 
 use std::fs;
 use std::io;
 use std::path::Path;
 
-/// Returns the names of the complete checkpoints in a folder, oldest first. Names are numbers;
-/// everything else in the folder is ignored.
+/// Returns the names of the complete checkpoints in a folder, oldest first. Entries of the folder
+/// whose name is not a number are ignored.
 ///
 /// # Errors
-/// The folder cannot be read.
+/// If the folder cannot be read.
 pub fn names(folder: &Path) -> io::Result<Vec<String>> {
     let mut numbered = Vec::new();
     for entry in fs::read_dir(folder)? {

@@ -1,9 +1,9 @@
-//! Types and code that workers and learner share.
+//! Types and code shared by workers and learner.
 //!
-//! This crate does not depend on Python, an async runtime or an optimiser. It reads no clock, no
-//! environment variable and no global source of randomness: all three are passed in. `config` is
-//! stage 1 of the data flow, `transport` is stages 4 and 7. Both the rollout (stage 3) and the
-//! update (stage 6) use `dmp` and `policy`.
+//! This crate does not depend on Python, an async runtime or an optimiser. It does not read clocks,
+//! environment variables or global random generators; callers pass these in. `config` is stage 1 of
+//! the data flow, `transport` is stages 4 and 7. `dmp` and `policy` are used by the rollout (stage
+//! 3) and the update (stage 6).
 
 pub mod checkpoint;
 pub mod config;

@@ -1,14 +1,14 @@
-//! Stage 7 of 8, its record: policy snapshots, which the learner publishes and the workers use.
+//! Stage 7 of 8, its record: policy snapshots, published by the learner and used by the workers.
 
 use thiserror::Error;
 
 /// The actor's parameters at one version.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct ParameterSnapshot {
-    /// Number of the snapshot within the run. It never decreases, and continues after a resume.
+    /// Number of the snapshot within the run. It never decreases, even after a resume.
     pub version: u64,
-    /// Environment steps inserted before publication; workers derive the end of the warm-up from
-    /// it.
+    /// Environment steps inserted before publication. With it, workers detect the end of the
+    /// warm-up.
     pub env_steps: u64,
     /// Hash of the architecture that `values` belongs to.
     pub architecture_hash: u64,
@@ -19,12 +19,12 @@ pub struct ParameterSnapshot {
 /// Why a snapshot was rejected.
 #[derive(Debug, Error, PartialEq, Eq)]
 pub enum SnapshotError {
-    /// A wrong checksum: the snapshot is incomplete or damaged.
+    /// A wrong checksum: the snapshot is incomplete or corrupted.
     #[error("policy version {version}: checksum {got:#010x}, expected {expected:#010x}")]
     Checksum {
         /// The snapshot's version.
         version: u64,
-        /// Checksum stated in its header.
+        /// Checksum in its header.
         expected: u32,
         /// Checksum of its values.
         got: u32,
@@ -42,14 +42,14 @@ pub enum SnapshotError {
 }
 
 impl ParameterSnapshot {
-    /// CRC-32 over version, steps, architecture and values.
+    /// Returns the CRC-32 of version, steps, architecture hash and values.
     #[must_use]
     pub fn checksum(&self) -> u32 {
         checksum(self.version, self.env_steps, self.architecture_hash, &self.values)
     }
 }
 
-/// CRC-32 over the parts of a snapshot whose values are not in a `Vec` yet.
+/// Returns the checksum of a snapshot whose values are not in a `Vec` yet.
 #[must_use]
 pub fn checksum(version: u64, env_steps: u64, architecture_hash: u64, values: &[f32]) -> u32 {
     let mut hasher = crc32fast::Hasher::new();

@@ -1,8 +1,8 @@
 //! Policy files: safetensors with one tensor per weight matrix or bias, and a description.
 //!
-//! A file contains everything that is needed to act. Its tensors include observation normalisation.
+//! A file is sufficient to run the policy. Observation normalisation is folded into its tensors.
 //! Its metadata contain the policy's description (environment, DMP, ranges, controller, start) as
-//! JSON, and `segment_map` is the DMP as one matrix, so that a reader needs no integrator.
+//! JSON. The tensor `segment_map` is the DMP as one matrix, so that readers need no integrator.
 
 use std::collections::HashMap;
 use std::fs;
@@ -61,7 +61,7 @@ pub enum PolicyFileError {
     },
 }
 
-/// Origin of a policy, for readers of the file.
+/// Origin of a policy: run, task and results.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Origin {
     /// Id of the run that trained it.
@@ -72,7 +72,7 @@ pub struct Origin {
     pub seed: u64,
     /// Version of dmprl that wrote the file.
     pub dmprl_version: String,
-    /// Commit of that version, if known.
+    /// Git commit of that version, if known.
     pub git_commit: Option<String>,
     /// Mean return of its evaluation, if it was evaluated.
     pub return_mean: Option<f64>,
@@ -91,7 +91,7 @@ pub struct OpenedPolicy {
     pub origin: Option<Origin>,
 }
 
-/// Required match between a file and the policy it is loaded into.
+/// How well a file must match the policy that it is loaded into.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Match {
     /// The same architecture: configuration, DMP, task and sizes.
@@ -102,7 +102,7 @@ pub enum Match {
 
 /// Encodes a policy file.
 ///
-/// - `origin`: where the policy comes from, for files that leave their run.
+/// - `origin`: origin of the policy, for files that leave their run's directory.
 ///
 /// # Errors
 /// `Format` if the parameters do not fit the policy.
@@ -111,7 +111,7 @@ pub fn encode(
     snapshot: &ParameterSnapshot,
     origin: Option<&Origin>,
 ) -> Result<Vec<u8>, PolicyFileError> {
-    let path = Path::new("a policy's file");
+    let path = Path::new("policy file");
     let view = |shape, numbers| {
         let view = TensorView::new(Dtype::F32, shape, bytemuck::cast_slice::<f32, u8>(numbers));
         view.map_err(|error| format_error(path, error))
@@ -141,8 +141,7 @@ pub fn encode(
     safetensors::serialize(tensors, Some(metadata)).map_err(|e| format_error(path, e))
 }
 
-/// CRC-32 over the description and the tensors' bytes, in the order of their names, because each is
-/// only valid with the other.
+/// Returns the CRC-32 of the description and of the tensors' bytes, in the order of their names.
 fn checksum(description: &str, tensors: &[(String, TensorView<'_>)]) -> String {
     let mut hasher = crc32fast::Hasher::new();
     hasher.update(description.as_bytes());
@@ -155,7 +154,7 @@ fn checksum(description: &str, tensors: &[(String, TensorView<'_>)]) -> String {
 /// Reads a snapshot for an existing policy.
 ///
 /// # Errors
-/// If the file is unreadable, damaged or of another architecture.
+/// If the file is unreadable, corrupted or of another architecture.
 pub fn load(
     path: &Path,
     policy: &Policy,
@@ -165,25 +164,26 @@ pub fn load(
     Contents::new(path, &bytes)?.snapshot(policy, strictness)
 }
 
-/// Reads a policy with its parameters from the file alone.
+/// Reads a policy and its parameters.
 ///
 /// # Errors
-/// If the file is unreadable or damaged, or so old that it has no description.
+/// If the file is unreadable or corrupted, or so old that it has no description.
 pub fn open(path: &Path) -> Result<OpenedPolicy, PolicyFileError> {
     let bytes = read(path)?;
     let contents = Contents::new(path, &bytes)?;
     let Some(text) = contents.fields.get(DESCRIPTION_KEY) else {
-        let expected = "there; write the file anew with dmprl export RUN";
+        let expected = "a policy description; write the file again with dmprl export RUN";
         return Err(contents.mismatch(DESCRIPTION_KEY, expected.into(), "missing".into()));
     };
-    let unfit = |name, error: &dyn std::error::Error| {
-        contents.mismatch(name, "one that this dmprl knows".into(), error.to_string())
+    let invalid = |name, error: &dyn std::error::Error| {
+        let expected = "one that this version of dmprl supports";
+        contents.mismatch(name, expected.into(), format!("invalid ({error})"))
     };
     let description: PolicyDescription =
-        serde_json::from_str(text).map_err(|error| unfit(DESCRIPTION_KEY, &error))?;
-    let policy = description.build().map_err(|error| unfit(DESCRIPTION_KEY, &error))?;
+        serde_json::from_str(text).map_err(|error| invalid(DESCRIPTION_KEY, &error))?;
+    let policy = description.build().map_err(|error| invalid(DESCRIPTION_KEY, &error))?;
     let origin = contents.fields.get(ORIGIN_KEY).map(|text| serde_json::from_str(text));
-    let origin = origin.transpose().map_err(|error| unfit(ORIGIN_KEY, &error))?;
+    let origin = origin.transpose().map_err(|error| invalid(ORIGIN_KEY, &error))?;
     let snapshot = contents.snapshot(&policy, Match::Architecture)?;
     contents.expect(CHECKSUM_KEY, checksum(text, &contents.tensors.tensors()))?;
     Ok(OpenedPolicy { policy, snapshot, origin })
@@ -255,8 +255,8 @@ impl<'a> Contents<'a> {
             }
             tensors.push((tensor, range));
         }
-        // Only after the shapes have been checked against the file, because a description may ask
-        // for any size.
+        // Allocates only after the shapes have been checked against the file, because the
+        // description of a corrupted file may have any size.
         let mut values = vec![0.0_f32; policy.parameters_len()];
         for (tensor, range) in tensors {
             bytemuck::cast_slice_mut(&mut values[range]).copy_from_slice(tensor.data());
@@ -321,7 +321,7 @@ mod tests {
     }
 
     #[test]
-    fn a_stochastic_policy_keeps_its_standard_deviations() {
+    fn stochastic_policy_keeps_its_standard_deviations() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("1.safetensors");
         let own = policy(&[("algorithm.name", "ndp"), ("algorithm.ndp.initial_log_std", "-0.5")]);
@@ -340,7 +340,7 @@ mod tests {
     }
 
     #[test]
-    fn a_policy_read_back_is_the_same_and_a_foreign_or_damaged_one_is_refused() {
+    fn policy_survives_a_round_trip_and_other_or_corrupted_files_are_rejected() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("7.safetensors");
         let own = policy(&[]);
@@ -391,7 +391,7 @@ mod tests {
     }
 
     #[test]
-    fn a_file_alone_makes_the_policy_again() {
+    fn policy_is_restored_from_the_file_alone() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("mine.safetensors");
         let sources =
@@ -412,33 +412,33 @@ mod tests {
     }
 
     #[test]
-    fn a_description_that_is_missing_or_absurd_is_refused() {
+    fn missing_or_invalid_description_is_rejected() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("mine.safetensors");
-        let refused = |from: &str, to: &str| {
+        let error_after_replacing = |from: &str, to: &str| {
             saved(&[], &path);
             let mut bytes = fs::read(&path).unwrap();
             let at = bytes.windows(from.len()).position(|part| part == from.as_bytes()).unwrap();
-            // The length of the header must not change.
+            // The header's length must not change.
             bytes[at..at + from.len()].copy_from_slice(format!("{to:<0$}", from.len()).as_bytes());
             fs::write(&path, bytes).unwrap();
             open(&path).unwrap_err().to_string()
         };
-        let error = refused("\"description\":", "\"descripti--\":");
+        let error = error_after_replacing("\"description\":", "\"descripti--\":");
         assert!(error.contains("description is missing") && error.contains("dmprl export"));
         let hidden = "\\\"hidden\\\":[256,256]";
-        let error = refused(hidden, &hidden.replace("256,256", "0,99999"));
+        let error = error_after_replacing(hidden, &hidden.replace("256,256", "0,99999"));
         assert!(error.contains("policy.hidden"), "{error}");
-        let error = refused(hidden, &hidden.replace("256,256", "256,255"));
+        let error = error_after_replacing(hidden, &hidden.replace("256,256", "256,255"));
         assert!(error.contains("architecture_hash"), "{error}");
-        // Another function with the same parameters.
+        // The same parameters, but a different function.
         let range = "\\\"goal_range\\\":1.0";
-        let error = refused(range, &range.replace("1.0", "2.0"));
+        let error = error_after_replacing(range, &range.replace("1.0", "2.0"));
         assert!(error.contains("architecture_hash"), "{error}");
         let dims = "\\\"action_len\\\":2";
-        let error = refused(dims, &dims.replace('2', "9"));
+        let error = error_after_replacing(dims, &dims.replace('2', "9"));
         assert!(error.contains("action_low has 2 entries, expected 9"), "{error}");
-        // A valid number that is not the policy's.
+        // A flipped bit that leaves a valid number.
         saved(&[], &path);
         let mut bytes = fs::read(&path).unwrap();
         let last = bytes.len() - 1;

@@ -3,7 +3,7 @@
 use rand::SeedableRng;
 pub use rand_xoshiro::Xoshiro256PlusPlus as Stream;
 
-/// The stream `name`/`index` of the run with seed `master`.
+/// Returns the random stream `name`/`index` of the run with seed `master`.
 ///
 /// Streams with different names or indices are independent for all practical purposes. Their seeds
 /// are a 64-bit hash (FNV-1a, then the SplitMix64 finaliser) of all three arguments.
@@ -12,7 +12,7 @@ pub fn stream(master: u64, name: &str, index: u64) -> Stream {
     Stream::seed_from_u64(derive(master, name, index))
 }
 
-/// The seed of [`stream`], for sources of randomness outside Rust (environment resets).
+/// Returns the seed of [`stream`], for random generators outside Rust, such as in environments.
 #[must_use]
 pub fn derive(master: u64, name: &str, index: u64) -> u64 {
     let mut hash = 0xcbf2_9ce4_8422_2325_u64;
@@ -31,7 +31,7 @@ mod tests {
     use std::collections::HashSet;
 
     #[test]
-    fn names_and_indices_give_distinct_seeds_and_the_same_name_the_same() {
+    fn seeds_are_distinct_and_reproducible() {
         let mut seen = HashSet::new();
         for master in 0..10 {
             for name in ["a", "b", "actor", "replay"] {

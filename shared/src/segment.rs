@@ -1,5 +1,5 @@
-//! Stage 4 of 8, its record: K steps that a worker sends to the learner, as a fixed header and one
-//! block of f32.
+//! Stage 4 of 8, its record: the segment, K steps that a worker sends to the learner as a fixed
+//! header and one block of f32.
 //!
 //! Block of a segment with K steps, observation length O and action length A:
 //! ```text
@@ -16,17 +16,17 @@ use thiserror::Error;
 /// Version of this layout; peers with another version are rejected.
 pub const LAYOUT_VERSION: u32 = 1;
 
-/// The last step ended the episode by the task's own rule.
+/// The last step reached a terminal state of the task.
 pub const TERMINATED: u32 = 1;
 /// The last step reached the time limit.
 pub const TRUNCATED: u32 = 1 << 1;
 /// The environment reported success at the last step.
 pub const SUCCESS: u32 = 1 << 2;
-/// The environment reports success; without this flag [`SUCCESS`] has no meaning.
+/// The environment reports success. Without this flag [`SUCCESS`] has no meaning.
 pub const SUCCESS_REPORTED: u32 = 1 << 3;
-/// Hindsight copy: the steps of other segments with another goal.
+/// The segment is a hindsight copy: steps of other segments with another goal.
 ///
-/// It counts as experience, but not as environment steps or as part of an episode. It has all K
+/// A copy counts as experience, but not as environment steps or as part of an episode. It has all K
 /// steps or is [`TERMINATED`].
 pub const HINDSIGHT: u32 = 1 << 4;
 
@@ -50,13 +50,13 @@ pub struct SegmentHeader {
     pub sequence: u64,
     /// Worker that produced the segment.
     pub worker_id: u32,
-    /// Number of the worker's start.
+    /// How many times the worker has been started; it distinguishes restarts of the same worker.
     pub incarnation: u32,
     /// Index of the worker's environment.
     pub env_index: u32,
-    /// Number of the environment's episode within this incarnation.
+    /// Number of the episode, per environment and incarnation.
     pub episode: u32,
-    /// Environment steps of the episode before this segment.
+    /// Steps of the episode before this segment.
     pub episode_step: u32,
     /// Executed steps, 1 to K.
     pub steps_len: u32,
@@ -70,7 +70,7 @@ pub struct SegmentHeader {
     pub checksum: u32,
 }
 
-// The header is shared between processes, so a change of its layout must not go unnoticed.
+// Processes exchange the header as bytes, so its layout must not change by accident.
 const _: () = assert!(size_of::<SegmentHeader>() == 80 && align_of::<SegmentHeader>() == 8);
 
 /// Sizes that determine a block's layout.
@@ -85,7 +85,7 @@ pub struct SegmentLayout {
 }
 
 impl SegmentLayout {
-    /// Length of the block in f32 values.
+    /// Returns the length of the block in f32 values.
     #[must_use]
     pub fn block_len(&self) -> usize {
         self.actions_len() + self.observations_len() + self.segment_steps
@@ -95,7 +95,7 @@ impl SegmentLayout {
         (self.segment_steps + 1) * self.observation_len
     }
 
-    /// Length of a segment's actions, K A.
+    /// Returns the length of a segment's actions, K A.
     #[must_use]
     pub fn actions_len(&self) -> usize {
         self.segment_steps * self.action_len
@@ -139,20 +139,20 @@ pub struct Segment {
 }
 
 impl Segment {
-    /// A zeroed segment of the given layout.
+    /// Creates a segment whose header and block are all zero.
     #[must_use]
     pub fn zeroed(layout: SegmentLayout) -> Self {
         Self { header: SegmentHeader::default(), block: vec![0.0; layout.block_len()] }
     }
 }
 
-/// Range of an action in a segment; actions are always finite.
+/// Allowed range of the actions in a segment. Actions are always finite.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum ActionBounds {
     /// In [-1, 1].
     Unit,
-    /// Unbounded: as drawn from an unbounded distribution, before the environment's bounds are
-    /// applied.
+    /// Unbounded: draws from an unbounded distribution, before they are clipped to the
+    /// environment's bounds.
     None,
 }
 
@@ -165,15 +165,15 @@ pub struct Expected {
     pub architecture_hash: u64,
     /// Sizes of the block.
     pub layout: SegmentLayout,
-    /// Number of workers; valid ids are below it.
+    /// Number of workers; valid ids are smaller.
     pub worker_count: u32,
-    /// Environments per worker; valid indices are below it.
+    /// Environments per worker; valid indices are smaller.
     pub env_count: u32,
     /// Range of the policy's actions.
     pub action_bounds: ActionBounds,
 }
 
-/// Why a segment was rejected. Each variant has its own counter.
+/// Why a segment was rejected. The metrics count each variant separately.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord, Error)]
 pub enum Rejection {
     /// Another layout version.
@@ -197,26 +197,26 @@ pub enum Rejection {
     /// A number that is NaN or infinite, or an action outside its bounds.
     #[error("value not finite or action out of bounds")]
     Value,
-    /// A sequence number that this worker has already used. Only the learner detects it, because it
-    /// remembers sequence numbers.
+    /// A sequence number that this worker has already used. [`check`] does not detect it; the
+    /// learner does, which tracks sequence numbers.
     #[error("duplicate")]
     Duplicate,
 }
 
-/// Rejects a segment that does not match.
+/// Checks a segment: header fields, checksum and values.
 ///
 /// # Errors
-/// The first reason found; the header is checked before the block.
+/// The first reason for a rejection. The header is checked before the block.
 pub fn check(header: &SegmentHeader, block: &[f32], expected: &Expected) -> Result<(), Rejection> {
-    let refuse = |wrong: bool, why: Rejection| if wrong { Err(why) } else { Ok(()) };
+    let reject_if = |wrong: bool, why: Rejection| if wrong { Err(why) } else { Ok(()) };
     let layout = expected.layout;
     let sizes = [header.segment_steps, header.observation_len, header.action_len];
     let wanted = [layout.segment_steps, layout.observation_len, layout.action_len];
-    refuse(header.layout_version != LAYOUT_VERSION, Rejection::LayoutVersion)?;
-    refuse(header.run_id != expected.run_id, Rejection::Run)?;
-    refuse(header.architecture_hash != expected.architecture_hash, Rejection::Architecture)?;
-    refuse(sizes.map(|size| size as usize) != wanted, Rejection::Sizes)?;
-    refuse(block.len() != layout.block_len(), Rejection::Sizes)?;
+    reject_if(header.layout_version != LAYOUT_VERSION, Rejection::LayoutVersion)?;
+    reject_if(header.run_id != expected.run_id, Rejection::Run)?;
+    reject_if(header.architecture_hash != expected.architecture_hash, Rejection::Architecture)?;
+    reject_if(sizes.map(|size| size as usize) != wanted, Rejection::Sizes)?;
+    reject_if(block.len() != layout.block_len(), Rejection::Sizes)?;
     let in_range = header.worker_id < expected.worker_count
         && header.env_index < expected.env_count
         && header.sequence > 0
@@ -226,22 +226,22 @@ pub fn check(header: &SegmentHeader, block: &[f32], expected: &Expected) -> Resu
         && (header.flags & HINDSIGHT == 0 || header.flags & !(HINDSIGHT | TERMINATED) == 0)
         && (header.steps_len == header.segment_steps
             || header.flags & (TERMINATED | TRUNCATED) != 0);
-    refuse(!in_range, Rejection::Field)?;
-    refuse(block_checksum(block) != header.checksum, Rejection::Checksum)?;
+    reject_if(!in_range, Rejection::Field)?;
+    reject_if(block_checksum(block) != header.checksum, Rejection::Checksum)?;
     let (_, actions, _) = layout.split(block);
-    let sound = all(block, |value| value.is_finite())
+    let valid = all(block, |value| value.is_finite())
         && (expected.action_bounds == ActionBounds::None
             || all(actions, |action| action.abs() <= 1.0));
-    refuse(!sound, Rejection::Value)
+    reject_if(!valid, Rejection::Value)
 }
 
-/// Whether all values pass. It never returns early: without an early exit the compiler vectorises
-/// the loop, which makes it ten times as fast.
-fn all(values: &[f32], passes: impl Fn(f32) -> bool) -> bool {
-    values.iter().fold(true, |sound, &value| sound & passes(value))
+/// Returns whether all values satisfy the predicate. Without an early return the compiler
+/// vectorises the loop, which makes it ten times as fast.
+fn all(values: &[f32], predicate: impl Fn(f32) -> bool) -> bool {
+    values.iter().fold(true, |valid, &value| valid & predicate(value))
 }
 
-/// CRC-32 of a block.
+/// Returns the CRC-32 of a block.
 #[must_use]
 pub fn block_checksum(block: &[f32]) -> u32 {
     crc32fast::hash(bytemuck::cast_slice(block))
@@ -262,7 +262,7 @@ mod tests {
         action_bounds: ActionBounds::Unit,
     };
 
-    fn sound() -> Segment {
+    fn valid_segment() -> Segment {
         let mut segment = Segment::zeroed(LAYOUT);
         segment.header = SegmentHeader {
             layout_version: LAYOUT_VERSION,
@@ -279,73 +279,73 @@ mod tests {
         segment
     }
 
-    fn verdict(change: impl FnOnce(&mut Segment)) -> Result<(), Rejection> {
-        let mut segment = sound();
+    fn check_changed(change: impl FnOnce(&mut Segment)) -> Result<(), Rejection> {
+        let mut segment = valid_segment();
         change(&mut segment);
         check(&segment.header, &segment.block, &EXPECTED)
     }
 
     #[test]
-    fn a_sound_segment_is_taken() {
-        assert_eq!(verdict(|_| {}), Ok(()));
+    fn valid_segment_is_accepted() {
+        assert_eq!(check_changed(|_| {}), Ok(()));
     }
 
     #[test]
     fn every_misfit_is_refused_with_its_reason() {
-        assert_eq!(verdict(|s| s.header.layout_version = 2), Err(Rejection::LayoutVersion));
-        assert_eq!(verdict(|s| s.header.run_id = 8), Err(Rejection::Run));
-        assert_eq!(verdict(|s| s.header.architecture_hash = 8), Err(Rejection::Architecture));
-        assert_eq!(verdict(|s| s.header.observation_len = 4), Err(Rejection::Sizes));
-        assert_eq!(verdict(|s| s.block.truncate(3)), Err(Rejection::Sizes));
-        assert_eq!(verdict(|s| s.header.steps_len = 0), Err(Rejection::Field));
-        assert_eq!(verdict(|s| s.header.steps_len = 6), Err(Rejection::Field));
-        assert_eq!(verdict(|s| s.header.steps_len = 4), Err(Rejection::Field));
-        assert_eq!(verdict(|s| s.header.episode_step = u32::MAX - 4), Err(Rejection::Field));
-        assert_eq!(verdict(|s| s.header.worker_id = 2), Err(Rejection::Field));
-        assert_eq!(verdict(|s| s.header.env_index = 4), Err(Rejection::Field));
-        assert_eq!(verdict(|s| s.header.sequence = 0), Err(Rejection::Field));
-        assert_eq!(verdict(|s| s.header.flags = 32), Err(Rejection::Field));
-        assert_eq!(verdict(|s| s.block[0] = 1.0), Err(Rejection::Checksum));
+        assert_eq!(check_changed(|s| s.header.layout_version = 2), Err(Rejection::LayoutVersion));
+        assert_eq!(check_changed(|s| s.header.run_id = 8), Err(Rejection::Run));
+        assert_eq!(check_changed(|s| s.header.architecture_hash = 8), Err(Rejection::Architecture));
+        assert_eq!(check_changed(|s| s.header.observation_len = 4), Err(Rejection::Sizes));
+        assert_eq!(check_changed(|s| s.block.truncate(3)), Err(Rejection::Sizes));
+        assert_eq!(check_changed(|s| s.header.steps_len = 0), Err(Rejection::Field));
+        assert_eq!(check_changed(|s| s.header.steps_len = 6), Err(Rejection::Field));
+        assert_eq!(check_changed(|s| s.header.steps_len = 4), Err(Rejection::Field));
+        assert_eq!(check_changed(|s| s.header.episode_step = u32::MAX - 4), Err(Rejection::Field));
+        assert_eq!(check_changed(|s| s.header.worker_id = 2), Err(Rejection::Field));
+        assert_eq!(check_changed(|s| s.header.env_index = 4), Err(Rejection::Field));
+        assert_eq!(check_changed(|s| s.header.sequence = 0), Err(Rejection::Field));
+        assert_eq!(check_changed(|s| s.header.flags = 32), Err(Rejection::Field));
+        assert_eq!(check_changed(|s| s.block[0] = 1.0), Err(Rejection::Checksum));
         for value in [f32::NAN, f32::INFINITY, 1.5] {
             let change = |s: &mut Segment| {
                 s.block[18] = value;
                 s.header.checksum = block_checksum(&s.block);
             };
-            assert_eq!(verdict(change), Err(Rejection::Value));
+            assert_eq!(check_changed(change), Err(Rejection::Value));
         }
     }
 
     #[test]
-    fn an_action_beyond_the_bounds_is_taken_from_an_unbounded_policy_and_a_nan_is_not() {
+    fn unbounded_policy_may_exceed_the_bounds_but_not_send_nan() {
         let expected = Expected { action_bounds: ActionBounds::None, ..EXPECTED };
-        let verdict_on = |value: f32| {
-            let mut segment = sound();
+        let check_action = |value: f32| {
+            let mut segment = valid_segment();
             segment.block[18] = value;
             segment.header.checksum = block_checksum(&segment.block);
             check(&segment.header, &segment.block, &expected)
         };
-        assert_eq!(verdict_on(1.5), Ok(()));
-        assert_eq!(verdict_on(f32::NAN), Err(Rejection::Value));
-        assert_eq!(verdict_on(f32::INFINITY), Err(Rejection::Value));
+        assert_eq!(check_action(1.5), Ok(()));
+        assert_eq!(check_action(f32::NAN), Err(Rejection::Value));
+        assert_eq!(check_action(f32::INFINITY), Err(Rejection::Value));
     }
 
     #[test]
-    fn a_copy_with_another_goal_is_whole_or_terminated_and_no_part_of_an_episode() {
-        let verdict = |flags: u32, steps_len: u32| {
-            verdict(|s| (s.header.flags, s.header.steps_len) = (HINDSIGHT | flags, steps_len))
+    fn hindsight_copy_is_complete_or_terminated_and_not_part_of_an_episode() {
+        let check_copy = |flags: u32, steps_len: u32| {
+            check_changed(|s| (s.header.flags, s.header.steps_len) = (HINDSIGHT | flags, steps_len))
         };
-        assert_eq!((verdict(0, 5), verdict(TERMINATED, 2)), (Ok(()), Ok(())));
+        assert_eq!((check_copy(0, 5), check_copy(TERMINATED, 2)), (Ok(()), Ok(())));
         for (flags, len) in [(0, 4), (TRUNCATED, 5), (TRUNCATED, 4), (SUCCESS_REPORTED, 5)] {
-            assert_eq!(verdict(flags, len), Err(Rejection::Field), "{flags} {len}");
+            assert_eq!(check_copy(flags, len), Err(Rejection::Field), "{flags} {len}");
         }
     }
 
     #[test]
-    fn a_segment_cut_short_by_the_episodes_end_is_taken() {
+    fn segment_shortened_by_the_end_of_an_episode_is_accepted() {
         let change = |s: &mut Segment| {
             s.header.steps_len = 2;
             s.header.flags = TERMINATED | SUCCESS;
         };
-        assert_eq!(verdict(change), Ok(()));
+        assert_eq!(check_changed(change), Ok(()));
     }
 }

@@ -1,4 +1,4 @@
-//! Properties of an environment that learner and policy need.
+//! Sizes, bounds and timing of an environment.
 
 use serde::{Deserialize, Serialize};
 use thiserror::Error;
@@ -21,8 +21,8 @@ pub struct EnvSpec {
     pub control_dt_s: f64,
     /// Steps after which an episode is truncated; 0 if it never is.
     pub episode_steps: u32,
-    /// Name of each entry of an observation, such as `achieved_goal[0]`. Empty if there are no
-    /// names, as in files of older versions.
+    /// Name of each entry of an observation, such as `achieved_goal[0]`. Empty if the entries have
+    /// no names, as in files of older versions.
     #[serde(default)]
     pub observation_names: Vec<String>,
 }
@@ -30,7 +30,7 @@ pub struct EnvSpec {
 /// Why an environment cannot be used.
 #[derive(Debug, Error)]
 pub enum SpecError {
-    /// Lengths that do not match.
+    /// A list of the wrong length.
     #[error("{id}: {name} has {got} entries, expected {expected}")]
     Length {
         /// Gymnasium id.
@@ -42,7 +42,7 @@ pub enum SpecError {
         /// Actual length.
         got: usize,
     },
-    /// A bound that is infinite, NaN or empty.
+    /// An action range that is not finite or is empty.
     #[error(
         "{id}: action dimension {dimension} is bounded by [{low}, {high}]; \
          expected finite, low < high"
@@ -57,11 +57,11 @@ pub enum SpecError {
         /// Its upper bound.
         high: f64,
     },
-    /// An invalid duration of a step. The duration scales the policy's start velocity. Workers
-    /// report it as JSON, where NaN and infinity become null.
+    /// An invalid duration of a step. The duration scales the policy's start velocity, and workers
+    /// report it as JSON, which cannot represent NaN or infinity.
     #[error(
         "{id}: the duration of a step (the environment's attribute dt) is {got} s; expected a \
-         finite number, 0 or more, where 0 says that it is not known"
+         finite number, 0 or more (0: unknown)"
     )]
     Duration {
         /// Gymnasium id.
@@ -105,7 +105,8 @@ impl EnvSpec {
         Ok(())
     }
 
-    /// Whether both describe the same environment. Names are ignored if only one side has them.
+    /// Whether both describe the same environment. Names of observation entries are ignored if only
+    /// one side has them.
     #[must_use]
     pub fn is_same(&self, other: &Self) -> bool {
         let named = !self.observation_names.is_empty() && !other.observation_names.is_empty();
@@ -116,7 +117,7 @@ impl EnvSpec {
         nameless(self) == nameless(other)
     }
 
-    /// Name of entry `index` of an observation.
+    /// Returns the name of entry `index` of an observation, `observation[index]` if it has none.
     #[must_use]
     pub fn observation_name(&self, index: usize) -> String {
         let name = self.observation_names.get(index).cloned();
@@ -128,12 +129,12 @@ impl EnvSpec {
 mod tests {
     use super::*;
 
-    /// As written by version 0.1.0.
+    /// Written by version 0.1.0.
     const OLDER: &str = r#"{"id": "Test-v0", "observation_len": 2, "action_len": 1,
         "action_low": [-1.0], "action_high": [1.0], "control_dt_s": 0.02, "episode_steps": 50}"#;
 
     #[test]
-    fn a_file_without_names_is_read_and_is_the_same_environment() {
+    fn spec_without_names_equals_the_same_spec_with_names() {
         let older: EnvSpec = serde_json::from_str(OLDER).unwrap();
         older.check().unwrap();
         assert_eq!(older.observation_name(1), "observation[1]");
@@ -148,7 +149,7 @@ mod tests {
     }
 
     #[test]
-    fn names_for_another_number_of_entries_are_refused() {
+    fn wrong_number_of_names_is_rejected() {
         let older: EnvSpec = serde_json::from_str(OLDER).unwrap();
         let spec = EnvSpec { observation_names: vec!["angle".into()], ..older };
         let message = spec.check().unwrap_err().to_string();
@@ -156,13 +157,13 @@ mod tests {
     }
 
     #[test]
-    fn a_step_without_a_finite_duration_is_refused() {
+    fn invalid_step_duration_is_rejected() {
         let older: EnvSpec = serde_json::from_str(OLDER).unwrap();
         for (got, shown) in [(f64::NAN, "NaN"), (f64::INFINITY, "inf"), (-1.0, "-1")] {
             let spec = EnvSpec { control_dt_s: got, ..older.clone() };
             let message = spec.check().unwrap_err().to_string();
-            let begins = "Test-v0: the duration of a step (the environment's attribute dt) is ";
-            assert!(message.starts_with(&format!("{begins}{shown} s; expected")), "{message}");
+            let start = "Test-v0: the duration of a step (the environment's attribute dt) is ";
+            assert!(message.starts_with(&format!("{start}{shown} s; expected")), "{message}");
         }
         EnvSpec { control_dt_s: 0.0, ..older }.check().unwrap();
     }

@@ -1,4 +1,5 @@
-//! The runtime does not allocate after its start, so that control steps take a constant time.
+//! Checks that the policy runtime does not allocate after its start, so that the duration of a
+//! control step does not vary.
 
 #![allow(clippy::unwrap_used, reason = "a test's helpers fail the test")]
 
@@ -11,7 +12,7 @@ use dmprl_shared::runtime::PolicyRuntime;
 use dmprl_shared::seeds;
 use dmprl_shared::spec::EnvSpec;
 
-/// The only test in its binary, because the counter counts every thread.
+/// The only test in its binary, because the counter counts all threads.
 #[test]
 fn decisions_steps_and_holds_allocate_nothing() {
     let spec = EnvSpec {
@@ -31,7 +32,7 @@ fn decisions_steps_and_holds_allocate_nothing() {
         let parameters = policy.initial_parameters(&mut seeds::stream(1, "test", 0));
         let mut runtime = PolicyRuntime::new(policy, &parameters);
         let observation = [0.1, -0.2, 0.3, -0.4];
-        // gemm allocates its buffers in its first product.
+        // gemm allocates its buffers in the first product.
         runtime.segment(&observation).unwrap();
         let allocated = allocations_of(|| {
             for step in 0..100 {

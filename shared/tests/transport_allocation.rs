@@ -1,4 +1,4 @@
-//! Allocations of sending, receiving and reading snapshots after start-up.
+//! Counts the allocations of sending, receiving and reading snapshots after start-up.
 
 #![allow(clippy::unwrap_used, reason = "a test's helpers fail the test")]
 
@@ -21,7 +21,7 @@ fn log(parent: &Parent) -> SegmentLog {
 }
 
 /// The only test in its binary, because the counter counts every thread. iceoryx2 0.10 allocates
-/// about 100 bytes for each sample that is filled, and 0 for each that is read; dmprl adds none.
+/// about 100 bytes for each sample that is written and nothing for reading; dmprl adds none.
 #[test]
 fn the_steady_state_allocates_only_what_iceoryx2_does_for_a_sample() {
     const ROUNDS: u64 = 1000;
@@ -79,7 +79,7 @@ fn the_steady_state_allocates_only_what_iceoryx2_does_for_a_sample() {
         };
         for (worker, outbox, _) in &mut workers {
             reading += allocations_of(&mut take);
-            // The segment that found its queue full.
+            // The segment that did not fit into the full queue before.
             sending += allocations_of(|| {
                 assert_eq!(outbox.offer(&mut worker.segments).unwrap(), SendOutcome::Delivered);
             });

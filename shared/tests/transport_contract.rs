@@ -1,4 +1,4 @@
-//! The contract of every transport, tested in one process and over shared memory.
+//! The contract of every transport, tested in process and over shared memory.
 
 #![allow(clippy::unwrap_used, reason = "a test's helpers fail the test")]
 
@@ -19,7 +19,7 @@ use transport_support::{
 type Subscriber = Box<dyn ParameterSubscriber + Send>;
 type Listener = Box<dyn AcknowledgementSubscriber + Send>;
 
-/// One learner with its workers over either transport.
+/// One learner and its workers, connected by either transport.
 struct Transport {
     senders: Vec<Box<dyn SegmentSender + Send>>,
     receiver: Box<dyn SegmentReceiver + Send>,
@@ -64,7 +64,7 @@ fn over_shared_memory(workers: usize, queue_segments: usize) -> Transport {
         listen: Box::new(move || Box::new(hear(&path, &plan).unwrap())),
         _domain: Some((domain, parent)),
     };
-    // The learner's first poll connects the queues; until then a full queue counts as detached.
+    // The learner's first poll connects the queues. Until then a full queue returns `Detached`.
     assert!(!transport.receiver.try_receive(&mut Segment::default()).unwrap());
     transport
 }
@@ -76,9 +76,9 @@ fn offer(transport: &mut Transport, worker: usize, sequence: u64) -> SendOutcome
     transport.senders[worker].try_send(&header(worker as u32, 1, sequence), &block).unwrap()
 }
 
-fn nothing_is_lost_or_duplicated_with_a_slow_reader(mut transport: Transport) {
+fn slow_reader_loses_and_duplicates_no_segment(mut transport: Transport) {
     const SEGMENTS: u64 = 100_000;
-    const NAP_EVERY: u64 = 1000;
+    const PAUSE_EVERY: u64 = 1000;
     let (full, seen_full) = std::sync::mpsc::channel();
     let mut sender = transport.senders.pop().unwrap();
     let worker = std::thread::spawn(move || {
@@ -95,8 +95,8 @@ fn nothing_is_lost_or_duplicated_with_a_slow_reader(mut transport: Transport) {
     });
     let mut segment = Segment::zeroed(LAYOUT);
     for sequence in 1..=SEGMENTS {
-        if sequence % NAP_EVERY == 0 && sequence < SEGMENTS - NAP_EVERY {
-            // The reader pauses until the queue has been full again.
+        if sequence % PAUSE_EVERY == 0 && sequence < SEGMENTS - PAUSE_EVERY {
+            // The reader pauses until the queue is full.
             while seen_full.try_recv().is_ok() {}
             seen_full.recv().unwrap();
         }
@@ -144,7 +144,7 @@ fn full_queues_are_drained_in_turn(mut transport: Transport) {
     assert!(f64::from(*max) <= 1.5 * f64::from(*min), "{taken:?}");
 }
 
-fn a_learner_that_left_is_reported(mut transport: Transport) {
+fn sending_without_a_learner_returns_detached(mut transport: Transport) {
     assert_eq!(offer(&mut transport, 0, 1), SendOutcome::Delivered);
     transport.receiver = over_memory_of_one_process(1, 1).receiver;
     for _ in 0..10 {
@@ -152,15 +152,15 @@ fn a_learner_that_left_is_reported(mut transport: Transport) {
     }
 }
 
-fn a_wrong_length_is_refused(mut transport: Transport) {
+fn segment_of_the_wrong_length_is_rejected(mut transport: Transport) {
     let short = vec![0.0; LAYOUT.block_len() - 1];
-    let refusal = transport.senders[0].try_send(&header(0, 1, 1), &short).unwrap_err();
-    let TransportError::Length { expected, got } = refusal else { panic!("{refusal}") };
+    let error = transport.senders[0].try_send(&header(0, 1, 1), &short).unwrap_err();
+    let TransportError::Length { expected, got } = error else { panic!("{error}") };
     assert_eq!((expected, got), (LAYOUT.block_len(), short.len()));
     assert!(!transport.receiver.try_receive(&mut Segment::default()).unwrap());
 }
 
-fn the_newest_snapshot_replaces_the_ones_before(mut transport: Transport) {
+fn newest_snapshot_replaces_earlier_ones(mut transport: Transport) {
     let mut subscriber = (transport.join)();
     let mut taken = ParameterSnapshot::default();
     assert!(!subscriber.newest(&mut taken).unwrap());
@@ -172,7 +172,7 @@ fn the_newest_snapshot_replaces_the_ones_before(mut transport: Transport) {
     assert!(!subscriber.newest(&mut taken).unwrap());
 }
 
-fn snapshots_are_whole_and_their_version_never_decreases(mut transport: Transport) {
+fn snapshots_are_complete_and_versions_never_decrease(mut transport: Transport) {
     const VERSIONS: u64 = 2000;
     let mut subscriber = (transport.join)();
     let reader = std::thread::spawn(move || {
@@ -194,7 +194,7 @@ fn snapshots_are_whole_and_their_version_never_decreases(mut transport: Transpor
     reader.join().unwrap();
 }
 
-fn a_late_joiner_gets_the_newest_snapshot(mut transport: Transport) {
+fn late_subscriber_gets_the_newest_snapshot(mut transport: Transport) {
     transport.publisher.publish(&snapshot(1)).unwrap();
     transport.publisher.publish(&snapshot(2)).unwrap();
     let mut subscriber = (transport.join)();
@@ -204,23 +204,23 @@ fn a_late_joiner_gets_the_newest_snapshot(mut transport: Transport) {
     assert_eq!(taken, snapshot(2));
 }
 
-fn a_snapshot_of_another_architecture_is_refused(mut transport: Transport) {
+fn snapshot_of_another_architecture_is_rejected(mut transport: Transport) {
     let mut subscriber = (transport.join)();
     transport.publisher.publish(&snapshot(1)).unwrap();
     let mut taken = ParameterSnapshot::default();
     assert!(subscriber.newest(&mut taken).unwrap());
     let foreign = ParameterSnapshot { architecture_hash: 1, ..snapshot(2) };
     transport.publisher.publish(&foreign).unwrap();
-    let refusal = subscriber.newest(&mut taken).unwrap_err();
+    let error = subscriber.newest(&mut taken).unwrap_err();
     let expected = SnapshotError::Architecture { version: 2, expected: ARCHITECTURE, got: 1 };
-    assert!(matches!(&refusal, TransportError::Snapshot(e) if *e == expected), "{refusal}");
+    assert!(matches!(&error, TransportError::Snapshot(e) if *e == expected), "{error}");
     assert_eq!(taken, snapshot(1));
     transport.publisher.publish(&snapshot(3)).unwrap();
     assert!(subscriber.newest(&mut taken).unwrap());
     assert_eq!(taken.values.len(), PARAMETERS_LEN);
 }
 
-fn the_newest_acknowledgements_replace_the_ones_before(mut transport: Transport) {
+fn newest_acknowledgements_replace_earlier_ones(mut transport: Transport) {
     let marks = |sequence| [1, 2].map(|incarnation| Watermark { incarnation, sequence });
     let mut listener = (transport.listen)();
     let mut taken = Acknowledgements::default();
@@ -231,8 +231,8 @@ fn the_newest_acknowledgements_replace_the_ones_before(mut transport: Transport)
     assert!(listener.newest(&mut taken).unwrap());
     assert_eq!((taken.epoch, &taken.marks[..]), (1, &marks(5)[..]));
     assert!(!listener.newest(&mut taken).unwrap());
-    let refusal = transport.acknowledger.acknowledge(&marks(6)[..1]).unwrap_err();
-    assert!(matches!(refusal, TransportError::Length { .. }), "{refusal}");
+    let error = transport.acknowledger.acknowledge(&marks(6)[..1]).unwrap_err();
+    assert!(matches!(error, TransportError::Length { .. }), "{error}");
     assert!(!listener.newest(&mut taken).unwrap());
 }
 
@@ -252,14 +252,14 @@ macro_rules! contract {
 }
 
 contract! {
-    nothing_is_lost_or_duplicated_with_a_slow_reader(1, 64);
+    slow_reader_loses_and_duplicates_no_segment(1, 64);
     a_full_queue_says_so_and_keeps_what_it_has(1, 4);
     full_queues_are_drained_in_turn(4, 16);
-    a_learner_that_left_is_reported(1, 8);
-    a_wrong_length_is_refused(1, 4);
-    the_newest_snapshot_replaces_the_ones_before(1, 1);
-    snapshots_are_whole_and_their_version_never_decreases(1, 1);
-    a_late_joiner_gets_the_newest_snapshot(1, 1);
-    a_snapshot_of_another_architecture_is_refused(1, 1);
-    the_newest_acknowledgements_replace_the_ones_before(2, 1);
+    sending_without_a_learner_returns_detached(1, 8);
+    segment_of_the_wrong_length_is_rejected(1, 4);
+    newest_snapshot_replaces_earlier_ones(1, 1);
+    snapshots_are_complete_and_versions_never_decrease(1, 1);
+    late_subscriber_gets_the_newest_snapshot(1, 1);
+    snapshot_of_another_architecture_is_rejected(1, 1);
+    newest_acknowledgements_replace_earlier_ones(2, 1);
 }

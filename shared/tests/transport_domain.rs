@@ -1,4 +1,4 @@
-//! The run's shared-memory directory: its permissions, its checks and its removal.
+//! Tests of the run's shared-memory directory: permissions, checks and removal.
 
 #![allow(clippy::unwrap_used, reason = "a test's helpers fail the test")]
 
@@ -32,34 +32,34 @@ fn another_process_owns_a_domain() {
 fn owner(parent: &Path, token: &str) -> (Process, PathBuf) {
     let process = Process::start(ENTRY, token, parent, 1);
     let path = parent.join(token);
-    eventually("the other process owns a domain", || path.join("ready").exists().then_some(()));
+    eventually("the child process owns a domain", || path.join("ready").exists().then_some(()));
     (process, path)
 }
 
 fn entries(directory: &Path) -> Vec<PathBuf> {
-    // The last domain removes its parent.
+    // The parent is removed with its last domain.
     let Ok(entries) = directory.read_dir() else { return Vec::new() };
     let mut paths: Vec<_> = entries.map(|entry| entry.unwrap().path()).collect();
     paths.sort();
     paths
 }
 
-/// Files that iceoryx2 creates in its default locations if a resource is not in the domain.
-fn loose_resources() -> Vec<PathBuf> {
-    let loose = |path: &PathBuf| {
+/// Returns files that iceoryx2 has created in its default locations, outside of any domain.
+fn resources_outside_domains() -> Vec<PathBuf> {
+    let is_resource = |path: &PathBuf| {
         let name = path.file_name().unwrap().to_string_lossy();
         name.starts_with("iox2_") || name.starts_with("d_") || name.contains("global_mgmt")
     };
     let shared_memory = Path::new("/dev/shm");
     let mut paths = if shared_memory.is_dir() { entries(shared_memory) } else { Vec::new() };
-    paths.retain(loose);
+    paths.retain(is_resource);
     paths
 }
 
 #[test]
-fn nothing_is_left_when_the_domain_is_dropped() {
-    let loose_before = loose_resources();
-    let default_place = Path::new("/tmp/iceoryx2").exists();
+fn dropping_the_domain_removes_all_files() {
+    let outside_before = resources_outside_domains();
+    let default_existed = Path::new("/tmp/iceoryx2").exists();
     let parent = Parent::new();
     let domain = parent.domain("run");
     let plan = plan(2, 8);
@@ -69,14 +69,14 @@ fn nothing_is_left_when_the_domain_is_dropped() {
     let block = vec![0.0; LAYOUT.block_len()];
     let sent = worker.segments.try_send(&header(1, 1, 1), &block).unwrap();
     assert_eq!(sent, SendOutcome::Delivered);
-    assert_eq!(loose_resources(), loose_before);
-    assert_eq!(Path::new("/tmp/iceoryx2").exists(), default_place);
-    // The directory is removed first; ends that outlive it must tolerate this.
+    assert_eq!(resources_outside_domains(), outside_before);
+    assert_eq!(Path::new("/tmp/iceoryx2").exists(), default_existed);
+    // The directory is removed before the ends, which must tolerate this.
     drop(domain);
-    assert!(!parent.path().exists(), "the last domain takes its parent along");
+    assert!(!parent.path().exists(), "the parent is removed with its last domain");
     drop((learner, worker));
     assert_eq!(entries(&parent.path()), Vec::<PathBuf>::new());
-    assert_eq!(loose_resources(), loose_before);
+    assert_eq!(resources_outside_domains(), outside_before);
 }
 
 #[test]
@@ -93,7 +93,7 @@ fn only_domains_of_dead_owners_are_removed() {
     let found = abandoned(&parent.path()).unwrap();
     assert_eq!(found.iter().map(|leftover| &leftover.path).collect::<Vec<_>>(), [&dead]);
     assert!(found[0].bytes > 0);
-    assert!(dead.is_dir(), "looking removes nothing");
+    assert!(dead.is_dir(), "`abandoned` removes nothing");
     assert_eq!(remove_abandoned(&parent.path()).unwrap(), found);
     assert_eq!(entries(&parent.path()), [foreign, live.path().to_owned()]);
     assert_eq!(remove_abandoned(&parent.path()).unwrap(), []);
@@ -111,9 +111,9 @@ fn domains_half_made_or_half_removed_are_removed() {
     assert_eq!(entries(&parent.path()), [live.path()]);
 }
 
-/// A learner whose supervisor was killed still writes its last checkpoint.
+/// After its supervisor is killed, a learner still writes its last checkpoint.
 #[test]
-fn a_domain_stays_as_long_as_its_learner_lives() {
+fn domain_is_kept_while_its_learner_is_alive() {
     let parent = Parent::new();
     let (mut process, dead) = owner(&parent.path(), "dead");
     process.kill();
@@ -123,11 +123,11 @@ fn a_domain_stays_as_long_as_its_learner_lives() {
     assert_eq!(remove_abandoned(&parent.path()).unwrap(), []);
     drop(learner);
     assert_eq!(remove_abandoned(&parent.path()).unwrap().len(), 1);
-    assert!(!parent.path().exists(), "the last domain takes its parent along");
+    assert!(!parent.path().exists(), "the parent is removed with its last domain");
 }
 
 #[test]
-fn a_link_among_the_domains_is_neither_followed_nor_removed() {
+fn symbolic_link_among_the_domains_is_neither_followed_nor_removed() {
     let parent = Parent::new();
     let (mut process, dead) = owner(&parent.path(), "dead");
     process.kill();
@@ -137,7 +137,7 @@ fn a_link_among_the_domains_is_neither_followed_nor_removed() {
     symlink(&theirs, &dead).unwrap();
     assert_eq!(remove_abandoned(&parent.path()).unwrap(), []);
     assert!(theirs.join("domain").exists());
-    // A link inside a domain is removed without its target.
+    // A link inside a domain is removed, but not its target.
     std::fs::remove_file(&dead).unwrap();
     std::fs::rename(&theirs, &dead).unwrap();
     std::fs::write(outside.path().join("kept"), "").unwrap();
@@ -146,26 +146,26 @@ fn a_link_among_the_domains_is_neither_followed_nor_removed() {
     assert!(outside.path().join("kept").exists());
 }
 
-/// A directory between `mkdir` and its lock must not count as abandoned.
+/// A directory between its `mkdir` and its lock must not be considered abandoned.
 #[test]
-fn domains_being_made_survive_the_removal_of_abandoned_ones() {
+fn domains_being_created_survive_the_removal_of_abandoned_ones() {
     let parent = Parent::new();
     drop(parent.domain("first"));
     let path = parent.path();
     std::thread::scope(|scope| {
-        let makers: Vec<_> = ["a", "b"]
-            .map(|maker| {
+        let creators: Vec<_> = ["a", "b"]
+            .map(|creator| {
                 let path = &path;
                 scope.spawn(move || {
                     for round in 0..200 {
-                        let domain = Domain::create(path, &format!("{maker}{round}")).unwrap();
+                        let domain = Domain::create(path, &format!("{creator}{round}")).unwrap();
                         Domain::open(domain.path()).unwrap();
                     }
                 })
             })
             .into();
-        while makers.iter().any(|maker| !maker.is_finished()) {
-            // A directory that a maker is removing may be removed here too.
+        while creators.iter().any(|creator| !creator.is_finished()) {
+            // May also remove a directory that a creator is removing at the same time.
             for removed in remove_abandoned(&path).unwrap() {
                 assert!(removed.path.to_string_lossy().contains("condemned"), "{removed:?}");
             }
@@ -175,50 +175,51 @@ fn domains_being_made_survive_the_removal_of_abandoned_ones() {
 }
 
 #[test]
-fn a_missing_parent_has_nothing_abandoned() {
+fn missing_parent_has_no_abandoned_domains() {
     assert_eq!(remove_abandoned(&Parent::new().path()).unwrap(), []);
 }
 
 #[test]
-fn a_domain_that_exists_is_not_made_again() {
+fn existing_domain_is_not_created_again() {
     let parent = Parent::new();
     let domain = parent.domain("run");
-    let refusal = Domain::create(&parent.path(), "run").unwrap_err();
-    assert!(matches!(refusal, DomainError::Io { .. }), "{refusal}");
+    let error = Domain::create(&parent.path(), "run").unwrap_err();
+    assert!(matches!(error, DomainError::Io { .. }), "{error}");
     Domain::open(domain.path()).unwrap();
 }
 
 #[test]
-fn what_is_not_private_is_refused() {
+fn directory_that_is_not_private_is_rejected() {
     let parent = Parent::new();
     let domain = parent.domain("run");
-    let refused = |path: &Path| {
-        let refusal = Domain::open(path).unwrap_err();
-        assert!(matches!(refusal, DomainError::Untrusted { .. }), "{refusal}");
+    let assert_rejected = |path: &Path| {
+        let error = Domain::open(path).unwrap_err();
+        assert!(matches!(error, DomainError::Untrusted { .. }), "{error}");
     };
     let link = parent.path().join("link");
     symlink(domain.path(), &link).unwrap();
-    refused(&link);
+    assert_rejected(&link);
     std::fs::set_permissions(domain.path(), PermissionsExt::from_mode(0o755)).unwrap();
-    refused(domain.path());
+    assert_rejected(domain.path());
     std::fs::set_permissions(domain.path(), PermissionsExt::from_mode(0o700)).unwrap();
     std::fs::set_permissions(parent.path(), PermissionsExt::from_mode(0o770)).unwrap();
-    let refusal = Domain::create(&parent.path(), "other").unwrap_err();
-    assert!(matches!(refusal, DomainError::Untrusted { .. }), "{refusal}");
-    refused(&parent.path());
+    let error = Domain::create(&parent.path(), "other").unwrap_err();
+    assert!(matches!(error, DomainError::Untrusted { .. }), "{error}");
+    assert_rejected(&parent.path());
 }
 
 #[test]
-fn names_that_do_not_fit_are_refused_with_their_length() {
+fn invalid_tokens_and_long_paths_are_rejected() {
     let parent = Parent::new();
     for token in ["", "../up", "a/b", ".hidden", &"x".repeat(33)] {
-        let refusal = Domain::create(&parent.path(), token).unwrap_err();
-        assert!(matches!(refusal, DomainError::Token { .. }), "{refusal}");
+        let error = Domain::create(&parent.path(), token).unwrap_err();
+        assert!(matches!(error, DomainError::Token { .. }), "{error}");
     }
     let deep = PathBuf::from(format!("/{}", "p".repeat(60)));
-    let refusal = Domain::create(&deep, "12345678").unwrap_err();
-    assert!(matches!(refusal, DomainError::TooLong { got: 79, .. }), "{refusal}");
-    assert!(refusal.to_string().contains("79 bytes with what is added, at most 70"), "{refusal}");
+    let error = Domain::create(&deep, "12345678").unwrap_err();
+    assert!(matches!(error, DomainError::TooLong { got: 79, .. }), "{error}");
+    let message = "79 bytes including suffixes, the maximum is 70";
+    assert!(error.to_string().contains(message), "{error}");
 }
 
 #[test]
@@ -227,36 +228,36 @@ fn a_second_learner_is_refused() {
     let domain = parent.domain("run");
     let plan = plan(1, 8);
     let learner = serve(domain.path(), &plan).unwrap();
-    let refusal = serve(domain.path(), &plan).unwrap_err();
-    assert!(matches!(refusal, TransportError::Domain(DomainError::Locked { .. })), "{refusal}");
+    let error = serve(domain.path(), &plan).unwrap_err();
+    assert!(matches!(error, TransportError::Domain(DomainError::Locked { .. })), "{error}");
     drop(learner);
     serve(domain.path(), &plan).unwrap();
 }
 
 #[test]
-fn a_second_worker_of_the_same_index_is_refused_as_long_as_the_first_lives() {
+fn second_worker_with_the_same_index_is_rejected_while_the_first_is_alive() {
     let parent = Parent::new();
     let domain = parent.domain("run");
     let plan = plan(2, 8);
     let _learner = serve(domain.path(), &plan).unwrap();
     let first = attach(domain.path(), &plan, 0).unwrap();
-    let refusal = attach(domain.path(), &plan, 0).unwrap_err();
-    assert!(matches!(refusal, TransportError::Taken { .. }), "{refusal}");
+    let error = attach(domain.path(), &plan, 0).unwrap_err();
+    assert!(matches!(error, TransportError::Taken { .. }), "{error}");
     drop(first);
     attach(domain.path(), &plan, 0).unwrap();
 }
 
 #[test]
-fn a_worker_before_its_learner_is_refused_and_creates_nothing() {
+fn worker_cannot_attach_before_its_learner_and_creates_nothing() {
     let parent = Parent::new();
     let domain = parent.domain("run");
     let before = entries(domain.path());
-    let refusal = attach(domain.path(), &plan(1, 8), 0).unwrap_err();
-    assert!(matches!(refusal, TransportError::Middleware { .. }), "{refusal}");
+    let error = attach(domain.path(), &plan(1, 8), 0).unwrap_err();
+    assert!(matches!(error, TransportError::Middleware { .. }), "{error}");
     assert_eq!(entries(domain.path()), before);
     let learner = serve(domain.path(), &plan(1, 8)).unwrap();
-    let refusal = attach(domain.path(), &plan(1, 8), 1).unwrap_err();
-    assert!(refusal.to_string().contains("segments/1"), "{refusal}");
+    let error = attach(domain.path(), &plan(1, 8), 1).unwrap_err();
+    assert!(error.to_string().contains("segments/1"), "{error}");
     drop(learner);
 }
 
@@ -282,9 +283,9 @@ fn a_peer_of_another_plan_is_refused_by_name() {
         "parameters_len is 5000 there and 4999 here",
     ];
     for (plan, name) in theirs.iter().zip(names) {
-        let refusal = attach(domain.path(), plan, 0).unwrap_err();
-        assert!(matches!(refusal, TransportError::Incompatible { .. }), "{refusal}");
-        assert!(refusal.to_string().contains(name), "{refusal}");
+        let error = attach(domain.path(), plan, 0).unwrap_err();
+        assert!(matches!(error, TransportError::Incompatible { .. }), "{error}");
+        assert!(error.to_string().contains(name), "{error}");
     }
     attach(domain.path(), &ours, 0).unwrap();
 }
@@ -300,10 +301,10 @@ fn workers_of_another_plan_do_not_follow_a_new_learner() {
     let mut new = old.clone();
     new.architecture_hash += 1;
     let _learner = serve(domain.path(), &new).unwrap();
-    let refusal = worker.segments.renew().unwrap_err();
-    assert!(matches!(refusal, TransportError::Incompatible { .. }), "{refusal}");
-    let refusal = worker.parameters.newest(&mut snapshot(0)).unwrap_err();
-    assert!(matches!(refusal, TransportError::Incompatible { .. }), "{refusal}");
+    let error = worker.segments.renew().unwrap_err();
+    assert!(matches!(error, TransportError::Incompatible { .. }), "{error}");
+    let error = worker.parameters.newest(&mut snapshot(0)).unwrap_err();
+    assert!(matches!(error, TransportError::Incompatible { .. }), "{error}");
 }
 
 #[test]
@@ -311,13 +312,13 @@ fn too_little_space_is_reported_with_both_numbers() {
     let parent = Parent::new();
     let domain = parent.domain("run");
     domain.check_space(1).unwrap();
-    let refusal = domain.check_space(u64::MAX).unwrap_err();
+    let error = domain.check_space(u64::MAX).unwrap_err();
     assert!(
-        matches!(refusal, DomainError::Space { needed: u64::MAX, available, .. } if available > 0),
-        "{refusal}"
+        matches!(error, DomainError::Space { needed: u64::MAX, available, .. } if available > 0),
+        "{error}"
     );
-    let refusal = serve(domain.path(), &plan(1000, 1_000_000_000)).unwrap_err();
-    assert!(matches!(refusal, TransportError::Domain(DomainError::Space { .. })), "{refusal}");
+    let error = serve(domain.path(), &plan(1000, 1_000_000_000)).unwrap_err();
+    assert!(matches!(error, TransportError::Domain(DomainError::Space { .. })), "{error}");
 }
 
 fn used_bytes(directory: &Path) -> u64 {
@@ -330,7 +331,7 @@ fn used_bytes(directory: &Path) -> u64 {
 }
 
 #[test]
-fn the_space_asked_for_covers_what_is_used() {
+fn required_space_covers_the_measured_usage() {
     for (workers, queue_segments) in [(1, 1), (4, 64), (2, 1000)] {
         let parent = Parent::new();
         let domain = parent.domain("run");
@@ -351,16 +352,16 @@ fn the_space_asked_for_covers_what_is_used() {
                 learner.segments.try_receive(&mut Default::default()).unwrap();
             }
         }
-        let (used, asked) = (used_bytes(domain.path()), plan.required_bytes());
-        println!("{workers} workers, queue {queue_segments}: {used} bytes used, {asked} asked for");
-        assert!(used <= asked, "{used} bytes used, {asked} asked for");
+        let (used, required) = (used_bytes(domain.path()), plan.required_bytes());
+        println!("{workers} workers, queue {queue_segments}: {used} of {required} bytes used");
+        assert!(used <= required, "{used} bytes used, {required} required");
         drop(reader);
     }
 }
 
 #[test]
-fn the_ends_may_move_to_other_threads() {
-    fn movable<T: Send>() {}
-    movable::<dmprl_shared::transport::shared_memory::LearnerEnd>();
-    movable::<dmprl_shared::transport::shared_memory::WorkerEnd>();
+fn ends_can_move_to_other_threads() {
+    fn assert_send<T: Send>() {}
+    assert_send::<dmprl_shared::transport::shared_memory::LearnerEnd>();
+    assert_send::<dmprl_shared::transport::shared_memory::WorkerEnd>();
 }

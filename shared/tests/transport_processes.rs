@@ -1,4 +1,4 @@
-//! Processes over shared memory that are killed at any moment.
+//! Tests of shared memory with processes that are killed at arbitrary times.
 
 #![allow(clippy::unwrap_used, reason = "a test's helpers fail the test")]
 
@@ -34,7 +34,7 @@ fn another_process_plays_its_role() {
     }
 }
 
-/// Attaches as soon as possible, as its caller would, and sends forever.
+/// Retries to attach until it succeeds, then sends forever.
 fn play_worker(domain: &Path, index: usize, incarnation: u32) {
     let plan = plan(WORKERS, QUEUE_SEGMENTS);
     let mut worker = eventually("the worker attaches", || attach(domain, &plan, index).ok());
@@ -52,11 +52,11 @@ fn play_worker(domain: &Path, index: usize, incarnation: u32) {
     }
 }
 
-/// Segments sent before the fatal one.
+/// Number of segments sent before the fatal one.
 const BEFORE_THE_LOAN: u64 = 3;
 
-/// Sends a block whose second half is mapped beyond the end of its file. Copying it into the loaned
-/// sample fails in the middle, and the kernel kills the process there.
+/// Sends a block whose second half is mapped beyond the end of its file. The kernel kills the
+/// process in the middle of copying the block into the loaned sample.
 fn die_in_a_loan(domain: &Path, incarnation: u32) {
     /// A multiple of every page size.
     const FILE_BYTES: usize = 64 << 10;
@@ -75,16 +75,16 @@ fn die_in_a_loan(domain: &Path, incarnation: u32) {
     }
     let file = tempfile::tempfile().unwrap();
     file.set_len(FILE_BYTES as u64).unwrap();
-    // SAFETY: no other process has the file. Reading beyond its end is meant to kill this process.
+    // SAFETY: no other process uses the file. Reading beyond its end kills this process on purpose.
     let map = unsafe { memmap2::MmapOptions::new().len(2 * FILE_BYTES).map(&file) }.unwrap();
     let values: &[f32] = bytemuck::cast_slice(&map);
     let from = FILE_BYTES / size_of::<f32>() - LAYOUT.block_len() / 2;
     let torn = &values[from..from + LAYOUT.block_len()];
     let outcome = worker.segments.try_send(&header(0, incarnation, BEFORE_THE_LOAN + 1), torn);
-    panic!("it outlived the end of the file: {outcome:?}");
+    panic!("reading beyond the end of the file did not kill the process: {outcome:?}");
 }
 
-/// Serves, publishes its incarnation as a version and receives forever.
+/// Serves the domain, publishes a snapshot whose version is its incarnation, and receives forever.
 fn play_learner(domain: &Path, incarnation: u32) {
     let plan = plan(WORKERS, QUEUE_SEGMENTS);
     let mut learner = eventually("the learner serves", || serve(domain, &plan).ok());
@@ -101,7 +101,8 @@ fn play_learner(domain: &Path, incarnation: u32) {
     }
 }
 
-/// Takes one segment if there is one, and checks that its worker's sequence has no gap.
+/// Receives one segment, if there is one, and checks that its worker's sequence has no gap. Returns
+/// whether it received one.
 fn take(learner: &mut LearnerEnd, last: &mut [(u32, u64); WORKERS]) -> bool {
     let mut segment = Segment::zeroed(LAYOUT);
     if !learner.segments.try_receive(&mut segment).unwrap() {
@@ -141,7 +142,7 @@ fn a_killed_worker_loses_nothing_delivered_and_its_successor_continues() {
     learner.segments.maintain().unwrap();
 }
 
-/// More deaths than the queue has slots: loans that are not returned would fill it.
+/// There are more deaths than slots in the queue, so loans that are not returned would fill it.
 #[test]
 fn a_worker_that_dies_with_a_loaned_sample_takes_no_place_with_it() {
     const DEATHS: u32 = QUEUE_SEGMENTS as u32 + 8;
@@ -156,7 +157,7 @@ fn a_worker_that_dies_with_a_loaned_sample_takes_no_place_with_it() {
             Some(Signal::BUS.as_raw())
         );
         while take(&mut learner, &mut last) {}
-        assert_eq!(last[0], (death, BEFORE_THE_LOAN), "nothing torn, nothing lost");
+        assert_eq!(last[0], (death, BEFORE_THE_LOAN), "no segment is incomplete or lost");
     }
     let _worker = Process::start(ENTRY, "worker", domain.path(), DEATHS + 1);
     eventually("a whole worker's segments arrive", || {
@@ -175,7 +176,7 @@ fn workers_killed_while_they_start_block_nobody() {
     let mut last = [(0, 0); WORKERS];
     for kill in 1..=KILLS {
         let mut worker = Process::start(ENTRY, "worker", domain.path(), kill);
-        // The delay chooses the moment of the injected fault; the test does not depend on it.
+        // The delay varies the time of the fault. The test passes for any delay.
         std::thread::sleep(Duration::from_micros(u64::from(kill) * 500));
         worker.kill();
         learner.segments.maintain().unwrap();
@@ -189,7 +190,7 @@ fn workers_killed_while_they_start_block_nobody() {
     });
 }
 
-/// Starts and kills other workers continuously; the first one must not be affected.
+/// Starts and kills other workers continuously, which must not affect the first one.
 #[test]
 fn a_worker_is_not_disturbed_by_the_deaths_of_others() {
     const KILLS: u32 = 60;
@@ -254,9 +255,9 @@ fn a_killed_learner_stops_no_worker_and_its_successor_takes_over() {
     }
 }
 
-/// iceoryx2 0.10 leaves a service that hangs forever if its creator is killed in the middle.
+/// In iceoryx2 0.10, opening a service hangs forever if its creator was killed while creating it.
 #[test]
-fn learners_killed_while_they_start_leave_nothing_that_hangs() {
+fn learners_killed_while_they_start_do_not_block_their_successors() {
     const KILLS: u32 = 60;
     let parent = Parent::new();
     let domain = parent.domain("run");
@@ -272,7 +273,7 @@ fn learners_killed_while_they_start_leave_nothing_that_hangs() {
     assert!(take(&mut learner, &mut [(1, 0); WORKERS]));
 }
 
-/// As above, with a worker that holds the services, which must survive.
+/// Like the previous test, but with an attached worker, which must survive.
 #[test]
 fn learners_killed_while_they_take_over_leave_nothing_that_hangs() {
     const KILLS: u32 = 40;

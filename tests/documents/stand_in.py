@@ -17,9 +17,9 @@ from pathlib import Path
 
 STEPS_SHARE = 50
 STEPS = 400
-"""Of a training that says nothing of its length."""
+"""Environment steps of a training whose block gives none."""
 WAIT_S = 100.0
-"""For a page or a run to begin [s]."""
+"""Limit for a page or a run to start [s]."""
 POLL_S = 0.02
 INTERRUPTED = 130
 """Exit status after Ctrl-C."""
@@ -30,7 +30,7 @@ FEW = {
     "eval": {"--episodes": "2"},
     "record": {"--episodes": "1"},
 }
-"""Flags that cost time, and what they become where a block has them, or has them by default."""
+"""Values for flags that cost time, where a block has them or their default."""
 FEW_OF_BENCH = {
     "rollout": {"--rounds": "1", "--seconds": "0.2"},
     "learner": {"--rounds": "1", "--seconds": "0.05"},
@@ -45,14 +45,14 @@ FEW_OF_BENCH = {
         "--synthetic-workers": "8",
     },
 }
-"""The same of each benchmark."""
+"""The same for each benchmark."""
 
 PROGRAM = os.environ["STAND_IN_PROGRAM"]
 PROJECT = Path(os.environ["STAND_IN_PROJECT"])
 
 
 def main(words):
-    """Does what one command line says; returns its exit status."""
+    """Runs one command line; returns its exit status."""
     called, *words = words
     if called == "cargo":
         if words[:3] != ["run", "--release", "--"]:
@@ -72,7 +72,7 @@ def main(words):
 
 
 def cargo(line):
-    """No test builds or tests the project once more: what is shown must be what is done anyway."""
+    """Checks the cargo command line of a block, without building or testing again."""
     if line in (PROJECT / ".ci/run").read_text().splitlines():
         return 0
     test = re.fullmatch(r"cargo test --release --test (\w+)", line)
@@ -104,12 +104,12 @@ def cheap(words):
 
 
 def flag(words, name):
-    """A flag's value; none where the flag is not given."""
+    """Returns a flag's value, or None."""
     return words[words.index(name) + 1] if name in words else None
 
 
 def replaced(words, name, value):
-    """The words with another value of a flag."""
+    """Returns the words with another value for a flag."""
     if name in words:
         at = words.index(name)
         words = words[:at] + words[at + 2 :]
@@ -117,9 +117,9 @@ def replaced(words, name, value):
 
 
 def serve(words):
-    """Starts what is there until Ctrl-C, and stops it as soon as it has an address."""
+    """Starts a command that runs until Ctrl-C, and stops it once it has printed an address."""
     server = subprocess.Popen([PROGRAM, *words], stdout=subprocess.PIPE, encoding="utf-8")
-    # The program has limits of its own for everything before this line.
+    # The program limits everything before this line itself.
     line = server.stdout.readline()
     server.send_signal(signal.SIGINT)
     server.communicate(timeout=WAIT_S)
@@ -130,7 +130,7 @@ def serve(words):
 
 
 def join(run):
-    """Joins a run that is being trained, in the place of the one that is named, and leaves it."""
+    """Joins a running run in place of the named one, and leaves it."""
     run = f"{run}-joined"
     trained = [PROGRAM, "train", "reacher", "--run-dir", run, "--steps", str(10**9)]
     training = subprocess.Popen(trained, stderr=subprocess.DEVNULL)
@@ -139,13 +139,13 @@ def join(run):
         joined = subprocess.Popen(
             [PROGRAM, "actor", "--join", run], stderr=subprocess.PIPE, encoding="utf-8"
         )
-        # Its last line, if it may not join, is followed by none.
+        # If it may not join, this is its last line.
         said = joined.stderr.readline()
         while said and not re.match(r"joined .+ as actor-\d+", said):
             said = joined.stderr.readline()
         joined.send_signal(signal.SIGINT)
         joined.communicate(timeout=WAIT_S)
-        # Its hand-over is an end by Ctrl-C.
+        # Ctrl-C makes it deliver its segments and end.
         return 0 if said and joined.returncode == INTERRUPTED else 1
     finally:
         training.send_signal(signal.SIGINT)

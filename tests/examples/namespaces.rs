@@ -1,13 +1,13 @@
-//! `dmprl bench transport` between two hosts of its own, network namespaces on a wire that takes
-//! its time and loses some: what docs/benchmarks.md has figures of. Needs root.
+//! Runs `dmprl bench transport` between two network namespaces, on a wire with delay and loss;
+//! docs/benchmarks.md has its figures. Needs root.
 //!
 //!     cargo run --release --package dmprl-tests --example namespaces -- \
 //!         MS LOSS SECONDS WORKERS [RATE]
 //!
-//! MS: milliseconds each way. WORKERS: 0 for policies alone. RATE: segments a second they make
-//! together; without it as many as they can.
+//! MS: delay each way in milliseconds. WORKERS: 0 measures policies alone. RATE: total segments per
+//! second; unlimited without it.
 //!
-//! Prints what both ends print as JSON, a line each, and what became of the packets.
+//! Prints the JSON of both ends, one line each, and the numbers of packets.
 
 use std::process::{Command, ExitCode, Stdio};
 use std::time::Duration;
@@ -15,7 +15,7 @@ use std::time::Duration;
 use dmprl_tests::hosts::Hosts;
 use dmprl_tests::program::executable;
 
-/// What a connection may have under way: several times rate and round trip.
+/// Maximum size of a connection's buffers: several times rate × round trip.
 const TCP_BYTES_MAX: usize = 128 << 20;
 
 fn main() -> ExitCode {

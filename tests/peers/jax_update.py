@@ -298,7 +298,7 @@ def draw_batches(s):
 
 
 def make(settings, threads):
-    """A function that does one update, and what it is."""
+    """Returns a function that makes one update, and its description."""
     policy = Policy(settings)
     shape = (settings.batch_size, settings.steps, settings.action_len)
     names = {"td3": ["target_noise"], "sac": ["next_noise", "noise"]}

@@ -1,7 +1,7 @@
-"""What ``dmprl bench learner`` compares an update with: the same update in PyTorch or JAX.
+"""The peer of ``dmprl bench learner``: the same update in PyTorch or JAX.
 
 ``python learner_peer.py torch|jax --settings FILE --threads N`` writes one JSON object a line. The
-first is ``{"ready": "what it is"}``, or ``{"absent": "why"}`` if it cannot; then each line
+first is ``{"ready": "description"}``, or ``{"absent": "why"}`` if it cannot; then each line
 ``run SECONDS`` on standard input is answered by ``{"updates": …, "seconds": …, "cpu_s": …}``. It
 ends with its input, so the death of the program that started it ends it too.
 
@@ -62,7 +62,7 @@ def main():
     arguments = parser.parse_args()
     # Ctrl-C reaches the whole process group; the program that reads our lines decides.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    # What a library prints must not become a line of the protocol.
+    # Output of a library must not become a line of the protocol.
     lines = os.fdopen(os.dup(1), "w", buffering=1)
     os.dup2(2, 1)
     confine(arguments.threads)

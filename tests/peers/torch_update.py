@@ -77,7 +77,7 @@ def draw_batches(settings):
 
 
 def make(settings, threads):
-    """A function that does one update, and what it is."""
+    """Returns a function that makes one update, and its description."""
     torch.set_num_threads(threads)
     torch.manual_seed(1)
     algorithm = ALGORITHMS[settings.algorithm](settings, KIT)

@@ -1,5 +1,5 @@
-//! Exported policies of every kind, and what Rust's runtime makes of a thousand observations: what
-//! other runtimes are held to.
+//! Exported policies of every kind, with the actions of the Rust runtime for a thousand
+//! observations, as the reference for other runtimes.
 
 #![allow(
     clippy::unwrap_used,
@@ -18,15 +18,15 @@ use dmprl_shared::runtime::PolicyRuntime;
 use dmprl_shared::seeds;
 use dmprl_shared::spec::EnvSpec;
 
-/// Observations of each policy.
+/// Number of observations of each policy.
 pub const OBSERVATIONS: usize = 1_000;
 
-/// Where an angle changes sides.
+/// Angle at which a wrapped angle changes its sign.
 const CORNERS: [f64; 4] = [0.0, -0.0, 1.0, -1.0];
 
 type Keys = &'static [(&'static str, &'static str)];
 
-/// A name, a task, and what differs from its defaults.
+/// Name, task, and configuration keys that differ from the task's defaults.
 pub const KINDS: [(&str, &str, Keys); 9] = [
     ("dmp", "reacher", &[]),
     ("mlp", "pusher", &[("policy.kind", "mlp")]),
@@ -57,11 +57,11 @@ pub const KINDS: [(&str, &str, Keys); 9] = [
 ];
 
 /// Writes for each kind, into a folder of its name, `policy.safetensors`, `policy.onnx`,
-/// `observations.f64`, (n, O), and what [`PolicyRuntime::segment`] makes of them one after the
-/// other, `segments.f64`, (n, K, A).
+/// `observations.f64` of shape (n, O), and `segments.f64` of shape (n, K, A), the results of
+/// [`PolicyRuntime::segment`].
 ///
 /// # Panics
-/// If anything cannot be made.
+/// If a file cannot be written.
 pub fn write(folder: &Path) {
     for (name, task, keys) in KINDS {
         let folder = folder.join(name);
@@ -72,10 +72,10 @@ pub fn write(folder: &Path) {
         fs::write(folder.join("policy.onnx"), export::onnx(&opened).unwrap()).unwrap();
         let mut runtime = PolicyRuntime::load(&file).unwrap();
         let len = runtime.spec().observation_len;
-        // Numbers that f32 holds, so that each runtime is given the same.
+        // Numbers that f32 represents exactly, so that each runtime gets the same.
         let mut observations: Vec<f64> =
             (0..OBSERVATIONS * len).map(|i| f64::from(1.5 * (i as f32 * 1.7).sin())).collect();
-        // Zeros of both signs, in every combination with what is not zero.
+        // Zeros of both signs, in every combination with other numbers.
         for (row, observation) in observations.chunks_mut(len).take(4 * CORNERS.len()).enumerate() {
             for (i, value) in observation.iter_mut().enumerate() {
                 *value = CORNERS[(row + i * (1 + row / CORNERS.len())) % CORNERS.len()];
@@ -90,10 +90,10 @@ pub fn write(folder: &Path) {
     }
 }
 
-/// A policy of fresh, large parameters.
+/// Returns a policy with random, large parameters.
 ///
 /// # Panics
-/// If the keys make none.
+/// If the keys are invalid.
 #[must_use]
 pub fn policy(task: &str, keys: &[(&str, &str)]) -> OpenedPolicy {
     let mut layers = Layers::new();
@@ -104,14 +104,14 @@ pub fn policy(task: &str, keys: &[(&str, &str)]) -> OpenedPolicy {
     let config: ExperimentConfig = layers.finish().unwrap().resolve(Limits { cores: 2 }).unwrap();
     let policy = Policy::new(&config, &spec(task)).unwrap();
     let mut values = policy.initial_parameters(&mut seeds::stream(1, "test", 0));
-    // Fresh networks hardly leave the middle of the tanh.
+    // Initial networks hardly leave the middle of the tanh.
     values.iter_mut().for_each(|value| *value *= 2.0);
     let architecture_hash = policy.architecture_hash();
     let snapshot = ParameterSnapshot { version: 7, env_steps: 100, architecture_hash, values };
     OpenedPolicy { policy, snapshot, origin: None }
 }
 
-/// Asymmetric bounds: scaling must take both into account.
+/// Asymmetric bounds: scaling must use both.
 fn spec(task: &str) -> EnvSpec {
     let task = task_defaults(task).unwrap();
     let action_len = task.action_low.len();
@@ -127,7 +127,7 @@ fn spec(task: &str) -> EnvSpec {
     }
 }
 
-/// Little-endian, one after the other.
+/// Writes numbers in little-endian order.
 ///
 /// # Panics
 /// If the file cannot be written.
@@ -136,7 +136,7 @@ pub fn write_numbers(path: &Path, numbers: &[f64]) {
     fs::write(path, bytes).unwrap();
 }
 
-/// What [`write_numbers`] wrote.
+/// Reads the numbers that [`write_numbers`] wrote.
 ///
 /// # Panics
 /// If the file cannot be read.

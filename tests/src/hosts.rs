@@ -1,11 +1,9 @@
-//! Hosts of a test's own: network namespaces with their own addresses, and the network between
-//! them.
+//! Hosts for a test: network namespaces with their own addresses, and the network between them.
 //!
-//! Each has one interface, a TUN device, and a thread of this process is the wire: it reads IP
-//! packets from one and writes them to another, later, or not at all. So delay, loss and a link
-//! that is down are the test's, by a seed, and need no queueing discipline that a kernel may lack.
-//! A namespace lives as long as somebody in it or this process: nothing can be left behind.
-
+//! Each namespace has one interface, a TUN device. A thread of this process is the wire: it reads
+//! IP packets from one device and writes them to another, with a delay, or drops them. The test
+//! thus sets delay, loss and failed links, from a seed, without a queueing discipline of the
+//! kernel. A namespace ends with its last process, so nothing is left behind.
 use std::collections::VecDeque;
 use std::fs::{self, File, OpenOptions};
 use std::io::{self, ErrorKind, Read, Write};
@@ -22,33 +20,33 @@ use std::time::{Duration, Instant};
 use rand::{RngExt, SeedableRng};
 use rand_xoshiro::Xoshiro256PlusPlus;
 
-/// Of the addresses: 10.203.0.1, 10.203.0.2, …; nothing outside the namespaces has them.
+/// First bytes of the addresses 10.203.0.1, 10.203.0.2, …, which exist only in the namespaces.
 const NETWORK: [u8; 3] = [10, 203, 0];
-/// As between machines of one rack; larger packets cost the wire less.
+/// Largest packet [bytes], as within a rack. Larger packets cost the wire less processor time.
 const PACKET_BYTES_MAX: i32 = 9_000;
-/// What waits for the wire; a device of TUN's loses what is more, without a word [packets].
+/// Length of a device's queue [packets]. TUN drops further packets silently.
 const QUEUE_PACKETS_MAX: i32 = 32_768;
-/// What a router holds; more is lost [bytes].
+/// Buffer of the router [bytes]; it drops further packets.
 const UNDER_WAY_BYTES_MAX: usize = 256 << 20;
-/// The longest wait without a look whether it is over.
+/// Longest wait before the thread checks whether it must end.
 const LOOK: Duration = Duration::from_millis(20);
 const PER_MILLION: u64 = 1_000_000;
 /// `TUNSETIFF` of linux/if_tun.h.
 const TUNSETIFF: libc::c_ulong = 0x4004_54ca;
 
-/// What the wire does to packets.
+/// Behaviour of the wire.
 #[derive(Debug, Default)]
 struct Wire {
     over: AtomicBool,
     delay_us: AtomicU64,
     loss_per_million: AtomicU64,
-    /// One bit a host.
+    /// Hosts that are cut off, one bit each.
     down: AtomicU64,
     carried: AtomicU64,
     lost: AtomicU64,
 }
 
-/// Hosts and what is between them.
+/// Hosts and the network between them.
 #[derive(Debug)]
 pub struct Hosts {
     namespaces: Vec<File>,
@@ -57,8 +55,8 @@ pub struct Hosts {
 }
 
 impl Hosts {
-    /// So many hosts on a wire that does nothing to packets yet; `tcp_bytes_max`: what a
-    /// connection may have under way.
+    /// Makes this many hosts, on a wire without delay and loss. `tcp_bytes_max` is the maximum size
+    /// of a connection's buffers.
     ///
     /// # Errors
     /// This process may not make namespaces or TUN devices.
@@ -73,12 +71,12 @@ impl Hosts {
         Ok(Self { namespaces, wire, thread: Some(thread) })
     }
 
-    /// The address of a host.
+    /// Returns the address of a host.
     pub fn address(&self, host: usize) -> Ipv4Addr {
         address(host)
     }
 
-    /// Has a command run on a host.
+    /// Makes a command run on a host.
     pub fn place(&self, host: usize, command: &mut Command) {
         let namespace = self.namespaces[host].as_raw_fd();
         let enter = move || match unsafe { libc::setns(namespace, libc::CLONE_NEWNET) } {
@@ -90,18 +88,18 @@ impl Hosts {
         unsafe { command.pre_exec(enter) };
     }
 
-    /// Packets take so long each way.
+    /// Sets the delay in each direction.
     pub fn delay(&self, delay: Duration) {
         self.wire.delay_us.store(delay.as_micros() as u64, Ordering::Release);
     }
 
-    /// This share of packets is lost.
+    /// Sets the share of packets that are lost.
     pub fn lose(&self, share: f64) {
         let per_million = (share * PER_MILLION as f64) as u64;
         self.wire.loss_per_million.store(per_million, Ordering::Release);
     }
 
-    /// Cuts a host off, or connects it again.
+    /// Cuts a host off, or reconnects it.
     pub fn cut(&self, host: usize, is_down: bool) {
         let bit = 1 << host;
         match is_down {
@@ -110,7 +108,7 @@ impl Hosts {
         };
     }
 
-    /// Packets that were carried and lost.
+    /// Returns the numbers of packets that were carried and lost.
     pub fn counts(&self) -> (u64, u64) {
         (self.wire.carried.load(Ordering::Acquire), self.wire.lost.load(Ordering::Acquire))
     }
@@ -130,10 +128,10 @@ fn address(host: usize) -> Ipv4Addr {
     Ipv4Addr::new(a, b, c, u8::try_from(host + 1).expect("fewer than 255 hosts"))
 }
 
-/// A namespace and its TUN device, made by a thread that lives in it for a moment.
+/// Makes a namespace and its TUN device, in a thread that enters the namespace and ends.
 fn host(index: usize, tcp_bytes_max: usize) -> io::Result<(File, File)> {
     let make = move || -> io::Result<(File, File)> {
-        // SAFETY: changes this thread's network alone, and the thread ends with this.
+        // SAFETY: changes only the network of this thread, which then ends.
         if unsafe { libc::unshare(libc::CLONE_NEWNET) } != 0 {
             return Err(io::Error::last_os_error());
         }
@@ -149,7 +147,7 @@ fn host(index: usize, tcp_bytes_max: usize) -> io::Result<(File, File)> {
     thread::spawn(make).join().expect("the thread does not panic")
 }
 
-/// An interface of this thread's namespace that is up, with an address.
+/// Opens an interface of this thread's namespace, sets its address, and brings it up.
 fn tun_device(address: Ipv4Addr) -> io::Result<File> {
     let mut options = OpenOptions::new();
     let tun = options
@@ -181,7 +179,7 @@ fn tun_device(address: Ipv4Addr) -> io::Result<File> {
 }
 
 fn interface(name: &str) -> libc::ifreq {
-    // SAFETY: plain numbers, of which zero is one.
+    // SAFETY: the struct consists of plain numbers, for which zero is valid.
     let mut request: libc::ifreq = unsafe { std::mem::zeroed() };
     for (to, from) in request.ifr_name.iter_mut().zip(name.bytes()) {
         *to = from as libc::c_char;
@@ -206,7 +204,7 @@ fn control(descriptor: i32, operation: libc::c_ulong, request: &mut libc::ifreq)
     }
 }
 
-/// A packet on its way.
+/// A packet in transit.
 struct Packet {
     due: Instant,
     to: usize,
@@ -222,11 +220,11 @@ fn await_packets(tuns: &[File], wait: Duration) {
     unsafe { libc::ppoll(all.as_mut_ptr(), all.len() as u64, &timeout, std::ptr::null()) };
 }
 
-/// Carries packets until it is over.
+/// Carries packets until `over` is set.
 fn carry(wire: &Wire, mut tuns: Vec<File>, mut random: Xoshiro256PlusPlus) {
     let mut under_way: VecDeque<Packet> = VecDeque::new();
     let mut under_way_bytes = 0;
-    // Used again: the wire shares the processor with what is measured on it.
+    // Reused, because the wire shares the processor with the measured program.
     let mut free: Vec<Vec<u8>> = Vec::new();
     while !wire.over.load(Ordering::Acquire) {
         let now = Instant::now();
@@ -239,7 +237,7 @@ fn carry(wire: &Wire, mut tuns: Vec<File>, mut random: Xoshiro256PlusPlus) {
                     free.push(bytes);
                     break;
                 };
-                let to = receiver(wire, (from, tuns.len()), &bytes[..len]);
+                let to = receiver(wire, from, tuns.len(), &bytes[..len]);
                 let loss = wire.loss_per_million.load(Ordering::Acquire);
                 let is_lost = random.random_range(0..PER_MILLION) < loss;
                 let full = under_way_bytes + len > UNDER_WAY_BYTES_MAX;
@@ -256,7 +254,7 @@ fn carry(wire: &Wire, mut tuns: Vec<File>, mut random: Xoshiro256PlusPlus) {
         while under_way.front().is_some_and(|first| first.due <= Instant::now()) {
             let Some(Packet { to, bytes, len, .. }) = under_way.pop_front() else { break };
             under_way_bytes -= len;
-            // A queue of the kernel's that is full loses a packet, as they do.
+            // A full queue of the kernel drops a packet too.
             match tuns[to].write(&bytes[..len]) {
                 Err(error) if error.kind() == ErrorKind::WouldBlock => {
                     wire.lost.fetch_add(1, Ordering::AcqRel);
@@ -268,8 +266,8 @@ fn carry(wire: &Wire, mut tuns: Vec<File>, mut random: Xoshiro256PlusPlus) {
     }
 }
 
-/// The host that a packet goes to, if it is one of ours and neither end is cut off.
-fn receiver(wire: &Wire, (from, hosts): (usize, usize), packet: &[u8]) -> Option<usize> {
+/// Returns the destination of a packet if it is one of our hosts and neither end is cut off.
+fn receiver(wire: &Wire, from: usize, hosts: usize, packet: &[u8]) -> Option<usize> {
     let is_ours = packet.len() >= 20 && packet[0] >> 4 == 4 && packet[16..19] == NETWORK;
     let to = usize::from(packet.get(19)?.checked_sub(1)?);
     let down = wire.down.load(Ordering::Acquire);

@@ -1,4 +1,4 @@
-//! Helpers of the tests that need more than one crate.
+//! Helpers of tests that need more than one crate.
 
 pub mod exported;
 pub mod hosts;
@@ -9,21 +9,21 @@ pub mod skipped;
 
 use std::path::{Path, PathBuf};
 
-/// The project's directory.
+/// Returns the project's directory.
 pub fn project_root() -> &'static Path {
-    Path::new(env!("CARGO_MANIFEST_DIR")).parent().expect("tests/ lies in the project")
+    Path::new(env!("CARGO_MANIFEST_DIR")).parent().expect("the parent of tests/")
 }
 
-/// Folder with the tiny environments (`tiny_envs:Id`), for `--python-path`.
+/// Returns the folder with the tiny environments (`tiny_envs:Id`), for `--python-path`.
 pub fn tiny_envs_dir() -> PathBuf {
     project_root().join("envs_py/tests")
 }
 
-/// The project's own `.venv`, made if it is not there: tests run what a user runs. Test processes
-/// that come here together wait for each other.
+/// Returns the project's `.venv`, made if it is missing, so that tests run what a user runs.
+/// Concurrent test processes wait for each other.
 ///
 /// # Panics
-/// When it cannot be made, with the reason.
+/// If it cannot be made; the message has the reason.
 #[cfg(feature = "python")]
 pub fn venv() -> &'static dmprl_supervisor::python_setup::PythonEnvironment {
     use std::sync::OnceLock;

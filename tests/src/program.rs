@@ -1,6 +1,6 @@
-//! The program as a user runs it: real processes with a deadline, and what they leave behind.
+//! Runs the program as a user does: real processes with a deadline.
 //!
-//! The one place that finds the executable, starts it, signals it, waits for it, and looks for
+//! Only this file finds the executable, starts, signals and awaits processes, and searches for
 //! processes and shared memory that should be gone.
 
 use std::ffi::OsStr;
@@ -21,15 +21,15 @@ pub use crate::run_files::{
     shared_memory_of,
 };
 
-/// No test waits longer for anything: far beyond what a loaded machine needs.
+/// Limit of every wait, far beyond the needs of a loaded machine.
 pub const PATIENCE: Duration = Duration::from_secs(120);
-/// Between two looks at a condition.
+/// Interval between two checks of a condition.
 const POLL: Duration = Duration::from_millis(10);
 
-/// The `dmprl` beside this test's executable; cargo builds it with the workspace's tests.
+/// Returns the `dmprl` next to this test's executable; cargo builds it with the workspace's tests.
 ///
 /// # Panics
-/// When it is missing or older than its sources: `cargo test -p dmprl-tests` does not build it.
+/// If it is missing, or older than its sources: `cargo test -p dmprl-tests` does not build it.
 pub fn executable() -> &'static Path {
     static EXECUTABLE: OnceLock<PathBuf> = OnceLock::new();
     EXECUTABLE.get_or_init(|| {
@@ -40,7 +40,7 @@ pub fn executable() -> &'static Path {
                       cargo build --bin dmprl first";
         let built = modified(&program)
             .unwrap_or_else(|| panic!("there is no {}; {advice}", program.display()));
-        // Cargo's own list of what the program was made from: the same rule as a rebuild.
+        // Cargo's list of the program's sources, by which it decides on a rebuild too.
         let listed = fs::read_to_string(folder.join("dmprl.d")).unwrap_or_default();
         let sources = listed.split_once(": ").map_or("", |(_, sources)| sources);
         for source in sources.split_whitespace().map(Path::new) {
@@ -59,10 +59,10 @@ fn modified(path: &Path) -> Option<SystemTime> {
     fs::metadata(path).and_then(|metadata| metadata.modified()).ok()
 }
 
-/// Looks at a condition until it holds.
+/// Checks a condition until it holds.
 ///
 /// # Panics
-/// When it does not within [`PATIENCE`].
+/// If it does not hold within [`PATIENCE`].
 pub fn until(what: &str, mut condition: impl FnMut() -> bool) {
     let deadline = Instant::now() + PATIENCE;
     while !condition() {
@@ -71,18 +71,18 @@ pub fn until(what: &str, mut condition: impl FnMut() -> bool) {
     }
 }
 
-/// A folder with a short path for a test's runs. Dropped, it is gone with every process that still
-/// names it.
+/// A folder with a short path for the runs of a test. Dropping it kills every process that names
+/// it, and removes it.
 #[derive(Debug)]
 pub struct Workplace {
     folder: TempDir,
 }
 
 impl Workplace {
-    /// An empty one; the Python environment is there, so that no deadline includes its making.
+    /// Makes an empty folder. Also makes the Python environment, so that no deadline includes this.
     ///
     /// # Panics
-    /// When it cannot be made.
+    /// If it cannot be made.
     #[cfg(feature = "python")]
     #[expect(clippy::new_without_default, reason = "it makes a folder and .venv")]
     pub fn new() -> Self {
@@ -91,33 +91,33 @@ impl Workplace {
         Self { folder: folder.expect("a temporary folder") }
     }
 
-    /// The folder.
+    /// Returns the folder.
     pub fn folder(&self) -> &Path {
         self.folder.path()
     }
 
-    /// A path in it, as text for a command line.
+    /// Returns a path in the folder, as text for a command line.
     ///
     /// # Panics
-    /// When the path is no UTF-8.
+    /// If the path is not UTF-8.
     pub fn path(&self, name: &str) -> String {
         self.folder().join(name).into_os_string().into_string().expect("UTF-8")
     }
 
-    /// Starts `dmprl` in this folder, in a process group of its own as a shell does.
+    /// Starts `dmprl` in this folder, in its own process group as a shell does.
     ///
     /// # Panics
-    /// When it cannot be started.
+    /// If it cannot be started.
     pub fn start(&self, arguments: &[impl AsRef<OsStr>]) -> Running {
         let mut command = Command::new(executable());
         command.args(arguments);
         self.start_command(command)
     }
 
-    /// As [`Workplace::start`], for a command that the test has changed.
+    /// Starts a command that the test has changed; otherwise as [`Workplace::start`].
     ///
     /// # Panics
-    /// When it cannot be started.
+    /// If it cannot be started.
     pub fn start_command(&self, mut command: Command) -> Running {
         let output = tempfile::tempdir_in(self.folder()).expect("a folder for output");
         let file = |name| File::create(output.path().join(name)).expect("a file for output");
@@ -127,9 +127,9 @@ impl Workplace {
             }
         }
         command.current_dir(self.folder());
-        // A session of its own, not only a group: when the leader of a group in our session is
-        // killed, the kernel wakes the group's stopped members with SIGHUP and SIGCONT, and a test
-        // that had stopped the learner found it running.
+        // A new session, not only a group: when the leader of a group in our session is killed, the
+        // kernel wakes the group's stopped members with SIGHUP and SIGCONT, so a learner that the
+        // test had stopped would run again.
         // SAFETY: `setsid` is async-signal-safe, allocates nothing and touches no lock.
         unsafe {
             command.pre_exec(|| rustix::process::setsid().map(drop).map_err(Into::into));
@@ -143,28 +143,28 @@ impl Workplace {
     /// Runs `dmprl` to its end.
     ///
     /// # Panics
-    /// When it does not end within [`PATIENCE`].
+    /// If it does not end within [`PATIENCE`].
     pub fn run(&self, arguments: &[impl AsRef<OsStr>]) -> Finished {
         self.start(arguments).wait()
     }
 
-    /// The processes that name this folder on their command line.
+    /// Returns the processes that name this folder on their command line.
     pub fn processes(&self) -> Vec<Process> {
         processes_naming(&self.path(""))
     }
 
-    /// Waits until no process names this folder and what has died has let go of its locks.
+    /// Waits until no process names this folder and ended processes have released their locks.
     ///
     /// # Panics
-    /// When that takes longer than [`PATIENCE`].
+    /// If that takes longer than [`PATIENCE`].
     pub fn until_no_process(&self) {
         until("no process of the workplace", || self.processes().is_empty() && !any_is_dying());
     }
 
-    /// Refuses a process that names this folder.
+    /// Fails if a process names this folder.
     ///
     /// # Panics
-    /// When there is one.
+    /// If there is one.
     pub fn assert_no_process(&self) {
         let processes = self.processes();
         assert!(processes.is_empty(), "left running: {processes:#?}");
@@ -182,32 +182,32 @@ impl Drop for Workplace {
 /// A process found in /proc.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Process {
-    /// Its id.
+    /// Process id.
     pub id: Pid,
-    /// The subcommand: `train`, `learner`, `actor`, …
+    /// Subcommand: `train`, `learner`, `actor`, …
     pub role: String,
-    /// Everything on its command line.
+    /// Whole command line.
     pub command_line: Vec<String>,
 }
 
 impl Process {
-    /// Sends a signal; a process that is gone already has no use for it.
+    /// Sends a signal; ignores a process that has ended.
     pub fn signal(&self, signal: Signal) {
         let _ = kill_process(self.id, signal);
     }
 
-    /// Processor time used so far, all threads, user and system together [clock ticks].
+    /// Returns the processor time of all threads, user and system [clock ticks].
     pub fn cpu_ticks(&self) -> Option<u64> {
         let id = self.id.as_raw_nonzero();
         let stat = fs::read_to_string(format!("/proc/{id}/stat")).ok()?;
-        // The name in parentheses may hold anything; utime and stime are fields 14 and 15.
+        // The name in parentheses may contain anything; utime and stime are fields 14 and 15.
         let fields: Vec<&str> = stat.rsplit_once(')')?.1.split_whitespace().collect();
         Some(fields.get(11)?.parse::<u64>().ok()? + fields.get(12)?.parse::<u64>().ok()?)
     }
 }
 
-/// Whether any `dmprl` has lost its command line, but not all of its files: a thread of it is on
-/// its way out, or will be when it next runs.
+/// Returns true if a `dmprl` has lost its command line but not all of its files: one of its threads
+/// is exiting.
 fn any_is_dying() -> bool {
     let ids = |path: &Path| {
         let entries = fs::read_dir(path).into_iter().flatten().flatten();
@@ -231,7 +231,7 @@ fn is_gone(state: char) -> bool {
     matches!(state, 'Z' | 'X')
 }
 
-/// Name, state and whether it is exiting, of a thread or of a process's first one.
+/// Name, state and exit flag of a thread, or of a process's main thread.
 fn thread_state(path: &Path) -> Option<(String, char, bool)> {
     /// `PF_EXITING` of the kernel's `flags`, field 9 of /proc/PID/stat.
     const EXITING: u64 = 0x4;
@@ -242,14 +242,14 @@ fn thread_state(path: &Path) -> Option<(String, char, bool)> {
     Some((name.to_owned(), fields.first()?.chars().next()?, flags & EXITING != 0))
 }
 
-/// The processes that have `text` on their command line. Zombies have no command line.
+/// Returns the processes with `text` on their command line. Zombies have no command line.
 pub fn processes_naming(text: &str) -> Vec<Process> {
     let Ok(entries) = fs::read_dir("/proc") else { return Vec::new() };
     let mut processes = Vec::new();
     for entry in entries.flatten() {
         let id = entry.file_name().to_str().and_then(|name| name.parse().ok());
         let Some(id) = id.and_then(Pid::from_raw) else { continue };
-        // One that ends between the listing and the look has no command line either.
+        // A process that ends after the listing has no command line either.
         let line = fs::read(entry.path().join("cmdline")).unwrap_or_default();
         let line = String::from_utf8_lossy(&line).into_owned();
         if line.contains(text) {
@@ -262,7 +262,7 @@ pub fn processes_naming(text: &str) -> Vec<Process> {
     processes
 }
 
-/// A `dmprl` that was started. Dropped, its whole process group is killed.
+/// A `dmprl` that was started. Dropping it kills its process group.
 #[derive(Debug)]
 pub struct Running {
     child: Child,
@@ -273,27 +273,27 @@ pub struct Running {
 }
 
 impl Running {
-    /// The process itself, without its children.
+    /// Returns the id of the process itself, without its children.
     pub fn id(&self) -> Pid {
         self.id
     }
 
-    /// A signal to the process and all its children, as a terminal sends Ctrl-C.
+    /// Sends a signal to the process and its children, as a terminal does for Ctrl-C.
     pub fn signal_group(&self, signal: Signal) {
         let _ = kill_process_group(self.id, signal);
     }
 
-    /// A signal to the process alone.
+    /// Sends a signal to the process only.
     pub fn signal(&self, signal: Signal) {
         let _ = kill_process(self.id, signal);
     }
 
-    /// What it has written to standard error so far.
+    /// Returns its standard error so far.
     pub fn said(&self) -> String {
         self.read("err")
     }
 
-    /// What it has written to standard output so far.
+    /// Returns its standard output so far.
     pub fn printed(&self) -> String {
         self.read("out")
     }
@@ -301,12 +301,12 @@ impl Running {
     /// Waits for a condition.
     ///
     /// # Panics
-    /// When the process ends before, or neither happens within [`PATIENCE`].
+    /// If the process ends first, or [`PATIENCE`] elapses.
     pub fn until(&mut self, what: &str, mut condition: impl FnMut(&Self) -> bool) {
         let deadline = Instant::now() + PATIENCE;
         while !condition(self) {
             let ended = self.child.try_wait().expect("a child can be waited for");
-            // What it waits for may have come with the end.
+            // The last output may fulfil the condition.
             if ended.is_some() && condition(self) {
                 return;
             }
@@ -325,15 +325,15 @@ impl Running {
         self.until(words, |running| running.said().contains(words));
     }
 
-    /// Its events so far, with `--events json`.
+    /// Returns its events so far, with `--events json`.
     ///
     /// # Panics
-    /// When a line on standard error is no JSON.
+    /// If a line on standard error is not JSON.
     pub fn events(&self) -> Vec<Value> {
         events(&self.said())
     }
 
-    /// Waits for an event that has these keys and values, among others.
+    /// Waits for an event with these keys and values; it may have others.
     ///
     /// # Panics
     /// As [`Running::until`].
@@ -341,7 +341,7 @@ impl Running {
         self.until(&format!("event {keys}"), |running| has_event(&running.events(), keys));
     }
 
-    /// Waits until `metrics.jsonl` of `run` tells of so many environment steps.
+    /// Waits until `metrics.jsonl` of `run` has reached this number of environment steps.
     ///
     /// # Panics
     /// As [`Running::until`].
@@ -353,7 +353,7 @@ impl Running {
     /// Waits for the end.
     ///
     /// # Panics
-    /// When it does not end within [`PATIENCE`].
+    /// If it does not end within [`PATIENCE`].
     pub fn wait(mut self) -> Finished {
         let deadline = Instant::now() + PATIENCE;
         let status = loop {
@@ -391,9 +391,9 @@ impl Drop for Running {
 /// A `dmprl` that has ended.
 #[derive(Debug)]
 pub struct Finished {
-    /// How.
+    /// Exit status.
     pub status: ExitStatus,
-    /// From start to end.
+    /// Time from start to end.
     pub took: Duration,
     /// Standard output.
     pub printed: String,
@@ -403,10 +403,10 @@ pub struct Finished {
 }
 
 impl Finished {
-    /// Insists on an exit status; returns itself to look further.
+    /// Checks the exit status; returns itself for further checks.
     ///
     /// # Panics
-    /// With all it has said, when it is another.
+    /// If the status differs, with the whole output.
     pub fn with_status(self, code: i32) -> Self {
         assert_eq!(
             (self.status.code(), self.status.signal()),
@@ -419,35 +419,35 @@ impl Finished {
         self
     }
 
-    /// Insists on words on standard error.
+    /// Checks that standard error contains a text.
     ///
     /// # Panics
-    /// With all it has said, when they are not there.
+    /// If it does not, with the whole output.
     pub fn saying(self, words: &str) -> Self {
         assert!(self.said.contains(words), "{}\ndid not say `{words}`:\n{}", self.line, self.said);
         self
     }
 
-    /// Insists on an event that has these keys and values, among others, with `--events json`.
+    /// Checks that there is an event with these keys and values, with `--events json`.
     ///
     /// # Panics
-    /// With all it has said, when there is none.
+    /// If there is none, with the whole output.
     pub fn with_event(self, keys: &Value) -> Self {
         assert!(has_event(&events(&self.said), keys), "{}\n{keys}:\n{}", self.line, self.said);
         self
     }
 
-    /// The JSON object on standard output.
+    /// Returns the JSON object on standard output.
     ///
     /// # Panics
-    /// When there is another thing.
+    /// If standard output is not one JSON object.
     pub fn json(&self) -> Value {
         serde_json::from_str(&self.printed)
             .unwrap_or_else(|error| panic!("{}\n{error}: {}", self.line, self.printed))
     }
 }
 
-/// The events in whole lines of standard error.
+/// Returns the events in the complete lines of standard error.
 fn events(said: &str) -> Vec<Value> {
     let whole = said.rfind('\n').map_or("", |end| &said[..end]);
     let parse = |line| serde_json::from_str(line).unwrap_or_else(|error| panic!("{error}: {line}"));

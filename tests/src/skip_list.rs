@@ -7,7 +7,7 @@ use serde_json::Value;
 
 use crate::skipped::{file_of_this_run, start_ticks};
 
-/// Prints what was skipped in this test run, and how to get it tested.
+/// Prints the tests that were skipped in this run, with the command for each.
 ///
 /// # Panics
 /// If the records cannot be read.
@@ -19,7 +19,7 @@ pub fn print() {
     let _ = fs::remove_file(file);
 }
 
-/// The list, one entry for each distinct record, in the order of first appearance.
+/// Returns the list, one entry per distinct record, in the order of first appearance.
 fn text(records: &str) -> String {
     let mut entries: Vec<(Value, usize)> = Vec::new();
     for line in records.lines() {
@@ -42,7 +42,7 @@ fn text(records: &str) -> String {
     text
 }
 
-/// Removes the records of test runs that failed or were stopped before they came to their list.
+/// Removes the records of test runs that failed or were stopped before they printed their list.
 fn remove_ended_runs(folder: &Path) {
     let Ok(entries) = fs::read_dir(folder) else { return };
     for entry in entries.flatten() {
@@ -92,7 +92,7 @@ mod tests {
         let own = std::process::id();
         let start = start_ticks(own).unwrap();
         let running = path(format!("{own}-{start}.jsonl"));
-        // A later process with the number of an earlier one.
+        // A later process with the id of an earlier one.
         let ended = path(format!("{own}-{}.jsonl", start + 1));
         for file in [&running, &ended, &path("other".to_owned())] {
             append(file, "a test", "a command");

@@ -1,7 +1,7 @@
-//! Records tests that were skipped for want of something, for the list at the end of a test run.
+//! Records skipped tests, for the list at the end of a test run.
 //!
-//! `tests/what_was_skipped.rs`, which cargo runs last, prints the list. This file needs nothing of
-//! its crate: unit tests of crates that `dmprl-tests` depends on include it by its path.
+//! `tests/what_was_skipped.rs`, which cargo runs last, prints the list. This file uses nothing else
+//! of its crate, because unit tests of crates that `dmprl-tests` depends on include it by its path.
 
 use std::fs::{self, OpenOptions};
 use std::io::Write;
@@ -10,11 +10,11 @@ use std::path::{Path, PathBuf};
 /// Records and prints that a test was skipped.
 ///
 /// - `required_by`: environment variable that turns this skip into a failure.
-/// - `what`: what is not tested.
-/// - `remedy`: the command or condition with which it would be.
+/// - `what`: the part that is not tested.
+/// - `remedy`: the command or condition that would test it.
 ///
 /// # Panics
-/// If `required_by` is set; if the record cannot be written, as the list would then be incomplete.
+/// If `required_by` is set, or if the record cannot be written.
 pub fn skipped(required_by: &str, what: &str, remedy: &str) {
     let required = std::env::var_os(required_by).is_some();
     assert!(!required, "{required_by} is set, but {what} cannot be tested; {remedy}");
@@ -33,10 +33,10 @@ pub(crate) fn append(file: &Path, what: &str, remedy: &str) {
     written.unwrap_or_else(|error| panic!("{}: {error}", file.display()));
 }
 
-/// The records of this test run, below `target/<profile>/skipped-tests`.
+/// Returns the records of this test run, below `target/<profile>/skipped-tests`.
 ///
 /// All test processes of one `cargo test` are children of that cargo, so its process identifies the
-/// run: the list begins empty each time, and runs at the same time do not share one.
+/// run. Each run thus starts with an empty list, and concurrent runs do not share one.
 pub(crate) fn file_of_this_run() -> PathBuf {
     let test = std::env::current_exe().expect("a test knows its executable");
     let profile = test.parent().and_then(Path::parent).expect("target/<profile>/deps/<test>");
@@ -45,8 +45,8 @@ pub(crate) fn file_of_this_run() -> PathBuf {
     profile.join("skipped-tests").join(name)
 }
 
-/// When a process started [clock ticks since boot], which tells it from a later one with its
-/// number; none if it has ended.
+/// Returns the start time of a process [clock ticks since boot], which distinguishes it from a
+/// later one with the same id; `None` if it has ended.
 pub(crate) fn start_ticks(process: u32) -> Option<u64> {
     let stat = fs::read_to_string(format!("/proc/{process}/stat")).ok()?;
     // Field 22; field 2 is the name, which may contain spaces and parentheses.

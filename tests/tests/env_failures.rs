@@ -39,7 +39,8 @@ fn environments(task_id: &str) -> PythonEnvironments {
     PythonEnvironments::start(interpreter, task_id, ENVS, 5).unwrap()
 }
 
-/// The headers that a worker delivers in so many calls, and why it stopped before.
+/// Returns the headers that a worker delivers in this many calls, and the error that stopped it
+/// earlier.
 fn delivered(rollout: &mut Rollout, calls: usize) -> (Vec<SegmentHeader>, Option<RolloutError>) {
     let mut headers = Vec::new();
     for _ in 0..calls {
@@ -65,8 +66,8 @@ fn of_env(headers: &[SegmentHeader], env: u32) -> Vec<(u32, u32, u32)> {
     headers.map(|header| (header.episode, header.episode_step, header.steps_len)).collect()
 }
 
-/// Episodes have seven steps, a life ends in its 23rd: three whole episodes, then a segment that
-/// nobody may see.
+/// Episodes have seven steps, and a life ends in its 23rd: three complete episodes, then a segment
+/// that must not be delivered.
 #[test]
 fn a_failed_segment_is_left_out_and_the_next_one_begins_another_episode() {
     for fault in ["Raise", "Observation", "Reward"] {
@@ -75,7 +76,7 @@ fn a_failed_segment_is_left_out_and_the_next_one_begins_another_episode() {
         assert!(error.is_none() && rollout.take_failures().is_empty());
         let whole = [(0, 0, 5), (0, 5, 2), (1, 0, 5), (1, 5, 2), (2, 0, 5), (2, 5, 2)];
         assert_eq!(of_env(&headers, 1), whole);
-        // The first failure is one too many here; what was delivered stays.
+        // The first failure already exceeds the limit; delivered segments remain.
         let (headers, error) = delivered(&mut rollout, 1);
         assert!(headers.is_empty());
         assert!(
@@ -110,7 +111,7 @@ fn an_environment_that_completes_no_episode_ends_its_worker_with_the_cause() {
     assert_eq!(rollout.take_failures().len(), 4 * ENVS);
 }
 
-/// It does not notice what it hands out, and cannot be made again: it is reset.
+/// The environment does not detect its own failure and cannot be recreated, so it is reset.
 #[test]
 fn a_foreign_environment_that_hands_out_nan_is_reset_and_goes_on() {
     let mut rollout = started("tiny_envs:BatchOfNan", 1);
@@ -150,7 +151,7 @@ fn an_episode_that_fails_in_an_evaluation_is_repeated_with_its_seed() {
 fn an_episode_that_fails_again_ends_the_evaluation_and_says_which() {
     let (mut evaluator, evaluation) = evaluated("tiny_envs:Hopeless-v0");
     let message = evaluation.unwrap_err().to_string();
-    assert!(message.contains("the episode of seed 50 has failed 2 times"), "{message}");
+    assert!(message.contains("the episode with seed 50 has failed 2 times"), "{message}");
     assert!(message.contains("environment 0, step 0 of the segment: ValueError"), "{message}");
     assert_eq!(evaluator.take_failures().len(), 2 * ENVS);
 }

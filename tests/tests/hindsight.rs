@@ -1,4 +1,4 @@
-//! Copies of segments with goals that their episode reached, made in a real interpreter.
+//! Copies of segments with goals that their episode reached, in a real interpreter.
 #![cfg(feature = "python")]
 #![allow(
     clippy::unwrap_used,
@@ -17,7 +17,7 @@ use dmprl_shared::segment::{
 use dmprl_tests::{tiny_envs_dir, venv};
 
 const ENVS: usize = 2;
-/// Achieved goal, desired goal, place, steps taken.
+/// Achieved goal, desired goal, position, steps taken.
 const LAYOUT: SegmentLayout = SegmentLayout { segment_steps: 5, observation_len: 4, action_len: 1 };
 
 fn config(keys: &[(&str, &str)]) -> ExperimentConfig {
@@ -66,8 +66,8 @@ fn is_copy(segment: &Segment) -> bool {
     segment.header.flags & HINDSIGHT != 0
 }
 
-/// The place after each step of the episodes that the real segments tell of, by environment and
-/// episode; the first is where it began.
+/// Returns the position after each step of the episodes in the real segments, by environment and
+/// episode; the first is the start.
 fn places(segments: &[Segment]) -> BTreeMap<(u32, u32), Vec<f32>> {
     let mut places: BTreeMap<_, Vec<f32>> = BTreeMap::new();
     for segment in segments.iter().filter(|segment| !is_copy(segment)) {
@@ -80,7 +80,8 @@ fn places(segments: &[Segment]) -> BTreeMap<(u32, u32), Vec<f32>> {
     places
 }
 
-/// Holds each copy to its episode: same places, a goal reached later, that goal's rewards.
+/// Checks each copy against its episode: same positions, a goal reached later, and that goal's
+/// rewards.
 fn assert_faithful(segments: &[Segment], ends: bool) {
     let places = places(segments);
     for copy in segments.iter().filter(|segment| is_copy(segment)) {
@@ -99,13 +100,13 @@ fn assert_faithful(segments: &[Segment], ends: bool) {
         let expected: Vec<f32> = reached.iter().map(|&near| f32::from(near) - 1.0).collect();
         assert_eq!(rewards[..len], expected);
         for step in 0..len {
-            // An action is u in [-1, 1], which is -2 to 2 here; half of that is the move.
+            // An action is u in [-1, 1], scaled to [-2, 2]; half of it is the displacement.
             let moved = places[first + step + 1] - places[first + step];
             assert!((actions[step] - moved).abs() < 1e-5);
         }
         let terminated = ends && reached[len - 1];
         assert_eq!(header.flags & TERMINATED != 0, terminated);
-        assert!(!ends || !reached[..len - 1].contains(&true), "it went on after its end");
+        assert!(!ends || !reached[..len - 1].contains(&true), "it continued after its end");
         assert!(terminated || len == 5);
     }
 }
@@ -118,7 +119,7 @@ fn copies_of_an_episode_have_goals_that_it_reached_and_their_rewards() {
     let copies = segments.iter().filter(|segment| is_copy(segment)).count();
     assert_eq!((segments.len() - copies, copies), (12, 2 * 2 * 3 * 4));
     assert_faithful(&segments, false);
-    // Windows slide, so copies begin anywhere that leaves them whole.
+    // Windows slide, so a copy may begin at any step that leaves it complete.
     let firsts: HashSet<u32> = segments
         .iter()
         .filter(|segment| is_copy(segment))
@@ -140,7 +141,7 @@ fn copies_of_segments_begin_where_a_segment_did() {
     let keys = [("algorithm.windows", "segment"), ("replay.hindsight_copies", "2")];
     let segments = delivered(&mut started("Reach", &keys).unwrap(), 3);
     let copies: Vec<_> = segments.iter().filter(|segment| is_copy(segment)).collect();
-    // The last two steps of an episode are no whole segment.
+    // The last two steps of an episode are not a complete segment.
     assert_eq!(copies.len(), 2 * 2 * 2);
     assert!(copies.iter().all(|copy| copy.header.episode_step.is_multiple_of(5)));
     assert_faithful(&segments, false);
@@ -163,8 +164,8 @@ fn what_a_worker_sends_passes_the_learners_check_and_leaves_no_number_out() {
     }
 }
 
-/// Each environment breaks in its 12th step: of the third segment nobody hears, and the ten sound
-/// steps before are an episode that ended there.
+/// Each environment fails in its 12th step. Its third segment is discarded, and the ten sound steps
+/// before it are an episode that ended there.
 #[test]
 fn the_sound_steps_before_a_failure_are_copied() {
     let mut rollout = started("FaultyReach", &[]).unwrap();
@@ -189,13 +190,13 @@ fn the_same_seed_draws_the_same_goals() {
 #[test]
 fn an_environment_without_goals_or_time_limit_is_refused_with_what_helps() {
     for (task, reason) in [
-        ("Long", "its observation is no Dict"),
+        ("Long", "its observation is not a Dict"),
         ("ReachAlone", "takes one goal at a time"),
         ("ReachTimeless", "its episodes have no time limit"),
     ] {
         let error = started(task, &[]).err().unwrap().to_string();
         assert!(error.contains(reason), "{error}");
-        assert!(error.contains("train with replay.hindsight = \"none\""), "{error}");
+        assert!(error.contains("set replay.hindsight = \"none\""), "{error}");
     }
     assert!(started("Long", &[("replay.hindsight", "none")]).is_ok());
 }

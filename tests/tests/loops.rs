@@ -1,5 +1,5 @@
-//! The loops of worker and evaluator, with real environments but without a process of their own:
-//! the supervisor is a fake, and the learner's end of the transport is the test's.
+//! The loops of worker and evaluator with real environments in this process. The supervisor is a
+//! fake, and the test has the learner's end of the transport.
 #![cfg(feature = "python")]
 #![allow(
     clippy::unwrap_used,
@@ -89,7 +89,7 @@ fn worker(config: &ExperimentConfig) -> Worker<'_> {
     Worker { config, identity: IDENTITY, environments, observer: None, joined: None }
 }
 
-/// Attaches to nothing.
+/// A connector that attaches to nothing.
 fn without_learner(_: &Plan) -> Result<Option<WorkerEnd<InProcess>>, DeliveryError> {
     Ok(None)
 }

@@ -1,4 +1,4 @@
-//! The policy in NumPy, which the benchmark's peers act with, against Rust's.
+//! Compares the NumPy policy of the benchmark's peers with the Rust policy.
 #![cfg(feature = "python")]
 #![allow(
     clippy::unwrap_used,
@@ -16,7 +16,7 @@ use dmprl_shared::spec::EnvSpec;
 use dmprl_tests::{project_root, venv};
 
 const ROWS: usize = 7;
-/// Both compute in f32 and add in different orders.
+/// Both compute in f32 and sum in different orders.
 const TOLERANCE: f32 = 1e-5;
 
 /// Reads the plan and observations as the policy sees them; writes u, then actions, as f32.
@@ -44,7 +44,7 @@ fn config(task: &str, keys: &[(&str, &str)]) -> ExperimentConfig {
     layers.finish().unwrap().resolve(Limits { cores: 2 }).unwrap()
 }
 
-/// Asymmetric bounds: scaling must take both into account.
+/// Asymmetric bounds: scaling must use both.
 fn spec(task: &str) -> EnvSpec {
     let task = task_defaults(task).unwrap();
     let (observation_len, action_len) = (task.observation_len, task.action_low.len());
@@ -76,7 +76,7 @@ fn assert_same(task: &str, keys: &[(&str, &str)]) {
     let (config, spec) = (config(task, keys), spec(task));
     let policy = Policy::new(&config, &spec).unwrap();
     let mut parameters = policy.initial_parameters(&mut seeds::stream(1, "test", 0));
-    // Fresh networks hardly leave the middle of the tanh.
+    // Initial networks hardly leave the middle of the tanh.
     parameters.iter_mut().for_each(|parameter| *parameter *= 3.0);
     let len = ROWS * policy.layout().observation_len;
     let observations: Vec<f32> = (0..len).map(|index| 1.5 * (index as f32 * 1.7).sin()).collect();
@@ -90,8 +90,9 @@ fn assert_same(task: &str, keys: &[(&str, &str)]) {
 
     let folder = tempfile::tempdir().unwrap();
     let path = |name: &str| folder.path().join(name);
-    let settings = (&config, &spec, Controls::Policy);
-    let plan = NumpyPlan::write(folder.path(), settings, &policy, &parameters).unwrap();
+    let controls = Controls::Policy;
+    let plan =
+        NumpyPlan::write(folder.path(), &config, &spec, controls, &policy, &parameters).unwrap();
     let bytes: Vec<u8> = observations.iter().flat_map(|value| value.to_le_bytes()).collect();
     std::fs::write(path("observations"), bytes).unwrap();
     let output = Command::new(&venv().executable)

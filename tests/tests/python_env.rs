@@ -1,5 +1,5 @@
-//! A real interpreter with real environments. All tests of this file share one interpreter, as a
-//! process has only one.
+//! A real interpreter with real environments. All tests of this file share one interpreter, because
+//! a process can have only one.
 #![cfg(feature = "python")]
 #![allow(
     clippy::unwrap_used,
@@ -31,7 +31,7 @@ fn started(task_id: &str, env_count: usize, segment_steps: usize) -> PythonEnvir
     envs
 }
 
-/// Any action sequence will do, if both sides compute the same; these are exact in f32.
+/// Any sequence of actions works if both sides compute the same; these are exact in f32.
 fn action_at(index: usize) -> f64 {
     ((index * 37) % 129) as f64 / 64.0 - 1.0
 }
@@ -82,7 +82,7 @@ fn same_seed_gives_the_same_observation() {
     assert_ne!(envs.next_observations()[..10], first[..10]);
 }
 
-/// The other side is a plain Gymnasium loop in a Python of its own, printed exactly.
+/// The reference is a plain Gymnasium loop in a separate Python, printed exactly.
 #[test]
 fn segments_equal_a_gymnasium_loop_over_two_episodes() {
     const LOOP: &str = "
@@ -116,7 +116,7 @@ for step in range(105):
     assert_eq!(expected.next(), None);
 }
 
-/// Reads Python's `float.hex()`.
+/// Parses the output of Python's `float.hex()`.
 fn from_hex(text: &str) -> f64 {
     let (sign, text) = text.strip_prefix('-').map_or((1.0, text), |rest| (-1.0, rest));
     let (digits, exponent) = text.strip_prefix("0x").unwrap().split_once('p').unwrap();
@@ -140,7 +140,7 @@ fn episode_that_terminates_inside_a_segment_keeps_its_true_end() {
     assert_ne!(envs.next_observations()[1], envs.observations()[1]);
 }
 
-/// The sentence says where; the traceback, with the line of the environment's code, is in the log.
+/// The message names the place; the log has the traceback with the line of the environment's code.
 #[test]
 fn a_failed_environment_is_named_and_made_again_beside_the_others() {
     let mut envs = started("tiny_envs:Raises-v0", 3, 5);

@@ -1,8 +1,9 @@
 //! The Python package with its optional extras: panda-gym, Gymnasium-Robotics, Optuna, an ONNX
 //! runtime and TensorBoard's reader.
 //!
-//! They get an environment of their own, made once: PyBullet is large, most users need none of
-//! them, and not every Python has a build of it. What cannot be installed is skipped.
+//! They have their own virtual environment, made once: PyBullet is large, most users need none of
+//! them, and it has no build for some versions of Python. Tests of packages that cannot be
+//! installed are skipped.
 #![cfg(feature = "python")]
 #![allow(
     clippy::unwrap_used,
@@ -18,12 +19,12 @@ use dmprl_tests::program::Workplace;
 use dmprl_tests::skipped::skipped;
 use dmprl_tests::{exported, project_root};
 
-/// Extras of `envs_py/pyproject.toml`, everything first, and the tests that need no more.
+/// Extras of `envs_py/pyproject.toml`, from all to one, with the tests that need them.
 const ATTEMPTS: [(&str, &str); 2] =
     [("test", "test_*.py"), ("frames,onnx,robotics,search,tensorboard", "test_[forst]*.py")];
-/// PyBullet has builds for this one only.
+/// PyBullet has builds only for this version.
 const REMEDY: &str = "PYO3_PYTHON=python3.11 on x86-64, with a network";
-/// What pip says when a package has no build for this Python, or the network cannot be reached.
+/// Messages of pip when a package has no build for this Python, or the network is unreachable.
 const NOT_AVAILABLE: [&str; 2] = ["No matching distribution found", "Could not find a version"];
 
 #[test]
@@ -39,8 +40,8 @@ fn unit_tests_of_the_optional_extras_pass() {
     }
 }
 
-/// An interpreter with `envs_py[extra]`, from an earlier run if nothing has changed; the reason, if
-/// the packages are not to be had.
+/// Returns an interpreter with `envs_py[extra]`, from an earlier run if nothing has changed, or the
+/// reason why the packages cannot be installed.
 fn environment_with(extra: &str) -> Result<PathBuf, String> {
     let venv = Path::new(env!("CARGO_TARGET_TMPDIR")).join(format!("extras-venv-{extra}"));
     let python = venv.join("bin/python");
@@ -63,8 +64,8 @@ fn environment_with(extra: &str) -> Result<PathBuf, String> {
     assert!(made.status.success(), "{}", report(&made));
     let installed = Command::new(&python)
         .args(["-I", "-m", "pip", "install", "--disable-pip-version-check", "--no-input"])
-        // Without builds from source: compiling PyBullet takes minutes. Few retries, lest a
-        // machine without a network wait for one.
+        // Without builds from source, because compiling PyBullet takes minutes. With few retries,
+        // so that a machine without a network does not wait.
         .args(["--quiet", "--only-binary", ":all:", "--retries", "1", "--timeout", "15"])
         .arg("--editable")
         .arg(format!("{}[{extra}]", package.display()))
@@ -98,7 +99,7 @@ fn run_tests(python: &Path, tests: &str) {
     assert!(!report.contains("Ran 0 tests"), "{report}");
 }
 
-/// A run that was resumed.
+/// A resumed run.
 fn trained(place: &Workplace) -> String {
     let run = place.path("run");
     let settings = [

@@ -1,4 +1,4 @@
-//! The Python package's own tests, in the environment that the program makes.
+//! Runs the Python package's own tests in the environment that the program makes.
 #![cfg(feature = "python")]
 #![allow(
     clippy::unwrap_used,
@@ -11,7 +11,7 @@ use dmprl_tests::skipped::skipped;
 use dmprl_tests::{project_root, venv};
 use toml::Table;
 
-/// Of the package alone.
+/// Version of the package.
 const ONLY_FOR_TESTS: &str = "test";
 
 #[test]

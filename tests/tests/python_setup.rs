@@ -1,4 +1,4 @@
-//! Making `.venv` for real, for a package that needs neither the network nor a build tool.
+//! Makes a real `.venv` for a package that needs neither a network nor a build tool.
 #![cfg(feature = "python")]
 #![allow(
     clippy::unwrap_used,
@@ -26,7 +26,7 @@ name = \"dmprl\"
 version = \"0.1.0\"
 ";
 
-/// The smallest build backend that can install by reference (PEP 660).
+/// The smallest build backend that supports an editable install (PEP 660).
 const BACKEND: &str = "\
 import os, zipfile
 
@@ -60,7 +60,7 @@ fn project() -> tempfile::TempDir {
     root
 }
 
-/// The result and every progress line.
+/// Returns the result and every progress line.
 fn ensured(root: &Path) -> (anyhow::Result<PythonEnvironment>, Vec<String>) {
     let lines = Mutex::new(Vec::new());
     let result = ensure(root, &|line| lines.lock().unwrap().push(line.to_owned()));
@@ -107,7 +107,7 @@ fn failed_or_killed_installation_is_reported_and_then_made_anew() {
     assert!(error.contains("pip install") && error.contains("line 99 of the reason"), "{error}");
     assert!(!error.contains("line 40 of the reason"), "only the end is shown: {error}");
 
-    // As a kill in the middle of the installation leaves it.
+    // The state after a kill during the installation.
     fs::remove_dir_all(project.path().join(".venv/lib")).unwrap();
     fs::remove_file(broken).unwrap();
     let (made, lines) = ensured(project.path());
@@ -118,14 +118,14 @@ fn failed_or_killed_installation_is_reported_and_then_made_anew() {
     let (installed, lines) = ensured(project.path());
     assert!(imports_dmprl(&installed.unwrap()));
     assert!(lines[0].contains("pyproject.toml has changed"), "{lines:#?}");
-    assert!(!lines.iter().any(|line| line.contains("making .venv")), "{lines:#?}");
+    assert!(!lines.iter().any(|line| line.contains("creating .venv")), "{lines:#?}");
 }
 
 #[test]
 fn an_extra_is_installed_when_it_is_asked_for_and_once() {
     let project = project();
     let manifest = project.path().join("envs_py/pyproject.toml");
-    // What it requires lies in a folder beside: nothing of this needs a network.
+    // Its requirement is in a folder beside it, so no network is needed.
     let other = project.path().join("other");
     fs::create_dir(&other).unwrap();
     fs::write(other.join("pyproject.toml"), MANIFEST.replace("\"dmprl\"", "\"other\"")).unwrap();

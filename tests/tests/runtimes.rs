@@ -1,4 +1,5 @@
-//! `dmprl.Policy`, with NumPy alone, beside Rust's runtime: the same actions, and the same care.
+//! Compares `dmprl.Policy`, which uses only NumPy, with the Rust runtime: the same actions and the
+//! same errors.
 #![cfg(feature = "python")]
 #![allow(
     clippy::unwrap_used,
@@ -12,12 +13,12 @@ use dmprl_shared::runtime::PolicyRuntime;
 use dmprl_tests::exported::{self, KINDS, read_numbers, write_numbers};
 use dmprl_tests::{project_root, venv};
 
-/// Both compute in f32 and add in different orders.
+/// Both compute in f32 and sum in different orders.
 const TOLERANCE: f64 = 1e-5;
-/// Control steps of the second test.
+/// Number of control steps in the second test.
 const STEPS: usize = 120;
 
-/// Runs a script with NumPy and the package, and nothing that it could import besides.
+/// Runs a script with NumPy and the package, and no other modules to import.
 fn python(script: &str, folder: &Path) -> String {
     let alone = "import sys\nfor name in ('gymnasium', 'mujoco', 'safetensors'):\n    \
                  sys.modules[name] = None\n";
@@ -75,7 +76,7 @@ for folder in pathlib.Path(sys.argv[1]).iterdir():
         actions.append(np.append(policy.action(row if is_seen else None), policy.is_holding))
     np.stack(actions).tofile(folder / 'numpy.f64')
 ";
-    // Gaps of every length up to 6 at every place of a segment.
+    // Gaps of every length up to 6 at every step of a segment.
     let seen: Vec<f64> =
         (0..STEPS).map(|step| f64::from(u8::from(step % 17 >= step / 17))).collect();
     assert!(seen.contains(&0.0));
@@ -104,7 +105,7 @@ for folder in pathlib.Path(sys.argv[1]).iterdir():
     assert!(held > 0, "nothing held: this shows nothing");
 }
 
-/// The beginning of a script: `refused` insists on an error and its words.
+/// Beginning of a script: `refused` checks for an error and its message.
 const REFUSED: &str = "
 import pathlib, dmprl, numpy as np
 folder = pathlib.Path(sys.argv[1])
@@ -167,7 +168,7 @@ refused(lambda: dmprl.Policy.load(folder), 'checkpoints/best')
 refused(lambda: dmprl.Policy.load(folder / 'none'), kind=OSError)
 whole = (folder / 'dmp/policy.safetensors').read_bytes()
 for damaged, word in [
-    (whole[:1000], 'cut short'),
+    (whole[:1000], 'truncated'),
     (b'', 'safetensors'),
     (whole.replace(b'dmprl-policy-1', b'dmprl-policy-9'), 'dmprl-policy-9'),
     (whole.replace(b'\"description\"', b'\"descripti--\"'), 'dmprl export'),

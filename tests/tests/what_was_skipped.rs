@@ -1,11 +1,11 @@
-//! Ends a test run with the list of what was skipped.
+//! Prints the list of skipped tests at the end of a test run.
 //!
-//! Not a test: cargo runs the members in the order of their names and each one's tests likewise, so
-//! this target is the last (`tidy.rs` checks that it is), and without libtest's harness its output
-//! is shown. Cargo does not come here after a failure.
+//! Not a test. Cargo runs the members in the order of their names, and each one's tests likewise,
+//! so this target is the last (`tidy/main.rs` checks this). It does not use libtest's harness, so
+//! its output is shown. Cargo does not run it after a failure.
 
 fn main() {
-    // Asked by `cargo test -- --list` and other runners for its tests: it has none.
+    // `cargo test -- --list` and other runners ask for its tests: it has none.
     if !std::env::args().any(|argument| argument == "--list") {
         dmprl_tests::skip_list::print();
     }

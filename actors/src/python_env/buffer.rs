@@ -1,4 +1,4 @@
-//! Arrays that Python allocates and Rust reads and writes.
+//! Accesses arrays that Python allocates.
 
 use std::ptr::NonNull;
 
@@ -12,11 +12,11 @@ use super::PythonError;
 /// A C-contiguous array, accessed through the buffer protocol.
 ///
 /// The protocol is part of Python, and pyo3 checks type and layout. The `numpy` crate would be
-/// another dependency that must follow pyo3's versions.
+/// another dependency, whose versions depend on pyo3's.
 ///
 /// While the buffer is held, Python cannot move or resize the memory, so the pointer stays valid.
 /// Python writes only during the calls of [`super::PythonEnvironments`], which take `&mut self`.
-/// The slices borrow from it, so no slice exists during a call.
+/// Slices borrow from that struct, so no slice exists during a call.
 pub(super) struct SharedBuffer<T> {
     slice: NonNull<[T]>,
     _owner: PyBuffer<T>,
@@ -57,8 +57,9 @@ impl<T: Element> SharedBuffer<T> {
     }
 
     pub(super) fn get(&self) -> &[T] {
-        // SAFETY: aligned and initialised (NumPy allocated it, pyo3 compared the type), alive
-        // while `_owner` is, and written only through `&mut` of the struct that owns this one.
+        // SAFETY: the memory is aligned and initialised (NumPy allocated it, pyo3 checked the
+        // type), lives as long as `_owner`, and is written only through `&mut` of the struct that
+        // owns this one.
         unsafe { self.slice.as_ref() }
     }
 

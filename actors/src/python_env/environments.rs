@@ -1,4 +1,4 @@
-//! E environments of one task, stepped by one Python call per segment.
+//! Steps E environments of one task with one Python call per segment.
 
 use std::sync::Arc;
 
@@ -8,18 +8,18 @@ use pyo3::{prelude::*, types::PyTuple};
 use super::{Interpreter, PythonError, buffer::SharedBuffer};
 use crate::watchdog::{CallKind, CallState};
 
-/// The environment reported no success at the last step run.
+/// The environment reported that the last executed step was not a success.
 pub const SUCCESS_NO: u8 = 0;
-/// The environment reported success at the last step run.
+/// The environment reported that the last executed step was a success.
 pub const SUCCESS_YES: u8 = 1;
 /// The environment does not report success.
 pub const SUCCESS_NOT_REPORTED: u8 = 2;
 
 /// E environments (`SegmentEnv` of `envs_py`) with K steps per segment.
 ///
-/// Slices are in C order; each method names the shape. They hold the results of the last call and
-/// are valid until the next call, which the borrow checker enforces. After an error the state of
-/// the environments is undefined: reset all of them or end the process.
+/// Slices are in C order; the doc comment of each method has the shape. They contain the results of
+/// the last call and are valid until the next call, which the borrow checker enforces. After an
+/// error the state of the environments is undefined: reset all of them or end the process.
 pub struct PythonEnvironments {
     spec: EnvSpec,
     segment_steps: usize,
@@ -40,8 +40,8 @@ pub struct PythonEnvironments {
     next_observations: SharedBuffer<f64>,
 }
 
-/// A bound method and its arguments. They are built once, because only the content of the arrays
-/// changes.
+/// A bound method and its arguments. They are created once, because only the contents of the arrays
+/// change.
 pub(super) struct Call {
     method: Py<PyAny>,
     arguments: Py<PyTuple>,
@@ -72,7 +72,7 @@ impl Call {
 }
 
 impl PythonEnvironments {
-    /// Makes environments of `task_id` (a Gymnasium id, `module:Id` or `module:Class`). They must
+    /// Creates environments of `task_id` (a Gymnasium id, `module:Id` or `module:Class`). They must
     /// be reset before the first step.
     ///
     /// # Errors
@@ -90,7 +90,7 @@ impl PythonEnvironments {
         })
     }
 
-    /// Connects to the `SegmentEnv` that `make` returns.
+    /// Creates buffers for the `SegmentEnv` that `make` returns, and connects to both.
     pub(super) fn start_with(
         env_count: usize,
         segment_steps: usize,
@@ -144,7 +144,7 @@ impl PythonEnvironments {
         })
     }
 
-    /// Sizes, bounds and timing of an environment.
+    /// Returns sizes, bounds and timing of an environment.
     pub fn spec(&self) -> &EnvSpec {
         &self.spec
     }
@@ -166,12 +166,12 @@ impl PythonEnvironments {
     }
 
     /// Runs `actions` (E, K, A), in environment units. An environment stops at the end of its
-    /// episode and begins the next one before this returns (see [`Self::next_observations`]).
-    /// [`Self::failed`] marks environments that failed and were made again.
+    /// episode and starts the next one before this returns (see [`Self::next_observations`]).
+    /// [`Self::failed`] marks environments that failed and were recreated.
     ///
     /// # Errors
-    /// `Length`, `ActionNotFinite`, or `Exception` with environment and step if an environment
-    /// could not be made again after a failure.
+    /// `Length`; `ActionNotFinite`; `Exception`, with environment and step, if an environment could
+    /// not be recreated after a failure.
     pub fn step_segment(&mut self, actions: &[f64]) -> Result<(), PythonError> {
         self.check_len("actions", actions.len(), self.actions.get().len())?;
         if let Some(index) = actions.iter().position(|action| !action.is_finite()) {
@@ -189,7 +189,7 @@ impl PythonEnvironments {
         drop(call);
         let steps_max = self.segment_steps;
         for (&steps, &failed) in self.steps.get().iter().zip(self.failed.get()) {
-            // A user's `SegmentEnv` may be wrong, and `steps` is used as an index.
+            // A user's `SegmentEnv` may be incorrect, and `steps` is used as an index.
             if failed != 0
                 || usize::try_from(steps).is_ok_and(|steps| (1..=steps_max).contains(&steps))
             {
@@ -204,24 +204,25 @@ impl PythonEnvironments {
         Ok(())
     }
 
-    /// State of the current call, for [`crate::watchdog`].
+    /// Returns the state of the current call, for [`crate::watchdog`].
     pub fn calls(&self) -> &Arc<CallState> {
         &self.calls
     }
 
-    /// Descriptions of the failures since the last call, with environment, step and cause.
+    /// Returns descriptions of the failures since the last call, with environment, step and cause.
     ///
     /// # Errors
     /// `Exception` if a user's `SegmentEnv` raises.
     pub fn take_failures(&mut self) -> Result<Vec<String>, PythonError> {
         Python::attach(|py| {
-            let told = self.env.bind(py).call_method0("take_failures");
-            let sentences = told.and_then(|list| list.extract());
-            sentences.map_err(|error| PythonError::exception(py, &error))
+            let list = self.env.bind(py).call_method0("take_failures");
+            let descriptions = list.and_then(|list| list.extract());
+            descriptions.map_err(|error| PythonError::exception(py, &error))
         })
     }
 
-    /// Observations, (E, K+1, O). Row k precedes step k, and row `steps` follows the last step run.
+    /// Observations, (E, K+1, O). Row k is before step k, and row `steps` after the last executed
+    /// step.
     pub fn observations(&self) -> &[f64] {
         self.observations.get()
     }
@@ -241,23 +242,24 @@ impl PythonEnvironments {
         self.truncated.get()
     }
 
-    /// [`SUCCESS_NO`], [`SUCCESS_YES`] or [`SUCCESS_NOT_REPORTED`] at the last step run, (E,).
+    /// [`SUCCESS_NO`], [`SUCCESS_YES`] or [`SUCCESS_NOT_REPORTED`] at the last executed step, (E,).
     pub fn success(&self) -> &[u8] {
         self.success.get()
     }
 
-    /// 1 where the environment failed in the last segment and was made again, (E,). Its other rows
-    /// are meaningless, and its next observation begins an episode.
+    /// 1 where the environment failed in the last segment and was recreated, (E,). Its other rows
+    /// are invalid, and its next observation starts an episode.
     pub fn failed(&self) -> &[u8] {
         self.failed.get()
     }
 
-    /// Number of steps run, 1 to K, (E,).
+    /// Number of executed steps, 1 to K, (E,).
     pub fn steps(&self) -> &[i32] {
         self.steps.get()
     }
 
-    /// Observations for the next actions, (E, O). Where an episode ended, the first of the next.
+    /// Observations for the next actions, (E, O). After the end of an episode, this is the first
+    /// observation of the next one.
     pub fn next_observations(&self) -> &[f64] {
         self.next_observations.get()
     }

@@ -20,8 +20,8 @@ pub enum PythonError {
     },
     /// The loaded libpython is not the linked one.
     #[error(
-        "this program was built for Python {expected} but loaded Python {got}. Is LD_LIBRARY_PATH \
-         set? If the Python of this machine was upgraded, build again"
+        "this program was built for Python {expected}, but loaded Python {got}. Unset \
+         LD_LIBRARY_PATH if it is set; if this machine's Python was upgraded, build again"
     )]
     OtherVersion {
         /// `sys.version` of the linked Python.
@@ -31,7 +31,7 @@ pub enum PythonError {
     },
     /// `.venv` belongs to another installation than the linked libpython.
     #[error(
-        "{} was made by the Python in {got}, but this program is linked against the one in \
+        "{} was created by the Python in {got}, but this program is linked against the one in \
          {expected}; remove it and start again", venv.display()
     )]
     OtherInstallation {
@@ -50,8 +50,8 @@ pub enum PythonError {
         /// CPython's message.
         message: String,
     },
-    /// The process's only interpreter already runs with other options.
-    #[error("Python already runs in this process with {running}; requested {asked}")]
+    /// The only interpreter of this process is running with other options.
+    #[error("Python is already running in this process with {running}; requested {asked}")]
     AlreadyStarted {
         /// Options of the running interpreter.
         running: String,
@@ -133,14 +133,14 @@ pub enum PythonError {
     #[error(
         "replay.hindsight needs a goal-conditioned environment: {reason}. Its observation must be \
          a Dict with two Boxes of one shape, achieved_goal and desired_goal, its method \
-         compute_reward(achieved_goal, desired_goal, info) must take many goals at once, and its \
-         episodes must have a time limit; without those, train with replay.hindsight = \"none\""
+         compute_reward(achieved_goal, desired_goal, info) must accept many goals at once, and \
+         its episodes must have a time limit. Otherwise set replay.hindsight = \"none\""
     )]
     NoGoals {
         /// The environment's message.
         reason: String,
     },
-    /// The package `dmprl` in `.venv` does not fit this program.
+    /// The package `dmprl` in `.venv`, or a user's `SegmentEnv`, does not match this program.
     #[error("{task_id}: {name} of the Python package dmprl: {reason}")]
     Interface {
         /// Task.
@@ -161,8 +161,8 @@ impl PythonError {
     }
 }
 
-/// The last lines of a traceback: of the exception's cause if it has one, because that is in the
-/// user's environment.
+/// Returns the last lines of a traceback: that of the exception's cause, if it has one, because the
+/// cause is in the user's environment.
 fn traceback_end(py: Python<'_>, error: &PyErr) -> Vec<String> {
     let cause = error.cause(py);
     let innermost = cause.as_ref().unwrap_or(error);

@@ -1,4 +1,4 @@
-//! Goals in an observation, and rewards of steps for other goals.
+//! Finds goals in an observation, and computes rewards of steps for other goals.
 
 use std::sync::Arc;
 
@@ -14,14 +14,13 @@ pub struct Goals {
     pub achieved: usize,
     /// First entry of the desired goal.
     pub desired: usize,
-    /// Number of entries G of each.
+    /// Number of entries of each goal, G.
     pub len: usize,
-    /// Whether the reward only tells if the goal is reached.
+    /// True if the reward only depends on whether the goal is reached.
     pub is_sparse: bool,
 }
 
-/// Computes the rewards of up to M steps for other goals in one call. The slices are shared with
-/// Python.
+/// Computes the rewards of up to M steps for other goals in one call, in arrays shared with Python.
 pub struct Relabelling {
     task_id: String,
     relabel: Call,
@@ -62,7 +61,10 @@ impl PythonEnvironments {
         Err(PythonError::Interface {
             task_id: spec.id.clone(),
             name: "goals",
-            reason: format!("{goals:?} in observations of {} entries", spec.observation_len),
+            reason: format!(
+                "{goals:?} do not fit observations of {} entries",
+                spec.observation_len
+            ),
         })
     }
 
@@ -132,7 +134,7 @@ impl Relabelling {
         self.rewards.get()
     }
 
-    /// Not 0 where the step would have ended its episode, (M,).
+    /// Non-zero where the step would have ended its episode, (M,).
     pub fn terminated(&self) -> &[u8] {
         self.terminated.get()
     }

@@ -1,4 +1,4 @@
-//! Starts and checks the only interpreter of this process, isolated in its virtual environment.
+//! Starts and checks the only interpreter of this process, isolated in a virtual environment.
 
 use std::{
     ffi::{CStr, CString},
@@ -12,12 +12,12 @@ use pyo3::{ffi, prelude::*, types::PyDict};
 
 use super::{LINKED_PYTHON, PythonError, loaded_python_version};
 
-/// Runs once after the start.
+/// Python code that runs once after the start.
 ///
 /// - `stdout` and `stdin` carry the supervisor's protocol, so `print` and `input` of an environment
 ///   must not use them.
-/// - A BLAS thread pool in each worker would compete with the other workers. A user can set the
-///   variables to override this.
+/// - A BLAS thread pool in each worker would compete with the other workers. A user can override
+///   this by setting the variables.
 /// - Importing `signal`, as much of the standard library does, installs a handler for SIGINT even
 ///   if CPython is configured without signal handlers. Import it here and restore the default;
 ///   CPython keeps handlers that the role has installed.
@@ -46,15 +46,16 @@ pub struct InterpreterOptions {
     pub python_path: Vec<PathBuf>,
 }
 
-/// Proof that CPython runs in this process and was checked. The calling thread does not hold the
-/// GIL. CPython is never shut down, because NumPy and MuJoCo cannot be loaded twice in one process.
+/// Proof that CPython is running in this process and was checked. The calling thread does not hold
+/// the GIL. CPython is never shut down, because NumPy and MuJoCo cannot be loaded twice in one
+/// process.
 #[derive(Debug, Clone, Copy)]
 pub struct Interpreter(());
 
 impl Interpreter {
-    /// Starts CPython in isolated mode: without `PYTHON*` variables, user site directory, working
-    /// directory on `sys.path` and signal handlers, which the roles install. The hash seed is
-    /// fixed, so that the order of a set is the same in every run.
+    /// Starts CPython in isolated mode: without `PYTHON*` variables, without a user site directory,
+    /// without the working directory on `sys.path` and without signal handlers, which the roles
+    /// install. The hash seed is fixed, so that the order of a set is the same in every run.
     ///
     /// A second call with the same options returns the running interpreter.
     ///
@@ -81,7 +82,7 @@ impl Interpreter {
         let python_path = absolute_paths(&options.python_path)?;
         check_version()?;
         initialise(&executable)?;
-        // Python runs from here on, so a later start cannot succeed after an error below.
+        // Python is running from here on, so a later start cannot succeed after an error below.
         *running = Some(options.clone());
         prepare(&options.venv, python_path)?;
         Ok(Self(()))
@@ -102,14 +103,14 @@ fn initialise(executable: &Path) -> Result<(), PythonError> {
     let executable_bytes = c_path(executable)?;
     let mut preconfig = MaybeUninit::uninit();
     let mut config = MaybeUninit::uninit();
-    // SAFETY: CPython is not initialised (RUNNING is held and empty; nothing else in this program
-    // starts it). Both structs are filled by their Init function before any field is touched, and
-    // the config is cleared on every way out. PyEval_SaveThread follows a successful start on the
-    // same thread, which holds the GIL then.
+    // SAFETY: CPython is not initialised (RUNNING is locked and empty; nothing else in this program
+    // starts it). Both structs are initialised by their Init function before any field is accessed,
+    // and the config is cleared on every path. PyEval_SaveThread follows a successful start on the
+    // same thread, which then holds the GIL.
     unsafe {
         ffi::PyPreConfig_InitIsolatedConfig(preconfig.as_mut_ptr());
         let mut preconfig = preconfig.assume_init();
-        // The isolated default is the C locale's ASCII: a model file with "°" could not be read.
+        // The default in isolated mode is ASCII, in which a model file with "°" cannot be read.
         preconfig.utf8_mode = 1;
         check(ffi::Py_PreInitialize(&raw const preconfig))?;
 
@@ -151,14 +152,14 @@ fn prepare(venv: &Path, python_path: Vec<String>) -> Result<(), PythonError> {
 }
 
 impl Interpreter {
-    /// Seeds Python's and NumPy's global generators, for environments that use them instead of the
-    /// generator that Gymnasium gives them.
+    /// Seeds the global generators of Python and NumPy, for environments that use them instead of
+    /// Gymnasium's.
     ///
     /// # Errors
     /// `Exception` if NumPy cannot be imported.
     pub fn seed(&self, seed: u64) -> Result<(), PythonError> {
         Python::attach(|py| {
-            // NumPy takes 32 bits.
+            // NumPy accepts 32 bits.
             let seed = seed >> 32;
             let module = |name: &str| py.import(name)?.call_method1("seed", (seed,));
             let seeded = module("random").and_then(|_| module("numpy.random"));
@@ -175,7 +176,7 @@ fn check(status: ffi::PyStatus) -> Result<(), PythonError> {
         // SAFETY: not null; CPython's status strings are static and NUL-terminated.
         unsafe { CStr::from_ptr(pointer) }.to_string_lossy().into_owned()
     };
-    // SAFETY: a plain predicate on a value that CPython returned.
+    // SAFETY: a pure predicate on a value that CPython returned.
     if unsafe { ffi::PyStatus_Exception(status) } == 0 {
         return Ok(());
     }

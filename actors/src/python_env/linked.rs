@@ -10,9 +10,9 @@ use pyo3::ffi;
 /// A CPython installation.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct LinkedPython {
-    /// Its interpreter outside of any virtual environment, which makes `.venv`.
+    /// Its interpreter, outside of any virtual environment; creates `.venv`.
     pub executable: &'static str,
-    /// `sys.version` with single blanks: number, build date and compiler.
+    /// `sys.version` with single spaces: number, build date and compiler.
     pub version: &'static str,
     /// `sys.base_prefix`, which distinguishes installations of one version.
     pub base_prefix: &'static str,
@@ -20,9 +20,8 @@ pub struct LinkedPython {
     pub library_dir: &'static str,
 }
 
-/// The installation that this program was linked against, as found by its build. If it does not
-/// exist, because the program was built on another machine: the installation whose libpython this
-/// process has loaded.
+/// The installation that this program was linked against. If it does not exist, because the program
+/// was built on another machine, this is the installation whose libpython the process has loaded.
 pub static LINKED_PYTHON: LazyLock<LinkedPython> = LazyLock::new(|| {
     let at_build = LinkedPython {
         executable: env!("DMPRL_PYTHON_EXECUTABLE"),
@@ -34,7 +33,7 @@ pub static LINKED_PYTHON: LazyLock<LinkedPython> = LazyLock::new(|| {
         return at_build;
     }
     let version = loaded_python_version();
-    loaded_library().and_then(|library| of_library(&library, version)).unwrap_or(at_build)
+    loaded_library().and_then(|library| installation_of(&library, version)).unwrap_or(at_build)
 });
 
 impl LinkedPython {
@@ -44,7 +43,7 @@ impl LinkedPython {
     }
 }
 
-/// `sys.version` of the libpython that this process has loaded, with single blanks as in
+/// Returns `sys.version` of the libpython that this process has loaded, with single spaces as in
 /// [`LINKED_PYTHON`]. Works before CPython starts.
 #[must_use]
 pub fn loaded_python_version() -> String {
@@ -53,12 +52,12 @@ pub fn loaded_python_version() -> String {
     version.split_ascii_whitespace().collect::<Vec<_>>().join(" ")
 }
 
-/// The file of the libpython that this process has loaded.
+/// Returns the path of the libpython that this process has loaded.
 fn loaded_library() -> Option<PathBuf> {
     let function = ffi::Py_GetVersion as *const c_void;
-    // SAFETY: the struct is plain pointers, for which zeroes are valid; dladdr reads the address
-    // only to compare it, and what it fills in lives as long as the library, which is never
-    // unloaded.
+    // SAFETY: the struct consists of plain pointers, for which zeros are valid. dladdr does not
+    // dereference the address, and the strings that it returns live as long as the library, which
+    // is never unloaded.
     let path = unsafe {
         let mut info: libc::Dl_info = std::mem::zeroed();
         if libc::dladdr(function, &raw mut info) == 0 || info.dli_fname.is_null() {
@@ -69,9 +68,9 @@ fn loaded_library() -> Option<PathBuf> {
     Path::new(OsStr::from_bytes(path.to_bytes())).canonicalize().ok()
 }
 
-/// The installation of a `libpython3.11.so.1.0`: the nearest folder above it with a
+/// Finds the installation of a `libpython3.11.so.1.0`: the nearest folder above it with a
 /// `bin/python3.11`.
-fn of_library(library: &Path, version: String) -> Option<LinkedPython> {
+fn installation_of(library: &Path, version: String) -> Option<LinkedPython> {
     let name = library.file_name()?.to_str()?.strip_prefix("lib")?.split(".so").next()?;
     let interpreter = |prefix: &Path| prefix.join("bin").join(name);
     let prefix = library.ancestors().skip(1).find(|prefix| interpreter(prefix).exists())?;
@@ -99,9 +98,9 @@ mod tests {
         fs::create_dir_all(&libraries).unwrap();
         fs::create_dir(prefix.join("bin")).unwrap();
         fs::write(prefix.join("bin/python3.11"), "").unwrap();
-        assert_eq!(of_library(&library, "3.12.3 (main)".into()), None, "of another version");
+        assert_eq!(installation_of(&library, "3.12.3 (main)".into()), None, "of another version");
         fs::write(prefix.join("bin/python3.12"), "").unwrap();
-        let found = of_library(&library, "3.12.3 (main)".into()).unwrap();
+        let found = installation_of(&library, "3.12.3 (main)".into()).unwrap();
         assert_eq!(Path::new(found.executable), prefix.join("bin/python3.12"));
         assert_eq!(Path::new(found.base_prefix), prefix);
         assert_eq!(Path::new(found.library_dir), libraries);
@@ -109,9 +108,9 @@ mod tests {
     }
 
     #[test]
-    fn the_loaded_library_is_that_of_the_build() {
+    fn the_loaded_library_belongs_to_the_linked_installation() {
         let library = loaded_library().unwrap();
-        let found = of_library(&library, loaded_python_version()).unwrap();
+        let found = installation_of(&library, loaded_python_version()).unwrap();
         assert_eq!(found.base_prefix, LINKED_PYTHON.base_prefix);
         assert_eq!(found.version, LINKED_PYTHON.version);
     }

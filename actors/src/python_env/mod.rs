@@ -1,8 +1,8 @@
 //! Stage 3 of 8: environments in an embedded CPython. Called by the rollout and the evaluator.
 //!
-//! This is the only folder that names pyo3. A process has one interpreter ([`Interpreter`]). One
-//! Python call per segment steps the E environments of a worker ([`PythonEnvironments`]) and fills
-//! arrays that Rust reads.
+//! Only this folder uses pyo3. A process has one interpreter ([`Interpreter`]). One Python call per
+//! segment steps the E environments of a worker ([`PythonEnvironments`]) and fills arrays that Rust
+//! reads.
 
 mod buffer;
 mod environments;

@@ -1,4 +1,4 @@
-//! One environment that records each step of its robot (`envs_py/dmprl/recording.py`).
+//! An environment that records each step of its robot (`envs_py/dmprl/recording.py`).
 
 use std::path::Path;
 
@@ -15,12 +15,12 @@ pub enum JointKind {
     Slide,
 }
 
-/// The robot's joints; none if the environment does not expose them.
+/// The robot's joints; empty if the environment does not expose them.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Joints {
     /// Name and kind of each joint.
     pub joints: Vec<(String, JointKind)>,
-    /// Why there are none; empty if there are some.
+    /// Reason for an empty list; otherwise empty.
     pub why_none: String,
 }
 
@@ -37,13 +37,13 @@ pub struct StepRecording {
     pub success: Vec<u8>,
     /// Files of pictures, if requested.
     pub frames: Vec<String>,
-    /// Number of steps done at each picture.
+    /// Number of executed steps at each picture.
     pub frame_steps: Vec<usize>,
 }
 
 impl PythonEnvironments {
-    /// Makes one environment of `task_id` that records its steps and draws them into the folder
-    /// `pictures`, if given.
+    /// Creates an environment of `task_id` that records its steps and, if `pictures` is given,
+    /// draws them into that folder.
     ///
     /// # Errors
     /// As [`PythonEnvironments::start`]; `Exception` if the environment cannot be drawn.
@@ -59,15 +59,16 @@ impl PythonEnvironments {
         })
     }
 
-    /// Description of the goal's appearance in pictures; empty if unknown.
+    /// Returns the goal's appearance in pictures, such as `red ball`; empty if unknown.
     ///
     /// # Errors
     /// `Exception` if the installed package does not fit.
     pub fn goal_in_pictures(&self) -> Result<String, PythonError> {
-        self.ask(|env| env.call_method0("goal_in_pictures")?.extract())
+        self.call(|env| env.call_method0("goal_in_pictures")?.extract())
     }
 
-    /// The robot's joints. Only for environments of [`PythonEnvironments::start_recording`].
+    /// Returns the robot's joints. Only for environments of
+    /// [`PythonEnvironments::start_recording`].
     ///
     /// # Errors
     /// `Exception` or `Interface` if the installed package does not fit.
@@ -76,25 +77,28 @@ impl PythonEnvironments {
             let joints: Vec<(String, String)> = env.call_method0("joints")?.extract()?;
             Ok((joints, env.call_method0("why_no_joints")?.extract()?))
         };
-        let (named, why_none) = self.ask(read)?;
+        let (named, why_none) = self.call(read)?;
         let mut joints = Vec::with_capacity(named.len());
         for (name, kind) in named {
             let kind = match kind.as_str() {
                 "hinge" => JointKind::Hinge,
                 "slide" => JointKind::Slide,
-                other => return Err(self.unfit(format!("joint {name} is a {other}"))),
+                other => {
+                    let reason = format!("joint {name} is a {other}; expected hinge or slide");
+                    return Err(self.interface_error(reason));
+                }
             };
             joints.push((name, kind));
         }
         Ok(Joints { joints, why_none })
     }
 
-    /// The record of the `steps` steps since the last reset by a seed.
+    /// Returns the recording of the `steps` steps since the last reset with a seed.
     ///
     /// # Errors
     /// `Exception` or `Interface` if the installed package does not fit.
     pub fn recording(&self, steps: usize) -> Result<StepRecording, PythonError> {
-        let recording = self.ask(|env| -> PyResult<_> {
+        let recording = self.call(|env| -> PyResult<_> {
             let recording = env.call_method0("recording")?;
             Ok(StepRecording {
                 joint_positions: recording.get_item("joint_positions")?.extract()?,
@@ -114,22 +118,23 @@ impl PythonEnvironments {
             return Ok(recording);
         }
         let success = recording.success.len();
-        Err(self.unfit(format!(
-            "{positions} positions, {velocities} velocities and {success} values of success of \
+        Err(self.interface_error(format!(
+            "{positions} positions, {velocities} velocities and {success} values of success for \
              {steps} steps"
         )))
     }
 
-    fn ask<T>(
+    /// Calls a function with the Python environment.
+    fn call<T>(
         &self,
-        question: impl FnOnce(&Bound<'_, PyAny>) -> PyResult<T>,
+        function: impl FnOnce(&Bound<'_, PyAny>) -> PyResult<T>,
     ) -> Result<T, PythonError> {
         Python::attach(|py| {
-            question(self.env.bind(py)).map_err(|error| PythonError::exception(py, &error))
+            function(self.env.bind(py)).map_err(|error| PythonError::exception(py, &error))
         })
     }
 
-    fn unfit(&self, reason: String) -> PythonError {
+    fn interface_error(&self, reason: String) -> PythonError {
         PythonError::Interface { task_id: self.spec().id.clone(), name: "recording", reason }
     }
 }

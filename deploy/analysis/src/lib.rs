@@ -1,8 +1,8 @@
-//! What runs have done: motion measures, statistics, reports, plots, exported policies and
+//! Analysis of runs: motion measures, statistics, reports, plots, exported policies and
 //! TensorBoard files.
 //!
-//! Everything here reads run directories. Nothing starts a process or draws on a terminal: the
-//! caller passes a function where a policy must be rolled out.
+//! The crate reads run directories. It starts no process and does not write to the terminal: where
+//! a policy must be rolled out, the caller passes a function.
 
 pub mod export;
 pub mod motion;

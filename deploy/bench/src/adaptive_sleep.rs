@@ -1,13 +1,13 @@
-//! Sleep of the receiver when all queues are empty.
+//! The receiver's sleep when all queues are empty.
 
 use std::time::Duration;
 
-/// Minimum and maximum of a sleep.
-const NAP_MIN: Duration = Duration::from_micros(50);
-const NAP_MAX: Duration = Duration::from_millis(5);
+/// Minimum and maximum length of a sleep.
+const SLEEP_MIN: Duration = Duration::from_micros(50);
+const SLEEP_MAX: Duration = Duration::from_millis(5);
 
-/// Adapts the receiver's sleep to the fill of the queues. Each wake-up takes time from a worker on
-/// its core, but a worker with a full queue loses more.
+/// Adapts the receiver's sleep to the rate at which the queues fill. Each wake-up takes core time
+/// from a worker, but a full queue costs the worker more.
 #[derive(Debug)]
 pub(super) struct AdaptiveSleep {
     length: Duration,
@@ -15,17 +15,17 @@ pub(super) struct AdaptiveSleep {
 }
 
 impl AdaptiveSleep {
-    /// Creates it for queues with a total capacity of `queued_max` segments.
+    /// Creates a sleep for queues with a total capacity of `queued_max` segments.
     pub(super) fn new(queued_max: usize) -> Self {
-        Self { length: NAP_MIN, queued_max }
+        Self { length: SLEEP_MIN, queued_max }
     }
 
     /// Returns the next sleep; `taken` is the number of segments queued during the last one.
     pub(super) fn next(&mut self, taken: usize) -> Duration {
         if taken * 2 > self.queued_max {
-            self.length = (self.length / 2).max(NAP_MIN);
+            self.length = (self.length / 2).max(SLEEP_MIN);
         } else if taken * 4 < self.queued_max {
-            self.length = (self.length * 5 / 4).min(NAP_MAX);
+            self.length = (self.length * 5 / 4).min(SLEEP_MAX);
         }
         self.length
     }
@@ -36,12 +36,12 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_sink_sleeps_as_long_as_a_quarter_to_a_half_of_the_queues_fills() {
-        let mut nap = AdaptiveSleep::new(64);
-        let settled = |nap: &mut AdaptiveSleep, taken| (0..100).map(|_| nap.next(taken)).last();
-        assert_eq!(settled(&mut nap, 0), Some(NAP_MAX));
-        assert_eq!(nap.next(20), NAP_MAX);
-        assert_eq!(nap.next(33), NAP_MAX / 2);
-        assert_eq!(settled(&mut nap, 64), Some(NAP_MIN));
+    fn sleep_grows_below_a_quarter_full_and_shrinks_above_half_full() {
+        let mut sleep = AdaptiveSleep::new(64);
+        let settled = |sleep: &mut AdaptiveSleep, taken| (0..100).map(|_| sleep.next(taken)).last();
+        assert_eq!(settled(&mut sleep, 0), Some(SLEEP_MAX));
+        assert_eq!(sleep.next(20), SLEEP_MAX);
+        assert_eq!(sleep.next(33), SLEEP_MAX / 2);
+        assert_eq!(settled(&mut sleep, 64), Some(SLEEP_MIN));
     }
 }

@@ -1,4 +1,4 @@
-//! A child process that communicates in lines and never outlives this process.
+//! A child process that exchanges lines of text with this process and ends with it.
 
 use std::io::{BufRead, BufReader, Read, Write};
 use std::path::{Path, PathBuf};
@@ -12,17 +12,17 @@ use dmprl_run::Watch;
 use dmprl_run::{describe, last_lines};
 use serde::Deserialize;
 
-/// Received but unread lines. When the channel is full, the child blocks.
+/// Capacity for received lines. When it is full, the child blocks.
 const LINES_MAX: usize = 64;
-/// Limit of a line's length; no line of the protocol is that long.
+/// Maximum length of a line, far above that of any line in the protocol.
 const LINE_BYTES_MAX: u64 = 1 << 20;
-/// Grace period for a child that has closed its output or does not read its input. Its own exit
-/// status says more than that of a kill.
-const END: Duration = Duration::from_secs(1);
-/// Interval between checks for its exit.
-const END_LOOK: Duration = Duration::from_millis(5);
+/// Time for a child to exit by itself after it closed its output or stopped reading its input,
+/// before it is killed. Its own exit status is more informative.
+const EXIT_GRACE: Duration = Duration::from_secs(1);
+/// Interval between checks for the exit.
+const EXIT_POLL_INTERVAL: Duration = Duration::from_millis(5);
 
-/// First line of a process with which a benchmark compares.
+/// First line that a peer sends.
 #[derive(Debug, Deserialize)]
 #[serde(rename_all = "snake_case")]
 enum Greeting {
@@ -54,8 +54,8 @@ fn cpu_s(folder: &Path) -> Option<f64> {
     text.split_whitespace().next()?.parse::<f64>().ok().map(|nanoseconds| nanoseconds * 1e-9)
 }
 
-/// A running child, which is killed and reaped on drop. A kill can damage nothing that it holds. If
-/// this process is killed, the child's input ends.
+/// A running child process, killed and reaped on drop. It holds nothing that a kill could damage.
+/// If this process is killed, the child exits at the end of its input.
 pub(super) struct LineChild {
     name: String,
     child: Child,
@@ -80,39 +80,39 @@ impl LineChild {
             let _ = child.kill();
             return Err(anyhow!("{name} has no standard input or output"));
         };
-        // A thread, because reading a line cannot time out. It exits when the child's output ends.
+        // Reading a line has no timeout, so a thread does it. It exits at the end of the output.
         thread::spawn(move || read_lines(output, &sender));
         Ok(Self { name, child, input, lines, log: log.to_owned(), started })
     }
 
-    /// Name of the child, for messages.
+    /// Returns the child's name, for messages.
     pub(super) fn name(&self) -> &str {
         &self.name
     }
 
-    /// Start time of the child.
+    /// Returns the child's start time.
     pub(super) fn started(&self) -> Instant {
         self.started
     }
 
     /// Sends one line to the child.
-    pub(super) fn say(&mut self, line: &str) -> anyhow::Result<()> {
+    pub(super) fn send_line(&mut self, line: &str) -> anyhow::Result<()> {
         let result = writeln!(self.input, "{line}").and_then(|()| self.input.flush());
-        result.map_err(|_| self.death())
+        result.map_err(|_| self.exit_error())
     }
 
     /// Receives the next line from the child.
-    pub(super) fn next(
+    pub(super) fn next_line(
         &mut self,
         watch: &Watch,
         limit: Duration,
         what: &str,
     ) -> anyhow::Result<String> {
-        self.next_if_any(watch, limit, what)?.ok_or_else(|| self.death())
+        self.next_line_if_any(watch, limit, what)?.ok_or_else(|| self.exit_error())
     }
 
     /// Receives the next line, or `None` if the child has exited without one.
-    pub(super) fn next_if_any(
+    pub(super) fn next_line_if_any(
         &mut self,
         watch: &Watch,
         limit: Duration,
@@ -122,36 +122,36 @@ impl LineChild {
         next.with_context(|| last_lines(&self.log).trim().to_owned())
     }
 
-    /// Receives the first line: a description, or the reason why this peer is unavailable here. An
-    /// interpreter that is missing or lacks a package only removes this peer from the benchmark.
+    /// Receives the first line: a description, or the reason why this peer is unavailable. A
+    /// missing interpreter or package only removes the peer from the benchmark.
     pub(super) fn greeting(
         &mut self,
         watch: &Watch,
         limit: Duration,
     ) -> anyhow::Result<Result<String, String>> {
-        let Some(line) = self.next_if_any(watch, limit, "the first line")? else {
-            return Ok(Err(self.last_word()));
+        let Some(line) = self.next_line_if_any(watch, limit, "the first line")? else {
+            return Ok(Err(self.exit_summary()));
         };
         Ok(match serde_json::from_str(&line) {
             Ok(Greeting::Ready(text)) => Ok(text),
             Ok(Greeting::Absent(why)) => Err(why),
-            Err(_) => Err(self.no_answer(&line).to_string()),
+            Err(_) => Err(self.unexpected_line(&line).to_string()),
         })
     }
 
     /// The error for a line that is not part of the protocol.
-    pub(super) fn no_answer(&self, line: &str) -> anyhow::Error {
+    pub(super) fn unexpected_line(&self, line: &str) -> anyhow::Error {
         anyhow!("{} sent an unexpected line: {line}", self.name)
     }
 
     /// Returns the lines received so far, without waiting.
-    pub(super) fn said(&mut self) -> anyhow::Result<Vec<String>> {
-        let mut said = Vec::new();
+    pub(super) fn received_lines(&mut self) -> anyhow::Result<Vec<String>> {
+        let mut lines = Vec::new();
         loop {
             match self.lines.try_recv() {
-                Ok(line) => said.push(line),
-                Err(TryRecvError::Empty) => return Ok(said),
-                Err(TryRecvError::Disconnected) => return Err(self.death()),
+                Ok(line) => lines.push(line),
+                Err(TryRecvError::Empty) => return Ok(lines),
+                Err(TryRecvError::Disconnected) => return Err(self.exit_error()),
             }
         }
     }
@@ -172,30 +172,30 @@ impl LineChild {
         threads.map(|thread| cpu_s(&thread.ok()?.path())).sum()
     }
 
-    /// Ends the child and returns its exit as an error with the last lines of its log. The log
-    /// itself is deleted when the benchmark ends.
-    fn death(&mut self) -> anyhow::Error {
-        let how = self.end();
+    /// Ends the child and returns an error with its exit status and the last lines of its log,
+    /// because the log is deleted with the benchmark's folder.
+    fn exit_error(&mut self) -> anyhow::Error {
+        let how = self.wait_or_kill();
         let lines = last_lines(&self.log);
         anyhow!("{} died: {how}\n  last lines of its log:\n{lines}", self.name)
     }
 
-    /// Ends the child and describes its exit in one line, with the last line of its log.
-    pub(super) fn last_word(&mut self) -> String {
-        let how = self.end();
+    /// Ends the child. Describes its exit in one line, with the last line of its log.
+    pub(super) fn exit_summary(&mut self) -> String {
+        let how = self.wait_or_kill();
         let lines = last_lines(&self.log);
         let last = lines.lines().map(str::trim).rfind(|line| !line.is_empty());
         format!("it died: {how}{}", last.map_or_else(String::new, |line| format!(", {line}")))
     }
 
-    /// Waits for the child's exit, kills it if necessary, and describes how it ended.
-    fn end(&mut self) -> String {
-        let deadline = Instant::now() + END;
+    /// Waits for the child to exit, kills it after [`EXIT_GRACE`], and describes its exit status.
+    fn wait_or_kill(&mut self) -> String {
+        let deadline = Instant::now() + EXIT_GRACE;
         while Instant::now() < deadline {
             if let Ok(Some(status)) = self.child.try_wait() {
                 return describe(status);
             }
-            thread::sleep(END_LOOK);
+            thread::sleep(EXIT_POLL_INTERVAL);
         }
         let _ = self.child.kill();
         self.child.wait().map_or_else(|error| error.to_string(), describe)

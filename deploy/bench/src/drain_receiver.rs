@@ -1,6 +1,6 @@
-//! A stand-in for the learner: a thread that only takes, checks and counts segments.
+//! A stand-in for the learner: a thread that only receives, checks and counts segments.
 //!
-//! It takes nothing between two measurements. The workers' queues fill and the workers sleep, which
+//! Between two measurements it receives nothing, so the queues fill and the workers sleep. This
 //! leaves the machine to the next measurement.
 
 use std::sync::Arc;
@@ -12,12 +12,12 @@ use std::time::{Duration, Instant};
 use anyhow::{Context, bail};
 use dmprl_control::Report;
 use dmprl_run::Watch;
-use dmprl_run::say;
 use dmprl_shared::segment::{Expected, HINDSIGHT, Rejection, Segment, SegmentHeader, check};
 use dmprl_shared::transport::delivery::Inbox;
 use dmprl_shared::transport::shared_memory::LearnerEnd;
 use dmprl_shared::transport::{AcknowledgementPublisher, ParameterPublisher, SegmentReceiver};
 use rustix::time::{ClockId, clock_gettime};
+use tracing::info;
 
 use super::adaptive_sleep::AdaptiveSleep;
 use super::child::LineChild;
@@ -26,67 +26,67 @@ use super::child::LineChild;
 const MAINTENANCE_INTERVAL: Duration = Duration::from_millis(250);
 /// Interval between two acknowledgements, as in the learner.
 const ACKNOWLEDGEMENT_INTERVAL: Duration = Duration::from_millis(10);
-/// Interval between checks for new workers without a policy, while workers start.
+/// Interval between checks for new workers that need the policy, while workers start.
 const GREETING_INTERVAL: Duration = Duration::from_millis(5);
-/// Interval between checks for the first segments.
-const FIRST_LOOK: Duration = Duration::from_micros(50);
-/// Time before the clock starts, in which the stale segments of the full queues are taken and the
-/// workers return to full speed.
+/// Interval between checks for each worker's first segment.
+const FIRST_POLL_INTERVAL: Duration = Duration::from_micros(50);
+/// Time before the measurement starts, in which the full queues are emptied and the workers return
+/// to full speed.
 const SETTLE: Duration = Duration::from_millis(100);
 
-/// Maximum delay until a worker's death is noticed.
-const ANSWER_LOOK: Duration = Duration::from_millis(20);
+/// Interval between checks on the workers while waiting for an answer.
+const ANSWER_POLL_INTERVAL: Duration = Duration::from_millis(20);
 
 /// A request to the receiver.
 #[derive(Debug, Clone, Copy)]
 pub(super) enum Request {
-    /// Take segments until each worker has delivered one.
+    /// Receive segments until each worker has delivered one.
     FirstOfEach,
-    /// Take segments, and count those received during this time.
-    Measure(Duration, From),
+    /// Receive segments from a source for this time, and count them.
+    Measure(Duration, Source),
 }
 
-/// Workers whose segments are taken.
+/// Workers whose segments are received.
 #[derive(Debug, Clone, Copy)]
-pub(super) enum From {
+pub(super) enum Source {
     /// All workers, in turn.
     All,
     /// The first worker; the others sleep once their queues are full.
     First,
 }
 
-/// An answer of the receiver.
+/// The receiver's answer to a request.
 #[derive(Debug)]
 pub(super) enum Answer {
     /// Time of each worker's first segment.
     FirstOfEach(Vec<Instant>),
     /// Result of the measurement.
-    Measured(Window),
+    Measured(DrainWindow),
 }
 
 /// Segments received during one measurement.
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
-pub(super) struct Window {
+pub(super) struct DrainWindow {
     /// Number of valid segments.
     pub(super) segments: u64,
     /// Number of environment steps in the valid segments.
     pub(super) env_steps: u64,
     /// Duration of the measurement [s].
     pub(super) seconds: f64,
-    /// Processor time of the receiver itself [s].
+    /// Processor time of the receiver's thread [s].
     pub(super) cpu_s: f64,
 }
 
 /// Rejected and lost segments over all measurements.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub(super) struct Discrepancies {
-    /// Rejected for their content, or duplicate.
+    /// Rejected for their content or as duplicates.
     pub(super) rejected: u64,
-    /// Duplicate; included in `rejected`.
+    /// Duplicates, which `rejected` includes.
     pub(super) duplicate: u64,
     /// Missing from their worker's sequence.
     pub(super) lost: u64,
-    /// All received segments, rejected or not, for comparison.
+    /// All received segments, including rejected ones.
     pub(super) received: u64,
 }
 
@@ -99,7 +99,7 @@ pub(super) struct DrainReceiver {
 }
 
 impl DrainReceiver {
-    /// Starts the thread; it takes nothing before the first request.
+    /// Starts the thread, which receives nothing before the first request.
     pub(super) fn start(
         end: LearnerEnd,
         expected: Expected,
@@ -109,19 +109,19 @@ impl DrainReceiver {
         let (requests, asked) = mpsc::channel();
         let (sender, answers) = mpsc::channel();
         let stop = Arc::new(AtomicBool::new(false));
-        let taker = Taker {
+        let drain = Drain {
             end,
             expected,
             stop: Arc::clone(&stop),
             segment: Segment::zeroed(expected.layout),
             inbox,
             discrepancies: Discrepancies::default(),
-            maintained: Instant::now(),
-            acknowledged: Instant::now(),
-            nap: AdaptiveSleep::new(queue_segments * expected.worker_count as usize),
-            nap_of_first: AdaptiveSleep::new(queue_segments),
+            maintained_at: Instant::now(),
+            acknowledged_at: Instant::now(),
+            sleep: AdaptiveSleep::new(queue_segments * expected.worker_count as usize),
+            sleep_of_first: AdaptiveSleep::new(queue_segments),
         };
-        let thread = thread::spawn(move || taker.serve(&asked, &sender));
+        let thread = thread::spawn(move || drain.serve(&asked, &sender));
         Self { requests: Some(requests), answers, stop, thread: Some(thread) }
     }
 
@@ -138,12 +138,12 @@ impl DrainReceiver {
         loop {
             watch.check()?;
             for child in &mut *children {
-                let said = child.said()?;
-                said.iter().for_each(|line| show_warning(child.name(), line));
+                let lines = child.received_lines()?;
+                lines.iter().for_each(|line| show_warning(child.name(), line));
             }
-            match self.answers.recv_timeout(ANSWER_LOOK) {
+            match self.answers.recv_timeout(ANSWER_POLL_INTERVAL) {
                 Ok(answer) => return answer.context("the transport failed"),
-                Err(RecvTimeoutError::Disconnected) => bail!("the receiver has ended"),
+                Err(RecvTimeoutError::Disconnected) => bail!("the receiver's thread has exited"),
                 Err(RecvTimeoutError::Timeout) if Instant::now() >= deadline => {
                     bail!("{request:?}: the workers delivered too little within {limit:?}")
                 }
@@ -153,7 +153,7 @@ impl DrainReceiver {
     }
 
     fn ask(&self, request: Request) {
-        // A thread that has exited has sent its error, which the next answer returns.
+        // If the thread has failed, its error is the next answer.
         let _ = self.requests.as_ref().map(|requests| requests.send(request));
     }
 }
@@ -170,24 +170,25 @@ impl Drop for DrainReceiver {
 /// Shows a worker's warning to the user.
 pub(super) fn show_warning(name: &str, line: &str) {
     if let Ok(Report::Warning { message }) = serde_json::from_str(line) {
-        say(&format!("{name}: {message}"));
+        info!("{name}: {message}");
     }
 }
 
-struct Taker {
+/// State of the receiver's thread.
+struct Drain {
     end: LearnerEnd,
     expected: Expected,
     stop: Arc<AtomicBool>,
     segment: Segment,
     inbox: Inbox,
     discrepancies: Discrepancies,
-    maintained: Instant,
-    acknowledged: Instant,
-    nap: AdaptiveSleep,
-    nap_of_first: AdaptiveSleep,
+    maintained_at: Instant,
+    acknowledged_at: Instant,
+    sleep: AdaptiveSleep,
+    sleep_of_first: AdaptiveSleep,
 }
 
-impl Taker {
+impl Drain {
     fn serve(
         mut self,
         requests: &Receiver<Request>,
@@ -196,8 +197,8 @@ impl Taker {
         loop {
             let answer = match requests.recv_timeout(MAINTENANCE_INTERVAL) {
                 Ok(Request::FirstOfEach) => self.first_of_each().map(Answer::FirstOfEach),
-                Ok(Request::Measure(duration, from)) => {
-                    self.measure(duration, from).map(Answer::Measured)
+                Ok(Request::Measure(duration, source)) => {
+                    self.measure(duration, source).map(Answer::Measured)
                 }
                 Err(RecvTimeoutError::Timeout) => match self.maintain() {
                     Ok(()) => continue,
@@ -217,49 +218,49 @@ impl Taker {
         let mut first: Vec<Option<Instant>> = vec![None; self.expected.worker_count as usize];
         let mut greeted = Instant::now();
         while !self.stop.load(Ordering::Acquire) && first.iter().any(Option::is_none) {
-            match self.take(From::All)? {
+            match self.take(Source::All)? {
                 Some(header) => {
-                    // A worker id out of range was rejected.
+                    // A segment with an invalid worker id was rejected.
                     if let Some(first) = first.get_mut(header.worker_id as usize) {
                         first.get_or_insert_with(Instant::now);
                     }
                 }
-                None => thread::sleep(FIRST_LOOK),
+                None => thread::sleep(FIRST_POLL_INTERVAL),
             }
             if greeted.elapsed() >= GREETING_INTERVAL {
                 ParameterPublisher::maintain(&mut self.end.parameters)?;
                 greeted = Instant::now();
             }
-            self.maintain_in_time()?;
+            self.maintain_if_due()?;
         }
         Ok(first.into_iter().flatten().collect())
     }
 
-    fn measure(&mut self, duration: Duration, from: From) -> anyhow::Result<Window> {
-        self.take_for(SETTLE, from)?;
+    fn measure(&mut self, duration: Duration, source: Source) -> anyhow::Result<DrainWindow> {
+        self.take_for(SETTLE, source)?;
         let cpu_s = thread_cpu_s();
-        let taken = self.take_for(duration, from)?;
-        Ok(Window { cpu_s: thread_cpu_s() - cpu_s, ..taken })
+        let taken = self.take_for(duration, source)?;
+        Ok(DrainWindow { cpu_s: thread_cpu_s() - cpu_s, ..taken })
     }
 
-    /// Takes segments for `duration`; also measures the actual time.
-    fn take_for(&mut self, duration: Duration, from: From) -> anyhow::Result<Window> {
+    /// Receives segments for `duration`. The result has the actual time.
+    fn take_for(&mut self, duration: Duration, source: Source) -> anyhow::Result<DrainWindow> {
         let start = Instant::now();
-        let (mut window, mut taken) = (Window::default(), 0);
+        let (mut window, mut taken) = (DrainWindow::default(), 0);
         while start.elapsed() < duration && !self.stop.load(Ordering::Acquire) {
-            match self.take(from)? {
+            match self.take(source)? {
                 Some(header) => {
                     window.segments += u64::from(header.steps_len > 0);
                     window.env_steps += u64::from(header.steps_len);
                     taken += 1;
                 }
                 None => {
-                    self.maintain_in_time()?;
-                    let nap = match from {
-                        From::All => &mut self.nap,
-                        From::First => &mut self.nap_of_first,
+                    self.maintain_if_due()?;
+                    let sleep = match source {
+                        Source::All => &mut self.sleep,
+                        Source::First => &mut self.sleep_of_first,
                     };
-                    thread::sleep(nap.next(taken));
+                    thread::sleep(sleep.next(taken));
                     taken = 0;
                 }
             }
@@ -268,27 +269,27 @@ impl Taker {
         Ok(window)
     }
 
-    /// Takes the next segment and does the learner's first steps: it checks the segment and updates
-    /// its worker's sequence. Rejected segments and duplicates add no steps.
-    fn take(&mut self, from: From) -> anyhow::Result<Option<SegmentHeader>> {
+    /// Receives the next segment, checks it and updates its worker's sequence, as the learner does.
+    /// Rejected segments and duplicates count no steps.
+    fn take(&mut self, source: Source) -> anyhow::Result<Option<SegmentHeader>> {
         self.make_room()?;
         let Self { end, segment, .. } = self;
-        let received = match from {
-            From::All => end.segments.try_receive(segment)?,
-            From::First => end.segments.try_receive_from(0, segment)?,
+        let received = match source {
+            Source::All => end.segments.try_receive(segment)?,
+            Source::First => end.segments.try_receive_from(0, segment)?,
         };
-        self.acknowledge_in_time()?;
+        self.acknowledge_if_due()?;
         if !received {
             return Ok(None);
         }
         self.discrepancies.received += 1;
         let mut header = self.segment.header;
-        let sound = check(&header, &self.segment.block, &self.expected);
-        match sound.and_then(|()| self.inbox.settle(&header, &self.segment.block)) {
+        let checked = check(&header, &self.segment.block, &self.expected);
+        match checked.and_then(|()| self.inbox.settle(&header, &self.segment.block)) {
             Ok(lost) => self.discrepancies.lost += lost,
-            Err(why) => {
+            Err(rejection) => {
                 self.discrepancies.rejected += 1;
-                self.discrepancies.duplicate += u64::from(why == Rejection::Duplicate);
+                self.discrepancies.duplicate += u64::from(rejection == Rejection::Duplicate);
                 header.steps_len = 0;
             }
         }
@@ -298,16 +299,16 @@ impl Taker {
         Ok(Some(header))
     }
 
-    fn acknowledge_in_time(&mut self) -> anyhow::Result<()> {
-        let early = !self.inbox.owes_acknowledgement();
-        if early && self.acknowledged.elapsed() < ACKNOWLEDGEMENT_INTERVAL {
+    fn acknowledge_if_due(&mut self) -> anyhow::Result<()> {
+        let owed = self.inbox.owes_acknowledgement();
+        if !owed && self.acknowledged_at.elapsed() < ACKNOWLEDGEMENT_INTERVAL {
             return Ok(());
         }
-        self.acknowledged = Instant::now();
+        self.acknowledged_at = Instant::now();
         Ok(self.end.acknowledgements.acknowledge(self.inbox.acknowledge()?)?)
     }
 
-    /// Clears a full log, as after a checkpoint.
+    /// Clears a full log, as a checkpoint would.
     fn make_room(&mut self) -> anyhow::Result<()> {
         if self.inbox.is_full() {
             self.inbox.checkpointed(self.inbox.logged())?;
@@ -317,22 +318,22 @@ impl Taker {
         Ok(())
     }
 
-    fn maintain_in_time(&mut self) -> anyhow::Result<()> {
-        if self.maintained.elapsed() < MAINTENANCE_INTERVAL {
+    fn maintain_if_due(&mut self) -> anyhow::Result<()> {
+        if self.maintained_at.elapsed() < MAINTENANCE_INTERVAL {
             return Ok(());
         }
         self.maintain()
     }
 
     fn maintain(&mut self) -> anyhow::Result<()> {
-        self.maintained = Instant::now();
+        self.maintained_at = Instant::now();
         SegmentReceiver::maintain(&mut self.end.segments)?;
         ParameterPublisher::maintain(&mut self.end.parameters)?;
         Ok(self.end.acknowledgements.maintain()?)
     }
 }
 
-/// Processor time of the calling thread so far [s].
+/// Returns the processor time of the calling thread so far [s].
 pub(super) fn thread_cpu_s() -> f64 {
     let time = clock_gettime(ClockId::ThreadCPUTime);
     time.tv_sec as f64 + time.tv_nsec as f64 * 1e-9

@@ -11,9 +11,9 @@ use super::rollout::RolloutBench;
 use super::round::Round;
 use super::statistics::{load_average, max, median, min};
 
-/// The workers, in the report.
+/// Name of the workers in the report.
 pub(super) const WORKER: &str = "worker";
-/// One of several workers, measured while the others sleep.
+/// Name of one of several workers, measured while the others sleep.
 pub(super) const ONE_WORKER: &str = "one_worker";
 /// All candidates, in the order of the report.
 pub(super) const NAMES: [&str; 7] =
@@ -30,9 +30,9 @@ pub struct Figures {
     controls: Controls,
     machine: Machine,
     load_average: Option<f64>,
-    /// (name, rounds), without absent candidates.
+    /// (name, rounds) of each available candidate.
     rounds: Vec<(&'static str, Vec<Round>)>,
-    /// (name, description or reason for absence).
+    /// (name, description or reason why it is unavailable).
     pub(super) notes: Vec<(&'static str, String)>,
     pub(super) workers: WorkerFigures,
 }
@@ -40,7 +40,7 @@ pub struct Figures {
 /// Figures of the workers besides their rate.
 #[derive(Debug, Clone, Default)]
 pub(super) struct WorkerFigures {
-    /// Time from a worker's start to its first delivered segment [s]; that of the slowest.
+    /// Time from start to first delivered segment of the slowest worker [s].
     pub(super) first_segment_s: f64,
     /// Peak resident memory of the largest worker.
     pub(super) rss_bytes: Option<u64>,
@@ -75,7 +75,7 @@ impl Figures {
         }
     }
 
-    /// Describes `name`, or gives the reason for its absence.
+    /// Adds a description of `name`, or the reason why it is unavailable.
     pub(super) fn note(&mut self, name: &'static str, text: &str) {
         self.notes.push((name, text.to_owned()));
     }
@@ -89,7 +89,7 @@ impl Figures {
         self.rounds(name).iter().map(|round| round.steps_per_s).collect()
     }
 
-    /// Processor time per step, which other programs on the machine affect least.
+    /// Processor time per step. Other programs affect it less than wall time.
     pub(super) fn cpu_us_per_step(&self, name: &str) -> Option<f64> {
         let of = |round: &Round| round.cores.map(|cores| 1e6 * cores / round.steps_per_s);
         median(&self.rounds(name).iter().filter_map(of).collect::<Vec<_>>())
@@ -99,8 +99,8 @@ impl Figures {
         median(&self.rates(name))
     }
 
-    /// The worker's rate divided by that of `name`. It is the median of the rounds' own ratios,
-    /// because a machine's speed drifts less within a round than over all of them.
+    /// The worker's rate divided by that of `name`: the median of the ratios in each round, because
+    /// the machine's speed drifts less within a round than between rounds.
     pub(super) fn ratio(&self, name: &str) -> Option<f64> {
         let (worker, other) = (self.rates(WORKER), self.rates(name));
         median(&worker.iter().zip(&other).map(|(a, b)| a / b).collect::<Vec<_>>())
@@ -113,7 +113,7 @@ impl Figures {
         }
     }
 
-    /// The figures as one JSON object; unavailable ones are null.
+    /// Returns the figures as one JSON object. Unavailable ones are null.
     #[must_use]
     pub fn json(&self) -> Value {
         let WorkerFigures { first_segment_s, rss_bytes, sink_cpu_share, rejected, lost } =
@@ -194,7 +194,7 @@ pub(super) mod tests {
     }
 
     #[test]
-    fn the_object_has_medians_ratios_rounds_and_null_for_what_is_absent() {
+    fn json_has_medians_ratios_rounds_and_null_for_absent_peers() {
         let json = figures().json();
         assert_eq!(json["ceiling_steps_per_s"], 200.0);
         assert_eq!(json["worker_steps_per_s"], 180.0);

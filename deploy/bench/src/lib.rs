@@ -1,14 +1,17 @@
 //! `dmprl bench`: measures parts of the system and compares them with alternatives.
 //!
-//! `rollout` measures the workers of a run. It acts as the learner for real `dmprl actor` processes
-//! (`workers`, `drain_receiver`) and, in turn with them, runs processes of `dmprl.bench_rollout` in
-//! Python that do the same work (`peers`, `numpy_plan`). `figures` and `table` are its report. All
-//! waiting is in `child` and [`dmprl_run::Watch`], which notice an interrupt. `learner` compares an
-//! update with its matrix products and with other libraries. `transport` compares the transport of
-//! segments with pipes, sockets and Python's queues; its workers only send. `system` measures a
-//! complete run. `scale` predicts the throughput of many workers from the cost of each part, and
-//! measures a learner with 256 synthetic workers. `synthetic_segments` generates the synthetic
-//! segments.
+//! - `rollout` measures the workers of a run. It takes the learner's place for real `dmprl actor`
+//!   processes (`workers`, `drain_receiver`) and alternates with Python processes that do the same
+//!   work (`peers`, `numpy_plan`). `figures` and `table` form its report.
+//! - `learner` compares an update with its matrix products and with other libraries.
+//! - `transport` compares the transport of segments with pipes, sockets and Python's queues. Its
+//!   workers only send.
+//! - `system` measures a complete run.
+//! - `scale` predicts the throughput of many workers from the cost of each part, and measures a
+//!   learner with 256 synthetic workers.
+//! - `policy` compares the latency of a policy with other runtimes.
+//!
+//! Every long wait checks [`dmprl_run::Watch`], so that an interrupt ends the benchmark.
 
 mod adaptive_sleep;
 mod child;
@@ -42,7 +45,7 @@ pub use transport::{
     transport_worker,
 };
 
-/// Shows the round that begins, counted from 0.
+/// Reports the start of `round`, counted from 0, to the progress display.
 fn announce_round(progress: &dyn Progress, round: usize, rounds: usize) {
     progress.stage(&format!("round {} of {rounds}", round + 1));
     progress.at(round as u64, rounds as u64);

@@ -1,4 +1,5 @@
-//! Tells the Python side how to act as the workers do: `envs_py/dmprl/numpy_policy.py`.
+//! The plan from which Python peers do the same work as the workers
+//! (`envs_py/dmprl/numpy_policy.py`).
 
 use std::path::{Path, PathBuf};
 
@@ -22,7 +23,7 @@ pub enum Controls {
     Random,
 }
 
-/// A task, its environments and a policy with its parameters, as one JSON object.
+/// A task, its environments and a policy with its parameters, written as one JSON object.
 #[derive(Debug, Serialize)]
 pub struct NumpyPlan<'a> {
     task: &'a TaskConfig,
@@ -32,16 +33,16 @@ pub struct NumpyPlan<'a> {
     spec: &'a EnvSpec,
     seed: u64,
     env_count: usize,
-    /// Origin of the actions that result in the controls of physics alone.
+    /// Source of the actions for the benchmark of physics alone.
     controls: Controls,
     /// Environment steps per decision.
     decision_steps: usize,
     /// Widths of the network, from input to output.
     widths: Vec<usize>,
-    /// Linear map from (y0, yd0, g, w) to the samples of one dimension, (3K, 3+N); empty without a
+    /// Linear map from (y0, yd0, g, w) to the samples of one dimension, (3K, 3+N). Empty without a
     /// DMP.
     segment_map: Vec<f32>,
-    /// Standard deviations of the policy's own Gaussian, (A,); empty if it has none.
+    /// Standard deviations of the policy's own Gaussian, (A,). Empty if it has none.
     gaussian_std: Vec<f32>,
     /// Number of the network's last outputs that are logarithmic standard deviations: K A or 0.
     log_stds_len: usize,
@@ -50,13 +51,16 @@ pub struct NumpyPlan<'a> {
 }
 
 impl<'a> NumpyPlan<'a> {
-    /// Writes the parameters and the plan that names them into `folder`; returns the plan's path.
+    /// Writes the parameters and the plan, which refers to them, into `folder`. Returns the plan's
+    /// path.
     ///
     /// # Errors
-    /// The DMP is invalid, or the file system fails.
+    /// The DMP is invalid, or a file cannot be written.
     pub fn write(
         folder: &Path,
-        (config, spec, controls): (&'a ExperimentConfig, &'a EnvSpec, Controls),
+        config: &'a ExperimentConfig,
+        spec: &'a EnvSpec,
+        controls: Controls,
         policy: &Policy,
         parameters: &[f32],
     ) -> anyhow::Result<PathBuf> {

@@ -13,10 +13,9 @@ use serde::Deserialize;
 use super::child::LineChild;
 use super::round::Round;
 
-/// Time limit from a start to the first line. Many processes may start at once, each with many
-/// environments.
+/// Time limit until a process is ready. Many may start at once, each with many environments.
 const READY: Duration = Duration::from_secs(300);
-/// Extra time that a measurement may take.
+/// Time beyond a measurement's duration until it times out.
 const MEASURE_SLACK: Duration = Duration::from_secs(60);
 
 /// An alternative to the workers.
@@ -36,7 +35,7 @@ pub(super) enum PeerKind {
 
 /// Name of [`PeerKind::PandaGym`].
 pub(super) const PANDA_GYM: &str = "panda_gym";
-/// Tasks that panda-gym has too; `dmprl.bench_peers` has its names for them.
+/// Tasks that panda-gym has too. `dmprl.bench_peers` maps them to panda-gym's names.
 const PANDA_GYM_TASKS: [&str; 2] = ["dmprl/PandaReach-v0", "dmprl/PandaReachJoints-v0"];
 
 /// Returns true if panda-gym has an equivalent of this environment.
@@ -45,8 +44,8 @@ pub(super) fn is_in_panda_gym(env_id: &str) -> bool {
 }
 
 impl PeerKind {
-    /// All peers, in the order of a round. The workers follow right after their bounds, so that
-    /// drift of the machine's speed affects both.
+    /// All peers, in the order of a round. The workers' upper bounds (`Ceiling`, `Physics`) come
+    /// last, right before the workers, so that drift of the machine's speed affects both alike.
     pub(super) const ALL: [Self; 5] =
         [Self::PandaGym, Self::EnvPool, Self::Gymnasium, Self::Ceiling, Self::Physics];
 
@@ -61,15 +60,15 @@ impl PeerKind {
         }
     }
 
-    /// Returns true if the peer runs in the interpreter given by the user. Such peers are no
-    /// requirement of this project, and their own requirements conflict with it.
+    /// Returns true if the peer needs an interpreter given by the user, because its dependencies
+    /// conflict with those of this project.
     pub(super) fn is_foreign(self) -> bool {
         matches!(self, Self::EnvPool | Self::PandaGym)
     }
 }
 
-/// The common parts of every peer's command line.
-pub(super) struct PeerStage<'a> {
+/// The parts of the command line that all peers share.
+pub(super) struct PeerSetup<'a> {
     /// Run directory for logs.
     pub(super) run: &'a RunDirectory,
     /// Folder with the package `dmprl`.
@@ -98,29 +97,29 @@ impl Peer {
     pub(super) fn start(
         kind: PeerKind,
         python: &Path,
-        stage: &PeerStage<'_>,
+        setup: &PeerSetup<'_>,
     ) -> anyhow::Result<Self> {
         let start = |index: usize| {
             let name = format!("{}-{index}", kind.name());
-            let path = stage.run.log_path(&name);
+            let path = setup.run.log_path(&name);
             let log =
                 File::create(&path).with_context(|| format!("cannot make {}", path.display()))?;
             let mut command = Command::new(python);
             command
                 .args(["-m", "dmprl.bench_rollout", kind.name(), "--plan"])
-                .arg(&stage.plan)
+                .arg(&setup.plan)
                 .args(["--index", &index.to_string()])
-                // `-m` puts the working directory first on the path: use one without modules.
-                .current_dir(stage.run.path())
-                .env("PYTHONPATH", &stage.package_path)
+                // `-m` puts the working directory first on the module path, so it must have none.
+                .current_dir(setup.run.path())
+                .env("PYTHONPATH", &setup.package_path)
                 .stderr(log);
-            // One thread of linear algebra in each process, as in the worker.
+            // One thread for linear algebra in each process, as in the worker.
             for name in ["OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"] {
                 command.env(name, "1");
             }
             LineChild::start(name, command, &path)
         };
-        let children = (0..stage.workers).map(start).collect::<anyhow::Result<_>>()?;
+        let children = (0..setup.workers).map(start).collect::<anyhow::Result<_>>()?;
         Ok(Self { kind, children })
     }
 
@@ -141,17 +140,17 @@ impl Peer {
     pub(super) fn measure(&mut self, watch: &Watch, duration: Duration) -> anyhow::Result<Round> {
         let seconds = duration.as_secs_f64();
         for child in &mut self.children {
-            child.say(&format!("run {seconds}"))?;
+            child.send_line(&format!("run {seconds}"))?;
         }
         let (mut steps_per_s, mut cores) = (0.0, 0.0);
         for child in &mut self.children {
-            let line = child.next(watch, duration + MEASURE_SLACK, "the measurement")?;
+            let line = child.next_line(watch, duration + MEASURE_SLACK, "the measurement")?;
             let Ok(Measured { steps, seconds, cpu_s }) = serde_json::from_str(&line) else {
-                return Err(child.no_answer(&line));
+                return Err(child.unexpected_line(&line));
             };
             ensure!(
                 steps > 0 && seconds > 0.0,
-                "{}: {steps} steps in {seconds} s, expected some",
+                "{}: {steps} steps in {seconds} s, expected at least one",
                 child.name()
             );
             steps_per_s += steps as f64 / seconds;

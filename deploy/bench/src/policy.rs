@@ -1,4 +1,4 @@
-//! `dmprl bench policy`: compares the time of a decision with other runtimes.
+//! `dmprl bench policy`: compares the latency of a decision with other runtimes.
 
 use std::path::{Path, PathBuf};
 use std::process::Command;
@@ -20,16 +20,16 @@ const GREETING: Duration = Duration::from_secs(60);
 const ROUND: Duration = Duration::from_secs(60);
 /// Calls before the first round, to warm up caches, clock frequency and pages.
 const WARM_UP: usize = 500;
-/// Number of different observations, used in turn.
+/// Number of different observations to cycle through.
 const OBSERVATIONS: usize = 256;
-/// A tenth of a control period at 1 kHz.
+/// Goal for the 99th percentile of a decision: a tenth of a control period at 1 kHz.
 pub const GOAL_US: f64 = 100.0;
 
-/// Plan of the benchmark.
+/// Settings of the benchmark.
 pub struct PolicyBench {
     /// Policy to measure.
     pub opened: OpenedPolicy,
-    /// Python interpreter with NumPy, and with onnxruntime for that peer.
+    /// Python interpreter with NumPy, and onnxruntime for the ONNX peer.
     pub python: PathBuf,
     /// Folder with the package `dmprl`.
     pub package_path: PathBuf,
@@ -51,7 +51,7 @@ pub struct Latency {
 }
 
 impl Latency {
-    /// Computes the quantiles; `None` without calls.
+    /// Computes the quantiles. Returns `None` if there were no calls.
     fn of(mut us: Vec<f64>) -> Option<Self> {
         us.sort_by(f64::total_cmp);
         let at = |share: f64| us.get(((us.len() as f64 * share).ceil() as usize).max(1) - 1);
@@ -66,15 +66,15 @@ impl Latency {
     }
 }
 
-/// A peer's name and latency, or the reason for its absence.
+/// A peer's name and latency, or the reason why it is unavailable.
 pub type Peer = Result<(String, Latency), String>;
 
 /// Report of the benchmark.
 #[derive(Debug)]
 pub struct PolicyFigures {
-    /// Environment and widths of the network.
+    /// Environment and network widths.
     pub what: String,
-    /// Number of the policy's parameters.
+    /// Number of policy parameters.
     pub parameters: usize,
     /// Latency from an observation to a segment.
     pub decision: Latency,
@@ -85,7 +85,7 @@ pub struct PolicyFigures {
 }
 
 impl PolicyFigures {
-    /// The figures as one JSON object.
+    /// Returns the figures as one JSON object.
     #[must_use]
     pub fn json(&self) -> serde_json::Value {
         let peers = self.peers.iter().map(|(kind, found)| {
@@ -102,7 +102,7 @@ impl PolicyFigures {
         })
     }
 
-    /// The figures as text for people.
+    /// Returns the figures as text.
     #[must_use]
     pub fn text(&self) -> String {
         let mut lines = vec![format!("{}, {} parameters, one core", self.what, self.parameters)];
@@ -112,9 +112,9 @@ impl PolicyFigures {
             lines.push(match found {
                 Ok((name, latency)) => {
                     let times = latency.p50_us / self.decision.p50_us;
-                    format!("{kind:<12} {}   {times:.1} × ours ({name})", latency.text())
+                    format!("{kind:<12} {}   {times:.1} × our time ({name})", latency.text())
                 }
-                Err(why) => format!("{kind:<12} absent: {why}"),
+                Err(why) => format!("{kind:<12} unavailable: {why}"),
             });
         }
         let met = if self.decision.p99_us < GOAL_US { "met" } else { "missed" };
@@ -123,7 +123,7 @@ impl PolicyFigures {
     }
 }
 
-/// Runs the benchmark; returns `None` if the user interrupts it.
+/// Runs the benchmark; returns `None` if the user interrupted it.
 ///
 /// # Errors
 /// A peer dies or sends an invalid answer, or the file system fails.
@@ -141,8 +141,8 @@ fn measure(bench: &PolicyBench, watch: &Watch) -> anyhow::Result<PolicyFigures> 
         ("numpy", folder.path().join("policy.safetensors")),
         ("onnx", folder.path().join("policy.onnx")),
     ];
-    let made = [export::safetensors(&bench.opened)?, export::onnx(&bench.opened)?];
-    for ((_, file), bytes) in files.iter().zip(made) {
+    let exported = [export::safetensors(&bench.opened)?, export::onnx(&bench.opened)?];
+    for ((_, file), bytes) in files.iter().zip(exported) {
         std::fs::write(file, bytes).context("cannot write the policy")?;
     }
     let mut peers = Vec::new();
@@ -151,7 +151,7 @@ fn measure(bench: &PolicyBench, watch: &Watch) -> anyhow::Result<PolicyFigures> 
         let greeting = child.greeting(watch, GREETING)?;
         peers.push((*kind, greeting.map(|name| (name, child)), Vec::new()));
     }
-    let mut ours = Ours::load(&files[0].1)?;
+    let mut ours = OwnRuntime::load(&files[0].1)?;
     ours.calls(WARM_UP, Call::Decision)?;
     let (mut decisions, mut actions) = (Vec::new(), Vec::new());
     for _ in 0..bench.rounds {
@@ -176,7 +176,7 @@ fn measure(bench: &PolicyBench, watch: &Watch) -> anyhow::Result<PolicyFigures> 
     let widths = widths.chain(shape.layers().iter().map(|layer| layer.outputs));
     let widths: Vec<_> = widths.map(|width| width.to_string()).collect();
     Ok(PolicyFigures {
-        what: format!("{} {}", ours.0.spec().id, widths.join("-")),
+        what: format!("{} {}", ours.runtime.spec().id, widths.join("-")),
         parameters: bench.opened.policy.parameters_len(),
         decision: Latency::of(decisions).ok_or_else(none)?,
         action: Latency::of(actions).ok_or_else(none)?,
@@ -189,10 +189,10 @@ fn start(bench: &PolicyBench, kind: &str, file: &Path, folder: &Path) -> anyhow:
     let stderr = std::fs::File::create(&log).context("cannot make a log")?;
     let mut command = Command::new(&bench.python);
     command.args(["-m", "dmprl.bench_policy", kind]).arg(file).stderr(stderr);
-    // `-m` puts the working directory first on the path: use one without modules.
+    // `-m` puts the working directory first on the module path, so it must have no modules.
     command.current_dir(folder);
     command.env("PYTHONPATH", &bench.package_path).env("PYTHONDONTWRITEBYTECODE", "1");
-    // One core, as for our runtime.
+    // One core, like our own runtime.
     command.envs(["OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"].map(|name| (name, "1")));
     LineChild::start(format!("the policy in {kind}"), command, &log)
 }
@@ -202,9 +202,9 @@ fn round(child: &mut LineChild, watch: &Watch, calls: usize) -> anyhow::Result<V
     struct Round {
         us: Vec<f64>,
     }
-    child.say(&format!("run {calls}"))?;
-    let line = child.next(watch, ROUND, "a round")?;
-    let round: Round = serde_json::from_str(&line).map_err(|_| child.no_answer(&line))?;
+    child.send_line(&format!("run {calls}"))?;
+    let line = child.next_line(watch, ROUND, "a round")?;
+    let round: Round = serde_json::from_str(&line).map_err(|_| child.unexpected_line(&line))?;
     Ok(round.us)
 }
 
@@ -214,29 +214,33 @@ enum Call {
     Action,
 }
 
-/// Our runtime, with the observations.
-struct Ours(PolicyRuntime, Vec<Vec<f64>>);
+/// The runtime of this project, with the observations for its calls.
+struct OwnRuntime {
+    runtime: PolicyRuntime,
+    observations: Vec<Vec<f64>>,
+}
 
-impl Ours {
+impl OwnRuntime {
     fn load(file: &Path) -> anyhow::Result<Self> {
         let runtime = PolicyRuntime::load(file)?;
         let len = runtime.spec().observation_len;
         let row = |row: usize| (0..len).map(|i| ((row * len + i) as f64 * 1.7).sin()).collect();
-        Ok(Self(runtime, (0..OBSERVATIONS).map(row).collect()))
+        let observations = (0..OBSERVATIONS).map(row).collect();
+        Ok(Self { runtime, observations })
     }
 
-    /// Times `count` calls, in microseconds each.
+    /// Returns the time of each of `count` calls in microseconds.
     fn calls(&mut self, count: usize, call: Call) -> anyhow::Result<Vec<f64>> {
-        let Self(runtime, rows) = self;
+        let Self { runtime, observations } = self;
         let mut took = Vec::with_capacity(count);
-        for row in rows.iter().cycle().take(count) {
-            let begun = Instant::now();
+        for row in observations.iter().cycle().take(count) {
+            let start = Instant::now();
             let actions = match call {
                 Call::Decision => runtime.segment(row)?,
                 Call::Action => runtime.action(Some(row))?,
             };
             std::hint::black_box(actions);
-            took.push(begun.elapsed().as_secs_f64() * 1e6);
+            took.push(start.elapsed().as_secs_f64() * 1e6);
         }
         Ok(took)
     }
@@ -247,7 +251,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn quantiles_are_those_of_sorted_calls() {
+    fn quantiles_ignore_the_order_of_calls() {
         let latency = Latency::of((1..=200).rev().map(f64::from).collect()).unwrap();
         assert_eq!(latency, Latency { p50_us: 100.0, p99_us: 198.0, max_us: 200.0 });
         assert_eq!(Latency::of(vec![3.0]).unwrap().p99_us, 3.0);

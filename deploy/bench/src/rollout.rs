@@ -1,8 +1,8 @@
-//! `dmprl bench rollout`: measures workers and their peers in turn.
+//! `dmprl bench rollout`: compares the workers with their peers.
 //!
-//! A machine's speed drifts. Therefore in every round each candidate runs once for the same time
-//! while the others sleep, and the median over the rounds counts. A worker sleeps because its queue
-//! is full, the peers because they wait for a request.
+//! A machine's speed drifts. Each round therefore runs every candidate once, for the same time,
+//! while the others sleep, and the report has the median over the rounds. A worker sleeps because
+//! its queue is full, a peer because it waits for a request.
 
 use std::path::PathBuf;
 use std::time::Duration;
@@ -14,13 +14,13 @@ use dmprl_shared::config::ExperimentConfig;
 
 use super::figures::{Figures, ONE_WORKER, WORKER, WorkerFigures};
 use super::numpy_plan::{Controls, NumpyPlan};
-use super::peers::{PANDA_GYM, Peer, PeerKind, PeerStage, is_in_panda_gym};
-use super::workers::{Stage, Workers};
+use super::peers::{PANDA_GYM, Peer, PeerKind, PeerSetup, is_in_panda_gym};
+use super::workers::{BenchRun, Workers};
 use crate::announce_round;
 
-/// Plan of the benchmark.
+/// Settings of the benchmark.
 pub struct RolloutBench {
-    /// Program of the worker processes: this one.
+    /// Path of this program, which also runs the workers.
     pub program: PathBuf,
     /// The resolved configuration.
     pub config: ExperimentConfig,
@@ -30,7 +30,7 @@ pub struct RolloutBench {
     pub package_path: PathBuf,
     /// Python interpreter for EnvPool and panda-gym.
     pub peer_python: PathBuf,
-    /// Controls for physics alone.
+    /// Controls for the benchmark of physics alone.
     pub controls: Controls,
     /// Number of rounds.
     pub rounds: usize,
@@ -38,8 +38,8 @@ pub struct RolloutBench {
     pub duration: Duration,
 }
 
-/// Runs the benchmark; returns `None` if the user interrupted it. Leaves no process and no file
-/// behind.
+/// Runs the benchmark; returns `None` if the user interrupted it. Removes all its processes and
+/// files.
 ///
 /// # Errors
 /// A worker or a peer cannot be started or dies.
@@ -52,14 +52,14 @@ pub fn rollout(bench: RolloutBench, progress: &dyn Progress) -> anyhow::Result<O
 
 fn measure(bench: RolloutBench, progress: &dyn Progress) -> anyhow::Result<Figures> {
     let watch = Watch::start()?;
-    // Everything below is dropped in reverse order: processes, shared memory, files.
-    let stage = Stage::new(bench.program.clone(), bench.venv.clone(), &bench.config)?;
-    let run = &stage.launcher.run;
+    // Dropped in reverse order: processes, shared memory, files.
+    let bench_run = BenchRun::new(bench.program.clone(), bench.venv.clone(), &bench.config)?;
+    let run = &bench_run.launcher.run;
     progress.stage("starting the workers");
     // Start the workers alone, so that nothing else delays their first segments.
-    let mut workers = Workers::start(&stage, &watch)?;
+    let mut workers = Workers::start(&bench_run, &watch)?;
     progress.stage("starting the peers");
-    let mut figures = Figures::new(&bench, &workers.spec, stage.manifest.machine.clone());
+    let mut figures = Figures::new(&bench, &workers.spec, bench_run.manifest.machine.clone());
     let mut peers = start_peers(&bench, run, &workers, &watch, &mut figures)?;
     let mut sink_cpu_s = 0.0;
     let mut measured_s = 0.0;
@@ -70,7 +70,7 @@ fn measure(bench: RolloutBench, progress: &dyn Progress) -> anyhow::Result<Figur
             figures.add(peer.kind.name(), peer.measure(&watch, bench.duration)?);
         }
         progress.detail(WORKER);
-        // Measured first, while the other workers' queues are full from the peers' turns.
+        // Comes first, while the other workers' queues are still full.
         if let Some(one) = workers.measure_first(&watch, bench.duration)? {
             figures.add(ONE_WORKER, one);
         }
@@ -90,7 +90,7 @@ fn measure(bench: RolloutBench, progress: &dyn Progress) -> anyhow::Result<Figur
     Ok(figures)
 }
 
-/// Starts all peers; unavailable ones become a note.
+/// Starts all peers. Adds a note to `figures` for each unavailable one.
 fn start_peers(
     bench: &RolloutBench,
     run: &RunDirectory,
@@ -100,25 +100,25 @@ fn start_peers(
 ) -> anyhow::Result<Vec<Peer>> {
     let Workers { spec, policy, parameters, .. } = workers;
     let plan =
-        NumpyPlan::write(run.path(), (&bench.config, spec, bench.controls), policy, parameters)?;
+        NumpyPlan::write(run.path(), &bench.config, spec, bench.controls, policy, parameters)?;
     let package_path = bench.package_path.clone();
-    let stage = PeerStage { run, package_path, plan, workers: bench.config.actors.workers };
-    let own = bench.venv.join("bin/python");
-    // Start all at once: most of a start is importing Python packages.
-    let suits = |kind: &PeerKind| *kind != PeerKind::PandaGym || is_in_panda_gym(&spec.id);
+    let setup = PeerSetup { run, package_path, plan, workers: bench.config.actors.workers };
+    let own_python = bench.venv.join("bin/python");
+    // Started together, because importing Python packages takes most of the time.
+    let applies = |kind: &PeerKind| *kind != PeerKind::PandaGym || is_in_panda_gym(&spec.id);
     if !is_in_panda_gym(&spec.id) {
         figures.note(PANDA_GYM, &format!("panda-gym has no {}", spec.id));
     }
-    let started = PeerKind::ALL.into_iter().filter(suits).map(|kind| {
-        let python = if kind.is_foreign() { &bench.peer_python } else { &own };
-        (kind, Peer::start(kind, python, &stage))
+    let started = PeerKind::ALL.into_iter().filter(applies).map(|kind| {
+        let python = if kind.is_foreign() { &bench.peer_python } else { &own_python };
+        (kind, Peer::start(kind, python, &setup))
     });
     let started: Vec<_> = started.collect();
     let mut peers = Vec::new();
     for (kind, peer) in started {
         let mut peer = match peer {
             Ok(peer) => peer,
-            // For example, --peer-python is no program.
+            // For example, `--peer-python` is not an executable.
             Err(error) => {
                 figures.note(kind.name(), &format!("{error:#}"));
                 continue;

@@ -1,13 +1,12 @@
-//! Statistics of measurements, and the load of the machine during them.
+//! Statistics of measurements, and the machine's load.
 
-/// Average number of runnable processes over the last minute; `None` if the system does not report
-/// it.
+/// Returns the load average of the last minute, or `None` if the system does not report it.
 pub(super) fn load_average() -> Option<f64> {
     let text = std::fs::read_to_string("/proc/loadavg").ok()?;
     text.split_whitespace().next()?.parse().ok()
 }
 
-/// The middle value, or the mean of the two in the middle; `None` if there are no values.
+/// Returns the median, or `None` if there are no values.
 pub(super) fn median(values: &[f64]) -> Option<f64> {
     let mut sorted = values.to_vec();
     sorted.sort_by(f64::total_cmp);
@@ -32,7 +31,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_median_is_the_middle_whatever_the_order_and_however_far_the_rest() {
+    fn median_ignores_order_and_outliers() {
         assert_eq!(median(&[]), None);
         assert_eq!(median(&[3.0]), Some(3.0));
         assert_eq!(median(&[1e9, 1.0, 2.0]), Some(2.0));

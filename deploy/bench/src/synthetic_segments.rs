@@ -1,4 +1,4 @@
-//! Synthetic segments of a given size in bytes.
+//! Generates synthetic segments of a given size in bytes.
 
 use dmprl_shared::segment::{
     ActionBounds, Expected, LAYOUT_VERSION, Segment, SegmentHeader, SegmentLayout, TRUNCATED,
@@ -6,26 +6,25 @@ use dmprl_shared::segment::{
 };
 use dmprl_shared::transport::shared_memory::Plan;
 
-/// Segment sizes of the benchmark, header and block \[bytes\].
+/// Segment sizes of the benchmark, header plus block.
 pub(super) const SIZES: [Size; 2] =
     [Size { bytes: 1_024, layout: layout(36, 3) }, Size { bytes: 10_240, layout: layout(405, 21) }];
 /// Segment size of the benchmark between hosts.
-pub(super) const BETWEEN_HOSTS: Size = Size { bytes: 2_048, layout: layout(77, 5) };
-/// Capacity of a worker's queue and of its outbox. Both are full when the receiver stops taking
-/// segments.
+pub(super) const SIZE_BETWEEN_HOSTS: Size = Size { bytes: 2_048, layout: layout(77, 5) };
+/// Capacity of a worker's queue and of its outbox. Both fill up when the receiver pauses.
 pub(super) const QUEUE_SEGMENTS: usize = 512;
 
 /// Run id in the synthetic segments.
 pub(super) const RUN_ID: u64 = 1;
-/// Segments per episode, so that a replay links them.
+/// Segments per episode, so that the replay has successive segments to link.
 const EPISODE_SEGMENTS: u64 = 10;
 const ARCHITECTURE_HASH: u64 = 1;
-/// Phase between two values. It is not commensurable with the sine's period.
+/// Phase step between two values. The sine never repeats, because 0.37 / 2 pi is irrational.
 const STRIDE: f32 = 0.37;
-/// Larger integers have no exact f32.
+/// Integers up to this one are exact in an f32.
 const STAMP_MAX: u64 = 1 << 24;
 
-/// A segment's size and its layout.
+/// A segment's size in bytes and the layout that results in it.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Size {
     pub(super) bytes: usize,
@@ -42,7 +41,7 @@ impl Size {
         SIZES.into_iter().find(|size| size.bytes == bytes)
     }
 
-    /// The plan of the shared memory between the workers and the receiver.
+    /// Returns the plan of the shared memory between the workers and the receiver.
     pub(super) fn plan(self, workers: usize) -> Plan {
         Plan {
             run_id: RUN_ID,
@@ -54,7 +53,7 @@ impl Size {
         }
     }
 
-    /// The values that a valid segment must have.
+    /// Returns the values that a valid segment must have.
     pub(super) fn expected(self, workers: u32) -> Expected {
         Expected {
             run_id: RUN_ID,
@@ -72,13 +71,13 @@ impl Size {
 pub(super) struct SyntheticSegments(Segment);
 
 impl SyntheticSegments {
-    /// Creates the generator of a worker.
+    /// Creates the generator for a worker.
     pub(super) fn new(layout: SegmentLayout, worker_id: u32) -> Self {
-        Self::of(layout, worker_id, ARCHITECTURE_HASH)
+        Self::with_hash(layout, worker_id, ARCHITECTURE_HASH)
     }
 
-    /// Creates the generator for a learner with this architecture hash.
-    pub(super) fn of(layout: SegmentLayout, worker_id: u32, architecture_hash: u64) -> Self {
+    /// Creates the generator for a worker of a learner with this architecture hash.
+    pub(super) fn with_hash(layout: SegmentLayout, worker_id: u32, architecture_hash: u64) -> Self {
         let mut segment = Segment::zeroed(layout);
         for (index, value) in segment.block.iter_mut().enumerate() {
             *value = (index as f32 * STRIDE).sin();
@@ -97,15 +96,14 @@ impl SyntheticSegments {
         Self(segment)
     }
 
-    /// Generates the next segment. It has a new number, different values, and a checksum as from a
-    /// real worker.
+    /// Generates the next segment, with a new sequence number, other values and a valid checksum.
     pub(super) fn next(&mut self) -> &Segment {
         let Segment { header, block } = &mut self.0;
-        let (episode, place) =
+        let (episode, index) =
             (header.sequence / EPISODE_SEGMENTS, header.sequence % EPISODE_SEGMENTS);
         header.episode = episode as u32;
-        header.episode_step = place as u32 * header.segment_steps;
-        header.flags = if place + 1 == EPISODE_SEGMENTS { TRUNCATED } else { 0 };
+        header.episode_step = index as u32 * header.segment_steps;
+        header.flags = if index + 1 == EPISODE_SEGMENTS { TRUNCATED } else { 0 };
         header.sequence += 1;
         block[0] = (header.sequence % STAMP_MAX) as f32;
         header.checksum = block_checksum(block);
@@ -120,8 +118,8 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_made_up_segment_has_its_size_and_is_sound() {
-        for size in SIZES.into_iter().chain([BETWEEN_HOSTS]) {
+    fn synthetic_segments_are_valid_and_have_their_size() {
+        for size in SIZES.into_iter().chain([SIZE_BETWEEN_HOSTS]) {
             let mut synthetic_segments = SyntheticSegments::new(size.layout, 1);
             let checksums = [1, 2].map(|sequence| {
                 let Segment { header, block } = synthetic_segments.next();
@@ -135,9 +133,9 @@ mod tests {
     }
 
     #[test]
-    fn made_up_segments_follow_each_other_in_episodes() {
+    fn synthetic_segments_form_episodes() {
         let layout = SIZES[0].layout;
-        let mut synthetic_segments = SyntheticSegments::of(layout, 0, 7);
+        let mut synthetic_segments = SyntheticSegments::with_hash(layout, 0, 7);
         let mut next = || synthetic_segments.next().header;
         let (first, second) = (next(), next());
         assert_eq!((first.episode, first.episode_step, first.architecture_hash), (0, 0, 7));

@@ -1,4 +1,4 @@
-//! Formats the figures of a benchmark as a table.
+//! Formats the figures of `bench rollout` as a table.
 
 use dmprl_run::format::grouped;
 
@@ -7,14 +7,14 @@ use super::peers::{PANDA_GYM, is_in_panda_gym};
 use super::statistics::{max, min};
 
 impl Figures {
-    /// Formats the figures as a table, like [`Figures::json`].
+    /// Returns the figures as a table.
     #[must_use]
     pub fn text(&self) -> String {
         let actors = &self.config.actors;
         let rounds = self.rounds(WORKER).len();
         let mut lines = vec![
             format!(
-                "{} ({}) · {} · {} × {} environments · {} steps a segment",
+                "{} ({}) · {} · {} × {} environments · {} steps per segment",
                 self.config.task.name,
                 self.env_id,
                 self.policy(),
@@ -22,13 +22,10 @@ impl Figures {
                 actors.envs_per_worker,
                 self.config.policy.decision_steps()
             ),
-            format!(
-                "median of {rounds} rounds of {} s; microseconds are of one worker",
-                self.seconds
-            ),
+            format!("median of {rounds} rounds of {} s; step times are per worker", self.seconds),
             String::new(),
             format!(
-                "  {:<10} {:>11} {:>9} {:>9}   {:<21} worker is",
+                "  {:<10} {:>11} {:>9} {:>9}   {:<21} worker/this",
                 "", "steps/s", "µs/step", "CPU µs", "from … to"
             ),
         ];
@@ -94,7 +91,7 @@ mod tests {
     use crate::figures::tests::figures;
 
     #[test]
-    fn the_table_gives_the_time_of_a_step_in_one_worker() {
+    fn table_shows_step_time_per_worker() {
         let text = figures().text();
         let row = |name: &str| {
             let line = text.lines().find(|line| line.trim_start().starts_with(name)).unwrap();

@@ -1,4 +1,4 @@
-//! The workers of a run, with a receiver as the learner.
+//! The workers of a run, with a [`DrainReceiver`] in place of the learner.
 
 use std::path::PathBuf;
 use std::time::{Duration, Instant};
@@ -22,27 +22,27 @@ use tempfile::TempDir;
 
 use super::child::LineChild;
 use super::drain_receiver::{
-    Answer, Discrepancies, DrainReceiver, From, Request, Window, show_warning,
+    Answer, Discrepancies, DrainReceiver, DrainWindow, Request, Source, show_warning,
 };
 use super::round::Round;
 
-/// Extra time that a measurement may take.
+/// Time beyond a measurement's duration until it times out.
 const MEASURE_SLACK: Duration = Duration::from_secs(30);
 
-/// A worker that waits for the next round is no reason for a warning [s].
+/// Workers warn when a send takes longer than this [s]. Waiting for the next round is normal.
 const SEND_DEADLINE_S: f64 = 1e6;
 
-/// A run without a learner, as the environment of workers. Leaves nothing behind on drop.
-pub(super) struct Stage {
+/// A temporary run directory and shared memory for workers without a learner, removed on drop.
+pub(super) struct BenchRun {
     pub(super) launcher: Launcher,
     pub(super) domain: Domain,
     pub(super) manifest: Manifest,
-    /// Last: removed after all its users have been dropped.
+    /// The last field, so that it is removed after its users are dropped.
     _folder: TempDir,
 }
 
-impl Stage {
-    /// Creates a folder and shared memory.
+impl BenchRun {
+    /// Creates the run directory and the shared memory.
     pub(super) fn new(
         program: PathBuf,
         venv: PathBuf,
@@ -50,7 +50,7 @@ impl Stage {
     ) -> anyhow::Result<Self> {
         let mut config = config.clone();
         config.actors.send_deadline_s = SEND_DEADLINE_S;
-        // No worker joins a benchmark.
+        // No workers join during a benchmark.
         config.actors.joined_max = 0;
         let folder = tempfile::Builder::new().prefix("dmprl-bench-").tempdir();
         let folder = folder.context("cannot make a folder for the workers' run")?;
@@ -65,25 +65,23 @@ impl Stage {
     }
 }
 
-/// Running workers, whose queues are full between two measurements.
+/// Running workers. Their queues are full between two measurements.
 pub(super) struct Workers {
     children: Vec<LineChild>,
     receiver: DrainReceiver,
     discrepancies: Discrepancies,
-    /// Environment spec that a worker reported.
+    /// Environment spec, as reported by a worker.
     pub(super) spec: EnvSpec,
-    /// Policy architecture.
     pub(super) policy: Policy,
-    /// Parameters of the workers' policy.
     pub(super) parameters: Vec<f32>,
-    /// Time from a worker's start to its first delivered segment [s]; that of the slowest.
+    /// Time from start to first delivered segment of the slowest worker [s].
     pub(super) first_segment_s: f64,
 }
 
 impl Workers {
     /// Starts the workers; returns when each has delivered its first segment.
-    pub(super) fn start(stage: &Stage, watch: &Watch) -> anyhow::Result<Self> {
-        let Stage { launcher, domain, .. } = stage;
+    pub(super) fn start(run: &BenchRun, watch: &Watch) -> anyhow::Result<Self> {
+        let BenchRun { launcher, domain, .. } = run;
         let setup = Setup::read(launcher.run.path())?;
         let config = &setup.config;
         let limit = TimeLimits::default().ready;
@@ -96,14 +94,14 @@ impl Workers {
         }
         let mut spec = None;
         for child in &mut children {
-            spec = Some(environment(child, watch, limit)?);
+            spec = Some(receive_spec(child, watch, limit)?);
         }
         let spec = spec.context("no worker")?;
         let policy = Policy::new(config, &spec)?;
         let mut random = seeds::stream(config.run.seed, "actor parameters", 0);
         let snapshot = ParameterSnapshot {
             version: 1,
-            // The warm-up is over: the network decides from the first segment on.
+            // Past the warm-up, so that the network decides from the first segment on.
             env_steps: config.exploration.warm_up_steps,
             architecture_hash: policy.architecture_hash(),
             values: policy.initial_parameters(&mut random),
@@ -132,14 +130,14 @@ impl Workers {
         &mut self,
         watch: &Watch,
         duration: Duration,
-    ) -> anyhow::Result<(Round, Window)> {
-        self.measure_from(watch, duration, From::All)
+    ) -> anyhow::Result<(Round, DrainWindow)> {
+        self.measure_source(watch, duration, Source::All)
     }
 
-    /// Measures the first worker while the others sleep on their full queues; `None` with one
-    /// worker. Requires that those queues have had time to fill.
+    /// Measures the first worker while the others sleep because their queues are full. Returns
+    /// `None` if there is only one worker. The queues must have had time to fill.
     ///
-    /// It stops no process: a stopped process would outlive a benchmark that is killed.
+    /// The others do not get SIGSTOP: a stopped process would outlive a killed benchmark.
     pub(super) fn measure_first(
         &mut self,
         watch: &Watch,
@@ -148,31 +146,32 @@ impl Workers {
         if self.children.len() == 1 {
             return Ok(None);
         }
-        Ok(Some(self.measure_from(watch, duration, From::First)?.0))
+        Ok(Some(self.measure_source(watch, duration, Source::First)?.0))
     }
 
-    fn measure_from(
+    fn measure_source(
         &mut self,
         watch: &Watch,
         duration: Duration,
-        from: From,
-    ) -> anyhow::Result<(Round, Window)> {
-        let (start, cpu_s) = (Instant::now(), self.cpu_s(from));
-        let answer = self.ask(Request::Measure(duration, from), watch, duration + MEASURE_SLACK)?;
+        source: Source,
+    ) -> anyhow::Result<(Round, DrainWindow)> {
+        let (start, cpu_s) = (Instant::now(), self.cpu_s(source));
+        let answer =
+            self.ask(Request::Measure(duration, source), watch, duration + MEASURE_SLACK)?;
         let Answer::Measured(window) = answer else {
-            bail!("the receiver answered another question");
+            bail!("the receiver sent an unexpected answer");
         };
-        // The time to settle is included, in which the workers do the same.
+        // Includes the settling time, during which the workers run in the same way.
         let elapsed_s = start.elapsed().as_secs_f64();
-        let cores = self.cpu_s(from).zip(cpu_s).map(|(now, then)| (now - then) / elapsed_s);
+        let cores = self.cpu_s(source).zip(cpu_s).map(|(now, then)| (now - then) / elapsed_s);
         let steps_per_s = window.env_steps as f64 / window.seconds;
         Ok((Round { steps_per_s, cores }, window))
     }
 
-    fn cpu_s(&self, from: From) -> Option<f64> {
-        let count = match from {
-            From::All => self.children.len(),
-            From::First => 1,
+    fn cpu_s(&self, source: Source) -> Option<f64> {
+        let count = match source {
+            Source::All => self.children.len(),
+            Source::First => 1,
         };
         self.children.iter().take(count).map(LineChild::cpu_s).sum()
     }
@@ -191,10 +190,10 @@ impl Workers {
         let command = Command::Attach { domain: domain.path().to_owned() };
         let line = serde_json::to_string(&command).context("cannot write a command as JSON")?;
         for child in &mut self.children {
-            child.say(&line)?;
+            child.send_line(&line)?;
         }
         let Answer::FirstOfEach(first) = self.ask(Request::FirstOfEach, watch, limit)? else {
-            bail!("the receiver answered another question");
+            bail!("the receiver sent an unexpected answer");
         };
         ensure!(first.len() == self.children.len(), "not every worker delivered a segment");
         let waits = self.children.iter().zip(first).map(|(child, at)| at - child.started());
@@ -211,12 +210,12 @@ impl Workers {
     }
 }
 
-/// Waits until a worker has created its environments; returns their spec.
-fn environment(child: &mut LineChild, watch: &Watch, limit: Duration) -> anyhow::Result<EnvSpec> {
+/// Waits until a worker has created its environments, and returns their spec.
+fn receive_spec(child: &mut LineChild, watch: &Watch, limit: Duration) -> anyhow::Result<EnvSpec> {
     let deadline = Instant::now() + limit;
     loop {
         let left = deadline.saturating_duration_since(Instant::now());
-        let line = child.next(watch, left, "the environments")?;
+        let line = child.next_line(watch, left, "the environments")?;
         match serde_json::from_str(&line) {
             Ok(Report::EnvironmentReady { spec }) => return Ok(spec),
             Ok(_) => show_warning(child.name(), &line),

@@ -22,9 +22,8 @@ use dmprl_shared::transport::{AcknowledgementSubscriber, ParameterSubscriber, Tr
 use super::host_messages::HostStatus;
 use super::host_registry::{Host, HostRegistry};
 use super::join::JOIN;
-use super::link::{
-    Link, LinkMode, Message, MessageReceiver, MessageSender, Presence, Requests, Urgency,
-};
+use super::link::{Link, Message, MessageReceiver, MessageSender, Presence, Requests};
+use super::link_mode::{LinkMode, Urgency};
 use super::link_receiver::LinkReceiver;
 use super::policy_sender::PolicySender;
 use super::wire::{self, LinkAck, RunState};

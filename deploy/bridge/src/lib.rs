@@ -4,20 +4,24 @@
 //!  learner's host                                    other hosts
 //!  learner ◄── queue, one a worker ── gateway ◄──── Zenoh ──── relay ◄── queues ── workers
 //!     └── policies, acknowledgements ──► gateway ── Zenoh ────► relay ── the same ──► workers
-//! ``` A [`relay`] acts as the learner for the workers of its host; the [`gateway`] acts as the
+//! ```
+//! A [`relay`] acts as the learner for the workers of its host; the [`gateway`] acts as the
 //! workers of all other hosts for the learner. Like a worker, each hop retains the segments that
 //! the learner has not acknowledged: `link_sender` at the relay, `link_receiver` at the gateway. So
 //! after any process has died, its predecessor in the chain retransmits. [`wire`] and
 //! [`host_messages`] define the messages, `congestion_window` limits the data in flight,
 //! `policy_sender` sends policies, [`join`] requests places, `host_registry` leases them, and
-//! `link` is the only file that names Zenoh.
+//! `link` is the only file that names Zenoh; a build without the feature `zenoh` has
+//! `link_absent` in its place.
 
 mod congestion_window;
 pub mod gateway;
 pub mod host_messages;
 mod host_registry;
 pub mod join;
+#[cfg_attr(not(feature = "zenoh"), path = "link_absent.rs")]
 mod link;
+mod link_mode;
 mod link_receiver;
 mod link_sender;
 mod policy_sender;
@@ -25,4 +29,19 @@ pub mod relay;
 pub mod token;
 pub mod wire;
 
-pub use link::{Link, LinkMode, Urgency};
+pub use link::Link;
+pub use link_mode::{LinkMode, Urgency};
+
+/// Checks that this program was built with workers of other hosts.
+///
+/// # Errors
+/// Wrong use: it was built without the feature `zenoh`; the message has the command that builds it.
+pub fn check_available() -> anyhow::Result<()> {
+    if cfg!(feature = "zenoh") {
+        return Ok(());
+    }
+    Err(dmprl_run::failure::wrong_use(
+        "this program was built without workers of other hosts; build it with them: \
+         cargo build --release --features hosts",
+    ))
+}

@@ -18,6 +18,8 @@ use zenoh::query::{Query, Queryable};
 use zenoh::sample::{Sample, SampleKind};
 use zenoh::{Config, Session, Wait};
 
+use crate::{LinkMode, Urgency};
+
 /// Capacity of a queue of received messages. If it is full, the link is not read and its sender
 /// blocks.
 const WAITING_MAX: usize = 256;
@@ -35,29 +37,9 @@ const BATCH_BYTES_MAX: usize = 16 << 20;
 /// Maximum number of sessions with the learner's host.
 const SESSIONS_MAX: usize = 256;
 
-/// How an end of a link makes its connection.
-#[derive(Debug, Clone, Copy)]
-pub enum LinkMode<'a> {
-    /// The learner's host, which listens on these endpoints.
-    Listen(&'a [String]),
-    /// Another host, which connects to this endpoint.
-    Connect(&'a str),
-}
-
 /// An open session.
 #[derive(Debug)]
 pub struct Link(Session);
-
-/// Priority of messages on a full link.
-#[derive(Debug, Clone, Copy)]
-pub enum Urgency {
-    /// Small messages that the other end waits for.
-    First,
-    /// Policies.
-    Policies,
-    /// Segments.
-    Segments,
-}
 
 /// Sends messages under one name.
 #[derive(Debug)]

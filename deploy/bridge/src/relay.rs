@@ -18,7 +18,8 @@ use dmprl_shared::transport::{AcknowledgementPublisher, ParameterPublisher, Segm
 use super::congestion_window::CongestionWindow;
 use super::host_messages::{HostStatus, HostWelcome, Lease};
 use super::join::{JoinOutcome, JoinSettings, request_join};
-use super::link::{Link, LinkMode, MessageReceiver, MessageSender, Presence, Urgency};
+use super::link::{Link, MessageReceiver, MessageSender, Presence};
+use super::link_mode::{LinkMode, Urgency};
 use super::link_sender::LinkSender;
 use super::wire::{self, Batch, RunState};
 

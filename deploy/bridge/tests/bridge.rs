@@ -1,5 +1,6 @@
 //! Relay and gateway over shared memory and Zenoh on loopback, while learner, gateway and relay are
 //! replaced repeatedly: every segment arrives once and in order.
+#![cfg(feature = "zenoh")]
 #![allow(clippy::unwrap_used)] // a helper that panics fails its test
 
 use std::net::TcpListener;

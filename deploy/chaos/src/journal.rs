@@ -2,10 +2,10 @@
 //! event.
 //!
 //! ```text
-//!   record: kind · worker · incarnation · checksum · three numbers · time · CRC-32 of all that
+//!   record: kind · worker · incarnation · checksum · three numbers · time · CRC-32 of the rest
 //! ```
-//! Each record is written by one plain `write`, so that SIGKILL loses no written record; the last
-//! record of a killed process may be incomplete. Without `--journal` no journal is written.
+//! Each record is written with one unbuffered `write`, so that SIGKILL loses no written record. The
+//! last record of a killed process may be incomplete. Without `--journal`, no journal is written.
 
 use std::fs::{File, OpenOptions};
 use std::io::Write;
@@ -20,9 +20,9 @@ use dmprl_shared::segment::SegmentHeader;
 use dmprl_shared::transport::delivery::Watermark;
 use rustix::time::{ClockId, clock_gettime};
 
-/// Counters of a learner.
+/// A learner's counters of inserted segments and updates.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
-pub struct Standing {
+pub struct LearnerCounters {
     /// Environment steps inserted.
     pub env_steps: u64,
     /// Updates done.
@@ -31,7 +31,7 @@ pub struct Standing {
     pub segments: u64,
 }
 
-impl From<&Counters> for Standing {
+impl From<&Counters> for LearnerCounters {
     fn from(counters: &Counters) -> Self {
         let Counters { env_steps, updates, segments, .. } = *counters;
         Self { env_steps, updates, segments }
@@ -40,19 +40,19 @@ impl From<&Counters> for Standing {
 
 /// Identity and checksum of a segment.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct Piece {
+pub struct SegmentDigest {
     /// Index of the worker.
     pub worker: u32,
     /// Incarnation and sequence number.
     pub mark: Watermark,
-    /// CRC-32 of header and block, computed at each end.
+    /// CRC-32 of header and block, computed independently by worker and learner.
     pub checksum: u32,
     /// Environment steps in the segment.
     pub env_steps: u64,
 }
 
-impl Piece {
-    /// Describes a segment, computing its checksum.
+impl SegmentDigest {
+    /// Computes the digest of a segment.
     #[must_use]
     pub fn of(header: &SegmentHeader, block: &[f32]) -> Self {
         let mut checksum = crc32fast::Hasher::new();
@@ -67,32 +67,37 @@ impl Piece {
     }
 }
 
-/// An event.
+/// An event in the journal of a worker or learner.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Entry {
-    /// A worker has finished a segment, but not yet retained or offered it.
-    Produced(Piece),
-    /// A worker has dropped its segments up to this mark.
+    /// A worker has finished a segment, but not yet put it into its outbox.
+    Produced(SegmentDigest),
+    /// A worker has dropped its acknowledged segments up to this mark.
     Acknowledged(Watermark),
-    /// A worker has taken a policy.
+    /// A worker has adopted a policy.
     Policy {
-        /// Number of the learner in the session.
+        /// Number of the learner within the session.
         epoch: u64,
         /// Version of the policy.
         version: u64,
     },
-    /// A learner starts; it has settled this worker's segments up to the mark.
+    /// A learner starts, having settled this worker's segments up to the mark.
     Restored(u32, Watermark),
-    /// Its counters, after one [`Entry::Restored`] per worker.
-    Started(Standing),
-    /// It has read its log, and now takes segments from workers.
+    /// The starting learner's counters, after one [`Entry::Restored`] per worker.
+    Started(LearnerCounters),
+    /// The learner has read its log, and now receives segments from workers.
     Serving,
     /// A learner has inserted a segment, from a worker or from its log.
-    Inserted(Piece),
-    /// It has rejected a segment; true if it was a duplicate.
-    Refused(Piece, bool),
-    /// It begins a checkpoint.
-    Cut(Standing),
+    Inserted(SegmentDigest),
+    /// A learner has rejected a segment.
+    Rejected {
+        /// The segment.
+        segment: SegmentDigest,
+        /// True if it was rejected as a duplicate.
+        is_duplicate: bool,
+    },
+    /// A learner begins a checkpoint with these counters.
+    CheckpointBegun(LearnerCounters),
 }
 
 /// An event and its time [us of the monotonic clock, which all processes share].
@@ -105,11 +110,11 @@ pub struct Record {
 }
 
 /// Size of a record in bytes.
-pub const RECORD_BYTES: usize = size_of::<Raw>();
+pub const RECORD_BYTES: usize = size_of::<RawRecord>();
 
 #[derive(Debug, Clone, Copy, Default, Pod, Zeroable)]
 #[repr(C)]
-struct Raw {
+struct RawRecord {
     kind: u32,
     worker: u32,
     incarnation: u32,
@@ -122,19 +127,20 @@ struct Raw {
 
 const CRC_BYTES: usize = size_of::<u32>();
 
-impl Raw {
-    fn sum(&self) -> u32 {
+impl RawRecord {
+    /// CRC-32 of all other fields.
+    fn compute_crc32(&self) -> u32 {
         crc32fast::hash(&bytemuck::bytes_of(self)[..RECORD_BYTES - CRC_BYTES])
     }
 
-    fn piece(kind: u32, piece: &Piece) -> Self {
-        let Piece { worker, mark, checksum, env_steps } = *piece;
+    fn segment(kind: u32, segment: &SegmentDigest) -> Self {
+        let SegmentDigest { worker, mark, checksum, env_steps } = *segment;
         let numbers = [mark.sequence, env_steps, 0];
         Self { kind, worker, incarnation: mark.incarnation, checksum, numbers, ..Self::default() }
     }
 
-    fn standing(kind: u32, standing: &Standing) -> Self {
-        let Standing { env_steps, updates, segments } = *standing;
+    fn counters(kind: u32, counters: &LearnerCounters) -> Self {
+        let LearnerCounters { env_steps, updates, segments } = *counters;
         Self { kind, numbers: [env_steps, updates, segments], ..Self::default() }
     }
 
@@ -142,14 +148,14 @@ impl Raw {
         Watermark { incarnation: self.incarnation, sequence: self.numbers[0] }
     }
 
-    fn as_piece(&self) -> Piece {
+    fn as_segment(&self) -> SegmentDigest {
         let Self { worker, checksum, numbers: [_, env_steps, _], .. } = *self;
-        Piece { worker, mark: self.as_mark(), checksum, env_steps }
+        SegmentDigest { worker, mark: self.as_mark(), checksum, env_steps }
     }
 
-    fn as_standing(&self) -> Standing {
+    fn as_counters(&self) -> LearnerCounters {
         let [env_steps, updates, segments] = self.numbers;
-        Standing { env_steps, updates, segments }
+        LearnerCounters { env_steps, updates, segments }
     }
 }
 
@@ -157,74 +163,76 @@ impl Record {
     /// Encodes the record for a file.
     #[must_use]
     pub fn encode(&self) -> [u8; RECORD_BYTES] {
-        let marked = |kind, worker, mark: &Watermark| Raw {
+        let marked = |kind, worker, mark: &Watermark| RawRecord {
             kind,
             worker,
             incarnation: mark.incarnation,
             numbers: [mark.sequence, 0, 0],
-            ..Raw::default()
+            ..RawRecord::default()
         };
         let raw = match &self.entry {
-            Entry::Produced(piece) => Raw::piece(1, piece),
+            Entry::Produced(segment) => RawRecord::segment(1, segment),
             Entry::Acknowledged(mark) => marked(2, 0, mark),
             Entry::Policy { epoch, version } => {
-                Raw { kind: 3, numbers: [*epoch, *version, 0], ..Raw::default() }
+                RawRecord { kind: 3, numbers: [*epoch, *version, 0], ..RawRecord::default() }
             }
             Entry::Restored(worker, mark) => marked(4, *worker, mark),
-            Entry::Started(standing) => Raw::standing(5, standing),
-            Entry::Serving => Raw { kind: 6, ..Raw::default() },
-            Entry::Inserted(piece) => Raw::piece(7, piece),
-            Entry::Refused(piece, known) => Raw::piece(8 + u32::from(*known), piece),
-            Entry::Cut(standing) => Raw::standing(10, standing),
+            Entry::Started(counters) => RawRecord::counters(5, counters),
+            Entry::Serving => RawRecord { kind: 6, ..RawRecord::default() },
+            Entry::Inserted(segment) => RawRecord::segment(7, segment),
+            Entry::Rejected { segment, is_duplicate } => {
+                RawRecord::segment(8 + u32::from(*is_duplicate), segment)
+            }
+            Entry::CheckpointBegun(counters) => RawRecord::counters(10, counters),
         };
-        let mut raw = Raw { time_us: self.time_us, ..raw };
-        raw.crc32 = raw.sum();
+        let mut raw = RawRecord { time_us: self.time_us, ..raw };
+        raw.crc32 = raw.compute_crc32();
         let mut bytes = [0; RECORD_BYTES];
         bytes.copy_from_slice(bytemuck::bytes_of(&raw));
         bytes
     }
 
-    /// Decodes a record; `None` if it is incomplete or invalid.
+    /// Decodes a record. Returns `None` if it is invalid.
     #[must_use]
     pub fn decode(bytes: &[u8; RECORD_BYTES]) -> Option<Self> {
-        let raw: Raw = bytemuck::pod_read_unaligned(bytes);
+        let raw: RawRecord = bytemuck::pod_read_unaligned(bytes);
         let entry = match raw.kind {
-            _ if raw.crc32 != raw.sum() => return None,
-            1 => Entry::Produced(raw.as_piece()),
+            _ if raw.crc32 != raw.compute_crc32() => return None,
+            1 => Entry::Produced(raw.as_segment()),
             2 => Entry::Acknowledged(raw.as_mark()),
             3 => Entry::Policy { epoch: raw.numbers[0], version: raw.numbers[1] },
             4 => Entry::Restored(raw.worker, raw.as_mark()),
-            5 => Entry::Started(raw.as_standing()),
+            5 => Entry::Started(raw.as_counters()),
             6 => Entry::Serving,
-            7 => Entry::Inserted(raw.as_piece()),
-            8 => Entry::Refused(raw.as_piece(), false),
-            9 => Entry::Refused(raw.as_piece(), true),
-            10 => Entry::Cut(raw.as_standing()),
+            7 => Entry::Inserted(raw.as_segment()),
+            8 => Entry::Rejected { segment: raw.as_segment(), is_duplicate: false },
+            9 => Entry::Rejected { segment: raw.as_segment(), is_duplicate: true },
+            10 => Entry::CheckpointBegun(raw.as_counters()),
             _ => return None,
         };
         Some(Self { entry, time_us: raw.time_us })
     }
 }
 
-/// Microseconds of the monotonic clock, which all processes of a machine share.
+/// Returns the time of the monotonic clock \[us\], which all processes of a machine share.
 #[must_use]
 pub fn now_us() -> u64 {
     let now = clock_gettime(ClockId::Monotonic);
-    // Since the machine started: never negative.
+    // Time since boot, never negative.
     (now.tv_sec * 1_000_000 + now.tv_nsec / 1_000).unsigned_abs()
 }
 
-/// Process that writes a journal.
+/// The process that writes a journal.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub enum Author {
     /// A worker, by index and incarnation.
     Worker(u32, u32),
-    /// A learner, by the number of deaths before it.
+    /// A learner, by the number of learner deaths before it.
     Learner(u64),
 }
 
 impl Author {
-    /// Path of its journal.
+    /// Returns the path of this process's journal in a folder.
     #[must_use]
     pub fn path(&self, folder: &Path) -> PathBuf {
         folder.join(match self {
@@ -233,7 +241,7 @@ impl Author {
         })
     }
 
-    /// Returns the author of a journal with this name.
+    /// Parses the author from a journal's file name.
     #[must_use]
     pub fn of(name: &str) -> Option<Self> {
         let mut parts = name.split('-');
@@ -248,12 +256,12 @@ impl Author {
     }
 }
 
-/// The journal of a process, for writing.
+/// A journal open for writing.
 #[derive(Debug, Clone)]
 pub struct Journal(Arc<File>);
 
 impl Journal {
-    /// Creates an empty journal in a folder; returns `None` without a folder.
+    /// Creates a journal in a folder. Returns `None` without a folder.
     ///
     /// # Errors
     /// The file cannot be created, or already exists.
@@ -265,10 +273,10 @@ impl Journal {
         Ok(Some(Self(Arc::new(file))))
     }
 
-    /// Writes an entry.
+    /// Appends an entry with the current time.
     ///
     /// # Panics
-    /// If it cannot be written, because the checker would report violations that never happened.
+    /// If the write fails: without the entry, the checker would report false violations.
     pub fn note(&self, entry: Entry) {
         let written = (&*self.0).write_all(&Record { entry, time_us: now_us() }.encode());
         assert!(written.is_ok(), "cannot write the journal: {written:?}");
@@ -280,21 +288,21 @@ mod tests {
     use super::*;
 
     #[test]
-    fn every_entry_is_read_as_it_was_written_and_a_torn_one_is_not_read() {
+    fn entries_round_trip_and_corrupt_ones_are_rejected() {
         let mark = Watermark { incarnation: 3, sequence: 1 << 40 };
-        let piece = Piece { worker: 7, mark, checksum: 0xdead_beef, env_steps: 5 };
-        let standing = Standing { env_steps: 1, updates: 2, segments: 3 };
+        let segment = SegmentDigest { worker: 7, mark, checksum: 0xdead_beef, env_steps: 5 };
+        let counters = LearnerCounters { env_steps: 1, updates: 2, segments: 3 };
         let entries = [
-            Entry::Produced(piece),
+            Entry::Produced(segment),
             Entry::Acknowledged(mark),
             Entry::Policy { epoch: 4, version: 9 },
             Entry::Restored(7, mark),
-            Entry::Started(standing),
+            Entry::Started(counters),
             Entry::Serving,
-            Entry::Inserted(piece),
-            Entry::Refused(piece, false),
-            Entry::Refused(piece, true),
-            Entry::Cut(standing),
+            Entry::Inserted(segment),
+            Entry::Rejected { segment, is_duplicate: false },
+            Entry::Rejected { segment, is_duplicate: true },
+            Entry::CheckpointBegun(counters),
         ];
         for entry in entries {
             let record = Record { entry, time_us: 12 };
@@ -309,7 +317,7 @@ mod tests {
     }
 
     #[test]
-    fn an_author_is_read_from_the_name_of_its_file() {
+    fn author_round_trips_through_the_file_name() {
         for author in [Author::Worker(3, 65_536), Author::Learner(12)] {
             let path = author.path(Path::new("folder"));
             assert_eq!(Author::of(path.file_name().unwrap().to_str().unwrap()), Some(author));

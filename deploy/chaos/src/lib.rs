@@ -2,24 +2,28 @@
 //! their journals.
 //!
 //! ```text
-//!   schedule ─► nemesis ──SIGKILL, SIGSTOP──► train (subject) ─► workers, learner
-//!                  │                                                  │ journals
-//!                  ▼                                                  ▼
-//!               timeline ◄────────── recovery of processes ─────── journals ─► checker ─► report
+//!   schedule ─► fault_injector ──SIGKILL, SIGSTOP──► run_under_test ─► workers, learner
+//!                    │                                                     │ journal
+//!                    ▼                                                     ▼
+//!                 timeline ◄────────── recovery of processes ────────── journals ─► checker
+//!                                                                                     │
+//!                                                                                     ▼
+//!                                                                                   report
 //! ```
-//! One loop in one thread reads the journals, injects due faults and checks progress, every few
-//! milliseconds. At the end suspended processes are resumed, all workers must make progress, the
-//! run is stopped as by a user, and its files are compared with the journals.
+//! One loop in one thread (`trial`) reads the journals, injects due faults and checks progress,
+//! every few milliseconds. At the end it resumes suspended processes, waits until all workers make
+//! progress, stops the run as a user would, and compares its files with the journals
+//! (`post_run_checks`).
 
 mod checker;
+mod fault_injector;
 pub mod journal;
 mod journals;
-mod nemesis;
 mod post_run_checks;
 mod report;
+mod run_under_test;
 mod samples;
 mod schedule;
-mod subject;
 mod timeline;
 mod trial;
 mod violations;
@@ -31,12 +35,12 @@ use anyhow::Context;
 use dmprl_run::RunDirectory;
 use dmprl_run::{Progress, Watch};
 pub use report::Report;
-use subject::Subject;
+use run_under_test::RunUnderTest;
 use trial::Trial;
 
-/// Plan of a trial.
+/// Settings of a trial.
 pub struct TrialPlan {
-    /// Program of all processes: this one.
+    /// Path of this program, which also runs the run's processes.
     pub program: PathBuf,
     /// Task to train.
     pub task: String,
@@ -50,15 +54,15 @@ pub struct TrialPlan {
     pub worker_kills: u64,
     /// Minimum number of learner kills.
     pub learner_kills: u64,
-    /// Folder for all files, which is kept. `None` for a temporary folder, which is kept only if a
-    /// check fails.
+    /// Folder for all files, which is kept. With `None`, a temporary folder is used, which is kept
+    /// only if a check fails.
     pub output: Option<PathBuf>,
 }
 
 /// Runs a trial and checks it.
 ///
 /// # Errors
-/// The trial itself failed. Violations are in the report, not errors.
+/// The trial itself fails. Violations are not errors, but part of the report.
 pub fn chaos(plan: &TrialPlan, progress: &dyn Progress) -> anyhow::Result<Report> {
     let watch = Watch::start()?;
     let (folder, temporary) = match &plan.output {
@@ -69,26 +73,26 @@ pub fn chaos(plan: &TrialPlan, progress: &dyn Progress) -> anyhow::Result<Report
             (std::fs::canonicalize(folder).context("cannot resolve --output")?, None)
         }
         None => {
-            let made = tempfile::Builder::new().prefix("dmprl-chaos-").tempdir();
-            let made = made.context("cannot make a temporary folder")?;
-            (made.path().to_owned(), Some(made))
+            let created = tempfile::Builder::new().prefix("dmprl-chaos-").tempdir();
+            let created = created.context("cannot make a temporary folder")?;
+            (created.path().to_owned(), Some(created))
         }
     };
-    let tried = Subject::start(plan, &folder)
-        .and_then(|subject| Trial::new(plan, subject))
+    let result = RunUnderTest::start(plan, &folder)
+        .and_then(|run| Trial::new(plan, run))
         .and_then(|trial| trial.run(&watch, progress));
-    let mut report = match tried {
+    let mut report = match result {
         Ok(report) => report,
         Err(error) => {
-            // The files show the reason.
+            // Keep the files, which show the reason.
             let _ = temporary.map(tempfile::TempDir::keep);
             return Err(error.context(format!("the trial failed; see {}", folder.display())));
         }
     };
     let kept = plan.output.is_some() || !report.is_sound();
     report.kept = kept.then(|| folder.display().to_string());
-    if let Some(made) = temporary.filter(|_| kept) {
-        let _ = made.keep();
+    if let Some(created) = temporary.filter(|_| kept) {
+        let _ = created.keep();
     }
     Ok(report)
 }

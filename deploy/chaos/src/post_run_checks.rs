@@ -1,5 +1,4 @@
-//! Checks the state that a stopped run leaves behind: its last checkpoint, its metrics, no
-//! leftovers.
+//! Checks a stopped run: its last checkpoint, its metrics, and that it has cleaned up.
 
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
@@ -12,21 +11,21 @@ use dmprl_run::Setup;
 use dmprl_supervisor::members::of_session;
 use rustix::process::Pid;
 
-use super::checker::{Checker, Sums};
+use super::checker::{Checker, SegmentTotals};
 use super::samples::shared_memory;
 use super::violations::Violations;
-use crate::journal::Standing;
+use crate::journal::LearnerCounters;
 
-/// Time within which the processes of a finished run must be gone.
-const GONE: Duration = Duration::from_secs(10);
+/// Time limit for all processes of a finished run to exit.
+const EXIT_TIMEOUT: Duration = Duration::from_secs(10);
 /// Interval between checks.
-const LOOK: Duration = Duration::from_millis(20);
+const POLL_INTERVAL: Duration = Duration::from_millis(20);
 
 /// Compares the files on disk with the journals (I1, I5, I9).
-pub(super) fn check_files(run: &Path, checker: &Checker, sums: &Sums) -> Violations {
+pub(super) fn check_files(run: &Path, checker: &Checker, sums: &SegmentTotals) -> Violations {
     let mut violations = Violations::default();
     let checked = check_checkpoint(run, checker, &mut violations)
-        .and_then(|()| check_metrics(run, checker.standing(), sums, &mut violations));
+        .and_then(|()| check_metrics(run, checker.counters(), sums, &mut violations));
     if let Err(error) = checked {
         violations.add(format!("I5: {error:#}"));
     }
@@ -43,25 +42,26 @@ fn check_checkpoint(
     let fresh = || Learner::new(setup.config.clone(), &spec, setup.run_id);
     let (learner, loaded) = checkpoint::load_newest(&setup.run.checkpoints_path(), &fresh)?;
     violations
-        .extend(loaded.rejected.iter().map(|why| format!("I5: a checkpoint is refused: {why}")));
-    let (found, expected) = (Standing::from(&learner.counters), checker.standing());
-    // Updates are only in metrics.jsonl: the journal counts segments.
+        .extend(loaded.rejected.iter().map(|why| format!("I5: a checkpoint was rejected: {why}")));
+    let (found, expected) = (LearnerCounters::from(&learner.counters), checker.counters());
+    // Not compared: the number of updates, because the journal has only segments.
     if (found.env_steps, found.segments) != (expected.env_steps, expected.segments) {
         violations.add(format!(
-            "I5: the last checkpoint is of {found:?}, the last learner came to {expected:?}"
+            "I5: the last checkpoint has {found:?}, the last learner reached {expected:?}"
         ));
     }
     let (found, expected) = (learner.inbox.settled(), checker.settled());
     if found != expected {
-        violations.add(format!("I1: the last checkpoint has {found:?}, inserted was {expected:?}"));
+        violations
+            .add(format!("I1: the last checkpoint has {found:?}, inserted were {expected:?}"));
     }
     Ok(())
 }
 
 fn check_metrics(
     run: &Path,
-    standing: Standing,
-    sums: &Sums,
+    counters: LearnerCounters,
+    sums: &SegmentTotals,
     violations: &mut Violations,
 ) -> anyhow::Result<()> {
     let path = run.join("metrics.jsonl");
@@ -89,9 +89,9 @@ fn check_metrics(
         last = Some(line);
     }
     let last = last.context("metrics.jsonl is empty")?;
-    if (last.env_steps, last.segments) != (standing.env_steps, standing.segments) {
+    if (last.env_steps, last.segments) != (counters.env_steps, counters.segments) {
         violations.add(format!(
-            "I5: metrics.jsonl ends at {} steps and {} segments, the last learner at {standing:?}",
+            "I5: metrics.jsonl ends at {} steps and {} segments, the last learner at {counters:?}",
             last.env_steps, last.segments
         ));
     }
@@ -100,12 +100,12 @@ fn check_metrics(
     }
     if last.rejected.total() > sums.rejected {
         violations.add(format!(
-            "I9: metrics.jsonl counts {} refused segments, the journals {}",
+            "I9: metrics.jsonl counts {} rejected segments, the journals {}",
             last.rejected.total(),
             sums.rejected
         ));
     }
-    // Workers report once per second; counts not yet reported die with them.
+    // May be lower: workers report once per second, so a killed worker's last counts are missing.
     let delivery = last.delivery;
     if delivery.produced > sums.produced || delivery.acked > sums.acknowledged {
         violations.add(format!("I9: metrics.jsonl counts more than the journals: {delivery:?}"));
@@ -113,35 +113,35 @@ fn check_metrics(
     Ok(())
 }
 
-/// Looks for leftovers of the run (I8): processes, shared memory, temporary files.
+/// Checks for leftovers of the run (I8): processes, shared memory, temporary files.
 pub(super) fn check_leftovers(
     run: &Path,
     run_id: &str,
     session: Pid,
 ) -> anyhow::Result<Violations> {
     let mut violations = Violations::default();
-    let deadline = Instant::now() + GONE;
+    let deadline = Instant::now() + EXIT_TIMEOUT;
     let processes = loop {
         let processes = of_session(session)?;
         if processes.is_empty() || Instant::now() >= deadline {
             break processes;
         }
-        std::thread::sleep(LOOK);
+        std::thread::sleep(POLL_INTERVAL);
     };
     if !processes.is_empty() {
-        violations.add(format!("I8: processes are left: {}", processes.join(", ")));
+        violations.add(format!("I8: processes are still running: {}", processes.join(", ")));
     }
     for path in shared_memory(run_id) {
-        violations.add(format!("I8: shared memory is left: {}", path.display()));
+        violations.add(format!("I8: shared memory was not removed: {}", path.display()));
     }
-    for path in temporaries(run) {
-        violations.add(format!("I8: a temporary file is left: {}", path.display()));
+    for path in temporary_files(run) {
+        violations.add(format!("I8: a temporary file was not removed: {}", path.display()));
     }
     Ok(violations)
 }
 
-/// Lists files and folders below a folder that still have their temporary names.
-fn temporaries(folder: &Path) -> Vec<PathBuf> {
+/// Lists the files and folders below a folder that still have their temporary names.
+fn temporary_files(folder: &Path) -> Vec<PathBuf> {
     let entries = folder.read_dir().into_iter().flatten().flatten();
     let mut found = Vec::new();
     for path in entries.map(|entry| entry.path()) {
@@ -149,7 +149,7 @@ fn temporaries(folder: &Path) -> Vec<PathBuf> {
         if extension.strip_prefix("tmp").is_some_and(|id| id.bytes().all(|b| b.is_ascii_digit())) {
             found.push(path);
         } else if path.is_dir() && !path.is_symlink() {
-            found.extend(temporaries(&path));
+            found.extend(temporary_files(&path));
         }
     }
     found
@@ -164,7 +164,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn what_was_written_aside_is_found_wherever_it_lies() {
+    fn temporary_files_are_found_in_all_folders() {
         let folder = tempfile::tempdir().unwrap();
         let run = folder.path();
         std::fs::create_dir_all(run.join("checkpoints/.000012.tmp")).unwrap();
@@ -175,15 +175,15 @@ mod tests {
         for name in ["segments.tmp", "config.tmp123", "checkpoints/000011/networks.tmp"] {
             std::fs::write(run.join(name), "").unwrap();
         }
-        assert_eq!(temporaries(run).len(), 4);
-        // No process has a session with this id: process ids are smaller.
-        let nobody = Pid::from_raw(i32::MAX).unwrap();
-        let violations = check_leftovers(run, "no such run", nobody).unwrap();
+        assert_eq!(temporary_files(run).len(), 4);
+        // No session has this id, because process ids are smaller.
+        let no_session = Pid::from_raw(i32::MAX).unwrap();
+        let violations = check_leftovers(run, "no such run", no_session).unwrap();
         assert_eq!(violations.count(), 4);
     }
 
     #[test]
-    fn a_process_that_is_left_is_found() {
+    fn running_processes_of_the_session_are_found() {
         let session = rustix::process::getsid(None).unwrap();
         let pipe = std::process::Stdio::piped;
         let mut child = std::process::Command::new("cat").stdin(pipe()).spawn().unwrap();
@@ -199,13 +199,18 @@ mod tests {
         let lines: Vec<String> = rows.iter().map(Value::to_string).collect();
         std::fs::write(folder.path().join("metrics.jsonl"), lines.join("\n")).unwrap();
         let mut violations = Violations::default();
-        let sums = Sums { produced: 25, acknowledged: 20, inserted: 20, ..Sums::default() };
-        let standing = Standing { env_steps: 100, updates: 0, segments: 20 };
-        check_metrics(folder.path(), standing, &sums, &mut violations).unwrap();
+        let sums = SegmentTotals {
+            produced: 25,
+            acknowledged: 20,
+            inserted: 20,
+            ..SegmentTotals::default()
+        };
+        let counters = LearnerCounters { env_steps: 100, updates: 0, segments: 20 };
+        check_metrics(folder.path(), counters, &sums, &mut violations).unwrap();
         violations.into_sentences()
     }
 
-    /// A line as the learner writes it.
+    /// Returns a line of metrics as the learner writes it.
     fn line(env_steps: u64, updates: u64) -> Value {
         let mut config = ExperimentConfig::default();
         config.actors.workers = 1;
@@ -228,7 +233,7 @@ mod tests {
     }
 
     #[test]
-    fn i5_metrics_that_go_back_are_found() {
+    fn i5_decreasing_metrics_are_found() {
         assert_eq!(metrics(&[line(50, 4), line(100, 9)]), Vec::<String>::new());
         let found = metrics(&[line(50, 10), line(100, 9)]);
         assert!(found.len() == 1 && found[0].starts_with("I5: metrics.jsonl goes"), "{found:?}");
@@ -237,7 +242,7 @@ mod tests {
     }
 
     #[test]
-    fn i1_and_i9_counts_of_metrics_that_the_journals_contradict_are_found() {
+    fn i1_and_i9_metrics_that_contradict_the_journals_are_found() {
         let mut wrong = line(100, 9);
         wrong["lost"] = 2.into();
         assert!(metrics(&[wrong])[0].starts_with("I1: metrics.jsonl counts 2 lost"));

@@ -2,25 +2,25 @@
 
 use serde_json::{Value, json};
 
-use super::checker::Sums;
-use super::nemesis::Done;
+use super::checker::SegmentTotals;
+use super::fault_injector::FaultCounts;
 use super::samples::{Samples, median};
 
 /// Result of a trial.
 pub struct Report {
     pub(super) seed: u64,
     pub(super) workers: u32,
-    /// Time from the first to the last strike [s].
+    /// Duration of the fault injection [s].
     pub(super) seconds: f64,
     pub(super) interrupted: bool,
-    pub(super) done: Done,
+    pub(super) faults: FaultCounts,
     pub(super) violations: Vec<String>,
-    pub(super) sums: Sums,
+    pub(super) sums: SegmentTotals,
     pub(super) env_steps: u64,
     pub(super) checkpoints: u64,
     pub(super) worker_back_s: Vec<f64>,
     pub(super) learner_back_s: Vec<f64>,
-    /// Segments of each worker while no fault was active, and the duration of that time [s].
+    /// Segments of each worker while no fault was active, and the length of that time [s].
     pub(super) undisturbed: Vec<u64>,
     pub(super) undisturbed_s: f64,
     pub(super) samples: Samples,
@@ -35,37 +35,45 @@ impl Report {
         self.violations.is_empty()
     }
 
-    /// Returns true if the user ended the trial.
+    /// Returns true if the user interrupted the trial.
     #[must_use]
     pub fn is_interrupted(&self) -> bool {
         self.interrupted
     }
 
-    /// Most over fewest segments of a worker while no fault was active.
+    /// Returns the largest number of segments of a worker divided by the smallest, counted while no
+    /// fault was active.
     fn fairness(&self) -> Option<f64> {
         let (most, fewest) = (self.undisturbed.iter().max()?, self.undisturbed.iter().min()?);
         (*fewest > 0).then(|| *most as f64 / *fewest as f64)
     }
 
-    /// The report as one JSON object.
+    /// Returns the report as one JSON object.
     #[must_use]
     pub fn json(&self) -> Value {
-        let Sums { produced, inserted, rejected, in_flight, lost, duplicate, acknowledged } =
-            self.sums;
-        let done = &self.done;
+        let SegmentTotals {
+            produced,
+            inserted,
+            rejected,
+            in_flight,
+            lost,
+            duplicate,
+            acknowledged,
+        } = self.sums;
+        let faults = &self.faults;
         let mut object = json!({
             "seed": self.seed,
             "workers": self.workers,
             "seconds": self.seconds,
             "interrupted": self.interrupted,
             "violations": self.violations,
-            "worker_kills": done.worker_kills,
-            "learner_kills": done.learner_kills,
-            "learner_kills_in_recovery": done.learner_kills_in_recovery,
-            "learner_kills_in_checkpoint": done.learner_kills_in_checkpoint,
-            "evaluator_kills": done.evaluator_kills,
-            "stops": done.stops,
-            "strikes_left_out": done.left_out,
+            "worker_kills": faults.worker_kills,
+            "learner_kills": faults.learner_kills,
+            "learner_kills_in_recovery": faults.learner_kills_in_recovery,
+            "learner_kills_in_checkpoint": faults.learner_kills_in_checkpoint,
+            "evaluator_kills": faults.evaluator_kills,
+            "stops": faults.stops,
+            "strikes_left_out": faults.skipped,
             "produced": produced,
             "inserted": inserted,
             "rejected": rejected,
@@ -75,8 +83,8 @@ impl Report {
             "acknowledged": acknowledged,
             "env_steps": self.env_steps,
             "checkpoints": self.checkpoints,
-            "worker_back_s": back(&self.worker_back_s),
-            "learner_back_s": back(&self.learner_back_s),
+            "worker_back_s": recovery_json(&self.worker_back_s),
+            "learner_back_s": recovery_json(&self.learner_back_s),
             "fairness": self.fairness(),
             "undisturbed_s": self.undisturbed_s,
             "held": self.samples.summary(),
@@ -88,39 +96,40 @@ impl Report {
         object
     }
 
-    /// The report as text for people.
+    /// Returns the report as text.
     #[must_use]
     pub fn text(&self) -> String {
-        let Sums { produced, inserted, rejected, in_flight, lost, duplicate, .. } = self.sums;
-        let done = &self.done;
+        let SegmentTotals { produced, inserted, rejected, in_flight, lost, duplicate, .. } =
+            self.sums;
+        let faults = &self.faults;
         let mut lines = vec![
             format!(
                 "killed       {} workers, {} learners ({} recovering, {} writing a checkpoint), {} \
-                 evaluators; stopped {} times",
-                done.worker_kills,
-                done.learner_kills,
-                done.learner_kills_in_recovery,
-                done.learner_kills_in_checkpoint,
-                done.evaluator_kills,
-                done.stops
+                 evaluators; suspended processes {} times",
+                faults.worker_kills,
+                faults.learner_kills,
+                faults.learner_kills_in_recovery,
+                faults.learner_kills_in_checkpoint,
+                faults.evaluator_kills,
+                faults.stops
             ),
             format!(
                 "segments     {produced} produced = {inserted} inserted + {rejected} rejected + \
-                 {in_flight} in flight + {lost} lost; {duplicate} came twice and were refused"
+                 {in_flight} in flight + {lost} lost; {duplicate} duplicates rejected"
             ),
-            format!("worker back  {}", shown(&self.worker_back_s)),
-            format!("learner back {}", shown(&self.learner_back_s)),
+            format!("worker back  {}", recovery_text(&self.worker_back_s)),
+            format!("learner back {}", recovery_text(&self.learner_back_s)),
             format!(
-                "fairness     {} between {} workers, in {:.0} s undisturbed",
+                "fairness     {} between {} workers, in {:.0} s without faults",
                 number(self.fairness()),
                 self.workers,
                 self.undisturbed_s
             ),
         ];
-        let grown = self.samples.ratios();
-        let grown: Vec<_> =
-            grown.iter().map(|(name, ratio)| format!("{name} {}", number(*ratio))).collect();
-        lines.push(format!("grown        {}", grown.join(", ")));
+        let growth = self.samples.ratios();
+        let growth: Vec<_> =
+            growth.iter().map(|(name, ratio)| format!("{name} {}", number(*ratio))).collect();
+        lines.push(format!("growth       {}", growth.join(", ")));
         match self.violations.len() {
             0 => lines
                 .push(format!("violations   none in {:.0} s, seed {}", self.seconds, self.seed)),
@@ -134,12 +143,12 @@ impl Report {
     }
 }
 
-fn back(seconds: &[f64]) -> Value {
+fn recovery_json(seconds: &[f64]) -> Value {
     let max = seconds.iter().copied().reduce(f64::max);
     json!({ "count": seconds.len(), "p50": median(seconds), "max": max })
 }
 
-fn shown(seconds: &[f64]) -> String {
+fn recovery_text(seconds: &[f64]) -> String {
     let max = seconds.iter().copied().reduce(f64::max);
     let (count, p50) = (seconds.len(), number(median(seconds)));
     format!("after {p50} s (median of {count}), at most {} s", number(max))

@@ -1,4 +1,4 @@
-//! Samples the run's resources over time: memory, files, maps, shared memory.
+//! Samples the run's resources over time: memory, open files, memory maps, shared memory.
 
 use std::fs;
 use std::os::unix::fs::MetadataExt;
@@ -14,12 +14,12 @@ const INTERVAL_US: u64 = 1_000_000;
 /// Minimum number of samples to judge growth.
 const SAMPLES_MIN: usize = 9;
 
-/// Values in the order of sampling; four hours have 14 400.
+/// Values in the order of sampling: 14,400 in four hours.
 #[derive(Debug, Clone, Default)]
 struct Series(Vec<f64>);
 
 impl Series {
-    /// Median of the last third divided by the median of the first.
+    /// Median of the last third divided by the median of the first third.
     fn ratio(&self) -> Option<f64> {
         let third = self.0.len() / 3;
         if self.0.len() < SAMPLES_MIN {
@@ -36,27 +36,27 @@ impl Series {
     }
 }
 
-/// The middle value; the upper of two.
+/// Returns the median, or the upper of the two middle values. `None` if there are no values.
 pub(super) fn median(numbers: &[f64]) -> Option<f64> {
     let mut sorted = numbers.to_vec();
     sorted.sort_by(f64::total_cmp);
     sorted.get(sorted.len() / 2).copied()
 }
 
-/// Samples of one kind of process.
+/// Samples of one process.
 #[derive(Debug, Clone, Default)]
-struct Kind {
+struct ProcessSamples {
     rss: Series,
     fds: Series,
     maps: Series,
 }
 
-impl Kind {
+impl ProcessSamples {
     fn add(&mut self, pid: Pid) {
-        if let Some(held) = holdings(pid) {
-            self.rss.0.push(held.rss_kib as f64);
-            self.fds.0.push(held.fds as f64);
-            self.maps.0.push(held.maps as f64);
+        if let Some(resources) = holdings(pid) {
+            self.rss.0.push(resources.rss_kib as f64);
+            self.fds.0.push(resources.fds as f64);
+            self.maps.0.push(resources.maps as f64);
         }
     }
 
@@ -71,14 +71,14 @@ impl Kind {
 pub(super) struct Samples {
     run_id: String,
     next_us: u64,
-    supervisor: Kind,
-    learner: Kind,
+    supervisor: ProcessSamples,
+    learner: ProcessSamples,
     shm: Series,
 }
 
 impl Samples {
     pub(super) fn new(run_id: String) -> Self {
-        let (supervisor, learner) = (Kind::default(), Kind::default());
+        let (supervisor, learner) = (ProcessSamples::default(), ProcessSamples::default());
         Self { run_id, next_us: 0, supervisor, learner, shm: Series::default() }
     }
 
@@ -87,8 +87,8 @@ impl Samples {
         now_us >= self.next_us
     }
 
-    /// Takes a sample. `learner` is `None` unless a learner is working and its replay is full; then
-    /// shared memory is sampled too.
+    /// Takes a sample of the supervisor, and of the learner and the shared memory if `learner` is
+    /// given. It must only be given while the learner works and its replay is full.
     pub(super) fn take(&mut self, now_us: u64, supervisor: Pid, learner: Option<Pid>) {
         self.next_us = now_us + INTERVAL_US;
         self.supervisor.add(supervisor);
@@ -99,16 +99,16 @@ impl Samples {
         }
     }
 
-    /// The larger of the supervisor's and the learner's ratio, since neither may grow.
+    /// Returns the growth of each resource: the larger of the supervisor's and the learner's ratio.
     pub(super) fn ratios(&self) -> [(&'static str, Option<f64>); 4] {
-        let larger = |of: fn(&Kind) -> &Series| {
+        let larger = |of: fn(&ProcessSamples) -> &Series| {
             let both = [of(&self.supervisor).ratio(), of(&self.learner).ratio()];
             both.into_iter().flatten().reduce(f64::max)
         };
         [
-            ("rss_ratio", larger(|kind| &kind.rss)),
-            ("fds_ratio", larger(|kind| &kind.fds)),
-            ("maps_ratio", larger(|kind| &kind.maps)),
+            ("rss_ratio", larger(|samples| &samples.rss)),
+            ("fds_ratio", larger(|samples| &samples.fds)),
+            ("maps_ratio", larger(|samples| &samples.maps)),
             ("shm_ratio", self.shm.ratio()),
         ]
     }
@@ -119,7 +119,7 @@ impl Samples {
     }
 }
 
-/// Lists the shared memory of a run.
+/// Lists the shared-memory folders of a run.
 pub(super) fn shared_memory(run_id: &str) -> Vec<PathBuf> {
     let (folder, _) = Place::of_this_user().standard();
     let entries = fs::read_dir(folder).into_iter().flatten().flatten();
@@ -127,7 +127,7 @@ pub(super) fn shared_memory(run_id: &str) -> Vec<PathBuf> {
     entries.map(|entry| entry.path()).filter(named).collect()
 }
 
-/// Size of a folder in bytes. Files that disappear meanwhile do not count.
+/// Returns the size of a folder in bytes, without files that disappear meanwhile.
 fn bytes(path: &Path) -> u64 {
     let Ok(metadata) = path.symlink_metadata() else { return 0 };
     if !metadata.is_dir() {
@@ -142,7 +142,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_ratio_is_of_the_last_third_to_the_first() {
+    fn ratio_compares_the_last_third_with_the_first() {
         let flat = Series(vec![5.0; 30]);
         assert_eq!(flat.ratio(), Some(1.0));
         let grown = Series((0..30).map(|n| if n < 15 { 10.0 } else { 11.0 }).collect());

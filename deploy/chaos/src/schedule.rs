@@ -1,16 +1,18 @@
-//! Generates a schedule of faults, times and victims from a seed.
+//! Generates a schedule of faults, with times and victims, from a seed.
+
+use std::ops::RangeInclusive;
 
 use dmprl_shared::seeds::{self, Stream};
 use rand::RngExt;
 use rand::seq::SliceRandom;
 
-/// Minimum and maximum pause between two strikes [ms].
-const PAUSE_MS: (u64, u64) = (300, 1_500);
-/// Minimum and maximum time for which a process is suspended [ms].
-const STOP_MS: (u64, u64) = (200, 2_000);
-/// Minimum and maximum delay after which a newly started learner is killed again [ms].
-const AGAIN_MS: (u64, u64) = (0, 600);
-/// Time without faults, in which undisturbed work is measured [ms].
+/// Range of the pause before a fault [ms].
+const PAUSE_MS: RangeInclusive<u64> = 300..=1_500;
+/// Range of the time for which a process is suspended [ms].
+const SUSPENSION_MS: RangeInclusive<u64> = 200..=2_000;
+/// Range of the delay after which a newly started learner is killed again [ms].
+const KILL_AGAIN_MS: RangeInclusive<u64> = 0..=600;
+/// Time without faults, in which the workers' fairness is measured [ms].
 const REST_MS: u64 = 4_000;
 
 /// A fault to inject.
@@ -20,14 +22,14 @@ pub(super) enum Fault {
     KillWorker {
         /// Index of the worker.
         worker: u32,
-        /// True if it may still be starting.
+        /// True if the worker may still be starting.
         early: bool,
     },
     /// SIGKILL to all workers at once.
     KillWorkers,
     /// SIGKILL to the learner.
     KillLearner,
-    /// SIGKILL to the learner, and again while its successor starts.
+    /// SIGKILL to the learner, and to its successor while that starts.
     KillLearnerTwice {
         /// Delay after the successor's start.
         after_ms: u64,
@@ -48,31 +50,44 @@ pub(super) enum Fault {
     },
     /// SIGKILL to the evaluator.
     KillEvaluator,
-    /// No fault.
+    /// A time without faults.
     Rest {
         /// Duration after the recovery from the last fault.
         for_ms: u64,
     },
 }
 
+impl Fault {
+    /// Returns true if the fault kills or suspends the learner.
+    pub(super) fn targets_learner(self) -> bool {
+        matches!(
+            self,
+            Self::KillLearner
+                | Self::KillLearnerTwice { .. }
+                | Self::KillLearnerInCheckpoint
+                | Self::StopLearner { .. }
+        )
+    }
+}
+
 /// A fault and the pause before it.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) struct Strike {
+pub(super) struct ScheduledFault {
     pub(super) pause_ms: u64,
     pub(super) fault: Fault,
 }
 
-/// Endless sequence of strikes, in rounds that contain every kind of fault in random order.
+/// Endless sequence of faults, in rounds that contain every kind of fault in random order.
 #[derive(Debug)]
 pub(super) struct Schedule {
     random: Stream,
     workers: u32,
     /// The remaining faults of the current round.
-    round: Vec<Kind>,
+    round: Vec<FaultKind>,
 }
 
 #[derive(Debug, Clone, Copy)]
-enum Kind {
+enum FaultKind {
     Worker { early: bool },
     Workers,
     Learner,
@@ -84,18 +99,18 @@ enum Kind {
     Rest,
 }
 
-/// Faults of a round: about ten workers are killed for each learner.
-const ROUND: [(Kind, usize); 10] = [
-    (Kind::Worker { early: false }, 22),
-    (Kind::Worker { early: true }, 8),
-    (Kind::Workers, 3),
-    (Kind::Learner, 1),
-    (Kind::LearnerTwice, 1),
-    (Kind::InCheckpoint, 1),
-    (Kind::StopWorker, 2),
-    (Kind::StopLearner, 1),
-    (Kind::Evaluator, 1),
-    (Kind::Rest, 1),
+/// Kinds of faults in a round and how often each occurs. About ten workers are killed per learner.
+const ROUND: [(FaultKind, usize); 10] = [
+    (FaultKind::Worker { early: false }, 22),
+    (FaultKind::Worker { early: true }, 8),
+    (FaultKind::Workers, 3),
+    (FaultKind::Learner, 1),
+    (FaultKind::LearnerTwice, 1),
+    (FaultKind::InCheckpoint, 1),
+    (FaultKind::StopWorker, 2),
+    (FaultKind::StopLearner, 1),
+    (FaultKind::Evaluator, 1),
+    (FaultKind::Rest, 1),
 ];
 
 impl Schedule {
@@ -103,42 +118,41 @@ impl Schedule {
         Self { random: seeds::stream(seed, "chaos", 0), workers, round: Vec::new() }
     }
 
-    fn kind(&mut self) -> Kind {
+    fn kind(&mut self) -> FaultKind {
         if self.round.is_empty() {
             for (kind, count) in ROUND {
                 self.round.extend(std::iter::repeat_n(kind, count));
             }
             self.round.shuffle(&mut self.random);
         }
-        self.round.pop().unwrap_or(Kind::Learner)
+        self.round.pop().unwrap_or(FaultKind::Learner)
     }
 
-    fn between(&mut self, (least, most): (u64, u64)) -> u64 {
-        self.random.random_range(least..=most)
+    fn draw(&mut self, range: RangeInclusive<u64>) -> u64 {
+        self.random.random_range(range)
     }
 }
 
 impl Iterator for Schedule {
-    type Item = Strike;
+    type Item = ScheduledFault;
 
-    fn next(&mut self) -> Option<Strike> {
+    fn next(&mut self) -> Option<ScheduledFault> {
         let kind = self.kind();
-        // Always draws the same number of values, whether or not the fault needs them.
-        let (pause_ms, worker) =
-            (self.between(PAUSE_MS), self.random.random_range(0..self.workers));
-        let (stop_ms, after_ms) = (self.between(STOP_MS), self.between(AGAIN_MS));
+        // Always draws the same number of values, so that all kinds advance the stream equally.
+        let (pause_ms, worker) = (self.draw(PAUSE_MS), self.random.random_range(0..self.workers));
+        let (for_ms, after_ms) = (self.draw(SUSPENSION_MS), self.draw(KILL_AGAIN_MS));
         let fault = match kind {
-            Kind::Worker { early } => Fault::KillWorker { worker, early },
-            Kind::Workers => Fault::KillWorkers,
-            Kind::Learner => Fault::KillLearner,
-            Kind::LearnerTwice => Fault::KillLearnerTwice { after_ms },
-            Kind::InCheckpoint => Fault::KillLearnerInCheckpoint,
-            Kind::StopWorker => Fault::StopWorker { worker, for_ms: stop_ms },
-            Kind::StopLearner => Fault::StopLearner { for_ms: stop_ms },
-            Kind::Evaluator => Fault::KillEvaluator,
-            Kind::Rest => Fault::Rest { for_ms: REST_MS },
+            FaultKind::Worker { early } => Fault::KillWorker { worker, early },
+            FaultKind::Workers => Fault::KillWorkers,
+            FaultKind::Learner => Fault::KillLearner,
+            FaultKind::LearnerTwice => Fault::KillLearnerTwice { after_ms },
+            FaultKind::InCheckpoint => Fault::KillLearnerInCheckpoint,
+            FaultKind::StopWorker => Fault::StopWorker { worker, for_ms },
+            FaultKind::StopLearner => Fault::StopLearner { for_ms },
+            FaultKind::Evaluator => Fault::KillEvaluator,
+            FaultKind::Rest => Fault::Rest { for_ms: REST_MS },
         };
-        Some(Strike { pause_ms, fault })
+        Some(ScheduledFault { pause_ms, fault })
     }
 }
 
@@ -147,14 +161,14 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_seed_is_a_schedule_and_another_seed_another() {
-        let strikes = |seed| Schedule::new(seed, 3).take(100).collect::<Vec<_>>();
-        assert_eq!(strikes(1), strikes(1));
-        assert_ne!(strikes(1), strikes(2));
+    fn schedule_depends_only_on_the_seed() {
+        let schedule = |seed| Schedule::new(seed, 3).take(100).collect::<Vec<_>>();
+        assert_eq!(schedule(1), schedule(1));
+        assert_ne!(schedule(1), schedule(2));
     }
 
     #[test]
-    fn every_round_strikes_everybody() {
+    fn every_round_has_faults_of_every_process() {
         let len = ROUND.iter().map(|(_, count)| count).sum();
         for seed in 0..20 {
             let round: Vec<_> = Schedule::new(seed, 2).take(len).map(|it| it.fault).collect();

@@ -1,7 +1,7 @@
-//! The `dmprl` program: its commands, the roles of its processes, and what it shows on a terminal.
+//! The `dmprl` program: its commands, the roles of its processes, and its terminal output.
 //!
-//! One binary plays every part: `dmprl train` starts itself again as `dmprl learner`, `dmprl actor`
-//! and `dmprl evaluator`, and exchanges the lines of `dmprl-control` with them.
+//! All processes of a run are this program: `dmprl train` starts `dmprl learner`, `dmprl actor` and
+//! `dmprl evaluator`, and exchanges JSON lines with them as defined in `dmprl-control`.
 
 pub mod cli;
 mod doctor;

@@ -1,4 +1,4 @@
-//! The `dmprl` program; everything is in the library, where tests reach it.
+//! The `dmprl` program. Everything is in the library, so that tests can use it.
 
 use std::process::ExitCode;
 

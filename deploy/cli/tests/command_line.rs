@@ -1,4 +1,4 @@
-//! The program as a user types it: help, refusals, exit statuses.
+//! Tests the command line: help, usage errors and exit statuses.
 #![allow(clippy::unwrap_used)] // helpers of tests fail as tests do
 
 use std::path::Path;
@@ -15,7 +15,7 @@ fn stdout(output: &Output) -> String {
     String::from_utf8(output.stdout.clone()).unwrap()
 }
 
-/// Runs what must be refused with status 2; returns what it says.
+/// Runs a command that must be rejected with status 2; returns its error message.
 fn refused(arguments: &[&str]) -> String {
     let output = dmprl(arguments);
     let said = String::from_utf8(output.stderr.clone()).unwrap();
@@ -39,7 +39,7 @@ fn every_command_has_help_with_examples() {
 }
 
 #[test]
-fn the_short_help_leaves_out_the_roles_and_the_long_one_explains_them() {
+fn only_the_long_help_lists_the_roles() {
     let short = stdout(&dmprl(&["-h"]));
     let long = stdout(&dmprl(&["--help"]));
     assert!(short.contains("train") && !short.contains("\n  learner "), "{short}");
@@ -48,7 +48,7 @@ fn the_short_help_leaves_out_the_roles_and_the_long_one_explains_them() {
 }
 
 #[test]
-fn wrong_use_names_the_nearest_right_one() {
+fn usage_errors_suggest_the_nearest_valid_value() {
     for (arguments, expected) in [
         (&["tain"][..], "'train'"),
         (&["train", "reachr"], "did you mean `reacher`"),
@@ -71,7 +71,7 @@ fn wrong_use_names_the_nearest_right_one() {
 }
 
 #[test]
-fn values_that_cannot_be_are_wrong_use() {
+fn invalid_values_are_usage_errors() {
     for arguments in [
         &["train"][..],
         &["train", "reacher", "--steps", "0"],
@@ -106,7 +106,7 @@ fn values_that_cannot_be_are_wrong_use() {
 }
 
 #[test]
-fn an_unknown_variable_of_ours_is_wrong_use() {
+fn an_unknown_dmprl_variable_is_a_usage_error() {
     let output = Command::new(env!("CARGO_BIN_EXE_dmprl"))
         .args(["train", "reacher"])
         .env("DMPRL_RUN__STEP", "5")
@@ -123,7 +123,7 @@ fn new_run(path: &Path) -> RunDirectory {
 }
 
 #[test]
-fn a_run_directory_in_use_is_refused_with_advice_before_anything_is_done() {
+fn a_run_directory_in_use_is_rejected_with_advice() {
     let parent = tempfile::tempdir().unwrap();
     let run = new_run(&parent.path().join("run"));
     let path = run.path().to_str().unwrap();
@@ -145,7 +145,7 @@ fn a_run_of_a_newer_format_fails_with_its_version() {
 }
 
 #[test]
-fn tasks_are_listed_for_people_and_for_programs() {
+fn tasks_are_listed_as_text_and_as_json() {
     let text = stdout(&dmprl(&["tasks"]));
     assert!(text.contains("reacher") && text.contains("Pusher-v5"), "{text}");
     let json: serde_json::Value =

@@ -1,6 +1,6 @@
-//! README, the book, ARCHITECTURE and the example configurations, held to what the program really
-//! has. Their code is run by `tests/tests/program/documents.rs`, the book built and its links
-//! followed by `tests/tests/book/main.rs`.
+//! Checks README, the book, ARCHITECTURE and the example configurations against the program.
+//! `tests/tests/program/documents.rs` runs their code, and `tests/book` builds the
+//! book and checks its links.
 #![allow(clippy::unwrap_used)] // helpers of tests fail as tests do
 
 use std::collections::BTreeSet;
@@ -13,11 +13,12 @@ use dmprl_shared::config::{ExperimentConfig, Layers, Limits, task_defaults};
 
 const EXAMPLES: &str = "docs/examples";
 const LIMITS: Limits = Limits { cores: 2 };
-/// How the program is called in the documents.
+/// Commands that call the program in the documents.
 const CALLS: [&str; 3] = ["cargo run --release -- ", "target/release/dmprl ", "dmprl "];
 /// Flags of other programs: cargo's, TensorBoard's, docker's, and those of Slurm's sbatch.
-const FOREIGN: [&str; 16] = [
+const FOREIGN: [&str; 17] = [
     "--bench",
+    "--package",
     "--features",
     "--release",
     "--check",
@@ -50,8 +51,7 @@ fn help(arguments: &[&str]) -> String {
     String::from_utf8(output.stdout).unwrap()
 }
 
-/// What people write: README, the pages of the book and what lies beside the code. What `report`
-/// has written in `docs/results` speaks for itself.
+/// Lists the handwritten documents. Pages that `report` has written in `docs/results` are excluded.
 fn documents() -> Vec<String> {
     let beside = ["README.md", "ARCHITECTURE.md", "CHANGELOG.md", "tests/FAULTS.md"];
     let mut documents: Vec<String> = beside.map(str::to_owned).into();
@@ -63,18 +63,18 @@ fn documents() -> Vec<String> {
             }
         }
     }
-    assert!(documents.len() > 20, "only {documents:?}: has the book moved?");
+    assert!(documents.len() > 20, "only {documents:?}; has the book moved?");
     documents
 }
 
-/// The long flags in a text.
+/// Returns the long flags in a text.
 fn flags(text: &str) -> BTreeSet<String> {
     let words = text.split(|letter: char| !letter.is_ascii_alphanumeric() && letter != '-');
     let long = words.filter(|word| word.starts_with("--") && word.len() > 2);
     long.map(str::to_owned).collect()
 }
 
-/// Code between single backticks, outside of fenced blocks.
+/// Returns code between single backticks, outside fenced blocks.
 fn spans(text: &str) -> Vec<String> {
     let mut spans = Vec::new();
     let mut fenced = false;
@@ -88,7 +88,7 @@ fn spans(text: &str) -> Vec<String> {
     spans
 }
 
-/// Fenced blocks of a language, whatever else stands behind its name.
+/// Returns the fenced blocks of a language, with or without attributes after its name.
 fn blocks(text: &str, language: &str) -> Vec<String> {
     let fence = format!("```{language}");
     let starts = text.split(fence.as_str()).skip(1);
@@ -97,20 +97,25 @@ fn blocks(text: &str, language: &str) -> Vec<String> {
     code.map(|(_, code)| code.split("\n```").next().unwrap_or_default().to_owned()).collect()
 }
 
-/// The section below a heading, up to the next heading of any level.
+/// Returns the section below a heading, up to the next heading of any level.
 fn section<'a>(text: &'a str, heading: &str) -> &'a str {
     let below = text.split_once(&format!("\n{heading}\n")).map(|(_, below)| below);
     let below = below.unwrap_or_else(|| panic!("no heading `{heading}`"));
     below.split("\n#").next().unwrap_or(below)
 }
 
-/// Code spans in the first cell of every row of a table.
+/// Returns the code spans in the first cell of every row of a table.
 fn first_cells(section: &str) -> BTreeSet<String> {
-    let rows = section.lines().filter(|line| line.starts_with("| `"));
-    rows.flat_map(|row| spans(row.split('|').nth(1).unwrap())).collect()
+    cells(section, 1)
 }
 
-/// As `train` merges them: the task's defaults, then the file.
+/// Code spans in a column of the tables, the first being 1.
+fn cells(section: &str, column: usize) -> BTreeSet<String> {
+    let rows = section.lines().filter(|line| line.starts_with("| "));
+    rows.filter_map(|row| row.split('|').nth(column)).flat_map(spans).collect()
+}
+
+/// Merges the task's defaults and the file, as `train` does.
 fn merged(text: &str, origin: &str) -> ExperimentConfig {
     let table: toml::Table = text.parse().unwrap_or_else(|error| panic!("{origin}: {error}"));
     let name = table.get("task").and_then(|task| task.get("name")).and_then(|name| name.as_str());
@@ -123,13 +128,13 @@ fn merged(text: &str, origin: &str) -> ExperimentConfig {
 }
 
 #[test]
-fn every_example_is_named_and_every_configuration_among_them_accepted() {
+fn every_example_is_documented_and_every_example_configuration_is_valid() {
     let texts: Vec<_> = documents().iter().map(|document| read(document)).collect();
     let mut seen = 0;
     for entry in std::fs::read_dir(root().join(EXAMPLES)).unwrap() {
         let entry = entry.unwrap();
         if !entry.file_type().unwrap().is_file() {
-            continue; // Python's cache, once the example has been trained
+            continue; // Python's bytecode cache
         }
         let name = entry.file_name().into_string().unwrap();
         let path = format!("examples/{name}");
@@ -148,11 +153,14 @@ fn every_example_is_named_and_every_configuration_among_them_accepted() {
 }
 
 #[test]
-fn the_table_of_commands_is_what_the_program_has() {
+fn the_table_of_commands_is_complete() {
     let readme = read("README.md");
-    let cells = first_cells(section(&readme, "## Commands"));
+    // The first column groups the commands.
+    let commands = cells(section(&readme, "## Commands"), 2);
+    let page = read("docs/commands.md");
+    let roles = first_cells(section(&page, "## Roles"));
     let documented: BTreeSet<_> =
-        cells.iter().map(|cell| cell.split(' ').next().unwrap().to_owned()).collect();
+        commands.union(&roles).map(|cell| cell.split(' ').next().unwrap().to_owned()).collect();
     let help = help(&[]);
     let listed = |heading: &str| {
         let below = help.split_once(heading).unwrap_or_else(|| panic!("no {heading} in help")).1;
@@ -162,7 +170,10 @@ fn the_table_of_commands_is_what_the_program_has() {
     let mut existing: BTreeSet<_> = listed("Commands:").into_iter().collect();
     existing.extend(listed("ROLES"));
     existing.remove("help");
-    assert_eq!(documented, existing, "README, `## Commands`, against `dmprl --help`");
+    assert_eq!(
+        documented, existing,
+        "README, `## Commands`, and docs/commands.md, `## Roles`, against `dmprl --help`"
+    );
 }
 
 #[test]
@@ -219,7 +230,7 @@ fn every_flag_that_is_shown_exists() {
             let exists = all.contains(&flag) || FOREIGN.contains(&flag.as_str());
             assert!(exists, "{document} shows {flag}, which no command has");
         }
-        // In a block the command is known, so the flag must be one of that command.
+        // In a block the command is known, so the flag must belong to this command.
         for line in blocks(&text, "sh").iter().flat_map(|block| block.lines()) {
             let call = CALLS.iter().find_map(|call| line.split_once(call)).map(|(_, rest)| rest);
             let Some(rest) = call else { continue };
@@ -267,7 +278,7 @@ fn every_configuration_key_that_is_named_exists() {
             seen += 1;
         }
     }
-    assert!(seen > 20, "only {seen} keys were recognised: has the notation changed?");
+    assert!(seen > 20, "only {seen} keys were recognised; has the notation changed?");
 }
 
 #[test]
@@ -331,7 +342,7 @@ fn the_keys_of_both_kinds_of_lines_are_documented() {
 }
 
 #[test]
-fn every_path_and_test_that_the_documents_name_is_there() {
+fn every_path_and_test_that_the_documents_name_exists() {
     const FOLDERS: [&str; 8] =
         ["actors/", "deploy/", "docs/", "envs_py/", "learner/", "shared/", "tests/", ".ci/"];
     for document in documents() {
@@ -349,14 +360,14 @@ fn every_path_and_test_that_the_documents_name_is_there() {
                 continue;
             }
             let (path, test) = name.split_once("::").unwrap_or((&name, ""));
-            // The book's test looks at headings of other pages.
+            // The book's test checks headings of other pages.
             let path = path.split('#').next().unwrap_or(path);
             // A link is relative to its document, a path in code to the project.
             let beside = Path::new(&document).parent().unwrap_or(Path::new(""));
             let there = [root().join(path), root().join(beside).join(path)];
             assert!(
                 there.iter().any(|path| path.exists()),
-                "{document} names {path}, which is not there"
+                "{document} names {path}, which does not exist"
             );
             let there = test.is_empty() || read(path).contains(&format!("fn {test}("));
             assert!(there, "{document} names the test {test}, which {path} does not have");
@@ -364,7 +375,7 @@ fn every_path_and_test_that_the_documents_name_is_there() {
     }
 }
 
-/// What a link to a heading is called.
+/// Returns the anchor of a heading.
 fn anchor_of(heading: &str) -> String {
     let words = heading.trim_start_matches('#').trim().to_lowercase();
     let kept = words.chars().filter(|letter| letter.is_alphanumeric() || " -_".contains(*letter));

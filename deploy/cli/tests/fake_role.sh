@@ -1,6 +1,7 @@
 #!/bin/sh
-# Plays learner, actor and evaluator for the supervisor's tests, as `RUN/fake/NAME` says.
-# It keeps its process id in RUN/fake/pids and what it was told in RUN/fake/NAME.seen.
+# Plays learner, actor and evaluator in tests of the supervisor. RUN/fake/NAME has its mode.
+# Appends its process id to RUN/fake/pids, and its starts and received commands to
+# RUN/fake/NAME.seen.
 trap '' INT TERM HUP
 role=$1
 shift
@@ -33,7 +34,7 @@ row() {
 evaluate() {
     echo '{"evaluate":{"env_steps":10,"updates":10,"segments":2,"wall_s":1.0,"policy_version":'"$1"'}}'
 }
-# Signs of life until the process ends; what it was told is noted meanwhile.
+# Sends heartbeats in the background until the process exits.
 beat() {
     (while kill -0 $$ 2>/dev/null; do echo '{"alive":{"doing":"stepping","kept":0}}'; sleep 0.1; done) &
 }
@@ -43,7 +44,7 @@ sent() {
 starts() {
     grep -c started "$fake/$name.seen"
 }
-# 0 on stop or finish, 1 at end of input.
+# Returns 0 on stop or finish, and 1 at the end of input.
 until_stop() {
     while read -r line; do
         echo "$line" >>"$fake/$name.seen"
@@ -60,7 +61,7 @@ finish() {
 case $role-$mode in
 *-silent) until_stop; exit 0 ;;
 *-stubborn)
-    # Ready, then deaf to everything but the end of input.
+    # Reports that it is ready, then ignores everything but the end of input.
     [ "$role" = learner ] && echo '"learner_ready"' || ready
     while read -r line; do :; done
     ;;
@@ -106,7 +107,7 @@ learner-until-stopped)
     until_stop && finish
     echo saved >"$fake/orphaned"
     ;;
-learner-told-of-failures)
+learner-until-five-failures)
     echo '"learner_ready"'
     while read -r line; do
         case $line in *'"total":5'*) finish ;; esac
@@ -119,7 +120,7 @@ learner-dies)
     kill -9 $$
     ;;
 learner-dies-once)
-    # In the middle of an evaluation, the first time.
+    # The first start dies during an evaluation.
     echo '"learner_ready"'
     progress 10
     if [ "$(grep -c started "$fake/$name.seen")" = 1 ]; then
@@ -132,7 +133,7 @@ learner-dies-once)
     finish
     ;;
 learner-dies-after-work)
-    # Lives for a while with a checkpoint in it, and comes to its end at the fourth start.
+    # Writes a checkpoint and runs for a while before each death; finishes at the fourth start.
     echo '"learner_ready"'
     [ "$(starts)" = 4 ] && finish
     echo '{"checkpoint":{"name":"001","env_steps":10}}'
@@ -156,7 +157,7 @@ learner-asks-for-the-lock)
     finish
     ;;
 learner-after-restarts)
-    # Comes to its end when both workers have been given up or restarted.
+    # Finishes when worker 0 has been restarted.
     echo '"learner_ready"'
     while ! grep -q 'started 1' "$fake/actor-0.seen"; do :; done
     finish

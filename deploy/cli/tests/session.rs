@@ -1,4 +1,4 @@
-//! A whole session around fake children: shared memory, lock, picture, and going on.
+//! Tests a whole session with fake children: shared memory, lock, plots and resuming.
 #![allow(clippy::unwrap_used)] // helpers of tests fail as tests do
 
 mod fakes;
@@ -15,7 +15,7 @@ fn plan(fixture: &Fixture, resume: bool) -> TrainingPlan {
         trial: Trial::default(),
         program: fake_role(),
         run: fixture.run.clone(),
-        // A child of a test beside this one may hold the lock's descriptor for a moment.
+        // A child of a concurrent test may briefly hold the lock's descriptor.
         lock: fixture.run.lock(PATIENCE).unwrap(),
         config: fixture.config.clone(),
         venv: None,
@@ -38,7 +38,7 @@ fn row(policy_version: u64) -> EvaluationRow {
     }
 }
 
-/// Directories of this run below the user's folder for shared memory.
+/// Lists the shared-memory directories of this run.
 fn domains(fixture: &Fixture) -> Vec<String> {
     let parent = format!("/dev/shm/dmprl-{}", rustix::process::getuid().as_raw());
     let Ok(entries) = std::fs::read_dir(parent) else { return Vec::new() };
@@ -48,7 +48,7 @@ fn domains(fixture: &Fixture) -> Vec<String> {
 }
 
 #[test]
-fn a_session_leaves_a_picture_and_neither_shared_memory_nor_a_lock() {
+fn a_session_leaves_a_plot_and_neither_shared_memory_nor_a_lock() {
     let fixture = Fixture::new(&[]);
     fixture.run.append_evaluation(&row(1)).unwrap();
     assert_eq!(train_session(plan(&fixture, false)).unwrap(), Outcome::Done);
@@ -59,14 +59,14 @@ fn a_session_leaves_a_picture_and_neither_shared_memory_nor_a_lock() {
 }
 
 #[test]
-fn while_children_live_nobody_else_trains_the_run() {
+fn children_hold_the_lock_of_the_run() {
     let fixture = Fixture::new(&[("learner", "asks-for-the-lock")]);
     assert_eq!(train_session(plan(&fixture, false)).unwrap(), Outcome::Done);
     assert!(fixture.seen("learner").contains("locked"), "{}", fixture.seen("learner"));
 }
 
 #[test]
-fn a_run_without_a_checkpoint_begins_again_without_its_old_rows() {
+fn a_run_without_a_checkpoint_starts_over_without_its_old_rows() {
     let fixture = Fixture::new(&[]);
     fixture.run.append_evaluation(&row(1)).unwrap();
     fixture.run.point_best().unwrap();
@@ -77,7 +77,7 @@ fn a_run_without_a_checkpoint_begins_again_without_its_old_rows() {
 }
 
 #[test]
-fn a_run_with_a_checkpoint_goes_on_from_it() {
+fn a_run_with_a_checkpoint_resumes_from_it() {
     let fixture = Fixture::new(&[]);
     fixture.run.append_evaluation(&row(1)).unwrap();
     // No `latest`: a run may have been copied without its symbolic links.
@@ -88,7 +88,7 @@ fn a_run_with_a_checkpoint_goes_on_from_it() {
 }
 
 #[test]
-fn a_failed_session_says_why_and_leaves_nothing_either() {
+fn a_failed_session_returns_its_reason_and_leaves_no_shared_memory() {
     let fixture = Fixture::new(&[("learner", "dies")]);
     let error = train_session(plan(&fixture, false)).unwrap_err();
     assert!(error.to_string().contains("learner died"), "{error}");

@@ -1,4 +1,4 @@
-//! Real signals to a real supervisor process, whose children are fakes.
+//! Sends real signals to a real supervisor process with fake children.
 //!
 //! The supervisor process is this test program, started again for the test `supervisor_process`.
 #![allow(clippy::unwrap_used)] // helpers of tests fail as tests do
@@ -12,14 +12,14 @@ use std::process::{Child, Command, Stdio};
 
 use dmprl::terminal::{Display, ProgressStyle};
 use dmprl_run::RunDirectory;
-use dmprl_supervisor::{Ending, SupervisorPlan, TimeLimits, Totals, interrupts, supervise};
+use dmprl_supervisor::{Ending, TimeLimits, interrupts, supervise};
 use fakes::{Fixture, living_children, until};
 use rustix::process::{Pid, Signal, kill_process};
 
-/// Where the supervisor process finds its run.
+/// Environment variable with the run directory of the supervisor process.
 const RUN: &str = "SUPERVISOR_TEST_RUN";
 
-/// Not a test by itself: what the others start, and a test of nothing when nobody has.
+/// The supervisor process of the other tests. Without their environment variable it tests nothing.
 #[test]
 fn supervisor_process() {
     let Some(run) = std::env::var_os(RUN).map(PathBuf::from) else { return };
@@ -27,11 +27,9 @@ fn supervisor_process() {
     let config = run.config().unwrap();
     let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().unwrap();
     let report = runtime.block_on(async {
-        let (launcher, config, limits) = fakes::plan(&run, &config, TimeLimits::default(), false);
-        let mut display = Display::new(ProgressStyle::Lines, config.run.steps);
         let interrupts = interrupts().unwrap();
-        let earlier = Totals::default();
-        let plan = SupervisorPlan { launcher, config, limits, earlier, interrupts };
+        let plan = fakes::plan(&run, &config, TimeLimits::default(), false, interrupts);
+        let mut display = Display::new(ProgressStyle::Lines, config.run.steps);
         supervise(plan, &mut display).await
     });
     std::process::exit(match report.ending {
@@ -62,7 +60,7 @@ fn seen(run: &Path, name: &str) -> String {
     std::fs::read_to_string(path).unwrap_or_default()
 }
 
-/// Everything is up: the workers are attached and an evaluation has come back.
+/// Waits until the workers are attached and the evaluator has received a request.
 fn until_training(fixture: &Fixture) {
     let run = fixture.run.path();
     until("a run under way", || {
@@ -85,14 +83,14 @@ fn sigint_and_sigterm_end_the_run_with_a_checkpoint_and_130() {
 }
 
 #[test]
-fn a_second_sigint_ends_even_stubborn_children_at_once() {
+fn a_second_sigint_kills_children_that_ignore_stop_at_once() {
     let fixture = Fixture::new(&[("learner", "until-stopped"), ("actor-0", "stubborn")]);
     let supervisor = start(&fixture);
     until("a learner", || fixture.seen("learner").contains("started"));
     until("an evaluator", || fixture.seen("evaluator").contains("evaluate"));
     signal(&supervisor, Signal::INT);
     until("a stop", || fixture.seen("learner").contains("stop"));
-    // Two so close together count as one, so it is repeated.
+    // Two signals within a short time count as one, so the second is repeated.
     let supervisor = RefCell::new(supervisor);
     until("the end", || {
         signal(&supervisor.borrow(), Signal::INT);
@@ -103,7 +101,7 @@ fn a_second_sigint_ends_even_stubborn_children_at_once() {
 }
 
 #[test]
-fn children_end_when_the_supervisor_is_killed_and_the_learner_saves_first() {
+fn children_exit_after_the_supervisor_is_killed_and_the_learner_saves_first() {
     let fixture = Fixture::new(&[("learner", "until-stopped")]);
     let mut supervisor = start(&fixture);
     until_training(&fixture);

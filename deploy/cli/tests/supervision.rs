@@ -1,4 +1,4 @@
-//! The supervisor against fake children that hang, crash in a loop, or die now and then.
+//! Tests the supervisor with fake children that hang, crash in a loop, or die occasionally.
 #![allow(clippy::unwrap_used)] // helpers of tests fail as tests do
 
 mod fakes;
@@ -15,7 +15,7 @@ fn failure(ending: Ending) -> String {
     }
 }
 
-/// The other worker gives signs of life all the time.
+/// The other worker sends heartbeats all the time.
 #[test]
 fn a_worker_that_gives_no_sign_of_life_is_said_to_hang_and_replaced() {
     let fakes =
@@ -24,17 +24,17 @@ fn a_worker_that_gives_no_sign_of_life_is_said_to_hang_and_replaced() {
     fixture.config.supervision.heartbeat_timeout_s = 3.0;
     let (report, shown) = fixture.supervise();
     assert!(matches!(report.ending, Ending::Completed), "{:?}\n{shown}", report.ending);
-    for words in ["actor-0 hung (no sign of life for 3.", "the last: waiting for", "restart 1 of 5"]
-    {
+    let hung = "actor-0 hung (no heartbeat for 3.";
+    for words in [hung, "last activity: waiting for", "restart 1 of 5"] {
         assert!(shown.contains(words), "{words}\n{shown}");
     }
     assert!(!shown.contains("actor-1 hung") && !shown.contains("died"), "{shown}");
     fixture.assert_no_child_lives();
 }
 
-/// Four lives with one restart: each was long enough to be no crash loop.
+/// The worker is started four times with a budget of one restart, as each start worked long enough.
 #[test]
-fn a_worker_that_worked_for_long_before_its_death_has_all_its_restarts_again() {
+fn a_worker_that_worked_for_long_gets_a_new_restart_budget() {
     let fakes = [("actor-0", "dies-after-work"), ("learner", "after-four-starts")];
     let mut fixture = Fixture::new(&fakes);
     fixture.config.actors.restarts_max = 1;
@@ -50,16 +50,16 @@ fn a_worker_that_worked_for_long_before_its_death_has_all_its_restarts_again() {
 }
 
 #[test]
-fn a_worker_that_dies_soon_after_each_start_is_given_up_whatever_it_sent() {
+fn a_worker_that_dies_soon_after_each_start_is_given_up_even_if_it_sent_segments() {
     let fakes = [("actor-0", "dies-before-work"), ("learner", "until-stopped")];
     let mut fixture = Fixture::new(&fakes);
     fixture.config.actors.restarts_max = 2;
     let (_, shown) = fixture.supervise_until("giving up on it after 2 restarts");
-    assert!(shown.contains("going on with 1 of 2 workers"), "{shown}");
+    assert!(shown.contains("continuing with 1 of 2 workers"), "{shown}");
 }
 
 #[test]
-fn a_learner_that_worked_for_long_before_its_death_has_all_its_restarts_again() {
+fn a_learner_that_worked_for_long_gets_a_new_restart_budget() {
     let mut fixture = Fixture::new(&[("learner", "dies-after-work")]);
     fixture.config.supervision.learner_restarts_max = 1;
     fixture.limits.proven = Duration::from_millis(200);
@@ -68,9 +68,9 @@ fn a_learner_that_worked_for_long_before_its_death_has_all_its_restarts_again() 
     assert_eq!(report.learner_restarts, 3, "{shown}");
 }
 
-/// A checkpoint right after each start once made the count begin anew, for ever.
+/// Regression test: a checkpoint soon after each start once reset the budget, for ever.
 #[test]
-fn a_learner_that_dies_soon_after_each_start_is_given_up_whatever_it_wrote() {
+fn a_learner_that_dies_soon_after_each_start_is_given_up_even_if_it_wrote_a_checkpoint() {
     let mut fixture = Fixture::new(&[("learner", "dies-after-a-checkpoint")]);
     fixture.config.supervision.learner_restarts_max = 2;
     let (report, shown) = fixture.supervise();

@@ -1,4 +1,4 @@
-//! The supervisor against fake children: ends, deaths, interrupts, deadlines.
+//! Tests the supervisor with fake children: completion, deaths, interrupts and deadlines.
 #![allow(clippy::unwrap_used)] // helpers of tests fail as tests do
 
 mod fakes;
@@ -16,7 +16,7 @@ fn failure(ending: Ending) -> String {
 }
 
 #[test]
-fn a_run_ends_when_the_learner_is_done_and_every_evaluation_answered() {
+fn a_run_completes_when_the_learner_is_done_and_all_evaluations_are_answered() {
     let fixture = Fixture::new(&[]);
     let (report, shown) = fixture.supervise();
     assert!(matches!(report.ending, Ending::Completed), "{:?}\n{shown}", report.ending);
@@ -42,7 +42,7 @@ fn one_process_needs_neither_workers_nor_evaluator() {
 }
 
 #[test]
-fn the_run_comes_to_its_end_when_an_evaluation_reaches_the_aim() {
+fn the_run_completes_when_an_evaluation_reaches_the_target() {
     let mut fixture = Fixture::new(&[("learner", "until-stopped")]);
     fixture.config.run.until_return = -3.0;
     let (report, shown) = fixture.supervise();
@@ -51,12 +51,12 @@ fn the_run_comes_to_its_end_when_an_evaluation_reaches_the_aim() {
 }
 
 #[test]
-fn the_run_comes_to_its_end_when_its_time_is_over() {
+fn the_run_completes_when_its_time_has_elapsed() {
     let mut fixture = Fixture::new(&[("learner", "until-stopped")]);
     fixture.config.run.max_minutes = 1e-6;
     let (report, shown) = fixture.supervise();
     assert!(matches!(report.ending, Ending::Completed), "{:?}\n{shown}", report.ending);
-    assert!(shown.contains("run.max_minutes are over"), "{shown}");
+    assert!(shown.contains("run.max_minutes has elapsed"), "{shown}");
 }
 
 #[test]
@@ -69,16 +69,16 @@ fn a_worker_that_dies_is_restarted_with_the_next_incarnation() {
 }
 
 #[test]
-fn a_worker_that_keeps_dying_is_given_up_and_the_rest_goes_on() {
+fn a_worker_that_keeps_dying_is_given_up_and_the_others_continue() {
     let mut fixture = Fixture::new(&[("actor-0", "dies"), ("learner", "until-stopped")]);
     fixture.config.actors.restarts_max = 2;
     let (report, shown) = fixture.supervise_until("giving up on it after 2 restarts");
     assert!(matches!(report.ending, Ending::Interrupted), "{:?}\n{shown}", report.ending);
     assert!(shown.contains("actor-0 died (exit status 3) again"), "{shown}");
-    assert!(shown.contains("going on with 1 of 2 workers"), "{shown}");
-    let last_words = shown.split("going on with 1 of 2 workers").nth(1).unwrap();
-    assert!(last_words.contains("logs/actor-0.log:\n"), "{shown}");
-    assert!(last_words.contains("error: out of luck"), "{shown}");
+    assert!(shown.contains("continuing with 1 of 2 workers"), "{shown}");
+    let log_tail = shown.split("continuing with 1 of 2 workers").nth(1).unwrap();
+    assert!(log_tail.contains("logs/actor-0.log:\n"), "{shown}");
+    assert!(log_tail.contains("error: out of luck"), "{shown}");
     assert_eq!(fixture.seen("actor-0").matches("started").count(), 3);
 }
 
@@ -94,7 +94,7 @@ fn without_any_worker_left_the_run_stops_with_a_checkpoint_and_advice() {
 }
 
 #[test]
-fn an_environment_that_cannot_be_made_ends_the_run_at_once_with_its_reason() {
+fn an_environment_that_cannot_be_created_ends_the_run_at_once_with_its_reason() {
     let fixture = Fixture::new(&[("actor-0", "refused"), ("actor-1", "silent")]);
     let (report, _) = fixture.supervise();
     let message = failure(report.ending);
@@ -116,14 +116,14 @@ fn a_learner_that_dies_once_is_replaced_and_its_workers_stay() {
         let seen = fixture.seen(actor);
         assert_eq!((seen.matches("started").count(), seen.matches("attach").count()), (1, 1));
     }
-    // The evaluation that was going on is given up, and the next one done.
+    // The evaluation in flight is given up, and the next one is answered.
     assert_eq!(fixture.seen("evaluator").matches("policy_version\":1").count(), 1);
     assert_eq!(report.last_row.unwrap().policy_version, 2);
     fixture.assert_no_child_lives();
 }
 
 #[test]
-fn a_learner_that_refuses_to_start_is_not_started_again() {
+fn a_learner_that_fails_at_its_start_is_not_restarted() {
     let fixture = Fixture::new(&[("learner", "refuses")]);
     let message = failure(fixture.supervise().0.ending);
     assert!(message.contains("error: no such checkpoint"), "{message}");
@@ -131,7 +131,7 @@ fn a_learner_that_refuses_to_start_is_not_started_again() {
 }
 
 #[test]
-fn a_learner_that_keeps_dying_ends_the_run_with_its_last_words_and_advice() {
+fn a_learner_that_keeps_dying_ends_the_run_with_its_log_and_advice() {
     let mut fixture = Fixture::new(&[("learner", "dies")]);
     fixture.config.supervision.learner_restarts_max = 2;
     std::fs::create_dir(fixture.run.checkpoints_path().join("000001")).unwrap();
@@ -147,7 +147,7 @@ fn a_learner_that_keeps_dying_ends_the_run_with_its_last_words_and_advice() {
 }
 
 #[test]
-fn without_a_checkpoint_nobody_is_sent_back_to_one() {
+fn without_a_checkpoint_a_failure_does_not_suggest_to_resume() {
     let fixture = Fixture::new(&[("learner", "dies")]);
     let message = failure(fixture.supervise().0.ending);
     assert!(!message.contains("dmprl resume"), "{message}");
@@ -172,7 +172,7 @@ fn an_evaluator_that_keeps_dying_ends_the_run() {
 }
 
 #[test]
-fn an_evaluation_that_fails_is_said_and_left_out() {
+fn a_failed_evaluation_is_reported_and_skipped() {
     let fixture = Fixture::new(&[("evaluator", "fails-once")]);
     let (report, shown) = fixture.supervise();
     assert!(matches!(report.ending, Ending::Completed), "{:?}\n{shown}", report.ending);
@@ -182,16 +182,16 @@ fn an_evaluation_that_fails_is_said_and_left_out() {
     assert_eq!(fixture.seen("evaluator").matches("started").count(), 1);
 }
 
-/// The learner here comes to its end when it has been told of all five.
+/// The learner finishes when it has received the count of all five failures.
 #[test]
-fn failures_of_environments_are_added_up_and_each_doubling_is_shown() {
-    let fakes = [("actor-0", "failing"), ("learner", "told-of-failures")];
+fn environment_failures_are_summed_and_each_doubling_is_shown() {
+    let fakes = [("actor-0", "failing"), ("learner", "until-five-failures")];
     let (report, shown) = Fixture::new(&fakes).supervise();
     assert!(matches!(report.ending, Ending::Completed), "{:?}\n{shown}", report.ending);
     assert_eq!(report.env_failures, 5);
-    let told =
+    let is_shown =
         |count| shown.contains(&format!("actor-0: environment failure {count}: the gripper"));
-    assert_eq!([1, 2, 3, 4, 5].map(told), [true, true, false, false, true], "{shown}");
+    assert_eq!([1, 2, 3, 4, 5].map(is_shown), [true, true, false, false, true], "{shown}");
     assert!(shown.contains("logs/actor-0.log"), "{shown}");
 }
 
@@ -252,7 +252,7 @@ fn a_child_that_does_not_stop_in_time_is_killed_and_named() {
 #[test]
 fn a_second_interrupt_kills_at_once() {
     let mut fixture = Fixture::new(&[("learner", "until-stopped"), ("actor-0", "stubborn")]);
-    // Longer than the test may take: only the second interrupt can end it.
+    // Longer than the test's time limit: only the second interrupt can end the run.
     fixture.limits = TimeLimits { stop: PATIENCE * 10, ..fixture.limits };
     fixture.interrupted_twice = true;
     let (report, shown) = fixture.supervise_until("evaluation at 10 steps");
@@ -262,7 +262,7 @@ fn a_second_interrupt_kills_at_once() {
 }
 
 #[test]
-fn what_an_environment_prints_is_shown_and_harms_nothing() {
+fn output_of_an_environment_is_shown_and_harmless() {
     let fixture = Fixture::new(&[("actor-0", "noisy")]);
     let (report, shown) = fixture.supervise();
     assert!(matches!(report.ending, Ending::Completed), "{:?}\n{shown}", report.ending);
@@ -270,12 +270,12 @@ fn what_an_environment_prints_is_shown_and_harms_nothing() {
 }
 
 #[test]
-fn a_resumed_run_whose_environment_has_changed_is_refused() {
+fn a_resumed_run_with_a_changed_environment_fails() {
     let fixture = Fixture::new(&[]);
     let mut spec = fixture.spec();
     spec.observation_len = 3;
     fixture.run.write_spec(&spec).unwrap();
     let (report, _) = fixture.supervise();
     let message = failure(report.ending);
-    assert!(message.contains("is not the run's"), "{message}");
+    assert!(message.contains("differs from the run's"), "{message}");
 }

@@ -1,8 +1,8 @@
-//! A worker's heartbeats.
+//! Heartbeats of a worker.
 //!
-//! A thread sends a heartbeat in each second in which the worker's loop completed a round or a call
-//! into the environments was running; the watchdog limits the duration of such a call. So a worker
-//! that waits for its learner, or has a slow environment, still sends heartbeats. A worker that is
+//! Every second a thread sends a heartbeat if the worker's loop has completed a round or is in a
+//! call into the environments; the watchdog limits the duration of such a call. So a worker that
+//! waits for its learner, or has a slow environment, still sends heartbeats. A worker that is
 //! suspended, or whose loop hangs anywhere else, sends none, and the supervisor detects it.
 
 use std::sync::atomic::{AtomicU64, Ordering};
@@ -15,7 +15,7 @@ use crate::{Activity, ControlPipe, Report};
 /// Interval between two heartbeats.
 const BEAT: Duration = Duration::from_secs(1);
 
-/// State of a loop, which the thread reads.
+/// State of a worker's loop, which the heartbeat thread reads.
 #[derive(Debug)]
 pub struct Pulse {
     /// Number of rounds and, in the two lowest bits, the activity.
@@ -25,7 +25,7 @@ pub struct Pulse {
 }
 
 impl Pulse {
-    /// Creates the state of a loop that has not begun.
+    /// Creates the state of a loop that has not started.
     #[must_use]
     pub fn new(doing: Activity) -> Self {
         Self { state: AtomicU64::new(bits(doing)), kept: AtomicU64::new(0) }
@@ -33,7 +33,7 @@ impl Pulse {
 
     /// Records a round of the loop. Call it only from the loop's thread.
     pub fn beat(&self, doing: Activity) {
-        // Relaxed, because the other thread reads no other memory.
+        // Relaxed, because this value does not guard any other memory.
         let number = (self.state.load(Ordering::Relaxed) >> 2).wrapping_add(1);
         self.state.store(number << 2 | bits(doing), Ordering::Relaxed);
     }
@@ -63,12 +63,13 @@ fn bits(doing: Activity) -> u64 {
 }
 
 /// Starts the thread that sends heartbeats. It ends when the supervisor is gone or the worker's
-/// environments are.
+/// environments are closed.
 ///
-/// - `calling`: whether a call into the environments is under way; none once they are gone.
+/// - `calling`: returns whether a call into the environments is running; `None` once they are
+///   closed.
 ///
 /// # Errors
-/// The system refuses a thread.
+/// The thread cannot be started.
 pub fn start_heartbeat(
     control: &ControlPipe,
     calling: impl Fn() -> Option<bool> + Send + 'static,

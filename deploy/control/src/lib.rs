@@ -1,7 +1,7 @@
-//! How the supervisor and the processes of a run talk: one JSON object a line over standard input
-//! and output, with heartbeats.
+//! The connection between the supervisor and the processes of a run: one JSON object per line over
+//! standard input and output, with heartbeats.
 //!
-//! `messages` is the protocol, `pipe` a process's end of it. The supervisor's end is in
+//! `messages` is the protocol, `pipe` the end of a role's process. The supervisor's end is in
 //! `dmprl-supervisor`, because it is asynchronous.
 
 mod heartbeat;

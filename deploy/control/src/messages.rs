@@ -1,35 +1,36 @@
-//! What supervisor and roles say to each other: one JSON object a line, on the child's standard
-//! input and output. A child's standard error is its log file.
+//! Messages with which a worker joins a run. The messages of `dmprl_shared::supervision` follow.
 //!
-//! End of input means that the supervisor is gone: the child ends itself (the learner after a
-//! checkpoint), so no SIGKILL of the supervisor leaves an orphan.
+//! All messages are JSON objects, one per line. A worker that joins uses a socket; a child uses its
+//! standard input and output, and its standard error is its log file. End of input means that the
+//! supervisor is gone. The process then exits (the learner after a checkpoint), so a supervisor
+//! killed by SIGKILL leaves no orphans.
 
 use std::fmt::{self, Display, Formatter};
 use std::path::PathBuf;
 
 use serde::{Deserialize, Serialize};
 
-/// What a terminal or a service manager sends to the whole process group. Only the supervisor
-/// listens; roles ignore it.
+/// Signals that a terminal or service manager sends to the whole process group. Only the supervisor
+/// handles them; roles ignore them.
 pub const GROUP_SIGNALS: [i32; 3] = [libc::SIGINT, libc::SIGTERM, libc::SIGHUP];
 
-/// Where a run's supervisor takes in workers that join, below its private directory.
+/// Name of the socket on which a supervisor accepts workers that join, in its private directory.
 pub const JOIN_SOCKET: &str = "join.sock";
-/// Version of what a supervisor and a worker that joins say to each other. Children are of the
-/// same build and need none.
+/// Version of the protocol between a supervisor and a worker that joins. Children are of the same
+/// build and need no version.
 const CONTROL_VERSION: u32 = 1;
 
-/// Which program speaks; the supervisor says so first.
+/// Version of a program. Each side sends its own, the supervisor first.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Greeting {
-    /// Of the program.
+    /// Version of `dmprl`.
     pub version: String,
-    /// Of this protocol.
+    /// Version of this protocol.
     pub control: u32,
 }
 
 impl Greeting {
-    /// This program.
+    /// Returns the version of this program.
     #[must_use]
     pub fn this() -> Self {
         Self { version: env!("CARGO_PKG_VERSION").to_owned(), control: CONTROL_VERSION }
@@ -42,37 +43,37 @@ impl Display for Greeting {
     }
 }
 
-/// From a worker that asks to join.
+/// Request of a worker to join.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct JoinRequest {
-    /// Which program it is.
+    /// Version of the worker's program.
     pub speaks: Greeting,
 }
 
-/// From the supervisor to a worker that has asked to join.
+/// The supervisor's answer to a [`JoinRequest`].
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case", deny_unknown_fields)]
 pub enum JoinAnswer {
-    /// It may.
+    /// The worker may join.
     Welcome(Welcome),
-    /// It may not.
+    /// The worker may not join.
     Refused {
-        /// Why, and what can be done.
+        /// The reason, with advice.
         reason: String,
     },
 }
 
-/// What a worker that joins is from now on.
+/// Settings of a worker that joins.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Welcome {
-    /// Which of the run's workers.
+    /// Index of the worker in the run.
     pub index: u32,
-    /// Which start of it.
+    /// Number of this start of the worker, unique for its index in the run.
     pub incarnation: u32,
     /// The run's Python virtual environment.
     pub venv: Option<PathBuf>,
-    /// How many workers there are, with it.
+    /// Number of workers, including this one.
     pub workers: usize,
 }

@@ -9,16 +9,16 @@ use std::thread;
 use std::time::Duration;
 
 use anyhow::{Context, ensure};
-use dmprl_run::say;
 use dmprl_shared::supervision::{ReportError, RunTotals, Supervisor};
 use dmprl_shared::transport::delivery::Sent;
+use tracing::error;
 
 use super::heartbeat::Pulse;
 use crate::{Activity, Command, GROUP_SIGNALS, Report, WorkersNow};
 
 /// Time limit for a worker or evaluator to exit after its supervisor is gone.
 pub const ORPHAN_LIMIT: Duration = Duration::from_secs(5);
-/// The same for the learner, which writes a last checkpoint.
+/// Time limit for the learner, which first writes a last checkpoint.
 pub const ORPHANED_LEARNER_LIMIT: Duration = Duration::from_secs(60);
 
 /// Maximum number of commands in the queue. The supervisor sends few, and one evaluation at a time.
@@ -61,7 +61,11 @@ impl Reporter {
     /// The supervisor is gone.
     pub fn send(&self, report: &Report) -> anyhow::Result<()> {
         let mut line = serde_json::to_vec(report).context("cannot write a report as JSON")?;
-        ensure!((line.len() as u64) < LINE_BYTES_MAX, "a report of {} bytes", line.len());
+        ensure!(
+            (line.len() as u64) < LINE_BYTES_MAX,
+            "a report has {} bytes; expected fewer than {LINE_BYTES_MAX}",
+            line.len()
+        );
         line.push(b'\n');
         let mut output = self.0.lock().unwrap_or_else(PoisonError::into_inner);
         output.write_all(&line).and_then(|()| output.flush()).context("the supervisor is gone")
@@ -121,25 +125,26 @@ impl ControlPipe {
         self.flags.finish.load(Ordering::Acquire)
     }
 
-    /// The flag of [`ControlPipe::stop_requested`], for signal handlers.
+    /// Returns the flag of [`ControlPipe::stop_requested`], for signal handlers.
     #[must_use]
     pub fn shared_stop_flag(&self) -> Arc<AtomicBool> {
         Arc::clone(&self.flags.stop)
     }
 
-    /// Number of failures of environments in the whole run, as last sent by the supervisor.
+    /// Returns the number of environment failures in the whole run, as last sent by the supervisor.
     #[must_use]
     pub fn env_failures(&self) -> u64 {
         self.flags.env_failures.load(Ordering::Acquire)
     }
 
-    /// State of the workers, as last sent by the supervisor.
+    /// Returns the state of the workers, as last sent by the supervisor.
     #[must_use]
     pub fn workers(&self) -> WorkersNow {
         *self.flags.workers.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// Counts of the workers' segments in the whole run, as last sent by the supervisor.
+    /// Returns the counts of the workers' segments in the whole run, as last sent by the
+    /// supervisor.
     #[must_use]
     pub fn sent(&self) -> Sent {
         *self.flags.sent.lock().unwrap_or_else(PoisonError::into_inner)
@@ -167,13 +172,13 @@ impl ControlPipe {
         self.reporter.send(report)
     }
 
-    /// State of the loop, for the thread that sends heartbeats.
+    /// Returns the state of the loop, for the thread that sends heartbeats.
     #[must_use]
     pub fn pulse(&self) -> Arc<Pulse> {
         Arc::clone(&self.pulse)
     }
 
-    /// Another sender of reports, for a separate thread.
+    /// Returns another sender of reports, for a separate thread.
     #[must_use]
     pub fn reporter(&self) -> Reporter {
         self.reporter.clone()
@@ -218,7 +223,7 @@ impl Supervisor for ControlPipe {
 /// Kills this process after `limit`, because its supervisor is gone.
 pub fn end_process_after(limit: Duration) {
     thread::sleep(limit);
-    say("error: the supervisor is gone and this process did not exit in time: killing it");
+    error!("the supervisor is gone and this process did not exit in time; killing it");
     // Not `exit`, because destructors of a hanging library could block forever.
     let _ = rustix::process::kill_process(rustix::process::getpid(), rustix::process::Signal::KILL);
 }
@@ -237,7 +242,7 @@ pub fn detach_standard_streams() -> std::io::Result<()> {
     Ok(rustix::stdio::dup2_stdout(rustix::stdio::stderr())?)
 }
 
-/// Returns at end of input or on a read error: either way the supervisor is gone.
+/// Reads commands until end of input or a read error; either way the supervisor is gone.
 fn read_commands(input: impl Read, sender: &SyncSender<Command>, flags: &Flags) {
     let mut reader = BufReader::new(input);
     let mut line = Vec::new();
@@ -262,12 +267,10 @@ fn read_commands(input: impl Read, sender: &SyncSender<Command>, flags: &Flags) 
             Ok(command) => match sender.try_send(command) {
                 Ok(()) | Err(TrySendError::Disconnected(_)) => {}
                 Err(TrySendError::Full(command)) => {
-                    say(&format!(
-                        "error: dropped a command, {COMMANDS_MAX} are waiting already: {command:?}"
-                    ));
+                    error!("dropped a command because {COMMANDS_MAX} are queued: {command:?}");
                 }
             },
-            Err(error) => say(&format!("error: the supervisor sent an invalid command: {error}")),
+            Err(error) => error!("the supervisor sent an invalid command: {error}"),
         }
     }
 }

@@ -1,4 +1,4 @@
-//! Finds the runs below a directory, repeatedly, because new runs can start at any time.
+//! Searches a directory for runs, repeatedly, because runs can start at any time.
 
 use std::collections::BTreeMap;
 use std::fs;
@@ -8,25 +8,27 @@ use std::time::{Duration, Instant};
 use dmprl_run::RunDirectory;
 use dmprl_run::failure::wrong_use;
 
-use super::watched::Watched;
+use super::cached_run::CachedRun;
 
 /// Minimum interval between two searches for new runs.
-const WALK_INTERVAL: Duration = Duration::from_secs(2);
-/// Minimum interval as a multiple of the duration of a search, for large directories.
-const WALK_REST: u32 = 50;
-/// Maximum depth of a run below the directory; a sweep needs three.
+const SCAN_INTERVAL: Duration = Duration::from_secs(2);
+/// Minimum interval between two searches as a multiple of the duration of one, which limits the
+/// cost of large directories.
+const SCAN_PAUSE_FACTOR: u32 = 50;
+/// Maximum depth of a run below the directory; a sweep needs three or four.
 const DEPTH_MAX: usize = 6;
-/// Maximum number of entries visited per search. A directory with more does not contain only runs.
+/// Maximum number of directory entries visited per search. A directory with more hardly contains
+/// only runs.
 const ENTRIES_MAX: usize = 100_000;
-/// Maximum number of runs shown; the others are counted.
-pub const RUNS_MAX: usize = 2_000;
+/// Maximum number of runs listed; the others are counted.
+const RUNS_MAX: usize = 2_000;
 
-/// The runs below a directory, or the one run in it, by their relative paths.
+/// The runs below a directory, or the directory itself if it is a run.
 #[derive(Debug)]
 pub struct Catalogue {
     root: PathBuf,
-    /// Runs by their names on the page. Requests can open only these.
-    pub runs: BTreeMap<String, Watched>,
+    /// Runs by name, which is the path relative to the directory. Requests can open only these.
+    pub runs: BTreeMap<String, CachedRun>,
     /// Number of runs beyond [`RUNS_MAX`].
     pub left_out: usize,
     /// Time of the next search; `None` before the first.
@@ -42,37 +44,37 @@ impl Catalogue {
         let resolved = fs::canonicalize(root).ok().filter(|path| path.is_dir());
         let root = resolved.ok_or_else(|| {
             wrong_use(format!(
-                "there is no directory {}; name a run, or a directory with runs below it",
+                "there is no directory {}; give a run, or a directory that contains runs",
                 root.display()
             ))
         })?;
         Ok(Self { root, runs: BTreeMap::new(), left_out: 0, due: None })
     }
 
-    /// The directory, as an absolute path.
+    /// Absolute path of the directory.
     pub fn root(&self) -> &Path {
         &self.root
     }
 
     /// Searches for new and removed runs, unless the last search was recent.
-    pub fn walk(&mut self) {
-        let begun = Instant::now();
-        if self.due.is_some_and(|due| begun < due) {
+    pub fn scan(&mut self) {
+        let started = Instant::now();
+        if self.due.is_some_and(|due| started < due) {
             return;
         }
-        let mut walk = Walk { found: Vec::new(), entries: 0 };
-        walk.visit(&self.root, DEPTH_MAX);
-        walk.found.sort();
-        self.left_out = walk.found.len().saturating_sub(RUNS_MAX);
-        walk.found.truncate(RUNS_MAX);
+        let mut scan = Scan { found: Vec::new(), entries: 0 };
+        scan.visit(&self.root, DEPTH_MAX);
+        scan.found.sort();
+        self.left_out = scan.found.len().saturating_sub(RUNS_MAX);
+        scan.found.truncate(RUNS_MAX);
         let mut before = std::mem::take(&mut self.runs);
-        for path in walk.found {
+        for path in scan.found {
             let name = self.name_of(&path);
             let known = before.remove(&name);
-            let watched = known.or_else(|| RunDirectory::open(&path).ok().map(Watched::new));
-            self.runs.extend(watched.map(|watched| (name, watched)));
+            let run = known.or_else(|| RunDirectory::open(&path).ok().map(CachedRun::new));
+            self.runs.extend(run.map(|run| (name, run)));
         }
-        self.due = begun.checked_add(WALK_INTERVAL.max(begun.elapsed() * WALK_REST));
+        self.due = started.checked_add(SCAN_INTERVAL.max(started.elapsed() * SCAN_PAUSE_FACTOR));
     }
 
     fn name_of(&self, path: &Path) -> String {
@@ -83,19 +85,20 @@ impl Catalogue {
     }
 }
 
-struct Walk {
+/// A search for runs.
+struct Scan {
     found: Vec<PathBuf>,
     entries: usize,
 }
 
-impl Walk {
-    /// Visits a folder. Links are not followed: their targets are not below the directory.
+impl Scan {
+    /// Collects the runs below a folder. Links are not followed, as they can lead out of it.
     fn visit(&mut self, folder: &Path, depth: usize) {
         if folder.join("manifest.json").is_file() && folder.join("config.toml").is_file() {
             self.found.push(folder.to_owned());
             return;
         }
-        // Skip folders that cannot be read or have just been removed.
+        // Skips folders that cannot be read or have just been removed.
         let Ok(entries) = fs::read_dir(folder) else { return };
         for entry in entries.flatten() {
             self.entries += 1;
@@ -126,7 +129,7 @@ mod tests {
     }
 
     #[test]
-    fn runs_are_found_at_any_depth_and_nothing_behind_a_link() {
+    fn runs_are_found_at_any_depth_but_not_through_links() {
         let folder = tempfile::tempdir().unwrap();
         let elsewhere = tempfile::tempdir().unwrap();
         make(&folder.path().join("alone"));
@@ -134,18 +137,18 @@ mod tests {
         make(&elsewhere.path().join("foreign"));
         symlink(elsewhere.path(), folder.path().join("link")).unwrap();
         let mut catalogue = Catalogue::new(folder.path()).unwrap();
-        catalogue.walk();
+        catalogue.scan();
         assert_eq!(names(&catalogue), ["alone", "sweep/reacher/td3/seed-1"]);
         assert_eq!(catalogue.left_out, 0);
     }
 
     #[test]
-    fn one_run_is_called_by_its_own_name() {
+    fn directory_that_is_a_run_is_listed_by_its_own_name() {
         let folder = tempfile::tempdir().unwrap();
         let run = folder.path().join("mine");
         make(&run);
         let mut catalogue = Catalogue::new(&run).unwrap();
-        catalogue.walk();
+        catalogue.scan();
         assert_eq!(names(&catalogue), ["mine"]);
     }
 }

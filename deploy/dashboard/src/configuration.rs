@@ -1,4 +1,4 @@
-//! Flattens a configuration to keys and values, for comparison.
+//! Flattens a configuration into keys and values, so that runs can be compared.
 
 use std::collections::BTreeMap;
 
@@ -6,11 +6,11 @@ use dmprl_run::sweep_files::flatten;
 use dmprl_shared::config::ExperimentConfig;
 use toml::Table;
 
-/// Returns every key as `section.key`, with its value in TOML.
+/// Returns the value of every key `section.key`, in TOML syntax.
 ///
 /// # Errors
-/// None is known: a configuration that was read can be written.
-pub fn flat(config: &ExperimentConfig) -> anyhow::Result<BTreeMap<String, String>> {
+/// The configuration cannot be serialized, which is not expected.
+pub fn flattened(config: &ExperimentConfig) -> anyhow::Result<BTreeMap<String, String>> {
     let keys = flatten(&Table::try_from(config)?);
     Ok(keys.into_iter().map(|(key, value)| (key, value.to_string())).collect())
 }
@@ -20,8 +20,8 @@ mod tests {
     use super::*;
 
     #[test]
-    fn keys_are_called_as_on_the_command_line() {
-        let keys = flat(&ExperimentConfig::default()).unwrap();
+    fn keys_have_the_names_used_on_the_command_line() {
+        let keys = flattened(&ExperimentConfig::default()).unwrap();
         assert_eq!(keys["algorithm.td3.actor_interval"], "2");
         assert!(keys["policy.hidden"].starts_with('['));
         assert!(keys["run.until_return"].contains("inf"));

@@ -6,25 +6,25 @@ use serde_json::{Value, json};
 
 use super::table::rounded;
 
-/// Maximum number of rows in a chart; an episode may have ten times as many.
+/// Maximum number of rows in a response; longer episodes are thinned out.
 const ROWS_MAX: usize = 1_000;
 
-/// Returns the data of the charts; null if the run's motion was never recorded.
+/// Returns the data of the charts; null if the run's motion has not been recorded.
 ///
 /// # Errors
 /// The file cannot be read.
 pub fn read(run: &RunDirectory) -> anyhow::Result<Value> {
-    Ok(motion::stored(run)?.map_or(Value::Null, |motion| drawn(&motion)))
+    Ok(motion::read_any(run)?.map_or(Value::Null, |motion| chart_data(&motion)))
 }
 
-fn drawn(motion: &Motion) -> Value {
+fn chart_data(motion: &Motion) -> Value {
     let Motion { episode, robot, .. } = motion;
     let times = motion.times();
     let every = times.len().div_ceil(ROWS_MAX).max(1);
-    let few = |row: usize| row.is_multiple_of(every);
+    let is_kept = |row: usize| row.is_multiple_of(every);
     let by_joint = |rows: &[Vec<f64>]| -> Vec<Vec<f64>> {
         let column = |joint: usize| {
-            let chosen = rows.iter().enumerate().filter(|(row, _)| few(*row));
+            let chosen = rows.iter().enumerate().filter(|(row, _)| is_kept(*row));
             chosen.map(|(_, values)| rounded(values[joint])).collect()
         };
         (0..rows.first().map_or(0, Vec::len)).map(column).collect()
@@ -46,7 +46,7 @@ fn drawn(motion: &Motion) -> Value {
         "sparc": motion.sparc.map(rounded),
         "unit": motion.unit,
         "in_seconds": robot.control_dt_s > 0.0,
-        "times": times.iter().enumerate().filter(|(row, _)| few(*row))
+        "times": times.iter().enumerate().filter(|(row, _)| is_kept(*row))
             .map(|(_, time)| rounded(*time)).collect::<Vec<_>>(),
         "joints": joints.map(|joint| json!({"name": joint.name, "unit": joint.kind.unit()}))
             .collect::<Vec<_>>(),

@@ -1,15 +1,15 @@
 //! Stage 8 of 8: the web page that shows runs during and after training.
 //!
 //! ```text
-//!  browser ──HTTP──► server ──► answers ──► catalogue ──► watched runs ──► tail, table
-//!  Prometheus ─────────┘ └──► page/ (HTML, CSS, scripts in the binary)        run directories
+//!  browser ──HTTP──► server ──► api ──► catalogue ──► cached runs ──► tail, table
+//!  Prometheus ─────────┘ └──► page/ (HTML, CSS, scripts in the binary)   run directories
 //! ```
 //! The dashboard only reads run directories and is independent of the training processes. It caches
-//! the data it has read, so that refreshing a long run costs only the added part, and it sends only
-//! the new points of a curve. A request names a run or a video and is answered only if it is
-//! listed: no path ever comes from a client.
+//! the data it has read, so a refresh reads only what was appended, and it sends only the new
+//! points of a curve. A request gives the name of a listed run or video, never a path.
 
-mod answers;
+mod api;
+mod cached_run;
 mod catalogue;
 mod configuration;
 mod episode;
@@ -17,7 +17,6 @@ mod page;
 mod prometheus;
 mod server;
 mod table;
-pub(crate) mod videos;
-mod watched;
+mod videos;
 
-pub use server::{Plan, serve};
+pub use server::{Options, serve};

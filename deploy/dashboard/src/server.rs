@@ -22,35 +22,37 @@ use tower_http::compression::CompressionLayer;
 use tower_http::services::ServeFile;
 use tower_http::timeout::TimeoutLayer;
 
-use super::answers::{self, Refusal};
+use super::api::{self, ApiError};
+use super::cached_run::TablePosition;
 use super::catalogue::Catalogue;
-use super::{page, prometheus};
+use super::page::{self, PageFile};
+use super::prometheus;
 
 /// Time limit of a request.
-const REQUEST_MAX: Duration = Duration::from_secs(30);
+const REQUEST_TIMEOUT: Duration = Duration::from_secs(30);
 /// Time limit for responses in progress after Ctrl-C.
-const LAST_ANSWERS: Duration = Duration::from_millis(500);
-/// Names under which this machine accepts requests. They protect against DNS rebinding: a page
-/// whose domain resolves to this machine still sends its own name.
-const OWN_NAMES: [&str; 3] = ["localhost", "127.0.0.1", "[::1]"];
-/// Forbids resources of other origins and inline scripts.
-const POLICY: &str = "default-src 'none'; script-src 'self'; style-src 'self'; \
-                      img-src 'self' data:; media-src 'self'; connect-src 'self'; \
-                      base-uri 'none'; form-action 'none'; frame-ancestors 'none'";
+const SHUTDOWN_TIMEOUT: Duration = Duration::from_millis(500);
+/// Accepted values of the `Host` header. This protects against DNS rebinding: in requests of a page
+/// whose domain resolves to this machine, the header has that domain.
+const LOCAL_HOSTS: [&str; 3] = ["localhost", "127.0.0.1", "[::1]"];
+/// Forbids inline scripts and resources of other origins.
+const SECURITY_POLICY: &str = "default-src 'none'; script-src 'self'; style-src 'self'; \
+                               img-src 'self' data:; media-src 'self'; connect-src 'self'; \
+                               base-uri 'none'; form-action 'none'; frame-ancestors 'none'";
 /// Headers of every response.
 const HEADERS: [(HeaderName, HeaderValue); 4] = [
-    (header::CONTENT_SECURITY_POLICY, HeaderValue::from_static(POLICY)),
+    (header::CONTENT_SECURITY_POLICY, HeaderValue::from_static(SECURITY_POLICY)),
     (header::X_CONTENT_TYPE_OPTIONS, HeaderValue::from_static("nosniff")),
     (header::REFERRER_POLICY, HeaderValue::from_static("no-referrer")),
-    // The page of an older version must not be used with a newer program at the same address.
+    // A cached page of an older version must not be used with a newer server at the same address.
     (header::CACHE_CONTROL, HeaderValue::from_static("no-store")),
 ];
 
-/// What the dashboard shows, and on which port.
+/// Options of the dashboard.
 #[derive(Debug)]
-pub struct Plan<'p> {
+pub struct Options<'o> {
     /// A run, or a directory that contains runs.
-    pub root: &'p Path,
+    pub root: &'o Path,
     /// Port on 127.0.0.1; 0 for any free port.
     pub port: u16,
 }
@@ -79,51 +81,52 @@ struct VideoQuery {
     name: String,
 }
 
-/// Serves the page until the user interrupts it, which is its normal end.
+/// Serves the page until the user interrupts it, which is the normal end.
 ///
-/// - `interrupts`: called in the runtime; returns a stream with one item per interrupt.
-/// - `listening`: called with the address once the server accepts connections.
+/// - `interrupts`: called in the runtime; returns a channel with one message per interrupt.
+/// - `on_listening`: called with the address once the server accepts connections.
 ///
 /// # Errors
 /// Wrong use: the directory does not exist. The port is in use.
 pub fn serve(
-    plan: &Plan,
+    options: &Options,
     interrupts: fn() -> anyhow::Result<mpsc::Receiver<()>>,
-    listening: impl FnOnce(SocketAddr) -> anyhow::Result<()>,
+    on_listening: impl FnOnce(SocketAddr) -> anyhow::Result<()>,
 ) -> anyhow::Result<Outcome> {
-    let mut catalogue = Catalogue::new(plan.root)?;
-    catalogue.walk();
+    let mut catalogue = Catalogue::new(options.root)?;
+    catalogue.scan();
     let runtime = tokio::runtime::Builder::new_current_thread()
         .enable_all()
         .build()
         .context("cannot start the dashboard's runtime")?;
     let served = runtime.block_on(async {
         let mut interrupts = interrupts()?;
-        let address = SocketAddr::from((Ipv4Addr::LOCALHOST, plan.port));
+        let address = SocketAddr::from((Ipv4Addr::LOCALHOST, options.port));
         let listener = TcpListener::bind(address).await.with_context(|| {
-            format!("cannot listen on {address}; choose another --port, 0 for any that is free")
+            format!("cannot listen on {address}; choose another --port, or 0 for any free one")
         })?;
-        listening(listener.local_addr().context("cannot determine the port")?)?;
+        on_listening(listener.local_addr().context("cannot determine the port")?)?;
         let (stop, stopped) = tokio::sync::oneshot::channel::<()>();
         let server = axum::serve(listener, router(Arc::new(Mutex::new(catalogue))))
             .with_graceful_shutdown(async { drop(stopped.await) });
         let mut server = std::pin::pin!(server.into_future());
         tokio::select! {
-            ended = &mut server => return ended.context("the dashboard's server has ended"),
+            ended = &mut server => return ended.context("the dashboard's server failed"),
             _ = interrupts.recv() => drop(stop),
         }
-        // A connection that reads nothing may stay open forever; cutting it is no failure.
-        let _ = tokio::time::timeout(LAST_ANSWERS, server).await;
+        // A client that does not read could keep its connection open forever. Dropping it is not an
+        // error.
+        let _ = tokio::time::timeout(SHUTDOWN_TIMEOUT, server).await;
         Ok(())
     });
-    // Does not wait for a file that is being read.
+    // Does not wait for blocking threads that read files.
     runtime.shutdown_background();
     served.map(|()| Outcome::Done)
 }
 
 fn router(shared: Shared) -> Router {
     let mut texts = Router::new()
-        .route("/", get(|| async { file(&page::FILES[0]) }))
+        .route("/", get(|| async { page_file(&page::FILES[0]) }))
         .route("/api/runs", get(runs))
         .route("/api/curves", get(curves))
         .route("/api/evaluations", get(evaluations))
@@ -132,26 +135,27 @@ fn router(shared: Shared) -> Router {
         .route("/api/processes", get(processes))
         .route("/api/config", get(config))
         .route("/metrics", get(metrics));
-    for one in &page::FILES[1..] {
-        texts = texts.route(&format!("/page/{}", one.0), get(move || async move { file(one) }));
+    for file in &page::FILES[1..] {
+        let path = format!("/page/{}", file.name);
+        texts = texts.route(&path, get(move || async move { page_file(file) }));
     }
-    // Videos are already compressed, and players request parts of them.
+    // Videos are not compressed again, since they already are and players request ranges of them.
     let texts = texts.layer(CompressionLayer::new());
-    let all = texts.route("/video", get(video)).fallback(nothing);
-    let timeout = TimeoutLayer::with_status_code(StatusCode::SERVICE_UNAVAILABLE, REQUEST_MAX);
+    let all = texts.route("/video", get(video)).fallback(not_found);
+    let timeout = TimeoutLayer::with_status_code(StatusCode::SERVICE_UNAVAILABLE, REQUEST_TIMEOUT);
     all.layer(timeout).layer(middleware::from_fn(guard)).with_state(shared)
 }
 
-/// Answers only requests that name this machine, and adds the headers to the response.
+/// Rejects requests with a foreign `Host` header, and adds [`HEADERS`] to each response.
 async fn guard(request: Request, next: Next) -> Response {
     let host = request.headers().get(header::HOST).and_then(|host| host.to_str().ok());
     let mut response = match host {
-        Some(host) if is_own_name(host) => next.run(request).await,
+        Some(host) if is_local_host(host) => next.run(request).await,
         _ => {
-            let host = host.unwrap_or("nothing");
+            let host = host.unwrap_or_default();
             let message = format!(
-                "expected a request to localhost or 127.0.0.1, got one to {host:?}; from another \
-                 machine: ssh -L 8787:127.0.0.1:PORT, then http://127.0.0.1:8787\n"
+                "Host header: expected localhost or 127.0.0.1, got {host:?}; from another \
+                 machine, use ssh -L 8787:127.0.0.1:PORT and open http://127.0.0.1:8787\n"
             );
             (StatusCode::FORBIDDEN, message).into_response()
         }
@@ -160,40 +164,42 @@ async fn guard(request: Request, next: Next) -> Response {
     response
 }
 
-/// Returns true if a host is this machine. Any port is accepted, since it may have been forwarded.
-fn is_own_name(host: &str) -> bool {
+/// Returns true if a `Host` header names this machine. Any port is accepted, since the port may be
+/// forwarded.
+fn is_local_host(host: &str) -> bool {
     let host = host.parse::<Authority>();
-    host.is_ok_and(|host| OWN_NAMES.iter().any(|name| host.host().eq_ignore_ascii_case(name)))
+    host.is_ok_and(|host| LOCAL_HOSTS.iter().any(|name| host.host().eq_ignore_ascii_case(name)))
 }
 
-fn file((_, kind, content): &(&str, &'static str, &'static [u8])) -> Response {
-    ([(header::CONTENT_TYPE, *kind)], *content).into_response()
+fn page_file(file: &PageFile) -> Response {
+    ([(header::CONTENT_TYPE, file.content_type)], file.content).into_response()
 }
 
-async fn nothing(request: Request) -> Response {
+async fn not_found(request: Request) -> Response {
     let message = format!("there is no {}; the page is at /", request.uri().path());
-    Refusal::Missing(message).into_response()
+    ApiError::NotFound(message).into_response()
 }
 
-/// Reads files on a blocking thread.
+/// Runs `work` on a blocking thread, because it reads files.
 async fn read<T: Send + 'static>(
     shared: Shared,
-    work: impl FnOnce(&mut Catalogue) -> Result<T, Refusal> + Send + 'static,
-) -> Result<T, Refusal> {
+    work: impl FnOnce(&mut Catalogue) -> Result<T, ApiError> + Send + 'static,
+) -> Result<T, ApiError> {
     let work = move || work(&mut shared.lock().unwrap_or_else(PoisonError::into_inner));
     let joined = tokio::task::spawn_blocking(work).await;
-    joined.map_err(|error| Refusal::Failed(error.into()))?
+    joined.map_err(|error| ApiError::Internal(error.into()))?
 }
 
+/// Responds with the result of `work` as JSON.
 async fn answer<T: Serialize + Send + 'static>(
     shared: Shared,
-    work: impl FnOnce(&mut Catalogue) -> Result<T, Refusal> + Send + 'static,
-) -> Result<Json<T>, Refusal> {
+    work: impl FnOnce(&mut Catalogue) -> Result<T, ApiError> + Send + 'static,
+) -> Result<Json<T>, ApiError> {
     read(shared, work).await.map(Json)
 }
 
 async fn runs(State(shared): State<Shared>) -> impl IntoResponse {
-    answer(shared, |catalogue| Ok(answers::runs(catalogue))).await
+    answer(shared, |catalogue| Ok(api::runs(catalogue))).await
 }
 
 async fn curves(
@@ -202,7 +208,7 @@ async fn curves(
 ) -> impl IntoResponse {
     answer(shared, move |catalogue| {
         let CurvesQuery { run, file, names, table, from } = query;
-        answers::curves(catalogue, (&run, &file), &names, (table, from))
+        api::curves(catalogue, &run, &file, &names, TablePosition { table, row: from })
     })
     .await
 }
@@ -211,29 +217,29 @@ async fn evaluations(
     State(shared): State<Shared>,
     Query(query): Query<RunQuery>,
 ) -> impl IntoResponse {
-    answer(shared, move |catalogue| answers::evaluations(catalogue, &query.run)).await
+    answer(shared, move |catalogue| api::evaluations(catalogue, &query.run)).await
 }
 
 async fn motion(State(shared): State<Shared>, Query(query): Query<RunQuery>) -> impl IntoResponse {
-    answer(shared, move |catalogue| answers::motion(catalogue, &query.run)).await
+    answer(shared, move |catalogue| api::motion(catalogue, &query.run)).await
 }
 
 async fn videos(State(shared): State<Shared>, Query(query): Query<RunQuery>) -> impl IntoResponse {
-    answer(shared, move |catalogue| answers::videos(catalogue, &query.run)).await
+    answer(shared, move |catalogue| api::videos(catalogue, &query.run)).await
 }
 
 async fn processes(
     State(shared): State<Shared>,
     Query(query): Query<RunQuery>,
 ) -> impl IntoResponse {
-    answer(shared, move |catalogue| answers::processes(catalogue, &query.run)).await
+    answer(shared, move |catalogue| api::processes(catalogue, &query.run)).await
 }
 
 async fn config(State(shared): State<Shared>, Query(query): Query<RunQuery>) -> impl IntoResponse {
-    answer(shared, move |catalogue| answers::config(catalogue, &query.run)).await
+    answer(shared, move |catalogue| api::config(catalogue, &query.run)).await
 }
 
-async fn metrics(State(shared): State<Shared>) -> Result<Response, Refusal> {
+async fn metrics(State(shared): State<Shared>) -> Result<Response, ApiError> {
     let text = read(shared, |catalogue| Ok(prometheus::text(catalogue)?)).await?;
     Ok(([(header::CONTENT_TYPE, prometheus::CONTENT_TYPE)], text).into_response())
 }
@@ -242,21 +248,21 @@ async fn video(
     State(shared): State<Shared>,
     Query(query): Query<VideoQuery>,
     request: Request,
-) -> Result<Response, Refusal> {
-    let find = move |catalogue: &mut Catalogue| answers::video(catalogue, &query.run, &query.name);
+) -> Result<Response, ApiError> {
+    let find = move |catalogue: &mut Catalogue| api::video(catalogue, &query.run, &query.name);
     let path: PathBuf = read(shared, find).await?;
-    // Supports ranges, which players request.
+    // `ServeFile` supports the range requests of players.
     let served = ServeFile::new(&path).try_call(request).await;
     let served = served.with_context(|| format!("cannot read {}", path.display()))?;
     Ok(served.into_response())
 }
 
-impl IntoResponse for Refusal {
+impl IntoResponse for ApiError {
     fn into_response(self) -> Response {
         let (status, message) = match self {
-            Self::Missing(message) => (StatusCode::NOT_FOUND, message),
-            Self::Senseless(message) => (StatusCode::BAD_REQUEST, message),
-            Self::Failed(error) => (StatusCode::INTERNAL_SERVER_ERROR, format!("{error:#}")),
+            Self::NotFound(message) => (StatusCode::NOT_FOUND, message),
+            Self::BadRequest(message) => (StatusCode::BAD_REQUEST, message),
+            Self::Internal(error) => (StatusCode::INTERNAL_SERVER_ERROR, format!("{error:#}")),
         };
         (status, Json(json!({ "error": message }))).into_response()
     }
@@ -267,12 +273,12 @@ mod tests {
     use super::*;
 
     #[test]
-    fn only_names_of_this_machine_are_its_own() {
-        for own in ["localhost", "127.0.0.1:8787", "LOCALHOST:1", "[::1]:8787"] {
-            assert!(is_own_name(own), "{own}");
+    fn only_loopback_names_are_accepted_as_host() {
+        for local in ["localhost", "127.0.0.1:8787", "LOCALHOST:1", "[::1]:8787"] {
+            assert!(is_local_host(local), "{local}");
         }
         for foreign in ["", "evil.example:8787", "localhost.evil.example", "0.0.0.0", "a b"] {
-            assert!(!is_own_name(foreign), "{foreign}");
+            assert!(!is_local_host(foreign), "{foreign}");
         }
     }
 }

@@ -1,4 +1,4 @@
-//! Stores the numbers of a JSON Lines file as columns, and thins them out for curves.
+//! Stores the numbers of a JSON Lines file in columns, and returns curves of limited length.
 
 use std::collections::BTreeMap;
 
@@ -7,9 +7,9 @@ use serde_json::Value;
 
 /// Maximum number of rows. Beyond it every other row is dropped, repeatedly.
 const ROWS_MAX: usize = 50_000;
-/// Maximum number of columns: about three times as many as in a line of `metrics.jsonl`.
+/// Maximum number of columns, about three times as many as `metrics.jsonl` has.
 const COLUMNS_MAX: usize = 128;
-/// Significant digits in a curve. More are invisible and lengthen the response.
+/// Significant digits in a curve. More would be invisible and enlarge the response.
 const DIGITS: i32 = 6;
 
 /// Columns of numbers. Missing and null values are NaN.
@@ -34,7 +34,7 @@ pub struct Curve {
 }
 
 impl Table {
-    /// Adds a row; returns true if rows were dropped, so that the remaining ones have new indices.
+    /// Adds a row; returns true if rows were dropped, which gives the remaining ones new indices.
     pub fn push(&mut self, row: &Value) -> bool {
         self.stride = self.stride.max(1);
         self.seen += 1;
@@ -66,8 +66,9 @@ impl Table {
         self.rows
     }
 
-    /// Returns the curve of a column from row `from` on, with at most `points_max` points. It keeps
-    /// the minimum and the maximum of each stretch, so that no spike is lost.
+    /// Returns the curve of a column from row `from` on, with about `points_max` points at most.
+    /// Longer curves are reduced to the minimum and maximum of each interval, so that spikes are
+    /// kept.
     #[must_use]
     pub fn curve(&self, name: &str, from: usize, points_max: usize) -> Curve {
         let Some(column) = self.columns.get(name) else { return Curve::default() };
@@ -75,8 +76,8 @@ impl Table {
         let chosen = if rows.len() <= points_max {
             rows
         } else {
-            let stretch = rows.len().div_ceil((points_max / 2).max(1));
-            rows.chunks(stretch).flat_map(|rows| extremes(rows, column)).collect()
+            let interval = rows.len().div_ceil((points_max / 2).max(1));
+            rows.chunks(interval).flat_map(|rows| extremes(rows, column)).collect()
         };
         let of = |name: &str| -> Vec<f64> {
             let column = self.columns.get(name);
@@ -95,7 +96,7 @@ impl Table {
     }
 }
 
-/// Rows of the minimum and the maximum, in order.
+/// Returns the rows of the minimum and the maximum, in ascending order.
 fn extremes(rows: &[usize], column: &[f64]) -> Vec<usize> {
     let by_value = |a: &&usize, b: &&usize| column[**a].total_cmp(&column[**b]);
     let low = rows.iter().min_by(by_value).copied();
@@ -106,8 +107,8 @@ fn extremes(rows: &[usize], column: &[f64]) -> Vec<usize> {
     both
 }
 
-/// Collects every number of an object; those of nested objects as `outer.inner`.
-pub fn flatten(value: &Value, name: String, numbers: &mut Vec<(String, f64)>) {
+/// Collects the numbers of an object; those of nested objects are named `outer.inner`.
+fn flatten(value: &Value, name: String, numbers: &mut Vec<(String, f64)>) {
     match value {
         Value::Number(number) => numbers.extend(number.as_f64().map(|number| (name, number))),
         Value::Object(inner) => {
@@ -147,7 +148,7 @@ mod tests {
     }
 
     #[test]
-    fn a_curve_has_only_the_rows_that_have_a_value() {
+    fn curve_skips_rows_without_a_value() {
         let table = table([json!(1.0), json!(null), json!(3.123_456_789)]);
         let curve = table.curve("loss", 0, 10);
         assert_eq!(curve.env_steps, [0.0, 2.0]);
@@ -157,7 +158,7 @@ mod tests {
     }
 
     #[test]
-    fn a_spike_among_many_points_is_kept() {
+    fn spike_survives_the_reduction_of_a_curve() {
         let mut values = vec![json!(0.0); 10_000];
         values[6_789] = json!(42.0);
         let curve = table(values).curve("loss", 0, 100);
@@ -168,7 +169,7 @@ mod tests {
     }
 
     #[test]
-    fn a_column_may_appear_late_and_inner_objects_have_names() {
+    fn column_may_appear_late_and_nested_keys_are_joined_by_dots() {
         let mut table = Table::default();
         table.push(&json!({"env_steps": 1, "wall_s": 1.0}));
         table.push(&json!({"env_steps": 2, "wall_s": 2.0, "rejected": {"run": 3}}));
@@ -177,7 +178,7 @@ mod tests {
     }
 
     #[test]
-    fn a_run_without_an_end_keeps_a_bounded_number_of_rows_of_its_whole_length() {
+    fn long_run_keeps_a_bounded_number_of_evenly_spaced_rows() {
         let mut table = Table::default();
         let mut dropped = 0;
         let rows = ROWS_MAX * 3;

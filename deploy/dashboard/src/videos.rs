@@ -1,4 +1,4 @@
-//! Lists the files that `dmprl record` has written for a run.
+//! Lists the videos and pictures that `dmprl record` has made of a run.
 
 use std::fs;
 use std::io::ErrorKind;
@@ -10,22 +10,22 @@ use serde::Serialize;
 
 /// File types that a browser can show.
 const EXTENSIONS: [&str; 3] = ["mp4", "gif", "png"];
-/// Maximum number of files in the list.
+/// Maximum number of files listed.
 const VIDEOS_MAX: usize = 200;
 
-/// A file in `videos/`.
+/// A file in the run's `videos` folder.
 #[derive(Debug, Serialize)]
 pub struct Video {
     pub name: String,
     pub bytes: u64,
 }
 
-/// Folder of the videos.
+/// Returns the path of a run's `videos` folder.
 pub fn folder(run: &RunDirectory) -> PathBuf {
     run.path().join("videos")
 }
 
-/// Lists regular files that a browser can show, by name; links are skipped.
+/// Lists the files that a browser can show, sorted by name; links are skipped.
 ///
 /// # Errors
 /// The folder cannot be read.

@@ -1,4 +1,4 @@
-//! Replacing files so that a crash leaves the old or the new content, never a torn file.
+//! Replaces files so that a crash leaves the old or the new content, never a partial file.
 
 use std::fs::{self, File, Permissions};
 use std::io::Write;
@@ -11,17 +11,17 @@ use tempfile::{Builder, NamedTempFile};
 /// Start and end of a temporary file's name.
 const PREFIX: &str = ".aside-";
 const SUFFIX: &str = ".tmp";
-/// Permissions before the user's mask applies, as for any new file.
+/// Permissions before the umask applies, as for any new file.
 const MODE: u32 = 0o666;
 
 /// Replaces a file: writes a temporary file beside it, syncs it and renames it.
 ///
 /// # Errors
-/// The file system refuses; `path` is then unchanged.
+/// An I/O error; `path` is then unchanged.
 pub fn replace(path: &Path, bytes: &[u8]) -> anyhow::Result<()> {
     let parent = parent_of(path)?;
     let write = || -> std::io::Result<()> {
-        let mut file = aside(parent)?;
+        let mut file = temporary_file(parent)?;
         file.write_all(bytes)?;
         file.as_file().sync_all()?;
         file.persist(path)?;
@@ -30,11 +30,11 @@ pub fn replace(path: &Path, bytes: &[u8]) -> anyhow::Result<()> {
     write().with_context(|| format!("cannot write {}", path.display()))
 }
 
-/// Replaces a file without a sync: after a crash of the machine it may be empty.
+/// Replaces a file without syncing it: after a power failure it may be empty.
 pub(crate) fn replace_unsynced(path: &Path, bytes: &[u8]) -> anyhow::Result<()> {
     let parent = parent_of(path)?;
     let write = || -> std::io::Result<()> {
-        let mut file = aside(parent)?;
+        let mut file = temporary_file(parent)?;
         file.write_all(bytes)?;
         file.persist(path)?;
         Ok(())
@@ -42,15 +42,15 @@ pub(crate) fn replace_unsynced(path: &Path, bytes: &[u8]) -> anyhow::Result<()> 
     write().with_context(|| format!("cannot write {}", path.display()))
 }
 
-/// Makes `link` a symbolic link to `target`; an existing one is replaced atomically.
-pub(crate) fn point(link: &Path, target: &Path) -> anyhow::Result<()> {
-    let make = || -> anyhow::Result<()> {
-        let aside =
+/// Creates a symbolic link from `link` to `target`, or replaces it atomically if it exists.
+pub(crate) fn replace_link(link: &Path, target: &Path) -> anyhow::Result<()> {
+    let create = || -> anyhow::Result<()> {
+        let temporary =
             builder().make_in(parent_of(link)?, |at| std::os::unix::fs::symlink(target, at))?;
-        aside.persist(link)?;
+        temporary.persist(link)?;
         Ok(())
     };
-    make().with_context(|| format!("cannot write {}", link.display()))
+    create().with_context(|| format!("cannot write {}", link.display()))
 }
 
 fn builder() -> Builder<'static, 'static> {
@@ -59,7 +59,7 @@ fn builder() -> Builder<'static, 'static> {
     builder
 }
 
-fn aside(folder: &Path) -> std::io::Result<NamedTempFile> {
+fn temporary_file(folder: &Path) -> std::io::Result<NamedTempFile> {
     builder().permissions(Permissions::from_mode(MODE)).tempfile_in(folder)
 }
 
@@ -70,13 +70,15 @@ fn parent_of(path: &Path) -> anyhow::Result<&Path> {
 
 /// Removes the temporary files of killed processes from a folder. No other process may be writing
 /// there.
-pub(crate) fn remove_asides(folder: &Path) -> anyhow::Result<()> {
+pub(crate) fn remove_temporary_files(folder: &Path) -> anyhow::Result<()> {
     let failed = |path: &Path| format!("cannot remove {}", path.display());
     for entry in fs::read_dir(folder).with_context(|| failed(folder))? {
         let entry = entry.with_context(|| failed(folder))?;
         let path = entry.path();
         // The learner removes half-written checkpoints, which are folders.
-        if is_aside(&entry.file_name().to_string_lossy()) && (path.is_symlink() || path.is_file()) {
+        if is_temporary(&entry.file_name().to_string_lossy())
+            && (path.is_symlink() || path.is_file())
+        {
             fs::remove_file(&path).with_context(|| failed(&path))?;
         }
     }
@@ -85,7 +87,7 @@ pub(crate) fn remove_asides(folder: &Path) -> anyhow::Result<()> {
 
 /// Returns true if a file has the name of a temporary file: `NAME.tmp`, or `NAME.tmp<process id>`
 /// of an older version.
-fn is_aside(name: &str) -> bool {
+fn is_temporary(name: &str) -> bool {
     let after = name.rsplit_once(SUFFIX).map(|(_, after)| after);
     after.is_some_and(|after| after.bytes().all(|byte| byte.is_ascii_digit()))
 }

@@ -1,4 +1,4 @@
-//! How a process ended.
+//! Describes how a process ended.
 
 use std::os::unix::process::ExitStatusExt;
 use std::process::ExitStatus;
@@ -6,7 +6,7 @@ use std::process::ExitStatus;
 /// Exit status of a process that ended itself because an environment hung.
 pub const ENV_HUNG_STATUS: i32 = 75;
 
-/// Describes an exit status, such as `exit status 3` or `signal 9 (SIGKILL), perhaps for want of
+/// Describes an exit status, such as `exit status 3` or `signal 9 (SIGKILL), perhaps out of
 /// memory`.
 #[must_use]
 pub fn describe(status: ExitStatus) -> String {
@@ -19,10 +19,10 @@ pub fn describe(status: ExitStatus) -> String {
         (None, None) => return status.to_string(),
     };
     let name = match signal {
-        4 => " (SIGILL), an instruction this processor lacks",
+        4 => " (SIGILL), an instruction that this processor does not support",
         6 => " (SIGABRT)",
         7 => " (SIGBUS), perhaps because shared memory (/dev/shm) is full",
-        9 => " (SIGKILL), perhaps for want of memory",
+        9 => " (SIGKILL), perhaps out of memory",
         11 => " (SIGSEGV), a fault in native code",
         15 => " (SIGTERM)",
         _ => "",

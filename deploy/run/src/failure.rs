@@ -1,18 +1,18 @@
-//! How a command ends: its outcome, its exit status, and the text of its errors.
+//! The outcome of a command: its exit status and the text of its errors.
 
 use std::fmt::{self, Display, Formatter};
 use std::process::ExitCode;
 
-/// Result of a command that did not fail.
+/// How a command that did not fail ended.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Outcome {
     /// The command completed.
     Done,
-    /// The user interrupted it.
+    /// It was interrupted by the user.
     Interrupted,
 }
 
-/// An invalid request of the user, with exit status 2 instead of 1.
+/// Error for an invalid request; the exit status is 2 instead of 1.
 #[derive(Debug)]
 pub struct WrongUse(pub String);
 
@@ -40,7 +40,7 @@ pub fn exit_code(result: &anyhow::Result<Outcome>) -> ExitCode {
     })
 }
 
-/// Formats `error: what`, then each cause on its own line.
+/// Formats an error as `error: MESSAGE`, then each cause on its own line.
 #[must_use]
 pub fn render(error: &anyhow::Error) -> String {
     let mut text = format!("error: {error}");
@@ -70,7 +70,7 @@ mod tests {
     }
 
     #[test]
-    fn wrong_use_is_told_from_failure_below_context_too() {
+    fn wrong_use_is_recognised_below_a_context() {
         let error = Err::<Outcome, _>(wrong_use("no such task")).context("cannot train");
         assert_eq!(exit_code(&error), ExitCode::from(2));
         assert_eq!(exit_code(&Err(anyhow::anyhow!("x"))), ExitCode::from(1));

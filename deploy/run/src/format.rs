@@ -28,7 +28,7 @@ pub fn binary_bytes(bytes: u64) -> String {
     BinaryBytes(bytes).to_string().replace(".00 ", " ")
 }
 
-/// Formats a path relative to the working directory, if it is below.
+/// Formats a path relative to the working directory if it is inside it.
 #[must_use]
 pub fn shown(path: &Path) -> String {
     let here = std::env::current_dir().unwrap_or_default();

@@ -1,6 +1,7 @@
-//! The run directory, and what every command shares: errors, number formats, progress, sweep files.
+//! The run directory, and code that all commands share: errors, number formats, progress and sweep
+//! files.
 //!
-//! Each crate of `deploy` builds on this one. It starts no process and draws nothing.
+//! The other crates of `deploy` build on this one. It starts no process and draws nothing.
 
 mod atomic;
 mod directory;
@@ -10,7 +11,6 @@ pub mod format;
 mod lock;
 mod log_tail;
 mod manifest;
-mod message;
 mod policies;
 mod processes;
 mod progress;
@@ -30,12 +30,11 @@ pub use exit_status::{ENV_HUNG_STATUS, describe};
 pub use lock::RunLock;
 pub use log_tail::last_lines;
 pub use manifest::{FORMAT_VERSION, Machine, Manifest, Packages, Session};
-pub use message::{event_line, say, say_json, says_json, write_line};
 pub use policies::{ChosenPolicy, PolicyChoice};
 pub use processes::{ProcessRow, ProcessState, Processes};
 pub use progress::{NoProgress, Progress};
 pub use random::random_u64;
 pub use setup::Setup;
-pub use timestamp::{compact, compact_now, rfc3339, unix_s};
+pub use timestamp::{compact, compact_now, now_rfc3339, rfc3339, unix_s};
 pub use title::{method_label, title};
 pub use watch::{Interrupted, Watch, is_ignored};

@@ -1,4 +1,4 @@
-//! One run, one trainer: an exclusive `flock` on the file `lock`.
+//! An exclusive `flock` on a run's file `lock`, so that only one supervisor trains the run.
 
 use std::fs::{File, OpenOptions, TryLockError};
 use std::io::{Read, Seek, Write};
@@ -9,25 +9,26 @@ use std::time::{Duration, Instant};
 
 use anyhow::{Context, bail};
 
-use crate::say;
+use tracing::info;
 
-/// How often a waiting process looks again.
+/// Interval at which a waiting process tries again.
 const POLL: Duration = Duration::from_millis(50);
 
-/// Holds the run until it and every child that inherited it are gone.
+/// The lock of a run, held until this process and every child that inherited it have ended.
 ///
-/// Children inherit the descriptor on purpose: when the supervisor is killed, the learner still
-/// writes a last checkpoint, and a `dmprl resume` must not start beside it.
+/// Children inherit the descriptor on purpose: if the supervisor is killed, the learner still
+/// writes a last checkpoint, and `dmprl resume` must not start before that.
 #[derive(Debug)]
 pub struct RunLock {
     _file: File,
 }
 
 impl RunLock {
-    /// Takes the lock of the directory `run`; waits at most `wait` for another holder.
+    /// Locks the directory `run`. If its supervisor has died, waits at most `wait` for the
+    /// supervisor's children to end.
     ///
     /// # Errors
-    /// Another process holds it beyond `wait`, or the file cannot be written.
+    /// The supervisor is alive, its children outlive `wait`, or an I/O error.
     pub fn take(run: &Path, wait: Duration) -> anyhow::Result<Self> {
         let path = run.join("lock");
         let mut file = OpenOptions::new()
@@ -35,30 +36,30 @@ impl RunLock {
             .write(true)
             .create(true)
             .truncate(false)
-            // Who can open it can lock it, and so keep the owner from resuming.
+            // Any user who can open the file could lock it and keep the owner from resuming.
             .mode(0o600)
             .open(&path)
             .with_context(|| format!("cannot open {}", path.display()))?;
         let deadline = Instant::now() + wait;
-        let mut told = false;
+        let mut logged = false;
         loop {
             match file.try_lock() {
                 Ok(()) => break,
                 Err(TryLockError::WouldBlock) => {
                     let holder = holder(&mut file);
-                    if lives(&holder) || Instant::now() >= deadline {
+                    if is_other_live_process(&holder) || Instant::now() >= deadline {
                         bail!(
-                            "{} is being trained by process {holder}; stop it first or wait \
-                             for its end",
+                            "{} is being trained by process {holder}; stop it, or wait until it \
+                             ends",
                             run.display()
                         );
                     }
-                    if !told {
-                        told = true;
-                        say(&format!(
-                            "process {holder} has died; waiting up to {wait:?} for the last \
-                             checkpoint of its learner"
-                        ));
+                    if !logged {
+                        logged = true;
+                        info!(
+                            "process {holder} has died; waiting up to {wait:?} for its learner's \
+                             last checkpoint"
+                        );
                     }
                     thread::sleep(POLL);
                 }
@@ -72,34 +73,33 @@ impl RunLock {
             .and_then(|()| writeln!(file, "{}", std::process::id()))
             .with_context(|| format!("cannot write {}", path.display()))?;
         rustix::io::fcntl_setfd(&file, rustix::io::FdFlags::empty())
-            .with_context(|| format!("cannot pass {} on to children", path.display()))?;
+            .with_context(|| format!("cannot make {} inheritable", path.display()))?;
         Ok(Self { _file: file })
     }
 }
 
-/// The supervisor that took the lock last, by its process's number.
+/// Returns the process id of the supervisor that took the lock last.
 pub(crate) fn last_holder(run: &Path) -> Option<u32> {
     holder(&mut File::open(run.join("lock")).ok()?).parse().ok()
 }
 
-/// Whether a process is a supervisor: its number may be another's by now. Asked of the system and
-/// not of the lock, which nobody else may hold for a moment while a resume asks for it.
+/// Returns true if a process is a supervisor; its id may have been reused. Reads `/proc` instead of
+/// trying the lock, because even a short hold of the lock could make a concurrent resume fail.
 pub(crate) fn is_trainer(id: u32) -> bool {
     let line = std::fs::read(format!("/proc/{id}/cmdline")).unwrap_or_default();
     let command = line.split(|&byte| byte == 0).nth(1).unwrap_or_default();
     [b"train".as_slice(), b"resume", b"chaos"].contains(&command)
 }
 
-/// The supervisor that took the lock last. An unreadable file is as good as an empty one.
+/// Returns the process id that the lock file contains; empty if the file cannot be read.
 fn holder(file: &mut File) -> String {
     let mut text = String::new();
     let _ = file.rewind().and_then(|()| file.read_to_string(&mut text));
     text.trim().to_owned()
 }
 
-/// Whether waiting for `holder`'s children is in vain, because it lives itself. This process's own
-/// number is there when it held the lock before.
-fn lives(holder: &str) -> bool {
+/// Returns true if `holder` is alive and not this process, which may have held the lock before.
+fn is_other_live_process(holder: &str) -> bool {
     let other = holder.parse().is_ok_and(|id: u32| id != std::process::id());
     // A zombie has no command line.
     let line = std::fs::read(Path::new("/proc").join(holder).join("cmdline"));

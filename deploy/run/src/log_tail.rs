@@ -1,4 +1,4 @@
-//! The end of a process's log, for error messages.
+//! Reads the end of a process's log, for error messages.
 
 use std::fs::File;
 use std::io::{Read, Seek, SeekFrom};
@@ -24,7 +24,7 @@ pub fn last_lines(path: &Path) -> String {
     let text = String::from_utf8_lossy(&tail);
     let lines: Vec<&str> = text.lines().collect();
     let last = lines[lines.len().saturating_sub(LOG_LINES)..].iter().map(|line| {
-        // Control characters that an environment printed could reprogram the terminal.
+        // An environment may have printed control characters, which could change the terminal.
         let plain = line.chars().map(|letter| if letter.is_control() { ' ' } else { letter });
         format!("    {}", plain.collect::<String>())
     });

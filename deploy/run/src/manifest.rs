@@ -1,4 +1,4 @@
-//! `manifest.json`: format, versions, machine and command of a run.
+//! `manifest.json`: a run's format, versions, machine and commands.
 
 use std::time::SystemTime;
 
@@ -10,48 +10,47 @@ use sha2::{Digest, Sha256};
 use crate::random::random_u64;
 use crate::timestamp::rfc3339;
 
-/// Version of the run directory's format; older ones are read, newer ones refused.
+/// Version of the run directory's format. Other versions are rejected.
 pub const FORMAT_VERSION: u32 = 1;
 
-/// Who made a run, where, when and with what.
+/// Origin of a run: its machine, and the commands and versions of its sessions.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Manifest {
     /// [`FORMAT_VERSION`] of the writer.
     pub format_version: u32,
-    /// Tells the run's segments and files from another's: 16 hexadecimal digits.
+    /// Identifies the run's segments and files; 16 hexadecimal digits.
     pub run_id: String,
-    /// Where it began; sessions may have gone on elsewhere.
+    /// Machine of the first session; later ones may have run elsewhere.
     pub machine: Machine,
-    /// File of the policy that the run began from, for a warm start.
+    /// Policy file that the run started from, for a warm start.
     pub init_from: Option<String>,
-    /// `train`, then one per `resume`.
+    /// The session of `train`, then one per `resume`.
     pub sessions: Vec<Session>,
 }
 
 /// One start of the supervisor.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Session {
-    /// UTC, RFC 3339.
+    /// Start time in UTC, as in RFC 3339.
     pub started: String,
-    /// As typed.
+    /// Command line, including the program.
     pub command: Vec<String>,
-    /// Version of this program.
+    /// Version of `dmprl`.
     pub dmprl_version: String,
-    /// Commit that the program was built from, `-dirty` appended where its sources differed from
-    /// it; none if it was built outside a git repository.
+    /// Commit that the program was built from, with `-dirty` if its sources differed from it;
+    /// `None` if it was built outside a git repository.
     pub git_commit: Option<String>,
-    /// SHA-256 of the resolved configuration, as hexadecimal digits; none in manifests of older
+    /// SHA-256 of the resolved configuration, in hexadecimal; `None` in manifests of older
     /// programs.
     #[serde(default)]
     pub config_sha256: Option<String>,
-    /// What its environments run on; none in manifests of older programs.
+    /// Versions that the environments depend on; `None` in manifests of older programs.
     #[serde(default)]
     pub packages: Option<Packages>,
 }
 
-/// Versions of the Python packages that decide what an environment does.
-///
-/// A version is none where the package is not installed.
+/// Versions of the Python packages that determine how an environment behaves; `None` if a package
+/// is not installed.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Packages {
     /// The interpreter's version.
@@ -62,26 +61,26 @@ pub struct Packages {
     pub gymnasium: Option<String>,
     /// NumPy's version.
     pub numpy: Option<String>,
-    /// SHA-256 over the Python sources of the package `dmprl`, as hexadecimal digits.
+    /// SHA-256 of the Python sources of the package `dmprl`, in hexadecimal.
     pub dmprl_sha256: Option<String>,
 }
 
-/// What figures like steps per second depend on.
+/// The machine, on which measurements such as steps per second depend.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Machine {
     /// Operating system and architecture.
     pub os: String,
-    /// The processor's name, when the system tells it.
+    /// Name of the processor, if the system reports it.
     pub cpu: Option<String>,
-    /// Cores this process may use.
+    /// Number of cores that this process may use.
     pub cores: usize,
-    /// Main memory \[bytes\], when the system tells it.
+    /// Main memory \[bytes\], if the system reports it.
     pub memory_bytes: Option<u64>,
 }
 
 impl Manifest {
-    /// The manifest of something other than a training run, which records neither configuration
-    /// nor packages.
+    /// Creates the manifest of a run that does not train: it records neither configuration nor
+    /// packages.
     ///
     /// # Errors
     /// As [`Manifest::begin`].
@@ -89,10 +88,10 @@ impl Manifest {
         Self::begin(init_from, Session::now())
     }
 
-    /// The manifest of a run whose first session begins now.
+    /// Creates the manifest of a run whose first session begins now.
     ///
     /// # Errors
-    /// The system gives no random number for the run's id.
+    /// The system returns no random number for the run's id.
     pub fn begin(init_from: Option<String>, session: Session) -> anyhow::Result<Self> {
         Ok(Self {
             format_version: FORMAT_VERSION,
@@ -103,39 +102,43 @@ impl Manifest {
         })
     }
 
-    /// Reads a manifest of this or an older format.
+    /// Parses a manifest; one of another format is rejected with its version.
     pub(crate) fn parse(text: &str) -> anyhow::Result<Self> {
-        // The version first: the rest of a newer format may not fit.
+        // The version first, because the rest of a newer format may differ.
         #[derive(Deserialize)]
         struct Head {
             format_version: u32,
         }
-        let head: Head = serde_json::from_str(text).context("no format_version")?;
+        let head: Head = serde_json::from_str(text).context("it has no valid format_version")?;
         if head.format_version > FORMAT_VERSION {
             bail!(
-                "format version {} is newer than {FORMAT_VERSION}, the newest this dmprl reads; \
-                 update dmprl",
+                "format version {} is newer than {FORMAT_VERSION}, the newest that this dmprl \
+                 reads; update dmprl",
                 head.format_version
             );
         }
-        ensure!(head.format_version == FORMAT_VERSION, "format version {}", head.format_version);
-        let manifest: Self = serde_json::from_str(text).context("damaged")?;
+        ensure!(
+            head.format_version == FORMAT_VERSION,
+            "format version {}; expected {FORMAT_VERSION}",
+            head.format_version
+        );
+        let manifest: Self = serde_json::from_str(text).context("it is damaged")?;
         manifest.run_id()?;
         ensure!(!manifest.sessions.is_empty(), "expected at least one session, got none");
         Ok(manifest)
     }
 
-    /// The run's id as the number that segments carry.
+    /// Returns the run's id as a number, as in segments.
     ///
     /// # Errors
-    /// It is no hexadecimal number of 64 bits.
+    /// The id is not a hexadecimal number of 64 bits.
     pub fn run_id(&self) -> anyhow::Result<u64> {
         u64::from_str_radix(&self.run_id, 16).with_context(|| {
             format!("run_id: expected 16 hexadecimal digits, got {:?}", self.run_id)
         })
     }
 
-    /// The preset that the run was begun with, where its command names one.
+    /// Returns the preset of the run's first command, if it has one.
     #[must_use]
     pub fn preset(&self) -> Option<&str> {
         let words = &self.sessions.first()?.command;
@@ -146,7 +149,7 @@ impl Manifest {
 }
 
 impl Session {
-    /// The session of this process.
+    /// Creates the session of this process.
     #[must_use]
     pub fn now() -> Self {
         Self {
@@ -159,7 +162,7 @@ impl Session {
         }
     }
 
-    /// The session of this process, which trains `config` with `packages`.
+    /// Creates the session of this process, which trains `config` with `packages`.
     ///
     /// # Errors
     /// The configuration cannot be written as TOML.
@@ -169,19 +172,19 @@ impl Session {
     }
 }
 
-/// Hash of a resolved configuration as `config.toml` holds it, without the comment above it.
+/// Hashes a resolved configuration as in `config.toml`, without the comment above it.
 fn config_sha256(config: &ExperimentConfig) -> anyhow::Result<String> {
     let text = toml::to_string(config).context("cannot write the configuration as TOML")?;
     Ok(hexadecimal(&Sha256::digest(text)))
 }
 
-/// Two digits a byte.
+/// Formats bytes with two digits each.
 fn hexadecimal(bytes: &[u8]) -> String {
     bytes.iter().map(|byte| format!("{byte:02x}")).collect()
 }
 
 impl Machine {
-    /// The one this program runs on.
+    /// Describes the machine that this program runs on.
     pub fn this() -> Self {
         let read = |path| std::fs::read_to_string(path).unwrap_or_default();
         let value = |text: &str, name: &str| {

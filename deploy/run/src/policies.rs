@@ -1,4 +1,4 @@
-//! `policies/<version>.safetensors`: which are kept, and which one a user means.
+//! `policies/<version>.safetensors`: chooses, lists and prunes saved policies.
 
 use std::collections::BTreeSet;
 use std::fmt::{self, Display, Formatter};
@@ -12,14 +12,14 @@ use crate::atomic;
 use crate::directory::RunDirectory;
 use crate::failure::wrong_use;
 
-/// Which of a run's saved policies.
+/// A user's choice of a saved policy.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum PolicyChoice {
-    /// The one with the highest evaluation return.
+    /// The policy with the highest evaluation return.
     Best,
-    /// The last one evaluated.
+    /// The policy that was evaluated last.
     Latest,
-    /// This one.
+    /// The policy with this version.
     Version(u64),
 }
 
@@ -48,28 +48,29 @@ impl Display for PolicyChoice {
     }
 }
 
-/// A saved policy, and how it did when the run evaluated it.
+/// A saved policy and its evaluation.
 #[derive(Debug, Clone, PartialEq)]
 pub struct ChosenPolicy {
-    /// Its version.
+    /// Version of the policy.
     pub version: u64,
-    /// Its file, which exists.
+    /// Path of its file, which exists.
     pub path: PathBuf,
-    /// Its row, when there is one.
+    /// Its evaluation, if the run has evaluated it.
     pub row: Option<EvaluationRow>,
 }
 
 impl RunDirectory {
-    /// Where a policy is saved.
+    /// Path of a policy's file.
     #[must_use]
     pub fn policy_path(&self, version: u64) -> PathBuf {
         self.path().join("policies").join(format!("{version}.safetensors"))
     }
 
-    /// The policy that `choice` means.
+    /// Finds the policy that the user chose.
     ///
     /// # Errors
-    /// Wrong use: nothing evaluated yet, or no such version; the versions there are named.
+    /// Wrong use: the run has no evaluation yet, or no such version; the error lists the saved
+    /// versions.
     pub fn choose_policy(&self, choice: PolicyChoice) -> anyhow::Result<ChosenPolicy> {
         let row = match choice {
             PolicyChoice::Best => self.best_row()?,
@@ -83,8 +84,8 @@ impl RunDirectory {
             (_, Some(row)) => row.policy_version,
             (_, None) => {
                 return Err(wrong_use(format!(
-                    "run {} has no evaluation yet, so no {choice} policy; go on with it: \
-                     dmprl resume {}",
+                    "run {} has no evaluation yet, so no {choice} policy; resume it: dmprl resume \
+                     {}",
                     self.path().display(),
                     self.path().display()
                 )));
@@ -94,18 +95,18 @@ impl RunDirectory {
         if path.is_file() {
             return Ok(ChosenPolicy { version, path, row });
         }
-        let there: Vec<String> = self.saved_policies()?.iter().map(u64::to_string).collect();
+        let saved: Vec<String> = self.saved_policies()?.iter().map(u64::to_string).collect();
         Err(wrong_use(format!(
-            "run {} has not kept policy {version}; kept: {}",
+            "run {} has no saved policy {version}; saved: {}",
             self.path().display(),
-            if there.is_empty() { "none".into() } else { there.join(", ") }
+            if saved.is_empty() { "none".into() } else { saved.join(", ") }
         )))
     }
 
-    /// The versions saved.
+    /// Lists the versions of the saved policies.
     ///
     /// # Errors
-    /// What the file system refuses.
+    /// An I/O error.
     pub fn saved_policies(&self) -> anyhow::Result<BTreeSet<u64>> {
         let folder = self.path().join("policies");
         let entries =
@@ -120,32 +121,32 @@ impl RunDirectory {
         Ok(versions)
     }
 
-    /// Points `checkpoints/best` at the best row's policy.
+    /// Points the link `checkpoints/best` at the policy of the best row.
     ///
     /// # Errors
-    /// What the file system refuses.
+    /// An I/O error, or an invalid row.
     pub fn point_best(&self) -> anyhow::Result<()> {
         let Some(best) = self.best_row()? else { return Ok(()) };
         let target = Path::new("../policies").join(format!("{}.safetensors", best.policy_version));
-        atomic::point(&self.checkpoints_path().join("best"), &target)
+        atomic::replace_link(&self.checkpoints_path().join("best"), &target)
     }
 
-    /// Removes the policies that nothing names any more. Kept are the best and the latest row's,
-    /// those in `also` (what the checkpoints name), and every version after the latest row's:
-    /// its evaluation is still to come.
+    /// Removes policies that are no longer needed. Keeps those of the best and the latest row,
+    /// those in `in_checkpoints`, and every version after the latest row, which is not evaluated
+    /// yet.
     ///
     /// # Errors
-    /// What the file system refuses.
-    pub fn prune_policies(&self, also: &[u64]) -> anyhow::Result<()> {
+    /// An I/O error, or an invalid row.
+    pub fn prune_policies(&self, in_checkpoints: &[u64]) -> anyhow::Result<()> {
         let (Some(best), Some(latest)) = (self.best_row()?, self.latest_row()?) else {
             return Ok(());
         };
-        let kept = |version: u64| {
+        let is_kept = |version: u64| {
             version >= latest.policy_version
                 || version == best.policy_version
-                || also.contains(&version)
+                || in_checkpoints.contains(&version)
         };
-        for version in self.saved_policies()?.into_iter().filter(|&version| !kept(version)) {
+        for version in self.saved_policies()?.into_iter().filter(|&version| !is_kept(version)) {
             let path = self.policy_path(version);
             match std::fs::remove_file(&path) {
                 Err(error) if error.kind() != std::io::ErrorKind::NotFound => {

@@ -1,5 +1,5 @@
-//! `processes.json`: which processes a run has, and what they do. The supervisor replaces it while
-//! it trains; whoever watches reads it.
+//! `processes.json`: the processes of a run and their states. The supervisor replaces it during
+//! training, and the dashboard reads it.
 
 use anyhow::Context;
 use dmprl_shared::supervision::Activity;
@@ -8,64 +8,64 @@ use serde::{Deserialize, Serialize};
 use crate::atomic;
 use crate::directory::{RunDirectory, read_small};
 
-/// Of this file; raised when what it holds changes.
+/// Version of the file's format.
 const FORMAT: u32 = 1;
 
 /// The processes of a run's last session.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Processes {
     format: u32,
-    /// Whether the session has come to its end; if not, and nobody trains, it was killed.
+    /// True if the session has ended. If false and no process is training, it was killed.
     pub ended: bool,
-    /// How old the session was when this was written \[s\].
+    /// Age of the session when the file was written \[s\].
     pub session_s: f64,
     /// Learner, workers, evaluator.
     pub processes: Vec<ProcessRow>,
 }
 
-/// One of them.
+/// State of one process.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct ProcessRow {
     /// `learner`, `actor-0`, `evaluator`.
     pub name: String,
-    /// Whether somebody else has started it: a worker that has joined.
+    /// True for a worker that joined the run, and was not started by the supervisor.
     pub joined: bool,
-    /// Where it is in its life.
+    /// State of the process.
     pub state: ProcessState,
-    /// What a worker did when it last gave a sign of life.
+    /// Activity of a worker at its last heartbeat.
     pub doing: Option<Activity>,
     /// Segments that a worker keeps until the learner acknowledges them.
     pub kept_segments: u64,
     /// Segments of a worker that the learner has acknowledged in this session.
     pub acknowledged_segments: u64,
-    /// Starts in this session.
+    /// Number of starts in this session.
     pub starts: u32,
-    /// Seconds since the last start; none when it does not run.
+    /// Time since the last start \[s\]; `None` if it is not running.
     pub up_s: Option<f64>,
-    /// Seconds since it last said anything.
+    /// Time since its last message \[s\].
     pub silent_s: Option<f64>,
     /// Processor time since its start \[s\].
     pub cpu_s: Option<f64>,
-    /// Memory that it occupies, what it shares included.
+    /// Resident memory, including shared pages.
     pub memory_bytes: Option<u64>,
 }
 
-/// Where a process is in its life.
+/// State of a process.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum ProcessState {
-    /// It makes its environments or reads its checkpoint.
+    /// It is creating its environments or reading its checkpoint.
     Starting,
-    /// It does its work.
+    /// It is working.
     Running,
-    /// It has died, and will be started again.
+    /// It has died and will be restarted.
     Restarting,
-    /// It is not there, and will not be.
+    /// It has ended and will not be restarted.
     Gone,
 }
 
 impl Processes {
-    /// What a session has now.
+    /// Creates the content of the file.
     #[must_use]
     pub fn new(ended: bool, session_s: f64, processes: Vec<ProcessRow>) -> Self {
         Self { format: FORMAT, ended, session_s, processes }
@@ -73,17 +73,17 @@ impl Processes {
 }
 
 impl RunDirectory {
-    /// Replaces `processes.json`. Not synced: it is about this moment only, and nothing may wait
-    /// for a disk.
+    /// Replaces `processes.json`. The file is not synced: it describes only the current state, and
+    /// the supervisor must not wait for a disk.
     ///
     /// # Errors
-    /// What the file system refuses.
+    /// An I/O error.
     pub fn write_processes(&self, processes: &Processes) -> anyhow::Result<()> {
         let text = serde_json::to_vec(processes).context("cannot write processes.json")?;
         atomic::replace_unsynced(&self.path().join("processes.json"), &text)
     }
 
-    /// What the supervisor wrote last; none by a version that did not, or of another format.
+    /// Reads the file; `None` if it does not exist or has another format.
     ///
     /// # Errors
     /// The file cannot be read, or is damaged.

@@ -1,14 +1,14 @@
-//! Progress of long work. The crates report it here; the program draws it.
+//! Progress of long work. The crates report it through a trait; the program shows it.
 
 /// Shows the progress of long work.
 pub trait Progress {
-    /// Shows what begins now. Without a terminal it is printed as a line.
+    /// Shows the start of a stage. Without a terminal it is printed as a line.
     fn stage(&self, what: &str);
 
-    /// Shows what is being done within the stage. Only a terminal shows it.
+    /// Shows the current step within the stage. Only a terminal shows it.
     fn detail(&self, what: &str);
 
-    /// Shows how much is done. Only a terminal shows it.
+    /// Shows the amount done, out of a total. Only a terminal shows it.
     fn at(&self, done: u64, of: u64);
 
     /// Shows the current state. Without a terminal a line is printed every few seconds.

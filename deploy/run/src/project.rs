@@ -1,16 +1,16 @@
-//! Finds the project's files, and says which commit the program was built from.
+//! Finds the project's files and records the commit that the program was built from.
 
 use std::path::{Path, PathBuf};
 use std::sync::OnceLock;
 
-/// Ancestors searched for the project when the build's own folder is gone.
+/// Maximum number of ancestors of the current directory in which to look for the project.
 const ANCESTORS_MAX: usize = 16;
 
-/// The folder that holds `envs_py/`: the one this program was built from, the one it lies in, as
-/// in a released archive, or one above the current directory.
+/// Finds the folder that contains `envs_py/`: the folder that this program was built from, the
+/// program's own folder (as in a released archive), or the current directory or one above it.
 ///
 /// # Errors
-/// Neither is there any more.
+/// None of these folders contains `envs_py/`.
 pub fn root() -> anyhow::Result<PathBuf> {
     let built_from = Path::new(env!("CARGO_MANIFEST_DIR")).ancestors().nth(2).map(Path::to_owned);
     let beside = std::env::current_exe().ok().and_then(|file| file.parent().map(Path::to_owned));
@@ -19,7 +19,7 @@ pub fn root() -> anyhow::Result<PathBuf> {
     built_from.into_iter().chain(beside).chain(above).find(|path| is_root(path)).ok_or_else(|| {
         anyhow::anyhow!(
             "cannot find the project's Python package; run dmprl inside a clone of the project, or \
-             install it into a virtual environment (pip install ., in a clone)"
+             install the package into a virtual environment (in a clone: pip install .)"
         )
     })
 }
@@ -30,15 +30,15 @@ fn is_root(path: &Path) -> bool {
 
 static GIT_COMMIT: OnceLock<String> = OnceLock::new();
 
-/// Records the commit that this program was built from; empty if it is unknown. Only the program
-/// itself is compiled again after a commit, so it passes the commit on at its start.
+/// Records the commit that this program was built from; empty if it is unknown. Only the binary is
+/// recompiled after each commit, so it passes the commit to this library when it starts.
 pub fn set_git_commit(commit: &str) {
     // A second call passes the same commit.
     let _ = GIT_COMMIT.set(commit.to_owned());
 }
 
-/// The commit that this program was built from, with `-dirty` where its sources differed from it;
-/// none if it was built outside a git repository, or in a program that does not record it.
+/// Returns the commit that this program was built from, with `-dirty` if its sources differed from
+/// it; `None` if it was built outside a git repository or did not record the commit.
 #[must_use]
 pub fn git_commit() -> Option<String> {
     GIT_COMMIT.get().filter(|commit| !commit.is_empty()).cloned()

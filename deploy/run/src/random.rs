@@ -11,6 +11,6 @@ pub fn random_u64() -> anyhow::Result<u64> {
     let mut bytes = [0; 8];
     std::fs::File::open("/dev/urandom")
         .and_then(|mut file| file.read_exact(&mut bytes))
-        .context("cannot draw a random number from /dev/urandom")?;
+        .context("cannot read a random number from /dev/urandom")?;
     Ok(u64::from_le_bytes(bytes))
 }

@@ -1,4 +1,4 @@
-//! `evaluations.jsonl` and `metrics.jsonl`: lines that outlive a crash in the middle of one.
+//! `evaluations.jsonl` and `metrics.jsonl`: JSON lines. A crash can cut only the last one short.
 
 use std::fs::{File, OpenOptions};
 use std::io::{BufRead, BufReader, Read, Seek, SeekFrom, Write};
@@ -12,16 +12,16 @@ use serde::de::DeserializeOwned;
 use crate::atomic;
 use crate::directory::RunDirectory;
 
-/// A longer line is damage, not a row.
+/// Maximum length of a line. A file with a longer one is damaged.
 const LINE_BYTES_MAX: u64 = 64 << 20;
-/// How far back from the end the last whole line is looked for.
+/// Number of bytes at the end of a file in which to look for its last complete line.
 const TAIL_BYTES: u64 = 1 << 20;
 
 impl RunDirectory {
-    /// Appends a row and syncs it; a torn line that a crash left behind is cut off first.
+    /// Appends a row and syncs it. First removes a partial line that a crash left behind.
     ///
     /// # Errors
-    /// A number of the row is not finite (JSON has no such number), or the file system refuses.
+    /// A number of the row is not finite, which JSON cannot represent, or an I/O error.
     pub fn append_evaluation(&self, row: &EvaluationRow) -> anyhow::Result<()> {
         row.check_finite()?;
         let path = self.evaluations_path();
@@ -30,23 +30,23 @@ impl RunDirectory {
         append(&path, &line).with_context(|| format!("cannot append to {}", path.display()))
     }
 
-    /// Every whole row, oldest first.
+    /// Reads all complete rows, oldest first.
     ///
     /// # Errors
-    /// A whole line is no row: the file was changed by something else.
+    /// A complete line is invalid, because another program changed the file, or an I/O error.
     pub fn evaluations(&self) -> anyhow::Result<Vec<EvaluationRow>> {
         let path = self.evaluations_path();
         let mut rows = Vec::new();
         for_each_line(&path, |index, line| {
             rows.push(serde_json::from_slice(line).with_context(|| {
-                format!("{}, line {}: no evaluation row", path.display(), index + 1)
+                format!("{}, line {}: invalid evaluation", path.display(), index + 1)
             })?);
             Ok(())
         })?;
         Ok(rows)
     }
 
-    /// The row with the highest mean return; of equals the latest.
+    /// Returns the row with the highest mean return; the latest of equals.
     ///
     /// # Errors
     /// As [`RunDirectory::evaluations`].
@@ -55,7 +55,7 @@ impl RunDirectory {
         Ok(rows.into_iter().max_by(|a, b| a.return_mean.total_cmp(&b.return_mean)))
     }
 
-    /// The last row.
+    /// Returns the last row.
     ///
     /// # Errors
     /// As [`RunDirectory::evaluations`].
@@ -63,11 +63,11 @@ impl RunDirectory {
         Ok(self.evaluations()?.pop())
     }
 
-    /// Forgets every metric and evaluation after `env_steps`: what the checkpoint that a resume
-    /// goes on from has not seen. The lines kept are kept byte for byte.
+    /// Removes the metrics and evaluations after `env_steps`, the steps of the checkpoint from
+    /// which the run resumes. The other lines are not changed.
     ///
     /// # Errors
-    /// A whole line has no `env_steps`, or the file system refuses.
+    /// A complete line has no `env_steps`, or an I/O error.
     pub fn rewind(&self, env_steps: u64) -> anyhow::Result<()> {
         #[derive(Deserialize)]
         struct Row {
@@ -90,10 +90,10 @@ impl RunDirectory {
         Ok(())
     }
 
-    /// Forgets every metric, evaluation and saved policy: the run begins again.
+    /// Removes all metrics, evaluations and saved policies, so that the run can start again.
     ///
     /// # Errors
-    /// What the file system refuses.
+    /// An I/O error.
     pub fn begin_again(&self) -> anyhow::Result<()> {
         for path in [self.metrics_path(), self.evaluations_path()] {
             atomic::replace(&path, b"")?;
@@ -103,7 +103,7 @@ impl RunDirectory {
             std::fs::remove_file(&path)
                 .with_context(|| format!("cannot remove {}", path.display()))?;
         }
-        // It led to one of them.
+        // This link points to one of the policies.
         let best = self.checkpoints_path().join("best");
         match std::fs::remove_file(&best) {
             Err(error) if error.kind() != std::io::ErrorKind::NotFound => {
@@ -113,7 +113,7 @@ impl RunDirectory {
         }
     }
 
-    /// Seconds of training over all sessions so far, as the last rows tell.
+    /// Returns the training time of all sessions so far \[s\], according to the last rows.
     ///
     /// # Errors
     /// The rows cannot be read.
@@ -132,7 +132,7 @@ impl RunDirectory {
         Ok(latest)
     }
 
-    /// The last line of `metrics.jsonl`.
+    /// Reads the last line of `metrics.jsonl`.
     ///
     /// # Errors
     /// The line cannot be read.
@@ -140,7 +140,7 @@ impl RunDirectory {
         last_row(&self.metrics_path())
     }
 
-    /// Environment steps at the last line of `metrics.jsonl`.
+    /// Reads the environment steps in the last line of `metrics.jsonl`.
     ///
     /// # Errors
     /// The line cannot be read.
@@ -163,7 +163,7 @@ fn append(path: &Path, line: &[u8]) -> std::io::Result<()> {
     file.sync_data()
 }
 
-/// Length of the file up to and with its last line end.
+/// Returns the length of the file up to and including its last line end.
 fn whole_len(file: &mut File) -> std::io::Result<u64> {
     let mut end = file.seek(SeekFrom::End(0))?;
     let mut block = [0; 4096];
@@ -187,7 +187,7 @@ fn last_row<T: DeserializeOwned>(path: &Path) -> anyhow::Result<Option<T>> {
         .with_context(|| format!("{}: the last line is damaged", path.display()))
 }
 
-/// The last whole line that is not empty, looked for in the file's last [`TAIL_BYTES`].
+/// Reads the last complete line that is not empty, among the file's last [`TAIL_BYTES`].
 fn last_line(path: &Path) -> std::io::Result<Option<Vec<u8>>> {
     let Ok(mut file) = File::open(path) else { return Ok(None) };
     let whole = whole_len(&mut file)?;
@@ -198,11 +198,11 @@ fn last_line(path: &Path) -> std::io::Result<Option<Vec<u8>>> {
     Ok(tail.split(|&byte| byte == b'\n').rfind(|line| !line.is_empty()).map(<[u8]>::to_vec))
 }
 
-/// Hands over each whole line without its end; a torn last one is left out, a missing file is
-/// an empty one.
+/// Calls `use_line` with the index and content of each complete line, without its line end. A
+/// missing file has no lines.
 fn for_each_line(
     path: &Path,
-    mut line_is: impl FnMut(usize, &[u8]) -> anyhow::Result<()>,
+    mut use_line: impl FnMut(usize, &[u8]) -> anyhow::Result<()>,
 ) -> anyhow::Result<()> {
     let file = match File::open(path) {
         Ok(file) => file,
@@ -220,12 +220,12 @@ fn for_each_line(
         if line.pop() != Some(b'\n') {
             ensure!(
                 (line.len() as u64) < LINE_BYTES_MAX - 1,
-                "{}: a line is too long",
+                "{}: a line is longer than {LINE_BYTES_MAX} bytes",
                 path.display()
             );
             break;
         }
-        line_is(index, &line)?;
+        use_line(index, &line)?;
     }
     Ok(())
 }

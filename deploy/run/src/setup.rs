@@ -1,4 +1,4 @@
-//! The files of a run directory that every process of a run needs.
+//! Reads the files of a run directory that every process of a run needs.
 
 use std::path::Path;
 
@@ -9,11 +9,11 @@ use crate::RunDirectory;
 
 /// A run directory with its configuration and id.
 pub struct Setup {
-    /// The run.
+    /// The run directory.
     pub run: RunDirectory,
-    /// Its resolved configuration.
+    /// Resolved configuration of the run.
     pub config: ExperimentConfig,
-    /// Its id, which every segment carries.
+    /// Id of the run, which every segment contains.
     pub run_id: u64,
 }
 

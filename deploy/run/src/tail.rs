@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 
 use anyhow::{Context, bail};
 
-/// Maximum number of bytes per read; the rest follows with the next one.
+/// Maximum number of bytes per read; the next read returns the rest.
 const BYTES_MAX: u64 = 8 << 20;
 /// Length of the remembered end of the last line, by which a replaced file is recognised.
 const MARK_LEN: usize = 128;
@@ -100,7 +100,7 @@ mod tests {
     }
 
     #[test]
-    fn only_what_is_new_and_whole_is_read() {
+    fn only_new_and_complete_lines_are_read() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("rows");
         let mut tail = Tail::new(&path);
@@ -113,9 +113,9 @@ mod tests {
         assert_eq!((lines(&look), look.begun_again), ("two\nthree\n", false));
     }
 
-    /// A resume cuts the rows after its checkpoint, and the run soon has as many again.
+    /// A resume removes the rows after its checkpoint, and the run soon has as many as before.
     #[test]
-    fn a_file_that_was_cut_is_read_anew_even_when_it_has_grown_longer_since() {
+    fn a_truncated_file_is_read_from_the_start_even_if_it_has_grown_longer_since() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("rows");
         let mut tail = Tail::new(&path);

@@ -1,4 +1,4 @@
-//! Points in time as text, in UTC.
+//! Formats points in time, in UTC.
 
 use std::time::{SystemTime, UNIX_EPOCH};
 
@@ -16,6 +16,12 @@ pub fn rfc3339(time: SystemTime) -> String {
     format(time, "%Y-%m-%dT%H:%M:%SZ")
 }
 
+/// Formats the current time as [`rfc3339`] does.
+#[must_use]
+pub fn now_rfc3339() -> String {
+    rfc3339(SystemTime::now())
+}
+
 /// Formats a time as `20260131-235958`, for names that sort by time.
 #[must_use]
 pub fn compact(time: SystemTime) -> String {
@@ -29,7 +35,7 @@ pub fn compact_now() -> String {
 }
 
 fn format(time: SystemTime, format: &str) -> String {
-    // A clock outside jiff's range is broken; 1970 says so.
+    // A clock outside jiff's range is broken; 1970 makes that visible.
     Timestamp::try_from(time).unwrap_or(Timestamp::UNIX_EPOCH).strftime(format).to_string()
 }
 
@@ -40,7 +46,7 @@ mod tests {
 
     // Expected: GNU date, `date -u -d @N +%FT%TZ`.
     #[test]
-    fn seconds_become_dates_as_gnu_date_has_it() {
+    fn dates_are_formatted_as_by_gnu_date() {
         for (seconds, expected) in [
             (0, "1970-01-01T00:00:00Z"),
             (951_782_399, "2000-02-28T23:59:59Z"),

@@ -1,4 +1,4 @@
-//! Names a run and its method, on the terminal, in reports and on the dashboard.
+//! Names of a run and its method, for the terminal, reports and the dashboard.
 
 use dmprl_shared::config::{AlgorithmName, ExperimentConfig, PRESETS, PolicyKind};
 
@@ -12,9 +12,9 @@ pub fn title(config: &ExperimentConfig) -> String {
         |count: usize, what: &str| format!("{count} {what}{}", if count == 1 { "" } else { "s" });
     let process = if config.run.deterministic { "one process, " } else { "" };
     let workers = count(actors.workers, "worker");
-    let hands = format!("{process}{workers} × {}", count(actors.envs_per_worker, "environment"));
+    let environments = count(actors.envs_per_worker, "environment");
     let (task, seed) = (&config.task.name, config.run.seed);
-    format!("{task} · {algorithm} · {policy} · seed {seed} · {hands}")
+    format!("{task} · {algorithm} · {policy} · seed {seed} · {process}{workers} × {environments}")
 }
 
 /// Returns the label of a run that belongs to no sweep, such as `TD3-DMP` or `DDPG-DMP (paper)`.
@@ -34,7 +34,7 @@ fn method(config: &ExperimentConfig) -> String {
         AlgorithmName::Ddpg => "DDPG",
         AlgorithmName::Td3 => "TD3",
         AlgorithmName::Sac => "SAC",
-        // Its policy is always a movement primitive.
+        // Its policy is always a DMP.
         AlgorithmName::Ndp => return "NDP".to_owned(),
     };
     match config.policy.kind {
@@ -50,7 +50,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_deterministic_run_has_one_worker_whatever_was_asked_for() {
+    fn a_deterministic_run_has_one_worker_regardless_of_the_configuration() {
         let mut config = ExperimentConfig::default();
         (config.actors.workers, config.run.deterministic) = (4, true);
         let config = config.resolve(Limits { cores: 8 }).unwrap();

@@ -1,4 +1,4 @@
-//! Catches interrupts without a runtime: waits for answers until a time limit or an interrupt.
+//! Waits with a time limit and for interrupts, without an async runtime.
 
 use std::fmt::{self, Display, Formatter};
 use std::sync::Arc;
@@ -9,8 +9,8 @@ use std::time::{Duration, Instant};
 use anyhow::{Context, bail};
 use signal_hook::consts::{SIGHUP, SIGINT, SIGTERM};
 
-/// Maximum delay until an interrupt is noticed.
-const LOOK: Duration = Duration::from_millis(20);
+/// Interval at which a wait checks for an interrupt.
+const POLL: Duration = Duration::from_millis(20);
 
 /// Error for an interrupt by the user.
 #[derive(Debug)]
@@ -43,20 +43,20 @@ impl Watch {
         Ok(Self(seen))
     }
 
-    /// Fails with [`Interrupted`] once the user has interrupted.
+    /// Fails with [`Interrupted`] after an interrupt.
     ///
     /// # Errors
-    /// The user has interrupted.
+    /// The user has interrupted the program.
     pub fn check(&self) -> anyhow::Result<()> {
         if self.0.load(Ordering::Acquire) { Err(Interrupted.into()) } else { Ok(()) }
     }
 
-    /// Returns the next item, or `None` if the sender is gone.
+    /// Waits for the next item; returns `None` if the sender is dropped.
     ///
     /// - `what`: the item, for the error.
     ///
     /// # Errors
-    /// The user interrupted, or no item came within `limit`.
+    /// The user interrupted, or no item arrived within `limit`.
     pub fn next<T>(
         &self,
         items: &Receiver<T>,
@@ -66,11 +66,11 @@ impl Watch {
         let deadline = Instant::now() + limit;
         loop {
             self.check()?;
-            match items.recv_timeout(LOOK) {
+            match items.recv_timeout(POLL) {
                 Ok(item) => return Ok(Some(item)),
                 Err(RecvTimeoutError::Disconnected) => return Ok(None),
                 Err(RecvTimeoutError::Timeout) if Instant::now() >= deadline => {
-                    bail!("{what} did not come within {limit:?}")
+                    bail!("{what} did not arrive within {limit:?}")
                 }
                 Err(RecvTimeoutError::Timeout) => {}
             }
@@ -78,7 +78,8 @@ impl Watch {
     }
 }
 
-/// Returns true if the parent process made this one ignore a signal, according to the kernel.
+/// Returns true if this process ignores a signal, as inherited from its parent, according to the
+/// kernel.
 #[must_use]
 pub fn is_ignored(signal: i32) -> bool {
     let status = std::fs::read_to_string("/proc/self/status").unwrap_or_default();

@@ -1,4 +1,4 @@
-//! Runs another program for its output, within a time limit.
+//! Runs another program and returns its output, within a time limit.
 
 use std::ffi::OsStr;
 use std::process::Stdio;
@@ -12,7 +12,7 @@ const ANSWER_MAX: Duration = Duration::from_secs(60);
 /// Runs `program` and returns its standard output.
 ///
 /// # Errors
-/// The reason: the program cannot be run, fails (with its last line), or takes too long.
+/// The program cannot be run, fails (the error is its last line), or takes too long.
 pub fn answer(program: impl AsRef<OsStr>, arguments: &[&str]) -> Result<String, String> {
     let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build();
     let runtime = runtime.map_err(|error| error.to_string())?;

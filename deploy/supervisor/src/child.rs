@@ -1,4 +1,4 @@
-//! A child process: takes commands, and returns its reports and its exit as events.
+//! A child process: accepts commands, and turns its reports and its exit into events.
 
 use std::os::fd::OwnedFd;
 use std::os::unix::process::{CommandExt, ExitStatusExt};
@@ -17,7 +17,7 @@ use tokio::sync::{Notify, mpsc};
 
 use super::process::Process;
 
-/// Maximum number of events in the queue. If it is full, children wait and their pipes fill.
+/// Maximum number of events in the queue. If it is full, reading stops and pipes fill.
 pub(super) const EVENTS_MAX: usize = 1_024;
 /// Maximum number of commands in a child's queue. A child whose queue is full is stuck.
 const COMMANDS_MAX: usize = 64;
@@ -25,11 +25,11 @@ const COMMANDS_MAX: usize = 64;
 const LINE_BYTES_MAX: u64 = 1 << 20;
 /// Maximum time for reading the last reports after a child's exit: a grandchild may hold the pipe
 /// open.
-const LAST_REPORTS: Duration = Duration::from_secs(1);
-/// Maximum time from the end of a joined worker's connection to its exit, before it is killed.
-const SILENT_EXIT: Duration = Duration::from_secs(10);
-/// Maximum time for writing a refusal.
-const REFUSAL: Duration = Duration::from_secs(5);
+const LAST_REPORTS_LIMIT: Duration = Duration::from_secs(1);
+/// Time limit for the exit of a joined worker that closed its connection. Then it is killed.
+const SILENT_EXIT_LIMIT: Duration = Duration::from_secs(10);
+/// Maximum time for writing a rejection.
+const REFUSAL_LIMIT: Duration = Duration::from_secs(5);
 
 /// An event from outside the supervisor.
 #[derive(Debug)]
@@ -43,11 +43,11 @@ pub(super) enum Incoming {
 #[derive(Debug)]
 pub(super) enum ChildEvent {
     Report(Report),
-    /// It wrote a line that is no report.
+    /// The child wrote a line that is not a report.
     Garbage(String),
-    /// It ended, and all its reports have been sent.
+    /// The child exited, and all its reports have been sent.
     Exited(ExitStatus),
-    /// As `Exited` for a worker that had joined. Only its parent knows its exit status.
+    /// Like `Exited`, for a worker that had joined. Only its parent knows its exit status.
     Gone,
 }
 
@@ -68,8 +68,9 @@ impl PendingJoin {
     pub(super) fn refuse(mut self, reason: String) {
         tokio::spawn(async move {
             let answer = JoinAnswer::Refused { reason };
-            // A worker that has gone needs no answer.
-            let _ = tokio::time::timeout(REFUSAL, write_line(&mut self.stream, &answer)).await;
+            // Fails harmlessly if the worker has exited.
+            let written = write_line(&mut self.stream, &answer);
+            let _ = tokio::time::timeout(REFUSAL_LIMIT, written).await;
         });
     }
 }
@@ -83,7 +84,7 @@ pub(super) struct Child {
 }
 
 impl Child {
-    /// Starts the command, whose standard streams the launcher has set.
+    /// Starts the command. The launcher has set its standard streams.
     pub(super) fn spawn(
         mut command: std::process::Command,
         process: Process,
@@ -107,11 +108,11 @@ impl Child {
             let status = loop {
                 tokio::select! {
                     status = child.wait() => break status,
-                    // An error means that it has just ended: `wait` will say so.
+                    // An error means that it has just exited: `wait` will return.
                     () = killed.notified() => drop(child.start_kill()),
                 }
             };
-            if tokio::time::timeout(LAST_REPORTS, &mut reader).await.is_err() {
+            if tokio::time::timeout(LAST_REPORTS_LIMIT, &mut reader).await.is_err() {
                 reader.abort();
             }
             // Waiting fails only for a process that is no longer a child of this one.
@@ -122,8 +123,8 @@ impl Child {
         Ok(Self { commands, kill, id })
     }
 
-    /// Admits a worker that joins, and sends it `answer`. The descriptor of its process tells when
-    /// it ends: a process that it has forked may hold the connection open.
+    /// Admits a worker that joins, and sends it `answer`. Detects its exit by the descriptor of its
+    /// process, because a process that it has forked may hold the connection open.
     pub(super) fn join(
         pending: PendingJoin,
         answer: &JoinAnswer,
@@ -133,7 +134,7 @@ impl Child {
         let PendingJoin { stream, process: descriptor, id, .. } = pending;
         // SAFETY: an owned descriptor stays the same until it is dropped, and has no other owner.
         let descriptor = unsafe { AsyncFd::register_with_interest(descriptor, Interest::READABLE) };
-        let descriptor = descriptor.context("cannot watch its process")?;
+        let descriptor = descriptor.context("cannot monitor its process")?;
         let answer = answer.clone();
         let (input, mut output) = stream.into_split();
         let (commands, receiver) = mpsc::channel(COMMANDS_MAX);
@@ -154,16 +155,16 @@ impl Child {
                     () = killed.notified() => kill_by(&descriptor),
                     _ = &mut reader, if listening => {
                         listening = false;
-                        grace = Box::pin(tokio::time::sleep(SILENT_EXIT));
+                        grace = Box::pin(tokio::time::sleep(SILENT_EXIT_LIMIT));
                     }
-                    // A worker without a connection must end.
+                    // A worker without a connection must exit.
                     () = &mut grace, if !listening => {
                         kill_by(&descriptor);
-                        grace = Box::pin(tokio::time::sleep(SILENT_EXIT));
+                        grace = Box::pin(tokio::time::sleep(SILENT_EXIT_LIMIT));
                     }
                 }
             }
-            if listening && tokio::time::timeout(LAST_REPORTS, &mut reader).await.is_err() {
+            if listening && tokio::time::timeout(LAST_REPORTS_LIMIT, &mut reader).await.is_err() {
                 reader.abort();
             }
             let _ = events.send(Incoming::Child(process, ChildEvent::Gone)).await;
@@ -171,7 +172,7 @@ impl Child {
         Ok(Self { commands, kill, id: u32::try_from(id).ok() })
     }
 
-    /// The process id. After the exit, the system may assign it to another process.
+    /// Returns the process id. After the exit, the system may assign it to another process.
     pub(super) fn id(&self) -> Option<u32> {
         self.id
     }
@@ -187,9 +188,9 @@ impl Child {
     }
 }
 
-/// Makes the child ignore, from its first instruction, the signals that a terminal or a service
-/// manager sends to the whole group. Only the supervisor decides when a role ends. A Ctrl-C before
-/// the child sets its own handlers must not look like a failure of the child.
+/// Makes the child ignore, from its start, the signals that a terminal or a service manager sends
+/// to the whole group: only the supervisor decides when a role ends. Otherwise a Ctrl-C before the
+/// child has set its own handlers would look like a failure of the child.
 fn ignore_group_signals(command: &mut std::process::Command) {
     let ignore = || {
         for signal in GROUP_SIGNALS {
@@ -204,7 +205,7 @@ fn ignore_group_signals(command: &mut std::process::Command) {
     unsafe { command.pre_exec(ignore) };
 }
 
-/// Sends SIGKILL to the process of a descriptor; does nothing if it has ended.
+/// Sends SIGKILL to the process of a descriptor; does nothing if the process has exited.
 fn kill_by(descriptor: &AsyncFd<OwnedFd>) {
     let _ = pidfd_send_signal(descriptor.get_ref(), Signal::KILL);
 }
@@ -219,8 +220,7 @@ pub(super) async fn write_line<W: AsyncWrite + Unpin>(
     Ok(output.write_all(&line).await?)
 }
 
-/// Writes commands until the supervisor drops the sender or the child closes its input. The exit
-/// event follows the latter.
+/// Writes commands until the supervisor drops the sender or the child closes its input.
 async fn write_commands(mut input: impl AsyncWrite + Unpin, mut commands: mpsc::Receiver<Command>) {
     while let Some(command) = commands.recv().await {
         if write_line(&mut input, &command).await.is_err() {

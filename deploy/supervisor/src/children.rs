@@ -9,7 +9,7 @@ use dmprl_shared::transport::delivery::Sent;
 use super::process::Process;
 use super::restart_policy::Death;
 
-/// All processes of the session, by name.
+/// All processes of the session.
 #[derive(Debug, Default)]
 pub(super) struct Children {
     pub(super) slots: BTreeMap<Process, Slot>,
@@ -19,9 +19,9 @@ pub(super) struct Children {
 #[derive(Debug, Default)]
 pub(super) struct Slot {
     pub(super) running: Option<Running>,
-    /// Starts in this session; each is an incarnation of its own.
+    /// Number of starts in this session; each is a new incarnation.
     pub(super) starts: u32,
-    /// Restarts since the process was last proven.
+    /// Restarts since the restart budget was last reset.
     pub(super) restarts: u32,
     pub(super) restart_at: Option<Instant>,
     /// Segments of a worker in this session.
@@ -33,7 +33,7 @@ pub(super) struct Slot {
 pub(super) struct Running {
     pub(super) spawned: Instant,
     pub(super) ready: bool,
-    /// The worker has the shared-memory directory, in which it also finds the next learner.
+    /// The worker has received the path of the shared memory, where it also finds a new learner.
     pub(super) attached: bool,
     /// Time of the last report.
     pub(super) heard: Instant,
@@ -44,13 +44,13 @@ pub(super) struct Running {
     pub(super) worked: Option<Worked>,
     /// A worker that had joined has announced that it leaves.
     pub(super) left: bool,
-    /// Why the supervisor killed it.
+    /// Set if the supervisor killed it.
     pub(super) killed_for: Option<Death>,
-    /// When a process that was killed must have ended.
+    /// Deadline for the exit of a killed process.
     pub(super) ends_by: Option<Instant>,
 }
 
-/// When a process first and last reported work: a worker segments, a learner checkpoints.
+/// Times of the first and the last report of work: a worker's segments, a learner's checkpoints.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Worked {
     pub(super) first: Instant,
@@ -85,7 +85,7 @@ impl Children {
     }
 
     /// Whether the process was started in this session.
-    pub(super) fn knows(&self, process: Process) -> bool {
+    pub(super) fn was_started(&self, process: Process) -> bool {
         self.slots.contains_key(&process)
     }
 
@@ -97,7 +97,7 @@ impl Children {
         self.slots.get_mut(&process)?.running.as_mut()
     }
 
-    /// Records the end of a process.
+    /// Records the exit of a process.
     pub(super) fn take(&mut self, process: Process) -> Option<Running> {
         self.slots.get_mut(&process)?.running.take()
     }
@@ -115,7 +115,7 @@ impl Children {
         self.all_running().map(|(process, _)| process).collect()
     }
 
-    /// Attached workers: the run's own, and those that have joined.
+    /// Number of attached workers: the run's own and those that have joined.
     pub(super) fn workers(&self) -> usize {
         let attached = self.all_running().filter(|(process, running)| {
             process.is_worker() && running.attached && running.killed_for.is_none()
@@ -123,7 +123,7 @@ impl Children {
         attached.count()
     }
 
-    /// Workers that run or will be restarted.
+    /// Number of workers that run or will be restarted.
     pub(super) fn workers_left(&self) -> usize {
         let remains = |(process, slot): &(&Process, &Slot)| {
             process.is_worker() && (slot.running.is_some() || slot.restart_at.is_some())
@@ -131,13 +131,13 @@ impl Children {
         self.slots.iter().filter(remains).count()
     }
 
-    /// Unacknowledged segments of all workers.
+    /// Number of unacknowledged segments of all workers.
     pub(super) fn kept(&self) -> u64 {
         self.all_running().map(|(_, running)| running.kept).sum()
     }
 
     /// Resets a process's restart budget and back-off.
-    pub(super) fn forgive(&mut self, process: Process) {
+    pub(super) fn reset_restarts(&mut self, process: Process) {
         if let Some(slot) = self.slots.get_mut(&process) {
             slot.restarts = 0;
         }
@@ -151,19 +151,19 @@ impl Children {
         }
     }
 
-    /// Cancels all scheduled restarts that `of` selects.
-    pub(super) fn cancel_restarts(&mut self, of: impl Fn(Process) -> bool) {
-        let slots = self.slots.iter_mut().filter(|(process, _)| of(**process));
+    /// Cancels the scheduled restarts of the selected processes.
+    pub(super) fn cancel_restarts(&mut self, selects: impl Fn(Process) -> bool) {
+        let slots = self.slots.iter_mut().filter(|(process, _)| selects(**process));
         slots.for_each(|(_, slot)| slot.restart_at = None);
     }
 
-    /// Counts the silence of every process from `now`.
-    pub(super) fn hear_anew(&mut self, now: Instant) {
+    /// Measures the silence of every process from `now`.
+    pub(super) fn reset_silence(&mut self, now: Instant) {
         self.each_running().for_each(|running| running.heard = now);
     }
 
-    /// The process whose silence will first exceed `limit`, and when. Only workers, gateway and
-    /// relay send heartbeats, once they are ready.
+    /// Returns the process whose silence will first exceed `limit`, and when. Only workers, gateway
+    /// and relay send heartbeats, once they are ready.
     pub(super) fn first_silent(&self, limit: Duration) -> Option<(Instant, Process)> {
         let watched = self.all_running().filter(|(process, running)| {
             let beats = !matches!(process, Process::Learner | Process::Evaluator);

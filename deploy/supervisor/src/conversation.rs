@@ -1,5 +1,5 @@
-//! Runs one child outside training, from its start to its answer. Evaluations, observations and
-//! videos use it.
+//! Runs one child outside training, from its start to its answer: an evaluator, an observer or the
+//! video process.
 
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
@@ -8,8 +8,8 @@ use anyhow::{Context, bail};
 use dmprl_control::{Command, Report};
 use dmprl_run::describe;
 use dmprl_run::format::shown;
-use dmprl_run::say;
 use tokio::sync::mpsc;
+use tracing::info;
 
 use super::child::{Child, ChildEvent, EVENTS_MAX, Incoming};
 use super::limits::TimeLimits;
@@ -17,13 +17,13 @@ use super::logs::log_tail;
 use super::process::Process;
 use super::signals::interrupts;
 
-/// What follows from a report of the child.
+/// Reaction to a report of the child.
 pub(super) enum Turn<T> {
-    /// Nothing.
+    /// Ignore the report; the deadline stays.
     Continue,
-    /// The child works; the next turn must come within this time.
+    /// Wait for the next report, at most for this time.
     Wait(Duration),
-    /// Send this command; the next turn must come within this time.
+    /// Send this command, and wait for the next report, at most for this time.
     Ask(Command, Duration),
     /// The child has answered.
     Done(T),
@@ -38,8 +38,8 @@ pub(super) struct Conversation {
 }
 
 impl Conversation {
-    /// Starts the child and passes its reports to `on_report` until an answer; returns `None` if
-    /// the user interrupts. Then kills the child, which has no state to lose.
+    /// Starts the child and passes its reports to `on_report` until it answers; returns `None` if
+    /// the user interrupts. Finally kills the child, which has no state to lose.
     ///
     /// # Errors
     /// The child died or took too long, or `on_report` failed.
@@ -79,7 +79,7 @@ impl Conversation {
         // After an error the child may have exited already.
         if answer.is_ok() {
             tokio::time::timeout(limits.kill, exited).await.with_context(|| {
-                format!("{} did not end {:?} after SIGKILL", self.who, limits.kill)
+                format!("{} did not exit within {:?} of SIGKILL", self.who, limits.kill)
             })?;
         }
         answer
@@ -119,7 +119,7 @@ impl Conversation {
         }
     }
 
-    /// The last lines of its log, to be appended to an error.
+    /// Returns the last lines of the child's log, to be appended to an error.
     pub(super) fn log_tail(&self) -> String {
         log_tail(&self.log)
     }
@@ -129,9 +129,9 @@ impl Conversation {
 fn show(report: &Report, log: &Path) {
     match report {
         Report::EnvFailures { last, .. } => {
-            say(&format!("environment failure: {last}; log: {}", shown(log)));
+            info!("environment failure: {last}; log: {}", shown(log));
         }
-        Report::Warning { message } | Report::EnvHung { message } => say(message),
+        Report::Warning { message } | Report::EnvHung { message } => info!("{message}"),
         _ => {}
     }
 }

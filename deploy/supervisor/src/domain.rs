@@ -1,16 +1,17 @@
 //! Creates, finds and removes the run's private shared-memory directory, its domain.
 //!
 //! A user's domains are in `dmprl-<uid>`. Shared memory is writable for all users, so another user
-//! can take that name first. Then they are in `dmprl-<uid>-<random>`, which is hard to guess.
+//! can take that name first. The domains are then in `dmprl-<uid>-<random>`, whose name is hard to
+//! guess.
 
 use std::fs::Metadata;
 use std::os::unix::fs::MetadataExt;
 use std::path::{Path, PathBuf};
 
 use anyhow::Context;
-use dmprl_run::say;
 use dmprl_run::{Manifest, random_u64};
 use dmprl_shared::transport::shared_memory::{Domain, Leftover, abandoned, remove_abandoned};
+use tracing::warn;
 
 /// Number of random digits in a name. Paths of domains must stay short.
 const RANDOM_DIGITS: usize = 8;
@@ -23,7 +24,7 @@ pub struct Place {
 }
 
 impl Place {
-    /// Domains of this user, in a memory-backed file system if there is one.
+    /// Returns the place for this user, in a memory-backed file system if there is one.
     pub fn of_this_user() -> Self {
         let shared_memory = Path::new("/dev/shm");
         let base =
@@ -76,7 +77,7 @@ impl Place {
         let (standard, taken_by) = self.standard();
         for parent in taken_by.is_none().then_some(standard).into_iter().chain(self.others()) {
             leftovers.extend(apply(&parent).with_context(|| {
-                format!("cannot {what} what dead runs have left in {}", parent.display())
+                format!("cannot {what} leftovers of dead runs in {}", parent.display())
             })?);
         }
         Ok(leftovers)
@@ -111,11 +112,11 @@ impl Place {
                 self.base.join(format!("dmprl-{}-{}", self.user, &random[..RANDOM_DIGITS]))
             }
         };
-        say(&format!(
-            "warning: {} belongs to user {other}; shared memory is in {} instead",
+        warn!(
+            "{} belongs to user {other}; shared memory is in {} instead",
             standard.display(),
             parent.display()
-        ));
+        );
         Ok(parent)
     }
 
@@ -123,7 +124,7 @@ impl Place {
         self.remove_leftovers()?;
         let parent = self.parent()?;
         Domain::create(&parent, token)
-            .with_context(|| format!("cannot make shared memory in {}", parent.display()))
+            .with_context(|| format!("cannot create shared memory in {}", parent.display()))
     }
 }
 
@@ -157,7 +158,6 @@ mod tests {
         (base, place)
     }
 
-    /// Any user who can write to shared memory can take the name first.
     #[test]
     fn a_name_taken_by_another_user_is_avoided() {
         let (_base, place) = place();

@@ -1,4 +1,4 @@
-//! One evaluation outside training, for `dmprl eval`.
+//! Evaluates a policy outside training, for `dmprl eval`.
 
 use std::path::PathBuf;
 use std::process::Command;
@@ -19,7 +19,7 @@ pub struct EvaluationPlan<'a> {
     pub run: &'a RunDirectory,
     /// The Python virtual environment.
     pub venv: Option<PathBuf>,
-    /// The policy and its place in training.
+    /// The policy and its counts in training.
     pub request: EvaluationRequest,
     /// Number of episodes.
     pub episodes: u64,

@@ -1,4 +1,4 @@
-//! Requested evaluations without an answer: one in flight, the others in order.
+//! Queue of evaluation requests without an answer. At most one is in flight.
 
 use std::collections::VecDeque;
 use std::time::{Duration, Instant};
@@ -6,7 +6,7 @@ use std::time::{Duration, Instant};
 use dmprl_control::EvaluationRequest;
 
 /// Maximum number of waiting requests. If the queue is full, the oldest is skipped with a warning:
-/// an evaluator so far behind never catches up, and the newest policy matters most.
+/// an evaluator this far behind does not catch up, and the newest policy matters most.
 const WAITING_MAX: usize = 64;
 
 #[derive(Debug)]
@@ -25,7 +25,7 @@ struct InFlight {
 }
 
 impl EvaluationQueue {
-    /// An empty queue; `limit` is the maximum duration of an evaluation.
+    /// Creates an empty queue. `limit` is the maximum duration of an evaluation.
     pub(super) fn new(limit: Duration) -> Self {
         Self { waiting: VecDeque::with_capacity(WAITING_MAX), in_flight: None, limit }
     }
@@ -58,22 +58,22 @@ impl EvaluationQueue {
 
     /// Accepts the answer for this policy; returns false if no such request is in flight.
     pub(super) fn finish(&mut self, policy_version: u64) -> bool {
-        let asked = |in_flight: &mut InFlight| in_flight.request.policy_version == policy_version;
-        self.in_flight.take_if(asked).is_some()
+        let matches = |in_flight: &mut InFlight| in_flight.request.policy_version == policy_version;
+        self.in_flight.take_if(matches).is_some()
     }
 
-    /// Accepts the answer of an evaluator that was killed because it took too long, and whose
+    /// Accepts the answer of an evaluator that was killed because it took too long, so that its
     /// request waits to be sent again; returns false if no such request waits.
     pub(super) fn finish_late(&mut self, policy_version: u64) -> bool {
-        let asked = |request: &EvaluationRequest| request.policy_version == policy_version;
-        let waits = self.waiting.front().is_some_and(asked);
+        let matches = |request: &EvaluationRequest| request.policy_version == policy_version;
+        let waits = self.waiting.front().is_some_and(matches);
         if waits {
             self.waiting.pop_front();
         }
         waits
     }
 
-    /// Puts the request in flight back to the front: the evaluator died.
+    /// Puts the request in flight back to the front of the queue, after the evaluator died.
     pub(super) fn send_again(&mut self) {
         if let Some(in_flight) = self.in_flight.take() {
             self.waiting.push_front(in_flight.request);
@@ -113,13 +113,13 @@ mod tests {
     }
 
     #[test]
-    fn one_is_in_flight_and_goes_first_when_sent_again() {
+    fn one_request_is_in_flight_and_a_repeated_one_comes_first() {
         let mut queue = EvaluationQueue::new(Duration::from_secs(1));
         assert_eq!(queue.push(request(1)), None);
         assert_eq!(queue.push(request(2)), None);
         assert_eq!(queue.start(Instant::now()), Some(request(1)));
         assert_eq!(queue.start(Instant::now()), None);
-        assert!(!queue.finish(2), "2 was not asked for");
+        assert!(!queue.finish(2), "2 is not in flight");
         queue.send_again();
         assert_eq!(queue.start(Instant::now()), Some(request(1)));
         assert!(queue.finish(1));
@@ -127,7 +127,7 @@ mod tests {
     }
 
     #[test]
-    fn a_full_queue_skips_its_oldest_and_says_which() {
+    fn a_full_queue_skips_and_returns_its_oldest_request() {
         let mut queue = EvaluationQueue::new(Duration::from_secs(1));
         for version in 0..WAITING_MAX as u64 {
             assert_eq!(queue.push(request(version)), None);

@@ -1,4 +1,4 @@
-//! Makes a video of recorded episodes with `envs_py/dmprl/film.py`.
+//! Creates a video of recorded episodes with `envs_py/dmprl/film.py`.
 
 use std::path::Path;
 use std::process::Command;
@@ -11,11 +11,11 @@ use dmprl_run::failure::Outcome;
 use super::conversation::{Conversation, Turn};
 use super::launcher::Launcher;
 
-/// Maximum time between two frames, and for the end of the animation, which is written at once.
-const FRAME: Duration = Duration::from_secs(120);
+/// Maximum time between two frames, and for writing the animation after the last one.
+const FRAME_LIMIT: Duration = Duration::from_secs(120);
 
-/// Makes the video that the file `plan` describes. Calls `progress` with the number of completed
-/// frames and of all frames.
+/// Creates the video that the file `plan` describes. Calls `progress` with the number of completed
+/// frames and the total number.
 ///
 /// # Errors
 /// The process died or took too long.
@@ -29,12 +29,12 @@ pub fn film(
     let mut command = Command::new(python);
     command.args(["-I", "-m", "dmprl.film"]).arg(plan);
     let command = launcher.streams(command, "film")?;
-    let maker = Conversation { who: "the maker of the video", log: run.log_path("film") };
+    let maker = Conversation { who: "the video process", log: run.log_path("film") };
     let answer = maker.hold(command, |report| {
         Ok(match report {
             Report::Filmed { done, of } => {
                 progress(done, of);
-                if done < of { Turn::Wait(FRAME) } else { Turn::Done(()) }
+                if done < of { Turn::Wait(FRAME_LIMIT) } else { Turn::Done(()) }
             }
             _ => Turn::Continue,
         })

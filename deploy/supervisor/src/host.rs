@@ -35,14 +35,14 @@ pub struct HostPlan {
 /// Steps environments for the run until it ends or the user stops this host.
 ///
 /// # Errors
-/// The session could not begin. How it ended is in the report.
+/// The session could not start. Later failures are in the report.
 pub fn host(plan: HostPlan, observer: &mut dyn RunObserver) -> anyhow::Result<SessionReport> {
     let HostPlan { program, run, config, venv, upstream, session } = plan;
     let runtime = tokio::runtime::Builder::new_current_thread()
         .enable_all()
         .build()
         .context("cannot start the supervisor's runtime")?;
-    // Catch signals before making shared memory: a fatal signal would leave it behind.
+    // Catch signals before creating shared memory: a fatal signal would leave it behind.
     let interrupts = runtime.block_on(async { interrupts() })?;
     let domain = domain::create(&domain::token(&run.manifest()?, std::process::id()))?;
     observer.on_event(RunEvent::Started {
@@ -67,7 +67,7 @@ pub fn host(plan: HostPlan, observer: &mut dyn RunObserver) -> anyhow::Result<Se
     let earlier = Totals::default();
     let plan = SupervisorPlan { launcher, config, limits, earlier, interrupts };
     let report = runtime.block_on(supervise(plan, observer));
-    // The runtime kills children that remain, which must not outlive their shared memory.
+    // The runtime kills remaining children, which must not outlive their shared memory.
     drop(runtime);
     drop(domain);
     Ok(report)

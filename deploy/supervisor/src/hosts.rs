@@ -1,4 +1,4 @@
-//! Other hosts that take part in the run, as the gateway reports them.
+//! Other hosts of the run, as reported by the gateway.
 
 use dmprl_control::HostNow;
 
@@ -7,17 +7,17 @@ use dmprl_control::HostNow;
 pub(super) struct Hosts(pub(super) Vec<HostNow>);
 
 impl Hosts {
-    /// Attached workers of the hosts that can be reached.
+    /// Number of attached workers of reachable hosts.
     pub(super) fn workers(&self) -> u64 {
         self.0.iter().filter(|host| host.here).map(|host| host.workers).sum()
     }
 
-    /// Restarts of their workers.
+    /// Number of restarts of all hosts' workers.
     pub(super) fn restarts(&self) -> u64 {
         self.0.iter().map(|host| host.restarts).sum()
     }
 
-    /// Unacknowledged segments of their workers.
+    /// Number of unacknowledged segments of all hosts' workers.
     pub(super) fn kept(&self) -> u64 {
         self.0.iter().map(|host| host.kept).sum()
     }
@@ -29,7 +29,7 @@ impl Hosts {
         }
         let host = |host: &HostNow| {
             let state = match (host.here, host.workers) {
-                (false, _) => "out of reach".to_owned(),
+                (false, _) => "unreachable".to_owned(),
                 (true, 1) => "1 worker".to_owned(),
                 (true, workers) => format!("{workers} workers"),
             };

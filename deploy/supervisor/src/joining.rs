@@ -1,14 +1,14 @@
-//! Accepts workers that somebody else starts and that join the run.
+//! Accepts workers that a user starts to join the run.
 //!
 //! ```text
 //!  dmprl actor --join RUN ──► join.sock, in the run's private directory
 //!      greeting ◄── supervisor      its version
 //!      request  ──►                 the worker's version
-//!      welcome or refusal ◄──       an index and an incarnation of its own
+//!      welcome or refusal ◄──       the worker's index and incarnation, or a reason
 //! ```
-//! From then on the connection replaces a child's standard input and output, and its end means the
-//! worker's exit. The descriptor of the worker's process tells whether the process has ended;
-//! unlike a process id, it never refers to another process.
+//! Afterwards the connection replaces a child's standard input and output. A worker that closes it
+//! must exit. The supervisor detects the exit by a descriptor of the process: unlike a process id,
+//! it never refers to another process.
 
 use std::path::Path;
 use std::sync::Arc;
@@ -23,11 +23,11 @@ use tokio::sync::{Semaphore, mpsc};
 
 use super::child::{Incoming, PendingJoin, write_line};
 
-/// Maximum duration of the exchange before the answer.
-const HANDSHAKE: Duration = Duration::from_secs(5);
-/// Maximum number of exchanges at once. More connections wait in the system's queue.
+/// Maximum duration of a handshake, until the request is received.
+const HANDSHAKE_LIMIT: Duration = Duration::from_secs(5);
+/// Maximum number of concurrent handshakes. More connections wait in the system's queue.
 const HANDSHAKES_MAX: usize = 16;
-/// Pause after a connection could not be accepted, for instance for want of descriptors.
+/// Pause after a connection could not be accepted, for instance because no descriptor was free.
 const ACCEPT_PAUSE: Duration = Duration::from_millis(100);
 /// Maximum length of a request.
 const REQUEST_BYTES_MAX: u64 = 4_096;
@@ -36,7 +36,7 @@ const REQUEST_BYTES_MAX: u64 = 4_096;
 pub(super) fn listen(domain: &Path, events: mpsc::Sender<Incoming>) -> anyhow::Result<()> {
     let path = domain.join(JOIN_SOCKET);
     let listener = UnixListener::bind(&path)
-        .with_context(|| format!("cannot make the socket {}", path.display()))?;
+        .with_context(|| format!("cannot create the socket {}", path.display()))?;
     tokio::spawn(accept(listener, events));
     Ok(())
 }
@@ -51,7 +51,7 @@ async fn accept(listener: UnixListener, events: mpsc::Sender<Incoming>) {
         };
         let events = events.clone();
         tokio::spawn(async move {
-            let request = tokio::time::timeout(HANDSHAKE, handshake(stream)).await;
+            let request = tokio::time::timeout(HANDSHAKE_LIMIT, handshake(stream)).await;
             drop(permit);
             // Drops clients that send no valid request, without an answer.
             if let Ok(Ok(pending)) = request {
@@ -70,7 +70,7 @@ async fn handshake(mut stream: UnixStream) -> anyhow::Result<PendingJoin> {
     let id = peer.pid().context("a peer without a process")?;
     let Some(pid) = Pid::from_raw(id) else {
         write_line(&mut stream, &Greeting::this()).await?;
-        let reason = "it runs in another container, where the supervisor cannot watch over it";
+        let reason = "it runs in another container, where the supervisor cannot monitor it";
         write_line(&mut stream, &JoinAnswer::Refused { reason: reason.to_owned() }).await?;
         bail!("a peer of another container");
     };

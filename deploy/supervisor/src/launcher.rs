@@ -40,7 +40,7 @@ pub struct Launcher {
     pub upstream: Option<Upstream>,
 }
 
-/// The learner's host, as another host sees it.
+/// Connection of a host without a learner to the learner's host.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Upstream {
     /// The Zenoh endpoint.
@@ -66,7 +66,7 @@ impl Launcher {
         if self.upstream.is_some() { Process::Relay } else { Process::Learner }
     }
 
-    /// A launcher of single children outside training.
+    /// Creates a launcher for single children outside training.
     #[must_use]
     pub fn outside_training(program: PathBuf, run: &RunDirectory, venv: Option<PathBuf>) -> Self {
         Self {
@@ -93,7 +93,7 @@ impl Launcher {
         let first = first.filter(|_| start < INCARNATIONS_PER_SESSION);
         first.and_then(|first| first.checked_add(start)).with_context(|| {
             format!(
-                "start {start} of a worker in session {} of the run: there are numbers for \
+                "start {start} of a worker in session {} of the run: the limits are \
                  {INCARNATIONS_PER_SESSION} starts in each of {INCARNATIONS_PER_SESSION} sessions",
                 self.sessions_before
             )
@@ -178,7 +178,7 @@ impl Launcher {
         }
     }
 
-    /// Connects a command's standard streams: pipes for input and output, and the log of `name` for
+    /// Sets a command's standard streams: pipes for input and output, and the log of `name` for
     /// errors.
     ///
     /// # Errors
@@ -190,7 +190,7 @@ impl Launcher {
             .create(true)
             .open(&path)
             .with_context(|| format!("cannot open {}", path.display()))?;
-        // All starts of a process share a log: mark where each begins.
+        // All starts of a process share a log: mark the beginning of each.
         writeln!(log, "--- {name}, {} ---", rfc3339(SystemTime::now()))
             .with_context(|| format!("cannot write {}", path.display()))?;
         command.stdin(Stdio::piped()).stdout(Stdio::piped()).stderr(log);

@@ -7,13 +7,13 @@
 //! ```
 //! With `run.deterministic` there is one child, `learner --one-process`, which does everything.
 //!
-//! A child ignores terminal signals. It ends on `stop` or at the end of its standard input, which
-//! also follows from the death of the supervisor. A parent-death signal would kill the learner
-//! before its last checkpoint. Children inherit the run's lock, so `resume` waits for such orphans.
+//! A child ignores terminal signals. It exits on `stop` or at the end of its standard input, which
+//! closes when the supervisor dies. There is no parent-death signal, as it would kill the learner
+//! before its last checkpoint. Children inherit the run's lock, so `resume` waits for orphans.
 //!
-//! The supervisor is a state machine (`machine.rs`) and a loop around it (`supervisor.rs`) that
-//! waits for events, interrupts and the next deadline, and nowhere else. Every wait has a limit in
-//! [`TimeLimits`]. A [`RunObserver`] receives everything that happens; nothing here draws.
+//! The supervisor is a state machine (`machine.rs`) and a loop around it (`supervisor.rs`), which
+//! waits for events, interrupts and the next deadline. Nothing else blocks. Every wait has a limit
+//! in [`TimeLimits`]. A [`RunObserver`] receives all events and displays them.
 
 mod answer;
 pub mod capacity;

@@ -2,24 +2,24 @@
 
 use std::time::Duration;
 
-/// Every wait of the supervisor. Tests shorten them; users get the defaults.
+/// Limits of all waits of the supervisor. Users get the defaults; tests use shorter ones.
 #[derive(Debug, Clone, Copy)]
 pub struct TimeLimits {
     /// From a child's start to its report that it is ready.
     pub ready: Duration,
-    /// Added for a learner, for each update of its imitation of demonstrations.
+    /// Added to `ready` for a learner, for each update of its imitation of demonstrations.
     pub cloning_update: Duration,
-    /// From an interrupt to the last exit. The rest of ten seconds is for SIGKILL.
+    /// From an interrupt to the last exit. The rest of the promised ten seconds is for SIGKILL.
     pub stop: Duration,
     /// For a learner that finishes: it drains the queues, writes a checkpoint and exits.
     pub drain: Duration,
     /// From SIGKILL to the exit when the run stops.
     pub kill: Duration,
-    /// From SIGKILL to the exit while the run continues: freeing a large memory takes time.
+    /// From SIGKILL to the exit while the run continues: the kernel may free much memory first.
     pub killed: Duration,
-    /// For an evaluation, whatever its number of episodes.
+    /// For an evaluation, in addition to the time for its episodes.
     pub evaluation: Duration,
-    /// Added for each episode of an evaluation.
+    /// For each episode of an evaluation.
     pub evaluation_episode: Duration,
     /// Maximum time without a step or an update.
     pub stall: Duration,
@@ -72,7 +72,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn back_off_doubles_up_to_its_cap() {
+    fn back_off_doubles_up_to_its_maximum() {
         let limits = TimeLimits::default();
         let waits = [0, 1, 2, 5, 6, 400].map(|restarts| limits.back_off(restarts).as_millis());
         assert_eq!(waits, [100, 200, 400, 1_000, 1_000, 1_000]);

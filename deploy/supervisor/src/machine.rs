@@ -1,13 +1,11 @@
 //! The supervisor's decisions: a pure state machine.
 //!
 //! [`Machine::step`] maps state, event and time to actions. It reads no clock and no file, and
-//! starts nothing: the shell in `supervisor.rs` performs the actions and passes on what happens.
-//! `simulation/` drives it through deaths, hangs, late messages and interrupts.
+//! starts nothing: the loop in `supervisor.rs` performs the actions and passes events to it.
+//! `simulation/` tests it with deaths, hangs, late messages and interrupts.
 //!
-//! The state consists of the children, the evaluations, the other hosts, the totals, and the phase
-//! (`state.rs`).
-//! This file has the state, the start and the clock; `reports.rs` handles what children report,
-//! `shutdown.rs` how children and the run end.
+//! This file has the state, the start of a session and the deadlines. `reports.rs` handles reports
+//! of children, and `shutdown.rs` the end of children and of the run.
 
 use std::path::PathBuf;
 use std::time::{Duration, Instant};
@@ -47,7 +45,7 @@ pub(super) struct Machine {
     pub(super) failure: Option<Failure>,
     /// A process survived SIGKILL.
     pub(super) abandoned: bool,
-    /// Lines that were no reports.
+    /// Number of lines that were not reports.
     pub(super) garbage: u32,
     pub(super) started: Instant,
     /// When steps or updates last increased.
@@ -62,7 +60,7 @@ pub(super) struct Machine {
 }
 
 impl Machine {
-    /// A session that begins with [`Event::Begin`].
+    /// Creates a session, which begins with [`Event::Begin`].
     pub(super) fn new(settings: Settings, now: Instant) -> Self {
         let limit = settings.limits.evaluation_of(settings.config.evaluation.episodes_max());
         Self {
@@ -89,8 +87,8 @@ impl Machine {
         }
     }
 
-    /// Handles an event, then everything that is due at `now`. The actions are to be performed in
-    /// order.
+    /// Handles an event, then everything that is due at `now`. The caller must perform the returned
+    /// actions in order.
     pub(super) fn step(&mut self, event: Event, now: Instant) -> Vec<Action> {
         self.now = now;
         let handled = self.handle(event);
@@ -120,15 +118,15 @@ impl Machine {
             Event::ActionFailed(error) => return Err(error.into()),
             Event::DomainLost(path) => {
                 let message = format!(
-                    "the run's shared memory is gone: {} was removed under it; nothing may clear \
-                     /dev/shm while a run goes on",
+                    "the run's shared memory {} was removed; do not clear /dev/shm while a run is \
+                     active",
                     shown(&path)
                 );
                 return Err(Failure::new(message).advice(self.resume_advice()));
             }
             Event::Interrupt => self.on_interrupt(),
-            Event::Late => self.children.hear_anew(self.now),
-            Event::StoodStill(lost) => self.postpone(lost),
+            Event::Late => self.children.reset_silence(self.now),
+            Event::Suspended(lost) => self.postpone(lost),
             Event::Tick { all_heard: true } => self.check_heartbeats(),
             Event::Tick { all_heard: false } => {}
         }
@@ -159,15 +157,15 @@ impl Machine {
         let successor =
             is_successor.then(|| Successor { restarts: earlier + self.totals.learner_restarts });
         self.actions.push(Action::Start { process, start, successor });
-        self.tell(RunEvent::ChildStarted { process, start });
+        self.notify(RunEvent::ChildStarted { process, start });
     }
 
-    pub(super) fn tell(&mut self, event: RunEvent) {
-        self.actions.push(Action::Tell(event));
+    pub(super) fn notify(&mut self, event: RunEvent) {
+        self.actions.push(Action::Notify(event));
     }
 
     pub(super) fn warn(&mut self, process: Process, message: String) {
-        self.tell(RunEvent::Warning { process: Some(process), message });
+        self.notify(RunEvent::Warning { process: Some(process), message });
     }
 
     pub(super) fn send(&mut self, process: Process, command: Command) {
@@ -189,8 +187,8 @@ impl Machine {
         self.settings.run.log_path(&process.to_string())
     }
 
-    /// Sends the learner the counts of the whole run, for metrics and checkpoints. Each message has
-    /// all counts, so a lost one does no harm.
+    /// Sends the counts of the whole run to the learner, for metrics and checkpoints. Each message
+    /// has all counts, so a lost message does no harm.
     pub(super) fn send_totals(&mut self) {
         if self.settings.one_process {
             return;
@@ -206,7 +204,7 @@ impl Machine {
         self.send(hub, Command::Workers(workers));
     }
 
-    /// Whether the session is over: everything has ended, or cannot be ended.
+    /// Whether the session is over: all processes have exited, or one cannot be killed.
     pub(super) fn is_over(&self) -> bool {
         let stopping = matches!(self.phase, Phase::Stopping { .. });
         stopping && (self.abandoned || self.children.all_running().next().is_none())
@@ -217,7 +215,7 @@ impl Machine {
         !self.settings.one_process && matches!(self.phase, Phase::Training | Phase::Draining { .. })
     }
 
-    /// When the next step is due without an event.
+    /// Returns when the next step is due if no event arrives.
     pub(super) fn next_deadline(&self, now: Instant) -> Instant {
         let mut deadlines = vec![now + IDLE];
         match self.phase {
@@ -244,10 +242,10 @@ impl Machine {
         deadlines.into_iter().min().unwrap_or(now)
     }
 
-    /// Moves every deadline: time in which the supervisor and its children were stopped together
+    /// Extends all deadlines: time in which the supervisor and its children were suspended together
     /// does not count.
     fn postpone(&mut self, lost: Duration) {
-        self.children.hear_anew(self.now);
+        self.children.reset_silence(self.now);
         self.advanced += lost;
         self.evaluations.postpone(lost);
         match &mut self.phase {
@@ -269,7 +267,7 @@ impl Machine {
                 if self.now >= deadline && killed {
                     self.abandon();
                 } else if self.now >= deadline {
-                    self.kill_all("not ended in time");
+                    self.kill_all("time limit exceeded");
                 }
                 return Ok(());
             }
@@ -285,8 +283,8 @@ impl Machine {
         Ok(())
     }
 
-    /// When `run.max_minutes` have passed since the start of the session. Without a learner there
-    /// is nothing to finish.
+    /// Returns the end of `run.max_minutes`, counted from the start of the session; `None` before
+    /// the learner is ready.
     fn time_is_up(&self) -> Option<Instant> {
         if !self.learner.ready {
             return None;
@@ -295,9 +293,9 @@ impl Machine {
         self.started.checked_add(limit.ok()?)
     }
 
-    /// When a learner that is ready counts as stuck because it neither steps nor updates. A single
-    /// process does neither while it evaluates. On a host without a learner, the relay has its own
-    /// limit.
+    /// Returns when a ready learner counts as stuck because steps and updates do not advance. In a
+    /// one-process run they do not advance during an evaluation. On a host without a learner, the
+    /// relay has its own limit.
     fn stalled(&self) -> Option<Instant> {
         let Settings { config, limits, .. } = &self.settings;
         if self.settings.patience.is_some() || !self.learner.ready {
@@ -310,13 +308,13 @@ impl Machine {
     fn check_training(&mut self) -> Result<(), Failure> {
         if self.stalled().is_some_and(|deadline| self.now >= deadline) {
             return Err(Failure::new(format!(
-                "neither a step nor an update for {:?}: workers or learner hang; see {}",
+                "neither a step nor an update for {:?}: a worker or the learner hangs; see {}",
                 self.settings.limits.stall,
                 shown(&self.settings.run.path().join("logs"))
             )));
         }
         if self.time_is_up().is_some_and(|deadline| self.now >= deadline) {
-            self.drain("run.max_minutes are over".to_owned());
+            self.drain("run.max_minutes has elapsed".to_owned());
         }
         Ok(())
     }
@@ -330,22 +328,20 @@ impl Machine {
         let limit = self.settings.limits.drain;
         self.kill(hub, Death::too_slow(format!("not done within {limit:?}")));
         if !self.learner.finished {
-            return Err(Failure::new(format!(
-                "{hub} did not come to its end within {limit:?}: killed it"
-            )));
+            return Err(Failure::new(format!("{hub} did not finish within {limit:?}: killed it")));
         }
         self.warn(hub, format!("{hub} did not exit within {limit:?}: killed it"));
         Ok(())
     }
 
-    /// Fails if a process has survived SIGKILL, which only a fault of kernel or device explains. It
-    /// can be neither used nor replaced.
+    /// Fails if a process has survived SIGKILL, which happens only after a fault of the kernel or a
+    /// device. Such a process can be neither used nor replaced.
     fn check_killed(&self) -> Result<(), Failure> {
         let survives = |running: &Running| running.ends_by.is_some_and(|at| self.now >= at);
         match self.children.all_running().find(|(_, running)| survives(running)) {
             Some((process, _)) => {
                 let limit = self.settings.limits.killed;
-                let message = format!("{process} did not end {limit:?} after SIGKILL");
+                let message = format!("{process} did not exit within {limit:?} of SIGKILL");
                 Err(Failure::new(message).advice(self.resume_advice()))
             }
             None => Ok(()),
@@ -368,7 +364,8 @@ impl Machine {
         process != Process::Learner || !self.learner.waits_for_evaluator
     }
 
-    /// Processes that are not ready. Workers are not needed once the learner has finished.
+    /// Iterates over processes that are not ready. Once the learner has finished, this excludes
+    /// workers, which are no longer needed.
     fn starting(&self) -> impl Iterator<Item = (Process, &Running)> {
         let needed = |process: Process| !(self.learner.finished && process.is_worker());
         self.children
@@ -417,16 +414,16 @@ impl Machine {
         if self.evaluations.deadline().is_none_or(|deadline| self.now < deadline) {
             return;
         }
-        // The restarted evaluator gets the request again, with a new deadline.
+        // The restarted evaluator receives the request again, with a new deadline.
         self.evaluations.send_again();
-        let message = "the evaluation takes too long: killing the evaluator".to_owned();
+        let message = "the evaluation is taking too long: killing the evaluator".to_owned();
         self.warn(Process::Evaluator, message);
         let death = Death::too_slow("an evaluation took too long".to_owned());
         self.kill(Process::Evaluator, death);
     }
 
     fn heartbeat_timeout(&self) -> Option<Duration> {
-        // A limit beyond the range of a clock is none.
+        // A limit beyond the range of a clock means no limit.
         Duration::try_from_secs_f64(self.settings.config.supervision.heartbeat_timeout_s).ok()
     }
 
@@ -435,16 +432,16 @@ impl Machine {
         self.children.first_silent(limit)
     }
 
-    /// Kills processes whose heartbeats are missing. Each sends one a second, even while it waits
-    /// for the learner or its environment is slow (`roles/heartbeat.rs`).
+    /// Kills processes whose heartbeats are missing. A process sends one every second, even while
+    /// it waits for the learner or its environment is slow (`heartbeat.rs` in `dmprl-control`).
     fn check_heartbeats(&mut self) {
         while let Some((_, process)) = self.first_silent().filter(|(at, _)| self.now >= *at) {
             let Some(running) = self.children.running(process) else { return };
             let cause = format!(
-                "no sign of life for {:.1} s, supervision.heartbeat_timeout_s = {}; the last: {}",
+                "no heartbeat for {:.1} s, supervision.heartbeat_timeout_s = {}; last activity: {}",
                 self.now.duration_since(running.heard).as_secs_f64(),
                 self.settings.config.supervision.heartbeat_timeout_s,
-                running.activity.map_or("it was ready", Activity::name)
+                running.activity.map_or("ready", Activity::name)
             );
             self.kill(process, Death::hung(cause));
         }
@@ -460,7 +457,7 @@ pub(super) mod tests {
     use dmprl_control::Report;
     use dmprl_run::{Manifest, RunDirectory};
 
-    /// A machine that has not begun.
+    /// Creates a machine before its first event.
     pub(crate) fn machine(folder: &std::path::Path, now: Instant) -> Machine {
         let config = ExperimentConfig::default();
         let manifest = Manifest::new(None).unwrap();
@@ -478,7 +475,7 @@ pub(super) mod tests {
     }
 
     /// Regression test: an evaluator that is killed with the learner may have answered already.
-    /// That answer once ended the run.
+    /// Such an answer once ended the run.
     #[test]
     fn an_answer_to_a_dead_learner_is_ignored_and_an_unrequested_one_is_an_error() {
         let folder = tempfile::tempdir().unwrap();
@@ -493,7 +490,7 @@ pub(super) mod tests {
             machine.failure.map(|failure| failure.error.to_string())
         };
         let error = after_answer(false).unwrap();
-        assert!(error.contains("policy 7, which nobody asked for"), "{error}");
+        assert!(error.contains("policy 7 without a request"), "{error}");
         assert_eq!(after_answer(true), None);
     }
 }

@@ -1,5 +1,5 @@
-//! Finds the processes of a run that another process supervises, in /proc. `chaos` and `bench
-//! system` use it.
+//! Finds the processes of a run in /proc, for `chaos` and `bench system`, which do not supervise
+//! the run themselves.
 
 use std::fs;
 
@@ -37,7 +37,7 @@ impl Member {
     }
 }
 
-/// Lists the supervisor's children whose command line is visible already.
+/// Lists the supervisor's children that have started a role already.
 pub fn members(supervisor: Pid) -> anyhow::Result<Vec<Member>> {
     let entries = fs::read_dir("/proc").context("cannot list /proc")?;
     let child = |name: &str| {
@@ -71,8 +71,8 @@ fn role(command_line: &str) -> Option<Role> {
     }
 }
 
-/// Lists the process ids of a session, except this process. A run started by [`super::WholeRun`]
-/// has a session of its own.
+/// Lists the process ids of a session, except this process. Each [`super::WholeRun`] has its own
+/// session.
 pub fn of_session(session: Pid) -> anyhow::Result<Vec<String>> {
     let (session, own) = (session.as_raw_nonzero().to_string(), std::process::id().to_string());
     let entries = fs::read_dir("/proc").context("cannot list /proc")?;
@@ -87,7 +87,7 @@ pub fn of_session(session: Pid) -> anyhow::Result<Vec<String>> {
     Ok(names.filter_map(member).collect())
 }
 
-/// Reads a process's processor time, including that of ended threads [s]; `None` if it is gone.
+/// Reads a process's processor time, including that of ended threads \[s\]; `None` if it is gone.
 pub fn cpu_s(pid: Pid) -> Option<f64> {
     let stat = fs::read_to_string(format!("/proc/{}/stat", pid.as_raw_nonzero())).ok()?;
     // The name in parentheses may contain anything; utime and stime are the twelfth and thirteenth
@@ -100,7 +100,7 @@ pub fn cpu_s(pid: Pid) -> Option<f64> {
 /// Resources of a process.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Holdings {
-    /// Memory [KiB].
+    /// Memory \[KiB\].
     pub rss_kib: u64,
     /// Open files.
     pub fds: u64,
@@ -145,8 +145,8 @@ mod tests {
     #[test]
     fn processor_time_is_counted_in_seconds() {
         let clock = rustix::time::clock_gettime(rustix::time::ClockId::ProcessCPUTime);
-        let told = cpu_s(rustix::process::getpid()).unwrap();
+        let read = cpu_s(rustix::process::getpid()).unwrap();
         // The clock was read first, and /proc rounds down to hundredths of a second.
-        assert!(told >= clock.tv_sec as f64 - 1.0 && told < clock.tv_sec as f64 + 60.0, "{told}");
+        assert!(read >= clock.tv_sec as f64 - 1.0 && read < clock.tv_sec as f64 + 60.0, "{read}");
     }
 }

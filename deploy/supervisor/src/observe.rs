@@ -28,7 +28,7 @@ pub struct ObservationPlan<'a> {
     pub episodes: u64,
     /// File that the observer writes.
     pub output: PathBuf,
-    /// Folder for frames, if they are wanted.
+    /// Folder for frames; `None` records no frames.
     pub pictures: Option<PathBuf>,
 }
 
@@ -54,15 +54,15 @@ impl ObservationPlan<'_> {
     }
 }
 
-/// Records the episodes. Calls `progress` with the number of completed episodes and of steps of the
-/// next one, which is 0 when an episode has just ended.
+/// Records the episodes. Calls `progress` with the number of completed episodes and the number of
+/// steps of the next one, which is 0 when an episode has just ended.
 ///
 /// # Errors
 /// The observer died or took too long.
 pub fn observe(plan: ObservationPlan<'_>, progress: &dyn Fn(u64, u64)) -> anyhow::Result<Outcome> {
     let launcher = Launcher::outside_training(plan.program.clone(), plan.run, plan.venv.clone());
     let command = launcher.streams(plan.command(), "observer")?;
-    // A report follows each call into the environment, whose duration the watchdog limits.
+    // A report follows each call into the environment, and the watchdog limits the call's duration.
     let seconds = plan.run.config()?.actors.env_call_timeout_s;
     let call = Duration::try_from_secs_f64(seconds).unwrap_or(Duration::MAX);
     let limit = TimeLimits::default().evaluation_of(1).saturating_add(call);

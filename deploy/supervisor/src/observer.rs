@@ -1,4 +1,4 @@
-//! How the supervisor reports a run: it draws and writes nothing itself.
+//! Events of a run. The supervisor passes them to an observer, which displays or writes them.
 
 use std::fmt::{self, Display, Formatter};
 use std::path::PathBuf;
@@ -16,7 +16,7 @@ pub trait RunObserver {
     /// Handles an event.
     fn on_event(&mut self, event: RunEvent);
 
-    /// Whether the observer shows the processes, whose states are computed only then.
+    /// Whether the observer shows the processes. Their states are computed only if it does.
     fn shows_processes(&self) -> bool {
         false
     }
@@ -43,7 +43,7 @@ pub enum RunEvent {
         /// Number of the start in this session, from 0.
         start: u32,
     },
-    /// A worker that somebody else started is attached.
+    /// A worker that a user started has joined the run.
     Joined {
         /// Its name.
         process: Process,
@@ -56,7 +56,7 @@ pub enum RunEvent {
         process: Process,
         /// Why, unless it left by itself.
         death: Option<Death>,
-        /// Whether it had announced its end.
+        /// Whether it announced that it leaves.
         announced: bool,
         /// Number of attached workers that remain.
         workers: usize,
@@ -77,9 +77,9 @@ pub enum RunEvent {
     },
     /// States of all processes, between two reports of progress.
     Processes(Vec<ProcessLine>),
-    /// The learner has returned to a checkpoint; these evaluations precede it.
+    /// The learner has returned to a checkpoint.
     Rewound {
-        /// Oldest first.
+        /// Evaluations up to this checkpoint, oldest first.
         evaluations: Vec<EvaluationRow>,
     },
     /// An evaluation is complete.
@@ -93,7 +93,7 @@ pub enum RunEvent {
     NotEvaluated {
         /// Version of the policy.
         policy_version: u64,
-        /// Why.
+        /// Reason.
         reason: NotEvaluated,
     },
     /// The learner has written a checkpoint.
@@ -105,11 +105,11 @@ pub enum RunEvent {
     },
     /// Environments have failed. Shown whenever their number has doubled.
     EnvFailure {
-        /// Where.
+        /// The process with the environments.
         process: Process,
         /// Failures in this session.
         count: u64,
-        /// Message of the last.
+        /// Message of the last failure.
         last: String,
         /// Log with all of them; `None` if the process has its own terminal.
         log: Option<PathBuf>,
@@ -118,16 +118,16 @@ pub enum RunEvent {
     ChildDied {
         /// Its name.
         process: Process,
-        /// How.
+        /// Kind and cause of the death.
         death: Death,
         /// Its log.
         log: PathBuf,
-        /// What follows.
+        /// Consequence.
         next: AfterDeath,
     },
     /// The run ends before its last step.
     Draining {
-        /// Why.
+        /// Reason.
         reason: String,
     },
     /// The user has interrupted the run.
@@ -139,21 +139,21 @@ pub enum RunEvent {
     Killed {
         /// Their names.
         processes: Vec<Process>,
-        /// Why.
+        /// Reason.
         reason: &'static str,
     },
-    /// Something else that the user should read.
+    /// A warning for the user.
     Warning {
         /// The process that caused it.
         process: Option<Process>,
-        /// The sentence.
+        /// Text of the warning.
         message: String,
     },
     /// All processes have ended.
     Ended,
 }
 
-/// Why a requested evaluation has no row.
+/// Reason why a requested evaluation has no row.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum NotEvaluated {
     /// Its episodes failed.
@@ -168,36 +168,36 @@ pub enum NotEvaluated {
         /// Environment steps of the policy.
         env_steps: u64,
     },
-    /// The learner died; its successor requests what is missing after its checkpoint.
+    /// The learner died. Its successor requests the evaluations after its checkpoint again.
     LearnerDied,
     /// The run stops.
     Stopping,
 }
 
-/// What follows the death of a process.
+/// Consequence of the death of a process.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum AfterDeath {
     /// It is restarted.
     Restart {
-        /// Number of the restart since it was last proven.
+        /// Number of the restart since the restart budget was last reset.
         restart: u32,
         /// Maximum of this number.
         restarts_max: u32,
-        /// Time until then.
+        /// Time until the restart.
         back_off: Duration,
     },
     /// A worker is given up.
     WorkerGivenUp {
-        /// Restarts that it has had.
+        /// Number of its restarts.
         restarts: u32,
         /// Workers that remain.
         left: usize,
-        /// Workers of the configuration and those that have joined.
+        /// Configured workers and workers that have joined.
         of: usize,
     },
     /// The gateway is given up, and with it the workers of other hosts.
     GatewayGivenUp {
-        /// Restarts that it has had.
+        /// Number of its restarts.
         restarts: u32,
     },
 }
@@ -233,10 +233,10 @@ impl Display for RunEvent {
             Self::Left { process, death, announced, workers } => {
                 let how = match death {
                     Some(death) => death.to_string(),
-                    None if *announced => "has left".to_owned(),
-                    None => "died (its own terminal may say why)".to_owned(),
+                    None if *announced => "left the run".to_owned(),
+                    None => "died (see its terminal)".to_owned(),
                 };
-                write!(out, "{process}, which had joined, {how}: {}", counted(*workers))
+                write!(out, "joined worker {process} {how}: {}", counted(*workers))
             }
             Self::FirstStep { after, is_successor } => {
                 let seconds = after.as_secs_f64();
@@ -263,19 +263,19 @@ impl Display for RunEvent {
             Self::EnvFailure { process, count, last, log } => {
                 let count = grouped(*count);
                 write!(out, "{process}: environment failure {count}: {last}; ")?;
-                out.write_str("its segment is not used; ")?;
+                out.write_str("its segment is discarded; ")?;
                 match log {
                     Some(log) => write!(out, "log: {}", shown(log)),
-                    None => out.write_str("its own terminal has more"),
+                    None => out.write_str("see its terminal"),
                 }
             }
             Self::ChildDied { process, death, log, next } => {
                 write!(out, "{process} {death}")?;
                 next.write(log, out)
             }
-            Self::Draining { reason } => write!(out, "{reason}: coming to an end"),
+            Self::Draining { reason } => write!(out, "{reason}: finishing the run"),
             Self::Interrupted { before_the_end } => {
-                write!(out, "interrupted: {before_the_end} (once more: stop at once)")
+                write!(out, "interrupted: {before_the_end} (interrupt again to stop at once)")
             }
             Self::Killed { processes, reason } => {
                 let names: Vec<_> = processes.iter().map(ToString::to_string).collect();
@@ -296,7 +296,7 @@ impl NotEvaluated {
         match self {
             Self::Failed { reason, log } => write!(
                 out,
-                "no evaluation of policy {policy_version}, the run goes on: {reason}; log: {}",
+                "no evaluation of policy {policy_version}, the run continues: {reason}; log: {}",
                 shown(log)
             ),
             Self::TooFarBehind { env_steps } => write!(
@@ -320,13 +320,13 @@ impl AfterDeath {
             ),
             Self::WorkerGivenUp { restarts, left, of } => write!(
                 out,
-                " again: giving up on it after {restarts} restarts, going on with {left} of {of} \
+                " again: giving up on it after {restarts} restarts, continuing with {left} of {of} \
                  workers{}",
                 log_tail(log)
             ),
             Self::GatewayGivenUp { restarts } => write!(
                 out,
-                ": giving up on it after {restarts} restarts; the run goes on without other \
+                ": giving up on it after {restarts} restarts; the run continues without other \
                  hosts{}",
                 log_tail(log)
             ),

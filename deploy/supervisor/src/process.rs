@@ -7,13 +7,13 @@ use std::fmt::{self, Display, Formatter};
 pub enum Process {
     /// The learner.
     Learner,
-    /// Represents the learner on another host.
+    /// Acts as the learner on a host without one.
     Relay,
     /// A worker, by its index.
     Actor(u32),
     /// The evaluator.
     Evaluator,
-    /// Represents the workers of other hosts.
+    /// Acts as the workers of other hosts.
     Gateway,
 }
 

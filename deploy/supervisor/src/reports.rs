@@ -1,4 +1,4 @@
-//! What the state machine does about reports of children and requests to join.
+//! Handles reports of children and requests to join.
 
 use dmprl_control::{Command, EvaluationRequest, EvaluationRow, Greeting, Progress, Report};
 use dmprl_shared::spec::EnvSpec;
@@ -11,7 +11,7 @@ use super::restart_policy::Death;
 use super::state::{Milestone, Phase};
 use super::step::{Action, Admission, Failure};
 
-/// Maximum number of shown lines that are no reports. The rest is counted.
+/// Maximum number of lines that are shown although they are not reports. Further ones are counted.
 const GARBAGE_SHOWN_MAX: u32 = 3;
 /// Maximum number of characters of such a line.
 const GARBAGE_CHARS: usize = 200;
@@ -21,15 +21,16 @@ impl Machine {
         self.garbage += 1;
         if self.garbage <= GARBAGE_SHOWN_MAX {
             let line: String = line.escape_debug().take(GARBAGE_CHARS).collect();
-            self.warn(process, format!("{process} wrote what is no report: {line}"));
+            self.warn(process, format!("{process} wrote a line that is not a report: {line}"));
         }
     }
 
-    /// Handles a report. A worker that joined cannot end the run by an invalid one.
+    /// Handles a report. An invalid report ends the run, unless it is from a worker that joined:
+    /// then only that worker is killed.
     pub(super) fn on_report(&mut self, process: Process, report: Report) -> Result<(), Failure> {
         match self.handle_report(process, report) {
             Err(failure) if self.is_joined(process) => {
-                self.kill(process, Death::sent_away(format!("{:#}", failure.error)));
+                self.kill(process, Death::rejected(format!("{:#}", failure.error)));
                 Ok(())
             }
             handled => handled,
@@ -40,7 +41,7 @@ impl Machine {
         let counts =
             matches!(report, Report::Sent(_) | Report::EnvFailures { .. } | Report::EnvHung { .. });
         if self.children.running(process).is_none() && !counts {
-            // The process has ended, so only its counts still matter.
+            // The process has exited, so only its counts still matter.
             return Ok(());
         }
         self.heard(process, &report);
@@ -87,7 +88,7 @@ impl Machine {
             Report::Checkpoint { name, env_steps } => {
                 self.learner.checkpointed = true;
                 self.children.worked(process, self.now);
-                self.tell(RunEvent::Checkpoint { name, env_steps });
+                self.notify(RunEvent::Checkpoint { name, env_steps });
             }
             Report::Finished => {
                 if process != self.settings.hub || !self.learner.ready {
@@ -121,7 +122,7 @@ impl Machine {
             Some(known) if !known.is_same(&spec) => {
                 let json = |spec| serde_json::to_string(spec).unwrap_or_default();
                 return Err(Failure::new(format!(
-                    "the environment of {process} is not the run's: expected {}, got {}",
+                    "the environment of {process} differs from the run's: expected {}, got {}",
                     json(known),
                     json(&spec)
                 )));
@@ -136,7 +137,7 @@ impl Machine {
         match process {
             Process::Evaluator => self.send_evaluation(),
             _ if self.learner.ready => self.attach(process),
-            _ if !self.children.knows(hub) => self.start(hub),
+            _ if !self.children.was_started(hub) => self.start(hub),
             _ => {}
         }
         Ok(())
@@ -155,7 +156,7 @@ impl Machine {
         self.advanced = self.now;
         self.send_totals();
         if matches!(self.phase, Phase::Draining { .. }) {
-            // Its predecessor was asked, and died of something else.
+            // Its predecessor was asked to finish, but died.
             self.send(hub, Command::Finish);
         }
         if self.settings.one_process || self.phase != Phase::Training {
@@ -170,10 +171,10 @@ impl Machine {
         if hub == Process::Relay {
             return Ok(());
         }
-        if !self.children.knows(Process::Evaluator) {
+        if !self.children.was_started(Process::Evaluator) {
             self.start(Process::Evaluator);
         }
-        if self.settings.config.bridge.is_open() && !self.children.knows(Process::Gateway) {
+        if self.settings.config.bridge.is_open() && !self.children.was_started(Process::Gateway) {
             self.start(Process::Gateway);
         }
         Ok(())
@@ -182,7 +183,7 @@ impl Machine {
     fn on_first_segment(&mut self) {
         let died = self.learner.died.take();
         let after = self.now.duration_since(died.unwrap_or(self.started));
-        self.tell(RunEvent::FirstStep { after, is_successor: died.is_some() });
+        self.notify(RunEvent::FirstStep { after, is_successor: died.is_some() });
     }
 
     fn set_ready(&mut self, process: Process) {
@@ -197,7 +198,7 @@ impl Machine {
             running.attached = true;
         }
         if self.is_joined(process) {
-            self.tell(RunEvent::Joined { process, workers: self.children.workers() });
+            self.notify(RunEvent::Joined { process, workers: self.children.workers() });
         }
         self.send_totals();
     }
@@ -209,7 +210,7 @@ impl Machine {
         }
         self.learner.checkpointed = false;
         self.send_totals();
-        self.tell(RunEvent::Progress { progress: progress.clone(), processes: Vec::new() });
+        self.notify(RunEvent::Progress { progress: progress.clone(), processes: Vec::new() });
         let milestone = |progress| Some(Milestone { at: self.now, progress });
         if self.first.is_none() {
             self.first = milestone(progress.clone());
@@ -217,13 +218,13 @@ impl Machine {
         self.last = milestone(progress);
     }
 
-    /// Shows the first failure, and then the last one whenever the count has doubled. The process's
-    /// log has each.
+    /// Shows the first failure, and the latest one whenever the count has doubled. The process's
+    /// log has all of them.
     fn on_env_failures(&mut self, process: Process, count: u64, last: String) {
         if self.totals.add_env_failures(count) {
             let log = (!self.is_joined(process)).then(|| self.log_path(process));
             let count = self.totals.env_failures;
-            self.tell(RunEvent::EnvFailure { process, count, last, log });
+            self.notify(RunEvent::EnvFailure { process, count, last, log });
         }
         self.send_totals();
     }
@@ -240,7 +241,7 @@ impl Machine {
     }
 
     fn give_up_evaluation(&mut self, request: &EvaluationRequest, reason: NotEvaluated) {
-        self.tell(RunEvent::NotEvaluated { policy_version: request.policy_version, reason });
+        self.notify(RunEvent::NotEvaluated { policy_version: request.policy_version, reason });
     }
 
     /// Gives up all evaluations that are waiting or in flight.
@@ -274,8 +275,8 @@ impl Machine {
         } else {
             None
         };
-        // The shell knows the best row of the run.
-        self.tell(RunEvent::Evaluated { row: row.clone(), is_best: false });
+        // `Supervisor::notify` sets `is_best`, as it knows the best row of the run.
+        self.notify(RunEvent::Evaluated { row: row.clone(), is_best: false });
         self.last_row = Some(row);
         if let Some(reason) = reached {
             self.drain(reason);
@@ -284,7 +285,7 @@ impl Machine {
         Ok(())
     }
 
-    /// The run continues: its curve has one point less.
+    /// Handles a failed evaluation. The run continues without this point of its curve.
     fn on_not_evaluated(
         &mut self,
         process: Process,
@@ -296,13 +297,13 @@ impl Machine {
         }
         self.on_answer(process, policy_version)?;
         let reason = NotEvaluated::Failed { reason, log: self.log_path(process) };
-        self.tell(RunEvent::NotEvaluated { policy_version, reason });
+        self.notify(RunEvent::NotEvaluated { policy_version, reason });
         self.complete_if_done();
         Ok(())
     }
 
-    /// Whether an answer belongs to a request that was given up: the run stops, or the learner
-    /// died, whose successor requests the evaluation again.
+    /// Whether an answer belongs to a request that was given up, because the run stops or because
+    /// the learner died. Its successor requests the evaluation again.
     fn expects_no_answer(&self) -> bool {
         self.learner.waits_for_evaluator || matches!(self.phase, Phase::Stopping { .. })
     }
@@ -317,27 +318,28 @@ impl Machine {
         }
         if process != Process::Evaluator || !self.evaluations.finish(policy_version) {
             return Err(Failure::new(format!(
-                "{process} evaluated policy {policy_version}, which nobody asked for"
+                "{process} evaluated policy {policy_version} without a request"
             )));
         }
-        // An evaluator that answers from time to time is worth its restarts.
-        self.children.forgive(Process::Evaluator);
+        // Each answer resets the evaluator's restart budget.
+        self.children.reset_restarts(Process::Evaluator);
         self.send_evaluation();
         Ok(())
     }
 
-    /// Workers that join have the indices after the run's own.
+    /// Whether the process is a worker that joined. Such workers have the indices after the run's
+    /// own workers.
     pub(super) fn is_joined(&self, process: Process) -> bool {
         let workers = self.settings.config.actors.workers;
         matches!(process, Process::Actor(index) if index as usize >= workers)
     }
 
-    /// Workers that have joined and run.
+    /// Number of running workers that joined.
     pub(super) fn joined(&self) -> usize {
         self.children.all_running().filter(|(process, _)| self.is_joined(*process)).count()
     }
 
-    /// Admits a worker, or says why not.
+    /// Admits a worker, or rejects it with a reason.
     pub(super) fn on_join_request(&mut self, request: u64, id: i32, speaks: &Greeting) {
         match self.free_place(speaks) {
             Ok(index) => {
@@ -345,11 +347,11 @@ impl Machine {
                 let start = self.children.start(process, self.now);
                 let workers = self.children.workers() + 1;
                 self.actions.push(Action::Admit(Admission { request, index, start, workers }));
-                self.tell(RunEvent::ChildStarted { process, start });
+                self.notify(RunEvent::ChildStarted { process, start });
             }
             Err(reason) => {
-                let message = format!("process {id} may not join: {reason}");
-                self.tell(RunEvent::Warning { process: None, message });
+                let message = format!("process {id} was not admitted to the run: {reason}");
+                self.notify(RunEvent::Warning { process: None, message });
                 self.actions.push(Action::Refuse { request, reason });
             }
         }
@@ -360,9 +362,9 @@ impl Machine {
             return Err(format!("expected {}, got {speaks}", Greeting::this()));
         }
         if self.phase != Phase::Training {
-            return Err("the run is coming to its end".to_owned());
+            return Err("the run is ending".to_owned());
         }
-        if !self.children.knows(self.settings.hub) {
+        if !self.children.was_started(self.settings.hub) {
             return Err("the run is still starting; try again in a moment".to_owned());
         }
         let actors = &self.settings.config.actors;
@@ -376,7 +378,7 @@ impl Machine {
         places.find(free).ok_or_else(|| {
             format!(
                 "{count} of {count} places for workers that join are taken (actors.joined_max); \
-                 one that leaves makes room"
+                 try again when a worker has left"
             )
         })
     }

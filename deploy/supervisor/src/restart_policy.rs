@@ -1,8 +1,8 @@
-//! Decides whether a process that has ended is restarted, and after which back-off.
+//! Decides whether and after which back-off a dead process is restarted.
 //!
-//! A process that dies soon after each start is in a crash loop: it is given up after its last
-//! restart. Once it has worked for [`TimeLimits::proven`], its restart budget and its back-off are
-//! reset. Otherwise a run of weeks would lose its workers at one death a day.
+//! A process that dies soon after each start is in a crash loop, and is given up when its restart
+//! budget is exhausted. Once it has worked for [`TimeLimits::proven`], its budget and its back-off
+//! are reset. Otherwise a run of several weeks would lose its workers to occasional deaths.
 
 use std::fmt::{self, Display, Formatter};
 use std::process::ExitStatus;
@@ -15,16 +15,16 @@ use super::launcher::INCARNATIONS_PER_SESSION;
 use super::limits::TimeLimits;
 use super::process::Process;
 
-/// Deaths of the evaluator without an answer in between before the run stops. A run without
-/// evaluations is not worth its computing time.
+/// Maximum number of the evaluator's restarts without an answer in between. Then the run stops: a
+/// run without evaluations is not worth its computing time.
 pub(super) const EVALUATOR_RESTARTS_MAX: u32 = 3;
 /// Exit status of a program that panicked.
 const PANIC_STATUS: i32 = 101;
 
-/// How a process ended: by itself, or why the supervisor killed it.
+/// How a process ended: by itself, or killed by the supervisor for a reason.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Death {
-    /// Verb of the message: `died`, `hung`, `was sent away` or `was killed`.
+    /// Verb of the message: `died`, `hung`, `was rejected` or `was killed`.
     pub verb: &'static str,
     /// Exit status, signal or reason.
     pub cause: String,
@@ -35,17 +35,17 @@ impl Death {
         Self { verb: "died", cause: describe(status) }
     }
 
-    /// It sent no heartbeat in time.
+    /// The process sent no heartbeat in time.
     pub(super) fn hung(cause: String) -> Self {
         Self { verb: "hung", cause }
     }
 
     /// A worker that had joined does not fit the run.
-    pub(super) fn sent_away(cause: String) -> Self {
-        Self { verb: "was sent away", cause }
+    pub(super) fn rejected(cause: String) -> Self {
+        Self { verb: "was rejected", cause }
     }
 
-    /// It exceeded a time limit.
+    /// The process exceeded a time limit.
     pub(super) fn too_slow(cause: String) -> Self {
         Self { verb: "was killed", cause }
     }
@@ -60,7 +60,7 @@ impl Display for Death {
 /// A restart that is due later.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) struct Restart {
-    /// Number of restarts since the process was last proven, this one included.
+    /// Number of restarts since the budget was last reset, including this one.
     pub(super) number: u32,
     pub(super) back_off: Duration,
 }
@@ -82,11 +82,11 @@ pub(super) fn restart(
     Some(Restart { number: slot.restarts, back_off })
 }
 
-/// Whether a process worked long enough to get its whole restart budget again.
+/// Whether a process worked long enough for its restart budget to be reset.
 ///
-/// A worker must have delivered segments for that long. A learner must have lived that long and
-/// have written a checkpoint, without which its successor repeats all its work. The evaluator's
-/// budget is reset by each answer instead.
+/// A worker must have delivered segments for that long. A learner must have run that long and have
+/// written a checkpoint: without one, its successor repeats all its work. The evaluator's budget is
+/// reset by each answer instead.
 pub(super) fn is_proven(
     process: Process,
     running: &Running,
@@ -103,8 +103,8 @@ pub(super) fn is_proven(
     }
 }
 
-/// Whether the process was killed by a signal or panicked. One that ended by itself gave a reason,
-/// which a restart does not remove.
+/// Whether the process was killed by a signal or panicked. A process that exited by itself with an
+/// error would fail again after a restart.
 pub(super) fn is_crash(status: ExitStatus) -> bool {
     status.code().is_none_or(|code| code == PANIC_STATUS)
 }

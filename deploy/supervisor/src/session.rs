@@ -1,4 +1,4 @@
-//! One session of a run: the shared memory around the supervisor and the children's command lines.
+//! Runs one session of a run: creates the shared memory, then starts the supervisor.
 
 use std::path::PathBuf;
 use std::time::Duration;
@@ -16,10 +16,10 @@ use super::signals::interrupts;
 use super::supervisor::{SessionReport, SupervisorPlan, supervise};
 use super::totals::Totals;
 
-/// How long `resume` waits for the learner of a killed supervisor to write its checkpoint.
+/// Maximum wait of `resume` for the learner of a killed supervisor to write its checkpoint.
 pub const RESUME_WAIT: Duration = Duration::from_secs(70);
 
-/// A run directory that is ready for training.
+/// A session to run, in a run directory that is ready for training.
 pub struct SessionPlan {
     /// The program that plays the roles: this one, or a fake in tests.
     pub program: PathBuf,
@@ -29,27 +29,27 @@ pub struct SessionPlan {
     pub config: ExperimentConfig,
     /// The Python virtual environment.
     pub venv: Option<PathBuf>,
-    /// Whether the run has been trained before.
+    /// Whether the run has been trained before and resumes from its last checkpoint.
     pub resume: bool,
     /// Counts of earlier sessions of the run.
     pub earlier: Totals,
-    /// Differences for `dmprl chaos`.
+    /// Special settings for `dmprl chaos`.
     pub trial: Trial,
 }
 
-/// Settings of a run whose processes are killed on purpose.
+/// Settings of a run whose processes are killed deliberately.
 #[derive(Debug, Default)]
 pub struct Trial {
     /// Directory of the journals of workers and learner.
     pub journal: Option<PathBuf>,
-    /// Maximum back-off before a restart: a deliberate kill does not predict another one.
+    /// Maximum back-off before a restart; `None` for the default.
     pub restart_max: Option<Duration>,
 }
 
 /// Trains until the run ends, is stopped or fails.
 ///
 /// # Errors
-/// The session could not begin. How it ended is in the report.
+/// The session could not start. Later failures are in the report.
 pub fn session(plan: SessionPlan, observer: &mut dyn RunObserver) -> anyhow::Result<SessionReport> {
     let SessionPlan { program, run, config, venv, resume, earlier, trial } = plan;
     let manifest = run.manifest()?;
@@ -59,7 +59,7 @@ pub fn session(plan: SessionPlan, observer: &mut dyn RunObserver) -> anyhow::Res
         .enable_all()
         .build()
         .context("cannot start the supervisor's runtime")?;
-    // Catch signals before making shared memory: a fatal signal would leave it behind.
+    // Catch signals before creating shared memory: a fatal signal would leave it behind.
     let interrupts = runtime.block_on(async { interrupts() })?;
     let domain = match config.run.deterministic {
         true => None,
@@ -84,19 +84,19 @@ pub fn session(plan: SessionPlan, observer: &mut dyn RunObserver) -> anyhow::Res
     limits.restart_max = trial.restart_max.unwrap_or(limits.restart_max);
     let plan = SupervisorPlan { launcher, config, limits, earlier, interrupts };
     let report = runtime.block_on(supervise(plan, observer));
-    // The runtime kills children that remain, which must not outlive their shared memory.
+    // The runtime kills remaining children, which must not outlive their shared memory.
     drop(runtime);
     drop(domain);
     Ok(report)
 }
 
-/// Returns whether the run has a checkpoint. A run without one begins again, without the rows of
+/// Returns whether the run has a checkpoint. A run without one starts over, without the rows of
 /// the first attempt.
 fn can_resume(run: &RunDirectory, observer: &mut dyn RunObserver) -> anyhow::Result<bool> {
     if run.has_checkpoint()? {
         return Ok(true);
     }
-    let message = "the run has no checkpoint yet: it begins again".to_owned();
+    let message = "the run has no checkpoint yet: it starts from the beginning".to_owned();
     observer.on_event(RunEvent::Warning { process: None, message });
     run.begin_again()?;
     Ok(false)

@@ -1,5 +1,4 @@
-//! How children and the run end: deaths and their consequences, the regular end, interrupts and
-//! failures.
+//! Handles the end of children and of the run: deaths, completion, interrupts and failures.
 
 use std::process::ExitStatus;
 use std::time::Duration;
@@ -14,8 +13,8 @@ use super::restart_policy::{Death, EVALUATOR_RESTARTS_MAX, Restart, is_crash, is
 use super::state::Phase;
 use super::step::{Action, Failure, ResumeAdvice};
 
-/// Interrupts that are closer together count as one: `timeout` and some job schedulers signal both
-/// a process and its group.
+/// Interrupts within this time count as one: `timeout` and some job schedulers signal both a
+/// process and its group.
 const INTERRUPT_GAP: Duration = Duration::from_millis(100);
 
 impl Machine {
@@ -24,29 +23,29 @@ impl Machine {
         if let Phase::Stopping { killed, .. } = self.phase {
             if process == Process::Learner && ended.ready && !self.learner.finished {
                 let cause = if killed { String::new() } else { format!(": {}", describe(status)) };
-                let message = format!("learner ended without its last checkpoint{cause}");
+                let message = format!("learner exited without writing its last checkpoint{cause}");
                 self.warn(process, message);
             }
             if self.settings.hub == Process::Relay {
-                // The relay stays until the last worker has ended, whose last segment may follow.
+                // The relay stays until the last worker has exited, to receive its last segments.
                 self.send_totals();
             }
             return Ok(());
         }
         if is_proven(process, &ended, &self.settings.limits, self.now) {
-            self.children.forgive(process);
+            self.children.reset_restarts(process);
         }
         let death = ended.killed_for.unwrap_or_else(|| Death::of(status));
         match process {
             Process::Learner | Process::Relay if self.learner.finished => {
                 if !status.success() {
-                    self.warn(process, format!("{process} ended with {}", describe(status)));
+                    self.warn(process, format!("{process} exited with {}", describe(status)));
                 }
                 self.complete_if_done();
                 Ok(())
             }
             Process::Learner | Process::Relay => self.on_learner_death(status, death),
-            // Such as an address in use or a missing file, which a restart does not change.
+            // For instance an address in use or a missing file: a restart would not help.
             Process::Gateway if !ended.ready && status.code().is_some() => {
                 Err(self.failure_of(process, &death))
             }
@@ -66,8 +65,8 @@ impl Machine {
     /// wait meanwhile and keep unacknowledged segments.
     ///
     /// The successor cuts the curve back to its checkpoint and requests the missing evaluations
-    /// again. An evaluation in flight would append its row behind the cut, so the evaluator is
-    /// killed, and the successor starts after its exit.
+    /// again. An evaluation in flight would append its row after the cut, so the evaluator is
+    /// killed first, and the successor starts after its exit.
     fn on_learner_death(&mut self, status: ExitStatus, death: Death) -> Result<(), Failure> {
         let hub = self.settings.hub;
         let restarts_max = self.settings.config.supervision.learner_restarts_max;
@@ -86,20 +85,20 @@ impl Machine {
         if may_answer {
             let death = Death::too_slow("its learner died".to_owned());
             self.kill(Process::Evaluator, death);
-            // Not the evaluator's fault.
-            self.children.forgive(Process::Evaluator);
+            // The evaluator is not at fault.
+            self.children.reset_restarts(Process::Evaluator);
             self.learner.waits_for_evaluator = true;
         }
         Ok(())
     }
 
-    /// The run continues with its own workers if the gateway is given up.
+    /// Restarts the gateway. If it is given up, the run continues with its own workers.
     fn on_gateway_death(&mut self, death: Death) {
         self.hosts.0.clear();
         let restarts = self.settings.config.supervision.learner_restarts_max;
         if self.phase == Phase::Training && !self.restart(Process::Gateway, &death, restarts) {
             let next = AfterDeath::GatewayGivenUp { restarts };
-            self.tell_death(Process::Gateway, death, next);
+            self.notify_death(Process::Gateway, death, next);
         }
     }
 
@@ -123,8 +122,8 @@ impl Machine {
         status: ExitStatus,
         death: Death,
     ) -> Result<(), Failure> {
-        // No environment has worked yet: a worker that ends by itself has a reason that a restart
-        // does not remove.
+        // No environment has worked yet: a worker that exits by itself would fail again after a
+        // restart.
         if self.spec.is_none() && status.code().is_some() {
             return Err(self.failure_of(process, &death));
         }
@@ -139,11 +138,11 @@ impl Machine {
         }
         let restarts = self.children.slots.get(&process).map_or(0, |slot| slot.restarts);
         let of = self.settings.config.actors.workers + self.joined();
-        self.tell_death(process, death, AfterDeath::WorkerGivenUp { restarts, left, of });
+        self.notify_death(process, death, AfterDeath::WorkerGivenUp { restarts, left, of });
         Ok(())
     }
 
-    /// A worker that had joined has ended. Only its parent starts it again.
+    /// Handles the exit of a worker that had joined. The supervisor does not restart it.
     pub(super) fn on_gone(&mut self, process: Process) -> Result<(), Failure> {
         let ended = self.children.take(process);
         if self.phase != Phase::Training {
@@ -153,9 +152,9 @@ impl Machine {
         let (announced, death) =
             ended.map_or((false, None), |running| (running.left, running.killed_for));
         let workers = self.children.workers();
-        self.tell(RunEvent::Left { process, death, announced, workers });
+        self.notify(RunEvent::Left { process, death, announced, workers });
         if self.children.workers_left() == 0 {
-            let message = "no worker is left: those that had joined are gone too".to_owned();
+            let message = "no worker is left: all workers that joined are gone".to_owned();
             return Err(Failure::new(message).advice(self.resume_advice()));
         }
         Ok(())
@@ -168,13 +167,13 @@ impl Machine {
         let Some(Restart { number, back_off }) = scheduled else { return false };
         self.totals.worker_restarts += u64::from(process.is_worker());
         let next = AfterDeath::Restart { restart: number, restarts_max, back_off };
-        self.tell_death(process, death.clone(), next);
+        self.notify_death(process, death.clone(), next);
         true
     }
 
-    fn tell_death(&mut self, process: Process, death: Death, next: AfterDeath) {
+    fn notify_death(&mut self, process: Process, death: Death, next: AfterDeath) {
         let log = self.log_path(process);
-        self.tell(RunEvent::ChildDied { process, death, log, next });
+        self.notify(RunEvent::ChildDied { process, death, log, next });
     }
 
     fn failure_of(&self, process: Process, death: &Death) -> Failure {
@@ -190,17 +189,17 @@ impl Machine {
         }
     }
 
-    /// Turns an error into the end of the run.
+    /// Ends the run if `result` is an error.
     pub(super) fn fail_on_error(&mut self, result: Result<(), Failure>) {
         if let Err(failure) = result {
             self.fail(failure);
         }
     }
 
-    /// Ends the run because it cannot continue. The learner, if it runs, writes a checkpoint.
+    /// Ends the run because it cannot continue. The learner writes a checkpoint if it is running.
     fn fail(&mut self, failure: Failure) {
         if self.failure.is_some() || self.interrupts > 0 {
-            self.actions.push(Action::TellFailure(failure));
+            self.actions.push(Action::NotifyFailure(failure));
             return;
         }
         self.failure = Some(failure);
@@ -213,7 +212,7 @@ impl Machine {
     /// Asks the learner to finish before its last step.
     pub(super) fn drain(&mut self, reason: String) {
         if self.phase == Phase::Training {
-            self.tell(RunEvent::Draining { reason });
+            self.notify(RunEvent::Draining { reason });
             self.phase = Phase::Draining { deadline: self.now + self.settings.limits.drain };
             self.send(self.settings.hub, Command::Finish);
         }
@@ -230,11 +229,11 @@ impl Machine {
         for process in self.children.names().into_iter().filter(|process| process.is_worker()) {
             self.send(process, Command::Stop);
         }
-        // The gateway tells the other hosts that the run is over, and ends.
+        // The gateway tells the other hosts that the run is over, and exits.
         self.send(Process::Gateway, Command::Finish);
     }
 
-    /// The regular end: the learner has exited, and all evaluations are answered.
+    /// Stops all processes once the learner has exited and all evaluations are answered.
     pub(super) fn complete_if_done(&mut self) {
         let finishing = matches!(self.phase, Phase::Finishing { .. });
         let learner_gone = self.children.running(self.settings.hub).is_none();
@@ -253,11 +252,11 @@ impl Machine {
         match self.interrupts {
             1 => {
                 let before_the_end = match self.settings.hub {
-                    Process::Relay => "handing over what the workers have sent",
+                    Process::Relay => "delivering the workers' segments",
                     _ if self.learner.finished => "skipping evaluations",
                     _ => "writing a checkpoint",
                 };
-                self.tell(RunEvent::Interrupted { before_the_end });
+                self.notify(RunEvent::Interrupted { before_the_end });
                 self.stop(self.settings.limits.stop);
             }
             2 => self.kill_all("interrupted twice"),
@@ -265,8 +264,8 @@ impl Machine {
         }
     }
 
-    /// Asks every child to end within `limit`. An interrupt can shorten the limit of a stop in
-    /// progress; nothing extends it.
+    /// Asks every child to exit within `limit`. If a stop is in progress, this can shorten its
+    /// limit but not extend it.
     fn stop(&mut self, limit: Duration) {
         let deadline = self.now + limit;
         if let Phase::Stopping { deadline: before, killed } = self.phase {
@@ -287,17 +286,18 @@ impl Machine {
         let kills = processes.iter().map(|process| Action::Kill(*process));
         self.actions.extend(kills);
         if !processes.is_empty() {
-            self.tell(RunEvent::Killed { processes, reason });
+            self.notify(RunEvent::Killed { processes, reason });
         }
         let deadline = self.now + self.settings.limits.kill;
         self.phase = Phase::Stopping { deadline, killed: true };
     }
 
-    /// Gives up: a process survived SIGKILL, which only a fault of kernel or device explains.
+    /// Gives up because a process survived SIGKILL, which happens only after a fault of the kernel
+    /// or a device.
     pub(super) fn abandon(&mut self) {
         let names: Vec<String> = self.children.names().iter().map(ToString::to_string).collect();
         let limit = self.settings.limits.kill;
-        let message = format!("{} did not end {limit:?} after SIGKILL", names.join(", "));
+        let message = format!("{} did not exit within {limit:?} of SIGKILL", names.join(", "));
         self.failure = Some(Failure::new(message));
         self.abandoned = true;
     }

@@ -5,10 +5,10 @@ use dmprl_run::is_ignored;
 use tokio::signal::unix::{SignalKind, signal};
 use tokio::sync::mpsc;
 
-/// Maximum number of waiting interrupts; the third and later ones have no effect.
+/// Maximum number of queued interrupts. The third and later ones have no effect.
 const INTERRUPTS_MAX: usize = 4;
 
-/// Returns a stream with one item per signal from now on. Must be called inside the runtime.
+/// Returns a stream with one item per signal from now on. Must be called within a tokio runtime.
 ///
 /// # Errors
 /// A signal cannot be caught.
@@ -25,7 +25,7 @@ pub fn interrupts() -> anyhow::Result<mpsc::Receiver<()>> {
         let sender = sender.clone();
         tokio::spawn(async move {
             while signals.recv().await.is_some() {
-                // If the queue is full, enough interrupts are waiting.
+                // If the queue is full, enough interrupts are queued.
                 let _ = sender.try_send(());
             }
         });

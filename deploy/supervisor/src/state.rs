@@ -37,23 +37,23 @@ pub(super) enum Phase {
     Training,
     /// The learner was asked to finish.
     Draining { deadline: Instant },
-    /// The learner has finished and exits; evaluations are outstanding.
+    /// The learner has finished and is exiting, or evaluations are outstanding.
     Finishing { deadline: Instant },
     /// All processes were asked to stop, and were killed later if `killed`.
     Stopping { deadline: Instant, killed: bool },
 }
 
-/// State of the learner, or of the relay that represents it.
+/// State of the learner, or of the relay on a host without one.
 #[derive(Debug, Default)]
 pub(super) struct Learner {
     pub(super) ready: bool,
-    /// Death of the last learner, until its successor learns.
+    /// Time of the last learner's death, until its successor receives a segment.
     pub(super) died: Option<Instant>,
-    /// The evaluator was killed with its learner and has not ended yet. The successor waits for it.
+    /// The evaluator was killed with its learner and has not exited; the successor waits for it.
     pub(super) waits_for_evaluator: bool,
-    /// It has finished and written its last checkpoint.
+    /// The learner has finished and written its last checkpoint.
     pub(super) finished: bool,
-    /// A checkpoint followed the newest progress.
+    /// A checkpoint was written after the newest progress.
     pub(super) checkpointed: bool,
 }
 

@@ -18,11 +18,11 @@ pub(super) enum Event {
     Begin,
     /// A process sent a report.
     Report(Process, Report),
-    /// A process wrote a line that is no report.
+    /// A process wrote a line that is not a report.
     Garbage(Process, String),
-    /// A child ended, and all its reports have been handled.
+    /// A child exited, and all its reports have been handled.
     Exited(Process, ExitStatus),
-    /// A worker that had joined ended. Only its parent knows its exit status.
+    /// A worker that had joined exited. Only its parent knows its exit status.
     Gone(Process),
     /// A worker asks to join.
     JoinRequested {
@@ -41,18 +41,18 @@ pub(super) enum Event {
     DomainLost(PathBuf),
     /// The user interrupts.
     Interrupt,
-    /// The supervisor itself was late: silence since its last turn proves nothing.
+    /// The supervisor itself was late, so a child's silence since its last turn does not count.
     Late,
-    /// The supervisor itself was stopped for so long, by Ctrl-Z or a paused container.
-    StoodStill(Duration),
+    /// The supervisor itself was suspended for this time, by Ctrl-Z or a paused container.
+    Suspended(Duration),
     /// Time has passed.
     Tick {
-        /// Whether all reports that had arrived were handled. Only then does silence count.
+        /// Whether all reports that had arrived were handled. Silence counts only in this case.
         all_heard: bool,
     },
 }
 
-/// What the shell does on behalf of the state machine.
+/// An action that the supervisor performs for the state machine.
 #[derive(Debug)]
 pub(super) enum Action {
     /// Starts a process.
@@ -60,10 +60,11 @@ pub(super) enum Action {
         process: Process,
         /// Number of the start in this session, from 0.
         start: u32,
-        /// The successor of a dead learner begins at the newest checkpoint, or anew without one.
+        /// Set for a learner that replaces a dead one. It starts from the newest checkpoint, or
+        /// from the beginning if there is none.
         successor: Option<Successor>,
     },
-    /// Tells a worker where the shared memory is.
+    /// Sends the path of the shared memory to a worker.
     Attach(Process),
     /// Sends a command without waiting.
     Send(Process, Command),
@@ -77,18 +78,18 @@ pub(super) enum Action {
     Refuse { request: u64, reason: String },
     /// Writes the environment's description into the run directory.
     WriteSpec(EnvSpec),
-    /// Reads the evaluations again, which a returned learner has cut back to its checkpoint.
+    /// Reads the evaluations again after a restarted learner has cut them back to its checkpoint.
     Rewind,
-    /// Tells the observer.
-    Tell(RunEvent),
-    /// Tells the observer of a failure while the run stops already.
-    TellFailure(Failure),
+    /// Passes an event to the observer.
+    Notify(RunEvent),
+    /// Reports a failure to the observer while the run is already stopping.
+    NotifyFailure(Failure),
 }
 
 /// A learner that replaces a dead one.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) struct Successor {
-    /// Restarts of the learner in the whole run, this one included.
+    /// Restarts of the learner in the whole run, including this one.
     pub(super) restarts: u64,
 }
 
@@ -100,29 +101,29 @@ pub(super) struct Admission {
     pub(super) index: u32,
     /// Number of its start in this session, from 0.
     pub(super) start: u32,
-    /// Number of workers, this one included.
+    /// Number of workers, including this one.
     pub(super) workers: usize,
 }
 
-/// Why the run cannot continue.
+/// An error that ends the run.
 #[derive(Debug)]
 pub(super) struct Failure {
     pub(super) error: Error,
     /// Process whose last log lines follow the error.
     pub(super) log: Option<Process>,
     pub(super) advice: ResumeAdvice,
-    /// What the error means for the run.
+    /// Consequence for the run, shown before the error.
     pub(super) context: Option<&'static str>,
 }
 
-/// Whether a failure advises to resume the run.
+/// Whether the error message suggests to resume the run.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum ResumeAdvice {
-    /// A restart would fail for the same reason.
+    /// A resumed run would fail for the same reason.
     Never,
-    /// A run without a checkpoint would begin again and fail in the same way.
+    /// A run without a checkpoint would start over and fail in the same way.
     IfCheckpoint,
-    /// The learner runs, and writes a checkpoint when the run stops.
+    /// The learner is running, and writes a checkpoint when the run stops.
     Always,
 }
 

@@ -1,5 +1,5 @@
-//! The supervisor's shell: waits for events, passes them to the state machine, and performs the
-//! actions that it decides.
+//! The supervisor's loop: waits for events, passes them to the state machine, and performs the
+//! actions that it returns.
 
 use std::collections::{BTreeMap, VecDeque};
 use std::time::{Duration, Instant};
@@ -24,20 +24,20 @@ use super::step::{Action, Admission, Event, Failure, ResumeAdvice, Successor};
 use super::totals::Totals;
 use super::{joining, views};
 
-/// The supervisor was stopped, not late, if it wakes this long after its own deadline: by Ctrl-Z
-/// and `fg`, or a paused container.
-const STANDSTILL: Duration = Duration::from_secs(5);
-/// A supervisor this late cannot tell a worker that hangs from one that was stopped with it.
+/// If the supervisor wakes this long after its own deadline, it was suspended, by Ctrl-Z and `fg`
+/// or a paused container, and not only late.
+const SUSPENDED: Duration = Duration::from_secs(5);
+/// A supervisor this late cannot distinguish a worker that hangs from one that was suspended too.
 const LATE: Duration = Duration::from_secs(1);
 /// Maximum interval between checks for the shared-memory directory: each is one `stat`.
-const DOMAIN_LOOK: Duration = Duration::from_secs(1);
-/// Interval between redraws of the live display. Workers send a heartbeat a second, so events are
-/// frequent enough.
-const REDRAW_EVERY: Duration = Duration::from_millis(500);
+const DOMAIN_CHECK_INTERVAL: Duration = Duration::from_secs(1);
+/// Interval between redraws of the live display. Workers send a heartbeat every second, so events
+/// are frequent enough.
+const REDRAW_INTERVAL: Duration = Duration::from_millis(500);
 /// Interval between writes of `processes.json`.
-const PROCESSES_EVERY: Duration = Duration::from_secs(2);
+const PROCESSES_INTERVAL: Duration = Duration::from_secs(2);
 
-/// What the supervisor needs.
+/// Inputs of [`supervise`].
 pub struct SupervisorPlan {
     /// How to start children, and the run.
     pub launcher: Launcher,
@@ -133,7 +133,7 @@ pub async fn supervise(plan: SupervisorPlan, observer: &mut dyn RunObserver) -> 
     supervisor.best_return = known.best_return.unwrap_or(f64::NEG_INFINITY);
     supervisor.step(unreadable.map_or(Event::Begin, Event::ActionFailed));
     while !supervisor.machine.is_over() {
-        // A blocked terminal (Ctrl-S) may have delayed this turn.
+        // A blocked terminal (Ctrl-S) can delay a turn.
         let looked = Instant::now();
         supervisor.on_wake(woke, woke, looked);
         let due = supervisor.next_deadline();
@@ -149,7 +149,7 @@ pub async fn supervise(plan: SupervisorPlan, observer: &mut dyn RunObserver) -> 
             Wake::Interrupt => supervisor.step(Event::Interrupt),
             Wake::Incoming(event) => supervisor.take(event),
             Wake::Time => {
-                // Reports that arrived meanwhile come first.
+                // Let the reading tasks deliver reports that arrived meanwhile.
                 tokio::task::yield_now().await;
                 supervisor.step(Event::Tick { all_heard: incoming.is_empty() });
             }
@@ -199,8 +199,8 @@ impl<'a> Supervisor<'a> {
         }
     }
 
-    /// Passes an event to the machine and performs its actions, and so on with the events that
-    /// follow from them.
+    /// Passes an event to the machine and performs its actions, then handles the events of actions
+    /// that failed.
     fn step(&mut self, event: Event) {
         let mut events = VecDeque::from([event]);
         while let Some(event) = events.pop_front() {
@@ -265,8 +265,8 @@ impl<'a> Supervisor<'a> {
                 return self.launcher.run.write_spec(&spec).err().map(Event::ActionFailed);
             }
             Action::Rewind => return self.rewind().err().map(Event::ActionFailed),
-            Action::Tell(event) => self.tell(event),
-            Action::TellFailure(failure) => {
+            Action::Notify(event) => self.notify(event),
+            Action::NotifyFailure(failure) => {
                 let message = format!("while stopping: {:#}", self.render(failure));
                 self.warn(message);
             }
@@ -293,8 +293,8 @@ impl<'a> Supervisor<'a> {
         Ok(())
     }
 
-    /// Sends a command without waiting. A child that takes none is stuck or dying: its deadline or
-    /// its exit follows, so only a command that it cannot do without is worth a warning.
+    /// Sends a command without waiting. A child that accepts no commands is stuck or dying, so its
+    /// deadline or its exit follows. Warns only about commands that the child needs.
     fn send(&mut self, process: Process, command: Command) {
         let matters = !matches!(
             command,
@@ -302,15 +302,15 @@ impl<'a> Supervisor<'a> {
         );
         let sent = self.children.get(&process).is_none_or(|child| child.send(command));
         if !sent && matters {
-            let message = format!("{process} takes no commands");
-            self.tell(RunEvent::Warning { process: Some(process), message });
+            let message = format!("{process} accepts no commands");
+            self.notify(RunEvent::Warning { process: Some(process), message });
         }
     }
 
     fn listen(&mut self) {
         let Some(domain) = &self.launcher.domain else { return };
         if let Err(error) = joining::listen(domain, self.events.clone()) {
-            self.warn(format!("warning: nobody can join this run: {error:#}"));
+            self.warn(format!("warning: workers cannot join this run: {error:#}"));
         }
     }
 
@@ -334,11 +334,11 @@ impl<'a> Supervisor<'a> {
     }
 
     fn warn(&mut self, message: String) {
-        self.tell(RunEvent::Warning { process: None, message });
+        self.notify(RunEvent::Warning { process: None, message });
     }
 
-    /// Passes an event to the observer, completed by what the machine does not know.
-    fn tell(&mut self, mut event: RunEvent) {
+    /// Passes an event to the observer. Adds whether a row is the best one, and process lines.
+    fn notify(&mut self, mut event: RunEvent) {
         match &mut event {
             RunEvent::Evaluated { row, is_best } => {
                 *is_best = row.return_mean > self.best_return;
@@ -353,11 +353,11 @@ impl<'a> Supervisor<'a> {
         self.observer.on_event(event);
     }
 
-    /// Reports to the machine if the supervisor itself did not run: it last looked at `looked`, was
-    /// to wake at `due` at the latest, and woke at `now`.
+    /// Reports to the machine if the supervisor itself was suspended or late. It last ran at
+    /// `looked`, should have woken at `due` at the latest, and woke at `now`.
     fn on_wake(&mut self, looked: Instant, due: Instant, now: Instant) {
-        if let Some(lost) = stood_still(looked, due, now) {
-            self.step(Event::StoodStill(lost));
+        if let Some(lost) = suspension(looked, due, now) {
+            self.step(Event::Suspended(lost));
         } else if lateness(looked, due, now) >= LATE {
             self.step(Event::Late);
         }
@@ -367,14 +367,13 @@ impl<'a> Supervisor<'a> {
         let now = Instant::now();
         let deadline = self.machine.next_deadline(now);
         let watches_domain = self.machine.needs_domain() && self.launcher.domain.is_some();
-        if watches_domain { deadline.min(now + DOMAIN_LOOK) } else { deadline }
+        if watches_domain { deadline.min(now + DOMAIN_CHECK_INTERVAL) } else { deadline }
     }
 
     /// Ends the run if its shared-memory directory was removed.
     ///
     /// Mapped memory remains, so segments continue to arrive. But no process can attach any more,
-    /// so the next death would be the last one, and nothing could be cleaned up. The run ends
-    /// while a checkpoint is still possible.
+    /// so a dead process could not be replaced. The run ends while a checkpoint is still possible.
     fn check_domain(&mut self) {
         let domain = self.launcher.domain.as_ref().filter(|_| self.machine.needs_domain());
         if let Some(domain) = domain.filter(|domain| !domain.is_dir()) {
@@ -382,10 +381,10 @@ impl<'a> Supervisor<'a> {
         }
     }
 
-    /// Redraws the live display between two reports of progress: deaths and restarts are visible
-    /// without progress.
+    /// Redraws the live display between two reports of progress, so that deaths and restarts are
+    /// visible without progress.
     fn refresh(&mut self, now: Instant) {
-        if self.observer.shows_processes() && now.duration_since(self.drawn) >= REDRAW_EVERY {
+        if self.observer.shows_processes() && now.duration_since(self.drawn) >= REDRAW_INTERVAL {
             self.drawn = now;
             let processes = views::process_lines(&self.machine, now);
             self.observer.on_event(RunEvent::Processes(processes));
@@ -394,7 +393,7 @@ impl<'a> Supervisor<'a> {
 
     fn write_processes_if_due(&mut self, now: Instant) {
         if self.processes_due.is_some_and(|due| now >= due) {
-            self.processes_due = now.checked_add(PROCESSES_EVERY);
+            self.processes_due = now.checked_add(PROCESSES_INTERVAL);
             self.write_processes(false);
         }
     }
@@ -411,12 +410,12 @@ impl<'a> Supervisor<'a> {
         let rows = views::process_rows(&self.machine, usage, Instant::now());
         let table = Processes::new(ended, self.started.elapsed().as_secs_f64(), rows);
         if let Err(error) = self.launcher.run.write_processes(&table) {
-            self.warn(format!("warning: {error:#}; the run goes on without this file"));
+            self.warn(format!("warning: {error:#}; the run continues without this file"));
             self.processes_due = None;
         }
     }
 
-    /// Completes a failure with the last lines of a log and advice.
+    /// Formats a failure, with the last lines of a log and advice.
     fn render(&self, failure: Failure) -> Error {
         let Failure { mut error, log, advice, context } = failure;
         let run = &self.launcher.run;
@@ -427,7 +426,7 @@ impl<'a> Supervisor<'a> {
             ResumeAdvice::Always => true,
         };
         let advice = resumable.then(|| {
-            format!("\n  go on from the last checkpoint: dmprl resume {}", shown(run.path()))
+            format!("\n  resume from the last checkpoint: dmprl resume {}", shown(run.path()))
         });
         if tail.is_some() || advice.is_some() {
             let (tail, advice) = (tail.unwrap_or_default(), advice.unwrap_or_default());
@@ -466,10 +465,10 @@ impl<'a> Supervisor<'a> {
     }
 }
 
-/// For how long a supervisor was stopped that last looked at `looked`, was to wake at `due` at the
-/// latest and woke at `now`; `None` if it was on time.
-fn stood_still(looked: Instant, due: Instant, now: Instant) -> Option<Duration> {
-    (lateness(looked, due, now) >= STANDSTILL).then(|| now.duration_since(looked))
+/// Returns how long the supervisor was suspended, or `None` if it was not. It last ran at `looked`,
+/// should have woken at `due` at the latest, and woke at `now`.
+fn suspension(looked: Instant, due: Instant, now: Instant) -> Option<Duration> {
+    (lateness(looked, due, now) >= SUSPENDED).then(|| now.duration_since(looked))
 }
 
 fn lateness(looked: Instant, due: Instant, now: Instant) -> Duration {
@@ -482,13 +481,13 @@ mod tests {
 
     /// Regression test: Ctrl-Z for an hour was once taken for an hour without progress.
     #[test]
-    fn a_standstill_is_told_from_a_wait() {
+    fn a_suspension_is_distinguished_from_a_wait() {
         let looked = Instant::now();
         let due = looked + Duration::from_secs(60);
-        assert_eq!(stood_still(looked, due, looked), None, "a report came at once");
-        assert_eq!(stood_still(looked, due, due + Duration::from_millis(20)), None, "a timer");
+        assert_eq!(suspension(looked, due, looked), None, "an early report");
+        assert_eq!(suspension(looked, due, due + Duration::from_millis(20)), None, "a timer");
         let hour = Duration::from_secs(3_600);
-        assert_eq!(stood_still(looked, due, looked + hour), Some(hour));
-        assert_eq!(stood_still(due, looked, due), None, "overdue and handled at once");
+        assert_eq!(suspension(looked, due, looked + hour), Some(hour));
+        assert_eq!(suspension(due, looked, due), None, "overdue and handled at once");
     }
 }

@@ -2,12 +2,12 @@
 
 use dmprl_shared::transport::delivery::Sent;
 
-/// Counts of a run's earlier sessions, as its newest checkpoint has them, or of this session.
+/// Counts of a run's earlier sessions, from its newest checkpoint, or of this session.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct Totals {
     /// Failures of environments.
     pub env_failures: u64,
-    /// Segments that workers have produced, sent and had acknowledged.
+    /// Numbers of segments that workers have produced and sent, and that were acknowledged.
     pub sent: Sent,
     /// Restarts of the learner after a death.
     pub learner_restarts: u64,
@@ -16,7 +16,7 @@ pub struct Totals {
 }
 
 impl Totals {
-    /// The sum of both counts.
+    /// Returns the sums of both counts.
     #[must_use]
     pub fn plus(mut self, more: &Self) -> Self {
         self.env_failures = self.env_failures.saturating_add(more.env_failures);
@@ -26,9 +26,9 @@ impl Totals {
         self
     }
 
-    /// Adds failures of environments. Returns whether to show the last of them: the first is shown,
-    /// and then one whenever the count has doubled, so that frequent failures do not fill the
-    /// terminal.
+    /// Adds failures of environments. Returns whether to show the last of them: so that frequent
+    /// failures do not fill the terminal, this is true for the first one and then whenever the
+    /// count has doubled.
     pub(super) fn add_env_failures(&mut self, count: u64) -> bool {
         let before = self.env_failures;
         self.env_failures = before.saturating_add(count);
@@ -36,7 +36,7 @@ impl Totals {
     }
 }
 
-/// Whether a power of two lies between the two counts, the second included.
+/// Whether there is a power of two in `before + 1..=after`.
 fn is_shown(before: u64, after: u64) -> bool {
     after > before && after.checked_ilog2() != before.checked_ilog2()
 }

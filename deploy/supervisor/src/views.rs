@@ -24,7 +24,7 @@ pub(super) fn process_lines(machine: &Machine, now: Instant) -> Vec<ProcessLine>
 fn describe(machine: &Machine, process: Process, slot: &Slot, now: Instant) -> String {
     let running = slot.running.as_ref();
     if running.is_some_and(|running| running.killed_for.is_some()) {
-        return "killed, to be replaced".into();
+        return "killed, exiting".into();
     }
     let attached = running.is_some_and(|running| running.attached);
     let words = match (process_state(machine, slot), process) {
@@ -33,10 +33,10 @@ fn describe(machine: &Machine, process: Process, slot: &Slot, now: Instant) -> S
         (ProcessState::Restarting, _) => {
             let wait = slot.restart_at.map(|at| at.saturating_duration_since(now));
             let seconds = wait.unwrap_or_default().as_secs_f64().ceil();
-            return format!("dead, starts again in {seconds:.0} s");
+            return format!("dead, restarts in {seconds:.0} s");
         }
         (ProcessState::Running, Process::Learner) => "learning",
-        (ProcessState::Running, Process::Relay) => "passing segments and policies on",
+        (ProcessState::Running, Process::Relay) => "forwarding segments and policies",
         (ProcessState::Running, Process::Gateway) => return machine.hosts.description(),
         (ProcessState::Running, Process::Evaluator) => match machine.evaluations.deadline() {
             Some(_) => "evaluating",
@@ -44,7 +44,7 @@ fn describe(machine: &Machine, process: Process, slot: &Slot, now: Instant) -> S
         },
         (ProcessState::Running, Process::Actor(_)) if !attached => "waiting for the learner",
         (ProcessState::Running, Process::Actor(_)) => {
-            // Before its first heartbeat it attaches.
+            // It attaches before its first heartbeat.
             running.and_then(|running| running.activity).unwrap_or(Activity::Attaching).name()
         }
     };
@@ -68,7 +68,7 @@ pub(super) struct Usage {
     pub(super) memory_bytes: Option<u64>,
 }
 
-/// Makes a row for each process and each other host.
+/// Creates a row for each process and each other host.
 pub(super) fn process_rows(
     machine: &Machine,
     usage: impl Fn(Process) -> Usage,
@@ -96,7 +96,7 @@ pub(super) fn process_rows(
     rows.chain(machine.hosts.0.iter().map(host_row)).collect()
 }
 
-/// The workers of another host, together.
+/// Creates one row for all workers of another host.
 fn host_row(host: &HostNow) -> ProcessRow {
     let state = if host.here { ProcessState::Running } else { ProcessState::Gone };
     ProcessRow {
@@ -139,7 +139,7 @@ mod tests {
     use crate::machine::tests::machine;
 
     #[test]
-    fn a_dead_process_has_the_time_until_its_restart() {
+    fn a_dead_process_shows_the_time_until_its_restart() {
         let folder = tempfile::tempdir().unwrap();
         let now = Instant::now();
         let mut machine = machine(folder.path(), now);
@@ -148,7 +148,7 @@ mod tests {
         machine.children.slots.insert(Process::Learner, dead);
         machine.children.slots.insert(Process::Actor(1), Slot { starts: 1, ..Slot::default() });
         let lines = process_lines(&machine, now);
-        let expected = [("learner", "dead, starts again in 4 s", 2), ("actor-1", "ended", 0)];
+        let expected = [("learner", "dead, restarts in 4 s", 2), ("actor-1", "ended", 0)];
         for (line, (name, state, restarts)) in lines.iter().zip(expected) {
             assert_eq!((line.name.as_str(), line.state.as_str()), (name, state));
             assert_eq!(line.restarts, restarts);

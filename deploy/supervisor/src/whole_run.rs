@@ -11,30 +11,29 @@ use dmprl_run::describe;
 use dmprl_run::last_lines;
 use rustix::process::{Pid, Signal, kill_process};
 
-/// Maximum time from SIGINT to the exit. The supervisor's own limits are shorter.
-const END: Duration = Duration::from_secs(90);
+/// Maximum time from SIGINT to the exit, longer than the supervisor's own limits.
+const EXIT_LIMIT: Duration = Duration::from_secs(90);
 /// Interval between checks for the exit.
-const LOOK: Duration = Duration::from_millis(10);
+const CHECK_INTERVAL: Duration = Duration::from_millis(10);
 
-/// A running `dmprl train`. Dropping it kills the supervisor, and its children end by themselves.
+/// A running `dmprl train`. Dropping it kills the supervisor; its children then exit by themselves.
 pub struct WholeRun {
     child: Child,
     log: PathBuf,
 }
 
 impl WholeRun {
-    /// Starts it. Variables of the caller's environment that would configure a run are not passed
-    /// on.
+    /// Starts the command, without the environment variables that would configure a run.
     pub fn start(mut command: Command, log: &Path) -> anyhow::Result<Self> {
-        let file = File::create(log).with_context(|| format!("cannot make {}", log.display()))?;
+        let file = File::create(log).with_context(|| format!("cannot create {}", log.display()))?;
         for (name, _) in std::env::vars_os() {
             if name.to_string_lossy().starts_with("DMPRL_") {
                 command.env_remove(name);
             }
         }
         command.stdin(Stdio::null()).stdout(Stdio::null()).stderr(file);
-        // In a session of its own it does not receive Ctrl-C, and the kernel does not wake its
-        // stopped members. SAFETY: both are system calls that neither allocate nor take a lock.
+        // In its own session it does not receive Ctrl-C, and the kernel does not wake its stopped
+        // members. SAFETY: both are system calls that neither allocate nor take a lock.
         unsafe {
             command.pre_exec(|| {
                 rustix::process::setsid()?;
@@ -53,7 +52,7 @@ impl WholeRun {
         pid.context("a child without an id")
     }
 
-    /// Describes its exit, if it has exited by itself.
+    /// Describes the exit; `None` if the run has not exited.
     pub fn end(&mut self) -> anyhow::Result<Option<String>> {
         let status = self.child.try_wait().context("cannot wait for dmprl train")?;
         Ok(status.map(|status| self.describe(status)))
@@ -64,11 +63,11 @@ impl WholeRun {
         format!("{how}; the last lines of {}:\n{lines}", self.log.display())
     }
 
-    /// Stops it with SIGINT; describes an irregular exit.
+    /// Stops the run with SIGINT. Describes the exit if its status is not 130.
     pub fn stop(&mut self) -> anyhow::Result<Option<String>> {
         let pid = self.pid()?;
         kill_process(pid, Signal::INT).context("cannot interrupt dmprl train")?;
-        let deadline = Instant::now() + END;
+        let deadline = Instant::now() + EXIT_LIMIT;
         loop {
             if let Some(status) = self.child.try_wait().context("cannot wait for dmprl train")? {
                 let regular = status.code() == Some(130);
@@ -78,11 +77,11 @@ impl WholeRun {
                 self.child.kill().context("cannot kill dmprl train")?;
                 let status = self.child.wait().context("cannot wait for dmprl train")?;
                 return Ok(Some(format!(
-                    "not within {END:?} of SIGINT; {}",
+                    "no exit within {EXIT_LIMIT:?} of SIGINT; {}",
                     self.describe(status)
                 )));
             }
-            std::thread::sleep(LOOK);
+            std::thread::sleep(CHECK_INTERVAL);
         }
     }
 }

@@ -1,13 +1,13 @@
-//! `dmprl sweep`: trains many runs from one file, in parallel within the machine's cores.
+//! `dmprl sweep`: trains many runs from one file, in parallel on the cores of one machine.
 //!
 //! ```text
 //!  FILE ─► plan: tasks × methods × grid × seeds ─► runner ─┬─ dmprl train, in OUTPUT/TASK/METHOD/
 //!                         ▲                                └─ dmprl resume, where one was stopped
-//!                     ledger: what has finished, and how long it took
+//!                     ledger: finished runs and their training time
 //! ```
-//! Each run is a separate `dmprl train`, with the arguments that a user would type, and does not
-//! depend on the sweep. Finished runs are recorded in `finished.jsonl`, so a killed sweep continues
-//! where it stopped. With `[search]` instead of a grid, `search` replaces plan and runner.
+//! Each run is a separate `dmprl train` process, with the arguments that a user would type.
+//! Finished runs are recorded in `finished.jsonl`, so that a killed sweep continues where it
+//! stopped. If the file has `[search]` instead of `[grid]`, `search` replaces plan and runner.
 
 mod estimate;
 pub mod record;

@@ -1,4 +1,4 @@
-//! Trains the runs of a plan, several in parallel, until all have finished or the user stops it.
+//! Trains the runs of a plan, several in parallel, until all have ended or the user interrupts.
 
 use std::process::ExitStatus;
 use std::time::Duration;
@@ -10,25 +10,25 @@ use dmprl_shared::config::ExperimentConfig;
 use dmprl_supervisor::interrupts;
 use tokio::sync::mpsc;
 
-use super::estimate::Estimate;
-use super::run::{RunProcess, result};
+use super::estimate::{Estimate, RunKind};
+use super::run::{RunProcess, evaluation_text};
 use super::{RunState, Site};
 use crate::tally::Tally;
 
-/// Interval between checks of the progress of running runs.
-pub(super) const LOOK: Duration = Duration::from_secs(2);
+/// Interval between updates of the remaining time.
+pub(super) const PROGRESS_INTERVAL: Duration = Duration::from_secs(2);
 /// Interval between checks for exited children.
-pub(super) const END_LOOK: Duration = Duration::from_millis(100);
+pub(super) const EXIT_POLL_INTERVAL: Duration = Duration::from_millis(100);
 
 /// A sweep to run.
 pub struct Sweep {
-    /// Location of the sweep.
+    /// Output directory and program.
     pub site: Site,
     /// Runs with their expected configurations.
     pub runs: Vec<(PlannedRun, ExperimentConfig)>,
     /// Number of parallel runs.
     pub jobs: usize,
-    /// The finished runs in the output directory.
+    /// Finished runs in the output directory.
     pub ledger: Ledger,
 }
 
@@ -37,7 +37,7 @@ pub struct Sweep {
 pub struct SweepReport {
     /// State of each run, in the plan's order.
     pub states: Vec<RunState>,
-    /// True if the user stopped it.
+    /// True if the user interrupted the sweep.
     pub interrupted: bool,
 }
 
@@ -53,11 +53,11 @@ pub fn states(sweep: &Sweep) -> anyhow::Result<Vec<RunState>> {
 /// Trains all unfinished runs.
 ///
 /// # Errors
-/// A run directory has another configuration, or the ledger cannot be written. A failed run is no
-/// error of the sweep, which continues with the others.
+/// A run directory has another configuration, or the ledger cannot be written. A failed run is not
+/// an error: the sweep continues with the others.
 pub fn sweep(sweep: &mut Sweep, progress: &dyn Progress) -> anyhow::Result<SweepReport> {
     let states = states(sweep)?;
-    sweep.site.keep_file()?;
+    sweep.site.save_sweep_file()?;
     let runtime = tokio::runtime::Builder::new_current_thread()
         .enable_all()
         .build()
@@ -68,7 +68,7 @@ pub fn sweep(sweep: &mut Sweep, progress: &dyn Progress) -> anyhow::Result<Sweep
     })
 }
 
-/// A running run.
+/// A run in progress.
 struct Job {
     index: usize,
     process: RunProcess,
@@ -92,7 +92,7 @@ impl<'a> Runner<'a> {
         let mut estimate = Estimate::default();
         for (run, _) in &sweep.runs {
             if let Some(done) = sweep.ledger.of(&run.directory) {
-                estimate.add(kind(run), done.env_steps, done.wall_s);
+                estimate.add(RunKind::of_run(run), done.env_steps, done.wall_s);
             }
         }
         let progress = Tally::new(progress, "runs", states.len(), states.len() - waiting.len());
@@ -100,8 +100,8 @@ impl<'a> Runner<'a> {
     }
 
     async fn run(mut self, mut interrupts: mpsc::Receiver<()>) -> anyhow::Result<SweepReport> {
-        let mut look = tokio::time::interval(LOOK);
-        let mut end_look = tokio::time::interval(END_LOOK);
+        let mut progress_tick = tokio::time::interval(PROGRESS_INTERVAL);
+        let mut exit_poll = tokio::time::interval(EXIT_POLL_INTERVAL);
         loop {
             while self.interrupts == 0 && self.jobs.len() < self.sweep.jobs {
                 let Some(index) = self.waiting.pop() else { break };
@@ -112,19 +112,22 @@ impl<'a> Runner<'a> {
             }
             tokio::select! {
                 Some(()) = interrupts.recv() => self.on_interrupt(),
-                _ = end_look.tick() => self.on_ends()?,
-                _ = look.tick() => self.progress.remaining(self.remaining()),
+                _ = exit_poll.tick() => self.check_exits()?,
+                _ = progress_tick.tick() => self.progress.remaining(self.remaining()),
             }
         }
         Ok(SweepReport { states: self.states, interrupted: self.interrupts > 0 })
     }
 
-    /// Forwards each interrupt to the runs: on the first they write a checkpoint, on the second
-    /// they exit at once.
+    /// Forwards an interrupt to the runs: on the first they write a checkpoint and exit, on the
+    /// second they exit at once.
     fn on_interrupt(&mut self) {
         self.interrupts += 1;
         if self.interrupts == 1 {
-            self.progress.message("interrupted: the runs write a checkpoint (once more: at once)");
+            self.progress.message(
+                "interrupted: the runs stop after writing a checkpoint (interrupt again to stop at \
+                 once)",
+            );
         }
         for job in &self.jobs {
             job.process.interrupt();
@@ -137,36 +140,36 @@ impl<'a> Runner<'a> {
             RunState::Open { env_steps } => env_steps,
             _ => 0,
         };
-        self.progress.message(&format!("{}: begins", run.title()));
+        self.progress.message(&format!("{}: started", run.title()));
         match self.sweep.site.start(run, config, env_steps) {
             Ok(process) => self.jobs.push(Job { index, process }),
             Err(error) => self.fail(index, format!("{error:#}")),
         }
     }
 
-    fn on_ends(&mut self) -> anyhow::Result<()> {
-        let mut place = 0;
-        while place < self.jobs.len() {
-            match self.jobs[place].process.child.try_wait() {
-                Ok(None) => place += 1,
+    fn check_exits(&mut self) -> anyhow::Result<()> {
+        let mut position = 0;
+        while position < self.jobs.len() {
+            match self.jobs[position].process.child.try_wait() {
+                Ok(None) => position += 1,
                 Ok(Some(status)) => {
-                    let job = self.jobs.swap_remove(place);
-                    self.on_end(&job, status)?;
+                    let job = self.jobs.swap_remove(position);
+                    self.on_exit(&job, status)?;
                 }
                 Err(error) => {
-                    let job = self.jobs.swap_remove(place);
-                    self.fail(job.index, format!("cannot wait for it: {error}"));
+                    let job = self.jobs.swap_remove(position);
+                    self.fail(job.index, format!("cannot wait for the process: {error}"));
                 }
             }
         }
         Ok(())
     }
 
-    fn on_end(&mut self, job: &Job, status: ExitStatus) -> anyhow::Result<()> {
+    fn on_exit(&mut self, job: &Job, status: ExitStatus) -> anyhow::Result<()> {
         let (run, config) = self.sweep.runs[job.index].clone();
         if !status.success() {
             if self.interrupts > 0 {
-                // The run has progressed if it wrote its checkpoint.
+                // The run has advanced if it wrote a checkpoint.
                 if let Ok(state) = self.sweep.site.state(&self.sweep.ledger, &run, &config) {
                     self.states[job.index] = state;
                 }
@@ -175,7 +178,7 @@ impl<'a> Runner<'a> {
             self.fail(job.index, self.sweep.site.failure(&run, status));
             return Ok(());
         }
-        let (wall_s, row) = match self.sweep.site.ended(&run) {
+        let (wall_s, row) = match self.sweep.site.final_result(&run) {
             Ok(ended) => ended,
             Err(error) => {
                 self.fail(job.index, format!("its results cannot be read: {error:#}"));
@@ -188,9 +191,9 @@ impl<'a> Runner<'a> {
         let finished = Finished { run: directory, steps, env_steps, wall_s, state };
         self.sweep.ledger.add(finished)?;
         let (steps, seconds) = job.process.measured(env_steps);
-        self.estimate.add(kind(&run), steps, seconds);
+        self.estimate.add(RunKind::of_run(&run), steps, seconds);
         self.states[job.index] = RunState::Finished;
-        let result = row.map_or_else(|| "no evaluation".to_owned(), |row| result(&row));
+        let result = row.map_or_else(|| "no evaluation".to_owned(), |row| evaluation_text(&row));
         self.progress.message(&format!("{}: {result} after {wall_s:.0} s", run.title()));
         let remaining = self.remaining();
         self.progress.ended(remaining);
@@ -199,7 +202,7 @@ impl<'a> Runner<'a> {
 
     fn fail(&mut self, index: usize, reason: String) {
         let title = self.sweep.runs[index].0.title();
-        self.progress.message(&format!("{title}: failed, {reason}"));
+        self.progress.message(&format!("{title}: failed: {reason}"));
         self.states[index] = RunState::Failed { reason };
         let remaining = self.remaining();
         self.progress.ended(remaining);
@@ -211,20 +214,16 @@ impl<'a> Runner<'a> {
         let mut left = Vec::new();
         for job in &self.jobs {
             let (run, config) = &self.sweep.runs[job.index];
-            let reached = self.sweep.site.reached(run).max(job.process.env_steps);
+            let reached = self.sweep.site.measured_steps(run).max(job.process.env_steps);
             let (steps, seconds) = job.process.measured(reached);
-            estimate.add(kind(run), steps, seconds);
-            left.push((kind(run), config.run.steps.saturating_sub(reached)));
+            estimate.add(RunKind::of_run(run), steps, seconds);
+            left.push((RunKind::of_run(run), config.run.steps.saturating_sub(reached)));
         }
         for &index in &self.waiting {
             let (run, config) = &self.sweep.runs[index];
             let RunState::Open { env_steps } = self.states[index] else { continue };
-            left.push((kind(run), config.run.steps.saturating_sub(env_steps)));
+            left.push((RunKind::of_run(run), config.run.steps.saturating_sub(env_steps)));
         }
         estimate.remaining(left, self.sweep.jobs)
     }
-}
-
-fn kind(run: &PlannedRun) -> (&str, &str) {
-    (&run.task, &run.method)
 }

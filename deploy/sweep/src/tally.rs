@@ -5,7 +5,7 @@ use std::time::Duration;
 use dmprl_run::Progress;
 use dmprl_run::format::duration;
 
-/// Number of ended items of a sweep, and where it is shown.
+/// Counter of the ended runs or trials of a sweep.
 pub(crate) struct Tally<'a> {
     progress: &'a dyn Progress,
     what: &'static str,
@@ -14,9 +14,9 @@ pub(crate) struct Tally<'a> {
 }
 
 impl<'a> Tally<'a> {
-    /// Creates a tally; `ended` of `count` items had already ended.
+    /// Creates a tally of `count` items, of which `ended` have already ended.
     ///
-    /// - `what`: the items' plural, such as `runs`.
+    /// - `what`: name of the items in the plural, such as `runs`.
     pub(crate) fn new(
         progress: &'a dyn Progress,
         what: &'static str,
@@ -28,13 +28,13 @@ impl<'a> Tally<'a> {
         tally
     }
 
-    /// Sets the number of items that had already ended.
-    pub(crate) fn begin_at(&mut self, ended: usize) {
+    /// Sets the number of ended items.
+    pub(crate) fn set_ended(&mut self, ended: usize) {
         self.ended = ended;
         self.show();
     }
 
-    /// Prints a message that stays.
+    /// Prints a permanent line.
     pub(crate) fn message(&self, text: &str) {
         self.progress.print(text);
     }
@@ -44,16 +44,16 @@ impl<'a> Tally<'a> {
         self.ended += 1;
         let Self { progress, what, count, ended } = self;
         if ended < count {
-            progress.stage(&format!("{ended} of {count} {what}; {}", left(remaining)));
+            progress.stage(&format!("{ended} of {count} {what}; {}", time_left(remaining)));
         }
         self.show();
         self.remaining(remaining);
     }
 
-    /// Shows the remaining time; unknown until the first run has made steps.
+    /// Shows the remaining time; `None` if it is unknown.
     pub(crate) fn remaining(&self, remaining: Option<Duration>) {
         let Self { progress, what, .. } = self;
-        progress.detail(&format!("{what} {}", left(remaining)));
+        progress.detail(&format!("{what} {}", time_left(remaining)));
     }
 
     fn show(&self) {
@@ -61,6 +61,6 @@ impl<'a> Tally<'a> {
     }
 }
 
-fn left(remaining: Option<Duration>) -> String {
+fn time_left(remaining: Option<Duration>) -> String {
     remaining.map_or_else(String::new, |time| format!("about {} left", duration(time)))
 }

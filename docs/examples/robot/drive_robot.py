@@ -120,13 +120,13 @@ def drive(policy: dmprl.Policy, robot: RemoteRobot, seed: int, hz: float) -> dic
 def main() -> None:
     """Runs an episode and prints the result as JSON."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("policy", help="a file of dmprl export, or a run directory")
+    parser.add_argument("policy", help="a policy file or a run directory")
     parser.add_argument("--host", default="127.0.0.1")
     parser.add_argument("--port", type=int, default=5555)
-    parser.add_argument("--hz", type=float, default=20.0, help="control rate; 0: no waiting")
-    parser.add_argument("--patience", type=float, help="of a step [s]; else its own duration")
+    parser.add_argument("--hz", type=float, default=20.0, help="control rate [Hz]; 0: no limit")
+    parser.add_argument("--patience", type=float, help="maximum wait for an answer [s]")
     parser.add_argument("--seed", type=int, default=1000)
-    parser.add_argument("--rate", type=float, help="largest change of an action in a step")
+    parser.add_argument("--rate", type=float, help="maximum change of an action per step")
     arguments = parser.parse_args()
     policy = dmprl.Policy.load(arguments.policy)
     if arguments.rate is not None:

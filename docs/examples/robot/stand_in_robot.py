@@ -64,7 +64,7 @@ def main() -> None:
     """Serves until interrupted."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("environment", help="a Gymnasium id, such as dmprl/PandaReachJoints-v0")
-    parser.add_argument("--port", type=int, default=5555, help="0: any that is free")
+    parser.add_argument("--port", type=int, default=5555, help="0: any free port")
     parser.add_argument("--silence", type=int, nargs=2, metavar=("FROM", "TO"), default=(0, 0))
     arguments = parser.parse_args()
     with Server(("127.0.0.1", arguments.port), Controller) as server:

@@ -1,7 +1,7 @@
 """The tasks of the paper and their variants.
 
-Each runs batched in a worker (:func:`make_task`) and, one at a time, as a Gymnasium environment
-(``gymnasium.make("dmprl/Thrower-v0")`` after ``import dmprl``).
+A worker runs a task as a batch of environments (:func:`make_batch`). As a Gymnasium environment it
+runs one at a time (``gymnasium.make("dmprl/Thrower-v0")`` after ``import dmprl``).
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
 
 class Registered(NamedTuple):
-    """Module and class of a task, and the limit that Gymnasium needs before it is made."""
+    """Module and class of a task, and its time limit, which Gymnasium needs for registration."""
 
     module: str
     name: str
@@ -42,7 +42,7 @@ def registered(task_id: str) -> Registered | None:
 
 
 def make_task(task_id: str, env_count: int) -> MujocoTask | None:
-    """Makes a task for ``env_count`` environments; None if the id is not one of dmprl's."""
+    """Creates a task for ``env_count`` environments; None if dmprl has no task with this id."""
     entry = registered(task_id)
     if entry is None:
         return None
@@ -50,9 +50,9 @@ def make_task(task_id: str, env_count: int) -> MujocoTask | None:
 
 
 def make_batch(task_id: str, env_count: int, segment_steps: int) -> BatchSegmentEnv | None:
-    """Makes a task's batched environments for a worker; None if the id is not one of dmprl's.
+    """Creates a task's environments for a worker; None if dmprl has no task with this id.
 
-    This changes settings of the process: see :func:`dmprl.mujoco_batch.quieten_mujoco`.
+    This changes settings of the process; see :func:`dmprl.mujoco_batch.quieten_mujoco`.
     """
     task = make_task(task_id, env_count)
     if task is None:

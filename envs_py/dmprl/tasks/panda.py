@@ -1,12 +1,14 @@
 """PandaReach: a Franka Panda moves its end effector to a point.
 
-This is panda-gym's task in MuJoCo: its start, goals, actions, reward and timing, and an arm whose
-servo responds like PyBullet's (``models/panda.xml``). It differs in three ways. Reaching the goal
-does not end the episode, as in panda-gym 2: the reward is for coming close and staying there. The
-observation is one vector with joints and end effector, for both kinds of actions, where panda-gym
-only has the end effector. And the arm supports its own weight, as the real one does; panda-gym's
-sags a little in every step, from where the next step starts, by 17 cm in an episode of random
-actions.
+This is panda-gym's task in MuJoCo, with its start, goals, actions, reward and timing. The arm's
+servos respond like PyBullet's (``models/panda.xml``). There are three differences:
+
+- Reaching the goal does not end the episode, as in panda-gym 2: the reward is for coming close and
+  staying there.
+- For both kinds of actions the observation is one vector with the joints and the end effector;
+  panda-gym's has only the end effector.
+- The arm is compensated for gravity, as the real one is. panda-gym's arm sags a little in every
+  step, and the next step starts from there: by 17 cm in an episode of random actions.
 """
 
 from __future__ import annotations
@@ -29,7 +31,7 @@ NEUTRAL = (0.0, 0.41, 0.0, -1.85, 0.0, 2.26, 0.79)
 GOAL_LOW, GOAL_HIGH = (-0.15, -0.15, 0.0), (0.15, 0.15, 0.3)
 """Corners of the box from which goals are drawn [m]."""
 DISPLACEMENT = 0.05
-"""Displacement of an action of 1 in one step: [rad] of a joint, [m] of the end effector."""
+"""Displacement by an action of 1 in one step: of a joint [rad], or of the end effector [m]."""
 SUCCESS_DISTANCE = 0.05
 """Distance below which the goal counts as reached [m]."""
 MODEL = "panda.xml"
@@ -53,7 +55,7 @@ class PandaReachJoints(StepwiseTask):
 
     def __init__(self, env_count: int) -> None:
         super().__init__(env_count)
-        # The actuators' range is in joint angles, unlike the actions'.
+        # The actuators' ranges are joint angles, which the actions are not.
         self.action_high = np.ones(self.action_len, np.float32)
         self.action_low = -self.action_high
         self._displacement = np.zeros((env_count, self.action_len))

@@ -1,15 +1,17 @@
-"""Inverse kinematics of the Panda for small displacements, for all environments together.
+"""Solves the Panda's inverse kinematics for small displacements, for all environments together.
 
-The method is damped least squares. MuJoCo has just computed the parts of the Jacobian at the start,
-so it costs little more than an inverse. The iterations after the first correct that inverse with
-their own results (Broyden's method) instead of computing another, so each costs little more than a
-pose. Measured in the box of the goals, for displacements up to 0.05 m along each axis: 99.9 of 100
-points have an error of less than 0.3 mm. Rejected: the first inverse throughout (5 mm at nearly the
-same cost), a new one in every iteration (no better, twice the cost), and a second
-:class:`mujoco.batch.Batch` for the poses, which also computes unneeded dynamics.
+The method is damped least squares. MuJoCo has already computed the parts of the Jacobian at the
+start, so the first iteration costs little more than a matrix inverse. Later iterations correct that
+inverse with their own results (Broyden's method) instead of computing a new one, so each costs
+little more than a forward pose. In the box of the goals, for displacements up to 0.05 m along each
+axis, 99.9 % of the measured errors are below 0.3 mm.
 
-Shapes: E environments; a pose is a 3 x 4 matrix [rotation, position]. No product mixes
-environments, so results do not depend on their number, to the last bit.
+Rejected alternatives: the first inverse in every iteration (5 mm at nearly the same cost), a new
+inverse in every iteration (no better at twice the cost), and a second :class:`mujoco.batch.Batch`
+for the poses, which also computes unneeded dynamics.
+
+Shapes: E environments; a pose is a 3 x 4 matrix [rotation, position]. No matrix product mixes
+environments, so the results are bit-identical for any number of environments.
 """
 
 from __future__ import annotations
@@ -25,20 +27,21 @@ from dmprl.mujoco_batch import Fields
 JOINTS = 7
 
 CORRECTIONS = 2
-"""Iterations after the first. One leaves up to 3 mm; a third gains less than a servo resolves."""
+"""Iterations after the first. With one, errors reach 3 mm; a third gains less than the resolution
+of a servo."""
 
 DAMPING = 0.05
-"""Damping of the least squares. Near a stretched or folded pose, it prevents large joint motions
-for a direction in which they cannot move the end effector."""
+"""Damping of the least squares. It prevents large joint motions near singular (stretched or folded)
+poses, where they cannot move the end effector in some direction."""
 
 GROWTH_MAX = 2.0
-"""Largest factor by which Broyden's method lengthens a step; larger ones are unreliable."""
+"""Maximum factor by which Broyden's method lengthens a step; larger ones are unreliable."""
 
 TURN_MAX = 0.5
-"""Largest change of a joint [rad]. A larger one means that the target is out of reach."""
+"""Maximum change of a joint [rad]. A larger one means that the target is out of reach."""
 
 TINY = 1e-30
-"""Keeps the quotients finite in environments without motion."""
+"""Added to squared norms, so that quotients are finite in environments without motion."""
 
 _IDENTITY = np.eye(6)
 
@@ -47,7 +50,7 @@ class InverseKinematics:
     """Computes joint angles that bring the end effector to a point, with the gripper down."""
 
     recorded = ("site_xpos", "site_xmat", "cdof", "subtree_com")
-    """Fields of MjData that it reads besides qpos."""
+    """Fields of MjData that :meth:`solve` reads besides qpos."""
 
     def __init__(self, model: mujoco.MjModel, env_count: int) -> None:
         """Reads the chain from ``model``: its joints, each the parent of the next, then a site."""
@@ -55,19 +58,20 @@ class InverseKinematics:
         self._error_of_pose = _error_of_pose()
         self._skew = _skew()
         self._root = model.body_rootid[model.jnt_bodyid[0]]
-        # 1, cosine and sine of each joint's angle.
+        # For each joint: 1, and the cosine and sine of its angle.
         self._turns = np.ones((env_count, JOINTS, 1, 3))
-        # One for each joint, and the end effector on the last one.
+        # The transform of each joint's link, and of the end effector on the last link.
         self._links = np.zeros((env_count, JOINTS + 1, 1, 16))
         self._links[:, -1, 0] = _transform(model.site_pos[0], model.site_quat[0]).ravel()
         self._start = np.zeros((env_count, 3, 4))
         self._damping = DAMPING**2 * np.eye(6)
 
     def solve(self, fields: Fields, target: NDArray[np.float64], out: NDArray[np.float64]) -> None:
-        """Writes the angles.
+        """Writes the joint angles that bring the end effector to a point.
 
         - ``fields``: current qpos and :attr:`recorded`.
-        - ``target`` (E, 3): the point [m]. ``out`` (E, 7): angles [rad].
+        - ``target`` (E, 3): the point [m].
+        - ``out`` (E, 7): angles [rad].
         """
         qpos, start = fields["qpos"], self._start
         start[:, :, :3] = fields["site_xmat"][:, 0].reshape(-1, 3, 3)
@@ -80,7 +84,7 @@ class InverseKinematics:
             step = _corrected(self._step(inverse, self.pose(qpos + turn), target), steps)
             turn += step
         largest = np.abs(turn).max(axis=1, keepdims=True)
-        # The whole step is shortened, so that the end effector still moves towards the target.
+        # Scales all joints, so that the end effector still moves towards the target.
         turn *= TURN_MAX / np.maximum(largest, TURN_MAX)
         np.add(qpos, turn, out=out)
 
@@ -108,13 +112,13 @@ class InverseKinematics:
     def _inverse_at(self, fields: Fields) -> NDArray[np.float64]:
         """Computes the damped inverse (E, 7, 6) of the Jacobian.
 
-        The Jacobian's rows are angular velocity and velocity. MuJoCo's cdof is the transposed
-        Jacobian (E, 7, 6) of the arm's centre of mass.
+        The Jacobian's rows are the angular and the linear velocity. MuJoCo's cdof is the transposed
+        Jacobian (E, 7, 6) at the arm's centre of mass.
         """
         lever = fields["site_xpos"][:, 0] - fields["subtree_com"][:, self._root]
-        moved = (lever[:, None] @ self._skew).reshape(-1, 6, 6)
-        moved += _IDENTITY
-        transposed = fields["cdof"] @ moved
+        shift = (lever[:, None] @ self._skew).reshape(-1, 6, 6)
+        shift += _IDENTITY
+        transposed = fields["cdof"] @ shift
         square = transposed.transpose(0, 2, 1) @ transposed
         square += self._damping
         return transposed @ np.linalg.inv(square)
@@ -123,10 +127,10 @@ class InverseKinematics:
 def _corrected(
     step: NDArray[np.float64], steps: list[tuple[NDArray[np.float64], NDArray[np.float64]]]
 ) -> NDArray[np.float64]:
-    """Corrects the step that the first inverse proposes by the ``steps`` taken so far.
+    """Corrects a step of the first inverse, using the previous ``steps`` with their squared norms.
 
     This is Broyden's "good" update of the inverse, applied to vectors without forming a matrix, as
-    in Kelley (1995). Each of ``steps`` has its squared norm.
+    in Kelley (1995).
     """
     for (earlier, square), (later, _) in pairwise(steps):
         step += later * (np.vecdot(step, earlier) / square)[:, None]
@@ -138,7 +142,7 @@ def _corrected(
 def _chain(model: mujoco.MjModel) -> NDArray[np.float64]:
     """Computes the factors of 1, cosine and sine of each joint's angle (7, 3, 16).
 
-    The weighted sum is the transform from the joint's parent to the link that the joint turns.
+    Their weighted sum is the pose of the link that the joint turns in its parent's frame.
     """
     chain = np.zeros((3, JOINTS, 4, 4))
     chain[0, :, 2, 2] = chain[0, :, 3, 3] = 1.0
@@ -163,11 +167,11 @@ def _transform(
 
 
 def _error_of_pose() -> NDArray[np.float64]:
-    """Returns the matrix (12, 6) of a pose's error without the target's position, which is linear.
+    """Returns the matrix (12, 6) that maps a pose to its error, without the target's position.
 
-    Rotation: half the sum of the cross products of the gripper's axes with (1, 0, 0), (0, -1, 0)
-    and (0, 0, -1), their directions when it points down. For a small rotation this is the vector
-    that reverts it. Position: minus the position.
+    The rotational error is half the sum of the cross products of the gripper's axes with
+    (1, 0, 0), (0, -1, 0) and (0, 0, -1), their directions when it points down. For a small rotation
+    this is the rotation vector that reverts it. The error of the position is minus the position.
     """
     matrix = np.zeros((3, 4, 6))
     matrix[2, 1, 0], matrix[1, 2, 0] = 0.5, -0.5
@@ -179,7 +183,7 @@ def _error_of_pose() -> NDArray[np.float64]:
 
 
 def _skew() -> NDArray[np.float64]:
-    """Returns the matrix (3, 36) from a lever to the map of angular velocity to velocity."""
+    """Returns the matrix (3, 36) from a lever arm to the map from angular to linear velocity."""
     matrix = np.zeros((3, 6, 6))
     for first, second, third in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
         matrix[second, first, 3 + third] = 1.0

@@ -1,8 +1,8 @@
 """Pusher: an arm of seven joints pushes a cylinder to a goal.
 
 There are two versions: Gymnasium's Pusher-v5, bit-identical, and Gym's Pusher-v0, which the paper
-used. In Pusher-v0 positions of bodies are centres of mass of their subtrees, which puts the tip
-between the arm's two prongs instead of at the wrist. Its reward is that of the state before the
+used. In Pusher-v0 the position of a body is the centre of mass of its subtree, so the tip is
+between the arm's two prongs instead of at the wrist. Its reward depends on the state before the
 step, and its cylinder has a thousandth of the mass.
 """
 
@@ -28,7 +28,7 @@ JOINTS = (
     "wrist_flex",
     "wrist_roll",
 )
-"""The arm's joints; Thrower has the same."""
+"""The arm's joints, also in Thrower."""
 OBSERVED_BODIES = ("tips_arm", "object", "goal")
 
 
@@ -58,7 +58,7 @@ class Pusher(MujocoTask):
         self, rng: np.random.Generator, start: Start
     ) -> None:
         while True:
-            # The slides: y first. The goal is at their origin.
+            # Positions of the slide joints, y first. The goal is at their origin.
             offset = np.array([rng.uniform(-0.3, 0.0), rng.uniform(-0.2, 0.2)])
             if np.linalg.norm(offset) > 0.17:
                 break
@@ -102,7 +102,7 @@ class PusherV0(Pusher):
 
     def load_model(self) -> mujoco.MjModel:  # noqa: D102 - inherited
         model = super().load_model()
-        count_armature(model)
+        include_armature(model)
         return model
 
     def rewarded(self, observations: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -110,14 +110,14 @@ class PusherV0(Pusher):
         return observations[:, :-1]
 
 
-def count_armature(model: mujoco.MjModel) -> None:
+def include_armature(model: mujoco.MjModel) -> None:
     """Makes contacts as stiff as in MuJoCo 1 and 2, for which Gym's versions were made.
 
-    A contact's softness is scaled by the inverse inertia of both bodies. Since MuJoCo 3, for a body
-    with slide joints only, this value ignores the armature of the joints. The cylinder then counts
-    as a millionth of its effective inertia, and the arm passes through it. MuJoCo 2 used, for each
+    A contact's softness is scaled by the inverse inertia of both bodies. Since MuJoCo 3, the value
+    of a body with only slide joints ignores the armature of the joints. The cylinder's inertia is
+    then a millionth of the effective one, and the arm passes through it. MuJoCo 2 used, for each
     joint, its entry in the diagonal of the inverse inertia matrix, and for each body the mean over
-    the axes of the inverse inertia at its centre of mass (sliding bodies have no rotation).
+    the axes of the inverse inertia at its centre of mass (sliding bodies do not rotate).
     """
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)

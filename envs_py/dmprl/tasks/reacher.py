@@ -1,8 +1,8 @@
 """Reacher: a planar arm of two joints moves its fingertip to a target.
 
 There are two versions: Gymnasium's Reacher-v5, bit-identical, and Reacher-v1, which Gym had until
-0.9.4. Reacher-v1 has targets beyond reach, a third coordinate of the distance (always zero), and
-the reward of the state before the step.
+0.9.4. In Reacher-v1 some targets are out of reach, the distance has a third coordinate (always
+zero), and the reward depends on the state before the step.
 """
 
 from __future__ import annotations
@@ -35,8 +35,7 @@ class Reacher(MujocoTask):
 
     def load_model(self) -> mujoco.MjModel:  # noqa: D102 - inherited
         model = gymnasium_model("reacher.xml")
-        # No pair of its geoms can collide, so the search for contacts, a fifth of the time, is
-        # disabled.
+        # Its geoms cannot collide. Without the collision detection a step takes a fifth less time.
         assert not np.any(model.geom_contype), "a geom of reacher.xml can collide"
         model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONTACT
         return model
@@ -61,7 +60,7 @@ class Reacher(MujocoTask):
         """Draws a point within reach [m]."""
         while True:
             target = rng.uniform(-0.2, 0.2, 2)
-            if math.sqrt(target.dot(target)) < 0.2:  # np.linalg.norm, in a fifth of its time
+            if math.sqrt(target.dot(target)) < 0.2:  # five times as fast as np.linalg.norm
                 return target
 
     def observe(self, fields: Fields, out: NDArray[np.float64]) -> None:  # noqa: D102 - inherited
@@ -96,9 +95,9 @@ class ReacherV1(Reacher):
     distance_dims = 3
 
     def draw_target(self, rng: np.random.Generator) -> NDArray[np.float64]:
-        """Draws a point of the square, a fifth of which is beyond reach [m].
+        """Draws a point of the square, a fifth of which is out of reach [m].
 
-        Gym meant the disc of Reacher-v5, but compared the norm with 2.
+        Gym intended the disc of Reacher-v5, but compared the norm with 2 instead of 0.2.
         """
         return rng.uniform(-0.2, 0.2, 2)
 
@@ -108,7 +107,7 @@ class ReacherV1(Reacher):
 
 
 def minus_distance(differences: NDArray[np.float64], out: NDArray[np.float64]) -> None:
-    """Writes ``-|difference|`` of each row, with the rounding of ``np.linalg.norm`` of one row."""
+    """Writes ``-|difference|`` of each row, rounded as ``np.linalg.norm`` rounds a single row."""
     np.vecdot(differences, differences, out=out)
     np.sqrt(out, out=out)
     np.negative(out, out=out)

@@ -1,9 +1,9 @@
 """Thrower: an arm of seven joints throws a ball into a box.
 
 This is Gym's Thrower-v0, which the paper used and no maintained package provides. The model is
-built from its published dimensions (``models/thrower.xml``). Positions of bodies are centres of
-mass of their subtrees, and the reward is that of the state before the step. In later versions of
-Gym, the point where the ball hit the ground moves on with the rolling ball; here it stays fixed.
+built from its published dimensions (``models/thrower.xml``). The position of a body is the centre
+of mass of its subtree, and the reward depends on the state before the step. In later versions of
+Gym the point where the ball hits the ground moves with the rolling ball; here it is fixed.
 """
 
 from __future__ import annotations

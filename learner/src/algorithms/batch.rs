@@ -108,7 +108,7 @@ pub struct States<'a> {
     pub inputs: &'a [f32],
 }
 
-/// What a batch is sampled from.
+/// The source of a batch's samples.
 #[derive(Debug)]
 pub struct SampleSource<'a> {
     /// The experience.

@@ -1,4 +1,4 @@
-//! What an update reports about itself.
+//! The figures that an update reports: losses, Q and policy statistics.
 
 /// Losses of one update, as means over the batch.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]

@@ -34,7 +34,7 @@ pub struct LossSums {
     pub outside: usize,
 }
 
-/// What a shard's segments are copied from.
+/// The source of a shard's segments.
 #[derive(Debug, Clone, Copy)]
 pub struct RolloutSource<'a> {
     /// The rollout.

@@ -98,7 +98,7 @@ pub struct Ndp {
     pool: ThreadPool,
 }
 
-/// What an update reads besides the rollout.
+/// The inputs of an update besides the rollout.
 #[derive(Debug, Clone, Copy)]
 pub struct UpdateContext<'a> {
     /// The policy's architecture.

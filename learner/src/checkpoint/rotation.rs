@@ -21,7 +21,7 @@ pub(super) fn next_name(folder: &Path) -> Result<String, CheckpointError> {
     Ok(format!("{:06}", newest + 1))
 }
 
-/// Deletes what a killed writer left.
+/// Deletes the partial files of a killed writer.
 pub(super) fn remove_temporaries(folder: &Path) -> Result<(), CheckpointError> {
     for entry in fs::read_dir(folder).map_err(io_error(folder))? {
         let path = entry.map_err(io_error(folder))?.path();

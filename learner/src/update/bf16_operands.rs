@@ -32,7 +32,7 @@ impl Bf16Operands {
         &self.layers[index]
     }
 
-    /// Packs what the passes over the shards recorded.
+    /// Packs the recorded passes over the shards.
     pub fn fill<'b, B: Sync>(
         &mut self,
         shape: &MlpShape,

@@ -39,7 +39,7 @@ pub struct TrainableNetwork {
     arithmetic: Arithmetic,
 }
 
-/// What the passes over one shard recorded: everything that the parameters' gradient is summed
+/// The recorded passes over one shard: everything that the parameters' gradient is summed
 /// from.
 #[derive(Debug, Clone, Copy)]
 pub struct PassRecord<'a> {

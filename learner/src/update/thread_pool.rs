@@ -1,6 +1,6 @@
 //! The threads of an update. A job consists of independent parts, which the threads share.
 //!
-//! Any thread may compute any part. What a part computes depends only on its index, and no two
+//! Any thread may compute any part. The result of a part depends only on its index, and no two
 //! parts write the same result, so the number of threads does not change a single bit.
 
 use std::sync::atomic::{AtomicBool, AtomicU32, AtomicUsize, Ordering};

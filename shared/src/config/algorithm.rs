@@ -7,7 +7,7 @@ use serde::{Deserialize, Serialize};
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "snake_case")]
 pub enum AlgorithmName {
-    /// Deep deterministic policy gradient (Lillicrap et al. 2016), with segments DDPG-DMP.
+    /// Deep deterministic policy gradient (Lillicrap et al. 2016); called DDPG-DMP with segments.
     Ddpg,
     /// Twin delayed deep deterministic policy gradient (Fujimoto et al. 2018).
     Td3,
@@ -116,7 +116,7 @@ pub struct SacConfig {
     /// Adam step size of the temperature's logarithm.
     pub temperature_learning_rate: f64,
     /// Target entropy for each action of a decision \[nat\]. The default for `mlp` policies is -1.
-    /// The magnitude is smaller for segments because their actions are correlated.
+    /// Segments need a smaller magnitude because their actions are correlated.
     pub target_entropy_per_action: f64,
 }
 
@@ -162,25 +162,26 @@ pub enum LearningRateDecay {
     Linear,
 }
 
-/// Proximal policy optimisation over segments, after the released code of Neural Dynamic Policies.
+/// Settings of `ndp`: proximal policy optimisation over segments, as in the released code of Neural
+/// Dynamic Policies.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct NdpConfig {
-    /// Clipping range of the probability ratio: beyond 1 ± `clip` it no longer improves the
+    /// Clipping range of the probability ratio. Beyond 1 ± `clip` the ratio no longer improves the
     /// objective.
     pub clip: f64,
     /// Decay of the generalised advantage estimate per segment, in addition to the discount.
     pub gae_lambda: f64,
-    /// Segments of one policy, from all workers together, that form a rollout; 0 means 10 per
+    /// Segments per rollout, from all workers together and of one policy version; 0 means 10 per
     /// environment.
     pub rollout_segments: usize,
     /// Passes over a rollout.
     pub epochs: usize,
-    /// Minibatches per pass. Each gives one step of both optimisers and has at least one segment.
+    /// Minibatches per pass. Each has at least one segment and is one step of both optimisers.
     pub minibatches: usize,
     /// Weight of the entropy in the policy's loss.
     pub entropy_coefficient: f64,
-    /// Maximum gradient norm of each network; longer gradients are scaled down.
+    /// Maximum gradient norm of each network; larger gradients are scaled down.
     pub gradient_norm_max: f64,
     /// Logarithm of the initial standard deviation of every action dimension, in units of u.
     pub initial_log_std: f64,
@@ -222,14 +223,15 @@ pub enum ExplorationKind {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "snake_case")]
 pub enum WarmUpKind {
-    /// Actions uniform within `warm_up_range` of the full range.
+    /// Uniform actions within `warm_up_range` of the full range.
     Uniform,
-    /// DMP parameters uniform within their ranges, so that y is defined.
+    /// Uniform DMP parameters within `warm_up_range` of their ranges. Unlike with `uniform`, the
+    /// DMP's motion y is defined during the warm-up.
     DmpParameters,
 }
 
-/// Exploration noise of the rollout. A policy with an action distribution of its own (SAC) explores
-/// by sampling from it; `kind` and `std` then have no effect.
+/// Exploration noise of the rollout. `kind` and `std` have no effect on policies that explore by
+/// sampling from their own action distribution (SAC and `ndp`).
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct ExplorationConfig {
@@ -237,11 +239,12 @@ pub struct ExplorationConfig {
     pub kind: ExplorationKind,
     /// Standard deviation, in units of u (actions scaled to [-1, 1]).
     pub std: f64,
-    /// Environment steps of all workers together before the policy acts.
+    /// Length of the warm-up, in which actions are random: environment steps of all workers
+    /// together.
     pub warm_up_steps: u64,
     /// How actions are drawn during the warm-up.
     pub warm_up_kind: WarmUpKind,
-    /// Half-width of the warm-up's distribution, as a share of the full range.
+    /// Half-width of the warm-up's uniform distribution, as a fraction of the full range.
     pub warm_up_range: f64,
 }
 

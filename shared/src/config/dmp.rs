@@ -7,7 +7,8 @@ use serde::{Deserialize, Serialize};
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "snake_case")]
 pub enum CanonicalIntegration {
-    /// Explicit Euler, advanced before the basis is evaluated (x_1 = 0.975).
+    /// Explicit Euler; x is advanced before the basis is evaluated, so that with the default values
+    /// the first evaluation is at x_1 = 0.975.
     Euler,
     /// The exact exponential exp(-alpha_x t / tau).
     Exact,
@@ -19,8 +20,8 @@ pub enum CanonicalIntegration {
 pub enum BasisWidths {
     /// h_i = N^1.5 / (c_i alpha_x), as in Neural Dynamic Policies.
     Ndp,
-    /// Neighbours overlap at 0.8: h_i = -ln(0.8) / (c_{i+1} - c_i)^2; the last width repeats the
-    /// one before.
+    /// Each basis function is 0.8 at the next centre: h_i = -ln(0.8) / (c_{i+1} - c_i)^2. The last
+    /// width equals the one before it.
     Overlap,
 }
 
@@ -49,9 +50,9 @@ pub enum Integrator {
 impl Integrator {
     /// Stability limit of `alpha_y` at the step `dt` = tau / integration_steps, with tau = 1.
     ///
-    /// The unforced system decays if and only if `alpha_y` is below the limit. With a = omega dt =
-    /// alpha_y dt / 2, all roots of the step's characteristic polynomial are inside the unit circle
-    /// (Jury's criterion) while
+    /// The unforced system decays if and only if `alpha_y` is below the limit. Let
+    /// a = omega dt = alpha_y dt / 2. All roots of the step's characteristic polynomial are inside
+    /// the unit circle (Jury's criterion) under these conditions:
     /// - `explicit`: (z - 1 + a)^2; a < 2.
     /// - `semi_implicit`: z^2 - (2 - 2a - a^2) z + 1 - 2a; a^2 + 4a < 4, so a < 2 sqrt(2) - 2.
     /// - `paper`: z^3 - 2z^2 + (1 + 2a) z + a^2 - 2a; a^3 - 4a^2 + 6a < 2, so a < 0.456.
@@ -76,13 +77,13 @@ impl Integrator {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct DmpConfig {
-    /// Number of basis functions N; more allow more detailed motions.
+    /// Number of basis functions N. More basis functions allow more detailed motions.
     pub basis_count: usize,
     /// Decay of the phase, alpha_x. Larger values make the forcing term fade sooner.
     pub alpha_x: f64,
-    /// Stiffness of the transformation system; beta_y = alpha_y / 4 (critically damped). Larger
-    /// values make the motion reach its goal sooner. Values at which the integrator is unstable are
-    /// rejected.
+    /// Stiffness of the transformation system; beta_y = alpha_y / 4 (critically damped). With a
+    /// larger value the motion reaches its goal sooner. Values for which the integrator is unstable
+    /// are rejected.
     pub alpha_y: f64,
     /// Integration steps m over one segment; a multiple of `policy.segment_steps`.
     pub integration_steps: usize,
@@ -127,18 +128,18 @@ pub enum PolicyKind {
 pub enum RhoKind {
     /// rho = (1, 0, 0, 0) + rho_range * tanh(.).
     Bounded,
-    /// rho = (1, 0, 0, 0) + the network's raw output; saturates and learns worse.
+    /// rho = (1, 0, 0, 0) + the network's raw output. Actions saturate, and learning is worse.
     Free,
 }
 
-/// How actions follow from the DMP's motion.
+/// Controller that converts the DMP's motion into actions.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "snake_case")]
 pub enum Controller {
     /// The adaptive inverse controller, with rho from the network.
     Inverse,
-    /// Successive differences of y, times `position_scale` (Neural Dynamic Policies). They are
-    /// unbounded, so only algorithms that clip actions allow them.
+    /// Successive differences of y, times `position_scale` (Neural Dynamic Policies). These actions
+    /// are unbounded, so only algorithms that clip actions accept this controller.
     Position,
 }
 
@@ -146,9 +147,9 @@ pub enum Controller {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "snake_case")]
 pub enum Start {
-    /// y = yd = 0 at every segment.
+    /// y = yd = 0 at the start of every segment.
     Zero,
-    /// y0 and yd0 are read from the observation by `task.start_sources`.
+    /// y0 and yd0 are read from the observation, at the entries in `task.start_sources`.
     Observed,
     /// y and yd continue from the end of the previous segment; they are zero after a reset.
     Carry,
@@ -164,7 +165,7 @@ pub enum StartVelocity {
     Zero,
 }
 
-/// Entries of an observation that give one action dimension's y0 and yd0.
+/// Entries of an observation from which one action dimension's y0 and yd0 are read.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(untagged, deny_unknown_fields)]
 pub enum StartSource {
@@ -199,19 +200,20 @@ fn unit_scale() -> f32 {
 pub struct PolicyConfig {
     /// Kind of policy.
     pub kind: PolicyKind,
-    /// Environment steps K per decision, executed open-loop; `mlp` ignores this and decides at
+    /// Environment steps K per decision, executed open-loop. Ignored by `mlp`, which decides at
     /// every step.
     pub segment_steps: usize,
     /// Widths of the actor's hidden layers.
     pub hidden: Vec<usize>,
-    /// Whether observations are normalised to zero mean and unit scale for the networks. The
-    /// statistics start at the end of the warm-up and are folded into published policies.
+    /// Whether observations are normalised to zero mean and unit scale before they enter the
+    /// networks. Normalisation starts at the end of the warm-up. Its statistics are folded into
+    /// published policies.
     pub normalise_observations: bool,
     /// Bound of the goal: g = goal_range * tanh(.).
     pub goal_range: f64,
     /// Bound of the weights: w = weight_range * omega^2 * tanh(.), omega = alpha_y / 2.
     pub weight_range: f64,
-    /// How actions follow from the DMP's motion.
+    /// Controller that converts the DMP's motion into actions.
     pub controller: Controller,
     /// Action per unit of motion in y, for `controller = "position"`.
     pub position_scale: f64,
@@ -245,7 +247,7 @@ impl Default for PolicyConfig {
 }
 
 impl PolicyConfig {
-    /// Environment steps of one decision: K for `dmp`, 1 for `mlp`.
+    /// Returns the environment steps of one decision: K for `dmp`, 1 for `mlp`.
     #[must_use]
     pub fn decision_steps(&self) -> usize {
         match self.kind {

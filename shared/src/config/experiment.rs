@@ -1,4 +1,4 @@
-//! The root of the configuration tree and the sections that are neither policy nor algorithm.
+//! The root of the configuration, and all sections except policy, DMP and algorithm.
 
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
@@ -23,17 +23,17 @@ pub struct ExperimentConfig {
     pub exploration: ExplorationConfig,
     /// The replay.
     pub replay: ReplayConfig,
-    /// Recorded experience from other sources.
+    /// Recorded experience that a run starts from.
     pub demonstrations: DemonstrationsConfig,
-    /// Updates per inserted segment.
+    /// Ratio of updates to inserted segments.
     pub pacing: PacingConfig,
     /// The rollout workers.
     pub actors: ActorsConfig,
-    /// Guarantees for segments on their way from worker to learner.
+    /// Delivery of segments from worker to learner.
     pub delivery: DeliveryConfig,
     /// Workers on other hosts (docs/several-hosts.md).
     pub bridge: BridgeConfig,
-    /// Reaction to processes that die or hang.
+    /// Handling of processes that crash or hang.
     pub supervision: SupervisionConfig,
     /// The learner process.
     pub learner: LearnerConfig,
@@ -46,30 +46,33 @@ pub struct ExperimentConfig {
 }
 
 impl ExperimentConfig {
-    /// Maximum number of simultaneous workers: the run's own, joined ones and those on other hosts.
+    /// Returns the maximum number of simultaneous workers: the run's own, those that join it, and
+    /// those on other hosts.
     #[must_use]
     pub fn places(&self) -> usize {
         self.actors.places().saturating_add(self.bridge.places())
     }
 }
 
-/// Length, seed and stopping rules. An infinite bound never stops a run.
+/// Length, seed and stopping rules.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct RunConfig {
-    /// Master seed; every random stream of the run derives from it.
+    /// Master seed, from which every random stream of the run is derived.
     pub seed: u64,
     /// Environment steps of all workers together.
     pub steps: u64,
-    /// One worker, in one process with the learner and in lock-step with it: the same seed gives
-    /// the same bytes. `actors.workers`, `actors.joined_max` and `bridge.listen` have no effect.
+    /// Runs one worker in the learner's process, in lock-step with the learner, so that the same
+    /// seed gives bit-identical results. `actors.workers`, `actors.joined_max` and `bridge.listen`
+    /// have no effect.
     pub deterministic: bool,
-    /// Stop at the first evaluation with at least this mean return; inf: never.
+    /// Mean return at which the run stops, at the first evaluation that reaches it; inf: never.
     pub until_return: f64,
-    /// Stop at the first evaluation with at least this success rate (0 to 1); inf: never.
-    pub until_success: f64,
-    /// Stop after this many minutes of wall-clock time, which `resume` counts from zero; inf:
+    /// Success rate (0 to 1) at which the run stops, at the first evaluation that reaches it; inf:
     /// never.
+    pub until_success: f64,
+    /// Wall-clock time after which the run stops \[min\]; inf: never. `resume` starts again from
+    /// zero.
     pub max_minutes: f64,
 }
 
@@ -96,8 +99,8 @@ pub struct TaskConfig {
     pub id: String,
     /// Directories that are searched for your own environment modules.
     pub python_path: Vec<String>,
-    /// Entries of the observation that give y0 and yd0, one source per action dimension; empty:
-    /// unknown.
+    /// Entries of the observation from which y0 and yd0 are read, one source per action dimension;
+    /// empty: unknown.
     pub start_sources: Vec<StartSource>,
 }
 
@@ -112,7 +115,7 @@ impl Default for TaskConfig {
     }
 }
 
-/// Goals of an episode's copies.
+/// Goals of hindsight copies.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "snake_case")]
 pub enum Hindsight {
@@ -126,11 +129,13 @@ pub enum Hindsight {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct ReplayConfig {
-    /// Capacity in environment steps, hindsight copies included; the oldest are overwritten.
+    /// Capacity in environment steps, including hindsight copies. A full replay overwrites its
+    /// oldest steps.
     pub capacity_steps: usize,
-    /// Goals of the copies that workers make of their segments, in goal-conditioned environments.
+    /// Goals of the hindsight copies that workers make of their segments. Needs a goal-conditioned
+    /// environment.
     pub hindsight: Hindsight,
-    /// Copies of each segment, each with a different goal.
+    /// Hindsight copies per segment, each with its own goal.
     pub hindsight_copies: usize,
 }
 
@@ -144,11 +149,12 @@ impl Default for ReplayConfig {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct DemonstrationsConfig {
-    /// Files of recorded steps (docs/demonstrations.md).
+    /// Files with recorded steps (docs/demonstrations.md).
     pub files: Vec<String>,
-    /// Updates in which the actor imitates the demonstrations before training starts; 0: none.
+    /// Behaviour-cloning updates of the actor before training starts; 0: none.
     pub cloning_updates: u64,
-    /// Environment steps after the warm-up over which the imitation term of the updates fades out.
+    /// Environment steps after the warm-up over which the imitation term of the actor's updates
+    /// falls linearly to zero.
     pub imitation_steps: u64,
 }
 
@@ -159,21 +165,22 @@ impl Default for DemonstrationsConfig {
 }
 
 impl DemonstrationsConfig {
-    /// Whether the run starts with a cloned policy.
+    /// Whether the run starts with behaviour cloning.
     #[must_use]
     pub fn are_cloned(&self) -> bool {
         !self.files.is_empty() && self.cloning_updates > 0
     }
 }
 
-/// Updates per inserted segment, and how far workers and learner may drift apart.
+/// Ratio of updates to inserted segments.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct PacingConfig {
-    /// Updates per segment inserted after the warm-up. More updates learn more from each step but
-    /// take longer, and can make the critic diverge.
+    /// Updates per segment inserted after the warm-up. With more updates a run needs fewer
+    /// environment steps but more time, and the critic can diverge.
     pub updates_per_segment: f64,
-    /// Segments with pending updates at which the learner stops receiving, so that workers wait.
+    /// Number of inserted segments with pending updates at which the learner stops receiving, so
+    /// that workers wait.
     pub tolerance_segments: u64,
 }
 
@@ -189,26 +196,26 @@ impl Default for PacingConfig {
 pub struct ActorsConfig {
     /// Worker processes; 0 means cores - 1, at least 1.
     pub workers: usize,
-    /// Maximum number of workers that take part in a running experiment by joining it
-    /// (`dmprl actor --join RUN`), at any one time. Their queues are reserved at the start of the
-    /// run.
+    /// Maximum number of simultaneous workers that have joined the running experiment
+    /// (`dmprl actor --join RUN`). Their queues are reserved at the start of the run.
     pub joined_max: usize,
-    /// Environments per worker; one call runs a segment in all of them.
+    /// Environments per worker. One call runs a segment in all of them.
     pub envs_per_worker: usize,
-    /// Capacity of a worker's queue to the learner; a worker waits while it is full. 0 means
-    /// `envs_per_worker`; with less, a worker would wait for the learner in every segment.
+    /// Capacity of a worker's queue to the learner \[segments\]. A worker waits while its queue is
+    /// full. 0 means `envs_per_worker`; with a smaller queue, a worker waits for the learner at
+    /// every segment.
     pub queue_segments: usize,
-    /// Wait on a full queue after which a worker reports that the learner is slow \[s\].
+    /// Time that a worker waits on a full queue before it reports that the learner is slow \[s\].
     pub send_deadline_s: f64,
-    /// Restarts of one worker before the run continues without it. Delivering segments for five
-    /// minutes resets the count.
+    /// Maximum number of restarts of one worker; after that the run continues without it. The count
+    /// is reset once the worker has delivered segments for five minutes.
     pub restarts_max: u32,
-    /// Environment failures that a worker tolerates by recreating the environment. The count is per
-    /// environment and restarts after a completed episode or 1 000 valid segments. One more failure
-    /// ends the worker, which is then restarted.
+    /// Maximum number of failures of one environment. Up to this number, the worker recreates the
+    /// environment; on one more, the worker exits and is restarted. The count is reset after a
+    /// completed episode, or after 1 000 valid segments since the first counted failure.
     pub env_failures_max: u32,
-    /// Timeout of one call into the environments (a segment in each of a worker's environments, or
-    /// their reset) \[s\]. On a timeout the worker or evaluator exits and is restarted.
+    /// Timeout of one call into the environments, which runs or resets all environments of a worker
+    /// \[s\]. On a timeout the worker or evaluator exits and is restarted.
     pub env_call_timeout_s: f64,
 }
 
@@ -228,7 +235,8 @@ impl Default for ActorsConfig {
 }
 
 impl ActorsConfig {
-    /// Maximum number of simultaneous workers on the learner's host: its own and joined ones.
+    /// Returns the maximum number of simultaneous workers on the learner's host, including those
+    /// that join.
     #[must_use]
     pub fn places(&self) -> usize {
         self.workers.saturating_add(self.joined_max)
@@ -239,20 +247,19 @@ impl ActorsConfig {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct BridgeConfig {
-    /// Zenoh endpoints that accept other hosts, such as `tcp/0.0.0.0:7447` or `tls/[::]:7447`;
-    /// empty: the run uses one host.
+    /// Zenoh endpoints on which the run accepts other hosts, such as `tcp/0.0.0.0:7447` or
+    /// `tls/[::]:7447`; empty: the run accepts no other host.
     pub listen: Vec<String>,
     /// Maximum number of workers on all other hosts together. Their queues are reserved at the
     /// start of the run.
     pub workers_max: usize,
-    /// Maximum amount of unacknowledged data per host \[bytes\]; its workers wait while it is
-    /// reached. Set it to at least the link's rate times its round trip, or the link is never fully
-    /// used.
+    /// Maximum amount of unacknowledged data per host \[bytes\]. At the limit, the host's workers
+    /// wait. A limit below the link's rate times its round-trip time leaves the link partly idle.
     pub under_way_bytes_max: u64,
-    /// File with the secret that other hosts must present, readable only by its owner; empty:
-    /// `bridge.token` is created in the run's directory.
+    /// File with the secret that other hosts must present. Only its owner may have access to it.
+    /// Empty: `bridge.token`, which is created in the run's directory.
     pub token_file: String,
-    /// File of Zenoh's own configuration (JSON5), for certificates and access control; empty: none.
+    /// Zenoh configuration file (JSON5), for certificates and access control; empty: none.
     pub zenoh_file: String,
 }
 
@@ -275,36 +282,36 @@ impl BridgeConfig {
         !self.listen.is_empty()
     }
 
-    /// Maximum number of simultaneous workers on other hosts.
+    /// Returns the maximum number of simultaneous workers on other hosts.
     #[must_use]
     pub fn places(&self) -> usize {
         if self.is_open() { self.workers_max } else { 0 }
     }
 }
 
-/// When a worker discards a segment.
+/// Point at which a worker discards its copy of a segment.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "snake_case")]
 pub enum DeliveryLevel {
-    /// After the learner has inserted it. A learner that dies loses the segments since its last
+    /// After the learner has inserted it. A crash of the learner loses the segments since its last
     /// checkpoint.
     Memory,
-    /// After it is also in the learner's segment log. A learner that dies loses nothing.
+    /// After it is also in the learner's segment log. A crash of the learner loses no segment.
     Log,
 }
 
-/// Guarantees for segments on their way from worker to learner.
+/// Delivery of segments from worker to learner.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct DeliveryConfig {
-    /// When a worker discards a segment.
+    /// Point at which a worker discards its copy of a segment.
     pub level: DeliveryLevel,
-    /// Unacknowledged segments that a worker keeps; it waits when this many are kept. 0 means
-    /// `actors.queue_segments` plus 1 024, for segments sent while an acknowledgement is on its
-    /// way.
+    /// Maximum number of unacknowledged segments that a worker keeps. At the limit, the worker
+    /// waits. 0 means `actors.queue_segments` plus 1 024 for segments that are sent before an
+    /// acknowledgement arrives.
     pub unacknowledged_segments: usize,
     /// Maximum size of the segment log \[bytes\]. A full log triggers a checkpoint, which empties
-    /// it.
+    /// the log.
     pub log_bytes_max: u64,
 }
 
@@ -315,14 +322,14 @@ impl Default for DeliveryConfig {
     }
 }
 
-/// Reaction to processes that die or hang.
+/// Handling of processes that crash or hang.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct SupervisionConfig {
-    /// Restarts of a killed or crashed learner before the run fails. Writing a checkpoint and
-    /// living for five minutes resets the count.
+    /// Maximum number of restarts of a killed or crashed learner; after that the run fails. The
+    /// count is reset once the learner has run for five minutes and written a checkpoint.
     pub learner_restarts_max: u32,
-    /// Heartbeat timeout of a worker \[s\]; after it the worker is killed and restarted.
+    /// Time without a heartbeat after which a worker is killed and restarted \[s\].
     pub heartbeat_timeout_s: f64,
 }
 
@@ -332,23 +339,24 @@ impl Default for SupervisionConfig {
     }
 }
 
-/// Device of the update.
+/// Device that computes the updates.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "snake_case")]
 pub enum Device {
     /// The CPU.
     Cpu,
-    /// An NVIDIA GPU, in a build with the feature `cuda`.
+    /// An NVIDIA GPU. Needs a build with the feature `cuda`.
     Cuda,
 }
 
-/// Precision of the products in an update; sums and parameters are always f32.
+/// Precision of the multiplications in an update. Sums and parameters are always f32.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "snake_case")]
 pub enum Precision {
     /// 32 bits.
     F32,
-    /// 16 bits (bfloat16), on processors with AVX512-BF16: faster, with three significant digits.
+    /// 16 bits (bfloat16): faster, with about three significant digits. Needs a processor with
+    /// AVX512-BF16.
     Bf16,
 }
 
@@ -356,13 +364,13 @@ pub enum Precision {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct LearnerConfig {
-    /// Device of the update.
+    /// Device that computes the updates.
     pub device: Device,
-    /// Threads of the update; the result is bit-identical for every number.
+    /// Threads that compute an update. Results are bit-identical for every number of threads.
     pub threads: usize,
-    /// Precision of the products in an update; sums and parameters are always f32.
+    /// Precision of the multiplications in an update. Sums and parameters are always f32.
     pub precision: Precision,
-    /// Updates between two published parameter snapshots.
+    /// Updates between two published versions of the policy.
     pub publish_every_updates: u64,
 }
 
@@ -381,16 +389,16 @@ impl Default for LearnerConfig {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct EvaluationConfig {
-    /// Environment steps between evaluations; one more follows the last step.
+    /// Environment steps between evaluations. One more evaluation follows the last step.
     pub interval_steps: u64,
     /// Episodes per evaluation.
     pub episodes: usize,
-    /// Episodes of the evaluation after the last step of `run.steps`, if that is more than
-    /// `episodes`. Published results need 100; 100 in each evaluation would take longer than
-    /// training. A run that stops earlier, at its goal or time limit, ends with `episodes`.
+    /// Episodes of the final evaluation, after `run.steps`; ignored if less than `episodes`.
+    /// Published results need 100, which would take longer than training in every evaluation. A
+    /// run that stops earlier, at its goal or time limit, does not use this.
     pub final_episodes: usize,
     /// Seed of the first episode: every evaluation resets episode i with seed first_seed + i.
-    /// Searches use seeds from 5000, so that their results are evaluated on unseen episodes.
+    /// Searches use seeds from 5000, so that published evaluations use unseen episodes.
     pub first_seed: u64,
 }
 
@@ -401,13 +409,13 @@ impl Default for EvaluationConfig {
 }
 
 impl EvaluationConfig {
-    /// Episodes of an evaluation after `env_steps` of a run of `run_steps`.
+    /// Returns the number of episodes of an evaluation after `env_steps` in a run of `run_steps`.
     #[must_use]
     pub fn episodes_at(&self, env_steps: u64, run_steps: u64) -> usize {
         if env_steps >= run_steps { self.episodes_max() } else { self.episodes }
     }
 
-    /// Episodes of the longest evaluation.
+    /// Returns the number of episodes of the longest evaluation.
     #[must_use]
     pub fn episodes_max(&self) -> usize {
         self.episodes.max(self.final_episodes)
@@ -418,11 +426,12 @@ impl EvaluationConfig {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct CheckpointConfig {
-    /// Environment steps between checkpoints; one more is written at the end of a run.
+    /// Environment steps between checkpoints. One more is written at the end of a run.
     pub interval_steps: u64,
-    /// Number of checkpoints that are kept.
+    /// Number of checkpoints to keep.
     pub keep: usize,
-    /// Maximum disk space for all checkpoints of a run \[bytes\]; at least one is kept.
+    /// Maximum disk space for all checkpoints of a run \[bytes\]. At least one checkpoint is kept,
+    /// even if it is larger.
     pub disk_bytes_max: u64,
 }
 

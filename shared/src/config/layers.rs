@@ -1,4 +1,4 @@
-//! Merges the layers of configuration and rejects unknown keys with the nearest known name.
+//! Merges the layers of configuration. Unknown keys are rejected, with the nearest known name.
 
 use thiserror::Error;
 use toml::{Table, Value};
@@ -14,22 +14,22 @@ pub enum ConfigError {
     /// A key that does not exist.
     #[error("{origin}: unknown key `{key}`{hint}")]
     UnknownKey {
-        /// The layer it came from: a file name, `--set`, an environment variable.
+        /// The layer that contains it: a file name, `--set`, an environment variable.
         origin: String,
         /// The dotted key.
         key: String,
-        /// `, did you mean ...?` or empty.
+        /// `, did you mean ...?`, or empty.
         hint: String,
     },
-    /// A value of the wrong type, or not one of the allowed ones.
+    /// A value of the wrong type, or a word that is not among the allowed ones.
     #[error("{origin}: {message}")]
     Value {
-        /// The layer it came from.
+        /// The layer that contains it.
         origin: String,
-        /// The error, with key, expected and actual value.
+        /// Description with key, expected and actual value.
         message: String,
     },
-    /// A value out of range, or values that exclude each other.
+    /// A value out of range, or one that conflicts with another value.
     #[error("`{key}` = {got}: {expected}")]
     Range {
         /// The dotted key.
@@ -41,7 +41,7 @@ pub enum ConfigError {
     },
 }
 
-/// Layers merged so far, lowest precedence first.
+/// The configuration layers merged so far.
 #[derive(Debug, Clone)]
 pub struct Layers {
     known: Table,
@@ -55,10 +55,10 @@ impl Default for Layers {
 }
 
 impl Layers {
-    /// Starts from the defaults of the configuration tree.
+    /// Creates the lowest layer: the defaults.
     ///
     /// # Panics
-    /// Never: a test shows that the default tree serialises.
+    /// Never: a test checks that the defaults serialise.
     #[must_use]
     pub fn new() -> Self {
         let known = Table::try_from(ExperimentConfig::default()).expect("defaults serialise");
@@ -68,7 +68,7 @@ impl Layers {
     /// Merges `table` over the existing layers.
     ///
     /// # Errors
-    /// `UnknownKey` if the tree has no such key, `Value` for a wrong type. The layers are then
+    /// `UnknownKey` if a key does not exist, `Value` for a wrong type. The layers are then
     /// unchanged.
     pub fn add(&mut self, origin: &str, table: Table) -> Result<(), ConfigError> {
         check_keys(origin, &self.known, &table, "")?;
@@ -79,15 +79,15 @@ impl Layers {
         Ok(())
     }
 
-    /// Sets one dotted key over the existing layers, as `--set key=value` and `DMPRL_KEY` do.
+    /// Merges one dotted key over the existing layers, for `--set key=value` and `DMPRL_KEY`.
     ///
-    /// A value that is not a TOML literal is taken as a string.
+    /// A value that is not a TOML literal is treated as a string.
     ///
     /// # Errors
-    /// As [`Layers::add`].
+    /// The errors of [`Layers::add`].
     pub fn set(&mut self, origin: &str, key: &str, text: &str) -> Result<(), ConfigError> {
         if key.split('.').nth(KEY_NAMES_MAX).is_some() {
-            // No key is this long, and dropping a tree this deep would overflow the stack.
+            // No key is this long. Dropping a tree of this depth would overflow the stack.
             let (origin, hint) = (origin.to_owned(), String::new());
             let key = key.split('.').take(KEY_NAMES_MAX).collect::<Vec<_>>().join(".") + "...";
             return Err(ConfigError::UnknownKey { origin, key, hint });
@@ -95,7 +95,7 @@ impl Layers {
         let value = format!("value = {text}")
             .parse::<Table>()
             .ok()
-            // Further lines would set further keys.
+            // Rejects a text of several lines, which could set other keys.
             .filter(|table| table.len() == 1)
             .and_then(|mut table| table.remove("value"))
             .unwrap_or_else(|| Value::String(text.to_owned()));
@@ -114,7 +114,7 @@ impl Layers {
         self.add(origin, table)
     }
 
-    /// The dotted keys a user may set, sorted.
+    /// Returns the dotted keys that a user may set, sorted.
     #[must_use]
     pub fn keys(&self) -> Vec<String> {
         let mut keys = Vec::new();
@@ -122,15 +122,15 @@ impl Layers {
         keys
     }
 
-    /// The merged tree.
+    /// Returns the merged configuration.
     ///
     /// # Errors
-    /// `Value` if a value does not fit its type; `add` has already rejected these.
+    /// `Value` if a value does not fit its type, which does not happen: `add` rejects it first.
     pub fn finish(self) -> Result<ExperimentConfig, ConfigError> {
         typed("configuration", self.merged)
     }
 
-    /// Converts `1` to `1.0` where the key is a float, because users type `--set x=1`.
+    /// Converts an integer to a float if the key is a float, so that `--set x=1` is accepted.
     fn widen(&self, key: &str, value: Value) -> Value {
         let default = key.split('.').try_fold(None::<&Value>, |at, name| match at {
             None => self.known.get(name).map(Some),
@@ -143,7 +143,7 @@ impl Layers {
     }
 }
 
-/// The candidate nearest to `name`, if it is near enough to be a typo.
+/// Returns the candidate that is most similar to `name`, if `name` could be a typo of it.
 #[must_use]
 pub fn nearest<'a>(name: &str, candidates: impl IntoIterator<Item = &'a str>) -> Option<&'a str> {
     candidates
@@ -172,7 +172,7 @@ fn check_keys(origin: &str, known: &Table, given: &Table, path: &str) -> Result<
             (Some(Value::Table(_)), _) => {
                 return Err(ConfigError::Value {
                     origin: origin.to_owned(),
-                    message: format!("`{key}` is a table of keys, got {value}"),
+                    message: format!("`{key}`: expected a table, got {value}"),
                 });
             }
             _ => {}
@@ -181,8 +181,8 @@ fn check_keys(origin: &str, known: &Table, given: &Table, path: &str) -> Result<
     Ok(())
 }
 
-/// Searches the siblings first, then the whole tree: `--set batch_size=64` means
-/// `algorithm.batch_size`.
+/// Creates the error for an unknown key. The hint is the nearest key in the same table, or else in
+/// the whole tree, so that `batch_size` suggests `algorithm.batch_size`.
 fn unknown(origin: &str, key: String, name: &str, siblings: &Table, path: &str) -> ConfigError {
     let sibling = nearest(name, siblings.keys().map(String::as_str))
         .map(|near| if path.is_empty() { near.to_owned() } else { format!("{path}.{near}") });
@@ -236,7 +236,7 @@ mod tests {
     }
 
     #[test]
-    fn a_later_layer_wins_and_leaves_the_rest() {
+    fn later_layer_overrides_only_its_own_keys() {
         let mut layers = Layers::new();
         layers.add("file", "[dmp]\nalpha_y = 7.0".parse().unwrap()).unwrap();
         layers.set("--set", "dmp.basis_count", "3").unwrap();
@@ -247,7 +247,7 @@ mod tests {
     }
 
     #[test]
-    fn an_unknown_key_is_refused_with_the_nearest_name() {
+    fn unknown_key_is_rejected_with_the_nearest_name() {
         let mut layers = Layers::new();
         for (given, near) in [
             ("algorithm.bach_size", "algorithm.batch_size"),
@@ -260,9 +260,9 @@ mod tests {
         }
     }
 
-    /// Regression: the tree of tables overflowed the stack and ended the program.
+    /// Regression: dropping the nested tables overflowed the stack and crashed the program.
     #[test]
-    fn a_key_without_end_is_unknown() {
+    fn overlong_key_is_rejected_as_unknown() {
         let error = Layers::new().set("--set", &"a.".repeat(100_000), "1").unwrap_err();
         assert!(matches!(error, ConfigError::UnknownKey { .. }), "{error}");
         assert!(error.to_string().len() < 100, "{error}");
@@ -270,14 +270,14 @@ mod tests {
 
     /// Regression: the second line was silently dropped.
     #[test]
-    fn a_value_of_several_lines_sets_no_other_key() {
+    fn multi_line_value_sets_no_other_key() {
         let mut layers = Layers::new();
         assert!(layers.set("--set", "run.seed", "1\nsteps = 2").is_err());
         assert_eq!(layers.finish().unwrap(), ExperimentConfig::default());
     }
 
     #[test]
-    fn a_value_of_the_wrong_type_names_its_key_and_changes_nothing() {
+    fn value_of_the_wrong_type_is_rejected_and_changes_nothing() {
         let mut layers = Layers::new();
         let error = layers.set("--set", "algorithm.critic", "third").unwrap_err().to_string();
         assert!(error.contains("third") && error.contains("segment"), "{error}");
@@ -285,7 +285,7 @@ mod tests {
     }
 
     #[test]
-    fn the_tree_survives_a_round_trip_through_toml() {
+    fn configuration_survives_a_round_trip_through_toml() {
         let config = ExperimentConfig::default();
         let text = toml::to_string(&config).unwrap();
         assert_eq!(toml::from_str::<ExperimentConfig>(&text).unwrap(), config);

@@ -1,9 +1,9 @@
-//! Stage 1 of 8: the typed experiment tree, its defaults, and how a user's values reach it.
+//! Stage 1 of 8: the typed configuration of an experiment and its defaults.
 //!
 //! Precedence, lowest first: task defaults, preset, file, environment variables, `--set` and flags.
-//! `layers` merges them as TOML tables and rejects unknown keys with the nearest known name.
-//! `resolve` turns the merged tree into checked values. This folder contains every default of the
-//! system.
+//! `layers` merges them as TOML tables. It rejects unknown keys and suggests the nearest known one.
+//! `resolve` fills in values that depend on others and checks all of them. Every default of the
+//! system is in this folder.
 
 mod algorithm;
 mod dmp;

@@ -1,4 +1,4 @@
-//! Named sets of values between the task defaults and the user's file.
+//! Presets: named sets of values, which override the task defaults and yield to the user's file.
 
 use toml::Table;
 
@@ -9,7 +9,7 @@ use super::{AlgorithmName, PolicyKind};
 pub struct Preset {
     /// The name for `--preset`.
     pub name: &'static str,
-    /// Its purpose, in one line.
+    /// One-line description.
     pub about: &'static str,
     text: &'static str,
 }
@@ -18,25 +18,25 @@ pub struct Preset {
 pub const PRESETS: [Preset; 3] = [
     Preset {
         name: "default",
-        about: "segment critic, sliding windows, n-step target: what we measured to learn best",
+        about: "segment critic, sliding windows, n-step target: best in our measurements",
         text: "",
     },
     Preset {
         name: "paper",
-        about: "one reading of the paper: first-action critic, literal target, its Table 2",
+        about: "our reading of the paper: first-action critic, literal target, values of Table 2",
         text: PAPER,
     },
     Preset {
         name: "fast",
-        about: "least wall time: the update on two threads, evaluated often, so that \
-                --until-return and --until-success stop it soon",
+        about: "least wall time: two update threads and frequent evaluations, so that \
+                --until-return and --until-success stop the run early",
         text: FAST,
     },
 ];
 
-// The usual ways to save time on GPUs do not help here, because an update takes as long as its
-// matrix products. Larger batches, fewer updates per step, and smaller networks or batches were no
-// faster on reacher beyond the spread of three seeds (docs/decisions/0031-preset-fast.md).
+// Methods that save time on GPUs do not help on a CPU, where matrix products dominate an update's
+// time. Larger batches, fewer updates per step, and smaller networks or batches were not faster on
+// reacher by more than the spread of three seeds (docs/decisions/0031-preset-fast.md).
 const FAST: &str = r#"
 [learner]
 threads = 2
@@ -44,11 +44,11 @@ threads = 2
 interval_steps = 1000
 "#;
 
-// Table 2 of the paper and section 4 of the specification, written out in full, so that changes of
-// `default` do not affect the paper's settings. The paper leaves N, widths, ranges and Adam open;
-// these values are our reading. `tolerance_segments`, `queue_segments` and `publish_every_updates`
-// of 1 keep the worker as close behind its learner as two processes can be. The Panda tasks have
-// their own column in Table 2, which is merged over this (`tasks.rs`).
+// Table 2 of the paper and section 4 of the specification. Every value is written out, so that
+// changes of `default` do not affect this preset. The paper does not specify N, the widths, the
+// ranges and Adam's settings; these are our choice. `tolerance_segments`, `queue_segments` and
+// `publish_every_updates` are 1 to minimise the policy lag between the two processes. The Panda
+// tasks have their own column in Table 2, which is merged over this (`tasks.rs`).
 const PAPER: &str = r#"
 [policy]
 segment_steps = 5
@@ -111,10 +111,10 @@ queue_segments = 1
 publish_every_updates = 1
 "#;
 
-/// Values that differ from the defaults for a kind of policy, merged over those of the task.
+/// Returns the values that a kind of policy changes, which are merged over those of the task.
 ///
-/// `mlp` decides at every step, so two updates per decision would be ten times as many as for
-/// `dmp`. The paper's baselines do one per step.
+/// `mlp` decides at every step, so two updates per decision would be five times as many per step as
+/// for `dmp`. The paper's baselines do one update per step.
 ///
 /// # Panics
 /// Never: a test parses it.
@@ -122,7 +122,7 @@ publish_every_updates = 1
 pub fn policy_defaults(kind: PolicyKind) -> Option<Table> {
     match kind {
         PolicyKind::Dmp => None,
-        // The target entropy also belongs to the baselines; no preset sets it.
+        // No preset sets the target entropy.
         PolicyKind::Mlp => {
             let text = "[pacing]\nupdates_per_segment = 1.0\n\
                         [algorithm]\naction_rate_penalty = 0.0\n\
@@ -132,9 +132,11 @@ pub fn policy_defaults(kind: PolicyKind) -> Option<Table> {
     }
 }
 
-/// Published settings of an algorithm, merged over task and preset and below the user's own values.
+/// Returns the published settings of an algorithm, which are merged over task and preset. The
+/// user's values override them.
 ///
-/// Presets describe DDPG-DMP; other algorithms use a different start, integrator and forcing.
+/// Presets are made for DDPG, TD3 and SAC. `ndp` needs a different start, integrator and forcing
+/// term.
 ///
 /// # Panics
 /// Never: a test parses it.
@@ -146,9 +148,9 @@ pub fn algorithm_defaults(name: AlgorithmName) -> Option<Table> {
     }
 }
 
-// From the released code of Neural Dynamic Policies: integrator, forcing, start, learning rates.
-// The networks are those of Table 2. Workers and pacing are not set: on-policy, each update waits
-// for its segments.
+// Integrator, forcing term, start and learning rates are from the released code of Neural Dynamic
+// Policies. The networks are those of Table 2. Workers and pacing are not set: an on-policy update
+// waits for its segments anyway.
 const NDP: &str = r#"
 [policy]
 controller = "position"
@@ -169,7 +171,7 @@ warm_up_steps = 0
 "#;
 
 impl Preset {
-    /// The preset's values.
+    /// Returns the preset's values.
     ///
     /// # Panics
     /// Never for the built-in presets: a test parses each.
@@ -190,24 +192,23 @@ mod tests {
     }
 
     #[test]
-    fn the_paper_states_every_value_that_the_default_may_tune() {
+    fn preset_paper_sets_every_value_that_default_may_tune() {
         let paper = PRESETS[1].table();
         let all = Table::try_from(ExperimentConfig::default()).unwrap();
         for section in ["policy", "dmp", "algorithm", "exploration", "replay", "pacing"] {
             let missing = |key: &String| !keys(&paper, section).contains(key);
             let missing: Vec<_> = keys(&all, section).into_iter().filter(missing).collect();
-            // A policy without a DMP is the user's choice, not the paper's. The same holds for
-            // another algorithm and its settings.
-            let others = |key: &String| {
+            // The kind of policy and the settings of other algorithms are the user's choice.
+            let is_from_paper = |key: &String| {
                 !["kind", "td3", "sac", "ndp", "position_scale"].contains(&key.as_str())
             };
-            let missing: Vec<_> = missing.into_iter().filter(others).collect();
+            let missing: Vec<_> = missing.into_iter().filter(is_from_paper).collect();
             assert!(missing.is_empty(), "{section}: {missing:?}");
         }
     }
 
     #[test]
-    fn the_paper_is_table_2() {
+    fn preset_paper_matches_table_2() {
         let mut layers = Layers::new();
         layers.add("paper", PRESETS[1].table()).unwrap();
         let config = layers.finish().unwrap();

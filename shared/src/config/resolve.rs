@@ -1,49 +1,48 @@
-//! Checks the merged tree: ranges, combinations and limits.
+//! Checks the merged configuration: ranges, combinations and limits.
 
 use super::{
     AlgorithmName, ConfigError, Controller, CriticInput, DeliveryLevel, ExperimentConfig,
     PolicyKind, Start, WarmUpKind, Windows,
 };
 
-/// Properties of the machine; they are passed in, never read here.
+/// Properties of the machine, passed in by the caller.
 #[derive(Debug, Clone, Copy)]
 pub struct Limits {
     /// Available processor cores.
     pub cores: usize,
 }
 
-/// Limits that no experiment needs to exceed; a larger value is more likely a typo.
+/// No experiment needs more; a larger value is probably a typo.
 const WORKERS_MAX: usize = 1_024;
 const ENVS_PER_WORKER_MAX: usize = 4_096;
-/// A slot of the replay counts its steps in one byte.
+/// A replay slot stores its number of steps in one byte.
 const SEGMENT_STEPS_MAX: usize = 255;
 const HINDSIGHT_COPIES_MAX: usize = 64;
 const HIDDEN_MAX: usize = 65_536;
-/// Enough for a worker of 100 000 segments per second and 100 acknowledgements per second. A
-/// learner that settles more acknowledges sooner.
+/// Enough for a worker that sends 100 000 segments per second and gets 100 acknowledgements per
+/// second. At higher rates the learner acknowledges more often.
 const SEGMENTS_UNTIL_ACKNOWLEDGED: usize = 1_024;
 const UNACKNOWLEDGED_MAX: usize = 1 << 20;
-/// Space for a few segments of any size.
+/// Fits a few segments of any size.
 const LOG_BYTES_MIN: u64 = 1 << 20;
 const LOG_BYTES_MAX: u64 = 1 << 44;
-/// A smaller window leaves any long link nearly idle. With a larger one, segments that queue for a
-/// slow learner come from outdated policies.
+/// A smaller window leaves a link with a long round trip nearly idle. With a larger one, segments
+/// that wait for a slow learner come from outdated policies.
 const UNDER_WAY_BYTES_MIN: u64 = 1 << 16;
 const UNDER_WAY_BYTES_MAX: u64 = 1 << 34;
 const UPDATES_PER_SEGMENT_MAX: f64 = 1e6;
-/// Heartbeats are sent once a second, and later on a busy machine.
+/// Heartbeats are sent once per second, and less often on a busy machine.
 const HEARTBEAT_S_MIN: f64 = 3.0;
 /// About thirty years.
 const SECONDS_MAX: f64 = 1e9;
-/// 50 environment steps of each environment at K = 5, as published.
+/// The published 50 environment steps of each environment, at K = 5.
 const ROLLOUT_SEGMENTS_PER_ENV: usize = 10;
 
 impl ExperimentConfig {
-    /// Fills in values that depend on the machine or the kind of policy, and checks every value.
+    /// Fills in values that depend on the machine or on other values, and checks every value.
     ///
     /// # Errors
-    /// `Range` for the first value out of range or the first pair of values that exclude each
-    /// other.
+    /// `Range` for the first value that is out of range or conflicts with another.
     pub fn resolve(mut self, limits: Limits) -> Result<Self, ConfigError> {
         if self.actors.workers == 0 {
             self.actors.workers = limits.cores.saturating_sub(1).max(1);
@@ -77,9 +76,7 @@ impl ExperimentConfig {
     fn check_delivery(&self) -> Result<(), ConfigError> {
         let log = self.delivery.level == DeliveryLevel::Log;
         range("delivery.level", "log", !(log && self.run.deterministic), || {
-            "memory with run.deterministic, whose one process sends itself nothing that could be \
-             lost"
-                .into()
+            "memory with run.deterministic, which runs in one process and sends no segments".into()
         })?;
         let (key, got) = ("delivery.log_bytes_max", self.delivery.log_bytes_max);
         range(key, got, (LOG_BYTES_MIN..=LOG_BYTES_MAX).contains(&got), || {
@@ -187,7 +184,7 @@ impl ExperimentConfig {
         let (key, got) = ("supervision.heartbeat_timeout_s", self.supervision.heartbeat_timeout_s);
         let limits = HEARTBEAT_S_MIN..=SECONDS_MAX;
         range(key, got, limits.contains(&got), || {
-            format!("{HEARTBEAT_S_MIN} to {SECONDS_MAX}; a worker gives a sign of life a second")
+            format!("{HEARTBEAT_S_MIN} to {SECONDS_MAX}; workers send a heartbeat every second")
         })?;
         let goals = [
             ("run.until_return", self.run.until_return),
@@ -231,7 +228,7 @@ impl ExperimentConfig {
         let max = dmp.integrator.alpha_y_max(1.0 / dmp.integration_steps as f64);
         range("dmp.alpha_y", dmp.alpha_y, dmp.alpha_y < max, || {
             format!(
-                "below {max:.0}, where the {:?} integrator is stable with {} steps; \
+                "less than {max:.0}, the stability limit of the {:?} integrator with {} steps; \
                      lower alpha_y or raise dmp.integration_steps",
                 dmp.integrator, dmp.integration_steps
             )
@@ -243,39 +240,42 @@ impl ExperimentConfig {
         let sliding = self.algorithm.windows == Windows::Sliding;
         let several = self.policy.decision_steps() > 1;
         range("algorithm.windows", "sliding", !(first && sliding && several), || {
-            "algorithm.critic = \"first\" needs windows = \"segment\": the later actions of a \
-             sliding window come from two decisions"
+            "segment with algorithm.critic = \"first\": the actions of a sliding window can come \
+             from two decisions"
                 .into()
         })?;
         let literal = self.algorithm.target == super::Target::Literal;
         range("algorithm.target", "literal", !(literal && sliding && several), || {
-            "the literal target needs algorithm.windows = \"segment\"".into()
+            "n_step, or algorithm.windows = \"segment\", which the literal target requires".into()
         })?;
         let dmp = self.policy.kind == PolicyKind::Dmp;
-        let drawn = self.exploration.warm_up_kind == WarmUpKind::DmpParameters;
-        range("exploration.warm_up_kind", "dmp_parameters", dmp || !drawn, || {
-            "policy.kind = \"mlp\" has no DMP parameters to draw".into()
+        let draws_dmp_parameters = self.exploration.warm_up_kind == WarmUpKind::DmpParameters;
+        range("exploration.warm_up_kind", "dmp_parameters", dmp || !draws_dmp_parameters, || {
+            "uniform with policy.kind = \"mlp\", which has no DMP parameters".into()
         })?;
-        let explored = self.exploration.kind == super::ExplorationKind::DmpParameters;
-        range("exploration.kind", "dmp_parameters", dmp || !explored, || {
-            "policy.kind = \"mlp\" has no DMP parameters to disturb".into()
+        let perturbs_dmp_parameters =
+            self.exploration.kind == super::ExplorationKind::DmpParameters;
+        range("exploration.kind", "dmp_parameters", dmp || !perturbs_dmp_parameters, || {
+            "another kind of noise with policy.kind = \"mlp\", which has no DMP parameters".into()
         })?;
         let carry = dmp && self.policy.start == Start::Carry;
-        range("exploration.warm_up_kind", "uniform", drawn || !carry, || {
-            "policy.start = \"carry\" needs warm_up_kind = \"dmp_parameters\", so that y is \
-             defined during the warm-up"
+        range("exploration.warm_up_kind", "uniform", draws_dmp_parameters || !carry, || {
+            "dmp_parameters with policy.start = \"carry\", because uniform actions leave y \
+             undefined during the warm-up"
                 .into()
         })?;
         let demonstrated = !self.demonstrations.files.is_empty();
         range("policy.start", "carry", !(carry && demonstrated), || {
-            "demonstrations hold no state of a movement primitive to carry on; choose \"zero\" or \
-             \"observed\""
+            "\"zero\" or \"observed\" with demonstrations, which do not contain the state of a DMP"
                 .into()
         })?;
         let observed = dmp && self.policy.start == Start::Observed;
         let sources = self.task.start_sources.len();
         range("policy.start", "observed", !observed || sources > 0, || {
-            format!("task `{}` has no task.start_sources to read y0 from", self.task.name)
+            format!(
+                "zero or carry; task `{}` has no task.start_sources to read y0 from",
+                self.task.name
+            )
         })
     }
 
@@ -308,17 +308,17 @@ impl ExperimentConfig {
         range("algorithm.ndp.initial_log_std", log_std, fits, || "from -10 to 2".into())?;
         let on_policy = self.algorithm.name == AlgorithmName::Ndp;
         range("policy.kind", "mlp", !on_policy || self.policy.kind == PolicyKind::Dmp, || {
-            "algorithm.name = \"ndp\" is about movement primitives: leave policy.kind at \"dmp\""
-                .into()
+            "dmp with algorithm.name = \"ndp\", which learns only movement primitives".into()
         })?;
         let warm_up = self.exploration.warm_up_steps;
         range("exploration.warm_up_steps", warm_up, !on_policy || warm_up == 0, || {
-            "0 with algorithm.name = \"ndp\", which learns only from what its own policy did".into()
+            "0 with algorithm.name = \"ndp\", which learns only from actions of its own policy"
+                .into()
         })?;
         let on_cpu = self.learner.device == super::Device::Cpu;
         let bf16 = self.learner.precision == super::Precision::Bf16;
         range("learner.precision", "bf16", on_cpu || !bf16, || {
-            "f32 with learner.device = \"cuda\": bf16 is the processor's".into()
+            "f32 with learner.device = \"cuda\"; bf16 runs only on the CPU".into()
         })?;
         range("learner.device", "cuda", !on_policy || on_cpu, || {
             "cpu with algorithm.name = \"ndp\", whose minibatches are too small for a GPU".into()
@@ -333,17 +333,17 @@ impl ExperimentConfig {
         })?;
         let layer_norm = self.algorithm.critic_layer_norm;
         range("algorithm.critic_layer_norm", "true", !on_policy || !layer_norm, || {
-            "false with algorithm.name = \"ndp\", whose critic judges states of its own policy"
-                .into()
+            "false with algorithm.name = \"ndp\"; only ddpg, td3 and sac support it".into()
         })?;
         let penalty = self.algorithm.action_rate_penalty;
         range("algorithm.action_rate_penalty", penalty, !on_policy || penalty == 0.0, || {
-            "0 with algorithm.name = \"ndp\", whose actor learns from probabilities alone".into()
+            "0 with algorithm.name = \"ndp\"; only ddpg, td3 and sac support it".into()
         })?;
         let position = self.policy.controller == Controller::Position;
         let dmp = self.policy.kind == PolicyKind::Dmp;
         range("policy.controller", "position", on_policy || !position || !dmp, || {
-            "inverse, or algorithm.name = \"ndp\", which alone clips actions without bounds".into()
+            "inverse, or algorithm.name = \"ndp\", the only algorithm that clips unbounded actions"
+                .into()
         })
     }
 }
@@ -389,7 +389,7 @@ mod tests {
     }
 
     #[test]
-    fn workers_default_to_the_cores_but_one() {
+    fn workers_default_to_one_less_than_the_cores() {
         assert_eq!(resolved(&[]).unwrap().actors.workers, 1);
         let queue = |pairs| resolved(pairs).unwrap().actors.queue_segments;
         assert_eq!(queue(&[("actors.envs_per_worker", "16")]), 16);
@@ -401,22 +401,22 @@ mod tests {
     }
 
     #[test]
-    fn ndp_wants_movement_primitives_and_no_warm_up() {
+    fn ndp_requires_movement_primitives_and_no_warm_up() {
         let ndp = ("algorithm.name", "ndp");
-        let cold = ("exploration.warm_up_steps", "0");
-        let free = ("algorithm.action_rate_penalty", "0.0");
-        let config = resolved(&[ndp, cold, free, ("actors.workers", "3")]).unwrap();
+        let no_warm_up = ("exploration.warm_up_steps", "0");
+        let no_penalty = ("algorithm.action_rate_penalty", "0.0");
+        let config = resolved(&[ndp, no_warm_up, no_penalty, ("actors.workers", "3")]).unwrap();
         assert_eq!(config.algorithm.ndp.rollout_segments, 10 * 3 * 8);
-        let refused = |more| resolved(&[ndp, cold, free, more]).unwrap_err().to_string();
-        let mlp = refused(("policy.kind", "mlp"));
-        assert!(mlp.contains("about movement primitives"), "{mlp}");
-        assert!(refused(("exploration.warm_up_steps", "1")).contains("its own policy"));
-        assert!(refused(("algorithm.action_rate_penalty", "0.1")).contains("probabilities"));
-        assert!(refused(("policy.start", "observed")).contains("start_sources"));
+        let error = |more| resolved(&[ndp, no_warm_up, no_penalty, more]).unwrap_err().to_string();
+        let mlp = error(("policy.kind", "mlp"));
+        assert!(mlp.contains("only movement primitives"), "{mlp}");
+        assert!(error(("exploration.warm_up_steps", "1")).contains("its own policy"));
+        assert!(error(("algorithm.action_rate_penalty", "0.1")).contains("td3 and sac"));
+        assert!(error(("policy.start", "observed")).contains("start_sources"));
     }
 
     #[test]
-    fn values_out_of_range_are_refused_by_name() {
+    fn values_out_of_range_are_rejected() {
         for (key, value) in [
             ("dmp.alpha_y", "70"),
             ("dmp.integration_steps", "41"),

@@ -1,4 +1,4 @@
-//! The tasks with a short name, and the values that differ from the defaults for each.
+//! Tasks with a short name, and the configuration values that each changes.
 
 use serde::Serialize;
 use toml::Table;
@@ -7,7 +7,7 @@ use crate::spec::EnvSpec;
 
 /// A task with a short name.
 ///
-/// `dmprl tasks` prints these fields, so that it needs no Python. A test compares them with the
+/// `dmprl tasks` prints these fields without starting Python. A test compares them with the
 /// environment.
 #[derive(Debug, Clone, Copy, Serialize)]
 pub struct TaskDefaults {
@@ -31,10 +31,10 @@ pub struct TaskDefaults {
     pub episode_steps: u32,
     /// Duration of a step \[s\].
     pub control_dt_s: f64,
-    /// Values over the defaults, as parts of one TOML text.
+    /// Values merged over the defaults, as parts of one TOML text.
     #[serde(skip)]
     values: &'static [&'static str],
-    /// Values over the preset `paper` in the same form, for tasks with their own column in Table 2.
+    /// Values merged over the preset `paper`, for tasks with their own column in Table 2.
     #[serde(skip)]
     paper: &'static [&'static str],
 }
@@ -42,9 +42,9 @@ pub struct TaskDefaults {
 const REACHER: TaskDefaults = TaskDefaults {
     name: "reacher",
     id: "Reacher-v5",
-    about: "two-joint planar arm brings its fingertip to a target",
+    about: "two-joint planar arm moves its fingertip to a target",
     control: "torque, ±1 (gear 200)",
-    source: "Gymnasium, batched, equal bit for bit",
+    source: "Gymnasium, batched, bit-identical",
     observation_len: 10,
     action_low: &[-1.0; 2],
     action_high: &[1.0; 2],
@@ -59,7 +59,7 @@ const PUSHER: TaskDefaults = TaskDefaults {
     id: "Pusher-v5",
     about: "seven-joint arm pushes a cylinder to a goal",
     control: "torque, ±2",
-    source: "Gymnasium, batched, equal bit for bit",
+    source: "Gymnasium, batched, bit-identical",
     observation_len: 23,
     action_low: &[-2.0; 7],
     action_high: &[2.0; 7],
@@ -84,8 +84,8 @@ const THROWER: TaskDefaults = TaskDefaults {
 const PANDA_REACH: TaskDefaults = TaskDefaults {
     name: "panda-reach",
     id: "dmprl/PandaReach-v0",
-    about: "Franka Panda brings its gripper to a goal",
-    control: "gripper displacement, ±1 = 5 cm a step",
+    about: "Franka Panda moves its gripper to a goal",
+    control: "gripper displacement, ±1 = 5 cm per step",
     source: "panda-gym's task, in MuJoCo",
     observation_len: 20,
     action_low: &[-1.0; 3],
@@ -99,7 +99,7 @@ const PANDA_REACH: TaskDefaults = TaskDefaults {
 const PANDA_REACH_JOINTS: TaskDefaults = TaskDefaults {
     name: "panda-reach-joints",
     id: "dmprl/PandaReachJoints-v0",
-    control: "joint displacement, ±1 = 0.05 rad a step",
+    control: "joint displacement, ±1 = 0.05 rad per step",
     action_low: &[-1.0; 7],
     action_high: &[1.0; 7],
     values: PANDA_REACH_JOINTS_VALUES,
@@ -109,7 +109,7 @@ const PANDA_REACH_JOINTS: TaskDefaults = TaskDefaults {
 const REACHER_V1: TaskDefaults = TaskDefaults {
     name: "reacher-v1",
     id: "dmprl/Reacher-v1",
-    about: "reacher as the paper had it: targets beyond reach, reward of the state before",
+    about: "the paper's reacher: some targets out of reach, reward of the previous state",
     source: "OpenAI Gym 0.9.4, on Gymnasium's model",
     observation_len: 11,
     ..REACHER
@@ -118,14 +118,14 @@ const REACHER_V1: TaskDefaults = TaskDefaults {
 const PUSHER_V0: TaskDefaults = TaskDefaults {
     name: "pusher-v0",
     id: "dmprl/Pusher-v0",
-    about: "pusher as the paper had it: other positions, reward of the state before",
+    about: "the paper's pusher: different positions, reward of the previous state",
     source: "OpenAI Gym 0.9.4, on Gymnasium's model",
     values: PUSHER_V0_VALUES,
     ..PUSHER
 };
 
 const THROWER_V0: TaskDefaults =
-    TaskDefaults { name: "thrower-v0", about: "another name of thrower", ..THROWER };
+    TaskDefaults { name: "thrower-v0", about: "alias of thrower", ..THROWER };
 
 /// Every task with a short name: the five tasks, then the paper's older versions.
 pub const TASKS: [TaskDefaults; 8] =
@@ -145,13 +145,13 @@ steps = 60000
 // Observation: joint angles (7), joint velocities (7), three positions (3 each).
 const ARM_VALUES: &[&str] = &[JOINTS, "[run]\nsteps = 200000"];
 
-// With half of this noise the arm rarely touched the cylinder: the return was -34 to -36, against
-// -25 and -31 with this value, after 60,000 steps (TD3, seeds from 5000). With 0.3 it was -37.
+// With half of this noise the arm rarely touched the cylinder. Returns after 60,000 steps (TD3,
+// seeds from 5000): -34 to -36 with 0.1, -25 and -31 with 0.2, -37 with 0.3.
 const PUSHER_V0_VALUES: &[&str] = &[ARM_VALUES[0], ARM_VALUES[1], "\n[exploration]\nstd = 0.2"];
 
-// The same observation. It does not contain the ball's landing point, which determines all later
-// rewards. With more updates, or with near-constant entries scaled up, TD3 forgets what it has
-// learned. A throw is a jerk: a smoothness penalty of a fifth of |Q| reduced the return.
+// Observation: as above. It lacks the ball's landing point, which determines all later rewards.
+// With more updates, or with normalisation, which scales up near-constant entries, TD3's return
+// drops again during a run. A throw needs a jerk: an action-rate penalty of 0.2 reduced the return.
 const THROWER_VALUES: &[&str] = &[
     ARM_VALUES[0],
     r#"
@@ -166,7 +166,7 @@ action_rate_penalty = 0.05
 "#,
 ];
 
-// Angles and velocities of seven joints, at the start of these observations.
+// Angles and velocities of seven joints are the first entries of these observations.
 const JOINTS: &str = r#"
 [task]
 start_sources = [
@@ -181,7 +181,7 @@ start_sources = [
 "#;
 
 // Observation: joint angles (7), joint velocities (7), goal - end effector (3), velocity of the end
-// effector (3). The start is the end effector's position relative to the goal.
+// effector (3). y0 is the end effector's position relative to the goal.
 const PANDA_REACH_VALUES: &[&str] = &[
     r#"
 [task]
@@ -200,7 +200,7 @@ discount = 0.95
 "#,
 ];
 
-// Small networks learn this task in fewer steps and in less time.
+// Smaller networks learn this task in fewer steps and less time.
 const PANDA_REACH_JOINTS_VALUES: &[&str] = &[
     JOINTS,
     PANDA_RUN,
@@ -214,8 +214,9 @@ critic_hidden = [128, 128]
 "#,
 ];
 
-// u = 1 moves the gripper or joint by 0.05 m or rad, so with 20 a robot follows its primitive's y.
-// Success takes few steps, so each may have more updates. The discount is from Table 2.
+// u = 1 moves the gripper or joint by 0.05 m or rad, so with `position_scale = 20` the robot
+// follows the DMP's y. These tasks are solved in few steps, which leaves time for more updates per
+// step. The discount is from Table 2.
 const PANDA_RUN: &str = r#"
 [run]
 steps = 30000
@@ -237,7 +238,7 @@ capacity_steps = 100000
 "#];
 
 impl TaskDefaults {
-    /// The spec that the environment will report; without names of observations.
+    /// Returns the spec that the environment reports, without names of observations.
     #[must_use]
     pub fn spec(&self) -> EnvSpec {
         EnvSpec {
@@ -252,7 +253,7 @@ impl TaskDefaults {
         }
     }
 
-    /// The task's values, name and id included.
+    /// Returns the task's values, including its name and id.
     ///
     /// # Panics
     /// Never for the built-in tasks: a test parses each.
@@ -266,7 +267,7 @@ impl TaskDefaults {
         table
     }
 
-    /// Values merged over a preset for this task.
+    /// Returns the values that are merged over a preset for this task.
     ///
     /// # Panics
     /// Never for the built-in tasks: a test parses each.
@@ -277,7 +278,7 @@ impl TaskDefaults {
     }
 }
 
-/// The defaults of a task by its short name.
+/// Returns the defaults of the task with this short name.
 #[must_use]
 pub fn task_defaults(name: &str) -> Option<&'static TaskDefaults> {
     TASKS.iter().find(|task| task.name == name)
@@ -312,7 +313,7 @@ mod tests {
     }
 
     #[test]
-    fn the_paper_has_a_column_for_the_panda() {
+    fn preset_paper_uses_the_panda_column_of_table_2() {
         for (name, discount, actor, warm_up, capacity) in [
             ("reacher-v1", 0.99, 5e-4, 10_000, 1_000_000),
             ("panda-reach", 0.95, 3e-4, 2_000, 100_000),

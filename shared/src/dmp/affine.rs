@@ -1,20 +1,20 @@
 //! The fast map of a segment, in controller units.
 //!
-//! It runs for every decision and every sample of an update: batch times action dimensions. It
-//! therefore allocates nothing and vectorises.
+//! It runs for every decision and every sample of an update, once per action dimension. It does not
+//! allocate, and the compiler vectorises it.
 
 use super::{Dmp, STATE_INPUTS};
 use crate::config::ForcingScaling;
 
-/// Rows of a product that are computed together: two SSE registers or one AVX register of f32.
+/// Rows of a product that are computed together: two SSE registers or one AVX register.
 const LANES: usize = 8;
 
 /// Maps (y0, yd0, g, w) to the K samples that the inverse controller reads, in f32, for one action
 /// dimension.
 ///
-/// Controller units: samples are (y, yd / omega, ydd / omega^2), all of the size of y. Weights are
-/// the network's bounded outputs; `weight_scale` (weight_range * omega^2) is part of the matrix.
-/// The matrix is computed in f64 and rounded once, so it is as accurate as f32 allows.
+/// In controller units, samples are (y, yd / omega, ydd / omega^2), all of similar size. Weights
+/// are the network's bounded outputs; `weight_scale` (weight_range * omega^2) is part of the
+/// matrix. The matrix is computed in f64 and rounded once, so it is as accurate as f32 allows.
 ///     samples = M_s (y0, yd0, g) + factor M_w w,     factor = 1 or g - y0 (goal scaling)
 #[derive(Debug, Clone, PartialEq)]
 pub struct SegmentMap {
@@ -28,7 +28,7 @@ pub struct SegmentMap {
 }
 
 impl SegmentMap {
-    /// Scales and rounds the matrix of `dmp`.
+    /// Creates the map from the matrix of `dmp`.
     /// - `weight_scale`: DMP weight per unit of network output, weight_range * omega^2 \[u/s^2\].
     #[must_use]
     pub fn new(dmp: &Dmp, weight_scale: f64) -> Self {
@@ -51,13 +51,13 @@ impl SegmentMap {
         }
     }
 
-    /// Inputs of one dimension, 3 + N.
+    /// Number of inputs of one dimension, 3 + N.
     #[must_use]
     pub fn input_count(&self) -> usize {
         self.inputs
     }
 
-    /// Samples of one dimension, 3K.
+    /// Number of samples of one dimension, 3K.
     #[must_use]
     pub fn sample_count(&self) -> usize {
         3 * self.segment_steps
@@ -109,8 +109,8 @@ impl SegmentMap {
         }
     }
 
-    /// End state of the segment in DMP units: (y_K, yd_K), the next segment's (y0, yd0) under
-    /// `carry`.
+    /// Returns the end state of the segment in DMP units, (y_K, yd_K). With `start = "carry"` it is
+    /// the next segment's (y0, yd0).
     /// - `samples`: (3K,) from [`forward`](Self::forward).
     /// # Panics
     /// If the length is wrong.
@@ -133,9 +133,9 @@ impl SegmentMap {
     }
 }
 
-/// A matrix in blocks of [`LANES`] rows, each stored column by column and padded with zeros. A
-/// product keeps one block's sums in registers, and needs neither a horizontal sum nor a remainder
-/// loop.
+/// A matrix in blocks of [`LANES`] rows, each stored column by column and padded with zeros.
+///
+/// A product keeps a block's sums in registers and needs no horizontal sum and no remainder loop.
 #[derive(Debug, Clone, PartialEq)]
 struct Panels {
     columns: usize,

@@ -1,10 +1,10 @@
-//! The fast map against the stepped reference, and its gradients against finite differences.
+//! Compares the fast map with the stepped reference, and its gradients with finite differences.
 
 use super::test_support::{Draw, INTEGRATORS, every_config};
 use super::*;
 use crate::config::{DmpConfig, ForcingScaling};
 
-/// Samples K of a path in DMP units, as `Dmp::matrix` orders them.
+/// Returns the K samples of a path in DMP units, in the order of `Dmp::matrix`.
 fn samples_of(path: &Trajectory<f64>, k_count: usize) -> Vec<f64> {
     let every = (path.y.len() - 1) / k_count;
     let pick = |values: &[f64]| (1..=k_count).map(|k| values[k * every]).collect::<Vec<_>>();
@@ -20,7 +20,7 @@ fn distance(a: &[f64], b: &[f64]) -> f64 {
     norm(a.iter().zip(b).map(|(a, b)| a - b))
 }
 
-/// (y0, yd0, g, w..) with weights divided by `weight_scale`, as a policy passes them to the map.
+/// Returns the map's inputs (y0, yd0, g, w..), with weights divided by `weight_scale`.
 fn inputs_of(start: State<f64>, goal: f64, weights: &[f64], weight_scale: f64) -> Vec<f64> {
     let weights = weights.iter().map(|w| w / weight_scale);
     [start.y, start.yd, goal].into_iter().chain(weights).collect()
@@ -109,8 +109,8 @@ fn stepping_in_f32_agrees_with_f64_to_1e_5() {
     }
 }
 
-/// A loss of the actions for which the gradient of every sample differs: sum_k (k + 1) u_k, plus
-/// the end state's y and yd / omega.
+/// Returns sum_k (k + 1) u_k plus the end state's y and yd / omega, a loss whose gradient is
+/// different for every sample.
 fn loss(map: &SegmentMap, inputs: &[f32], rho: &[f32; 4]) -> f64 {
     let k_count = map.sample_count() / 3;
     let (mut samples, mut actions) = (vec![0.0; 3 * k_count], vec![0.0; k_count]);
@@ -178,8 +178,8 @@ fn gradients_through_map_and_inverse_controller_match_central_differences() {
 
 #[test]
 fn backward_of_the_map_is_the_transpose_of_its_jacobian_up_to_rounding() {
-    // Forward is affine in each single input (bilinear with goal scaling), so central differences
-    // are exact up to rounding, for any step. This check is sharper than one through the tanh.
+    // The map is affine in each single input (bilinear with goal scaling), so central differences
+    // are exact up to rounding for any step. That allows a smaller tolerance than with the tanh.
     let mut draw = Draw::new("transpose", 0);
     for config in every_config() {
         let dmp = Dmp::new(&config, 5).unwrap();
@@ -203,7 +203,7 @@ fn backward_of_the_map_is_the_transpose_of_its_jacobian_up_to_rounding() {
 }
 
 #[test]
-fn goal_scaled_weights_are_mute_where_goal_meets_start_but_still_steer_the_goals_gradient() {
+fn goal_scaled_weights_have_no_effect_at_the_start_but_change_the_goals_gradient() {
     let config = DmpConfig { forcing_scaling: ForcingScaling::Goal, ..DmpConfig::default() };
     let dmp = Dmp::new(&config, 5).unwrap();
     let map = SegmentMap::new(&dmp, 25.0);

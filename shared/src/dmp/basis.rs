@@ -1,4 +1,4 @@
-//! Gaussian basis functions of the phase. Called by `forcing`.
+//! Gaussian basis functions of the phase. Used by `forcing`.
 
 use super::DmpError;
 use crate::config::BasisWidths;
@@ -12,10 +12,10 @@ pub struct Basis {
 }
 
 impl Basis {
-    /// Creates N functions with centres equally spaced in time, c_i = exp(-alpha_x t_i) with t from
-    /// 0 to 1.
+    /// Creates N functions whose centres are equally spaced in time: c_i = exp(-alpha_x t_i) with
+    /// t_i from 0 to 1.
     ///
-    /// The paper does not specify sigma_i; [`BasisWidths`] lists the interpretations.
+    /// The paper does not specify sigma_i. [`BasisWidths`] lists the alternatives.
     /// - `count`: N.
     /// # Errors
     /// `Parameter` if `count` is zero (or one with `overlap`, which needs a neighbour) or `alpha_x`
@@ -83,9 +83,9 @@ impl Basis {
     /// Computes the normalised activations psi_i / sum psi at phase `x`; they sum to one.
     /// - `out`: (N,), overwritten.
     ///
-    /// The largest exponent is subtracted from all, as in a softmax. Far from every centre all psi
-    /// would otherwise underflow to 0 / 0. Other implementations add an epsilon to the denominator
-    /// instead.
+    /// The largest exponent is subtracted from all, as in a softmax. Otherwise, far from every
+    /// centre, all psi would underflow and the result would be 0 / 0. Other implementations add an
+    /// epsilon to the denominator instead.
     /// # Panics
     /// If `out` is not N long.
     pub fn normalised(&self, x: f64, out: &mut [f64]) {
@@ -104,7 +104,8 @@ impl Basis {
     }
 }
 
-/// Widths for which each basis function is 0.8 at the next centre; the last repeats the one before.
+/// Returns widths for which each basis function is 0.8 at the next centre. The last width equals
+/// the one before it.
 fn overlap_widths(centres: &[f64]) -> Vec<f64> {
     let width = |pair: &[f64]| -(0.8_f64.ln()) / (pair[1] - pair[0]).powi(2);
     let mut widths: Vec<f64> = centres.windows(2).map(width).collect();
@@ -123,9 +124,9 @@ mod tests {
         }
     }
 
-    /// Values of Neural Dynamic Policies' released code (research/algorithms.md, section 1).
+    /// Expected values: computed with the released code of Neural Dynamic Policies.
     #[test]
-    fn centres_and_widths_are_those_of_neural_dynamic_policies() {
+    fn centres_and_widths_match_neural_dynamic_policies() {
         let five = Basis::new(5, 1.0, BasisWidths::Ndp).unwrap();
         assert_close(five.centres(), &[1.0, 0.7788, 0.6065, 0.4724, 0.3679], 5e-5);
         assert_close(five.widths(), &[11.18, 14.36, 18.43, 23.67, 30.39], 6e-3);
@@ -135,7 +136,7 @@ mod tests {
     }
 
     #[test]
-    fn overlapping_neighbours_are_worth_0_8_at_the_next_centre() {
+    fn overlap_widths_give_0_8_at_the_next_centre() {
         let basis = Basis::new(6, 1.0, BasisWidths::Overlap).unwrap();
         let (c, h) = (basis.centres(), basis.widths());
         for i in 0..5 {
@@ -155,7 +156,7 @@ mod tests {
     }
 
     #[test]
-    fn impossible_bases_are_refused() {
+    fn invalid_bases_are_rejected() {
         assert!(Basis::new(0, 1.0, BasisWidths::Ndp).is_err());
         assert!(Basis::new(1, 1.0, BasisWidths::Ndp).is_ok());
         assert!(Basis::new(1, 1.0, BasisWidths::Overlap).is_err());

@@ -1,19 +1,18 @@
-//! Canonical system: the phase, which replaces time. Used by `primitive`.
+//! Canonical system: the phase, which replaces explicit time. Used by `primitive`.
 
 use crate::config::CanonicalIntegration;
 
-/// The phase's decay from x_0 = 1 towards 0.
+/// The canonical system, whose phase x decays from x_0 = 1 towards 0.
 ///     tau xd = -alpha_x x      (paper, section 2.3)
-/// Differs from the paper: x advances *before* the basis functions are evaluated, so the first
-/// integration step uses x_1. The paper leaves the order open; Neural Dynamic Policies uses this
-/// one.
+/// x advances *before* the basis functions are evaluated, so the first integration step uses x_1.
+/// The paper does not specify this order; Neural Dynamic Policies uses it.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct CanonicalSystem {
     /// Decay alpha_x.
     pub alpha_x: f64,
     /// Duration tau \[s\].
     pub tau: f64,
-    /// Integration of x.
+    /// How x is integrated.
     pub integration: CanonicalIntegration,
 }
 
@@ -54,7 +53,7 @@ mod tests {
     }
 
     #[test]
-    fn exact_phase_ends_at_one_over_e_whatever_tau_and_step() {
+    fn exact_phase_ends_at_one_over_e_for_any_tau_and_step() {
         for (tau, steps) in [(1.0, 40), (0.5, 40), (3.0, 7)] {
             let x = phases(CanonicalIntegration::Exact, tau, steps);
             assert!((x[steps] - (-1.0_f64).exp()).abs() < 1e-15);

@@ -5,7 +5,7 @@ use super::*;
 use crate::config::{CanonicalIntegration, DmpConfig, Integrator};
 
 /// Solves the differential equation with the exact phase by the classical Runge-Kutta method in
-/// 4000 steps, whose error is far below those measured. Returns y and yd at the five sample times.
+/// 4000 steps. Its error is far below the measured errors. Returns y and yd at five sample times.
 fn reference(dmp: &Dmp, start: State<f64>, goal: f64, weights: &[f64]) -> [State<f64>; 5] {
     let (steps, omega) = (4000, dmp.omega());
     let dt = 1.0 / f64::from(steps);
@@ -37,7 +37,7 @@ fn reference(dmp: &Dmp, start: State<f64>, goal: f64, weights: &[f64]) -> [State
     sampled
 }
 
-/// Largest errors of y and yd over the sample times and several random parameters.
+/// Returns the largest errors of y and yd over the sample times and several random parameters.
 fn errors(config: &DmpConfig) -> [f64; 2] {
     let dmp = Dmp::new(config, 5).unwrap();
     let mut draw = Draw::new("convergence", 0);
@@ -54,8 +54,9 @@ fn errors(config: &DmpConfig) -> [f64; 2] {
     worst
 }
 
-/// All three are of first order in y and yd, including `semi_implicit`, which is symplectic Euler
-/// (its second-order relatives need half steps). They differ in their stability limit.
+/// All three integrators are of first order in y and yd, including `semi_implicit`, which is
+/// symplectic Euler (its second-order variants need half steps). They differ in their stability
+/// limit.
 #[test]
 fn every_integrator_converges_with_first_order_in_y_and_yd() {
     for integrator in INTEGRATORS {
@@ -88,12 +89,12 @@ fn every_integrator_converges_with_first_order_in_y_and_yd() {
     }
 }
 
-/// Spectral radius of one unforced step on (y, yd, ydd): |A^n|^(1/n) with n = 2^40, by repeated
-/// squaring, which also works for a defective or complex pair.
+/// Computes the spectral radius of one unforced step on (y, yd, ydd): |A^n|^(1/n) with n = 2^40, by
+/// repeated squaring. This also works for defective matrices and complex eigenvalues.
 fn spectral_radius(integrator: Integrator, alpha_y: f64, dt: f64) -> f64 {
     let system = TransformationSystem { alpha_y, tau: 1.0, dt, integrator };
     let mut power = [[0.0; 3]; 3];
-    // The transpose, which has the same eigenvalues.
+    // Uses the transposed matrix, which has the same eigenvalues.
     for (column, response) in power.iter_mut().enumerate() {
         let unit = |row| f64::from(u8::from(row == column));
         let next = system.step(Sample { y: unit(0), yd: unit(1), ydd: unit(2) }, 0.0, 0.0);
@@ -130,9 +131,9 @@ fn spectral_radius_crosses_one_at_the_limit_of_each_integrator() {
     }
 }
 
-/// Values of the stability table in research/algorithms.md, section 1.
+/// Expected values: eigenvalues of the step matrices, computed separately.
 #[test]
-fn spectral_radii_at_the_default_step_are_those_of_the_research() {
+fn spectral_radii_at_the_default_step_match_a_separate_computation() {
     let table = [
         (Integrator::Explicit, [0.9375, 0.875, 0.8125, 0.6875]),
         (Integrator::Paper, [0.949, 0.905, 0.863, 0.819]),

@@ -5,7 +5,7 @@ use thiserror::Error;
 /// Why a DMP cannot be built, or cannot imitate a demonstration.
 #[derive(Debug, Clone, PartialEq, Error)]
 pub enum DmpError {
-    /// A parameter outside the range in which the equations make sense.
+    /// A parameter out of range.
     #[error("{name}: expected {expected}, got {got}")]
     Parameter {
         /// Name of the parameter in the configuration.
@@ -35,8 +35,7 @@ pub enum DmpError {
         /// The actual value.
         got: f64,
     },
-    /// With goal scaling the forcing term vanishes if goal and start coincide, so no weights can
-    /// shape the motion.
+    /// Goal and start coincide. With goal scaling the forcing term is then zero for all weights.
     #[error("goal {goal} and start {start} coincide: forcing_scaling = \"goal\" cannot imitate")]
     GoalEqualsStart {
         /// The demonstration's goal.
@@ -44,7 +43,8 @@ pub enum DmpError {
         /// The demonstration's start.
         start: f64,
     },
-    /// Too few samples, or too similar basis functions, to determine every weight.
+    /// The demonstration does not determine every weight: it has too few samples, or the basis
+    /// functions are too similar.
     #[error(
         "weight {weight} is not determined by the demonstration: use fewer basis functions \
              or more integration steps"

@@ -4,7 +4,7 @@
 use super::Basis;
 use crate::config::ForcingScaling;
 
-/// Computes the features of the forcing term at phase `x`, the factors of the weights.
+/// Computes the features of the forcing term at phase `x`, which are the factors of the weights.
 ///     phi_i(x) = x psi_i(x) / sum_j psi_j(x)      (paper, equation 9)
 /// - `out`: (N,), overwritten.
 /// # Panics
@@ -16,7 +16,7 @@ pub fn features(basis: &Basis, x: f64, out: &mut [f64]) {
     }
 }
 
-/// The matrix Phi of the paper's equation 12, transposed: features at each phase.
+/// Computes the features at each phase: the transposed matrix Phi of the paper's equation 12.
 /// - `phases`: (T,).
 /// - Returns (T, N), row-major.
 #[must_use]
@@ -28,7 +28,7 @@ pub fn feature_matrix(basis: &Basis, phases: &[f64]) -> Vec<f64> {
     matrix
 }
 
-/// Forcing term at phase `x`, before goal scaling.
+/// Computes the forcing term at phase `x`, before goal scaling.
 ///     f(x) = sum_i phi_i(x) w_i      (paper, equation 9)
 /// - `weights`: (N,) \[u/s^2\].
 /// # Panics
@@ -41,7 +41,8 @@ pub fn forcing(basis: &Basis, x: f64, weights: &[f64]) -> f64 {
     phi.iter().zip(weights).map(|(phi, w)| phi * w).sum()
 }
 
-/// Factor on the forcing term: 1, or g - y0 (not in the paper; Neural Dynamic Policies).
+/// Returns the factor on the forcing term: 1, or g - y0 as in Neural Dynamic Policies (not in the
+/// paper).
 #[must_use]
 pub fn forcing_factor(scaling: ForcingScaling, y0: f64, goal: f64) -> f64 {
     match scaling {
@@ -70,7 +71,7 @@ mod tests {
     }
 
     #[test]
-    fn equal_weights_force_by_weight_times_phase() {
+    fn forcing_of_equal_weights_is_weight_times_phase() {
         let basis = Basis::new(5, 1.0, BasisWidths::Ndp).unwrap();
         for x in [1.0, 0.975, 0.5, 0.36] {
             assert!((forcing(&basis, x, &[7.0; 5]) - 7.0 * x).abs() < 1e-12);

@@ -1,8 +1,8 @@
-//! The DMP's building blocks against two public packages.
+//! Compares the DMP's building blocks with two public packages.
 //!
-//! tests/golden/dmp/make_golden.py made the numbers in tests/golden/dmp/golden.json with
+//! tests/golden/dmp/make_golden.py computed the numbers in tests/golden/dmp/golden.json with
 //! movement_primitives 0.9.1 and mp-pytorch 0.1.4. Both step semi-implicitly with an exact phase.
-//! Where they differ from our defaults otherwise, the tests compose the parts accordingly.
+//! Where they otherwise differ from our defaults, the tests combine our parts to match them.
 
 use super::*;
 use crate::config::{BasisWidths, CanonicalIntegration, Integrator};
@@ -21,7 +21,8 @@ impl Case {
         self.0[key].as_array().expect(key).iter().map(|v| v.as_f64().expect(key)).collect()
     }
 
-    /// The trajectory with this basis; step j of the package uses the phase x_{j - `phase_delay`}.
+    /// Computes the case's trajectory with `basis`. Step j uses the phase x_{j - `phase_delay`}, as
+    /// the package does.
     fn movement(&self, basis: &Basis, phase_delay: usize) -> Trajectory<f64> {
         let tau = self.number("tau");
         let steps = (self.number("inner_steps") as usize) * (self.numbers("y").len() - 1);
@@ -53,8 +54,8 @@ impl Case {
     }
 }
 
-/// Tolerance: 1e-12 of the largest value. The packages sum in another order, and one accumulates
-/// its time.
+/// Compares with a tolerance of 1e-12 of the largest value. The packages sum in a different order,
+/// and one of them accumulates its time.
 fn assert_close(got: &[f64], expected: &[f64], what: &str) {
     assert_eq!(got.len(), expected.len(), "{what}");
     let size = expected.iter().fold(0.0_f64, |max, v| max.max(v.abs()));

@@ -1,6 +1,6 @@
-//! Imitation: the weights with which a DMP follows a demonstrated movement.
+//! Imitation: computes the weights with which a DMP follows a demonstrated movement.
 //!
-//! Training does not use it. It can initialise a policy from a demonstration, and serves tests.
+//! Training does not use it; tests do.
 
 use super::least_squares::solve;
 use super::{Dmp, DmpError, Trajectory, forcing_factor};
@@ -18,28 +18,30 @@ pub struct Imitation {
     pub weights: Vec<f64>,
 }
 
-/// Fits a DMP that follows `demonstration` to its last position (paper, equations 11 and 12).
-/// - `demonstration`: m + 1 samples at the DMP's own steps, in DMP time (tau = 1). `ydd[j]` is the
-///   acceleration between samples j - 1 and j, as in [`Dmp::integrate`]; `ydd[0]` is not read.
+/// Fits a DMP to `demonstration`, with the last position as goal (paper, equations 11 and 12).
+/// - `demonstration`: m + 1 samples at the DMP's integration steps, in DMP time (tau = 1). `ydd[j]`
+///   is the acceleration between samples j - 1 and j, as in [`Dmp::integrate`]; `ydd[0]` is not
+///   used.
 /// # Errors
-/// As [`fit_weights`].
+/// The errors of [`fit_weights`].
 pub fn imitate(dmp: &Dmp, demonstration: &Trajectory<f64>) -> Result<Imitation, DmpError> {
     check(dmp, demonstration)?;
     let goal = demonstration.y[dmp.integration_steps()];
     Ok(Imitation { goal, weights: fit_weights(dmp, demonstration, goal)? })
 }
 
-/// Fits the weights for which the DMP with goal `goal` comes closest to the demonstration's
-/// accelerations.
+/// Fits the weights of a DMP with goal `goal` to the demonstration's accelerations by least
+/// squares.
 ///     f_j = tau^2 ydd_j - alpha_y (beta_y (g - y_{j-1}) - tau yd_{j-1})     (paper, equation 11)
 ///     w = argmin |Phi w - f|^2 = (Phi^T Phi)^-1 Phi^T f                     (paper, equation 12)
-/// Differs from the paper: y and yd are taken one step before ydd, as the integrators do, so that
-/// the DMP's own movements give back their weights exactly. With goal scaling f is first divided by
-/// g - y0.
+/// Differs from the paper: y and yd are taken one step before ydd, as in the integrators, so that
+/// the weights of a DMP's own movement are recovered exactly. With goal scaling f is first divided
+/// by g - y0.
 /// - `demonstration`: as in [`imitate`].
 /// # Errors
-/// `Shape` or `NotFinite` unless each is m + 1 finite samples; `RankDeficient` if it does not
-/// determine the weights; `GoalEqualsStart` with goal scaling.
+/// `Shape` or `NotFinite` unless y, yd and ydd are m + 1 finite samples each; `RankDeficient` if
+/// the demonstration does not determine the weights; `GoalEqualsStart` if goal and start coincide,
+/// with goal scaling only.
 pub fn fit_weights(
     dmp: &Dmp,
     demonstration: &Trajectory<f64>,
@@ -88,7 +90,7 @@ mod tests {
         }
     }
 
-    /// Largest deviation from the path, whose length is 1.
+    /// Returns the largest deviation from the minimum-jerk path, whose length is 1.
     fn deviation(config: &DmpConfig) -> f64 {
         let dmp = Dmp::new(config, 5).unwrap();
         let path = minimum_jerk(config.integration_steps);
@@ -98,7 +100,7 @@ mod tests {
     }
 
     #[test]
-    fn imitating_a_dmp_gives_back_its_weights_in_every_configuration() {
+    fn imitating_a_dmp_recovers_its_weights_in_every_configuration() {
         let mut draw = Draw::new("imitation", 0);
         for config in every_config() {
             let dmp = Dmp::new(&config, 5).unwrap();
@@ -112,8 +114,8 @@ mod tests {
         }
     }
 
-    /// Measured: a deviation of at most 6.6 % of the path with three weights, and 3.8 % with four
-    /// to six.
+    /// Measured deviations: at most 6.6 % of the path with three weights, and 3.8 % with four to
+    /// six.
     #[test]
     fn minimum_jerk_path_is_reproduced_in_every_configuration() {
         for config in every_config() {
@@ -124,7 +126,7 @@ mod tests {
     }
 
     #[test]
-    fn minimum_jerk_path_is_followed_ever_closer_with_more_basis_functions_and_smaller_steps() {
+    fn more_basis_functions_and_smaller_steps_reduce_the_deviation() {
         let with = |basis_count, integration_steps| {
             deviation(&DmpConfig { basis_count, integration_steps, ..DmpConfig::default() })
         };
@@ -133,7 +135,7 @@ mod tests {
     }
 
     #[test]
-    fn demonstrations_that_determine_nothing_are_refused() {
+    fn invalid_demonstrations_are_rejected() {
         let config = DmpConfig { forcing_scaling: ForcingScaling::Goal, ..DmpConfig::default() };
         let dmp = Dmp::new(&config, 5).unwrap();
         let mut back_and_forth = minimum_jerk(40);
@@ -144,9 +146,9 @@ mod tests {
             imitate(&dmp, &short),
             Err(DmpError::Shape { expected: 41, got: 40, .. })
         ));
-        let mut broken = minimum_jerk(40);
-        broken.ydd[7] = f64::NAN;
-        assert!(matches!(imitate(&dmp, &broken), Err(DmpError::NotFinite { index: 7, .. })));
+        let mut with_nan = minimum_jerk(40);
+        with_nan.ydd[7] = f64::NAN;
+        assert!(matches!(imitate(&dmp, &with_nan), Err(DmpError::NotFinite { index: 7, .. })));
         let many = DmpConfig { basis_count: 41, ..DmpConfig::default() };
         let many = Dmp::new(&many, 5).unwrap();
         assert!(matches!(

@@ -1,11 +1,10 @@
-//! Inverse controllers, which compute a segment's actions from its samples, one action dimension at
-//! a time.
+//! Controllers, which compute a segment's actions from its samples, one action dimension at a time.
 //!
-//! There are two: the paper's adaptive controller, a single tanh neuron whose weights rho the
-//! policy outputs (section 3.2), and the position controller of Neural Dynamic Policies. Neither
-//! allocates.
+//! There are two: the paper's adaptive inverse controller (section 3.2), a single tanh neuron whose
+//! weights rho are outputs of the policy, and the position controller of Neural Dynamic Policies.
+//! Neither allocates.
 
-/// Computes the adaptive inverse controller before its tanh.
+/// Computes the output of the adaptive inverse controller, before its tanh.
 ///     v_k = rho_1 y_k + rho_2 yd_k / omega + rho_3 ydd_k / omega^2 + rho_4,     u_k = tanh(v_k)
 /// Differs from the paper: velocity and acceleration are divided by omega and omega^2, because at
 /// alpha_y = 25 the acceleration is about 150 times the position and would saturate the tanh.
@@ -19,7 +18,7 @@ pub fn act(samples: &[f32], rho: &[f32; 4], values: &mut [f32]) {
     }
 }
 
-/// Computes the gradients of [`act`] and returns the one with respect to rho.
+/// Computes the gradients of [`act`]. Returns the gradient with respect to rho.
 /// - `values_gradient`: with respect to v, (K,). `samples_gradient`: (3K,), overwritten.
 /// # Panics
 /// If a length is wrong.
@@ -58,8 +57,8 @@ pub fn act_position(y0: f32, samples: &[f32], position_scale: f32, actions: &mut
     }
 }
 
-/// Computes the gradients of [`act_position`] and returns the direct one with respect to y0 (the
-/// samples depend on y0 as well).
+/// Computes the gradients of [`act_position`]. Returns the gradient with respect to its argument
+/// `y0`, on which the samples depend as well.
 /// - `actions_gradient`: (K,). `samples_gradient`: (3K,), overwritten.
 /// # Panics
 /// If `samples_gradient` is not three times as long as `actions_gradient`.
@@ -78,7 +77,7 @@ pub fn act_position_backward(
     -position_scale * actions_gradient.first().copied().unwrap_or(0.0)
 }
 
-/// Positions, velocities and accelerations, (K,) each.
+/// Splits samples into positions, velocities and accelerations, (K,) each.
 fn kinds(samples: &[f32], k_count: usize) -> [&[f32]; 3] {
     assert_eq!(samples.len(), 3 * k_count, "3K samples for K actions");
     [&samples[..k_count], &samples[k_count..2 * k_count], &samples[2 * k_count..]]
@@ -106,7 +105,8 @@ mod tests {
         for (got, expected) in actions.iter().zip([2.0, -2.0, 5.0]) {
             assert!((got - expected).abs() < 1e-6);
         }
-        // u = 10 (y1 - y0, y2 - y1, y3 - y2), so d(u . (1, 2, 4)) is -10 for y0, then:
+        // u = 10 (y1 - y0, y2 - y1, y3 - y2), so d(u . (1, 2, 4)) / d(y0, y1, y2, y3) is
+        // (-10, -10, -20, 40).
         let mut gradient = [7.0; 9];
         assert_eq!(act_position_backward(10.0, &[1.0, 2.0, 4.0], &mut gradient), -10.0);
         assert_eq!(gradient, [-10.0, -20.0, 40.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0]);

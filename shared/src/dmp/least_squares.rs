@@ -1,10 +1,10 @@
 //! Linear least squares by Householder QR, for `imitation`.
 //!
-//! The normal equations of the paper's equation 12 would square the condition number, and
-//! neighbouring basis functions overlap. Measured relative errors of recovered weights, QR and
-//! Cholesky: 4e-16 and 2e-14 with N = 5, 2e-12 and 2e-5 with N = 20 (`ndp` widths). Both have the
-//! same minimum, and 40 x 5 values are cheap either way. There is no regularisation, because it
-//! would bias the weights; a rank-deficient matrix is reported instead.
+//! The normal equations of the paper's equation 12 have the same solution, but they square the
+//! condition number, which is large because neighbouring basis functions overlap. Measured relative
+//! errors of recovered weights (`ndp` widths): 4e-16 with QR and 2e-14 with Cholesky for N = 5,
+//! 2e-12 and 2e-5 for N = 20. With 40 x 5 values both are cheap. There is no regularisation,
+//! because it would bias the weights; a rank-deficient matrix is an error instead.
 
 /// Smallest diagonal entry of R, relative to the largest, for full rank.
 const RANK_TOLERANCE: f64 = 1e-12;
@@ -12,7 +12,8 @@ const RANK_TOLERANCE: f64 = 1e-12;
 /// Returns the vector that minimises |matrix * vector - target|.
 /// - `matrix`: (R, C), row-major. `target`: (R,).
 /// # Errors
-/// The index of the first column that (nearly) depends on those before it, or that has no row left.
+/// The index of the first column that is (nearly) a linear combination of the columns before it, or
+/// for which there are too few rows.
 /// # Panics
 /// If the lengths do not match.
 pub(super) fn solve(matrix: &[f64], columns: usize, target: &[f64]) -> Result<Vec<f64>, usize> {
@@ -21,7 +22,7 @@ pub(super) fn solve(matrix: &[f64], columns: usize, target: &[f64]) -> Result<Ve
     if rows < columns {
         return Err(rows);
     }
-    // Columns, then the target, so that reflections act on contiguous slices.
+    // Stores the columns and then the target, so that reflections act on contiguous slices.
     let mut work: Vec<Vec<f64>> =
         (0..columns).map(|c| matrix.iter().skip(c).step_by(columns).copied().collect()).collect();
     work.push(target.to_vec());
@@ -42,8 +43,9 @@ pub(super) fn solve(matrix: &[f64], columns: usize, target: &[f64]) -> Result<Ve
     Ok(solution)
 }
 
-/// Reflects `column` onto its first axis, and all of `rest` (from `first` on) with it. Returns the
-/// diagonal entry of R. `column` then contains the reflection's direction.
+/// Applies the Householder reflection that maps `column` onto its first axis to all of `rest`, from
+/// index `first` on. Returns the diagonal entry of R and leaves the reflection's direction in
+/// `column`.
 fn reflect(column: &mut [f64], rest: &mut [Vec<f64>], first: usize) -> f64 {
     let norm = column.iter().map(|v| v * v).sum::<f64>().sqrt();
     // This sign avoids cancellation.
@@ -67,7 +69,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn line_through_four_points_is_the_one_of_the_textbook() {
+    fn line_fit_through_four_points_matches_a_value_worked_by_hand() {
         // y = a + b t through (1, 6), (2, 5), (3, 7), (4, 10): a = 3.5, b = 1.4.
         let solution =
             solve(&[1.0, 1.0, 1.0, 2.0, 1.0, 3.0, 1.0, 4.0], 2, &[6.0, 5.0, 7.0, 10.0]).unwrap();

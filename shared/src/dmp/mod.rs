@@ -1,10 +1,10 @@
-//! Stages 3 and 6 of 8: dynamic movement primitives, which turn a decision (g, w, rho) into the
+//! Stages 3 and 6 of 8: dynamic movement primitives, which map a decision (g, w, rho) to the
 //! actions of a segment.
 //!
 //! `policy` calls this module once per action dimension. "The paper" is "Efficient Robot
 //! Manipulation via Reinforcement Learning with Dynamic Movement Primitives-Based Policy" (Appl.
-//! Sci. 2024, 14, 10665), with equations 8 to 14. Each item names its differences from the paper
-//! and its interpretation of ambiguous passages.
+//! Sci. 2024, 14, 10665), equations 8 to 14. Each item documents its differences from the paper and
+//! its reading of ambiguous passages.
 //!
 //! | symbol | meaning | unit (DMP time, tau = 1) |
 //! |---|---|---|
@@ -26,10 +26,10 @@
 //!
 //! "u" is the unit of y (an angle, a torque as a fraction of its bound, ...).
 //!
-//! A segment can be computed in two ways. [`Dmp::integrate`] steps the differential equation and is
-//! the reference. [`SegmentMap`] is used in production: the whole segment is an affine map of (y0,
-//! yd0, g, w) with constant coefficients, that is, one small product, whose gradient is the
-//! transposed product. Tests compare the two.
+//! There are two implementations. [`Dmp::integrate`] steps the differential equation and is the
+//! reference. [`SegmentMap`] is used in production: a segment is an affine map of (y0, yd0, g, w)
+//! with constant coefficients, so it is one small matrix product, whose gradient is the product
+//! with the transposed matrix. Tests compare the two.
 
 mod affine;
 mod basis;

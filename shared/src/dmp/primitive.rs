@@ -1,6 +1,6 @@
-//! One DMP with its constants: phases, features, steps, and the matrix of a whole segment.
+//! A DMP with precomputed constants: phases, features, and the matrix of a whole segment.
 //!
-//! It is built once per run from the configuration. `SegmentMap` derives the fast map from it.
+//! It is built once from the configuration. `SegmentMap` derives the fast map from it.
 
 use super::{
     Basis, CanonicalSystem, DmpError, State, Trajectory, TransformationSystem, feature_matrix,
@@ -8,7 +8,7 @@ use super::{
 };
 use crate::config::{DmpConfig, ForcingScaling};
 
-/// Number of the map's inputs before the weights: y0, yd0, g.
+/// Number of the map's inputs that precede the weights: y0, yd0, g.
 pub const STATE_INPUTS: usize = 3;
 
 /// A DMP with duration tau = 1 per segment, shared by all action dimensions.
@@ -31,9 +31,12 @@ impl Dmp {
     /// Creates a DMP and computes its constants.
     /// - `segment_steps`: K.
     /// # Errors
-    /// `Parameter` if m is not a multiple of K, or either is zero; if `alpha_y` is not positive or
-    /// unstable with m steps ([`crate::config::Integrator::alpha_y_max`]); if `alpha_x` or N do not
-    /// give a basis, or the phase does not decay monotonically (alpha_x >= m, `euler` only).
+    /// `Parameter` in these cases:
+    /// - m or K is zero, or m is not a multiple of K.
+    /// - `alpha_y` is not positive, or the integrator is unstable with m steps
+    ///   ([`crate::config::Integrator::alpha_y_max`]).
+    /// - `alpha_x` is not positive or not less than m.
+    /// - N is too small for the basis.
     pub fn new(config: &DmpConfig, segment_steps: usize) -> Result<Self, DmpError> {
         let integration_steps = config.integration_steps;
         check(config, segment_steps)?;
@@ -116,7 +119,8 @@ impl Dmp {
         &self.features
     }
 
-    /// Computes all m + 1 samples of a segment of duration tau = 1 by stepping, as the reference.
+    /// Computes all m + 1 samples of a segment of duration tau = 1 by stepping. This is the
+    /// reference implementation.
     /// - `weights`: (N,) \[u/s^2\].
     /// # Panics
     /// If `weights` is not N long.
@@ -125,8 +129,8 @@ impl Dmp {
         self.integrate_over(1.0, start, goal, weights)
     }
 
-    /// As [`integrate`](Self::integrate), in m steps of a duration `tau`. The path is the same at 1
-    /// / tau times the speed, if `start.yd` is scaled by it too.
+    /// Like [`integrate`](Self::integrate), but for a segment of duration `tau` in m steps. If
+    /// `start.yd` is divided by `tau` too, the path is the same and the speed is divided by `tau`.
     /// - `tau`: \[s\], positive. `weights`: (N,) \[u/s^2 at tau = 1\].
     /// # Panics
     /// If `weights` is not N long.
@@ -151,16 +155,16 @@ impl Dmp {
     /// The segment as a matrix: samples = matrix * (y0, yd0, g, w_1 .. w_N).
     ///
     /// (3K) x (3 + N), row-major, f64. The rows are y_1 .. y_K, yd_1 .. yd_K, ydd_1 .. ydd_K.
-    /// Sample k is the one after k m / K steps; the start is never included, so that the first
-    /// action already depends on g and w. With goal scaling the weights' columns are those of g -
-    /// y0 = 1; the caller multiplies them by g - y0.
+    /// Sample k is the state after k m / K steps. The start is not included, so that the first
+    /// action depends on g and w. With goal scaling the weights' columns are for g - y0 = 1; the
+    /// caller multiplies them by g - y0.
     #[must_use]
     pub fn matrix(&self) -> &[f64] {
         &self.matrix
     }
 
-    /// Computes the matrix. The map has no constant term, so its columns are the responses to unit
-    /// inputs.
+    /// Computes the matrix. The map has no constant term, so each column is the response to a unit
+    /// input.
     fn segment_matrix(&self) -> Vec<f64> {
         let (n, m, k_count) = (self.basis_count(), self.integration_steps, self.segment_steps);
         let columns = STATE_INPUTS + n;
@@ -203,11 +207,11 @@ fn check(config: &DmpConfig, segment_steps: usize) -> Result<(), DmpError> {
     DmpError::parameter(
         alpha_y > 0.0 && alpha_y < max,
         "dmp.alpha_y",
-        || format!("above 0 and below {max:.2}, where {:?} is stable", config.integrator),
+        || format!("above 0 and below {max:.2}, the stability limit of {:?}", config.integrator),
         alpha_y,
     )?;
-    // From this bound on, explicit Euler's factor 1 - alpha_x / m is not positive. The exact phase
-    // would allow more, but a phase that decays within one step does not shape the motion.
+    // At alpha_x >= m, explicit Euler's factor 1 - alpha_x / m is not positive. The exact phase
+    // would be defined, but a phase that decays within one step does not shape the motion.
     DmpError::parameter(
         alpha_x > 0.0 && alpha_x < steps as f64,
         "dmp.alpha_x",
@@ -222,30 +226,30 @@ mod tests {
     use crate::config::{BasisWidths, Integrator};
 
     #[test]
-    fn impossible_configurations_are_refused_by_name() {
+    fn invalid_parameter_is_rejected_by_name() {
         let config = DmpConfig::default();
-        let refused = |config: DmpConfig, steps| match Dmp::new(&config, steps).unwrap_err() {
+        let rejected = |config: DmpConfig, steps| match Dmp::new(&config, steps).unwrap_err() {
             DmpError::Parameter { name, .. } => name,
             other => panic!("{other}"),
         };
         let base = || config.clone();
-        assert_eq!(refused(base(), 0), "policy.segment_steps");
-        assert_eq!(refused(base(), 7), "dmp.integration_steps");
+        assert_eq!(rejected(base(), 0), "policy.segment_steps");
+        assert_eq!(rejected(base(), 7), "dmp.integration_steps");
         assert_eq!(
-            refused(DmpConfig { integration_steps: 0, ..base() }, 5),
+            rejected(DmpConfig { integration_steps: 0, ..base() }, 5),
             "dmp.integration_steps"
         );
         for alpha_y in [0.0, -1.0, f64::NAN, f64::INFINITY, 66.3] {
-            assert_eq!(refused(DmpConfig { alpha_y, ..base() }, 5), "dmp.alpha_y");
+            assert_eq!(rejected(DmpConfig { alpha_y, ..base() }, 5), "dmp.alpha_y");
         }
-        let late = DmpConfig { alpha_y: 36.6, integrator: Integrator::Paper, ..base() };
-        assert_eq!(refused(late, 5), "dmp.alpha_y");
+        let unstable = DmpConfig { alpha_y: 36.6, integrator: Integrator::Paper, ..base() };
+        assert_eq!(rejected(unstable, 5), "dmp.alpha_y");
         for alpha_x in [0.0, f64::NAN, 40.0] {
-            assert_eq!(refused(DmpConfig { alpha_x, ..base() }, 5), "dmp.alpha_x");
+            assert_eq!(rejected(DmpConfig { alpha_x, ..base() }, 5), "dmp.alpha_x");
         }
-        assert_eq!(refused(DmpConfig { basis_count: 0, ..base() }, 5), "dmp.basis_count");
-        let lonely = DmpConfig { basis_count: 1, widths: BasisWidths::Overlap, ..base() };
-        assert_eq!(refused(lonely, 5), "dmp.basis_count");
+        assert_eq!(rejected(DmpConfig { basis_count: 0, ..base() }, 5), "dmp.basis_count");
+        let single = DmpConfig { basis_count: 1, widths: BasisWidths::Overlap, ..base() };
+        assert_eq!(rejected(single, 5), "dmp.basis_count");
     }
 
     #[test]
@@ -268,7 +272,7 @@ mod tests {
     fn without_goal_scaling_shifting_start_and_goal_shifts_the_path() {
         let dmp = Dmp::new(&DmpConfig::default(), 5).unwrap();
         for row in dmp.matrix()[..5 * 8].chunks_exact(8) {
-            assert!((row[0] + row[2] - 1.0).abs() < 1e-12, "y0 and g must share all of y");
+            assert!((row[0] + row[2] - 1.0).abs() < 1e-12, "y0 and g contribute all of y");
         }
     }
 }

@@ -1,13 +1,13 @@
-//! Consecutive segments: continuity at the borders, and convergence.
+//! Tests of consecutive segments: continuity at their borders, and convergence.
 
 use super::test_support::{Draw, INTEGRATORS};
 use super::*;
 use crate::config::{CanonicalIntegration, DmpConfig};
 
-/// The unforced system is time-invariant: with f = 0 and one goal, segments with carry form one
+/// The unforced system is time-invariant, so with f = 0 and one goal, segments with carry equal one
 /// long movement. `paper` is excluded, because it restarts each segment with ydd_0 = 0.
 #[test]
-fn unforced_segments_with_carry_are_one_long_movement() {
+fn unforced_segments_with_carry_equal_one_long_movement() {
     for integrator in [INTEGRATORS[0], INTEGRATORS[1]] {
         let dmp = Dmp::new(&DmpConfig { integrator, ..DmpConfig::default() }, 5).unwrap();
         let start = State { y: 0.3, yd: -4.0 };
@@ -53,9 +53,9 @@ fn jumps(integration_steps: usize, config: &DmpConfig) -> [f32; 3] {
     largest
 }
 
-/// With carry, position and velocity at a border only differ by the change within one step, so the
-/// jump shrinks with the step. Acceleration (and so, in general, the action) jumps with the new
-/// goal and weights, for any step.
+/// With carry, position and velocity at a border differ only by the change within one step, so
+/// their jumps shrink with the step size. Acceleration, and in general the action, jumps with the
+/// new goal and weights for any step size.
 #[test]
 fn with_carry_position_and_velocity_are_continuous_across_segments_and_acceleration_is_not() {
     for integrator in INTEGRATORS {
@@ -68,16 +68,16 @@ fn with_carry_position_and_velocity_are_continuous_across_segments_and_accelerat
         let (coarse, fine) = (jumps(40, &config), jumps(640, &config));
         for (kind, name) in ["y", "yd"].into_iter().enumerate() {
             let ratio = coarse[kind] / fine[kind];
-            // `paper` keeps yd constant for its first step: its jump is rounding at any step.
-            let held = coarse[kind] < 1e-5;
-            assert!(held || (8.0..32.0).contains(&ratio), "{integrator:?} {name} {ratio}");
+            // `paper` keeps yd constant in its first step, so its jump is only a rounding error.
+            let is_rounding = coarse[kind] < 1e-5;
+            assert!(is_rounding || (8.0..32.0).contains(&ratio), "{integrator:?} {name} {ratio}");
         }
         assert!(fine[2] > coarse[2] / 2.0 && fine[2] > 1.0, "{integrator:?} ydd {fine:?}");
     }
 }
 
 #[test]
-fn segments_with_carry_through_the_f32_map_follow_the_stepped_reference() {
+fn segments_with_carry_through_the_f32_map_match_the_reference() {
     for integrator in INTEGRATORS {
         let dmp = Dmp::new(&DmpConfig { integrator, ..DmpConfig::default() }, 5).unwrap();
         let omega = dmp.omega();
@@ -101,7 +101,7 @@ fn segments_with_carry_through_the_f32_map_follow_the_stepped_reference() {
 }
 
 #[test]
-fn without_weights_segment_after_segment_converges_to_the_goal() {
+fn segments_without_weights_converge_to_the_goal() {
     for integrator in INTEGRATORS {
         for alpha_y in [5.0, 10.0, 25.0] {
             let config = DmpConfig { integrator, alpha_y, ..DmpConfig::default() };

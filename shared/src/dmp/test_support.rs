@@ -1,4 +1,4 @@
-//! Shared parts of the DMP tests: every configuration, and random parameters from a named seed.
+//! Helpers of the DMP tests: a list of configurations, and random parameters with a fixed seed.
 
 use super::{Dmp, State};
 use crate::config::{BasisWidths, CanonicalIntegration, DmpConfig, ForcingScaling, Integrator};
@@ -49,7 +49,7 @@ impl Draw {
         self.0.random_range(-range..range)
     }
 
-    /// Start, goal and weights within 1, omega, 1 and omega^2.
+    /// Returns a start (y0, yd0), a goal and weights, uniform within 1, omega, 1 and omega^2.
     pub fn parameters(&mut self, dmp: &Dmp) -> (State<f64>, f64, Vec<f64>) {
         let omega = dmp.omega();
         let start = State { y: self.uniform(1.0), yd: self.uniform(omega) };

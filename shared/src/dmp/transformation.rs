@@ -1,7 +1,7 @@
-//! Transformation system: the spring-damper that the forcing term shapes, stepped through time.
+//! Transformation system: a spring-damper driven by the forcing term, stepped through time.
 //!
-//! It is the reference for the tests of the affine map. `primitive` computes the forcing values,
-//! which are plain numbers here.
+//! It is the reference in the tests of the affine map. `primitive` computes the forcing values that
+//! are passed in here.
 
 use crate::config::Integrator;
 use std::ops::{Add, Div, Mul, Sub};
@@ -21,7 +21,7 @@ pub trait Real:
     + Mul<Output = Self>
     + Div<Output = Self>
 {
-    /// Rounds to the nearest number of this precision.
+    /// Rounds `value` to this precision.
     fn from_f64(value: f64) -> Self;
 }
 
@@ -53,7 +53,7 @@ pub struct Sample<T> {
     pub y: T,
     /// Velocity yd \[u/s\].
     pub yd: T,
-    /// Acceleration ydd \[u/s^2\] that the step to this sample has computed.
+    /// Acceleration ydd \[u/s^2\], computed in the step to this sample.
     pub ydd: T,
 }
 
@@ -64,8 +64,8 @@ pub struct Trajectory<T> {
     pub y: Vec<T>,
     /// Velocities yd, (m + 1,) \[u/s\].
     pub yd: Vec<T>,
-    /// Accelerations ydd, (m + 1,) \[u/s^2\]. `ydd[0]` is 0, because no step led to the start (the
-    /// paper initialises it to 0 as well).
+    /// Accelerations ydd, (m + 1,) \[u/s^2\]. `ydd[0]` is 0, as in the paper, because no step leads
+    /// to the start.
     pub ydd: Vec<T>,
 }
 
@@ -164,10 +164,10 @@ impl<T: Real> TransformationSystem<T> {
 mod tests {
     use super::*;
 
-    /// Reference fractions from Neural Dynamic Policies' released code: research/algorithms.md,
-    /// section 1, steps 8, 16, 24, 32, 40 of 0.025.
+    /// Expected fractions: computed with the released code of Neural Dynamic Policies, after 8, 16,
+    /// 24, 32 and 40 steps of 0.025.
     #[test]
-    fn unforced_explicit_response_has_the_fractions_of_neural_dynamic_policies() {
+    fn unforced_explicit_response_matches_neural_dynamic_policies() {
         let expected = [
             (5.0, [0.085, 0.264, 0.448, 0.603, 0.723]),
             (10.0, [0.264, 0.612, 0.820, 0.922, 0.968]),
@@ -203,7 +203,7 @@ mod tests {
     }
 
     #[test]
-    fn required_forcing_undoes_a_step() {
+    fn required_forcing_inverts_a_step() {
         for integrator in [Integrator::SemiImplicit, Integrator::Explicit, Integrator::Paper] {
             let system = TransformationSystem { alpha_y: 15.0, tau: 2.0, dt: 0.05, integrator };
             let previous = Sample { y: 0.3, yd: -1.0, ydd: 2.0 };

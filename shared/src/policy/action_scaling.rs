@@ -1,6 +1,6 @@
 //! Scaling from u to the environment's units, per dimension: action = mid + half_range u.
 //!
-//! u is first clipped to [-1, 1], because a Gaussian's draws may be outside.
+//! u is first clipped to [-1, 1], because draws from a Gaussian may be outside.
 
 use crate::spec::EnvSpec;
 
@@ -32,7 +32,7 @@ impl ActionScaling {
         }
     }
 
-    /// Computes the u, (rows, A), of `actions`, (rows, A), which must be within their bounds.
+    /// Computes u, (rows, A), from `actions`, (rows, A), which must be within their bounds.
     pub fn invert(&self, actions: &[f64], u: &mut [f32]) {
         let dims = self.mid.len();
         for (row, out) in actions.chunks_exact(dims).zip(u.chunks_exact_mut(dims)) {

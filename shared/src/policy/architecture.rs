@@ -5,11 +5,11 @@ use crate::config::{AlgorithmName, Controller, ExperimentConfig, PolicyKind, Sta
 use crate::seeds;
 use crate::spec::EnvSpec;
 
-/// Version of the hashed list. Snapshots, policy files and checkpoints of another version are
-/// rejected.
+/// Version of the hashed list. A new version makes all stored snapshots, policy files and
+/// checkpoints invalid.
 const VERSION: u32 = 1;
 
-/// Hashes the values that change the policy's function, listed explicitly. Keys that are added
+/// Hashes an explicit list of the values that determine the policy's actions. Keys that are added
 /// later, or that this kind of policy does not use, do not change the hash of stored policies.
 pub(super) fn hash(config: &ExperimentConfig, spec: &EnvSpec) -> u64 {
     let mut list = format!(
@@ -100,14 +100,14 @@ mod tests {
     }
 
     #[test]
-    fn the_default_policys_hash_is_the_one_that_stored_runs_have() {
-        // If this changes, every stored checkpoint and policy is rejected: raise VERSION and say so
-        // in the changelog, or find the accidental change.
+    fn hash_of_the_default_policy_is_unchanged() {
+        // A different hash invalidates every stored checkpoint and policy. If the change is
+        // intended, raise VERSION and document it in the changelog.
         assert_eq!(format!("{:016x}", hash_of(&[])), "458fc872445cefcd");
     }
 
     #[test]
-    fn what_changes_the_function_changes_the_hash_and_nothing_else_does() {
+    fn hash_depends_only_on_values_that_determine_the_actions() {
         let same = hash_of(&[]);
         for (key, value) in [
             ("algorithm.batch_size", "8"),

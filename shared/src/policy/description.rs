@@ -1,5 +1,5 @@
-//! Serialisable description of a policy without its parameters, from which it can be rebuilt
-//! without the run that trained it.
+//! Serialisable description of a policy, from which it is rebuilt without the run that trained it.
+//! The parameters are stored separately.
 
 use serde::{Deserialize, Serialize};
 
@@ -15,14 +15,14 @@ use crate::spec::EnvSpec;
 pub struct PolicyDescription {
     /// The environment's sizes, bounds and timing.
     pub spec: EnvSpec,
-    /// Algorithm that trained it: SAC's network also outputs log-stds, and NDP's actions are not
-    /// squashed.
+    /// Algorithm that trained the policy. With SAC the network also outputs log-stds; with NDP the
+    /// policy has learned standard deviations.
     pub algorithm: AlgorithmName,
     /// Kind, network, ranges, controller and start.
     pub policy: PolicyConfig,
     /// The movement primitive; unused for `mlp`.
     pub dmp: DmpConfig,
-    /// Entries of an observation that give y0 and yd0, for `start = "observed"`.
+    /// Entries of an observation from which y0 and yd0 are read, for `start = "observed"`.
     pub start_sources: Vec<StartSource>,
 }
 
@@ -39,17 +39,17 @@ impl PolicyDescription {
         }
     }
 
-    /// Builds the policy. The description may be untrusted: every value is checked like that of a
-    /// configuration.
+    /// Builds the policy. Checks every value as in a configuration, because the description may
+    /// come from an untrusted file.
     ///
     /// # Errors
-    /// If a value is out of range, or does not fit the environment.
+    /// If a value is out of range or does not fit the environment.
     pub fn build(&self) -> Result<Policy, PolicyError> {
         let config = self.config()?;
         Policy::new(&config, &self.spec)
     }
 
-    /// A configuration that gives this policy; all other values are defaults.
+    /// Returns a configuration with the policy's values and defaults for all others.
     fn config(&self) -> Result<ExperimentConfig, ConfigError> {
         let mut layers = Layers::new();
         for own in [policy_defaults(self.policy.kind), algorithm_defaults(self.algorithm)] {

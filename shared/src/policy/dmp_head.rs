@@ -1,8 +1,8 @@
 //! Maps the network's outputs to a segment of actions, and propagates gradients back.
 //!
 //! The outputs of one action dimension are adjacent: goal, N weights, 4 rho. With t = tanh(output):
-//! g = goal_range t, w = weight_range omega² t, rho = (1, 0, 0, 0) + rho_range t, or + output for
-//! `free` rho (specification, sections 2 and 3). There is no rho with `controller = "position"`.
+//! g = goal_range t, w = weight_range omega² t, and rho = (1, 0, 0, 0) + rho_range t. With
+//! `rho = "free"`, rho = (1, 0, 0, 0) + output. With `controller = "position"` there is no rho.
 
 use super::PolicyError;
 use super::start::StartState;
@@ -11,7 +11,8 @@ use crate::config::{Controller, ExperimentConfig, PolicyKind, RhoKind, Start};
 use crate::dmp::{Dmp, SegmentMap, act, act_backward, act_position, act_position_backward};
 use crate::spec::EnvSpec;
 
-/// Length of the DMP state (y, yd) that a carrying policy appends to the observation.
+/// Returns the length of the DMP state (y, yd) that follows the observation with
+/// `start = "carry"`; otherwise 0.
 pub(super) fn carried_len(config: &ExperimentConfig, spec: &EnvSpec) -> usize {
     let carries = config.policy.kind == PolicyKind::Dmp && config.policy.start == Start::Carry;
     if carries { 2 * spec.action_len } else { 0 }
@@ -58,7 +59,7 @@ struct Scratch {
     inputs_gradient: Vec<f32>,
 }
 
-/// Incoming gradient of the head's backward pass.
+/// Gradient that the head's backward pass starts from.
 #[derive(Debug, Clone, Copy)]
 pub struct HeadGradient<'a> {
     /// Gradient with respect to the means, before their tanh, (rows, K, A).
@@ -71,7 +72,7 @@ impl DmpHead {
     /// Creates the head that `config` describes.
     ///
     /// # Errors
-    /// If the DMP or the start table does not fit the environment.
+    /// If the DMP's configuration is invalid, or `task.start_sources` does not fit the environment.
     pub fn new(config: &ExperimentConfig, spec: &EnvSpec) -> Result<Self, PolicyError> {
         let dmp = Dmp::new(&config.dmp, config.policy.segment_steps)?;
         let weight_scale = config.policy.weight_range * dmp.omega() * dmp.omega();
@@ -109,7 +110,7 @@ impl DmpHead {
         3 + self.basis_count
     }
 
-    /// Buffers for up to `rows_max` rows.
+    /// Allocates buffers for up to `rows_max` rows.
     #[must_use]
     pub fn workspace(&self, rows_max: usize) -> DmpWorkspace {
         let cells = rows_max * self.dims;
@@ -126,7 +127,8 @@ impl DmpHead {
         }
     }
 
-    /// Squashes the network's outputs. Each row of `stride` starts with the head's A (1+N+4).
+    /// Squashes the network's outputs. The head's A (1+N+4) outputs are the first of each row of
+    /// length `stride`.
     pub fn squash(&self, outputs: &[f32], stride: usize, work: &mut DmpWorkspace) {
         let (n, len) = (self.per_dimension(), self.outputs_len());
         let rows = outputs.len() / stride;
@@ -144,15 +146,15 @@ impl DmpHead {
         }
     }
 
-    /// The squashed parameters of row `row`, (A (1+N+4)), so that they can be drawn at random
-    /// instead.
+    /// Returns the squashed parameters of row `row`, (A (1+N+4)), so that the warm-up can replace
+    /// them by random ones.
     pub fn squashed_mut<'a>(&self, work: &'a mut DmpWorkspace, row: usize) -> &'a mut [f32] {
         let len = self.outputs_len();
         &mut work.squashed[row * len..(row + 1) * len]
     }
 
-    /// Computes the means of the segments' actions before their tanh, (rows, K, A), from squashed
-    /// parameters and observations, (rows, O).
+    /// Computes the means of the segments' actions before tanh, (rows, K, A), from the squashed
+    /// parameters and the observations, (rows, O).
     pub fn segment(&self, observations: &[f32], work: &mut DmpWorkspace, means: &mut [f32]) {
         let (dims, steps) = (self.dims, self.steps);
         let (n, inputs_len) = (self.per_dimension(), self.inputs_len());
@@ -236,7 +238,7 @@ impl DmpHead {
     }
 
     /// Computes the gradient with respect to the network's outputs. Overwrites the head's A (1+N+4)
-    /// at the start of each row of `stride`.
+    /// numbers at the start of each row of length `stride`.
     pub fn backward(
         &self,
         work: &mut DmpWorkspace,
@@ -284,7 +286,7 @@ impl DmpHead {
                 act_backward(samples, &rho, means_gradient, samples_gradient)
             }
             Controller::Position => {
-                // The start is measured or carried, so it gets no gradient.
+                // The start is not computed by the network, so its gradient is not needed.
                 act_position_backward(self.position_scale, means_gradient, samples_gradient);
                 [0.0; RHO_LEN]
             }

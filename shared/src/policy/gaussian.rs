@@ -1,4 +1,4 @@
-//! The squashed Gaussian of soft actor-critic: u = tanh(mean + std noise), on every action.
+//! The squashed Gaussian of soft actor-critic: u = tanh(mean + std noise) for each action.
 
 use std::f32::consts::{LN_2, PI};
 
@@ -6,7 +6,7 @@ use std::f32::consts::{LN_2, PI};
 const LOG_STD_MIN: f32 = -20.0;
 const LOG_STD_MAX: f32 = 2.0;
 
-/// One drawn action, with the values that its gradients need.
+/// A drawn action and the values that its gradients need.
 #[derive(Debug, Clone, Copy)]
 pub struct Draw {
     /// u = tanh(mean + std noise).
@@ -48,7 +48,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_density_of_the_actions_integrates_to_one() {
+    fn density_of_actions_integrates_to_one() {
         // Midpoints of 20 000 slices of (-1, 1); noise = (atanh(u) - mean) / std.
         for (mean, log_std) in [(0.0_f32, -1.0_f32), (0.7, 0.0), (-1.0, -2.0)] {
             let slices = 20_000;
@@ -66,7 +66,7 @@ mod tests {
     }
 
     #[test]
-    fn a_saturated_action_has_a_finite_density() {
+    fn saturated_action_has_a_finite_density() {
         for mean in [-30.0, 30.0] {
             let drawn = draw(mean, 5.0, 0.5);
             assert!(drawn.log_density.is_finite() && !drawn.in_range, "{drawn:?}");

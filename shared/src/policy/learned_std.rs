@@ -2,9 +2,9 @@
 //! logarithmic standard deviation.
 //!
 //! It is the same for all K steps of a segment (Schulman et al. 2017, section 6.1; Neural Dynamic
-//! Policies). The A logarithms follow the network's parameters in the policy's flat ones. A draw is
-//! not bounded. The segment keeps it unclipped, because learning uses its probability; the
-//! environment gets it clipped to the action's bounds.
+//! Policies). In the policy's flat parameters, the A logarithms follow the network's parameters.
+//! Draws are not bounded. Segments contain the unclipped draw, because learning needs its
+//! probability. The environment receives it clipped to the action's bounds.
 
 use crate::config::{AlgorithmName, ExperimentConfig};
 use crate::spec::EnvSpec;
@@ -17,7 +17,7 @@ pub struct LearnedStd {
 }
 
 impl LearnedStd {
-    /// Creates it if the algorithm uses one.
+    /// Creates the distribution, or `None` if the algorithm does not use it.
     pub(super) fn of(config: &ExperimentConfig, spec: &EnvSpec) -> Option<Self> {
         (config.algorithm.name == AlgorithmName::Ndp).then_some(Self {
             dims: spec.action_len,
@@ -25,7 +25,7 @@ impl LearnedStd {
         })
     }
 
-    /// Number of its parameters, A.
+    /// Number of parameters, A.
     #[must_use]
     #[expect(clippy::len_without_is_empty, reason = "an action has at least one dimension")]
     pub fn len(&self) -> usize {

@@ -1,10 +1,10 @@
-//! The matrix product of the networks' forward and backward passes.
+//! The matrix product for the networks' forward and backward passes.
 
 use std::ops::Range;
 
 use gemm::Parallelism;
 
-/// A (rows, cols) matrix in a slice, with strides.
+/// A strided view of a slice as a (rows, cols) matrix.
 #[derive(Debug, Clone, Copy)]
 pub struct Matrix<'a> {
     data: &'a [f32],
@@ -50,7 +50,7 @@ impl<'a> Matrix<'a> {
     /// Returns a range of columns.
     ///
     /// # Panics
-    /// If the matrix does not have them.
+    /// If the range is empty or exceeds the matrix.
     #[must_use]
     pub fn columns(self, columns: Range<usize>) -> Self {
         assert!(columns.start < columns.end && columns.end <= self.cols, "{columns:?}");
@@ -118,7 +118,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_product_is_what_the_definition_says_for_every_orientation() {
+    fn product_matches_its_definition_for_every_orientation() {
         let a: Vec<f32> = (0..6).map(|i| i as f32).collect(); // 2 x 3
         let b: Vec<f32> = (0..12).map(|i| (i as f32).sin()).collect(); // 3 x 4
         let expected: Vec<f32> = (0..8)

@@ -1,6 +1,6 @@
 //! Stages 3 and 6 of 8: policies, which map an observation to the actions of a segment.
 //!
-//! Rollout, evaluation and update share this forward pass.
+//! Rollout, evaluation and update use the same forward pass.
 //!
 //! ```text
 //!   observation ── network ──► outputs ── tanh, ranges ──► goal, weights, rho   (per dimension)
@@ -8,9 +8,9 @@
 //!                                                            ▼
 //!                              actions u in [-1, 1] ◄── inverse controller ◄── y, yd, ydd
 //! ```
-//! `network` is the multilayer perceptron, and `dmp_head` the rest of the `dmp` policy. The `mlp`
-//! policy is the network and a tanh. All code works on flat `f32` slices and on buffers that are
-//! allocated once.
+//! `network` is the multilayer perceptron. `dmp_head` is the rest of the `dmp` policy. The `mlp`
+//! policy is the network followed by a tanh. All code works on flat `f32` slices and on buffers
+//! that are allocated once.
 
 mod action_scaling;
 mod architecture;
@@ -50,7 +50,7 @@ pub enum PolicyError {
     /// The DMP's configuration is invalid.
     #[error(transparent)]
     Dmp(#[from] DmpError),
-    /// A value of a description is out of range.
+    /// A value of a policy description is out of range.
     #[error(transparent)]
     Config(#[from] ConfigError),
     /// `task.start_sources` does not fit the environment.
@@ -59,14 +59,14 @@ pub enum PolicyError {
     /// Wrong number of parameters.
     #[error("policy takes {expected} parameters, got {got}")]
     Length {
-        /// Length of the architecture's parameters.
+        /// Expected number.
         expected: usize,
-        /// Length of the given parameters.
+        /// Actual number.
         got: usize,
     },
 }
 
-/// The part of a policy that turns the network's outputs into actions.
+/// The part of a policy that maps the network's outputs to actions.
 #[derive(Debug)]
 pub enum Head {
     /// One action: u = tanh(output).
@@ -75,16 +75,16 @@ pub enum Head {
     Dmp(Box<DmpHead>),
 }
 
-/// A policy's architecture: everything but its parameters.
+/// A policy without its parameters.
 #[derive(Debug)]
 pub struct Policy {
     shape: MlpShape,
     head: Head,
-    /// Number of network outputs that the head reads; log-stds may follow.
+    /// Number of network outputs that the head reads. Log-stds may follow them.
     head_outputs: usize,
     layout: SegmentLayout,
     learned_std: Option<LearnedStd>,
-    /// Whether u = tanh(mean). The means of the position controller are already actions.
+    /// Whether u = tanh(mean). The position controller's means are actions already.
     squashes: bool,
     scaling: ActionScaling,
     env_observation_len: usize,
@@ -107,7 +107,7 @@ pub struct PolicyWorkspace {
 }
 
 impl Policy {
-    /// Builds the architecture that `config` describes for an environment.
+    /// Builds the policy that `config` describes, for one environment.
     ///
     /// # Errors
     /// If the environment's spec is invalid or does not fit the configuration.
@@ -147,7 +147,7 @@ impl Policy {
         })
     }
 
-    /// Hash of everything that determines the policy's function, except the parameters.
+    /// Hash of everything except the parameters that determines the policy's actions.
     #[must_use]
     pub fn architecture_hash(&self) -> u64 {
         self.architecture_hash
@@ -171,19 +171,19 @@ impl Policy {
         &self.shape
     }
 
-    /// Number P of flat parameters: the network's, then those of the action distribution.
+    /// Number P of flat parameters: those of the network, then those of the action distribution.
     #[must_use]
     pub fn parameters_len(&self) -> usize {
         self.shape.parameters_len() + self.learned_std.as_ref().map_or(0, LearnedStd::len)
     }
 
-    /// The state-independent learned standard deviations of the action distribution, if it has any.
+    /// Learned, state-independent standard deviations of the action distribution, if it has any.
     #[must_use]
     pub fn learned_std(&self) -> Option<&LearnedStd> {
         self.learned_std.as_ref()
     }
 
-    /// Whether u = tanh(mean) rather than the mean itself.
+    /// Whether u is tanh(mean) instead of the mean itself.
     #[must_use]
     pub fn squashes(&self) -> bool {
         self.squashes
@@ -195,26 +195,27 @@ impl Policy {
         if self.learned_std.is_some() { ActionBounds::None } else { ActionBounds::Unit }
     }
 
-    /// The part that turns the network's outputs into actions.
+    /// The part that maps the network's outputs to actions.
     #[must_use]
     pub fn head(&self) -> &Head {
         &self.head
     }
 
-    /// Range of a Gaussian policy's raw log-stds, (K, A), in a row of the network's outputs.
+    /// Range of the raw log-stds, (K, A), in a row of the network's outputs; `None` unless the
+    /// policy is SAC's Gaussian policy.
     #[must_use]
     pub fn log_stds(&self) -> Option<Range<usize>> {
         let outputs = self.head_outputs..self.shape.outputs();
         (!outputs.is_empty()).then_some(outputs)
     }
 
-    /// Scaling from u to the environment's units.
+    /// Scaling of u to the environment's units.
     #[must_use]
     pub fn scaling(&self) -> &ActionScaling {
         &self.scaling
     }
 
-    /// Length of the environment's part of an observation; a carried DMP state follows it.
+    /// Length of the environment's part of an observation. A carried DMP state follows it.
     #[must_use]
     pub fn env_observation_len(&self) -> usize {
         self.env_observation_len
@@ -236,7 +237,7 @@ impl Policy {
         parameters
     }
 
-    /// Buffers for up to `rows_max` observations at a time.
+    /// Allocates buffers for up to `rows_max` observations at a time.
     #[must_use]
     pub fn workspace(&self, rows_max: usize) -> PolicyWorkspace {
         PolicyWorkspace {
@@ -250,13 +251,13 @@ impl Policy {
         }
     }
 
-    /// Computes u for every observation into `work.actions`. For a Gaussian policy this is its
-    /// mean, which is not bounded.
+    /// Computes u for every observation into `work.actions`. For a stochastic policy u is computed
+    /// from the mean. With the position controller u is not bounded.
     ///
     /// - `parameters`: (P,). `observations`: (rows, O).
     ///
     /// # Panics
-    /// If a length is wrong or there are more rows than the workspace has.
+    /// If a length is wrong, or if there are more observations than the workspace has rows.
     pub fn act(&self, parameters: &[f32], observations: &[f32], work: &mut PolicyWorkspace) {
         assert_eq!(parameters.len(), self.parameters_len(), "policy parameters");
         let network = &parameters[..self.shape.parameters_len()];
@@ -264,8 +265,8 @@ impl Policy {
         self.decode(observations, work);
     }
 
-    /// The second half of [`Policy::act`]: computes u from the network's outputs in
-    /// `work.activations`, to which exploration may have added noise.
+    /// Computes u from the network's outputs in `work.activations`, to which exploration may have
+    /// added noise. This is the second half of [`Policy::act`].
     pub fn decode(&self, observations: &[f32], work: &mut PolicyWorkspace) {
         let rows = observations.len() / self.layout.observation_len;
         let (outputs, stride) = (work.activations.output(&self.shape, rows), self.shape.outputs());

@@ -1,4 +1,4 @@
-//! The multilayer perceptron of every policy and critic: ReLU layers and a linear last layer.
+//! The multilayer perceptron of policies and critics: ReLU layers and a linear last layer.
 
 use std::ops::Range;
 
@@ -30,7 +30,7 @@ impl MlpShape {
     /// Creates a network of the given widths, input first, output last.
     ///
     /// # Panics
-    /// With fewer than two widths.
+    /// If there are fewer than two widths.
     #[must_use]
     pub fn new(widths: Vec<usize>) -> Self {
         assert!(widths.len() >= 2, "a network has an input and an output");
@@ -73,8 +73,9 @@ impl MlpShape {
     }
 }
 
-/// Draws weights and biases from U(-1/sqrt(inputs), 1/sqrt(inputs)), PyTorch's default for a linear
-/// layer, so that results are comparable with the baselines.
+/// Draws weights and biases from U(-1/sqrt(inputs), 1/sqrt(inputs)).
+///
+/// This is PyTorch's default for linear layers, so results are comparable with the baselines.
 pub fn initial_parameters(shape: &MlpShape, random: &mut impl Rng) -> Vec<f32> {
     let mut parameters = Vec::with_capacity(shape.parameters_len());
     for layer in shape.layers() {
@@ -85,12 +86,12 @@ pub fn initial_parameters(shape: &MlpShape, random: &mut impl Rng) -> Vec<f32> {
     parameters
 }
 
-/// The output of every layer for up to `rows_max` inputs.
+/// The outputs of every layer for up to `rows_max` inputs.
 #[derive(Debug)]
 pub struct Activations(Vec<Vec<f32>>);
 
 impl Activations {
-    /// Buffers for up to `rows_max` rows.
+    /// Allocates buffers for up to `rows_max` rows.
     #[must_use]
     pub fn new(shape: &MlpShape, rows_max: usize) -> Self {
         Self(shape.layers().iter().map(|layer| vec![0.0; rows_max * layer.outputs]).collect())
@@ -102,7 +103,7 @@ impl Activations {
         self.layer(shape, shape.layers().len() - 1, rows)
     }
 
-    /// As [`Activations::output`], but mutable, so that exploration can add noise.
+    /// The network's output, (rows, outputs), mutable so that exploration can add noise.
     pub fn output_mut(&mut self, shape: &MlpShape, rows: usize) -> &mut [f32] {
         let last = self.0.len() - 1;
         &mut self.0[last][..rows * shape.outputs()]
@@ -174,12 +175,12 @@ fn forward_with<'a>(
     }
 }
 
-/// A network for few rows at a time and rarely changing parameters, as in a worker.
+/// A network for small batches and rarely changing parameters, as in a worker.
 ///
-/// The cost of a product is then that of reading the weights, which gemm needs in the order
-/// (inputs, outputs). From the order of the flat parameters it would rearrange them for every
-/// product, which takes three times as long as the product itself. Here this is done once per new
-/// policy. The results equal those of [`forward`] up to rounding.
+/// For small batches, reading the weights dominates the cost of a product. gemm needs them in the
+/// order (inputs, outputs). From the order of the flat parameters it would rearrange them for every
+/// product, which takes three times as long as the product. [`SmallBatchNetwork::load`] does it
+/// once per policy. The results equal those of [`forward`] up to rounding.
 #[derive(Debug, Clone)]
 pub struct SmallBatchNetwork {
     shape: MlpShape,
@@ -232,7 +233,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_network_worked_by_hand() {
+    fn forward_matches_a_value_worked_by_hand() {
         // 2 -> 2 (ReLU) -> 1. For x = (1, -1) the hidden layer is
         // relu([1*1 + 2*(-1) + 0.5, 3*1 + 1*(-1) - 4]) = relu([-0.5, -2]),
         // and relu([1 + 2 + 0.5, 3 + 1 - 4]) = [3.5, 0] for x = (1, 1).
@@ -244,7 +245,7 @@ mod tests {
     }
 
     #[test]
-    fn a_network_for_few_rows_computes_the_same() {
+    fn small_batch_network_matches_forward() {
         let shape = MlpShape::new(vec![14, 256, 256, 20]);
         let mut random = crate::seeds::stream(1, "test", 0);
         let parameters = initial_parameters(&shape, &mut random);

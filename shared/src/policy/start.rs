@@ -12,10 +12,10 @@ pub enum StartState {
     /// Read from the observation with one source per dimension. Velocities are multiplied by
     /// `velocity_scale`.
     Observed {
-        /// Entries that give each dimension's position and velocity.
+        /// Entries of the observation that are each dimension's position and velocity.
         sources: Vec<StartSource>,
         /// Duration of a segment, K * control_dt_s [s], or 0 for `start_velocity = "zero"`. It
-        /// converts velocities to DMP time, in which a segment has the duration tau = 1.
+        /// converts velocities to DMP time, in which a segment lasts tau = 1.
         velocity_scale: f32,
     },
     /// Carried: y (A,), then yd (A,) follow the environment's observation at this index.
@@ -26,10 +26,10 @@ pub enum StartState {
 }
 
 impl StartState {
-    /// Creates it from the configuration.
+    /// Creates the source that the configuration describes.
     ///
     /// # Errors
-    /// `StartSources` if the table does not fit the environment.
+    /// `StartSources` if `task.start_sources` does not fit the environment.
     pub fn new(config: &ExperimentConfig, spec: &EnvSpec) -> Result<Self, PolicyError> {
         match config.policy.start {
             Start::Zero => Ok(Self::Zero),
@@ -53,7 +53,7 @@ impl StartState {
             Self::Carry { at } => (observation[at + d], observation[at + dims + d]),
             Self::Observed { sources, velocity_scale } => match &sources[d] {
                 StartSource::Angle { cos, sin, velocity } => {
-                    // Converts -0 to 0, because atan2 of -0 can be -pi instead of pi.
+                    // Adding 0 turns -0 into 0, for which atan2 returns pi instead of -pi.
                     let angle = (observation[*sin] + 0.0).atan2(observation[*cos] + 0.0);
                     (angle, observation[*velocity] * velocity_scale)
                 }
@@ -81,7 +81,7 @@ fn check(sources: &[StartSource], spec: &EnvSpec) -> Result<(), PolicyError> {
         };
         if let Some(index) = indices.iter().find(|&&index| index >= spec.observation_len) {
             return Err(PolicyError::StartSources(format!(
-                "dimension {dimension} reads index {index}, the observation of {} has {}",
+                "dimension {dimension} reads index {index}, but observations of {} have length {}",
                 spec.id, spec.observation_len
             )));
         }

@@ -1,8 +1,8 @@
-//! Vectorised tanh, with which policies bound their outputs.
+//! Vectorised tanh, which bounds the outputs of policies.
 //!
-//! The library's tanh takes a call and 20 ns per number, which was a tenth of an update. This one
-//! has no branch, so the compiler vectorises the loop. It rounds identically for all instruction
-//! sets, so workers and learner get the same bits on any processor.
+//! The standard library's tanh takes a call and 20 ns per number, a tenth of an update's time. This
+//! function has no branches, so the compiler vectorises the loop. It rounds identically for all
+//! instruction sets, so workers and learner get the same bits on any processor.
 
 use pulp::{Arch, Simd, WithSimd};
 
@@ -10,7 +10,7 @@ use pulp::{Arch, Simd, WithSimd};
 const SATURATED: f32 = 9.02;
 /// 1.5 * 2^23: adding it rounds to an integer, which is then in the lowest bits.
 const ROUNDING: f32 = 12_582_912.0;
-/// ln 2 in two parts, of which the first has so few digits that small multiples of it are exact.
+/// ln 2 in two parts. The first has few enough digits that small multiples of it are exact.
 const LN_2_HIGH: f32 = 0.693_359_4;
 const LN_2_LOW: f32 = -2.121_944_4e-4;
 
@@ -34,11 +34,11 @@ impl WithSimd for Job<'_> {
 
 /// Computes tanh|x| = e / (e + 2) with e = exp(2|x|) - 1, which keeps full precision near zero.
 ///
-/// With t = 2|x|, exp(t) = 2^n exp(r), |r| <= ln(2) / 2, and exp(r) - 1 from its Taylor series, e =
-/// 2^n (exp(r) - 1) + (2^n - 1).
+/// Let t = 2|x| and exp(t) = 2^n exp(r) with |r| <= ln(2) / 2. Then
+/// e = 2^n (exp(r) - 1) + (2^n - 1), with exp(r) - 1 from its Taylor series.
 #[inline(always)]
 fn tanh_of(x: f32) -> f32 {
-    // Not `min`, which would replace NaN by a number.
+    // `min` would replace NaN by a number.
     let size = if x.abs() > SATURATED { SATURATED } else { x.abs() };
     let t = 2.0 * size;
     let rounded = t * std::f32::consts::LOG2_E + ROUNDING;
@@ -57,7 +57,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn it_is_the_hyperbolic_tangent_to_the_last_digits() {
+    fn tanh_matches_the_library_to_3e_7() {
         let tiny = (0..2000).map(|i| 1e-30_f32 * 1.05_f32.powi(i));
         let all = tiny.chain((0..100_000).map(|i| i as f32 * 1e-4));
         for x in all.flat_map(|x| [x, -x]) {
@@ -71,7 +71,7 @@ mod tests {
     }
 
     #[test]
-    fn vectors_round_as_single_numbers_do() {
+    fn vectors_and_single_numbers_round_identically() {
         let numbers: Vec<f32> = (0..1003).map(|i| (i as f32 * 0.7).sin() * 4.0).collect();
         let mut values = numbers.clone();
         tanh(&mut values);

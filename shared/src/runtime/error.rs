@@ -11,7 +11,7 @@ pub enum RuntimeError {
     #[error(transparent)]
     File(#[from] PolicyFileError),
     /// An observation of the wrong length.
-    #[error("an observation of {got} numbers, expected {expected}")]
+    #[error("the observation has {got} numbers, expected {expected}")]
     Length {
         /// Length O of the environment's observations.
         expected: usize,
@@ -30,12 +30,12 @@ pub enum RuntimeError {
     },
     /// The network's outputs are NaN.
     #[error(
-        "the policy makes no finite action of this observation: it is far beyond what it was \
-         trained on"
+        "the policy's action for this observation is not finite: the observation is far outside \
+         the training data"
     )]
     Decision,
     /// The given start is invalid for this policy.
-    #[error("this policy cannot begin at that y0: {reason}")]
+    #[error("this policy cannot start at the given y0: {reason}")]
     Start {
         /// The reason.
         reason: String,

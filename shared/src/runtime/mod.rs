@@ -1,14 +1,14 @@
-//! Runs a trained policy on a robot, without Python and without the run that trained it.
+//! Runs a trained policy on a robot, from a policy file and without Python.
 //!
-//! It returns the actions of a segment, or one action per control step. It rejects invalid
-//! observations, keeps actions within their bounds and below a maximum rate, and holds the robot
-//! when observations stop.
+//! [`PolicyRuntime`] returns the actions of a segment, or one action per control step. It rejects
+//! invalid observations, limits actions to their bounds and their rate to a maximum, and holds the
+//! robot when observations stop.
 //!
 //! ```
 #![doc = include_str!("../../examples/act.rs")]
 //! ```
-//! `dmprl.Policy` does the same with NumPy (`envs_py/dmprl/policy.py`). A test compares both with
-//! each other and with the ONNX graph.
+//! `dmprl.Policy` is the same runtime in NumPy (`envs_py/dmprl/policy.py`). A test compares both
+//! and the ONNX graph.
 
 mod error;
 mod safety;
@@ -24,7 +24,7 @@ use crate::policy::{Head, Policy, PolicyWorkspace, SmallBatchNetwork};
 use crate::policy_file::{self, OpenedPolicy};
 use crate::spec::EnvSpec;
 
-/// Runs a policy on one observation at a time. It allocates only on creation.
+/// Runs a policy on one observation at a time. It allocates memory only on creation.
 #[derive(Debug)]
 pub struct PolicyRuntime {
     policy: Policy,
@@ -39,7 +39,7 @@ pub struct PolicyRuntime {
     decided: Vec<f64>,
     /// The segment's actions after limits, (K, A).
     given: Vec<f64>,
-    /// Number of the segment's steps already executed; at K a decision is due.
+    /// Executed steps of the segment. At K the next step needs a decision.
     step: usize,
     /// The previous action, (A,); initially the hold.
     previous: Vec<f64>,
@@ -51,10 +51,10 @@ pub struct PolicyRuntime {
 }
 
 impl PolicyRuntime {
-    /// Loads a policy file, written by `dmprl export` or from a run's `policies/`.
+    /// Loads a policy file, either written by `dmprl export` or from a run's `policies/`.
     ///
     /// # Errors
-    /// `File` if it cannot be read or is incomplete.
+    /// `File` if it cannot be read or is invalid.
     pub fn load(path: &Path) -> Result<Self, RuntimeError> {
         let OpenedPolicy { policy, snapshot, .. } = policy_file::open(path)?;
         Ok(Self::new(policy, &snapshot.values))
@@ -63,7 +63,7 @@ impl PolicyRuntime {
     /// Creates a runtime from a policy and its parameters, (P,).
     ///
     /// # Panics
-    /// If the number of parameters is not the policy's.
+    /// If the number of parameters is wrong.
     #[must_use]
     pub fn new(policy: Policy, parameters: &[f32]) -> Self {
         assert_eq!(parameters.len(), policy.parameters_len(), "policy parameters");
@@ -88,30 +88,30 @@ impl PolicyRuntime {
         }
     }
 
-    /// The environment that the policy was trained in: sizes, bounds, names, control period.
+    /// Returns the spec of the environment that the policy was trained in.
     #[must_use]
     pub fn spec(&self) -> &EnvSpec {
         &self.policy.description().spec
     }
 
-    /// Control steps per decision, K.
+    /// Returns the number of control steps per decision, K.
     #[must_use]
     pub fn segment_steps(&self) -> usize {
         self.policy.layout().segment_steps
     }
 
-    /// Limits and watchdog.
+    /// Returns the limits and the watchdog's settings.
     #[must_use]
     pub fn safety(&self) -> &Safety {
         &self.safety
     }
 
-    /// Mutable limits and watchdog. Changes apply from the next action on.
+    /// Returns the limits and the watchdog's settings. Changes apply from the next action on.
     pub fn safety_mut(&mut self) -> &mut Safety {
         &mut self.safety
     }
 
-    /// Whether the last action was the hold, because observations had stopped or by request.
+    /// Whether the last action was the hold, either on request or because observations stopped.
     #[must_use]
     pub fn is_holding(&self) -> bool {
         self.holding
@@ -119,7 +119,7 @@ impl PolicyRuntime {
 
     /// Starts an episode. The next action starts a segment.
     ///
-    /// A limited rate starts from the hold, as if the robot had executed the hold before.
+    /// A rate limit applies from the first action on, relative to the hold.
     ///
     /// - `y0`: start of the DMP, (A,) in units of y, for a policy that carries its state across
     ///   segments (`policy.start = "carry"`). The default is 0, as in training.
@@ -130,7 +130,7 @@ impl PolicyRuntime {
         if let Some(y0) = y0 {
             let dims = self.policy.layout().action_len;
             if self.carried.is_empty() {
-                return Err(RuntimeError::start("its start comes from the observation"));
+                return Err(RuntimeError::start("it does not carry its DMP state"));
             }
             if y0.len() != dims || y0.iter().any(|y| !y.is_finite()) {
                 return Err(RuntimeError::start(&format!("expected {dims} finite numbers")));
@@ -153,8 +153,8 @@ impl PolicyRuntime {
     /// - `observation`: (O,) in the environment's units.
     ///
     /// # Errors
-    /// If the observation is invalid, or the network's outputs are NaN. The only available action
-    /// is then [`PolicyRuntime::hold`]; the policy continues at the next valid observation.
+    /// If the observation is invalid, or the network's outputs are NaN. Execute
+    /// [`PolicyRuntime::hold`] then. The policy continues at the next valid observation.
     pub fn segment(&mut self, observation: &[f64]) -> Result<&[f64], RuntimeError> {
         self.decide(observation)?;
         self.missed = 0;
@@ -171,8 +171,9 @@ impl PolicyRuntime {
     /// executes that decision, and observations only reset the watchdog.
     ///
     /// - `observation`: (O,) in the environment's units; `None` if there is no new one since the
-    ///   last call. After [`Safety::hold_after`] calls without one, or if a decision is due without
-    ///   one, the action is the hold, and the next observation starts a new segment.
+    ///   last call. After more than [`Safety::hold_after`] calls with `None`, or with `None` at a
+    ///   segment's first step, the action is the hold, and the next observation starts a new
+    ///   segment.
     ///
     /// # Errors
     /// As [`PolicyRuntime::segment`], at every step.
@@ -201,7 +202,7 @@ impl PolicyRuntime {
         Ok(&self.previous)
     }
 
-    /// Returns a control step towards the hold, as far as the rate allows, (A,). Use it after an
+    /// Returns an action that moves towards the hold within the rate limit, (A,). Use it after an
     /// error, and whenever the policy must not act. The next observation starts a new segment.
     pub fn hold(&mut self) -> &[f64] {
         self.holding = true;
@@ -214,14 +215,14 @@ impl PolicyRuntime {
         self.safety.approach_hold(&mut self.previous);
     }
 
-    /// Starts from the hold before the first action.
+    /// Sets the previous action to the hold if no action has been returned yet.
     fn begin_at_hold(&mut self) {
         if !std::mem::replace(&mut self.has_acted, true) {
             self.previous.copy_from_slice(self.safety.hold());
         }
     }
 
-    /// Executes the segment's next action, into `given` and `previous`.
+    /// Limits the segment's next action and writes it to `given` and `previous`.
     fn give(&mut self) {
         self.begin_at_hold();
         let dims = self.previous.len();
@@ -245,7 +246,7 @@ impl PolicyRuntime {
         of_dmp.copy_from_slice(&self.carried);
         self.network.forward(&self.seen, &mut self.work.activations);
         self.policy.decode(&self.seen, &mut self.work);
-        // Far outside the training data, sums of large numbers can be NaN.
+        // Far outside the training data, sums of large numbers may be NaN.
         if self.work.actions.iter().any(|u| u.is_nan()) {
             self.step = self.segment_steps();
             return Err(RuntimeError::Decision);

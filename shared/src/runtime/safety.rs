@@ -1,9 +1,9 @@
-//! Limits between a policy and a robot: bounds, a maximum rate, and the hold.
+//! Limits on the actions that a robot receives: bounds, a maximum rate, and the hold.
 
 use super::RuntimeError;
 use crate::spec::EnvSpec;
 
-/// Limits of the returned actions, and the hold for missing observations.
+/// Limits on the returned actions, and the hold, which replaces them when observations stop.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Safety {
     low: Vec<f64>,
@@ -28,20 +28,20 @@ impl Safety {
         }
     }
 
-    /// The action for missing observations, (A,).
+    /// Returns the action that is used when observations stop, (A,).
     #[must_use]
     pub fn hold(&self) -> &[f64] {
         &self.hold
     }
 
-    /// Control steps without an observation after which the robot holds.
+    /// Returns the number of control steps without an observation after which the robot holds.
     #[must_use]
     pub fn hold_after(&self) -> usize {
         self.hold_after
     }
 
-    /// Sets the number of control steps without an observation after which the robot holds. More
-    /// than K has no effect, because the next segment needs an observation.
+    /// Sets the number of control steps without an observation after which the robot holds. Values
+    /// above K have no effect, because the next segment needs an observation.
     pub fn set_hold_after(&mut self, steps: usize) {
         self.hold_after = steps;
     }
@@ -49,7 +49,8 @@ impl Safety {
     /// Sets the action that holds the robot, (A,).
     ///
     /// # Errors
-    /// `Limit` if the number of dimensions is wrong, or one is out of bounds. Nothing changes then.
+    /// `Limit` if the number of dimensions is wrong or a value is out of bounds. The hold is then
+    /// unchanged.
     pub fn set_hold(&mut self, hold: &[f64]) -> Result<(), RuntimeError> {
         let expected = |d: usize| format!("{} to {}", self.low[d], self.high[d]);
         self.check("the hold", hold, &expected, |d, value| {
@@ -60,10 +61,11 @@ impl Safety {
     }
 
     /// Sets the maximum change of each action dimension between control steps, (A,) in the
-    /// environment's units; infinity: no limit.
+    /// environment's units. Infinity means no limit.
     ///
     /// # Errors
-    /// `Limit` if the number of dimensions is wrong, or one is not positive. Nothing changes then.
+    /// `Limit` if the number of dimensions is wrong or a value is not positive. The limits are then
+    /// unchanged.
     pub fn set_rate(&mut self, rate: &[f64]) -> Result<(), RuntimeError> {
         let expected = |_| "a positive number".to_owned();
         self.check("the rate", rate, &expected, |_, value| value > 0.0)?;

@@ -1,4 +1,4 @@
-//! The runtime with the observations that robots send, valid and invalid.
+//! Tests of the runtime with valid, invalid and missing observations.
 
 use super::*;
 use crate::config::{ExperimentConfig, Layers};
@@ -30,7 +30,7 @@ fn policy(keys: &[(&str, &str)]) -> Policy {
     Policy::new(&config, &spec()).unwrap()
 }
 
-/// Scales the parameters up, so that actions differ from step to step.
+/// Creates a runtime with scaled-up parameters, so that actions differ from step to step.
 fn runtime(keys: &[(&str, &str)]) -> PolicyRuntime {
     let policy = policy(keys);
     let mut parameters = policy.initial_parameters(&mut seeds::stream(1, "test", 0));
@@ -45,7 +45,7 @@ fn observation(seed: f64) -> [f64; 4] {
 }
 
 #[test]
-fn a_segment_is_what_the_policy_decides_in_the_environments_units() {
+fn segment_equals_the_policys_decision_in_the_environments_units() {
     for keys in [&[][..], &[("policy.kind", "mlp")], CARRY, &[("algorithm.name", "sac")]] {
         let mut runtime = runtime(keys);
         let own = policy(keys);
@@ -66,14 +66,14 @@ fn a_segment_is_what_the_policy_decides_in_the_environments_units() {
 }
 
 #[test]
-fn one_action_a_step_is_the_segment_step_by_step() {
+fn actions_step_by_step_equal_the_segment() {
     for keys in [&[][..], CARRY] {
         let (mut whole, mut stepwise) = (runtime(keys), runtime(keys));
         for decision in 0..3 {
             let first = observation(f64::from(decision));
             let segment = whole.segment(&first).unwrap().to_vec();
             for (k, expected) in segment.chunks(DIMS).enumerate() {
-                // Observations within a segment decide nothing.
+                // Observations within a segment have no effect.
                 let now = if k == 0 { first } else { observation(100.0 + k as f64) };
                 let action = stepwise.action((k != 2).then_some(&now)).unwrap();
                 assert_eq!(action, expected, "{keys:?}, decision {decision}, step {k}");
@@ -83,29 +83,29 @@ fn one_action_a_step_is_the_segment_step_by_step() {
 }
 
 #[test]
-fn a_bad_observation_is_refused_at_every_step_and_changes_nothing() {
-    let (mut disturbed, mut calm) = (runtime(CARRY), runtime(CARRY));
-    let bad: [(&[f64], &str); 5] = [
-        (&[0.0; 3], "of 3 numbers, expected 4"),
-        (&[0.0; 5], "of 5 numbers, expected 4"),
+fn invalid_observation_is_rejected_at_every_step_and_changes_nothing() {
+    let (mut disturbed, mut reference) = (runtime(CARRY), runtime(CARRY));
+    let invalid: [(&[f64], &str); 5] = [
+        (&[0.0; 3], "has 3 numbers, expected 4"),
+        (&[0.0; 5], "has 5 numbers, expected 4"),
         (&[0.0, f64::NAN, 0.0, 0.0], "observation[1], sin, is NaN"),
         (&[0.0, 0.0, f64::NEG_INFINITY, 0.0], "observation[2], speed, is -inf"),
         (&[0.0, 0.0, 0.0, 1e300], "observation[3], force, is 1"),
     ];
     for step in 0..12 {
-        for (observation, message) in bad {
+        for (observation, message) in invalid {
             let error = disturbed.action(Some(observation)).unwrap_err().to_string();
             assert!(error.contains(message), "{error}");
             assert!(step % STEPS > 0 || disturbed.segment(observation).is_err());
         }
         let now = observation(f64::from(step as u32));
-        let expected = calm.action(Some(&now)).unwrap();
+        let expected = reference.action(Some(&now)).unwrap();
         assert_eq!(disturbed.action(Some(&now)).unwrap(), expected, "step {step}");
     }
 }
 
 #[test]
-fn no_action_leaves_its_bounds_whatever_is_observed() {
+fn actions_stay_within_bounds_for_any_observation() {
     for keys in [&[][..], &[("policy.rho", "free")], CARRY, &[("policy.kind", "mlp")]] {
         let mut runtime = runtime(keys);
         for exponent in 0..39 {
@@ -119,27 +119,27 @@ fn no_action_leaves_its_bounds_whatever_is_observed() {
                             assert!((1.0..=4.0).contains(&action[1]), "{action:?}");
                         }
                     }
-                    // Sums of large numbers can be NaN.
+                    // Sums of large numbers may be NaN.
                     Err(RuntimeError::Decision) => {}
                     Err(error) => panic!("{error}"),
                 }
             }
         }
-        // Afterwards it acts as before.
+        // After a reset the runtime works normally.
         runtime.reset(None).unwrap();
         runtime.segment(&observation(1.0)).unwrap();
     }
 }
 
 #[test]
-fn actions_move_no_faster_than_allowed_and_get_there() {
+fn actions_obey_the_rate_limit() {
     let mut runtime = runtime(&[]);
     let error = runtime.safety_mut().set_rate(&[0.1, 0.0]).unwrap_err().to_string();
     assert_eq!(error, "the rate of action dimension 1 is 0: expected a positive number");
     runtime.safety_mut().set_rate(&[0.1, f64::INFINITY]).unwrap();
     runtime.reset(None).unwrap();
     let mut before = runtime.safety().hold().to_vec();
-    assert_eq!(before, [0.0, 1.0], "0, or the bound next to it");
+    assert_eq!(before, [0.0, 1.0], "0, or the nearest bound");
     let mut limited = 0;
     for step in 0..40 {
         let now = observation(f64::from(step / 10));
@@ -149,11 +149,11 @@ fn actions_move_no_faster_than_allowed_and_get_there() {
         limited += usize::from(change > 0.1 - 1e-12);
         before.copy_from_slice(action);
     }
-    assert!(limited > 0, "nothing was limited: this shows nothing");
+    assert!(limited > 0, "the limit never applied, so this test checked nothing");
 }
 
 #[test]
-fn the_robot_holds_when_observations_stop_and_goes_on_when_they_come_again() {
+fn robot_holds_when_observations_stop_and_continues_when_they_return() {
     let mut runtime = runtime(&[]);
     runtime.safety_mut().set_hold(&[0.5, 2.0]).unwrap();
     runtime.safety_mut().set_hold_after(2);
@@ -162,7 +162,7 @@ fn the_robot_holds_when_observations_stop_and_goes_on_when_they_come_again() {
     runtime.action(Some(&now)).unwrap();
     for _ in 0..2 {
         runtime.action(None).unwrap();
-        assert!(!runtime.is_holding(), "the segment goes on for so many steps");
+        assert!(!runtime.is_holding(), "the segment continues for this many steps");
     }
     let mut actions = Vec::new();
     for _ in 0..10 {
@@ -171,13 +171,13 @@ fn the_robot_holds_when_observations_stop_and_goes_on_when_they_come_again() {
     }
     assert_eq!(actions[9], [0.5, 2.0]);
     assert!(actions.windows(2).all(|pair| (pair[1][0] - pair[0][0]).abs() <= 0.4 + 1e-12));
-    // A new segment, not the rest of the old one.
+    // The next observation starts a new segment instead of finishing the old one.
     runtime.safety_mut().set_rate(&[f64::INFINITY; DIMS]).unwrap();
     let expected = self::runtime(&[]).segment(&now).unwrap()[..DIMS].to_vec();
     assert_eq!(runtime.action(Some(&now)).unwrap(), expected);
     assert!(!runtime.is_holding());
 
-    // Where a decision is due, a missing observation leads to the hold.
+    // A missing observation at a segment's first step leads to the hold.
     for _ in 1..STEPS {
         runtime.action(Some(&now)).unwrap();
     }
@@ -186,7 +186,7 @@ fn the_robot_holds_when_observations_stop_and_goes_on_when_they_come_again() {
 }
 
 #[test]
-fn a_hold_out_of_bounds_is_refused() {
+fn hold_out_of_bounds_is_rejected() {
     let mut runtime = runtime(&[]);
     for (hold, message) in [
         (&[0.0, 0.5][..], "the hold of action dimension 1 is 0.5: expected 1 to 4"),
@@ -201,9 +201,9 @@ fn a_hold_out_of_bounds_is_refused() {
 }
 
 #[test]
-fn only_a_policy_that_carries_its_state_begins_where_it_is_told() {
+fn only_a_policy_that_carries_its_state_accepts_y0() {
     let error = runtime(&[]).reset(Some(&[0.0; DIMS])).unwrap_err().to_string();
-    assert!(error.contains("comes from the observation"), "{error}");
+    assert!(error.contains("does not carry its DMP state"), "{error}");
     let mut carrying = runtime(CARRY);
     let at_rest = carrying.segment(&observation(0.0)).unwrap().to_vec();
     carrying.reset(Some(&[0.5, -0.5])).unwrap();
@@ -217,17 +217,17 @@ fn only_a_policy_that_carries_its_state_begins_where_it_is_told() {
 }
 
 #[test]
-fn errors_answered_by_the_hold_move_no_faster_than_allowed_either() {
+fn hold_after_errors_obeys_the_rate_limit() {
     let mut runtime = runtime(&[]);
     runtime.safety_mut().set_rate(&[0.05, 0.05]).unwrap();
     runtime.safety_mut().set_hold(&[0.5, 2.0]).unwrap();
     runtime.reset(None).unwrap();
-    let bad = [f64::NAN; 4];
+    let invalid = [f64::NAN; 4];
     let mut before = runtime.safety().hold().to_vec();
     let (mut held, mut acted) = (0, 0);
     for step in 0..120 {
-        // Twenty good observations, then twenty bad ones, and so on.
-        let now = if step / 20 % 2 == 0 { observation(f64::from(step)) } else { bad };
+        // Twenty valid observations, then twenty invalid ones, and so on.
+        let now = if step / 20 % 2 == 0 { observation(f64::from(step)) } else { invalid };
         let action = match runtime.action(Some(&now)) {
             Ok(action) => {
                 acted += 1;
@@ -246,6 +246,6 @@ fn errors_answered_by_the_hold_move_no_faster_than_allowed_either() {
     }
     assert_eq!((held, acted), (60, 60));
     for (held, wanted) in before.iter().zip([0.5, 2.0]) {
-        assert!((held - wanted).abs() < 1e-9, "twenty steps are enough to get there: {held}");
+        assert!((held - wanted).abs() < 1e-9, "the hold is reached in 20 steps: {held}");
     }
 }

@@ -1,4 +1,4 @@
-//! A supervisor for tests.
+//! A fake supervisor for tests.
 
 use std::collections::VecDeque;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
@@ -7,13 +7,13 @@ use std::time::Duration;
 
 use super::{Activity, Command, Report, ReportError, RunTotals, Supervisor};
 
-/// A supervisor that a test controls: it hands out the commands that it was given, records
-/// heartbeats and reports, and can request a stop at a chosen heartbeat or report.
+/// A supervisor that a test controls. It returns the test's commands, records heartbeats and
+/// reports, and can request a stop at a chosen heartbeat or report.
 #[derive(Debug, Default)]
 pub struct FakeSupervisor {
     /// Requests a stop.
     pub stop: AtomicBool,
-    /// Requests that the run end as if it had all its steps.
+    /// Requests that the run end as it does after its last step.
     pub finish: AtomicBool,
     /// Makes every report fail.
     pub gone: AtomicBool,
@@ -31,41 +31,41 @@ fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
 }
 
 impl FakeSupervisor {
-    /// A supervisor that requests a stop at heartbeat number `count`.
+    /// Creates a supervisor that requests a stop at heartbeat number `count`.
     #[must_use]
     pub fn stopping_after_heartbeats(count: usize) -> Self {
         Self { stop_after_heartbeats: Some(count), ..Self::default() }
     }
 
-    /// A supervisor that requests a stop at a report that satisfies `predicate`.
+    /// Creates a supervisor that requests a stop at the first report that satisfies `predicate`.
     #[must_use]
     pub fn stopping_on(predicate: fn(&Report) -> bool) -> Self {
         Self { stop_on: Some(predicate), ..Self::default() }
     }
 
-    /// Sets what [`Supervisor::totals`] returns.
+    /// Sets the return value of [`Supervisor::totals`].
     pub fn set_totals(&self, totals: RunTotals) {
         *lock(&self.totals) = totals;
     }
 
-    /// Appends a command to those that the process has not taken yet.
+    /// Queues a command for the process.
     pub fn command(&self, command: Command) {
         lock(&self.commands).push_back(command);
     }
 
-    /// All heartbeats so far, in order.
+    /// Returns all heartbeats so far, in order.
     #[must_use]
     pub fn heartbeats(&self) -> Vec<Activity> {
         lock(&self.heartbeats).clone()
     }
 
-    /// All reports so far, in order.
+    /// Returns all reports so far, in order.
     #[must_use]
     pub fn reports(&self) -> Vec<Report> {
         lock(&self.reports).clone()
     }
 
-    /// The messages of all warnings so far, in order.
+    /// Returns the messages of all warnings so far, in order.
     #[must_use]
     pub fn warnings(&self) -> Vec<String> {
         let message = |report: &Report| match report {
@@ -75,7 +75,7 @@ impl FakeSupervisor {
         lock(&self.reports).iter().filter_map(message).collect()
     }
 
-    /// The newest count of segments that the learner has not acknowledged.
+    /// Returns the latest number of unacknowledged segments.
     #[must_use]
     pub fn unacknowledged(&self) -> u64 {
         self.unacknowledged.load(Ordering::Acquire)
@@ -95,7 +95,7 @@ impl Supervisor for FakeSupervisor {
         self.gone.load(Ordering::Acquire)
     }
 
-    /// Does not wait.
+    /// Returns at once.
     fn next_command(&self, _wait: Duration) -> Option<Command> {
         lock(&self.commands).pop_front()
     }

@@ -8,34 +8,34 @@ use thiserror::Error;
 use crate::spec::EnvSpec;
 use crate::transport::delivery::Sent;
 
-/// A command of the supervisor to a process.
+/// A command from the supervisor to a process.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case", deny_unknown_fields)]
 pub enum Command {
-    /// To a worker: attach to the learner of this shared-memory directory.
+    /// To a worker: attach to the learner through this shared-memory directory.
     Attach {
         /// The run's private shared-memory directory.
         domain: PathBuf,
     },
     /// To the evaluator: evaluate this policy.
     Evaluate(EvaluationRequest),
-    /// To the learner: number of failures of environments.
+    /// To the learner: number of environment failures.
     EnvFailures {
         /// Failures in the whole run, of all processes.
         total: u64,
     },
-    /// To the learner: counts of the segments of all workers in the whole run.
+    /// To the learner: segment counts of all workers in the whole run.
     Sent(Sent),
     /// To the learner: state of the workers.
     Workers(WorkersNow),
-    /// To the learner: the run has reached its goal or its time limit; finish as after the last
-    /// step, with a last evaluation.
+    /// To the learner: the run has reached its goal or its time limit; finish with a last
+    /// evaluation, as after the last step.
     Finish,
-    /// To any process: save what must be saved and exit.
+    /// To any process: save all state and exit.
     Stop,
 }
 
-/// A report of a process to the supervisor.
+/// A report from a process to the supervisor.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case", deny_unknown_fields)]
 pub enum Report {
@@ -44,9 +44,9 @@ pub enum Report {
         /// Properties of the environments.
         spec: EnvSpec,
     },
-    /// The learner is ready: workers may attach.
+    /// The learner is ready, and workers may attach.
     LearnerReady,
-    /// The first environment step of this run has reached the learner.
+    /// The first segment of this run has reached the learner.
     FirstSegment,
     /// Progress of the learner, sent a few times per second.
     Progress(Progress),
@@ -54,7 +54,7 @@ pub enum Report {
     Evaluate(EvaluationRequest),
     /// The evaluator has appended this row to `evaluations.jsonl`.
     Evaluated(EvaluationRow),
-    /// The episodes of an evaluation failed; the next evaluation may succeed.
+    /// An evaluation failed. The next one may succeed.
     NotEvaluated {
         /// Version of the policy.
         policy_version: u64,
@@ -70,19 +70,19 @@ pub enum Report {
     },
     /// Progress of a video.
     Filmed {
-        /// Frames done.
+        /// Frames rendered.
         done: u64,
         /// Total number of frames.
         of: u64,
     },
-    /// Environments failed and were made again.
+    /// Environments failed and were recreated.
     EnvFailures {
-        /// Number of failures since the last such report.
+        /// Number of failures since the previous report of this kind.
         count: u64,
         /// Description of the last failure.
         last: String,
     },
-    /// Counts of a worker's segments since its last such report.
+    /// A worker's segment counts since its previous report of this kind.
     Sent(Sent),
     /// A worker's heartbeat, once per second.
     Alive {
@@ -91,20 +91,21 @@ pub enum Report {
         /// Segments that the learner has not acknowledged.
         kept: u64,
     },
-    /// A call into the environments does not return. The process exits after this report.
+    /// A call into the environments has timed out. The process exits after this report.
     EnvHung {
         /// The message.
         message: String,
     },
-    /// From the gateway, twice per second: the hosts that take part.
+    /// From the gateway, twice per second: the hosts that take part in the run.
     Hosts(Vec<HostNow>),
-    /// A worker that joined the run leaves. It has delivered its segments as far as possible.
+    /// A worker that joined the run leaves, after it has delivered as many of its segments as
+    /// possible.
     Left,
     /// The learner wrote a checkpoint.
     Checkpoint {
         /// Name of its directory in `checkpoints/`.
         name: String,
-        /// Environment steps in it.
+        /// Environment steps inserted when it was written.
         env_steps: u64,
     },
     /// The learner has finished and written its last checkpoint.
@@ -122,9 +123,9 @@ pub enum Report {
 pub struct WorkersNow {
     /// Attached workers, including those that joined.
     pub count: u64,
-    /// Restarts after a death in the whole run.
+    /// Restarts of workers in the whole run.
     pub restarts: u64,
-    /// Segments that the learner has not acknowledged, of all workers.
+    /// Unacknowledged segments of all workers.
     pub queued_segments: u64,
 }
 
@@ -142,7 +143,7 @@ pub struct HostNow {
     pub kept: u64,
     /// Segments of its workers that the learner has acknowledged.
     pub acked: u64,
-    /// Restarts of its workers after a death.
+    /// Restarts of its workers.
     pub restarts: u64,
 }
 
@@ -176,7 +177,7 @@ impl Activity {
 pub struct Progress {
     /// Environment steps inserted.
     pub env_steps: u64,
-    /// Updates done.
+    /// Number of updates.
     pub updates: u64,
     /// Segments inserted.
     pub segments: u64,
@@ -184,21 +185,21 @@ pub struct Progress {
     pub env_steps_per_s: f64,
     /// Recent rate of updates \[1/s\].
     pub updates_per_s: f64,
-    /// Mean return of the last training episodes, with noise; null if there are none.
+    /// Mean return of recent training episodes, with exploration noise; null if there are none.
     pub return_mean: Option<f64>,
-    /// Updates times batch size over environment steps inserted.
+    /// Updates times batch size, divided by environment steps inserted.
     pub samples_per_insert: f64,
     /// Median policy lag of recent segments: policy versions between acting and insertion.
     pub policy_lag_p50: u64,
     /// Maximum policy lag of recent segments.
     pub policy_lag_max: u64,
-    /// Segments of all workers that the learner has not acknowledged.
+    /// Unacknowledged segments of all workers.
     pub queued_segments: u64,
-    /// Restarts of workers and learner after a death in the whole run.
+    /// Restarts of workers and learner in the whole run.
     pub restarts: u64,
-    /// Segments rejected, without duplicates.
+    /// Segments rejected, not counting duplicates.
     pub rejected: u64,
-    /// Failures of environments.
+    /// Environment failures.
     pub env_failures: u64,
 }
 
@@ -236,13 +237,13 @@ pub struct EvaluationRow {
     pub returns: Vec<f64>,
     /// Mean of the returns.
     pub return_mean: f64,
-    /// Share of episodes that ended in success; null if the task does not report success.
+    /// Fraction of episodes that ended in success; null if the task does not report success.
     pub success_rate: Option<f64>,
     /// Mean |u_t - u_{t-1}| over all steps and action dimensions.
     pub smoothness: f64,
 }
 
-/// An evaluation with a number that JSON cannot represent.
+/// An evaluation contains a number that JSON cannot represent.
 #[derive(Debug, Clone, Copy, PartialEq, Error)]
 #[error("evaluation of policy {policy_version}: expected finite numbers, got {number}")]
 pub struct EvaluationNotFinite {
@@ -253,7 +254,7 @@ pub struct EvaluationNotFinite {
 }
 
 impl EvaluationRow {
-    /// Rejects a row that JSON cannot represent.
+    /// Checks that JSON can represent the row.
     ///
     /// # Errors
     /// If a number is NaN or infinite.

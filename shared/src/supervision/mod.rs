@@ -1,8 +1,8 @@
-//! The trait by which a process talks to its supervisor.
+//! The interface between a process and its supervisor.
 //!
-//! The loops in `actors` and `learner` know their supervisor only through the trait [`Supervisor`].
-//! In the program the control pipe implements it, with one JSON object per line; [`FakeSupervisor`]
-//! implements it for tests, which run a loop without starting a process.
+//! The loops in `actors` and `learner` use their supervisor through the trait [`Supervisor`]. In
+//! production the control pipe implements it, with one JSON object per line. In tests
+//! [`FakeSupervisor`] implements it, so that a loop runs without a process of its own.
 
 mod fake;
 mod messages;
@@ -19,7 +19,7 @@ pub use messages::{
 
 use crate::transport::delivery::Sent;
 
-/// Why a report was not delivered. Usually the supervisor is gone.
+/// Why a report was not delivered, usually because the supervisor is gone.
 #[derive(Debug, thiserror::Error)]
 #[error(transparent)]
 pub struct ReportError(#[from] pub Box<dyn Error + Send + Sync>);
@@ -31,15 +31,18 @@ pub struct RunTotals {
     pub env_failures: u64,
     /// State of the workers.
     pub workers: WorkersNow,
-    /// Segments that workers have produced, sent and had acknowledged.
+    /// Counts of segments that workers have produced and sent and that the learner has
+    /// acknowledged.
     pub sent: Sent,
 }
 
-/// A process's end of the conversation with its supervisor. No method waits, except
-/// [`Supervisor::next_command`], and none allocates, except those that send a report.
+/// A process's connection to its supervisor.
+///
+/// No method blocks, except [`Supervisor::next_command`], and none allocates, except those that
+/// send a report.
 pub trait Supervisor {
-    /// Set once the process must finish and exit: on a stop command, or because the supervisor is
-    /// gone.
+    /// A flag that is set when the process must finish and exit, either on a stop command or
+    /// because the supervisor is gone.
     fn stop_flag(&self) -> &AtomicBool;
 
     /// Whether the process must finish and exit.
@@ -47,34 +50,34 @@ pub trait Supervisor {
         self.stop_flag().load(Ordering::Acquire)
     }
 
-    /// Whether the run must end as if it had all its steps.
+    /// Whether the run must end as it does after its last step.
     fn finish_requested(&self) -> bool;
 
-    /// Whether the supervisor is gone. Then reports fail, and a stop is requested.
+    /// Whether the supervisor is gone. If so, reports fail and a stop is requested.
     fn is_gone(&self) -> bool;
 
-    /// Waits up to `wait` for the next command and returns it. Stop, finish and totals are not
-    /// returned: each has its own method.
+    /// Waits up to `wait` for the next command and returns it. Commands that other methods expose
+    /// (stop, finish and totals) are not returned.
     fn next_command(&self, wait: Duration) -> Option<Command>;
 
-    /// The newest totals; all zero before the supervisor has sent any.
+    /// Returns the latest totals; all zero until the supervisor has sent some.
     fn totals(&self) -> RunTotals;
 
-    /// Records that the loop has completed another round. A loop that completes none for too long
-    /// counts as hanging.
+    /// Records that the loop has completed an iteration. A loop without a heartbeat for too long is
+    /// considered hung.
     fn heartbeat(&self, doing: Activity);
 
-    /// Records how many segments the learner has not acknowledged; sent along with heartbeats.
+    /// Records the number of unacknowledged segments, which is sent with each heartbeat.
     fn note_unacknowledged(&self, segments: usize);
 
     /// Sends a report.
     ///
     /// # Errors
-    /// The supervisor is gone.
+    /// If the supervisor is gone.
     fn report(&self, report: &Report) -> Result<(), ReportError>;
 
-    /// Sends a warning, which the supervisor shows to the user. Does nothing if the supervisor is
-    /// gone: the loop notices that as a stop.
+    /// Sends a warning, which the supervisor shows to the user. Errors are ignored: if the
+    /// supervisor is gone, a stop is requested as well.
     fn warn(&self, message: String) {
         let _ = self.report(&Report::Warning { message });
     }

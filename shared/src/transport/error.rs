@@ -1,4 +1,4 @@
-//! Errors of every transport.
+//! Errors of all transports.
 
 use thiserror::Error;
 
@@ -9,7 +9,7 @@ use crate::parameters::SnapshotError;
 #[derive(Debug, Error)]
 pub enum TransportError {
     /// The middleware returned an error.
-    #[error("{operation} on {name}: {cause}")]
+    #[error("{operation} {name}: {cause}")]
     Middleware {
         /// The attempted operation.
         operation: &'static str,
@@ -19,15 +19,15 @@ pub enum TransportError {
         cause: String,
     },
     /// The peer has another version or another configuration.
-    #[error("{name}: peers disagree, {cause}; start both from the same build and configuration")]
+    #[error("{name}: peers differ ({cause}); start both from the same build and configuration")]
     Incompatible {
         /// The service.
         name: String,
         /// The difference.
         cause: String,
     },
-    /// The slot belongs to a live process, or to a dead one that has not been cleaned up yet.
-    #[error("{name} is taken ({cause}): try again when the process that holds it has ended")]
+    /// A live process occupies the slot, or a dead one whose resources have not been freed yet.
+    #[error("{name} is in use ({cause}): retry after the process that uses it has ended")]
     Taken {
         /// The service.
         name: String,
@@ -35,17 +35,17 @@ pub enum TransportError {
         cause: String,
     },
     /// A segment or snapshot of the wrong length was offered or received.
-    #[error("{got} numbers, this channel carries {expected}")]
+    #[error("got {got} numbers, this channel transfers {expected}")]
     Length {
-        /// Length that the channel was created for.
+        /// Expected length.
         expected: usize,
-        /// Length that was offered or received.
+        /// Actual length.
         got: usize,
     },
     /// The run's shared-memory directory is unusable.
     #[error(transparent)]
     Domain(#[from] DomainError),
-    /// A damaged snapshot, or one of another architecture.
+    /// A corrupted snapshot, or one of another architecture.
     #[error(transparent)]
     Snapshot(#[from] SnapshotError),
 }

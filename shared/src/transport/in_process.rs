@@ -1,6 +1,6 @@
 //! Segment queues, the parameter channel and the acknowledgement channel inside one process.
 //!
-//! They are bounded like the shared-memory ones and pass the same contract test. Buffers circulate
+//! They are bounded like those in shared memory and pass the same contract test. Buffers circulate
 //! between a free list and the queue, so nothing is allocated after construction.
 
 use std::collections::VecDeque;
@@ -14,7 +14,7 @@ use super::{
 use crate::parameters::{ParameterSnapshot, SnapshotError};
 use crate::segment::{Segment, SegmentHeader, SegmentLayout};
 
-/// Names this transport's types.
+/// The types of this transport.
 #[derive(Debug)]
 pub struct InProcess;
 
@@ -24,7 +24,7 @@ impl WorkerTransport for InProcess {
     type Acknowledgements = AcknowledgementReader;
 }
 
-/// Number of the only learner of a session inside one process.
+/// Number of the learner. A session inside one process has only one.
 const EPOCH: u64 = 1;
 
 #[derive(Debug)]
@@ -35,8 +35,8 @@ struct Queue {
     attached: bool,
 }
 
-/// Locks a mutex and ignores poisoning: the data is consistent after every statement, so a panic
-/// while the lock was held leaves nothing half-written.
+/// Locks a mutex and ignores poisoning: the data is consistent after every statement, even if a
+/// thread panics while it holds the lock.
 fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
     mutex.lock().unwrap_or_else(PoisonError::into_inner)
 }
@@ -72,7 +72,7 @@ pub fn segment_queues(
 }
 
 impl SegmentSender for Sender {
-    /// Does nothing: the one connection never breaks.
+    /// Does nothing, because the connection never breaks.
     fn renew(&mut self) -> Result<bool, TransportError> {
         Ok(false)
     }
@@ -104,7 +104,7 @@ impl SegmentReceiver for Receiver {
             let mut queue = lock(&self.queues[index]);
             if let Some(mut taken) = queue.full.pop_front() {
                 std::mem::swap(segment, &mut taken);
-                // The caller's buffer replaces the one handed out.
+                // The caller's old buffer replaces the returned one in the free list.
                 taken.block.resize(queue.block_len, 0.0);
                 queue.free.push(taken);
                 self.next = index + 1;
@@ -174,13 +174,12 @@ impl ParameterSubscriber for Subscriber {
         Ok(true)
     }
 
-    /// There is one learner.
     fn epoch(&self) -> u64 {
         EPOCH
     }
 }
 
-/// The newest acknowledgements and how many there have been.
+/// The newest acknowledgements, and the number of publications so far.
 #[derive(Debug)]
 struct Acknowledged {
     marks: Vec<Watermark>,

@@ -1,9 +1,9 @@
-//! Stages 4 and 7 of 8: segments from workers to the learner, policy snapshots back.
+//! Stages 4 and 7 of 8: transfers segments from workers to the learner and policy snapshots back.
 //!
-//! The same six traits have two implementations: `in_process` (one-process runs and tests) and
-//! `shared_memory` (iceoryx2, between processes). No call blocks: a full queue is reported, and the
-//! caller decides how long to wait. `delivery` keeps segments until they are acknowledged, and
-//! drops duplicates.
+//! Six traits have two implementations each: `in_process` (one-process runs and tests) and
+//! `shared_memory` (iceoryx2, between processes). No call blocks: if a queue is full, the call says
+//! so, and the caller decides how long to wait. `delivery` keeps segments until they are
+//! acknowledged, and drops duplicates.
 
 pub mod delivery;
 mod error;
@@ -21,9 +21,9 @@ use crate::segment::{Segment, SegmentHeader};
 pub enum SendOutcome {
     /// The segment is in the learner's queue.
     Delivered,
-    /// The queue is full; retry later.
+    /// The queue is full. Retry later.
     Full,
-    /// No learner is attached (not yet, or no longer); retry later.
+    /// No learner is attached at the moment. Retry later.
     Detached,
 }
 
@@ -32,11 +32,11 @@ pub trait SegmentSender {
     /// Reconnects if there is a new learner or the connection broke. Call it before each round of
     /// offers.
     ///
-    /// Returns true once for each new connection. Unacknowledged segments that were delivered
-    /// through the previous connection may be lost.
+    /// Returns true once for each new connection. Unacknowledged segments that were sent through
+    /// the previous connection may be lost.
     ///
     /// # Errors
-    /// `Incompatible` if the learner has another plan; other errors if they persist.
+    /// `Incompatible` if the learner has another plan. Other errors only if they persist.
     fn renew(&mut self) -> Result<bool, TransportError>;
 
     /// Offers one segment without blocking. The queue has accepted it only if the result is
@@ -51,9 +51,10 @@ pub trait SegmentSender {
     ) -> Result<SendOutcome, TransportError>;
 }
 
-/// The learner's end of all segment queues, which it serves in turn so that no worker starves.
+/// The learner's end of all segment queues. It serves the queues in turn, so that no worker
+/// starves.
 pub trait SegmentReceiver {
-    /// Copies the next segment into `segment`; `false` if every queue is empty.
+    /// Copies the next segment into `segment`. Returns false if every queue is empty.
     ///
     /// # Errors
     /// `Middleware` if a queue is broken.
@@ -91,14 +92,15 @@ pub trait ParameterSubscriber {
     /// `Middleware` if the channel is broken.
     fn newest(&mut self, snapshot: &mut ParameterSnapshot) -> Result<bool, TransportError>;
 
-    /// Number of the learner that this channel is connected to, counted over a session.
+    /// Returns the number of the learner that this channel is connected to. Each new learner of a
+    /// session has a higher number.
     fn epoch(&self) -> u64;
 }
 
-/// The learner's end of the acknowledgement channel. Acknowledgements are cumulative: the newest
-/// replace the ones before.
+/// The learner's end of the acknowledgement channel. Acknowledgements are cumulative, so each one
+/// replaces all earlier ones.
 pub trait AcknowledgementPublisher {
-    /// Sends every worker its newest mark. Call it about a hundred times per second.
+    /// Sends the newest mark of every worker. Call it about a hundred times per second.
     ///
     /// # Errors
     /// `Length` if there is not one mark per worker, `Middleware` if publishing failed.
@@ -114,14 +116,15 @@ pub trait AcknowledgementPublisher {
 
 /// A worker's end of the acknowledgement channel.
 pub trait AcknowledgementSubscriber {
-    /// Copies the newest acknowledgements into `acknowledgements` if they have not been taken yet.
+    /// Copies the newest acknowledgements into `acknowledgements` unless a previous call already
+    /// did. Returns whether it copied them.
     ///
     /// # Errors
     /// `Length` if there is not one mark per worker, `Middleware` if the channel is broken.
     fn newest(&mut self, acknowledgements: &mut Acknowledgements) -> Result<bool, TransportError>;
 }
 
-/// The types of a worker's ends in one implementation of the transport.
+/// The types of a worker's ends of the channels, in one implementation of the transport.
 pub trait WorkerTransport {
     /// Offers segments to the learner.
     type Segments: SegmentSender;
@@ -131,7 +134,7 @@ pub trait WorkerTransport {
     type Acknowledgements: AcknowledgementSubscriber;
 }
 
-/// A worker's three ends of the transport.
+/// A worker's ends of the three channels.
 #[derive(Debug)]
 pub struct WorkerEnd<T: WorkerTransport> {
     /// Offers segments to the learner.

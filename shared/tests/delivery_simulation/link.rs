@@ -7,11 +7,11 @@ use dmprl_shared::transport::{SegmentSender, SendOutcome, TransportError};
 use rand::RngExt;
 use rand_xoshiro::Xoshiro256PlusPlus;
 
-/// The worst behaviour that shared memory allows.
+/// A queue with the worst behaviour that shared memory allows.
 pub struct Link {
     random: Xoshiro256PlusPlus,
     pub faults: bool,
-    /// A dead learner's queue still accepts segments.
+    /// Queued segments. The queue of a dead learner still accepts segments.
     pub queue: VecDeque<Segment>,
     capacity: usize,
     epoch: u64,
@@ -52,7 +52,7 @@ impl SegmentSender for Link {
         let broke = self.chance(30);
         if broke {
             self.renewals += 1;
-            // With or without its content.
+            // The queue's content may be lost or not.
             if self.chance(2) {
                 self.queue.clear();
             }
@@ -68,11 +68,11 @@ impl SegmentSender for Link {
         block: &[f32],
     ) -> Result<SendOutcome, TransportError> {
         if self.chance(20) {
-            // Corresponds to iceoryx2's Ok(0).
+            // The case in which iceoryx2 returns Ok(0).
             self.drops += 1;
             return Ok(SendOutcome::Detached);
         }
-        // A learner has just started, so the connection is the dead one's.
+        // The connection still belongs to the previous learner.
         if self.connected != self.epoch {
             return Ok(SendOutcome::Detached);
         }

@@ -15,16 +15,16 @@ use crate::link::Link;
 
 const WORKERS: usize = 2;
 const STEPS: u32 = 250;
-/// Rounds without faults, within which every kept segment must arrive.
-const HEALING_ROUNDS: u32 = 100;
-/// Number of these rounds in which workers produce.
-const NEW_ROUNDS: u32 = 3;
-/// Small enough to fill up occasionally.
+/// Number of rounds without faults, within which every kept segment must arrive.
+const FAULTLESS_ROUNDS: u32 = 100;
+/// Number of these rounds in which workers still produce segments.
+const PRODUCING_ROUNDS: u32 = 3;
+/// Maximum size of the log, small enough that the log sometimes fills up.
 const LOG_BYTES_MAX: u64 = 5_000;
 pub const LAYOUT: SegmentLayout =
     SegmentLayout { segment_steps: 1, observation_len: 1, action_len: 1 };
 
-/// Counts of all events, over one world or many.
+/// Counts of all events, in one or several simulations.
 #[derive(Debug, Default)]
 pub struct Tally {
     pub inserted: u64,
@@ -81,7 +81,8 @@ impl Tally {
         ours.into_iter().zip(more).for_each(|(ours, more)| *ours += more);
     }
 
-    pub fn every_fault_has_struck(&self) -> bool {
+    /// Whether every event has occurred at least once.
+    pub fn has_every_event(&self) -> bool {
         self.counts().iter().all(|&count| count > 0)
     }
 }
@@ -92,13 +93,14 @@ struct Worker {
     /// The next sequence number.
     sequence: u64,
     link: Link,
-    /// The newest learner whose acknowledgement it has read.
+    /// Epoch of the newest learner whose acknowledgement the worker has read.
     heard: u64,
 }
 
-/// State that survives a learner's death: per worker, its mark and the number of inserted segments.
+/// State that survives the death of a learner. Both fields have one entry per worker.
 struct Checkpoint {
     marks: Vec<Watermark>,
+    /// Number of inserted segments.
     inserted: [usize; WORKERS],
 }
 
@@ -108,19 +110,19 @@ pub struct World {
     log_path: PathBuf,
     outbox_segments: usize,
     workers: Vec<Worker>,
-    /// `None` while no learner lives.
+    /// `None` while no learner is alive.
     inbox: Option<Inbox>,
     epoch: u64,
-    /// The model's replay: the learner's segments of each worker, in order.
+    /// The learner's replay: the inserted segments of each worker, in order.
     inserted: [Vec<Watermark>; WORKERS],
-    /// Segments that were inserted by learners that died before storing them.
+    /// Segments inserted by learners that died before a checkpoint contained them.
     forgotten: [Vec<Watermark>; WORKERS],
     /// The last acknowledged segment of each incarnation of each worker.
     acked: [Vec<Watermark>; WORKERS],
     checkpoint: Checkpoint,
-    /// A checkpoint in progress, and the size of the log at its start.
+    /// A checkpoint that is being written, and the size of the log at its start.
     saving: Option<(Checkpoint, u64)>,
-    /// All published acknowledgements, because an old one may arrive late.
+    /// All published acknowledgements, because old ones may arrive late.
     published: Vec<Acknowledgements>,
     tally: Tally,
 }
@@ -167,7 +169,7 @@ impl World {
     }
 
     /// Runs random events with faults.
-    pub fn suffer(&mut self) {
+    pub fn run_with_faults(&mut self) {
         for _ in 0..STEPS {
             match self.random.random_range(0..100) {
                 0..40 => {
@@ -187,17 +189,18 @@ impl World {
         }
     }
 
-    /// Runs without faults: all kept and newly produced segments must arrive.
-    pub fn heal(&mut self) {
+    /// Runs without faults and checks that all kept and newly produced segments arrive.
+    pub fn run_without_faults(&mut self) {
         self.workers.iter_mut().for_each(|worker| worker.link.faults = false);
         self.start_learner();
-        for round in 0..HEALING_ROUNDS {
-            if round > NEW_ROUNDS && self.workers.iter().all(|worker| worker.outbox.is_empty()) {
+        for round in 0..FAULTLESS_ROUNDS {
+            let all_arrived = self.workers.iter().all(|worker| worker.outbox.is_empty());
+            if round > PRODUCING_ROUNDS && all_arrived {
                 break;
             }
             for index in 0..WORKERS {
                 self.hear(index, self.published.len().checked_sub(1));
-                if round < NEW_ROUNDS {
+                if round < PRODUCING_ROUNDS {
                     self.produce(index);
                 }
                 let worker = &mut self.workers[index];
@@ -214,7 +217,7 @@ impl World {
             assert!(outbox.is_empty(), "worker {index} still keeps {}", outbox.len());
             assert_eq!(outbox.sent().acked, outbox.sent().produced, "worker {index}");
             let last = Watermark { incarnation: worker.incarnation, sequence: worker.sequence - 1 };
-            assert!(last.sequence > 0, "worker {index} has produced nothing");
+            assert!(last.sequence > 0, "worker {index} has produced no segment");
             assert_eq!(self.inserted[index].last(), Some(&last), "worker {index}");
         }
     }
@@ -230,7 +233,8 @@ impl World {
         self.tally
     }
 
-    /// A worker may read an acknowledgement, produces a segment if it has space, and offers.
+    /// One step of a worker: it may read an acknowledgement, produces a segment if there is room,
+    /// and offers its segments.
     fn work(&mut self, index: usize) {
         if !self.published.is_empty() && self.chance(2) {
             let newest = self.published.len() - 1;
@@ -261,8 +265,8 @@ impl World {
         }
     }
 
-    /// A worker reads an acknowledgement. The segments that it then discards must be where the
-    /// level guarantees.
+    /// A worker reads an acknowledgement. Checks that the segments that it then discards have been
+    /// stored as the delivery level guarantees.
     fn hear(&mut self, index: usize, which: Option<usize>) {
         let Some(acknowledgements) = which.map(|which| &self.published[which]) else { return };
         self.tally.stale_acknowledgements += u64::from(acknowledgements.epoch < self.epoch);
@@ -271,7 +275,7 @@ impl World {
         worker.outbox.acknowledge(acknowledgements);
         let gone = (kept_before - worker.outbox.len()) as u64;
         let is_stale = acknowledgements.epoch < worker.heard;
-        assert!(gone == 0 || !is_stale, "a dead learner's word counted");
+        assert!(gone == 0 || !is_stale, "an acknowledgement of a replaced learner was used");
         worker.heard = worker.heard.max(acknowledgements.epoch);
         if let Some(last) = self.acked[index].last_mut() {
             last.sequence += gone;
@@ -284,16 +288,16 @@ impl World {
         self.assert_acked_is_inserted();
     }
 
-    /// Checks, at level `log` and with a live learner, that every segment a worker has discarded is
-    /// in the replay.
+    /// Checks, at level `log` and while a learner is alive, that every segment that a worker has
+    /// discarded is in the replay.
     fn assert_acked_is_inserted(&self) {
         if self.level == DeliveryLevel::Memory || self.inbox.is_none() {
             return;
         }
         for (index, acked) in self.acked.iter().enumerate() {
             for mark in acked.iter().filter(|mark| mark.sequence > 0) {
-                let there = self.inserted[index].binary_search(mark).is_ok();
-                assert!(there, "worker {index}: {mark:?} was acknowledged and is lost");
+                let is_inserted = self.inserted[index].binary_search(mark).is_ok();
+                assert!(is_inserted, "worker {index}: {mark:?} was acknowledged and is lost");
             }
         }
     }
@@ -302,7 +306,8 @@ impl World {
         self.inbox.as_ref().is_some_and(Inbox::is_full)
     }
 
-    /// The learner takes a segment from one of the queues, as `Learner::insert` does.
+    /// The learner receives a segment from one of the queues and inserts it, like
+    /// `Learner::insert`.
     fn take(&mut self) {
         let Some(inbox) = &mut self.inbox else { return };
         if !inbox.has_room() {
@@ -328,18 +333,18 @@ impl World {
         let last = self.inserted[index].last().copied().unwrap_or_default();
         assert!(mark > last, "worker {index}: {mark:?} after {last:?}");
         for sequence in mark.sequence - lost..mark.sequence {
-            // Only a dead learner may have lost it, and only at level `memory`.
+            // Only the death of a learner may lose a segment, and only at level `memory`.
             let missing = Watermark { sequence, ..mark };
             assert_eq!(self.level, DeliveryLevel::Memory, "worker {index}: {missing:?} is lost");
-            assert!(self.forgotten[index].contains(&missing), "{missing:?} never came");
+            assert!(self.forgotten[index].contains(&missing), "{missing:?} was never inserted");
             self.tally.lost_at_level_memory += 1;
         }
         let gap = if mark.incarnation == last.incarnation { last.sequence } else { 0 };
-        assert_eq!(mark.sequence - gap - 1, lost, "worker {index}: a gap that nobody counted");
+        assert_eq!(mark.sequence - gap - 1, lost, "worker {index}: an uncounted gap");
         self.inserted[index].push(mark);
     }
 
-    /// Acknowledges as the learner's loop does. The learner may die before publishing and leave a
+    /// Acknowledges like the learner's loop. The learner may die before it publishes, and leave a
     /// torn log record, which was never acknowledged.
     fn acknowledge(&mut self) {
         let dies = self.workers[0].link.faults && self.chance(20);
@@ -361,8 +366,8 @@ impl World {
         self.kill_learner();
     }
 
-    /// Starts a checkpoint, or completes the current one; segments continue to arrive while it is
-    /// written. The learner may die before it truncates the log.
+    /// Starts a checkpoint, or completes the current one. Segments arrive while it is written. The
+    /// learner may die before it truncates the log.
     fn save(&mut self) {
         let dies = self.workers[0].link.faults && self.chance(10);
         let Some(inbox) = &mut self.inbox else { return };
@@ -391,7 +396,7 @@ impl World {
         }
     }
 
-    /// Starts a learner from checkpoint and log, with new queues.
+    /// Starts a learner from checkpoint and log, with empty queues.
     fn start_learner(&mut self) {
         if self.inbox.is_some() {
             return;
@@ -403,7 +408,7 @@ impl World {
             let identity = LogIdentity { run_id: 1, architecture_hash: 1 };
             let log = SegmentLog::open(&self.log_path, identity, LAYOUT, LOG_BYTES_MAX);
             let mut log = log.unwrap();
-            // As in `Learner::recover`.
+            // Like `Learner::recover`.
             log.replay(|segment| {
                 if !inbox.has(&segment.header) {
                     let lost = inbox.settle(&segment.header, &segment.block).unwrap();
@@ -418,7 +423,7 @@ impl World {
         self.assert_acked_is_inserted();
     }
 
-    /// Kills a worker with all unsent segments, and possibly with its queue.
+    /// Kills a worker, which loses all segments in its outbox, and possibly its queue.
     fn kill_worker(&mut self, index: usize) {
         let with_queue = self.chance(2);
         let worker = &mut self.workers[index];

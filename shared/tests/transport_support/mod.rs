@@ -1,7 +1,5 @@
-//! Shared parts of the transport tests.
-//!
-//! They are a run's directory, segments with sequence numbers, conditions with a deadline, and this
-//! test binary as another process.
+//! Helpers of the transport tests: a run's directory, segments with sequence numbers, conditions
+//! with a deadline, and child processes that run this test binary.
 
 #![allow(dead_code, reason = "each test binary uses a part")]
 
@@ -14,7 +12,7 @@ use dmprl_shared::parameters::ParameterSnapshot;
 use dmprl_shared::segment::{Segment, SegmentHeader, SegmentLayout};
 use dmprl_shared::transport::shared_memory::{Domain, Plan};
 
-/// Long enough for a loaded machine; a test that waits for it has failed.
+/// Time after which a condition has failed, long enough for a loaded machine.
 const DEADLINE: Duration = Duration::from_secs(60);
 const POLL_PAUSE: Duration = Duration::from_millis(1);
 
@@ -56,7 +54,7 @@ impl Parent {
     }
 }
 
-/// Polls `condition` until it returns a value.
+/// Polls `condition` until it returns a value. Panics after the deadline.
 #[track_caller]
 pub fn eventually<T>(what: &str, mut condition: impl FnMut() -> Option<T>) -> T {
     let start = Instant::now();
@@ -81,7 +79,7 @@ pub fn fill(block: &mut [f32], sequence: u64) {
     }
 }
 
-/// Panics unless the block has the numbers of the segment's sequence number.
+/// Checks that the block has the numbers of the segment's sequence number.
 #[track_caller]
 pub fn assert_whole(segment: &Segment) {
     let mut expected = vec![0.0; LAYOUT.block_len()];
@@ -89,7 +87,7 @@ pub fn assert_whole(segment: &Segment) {
     assert_eq!(segment.block, expected);
 }
 
-/// A snapshot whose values are its version.
+/// A snapshot whose values all equal its version.
 pub fn snapshot(version: u64) -> ParameterSnapshot {
     ParameterSnapshot {
         version,
@@ -103,7 +101,7 @@ const ROLE: &str = "DMPRL_TEST_ROLE";
 const DOMAIN: &str = "DMPRL_TEST_DOMAIN";
 const INCARNATION: &str = "DMPRL_TEST_INCARNATION";
 
-/// Another process: this test binary running only the test `entry`. Killed on drop.
+/// A child process: this test binary, running only the test `entry`. It is killed on drop.
 pub struct Process(Child);
 
 impl Process {
@@ -125,10 +123,10 @@ impl Process {
         self.0.wait().unwrap();
     }
 
-    /// Waits until the process dies, and returns its signal; calls `meanwhile` repeatedly.
+    /// Calls `meanwhile` repeatedly until the process dies. Returns the signal that killed it.
     #[track_caller]
     pub fn died_of(&mut self, mut meanwhile: impl FnMut()) -> Option<i32> {
-        let ended = eventually("the other process dies", || {
+        let ended = eventually("the child process dies", || {
             meanwhile();
             self.0.try_wait().unwrap()
         });
@@ -137,7 +135,7 @@ impl Process {
 
     #[track_caller]
     pub fn assert_alive(&mut self) {
-        assert_eq!(self.0.try_wait().unwrap(), None, "the other process has ended");
+        assert_eq!(self.0.try_wait().unwrap(), None, "the child process has ended");
     }
 }
 
@@ -148,7 +146,7 @@ impl Drop for Process {
     }
 }
 
-/// Role, domain and incarnation, in a process started by [`Process::start`].
+/// Returns role, domain and incarnation in a process that [`Process::start`] started, else `None`.
 pub fn role() -> Option<(String, PathBuf, u32)> {
     let role = std::env::var(ROLE).ok()?;
     let incarnation = std::env::var(INCARNATION).unwrap().parse().unwrap();

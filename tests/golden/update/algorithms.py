@@ -28,7 +28,7 @@ def adam(parameters, learning_rate):
 
 @dataclass(frozen=True)
 class Kit:
-    """What a benchmark exchanges for something faster that computes the same."""
+    """Parts that a benchmark replaces by faster ones with the same results."""
 
     make_policy: Callable = make_policy
     adam: Callable = adam
@@ -41,7 +41,7 @@ def squared_error(q, targets):
 
 
 class ActorCritic:
-    """What the three have in common: the networks and how a critic is asked."""
+    """The networks and the critic's inputs, common to the three algorithms."""
 
     def __init__(self, settings, kit, critics, extra_outputs=0):
         self.settings, self.kit = settings, kit

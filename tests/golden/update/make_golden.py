@@ -157,7 +157,7 @@ def parameters_of(algorithm):
 
 
 def run(algorithm, batches):
-    """All updates; returns what the file holds of them."""
+    """Makes all updates; returns the tensors of the file."""
     detailed = DETAILED[algorithm.settings.algorithm]
     out = {f"initial.{n}": flat(v) for n, v in parameters_of(algorithm).items()}
     for index in range(UPDATES):

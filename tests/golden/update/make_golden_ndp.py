@@ -35,7 +35,7 @@ CASE = replace(
 
 
 def keys():
-    """What differs from dmprl's defaults."""
+    """Keys that differ from dmprl's defaults."""
     return configuration(CASE) | {
         "policy.controller": "position",
         "policy.position_scale": "2.0",
@@ -106,7 +106,7 @@ def in_double(ndp):
 
 
 def run(ndp):
-    """All updates; returns what the file holds of them."""
+    """Makes all updates; returns the tensors of the file."""
     out = {f"initial.{name}": flat(values) for name, values in ndp.parameters.items()}
     out |= {f"rollout.{name}": values for name, values in ndp.rollout.items()}
     ndp.judge()

@@ -21,7 +21,7 @@ DEVIATION_MIN = 1e-5
 
 
 class Ndp:
-    """Actor, log-std and value, and what a rollout was worth when it began."""
+    """Actor, log-std and value function, and the advantages at the start of a rollout."""
 
     def __init__(self, settings, rollout, initial_log_std):
         self.settings, self.rollout = settings, rollout

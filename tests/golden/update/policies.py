@@ -73,7 +73,7 @@ def make_policy(settings, extra_outputs=0):
 
 
 def seen_by_critic(settings, actions, end):
-    """Of a segment's actions (B, K, A) and end state, what the critic's input holds."""
+    """Selects the critic's inputs from a segment's actions (B, K, A) and end state."""
     if settings.critic == "first":
         return actions[:, 0]
     return torch.cat([actions.flatten(1), end], dim=1)

@@ -1,11 +1,11 @@
-"""What a golden case, or a benchmark, is about: the settings of one experiment and its sizes."""
+"""Settings and sizes of a golden case or a benchmark."""
 
 from dataclasses import dataclass, fields
 
 
 @dataclass(frozen=True)
 class Start:
-    """Where one dimension's y0 and yd0 stand in an observation.
+    """Indices of one dimension's y0 and yd0 in an observation.
 
     y0 = atan2(observation[sin], observation[cos]), or scale * observation[index].
     """
@@ -19,7 +19,7 @@ class Start:
 
 @dataclass(frozen=True)
 class Settings:
-    """The values that decide what one update computes."""
+    """The values that an update depends on."""
 
     algorithm: str
     policy: str
@@ -51,7 +51,7 @@ class Settings:
 
     @staticmethod
     def from_dict(values):
-        """Reads what a JSON object holds, as a benchmark is told; unknown keys are refused."""
+        """Reads the JSON object of a benchmark; rejects unknown keys."""
         known = {item.name for item in fields(Settings)}
         assert set(values) <= known, f"unknown settings: {sorted(set(values) - known)}"
         values = {key: tuple(v) if isinstance(v, list) else v for key, v in values.items()}
@@ -75,7 +75,7 @@ class Settings:
 
     @property
     def critic_action_len(self):
-        """Of a segment's actions and end state, what the critic sees."""
+        """The part of a segment's actions and end state in the critic's input."""
         if self.critic == "first":
             return self.action_len
         return self.steps * self.action_len + (2 * self.action_len if self.carries else 0)

@@ -1,4 +1,4 @@
-//! What a case may use of memory and time. Beyond that the process ends at once, with the seed.
+//! Limits of memory and time for a case. Beyond them the process ends at once and prints the seed.
 
 use std::alloc::{GlobalAlloc, Layout, System};
 use std::cell::Cell;
@@ -9,14 +9,15 @@ use std::time::{Duration, Instant};
 
 use crate::{ONE_SEED, Target};
 
-/// A case takes milliseconds; so long that only a hang takes longer, on any machine.
+/// A case takes milliseconds; only a hang takes this long, on any machine.
 const CASE_LIMIT: Duration = Duration::from_secs(60);
-/// Between two looks whether a case is over.
+/// Interval between two checks whether a case has ended.
 const LOOK: Duration = Duration::from_millis(500);
 
-/// Says how to run a case alone.
+/// Prints how to run a case alone.
 pub fn tell(name: &str, seed: u64, what: &str) {
-    // Not `eprintln!`: a process that ends at once takes with it what the harness keeps.
+    // Not `eprintln!`: its output, which the harness captures, is lost when the process ends at
+    // once.
     let _ = writeln!(
         std::io::stderr(),
         "{name}, seed {seed}: {what}; alone: {ONE_SEED}={seed} cargo test --release \
@@ -24,7 +25,7 @@ pub fn tell(name: &str, seed: u64, what: &str) {
     );
 }
 
-/// What this thread's case holds, and may.
+/// Memory in use and its limit for this thread's case.
 #[derive(Clone, Copy)]
 struct Account {
     name: &'static str,
@@ -37,12 +38,12 @@ thread_local! {
     static ACCOUNT: Cell<Option<Account>> = const { Cell::new(None) };
 }
 
-/// Books memory of this thread's case; the end of the process if it asks for too much.
+/// Counts memory of this thread's case; ends the process if it exceeds the limit.
 fn book(bytes: isize) {
     // A thread that is ending has no case.
     let Ok(Some(mut account)) = ACCOUNT.try_with(Cell::get) else { return };
     if std::thread::panicking() {
-        // What a backtrace takes is not the case's.
+        // Memory for a backtrace is not counted.
         return;
     }
     account.held += bytes;
@@ -54,8 +55,8 @@ fn book(bytes: isize) {
     let _ = ACCOUNT.try_with(|it| it.set(Some(account)));
 }
 
-/// Names the case of the thread that ends the process: after too much memory, and after an
-/// overflow of the stack, of which Rust tells nobody who could.
+/// Names the case of the thread that ends the process, after too much memory or a stack overflow,
+/// which Rust does not report to the harness.
 extern "C" fn on_abort(_signal: libc::c_int) {
     if let Ok(Some(account)) = ACCOUNT.try_with(|it| it.replace(None)) {
         tell(account.name, account.seed, "ended the process");
@@ -64,7 +65,7 @@ extern "C" fn on_abort(_signal: libc::c_int) {
 
 struct Bounded;
 
-// SAFETY: all work is the system allocator's; the account does not touch the memory.
+// SAFETY: the system allocator does all work; the counter does not touch the memory.
 unsafe impl GlobalAlloc for Bounded {
     unsafe fn alloc(&self, layout: Layout) -> *mut u8 {
         book(layout.size().cast_signed());
@@ -94,13 +95,13 @@ unsafe impl GlobalAlloc for Bounded {
 #[global_allocator]
 static ALLOCATOR: Bounded = Bounded;
 
-/// A case under way on this thread.
+/// A running case of this thread.
 pub struct Watched {
     over: Arc<AtomicBool>,
 }
 
 thread_local! {
-    /// Tells the watch of this thread's cases which one is under way.
+    /// Reports the running case to this thread's watchdog.
     static WATCH: std::cell::RefCell<Option<std::sync::mpsc::Sender<Begun>>> =
         const { std::cell::RefCell::new(None) };
 }
@@ -117,7 +118,7 @@ impl Watched {
         let over = Arc::new(AtomicBool::new(false));
         let begun = Begun { name, seed, over: Arc::clone(&over) };
         WATCH.with_borrow_mut(|watch| {
-            // A watch that has ended has seen a panic of its own.
+            // The watchdog has ended only if it panicked itself.
             let _ = watch.get_or_insert_with(start_watch).send(begun);
         });
         ACCOUNT.set(Some(Account { name, seed, held: 0, most: bytes_max }));
@@ -134,7 +135,7 @@ impl Drop for Watched {
 
 fn start_watch() -> std::sync::mpsc::Sender<Begun> {
     let handler = on_abort as extern "C" fn(libc::c_int);
-    // SAFETY: the handler only reads this thread's account and writes to standard error; the
+    // SAFETY: the handler only reads this thread's counter and writes to standard error; the
     // process ends after it in any case.
     unsafe { libc::signal(libc::SIGABRT, handler as libc::sighandler_t) };
     let (sender, cases) = std::sync::mpsc::channel::<Begun>();

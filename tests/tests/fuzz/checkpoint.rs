@@ -1,4 +1,4 @@
-//! Checkpoints with damaged files, and such whose checksums say that all is well.
+//! Checkpoints with damaged files, with and without matching checksums.
 
 use std::collections::BTreeMap;
 use std::fs;
@@ -14,20 +14,20 @@ use crate::{Target, Verdict};
 
 const STATE: &str = "state.json";
 const REPLAY: &str = "replay.bin";
-/// Before the slots of a replay, each of 8 bytes, its successor first.
+/// Bytes in front of a replay's slots, which have 8 bytes each, beginning with the successor.
 const REPLAY_HEAD: usize = 80;
 const NETWORKS: &str = "networks.safetensors";
-/// Updates after a checkpoint that was accepted: it must be fit to go on from.
+/// Number of updates from an accepted checkpoint, which must be usable.
 const UPDATES: usize = 2;
 
-/// Keys of a run; the ones with most in their checkpoints.
+/// Keys of a run whose checkpoints have the most content.
 type Keys = &'static [(&'static str, &'static str)];
 const RUNS: [Keys; 2] = [
     &[("policy.normalise_observations", "true")],
     &[("algorithm.name", "sac"), ("policy.kind", "mlp"), ("policy.start", "zero")],
 ];
 
-/// A checkpoint's files by name.
+/// Files of a checkpoint by name.
 type Files = BTreeMap<String, Vec<u8>>;
 
 fn write(learner: &mut Learner, folder: &Path) -> Files {
@@ -37,12 +37,12 @@ fn write(learner: &mut Learner, folder: &Path) -> Files {
     entries.map(|entry| (entry.file_name().into_string().unwrap(), read(&entry.path()))).collect()
 }
 
-/// Checkpoints of one run at two moments.
+/// Checkpoints of one run at two times.
 fn checkpoints(keys: Keys, folder: &Path) -> [Files; 2] {
     let mut random = Random::new(dmprl_shared::seeds::stream(1, "checkpoints", 0));
     let mut learner = fixture::learner(keys).unwrap();
     let mut number = 0;
-    // The second when the ring has come round.
+    // The second one after the ring has wrapped around.
     [20, 230].map(|segments| {
         for _ in 0..segments {
             let segment = fixture::segment(&mut random, &learner, number);
@@ -56,8 +56,8 @@ fn checkpoints(keys: Keys, folder: &Path) -> [Files; 2] {
     })
 }
 
-/// Has `state.json` say what the files are, and nothing of itself, as in older versions: damage
-/// gets past the checksums.
+/// Writes the checksums of the files, and none of itself, into `state.json`, as older versions did,
+/// so that damage passes the checksums.
 fn repair(files: &mut Files) {
     let Ok(mut state) = serde_json::from_slice::<Value>(&files[STATE]) else { return };
     for sum in state.get_mut("files").and_then(Value::as_array_mut).into_iter().flatten() {
@@ -76,7 +76,7 @@ fn repair(files: &mut Files) {
     files.insert(STATE.into(), serde_json::to_vec(&state).unwrap());
 }
 
-/// Changes one file, or two.
+/// Changes one file or two.
 fn damage(random: &mut Random, files: &mut Files, other: &Files) {
     for _ in 0..=random.below(2) {
         match random.below(9) {
@@ -86,10 +86,10 @@ fn damage(random: &mut Random, files: &mut Files, other: &Files) {
                     files.insert(STATE.into(), serde_json::to_vec(&state).unwrap());
                 }
             }
-            // The counts at its front decide how the rest is read.
+            // The counts at its beginning determine how the rest is read.
             3 => overwrite_count(random, files.get_mut(REPLAY).unwrap()),
             4 => overwrite_count(random, files.get_mut(NETWORKS).unwrap()),
-            // A slot's successor, of which a window takes its other half.
+            // A slot's successor, from which a window takes its second half.
             5 => {
                 let replay = files.get_mut(REPLAY).unwrap();
                 let (at, number) = (REPLAY_HEAD + 8 * random.below(240), random.number() as u32);
@@ -128,7 +128,7 @@ fn one_that_is_accepted_can_be_gone_on_from_and_any_other_is_refused() {
     let target = Target {
         name: "checkpoint::one_that_is_accepted_can_be_gone_on_from_and_any_other_is_refused",
         cases: 800,
-        // A buffer of 1 MiB for each file and a learner.
+        // A buffer of 1 MiB for each file, and a learner.
         bytes_max: 16 << 20,
     };
     let folder = fixture::folder();
@@ -162,7 +162,7 @@ fn one_that_is_accepted_can_be_gone_on_from_and_any_other_is_refused() {
     });
 }
 
-/// What was accepted is written as it was read, and trains.
+/// An accepted checkpoint is written again unchanged, and trains.
 fn go_on(random: &mut Random, mut learner: Learner, keys: Keys, folder: &Path) -> Files {
     let first = write(&mut learner, folder);
     let (mut copy, _) = load_newest(folder, &|| fixture::learner(keys)).unwrap();
@@ -170,7 +170,7 @@ fn go_on(random: &mut Random, mut learner: Learner, keys: Keys, folder: &Path) -
     for number in 0..4 {
         let mut segment = fixture::segment(random, &learner, number);
         segment.header.incarnation = u32::MAX;
-        // Its marks may be as far as they can be.
+        // Its counters may be at their limits.
         let _ = learner.insert(&segment);
     }
     for slot in 0..learner.replay.len() {
@@ -182,7 +182,7 @@ fn go_on(random: &mut Random, mut learner: Learner, keys: Keys, folder: &Path) -
         }
     }
     for _ in 0..UPDATES {
-        // A number that is not finite ends the run, with its name.
+        // A number that is not finite ends the run, with the name of its tensor.
         if learner.update().is_err() {
             break;
         }

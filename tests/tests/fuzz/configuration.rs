@@ -1,4 +1,4 @@
-//! Configurations: files, and keys set one by one as by `--set` and environment variables.
+//! Configurations: files, and single keys as set by `--set` and environment variables.
 
 use std::time::Duration;
 
@@ -9,7 +9,7 @@ use crate::mutate::{self, Random};
 use crate::{Target, Verdict, fixture};
 
 const LIMITS: Limits = Limits { cores: 2 };
-/// Values that are trouble where a number, a word or a list is expected.
+/// Values that cause errors where a number, a word or a list is expected.
 const VALUES: [&str; 24] = [
     "0",
     "1",
@@ -37,7 +37,7 @@ const VALUES: [&str; 24] = [
     "1\nrun.seed = 2",
 ];
 const INTEGRATION_STEPS_MAX: usize = 2_000;
-/// Nested deeper than any tree of keys.
+/// Deeper than any tree of keys.
 const DEPTH_MAX: usize = 100_000;
 
 fn value(random: &mut Random) -> String {
@@ -60,7 +60,7 @@ fn key(random: &mut Random, keys: &[String]) -> String {
     key
 }
 
-/// Text of a file: one that is complete, changed here and there.
+/// Text of a complete file with changes.
 fn file(random: &mut Random, keys: &[String], whole: &str) -> String {
     match random.below(4) {
         0 => {
@@ -121,7 +121,8 @@ fn one_that_is_accepted_is_in_range_and_the_same_when_written_and_read() {
     });
 }
 
-/// Where a run turns it into durations and sizes. Large ones are left out: they only take long.
+/// Numbers that a run turns into durations and sizes. Large ones are left out, because they take
+/// long.
 fn use_as_a_run_does(config: &ExperimentConfig) {
     for seconds in [config.actors.send_deadline_s, config.actors.env_call_timeout_s] {
         assert!(Duration::try_from_secs_f64(seconds).is_ok(), "{seconds}");
@@ -134,7 +135,7 @@ fn use_as_a_run_does(config: &ExperimentConfig) {
     }
 }
 
-/// Equal, with numbers that are none equal to themselves: they are refused later, by range.
+/// Compares with NaN equal to itself; ranges reject NaN later.
 fn assert_same(one: &ExperimentConfig, other: &ExperimentConfig) {
     assert_eq!(toml::to_string(one).unwrap(), toml::to_string(other).unwrap());
 }

@@ -1,4 +1,4 @@
-//! The control protocol: whatever comes in a line, and lines without end.
+//! The control protocol: arbitrary lines, and lines without an end.
 
 use std::io::{Cursor, Read};
 use std::sync::mpsc;
@@ -14,7 +14,7 @@ use serde_json::Value;
 use crate::mutate::{self, Random};
 use crate::{Target, Verdict, fixture};
 
-/// The pipe's thread needs so long at most, on any machine.
+/// Limit for the pipe's thread on any machine.
 const PATIENCE: Duration = Duration::from_secs(30);
 
 fn request() -> EvaluationRequest {
@@ -47,7 +47,7 @@ fn reports() -> Vec<Value> {
     reports.iter().map(|report| serde_json::to_value(report).unwrap()).collect()
 }
 
-/// A line that is nearly one of `valid`.
+/// A line that is almost one of `valid`.
 fn line(random: &mut Random, valid: &[Value]) -> Vec<u8> {
     let mut tree = random.pick(valid).clone();
     let other = serde_json::to_vec(random.pick(valid)).unwrap();
@@ -101,7 +101,7 @@ fn a_command_that_is_accepted_is_the_same_when_written_and_read() {
     });
 }
 
-/// What workers that join and supervisors say before they trust each other.
+/// Messages between joining workers and supervisors before the worker is accepted.
 #[test]
 fn a_word_of_joining_that_is_accepted_is_the_same_when_written_and_read() {
     let target = Target {
@@ -132,12 +132,12 @@ fn a_word_of_joining_that_is_accepted_is_the_same_when_written_and_read() {
     });
 }
 
-/// A role among lines that are none: it takes what is a command, in order, and its end is seen.
+/// A role receives valid commands in order among invalid lines, and detects the end.
 #[test]
 fn commands_come_through_between_lines_that_are_none() {
     let target = Target {
         name: "control::commands_come_through_between_lines_that_are_none",
-        // Few: the role says of each line that it is none.
+        // Few, because the role reports each invalid line.
         cases: 12,
         bytes_max: 16 << 20,
     };
@@ -158,7 +158,7 @@ fn commands_come_through_between_lines_that_are_none() {
             input.extend(line);
             input.push(b'\n');
             if too_long {
-                // Nobody is there to be understood.
+                // The supervisor is gone.
                 break;
             }
         }

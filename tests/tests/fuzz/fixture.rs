@@ -1,4 +1,4 @@
-//! A small learner and what belongs to it.
+//! A small learner with its configuration, segments and folders.
 
 use std::path::Path;
 
@@ -28,7 +28,7 @@ pub fn spec() -> EnvSpec {
     }
 }
 
-/// Small in everything, so that a case takes a fraction of a millisecond; nobody joins.
+/// Small sizes, so that a case takes a fraction of a millisecond; no worker may join.
 pub fn config(keys: &[(&str, &str)]) -> ExperimentConfig {
     let mut layers = Layers::new();
     let small = [
@@ -52,7 +52,7 @@ pub fn learner(keys: &[(&str, &str)]) -> Result<Learner, LearnerError> {
     Learner::new(config(keys), &spec(), RUN_ID)
 }
 
-/// A valid segment: the `number`th of all workers, in turns.
+/// A valid segment, the `number`th in total, from the workers in turn.
 pub fn segment(random: &mut Random, learner: &Learner, number: u64) -> Segment {
     let layout = learner.policy().layout();
     let mut segment = Segment::zeroed(layout);
@@ -82,7 +82,7 @@ pub fn segment(random: &mut Random, learner: &Learner, number: u64) -> Segment {
     segment
 }
 
-/// A folder whose files cost no disk, where the system has one.
+/// Returns a folder in memory, where the system has one.
 pub fn folder() -> tempfile::TempDir {
     let memory = Path::new("/dev/shm");
     let parent = if memory.is_dir() { memory.to_owned() } else { std::env::temp_dir() };

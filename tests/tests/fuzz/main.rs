@@ -1,12 +1,12 @@
-//! Everything that is read from outside, fed with what is nearly right: segments in shared memory,
-//! the segment log, checkpoints, policies, configurations, lines of the control protocol.
+//! Fuzzes everything that is read from outside: segments in shared memory, the segment log,
+//! checkpoints, policies, configurations, lines of the control protocol.
 //!
-//! Whatever comes, nothing panics, hangs, or asks for more memory than its limit; what is refused
-//! changes nothing, and what is accepted is sound. Inputs are made from valid ones by small
-//! changes, mostly with their checksums made right again, so that they come past the first door.
+//! No input may cause a panic, a hang, or more memory than its limit. Rejected input changes
+//! nothing, and accepted input is sound. Inputs are valid ones with small changes, most with
+//! corrected checksums, so that they pass the first check.
 //!
-//! A failure names its target and seed; `DMPRL_FUZZ_SEED=<seed>` runs that one alone, and
-//! `DMPRL_FUZZ_SECONDS=<seconds>` each target for so long instead of its usual number of cases.
+//! A failure prints its target and seed. `DMPRL_FUZZ_SEED=<seed>` runs that case alone, and
+//! `DMPRL_FUZZ_SECONDS=<seconds>` runs each target for this time instead of its number of cases.
 
 #![allow(clippy::unwrap_used, reason = "a test's helpers fail the test")]
 
@@ -29,7 +29,7 @@ use mutate::Random;
 const ONE_SEED: &str = "DMPRL_FUZZ_SEED";
 const SECONDS: &str = "DMPRL_FUZZ_SECONDS";
 
-/// What became of an input.
+/// Outcome of an input.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Verdict {
     Accepted,
@@ -42,19 +42,19 @@ impl Verdict {
     }
 }
 
-/// A test and how often it tries.
+/// A fuzz target and its number of cases.
 #[derive(Debug, Clone, Copy)]
 struct Target {
-    /// The test's path, to run it alone.
+    /// Path of the test, to run it alone.
     name: &'static str,
-    /// Cases of a usual run, all targets together a few seconds.
+    /// Number of cases of a usual run; all targets take a few seconds.
     cases: u64,
-    /// Memory that one case may hold at once [bytes].
+    /// Memory limit of one case [bytes].
     bytes_max: usize,
 }
 
 impl Target {
-    /// Runs the cases; both verdicts must occur, or nothing was tested.
+    /// Runs the cases. Both outcomes must occur; otherwise nothing was tested.
     fn fuzz(self, mut case: impl FnMut(&mut Random) -> Verdict) {
         let mut run = |seed: u64| {
             let stream = seeds::stream(seed, self.name, 0);

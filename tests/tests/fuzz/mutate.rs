@@ -1,10 +1,10 @@
-//! Small changes to what is valid.
+//! Small changes to valid inputs.
 
 use dmprl_shared::seeds::Stream;
 use rand::RngExt;
 use serde_json::Value;
 
-/// Numbers at which counts, lengths and indices go wrong.
+/// Numbers that often break counts, lengths and indices.
 const EDGES: [u64; 14] = [
     0,
     1,
@@ -21,12 +21,12 @@ const EDGES: [u64; 14] = [
     u64::MAX - 1,
     u64::MAX,
 ];
-/// Changes of one input, at most.
+/// Maximum number of changes to an input.
 const CHANGES_MAX: usize = 4;
-/// Bytes put in or repeated at once, at most.
+/// Maximum number of bytes inserted or repeated at once.
 const PIECE_MAX: usize = 64;
 
-/// Chance, from one seed.
+/// Random choices from one seed.
 pub struct Random(Stream);
 
 impl Random {
@@ -34,12 +34,12 @@ impl Random {
         Self(stream)
     }
 
-    /// Below `limit`; 0 if that is 0.
+    /// Below `limit`; 0 if `limit` is 0.
     pub fn below(&mut self, limit: usize) -> usize {
         if limit == 0 { 0 } else { self.0.random_range(0..limit) }
     }
 
-    /// Once in `n`.
+    /// True once in `n`.
     pub fn once_in(&mut self, n: usize) -> bool {
         self.below(n) == 0
     }
@@ -48,7 +48,7 @@ impl Random {
         &from[self.below(from.len())]
     }
 
-    /// An edge, something beside one, or anything.
+    /// An edge value, a value next to one, or any value.
     pub fn number(&mut self) -> u64 {
         match self.below(4) {
             0 => self.0.random(),
@@ -63,7 +63,7 @@ impl Random {
         self.0.random_range(-1.0..=1.0)
     }
 
-    /// A float that is trouble, or not.
+    /// A problematic float, or a usual one.
     pub fn float(&mut self) -> f32 {
         match self.below(3) {
             0 => self.unit(),
@@ -114,7 +114,7 @@ pub fn json(random: &mut Random, tree: &mut Value) {
     }
 }
 
-/// Goes down to a random value and changes it, or what holds it.
+/// Descends to a random value and changes it or its container.
 fn change(random: &mut Random, tree: &mut Value) {
     let stays = random.once_in(8);
     match tree {

@@ -28,11 +28,11 @@ fn one_that_is_accepted_is_finite_and_stays_what_it_is() {
     target.fuzz(|random| {
         let mut bytes = made[0].clone();
         if random.once_in(3) {
-            // A number at the end, where the numbers are.
+            // A number in the tensors at the end of the file.
             let at = bytes.len() - 4 * (1 + random.below(8));
             bytes[at..at + 4].copy_from_slice(&random.float().to_le_bytes());
         } else if random.once_in(3) {
-            // The length of the header, which is text, and its text.
+            // The length of the header, or the header's text.
             let at = 8 + random.below(200);
             bytes[at] = *random.pick(b"0123456789[]{}\",:eE-");
             if random.once_in(4) {

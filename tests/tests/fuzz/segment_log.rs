@@ -1,4 +1,4 @@
-//! The segment log, as a learner finds it after a crash or on a bad disk.
+//! The segment log after a crash or on a faulty disk.
 
 use std::fs;
 
@@ -22,7 +22,7 @@ fn open(path: &std::path::Path, learner: &Learner) -> Result<SegmentLog, LogErro
     SegmentLog::open(path, identity, policy.layout(), BYTES_MAX)
 }
 
-/// A valid log's bytes.
+/// Bytes of a valid log.
 fn written(random: &mut Random, path: &std::path::Path, learner: &Learner) -> Vec<u8> {
     let mut log = open(path, learner).unwrap();
     for number in 0..RECORDS {
@@ -36,7 +36,7 @@ fn written(random: &mut Random, path: &std::path::Path, learner: &Learner) -> Ve
     bytes
 }
 
-/// Makes the checksums right again of records that are whole but for them.
+/// Corrects the checksums of records that are otherwise complete.
 fn repair(log: &mut [u8], record_bytes: usize) {
     for record in log.get_mut(HEAD_BYTES..).unwrap_or_default().chunks_exact_mut(record_bytes) {
         let (frame, payload) = record.split_at_mut(FRAME_BYTES);
@@ -49,7 +49,7 @@ fn every_whole_record_is_read_and_the_rest_is_cut_off() {
     let target = Target {
         name: "segment_log::every_whole_record_is_read_and_the_rest_is_cut_off",
         cases: 900,
-        // The log's own buffers of 4 and 1 MiB, twice, and a learner.
+        // The log's buffers of 4 and 1 MiB, twice, and a learner.
         bytes_max: 16 << 20,
     };
     let folder = fixture::folder();
@@ -77,7 +77,7 @@ fn read(path: &std::path::Path, log: &[u8], plain: &Learner) -> Verdict {
     let mut opened = match open(path, plain) {
         Ok(opened) => opened,
         Err(LogError::Foreign) => {
-            assert_eq!(fs::read(path).unwrap(), log, "what is another's stays");
+            assert_eq!(fs::read(path).unwrap(), log, "the log of another run is unchanged");
             return Verdict::Refused;
         }
         Err(error) => panic!("{error}"),
@@ -89,7 +89,7 @@ fn read(path: &std::path::Path, log: &[u8], plain: &Learner) -> Verdict {
     });
     let replayed = replayed.unwrap();
     drop(opened);
-    // What was handed over is what the file has, and what the file has now is that and no more.
+    // Exactly the delivered records are in the file.
     let left = fs::read(path).unwrap();
     assert_eq!(left.len() as u64 + replayed.cut_bytes, log.len().max(HEAD_BYTES) as u64);
     if log.len() >= HEAD_BYTES {
@@ -104,9 +104,9 @@ fn read(path: &std::path::Path, log: &[u8], plain: &Learner) -> Verdict {
     for record in left[HEAD_BYTES..].chunks_exact(records.max(1)) {
         let (frame, payload) = record.split_at(FRAME_BYTES);
         let expected = [payload.len() as u32, crc32fast::hash(payload)].map(u32::to_le_bytes);
-        assert_eq!(frame, expected.as_flattened(), "what is handed over is whole");
+        assert_eq!(frame, expected.as_flattened(), "delivered records are complete");
     }
-    // The learner takes of it what is sound, each once, and goes on.
+    // The learner accepts the sound records once each, and continues.
     let mut learner = fixture::learner(&[]).unwrap();
     let again = learner.recover(open(path, plain).unwrap()).unwrap();
     assert_eq!((again.records, again.cut_bytes), (replayed.records, 0));

@@ -1,4 +1,4 @@
-//! Segments as a peer may have written them: what the learner takes, and from shared memory.
+//! Arbitrary segments from a peer, given to the learner directly and through shared memory.
 
 use std::fs::{self, OpenOptions};
 use std::os::unix::fs::FileExt;
@@ -16,7 +16,7 @@ use crate::fixture::{self, ENVS, RUN_ID, WORKERS};
 use crate::mutate::Random;
 use crate::{Target, Verdict};
 
-/// Changes a valid segment: a field of the header to an edge, bits of it, numbers of the block.
+/// Changes a valid segment: a header field to an edge value, single bits, or numbers of the block.
 fn damage(random: &mut Random, segment: &mut Segment) {
     for _ in 0..random.below(3) {
         let header: &mut [u32] =
@@ -41,7 +41,7 @@ fn damage(random: &mut Random, segment: &mut Segment) {
     }
 }
 
-/// What holds of every segment that is taken, said anew and not by the code that is tested.
+/// Properties of every accepted segment, independent of the tested code.
 fn assert_sound(segment: &Segment, layout: SegmentLayout, architecture_hash: u64) {
     let header = segment.header;
     let (_, actions, _) = layout.split(&segment.block);
@@ -102,12 +102,12 @@ fn the_learner_takes_what_is_sound_and_refuses_the_rest_unchanged() {
     });
 }
 
-/// One worker's queue and the file in which its segments lie.
+/// One worker's queue and the file with its segments.
 struct Queue {
     learner: LearnerEnd,
     worker: WorkerEnd,
     data: PathBuf,
-    // Last: its folder goes when nobody uses it any more.
+    // Last, because its folder is removed with its last user.
     _domain: Domain,
     _folder: tempfile::TempDir,
 }
@@ -126,7 +126,7 @@ impl Queue {
         };
         let mut learner = serve(domain.path(), &plan).unwrap();
         let mut worker = attach(domain.path(), &plan, 0).unwrap();
-        // The file with a block that no other file has.
+        // The file whose block no other file has.
         let marked = vec![0.812_345_7; layout.block_len()];
         let sent = worker.segments.try_send(&SegmentHeader::default(), &marked).unwrap();
         assert_eq!(sent, SendOutcome::Delivered);
@@ -149,17 +149,17 @@ fn files(folder: &Path) -> Vec<PathBuf> {
     found
 }
 
-/// Where a block lies in a file [bytes].
+/// Position of a block in a file [bytes].
 fn places(path: &Path, block: &[f32]) -> Option<usize> {
     let (bytes, block) = (fs::read(path).ok()?, bytemuck::cast_slice::<f32, u8>(block));
     bytes.windows(block.len()).position(|window| window == block)
 }
 
-/// Bytes before a block in which its headers lie, iceoryx2's and ours: its lengths among them.
+/// Bytes of headers in front of a block, iceoryx2's and ours, including its lengths.
 const HEADERS: usize = 160;
 
-/// The peer changes a sample after it has sent it: its numbers, our header, the middleware's words
-/// about who sent it and how long it is.
+/// A peer changes a sample after sending it: its numbers, our header, or the middleware's fields
+/// for sender and length.
 #[test]
 fn what_a_peer_writes_into_a_sample_harms_nobody() {
     let target = Target {
@@ -174,7 +174,7 @@ fn what_a_peer_writes_into_a_sample_harms_nobody() {
     target.fuzz(|random| {
         learner.inbox.restore(&[]);
         let mut sent = fixture::segment(random, &learner, 0);
-        // So that its place is found.
+        // So that its position can be found.
         sent.block[0] = number as f32;
         number += 1;
         sent.header.checksum = block_checksum(&sent.block);

@@ -1,12 +1,11 @@
-//! What runs dmprl on many machines, held to what it is written for: the manifests to Kubernetes'
-//! and JobSet's published types, the Slurm script to a play of Slurm, units and Compose file to
-//! their own programs where these are installed.
+//! Files that start dmprl on many machines: the Slurm script against an imitation of Slurm, units
+//! and the Compose file against their own programs where these are installed. `tests/manifests`
+//! checks the Kubernetes manifests.
 #![allow(
     clippy::unwrap_used,
     reason = "helpers of tests; clippy.toml covers only the tests themselves"
 )]
 
-mod kubernetes;
 mod own_checks;
 mod slurm;
 

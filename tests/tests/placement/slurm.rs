@@ -1,5 +1,5 @@
-//! `deploy/slurm/train.sbatch` from its first line to its last, in a play: `srun`, `scontrol` and
-//! `dmprl` are a few lines of bash that write down how they were called.
+//! Runs `deploy/slurm/train.sbatch` completely, with `srun`, `scontrol` and `dmprl` replaced by a
+//! few lines of bash that record their calls.
 
 use std::fs;
 use std::os::unix::fs::PermissionsExt;
@@ -12,8 +12,9 @@ use dmprl_tests::project_root;
 use rustix::process::{Pid, Signal, kill_process, kill_process_group};
 use tempfile::TempDir;
 
-/// The learner of a run is there until the test writes down its exit status in `over`; so are the
-/// bridges, which end well. Both end with the run's directory: a test that fails leaves nothing.
+/// The learner of a run waits until the test writes its exit status to `over`; so do the bridges,
+/// which exit with 0. Both end when the run's directory is removed, so a failed test leaves
+/// nothing.
 const DMPRL: &str = r#"
 echo "dmprl $*" >>"$CALLS"
 case $1 in
@@ -58,7 +59,7 @@ impl Job {
         self.folder.path().join(name)
     }
 
-    /// As Slurm starts it on the first of three nodes with eight cores each.
+    /// Starts it as Slurm does on the first of three nodes with eight cores each.
     fn start(&self, arguments: &[&str]) -> Child {
         let path = std::env::var("PATH").unwrap();
         Command::new("bash")
@@ -70,7 +71,7 @@ impl Job {
             .envs([("SLURM_JOB_ID", "7"), ("SLURM_JOB_NODELIST", "node[1-3]")])
             .envs([("SLURM_JOB_NUM_NODES", "3"), ("SLURM_CPUS_PER_TASK", "8")])
             .env("TMPDIR", "/tmp")
-            // What Slurm signals when it ends a job.
+            // The signal of Slurm when it ends a job.
             .process_group(0)
             .stdout(Stdio::null())
             .stderr(Stdio::null())
@@ -88,7 +89,7 @@ impl Job {
     }
 
     fn learner_ends(&self, status: &str) {
-        // Renamed: nobody reads half of it.
+        // Renamed, so that a reader never sees a partial file.
         fs::write(self.path("over"), status).unwrap();
         fs::rename(self.path("over"), self.path("runs/slurm-7/over")).unwrap();
     }
@@ -129,7 +130,7 @@ fn job_whose_time_is_over_is_stopped_requeued_and_resumed() {
     job.until_called(3);
     job.learner_ends("0");
     assert_eq!(script.wait().unwrap().code(), Some(0));
-    // The token is there already, so the hosts may come first.
+    // The token already exists, so the hosts may start first.
     assert!(job.calls().contains(&"dmprl resume runs/slurm-7 --no-progress".to_owned()));
 }
 

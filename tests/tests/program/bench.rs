@@ -1,4 +1,4 @@
-//! `dmprl bench rollout` with real workers and real peers, in rounds too short to mean anything.
+//! `dmprl bench rollout` with real workers and peers, in rounds too short for meaningful figures.
 
 use std::process::Command;
 
@@ -6,7 +6,7 @@ use dmprl_tests::program::{Running, Workplace, executable, shared_memory_named};
 use rustix::process::Signal;
 use serde_json::Value;
 
-/// Starts a benchmark whose temporary files lie in the test's folder.
+/// Starts a benchmark with its temporary files in the test's folder.
 fn bench(place: &Workplace, task: &str, more: &[&str]) -> Running {
     let temporary = place.path("tmp");
     std::fs::create_dir(&temporary).unwrap();
@@ -21,7 +21,7 @@ fn assert_nothing_left(place: &Workplace, process: rustix::process::Pid) {
     place.assert_no_process();
     let end = format!("-{}", process.as_raw_nonzero());
     let mut left = shared_memory_named(&end);
-    // A longer number begins alike.
+    // A longer number would have the same beginning.
     left.retain(|path| path.to_string_lossy().ends_with(&end));
     assert_eq!(left, Vec::<std::path::PathBuf>::new());
     assert_eq!(std::fs::read_dir(place.path("tmp")).unwrap().count(), 0, "temporary files");
@@ -45,7 +45,7 @@ fn a_task_on_the_batch_is_measured_beside_its_ceiling_and_gymnasium() {
     for key in ["worker_to_ceiling", "worker_to_gymnasium", "first_segment_s", "worker_rss_mb"] {
         positive(&json, key);
     }
-    // Whoever has EnvPool in .venv gets a figure, everyone else null and the reason.
+    // With EnvPool in .venv there is a figure, otherwise null and the reason.
     let envpool = json.get("envpool_steps_per_s").unwrap();
     assert!(envpool.as_f64() > Some(0.0) || envpool.is_null(), "{json}");
     assert!(json["notes"]["envpool"].as_str().unwrap().contains("envpool"), "{json}");
@@ -99,7 +99,7 @@ fn a_gymnasium_class_of_ones_own_is_measured_beside_gymnasiums_loop() {
     positive(&json, "worker_to_gymnasium");
 }
 
-/// The rest is measured all the same.
+/// The remaining parts are measured.
 #[test]
 fn an_interpreter_of_peers_that_is_none_makes_them_absent_with_its_last_word() {
     let place = Workplace::new();
@@ -128,7 +128,7 @@ fn an_environment_that_cannot_be_made_is_named_with_the_workers_own_words() {
     let id = running.id();
     let finished =
         running.wait().with_status(1).saying("actor-0 died: exit status 1").saying("Reachr");
-    // The folder of the logs is gone with the benchmark.
+    // The folder of the logs is removed with the benchmark.
     assert!(!finished.said.contains("logs/"), "{}", finished.said);
     assert_nothing_left(&place, id);
 }
@@ -144,8 +144,8 @@ fn ctrl_c_ends_it_at_once_and_leaves_nothing() {
     assert_nothing_left(&place, id);
 }
 
-/// Two workers, because one of several is measured alone: a worker that had been stopped for that
-/// would stay behind. Shared memory of the killed is removed by whoever starts next.
+/// With two workers, one is also measured alone, while the other is stopped and must not be left
+/// behind. The next start removes the shared memory of killed processes.
 #[test]
 fn a_killed_benchmark_takes_its_processes_with_it() {
     let place = Workplace::new();

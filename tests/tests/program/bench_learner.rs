@@ -1,4 +1,4 @@
-//! `dmprl bench learner`, in rounds too short to mean anything. It needs no Python of its own.
+//! `dmprl bench learner`, in rounds too short for meaningful figures. It needs no Python.
 
 use std::process::Command;
 
@@ -6,7 +6,7 @@ use dmprl_tests::program::{Running, Workplace, executable};
 use rustix::process::Signal;
 use serde_json::Value;
 
-/// Starts a benchmark of small networks whose temporary files lie in the test's folder.
+/// Starts a benchmark of small networks with its temporary files in the test's folder.
 fn bench(place: &Workplace, more: &[&str]) -> Running {
     let temporary = place.path("tmp");
     std::fs::create_dir_all(&temporary).unwrap();
@@ -52,7 +52,7 @@ fn every_algorithm_with_every_policy_is_measured_beside_its_floor() {
     assert_nothing_left(&place);
 }
 
-/// A stand-in that speaks the protocol: the real ones are no requirement of the tests.
+/// A fake peer that speaks the protocol, so that the tests do not need the real ones.
 #[test]
 fn a_peer_is_asked_for_rounds_of_its_own_and_an_absent_one_says_why() {
     let place = Workplace::new();

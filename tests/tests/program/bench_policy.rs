@@ -1,4 +1,4 @@
-//! `dmprl bench policy`: how long a decision takes next to a robot.
+//! `dmprl bench policy`: the time of a decision next to a robot.
 
 use dmprl_tests::program::Workplace;
 
@@ -13,7 +13,7 @@ fn a_decision_is_measured_beside_numpy() {
         assert!(0.0 < us[0] && us.is_sorted(), "{json}");
     }
     assert_eq!(json["what"], "Pusher-v5 23-256-256-70");
-    // The interpreter of .venv has no onnxruntime: told, and no failure.
+    // The interpreter of .venv has no onnxruntime, which is reported and is not a failure.
     assert!(json["peers"]["onnx"].is_null(), "{json}");
     place.assert_no_process();
 }

@@ -1,4 +1,4 @@
-//! `dmprl bench scale` with few synthetic workers, for too short a time to mean anything.
+//! `dmprl bench scale` with few synthetic workers, too short for meaningful figures.
 
 use std::process::Command;
 
@@ -6,7 +6,7 @@ use dmprl_tests::program::{Running, Workplace, executable, processes_naming, unt
 use rustix::process::{Pid, Signal};
 use serde_json::Value;
 
-/// Starts a benchmark whose temporary files lie in the test's folder.
+/// Starts a benchmark with its temporary files in the test's folder.
 fn bench(place: &Workplace, more: &[&str]) -> Running {
     let temporary = place.path("tmp");
     std::fs::create_dir_all(&temporary).unwrap();
@@ -15,7 +15,7 @@ fn bench(place: &Workplace, more: &[&str]) -> Running {
     command.args(["--cost-seconds", "0.2", "--check-seconds", "0.2", "--envs-per-worker", "2"]);
     command.args(["--set", "policy.hidden=[16]", "--set", "algorithm.critic_hidden=[16]"]);
     command.args(["--set", "algorithm.batch_size=16", "--set", "exploration.warm_up_steps=200"]);
-    // A small replay is full at once.
+    // A small replay fills at once.
     command.args(["--set", "replay.capacity_steps=5000"]).args(more);
     command.env("TMPDIR", temporary);
     place.start_command(command)
@@ -31,7 +31,7 @@ fn assert_nothing_left(place: &Workplace, benchmark: Pid) {
     place.assert_no_process();
     let end = format!("-{}", benchmark.as_raw_nonzero());
     let mut left = dmprl_tests::program::shared_memory_named(&end);
-    // A longer number begins alike.
+    // A longer number would have the same beginning.
     left.retain(|path| path.to_string_lossy().ends_with(&end));
     assert_eq!(left, Vec::<std::path::PathBuf>::new());
     assert_eq!(std::fs::read_dir(place.path("tmp")).unwrap().count(), 0, "temporary files");
@@ -54,7 +54,7 @@ fn ingest_loses_nothing_the_model_has_its_rows_and_a_real_system_stands_beside_i
     for fault in ["lost", "duplicate", "rejected"] {
         assert_eq!(json[fault], 0, "{fault}: {json}");
     }
-    // How fair it is on a loaded machine is no matter of a test.
+    // Not tested: fairness on a loaded machine.
     assert!(json["share_min"].as_f64() <= Some(1.0) && json["share_max"].as_f64() >= Some(1.0));
     for cost in ["worker_us", "insert_us", "ingest_us", "update_us", "update_cpu_us"] {
         positive(&json["costs"], cost);
@@ -88,7 +88,7 @@ fn ctrl_c_ends_the_simulation_at_once_and_leaves_nothing() {
     assert_nothing_left(&place, id);
 }
 
-/// Shared memory of the killed is removed by whoever starts next.
+/// The next start removes the shared memory of killed processes.
 #[test]
 fn a_killed_benchmark_takes_its_feeders_with_it() {
     let place = Workplace::new();

@@ -1,4 +1,4 @@
-//! `dmprl bench system` with a real run, for too short a time to mean anything.
+//! `dmprl bench system` with a real run, too short for meaningful figures.
 
 use std::process::Command;
 
@@ -6,7 +6,7 @@ use dmprl_tests::program::{Running, Workplace, executable};
 use rustix::process::Signal;
 use serde_json::Value;
 
-/// Starts a benchmark whose temporary files, the run among them, lie in the test's folder.
+/// Starts a benchmark with its temporary files, including the run, in the test's folder.
 fn bench(place: &Workplace, more: &[&str]) -> Running {
     let temporary = place.path("tmp");
     std::fs::create_dir_all(&temporary).unwrap();
@@ -19,7 +19,7 @@ fn bench(place: &Workplace, more: &[&str]) -> Running {
     place.start_command(command)
 }
 
-/// The supervisor of the run is in a session of its own, so the benchmark waits for it.
+/// The run's supervisor has its own session, so the benchmark waits for it.
 fn assert_nothing_left(place: &Workplace) {
     place.assert_no_process();
     assert_eq!(std::fs::read_dir(place.path("tmp")).unwrap().count(), 0, "temporary files");
@@ -38,11 +38,11 @@ fn a_whole_run_is_measured_after_its_warm_up_and_leaves_nothing() {
         positive(&json, key);
     }
     assert!(json["wall_s"].as_f64() >= Some(0.5), "{json}");
-    // Both kinds of lag are there, and no median is larger than the largest.
+    // Both kinds of lag are present, and no median exceeds its maximum.
     assert!(json["policy_lag_p50"].as_u64() <= json["policy_lag_max"].as_u64(), "{json}");
     assert!(json["policy_lag_max"].is_u64(), "{json}");
     assert!(json["excluded"]["env_steps"].as_u64() > Some(200), "{json}");
-    // The pacing holds over any stretch, up to what may be owed at its ends.
+    // The pacing holds for any interval, up to the updates that may be pending at its ends.
     assert_eq!(json["updates_per_segment_asked"], 2.0);
     let measured = json["updates_per_segment"].as_f64().unwrap();
     assert!((0.5..4.0).contains(&measured), "{json}");

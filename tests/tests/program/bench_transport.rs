@@ -1,4 +1,4 @@
-//! `dmprl bench transport` with real processes, in rounds too short to mean anything.
+//! `dmprl bench transport` with real processes, in rounds too short for meaningful figures.
 
 use std::process::Command;
 
@@ -8,7 +8,7 @@ use dmprl_tests::program::{
 use rustix::process::{Pid, Signal};
 use serde_json::Value;
 
-/// Starts a benchmark whose temporary files lie in the test's folder.
+/// Starts a benchmark with its temporary files in the test's folder.
 fn bench(place: &Workplace, more: &[&str]) -> Running {
     let temporary = place.path("tmp");
     std::fs::create_dir_all(&temporary).unwrap();
@@ -18,8 +18,8 @@ fn bench(place: &Workplace, more: &[&str]) -> Running {
     place.start_command(command)
 }
 
-/// The processes of a benchmark: one names the shared memory, which names the benchmark, or its
-/// pipe, or the folder of its logs.
+/// Returns the processes of a benchmark. Each names the shared memory, which names the benchmark,
+/// or its pipe, or the folder of its logs.
 fn is_alone(place: &Workplace, benchmark: Pid) -> bool {
     let id = benchmark.as_raw_nonzero();
     let names = [format!("-{id}"), format!("/proc/{id}/fd/")];
@@ -29,12 +29,12 @@ fn is_alone(place: &Workplace, benchmark: Pid) -> bool {
     place.processes().is_empty() && !names.iter().any(its_worker)
 }
 
-/// The sender of a Python peer looks twenty times a second whether its receiver lives.
+/// The sender of a Python peer checks twenty times a second whether its receiver is alive.
 fn until_nothing_left(place: &Workplace, benchmark: Pid) {
     until("no process", || is_alone(place, benchmark));
     let end = format!("-{}", benchmark.as_raw_nonzero());
     let mut left = shared_memory_named(&end);
-    // A longer number begins alike.
+    // A longer number would have the same beginning.
     left.retain(|path| path.to_string_lossy().ends_with(&end));
     assert_eq!(left, Vec::<std::path::PathBuf>::new());
     assert_eq!(std::fs::read_dir(place.path("tmp")).unwrap().count(), 0, "temporary files");
@@ -51,7 +51,7 @@ fn nothing_is_lost_and_nothing_comes_twice_whatever_the_size() {
     let id = running.id();
     let json = running.wait().with_status(0).json();
     assert_eq!(json["workers"], 2);
-    // How small it is on a loaded machine is no matter of a test.
+    // Not tested: its size on a loaded machine.
     assert!(json["blocked_cpu_fraction"].as_f64() >= Some(0.0), "{json}");
     let sizes = json["sizes"].as_array().unwrap();
     let bytes: Vec<_> = sizes.iter().map(|size| &size["segment_bytes"]).collect();
@@ -69,7 +69,7 @@ fn nothing_is_lost_and_nothing_comes_twice_whatever_the_size() {
         }
     }
     assert_eq!(json["peers"], sizes[0]["peers"]);
-    // Whoever has pyzmq in .venv gets a figure, everyone else null and the reason.
+    // With pyzmq in .venv there is a figure, otherwise null and the reason.
     let zeromq = json["peers"].get("zeromq").unwrap();
     assert!(zeromq.as_f64() > Some(0.0) || zeromq.is_null(), "{json}");
     let note = json["notes"]["zeromq"].as_str().unwrap();
@@ -77,7 +77,7 @@ fn nothing_is_lost_and_nothing_comes_twice_whatever_the_size() {
     until_nothing_left(&place, id);
 }
 
-/// The learner's place writes each segment before it is acknowledged.
+/// The receiver writes each segment to the log before it acknowledges it.
 #[test]
 fn at_level_log_nothing_is_lost_either_and_no_log_stays() {
     let place = Workplace::new();
@@ -94,7 +94,7 @@ fn at_level_log_nothing_is_lost_either_and_no_log_stays() {
     until_nothing_left(&place, id);
 }
 
-/// The rest is measured all the same.
+/// The remaining parts are measured.
 #[test]
 fn an_interpreter_that_is_none_makes_its_peers_absent_with_its_last_word() {
     let place = Workplace::new();
@@ -126,7 +126,7 @@ fn ctrl_c_ends_it_at_once_and_leaves_nothing() {
     until_nothing_left(&place, id);
 }
 
-/// Shared memory of the killed is removed by whoever starts next.
+/// The next start removes the shared memory of killed processes.
 #[test]
 fn a_killed_benchmark_takes_its_processes_with_it() {
     let place = Workplace::new();

@@ -1,4 +1,4 @@
-//! A run whose workers are on other hosts, all of them this one: real processes, real deaths.
+//! Runs with workers on other hosts, which are all this host: real processes and real crashes.
 
 use std::fs;
 use std::net::TcpListener;
@@ -12,23 +12,18 @@ use rustix::process::Signal;
 
 use crate::{ENDLESS, train};
 
-/// An endpoint on loopback that nobody has.
+/// Returns an unused endpoint on loopback.
 fn endpoint() -> String {
     let free = TcpListener::bind("127.0.0.1:0").unwrap();
     format!("tcp/{}", free.local_addr().unwrap())
 }
 
-/// A run that other hosts may take part in.
+/// Starts a run that accepts workers of other hosts.
 fn learner(place: &Workplace, run: &str, endpoint: &str, more: &[&str]) -> Running {
-    learner_of("reacher", place, (run, endpoint), more)
+    learner_of("reacher", place, run, endpoint, more)
 }
 
-fn learner_of(
-    task: &str,
-    place: &Workplace,
-    (run, endpoint): (&str, &str),
-    more: &[&str],
-) -> Running {
+fn learner_of(task: &str, place: &Workplace, run: &str, endpoint: &str, more: &[&str]) -> Running {
     let listen = format!("bridge.listen=[\"{endpoint}\"]");
     let open = ["--workers", "1", "--set", &listen, "--set", "bridge.workers_max=2"];
     let more = [&open[..], &["--set", "delivery.level=log"], more].concat();
@@ -57,12 +52,12 @@ fn last(run: &str) -> serde_json::Value {
     rows(run, "metrics.jsonl").pop().unwrap_or_default()
 }
 
-/// Segments of the other host's worker that the learner has, as its newest checkpoint knows.
+/// Number of segments of the other host's worker in the newest checkpoint.
 fn learned(run: &str, worker: usize) -> u64 {
     settled(run, worker, "sequence")
 }
 
-/// Which start of the worker those are of.
+/// Incarnation of the worker that sent them.
 fn incarnation(run: &str, worker: usize) -> u64 {
     settled(run, worker, "incarnation")
 }
@@ -72,7 +67,7 @@ fn settled(run: &str, worker: usize, what: &str) -> u64 {
     state["settled"][worker][what].as_u64().unwrap_or(0)
 }
 
-/// The worker of another host comes after the run's own and the four that may join.
+/// Index of the other host's worker: after the run's own, and the four that may join.
 const REMOTE: usize = 5;
 
 #[test]
@@ -87,7 +82,7 @@ fn another_hosts_worker_is_learned_from_whoever_dies_and_nothing_is_lost() {
     for (who, role) in [("far", "relay"), ("run", "gateway"), ("run", "learner")] {
         strike(&place.path(who), role, Signal::KILL);
         training.until("segments of the other host after that", |_| learned(&run, REMOTE) > before);
-        // Beyond what was on its way.
+        // Beyond the segments that were in transit.
         before = learned(&run, REMOTE) + 20;
         training.until("more of them", |_| learned(&run, REMOTE) > before);
     }
@@ -95,7 +90,7 @@ fn another_hosts_worker_is_learned_from_whoever_dies_and_nothing_is_lost() {
     strike(&place.path("far"), "actor", Signal::KILL);
     training.until("segments of its next start", |_| incarnation(&run, REMOTE) > first);
     host.until_said("restart 1 of");
-    // All of the host at once, which says no goodbye; started again it has its places.
+    // Kills the whole host at once, without a farewell. Started again, it gets its places back.
     let first = incarnation(&run, REMOTE);
     host.signal_group(Signal::KILL);
     let mut host = bridge(&place, &run, &endpoint, "far");
@@ -105,7 +100,7 @@ fn another_hosts_worker_is_learned_from_whoever_dies_and_nothing_is_lost() {
         let rows = table["processes"].as_array().cloned().unwrap_or_default();
         rows.iter().any(|row| row["name"] == "host far")
     });
-    // The host leaves; the run goes on.
+    // The host leaves; the run continues.
     host.signal_group(Signal::INT);
     host.wait().with_status(130).saying("left the run");
     training.until_said("host far has left");
@@ -123,7 +118,7 @@ fn another_hosts_worker_is_learned_from_whoever_dies_and_nothing_is_lost() {
 fn hosts_wait_for_a_run_that_was_stopped_and_end_with_one_that_is_over() {
     let place = Workplace::new();
     let (run, endpoint) = (place.path("run"), endpoint());
-    // It is there before the run is.
+    // The bridge starts before the run.
     let mut early = {
         let token = place.path("early.token");
         fs::write(&token, "a secret that was made beforehand\n").unwrap();
@@ -171,7 +166,7 @@ fn a_host_with_a_wrong_token_or_too_many_workers_is_told_what_to_do() {
     let odd = place.run(&["bridge", "--connect", "10.0.0.1", "--token-file", &wrong]);
     odd.with_status(2).saying("expected tcp/ADDRESS:PORT");
     drop(training);
-    // An address that is taken is said at once, and ends the run.
+    // An address in use is reported at once, and ends the run.
     let taken = TcpListener::bind("127.0.0.1:0").unwrap();
     let listen = format!("bridge.listen=[\"tcp/{}\"]", taken.local_addr().unwrap());
     let second = place.path("second");
@@ -179,7 +174,7 @@ fn a_host_with_a_wrong_token_or_too_many_workers_is_told_what_to_do() {
     place.run(&train("reacher", &second, &more)).with_status(1).saying("cannot listen at");
 }
 
-/// Every step stops while `hold` is there, and says in which of its process's steps it does.
+/// Each step blocks while `hold` exists, and reports its number within its process.
 const HELD: &str = "
 import os
 import pathlib
@@ -224,7 +219,7 @@ fn a_host_that_leaves_hands_over_the_segment_that_its_worker_was_in() {
     let (run, endpoint) = (place.path("run"), endpoint());
     fs::write(place.path("held.py"), HELD).unwrap();
     let more = ["--python-path", &place.path(""), "--envs-per-worker", "1", "--steps", ENDLESS];
-    let mut training = learner_of("held:Held-v0", &place, (&run, &endpoint), &more);
+    let mut training = learner_of("held:Held-v0", &place, &run, &endpoint, &more);
     let mut host = bridge(&place, &run, &endpoint, "far");
     training.until_said("host far takes part: 1 worker");
     let far = place.path("far");
@@ -237,7 +232,7 @@ fn a_host_that_leaves_hands_over_the_segment_that_its_worker_was_in() {
     host.until("the worker in mid-segment", |_| Path::new(&held).is_file());
     let steps: u64 = fs::read_to_string(&held).unwrap().parse().unwrap();
     host.signal_group(Signal::INT);
-    host.until_said("handing over what the workers have sent");
+    host.until_said("delivering the workers' segments");
     fs::remove_file(place.path("hold")).unwrap();
     host.wait().with_status(130).saying("left the run");
     training.until_said("host far has left");

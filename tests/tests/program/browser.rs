@@ -15,24 +15,24 @@ use dmprl_tests::program::{PATIENCE, until};
 use serde_json::{Value, json};
 use tempfile::TempDir;
 
-/// Under which names systems have it.
+/// Names of the program on different systems.
 const NAMES: [&str; 4] = ["chromium", "chromium-browser", "google-chrome", "google-chrome-stable"];
-/// Where the protocol has its ends in the browser.
+/// File descriptors of the protocol in the browser.
 const ENDS: [i32; 2] = [3, 4];
 
-/// A browser with one page. Dropped, it is killed.
+/// A browser with one page. Dropping it kills the browser.
 pub struct Browser {
     child: Child,
     commands: RefCell<PipeWriter>,
     answers: Receiver<Value>,
     session: String,
     number: Cell<u64>,
-    /// What the page or the browser complained about.
+    /// Complaints of the page and the browser.
     complaints: RefCell<VecDeque<String>>,
     _profile: TempDir,
 }
 
-/// The browser of this machine, by `TEST_CHROMIUM` or by name.
+/// Returns the browser of this machine, by `TEST_CHROMIUM` or by name.
 pub fn find() -> Option<PathBuf> {
     if let Some(named) = std::env::var_os("TEST_CHROMIUM") {
         return Some(named.into());
@@ -54,16 +54,16 @@ impl Browser {
         command.args(["--disable-gpu", "--disable-dev-shm-usage", "--disable-extensions"]);
         command.args(["--disable-background-networking", "--no-default-browser-check"]);
         if rustix::process::geteuid().is_root() {
-            // It refuses to run as root with its sandbox; the page is our own.
+            // As root it refuses to run with its sandbox; the page is our own.
             command.arg("--no-sandbox");
         }
         command.arg(format!("--user-data-dir={}", profile.path().display())).arg("about:blank");
         command.stdin(Stdio::null()).stdout(Stdio::null()).stderr(Stdio::null());
-        // Its helpers end with its process group.
+        // Its helper processes end with its process group.
         command.process_group(0);
         let ends = [their_input.as_raw_fd(), their_output.as_raw_fd()];
         let give = move || {
-            // Out of the way first: one end may have the number that the other is to get.
+            // Moved first: one end may have the number that the other end gets.
             // SAFETY: `fcntl` and `dup2` are async-signal-safe and take plain numbers.
             unsafe {
                 let aside = ends.map(|end| libc::fcntl(end, libc::F_DUPFD_CLOEXEC, 10));
@@ -102,7 +102,7 @@ impl Browser {
         assert!(opened["errorText"].is_null(), "{opened}");
     }
 
-    /// The value of an expression in the page.
+    /// Evaluates an expression in the page.
     pub fn evaluate(&self, expression: &str) -> Value {
         let params = json!({"expression": expression, "returnByValue": true});
         let answer = self.call("Runtime.evaluate", params);
@@ -117,13 +117,13 @@ impl Browser {
         });
     }
 
-    /// Clicks an element, wherever it is: a page that is still being filled moves, and a press of
-    /// the mouse at a place that was right a moment ago would miss.
+    /// Clicks an element by reference. A page that is still loading moves, so a click at
+    /// coordinates could miss it.
     pub fn click(&self, selector: &str) {
         self.evaluate(&format!("document.querySelector({selector:?}).click()"));
     }
 
-    /// Makes the page as wide as this many CSS pixels, on a phone or not.
+    /// Sets the width of the page [CSS pixels], on a phone or not.
     pub fn resize(&self, width: u32, mobile: bool) {
         self.call(
             "Emulation.setDeviceMetricsOverride",
@@ -131,7 +131,7 @@ impl Browser {
         );
     }
 
-    /// What pages and browser have complained about since the last question.
+    /// Takes the complaints of page and browser since the last call.
     pub fn complaints(&self) -> Vec<String> {
         self.complaints.borrow_mut().drain(..).collect()
     }
@@ -176,7 +176,7 @@ impl Drop for Browser {
     }
 }
 
-/// Answers and events, until the browser ends.
+/// Reads answers and events until the browser ends.
 fn read(pipe: PipeReader) -> Receiver<Value> {
     let (sender, receiver) = channel();
     std::thread::spawn(move || {

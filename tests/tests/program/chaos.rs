@@ -1,4 +1,4 @@
-//! `dmprl chaos` with real processes: a minute of what takes half an hour before a release.
+//! `dmprl chaos` with real processes: a short trial; a release runs one of half an hour.
 
 use std::path::PathBuf;
 use std::process::Command;
@@ -6,7 +6,7 @@ use std::process::Command;
 use dmprl_tests::program::{Running, Workplace, executable, processes_naming, shared_memory_of};
 use rustix::process::Signal;
 
-/// Starts a trial whose temporary files lie in the test's folder.
+/// Starts a trial with its temporary files in the test's folder.
 fn chaos(place: &Workplace, more: &[&str]) -> Running {
     let temporary = place.path("tmp");
     std::fs::create_dir_all(&temporary).unwrap();
@@ -23,9 +23,9 @@ fn assert_nothing_left(place: &Workplace) {
 #[test]
 fn whoever_is_killed_nothing_is_lost_nothing_comes_twice_and_nothing_is_left() {
     let place = Workplace::new();
-    // On a slow machine it goes on until so many are killed.
+    // The trial takes longer than that on a slow machine: it continues until so many are killed.
     let kills = ["--worker-kills", "5", "--learner-kills", "2"];
-    let more = [&["--seed", "1", "--seconds", "60", "--json"][..], &kills].concat();
+    let more = [&["--seed", "1", "--seconds", "20", "--json"][..], &kills].concat();
     let json = chaos(&place, &more).wait().with_status(0).json();
     let count = |key: &str| json[key].as_u64().unwrap_or_else(|| panic!("{key}: {json}"));
     assert!(count("worker_kills") >= 5 && count("learner_kills") >= 2, "{json}");
@@ -34,7 +34,7 @@ fn whoever_is_killed_nothing_is_lost_nothing_comes_twice_and_nothing_is_left() {
     assert_eq!(count("lost"), 0, "{json}");
     let accounted = count("inserted") + count("rejected") + count("in_flight");
     assert_eq!(count("produced"), accounted, "{json}");
-    // How long it takes on a loaded machine is no matter of a test.
+    // Not tested: the time of a recovery on a loaded machine.
     assert!(json["worker_back_s"]["p50"].as_f64() > Some(0.0), "{json}");
     assert!(json["learner_back_s"]["p50"].as_f64() > Some(0.0), "{json}");
     assert_nothing_left(&place);
@@ -59,7 +59,7 @@ fn ctrl_c_ends_a_trial_with_the_report_so_far() {
     assert_nothing_left(&place);
 }
 
-/// The run is a session of its own, but not one that outlives whoever strikes it.
+/// The run has its own session, but does not outlive the trial.
 #[test]
 fn a_killed_trial_takes_its_run_with_it() {
     let place = Workplace::new();

@@ -1,4 +1,4 @@
-//! What a shell and `man` are told of the program.
+//! Shell completions and manual pages.
 
 use std::fs;
 use std::process::Command;
@@ -24,7 +24,7 @@ fn bash_completes_commands_and_flags() {
     assert_eq!(completed("dmprl tra").trim(), "train");
     assert!(completed("dmprl bench po").contains("policy"));
     assert!(completed("dmprl export --form").contains("--format"));
-    // Roles are not for people.
+    // Roles are not for users.
     assert_eq!(completed("dmprl obs").trim(), "");
 }
 

@@ -1,4 +1,4 @@
-//! `dmprl dashboard` over real HTTP: while a run is trained, afterwards, and what it refuses.
+//! `dmprl dashboard` over real HTTP, during and after a run, and the requests that it refuses.
 
 use std::collections::BTreeSet;
 use std::fs;
@@ -13,7 +13,7 @@ use serde_json::{Value, json};
 use crate::http::{get, request};
 use crate::{ENDLESS, train};
 
-/// Starts it on any port; its host and port are on standard output.
+/// Starts it on any port; returns host and port from standard output.
 pub fn start(place: &Workplace, directory: &str) -> (Running, String) {
     let mut running = place.start(&["dashboard", directory, "--port", "0"]);
     running.until("an address", |running| running.printed().ends_with('\n'));
@@ -21,7 +21,7 @@ pub fn start(place: &Workplace, directory: &str) -> (Running, String) {
     (running, address)
 }
 
-/// The entry of a run in the list.
+/// Returns the entry of a run in the list.
 fn listed(address: &str, run: &str) -> Option<Value> {
     let answer = get(address, "/api/runs").json();
     answer["runs"].as_array().unwrap().iter().find(|one| one["name"] == run).cloned()
@@ -36,7 +36,7 @@ fn steps(answer: &Value) -> Vec<u64> {
     steps.map(|step| step.as_f64().unwrap() as u64).collect()
 }
 
-/// Every file below a folder.
+/// Returns every file below a folder.
 fn files(folder: &Path) -> BTreeSet<String> {
     let mut found = BTreeSet::new();
     for entry in fs::read_dir(folder).unwrap().flatten() {
@@ -68,7 +68,7 @@ fn a_run_that_begins_later_appears_grows_and_stays_when_it_has_ended() {
     let more = curves(&address, &query);
     assert_eq!(more["table"], first["table"]);
     let last = *steps(&first).last().unwrap();
-    assert!(steps(&more).iter().all(|step| *step > last), "only what is new: {more}");
+    assert!(steps(&more).iter().all(|step| *step > last), "only new rows: {more}");
     let running = |name: &str| {
         let answer = get(&address, "/api/processes?run=one").json();
         let rows = answer["session"]["processes"].as_array().cloned().unwrap_or_default();
@@ -114,7 +114,7 @@ fn a_run_that_begins_later_appears_grows_and_stays_when_it_has_ended() {
     assert!(TcpStream::connect(&address).is_err());
 }
 
-/// What the format demands: each family is announced once, with a type, before its samples.
+/// Checks the exposition format: each family is announced once, with a type, before its samples.
 fn check_exposition(text: &str) {
     let mut announced = BTreeSet::new();
     let mut samples = 0;
@@ -192,7 +192,7 @@ fn only_runs_and_their_videos_are_served_and_only_to_this_machine() {
         request(&address, &format!("POST /api/runs HTTP/1.1\r\nHost: {address}\r\n")).status,
         405
     );
-    // A page of another site whose name was led to 127.0.0.1.
+    // A page of another site whose host name resolves to 127.0.0.1.
     for host in ["Host: evil.example\r\n", "Host: evil.example:8787\r\n", "Host: \r\n"] {
         let answer = request(&address, &format!("GET /api/runs HTTP/1.1\r\n{host}"));
         assert_eq!(answer.status, 403, "{host}");
@@ -209,7 +209,7 @@ fn a_rollout_that_was_measured_is_shown_joint_by_joint() {
     let place = Workplace::new();
     let run = place.path("one");
     place.run(&train("reacher", &run, &["--steps", "1000"])).with_status(0);
-    // The run itself, not a folder of runs.
+    // The run itself instead of a folder of runs.
     let (_dashboard, address) = start(&place, &run);
     assert_eq!(get(&address, "/api/motion?run=one").json(), Value::Null);
     place.run(&["report", &run]).with_status(0);

@@ -1,7 +1,7 @@
 //! The dashboard's page in a real browser: start, watch a curve grow, switch the axis, compare two
 //! runs, and the same on a phone.
 //!
-//! Skipped where there is no Chromium.
+//! Skipped without Chromium.
 
 use dmprl_tests::program::Workplace;
 use dmprl_tests::skipped::skipped;
@@ -11,16 +11,16 @@ use crate::browser::{self, Browser};
 use crate::dashboard::start;
 use crate::{ENDLESS, train};
 
-/// First paint, all of it: page, styles, scripts, data.
+/// Size of the first load [bytes]: page, styles, scripts, data.
 const BYTES_MAX: u64 = 300_000;
-/// A phone's width in CSS pixels, a narrow one.
+/// Width of a narrow phone [CSS pixels].
 const PHONE: u32 = 360;
 
-/// Whether two runs have a return.
+/// True when two runs have a return.
 const TWO_LINES: &str =
     "document.querySelectorAll('figure[data-key=return_mean] .readout li').length === 2";
 
-/// Whether some of a chart is drawn in a colour, given as it is in its data.
+/// True when some pixel of a chart has a colour, given as in its data.
 fn draws(key: &str, colour: [u8; 3]) -> String {
     let [red, green, blue] = colour;
     format!(
@@ -35,7 +35,7 @@ fn draws(key: &str, colour: [u8; 3]) -> String {
     )
 }
 
-/// A number that a chart tells of what it draws.
+/// A number that a chart reports about its drawing.
 fn of_chart(browser: &Browser, key: &str, what: &str) -> f64 {
     let found = browser.evaluate(&format!(
         "Number(document.querySelector('figure[data-key={key}]').dataset.{what})"
@@ -55,14 +55,14 @@ fn a_browser_watches_a_run_grow_beside_another() {
     let more = ["--steps", "1000", "--algo", "ddpg", "--seed", "7"];
     place.run(&train("reacher", &first, &more)).with_status(0);
     let mut training = place.start(&train("reacher", &second, &["--steps", ENDLESS]));
-    // What is being trained when the page is opened is what it shows: it must have begun.
+    // When the page is opened, it shows the runs in training; so the run must have begun.
     training.until_steps(&second, 1_000);
     let (dashboard, address) = start(&place, &place.path("runs"));
     let browser = Browser::start(program);
     browser.resize(1280, false);
     browser.open(&format!("http://{address}/"));
 
-    // What is trained is shown, without a click, and grows.
+    // A run in training is shown without a click, and grows.
     let key = "env_steps_per_s";
     browser.until(&format!(
         "Number(document.querySelector('figure[data-key={key}]')?.dataset.points) > 0"
@@ -78,7 +78,7 @@ fn a_browser_watches_a_run_grow_beside_another() {
         "Number(document.querySelector('figure[data-key={key}]').dataset.points) > {points}"
     ));
 
-    // By steps it ends at thousands, by time at seconds.
+    // The axis ends at thousands of steps, or at seconds.
     let steps = of_chart(&browser, key, "end");
     assert!(steps >= 500.0, "{steps}");
     browser.click("input[value=wall_s]");
@@ -90,7 +90,7 @@ fn a_browser_watches_a_run_grow_beside_another() {
     compare_with(&browser, "first");
     look_on_a_phone(&browser);
 
-    // Afterwards everything is still there; and a dashboard that has ended is told.
+    // After the run everything is still shown, and the page reports that the dashboard has ended.
     training.signal_group(Signal::INT);
     training.wait().with_status(130);
     browser.until(
@@ -102,13 +102,13 @@ fn a_browser_watches_a_run_grow_beside_another() {
     browser.until("document.getElementById('connection').className === 'lost'");
 }
 
-/// Another run beside it: two lines, two figures, and what differs in their configurations.
+/// A second run adds a line, a figure, and the configuration keys that differ.
 fn compare_with(browser: &Browser, other: &str) {
     assert_eq!(browser.evaluate("document.querySelectorAll('#keys td.differs').length"), 0);
     let chosen = format!("document.querySelector('input[value={other}]').checked");
-    assert_eq!(browser.evaluate(&chosen), false, "only what is being trained is shown at first");
+    assert_eq!(browser.evaluate(&chosen), false, "only running runs are shown at first");
     browser.click(&format!("input[value={other}]"));
-    // What is not in view is not drawn.
+    // Charts outside the view are not drawn.
     browser.evaluate("document.querySelector('figure[data-key=return_mean]').scrollIntoView()");
     browser.until(TWO_LINES);
     browser.until(&draws("return_mean", [0x00, 0x72, 0xb2]));
@@ -125,7 +125,7 @@ fn compare_with(browser: &Browser, other: &str) {
     browser.until(&format!("{processes}.some((one) => one.textContent === 'actor-0')"));
 }
 
-/// The same address on a phone: the same view, and nothing to scroll sideways.
+/// The same address on a phone: the same view, without horizontal scrolling.
 fn look_on_a_phone(browser: &Browser) {
     let view = browser.evaluate("location.href");
     browser.resize(PHONE, true);

@@ -1,4 +1,4 @@
-//! SIGKILL to everything, to the supervisor, to a worker, to the learner.
+//! SIGKILL to all processes, to the supervisor, to a worker, to the learner.
 
 use std::path::PathBuf;
 use std::time::Instant;
@@ -12,7 +12,7 @@ use serde_json::{Value, json};
 
 use crate::{ENDLESS, train};
 
-/// `checkpoint.interval_steps` of the runs here, and the segment by which it may be passed.
+/// `checkpoint.interval_steps` of these runs, and the segment by which it may be exceeded.
 const CHECKPOINT_INTERVAL: u64 = 1_000 + 5;
 
 fn training(place: &Workplace, run: &str, more: &[&str]) -> Running {
@@ -28,15 +28,15 @@ fn signal_role(place: &Workplace, role: &str, signal: Signal) {
     process.unwrap_or_else(|| panic!("no {role} in {processes:#?}")).signal(signal);
 }
 
-/// The first death of a process, which is restarted.
+/// The event of the first death of a process, which is restarted.
 fn death(process: &str, how: &str) -> Value {
     json!({ "event": "child_died", "process": process, "how": how, "restart": 1 })
 }
 
-/// Resumes for some steps and looks at the whole curve.
+/// Resumes for some more steps and checks the whole curve.
 fn resume_and_check_curve(place: &Workplace, run: &str, reached: u64) {
     let checkpoint = env_steps_of_checkpoint(run).unwrap();
-    // The newest may have been on its way to the disk, and is then none; the one before is there.
+    // The newest checkpoint may be incomplete and is then ignored; the one before is used.
     assert!(
         checkpoint + 2 * CHECKPOINT_INTERVAL >= reached,
         "{checkpoint} of {reached} steps are left"
@@ -70,7 +70,7 @@ fn a_run_killed_as_a_whole_goes_on_from_its_checkpoint_beside_a_living_one() {
     assert_eq!(running.wait().status.code(), None);
     place.until_no_process();
 
-    // Any next start removes what the dead run left, and nothing of a living one.
+    // The next start removes the dead run's shared memory, and nothing of a live run.
     let mut living = training(&other_place, &other, &[]);
     assert_eq!(shared_memory_of(&run), Vec::<PathBuf>::new());
     let domain = shared_memory_of(&other);
@@ -110,7 +110,7 @@ fn resume_waits_for_the_learner_of_a_killed_supervisor() {
     let mut resuming = place.start(&["resume", &run]);
     resuming.until_said("waiting up to");
     signal_role(&place, "learner", Signal::CONT);
-    // From the checkpoint that the old learner has written meanwhile.
+    // Training continues from a checkpoint that the old learner wrote in the meantime.
     resuming.until_steps(&run, reached + 2_000);
     resuming.signal_group(Signal::INT);
     resuming.wait().with_status(130);
@@ -123,13 +123,13 @@ fn resume_waits_for_the_learner_of_a_killed_supervisor() {
 fn a_run_whose_learner_sleeps_for_a_while_goes_on() {
     let place = Workplace::new();
     let run = place.path("run");
-    // A worker that waits for it lives, however long that takes.
+    // A worker that waits for the learner counts as alive, however long that takes.
     let keys = ["actors.send_deadline_s=0.5", "supervision.heartbeat_timeout_s=5"];
     let keys: Vec<&str> = keys.into_iter().flat_map(|key| ["--set", key]).collect();
     let mut running = training(&place, &run, &keys);
     let workers = ids(&place, "actor");
     signal_role(&place, "learner", Signal::STOP);
-    running.until_said("waited 7 s: the learner takes nothing from its full queue");
+    running.until_said("waited 7 s: its queue is full");
     signal_role(&place, "learner", Signal::CONT);
     let steps = env_steps_of(&run).unwrap();
     running.until_steps(&run, steps + 2_000);
@@ -172,7 +172,7 @@ fn a_worker_that_somebody_stopped_is_said_to_hang_and_replaced() {
     place.assert_no_process();
 }
 
-/// Ctrl-Z, or a container that is paused: nobody is to blame for what was not said meanwhile.
+/// Ctrl-Z or a paused container stops all processes; none is blamed for the silence.
 #[test]
 fn a_run_that_stands_still_as_a_whole_blames_nobody() {
     let place = Workplace::new();
@@ -180,7 +180,8 @@ fn a_run_that_stands_still_as_a_whole_blames_nobody() {
     let mut running = training(&place, &run, &["--set", "supervision.heartbeat_timeout_s=3"]);
     let workers = ids(&place, "actor");
     running.signal_group(Signal::STOP);
-    // Longer than the limit, and than what the supervisor takes for being late.
+    // Longer than the heartbeat limit, and than the delay at which the supervisor detects its own
+    // suspension.
     let stopped = Instant::now();
     until("time enough for a worker to be blamed", || stopped.elapsed().as_secs() >= 7);
     running.signal_group(Signal::CONT);
@@ -228,13 +229,13 @@ fn a_killed_evaluator_answers_after_its_restart() {
     assert!(steps.is_sorted_by(|a, b| a < b), "{steps:?}");
 }
 
-/// Processes of one role, by their ids.
+/// Returns the processes of one role, by their ids.
 fn ids(place: &Workplace, role: &str) -> Vec<i32> {
     let processes = place.processes().into_iter().filter(|process| process.role == role);
     processes.map(|process| process.id.as_raw_nonzero().get()).collect()
 }
 
-/// Kills the learner and waits for the next one's first segment, and for some steps of it.
+/// Kills the learner, and waits for the next one's first segment and some of its steps.
 fn replace_learner(place: &Workplace, run: &str, running: &mut Running, deaths: usize) {
     signal_role(place, "learner", Signal::KILL);
     let back = |running: &Running| {
@@ -271,7 +272,7 @@ fn a_killed_learner_is_replaced_and_its_workers_stay() {
     assert_eq!(shared_memory_of(&run), Vec::<PathBuf>::new());
 }
 
-/// Without any checkpoint: all that the next learner knows it has from the log.
+/// Without a checkpoint, the next learner takes everything from the log.
 #[test]
 fn at_delivery_level_log_a_killed_learner_loses_nothing() {
     let place = Workplace::new();

@@ -1,5 +1,5 @@
-//! The segment log and checkpoints where they meet their limits: full, on a full disk, and under a
-//! learner that dies at a bad moment.
+//! Segment log and checkpoints at their limits: full, on a full disk, and with a learner that dies
+//! at a bad moment.
 
 use std::fs;
 use std::path::Path;
@@ -15,7 +15,7 @@ use serde_json::Value;
 use crate::{ENDLESS, train};
 
 const LOG: [&str; 2] = ["--set", "delivery.level=log"];
-/// Only a full log makes a checkpoint due.
+/// Only a full log triggers a checkpoint.
 const NO_CHECKPOINTS: [&str; 2] = ["--set", "checkpoint.interval_steps=1000000"];
 
 fn signal_role(place: &Workplace, role: &str, signal: Signal) {
@@ -28,7 +28,7 @@ fn last_metrics(run: &str) -> Value {
     rows(run, "metrics.jsonl").pop().unwrap()
 }
 
-/// Ends a run by Ctrl-C and insists that nothing that was acknowledged is missing.
+/// Ends a run by Ctrl-C and checks that no acknowledged segment is missing.
 fn end_without_loss(running: Running, run: &str) {
     running.signal_group(Signal::INT);
     running.wait().with_status(130).saying("checkpoint written");
@@ -52,7 +52,7 @@ fn a_full_segment_log_makes_a_checkpoint_due() {
     let mut before = 0;
     for _ in 0..2 {
         running.until("a checkpoint although none is due by its steps", |_| {
-            // The head of 32 bytes comes on top.
+            // Plus the header of 32 bytes.
             assert!(fs::metadata(&log).map_or(0, |log| log.len()) <= LOG_BYTES_MAX + 32);
             env_steps_of_checkpoint(&run).is_some_and(|steps| steps > before)
         });
@@ -62,13 +62,14 @@ fn a_full_segment_log_makes_a_checkpoint_due() {
     assert_eq!(fs::metadata(&log).unwrap().len(), 32, "the last checkpoint holds all of it");
 }
 
-/// Largest file here, in blocks of 512 bytes: the replay of some 3000 steps just fits. To the
-/// program it is as a full disk, and it needs no mount.
+/// Largest file [blocks of 512 bytes]: just enough for the replay of about 3,000 steps. The program
+/// sees a full disk, without a mount.
 const FILE_BLOCKS_MAX: &str = "400";
 /// Segments that a worker keeps until they are acknowledged.
 const KEPT: u64 = 64;
 
-/// First no checkpoint can be written, then no log: nothing more is acknowledged, and workers wait.
+/// First no checkpoint can be written, then no log. Then nothing is acknowledged, and the workers
+/// wait.
 #[test]
 fn a_disk_too_full_for_checkpoint_and_log_stops_the_acknowledging_and_loses_nothing() {
     let place = Workplace::new();
@@ -83,9 +84,9 @@ fn a_disk_too_full_for_checkpoint_and_log_stops_the_acknowledging_and_loses_noth
     let mut running = place.start_command(command);
     running.until_said("no checkpoint could be written");
     running.until_said("no segment can be acknowledged");
-    running.until_said("the learner acknowledges nothing that it has taken");
+    running.until_said("the learner acknowledges none of its segments");
     running.signal_group(Signal::INT);
-    let finished = running.wait().with_status(130).saying("the last checkpoint is missing");
+    let finished = running.wait().with_status(130).saying("the last checkpoint was not written");
     assert_eq!(finished.said.matches("no segment can be acknowledged").count(), 1, "told once");
     let inserted = last_metrics(&run)["segments"].as_u64().unwrap();
     let state = json_file(&run, "checkpoints/latest/state.json");
@@ -94,27 +95,27 @@ fn a_disk_too_full_for_checkpoint_and_log_stops_the_acknowledging_and_loses_noth
         state["counters"]["segments"].as_u64().unwrap(),
     );
 
-    // With room again: the checkpoint, what the log has beyond it, and all that was acknowledged.
+    // After space is freed: checkpoint and log together have everything that was acknowledged.
     let end = (steps + 20_000).to_string();
     let resumed = place.run(&["resume", &run, "--steps", &end]).with_status(0);
     let words = " segments read from the segment log";
     let (before, _) = resumed.said.split_once(words).unwrap_or_else(|| panic!("{}", resumed.said));
     let read: u64 = before.rsplit(' ').next().unwrap().parse().unwrap();
-    // Its worker kept no more than these; all others it had been told to forget.
+    // The worker kept no more than these; it had forgotten the acknowledged ones.
     let promised = inserted - KEPT;
     assert!(read > 0 && in_checkpoint + read >= promised, "{in_checkpoint} + {read} of {inserted}");
     assert_eq!(last_metrics(&run)["lost"], 0);
     assert_eq!(env_steps_of_checkpoint(&run), Some(steps + 20_000));
 }
 
-/// Asked to come to its end, and killed before it has.
+/// The learner is asked to stop, and killed before it has.
 #[test]
 fn a_learner_killed_while_it_comes_to_its_end_does_so_after_its_restart() {
     let place = Workplace::new();
     let run = place.path("run");
     let more = [&LOG[..], &NO_CHECKPOINTS, &["--until-return", "-1000", "--steps", ENDLESS]];
     let mut running = place.start(&train("reacher", &run, &more.concat()));
-    // No answer yet: an evaluation ends the run.
+    // No evaluation yet: an evaluation would end the run.
     running.until("an evaluator", |_| place.processes().iter().any(|it| it.role == "evaluator"));
     signal_role(&place, "evaluator", Signal::STOP);
     let acknowledged = || {
@@ -137,7 +138,8 @@ fn a_learner_killed_while_it_comes_to_its_end_does_so_after_its_restart() {
     assert_eq!(shared_memory_of(&run), Vec::<std::path::PathBuf>::new());
 }
 
-/// At each point of the writing: `learner/tests/checkpoint_kill.rs`. Here with all around it.
+/// `learner/tests/checkpoint_kill.rs` tests each point of the writing; this test uses the whole
+/// program.
 #[test]
 fn a_learner_killed_in_the_middle_of_a_checkpoint_goes_on_from_the_one_before() {
     const KILLS: usize = 3;
@@ -168,6 +170,6 @@ fn a_learner_killed_in_the_middle_of_a_checkpoint_goes_on_from_the_one_before() 
         });
     }
     end_without_loss(running, &run);
-    assert_eq!(half_written(), 0, "what a killed writer left is swept away");
+    assert_eq!(half_written(), 0, "partial files are removed");
     assert_eq!(last_metrics(&run)["learner_restarts"], KILLS);
 }

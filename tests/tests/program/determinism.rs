@@ -1,4 +1,4 @@
-//! `--deterministic`: one seed, one result, to the byte.
+//! `--deterministic`: the same seed gives the same bytes.
 
 use std::collections::BTreeMap;
 use std::fs;
@@ -10,7 +10,7 @@ use serde_json::Value;
 
 use crate::train;
 
-/// Everything that must repeat: rows without their times, and the newest checkpoint's files.
+/// Returns everything that must repeat: rows without times, and the newest checkpoint's files.
 #[derive(Debug, PartialEq)]
 struct Result {
     metrics: Vec<Value>,

@@ -1,14 +1,14 @@
-//! README and the book as a reader follows them: every code block of a page is run, in order and in
-//! one folder that looks like a clone of the project.
+//! Runs the code blocks of README and the book in order, each page in a folder that looks like a
+//! clone.
 //!
 //! - `sh` runs in bash; `cargo` and `dmprl` are the program itself with less to do
-//!   (`tests/documents/stand_in.py`), and the first seed of a loop over seeds counts.
+//!   (`tests/documents/stand_in.py`), and a loop over seeds runs only the first.
 //! - `python` runs in the interpreter of `.venv`.
-//! - `file=NAME` after the language: the block is saved under that name, for blocks that follow.
-//! - `not-run` after the language: it cannot be run in a test; its first line is a comment that
-//!   says why. There is a limit to their number.
-//! - `text` and `json` are what something prints. `text` is also what is typed where there is a
-//!   cluster, a container engine or systemd; `tests/tests/placement/main.rs` tries what it starts.
+//! - `file=NAME` after the language saves the block under that name, for later blocks.
+//! - `not-run` after the language marks a block that a test cannot run. Its first line is a comment
+//!   with the reason. Their number is limited.
+//! - `text`, `json` and `math` are not run: output, equations, and commands for a cluster, a
+//!   container engine or systemd, whose files `tests/tests/placement/main.rs` checks.
 
 use std::fmt::Write;
 use std::fs;
@@ -21,11 +21,11 @@ use dmprl_tests::{project_root, venv};
 
 use super::record::can_draw;
 
-/// Blocks that are not run, in all pages together. Better than raising it: say less, or run it.
+/// Maximum number of `not-run` blocks in all pages.
 const NOT_RUN_MAX: usize = 6;
-/// What a clone has that blocks name.
+/// Files of a clone that blocks name.
 const OF_A_CLONE: [&str; 6] = [".venv", "deploy", "docs", "envs_py", "tests", "ARCHITECTURE.md"];
-/// Small networks and few updates, wherever a block does not say otherwise.
+/// Small networks and few updates, unless a block sets them.
 const SMALL: [(&str, &str); 8] = [
     ("DMPRL_POLICY__HIDDEN", "[16]"),
     ("DMPRL_ALGORITHM__CRITIC_HIDDEN", "[16]"),
@@ -38,10 +38,11 @@ const SMALL: [(&str, &str); 8] = [
 ];
 
 macro_rules! pages {
-    ($($test:ident: $path:literal,)*) => {
-        /// Pages with blocks, which are run.
+    ($($(#[$attribute:meta])* $test:ident: $path:literal,)*) => {
+        /// Pages with code blocks.
         const PAGES: &[&str] = &[$($path),*];
         $(
+            $(#[$attribute])*
             #[test]
             fn $test() {
                 follow($path);
@@ -65,6 +66,7 @@ pages! {
     every_block_about_robots_runs: "docs/robot.md",
     every_block_about_python_runs: "docs/python.md",
     every_block_about_workers_runs: "docs/workers.md",
+    #[cfg(feature = "hosts")]
     every_block_about_several_hosts_runs: "docs/several-hosts.md",
     every_block_about_trouble_runs: "docs/troubleshooting.md",
     every_block_about_results_runs: "docs/results.md",
@@ -82,7 +84,7 @@ struct Block {
 
 impl Block {
     fn is_run(&self) -> bool {
-        !self.has("not-run") && !["text", "json"].contains(&self.language.as_str())
+        !self.has("not-run") && !["text", "json", "math"].contains(&self.language.as_str())
     }
 
     fn has(&self, attribute: &str) -> bool {
@@ -124,7 +126,7 @@ fn follow(page: &str) {
     settle(&place);
     let blocks: Vec<_> = blocks(page).into_iter().filter(Block::is_run).collect();
     assert!(!blocks.is_empty(), "{page} has nothing to run: take it out of `pages!`");
-    // Asked only where there is something to draw: it takes a second.
+    // Checked only where a block draws, because it takes a second.
     let draws = |block: &Block| ["record", "play"].iter().any(|word| block.text.contains(word));
     let can_draw = !blocks.iter().any(draws) || can_draw();
     for block in blocks {
@@ -166,7 +168,7 @@ fn follow(page: &str) {
     place.until_no_process();
 }
 
-/// Makes the folder look like a clone, with `cargo` and `dmprl` on the way to it.
+/// Makes the folder look like a clone, with `cargo` and `dmprl` in its search path.
 fn settle(place: &Workplace) {
     for name in OF_A_CLONE {
         symlink(project_root().join(name), place.path(name)).unwrap();
@@ -188,8 +190,8 @@ fn search_path(place: &Workplace) -> String {
     format!("{}:{}", place.path("bin"), std::env::var("PATH").unwrap())
 }
 
-/// README and everything in `docs/` that people write: the tables of contents are no pages, and
-/// `docs/results` is what `report` has written.
+/// Returns README and the pages of `docs/` that people write, without tables of contents and
+/// reports.
 fn written_pages() -> Vec<String> {
     let mut pages = vec!["README.md".to_owned()];
     for entry in fs::read_dir(project_root().join("docs")).unwrap().flatten() {
@@ -230,7 +232,7 @@ fn what_is_not_run_says_why_and_is_rare() {
     );
 }
 
-/// What the pages promise.
+/// Promises of the pages.
 #[test]
 fn a_task_has_thirty_lines_and_a_policy_acts_in_three() {
     let lines = |page: &str| {

@@ -1,4 +1,4 @@
-//! Runs that end by their own rules before they have all their steps.
+//! Runs that end by their own limits before they have all their steps.
 
 use std::process::Command;
 
@@ -9,7 +9,7 @@ use rustix::process::Signal;
 
 use crate::{ENDLESS, train};
 
-/// Runs without end but for `more`; the last evaluation must be of the last moment.
+/// Starts a run that only `more` limits, and checks that its last evaluation is of its last step.
 fn ends(more: &[&str], saying: &str) {
     let place = Workplace::new();
     let run = place.path("run");
@@ -35,11 +35,11 @@ fn a_return_that_is_reached_ends_a_deterministic_run_too() {
 
 #[test]
 fn minutes_that_are_over_end_the_run_with_a_last_evaluation() {
-    ends(&["--max-minutes", "0.05"], "run.max_minutes are over");
+    ends(&["--max-minutes", "0.05"], "run.max_minutes has elapsed");
 }
 
-/// Largest file that a run here may write, in blocks of 512 bytes: the replay of some 6000 steps
-/// just fits. To the program it is as a full disk, and it needs no mount.
+/// Largest file that a run may write [blocks of 512 bytes]: just enough for the replay of about
+/// 6,000 steps. The program sees a full disk, without a mount.
 const FILE_BLOCKS_MAX: &str = "800";
 
 fn train_on_a_full_disk(run: &str, more: &[&str]) -> Command {
@@ -59,13 +59,13 @@ fn a_full_disk_costs_the_checkpoints_and_not_the_run() {
         .wait()
         .with_status(0)
         .saying("no checkpoint could be written, training continues")
-        .saying("the last checkpoint is missing");
+        .saying("the last checkpoint was not written");
     assert_eq!(finished.said.matches("no checkpoint could be written").count(), 1, "told once");
     assert_eq!(env_steps(&rows(&run, "evaluations.jsonl")).last(), Some(&9000));
     let kept = env_steps_of_checkpoint(&run).unwrap();
     assert!((4_000..9_000).contains(&kept), "{kept}");
 
-    // With room again, from the checkpoint before.
+    // After space is freed, from the previous checkpoint.
     place.run(&["resume", &run]).with_status(0);
     assert_eq!(env_steps_of_checkpoint(&run), Some(9000));
 }
@@ -77,12 +77,12 @@ fn ctrl_c_on_a_full_disk_does_not_claim_a_checkpoint() {
     let mut running = place.start_command(train_on_a_full_disk(&run, &["--steps", ENDLESS]));
     running.until_said("no checkpoint could be written");
     running.signal_group(Signal::INT);
-    let finished = running.wait().with_status(130).saying("the last checkpoint is missing");
+    let finished = running.wait().with_status(130).saying("the last checkpoint was not written");
     assert!(!finished.said.contains("checkpoint written"), "{}", finished.said);
     place.assert_no_process();
 }
 
-/// The evaluation takes minutes; in one process nothing else happens meanwhile.
+/// The evaluation takes minutes, during which a run in one process does nothing else.
 #[test]
 fn ctrl_c_during_a_long_evaluation_still_writes_the_checkpoint() {
     let place = Workplace::new();

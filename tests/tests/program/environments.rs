@@ -1,5 +1,5 @@
-//! Environments that break in every life: named, made again and their worker restarted within the
-//! limits, never in the replay.
+//! Environments that fail in every life are named, recreated, and restart their worker within
+//! limits. Their segments never enter the replay.
 
 use std::fs;
 
@@ -7,7 +7,7 @@ use dmprl_tests::program::{Finished, Workplace, json_file, rows, shared_memory_o
 
 use crate::train;
 
-/// Every environment breaks in step 23 of its life: in its fifth segment, after four whole ones.
+/// Each environment fails in step 23 of its life: in its fifth segment, after four complete ones.
 const FAULTY: &str = "
 import os
 
@@ -62,8 +62,8 @@ fn train_faulty(place: &Workplace, id: &str, more: &[&str]) -> (String, Finished
     (run, finished)
 }
 
-/// One restart is allowed, so two lives of a worker come to the replay: the whole segments of
-/// `lives` lives of their environments.
+/// One restart is allowed, so two lives of a worker contribute to the replay: the complete segments
+/// of `lives` lives of their environments.
 fn breaks(id: &str, lives: u64, words: &[&str]) {
     let place = Workplace::new();
     let restarts = ["--set", "actors.restarts_max=1", "--set", "actors.env_failures_max=1"];
@@ -111,7 +111,7 @@ fn what_an_environment_prints_is_in_the_log_and_disturbs_nobody() {
     let place = Workplace::new();
     let (run, finished) = train_faulty(&place, "faulty:Chatter-v0", &[]);
     let finished = finished.with_status(0);
-    assert!(!finished.said.contains("no report"), "{}", finished.said);
+    assert!(!finished.said.contains("not a report"), "{}", finished.said);
     let log = fs::read_to_string(place.path("run/logs/actor-0.log")).unwrap();
     assert!(log.contains("learner_ready") && log.contains("progress"));
     assert_eq!(rows(&run, "metrics.jsonl").pop().unwrap()["env_steps"], 1000);

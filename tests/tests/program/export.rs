@@ -1,4 +1,4 @@
-//! `dmprl export`: a run's policy as one file that acts without the run.
+//! `dmprl export`: a policy as one file that acts without its run.
 
 use std::fs;
 use std::path::Path;
@@ -6,6 +6,7 @@ use std::path::Path;
 use dmprl_shared::policy_file;
 use dmprl_shared::runtime::PolicyRuntime;
 use dmprl_tests::program::Workplace;
+use serde_json::json;
 
 use crate::{ENDLESS, train};
 
@@ -30,7 +31,7 @@ fn a_runs_policy_leaves_as_one_file() {
         ("reacher", json["return_mean"].as_f64())
     );
 
-    // It goes where the run does not, and begins another run as well.
+    // The file moves without the run, and can start another run.
     let moved = place.path("elsewhere.safetensors");
     fs::rename(&own, &moved).unwrap();
     let mut policy = PolicyRuntime::load(Path::new(&moved)).unwrap();
@@ -38,7 +39,7 @@ fn a_runs_policy_leaves_as_one_file() {
     let warm = ["--steps", "600", "--init-from", &moved];
     place.run(&train("reacher", &place.path("warm"), &warm)).with_status(0);
 
-    // As --help shows it: a name in the folder where one is.
+    // As in --help: a name in an existing folder.
     let onnx = place.path("reacher.onnx");
     let said = place.run(&["export", "run", "--format", "onnx", "--output", "reacher.onnx"]);
     let said = said.with_status(0);
@@ -51,8 +52,9 @@ fn what_cannot_be_exported_is_told_and_leaves_no_file() {
     let place = Workplace::new();
     place.run(&["export", "nowhere"]).with_status(2).saying("nowhere");
     let run = place.path("run");
-    let mut training = place.start(&train("reacher", &run, &["--steps", ENDLESS]));
-    training.until("a run directory", |_| Path::new(&run).join("manifest.json").is_file());
+    let more = ["--steps", ENDLESS, "--events", "json"];
+    let mut training = place.start(&train("reacher", &run, &more));
+    training.until_event(&json!({ "event": "started" }));
     training.signal_group(rustix::process::Signal::INT);
     training.wait();
     place.run(&["export", &run]).with_status(2).saying("no evaluation yet");
@@ -60,12 +62,13 @@ fn what_cannot_be_exported_is_told_and_leaves_no_file() {
     place
         .run(&["export", &run, "--format", "safetensors", "--output", &output])
         .with_status(2)
-        .saying("ends like the other format");
+        .saying("has the extension of the other format");
     assert!(!Path::new(&output).exists());
     let trained = place.path("trained");
     place.run(&train("reacher", &trained, &["--steps", "1000"])).with_status(0);
     let before = fs::read_dir(place.path("")).unwrap().count();
-    for (output, words) in [("/dev/null", "no regular file"), ("no/such/p.onnx", "no such folder")]
+    for (output, words) in
+        [("/dev/null", "not a regular file"), ("no/such/p.onnx", "does not exist")]
     {
         place.run(&["export", &trained, "--output", output]).with_status(2).saying(words);
     }

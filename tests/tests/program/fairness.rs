@@ -1,4 +1,4 @@
-//! Who gets how much of a learner that cannot take all that its workers make.
+//! Shares of workers in a learner that is slower than they are.
 
 use std::fs;
 use std::path::Path;
@@ -10,7 +10,7 @@ use crate::train;
 
 const WORKERS: usize = 4;
 
-/// How many segments of each worker have come by each checkpoint, oldest first.
+/// Returns the number of segments of each worker at each checkpoint, oldest first.
 fn settled(run: &str) -> Vec<Vec<u64>> {
     let folder = fs::read_dir(Path::new(run).join("checkpoints")).unwrap();
     let mut states: Vec<_> = folder
@@ -27,7 +27,7 @@ fn settled(run: &str) -> Vec<Vec<u64>> {
     states.into_iter().map(read).collect()
 }
 
-/// 50 updates a segment: the learner is several times slower than one worker.
+/// 50 updates per segment make the learner several times slower than one worker.
 #[test]
 fn workers_share_a_slow_learner_evenly() {
     let place = Workplace::new();
@@ -42,7 +42,7 @@ fn workers_share_a_slow_learner_evenly() {
     ];
     place.run(&train("reacher", &run, &more.concat())).with_status(0);
     let settled = settled(&run);
-    // From the first checkpoint by which all of them had come, to the last.
+    // From the first checkpoint that contains all of them to the last.
     let first = settled.iter().find(|counts| counts.iter().all(|&count| count > 0)).unwrap();
     let last = settled.last().unwrap();
     let shares: Vec<u64> = last.iter().zip(first).map(|(last, first)| last - first).collect();

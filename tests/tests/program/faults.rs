@@ -1,5 +1,5 @@
-//! Environments that break, hang or end their process: the run goes on, and nothing of what broke
-//! is learnt from.
+//! Environments that raise, hang or end their process: the run continues, and failed segments are
+//! not learned from.
 
 use std::fs;
 use std::path::PathBuf;
@@ -14,7 +14,7 @@ use crate::train;
 const ENVS: u64 = 3;
 /// Steps of an episode.
 const EPISODE: u64 = 7;
-/// Steps of a life of `tiny_envs:Faulty` that can be used: three episodes.
+/// Usable steps of a life of `tiny_envs:Faulty`: three episodes.
 const LIFE: u64 = 21;
 
 fn train_tiny(place: &Workplace, task: &str, more: &[&str]) -> (String, Finished) {
@@ -38,7 +38,7 @@ fn assert_sound(run: &str) -> Value {
     last
 }
 
-/// Three episodes of each life come to the learner, the fourth breaks in its second step.
+/// Three episodes of each life reach the learner; the fourth fails in its second step.
 fn goes_on_and_counts(task: &str, words: &str) {
     let place = Workplace::new();
     let (run, finished) = train_tiny(&place, task, &["--steps", "4000"]);
@@ -50,7 +50,7 @@ fn goes_on_and_counts(task: &str, words: &str) {
     let unfinished = steps - episodes * EPISODE;
     assert!(unfinished <= ENVS * EPISODE, "{steps} steps in {episodes} episodes");
 
-    // The evaluator's environments break in their fourth evaluation; its row is there all the same.
+    // The evaluator's environments fail in their fourth evaluation, whose row exists all the same.
     let evaluated = env_steps(&rows(&run, "evaluations.jsonl"));
     assert_eq!(evaluated.iter().map(|steps| steps / 1000).collect::<Vec<_>>(), [1, 2, 3, 4]);
     let count = |name| log(&place, name).matches("environment failure: ").count() as u64;
@@ -59,12 +59,12 @@ fn goes_on_and_counts(task: &str, words: &str) {
     assert_eq!(by_evaluator, 4, "one in each episode of the evaluation");
     let counted = last["env_failures"].as_u64().unwrap();
     let total = by_worker + by_evaluator;
-    // The supervisor passes the number on: on a busy machine the learner's last line lags behind.
+    // The learner's last line may lag behind the supervisor's count on a busy machine.
     let at_least = (steps / LIFE - ENVS) / 2;
     assert!((at_least..=total).contains(&counted), "{counted} of {total}, {at_least} at least");
-    let summary = format!("failures   {total} of environments");
+    let summary = format!("failures   {total} in environments");
     assert!(finished.said.contains(&summary), "{summary}\n{}", finished.said);
-    // Each doubling of the number at most.
+    // At most one message for each doubling of the number.
     let told = finished.said.matches(": environment failure ").count() as u32;
     assert!((1..=total.ilog2() + 1).contains(&told), "{told} told\n{}", finished.said);
 }
@@ -97,14 +97,14 @@ fn an_environment_that_always_fails_costs_its_worker_and_then_the_run() {
         .saying("no worker is left");
 }
 
-/// The environment that breaks leaves a mark, so the next life of its worker is a sound one.
+/// The environment that fails leaves a mark, so the next life of its worker is sound.
 fn survives(task: &str, words: &[&str]) -> (Workplace, String) {
     let place = Workplace::new();
-    // A call may last longer than silence may: its worker says that it is in one.
+    // A call may take longer than the heartbeat limit: the worker reports that it is in a call.
     let keys = ["actors.env_call_timeout_s=10", "supervision.heartbeat_timeout_s=5"];
     let more = ["--steps", "1500", "--set", keys[0], "--set", keys[1]];
     let (run, finished) = train_tiny(&place, task, &more);
-    assert!(!finished.said.contains("no sign of life"), "{}", finished.said);
+    assert!(!finished.said.contains("no heartbeat"), "{}", finished.said);
     let mut finished = finished.with_status(0).saying("actor-0 died").saying("restart 1 of 5");
     for words in words {
         finished = finished.saying(words);
@@ -127,7 +127,7 @@ fn a_worker_whose_environment_hangs_is_replaced_and_an_evaluator_says_so() {
     place.assert_no_process();
 }
 
-/// No other Python code runs any more in such a worker, not even another thread's.
+/// In such a worker no other Python code runs, not even in another thread.
 #[test]
 fn a_worker_whose_environment_hangs_with_the_interpreters_lock_is_replaced() {
     survives("HangWithLockOnce", &["an environment hangs", "exit status 75"]);
@@ -153,7 +153,7 @@ fn an_environment_that_forks_takes_nothing_from_its_worker() {
 fn one_process_goes_on_after_failures_and_repeats_them_to_the_byte() {
     let repeated = || {
         let place = Workplace::new();
-        // The fourth evaluation is the last, and the one in which its environments break.
+        // The fourth evaluation is the last, and the one in which its environments fail.
         let more = ["--deterministic", "--steps", "1500", "--set", "evaluation.interval_steps=400"];
         let (run, finished) = train_tiny(&place, "FaultyRaise", &more);
         finished.with_status(0).saying("learner: environment failure ").saying("failures   ");
@@ -169,7 +169,7 @@ fn one_process_goes_on_after_failures_and_repeats_them_to_the_byte() {
     assert_eq!(repeated(), repeated());
 }
 
-/// Nobody restarts the only process; it says why it ended, and a resume goes on.
+/// The only process is not restarted. It reports why it ended, and a resume continues.
 #[test]
 fn one_process_whose_environment_hangs_ends_and_can_be_resumed() {
     let place = Workplace::new();

@@ -1,5 +1,5 @@
-//! A run over real hosts of its own: three network namespaces, each with its address, on a wire
-//! that is long, lossy and cut.
+//! A run over three hosts: network namespaces with their own addresses, on a wire with delay, loss
+//! and interruptions.
 
 use std::fs;
 use std::path::Path;
@@ -16,13 +16,13 @@ use rustix::process::Signal;
 
 use crate::{ENDLESS, train};
 
-/// As much as a connection of these tests has under way.
+/// Bytes in transit of a connection of these tests.
 const TCP_BYTES_MAX: usize = 16 << 20;
-/// The workers of other hosts come after the run's own and the four that may join.
+/// The workers of other hosts follow the run's own, and the four that may join.
 const REMOTE: usize = 5;
 const PORT: u16 = 7447;
 
-/// Three hosts; none, and the test is skipped, where they cannot be made.
+/// Makes three hosts; `None`, and the test is skipped, if that is impossible.
 fn three_hosts(seed: u64) -> Option<Hosts> {
     match Hosts::new(3, TCP_BYTES_MAX, seed) {
         Ok(hosts) => Some(hosts),
@@ -35,7 +35,7 @@ fn three_hosts(seed: u64) -> Option<Hosts> {
     }
 }
 
-fn start(place: &Workplace, (hosts, host): (&Hosts, usize), arguments: &[&str]) -> Running {
+fn start(place: &Workplace, hosts: &Hosts, host: usize, arguments: &[&str]) -> Running {
     let mut command = Command::new(executable());
     command.args(arguments);
     hosts.place(host, &mut command);
@@ -48,13 +48,13 @@ fn strike(run: &str, role: &str) {
     process.unwrap_or_else(|| panic!("no {role} in {processes:#?}")).signal(Signal::KILL);
 }
 
-/// Segments of each other host's worker that are in the newest checkpoint.
+/// Returns the segments of each other host's worker in the newest checkpoint.
 fn learned(run: &str) -> [u64; 2] {
     let state = json_file(run, "checkpoints/latest/state.json");
     [0, 1].map(|host| state["settled"][REMOTE + host]["sequence"].as_u64().unwrap_or(0))
 }
 
-/// Waits until more has been learned from each of these hosts.
+/// Waits until segments of each of these hosts were learned from.
 fn until_more(running: &mut Running, run: &str, hosts: &[usize], what: &str) {
     let before = learned(run);
     running.until(what, |_| {
@@ -66,7 +66,8 @@ fn until_more(running: &mut Running, run: &str, hosts: &[usize], what: &str) {
 fn bridge_arguments<'a>(
     token: &'a str,
     endpoint: &'a str,
-    (name, run): (&'a str, &'a str),
+    name: &'a str,
+    run: &'a str,
 ) -> Vec<&'a str> {
     let asks = ["bridge", "--connect", endpoint, "--token-file", token];
     let own = ["--workers", "1", "--name", name, "--run-dir", run];
@@ -82,14 +83,14 @@ fn three_hosts_lose_nothing_on_a_long_lossy_wire_that_is_cut_while_processes_die
     let listen = format!("bridge.listen=[\"{endpoint}\"]");
     let open = ["--workers", "1", "--set", &listen, "--set", "delivery.level=log"];
     let more = [&open[..], &["--steps", ENDLESS]].concat();
-    let mut training = start(&place, (&hosts, 0), &train("reacher", &run, &more));
+    let mut training = start(&place, &hosts, 0, &train("reacher", &run, &more));
     let token = format!("{run}/bridge.token");
     training.until("a token", |_| Path::new(&token).is_file());
     let mut bridges = [0, 1].map(|host| {
         let name = ["near", "far"][host];
-        let arguments = bridge_arguments(&token, &endpoint, (name, &far[host]));
-        let bridge = start(&place, (&hosts, host + 1), &arguments);
-        // Who comes first has the first place, by which its segments are told from the other's.
+        let arguments = bridge_arguments(&token, &endpoint, name, &far[host]);
+        let bridge = start(&place, &hosts, host + 1, &arguments);
+        // Started first, it gets the first place, which identifies its segments.
         training.until_said(&format!("host {name} takes part"));
         bridge
     });
@@ -123,7 +124,7 @@ fn three_hosts_lose_nothing_on_a_long_lossy_wire_that_is_cut_while_processes_die
     assert!(shared_memory_of(&run).is_empty());
 }
 
-/// Cuts the second of the other hosts off for so long; the run goes on with the first meanwhile.
+/// Cuts the second of the other hosts off for this time, while the run continues with the first.
 fn cut(hosts: &Hosts, training: &mut Running, run: &str, seconds: u64) {
     hosts.cut(2, true);
     let began = Instant::now();
@@ -133,7 +134,7 @@ fn cut(hosts: &Hosts, training: &mut Running, run: &str, seconds: u64) {
     until_more(training, run, &[1], "segments of the host that was cut off");
 }
 
-/// The examples of the documentation, as they stand there.
+/// The examples of the documentation, unchanged.
 #[test]
 fn with_mutual_tls_a_host_takes_part_whose_certificate_is_named_and_no_other() {
     let Some(hosts) = three_hosts(2) else { return };
@@ -158,21 +159,21 @@ fn with_mutual_tls_a_host_takes_part_whose_certificate_is_named_and_no_other() {
     let open = ["--workers", "1", "--set", &listen];
     let secured = ["--set", "bridge.zenoh_file=zenoh-learner.json5", "--steps", ENDLESS];
     let arguments = [&open[..], &secured].concat();
-    let mut training = start(&place, (&hosts, 0), &train("reacher", &run, &arguments));
+    let mut training = start(&place, &hosts, 0, &train("reacher", &run, &arguments));
     let token = format!("{run}/bridge.token");
     training.until("a token", |_| Path::new(&token).is_file());
     let (near, far) = (place.path("near"), place.path("far"));
     let mut strangers = [
-        // Of the authority, but not named.
-        [&bridge_arguments(&token, &endpoint, ("c", &far))[..], &["--zenoh-config", "other.json5"]]
+        // Signed by the authority, but not named.
+        [&bridge_arguments(&token, &endpoint, "c", &far)[..], &["--zenoh-config", "other.json5"]]
             .concat(),
         // Without any certificate.
-        bridge_arguments(&token, &endpoint, ("d", &far)),
+        bridge_arguments(&token, &endpoint, "d", &far),
     ]
-    .map(|arguments| start(&place, (&hosts, 2), &arguments));
-    let named = bridge_arguments(&token, &endpoint, ("a", &near));
+    .map(|arguments| start(&place, &hosts, 2, &arguments));
+    let named = bridge_arguments(&token, &endpoint, "a", &near);
     let named = [&named[..], &["--zenoh-config", "zenoh-host.json5"]].concat();
-    let bridge = start(&place, (&hosts, 1), &named);
+    let bridge = start(&place, &hosts, 1, &named);
     until_more(&mut training, &run, &[0], "segments of the host that is named");
     for stranger in &mut strangers {
         stranger.until_said("no learner's host answers");

@@ -1,4 +1,4 @@
-//! Requests as they stand on the wire: also those that no well-behaved client would send.
+//! HTTP requests by hand, including those that no well-behaved client sends.
 
 use std::io::{Read, Write};
 use std::net::TcpStream;
@@ -6,10 +6,10 @@ use std::net::TcpStream;
 use dmprl_tests::program::PATIENCE;
 use serde_json::Value;
 
-/// What came back.
+/// The answer.
 pub struct Answer {
     pub status: u16,
-    /// Status line and headers, lower case.
+    /// Status line and headers, in lower case.
     pub head: String,
     pub body: Vec<u8>,
 }
@@ -25,7 +25,7 @@ impl Answer {
     }
 }
 
-/// GET `path` of `address` (host and port), with its own name as host.
+/// Sends GET `path` to `address` (host and port), with that host as the header.
 pub fn get(address: &str, path: &str) -> Answer {
     request(address, &format!("GET {path} HTTP/1.1\r\nHost: {address}\r\n"))
 }

@@ -1,4 +1,4 @@
-//! Ctrl-C, once and twice, in good times and in bad.
+//! Ctrl-C, once and twice, in normal and in broken runs.
 
 use std::path::Path;
 
@@ -13,7 +13,7 @@ use crate::{ENDLESS, train};
 /// Flags of a run that only an interrupt ends.
 const EVENTS: [&str; 4] = ["--steps", ENDLESS, "--events", "json"];
 
-/// The last event of an interrupted run whose checkpoint is of its last moment.
+/// The last event of an interrupted run whose checkpoint has its last step.
 fn interrupted() -> Value {
     json!({ "event": "finished", "outcome": "interrupted", "checkpointed": true })
 }
@@ -59,7 +59,7 @@ fn sigterm_is_an_interrupt_too() {
     let place = Workplace::new();
     let run = place.path("run");
     let running = training(&place, &run);
-    // As a service manager does: the supervisor alone.
+    // To the supervisor alone, as a service manager does.
     running.signal(Signal::TERM);
     running.wait().with_status(130).with_event(&interrupted());
     assert_nothing_left(&place, &run);
@@ -74,7 +74,10 @@ fn ctrl_c_before_the_first_step_leaves_nothing_running() {
     running.signal_group(Signal::INT);
     running.wait().with_status(130);
     assert_nothing_left(&place, &run);
-    place.run(&["resume", &run, "--steps", "1000"]).with_status(0).saying("begins again");
+    place
+        .run(&["resume", &run, "--steps", "1000"])
+        .with_status(0)
+        .saying("starts from the beginning");
 }
 
 /// The learner hangs, so that only the second interrupt can end the run at once.
@@ -87,7 +90,7 @@ fn ctrl_c_twice_ends_a_run_whose_learner_hangs() {
     stop_role(&place, "learner");
     running.signal_group(Signal::INT);
     running.until_event(&json!({ "event": "interrupted" }));
-    // Two signals at almost the same moment are one wish, so the second is repeated.
+    // Two signals at almost the same time can merge, so the second is repeated.
     running.until("the second interrupt", |running| {
         running.signal_group(Signal::INT);
         running.events().iter().any(|event| event["event"] == "killed")

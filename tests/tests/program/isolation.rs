@@ -1,4 +1,4 @@
-//! What a machine must have before anything starts, and what nobody else may do to a run.
+//! Resources that a start requires, and protection of a run from other users.
 
 use std::fs;
 use std::os::unix::fs::{MetadataExt, PermissionsExt};
@@ -13,10 +13,10 @@ use rustix::process::Signal;
 
 use crate::{ENDLESS, train};
 
-/// Any user that owns nothing here.
+/// A user that owns no file here.
 const STRANGER: &str = "65534";
 
-/// Each entry below a directory, itself included.
+/// Returns each entry below a directory, and the directory itself.
 fn tree(path: &Path) -> Vec<PathBuf> {
     let mut paths = vec![path.to_owned()];
     if path.symlink_metadata().unwrap().is_dir() {
@@ -28,7 +28,7 @@ fn tree(path: &Path) -> Vec<PathBuf> {
 
 fn refused_by_its_size(command: Command, place: &Workplace, words: &[&str]) {
     let mut finished = place.start_command(command).wait().with_status(1);
-    for word in ["this machine cannot hold the run"].iter().chain(words) {
+    for word in ["the run exceeds this machine's resources"].iter().chain(words) {
         finished = finished.saying(word);
     }
     assert_eq!(fs::read_dir(place.folder()).unwrap().count(), 0, "it was refused before it began");
@@ -54,8 +54,8 @@ fn a_run_that_shared_memory_cannot_hold_is_refused_with_both_numbers() {
     refused_by_its_size(command, &place, &words);
 }
 
-/// A command with a /dev/shm of its own, of so many KiB, as in a container; none, and the test is
-/// skipped, where it cannot be mounted.
+/// Returns a command with its own /dev/shm of this size [KiB], as in a container; `None`, and the
+/// test is skipped, if it cannot be mounted.
 pub(crate) fn with_shared_memory_of(kib: u32, script: &str) -> Option<Command> {
     let mount = format!("mount -t tmpfs -o size={kib}k,mode=1777 tmpfs /dev/shm");
     let alone = |script: &str| {
@@ -84,7 +84,7 @@ fn a_container_with_too_little_shared_memory_is_told_before_it_starts() {
     refused_by_its_size(command, &place, &words);
 }
 
-/// What Docker gives is enough for a default run, and doctor says so with the numbers.
+/// Docker's default suffices for a default run, and doctor reports this with the numbers.
 #[test]
 fn dockers_shared_memory_is_enough_and_worth_a_warning() {
     let place = Workplace::new();
@@ -94,7 +94,7 @@ fn dockers_shared_memory_is_enough_and_worth_a_warning() {
     let script = format!("{program} doctor; exec {program} {line}");
     let Some(command) = with_shared_memory_of(64 << 10, &script) else { return };
     let finished = place.start_command(command).wait().with_status(0);
-    // Where there are many cores, a default run has many workers and does not fit.
+    // With many cores a default run has many workers and does not fit.
     let warning = |line: &str| {
         line.contains(" shared memory ")
             && line.contains("needs")
@@ -127,10 +127,10 @@ fn resume_asks_for_the_same_room_and_leaves_the_run_as_it_is() {
     assert_eq!(fs::read(Path::new(&run).join("manifest.json")).unwrap(), manifest);
 }
 
-/// The numbers that a start is refused by are bounds of what a run really takes.
+/// The numbers that a start is checked against are upper bounds of a run's real use.
 #[test]
 fn what_is_asked_for_covers_what_a_run_takes() {
-    /// The run's own and those that may join.
+    /// The run's own workers and those that may join.
     const WORKERS: usize = 4 + 4;
     let place = Workplace::new();
     let run = place.path("run");
@@ -165,7 +165,7 @@ fn two_runs_of_one_user_at_once_have_nothing_in_common() {
         let steps = env_steps_of(run).unwrap();
         running.until_steps(run, steps + 1_000);
     }
-    // Each process maps its own run's shared memory and no other's.
+    // Each process maps the shared memory of its own run only.
     for process in place.processes() {
         let maps = format!("/proc/{}/maps", process.id.as_raw_nonzero());
         let maps = fs::read_to_string(maps).unwrap_or_default();
@@ -215,7 +215,7 @@ fn another_user_can_neither_read_nor_inject_nor_block() {
         let remedy = "run the tests as root, with setpriv (apt install util-linux)";
         return skipped("TEST_ROOT_REQUIRED", "a run that another user attacks", remedy);
     }
-    // Everybody may come as far as the run's directory, as on a shared machine.
+    // As on a shared machine, all users can reach the run's directory.
     fs::set_permissions(place.folder(), PermissionsExt::from_mode(0o755)).unwrap();
     let marker = domain.join("domain");
     let [domain, marker, lock] = [domain, &marker, &lock].map(|path| path.display().to_string());
@@ -240,7 +240,7 @@ fn another_user_can_neither_read_nor_inject_nor_block() {
     running.wait().with_status(130);
 }
 
-/// A module of the working directory must not stand in for one of Python's.
+/// A module of the working directory must not replace one of Python's.
 #[test]
 fn nothing_of_the_working_directory_or_of_pythons_variables_is_imported() {
     let place = Workplace::new();
@@ -253,7 +253,7 @@ fn nothing_of_the_working_directory_or_of_pythons_variables_is_imported() {
             fs::write(folder.join(module), trap).unwrap();
         }
     }
-    // iceoryx2 would read this one, were it not told another.
+    // iceoryx2 would read this file if it were not given another.
     fs::create_dir(place.folder().join("config")).unwrap();
     fs::write(place.folder().join("config/iceoryx2.toml"), "no = [ TOML").unwrap();
     let mut command = Command::new(executable());

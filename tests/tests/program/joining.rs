@@ -1,4 +1,4 @@
-//! Workers that join a run that is being trained, and leave it.
+//! Workers that join a running run, and leave it.
 
 use std::fs;
 use std::io::{BufRead, BufReader, Write};
@@ -11,17 +11,23 @@ use dmprl_tests::program::{
 };
 use dmprl_tests::skipped::skipped;
 use rustix::process::Signal;
-use serde_json::Value;
+use serde_json::{Value, json};
 
 use crate::{ENDLESS, train};
 
-/// A run with one worker of its own and `places` for those that join.
+/// Starts a run with one worker of its own and `places` for joining workers.
 fn training(place: &Workplace, run: &str, places: &str, more: &[&str]) -> Running {
     let places = format!("actors.joined_max={places}");
-    let more = [&["--steps", ENDLESS, "--workers", "1", "--set", &places], more].concat();
+    let own = ["--steps", ENDLESS, "--workers", "1", "--events", "json", "--set", &places];
+    let more = [&own[..], more].concat();
     let mut running = place.start(&train("reacher", run, &more));
     running.until_steps(run, 1_000);
     running
+}
+
+/// The event of a joined worker that died or hung.
+fn lost() -> Value {
+    json!({ "event": "left", "process": "actor-1", "announced": false, "workers": 1 })
 }
 
 fn join(place: &Workplace, run: &str) -> Running {
@@ -30,8 +36,8 @@ fn join(place: &Workplace, run: &str) -> Running {
     joined
 }
 
-/// Waits until the learner has learned from the segments of the worker that has joined: it knows
-/// how far its newest incarnation has come.
+/// Waits until the learner has learned from the joined worker: it knows the progress of its newest
+/// incarnation.
 fn until_learned_from(running: &mut Running, run: &str, incarnation: u64) {
     running.until("a checkpoint with segments of the worker that joined", |_| {
         let mark = &newest_state(run)["settled"][1];
@@ -39,13 +45,13 @@ fn until_learned_from(running: &mut Running, run: &str, incarnation: u64) {
     });
 }
 
-/// The newest checkpoint's; null while there is none.
+/// Returns the newest checkpoint's; null if there is none.
 fn newest_state(run: &str) -> Value {
     let folder = fs::read_dir(Path::new(run).join("checkpoints")).unwrap();
     let states = folder.flatten().map(|entry| entry.path().join("state.json"));
     let newest = states.filter(|path| path.exists()).max();
     let text = newest.and_then(|path| fs::read_to_string(path).ok());
-    // One that is removed in this moment is no more the newest.
+    // One that is removed just now is no longer the newest.
     text.and_then(|text| serde_json::from_str(&text).ok()).unwrap_or_default()
 }
 
@@ -66,7 +72,7 @@ fn a_worker_joins_is_learned_from_and_makes_room_when_it_leaves_or_dies() {
     let run = place.path("run");
     let mut running = training(&place, &run, "1", &[]);
     let joined = join(&place, &run);
-    running.until_said("actor-1 has joined: 2 workers");
+    running.until_event(&json!({ "event": "joined", "process": "actor-1", "workers": 2 }));
     until_learned_from(&mut running, &run, 0);
     running.until("a line that counts both", |_| {
         rows(&run, "metrics.jsonl").pop().is_some_and(|last| last["workers"] == 2)
@@ -79,13 +85,14 @@ fn a_worker_joins_is_learned_from_and_makes_room_when_it_leaves_or_dies() {
     let counts = said.split("left the run: ").nth(1).unwrap();
     let (acknowledged, rest) = counts.split_once(" of ").unwrap();
     assert_eq!(Some(acknowledged), rest.split(' ').next(), "all of them: {said}");
-    running.until_said("actor-1, which had joined, has left: 1 worker");
+    let left = json!({ "event": "left", "process": "actor-1", "announced": true, "workers": 1 });
+    running.until_event(&left);
 
-    // The next is killed, and the one after that has its place too.
+    // The next one is killed, and the one after it gets its place too.
     let killed = join(&place, &run);
     until_learned_from(&mut running, &run, 1);
     killed.signal_group(Signal::KILL);
-    running.until_said("actor-1, which had joined, died");
+    running.until_event(&lost());
     let mut last = join(&place, &run);
     until_learned_from(&mut running, &run, 2);
     last.until_said("segments sent");
@@ -103,7 +110,7 @@ fn a_worker_that_has_joined_stays_when_the_learner_is_replaced() {
     let learner = processes(&place, "learner").pop().unwrap();
     let before = newest_state(&run)["settled"][1]["sequence"].as_u64().unwrap();
     learner.signal(Signal::KILL);
-    running.until_said("the learner is back: first segment");
+    running.until_event(&json!({ "event": "first_step", "after_restart": true }));
     running.until("more of its segments", |_| {
         newest_state(&run)["settled"][1]["sequence"].as_u64() > Some(before + 100)
     });
@@ -119,9 +126,9 @@ fn a_worker_that_has_joined_and_is_stopped_loses_its_place() {
     let more = ["--set", "supervision.heartbeat_timeout_s=5"];
     let mut running = training(&place, &run, "1", &more);
     let joined = join(&place, &run);
-    running.until_said("actor-1 has joined");
+    running.until_event(&json!({ "event": "joined", "process": "actor-1" }));
     joined.signal_group(Signal::STOP);
-    running.until_said("actor-1, which had joined, hung (no sign of life for 5.");
+    running.until_event(&lost());
     assert_eq!(joined.wait().status.code(), None);
     let joined = join(&place, &run);
     until_learned_from(&mut running, &run, 1);
@@ -134,7 +141,7 @@ fn processes(place: &Workplace, role: &str) -> Vec<Process> {
     place.processes().into_iter().filter(|process| process.role == role).collect()
 }
 
-/// Open files of supervisor and learner, and files in shared memory.
+/// Counts open files of supervisor and learner, and files in shared memory.
 fn held(place: &Workplace, run: &str) -> (Vec<usize>, usize) {
     let files = ["train", "learner"].into_iter().flat_map(|role| processes(place, role));
     let files = files.map(|process| {
@@ -163,7 +170,7 @@ fn joining_and_leaving_all_the_time_leaks_nothing() {
     for round in 0..10 {
         let mut joined = join(&place, &run);
         match round % 4 {
-            // In the middle of its start, of its work, or of its farewell.
+            // In the middle of its start, its work, or its farewell.
             0 => joined.signal_group(Signal::KILL),
             1 => {
                 joined.until_said("segments sent");
@@ -180,14 +187,12 @@ fn joining_and_leaving_all_the_time_leaks_nothing() {
         }
         joined.wait();
         let gone = |running: &Running| {
-            let said = running.said();
-            let of = |words: &str| said.matches(&format!("which had joined, {words}")).count();
-            of("has left") + of("died") == round + 1
+            running.events().iter().filter(|event| event["event"] == "left").count() == round + 1
         };
         running.until("its end is noticed", gone);
         if before.is_none() {
             until_learned_from_own(&mut running, &run);
-            // Which stays open from the first line of metrics on.
+            // Which stays open from the first line of metrics.
             running.until("its event file", |_| Path::new(&run).join("tensorboard").is_dir());
             before = Some(held(&place, &run));
         }
@@ -197,7 +202,7 @@ fn joining_and_leaving_all_the_time_leaks_nothing() {
     end(&place, &run, running);
 }
 
-/// The run goes on, and what a dead worker left has been cleaned up.
+/// The run continues, and the files of a dead worker are removed.
 fn until_learned_from_own(running: &mut Running, run: &str) {
     let steps = env_steps_of(run).unwrap_or(0);
     running.until_steps(run, steps + 2_000);
@@ -230,8 +235,8 @@ fn a_run_that_cannot_take_a_worker_in_says_why() {
     refused(&deterministic, 2, "is deterministic");
 }
 
-/// Whoever gets as far as the socket is this user, and may still be of another version, or no
-/// worker at all.
+/// Only processes of this user reach the socket, but they may have another version, or not be
+/// workers at all.
 #[test]
 fn a_run_answers_strangers_and_goes_on() {
     let place = Workplace::new();
@@ -243,7 +248,7 @@ fn a_run_answers_strangers_and_goes_on() {
     let mut nonsense = Vec::new();
     for line in ["{}\n", "nonsense\n", "\n", &"x".repeat(100_000)] {
         let mut stream = knock();
-        // It may have been sent away before all of it was said.
+        // It may be rejected before it has sent everything.
         let _ = stream.get_mut().write_all(line.as_bytes());
         nonsense.push(stream);
     }

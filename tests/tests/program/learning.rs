@@ -1,4 +1,4 @@
-//! That a short run learns: the one test that no amount of right plumbing passes.
+//! A short run learns.
 
 use dmprl_tests::program::{Workplace, rows};
 

@@ -1,4 +1,4 @@
-//! `dmprl clean`, and what `dmprl doctor` says of it, beside runs that live and runs that died.
+//! `dmprl clean` and the report of `dmprl doctor`, with live and dead runs.
 
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -14,19 +14,19 @@ fn training(place: &Workplace, run: &str) -> Running {
     running
 }
 
-/// Whether a report of `clean --json` names the shared memory of a run.
+/// Returns true if a report of `clean --json` names the shared memory of a run.
 fn names(report: &Finished, domain: &Path) -> bool {
     let report = report.json();
     let listed = report["leftovers"].as_array().unwrap();
     listed.iter().any(|leftover| leftover["path"].as_str() == domain.to_str())
 }
 
-/// Other tests start and kill runs meanwhile, so only these two runs are looked at.
+/// Other tests start and kill runs at the same time, so only these two runs are checked.
 #[test]
 fn clean_removes_what_a_killed_run_left_and_nothing_of_a_living_one() {
     let (place, other_place) = (Workplace::new(), Workplace::new());
     let (run, other) = (place.path("run"), other_place.path("other"));
-    // The living one first: a start removes what the dead have left.
+    // The live one first: a start removes the files of dead runs.
     let mut living = training(&other_place, &other);
     let killed = training(&place, &run);
     let (dead, alive) = (shared_memory_of(&run), shared_memory_of(&other));
@@ -35,9 +35,9 @@ fn clean_removes_what_a_killed_run_left_and_nothing_of_a_living_one() {
     drop(killed);
     place.until_no_process();
 
-    // Unless the start of another test was faster, it is still there; one that has just begun to
-    // remove it holds its locks.
-    until("what the killed run left is listed or gone", || {
+    // It still exists, unless the start of another test was faster. A start that is removing it
+    // holds its locks.
+    until("the killed run's files are listed or gone", || {
         let listed = place.run(&["clean", "--dry-run", "--json"]).with_status(0);
         assert!(!names(&listed, &alive[0]), "{}", listed.printed);
         names(&listed, &dead[0]) || shared_memory_of(&run).is_empty()
@@ -45,7 +45,7 @@ fn clean_removes_what_a_killed_run_left_and_nothing_of_a_living_one() {
     let removed = place.run(&["clean"]).with_status(0);
     assert!(removed.printed.contains("dead runs"), "{}", removed.printed);
     assert_eq!(shared_memory_of(&run), Vec::<PathBuf>::new());
-    assert!(Path::new(&run).join("manifest.json").is_file(), "results are nobody's leftovers");
+    assert!(Path::new(&run).join("manifest.json").is_file(), "results stay");
 
     assert_eq!(shared_memory_of(&other), alive);
     let steps = dmprl_tests::program::env_steps_of(&other).unwrap();
@@ -54,7 +54,7 @@ fn clean_removes_what_a_killed_run_left_and_nothing_of_a_living_one() {
     living.wait().with_status(130);
 }
 
-/// The supervisor owns the shared memory, but its learner still has a checkpoint to write.
+/// The supervisor owns the shared memory, but its learner still has to write a checkpoint.
 #[test]
 fn clean_leaves_the_learner_of_a_killed_supervisor_its_shared_memory() {
     let place = Workplace::new();

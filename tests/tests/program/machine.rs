@@ -1,5 +1,5 @@
-//! What a machine may do to a run that goes on: too little memory, shared memory that fills up or
-//! is removed, and a learner for which everybody waits.
+//! Failures of the machine: little memory, full or removed shared memory, and a learner that keeps
+//! all workers waiting.
 
 use std::fs;
 use std::io::Write;
@@ -12,6 +12,7 @@ use dmprl_tests::program::{
 };
 use dmprl_tests::skipped::skipped;
 use rustix::process::{Pid, Signal};
+use serde_json::json;
 
 use crate::isolation::with_shared_memory_of;
 use crate::{ENDLESS, train};
@@ -22,7 +23,7 @@ fn role(place: &Workplace, role: &str) -> Process {
     found.unwrap_or_else(|| panic!("no {role} in {processes:#?}")).clone()
 }
 
-/// Processor time that a process uses a second while something happens [clock ticks].
+/// Processor time of a process per second while a closure runs [clock ticks].
 fn ticks_per_s(process: &Process, meanwhile: impl FnOnce()) -> f64 {
     let ticks = || process.cpu_ticks().expect("a living process") as f64;
     let (before, started) = (ticks(), Instant::now());
@@ -30,7 +31,7 @@ fn ticks_per_s(process: &Process, meanwhile: impl FnOnce()) -> f64 {
     (ticks() - before) / started.elapsed().as_secs_f64()
 }
 
-/// How little exactly is measured by `bench transport`; here only that it does not spin.
+/// Only checks that it does not spin; `bench transport` measures the exact share.
 #[test]
 fn a_worker_whose_learner_takes_nothing_sleeps() {
     let place = Workplace::new();
@@ -41,13 +42,25 @@ fn a_worker_whose_learner_takes_nothing_sleeps() {
     let (worker, learner) = (role(&place, "actor"), role(&place, "learner"));
     let stepping = ticks_per_s(&worker, || running.until_steps(&run, 2_500 + 10_000));
     learner.signal(Signal::STOP);
-    running.until_said("has waited 1 s: the learner takes nothing");
+    running.until_said("has waited 1 s: its queue is full");
     let blocked = ticks_per_s(&worker, || running.until_said("has waited 4 s"));
     learner.signal(Signal::CONT);
     println!("{stepping:.1} ticks a second while it steps, {blocked:.1} while it waits");
     assert!(blocked < stepping / 2.0, "{blocked} ticks a second while it waits, {stepping} before");
     running.signal_group(Signal::INT);
     running.wait().with_status(130);
+}
+
+/// Waits until a process has died of this cause and is restarted.
+fn until_death(running: &mut Running, process: &str, cause: &str) {
+    running.until(&format!("the death of {process}"), |running| {
+        running.events().iter().any(|event| {
+            event["event"] == "child_died"
+                && event["process"] == process
+                && event["next"] == "restart"
+                && event["cause"].as_str().is_some_and(|found| found.starts_with(cause))
+        })
+    });
 }
 
 fn end(running: Running, run: &str) {
@@ -59,16 +72,17 @@ fn end(running: Running, run: &str) {
     assert!(refused.values().all(|count| count == 0), "{last}");
 }
 
-/// Pages of shared memory that nobody has written to yet are not there when somebody else has taken
-/// all; who then writes is killed by the kernel.
+/// Unwritten pages of shared memory are not allocated. If another process has used all memory, the
+/// kernel kills the writer.
 #[test]
 fn a_worker_killed_by_full_shared_memory_is_told_the_cause_and_replaced() {
     let place = Workplace::new();
     let run = place.path("run");
     let keys = ["actors.queue_segments=8192"].into_iter().flat_map(|key| ["--set", key]);
-    let more = ["--steps", ENDLESS, "--workers", "1"].into_iter().chain(keys).collect::<Vec<_>>();
+    let own = ["--steps", ENDLESS, "--workers", "1", "--events", "json"];
+    let more = own.into_iter().chain(keys).collect::<Vec<_>>();
     let line = train("reacher", &run, &more).join(" ");
-    // Somebody else on the machine, when he is asked to, for two minutes at most.
+    // Another process on the machine, on request, for at most two minutes.
     let waiting =
         |file: &str| format!("for i in $(seq 2400); do [ -e {file} ] && break; sleep 0.05; done");
     let other = format!(
@@ -82,14 +96,15 @@ fn a_worker_killed_by_full_shared_memory_is_told_the_cause_and_replaced() {
     let mut running = place.start_command(command);
     running.until_steps(&run, 1_000);
     let learner = role(&place, "learner");
-    // The worker comes to pages that it has never used: its queue is long, and nobody takes.
+    // The worker reaches pages that it has never used: its queue is long, and the learner takes
+    // nothing.
     learner.signal(Signal::STOP);
     let ask = |file: &str, answer: &str| {
         fs::write(place.path(file), "").unwrap();
         until(answer, || Path::new(&place.path(answer)).exists());
     };
     ask("fill", "filled");
-    running.until_said("actor-0 died (signal 7 (SIGBUS), perhaps because shared memory");
+    until_death(&mut running, "actor-0", "signal 7 (SIGBUS), perhaps because shared memory");
     ask("free", "freed");
     learner.signal(Signal::CONT);
     let steps = env_steps_of(&run).unwrap();
@@ -98,13 +113,14 @@ fn a_worker_killed_by_full_shared_memory_is_told_the_cause_and_replaced() {
     place.assert_no_process();
 }
 
-/// A group of processes with little memory, below the test's own; removed when dropped.
+/// A cgroup with little memory, below the test's own; dropping it removes it.
 struct Memory {
     group: PathBuf,
 }
 
 impl Memory {
-    /// Cgroups of version 2 where they have memory, or else of version 1; none where we may not.
+    /// Makes a cgroup of version 2 if memory is controlled there, else of version 1; `None` without
+    /// the right.
     fn new(bytes: u64) -> Option<Self> {
         let own = fs::read_to_string("/proc/self/cgroup").ok()?;
         let below = |base: &str, path: &str| Path::new(base).join(path.trim_start_matches('/'));
@@ -119,7 +135,7 @@ impl Memory {
             let group = parent.join(format!("dmprl-test-{}", std::process::id()));
             fs::create_dir(&group).ok()?;
             let memory = Self { group };
-            // Dropped, and so removed, where it is not one of memory.
+            // Dropped, and so removed, because it does not control memory.
             fs::OpenOptions::new()
                 .write(true)
                 .open(memory.group.join(limit))
@@ -136,7 +152,7 @@ impl Memory {
 
 impl Drop for Memory {
     fn drop(&mut self) {
-        // Not before its last process has gone.
+        // Only after its last process has ended.
         let gone = || fs::remove_dir(&self.group).is_ok() || !self.group.exists();
         if !std::thread::panicking() {
             until("an empty group of processes", gone);
@@ -144,7 +160,7 @@ impl Drop for Memory {
     }
 }
 
-/// The kernel itself kills it. What a run then says names the likely cause.
+/// The kernel kills the process. The run's message names the likely cause.
 #[test]
 fn a_learner_killed_for_want_of_memory_is_told_so_and_replaced() {
     let place = Workplace::new();
@@ -154,13 +170,14 @@ fn a_learner_killed_for_want_of_memory_is_told_so_and_replaced() {
         skipped("TEST_CGROUP_REQUIRED", "a learner that the kernel kills for memory", remedy);
     };
     let Some(memory) = Memory::new(512 << 10) else { return skip() };
-    let mut running = place.start(&train("reacher", &run, &["--steps", ENDLESS]));
+    let mut running =
+        place.start(&train("reacher", &run, &["--steps", ENDLESS, "--events", "json"]));
     running.until_steps(&run, 2_500);
     if memory.take(role(&place, "learner").id).is_err() {
         return skip();
     }
-    running.until_said("learner died (signal 9 (SIGKILL), perhaps for want of memory): restart 1");
-    running.until_said("the learner is back");
+    until_death(&mut running, "learner", "signal 9 (SIGKILL), perhaps out of memory");
+    running.until_event(&json!({ "event": "first_step", "after_restart": true }));
     let steps = env_steps_of(&run).unwrap_or(0);
     running.until_steps(&run, steps + 1_000);
     end(running, &run);
@@ -176,10 +193,10 @@ fn shared_memory_that_is_removed_under_a_run_ends_it_with_a_checkpoint() {
     let [domain] = &shared_memory_of(&run)[..] else { panic!("one domain") };
     let started = Instant::now();
     fs::remove_dir_all(domain).unwrap();
-    running.until_said("was removed under it");
+    running.until_said("was removed; do not clear /dev/shm");
     println!("told after {:?}", started.elapsed());
     let reached = env_steps_of(&run).unwrap();
-    running.wait().with_status(1).saying("the run's shared memory is gone").saying("dmprl resume");
+    running.wait().with_status(1).saying("the run's shared memory").saying("dmprl resume");
     place.assert_no_process();
     assert_eq!(shared_memory_of(&run), Vec::<PathBuf>::new());
     let checkpoint = env_steps_of_checkpoint(&run).unwrap();

@@ -1,7 +1,6 @@
-//! The whole program with real processes, as a user meets it: what a run leaves behind, how it
-//! ends, what it survives.
+//! The whole program with real processes, as a user runs it.
 //!
-//! One executable for all of them: linking is dear, and the tests run side by side.
+//! All these tests are one executable, because linking is slow and they run in parallel.
 #![cfg(feature = "python")]
 #![allow(
     clippy::unwrap_used,
@@ -14,6 +13,7 @@ mod bench_policy;
 mod bench_scale;
 mod bench_system;
 mod bench_transport;
+#[cfg(feature = "hosts")]
 mod bridge;
 mod browser;
 mod chaos;
@@ -29,6 +29,7 @@ mod environments;
 mod export;
 mod fairness;
 mod faults;
+#[cfg(feature = "hosts")]
 mod hosts;
 mod http;
 mod interrupts;
@@ -50,7 +51,7 @@ mod start_stop;
 mod sweep;
 mod variants;
 
-/// Settings that make a run cheap: small networks, few updates, and every kind of output often.
+/// Settings of a cheap run: small networks, few updates, and frequent output of every kind.
 const SMALL: [&str; 9] = [
     "policy.hidden=[32,32]",
     "algorithm.critic_hidden=[32,32]",
@@ -63,10 +64,10 @@ const SMALL: [&str; 9] = [
     "metrics.interval_steps=500",
 ];
 
-/// Long beyond the end of any test: for runs that something else ends.
+/// Longer than any test, for runs that end otherwise.
 const ENDLESS: &str = "1000000000";
 
-/// The command line of a cheap `train`; `more` comes last and so has the last word.
+/// Returns the command line of a cheap `train`; `more` comes last and overrides.
 fn train<'a>(task: &'a str, run: &'a str, more: &[&'a str]) -> Vec<&'a str> {
     let mut arguments = vec!["train", task, "--run-dir", run];
     SMALL.iter().for_each(|setting| arguments.extend(["--set", setting]));

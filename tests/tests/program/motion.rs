@@ -19,8 +19,8 @@ fn measured(run: &str) -> motion::Motion {
     measure_motion(&run, &observer()).unwrap().expect("no interrupt")
 }
 
-/// The recorded episodes are those of the evaluation: a report shows motion and return of the same
-/// policy.
+/// The recorded episodes are those of the evaluation, so a report shows motion and return of the
+/// same policy.
 #[test]
 fn the_episodes_measured_are_those_evaluated_also_where_the_controls_follow_the_state() {
     let place = Workplace::new();

@@ -1,4 +1,4 @@
-//! `dmprl play`: a policy at work, as a page, since a test has no display.
+//! `dmprl play` as a page, because a test has no display.
 
 use std::io::{BufRead, BufReader, Read, Write};
 use std::net::TcpStream;
@@ -13,7 +13,7 @@ use crate::train;
 /// Longer than any frame takes.
 const PATIENCE: Duration = Duration::from_secs(60);
 
-/// A request's head, to be read on from.
+/// Sends the head of a request; the answer is read later.
 fn ask(port: &str, path: &str, host: &str) -> (String, BufReader<TcpStream>) {
     let mut stream = TcpStream::connect(format!("127.0.0.1:{port}")).unwrap();
     stream.set_read_timeout(Some(PATIENCE)).unwrap();
@@ -22,7 +22,7 @@ fn ask(port: &str, path: &str, host: &str) -> (String, BufReader<TcpStream>) {
     (head(&mut reader), reader)
 }
 
-/// Lines up to an empty one.
+/// Reads lines up to an empty one.
 fn head(reader: &mut BufReader<TcpStream>) -> String {
     let mut text = String::new();
     while !text.ends_with("\r\n\r\n") {
@@ -31,7 +31,7 @@ fn head(reader: &mut BufReader<TcpStream>) -> String {
     text
 }
 
-/// The next picture of a stream.
+/// Reads the next picture of a stream.
 fn picture(reader: &mut BufReader<TcpStream>) -> Vec<u8> {
     let head = head(reader);
     let length = head.split("Content-Length: ").nth(1).unwrap().trim().parse().unwrap();
@@ -69,7 +69,7 @@ fn a_browser_sees_the_episode_move_until_it_is_stopped() {
     assert!(pictures.iter().all(|picture| picture.starts_with(&[0xff, 0xd8])), "no JPEG");
     assert!(pictures.windows(2).any(|pair| pair[0] != pair[1]), "nothing moves");
 
-    // Another site that makes a browser believe it were this machine gets nothing.
+    // A site whose host name resolves to this machine gets nothing.
     assert!(ask(&port, "/stream", "example.org").0.starts_with("HTTP/1.0 403"));
     assert!(ask(&port, "/else", "127.0.0.1").0.starts_with("HTTP/1.0 404"));
     playing.signal(Signal::INT);

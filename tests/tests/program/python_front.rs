@@ -7,7 +7,7 @@ use dmprl_tests::program::{Finished, Workplace};
 use dmprl_tests::{project_root, venv};
 use rustix::process::Signal;
 
-/// Of every script: small networks, few updates.
+/// Settings of every script: small networks, few updates.
 const SMALL: &str = "dict(
     policy__hidden=[32], algorithm__critic_hidden=[32], exploration__warm_up_steps=500,
     evaluation__episodes=2, evaluation__interval_steps=500, checkpoint__interval_steps=500,
@@ -46,8 +46,8 @@ except dmprl.ProgramError as error:
 ";
     let ended = python(&place, script).with_status(0).saying("evaluation at");
     let first = format!(
-        "Run('{}') <Policy for Reacher-v5: 10 numbers observed, 5 actions of 2 \
-                         decided, one every 0.02 s>",
+        "Run('{}') <Policy for Reacher-v5: observation of 10 values, 5 actions of 2 values per \
+         decision, 0.02 s per action>",
         place.path("mine")
     );
     let (printed, refused) = ended.printed.split_once('\n').unwrap();

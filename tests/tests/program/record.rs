@@ -1,4 +1,4 @@
-//! `dmprl record`: videos of real runs, looked at with the library that made them.
+//! `dmprl record`: videos of real runs, checked with the library that made them.
 
 use std::fs;
 use std::path::Path;
@@ -12,7 +12,7 @@ use serde_json::Value;
 
 use crate::train;
 
-/// Prints frames, width and height of a video, and the number of pictures of an animation.
+/// Prints frames, width and height of a video, and the number of frames of an animation.
 const LOOK: &str = "
 import sys, av
 from PIL import Image
@@ -28,7 +28,7 @@ fn python(arguments: &[&str]) -> std::process::Output {
     Command::new(&venv().executable).arg("-I").args(arguments).output().unwrap()
 }
 
-/// Whether this machine can draw; if not, the caller skips what draws.
+/// Returns true if this machine can draw; otherwise the caller skips its check of pictures.
 pub(super) fn can_draw() -> bool {
     let asked = "import os; from dmprl.pictures import name_opengl; name_opengl(); \
                  raise SystemExit('MUJOCO_GL' not in os.environ)";
@@ -75,7 +75,7 @@ fn two_runs_side_by_side_show_the_episodes_that_eval_runs() {
     let [mp4, gif, strip] = &files;
     let looked = python(&["-c", LOOK, mp4, gif, strip]);
     assert!(looked.status.success(), "{}", String::from_utf8_lossy(&looked.stderr));
-    // Two scenes of 480 pixels and what is between them; 50 frames a second are 25 of the GIF's.
+    // Two scenes of 480 pixels and the gap between them; 50 frames per second become 25 in the GIF.
     let expected = [102, 968, 568, 101, 51, 6 * 240 + 5 * 8, 4 * (240 + 2 * 44)];
     assert_eq!(numbers(&looked.stdout), expected);
     assert_eq!(fs::read_dir(format!("{run}/videos")).unwrap().count(), 3, "nothing else is left");
@@ -108,7 +108,7 @@ fn what_cannot_be_recorded_is_said() {
         .run(&["record", &own])
         .with_status(1)
         .saying("cannot be drawn")
-        .saying("has the render mode 'rgb_array'");
+        .saying("expected a Gymnasium environment with the render mode 'rgb_array'");
     assert_eq!(fs::read_dir(format!("{own}/videos")).unwrap().count(), 0);
     place.assert_no_process();
 }

@@ -1,4 +1,4 @@
-//! Wrong use costs nothing: status 2, the right name, and not a file.
+//! Wrong use ends with status 2 and the right name, and writes no file.
 
 use std::fs;
 
@@ -26,13 +26,33 @@ fn wrong_use_names_the_right_word_and_creates_nothing() {
     ] {
         let finished = place.run(arguments).with_status(2).saying(expected);
         assert!(finished.said.starts_with("error: "), "{}", finished.said);
-        // The harness has removed the folder for the output by now.
+        // The harness has removed the folder for the output already.
         let files: Vec<_> = fs::read_dir(place.folder()).unwrap().collect();
         assert!(files.is_empty(), "{arguments:?} left {files:?}");
     }
 }
 
-/// A worker that reported it would write `null`, which is no number to whoever reads the report.
+/// This build has no tests of workers on other hosts either.
+#[cfg(not(feature = "hosts"))]
+#[test]
+fn a_build_without_other_hosts_names_the_command_that_adds_them() {
+    let what = "runs on several hosts";
+    let remedy = "cargo test --release --features hosts";
+    dmprl_tests::skipped::skipped("TEST_BRIDGE_REQUIRED", what, remedy);
+    let (place, expected) = (Workplace::new(), "cargo build --release --features hosts");
+    let token = place.path("token");
+    fs::write(&token, "").unwrap();
+    for arguments in [
+        &["train", "reacher", "--set", "bridge.listen=[\"tcp/127.0.0.1:7447\"]"][..],
+        &["bridge", "--connect", "tcp/127.0.0.1:7447", "--token-file", &token],
+        &["bench", "transport", "--listen", "tcp/127.0.0.1:7447"],
+    ] {
+        place.run(arguments).with_status(2).saying(expected);
+    }
+}
+
+/// A worker that reported it would write `null`, which readers of the report cannot parse as a
+/// number.
 #[test]
 fn an_environment_whose_step_lasts_no_time_is_refused_by_its_worker() {
     let (place, folder) = (Workplace::new(), dmprl_tests::tiny_envs_dir());
@@ -54,7 +74,7 @@ fn a_run_that_is_being_trained_is_not_resumed_beside_itself() {
     let mut running = place.start(&crate::train("reacher", &run, &["--steps", crate::ENDLESS]));
     running.until_steps(&run, 500);
     place.run(&crate::train("reacher", &run, &[])).with_status(2).saying("already holds files");
-    // At once: `resume` waits only for the children of a supervisor that is gone.
+    // At once: `resume` waits only for the children of a dead supervisor.
     let resumed = place.run(&["resume", &run]).with_status(1).saying("is being trained by process");
     assert!(!resumed.said.contains("waiting"), "{}", resumed.said);
     let steps = dmprl_tests::program::env_steps_of(&run).unwrap();

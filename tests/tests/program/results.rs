@@ -1,4 +1,4 @@
-//! What a run leaves behind, and that it can be used again.
+//! Files of a finished run, and their use by other commands.
 
 use std::fs;
 use std::path::Path;
@@ -72,7 +72,7 @@ fn training_with_two_workers_leaves_a_whole_run_directory_and_nothing_else() {
         let mean = returns.iter().sum::<f64>() / episodes as f64;
         assert!((mean - number(row, "return_mean")).abs() < 1e-9, "{row}");
     }
-    // Workers send whole segments: a step that is due is met within one segment.
+    // Workers send complete segments, so a step limit is met within one segment.
     let steps: Vec<u64> = env_steps(&evaluations).iter().map(|steps| steps / 5 * 5).collect();
     assert_eq!(steps, [1000, 2000, 2500]);
     let metrics = rows(&run, "metrics.jsonl");
@@ -133,7 +133,8 @@ fn eval_repeats_the_stored_evaluations() {
     place.assert_no_process();
 }
 
-/// A run that was stopped before its evaluator had answered has a checkpoint without its row.
+/// A run that was stopped before its evaluator answered has a checkpoint without the row of its
+/// evaluation.
 #[test]
 fn a_resumed_run_makes_up_for_the_evaluation_that_was_never_answered() {
     for mode in [None, Some("--deterministic")] {
@@ -160,16 +161,19 @@ fn resume_with_more_steps_extends_a_finished_run() {
     let first = rows(&run, "metrics.jsonl");
     place.run(&["resume", &run, "--steps", "3000"]).with_status(0).saying("evaluation at 3,000");
     let metrics = rows(&run, "metrics.jsonl");
-    assert_eq!(metrics[..first.len()], first, "what was written stays");
+    assert_eq!(metrics[..first.len()], first, "earlier rows stay");
     assert_eq!(env_steps(&metrics), [500, 1000, 1500, 2000, 2500, 3000]);
     assert_eq!(env_steps(&rows(&run, "evaluations.jsonl")), [1000, 1500, 2000, 3000]);
     let clock: Vec<f64> = metrics.iter().map(|row| number(row, "wall_s")).collect();
-    assert!(clock.is_sorted(), "time goes on where it stopped: {clock:?}");
+    assert!(clock.is_sorted(), "time continues where it stopped: {clock:?}");
     assert_eq!(json_file(&run, "manifest.json")["sessions"].as_array().unwrap().len(), 2);
 
-    place.run(&["resume", &run, "--steps", "2000"]).with_status(2).saying("has 3000 steps already");
+    place
+        .run(&["resume", &run, "--steps", "2000"])
+        .with_status(2)
+        .saying("the run already has 3000 steps");
 
-    // Nothing is left to do: said, not done again.
+    // No steps are left: reported, not trained again.
     place.run(&["resume", &run]).with_status(0).saying("  return ");
     assert_eq!(rows(&run, "metrics.jsonl"), metrics);
     assert_eq!(env_steps(&rows(&run, "evaluations.jsonl")), [1000, 1500, 2000, 3000]);
@@ -180,8 +184,8 @@ fn a_warm_start_begins_with_the_given_policy() {
     let place = Workplace::new();
     let (source, run) = (place.path("source"), place.path("run"));
     place.run(&train("reacher", &source, &["--steps", "1500"])).with_status(0);
-    // Steps so small that they are lost in the rounding of a parameter: the first evaluation is
-    // that of the policy given, but for the rounding of its first layer when observations are
+    // The steps are so small that they vanish in the rounding of a parameter. The first evaluation
+    // is that of the given policy, except for the rounding of its first layer when observations are
     // normalised.
     let still = ["--init-from", &source, "--set", "algorithm.actor_learning_rate=1e-15"];
     let more = [&still[..], &["--steps", "1000", "--seed", "9"]].concat();

@@ -9,7 +9,7 @@ use dmprl_tests::{project_root, venv};
 use crate::train;
 
 const TASK: &str = "panda-reach-joints";
-/// Both compute in f32 and add in different orders.
+/// Both compute in f32 and sum in different orders.
 const TOLERANCE: f64 = 1e-3;
 
 fn script(name: &str) -> PathBuf {
@@ -22,7 +22,7 @@ fn python(script: PathBuf) -> Command {
     command
 }
 
-/// A robot that is none, and its port.
+/// Starts a simulated robot and returns its port.
 fn robot(place: &Workplace, more: &[&str]) -> (Running, String) {
     let mut command = python(script("stand_in_robot.py"));
     command.args(["dmprl/PandaReachJoints-v0", "--port", "0"]).args(more);
@@ -42,7 +42,7 @@ fn a_policy_drives_a_robot_over_the_network_and_holds_when_it_falls_silent() {
     let evaluated = place.run(&["eval", &run, "--episodes", "1", "--json"]).with_status(0).json();
 
     let (answering, port) = robot(&place, &[]);
-    // Without a rhythm and with patience, so that no answer comes too late on a busy machine.
+    // Without a fixed rate and with a long limit, so that no answer is late on a busy machine.
     let drive = |port: &str, patience: &str| {
         let mut command = python(script("drive_robot.py"));
         command.args([&policy, "--port", port, "--hz", "0", "--patience", patience]);
@@ -51,13 +51,13 @@ fn a_policy_drives_a_robot_over_the_network_and_holds_when_it_falls_silent() {
     let driven = drive(&port, "30");
     assert_eq!(driven["steps"], 50);
     assert_eq!(driven["held_steps"].as_array().unwrap().len(), 0, "{driven}");
-    // The very episode of the evaluation.
+    // The same episode as in the evaluation.
     let difference = driven["return"].as_f64().unwrap() - evaluated["returns"][0].as_f64().unwrap();
     assert!(difference.abs() < TOLERANCE, "{driven} {evaluated}");
     drop(answering);
 
-    // Steps 11 to 19 are not answered. What was decided at step 11 is moved to its end, step 15;
-    // then it holds, until step 20 is answered.
+    // Steps 11 to 19 get no answer. The segment decided at step 11 is executed to its end, step 15;
+    // then the robot holds until step 20 is answered.
     let (_silent, port) = robot(&place, &["--silence", "11", "20"]);
     let driven = drive(&port, "0.5");
     assert_eq!(driven["steps"], 50);

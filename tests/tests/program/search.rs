@@ -1,4 +1,4 @@
-//! `dmprl sweep` of a file with `[search]`: real Optuna, real runs, short ones.
+//! `dmprl sweep` of a file with `[search]`: real Optuna, short real runs.
 
 use std::fs;
 use std::path::Path;
@@ -9,7 +9,7 @@ use serde_json::Value;
 
 use crate::SMALL;
 
-/// `values`: of `search.space`, `search.first` and beyond.
+/// `values` of `search.space`, `search.first` and more.
 fn write(place: &Workplace, steps: u64, seeds: &str, values: &str) -> String {
     let file = place.path("small.toml");
     let text = format!(
@@ -36,14 +36,14 @@ fn states(json: &Value) -> Vec<&str> {
         .collect()
 }
 
-/// How often a run was begun or resumed.
+/// Number of sessions of a run.
 fn sessions(run: &str) -> usize {
     json_file(run, "manifest.json")["sessions"].as_array().unwrap().len()
 }
 
-/// An actor that takes steps so long is at the limits of its actions after the first few updates;
-/// one that learns nothing does ten times as well. The two come first, in this order. The bad one
-/// has so many updates to do that it cannot be over before it is given up.
+/// A large learning rate drives the actor to the limits of its actions within the first updates; an
+/// actor that learns nothing does ten times as well. The two trials come first, in this order. The
+/// bad one has so many updates that it cannot finish before it is pruned.
 const GOOD_AND_BAD: &str = "
     trials = 2
     prune_after_trials = 1
@@ -68,7 +68,7 @@ fn a_search_gives_up_the_bad_trial_and_hands_over_the_best() {
 
     let finished = place.run(&["sweep", &file, "--jobs", "1", "--json"]).with_status(0);
     let finished = finished.saying("trial 1 · algorithm.actor_learning_rate=10.0");
-    let json = finished.saying("given up at").json();
+    let json = finished.saying("pruned at").json();
     assert_eq!(states(&json), ["finished", "pruned"]);
     let (good, bad) = (trial(&json, 0), trial(&json, 1));
     let run = |trial: &Value, index: usize| trial["runs"][index].as_str().unwrap().to_owned();
@@ -81,7 +81,7 @@ fn a_search_gives_up_the_bad_trial_and_hands_over_the_best() {
     let config = fs::read_to_string(Path::new(&run(good, 0)).join("config.toml")).unwrap();
     assert!(config.contains("first_seed = 5000"), "{config}");
 
-    // Pruned: in the middle of the first seed, with a checkpoint, and the second never began.
+    // Pruned in the middle of the first seed, with a checkpoint; the second seed never began.
     assert_eq!(bad["runs"].as_array().unwrap().len(), 1);
     let reached = env_steps_of_checkpoint(&run(bad, 0)).unwrap();
     assert!((1_000..5_000).contains(&reached), "{reached}");
@@ -90,7 +90,7 @@ fn a_search_gives_up_the_bad_trial_and_hands_over_the_best() {
     assert_eq!(entry("reacher/mlp/trial-001/seed-1")["state"], "pruned");
     assert_eq!(entry("reacher/mlp/trial-000/seed-2")["state"], Value::Null);
 
-    // What it hands over is what `train` takes, and is evaluated on the evaluation's own seeds.
+    // `train` accepts its output, and evaluates it on the evaluation's own seeds.
     let best = &json["best"][0];
     let config = best["config"].as_str().unwrap();
     let trained = place.path("anew");
@@ -101,10 +101,10 @@ fn a_search_gives_up_the_bad_trial_and_hands_over_the_best() {
     assert!(config.contains("actor_learning_rate = 0.00001"), "{config}");
     assert!(best["set"].as_str().unwrap().contains("--set algorithm.actor_learning_rate=0.00001"));
 
-    // Nothing is left to do, with a listing that says so and a report of the best.
+    // Nothing is left to do; it prints the trials and reports the best.
     let again = place.run(&["sweep", &file, "--json"]).with_status(0).json();
     assert_eq!(again["trials"], json["trials"]);
-    assert_eq!(sessions(&run(good, 0)), 1, "what has finished is not done again");
+    assert_eq!(sessions(&run(good, 0)), 1, "a finished run is not repeated");
     let listed = place.run(&["sweep", &file, "--dry-run"]).with_status(0);
     assert!(listed.printed.contains("pruned"), "{}", listed.printed);
     let report = place.run(&["report", "runs/small", "--json"]).with_status(0).json();
@@ -132,7 +132,7 @@ fn a_search_that_is_killed_goes_on_with_the_trials_under_way() {
         running.signal(signal);
         let finished = running.wait();
         if signal == Signal::INT {
-            let json = finished.with_status(130).saying("go on with: dmprl sweep").json();
+            let json = finished.with_status(130).saying("resume with: dmprl sweep").json();
             asked.extend([0, 1].map(|number| trial(&json, number)["values"].clone()));
             assert_eq!(trial(&json, 1)["state"], "running");
         }
@@ -147,12 +147,12 @@ fn a_search_that_is_killed_goes_on_with_the_trials_under_way() {
     let steps = env_steps(&rows(run, "evaluations.jsonl"));
     assert!(steps.is_sorted_by(|a, b| a < b), "{steps:?}");
 
-    // Another space in the same place is refused before anything is asked or begun.
+    // A different space in the same folder is refused before anything starts.
     let other = write(&place, 12_000, "[1]", &space.replace("1e-5", "1e-6"));
     let kept = place.path("runs/small/sweep.toml");
     let before = fs::read_to_string(&kept).unwrap();
     place.run(&["sweep", &other]).with_status(1).saying("space").saying("--output");
-    assert_eq!(fs::read_to_string(&kept).unwrap(), before, "it still says what was searched");
+    assert_eq!(fs::read_to_string(&kept).unwrap(), before, "the file is unchanged");
 }
 
 #[test]

@@ -1,11 +1,11 @@
-//! Many starts and stops in a row leave no process and no byte behind.
+//! Many starts and stops in a row leave no process and no shared memory behind.
 
 use dmprl_tests::program::{Workplace, shared_memory_of};
 use rustix::process::Signal;
 
 use crate::{ENDLESS, train};
 
-/// Enough for every test run; `TEST_START_STOP_COUNT=100` is the figure of the issue.
+/// Enough for every test run; `TEST_START_STOP_COUNT=100` for a long one.
 const COUNT: usize = 10;
 
 fn has_role(place: &Workplace, role: &str) -> bool {
@@ -20,7 +20,7 @@ fn starts_and_stops_in_a_row_leave_no_process_and_no_byte() {
     for index in 0..count {
         let run = place.path(&index.to_string());
         let mut running = place.start(&train("reacher", &run, &["--steps", ENDLESS]));
-        // Each a little later than the last, from before the first child to well into training.
+        // Each a little later than the last, from before the first child until well into training.
         match index % 5 {
             0 => running.until_said("training reacher"),
             1 => running.until("a worker", |_| has_role(&place, "actor")),
@@ -28,7 +28,7 @@ fn starts_and_stops_in_a_row_leave_no_process_and_no_byte() {
             3 => running.until_said("first environment step"),
             _ => running.until_steps(&run, 1_000),
         }
-        // Every other one by SIGKILL, which the next start has to clean up.
+        // Every other one by SIGKILL, after which the next start cleans up.
         if index % 2 == 0 {
             running.signal_group(Signal::INT);
             running.wait().with_status(130);

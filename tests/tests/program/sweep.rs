@@ -1,4 +1,4 @@
-//! `dmprl sweep` with real runs, short ones.
+//! `dmprl sweep` with short real runs.
 
 use std::fs;
 
@@ -51,7 +51,7 @@ fn every_run_of_a_sweep_is_trained_once_and_a_longer_one_goes_on() {
     assert_eq!(states(&listed), vec![("open".to_owned(), 0); 4]);
     assert!(!std::path::Path::new(&place.path("runs")).exists(), "a dry run makes nothing");
 
-    // A kill, or a full disk, has cut the making of a run directory short.
+    // A kill or a full disk interrupted the making of a run directory.
     let unfinished = place.path("runs/small/reacher/dmp/seed-1");
     fs::create_dir_all(format!("{unfinished}/logs")).unwrap();
     let json = place.run(&["sweep", &file, "--jobs", "2", "--json"]).with_status(0).json();
@@ -63,9 +63,10 @@ fn every_run_of_a_sweep_is_trained_once_and_a_longer_one_goes_on() {
 
     let again = place.run(&["sweep", &file, "--json"]).with_status(0).json();
     assert_eq!(states(&again), states(&json));
-    assert_eq!(sessions(&again, 0), 1, "what has finished is not done again");
+    assert_eq!(sessions(&again, 0), 1, "a finished run is not repeated");
 
-    // Longer: each goes on. Otherwise configured: refused, and nothing is touched.
+    // With more steps, each run continues. With another configuration, the sweep is refused and
+    // nothing changes.
     let longer = write(&place, &TWO_METHODS.replace("300", "400"));
     let json = place.run(&["sweep", &longer, "--json"]).with_status(0).json();
     assert_eq!(states(&json), vec![("finished".to_owned(), 400); 4]);
@@ -74,7 +75,7 @@ fn every_run_of_a_sweep_is_trained_once_and_a_longer_one_goes_on() {
     let refused = place.run(&["sweep", &other]).with_status(1);
     refused.saying("dmp.alpha_y").saying("another configuration");
     let kept = fs::read_to_string(place.path("runs/small/sweep.toml")).unwrap();
-    assert!(!kept.contains("alpha_y"), "what lies there is of the file before");
+    assert!(!kept.contains("alpha_y"), "the folder belongs to the earlier file");
     place.assert_no_process();
 }
 
@@ -92,7 +93,7 @@ fn a_sweep_that_is_interrupted_or_killed_goes_on_where_it_was() {
         running.signal(signal);
         let finished = running.wait();
         if signal == Signal::INT {
-            let finished = finished.with_status(130).saying("go on with: dmprl sweep");
+            let finished = finished.with_status(130).saying("resume with: dmprl sweep");
             let (state, env_steps) = states(&finished.json()).swap_remove(0);
             assert!(state == "open" && env_steps > before, "{state} at {env_steps}");
         }
@@ -129,7 +130,7 @@ fn a_run_that_fails_costs_the_others_nothing_and_is_tried_again() {
 fn the_sweeps_behind_the_published_results_can_be_started() {
     let place = Workplace::new();
     let folder = dmprl_tests::project_root().join("deploy/experiments");
-    // Tasks × methods × seeds. A code block of docs/results.md tries the one with demonstrations,
+    // Tasks × methods × seeds. A code block of docs/results.md runs the one with demonstrations,
     // which needs their file.
     for (name, runs) in [("paper", 5 * 11 * 5), ("defaults", 5 * 3), ("algorithms", 4 * 3)] {
         let file = folder.join(format!("{name}.toml")).display().to_string();

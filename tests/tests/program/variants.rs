@@ -40,7 +40,7 @@ fn a_dmp_that_carries_its_state_on_trains() {
     trains("reacher", &carry);
 }
 
-/// On-policy: its segments are not bounded, and some are stale.
+/// On-policy: the number of its segments is not bounded, and some are stale.
 #[test]
 fn neural_dynamic_policies_train() {
     let ndp = |more: &[&'static str]| {
@@ -85,7 +85,7 @@ fn an_environment_of_ones_own_that_ends_inside_a_segment_trains() {
     trains("tiny_envs:Countdown-v0", &["--python-path", folder.to_str().unwrap()]);
 }
 
-/// Episodes of seven steps: every second segment is cut short by the time limit.
+/// Episodes of seven steps: the time limit cuts every second segment short.
 #[test]
 fn an_environment_with_a_time_limit_inside_a_segment_trains() {
     let folder = tiny_envs_dir();
@@ -98,7 +98,7 @@ fn an_environment_whose_observation_is_a_dictionary_trains() {
     trains("tiny_envs:Goal-v0", &["--python-path", folder.to_str().unwrap()]);
 }
 
-/// Its two actions have bounds of their own, neither symmetric.
+/// Its two actions have different, asymmetric bounds.
 #[test]
 fn a_class_that_nobody_registered_trains() {
     let folder = tiny_envs_dir();
@@ -143,11 +143,11 @@ fn hindsight_is_recommended_for_a_sparse_goal_and_refused_where_there_is_none() 
     let place = Workplace::new();
     let more = [&path[..], &["--set", "replay.hindsight=future"]].concat();
     let end = place.run(&train("tiny_envs:Long-v0", &place.path("run"), &more)).with_status(1);
-    assert!(end.said.contains("its observation is no Dict"), "{}", end.said);
+    assert!(end.said.contains("its observation is not a Dict"), "{}", end.said);
     place.assert_no_process();
 }
 
-/// As docs/demonstrations.md has it, with the script that it names.
+/// As in docs/demonstrations.md, with its script.
 #[test]
 fn a_run_starts_from_demonstrations_and_keeps_them_through_a_resume() {
     let place = Workplace::new();
@@ -159,7 +159,7 @@ fn a_run_starts_from_demonstrations_and_keeps_them_through_a_resume() {
     let end = place.run(&train("panda-reach", &run, &["--steps", "1200", "--demos", &file]));
     let told = end.with_status(0).said;
     assert!(told.contains("1000 demonstrated steps in 20 episodes, return -0.19"), "{told}");
-    // A policy that nobody has taught anything gets about -15 on these seeds, this one -5.1.
+    // An untrained policy gets about -15 on these seeds, this one -5.1.
     let reached = rows(&run, "evaluations.jsonl").pop().unwrap()["return_mean"].as_f64().unwrap();
     assert!(reached > -9.0, "{reached}");
     std::fs::remove_file(&file).unwrap();

@@ -1,11 +1,11 @@
-//! Builds an ONNX graph, operation by operation; values are referenced by name.
+//! Builds an ONNX graph operation by operation. Values are referenced by name.
 
 use super::onnx_format::{
     ATTRIBUTE_INT, ATTRIBUTE_INTS, AttributeProto, Dimension, DimensionProto, FLOAT, GraphProto,
     INT64, NodeProto, TensorProto, TensorShapeProto, TensorTypeProto, TypeProto, ValueInfoProto,
 };
 
-/// First axis of inputs and outputs: any number of observations.
+/// Name of the first axis of inputs and outputs, whose length is variable.
 const BATCH: &str = "batch";
 
 /// A graph under construction.
@@ -39,16 +39,17 @@ impl Graph {
         });
     }
 
-    /// Adds an operation with one result.
+    /// Adds an operation with one output; returns the output's name.
     pub(super) fn op(&mut self, op: &str, inputs: &[&str]) -> String {
         self.op_with(op, inputs, Vec::new())
     }
 
+    /// Like [`Self::op`], with attributes.
     pub(super) fn op_with(
         &mut self,
         op: &str,
         inputs: &[&str],
-        attribute: Vec<AttributeProto>,
+        attributes: Vec<AttributeProto>,
     ) -> String {
         let name = format!("{}_{}", op.to_lowercase(), self.0.node.len());
         self.0.node.push(NodeProto {
@@ -56,7 +57,7 @@ impl Graph {
             output: vec![name.clone()],
             name: name.clone(),
             op_type: op.to_owned(),
-            attribute,
+            attribute: attributes,
         });
         name
     }
@@ -84,7 +85,7 @@ impl Graph {
         name
     }
 
-    /// Slices `begin`..`end` of an axis.
+    /// Selects the entries `begin..end` of an axis.
     pub(super) fn slice(&mut self, from: &str, axis: i64, begin: usize, end: usize) -> String {
         let parts = [begin as i64, end as i64, axis].map(|number| self.integers(&[number]));
         let [begin, end, axis] = &parts;

@@ -1,7 +1,7 @@
-//! Exports a run's policy as one file, for use on a robot.
+//! Exports a run's policy as a single file, for use on a robot.
 //!
-//! `onnx` writes the complete policy as a graph for any ONNX runtime. `safetensors` writes the
-//! project's own format (`dmprl_shared::policy_file`), for Rust and for `dmprl.Policy`.
+//! `onnx` encodes the complete policy as a graph for any ONNX runtime. `safetensors` encodes it in
+//! the project's own format (`dmprl_shared::policy_file`), for Rust and for `dmprl.Policy`.
 
 mod graph;
 mod onnx;
@@ -18,13 +18,13 @@ use dmprl_run::{ChosenPolicy, RunDirectory, Session};
 /// Reads a run's policy and its origin.
 ///
 /// # Errors
-/// The run has no environment spec yet, or the file is damaged.
+/// The run has not started an environment yet, or a file cannot be read.
 pub fn read_policy(run: &RunDirectory, chosen: &ChosenPolicy) -> anyhow::Result<OpenedPolicy> {
     let (config, manifest) = (run.config()?, run.manifest()?);
     let spec = run.spec()?.with_context(|| {
         format!("run {} has not started an environment yet", run.path().display())
     })?;
-    // Use the run's configuration: files of older versions contain no description.
+    // Uses the run's configuration, because policy files of older versions have no description.
     let policy = Policy::new(&config, &spec)?;
     let snapshot = policy_file::load(&chosen.path, &policy, Match::Architecture)?;
     let this = Session::now();
@@ -43,7 +43,7 @@ pub fn read_policy(run: &RunDirectory, chosen: &ChosenPolicy) -> anyhow::Result<
 /// Encodes a policy in the project's own format.
 ///
 /// # Errors
-/// None is known: the parameters belong to the policy.
+/// The parameters do not match the policy, which is not expected.
 pub fn safetensors(opened: &OpenedPolicy) -> anyhow::Result<Vec<u8>> {
     Ok(policy_file::encode(&opened.policy, &opened.snapshot, opened.origin.as_ref())?)
 }

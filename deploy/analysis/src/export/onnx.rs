@@ -1,12 +1,12 @@
-//! The whole policy as an ONNX graph: network, DMP, controller, start and action scaling.
+//! Encodes the whole policy as an ONNX graph: network, DMP, controller and action scaling.
 //!
 //! ```text
 //!   observation (batch, O) ─┐                                       ┌─► actions (batch, K, A)
 //!                           ├─ Gemm, Relu … ─ Tanh ─ MatMul ─ … ────┤
 //!   state (batch, 2A) ──────┘  network        ranges  DMP's map     └─► next_state (batch, 2A)
 //! ```
-//! `state` and `next_state` exist for a policy that carries (y, yd) from segment to segment. The
-//! steps are those of `dmprl_shared::policy`, in the same order; a test compares the two.
+//! `state` and `next_state` exist only if the policy carries (y, yd) from segment to segment. The
+//! graph computes the same as `dmprl_shared::policy`, in the same order; a test compares the two.
 
 use anyhow::Context;
 use dmprl_shared::config::{Controller, ForcingScaling, RhoKind, StartSource};
@@ -17,17 +17,19 @@ use prost::Message;
 use super::graph::{Graph, int, ints};
 use super::onnx_format::{ModelProto, OperatorSetIdProto, StringStringEntryProto};
 
-/// Version 17 of the operators and 8 of the format, of 2022: all runtimes in use support them.
-const OPERATORS: i64 = 17;
+/// Version of the operator set. It dates from 2022, so current runtimes support it.
+const OPSET_VERSION: i64 = 17;
+/// Version of the file format that belongs to it.
 const IR_VERSION: i64 = 8;
 
 /// Encodes a policy as an ONNX file.
 ///
 /// # Errors
-/// None is known: the description of the policy can be written as JSON.
+/// The policy's description cannot be serialized, which is not expected.
 pub fn onnx(opened: &OpenedPolicy) -> anyhow::Result<Vec<u8>> {
     let description = opened.policy.description();
-    let json = serde_json::to_string(description).context("cannot write the description")?;
+    let json =
+        serde_json::to_string(description).context("cannot serialize the policy's description")?;
     let entry = |key: &str, value: String| StringStringEntryProto { key: key.to_owned(), value };
     let mut metadata_props = vec![entry("description", json)];
     if let Some(origin) = &opened.origin {
@@ -39,26 +41,29 @@ pub fn onnx(opened: &OpenedPolicy) -> anyhow::Result<Vec<u8>> {
         producer_version: env!("CARGO_PKG_VERSION").into(),
         model_version: i64::try_from(opened.snapshot.version).unwrap_or(i64::MAX),
         doc_string: format!(
-            "A policy of dmprl for {}: from an observation to the actions of the next control \
-             steps, in the environment's units.",
+            "dmprl policy for {}: maps an observation to the actions of the next control steps, \
+             in the environment's units.",
             description.spec.id
         ),
-        graph: Some(PolicyGraph::new(opened).draw().finish()),
-        opset_import: vec![OperatorSetIdProto { domain: String::new(), version: OPERATORS }],
+        graph: Some(PolicyGraph::new(opened).build().finish()),
+        opset_import: vec![OperatorSetIdProto { domain: String::new(), version: OPSET_VERSION }],
         metadata_props,
     };
     Ok(model.encode_to_vec())
 }
 
+/// Builds the graph of a policy.
 struct PolicyGraph<'a> {
     opened: &'a OpenedPolicy,
     description: &'a PolicyDescription,
     graph: Graph,
+    /// A, the number of action dimensions.
     dims: usize,
+    /// K, the number of steps of a segment.
     steps: usize,
 }
 
-/// Start of the DMP, input of its samples, (batch, A, 1) each.
+/// Names of the DMP's initial position and velocity, (batch, A, 1) each.
 struct Start {
     y: String,
     yd: String,
@@ -76,21 +81,21 @@ impl<'a> PolicyGraph<'a> {
         }
     }
 
-    fn draw(mut self) -> Graph {
+    fn build(mut self) -> Graph {
         let carries = self.opened.policy.carries_state();
         let about = "(batch, O), in the environment's units";
         let len = self.description.spec.observation_len;
         let observation = self.graph.input("observation", len, about);
         let state = carries.then(|| {
-            let about = "(batch, 2A): y, then yd, where the movement primitive begins; zeros at \
-                         the beginning of an episode, then the last next_state";
+            let about = "(batch, 2A): initial y, then yd, of the movement primitive; zeros at the \
+                         start of an episode, then the previous next_state";
             self.graph.input("state", 2 * self.dims, about)
         });
-        let seen = match &state {
+        let network_input = match &state {
             Some(state) => self.graph.concat(&[&observation, state], 1),
             None => observation.clone(),
         };
-        let outputs = self.network(seen);
+        let outputs = self.network(network_input);
         let u = match self.opened.policy.head() {
             Head::Mlp => {
                 let u = self.graph.op("Tanh", &[&outputs]);
@@ -98,12 +103,12 @@ impl<'a> PolicyGraph<'a> {
             }
             Head::Dmp(_) => self.segment(&outputs, &observation, state.as_deref()),
         };
-        self.scaled(&u);
+        self.scale_actions(&u);
         self.graph
     }
 
-    /// The network's decisions, (batch, D). Outputs after them are a Gaussian's standard
-    /// deviations.
+    /// Adds the network; returns its outputs, (batch, D), without the standard deviations of a
+    /// Gaussian policy.
     fn network(&mut self, mut x: String) -> String {
         let (policy, values) = (&self.opened.policy, &self.opened.snapshot.values);
         for (index, layer) in policy.shape().layers().iter().enumerate() {
@@ -121,7 +126,7 @@ impl<'a> PolicyGraph<'a> {
         }
     }
 
-    /// u of a movement primitive, (batch, K, A).
+    /// Adds the movement primitive and its controller; returns u, (batch, K, A).
     fn segment(&mut self, outputs: &str, observation: &str, state: Option<&str>) -> String {
         let Head::Dmp(head) = self.opened.policy.head() else { return outputs.to_owned() };
         let (policy, basis_count) = (&self.description.policy, self.description.dmp.basis_count);
@@ -137,8 +142,8 @@ impl<'a> PolicyGraph<'a> {
         let start = self.start(&goal, observation, state);
         let graph = &mut self.graph;
         if self.description.dmp.forcing_scaling == ForcingScaling::Goal {
-            let way = graph.op("Sub", &[&goal, &start.y]);
-            weights = graph.op("Mul", &[&weights, &way]);
+            let distance = graph.op("Sub", &[&goal, &start.y]);
+            weights = graph.op("Mul", &[&weights, &distance]);
         }
         let inputs = graph.concat(&[&start.y, &start.yd, &goal, &weights], 2);
         let (rows, columns) = (map.sample_count(), map.input_count());
@@ -170,7 +175,8 @@ impl<'a> PolicyGraph<'a> {
         self.graph.op_with("Transpose", &[&u], vec![ints("perm", &[0, 2, 1])])
     }
 
-    /// u = tanh(rho_0 y + rho_1 yd + rho_2 ydd + rho_3), rho = (1, 0, 0, 0) + range · `rho`.
+    /// Adds the inverse controller: u = tanh(rho_0 y + rho_1 yd + rho_2 ydd + rho_3), with
+    /// rho = (1, 0, 0, 0) + range · `rho`.
     fn inverse(&mut self, rho: &str, range: f32, y: &str, samples: &str) -> String {
         let (graph, steps) = (&mut self.graph, self.steps);
         let centre = graph.constant(&[1, 1, 4], &[1.0, 0.0, 0.0, 0.0]);
@@ -189,7 +195,7 @@ impl<'a> PolicyGraph<'a> {
         graph.op("Tanh", &[&sum])
     }
 
-    /// (y_K, yd_K), (batch, 2A); the map's velocities are in units of omega.
+    /// Adds the output (y_K, yd_K), (batch, 2A). The samples' velocities are in units of omega.
     fn next_state(&mut self, samples: &str, omega: f32) {
         let (graph, steps, dims) = (&mut self.graph, self.steps, self.dims as i64);
         let omega = graph.scalar(omega);
@@ -198,10 +204,11 @@ impl<'a> PolicyGraph<'a> {
         let yd = graph.op("Mul", &[&yd, &omega]);
         let [y, yd] = [y, yd].map(|part| graph.reshape(&part, &[-1, dims]));
         let state = graph.concat(&[&y, &yd], 1);
-        let about = "(batch, 2A): state of the next decision";
+        let about = "(batch, 2A): state for the next decision";
         graph.output(&state, "next_state", &[2 * self.dims], about);
     }
 
+    /// Adds the initial position and velocity of the movement primitive.
     fn start(&mut self, goal: &str, observation: &str, state: Option<&str>) -> Start {
         use dmprl_shared::config::Start as Kind;
         match (self.description.policy.start, state) {
@@ -216,7 +223,7 @@ impl<'a> PolicyGraph<'a> {
             }
             (Kind::Observed, _) => self.observed_start(observation),
             _ => {
-                // Zeros of the goal's shape: (batch, A, 1).
+                // Zeros with the goal's shape, (batch, A, 1).
                 let zero = self.graph.scalar(0.0);
                 let zeros = self.graph.op("Mul", &[goal, &zero]);
                 Start { y: zeros.clone(), yd: zeros }
@@ -256,8 +263,8 @@ impl<'a> PolicyGraph<'a> {
         Start { y, yd }
     }
 
-    /// Actions in the environment's units, within their bounds.
-    fn scaled(&mut self, u: &str) {
+    /// Adds the output of actions, in the environment's units and within their bounds.
+    fn scale_actions(&mut self, u: &str) {
         let (graph, spec, dims) = (&mut self.graph, &self.description.spec, self.dims);
         let bounds = || spec.action_low.iter().zip(&spec.action_high);
         let per_dimension = |graph: &mut Graph, numbers: Vec<f64>| {
@@ -270,37 +277,37 @@ impl<'a> PolicyGraph<'a> {
         let u = graph.op("Clip", &[u, &least, &most]);
         let scaled = graph.op("Mul", &[&u, &half]);
         let scaled = graph.op("Add", &[&scaled, &mid]);
-        // Rounding must not exceed the bounds.
+        // Rounding may have exceeded the bounds.
         let low = per_dimension(graph, spec.action_low.clone());
         let high = per_dimension(graph, spec.action_high.clone());
         let scaled = graph.op("Max", &[&scaled, &low]);
         let actions = graph.op("Min", &[&scaled, &high]);
-        let about = "(batch, K, A), one action a control step, in the environment's units";
+        let about = "(batch, K, A): one action per control step, in the environment's units";
         graph.output(&actions, "actions", &[self.steps, dims], about);
     }
 }
 
-/// atan2(sin, cos), for which ONNX has no operator.
+/// Adds atan2(sin, cos), for which ONNX has no operator.
 fn angle(graph: &mut Graph, sin: &str, cos: &str) -> String {
     let zero = graph.scalar(0.0);
     let [pi, minus_pi] = [std::f32::consts::PI, -std::f32::consts::PI].map(|pi| graph.scalar(pi));
     let one = graph.scalar(1.0);
-    // Replace -0 by 0, because it would select the other side. Runtimes optimise an addition of 0
-    // away.
+    // Replaces -0 by 0, because sin / -0 is infinite with the wrong sign. Adding 0 would do the
+    // same, but runtimes optimise it away.
     let [sin, cos] = &[sin, cos].map(|part| {
-        let none = graph.op("Equal", &[part, &zero]);
-        graph.op("Where", &[&none, &zero, part])
+        let is_zero = graph.op("Equal", &[part, &zero]);
+        graph.op("Where", &[&is_zero, &zero, part])
     });
-    let no_way = graph.op("Equal", &[cos, &zero]);
-    let no_height = graph.op("Equal", &[sin, &zero]);
-    let nowhere = graph.op("And", &[&no_way, &no_height]);
+    let cos_is_zero = graph.op("Equal", &[cos, &zero]);
+    let sin_is_zero = graph.op("Equal", &[sin, &zero]);
+    let is_origin = graph.op("And", &[&cos_is_zero, &sin_is_zero]);
     // 0/0 is NaN, but atan2(0, 0) is 0.
-    let cos_or_one = graph.op("Where", &[&nowhere, &one, cos]);
+    let cos_or_one = graph.op("Where", &[&is_origin, &one, cos]);
     let ratio = graph.op("Div", &[sin, &cos_or_one]);
     let half = graph.op("Atan", &[&ratio]);
-    let behind = graph.op("Less", &[&cos_or_one, &zero]);
-    let below = graph.op("Less", &[sin, &zero]);
-    let turn = graph.op("Where", &[&below, &minus_pi, &pi]);
-    let turn = graph.op("Where", &[&behind, &turn, &zero]);
+    let is_left = graph.op("Less", &[&cos_or_one, &zero]);
+    let is_below = graph.op("Less", &[sin, &zero]);
+    let turn = graph.op("Where", &[&is_below, &minus_pi, &pi]);
+    let turn = graph.op("Where", &[&is_left, &turn, &zero]);
     graph.op("Add", &[&half, &turn])
 }

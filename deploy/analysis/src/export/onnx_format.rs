@@ -1,5 +1,4 @@
-//! The part of the ONNX format that a policy needs: messages of `onnx.proto`, IR version 8, with
-//! their field numbers.
+//! The messages of `onnx.proto` (IR version 8) that a policy needs, with their field numbers.
 
 use prost::Message;
 
@@ -12,7 +11,7 @@ pub(super) const ATTRIBUTE_INT: i32 = 2;
 /// `AttributeProto.AttributeType` INTS.
 pub(super) const ATTRIBUTE_INTS: i32 = 7;
 
-/// An ONNX file.
+/// Content of an ONNX file.
 #[derive(Clone, PartialEq, Message)]
 pub(super) struct ModelProto {
     #[prost(int64, tag = "1")]
@@ -33,7 +32,7 @@ pub(super) struct ModelProto {
     pub metadata_props: Vec<StringStringEntryProto>,
 }
 
-/// Version of the operators; the empty domain is ONNX's own.
+/// Version of an operator set; the empty domain is ONNX's own.
 #[derive(Clone, PartialEq, Message)]
 pub(super) struct OperatorSetIdProto {
     #[prost(string, tag = "1")]

@@ -1,4 +1,4 @@
-//! `motion.json`: how the latest policy of a run moves.
+//! Reads `motion.json`, the measured motion of a run's latest policy.
 
 use std::fs::File;
 use std::io::{ErrorKind, Read};
@@ -9,9 +9,9 @@ use serde::{Deserialize, Serialize};
 
 use super::recorded::{RecordedEpisode, Robot};
 
-/// Maximum size of a file that is read.
+/// Maximum number of bytes read.
 const FILE_BYTES_MAX: u64 = 256 << 20;
-/// Version of the file; raised when the measures or their definition change.
+/// Version of the format; raised when the measures or their definitions change.
 pub(super) const FORMAT: u32 = 1;
 
 /// Contents of `motion.json`.
@@ -22,38 +22,38 @@ pub struct Motion {
     pub format: u32,
     /// Version of the policy.
     pub policy_version: u64,
-    /// Environment steps with which the policy was trained.
+    /// Environment steps on which the policy was trained.
     pub env_steps: u64,
     /// Episode i was reset with seed `first_seed + i`.
     pub first_seed: u64,
     /// Return of each episode.
     pub returns: Vec<f64>,
-    /// The robot's joints and the duration of a step.
+    /// Joints of the robot, and duration of a step.
     pub robot: Robot,
-    /// `rad` or `m`: unit of the joints that jerk and SPARC measure. Sliding joints are measured
-    /// only if the robot has no hinge.
+    /// Unit of the measured joints, `rad` or `m`. Jerk and SPARC measure the hinges, or the sliding
+    /// joints if there is no hinge.
     pub unit: String,
     /// Mean |u_t - u_{t-1}| over steps and action dimensions; `None` if no episode has two steps.
     pub action_change: Option<f64>,
-    /// The same for each dimension, (A,).
+    /// The same by dimension, (A,).
     pub action_change_by_dimension: Vec<Option<f64>>,
     /// Mean |jerk| over steps and joints [unit/s³]; `None` if joints or step duration are unknown.
     pub joint_jerk: Option<f64>,
-    /// The same for each joint [unit/s³], (J,); `None` for a joint that is not measured.
+    /// The same by joint [unit/s³], (J,); `None` for joints that are not measured.
     pub joint_jerk_by_joint: Vec<Option<f64>>,
-    /// Mean over episodes of the spectral arc length of the joints' speed, which is the Euclidean
-    /// norm of their velocities; `None` if no joint moves, or joints or step duration are unknown.
+    /// Spectral arc length of the joints' speed, averaged over episodes; `None` if no joint moves,
+    /// or joints or step duration are unknown. The speed is the Euclidean norm of the velocities.
     pub sparc: Option<f64>,
-    /// The same for each episode.
+    /// The same by episode.
     pub sparc_by_episode: Vec<Option<f64>>,
-    /// The first episode in full.
+    /// Complete data of the first episode.
     pub episode: RecordedEpisode,
 }
 
 impl Motion {
-    /// Returns the time of each row of the episode's joints \[s\], (T+1,). Row t of actions and
-    /// rewards covers the time from t to t+1. If the environment does not report the duration of a
-    /// step, times are in steps.
+    /// Returns the time of each row of joint positions \[s\], (T+1,). Row t of actions and rewards
+    /// covers the interval from time t to t+1. Times are in steps if the environment does not
+    /// report the duration of a step.
     #[must_use]
     pub fn times(&self) -> Vec<f64> {
         let dt = self.robot.control_dt_s;
@@ -62,15 +62,15 @@ impl Motion {
     }
 }
 
-/// Reads the motion of the run's latest policy; `None` if it was not measured with the current
+/// Reads the motion of the run's latest policy; `None` if it has not been measured with the current
 /// evaluation seeds.
 ///
 /// # Errors
-/// The run's files cannot be read. A damaged or older `motion.json` counts as not measured.
+/// The run's files cannot be read. An invalid or older `motion.json` counts as not measured.
 pub fn read(run: &RunDirectory) -> anyhow::Result<Option<Motion>> {
     let Some(row) = run.latest_row()? else { return Ok(None) };
     let settings = run.config()?.evaluation;
-    let Some(motion) = stored(run)? else { return Ok(None) };
+    let Some(motion) = read_any(run)? else { return Ok(None) };
     let is_current = motion.format == FORMAT
         && motion.policy_version == row.policy_version
         && motion.first_seed == settings.first_seed
@@ -78,12 +78,12 @@ pub fn read(run: &RunDirectory) -> anyhow::Result<Option<Motion>> {
     Ok(is_current.then_some(motion))
 }
 
-/// Reads the last measured motion, of any policy of the run; `None` if it is missing, damaged or
-/// of an older format.
+/// Reads the last measured motion, of any policy of the run; `None` if the file is missing or
+/// cannot be parsed.
 ///
 /// # Errors
 /// The file cannot be read.
-pub fn stored(run: &RunDirectory) -> anyhow::Result<Option<Motion>> {
+pub fn read_any(run: &RunDirectory) -> anyhow::Result<Option<Motion>> {
     let path = run.motion_path();
     let file = match File::open(&path) {
         Ok(file) => file,

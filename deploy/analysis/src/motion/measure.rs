@@ -5,27 +5,27 @@ use std::path::Path;
 use anyhow::Context;
 
 use super::file::{FORMAT, Motion};
-use super::recorded::{JointKind, Recorded, RecordedEpisode, Robot};
+use super::recorded::{JointKind, RecordedEpisode, RecordingReader, Robot};
 use super::smoothness::{Mean, add_action_changes, add_jerks, sparc};
 
-/// Policy of a recording.
+/// The policy of a recording.
 #[derive(Debug, Clone, Copy)]
 pub struct RecordedPolicy {
     /// Version of the policy.
     pub version: u64,
-    /// Environment steps with which it was trained.
+    /// Environment steps on which it was trained.
     pub env_steps: u64,
     /// Seed of the first episode.
     pub first_seed: u64,
 }
 
 /// Measures the episodes in a file that an observer wrote. Reads one episode at a time, because
-/// all of them may not fit into memory.
+/// the whole file may not fit into memory.
 ///
 /// # Errors
-/// The file cannot be read, is damaged, or contains no episode.
+/// The file cannot be read, is invalid, or contains no episode.
 pub fn measure(path: &Path, policy: RecordedPolicy) -> anyhow::Result<Motion> {
-    let mut recorded = Recorded::open(path)?;
+    let mut recorded = RecordingReader::open(path)?;
     let mut first = None;
     let mut sums = Sums::new(&recorded.robot);
     while let Some(episode) = recorded.next_episode()? {
@@ -64,7 +64,7 @@ pub fn measure(path: &Path, policy: RecordedPolicy) -> anyhow::Result<Motion> {
 struct Sums {
     dt: f64,
     unit: &'static str,
-    /// Indices of the joints that are measured.
+    /// Indices of the measured joints.
     measured_joints: Vec<usize>,
     returns: Vec<f64>,
     action_changes: Vec<Mean>,

@@ -1,10 +1,10 @@
 //! Stage 8 of 8: measures how smoothly a policy moves.
 //!
-//! An observer process, which `dmprl_sweep::record` starts, rolls a saved policy out with the seeds
-//! of its evaluation and writes the episodes, which `recorded` reads. `measure` computes jerk,
-//! spectral arc length and change of actions; `file` keeps them in `motion.json` in the run
-//! directory, so each policy is measured once. Only joints that actuators move are measured
-//! (`envs_py/dmprl/robot_joints.py`), not a pushed object or a goal on slides.
+//! `dmprl_sweep::record` starts an observer process, which rolls out a saved policy with the seeds
+//! of its evaluation and writes the episodes to a file. `recorded` reads them, and `measure`
+//! computes jerk, spectral arc length and change of actions. The results are kept in `motion.json`
+//! in the run directory (`file`), so each policy is measured only once. Only actuated joints are
+//! measured (`envs_py/dmprl/robot_joints.py`), not those of pushed objects or goals.
 
 mod file;
 mod measure;
@@ -13,6 +13,6 @@ mod smoothness;
 #[cfg(test)]
 mod tests;
 
-pub use file::{Motion, read, stored};
+pub use file::{Motion, read, read_any};
 pub use measure::{RecordedPolicy, measure};
-pub use recorded::{Joint, JointKind, Recorded, RecordedEpisode, Robot};
+pub use recorded::{Joint, JointKind, RecordedEpisode, RecordingReader, Robot};

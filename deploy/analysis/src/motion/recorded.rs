@@ -1,5 +1,4 @@
-//! Reads and writes the observer's file: one JSON object per line, first the robot, then each
-//! episode.
+//! The file that an observer writes: one JSON object per line, first the robot, then each episode.
 
 use std::fs::File;
 use std::io::{BufRead, BufReader, Read};
@@ -9,7 +8,7 @@ use anyhow::{Context, ensure};
 use serde::de::DeserializeOwned;
 use serde::{Deserialize, Serialize};
 
-/// Maximum length of a line. An episode of 10,000 steps of a humanoid needs a tenth of it.
+/// Maximum length of a line, ten times that of a humanoid's episode of 10,000 steps.
 const LINE_BYTES_MAX: u64 = 256 << 20;
 
 /// Kind of a joint.
@@ -47,18 +46,18 @@ pub struct Joint {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Robot {
-    /// Joints that actuators move; empty if the environment does not report them.
+    /// Actuated joints; empty if the environment does not report them.
     pub joints: Vec<Joint>,
-    /// Reason why there are no joints; empty if there are.
+    /// Why there are no joints; empty if there are.
     pub why_no_joints: String,
-    /// Appearance of the goal in pictures; empty if the environment does not declare it.
+    /// Appearance of the goal in rendered frames; empty if the environment does not declare it.
     #[serde(default, skip_serializing_if = "String::is_empty")]
     pub goal_in_pictures: String,
     /// Duration of a step \[s\]; 0 if the environment does not report it.
     pub control_dt_s: f64,
 }
 
-/// A noise-free episode of T steps. Rows are points in time.
+/// An episode of T steps without exploration noise. Rows are points in time.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct RecordedEpisode {
@@ -71,7 +70,7 @@ pub struct RecordedEpisode {
     pub success: Option<bool>,
     /// Rewards, (T,).
     pub rewards: Vec<f64>,
-    /// Actions of the policy in [-1, 1], (T, A).
+    /// Actions of the policy, scaled to [-1, 1], (T, A).
     pub actions: Vec<Vec<f32>>,
     /// Positions before the first step and after each, (T+1, J) [rad or m]; empty without joints.
     pub joint_positions: Vec<Vec<f64>>,
@@ -82,20 +81,20 @@ pub struct RecordedEpisode {
     /// Files of rendered frames; empty if none were requested.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub frames: Vec<PathBuf>,
-    /// Number of steps done at each frame.
+    /// Number of steps done before each frame.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub frame_steps: Vec<usize>,
 }
 
 /// Reads a recording one episode at a time.
 #[derive(Debug)]
-pub struct Recorded {
-    /// The robot.
+pub struct RecordingReader {
+    /// Description of the robot.
     pub robot: Robot,
     lines: Lines,
 }
 
-impl Recorded {
+impl RecordingReader {
     /// Opens a file that an observer wrote.
     ///
     /// # Errors
@@ -136,6 +135,7 @@ impl Recorded {
     }
 }
 
+/// Parses the lines of a file.
 #[derive(Debug)]
 struct Lines {
     reader: BufReader<File>,
@@ -151,6 +151,6 @@ impl Lines {
         }
         ensure!(line.ends_with(b"\n"), "{}: the last line is incomplete", self.name);
         let parsed = serde_json::from_slice(&line);
-        parsed.map(Some).with_context(|| format!("{}: a line is not an episode", self.name))
+        parsed.map(Some).with_context(|| format!("{}: a line cannot be parsed", self.name))
     }
 }

@@ -1,13 +1,13 @@
-//! Three measures of smoothness, each a pure function of an episode.
+//! Measures the smoothness of an episode: change of actions, jerk, and spectral arc length.
 
 use rustfft::FftPlanner;
 use rustfft::num_complex::Complex64;
 
-/// The profile is padded to 2^4 times its length, which is rounded up to a power of two.
+/// Zero padding: the length, rounded up to a power of two, is multiplied by 2^4.
 const PAD_LEVEL: u32 = 4;
-/// Maximum frequency of a movement [Hz]; higher ones are ignored.
+/// Cutoff frequency [Hz]; higher frequencies are ignored.
 const CUTOFF_HZ: f64 = 10.0;
-/// The spectrum is cut where it falls below this share of its maximum.
+/// The spectrum is cut where it falls below this fraction of its maximum.
 const AMPLITUDE_THRESHOLD: f64 = 0.05;
 
 /// Accumulates a mean.
@@ -42,26 +42,27 @@ pub fn add_action_changes(u: &[Vec<f32>], means: &mut [Mean]) {
     }
 }
 
-/// Adds the absolute jerk of each joint to its mean. Jerk is the second difference of velocities at
-/// the control rate, `(qd_{t+1} - 2 qd_t + qd_{t-1}) / dt²`, without a model or a filter.
+/// Adds the absolute jerk of each joint to its mean. Jerk is the second difference of the velocity
+/// at the control rate, `(qd_{t+1} - 2 qd_t + qd_{t-1}) / dt²`, unfiltered.
 ///
 /// - `velocities`: (T+1, J) [rad/s]. `dt`: \[s\]. `means`: (J,) [rad/s³].
 pub fn add_jerks(velocities: &[Vec<f64>], dt: f64, means: &mut [Mean]) {
-    for three in velocities.windows(3) {
+    for rows in velocities.windows(3) {
         for (joint, mean) in means.iter_mut().enumerate() {
-            let difference = three[2][joint] - 2.0 * three[1][joint] + three[0][joint];
+            let difference = rows[2][joint] - 2.0 * rows[1][joint] + rows[0][joint];
             mean.add((difference / (dt * dt)).abs());
         }
     }
 }
 
-/// Returns the spectral arc length of a speed profile: about -1.6 for a smooth movement, lower for
-/// others (Balasubramanian et al. 2015, "On the analysis of movement smoothness", with the paper's
-/// parameters). `None` if nothing moves, or the profile is too short for a spectrum.
+/// Returns the spectral arc length of a speed profile; `None` if nothing moves, or the profile is
+/// too short for a spectrum.
+///
+/// It is about -1.6 for a smooth movement and lower for others (Balasubramanian et al. 2015, "On
+/// the analysis of movement smoothness", with the paper's parameters). Difference from the paper:
+/// the cutoff is at most half the sampling rate.
 ///
 /// - `speed`: (T,), not negative. `rate_hz`: samples per second.
-///
-/// Difference from the paper: the cutoff is at most half the sampling rate.
 #[must_use]
 pub fn sparc(speed: &[f64], rate_hz: f64) -> Option<f64> {
     if speed.len() < 2 || rate_hz.is_nan() || rate_hz <= 0.0 {
@@ -120,7 +121,7 @@ mod tests {
     }
 
     #[test]
-    fn a_profile_without_movement_has_no_arc_length() {
+    fn speed_profile_without_movement_has_no_arc_length() {
         assert_eq!(sparc(&[0.0; 50], 50.0), None);
         assert_eq!(sparc(&[1.0], 50.0), None);
         assert_eq!(sparc(&[0.0, f64::NAN, 1.0], 50.0), None);
@@ -144,14 +145,14 @@ mod tests {
     }
 
     #[test]
-    fn two_states_have_no_jerk() {
+    fn two_rows_have_no_jerk() {
         let mut means = [Mean::default()];
         add_jerks(&[vec![0.0], vec![1.0]], 0.1, &mut means);
         assert_eq!(means[0].value(), None);
     }
 
     #[test]
-    fn changes_of_actions_are_counted_within_an_episode_only() {
+    fn action_changes_do_not_span_episodes() {
         let mut means = [Mean::default(); 2];
         add_action_changes(&[vec![0.0, 1.0], vec![0.5, -1.0]], &mut means);
         add_action_changes(&[vec![-1.0, 0.0], vec![-1.0, 0.0]], &mut means);

@@ -1,4 +1,4 @@
-//! Measures recordings whose jerk and action change are known.
+//! Tests the measures with recordings whose jerk and change of actions are known.
 
 use std::path::{Path, PathBuf};
 
@@ -10,9 +10,11 @@ fn joint(name: &str, kind: JointKind) -> Joint {
     Joint { name: name.to_owned(), kind }
 }
 
-/// Writes episodes whose hinges have a jerk of 1 / dt²: their velocities are half the square of the
-/// step. The velocities of slides differ, and must not be measured next to hinges.
-fn written(folder: &Path, robot: &Robot, lengths: &[usize]) -> PathBuf {
+/// Writes a recording with episodes of the given lengths; returns its path.
+///
+/// The velocity of hinges is half the square of the step, so their jerk is 1 / dt². The velocities
+/// of slides differ, so a measure that included them would be noticed.
+fn write_recording(folder: &Path, robot: &Robot, lengths: &[usize]) -> PathBuf {
     let mut lines = vec![serde_json::to_string(robot).unwrap()];
     for (index, &steps) in lengths.iter().enumerate() {
         let row = |step: usize| {
@@ -52,7 +54,7 @@ fn all_episodes_are_measured_and_the_first_is_kept() {
         goal_in_pictures: String::new(),
         control_dt_s: 0.1,
     };
-    let motion = measure(&written(folder.path(), &robot, &[20, 30]), POLICY).unwrap();
+    let motion = measure(&write_recording(folder.path(), &robot, &[20, 30]), POLICY).unwrap();
     assert_eq!(motion.returns, [-20.0, -30.0]);
     assert_eq!((motion.episode.seed, motion.times().len()), (7, 21));
     assert_eq!(motion.action_change_by_dimension, [Some(1.0), Some(0.0)]);
@@ -66,7 +68,7 @@ fn all_episodes_are_measured_and_the_first_is_kept() {
 }
 
 #[test]
-fn a_robot_of_slides_is_measured_in_metres() {
+fn robot_with_sliding_joints_only_is_measured_in_metres() {
     let folder = tempfile::tempdir().unwrap();
     let joints = vec![joint("rail", JointKind::Slide)];
     let robot = Robot {
@@ -75,7 +77,7 @@ fn a_robot_of_slides_is_measured_in_metres() {
         goal_in_pictures: String::new(),
         control_dt_s: 0.1,
     };
-    let motion = measure(&written(folder.path(), &robot, &[20]), POLICY).unwrap();
+    let motion = measure(&write_recording(folder.path(), &robot, &[20]), POLICY).unwrap();
     assert_eq!(motion.unit, "m");
     assert!((motion.joint_jerk.unwrap() - 200_000.0).abs() < 1e-3, "{:?}", motion.joint_jerk);
 }
@@ -83,20 +85,20 @@ fn a_robot_of_slides_is_measured_in_metres() {
 #[test]
 fn without_joints_only_actions_are_measured() {
     let folder = tempfile::tempdir().unwrap();
-    let why_no_joints = "it does not say".to_owned();
+    let why_no_joints = "not reported".to_owned();
     let robot = Robot {
         joints: Vec::new(),
         why_no_joints,
         goal_in_pictures: String::new(),
         control_dt_s: 0.0,
     };
-    let motion = measure(&written(folder.path(), &robot, &[5]), POLICY).unwrap();
+    let motion = measure(&write_recording(folder.path(), &robot, &[5]), POLICY).unwrap();
     assert_eq!((motion.joint_jerk, motion.sparc, motion.action_change), (None, None, Some(0.5)));
     assert_eq!(motion.times(), [0.0, 1.0, 2.0, 3.0, 4.0, 5.0]);
 }
 
 #[test]
-fn an_inconsistent_episode_is_refused() {
+fn inconsistent_or_incomplete_episode_is_rejected() {
     let folder = tempfile::tempdir().unwrap();
     let robot = |joints| Robot {
         joints,
@@ -104,14 +106,13 @@ fn an_inconsistent_episode_is_refused() {
         goal_in_pictures: String::new(),
         control_dt_s: 0.1,
     };
-    let none = written(folder.path(), &robot(Vec::new()), &[4]);
-    let text = std::fs::read_to_string(&none).unwrap();
+    let path = write_recording(folder.path(), &robot(Vec::new()), &[4]);
+    let text = std::fs::read_to_string(&path).unwrap();
     let (_, episode) = text.split_once('\n').unwrap();
     let head = serde_json::to_string(&robot(vec![joint("elbow", JointKind::Hinge)])).unwrap();
-    std::fs::write(&none, format!("{head}\n{episode}")).unwrap();
-    let error = measure(&none, POLICY).unwrap_err().to_string();
+    std::fs::write(&path, format!("{head}\n{episode}")).unwrap();
+    let error = measure(&path, POLICY).unwrap_err().to_string();
     assert!(error.contains("0 positions, 0 velocities of 1 joints"), "{error}");
-    let torn = text.trim_end();
-    std::fs::write(&none, torn).unwrap();
-    assert!(measure(&none, POLICY).unwrap_err().to_string().contains("incomplete"));
+    std::fs::write(&path, text.trim_end()).unwrap();
+    assert!(measure(&path, POLICY).unwrap_err().to_string().contains("incomplete"));
 }

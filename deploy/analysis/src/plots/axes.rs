@@ -1,4 +1,4 @@
-//! Axes of a learning curve, with labels and a light grid.
+//! Draws the axes of a learning curve, with labels and a light grid.
 
 use std::ops::Range;
 
@@ -19,13 +19,13 @@ pub(crate) struct Axes<'t> {
     /// Title above the chart.
     pub(crate) title: &'t str,
     /// Label of the vertical axis.
-    pub(crate) what: &'t str,
-    /// Maximum of the environment steps, which start at 0.
+    pub(crate) y_label: &'t str,
+    /// Maximum of the environment steps. The axis starts at 0.
     pub(crate) steps_max: f64,
     /// Minimum and maximum of the values.
     pub(crate) values: Range<f64>,
     /// Space to the right of the chart, in pixels.
-    pub(crate) beside: u32,
+    pub(crate) right_margin: u32,
 }
 
 impl Axes<'_> {
@@ -40,14 +40,14 @@ impl Axes<'_> {
         let mut chart = ChartBuilder::on(area)
             .caption(self.title, ("sans-serif", 20))
             .margin(16)
-            .margin_right(self.beside)
+            .margin_right(self.right_margin)
             .x_label_area_size(44)
             .y_label_area_size(64)
             .build_cartesian_2d(0.0..self.steps_max, (low - margin)..(high + margin))?;
         chart
             .configure_mesh()
             .x_desc("environment steps")
-            .y_desc(self.what)
+            .y_desc(self.y_label)
             .x_label_formatter(&|steps| grouped(steps.round() as u64))
             .y_label_formatter(&|value| tick(*value))
             .label_style(("sans-serif", 14))
@@ -59,7 +59,7 @@ impl Axes<'_> {
     }
 }
 
-/// Formats `-4` or `-4.5`, without trailing zeros.
+/// Formats a tick label, such as `-4` or `-4.5`, without trailing zeros.
 fn tick(value: f64) -> String {
     // Adding zero turns -0 into 0.
     format!("{}", (value * 1e3).round() / 1e3 + 0.0)

@@ -1,9 +1,9 @@
-//! Colours of methods, the same in every picture.
+//! The colours of methods, which are the same in every picture.
 
 use plotters::style::RGBColor;
 
-/// Okabe and Ito's palette, which is distinguishable with all common types of colour vision. The
-/// yellow is darker here, for a white background.
+/// Palette of Okabe and Ito, distinguishable with all common types of colour vision. The yellow is
+/// darker here, for a white background.
 const COLOURS: [RGBColor; 8] = [
     RGBColor(0, 114, 178),
     RGBColor(213, 94, 0),
@@ -14,17 +14,19 @@ const COLOURS: [RGBColor; 8] = [
     RGBColor(0, 0, 0),
     RGBColor(150, 140, 0),
 ];
-/// Methods with the same colour in every report.
+/// Methods with a fixed colour, in the order of the colours.
 const KNOWN: [&str; 8] =
     ["DDPG-DMP", "DDPG-DMP (paper)", "TD3-DMP", "SAC-DMP", "DDPG", "TD3", "SAC", "NDP"];
 
-/// Returns true if a method has its own colour.
+/// Returns true if a method has a fixed colour.
 #[must_use]
 pub fn has_colour(method: &str) -> bool {
     KNOWN.contains(&method)
 }
 
-/// Returns the colour of a method, which has the given index in the report.
+/// Returns the colour of a method.
+///
+/// - `index`: index of the method in the report, which selects the colour if it has no fixed one.
 #[must_use]
 pub fn colour(index: usize, method: &str) -> RGBColor {
     let known = KNOWN.iter().position(|known| *known == method);

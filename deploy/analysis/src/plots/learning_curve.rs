@@ -1,4 +1,5 @@
-//! Draws evaluation return over environment steps: mean, and one standard deviation over episodes.
+//! Draws the learning curve of a run: evaluation return over environment steps, as mean and
+//! standard deviation over episodes.
 
 use std::path::PathBuf;
 
@@ -11,15 +12,16 @@ use plotters::prelude::*;
 use super::axes::Axes;
 use super::png::png;
 
-/// Blue of the Okabe-Ito palette, which suits all common types of colour vision.
+/// Blue of the Okabe-Ito palette.
 const BLUE: RGBColor = RGBColor(0, 114, 178);
+/// Size of the picture in pixels.
 const SIZE: (u32, u32) = (800, 480);
-/// Space for half of the last step's label.
-const BESIDE: u32 = 40;
+/// Space to the right of the chart, for half of the last tick label.
+const RIGHT_MARGIN: u32 = 40;
 
 /// Draws `plots/learning_curve.svg` and a PNG of it; returns `None` without evaluations.
 ///
-/// - `title`: above the curve.
+/// - `title`: title above the curve.
 ///
 /// # Errors
 /// The rows cannot be read, or the picture cannot be written.
@@ -50,8 +52,13 @@ fn draw(rows: &[EvaluationRow], title: &str) -> Result<String, Box<dyn std::erro
     let mut svg = String::new();
     {
         let area = SVGBackend::with_string(&mut svg, SIZE).into_drawing_area();
-        let what = "evaluation return";
-        let axes = Axes { title, what, steps_max, values: low..high, beside: BESIDE };
+        let axes = Axes {
+            title,
+            y_label: "evaluation return",
+            steps_max,
+            values: low..high,
+            right_margin: RIGHT_MARGIN,
+        };
         let mut chart = axes.draw(&area)?;
         let above = points.iter().map(|&(steps, mean, std)| (steps, mean + std));
         let below = points.iter().rev().map(|&(steps, mean, std)| (steps, mean - std));
@@ -62,7 +69,7 @@ fn draw(rows: &[EvaluationRow], title: &str) -> Result<String, Box<dyn std::erro
         chart.draw_series(mean.map(|point| Circle::new(point, 3, BLUE.filled())))?;
         let note = format!("mean ± 1 std over {} episodes", rows[0].returns.len());
         let style = ("sans-serif", 14).into_font().color(&BLUE);
-        // Below a curve that rises to the right.
+        // At the lower right, below a rising curve.
         area.draw_text(&note, &style, (SIZE.0 as i32 - 250, SIZE.1 as i32 - 90))?;
         area.present()?;
     }
@@ -88,7 +95,7 @@ mod tests {
     }
 
     #[test]
-    fn the_picture_names_its_axes_and_has_one_dot_per_evaluation() {
+    fn picture_has_labelled_axes_and_one_dot_per_evaluation() {
         let rows = [row(0, &[-12.0, -8.0]), row(5_000, &[-7.0, -6.0]), row(10_000, &[-5.0, -5.0])];
         let svg = draw(&rows, "reacher").unwrap();
         for text in ["environment steps", "evaluation return", "reacher", "10,000", "± 1 std"] {
@@ -99,7 +106,7 @@ mod tests {
     }
 
     #[test]
-    fn a_single_evaluation_without_spread_is_drawn_too() {
+    fn single_evaluation_without_spread_is_drawn() {
         let svg = draw(&[row(0, &[0.0])], "one").unwrap();
         assert_eq!(svg.matches("<circle").count(), 1);
     }

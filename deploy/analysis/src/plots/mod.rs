@@ -1,4 +1,4 @@
-//! Stage 8 of 8: the pictures of a run and of a report.
+//! Stage 8 of 8: draws the pictures of runs and reports.
 
 mod axes;
 mod colours;

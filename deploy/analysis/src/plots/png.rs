@@ -1,25 +1,25 @@
-//! Converts an SVG to PNG, for slides, chats and viewers without SVG.
+//! Converts SVG to PNG, for slides, chats and viewers that do not support SVG.
 
 use anyhow::{Context, anyhow};
 use resvg::tiny_skia::{Pixmap, Transform};
 use resvg::usvg::{Options, Tree};
 
-/// Font under Apache-2.0, see the README next to it. With a bundled font the pictures are the same
-/// on every machine, even without installed fonts.
+/// Bundled font, so that pictures are the same on every machine. It is under Apache-2.0; see the
+/// README next to it.
 const FONT: &[u8] = include_bytes!("roboto/Roboto-Regular.ttf");
 const FAMILY: &str = "Roboto";
-/// Pixels per unit of the SVG, for high-resolution screens and print.
+/// Pixels per SVG unit, for high-resolution screens and print.
 const SCALE: f32 = 2.0;
 
-/// Renders an SVG of this program.
+/// Renders an SVG that this program has drawn.
 ///
 /// # Errors
-/// The text is not an SVG, or has no size.
+/// The text is not an SVG, or the SVG has no size.
 pub(crate) fn png(svg: &str) -> anyhow::Result<Vec<u8>> {
     let mut options = Options { font_family: FAMILY.to_owned(), ..Options::default() };
     let fonts = options.fontdb_mut();
     fonts.load_font_data(FONT.to_vec());
-    // The generic family that our pictures use.
+    // The pictures name the generic family only.
     fonts.set_sans_serif_family(FAMILY);
     let tree = Tree::from_str(svg, &options).context("cannot render an SVG")?;
     let size = tree.size().to_int_size().scale_by(SCALE);
@@ -27,7 +27,7 @@ pub(crate) fn png(svg: &str) -> anyhow::Result<Vec<u8>> {
         .and_then(|size| Pixmap::new(size.width(), size.height()))
         .ok_or_else(|| anyhow!("an SVG has no size"))?;
     resvg::render(&tree, Transform::from_scale(SCALE, SCALE), &mut pixels.as_mut());
-    pixels.encode_png().context("cannot write a PNG")
+    pixels.encode_png().context("cannot encode a PNG")
 }
 
 #[cfg(test)]
@@ -35,7 +35,7 @@ mod tests {
     use super::*;
 
     /// Renders `text` in black on white.
-    fn drawn(text: &str) -> Pixmap {
+    fn rendered(text: &str) -> Pixmap {
         let svg = format!(
             "<svg width='200' height='40' xmlns='http://www.w3.org/2000/svg'>\
              <rect width='200' height='40' fill='white'/>\
@@ -44,28 +44,28 @@ mod tests {
         Pixmap::decode_png(&png(&svg).unwrap()).unwrap()
     }
 
-    fn dark(pixels: &Pixmap) -> usize {
+    fn dark_count(pixels: &Pixmap) -> usize {
         pixels.pixels().iter().filter(|pixel| pixel.red() < 128).count()
     }
 
     #[test]
-    fn text_is_drawn_with_the_font_that_the_program_carries() {
-        let empty = drawn("");
+    fn text_is_rendered_with_the_bundled_font() {
+        let empty = rendered("");
         assert_eq!((empty.width(), empty.height()), (400, 80));
-        assert_eq!(dark(&empty), 0);
-        // Two letters have twice as many dark pixels, except for partly covered ones.
-        let (one, two) = (dark(&drawn("H")), dark(&drawn("HH")));
+        assert_eq!(dark_count(&empty), 0);
+        // Two letters have about twice as many dark pixels; partly covered ones vary.
+        let (one, two) = (dark_count(&rendered("H")), dark_count(&rendered("HH")));
         assert!(one > 100 && two.abs_diff(2 * one) < one / 5, "{one} {two}");
-        // Characters used in figures and units.
-        let missing = dark(&drawn("\u{1F600}"));
+        // Characters used in numbers and units, and of names.
+        let missing = dark_count(&rendered("\u{1F600}"));
         for sign in ["−", "±", "²", "³", "°", "Δ", "≥", "–", "·", "é", "ж"] {
-            let drawn = dark(&drawn(sign));
-            assert!(drawn > 0 && drawn != missing, "{sign} is not in the font");
+            let count = dark_count(&rendered(sign));
+            assert!(count > 0 && count != missing, "{sign} is not in the font");
         }
     }
 
     #[test]
-    fn a_text_that_is_not_an_svg_is_refused() {
+    fn text_that_is_not_svg_is_rejected() {
         assert!(png("<p>").is_err());
     }
 }

@@ -1,4 +1,4 @@
-//! Draws panels side by side on the same axes, for comparison.
+//! Draws small multiples: panels side by side with the same axes, for comparison.
 
 use plotters::prelude::*;
 
@@ -6,19 +6,21 @@ use plotters::prelude::*;
 const COLUMNS_MAX: usize = 4;
 /// Size of a panel, including its labels.
 const PANEL: (u32, u32) = (270, 210);
-/// Space for the title above and the axis name below all panels.
+/// Space for the title above all panels.
 const TITLE_HEIGHT: u32 = 44;
-const FOOT_HEIGHT: u32 = 40;
-/// Space for the name of the vertical axis, and for the names of the lines.
-const LEFT: u32 = 34;
-const RIGHT: u32 = 190;
-/// Distance between two names of lines.
+/// Space for the label of the horizontal axis below all panels.
+const X_LABEL_HEIGHT: u32 = 40;
+/// Space for the label of the vertical axis.
+const Y_LABEL_WIDTH: u32 = 34;
+/// Space for the legend.
+const LEGEND_WIDTH: u32 = 190;
+/// Distance between two lines of the legend.
 const LINE_HEIGHT: i32 = 22;
 /// Margin above and below the values, as a fraction of their range.
 const MARGIN: f64 = 0.05;
 const INK: RGBAColor = RGBAColor(0, 0, 0, 0.85);
-/// Tol's "bright" scheme, which is distinguishable with all common types of colour vision and
-/// differs from the methods' colours. The grey is darker here, for a white background.
+/// Tol's "bright" scheme, distinguishable with all common types of colour vision and different from
+/// the methods' colours. The grey is darker here, for a white background.
 const COLOURS: [RGBColor; 7] = [
     RGBColor(68, 119, 170),
     RGBColor(238, 102, 119),
@@ -39,7 +41,7 @@ pub(crate) struct Panel {
     pub(crate) lines: Vec<Vec<(f64, f64)>>,
 }
 
-/// Axes of a panel that have tick labels: only those at the border of the figure.
+/// Which axes of a panel have tick labels: only those at the border of the figure.
 #[derive(Debug, Clone, Copy)]
 struct TickLabels {
     x: bool,
@@ -50,7 +52,7 @@ struct TickLabels {
 pub(crate) struct SmallMultiples<'t> {
     /// Title above all panels.
     pub(crate) title: &'t str,
-    /// Names of the axes, with units.
+    /// Labels of the horizontal and the vertical axis, with units.
     pub(crate) axes: [&'t str; 2],
     /// Names of the lines, the same in each panel.
     pub(crate) names: &'t [String],
@@ -64,7 +66,8 @@ impl SmallMultiples<'_> {
         let columns = self.panels.len().clamp(1, COLUMNS_MAX);
         let rows = self.panels.len().div_ceil(columns);
         let inner = (PANEL.0 * columns as u32, PANEL.1 * rows as u32);
-        let size = (LEFT + inner.0 + RIGHT, TITLE_HEIGHT + inner.1 + FOOT_HEIGHT);
+        let size =
+            (Y_LABEL_WIDTH + inner.0 + LEGEND_WIDTH, TITLE_HEIGHT + inner.1 + X_LABEL_HEIGHT);
         let mut svg = String::new();
         {
             let area = SVGBackend::with_string(&mut svg, size).into_drawing_area();
@@ -73,20 +76,21 @@ impl SmallMultiples<'_> {
                 let style = ("sans-serif", points).into_font().color(&INK);
                 area.draw_text(text, &style, (at.0 as i32, at.1 as i32))
             };
-            words(self.title, 20, (LEFT + 16, 10))?;
-            words(self.axes[0], 16, (LEFT + inner.0 / 2, TITLE_HEIGHT + inner.1 + 10))?;
+            words(self.title, 20, (Y_LABEL_WIDTH + 16, 10))?;
+            let below = TITLE_HEIGHT + inner.1 + 10;
+            words(self.axes[0], 16, (Y_LABEL_WIDTH + inner.0 / 2, below))?;
             let upright =
                 ("sans-serif", 16).into_font().transform(FontTransform::Rotate270).color(&INK);
             let middle = (TITLE_HEIGHT + inner.1 / 2 + 60) as i32;
             area.draw_text(self.axes[1], &upright, (10, middle))?;
-            let panels = area.margin(TITLE_HEIGHT, FOOT_HEIGHT, LEFT, RIGHT);
-            let places = panels.split_evenly((rows, columns));
-            for (index, (panel, place)) in self.panels.iter().zip(&places).enumerate() {
+            let panels = area.margin(TITLE_HEIGHT, X_LABEL_HEIGHT, Y_LABEL_WIDTH, LEGEND_WIDTH);
+            let cells = panels.split_evenly((rows, columns));
+            for (index, (panel, cell)) in self.panels.iter().zip(&cells).enumerate() {
                 let tick_labels =
                     TickLabels { x: index + columns >= self.panels.len(), y: index % columns == 0 };
-                self.draw_panel(place, panel, tick_labels)?;
+                self.draw_panel(cell, panel, tick_labels)?;
             }
-            let x = (LEFT + inner.0 + 16) as i32;
+            let x = (Y_LABEL_WIDTH + inner.0 + 16) as i32;
             for (index, name) in self.names.iter().enumerate() {
                 let y = (TITLE_HEIGHT + 12) as i32 + index as i32 * LINE_HEIGHT;
                 let stroke = vec![(x, y + 7), (x + 22, y + 7)];
@@ -100,7 +104,7 @@ impl SmallMultiples<'_> {
 
     fn draw_panel<DB: DrawingBackend>(
         &self,
-        place: &DrawingArea<DB, plotters::coord::Shift>,
+        area: &DrawingArea<DB, plotters::coord::Shift>,
         panel: &Panel,
         tick_labels: TickLabels,
     ) -> Result<(), Box<dyn std::error::Error>>
@@ -108,7 +112,7 @@ impl SmallMultiples<'_> {
         DB::ErrorType: 'static,
     {
         let [x, y] = self.ranges();
-        let mut chart = ChartBuilder::on(place)
+        let mut chart = ChartBuilder::on(area)
             .margin(8)
             .margin_top(26)
             .x_label_area_size(22)
@@ -133,11 +137,12 @@ impl SmallMultiples<'_> {
             chart.draw_series(LineSeries::new(line.iter().copied(), stroke))?;
         }
         let style = ("sans-serif", 15).into_font().color(&INK);
-        place.draw(&Rectangle::new([(52, 9), (64, 21)], panel.colour.filled()))?;
-        place.draw_text(&panel.title, &style, (70, 7))?;
+        area.draw(&Rectangle::new([(52, 9), (64, 21)], panel.colour.filled()))?;
+        area.draw_text(&panel.title, &style, (70, 7))?;
         Ok(())
     }
 
+    /// Returns the ranges of both axes over all panels.
     fn ranges(&self) -> [std::ops::Range<f64>; 2] {
         let points = || self.panels.iter().flat_map(|panel| panel.lines.iter().flatten());
         let over = |of: fn(&(f64, f64)) -> f64| {
@@ -161,7 +166,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn panels_share_their_axes_and_name_lines_once() {
+    fn panels_share_axes_and_legend() {
         let panel = |title: &str, top: f64| Panel {
             title: title.to_owned(),
             colour: RGBColor(0, 114, 178),

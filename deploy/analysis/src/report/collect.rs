@@ -1,4 +1,4 @@
-//! Reads the runs of a report.
+//! Reads the runs of a report from run directories, sweeps and earlier reports.
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -16,7 +16,7 @@ use super::results::Results;
 use super::run::{Origin, Run, RunKey, Source};
 use super::snapshot;
 
-/// A directory of a sweep and its record of finished runs.
+/// The directory of a sweep, and its record of finished runs.
 struct Sweep<'s> {
     directory: &'s Path,
     ledger: Ledger,
@@ -26,7 +26,7 @@ impl Results {
     /// Reads runs, sweeps and the folders of earlier reports.
     ///
     /// # Errors
-    /// Wrong use if a path is none of these, or if no run has an evaluation. A run cannot be read.
+    /// Wrong use: a path is none of these, or no run has an evaluation. A run cannot be read.
     pub fn read(paths: &[PathBuf]) -> anyhow::Result<Self> {
         let mut results = Self::default();
         for path in paths {
@@ -52,7 +52,7 @@ impl Results {
         self.sweeps.push((name.unwrap_or_default(), text));
         let sweep = Sweep { directory, ledger: Ledger::open(directory)? };
         if let Some(search) = &file.search {
-            // Only the best trial: a column for each of dozens of trials would compare no methods.
+            // Only the best trial is compared: a table cannot have a column for each of dozens.
             for found in found(&file, search, directory)? {
                 let method = format!("{}, best trial", found.method);
                 self.add_planned(&found.task, &method);
@@ -73,7 +73,8 @@ impl Results {
         Ok(())
     }
 
-    /// Adds a row and a column, so that tables show planned cells without runs.
+    /// Adds the row and the column of a planned run, so that tables show it even if it has not
+    /// started.
     fn add_planned(&mut self, task: &str, method: &str) {
         add_new(&mut self.tasks, task);
         add_new(&mut self.methods, method);
@@ -81,15 +82,15 @@ impl Results {
 
     /// Adds a run of a sweep.
     ///
-    /// - `place`: its directory, relative to that of the sweep.
+    /// - `relative`: the run directory, relative to that of the sweep.
     fn add_sweep_run(
         &mut self,
         sweep: &Sweep<'_>,
-        place: &Path,
+        relative: &Path,
         key: RunKey,
     ) -> anyhow::Result<()> {
-        let path = sweep.directory.join(place);
-        // The manifest is the last file that is written when a run directory is created.
+        let path = sweep.directory.join(relative);
+        // The manifest is the last file written when a run directory is created.
         if !path.join("manifest.json").is_file() {
             self.not_started.push(key);
             return Ok(());
@@ -97,7 +98,7 @@ impl Results {
         let directory = RunDirectory::open(&path)?;
         let config = directory.config()?;
         let mut run = run(&directory, &config, key.method)?;
-        let finished = sweep.ledger.of(place);
+        let finished = sweep.ledger.of(relative);
         run.ended |= finished.is_some_and(|finished| finished.is_whole(config.run.steps));
         self.runs.push(run);
         Ok(())
@@ -118,9 +119,9 @@ impl Results {
         Ok(())
     }
 
-    /// Keeps one of several copies of a run: a finished one before an unfinished one, then one in
-    /// a run directory before one of an earlier report, then the one named first. Two directories
-    /// are never copies of one run, nor are two runs of one report.
+    /// Keeps one of several copies of a run. A finished copy is preferred to an unfinished one,
+    /// then a run directory to an earlier report, then the first on the command line. Two
+    /// directories are never copies of one run, nor are two runs of the same report.
     fn remove_duplicates(&mut self) {
         let rank = |index: usize, run: &Run| (!run.ended, run.directory().is_none(), index);
         let is_replaced = |(index, run): &(usize, &Run)| {
@@ -128,7 +129,7 @@ impl Results {
                 let is_copy = other.directory().is_none() || run.directory().is_none();
                 is_copy
                     && other.source != run.source
-                    && other.is(&run.key())
+                    && other.has_key(&run.key())
                     && rank(other_index, other) < rank(*index, run)
             })
         };
@@ -136,15 +137,15 @@ impl Results {
         self.runs = kept.map(|(_, run)| run.clone()).collect();
         let mut not_started: Vec<RunKey> = Vec::new();
         for key in std::mem::take(&mut self.not_started) {
-            if !not_started.contains(&key) && !self.runs.iter().any(|run| run.is(&key)) {
+            if !not_started.contains(&key) && !self.runs.iter().any(|run| run.has_key(&key)) {
                 not_started.push(key);
             }
         }
         self.not_started = not_started;
     }
 
-    /// Returns the label, extended by the first differing key if another run of the task has the
-    /// same label and another learning configuration: such runs are not seeds of one method.
+    /// Returns a label for a run that differs from those of other methods. If a run of the task has
+    /// the same label and another learning configuration, it appends the first differing key.
     fn distinct_label(&self, label: String, config: &ExperimentConfig) -> anyhow::Result<String> {
         let own = learning_keys(config)?;
         let others = self.of(&config.task.name, &label).filter_map(Run::directory);
@@ -172,13 +173,13 @@ impl Results {
     }
 }
 
-fn run_key(task: &str, method: &str, seed: i64, place: &Path) -> anyhow::Result<RunKey> {
-    let seed = u64::try_from(seed).with_context(|| format!("seed of {}", place.display()))?;
+fn run_key(task: &str, method: &str, seed: i64, path: &Path) -> anyhow::Result<RunKey> {
+    let seed = u64::try_from(seed).with_context(|| format!("seed of {}", path.display()))?;
     Ok(RunKey { task: task.to_owned(), method: method.to_owned(), seed })
 }
 
-/// Sections of the configuration that define a method: runs that differ only elsewhere are seeds
-/// of one method.
+/// Sections of the configuration that define a method. Runs that differ only in other sections
+/// count as seeds of the same method.
 const LEARNING_SECTIONS: [&str; 7] =
     ["policy", "dmp", "algorithm", "exploration", "replay", "demonstrations", "pacing"];
 
@@ -227,8 +228,9 @@ mod tests {
     use super::super::fixtures::{FixtureRun, fixture_results};
     use super::*;
 
-    /// Returns seed and return of the runs that are kept, of runs given by seed, whether they have
-    /// a directory, whether they are finished, and return.
+    /// Removes duplicates; returns seed and return of the remaining runs.
+    ///
+    /// - `runs`: seed, whether it has a directory, whether it is finished, and return of each.
     fn kept(runs: &[(u64, bool, bool, f64)]) -> Vec<(u64, f64)> {
         let run = |(seed, _, ended, value): &(u64, bool, bool, f64)| FixtureRun {
             task: "reacher-v1",
@@ -253,18 +255,21 @@ mod tests {
     }
 
     #[test]
-    fn a_run_of_an_earlier_report_counts_where_no_directory_has_a_finished_one() {
-        let (directory, report, ended, begun) = (true, false, true, false);
+    fn finished_run_directory_is_preferred_to_an_earlier_report() {
+        let (directory, report, ended, unfinished) = (true, false, true, false);
         let cases = [
             // The order of the arguments does not matter.
             (vec![(1, directory, ended, -1.0), (1, report, ended, -2.0)], vec![(1, -1.0)]),
             (vec![(1, report, ended, -2.0), (1, directory, ended, -1.0)], vec![(1, -1.0)]),
-            (vec![(1, directory, begun, -1.0), (1, report, ended, -2.0)], vec![(1, -2.0)]),
-            (vec![(1, report, begun, -2.0), (1, directory, begun, -1.0)], vec![(1, -1.0)]),
-            // Two reports: the first in which the run is finished.
+            (vec![(1, directory, unfinished, -1.0), (1, report, ended, -2.0)], vec![(1, -2.0)]),
+            (
+                vec![(1, report, unfinished, -2.0), (1, directory, unfinished, -1.0)],
+                vec![(1, -1.0)],
+            ),
+            // Of two reports, the first in which the run is finished is kept.
             (vec![(1, report, ended, -1.0), (1, report, ended, -2.0)], vec![(1, -1.0)]),
-            (vec![(1, report, begun, -1.0), (1, report, ended, -2.0)], vec![(1, -2.0)]),
-            // Other seeds are other runs, and two directories are never copies of one run.
+            (vec![(1, report, unfinished, -1.0), (1, report, ended, -2.0)], vec![(1, -2.0)]),
+            // Different seeds are different runs, and two directories are never copies of one run.
             (
                 vec![(1, directory, ended, -1.0), (2, report, ended, -2.0)],
                 vec![(1, -1.0), (2, -2.0)],

@@ -1,4 +1,4 @@
-//! The contents of a report.
+//! The content of a report, which the output modules write.
 
 use super::efficiency::EfficiencyRow;
 use super::filmstrips::Filmstrip;
@@ -11,17 +11,17 @@ use super::tables::Table;
 pub struct Report {
     /// Heading.
     pub title: String,
-    /// Command that makes the report again.
+    /// Command that recreates the report.
     pub command: String,
-    /// Time at which it was made (RFC 3339).
+    /// Creation time (RFC 3339).
     pub made: String,
-    /// Git commit of the program, if it is known.
+    /// Git commit of the program, if known.
     pub commit: Option<String>,
-    /// The runs.
+    /// The compared runs.
     pub results: Results,
-    /// Tables of measures.
+    /// One table per measure.
     pub tables: Vec<Table>,
-    /// Environment steps until a threshold is reached.
+    /// Sample efficiency: environment steps until a threshold is reached.
     pub efficiency: Vec<EfficiencyRow>,
     /// The paper's statements with their verdicts.
     pub claims: PaperClaims,
@@ -29,6 +29,6 @@ pub struct Report {
     pub curves: Vec<Picture>,
     /// Frames of a rollout.
     pub filmstrips: Vec<Filmstrip>,
-    /// Joints over a rollout.
+    /// Joint trajectories of a rollout.
     pub trajectories: Vec<Picture>,
 }

@@ -1,12 +1,12 @@
-//! Writes the figures of a report as CSV files.
+//! Encodes the figures of a report and its runs as CSV.
 
 use super::contents::Report;
 use super::run::Run;
 
-/// Encodes `figures.csv`: a line per table, task and method.
+/// Encodes `figures.csv`, with a line per table, task and method.
 ///
 /// # Errors
-/// None is known: it is written into memory.
+/// Encoding fails, which is not expected: the file is written to memory.
 pub fn figures_csv(report: &Report) -> anyhow::Result<Vec<u8>> {
     let mut csv = csv::Writer::from_writer(Vec::new());
     csv.write_record([
@@ -55,10 +55,10 @@ pub fn figures_csv(report: &Report) -> anyhow::Result<Vec<u8>> {
     Ok(csv.into_inner()?)
 }
 
-/// Encodes `runs.csv`: a line per evaluation of a run.
+/// Encodes `runs.csv`, with a line per evaluation of each run.
 ///
 /// # Errors
-/// None is known: it is written into memory.
+/// Encoding fails, which is not expected: the file is written to memory.
 pub fn runs_csv(runs: &[Run]) -> anyhow::Result<Vec<u8>> {
     let mut csv = csv::Writer::from_writer(Vec::new());
     csv.write_record([

@@ -1,4 +1,5 @@
-//! Draws learning curves: evaluation return or success over environment steps, a line per method.
+//! Draws learning curves: evaluation return or success rate over environment steps, with a line per
+//! method.
 
 use anyhow::anyhow;
 use dmprl_run::safe_name;
@@ -15,14 +16,16 @@ use crate::plots::{Axes, Chart, colour};
 
 /// Size of the plot with its axes, in pixels.
 const SIZE: (u32, u32) = (760, 520);
-/// Width of the legend to the right of the plot, in pixels: without text, per letter, and maximum.
+/// Width of the legend without text, in pixels. The legend is to the right of the plot.
 const LEGEND_MARGIN: u32 = 76;
+/// Width of a letter in the legend, in pixels.
 const LEGEND_LETTER: u32 = 7;
+/// Maximum width of the legend, in pixels.
 const LEGEND_MAX: u32 = 480;
 /// Distance between two lines of the legend, in pixels.
 const LINE_HEIGHT: i32 = 24;
 
-/// A point of a method's line, over its seeds.
+/// A point of a method's line: mean and range over its seeds.
 struct Point {
     env_steps: f64,
     mean: f64,
@@ -30,7 +33,7 @@ struct Point {
     high: f64,
 }
 
-/// Draws the returns of every task, and its success if the task reports it.
+/// Draws the return of each task, and the success rate if the task reports it.
 ///
 /// # Errors
 /// A picture cannot be drawn.
@@ -57,9 +60,8 @@ pub fn curves(results: &Results) -> anyhow::Result<Vec<Picture>> {
     Ok(curves)
 }
 
-/// Averages the n-th evaluations of all seeds. They were made after the same number of steps, up to
-/// the rest of a segment. The line ends with the shortest run, so that all means are over the same
-/// seeds.
+/// Averages the n-th evaluations of all seeds, which differ by less than a segment in their steps.
+/// The line ends with the shortest run, so that all means are over the same seeds.
 fn points(runs: &[&Run], measure: Measure) -> Vec<Point> {
     let rows = runs.iter().map(|run| run.rows.len()).min().unwrap_or(0);
     let at = |index: usize| {
@@ -79,7 +81,7 @@ fn points(runs: &[&Run], measure: Measure) -> Vec<Point> {
     (0..rows).map_while(at).collect()
 }
 
-/// A method's line, and its result in the paper.
+/// The line of a method, and its result in the paper.
 struct MethodLine {
     label: String,
     colour: RGBColor,
@@ -88,8 +90,8 @@ struct MethodLine {
 }
 
 impl MethodLine {
-    /// Averages the finished runs of a method, so that a seed that has just started does not cut
-    /// the line short. Without finished runs, averages the unfinished ones.
+    /// Averages the finished runs of a method, because a seed that has just started would cut the
+    /// line short. If there are none, averages the unfinished runs.
     ///
     /// - `index`: index of the method in the report.
     fn new(results: &Results, task: &str, index: usize, measure: Measure) -> Self {
@@ -98,7 +100,7 @@ impl MethodLine {
         if runs.is_empty() {
             runs = results.of(task, method).filter(|run| !run.rows.is_empty()).collect();
         }
-        let paper = measure.in_paper().and_then(|figure| reported(figure, task, method));
+        let paper = measure.in_paper().and_then(|table| reported(table, task, method));
         let software = SoftwareCounts::of(runs.iter().copied());
         Self {
             label: format!("{method} · n = {}{}", runs.len(), software.mark()),
@@ -111,7 +113,7 @@ impl MethodLine {
 
 fn draw(
     task: &str,
-    what: &str,
+    y_label: &str,
     lines: &[MethodLine],
 ) -> Result<String, Box<dyn std::error::Error>> {
     let points = || lines.iter().flat_map(|line| &line.points);
@@ -122,12 +124,12 @@ fn draw(
     let mut svg = String::new();
     {
         let letters = lines.iter().map(|line| line.label.chars().count()).max().unwrap_or(0);
-        let beside = (LEGEND_MARGIN + LEGEND_LETTER * letters as u32).min(LEGEND_MAX);
-        let size = (SIZE.0 + beside, SIZE.1);
+        let right_margin = (LEGEND_MARGIN + LEGEND_LETTER * letters as u32).min(LEGEND_MAX);
+        let size = (SIZE.0 + right_margin, SIZE.1);
         let area = SVGBackend::with_string(&mut svg, size).into_drawing_area();
-        let axes = Axes { title: task, what, steps_max, values: low..high, beside };
+        let axes = Axes { title: task, y_label, steps_max, values: low..high, right_margin };
         let mut chart = axes.draw(&area)?;
-        // Lines last: a band on top of another method's line would change its colour.
+        // Bands first: a band on top of a line would change the line's colour.
         for line in lines {
             draw_band(&mut chart, line)?;
         }
@@ -162,12 +164,12 @@ fn draw(
     Ok(svg)
 }
 
-/// Returns a triangle whose left corner is at (x, y). At the right edge it points at the plot.
+/// Returns a triangle that points left to (x, y).
 fn triangle(x: i32, y: i32, colour: RGBColor) -> Polygon<(i32, i32)> {
     Polygon::new(vec![(x, y), (x + 10, y - 5), (x + 10, y + 5)], colour.filled())
 }
 
-/// Draws the band from the lowest seed to the highest.
+/// Draws the band between the lowest and the highest seed.
 fn draw_band(
     chart: &mut Chart<'_, '_>,
     line: &MethodLine,
@@ -187,7 +189,7 @@ fn draw_line(
     let stroke = line.colour.stroke_width(2);
     chart.draw_series(LineSeries::new(mean.iter().copied(), stroke))?;
     if let [only] = mean.as_slice() {
-        // A line of one point is invisible.
+        // A line with a single point is invisible.
         chart.draw_series(std::iter::once(Circle::new(*only, 3, line.colour.filled())))?;
     }
     Ok(())

@@ -1,4 +1,5 @@
-//! Sample efficiency: environment steps until a threshold is reached, by task and method.
+//! Computes the sample efficiency: environment steps until a threshold is reached, by task and
+//! method.
 
 use dmprl_run::format::grouped;
 use serde::Serialize;
@@ -10,7 +11,7 @@ use super::run::Run;
 use super::statistics::{INTERVAL_SCORES_MIN, median_with_bounds, range};
 use super::thresholds::{reported_steps, threshold};
 
-/// The row of a task.
+/// Sample efficiency of all methods on a task.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct EfficiencyRow {
     /// The task.
@@ -26,19 +27,19 @@ pub struct EfficiencyRow {
 /// Environment steps until the seeds of a method reached the threshold.
 #[derive(Debug, Clone, Default, PartialEq, Serialize)]
 pub struct EfficiencyCell {
-    /// Environment steps of each seed; null for a finished one that never reached the threshold.
-    /// Does not contain unfinished seeds that have not reached it.
+    /// Environment steps of each seed; null for a finished seed that never reached the threshold.
+    /// Unfinished seeds that have not reached it are left out.
     pub steps: Vec<Option<f64>>,
     /// Number of unfinished seeds that have not reached the threshold.
     pub unfinished: usize,
-    /// Median; null if half of the seeds or more never reached the threshold.
+    /// Median; null if at least half of the seeds never reached the threshold.
     pub median: Option<f64>,
-    /// Its 95 % interval by bootstrap. An end is null if it lies beyond every run; both are null
-    /// with fewer than four seeds.
+    /// Bounds of the median's 95 % bootstrap interval. A bound is null if it is infinite; both are
+    /// null with fewer than four seeds.
     pub interval: [Option<f64>; 2],
-    /// Minimum and maximum; null for a seed that never reached the threshold.
+    /// Minimum and maximum; null if that seed never reached the threshold.
     pub range: [Option<f64>; 2],
-    /// The paper's statement.
+    /// The steps that the paper reports, in its words.
     pub paper: Option<&'static str>,
     /// Number of programs and sets of packages.
     #[serde(flatten)]
@@ -69,7 +70,7 @@ impl EfficiencyCell {
         cell
     }
 
-    /// Formats the lines of the cell.
+    /// Returns the cell's lines of text.
     #[must_use]
     pub fn lines(&self) -> Vec<String> {
         let mut lines = Vec::new();
@@ -88,7 +89,7 @@ impl EfficiencyCell {
             let mark = self.software.mark();
             lines.push(format!("{reached} of {} seeds{mark}", self.steps.len()));
             if self.unfinished > 0 {
-                lines.push(format!("{} under way", self.unfinished));
+                lines.push(format!("{} unfinished", self.unfinished));
             }
         }
         lines.extend(self.paper.map(|paper| format!("paper: {paper}")));
@@ -129,7 +130,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_seed_that_never_reached_it_counts_as_infinite_and_an_unfinished_one_does_not_count() {
+    fn seed_that_never_reached_the_threshold_is_infinite_and_an_unfinished_one_left_out() {
         let run = |seed, rows: Vec<f64>, ended| FixtureRun {
             task: "reacher-v1",
             method: "DDPG",
@@ -155,14 +156,14 @@ mod tests {
                 "3,000",
                 "range [2,000 – not reached]",
                 "2 of 3 seeds",
-                "1 under way",
+                "1 unfinished",
                 "paper: about 33,000"
             ]
         );
     }
 
     #[test]
-    fn a_method_without_runs_and_one_that_never_reached_it_are_distinguished() {
+    fn method_without_runs_differs_from_one_that_never_reached_the_threshold() {
         let never = FixtureRun {
             task: "reacher-v1",
             method: "NDP",

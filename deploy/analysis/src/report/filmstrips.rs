@@ -1,5 +1,5 @@
-//! Frames of a rollout, as in the paper's Figure 5: for each task, those of the best method with a
-//! dmp policy, and those of DDPG for comparison.
+//! Shows frames of a rollout as in the paper's Figure 5: for each task, of the best method with a
+//! dmp policy, and of DDPG for comparison.
 
 use std::path::PathBuf;
 
@@ -17,17 +17,17 @@ use super::results::Results;
 use super::run::{Run, Source};
 use super::statistics::Summary;
 
-/// The method with which the paper compares its own.
-const COMPARED: &str = "DDPG";
+/// The method that the paper's Figure 5 compares with its own.
+const BASELINE: &str = "DDPG";
 
 /// A row of frames.
 #[derive(Debug, Clone, Serialize)]
 pub struct Filmstrip {
-    /// Path in the folder of the report, without the extension.
+    /// Path relative to the folder of the report, without the extension.
     pub path: String,
     /// Alternative text.
     pub alt: String,
-    /// Contents of the PNG file.
+    /// Content of the PNG file.
     #[serde(skip)]
     pub png: Vec<u8>,
     /// The same in Base64, for the page.
@@ -39,40 +39,41 @@ pub struct Filmstrip {
 pub struct PlannedFilmstrip {
     task: String,
     method: String,
-    /// `None` if the run was read from an earlier report, so that it cannot be recorded.
+    /// `None` if the run was read from an earlier report, and therefore cannot be recorded.
     run: Option<RunDirectory>,
     file: PathBuf,
 }
 
-/// Path in the folder of a report, without the extension.
+/// Returns the path of a filmstrip relative to the folder of a report, without the extension.
 fn path(task: &str, method: &str) -> String {
     format!("frames/{}-{}", safe_name(task), safe_name(method))
 }
 
-/// Plans the filmstrips of every task whose motion is known.
+/// Plans the filmstrips of each task.
 ///
 /// # Errors
 /// A run cannot be read.
 pub fn plan_filmstrips(results: &Results) -> anyhow::Result<Vec<PlannedFilmstrip>> {
     let mut planned = Vec::new();
     for task in &results.tasks {
-        for run in best_dmp(results, task).into_iter().chain(first_run(results, task, COMPARED)) {
+        for run in best_dmp(results, task).into_iter().chain(first_run(results, task, BASELINE)) {
             let (directory, file) = match &run.source {
                 Source::Directory(path) => {
                     let directory = RunDirectory::open(path)?;
                     let seed = directory.config()?.evaluation.first_seed;
                     let version = run.last().map_or(0, |row| row.policy_version);
-                    // `dmprl_sweep::record` chooses the same name, so it is recorded only once.
+                    // The name that `dmprl_sweep::record` chooses, so that an existing recording is
+                    // found.
                     let name = format!("policy-{version}-seed-{seed}.png");
                     (Some(directory), path.join("videos").join(name))
                 }
-                // The earlier report chose the same run.
+                // The earlier report has the filmstrip, as it chose the same run.
                 Source::Report(report) => {
                     (None, report.join(path(&run.task, &run.method) + ".png"))
                 }
             };
             let (task, method) = (run.task.clone(), run.method.clone());
-            // Skip runs whose motion rollout failed: a recording needs the same rollout.
+            // Skips runs whose motion rollout failed, because a recording would fail too.
             if run.motion.is_some() || file.is_file() {
                 planned.push(PlannedFilmstrip { task, method, run: directory, file });
             }
@@ -81,13 +82,13 @@ pub fn plan_filmstrips(results: &Results) -> anyhow::Result<Vec<PlannedFilmstrip
     Ok(planned)
 }
 
-/// Returns whether [`record_filmstrips`] has something to do.
+/// Returns true if [`record_filmstrips`] would record something.
 #[must_use]
 pub fn needs_recording(planned: &[PlannedFilmstrip]) -> bool {
     planned.iter().any(|filmstrip| filmstrip.run.is_some() && !filmstrip.file.is_file())
 }
 
-/// Names the filmstrips that an earlier report lacks.
+/// Lists the planned filmstrips that an earlier report does not have.
 #[must_use]
 pub fn missing_filmstrips(planned: &[PlannedFilmstrip]) -> Vec<String> {
     let missing =
@@ -98,11 +99,11 @@ pub fn missing_filmstrips(planned: &[PlannedFilmstrip]) -> Vec<String> {
     missing.map(line).collect()
 }
 
-/// Records the filmstrips that do not exist yet. If one cannot be recorded, appends the reason to
+/// Records the filmstrips that do not exist yet. If a recording fails, appends the reason to
 /// `undrawn` and continues.
 ///
-/// - `record`: records the first evaluation episode of the run's latest policy into `videos` of the
-///   run directory.
+/// - `record`: records the first evaluation episode of the run's latest policy to the folder
+///   `videos` of the run directory.
 pub fn record_filmstrips(
     planned: &[PlannedFilmstrip],
     undrawn: &mut Vec<String>,
@@ -122,7 +123,7 @@ pub fn record_filmstrips(
     Outcome::Done
 }
 
-/// Reads the filmstrips that exist.
+/// Reads the existing filmstrips.
 ///
 /// # Errors
 /// A file cannot be read.
@@ -141,8 +142,8 @@ pub fn read_filmstrips(planned: &[PlannedFilmstrip]) -> anyhow::Result<Vec<Films
     existing.map(read).collect()
 }
 
-/// Returns the finished run of the lowest seed of the best method with a dmp policy, by success and
-/// then by return.
+/// Returns the finished run with the lowest seed of the best method with a dmp policy. Methods are
+/// compared by mean success rate, then by mean return.
 fn best_dmp<'r>(results: &'r Results, task: &str) -> Option<&'r Run> {
     let mean = |method: &str, measure: Measure| {
         let scores: Vec<f64> = results.of(task, method).filter_map(|run| measure.of(run)).collect();
@@ -159,7 +160,7 @@ fn best_dmp<'r>(results: &'r Results, task: &str) -> Option<&'r Run> {
     best.map(|(_, run)| run)
 }
 
-/// Returns the finished run with the lowest seed.
+/// Returns the finished run of a method with the lowest seed.
 fn first_run<'r>(results: &'r Results, task: &str, method: &str) -> Option<&'r Run> {
     let finished = results.runs.iter().filter(|run| run.last().is_some());
     let runs = finished.filter(|run| run.task == task && run.method == method);
@@ -173,7 +174,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_best_method_with_a_dmp_policy_is_shown_with_its_lowest_seed() {
+    fn best_method_with_a_dmp_policy_is_shown_with_its_lowest_seed() {
         let run = |method, seed, value| FixtureRun {
             task: "pusher-v0",
             method,
@@ -190,12 +191,12 @@ mod tests {
         ]);
         let best = best_dmp(&results, "pusher-v0").unwrap();
         assert_eq!((best.method.as_str(), best.seed), ("DDPG-DMP", 1));
-        assert_eq!(first_run(&results, "pusher-v0", COMPARED).unwrap().method, "DDPG");
+        assert_eq!(first_run(&results, "pusher-v0", BASELINE).unwrap().method, "DDPG");
         assert!(best_dmp(&results, "reacher-v1").is_none());
     }
 
     #[test]
-    fn success_counts_before_return() {
+    fn success_rate_takes_precedence_over_return() {
         let run = |method, success| FixtureRun {
             task: "panda-reach",
             method,
@@ -210,7 +211,7 @@ mod tests {
     }
 
     #[test]
-    fn a_run_of_an_earlier_report_is_shown_with_its_picture() {
+    fn filmstrip_of_an_earlier_report_is_reused() {
         let run = |method| FixtureRun {
             task: "panda-reach",
             method,

@@ -1,4 +1,4 @@
-//! Results for the tests of a report.
+//! Synthetic results for the tests of the report.
 
 use dmprl_shared::config::PolicyKind;
 use dmprl_shared::supervision::EvaluationRow;
@@ -11,18 +11,18 @@ use crate::motion::{Joint, JointKind, Motion, RecordedEpisode, Robot};
 /// Environment steps between two evaluations.
 const INTERVAL: u64 = 1_000;
 
-/// Description of a run.
+/// Description of a synthetic run.
 #[derive(Debug, Clone)]
 pub(super) struct FixtureRun {
     pub(super) task: &'static str,
     pub(super) method: &'static str,
     pub(super) seed: u64,
-    /// Return of each evaluation, or success on a Panda task; one every 1,000 steps.
+    /// Return of each evaluation, or success rate on a Panda task, every 1,000 steps.
     pub(super) rows: Vec<f64>,
     pub(super) ended: bool,
 }
 
-/// Builds the results of runs.
+/// Returns the results of synthetic runs.
 pub(super) fn fixture_results(runs: &[FixtureRun]) -> Results {
     let mut results = Results::default();
     for run in runs {
@@ -76,7 +76,7 @@ pub(super) fn fixture_motion(jerk: f64, sparc: f64) -> MotionMetrics {
     MotionMetrics::of(&motion_of(jerk, sparc))
 }
 
-/// Returns the motion of an arm with an elbow and a sliding finger, over two steps.
+/// Returns the motion of an arm with an elbow and a sliding finger over two steps.
 pub(super) fn motion_of(jerk: f64, sparc: f64) -> Motion {
     let joint = |name: &str, kind| Joint { name: name.to_owned(), kind };
     Motion {

@@ -1,21 +1,21 @@
-//! Parts that the sections of a report consist of.
+//! Elements of a report's sections: pictures and tables.
 
 use serde::Serialize;
 
 use super::results::Results;
 
-/// A drawing.
+/// A picture.
 #[derive(Debug, Clone, Serialize)]
 pub struct Picture {
-    /// Path in the folder of the report, without the extension.
+    /// Path relative to the folder of the report, without the extension.
     pub path: String,
     /// Alternative text.
     pub alt: String,
-    /// The drawing.
+    /// The picture as SVG.
     pub svg: String,
 }
 
-/// A table with cells of several lines, by task and method.
+/// A table by task and method, whose cells have several lines.
 #[derive(Debug, Clone, Default, Serialize)]
 pub struct Grid {
     /// Headings of the columns.
@@ -25,7 +25,7 @@ pub struct Grid {
 }
 
 impl Grid {
-    /// Makes a cell for each task and method.
+    /// Calls `cell` for each task and method.
     pub fn of(results: &Results, cell: impl Fn(&str, &str) -> Vec<String>) -> Self {
         let rows = results.tasks.iter().map(|task| {
             let cells = results.methods.iter().map(|method| cell(task, method));

@@ -2,10 +2,10 @@
 
 use super::contents::Report;
 use super::layout::Grid;
-use super::sections::{READING, Section, sections};
+use super::sections::{Section, TABLES_NOTE, sections};
 use super::statements::ClaimResult;
 
-/// Returns the text of `report.md`.
+/// Returns the content of `report.md`.
 #[must_use]
 pub fn markdown(report: &Report) -> String {
     let mut text = format!("# {}\n\nMade by `{}` at {}", report.title, report.command, report.made);
@@ -13,7 +13,7 @@ pub fn markdown(report: &Report) -> String {
         text.push_str(&format!(", commit {commit}"));
     }
     text.push_str(".\n\nIn the tables: ");
-    text.push_str(READING);
+    text.push_str(TABLES_NOTE);
     text.push('\n');
     for section in sections(report) {
         text.push_str(&section_text(&section));
@@ -63,7 +63,7 @@ fn grid_text(grid: &Grid) -> String {
 }
 
 fn statements_text(claims: &[ClaimResult]) -> String {
-    let mut text = String::from("\n| Statement | What became of it |\n|---|---|\n");
+    let mut text = String::from("\n| Statement | Verdict |\n|---|---|\n");
     for ClaimResult { task, place, claim, contradiction, findings, .. } in claims {
         let mut lines: Vec<String> = findings
             .iter()

@@ -1,9 +1,9 @@
-//! The measures of a run, with their descriptions.
+//! The measures by which runs are compared, with their descriptions.
 
 use dmprl_shared::supervision::EvaluationRow;
 use serde::Deserialize;
 
-use super::paper::Figure;
+use super::paper::PaperTable;
 use super::run::Run;
 use super::thresholds::threshold;
 
@@ -24,15 +24,15 @@ pub enum MeasureKind {
 pub enum Measure {
     /// Mean return of the last evaluation.
     Return,
-    /// Share of the last evaluation's episodes that end in success.
+    /// Fraction of the last evaluation's episodes that end in success.
     Success,
-    /// Mean absolute change of an action.
+    /// Mean absolute change of actions between two steps.
     ActionChange,
-    /// Mean absolute jerk of a joint.
+    /// Mean absolute jerk of the joints.
     JointJerk,
     /// Spectral arc length of the joints' speed.
     Sparc,
-    /// Segments decided in training.
+    /// Policy decisions in training, one per segment.
     Decisions,
     /// Updates of the learner.
     Updates,
@@ -40,13 +40,13 @@ pub enum Measure {
     TrainingTime,
     /// Updates per environment step.
     UpdateRate,
-    /// Environment steps until the task's threshold is reached; infinite for a finished run that
-    /// never reached it.
+    /// Environment steps until the task's threshold is reached; infinite if a finished run never
+    /// reached it.
     StepsToThreshold,
 }
 
 impl Measure {
-    /// Measures that have a table of means.
+    /// Measures that have a table in the report, in its order.
     pub const TABLES: [Self; 8] = [
         Self::Return,
         Self::Success,
@@ -71,42 +71,46 @@ impl Measure {
             Self::Updates => "Updates",
             Self::TrainingTime => "Training time [s]",
             Self::UpdateRate => "Updates per environment step",
-            Self::StepsToThreshold => "Environment steps to a threshold",
+            Self::StepsToThreshold => "Environment steps to threshold",
         }
     }
 
-    /// Describes how it is measured.
+    /// Returns a description of how it is measured.
     #[must_use]
     pub fn about(self) -> &'static str {
         match self {
             Self::Return => {
-                "Mean return of the last evaluation, without noise, as in the paper's Table 3."
+                "Mean return of the last evaluation, without exploration noise, as in the paper's \
+                 Table 3."
             }
             Self::Success => {
-                "Share of the last evaluation's episodes that end in success, as in the paper's \
+                "Fraction of the last evaluation's episodes that end in success, as in the paper's \
                  Table 4."
             }
             Self::ActionChange => {
-                "Mean absolute change of an action between two steps of the last evaluation, with \
-                 actions scaled to [-1, 1]; lower is smoother."
+                "Mean absolute change of the actions between two steps of the last evaluation, \
+                 with actions scaled to [-1, 1]. Lower is smoother."
             }
             Self::JointJerk => {
-                "Mean absolute jerk of a joint, computed from its velocity at each step, over the \
-                 first evaluation.episodes episodes of the last evaluation; lower is smoother. In \
-                 m/s³ for robots with sliding joints only."
+                "Mean absolute jerk of the joints, computed from their velocities at each step, \
+                 over the first evaluation.episodes episodes of the last evaluation. Lower is \
+                 smoother. In m/s³ for robots with sliding joints only."
             }
             Self::Sparc => {
                 "Spectral arc length of the joints' speed (Balasubramanian et al. 2015), averaged \
-                 over the same episodes as joint jerk; closer to zero is smoother."
+                 over the same episodes as joint jerk. Closer to zero is smoother."
             }
-            Self::Decisions => "Segments decided in training; an mlp policy decides at every step.",
+            Self::Decisions => {
+                "Policy decisions in training, one per segment. An mlp policy decides at every \
+                 step."
+            }
             Self::Updates => "Updates of the learner in training.",
             Self::TrainingTime => {
-                "Wall-clock time of a run; runs of a sweep share the cores of the machine."
+                "Wall-clock time of a run. Runs of a sweep share the cores of the machine."
             }
-            Self::UpdateRate => "Updates of the learner for each environment step.",
+            Self::UpdateRate => "Updates of the learner per environment step.",
             Self::StepsToThreshold => {
-                "Environment steps until an evaluation's mean first reaches the threshold; the \
+                "Environment steps until an evaluation's mean first reaches the threshold. The \
                  resolution is the interval between evaluations."
             }
         }
@@ -123,23 +127,23 @@ impl Measure {
         }
     }
 
-    /// Returns the corresponding figure of the paper, if it has one.
+    /// Returns the paper's table for the measure, if it has one.
     #[must_use]
-    pub fn in_paper(self) -> Option<Figure> {
+    pub fn in_paper(self) -> Option<PaperTable> {
         match self {
-            Self::Return => Some(Figure::Return),
-            Self::Success => Some(Figure::Success),
+            Self::Return => Some(PaperTable::Return),
+            Self::Success => Some(PaperTable::Success),
             _ => None,
         }
     }
 
-    /// Returns whether a higher value is better.
+    /// Returns true if a higher value is better.
     #[must_use]
     pub fn higher_is_better(self) -> bool {
         matches!(self, Self::Return | Self::Success | Self::Sparc)
     }
 
-    /// Returns whether it needs a rollout after training.
+    /// Returns true if it is measured by a rollout after training.
     #[must_use]
     pub fn is_of_motion(self) -> bool {
         matches!(self, Self::JointJerk | Self::Sparc)
@@ -157,7 +161,7 @@ impl Measure {
         }
     }
 
-    /// Returns the value of a run; `None` while it is unknown.
+    /// Returns the value of a run; `None` if it is not known yet.
     #[must_use]
     pub fn of(self, run: &Run) -> Option<f64> {
         if self == Self::StepsToThreshold {

@@ -1,20 +1,20 @@
-//! `dmprl report`: compares runs, as a web page, Markdown, CSV, JSON and pictures.
+//! `dmprl report`: compares runs in a web page, Markdown, CSV, JSON and pictures.
 //!
-//! Layers, each of which uses only those above it:
+//! The layers, each of which uses only those above it:
 //!
-//! - Data: `run` and `motion_metrics` describe a run, `results` the runs of a report, `paper` the
-//!   paper's tables.
-//! - Reading: `collect` reads runs and sweeps, `snapshot` the data of earlier reports, `motion` how
-//!   policies move.
-//! - Measures: `measures` and `thresholds` take the figures of a run, `statistics` summarises them,
-//!   `provenance` counts the programs behind them.
+//! - Data: `run` and `motion_metrics` describe a run, `results` holds the runs of a report, `paper`
+//!   the paper's tables.
+//! - Input: `collect` reads runs and sweeps, `snapshot` the data of earlier reports, `motion` the
+//!   measured motions.
+//! - Measures: `measures` and `thresholds` compute the figures of a run, `statistics` summarises
+//!   them over seeds, `provenance` counts the program versions behind them.
 //! - Comparison: `tables`, `efficiency`, `curves`, `trajectories`, `filmstrips` and `statements`
-//!   compare methods; `layout` has their parts.
-//! - Output: `contents` combines them, `sections` orders them for `page` and `markdown`.
-//!   `csv_files` and `snapshot` write them for other programs.
+//!   compare methods, with the elements of `layout`.
+//! - Output: `contents` combines the parts, `sections` orders them for `page` and `markdown`.
+//!   `csv_files` and `snapshot` write the data for other programs and later reports.
 //!
-//! Reads files only. `cli` starts the processes that roll policies out, through the functions that
-//! `measure_motions` and `record_filmstrips` take.
+//! The module only reads and writes files. Where a policy must be rolled out, the caller passes a
+//! function (`measure_motions`, `record_filmstrips`).
 
 mod collect;
 mod contents;

@@ -1,5 +1,5 @@
-//! Collects the motion of the runs: reads it if it was measured before, otherwise has the run's
-//! last policy rolled out.
+//! Collects the motion of the runs: reads it if it has been measured, otherwise has the latest
+//! policy rolled out.
 
 use dmprl_run::RunDirectory;
 use dmprl_run::failure::Outcome;
@@ -10,11 +10,11 @@ use super::run::{Run, Source};
 use super::snapshot;
 use crate::motion::{self, Motion};
 
-/// After that many consecutive failures on a task, its other runs are not tried.
+/// Number of consecutive failures on a task after which its other runs are skipped.
 const FAILURES_MAX: usize = 2;
 
-/// Reads the motions that were measured before. A run of an earlier report has one already, or can
-/// no longer be measured.
+/// Reads the motions measured before. Runs of an earlier report cannot be measured; those without a
+/// motion are added to `results.unmeasured`.
 ///
 /// # Errors
 /// A run cannot be read.
@@ -28,7 +28,7 @@ pub(super) fn read_motions(results: &mut Results) -> anyhow::Result<()> {
             Source::Report(report) if run.motion.is_none() => {
                 let file = snapshot::find(report).unwrap_or_else(|| report.clone());
                 results.unmeasured.push(format!(
-                    "{}: {} has no motion of it",
+                    "{}: not measured in {}",
                     run.key(),
                     file.display()
                 ));
@@ -39,7 +39,7 @@ pub(super) fn read_motions(results: &mut Results) -> anyhow::Result<()> {
     Ok(())
 }
 
-/// Returns the number of finished runs that can be measured and are not.
+/// Returns the number of finished runs that can be measured but have not been.
 #[must_use]
 pub fn unmeasured(results: &Results) -> usize {
     results.runs.iter().filter(|run| is_unmeasured(run)).count()
@@ -49,21 +49,21 @@ fn is_unmeasured(run: &Run) -> bool {
     run.last().is_some() && run.motion.is_none() && run.directory().is_some()
 }
 
-/// A run whose motion is to be measured.
+/// A run to measure.
 #[derive(Debug)]
 pub struct UnmeasuredRun<'r> {
-    /// The run.
+    /// Run directory.
     pub directory: &'r RunDirectory,
     /// Task, method and seed.
     pub name: &'r str,
-    /// Index among the unmeasured runs.
+    /// Index of the run among the unmeasured ones.
     pub index: u64,
 }
 
-/// Measures the motion of the runs. If a run cannot be measured, appends the reason to
+/// Measures the motion of the runs that have none. If that fails for a run, appends the reason to
 /// `results.unmeasured` and continues.
 ///
-/// - `measure`: rolls the run's latest policy out; returns `None` if the user interrupted it.
+/// - `measure`: rolls out the run's latest policy; returns `None` if the user interrupts.
 pub fn measure_motions(
     results: &mut Results,
     mut measure: impl FnMut(&UnmeasuredRun<'_>) -> anyhow::Result<Option<Motion>>,
@@ -75,7 +75,7 @@ pub fn measure_motions(
         let name = run.key().to_string();
         let failed = failures.iter().position(|(task, _)| *task == run.task);
         if failed.is_some_and(|at| failures[at].1 >= FAILURES_MAX) {
-            results.unmeasured.push(format!("{name}: not tried after {FAILURES_MAX} failures"));
+            results.unmeasured.push(format!("{name}: skipped after {FAILURES_MAX} failures"));
             continue;
         }
         let measured = RunDirectory::open(path).and_then(|directory| {
@@ -99,8 +99,8 @@ pub fn measure_motions(
     Outcome::Done
 }
 
-/// Formats an error in one line. If it quotes the end of a log, keeps its first line and the last
-/// line of the log.
+/// Formats an error in one line. Of an error that quotes the end of a log, it keeps the first line
+/// and the last line of the log.
 pub(super) fn in_one_line(error: &anyhow::Error) -> String {
     let text = format!("{error:#}");
     let mut lines = text.lines().map(str::trim);
@@ -140,7 +140,7 @@ mod tests {
     }
 
     #[test]
-    fn after_two_failures_the_other_runs_of_a_task_are_not_tried() {
+    fn other_runs_of_a_task_are_skipped_after_two_failures() {
         let parent = tempfile::tempdir().unwrap();
         let mut results = runs_in(&parent, &["reacher", "reacher", "reacher", "pusher"]);
         assert_eq!(unmeasured(&results), 4);
@@ -160,7 +160,7 @@ mod tests {
     }
 
     #[test]
-    fn an_interrupt_ends_the_measuring() {
+    fn interrupt_stops_the_measurements() {
         let parent = tempfile::tempdir().unwrap();
         let mut results = runs_in(&parent, &["reacher", "pusher"]);
         let mut calls = 0;
@@ -172,7 +172,7 @@ mod tests {
     }
 
     #[test]
-    fn an_error_with_a_log_is_shortened_to_its_cause() {
+    fn error_with_a_log_is_shortened_to_its_cause() {
         let died = anyhow::anyhow!(
             "the observer died: exit status 1\n  last lines of a.log:\n    \
              error: no such folder\n    --- observer, later ---"

@@ -1,15 +1,15 @@
-//! The part of a `motion.json` that a report shows: two figures and one rollout, small enough for
-//! `report-data.json`.
+//! The part of `motion.json` that a report shows: two figures and one rollout. It is small enough
+//! for `report-data.json`.
 
 use anyhow::ensure;
 use serde::{Deserialize, Serialize};
 
 use crate::motion::Motion;
 
-/// Positions and velocities keep four decimals, which is finer than a pixel of a plot.
+/// Positions and velocities are rounded to four decimals, which is finer than a pixel of a plot.
 const ROUNDING: f64 = 1e4;
 
-/// Motion of a run's last policy.
+/// Motion of a run's latest policy.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct MotionMetrics {
@@ -17,7 +17,8 @@ pub struct MotionMetrics {
     pub joint_jerk: Option<f64>,
     /// Spectral arc length of the joints' speed.
     pub sparc: Option<f64>,
-    /// The first episode; `None` if the joints are unknown, or an earlier report did not keep it.
+    /// The first episode; `None` if the joints are unknown, or the run was read from an earlier
+    /// report that does not show it.
     pub rollout: Option<Rollout>,
 }
 
@@ -49,8 +50,8 @@ impl MotionMetrics {
 }
 
 impl Rollout {
-    /// Returns `None` without joints. Rounds the values here rather than when they are written, so
-    /// that a picture of an earlier report's data is the same.
+    /// Returns the rollout of a motion; `None` without joints. The values are rounded here, so that
+    /// pictures drawn from a motion and from an earlier report are the same.
     fn of(motion: &Motion) -> Option<Self> {
         let joints = motion.robot.joints.iter().enumerate();
         let counted: Vec<usize> = joints
@@ -72,15 +73,16 @@ impl Rollout {
         })
     }
 
-    /// Returns the time of each row \[s\], (T+1,); in steps if their duration is unknown.
+    /// Returns the time of each row \[s\], (T+1,). Times are in steps if the duration of a step is
+    /// unknown.
     #[must_use]
     pub fn times(&self) -> Vec<f64> {
         let step = if self.control_dt_s > 0.0 { self.control_dt_s } else { 1.0 };
         (0..self.positions.len()).map(|index| index as f64 * step).collect()
     }
 
-    /// Returns whether the other rollout is of the same episode and robot, so that the panels of a
-    /// figure may show both.
+    /// Returns true if the other rollout has the same episode and robot, so that both can be
+    /// compared in a figure.
     #[must_use]
     pub fn is_comparable(&self, other: &Self) -> bool {
         (self.seed, self.control_dt_s, &self.unit, &self.joints)
@@ -96,13 +98,13 @@ impl Rollout {
         let fit = |rows: &[Vec<f64>]| rows.iter().all(|row| row.len() == joints);
         ensure!(
             joints > 0 && rows > 0 && self.velocities.len() == rows,
-            "the rollout has {joints} joints, {rows} rows of positions and {} of velocities: \
-             expected at least one, and as many of both",
+            "the rollout has {joints} joints, {rows} rows of positions and {} of velocities; \
+             expected at least one joint and row, and equal numbers of rows",
             self.velocities.len()
         );
         ensure!(
             fit(&self.positions) && fit(&self.velocities),
-            "the rollout has rows that are not of its {joints} joints"
+            "the rollout has rows whose length differs from its {joints} joints"
         );
         Ok(())
     }

@@ -1,4 +1,4 @@
-//! Summarises the runs: how many are finished, when they started and on which machines.
+//! Summarises the runs: how many are finished, when they started, and on which machines.
 
 use dmprl_run::format::grouped;
 
@@ -39,8 +39,7 @@ pub fn sentences(results: &Results) -> Vec<String> {
             1 => "1 run".to_owned(),
             count => format!("{count} runs"),
         };
-        sentences
-            .push(format!("The motion of {count} was not measured; the first reason: {first}."));
+        sentences.push(format!("The motion of {count} was not measured. First reason: {first}."));
     }
     if !results.undrawn.is_empty() {
         sentences.push(format!("Not drawn: {}.", results.undrawn.join("; ")));
@@ -48,7 +47,7 @@ pub fn sentences(results: &Results) -> Vec<String> {
     sentences
 }
 
-/// Joins the distinct values, in order, with "; ".
+/// Joins the distinct values with "; ", in order.
 fn distinct(values: impl Iterator<Item = String>) -> String {
     let mut known: Vec<String> = Vec::new();
     for value in values {
@@ -59,7 +58,7 @@ fn distinct(values: impl Iterator<Item = String>) -> String {
     known.join("; ")
 }
 
-/// Returns the seeds and steps by task and method.
+/// Returns a table of seeds and steps by task and method.
 #[must_use]
 pub fn runs_table(results: &Results) -> Grid {
     let cell = |task: &str, method: &str| {
@@ -98,7 +97,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn finished_started_and_missing_runs_are_counted_separately() {
+    fn finished_unfinished_and_not_started_runs_are_counted_separately() {
         let run = |seed, ended| FixtureRun {
             task: "reacher-v1",
             method: "DDPG",

@@ -1,4 +1,5 @@
-//! Writes the files of a report: a self-contained page, the same as Markdown, pictures and data.
+//! Writes the files of a report: a self-contained web page, the same as Markdown, pictures and
+//! data.
 
 use std::path::Path;
 
@@ -9,7 +10,7 @@ use minijinja::{AutoEscape, Environment, context};
 use super::contents::Report;
 use super::csv_files::{figures_csv, runs_csv};
 use super::markdown::markdown;
-use super::sections::{READING, sections};
+use super::sections::{TABLES_NOTE, sections};
 use super::snapshot;
 use crate::plots::png;
 
@@ -20,19 +21,19 @@ impl Report {
     /// picture as SVG and PNG.
     ///
     /// # Errors
-    /// A picture cannot be rendered, or the file system fails.
+    /// A picture cannot be rendered, or a file cannot be written.
     pub fn write(&self, folder: &Path) -> anyhow::Result<()> {
         for picture in self.curves.iter().chain(&self.trajectories) {
             let file = |ending: &str| folder.join(format!("{}.{ending}", picture.path));
             let svg = file("svg");
-            make_parent(&svg)?;
+            create_parent(&svg)?;
             write(&svg, picture.svg.as_bytes())?;
             let png = png(&picture.svg).with_context(|| picture.alt.clone())?;
             write(&file("png"), &png)?;
         }
         for filmstrip in &self.filmstrips {
             let file = folder.join(format!("{}.png", filmstrip.path));
-            make_parent(&file)?;
+            create_parent(&file)?;
             write(&file, &filmstrip.png)?;
         }
         write(&folder.join("figures.csv"), &figures_csv(self)?)?;
@@ -46,22 +47,22 @@ impl Report {
     fn html(&self) -> anyhow::Result<String> {
         let mut environment = Environment::new();
         environment.set_auto_escape_callback(|_| AutoEscape::Html);
-        environment.add_template("page", TEMPLATE).context("the template of the report")?;
+        environment.add_template("page", TEMPLATE).context("the report's template is invalid")?;
         let page = environment.get_template("page")?.render(context! {
             title => self.title.clone(),
             command => self.command.clone(),
             made => self.made.clone(),
             commit => self.commit.clone(),
-            reading => READING,
+            tables_note => TABLES_NOTE,
             sections => Serde(sections(self)),
         });
-        page.context("cannot render the page of the report")
+        page.context("cannot render the report's page")
     }
 }
 
-fn make_parent(path: &Path) -> anyhow::Result<()> {
+fn create_parent(path: &Path) -> anyhow::Result<()> {
     let Some(parent) = path.parent() else { return Ok(()) };
-    std::fs::create_dir_all(parent).with_context(|| format!("cannot make {}", parent.display()))
+    std::fs::create_dir_all(parent).with_context(|| format!("cannot create {}", parent.display()))
 }
 
 fn write(path: &Path, bytes: &[u8]) -> anyhow::Result<()> {

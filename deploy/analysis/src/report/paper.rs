@@ -1,6 +1,6 @@
-//! The results that the paper reports in its Tables 3 and 4.
+//! The results of the paper's Tables 3 and 4.
 
-/// Returns of Table 3. The printed table lacks the minus signs, which the paper's figures show.
+/// Returns of Table 3. The printed table has no minus signs; the paper's figures show them.
 const RETURNS: [Row; 3] = [
     Row("reacher-v1", [(-7.36, 0.54), (-6.58, 0.54), (-7.89, 0.57), (-6.10, 0.61), (-15.56, 1.47)]),
     Row(
@@ -20,15 +20,15 @@ const SUCCESS: [Row; 2] = [
 ];
 
 /// The method that follows this project's first interpretation of the paper.
-pub const READING_METHOD: &str = "DDPG-DMP (paper)";
-/// Footnote about the interpretation, beside the figures of that method.
-pub const READING: &str = "¹ DDPG-DMP (paper) is one interpretation of the paper, which leaves \
-    these choices open: goal, weights and rho are bounded by tanh; the controller sees velocity \
-    and acceleration divided by omega and omega²; the target takes s' = s_{t+1} after the sum of K \
-    rewards; forcing-term widths follow NDP's code. Other interpretations are methods of \
-    deploy/experiments/paper.toml.";
+pub const INTERPRETED_METHOD: &str = "DDPG-DMP (paper)";
+/// Footnote about the interpretation, next to the figures of that method.
+pub const INTERPRETATION_NOTE: &str = "¹ DDPG-DMP (paper) is one interpretation of the paper, \
+    which does not specify these choices: goal, weights and rho are bounded by tanh; the inputs of \
+    the controller are velocity and acceleration divided by omega and omega²; the target takes \
+    s' = s_{t+1} after the sum of K rewards; forcing-term widths follow NDP's code. \
+    deploy/experiments/paper.toml has other interpretations.";
 
-/// Number of seeds behind each figure of the paper.
+/// Number of seeds of each result in the paper.
 pub const SEEDS: usize = 5;
 
 /// Columns of both tables.
@@ -36,24 +36,25 @@ const METHODS: [&str; 5] = ["DDPG-DMP (paper)", "DDPG", "TD3", "SAC", "NDP"];
 
 struct Row(&'static str, [(f64, f64); 5]);
 
-/// Selects a table of the paper.
+/// A table of the paper.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Figure {
+pub enum PaperTable {
     /// Return: Table 3.
     Return,
     /// Success rate: Table 4.
     Success,
 }
 
-/// Returns mean and standard deviation that the paper reports for a method on a task, by the names
-/// of `deploy/experiments/paper.toml`; `None` if it reports none.
+/// Returns the mean and standard deviation that the paper reports; `None` if it reports none.
+///
+/// - `task`, `method`: names in `deploy/experiments/paper.toml`.
 #[must_use]
-pub fn reported(figure: Figure, task: &str, method: &str) -> Option<(f64, f64)> {
-    let table: &[Row] = match figure {
-        Figure::Return => &RETURNS,
-        Figure::Success => &SUCCESS,
+pub fn reported(table: PaperTable, task: &str, method: &str) -> Option<(f64, f64)> {
+    let rows: &[Row] = match table {
+        PaperTable::Return => &RETURNS,
+        PaperTable::Success => &SUCCESS,
     };
-    let Row(_, row) = table.iter().find(|Row(name, _)| *name == task)?;
+    let Row(_, row) = rows.iter().find(|Row(name, _)| *name == task)?;
     let column = METHODS.iter().position(|name| *name == method)?;
     Some(row[column])
 }
@@ -64,10 +65,10 @@ mod tests {
 
     #[test]
     fn figures_are_found_by_task_and_method() {
-        assert_eq!(reported(Figure::Return, "pusher-v0", "SAC"), Some((-31.87, 4.01)));
-        assert_eq!(reported(Figure::Success, "panda-reach", "DDPG"), Some((0.41, 0.24)));
-        assert_eq!(reported(Figure::Return, "panda-reach", "DDPG"), None);
-        assert_eq!(reported(Figure::Return, "reacher", "SAC"), None);
-        assert_eq!(reported(Figure::Return, "reacher-v1", "TD3-DMP"), None);
+        assert_eq!(reported(PaperTable::Return, "pusher-v0", "SAC"), Some((-31.87, 4.01)));
+        assert_eq!(reported(PaperTable::Success, "panda-reach", "DDPG"), Some((0.41, 0.24)));
+        assert_eq!(reported(PaperTable::Return, "panda-reach", "DDPG"), None);
+        assert_eq!(reported(PaperTable::Return, "reacher", "SAC"), None);
+        assert_eq!(reported(PaperTable::Return, "reacher-v1", "TD3-DMP"), None);
     }
 }

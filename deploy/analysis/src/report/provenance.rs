@@ -1,5 +1,5 @@
-//! Provenance of the figures: program and packages that made the runs of each cell, and the data
-//! that is available of them.
+//! Provenance of the figures: the programs and packages that made the runs of each cell, and the
+//! data available for them.
 
 use std::collections::BTreeSet;
 
@@ -9,11 +9,11 @@ use super::layout::Grid;
 use super::results::Results;
 use super::run::{Origin, Run};
 
-/// Number of different programs and sets of package versions that made the runs behind a figure.
+/// Number of different programs and sets of package versions behind a figure.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize)]
 pub struct SoftwareCounts {
-    /// Programs, by version and commit. A run whose sources are unknown counts as a program of its
-    /// own.
+    /// Programs, by version and commit. A run whose sources are unknown counts as a separate
+    /// program.
     pub programs: usize,
     /// Sets of package versions, counted in the same way.
     pub package_sets: usize,
@@ -34,7 +34,7 @@ impl SoftwareCounts {
         }
     }
 
-    /// Returns the mark behind a figure that covers several programs or sets of packages.
+    /// Returns the mark after a figure of several programs or sets of packages; otherwise nothing.
     #[must_use]
     pub fn mark(self) -> &'static str {
         if self.programs > 1 || self.package_sets > 1 { " †" } else { "" }
@@ -50,7 +50,7 @@ pub struct Provenance {
     pub grid: Grid,
 }
 
-/// Describes program and packages of a run.
+/// Describes the programs and packages of a run.
 fn source(run: &Run) -> String {
     let programs = distinct(&run.origin.programs);
     let packages = if run.origin.packages.is_empty() {
@@ -61,7 +61,7 @@ fn source(run: &Run) -> String {
     format!("dmprl {programs}; {packages}")
 }
 
-/// Joins the distinct texts, in order, with "; then ".
+/// Joins the distinct texts with "; then ", in order.
 fn distinct(texts: &[String]) -> String {
     let mut known: Vec<&str> = Vec::new();
     for text in texts {
@@ -87,7 +87,7 @@ impl Provenance {
         Self { sources, grid }
     }
 
-    /// Returns the numbered programs as one paragraph.
+    /// Returns a paragraph that lists the numbered programs.
     #[must_use]
     pub fn legend(&self) -> String {
         let numbered =
@@ -96,7 +96,8 @@ impl Provenance {
     }
 }
 
-/// Formats `[1]: seeds 1, 2`, then the seeds whose motion and rollout are available.
+/// Formats a cell: the seeds of each program, such as `[1]: seeds 1, 2`, then the seeds with a
+/// motion and with a rollout.
 fn cell(results: &Results, task: &str, method: &str, sources: &[String]) -> Vec<String> {
     let mut runs: Vec<&Run> = results.of(task, method).collect();
     runs.sort_by_key(|run| run.seed);
@@ -128,7 +129,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn each_cell_names_the_programs_and_the_available_data_of_its_seeds() {
+    fn cells_list_programs_and_available_data_by_seed() {
         let run = |method, seed| FixtureRun {
             task: "pusher-v0",
             method,

@@ -3,7 +3,7 @@
 use super::motion_metrics::Rollout;
 use super::run::{Run, RunKey};
 
-/// Runs of a report; tasks and methods in the order in which they were named.
+/// The runs of a report. Tasks and methods are in the order of the command line.
 #[derive(Debug, Clone, Default)]
 pub struct Results {
     /// Rows of the tables.
@@ -14,11 +14,11 @@ pub struct Results {
     pub runs: Vec<Run>,
     /// Planned runs that have not started.
     pub not_started: Vec<RunKey>,
-    /// Name of each sweep's directory, and the text of its file.
+    /// Name of each sweep's directory, and the text of its sweep file.
     pub sweeps: Vec<(String, String)>,
     /// Runs whose motion could not be measured, with the reason.
     pub unmeasured: Vec<String>,
-    /// Runs that could not be drawn, with the reason.
+    /// Pictures that could not be drawn, with the reason.
     pub undrawn: Vec<String>,
 }
 
@@ -40,8 +40,8 @@ impl Results {
         self.runs.iter().filter(move |run| run.task == task && run.method == method)
     }
 
-    /// Returns for each method the recorded rollout of its lowest seed, if there is one. All are of
-    /// the same episode and robot as that of the first method.
+    /// Returns the rollout of each method's lowest seed that has one. All have the same episode and
+    /// robot as that of the first method.
     pub(super) fn shown_rollouts<'r>(&'r self, task: &'r str) -> Vec<ShownRollout<'r>> {
         let mut shown: Vec<ShownRollout<'r>> = Vec::new();
         for (method_index, method) in self.methods.iter().enumerate() {
@@ -62,7 +62,7 @@ impl Results {
         shown
     }
 
-    /// Returns whether the run's rollout represents its method in the pictures.
+    /// Returns true if the run's rollout represents its method in the pictures.
     pub(super) fn is_shown(&self, run: &Run) -> bool {
         self.shown_rollouts(&run.task).iter().any(|shown| std::ptr::eq(shown.run, run))
     }

@@ -1,4 +1,4 @@
-//! One run of a report, read from its directory or from an earlier report.
+//! A run of a report, read from its directory or from an earlier report.
 
 use std::fmt::{self, Display, Formatter};
 use std::path::{Path, PathBuf};
@@ -11,17 +11,17 @@ use serde::{Deserialize, Serialize};
 
 use super::motion_metrics::MotionMetrics;
 
-/// Digits of a hash that are shown.
+/// Number of digits of a hash that are shown.
 const HASH_LEN: usize = 12;
 
-/// One run and its evaluations.
+/// A run and its evaluations.
 #[derive(Debug, Clone)]
 pub struct Run {
     /// The task's name.
     pub task: String,
     /// The method's label.
     pub method: String,
-    /// Kind of its policy.
+    /// Kind of the policy.
     pub policy: PolicyKind,
     /// `run.seed`.
     pub seed: u64,
@@ -35,9 +35,9 @@ pub struct Run {
     pub origin: Origin,
     /// Evaluations, oldest first.
     pub rows: Vec<EvaluationRow>,
-    /// Number of episodes in the last evaluation; `None` if an older report does not contain it.
+    /// Number of episodes in the last evaluation; `None` if an older report does not record it.
     pub final_episodes: Option<u64>,
-    /// Motion of the last policy, if it was measured.
+    /// Motion of the latest policy, if it has been measured.
     pub motion: Option<MotionMetrics>,
 }
 
@@ -46,11 +46,11 @@ pub struct Run {
 pub enum Source {
     /// Its own directory.
     Directory(PathBuf),
-    /// The folder of an earlier report; the run directory is not available.
+    /// Folder of an earlier report. The run directory is not available.
     Report(PathBuf),
 }
 
-/// Identifies a run of a comparison.
+/// Identifies a run in a report.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct RunKey {
@@ -68,15 +68,15 @@ impl Display for RunKey {
     }
 }
 
-/// Program, packages and machine that made a run.
+/// Programs, packages and machine of a run.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Origin {
     /// Start of the first session (UTC, RFC 3339).
     pub started: String,
-    /// Program version of each session, with the commit if it was recorded.
+    /// Program version of each session, with the commit if recorded.
     pub programs: Vec<String>,
-    /// Versions of Python, MuJoCo, Gymnasium and NumPy, of each session that recorded them.
+    /// Versions of Python, MuJoCo, Gymnasium and NumPy in each session that recorded them.
     #[serde(default)]
     pub packages: Vec<String>,
     /// SHA-256 of the resolved configuration of the last session that recorded it.
@@ -119,8 +119,8 @@ impl Origin {
 }
 
 impl Origin {
-    /// Returns the programs of the sessions; `None` if the sources of one are unknown, because no
-    /// commit was recorded or the sources differed from it.
+    /// Returns the programs of the sessions; `None` if the sources of one are unknown because no
+    /// commit was recorded or the sources had uncommitted changes.
     pub(super) fn known_programs(&self) -> Option<&[String]> {
         let is_known = |program: &String| {
             let commit = program.split_once("(commit ").map_or("", |(_, rest)| rest);
@@ -175,8 +175,8 @@ impl Run {
         RunKey { task: self.task.clone(), method: self.method.clone(), seed: self.seed }
     }
 
-    /// Returns whether the run has this task, method and seed.
-    pub(super) fn is(&self, key: &RunKey) -> bool {
+    /// Returns true if the run has this task, method and seed.
+    pub(super) fn has_key(&self, key: &RunKey) -> bool {
         (&self.task, &self.method, self.seed) == (&key.task, &key.method, key.seed)
     }
 }

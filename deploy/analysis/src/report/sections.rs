@@ -1,4 +1,4 @@
-//! The sections of a report in reading order, for the page and for Markdown.
+//! The sections of a report, in order, for the web page and for Markdown.
 
 use dmprl_run::safe_name;
 use serde::Serialize;
@@ -18,36 +18,36 @@ use super::statements::{
 use super::tables::Table;
 
 /// Explains the cells of the tables.
-pub(super) const READING: &str = "mean ± standard deviation over seeds. With four or more \
+pub(super) const TABLES_NOTE: &str = "mean ± standard deviation over seeds. With four or more \
     seeds, IQM is the interquartile mean with its 95 % interval by stratified bootstrap; with \
-    fewer, the range from the lowest seed to the highest is given instead. Only finished runs \
-    count. † marks figures over runs of different programs or package versions, or over runs \
-    that did not record them; see Provenance.";
+    fewer, the range over the seeds is given instead. Only finished runs are included. † marks \
+    figures over runs with different program or package versions, or over runs that did not \
+    record them; see Provenance.";
 
 /// Explains the learning curves.
-const CURVES: &str = "Evaluations without noise: mean over the seeds (n), and a band from the \
-    lowest seed to the highest. Triangles at the right edge mark the final results in the paper \
-    (its Tables 3 and 4), which may be after another number of steps.";
+const CURVES: &str = "Evaluations without exploration noise: mean over the seeds (n), and a band \
+    from the lowest seed to the highest. Triangles at the right edge mark the final results in \
+    the paper (Tables 3 and 4), which may be after a different number of steps.";
 /// Explains the steps to the thresholds.
 const EFFICIENCY: &str = "Environment steps until an evaluation's mean first reaches the \
     threshold: median over the seeds, with its 95 % interval by bootstrap (the range for fewer \
     than four seeds), and the number of finished seeds that reached it. A seed that never \
-    reached it counts as later than all others. The resolution is the interval between \
-    evaluations.";
+    reached it counts as infinite. The resolution is the interval between evaluations.";
 /// Explains the filmstrips.
-const FRAMES: &str = "One noise-free episode after training, of the best method with a dmp policy \
-    and of DDPG, reset with the same seed, as in the paper's Figure 5.";
-/// Explains the pictures of the joints.
-const JOINTS: &str = "One noise-free episode of each method's policy after training, reset with \
-    the same seed. All panels have the same axes, as in the paper's Figures 6 and 7.";
+const FRAMES: &str = "One episode after training, without exploration noise, of the best method \
+    with a dmp policy and of DDPG, reset with the same seed, as in the paper's Figure 5.";
+/// Explains the joint trajectories.
+const JOINTS: &str = "One episode of each method's policy after training, without exploration \
+    noise, reset with the same seed. All panels have the same axes, as in the paper's Figures 6 \
+    and 7.";
 /// Explains the provenance.
-const PROVENANCE: &str = "Program and packages that made the runs of each cell, by number, and \
-    the seeds whose motion was measured and whose rollout was recorded.";
+const PROVENANCE: &str = "Programs and packages that made the runs of each cell, by number, and \
+    the seeds with a measured motion and with a recorded rollout.";
 
 /// A section with its heading.
 #[derive(Debug, Clone, Default, Serialize)]
 pub struct Section {
-    /// Target of links.
+    /// Anchor of links.
     pub id: String,
     /// Heading.
     pub title: String,
@@ -55,13 +55,13 @@ pub struct Section {
     pub about: Vec<String>,
     /// Table.
     pub grid: Option<Grid>,
-    /// Drawings.
+    /// Plots.
     pub pictures: Vec<Picture>,
     /// Frames of rollouts.
     pub filmstrips: Vec<Filmstrip>,
     /// Statements of the paper.
     pub statements: Vec<ClaimResult>,
-    /// Names and texts of files.
+    /// Name and text of files to quote.
     pub files: Vec<(String, String)>,
 }
 
@@ -108,25 +108,25 @@ pub fn sections(report: &Report) -> Vec<Section> {
     if !report.claims.results.is_empty() {
         sections.push(statements(&report.claims));
     }
-    if report.results.methods.iter().any(|method| method == paper::READING_METHOD) {
-        sections.iter_mut().for_each(mark_reading);
+    if report.results.methods.iter().any(|method| method == paper::INTERPRETED_METHOD) {
+        sections.iter_mut().for_each(add_interpretation_note);
     }
     sections.push(provenance(&report.results));
     sections
 }
 
-/// Marks the column of the paper's method, and explains its interpretation in a footnote.
-fn mark_reading(section: &mut Section) {
+/// Marks the column of the paper's method, and adds a footnote about its interpretation.
+fn add_interpretation_note(section: &mut Section) {
     let has_figures =
         section.grid.is_some() || !section.pictures.is_empty() || !section.statements.is_empty();
     if !has_figures {
         return;
     }
     let columns = section.grid.iter_mut().flat_map(|grid| &mut grid.columns);
-    for column in columns.filter(|column| *column == paper::READING_METHOD) {
+    for column in columns.filter(|column| *column == paper::INTERPRETED_METHOD) {
         column.push_str(" ¹");
     }
-    section.about.push(paper::READING.to_owned());
+    section.about.push(paper::INTERPRETATION_NOTE.to_owned());
 }
 
 fn provenance(results: &Results) -> Section {
@@ -184,18 +184,18 @@ fn efficiency(report: &Report) -> Section {
 fn statements(claims: &PaperClaims) -> Section {
     let Limits { failure, almost_always, loss, .. } = claims.limits;
     let about = format!(
-        "Rules judge the paper's statements by the figures of the runs. \"Held\" and \"did not \
-         hold\" need at least {SEEDS_MIN} seeds of each method, {EPISODES_MIN} episodes in each \
-         last evaluation, and 95 % intervals that do not overlap (of the interquartile mean, or \
-         of the median for steps). With fewer, the verdict is \"too few seeds\" or \"too few \
-         episodes\". Statements about the course of training also use the earlier evaluations, \
-         with any number of episodes. If intervals overlap, the verdict is \"no clear \
-         difference\". Statements that methods are alike, or that a method does not improve, \
-         hold if there is no clear difference. \"Cannot hold\": the paper's own figures \
-         contradict the statement. Failure is a success rate of at most {failure}; almost always \
-         is a rate of at least {almost_always}; a loss is more than {loss} of the gain, by moving \
-         means of five evaluations. The paper trained for about 200,000 steps; nothing is \
-         extrapolated."
+        "The paper's statements are evaluated as rules on the figures of the runs. \"Held\" and \
+         \"did not hold\" require at least {SEEDS_MIN} seeds of each method, {EPISODES_MIN} \
+         episodes in each last evaluation, and 95 % intervals that do not overlap (of the \
+         interquartile mean, or of the median for steps). With fewer seeds or episodes, the \
+         verdict is \"too few seeds\" or \"too few episodes\". Statements about the course of \
+         training also use the earlier evaluations, with any number of episodes. If intervals \
+         overlap, the verdict is \"no clear difference\". Statements that methods are alike, or \
+         that a method does not improve, hold if there is no clear difference. \"Cannot hold\" \
+         means that the paper's own figures contradict the statement. Failure is a success rate \
+         of at most {failure}; almost always is a rate of at least {almost_always}; a loss is more \
+         than {loss} of the gain, measured with moving means of five evaluations. The paper \
+         trained for about 200,000 steps; nothing is extrapolated."
     );
     let mut section = Section::new("Statements of the paper", &[&about]);
     section.statements = claims.results.clone();

@@ -1,9 +1,9 @@
-//! `report-data.json`: writes and reads all data that a report has of its runs, one run per line.
+//! Writes and reads `report-data.json`, which has all data of a report's runs, one run per line.
 //!
 //! Run directories are large and stay on the machine that trained them. The folder of a report is
-//! small and can be committed or sent. A later report reads it instead of the run directories, so a
-//! sweep that several machines share, or that continues elsewhere, ends in one comparison. Numbers
-//! are written with all digits, so the tables of both reports are the same.
+//! small and can be committed or copied. A later report can read it instead of the run directories,
+//! for example to combine the parts of a sweep from several machines. Numbers are written with all
+//! digits, so that the tables of both reports are the same.
 
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -21,12 +21,12 @@ use super::run::{Origin, Run, RunKey, Source};
 pub(super) const FILE: &str = "report-data.json";
 /// Name of the file in older reports.
 const OLD_FILE: &str = "curves.json";
-/// Version of the format that is written.
+/// Version of the format written.
 const FORMAT_VERSION: u32 = 3;
-/// Oldest version that is read. It lacks final episodes, packages and hashes.
+/// Oldest version that can be read. It has no final episodes, packages and hashes.
 const FORMAT_VERSION_MIN: u32 = 2;
 
-/// The key that every version of the file has.
+/// The part that all versions of the file have.
 #[derive(Debug, Deserialize)]
 struct Versioned {
     format_version: u32,
@@ -84,7 +84,8 @@ struct RunRecord {
 }
 
 impl RunRecord {
-    /// Drops the rollout unless the report draws it, because all of them would make the file large.
+    /// Copies the data of a run. Rollouts that the report does not draw are dropped, to keep the
+    /// file small.
     fn new(run: &Run, results: &Results) -> Self {
         let mut motion = run.motion.clone();
         if let Some(motion) = &mut motion
@@ -114,6 +115,7 @@ impl RunRecord {
         }
     }
 
+    /// Checks that the arrays fit together.
     fn check(&self) -> anyhow::Result<()> {
         let count = self.env_steps.len();
         let lengths = [
@@ -127,12 +129,12 @@ impl RunRecord {
         for (name, length) in lengths {
             ensure!(
                 length == count,
-                "{name} has {length} evaluations, expected {count} as env_steps"
+                "{name} has {length} evaluations, expected {count} as in env_steps"
             );
         }
         ensure!(
             self.env_steps.is_sorted(),
-            "env_steps decreases, expected evaluations in the order in which they were made"
+            "env_steps decreases; expected evaluations in chronological order"
         );
         ensure!(count > 0 || !self.ended, "the run is finished without an evaluation");
         let rollout = self.motion.as_ref().and_then(|motion| motion.rollout.as_ref());
@@ -145,7 +147,7 @@ impl RunRecord {
             updates: self.updates[index],
             segments: self.segments[index],
             wall_s: self.wall_s[index],
-            // The file contains neither policies nor single episodes.
+            // The file has neither policy versions nor single episodes.
             policy_version: 0,
             returns: Vec::new(),
             return_mean: self.return_mean[index],
@@ -175,7 +177,7 @@ impl RunRecord {
 /// Encodes the file.
 ///
 /// # Errors
-/// None is known: it is written into memory.
+/// Serialization fails, which is not expected.
 pub(super) fn encode(results: &Results) -> anyhow::Result<Vec<u8>> {
     let Results { tasks, methods, sweeps, not_started: waiting, .. } = results;
     let head = Head { format_version: FORMAT_VERSION, tasks, methods, sweeps, waiting };
@@ -195,7 +197,7 @@ pub(super) fn find(report: &Path) -> Option<PathBuf> {
 /// Reads the tasks, methods, sweeps and runs of an earlier report.
 ///
 /// # Errors
-/// The file cannot be read, is of another format, or is damaged.
+/// The file cannot be read, has another format, or is invalid.
 pub(super) fn read(path: &Path) -> anyhow::Result<Results> {
     let report = path.parent().unwrap_or(Path::new("."));
     let name = path.display();
@@ -206,16 +208,16 @@ pub(super) fn read(path: &Path) -> anyhow::Result<Results> {
         FORMAT_VERSION_MIN..=FORMAT_VERSION => {}
         ..FORMAT_VERSION_MIN => bail!(
             "{name} has format {format_version}, expected {FORMAT_VERSION_MIN} to \
-             {FORMAT_VERSION}: it contains only curves; make that report again from its runs with \
+             {FORMAT_VERSION}: it contains only curves; recreate that report from its runs with \
              this program"
         ),
         _ => bail!(
             "{name} has format {format_version}, expected {FORMAT_VERSION_MIN} to \
-             {FORMAT_VERSION}: a newer program made it; use that program"
+             {FORMAT_VERSION}: it was written by a newer program; use that program"
         ),
     }
     let document: Document =
-        serde_json::from_str(&text).with_context(|| format!("{name} is damaged"))?;
+        serde_json::from_str(&text).with_context(|| format!("{name} is invalid"))?;
     let Document { tasks, methods, sweeps, waiting: not_started, runs, .. } = document;
     let mut results = Results { tasks, methods, sweeps, not_started, ..Results::default() };
     for (value, number) in runs.into_iter().zip(1..) {
@@ -224,14 +226,14 @@ pub(super) fn read(path: &Path) -> anyhow::Result<Results> {
         record.check().with_context(|| which.clone())?;
         ensure!(
             results.tasks.contains(&record.task) && results.methods.contains(&record.method),
-            "{which}: its task or method is not in the lists at the beginning of the file"
+            "{which}: its task or method is not in the lists at the start of the file"
         );
         results.runs.push(record.run(Source::Report(report.to_owned())));
     }
     Ok(results)
 }
 
-/// Returns task, method and seed of a run that may be damaged.
+/// Returns the task, method and seed of a run that may be invalid.
 fn title(run: &serde_json::Value) -> String {
     let parts = ["task", "method", "seed"].map(|key| run[key].to_string());
     parts.join(" · ").replace('"', "")
@@ -243,7 +245,7 @@ mod tests {
     use super::super::tables::tables;
     use super::*;
 
-    /// Two finished runs, of which one has joints, and one without an evaluation.
+    /// Two finished runs, of which one has a motion, and an unfinished one without an evaluation.
     fn results() -> Results {
         let run = |task, seed, rows: &[f64], ended| FixtureRun {
             task,
@@ -263,18 +265,18 @@ mod tests {
         results
     }
 
-    fn written(text: &[u8]) -> tempfile::TempDir {
+    fn folder_with(text: &[u8]) -> tempfile::TempDir {
         let folder = tempfile::tempdir().unwrap();
         fs::write(folder.path().join(FILE), text).unwrap();
         folder
     }
 
     #[test]
-    fn reading_returns_every_digit_that_was_written() {
+    fn numbers_survive_writing_and_reading_exactly() {
         let results = results();
         let text = encode(&results).unwrap();
         assert_eq!(text.iter().filter(|byte| **byte == b'\n').count(), 5, "one line per run");
-        let folder = written(&text);
+        let folder = folder_with(&text);
         let earlier = read(&folder.path().join(FILE)).unwrap();
         assert_eq!(String::from_utf8(encode(&earlier).unwrap()), String::from_utf8(text));
         let json = |results| serde_json::to_string(&tables(results)).unwrap();
@@ -289,7 +291,7 @@ mod tests {
     }
 
     #[test]
-    fn a_file_of_the_old_format_and_name_is_read() {
+    fn file_with_the_old_format_and_name_is_read() {
         let text = String::from_utf8(encode(&results()).unwrap()).unwrap();
         let older = text
             .replace("\"format_version\":3", "\"format_version\":2")
@@ -304,12 +306,12 @@ mod tests {
     }
 
     #[test]
-    fn only_the_rollout_that_is_drawn_is_kept() {
+    fn only_drawn_rollouts_are_kept() {
         let mut results = results();
         let mut second = results.runs[0].clone();
         second.seed = 2;
         results.runs.push(second);
-        let folder = written(&encode(&results).unwrap());
+        let folder = folder_with(&encode(&results).unwrap());
         let earlier = read(&folder.path().join(FILE)).unwrap();
         let motion = |index: usize| earlier.runs[index].motion.as_ref().unwrap();
         assert!(motion(0).rollout.is_some() && motion(3).rollout.is_none());
@@ -325,11 +327,11 @@ mod tests {
             ("\"updates\":[1000,2000]", "\"updates\":[1000,null]", "expected u64"),
             ("\"env_steps\":[1000,2000]", "\"env_steps\":[2000,1000]", "env_steps decreases"),
             (",[4.0]]", "]", "3 rows of positions and 2 of velocities"),
-            (",[0.3]]", ",[0.3,0.3]]", "rows that are not of its 1 joints"),
+            (",[0.3]]", ",[0.3,0.3]]", "rows whose length differs from its 1 joints"),
             ("\"policy\":\"mlp\"", "\"policy\":\"table\"", "unknown variant"),
         ] {
             assert!(text.contains(from), "{from}");
-            let folder = written(text.replacen(from, to, 1).as_bytes());
+            let folder = folder_with(text.replacen(from, to, 1).as_bytes());
             let error = format!("{:#}", read(&folder.path().join(FILE)).unwrap_err());
             for part in [FILE, run, expected] {
                 assert!(error.contains(part), "{part} is not in: {error}");
@@ -342,12 +344,12 @@ mod tests {
             ("\"methods\":[\"TD3\"]", "\"methods\":[]", "not in the lists"),
             ("-1.000049", "1e999", "number out of range"),
         ] {
-            let folder = written(text.replacen(from, to, 1).as_bytes());
+            let folder = folder_with(text.replacen(from, to, 1).as_bytes());
             let error = format!("{:#}", read(&folder.path().join(FILE)).unwrap_err());
             assert!(error.contains(FILE) && error.contains(expected), "{error}");
         }
         let ended = text.replacen("\"ended\":false", "\"ended\":true", 1);
-        let folder = written(ended.as_bytes());
+        let folder = folder_with(ended.as_bytes());
         let error = format!("{:#}", read(&folder.path().join(FILE)).unwrap_err());
         assert!(error.contains("run 3") && error.contains("without an evaluation"), "{error}");
     }

@@ -1,6 +1,6 @@
-//! Statistics over seeds: mean and standard deviation, and from four seeds on interquartile mean
-//! and median with bootstrap intervals. With fewer seeds, the interquartile mean is the mean and a
-//! bootstrap interval is the range of the scores, so only the range is given.
+//! Statistics over seeds: mean and standard deviation, and with at least four seeds, interquartile
+//! mean and median with bootstrap intervals. With fewer seeds, the interquartile mean equals the
+//! mean, and a bootstrap interval is hardly more than the range, so only the range is given.
 //!
 //! Interquartile mean and stratified bootstrap follow Agarwal et al. 2021, "Deep Reinforcement
 //! Learning at the Edge of the Statistical Precipice" (arXiv 2108.13264), as implemented in their
@@ -12,11 +12,11 @@ use serde::Serialize;
 
 /// Minimum number of scores for an interquartile mean and an interval.
 pub const INTERVAL_SCORES_MIN: usize = 4;
-/// Number of resamples of a bootstrap; rliable's default.
-const REPETITIONS: usize = 50_000;
-/// Share of scores that an interquartile mean drops at each end.
-const CUT: f64 = 0.25;
-/// Quantiles at the ends of a 95 % interval.
+/// Number of bootstrap resamples, which is rliable's default.
+const RESAMPLES: usize = 50_000;
+/// Fraction of the scores that an interquartile mean drops at each end.
+const TRIMMED: f64 = 0.25;
+/// Quantiles that bound a 95 % interval.
 const QUANTILES: [f64; 2] = [0.025, 0.975];
 
 /// Summary of the scores of several seeds.
@@ -32,7 +32,7 @@ pub struct Summary {
     pub range: [f64; 2],
     /// Interquartile mean; `None` with fewer than four scores.
     pub iqm: Option<f64>,
-    /// Its 95 % interval by bootstrap; `None` with fewer than four scores.
+    /// 95 % bootstrap interval of the interquartile mean; `None` with fewer than four scores.
     pub interval: Option<[f64; 2]>,
 }
 
@@ -55,14 +55,15 @@ impl Summary {
         Some(Self { count, mean, std, range, iqm: Some(iqm), interval: Some(interval) })
     }
 
-    /// Returns the interquartile mean with its interval, or mean with range for too few scores.
+    /// Returns the interquartile mean and its interval, or with fewer than four scores the mean and
+    /// the range.
     #[must_use]
     pub fn point_and_bounds(&self) -> (f64, [f64; 2]) {
         (self.iqm.unwrap_or(self.mean), self.interval.unwrap_or(self.range))
     }
 }
 
-/// Returns the lowest and the highest of at least one score.
+/// Returns the lowest and the highest score, of at least one.
 pub(super) fn range(scores: &[f64]) -> [f64; 2] {
     let low = scores.iter().copied().fold(f64::INFINITY, f64::min);
     let high = scores.iter().copied().fold(f64::NEG_INFINITY, f64::max);
@@ -73,12 +74,12 @@ pub(super) fn range(scores: &[f64]) -> [f64; 2] {
 #[must_use]
 pub fn interquartile_mean(scores: &mut [f64]) -> f64 {
     scores.sort_by(f64::total_cmp);
-    let cut = (scores.len() as f64 * CUT) as usize;
+    let cut = (scores.len() as f64 * TRIMMED) as usize;
     let middle = &scores[cut..scores.len() - cut];
     middle.iter().sum::<f64>() / middle.len() as f64
 }
 
-/// Returns the interquartile mean over all scores, and its 95 % interval by [`bootstrap`].
+/// Returns the interquartile mean of all scores, and its 95 % interval by [`bootstrap`].
 ///
 /// - `scores`: (task, run), at least one.
 #[must_use]
@@ -86,8 +87,8 @@ pub fn interquartile_mean_with_interval(scores: &[Vec<f64>]) -> (f64, [f64; 2]) 
     bootstrap(scores, interquartile_mean)
 }
 
-/// Returns the median, and its 95 % interval by [`bootstrap`], or the range for fewer than four
-/// scores. Unlike a mean, it is finite while fewer than half of the scores are infinite.
+/// Returns the median, and its 95 % interval by [`bootstrap`], or the range with fewer than four
+/// scores. Unlike a mean, the median is finite if fewer than half of the scores are infinite.
 ///
 /// - `scores`: at least one; infinite for a seed that never reached a threshold.
 #[must_use]
@@ -110,36 +111,36 @@ fn median(scores: &mut [f64]) -> f64 {
 /// The bootstrap is stratified: the runs of each task are resampled from those of the same task.
 /// Its seed is fixed.
 fn bootstrap(scores: &[Vec<f64>], statistic: fn(&mut [f64]) -> f64) -> (f64, [f64; 2]) {
-    let mut drawn: Vec<f64> = scores.concat();
-    let point = statistic(&mut drawn);
+    let mut sample: Vec<f64> = scores.concat();
+    let point = statistic(&mut sample);
     if scores.iter().all(|runs| runs.iter().all(|score| *score == runs[0])) {
         // All resamples are equal.
         return (point, [point; 2]);
     }
     let mut random = seeds::stream(0, "bootstrap", 0);
-    let mut values: Vec<f64> = (0..REPETITIONS)
+    let mut values: Vec<f64> = (0..RESAMPLES)
         .map(|_| {
-            drawn.clear();
+            sample.clear();
             for runs in scores {
-                drawn.extend((0..runs.len()).map(|_| runs[random.random_range(0..runs.len())]));
+                sample.extend((0..runs.len()).map(|_| runs[random.random_range(0..runs.len())]));
             }
-            statistic(&mut drawn)
+            statistic(&mut sample)
         })
         .collect();
     values.sort_by(f64::total_cmp);
     (point, QUANTILES.map(|quantile| quantile_of(&values, quantile)))
 }
 
-/// Interpolates linearly between two sorted values, like NumPy's default.
+/// Returns a quantile of sorted values, with linear interpolation as in NumPy's default.
 fn quantile_of(sorted: &[f64], quantile: f64) -> f64 {
-    let place = quantile * (sorted.len() - 1) as f64;
-    let (below, share) = (place.floor() as usize, place.fract());
+    let position = quantile * (sorted.len() - 1) as f64;
+    let (below, fraction) = (position.floor() as usize, position.fract());
     let above = (below + 1).min(sorted.len() - 1);
     if sorted[below] == sorted[above] {
-        // The difference of two infinite values is NaN.
+        // Avoids the difference of two infinite values, which is NaN.
         return sorted[below];
     }
-    sorted[below] + share * (sorted[above] - sorted[below])
+    sorted[below] + fraction * (sorted[above] - sorted[below])
 }
 
 #[cfg(test)]
@@ -170,7 +171,7 @@ mod tests {
         for Case { scores, interquartile_mean, interval } in golden.cases {
             let (point, ours) = interquartile_mean_with_interval(&scores);
             assert!((point - interquartile_mean).abs() < 1e-12, "{point} {interquartile_mean}");
-            // Both sample at random, and quantiles of so few values lie on steps.
+            // Both are random, and quantiles of so few values change in steps.
             let tolerance = 0.04 * (interval[1] - interval[0]);
             for (ours, theirs) in ours.into_iter().zip(interval) {
                 assert!((ours - theirs).abs() <= tolerance, "{ours} {theirs} of {scores:?}");
@@ -179,7 +180,7 @@ mod tests {
     }
 
     #[test]
-    fn one_score_has_no_spread() {
+    fn single_score_has_no_spread() {
         let summary = Summary::of(&[-4.5]).unwrap();
         let range = [-4.5; 2];
         let expected = Summary { count: 1, mean: -4.5, std: 0.0, range, iqm: None, interval: None };
@@ -201,7 +202,7 @@ mod tests {
     }
 
     #[test]
-    fn a_median_treats_infinite_scores_as_the_largest() {
+    fn median_treats_infinite_scores_as_the_largest() {
         let never = f64::INFINITY;
         assert_eq!(median_with_bounds(&[3.0, 1.0, 2.0]), (2.0, [1.0, 3.0]));
         assert_eq!(median_with_bounds(&[1.0, 2.0]).0, 1.5);

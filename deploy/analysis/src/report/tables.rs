@@ -1,4 +1,4 @@
-//! Tables of a report: each measure by task and method.
+//! Builds the tables of a report: one per measure, by task and method.
 
 use dmprl_run::format::grouped;
 use serde::Serialize;
@@ -9,7 +9,7 @@ use super::provenance::SoftwareCounts;
 use super::results::Results;
 use super::statistics::Summary;
 
-/// One table: a cell for each task and method.
+/// The table of a measure, with a cell for each task and method.
 #[derive(Debug, Clone, Serialize)]
 pub struct Table {
     /// Heading.
@@ -18,7 +18,7 @@ pub struct Table {
     pub about: &'static str,
     /// Number of decimals.
     pub digits: usize,
-    /// Group of the measure, which decides the table's place in the report.
+    /// Group of the measure, which determines the table's position in the report.
     #[serde(skip)]
     pub kind: MeasureKind,
     /// Rows: a task and its cells in the order of the methods.
@@ -28,13 +28,13 @@ pub struct Table {
 /// The values of one task and method.
 #[derive(Debug, Clone, Default, PartialEq, Serialize)]
 pub struct Cell {
-    /// Summary over the seeds; `None` if no value is known.
+    /// Summary over the seeds with a value; `None` if there are none.
     pub summary: Option<Summary>,
     /// Number of unfinished seeds.
     pub unfinished: usize,
     /// Number of finished seeds whose value is unknown.
     pub unknown: usize,
-    /// Mean and standard deviation in the paper.
+    /// Mean and standard deviation that the paper reports.
     pub paper: Option<(f64, f64)>,
     /// Number of programs and sets of packages.
     #[serde(flatten)]
@@ -42,7 +42,7 @@ pub struct Cell {
 }
 
 impl Cell {
-    /// Formats the lines of the cell.
+    /// Returns the cell's lines of text.
     #[must_use]
     pub fn lines(&self, digits: usize) -> Vec<String> {
         let mut lines = Vec::new();
@@ -50,7 +50,7 @@ impl Cell {
             None if self.unknown > 0 => lines.push("not measured".to_owned()),
             None if self.unfinished > 0 => lines.push("not finished".to_owned()),
             None => lines.push("not run".to_owned()),
-            // The spread of one seed is unknown, not zero.
+            // With one seed, the standard deviation is unknown, not zero.
             Some(Summary { count: 1, mean, .. }) => {
                 lines.extend([number(*mean, digits), format!("1 seed{}", self.software.mark())]);
             }
@@ -77,7 +77,7 @@ impl Cell {
     }
 }
 
-/// Formats a number; a count, which has no decimals, with separators of thousands.
+/// Formats a number; without decimals, with thousands separators.
 fn number(value: f64, digits: usize) -> String {
     if digits == 0 && value >= 0.0 {
         grouped(value.round() as u64)
@@ -86,7 +86,7 @@ fn number(value: f64, digits: usize) -> String {
     }
 }
 
-/// Returns the table of each measure for which a value is known.
+/// Returns the tables of the measures for which any value is known.
 #[must_use]
 pub fn tables(results: &Results) -> Vec<Table> {
     let shows = |table: &Table| {
@@ -104,14 +104,14 @@ fn table(results: &Results, measure: Measure) -> Table {
             summary: Summary::of(&scores),
             unfinished: runs().filter(|run| run.last().is_none()).count(),
             unknown: runs().filter(|run| run.last().is_some() && measure.of(run).is_none()).count(),
-            paper: measure.in_paper().and_then(|figure| reported(figure, task, method)),
+            paper: measure.in_paper().and_then(|table| reported(table, task, method)),
         }
     };
     let rows = results.tasks.iter().map(|task| {
         let cells = results.methods.iter().map(|method| cell(task, method));
         (task.clone(), cells.collect::<Vec<_>>())
     });
-    // Omit tasks without the measure, for instance tasks that do not report success.
+    // Omits tasks that do not have the measure, such as the success rate.
     let has_measure = |(_, cells): &(String, Vec<Cell>)| {
         cells.iter().any(|cell| cell.summary.is_some())
             || cells.iter().all(|cell| cell.unknown == 0)
@@ -131,7 +131,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_cell_shows_the_range_below_four_seeds_and_marks_several_programs() {
+    fn cell_shows_the_range_below_four_seeds_and_marks_several_programs() {
         let run = |seed| FixtureRun {
             task: "point-reach",
             method: "TD3",
@@ -151,7 +151,7 @@ mod tests {
         three.runs.iter_mut().for_each(|run| run.origin.programs = vec![known()]);
         three.runs[0].origin.programs = vec![known(), known()];
         three.runs[0].origin.packages.push("Python 3.11.7".to_owned());
-        assert_eq!(lines(&three)[2], "3 seeds", "one was resumed by the same program");
+        assert_eq!(lines(&three)[2], "3 seeds", "a run was resumed by the same program");
         let mut one = fixture_results(&runs[..1]);
         assert_eq!(lines(&one), ["-1.0", "1 seed"]);
         one.runs[0].origin.programs = vec![known(), "0.1.0 (commit 5678)".to_owned()];
@@ -165,7 +165,7 @@ mod tests {
     }
 
     #[test]
-    fn a_task_without_success_has_no_row_in_its_table() {
+    fn task_without_success_rate_has_no_row_in_its_table() {
         let run =
             |task, method, ended| FixtureRun { task, method, seed: 1, rows: vec![0.5], ended };
         let results = fixture_results(&[

@@ -1,20 +1,21 @@
-//! Thresholds that define when a task counts as learnt, and when the paper reports reaching them.
+//! Thresholds at which a task counts as learnt, and the steps after which the paper reports to
+//! reach them.
 
 use super::measures::Measure;
 
-/// Value that an evaluation of a task must reach.
+/// Minimum that an evaluation must reach for its task to count as learnt.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Threshold {
     /// Measure of the evaluation.
     pub measure: Measure,
-    /// Its minimum.
+    /// Minimum of the measure.
     pub value: f64,
     /// Source of the threshold.
     pub source: &'static str,
 }
 
 impl Threshold {
-    /// Formats `return ≥ -10`.
+    /// Describes the threshold, such as `return ≥ -10`.
     #[must_use]
     pub fn text(&self) -> String {
         let what = if self.measure == Measure::Success { "success" } else { "return" };
@@ -22,7 +23,7 @@ impl Threshold {
     }
 }
 
-/// The thresholds by task; other tasks have none.
+/// Thresholds by task; other tasks have none.
 const THRESHOLDS: [(&[&str], Threshold); 4] = [
     (
         &["reacher-v1", "reacher"],
@@ -50,8 +51,8 @@ const THRESHOLDS: [(&[&str], Threshold); 4] = [
     ),
 ];
 
-/// Environment steps at which methods reach the threshold, in the words of the paper's section 4.2:
-/// task, method, steps. The paper reports no others.
+/// Task, method, and the environment steps after which it reaches the threshold, in the words of
+/// the paper's section 4.2. The paper reports no others.
 const REPORTED_STEPS: [(&str, &str, &str); 5] = [
     ("reacher-v1", "DDPG-DMP (paper)", "about 26,000"),
     ("reacher-v1", "DDPG", "about 33,000"),
@@ -79,7 +80,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn both_versions_of_a_task_share_a_threshold() {
+    fn versions_of_a_task_share_a_threshold() {
         assert_eq!(threshold("reacher").unwrap().text(), "return ≥ -10");
         assert_eq!(threshold("reacher"), threshold("reacher-v1"));
         assert_eq!(threshold("panda-reach-joints").unwrap().text(), "success ≥ 0.95");
@@ -87,7 +88,7 @@ mod tests {
     }
 
     #[test]
-    fn the_paper_reports_steps_on_its_own_tasks_only() {
+    fn steps_are_reported_only_for_the_papers_tasks_and_methods() {
         assert_eq!(reported_steps("reacher-v1", "DDPG"), Some("about 33,000"));
         assert_eq!(reported_steps("reacher", "DDPG"), None);
         assert_eq!(reported_steps("reacher-v1", "DDPG-DMP"), None);

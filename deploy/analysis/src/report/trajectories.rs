@@ -1,4 +1,4 @@
-//! Draws the joints over a rollout of each method, as in the paper's Figures 6 and 7.
+//! Draws the joint trajectories of a rollout of each method, as in the paper's Figures 6 and 7.
 
 use anyhow::anyhow;
 use dmprl_run::safe_name;
@@ -9,8 +9,8 @@ use super::results::{Results, ShownRollout};
 use super::run::Run;
 use crate::plots::{Panel, SmallMultiples, colour};
 
-/// Draws positions and velocities for each task whose joints are known, with the same episode for
-/// every method.
+/// Draws joint positions and velocities for each task whose joints are known. The pictures of a
+/// task show the same episode for every method.
 ///
 /// # Errors
 /// A picture cannot be drawn.
@@ -43,8 +43,8 @@ pub fn trajectories(results: &Results) -> anyhow::Result<Vec<Picture>> {
     Ok(pictures)
 }
 
-/// Names the methods without a panel although an earlier report measured the joints of a run: a
-/// report keeps only the rollouts that it draws.
+/// Lists the methods that have no panel although an earlier report measured their motion. This
+/// happens because a report keeps only the rollouts that it draws.
 #[must_use]
 pub fn missing_trajectories(results: &Results) -> Vec<String> {
     let mut missing = Vec::new();
@@ -94,7 +94,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn every_method_has_a_panel_of_the_same_episode_without_sliding_joints() {
+    fn methods_with_a_rollout_of_the_same_episode_have_panels_without_sliding_joints() {
         let run = |method, seed| FixtureRun {
             task: "pusher-v0",
             method,
@@ -123,13 +123,13 @@ mod tests {
             assert!(svg.contains(text), "{text} is missing");
         }
         for text in ["TD3", "NDP", "seed 2", "finger"] {
-            assert!(!svg.contains(text), "{text} is there");
+            assert!(!svg.contains(text), "{text} is in the picture");
         }
         assert!(pictures[0].svg.contains("joint position [rad]"));
     }
 
     #[test]
-    fn without_motion_there_is_no_picture() {
+    fn no_picture_without_motion() {
         let run = FixtureRun {
             task: "pusher-v0",
             method: "SAC",
@@ -141,7 +141,7 @@ mod tests {
     }
 
     #[test]
-    fn another_seed_replaces_a_rollout_that_was_not_kept_or_the_loss_is_reported() {
+    fn missing_rollout_is_replaced_by_another_seed_or_reported() {
         let run = |method, seed| FixtureRun {
             task: "pusher-v0",
             method,

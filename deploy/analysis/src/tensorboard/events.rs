@@ -1,4 +1,5 @@
-//! TensorBoard's event files: TFRecords of `tensorflow.Event` messages, with their field numbers.
+//! Writes TensorBoard event files: TFRecords of `tensorflow.Event` messages. The field numbers are
+//! those of TensorFlow.
 
 use std::fs::File;
 use std::io::{BufWriter, Write};
@@ -6,9 +7,10 @@ use std::path::Path;
 
 use prost::Message;
 
-/// `SessionLog.SessionStatus` START: readers drop earlier events at or after its step.
+/// `SessionLog.SessionStatus` START: readers drop earlier events whose step is not less than that
+/// of this event.
 const START: i32 = 1;
-/// Mask of the checksums in TFRecord.
+/// Constant that TFRecord adds to its checksums.
 const MASK: u32 = 0xa282_ead8;
 
 /// One record of an event file.
@@ -22,6 +24,7 @@ struct Event {
     what: Option<What>,
 }
 
+/// The oneof `what` of `tensorflow.Event`.
 #[derive(Clone, PartialEq, prost::Oneof)]
 enum What {
     #[prost(string, tag = "3")]
@@ -56,7 +59,7 @@ struct SessionLog {
 pub(super) struct EventFile(BufWriter<File>);
 
 impl EventFile {
-    /// Creates a file with its header.
+    /// Creates a file and writes its header.
     pub(super) fn create(path: &Path, wall_time: f64) -> std::io::Result<Self> {
         let mut file = Self(BufWriter::new(File::create(path)?));
         let version = What::FileVersion("brain.Event:2".into());
@@ -66,7 +69,9 @@ impl EventFile {
         Ok(file)
     }
 
-    /// Writes scalars of one step, by tag.
+    /// Writes the scalars of a step.
+    ///
+    /// - `scalars`: tag and value of each.
     pub(super) fn scalars(
         &mut self,
         wall_time: f64,
@@ -89,13 +94,14 @@ impl EventFile {
         let data = event.encode_to_vec();
         let length = (data.len() as u64).to_le_bytes();
         self.0.write_all(&length)?;
-        self.0.write_all(&masked(&length).to_le_bytes())?;
+        self.0.write_all(&masked_crc(&length).to_le_bytes())?;
         self.0.write_all(&data)?;
-        self.0.write_all(&masked(&data).to_le_bytes())
+        self.0.write_all(&masked_crc(&data).to_le_bytes())
     }
 }
 
-fn masked(bytes: &[u8]) -> u32 {
+/// Returns the masked CRC-32C of TFRecord.
+fn masked_crc(bytes: &[u8]) -> u32 {
     crc32c::crc32c(bytes).rotate_right(15).wrapping_add(MASK)
 }
 
@@ -106,9 +112,9 @@ pub(super) fn scalars_of(mut bytes: &[u8]) -> Vec<(String, i64, f32)> {
     while !bytes.is_empty() {
         let (head, rest) = bytes.split_at(12);
         let length = u64::from_le_bytes(head[..8].try_into().unwrap()) as usize;
-        assert_eq!(head[8..], masked(&head[..8]).to_le_bytes());
+        assert_eq!(head[8..], masked_crc(&head[..8]).to_le_bytes());
         let (data, rest) = rest.split_at(length);
-        assert_eq!(rest[..4], masked(data).to_le_bytes());
+        assert_eq!(rest[..4], masked_crc(data).to_le_bytes());
         bytes = &rest[4..];
         let event = Event::decode(data).unwrap();
         if let Some(What::Summary(Summary { value })) = event.what {

@@ -1,5 +1,4 @@
-//! Compares the mirror with the lines. `envs_py/tests_extras` checks it with TensorBoard's own
-//! reader.
+//! Compares the event file with the lines. `envs_py/tests_extras` reads it with TensorBoard.
 
 use std::fs::OpenOptions;
 use std::io::Write;
@@ -28,7 +27,7 @@ fn mirrored(run: &RunDirectory) -> Vec<(String, i64, f32)> {
 }
 
 #[test]
-fn new_lines_follow_and_half_a_line_waits() {
+fn complete_lines_are_copied_and_an_incomplete_one_waits() {
     let parent = tempfile::tempdir().unwrap();
     let run = new_run(&parent);
     let mut writer = Writer::new(&run);
@@ -56,7 +55,7 @@ fn new_lines_follow_and_half_a_line_waits() {
 }
 
 #[test]
-fn a_resume_that_goes_back_leaves_nothing_of_what_it_took_back() {
+fn event_file_has_no_rows_that_a_resume_removed() {
     let parent = tempfile::tempdir().unwrap();
     let run = new_run(&parent);
     let line = |step: u64, number: f64| format!("{{\"env_steps\":{step},\"q_mean\":{number}}}\n");
@@ -85,7 +84,7 @@ fn a_resume_that_goes_back_leaves_nothing_of_what_it_took_back() {
 }
 
 #[test]
-fn the_thread_takes_over_the_last_line_before_it_ends() {
+fn drop_waits_until_the_last_line_is_copied() {
     let parent = tempfile::tempdir().unwrap();
     let run = new_run(&parent);
     let mirror = Mirror::start(&run);

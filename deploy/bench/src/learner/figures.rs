@@ -7,15 +7,15 @@ use serde_json::{Map, Value, json};
 use super::{LearnerBench, PeerKind};
 use crate::statistics::{load_average, max, median, min};
 
-/// The learner of a run.
+/// Name of the learner's own update in the report.
 pub(super) const OURS: &str = "ours";
-/// The matrix products by the `gemm` crate.
+/// Name of the matrix products with the `gemm` crate.
 pub(super) const LIBRARY: &str = "floor_library";
-/// The matrix products by our own kernels.
+/// Name of the matrix products with the learner's kernels.
 pub(super) const KERNELS: &str = "floor_kernels";
-/// Sampling a batch, alone.
+/// Name of sampling a batch.
 pub(super) const SAMPLE: &str = "sample";
-/// The optimiser and the target networks, alone.
+/// Name of the optimiser and the target networks.
 pub(super) const OPTIMISER: &str = "optimiser";
 
 /// Duration of one update, or of a part of it.
@@ -23,12 +23,12 @@ pub(super) const OPTIMISER: &str = "optimiser";
 pub(crate) struct Timed {
     /// Wall time \[s\].
     pub(crate) wall_s: f64,
-    /// Processor time of all threads \[s\], which other programs on the machine affect least.
+    /// Processor time of all threads \[s\]. Other programs affect it less than wall time.
     pub(crate) cpu_s: f64,
 }
 
 impl Timed {
-    /// Divides the time of `count` updates by their number.
+    /// Divides both times by `count`.
     pub(crate) fn over(self, count: f64) -> Self {
         Self { wall_s: self.wall_s / count, cpu_s: self.cpu_s / count }
     }
@@ -41,9 +41,9 @@ pub struct Figures {
     pub(super) seconds: f64,
     machine: Option<Machine>,
     load_average: Option<f64>,
-    /// (name, rounds), without absent candidates.
+    /// (name, rounds) of each available candidate.
     rounds: Vec<(&'static str, Vec<Timed>)>,
-    /// (name, description or reason for absence).
+    /// (name, description or reason why it is unavailable).
     pub(super) notes: Vec<(&'static str, String)>,
     /// Peak resident memory of the learner, including its replay.
     pub(super) peak_memory_bytes: Option<u64>,
@@ -70,7 +70,7 @@ impl Figures {
         }
     }
 
-    /// Describes `name`, or gives the reason for its absence.
+    /// Adds a description of `name`, or the reason why it is unavailable.
     pub(super) fn note(&mut self, name: &'static str, text: &str) {
         self.notes.push((name, text.to_owned()));
     }
@@ -84,7 +84,7 @@ impl Figures {
         self.rounds(OURS).len()
     }
 
-    /// Wall time of an update in each round, in milliseconds.
+    /// Returns the wall time of an update in each round [ms].
     pub(super) fn all_ms(&self, name: &str) -> Vec<f64> {
         self.rounds(name).iter().map(|timed| 1e3 * timed.wall_s).collect()
     }
@@ -97,26 +97,26 @@ impl Figures {
         median(&self.rounds(name).iter().map(|timed| 1e3 * timed.cpu_s).collect::<Vec<_>>())
     }
 
-    /// Name of the faster implementation of the products, over all rounds.
+    /// Returns the name of the implementation of the products that is faster over all rounds.
     pub(super) fn floor(&self) -> &'static str {
         let kernels = self.ms(KERNELS) < self.ms(LIBRARY);
         if kernels { KERNELS } else { LIBRARY }
     }
 
-    /// The time of `a` divided by that of `b`. It is the median of the rounds' own ratios, because
-    /// a machine's speed drifts less within a round than over all of them.
+    /// The time of `a` divided by that of `b`: the median of the ratios in each round, because the
+    /// machine's speed drifts less within a round than between rounds.
     pub(super) fn ratio(&self, a: &str, b: &str, of: impl Fn(&Timed) -> f64) -> Option<f64> {
         let pairs = self.rounds(a).iter().zip(self.rounds(b));
         median(&pairs.map(|(a, b)| of(a) / of(b)).collect::<Vec<_>>())
     }
 
-    /// Wall time of `name` divided by that of our update.
+    /// Wall time of `name` divided by that of the learner's update.
     pub(super) fn ratio_to_ours(&self, name: &str) -> Option<f64> {
         self.ratio(name, OURS, |timed| timed.wall_s)
     }
 
-    /// (part, its share of an update). Each part is measured alone. The rest are activation
-    /// functions, the DMP, losses, noise and synchronisation of the threads.
+    /// (part, its share of an update). Each part is measured alone. The rest consists of activation
+    /// functions, DMP, losses, noise and thread synchronisation.
     pub(super) fn shares(&self) -> Option<[(&'static str, f64); 4]> {
         let sample = self.ratio_to_ours(SAMPLE)?;
         let products = self.ratio_to_ours(self.floor())?;
@@ -125,7 +125,7 @@ impl Figures {
         Some([("sample", sample), ("products", products), (OPTIMISER, optimiser), ("rest", rest)])
     }
 
-    /// The figures as one JSON object; unavailable ones are null.
+    /// Returns the figures as one JSON object. Unavailable ones are null.
     #[must_use]
     pub fn json(&self) -> Value {
         let floor = self.floor();
@@ -203,7 +203,7 @@ pub(super) mod tests {
         };
         figures.note("torch", "PyTorch, eager");
         figures.note("jax", "is not installed");
-        // The machine becomes four times, then twice as slow during the measurement.
+        // The machine is four times slower in the second round, and twice in the third.
         for slow in [1.0, 4.0, 2.0] {
             for (name, ms) in [
                 (OURS, 5.0),
@@ -221,7 +221,7 @@ pub(super) mod tests {
     }
 
     #[test]
-    fn the_object_has_medians_ratios_shares_and_null_for_what_is_absent() {
+    fn json_has_medians_ratios_shares_and_null_for_absent_peers() {
         let json = figures().json();
         let close = |key: &str, expected: f64| {
             let got = json[key].as_f64().unwrap();
@@ -245,7 +245,7 @@ pub(super) mod tests {
     }
 
     #[test]
-    fn the_shares_of_an_update_add_up_to_it() {
+    fn shares_of_an_update_add_up_to_one() {
         let shares = figures().shares().unwrap();
         let expected = [0.05, 0.8, 0.1, 0.05];
         for ((part, got), expected) in shares.iter().zip(expected) {

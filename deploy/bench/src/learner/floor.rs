@@ -1,8 +1,8 @@
-//! The floor of an update: computes its matrix products (`products`) and nothing else.
+//! The floor of an update's duration: the time of its matrix products (`products`) alone.
 //!
-//! [`Floor`] has the operands of the products. Products of the same shape share their operands, as
-//! a network's passes share its weights. It uses the library's product or the learner's kernels;
-//! the faster of the two is the floor.
+//! [`Floor`] owns the operands of the products. Products of the same shape share their operands,
+//! as a network's passes share its weights. It computes them with the library or with the learner's
+//! kernels; the faster of the two is the floor.
 
 use dmprl_learner::update::SHARD_ROWS;
 use dmprl_learner::update::kernels::{
@@ -61,7 +61,7 @@ struct Operands {
 impl Operands {
     fn new(shape: Shape, instructions: InstructionSet) -> Self {
         let Shape { rows, inputs, outputs } = shape;
-        // Any numbers except denormals, which are slow.
+        // Arbitrary numbers, but not denormals, which are slow.
         let numbers = |len: usize| (0..len).map(|i| (i as f32).sin()).collect::<Vec<_>>();
         let weights = numbers(outputs * inputs);
         let mut packed = vec![0.0; packed_len(inputs, outputs)];
@@ -76,7 +76,7 @@ impl Operands {
         }
     }
 
-    fn library(&mut self, kind: ProductKind) {
+    fn run_library(&mut self, kind: ProductKind) {
         let Shape { rows, inputs, outputs } = self.shape;
         let Self { inputs: x, outputs: y, weights: w, .. } = self;
         match kind {
@@ -95,7 +95,7 @@ impl Operands {
         }
     }
 
-    fn kernels(&mut self, kind: ProductKind, instructions: InstructionSet) {
+    fn run_kernels(&mut self, kind: ProductKind, instructions: InstructionSet) {
         let Shape { inputs, outputs, .. } = self.shape;
         let Self { inputs: x, outputs: y, weights, packed, bias, .. } = self;
         let shards = x.chunks_mut(SHARD_ROWS * inputs).zip(y.chunks_mut(SHARD_ROWS * outputs));
@@ -158,8 +158,8 @@ impl Floor {
         for FloorProduct { product, operands } in &self.products {
             let operands = &mut self.operands[*operands];
             match engine {
-                Engine::Library => operands.library(product.kind),
-                Engine::Kernels => operands.kernels(product.kind, self.instructions),
+                Engine::Library => operands.run_library(product.kind),
+                Engine::Kernels => operands.run_kernels(product.kind, self.instructions),
             }
         }
     }
@@ -181,7 +181,7 @@ mod tests {
                 .chain(Product::weight_gradient(&shape, 70))
         };
         let (mut library, mut kernels) = (Floor::new(products()), Floor::new(products()));
-        // Each product reads operands that earlier ones wrote.
+        // Some products read operands that others have written.
         library.run(Engine::Library);
         kernels.run(Engine::Kernels);
         for (a, b) in library.operands.iter().zip(&kernels.operands) {

@@ -1,20 +1,20 @@
 //! `dmprl bench learner`: compares an update with its matrix products, PyTorch and JAX.
 //!
 //! `ours` is the learner of a run on a replay full of synthetic segments (`synthetic`), so it needs
-//! neither Python nor an environment. The floor consists of the update's matrix products only
-//! (`products`, `floor`). Other parts of the update are measured alone (`work`, `optimiser`). The
-//! peers do the same update in their own processes (`peers`). In every round each candidate runs
-//! once for the same time while the others sleep, because a machine's speed drifts. The report has
-//! medians over the rounds, and medians of the rounds' own ratios (`figures`, `table`).
+//! neither Python nor an environment. The floor consists of the update's matrix products alone
+//! (`products`, `floor`). Other parts of the update are measured separately (`parts`, `optimiser`).
+//! The peers do the same update in their own processes (`peers`). Because a machine's speed drifts,
+//! each round runs every candidate once, for the same time, while the others sleep. The report has
+//! the medians over the rounds of the times and of their ratios (`figures`, `table`).
 
 mod figures;
 mod floor;
 mod optimiser;
+mod parts;
 mod peers;
 mod products;
 mod synthetic;
 mod table;
-mod work;
 
 use std::path::PathBuf;
 use std::time::Duration;
@@ -31,21 +31,21 @@ use crate::announce_round;
 
 pub use figures::Figures;
 pub(super) use figures::Timed;
+pub(super) use parts::timed;
 pub use peers::PeerKind;
 pub(super) use synthetic::fill;
-pub(super) use work::timed;
 
 use figures::{KERNELS, LIBRARY, OPTIMISER, OURS, SAMPLE};
 use floor::Engine;
+use parts::{FloorWork, OptimiserWork, SampleWork};
 use peers::Peer;
 use products::Cycle;
-use work::{FloorWork, OptimiserWork, SampleWork};
 
-/// Plan of the benchmark.
+/// Settings of the benchmark.
 pub struct LearnerBench {
     /// The resolved configuration.
     pub config: ExperimentConfig,
-    /// Spec with the task's sizes.
+    /// Spec of the task's environment.
     pub spec: EnvSpec,
     /// Peers that do the same update.
     pub peers: Vec<PeerKind>,
@@ -59,8 +59,8 @@ pub struct LearnerBench {
     pub duration: Duration,
 }
 
-/// Runs the benchmark; returns `None` if the user interrupted it. Leaves no process and no file
-/// behind.
+/// Runs the benchmark; returns `None` if the user interrupted it. Removes all its processes and
+/// files.
 ///
 /// # Errors
 /// The learner cannot be built or diverges, or a peer dies during a measurement.
@@ -77,12 +77,12 @@ fn measure(bench: &LearnerBench, progress: &dyn Progress) -> anyhow::Result<Figu
     let folder = folder.context("cannot make a folder for the peers' logs")?;
     progress.stage("filling the replay");
     let mut figures = Figures::new(bench);
-    // Started before the replay is filled, because importing their packages takes as long.
+    // Started first, so that they import their packages while the replay is filled.
     let mut peers = Vec::new();
     for kind in &bench.peers {
         match Peer::start(*kind, bench, folder.path()) {
             Ok(peer) => peers.push(peer),
-            // For example, --peer-python is no program.
+            // For example, `--peer-python` is not an executable.
             Err(error) => figures.note(kind.name(), &format!("{error:#}")),
         }
     }
@@ -92,7 +92,7 @@ fn measure(bench: &LearnerBench, progress: &dyn Progress) -> anyhow::Result<Figu
     timed(bench.duration, || Ok(learner.update()?))?;
     // Measured before the benchmark allocates its own buffers.
     figures.peak_memory_bytes = resident_bytes_max("self");
-    let mut work = Work::new(&learner)?;
+    let mut work = OwnWork::new(&learner)?;
     progress.stage("starting the peers");
     let mut ready = Vec::new();
     for mut peer in peers {
@@ -114,14 +114,14 @@ fn measure(bench: &LearnerBench, progress: &dyn Progress) -> anyhow::Result<Figu
     Ok(figures)
 }
 
-/// The parts of a round that this process measures itself.
-struct Work {
+/// The candidates that run in this process.
+struct OwnWork {
     floor: FloorWork,
     sample: SampleWork,
     optimiser: OptimiserWork,
 }
 
-impl Work {
+impl OwnWork {
     fn new(learner: &Learner) -> anyhow::Result<Self> {
         let cycle = Cycle::of(learner);
         Ok(Self {
@@ -139,13 +139,14 @@ impl Work {
         figures: &mut Figures,
     ) -> anyhow::Result<()> {
         let Self { floor, sample, optimiser } = self;
-        // Our update runs in the middle, so that drift of the machine's speed affects both sides.
+        // The update runs between the two floors, so that drift of the machine's speed affects
+        // both alike.
         figures.add(LIBRARY, floor.measure(Engine::Library, duration)?);
         watch.check()?;
         figures.add(OURS, timed(duration, || Ok(learner.update()?))?);
         watch.check()?;
         figures.add(KERNELS, floor.measure(Engine::Kernels, duration)?);
-        // These are small parts of an update, so a shorter time is enough.
+        // Short calls compared with an update: less time is enough.
         figures.add(SAMPLE, sample.measure(learner, duration / 4)?);
         figures.add(OPTIMISER, optimiser.measure(duration / 4)?);
         watch.check()

@@ -1,20 +1,20 @@
-//! The steps of the optimiser and the target networks alone, to measure their share of an update.
+//! The steps of the optimiser and the target networks, to measure their share of an update.
 
 use dmprl_learner::learner::Learner;
 use dmprl_learner::update::kernels::{AdamPass, InstructionSet, PolyakStep, StepSizes, adam};
 use dmprl_learner::update::network::TrainableNetwork;
 use dmprl_learner::update::thread_pool::ThreadPool;
 
-/// Number of the step. With a large one, the bias corrections are those of a long run.
+/// Step count: large, so that the bias corrections are those of a long run.
 const STEP: u64 = 100_000;
 /// Small enough that repeated steps do not change the numbers.
 const LEARNING_RATE: f64 = 1e-12;
 
-/// The optimiser steps of a cycle of updates, on numbers of their own.
+/// The optimiser steps of a cycle of updates, on networks of their own.
 #[derive(Debug)]
 pub(super) struct OptimiserSteps {
     pool: ThreadPool,
-    /// The parts of all networks, for each thread.
+    /// Each thread's parts of all networks.
     shares: Vec<Vec<NetworkPart>>,
     polyak: f32,
     /// Number of updates in a cycle.
@@ -30,12 +30,13 @@ struct NetworkPart {
     target: Vec<f32>,
     gradient: Vec<f32>,
     has_target: bool,
-    /// Steps in a cycle. TD3's actor does one, its critics do one per update.
+    /// Steps in a cycle: one for an actor, one per update for a critic.
     steps: u64,
 }
 
 impl OptimiserSteps {
-    /// Copies the sizes of the learner's networks. `updates` is the number of updates in a cycle.
+    /// Allocates networks of the same sizes as the learner's. `updates` is the number of updates in
+    /// a cycle.
     pub(super) fn new(learner: &Learner, updates: u64) -> Self {
         let config = learner.config();
         let (threads, polyak) = (config.learner.threads, config.algorithm.polyak as f32);
@@ -60,7 +61,7 @@ impl OptimiserSteps {
         pool.for_each(shares, |parts| {
             for part in parts {
                 for step in 1..=part.steps {
-                    // Targets move in the last update of a cycle.
+                    // Target networks change in the last update of a cycle.
                     let polyak = (part.has_target && step == part.steps).then_some(*polyak);
                     part.step(sizes, polyak, instructions);
                 }
@@ -71,7 +72,7 @@ impl OptimiserSteps {
 
 impl NetworkPart {
     fn new(len: usize, has_target: bool, steps: u64) -> Self {
-        // Any numbers whose moments are not denormals, which are slow.
+        // Arbitrary numbers, but without denormal moments, which are slow.
         let numbers = || (0..len).map(|i| 1.5 + (i as f32).sin()).collect::<Vec<_>>();
         Self {
             parameters: numbers(),
@@ -99,7 +100,7 @@ mod tests {
     use crate::learner::synthetic::tests::small_spec;
 
     #[test]
-    fn the_threads_shares_are_the_algorithms_networks() {
+    fn threads_share_all_networks_of_the_algorithm() {
         let mut layers = Layers::new();
         layers.set("test", "algorithm.name", "td3").unwrap();
         layers.set("test", "learner.threads", "3").unwrap();

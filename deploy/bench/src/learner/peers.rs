@@ -1,4 +1,4 @@
-//! The same update in PyTorch and JAX: processes of `tests/peers/learner_peer.py`.
+//! Peers of the learner: the same update in PyTorch and JAX (`tests/peers/learner_peer.py`).
 
 use std::fs::File;
 use std::path::Path;
@@ -17,10 +17,9 @@ use super::LearnerBench;
 use super::figures::Timed;
 use crate::child::LineChild;
 
-/// Time limit from a start to the first line. Importing PyTorch from a cold disk alone takes half a
-/// minute.
+/// Time limit until a peer is ready. Importing PyTorch from a cold disk alone takes half a minute.
 const READY: Duration = Duration::from_secs(300);
-/// Extra time that a measurement may take; the first one includes compilation.
+/// Time beyond a measurement's duration until it times out. The first one includes compilation.
 const MEASURE_SLACK: Duration = Duration::from_secs(120);
 
 /// A library that does the same update.
@@ -65,7 +64,7 @@ impl Peer {
         bench: &LearnerBench,
         folder: &Path,
     ) -> anyhow::Result<Self> {
-        if let Some(why) = cannot_do(&bench.config) {
+        if let Some(why) = unsupported(&bench.config) {
             bail!("{}", why);
         }
         let settings = folder.join("settings.json");
@@ -82,7 +81,7 @@ impl Peer {
             .arg(&settings)
             .args(["--threads", &bench.config.learner.threads.to_string()])
             .current_dir(folder)
-            // Keeps Python from writing next to the sources.
+            // Prevents Python from writing next to the sources.
             .env("PYTHONDONTWRITEBYTECODE", "1")
             .stderr(log);
         let child = LineChild::start(kind.name().to_owned(), command, &log_path)?;
@@ -96,10 +95,10 @@ impl Peer {
 
     /// Measures the time of one update.
     pub(super) fn measure(&mut self, watch: &Watch, duration: Duration) -> anyhow::Result<Timed> {
-        self.child.say(&format!("run {}", duration.as_secs_f64()))?;
-        let line = self.child.next(watch, duration + MEASURE_SLACK, "the measurement")?;
+        self.child.send_line(&format!("run {}", duration.as_secs_f64()))?;
+        let line = self.child.next_line(watch, duration + MEASURE_SLACK, "the measurement")?;
         let Ok(Measured { updates, seconds, cpu_s }) = serde_json::from_str(&line) else {
-            return Err(self.child.no_answer(&line));
+            return Err(self.child.unexpected_line(&line));
         };
         let name = self.kind.name();
         ensure!(updates > 0 && seconds > 0.0, "{name}: {updates} updates in {seconds} s");
@@ -108,20 +107,23 @@ impl Peer {
     }
 }
 
-/// Returns the reason if the script cannot do this configuration's update.
-fn cannot_do(config: &ExperimentConfig) -> Option<&'static str> {
+/// Returns the reason why the script cannot do this configuration's update, if any.
+fn unsupported(config: &ExperimentConfig) -> Option<&'static str> {
     let algorithm = &config.algorithm;
-    let otherwise = [
-        (algorithm.critic_layer_norm, "tests/peers does no layer normalisation"),
-        (algorithm.td3.actor_interval != 2, "tests/peers moves TD3's actor at every second update"),
-        (config.policy.rho == RhoKind::Free, "tests/peers bounds rho"),
-        (algorithm.action_rate_penalty > 0.0, "tests/peers puts no price on changes of actions"),
+    let differences = [
+        (algorithm.critic_layer_norm, "tests/peers has no layer normalisation"),
+        (
+            algorithm.td3.actor_interval != 2,
+            "tests/peers updates TD3's actor at every second update",
+        ),
+        (config.policy.rho == RhoKind::Free, "tests/peers has only a bounded rho"),
+        (algorithm.action_rate_penalty > 0.0, "tests/peers has no action rate penalty"),
     ];
-    otherwise.into_iter().find_map(|(differs, why)| differs.then_some(why))
+    differences.into_iter().find_map(|(differs, why)| differs.then_some(why))
 }
 
-/// `Settings` of `tests/golden/update/settings.py`: sizes, and everything that changes the amount
-/// of work.
+/// Returns the `Settings` of `tests/golden/update/settings.py`: sizes, and everything else that
+/// changes the amount of work.
 fn settings_of(config: &ExperimentConfig, spec: &EnvSpec) -> Value {
     let (algorithm, policy, dmp) = (&config.algorithm, &config.policy, &config.dmp);
     json!({
@@ -160,12 +162,12 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_peer_is_not_compared_with_another_update() {
+    fn peers_reject_configurations_with_another_update() {
         let with = |key: &str, value: &str| {
             let mut layers = Layers::new();
             layers.set("test", "algorithm.action_rate_penalty", "0.0").unwrap();
             layers.set("test", key, value).unwrap();
-            cannot_do(&layers.finish().unwrap())
+            unsupported(&layers.finish().unwrap())
         };
         assert_eq!(with("algorithm.batch_size", "64"), None);
         for (key, value) in [

@@ -1,4 +1,4 @@
-//! Lists the matrix products of an update of DDPG, TD3 and SAC, which are its floor.
+//! Lists the matrix products of an update of DDPG, TD3 and SAC, whose time is the floor.
 
 use dmprl_learner::algorithms::BatchShape;
 use dmprl_learner::learner::Learner;
@@ -6,16 +6,16 @@ use dmprl_learner::regime::Regime;
 use dmprl_shared::config::AlgorithmName;
 use dmprl_shared::policy::{Layer, MlpShape};
 
-/// The products of a cycle of updates, after which they repeat.
+/// The products of the shortest sequence of updates that repeats.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) struct Cycle {
     /// Products of all updates of the cycle.
     pub(super) products: Vec<Product>,
-    /// Number of updates. TD3 updates its actor only in the last one.
+    /// Number of updates in the cycle. TD3 updates its actor only in the last one.
     pub(super) updates: u64,
 }
 
-/// The operand of a layer that a product computes.
+/// Kind of a product, by its result for a layer.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum ProductKind {
     /// Y = X Wᵀ.
@@ -26,7 +26,7 @@ pub(super) enum ProductKind {
     WeightGradient,
 }
 
-/// One matrix product of an update, with rows * inputs * outputs multiplications and additions.
+/// One matrix product of an update: rows * inputs * outputs multiply-adds.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) struct Product {
     pub(super) kind: ProductKind,
@@ -51,14 +51,15 @@ impl Product {
         shape.layers()[1..].iter().map(of_layer)
     }
 
-    /// Returns the product of the inputs' gradient from column `first` on, which follows
+    /// Returns the product for the gradient of the inputs from column `first` on. It follows
     /// [`Product::backward`].
     pub(super) fn input_gradient(shape: &MlpShape, rows: usize, first: usize) -> Self {
         let all = Self::of(ProductKind::Backward, rows, &shape.layers()[0]);
         Self { inputs: all.inputs - first, ..all }
     }
 
-    /// Returns the products of the parameters' gradient, which follow [`Product::backward`].
+    /// Returns the products for the gradient of the parameters. They follow
+    /// [`Product::backward`].
     pub(super) fn weight_gradient(
         shape: &MlpShape,
         rows: usize,
@@ -72,7 +73,7 @@ impl Product {
     }
 }
 
-/// The networks of an algorithm, with the sizes of its batch.
+/// The networks of an algorithm, with the shape of its batch.
 struct Networks<'a> {
     actor: &'a MlpShape,
     critic: &'a MlpShape,
@@ -80,11 +81,11 @@ struct Networks<'a> {
 }
 
 impl Cycle {
-    /// Lists the products of the learner's networks, without those of the DMP. An on-policy
-    /// algorithm has none, because the benchmark does not support it.
+    /// Lists the products of the learner's networks, without those of the DMP. Empty for on-policy
+    /// algorithms, which the benchmark does not support.
     pub(super) fn of(learner: &Learner) -> Self {
-        let once = |products| Self { products, updates: 1 };
-        let Regime::OffPolicy(off_policy) = &learner.regime else { return once(Vec::new()) };
+        let one_update = |products| Self { products, updates: 1 };
+        let Regime::OffPolicy(off_policy) = &learner.regime else { return one_update(Vec::new()) };
         let all = learner.networks();
         let shape = |prefix: &str| {
             let network = all.iter().find(|(name, _)| name.starts_with(prefix));
@@ -95,15 +96,17 @@ impl Cycle {
         let config = &learner.config().algorithm;
         match config.name {
             AlgorithmName::Ddpg => {
-                once([networks.critics_step(1), networks.actor_step(1)].concat())
+                one_update([networks.critics_step(1), networks.actor_step(1)].concat())
             }
-            AlgorithmName::Sac => once([networks.critics_step(2), networks.actor_step(2)].concat()),
+            AlgorithmName::Sac => {
+                one_update([networks.critics_step(2), networks.actor_step(2)].concat())
+            }
             AlgorithmName::Td3 => {
                 let updates = config.td3.actor_interval;
                 let critics = networks.critics_step(2).repeat(updates as usize);
                 Self { products: [critics, networks.actor_step(1)].concat(), updates }
             }
-            AlgorithmName::Ndp => once(Vec::new()),
+            AlgorithmName::Ndp => one_update(Vec::new()),
         }
     }
 }
@@ -114,7 +117,7 @@ impl Networks<'_> {
     }
 
     /// Returns the products of a forward pass, a backward pass and the parameters' gradient.
-    fn learn(&self, shape: &MlpShape) -> Vec<Product> {
+    fn training(&self, shape: &MlpShape) -> Vec<Product> {
         let rows = self.batch.rows;
         let passes = Product::forward(shape, rows).chain(Product::backward(shape, rows));
         passes.chain(Product::weight_gradient(shape, rows)).collect()
@@ -128,16 +131,16 @@ impl Networks<'_> {
         passes.chain([Product::input_gradient(shape, rows, first)]).collect()
     }
 
-    /// Returns the products of a step of the critics: the actor on the next observations, each
-    /// target critic, then each critic's passes.
+    /// Returns the products of a step of the critics: the actor on the next observations, then each
+    /// target critic and each critic's training.
     fn critics_step(&self, critics: usize) -> Vec<Product> {
-        let each = [self.forward(self.critic), self.learn(self.critic)].concat();
+        let each = [self.forward(self.critic), self.training(self.critic)].concat();
         [self.forward(self.actor), each.repeat(critics)].concat()
     }
 
-    /// Returns the products of a step of the actor with the gradients of this many critics.
+    /// Returns the products of a step of the actor, with gradients from this many critics.
     fn actor_step(&self, critics: usize) -> Vec<Product> {
-        [self.learn(self.actor), self.actions_gradient().repeat(critics)].concat()
+        [self.training(self.actor), self.actions_gradient().repeat(critics)].concat()
     }
 }
 
@@ -148,7 +151,8 @@ mod tests {
     use super::*;
     use crate::learner::synthetic::tests::small_spec;
 
-    /// Returns the multiplications of an update with one hidden layer per network and B = 1.
+    /// Returns the multiplications and updates of a cycle, with one hidden layer per network and
+    /// B = 1.
     fn multiplications(algorithm: &str) -> (usize, u64) {
         let mut layers = Layers::new();
         for (key, value) in [
@@ -167,7 +171,7 @@ mod tests {
     }
 
     #[test]
-    fn an_updates_products_are_those_counted_by_hand() {
+    fn products_match_a_count_by_hand() {
         // Actor 4-10-2 (SAC 4-10-4), critic 6-100-1. The passes are forward, back to the hidden
         // layer, gradient of the weights, and back to the actions, which are 2 of the critic's 6
         // inputs.

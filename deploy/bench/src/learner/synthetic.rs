@@ -8,13 +8,13 @@ use dmprl_shared::spec::EnvSpec;
 /// Run id in the synthetic segments.
 pub(super) const RUN_ID: u64 = 1;
 
-/// Enough steps that batches do not come from the processor's cache.
+/// Number of steps to insert: enough that batches do not come from the processor's caches.
 const STEPS: usize = 100_000;
 
-/// Phase between two values. It is not commensurable with the sine's period.
+/// Phase step between two values. The sine never repeats, because 0.37 / 2 pi is irrational.
 const STRIDE: f32 = 0.37;
 
-/// Inserts complete episodes, one environment after the other.
+/// Inserts complete episodes, one after the other.
 pub(crate) fn fill(learner: &mut Learner, spec: &EnvSpec) -> anyhow::Result<()> {
     let layout = learner.policy().layout();
     let mut segment = Segment::zeroed(layout);

@@ -1,4 +1,4 @@
-//! The figures of `bench learner` as a table.
+//! Formats the figures of `bench learner` as a table.
 
 use dmprl_run::format::grouped;
 
@@ -7,7 +7,7 @@ use super::peers::PeerKind;
 use crate::statistics::{max, min};
 
 impl Figures {
-    /// Formats the figures as a table, like [`Figures::json`].
+    /// Returns the figures as a table.
     #[must_use]
     pub fn text(&self) -> String {
         let (algorithm, threads) = (&self.config.algorithm, self.config.learner.threads);
@@ -23,16 +23,13 @@ impl Figures {
             .to_lowercase(),
             format!("median of {} rounds of {} s", self.rounds_len(), self.seconds),
             String::new(),
-            format!(
-                "  {:<15} {:>9} {:>9}   {:<19} ours is",
-                "", "ms/update", "CPU ms", "from … to"
-            ),
+            format!("  {:<15} {:>9} {:>9}   {:<19} ours", "", "ms/update", "CPU ms", "from … to"),
         ];
         let rows = [(OURS, "ours"), (KERNELS, "floor, ours"), (LIBRARY, "floor, library")];
         lines.extend(rows.iter().map(|(name, label)| self.row(name, label)));
         let peers = PeerKind::ALL.iter().map(|kind| kind.name());
-        let asked = peers.filter(|name| self.notes.iter().any(|(noted, _)| noted == name));
-        lines.extend(asked.map(|name| self.row(name, name)));
+        let requested = peers.filter(|name| self.notes.iter().any(|(noted, _)| noted == name));
+        lines.extend(requested.map(|name| self.row(name, name)));
         lines.push(String::new());
         if let Some(ms) = self.ms(OURS) {
             let updates = 1e3 / ms;
@@ -71,7 +68,7 @@ mod tests {
     use crate::learner::figures::tests::figures;
 
     #[test]
-    fn the_table_says_how_ours_compares_and_what_was_asked_for_in_vain() {
+    fn table_shows_ratios_and_absent_peers() {
         let text = figures().text();
         let row = |name: &str| {
             let line = text.lines().find(|line| line.trim_start().starts_with(name)).unwrap();

@@ -1,4 +1,4 @@
-//! Measures the cost of a segment for each part of the system, and of an update for the learner.
+//! Measures the cost of a segment in each part of the system, and of an update in the learner.
 
 use std::path::{Path, PathBuf};
 use std::time::Duration;
@@ -15,43 +15,46 @@ use super::feed::FeedPlan;
 use crate::learner::{Timed, fill, timed};
 use crate::statistics::median;
 use crate::synthetic_segments::{RUN_ID, SyntheticSegments};
-use crate::workers::{Stage, Workers};
+use crate::workers::{BenchRun, Workers};
 
-/// Measurements of each cost. A worker's is their median.
+/// Number of measurements of each cost. A worker's cost is their median.
 const ROUNDS: u32 = 5;
-/// Limit of repetitions. A round is repeated if a busy machine delivered nothing during it.
+/// Maximum number of attempts. A measurement is repeated if no segment arrived, as on a busy
+/// machine.
 const TRIES_MAX: u32 = 20 * ROUNDS;
-/// Queue length in segments per environment. It keeps the receiver's sleep out of the measurement.
+/// Queue length in segments per environment: enough that the receiver's sleep does not block
+/// workers.
 const QUEUED_SEGMENTS: usize = 4;
-/// Number of different segments inserted in turn: more than the processor's caches hold.
+/// Number of different segments to insert: more than fit into the processor's caches.
 const POOL_SEGMENTS: usize = 8_192;
-/// Segments between two checks of the clock, and between two acknowledgements.
-const TOGETHER: usize = 256;
-/// A full log is cleared, as after a checkpoint, so that the benchmark does not fill the disk.
+/// Segments between two readings of the clock, and between two acknowledgements.
+const BATCH_SEGMENTS: usize = 256;
+/// Capacity of the log, which is cleared like after a checkpoint to limit its size on disk.
 const LOG_BYTES_MAX: u64 = 256 << 20;
 
-/// Cost of a run's worker.
+/// Cost of a worker.
 #[derive(Debug, Clone)]
 pub(super) struct WorkerCost {
     /// Processor time per segment [s].
     pub(super) cpu_s: f64,
     /// Environment steps per segment.
     pub(super) steps_per_segment: f64,
-    /// Environment spec that the worker reported.
+    /// Environment spec, as reported by the worker.
     pub(super) spec: EnvSpec,
 }
 
-/// Measures real workers, whose segments are taken as fast as they arrive.
+/// Measures real workers while their segments are received as fast as they arrive.
 pub(super) fn worker(
     program: PathBuf,
     venv: PathBuf,
     config: &ExperimentConfig,
-    (watch, duration): (&Watch, Duration),
+    watch: &Watch,
+    duration: Duration,
 ) -> anyhow::Result<WorkerCost> {
     let mut config = config.clone();
     config.actors.queue_segments = QUEUED_SEGMENTS * config.actors.envs_per_worker;
-    let stage = Stage::new(program, venv, &config)?;
-    let mut workers = Workers::start(&stage, watch)?;
+    let run = BenchRun::new(program, venv, &config)?;
+    let mut workers = Workers::start(&run, watch)?;
     let (mut cpu_s, mut steps) = (Vec::new(), Vec::new());
     for _ in 0..TRIES_MAX {
         let (round, window) = workers.measure(watch, duration / ROUNDS)?;
@@ -68,15 +71,15 @@ pub(super) fn worker(
         }
     }
     ensure!(!cpu_s.is_empty(), "the workers delivered nothing in {TRIES_MAX} rounds");
-    let middle = |values: &[f64]| median(values).context("no round");
+    let median_of = |values: &[f64]| median(values).context("no round");
     Ok(WorkerCost {
-        cpu_s: middle(&cpu_s)?,
-        steps_per_segment: middle(&steps)?,
+        cpu_s: median_of(&cpu_s)?,
+        steps_per_segment: median_of(&steps)?,
         spec: workers.spec.clone(),
     })
 }
 
-/// Processor time of an insertion without transport: checking, settling, storing.
+/// Processor time per segment of ingest without transport: check, settle, insert.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) struct InsertCost {
     /// At delivery level `memory` [s].
@@ -85,14 +88,14 @@ pub(super) struct InsertCost {
     pub(super) log_s: f64,
 }
 
-/// Measures insertion into a full replay, with as many workers as in the feed.
+/// Measures insertion into a full replay, with as many workers as the feed has.
 pub(super) fn insert(
     feed: &FeedPlan<'_>,
     folder: &Path,
     duration: Duration,
 ) -> anyhow::Result<InsertCost> {
     let mut learner = feed.learner()?;
-    let mut pool = Pool::new(&learner, feed.workers);
+    let mut pool = SegmentPool::new(&learner, feed.workers);
     while learner.replay.len() < learner.replay.capacity() {
         pool.insert(&mut learner)?;
     }
@@ -109,49 +112,51 @@ pub(super) fn insert(
         }
         Ok(())
     })?;
-    let [memory_s, with_log_s] = [memory, log].map(|timed| timed.over(TOGETHER as f64).cpu_s);
+    let [memory_s, with_log_s] = [memory, log].map(|timed| timed.over(BATCH_SEGMENTS as f64).cpu_s);
     Ok(InsertCost { memory_s, log_s: (with_log_s - memory_s).max(0.0) })
 }
 
-/// Segments of all workers, inserted in turn and repeatedly, each time with new numbers.
-struct Pool {
+/// Segments of all workers, inserted repeatedly with increasing sequence numbers.
+struct SegmentPool {
     segments: Vec<Segment>,
-    of_each: u64,
+    per_worker: u64,
     next: usize,
 }
 
-impl Pool {
+impl SegmentPool {
     fn new(learner: &Learner, workers: usize) -> Self {
         let (layout, hash) = (learner.policy().layout(), learner.policy().architecture_hash());
-        let of_each = POOL_SEGMENTS.div_ceil(workers);
-        let mut synthetic_segments: Vec<_> =
-            (0..workers).map(|worker| SyntheticSegments::of(layout, worker as u32, hash)).collect();
-        let rounds = (0..of_each).flat_map(|_| {
+        let per_worker = POOL_SEGMENTS.div_ceil(workers);
+        let mut synthetic_segments: Vec<_> = (0..workers)
+            .map(|worker| SyntheticSegments::with_hash(layout, worker as u32, hash))
+            .collect();
+        let rounds = (0..per_worker).flat_map(|_| {
             synthetic_segments.iter_mut().map(|it| it.next().clone()).collect::<Vec<_>>()
         });
-        Self { segments: rounds.collect(), of_each: of_each as u64, next: 0 }
+        Self { segments: rounds.collect(), per_worker: per_worker as u64, next: 0 }
     }
 
     fn insert(&mut self, learner: &mut Learner) -> anyhow::Result<()> {
-        for _ in 0..TOGETHER {
+        for _ in 0..BATCH_SEGMENTS {
             let segment = &mut self.segments[self.next];
             learner.insert(segment).context("a synthetic segment was rejected")?;
-            // The checksum covers only the block.
-            segment.header.sequence += self.of_each;
+            // The checksum stays valid, because it covers only the block.
+            segment.header.sequence += self.per_worker;
             self.next = (self.next + 1) % self.segments.len();
         }
         Ok(())
     }
 }
 
-/// Measures an update of a run's learner, on a replay full of synthetic segments.
+/// Measures the learner's update on a replay full of synthetic segments.
 ///
-/// Returns the minimum over several rounds. On one thread it uses processor time, which does not
-/// include the time that other programs take.
+/// Returns the minimum over several rounds. With one thread, its wall time is the processor time,
+/// which excludes other programs.
 pub(super) fn update(
     config: &ExperimentConfig,
     spec: &EnvSpec,
-    (watch, duration): (&Watch, Duration),
+    watch: &Watch,
+    duration: Duration,
 ) -> anyhow::Result<Timed> {
     let mut config = config.clone();
     config.actors.joined_max = 0;

@@ -1,8 +1,8 @@
-//! `dmprl segment-feeder`: runs many synthetic workers, which only send, in one process.
+//! `dmprl segment-feeder`: many synthetic workers that only send, in one process.
 //!
-//! Each of them has what a run's worker has: its own queue and outbox, checksums, acknowledgements.
-//! One thread serves all of them in turn. With a thread or a process each, a small machine would
-//! spend most of its time waking workers with full queues.
+//! Like a run's worker, each has its own queue and outbox, and handles checksums and
+//! acknowledgements. One thread serves all of them. With a thread or a process each, a small
+//! machine would spend most of its time waking workers with full queues.
 
 use std::path::PathBuf;
 use std::thread;
@@ -19,15 +19,15 @@ use dmprl_shared::transport::{AcknowledgementSubscriber, SendOutcome};
 
 use crate::synthetic_segments::{RUN_ID, SyntheticSegments};
 
-/// A round that fills less than this fraction of all queues is followed by a pause, because
-/// checking a full queue takes as long as sending a segment.
-const FILLED_PART: usize = 4;
-/// Pause, during which the learner empties a small part of the queues.
-const PAUSE: Duration = Duration::from_micros(500);
+/// The feeder sleeps after a round in which it sent less than 1 / `FILLED_DIVISOR` of the capacity
+/// of all queues, because checking a full queue costs as much as sending a segment.
+const FILLED_DIVISOR: usize = 4;
+/// Length of that sleep. The learner empties a small part of the queues in this time.
+const SLEEP: Duration = Duration::from_micros(500);
 
 const HELP: &str = "\
-Speaks JSON lines on standard input and output as the roles of a run do, and ends when its standard
-input ends. `bench scale` starts it.
+Exchanges JSON lines on standard input and output, like the other processes of a run, and exits at
+the end of its input. Started by `bench scale`.
 
 EXAMPLES
   dmprl segment-feeder --shared-memory /dev/shm/dmprl-1000/4f2a --workers 256 --first 0 \\
@@ -53,7 +53,7 @@ pub struct SegmentFeederArgs {
     /// Capacity of a queue in segments.
     #[arg(long, value_name = "N")]
     queue_segments: usize,
-    /// Segments that a worker retains until they are acknowledged.
+    /// Capacity in segments of a worker's outbox, which retains them until they are acknowledged.
     #[arg(long, value_name = "N")]
     outbox_segments: usize,
     /// Control steps per segment.
@@ -89,8 +89,9 @@ impl SegmentFeederArgs {
         }
     }
 
-    /// Command-line arguments for a plan, without the directory and the choice of workers.
-    pub(super) fn words(plan: &Plan, outbox_segments: usize) -> Vec<String> {
+    /// Returns the command-line arguments for a plan, without the directory and the workers'
+    /// indices.
+    pub(super) fn arguments(plan: &Plan, outbox_segments: usize) -> Vec<String> {
         let numbers = [
             ("--workers", plan.worker_count),
             ("--queue-segments", plan.queue_segments),
@@ -100,17 +101,18 @@ impl SegmentFeederArgs {
             ("--action-len", plan.layout.action_len),
             ("--parameters-len", plan.parameters_len),
         ];
-        let mut words = vec!["segment-feeder".to_owned()];
-        words.extend(["--architecture-hash".to_owned(), plan.architecture_hash.to_string()]);
-        words.extend(numbers.into_iter().flat_map(|(flag, it)| [flag.to_owned(), it.to_string()]));
-        words
+        let mut arguments = vec!["segment-feeder".to_owned()];
+        arguments.extend(["--architecture-hash".to_owned(), plan.architecture_hash.to_string()]);
+        arguments
+            .extend(numbers.into_iter().flat_map(|(flag, it)| [flag.to_owned(), it.to_string()]));
+        arguments
     }
 }
 
-/// Sends until a stop is requested; then reports the number of segments that each worker has sent.
+/// Sends until a stop is requested, then reports the number of segments that each worker sent.
 ///
 /// # Errors
-/// The learner is gone, or the transport failed.
+/// The learner has exited, or the transport fails.
 pub fn segment_feeder(args: &SegmentFeederArgs) -> anyhow::Result<()> {
     let control = ControlPipe::open(ORPHAN_LIMIT)?;
     let plan = args.plan();
@@ -121,7 +123,11 @@ pub fn segment_feeder(args: &SegmentFeederArgs) -> anyhow::Result<()> {
         workers.push(Worker {
             end,
             outbox: Outbox::new(plan.layout, args.outbox_segments, index, 0),
-            synthetic_segments: SyntheticSegments::of(plan.layout, index, plan.architecture_hash),
+            synthetic_segments: SyntheticSegments::with_hash(
+                plan.layout,
+                index,
+                plan.architecture_hash,
+            ),
             acknowledgements: Acknowledgements::default(),
         });
     }
@@ -131,8 +137,8 @@ pub fn segment_feeder(args: &SegmentFeederArgs) -> anyhow::Result<()> {
         for worker in &mut workers {
             sent += worker.fill(plan.queue_segments)?;
         }
-        if sent * FILLED_PART < queued_max {
-            thread::sleep(PAUSE);
+        if sent * FILLED_DIVISOR < queued_max {
+            thread::sleep(SLEEP);
         }
     }
     for worker in &mut workers {
@@ -150,8 +156,8 @@ struct Worker {
 }
 
 impl Worker {
-    /// Sends until its queue is full, at most `segments_max` segments; returns their number. It
-    /// does not sleep on its full queue as a run's worker would, but yields to the others.
+    /// Sends up to `segments_max` segments until the queue is full, and returns their number. A
+    /// full queue does not block, because other workers share the thread.
     fn fill(&mut self, segments_max: usize) -> anyhow::Result<usize> {
         let Self { end, outbox, synthetic_segments, acknowledgements } = self;
         for sent in 0..segments_max {
@@ -160,7 +166,7 @@ impl Worker {
             {
                 outbox.acknowledge(acknowledgements);
             }
-            // A segment that did not fit the last time comes first.
+            // Retries the segment that did not fit the last time.
             if outbox.offer(&mut end.segments)? != SendOutcome::Delivered
                 || outbox.len() == outbox.capacity()
             {

@@ -9,7 +9,7 @@ use super::feed::FeedWindow;
 use super::model::{Bottleneck, Demand, Model, Prediction};
 use crate::drain_receiver::Discrepancies;
 use crate::statistics::load_average;
-use crate::system::Window;
+use crate::system::SteadyWindow;
 
 /// Numbers of workers for which the model predicts the throughput.
 pub(super) const WORKERS: [usize; 7] = [16, 32, 64, 128, 256, 512, 1_024];
@@ -30,32 +30,32 @@ impl Simulated {
         self.window.total() as f64 / self.window.seconds
     }
 
-    /// Fraction of a core that the learner's thread used.
+    /// Returns the fraction of a core that the learner's thread used.
     pub(super) fn learner_cores(&self) -> f64 {
         self.window.cpu_s / self.window.seconds
     }
 
-    /// Processor time of the learner's thread per segment [s].
+    /// Returns the processor time of the learner's thread per segment [s].
     pub(super) fn cpu_s(&self) -> f64 {
         self.window.cpu_s / self.window.total().max(1) as f64
     }
 
-    /// Each worker's segments divided by an equal share: minimum and maximum.
+    /// Returns the minimum and maximum of the workers' segments divided by an equal share.
     pub(super) fn shares(&self) -> (f64, f64) {
         let equal = self.window.total() as f64 / self.window.segments.len().max(1) as f64;
         let shares = self.window.segments.iter().map(|&segments| segments as f64 / equal);
         shares.fold((f64::INFINITY, 0.0), |(least, most), it| (it.min(least), it.max(most)))
     }
 
-    /// Jain's fairness index (sum of x)^2 / (n sum of x^2) (Jain et al. 1984): 1 when all have the
-    /// same, 1/n when one has everything.
+    /// Jain's fairness index (sum of x)^2 / (n sum of x^2) (Jain et al. 1984): 1 if all workers
+    /// have equal shares, 1/n if one worker has everything.
     pub(super) fn jain_index(&self) -> f64 {
         let segments = || self.window.segments.iter().map(|&segments| segments as f64);
         let (sum, squares) = (segments().sum::<f64>(), segments().map(|it| it * it).sum::<f64>());
         sum * sum / (self.window.segments.len().max(1) as f64 * squares.max(1.0))
     }
 
-    /// The learner's memory at the start, in the middle and at the end [MB].
+    /// Resident memory of the learner at the start, in the middle and at the end [MB].
     pub(super) fn resident_mb(&self) -> [Option<f64>; 3] {
         self.window.resident_bytes.map(|bytes| bytes.map(|bytes| bytes as f64 / 1e6))
     }
@@ -76,13 +76,13 @@ pub(super) struct CostFigures {
 }
 
 impl CostFigures {
-    /// Cost of the queues between processes for the learner: ingest minus insertion.
+    /// Cost of the queues between processes in the learner: ingest minus insertion.
     pub(super) fn transport_s(&self) -> f64 {
         (self.ingest_s - self.insert_s).max(0.0)
     }
 }
 
-/// A real system compared with the model.
+/// Comparison of a real system with the model.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Check {
     pub(super) predicted: Prediction,
@@ -96,7 +96,7 @@ pub(super) struct Check {
 }
 
 impl Check {
-    pub(super) fn new(model: &Model, workers: usize, window: &Window) -> Self {
+    pub(super) fn new(model: &Model, workers: usize, window: &SteadyWindow) -> Self {
         let steps = (window.last.env_steps - window.first.env_steps).max(1) as f64;
         let cpu_s = window.cpu.learner_s + window.cpu.workers_s;
         Self {
@@ -113,7 +113,8 @@ impl Check {
         self.measured_steps_per_s / self.predicted.steps_per_s
     }
 
-    /// Measured divided by predicted processor time per step, which other load affects least.
+    /// Measured divided by predicted processor time per step. Other load affects it less than the
+    /// throughput.
     pub(super) fn cpu_ratio(&self) -> f64 {
         self.measured_cpu_s / self.predicted_cpu_s
     }
@@ -152,7 +153,10 @@ pub struct Figures {
 impl Figures {
     pub(super) fn new(
         bench: &ScaleBench,
-        (simulated, costs, model, checks): (Simulated, CostFigures, Model, Vec<Check>),
+        simulated: Simulated,
+        costs: CostFigures,
+        model: Model,
+        checks: Vec<Check>,
         machine: Machine,
     ) -> Self {
         Self {
@@ -170,17 +174,17 @@ impl Figures {
         }
     }
 
-    /// The model's predictions for more workers than this machine has.
+    /// Returns the model's predictions for [`WORKERS`].
     pub(super) fn predictions(&self) -> [Prediction; WORKERS.len()] {
         WORKERS.map(|workers| self.model.predict(workers))
     }
 
-    /// The first bottleneck, and the number of workers that reach it.
+    /// Returns the first bottleneck and the number of workers that reach it.
     pub(super) fn first_bottleneck(&self) -> (Bottleneck, usize) {
         self.model.first_bottleneck()
     }
 
-    /// The figures as one JSON object; unavailable ones are null.
+    /// Returns the figures as one JSON object. Unavailable ones are null.
     #[must_use]
     pub fn json(&self) -> Value {
         let Self { simulated, costs, model, .. } = self;
@@ -246,7 +250,7 @@ pub(super) mod tests {
     use dmprl_shared::config::Limits;
 
     use super::*;
-    use crate::scale::model::{Costs, Place};
+    use crate::scale::model::{Costs, Topology};
     use crate::system::CpuTime;
 
     fn line(env_steps: u64, wall_s: f64) -> MetricsLine {
@@ -259,7 +263,7 @@ pub(super) mod tests {
         MetricsLine { env_steps, wall_s, ..line }
     }
 
-    /// Two workers, one with three quarters of all segments; costs are round numbers.
+    /// Two workers, one with three quarters of all segments, and round numbers as costs.
     pub(in super::super) fn figures() -> Figures {
         let costs = CostFigures {
             worker_s: 1e-3,
@@ -276,12 +280,12 @@ pub(super) mod tests {
                 updates_per_segment: 0.0,
                 segment_bytes: 1_024,
             },
-            place: Place::Hosts { cores_per_host: 16, link_bytes_per_s: None },
+            topology: Topology::Hosts { cores_per_host: 16, link_bytes_per_s: None },
         };
-        let here = Model { place: Place::OneMachine { cores: 2.0 }, ..model };
+        let here = Model { topology: Topology::OneMachine { cores: 2.0 }, ..model };
         let cpu = CpuTime { learner_s: 0.03, workers_s: 9.0, others_s: 0.0 };
         let (first, last) = (line(1_000, 2.0), line(41_000, 12.0));
-        let window = Window { first, last, lags: Vec::new(), cpu, seen_s: 10.0 };
+        let window = SteadyWindow { first, last, lags: Vec::new(), cpu, seen_s: 10.0 };
         let megabytes = |mb: u64| Some(mb * 1_000_000);
         Figures {
             config: ExperimentConfig::default().resolve(Limits { cores: 2 }).unwrap(),
@@ -309,7 +313,7 @@ pub(super) mod tests {
     }
 
     #[test]
-    fn the_object_has_the_simulation_its_shares_the_model_and_the_check() {
+    fn json_has_simulation_shares_model_and_check() {
         let json = figures().json();
         let close = |value: &Value, expected: f64| {
             let got = value.as_f64().unwrap();

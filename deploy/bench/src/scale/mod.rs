@@ -1,14 +1,14 @@
 //! `dmprl bench scale`: predicts the throughput of many workers, and measures a learner with 256.
 //!
 //! ```text
-//!   feed (feeder processes ─► real queues ─► session) ─► can ingest keep up?
+//!   feed (feeder processes ─► real queues ─► session) ─► capacity of ingest
 //!   costs: worker, transport, ingest, update ─► model ─► table for 16 to 1 024 workers
-//!                                                 └────► check: real runs of 1 to 4 workers here
+//!                                                 └────► check: real runs with 1 to 4 workers
 //! ```
 //! The simulation (`feed`, `feeder`) measures the capacity of one learner: segments per second,
-//! shares, memory. `costs` measures the cost of a segment for each part, and of an update for the
-//! learner. `model` derives predictions for other numbers of workers and hosts, and `bench system`
-//! measures real systems for comparison.
+//! shares of the workers, memory. `costs` measures the cost of a segment in each part, and of an
+//! update in the learner. `model` predicts the throughput for other numbers of workers and hosts,
+//! and `bench system` measures real systems for comparison.
 
 mod costs;
 mod feed;
@@ -27,21 +27,22 @@ use dmprl_run::{Interrupted, Watch};
 use dmprl_shared::config::{ExperimentConfig, Limits};
 use dmprl_shared::spec::EnvSpec;
 
+use super::drain_receiver::Discrepancies;
 use super::synthetic_segments::Size;
-use super::system::{self, SystemBench, Window};
+use super::system::{self, SteadyWindow, SystemBench};
 
 pub use feeder::{SegmentFeederArgs, segment_feeder};
 pub use figures::Figures;
 
 use feed::{Feed, FeedPlan, FeedWindow};
 use figures::{Check, CostFigures, Simulated};
-use model::{Costs, Demand, Model, Place};
+use model::{Costs, Demand, Model, Topology};
 
-/// Plan of the benchmark.
+/// Settings of the benchmark.
 pub struct ScaleBench {
-    /// Program of all processes: this one.
+    /// Path of this program, which also runs the other processes.
     pub program: PathBuf,
-    /// The resolved configuration of a run; the cost of a worker is measured with its
+    /// The resolved configuration of a run. The cost of a worker is measured with
     /// `actors.workers` workers.
     pub config: ExperimentConfig,
     /// Python virtual environment of the workers.
@@ -56,7 +57,7 @@ pub struct ScaleBench {
     pub duration: Duration,
     /// Duration of the measurement of each cost.
     pub cost_duration: Duration,
-    /// Real systems of 1 to this number of workers are compared with the model.
+    /// Largest real system to compare with the model; all smaller ones are compared too.
     pub check_workers: usize,
     /// Duration of the measurement of each real system.
     pub check_duration: Duration,
@@ -68,8 +69,8 @@ pub struct ScaleBench {
     pub link_bytes_per_s: Option<f64>,
 }
 
-/// Runs the benchmark; returns `None` if the user interrupted it. Leaves no process and no file
-/// behind.
+/// Runs the benchmark; returns `None` if the user interrupted it. Removes all its processes and
+/// files.
 ///
 /// # Errors
 /// A process cannot be started or dies, or the transport fails.
@@ -90,20 +91,21 @@ fn measure(bench: &ScaleBench, progress: &dyn Progress) -> anyhow::Result<Figure
         update_s: costs.update_s,
         update_cpu_s: costs.update_cpu_s,
     };
-    let place = Place::Hosts {
+    let topology = Topology::Hosts {
         cores_per_host: bench.cores_per_host,
         link_bytes_per_s: bench.link_bytes_per_s,
     };
-    let model = Model { costs: costs_for_model, demand, place };
-    let here = Model { place: Place::OneMachine { cores: bench.cores as f64 }, ..model };
+    let model = Model { costs: costs_for_model, demand, topology };
+    let this_machine =
+        Model { topology: Topology::OneMachine { cores: bench.cores as f64 }, ..model };
     let mut checks = Vec::new();
     for workers in 1..=bench.check_workers {
-        progress.stage(&format!("a real system of {workers}"));
+        progress.stage(&format!("real system with {workers} workers"));
         let window = real_system(bench, workers, &watch)?;
-        checks.push(Check::new(&here, workers, &window));
+        checks.push(Check::new(&this_machine, workers, &window));
     }
     let machine = Manifest::new(None)?.machine;
-    Ok(Figures::new(bench, (simulated, costs, model, checks), machine))
+    Ok(Figures::new(bench, simulated, costs, model, checks, machine))
 }
 
 /// Measures the ingest of one learner with many workers.
@@ -112,15 +114,16 @@ fn simulate(
     watch: &Watch,
     progress: &dyn Progress,
 ) -> anyhow::Result<Simulated> {
-    let size = Size::of_bytes(bench.segment_bytes).context("no such size")?;
+    let size = Size::of_bytes(bench.segment_bytes).context("unsupported segment size")?;
     let spec = spec_of(size);
-    // The task's own policy may need longer observations than these segments have.
+    // The default configuration, because the task's may need longer observations.
     let mut config = ExperimentConfig::default().resolve(Limits { cores: bench.cores })?;
     config.replay.capacity_steps = bench.config.replay.capacity_steps;
     let feed = feed_plan(bench, &config, &spec);
     progress.stage(&format!("{} synthetic workers", feed.workers));
-    let (window, feeders_cpu_s, discrepancies) = fed(&feed, "s", watch, bench.duration)?;
-    let folder = temporary()?;
+    let FeedResult { window, feeders_cpu_s, discrepancies } =
+        run_feed(&feed, "s", watch, bench.duration)?;
+    let folder = temporary_folder()?;
     let insert = costs::insert(&feed, folder.path(), bench.cost_duration)?;
     Ok(Simulated { window, feeders_cpu_s, discrepancies, insert_s: insert.memory_s })
 }
@@ -133,16 +136,16 @@ fn measure_costs(
     let ScaleBench { config, cost_duration, .. } = bench;
     progress.stage("cost of a worker");
     let (program, venv) = (bench.program.clone(), bench.venv.clone());
-    let worker = costs::worker(program, venv, config, (watch, *cost_duration))?;
+    let worker = costs::worker(program, venv, config, watch, *cost_duration)?;
     progress.stage("cost of ingest");
     let feed = feed_plan(bench, config, &worker.spec);
-    let (window, _, _) = fed(&feed, "c", watch, *cost_duration)?;
+    let window = run_feed(&feed, "c", watch, *cost_duration)?.window;
     let ingest_s = window.cpu_s / window.total().max(1) as f64;
-    let folder = temporary()?;
+    let folder = temporary_folder()?;
     let insert = costs::insert(&feed, folder.path(), *cost_duration)?;
     watch.check()?;
     progress.stage("cost of an update");
-    let update = costs::update(config, &worker.spec, (watch, *cost_duration))?;
+    let update = costs::update(config, &worker.spec, watch, *cost_duration)?;
     let segment_bytes = feed.segment_bytes()?;
     let demand = Demand {
         steps_per_segment: worker.steps_per_segment,
@@ -174,26 +177,33 @@ fn feed_plan<'a>(
     }
 }
 
-/// Runs a feed from start to end; returns its window, the feeders' processor time, and
-/// discrepancies.
-fn fed(
+/// Result of a complete feed.
+struct FeedResult {
+    window: FeedWindow,
+    /// Processor time of the feeders [s], if the system reports it.
+    feeders_cpu_s: Option<f64>,
+    discrepancies: Discrepancies,
+}
+
+/// Runs a feed from start to end.
+fn run_feed(
     plan: &FeedPlan<'_>,
     name: &str,
     watch: &Watch,
     duration: Duration,
-) -> anyhow::Result<(FeedWindow, Option<f64>, super::drain_receiver::Discrepancies)> {
-    let folder = temporary()?;
+) -> anyhow::Result<FeedResult> {
+    let folder = temporary_folder()?;
     let run_id = Manifest::new(None)?.run_id;
     let token = format!("{name}{}-{}", &run_id[..8], std::process::id());
-    let mut feed = Feed::start(plan, &token, (folder.path(), watch))?;
+    let mut feed = Feed::start(plan, &token, folder.path(), watch)?;
     let before = feed.feeders_cpu_s();
     let window = feed.measure(watch, duration)?;
     let after = feed.feeders_cpu_s();
     let feeders_cpu_s = before.zip(after).map(|(before, after)| after - before);
-    Ok((window, feeders_cpu_s, feed.finish(watch)?))
+    Ok(FeedResult { window, feeders_cpu_s, discrepancies: feed.finish(watch)? })
 }
 
-fn real_system(bench: &ScaleBench, workers: usize, watch: &Watch) -> anyhow::Result<Window> {
+fn real_system(bench: &ScaleBench, workers: usize, watch: &Watch) -> anyhow::Result<SteadyWindow> {
     let mut config = bench.config.clone();
     config.actors.workers = workers;
     let system = SystemBench {
@@ -205,12 +215,12 @@ fn real_system(bench: &ScaleBench, workers: usize, watch: &Watch) -> anyhow::Res
     system::measure(&system, watch, &|_| {})
 }
 
-fn temporary() -> anyhow::Result<tempfile::TempDir> {
+fn temporary_folder() -> anyhow::Result<tempfile::TempDir> {
     let folder = tempfile::Builder::new().prefix("dmprl-bench-").tempdir();
     folder.context("cannot make a folder for logs")
 }
 
-/// The spec of an environment whose segments have this size.
+/// Returns the spec of an environment whose segments have this size.
 fn spec_of(size: Size) -> EnvSpec {
     let action_len = size.layout.action_len;
     EnvSpec {
@@ -231,7 +241,7 @@ mod tests {
     use crate::synthetic_segments::SIZES;
 
     #[test]
-    fn a_learner_for_a_size_takes_segments_of_this_size() {
+    fn spec_of_a_size_gives_segments_of_that_size() {
         let config = ExperimentConfig::default().resolve(Limits { cores: 2 }).unwrap();
         for size in SIZES {
             let spec = spec_of(size);

@@ -1,27 +1,26 @@
 //! Predicts the throughput of many workers from the costs of each part, by pure arithmetic.
 //!
-//! Every environment step passes four stages. Each limits the number of segments per second, and
-//! the lowest limit is the bottleneck:
+//! Four resources limit the number of segments per second. The lowest limit is the bottleneck:
 //!
 //! ```text
 //!   workers   busy workers / worker_s                 one thread each: at most one core
-//!   learner   1 / (ingest_s + u update_s)             one thread takes segments and does updates,
-//!                                                     in turn; u updates per segment (pacing)
-//!   link      link_bytes_per_s / segment_bytes        into the learner's host, if it is given
-//!   cores     cores / (worker_s + ingest_s + u update_cpu_s)     only if all share one machine
+//!   learner   1 / (ingest_s + u update_s)             one thread alternates between segments and
+//!                                                     updates; u updates per segment (pacing)
+//!   link      link_bytes_per_s / segment_bytes        into the learner's host, if given
+//!   cores     cores / (worker_s + ingest_s + u update_cpu_s)     if all share one machine
 //! ```
-//! The learner's limit is called `ingest` if taking segments is most of it, else `updates`.
+//! The learner's limit is called `ingest` if segments take most of its time, else `updates`.
 //!
 //! Assumptions, checked against a real system on one machine only:
-//! - Costs are constants: a worker's does not depend on the number of workers, the learner's not on
-//!   the number of queues (it is measured with many), and an update's not on other load. All cores
-//!   are alike and have nothing else to do.
-//! - Queues are long enough that only the bottleneck makes others wait.
-//! - Each worker host has `cores_per_host` workers. The learner has a host of its own, and each of
-//!   its threads a core.
-//! - A network limits only the number of bytes. The processor time of the gateway on the learner's
-//!   host is not included.
-//! - Publishing, metrics, checkpoints and evaluations cost nothing, as they are rare compared to
+//! - Costs are constant: a worker's is independent of the number of workers, the learner's of the
+//!   number of queues (it is measured with many), and an update's of other load. All cores are
+//!   equal and otherwise idle.
+//! - Queues are long enough that only the bottleneck makes the other parts wait.
+//! - Each worker host has `cores_per_host` workers. The learner has its own host, with a core for
+//!   each of its threads.
+//! - A network limits only the number of bytes. The gateway's processor time on the learner's host
+//!   is not included.
+//! - Publishing, metrics, checkpoints and evaluations are free, because they are rare compared with
 //!   updates.
 
 use serde::Serialize;
@@ -39,7 +38,7 @@ pub(super) struct Costs {
     pub(super) update_cpu_s: f64,
 }
 
-/// Requirements of a run.
+/// Requirements of a run per segment.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) struct Demand {
     /// Average number of environment steps per segment.
@@ -50,15 +49,15 @@ pub(super) struct Demand {
     pub(super) segment_bytes: usize,
 }
 
-/// Location of workers and learner.
+/// Placement of workers and learner on machines.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub(super) enum Place {
+pub(super) enum Topology {
     /// Workers and learner share a machine.
     OneMachine {
         /// Number of cores available to them.
         cores: f64,
     },
-    /// The learner has a host of its own, the workers have other hosts.
+    /// The learner has its own host; the workers run on other hosts.
     Hosts {
         /// Workers per host.
         cores_per_host: usize,
@@ -67,7 +66,7 @@ pub(super) enum Place {
     },
 }
 
-/// The part that limits a system.
+/// The resource that limits a system.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "snake_case")]
 pub(super) enum Bottleneck {
@@ -84,7 +83,7 @@ pub(super) enum Bottleneck {
 }
 
 impl Bottleneck {
-    /// Name of the bottleneck in reports.
+    /// Returns the bottleneck's name for reports.
     pub(super) fn name(self) -> &'static str {
         match self {
             Self::Workers => "workers",
@@ -96,7 +95,7 @@ impl Bottleneck {
     }
 }
 
-/// Predicted throughput of a number of workers.
+/// Predicted throughput with a number of workers.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub(super) struct Prediction {
     pub(super) workers: usize,
@@ -104,16 +103,16 @@ pub(super) struct Prediction {
     pub(super) hosts: usize,
     pub(super) steps_per_s: f64,
     pub(super) bottleneck: Bottleneck,
-    /// Fraction of its time that the learner's thread is busy.
+    /// Fraction of time in which the learner's thread is busy.
     pub(super) learner_utilisation: f64,
 }
 
-/// A model of costs, requirements and location.
+/// The model's parameters.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) struct Model {
     pub(super) costs: Costs,
     pub(super) demand: Demand,
-    pub(super) place: Place,
+    pub(super) topology: Topology,
 }
 
 impl Model {
@@ -133,24 +132,24 @@ impl Model {
         worker_s + ingest_s + self.demand.updates_per_segment * update_cpu_s
     }
 
-    /// Segments per second of the workers if nothing else limited them.
+    /// Segments per second of the workers without any other limit.
     fn workers_rate(&self, workers: usize) -> f64 {
-        let at_work = match self.place {
-            Place::OneMachine { cores } => (workers as f64).min(cores),
-            Place::Hosts { .. } => workers as f64,
+        let busy = match self.topology {
+            Topology::OneMachine { cores } => (workers as f64).min(cores),
+            Topology::Hosts { .. } => workers as f64,
         };
-        at_work / self.costs.worker_s
+        busy / self.costs.worker_s
     }
 
-    /// All other limits of segments per second.
-    fn other_bounds(&self) -> [(Bottleneck, f64); 3] {
-        let Self { costs, demand, place } = self;
+    /// All other limits on segments per second.
+    fn other_limits(&self) -> [(Bottleneck, f64); 3] {
+        let Self { costs, demand, topology } = self;
         let updates_s = demand.updates_per_segment * costs.update_s;
         let learner =
             if updates_s > costs.ingest_s { Bottleneck::Updates } else { Bottleneck::Ingest };
-        let (cores, link) = match *place {
-            Place::OneMachine { cores } => (cores / self.cpu_s(), None),
-            Place::Hosts { link_bytes_per_s, .. } => (f64::INFINITY, link_bytes_per_s),
+        let (cores, link) = match *topology {
+            Topology::OneMachine { cores } => (cores / self.cpu_s(), None),
+            Topology::Hosts { link_bytes_per_s, .. } => (f64::INFINITY, link_bytes_per_s),
         };
         let link = link.map_or(f64::INFINITY, |bytes| bytes / demand.segment_bytes as f64);
         [(learner, 1.0 / self.learner_s()), (Bottleneck::Link, link), (Bottleneck::Cores, cores)]
@@ -158,13 +157,13 @@ impl Model {
 
     /// Predicts the throughput of `workers` workers.
     pub(super) fn predict(&self, workers: usize) -> Prediction {
-        let bounds = self.other_bounds().into_iter();
-        let least = |a: (Bottleneck, f64), b: (Bottleneck, f64)| if b.1 < a.1 { b } else { a };
+        let limits = self.other_limits().into_iter();
+        let lower = |a: (Bottleneck, f64), b: (Bottleneck, f64)| if b.1 < a.1 { b } else { a };
         let (bottleneck, segments_per_s) =
-            bounds.fold((Bottleneck::Workers, self.workers_rate(workers)), least);
-        let hosts = match self.place {
-            Place::OneMachine { .. } => 1,
-            Place::Hosts { cores_per_host, .. } => 1 + workers.div_ceil(cores_per_host.max(1)),
+            limits.fold((Bottleneck::Workers, self.workers_rate(workers)), lower);
+        let hosts = match self.topology {
+            Topology::OneMachine { .. } => 1,
+            Topology::Hosts { cores_per_host, .. } => 1 + workers.div_ceil(cores_per_host.max(1)),
         };
         Prediction {
             workers,
@@ -175,11 +174,11 @@ impl Model {
         }
     }
 
-    /// The lowest limit besides the workers' own, and the number of workers that reach it.
+    /// Returns the lowest limit besides the workers' own, and the number of workers that reach it.
     pub(super) fn first_bottleneck(&self) -> (Bottleneck, usize) {
-        let least = |a: (Bottleneck, f64), b: (Bottleneck, f64)| if b.1 < a.1 { b } else { a };
+        let lower = |a: (Bottleneck, f64), b: (Bottleneck, f64)| if b.1 < a.1 { b } else { a };
         let none = (Bottleneck::Workers, f64::INFINITY);
-        let (bottleneck, rate) = self.other_bounds().into_iter().fold(none, least);
+        let (bottleneck, rate) = self.other_limits().into_iter().fold(none, lower);
         (bottleneck, (rate * self.costs.worker_s).ceil() as usize)
     }
 }
@@ -188,14 +187,14 @@ impl Model {
 mod tests {
     use super::*;
 
-    /// A worker makes 100 segments per second; the learner takes 10,000 or does 500 updates.
+    /// A worker makes 100 segments per second; the learner ingests 10,000 or does 500 updates.
     const COSTS: Costs =
         Costs { worker_s: 1e-2, ingest_s: 1e-4, update_s: 2e-3, update_cpu_s: 2e-3 };
     const DEMAND: Demand =
         Demand { steps_per_segment: 5.0, updates_per_segment: 0.0, segment_bytes: 1_000 };
 
     fn hosts(costs: Costs, demand: Demand, link_bytes_per_s: Option<f64>) -> Model {
-        Model { costs, demand, place: Place::Hosts { cores_per_host: 16, link_bytes_per_s } }
+        Model { costs, demand, topology: Topology::Hosts { cores_per_host: 16, link_bytes_per_s } }
     }
 
     #[track_caller]
@@ -204,7 +203,7 @@ mod tests {
     }
 
     #[test]
-    fn few_workers_are_their_own_bound_and_the_learner_idles() {
+    fn few_workers_limit_themselves_and_the_learner_idles() {
         let prediction = hosts(COSTS, DEMAND, None).predict(50);
         assert_eq!((prediction.bottleneck, prediction.hosts), (Bottleneck::Workers, 5));
         close(prediction.steps_per_s, 50.0 * 100.0 * 5.0);
@@ -212,7 +211,7 @@ mod tests {
     }
 
     #[test]
-    fn without_updates_taking_segments_is_the_first_bound_of_many() {
+    fn without_updates_ingest_is_the_first_bottleneck() {
         let model = hosts(COSTS, DEMAND, None);
         assert_eq!(model.first_bottleneck(), (Bottleneck::Ingest, 100));
         let prediction = model.predict(1_024);
@@ -233,7 +232,7 @@ mod tests {
     }
 
     #[test]
-    fn a_narrow_link_bounds_what_the_learner_could_take() {
+    fn slow_link_limits_the_learner() {
         let model = hosts(COSTS, DEMAND, Some(1e6));
         assert_eq!(model.first_bottleneck(), (Bottleneck::Link, 10));
         close(model.predict(16).steps_per_s, 1_000.0 * 5.0);
@@ -243,8 +242,8 @@ mod tests {
     #[test]
     fn on_one_machine_learner_and_workers_share_the_cores() {
         let demand = Demand { updates_per_segment: 3.0, ..DEMAND };
-        let place = Place::OneMachine { cores: 2.0 };
-        let model = Model { costs: COSTS, demand, place };
+        let topology = Topology::OneMachine { cores: 2.0 };
+        let model = Model { costs: COSTS, demand, topology };
         // 10 ms of a worker, 6.1 ms of the learner.
         let [one, two, four] = [1, 2, 4].map(|workers| model.predict(workers));
         assert_eq!((one.bottleneck, one.hosts), (Bottleneck::Workers, 1));
@@ -255,12 +254,12 @@ mod tests {
         close(two.learner_utilisation, 2.0 * 6.1 / 16.1);
     }
 
-    /// Two threads halve the wall time of an update, but not its processor time.
+    /// Two threads halve the wall time of an update but not its processor time.
     #[test]
-    fn threads_of_the_learner_count_as_cores() {
+    fn learner_threads_count_as_cores() {
         let costs = Costs { update_s: 1e-3, ..COSTS };
         let demand = Demand { updates_per_segment: 50.0, ..DEMAND };
-        let one_machine = Model { costs, demand, place: Place::OneMachine { cores: 2.0 } };
+        let one_machine = Model { costs, demand, topology: Topology::OneMachine { cores: 2.0 } };
         let prediction = one_machine.predict(2);
         assert_eq!(prediction.bottleneck, Bottleneck::Cores);
         close(prediction.steps_per_s, 5.0 * 2.0 / 110.1e-3);

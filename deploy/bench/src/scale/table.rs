@@ -7,7 +7,7 @@ use super::model::Prediction;
 use crate::drain_receiver::Discrepancies;
 
 impl Figures {
-    /// Formats the figures as tables, like [`Figures::json`].
+    /// Returns the figures as tables.
     #[must_use]
     pub fn text(&self) -> String {
         let mut lines = self.simulation();
@@ -43,13 +43,14 @@ impl Figures {
             String::new(),
             format!("  segments/s       {:>11}", whole(simulated.segments_per_s())),
             format!(
-                "  learner's thread {:>11.2} cores, {:.2} µs a segment, {:.2} µs without transport",
+                "  learner's thread {:>11.2} cores, {:.2} µs per segment, {:.2} µs without \
+                 transport",
                 simulated.learner_cores(),
                 1e6 * simulated.cpu_s(),
                 1e6 * simulated.insert_s
             ),
             format!(
-                "  fair shares      {:>11.4} Jain's index; {least:.2} to {most:.2} of an equal \
+                "  fairness         {:>11.4} Jain's index; {least:.2} to {most:.2} of an equal \
                  share",
                 simulated.jain_index()
             ),
@@ -71,7 +72,7 @@ impl Figures {
         let steps = demand.steps_per_segment;
         vec![
             format!(
-                "costs of {} · {:?} · {:?} · {} environments a worker · {} bytes a segment",
+                "costs of {} · {:?} · {:?} · {} environments per worker · {} bytes per segment",
                 self.config.task.name,
                 self.config.algorithm.name,
                 self.config.policy.kind,
@@ -81,15 +82,15 @@ impl Figures {
             .to_lowercase(),
             String::new(),
             "                      µs".to_owned(),
-            row("worker", worker_s, &format!("a segment of {steps:.2} steps")),
-            row("transport", self.costs.transport_s(), "a segment, in the learner"),
-            row("ingest", insert_s, "a segment: check, settle, insert"),
-            row("log", log_s, "more a segment at delivery level log"),
+            row("worker", worker_s, &format!("per segment of {steps:.2} steps")),
+            row("transport", self.costs.transport_s(), "per segment, in the learner"),
+            row("ingest", insert_s, "per segment: check, settle, insert"),
+            row("log", log_s, "more per segment at delivery level log"),
             row(
                 "update",
                 update_s,
                 &format!(
-                    "on {threads} thread{}, {:.2} µs of them together; {} a segment",
+                    "on {threads} thread{}, {:.2} µs of processor time; {} per segment",
                     if threads == 1 { "" } else { "s" },
                     1e6 * update_cpu_s,
                     demand.updates_per_segment
@@ -102,11 +103,11 @@ impl Figures {
         let (bottleneck, workers) = self.first_bottleneck();
         let link = match self.link_bytes_per_s {
             Some(bytes) => format!("{:.1} Gbit/s into the learner's host", bytes * 8.0 / 1e9),
-            None => "no bound of a network".to_owned(),
+            None => "unlimited network".to_owned(),
         };
         let mut lines = vec![
             format!(
-                "by the model, {} workers a host, the learner on one of its own, {link}",
+                "predictions for {} workers per host, the learner on its own host, {link}",
                 self.cores_per_host
             ),
             String::new(),
@@ -170,7 +171,7 @@ mod tests {
     use crate::scale::figures::tests::figures;
 
     #[test]
-    fn the_tables_say_how_ingest_held_and_what_comes_first() {
+    fn tables_show_ingest_and_first_bottleneck() {
         let text = figures().text();
         for words in [
             "2 synthetic workers in 2 processes · segments of 1,024 bytes · 2.0 s",

@@ -1,4 +1,4 @@
-//! The report of `dmprl bench system`: one JSON object for programs, a few lines for people.
+//! The report of `dmprl bench system`: one JSON object for programs, a summary for people.
 
 use dmprl_run::Machine;
 use dmprl_run::format::grouped;
@@ -6,7 +6,7 @@ use dmprl_shared::config::{AlgorithmName, ExperimentConfig};
 use serde_json::{Value, json};
 
 use super::SystemBench;
-use super::steady::Window;
+use super::steady::SteadyWindow;
 use crate::statistics::load_average;
 
 /// The steady state of a run, with further figures.
@@ -14,45 +14,47 @@ use crate::statistics::load_average;
 pub struct Figures {
     config: ExperimentConfig,
     evaluate: bool,
-    window: Window,
+    window: SteadyWindow,
     machine: Machine,
     load_average: Option<f64>,
 }
 
 impl Figures {
-    pub(super) fn new(bench: &SystemBench, window: Window, machine: Machine) -> Self {
+    pub(super) fn new(bench: &SystemBench, window: SteadyWindow, machine: Machine) -> Self {
         let load_average = load_average();
         let (config, evaluate) = (bench.config.clone(), bench.evaluate);
         Self { config, evaluate, window, machine, load_average }
     }
 
-    /// Number of cores that learner, workers and other processes used.
+    /// Returns the number of cores used by the learner, the workers and other processes.
     fn cores(&self) -> [f64; 3] {
         let cpu = self.window.cpu;
         [cpu.learner_s, cpu.workers_s, cpu.others_s].map(|seconds| seconds / self.window.seen_s)
     }
 
-    /// Utilisation of learner and workers, relative to one core per thread.
+    /// Returns the utilisation of learner and workers, relative to one core per thread.
     fn utilisations(&self) -> [f64; 2] {
         let [learner, workers, _] = self.cores();
         let most = |threads: usize| threads.min(self.machine.cores).max(1) as f64;
         [learner / most(self.config.learner.threads), workers / most(self.config.actors.workers)]
     }
 
-    /// Measured and configured updates per segment; `None` for an algorithm with its own rule.
+    /// Returns measured and configured updates per segment, or `None` for an algorithm with its own
+    /// pacing.
     fn updates_per_segment(&self) -> Option<(f64, f64)> {
         if self.config.algorithm.name == AlgorithmName::Ndp {
             return None;
         }
-        let asked = self.config.pacing.updates_per_segment;
-        Some((self.window.per_s(|line| line.updates) / self.segments_per_s().max(1e-9), asked))
+        let configured = self.config.pacing.updates_per_segment;
+        let measured = self.window.per_s(|line| line.updates) / self.segments_per_s().max(1e-9);
+        Some((measured, configured))
     }
 
     fn segments_per_s(&self) -> f64 {
         self.window.per_s(|line| line.segments)
     }
 
-    /// Median of the lines' median policy lags.
+    /// Returns the median of the lines' median policy lags.
     fn lag_p50(&self) -> Option<u64> {
         let mut medians: Vec<_> = self.window.lags.iter().map(|(median, _)| *median).collect();
         medians.sort_unstable();
@@ -63,10 +65,10 @@ impl Figures {
         self.window.lags.iter().map(|(_, max)| *max).max()
     }
 
-    /// The figures as one JSON object; unavailable ones are null.
+    /// Returns the figures as one JSON object. Unavailable ones are null.
     #[must_use]
     pub fn json(&self) -> Value {
-        let Window { first, last, cpu, .. } = &self.window;
+        let SteadyWindow { first, last, cpu, .. } = &self.window;
         let ([learner, workers, others], actors) = (self.cores(), &self.config.actors);
         let [learner_utilisation, workers_utilisation] = self.utilisations();
         let pacing = self.updates_per_segment();
@@ -80,7 +82,7 @@ impl Figures {
             "segments_per_s": self.segments_per_s(),
             "excluded": { "wall_s": first.wall_s, "env_steps": first.env_steps },
             "updates_per_segment": pacing.map(|(measured, _)| measured),
-            "updates_per_segment_asked": pacing.map(|(_, asked)| asked),
+            "updates_per_segment_asked": pacing.map(|(_, configured)| configured),
             "updates_owed": last.updates_owed,
             "cpu_s": { "learner": cpu.learner_s, "workers": cpu.workers_s, "others": cpu.others_s },
             "cores_used": { "learner": learner, "workers": workers, "others": others },
@@ -103,7 +105,7 @@ impl Figures {
         })
     }
 
-    /// Formats the figures as lines, like [`Figures::json`].
+    /// Returns the figures as lines of text.
     #[must_use]
     pub fn text(&self) -> String {
         let Self { config, window, .. } = self;
@@ -114,7 +116,7 @@ impl Figures {
             |lag: Option<u64>| lag.map_or_else(|| "unknown".to_owned(), |lag| lag.to_string());
         let mut lines = vec![
             format!(
-                "{} · {:?} · {:?} · {} × {} environments · {} steps a segment · learner on {} \
+                "{} · {:?} · {:?} · {} × {} environments · {} steps per segment · learner on {} \
                  thread{}",
                 config.task.name,
                 config.algorithm.name,
@@ -127,7 +129,7 @@ impl Figures {
             )
             .to_lowercase(),
             format!(
-                "{:.1} s of steady state; {:.1} s and {} steps before it are left out",
+                "{:.1} s of steady state, after {:.1} s and {} steps of start-up and warm-up",
                 window.wall_s(),
                 window.first.wall_s,
                 grouped(window.first.env_steps)
@@ -137,8 +139,10 @@ impl Figures {
             format!("  updates/s             {:>10.1}", window.per_s(|line| line.updates)),
             format!("  samples per insert    {:>10.2}", window.samples_per_insert()),
         ];
-        if let Some((measured, asked)) = self.updates_per_segment() {
-            lines.push(format!("  updates per segment   {measured:>10.3}   configured: {asked}"));
+        if let Some((measured, configured)) = self.updates_per_segment() {
+            lines.push(format!(
+                "  updates per segment   {measured:>10.3}   configured: {configured}"
+            ));
         }
         lines.extend([
             format!(
@@ -152,7 +156,7 @@ impl Figures {
             format!("  others   {others:>6.2} cores   of {}", self.machine.cores),
             String::new(),
             format!(
-                "  {} segments lost, {} rejected, {} workers started again",
+                "  {} segments lost, {} rejected, {} worker restarts",
                 last.lost,
                 last.rejected.total(),
                 last.worker_restarts

@@ -1,10 +1,9 @@
 //! `dmprl bench system`: measures a real `dmprl train` while it learns.
 //!
-//! The run is a normal one, with supervisor, learner and workers, in a folder that is removed
-//! afterwards. Its rates are differences between two lines of its own `metrics.jsonl` (`steady`).
-//! Processor time is read from `/proc` when these lines appear. The measurement excludes the time
-//! before the first line: the start, the warm-up, in which nothing is learned, and a second after
-//! it.
+//! The run is a normal one, with supervisor, learner and workers, in a temporary folder. Its rates
+//! are differences between two lines of its `metrics.jsonl` (`steady`). Processor times come from
+//! `/proc` at the times when these lines appear. The measurement excludes start-up, the warm-up
+//! without updates, and the first second after it.
 
 mod figures;
 mod steady;
@@ -23,37 +22,37 @@ use dmprl_supervisor::WholeRun;
 pub use figures::Figures;
 #[cfg(test)]
 pub(super) use steady::CpuTime;
-use steady::Steady;
-pub(super) use steady::Window;
+use steady::MetricsMonitor;
+pub(super) use steady::SteadyWindow;
 
 /// More steps than any measurement reaches.
 const STEPS: u64 = 1_000_000_000_000;
-/// Maximum number of environment steps between two lines of metrics, at which the measurement
-/// begins and ends.
+/// Maximum number of environment steps between two lines of metrics. The measurement starts and
+/// ends at a line.
 const METRICS_STEPS_MAX: u64 = 500;
 
-/// Plan of the benchmark.
+/// Settings of the benchmark.
 pub struct SystemBench {
-    /// Program of all processes: this one.
+    /// Path of this program, which also runs the other processes.
     pub program: PathBuf,
     /// The resolved configuration.
     pub config: ExperimentConfig,
-    /// Evaluates the policy as configured if true, never if false.
+    /// Whether to evaluate the policy as configured, or never.
     pub evaluate: bool,
     /// Minimum duration of the measurement.
     pub duration: Duration,
 }
 
-/// Runs the benchmark; returns `None` if the user interrupted it. Leaves no process and no file
-/// behind.
+/// Runs the benchmark; returns `None` if the user interrupted it. Removes all its processes and
+/// files.
 ///
 /// # Errors
-/// The run cannot be started, ends by itself, or makes no progress.
+/// The run cannot be started, ends early, or makes no progress.
 pub fn system(bench: &SystemBench, progress: &dyn Progress) -> anyhow::Result<Option<Figures>> {
     let watch = Watch::start()?;
     progress.stage("starting the run");
-    let told = |what: &str| progress.stage(what);
-    match measure(bench, &watch, &told) {
+    let report = |what: &str| progress.stage(what);
+    match measure(bench, &watch, &report) {
         Err(error) if error.is::<Interrupted>() => Ok(None),
         result => {
             let machine = Manifest::new(None)?.machine;
@@ -62,34 +61,34 @@ pub fn system(bench: &SystemBench, progress: &dyn Progress) -> anyhow::Result<Op
     }
 }
 
-/// Starts a run and measures its steady state; `told` receives progress messages.
+/// Starts a run and measures its steady state. `report` receives progress messages.
 pub(super) fn measure(
     bench: &SystemBench,
     watch: &Watch,
-    told: &dyn Fn(&str),
-) -> anyhow::Result<Window> {
+    report: &dyn Fn(&str),
+) -> anyhow::Result<SteadyWindow> {
     let folder = tempfile::Builder::new().prefix("dmprl-bench-").tempdir();
     let folder = folder.context("cannot make a folder for the run")?;
     let log = folder.path().join("train.log");
     let mut train = WholeRun::start(command(bench, folder.path())?, &log)?;
     let metrics = folder.path().join("run/metrics.jsonl");
-    let measured =
-        Steady::new(&metrics, train.pid()?, bench).until_measured(&mut train, watch, told);
-    // In any case, stop the run as a user would, so that it leaves no process and no shared memory.
-    let wrong = if train.end()?.is_none() { train.stop()? } else { None };
+    let measured = MetricsMonitor::new(&metrics, train.pid()?, bench)
+        .until_measured(&mut train, watch, report);
+    // Always stop the run as a user would, so that it removes its processes and shared memory.
+    let failure = if train.end()?.is_none() { train.stop()? } else { None };
     let window = measured?;
-    match wrong {
-        Some(how) => bail!("dmprl train did not end as it should: {how}"),
+    match failure {
+        Some(how) => bail!("dmprl train did not end cleanly: {how}"),
         None => Ok(window),
     }
 }
 
-/// `dmprl train` with the complete configuration as a file.
+/// Returns the command of `dmprl train` with the complete configuration as a file.
 fn command(bench: &SystemBench, folder: &Path) -> anyhow::Result<Command> {
     let mut config = bench.config.clone();
     config.run.steps = STEPS;
     config.metrics.interval_steps = config.metrics.interval_steps.min(METRICS_STEPS_MAX);
-    // No worker joins a benchmark.
+    // No workers join during a benchmark.
     config.actors.joined_max = 0;
     if !bench.evaluate {
         config.evaluation.interval_steps = STEPS;

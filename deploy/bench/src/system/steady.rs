@@ -14,21 +14,21 @@ use rustix::process::Pid;
 
 use super::SystemBench;
 
-/// Time without a new line after which the run counts as stuck. A start includes importing Python
+/// Time without a new line after which the run counts as stuck. Start-up includes importing Python
 /// packages.
 const SILENCE: Duration = Duration::from_secs(300);
-/// Wait after the first update, until buffers, caches and clock frequency are as in a long run.
+/// Time after the warm-up for buffers, caches and clock frequency to reach a steady state.
 const SETTLE_S: f64 = 1.0;
-/// Interval between checks of the file.
-const LOOK: Duration = Duration::from_millis(5);
+/// Interval between checks for new lines.
+const POLL_INTERVAL: Duration = Duration::from_millis(5);
 
 /// Processor time so far [s].
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
 pub(crate) struct CpuTime {
     pub(crate) learner_s: f64,
-    /// Of all workers together.
+    /// All workers together.
     pub(crate) workers_s: f64,
-    /// Of supervisor and evaluator.
+    /// Supervisor and evaluator.
     pub(crate) others_s: f64,
 }
 
@@ -36,7 +36,7 @@ impl CpuTime {
     fn of(supervisor: Pid) -> anyhow::Result<Self> {
         let mut time = Self { others_s: cpu_s(supervisor).unwrap_or(0.0), ..Self::default() };
         for member in members(supervisor)? {
-            // A process that has just exited has none.
+            // `None` if the process has just exited.
             let seconds = cpu_s(member.pid()).unwrap_or(0.0);
             match member.role {
                 Role::Learner(_) => time.learner_s += seconds,
@@ -56,33 +56,33 @@ impl CpuTime {
     }
 }
 
-/// Result of the measurement.
+/// The steady state of a run, between two lines of its metrics.
 #[derive(Debug, Clone)]
-pub(crate) struct Window {
+pub(crate) struct SteadyWindow {
     /// Line at the start of the measurement.
     pub(crate) first: MetricsLine,
     /// Line at the end of the measurement.
     pub(crate) last: MetricsLine,
-    /// Median and maximum of the policy lag, for each line in between.
+    /// Median and maximum of the policy lag, for each line after the first.
     pub(crate) lags: Vec<(u64, u64)>,
-    /// Processor time between the moments at which the two lines were read.
+    /// Processor time between the readings of the two lines.
     pub(crate) cpu: CpuTime,
-    /// Time between these moments [s].
+    /// Time between these readings [s].
     pub(crate) seen_s: f64,
 }
 
-impl Window {
+impl SteadyWindow {
     /// Duration by the learner's clock [s].
     pub(crate) fn wall_s(&self) -> f64 {
         self.last.wall_s - self.first.wall_s
     }
 
-    /// Increase of a counter per second.
+    /// Returns the increase of a counter per second.
     pub(crate) fn per_s(&self, count: impl Fn(&MetricsLine) -> u64) -> f64 {
         count(&self.last).saturating_sub(count(&self.first)) as f64 / self.wall_s()
     }
 
-    /// Samples drawn per environment step inserted.
+    /// Returns the number of samples drawn per environment step inserted.
     pub(crate) fn samples_per_insert(&self) -> f64 {
         let samples = |line: &MetricsLine| line.samples_per_insert * line.env_steps as f64;
         let steps = self.last.env_steps.saturating_sub(self.first.env_steps).max(1);
@@ -91,25 +91,25 @@ impl Window {
 }
 
 /// Follows the metrics of a run.
-pub(super) struct Steady {
+pub(super) struct MetricsMonitor {
     tail: Tail,
     supervisor: Pid,
     workers: u64,
     warm_up_steps: u64,
     duration_s: f64,
     settled_from: Option<f64>,
-    open: Option<Open>,
+    measuring: Option<Measuring>,
 }
 
 /// A measurement in progress.
-struct Open {
+struct Measuring {
     first: MetricsLine,
     lags: Vec<(u64, u64)>,
     cpu: CpuTime,
     seen: Instant,
 }
 
-impl Steady {
+impl MetricsMonitor {
     pub(super) fn new(metrics: &Path, supervisor: Pid, bench: &SystemBench) -> Self {
         Self {
             tail: Tail::new(metrics),
@@ -118,62 +118,67 @@ impl Steady {
             warm_up_steps: bench.config.exploration.warm_up_steps,
             duration_s: bench.duration.as_secs_f64(),
             settled_from: None,
-            open: None,
+            measuring: None,
         }
     }
 
+    /// Waits for the end of the measurement, and returns its result.
     pub(super) fn until_measured(
         mut self,
         train: &mut WholeRun,
         watch: &Watch,
-        told: &dyn Fn(&str),
-    ) -> anyhow::Result<Window> {
-        let mut heard = Instant::now();
+        report: &dyn Fn(&str),
+    ) -> anyhow::Result<SteadyWindow> {
+        let mut last_line = Instant::now();
         loop {
             watch.check()?;
             let look = self.tail.look()?;
             for line in look.lines.split(|&byte| byte == b'\n').filter(|line| !line.is_empty()) {
-                heard = Instant::now();
-                let line = serde_json::from_slice(line).context("a damaged line of metrics")?;
-                if let Some(window) = self.take(line, told)? {
+                last_line = Instant::now();
+                let line = serde_json::from_slice(line).context("invalid line of metrics")?;
+                if let Some(window) = self.process(line, report)? {
                     return Ok(window);
                 }
             }
             if let Some(how) = train.end()? {
                 bail!("dmprl train exited unexpectedly: {how}");
             }
-            if heard.elapsed() >= SILENCE {
+            if last_line.elapsed() >= SILENCE {
                 bail!("the run wrote no metrics for {SILENCE:?}");
             }
-            thread::sleep(LOOK);
+            thread::sleep(POLL_INTERVAL);
         }
     }
 
-    /// Processes a line; returns the window if it ends the measurement.
-    fn take(&mut self, line: MetricsLine, told: &dyn Fn(&str)) -> anyhow::Result<Option<Window>> {
-        let Some(open) = &mut self.open else {
+    /// Processes a line. Returns the result if the line ends the measurement.
+    fn process(
+        &mut self,
+        line: MetricsLine,
+        report: &dyn Fn(&str),
+    ) -> anyhow::Result<Option<SteadyWindow>> {
+        let Some(measuring) = &mut self.measuring else {
             let learns = line.updates > 0 && line.env_steps > self.warm_up_steps;
             if learns && line.workers >= self.workers {
                 let from = *self.settled_from.get_or_insert_with(|| {
-                    told("the warm-up is over");
+                    report("the warm-up is over");
                     line.wall_s
                 });
                 if line.wall_s >= from + SETTLE_S {
-                    told(&format!("measuring for {} s", self.duration_s));
+                    report(&format!("measuring for {} s", self.duration_s));
                     let cpu = CpuTime::of(self.supervisor)?;
                     let seen = Instant::now();
-                    self.open = Some(Open { first: line, lags: Vec::new(), cpu, seen });
+                    self.measuring = Some(Measuring { first: line, lags: Vec::new(), cpu, seen });
                 }
             }
             return Ok(None);
         };
-        open.lags.extend(line.policy_lag_p50.zip(line.policy_lag_max));
-        if line.wall_s < open.first.wall_s + self.duration_s {
+        measuring.lags.extend(line.policy_lag_p50.zip(line.policy_lag_max));
+        if line.wall_s < measuring.first.wall_s + self.duration_s {
             return Ok(None);
         }
-        let cpu = CpuTime::of(self.supervisor)?.since(open.cpu);
-        let seen_s = open.seen.elapsed().as_secs_f64();
-        let (first, lags) = (open.first.clone(), std::mem::take(&mut open.lags));
-        Ok(Some(Window { first, last: line, lags, cpu, seen_s }))
+        let cpu = CpuTime::of(self.supervisor)?.since(measuring.cpu);
+        let seen_s = measuring.seen.elapsed().as_secs_f64();
+        let (first, lags) = (measuring.first.clone(), std::mem::take(&mut measuring.lags));
+        Ok(Some(SteadyWindow { first, last: line, lags, cpu, seen_s }))
     }
 }

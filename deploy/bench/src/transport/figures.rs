@@ -12,8 +12,8 @@ use crate::drain_receiver::Discrepancies;
 use crate::statistics::{load_average, max, median, min};
 use crate::synthetic_segments::{QUEUE_SEGMENTS, SIZES};
 
-/// Our transport, in the report.
-pub(super) const OURS: &str = "shared_memory";
+/// Name of the shared-memory transport in the report.
+pub(super) const SHARED_MEMORY: &str = "shared_memory";
 
 /// Segments per second of each transport, by size and round, with further figures.
 #[derive(Debug, Clone)]
@@ -23,15 +23,15 @@ pub struct Figures {
     seconds: f64,
     machine: Machine,
     load_average: Option<f64>,
-    /// (bytes, name, rounds), without absent peers.
+    /// (bytes, name, rounds) of each available transport.
     rounds: Vec<(usize, &'static str, Vec<f64>)>,
     /// (bytes, fraction of a core that the receiver used in a round).
     sink_shares: Vec<(usize, f64)>,
-    /// (name, description or reason for absence), each name once.
+    /// (name, description or reason why it is unavailable), each name once.
     notes: Vec<(&'static str, String)>,
     /// (bytes, rejected and lost segments).
     pub(super) discrepancies: Vec<(usize, Discrepancies)>,
-    /// Fraction of a core that a worker uses while queue and outbox are full.
+    /// Fraction of a core that a worker uses while its queue and outbox are full.
     pub(super) blocked_cpu_fraction: Option<f64>,
 }
 
@@ -65,7 +65,7 @@ impl Figures {
         self.sink_shares.push((bytes, share));
     }
 
-    /// Describes `name`, or gives the reason for its absence; keeps the first of several notes.
+    /// Adds a description of `name`, or the reason why it is unavailable, unless it has a note.
     pub(super) fn note(&mut self, name: &'static str, text: &str) {
         if self.notes.iter().all(|(noted, _)| *noted != name) {
             self.notes.push((name, text.to_owned()));
@@ -82,10 +82,10 @@ impl Figures {
         median(self.rates(bytes, name))
     }
 
-    /// Our rate divided by that of `name`. It is the median of the rounds' own ratios, because a
-    /// machine's speed drifts less within a round than over all of them.
+    /// The rate of shared memory divided by that of `name`: the median of the ratios in each round,
+    /// because the machine's speed drifts less within a round than between rounds.
     fn ratio(&self, bytes: usize, name: &str) -> Option<f64> {
-        let pairs = self.rates(bytes, OURS).iter().zip(self.rates(bytes, name));
+        let pairs = self.rates(bytes, SHARED_MEMORY).iter().zip(self.rates(bytes, name));
         median(&pairs.map(|(ours, other)| ours / other).collect::<Vec<_>>())
     }
 
@@ -94,7 +94,7 @@ impl Figures {
         found.map(|(_, discrepancies)| *discrepancies).unwrap_or_default()
     }
 
-    /// The figures as one JSON object; unavailable ones are null.
+    /// Returns the figures as one JSON object. Unavailable ones are null.
     #[must_use]
     pub fn json(&self) -> Value {
         let notes: Map<_, _> =
@@ -102,7 +102,7 @@ impl Figures {
         json!({
             "sizes": SIZES.map(|size| self.size_json(size.bytes)),
             "blocked_cpu_fraction": self.blocked_cpu_fraction,
-            // For the first size; each size has its own `peers` too.
+            // Those of the first size. Each size also has its own `peers`.
             "peers": self.each_peer(|name| self.segments_per_s(SIZES[0].bytes, name)),
             "workers": self.workers,
             "level": self.level,
@@ -117,7 +117,7 @@ impl Figures {
 
     fn size_json(&self, bytes: usize) -> Value {
         let Discrepancies { rejected, duplicate, lost, received } = self.discrepancies(bytes);
-        let rates = self.rates(bytes, OURS);
+        let rates = self.rates(bytes, SHARED_MEMORY);
         let shares = self.sink_shares.iter().filter(|(of, _)| *of == bytes);
         json!({
             "segment_bytes": bytes,
@@ -139,10 +139,10 @@ impl Figures {
         peers().map(|name| (name.to_owned(), of(name).into())).collect()
     }
 
-    /// Formats the figures as a table, like [`Figures::json`].
+    /// Returns the figures as a table.
     #[must_use]
     pub fn text(&self) -> String {
-        let rounds = self.rates(SIZES[0].bytes, OURS).len();
+        let rounds = self.rates(SIZES[0].bytes, SHARED_MEMORY).len();
         let mut lines = vec![
             format!(
                 "{} worker{} · level {} · queues of {QUEUE_SEGMENTS} segments · median of \
@@ -156,13 +156,13 @@ impl Figures {
         ];
         for size in SIZES {
             lines.push(format!(
-                "  {:<22} {:>11} {:>8}   {:<21} ours is",
+                "  {:<22} {:>11} {:>8}   {:<21} ours/this",
                 format!("{} bytes", grouped(size.bytes as u64)),
                 "segments/s",
                 "MB/s",
                 "from … to"
             ));
-            lines.push(self.row(size.bytes, OURS));
+            lines.push(self.row(size.bytes, SHARED_MEMORY));
             lines.extend(peers().map(|name| self.row(size.bytes, name)));
             let Discrepancies { rejected, duplicate, lost, received } =
                 self.discrepancies(size.bytes);
@@ -173,7 +173,7 @@ impl Figures {
             lines.push(String::new());
         }
         let blocked = self.blocked_cpu_fraction.map_or_else(
-            || "an unknown share".to_owned(),
+            || "an unknown fraction".to_owned(),
             |fraction| format!("{:.1} %", 100.0 * fraction),
         );
         lines.push(format!("  a blocked worker uses {blocked} of one core"));
@@ -189,7 +189,7 @@ impl Figures {
         };
         let whole = |rate: f64| grouped(rate.round() as u64);
         let spread = format!("{} … {}", whole(min(rates)), whole(max(rates)));
-        let ratio = self.ratio(bytes, name).filter(|_| name != OURS);
+        let ratio = self.ratio(bytes, name).filter(|_| name != SHARED_MEMORY);
         let ratio = ratio.map_or_else(String::new, |ratio| format!("{ratio:.2} ×"));
         let mb_per_s = rate * bytes as f64 / 1e6;
         let rate = whole(rate);
@@ -198,7 +198,7 @@ impl Figures {
     }
 }
 
-/// All possible peers, in the order of the report.
+/// Returns the names of all peers, in the order of the report.
 fn peers() -> impl Iterator<Item = &'static str> {
     StreamKind::ALL.map(StreamKind::name).into_iter().chain(python::NAMES)
 }
@@ -223,17 +223,17 @@ mod tests {
         };
         figures.note("zeromq", "is not installed");
         figures.note("zeromq", "again");
-        // The machine becomes four times, then twice as slow during the measurement.
+        // The machine is four times slower in the second round, and twice in the third.
         for slow in [1.0, 4.0, 2.0] {
-            figures.add(1_024, OURS, 400_000.0 / slow);
+            figures.add(1_024, SHARED_MEMORY, 400_000.0 / slow);
             figures.add(1_024, "pipe", 100_000.0 / slow);
-            figures.add(10_240, OURS, 200_000.0 / slow);
+            figures.add(10_240, SHARED_MEMORY, 200_000.0 / slow);
         }
         figures
     }
 
     #[test]
-    fn the_object_has_a_median_for_each_size_and_null_for_a_peer_that_is_absent() {
+    fn json_has_a_median_per_size_and_null_for_absent_peers() {
         let json = figures().json();
         let (small, large) = (&json["sizes"][0], &json["sizes"][1]);
         assert_eq!(
@@ -255,13 +255,13 @@ mod tests {
     }
 
     #[test]
-    fn the_table_says_how_ours_compares_and_what_is_absent() {
+    fn table_shows_ratios_and_absent_peers() {
         let text = figures().text();
         let row = |name: &str| {
             let line = text.lines().find(|line| line.trim_start().starts_with(name)).unwrap();
             line.split_whitespace().skip(1).collect::<Vec<_>>().join(" ")
         };
-        assert_eq!(row(OURS), "200,000 205 100,000 … 400,000");
+        assert_eq!(row(SHARED_MEMORY), "200,000 205 100,000 … 400,000");
         assert_eq!(row("pipe"), "50,000 51 25,000 … 100,000 4.00 ×");
         assert_eq!(row("zeromq"), "absent");
         assert!(text.contains("0 lost, 3 duplicate"), "{text}");

@@ -1,4 +1,4 @@
-//! Peers in Python: processes of `dmprl.bench_transport`, each with both ends.
+//! Peers in Python: processes of `dmprl.bench_transport`, each of which starts its own sender.
 
 use std::fs::File;
 use std::path::Path;
@@ -13,15 +13,15 @@ use super::TransportBench;
 use crate::child::LineChild;
 use crate::synthetic_segments::Size;
 
-/// Time limit from a start to the first line.
+/// Time limit until a peer is ready.
 const READY: Duration = Duration::from_secs(120);
-/// Extra time that a measurement may take.
+/// Time beyond a measurement's duration until it times out.
 const MEASURE_SLACK: Duration = Duration::from_secs(30);
 
 /// Names of the peers in `dmprl.bench_transport`.
 pub(super) const NAMES: [&str; 2] = ["multiprocessing_queue", "zeromq"];
 
-/// A peer's process, whose child is the sender.
+/// A peer's receiver process. Its child is the sender.
 pub(super) struct PythonPeer {
     pub(super) name: &'static str,
     child: LineChild,
@@ -50,7 +50,7 @@ impl PythonPeer {
             .args(["--segment-bytes", &size.bytes.to_string()])
             .arg("--folder")
             .arg(folder)
-            // `-m` puts the working directory first on the path: use one without modules.
+            // `-m` puts the working directory first on the module path, so it must have none.
             .current_dir(folder)
             .env("PYTHONPATH", &bench.package_path)
             .env("PYTHONDONTWRITEBYTECODE", "1")
@@ -65,10 +65,10 @@ impl PythonPeer {
 
     /// Measures segments per second.
     pub(super) fn measure(&mut self, watch: &Watch, duration: Duration) -> anyhow::Result<f64> {
-        self.child.say(&format!("run {}", duration.as_secs_f64()))?;
-        let line = self.child.next(watch, duration + MEASURE_SLACK, "the measurement")?;
+        self.child.send_line(&format!("run {}", duration.as_secs_f64()))?;
+        let line = self.child.next_line(watch, duration + MEASURE_SLACK, "the measurement")?;
         let Ok(Measured { segments, seconds }) = serde_json::from_str(&line) else {
-            return Err(self.child.no_answer(&line));
+            return Err(self.child.unexpected_line(&line));
         };
         ensure!(seconds > 0.0, "{}: {segments} segments in {seconds} s", self.name);
         Ok(segments as f64 / seconds)

@@ -1,8 +1,8 @@
-//! Peers: the same segments as frames through a pipe or a Unix socket.
+//! Stream peers: the same segments as frames through a pipe or a Unix socket.
 //!
-//! One process writes; a thread here reads, checks and counts like the receiver for shared memory.
-//! There are no acknowledgements and no retransmits. Between two measurements the thread does not
-//! read, and the writer sleeps in the kernel.
+//! One process writes. A thread of this process reads, checks and counts like the receiver for
+//! shared memory. There are no acknowledgements and no retransmits. Between two measurements, the
+//! thread does not read and the writer blocks.
 
 use std::fs::File;
 use std::io::{BufReader, Read};
@@ -24,12 +24,12 @@ use crate::synthetic_segments::Size;
 
 /// Time limit from the start of a process to its connection.
 const CONNECT: Duration = Duration::from_secs(30);
-/// Extra time that a measurement may take.
+/// Time beyond a measurement's duration until it times out.
 const MEASURE_SLACK: Duration = Duration::from_secs(30);
-/// Time before the clock starts, in which the pipe's old content is read and the writer returns to
-/// full speed.
+/// Time before the measurement starts, in which the buffered frames are read and the writer returns
+/// to full speed.
 const SETTLE: Duration = Duration::from_millis(100);
-/// Capacity of a pipe.
+/// Size of the reader's buffer: the default capacity of a pipe.
 const BUFFER_BYTES: usize = 64 << 10;
 
 /// Channel of a peer's frames.
@@ -42,7 +42,7 @@ pub(super) enum StreamKind {
 impl StreamKind {
     pub(super) const ALL: [Self; 2] = [Self::Pipe, Self::Socket];
 
-    /// Name of the channel in reports.
+    /// Returns the channel's name for reports.
     pub(super) fn name(self) -> &'static str {
         match self {
             Self::Pipe => "pipe",
@@ -50,21 +50,21 @@ impl StreamKind {
         }
     }
 
-    /// Description of the channel, for the report.
+    /// Returns a description of the channel for the report.
     pub(super) fn about(self) -> &'static str {
         match self {
-            Self::Pipe => "one frame a write into a pipe, read in 64 KiB; no acknowledgement",
-            Self::Socket => "the same through a Unix stream socket",
+            Self::Pipe => "a pipe, one write per frame, reads of 64 KiB, no acknowledgements",
+            Self::Socket => "the same with a Unix stream socket",
         }
     }
 }
 
-/// Bytes of a frame after its length field, for a block of `block_len` values.
+/// Returns the size of a frame after its length field, for a block of `block_len` values.
 pub(super) fn frame_bytes(block_len: usize) -> u32 {
     (size_of::<SegmentHeader>() + block_len * size_of::<f32>()) as u32
 }
 
-/// A writing process and the reading thread.
+/// A writer process and a reader thread.
 pub(super) struct StreamPeer {
     pub(super) kind: StreamKind,
     child: LineChild,
@@ -73,12 +73,13 @@ pub(super) struct StreamPeer {
 }
 
 impl StreamPeer {
-    /// Starts both; `command` is a `transport-worker` without its route.
+    /// Starts both. `command` is a `transport-worker` without its route.
     pub(super) fn start(
         kind: StreamKind,
         size: Size,
         mut command: Command,
-        (folder, watch): (&Path, &Watch),
+        folder: &Path,
+        watch: &Watch,
     ) -> anyhow::Result<Self> {
         let name = format!("{}-{}", kind.name(), size.bytes);
         let log_path = folder.join(format!("{name}.log"));
@@ -87,12 +88,12 @@ impl StreamPeer {
         let (stream, child): (Box<dyn Read + Send>, _) = match kind {
             StreamKind::Pipe => {
                 let (reader, writer) = std::io::pipe().context("cannot make a pipe")?;
-                // The child opens it by this path, so that no other process inherits it.
+                // The child opens the pipe by this path: other children must not inherit it.
                 let path = format!("/proc/{}/fd/{}", std::process::id(), writer.as_raw_fd());
                 command.args(["--pipe", &path]);
                 let mut child = LineChild::start(name, command, &log_path)?;
-                // Close our end once the child has its own, so that its death ends the stream.
-                child.next(watch, CONNECT, "the connection")?;
+                // Closed once the child has its own, so that the child's death ends the stream.
+                child.next_line(watch, CONNECT, "the connection")?;
                 drop(writer);
                 (Box::new(reader), child)
             }
@@ -102,17 +103,17 @@ impl StreamPeer {
                     .with_context(|| format!("cannot listen at {}", path.display()))?;
                 command.arg("--socket").arg(&path);
                 let mut child = LineChild::start(name, command, &log_path)?;
-                child.next(watch, CONNECT, "the connection")?;
+                child.next_line(watch, CONNECT, "the connection")?;
                 (Box::new(listener.accept().context("cannot accept a connection")?.0), child)
             }
         };
         let (requests, asked) = mpsc::channel();
         let (answers, rates) = mpsc::channel();
-        // It exits when the stream ends with the child's death, or when this peer is dropped.
+        // The thread exits at the end of the stream, or when this peer is dropped.
         thread::spawn(move || {
-            let mut taker = Taker::new(stream, size);
+            let mut reader = FrameReader::new(stream, size);
             for duration in asked {
-                let rate = taker.measure(duration);
+                let rate = reader.measure(duration);
                 if answers.send(rate).is_err() {
                     return;
                 }
@@ -123,25 +124,26 @@ impl StreamPeer {
 
     /// Measures segments per second.
     pub(super) fn measure(&mut self, watch: &Watch, duration: Duration) -> anyhow::Result<f64> {
-        // If the thread has exited, there is no answer either.
+        // If the thread has exited, receiving the answer fails too.
         let _ = self.requests.send(duration);
         let what = format!("the measurement of {}", self.child.name());
         let rate = watch.next(&self.rates, duration + MEASURE_SLACK, &what)?;
-        match rate.ok_or_else(|| anyhow!("the reader of {} has ended", self.child.name()))? {
+        match rate.ok_or_else(|| anyhow!("the reader of {} has exited", self.child.name()))? {
             Ok(rate) => Ok(rate),
-            Err(error) => Err(error.context(self.child.last_word())),
+            Err(error) => Err(error.context(self.child.exit_summary())),
         }
     }
 }
 
-struct Taker {
+/// State of the reader thread.
+struct FrameReader {
     stream: BufReader<Box<dyn Read + Send>>,
     expected: Expected,
     inbox: Inbox,
     segment: Segment,
 }
 
-impl Taker {
+impl FrameReader {
     fn new(stream: Box<dyn Read + Send>, size: Size) -> Self {
         Self {
             stream: BufReader::with_capacity(BUFFER_BYTES, stream),
@@ -152,28 +154,29 @@ impl Taker {
     }
 
     fn measure(&mut self, duration: Duration) -> anyhow::Result<f64> {
-        self.take_for(SETTLE)?;
-        self.take_for(duration)
+        self.read_for(SETTLE)?;
+        self.read_for(duration)
     }
 
-    fn take_for(&mut self, duration: Duration) -> anyhow::Result<f64> {
+    /// Reads segments for `duration`, and returns their rate per second.
+    fn read_for(&mut self, duration: Duration) -> anyhow::Result<f64> {
         let start = Instant::now();
         let mut segments = 0_u64;
         while start.elapsed() < duration {
-            self.take()?;
+            self.read_segment()?;
             segments += 1;
         }
         Ok(segments as f64 / start.elapsed().as_secs_f64())
     }
 
-    /// Takes a segment. A stream has no gaps: any gap is an error.
-    fn take(&mut self) -> anyhow::Result<()> {
+    /// Reads a segment and checks it. A gap in the sequence is an error: streams lose nothing.
+    fn read_segment(&mut self) -> anyhow::Result<()> {
         let Self { stream, expected, inbox, segment } = self;
         let Segment { header, block } = segment;
         let mut bytes = [0; size_of::<u32>()];
         stream.read_exact(&mut bytes).context("the stream has ended")?;
         let (got, wanted) = (u32::from_le_bytes(bytes), frame_bytes(block.len()));
-        ensure!(got == wanted, "a frame of {got} bytes, expected {wanted}");
+        ensure!(got == wanted, "got a frame of {got} bytes, expected {wanted}");
         stream.read_exact(bytemuck::bytes_of_mut(header)).context("the stream has ended")?;
         stream.read_exact(bytemuck::cast_slice_mut(block)).context("the stream has ended")?;
         check(header, block, expected)?;

@@ -1,7 +1,7 @@
-//! `dmprl transport-worker`: only sends synthetic segments, as fast as possible.
+//! `dmprl transport-worker`: sends synthetic segments as fast as possible.
 //!
-//! Through shared memory it sends with the code of a run's worker. Through a pipe or a socket it
-//! writes each segment as one frame: a length, header, block.
+//! Through shared memory, it uses the same code as a run's worker. Through a pipe or a socket, it
+//! writes each segment as one frame: length, header, block.
 
 use std::fs::OpenOptions;
 use std::io::Write;
@@ -20,12 +20,12 @@ use dmprl_shared::transport::delivery::{Outbox, Sent};
 use super::streams::frame_bytes;
 use crate::synthetic_segments::{QUEUE_SEGMENTS, Size, SyntheticSegments};
 
-/// A blocked worker waits for its next round, which is no reason for a warning.
-const NO_WARNING: Duration = Duration::from_secs(1_000_000);
+/// A worker warns when it is blocked for this long. Waiting for the next round is normal.
+const SEND_DEADLINE: Duration = Duration::from_secs(1_000_000);
 
 const HELP: &str = "\
-Speaks JSON lines on standard input and output as the roles of a run do, and ends when its standard
-input ends. `bench transport` starts it.
+Exchanges JSON lines on standard input and output, like the other processes of a run, and exits at
+the end of its input. Started by `bench transport`.
 
 EXAMPLES
   dmprl transport-worker --segment-bytes 1024 --shared-memory /dev/shm/dmprl-1000/4f2a";
@@ -69,10 +69,10 @@ fn size(text: &str) -> Result<usize, String> {
 /// Sends until a stop is requested.
 ///
 /// # Errors
-/// The receiver is gone, or the transport failed.
+/// The receiver has exited, or the transport fails.
 pub fn transport_worker(args: &TransportWorkerArgs) -> anyhow::Result<()> {
     let control = ControlPipe::open(ORPHAN_LIMIT)?;
-    let size = Size::of_bytes(args.segment_bytes).context("no such size")?;
+    let size = Size::of_bytes(args.segment_bytes).context("unsupported segment size")?;
     let Route { shared_memory, pipe, socket } = &args.route;
     if let Some(domain) = shared_memory {
         return through_shared_memory(args, size, domain, &control);
@@ -98,7 +98,7 @@ fn through_shared_memory(
     let plan = size.plan(args.workers);
     let Some(end) = attach(control, domain, &plan, args.index)? else { return Ok(()) };
     let outbox = Outbox::new(size.layout, QUEUE_SEGMENTS, args.index, 0);
-    let mut delivery = Delivery::new(control, NO_WARNING, end, outbox);
+    let mut delivery = Delivery::new(control, SEND_DEADLINE, end, outbox);
     let mut synthetic_segments = SyntheticSegments::new(size.layout, args.index);
     while !control.stop_requested() {
         let Segment { header, block } = synthetic_segments.next();
@@ -124,8 +124,8 @@ fn through_stream(
         frame.extend_from_slice(&frame_bytes(block.len()).to_le_bytes());
         frame.extend_from_slice(bytemuck::bytes_of(header));
         frame.extend_from_slice(bytemuck::cast_slice(block));
-        // A full pipe blocks; a closed one is an error.
-        stream.write_all(&frame).context("the receiver is gone")?;
+        // Blocks while the stream is full, and fails once it is closed.
+        stream.write_all(&frame).context("the receiver has closed the stream")?;
     }
     Ok(())
 }

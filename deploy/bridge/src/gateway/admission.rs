@@ -9,7 +9,8 @@ use dmprl_run::random_u64;
 use super::{Gateway, GatewayEvent, HostSenders, RemoteWorker, RunFacts};
 use crate::host_messages::{HostAnswer, HostRequest, HostWelcome, Lease};
 use crate::host_registry::Refusal;
-use crate::link::{Request, Urgency};
+use crate::link::Request;
+use crate::link_mode::Urgency;
 use crate::link_receiver::LinkReceiver;
 use crate::token;
 

@@ -1,40 +1,40 @@
-//! Verifies from the journals that no segment is lost, duplicated or corrupted, and that nothing
-//! goes backwards.
+//! Verifies from the journals that no segment is lost, duplicated or corrupted, and that counters
+//! and policies never go backwards.
 //!
-//! A learner's *lineage* consists of the segments in its checkpoint, those read from its log, and
-//! those it inserted. A starting learner reports, by its checkpoint's marks, how much of its
-//! predecessor's lineage is left; the log and the workers supply the rest. The checker stores four
-//! bytes per segment, its checksum at the worker. The inserted segments are stored as a number and
-//! the gaps below it.
+//! A learner's *lineage* consists of the segments in its checkpoint, those from its log, and those
+//! it has inserted since. The marks of its checkpoint say how much of its predecessor's lineage a
+//! starting learner has kept; the log and the workers restore the rest. The checker stores four
+//! bytes per segment: the worker's checksum. It stores the inserted segments as the highest
+//! sequence number and the gaps below it.
 
-mod life;
+mod incarnation;
 #[cfg(test)]
 mod tests;
 
 use std::collections::BTreeMap;
 
 use dmprl_shared::transport::delivery::Watermark;
-use life::Life;
+use incarnation::IncarnationState;
 
 use super::violations::Violations;
-use crate::journal::{Author, Entry, Piece, Record, Standing};
+use crate::journal::{Author, Entry, LearnerCounters, Record, SegmentDigest};
 
-/// Maximum distance between checkpoints, in intervals. A checkpoint being written delays the next,
-/// and a segment crosses the limit in one step.
+/// Maximum distance between checkpoints, in intervals. While a checkpoint is being written, the
+/// next one is delayed.
 const INTERVALS_MAX: u64 = 2;
-/// Upper bound of the environment steps in a segment.
+/// Upper bound on the environment steps in a segment, by which the distance may be exceeded.
 const SEGMENT_STEPS: u64 = 100;
 
-/// Fate of all segments.
+/// Total numbers of segments by outcome.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
-pub(super) struct Sums {
+pub(super) struct SegmentTotals {
     /// Finished by workers.
     pub(super) produced: u64,
     /// In the last learner's lineage.
     pub(super) inserted: u64,
     /// Rejected permanently, except duplicates.
     pub(super) rejected: u64,
-    /// Never sent or never taken, from a worker that was killed or stopped.
+    /// Never sent or never received, because the worker was killed or stopped.
     pub(super) in_flight: u64,
     /// Missing although acknowledged, or although later segments of the same worker arrived.
     pub(super) lost: u64,
@@ -44,20 +44,21 @@ pub(super) struct Sums {
     pub(super) acknowledged: u64,
 }
 
-/// Follows a run by its journals.
+/// Checks a run by its journals.
 pub(super) struct Checker {
-    /// For each worker, its lives by incarnation.
-    lives: Vec<BTreeMap<u32, Life>>,
-    /// The lineage's last segment of each worker.
+    /// State of each worker's incarnations, by number.
+    incarnations: Vec<BTreeMap<u32, IncarnationState>>,
+    /// Last segment of each worker in the lineage.
     settled: Vec<Watermark>,
-    standing: Standing,
-    /// Counters at the start and at each checkpoint begun since, without those that a later learner
-    /// has rolled back.
-    cuts: Vec<Standing>,
-    /// Environment steps since the last checkpoint began or the learner started to serve.
-    since_cut: u64,
+    /// Counters of the newest learner.
+    counters: LearnerCounters,
+    /// Counters at the start of the run and of each checkpoint begun since, except those that a
+    /// later learner has rolled back.
+    checkpoint_counters: Vec<LearnerCounters>,
+    /// Environment steps since the last checkpoint was begun or the learner started to serve.
+    steps_since_checkpoint: u64,
     checkpoint_interval: u64,
-    /// Epoch of the newest learner from which each worker has a policy.
+    /// Epoch of each worker's newest policy.
     epochs: Vec<u64>,
     duplicate: u64,
     checkpoints: u64,
@@ -68,11 +69,11 @@ impl Checker {
     pub(super) fn new(workers: u32, checkpoint_interval: u64) -> Self {
         let count = workers as usize;
         Self {
-            lives: vec![BTreeMap::new(); count],
+            incarnations: vec![BTreeMap::new(); count],
             settled: vec![Watermark::default(); count],
-            standing: Standing::default(),
-            cuts: vec![Standing::default()],
-            since_cut: 0,
+            counters: LearnerCounters::default(),
+            checkpoint_counters: vec![LearnerCounters::default()],
+            steps_since_checkpoint: 0,
             checkpoint_interval,
             epochs: vec![0; count],
             duplicate: 0,
@@ -81,186 +82,193 @@ impl Checker {
         }
     }
 
-    /// Processes a record. The records of an author must come in order, and a learner's after the
-    /// worker records written before them.
-    pub(super) fn take(&mut self, author: Author, record: &Record) {
+    /// Processes a record. An author's records must come in order, and a learner's records after
+    /// all earlier records of the workers.
+    pub(super) fn process(&mut self, author: Author, record: &Record) {
         match (author, record.entry) {
             (Author::Worker(worker, incarnation), entry) => {
-                if worker as usize >= self.lives.len() {
-                    self.violations.add(format!("I9: a journal of unknown worker {worker}"));
+                if worker as usize >= self.incarnations.len() {
+                    self.violations.add(format!("I9: journal of unknown worker {worker}"));
                 } else {
-                    self.on_worker((worker, incarnation), entry);
+                    self.on_worker(worker, incarnation, entry);
                 }
             }
             (Author::Learner(_), Entry::Restored(worker, mark)) => self.on_restored(worker, mark),
-            (Author::Learner(deaths), Entry::Started(standing)) => {
-                self.on_started(deaths, standing);
+            (Author::Learner(deaths), Entry::Started(counters)) => {
+                self.on_started(deaths, counters);
             }
-            (Author::Learner(_), Entry::Serving) => self.since_cut = 0,
-            (Author::Learner(_), Entry::Inserted(piece)) => self.on_inserted(&piece),
-            (Author::Learner(_), Entry::Refused(_, true)) => self.duplicate += 1,
-            (Author::Learner(_), Entry::Refused(piece, false)) => self.on_refused(&piece),
-            (Author::Learner(_), Entry::Cut(standing)) => {
-                self.cuts.push(standing);
+            (Author::Learner(_), Entry::Serving) => self.steps_since_checkpoint = 0,
+            (Author::Learner(_), Entry::Inserted(segment)) => self.on_inserted(&segment),
+            (Author::Learner(_), Entry::Rejected { is_duplicate: true, .. }) => self.duplicate += 1,
+            (Author::Learner(_), Entry::Rejected { segment, is_duplicate: false }) => {
+                self.on_rejected(&segment);
+            }
+            (Author::Learner(_), Entry::CheckpointBegun(counters)) => {
+                self.checkpoint_counters.push(counters);
                 self.checkpoints += 1;
-                self.since_cut = 0;
+                self.steps_since_checkpoint = 0;
             }
             (author, entry) => {
-                self.violations.add(format!("I9: {author:?} has logged {entry:?}"));
+                self.violations
+                    .add(format!("I9: unexpected {entry:?} in the journal of {author:?}"));
             }
         }
     }
 
-    /// The newest learner's counters.
-    pub(super) fn standing(&self) -> Standing {
-        self.standing
+    /// Returns the newest learner's counters.
+    pub(super) fn counters(&self) -> LearnerCounters {
+        self.counters
     }
 
-    /// The newest learner's last segment of each worker.
+    /// Returns the newest learner's last segment of each worker.
     pub(super) fn settled(&self) -> &[Watermark] {
         &self.settled
     }
 
-    /// Number of checkpoints begun.
+    /// Returns the number of checkpoints begun.
     pub(super) fn checkpoints(&self) -> u64 {
         self.checkpoints
     }
 
-    fn on_worker(&mut self, (worker, incarnation): (u32, u32), entry: Entry) {
-        let life = self.lives[worker as usize].entry(incarnation).or_default();
+    fn on_worker(&mut self, worker: u32, incarnation: u32, entry: Entry) {
+        let state = self.incarnations[worker as usize].entry(incarnation).or_default();
         let name = format!("worker {worker}, incarnation {incarnation}");
         match entry {
-            Entry::Produced(piece) => {
-                let expected = Watermark { incarnation, sequence: life.produced.len() as u64 + 1 };
-                life.produced.push(piece.checksum);
-                if (piece.worker, piece.mark) != (worker, expected) {
+            Entry::Produced(segment) => {
+                let expected = Watermark { incarnation, sequence: state.produced.len() as u64 + 1 };
+                state.produced.push(segment.checksum);
+                if (segment.worker, segment.mark) != (worker, expected) {
                     self.violations.add(format!(
-                        "I9: {name} has produced segment {} after {}",
-                        piece.mark.sequence,
+                        "I9: {name}, produced segment {} after {}",
+                        segment.mark.sequence,
                         expected.sequence - 1
                     ));
                 }
             }
             Entry::Acknowledged(mark) => {
-                if mark.sequence < life.acked || mark.sequence > life.produced.len() as u64 {
+                if mark.sequence < state.acked || mark.sequence > state.produced.len() as u64 {
                     self.violations.add(format!(
-                        "I1: {name} has had {} acknowledged after {}, and produced {}",
+                        "I1: {name}: {} acknowledged after {}, with {} produced",
                         mark.sequence,
-                        life.acked,
-                        life.produced.len()
+                        state.acked,
+                        state.produced.len()
                     ));
                 }
-                life.acked = life.acked.max(mark.sequence);
+                state.acked = state.acked.max(mark.sequence);
             }
             Entry::Policy { epoch, version } => {
                 let newest = &mut self.epochs[worker as usize];
                 if epoch < *newest {
-                    let text = format!("I6: {name} has gone from epoch {newest} to {epoch}");
+                    let text = format!("I6: {name}, went from epoch {newest} to {epoch}");
                     self.violations.add(text);
                 }
                 *newest = epoch.max(*newest);
-                let (epoch_before, before) = life.policy;
+                let (epoch_before, before) = state.policy;
                 if epoch == epoch_before && version < before {
                     self.violations.add(format!(
-                        "I6: {name} has gone from policy {before} to {version} in epoch {epoch}"
+                        "I6: {name}, went from policy {before} to {version} in epoch {epoch}"
                     ));
                 }
-                life.policy = (epoch, version);
+                state.policy = (epoch, version);
             }
-            entry => self.violations.add(format!("I9: {name} has logged {entry:?}")),
+            entry => {
+                self.violations.add(format!("I9: unexpected {entry:?} in the journal of {name}"));
+            }
         }
     }
 
     /// Rolls the lineage back to a worker's mark in a checkpoint.
     fn on_restored(&mut self, worker: u32, mark: Watermark) {
         let Some(settled) = self.settled.get_mut(worker as usize) else {
-            self.violations.add(format!("I1: a checkpoint has unknown worker {worker}"));
+            self.violations.add(format!("I1: a checkpoint contains unknown worker {worker}"));
             return;
         };
         if mark > *settled {
             self.violations.add(format!(
-                "I1: a learner goes on from {mark:?} of worker {worker}, of which {settled:?} was \
-                 the last inserted"
+                "I1: a learner resumes at {mark:?} of worker {worker}, but {settled:?} was \
+                 inserted last"
             ));
         }
         *settled = mark.min(*settled);
-        for (incarnation, life) in &mut self.lives[worker as usize] {
+        for (incarnation, state) in &mut self.incarnations[worker as usize] {
             if *incarnation >= mark.incarnation {
                 let kept = if *incarnation == mark.incarnation { mark.sequence } else { 0 };
-                life.forget_after(kept);
+                state.roll_back_to(kept);
             }
         }
     }
 
-    fn on_started(&mut self, deaths: u64, standing: Standing) {
-        let lineage: u64 = self.all_lives().map(Life::inserted).sum();
-        if lineage != standing.segments {
+    fn on_started(&mut self, deaths: u64, counters: LearnerCounters) {
+        let lineage: u64 = self.all_incarnations().map(IncarnationState::inserted).sum();
+        if lineage != counters.segments {
             self.violations.add(format!(
-                "I5: the learner after {deaths} deaths counts {} segments, its marks are of \
-                 {lineage}",
-                standing.segments
+                "I5: the learner after {deaths} deaths counts {} segments, its marks {lineage}",
+                counters.segments
             ));
         }
-        // The newest checkpoint may have been incomplete on disk; the previous one was complete.
-        match self.cuts.iter().rposition(|cut| *cut == standing) {
-            Some(index) if index + 2 >= self.cuts.len() => self.cuts.truncate(index + 1),
+        // The newest checkpoint may be incomplete on disk, but the previous one must be complete.
+        match self.checkpoint_counters.iter().rposition(|earlier| *earlier == counters) {
+            Some(index) if index + 2 >= self.checkpoint_counters.len() => {
+                self.checkpoint_counters.truncate(index + 1);
+            }
             Some(index) => {
                 self.violations.add(format!(
-                    "I5: the learner after {deaths} deaths has gone back {} checkpoints, to \
-                     {standing:?}",
-                    self.cuts.len() - 1 - index
+                    "I5: the learner after {deaths} deaths went back {} checkpoints, to \
+                     {counters:?}",
+                    self.checkpoint_counters.len() - 1 - index
                 ));
-                self.cuts.truncate(index + 1);
+                self.checkpoint_counters.truncate(index + 1);
             }
             None => {
                 self.violations.add(format!(
-                    "I5: the learner after {deaths} deaths begins with {standing:?}, of which no \
-                     checkpoint was made"
+                    "I5: the learner after {deaths} deaths starts with {counters:?}, which no \
+                     checkpoint has"
                 ));
-                self.cuts.push(standing);
+                self.checkpoint_counters.push(counters);
             }
         }
-        self.standing = standing;
-        self.since_cut = 0;
+        self.counters = counters;
+        self.steps_since_checkpoint = 0;
     }
 
-    fn on_inserted(&mut self, piece: &Piece) {
-        let Some(mark) = self.arrive(piece, "inserted") else { return };
-        let life = self.lives[piece.worker as usize].entry(mark.incarnation).or_default();
-        life.settle(mark.sequence);
-        self.settled[piece.worker as usize] = mark;
-        self.standing.segments += 1;
-        self.standing.env_steps += piece.env_steps;
-        let before = self.since_cut;
-        self.since_cut += piece.env_steps;
+    fn on_inserted(&mut self, segment: &SegmentDigest) {
+        let Some(mark) = self.check_arrival(segment, "inserted") else { return };
+        let state = self.incarnations[segment.worker as usize].entry(mark.incarnation).or_default();
+        state.settle(mark.sequence);
+        self.settled[segment.worker as usize] = mark;
+        self.counters.segments += 1;
+        self.counters.env_steps += segment.env_steps;
+        let before = self.steps_since_checkpoint;
+        self.steps_since_checkpoint += segment.env_steps;
         let limit = INTERVALS_MAX * self.checkpoint_interval + SEGMENT_STEPS;
-        if before <= limit && self.since_cut > limit {
-            self.violations.add(format!("I5: no checkpoint was begun in {limit} steps"));
+        if before <= limit && self.steps_since_checkpoint > limit {
+            self.violations.add(format!("I5: no checkpoint was begun within {limit} steps"));
         }
     }
 
-    fn on_refused(&mut self, piece: &Piece) {
-        let Some(mark) = self.arrive(piece, "refused") else { return };
-        let life = self.lives[piece.worker as usize].entry(mark.incarnation).or_default();
-        life.settle(mark.sequence);
-        life.refused.insert(mark.sequence);
-        self.settled[piece.worker as usize] = mark;
+    fn on_rejected(&mut self, segment: &SegmentDigest) {
+        let Some(mark) = self.check_arrival(segment, "rejected") else { return };
+        let state = self.incarnations[segment.worker as usize].entry(mark.incarnation).or_default();
+        state.settle(mark.sequence);
+        state.rejected.insert(mark.sequence);
+        self.settled[segment.worker as usize] = mark;
     }
 
-    /// Checks a segment that a learner settles; `None` if it is not the next one.
-    fn arrive(&mut self, piece: &Piece, what: &str) -> Option<Watermark> {
-        let Piece { worker, mark, checksum, .. } = *piece;
+    /// Checks a segment that a learner settles, and returns its mark. Returns `None` if it does not
+    /// come after the worker's last segment.
+    fn check_arrival(&mut self, segment: &SegmentDigest, what: &str) -> Option<Watermark> {
+        let SegmentDigest { worker, mark, checksum, .. } = *segment;
         let name = format!(
             "segment {} of worker {worker}, incarnation {}, was {what}",
             mark.sequence, mark.incarnation
         );
         let Some(last) = self.settled.get(worker as usize).copied() else {
-            self.violations.add(format!("I9: {name}, but there is no such worker"));
+            self.violations.add(format!("I9: {name}, but the worker is unknown"));
             return None;
         };
-        let life = self.lives[worker as usize].get(&mark.incarnation);
+        let state = self.incarnations[worker as usize].get(&mark.incarnation);
         let index = usize::try_from(mark.sequence).unwrap_or(usize::MAX).wrapping_sub(1);
-        match life.and_then(|life| life.produced.get(index)) {
+        match state.and_then(|state| state.produced.get(index)) {
             None => self.violations.add(format!("I9: {name}, but was never produced")),
             Some(produced) if *produced != checksum => self.violations.add(format!(
                 "I4: {name} with checksum {checksum:#010x}, produced with {produced:#010x}"
@@ -270,7 +278,7 @@ impl Checker {
         if mark > last {
             return Some(mark);
         }
-        if life.is_some_and(|life| life.holds(mark.sequence)) {
+        if state.is_some_and(|state| state.has_settled(mark.sequence)) {
             self.violations.add(format!("I2: {name} twice"));
         } else {
             self.violations.add(format!("I3: {name} after {last:?}"));
@@ -278,39 +286,39 @@ impl Checker {
         None
     }
 
-    fn all_lives(&self) -> impl Iterator<Item = &Life> {
-        self.lives.iter().flat_map(BTreeMap::values)
+    fn all_incarnations(&self) -> impl Iterator<Item = &IncarnationState> {
+        self.incarnations.iter().flat_map(BTreeMap::values)
     }
 
-    /// Checks the final state, after all journals have been read.
-    pub(super) fn conclude(&mut self) -> Sums {
-        let mut sums = Sums { duplicate: self.duplicate, ..Sums::default() };
-        for (worker, lives) in self.lives.iter().enumerate() {
-            for (incarnation, life) in lives {
-                let lost = life.lost();
-                sums.produced += life.produced.len() as u64;
-                sums.inserted += life.inserted();
-                sums.rejected += life.refused.len() as u64;
-                sums.in_flight += life.in_flight();
-                sums.acknowledged += life.acked;
-                sums.lost += lost;
+    /// Checks the final state after all journals have been read.
+    pub(super) fn conclude(&mut self) -> SegmentTotals {
+        let mut totals = SegmentTotals { duplicate: self.duplicate, ..SegmentTotals::default() };
+        for (worker, incarnations) in self.incarnations.iter().enumerate() {
+            for (incarnation, state) in incarnations {
+                let lost = state.lost();
+                totals.produced += state.produced.len() as u64;
+                totals.inserted += state.inserted();
+                totals.rejected += state.rejected.len() as u64;
+                totals.in_flight += state.in_flight();
+                totals.acknowledged += state.acked;
+                totals.lost += lost;
                 if lost > 0 {
                     self.violations.add(format!(
                         "I1: {lost} segments of worker {worker}, incarnation {incarnation}, are \
                          lost: {} acknowledged, {} inserted",
-                        life.acked,
-                        life.inserted()
+                        state.acked,
+                        state.inserted()
                     ));
                 }
             }
         }
-        let Sums { produced, inserted, rejected, in_flight, lost, .. } = sums;
+        let SegmentTotals { produced, inserted, rejected, in_flight, lost, .. } = totals;
         if produced != inserted + rejected + in_flight + lost {
             self.violations.add(format!(
                 "I9: {produced} segments were produced, and {inserted} inserted, {rejected} \
                  rejected, {in_flight} in flight, {lost} lost"
             ));
         }
-        sums
+        totals
     }
 }

@@ -1,5 +1,4 @@
-//! Hand-written journals: a correct one, and one for each way in which a run can violate a
-//! guarantee.
+//! Tests the checker with hand-written journals: a correct one, and one for each kind of violation.
 
 use dmprl_shared::transport::delivery::Watermark;
 
@@ -8,83 +7,85 @@ use super::*;
 const INTERVAL: u64 = 100;
 const STEPS: u64 = 5;
 
-/// A run of two workers, which writes journals like a real one.
-struct Story {
+/// Writes the journals of a run with two workers, as a real run would.
+struct JournalScript {
     checker: Checker,
     learner: Author,
 }
 
-fn piece(worker: u32, (incarnation, sequence): (u32, u64)) -> Piece {
-    let mark = Watermark { incarnation, sequence };
-    Piece { worker, mark, checksum: worker ^ sequence as u32, env_steps: STEPS }
+fn mark(incarnation: u32, sequence: u64) -> Watermark {
+    Watermark { incarnation, sequence }
 }
 
-fn standing(segments: u64) -> Standing {
-    Standing { env_steps: segments * STEPS, updates: 2 * segments, segments }
+fn digest(worker: u32, mark: Watermark) -> SegmentDigest {
+    SegmentDigest { worker, mark, checksum: worker ^ mark.sequence as u32, env_steps: STEPS }
 }
 
-impl Story {
-    /// Creates a run with a new learner.
+fn counters_after(segments: u64) -> LearnerCounters {
+    LearnerCounters { env_steps: segments * STEPS, updates: 2 * segments, segments }
+}
+
+impl JournalScript {
+    /// Creates a run whose learner starts without a checkpoint.
     fn new() -> Self {
-        let mut story = Self { checker: Checker::new(2, INTERVAL), learner: Author::Learner(0) };
-        story.begin(0, [(0, 0), (0, 0)], 0);
-        story
+        let mut script = Self { checker: Checker::new(2, INTERVAL), learner: Author::Learner(0) };
+        script.start_learner(0, [mark(0, 0), mark(0, 0)], 0);
+        script
     }
 
     fn note(&mut self, author: Author, entry: Entry) {
-        self.checker.take(author, &Record { entry, time_us: 0 });
+        self.checker.process(author, &Record { entry, time_us: 0 });
     }
 
-    fn says(&mut self, entry: Entry) {
+    fn note_learner(&mut self, entry: Entry) {
         self.note(self.learner, entry);
     }
 
-    /// Starts another learner from a checkpoint with this number of segments and these marks.
-    fn begin(&mut self, deaths: u64, marks: [(u32, u64); 2], segments: u64) {
+    /// Starts a learner from a checkpoint with these marks and this number of segments.
+    fn start_learner(&mut self, deaths: u64, marks: [Watermark; 2], segments: u64) {
         self.learner = Author::Learner(deaths);
-        for (worker, (incarnation, sequence)) in (0..).zip(marks) {
-            self.says(Entry::Restored(worker, Watermark { incarnation, sequence }));
+        for (worker, mark) in (0..).zip(marks) {
+            self.note_learner(Entry::Restored(worker, mark));
         }
-        self.says(Entry::Started(standing(segments)));
-        self.says(Entry::Serving);
+        self.note_learner(Entry::Started(counters_after(segments)));
+        self.note_learner(Entry::Serving);
     }
 
     fn produce(&mut self, worker: u32, incarnation: u32, sequences: std::ops::RangeInclusive<u64>) {
         for sequence in sequences {
-            let piece = piece(worker, (incarnation, sequence));
-            self.note(Author::Worker(worker, incarnation), Entry::Produced(piece));
+            let segment = digest(worker, mark(incarnation, sequence));
+            self.note(Author::Worker(worker, incarnation), Entry::Produced(segment));
         }
     }
 
     fn insert(&mut self, worker: u32, incarnation: u32, sequences: std::ops::RangeInclusive<u64>) {
         for sequence in sequences {
-            self.says(Entry::Inserted(piece(worker, (incarnation, sequence))));
+            self.note_learner(Entry::Inserted(digest(worker, mark(incarnation, sequence))));
         }
     }
 
-    fn acknowledge(&mut self, worker: u32, (incarnation, sequence): (u32, u64)) {
-        let mark = Watermark { incarnation, sequence };
-        self.note(Author::Worker(worker, incarnation), Entry::Acknowledged(mark));
+    fn acknowledge(&mut self, worker: u32, mark: Watermark) {
+        self.note(Author::Worker(worker, mark.incarnation), Entry::Acknowledged(mark));
     }
 
-    /// Creates a run that has inserted the first ten segments of both workers.
+    /// Creates a run that has inserted the first ten segments of each worker.
     fn with_ten_of_each() -> Self {
-        let mut story = Self::new();
+        let mut script = Self::new();
         for worker in [0, 1] {
-            story.produce(worker, 0, 1..=10);
-            story.insert(worker, 0, 1..=10);
+            script.produce(worker, 0, 1..=10);
+            script.insert(worker, 0, 1..=10);
         }
-        story
+        script
     }
 
-    fn end(mut self) -> (Sums, Vec<String>) {
+    fn end(mut self) -> (SegmentTotals, Vec<String>) {
         let sums = self.checker.conclude();
         (sums, self.checker.violations.into_sentences())
     }
 
-    /// Asserts that the run has exactly one violation, of this invariant.
+    /// Asserts that the run has exactly one violation, which is of this invariant.
     #[track_caller]
-    fn breaks(self, invariant: &str, words: &str) -> Sums {
+    fn expect_violation(self, invariant: &str, words: &str) -> SegmentTotals {
         let (sums, violations) = self.end();
         assert_eq!(violations.len(), 1, "{violations:#?}");
         assert!(violations[0].starts_with(invariant), "{violations:#?}");
@@ -93,32 +94,32 @@ impl Story {
     }
 }
 
-/// The deaths of a worker and of two learners, one with an incomplete checkpoint, only lose
-/// segments that were never sent.
+/// After the deaths of a worker and of two learners, one with an incomplete checkpoint, only unsent
+/// segments are missing.
 #[test]
-fn a_run_that_keeps_its_promises_is_not_accused() {
-    let mut story = Story::with_ten_of_each();
-    story.acknowledge(0, (0, 8));
-    story.says(Entry::Cut(standing(20)));
-    story.produce(0, 0, 11..=14);
-    story.insert(0, 0, 11..=12);
+fn correct_run_has_no_violations() {
+    let mut script = JournalScript::with_ten_of_each();
+    script.acknowledge(0, mark(0, 8));
+    script.note_learner(Entry::CheckpointBegun(counters_after(20)));
+    script.produce(0, 0, 11..=14);
+    script.insert(0, 0, 11..=12);
     // Worker 0 dies with two unsent segments; its successor starts a new incarnation.
-    story.produce(0, 1, 1..=3);
-    story.insert(0, 1, 1..=2);
-    story.says(Entry::Cut(standing(24)));
-    // The learner dies before that checkpoint is complete. The log restores all segments but the
-    // last, which the worker retransmits together with one more.
-    story.begin(1, [(0, 10), (0, 10)], 20);
-    story.insert(0, 0, 11..=12);
-    story.insert(0, 1, 1..=1);
-    story.says(Entry::Refused(piece(0, (1, 1)), true));
-    story.insert(0, 1, 2..=3);
-    story.acknowledge(0, (1, 3));
-    story.says(Entry::Refused(piece(0, (0, 13)), true));
-    story.begin(2, [(0, 10), (0, 10)], 20);
-    story.insert(0, 0, 11..=12);
-    story.insert(0, 1, 1..=3);
-    let expected = Sums {
+    script.produce(0, 1, 1..=3);
+    script.insert(0, 1, 1..=2);
+    script.note_learner(Entry::CheckpointBegun(counters_after(24)));
+    // The learner dies before that checkpoint is complete. The log restores all segments except the
+    // last one, which the worker retransmits together with an earlier one.
+    script.start_learner(1, [mark(0, 10), mark(0, 10)], 20);
+    script.insert(0, 0, 11..=12);
+    script.insert(0, 1, 1..=1);
+    script.note_learner(Entry::Rejected { segment: digest(0, mark(1, 1)), is_duplicate: true });
+    script.insert(0, 1, 2..=3);
+    script.acknowledge(0, mark(1, 3));
+    script.note_learner(Entry::Rejected { segment: digest(0, mark(0, 13)), is_duplicate: true });
+    script.start_learner(2, [mark(0, 10), mark(0, 10)], 20);
+    script.insert(0, 0, 11..=12);
+    script.insert(0, 1, 1..=3);
+    let expected = SegmentTotals {
         produced: 27,
         inserted: 25,
         rejected: 0,
@@ -127,185 +128,185 @@ fn a_run_that_keeps_its_promises_is_not_accused() {
         duplicate: 2,
         acknowledged: 11,
     };
-    assert_eq!(story.end(), (expected, Vec::new()));
+    assert_eq!(script.end(), (expected, Vec::new()));
 }
 
 #[test]
-fn i1_a_lost_segment_that_was_acknowledged_is_found() {
-    let mut story = Story::with_ten_of_each();
-    story.says(Entry::Cut(standing(20)));
-    story.produce(0, 0, 11..=15);
-    story.insert(0, 0, 11..=15);
-    story.acknowledge(0, (0, 15));
-    // The log has lost its last two segments.
-    story.begin(1, [(0, 10), (0, 10)], 20);
-    story.insert(0, 0, 11..=13);
-    let sums = story.breaks("I1", "2 segments of worker 0, incarnation 0, are lost");
+fn i1_a_lost_acknowledged_segment_is_found() {
+    let mut script = JournalScript::with_ten_of_each();
+    script.note_learner(Entry::CheckpointBegun(counters_after(20)));
+    script.produce(0, 0, 11..=15);
+    script.insert(0, 0, 11..=15);
+    script.acknowledge(0, mark(0, 15));
+    // The log has lost the last two segments.
+    script.start_learner(1, [mark(0, 10), mark(0, 10)], 20);
+    script.insert(0, 0, 11..=13);
+    let sums = script.expect_violation("I1", "2 segments of worker 0, incarnation 0, are lost");
     assert_eq!((sums.lost, sums.inserted, sums.in_flight), (2, 23, 0));
 }
 
-/// These segments were not acknowledged, but the worker sends in order and retains them, so none
-/// may be skipped.
+/// The segments were not acknowledged, but none may be skipped: the worker sends them in order and
+/// retains them.
 #[test]
-fn i1_a_segment_that_was_left_out_is_found() {
-    let mut story = Story::with_ten_of_each();
-    story.produce(1, 0, 11..=13);
-    story.insert(1, 0, 11..=11);
-    story.insert(1, 0, 13..=13);
-    let sums = story.breaks("I1", "1 segments of worker 1");
+fn i1_a_skipped_segment_is_found() {
+    let mut script = JournalScript::with_ten_of_each();
+    script.produce(1, 0, 11..=13);
+    script.insert(1, 0, 11..=11);
+    script.insert(1, 0, 13..=13);
+    let sums = script.expect_violation("I1", "1 segments of worker 1");
     assert_eq!(sums.lost, 1);
 }
 
 #[test]
-fn i1_marks_beyond_what_was_inserted_are_found() {
-    let mut story = Story::with_ten_of_each();
-    story.produce(0, 0, 11..=12);
-    story.says(Entry::Cut(standing(20)));
-    story.begin(1, [(0, 12), (0, 10)], 20);
-    let (_, violations) = story.end();
-    assert!(violations[0].starts_with("I1: a learner goes on from"), "{violations:#?}");
+fn i1_marks_beyond_the_inserted_segments_are_found() {
+    let mut script = JournalScript::with_ten_of_each();
+    script.produce(0, 0, 11..=12);
+    script.note_learner(Entry::CheckpointBegun(counters_after(20)));
+    script.start_learner(1, [mark(0, 12), mark(0, 10)], 20);
+    let (_, violations) = script.end();
+    assert!(violations[0].starts_with("I1: a learner resumes at"), "{violations:#?}");
 }
 
 #[test]
-fn i1_an_acknowledgement_that_goes_back_is_found() {
-    let mut story = Story::with_ten_of_each();
-    story.acknowledge(0, (0, 8));
-    story.acknowledge(0, (0, 7));
-    story.breaks("I1", "acknowledged after 8");
+fn i1_a_decreasing_acknowledgement_is_found() {
+    let mut script = JournalScript::with_ten_of_each();
+    script.acknowledge(0, mark(0, 8));
+    script.acknowledge(0, mark(0, 7));
+    script.expect_violation("I1", "acknowledged after 8");
 }
 
 #[test]
 fn i2_a_segment_inserted_twice_is_found() {
-    let mut story = Story::with_ten_of_each();
-    story.insert(0, 0, 4..=4);
-    story.breaks("I2", "segment 4 of worker 0");
+    let mut script = JournalScript::with_ten_of_each();
+    script.insert(0, 0, 4..=4);
+    script.expect_violation("I2", "segment 4 of worker 0");
 }
 
 /// Segments in a checkpoint count as inserted.
 #[test]
-fn i2_a_segment_inserted_again_after_it_was_restored_is_found() {
-    let mut story = Story::with_ten_of_each();
-    story.says(Entry::Cut(standing(20)));
-    story.begin(1, [(0, 10), (0, 10)], 20);
-    story.insert(1, 0, 10..=10);
-    story.breaks("I2", "segment 10 of worker 1");
+fn i2_a_segment_inserted_again_after_a_restore_is_found() {
+    let mut script = JournalScript::with_ten_of_each();
+    script.note_learner(Entry::CheckpointBegun(counters_after(20)));
+    script.start_learner(1, [mark(0, 10), mark(0, 10)], 20);
+    script.insert(1, 0, 10..=10);
+    script.expect_violation("I2", "segment 10 of worker 1");
 }
 
 #[test]
-fn i3_a_segment_that_comes_after_a_later_one_is_found() {
-    let mut story = Story::with_ten_of_each();
-    story.produce(0, 0, 11..=13);
-    story.insert(0, 0, 12..=12);
-    story.insert(0, 0, 11..=11);
-    let (_, violations) = story.end();
+fn i3_a_segment_out_of_order_is_found() {
+    let mut script = JournalScript::with_ten_of_each();
+    script.produce(0, 0, 11..=13);
+    script.insert(0, 0, 12..=12);
+    script.insert(0, 0, 11..=11);
+    let (_, violations) = script.end();
     assert!(violations[0].starts_with("I3: segment 11 of worker 0"), "{violations:#?}");
 }
 
 #[test]
-fn i3_a_segment_of_a_dead_worker_after_one_of_its_successor_is_found() {
-    let mut story = Story::with_ten_of_each();
-    story.produce(0, 0, 11..=11);
-    story.produce(0, 1, 1..=1);
-    story.insert(0, 1, 1..=1);
-    story.insert(0, 0, 11..=11);
-    story.breaks("I3", "segment 11 of worker 0, incarnation 0");
+fn i3_a_segment_after_one_of_a_later_incarnation_is_found() {
+    let mut script = JournalScript::with_ten_of_each();
+    script.produce(0, 0, 11..=11);
+    script.produce(0, 1, 1..=1);
+    script.insert(0, 1, 1..=1);
+    script.insert(0, 0, 11..=11);
+    script.expect_violation("I3", "segment 11 of worker 0, incarnation 0");
 }
 
 #[test]
-fn i4_a_payload_that_changed_on_its_way_is_found() {
-    let mut story = Story::with_ten_of_each();
-    story.produce(0, 0, 11..=11);
-    let torn = Piece { checksum: 0xbad, ..piece(0, (0, 11)) };
-    story.says(Entry::Inserted(torn));
-    story.breaks("I4", "checksum 0x00000bad");
+fn i4_a_changed_payload_is_found() {
+    let mut script = JournalScript::with_ten_of_each();
+    script.produce(0, 0, 11..=11);
+    let changed = SegmentDigest { checksum: 0xbad, ..digest(0, mark(0, 11)) };
+    script.note_learner(Entry::Inserted(changed));
+    script.expect_violation("I4", "checksum 0x00000bad");
 }
 
 #[test]
-fn i5_a_learner_that_goes_back_too_far_is_found() {
-    let mut story = Story::with_ten_of_each();
-    story.says(Entry::Cut(standing(20)));
-    story.produce(0, 0, 11..=20);
-    story.insert(0, 0, 11..=20);
-    story.says(Entry::Cut(standing(30)));
-    story.says(Entry::Cut(standing(30)));
-    story.begin(1, [(0, 10), (0, 10)], 20);
-    story.insert(0, 0, 11..=20);
-    story.breaks("I5", "gone back 2 checkpoints");
+fn i5_a_rollback_by_two_checkpoints_is_found() {
+    let mut script = JournalScript::with_ten_of_each();
+    script.note_learner(Entry::CheckpointBegun(counters_after(20)));
+    script.produce(0, 0, 11..=20);
+    script.insert(0, 0, 11..=20);
+    script.note_learner(Entry::CheckpointBegun(counters_after(30)));
+    script.note_learner(Entry::CheckpointBegun(counters_after(30)));
+    script.start_learner(1, [mark(0, 10), mark(0, 10)], 20);
+    script.insert(0, 0, 11..=20);
+    script.expect_violation("I5", "went back 2 checkpoints");
 }
 
 /// A checkpoint whose counters and marks were taken at different times.
 #[test]
-fn i5_counters_that_do_not_fit_the_marks_are_found() {
-    let mut story = Story::with_ten_of_each();
-    story.says(Entry::Cut(standing(20)));
-    story.begin(1, [(0, 10), (0, 9)], 20);
-    story.insert(1, 0, 10..=10);
-    story.breaks("I5", "counts 20 segments, its marks are of 19");
+fn i5_counters_that_contradict_the_marks_are_found() {
+    let mut script = JournalScript::with_ten_of_each();
+    script.note_learner(Entry::CheckpointBegun(counters_after(20)));
+    script.start_learner(1, [mark(0, 10), mark(0, 9)], 20);
+    script.insert(1, 0, 10..=10);
+    script.expect_violation("I5", "counts 20 segments, its marks 19");
 }
 
 #[test]
-fn i5_counters_that_no_checkpoint_had_are_found() {
-    let mut story = Story::with_ten_of_each();
-    story.says(Entry::Cut(standing(20)));
-    story.learner = Author::Learner(1);
-    let mark = Watermark { incarnation: 0, sequence: 10 };
-    story.says(Entry::Restored(0, mark));
-    story.says(Entry::Restored(1, mark));
-    story.says(Entry::Started(Standing { updates: 7, ..standing(20) }));
-    story.breaks("I5", "of which no checkpoint was made");
-}
-
-#[test]
-fn i5_a_learner_that_makes_no_checkpoints_is_found() {
-    let mut story = Story::new();
-    let segments = (2 * INTERVAL + SEGMENT_STEPS) / STEPS + 1;
-    story.produce(0, 0, 1..=segments);
-    story.insert(0, 0, 1..=segments);
-    story.breaks("I5", "no checkpoint was begun in 300 steps");
-}
-
-#[test]
-fn i6_a_policy_older_than_the_one_before_is_found() {
-    let mut story = Story::with_ten_of_each();
-    for version in [4, 5, 4] {
-        story.note(Author::Worker(0, 0), Entry::Policy { epoch: 1, version });
+fn i5_counters_of_no_checkpoint_are_found() {
+    let mut script = JournalScript::with_ten_of_each();
+    script.note_learner(Entry::CheckpointBegun(counters_after(20)));
+    script.learner = Author::Learner(1);
+    for worker in [0, 1] {
+        script.note_learner(Entry::Restored(worker, mark(0, 10)));
     }
-    story.breaks("I6", "from policy 5 to 4 in epoch 1");
+    script.note_learner(Entry::Started(LearnerCounters { updates: 7, ..counters_after(20) }));
+    script.expect_violation("I5", "which no checkpoint has");
 }
 
 #[test]
-fn i6_a_learner_older_than_the_one_before_is_found() {
-    let mut story = Story::with_ten_of_each();
-    story.note(Author::Worker(0, 0), Entry::Policy { epoch: 2, version: 9 });
-    story.note(Author::Worker(0, 1), Entry::Policy { epoch: 1, version: 10 });
-    story.breaks("I6", "from epoch 2 to 1");
+fn i5_missing_checkpoints_are_found() {
+    let mut script = JournalScript::new();
+    let segments = (2 * INTERVAL + SEGMENT_STEPS) / STEPS + 1;
+    script.produce(0, 0, 1..=segments);
+    script.insert(0, 0, 1..=segments);
+    script.expect_violation("I5", "no checkpoint was begun within 300 steps");
 }
 
 #[test]
-fn i9_a_segment_that_nobody_produced_is_found() {
-    let mut story = Story::with_ten_of_each();
-    story.insert(1, 0, 11..=11);
-    let (_, violations) = story.end();
+fn i6_a_decreasing_policy_version_is_found() {
+    let mut script = JournalScript::with_ten_of_each();
+    for version in [4, 5, 4] {
+        script.note(Author::Worker(0, 0), Entry::Policy { epoch: 1, version });
+    }
+    script.expect_violation("I6", "from policy 5 to 4 in epoch 1");
+}
+
+#[test]
+fn i6_a_decreasing_epoch_is_found() {
+    let mut script = JournalScript::with_ten_of_each();
+    script.note(Author::Worker(0, 0), Entry::Policy { epoch: 2, version: 9 });
+    script.note(Author::Worker(0, 1), Entry::Policy { epoch: 1, version: 10 });
+    script.expect_violation("I6", "from epoch 2 to 1");
+}
+
+#[test]
+fn i9_a_segment_never_produced_is_found() {
+    let mut script = JournalScript::with_ten_of_each();
+    script.insert(1, 0, 11..=11);
+    let (_, violations) = script.end();
     assert!(violations[0].starts_with("I9: segment 11 of worker 1"), "{violations:#?}");
 }
 
 #[test]
-fn i9_a_number_that_was_left_out_at_its_source_is_found() {
-    let mut story = Story::with_ten_of_each();
-    story.produce(0, 0, 12..=12);
-    let (_, violations) = story.end();
-    assert!(violations[0].starts_with("I9: worker 0, incarnation 0 has produced segment 12"));
+fn i9_a_skipped_sequence_number_is_found() {
+    let mut script = JournalScript::with_ten_of_each();
+    script.produce(0, 0, 12..=12);
+    let (_, violations) = script.end();
+    assert!(violations[0].starts_with("I9: worker 0, incarnation 0, produced segment 12"));
 }
 
-/// A permanent rejection is counted, but is no loss.
+/// A permanently rejected segment does not count as lost.
 #[test]
-fn i9_a_refused_segment_is_counted_and_not_lost() {
-    let mut story = Story::with_ten_of_each();
-    story.produce(0, 0, 11..=12);
-    story.says(Entry::Refused(piece(0, (0, 11)), false));
-    story.insert(0, 0, 12..=12);
-    story.acknowledge(0, (0, 12));
-    let (sums, violations) = story.end();
+fn i9_a_rejected_segment_is_counted_but_not_lost() {
+    let mut script = JournalScript::with_ten_of_each();
+    script.produce(0, 0, 11..=12);
+    script.note_learner(Entry::Rejected { segment: digest(0, mark(0, 11)), is_duplicate: false });
+    script.insert(0, 0, 12..=12);
+    script.acknowledge(0, mark(0, 12));
+    let (sums, violations) = script.end();
     assert_eq!((sums.rejected, sums.inserted, sums.lost), (1, 21, 0), "{violations:?}");
     assert_eq!(violations, Vec::<String>::new());
 }

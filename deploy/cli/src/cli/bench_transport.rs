@@ -124,7 +124,7 @@ fn between_hosts(args: &TransportArgs) -> anyhow::Result<Outcome> {
     let figures = match (&args.listen, &args.connect) {
         (Some(endpoint), _) => bench::listen(endpoint, file, duration)?,
         (None, Some(endpoint)) => {
-            bench::connect(endpoint, file, (args.workers.unwrap_or(1), args.rate))?
+            bench::connect(endpoint, file, args.workers.unwrap_or(1), args.rate)?
         }
         (None, None) => return Ok(Outcome::Done),
     };

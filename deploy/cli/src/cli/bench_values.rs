@@ -4,7 +4,7 @@ use std::path::{Path, PathBuf};
 
 use dmprl_run::failure::wrong_use;
 
-/// Shorter rounds would mostly measure the benchmark's own sleep; longer ones are a typing error.
+/// Shorter rounds would mostly measure the benchmark's own sleep; longer ones are probably typos.
 const SECONDS: std::ops::RangeInclusive<f64> = 0.05..=3600.0;
 
 /// Reads a duration of a round in seconds.
@@ -24,5 +24,5 @@ pub(super) fn interpreter(path: &Path) -> anyhow::Result<PathBuf> {
         ))
     };
     let absolute = std::path::absolute(path).map_err(|error| refused(&error.to_string()))?;
-    if absolute.is_file() { Ok(absolute) } else { Err(refused("there is no such file")) }
+    if absolute.is_file() { Ok(absolute) } else { Err(refused("not a file")) }
 }

@@ -11,8 +11,6 @@ use dmprl_bridge::{Link, LinkMode, token};
 use dmprl_run::Watch;
 use dmprl_run::failure::{Outcome, wrong_use};
 use dmprl_run::format::grouped;
-use dmprl_run::say;
-use dmprl_run::write_line;
 use dmprl_run::{
     Manifest, RunDirectory, RunLock, Session, compact_now, random_u64, replace_file, safe_name,
 };
@@ -23,7 +21,7 @@ use dmprl_supervisor::{self as launch, Ending, HostPlan, SessionReport, Upstream
 use super::configuration::refuse;
 use super::output::{OutputArgs, host_observer};
 use super::{cores, prepare_python, this_program};
-use crate::terminal::{ProgressStyle, events};
+use crate::terminal::{ProgressStyle, events, say, write_line};
 
 /// Interval between two join requests.
 const JOIN_INTERVAL: Duration = Duration::from_millis(500);
@@ -31,10 +29,11 @@ const JOIN_INTERVAL: Duration = Duration::from_millis(500);
 /// Wait for the processes of a killed bridge to exit. They do so at once, unless the machine is
 /// very busy.
 const LEFT_OVER: Duration = Duration::from_secs(60);
-/// File in a bridge's directory with the number by which the learner's host knows this one.
+/// File in a bridge's directory with the number that identifies this host to the learner's host.
 const HOST_FILE: &str = "bridge.host";
 
 const HELP: &str = "\
+Both hosts need a program that was built with: cargo build --release --features hosts
 On the learner's host, start the run with bridge.listen. Copy its token, bridge.token in the run's
 directory, to the other hosts; only its owner may have access to the file:
   dmprl train reacher --set 'bridge.listen=[\"tcp/0.0.0.0:7447\"]' --run-dir runs/mine
@@ -84,6 +83,7 @@ pub(super) struct BridgeArgs {
 }
 
 pub(super) fn run(args: &BridgeArgs) -> anyhow::Result<Outcome> {
+    dmprl_bridge::check_available()?;
     let absolute = |path: &PathBuf| {
         std::path::absolute(path).with_context(|| format!("cannot resolve {}", path.display()))
     };
@@ -100,8 +100,8 @@ pub(super) fn run(args: &BridgeArgs) -> anyhow::Result<Outcome> {
     };
     let patience = Duration::from_secs(args.patience * 60);
     let venv = prepare_python()?;
-    let asked = wait_for_welcome(&join, zenoh_file.as_deref(), patience);
-    let Some(welcome) = asked? else { return Ok(Outcome::Interrupted) };
+    let welcome = wait_for_welcome(&join, zenoh_file.as_deref(), patience)?;
+    let Some(welcome) = welcome else { return Ok(Outcome::Interrupted) };
     let config = host_config(&welcome, workers, &args.python_path)?;
     capacity::check(&config, Some(&welcome.spec))?;
     let run = run_directory(args, &join.name, &welcome, &config)?;
@@ -144,8 +144,8 @@ fn conclude(report: SessionReport, style: ProgressStyle) -> anyhow::Result<Outco
     Ok(outcome)
 }
 
-/// Locks the directory of an earlier bridge and reads its number. With it a restarted bridge gets
-/// its places back at once; without it they would stay reserved for minutes.
+/// Locks the directory of an earlier bridge and reads its host number. With this number a restarted
+/// bridge gets its leases back at once; otherwise they would stay reserved for minutes.
 fn earlier(args: &BridgeArgs) -> anyhow::Result<Option<(RunLock, u64)>> {
     let Some(path) = args.run_dir.as_deref().filter(|path| path.join(HOST_FILE).is_file()) else {
         return Ok(None);
@@ -183,7 +183,7 @@ fn wait_for_welcome(
 ) -> anyhow::Result<Option<HostWelcome>> {
     let watch = Watch::start()?;
     let link = Link::open(LinkMode::Connect(&join.endpoint), zenoh_file)?;
-    let (began, mut told) = (Instant::now(), String::new());
+    let (began, mut last_reason) = (Instant::now(), String::new());
     loop {
         if watch.check().is_err() {
             return Ok(None);
@@ -192,7 +192,7 @@ fn wait_for_welcome(
             JoinOutcome::Welcome(welcome) => return Ok(Some(*welcome)),
             JoinOutcome::Refused(reason) => {
                 return Err(wrong_use(format!(
-                    "the learner's host at {} refuses: {reason}",
+                    "the learner's host at {} rejects this host: {reason}",
                     join.endpoint
                 )));
             }
@@ -200,10 +200,10 @@ fn wait_for_welcome(
                 bail!("waited {} min: {reason}", patience.as_secs() / 60)
             }
             JoinOutcome::Later(reason) => {
-                if reason != told {
+                if reason != last_reason {
                     let minutes = patience.as_secs() / 60;
                     say(&format!("{reason}; waiting for at most {minutes} min"));
-                    told = reason;
+                    last_reason = reason;
                 }
             }
         }
@@ -217,8 +217,8 @@ fn host_config(
     workers: usize,
     python_path: &[PathBuf],
 ) -> anyhow::Result<ExperimentConfig> {
-    let mut config: ExperimentConfig =
-        toml::from_str(&welcome.config).context("the learner's host sent no configuration")?;
+    let mut config: ExperimentConfig = toml::from_str(&welcome.config)
+        .context("the learner's host sent an unreadable configuration")?;
     config.actors.workers = workers;
     config.actors.joined_max = 0;
     config.bridge.listen.clear();
@@ -237,8 +237,8 @@ fn host_config(
     }
     if let Some(gone) = config.task.python_path.iter().find(|path| !Path::new(path).is_dir()) {
         return Err(wrong_use(format!(
-            "the run's environments are in {gone} on the learner's host, which is not here: say \
-             with --python-path where they are on this host"
+            "the run's environments are in {gone} on the learner's host, and this host has no such \
+             directory: pass their directory on this host with --python-path"
         )));
     }
     config.resolve(Limits { cores: cores() }).map_err(refuse)
@@ -258,7 +258,8 @@ fn run_directory(
         let mut manifest = run.manifest()?;
         if manifest.run_id != welcome.run_id {
             return Err(wrong_use(format!(
-                "{} is of run {}, the learner's host trains run {}: choose another --run-dir",
+                "{} belongs to run {}, but the learner's host trains run {}: choose another \
+                 --run-dir",
                 path.display(),
                 manifest.run_id,
                 welcome.run_id

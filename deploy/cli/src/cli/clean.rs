@@ -8,9 +8,9 @@ use dmprl_supervisor::Place;
 use super::emit;
 
 const HELP: &str = "\
-A killed run leaves its shared memory behind. This removes shared memory that has dmprl's marker and
-belongs to you, if the run's supervisor and learner are dead: a live run holds a lock on its own.
-The next `train` does the same. Run directories and checkpoints are never touched.
+A killed run leaves its shared memory behind. Removes shared memory that has dmprl's marker and
+belongs to you, if the run's supervisor and learner are dead (a live run holds a lock on it).
+`train` does the same when it starts. Run directories and checkpoints are not touched.
 
 EXAMPLES
   dmprl clean --dry-run    # only list

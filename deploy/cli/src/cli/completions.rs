@@ -9,9 +9,9 @@ use clap_complete::Shell;
 use dmprl_run::failure::Outcome;
 use dmprl_run::format::shown;
 use dmprl_run::replace_file;
-use dmprl_run::say;
 
 use super::{Arguments, emit};
+use crate::terminal::say;
 
 /// Section 1 of the manual: commands.
 const SECTION: &str = "1";
@@ -48,7 +48,7 @@ pub(super) struct ManArgs {
 
 pub(super) fn completions(args: &CompletionsArgs) -> anyhow::Result<Outcome> {
     let program = Arguments::command();
-    // Leave the roles out: the program itself starts them.
+    // Leave out the roles: only the program itself starts them.
     let shown: Vec<_> =
         program.get_subcommands().filter(|own| !own.is_hide_set()).cloned().collect();
     let mut program = clap::Command::new("dmprl").args(program.get_arguments()).subcommands(shown);
@@ -60,7 +60,7 @@ pub(super) fn completions(args: &CompletionsArgs) -> anyhow::Result<Outcome> {
 
 pub(super) fn man(args: &ManArgs) -> anyhow::Result<Outcome> {
     std::fs::create_dir_all(&args.output)
-        .with_context(|| format!("cannot make {}", args.output.display()))?;
+        .with_context(|| format!("cannot create {}", args.output.display()))?;
     let mut program = Arguments::command();
     program.build();
     let count = write_pages(&program, "dmprl", &args.output)?;
@@ -68,7 +68,7 @@ pub(super) fn man(args: &ManArgs) -> anyhow::Result<Outcome> {
     Ok(Outcome::Done)
 }
 
-/// Writes the page of a command and of its subcommands; returns their number.
+/// Writes the pages of a command and its subcommands; returns their number.
 fn write_pages(command: &clap::Command, name: &str, folder: &Path) -> anyhow::Result<usize> {
     let mut page = Vec::new();
     // A page has the name by which `man` finds it: dmprl-bench-policy.
@@ -76,7 +76,7 @@ fn write_pages(command: &clap::Command, name: &str, folder: &Path) -> anyhow::Re
     clap_mangen::Man::new(named)
         .section(SECTION)
         .render(&mut page)
-        .context("cannot make a page")?;
+        .with_context(|| format!("cannot render the page {name}"))?;
     replace_file(&folder.join(format!("{name}.{SECTION}")), &page)?;
     let own = command.get_subcommands().filter(|own| !own.is_hide_set());
     own.filter(|own| own.get_name() != "help").try_fold(1, |count, own| {

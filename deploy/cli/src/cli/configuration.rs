@@ -1,4 +1,4 @@
-//! Stage 1 of 8, the command's side: merges task, preset, file, environment variables and flags
+//! Stage 1 of 8, on the command line: merges task, preset, file, environment variables and flags
 //! into one configuration.
 
 use std::path::Path;
@@ -40,7 +40,7 @@ pub(super) struct Sources<'a> {
     pub(super) flags: Vec<Flag>,
 }
 
-/// Merges the sources. Every mistake in them is wrong use.
+/// Merges the sources. Every mistake in them is a usage error.
 ///
 /// Policy and algorithm are known only after merging. The policy's own defaults override the
 /// task's, and the algorithm's override the preset: if there are any, the sources are merged once
@@ -97,15 +97,15 @@ fn merge_with(own: &Own, sources: &Sources<'_>) -> anyhow::Result<ExperimentConf
     let config = layers.finish().map_err(refuse)?;
     if config.task.name != sources.task {
         return Err(wrong_use(format!(
-            "the configuration is for task `{}`, the command line says `{}`; name the same task \
-             or remove task.name",
+            "the configuration is for task `{}`, but the command line names `{}`; name the same \
+             task or remove task.name",
             config.task.name, sources.task
         )));
     }
     Ok(config)
 }
 
-/// Reports a `ConfigError` as wrong use: it is the user's mistake, whatever its source.
+/// Turns a `ConfigError` into a usage error.
 pub(super) fn refuse(error: ConfigError) -> anyhow::Error {
     wrong_use(error.to_string())
 }
@@ -126,12 +126,12 @@ fn task_table(name: &str) -> anyhow::Result<Table> {
     }
     let near = nearest(&name.to_ascii_lowercase(), TASKS.iter().map(|task| task.name));
     let advice = near.map_or_else(
-        || "`dmprl tasks` lists those with a short name".to_owned(),
+        || "`dmprl tasks` lists the built-in tasks".to_owned(),
         |near| format!("did you mean `{near}`?"),
     );
     Err(wrong_use(format!(
-        "unknown task `{name}`, {advice}\n  A Gymnasium id ends in its version, as Pendulum-v1 or \
-         my_module:MyArm-v0; a class is my_module:MyClass"
+        "unknown task `{name}`, {advice}\n  A Gymnasium id ends with its version, such as \
+         Pendulum-v1 or my_module:MyArm-v0; a class is my_module:MyClass"
     )))
 }
 
@@ -221,7 +221,7 @@ mod tests {
         let mut merged = Vec::new();
         for layers in 0..5 {
             let mut sources = sources("pusher");
-            // The paper's preset does not set run.steps: a key of its own shows that it is below.
+            // The preset `paper` does not set run.steps, so it must not change the value.
             sources.preset = if layers >= 1 { "paper" } else { "default" };
             sources.file = (layers >= 1).then_some(file.path());
             sources.environment = vec![variable("HOME", "/root")];
@@ -252,7 +252,7 @@ mod tests {
     }
 
     #[test]
-    fn an_environment_variable_that_is_no_key_is_refused_with_the_nearest() {
+    fn an_unknown_environment_variable_is_rejected_with_the_nearest_key() {
         let mut sources = sources("reacher");
         sources.environment = vec![variable("DMPRL_ALGORITHM__BACH_SIZE", "64")];
         let message = refused(sources);
@@ -261,7 +261,7 @@ mod tests {
     }
 
     #[test]
-    fn an_unknown_task_is_refused_with_the_nearest_name() {
+    fn an_unknown_task_is_rejected_with_the_nearest_name() {
         for name in ["reachr", "Reacher", "pushr"] {
             assert!(refused(sources(name)).contains("did you mean `"), "{name}");
         }
@@ -292,7 +292,7 @@ mod tests {
     }
 
     #[test]
-    fn a_configuration_for_another_task_is_refused() {
+    fn a_configuration_for_another_task_is_rejected() {
         let mut file = tempfile::NamedTempFile::new().unwrap();
         writeln!(file, "[task]\nname = 'pusher'\nid = 'Pusher-v5'").unwrap();
         let mut sources = sources("reacher");
@@ -301,7 +301,7 @@ mod tests {
     }
 
     #[test]
-    fn a_runs_own_configuration_gives_the_same_run_again() {
+    fn a_runs_configuration_file_reproduces_its_configuration() {
         let parent = tempfile::tempdir().unwrap();
         let limits = dmprl_shared::config::Limits { cores: 4 };
         let mut first = sources("pusher");
@@ -317,7 +317,7 @@ mod tests {
     }
 
     #[test]
-    fn ndp_brings_its_own_dmp_over_any_preset_and_below_what_the_user_says() {
+    fn ndp_defaults_override_presets_but_not_the_users_settings() {
         for preset in ["default", "paper"] {
             let set = ["algorithm.name=ndp".to_owned(), "policy.start=zero".to_owned()];
             let ndp = Sources { preset, set: &set[..1], ..sources("panda-reach") };
@@ -330,8 +330,8 @@ mod tests {
             assert_eq!(config.dmp.integrator, Integrator::Explicit);
             assert_eq!(config.dmp.forcing_scaling, ForcingScaling::Goal);
             assert_eq!(config.exploration.warm_up_steps, 0);
-            let told = Sources { preset, set: &set, ..sources("panda-reach") };
-            assert_eq!(merge(&told).unwrap().policy.start, Start::Zero);
+            let user_set = Sources { preset, set: &set, ..sources("panda-reach") };
+            assert_eq!(merge(&user_set).unwrap().policy.start, Start::Zero);
         }
     }
 
@@ -344,13 +344,13 @@ mod tests {
     }
 
     #[test]
-    fn an_mlp_does_one_update_a_step_unless_told_otherwise() {
+    fn an_mlp_does_one_update_per_step_by_default() {
         let kind = [String::from("policy.kind=mlp")];
         let mlp = Sources { set: &kind, ..sources("reacher") };
         assert_eq!(merge(&mlp).unwrap().pacing.updates_per_segment, 1.0);
         let both = [kind[0].clone(), String::from("pacing.updates_per_segment=3")];
-        let told = Sources { set: &both, ..sources("reacher") };
-        assert_eq!(merge(&told).unwrap().pacing.updates_per_segment, 3.0);
+        let user_set = Sources { set: &both, ..sources("reacher") };
+        assert_eq!(merge(&user_set).unwrap().pacing.updates_per_segment, 3.0);
         assert_eq!(merge(&sources("reacher")).unwrap().pacing.updates_per_segment, 2.0);
     }
 }

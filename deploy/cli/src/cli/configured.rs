@@ -2,10 +2,11 @@
 
 use std::path::PathBuf;
 
+use anyhow::Context;
 use clap::Args;
 use clap::builder::{PossibleValuesParser, RangedI64ValueParser};
 use dmprl_run::failure::wrong_use;
-use dmprl_shared::config::{ExperimentConfig, PRESETS};
+use dmprl_shared::config::{Device, ExperimentConfig, PRESETS};
 use toml::Value;
 
 use super::configuration::{Flag, Sources};
@@ -16,23 +17,23 @@ pub(super) struct ConfiguredArgs {
     /// Learning algorithm.
     #[arg(long, value_parser = PossibleValuesParser::new(["ddpg", "td3", "sac", "ndp"]))]
     algo: Option<String>,
-    /// Policy: a DMP per segment, or a network per step.
+    /// Policy type: one DMP per segment, or an action of the network at every step.
     #[arg(long, value_parser = PossibleValuesParser::new(["dmp", "mlp"]))]
     policy: Option<String>,
     /// Named set of configuration values.
     #[arg(long, default_value = "default",
           value_parser = PossibleValuesParser::new(PRESETS.iter().map(|preset| preset.name)))]
     preset: String,
-    /// Rollout processes [default: cores - 1].
+    /// Number of worker processes [default: cores - 1].
     #[arg(long, value_name = "N")]
     pub(super) workers: Option<u32>,
-    /// Environments in each worker.
+    /// Number of environments in each worker.
     #[arg(long, value_name = "E")]
     envs_per_worker: Option<u32>,
-    /// Seed of every random stream.
+    /// Seed of all random streams.
     #[arg(long, value_name = "S", value_parser = integer())]
     seed: Option<i64>,
-    /// Folder with your own environment modules; repeatable.
+    /// Directory of your own environment modules; repeatable.
     #[arg(long, value_name = "DIR")]
     python_path: Vec<PathBuf>,
     /// Configuration file, such as a run's config.toml.
@@ -90,6 +91,20 @@ pub(super) fn integer() -> RangedI64ValueParser<i64> {
     clap::value_parser!(i64).range(0..)
 }
 
+/// Checks that this program was built with the features that the configuration needs.
+pub(super) fn check_build(config: &ExperimentConfig) -> anyhow::Result<()> {
+    if config.learner.device == Device::Cuda && !cfg!(feature = "cuda") {
+        return Err(wrong_use(
+            "learner.device = \"cuda\": this build has no CUDA; on a machine with an NVIDIA GPU \
+             and the CUDA toolkit, build with: cargo build --release --features cuda",
+        ));
+    }
+    if config.bridge.listen.is_empty() {
+        return Ok(());
+    }
+    dmprl_bridge::check_available().context("bridge.listen is set")
+}
+
 /// Makes the paths of the user's modules and demonstrations absolute: other processes have other
 /// working directories, and a run can be resumed from any directory.
 pub(super) fn make_absolute(config: &mut ExperimentConfig) -> anyhow::Result<()> {
@@ -125,7 +140,7 @@ fn absolute_file(path: &str) -> anyhow::Result<String> {
     let absolute = std::fs::canonicalize(path)
         .map_err(|error| wrong_use(format!("demonstrations {path}: {error}")))?;
     if !absolute.is_file() {
-        return Err(wrong_use(format!("demonstrations {path}: no file")));
+        return Err(wrong_use(format!("demonstrations {path}: not a file")));
     }
     text(absolute)
 }
@@ -135,8 +150,8 @@ fn text(absolute: PathBuf) -> anyhow::Result<String> {
     absolute.into_os_string().into_string().map_err(|_| wrong_use(format!("{shown}: not UTF-8")))
 }
 
-/// Collects environment variables. `DMPRL_` variables must be UTF-8; others that are not are
-/// skipped.
+/// Collects environment variables. Skips variables that are not UTF-8, but rejects those with the
+/// prefix `DMPRL_`.
 fn environment() -> anyhow::Result<Vec<(String, String)>> {
     let mut texts = Vec::new();
     for (name, value) in std::env::vars_os() {

@@ -3,11 +3,11 @@
 use std::path::PathBuf;
 
 use clap::Args;
-use dmprl_dashboard::{Plan, serve};
+use dmprl_dashboard::{Options, serve};
 use dmprl_run::failure::Outcome;
-use dmprl_run::say;
 
 use super::emit;
+use crate::terminal::say;
 
 const HELP: &str = "\
 Prints the address of a page that shows every run below the directory: learning curves, also of
@@ -36,10 +36,10 @@ pub(super) struct DashboardArgs {
 }
 
 pub(super) fn run(args: &DashboardArgs) -> anyhow::Result<Outcome> {
-    let plan = Plan { root: &args.directory, port: args.port };
-    serve(&plan, dmprl_supervisor::interrupts, |address| {
+    let options = Options { root: &args.directory, port: args.port };
+    serve(&options, dmprl_supervisor::interrupts, |address| {
         emit(&format!("http://{address}"))?;
-        say("the dashboard is at this address until Ctrl-C");
+        say("open this address in a browser (Ctrl-C to stop)");
         Ok(())
     })
 }

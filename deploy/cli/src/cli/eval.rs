@@ -1,4 +1,4 @@
-//! `dmprl eval`: a run's policy, evaluated by the same role that evaluated it in training.
+//! `dmprl eval`: evaluates a run's policy with the evaluator process that `train` uses.
 
 use std::path::PathBuf;
 
@@ -11,12 +11,12 @@ use dmprl_supervisor::{self as launch, EvaluationPlan};
 
 use super::{emit, prepare_python, this_program};
 
-/// Two evaluations whose means differ by less are the same.
+/// Mean returns that differ by at most this much count as equal.
 const SAME_RETURN: f64 = 1e-6;
 
 const HELP: &str = "\
-The episodes and their seeds are those of training, so the stored figures come out again.
-Writes nothing into the run but a log.
+Uses the evaluation episodes and seeds of training, so it reproduces the stored figures. Writes only
+a log into the run directory.
 
 EXAMPLES
   dmprl eval runs/mine
@@ -32,7 +32,7 @@ pub(super) struct EvalArgs {
     /// best, latest, or a policy version.
     #[arg(long, default_value_t = PolicyChoice::Best, value_name = "best|latest|VERSION")]
     policy: PolicyChoice,
-    /// Episodes [default: as many as the policy was evaluated with in training].
+    /// Number of episodes [default: as in the policy's evaluation during training].
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u64).range(1..=1_000_000))]
     episodes: Option<u64>,
     /// Print one JSON object on standard output.
@@ -78,7 +78,7 @@ fn request(chosen: &ChosenPolicy) -> EvaluationRequest {
 fn json(run: &RunDirectory, row: &EvaluationRow, chosen: &ChosenPolicy) -> String {
     let mut object = serde_json::json!(row);
     if chosen.row.is_none() {
-        // Nobody has measured them: the request had to say something.
+        // The policy was not evaluated in training: these are the request's placeholder zeros.
         for name in ["env_steps", "updates", "segments", "wall_s"] {
             object[name] = serde_json::Value::Null;
         }

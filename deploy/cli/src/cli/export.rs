@@ -61,14 +61,14 @@ impl Format {
     }
 }
 
-/// Rejects an output that is no regular file: root could replace even a device.
+/// Rejects an existing output that is not a regular file: root could replace even a device.
 fn check_output(path: &Path) -> anyhow::Result<()> {
     let refused = |what: &str| Err(wrong_use(format!("--output {}: {what}", path.display())));
     if path.exists() && !path.is_file() {
-        return refused("expected a file or a new name, got something that is no regular file");
+        return refused("expected a file or a new name, got something that is not a regular file");
     }
     match path.parent().filter(|parent| !parent.as_os_str().is_empty()) {
-        Some(folder) if !folder.is_dir() => refused("there is no such folder; make it first"),
+        Some(folder) if !folder.is_dir() => refused("the folder does not exist; create it first"),
         _ => Ok(()),
     }
 }
@@ -80,7 +80,7 @@ pub(super) fn run(args: &ExportArgs) -> anyhow::Result<Outcome> {
         && named != format
     {
         return Err(wrong_use(format!(
-            "--output {} ends like the other format; expected .{}, or leave --format out",
+            "--output {} has the extension of the other format; expected .{}, or omit --format",
             output.display(),
             format.extension()
         )));

@@ -1,4 +1,4 @@
-//! The command line: what may be typed, its help, and who answers.
+//! The command line: its commands, their help, and the dispatch to their implementations.
 
 mod bench;
 mod bench_learner;
@@ -35,46 +35,47 @@ use std::process::ExitCode;
 use anyhow::Context;
 use clap::{Parser, Subcommand};
 use dmprl_bench::{SegmentFeederArgs, TransportWorkerArgs, segment_feeder, transport_worker};
+use dmprl_run::Progress;
 use dmprl_run::Session;
 use dmprl_run::failure::{Outcome, exit_code, render, wrong_use};
-use dmprl_run::{Progress, say_json, says_json, write_line};
 use dmprl_shared::config::ExperimentConfig;
 
 use crate::roles::{
     self, ActorArgs, EvaluatorArgs, GatewayArgs, LearnerArgs, ObserverArgs, RelayArgs,
 };
-use crate::terminal::{ProgressStyle, TerminalProgress, events};
+use crate::terminal::messages::{self, MessageStyle};
+use crate::terminal::{ProgressStyle, TerminalProgress};
 #[cfg(feature = "python")]
 use dmprl_supervisor::python_setup::{Home, ensure_extra};
 pub use session::{TrainingPlan, train_session};
 
 const EXAMPLES: &str = "\
 EXAMPLES
-  dmprl train reacher                      train with the defaults; nothing else is needed
-  dmprl eval runs/reacher-td3-dmp-s1-…    how well does its best policy do?
-  dmprl resume runs/reacher-td3-dmp-s1-…  go on where it stopped
-  dmprl actor --join runs/reacher-td3-…   one more worker for a run that is being trained
-  dmprl bridge --connect tcp/10.0.0.1:7447 --token-file bridge.token   workers on another host
-  dmprl record runs/reacher-td3-dmp-s1-…  what does it look like?
-  dmprl dashboard                          watch every run in a browser
-  dmprl tasks                              what can be trained
-  dmprl doctor                             what this machine has and lacks
+  dmprl train reacher                      train with the defaults
+  dmprl eval runs/reacher-td3-dmp-s1-…    evaluate its best policy
+  dmprl resume runs/reacher-td3-dmp-s1-…  continue from the last checkpoint
+  dmprl actor --join runs/reacher-td3-…   add a worker to a run that is training
+  dmprl bridge --connect tcp/10.0.0.1:7447 --token-file bridge.token   add another host's workers
+  dmprl record runs/reacher-td3-dmp-s1-…  record a video of its best policy
+  dmprl dashboard                          watch all runs in a browser
+  dmprl tasks                              list the built-in tasks
+  dmprl doctor                             check this machine
 
-`dmprl COMMAND --help` has the details. Exit status: 0 done, 1 failed, 2 wrong use,
+See `dmprl COMMAND --help` for details. Exit status: 0 success, 1 failure, 2 usage error,
 130 interrupted.";
 
 const ROLES: &str = "\
 ROLES (train starts them; each has --help)
-  learner    replays, updates, publishes policies, writes checkpoints
+  learner    stores segments in a replay, updates and publishes policies, writes checkpoints
   actor      steps environments and sends segments
   evaluator  evaluates saved policies without noise
-  observer   writes down, step by step, what a saved policy does
-  gateway    stands for the workers of other hosts
-  relay      stands for the learner on a host that has none (bridge starts it)
+  observer   records every step of a saved policy's episodes
+  gateway    receives the segments of workers on other hosts
+  relay      forwards segments and policies on a host without a learner (started by bridge)
 
 ";
 
-/// Learns robot manipulation with DMP policies: one learner, many rollout workers.
+/// Trains DMP policies for robot manipulation: one learner, many rollout workers.
 #[derive(Debug, Parser)]
 #[command(name = "dmprl", version, after_help = EXAMPLES, after_long_help = long_help())]
 struct Arguments {
@@ -86,60 +87,60 @@ struct Arguments {
 enum Command {
     /// Train a policy on a task.
     Train(Box<train::TrainArgs>),
-    /// Go on with a run that was stopped or has died.
+    /// Resume a stopped or crashed run.
     Resume(resume::ResumeArgs),
     /// Evaluate a run's policy without noise.
     Eval(eval::EvalArgs),
-    /// Train many runs from one file, side by side, and go on where it was stopped.
+    /// Train many runs described in one file; resumes an interrupted sweep.
     Sweep(sweep::SweepArgs),
-    /// Set runs and sweeps side by side: tables, statistics, learning curves, one page.
+    /// Compare runs and sweeps: tables, statistics and learning curves on one page.
     Report(report::ReportArgs),
-    /// Show runs on a web page, while they are trained and afterwards.
+    /// Show runs on a web page, during and after training.
     Dashboard(dashboard::DashboardArgs),
     /// Make a video of a policy, or of two side by side.
     Record(record::RecordArgs),
-    /// Watch a policy at work, in a window or in a browser.
+    /// Play a policy live, in a window or in a browser.
     Play(play::PlayArgs),
-    /// Write a run's policy as one file, for a robot or an ONNX runtime.
+    /// Export a run's policy to one file, for a robot or an ONNX runtime.
     Export(export::ExportArgs),
-    /// Measure a part of the system beside what else could do its work.
+    /// Benchmark a part of the system against alternatives.
     Bench(bench::BenchArgs),
-    /// Kill a run's processes by a schedule and check that nothing is lost.
+    /// Kill a run's processes on a schedule and check that no data is lost.
     Chaos(chaos::ChaosArgs),
-    /// Step environments on this host for a run whose learner is on another.
+    /// Run workers on this host for a run whose learner is on another.
     Bridge(bridge::BridgeArgs),
-    /// List the tasks with a short name.
+    /// List the built-in tasks.
     Tasks(tasks::TasksArgs),
-    /// Check what this machine has for runs, and say what to do.
+    /// Check this machine and suggest remedies.
     Doctor(doctor::DoctorArgs),
-    /// Remove what dead runs have left in shared memory.
+    /// Remove the shared memory of dead runs.
     Clean(clean::CleanArgs),
-    /// Print what a shell needs to complete commands and flags.
+    /// Print shell completions.
     Completions(completions::CompletionsArgs),
     /// Write the manual pages.
     Man(completions::ManArgs),
-    /// A run's learner process; started by train.
+    /// Learner process; started by train.
     #[command(hide = true)]
     Learner(LearnerArgs),
-    /// A rollout worker process; started by train.
+    /// Rollout worker process; started by train.
     #[command(hide = true)]
     Actor(ActorArgs),
-    /// The process that evaluates; started by train and eval.
+    /// Evaluator process; started by train and eval.
     #[command(hide = true)]
     Evaluator(EvaluatorArgs),
-    /// The process that writes down what a policy does; started by record.
+    /// Process that records every step of a policy's episodes; started by record and report.
     #[command(hide = true)]
     Observer(ObserverArgs),
-    /// What stands for the workers of other hosts; started by train.
+    /// Process that receives the segments of workers on other hosts; started by train.
     #[command(hide = true)]
     Gateway(GatewayArgs),
-    /// What stands for the learner on a host that has none; started by bridge.
+    /// Process that forwards segments and policies on a host without a learner; started by bridge.
     #[command(hide = true)]
     Relay(RelayArgs),
-    /// A process that only sends segments; started by bench transport.
+    /// Process that only sends segments; started by bench transport.
     #[command(hide = true)]
     TransportWorker(TransportWorkerArgs),
-    /// A process that plays many workers, which only send segments; started by bench scale.
+    /// Process with many synthetic workers, which only send segments; started by bench scale.
     #[command(hide = true)]
     SegmentFeeder(SegmentFeederArgs),
 }
@@ -148,42 +149,46 @@ fn long_help() -> String {
     format!("{ROLES}{EXAMPLES}")
 }
 
-/// Parses the command line, does what it says, and tells how it ended.
+/// Parses the command line, runs the command and returns its exit status.
 #[must_use]
 pub fn main() -> ExitCode {
     dmprl_run::project::set_git_commit(env!("GIT_COMMIT_OF_BUILD"));
-    // Prints help and version, refuses wrong use with the nearest names and exits with 2.
+    // Handles help and version; on a usage error, suggests similar names and exits with 2.
     let arguments = Arguments::parse();
-    if arguments.command.writes_events() {
-        say_json();
-    }
+    messages::install(arguments.command.message_style());
     let result = run(arguments.command);
     if let Err(error) = &result {
-        let text = render(error);
-        write_line(&if says_json() { events::error(&text) } else { text });
+        messages::show_error(&render(error));
     }
     exit_code(&result)
 }
 
 impl Command {
-    /// Whether standard error is for events as JSON.
-    fn writes_events(&self) -> bool {
+    /// Format of messages on standard error.
+    fn message_style(&self) -> MessageStyle {
         let output = match self {
             Self::Train(args) => args.output,
             Self::Resume(args) => args.output,
             Self::Bridge(args) => args.output,
-            _ => return false,
+            Self::Learner(_) | Self::Evaluator(_) | Self::Gateway(_) | Self::Relay(_) => {
+                return MessageStyle::Log;
+            }
+            Self::Actor(args) if args.join.is_none() => return MessageStyle::Log,
+            _ => return MessageStyle::Text,
         };
-        output.style() == ProgressStyle::Events
+        match output.style() {
+            ProgressStyle::Events => MessageStyle::Json,
+            _ => MessageStyle::Text,
+        }
     }
 }
 
-/// What `dmprl train` with these arguments would train.
+/// Resolves the configuration of `dmprl train` with these arguments.
 fn train_configuration(arguments: &[String]) -> anyhow::Result<ExperimentConfig> {
     let words = ["dmprl", "train"].into_iter().chain(arguments.iter().map(String::as_str));
     match Arguments::try_parse_from(words) {
         Ok(Arguments { command: Command::Train(args) }) => train::configuration(&args),
-        Ok(_) => Err(wrong_use("another command than train")),
+        Ok(_) => Err(wrong_use("expected arguments of `dmprl train`")),
         Err(error) => Err(wrong_use(error.to_string())),
     }
 }
@@ -218,7 +223,7 @@ fn run(command: Command) -> anyhow::Result<Outcome> {
     }
 }
 
-/// Prints a result. A reader that has seen enough (`| head`) is no failure.
+/// Prints a result on standard output. A closed pipe (`| head`) is not an error.
 fn emit(text: &str) -> anyhow::Result<()> {
     let mut out = std::io::stdout().lock();
     match writeln!(out, "{text}").and_then(|()| out.flush()) {
@@ -227,15 +232,15 @@ fn emit(text: &str) -> anyhow::Result<()> {
     }
 }
 
-/// Makes sure that Python and our package are there, telling the user what takes time; returns
-/// the virtual environment.
+/// Installs Python and our package if they are missing, and shows the progress; returns the virtual
+/// environment.
 #[cfg(feature = "python")]
 fn prepare_python() -> anyhow::Result<PathBuf> {
     let progress = TerminalProgress::default();
     Ok(Home::find()?.ensure(&|line| progress.state(line))?.venv)
 }
 
-/// A session that trains `config` in this virtual environment.
+/// Creates the manifest's record of a session that trains `config` in this virtual environment.
 #[cfg(feature = "python")]
 fn training_session(config: &ExperimentConfig, venv: &Path) -> anyhow::Result<Session> {
     Session::training(config, dmprl_supervisor::python_setup::packages(&venv.join("bin/python"))?)
@@ -246,7 +251,7 @@ fn training_session(_config: &ExperimentConfig, _venv: &Path) -> anyhow::Result<
     Ok(Session::now())
 }
 
-/// The same with an optional part of the package; returns the interpreter, too.
+/// Like [`prepare_python`], with an extra of the package; also returns the interpreter.
 #[cfg(feature = "python")]
 fn prepare_python_with(extra: &str) -> anyhow::Result<(PathBuf, PathBuf)> {
     let progress = TerminalProgress::default();
@@ -254,7 +259,8 @@ fn prepare_python_with(extra: &str) -> anyhow::Result<(PathBuf, PathBuf)> {
     Ok((ready.venv, ready.executable))
 }
 
-/// The virtual environment, made or not, and what other interpreters need to `import dmprl`.
+/// Returns the path of the virtual environment, which may not exist yet, and the path from which
+/// other interpreters can `import dmprl`.
 #[cfg(feature = "python")]
 fn python_home() -> anyhow::Result<(PathBuf, PathBuf)> {
     let home = Home::find()?;
@@ -274,12 +280,12 @@ fn prepare_python_with(_extra: &str) -> anyhow::Result<(PathBuf, PathBuf)> {
 
 #[cfg(not(feature = "python"))]
 fn prepare_python() -> anyhow::Result<PathBuf> {
-    anyhow::bail!("this build is a learner without Python; build it with the feature `python`")
+    anyhow::bail!("this build has no Python support; build it with the feature `python`")
 }
 
-/// Which program plays the roles: every peer is the same build.
+/// Returns the path of this program, which also plays the roles: all processes are the same build.
 fn this_program() -> anyhow::Result<PathBuf> {
-    std::env::current_exe().context("cannot find this program's own file")
+    std::env::current_exe().context("cannot find the path of this program")
 }
 
 fn cores() -> usize {

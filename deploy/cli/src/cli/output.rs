@@ -1,4 +1,4 @@
-//! Flags for what a run prints while it is trained.
+//! Flags that determine how a run shows its progress.
 
 use clap::{Args, ValueEnum};
 use dmprl_supervisor::RunObserver;
@@ -11,7 +11,7 @@ pub(super) struct OutputArgs {
     /// Print lines instead of a progress bar.
     #[arg(long)]
     no_progress: bool,
-    /// Write events to standard error, one JSON object a line, instead of text (docs/runs.md).
+    /// Write events to standard error, one JSON object per line, instead of text (docs/runs.md).
     #[arg(long, value_name = "FORMAT")]
     events: Option<EventFormat>,
 }
@@ -19,7 +19,7 @@ pub(super) struct OutputArgs {
 /// Formats of `--events`.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
 enum EventFormat {
-    /// One JSON object a line.
+    /// One JSON object per line.
     Json,
 }
 

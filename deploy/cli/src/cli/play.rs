@@ -9,16 +9,16 @@ use clap::Args;
 use dmprl_analysis::export::{read_policy, safetensors};
 use dmprl_run::Watch;
 use dmprl_run::failure::Outcome;
-use dmprl_run::say;
 use dmprl_run::{PolicyChoice, RunDirectory};
 use rustix::process::{Pid, Signal, kill_process};
 
 use super::prepare_python_with;
+use crate::terminal::say;
 
 /// Interval between checks for exit and interrupt.
-const LOOK: Duration = Duration::from_millis(50);
+const CHECK_INTERVAL: Duration = Duration::from_millis(50);
 /// Grace period after the interrupt, before the player is killed.
-const END: Duration = Duration::from_secs(5);
+const GRACE_PERIOD: Duration = Duration::from_secs(5);
 /// Extra of the Python package for rendering.
 const EXTRA: &str = "video";
 
@@ -60,7 +60,7 @@ pub(super) fn run(args: &PlayArgs) -> anyhow::Result<Outcome> {
     let config = run.config()?;
     let opened = read_policy(&run, &run.choose_policy(args.policy)?)?;
     let (_, python) = prepare_python_with(EXTRA)?;
-    let folder = tempfile::tempdir().context("cannot make a folder for the policy")?;
+    let folder = tempfile::tempdir().context("cannot create a folder for the policy")?;
     let file = folder.path().join("policy.safetensors");
     std::fs::write(&file, safetensors(&opened)?).context("cannot write the policy")?;
     let window = !args.stream && has_display();
@@ -78,7 +78,7 @@ pub(super) fn run(args: &PlayArgs) -> anyhow::Result<Outcome> {
     if window {
         command.arg("--window");
     } else {
-        say("no window; open this page in a browser (Ctrl-C ends it):");
+        say("open this page in a browser (Ctrl-C to stop):");
     }
     play(command)
 }
@@ -93,8 +93,8 @@ fn has_display() -> bool {
 /// Runs the player until it ends or the user interrupts.
 fn play(mut command: Command) -> anyhow::Result<Outcome> {
     let watch = Watch::start()?;
-    // A process group of its own keeps the terminal's interrupt from the player; this process
-    // passes it on once.
+    // The player has its own process group, so that it does not get the terminal's interrupt; this
+    // process forwards it once.
     std::os::unix::process::CommandExt::process_group(&mut command, 0);
     // SAFETY: `prctl` is async-signal-safe, allocates nothing and touches no lock.
     unsafe {
@@ -104,26 +104,26 @@ fn play(mut command: Command) -> anyhow::Result<Outcome> {
     }
     let mut player = command.stdin(Stdio::null()).spawn().context("cannot start the player")?;
     let id = i32::try_from(player.id()).ok().and_then(Pid::from_raw);
-    let mut asked: Option<Instant> = None;
+    let mut interrupted_at: Option<Instant> = None;
     loop {
         if let Some(status) = player.try_wait().context("cannot wait for the player")? {
             return match status.code() {
-                _ if asked.is_some() => Ok(Outcome::Interrupted),
+                _ if interrupted_at.is_some() => Ok(Outcome::Interrupted),
                 Some(0) => Ok(Outcome::Done),
                 _ => bail!("the player ended with {status}; its output is above"),
             };
         }
-        match asked {
+        match interrupted_at {
             None if watch.check().is_err() => {
-                asked = Some(Instant::now());
-                // Fails if the player has exited meanwhile, which is fine.
+                interrupted_at = Some(Instant::now());
+                // Fails harmlessly if the player has exited meanwhile.
                 let _ = id.map(|id| kill_process(id, Signal::INT));
             }
-            Some(at) if at.elapsed() > END => {
+            Some(at) if at.elapsed() > GRACE_PERIOD => {
                 let _ = player.kill();
             }
             _ => {}
         }
-        std::thread::sleep(LOOK);
+        std::thread::sleep(CHECK_INTERVAL);
     }
 }

@@ -6,12 +6,11 @@ use clap::Args;
 use dmprl_analysis::motion::RecordedEpisode;
 use dmprl_run::failure::{Outcome, wrong_use};
 use dmprl_run::format::shown;
-use dmprl_run::say;
 use dmprl_run::{PolicyChoice, RunDirectory};
 use dmprl_sweep::record::{Observer, RecordPlan, Recordings, record};
 
 use super::{emit, prepare_python_with, this_program};
-use crate::terminal::TerminalProgress;
+use crate::terminal::{TerminalProgress, say};
 
 const HELP: &str = "\
 The episodes are those of `dmprl eval`: noise-free, each with its own seed. Writes an MP4, a GIF,
@@ -26,7 +25,7 @@ EXAMPLES
   dmprl record runs/td3-dmp --compare runs/td3-mlp --seed 1004
   dmprl record runs/mine --output pictures --json";
 
-/// More would be a video too long to watch.
+/// Maximum number of episodes; more would make the video too long to watch.
 const EPISODES_MAX: u64 = 100;
 
 /// Arguments of `dmprl record`.

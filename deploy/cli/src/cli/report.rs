@@ -12,24 +12,23 @@ use dmprl_analysis::report::{
 };
 use dmprl_run::failure::Outcome;
 use dmprl_run::format::shown;
-use dmprl_run::say;
 use dmprl_run::{PolicyChoice, Progress, RunDirectory, rfc3339};
 use dmprl_sweep::record::{Observer, RecordPlan, measure_motion, record};
 
 use super::{emit, prepare_python, prepare_python_with, this_program};
-use crate::terminal::TerminalProgress;
+use crate::terminal::{TerminalProgress, say};
 
 const HELP: &str = "\
 Writes index.html (one self-contained page), report.md, figures.csv, runs.csv, report-data.json and
 every picture as SVG and PNG. Tables show mean and standard deviation over seeds. With four or more
 seeds they also show the interquartile mean with a 95 % interval by stratified bootstrap (Agarwal
-et al. 2021), with fewer the range. On the paper's tasks they show the paper's figures, too. Only
+et al. 2021), with fewer the range. On the paper's tasks they also show the paper's figures. Only
 finished runs count. Figures over runs of different programs or package versions are marked.
 Motion is measured once per run, by rolling out its last policy, and kept in the run directory. The
 frames of a rollout are also recorded once; they need an environment that can render.
-The folder of an earlier report replaces run directories that are elsewhere or deleted: a run of the
-report counts unless a given run or sweep has a finished run of the same task, method and seed. The
-folder may be the output folder.
+The folder of an earlier report can replace run directories that are elsewhere or deleted: its runs
+count unless a given run or sweep has a finished run of the same task, method and seed. It may also
+be the output folder.
 
 EXAMPLES
   dmprl report runs/paper
@@ -72,10 +71,10 @@ pub(super) fn run(args: &ReportArgs) -> anyhow::Result<Outcome> {
     for reason in &results.undrawn {
         say(&format!("not drawn: {reason}"));
     }
-    let of_one = |path: &PathBuf| path.join("sweep.toml").is_file().then(|| path.join("report"));
+    let in_sweep = |path: &PathBuf| path.join("sweep.toml").is_file().then(|| path.join("report"));
     let output = match (&args.output, args.runs.as_slice()) {
         (Some(output), _) => output.clone(),
-        (None, [one]) => of_one(one).unwrap_or_else(|| PathBuf::from("report")),
+        (None, [one]) => in_sweep(one).unwrap_or_else(|| PathBuf::from("report")),
         (None, _) => PathBuf::from("report"),
     };
     let tables = tables(&results);
@@ -115,7 +114,7 @@ pub(super) fn run(args: &ReportArgs) -> anyhow::Result<Outcome> {
     Ok(Outcome::Done)
 }
 
-/// Measures the runs that were not measured yet. Without Python, continues without motion.
+/// Measures the motion of runs that have no measurement yet. Skips it if Python is unavailable.
 fn measure(results: &mut Results) -> anyhow::Result<Outcome> {
     let count = unmeasured(results);
     if count == 0 {
@@ -138,7 +137,7 @@ fn measure(results: &mut Results) -> anyhow::Result<Outcome> {
     }))
 }
 
-/// Records the frames that were not recorded yet. Without Python, continues without frames.
+/// Records the frames that do not exist yet. Skips them if Python is unavailable.
 fn draw(filmstrips: &[PlannedFilmstrip], results: &mut Results) -> anyhow::Result<Outcome> {
     if !needs_recording(filmstrips) {
         return Ok(Outcome::Done);

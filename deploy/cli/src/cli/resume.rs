@@ -1,4 +1,4 @@
-//! `dmprl resume`: go on with a run, from its last checkpoint.
+//! `dmprl resume`: resumes a run from its last checkpoint.
 
 use std::path::PathBuf;
 
@@ -11,16 +11,17 @@ use dmprl_supervisor::capacity;
 use dmprl_supervisor::{self as launch, Trial};
 
 use super::configuration::refuse;
+use super::configured::check_build;
 use super::output::OutputArgs;
 use super::{TrainingPlan, cores, prepare_python, this_program, train_session, training_session};
 
 const HELP: &str = "\
-Goes on from the last checkpoint with the run's own config.toml; environment variables and
-presets have no say. A run that has no checkpoint yet begins again.
+Resumes from the last checkpoint with the run's own config.toml; environment variables and presets
+are ignored. A run without a checkpoint starts from the beginning.
 
 EXAMPLES
   dmprl resume runs/reacher-td3-dmp-s1-20260131-120000
-  dmprl resume runs/mine --steps 120000    # longer than first asked for";
+  dmprl resume runs/mine --steps 120000    # extend the run";
 
 /// Arguments of `dmprl resume`.
 #[derive(Debug, Args)]
@@ -28,7 +29,7 @@ EXAMPLES
 pub(super) struct ResumeArgs {
     /// The run directory.
     run: PathBuf,
-    /// New length of the whole run [environment steps].
+    /// New total length of the run [environment steps].
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(i64).range(1..))]
     steps: Option<i64>,
     #[command(flatten)]
@@ -46,10 +47,10 @@ pub(super) fn run(args: &ResumeArgs) -> anyhow::Result<Outcome> {
     let folder = run.checkpoints_path();
     let counters = checkpoint::counters(&folder)?;
     let reached = counters.iter().map(|counters| counters.env_steps).max().unwrap_or(0);
-    // A run may end some steps beyond its length, in mid-segment: the same length is no mistake.
+    // A run can exceed its length by part of a segment, so its own length must be accepted.
     if config.run.steps < reached.min(steps_before) {
         return Err(wrong_use(format!(
-            "--steps {}: the run has {reached} steps already; --steps is the length of the whole \
+            "--steps {}: the run already has {reached} steps; --steps is the total length of the \
              run",
             config.run.steps
         )));
@@ -57,21 +58,23 @@ pub(super) fn run(args: &ResumeArgs) -> anyhow::Result<Outcome> {
     for path in &config.task.python_path {
         if !std::path::Path::new(path).is_dir() {
             return Err(wrong_use(format!(
-                "the run's environments were in {path}, which is gone; put it back or change \
-                 task.python_path in {}",
+                "the directory {path} of the run's environments does not exist any more; restore \
+                 it or change task.python_path in {}",
                 run.path().join("config.toml").display()
             )));
         }
     }
+    check_build(&config)?;
     capacity::check(&config, run.spec()?.as_ref())?;
     let venv = prepare_python()?;
-    // Before the lock, which children inherit: the interpreter that names its packages is one.
+    // Before the lock is taken: this starts an interpreter, which would inherit the lock.
     let session = training_session(&config, &venv)?;
     let lock = run.lock(launch::RESUME_WAIT)?;
     let mut manifest = run.manifest()?;
     manifest.sessions.push(session);
     run.write_manifest(&manifest)?;
-    // Of an older version, it lacks what has been added since and depends on the machine.
+    // The configuration of an older version lacks keys that were added later and whose defaults
+    // depend on the machine.
     if config != written {
         run.write_config(&config)?;
     }

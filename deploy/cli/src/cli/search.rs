@@ -3,7 +3,6 @@
 use anyhow::{Context, bail};
 use dmprl_run::failure::{Outcome, wrong_use};
 use dmprl_run::format::shown;
-use dmprl_run::say;
 use dmprl_run::sweep_files::{Ledger, Search, SweepFile};
 use dmprl_run::sweep_files::{Study, TUNING_SEED, Trial};
 use dmprl_sweep::Site;
@@ -11,7 +10,7 @@ use dmprl_sweep::search::{SearchSweep, search as run_search};
 
 use super::sweep::{SweepArgs, jobs, take};
 use super::{emit, prepare_python_with, train_configuration};
-use crate::terminal::TerminalProgress;
+use crate::terminal::{TerminalProgress, say};
 
 /// Extra of the Python package with Optuna.
 const EXTRA: &str = "search";
@@ -48,10 +47,10 @@ pub(super) fn run(
     listing.print(args)?;
     let again = format!("dmprl sweep {}", args.file.display());
     if let Some(reason) = ended.gave_up {
-        bail!("{reason}\ngo on with: {again}");
+        bail!("{reason}\nresume with: {again}");
     }
     if ended.interrupted {
-        say(&format!("go on with: {again}"));
+        say(&format!("resume with: {again}"));
         return Ok(Outcome::Interrupted);
     }
     if let Some(study) = studies.iter().find(|study| study.best().is_none()) {
@@ -76,8 +75,8 @@ impl Listing<'_> {
     fn text(&self) -> String {
         let Search { trials, objective, sampler, pruner, seed, .. } = self.search;
         let mut lines = vec![format!(
-            "  {trials} trials of each task and method for the greatest {}; sampler {}, seed \
-             {seed}; pruner {}",
+            "  {trials} trials for each task and method, maximising {}; sampler {}, seed {seed}; \
+             pruner {}",
             objective.name(),
             word(sampler),
             word(pruner),
@@ -88,7 +87,7 @@ impl Listing<'_> {
         for study in self.studies {
             let base = &study.base;
             lines.push(format!(
-                "  {}: {} of {trials} trials begun, each {} steps with {}; evaluated on seeds \
+                "  {}: {} of {trials} trials started, each {} steps with {}; evaluated on seeds \
                  from {}",
                 study.title(),
                 study.trials.len(),

@@ -1,6 +1,5 @@
-//! A session of a run as the user sees it: progress on the terminal, TensorBoard files, the
-//! learning curve and the summary around [`dmprl_supervisor::session`]. `train` and `resume` call
-//! it.
+//! Runs a session for `train` and `resume`: calls [`dmprl_supervisor::session`], shows its progress
+//! on the terminal, writes TensorBoard files, draws the learning curve and prints a summary.
 
 use std::path::PathBuf;
 
@@ -9,38 +8,37 @@ use dmprl_analysis::tensorboard::Mirror;
 use dmprl_learner::checkpoint;
 use dmprl_run::failure::Outcome;
 use dmprl_run::format::shown;
-use dmprl_run::say;
+use dmprl_run::title;
 use dmprl_run::{RunDirectory, RunLock};
-use dmprl_run::{title, write_line};
 use dmprl_shared::config::ExperimentConfig;
 use dmprl_supervisor::{
     self as launch, Ending, RunEvent, RunObserver, SessionPlan, SessionReport, Totals, Trial,
 };
 
 use super::output::observer;
-use crate::terminal::{ProgressStyle, events, summary};
+use crate::terminal::{ProgressStyle, events, say, summary, write_line};
 
-/// A run directory that is ready for training.
+/// A session to run, in a run directory that is ready for training.
 pub struct TrainingPlan {
     /// The program that plays the roles: this one, or a fake in tests.
     pub program: PathBuf,
     /// The run.
     pub run: RunDirectory,
-    /// The run's lock, held to the end.
+    /// The run's lock, held until the session ends.
     pub lock: RunLock,
     /// The resolved configuration.
     pub config: ExperimentConfig,
     /// The Python virtual environment.
     pub venv: Option<PathBuf>,
-    /// Whether the run has been trained before.
+    /// Whether the run has been trained before and resumes from its last checkpoint.
     pub resume: bool,
-    /// Bar or lines.
+    /// How to show the progress.
     pub progress: ProgressStyle,
-    /// Differences for `dmprl chaos`.
+    /// Special settings for `dmprl chaos`.
     pub trial: Trial,
 }
 
-/// Shows a session, and mirrors the run's rows from its begin to its end.
+/// Shows a session, and mirrors the run's rows to TensorBoard files while it runs.
 struct SessionObserver {
     display: Box<dyn RunObserver>,
     mirrored: RunDirectory,
@@ -82,7 +80,7 @@ pub fn train_session(plan: TrainingPlan) -> anyhow::Result<Outcome> {
     }
     drop(lock);
     if let Err(error) = plots::learning_curve(&run, &title) {
-        // The results exist without the picture.
+        // The results are complete without the plot.
         say(&format!("warning: {error:#}"));
     }
     match progress {
@@ -112,7 +110,7 @@ fn outcome(ending: Ending) -> anyhow::Result<Outcome> {
     }
 }
 
-/// Tells the user how the session ended and what can follow.
+/// Tells the user how the session ended and how to resume it.
 fn conclude(
     mut report: SessionReport,
     run: &RunDirectory,
@@ -120,8 +118,8 @@ fn conclude(
     steps_total: u64,
 ) -> anyhow::Result<Outcome> {
     let lost = match run.has_checkpoint() {
-        Ok(true) => "the last checkpoint is missing: a resume goes back to the one before it",
-        Ok(false) => "there is no checkpoint: a resume begins again",
+        Ok(true) => "the last checkpoint was not written: the run resumes from the one before",
+        Ok(false) => "there is no checkpoint: the run resumes from the beginning",
         Err(_) => "the checkpoints cannot be read",
     };
     match &report.ending {
@@ -129,10 +127,10 @@ fn conclude(
         Ending::Interrupted => {
             let path = shown(run.path());
             say(if report.checkpointed { "checkpoint written" } else { lost });
-            say(&format!("go on with: dmprl resume {path}"));
+            say(&format!("resume with: dmprl resume {path}"));
         }
         Ending::Completed => {
-            // A session that had nothing to do shows the newest result of the run.
+            // A session without training steps shows the newest result of the run.
             if report.last_row.is_none() {
                 report.last_row = run.latest_row()?;
             }

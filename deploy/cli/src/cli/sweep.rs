@@ -4,20 +4,20 @@ use std::path::{Path, PathBuf};
 
 use anyhow::{Context, bail};
 use clap::Args;
+use dmprl_run::RunDirectory;
 use dmprl_run::RunLock;
 use dmprl_run::failure::{Outcome, wrong_use};
 use dmprl_run::format::{grouped, shown};
 use dmprl_run::sweep_files::{Ledger, Plan, PlannedRun, SweepFile};
-use dmprl_run::{RunDirectory, say};
 use dmprl_shared::config::ExperimentConfig;
 use dmprl_supervisor::RESUME_WAIT;
 use dmprl_sweep::{RunState, Site, Sweep, states, sweep};
 
 use super::{cores, emit, prepare_python, search, this_program, train_configuration};
-use crate::terminal::TerminalProgress;
+use crate::terminal::{TerminalProgress, say};
 
 const HELP: &str = "\
-FILE is TOML. It trains every task with every method, at every point of the grid, with every seed.
+FILE is TOML. Trains every task with every method, at every point of the grid, with every seed.
   seeds = [1, 2, 3]
   set = { evaluation.episodes = 20 }      # any configuration key, for every run
   [[task]]
@@ -32,7 +32,7 @@ FILE is TOML. It trains every task with every method, at every point of the grid
   algorithm.batch_size = [128, 256]
 Each run is a `dmprl train` in OUTPUT/TASK/METHOD[/VALUES]/seed-S. After a stop or a crash, run the
 same command again: it skips finished runs and resumes the others from their checkpoints. A failed
-run does not affect the others; the next start tries it again.
+run does not affect the others; the next start retries it.
 On Ctrl-C the runs write a checkpoint; a second Ctrl-C stops them at once.
 
 SEARCH, instead of [grid]: Optuna suggests the values of each trial.
@@ -52,9 +52,9 @@ SEARCH, instead of [grid]: Optuna suggests the values of each trial.
 A trial is trained with each seed, one after the other, in OUTPUT/TASK/METHOD/trial-N/seed-S; its
 objective is the mean over the seeds. The pruner compares each evaluation with the evaluation of the
 same number in other trials. A pruned trial is interrupted and not resumed. A failed trial counts as
-a trial. The runs evaluate on episodes with seeds from 5000 on (evaluation.first_seed; lower values
-are rejected), which the final evaluation, with seeds from 1000 on, does not use. Train the best
-configuration anew to measure its performance:
+a trial. Trials are evaluated on episodes with seeds from 5000 on (evaluation.first_seed; lower
+values are rejected). By default `train` evaluates on seeds from 1000 on. Train the best
+configuration again to measure its performance:
   dmprl train TASK --config OUTPUT/TASK/METHOD/best.toml
 The first search installs Optuna into .venv. OUTPUT/optuna.db is its storage, which its own tools
 can read too: optuna-dashboard sqlite:///OUTPUT/optuna.db
@@ -117,7 +117,7 @@ fn checkpointed_steps(run: &RunDirectory) -> anyhow::Result<u64> {
 pub(super) fn take(site: &mut Site) -> anyhow::Result<RunLock> {
     let output = &mut site.output;
     std::fs::create_dir_all(&*output)
-        .with_context(|| format!("cannot make {}", output.display()))?;
+        .with_context(|| format!("cannot create {}", output.display()))?;
     *output = std::fs::canonicalize(&*output)
         .with_context(|| format!("cannot resolve {}", output.display()))?;
     // Children inherit the lock: those of a killed sweep first write their checkpoints.
@@ -131,14 +131,14 @@ fn finish(mut plan: Sweep, args: &SweepArgs) -> anyhow::Result<Outcome> {
     report(&plan, &ended.states, args.json)?;
     let again = format!("dmprl sweep {}", args.file.display());
     if ended.interrupted {
-        say(&format!("go on with: {again}"));
+        say(&format!("resume with: {again}"));
         return Ok(Outcome::Interrupted);
     }
     let failed = |state: &&RunState| matches!(state, RunState::Failed { .. });
     match ended.states.iter().filter(failed).count() {
         0 => Ok(Outcome::Done),
-        1 => bail!("a run failed, see above; try it again: {again}"),
-        count => bail!("{count} runs failed, see above; try them again: {again}"),
+        1 => bail!("a run failed, see above; retry with: {again}"),
+        count => bail!("{count} runs failed, see above; retry with: {again}"),
     }
 }
 
@@ -191,7 +191,7 @@ fn report(plan: &Sweep, states: &[RunState], json: bool) -> anyhow::Result<()> {
     let lines = runs.map(|((run, config), state)| {
         let state = match state {
             RunState::Finished => "finished".to_owned(),
-            RunState::Open { env_steps: 0 } => "not begun".to_owned(),
+            RunState::Open { env_steps: 0 } => "not started".to_owned(),
             RunState::Open { env_steps } => {
                 format!("at {} of {} steps", grouped(*env_steps), grouped(config.run.steps))
             }

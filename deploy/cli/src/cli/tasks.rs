@@ -1,4 +1,4 @@
-//! `dmprl tasks`: lists the tasks with a short name.
+//! `dmprl tasks`: lists the built-in tasks.
 
 use clap::Args;
 use dmprl_run::failure::Outcome;
@@ -7,7 +7,7 @@ use dmprl_shared::config::{TASKS, TaskDefaults};
 use super::emit;
 
 const HELP: &str = "\
-Every Gymnasium id with box-shaped observations and actions is a task too.
+Every Gymnasium environment with box-shaped observations and actions is also a task, by its id.
 
 EXAMPLES
   dmprl tasks
@@ -16,7 +16,7 @@ EXAMPLES
   dmprl train my_module:MyArm-v0 --python-path ./envs";
 
 const OTHERS: &str = "\
-Any other Gymnasium id works too, as Pendulum-v1; my_module:MyArm-v0 imports my_module first.";
+Other Gymnasium ids work too, such as Pendulum-v1; my_module:MyArm-v0 imports my_module first.";
 
 /// Arguments of `dmprl tasks`.
 #[derive(Debug, Args)]

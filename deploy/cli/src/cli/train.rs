@@ -1,4 +1,4 @@
-//! `dmprl train`: from the command line to a run directory, then over to `session`.
+//! `dmprl train`: creates a run directory from the command line and trains it.
 
 use std::io::Read;
 use std::path::{Path, PathBuf};
@@ -10,7 +10,7 @@ use clap::builder::PossibleValuesParser;
 use dmprl_run::failure::{Outcome, wrong_use};
 use dmprl_run::{Manifest, PolicyChoice, RunDirectory, compact, safe_name};
 use dmprl_shared::config::{
-    AlgorithmName, Device, ExperimentConfig, Limits, PolicyKind, TaskDefaults, task_defaults,
+    AlgorithmName, ExperimentConfig, Limits, PolicyKind, TaskDefaults, task_defaults,
 };
 use dmprl_shared::dmp::Dmp;
 use dmprl_supervisor::Trial;
@@ -18,18 +18,18 @@ use dmprl_supervisor::capacity;
 use toml::Value;
 
 use super::configuration::{Flag, merge, refuse};
-use super::configured::{ConfiguredArgs, flag, integer, make_absolute, paths};
+use super::configured::{ConfiguredArgs, check_build, flag, integer, make_absolute, paths};
 use super::output::OutputArgs;
 use super::{TrainingPlan, cores, prepare_python, this_program, train_session, training_session};
 
-/// A second run of the same second gets a number; more than this is a stuck clock.
+/// Runs created within one second get a number; this many mean that the clock is stuck.
 const SAME_SECOND_MAX: usize = 100;
 
 const HELP: &str = "\
-PRECEDENCE, lowest first: the policy's and the task's defaults, --preset, the algorithm's own values
-(ndp), --config, environment variables (DMPRL_ALGORITHM__BATCH_SIZE=64 sets algorithm.batch_size),
---set, the flags above.
-Ctrl-C once: checkpoint and a clean end within 10 s; twice: at once.
+PRECEDENCE, lowest first: defaults of the task and of the policy, --preset, defaults of the
+algorithm (ndp), --config, environment variables (DMPRL_ALGORITHM__BATCH_SIZE=64 sets
+algorithm.batch_size), --set, the other flags above.
+Ctrl-C writes a checkpoint and exits within 10 s; a second Ctrl-C exits at once.
 
 EXAMPLES
   dmprl train reacher
@@ -47,53 +47,53 @@ EXAMPLES
 #[derive(Debug, Args)]
 #[command(after_help = HELP)]
 pub(super) struct TrainArgs {
-    /// A task of `dmprl tasks`, or any Gymnasium id: Pendulum-v1, my_module:MyArm-v0; or a class
-    /// of your own, a gymnasium.Env or a SegmentEnv: my_module:MyClass.
+    /// A task of `dmprl tasks`; any Gymnasium id, such as Pendulum-v1 or my_module:MyArm-v0; or
+    /// your own gymnasium.Env or SegmentEnv class, as my_module:MyClass.
     task: String,
     #[command(flatten)]
     configured: ConfiguredArgs,
-    /// Environment steps, all workers together.
+    /// Length of the run in environment steps, summed over all workers.
     #[arg(long, value_name = "N", value_parser = integer())]
     steps: Option<i64>,
-    /// Where the results go; new or empty [default: runs/TASK-ALGO-POLICY-sSEED-TIME].
+    /// Run directory, new or empty [default: runs/TASK-ALGO-POLICY-sSEED-TIME].
     #[arg(long, value_name = "DIR")]
     run_dir: Option<PathBuf>,
-    /// One worker, in one process with the learner and in lock-step with it: the same seed gives
-    /// the same bytes.
+    /// Train with one worker, in lock-step with the learner in one process: runs with the same seed
+    /// are bit-identical.
     #[arg(long)]
     deterministic: bool,
-    /// Where the update runs; `cuda` needs a build with that feature.
+    /// Device of the update; `cuda` needs a build with that feature.
     #[arg(long, value_parser = PossibleValuesParser::new(["cpu", "cuda"]))]
     device: Option<String>,
     /// Threads of the update.
     #[arg(long, value_name = "N")]
     threads: Option<u32>,
-    /// Start from a run's best policy, or from a policy file.
+    /// Initialise the policy from a run's best policy or from a policy file.
     #[arg(long, value_name = "RUN|FILE")]
     init_from: Option<PathBuf>,
-    /// Demonstrations to start from, a file of steps (docs/demonstrations.md); repeatable.
+    /// Demonstrations to learn from, a file of steps (docs/demonstrations.md); repeatable.
     #[arg(long, value_name = "FILE")]
     demos: Vec<PathBuf>,
-    /// Stop at this mean evaluation return.
+    /// Stop when the mean evaluation return reaches this value.
     #[arg(long, value_name = "X", allow_negative_numbers = true)]
     until_return: Option<f64>,
-    /// Stop at this evaluation success rate, 0 to 1.
+    /// Stop when the evaluation success rate, 0 to 1, reaches this value.
     #[arg(long, value_name = "X")]
     until_success: Option<f64>,
-    /// Stop after so many minutes of this session.
+    /// Stop this session after this many minutes.
     #[arg(long, value_name = "M")]
     max_minutes: Option<f64>,
     #[command(flatten)]
     pub(super) output: OutputArgs,
-    /// Have worker and learner note in files of this folder what they do; for `chaos`.
+    /// Folder in which workers and learner log every segment; for `chaos`.
     #[arg(long, value_name = "DIR", hide = true)]
     journal: Option<PathBuf>,
-    /// The longest pause before a restart [ms]; for `chaos`.
+    /// Maximum back-off before a restart [ms]; for `chaos`.
     #[arg(long, value_name = "MS", hide = true)]
     restart_pause_max: Option<u64>,
 }
 
-/// What these arguments make of the configuration, checked.
+/// Resolves and checks the configuration that these arguments determine.
 pub(super) fn configuration(args: &TrainArgs) -> anyhow::Result<ExperimentConfig> {
     let sources = args.configured.sources(&args.task, flags(args)?)?;
     let mut config = merge(&sources)?.resolve(Limits { cores: cores() }).map_err(refuse)?;
@@ -131,22 +131,17 @@ pub(super) fn run(args: &TrainArgs) -> anyhow::Result<Outcome> {
     })
 }
 
-/// What is wrong before any process or environment is needed.
+/// Rejects mistakes that can be found without starting a process or an environment.
 fn check(config: &ExperimentConfig, args: &TrainArgs) -> anyhow::Result<()> {
     if config.policy.kind == PolicyKind::Dmp {
         Dmp::new(&config.dmp, config.policy.segment_steps)
             .map_err(|error| wrong_use(error.to_string()))?;
     }
-    if config.learner.device == Device::Cuda && !cfg!(feature = "cuda") {
-        return Err(wrong_use(
-            "learner.device = \"cuda\": this build has no CUDA; on a machine with an NVIDIA GPU \
-             and the CUDA toolkit, build with: cargo build --release --features cuda",
-        ));
-    }
+    check_build(config)?;
     if let Some(workers) = args.configured.workers.filter(|&n| n > 1 && config.run.deterministic) {
         return Err(wrong_use(format!(
-            "--workers {workers}: a deterministic run has one worker, in one process with the \
-             learner; leave out --workers, or run.deterministic"
+            "--workers {workers}: a deterministic run has exactly one worker; remove --workers or \
+             run.deterministic"
         )));
     }
     Ok(())
@@ -170,7 +165,7 @@ fn flags(args: &TrainArgs) -> anyhow::Result<[Option<Flag>; 8]> {
     ])
 }
 
-/// The policy that a run or a file stands for.
+/// Returns the path of a run's best policy, or of the given policy file.
 fn policy_file(path: &Path) -> anyhow::Result<PathBuf> {
     let file = if path.is_dir() {
         RunDirectory::open(path)?.choose_policy(PolicyChoice::Best)?.path
@@ -183,13 +178,16 @@ fn policy_file(path: &Path) -> anyhow::Result<PathBuf> {
         )));
     };
     if !is_safetensors(&file).unwrap_or(false) {
-        return Err(wrong_use(format!("--init-from {}: no readable policy file", file.display())));
+        return Err(wrong_use(format!(
+            "--init-from {}: not a readable policy file",
+            file.display()
+        )));
     }
     std::fs::canonicalize(&file).with_context(|| format!("cannot resolve {}", file.display()))
 }
 
-/// Whether a file begins as safetensors do: the header's length in 8 bytes, the header in JSON.
-/// The learner reads the rest, when the environment has said how large the policy is.
+/// Returns whether the file starts like a safetensors file: 8 bytes with the header's length, then
+/// the header in JSON. The learner reads the rest once the environment has reported its sizes.
 fn is_safetensors(path: &Path) -> std::io::Result<bool> {
     let mut head = [0; 9];
     let mut file = std::fs::File::open(path)?;
@@ -220,5 +218,5 @@ fn default_path(config: &ExperimentConfig) -> anyhow::Result<PathBuf> {
     candidates
         .into_iter()
         .find(|path| !path.exists())
-        .with_context(|| format!("{SAME_SECOND_MAX} runs named {name} exist; give --run-dir"))
+        .with_context(|| format!("{SAME_SECOND_MAX} runs named {name} exist; use --run-dir"))
 }

@@ -1,4 +1,4 @@
-//! System, processor, memory, disk and graphics.
+//! Checks of platform, processor, memory, disk and GPU.
 
 use std::path::Path;
 
@@ -10,13 +10,13 @@ use rustix::fs::{Access, access};
 
 use super::Check;
 
-/// Where `train` puts its runs.
+/// Default parent directory of runs.
 const RUNS: &str = "runs";
-/// Where the kernel was last asked about its name.
+/// File with the kernel's version.
 const KERNEL_RELEASE: &str = "/proc/sys/kernel/osrelease";
-/// Learner with its replay, and a worker with MuJoCo; less than that swaps or is killed.
+/// Needed by a learner with its replay and a worker with MuJoCo.
 const MEMORY_BYTES_MIN: u64 = 2 << 30;
-/// A checkpoint with the replay of a default run.
+/// Needed by a checkpoint with the replay of a default run.
 const DISK_BYTES_MIN: u64 = 1 << 30;
 
 pub(super) fn checks() -> Vec<Check> {
@@ -30,7 +30,7 @@ fn platform() -> Check {
     if os == "linux" && ["x86_64", "aarch64"].contains(&processor) {
         return Check::ok("platform", found);
     }
-    Check::problem("platform", found, "supported is Linux on x86_64 and aarch64")
+    Check::problem("platform", found, "only Linux on x86_64 and aarch64 is supported")
 }
 
 fn cores() -> Check {
@@ -40,7 +40,7 @@ fn cores() -> Check {
         None => cores.to_string(),
     };
     if cores == 1 {
-        let advice = "learner and worker share it: runs work, at half the speed";
+        let advice = "runs work, but slowly: learner and worker share the core";
         return Check::warning("cores", found, advice);
     }
     Check::ok("cores", found)
@@ -48,12 +48,12 @@ fn cores() -> Check {
 
 fn memory() -> Check {
     let Some(bytes) = MachineLimits::this().memory_bytes else {
-        return Check::warning("memory", "not known", "the kernel shows no /proc/meminfo");
+        return Check::warning("memory", "unknown", "/proc/meminfo cannot be read");
     };
     let found = binary_bytes(bytes);
     if bytes < MEMORY_BYTES_MIN {
         let advice = format!(
-            "below {}, learner and workers may be killed: lower replay.capacity_steps and \
+            "with less than {}, learner and workers may be killed: lower replay.capacity_steps and \
              actors.workers, or raise the container's limit",
             binary_bytes(MEMORY_BYTES_MIN)
         );
@@ -65,7 +65,7 @@ fn memory() -> Check {
 fn disk() -> Check {
     let here = std::env::current_dir().unwrap_or_default();
     let runs = here.join(RUNS);
-    // Not made yet, it will lie in the current directory's file system.
+    // If it does not exist yet, `train` creates it in the current directory.
     let path = if runs.is_dir() { runs } else { here };
     disk_at(&path)
 }
@@ -74,19 +74,19 @@ fn disk_at(path: &Path) -> Check {
     let space = match Space::of(path) {
         Ok(space) => space,
         Err(error) => {
-            let advice = "start dmprl in a directory that exists";
+            let advice = "run dmprl in a directory that exists";
             return Check::problem("disk", format!("{}: {error}", path.display()), advice);
         }
     };
     let found = format!("{} free in {}", binary_bytes(space.free_bytes), path.display());
     if let Err(error) = access(path, Access::WRITE_OK) {
-        let advice = "start dmprl in a directory of your own, or give train a --run-dir";
-        return Check::warning("disk", format!("{found}, but not for writing: {error}"), advice);
+        let advice = "run dmprl in a directory of your own, or use train --run-dir";
+        return Check::warning("disk", format!("{found}, but not writable: {error}"), advice);
     }
     if space.free_bytes < DISK_BYTES_MIN {
         let advice = format!(
-            "checkpoints may not fit into less than {}: checkpoint.keep and \
-             checkpoint.disk_bytes_max bound them",
+            "checkpoints may need more than {}: limit them with checkpoint.keep and \
+             checkpoint.disk_bytes_max",
             binary_bytes(DISK_BYTES_MIN)
         );
         return Check::warning("disk", found, advice);
@@ -105,14 +105,14 @@ fn gpu_check(gpu: Option<String>, built_with_cuda: bool) -> Check {
         (Some(gpu), true) => Check::ok("gpu", format!("{gpu}; used by --device cuda")),
         (Some(gpu), false) => Check::ok(
             "gpu",
-            format!("{gpu}; this build is without CUDA (cargo build --release --features cuda)"),
+            format!("{gpu}; not used, as this build has no CUDA (cargo build --features cuda)"),
         ),
         (None, true) => Check::warning(
             "gpu",
             "none, although this build has CUDA",
-            "nvidia-smi answers nothing: is the driver installed? --device cpu works",
+            "nvidia-smi reports no GPU; check that the driver is installed, or use --device cpu",
         ),
-        (None, false) => Check::ok("gpu", "none; nothing needs one"),
+        (None, false) => Check::ok("gpu", "none; not needed by this build"),
     }
 }
 
@@ -122,7 +122,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_build_for_a_gpu_that_is_not_there_is_worth_a_warning() {
+    fn a_cuda_build_without_a_gpu_gets_a_warning() {
         let gpu = || Some("NVIDIA H200".to_owned());
         assert_eq!(gpu_check(None, false).status, Status::Ok);
         assert_eq!(gpu_check(None, true).status, Status::Warning);
@@ -131,7 +131,7 @@ mod tests {
     }
 
     #[test]
-    fn a_directory_that_is_gone_is_a_problem() {
+    fn a_missing_directory_is_a_problem() {
         let folder = tempfile::tempdir().unwrap();
         assert_ne!(disk_at(folder.path()).status, Status::Problem);
         assert_eq!(disk_at(&folder.path().join("gone")).status, Status::Problem);

@@ -1,7 +1,7 @@
-//! What `dmprl doctor` looks at: one check each, with what was found and what to do about it.
+//! Checks of `dmprl doctor`. Each has a finding and, if something is wrong, a remedy.
 //!
-//! `machine` asks the system, `room` compares its limits with what a run takes, `python` looks at
-//! the interpreter and `.venv`. Nothing here changes anything.
+//! `machine` checks platform, memory, disk and GPU, `room` compares the kernel's limits with the
+//! needs of a run, and `python` checks the interpreter and `.venv`. No check changes anything.
 
 mod machine;
 #[cfg(feature = "python")]
@@ -11,25 +11,24 @@ mod room;
 use dmprl_shared::config::{ExperimentConfig, TaskDefaults};
 use serde::Serialize;
 
-/// How it stands with one thing.
+/// Result of a check.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "lowercase")]
 pub(crate) enum Status {
     Ok,
-    /// Runs work; something is worth knowing.
+    /// Runs work, perhaps slowly or with restrictions.
     Warning,
     /// Runs do not work.
     Problem,
 }
 
-/// One thing that was looked at.
+/// A check and its result.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize)]
 pub(crate) struct Check {
     name: &'static str,
     status: Status,
-    /// What is there.
     found: String,
-    /// What to do; none when all is well.
+    /// Remedy; `None` if nothing is wrong.
     advice: Option<String>,
 }
 
@@ -47,31 +46,30 @@ impl Check {
     }
 }
 
-/// A task as `dmprl train TASK` runs it here.
+/// A task with the configuration of `dmprl train TASK` on this machine.
 #[derive(Debug)]
 pub(crate) struct DefaultRun {
     pub(crate) task: &'static TaskDefaults,
-    /// Resolved.
     pub(crate) config: ExperimentConfig,
 }
 
-/// All checks.
+/// The results of all checks.
 #[derive(Debug)]
 pub(crate) struct Report(Vec<Check>);
 
 impl Report {
-    /// Looks at everything. `runs`: what has to fit.
+    /// Runs all checks. Every one of `runs` has to fit the machine's limits.
     pub(crate) fn of_this_machine(runs: &[DefaultRun]) -> Self {
         let mut checks = machine::checks();
         #[cfg(feature = "python")]
         checks.extend(python::checks());
         #[cfg(not(feature = "python"))]
-        checks.push(Check::ok("python", "not in this build, which is a learner only"));
+        checks.push(Check::ok("python", "not in this build, which has only the learner"));
         checks.extend(room::checks(runs));
         Self(checks)
     }
 
-    /// How many things keep runs from working.
+    /// Returns the number of problems, which prevent runs from working.
     pub(crate) fn problems(&self) -> usize {
         self.count(Status::Problem)
     }
@@ -80,7 +78,7 @@ impl Report {
         self.0.iter().filter(|check| check.status == status).count()
     }
 
-    /// The checks and their numbers.
+    /// Returns the checks and the numbers of problems and warnings.
     pub(crate) fn json(&self) -> serde_json::Value {
         serde_json::json!({
             "checks": self.0,
@@ -89,7 +87,7 @@ impl Report {
         })
     }
 
-    /// A line for each check, its advice below.
+    /// Formats a line for each check, with its advice below.
     pub(crate) fn text(&self) -> String {
         let mut lines = Vec::new();
         for Check { name, status, found, advice } in &self.0 {
@@ -104,7 +102,7 @@ impl Report {
         }
         let (problems, warnings) = (self.problems(), self.count(Status::Warning));
         lines.push(match (problems, warnings) {
-            (0, 0) => "\nnothing to do".to_owned(),
+            (0, 0) => "\nno problems".to_owned(),
             (problems, warnings) => format!("\nproblems {problems}, warnings {warnings}"),
         });
         lines.join("\n")
@@ -116,7 +114,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn advice_stands_below_what_was_found() {
+    fn advice_is_printed_below_the_finding() {
         let report = Report(vec![
             Check::ok("cores", "2"),
             Check::warning("leftovers", "3", "dmprl clean"),

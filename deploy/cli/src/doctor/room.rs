@@ -1,4 +1,4 @@
-//! Shared memory and the kernel's limits, beside what the default runs of this machine take.
+//! Checks of shared memory and the kernel's limits against the needs of default runs.
 
 use dmprl_run::format::binary_bytes;
 use dmprl_supervisor::Place;
@@ -6,7 +6,7 @@ use dmprl_supervisor::capacity::{MachineLimits, Need, Space};
 
 use super::{Check, DefaultRun};
 
-/// What Docker gives a container unless told otherwise.
+/// Docker's default size of a container's shared memory.
 const DOCKER_DEFAULT_BYTES: u64 = 64 << 20;
 
 pub(super) fn checks(runs: &[DefaultRun]) -> Vec<Check> {
@@ -22,7 +22,7 @@ pub(super) fn checks(runs: &[DefaultRun]) -> Vec<Check> {
     ]
 }
 
-/// The most that any task takes, of each thing.
+/// Returns the largest need of any run, for each resource.
 fn largest(runs: &[DefaultRun]) -> Need {
     let of = |run: &DefaultRun| Need::of(&run.config, Some(&run.task.spec()));
     let nothing = Need {
@@ -50,7 +50,7 @@ fn largest(runs: &[DefaultRun]) -> Need {
 fn shared_memory(place: &Place, space: Option<&Space>, need: &Need) -> Check {
     const NAME: &str = "shared memory";
     let Some(Space { path, size_bytes, free_bytes }) = space else {
-        let found = format!("{} does not tell its size", place.base().display());
+        let found = format!("cannot get the size of {}", place.base().display());
         return Check::problem(NAME, found, "mount a tmpfs on /dev/shm");
     };
     let needed = format!(
@@ -70,19 +70,19 @@ fn shared_memory(place: &Place, space: Option<&Space>, need: &Need) -> Check {
     }
     if let (taken, Some(owner)) = place.standard() {
         let advice = format!(
-            "{} belongs to user {owner}; runs use a directory of another name",
+            "{} belongs to user {owner}; runs use a directory with another name",
             taken.display()
         );
         return Check::warning(NAME, found, advice);
     }
     if path.as_os_str() != "/dev/shm" {
-        let advice = "there is no /dev/shm: segments go through files, perhaps on a disk";
+        let advice = "there is no /dev/shm: segments go through files, which may be on a disk";
         return Check::warning(NAME, found, advice);
     }
     if *size_bytes <= DOCKER_DEFAULT_BYTES {
         let advice = format!(
-            "no more than Docker's default of {}: enough for that, too little for many workers \
-             or long queues (docker run --shm-size)",
+            "not more than Docker's default of {}: enough for a default run, too little for many \
+             workers or long queues (docker run --shm-size)",
             binary_bytes(DOCKER_DEFAULT_BYTES)
         );
         return Check::warning(NAME, found, advice);
@@ -91,14 +91,14 @@ fn shared_memory(place: &Place, space: Option<&Space>, need: &Need) -> Check {
 }
 
 fn limit(name: &'static str, limit: Option<u64>, needed: u64, need: &Need, raise: &str) -> Check {
-    let beside = format!("a default run with {} here needs {needed}", need.counted());
+    let needs = format!("a default run with {} here needs {needed}", need.counted());
     match limit {
-        None => Check::ok(name, format!("no limit; {beside}")),
-        Some(limit) if limit >= needed => Check::ok(name, format!("at most {limit}; {beside}")),
+        None => Check::ok(name, format!("no limit; {needs}")),
+        Some(limit) if limit >= needed => Check::ok(name, format!("at most {limit}; {needs}")),
         Some(limit) => {
             let space = if raise.ends_with('=') { "" } else { " " };
             let advice = format!("raise it: {raise}{space}{needed}; or use fewer workers");
-            Check::problem(name, format!("at most {limit}; {beside}"), advice)
+            Check::problem(name, format!("at most {limit}; {needs}"), advice)
         }
     }
 }
@@ -108,7 +108,7 @@ fn leftovers(place: &Place) -> Check {
     let found = match place.leftovers() {
         Ok(found) => found,
         Err(error) => {
-            let advice = "no run can start like this: remove that directory, or give it mode 0700";
+            let advice = "no run can start: remove this directory, or set its mode to 0700";
             return Check::problem(NAME, format!("{error:#}"), advice);
         }
     };
@@ -117,7 +117,7 @@ fn leftovers(place: &Place) -> Check {
     }
     let bytes = found.iter().map(|leftover| leftover.bytes).sum();
     let found = format!("{} of {} dead runs", binary_bytes(bytes), found.len());
-    Check::warning(NAME, found, "dmprl clean removes them, and so does the next train")
+    Check::warning(NAME, found, "remove them with: dmprl clean; the next train does the same")
 }
 
 #[cfg(test)]
@@ -142,7 +142,7 @@ mod tests {
     }
 
     #[test]
-    fn dockers_shared_memory_is_a_warning_with_the_need_beside_it() {
+    fn dockers_default_shared_memory_is_a_warning_that_states_the_need() {
         let check = room(64 << 20, 64 << 20);
         assert_eq!(check.status, Status::Warning);
         assert!(check.found.contains("with 3 workers here needs 5 MiB"), "{check:?}");

@@ -10,7 +10,7 @@ use dmprl_actors::environments::interpreter;
 use dmprl_actors::python_env::Interpreter;
 use dmprl_actors::rollout::Identity;
 use dmprl_actors::worker::{self, JoinedWorker, Worker};
-use dmprl_chaos::journal::{Author, Entry, Journal, Piece};
+use dmprl_chaos::journal::{Author, Entry, Journal, SegmentDigest};
 use dmprl_control::{ControlPipe, start_heartbeat};
 use dmprl_run::Setup;
 use dmprl_shared::config::ExperimentConfig;
@@ -76,7 +76,9 @@ pub fn work(
 fn note_in(journal: Journal) -> DeliveryObserver {
     Box::new(move |event| {
         journal.note(match event {
-            DeliveryEvent::Produced { header, block } => Entry::Produced(Piece::of(header, block)),
+            DeliveryEvent::Produced { header, block } => {
+                Entry::Produced(SegmentDigest::of(header, block))
+            }
             DeliveryEvent::Acknowledged(mark) => Entry::Acknowledged(mark),
             DeliveryEvent::PolicyTaken { epoch, version } => Entry::Policy { epoch, version },
         });

@@ -1,4 +1,4 @@
-//! Command lines of the roles. The supervisor writes them; a user may, to inspect one process.
+//! Command lines of the roles. The supervisor starts the roles; a user can start one to inspect it.
 
 use std::path::PathBuf;
 
@@ -154,7 +154,7 @@ pub struct RelayArgs {
     /// Session of the run from which the incarnations of its workers are derived.
     #[arg(long, value_name = "N", default_value_t = 0)]
     pub session: u32,
-    /// How long to wait while the learner's host is unreachable [s].
+    /// How long to wait while the learner's host is unreachable, in seconds.
     #[arg(long, value_name = "S")]
     pub patience: u64,
     /// Zenoh configuration file (JSON5), for certificates.

@@ -5,8 +5,8 @@ use dmprl_actors::evaluator::{self, Evaluations};
 use dmprl_control::{EvaluationRow, Report};
 use dmprl_learner::checkpoint;
 use dmprl_run::Setup;
-use dmprl_run::say;
 use dmprl_shared::supervision::Supervisor;
+use tracing::warn;
 
 use super::environments::on_hang;
 use super::{ControlPipe, EvaluatorArgs};
@@ -44,7 +44,7 @@ pub fn keep(setup: &Setup, row: &EvaluationRow, control: &ControlPipe) -> anyhow
         if let Err(error) = result {
             let version = row.policy_version;
             let message = format!("evaluation of policy {version}: cannot {step}: {error:#}");
-            say(&format!("warning: {message}"));
+            warn!("{message}");
             // If the supervisor is gone, the loop notices it as a stop.
             let _ = control.send(&Report::Warning { message });
         }

@@ -12,6 +12,7 @@ use dmprl_run::Setup;
 use dmprl_run::{RunDirectory, TOKEN_FILE, replace_file};
 use dmprl_shared::policy::Policy;
 use dmprl_shared::transport::shared_memory::Plan;
+use tracing::warn;
 
 use super::{ControlPipe, GatewayArgs};
 
@@ -24,10 +25,10 @@ const REPORT_INTERVAL: Duration = Duration::from_millis(500);
 /// Time limit to attach to the learner. A learner that is being replaced first loads a checkpoint.
 const ATTACH_LIMIT: Duration = Duration::from_secs(60);
 const ATTACH_PAUSE: Duration = Duration::from_millis(20);
-/// Maximum time to tell the hosts that the run has ended, after which they leave. It is less than
-/// the supervisor waits for this process.
+/// Maximum time to announce the end of the run to the hosts, which then leave. Shorter than the
+/// supervisor's time limit for the exit of this process.
 const GOODBYE: Duration = Duration::from_secs(8);
-/// Silence after which a host is no longer waited for.
+/// Silence after which the gateway no longer waits for a host.
 const GONE: Duration = Duration::from_secs(60);
 const GOODBYE_INTERVAL: Duration = Duration::from_millis(100);
 /// Number of rejected messages at the first warning; the next ones follow at each doubling.
@@ -58,7 +59,7 @@ pub fn run(args: &GatewayArgs, control: &ControlPipe) -> anyhow::Result<()> {
             // If the supervisor is gone, the loop notices it as a stop.
             let _ = control.send(&match event {
                 GatewayEvent::Notice(message) => {
-                    eprintln!("{message}");
+                    warn!("{message}");
                     Report::Warning { message }
                 }
                 GatewayEvent::Sent(sent) => Report::Sent(sent),
@@ -69,7 +70,7 @@ pub fn run(args: &GatewayArgs, control: &ControlPipe) -> anyhow::Result<()> {
         }
         if gateway.rejected() >= rejected_next {
             let message = format!("rejected {} damaged or unexpected messages", gateway.rejected());
-            eprintln!("{message}");
+            warn!("{message}");
             let _ = control.send(&Report::Warning { message });
             rejected_next = gateway.rejected().saturating_mul(2);
         }
@@ -111,7 +112,7 @@ fn open(args: &GatewayArgs, control: &ControlPipe) -> anyhow::Result<Option<Gate
         };
         match Gateway::open(settings, facts.clone()) {
             Ok(gateway) => return Ok(Some(gateway)),
-            // Only errors of the transport pass: the learner may be restarting.
+            // Errors of the transport can be temporary: the learner may be restarting.
             Err(error) if !is_transport(&error) || Instant::now() >= deadline => return Err(error),
             Err(_) if control.stop_requested() => return Ok(None),
             Err(_) => std::thread::sleep(ATTACH_PAUSE),

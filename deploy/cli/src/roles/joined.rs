@@ -1,8 +1,8 @@
 //! A worker that joins a running training: `dmprl actor --join RUN`.
 //!
-//! It requests a place from the run's supervisor (`launch/joining.rs`) and then works like the
-//! others. On the first Ctrl-C it delivers its segments before it leaves; a second Ctrl-C ends it
-//! at once.
+//! It requests a place from the supervisor (`deploy/supervisor/src/joining.rs`) and then works
+//! like the others. On the first Ctrl-C it delivers its segments before it leaves; a second Ctrl-C
+//! ends it at once.
 
 use std::cell::Cell;
 use std::fs;
@@ -25,12 +25,12 @@ use dmprl_run::Setup;
 use dmprl_run::failure::{Outcome, wrong_use};
 use dmprl_run::format::{grouped, shown};
 use dmprl_run::is_ignored;
-use dmprl_run::say;
 use dmprl_shared::transport::delivery::Sent;
 use dmprl_supervisor::Place;
 use signal_hook::flag;
 
 use super::actor::{self, WorkerStart};
+use crate::terminal::say;
 
 /// Time limit for an answer. A supervisor answers at once unless it is suspended.
 const ANSWER_LIMIT: Duration = Duration::from_secs(10);
@@ -99,7 +99,7 @@ fn check_accepts_workers(setup: &Setup) -> anyhow::Result<()> {
     let (config, run) = (&setup.config, shown(setup.run.path()));
     if config.run.deterministic {
         return Err(wrong_use(format!(
-            "run {run} is deterministic: it has one process, and no worker can join it"
+            "run {run} is deterministic: it has one process and accepts no other workers"
         )));
     }
     if config.actors.joined_max == 0 {
@@ -133,14 +133,14 @@ fn ask(mut stream: &UnixStream, run: &RunDirectory) -> anyhow::Result<Welcome> {
         while !line.ends_with(b"\n") {
             let read = input.read(&mut byte);
             if read.with_context(|| format!("no answer within {ANSWER_LIMIT:?}"))? == 0 {
-                bail!("it has closed the connection");
+                bail!("it closed the connection");
             }
             line.extend(byte);
         }
         Ok(line)
     };
     let asked = || format!("the supervisor of {} did not answer", shown(run.path()));
-    // A supervisor of another version may send nothing else that can be parsed.
+    // Parse only the greeting first: other messages may differ between versions.
     let greeting: Greeting =
         serde_json::from_slice(&answer().with_context(asked)?).with_context(asked)?;
     let this = Greeting::this();

@@ -2,7 +2,7 @@
 //! `dmprl_learner::serve`.
 
 use anyhow::Context;
-use dmprl_chaos::journal::{Author, Entry, Journal, Piece};
+use dmprl_chaos::journal::{Author, Entry, Journal, SegmentDigest};
 use dmprl_learner::learner::{InsertObserver, Learner};
 use dmprl_learner::recorder::Recorder;
 use dmprl_learner::serve::Server;
@@ -51,10 +51,12 @@ fn note_all(learner: &mut Learner, journal: &Journal) {
     journal.note(Entry::Started((&learner.counters).into()));
     let journal = journal.clone();
     learner.insert_observer = InsertObserver::new(move |segment, inserted| {
-        let piece = Piece::of(&segment.header, &segment.block);
+        let digest = SegmentDigest::of(&segment.header, &segment.block);
         journal.note(match inserted {
-            Ok(()) => Entry::Inserted(piece),
-            Err(why) => Entry::Refused(piece, why == Rejection::Duplicate),
+            Ok(()) => Entry::Inserted(digest),
+            Err(why) => {
+                Entry::Rejected { segment: digest, is_duplicate: why == Rejection::Duplicate }
+            }
         });
     });
 }

@@ -11,7 +11,7 @@ use dmprl_learner::recorder::{PreviousSessions, RunFiles};
 use dmprl_learner::session::DueError;
 use dmprl_run::{RunDirectory, replace_file};
 
-/// Reads from the run\'s rows where its earlier sessions ended.
+/// Reads from the run's rows where its earlier sessions ended.
 pub fn past(run: &RunDirectory) -> anyhow::Result<PreviousSessions> {
     Ok(PreviousSessions {
         wall_s: run.wall_s_before()?,
@@ -56,7 +56,7 @@ impl RunFiles for LearnerFiles<'_> {
 
     fn checkpoint_begins(&mut self, counters: &Counters) {
         if let Some(journal) = &self.journal {
-            journal.note(Entry::Cut(counters.into()));
+            journal.note(Entry::CheckpointBegun(counters.into()));
         }
     }
 }

@@ -61,7 +61,7 @@ pub fn run(args: &ObserverArgs, control: &ControlPipe) -> anyhow::Result<()> {
     Ok(())
 }
 
-/// Appends a line and flushes it, because the reader of the report may end this process.
+/// Appends a line and flushes it, because the parent may kill this process after the report.
 fn append(lines: &mut BufWriter<File>, object: &impl Serialize) -> anyhow::Result<()> {
     serde_json::to_writer(&mut *lines, object).context("cannot write an episode")?;
     lines.write_all(b"\n").and_then(|()| lines.flush()).context("cannot write an episode")

@@ -2,8 +2,8 @@
 //!
 //! The worker runs one segment in each environment with the newest policy. Then the learner takes
 //! the segments in order and does all updates that are due. An evaluation runs when it is due.
-//! Nothing depends on a clock, so the same seed gives the same bytes in `metrics.jsonl` (except its
-//! time keys), `evaluations.jsonl` and every checkpoint.
+//! Nothing depends on a clock, so runs with the same seed write identical bytes to `metrics.jsonl`
+//! (except its time keys), `evaluations.jsonl` and every checkpoint.
 
 use std::cell::Cell;
 
@@ -86,7 +86,7 @@ pub fn run(args: &LearnerArgs, control: &ControlPipe) -> anyhow::Result<()> {
         if control.stop_requested() {
             break false;
         }
-        // The goal ends the run here, so that it ends at the same step every time.
+        // Check for the goal here, so that the run always ends at the same step.
         if turn == Turn::Finished || reached.get() || control.finish_requested() {
             break true;
         }
@@ -148,7 +148,7 @@ fn act(rollout: &mut Rollout, sender: &mut in_process::Sender) -> anyhow::Result
         .segment(&mut |header, block| match sender.try_send(header, block) {
             Ok(SendOutcome::Delivered) => Ok(()),
             Ok(outcome) => Err(Delivery(anyhow::anyhow!(
-                "the lock-step schedule emptied the queue, yet it is {outcome:?}"
+                "the learner should have emptied the queue, but sending returned {outcome:?}"
             ))),
             Err(error) => Err(Delivery(error.into())),
         })

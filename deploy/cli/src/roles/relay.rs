@@ -89,8 +89,8 @@ fn leave(relay: &mut Relay, control: &ControlPipe) -> anyhow::Result<()> {
     }
     if relay.in_flight() > 0 {
         let message = format!(
-            "{} segments are not acknowledged yet: those that have reached the learner's host will \
-             be used, the others are lost",
+            "{} segments are not acknowledged: those that reached the learner's host are used, the \
+             others are lost",
             relay.in_flight()
         );
         warn(control, message);
@@ -166,7 +166,7 @@ impl RelayReporter {
     /// `patience`.
     fn report_absence(&mut self, relay: &Relay, control: &ControlPipe) -> anyhow::Result<()> {
         match (relay.away(), &self.away) {
-            (Some((since, reason)), told) => {
+            (Some((since, reason)), reported) => {
                 let elapsed = since.elapsed();
                 if elapsed >= self.patience {
                     bail!(
@@ -175,7 +175,7 @@ impl RelayReporter {
                         self.endpoint
                     );
                 }
-                let new = told.as_ref().is_none_or(|(_, before)| before != reason);
+                let new = reported.as_ref().is_none_or(|(_, before)| before != reason);
                 if new && elapsed >= AWAY_REPORTED {
                     let patience = self.patience.as_secs();
                     warn(control, format!("{reason}; workers wait for at most {patience} s"));
@@ -194,6 +194,6 @@ impl RelayReporter {
 }
 
 fn warn(control: &ControlPipe, message: String) {
-    eprintln!("{message}");
+    tracing::warn!("{message}");
     let _ = control.send(&Report::Warning { message });
 }

@@ -8,12 +8,12 @@ use dmprl_run::format::{duration, grouped, plus_minus};
 use dmprl_supervisor::{ProcessLine, RunEvent, RunObserver};
 use indicatif::{ProgressBar, ProgressStyle as BarStyle};
 
-use super::panel::{Panel, SEPARATOR, Scope, speed, terminal_size, trouble, whole_items};
+use super::panel::{Panel, SEPARATOR, Scope, TerminalSize, speed, trouble, whole_items};
 
 /// Interval between two plain lines.
-const LINE_EVERY: Duration = Duration::from_secs(5);
+const LINE_INTERVAL: Duration = Duration::from_secs(5);
 /// Interval between two redraws of the bar without new reports.
-const REDRAW_EVERY: Duration = Duration::from_millis(200);
+const REDRAW_INTERVAL: Duration = Duration::from_millis(200);
 /// Columns of the bar, the percentage and the spaces around them.
 const BAR_COLUMNS: usize = 27;
 
@@ -24,7 +24,7 @@ pub enum ProgressStyle {
     Automatic,
     /// Always lines.
     Lines,
-    /// Events as JSON, one object a line, instead of a display.
+    /// Events as JSON, one object per line, instead of a display.
     Events,
 }
 
@@ -56,7 +56,7 @@ impl Display {
                 bar.set_style(style.progress_chars("━━╌"));
             }
             bar.set_message("starting");
-            bar.enable_steady_tick(REDRAW_EVERY);
+            bar.enable_steady_tick(REDRAW_INTERVAL);
             return Self::on(Target::Bar(bar), steps_total);
         }
         Self::lines(Box::new(std::io::stderr()), steps_total)
@@ -90,7 +90,7 @@ impl Display {
         matches!(self.target, Target::Bar(_))
     }
 
-    /// Updates the processes between two reports of progress.
+    /// Updates the list of processes between two reports of progress.
     fn refresh(&mut self, processes: &[ProcessLine]) {
         if self.is_live() {
             let last = std::mem::take(&mut self.last);
@@ -101,7 +101,7 @@ impl Display {
     /// Prints a message above the bar.
     fn message(&mut self, text: &str) {
         match &mut self.target {
-            Target::Bar(bar) => bar.suspend(|| dmprl_run::say(text)),
+            Target::Bar(bar) => bar.suspend(|| super::say(text)),
             Target::Lines(writer) => write_line(writer, text),
         }
     }
@@ -113,20 +113,20 @@ impl Display {
         match &mut self.target {
             Target::Bar(bar) => {
                 bar.set_position(progress.env_steps.min(self.steps_total));
-                let size = terminal_size();
+                let size = TerminalSize::of_stderr();
                 let (scope, evaluations) = (self.scope, self.evaluations.as_slice());
                 let panel = Panel { scope, progress, evaluations, processes };
-                let head = whole_items(&steps, size.0.saturating_sub(BAR_COLUMNS));
+                let head = whole_items(&steps, size.columns.saturating_sub(BAR_COLUMNS));
                 let lines = std::iter::once(head).chain(panel.lines(size));
                 bar.set_message(lines.collect::<Vec<_>>().join("\n"));
             }
             Target::Lines(writer) => {
                 let now = Instant::now();
-                if self.line_at.is_some_and(|at| now.duration_since(at) < LINE_EVERY) {
+                if self.line_at.is_some_and(|at| now.duration_since(at) < LINE_INTERVAL) {
                     return;
                 }
                 self.line_at = Some(now);
-                // The last segment may end after the last step.
+                // The last segment can exceed the run's length.
                 let done = progress.env_steps.min(self.steps_total);
                 let percent = done * 100 / self.steps_total.max(1);
                 write_line(writer, &format!("{percent:>3}% {steps}{SEPARATOR}{figures}"));
@@ -146,8 +146,8 @@ impl Display {
         let steps = format!("{}/{} steps", grouped(progress.env_steps), grouped(self.steps_total));
         let left = self.steps_total.saturating_sub(progress.env_steps) as f64;
         let eta = left / progress.env_steps_per_s;
-        // No remaining time for a rate of zero, for more than some years, or for a host with only
-        // part of the run's workers.
+        // No remaining time for a rate of zero, for more than three years, or for a host, which has
+        // only part of the run's workers.
         if self.scope == Scope::Run && (1e-9..1e8).contains(&eta) {
             return format!("{steps}{SEPARATOR}eta {}", duration(Duration::from_secs_f64(eta)));
         }
@@ -191,7 +191,7 @@ impl RunObserver for Display {
     }
 }
 
-/// Writes a line. A closed standard error is no reason to end the run.
+/// Writes a line. Ignores errors: a closed standard error must not end the run.
 fn write_line(writer: &mut Box<dyn Write + Send>, text: &str) {
     let _ = writeln!(writer, "{text}").and_then(|()| writer.flush());
 }
@@ -216,7 +216,7 @@ mod tests {
     }
 
     #[test]
-    fn lines_hold_every_figure_and_come_seldom() {
+    fn a_line_has_all_figures_and_lines_are_rate_limited() {
         let shared = Shared::default();
         let mut display = Display::lines(Box::new(shared.clone()), 1_000);
         let progress = Progress {
@@ -239,7 +239,7 @@ mod tests {
     }
 
     #[test]
-    fn a_host_promises_no_end_of_a_run_that_others_step_too() {
+    fn a_host_shows_no_remaining_time() {
         let display = Display::lines(Box::new(Shared::default()), 1_000).of_host();
         let progress =
             Progress { env_steps: 250, env_steps_per_s: 50.0, segments: 10, ..Progress::default() };
@@ -249,7 +249,7 @@ mod tests {
     }
 
     #[test]
-    fn a_rate_of_nothing_promises_no_end() {
+    fn a_rate_of_zero_shows_no_remaining_time() {
         let display = Display::lines(Box::new(Shared::default()), 1_000);
         for rate in [0.0, -1.0, f64::NAN, 1e-9] {
             let progress = Progress { env_steps_per_s: rate, ..Progress::default() };

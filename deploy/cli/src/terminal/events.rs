@@ -1,14 +1,16 @@
-//! Events of a run as JSON, one object a line: `--events json`.
+//! Events of a run as JSON, one object per line: `--events json`.
 //!
-//! `docs/runs.md` lists the kinds and their keys. Their `format` is raised if a key changes its
+//! `docs/runs.md` lists the kinds and their keys. `FORMAT` is raised if a key changes its
 //! meaning or disappears; new kinds and keys do not raise it.
 
 use std::io::Write;
 use std::time::{Duration, Instant};
 
-use dmprl_run::event_line;
 use dmprl_supervisor::{AfterDeath, Ending, NotEvaluated, RunEvent, RunObserver, SessionReport};
-use serde_json::{Value, json};
+use serde_json::{Map, Value, json};
+
+/// Version of the format; written in every line.
+const FORMAT: u32 = 1;
 
 /// Writes events to any writer.
 pub struct EventLines {
@@ -41,8 +43,7 @@ impl RunObserver for EventLines {
         if let Some((kind, mut keys)) = object(&event) {
             keys["session_s"] = json!(seconds(self.began.elapsed()));
             // A closed standard error does not end the run.
-            let _ =
-                writeln!(self.out, "{}", event_line(kind, &keys)).and_then(|()| self.out.flush());
+            let _ = writeln!(self.out, "{}", line(kind, &keys)).and_then(|()| self.out.flush());
         }
     }
 }
@@ -67,20 +68,36 @@ pub fn finished(report: &SessionReport) -> String {
         "learner_restarts": report.learner_restarts,
         "session_s": seconds(report.wall),
     });
-    event_line("finished", &keys)
+    line("finished", &keys)
 }
 
 /// Formats the event `error`, with which a command fails.
 #[must_use]
 pub fn error(message: &str) -> String {
-    event_line("error", &json!({ "message": message }))
+    line("error", &json!({ "message": message }))
+}
+
+/// Formats the event `message`: text from outside a session, such as the Python set-up.
+#[must_use]
+pub fn message(text: &str) -> String {
+    line("message", &json!({ "message": text }))
+}
+
+fn line(kind: &str, keys: &Value) -> String {
+    let mut object = Map::new();
+    object.insert("format".to_owned(), json!(FORMAT));
+    object.insert("event".to_owned(), json!(kind));
+    if let Value::Object(keys) = keys {
+        object.extend(keys.clone());
+    }
+    Value::Object(object).to_string()
 }
 
 fn seconds(duration: Duration) -> f64 {
     (duration.as_secs_f64() * 1e3).round() / 1e3
 }
 
-/// The kind of an event and its keys; `None` for those that only draw.
+/// Returns the kind of an event and its keys; `None` for events that only update the display.
 fn object(event: &RunEvent) -> Option<(&'static str, Value)> {
     let named = |process: &dmprl_supervisor::Process| process.to_string();
     Some(match event {
@@ -150,7 +167,7 @@ fn object(event: &RunEvent) -> Option<(&'static str, Value)> {
     })
 }
 
-/// The reason for which a policy is not evaluated, and the evaluator's message.
+/// Returns the reason why a policy is not evaluated, and the evaluator's message.
 fn skipped(reason: &NotEvaluated) -> (&'static str, Option<&String>) {
     match reason {
         NotEvaluated::Failed { reason, .. } => ("failed", Some(reason)),
@@ -186,7 +203,7 @@ mod tests {
     use dmprl_supervisor::{Death, Process};
 
     #[test]
-    fn a_death_says_how_why_and_what_follows() {
+    fn a_death_has_its_cause_and_its_consequence() {
         let event = RunEvent::ChildDied {
             process: Process::Actor(1),
             death: Death { verb: "died", cause: "exit status 3".to_owned() },
@@ -198,7 +215,7 @@ mod tests {
             },
         };
         let (kind, keys) = object(&event).unwrap();
-        let read: Value = serde_json::from_str(&event_line(kind, &keys)).unwrap();
+        let read: Value = serde_json::from_str(&line(kind, &keys)).unwrap();
         let expected = json!({
             "format": 1, "event": "child_died", "process": "actor-1", "how": "died",
             "cause": "exit status 3", "log": "/r/logs/actor-1.log", "next": "restart",

@@ -12,8 +12,8 @@ const SPARKS_MAX: usize = 24;
 const NAME_COLUMNS: usize = 10;
 /// Lines of the display that are not processes, including the cursor's line below it.
 const OTHER_LINES: usize = 4;
-/// Columns and rows if the terminal does not report them.
-const SIZE: (usize, usize) = (80, 24);
+/// Size if the terminal does not report it.
+const DEFAULT_SIZE: TerminalSize = TerminalSize { columns: 80, rows: 24 };
 
 /// Scope of the figures.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -33,25 +33,39 @@ pub(super) struct Panel<'a> {
     pub(super) processes: &'a [ProcessLine],
 }
 
-/// Columns and rows of the terminal of standard error.
-pub(super) fn terminal_size() -> (usize, usize) {
-    let size = rustix::termios::tcgetwinsize(std::io::stderr()).ok();
-    // Many pseudo-terminals report 0 by 0.
-    let said = |count: u16, otherwise| if count == 0 { otherwise } else { usize::from(count) };
-    size.map_or(SIZE, |size| (said(size.ws_col, SIZE.0), said(size.ws_row, SIZE.1)))
+/// Size of a terminal in characters.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct TerminalSize {
+    pub(super) columns: usize,
+    pub(super) rows: usize,
+}
+
+impl TerminalSize {
+    /// Returns the size of the terminal on standard error.
+    pub(super) fn of_stderr() -> Self {
+        let Ok(size) = rustix::termios::tcgetwinsize(std::io::stderr()) else {
+            return DEFAULT_SIZE;
+        };
+        // Many pseudo-terminals report 0 by 0.
+        let known = |count: u16, default| if count == 0 { default } else { usize::from(count) };
+        Self {
+            columns: known(size.ws_col, DEFAULT_SIZE.columns),
+            rows: known(size.ws_row, DEFAULT_SIZE.rows),
+        }
+    }
 }
 
 impl Panel<'_> {
     /// Formats the lines, none of them wider than the terminal.
-    pub(super) fn lines(&self, (columns, rows): (usize, usize)) -> Vec<String> {
+    pub(super) fn lines(&self, size: TerminalSize) -> Vec<String> {
         let mut lines = Vec::new();
         if self.scope == Scope::Run {
             lines.push(self.quality());
         }
         lines.extend(rates(self.progress, self.scope));
-        let room = rows.saturating_sub(OTHER_LINES + lines.len()).max(1);
+        let room = size.rows.saturating_sub(OTHER_LINES + lines.len()).max(1);
         lines.extend(self.process_lines(room));
-        lines.into_iter().map(|line| whole_items(&line, columns)).collect()
+        lines.into_iter().map(|line| whole_items(&line, size.columns)).collect()
     }
 
     fn quality(&self) -> String {
@@ -209,7 +223,7 @@ mod tests {
     }
 
     #[test]
-    fn it_says_how_well_how_fast_and_who_does_what() {
+    fn it_shows_returns_rates_and_processes() {
         let progress = Progress {
             env_steps_per_s: 520.4,
             updates_per_s: 205.0,
@@ -232,16 +246,15 @@ mod tests {
             "  learner    learning",
             "  actor-0    stepping · 2 restarts",
         ];
-        assert_eq!(panel.lines((100, 24)), expected);
-        let narrow = panel.lines((40, 24));
+        assert_eq!(panel.lines(TerminalSize { columns: 100, rows: 24 }), expected);
+        let narrow = panel.lines(TerminalSize { columns: 40, rows: 24 });
         assert_eq!(narrow[1], "  rates      520 steps/s · 205 updates/s");
         assert!(narrow.iter().all(|line| line.chars().count() <= 40), "{narrow:?}");
     }
 
-    /// Regression test: a host once showed 0 updates per second for a learner it knows nothing
-    /// about.
+    /// Regression test: a host without a learner once showed 0 updates per second.
     #[test]
-    fn of_a_host_it_says_nothing_that_only_the_learner_knows() {
+    fn on_a_host_it_shows_no_figures_of_the_learner() {
         let progress = Progress {
             env_steps_per_s: 240.2,
             queued_segments: 181,
@@ -255,26 +268,27 @@ mod tests {
             "  rates      240 steps/s here · 181 queued · 1,008 segments acknowledged",
             "  relay      relaying",
         ];
-        assert_eq!(panel.lines((100, 24)), expected);
+        assert_eq!(panel.lines(TerminalSize { columns: 100, rows: 24 }), expected);
     }
 
     #[test]
-    fn more_processes_than_lines_are_counted_by_what_they_do() {
+    fn processes_that_do_not_fit_are_counted_by_state() {
         let progress = Progress::default();
         let mut processes: Vec<_> =
             (0..32).map(|index| process(&format!("actor-{index}"), "stepping", 0)).collect();
         processes[30] = process("actor-30", "starting", 0);
         let scope = Scope::Run;
         let panel = Panel { scope, progress: &progress, evaluations: &[], processes: &processes };
-        let lines = panel.lines((80, 16));
+        let lines = panel.lines(TerminalSize { columns: 80, rows: 16 });
         assert!(lines.len() + OTHER_LINES <= 16, "{lines:?}");
         assert_eq!(lines.last().unwrap(), "  23 more    22 stepping · 1 starting");
         assert_eq!(lines[0], "  return     no evaluation yet");
-        assert_eq!(panel.lines((80, 3)).last().unwrap(), "  32 more    31 stepping · 1 starting");
+        let low = panel.lines(TerminalSize { columns: 80, rows: 3 });
+        assert_eq!(low.last().unwrap(), "  32 more    31 stepping · 1 starting");
     }
 
     #[test]
-    fn sparks_span_what_there_is_and_long_histories_are_means() {
+    fn sparklines_span_their_values_and_average_long_histories() {
         assert_eq!(sparkline(&[0.0, 7.0], None), "▁█");
         assert_eq!(sparkline(&[3.0, 3.0], None), "▁▁");
         assert_eq!(sparkline(&[0.5], Some((0.0, 1.0))), "▅");

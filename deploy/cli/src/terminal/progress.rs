@@ -1,16 +1,18 @@
-//! Draws the progress of long work: a bar in a terminal, occasional lines elsewhere.
+//! Shows the progress of a long operation: a bar in a terminal, occasional lines elsewhere.
 
 use std::cell::{Cell, OnceCell};
 use std::io::IsTerminal;
 use std::time::{Duration, Instant};
 
-use dmprl_run::{Progress, say, says_json};
+use dmprl_run::Progress;
 use indicatif::{ProgressBar, ProgressStyle};
 
+use super::messages::{say, says_json};
+
 /// Interval between two lines of [`Progress::state`] without a terminal.
-const LINE_EVERY: Duration = Duration::from_secs(10);
+const LINE_INTERVAL: Duration = Duration::from_secs(10);
 /// Interval between two redraws.
-const REDRAW_EVERY: Duration = Duration::from_millis(200);
+const REDRAW_INTERVAL: Duration = Duration::from_millis(200);
 /// Template before the amount of work is known.
 const SPINNER: &str = "{spinner:.cyan} {wide_msg}";
 /// Template once it is known.
@@ -30,7 +32,7 @@ impl TerminalProgress {
             let draws = std::io::stderr().is_terminal() && !says_json();
             draws.then(|| {
                 let bar = styled(ProgressBar::new_spinner(), SPINNER);
-                bar.enable_steady_tick(REDRAW_EVERY);
+                bar.enable_steady_tick(REDRAW_INTERVAL);
                 bar
             })
         });
@@ -68,7 +70,7 @@ impl Progress for TerminalProgress {
     fn state(&self, what: &str) {
         if let Some(bar) = self.bar() {
             bar.set_message(what.to_owned());
-        } else if self.printed.get().is_none_or(|at| at.elapsed() >= LINE_EVERY) {
+        } else if self.printed.get().is_none_or(|at| at.elapsed() >= LINE_INTERVAL) {
             self.printed.set(Some(Instant::now()));
             say(what);
         }

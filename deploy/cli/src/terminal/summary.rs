@@ -31,7 +31,7 @@ pub fn summary(report: &SessionReport, title: &str, run: &Path, steps_total: u64
     if report.env_failures > 0 {
         let logs = shown(&run.join("logs"));
         let count = grouped(report.env_failures);
-        lines.push(("failures", format!("{count} of environments; see {logs}")));
+        lines.push(("failures", format!("{count} in environments; see {logs}")));
     }
     if report.learner_restarts > 0 {
         lines.push(("restarts", format!("{} of the learner", report.learner_restarts)));

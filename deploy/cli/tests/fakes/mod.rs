@@ -1,5 +1,5 @@
 //! A run directory whose children are played by `fake_role.sh`.
-#![allow(dead_code, missing_docs)] // each test program uses its part
+#![allow(dead_code, missing_docs)] // each test program uses a part of it
 
 use std::fs;
 use std::io::{self, Write};
@@ -14,7 +14,7 @@ use dmprl_shared::spec::EnvSpec;
 use dmprl_supervisor::{Launcher, SessionReport, SupervisorPlan, TimeLimits, Totals, supervise};
 use tokio::sync::mpsc;
 
-/// A condition that has not come true by then never will.
+/// Time limit of all waits in tests.
 pub const PATIENCE: Duration = Duration::from_secs(60);
 
 pub struct Fixture {
@@ -26,7 +26,7 @@ pub struct Fixture {
     _parent: tempfile::TempDir,
 }
 
-/// Where the display writes and tests read.
+/// Output of the display, which tests read.
 #[derive(Clone, Default)]
 pub struct Screen(Arc<Mutex<Vec<u8>>>);
 
@@ -47,12 +47,13 @@ impl Write for Screen {
 }
 
 impl Fixture {
-    /// Two workers; `fakes` are pairs of process and behaviour, the rest behaves.
+    /// Creates a run with two workers. `fakes` are pairs of a process and its mode; other processes
+    /// have the mode `normal`.
     pub fn new(fakes: &[(&str, &str)]) -> Self {
         let parent = tempfile::tempdir().unwrap();
         let mut config = ExperimentConfig::default();
         config.actors.workers = 2;
-        // Most fakes give no sign of life.
+        // Most fakes send no heartbeats.
         config.supervision.heartbeat_timeout_s = PATIENCE.as_secs_f64() * 10.0;
         let manifest = Manifest::new(None).unwrap();
         let run = RunDirectory::create(&parent.path().join("run"), &config, &manifest).unwrap();
@@ -82,12 +83,12 @@ impl Fixture {
         }
     }
 
-    /// Supervises to the end, which must come by itself.
+    /// Supervises the run, which must end by itself.
     pub fn supervise(&self) -> (SessionReport, String) {
         self.supervise_with(None)
     }
 
-    /// Supervises, and interrupts when the screen shows `text`.
+    /// Supervises the run, and interrupts it when the screen shows `text`.
     pub fn supervise_until(&self, text: &str) -> (SessionReport, String) {
         self.supervise_with(Some(text))
     }
@@ -97,7 +98,7 @@ impl Fixture {
         let screen = Screen::default();
         let mut watched = screen.clone();
         writeln!(watched, "training").unwrap();
-        let plan = plan(&self.run, &self.config, self.limits, self.one_process);
+        let plan = plan(&self.run, &self.config, self.limits, self.one_process, interrupts);
         let mut display = Display::lines(Box::new(screen.clone()), self.config.run.steps);
         let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().unwrap();
         runtime.block_on(async {
@@ -107,19 +108,12 @@ impl Fixture {
                     tokio::task::yield_now().await;
                 }
                 sender.send(()).await.unwrap();
-                // Two at almost the same moment are one, so the second is repeated.
+                // Two interrupts within a short time count as one, so the second is repeated.
                 while self.interrupted_twice && !watched.text().contains("interrupted twice") {
                     let _ = sender.try_send(());
                     tokio::task::yield_now().await;
                 }
                 std::future::pending::<()>().await;
-            };
-            let plan = SupervisorPlan {
-                launcher: plan.0,
-                config: plan.1,
-                limits: plan.2,
-                earlier: Totals::default(),
-                interrupts,
             };
             let ended = tokio::select! {
                 report = tokio::time::timeout(PATIENCE, supervise(plan, &mut display)) => report,
@@ -130,7 +124,7 @@ impl Fixture {
         })
     }
 
-    /// What a fake has noted.
+    /// Returns the log of a fake.
     pub fn seen(&self, name: &str) -> String {
         let path = self.run.path().join("fake").join(format!("{name}.seen"));
         fs::read_to_string(path).unwrap_or_default()
@@ -142,18 +136,19 @@ impl Fixture {
     }
 }
 
-/// The program that plays every role.
+/// Path of the program that plays every role.
 pub fn fake_role() -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/fake_role.sh")
 }
 
-/// The parts of a plan that tests share: fakes for children.
+/// Creates a plan with fakes for children.
 pub fn plan(
     run: &RunDirectory,
     config: &ExperimentConfig,
     limits: TimeLimits,
     one_process: bool,
-) -> (Launcher, ExperimentConfig, TimeLimits) {
+    interrupts: mpsc::Receiver<()>,
+) -> SupervisorPlan {
     let launcher = Launcher {
         program: fake_role(),
         run: run.clone(),
@@ -167,10 +162,11 @@ pub fn plan(
         journal: None,
         upstream: None,
     };
-    (launcher, config.clone(), limits)
+    let (config, earlier) = (config.clone(), Totals::default());
+    SupervisorPlan { launcher, config, limits, earlier, interrupts }
 }
 
-/// Process ids of a run's fakes that are neither gone nor zombies.
+/// Lists the process ids of a run's living fakes, without zombies.
 pub fn living_children(run: &Path) -> Vec<String> {
     let pids = fs::read_to_string(run.join("fake/pids")).unwrap_or_default();
     let lives = |pid: &&str| {

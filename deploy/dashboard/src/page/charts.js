@@ -7,46 +7,46 @@ const DASHES = [[], [9, 4], [2, 3], [9, 3, 2, 3], [16, 4], [5, 2]];
 const SECONDS = [1, 2, 5, 10, 20, 30, 60, 120, 300, 600, 1200, 1800, 3600, 7200, 14400, 21600,
   43200, 86400, 172800, 432000, 864000];
 
-/** All charts: title, unit, file of the run, key, and whether a log scale is possible. */
-export const GROUPS = [
-  ["Evaluation, without noise", [
+/** All charts by group: title, unit, file of the run, key, and whether a log scale is possible. */
+const GROUPS = [
+  ["Evaluation, without exploration", [
     ["Return", "mean over episodes", "evaluations", "return_mean"],
-    ["Success rate", "share of episodes", "evaluations", "success_rate"],
-    ["Smoothness", "mean change of an action; lower is smoother", "evaluations", "smoothness"],
+    ["Success rate", "fraction of episodes", "evaluations", "success_rate"],
+    ["Smoothness", "mean change of actions; lower is smoother", "evaluations", "smoothness"],
   ]],
   ["Training, with exploration", [
     ["Training return", "mean over episodes", "metrics", "training_return_mean"],
-    ["Training success rate", "share of episodes", "metrics", "training_success_rate"],
+    ["Training success rate", "fraction of episodes", "metrics", "training_success_rate"],
   ]],
   ["Throughput and queues", [
     ["Environment steps", "1/s", "metrics", "env_steps_per_s", true],
     ["Updates", "1/s", "metrics", "updates_per_s", true],
     ["Queued segments", "waiting for the learner", "metrics", "queued_segments"],
-    ["Policy lag", "versions, largest", "metrics", "policy_lag_max"],
-    ["Updates owed", "updates that the pacing demands", "metrics", "updates_owed"],
+    ["Policy lag", "versions, maximum", "metrics", "policy_lag_max"],
+    ["Updates owed", "due according to the pacing", "metrics", "updates_owed"],
     ["Workers", "attached", "metrics", "workers"],
   ]],
   ["Learning", [
     ["Critic loss", "mean squared error", "metrics", "critic_loss", true],
-    ["Actor loss", "−mean Q and what is added", "metrics", "actor_loss"],
+    ["Actor loss", "−mean Q plus regularization", "metrics", "actor_loss"],
     ["Mean Q", "over the samples", "metrics", "q_mean"],
     ["Temperature", "weight of the entropy", "metrics", "temperature"],
     ["Entropy", "nat", "metrics", "entropy"],
     ["Policy loss", "negative clipped objective", "metrics", "policy_loss"],
     ["Value loss", "mean squared error", "metrics", "value_loss", true],
     ["Divergence from the acting policy", "approximate KL [nat]", "metrics", "approx_kl"],
-    ["Clipped steps", "share", "metrics", "clip_fraction"],
+    ["Clipped steps", "fraction", "metrics", "clip_fraction"],
   ]],
 ];
 
-/** Returns the keys of each file that the charts show. */
-export function names() {
+/** Returns the keys that the charts need, by file. */
+export function chartKeys() {
   const found = { metrics: [], evaluations: [] };
   for (const [, charts] of GROUPS) for (const [, , file, key] of charts) found[file].push(key);
   return found;
 }
 
-/** Assigns a line style to each run: the method's colour, with dashes if several share it. */
+/** Assigns a line style to each run: the method's colour, and dashes if several runs share it. */
 export function styles(runs) {
   const seen = new Map();
   return new Map(runs.map((run) => {
@@ -56,8 +56,8 @@ export function styles(runs) {
   }));
 }
 
-/** Exponential moving average with bias correction, so that it starts at the first value. */
-export function smoothed(values, weight) {
+/** Returns the exponential moving average, with bias correction: it starts at the first value. */
+function smoothed(values, weight) {
   let [mean, mass] = [0, 0];
   return values.map((value) => {
     if (value === null) return null;
@@ -85,13 +85,13 @@ function axes(axis) {
   return [x, y];
 }
 
-/** Returns the number of points of all lines, and the position of the last one. */
+/** Returns the number of points of all lines, and the largest x. */
 function extent(lines) {
   const ends = lines.map(({ x }) => x[x.length - 1]);
   return { points: lines.reduce((sum, { x }) => sum + x.length, 0), end: Math.max(...ends) };
 }
 
-/** A plot with a legend, which shows the values at the pointer, or the last ones. */
+/** A plot with a legend that shows the values at the pointer, or else the last values. */
 export class Plot {
   constructor(title, unit) {
     this.plot = element("div", { className: "plot" });
@@ -108,7 +108,7 @@ export class Plot {
     if (this.uplot && width && width !== this.uplot.width) this.uplot.setSize({ width, height: HEIGHT });
   }
 
-  /** Draws lines {label, style, x, y} over an axis. */
+  /** Draws lines {label, style, x, y}; `axis` names the horizontal axis. */
   draw(lines, { axis, weight = 0, log = false }) {
     this.lines = lines;
     const pairs = [];
@@ -126,21 +126,21 @@ export class Plot {
     const data = uPlot.join(pairs);
     const shape = JSON.stringify([series, axis, log]);
     if (this.uplot && shape === this.shape) {
-      // Keeps the zoom.
       this.uplot.setData(data, !this.zoomed);
       if (this.zoomed) this.uplot.redraw();
     } else {
-      this.make(series, data, axis, log);
+      this.create(series, data, axis, log);
       this.shape = shape;
     }
-    this.each = weight > 0 ? 2 : 1;
+    this.seriesPerLine = weight > 0 ? 2 : 1;
     const { points, end } = extent(lines);
+    // For tests.
     Object.assign(this.figure.dataset, { points, end });
     const { left, idx } = this.uplot.cursor;
-    this.write(left >= 0 ? idx : null);
+    this.writeLegend(left >= 0 ? idx : null);
   }
 
-  make(series, data, axis, log) {
+  create(series, data, axis, log) {
     this.uplot?.destroy();
     this.zoomed = false;
     const options = {
@@ -148,7 +148,7 @@ export class Plot {
       legend: { show: false }, scales: { x: { time: false }, y: { distr: log ? 3 : 1 } },
       cursor: { sync: { key: axis }, points: { size: 6 } },
       hooks: {
-        setCursor: [(plot) => this.write(plot.cursor.left >= 0 ? plot.cursor.idx : null)],
+        setCursor: [(plot) => this.writeLegend(plot.cursor.left >= 0 ? plot.cursor.idx : null)],
         setSelect: [() => { this.zoomed = true; }],
       },
     };
@@ -157,8 +157,8 @@ export class Plot {
     this.plot.firstElementChild.setAttribute("aria-hidden", "true");
   }
 
-  /** Shows the values at a point, or the last ones. */
-  write(index) {
+  /** Shows the values at an index, or the last values if it is null. */
+  writeLegend(index) {
     const data = this.uplot?.data;
     if (!data) return;
     const at = (column) => {
@@ -168,59 +168,59 @@ export class Plot {
     };
     this.readout.replaceChildren(...this.lines.map(({ label, style }, number) =>
       element("li", {}, swatch(style.colour, style.dash),
-        `${label}: ${figure(at(data[number * this.each + 1]) ?? null)}`)));
+        `${label}: ${figure(at(data[number * this.seriesPerLine + 1]) ?? null)}`)));
   }
 
-  drop() {
+  destroy() {
     this.uplot?.destroy();
     [this.uplot, this.shape] = [null, ""];
   }
 }
 
-/** All charts, each drawn when it becomes visible. */
+/** All charts. Each is drawn when it becomes visible. */
 export class Charts {
-  constructor(place) {
+  constructor(parent) {
     this.charts = [];
-    const watcher = new IntersectionObserver((entries) => {
+    const observer = new IntersectionObserver((entries) => {
       for (const entry of entries) {
         const chart = this.charts.find((one) => one.plot.figure === entry.target);
-        chart.seen = entry.isIntersecting;
-        if (chart.seen) this.drawOne(chart);
+        chart.visible = entry.isIntersecting;
+        if (chart.visible) this.drawOne(chart);
       }
     }, { rootMargin: "300px" });
     for (const [title, charts] of GROUPS) {
       const group = element("div", { className: "charts" });
       const section = element("section", {}, element("h2", {}, title), group);
-      for (const [name, unit, file, key, mayBeLog] of charts) {
+      for (const [name, unit, file, key, allowsLog] of charts) {
         const plot = new Plot(name, unit);
         plot.figure.dataset.key = key;
         group.append(plot.figure);
-        this.charts.push({ plot, file, key, mayBeLog, section, seen: false, stale: true });
-        watcher.observe(plot.figure);
+        this.charts.push({ plot, file, key, allowsLog, section, visible: false, stale: true });
+        observer.observe(plot.figure);
       }
-      place.append(section);
+      parent.append(section);
     }
   }
 
-  /** Sets the view: runs with labels and styles, the store, the settings. */
+  /** Shows a view: runs with labels and styles, the store with their curves, and settings. */
   show(view) {
     this.view = view;
     for (const chart of this.charts) {
-      const has = view.runs.some((run) => view.store.curve(run.name, chart.file, chart.key));
-      chart.plot.figure.hidden = !has;
+      const hasData = view.runs.some((run) => view.store.curve(run.name, chart.file, chart.key));
+      chart.plot.figure.hidden = !hasData;
       chart.stale = true;
     }
     for (const { section } of this.charts) {
       section.hidden = [...section.querySelectorAll("figure")].every((one) => one.hidden);
     }
-    for (const chart of this.charts) if (chart.seen) this.drawOne(chart);
+    for (const chart of this.charts) if (chart.visible) this.drawOne(chart);
   }
 
   drawOne(chart) {
     if (!this.view || !chart.stale || chart.plot.figure.hidden) return;
     chart.stale = false;
     const { runs, store, styles: known, axis, weight } = this.view;
-    const log = this.view.log && Boolean(chart.mayBeLog);
+    const log = this.view.log && Boolean(chart.allowsLog);
     const lines = runs.flatMap((run) => {
       const curve = store.curve(run.name, chart.file, chart.key);
       if (!curve) return [];

@@ -1,24 +1,25 @@
-// Caches the data of runs, and requests only additions.
+// Caches the curves of runs, and requests only new points.
 
 /** Time limit of a request. */
-const PATIENCE_MS = 15000;
-/** Number of cached points beyond which a curve is fetched anew, with at most a thousand points. */
+const TIMEOUT_MS = 15000;
+/** Number of cached points beyond which a curve is requested again as a whole. The server then
+ * reduces it to about a thousand points. */
 const POINTS_MAX = 4000;
 
-/** Requests JSON; an error has the server's message. */
-export async function ask(path, query = {}) {
+/** Requests JSON. Errors have the server's message. */
+export async function getJson(path, query = {}) {
   const text = new URLSearchParams(query).toString();
-  const answer = await fetch(text ? `${path}?${text}` : path,
-    { signal: AbortSignal.timeout(PATIENCE_MS) });
-  const content = await answer.json();
-  if (!answer.ok) throw new Error(content.error ?? answer.statusText);
+  const response = await fetch(text ? `${path}?${text}` : path,
+    { signal: AbortSignal.timeout(TIMEOUT_MS) });
+  const content = await response.json();
+  if (!response.ok) throw new Error(content.error ?? response.statusText);
   return content;
 }
 
-/** The growing curves of one file of one run. */
+/** The curves of one file of one run. */
 class Curves {
   constructor(run, file, names) {
-    Object.assign(this, { run, file, names, table: 0, next: 0, mark: null });
+    Object.assign(this, { run, file, names, table: 0, next: 0 });
     this.curves = new Map();
   }
 
@@ -28,16 +29,16 @@ class Curves {
     if (longest > POINTS_MAX) this.table = 0;
     const query = { run: this.run, file: this.file, names: this.names.join(","),
       table: this.table, from: this.next };
-    const answer = await ask("/api/curves", query);
-    const anew = answer.table !== this.table;
-    if (!anew && answer.next === this.next) return false;
+    const response = await getJson("/api/curves", query);
+    const isWhole = response.table !== this.table;
+    if (!isWhole && response.next === this.next) return false;
     this.names.forEach((name, index) => {
-      const more = answer.curves[index];
-      const known = anew ? undefined : this.curves.get(name);
-      if (!known) this.curves.set(name, more);
-      else for (const key of Object.keys(more)) known[key].push(...more[key]);
+      const points = response.curves[index];
+      const known = isWhole ? undefined : this.curves.get(name);
+      if (!known) this.curves.set(name, points);
+      else for (const key of Object.keys(points)) known[key].push(...points[key]);
     });
-    [this.table, this.next] = [answer.table, answer.next];
+    [this.table, this.next] = [response.table, response.next];
     return true;
   }
 }
@@ -49,24 +50,24 @@ export class Store {
     this.runs = new Map();
   }
 
-  /** Requests the new points of a run, if its entry in the list has changed. */
+  /** Requests new points of a run if it is training or its entry in the list has changed. */
   async update(run) {
-    const known = this.runs.get(run.name) ?? { mark: null, files: Object.keys(this.names).map(
+    const known = this.runs.get(run.name) ?? { stamp: null, files: Object.keys(this.names).map(
       (file) => new Curves(run.name, file, this.names[file])) };
     this.runs.set(run.name, known);
-    const mark = JSON.stringify([run.env_steps, run.wall_s, run.return_mean]);
-    if (known.mark === mark && run.state !== "training") return false;
+    const stamp = JSON.stringify([run.env_steps, run.wall_s, run.return_mean]);
+    if (known.stamp === stamp && run.state !== "training") return false;
     const changed = await Promise.all(known.files.map((file) => file.update()));
-    known.mark = mark;
+    known.stamp = stamp;
     return changed.some(Boolean);
   }
 
-  /** Drops runs that are no longer shown. */
+  /** Drops all runs except those in `names`. */
   keep(names) {
     for (const name of this.runs.keys()) if (!names.includes(name)) this.runs.delete(name);
   }
 
-  /** Returns a curve, or nothing if the run has no values for it. */
+  /** Returns a curve, or null if the run has no values for it. */
   curve(run, file, name) {
     const known = this.runs.get(run)?.files.find((one) => one.file === file);
     const curve = known?.curves.get(name);

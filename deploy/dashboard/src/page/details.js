@@ -1,17 +1,17 @@
-// Shows the details of one run, and differences between configurations.
+// Shows the details of one run, and compares configurations.
 
 import { Plot } from "./charts.js";
-import { ask } from "./data.js";
+import { getJson } from "./data.js";
 import { bytes, count, duration, element, figure, fill, share } from "./format.js";
 
 const get = (id) => document.getElementById(id);
-/** Okabe and Ito's palette, used for joints. */
+/** Palette of Okabe and Ito, used for joints. */
 const PALETTE = ["#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#000000",
   "#968c00"];
-const STATES = { starting: "starting", running: "running", restarting: "will be restarted",
+const STATES = { starting: "starting", running: "running", restarting: "waiting for restart",
   gone: "not running" };
-const DOING = { attaching: "waits for a learner", stepping: "steps environments",
-  waiting: "waits: its queue is full" };
+const ACTIVITIES = { attaching: "waiting for a learner", stepping: "stepping environments",
+  waiting: "waiting, queue full" };
 
 const quoted = (text) => (/^[\w./-]+$/.test(text) ? text : `'${text.replaceAll("'", "'\\''")}'`);
 
@@ -29,61 +29,62 @@ export class Details {
 
   /** Shows a run, or updates the parts that have changed. */
   async update(run, path) {
-    const another = this.run?.name !== run.name;
-    const moved = another || this.run.return_mean !== run.return_mean || run.env_steps !== this.run.env_steps;
+    const isOther = this.run?.name !== run.name;
+    const hasChanged = isOther || this.run.return_mean !== run.return_mean
+      || run.env_steps !== this.run.env_steps;
     [this.run, this.path] = [run, path];
-    if (another) this.cpu.clear();
+    if (isOther) this.cpu.clear();
     const parts = [this.workers()];
-    if (moved) parts.push(this.evaluations(), this.motion(), this.videos());
+    if (hasChanged) parts.push(this.evaluations(), this.motion(), this.videos());
     await Promise.all(parts);
   }
 
-  /** Requests a part of the run; null if the user has chosen another run meanwhile. */
-  async of(what) {
+  /** Requests data of the run; null if the user has selected another run meanwhile. */
+  async request(part) {
     const { name } = this.run;
-    const answer = await ask(`/api/${what}`, { run: name });
-    return this.run.name === name ? { answer } : null;
+    const content = await getJson(`/api/${part}`, { run: name });
+    return this.run.name === name ? { content } : null;
   }
 
   async workers() {
-    const got = await this.of("processes");
-    if (!got) return;
-    const { state, session } = got.answer;
+    const response = await this.request("processes");
+    if (!response) return;
+    const { state, session } = response.content;
     const note = get("workers-note");
     if (!session) {
-      note.textContent = "This run was trained by a version that did not write its processes down.";
+      note.textContent = "This run was trained by an older version, which did not record processes.";
       get("workers").replaceChildren();
       return;
     }
     const age = duration(session.session_s);
-    if (state === "training") note.textContent = `The session is ${age} old.`;
-    else if (session.ended) note.textContent = `The last session has ended after ${age}.`;
-    else note.textContent = `The last session was killed after ${age}; this is what was known last.`;
-    const heads = [["Process", false], ["State", false], ["Last sign of life", false],
-      ["Segments kept", true], ["Acknowledged", true], ["Starts", true], ["Cores used", true],
-      ["Memory", true], ["Up", true]];
+    if (state === "training") note.textContent = `The session started ${age} ago.`;
+    else if (session.ended) note.textContent = `The last session ended after ${age}.`;
+    else note.textContent = `The last session was killed after ${age}. Its last known state:`;
+    const heads = [["Process", false], ["State", false], ["Last heartbeat", false],
+      ["Queued segments", true], ["Acknowledged", true], ["Starts", true], ["Cores used", true],
+      ["Memory", true], ["Uptime", true]];
     fill(get("workers"), heads, session.processes.map((one) => this.processRow(one)));
   }
 
   processRow(one) {
     const worker = one.name.startsWith("actor");
-    const bad = one.state === "restarting" || one.starts > 1;
-    const heard = one.silent_s === null ? "–"
-      : `${DOING[one.doing] ?? "spoke"}, ${duration(one.silent_s)} ago`;
+    const wasRestarted = one.state === "restarting" || one.starts > 1;
+    const heartbeat = one.silent_s === null ? "–"
+      : [ACTIVITIES[one.doing], `${duration(one.silent_s)} ago`].filter(Boolean).join(", ");
     return [
       element("th", { scope: "row" }, one.joined ? `${one.name} (joined)` : one.name),
       element("td", { className: one.state === "restarting" ? "bad" : "" }, STATES[one.state]),
-      worker ? heard : "–",
+      worker ? heartbeat : "–",
       worker ? count(one.kept_segments) : "–",
       worker ? count(one.acknowledged_segments) : "–",
-      element("td", { className: bad ? "number bad" : "number" }, count(one.starts)),
+      element("td", { className: wasRestarted ? "number bad" : "number" }, count(one.starts)),
       figure(this.cores(one)),
       bytes(one.memory_bytes),
       duration(one.up_s),
     ];
   }
 
-  /** Processor time divided by time since the last update; at first, since the start. */
+  /** Returns the processor time per second since the last update, or first since the start. */
   cores({ name, cpu_s, up_s }) {
     if (cpu_s === null || !up_s) return null;
     const last = this.cpu.get(name);
@@ -96,18 +97,18 @@ export class Details {
   }
 
   async evaluations() {
-    const got = await this.of("evaluations");
-    if (!got) return;
-    const { first_seed, count: all, rows } = got.answer;
+    const response = await this.request("evaluations");
+    if (!response) return;
+    const { first_seed, count: all, rows } = response.content;
     const note = get("evaluations-note");
     const table = get("evaluations");
     if (!rows.length) {
-      note.textContent = "No evaluation yet.";
+      note.textContent = "No evaluations yet.";
       table.replaceChildren();
       return;
     }
     note.textContent = `Episode i is reset with seed ${first_seed} + i. `
-      + (all > rows.length ? `The newest ${rows.length} of ${count(all)} evaluations.` : "");
+      + (all > rows.length ? `Showing the newest ${rows.length} of ${count(all)}.` : "");
     const best = Math.max(...rows.map((row) => row.return_mean));
     const heads = [["Steps", true], ["Time", true], ["Policy", true], ["Return", true],
       ["Lowest", true], ["Highest", true], ["Success", true], ["Smoothness", true],
@@ -124,19 +125,19 @@ export class Details {
   }
 
   async motion() {
-    const got = await this.of("motion");
-    if (!got) return;
-    this.episode = got.answer;
+    const response = await this.request("motion");
+    if (!response) return;
+    this.episode = response.content;
     get("motion-kinds").hidden = !this.episode;
     if (!this.episode) {
-      get("motion-note").replaceChildren("Nobody has looked yet. To roll the latest policy out: ",
+      get("motion-note").replaceChildren("Not measured yet. To roll out the latest policy, run ",
         element("code", {}, `dmprl report ${quoted(this.path)}`));
-      this.plot?.drop();
+      this.plot?.destroy();
       get("motion").replaceChildren();
       return;
     }
     const { episode } = this;
-    const success = { true: ", a success", false: ", no success" }[episode.success] ?? "";
+    const success = { true: ", success", false: ", no success" }[episode.success] ?? "";
     get("motion-note").textContent = `Policy ${count(episode.policy_version)} `
       + `(${count(episode.env_steps)} steps), seed ${episode.seed}: return `
       + `${figure(episode.return)}${success}. Mean joint jerk ${figure(episode.joint_jerk)} `
@@ -149,12 +150,12 @@ export class Details {
     if (!episode) return;
     const kind = document.querySelector("input[name=motion]:checked").value;
     const units = [...new Set(episode.joints.map((joint) => joint.unit))].join(", ");
-    const unit = { positions: `[${units}]`, velocities: `[${units} a second]`,
+    const unit = { positions: `[${units}]`, velocities: `[${units} per second]`,
       actions: "scaled to [−1, 1]" }[kind];
     const columns = episode[kind];
     const names = kind === "actions" ? columns.map((_, index) => `action ${index + 1}`)
       : episode.joints.map((joint) => joint.name);
-    this.plot?.drop();
+    this.plot?.destroy();
     this.plot = new Plot(`Joint ${kind}`.replace("Joint actions", "Actions"), unit);
     get("motion").replaceChildren(this.plot.figure);
     const lines = columns.map((y, index) => ({
@@ -165,42 +166,42 @@ export class Details {
   }
 
   async videos() {
-    const got = await this.of("videos");
-    if (!got) return;
-    const { videos } = got.answer;
-    const place = get("videos");
+    const response = await this.request("videos");
+    if (!response) return;
+    const { videos } = response.content;
+    const parent = get("videos");
     const key = JSON.stringify([this.run.name, videos]);
-    // Does not restart a video that is playing.
-    if (place.dataset.key === key) return;
-    place.dataset.key = key;
+    // Drawing the same videos again would restart a playing one.
+    if (parent.dataset.key === key) return;
+    parent.dataset.key = key;
     const films = videos.filter((one) => one.name.endsWith(".mp4"));
     const shown = (films.length ? films : videos).slice(-6).reverse();
-    get("videos-note").replaceChildren(...(shown.length ? [] : ["None yet. To make one: ",
+    get("videos-note").replaceChildren(...(shown.length ? [] : ["No videos yet. To record one, run ",
       element("code", {}, `dmprl record ${quoted(this.path)}`)]));
-    place.replaceChildren(...shown.map((one) => {
+    parent.replaceChildren(...shown.map((one) => {
       const source = `/video?${new URLSearchParams({ run: this.run.name, name: one.name })}`;
       const title = one.name.replace(/\.\w+$/, "");
       const picture = one.name.endsWith(".mp4")
         ? element("video", { src: source, controls: true, loop: true, preload: "none", width: 480 })
         : element("img", { src: source, alt: title, loading: "lazy" });
       picture.setAttribute("aria-label", title);
-      if (picture.preload) near(picture, () => { picture.preload = "metadata"; });
+      if (picture.preload) onceNear(picture, () => { picture.preload = "metadata"; });
       return element("figure", {}, picture, element("figcaption", {}, title));
     }));
   }
 }
 
-/** Calls `act` once an element is near the visible part of the page. */
-function near(target, act) {
-  const watcher = new IntersectionObserver((entries) => {
+/** Calls `callback` once, when an element gets near the visible part of the page. */
+function onceNear(target, callback) {
+  const observer = new IntersectionObserver((entries) => {
     if (!entries.some((entry) => entry.isIntersecting)) return;
-    watcher.disconnect();
-    act();
+    observer.disconnect();
+    callback();
   }, { rootMargin: "300px" });
-  watcher.observe(target);
+  observer.observe(target);
 }
 
-/** A table that compares configurations. */
+/** The table that compares configurations. */
 export class Configuration {
   constructor() {
     this.known = new Map();
@@ -214,7 +215,7 @@ export class Configuration {
     this.runs = runs;
     await Promise.all(runs.filter((run) => this.known.get(run.name)?.steps !== run.steps)
       .map(async (run) => {
-        const { keys } = await ask("/api/config", { run: run.name });
+        const { keys } = await getJson("/api/config", { run: run.name });
         this.known.set(run.name, { steps: run.steps, keys });
       }));
     const content = JSON.stringify(runs.map((run) => [run.name, run.label, run.steps]));
@@ -236,7 +237,7 @@ export class Configuration {
     const wanted = get("key-filter").value.trim().toLowerCase();
     const shown = (all ? keys : different).filter((key) => key.toLowerCase().includes(wanted));
     get("configuration-note").textContent = runs.length < 2
-      ? `All ${keys.length} keys of ${runs[0].label}. Choose a second run to see what differs.`
+      ? `All ${keys.length} keys of ${runs[0].label}. Select a second run to compare them.`
       : `${different.length} of ${keys.length} keys differ between these ${runs.length} runs.`;
     fill(get("keys"), [["Key", false], ...runs.map((run) => [run.label, false])],
       shown.map((key) => [element("th", { scope: "row" }, key), ...values(key).map((value) =>

@@ -1,6 +1,6 @@
-// Formats figures and times, and creates elements.
+// Formats numbers and times, and creates elements.
 
-/** Creates an element with properties and children; text is never parsed as HTML. */
+/** Creates an element with properties and children. Text is never parsed as HTML. */
 export function element(tag, properties = {}, ...children) {
   const made = document.createElement(tag);
   for (const [name, value] of Object.entries(properties)) {
@@ -15,7 +15,7 @@ const small = new Intl.NumberFormat("en", { maximumSignificantDigits: 4 });
 const whole = new Intl.NumberFormat("en", { maximumFractionDigits: 0 });
 const short = new Intl.NumberFormat("en", { notation: "compact", maximumSignificantDigits: 4 });
 
-/** Formats a figure with at most four digits; a dash if there is none. */
+/** Formats a number with about four significant digits; a dash if there is none. */
 export function figure(value) {
   if (value === null || value === undefined || Number.isNaN(value)) return "–";
   const size = Math.abs(value);
@@ -29,7 +29,7 @@ export const compact = (value) => short.format(value).toLowerCase().replace("m",
 /** Formats a count with all digits. */
 export const count = (value) => (value === null || value === undefined ? "–" : whole.format(value));
 
-/** Formats a fraction in per cent. */
+/** Formats a fraction as a percentage. */
 export const share = (value) => (value === null || value === undefined ? "–"
   : `${small.format(100 * value)}\u00a0%`);
 
@@ -63,7 +63,7 @@ export function swatch(colour, dash) {
   return picture;
 }
 
-/** Fills a table: heads are [text, isNumber], rows are lists of texts or elements. */
+/** Fills a table. Heads are [text, isNumber]; rows are lists of texts or elements. */
 export function fill(table, heads, rows) {
   const head = element("thead", {}, element("tr", {}, ...heads.map(([text, isNumber]) =>
     element("th", { scope: "col", className: isNumber ? "number" : "" }, text))));

@@ -1,66 +1,66 @@
-// The page: selects the runs to show, and refreshes them.
+// The page: selects the runs to show, and refreshes their data.
 
-import { Charts, names, styles } from "./charts.js";
-import { ask, Store } from "./data.js";
+import { chartKeys, Charts, styles } from "./charts.js";
+import { getJson, Store } from "./data.js";
 import { Configuration, Details } from "./details.js";
 import { count, duration, element, figure, share, swatch } from "./format.js";
 
-/** Interval between two refreshes, during training and otherwise. A refresh takes some hundredths
- * of a second of processor time, which training may need. */
-const LOOK_MS = { training: 4000, still: 6000 };
-/** Maximum number of runs drawn at once: more lines are indistinguishable. */
+/** Interval between two refreshes, while a run is training and otherwise. A refresh costs some
+ * hundredths of a second of processor time, which training may need. */
+const REFRESH_MS = { training: 4000, idle: 6000 };
+/** Maximum number of runs drawn at once: more lines would be indistinguishable. */
 const SHOWN_MAX = 12;
-/** Number of runs shown initially. */
-const SHOWN_FIRST = 4;
+/** Maximum number of runs shown initially. */
+const SHOWN_INITIALLY = 4;
 const STATES = { training: "training", finished: "finished", stopped: "stopped" };
 
 const get = (id) => document.getElementById(id);
-const store = new Store(names());
+const store = new Store(chartKeys());
 const charts = new Charts(get("curves"));
 const details = new Details();
 const configuration = new Configuration();
 
-/** The settings after # in the address, so that a view can be bookmarked and shared. */
+/** The user's selection. It is kept in the fragment of the URL, so a view can be bookmarked. */
 const chosen = readAddress();
 let listed = [];
 let root = "";
 let leftOut = 0;
-/** Content already shown, which is not drawn again. */
+/** Content currently shown; equal content is not drawn again. */
 const drawn = { list: "", labels: "" };
 let timer = 0;
-let looking = false;
-let again = false;
-/** While a button is pressed the list is not redrawn; otherwise a click would miss its entry. */
+let refreshing = false;
+let refreshAgain = false;
+/** True while a pointer button is pressed. The list is not redrawn then: the click would miss. */
 let pressed = false;
 
 function readAddress() {
-  const said = new URLSearchParams(location.hash.slice(1));
+  const parameters = new URLSearchParams(location.hash.slice(1));
   return {
-    runs: said.has("run") || said.has("none") ? said.getAll("run") : null,
-    details: said.get("details"),
-    axis: said.get("axis") === "wall_s" ? "wall_s" : "env_steps",
-    weight: Math.min(0.95, Math.max(0, Number(said.get("smoothing")) || 0)),
-    log: said.has("log"),
+    runs: parameters.has("run") || parameters.has("none") ? parameters.getAll("run") : null,
+    details: parameters.get("details"),
+    axis: parameters.get("axis") === "wall_s" ? "wall_s" : "env_steps",
+    weight: Math.min(0.95, Math.max(0, Number(parameters.get("smoothing")) || 0)),
+    log: parameters.has("log"),
   };
 }
 
 function writeAddress() {
-  const says = new URLSearchParams();
-  (chosen.runs ?? []).forEach((run) => says.append("run", run));
-  if (chosen.runs?.length === 0) says.set("none", "");
-  if (chosen.details) says.set("details", chosen.details);
-  if (chosen.axis !== "env_steps") says.set("axis", chosen.axis);
-  if (chosen.weight > 0) says.set("smoothing", chosen.weight);
-  if (chosen.log) says.set("log", "");
-  history.replaceState(null, "", `#${says}`);
+  const parameters = new URLSearchParams();
+  (chosen.runs ?? []).forEach((run) => parameters.append("run", run));
+  if (chosen.runs?.length === 0) parameters.set("none", "");
+  if (chosen.details) parameters.set("details", chosen.details);
+  if (chosen.axis !== "env_steps") parameters.set("axis", chosen.axis);
+  if (chosen.weight > 0) parameters.set("smoothing", chosen.weight);
+  if (chosen.log) parameters.set("log", "");
+  history.replaceState(null, "", `#${parameters}`);
 }
 
-/** Chooses the runs shown initially: those being trained, or else the newest. */
-function firstChoice() {
+/** Returns the runs shown initially: those in training, else the newest. */
+function initialRuns() {
   const newest = [...listed].filter((run) => !run.fault)
     .sort((a, b) => b.started.localeCompare(a.started));
   const training = newest.filter((run) => run.state === "training");
-  return (training.length ? training : newest).slice(0, SHOWN_FIRST).map((run) => run.name);
+  return (training.length ? training : newest).slice(0, SHOWN_INITIALLY).map((run) => run.name);
 }
 
 /** Returns the runs to show, each with a unique label. */
@@ -72,12 +72,13 @@ function shownRuns() {
   return runs.map((run) => ({ ...run, label: unique(run) ? label(run) : run.name }));
 }
 
-async function look() {
-  if (looking) {
-    again = true;
+/** Refreshes the page, and schedules the next refresh. */
+async function refresh() {
+  if (refreshing) {
+    refreshAgain = true;
     return;
   }
-  looking = true;
+  refreshing = true;
   clearTimeout(timer);
   try {
     await update();
@@ -86,36 +87,36 @@ async function look() {
   } catch (error) {
     get("connection").className = "lost";
     get("connection").textContent = error instanceof TypeError || error.name === "TimeoutError"
-      ? "no connection: has dmprl dashboard ended? What is shown is what was known last."
+      ? "no connection to dmprl dashboard; showing the last known state"
       : `${error.message}`;
   }
-  looking = false;
-  const soon = listed.some((run) => run.state === "training");
+  refreshing = false;
+  const training = listed.some((run) => run.state === "training");
   // A hidden page sends no requests.
-  if (!document.hidden) timer = setTimeout(look, soon ? LOOK_MS.training : LOOK_MS.still);
-  if (again) {
-    again = false;
-    await look();
+  if (!document.hidden) timer = setTimeout(refresh, REFRESH_MS[training ? "training" : "idle"]);
+  if (refreshAgain) {
+    refreshAgain = false;
+    await refresh();
   }
 }
 
 async function update() {
-  const answer = await ask("/api/runs");
-  [listed, root, leftOut] = [answer.runs, answer.root, answer.left_out];
+  const response = await getJson("/api/runs");
+  [listed, root, leftOut] = [response.runs, response.root, response.left_out];
   get("root").textContent = root;
-  chosen.runs ??= listed.length ? firstChoice() : null;
+  chosen.runs ??= listed.length ? initialRuns() : null;
   drawList();
   const runs = shownRuns();
-  const asked = await Promise.allSettled(runs.map((run) => store.update(run)));
+  const updates = await Promise.allSettled(runs.map((run) => store.update(run)));
   store.keep(runs.map((run) => run.name));
   const labels = JSON.stringify([runs.map((run) => [run.name, run.label]), listed.length > 0]);
-  if (labels !== drawn.labels || asked.some((one) => one.value)) {
+  if (labels !== drawn.labels || updates.some((one) => one.value)) {
     drawn.labels = labels;
     drawCurves();
   }
   await configuration.update(runs.filter((run) => !run.fault));
   await showDetails(runs);
-  const failed = asked.find((one) => one.status === "rejected");
+  const failed = updates.find((one) => one.status === "rejected");
   if (failed) throw failed.reason;
 }
 
@@ -125,9 +126,9 @@ function drawCurves() {
   charts.show({ runs, store, styles: styles(runs), axis, weight, log });
   const note = get("nothing");
   note.hidden = runs.some((run) => store.runs.get(run.name)?.files.some((file) => file.next > 0));
-  if (!listed.length) note.textContent = "There is no run here yet; one that begins will appear.";
-  else if (!runs.length) note.textContent = "No run is chosen.";
-  else note.textContent = "Nothing was measured yet: curves begin with the first line of metrics.jsonl.";
+  if (!listed.length) note.textContent = "No runs yet. New runs appear automatically.";
+  else if (!runs.length) note.textContent = "No run is selected.";
+  else note.textContent = "No data yet. Curves start with the first line of metrics.jsonl.";
 }
 
 async function showDetails(runs) {
@@ -160,16 +161,16 @@ function facts(run) {
 
 function drawList() {
   const wanted = get("runs-filter").value.trim().toLowerCase().split(/\s+/);
-  const says = (run) => `${run.name} ${run.task} ${run.method} ${run.state}`.toLowerCase();
+  const textOf = (run) => `${run.name} ${run.task} ${run.method} ${run.state}`.toLowerCase();
   const order = { training: 0, stopped: 1, finished: 1 };
   const sorted = [...listed].sort((a, b) => order[a.state] - order[b.state]);
-  const found = sorted.filter((run) => wanted.every((word) => says(run).includes(word)));
+  const found = sorted.filter((run) => wanted.every((word) => textOf(run).includes(word)));
   const known = styles(shownRuns());
   get("runs-count").textContent = `(${found.length === listed.length ? "" : `${found.length} of `}`
     + `${count(listed.length)}, ${chosen.runs?.length ?? 0} shown)`;
   const full = (chosen.runs?.length ?? 0) >= SHOWN_MAX;
-  get("runs-note").textContent = [full ? `At most ${SHOWN_MAX} runs are shown at once.` : "",
-    leftOut ? `${count(leftOut)} more runs are below this directory.` : ""].join(" ").trim();
+  get("runs-note").textContent = [full ? `At most ${SHOWN_MAX} runs can be shown at once.` : "",
+    leftOut ? `${count(leftOut)} more runs are not listed.` : ""].join(" ").trim();
   const list = get("runs");
   const content = JSON.stringify([found, chosen.runs, full, [...known]]);
   if (pressed || content === drawn.list) return;
@@ -188,47 +189,47 @@ function drawList() {
   if (inside) list.querySelector(`input[value="${CSS.escape(focused)}"]`)?.focus();
 }
 
-function choose(runs) {
+function selectRuns(runs) {
   chosen.runs = runs;
   writeAddress();
-  look();
+  refresh();
 }
 
 function listen() {
   get("runs").addEventListener("change", ({ target }) => {
     const others = (chosen.runs ?? []).filter((run) => run !== target.value);
-    choose(target.checked ? [...others, target.value] : others);
+    selectRuns(target.checked ? [...others, target.value] : others);
   });
   get("runs").addEventListener("pointerdown", () => { pressed = true; });
   for (const end of ["pointerup", "pointercancel"]) {
     addEventListener(end, () => setTimeout(() => { pressed = false; }));
   }
   get("runs-filter").addEventListener("input", drawList);
-  get("show-training").addEventListener("click", () => choose(listed
+  get("show-training").addEventListener("click", () => selectRuns(listed
     .filter((run) => run.state === "training").slice(0, SHOWN_MAX).map((run) => run.name)));
-  get("show-none").addEventListener("click", () => choose([]));
+  get("show-none").addEventListener("click", () => selectRuns([]));
   for (const radio of document.getElementsByName("axis")) {
     radio.checked = radio.value === chosen.axis;
     radio.addEventListener("change", () => set({ axis: radio.value }));
   }
   const [slider, shown] = [get("smoothing"), get("smoothing-shown")];
-  const say = () => { shown.value = chosen.weight > 0 ? chosen.weight.toFixed(2) : "off"; };
+  const showWeight = () => { shown.value = chosen.weight > 0 ? chosen.weight.toFixed(2) : "off"; };
   slider.value = chosen.weight;
-  say();
+  showWeight();
   slider.addEventListener("input", () => {
     set({ weight: Number(slider.value) });
-    say();
+    showWeight();
   });
   get("log").checked = chosen.log;
   get("log").addEventListener("change", ({ target }) => set({ log: target.checked }));
   get("details-run").addEventListener("change", ({ target }) => {
     chosen.details = target.value;
     writeAddress();
-    look();
+    refresh();
   });
   get("controls").addEventListener("submit", (event) => event.preventDefault());
   document.addEventListener("visibilitychange", () => {
-    if (!document.hidden) look();
+    if (!document.hidden) refresh();
   });
 }
 
@@ -238,7 +239,7 @@ function set(setting) {
   drawCurves();
 }
 
-// On a narrow screen the curves come first.
+// On a narrow screen the list is folded, so that the curves come first.
 if (matchMedia("(max-width: 52rem)").matches) get("runs-fold").open = false;
 listen();
-look();
+refresh();

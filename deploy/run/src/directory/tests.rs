@@ -1,4 +1,4 @@
-//! The run directory's promises: refusals, torn lines, choices, the lock.
+//! Tests of the run directory: rejected paths and formats, partial lines, choices, the lock.
 
 use std::fs;
 use std::io::Write;
@@ -31,7 +31,7 @@ fn row(policy_version: u64, return_mean: f64) -> EvaluationRow {
 }
 
 #[test]
-fn what_is_written_is_read_back_by_a_second_process_in_time() {
+fn written_files_are_read_back() {
     let parent = tempfile::tempdir().unwrap();
     let run = new_run(&parent);
     let opened = RunDirectory::open(run.path()).unwrap();
@@ -43,7 +43,7 @@ fn what_is_written_is_read_back_by_a_second_process_in_time() {
 }
 
 #[test]
-fn a_directory_that_holds_something_is_refused_with_advice() {
+fn a_directory_with_files_is_rejected_with_advice() {
     let parent = tempfile::tempdir().unwrap();
     let run = new_run(&parent);
     let error = RunDirectory::check_free(run.path()).unwrap_err();
@@ -55,7 +55,7 @@ fn a_directory_that_holds_something_is_refused_with_advice() {
 }
 
 #[test]
-fn names_that_lead_elsewhere_or_surprise_tools_are_refused() {
+fn unsafe_names_are_rejected() {
     let long = "x".repeat(NAME_LEN_MAX + 1);
     for name in ["..", "runs/..", "/", "", ".hidden", "-flag", "a b", "a\nb", "a:b", "ü", &long] {
         let error = RunDirectory::check_free(Path::new(name)).unwrap_err();
@@ -66,7 +66,7 @@ fn names_that_lead_elsewhere_or_surprise_tools_are_refused() {
 }
 
 #[test]
-fn a_newer_format_is_refused_with_its_version() {
+fn a_newer_format_is_rejected_with_its_version() {
     let parent = tempfile::tempdir().unwrap();
     let run = new_run(&parent);
     let text = r#"{"format_version": 7, "shape": "unheard of"}"#;
@@ -76,7 +76,7 @@ fn a_newer_format_is_refused_with_its_version() {
 }
 
 #[test]
-fn a_torn_last_line_is_no_row_and_the_next_append_replaces_it() {
+fn a_partial_last_line_is_ignored_and_the_next_append_replaces_it() {
     let parent = tempfile::tempdir().unwrap();
     let run = new_run(&parent);
     run.append_evaluation(&row(1, -3.0)).unwrap();
@@ -89,7 +89,7 @@ fn a_torn_last_line_is_no_row_and_the_next_append_replaces_it() {
 }
 
 #[test]
-fn a_whole_line_that_is_no_row_is_reported_with_its_number() {
+fn an_invalid_line_is_reported_with_its_number() {
     let parent = tempfile::tempdir().unwrap();
     let run = new_run(&parent);
     run.append_evaluation(&row(1, -3.0)).unwrap();
@@ -99,7 +99,7 @@ fn a_whole_line_that_is_no_row_is_reported_with_its_number() {
 }
 
 #[test]
-fn a_row_that_json_cannot_hold_is_refused_before_it_is_written() {
+fn a_row_with_nan_is_rejected_before_it_is_written() {
     let parent = tempfile::tempdir().unwrap();
     let run = new_run(&parent);
     assert!(run.append_evaluation(&row(1, f64::NAN)).is_err());
@@ -107,7 +107,7 @@ fn a_row_that_json_cannot_hold_is_refused_before_it_is_written() {
 }
 
 #[test]
-fn best_is_the_highest_mean_return_and_latest_the_last_row() {
+fn best_has_the_highest_mean_return_and_latest_is_the_last_row() {
     let parent = tempfile::tempdir().unwrap();
     let run = new_run(&parent);
     let none = run.choose_policy(PolicyChoice::Best).unwrap_err();
@@ -120,11 +120,11 @@ fn best_is_the_highest_mean_return_and_latest_the_last_row() {
     assert_eq!(run.choose_policy(PolicyChoice::Latest).unwrap().version, 3);
     assert_eq!(run.choose_policy(PolicyChoice::Version(1)).unwrap().row, Some(row(1, -3.0)));
     let missing = run.choose_policy(PolicyChoice::Version(9)).unwrap_err();
-    assert!(missing.to_string().contains("kept: 1, 2, 3"), "{missing}");
+    assert!(missing.to_string().contains("saved: 1, 2, 3"), "{missing}");
 }
 
 #[test]
-fn pruning_keeps_best_latest_named_and_not_yet_evaluated_policies() {
+fn pruning_keeps_best_latest_checkpointed_and_unevaluated_policies() {
     let parent = tempfile::tempdir().unwrap();
     let run = new_run(&parent);
     for version in 1..=6 {
@@ -140,7 +140,7 @@ fn pruning_keeps_best_latest_named_and_not_yet_evaluated_policies() {
 }
 
 #[test]
-fn rewinding_forgets_what_came_after_the_checkpoint_and_keeps_the_rest_byte_for_byte() {
+fn rewinding_removes_rows_after_the_checkpoint_and_keeps_the_rest_unchanged() {
     let parent = tempfile::tempdir().unwrap();
     let run = new_run(&parent);
     fs::write(
@@ -156,35 +156,36 @@ fn rewinding_forgets_what_came_after_the_checkpoint_and_keeps_the_rest_byte_for_
     assert_eq!(run.evaluations().unwrap(), [row(1, -3.0)]);
 }
 
-/// Learners that were killed while they cut the curve back left their half of it for good.
+/// Processes that were killed while they rewrote a file used to leave a temporary file for good.
 #[test]
-fn what_killed_writers_left_beside_their_files_is_removed_and_nothing_else() {
+fn only_temporary_files_of_killed_writers_are_removed() {
     let parent = tempfile::tempdir().unwrap();
     let run = new_run(&parent);
     let checkpoints = run.checkpoints_path();
     fs::create_dir(checkpoints.join(".000002.tmp")).unwrap();
-    let left = ["evaluations.tmp21405", "segments.tmp", "policies/12.tmp", "checkpoints/best.tmp7"];
+    let temporary =
+        ["evaluations.tmp21405", "segments.tmp", "policies/12.tmp", "checkpoints/best.tmp7"];
     let kept = ["policies/12.safetensors", "evaluations.jsonl", "segments.log", "my.tmpfile"];
-    for name in left.iter().chain(&kept) {
+    for name in temporary.iter().chain(&kept) {
         fs::write(run.path().join(name), "").unwrap();
     }
     std::os::unix::fs::symlink("nowhere", checkpoints.join(".latest.tmp")).unwrap();
     run.remove_half_written().unwrap();
-    let is_there = |name: &&&str| run.path().join(name).symlink_metadata().is_ok();
-    assert_eq!(left.iter().filter(is_there).count(), 0);
-    assert_eq!(kept.iter().filter(is_there).count(), kept.len());
+    let exists = |name: &&&str| run.path().join(name).symlink_metadata().is_ok();
+    assert_eq!(temporary.iter().filter(exists).count(), 0);
+    assert_eq!(kept.iter().filter(exists).count(), kept.len());
     assert!(checkpoints.join(".latest.tmp").symlink_metadata().is_err());
     assert!(checkpoints.join(".000002.tmp").is_dir());
 }
 
 #[test]
-fn two_trainers_of_one_run_are_one_too_many() {
+fn a_second_trainer_of_a_run_is_rejected() {
     let parent = tempfile::tempdir().unwrap();
     let run = new_run(&parent);
     let held = run.lock(Duration::ZERO).unwrap();
     let error = run.lock(Duration::ZERO).unwrap_err().to_string();
     assert!(error.contains(&format!("process {}", std::process::id())), "{error}");
     drop(held);
-    // A process that another test starts at this moment may hold the descriptor a while longer.
+    // A process that another test starts concurrently may hold the descriptor a while longer.
     run.lock(Duration::from_secs(60)).unwrap();
 }

@@ -1,4 +1,4 @@
-//! The sweep file: TOML, without unknown keys.
+//! Parses the sweep file, a TOML file in which unknown keys are errors.
 
 use std::path::Path;
 
@@ -8,7 +8,7 @@ use toml::{Table, Value};
 use super::Search;
 use crate::failure::wrong_use;
 
-/// Size limit of a sweep file, which has a few kilobytes.
+/// Maximum size of a sweep file, which usually has a few kilobytes.
 const FILE_BYTES_MAX: u64 = 1 << 20;
 
 /// A sweep: every task with every method, at every point of the grid or of a search, with every
@@ -124,21 +124,21 @@ pub fn flatten(table: &Table) -> Vec<(String, Value)> {
 mod tests {
     use super::*;
 
-    const LEAST: &str = "seeds = [1]\n[[task]]\nname = 'reacher'\n";
+    const MINIMAL: &str = "seeds = [1]\n[[task]]\nname = 'reacher'\n";
 
     #[test]
-    fn the_least_file_runs_the_defaults() {
-        let file = SweepFile::parse(LEAST).unwrap();
+    fn the_minimal_file_runs_the_defaults() {
+        let file = SweepFile::parse(MINIMAL).unwrap();
         assert_eq!(file.methods.len(), 1);
         assert_eq!(file.methods[0].name, "default");
     }
 
     #[test]
-    fn nested_and_dotted_keys_say_the_same() {
+    fn nested_and_dotted_keys_are_equivalent() {
         let nested = "[set.algorithm]\nbatch_size = 64\n[set.dmp]\nalpha_y = 9.0\n";
         let dotted = "[set]\n'algorithm.batch_size' = 64\ndmp.alpha_y = 9.0\n";
         let leaves = [nested, dotted].map(|set| {
-            let mut leaves = flatten(&SweepFile::parse(&format!("{LEAST}{set}")).unwrap().set);
+            let mut leaves = flatten(&SweepFile::parse(&format!("{MINIMAL}{set}")).unwrap().set);
             leaves.sort_by(|a, b| a.0.cmp(&b.0));
             leaves
         });
@@ -147,16 +147,16 @@ mod tests {
     }
 
     #[test]
-    fn what_is_missing_or_misspelt_is_named() {
+    fn errors_name_the_missing_or_misspelt_key() {
         let refused = |text: &str| SweepFile::parse(text).unwrap_err();
         assert!(refused("seeds = []\n[[task]]\nname = 'a'").contains("seeds"));
         assert!(refused("seeds = [1]\ntask = []").contains("[[task]]"));
-        assert!(refused(&format!("{LEAST}step = 5")).contains("step"));
-        assert!(refused(&format!("{LEAST}[grid]\nrun.steps = 5")).contains("grid.run.steps"));
-        assert!(refused(&format!("{LEAST}[grid]\nrun.steps = []")).contains("grid.run.steps"));
+        assert!(refused(&format!("{MINIMAL}step = 5")).contains("step"));
+        assert!(refused(&format!("{MINIMAL}[grid]\nrun.steps = 5")).contains("grid.run.steps"));
+        assert!(refused(&format!("{MINIMAL}[grid]\nrun.steps = []")).contains("grid.run.steps"));
         let search = "[search]\ntrials = 2\nspace = { dmp.alpha_y = [9.0] }\n";
-        assert!(SweepFile::parse(&format!("{LEAST}{search}")).unwrap().search.is_some());
-        let both = refused(&format!("{LEAST}[grid]\ndmp.alpha_y = [9.0]\n{search}"));
+        assert!(SweepFile::parse(&format!("{MINIMAL}{search}")).unwrap().search.is_some());
+        let both = refused(&format!("{MINIMAL}[grid]\ndmp.alpha_y = [9.0]\n{search}"));
         assert!(both.contains("[grid] and [search]"), "{both}");
     }
 }

@@ -11,7 +11,7 @@ use serde::{Deserialize, Serialize};
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Finished {
-    /// Its directory, relative to the sweep's.
+    /// Run directory, relative to the sweep's.
     pub run: PathBuf,
     /// Configured number of environment steps.
     pub steps: u64,
@@ -31,7 +31,7 @@ pub enum End {
     /// It completed its steps or reached its goal.
     #[default]
     Finished,
-    /// A search has pruned its trial.
+    /// A search pruned its trial.
     Pruned,
 }
 
@@ -80,7 +80,7 @@ impl Ledger {
         let whole = text.rfind('\n').map_or("", |end| &text[..end]);
         let finished = whole.lines().enumerate().map(|(index, line)| {
             serde_json::from_str(line)
-                .with_context(|| format!("{}, line {}: no finished run", path.display(), index + 1))
+                .with_context(|| format!("{}, line {}: invalid entry", path.display(), index + 1))
         });
         let finished = finished.collect::<anyhow::Result<_>>()?;
         Ok(Self { path, finished })
@@ -92,7 +92,7 @@ impl Ledger {
         self.finished.iter().rev().find(|finished| finished.run == run)
     }
 
-    /// Adds an entry, first on disk.
+    /// Adds an entry, to the file first.
     ///
     /// # Errors
     /// The file system fails.
@@ -128,7 +128,7 @@ mod tests {
     }
 
     #[test]
-    fn what_was_added_is_read_back_and_a_torn_line_costs_only_itself() {
+    fn added_entries_are_read_back_and_a_partial_line_is_ignored() {
         let folder = tempfile::tempdir().unwrap();
         let mut ledger = Ledger::open(folder.path()).unwrap();
         assert_eq!(ledger.of(Path::new("a")), None);
@@ -160,7 +160,7 @@ mod tests {
     }
 
     #[test]
-    fn a_whole_line_that_is_no_entry_is_named() {
+    fn an_invalid_line_is_reported_with_its_number() {
         let folder = tempfile::tempdir().unwrap();
         std::fs::write(folder.path().join("finished.jsonl"), "{}\n").unwrap();
         let error = format!("{:#}", Ledger::open(folder.path()).unwrap_err());

@@ -1,5 +1,5 @@
-//! The files of a sweep: what was asked for, its plan of runs, what has finished, and the trials of
-//! a search. Sweeps write them; sweeps and reports read them.
+//! The files of a sweep: the sweep file, the plan of its runs, the list of finished runs, and the
+//! trials of a search. Sweeps write them; sweeps and reports read them.
 
 mod file;
 mod ledger;

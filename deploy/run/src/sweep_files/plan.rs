@@ -1,4 +1,4 @@
-//! Expands a sweep file into single runs.
+//! Expands a sweep file into its runs.
 
 use std::collections::BTreeSet;
 use std::path::PathBuf;
@@ -10,7 +10,7 @@ use super::file::{MethodEntry, TaskEntry, flatten};
 use crate::failure::wrong_use;
 use crate::safe_name;
 
-/// Maximum number of runs. More is a mistake in the file.
+/// Maximum number of runs. A larger number is a mistake in the file.
 const RUNS_MAX: usize = 10_000;
 
 /// One run of a sweep.
@@ -63,17 +63,18 @@ impl Plan {
         for &seed in &file.seeds {
             for task in &file.tasks {
                 for method in &file.methods {
-                    runs.extend(points.iter().map(|at| planned(file, (task, method), at, seed)));
+                    let run = |point| planned(file, task, method, point, seed);
+                    runs.extend(points.iter().map(run));
                 }
             }
         }
-        let mut places = BTreeSet::new();
+        let mut directories = BTreeSet::new();
         for run in &runs {
-            if !places.insert(&run.directory) {
-                let place = run.directory.display();
+            if !directories.insert(&run.directory) {
+                let directory = run.directory.display();
                 return Err(wrong_use(format!(
-                    "two runs of the sweep have the path {place}: give each task, method, seed \
-                     and value once"
+                    "two runs of the sweep have the path {directory}: list each task, method, \
+                     seed and value only once"
                 )));
             }
         }
@@ -107,11 +108,12 @@ fn points(file: &SweepFile) -> Vec<Point> {
 
 fn planned(
     file: &SweepFile,
-    (task, method): (&TaskEntry, &MethodEntry),
+    task: &TaskEntry,
+    method: &MethodEntry,
     point: &Point,
     seed: i64,
 ) -> PlannedRun {
-    let mut arguments = arguments(file, (task, method), point);
+    let mut arguments = arguments(file, task, method, point);
     arguments.extend(["--seed".to_owned(), seed.to_string()]);
     let mut directory = method_directory(task, method);
     if !point.is_empty() {
@@ -133,7 +135,8 @@ fn planned(
 /// Arguments of `dmprl train`, without seed and run directory.
 pub(super) fn arguments(
     file: &SweepFile,
-    (task, method): (&TaskEntry, &MethodEntry),
+    task: &TaskEntry,
+    method: &MethodEntry,
     point: &[(String, Value)],
 ) -> Vec<String> {
     let mut arguments = vec![task.name.clone()];
@@ -186,7 +189,7 @@ mod tests {
     }
 
     #[test]
-    fn every_combination_is_there_once_and_first_seeds_come_first() {
+    fn each_combination_runs_once_ordered_by_seed() {
         let runs = plan(FILE).unwrap().runs;
         assert_eq!(runs.len(), 2 * 2 * 2 * 2);
         assert!(runs[..8].iter().all(|run| run.seed == 1));
@@ -209,7 +212,7 @@ mod tests {
     }
 
     #[test]
-    fn runs_in_the_same_place_are_refused() {
+    fn runs_with_the_same_directory_are_rejected() {
         let error = plan(&FILE.replace("[1, 2]", "[1, 1]")).unwrap_err().to_string();
         assert!(error.contains("seed-1"), "{error}");
         let error = plan(&FILE.replace("'mlp'\n        policy", "'paper'\n        policy"));
@@ -217,7 +220,7 @@ mod tests {
     }
 
     #[test]
-    fn a_grid_without_end_is_refused() {
+    fn a_grid_that_is_too_large_is_rejected() {
         let many: Vec<String> = (0..200).map(|value| value.to_string()).collect();
         let grid = format!("a.b = [{0}]\nc.d = [{0}]", many.join(","));
         let error = plan(&FILE.replace("algorithm.batch_size = [64, 128]", &grid));

@@ -1,4 +1,4 @@
-//! `[search]` of a sweep file.
+//! Parses the table `[search]` of a sweep file.
 
 use dmprl_shared::supervision::EvaluationRow;
 use serde::{Deserialize, Serialize};
@@ -6,9 +6,9 @@ use toml::Table;
 
 use super::space::{self, Parameter};
 
-/// Maximum number of trials. More is a mistake in the file.
+/// Maximum number of trials. A larger number is a mistake in the file.
 const TRIALS_MAX: u32 = 10_000;
-/// The same as Optuna's default.
+/// Default of `prune_after_trials`; the same as Optuna's.
 const PRUNE_AFTER_TRIALS: u32 = 5;
 
 /// Objective of a search: the mean over a trial's last evaluations, which is maximised.
@@ -23,7 +23,7 @@ pub enum Objective {
 }
 
 impl Objective {
-    /// Value of one evaluation; `None` if the task does not report success.
+    /// Returns the value of an evaluation; `None` if the task does not report success.
     #[must_use]
     pub fn of(self, row: &EvaluationRow) -> Option<f64> {
         match self {
@@ -32,7 +32,7 @@ impl Objective {
         }
     }
 
-    /// Name of the objective in the file.
+    /// Returns the objective's name in the file.
     #[must_use]
     pub fn name(self) -> &'static str {
         match self {
@@ -124,7 +124,7 @@ impl TryFrom<Entry> for Search {
             entry.first.iter().map(|table| space::point(&space, table)).collect();
         let first = first?;
         if let Some(index) = first.iter().position(Table::is_empty) {
-            return Err(format!("search.first, entry {}: it has no values", index + 1));
+            return Err(format!("search.first, entry {}: no values", index + 1));
         }
         Ok(Self {
             trials,
@@ -143,11 +143,11 @@ impl TryFrom<Entry> for Search {
 mod tests {
     use super::*;
 
-    const LEAST: &str = "trials = 4\nspace = { dmp.alpha_y = [9.0, 25.0] }\n";
+    const MINIMAL: &str = "trials = 4\nspace = { dmp.alpha_y = [9.0, 25.0] }\n";
 
     #[test]
-    fn the_least_table_has_defaults() {
-        let search: Search = toml::from_str(LEAST).unwrap();
+    fn the_minimal_table_has_defaults() {
+        let search: Search = toml::from_str(MINIMAL).unwrap();
         assert_eq!(
             (search.objective, search.sampler, search.pruner, search.prune_after_trials),
             (Objective::Return, Sampler::Tpe, Pruner::Median, 5)
@@ -155,15 +155,15 @@ mod tests {
     }
 
     #[test]
-    fn what_is_wrong_is_named() {
+    fn errors_name_the_wrong_key_or_value() {
         for (text, words) in [
-            (LEAST.replace("4", "0"), "search.trials = 0"),
-            (LEAST.replace("trials", "trails"), "trails"),
-            (format!("sampler = 'cma'\n{LEAST}"), "cma"),
-            (format!("pruner = 'mean'\n{LEAST}"), "mean"),
-            (format!("objective = 'loss'\n{LEAST}"), "loss"),
-            (format!("{LEAST}[[first]]\ndmp.alpha_y = 1.0"), "search.first.dmp.alpha_y"),
-            (format!("{LEAST}[[first]]\n"), "no values"),
+            (MINIMAL.replace("4", "0"), "search.trials = 0"),
+            (MINIMAL.replace("trials", "trails"), "trails"),
+            (format!("sampler = 'cma'\n{MINIMAL}"), "cma"),
+            (format!("pruner = 'mean'\n{MINIMAL}"), "mean"),
+            (format!("objective = 'loss'\n{MINIMAL}"), "loss"),
+            (format!("{MINIMAL}[[first]]\ndmp.alpha_y = 1.0"), "search.first.dmp.alpha_y"),
+            (format!("{MINIMAL}[[first]]\n"), "no values"),
         ] {
             let error = toml::from_str::<Search>(&text).unwrap_err().to_string();
             assert!(error.contains(words), "{text}: {error}");

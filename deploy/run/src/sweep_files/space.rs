@@ -1,4 +1,4 @@
-//! The search space: configuration keys, each with a range or a choice of values.
+//! The search space: configuration keys, each with a range or a list of values.
 
 use dmprl_shared::config::{ExperimentConfig, Layers};
 use serde_json::json;
@@ -6,7 +6,7 @@ use toml::{Table, Value};
 
 use super::file::flatten;
 
-/// Sections that must be the same for all trials, so that their results are comparable.
+/// Tables that must be the same for all trials, so that their results are comparable.
 const NOT_SEARCHED: [&str; 3] = ["run", "task", "evaluation"];
 /// Keys of a range.
 const RANGE_KEYS: [&str; 3] = ["low", "high", "log"];
@@ -29,7 +29,7 @@ pub enum Domain {
         low: f64,
         /// Upper bound.
         high: f64,
-        /// Samples the logarithm uniformly if true.
+        /// If true, samples the logarithm uniformly.
         log: bool,
     },
     /// Integers from `low` to `high`, inclusive, for a key that holds an integer.
@@ -38,7 +38,7 @@ pub enum Domain {
         low: i64,
         /// Upper bound.
         high: i64,
-        /// Samples the logarithm uniformly if true.
+        /// If true, samples the logarithm uniformly.
         log: bool,
     },
     /// One of these values, without an order.
@@ -46,8 +46,8 @@ pub enum Domain {
 }
 
 impl Domain {
-    /// The extreme values: the ends of a range, or each value of a choice. If these are valid, all
-    /// values are.
+    /// Returns the extreme values: the ends of a range, or all values of a list. If these are
+    /// valid, all values are.
     #[must_use]
     pub fn extremes(&self) -> Vec<Value> {
         match self {
@@ -57,7 +57,7 @@ impl Domain {
         }
     }
 
-    /// Short description of the values.
+    /// Describes the values in a few words.
     #[must_use]
     pub fn words(&self) -> String {
         let scale = |log: bool| if log { ", logarithmic" } else { "" };
@@ -65,14 +65,14 @@ impl Domain {
             Self::Float { low, high, log } => {
                 format!("{} to {}{}", Value::Float(*low), Value::Float(*high), scale(*log))
             }
-            Self::Integer { low, high, log } => format!("{low} to {high}, whole{}", scale(*log)),
+            Self::Integer { low, high, log } => format!("{low} to {high}, integers{}", scale(*log)),
             Self::Choice(values) => {
                 values.iter().map(ToString::to_string).collect::<Vec<_>>().join(" or ")
             }
         }
     }
 
-    /// Converts a value of Optuna.
+    /// Converts a value that Optuna suggested.
     pub(super) fn value(&self, json: &serde_json::Value) -> Option<Value> {
         match self {
             Self::Float { .. } => json.as_f64().map(Value::Float),
@@ -98,7 +98,7 @@ impl Domain {
 }
 
 impl Parameter {
-    /// The parameter in the format of `dmprl.search`.
+    /// Formats the parameter for `dmprl.search`.
     pub(super) fn json(&self) -> serde_json::Value {
         let key = &self.key;
         match &self.domain {
@@ -137,7 +137,7 @@ pub(super) fn parse(space: &Table) -> Result<Vec<Parameter>, String> {
         let Some((_, default)) = defaults.iter().find(|(known, _)| *known == key) else {
             let unknown = Layers::new().set("search.space", &key, "0").err();
             return Err(unknown.map_or_else(
-                || refused("a table of keys, expected one key".to_owned()),
+                || refused("a table of keys; expected a single key".to_owned()),
                 |error| error.to_string(),
             ));
         };
@@ -148,7 +148,7 @@ pub(super) fn parse(space: &Table) -> Result<Vec<Parameter>, String> {
         let domain = match &value {
             Value::Array(values) => choice(values),
             Value::Table(range) => self::range(range, default),
-            other => Err(format!("{other}, expected {{ low, high }} or a list of values")),
+            other => Err(format!("{other}; expected {{ low, high }} or a list of values")),
         };
         parameters.push(Parameter { domain: domain.map_err(refused)?, key });
     }
@@ -177,7 +177,7 @@ fn entries(table: &Table) -> Vec<(String, Value)> {
 
 fn choice(values: &[Value]) -> Result<Domain, String> {
     let Some(first) = values.first() else {
-        return Err("an empty list, expected the values to choose from".to_owned());
+        return Err("an empty list; expected at least one value".to_owned());
     };
     if let Some(other) = values.iter().find(|value| !value.same_type(first)) {
         let types = (first.type_str(), other.type_str());
@@ -196,14 +196,14 @@ fn choice(values: &[Value]) -> Result<Domain, String> {
 
 fn range(range: &Table, default: &Value) -> Result<Domain, String> {
     if let Some(key) = range.keys().find(|key| !RANGE_KEYS.contains(&key.as_str())) {
-        return Err(format!("unknown key `{key}`, expected low, high and log"));
+        return Err(format!("unknown key `{key}`; expected low, high and log"));
     }
     let log = match range.get("log") {
         None => false,
         Some(Value::Boolean(log)) => *log,
-        Some(other) => return Err(format!("log = {other}, expected true or false")),
+        Some(other) => return Err(format!("log = {other}; expected true or false")),
     };
-    let end = |name: &str| range.get(name).ok_or_else(|| format!("it has no `{name}`"));
+    let end = |name: &str| range.get(name).ok_or_else(|| format!("no `{name}`"));
     let (low, high) = (end("low")?, end("high")?);
     let number = |value: &Value| match value {
         Value::Integer(number) => Some(*number as f64),
@@ -226,9 +226,9 @@ fn range(range: &Table, default: &Value) -> Result<Domain, String> {
             Ok(Domain::Integer { low: *low, high: *high, log })
         }
         (Value::Integer(_), ..) => {
-            Err(format!("low = {low}, high = {high}; the key holds an integer, so must these be"))
+            Err(format!("low = {low}, high = {high}; expected integers, as the key's type"))
         }
-        _ => Err(format!("the key holds no number ({default}): give a list of values")),
+        _ => Err(format!("the key is not a number ({default}); expected a list of values")),
     }
 }
 
@@ -238,7 +238,7 @@ pub(super) fn point(parameters: &[Parameter], table: &Table) -> Result<Table, St
     for (key, value) in flatten(table) {
         let parameter = parameters.iter().find(|parameter| parameter.key == key);
         let parameter =
-            parameter.ok_or_else(|| format!("search.first.{key}: it is not in search.space"))?;
+            parameter.ok_or_else(|| format!("search.first.{key}: not in search.space"))?;
         let value = parameter.domain.contains(&value).ok_or_else(|| {
             format!("search.first.{key} = {value}: expected {}", parameter.domain.words())
         })?;
@@ -256,7 +256,7 @@ mod tests {
     }
 
     #[test]
-    fn a_range_has_the_type_of_its_key_and_a_choice_its_own() {
+    fn a_range_has_the_type_of_its_key_and_a_list_that_of_its_values() {
         let parameters = space(
             "'algorithm.critic_learning_rate' = { low = 1e-4, high = 1, log = true }
              dmp.basis_count = { low = 3, high = 7 }
@@ -301,8 +301,8 @@ mod tests {
             ("dmp.alpha_y = []", "an empty list"),
             ("dmp.alpha_y = [1.0, 'a']", "one type"),
             ("dmp.alpha_y = [1.0, 1.0]", "twice"),
-            ("dmp.basis_count = { low = 1.5, high = 3 }", "holds an integer"),
-            ("exploration.kind = { low = 1, high = 3 }", "holds no number"),
+            ("dmp.basis_count = { low = 1.5, high = 3 }", "expected integers"),
+            ("exploration.kind = { low = 1, high = 3 }", "is not a number"),
         ] {
             let error = space(text).unwrap_err();
             assert!(error.contains(words), "{text}: {error}");
@@ -310,7 +310,7 @@ mod tests {
     }
 
     #[test]
-    fn a_first_point_lies_in_the_space() {
+    fn first_points_outside_the_space_are_rejected() {
         let parameters =
             space("dmp.alpha_y = { low = 1, high = 9 }\nexploration.kind = ['pink']").unwrap();
         let point = |text: &str| point(&parameters, &text.parse().unwrap());

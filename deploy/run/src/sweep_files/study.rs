@@ -1,4 +1,4 @@
-//! A study: one task with one method, and the trials of a search.
+//! A study: the trials of a search for one task and one method.
 
 use std::path::{Path, PathBuf};
 
@@ -16,10 +16,9 @@ use super::{PlannedRun, SweepFile};
 use crate::failure::wrong_use;
 use crate::replace_file;
 
-/// `evaluation.first_seed` of a search. If it used the final evaluation's own seeds, from 1000 on,
-/// the selected values would overfit to their episodes.
+/// `evaluation.first_seed` of a search. With the final evaluation's own seeds, from 1000 on, the
+/// selected values would overfit to its episodes.
 pub const TUNING_SEED: u64 = 5_000;
-/// Key of the first seed.
 const FIRST_SEED: &str = "evaluation.first_seed";
 
 /// A task with a method, and its trials.
@@ -33,7 +32,7 @@ pub struct Study {
     pub directory: PathBuf,
     /// `run.seed` of each run of a trial.
     pub seeds: Vec<i64>,
-    /// Configuration of a run without the searched keys; all trials have the same length.
+    /// Configuration of a run without the searched keys. All trials have the same length.
     pub base: ExperimentConfig,
     /// Trials, by number.
     pub trials: Vec<Trial>,
@@ -47,8 +46,8 @@ impl Study {
     /// - `configure`: returns the configuration for arguments of `dmprl train`.
     ///
     /// # Errors
-    /// Errors of `train`, with the searched key; evaluation on the final evaluation's seeds; two
-    /// studies with the same directory.
+    /// The errors of `train`, with the searched key; an evaluation on the final evaluation's seeds;
+    /// two studies with the same directory.
     pub fn all(
         file: &SweepFile,
         search: &Search,
@@ -57,34 +56,34 @@ impl Study {
         let mut studies: Vec<Self> = Vec::new();
         for task in &file.tasks {
             for method in &file.methods {
-                let mut words = arguments(file, (task, method), &[]);
+                let mut words = arguments(file, task, method, &[]);
                 // First, so that the file can override it.
                 words.splice(1..1, set(FIRST_SEED, &(TUNING_SEED as i64).into()));
                 let method_name = method.label.clone().unwrap_or_else(|| method.name.clone());
                 let title = format!("{} · {method_name}", task.name);
-                let told = |what: &str, error: anyhow::Error| {
+                let rejected = |what: &str, error: anyhow::Error| {
                     wrong_use(format!("{title}{what}: {error:#}"))
                 };
-                let base = configure(&words).map_err(|error| told("", error))?;
+                let base = configure(&words).map_err(|error| rejected("", error))?;
                 let first_seed = base.evaluation.first_seed;
                 if first_seed < TUNING_SEED {
                     return Err(wrong_use(format!(
-                        "{title}: {FIRST_SEED} = {first_seed}: a search evaluates on seeds from \
-                         {TUNING_SEED} on, so that nothing is tuned to the episodes of the \
-                         evaluation's own; leave it out"
+                        "{title}: {FIRST_SEED} = {first_seed}: expected at least {TUNING_SEED}, \
+                         so that the search is not tuned to the episodes of the final \
+                         evaluation; remove the key"
                     )));
                 }
                 for (parameter, value) in values(search) {
                     let setting = set(&parameter.key, &value);
                     let words: Vec<_> = words.iter().cloned().chain(setting).collect();
                     let what = format!(", search.space.{} at {value}", parameter.key);
-                    configure(&words).map_err(|error| told(&what, error))?;
+                    configure(&words).map_err(|error| rejected(&what, error))?;
                 }
                 let directory = method_directory(task, method);
                 if studies.iter().any(|study| study.directory == directory) {
-                    let place = directory.display();
                     return Err(wrong_use(format!(
-                        "{place}: give each task and method a name of its own"
+                        "two studies have the path {}: give each task and method a different name",
+                        directory.display()
                     )));
                 }
                 studies.push(Self {
@@ -101,18 +100,18 @@ impl Study {
         let mut seeds = file.seeds.clone();
         seeds.sort_unstable();
         if seeds.windows(2).any(|pair| pair[0] == pair[1]) {
-            return Err(wrong_use("seeds: give each once"));
+            return Err(wrong_use("seeds: list each seed only once"));
         }
         Ok(studies)
     }
 
-    /// Name of the study in Optuna's storage.
+    /// Returns the study's name in Optuna's storage.
     #[must_use]
     pub fn name(&self) -> String {
         self.directory.display().to_string()
     }
 
-    /// Short title.
+    /// Formats the study's task and method.
     #[must_use]
     pub fn title(&self) -> String {
         format!("{} · {}", self.task, self.method)
@@ -135,13 +134,13 @@ impl Study {
         }
     }
 
-    /// Environment steps of a complete trial.
+    /// Returns the environment steps of a complete trial.
     #[must_use]
     pub fn trial_steps(&self) -> u64 {
         self.base.run.steps.saturating_mul(self.seeds.len() as u64)
     }
 
-    /// Number of evaluations of one run; the last one follows the last step.
+    /// Returns the number of evaluations of a run; the last one follows the last step.
     fn evaluations_max(&self) -> u64 {
         self.base.run.steps.div_ceil(self.base.evaluation.interval_steps.max(1)).max(1)
     }
@@ -158,7 +157,7 @@ impl Study {
         seed as u64 * count + number
     }
 
-    /// The settings that all its trials share, without which they are not comparable.
+    /// Returns the settings that all trials must share to be comparable.
     fn identity(&self, search: &Search) -> serde_json::Value {
         json!({
             "space": space_json(&search.space), "objective": search.objective,
@@ -166,7 +165,7 @@ impl Study {
         })
     }
 
-    /// The request that opens this study in `dmprl.search`.
+    /// Returns the request that opens this study in `dmprl.search`.
     pub fn opening(&self, search: &Search) -> serde_json::Value {
         let first = |table: &Table| {
             let value = |(key, value)| (key, super::space::as_json(&value));
@@ -181,13 +180,13 @@ impl Study {
         })
     }
 
-    /// Rejects a storage that was created for other settings.
+    /// Rejects a storage that was created with other settings.
     pub fn check_identity(&self, search: &Search, found: &serde_json::Value) -> anyhow::Result<()> {
         let expected = self.identity(search);
         for key in ["space", "objective", "seeds", "steps"] {
             anyhow::ensure!(
                 expected[key] == found[key],
-                "{}: its trials were made with {key} {}, the file has {}; name another --output",
+                "{}: its trials ran with {key} {}, but the file has {}; choose another --output",
                 self.title(),
                 found[key],
                 expected[key]
@@ -205,21 +204,21 @@ impl Study {
         Ok(())
     }
 
-    /// The finished trial with the greatest objective; the first of equals.
+    /// Returns the finished trial with the greatest objective; the first of equals.
     #[must_use]
     pub fn best(&self) -> Option<&Trial> {
         best_of(&self.trials)
     }
 
-    /// Path of the file that `Study::write_best` writes.
+    /// Returns the path of the file that `Study::write_best` writes.
     #[must_use]
     pub fn best_path(&self, output: &Path) -> PathBuf {
         output.join(&self.directory).join("best.toml")
     }
 
-    /// Writes the best trial's configuration for `dmprl train --config`. It omits the seed and the
-    /// evaluation's seeds, because the configuration should be trained anew and evaluated on other
-    /// seeds.
+    /// Writes the best trial's configuration for `dmprl train --config`. The file omits the seed
+    /// and the evaluation's seeds, because the configuration should be trained and evaluated on
+    /// other seeds.
     pub fn write_best(
         &self,
         output: &Path,
@@ -291,7 +290,7 @@ fn space_json(space: &[Parameter]) -> Vec<serde_json::Value> {
     space.iter().map(Parameter::json).collect()
 }
 
-/// All extreme values, one at a time.
+/// Returns all extreme values, one at a time.
 fn values(search: &Search) -> impl Iterator<Item = (&Parameter, Value)> {
     let extremes = |parameter: &Parameter| parameter.domain.extremes();
     search
@@ -366,7 +365,7 @@ mod tests {
     }
 
     #[test]
-    fn a_run_of_a_trial_has_its_values_and_the_tuning_seeds() {
+    fn a_trials_run_has_its_values_and_the_tuning_seeds() {
         let study = studies(FILE).unwrap().swap_remove(0);
         assert_eq!(study.base.evaluation.first_seed, TUNING_SEED);
         let run = study.run(&trial(7, TrialState::Running, None), 2);
@@ -380,14 +379,14 @@ mod tests {
     }
 
     #[test]
-    fn nobody_tunes_on_the_seeds_of_the_evaluation() {
+    fn tuning_on_the_seeds_of_the_final_evaluation_is_rejected() {
         let error = studies(&FILE.replace("interval_steps", "first_seed")).unwrap_err();
         assert!(error.to_string().contains("evaluation.first_seed = 1000"), "{error}");
         assert!(studies(&FILE.replace("interval_steps = 1000", "first_seed = 6000")).is_ok());
     }
 
     #[test]
-    fn a_value_that_train_refuses_is_named_with_its_key() {
+    fn a_value_that_train_rejects_is_reported_with_its_key() {
         let error = studies(&FILE.replace("'pink'", "'brown'")).unwrap_err().to_string();
         assert!(error.contains("search.space.exploration.kind at \"brown\""), "{error}");
         let error = studies(&FILE.replace("[1, 2]", "[2, 2]")).unwrap_err().to_string();
@@ -403,7 +402,7 @@ mod tests {
     }
 
     #[test]
-    fn the_best_is_the_greatest_of_the_finished() {
+    fn the_best_trial_has_the_greatest_objective_of_the_finished() {
         let mut study = studies(FILE).unwrap().swap_remove(0);
         assert_eq!(study.best(), None);
         study.trials = vec![
@@ -426,7 +425,7 @@ mod tests {
     }
 
     #[test]
-    fn another_search_in_the_same_place_is_refused() {
+    fn another_search_in_the_same_directory_is_rejected() {
         let file: SweepFile = toml::from_str(FILE).unwrap();
         let mut search = file.search.clone().unwrap();
         let study = Study::all(&file, &search, configure).unwrap().swap_remove(0);

@@ -15,18 +15,18 @@ use crate::replace_file;
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum TrialState {
-    /// Not ended yet.
+    /// It has not ended yet.
     Running,
     /// All its runs have finished.
     Finished,
-    /// Stopped early because of its evaluations.
+    /// It was stopped early because of its evaluations.
     Pruned,
     /// One of its runs failed.
     Failed,
 }
 
 impl TrialState {
-    /// Name of the state.
+    /// Returns the state's name.
     #[must_use]
     pub fn name(self) -> &'static str {
         match self {
@@ -43,7 +43,7 @@ impl TrialState {
 pub struct Trial {
     /// Optuna's number of the trial, from 0.
     pub number: u32,
-    /// Values by key.
+    /// Value of each searched key.
     pub values: Vec<(String, Value)>,
     /// State of the trial.
     pub state: TrialState,
@@ -51,7 +51,7 @@ pub struct Trial {
     pub objective: Option<f64>,
 }
 
-/// A trial as the search's storage has it.
+/// A trial in the search's storage.
 #[derive(Debug, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct StoredTrial {
@@ -59,7 +59,7 @@ pub struct StoredTrial {
     pub trial: u32,
     /// State of the trial.
     pub state: TrialState,
-    /// Values by key.
+    /// Value of each searched key.
     pub values: Map<String, serde_json::Value>,
     /// Mean over the seeds, once it has finished.
     pub objective: Option<f64>,
@@ -76,7 +76,7 @@ struct File {
 }
 
 impl Trial {
-    /// Creates a new trial.
+    /// Creates a running trial with the suggested values.
     pub fn new(
         space: &[Parameter],
         number: u32,
@@ -102,30 +102,30 @@ impl Trial {
         Ok(Self { state, objective, ..Self::new(space, trial, values)? })
     }
 
-    /// Name of its folder.
+    /// Returns the name of the trial's folder.
     #[must_use]
     pub fn folder(&self) -> String {
         format!("trial-{:03}", self.number)
     }
 
-    /// Values as `key=value`.
+    /// Formats the values as `key=value`.
     #[must_use]
     pub fn point(&self) -> Vec<String> {
         self.values.iter().map(|(key, value)| format!("{key}={value}")).collect()
     }
 
-    /// Values as JSON, by key.
+    /// Returns the values as JSON, by key.
     #[must_use]
     pub fn json_values(&self) -> Map<String, serde_json::Value> {
         self.values.iter().map(|(key, value)| (key.clone(), as_json(value))).collect()
     }
 
-    /// Arguments for `dmprl train` with these values, quoted for a shell.
+    /// Formats the values as arguments of `dmprl train`, quoted for a shell.
     #[must_use]
     pub fn set_line(&self) -> String {
         let plain = |letter: char| letter.is_ascii_alphanumeric() || "._-+=/".contains(letter);
         let setting = |(key, value): &(String, Value)| {
-            // `--set` reads a value that is no TOML as a string.
+            // `--set` reads a value that is not valid TOML as a string.
             let text = value.as_str().map_or_else(|| value.to_string(), str::to_owned);
             let pair = format!("{key}={text}");
             let quoted = format!("'{}'", pair.replace('\'', r"'\''"));
@@ -138,7 +138,7 @@ impl Trial {
     pub fn write(&self, study: &Path) -> anyhow::Result<()> {
         let folder = study.join(self.folder());
         std::fs::create_dir_all(&folder)
-            .with_context(|| format!("cannot make {}", folder.display()))?;
+            .with_context(|| format!("cannot create {}", folder.display()))?;
         let text = json!({
             "trial": self.number, "state": self.state, "values": self.json_values(),
             "objective": self.objective,
@@ -146,7 +146,8 @@ impl Trial {
         replace_file(&folder.join("trial.json"), format!("{text:#}\n").as_bytes())
     }
 
-    /// Reads every `trial.json` below a study's directory, by number; an absent directory has none.
+    /// Reads every `trial.json` in a study's directory, sorted by number; empty if the directory
+    /// does not exist.
     pub fn read_all(space: &[Parameter], study: &Path) -> anyhow::Result<Vec<Self>> {
         let Ok(entries) = std::fs::read_dir(study) else { return Ok(Vec::new()) };
         let mut trials = Vec::new();
@@ -173,7 +174,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_trial_is_read_back_and_its_set_line_is_what_a_shell_takes() {
+    fn a_trial_is_read_back_and_its_set_line_is_quoted_for_a_shell() {
         let space = parse(
             &"dmp.alpha_y = { low = 1, high = 9 }\nexploration.kind = ['gaussian', 'pink']\n\
               policy.hidden = [[32, 32], [64]]"

@@ -16,9 +16,9 @@ const CONTROL_GROUPS: &str = "/sys/fs/cgroup";
 pub struct Space {
     /// A directory in it.
     pub path: PathBuf,
-    /// Total size [bytes].
+    /// Total size \[bytes\].
     pub size_bytes: u64,
-    /// Space available to this user [bytes].
+    /// Space available to this user \[bytes\].
     pub free_bytes: u64,
 }
 
@@ -49,7 +49,7 @@ pub struct MachineLimits {
     pub maps: Option<u64>,
     /// Processes and threads of this user or container.
     pub tasks: Option<u64>,
-    /// Main memory, or the container's limit [bytes].
+    /// Main memory, or the container's limit \[bytes\].
     pub memory_bytes: Option<u64>,
 }
 
@@ -68,15 +68,15 @@ impl MachineLimits {
     }
 }
 
-/// This process's control group of version 2; empty with version 1 only.
+/// Returns this process's control group of version 2; empty if there is only version 1.
 fn own_group() -> String {
     let text = fs::read_to_string("/proc/self/cgroup").unwrap_or_default();
     let own = text.lines().find_map(|line| line.strip_prefix("0::/"));
     own.unwrap_or_default().to_owned()
 }
 
-/// Returns the smallest limit in `file` of the group and its ancestors. `max` is no number and sets
-/// no limit. In a container the own group is the root.
+/// Returns the smallest limit in `file` of the group and its ancestors. The value `max` means no
+/// limit. In a container, the process's own group is the root.
 fn control_group_min(root: &Path, group: &str, file: &str) -> Option<u64> {
     let own = root.join(group);
     let groups = own.ancestors().take_while(|path| path.starts_with(root));

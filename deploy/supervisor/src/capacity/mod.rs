@@ -1,6 +1,6 @@
 //! Checks that this machine has enough resources for a run.
 //!
-//! The check precedes the start of any process, because a shortage would end the run later, often
+//! The check runs before any process is started, because a shortage would end the run later, often
 //! without an explanation.
 
 mod machine;
@@ -17,8 +17,8 @@ use dmprl_run::format::binary_bytes;
 
 /// Rejects a run that exceeds this machine's resources.
 ///
-/// `spec` is `None` if only a worker can determine it. Then the smallest environment is assumed,
-/// and the learner later rejects one that is too large.
+/// `spec` is `None` if only a worker can determine it. In this case the smallest environment is
+/// assumed, and the learner later rejects one that is too large.
 ///
 /// # Errors
 /// The shortages, each with the required and the available amount and a remedy.
@@ -28,11 +28,11 @@ pub fn check(config: &ExperimentConfig, spec: Option<&EnvSpec>) -> anyhow::Resul
     if shortages.is_empty() {
         return Ok(());
     }
-    bail!("this machine cannot hold the run\n  {}", shortages.join("\n  "))
+    bail!("the run exceeds this machine's resources\n  {}", shortages.join("\n  "))
 }
 
 impl Need {
-    /// Counts its workers, as part of a sentence.
+    /// Formats the number of workers, as part of a sentence.
     pub fn counted(&self) -> String {
         let Self { workers, joined, remote, .. } = self;
         let mut counted = format!("{workers} worker{}", if *workers == 1 { "" } else { "s" });
@@ -123,7 +123,7 @@ mod tests {
     }
 
     #[test]
-    fn what_just_fits_is_not_refused() {
+    fn a_run_that_just_fits_is_accepted() {
         assert_eq!(NEED.shortages(&machine()), Vec::<String>::new());
         let unlimited = MachineLimits {
             shared_memory: None,

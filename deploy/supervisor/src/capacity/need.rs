@@ -10,7 +10,7 @@ use dmprl_shared::transport::shared_memory::required_bytes;
 const FILES: u64 = 64;
 /// Additional open files in the learner per worker, for its services [measured: 6].
 const FILES_PER_WORKER: u64 = 12;
-/// Memory maps of any process; CPython with MuJoCo needs most [measured: 400].
+/// Memory maps of any process; CPython with MuJoCo needs the most [measured: 400].
 const MAPS: u64 = 1_024;
 /// Additional memory maps in the learner per worker [measured: 4].
 const MAPS_PER_WORKER: u64 = 12;
@@ -30,9 +30,9 @@ pub struct Need {
     pub joined: u64,
     /// Workers of other hosts.
     pub remote: u64,
-    /// Shared memory of all processes [bytes]; 0 for a run in one process.
+    /// Shared memory of all processes \[bytes\]; 0 for a run in one process.
     pub shared_memory_bytes: u64,
-    /// Size of the replay at the end of the run [bytes].
+    /// Size of the replay at the end of the run \[bytes\].
     pub replay_bytes: u64,
     /// Open files of the process with the most.
     pub open_files: u64,
@@ -109,7 +109,7 @@ mod tests {
     }
 
     #[test]
-    fn the_largest_configuration_that_is_accepted_has_a_size() {
+    fn the_need_of_the_largest_configuration_does_not_overflow() {
         let largest = need(&[
             ("actors.workers", "1024"),
             ("actors.queue_segments", "65536"),

@@ -44,13 +44,12 @@ pub(super) fn advice(output: &str) -> String {
         }
         Cause::DiskFull => "The disk is full.\n".to_owned(),
         Cause::NoNetwork => "The package index cannot be reached. The first start downloads \
-             gymnasium, mujoco and numpy, the first search Optuna and the first video PyAV; later \
-             ones need no network. \
-             Behind a proxy set HTTPS_PROXY; without a network set PIP_FIND_LINKS to a directory \
-             of wheels and PIP_NO_INDEX=1\n"
+             gymnasium, mujoco and numpy, the first search Optuna, and the first video PyAV; later \
+             starts need no network. Behind a proxy, set HTTPS_PROXY. Without a network, set \
+             PIP_FIND_LINKS to a directory of wheels and PIP_NO_INDEX=1\n"
             .to_owned(),
         Cause::NoPackage => format!(
-            "A package is not there for Python {}, or only for another processor.\n",
+            "A package is not available for Python {} on this processor.\n",
             LINKED_PYTHON.version_number()
         ),
     }

@@ -21,8 +21,9 @@ use super::{advice::advice, environment::PythonEnvironment, stamp};
 const LAST_LINES_MAX: usize = 20;
 /// Interval between progress lines of a command that prints nothing.
 const PROGRESS_INTERVAL: Duration = Duration::from_secs(1);
-/// Maximum number of lines between the reading thread and the progress. Beyond, the command blocks.
-const LINES_AHEAD_MAX: usize = 256;
+/// Maximum number of lines queued between the reading thread and the progress. If the queue is
+/// full, the command blocks.
+const QUEUED_LINES_MAX: usize = 256;
 
 /// A set-up of `.venv` in progress.
 pub(super) struct Setup<'a> {
@@ -40,14 +41,13 @@ impl Setup<'_> {
         stamp::begin(&self.environment.venv)?;
         let mut command = Command::new(LINKED_PYTHON.executable);
         command.args(["-I", "-m", "venv"]).arg(&self.environment.venv);
-        let phase = format!("making .venv with Python {}", LINKED_PYTHON.version_number());
+        let phase = format!("creating .venv with Python {}", LINKED_PYTHON.version_number());
         self.run(&phase, command)
     }
 
     /// Installs the package and its requirements.
     ///
-    /// The installation is editable, a reference to `envs_py`. So a changed or added task takes
-    /// effect at the next start, and only changed requirements are installed again.
+    /// The installation is editable: it refers to `envs_py`, so changed tasks need no installation.
     pub fn install(&self, package: &Path) -> Result<()> {
         let package: [&OsStr; 2] = ["--editable".as_ref(), package.as_ref()];
         self.pip("installing packages", &package)
@@ -77,12 +77,12 @@ impl Setup<'_> {
     fn run(&self, phase: &str, mut command: Command) -> Result<()> {
         let started = Instant::now();
         let line = command_line(&command);
-        let (output, input) = io::pipe().context("no pipe")?;
+        let (output, input) = io::pipe().context("cannot create a pipe")?;
         command
-            // The empty lock file serves as empty input, and the command holds the lock until its
-            // own exit: if this program is killed, the next start waits.
+            // The lock file is empty, so it serves as empty input. The command thereby holds the
+            // lock until it exits: if this program is killed, the next start waits.
             .stdin(Stdio::from(self.lock.try_clone().context("cannot share the lock")?))
-            .stdout(input.try_clone().context("no pipe")?)
+            .stdout(input.try_clone().context("cannot share the pipe")?)
             .stderr(input);
         let mut child = command.spawn().with_context(|| format!("cannot run {line}"))?;
         drop(command); // it holds the pipe's writing end
@@ -98,8 +98,8 @@ impl Setup<'_> {
         started: Instant,
         output: impl BufRead + Send + 'static,
     ) -> VecDeque<String> {
-        let (sender, receiver) = mpsc::sync_channel(LINES_AHEAD_MAX);
-        // A thread reads, because reading a line has no timeout.
+        let (sender, receiver) = mpsc::sync_channel(QUEUED_LINES_MAX);
+        // Read in a thread, because reading a line has no timeout.
         let reader = thread::spawn(move || {
             for line in output.split(b'\n').map_while(Result::ok) {
                 if sender.send(String::from_utf8_lossy(&line).trim_end().to_owned()).is_err() {

@@ -14,7 +14,7 @@ use super::{Home, PythonEnvironment, command::Setup, locked};
 /// pip nor need a network.
 ///
 /// # Errors
-/// As [`Home::ensure`], or the package has no such part.
+/// See [`Home::ensure`]; also if the package has no part `extra`.
 pub fn ensure_extra(
     home: &Home,
     extra: &str,

@@ -11,8 +11,7 @@ use super::{LOCK, PACKAGE, PythonEnvironment, State, VENV, ensure, state};
 /// Location of the package `dmprl` and of an environment that can import it.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum Home {
-    /// The project's directory, with `envs_py` and `.venv`, which refers to it and is created on
-    /// demand.
+    /// The project's directory, with `envs_py` and `.venv`, which is created on demand.
     Clone(PathBuf),
     /// The environment into which pip installed program and package. Only requirements of optional
     /// parts are installed there.
@@ -24,9 +23,9 @@ impl Home {
     /// directory.
     ///
     /// # Errors
-    /// Neither exists, or this program's own file cannot be found.
+    /// Neither exists, or the path of this program cannot be found.
     pub fn find() -> Result<Self> {
-        let program = std::env::current_exe().context("cannot find this program's own file")?;
+        let program = std::env::current_exe().context("cannot find the path of this program")?;
         match installed(&program) {
             Some(environment) => Ok(Self::Installed(environment)),
             None => project::root().map(Self::Clone),
@@ -36,7 +35,7 @@ impl Home {
     /// Ensures that there is an environment that can import the package.
     ///
     /// # Errors
-    /// As [`ensure`].
+    /// See [`ensure`].
     pub fn ensure(&self, progress: &dyn Fn(&str)) -> Result<PythonEnvironment> {
         match self {
             Self::Clone(root) => ensure(root, progress),

@@ -1,11 +1,11 @@
 //! Stage 2 of 8: creates `.venv` and installs `envs_py` into it. Every command that needs
 //! environments calls it.
 //!
-//! The interpreter against which the program is linked creates the virtual environment: a package
-//! built for another Python may crash this one. A stamp, which is written last, records from what
-//! the environment was made. If it fits, [`ensure`] only reads two small files. A lock file
-//! serialises concurrent starts. A program that pip has installed is in an environment already
-//! ([`Home`]).
+//! The virtual environment is created with the interpreter against which the program is linked: a
+//! package built for another Python may crash this one. A stamp, which is written last, records the
+//! inputs of the environment. If it matches, [`ensure`] only reads two small files. A lock file
+//! serialises concurrent starts. If pip installed the program, it is in an environment already (see
+//! [`Home`]).
 
 mod advice;
 mod command;
@@ -35,9 +35,9 @@ pub use self::{
 
 /// Name of the virtual environment in the project's root.
 const VENV: &str = ".venv";
-/// Lock file beside `.venv`: it must outlive an environment that is created again.
+/// Lock file beside `.venv`: it must survive when `.venv` is recreated.
 const LOCK: &str = ".venv.lock";
-/// Maximum wait for the lock; an installation over a slow connection takes less.
+/// Maximum wait for the lock, longer than an installation over a slow connection takes.
 const LOCK_WAIT_MAX: Duration = Duration::from_secs(30 * 60);
 /// Interval between attempts to take the lock, each with a progress line.
 const LOCK_INTERVAL: Duration = Duration::from_millis(500);
@@ -52,12 +52,12 @@ const PACKAGE: &str = "envs_py";
 ///
 /// # Errors
 /// The last lines of the command that failed, and a remedy: which Debian package is missing, or
-/// that the package index is unreachable. A `.venv` that is no virtual environment is not touched.
+/// that the package index is unreachable. A `.venv` that is not a virtual environment is kept.
 pub fn ensure(project_root: &Path, progress: &dyn Fn(&str)) -> Result<PythonEnvironment> {
     let (root, wanted) = wanted(project_root)?;
     let package = root.join(PACKAGE);
     let environment = PythonEnvironment::of(root.join(VENV));
-    // No lock is needed to read the stamp, which is written last and removed first.
+    // Reading the stamp needs no lock: it is written last and removed first.
     if wanted.compare(&environment.venv) == Fit::Ready {
         return Ok(environment);
     }
@@ -66,12 +66,12 @@ pub fn ensure(project_root: &Path, progress: &dyn Fn(&str)) -> Result<PythonEnvi
     match wanted.compare(&environment.venv) {
         Fit::Ready => return Ok(environment), // a concurrent start was faster
         Fit::OtherPackages => {
-            progress("python environment: envs_py/pyproject.toml has changed, installing again");
+            progress("python environment: envs_py/pyproject.toml has changed, reinstalling");
             stamp::remove(&environment.venv)?;
         }
         Fit::Absent => setup.create()?,
         Fit::Unusable(why) => {
-            progress(&format!("python environment: making .venv anew, {why}"));
+            progress(&format!("python environment: recreating .venv: {why}"));
             remove(&environment.venv)?;
             setup.create()?;
         }
@@ -144,7 +144,7 @@ fn locked(path: &Path, progress: &dyn Fn(&str)) -> Result<File> {
         thread::sleep(LOCK_INTERVAL);
     }
     bail!(
-        "another start has been making {VENV} for {} minutes; end it, or its pip, and start again",
+        "another process has been creating {VENV} for {} minutes; stop it, or its pip, and retry",
         LOCK_WAIT_MAX.as_secs() / 60
     )
 }
@@ -155,11 +155,11 @@ fn remove(venv: &Path) -> Result<()> {
     let is_empty = || fs::read_dir(venv).is_ok_and(|mut entries| entries.next().is_none());
     if !is_ours && !is_empty() {
         bail!(
-            "{} is not a virtual environment; move it away, dmprl keeps its own there",
+            "{} is not a virtual environment; move it away, as dmprl creates its own there",
             venv.display()
         );
     }
-    // The stamp goes first, so that an interrupted removal leaves no environment that looks
+    // Remove the stamp first: an interrupted removal must not leave an environment that looks
     // complete.
     stamp::remove(venv)?;
     fs::remove_dir_all(venv).with_context(|| format!("cannot remove {}", venv.display()))

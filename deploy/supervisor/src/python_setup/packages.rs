@@ -5,7 +5,7 @@ use dmprl_run::Packages;
 
 use crate::answer::answer;
 
-/// Prints the fields of [`Packages`] as JSON. It imports none of the packages: that takes seconds.
+/// Prints the fields of [`Packages`] as JSON. Importing the packages would take seconds.
 const QUESTION: &str = "\
 import hashlib, json, platform
 from importlib.metadata import PackageNotFoundError, version
@@ -43,7 +43,7 @@ print(json.dumps({
 /// # Errors
 /// The interpreter does not run, or does not answer in time.
 pub fn packages(python: &std::path::Path) -> Result<Packages> {
-    let cannot = || format!("cannot ask {} for its packages", python.display());
+    let cannot = || format!("cannot read the package versions of {}", python.display());
     let text = answer(python, &["-I", "-B", "-c", QUESTION])
         .map_err(|reason| anyhow!(reason))
         .with_context(cannot)?;

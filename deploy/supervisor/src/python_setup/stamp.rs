@@ -1,4 +1,5 @@
-//! Records in `.venv` from what it was made. The file is written last.
+//! A file in `.venv` that records its inputs: interpreter, project and requirements. It is written
+//! last.
 
 use std::{
     fs, io,
@@ -8,7 +9,7 @@ use std::{
 use anyhow::{Context, Result};
 use dmprl_actors::python_env::LinkedPython;
 
-/// Raised if the content of `.venv` changes for another reason than `pyproject.toml`.
+/// Must be increased if the content of `.venv` changes for another reason than `pyproject.toml`.
 const FORMAT: u32 = 1;
 const FILE: &str = "dmprl-stamp.txt";
 /// File that is written first. It marks a `.venv` whose creation was interrupted.
@@ -64,13 +65,13 @@ impl Stamp {
             let why = if venv.join(MAKING).exists() {
                 "the last attempt did not finish"
             } else {
-                "it was not made by dmprl"
+                "dmprl did not create it"
             };
             return Fit::Unusable(why.to_owned());
         };
         // `exists` follows the link, so it is false if that Python was uninstalled.
         if !venv.join("bin/python").exists() {
-            return Fit::Unusable("its interpreter is gone".to_owned());
+            return Fit::Unusable("its interpreter does not exist any more".to_owned());
         }
         if found == self.text() {
             return Fit::Ready;
@@ -81,7 +82,7 @@ impl Stamp {
         }
         let was = python.lines().zip(self.python.lines()).find(|(was, wanted)| was != wanted);
         let (was, wanted) = was.unwrap_or(("nothing", "something"));
-        Fit::Unusable(format!("it was made for {was}, needed is {wanted}"))
+        Fit::Unusable(format!("created for {was}, expected {wanted}"))
     }
 
     /// Marks a virtual environment as complete.
@@ -97,8 +98,8 @@ impl Stamp {
 /// Creates the directory, marked as incomplete.
 pub(super) fn begin(venv: &Path) -> Result<()> {
     fs::create_dir(venv)
-        .and_then(|()| fs::write(venv.join(MAKING), "dmprl is making this directory\n"))
-        .with_context(|| format!("cannot make {}", venv.display()))
+        .and_then(|()| fs::write(venv.join(MAKING), "dmprl is creating this directory\n"))
+        .with_context(|| format!("cannot create {}", venv.display()))
 }
 
 /// Marks a virtual environment as incomplete.
@@ -127,7 +128,7 @@ mod tests {
         library_dir: "/opt/a/lib",
     };
 
-    fn made() -> (tempfile::TempDir, PathBuf, Stamp) {
+    fn unfinished_venv() -> (tempfile::TempDir, PathBuf, Stamp) {
         let directory = tempfile::tempdir().unwrap();
         let venv = directory.path().join(".venv");
         begin(&venv).unwrap();
@@ -144,7 +145,7 @@ mod tests {
 
     #[test]
     fn incomplete_environment_is_not_ready() {
-        let (_directory, venv, stamp) = made();
+        let (_directory, venv, stamp) = unfinished_venv();
         assert_eq!(why(stamp.compare(&venv)), "the last attempt did not finish");
         stamp.write(&venv).unwrap();
         assert_eq!(stamp.compare(&venv), Fit::Ready);
@@ -154,15 +155,15 @@ mod tests {
 
     #[test]
     fn absent_and_foreign_environments_differ() {
-        let (_directory, venv, stamp) = made();
+        let (_directory, venv, stamp) = unfinished_venv();
         assert_eq!(stamp.compare(&venv.join("none")), Fit::Absent);
         fs::remove_file(venv.join(MAKING)).unwrap();
-        assert_eq!(why(stamp.compare(&venv)), "it was not made by dmprl");
+        assert_eq!(why(stamp.compare(&venv)), "dmprl did not create it");
     }
 
     #[test]
     fn changed_requirements_need_no_new_environment() {
-        let (directory, venv, stamp) = made();
+        let (directory, venv, stamp) = unfinished_venv();
         stamp.write(&venv).unwrap();
         let changed = Stamp::new(&LINKED, directory.path(), "[project]\nname = 'other'\n");
         assert_eq!(changed.compare(&venv), Fit::OtherPackages);
@@ -170,30 +171,30 @@ mod tests {
 
     #[test]
     fn another_installation_of_the_same_version_is_unusable() {
-        let (directory, venv, stamp) = made();
+        let (directory, venv, stamp) = unfinished_venv();
         stamp.write(&venv).unwrap();
         let other = LinkedPython { base_prefix: "/usr", ..LINKED };
         let other = Stamp::new(&other, directory.path(), &stamp.manifest);
         assert_eq!(
             why(other.compare(&venv)),
-            "it was made for installation /opt/a, needed is installation /usr"
+            "created for installation /opt/a, expected installation /usr"
         );
     }
 
     #[test]
     fn moved_project_is_unusable() {
-        let (_directory, venv, stamp) = made();
+        let (_directory, venv, stamp) = unfinished_venv();
         stamp.write(&venv).unwrap();
         let moved = Stamp::new(&LINKED, Path::new("/elsewhere"), &stamp.manifest);
-        assert!(why(moved.compare(&venv)).ends_with("needed is project /elsewhere"));
+        assert!(why(moved.compare(&venv)).ends_with("expected project /elsewhere"));
     }
 
     #[test]
     fn uninstalled_python_is_unusable() {
-        let (_directory, venv, stamp) = made();
+        let (_directory, venv, stamp) = unfinished_venv();
         stamp.write(&venv).unwrap();
         fs::remove_file(venv.join("bin/python")).unwrap();
         std::os::unix::fs::symlink("/no/such/python", venv.join("bin/python")).unwrap();
-        assert_eq!(why(stamp.compare(&venv)), "its interpreter is gone");
+        assert_eq!(why(stamp.compare(&venv)), "its interpreter does not exist any more");
     }
 }

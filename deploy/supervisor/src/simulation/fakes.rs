@@ -1,4 +1,4 @@
-//! Simulated children: what each does next, as derived from a seed.
+//! Simulated children, whose actions are derived from a seed.
 
 use std::collections::VecDeque;
 use std::os::unix::process::ExitStatusExt;
@@ -19,33 +19,32 @@ use crate::process::Process;
 /// A simulated process.
 pub struct Fake {
     pub process: Process,
-    /// It has joined, so it ends with [`Output::Gone`].
+    /// The process has joined, so it ends with [`Output::Gone`].
     pub joined: bool,
-    temper: Temper,
+    behaviour: Behaviour,
     /// Commands not yet handled.
     commands: VecDeque<Command>,
     ready: bool,
     attached: bool,
-    stopping: bool,
-    /// Progress reports until it finishes.
+    /// Number of progress reports until it finishes.
     work_left: u32,
     /// Time of its last output, which later outputs must follow.
     pub last_output: Instant,
 }
 
-/// How a process misbehaves.
+/// Behaviour of a process.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-enum Temper {
-    Good,
-    /// It dies or falls silent at a random turn.
-    Mortal,
-    /// It does nothing, but can be killed.
+enum Behaviour {
+    Healthy,
+    /// Dies or becomes silent at a random turn.
+    Dying,
+    /// Does nothing, but can be killed.
     Silent,
-    /// It ignores commands to end.
-    Stubborn,
+    /// Ignores commands to stop.
+    IgnoresStop,
 }
 
-/// What a process sends.
+/// An output of a process.
 #[derive(Debug, Clone)]
 pub enum Output {
     Report(Report),
@@ -54,7 +53,7 @@ pub enum Output {
     Gone,
 }
 
-/// The mode of the world, which all children share.
+/// Settings that all children share.
 #[derive(Debug, Clone, Copy)]
 pub struct Mode {
     pub faults: bool,
@@ -76,20 +75,19 @@ pub fn spec() -> EnvSpec {
 
 impl Fake {
     pub fn new(process: Process, mode: Mode, random: &mut Stream, now: Instant) -> Self {
-        let temper = match random.random_range(0..20) {
-            0..4 if mode.faults => Temper::Mortal,
-            4 if mode.faults => Temper::Silent,
-            5 if mode.faults => Temper::Stubborn,
-            _ => Temper::Good,
+        let behaviour = match random.random_range(0..20) {
+            0..4 if mode.faults => Behaviour::Dying,
+            4 if mode.faults => Behaviour::Silent,
+            5 if mode.faults => Behaviour::IgnoresStop,
+            _ => Behaviour::Healthy,
         };
         Self {
             process,
             joined: false,
-            temper,
+            behaviour,
             commands: VecDeque::new(),
             ready: false,
             attached: false,
-            stopping: false,
             work_left: random.random_range(1..40),
             last_output: now,
         }
@@ -99,10 +97,11 @@ impl Fake {
         self.commands.push_back(command);
     }
 
-    /// The faults are over: it works from now on, but what it has ignored stays ignored.
+    /// Makes a process healthy that would die at a random turn. A process that is silent or ignores
+    /// commands stays so.
     pub fn heal(&mut self) {
-        if self.temper == Temper::Mortal {
-            self.temper = Temper::Good;
+        if self.behaviour == Behaviour::Dying {
+            self.behaviour = Behaviour::Healthy;
         }
     }
 
@@ -110,19 +109,19 @@ impl Fake {
         Duration::from_millis(random.random_range(1..5_000))
     }
 
-    /// What it does in its turn; the last output may be its exit.
+    /// Takes a turn and returns its outputs; the last one may be the exit.
     pub fn turn(&mut self, mode: Mode, random: &mut Stream, version: &mut u64) -> Vec<Output> {
-        match self.temper {
-            Temper::Silent => return Vec::new(),
-            Temper::Mortal => match random.random_range(0..12) {
+        match self.behaviour {
+            Behaviour::Silent => return Vec::new(),
+            Behaviour::Dying => match random.random_range(0..12) {
                 0 | 1 => return vec![self.death(random)],
                 2 => {
-                    self.temper = Temper::Silent;
+                    self.behaviour = Behaviour::Silent;
                     return Vec::new();
                 }
                 _ => {}
             },
-            Temper::Good | Temper::Stubborn => {}
+            Behaviour::Healthy | Behaviour::IgnoresStop => {}
         }
         let mut outputs = Vec::new();
         if !self.ready {
@@ -159,15 +158,14 @@ impl Fake {
 
     /// Handles a command; returns true if it ends the process.
     fn obey(&mut self, command: Command, random: &mut Stream, out: &mut Vec<Output>) -> bool {
-        let stubborn = self.temper == Temper::Stubborn;
+        let ignores_stop = self.behaviour == Behaviour::IgnoresStop;
         match command {
             Command::Attach { .. } => self.attached = true,
-            Command::Stop | Command::Finish if stubborn => {}
+            Command::Stop | Command::Finish if ignores_stop => {}
             Command::Finish if matches!(self.process, Process::Learner | Process::Relay) => {
                 self.work_left = 0;
             }
             Command::Stop | Command::Finish => {
-                self.stopping = true;
                 out.extend(self.regular_end());
                 return true;
             }
@@ -218,7 +216,7 @@ impl Fake {
         let sent = random.random_range(0..4);
         let sent = Sent { produced: sent, sent, resent: 0, acked: sent / 2 };
         out.push(Output::Report(Report::Sent(sent)));
-        if self.temper == Temper::Good {
+        if self.behaviour == Behaviour::Healthy {
             return;
         }
         match random.random_range(0..12) {
@@ -238,7 +236,7 @@ impl Fake {
     }
 
     fn death(&self, random: &mut Stream) -> Output {
-        // Killed, panicked, or with an error of its own.
+        // Killed, panicked, or exited with an error.
         let status = [9, 101 << 8, 9, 1 << 8][random.random_range(0..4)];
         if self.joined { Output::Gone } else { Output::Exit(ExitStatus::from_raw(status)) }
     }

@@ -1,19 +1,19 @@
-//! Simulates whole sessions with the state machine of production and simulated children.
+//! Simulates whole sessions with the real state machine and simulated children.
 //!
-//! Children die, hang, ignore commands and answer late, and interrupts, standstills and failed
-//! starts happen, all as derived from a seed. After each step, `world.rs` checks the invariants:
+//! Children die, hang, ignore commands and answer late; interrupts, suspensions and failed starts
+//! occur. Everything is derived from a seed. After each step, `world.rs` checks the invariants:
 //!
 //! 1. There is never more than one learner, and no process is started twice at a time.
 //! 2. Every process that the run needs is running or has a restart due, and a step is due no later
 //!    than that restart.
 //! 3. Every evaluation request is answered, waits, is in flight, or is given up with a reason.
 //! 4. The totals, and the newest ones sent to the learner, equal what children reported.
-//! 5. The machine's children are those of the world, apart from exits that have not arrived.
-//! 6. Time passes: no deadline remains due after its step.
+//! 5. The machine and the world have the same children, apart from exits that have not arrived.
+//! 6. Time advances: no deadline remains due after its step.
 //!
 //! After a while all faults stop. Then the session must end within a bounded number of steps; after
-//! a stop, within its time limits. A failure names its seed, and `DMPRL_SIMULATION_SEED=<seed>`
-//! runs only that one.
+//! a stop, within its time limits. A failed test prints its seed. To run only this seed, set
+//! `DMPRL_SIMULATION_SEED=<seed>`.
 
 mod fakes;
 mod scenario;
@@ -34,15 +34,15 @@ fn run(seed: u64, directory: &RunDirectory) -> Tally {
     let ended = catch_unwind(AssertUnwindSafe(|| World::new(seed, directory).run()));
     ended.unwrap_or_else(|panic| {
         eprintln!(
-            "seed {seed} fails; alone: {ONE_SEED}={seed} cargo test --release -p dmprl --lib \
-             simulation -- --nocapture"
+            "seed {seed} fails; reproduce with: {ONE_SEED}={seed} cargo test --release -p \
+             dmprl-supervisor --lib simulation -- --nocapture"
         );
         resume_unwind(panic)
     })
 }
 
 #[test]
-fn a_session_keeps_its_invariants_and_ends_whatever_fails() {
+fn every_simulated_session_keeps_its_invariants_and_ends() {
     let folder = tempfile::tempdir().unwrap();
     let (path, manifest) = (folder.path().join("run"), Manifest::new(None).unwrap());
     let directory = RunDirectory::create(&path, &Default::default(), &manifest).unwrap();
@@ -53,6 +53,6 @@ fn a_session_keeps_its_invariants_and_ends_whatever_fails() {
     let mut all = Tally::default();
     (0..SEEDS).for_each(|seed| all.add(&run(seed, &directory)));
     println!("{SEEDS} seeds: {all:#?}");
-    // A fault that never occurs tests nothing.
+    // Every kind of event must occur in some session.
     assert_eq!(all.missing(), Vec::<&str>::new());
 }

@@ -1,4 +1,4 @@
-//! The settings of a simulated session, as derived from its seed.
+//! Draws the settings of a simulated session from its seed.
 
 use std::time::Duration;
 

@@ -2,11 +2,11 @@
 
 use std::collections::BTreeMap;
 
-/// Counts of what has happened, by name.
+/// Counts of events, by name.
 #[derive(Debug, Default)]
 pub struct Tally(BTreeMap<&'static str, u64>);
 
-/// Everything that must happen in some session.
+/// Names of events that must occur in some session.
 const EXPECTED: [&str; 26] = [
     "abandoned",
     "answers",
@@ -47,7 +47,7 @@ impl Tally {
         }
     }
 
-    /// The names that never occurred.
+    /// Returns the expected names that did not occur.
     pub fn missing(&self) -> Vec<&'static str> {
         EXPECTED.into_iter().filter(|name| !self.0.contains_key(name)).collect()
     }

@@ -1,4 +1,4 @@
-//! A simulated machine room: time, children, messages under way, and the invariants.
+//! The simulated world: time, children, messages in flight, and the invariants.
 
 use std::collections::{BTreeMap, BTreeSet, VecDeque};
 use std::os::unix::process::ExitStatusExt;
@@ -21,43 +21,43 @@ use crate::process::Process;
 use crate::state::Phase;
 use crate::step::{Action, Event};
 
-/// Maximum delay of an output. It is less than the limit from SIGKILL to the exit, which follows
-/// all outputs.
+/// Maximum delay of an output. It is less than the limit from SIGKILL to the exit, which arrives
+/// after all outputs.
 const LATE_MS: u64 = 4_000;
-/// Time with faults.
+/// Time until faults stop.
 const FAULTS_S: u64 = 120;
-/// A session without faults ends within this time.
-const SESSION: Duration = Duration::from_secs(4 * 3_600);
-/// Steps of a whole session.
+/// Maximum duration of a session.
+const SESSION_LIMIT: Duration = Duration::from_secs(4 * 3_600);
+/// Maximum number of steps of a session.
 const STEPS_MAX: u32 = 50_000;
 
-/// Something that happens at a time.
+/// A scheduled event of the world.
 #[derive(Debug)]
-enum Happening {
-    /// A process acts; the number is that of its start in the world.
+enum ScheduledEvent {
+    /// A process takes a turn; the number identifies its start.
     Turn(Process, u64),
-    /// Its output arrives.
+    /// An output of a process arrives.
     Arrival(Process, Output),
     JoinRequest,
     Interrupt,
-    /// The supervisor is stopped.
-    Standstill,
+    /// The supervisor is suspended.
+    Suspension,
     DomainLost,
     /// Faults end.
     Heal,
 }
 
-/// What the invariants compare with the machine.
+/// Expected state, which the invariants compare with the machine.
 #[derive(Debug, Default)]
 struct Model {
     env_failures: u64,
     sent: Sent,
     /// Versions of requested evaluations without an answer.
     requests: BTreeSet<u64>,
-    /// Those that were sent to an evaluator.
+    /// Versions that were sent to an evaluator.
     sent_requests: BTreeSet<u64>,
     given_up: BTreeSet<Process>,
-    /// By when a session that stops must have ended.
+    /// Deadline for the end of a session that stops.
     stops_by: Option<Instant>,
 }
 
@@ -71,7 +71,7 @@ pub struct World {
     fakes: BTreeMap<Process, Fake>,
     /// Number of each process's last start.
     serials: BTreeMap<Process, u64>,
-    agenda: BTreeMap<(Instant, u64), Happening>,
+    agenda: BTreeMap<(Instant, u64), ScheduledEvent>,
     order: u64,
     version: u64,
     join_requests: u64,
@@ -118,33 +118,33 @@ impl World {
     }
 
     fn plan_faults(&mut self) {
-        let at = |world: &mut Self, happening| {
+        let at = |world: &mut Self, event| {
             let after = world.random.random_range(0..FAULTS_S * 1_000);
-            world.plan(world.began + Duration::from_millis(after), happening);
+            world.plan(world.began + Duration::from_millis(after), event);
         };
         for _ in 0..self.random.random_range(0..5) {
-            at(self, Happening::JoinRequest);
+            at(self, ScheduledEvent::JoinRequest);
         }
         if self.chance(3) {
-            at(self, Happening::Interrupt);
-            at(self, Happening::Interrupt);
+            at(self, ScheduledEvent::Interrupt);
+            at(self, ScheduledEvent::Interrupt);
         }
         if self.chance(4) {
-            at(self, Happening::Standstill);
+            at(self, ScheduledEvent::Suspension);
         }
         if self.chance(40) {
-            at(self, Happening::DomainLost);
+            at(self, ScheduledEvent::DomainLost);
         }
         if self.chance(40) {
             let candidates = [Process::Actor(0), Process::Learner, Process::Evaluator];
             self.immortal = Some(candidates[self.random.random_range(0..3)]);
         }
-        self.plan(self.began + Duration::from_secs(FAULTS_S), Happening::Heal);
+        self.plan(self.began + Duration::from_secs(FAULTS_S), ScheduledEvent::Heal);
     }
 
-    fn plan(&mut self, at: Instant, happening: Happening) {
+    fn plan(&mut self, at: Instant, event: ScheduledEvent) {
         self.order += 1;
-        self.agenda.insert((at, self.order), happening);
+        self.agenda.insert((at, self.order), event);
     }
 
     /// Runs the session to its end.
@@ -154,11 +154,11 @@ impl World {
         while !self.machine.is_over() {
             steps += 1;
             assert!(steps < STEPS_MAX, "no end after {steps} steps");
-            let is_late = self.now >= self.began + SESSION;
-            assert!(!is_late, "no end after {SESSION:?}: {:#?}", self.machine);
+            let is_late = self.now >= self.began + SESSION_LIMIT;
+            assert!(!is_late, "no end after {SESSION_LIMIT:?}: {:#?}", self.machine);
             let deadline = self.machine.next_deadline(self.now).max(self.now);
             match self.agenda.first_key_value() {
-                Some(((at, _), _)) if *at <= deadline => self.happen(),
+                Some(((at, _), _)) if *at <= deadline => self.handle_next(),
                 _ => self.tick(deadline),
             }
         }
@@ -176,13 +176,13 @@ impl World {
         }
     }
 
-    fn happen(&mut self) {
-        let Some(((at, _), happening)) = self.agenda.pop_first() else { return };
+    fn handle_next(&mut self) {
+        let Some(((at, _), event)) = self.agenda.pop_first() else { return };
         self.now = self.now.max(at);
-        match happening {
-            Happening::Turn(process, serial) => self.turn(process, serial),
-            Happening::Arrival(process, output) => self.arrive(process, output),
-            Happening::JoinRequest => {
+        match event {
+            ScheduledEvent::Turn(process, serial) => self.turn(process, serial),
+            ScheduledEvent::Arrival(process, output) => self.arrive(process, output),
+            ScheduledEvent::JoinRequest => {
                 self.join_requests += 1;
                 let (request, id) = (self.join_requests, 1_000);
                 let mut speaks = Greeting::this();
@@ -191,30 +191,30 @@ impl World {
                 }
                 self.step(Event::JoinRequested { request, id, speaks });
             }
-            Happening::Interrupt => self.step(Event::Interrupt),
-            Happening::Standstill => {
+            ScheduledEvent::Interrupt => self.step(Event::Interrupt),
+            ScheduledEvent::Suspension => {
                 let lost = Duration::from_secs(self.random.random_range(5..10_000));
                 self.now += lost;
                 self.began += lost;
                 if let Some(stops_by) = &mut self.model.stops_by {
                     *stops_by += lost;
                 }
-                self.step(Event::StoodStill(lost));
+                self.step(Event::Suspended(lost));
                 self.step(Event::Late);
             }
-            Happening::DomainLost if self.machine.needs_domain() => {
+            ScheduledEvent::DomainLost if self.machine.needs_domain() => {
                 self.tally.count("domain lost");
                 self.step(Event::DomainLost("/dev/shm/gone".into()));
             }
-            Happening::DomainLost => {}
-            Happening::Heal => {
+            ScheduledEvent::DomainLost => {}
+            ScheduledEvent::Heal => {
                 self.mode.faults = false;
                 self.fakes.values_mut().for_each(Fake::heal);
             }
         }
     }
 
-    /// A living process acts.
+    /// Lets a living process take its turn.
     fn turn(&mut self, process: Process, serial: u64) {
         if self.serials.get(&process) != Some(&serial) {
             return;
@@ -223,10 +223,10 @@ impl World {
         let outputs = fake.turn(self.mode, &mut self.random, &mut self.version);
         let next = self.now + fake.turn_after(&mut self.random);
         self.emit(process, outputs);
-        self.plan(next, Happening::Turn(process, serial));
+        self.plan(next, ScheduledEvent::Turn(process, serial));
     }
 
-    /// Sends outputs on their way. They may be late, but stay in order.
+    /// Schedules the arrival of outputs, perhaps late but in order.
     fn emit(&mut self, process: Process, outputs: Vec<Output>) {
         for output in outputs {
             let late = self.chance(4);
@@ -237,7 +237,7 @@ impl World {
             if matches!(output, Output::Exit(_) | Output::Gone) {
                 self.fakes.remove(&process);
             }
-            self.plan(at, Happening::Arrival(process, output));
+            self.plan(at, ScheduledEvent::Arrival(process, output));
         }
     }
 
@@ -254,7 +254,7 @@ impl World {
         self.step(event);
     }
 
-    /// Enters a report into the model.
+    /// Adds a report to the model.
     fn expect(&mut self, process: Process, report: &Report) {
         match report {
             Report::Sent(sent) => self.model.sent += *sent,
@@ -309,8 +309,8 @@ impl World {
             Action::Rewind if self.chance(50) => {
                 return Some(Event::ActionFailed(anyhow!("a damaged file")));
             }
-            Action::Tell(event) => self.hear(&event),
-            Action::TellFailure(_) => self.tally.count("failures while stopping"),
+            Action::Notify(event) => self.hear(&event),
+            Action::NotifyFailure(_) => self.tally.count("failures while stopping"),
             Action::Listen | Action::WriteSpec(_) | Action::Rewind => {}
         }
         None
@@ -325,7 +325,7 @@ impl World {
         self.serials.insert(process, serial);
         let first = self.now + fake.turn_after(&mut self.random);
         self.fakes.insert(process, fake);
-        self.plan(first, Happening::Turn(process, serial));
+        self.plan(first, ScheduledEvent::Turn(process, serial));
     }
 
     fn deliver(&mut self, process: Process, command: Command) {
@@ -339,9 +339,9 @@ impl World {
             }
             Command::EnvFailures { total } => {
                 let expected = EARLIER_FAILURES + self.model.env_failures;
-                assert_eq!(*total, expected, "failures told to the learner");
+                assert_eq!(*total, expected, "failures sent to the learner");
             }
-            Command::Sent(sent) => assert_eq!(*sent, self.model.sent, "segments told"),
+            Command::Sent(sent) => assert_eq!(*sent, self.model.sent, "segments sent"),
             _ => {}
         }
         if let Some(fake) = self.fakes.get_mut(&process) {
@@ -359,9 +359,9 @@ impl World {
         self.emit(process, vec![exit]);
     }
 
-    /// Enters what the observer would see into the model.
+    /// Adds an event of the observer to the model.
     fn hear(&mut self, event: &RunEvent) {
-        // Each event has a text or none, but formatting never fails.
+        // Formatting must not panic.
         let _ = event.to_string();
         match event {
             RunEvent::Evaluated { row, .. } => {
@@ -408,7 +408,7 @@ impl World {
             let versions = self.machine.evaluations.versions();
             let requests: Vec<u64> = self.model.requests.iter().copied().collect();
             let outstanding: BTreeSet<u64> = versions.iter().copied().collect();
-            assert_eq!(outstanding.len(), versions.len(), "a request is there twice");
+            assert_eq!(outstanding.len(), versions.len(), "a request is queued twice");
             assert_eq!(outstanding.into_iter().collect::<Vec<_>>(), requests, "evaluations");
         }
         if let Phase::Stopping { .. } = self.machine.phase {
@@ -419,7 +419,7 @@ impl World {
         }
     }
 
-    /// Every process that the run needs is running or has a restart due, in time.
+    /// Checks that every process that the run needs is running or has a restart due in time.
     fn check_needed(&self) {
         let machine = &self.machine;
         let hub = machine.settings.hub;
@@ -457,7 +457,7 @@ impl World {
         }
     }
 
-    /// The machine's children are those of the world, apart from exits under way.
+    /// Checks that machine and world have the same children, apart from exits in flight.
     fn check_children(&self) {
         let learners = self.fakes.keys().filter(|process| **process == Process::Learner);
         assert!(learners.count() <= 1);
@@ -466,8 +466,8 @@ impl World {
         }
         for process in self.machine.children.names() {
             let exits = || {
-                self.agenda.values().any(|happening| match happening {
-                    Happening::Arrival(of, Output::Exit(_) | Output::Gone) => *of == process,
+                self.agenda.values().any(|event| match event {
+                    ScheduledEvent::Arrival(of, Output::Exit(_) | Output::Gone) => *of == process,
                     _ => false,
                 })
             };

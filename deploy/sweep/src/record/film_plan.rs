@@ -8,9 +8,9 @@ use serde::Serialize;
 use super::video::SideRecord;
 
 /// Frames per second if the environment does not report the duration of a step.
-const RATE_UNKNOWN: f64 = 25.0;
+const DEFAULT_RATE: f64 = 25.0;
 
-/// Files of a recording.
+/// Paths of a recording's files.
 #[derive(Debug, Clone, Serialize)]
 pub(super) struct FilmFiles {
     pub(super) mp4: PathBuf,
@@ -40,7 +40,7 @@ struct Side<'a> {
 
 /// Writes the plan into `folder`; returns its path.
 ///
-/// - `files`: the files that the program will write.
+/// - `files`: paths of the files that `film.py` will write.
 pub(super) fn write(
     sides: &[SideRecord],
     files: &FilmFiles,
@@ -51,7 +51,7 @@ pub(super) fn write(
     for side in sides {
         ensure!(
             side.episodes.len() == first.episodes.len() && side.robot.control_dt_s == dt,
-            "cannot show {} next to {}: {} and {} episodes, steps of {dt} and {} s",
+            "cannot show {} next to {}: they have {} and {} episodes, and steps of {dt} and {} s",
             first.run.display(),
             side.run.display(),
             first.episodes.len(),
@@ -70,11 +70,11 @@ pub(super) fn write(
     let plan = FilmPlan {
         episodes: episodes.collect(),
         control_dt_s: dt,
-        rate: if dt > 0.0 { 1.0 / (dt * frame_steps as f64) } else { RATE_UNKNOWN },
+        rate: if dt > 0.0 { 1.0 / (dt * frame_steps as f64) } else { DEFAULT_RATE },
         files,
     };
     let path = folder.join("plan.json");
-    let text = serde_json::to_vec(&plan).context("cannot write a plan as JSON")?;
+    let text = serde_json::to_vec(&plan).context("cannot serialize the plan of the video")?;
     std::fs::write(&path, text).with_context(|| format!("cannot write {}", path.display()))?;
     Ok(path)
 }

@@ -1,11 +1,11 @@
 //! Rolls saved policies out in observer processes: records videos of their episodes, and measures
 //! their motion.
 //!
-//! For a video of one run, or of two side by side, an observer for each run renders the episodes.
-//! Then `envs_py/dmprl/film.py` makes video, animation and filmstrip from the frames, by the plan
-//! that `film_plan` writes. All files are created in a temporary folder next to the output, and
-//! moved when they are complete. `motion` renders nothing and hands the episodes to
-//! [`dmprl_analysis::motion`]. The commands `record` and `report` call it.
+//! A video shows one run, or two side by side. An observer for each run renders the episodes. Then
+//! `envs_py/dmprl/film.py` makes the video, an animation and a filmstrip from the frames, as
+//! described by the plan that `film_plan` writes. All files are created in a temporary folder in
+//! the output directory, and moved when they are complete. `motion` renders nothing and passes the
+//! episodes to [`dmprl_analysis::motion`]. The commands `record` and `report` call this module.
 
 mod film_plan;
 mod motion;

@@ -8,18 +8,19 @@ use dmprl_supervisor::{self as launch, ObservationPlan};
 
 use super::observer::Observer;
 
-/// Measures the run's latest policy over the episodes of an evaluation and writes `motion.json`.
-/// If the file is current, reads it instead. Returns `None` if the user interrupted it.
+/// Measures the run's latest policy over as many episodes as an evaluation has, and writes
+/// `motion.json`. Reads the file instead if it is up to date. Returns `None` if the user
+/// interrupts.
 ///
 /// # Errors
-/// The run has no evaluation yet, the observer died, or the file system fails.
+/// The run has no evaluation yet, the observer dies, or a file cannot be read or written.
 pub fn measure_motion(run: &RunDirectory, observer: &Observer) -> anyhow::Result<Option<Motion>> {
     if let Some(motion) = motion::read(run)? {
         return Ok(Some(motion));
     }
     let chosen = run.choose_policy(PolicyChoice::Latest)?;
     let settings = run.config()?.evaluation;
-    let folder = tempfile::tempdir().context("cannot make a temporary folder")?;
+    let folder = tempfile::tempdir().context("cannot create a temporary folder")?;
     let output = folder.path().join("episodes.jsonl");
     let plan = ObservationPlan {
         program: observer.program.clone(),
@@ -42,11 +43,11 @@ pub fn measure_motion(run: &RunDirectory, observer: &Observer) -> anyhow::Result
     let motion = motion::measure(&output, policy)?;
     ensure!(
         motion.returns.len() == settings.episodes,
-        "{} episodes were observed, expected {}",
+        "{} episodes were recorded, expected {}",
         motion.returns.len(),
         settings.episodes
     );
-    let text = serde_json::to_string(&motion).context("cannot write motion.json")?;
+    let text = serde_json::to_string(&motion).context("cannot serialize motion.json")?;
     run.write_motion(&(text + "\n"))?;
     Ok(Some(motion))
 }

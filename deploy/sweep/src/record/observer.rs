@@ -1,11 +1,11 @@
-//! How to start an observer process.
+//! Program and environment of observer processes.
 
 use std::path::PathBuf;
 
 /// Program and Python environment of an observer.
 #[derive(Debug, Clone)]
 pub struct Observer {
-    /// The program that plays the observer: this one.
+    /// The `dmprl` binary, started as an observer.
     pub program: PathBuf,
     /// The Python virtual environment.
     pub venv: PathBuf,

@@ -1,9 +1,9 @@
-//! Records videos of a policy's episodes, of one run or of two side by side.
+//! Records videos of the episodes of one run, or of two side by side.
 
 use std::path::PathBuf;
 
 use anyhow::{Context, ensure};
-use dmprl_analysis::motion::{Recorded, RecordedEpisode, Robot};
+use dmprl_analysis::motion::{RecordedEpisode, RecordingReader, Robot};
 use dmprl_run::failure::{Outcome, wrong_use};
 use dmprl_run::format::grouped;
 use dmprl_run::{ChosenPolicy, Progress, RunDirectory, safe_name};
@@ -15,7 +15,7 @@ use super::observer::Observer;
 
 /// Plan of a recording.
 pub struct RecordPlan<'a> {
-    /// The runs, side by side, with the policy of each.
+    /// Runs to show side by side, and the policy of each.
     pub sides: Vec<(&'a RunDirectory, ChosenPolicy)>,
     /// Episode i is reset with seed `first_seed + i`.
     pub first_seed: u64,
@@ -23,9 +23,9 @@ pub struct RecordPlan<'a> {
     pub episodes: u64,
     /// Output directory.
     pub output: PathBuf,
-    /// The observers.
+    /// Program and environment of the observers.
     pub observer: Observer,
-    /// Python interpreter that makes the video.
+    /// Python interpreter that runs `dmprl.film`.
     pub python: PathBuf,
 }
 
@@ -56,15 +56,15 @@ pub struct Recordings {
     pub mp4: PathBuf,
     /// Path of the animation.
     pub gif: PathBuf,
-    /// Path of the strip of frames.
+    /// Path of the filmstrip.
     pub strip: PathBuf,
 }
 
-/// Records the episodes; returns `None` if the user interrupted it.
+/// Records the episodes; returns `None` if the user interrupts.
 ///
 /// # Errors
-/// Wrong use if the runs cannot be compared. An environment cannot be rendered, for instance
-/// without OpenGL. The file system fails.
+/// Wrong use: the runs have different tasks. An environment cannot be rendered, for instance
+/// without OpenGL. A file cannot be written.
 pub fn record(
     plan: &RecordPlan<'_>,
     progress: &dyn Progress,
@@ -75,12 +75,12 @@ pub fn record(
         let first = task.get_or_insert_with(|| id.clone());
         if *first != id {
             return Err(wrong_use(format!(
-                "{} is a run of {id}, not of {first}: episodes of the same seed would differ",
+                "{} is a run of {id}, not of {first}; episodes of the same seed would differ",
                 run.path().display()
             )));
         }
     }
-    let cannot = || format!("cannot write into {}", plan.output.display());
+    let cannot = || format!("cannot write to {}", plan.output.display());
     std::fs::create_dir_all(&plan.output).with_context(cannot)?;
     let temporary = tempfile::Builder::new()
         .prefix(".recording-")
@@ -137,9 +137,9 @@ fn observe(
     let (run, chosen) = &plan.sides[index];
     let pictures = folder.join("pictures");
     std::fs::create_dir_all(&pictures)
-        .with_context(|| format!("cannot make {}", pictures.display()))?;
+        .with_context(|| format!("cannot create {}", pictures.display()))?;
     let output = folder.join("episodes.jsonl");
-    progress.stage(&format!("drawing {title}"));
+    progress.stage(&format!("rendering {title}"));
     let episode_steps = run.spec()?.map_or(0, |spec| u64::from(spec.episode_steps));
     let on_steps = |episodes: u64, steps: u64| {
         let done = episodes * episode_steps + steps;
@@ -158,7 +158,7 @@ fn observe(
     if launch::observe(observation, &on_steps)? == Outcome::Interrupted {
         return Ok(None);
     }
-    let mut recorded = Recorded::open(&output)?;
+    let mut recorded = RecordingReader::open(&output)?;
     let mut episodes = Vec::new();
     while let Some(episode) = recorded.next_episode()? {
         ensure!(!episode.frames.is_empty(), "the episode of seed {} has no frame", episode.seed);
@@ -168,8 +168,7 @@ fn observe(
     Ok(Some(SideRecord { run, policy_version: chosen.version, title, robot, episodes }))
 }
 
-/// Returns titles that distinguish the runs: the method, or the run's name if the methods are
-/// equal.
+/// Returns a title for each run: its method, or the run's name if the methods are equal.
 fn titles(sides: &[(&RunDirectory, ChosenPolicy)]) -> anyhow::Result<Vec<String>> {
     let mut methods = Vec::new();
     for (run, _) in sides {

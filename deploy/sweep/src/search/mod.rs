@@ -2,14 +2,14 @@
 //!
 //! ```text
 //!  runner ── ask ──► dmprl.search (Optuna) ─► values ─► a trial: dmprl train, seed after seed
-//!    │  ◄─ give up? ─┘     │                                │
+//!    │  ◄── prune? ──┘     │                                │
 //!    └── report, tell ─────┘ ◄────── evaluations.jsonl ─────┘
 //! ```
-//! Optuna's storage, `optuna.db`, is authoritative for trials and their results: a killed search
-//! continues the trials that are running there, from their runs' checkpoints. `trial.json` in each
-//! trial's folder has the same data for listings and reports, which need no Python. A trial's runs
-//! are trained one seed after the other, so that a bad trial can be pruned before all of them have
-//! run.
+//! Optuna's storage, `optuna.db`, is authoritative for trials and their results: a restarted search
+//! continues the trials that the storage lists as running, from the checkpoints of their runs.
+//! `trial.json` in each trial's folder has the same data for listings and reports, which work
+//! without Python. The runs of a trial are trained one seed after the other, so that a bad trial
+//! can be pruned before all of them have run.
 
 mod endings;
 mod optuna;

@@ -14,19 +14,20 @@ use tokio::io::{AsyncBufReadExt, AsyncWriteExt, BufReader, Lines};
 use tokio::process::{Child, ChildStdin, ChildStdout};
 use tokio::time::timeout;
 
-use crate::run::{guarded, open_log};
+use crate::run::{background_command, open_log};
 
-/// Storage file in the sweep's directory. SQLite survives a kill during a write, and all of
-/// Optuna's tools can open it.
+/// Storage file in the sweep's directory. An SQLite file survives a kill during a write, and
+/// Optuna's own tools can open it.
 pub(super) const STORAGE: &str = "optuna.db";
 /// Time limit for importing Optuna and creating the storage.
 const START_WAIT: Duration = Duration::from_secs(120);
-/// Time limit for an answer. A suggestion after ten thousand trials takes seconds.
+/// Time limit for an answer. With ten thousand trials in the storage, a suggestion takes seconds.
 const ANSWER_WAIT: Duration = Duration::from_secs(120);
 
-/// The child process, which is killed on drop. The storage has everything that was sent to it.
+/// The child process, which is killed on drop. This loses nothing: each answered request is in the
+/// storage.
 pub(super) struct Optuna {
-    // Never read: kept so that the child lives as long as this.
+    // Never read: dropping it kills the child.
     _child: Child,
     input: ChildStdin,
     lines: Lines<BufReader<ChildStdout>>,
@@ -36,16 +37,16 @@ pub(super) struct Optuna {
 /// Content of an opened study.
 #[derive(Debug, Deserialize)]
 #[serde(deny_unknown_fields)]
-pub(super) struct Opened {
-    /// The settings that all its trials share.
+pub(super) struct OpenedStudy {
+    /// Settings shared by all of its trials.
     pub(super) identity: Value,
     pub(super) trials: Vec<StoredTrial>,
 }
 
-/// A new trial.
+/// A new trial with its suggested values.
 #[derive(Debug, Deserialize)]
 #[serde(deny_unknown_fields)]
-pub(super) struct Asked {
+pub(super) struct NewTrial {
     pub(super) trial: u32,
     pub(super) values: Map<String, Value>,
 }
@@ -56,11 +57,11 @@ impl Optuna {
         let log = output.join("logs").join("search.log");
         let mut command = std::process::Command::new(python);
         command
-            // Without the working directory in the module path.
+            // -P keeps the working directory out of the module path.
             .args(["-P", "-m", "dmprl.search"])
             .arg(format!("sqlite:///{STORAGE}"))
-            // SQLite's address is a URL, in which a `?` of a path would start the query. So use a
-            // relative path.
+            // The storage is given as a URL, in which a `?` in the path would start the query.
+            // Therefore the path is relative.
             .current_dir(output)
             .stdin(Stdio::piped())
             .stdout(Stdio::piped())
@@ -68,7 +69,7 @@ impl Optuna {
         for name in ["OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"] {
             command.env(name, "1");
         }
-        let mut command = guarded(command);
+        let mut command = background_command(command);
         let child = command.kill_on_drop(true).spawn();
         let mut child = child.with_context(|| format!("cannot start {}", python.display()))?;
         let (input, output) = (child.stdin.take(), child.stdout.take());
@@ -77,9 +78,9 @@ impl Optuna {
         };
         let lines = BufReader::new(output).lines();
         let mut optuna = Self { _child: child, input, lines, log };
-        let greeting = optuna.line(START_WAIT).await?;
+        let greeting = optuna.read_line(START_WAIT).await?;
         if let Some(why) = greeting.get("absent") {
-            bail!("Optuna is not in .venv ({why}); remove .venv and start again");
+            bail!("Optuna is not installed in .venv ({why}); remove .venv and start again");
         }
         Ok(optuna)
     }
@@ -89,36 +90,37 @@ impl Optuna {
         let line = format!("{request}\n");
         let written = self.input.write_all(line.as_bytes()).await;
         if written.is_err() {
-            return Err(self.death("does not read"));
+            return Err(self.failure("has closed its input"));
         }
-        let answer = self.line(ANSWER_WAIT).await?;
+        let answer = self.read_line(ANSWER_WAIT).await?;
         match answer.get("error").and_then(Value::as_str) {
-            Some(error) => bail!("Optuna cannot do {}: {error}", request["op"]),
+            Some(error) => bail!("the Optuna request {} failed: {error}", request["op"]),
             None => Ok(answer),
         }
     }
 
-    async fn line(&mut self, limit: Duration) -> anyhow::Result<Value> {
+    async fn read_line(&mut self, limit: Duration) -> anyhow::Result<Value> {
         match timeout(limit, self.lines.next_line()).await {
-            Err(_) => Err(self.death(&format!("did not answer for {} s", limit.as_secs()))),
+            Err(_) => Err(self.failure(&format!("did not answer within {} s", limit.as_secs()))),
             Ok(Ok(Some(line))) => {
                 serde_json::from_str(&line).with_context(|| format!("dmprl.search sent: {line}"))
             }
-            Ok(_) => Err(self.death("has ended")),
+            Ok(_) => Err(self.failure("has exited")),
         }
     }
 
-    fn death(&self, what: &str) -> anyhow::Error {
+    /// Returns an error about the child, with the last lines of its log.
+    fn failure(&self, what: &str) -> anyhow::Error {
         anyhow!("dmprl.search {what}; {}:\n{}", shown(&self.log), last_lines(&self.log))
     }
 
     /// Opens or creates a study; `request` has all fields that `dmprl.search` needs.
-    pub(super) async fn open(&mut self, request: &Value) -> anyhow::Result<Opened> {
+    pub(super) async fn open(&mut self, request: &Value) -> anyhow::Result<OpenedStudy> {
         Ok(serde_json::from_value(self.request(request).await?)?)
     }
 
     /// Asks for the next trial of a study.
-    pub(super) async fn ask(&mut self, study: &str) -> anyhow::Result<Asked> {
+    pub(super) async fn ask(&mut self, study: &str) -> anyhow::Result<NewTrial> {
         let answer = self.request(&json!({ "op": "ask", "study": study })).await?;
         Ok(serde_json::from_value(answer)?)
     }
@@ -126,7 +128,8 @@ impl Optuna {
     /// Reports an intermediate value; returns true if the trial should be pruned.
     pub(super) async fn report(
         &mut self,
-        (study, trial): (&str, u32),
+        study: &str,
+        trial: u32,
         step: u64,
         value: f64,
     ) -> anyhow::Result<bool> {
@@ -139,7 +142,8 @@ impl Optuna {
     /// Reports the end of a trial; `objective` is `None` unless it finished.
     pub(super) async fn tell(
         &mut self,
-        (study, trial): (&str, u32),
+        study: &str,
+        trial: u32,
         state: TrialState,
         objective: Option<f64>,
     ) -> anyhow::Result<()> {

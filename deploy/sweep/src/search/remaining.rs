@@ -2,73 +2,65 @@
 
 use std::time::Duration;
 
-use dmprl_run::sweep_files::PlannedRun;
-use dmprl_run::sweep_files::Study;
+use super::runner::{Runner, TrialId};
+use crate::estimate::RunKind;
 
-use super::runner::{Place, Runner};
+/// Number and environment steps of a study's ended trials.
+#[derive(Debug, Clone, Copy, Default)]
+pub(super) struct EndedTrials {
+    count: u64,
+    env_steps: u64,
+}
 
 impl Runner<'_> {
-    /// Counts an ended trial.
-    pub(super) fn count(&mut self) {
+    /// Counts an ended trial and shows the remaining time.
+    pub(super) fn count_ended(&mut self) {
         let remaining = self.remaining();
         self.progress.ended(remaining);
     }
 
     /// Estimates the remaining time. Running trials are assumed to finish, later ones to take as
-    /// long as the average ended trial, including pruned ones.
+    /// many steps as the average of the ended trials, including pruned ones.
     pub(super) fn remaining(&self) -> Option<Duration> {
         let mut estimate = self.estimate.clone();
         let mut left = Vec::new();
         for job in &self.jobs {
-            let reached = self.sweep.site.reached(&job.run).max(job.process.env_steps);
+            let kind = RunKind::of_run(&job.run);
+            let reached = self.sweep.site.measured_steps(&job.run).max(job.process.env_steps);
             let (steps, seconds) = job.process.measured(reached);
-            estimate.add(kind(&job.run), steps, seconds);
-            if !job.given_up {
-                let study = &self.sweep.studies[job.place.0];
+            estimate.add(kind, steps, seconds);
+            if !job.pruned {
+                let study = &self.sweep.studies[job.trial.study];
                 let done = study.base.run.steps.saturating_mul(job.seed as u64) + reached;
-                left.push((kind(&job.run), study.trial_steps().saturating_sub(done)));
+                left.push((kind, study.trial_steps().saturating_sub(done)));
             }
         }
-        for &place in &self.open {
-            let study = &self.sweep.studies[place.0];
-            let steps = study.trial_steps().saturating_sub(self.stepped(place));
-            left.push((study_kind(study), steps));
+        for &id in &self.open {
+            let study = &self.sweep.studies[id.study];
+            let steps = study.trial_steps().saturating_sub(self.trial_steps_done(id));
+            left.push((RunKind::of_study(study), steps));
         }
         for (study, ended) in self.sweep.studies.iter().zip(&self.ended) {
-            let mean = ended.env_steps.checked_div(ended.trials);
+            let mean = ended.env_steps.checked_div(ended.count);
             let mean = mean.unwrap_or_else(|| study.trial_steps());
             let to_come = (self.sweep.search.trials as usize).saturating_sub(study.trials.len());
-            left.extend(std::iter::repeat_n((study_kind(study), mean), to_come));
+            left.extend(std::iter::repeat_n((RunKind::of_study(study), mean), to_come));
         }
         estimate.remaining(left, self.sweep.jobs)
     }
 
-    /// Measures a trial that ended without an error.
-    pub(super) fn measure_trial(&mut self, place: Place) {
-        let env_steps = self.stepped(place);
-        let ended = &mut self.ended[place.0];
-        ended.trials += 1;
+    /// Adds the steps of a trial that ended without an error to those of its study.
+    pub(super) fn add_trial_steps(&mut self, id: TrialId) {
+        let env_steps = self.trial_steps_done(id);
+        let ended = &mut self.ended[id.study];
+        ended.count += 1;
         ended.env_steps += env_steps;
     }
 
     /// Environment steps of a trial's runs so far.
-    fn stepped(&self, place: Place) -> u64 {
-        let (study, trial) = self.at(place);
-        study.seeds.iter().map(|&seed| self.sweep.site.reached(&study.run(trial, seed))).sum()
+    fn trial_steps_done(&self, id: TrialId) -> u64 {
+        let (study, trial) = self.study_and_trial(id);
+        let steps = |&seed| self.sweep.site.measured_steps(&study.run(trial, seed));
+        study.seeds.iter().map(steps).sum()
     }
-}
-
-/// Number and environment steps of a study's ended trials.
-#[derive(Debug, Clone, Copy, Default)]
-pub(super) struct Ended {
-    trials: u64,
-    env_steps: u64,
-}
-
-pub(super) fn kind(run: &PlannedRun) -> (&str, &str) {
-    (&run.task, &run.method)
-}
-
-fn study_kind(study: &Study) -> (&str, &str) {
-    (&study.task, &study.method)
 }

@@ -1,4 +1,4 @@
-//! Runs trials, several in parallel, until all have ended or the user stops the search.
+//! Runs trials, several in parallel, until all have ended or the user interrupts.
 
 use std::collections::{BTreeMap, BTreeSet, VecDeque};
 use std::path::PathBuf;
@@ -17,27 +17,27 @@ use dmprl_supervisor::interrupts;
 use tokio::sync::mpsc;
 
 use super::optuna::Optuna;
-use super::remaining::{Ended, kind};
-use crate::estimate::Estimate;
-use crate::run::{RunProcess, result};
-use crate::runner::{END_LOOK, LOOK};
+use super::remaining::EndedTrials;
+use crate::estimate::{Estimate, RunKind};
+use crate::run::{RunProcess, evaluation_text};
+use crate::runner::{EXIT_POLL_INTERVAL, PROGRESS_INTERVAL};
 use crate::tally::Tally;
 use crate::{RunState, Site};
 
 /// Interval between checks for new evaluations.
-const EVALUATION_LOOK: Duration = Duration::from_millis(500);
+const EVALUATION_POLL_INTERVAL: Duration = Duration::from_millis(500);
 
-/// A search to run.
+/// A search to run, with its studies.
 pub struct SearchSweep {
-    /// Location of the sweep.
+    /// Output directory and program.
     pub site: Site,
     /// The `[search]` table of the sweep file.
     pub search: Search,
-    /// A study for every task with every method.
+    /// One study for each combination of task and method.
     pub studies: Vec<Study>,
     /// Number of parallel trials.
     pub jobs: usize,
-    /// The finished runs in the output directory.
+    /// Finished runs in the output directory.
     pub ledger: Ledger,
     /// Python interpreter with Optuna.
     pub python: PathBuf,
@@ -48,17 +48,17 @@ pub struct SearchSweep {
 /// Result of a search. Its trials are in the studies.
 #[derive(Debug)]
 pub struct SearchReport {
-    /// True if the user stopped it.
+    /// True if the user interrupted the search.
     pub interrupted: bool,
-    /// Reason for which the search stopped early.
+    /// Why the search stopped early; `None` if it did not.
     pub gave_up: Option<String>,
 }
 
-/// Continues the running trials, and asks for others until there are enough.
+/// Continues the running trials, and asks Optuna for new ones until each study has enough.
 ///
 /// # Errors
-/// The storage or a run directory belongs to another search, or Optuna or the ledger fails. A
-/// failed trial is no error of the search.
+/// The storage or a run directory belongs to another search, Optuna fails, or the ledger cannot be
+/// written. A failed trial is not an error.
 pub fn search(sweep: &mut SearchSweep, progress: &dyn Progress) -> anyhow::Result<SearchReport> {
     let runtime = tokio::runtime::Builder::new_current_thread()
         .enable_all()
@@ -68,35 +68,39 @@ pub fn search(sweep: &mut SearchSweep, progress: &dyn Progress) -> anyhow::Resul
         let interrupts = interrupts()?;
         let optuna = Optuna::start(&sweep.python, &sweep.site.output).await?;
         let mut runner = Runner::new(sweep, optuna, progress);
-        runner.open().await?;
-        runner.sweep.site.keep_file()?;
+        runner.load_studies().await?;
+        runner.sweep.site.save_sweep_file()?;
         runner.run(interrupts).await
     })
 }
 
-/// A trial, by the index of its study and its own index.
-pub(super) type Place = (usize, usize);
+/// Index of a trial's study, and of the trial in the study.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+pub(super) struct TrialId {
+    pub(super) study: usize,
+    pub(super) trial: usize,
+}
 
-/// A running run.
+/// A run in progress.
 pub(super) struct Job {
-    pub(super) place: Place,
-    /// Index of its seed in the list.
+    pub(super) trial: TrialId,
+    /// Index of its seed in the study's seeds.
     pub(super) seed: usize,
     pub(super) run: PlannedRun,
     pub(super) process: RunProcess,
-    pub(super) given_up: bool,
+    pub(super) pruned: bool,
 }
 
 pub(super) struct Runner<'a> {
     pub(super) sweep: &'a mut SearchSweep,
     pub(super) optuna: Optuna,
-    /// Running trials whose next run waits for a free job.
-    pub(super) open: VecDeque<Place>,
+    /// Running trials without a job.
+    pub(super) open: VecDeque<TrialId>,
     pub(super) jobs: Vec<Job>,
-    /// Evaluations of running trials that have been reported to Optuna.
-    pub(super) reported: BTreeMap<Place, BTreeSet<u64>>,
-    /// Ended trials of each study.
-    pub(super) ended: Vec<Ended>,
+    /// Numbers of the evaluations reported to Optuna.
+    pub(super) reported: BTreeMap<TrialId, BTreeSet<u64>>,
+    /// Number and steps of each study's ended trials.
+    pub(super) ended: Vec<EndedTrials>,
     pub(super) estimate: Estimate,
     pub(super) progress: Tally<'a>,
     pub(super) interrupts: u32,
@@ -114,7 +118,7 @@ impl<'a> Runner<'a> {
             open: VecDeque::new(),
             jobs: Vec::new(),
             reported: BTreeMap::new(),
-            ended: vec![Ended::default(); studies],
+            ended: vec![EndedTrials::default(); studies],
             estimate: Estimate::default(),
             progress: Tally::new(progress, "trials", count, 0),
             interrupts: 0,
@@ -123,8 +127,8 @@ impl<'a> Runner<'a> {
         }
     }
 
-    /// Reads the trials in the storage.
-    async fn open(&mut self) -> anyhow::Result<()> {
+    /// Opens the studies and reads their trials from the storage.
+    async fn load_studies(&mut self) -> anyhow::Result<()> {
         let mut ended = 0;
         for index in 0..self.sweep.studies.len() {
             let study = &mut self.sweep.studies[index];
@@ -134,24 +138,24 @@ impl<'a> Runner<'a> {
             let trials = opened.trials.iter().map(|stored| Trial::stored(space, stored));
             study.trials = trials.collect::<anyhow::Result<_>>()?;
             for (trial, stored) in opened.trials.into_iter().enumerate() {
-                let place = (index, trial);
-                self.reported.insert(place, stored.reported.into_iter().collect());
-                ended += usize::from(self.found(place)?);
+                let id = TrialId { study: index, trial };
+                self.reported.insert(id, stored.reported.into_iter().collect());
+                ended += usize::from(self.restore(id)?);
             }
             self.write_best(index)?;
         }
-        self.progress.begin_at(ended);
+        self.progress.set_ended(ended);
         Ok(())
     }
 
-    /// Adds a trial from the storage; returns true if it has ended.
-    fn found(&mut self, place: Place) -> anyhow::Result<bool> {
-        self.write(place)?;
-        let (study, trial) = self.at(place);
+    /// Restores a trial from the storage; returns true if it has ended.
+    fn restore(&mut self, id: TrialId) -> anyhow::Result<bool> {
+        self.write_trial(id)?;
+        let (study, trial) = self.study_and_trial(id);
         let (study, trial) = (study.clone(), trial.clone());
         for &seed in study.seeds.iter().filter(|_| !trial.values.is_empty()) {
             let run = study.run(&trial, seed);
-            // Check that it matches the current file, if it exists.
+            // Checks that an existing run matches the current sweep file.
             let config = (self.sweep.configure)(&run.arguments);
             let state =
                 config.and_then(|config| self.sweep.site.state(&self.sweep.ledger, &run, &config));
@@ -159,65 +163,69 @@ impl<'a> Runner<'a> {
                 state?;
             }
             if let Some(done) = self.sweep.ledger.of(&run.directory) {
-                self.estimate.add(kind(&run), done.env_steps, done.wall_s);
-            } else if trial.state == TrialState::Pruned && self.sweep.site.reached(&run) > 0 {
-                // The search was killed after the pruning and before the end of the run.
-                self.close_run(&run, &study, End::Pruned)?;
+                self.estimate.add(RunKind::of_run(&run), done.env_steps, done.wall_s);
+            } else if trial.state == TrialState::Pruned && self.sweep.site.measured_steps(&run) > 0
+            {
+                // The search was killed after it pruned the trial and before the run ended.
+                self.add_to_ledger(&run, &study, End::Pruned)?;
             }
         }
         match trial.state {
-            TrialState::Running => self.open.push_back(place),
-            TrialState::Finished | TrialState::Pruned => self.measure_trial(place),
+            TrialState::Running => self.open.push_back(id),
+            TrialState::Finished | TrialState::Pruned => self.add_trial_steps(id),
             TrialState::Failed => {}
         }
         Ok(trial.state != TrialState::Running)
     }
 
     async fn run(mut self, mut interrupts: mpsc::Receiver<()>) -> anyhow::Result<SearchReport> {
-        let mut look = tokio::time::interval(LOOK);
-        let mut end_look = tokio::time::interval(END_LOOK);
-        let mut evaluation_look = tokio::time::interval(EVALUATION_LOOK);
+        let mut progress_tick = tokio::time::interval(PROGRESS_INTERVAL);
+        let mut exit_poll = tokio::time::interval(EXIT_POLL_INTERVAL);
+        let mut evaluation_poll = tokio::time::interval(EVALUATION_POLL_INTERVAL);
         loop {
             while self.interrupts == 0 && self.jobs.len() < self.sweep.jobs {
-                let Some(place) = self.next().await? else { break };
-                self.advance(place).await?;
+                let Some(id) = self.next_trial().await? else { break };
+                self.advance(id).await?;
             }
             if self.jobs.is_empty() {
                 break;
             }
             tokio::select! {
                 Some(()) = interrupts.recv() => self.on_interrupt(),
-                _ = end_look.tick() => self.on_ends().await?,
-                _ = evaluation_look.tick() => self.on_evaluations().await?,
-                _ = look.tick() => self.progress.remaining(self.remaining()),
+                _ = exit_poll.tick() => self.check_exits().await?,
+                _ = evaluation_poll.tick() => self.check_evaluations().await?,
+                _ = progress_tick.tick() => self.progress.remaining(self.remaining()),
             }
         }
         let interrupted = self.interrupts > 0 && self.gave_up.is_none();
         Ok(SearchReport { interrupted, gave_up: self.gave_up })
     }
 
-    /// Forwards each interrupt to the runs: on the first they write a checkpoint, on the second
-    /// they exit at once.
+    /// Forwards an interrupt to the runs: on the first they write a checkpoint and exit, on the
+    /// second they exit at once.
     fn on_interrupt(&mut self) {
         self.interrupts += 1;
         if self.interrupts == 1 {
-            self.progress.message("interrupted: the runs write a checkpoint (once more: at once)");
+            self.progress.message(
+                "interrupted: the runs stop after writing a checkpoint (interrupt again to stop at \
+                 once)",
+            );
         }
         for job in &self.jobs {
             job.process.interrupt();
         }
     }
 
-    pub(super) fn at(&self, (study, trial): Place) -> (&Study, &Trial) {
-        let study = &self.sweep.studies[study];
-        (study, &study.trials[trial])
+    pub(super) fn study_and_trial(&self, id: TrialId) -> (&Study, &Trial) {
+        let study = &self.sweep.studies[id.study];
+        (study, &study.trials[id.trial])
     }
 
-    /// Returns the next trial to advance: a running one, or a new one of the study with the fewest
-    /// trials.
-    async fn next(&mut self) -> anyhow::Result<Option<Place>> {
-        if let Some(place) = self.open.pop_front() {
-            return Ok(Some(place));
+    /// Returns the next trial to advance: a running one without a job, else a new one of the study
+    /// with the fewest trials.
+    async fn next_trial(&mut self) -> anyhow::Result<Option<TrialId>> {
+        if let Some(id) = self.open.pop_front() {
+            return Ok(Some(id));
         }
         let wanted = self.sweep.search.trials as usize;
         let studies = self.sweep.studies.iter().enumerate();
@@ -228,37 +236,37 @@ impl<'a> Runner<'a> {
         let study = &mut self.sweep.studies[index];
         let asked = self.optuna.ask(&study.name()).await?;
         study.trials.push(Trial::new(&self.sweep.search.space, asked.trial, &asked.values)?);
-        let place = (index, study.trials.len() - 1);
-        self.write(place)?;
-        Ok(Some(place))
+        let id = TrialId { study: index, trial: study.trials.len() - 1 };
+        self.write_trial(id)?;
+        Ok(Some(id))
     }
 
     /// Starts the trial's next run, or ends the trial if there is none.
-    async fn advance(&mut self, place: Place) -> anyhow::Result<()> {
-        let (study, trial) = self.at(place);
+    async fn advance(&mut self, id: TrialId) -> anyhow::Result<()> {
+        let (study, trial) = self.study_and_trial(id);
         let (study, trial) = (study.clone(), trial.clone());
         for (seed, &number) in study.seeds.iter().enumerate() {
             let run = study.run(&trial, number);
             let config = match (self.sweep.configure)(&run.arguments) {
                 Ok(config) => config,
-                Err(error) => return self.fail(place, &run, format!("{error:#}")).await,
+                Err(error) => return self.fail(id, &run, format!("{error:#}")).await,
             };
             let state = self.sweep.site.state(&self.sweep.ledger, &run, &config)?;
             let rows = self.sweep.site.evaluations(&run)?;
             let is_last = seed + 1 == study.seeds.len();
-            // The last evaluation is reported here, after a run has ended or a killed search
-            // continues.
-            let prune = self.report(place, seed, &rows).await?;
+            // A run's last evaluation is reported here, after the run has ended or when a killed
+            // search continues.
+            let prune = self.report(id, seed, &rows).await?;
             match state {
-                RunState::Finished if is_last => return self.finish(place).await,
-                _ if prune => return self.prune(place, &run, rows.last()).await,
+                RunState::Finished if is_last => return self.finish(id).await,
+                _ if prune => return self.prune(id, &run, rows.last()).await,
                 RunState::Open { env_steps } => {
-                    self.progress.message(&format!("{}: begins", run.title()));
+                    self.progress.message(&format!("{}: started", run.title()));
                     match self.sweep.site.start(&run, &config, env_steps) {
                         Ok(process) => {
-                            self.jobs.push(Job { place, seed, run, process, given_up: false })
+                            self.jobs.push(Job { trial: id, seed, run, process, pruned: false })
                         }
-                        Err(error) => self.fail(place, &run, format!("{error:#}")).await?,
+                        Err(error) => self.fail(id, &run, format!("{error:#}")).await?,
                     }
                     return Ok(());
                 }
@@ -271,118 +279,124 @@ impl<'a> Runner<'a> {
     /// Reports new evaluations to Optuna; returns true if the trial should be pruned.
     async fn report(
         &mut self,
-        place: Place,
+        id: TrialId,
         seed: usize,
         rows: &[EvaluationRow],
     ) -> anyhow::Result<bool> {
         let mut prune = false;
         for row in rows {
-            let (study, trial) = self.at(place);
+            let (study, trial) = self.study_and_trial(id);
             let number = study.evaluation_number(seed, row);
             let (name, trial, value) = (study.name(), trial.number, self.measure(study, row)?);
-            if self.reported.entry(place).or_default().insert(number) {
-                prune = self.optuna.report((&name, trial), number, value).await?;
+            if self.reported.entry(id).or_default().insert(number) {
+                prune = self.optuna.report(&name, trial, number, value).await?;
             }
         }
         Ok(prune)
     }
 
+    /// Returns the value of the search's objective in an evaluation.
     pub(super) fn measure(&self, study: &Study, row: &EvaluationRow) -> anyhow::Result<f64> {
         let objective = self.sweep.search.objective;
         objective.of(row).with_context(|| {
             format!(
-                "search.objective = \"{}\": the evaluations of {} have no such rate; expected \
-                 \"return\"",
+                "search.objective = \"{}\": {} does not report success; expected \"return\"",
                 objective.name(),
                 study.task
             )
         })
     }
 
-    async fn on_evaluations(&mut self) -> anyhow::Result<()> {
+    /// Reports new evaluations of the running runs, and interrupts the runs of pruned trials.
+    async fn check_evaluations(&mut self) -> anyhow::Result<()> {
         if self.interrupts > 0 {
-            return Ok(()); // Its runs are ending, and a second interrupt would cut that short.
+            // The runs are already stopping. Interrupting one again would stop it without a
+            // checkpoint.
+            return Ok(());
         }
         for index in 0..self.jobs.len() {
-            let Job { place, seed, given_up, ref run, .. } = self.jobs[index];
-            if given_up {
+            let Job { trial: id, seed, pruned, ref run, .. } = self.jobs[index];
+            if pruned {
                 continue;
             }
             let run = run.clone();
-            // A run whose directory is being created or rewound has no rows to read.
+            // Reading fails while the run's directory is being created or rewound.
             let mut rows = self.sweep.site.evaluations(&run).unwrap_or_default();
-            // The last evaluation is reported after the run has ended.
-            let steps = self.sweep.studies[place.0].base.run.steps;
+            // `advance` reports the last evaluation after the run has ended.
+            let steps = self.sweep.studies[id.study].base.run.steps;
             rows.retain(|row| row.env_steps < steps);
-            if self.report(place, seed, &rows).await? {
-                self.prune(place, &run, rows.last()).await?;
-                self.jobs[index].given_up = true;
+            if self.report(id, seed, &rows).await? {
+                self.prune(id, &run, rows.last()).await?;
+                self.jobs[index].pruned = true;
                 self.jobs[index].process.interrupt();
             }
         }
         Ok(())
     }
 
-    async fn on_ends(&mut self) -> anyhow::Result<()> {
+    async fn check_exits(&mut self) -> anyhow::Result<()> {
         let mut index = 0;
         while index < self.jobs.len() {
             match self.jobs[index].process.child.try_wait() {
                 Ok(None) => index += 1,
                 Ok(Some(status)) => {
                     let job = self.jobs.swap_remove(index);
-                    self.on_end(&job, status).await?;
+                    self.on_exit(&job, status).await?;
                 }
                 Err(error) => {
                     let job = self.jobs.swap_remove(index);
-                    let reason = format!("cannot wait for it: {error}");
-                    self.fail(job.place, &job.run, reason).await?;
+                    let reason = format!("cannot wait for the process: {error}");
+                    self.fail(job.trial, &job.run, reason).await?;
                 }
             }
         }
         Ok(())
     }
 
-    async fn on_end(&mut self, job: &Job, status: ExitStatus) -> anyhow::Result<()> {
-        let study = self.sweep.studies[job.place.0].clone();
-        let (steps, seconds) = job.process.measured(self.sweep.site.reached(&job.run));
-        self.estimate.add(kind(&job.run), steps, seconds);
-        if job.given_up {
-            return self.close_run(&job.run, &study, End::Pruned).map(drop);
+    async fn on_exit(&mut self, job: &Job, status: ExitStatus) -> anyhow::Result<()> {
+        let study = self.sweep.studies[job.trial.study].clone();
+        let (steps, seconds) = job.process.measured(self.sweep.site.measured_steps(&job.run));
+        self.estimate.add(RunKind::of_run(&job.run), steps, seconds);
+        if job.pruned {
+            return self.add_to_ledger(&job.run, &study, End::Pruned).map(drop);
         }
         if !status.success() {
             if self.interrupts > 0 {
-                return Ok(()); // Under way still; it goes on from its checkpoint.
+                // The run can be resumed from its checkpoint.
+                return Ok(());
             }
             let reason = self.sweep.site.failure(&job.run, status);
-            return self.fail(job.place, &job.run, reason).await;
+            return self.fail(job.trial, &job.run, reason).await;
         }
-        match self.close_run(&job.run, &study, End::Finished) {
+        match self.add_to_ledger(&job.run, &study, End::Finished) {
             Ok(Some(row)) => {
-                self.progress.message(&format!("{}: {}", job.run.title(), result(&row)));
+                self.progress.message(&format!("{}: {}", job.run.title(), evaluation_text(&row)));
                 self.failed_in_a_row = 0;
                 if self.interrupts == 0 {
-                    // First in the queue, so that it precedes new trials; its last evaluation is
-                    // then reported.
-                    self.open.push_front(job.place);
+                    // At the front of the queue, so that the trial is advanced before others, which
+                    // also reports the run's last evaluation.
+                    self.open.push_front(job.trial);
                 }
                 Ok(())
             }
             Ok(None) => {
-                let reason = "it has no evaluation".to_owned();
-                self.fail(job.place, &job.run, reason).await
+                let reason = "the run has no evaluation".to_owned();
+                self.fail(job.trial, &job.run, reason).await
             }
             Err(error) => {
                 let reason = format!("its results cannot be read: {error:#}");
-                self.fail(job.place, &job.run, reason).await
+                self.fail(job.trial, &job.run, reason).await
             }
         }
     }
 
-    pub(super) fn write(&self, place: Place) -> anyhow::Result<()> {
-        let (study, trial) = self.at(place);
+    /// Writes a trial's `trial.json`.
+    pub(super) fn write_trial(&self, id: TrialId) -> anyhow::Result<()> {
+        let (study, trial) = self.study_and_trial(id);
         trial.write(&self.sweep.site.output.join(&study.directory))
     }
 
+    /// Writes the best configuration of a study.
     pub(super) fn write_best(&self, study: usize) -> anyhow::Result<()> {
         self.sweep.studies[study].write_best(&self.sweep.site.output, self.sweep.configure)
     }

@@ -1,4 +1,4 @@
-"""The models of the tasks."""
+"""Loads the models of the tasks."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ def own_model(name: str) -> mujoco.MjModel:
 
 
 def own_model_without_decoration(name: str) -> mujoco.MjModel:
-    """Compiles a model in this folder without the geoms that only pictures show.
+    """Compiles a model in this folder without its visual geoms.
 
-    A simulation moves every geom in every step. The state is the same with and without them.
+    A simulation moves every geom in every step, but visual geoms do not affect its state.
     """
     specification = mujoco.MjSpec.from_file(str(Path(__file__).parent / name))
     specification.compiler.discardvisual = True
@@ -29,7 +29,7 @@ def gymnasium_model(name: str) -> mujoco.MjModel:
 
 
 def gymnasium_picture_model(name: str) -> mujoco.MjModel:
-    """Compiles the same model for pictures, with a sky and more light; by default it is dark."""
+    """Compiles a model from Gymnasium's package for pictures, with a sky and more light."""
     spec = mujoco.MjSpec.from_file(str(_gymnasium_file(name)))
     spec.visual.headlight.ambient = [0.35, 0.35, 0.35]
     spec.visual.headlight.diffuse = [0.5, 0.5, 0.5]
@@ -49,5 +49,5 @@ def _gymnasium_file(name: str) -> Path:
     """Finds a file without importing Gymnasium, which a worker does not need."""
     package = importlib.util.find_spec("gymnasium")
     if package is None or package.origin is None:
-        raise ModuleNotFoundError(f"the model {name} belongs to the package gymnasium")
+        raise ModuleNotFoundError(f"the model {name} is in the package gymnasium; install it")
     return Path(package.origin).parent / "envs" / "mujoco" / "assets" / name

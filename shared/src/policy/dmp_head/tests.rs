@@ -1,4 +1,4 @@
-//! Gradients of the head against central differences of its forward pass.
+//! Compares the head's gradients with central differences of its forward pass.
 
 use rand::RngExt;
 

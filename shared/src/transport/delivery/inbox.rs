@@ -1,20 +1,21 @@
-//! The learner's side of the delivery: which segments of each worker have been settled.
+//! The learner's side of reliable delivery: tracks which segments of each worker are settled.
 
 use super::{LogError, SegmentLog, Watermark};
 use crate::segment::{Rejection, SegmentHeader};
 
-/// Settled segments after which an acknowledgement is due, because an acknowledgement costs far
-/// less than settling this many. It is a quarter of the default outbox capacity beyond its queue,
-/// so no worker runs out of space before the acknowledgement arrives.
-const ACKNOWLEDGED_TOGETHER: u64 = 256;
+/// Number of settled segments after which an acknowledgement is due. Settling this many costs far
+/// more than an acknowledgement. It is a quarter of an outbox's default capacity beyond its queue,
+/// so no outbox fills up before the acknowledgement arrives.
+const ACKNOWLEDGEMENT_BATCH: u64 = 256;
 
-/// Settled segments of each worker, and the log of those that no checkpoint contains yet.
+/// The last settled segment of each worker, and the log of segments that no checkpoint contains
+/// yet.
 #[derive(Debug)]
 pub struct Inbox {
     settled: Vec<Watermark>,
     /// Segments settled since the last acknowledgement.
     unacknowledged: u64,
-    /// At level `log`, every settled segment is appended.
+    /// Contains every settled segment at delivery level `log`; `None` at level `memory`.
     log: Option<SegmentLog>,
 }
 
@@ -25,41 +26,40 @@ impl Inbox {
         Self { settled: vec![Watermark::default(); worker_count], unacknowledged: 0, log: None }
     }
 
-    /// Continues from a checkpoint's marks. Workers without a mark start from zero.
+    /// Restores the marks of a checkpoint. Workers without a mark start from zero.
     pub fn restore(&mut self, marks: &[Watermark]) {
         for (index, settled) in self.settled.iter_mut().enumerate() {
             *settled = marks.get(index).copied().unwrap_or_default();
         }
     }
 
-    /// Appends settled segments to `log` from now on. Its existing records must be settled already.
+    /// Appends settled segments to `log` from now on. The records in it must be settled already.
     pub fn log_to(&mut self, log: SegmentLog) {
         self.log = Some(log);
     }
 
-    /// Last settled segment of each worker, as stored in a checkpoint. Settled means inserted or
-    /// finally rejected.
+    /// Last settled segment of each worker, as stored in checkpoints. A segment is settled when it
+    /// has been inserted or finally rejected.
     #[must_use]
     pub fn settled(&self) -> &[Watermark] {
         &self.settled
     }
 
-    /// Whether a segment has been settled, or belongs to an incarnation before the newest.
+    /// Whether a segment has been settled or belongs to an old incarnation.
     #[must_use]
     pub fn has(&self, header: &SegmentHeader) -> bool {
         let mark = Watermark { incarnation: header.incarnation, sequence: header.sequence };
         self.settled.get(header.worker_id as usize).is_some_and(|last| mark <= *last)
     }
 
-    /// Settles a segment. Call it at the moment of insertion.
+    /// Settles a segment. Call it together with the insertion.
     ///
-    /// Returns the number of missing segments before it, which will never arrive. A worker numbers
-    /// its segments from 1 without gaps and sends them in order, so it no longer has the missing
-    /// ones. Such a gap only occurs at level `memory`, if a learner died after acknowledging the
-    /// segments.
+    /// Returns the number of segments missing before it. A worker numbers its segments from 1
+    /// without gaps and sends them in order, so the missing ones are lost. This happens only at
+    /// level `memory`, if a learner died after acknowledging them.
     ///
     /// # Errors
-    /// `Duplicate` if it has been settled, or belongs to an incarnation before the newest.
+    /// `Duplicate` if the segment has been settled or belongs to an old incarnation.
     ///
     /// # Panics
     /// If the worker does not exist or the block has the wrong length. Call `segment::check` first.
@@ -82,10 +82,9 @@ impl Inbox {
     /// segments are written to the log first.
     ///
     /// # Errors
-    /// If writing fails. Nothing new may be acknowledged then, and the workers wait.
+    /// If writing fails. The caller must then not acknowledge anything new; workers wait.
     pub fn acknowledge(&mut self) -> Result<&[Watermark], LogError> {
-        // Reset first, so that a failed write is retried at the regular interval and not on every
-        // turn.
+        // Reset before the write, so that a failed write is retried only at the regular interval.
         self.unacknowledged = 0;
         if let Some(log) = &mut self.log {
             log.write()?;
@@ -93,23 +92,24 @@ impl Inbox {
         Ok(&self.settled)
     }
 
-    /// Size of the log at this moment \[bytes\]; a checkpoint taken now contains all of it.
+    /// Current size of the log \[bytes\]. A checkpoint taken now contains all of it.
     #[must_use]
     pub fn logged(&self) -> u64 {
         self.log.as_ref().map_or(0, SegmentLog::logged)
     }
 
-    /// Whether enough segments are settled to acknowledge now instead of at the regular interval.
+    /// Whether enough segments are settled to send an acknowledgement before the regular interval
+    /// ends.
     #[must_use]
     pub fn owes_acknowledgement(&self) -> bool {
-        self.unacknowledged >= ACKNOWLEDGED_TOGETHER
+        self.unacknowledged >= ACKNOWLEDGEMENT_BATCH
     }
 
-    /// Removes the first `logged` bytes of the log after the checkpoint that contains them is on
-    /// disk.
+    /// Removes the first `logged` bytes of the log. Call it when the checkpoint that contains them
+    /// is on disk.
     ///
     /// # Errors
-    /// If the log cannot be truncated; this only wastes its space.
+    /// If the log cannot be truncated. This only wastes space.
     pub fn checkpointed(&mut self, logged: u64) -> Result<(), LogError> {
         self.log.as_mut().map_or(Ok(()), |log| log.forget(logged))
     }
@@ -120,7 +120,7 @@ impl Inbox {
         self.log.as_ref().is_none_or(SegmentLog::has_room)
     }
 
-    /// Whether a checkpoint must empty the log before anything can be settled.
+    /// Whether the log is full, so that only a checkpoint makes room for more segments.
     #[must_use]
     pub fn is_full(&self) -> bool {
         self.log.as_ref().is_some_and(SegmentLog::is_full)

@@ -1,15 +1,16 @@
-//! The segment log: segments settled since the last checkpoint, for a restarted learner.
+//! The segment log: contains the segments settled since the last checkpoint, for a restarted
+//! learner.
 //!
 //! ```text
 //!   head:    magic "DMPRLSL1" · u64 run id, architecture hash, block length
 //!   record:  u32 bytes of the payload, u32 CRC-32 of the payload, payload: header · block
 //! ```
-//! All numbers are little-endian, as in memory on every supported processor. Records are collected
-//! and appended with one `write`. They survive the process, but are not synced: a power failure can
-//! lose them. A process killed during a `write` leaves a torn record, which was never acknowledged
-//! and is cut off. Once a checkpoint is on disk, the log removes the records that it contains. A
-//! process killed between these two steps leaves records that the checkpoint's marks identify as
-//! duplicates.
+//! All numbers are little-endian, as in memory on every supported processor. Records are buffered
+//! and appended with one `write`. They survive a crash of the process, but are not synced, so a
+//! power failure can lose them. A process killed during a `write` leaves an incomplete record,
+//! which was never acknowledged and is truncated. Once a checkpoint is on disk, the records that it
+//! contains are removed from the log. A process killed between these two steps leaves records that
+//! the checkpoint's marks identify as duplicates.
 
 use std::fs::{File, OpenOptions};
 use std::io::{self, Read, Seek, SeekFrom, Write};
@@ -22,9 +23,9 @@ use crate::segment::{Segment, SegmentHeader, SegmentLayout};
 
 const MAGIC: &[u8; 8] = b"DMPRLSL1";
 const HEAD_BYTES: usize = 32;
-/// Length and checksum before each payload.
+/// Size of the length and checksum before each payload.
 const FRAME_BYTES: usize = 8;
-/// Size of the buffer that collects records between two `write`s.
+/// Size of the buffer for records between two `write`s.
 const BUFFER_BYTES: usize = 4 << 20;
 
 /// Why the log cannot be used.
@@ -34,7 +35,7 @@ pub enum LogError {
     #[error("segment log: {0}")]
     Io(#[from] io::Error),
     /// The log of another run, architecture or segment length.
-    #[error("segment log: its head is another run's or another configuration's; remove the file")]
+    #[error("segment log: it belongs to another run or another configuration; remove the file")]
     Foreign,
 }
 
@@ -43,11 +44,11 @@ pub enum LogError {
 pub struct Replayed {
     /// Number of complete records.
     pub records: u64,
-    /// Bytes after the last complete record, which were cut off.
+    /// Bytes after the last complete record, which were truncated.
     pub cut_bytes: u64,
 }
 
-/// The run and the architecture to which a log belongs.
+/// The run and the architecture that a log belongs to.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct LogIdentity {
     /// Run id.
@@ -65,7 +66,7 @@ pub struct SegmentLog {
     head: [u8; HEAD_BYTES],
     /// Bytes of complete records in the file.
     written: u64,
-    /// A `write` failed, so the file may end in an incomplete record.
+    /// Whether a `write` failed, so that the file may end with an incomplete record.
     torn: bool,
     buffer: Vec<u8>,
     bytes_max: u64,
@@ -75,7 +76,8 @@ impl SegmentLog {
     /// Opens the log of a run, or creates an empty one, for at most `bytes_max` bytes of records.
     ///
     /// # Errors
-    /// `Foreign` if it belongs to another run, `Io` if the file system returns an error.
+    /// `Foreign` if the file belongs to another run, architecture or segment length; `Io` if the
+    /// file system returns an error.
     pub fn open(
         path: &Path,
         identity: LogIdentity,
@@ -98,7 +100,7 @@ impl SegmentLog {
         let mut found = Vec::new();
         (&log.file).take(HEAD_BYTES as u64).read_to_end(&mut found)?;
         if found.len() < HEAD_BYTES {
-            // A process was killed before it had written the head, so nothing follows.
+            // A process was killed before it had written the whole head, so there are no records.
             log.file.set_len(0)?;
             log.file.rewind()?;
             log.file.write_all(&log.head)?;
@@ -108,7 +110,8 @@ impl SegmentLog {
         Ok(log)
     }
 
-    /// Passes every complete record to `each`, oldest first, and cuts off the rest of the file.
+    /// Passes every complete record to `each`, oldest first, and truncates the file after the last
+    /// one.
     ///
     /// # Errors
     /// `Io` if the file system returns an error.
@@ -134,11 +137,11 @@ impl SegmentLog {
         Ok(replayed)
     }
 
-    /// Whether another segment can be appended now. If not, and the log is not full, it can be
-    /// after the next `write`.
+    /// Whether another segment can be appended now. If not, and the log is not full, the next
+    /// `write` makes room.
     #[must_use]
     pub fn has_room(&self) -> bool {
-        // A record longer than the buffer is written on its own.
+        // A record that is larger than the buffer is written alone.
         let fits = self.buffer.len() + self.record_bytes() <= BUFFER_BYTES;
         !self.is_full() && (fits || self.buffer.is_empty())
     }
@@ -150,7 +153,7 @@ impl SegmentLog {
         bytes > self.bytes_max
     }
 
-    /// Collects a segment for the next `write`.
+    /// Buffers a segment for the next `write`.
     ///
     /// # Panics
     /// If the block has the wrong length.
@@ -167,8 +170,8 @@ impl SegmentLog {
         self.buffer.extend_from_slice(block);
     }
 
-    /// Writes the collected records. After an error they stay collected, and the next call retries
-    /// all of them.
+    /// Writes the buffered records. After an error they stay in the buffer, and the next call
+    /// retries all of them.
     ///
     /// # Errors
     /// `Io` if the file system returns an error.
@@ -187,7 +190,7 @@ impl SegmentLog {
         Ok(())
     }
 
-    /// Total bytes of records, written or collected.
+    /// Total bytes of records, written or buffered.
     #[must_use]
     pub fn logged(&self) -> u64 {
         self.written + self.buffer.len() as u64
@@ -196,12 +199,12 @@ impl SegmentLog {
     /// Removes the first `bytes` of records, which a checkpoint on disk contains.
     ///
     /// # Errors
-    /// `Io` if the file system returns an error; the log is then unchanged.
+    /// `Io` if the file system returns an error. The log is then unchanged.
     ///
     /// # Panics
     /// If the log has fewer bytes.
     pub fn forget(&mut self, bytes: u64) -> Result<(), LogError> {
-        assert!(bytes <= self.logged(), "more than there is");
+        assert!(bytes <= self.logged(), "the log has fewer bytes");
         if bytes == self.logged() {
             self.buffer.clear();
             self.written = 0;
@@ -209,10 +212,9 @@ impl SegmentLog {
             return self.cut();
         }
         self.write()?;
-        // The file is rewritten, because the rest is small: records added while the checkpoint was
-        // written.
+        // Rewrites the file. The rest is small: it was added while the checkpoint was written.
         let mut rest = Vec::new();
-        // Until the rewrite is complete, the next write has to find the end of the records again.
+        // If the rewrite fails, the next write must seek to the end of the records first.
         self.torn = true;
         self.file.seek(SeekFrom::Start(HEAD_BYTES as u64 + bytes))?;
         self.file.read_to_end(&mut rest)?;
@@ -229,7 +231,7 @@ impl SegmentLog {
         Ok(())
     }
 
-    /// Truncates the file after the last complete record and continues there.
+    /// Truncates the file after the last complete record and seeks to its end.
     fn cut(&mut self) -> Result<(), LogError> {
         let len = HEAD_BYTES as u64 + self.written;
         self.file.set_len(len)?;
@@ -294,7 +296,7 @@ mod tests {
     }
 
     #[test]
-    fn what_was_written_is_read_back_and_what_was_not_is_gone() {
+    fn written_records_are_replayed_and_buffered_ones_are_lost() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("log");
         let mut log = open(&path);
@@ -315,64 +317,64 @@ mod tests {
     }
 
     #[test]
-    fn what_came_after_the_moment_of_a_checkpoint_stays() {
+    fn records_added_after_a_checkpoint_are_kept() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("log");
         let mut log = open(&path);
         append(&mut log, 1..=2);
         log.write().unwrap();
         append(&mut log, 3..=3);
-        let held = log.logged();
+        let in_checkpoint = log.logged();
         append(&mut log, 4..=5);
-        log.forget(held).unwrap();
+        log.forget(in_checkpoint).unwrap();
         append(&mut log, 6..=6);
         log.write().unwrap();
         assert_eq!(replay(&path), (vec![4, 5, 6], Replayed { records: 3, cut_bytes: 0 }));
         let others = std::fs::read_dir(folder.path()).unwrap().count();
-        assert_eq!(others, 1, "no temporary file stays");
+        assert_eq!(others, 1, "no temporary file is left");
     }
 
     #[test]
-    fn a_torn_or_damaged_record_is_cut_off_with_all_behind_it() {
+    fn log_is_truncated_at_an_incomplete_or_corrupted_record() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("log");
         let mut log = open(&path);
         append(&mut log, 1..=3);
         log.write().unwrap();
-        let sound = std::fs::read(&path).unwrap();
+        let valid = std::fs::read(&path).unwrap();
         let record = log.record_bytes();
         drop(log);
-        for len in 0..sound.len() {
-            std::fs::write(&path, &sound[..len]).unwrap();
+        for len in 0..valid.len() {
+            std::fs::write(&path, &valid[..len]).unwrap();
             let whole = len.saturating_sub(HEAD_BYTES) / record;
             let (sequences, replayed) = replay(&path);
             assert_eq!(sequences.len(), whole, "{len} bytes");
             let cut = len.saturating_sub(HEAD_BYTES) - whole * record;
             assert_eq!(replayed, Replayed { records: whole as u64, cut_bytes: cut as u64 });
         }
-        for at in HEAD_BYTES..sound.len() {
-            let mut damaged = sound.clone();
-            damaged[at] ^= 0x10;
-            std::fs::write(&path, &damaged).unwrap();
+        for at in HEAD_BYTES..valid.len() {
+            let mut corrupted = valid.clone();
+            corrupted[at] ^= 0x10;
+            std::fs::write(&path, &corrupted).unwrap();
             assert_eq!(replay(&path).0.len(), (at - HEAD_BYTES) / record, "byte {at}");
-            assert_eq!(replay(&path).1.cut_bytes, 0, "cut off for good");
+            assert_eq!(replay(&path).1.cut_bytes, 0, "the file has been truncated");
         }
     }
 
     #[test]
-    fn another_runs_log_is_refused() {
+    fn log_of_another_run_is_rejected() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("log");
         drop(open(&path));
         for (run_id, architecture_hash) in [(2, 2), (1, 3)] {
             let identity = LogIdentity { run_id, architecture_hash };
-            let refused = SegmentLog::open(&path, identity, LAYOUT, BYTES_MAX).unwrap_err();
-            assert!(matches!(refused, LogError::Foreign), "{refused}");
+            let error = SegmentLog::open(&path, identity, LAYOUT, BYTES_MAX).unwrap_err();
+            assert!(matches!(error, LogError::Foreign), "{error}");
         }
     }
 
     #[test]
-    fn a_full_log_has_no_room_until_it_is_cleared() {
+    fn full_log_has_no_room_until_it_is_cleared() {
         let folder = tempfile::tempdir().unwrap();
         let mut log = open(&folder.path().join("log"));
         let count = BYTES_MAX / log.record_bytes() as u64;

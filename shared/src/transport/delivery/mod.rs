@@ -7,19 +7,21 @@
 //!             ▲                                 │         └─► log ──────────┤ (level "log")
 //!             └────── acknowledgements ◄────────┴───────── marks ◄──────────┘
 //! ```
-//! A queue in shared memory dies with its learner. The worker's [`Outbox`] therefore keeps every
-//! unacknowledged segment and retransmits all of them, oldest first, after each reconnection. The
-//! learner's [`Inbox`] stores the last settled segment of each worker, rejects duplicates and
-//! acknowledges settled segments. Its [`Watermark`]s are part of a checkpoint and always match the
-//! replay in it.
+//! A queue in shared memory is lost when its learner dies. The worker's [`Outbox`] therefore keeps
+//! every unacknowledged segment and retransmits all of them, oldest first, after each reconnection.
+//! The learner's [`Inbox`] stores the last settled segment of each worker, rejects duplicates and
+//! acknowledges settled segments. Its [`Watermark`]s are part of each checkpoint and always match
+//! the replay in it.
 //!
-//! The delivery level decides when a segment is acknowledged. `memory`: when it is in the replay; a
-//! learner that dies loses the segments since its last checkpoint. `log`: when it is in the
-//! [`SegmentLog`] too, which a restarted learner reads after the checkpoint; its death loses
-//! nothing. At neither level do unsent segments survive the death of their worker. A power failure
-//! can lose segments at both levels.
+//! The delivery level decides when a segment is acknowledged:
+//! - `memory`: when it is in the replay. A crash of the learner loses the segments since its last
+//!   checkpoint.
+//! - `log`: when it is also in the [`SegmentLog`], which a restarted learner reads after the
+//!   checkpoint. A crash of the learner loses no segment.
 //!
-//! Nothing here blocks or reads a clock, so the same code runs in a simulation with faults
+//! At both levels, a crash of a worker loses its unsent segments, and a power failure can lose any.
+//!
+//! This module does not block or read a clock, so the same code runs in a simulation with faults
 //! (`shared/tests/delivery_simulation/`).
 
 mod inbox;
@@ -32,21 +34,21 @@ pub use inbox::Inbox;
 pub use log::{LogError, LogIdentity, Replayed, SegmentLog};
 pub use outbox::{Outbox, Sent};
 
-/// The last segment of a worker up to which all segments are settled.
+/// Position up to which all segments of a worker are settled.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, PartialOrd, Ord, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Watermark {
-    /// Number of the worker's start.
+    /// Incarnation of the worker, which increases with each restart.
     pub incarnation: u32,
-    /// Sequence number of the segment; 0 before the first.
+    /// Sequence number of the last settled segment; 0 before the first.
     pub sequence: u64,
 }
 
-/// The learner's acknowledgements to its workers. They are cumulative: the newest replaces all
-/// older ones.
+/// The learner's acknowledgements to its workers. They are cumulative, so each one replaces all
+/// earlier ones.
 #[derive(Debug, Clone, PartialEq, Eq, Default)]
 pub struct Acknowledgements {
-    /// Number of the learner within the domain; a restarted learner has a higher one.
+    /// Number of the learner within the domain. A restarted learner has a higher number.
     pub epoch: u64,
     /// One mark per worker.
     pub marks: Vec<Watermark>,

@@ -1,4 +1,4 @@
-//! The worker's side of the delivery: a bounded ring of unacknowledged segments.
+//! The worker's side of reliable delivery: a bounded ring of unacknowledged segments.
 
 use serde::{Deserialize, Serialize};
 
@@ -14,14 +14,14 @@ pub struct Sent {
     pub produced: u64,
     /// Segments accepted by a queue, including retransmits.
     pub sent: u64,
-    /// Retransmits; part of `sent`.
+    /// Retransmits, which `sent` includes.
     pub resent: u64,
     /// Acknowledged segments.
     pub acked: u64,
 }
 
 impl Sent {
-    /// Difference to an earlier count.
+    /// Returns the difference to an earlier count.
     #[must_use]
     pub fn since(&self, before: &Self) -> Self {
         Self {
@@ -42,7 +42,8 @@ impl std::ops::AddAssign for Sent {
     }
 }
 
-/// Unacknowledged segments of one incarnation of a worker. The worker waits while it is full.
+/// Unacknowledged segments of one incarnation of a worker. The worker waits while the outbox is
+/// full.
 #[derive(Debug)]
 pub struct Outbox {
     worker_id: u32,
@@ -51,13 +52,15 @@ pub struct Outbox {
     headers: Vec<SegmentHeader>,
     /// (ring, block). Zeroed pages take no memory until a segment is written to them.
     blocks: Vec<f32>,
-    /// Sequence numbers: the oldest kept, the next to offer, the next to put in, and the highest
-    /// that any queue has accepted. first <= next <= end.
+    /// Sequence number of the oldest segment kept. first <= next <= end.
     first: u64,
+    /// Sequence number of the next segment to offer.
     next: u64,
+    /// Sequence number of the next segment to put in.
     end: u64,
+    /// Highest sequence number that any queue has accepted.
     highest_sent: u64,
-    /// The newest learner that has sent an acknowledgement.
+    /// Number of the newest learner that has sent an acknowledgement.
     epoch: u64,
     sent: Sent,
 }
@@ -81,7 +84,7 @@ impl Outbox {
     /// acknowledged.
     ///
     /// # Panics
-    /// If `segments_max` is 0, or `first` is 0: sequences start at 1.
+    /// If `segments_max` or `first` is 0. Sequences start at 1.
     #[must_use]
     pub fn starting_at(
         first: u64,
@@ -90,7 +93,7 @@ impl Outbox {
         worker_id: u32,
         incarnation: u32,
     ) -> Self {
-        assert!(segments_max > 0, "an outbox holds at least one segment");
+        assert!(segments_max > 0, "an outbox needs room for at least one segment");
         assert!(first > 0, "the first segment has sequence 1");
         let block_len = layout.block_len();
         Self {
@@ -114,7 +117,7 @@ impl Outbox {
         self.worker_id
     }
 
-    /// Number of the worker's start.
+    /// Incarnation of the worker that owns the outbox.
     #[must_use]
     pub fn incarnation(&self) -> u32 {
         self.incarnation
@@ -171,7 +174,8 @@ impl Outbox {
     /// Keeps a copy of the worker's next segment. Returns false if the outbox is full.
     ///
     /// # Panics
-    /// If the segment is of another worker, not the next in sequence, or of another length.
+    /// If the segment is from another worker or incarnation, is not the next in sequence, or has
+    /// the wrong length.
     pub fn put(&mut self, header: &SegmentHeader, block: &[f32]) -> bool {
         let origin = (header.worker_id, header.incarnation, header.sequence);
         assert_eq!(origin, (self.worker_id, self.incarnation, self.end), "not the next segment");
@@ -186,14 +190,14 @@ impl Outbox {
         true
     }
 
-    /// Offers unsent segments, oldest first, and all kept segments after a reconnection.
+    /// Offers unsent segments, oldest first. After a reconnection it offers all kept segments.
     ///
-    /// Returns `Delivered` if nothing is left to offer, or the reason why not. Call it as long as
-    /// the outbox is not empty, even without new segments: a new learner may lack the ones already
-    /// sent.
+    /// Returns `Delivered` if no unsent segment is left, otherwise the outcome of the last offer.
+    /// Call it as long as the outbox is not empty, even without new segments: after a restart, the
+    /// learner may lack segments that were already sent.
     ///
     /// # Errors
-    /// Those of the link.
+    /// The errors of the link.
     pub fn offer(&mut self, link: &mut impl SegmentSender) -> Result<SendOutcome, TransportError> {
         if link.renew()? {
             self.next = self.first;
@@ -213,8 +217,8 @@ impl Outbox {
         Ok(SendOutcome::Delivered)
     }
 
-    /// Discards acknowledged segments. Acknowledgements of a replaced learner are ignored: its
-    /// successor may have fewer segments and still needs the rest.
+    /// Discards acknowledged segments. Acknowledgements of a replaced learner are ignored, because
+    /// its successor may have restored fewer segments.
     pub fn acknowledge(&mut self, acknowledgements: &Acknowledgements) {
         let Some(mark) = acknowledgements.marks.get(self.worker_id as usize) else { return };
         if acknowledgements.epoch < self.epoch {
@@ -224,8 +228,7 @@ impl Outbox {
         self.acknowledge_to(*mark);
     }
 
-    /// Discards segments up to `mark`. The caller ensures that the mark belongs to this worker and
-    /// is the newest.
+    /// Discards segments up to `mark`, which must belong to this worker and be the newest.
     pub fn acknowledge_to(&mut self, mark: Watermark) {
         let ours = mark.incarnation == self.incarnation && mark.sequence < self.end;
         if ours && mark.sequence >= self.first {
@@ -235,13 +238,13 @@ impl Outbox {
         }
     }
 
-    /// Discards all segments and continues at `first`, for a learner that already has the segments
-    /// in between.
+    /// Discards all segments and continues at `first`, because the learner already has all segments
+    /// before it.
     ///
     /// # Panics
     /// If `first` is before the end of the sequence.
     pub fn skip_to(&mut self, first: u64) {
-        assert!(first >= self.end, "an outbox does not go back");
+        assert!(first >= self.end, "sequence numbers of an outbox never decrease");
         (self.first, self.next, self.end) = (first, first, first);
         self.highest_sent = first - 1;
     }

@@ -1,7 +1,7 @@
 //! Acknowledgements from the learner to all workers.
 //!
-//! They are cumulative: the newest replaces the previous one, and a lost one only delays workers
-//! until the next.
+//! They are cumulative: each one replaces the previous one. If one is lost, workers only wait for
+//! the next.
 
 use std::fs::File;
 use std::sync::Arc;
@@ -15,29 +15,29 @@ use super::domain::Domain;
 use super::generation::Membership;
 use super::latest::{ReaderPort, SAMPLES_MAX, Writer, subscribe};
 use super::plan::Plan;
-use super::service::{PrivateIpc, refused};
+use super::service::{PrivateIpc, middleware_error};
 use crate::transport::delivery::{Acknowledgements, Watermark};
 use crate::transport::{AcknowledgementPublisher, AcknowledgementSubscriber, TransportError};
 
-/// Incarnation and sequence of a worker's mark.
+/// Numbers of a worker's mark: incarnation and sequence.
 const NUMBERS_PER_WORKER: usize = 2;
 
-/// Header of a sample: the learner that sent it.
+/// Header of a sample.
 #[derive(Debug, Default, Clone, Copy)]
 #[repr(transparent)]
 pub(super) struct WireHeader {
+    /// Number of the learner that sent the sample.
     epoch: u64,
 }
 
-// SAFETY: one integer, no pointers; every bit pattern is valid. A change of the layout changes the
-// name.
+// SAFETY: one integer, no pointers, every bit pattern valid. The name must change with the layout.
 unsafe impl ZeroCopySend for WireHeader {
     unsafe fn type_name() -> &'static str {
         "dmprl::AcknowledgementHeader1"
     }
 }
 
-/// Length of a sample in numbers.
+/// Returns the length of a sample in numbers.
 pub(super) fn sample_len(worker_count: usize) -> usize {
     worker_count * NUMBERS_PER_WORKER
 }
@@ -110,9 +110,10 @@ impl AcknowledgementSubscriber for AcknowledgementReader {
         let Some(port) = membership.port() else { return Ok(false) };
         let mut taken = false;
         for _ in 0..SAMPLES_MAX {
-            let received = port.receive().map_err(refused("receiving from", &channel.name))?;
+            let received =
+                port.receive().map_err(middleware_error("receiving from", &channel.name))?;
             let Some(sample) = received else { break };
-            // The peer states the length, so check it against the agreed one.
+            // The length comes from the peer, so check it.
             let got = usize::try_from(sample.header().number_of_elements()).unwrap_or(usize::MAX);
             if got != *len {
                 return Err(TransportError::Length { expected: *len, got });
@@ -121,7 +122,7 @@ impl AcknowledgementSubscriber for AcknowledgementReader {
             acknowledgements.marks.clear();
             let marks =
                 sample.payload().chunks_exact(NUMBERS_PER_WORKER).map(|numbers| Watermark {
-                    // No worker has an incarnation this large, so the mark matches none.
+                    // No worker has an incarnation this large, so nothing is acknowledged.
                     incarnation: u32::try_from(numbers[0]).unwrap_or(u32::MAX),
                     sequence: numbers[1],
                 });

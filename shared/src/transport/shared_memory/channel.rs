@@ -1,4 +1,5 @@
-//! One iceoryx2 service with agreed attributes: the learner creates it, and workers open it.
+//! An iceoryx2 service with attributes that its peers compare. The learner creates it, and workers
+//! open it.
 
 use std::fmt::Debug;
 use std::sync::Arc;
@@ -16,27 +17,28 @@ use iceoryx2::service::builder::publish_subscribe::{
 };
 use iceoryx2::service::port_factory::publish_subscribe::PortFactory;
 
-use super::service::{PrivateIpc, refused, service_name};
+use super::service::{PrivateIpc, middleware_error, service_name};
 use crate::transport::TransportError;
 
-/// Makes the ports of one service whose samples are slices of `E` with a header `H`.
+/// Creates the ports of one service whose samples are slices of `E` with a header `H`.
 ///
 /// The elements are plain numbers, not 64-byte blocks. The slice's length is then the block's
-/// length, so a wrong length is detected before the payload is read. The copies need no more than a
-/// number's alignment.
+/// length, so a wrong length is detected before the payload is read. Copying does not need a larger
+/// alignment.
 pub(super) type Factory<E, H> = PortFactory<PrivateIpc, [E], H>;
 /// A service before it is created or opened.
 pub(super) type ChannelBuilder<E, H> = Builder<[E], H, PrivateIpc>;
 
-/// A service's name, and the attributes that its peers must agree on (name and value).
+/// A service's name, and the attributes that must be equal in all peers.
 #[derive(Debug, Clone)]
 pub(super) struct Channel {
     pub(super) name: String,
+    /// Name and value of each attribute.
     pub(super) agreement: Vec<(&'static str, String)>,
 }
 
 impl Channel {
-    /// Creates the service, in a new directory that belongs only to this learner.
+    /// Creates the service. The learner calls this, in a directory of its own.
     pub(super) fn create<E, H>(
         &self,
         node: &Node<PrivateIpc>,
@@ -49,15 +51,17 @@ impl Channel {
         let mut attributes = AttributeSpecifier::new();
         for (key, value) in &self.agreement {
             let (key, value) = attribute(key, value)?;
-            attributes = attributes.define(&key, &value).map_err(refused("stating", key))?;
+            attributes = attributes
+                .define(&key, &value)
+                .map_err(middleware_error("defining the attribute", key))?;
         }
         limits(self.builder(node)?)
             .create_with_attributes(&attributes)
-            .map_err(refused("creating the service", &self.name))
+            .map_err(middleware_error("creating the service", &self.name))
     }
 
     /// Opens the service that the learner created. A worker never creates one: if it were killed
-    /// while doing so, the incomplete service would hang every process that opens it.
+    /// meanwhile, every process that opens the incomplete service would hang.
     pub(super) fn open<E, H>(
         &self,
         node: &Node<PrivateIpc>,
@@ -69,7 +73,9 @@ impl Channel {
         let mut attributes = AttributeVerifier::new();
         for (key, value) in &self.agreement {
             let (key, value) = attribute(key, value)?;
-            attributes = attributes.require(&key, &value).map_err(refused("stating", key))?;
+            attributes = attributes
+                .require(&key, &value)
+                .map_err(middleware_error("defining the attribute", key))?;
         }
         let opened = self.builder(node)?.open_with_attributes(&attributes);
         opened.map_err(|cause| self.not_opened(node, cause))
@@ -105,11 +111,11 @@ impl Channel {
             OpenError::ExceedsMaxNumberOfNodes | OpenError::IsMarkedForDestruction => {
                 self.taken(cause)
             }
-            cause => refused("opening the service", name)(cause),
+            cause => middleware_error("opening the service", name)(cause),
         }
     }
 
-    /// The error for a slot that a live process occupies.
+    /// Creates the error for a slot that another process occupies.
     pub(super) fn taken(&self, cause: impl Debug) -> TransportError {
         TransportError::Taken { name: self.name.clone(), cause: format!("{cause:?}") }
     }
@@ -134,20 +140,21 @@ impl Channel {
 }
 
 fn attribute(key: &str, value: &str) -> Result<(AttributeKey, AttributeValue), TransportError> {
-    let name = key.try_into().map_err(refused("stating", key))?;
-    Ok((name, value.try_into().map_err(refused("stating", key))?))
+    let name = key.try_into().map_err(middleware_error("defining the attribute", key))?;
+    Ok((name, value.try_into().map_err(middleware_error("defining the attribute", key))?))
 }
 
-/// Set when a port could not connect to a peer.
+/// Flag that is set when a port could not connect to a peer.
 ///
-/// Usually the peer died while connecting, and nothing is lost. But iceoryx2 tries to connect only
-/// once per peer: if a live peer was too slow, only a new port can reach it.
+/// Usually the peer died while connecting, and nothing is lost. However, iceoryx2 tries to connect
+/// only once per peer. If a live peer was too slow, only a new port can reach it.
 #[derive(Debug, Clone, Default)]
 pub(super) struct Disconnected(Arc<AtomicBool>);
 
 impl Disconnected {
-    /// Handler for a broken connection: sets the flag and continues to serve the other peers.
-    pub(super) fn remember<Cause, Info>(
+    /// Returns a handler for broken connections, which sets the flag and keeps the port in use for
+    /// the other peers.
+    pub(super) fn handler<Cause, Info>(
         &self,
     ) -> impl Fn(Cause, &Info) -> DegradationAction + Send + 'static {
         let flag = self.0.clone();

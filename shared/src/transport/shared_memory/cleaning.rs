@@ -1,10 +1,10 @@
 //! Decides when the learner cleans up after dead processes.
 //!
 //! To find dead processes, iceoryx2 reads several files per process, and three times as many for a
-//! worker. With 256 workers this takes 0.1 s, which the learner would spend four times a second if
-//! it did so in each maintenance call. The learner therefore scans immediately only if the process
-//! of a worker's port is gone, which one system call shows. In all other cases, such as a process
-//! that died before it had a port, it scans only as often as a fixed share of its time allows.
+//! worker. With 256 workers a scan takes 0.1 s. In every maintenance call, four times per second,
+//! that would be too much. The learner therefore scans immediately only if the process of a
+//! worker's port is gone, which one system call per port detects. Otherwise it scans at a limited
+//! rate, which finds processes that died before they had a port.
 
 use iceoryx2::node::Node;
 use iceoryx2::prelude::CallbackProgression;
@@ -16,25 +16,28 @@ use super::channel::Factory;
 use super::service::{PrivateIpc, clean};
 use crate::transport::TransportError;
 
-/// Nodes scanned per call on average. With up to ten workers every call scans all nodes; with 256
-/// workers a scan happens once in six seconds.
-const LOOKS: usize = 32;
-/// Consecutive failed cleanups before the error is returned. Single failures are normal: a worker
-/// that starts or ends during the scan hides the ones behind it.
+/// Average number of nodes scanned per call. With up to ten workers every call scans all nodes;
+/// with 256 workers a scan happens every six seconds.
+const NODES_PER_CALL: usize = 32;
+/// Consecutive failed cleanups before the error is returned. Single failures are normal: if a
+/// worker starts or ends during the scan, the scan stops early.
 const FAILURES_MAX: usize = 20;
 
 /// Rate limiter of the scans.
 #[derive(Debug, Default)]
 pub(super) struct Cleaning {
-    /// Scanned nodes that are not yet compensated by calls without a scan.
-    owed: usize,
+    /// Scanned nodes above the average. Each call reduces it by [`NODES_PER_CALL`], and the next
+    /// regular scan is due at 0.
+    excess: usize,
     failures: usize,
 }
 
 impl Cleaning {
-    /// Cleans up if a scan is due. Call it a few times a second. `died` says that a known process
-    /// is gone; for `found_dead` see [`clean`].
-    pub(super) fn clean_in_time(
+    /// Cleans up if a scan is due. Call it a few times per second.
+    ///
+    /// - `died`: whether a known process is gone.
+    /// - `found_dead`: see [`clean`].
+    pub(super) fn clean_if_due(
         &mut self,
         node: &Node<PrivateIpc>,
         died: bool,
@@ -44,7 +47,7 @@ impl Cleaning {
             return Ok(());
         }
         match clean(node, found_dead) {
-            Ok(looked) => *self = Self { owed: looked, failures: 0 },
+            Ok(scanned) => *self = Self { excess: scanned, failures: 0 },
             Err(error) if self.failures >= FAILURES_MAX => return Err(error),
             Err(_) => self.failures += 1,
         }
@@ -52,13 +55,13 @@ impl Cleaning {
     }
 
     fn is_due(&mut self, died: bool) -> bool {
-        self.owed = self.owed.saturating_sub(LOOKS);
-        died || self.owed == 0
+        self.excess = self.excess.saturating_sub(NODES_PER_CALL);
+        died || self.excess == 0
     }
 }
 
-/// Whether the process of one of the service's ports is gone. A process whose number has been
-/// reused, or that lives in another PID namespace, is found by the regular scans.
+/// Returns whether the process of one of the service's ports is gone. It misses processes whose PID
+/// has been reused or that are in another PID namespace; the regular scans find these.
 pub(super) fn sender_died<E, H>(factory: &Factory<E, H>) -> bool
 where
     E: core::fmt::Debug + iceoryx2::prelude::ZeroCopySend + 'static,
@@ -79,17 +82,17 @@ mod tests {
     use super::*;
 
     #[test]
-    fn few_processes_are_looked_at_every_time_and_many_in_turns() {
-        let mut few = Cleaning { owed: LOOKS, failures: 0 };
+    fn scan_rate_decreases_with_the_number_of_processes() {
+        let mut few = Cleaning { excess: NODES_PER_CALL, failures: 0 };
         assert!(few.is_due(false));
-        let mut many = Cleaning { owed: 10 * LOOKS, failures: 0 };
+        let mut many = Cleaning { excess: 10 * NODES_PER_CALL, failures: 0 };
         let calls = (1..).find(|_| many.is_due(false));
         assert_eq!(calls, Some(10));
     }
 
     #[test]
-    fn a_death_is_looked_after_at_once() {
-        let mut many = Cleaning { owed: 10 * LOOKS, failures: 0 };
+    fn death_of_a_process_triggers_a_scan() {
+        let mut many = Cleaning { excess: 10 * NODES_PER_CALL, failures: 0 };
         assert!(many.is_due(true));
         assert!(!many.is_due(false));
     }

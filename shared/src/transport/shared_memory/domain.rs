@@ -3,13 +3,13 @@
 //! ```text
 //! /dev/shm/dmprl-<uid>/     0700, the parent: all runs of this user
 //!   <token>/                0700, one run
-//!     domain                marker: dmprl may remove this directory
-//!     owner.lock            locked as long as the owner lives
+//!     domain                marks a directory that dmprl may remove
+//!     owner.lock            locked while the owner is alive
 //!     …                     see `generation`
 //! ```
-//! The kernel releases a lock when its process ends for any reason, so a directory with a free lock
-//! is abandoned. Directories are created and removed under a lock on the parent, so that a
-//! directory between `mkdir` and its lock never looks abandoned.
+//! The kernel releases a lock when its process ends for any reason, so a directory whose lock is
+//! free is abandoned. Directories are created and removed while the parent is locked, so that a
+//! directory between its `mkdir` and its lock never looks abandoned.
 
 mod error;
 mod leftovers;
@@ -32,13 +32,14 @@ use super::service::PREFIX;
 const MARKER_FILE: &str = "domain";
 const MARKER_TEXT: &str = "dmprl shared-memory domain, version 1\n";
 const LOCK_FILE: &str = "owner.lock";
-/// The learner holds this lock as long as it lives.
+/// The learner holds this lock while it is alive.
 pub(super) const LEARNER_LOCK: &str = "learner.lock";
-/// Prefix of directories under construction; complete ones are renamed.
+/// Prefix of directories that are being created. They are renamed when they are complete.
 const UNFINISHED: &str = ".dmprl-unfinished-";
-/// Prefix of directories under removal; they are renamed first, so that no process can join them.
+/// Prefix of directories that are being removed. They are renamed first, so that no process can
+/// join them.
 const CONDEMNED: &str = ".dmprl-condemned-";
-/// Attempts to take the parent's lock, which is held for milliseconds.
+/// Attempts to take the parent's lock, which other processes hold only for milliseconds.
 const PARENT_LOCK_ATTEMPTS: usize = 500;
 const PARENT_LOCK_PAUSE: Duration = Duration::from_millis(10);
 
@@ -53,7 +54,7 @@ pub struct Domain {
 impl Domain {
     /// Creates the directory `token` in `parent`, and `parent` if it does not exist.
     ///
-    /// `token` should be random, so that runs do not collide.
+    /// `token` should be random to avoid collisions between runs.
     ///
     /// # Errors
     /// `Token` or `TooLong` for invalid names, `Untrusted` if `parent` is not private to this user,
@@ -68,7 +69,7 @@ impl Domain {
         let _parent_lock = make_and_lock_parent(parent)?;
         let unfinished = parent.join(format!("{UNFINISHED}{token}"));
         remove_tree(&unfinished)?;
-        private_directory().create(&unfinished).map_err(failed("making", &unfinished))?;
+        private_directory().create(&unfinished).map_err(failed("creating", &unfinished))?;
         let owner = private_file(&unfinished.join(LOCK_FILE))?;
         try_lock(&owner, &path)?;
         let marker = unfinished.join(MARKER_FILE);
@@ -77,7 +78,7 @@ impl Domain {
             .map_err(failed("writing", &marker))?;
         // A plain rename would silently replace an empty directory.
         renameat_with(CWD, &unfinished, CWD, &path, RenameFlags::NOREPLACE)
-            .map_err(|errno| failed("making", &path)(errno.into()))?;
+            .map_err(|errno| failed("creating", &path)(errno.into()))?;
         Ok(Self { path, owner: Some(owner) })
     }
 
@@ -103,16 +104,16 @@ impl Domain {
         &self.path
     }
 
-    /// Fails if less than `needed_bytes` of shared memory are free.
+    /// Checks that at least `needed_bytes` of shared memory are free.
     ///
-    /// Files in shared memory are not reserved on creation. On a full file system, the kernel kills
-    /// the process that first writes to a missing page; this check prevents that.
+    /// Creating a file in shared memory does not reserve its space. If the file system is full when
+    /// a process first writes to a page, the kernel kills the process; this check prevents that.
     ///
     /// # Errors
-    /// `Space` with both numbers; `Io` if the free space cannot be read.
+    /// `Space` if too little is free; `Io` if the free space cannot be determined.
     pub fn check_space(&self, needed_bytes: u64) -> Result<(), DomainError> {
         let file_system = statvfs(&self.path)
-            .map_err(|errno| failed("asking for free space in", &self.path)(errno.into()))?;
+            .map_err(|errno| failed("reading the free space of", &self.path)(errno.into()))?;
         let available = file_system.f_bavail.saturating_mul(file_system.f_frsize);
         if available < needed_bytes {
             let path = self.path.clone();
@@ -121,7 +122,7 @@ impl Domain {
         Ok(())
     }
 
-    /// Takes the lock `name` in this domain for as long as the returned file is open.
+    /// Takes the lock `name` in this domain. The lock is held while the returned file is open.
     pub(super) fn lock(&self, name: &str) -> Result<File, DomainError> {
         let path = self.path.join(name);
         let file = OpenOptions::new()
@@ -139,7 +140,7 @@ impl Domain {
 impl Drop for Domain {
     fn drop(&mut self) {
         if self.owner.is_some() && has_marker(&self.path) {
-            // `drop` cannot report errors; `remove_abandoned` finds the rest.
+            // Ignores errors: `remove_abandoned` removes the rest later.
             let _ = condemn(&self.path);
             if let Some(parent) = self.path.parent() {
                 remove_parent_if_empty(parent);
@@ -148,7 +149,8 @@ impl Drop for Domain {
     }
 }
 
-/// Renames the domain, so that no process can join it, and removes it. `false` if it did not exist.
+/// Renames the domain, so that no process can join it, and removes it. Returns false if it did not
+/// exist.
 fn condemn(path: &Path) -> Result<bool, DomainError> {
     let mut name = std::ffi::OsString::from(CONDEMNED);
     name.push(path.file_name().unwrap_or_default());
@@ -160,7 +162,7 @@ fn condemn(path: &Path) -> Result<bool, DomainError> {
     remove_tree(&condemned).map(|()| true)
 }
 
-/// Removes a directory. Symbolic links below it are removed, not followed.
+/// Removes a directory if it exists. Symbolic links below it are removed, not followed.
 fn remove_tree(path: &Path) -> Result<(), DomainError> {
     match std::fs::remove_dir_all(path) {
         Err(error) if error.kind() != ErrorKind::NotFound => Err(failed("removing", path)(error)),
@@ -169,8 +171,8 @@ fn remove_tree(path: &Path) -> Result<(), DomainError> {
 }
 
 fn check_token(token: &str) -> Result<(), DomainError> {
-    let sound = |byte: u8| byte.is_ascii_alphanumeric() || byte == b'-' || byte == b'_';
-    if (1..=TOKEN_BYTES_MAX).contains(&token.len()) && token.bytes().all(sound) {
+    let is_valid = |byte: u8| byte.is_ascii_alphanumeric() || byte == b'-' || byte == b'_';
+    if (1..=TOKEN_BYTES_MAX).contains(&token.len()) && token.bytes().all(is_valid) {
         return Ok(());
     }
     Err(DomainError::Token { got: token.to_owned() })
@@ -188,16 +190,16 @@ fn private_file(path: &Path) -> Result<File, DomainError> {
         .create_new(true)
         .mode(0o600)
         .open(path)
-        .map_err(failed("making", path))
+        .map_err(failed("creating", path))
 }
 
-/// Creates and locks the parent. The last domain to be removed also removes the parent, so an
-/// existing parent may be gone when it is locked; it is then created again.
+/// Creates and locks the parent. Another process may remove it in between, together with the last
+/// domain in it; it is then created again.
 fn make_and_lock_parent(parent: &Path) -> Result<File, DomainError> {
     for _ in 0..PARENT_LOCK_ATTEMPTS {
         match private_directory().create(parent) {
             Err(error) if error.kind() != ErrorKind::AlreadyExists => {
-                return Err(failed("making", parent)(error));
+                return Err(failed("creating", parent)(error));
             }
             _ => {}
         }
@@ -209,7 +211,7 @@ fn make_and_lock_parent(parent: &Path) -> Result<File, DomainError> {
     Err(DomainError::Locked { path: parent.to_owned() })
 }
 
-/// Removes the parent if it is empty and can be locked. An empty directory that stays does no harm.
+/// Removes the parent if it is empty and can be locked. Otherwise it stays, which does no harm.
 fn remove_parent_if_empty(parent: &Path) {
     if let Ok(Some(_lock)) = lock_parent(parent) {
         let _ = std::fs::remove_dir(parent);
@@ -217,7 +219,7 @@ fn remove_parent_if_empty(parent: &Path) {
 }
 
 fn check_private(path: &Path) -> Result<(), DomainError> {
-    let metadata = path.symlink_metadata().map_err(failed("looking at", path))?;
+    let metadata = path.symlink_metadata().map_err(failed("inspecting", path))?;
     let user = rustix::process::geteuid().as_raw();
     let mode = metadata.mode() & 0o7777;
     if path.is_absolute() && metadata.is_dir() && metadata.uid() == user && mode == 0o700 {
@@ -226,7 +228,7 @@ fn check_private(path: &Path) -> Result<(), DomainError> {
     let kind = if metadata.is_dir() { "directory" } else { "file or symbolic link" };
     Err(DomainError::Untrusted {
         path: path.to_owned(),
-        expected: "an absolute path of a directory of this user with mode 0700",
+        expected: "the absolute path of a directory of this user with mode 0700",
         got: format!("{kind} of user {} with mode {mode:04o}", metadata.uid()),
     })
 }
@@ -243,8 +245,8 @@ fn try_lock(file: &File, path: &Path) -> Result<(), DomainError> {
     }
 }
 
-/// Locks the parent directory itself, so that no lock file can be left behind. `None` if the
-/// directory does not exist, or was removed while waiting for its lock.
+/// Locks the parent directory itself, so that no lock file can be left behind. Returns `None` if
+/// the directory does not exist or was removed while waiting for its lock.
 fn lock_parent(parent: &Path) -> Result<Option<File>, DomainError> {
     let opened = OpenOptions::new()
         .read(true)
@@ -259,7 +261,7 @@ fn lock_parent(parent: &Path) -> Result<Option<File>, DomainError> {
             Err(DomainError::Locked { .. }) => std::thread::sleep(PARENT_LOCK_PAUSE),
             Err(error) => return Err(error),
             Ok(()) => {
-                let locked = directory.metadata().map_err(failed("looking at", parent))?;
+                let locked = directory.metadata().map_err(failed("inspecting", parent))?;
                 let same = |there: std::fs::Metadata| {
                     (there.dev(), there.ino()) == (locked.dev(), locked.ino())
                 };

@@ -1,13 +1,14 @@
-//! A separate directory for each learner of a run, and the workers' switch from one to the next.
+//! Generations: each learner of a run has its own directory, and workers switch to the newest one.
 //!
 //! ```text
 //! <domain>/generation    number of the newest complete generation
-//! <domain>/g<number>/    all that iceoryx2 creates for one learner and its workers
+//! <domain>/g<number>/    all files of iceoryx2 for one learner and its workers
 //! ```
-//! iceoryx2 0.10 does not recover from every death: a process killed while creating a service
-//! leaves one that hangs, and a process killed during cleanup leaves slots that are never freed.
-//! Therefore a new learner inherits nothing. It starts in a new directory, removes the old one, and
-//! announces its number when all services are complete. Workers detect the new number and rejoin.
+//! iceoryx2 0.10 does not recover from every crash. If a process is killed while it creates a
+//! service, processes that open the service hang. If a process is killed during cleanup, some slots
+//! are never freed. Therefore a new learner reuses nothing: it removes the old directory, starts in
+//! a new one, and announces its number when all services are complete. Workers detect the new
+//! number and rejoin.
 
 use std::fs::{DirBuilder, File, OpenOptions};
 use std::os::unix::ffi::OsStrExt;
@@ -19,18 +20,18 @@ use memmap2::{Mmap, MmapOptions};
 
 use super::channel::Disconnected;
 use super::domain::Domain;
-use super::service::{self, PrivateIpc, refused};
+use super::service::{self, PrivateIpc, middleware_error};
 use crate::transport::TransportError;
 
 const NUMBER_FILE: &str = "generation";
 const DIRECTORY_PREFIX: &str = "g";
-/// Length that the directory adds to the domain's path: "/g" and four digits [bytes].
+/// Length that a generation's directory adds to the domain's path: "/g" and four digits [bytes].
 pub(super) const DIRECTORY_BYTES: usize = 6;
-/// Consecutive failures to join a new generation before the error is returned. A few are normal:
-/// the learner may die again during the join, or the predecessor's worker may still be registered.
-/// The limit is high because a learner may be killed just after announcing its generation. No
-/// worker can join that generation, and the next one is announced only after a checkpoint has been
-/// loaded.
+/// Consecutive failures to join a new generation before the error is returned. Some are normal: the
+/// learner may die during the join, or the worker's previous process may still be registered. The
+/// limit is high because a learner may be killed just after announcing its generation. No worker
+/// can join that generation, and the next one is announced only after the next learner has loaded a
+/// checkpoint.
 const JOIN_FAILURES_MAX: usize = 100_000;
 
 /// A generation under construction, which workers do not see yet.
@@ -44,10 +45,10 @@ pub(super) struct Generation {
 }
 
 impl Generation {
-    /// Starts a new generation and removes all others. The caller must hold the learner's lock.
+    /// Removes all other generations and starts a new one. The caller must hold the learner's lock.
     pub(super) fn begin(domain: &Domain) -> Result<Self, TransportError> {
         let path = domain.path();
-        let failed = || refused("starting a generation in", path.display());
+        let failed = || middleware_error("starting a generation in", path.display());
         for entry in path.read_dir().map_err(failed())? {
             let entry = entry.map_err(failed())?;
             let named = entry.file_name().as_bytes().starts_with(DIRECTORY_PREFIX.as_bytes());
@@ -79,7 +80,7 @@ impl Generation {
     pub(super) fn announce(self) -> Result<(), TransportError> {
         self.number_file
             .write_all_at(&self.number.to_le_bytes(), 0)
-            .map_err(refused("announcing", self.root.display()))
+            .map_err(middleware_error("announcing", self.root.display()))
     }
 }
 
@@ -93,24 +94,24 @@ fn read_number(file: &File) -> Option<u64> {
     Some(u64::from_le_bytes(bytes))
 }
 
-/// The number of the newest generation, memory-mapped: it is read before every segment, and a
+/// The number of the newest generation, memory-mapped because it is read before every segment. A
 /// system call would take as long as the rest of sending one.
 #[derive(Debug)]
 struct NewestNumber(Mmap);
 
 impl NewestNumber {
-    /// Opens the number of a domain that a learner has served.
+    /// Opens the number. Fails if no learner has served the domain yet.
     fn open(domain: &Path) -> Result<Self, TransportError> {
-        let operation = "looking for a learner in";
+        let operation = "finding a learner in";
         let file = File::open(domain.join(NUMBER_FILE));
-        let file = file.map_err(refused(operation, domain.display()))?;
+        let file = file.map_err(middleware_error(operation, domain.display()))?;
         // Before the first announcement the file is empty and cannot be mapped.
-        let served = read_number(&file).ok_or("none has served it yet");
-        served.map_err(refused(operation, domain.display()))?;
+        let served = read_number(&file).ok_or("no learner has served it yet");
+        served.map_err(middleware_error(operation, domain.display()))?;
         // SAFETY: the file has these bytes. No process of the run truncates it and no other user
         // can, so the mapping stays valid. `get` handles concurrent changes.
         let map = unsafe { MmapOptions::new().len(size_of::<u64>()).map(&file) };
-        Ok(Self(map.map_err(refused("mapping a file of", domain.display()))?))
+        Ok(Self(map.map_err(middleware_error("mapping a file of", domain.display()))?))
     }
 
     fn get(&self) -> u64 {
@@ -121,7 +122,7 @@ impl NewestNumber {
     }
 }
 
-/// A worker's port `P` to the newest generation.
+/// A port `P` of a worker, which it recreates for each new generation.
 #[derive(Debug)]
 pub(super) struct Membership<P> {
     domain: PathBuf,
@@ -153,21 +154,21 @@ impl<P> Membership<P> {
         self.port.as_ref()
     }
 
-    /// Number of the generation that it has joined or last tried to join.
+    /// Number of the generation that the worker has joined or last tried to join.
     pub(super) fn number(&self) -> u64 {
         self.number
     }
 
-    /// Recreates the port if there is a new generation or a connection failed. Returns true if it
+    /// Recreates the port if there is a new generation or a connection failed. Returns whether it
     /// did.
     ///
     /// # Errors
-    /// `Incompatible` immediately; other errors if they persist.
+    /// `Incompatible` immediately. Other errors only if they persist.
     pub(super) fn renew(
         &mut self,
         make: impl FnOnce(&Node<PrivateIpc>, &Disconnected) -> Result<P, TransportError>,
     ) -> Result<bool, TransportError> {
-        // This avoids deliveries to a dead learner's queue while the next learner waits.
+        // Checked before each segment, so that none is sent to the queue of a replaced learner.
         let is_current = self.newest.get() == self.number;
         if is_current && self.port.is_some() && !self.disconnected.is_set() {
             return Ok(false);
@@ -185,7 +186,7 @@ impl<P> Membership<P> {
         &mut self,
         make: impl FnOnce(&Node<PrivateIpc>, &Disconnected) -> Result<P, TransportError>,
     ) -> Result<(), TransportError> {
-        // The old port goes first, because the slot allows only one.
+        // Drops the old port first, because the slot allows only one.
         self.port = None;
         self.disconnected.clear();
         self.number = self.newest.get();

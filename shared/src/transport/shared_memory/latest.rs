@@ -1,4 +1,4 @@
-//! A channel from the learner to many readers; each sample replaces the previous one.
+//! A channel from the learner to many readers, in which each sample replaces the previous one.
 
 use std::fmt::Debug;
 use std::fs::File;
@@ -11,19 +11,19 @@ use iceoryx2::port::update_connections::UpdateConnections;
 use iceoryx2_bb_elementary_traits::zero_copy_send::ZeroCopySend;
 
 use super::channel::{Channel, ChannelBuilder, Disconnected, Factory};
-use super::service::{PrivateIpc, refused};
+use super::service::{PrivateIpc, middleware_error};
 use crate::transport::TransportError;
 
-/// Readers besides the workers: evaluator, dashboard, and dead ones that are not cleaned up yet.
+/// Readers besides the workers: evaluator, dashboard, and dead readers that are not cleaned up yet.
 const SPARE_SUBSCRIBERS: usize = 4;
-/// Processes besides the readers: dead ones that are not cleaned up yet.
+/// Processes besides the readers, such as dead ones that are not cleaned up yet.
 const SPARE_NODES: usize = 4;
-/// Samples read from the channel per call: the newest, and one more if the learner had to recreate
+/// Maximum number of samples read per call: the newest, and one more if the learner has recreated
 /// its port.
 pub(super) const SAMPLES_MAX: usize = 2;
 
-/// Chunks in the learner's data segment: the newest, the one being filled, and one that each reader
-/// may still be copying. Unwritten pages take no memory.
+/// Returns the number of chunks in the learner's data segment: the newest, the one being filled,
+/// and one per reader, which the reader may still be copying. Unwritten pages take no memory.
 pub(super) fn chunk_count(worker_count: usize) -> usize {
     worker_count + SPARE_SUBSCRIBERS + 2
 }
@@ -45,7 +45,7 @@ where
     disconnected: Disconnected,
     len: usize,
     chunk_count: usize,
-    /// Keeps the learner's lock, which prevents a second learner. The last field, so that it is
+    /// The learner's lock, which prevents a second learner. It is the last field, so that it is
     /// released after the port.
     _learner: Arc<File>,
 }
@@ -55,7 +55,7 @@ where
     E: Copy + Debug + ZeroCopySend + 'static,
     H: Debug + Default + ZeroCopySend,
 {
-    /// Creates the channel. Its samples have `len` elements.
+    /// Creates the channel, whose samples have `len` elements.
     pub(super) fn serve(
         node: &Node<PrivateIpc>,
         channel: Channel,
@@ -87,7 +87,7 @@ where
         Ok(writer)
     }
 
-    /// Creates the port, at the start and after a failed connection.
+    /// Creates the port, or recreates it after a failed connection.
     fn renew(&mut self) -> Result<(), TransportError> {
         self.disconnected.clear();
         self.port = None;
@@ -98,15 +98,17 @@ where
             .initial_max_slice_len(self.len)
             .max_loaned_samples(1)
             .override_sample_preallocation(move |worst_case| worst_case.min(chunk_count))
-            .set_degradation_handler(self.disconnected.remember())
+            .set_degradation_handler(self.disconnected.handler())
             .create()
-            .map_err(refused("making a port of", &self.channel.name))?;
+            .map_err(middleware_error("creating a port of", &self.channel.name))?;
         self.port = Some(port);
         Ok(())
     }
 
     fn port(&self) -> Result<&Port<PrivateIpc, [E], H>, TransportError> {
-        self.port.as_ref().ok_or_else(|| refused("publishing on", &self.channel.name)("no port"))
+        self.port
+            .as_ref()
+            .ok_or_else(|| middleware_error("publishing on", &self.channel.name)("no port"))
     }
 
     /// Replaces the newest sample.
@@ -119,19 +121,21 @@ where
         let mut sample = self
             .port()?
             .loan_slice_uninit(values.len())
-            .map_err(refused("taking shared memory for", name))?;
+            .map_err(middleware_error("allocating shared memory for", name))?;
         *sample.user_header_mut() = header;
         let sent = sample.write_from_slice(values).send();
-        sent.map(|_readers| ()).map_err(refused("publishing on", name))
+        sent.map(|_readers| ()).map_err(middleware_error("publishing on", name))
     }
 
-    /// Sends the newest sample to readers that have joined since. After a failed connection a new
-    /// port takes over, and late joiners wait for the next sample.
+    /// Sends the newest sample to readers that have joined since. After a failed connection it
+    /// recreates the port, and new readers wait for the next sample.
     pub(super) fn maintain(&mut self) -> Result<(), TransportError> {
         if self.disconnected.is_set() || self.port.is_none() {
             self.renew()?;
         }
-        self.port()?.update_connections().map_err(refused("connecting", &self.channel.name))
+        self.port()?
+            .update_connections()
+            .map_err(middleware_error("updating the connections of", &self.channel.name))
     }
 }
 
@@ -148,10 +152,10 @@ where
     let port = channel
         .open(node)?
         .subscriber_builder()
-        .set_degradation_handler(disconnected.remember())
+        .set_degradation_handler(disconnected.handler())
         .create();
     port.map_err(|cause| match cause {
         SubscriberCreateError::ExceedsMaxSupportedSubscribers => channel.taken(cause),
-        cause => refused("making a port of", &channel.name)(cause),
+        cause => middleware_error("creating a port of", &channel.name)(cause),
     })
 }

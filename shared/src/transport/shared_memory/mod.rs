@@ -1,19 +1,18 @@
 //! Stages 4 and 7 of 8: segments and snapshots between processes of one host, over iceoryx2.
 //!
 //! `domain` is the run's directory, and `generation` the part of it that belongs to one learner.
-//! `plan` holds parameters that all processes share, and `space` computes the memory that they
-//! need. `service`, `channel`, `cleaning` and `latest` wrap the middleware. `segments` and
-//! `parameters` implement the traits; `acknowledgements` is the third channel, for `delivery`. No
-//! other module uses iceoryx2.
+//! `plan` contains the parameters that all processes share, and `space` computes the memory that
+//! they need. `service`, `channel`, `cleaning` and `latest` wrap the middleware. `segments`,
+//! `parameters` and `acknowledgements` are the three channels. No other module uses iceoryx2.
 //!
 //! Guarantees when processes die:
-//! - A worker never creates a service and never cleans up, so its death at any point blocks no
-//!   other process. Its queued segments are still delivered; the learner's `maintain` frees its
+//! - A worker never creates a service and never cleans up, so its death at any point does not block
+//!   other processes. Its queued segments are still delivered. The learner's `maintain` frees its
 //!   slot.
 //! - A dead learner's queues are lost: `Delivered` only means that the segment is in the queue.
 //!   Workers get `Full` or `Detached` until the next learner serves the same domain, and then
-//!   reconnect to it. `delivery` keeps unacknowledged segments until then.
-//! - A new learner inherits nothing from its predecessor: it removes all incomplete files.
+//!   reconnect. Meanwhile `delivery` keeps unacknowledged segments.
+//! - A new learner reuses nothing from its predecessor and removes the predecessor's files.
 
 mod acknowledgements;
 mod channel;
@@ -54,7 +53,7 @@ pub struct LearnerEnd {
     pub acknowledgements: Acknowledger,
 }
 
-/// Names this transport's types.
+/// The types of this transport.
 #[derive(Debug)]
 pub struct SharedMemory;
 
@@ -64,21 +63,22 @@ impl WorkerTransport for SharedMemory {
     type Acknowledgements = AcknowledgementReader;
 }
 
-/// What a worker holds.
+/// A worker's ends of the transport.
 pub type WorkerEnd = super::WorkerEnd<SharedMemory>;
 
 /// Makes this process the run's learner and creates all services. Workers of a previous learner
 /// reconnect on their own.
 ///
 /// # Errors
-/// `Domain` if the directory is not a domain, another learner lives or space is short, `Middleware`
-/// for other errors. The next call removes incomplete files.
+/// `Domain` if the directory is not a domain, another learner is alive or too little space is free;
+/// `Middleware` for other errors. The next call removes incomplete files.
 pub fn serve(domain: &Path, plan: &Plan) -> Result<LearnerEnd, TransportError> {
     let domain = Domain::open(domain)?;
     let learner = Arc::new(domain.lock(LEARNER_LOCK)?);
     let generation = Generation::begin(&domain)?;
     if generation.is_first() {
-        // Later, workers still hold the previous generation's memory and release it one by one.
+        // Later generations skip this check, because workers still use the previous generation's
+        // memory for a while.
         domain.check_space(plan.required_bytes())?;
     }
     let node = service::join(&generation.root)?;
@@ -89,14 +89,14 @@ pub fn serve(domain: &Path, plan: &Plan) -> Result<LearnerEnd, TransportError> {
     Ok(LearnerEnd { segments, parameters, acknowledgements })
 }
 
-/// Attaches this process to the run as worker `worker_index`. It opens services and never creates
-/// one.
+/// Attaches this process to the run as worker `worker_index`. Opens services and never creates one.
 ///
 /// # Errors
-/// `Taken` if a worker with this index lives, or died and the learner's `maintain` has not freed
-/// its slot yet: retry a little later. `Incompatible` if the learner has another plan. `Domain` if
-/// the directory is not a domain. `Middleware` if no learner has served it yet, and for other
-/// errors.
+/// - `Taken` if a worker with this index is alive, or if it died and the learner's `maintain` has
+///   not freed its slot yet. Retry later.
+/// - `Incompatible` if the learner has another plan.
+/// - `Domain` if the directory is not a domain.
+/// - `Middleware` if no learner has served it yet, and for other errors.
 pub fn attach(
     domain: &Path,
     plan: &Plan,
@@ -109,10 +109,10 @@ pub fn attach(
     Ok(WorkerEnd { segments, parameters, acknowledgements })
 }
 
-/// Attaches this process only to the queue of one worker, on whose behalf it sends.
+/// Attaches this process only to the queue of one worker, to send on its behalf.
 ///
 /// # Errors
-/// As [`attach`].
+/// The errors of [`attach`].
 pub fn attach_queue(
     domain: &Path,
     plan: &Plan,
@@ -124,15 +124,15 @@ pub fn attach_queue(
 /// Attaches this process as a reader of acknowledgements only.
 ///
 /// # Errors
-/// As [`attach`].
+/// The errors of [`attach`].
 pub fn hear(domain: &Path, plan: &Plan) -> Result<AcknowledgementReader, TransportError> {
     AcknowledgementReader::attach(&Domain::open(domain)?, plan)
 }
 
-/// Attaches this process as a reader of snapshots only, such as the evaluator.
+/// Attaches this process as a reader of snapshots only.
 ///
 /// # Errors
-/// As [`attach`].
+/// The errors of [`attach`].
 pub fn subscribe(domain: &Path, plan: &Plan) -> Result<Subscriber, TransportError> {
     Subscriber::attach(&Domain::open(domain)?, plan)
 }

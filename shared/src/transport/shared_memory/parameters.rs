@@ -1,4 +1,4 @@
-//! Policy snapshots from the learner to all workers; each replaces the previous one.
+//! Policy snapshots from the learner to all workers. Each replaces the previous one.
 
 use std::fs::{File, OpenOptions};
 use std::os::unix::fs::{FileExt, OpenOptionsExt};
@@ -13,7 +13,7 @@ use super::domain::Domain;
 use super::generation::Membership;
 use super::latest::{ReaderPort, SAMPLES_MAX, Writer, subscribe};
 use super::plan::Plan;
-use super::service::{PrivateIpc, refused};
+use super::service::{PrivateIpc, middleware_error};
 use crate::parameters::{ParameterSnapshot, SnapshotError, checksum};
 use crate::transport::{ParameterPublisher, ParameterSubscriber, TransportError};
 
@@ -28,14 +28,14 @@ pub(super) struct WireHeader {
     env_steps: u64,
     architecture_hash: u64,
     checksum: u32,
-    /// Explicit padding of the last word.
+    /// Explicit padding, so that all bytes are initialised.
     reserved: u32,
 }
 
 const _: () = assert!(size_of::<WireHeader>() == 32 && align_of::<WireHeader>() == 8);
 
-// SAFETY: integers only, no pointers; size and alignment are asserted above. A change of the layout
-// changes the name.
+// SAFETY: integers only, no pointers. Size and alignment are asserted above. The name must change
+// with the layout.
 unsafe impl ZeroCopySend for WireHeader {
     unsafe fn type_name() -> &'static str {
         "dmprl::ParameterHeader1"
@@ -71,7 +71,7 @@ impl Publisher {
             .truncate(false)
             .mode(0o600)
             .open(&path)
-            .map_err(refused("opening", path.display()))?;
+            .map_err(middleware_error("opening", path.display()))?;
         let mut bytes = [0; size_of::<u64>()];
         // The file is empty before the first publication.
         let newest_version =
@@ -81,10 +81,10 @@ impl Publisher {
         Ok(Self { writer, version_file, newest_version })
     }
 
-    /// The newest version published in this domain, by this learner or a previous one.
+    /// Returns the newest version published in this domain, by this learner or a previous one.
     ///
-    /// A learner that resumes from a checkpoint must continue from this number: workers ignore
-    /// older versions, and two policies must not have the same number.
+    /// A learner that resumes from a checkpoint must continue from this number, because workers
+    /// ignore older versions and two policies must not have the same number.
     #[must_use]
     pub fn newest_version(&self) -> u64 {
         self.newest_version
@@ -100,10 +100,10 @@ impl ParameterPublisher for Publisher {
             checksum: snapshot.checksum(),
             reserved: 0,
         };
-        // Written first, so that a successor knows of every published version.
+        // Written before publication, so that a restarted learner knows every published version.
         self.version_file
             .write_all_at(&snapshot.version.to_le_bytes(), 0)
-            .map_err(refused("writing", VERSION_FILE))?;
+            .map_err(middleware_error("writing", VERSION_FILE))?;
         self.newest_version = snapshot.version;
         self.writer.send(header, &snapshot.values)
     }
@@ -132,7 +132,7 @@ impl Subscriber {
     }
 }
 
-/// Rejects a damaged snapshot, or one of another architecture.
+/// Rejects a corrupted snapshot, or one of another architecture.
 fn check(header: &WireHeader, values: &[f32], architecture_hash: u64) -> Result<(), SnapshotError> {
     let version = header.version;
     let (expected, got) = (architecture_hash, header.architecture_hash);
@@ -154,9 +154,10 @@ impl ParameterSubscriber for Subscriber {
         let Some(port) = membership.port() else { return Ok(false) };
         let mut replaced = false;
         for _ in 0..SAMPLES_MAX {
-            let received = port.receive().map_err(refused("receiving from", &channel.name))?;
+            let received =
+                port.receive().map_err(middleware_error("receiving from", &channel.name))?;
             let Some(sample) = received else { break };
-            // The peer states the length, so check it against the agreed one.
+            // The length comes from the peer, so check it.
             let got = usize::try_from(sample.header().number_of_elements()).unwrap_or(usize::MAX);
             if got != self.parameters_len {
                 return Err(TransportError::Length { expected: self.parameters_len, got });
@@ -201,13 +202,13 @@ mod tests {
         };
         let mut learner = serve(domain.path(), &plan).unwrap();
         let mut subscriber = subscribe(domain.path(), &plan).unwrap();
-        let sound = ParameterSnapshot {
+        let valid = ParameterSnapshot {
             version: 1,
             env_steps: 10,
             architecture_hash: 2,
             values: vec![1.0, 2.0, 3.0],
         };
-        learner.parameters.publish(&sound).unwrap();
+        learner.parameters.publish(&valid).unwrap();
         let mut taken = ParameterSnapshot::default();
         assert!(subscriber.newest(&mut taken).unwrap());
         let header = WireHeader {
@@ -218,13 +219,13 @@ mod tests {
             reserved: 0,
         };
         learner.parameters.writer.send(header, &[1.0, 2.0, 4.0]).unwrap();
-        let refusal = subscriber.newest(&mut taken).unwrap_err();
-        let TransportError::Snapshot(SnapshotError::Checksum { version, expected, got }) = refusal
+        let error = subscriber.newest(&mut taken).unwrap_err();
+        let TransportError::Snapshot(SnapshotError::Checksum { version, expected, got }) = error
         else {
-            panic!("{refusal}");
+            panic!("{error}");
         };
         assert_eq!((version, expected), (2, header.checksum));
         assert_ne!(got, expected);
-        assert_eq!(taken, sound);
+        assert_eq!(taken, valid);
     }
 }

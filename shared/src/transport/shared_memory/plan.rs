@@ -4,28 +4,28 @@ use crate::config::ExperimentConfig;
 use crate::policy::Policy;
 use crate::segment::SegmentLayout;
 
-/// Version of the protocol between the processes of a run; other versions are rejected.
+/// Version of the protocol between the processes of a run. Peers with another version are rejected.
 const PROTOCOL: u32 = 2;
 
 /// Parameters that must be equal in the learner and the workers of a run.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Plan {
-    /// Run; workers of another run are rejected.
+    /// Id of the run. Workers of another run are rejected.
     pub run_id: u64,
-    /// Hash of the architecture; workers with another one are rejected.
+    /// Hash of the policy's architecture. Workers with another one are rejected.
     pub architecture_hash: u64,
     /// Sizes of a segment.
     pub layout: SegmentLayout,
     /// Number of worker slots, each with its own queue.
     pub worker_count: usize,
-    /// Capacity of each worker's queue in segments.
+    /// Capacity of each worker's queue \[segments\].
     pub queue_segments: usize,
     /// Length of a snapshot's values.
     pub parameters_len: usize,
 }
 
 impl Plan {
-    /// The plan of a run whose policy is known.
+    /// Creates the plan of a run.
     #[must_use]
     pub fn new(config: &ExperimentConfig, run_id: u64, policy: &Policy) -> Self {
         Self {
@@ -38,7 +38,7 @@ impl Plan {
         }
     }
 
-    /// Attributes of every service, which are compared when a process attaches.
+    /// Returns the attributes of every service, which are compared when a process attaches.
     pub(super) fn identity(&self) -> Vec<(&'static str, String)> {
         vec![
             ("protocol", PROTOCOL.to_string()),

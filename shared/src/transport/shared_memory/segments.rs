@@ -1,7 +1,7 @@
-//! Segments from workers to the learner: one queue per worker slot.
+//! Segment queues from workers to the learner, one per worker slot.
 //!
-//! Each worker has its own service, because a subscriber of several publishers serves them in a
-//! fixed order and starves the last. The learner serves the queues in turn.
+//! Each worker has its own service, because a subscriber with several publishers serves them in a
+//! fixed order and would starve the last. The learner serves the queues in turn.
 
 use std::fs::File;
 use std::sync::Arc;
@@ -18,17 +18,18 @@ use super::cleaning::{Cleaning, sender_died};
 use super::domain::Domain;
 use super::generation::Membership;
 use super::plan::Plan;
-use super::service::{PrivateIpc, refused};
+use super::service::{PrivateIpc, middleware_error};
 use crate::segment::{LAYOUT_VERSION, Segment, SegmentHeader};
 use crate::transport::{SegmentReceiver, SegmentSender, SendOutcome, TransportError};
 
-/// Segments received from one worker before the next one's turn. More than one, so that a learner
-/// with many idle workers does not poll all of them for each segment.
+/// Segments received from one worker before the next worker's turn. It is more than one, so that a
+/// learner with many idle workers does not poll all of them for each segment.
 const TURN_SEGMENTS: usize = 8;
-/// Maximum number of processes that have one worker's service open: learner, worker, and dead ones
-/// that are not cleaned up yet.
+/// Maximum number of processes that have one worker's service open: learner, worker, and dead
+/// processes that are not cleaned up yet.
 const NODES_MAX: usize = 8;
-/// The learner copies a segment and returns it immediately; a worker fills one at a time.
+/// Chunks that the learner borrows. One is enough, because it copies a segment and returns the
+/// chunk immediately.
 const BORROWED_MAX: usize = 1;
 
 /// [`SegmentHeader`] in shared memory. Its name identifies the layout to peers of other builds.
@@ -37,14 +38,14 @@ const BORROWED_MAX: usize = 1;
 pub(super) struct WireHeader(pub(super) SegmentHeader);
 
 // SAFETY: `SegmentHeader` is `Pod`: no pointers, no padding, every bit pattern valid. Its
-// definition asserts size and alignment, and its layout version is part of the agreement.
+// definition asserts size and alignment, and peers compare its layout version.
 unsafe impl ZeroCopySend for WireHeader {
     unsafe fn type_name() -> &'static str {
         "dmprl::SegmentHeader"
     }
 }
 
-/// Chunks in a worker's data segment: queued, borrowed and being filled.
+/// Returns the number of chunks in a worker's data segment: queued, borrowed and being filled.
 pub(super) fn chunk_count(queue_segments: usize) -> usize {
     queue_segments + BORROWED_MAX + 1
 }
@@ -97,13 +98,13 @@ fn publish(
         .publisher_builder()
         .initial_max_slice_len(block_len)
         .max_loaned_samples(1)
-        // By default iceoryx2 blocks on a full queue, forever if the learner is dead.
+        // By default iceoryx2 blocks on a full queue, even forever if the learner is dead.
         .set_backpressure_handler(|_: &BackpressureInfo| BackpressureAction::DiscardDataAndFail)
-        .set_degradation_handler(disconnected.remember())
+        .set_degradation_handler(disconnected.handler())
         .create();
     port.map_err(|cause| match cause {
         PublisherCreateError::ExceedsMaxSupportedPublishers => channel.taken(cause),
-        cause => refused("making a port of", &channel.name)(cause),
+        cause => middleware_error("creating a port of", &channel.name)(cause),
     })
 }
 
@@ -128,12 +129,12 @@ impl SegmentSender for Sender {
             sample.write_from_slice(block).send()
         });
         match sent {
-            // No subscriber, or a full queue without a learner: the sample is dropped.
+            // No learner received the sample, and iceoryx2 has dropped it.
             Ok(Ok(0)) => Ok(SendOutcome::Detached),
             Ok(Ok(_)) => Ok(SendOutcome::Delivered),
             Ok(Err(SendError::UnableToDeliver)) => Ok(SendOutcome::Full),
-            Ok(Err(cause)) => Err(refused("sending to", &channel.name)(cause)),
-            Err(cause) => Err(refused("sending to", &channel.name)(cause)),
+            Ok(Err(cause)) => Err(middleware_error("sending to", &channel.name)(cause)),
+            Err(cause) => Err(middleware_error("sending to", &channel.name)(cause)),
         }
     }
 }
@@ -157,7 +158,7 @@ pub struct Receiver {
     block_len: usize,
     node: Node<PrivateIpc>,
     cleaning: Cleaning,
-    /// Keeps the learner's lock, which prevents a second learner. The last field, so that it is
+    /// The learner's lock, which prevents a second learner. It is the last field, so that it is
     /// released after the ports.
     _learner: Arc<File>,
 }
@@ -183,8 +184,8 @@ impl Receiver {
         })
     }
 
-    /// Receives as [`SegmentReceiver::try_receive`] does, but only from the queue of one worker.
-    /// The other workers wait once their queues are full.
+    /// Like [`SegmentReceiver::try_receive`], but receives only from the queue of one worker. The
+    /// other workers wait once their queues are full.
     ///
     /// # Errors
     /// `Middleware` if the queue is broken.
@@ -229,9 +230,10 @@ impl Slot {
 
     fn receive(&self, segment: &mut Segment, block_len: usize) -> Result<bool, TransportError> {
         let Some(port) = &self.port else { return Ok(false) };
-        let received = port.receive().map_err(refused("receiving from", &self.channel.name))?;
+        let received =
+            port.receive().map_err(middleware_error("receiving from", &self.channel.name))?;
         let Some(sample) = received else { return Ok(false) };
-        // The peer states the length, so check it against the agreed one.
+        // The length comes from the peer, so check it.
         let got = usize::try_from(sample.header().number_of_elements()).unwrap_or(usize::MAX);
         if got != block_len {
             return Err(TransportError::Length { expected: block_len, got });
@@ -242,7 +244,7 @@ impl Slot {
         Ok(true)
     }
 
-    /// Recreates the port after a failed connection, unless the old one still has segments.
+    /// Recreates the port after a failed connection, but not while the old one still has segments.
     fn renew(&mut self) -> Result<(), TransportError> {
         let waiting = |port: &ReceiverPort| port.has_samples().unwrap_or(false);
         let needed = self.disconnected.is_set() || self.port.is_none();
@@ -263,9 +265,9 @@ fn subscribe(
 ) -> Result<ReceiverPort, TransportError> {
     factory
         .subscriber_builder()
-        .set_degradation_handler(disconnected.remember())
+        .set_degradation_handler(disconnected.handler())
         .create()
-        .map_err(refused("making a port of", &channel.name))
+        .map_err(middleware_error("creating a port of", &channel.name))
 }
 
 impl SegmentReceiver for Receiver {
@@ -286,15 +288,15 @@ impl SegmentReceiver for Receiver {
     fn maintain(&mut self) -> Result<(), TransportError> {
         let Self { slots, cleaning, node, .. } = self;
         let died = slots.iter().any(|slot| sender_died(&slot.factory));
-        // Connect to dead workers before their cleanup, because the cleanup of a worker that was
-        // never connected discards its delivered segments. Connecting earlier, before a worker is
-        // known to be dead, would miss one that starts, sends and dies in between.
-        let join = || {
+        // Connects to dead workers before their cleanup, because the cleanup discards the delivered
+        // segments of a worker to which the learner never connected. Connecting before a scan has
+        // found dead workers would miss a worker that starts, sends and dies in between.
+        let connect = || {
             for port in slots.iter().filter_map(|slot| slot.port.as_ref()) {
                 let _ = port.has_samples();
             }
         };
-        cleaning.clean_in_time(node, died, join)?;
+        cleaning.clean_if_due(node, died, connect)?;
         self.slots.iter_mut().try_for_each(Slot::renew)
     }
 }
@@ -330,7 +332,7 @@ mod tests {
             workers[worker].try_send(&header, &block).unwrap()
         };
         let mut segment = Segment::zeroed(plan.layout);
-        // The learner connects to a queue on its first poll; before that, a full queue drops
+        // The learner connects to a queue on its first poll. Before that, a full queue drops
         // segments.
         assert_eq!(send(0, 0), SendOutcome::Delivered);
         assert!(learner.segments.try_receive(&mut segment).unwrap());
@@ -343,7 +345,7 @@ mod tests {
             assert!(!learner.segments.try_receive_from(1, &mut segment).unwrap());
             assert_eq!(send(0, 5), SendOutcome::Full);
         }
-        // The other worker's segments are all there.
+        // All segments of the other worker are still there.
         for sequence in 1..=4 {
             assert!(learner.segments.try_receive(&mut segment).unwrap());
             assert_eq!((segment.header.worker_id, segment.header.sequence), (0, sequence));
@@ -368,8 +370,8 @@ mod tests {
         send(&mut worker, len - 1);
         send(&mut worker, len);
         let mut segment = Segment::zeroed(layout);
-        let refusal = learner.segments.try_receive(&mut segment).unwrap_err();
-        let TransportError::Length { expected, got } = refusal else { panic!("{refusal}") };
+        let error = learner.segments.try_receive(&mut segment).unwrap_err();
+        let TransportError::Length { expected, got } = error else { panic!("{error}") };
         assert_eq!((expected, got), (len, len - 1));
         assert_eq!(segment, Segment::zeroed(layout));
         assert!(learner.segments.try_receive(&mut segment).unwrap());

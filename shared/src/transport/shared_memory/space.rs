@@ -1,4 +1,4 @@
-//! How much shared memory a run needs.
+//! Computes the shared memory that a run needs.
 
 use iceoryx2::service::header::publish_subscribe::Header;
 
@@ -6,14 +6,14 @@ use super::plan::Plan;
 use super::{acknowledgements, latest, parameters, segments};
 use crate::segment::SegmentLayout;
 
-/// Queues, registries and descriptions of one service, without its chunks [bytes]. Measured: see
-/// the test `the_space_asked_for_covers_what_is_used`.
+/// Overhead of one service: queues, registries and descriptions, without its chunks [bytes].
+/// The test `required_space_covers_the_measured_usage` checks it.
 const SERVICE_BYTES: usize = 64 * 1024;
-/// The same per segment of a queue's capacity [bytes].
+/// Additional overhead per segment of a queue's capacity [bytes].
 const QUEUE_ENTRY_BYTES: usize = 64;
 
 impl Plan {
-    /// Maximum shared memory of the run \[bytes\].
+    /// Returns the maximum shared memory of the run \[bytes\].
     #[must_use]
     pub fn required_bytes(&self) -> u64 {
         let Self { worker_count, queue_segments, layout, parameters_len, .. } = *self;
@@ -21,7 +21,7 @@ impl Plan {
     }
 }
 
-/// Maximum shared memory of a run \[bytes\].
+/// Returns the maximum shared memory of a run \[bytes\].
 #[must_use]
 pub fn required_bytes(
     worker_count: usize,
@@ -41,7 +41,7 @@ pub fn required_bytes(
     // Two numbers per worker, each as large as two f32.
     let marks = chunk(0, acknowledgements::sample_len(worker_count).saturating_mul(2))
         .saturating_mul(latest::chunk_count(worker_count));
-    // Each worker also has a connection on the channels for snapshots and acknowledgements.
+    // Each worker also has a connection to the channels for snapshots and acknowledgements.
     let services = worker_count.saturating_add(1).saturating_mul(2 * SERVICE_BYTES);
     let bytes = worker_count.saturating_mul(queue).saturating_add(snapshots).saturating_add(marks);
     u64::try_from(bytes.saturating_add(services)).unwrap_or(u64::MAX)

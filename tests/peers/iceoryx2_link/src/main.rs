@@ -1,8 +1,8 @@
-//! What iceoryx2's own link over Zenoh loses between two hosts, both of them this process.
+//! Measures the losses of iceoryx2's own link over Zenoh between two hosts, both in this process.
 //!
-//! `iceoryx2-link RATE SECONDS [still|cut AFTER FOR]`: segments of 2 KB with sequence numbers at a
-//! rate \[1/s\], through a wire that stands still, or is cut and joined again, `AFTER` seconds into
-//! it and for so many. The two hosts see each other over the link alone: their services have
+//! `iceoryx2-link RATE SECONDS [still|cut AFTER FOR]` sends segments of 2 KB with sequence numbers
+//! at a rate \[1/s\] through a wire that stalls, or is cut and reconnected, after `AFTER` seconds
+//! for `FOR` seconds. The two hosts see each other only over the link: their services have
 //! different prefixes.
 
 mod wire;
@@ -21,18 +21,18 @@ use wire::{Fault, Wire};
 
 const SEGMENT_BYTES: usize = 2048;
 const QUEUE: usize = 512;
-/// A turn that found nothing to do.
+/// Interval between two idle turns.
 const IDLE: Duration = Duration::from_micros(100);
-/// The two ends have found each other within this.
+/// Limit for the two ends to find each other.
 const FOUND_WITHIN: Duration = Duration::from_secs(3);
-/// Nothing comes any more after a silence longer than Zenoh takes to connect again.
+/// Silence after which nothing more arrives: longer than Zenoh takes to reconnect.
 const OVER_AFTER: Duration = Duration::from_secs(15);
 
 type Segment = [u8; SEGMENT_BYTES];
 type Service =
     iceoryx2::service::port_factory::publish_subscribe::PortFactory<ipc::Service, Segment, ()>;
 
-/// A host: its shared memory, and the link that joins it to the other.
+/// A host: its shared memory, and its end of the link.
 struct Host {
     config: Config,
     service: Service,
@@ -56,7 +56,7 @@ impl Host {
         Ok(Self { config, service, _node: node })
     }
 
-    /// Runs the link on a thread of its own, as its command does, until `over`.
+    /// Runs the link on its own thread, as its command does, until `over`.
     fn join(&self, ends: String, over: &Arc<AtomicBool>) -> JoinHandle<Result<u64>> {
         let (config, over) = (self.config.clone(), Arc::clone(over));
         thread::spawn(move || {
@@ -85,7 +85,7 @@ fn odd(error: impl std::fmt::Debug) -> anyhow::Error {
     anyhow!("{error:?}")
 }
 
-/// Sends at a steady rate; how many were sent.
+/// Sends at a steady rate; returns the number sent.
 fn send(host: &Host, rate: f64, seconds: f64) -> Result<u64> {
     let publisher = host.service.publisher_builder();
     let publisher =
@@ -108,7 +108,7 @@ fn send(host: &Host, rate: f64, seconds: f64) -> Result<u64> {
     Ok(sent)
 }
 
-/// Takes what comes until nothing does any more; how many came.
+/// Receives until nothing more arrives; returns the number received.
 fn receive(service: &Service, over: &AtomicBool) -> Result<u64> {
     let subscriber = service.subscriber_builder().buffer_size(QUEUE).create().map_err(odd)?;
     let (mut got, mut last) = (0, Instant::now());

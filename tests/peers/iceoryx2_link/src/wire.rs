@@ -1,4 +1,4 @@
-//! A wire of TCP on loopback that can be held still or cut.
+//! A TCP wire on loopback that can be stalled or cut.
 
 use std::io::{Read, Write};
 use std::net::{Shutdown, SocketAddr, TcpListener, TcpStream};
@@ -11,10 +11,10 @@ use anyhow::Result;
 
 const LOOK: Duration = Duration::from_millis(5);
 
-/// What happens to it.
+/// State of the wire.
 #[derive(Clone, Copy, PartialEq)]
 pub enum Fault {
-    /// Nothing passes, and what is under way stays so.
+    /// Nothing passes, and data in transit stays in transit.
     Still,
     /// Connections end, and none is made.
     Cut,
@@ -27,7 +27,7 @@ struct State {
     ends: Mutex<Vec<TcpStream>>,
 }
 
-/// The wire: whoever connects to the near end is joined to who listens at the far one.
+/// The wire: connects each client of the near end to the listener at the far end.
 pub struct Wire {
     near: SocketAddr,
     far: SocketAddr,
@@ -43,7 +43,7 @@ impl Wire {
         let accepting = Arc::clone(&state);
         thread::spawn(move || {
             for near in listener.incoming().flatten() {
-                // Who comes too early, or while it is cut, comes again.
+                // A client that connects too early, or while the wire is cut, tries again.
                 if !accepting.cut.load(Ordering::Acquire) {
                     let _ = accepting.join(near, far);
                 }
@@ -52,17 +52,17 @@ impl Wire {
         Ok(Self { near, far, state })
     }
 
-    /// Where to connect.
+    /// Address to connect to.
     pub fn near_end(&self) -> SocketAddr {
         self.near
     }
 
-    /// Where to listen.
+    /// Address to listen at.
     pub fn far_end(&self) -> SocketAddr {
         self.far
     }
 
-    /// Lets a fault happen some time from now, for so many seconds.
+    /// Schedules a fault after a delay, for a number of seconds.
     pub fn strike(&self, fault: Fault, after: Duration, seconds: f64) {
         let state = Arc::clone(&self.state);
         thread::spawn(move || {

@@ -1,15 +1,15 @@
-//! Finds the statements that the paper's own figures contradict, by computing with these figures.
+//! Finds the statements that contradict the paper's own figures.
 
 use super::statement::{Margin, PROPOSED, ReportedSteps, Rule, Statement};
 use crate::report::measures::Measure;
-use crate::report::paper::{Figure, SEEDS, reported};
+use crate::report::paper::{PaperTable, SEEDS, reported};
 
-/// Tolerance for the paper's percentages, which have one decimal and are of rounded figures.
+/// Tolerance for the paper's percentages, which have one decimal and come from rounded figures.
 const ROUNDING_PERCENT: f64 = 0.15;
 /// Label of the paper's method in [`reported`].
-const IN_TABLES: &str = "DDPG-DMP (paper)";
+const TABLE_LABEL: &str = "DDPG-DMP (paper)";
 
-/// Describes how the paper contradicts the statement; `None` if it does not.
+/// Describes how the paper's figures contradict the statement; `None` if they do not.
 pub(super) fn of(statement: &Statement) -> Option<String> {
     let task = statement.task.as_str();
     match &statement.rule {
@@ -18,7 +18,8 @@ pub(super) fn of(statement: &Statement) -> Option<String> {
         }
         Rule::BetterBy { method, margins } => {
             let wrong = margins.iter().filter_map(|Margin { than, percent }| {
-                let [ours, theirs] = [method, than].map(|name| figure(Figure::Return, task, name));
+                let [ours, theirs] =
+                    [method, than].map(|name| reported_mean(PaperTable::Return, task, name));
                 let real = 100.0 * (ours? - theirs?) / theirs?.abs();
                 let differs = (real - percent).abs() > ROUNDING_PERCENT;
                 differs.then(|| format!("{real:.1} % over {than}, not {percent:.1} %"))
@@ -32,12 +33,12 @@ pub(super) fn of(statement: &Statement) -> Option<String> {
             differs.then(|| format!("of these steps it is {real:.1} % fewer, not {said:.1} %"))
         }
         Rule::Spread { method } => {
-            let (mean, std) = reported(Figure::Success, task, in_tables(method))?;
-            let most = spread_max(mean, SEEDS);
-            (std > most).then(|| {
+            let (mean, std) = reported(PaperTable::Success, task, table_label(method))?;
+            let max = std_max(mean, SEEDS);
+            (std > max).then(|| {
                 format!(
                     "{SEEDS} rates between 0 and 1 with the mean {mean:.2} have a standard \
-                     deviation of at most {most:.2}"
+                     deviation of at most {max:.2}"
                 )
             })
         }
@@ -45,30 +46,32 @@ pub(super) fn of(statement: &Statement) -> Option<String> {
     }
 }
 
-/// Names the methods above the allegedly best one in the paper's own table.
+/// Describes the methods that have higher figures in the paper's table than the allegedly best one.
 fn surpassed(task: &str, measure: Measure, method: &str, than: &[String]) -> Option<String> {
     let of = measure.in_paper()?;
-    let ours = figure(of, task, method)?;
+    let ours = reported_mean(of, task, method)?;
     let above = than.iter().filter_map(|other| {
-        let theirs = figure(of, task, other)?;
+        let theirs = reported_mean(of, task, other)?;
         (theirs > ours).then(|| format!("{other} at {theirs:.2}"))
     });
     let above: Vec<_> = above.collect();
-    let table = if of == Figure::Return { 3 } else { 4 };
+    let table = if of == PaperTable::Return { 3 } else { 4 };
     (!above.is_empty())
         .then(|| format!("its Table {table} has {} above {ours:.2}", above.join(" and ")))
 }
 
-fn figure(figure: Figure, task: &str, method: &str) -> Option<f64> {
-    reported(figure, task, in_tables(method)).map(|(mean, _)| mean)
+/// Returns the mean in a table of the paper.
+fn reported_mean(table: PaperTable, task: &str, method: &str) -> Option<f64> {
+    reported(table, task, table_label(method)).map(|(mean, _)| mean)
 }
 
-fn in_tables(method: &str) -> &str {
-    if method == PROPOSED { IN_TABLES } else { method }
+fn table_label(method: &str) -> &str {
+    if method == PROPOSED { TABLE_LABEL } else { method }
 }
 
-/// Returns the largest standard deviation of rates with this mean: each of them is 0 or 1.
-fn spread_max(mean: f64, count: usize) -> f64 {
+/// Returns the maximum standard deviation of rates with this mean, which they have if each is 0 or
+/// 1.
+fn std_max(mean: f64, count: usize) -> f64 {
     let count = count as f64;
     (mean * (1.0 - mean) * count / (count - 1.0)).sqrt()
 }
@@ -79,7 +82,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_papers_inconsistencies_are_found_and_no_others() {
+    fn exactly_the_known_contradictions_are_found() {
         let found: Vec<String> = PaperStatements::read()
             .unwrap()
             .statements
@@ -99,8 +102,8 @@ mod tests {
     }
 
     #[test]
-    fn rates_spread_most_when_each_is_all_or_nothing() {
-        assert!((spread_max(0.5, 2) - 0.5_f64.sqrt()).abs() < 1e-12);
-        assert_eq!(spread_max(1.0, 5), 0.0);
+    fn maximum_standard_deviation_belongs_to_rates_of_zero_and_one() {
+        assert!((std_max(0.5, 2) - 0.5_f64.sqrt()).abs() < 1e-12);
+        assert_eq!(std_max(1.0, 5), 0.0);
     }
 }

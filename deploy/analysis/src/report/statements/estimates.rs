@@ -1,4 +1,4 @@
-//! Estimates of the methods' measures, which the rules compare.
+//! Estimates the methods' measures over seeds, for comparison by the rules.
 
 use std::cell::RefCell;
 use std::collections::BTreeMap;
@@ -14,7 +14,7 @@ use crate::report::run::Run;
 use crate::report::statistics::{INTERVAL_SCORES_MIN, Summary, median_with_bounds};
 use crate::report::thresholds::threshold;
 
-/// Estimate over the seeds of a method.
+/// Estimate of a measure over the seeds of a method.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Estimate {
     /// Number of seeds.
@@ -25,53 +25,55 @@ pub(super) struct Estimate {
 }
 
 impl Estimate {
-    /// Returns interquartile mean and interval, or mean and range for fewer than four seeds; `None`
-    /// without scores.
+    /// Estimates by interquartile mean and interval, or by mean and range with fewer than four
+    /// seeds. Returns `None` without scores.
     pub(super) fn of(scores: &[f64]) -> Option<Self> {
         let summary = Summary::of(scores)?;
         let (point, [low, high]) = summary.point_and_bounds();
         Some(Self { count: summary.count, point, low, high })
     }
 
+    /// Formats `-7.89 [-8.40, -7.31], 5 seeds`.
     pub(super) fn text(&self, digits: usize) -> String {
         let Self { count, point, low, high } = self;
         let range = self.range_word();
         format!("{point:.digits$} {range}[{low:.digits$}, {high:.digits$}], {count} seeds")
     }
 
-    /// Returns the word before the bounds if they are the range of the seeds.
+    /// Returns the word before the bounds: `range ` if they are the range over the seeds.
     fn range_word(&self) -> &'static str {
         if self.count < INTERVAL_SCORES_MIN { "range " } else { "" }
     }
 }
 
-/// Formats `26,000`, or that a threshold was not reached.
+/// Formats `26,000`, or `not reached` if infinite.
 fn steps_text(steps: f64) -> String {
     if steps.is_finite() { grouped(steps.round() as u64) } else { "not reached".to_owned() }
 }
 
-/// The results with a cache of estimates, because each of them needs a bootstrap.
+/// The results with a cache of estimates, since each estimate needs a bootstrap.
 pub(super) struct Estimates<'r> {
     results: &'r Results,
-    known: RefCell<BTreeMap<(Measure, String, String), Option<Estimate>>>,
+    cache: RefCell<BTreeMap<(Measure, String, String), Option<Estimate>>>,
 }
 
 impl<'r> Estimates<'r> {
     pub(super) fn new(results: &'r Results) -> Self {
-        Self { results, known: RefCell::default() }
+        Self { results, cache: RefCell::default() }
     }
 }
 
-/// Evaluates one statement: its task, and the method that represents the paper's.
+/// Context in which a statement is evaluated.
 pub(super) struct Context<'e> {
     pub(super) estimates: &'e Estimates<'e>,
     pub(super) limits: Limits,
     pub(super) task: &'e str,
+    /// Our method that represents the paper's.
     pub(super) subject: &'e str,
 }
 
 impl Context<'_> {
-    /// Returns the method's label in the results.
+    /// Returns the label of a statement's method in the results.
     pub(super) fn label<'n>(&'n self, method: &'n str) -> &'n str {
         if method == PROPOSED { self.subject } else { method }
     }
@@ -80,13 +82,14 @@ impl Context<'_> {
         self.estimates.results.of(self.task, self.label(method)).collect()
     }
 
-    /// Returns the measure that decides whether the task is learnt.
+    /// Returns the measure that defines whether the task is learnt.
     pub(super) fn learning_measure(&self) -> Measure {
         threshold(self.task).map_or(Measure::Return, |threshold| threshold.measure)
     }
 
-    /// Returns the verdict on missing data of a method, of which `count` scores are known; `None`
-    /// if it has enough.
+    /// Returns the verdict if a method does not have enough data; otherwise `None`.
+    ///
+    /// - `count`: number of known scores of the method.
     pub(super) fn missing_data(&self, method: &str, count: usize) -> Option<Verdict> {
         let is_short = |run: &&Run| run.final_episodes.is_none_or(|count| count < EPISODES_MIN);
         match count {
@@ -97,15 +100,18 @@ impl Context<'_> {
         }
     }
 
+    /// Estimates a measure of a method; `None` if there are no scores, or if the measure is the
+    /// steps to a threshold and some runs have none.
     pub(super) fn estimate(&self, measure: Measure, method: &str) -> Option<Estimate> {
         let key = (measure, self.task.to_owned(), self.label(method).to_owned());
-        if let Some(known) = self.estimates.known.borrow().get(&key) {
-            return *known;
+        if let Some(cached) = self.estimates.cache.borrow().get(&key) {
+            return *cached;
         }
         let runs = self.runs(method);
         let scores: Vec<f64> = runs.iter().filter_map(|run| measure.of(run)).collect();
         let estimate = if measure == Measure::StepsToThreshold {
-            // Unfinished runs will need more steps: without them the estimate would be too low.
+            // Runs without a score are unfinished and will need more steps. Without them the
+            // estimate would be too low.
             (!scores.is_empty() && scores.len() == runs.len()).then(|| {
                 let (point, [low, high]) = median_with_bounds(&scores);
                 Estimate { count: scores.len(), point, low, high }
@@ -113,11 +119,11 @@ impl Context<'_> {
         } else {
             Estimate::of(&scores)
         };
-        self.estimates.known.borrow_mut().insert(key, estimate);
+        self.estimates.cache.borrow_mut().insert(key, estimate);
         estimate
     }
 
-    /// Formats `TD3 -7.89 [-8.40, -7.31], 3 seeds`.
+    /// Formats a method's estimate, such as `TD3 -7.89 [-8.40, -7.31], 5 seeds`.
     pub(super) fn figure(&self, measure: Measure, method: &str) -> String {
         let label = self.label(method);
         let runs = self.runs(method);
@@ -125,7 +131,7 @@ impl Context<'_> {
         let mark = SoftwareCounts::of(measured).mark();
         match self.estimate(measure, method) {
             None if runs.is_empty() => format!("{label}: not run"),
-            // Of finished runs, only motion can be unknown.
+            // Of a finished run, only measures of motion can be unknown.
             None if runs.iter().any(|run| run.ended) && measure.is_of_motion() => {
                 format!("{label}: not measured")
             }

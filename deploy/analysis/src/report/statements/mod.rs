@@ -1,8 +1,9 @@
 //! Compares the runs with the paper's statements about its results.
 //!
 //! `statement` reads the statements as rules from `deploy/experiments/paper-statements.toml`.
-//! `rules` and `series` apply them to `estimates` of the runs' measures, and `contradictions` to
-//! the paper's own figures. `verdict` has the possible results.
+//! `rules` and `series` apply them to the runs, with `estimates` of their measures, and
+//! `contradictions` checks them against the paper's own figures. `verdict` lists the possible
+//! results.
 
 mod contradictions;
 mod estimates;
@@ -21,16 +22,16 @@ use self::statement::{PROPOSED, PaperStatements, Statement};
 pub use self::verdict::{EPISODES_MIN, SEEDS_MIN, Verdict};
 use super::results::Results;
 
-/// A verdict and the figures that support it.
+/// The verdict on a statement, with evidence.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct Finding {
     /// Our method that represents the paper's; null if the statement is not about it.
     pub subject: Option<&'static str>,
     /// The verdict.
     pub verdict: Verdict,
-    /// The verdict as a text.
+    /// The verdict as text.
     pub verdict_text: &'static str,
-    /// Figures of the runs, or what is missing.
+    /// Figures of the runs, or the missing data.
     pub evidence: String,
 }
 
@@ -41,11 +42,11 @@ pub struct ClaimResult {
     pub id: String,
     /// The task.
     pub task: String,
-    /// Place in the paper.
+    /// Section of the paper.
     pub place: String,
     /// The claim, in our words.
     pub claim: String,
-    /// How the paper contradicts it; null if it does not.
+    /// How the paper's figures contradict it; null if they do not.
     pub contradiction: Option<String>,
     /// A finding for each method that represents the paper's.
     pub findings: Vec<Finding>,
@@ -54,16 +55,16 @@ pub struct ClaimResult {
 /// The paper's statements with their verdicts.
 #[derive(Debug, Clone)]
 pub struct PaperClaims {
-    /// Limits that the rules use.
+    /// Limits used by the rules.
     pub limits: Limits,
-    /// The statements, in the paper's order; empty if no task is one of the paper's.
+    /// The statements, in the paper's order; empty if none of the tasks is in the paper.
     pub results: Vec<ClaimResult>,
 }
 
-/// Evaluates every statement if a task is one of the paper's.
+/// Evaluates all statements if any of the tasks is in the paper.
 ///
 /// # Errors
-/// None is known: the statements are compiled in.
+/// The embedded statements cannot be parsed, which is not expected.
 pub fn evaluate_statements(results: &Results) -> anyhow::Result<PaperClaims> {
     let PaperStatements { limits, statements } = PaperStatements::read()?;
     if !statements.iter().any(|statement| results.tasks.contains(&statement.task)) {
@@ -78,7 +79,7 @@ pub fn evaluate_statements(results: &Results) -> anyhow::Result<PaperClaims> {
 
 /// Evaluates a statement.
 ///
-/// - `labels`: of our versions of the paper's method that have runs.
+/// - `labels`: labels of our versions of the paper's method that have runs.
 fn evaluate(
     statement: Statement,
     estimates: &Estimates<'_>,
@@ -105,7 +106,7 @@ fn evaluate(
     ClaimResult { id, task, place, claim, contradiction, findings }
 }
 
-/// Counts the statements with each verdict, for one of [`SUBJECTS`].
+/// Counts the statements by verdict, for one of [`SUBJECTS`].
 #[must_use]
 pub fn counts(claims: &[ClaimResult], subject: &str) -> Vec<(Verdict, usize)> {
     let is_counted = |finding: &&Finding| finding.subject.is_none_or(|other| other == subject);

@@ -1,4 +1,4 @@
-//! Applies rules to the runs.
+//! Applies the rules that compare final figures.
 
 use std::iter::once;
 
@@ -9,7 +9,7 @@ use super::series;
 use super::statement::{Margin, Rule};
 use super::verdict::{Judgement, Verdict, all, clear};
 use crate::report::measures::Measure;
-use crate::report::paper::{Figure, reported};
+use crate::report::paper::{PaperTable, reported};
 use crate::report::run::Run;
 
 /// Judges whether a rule holds for the runs.
@@ -29,7 +29,7 @@ pub(super) fn judge(context: &Context<'_>, rule: &Rule) -> Judgement {
     }
 }
 
-/// Compares two methods if both have enough data.
+/// Compares two methods; if one of them has too little data, returns that verdict.
 fn compare(
     context: &Context<'_>,
     measure: Measure,
@@ -48,7 +48,7 @@ fn compare(
     }
 }
 
-/// Judges the success rate of one method.
+/// Judges the success rate of a method; if it has too little data, returns that verdict.
 fn judge_success(
     context: &Context<'_>,
     method: &str,
@@ -93,7 +93,7 @@ fn better_by(context: &Context<'_>, method: &String, margins: &[Margin]) -> Judg
     let verdicts = margins.iter().map(|Margin { than, percent }| {
         compare(context, Measure::Return, [method, than], |ours, theirs| {
             if theirs.high >= 0.0 {
-                // A share of a return around zero has no meaning.
+                // A percentage of a return around zero is meaningless.
                 return Verdict::NoClearDifference;
             }
             let low = gain(ours.low, theirs.high);
@@ -125,7 +125,7 @@ fn alike(context: &Context<'_>, measure: Measure, methods: &[String]) -> Judgeme
     let verdicts = pairs.map(|pair| {
         compare(context, measure, pair, |a, b| clear(false, a.low > b.high || a.high < b.low))
     });
-    // The statement says that there is no clear difference.
+    // The statement claims that there is no clear difference.
     let verdict = match all(verdicts) {
         Verdict::NoClearDifference => Verdict::Held,
         verdict => verdict,
@@ -166,7 +166,7 @@ fn fails(context: &Context<'_>, method: &str, steps: u64) -> Judgement {
 
 fn as_in_paper(context: &Context<'_>, method: &str) -> Judgement {
     let evidence = context.figure(Measure::Success, method);
-    let Some((mean, _)) = reported(Figure::Success, context.task, context.label(method)) else {
+    let Some((mean, _)) = reported(PaperTable::Success, context.task, context.label(method)) else {
         return Judgement::new(Verdict::NotRun, evidence);
     };
     let verdict = judge_success(context, method, |of| {

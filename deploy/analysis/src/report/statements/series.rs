@@ -1,4 +1,4 @@
-//! Rules about the course of training: they use all evaluations of a run, not one figure of it.
+//! Applies the rules about the course of training, which use all evaluations of a run.
 
 use dmprl_run::format::grouped;
 
@@ -7,14 +7,15 @@ use super::verdict::{Judgement, Verdict, clear};
 use crate::report::measures::Measure;
 use crate::report::run::Run;
 
-/// Number of evaluations in a moving mean. The best of many single evaluations would be luck.
+/// Number of evaluations in a moving mean. The maximum over single evaluations would be biased by
+/// their noise.
 const WINDOW: usize = 5;
 
 fn last_step(run: &Run) -> u64 {
     run.rows.last().map_or(0, |row| row.env_steps)
 }
 
-/// Judges whether `method` reaches the threshold within `steps`.
+/// Judges whether all seeds of `method` reach the threshold within `steps`.
 pub(super) fn within(context: &Context<'_>, method: &str, steps: u64) -> Judgement {
     let runs = context.runs(method);
     let is_in_time = |run: &Run| {
@@ -22,7 +23,7 @@ pub(super) fn within(context: &Context<'_>, method: &str, steps: u64) -> Judgeme
         if reached <= steps as f64 {
             Some(true)
         } else {
-            // A shorter run may still reach it in time.
+            // A shorter run could still have reached it in time.
             (last_step(run) >= steps).then_some(false)
         }
     };
@@ -67,7 +68,7 @@ fn not_within(context: &Context<'_>, method: &str, steps: u64) -> Judgement {
     let verdict = match context.missing_data(method, runs.len()) {
         Some(missing) => missing,
         None if above == runs.len() => Verdict::DidNotHold,
-        // A shorter run may still succeed.
+        // A shorter run could still have succeeded.
         None if shortest < steps => Verdict::NotRun,
         None => clear(above == 0, false),
     };
@@ -89,28 +90,28 @@ pub(super) fn unimproved(context: &Context<'_>, methods: &[String]) -> Judgement
     }))
 }
 
-/// Judges whether each of `methods` loses a share of its gain, after at least `steps`.
+/// Judges whether each of `methods` loses a fraction of its gain, after at least `steps`.
 pub(super) fn falls(context: &Context<'_>, methods: &[String], steps: u64) -> Judgement {
     let measure = context.learning_measure();
-    let share = context.limits.loss;
+    let limit = context.limits.loss;
     let loss = |run: &Run| {
         if !run.ended || last_step(run) < steps {
             return None;
         }
         let values: Option<Vec<f64>> = run.rows.iter().map(|row| measure.of_row(row)).collect();
-        lost_share(&values?)
+        lost_fraction(&values?)
     };
     Judgement::all(methods.iter().map(|method| {
         over_seeds(context, method, loss, |estimate| {
-            let text = format!("share of the gain that is lost {}", estimate.text(2));
-            Judgement::new(clear(estimate.low > share, estimate.high < share), text)
+            let text = format!("lost fraction of the gain {}", estimate.text(2));
+            Judgement::new(clear(estimate.low > limit, estimate.high < limit), text)
         })
     }))
 }
 
-/// Returns the share of the gain over the first evaluation that is lost at the end, by moving
-/// means; `None` if there is no gain, or if there are too few evaluations.
-fn lost_share(values: &[f64]) -> Option<f64> {
+/// Returns the fraction of the gain over the first evaluation that is lost at the end, by moving
+/// means; `None` without a gain or with too few evaluations.
+fn lost_fraction(values: &[f64]) -> Option<f64> {
     let first = *values.first()?;
     let means: Vec<f64> =
         values.windows(WINDOW).map(|window| window.iter().sum::<f64>() / WINDOW as f64).collect();
@@ -147,12 +148,11 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_loss_is_a_share_of_the_gain() {
-        let share = |values: &[f64]| lost_share(values);
-        assert_eq!(share(&[0.0, 10.0, 10.0, 10.0, 10.0, 10.0]), Some(0.0));
+    fn loss_is_a_fraction_of_the_gain() {
+        assert_eq!(lost_fraction(&[0.0, 10.0, 10.0, 10.0, 10.0, 10.0]), Some(0.0));
         let falls = [0.0, 10.0, 10.0, 10.0, 10.0, 10.0, 5.0, 5.0, 5.0, 5.0, 5.0];
-        assert_eq!(share(&falls), Some(0.5));
-        assert_eq!(share(&[0.0; 3]), None, "fewer than a moving mean needs");
-        assert_eq!(share(&[0.0; 9]), None, "there is no gain");
+        assert_eq!(lost_fraction(&falls), Some(0.5));
+        assert_eq!(lost_fraction(&[0.0; 3]), None, "fewer than a moving mean needs");
+        assert_eq!(lost_fraction(&[0.0; 9]), None, "there is no gain");
     }
 }

@@ -1,12 +1,12 @@
-//! The paper's statements about its results, as rules: the contents of
-//! `deploy/experiments/paper-statements.toml`, which explains them.
+//! The paper's statements about its results, as rules. `deploy/experiments/paper-statements.toml`
+//! has and explains them.
 
 use anyhow::Context;
 use serde::Deserialize;
 
 use crate::report::measures::Measure;
 
-/// Compiled in, because the program may run without its repository.
+/// Embedded in the binary, because the program may run without its repository.
 const FILE: &str = include_str!("../../../../experiments/paper-statements.toml");
 
 /// The paper's own method. A statement about it is evaluated with each of [`SUBJECTS`].
@@ -24,30 +24,30 @@ pub(super) struct PaperStatements {
 }
 
 impl PaperStatements {
-    /// Parses the compiled-in file.
+    /// Parses the embedded file.
     ///
     /// # Errors
-    /// None is known: a test parses the file.
+    /// The file is invalid, which a test rules out.
     pub(super) fn read() -> anyhow::Result<Self> {
-        toml::from_str(FILE).context("cannot read the paper's statements")
+        toml::from_str(FILE).context("cannot parse the paper's statements")
     }
 }
 
-/// Limits that give the paper's words a meaning.
+/// Limits that quantify the paper's words.
 #[derive(Debug, Clone, Copy, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Limits {
-    /// Highest success rate that counts as failure.
+    /// Maximum success rate that counts as failure.
     pub failure: f64,
-    /// Lowest success rate that counts as "almost 100 %".
+    /// Minimum success rate that counts as "almost 100 %".
     pub almost_always: f64,
     /// Success rate above which a method succeeds more often than not.
     pub mostly: f64,
-    /// Share of the gain; a smaller loss is noise.
+    /// Fraction of the gain; a smaller loss counts as noise.
     pub loss: f64,
 }
 
-/// A statement.
+/// A statement of the paper.
 #[derive(Debug, Clone, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(super) struct Statement {
@@ -55,7 +55,7 @@ pub(super) struct Statement {
     pub(super) id: String,
     /// The task.
     pub(super) task: String,
-    /// Place in the paper.
+    /// Section of the paper.
     pub(super) place: String,
     /// The claim, in our words.
     pub(super) claim: String,
@@ -68,11 +68,11 @@ pub(super) struct Statement {
 pub(super) enum Rule {
     /// Better in each of `measures`.
     Better { measures: Vec<Measure>, method: String, than: Vec<String> },
-    /// A return that is higher by a margin.
+    /// The return is higher by a margin.
     BetterBy { method: String, margins: Vec<Margin> },
     /// No two of `methods` clearly differ.
     Alike { measure: Measure, methods: Vec<String> },
-    /// Reaches the threshold in less than a share of the other's steps.
+    /// Reaches the threshold in less than a fraction (`share`) of the other's steps.
     Sooner {
         method: String,
         than: Vec<String>,
@@ -94,13 +94,13 @@ pub(super) enum Rule {
     },
     /// Each of `methods` ends no better than its first evaluation.
     Unimproved { methods: Vec<String> },
-    /// Each of `methods` loses more than a share of its gain, after at least `steps`.
+    /// Each of `methods` loses more than a fraction of its gain, after at least `steps`.
     Falls {
         methods: Vec<String>,
         #[serde(default)]
         steps: u64,
     },
-    /// The standard deviation that the paper reports is one that success rates can have.
+    /// The standard deviation that the paper reports is possible for success rates.
     Spread { method: String },
 }
 
@@ -127,7 +127,7 @@ pub(super) struct ReportedSteps {
 }
 
 impl Rule {
-    /// Returns whether the rule involves the paper's own method.
+    /// Returns true if the rule involves the paper's own method.
     pub(super) fn is_about_proposed(&self) -> bool {
         match self {
             Self::Better { method, than, .. } | Self::Sooner { method, than, .. } => {
@@ -158,7 +158,7 @@ mod tests {
     use crate::report::thresholds::threshold;
 
     #[test]
-    fn every_statement_has_an_id_a_place_and_the_threshold_that_it_needs() {
+    fn every_statement_has_a_unique_id_a_section_and_the_threshold_it_needs() {
         let statements = PaperStatements::read().unwrap().statements;
         assert_eq!(statements.len(), 34);
         let ids: BTreeSet<&str> = statements.iter().map(|it| it.id.as_str()).collect();
@@ -172,7 +172,7 @@ mod tests {
     }
 
     #[test]
-    fn every_method_has_a_label_of_the_papers_sweep() {
+    fn every_method_is_a_label_in_the_papers_sweep() {
         const SWEEP: &str = include_str!("../../../../experiments/paper.toml");
         let is_known =
             |method: &str| method == PROPOSED || SWEEP.contains(&format!("label = \"{method}\""));
@@ -202,7 +202,7 @@ mod tests {
     }
 
     #[test]
-    fn a_misspelt_key_is_an_error() {
+    fn misspelt_key_is_an_error() {
         let text = FILE.replacen("than = [\"DDPG\"]", "then = [\"DDPG\"]", 1);
         assert!(toml::from_str::<PaperStatements>(&text).is_err());
     }

@@ -1,10 +1,10 @@
-//! Tests each verdict with results whose figures are known.
+//! Tests the verdicts with synthetic results.
 
 use super::*;
 use crate::report::fixtures::{FixtureRun, fixture_motion, fixture_results};
 
-/// Returns runs with seeds 1, 2, …, from the evaluations of each. If there are three, the first and
-/// the last are used twice, because a verdict needs five seeds.
+/// Returns runs with seeds 1, 2, … and the given evaluations. Of three runs, the first and the last
+/// are used twice, because a verdict requires five seeds.
 fn seeds<R: AsRef<[f64]>>(task: &'static str, method: &'static str, rows: &[R]) -> Vec<FixtureRun> {
     let rows: Vec<&R> = match rows {
         [first, middle, last] => vec![first, first, middle, last, last],
@@ -45,7 +45,7 @@ const JOINTS: &str = "panda-reach-joints";
 const OURS: &str = "DDPG-DMP (paper)";
 
 #[test]
-fn a_difference_holds_fails_or_is_unclear_by_its_intervals() {
+fn intervals_decide_whether_a_difference_is_clear() {
     let id = "pusher-better-return";
     let with = |ddpg: [f64; 3], ndp: [f64; 3]| {
         let rows = |values: [f64; 3]| values.map(|value| vec![value]);
@@ -74,9 +74,9 @@ fn missing_data_is_reported() {
     assert!(without[0].evidence.ends_with("NDP: not run"), "{}", without[0].evidence);
     let few = together(vec![ours.clone(), ddpg.clone(), one.clone()]);
     assert_eq!(verdict(&few, id), Verdict::TooFewSeeds);
-    let mut under_way = one;
-    under_way[0].ended = false;
-    let found = found(&together(vec![ours, ddpg, under_way]), id);
+    let mut unfinished = one;
+    unfinished[0].ended = false;
+    let found = found(&together(vec![ours, ddpg, unfinished]), id);
     assert_eq!(found[0].verdict, Verdict::NotRun);
     assert!(found[0].evidence.ends_with("NDP: not finished"), "{}", found[0].evidence);
 }
@@ -117,12 +117,12 @@ fn both_versions_of_the_papers_method_are_evaluated() {
     let counted = counts(&evaluate_statements(&results).unwrap().results, "DDPG-DMP");
     let of = |verdict| counted.iter().find(|it| it.0 == verdict).map_or(0, |it| it.1);
     assert_eq!(counted.iter().map(|it| it.1).sum::<usize>(), 34);
-    // The statement about -40 within 30,000 steps holds, too.
+    // The statement about reaching -40 within 30,000 steps holds, too.
     assert_eq!((of(Verdict::Held), of(Verdict::CannotHold)), (2, 5), "{counted:?}");
 }
 
 #[test]
-fn a_statement_that_the_paper_contradicts_cannot_hold() {
+fn statement_that_the_papers_figures_contradict_cannot_hold() {
     let results = together(vec![
         seeds(REACHER, OURS, &[&[-3.0], &[-3.1], &[-3.2]]),
         seeds(REACHER, "DDPG", &[&[-6.0], &[-6.1], &[-6.2]]),
@@ -167,7 +167,7 @@ fn percentages_need_the_whole_interval() {
 }
 
 #[test]
-fn sooner_counts_a_seed_that_never_reached_it_as_the_latest() {
+fn seed_that_never_reaches_the_threshold_counts_as_the_slowest() {
     let id = "thrower-sooner-than-ndp";
     let with = |ours: &[&[f64]], ndp: &[&[f64]]| {
         let results = together(vec![seeds(THROWER, OURS, ours), seeds(THROWER, "NDP", ndp)]);
@@ -189,7 +189,7 @@ fn sooner_counts_a_seed_that_never_reached_it_as_the_latest() {
 }
 
 #[test]
-fn an_unfinished_seed_makes_no_method_look_faster() {
+fn unfinished_seed_prevents_a_verdict_on_steps() {
     let fast: &[f64] = &[-9.0];
     let mut ours = seeds(REACHER, OURS, &[fast; 4]);
     ours[3].rows = vec![-20.0];
@@ -233,7 +233,7 @@ fn none_within_can_fail_early_but_holds_only_at_the_end() {
 }
 
 #[test]
-fn failing_and_succeeding_are_bounds_on_the_rate() {
+fn failure_and_success_are_bounds_on_the_rate() {
     let flat = |rate: f64| vec![rate; 2];
     let with = |method, rate: f64, id| {
         let rows = flat(rate);
@@ -250,7 +250,7 @@ fn failing_and_succeeding_are_bounds_on_the_rate() {
         verdict(&results, "panda-almost-always")
     };
     assert_eq!((all(1.0), all(0.5)), (Verdict::Held, Verdict::DidNotHold));
-    // The statement is about 200,000 steps: runs of 2,000 can refute but not confirm it.
+    // The statement is about 200,000 steps. Runs of 2,000 can refute but not confirm it.
     let short = |rate: f64| {
         let rows = flat(rate);
         let results = together(vec![seeds(JOINTS, "DDPG", &[&rows[..]; 3])]);
@@ -260,7 +260,7 @@ fn failing_and_succeeding_are_bounds_on_the_rate() {
 }
 
 #[test]
-fn no_improvement_and_a_fall_are_seen_in_the_curve() {
+fn lack_of_improvement_and_loss_are_found_in_the_curve() {
     let id = "thrower-ddpg-unimproved";
     let with = |rows: &[&[f64]]| verdict(&together(vec![seeds(THROWER, "DDPG", rows)]), id);
     assert_eq!(with(&[&[-180.0, -181.0], &[-180.0, -170.0], &[-180.0, -183.0]]), Verdict::Held);

@@ -1,4 +1,4 @@
-//! Verdicts on statements, and how they combine.
+//! Verdicts on statements, and their combination.
 
 use serde::Serialize;
 
@@ -7,7 +7,7 @@ pub const SEEDS_MIN: usize = 5;
 /// Minimum number of episodes in the last evaluation of each run.
 pub const EPISODES_MIN: u64 = 100;
 
-/// Verdict on a statement.
+/// The verdict on a statement.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Verdict {
@@ -21,7 +21,7 @@ pub enum Verdict {
     TooFewSeeds,
     /// The last evaluation of a run has fewer than `EPISODES_MIN` episodes.
     TooFewEpisodes,
-    /// A method has no finished run, or the measure is unknown.
+    /// A method has no finished run, its runs are too short, or the measure is unknown.
     NotRun,
     /// The paper's own figures contradict the statement.
     CannotHold,
@@ -39,7 +39,7 @@ impl Verdict {
         Self::CannotHold,
     ];
 
-    /// Returns the text for people.
+    /// Returns the verdict as text for reports.
     #[must_use]
     pub fn text(self) -> &'static str {
         match self {
@@ -54,7 +54,7 @@ impl Verdict {
     }
 }
 
-/// A verdict with the figures that support it.
+/// A verdict with its evidence.
 pub(super) struct Judgement {
     pub(super) verdict: Verdict,
     pub(super) evidence: String,
@@ -73,8 +73,8 @@ impl Judgement {
     }
 }
 
-/// Combines verdicts on conditions that must all hold. A condition that does not hold decides;
-/// otherwise missing data does.
+/// Combines verdicts on conditions that must all hold. A condition that does not hold takes
+/// precedence, then missing data.
 pub(super) fn all(verdicts: impl IntoIterator<Item = Verdict>) -> Verdict {
     let verdicts: Vec<Verdict> = verdicts.into_iter().collect();
     let order = [

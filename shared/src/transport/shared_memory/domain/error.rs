@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 
 use thiserror::Error;
 
-/// Maximum length of a generation's path with iceoryx2's prefix [bytes]: iceoryx2 appends up to 38
+/// Maximum length of a generation's path with iceoryx2's prefix [bytes]. iceoryx2 appends up to 38
 /// bytes for Unix sockets, whose paths are limited to 108.
 pub(super) const ROOT_BYTES_MAX: usize = 70;
 pub(super) const TOKEN_BYTES_MAX: usize = 32;
@@ -35,8 +35,8 @@ pub enum DomainError {
     },
     /// The path leaves too little space for the names of sockets.
     #[error(
-        "shared-memory path {path} takes {got} bytes with what is added, at most {ROOT_BYTES_MAX} \
-         fit: choose a shorter directory or token"
+        "shared-memory path {path} has {got} bytes including suffixes, the maximum is \
+         {ROOT_BYTES_MAX}: choose a shorter directory or token"
     )]
     TooLong {
         /// The directory.
@@ -59,7 +59,7 @@ pub enum DomainError {
     /// Too little shared memory is free. Processes would later be killed by SIGBUS.
     #[error(
         "{path}: {needed} bytes of shared memory needed, {available} available: use fewer \
-         workers, shorter queues, or enlarge it (Docker: --shm-size)"
+         workers or shorter queues, or enlarge it (Docker: --shm-size)"
     )]
     Space {
         /// The directory.

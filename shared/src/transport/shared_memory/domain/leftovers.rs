@@ -1,4 +1,4 @@
-//! Finds and removes the directories of dead runs, holding their locks.
+//! Finds and removes the directories of dead runs while holding their locks.
 
 use std::fs::File;
 use std::os::unix::ffi::OsStrExt;
@@ -13,7 +13,7 @@ use super::{
 
 /// Unit of `st_blocks`, independent of the file system [bytes].
 const BLOCK_BYTES: u64 = 512;
-/// Maximum directory depth for sizes; domains are three levels deep.
+/// Maximum depth for computing sizes. Domains are three levels deep.
 const DEPTH_MAX: usize = 16;
 
 /// Directory of a dead run.
@@ -25,7 +25,7 @@ pub struct Leftover {
     pub bytes: u64,
 }
 
-/// A directory that may be removed, with its locks.
+/// A directory that may be removed, and its locks.
 struct Abandoned {
     leftover: Leftover,
     /// Whether it is a complete domain, which other processes can still find by its name.
@@ -35,7 +35,8 @@ struct Abandoned {
 
 /// Lists the domains in `parent` whose processes are dead, without changing anything.
 ///
-/// Live domains and directories without dmprl's marker are skipped. A missing `parent` has none.
+/// Skips live domains and directories without dmprl's marker. Returns an empty list if `parent`
+/// does not exist.
 ///
 /// # Errors
 /// `Untrusted` if `parent` is not private to this user, `Io` if it cannot be read.
@@ -50,7 +51,8 @@ pub fn abandoned(parent: &Path) -> Result<Vec<Leftover>, DomainError> {
 
 /// Removes the domains in `parent` whose processes are dead, and the parent if it is then empty.
 ///
-/// Live domains and directories without dmprl's marker are kept. A missing `parent` has none.
+/// Keeps live domains and directories without dmprl's marker. Does nothing if `parent` does not
+/// exist.
 ///
 /// # Errors
 /// `Untrusted` if `parent` is not private to this user, `Io` if a domain could not be removed.
@@ -60,7 +62,7 @@ pub fn remove_abandoned(parent: &Path) -> Result<Vec<Leftover>, DomainError> {
     for path in entries(parent)? {
         let Some(abandoned) = take(&path) else { continue };
         if !abandoned.whole {
-            // Another process may be removing it at the same time; this does no harm.
+            // Another process may be removing it too, which does no harm.
             remove_tree(&path)?;
         } else if !condemn(&path)? {
             continue;
@@ -74,7 +76,7 @@ pub fn remove_abandoned(parent: &Path) -> Result<Vec<Leftover>, DomainError> {
     Ok(removed)
 }
 
-/// Locks a parent that is private to this user; `None` if it does not exist.
+/// Locks a parent that is private to this user. Returns `None` if it does not exist.
 fn private_parent(parent: &Path) -> Result<Option<File>, DomainError> {
     if parent.symlink_metadata().is_ok_and(|metadata| !metadata.is_dir()) {
         check_private(parent)?;
@@ -89,9 +91,9 @@ fn entries(parent: &Path) -> Result<Vec<PathBuf>, DomainError> {
     listed.map(|entry| entry.map(|entry| entry.path()).map_err(failed("listing", parent))).collect()
 }
 
-/// Takes a directory's locks, if it belongs to dmprl and no other process holds them. The caller
-/// must hold the parent's lock: a process that creates a domain holds that lock until it has the
-/// domain's own.
+/// Takes a directory's locks if the directory belongs to dmprl and no other process holds them. The
+/// caller must hold the parent's lock, which a process that creates a domain holds until it has
+/// locked the domain itself.
 fn take(path: &Path) -> Option<Abandoned> {
     check_private(path).ok()?;
     let name = path.file_name().unwrap_or_default().as_bytes();
@@ -101,9 +103,9 @@ fn take(path: &Path) -> Option<Abandoned> {
     Some(Abandoned { leftover, whole, _locks: locks })
 }
 
-/// Takes the locks of owner and learner, because a learner outlives a killed owner while it writes
-/// its last checkpoint. A domain without the owner's lock file is damaged or being removed, and is
-/// skipped.
+/// Takes the locks of owner and learner. After the owner is killed, the learner is still alive
+/// while it writes its last checkpoint. Skips a domain without the owner's lock file, which is
+/// corrupted or being removed.
 fn locks(path: &Path) -> Option<Vec<File>> {
     if !has_marker(path) {
         return None;
@@ -120,7 +122,7 @@ fn locks(path: &Path) -> Option<Vec<File>> {
     Some(locks)
 }
 
-/// Disk usage of a directory. Entries that cannot be read, or no longer exist, count as 0.
+/// Returns the disk usage of a directory. Entries that cannot be read or are gone count as 0.
 fn bytes(directory: &Path, depth: usize) -> u64 {
     let Ok(entries) = directory.read_dir() else { return 0 };
     let of = |entry: std::fs::DirEntry| match entry.metadata() {

@@ -1,4 +1,4 @@
-//! Measures parts of an update alone: matrix products, sampling, optimiser.
+//! Measures parts of an update separately: matrix products, sampling, optimiser.
 
 use std::time::{Duration, Instant};
 
@@ -15,21 +15,21 @@ use super::floor::{Engine, Floor};
 use super::optimiser::OptimiserSteps;
 use super::products::{Cycle, Product};
 
-/// Divisor for the warm-up before the clock starts. It brings caches and clock frequency to the
-/// state of a long run.
-const SETTLE_SHARE: u32 = 8;
+/// The warm-up takes 1 / `WARM_UP_DIVISOR` of the measurement's duration. It brings caches and
+/// clock frequency to the state of a long run.
+const WARM_UP_DIVISOR: u32 = 8;
 
-/// Calls `work` repeatedly for `duration` and returns the time of one call.
+/// Calls `work` repeatedly for `duration`, after a warm-up, and returns the mean time of a call.
 pub(crate) fn timed(
     duration: Duration,
     mut work: impl FnMut() -> anyhow::Result<()>,
 ) -> anyhow::Result<Timed> {
-    let end = Instant::now() + duration / SETTLE_SHARE;
+    let end = Instant::now() + duration / WARM_UP_DIVISOR;
     while Instant::now() < end {
         work()?;
     }
     let (start, cpu, mut calls) = (Instant::now(), cpu_s(), 0.0);
-    // At least once: on a busy machine the time may be over before the first call.
+    // Calls it at least once: on a busy machine, the time may be over before the first call.
     loop {
         work()?;
         calls += 1.0;
@@ -38,18 +38,18 @@ pub(crate) fn timed(
         }
     }
     let wall_s = start.elapsed().as_secs_f64() / calls;
-    ensure!(wall_s > 0.0, "the clock stood still for {duration:?}");
+    ensure!(wall_s > 0.0, "the clock did not advance within {duration:?}");
     Ok(Timed { wall_s, cpu_s: (cpu_s() - cpu) / calls })
 }
 
-/// Processor time of all threads of this process so far [s].
+/// Returns the processor time of all threads of this process so far [s].
 fn cpu_s() -> f64 {
     let time = clock_gettime(ClockId::ProcessCPUTime);
     time.tv_sec as f64 + time.tv_nsec as f64 * 1e-9
 }
 
-/// The matrix products of an update. Each thread has its share of the rows. Summing the shares'
-/// parts of a weight's gradient is no product and is not included.
+/// The matrix products of an update, with the rows divided among the threads. Excludes the sum over
+/// the threads' weight gradients, which is not a product.
 pub(super) struct FloorWork {
     pool: ThreadPool,
     shares: Vec<Floor>,
@@ -84,7 +84,7 @@ impl FloorWork {
     }
 }
 
-/// Sampling a batch.
+/// The sampling of a batch.
 pub(super) struct SampleWork {
     batch: Batch,
     shape: BatchShape,

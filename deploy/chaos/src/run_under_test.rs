@@ -1,4 +1,4 @@
-//! The run under test: a real `dmprl train`, configured for many events in a short time.
+//! The run under test: a real `dmprl train`, configured to produce many events in a short time.
 
 use std::path::{Path, PathBuf};
 use std::process::Command;
@@ -9,20 +9,18 @@ use rustix::process::Pid;
 
 use super::TrialPlan;
 
-/// Environment steps between two checkpoints; results in about one per second.
+/// Environment steps between two checkpoints, which results in about one per second.
 pub(super) const CHECKPOINT_INTERVAL: u64 = 10_000;
-/// Capacity of the replay in environment steps. It fills quickly, after which its memory is
-/// constant.
+/// Capacity of the replay in environment steps. It is small, so that its memory soon stops growing.
 pub(super) const REPLAY_STEPS: u64 = 30_000;
 /// More steps than any trial reaches.
 const STEPS: &str = "1000000000000";
-/// Maximum pause before a restart. It is short, because the processes are killed on purpose.
+/// Maximum back-off before a restart. It is short, because the processes are killed on purpose.
 const RESTART_PAUSE_MAX_MS: u32 = 100;
 
-/// Configuration of the run. Networks are small and updates few, because the test is about
-/// processes. The outboxes are small enough that workers soon drop acknowledged segments, but large
-/// enough that a learner's death leaves segments whose acknowledgement has not arrived, and which
-/// are then retransmitted.
+/// Returns the run's configuration. Networks are small and updates few, because the trial tests
+/// processes, not learning. The outboxes are small enough that workers soon drop acknowledged
+/// segments, but large enough that workers retransmit some segments after a learner's death.
 fn keys() -> Vec<String> {
     let mut keys: Vec<String> = [
         "delivery.level=log",
@@ -36,7 +34,7 @@ fn keys() -> Vec<String> {
         "evaluation.interval_steps=50000",
         "metrics.interval_steps=5000",
         "actors.restarts_max=1000000",
-        // The checker needs to know every worker.
+        // The checker must know every worker in advance.
         "actors.joined_max=0",
         "supervision.learner_restarts_max=1000000",
     ]
@@ -48,13 +46,13 @@ fn keys() -> Vec<String> {
 }
 
 /// A running `dmprl train` and its paths.
-pub(super) struct Subject {
+pub(super) struct RunUnderTest {
     train: WholeRun,
     pub(super) run: PathBuf,
     pub(super) journal: PathBuf,
 }
 
-impl Subject {
+impl RunUnderTest {
     /// Starts the run in a folder.
     pub(super) fn start(plan: &TrialPlan, folder: &Path) -> anyhow::Result<Self> {
         let (run, journal) = (folder.join("run"), folder.join("journal"));
@@ -73,17 +71,17 @@ impl Subject {
         Ok(Self { train, run, journal })
     }
 
-    /// Process id of the supervisor.
+    /// Returns the process id of the supervisor.
     pub(super) fn pid(&self) -> anyhow::Result<Pid> {
         self.train.pid()
     }
 
-    /// Returns how the run ended by itself, if it has.
+    /// Returns how the run ended if it has ended by itself.
     pub(super) fn end(&mut self) -> anyhow::Result<Option<String>> {
         self.train.end()
     }
 
-    /// Stops the run like Ctrl-C; returns an error description if it did not end properly.
+    /// Stops the run like Ctrl-C. Returns a description of the error if it did not end cleanly.
     pub(super) fn stop(&mut self) -> anyhow::Result<Option<String>> {
         self.train.stop()
     }

@@ -1,26 +1,26 @@
-//! What a test looks at in a built page: its links, what a browser fetches for it, its anchors.
+//! Reads a built page: its links, the files that a browser loads for it, its anchors.
 
 use std::collections::BTreeSet;
 use std::fs;
 use std::path::{Path, PathBuf};
 
-/// Pages that are no reading matter: one for what is not found, which stands at no fixed place, and
-/// all pages in one for a printer, whose links are those of the pages.
+/// Pages without content of their own: the one for missing pages, which has no fixed address, and
+/// the one with all pages for a printer, whose links are those of the pages.
 const NOT_LOOKED_AT: [&str; 2] = ["404.html", "print.html"];
 
 /// A built page.
 pub struct Page {
     pub path: PathBuf,
     pub text: String,
-    /// Of `<a href>` and `<img src>`.
+    /// Targets of `<a href>` and `<img src>`.
     pub links: Vec<String>,
-    /// Of `<img src>`, `<script src>` and `<link href>`.
+    /// Targets of `<img src>`, `<script src>` and `<link href>`.
     pub fetched: Vec<String>,
-    /// Every `id`.
+    /// Value of every `id`.
     pub anchors: BTreeSet<String>,
 }
 
-/// The pages below a folder.
+/// Reads the pages below a folder.
 pub fn built_pages(folder: &Path) -> Vec<Page> {
     let mut pages = Vec::new();
     for entry in fs::read_dir(folder).unwrap().flatten() {
@@ -56,8 +56,8 @@ fn read(path: PathBuf) -> Page {
     Page { path, text, links, fetched, anchors }
 }
 
-/// What stands between `<` and `>`. Code in a page has its signs escaped; scripts hold no tags
-/// with the names that are asked for.
+/// Returns the tags of a page. Code in a page is escaped, and scripts contain no tags with the
+/// names that are searched for.
 fn tags(text: &str) -> impl Iterator<Item = &str> {
     text.split('<').skip(1).filter_map(|rest| rest.split('>').next())
 }

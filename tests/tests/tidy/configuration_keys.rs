@@ -1,36 +1,62 @@
-//! `docs/configuration-keys.md`: every key with meaning and default, made from the types in
-//! `shared/src/config/`, whose comments are the meanings and whose `Default`s are the defaults.
+//! Generates `docs/configuration-keys.md` from the types in `shared/src/config/`: each key with its
+//! doc comment and its default.
 
 use std::collections::BTreeMap;
 use std::fmt::Write;
+use std::fs;
 
 use dmprl_shared::config::{
     AlgorithmName, ExperimentConfig, PRESETS, PolicyKind, TASKS, algorithm_defaults,
     policy_defaults,
 };
+use dmprl_tests::project_root;
 use schemars::schema_for;
 use serde_json::Value;
 use toml::Table;
 
-/// A longer value would hide the rest of its line.
+/// Longer values would hide the rest of their line.
 const VALUE_LETTERS_MAX: usize = 40;
-/// With more, nobody reads the line.
+/// Maximum number of values in a line.
 const VALUES_MAX: usize = 6;
+
+const PAGE: &str = "docs/configuration-keys.md";
+/// Set to generate the page instead of comparing it.
+const WRITE: &str = "WRITE_CONFIGURATION_KEYS";
 
 const HEAD: &str = "\
 # Every configuration key
 
-<!-- Made from the types in shared/src/config by the test `book`. To write it anew:
-     WRITE_CONFIGURATION_KEYS=1 cargo test --release --test book -->
+<!-- Made from the types in shared/src/config by the test `tidy`. To generate it again:
+     WRITE_CONFIGURATION_KEYS=1 cargo test --release --test tidy -->
 
-Each key can stand in a file for `--config`, in `--set KEY=VALUE`, and in an environment variable;
-[Configuration](configuration.md) says how these are laid over each other. Where a preset, a kind of
-policy, an algorithm or a task brings another value, it stands below the default. Of several, an
-algorithm wins over a preset, a preset over a kind of policy, and that over a task.
+Set a key in a file for `--config`, with `--set KEY=VALUE`, or in an environment variable;
+[Configuration](configuration.md) describes their precedence. Values that a preset, a kind of
+policy, an algorithm or a task sets are listed below the default. An algorithm takes precedence over
+a preset, a preset over a kind of policy, and this over a task.
 ";
 
-/// The page.
-pub fn page() -> String {
+#[test]
+fn the_page_of_configuration_keys_matches_the_types() {
+    let path = project_root().join(PAGE);
+    let made = page();
+    if std::env::var_os(WRITE).is_some() {
+        fs::write(&path, made).unwrap();
+        return;
+    }
+    let written = fs::read_to_string(&path).unwrap_or_default();
+    let same = written.lines().zip(made.lines()).take_while(|(a, b)| a == b).count();
+    assert!(
+        written == made,
+        "{PAGE} differs from the types in shared/src/config at line {}:\n  found    {:?}\n  \
+         expected {:?}\ngenerate it again: {WRITE}=1 cargo test --release --test tidy",
+        same + 1,
+        written.lines().nth(same),
+        made.lines().nth(same),
+    );
+}
+
+/// Returns the page.
+fn page() -> String {
     let schema = schema_for!(ExperimentConfig).to_value();
     let defaults = Table::try_from(ExperimentConfig::default()).unwrap();
     let others = others();
@@ -50,14 +76,14 @@ pub fn page() -> String {
         assert!(!about.is_empty(), "{key} has no comment in shared/src/config");
         let value = default_text(&key, &defaults, &others);
         let kind = kind(&schema, property);
-        // A list stands by itself, a sentence goes on.
+        // A list is a block of its own; a sentence follows on the same line.
         let gap = if kind.ends_with('\n') { "\n" } else { " " };
         write!(text, "\n### {key}\n\n{about}\n\n{kind}{gap}{value}\n").unwrap();
     }
     text
 }
 
-/// Every key, in the order in which the types list them.
+/// Returns every key, in the order of the types.
 fn keys_in_order() -> Vec<String> {
     let text = toml::to_string(&ExperimentConfig::default()).unwrap();
     let mut section = String::new();
@@ -72,7 +98,7 @@ fn keys_in_order() -> Vec<String> {
     keys
 }
 
-/// What the schema says of a dotted name.
+/// Returns the schema of a dotted name.
 fn described(schema: &Value, name: &str) -> Value {
     name.split('.').fold(schema.clone(), |at, part| {
         let found = resolved(schema, &at)["properties"][part].clone();
@@ -81,7 +107,7 @@ fn described(schema: &Value, name: &str) -> Value {
     })
 }
 
-/// What a reference refers to.
+/// Resolves a reference.
 fn resolved(schema: &Value, part: &Value) -> Value {
     match part["$ref"].as_str() {
         Some(path) => schema.pointer(path.trim_start_matches('#')).unwrap().clone(),
@@ -89,13 +115,13 @@ fn resolved(schema: &Value, part: &Value) -> Value {
     }
 }
 
-/// A comment in one line; what is meant literally stays literal.
+/// Returns a comment in one line, with escaped special characters.
 fn meaning(part: &Value) -> String {
     let text = part["description"].as_str().unwrap_or_default();
     text.split_whitespace().collect::<Vec<_>>().join(" ")
 }
 
-/// What a value may be.
+/// Describes the values of a property.
 fn kind(schema: &Value, property: &Value) -> String {
     let part = resolved(schema, property);
     if let Some(choices) = part["oneOf"].as_array() {
@@ -124,7 +150,7 @@ fn kind(schema: &Value, property: &Value) -> String {
     }
 }
 
-/// One form of a table as a value.
+/// Describes one variant of an enum with fields.
 fn table_form(form: &Value) -> String {
     let fields = form["properties"].as_object().unwrap();
     let names: Vec<_> = fields.keys().map(|name| format!("{name} = …")).collect();
@@ -135,7 +161,7 @@ fn table_form(form: &Value) -> String {
     text
 }
 
-/// Who lays what over the defaults: a label and a table each.
+/// Returns the tables that override defaults, with a label each.
 fn others() -> Vec<(String, Table)> {
     let mut others = Vec::new();
     for kind in [PolicyKind::Dmp, PolicyKind::Mlp] {
@@ -170,7 +196,7 @@ fn at<'a>(table: &'a Table, key: &str) -> Option<&'a toml::Value> {
     rest.split('.').try_fold(inner, |value, name| value.get(name))
 }
 
-/// The default, and who else brings another value.
+/// Returns the default, and the values that presets, policies, algorithms and tasks set.
 fn default_text(key: &str, defaults: &Table, others: &[(String, Table)]) -> String {
     let default = at(defaults, key).unwrap().to_string();
     let mut by_value: BTreeMap<String, Vec<&str>> = BTreeMap::new();
@@ -179,7 +205,7 @@ fn default_text(key: &str, defaults: &Table, others: &[(String, Table)]) -> Stri
             by_value.entry(value).or_default().push(label);
         }
     }
-    // Who says what is the default says something only where a task says otherwise.
+    // An entry equal to the default is shown only if a task overrides it.
     let of_tasks = |labels: &Vec<&str>| labels.iter().any(|label| label.starts_with("on "));
     let same = by_value.remove(&default);
     if let Some(labels) = same.filter(|_| by_value.values().any(of_tasks)) {
@@ -193,7 +219,7 @@ fn default_text(key: &str, defaults: &Table, others: &[(String, Table)]) -> Stri
         return format!("Default: `{default}`; each of the tasks has its own.");
     }
     let mut text = format!("Default: `{default}`, but\n\n");
-    // By who comes first in the list above.
+    // In the order of the list above.
     let mut rest: Vec<_> = by_value.into_iter().collect();
     rest.sort_by_key(|(_, labels)| others.iter().position(|(label, _)| label == labels[0]));
     for (value, labels) in rest {

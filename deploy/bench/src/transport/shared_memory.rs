@@ -1,4 +1,4 @@
-//! Our own transport: processes that only send, and the receiver as the learner.
+//! Shared memory between processes that only send and a [`DrainReceiver`] in place of the learner.
 
 use std::fs::File;
 use std::path::Path;
@@ -15,44 +15,45 @@ use dmprl_supervisor::create_domain;
 
 use crate::child::LineChild;
 use crate::drain_receiver::{
-    Answer, Discrepancies, DrainReceiver, From, Request, Window, show_warning,
+    Answer, Discrepancies, DrainReceiver, DrainWindow, Request, Source, show_warning,
 };
 use crate::synthetic_segments::Size;
 
 /// Time limit from the start of the processes to the first segment of each.
 const START: Duration = Duration::from_secs(60);
-/// Extra time that a measurement may take.
+/// Time beyond a measurement's duration until it times out.
 const MEASURE_SLACK: Duration = Duration::from_secs(30);
-/// Time limit for a worker to stop. It answers within milliseconds; a waiting one at its next
-/// check.
+/// Time limit for a worker to stop. It normally answers within milliseconds.
 const STOP: Duration = Duration::from_secs(30);
-/// Duration of each attempt to take the remaining segments, and of all attempts together. On a busy
-/// machine this process may not run for a while; segments that are still missing at the end count
-/// as lost.
+/// Duration of each attempt to receive the remaining segments, and of all attempts together. On a
+/// busy machine, this can take several attempts. Segments still missing at the end count as lost.
 const DRAIN: Duration = Duration::from_millis(100);
 const DRAIN_MAX: Duration = Duration::from_secs(10);
 
-/// A full log is cleared, as after a checkpoint, so that the benchmark does not fill the disk.
+/// Capacity of the log, which is cleared like after a checkpoint to limit its size on disk.
 const LOG_BYTES_MAX: u64 = 256 << 20;
 
-/// Running workers of one size, whose queues are full between two measurements.
-pub(super) struct Ours {
+/// Running workers that send segments of one size. Their queues are full between two measurements.
+pub(super) struct SharedMemory {
     pub(super) size: Size,
     children: Vec<LineChild>,
     receiver: DrainReceiver,
     discrepancies: Discrepancies,
-    /// Last: removed after all its users have been dropped.
+    /// The last field, so that it is removed after its users are dropped.
     _domain: Domain,
 }
 
-impl Ours {
-    /// Starts the workers; `command` is a `transport-worker` of this size without its route.
+impl SharedMemory {
+    /// Starts the workers and waits for the first segment of each. `command` creates a
+    /// `transport-worker` for this size, without its route.
     pub(super) fn start(
         size: Size,
-        (workers, token): (u32, &str),
+        workers: u32,
+        token: &str,
         command: &dyn Fn() -> Command,
         level: DeliveryLevel,
-        (folder, watch): (&Path, &Watch),
+        folder: &Path,
+        watch: &Watch,
     ) -> anyhow::Result<Self> {
         let domain = create_domain(token)?;
         let plan = size.plan(workers as usize);
@@ -78,44 +79,48 @@ impl Ours {
             children.push(LineChild::start(name, command, &path)?);
         }
         let discrepancies = Discrepancies::default();
-        let mut ours = Self { size, children, receiver, discrepancies, _domain: domain };
-        ours.ask(Request::FirstOfEach, watch, START)?;
-        Ok(ours)
+        let mut shared_memory = Self { size, children, receiver, discrepancies, _domain: domain };
+        shared_memory.ask(Request::FirstOfEach, watch, START)?;
+        Ok(shared_memory)
     }
 
-    /// Measures what all workers together deliver during `duration`.
-    pub(super) fn measure(&mut self, watch: &Watch, duration: Duration) -> anyhow::Result<Window> {
-        let request = Request::Measure(duration, From::All);
+    /// Counts the segments of all workers during `duration`.
+    pub(super) fn measure(
+        &mut self,
+        watch: &Watch,
+        duration: Duration,
+    ) -> anyhow::Result<DrainWindow> {
+        let request = Request::Measure(duration, Source::All);
         match self.ask(request, watch, duration + MEASURE_SLACK)? {
             Answer::Measured(window) => Ok(window),
-            Answer::FirstOfEach(_) => bail!("the receiver answered another question"),
+            Answer::FirstOfEach(_) => bail!("the receiver sent an unexpected answer"),
         }
     }
 
-    /// Processor time of each worker so far \[s\], if the system reports it.
+    /// Returns the processor time of each worker so far \[s\], if the system reports it.
     pub(super) fn cpu_s(&self) -> Option<Vec<f64>> {
         self.children.iter().map(LineChild::cpu_s_of_all_threads).collect()
     }
 
-    /// Stops the workers, takes the remaining segments and compares their number with the workers'
-    /// reports.
+    /// Stops the workers, receives the remaining segments and compares their number with the
+    /// workers' reports.
     pub(super) fn finish(mut self, watch: &Watch) -> anyhow::Result<Discrepancies> {
         let mut sent = 0;
         for child in &mut self.children {
-            child.say("\"stop\"")?;
+            child.send_line("\"stop\"")?;
             sent += last_report(child, watch)?.sent;
         }
-        // The workers have exited as requested; do not treat this as a death.
+        // The workers have exited as requested: do not check on them any more.
         self.children.clear();
-        let began = Instant::now();
+        let start = Instant::now();
         loop {
-            self.ask(Request::Measure(DRAIN, From::All), watch, DRAIN + MEASURE_SLACK)?;
-            if self.discrepancies.received >= sent || began.elapsed() >= DRAIN_MAX {
+            self.ask(Request::Measure(DRAIN, Source::All), watch, DRAIN + MEASURE_SLACK)?;
+            if self.discrepancies.received >= sent || start.elapsed() >= DRAIN_MAX {
                 break;
             }
         }
         let Discrepancies { received, lost, .. } = self.discrepancies;
-        // Missing within a sequence, or at its end.
+        // Gaps within a sequence, or segments missing at its end.
         let lost = lost.max(sent.saturating_sub(received));
         Ok(Discrepancies { lost, ..self.discrepancies })
     }
@@ -128,12 +133,12 @@ impl Ours {
     }
 }
 
-/// Receives a worker's final report of the segments that it has sent.
+/// Receives a worker's final report, with the number of segments that it sent.
 fn last_report(child: &mut LineChild, watch: &Watch) -> anyhow::Result<Sent> {
     let deadline = Instant::now() + STOP;
     loop {
         let left = deadline.saturating_duration_since(Instant::now());
-        let line = child.next(watch, left, "the last report")?;
+        let line = child.next_line(watch, left, "the last report")?;
         match serde_json::from_str(&line) {
             Ok(Report::Sent(sent)) => return Ok(sent),
             Ok(_) => show_warning(child.name(), &line),

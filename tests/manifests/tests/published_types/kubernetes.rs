@@ -1,16 +1,16 @@
-//! `deploy/kubernetes/jobset.yaml` in the types that are made from the published schemas.
+//! Checks `deploy/kubernetes/jobset.yaml` against the published types.
 
-use dmprl_manifests::check;
 use serde::Deserialize;
 use serde_json::{Value, json};
 
 use super::read;
+use super::schema::check;
 
 const MANIFEST: &str = "deploy/kubernetes/jobset.yaml";
-/// In `deploy/Dockerfile`.
+/// User id of `deploy/Dockerfile`.
 const USER: i64 = 10_001;
 
-/// The documents of the manifest, by kind.
+/// Returns the documents of the manifest, by kind.
 fn documents() -> Vec<(String, Value)> {
     let text = read(MANIFEST);
     let documents = serde_yaml_ng::Deserializer::from_str(&text);
@@ -30,7 +30,7 @@ fn document(kind: &str) -> Value {
     value
 }
 
-/// Name and template of each kind of Job in the set.
+/// Returns name and template of each kind of Job in the set.
 fn jobs() -> Vec<(String, Value)> {
     let set = document("JobSet");
     let jobs = set["spec"]["replicatedJobs"].as_array().unwrap().iter();
@@ -43,7 +43,7 @@ fn pods() -> Vec<(String, Value)> {
     jobs().into_iter().map(pod).collect()
 }
 
-/// All containers of a pod, those that run before it first.
+/// Returns all containers of a pod, init containers first.
 fn containers(pod: &Value) -> Vec<&Value> {
     let kinds = ["initContainers", "containers"];
     kinds.iter().flat_map(|kind| pod[*kind].as_array().unwrap()).collect()
@@ -109,14 +109,14 @@ fn each_pod_has_shared_memory_of_its_own_within_its_limit() {
         assert_eq!(directory["medium"], "Memory", "{name}");
         let limit = &container["resources"]["limits"]["memory"];
         assert!(2 * mebibytes(&directory["sizeLimit"]) <= mebibytes(limit), "{name}: of {limit}");
-        // A mount without a volume is told by the cluster alone, after everything has been sent.
+        // Only the cluster detects a mount without a volume, after everything has been sent.
         for mount in containers(&pod).into_iter().flat_map(mounts) {
             assert!(volume(mount).is_some(), "{name}: {mount}");
         }
     }
 }
 
-/// A quantity of memory, which the manifest has in Mi or Gi.
+/// Parses a quantity of memory in Mi or Gi.
 fn mebibytes(quantity: &Value) -> u64 {
     let quantity = quantity.as_str().unwrap();
     let (number, unit) = quantity.split_at(quantity.len() - 2);
@@ -154,7 +154,7 @@ fn nothing_runs_as_root_or_writes_to_its_image() {
 fn wrong_use_ends_a_job_and_a_lost_node_costs_none_of_its_tries() {
     for (name, job) in jobs() {
         let pod = &job["spec"]["template"]["spec"];
-        // What a policy for failed pods needs.
+        // Requirements of a pod failure policy.
         assert_eq!(pod["restartPolicy"], "Never", "{name}");
         assert!(pod["terminationGracePeriodSeconds"].as_u64().unwrap() > 10, "{name}");
         let rules = &job["spec"]["podFailurePolicy"]["rules"];

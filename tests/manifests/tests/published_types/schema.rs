@@ -1,7 +1,4 @@
-//! Objects of a cluster, held to the types that are made from the published schemas.
-//!
-//! A crate of its own, because these types have thousands of fields: the workspace's `Cargo.toml`
-//! has it compiled without optimisation, which takes a tenth of the time.
+//! Checks an object of a cluster against the type that is generated from its published schema.
 
 use k8s_openapi::api::core::v1::PersistentVolumeClaim;
 use k8s_openapi::api::networking::v1::NetworkPolicy;
@@ -10,17 +7,17 @@ use serde::Serialize;
 use serde::de::DeserializeOwned;
 use serde_json::Value;
 
-/// Checks an object by its `kind`, strictly: the types themselves pass over what they have no field
-/// for, as a cluster does when it is not asked to be strict.
+/// Checks an object against the type of its `kind`. Unlike the types themselves it rejects fields
+/// that are not in the schema.
 ///
 /// # Errors
-/// What is wrong: a type, a field that is missing, or a field that is not in the schema.
+/// A field has another type, is missing, or is not in the schema.
 pub fn check(object: &Value) -> Result<(), String> {
     match object["kind"].as_str() {
         Some("JobSet") => check_as::<JobSet>(object),
         Some("NetworkPolicy") => check_as::<NetworkPolicy>(object),
         Some("PersistentVolumeClaim") => check_as::<PersistentVolumeClaim>(object),
-        other => Err(format!("{other:?}: its type is not known here")),
+        other => Err(format!("{other:?}: no type for this kind")),
     }
 }
 
@@ -32,7 +29,7 @@ fn check_as<T: Serialize + DeserializeOwned>(object: &Value) -> Result<(), Strin
     if lost.is_empty() { Ok(()) } else { Err(format!("not in the schema: {lost:?}")) }
 }
 
-/// Paths of what is in `written` and not the same in `back`.
+/// Collects the paths of values in `written` that are absent from `back` or differ.
 fn compare(written: &Value, back: &Value, path: &str, lost: &mut Vec<String>) {
     match (written, back) {
         (Value::Object(written), Value::Object(back)) => {

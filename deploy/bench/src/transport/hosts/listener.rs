@@ -1,4 +1,4 @@
-//! The learner's end of the benchmark between hosts.
+//! The learner's side of the benchmark between hosts.
 
 use std::collections::VecDeque;
 use std::path::Path;
@@ -11,7 +11,6 @@ use anyhow::{anyhow, bail};
 use dmprl_bridge::gateway::{Gateway, GatewayEvent, GatewaySettings, RunFacts};
 use dmprl_bridge::wire::RunState;
 use dmprl_run::Watch;
-use dmprl_run::say;
 use dmprl_shared::config::TASKS;
 use dmprl_shared::parameters::ParameterSnapshot;
 use dmprl_shared::segment::{Segment, check};
@@ -19,22 +18,26 @@ use dmprl_shared::transport::delivery::Inbox;
 use dmprl_shared::transport::shared_memory::{LearnerEnd, serve};
 use dmprl_shared::transport::{AcknowledgementPublisher, ParameterPublisher, SegmentReceiver};
 use serde_json::{Value, json};
+use tracing::info;
 
-use super::{IDLE, INTERVAL, KEPT, PARAMETERS, PATIENCE, TOKEN, domain, plan};
+use super::{
+    CONNECT_TIMEOUT, IDLE_SLEEP, INTERVAL, PARAMETERS, RETAINED_SEGMENTS_MAX, TOKEN, domain, plan,
+};
 use crate::statistics::{max, median};
-use crate::synthetic_segments::BETWEEN_HOSTS;
+use crate::synthetic_segments::SIZE_BETWEEN_HOSTS;
 
 const WORKERS_MAX: usize = 64;
 const PUBLISH_INTERVAL: Duration = Duration::from_millis(300);
-/// Time from the first segment until the clock starts, in which the window grows.
+/// Time from the first segment to the start of the measurement, in which the sender's window grows.
 const SETTLE: Duration = Duration::from_secs(3);
-/// Number of times that the end is announced, because a message can be lost on a full link.
-const GOODBYES: u32 = 10;
+/// Number of messages that announce the end, because a full link can lose some.
+const END_MESSAGES: u32 = 10;
 
-/// Acts as the learner for `duration`, at a Zenoh endpoint; returns `None` if interrupted.
+/// Receives segments at a Zenoh endpoint for `duration`, and returns the figures. Returns `None` if
+/// the user interrupted it.
 ///
 /// # Errors
-/// The endpoint is in use, no host connects, or an end fails.
+/// The endpoint is in use, no host connects, or the transport fails.
 pub fn listen(
     endpoint: &str,
     zenoh_file: Option<&Path>,
@@ -42,87 +45,89 @@ pub fn listen(
 ) -> anyhow::Result<Option<Value>> {
     let watch = Watch::start()?;
     let domain = domain()?;
-    let mut taker = Taker::new(serve(domain.path(), &plan(WORKERS_MAX))?);
+    let mut ingest = Ingest::new(serve(domain.path(), &plan(WORKERS_MAX))?);
     let policies = Arc::new(Policies::default());
-    let gateway = start_gateway(&policies, (endpoint, zenoh_file), domain.path());
-    let began = Instant::now();
-    let ended = loop {
+    let gateway = start_gateway(&policies, endpoint, zenoh_file, domain.path());
+    let start = Instant::now();
+    let measured_s = loop {
         if watch.check().is_err() {
             break None;
         }
-        taker.turn(&policies)?;
+        ingest.turn(&policies)?;
         if policies.has_confirmed() {
-            // A host without workers only receives policies.
-            taker.first.get_or_insert_with(Instant::now);
+            // A host without workers sends no segments.
+            ingest.first_segment.get_or_insert_with(Instant::now);
         }
         if gateway.is_finished() {
             break Some(0.0);
         }
-        match taker.first {
+        match ingest.first_segment {
             Some(first) if first.elapsed() >= SETTLE + duration => {
                 break Some((first.elapsed() - SETTLE).as_secs_f64());
             }
-            None if began.elapsed() >= PATIENCE => bail!("no host connected to {endpoint}"),
+            None if start.elapsed() >= CONNECT_TIMEOUT => bail!("no host connected to {endpoint}"),
             _ => {}
         }
     };
-    policies.over.store(true, Ordering::Release);
+    policies.stop.store(true, Ordering::Release);
     gateway.join().map_err(|_| anyhow!("the gateway has panicked"))??;
-    let Some(seconds) = ended else { return Ok(None) };
-    let ages_ms = policies.ages_ms.lock().unwrap_or_else(PoisonError::into_inner).clone();
+    let Some(seconds) = measured_s else { return Ok(None) };
+    let latencies_ms = policies.latencies_ms.lock().unwrap_or_else(PoisonError::into_inner).clone();
     Ok(Some(json!({
-        "segment_bytes": BETWEEN_HOSTS.bytes,
-        "segments_per_s": taker.taken as f64 / seconds,
-        "lost": taker.lost,
-        "sent_again": taker.repeated,
-        "refused": taker.refused,
+        "segment_bytes": SIZE_BETWEEN_HOSTS.bytes,
+        "segments_per_s": ingest.taken as f64 / seconds,
+        "lost": ingest.lost,
+        "sent_again": ingest.repeated,
+        "refused": ingest.refused,
         "seconds": seconds,
         "policy_bytes": PARAMETERS * size_of::<f32>(),
-        "policies": ages_ms.len(),
-        "policy_ms_median": median(&ages_ms),
-        "policy_ms_max": (!ages_ms.is_empty()).then(|| max(&ages_ms)),
+        "policies": latencies_ms.len(),
+        "policy_ms_median": median(&latencies_ms),
+        "policy_ms_max": (!latencies_ms.is_empty()).then(|| max(&latencies_ms)),
     })))
 }
 
-/// Policies in flight, and their latencies.
+/// The policies in flight and their latencies, shared with the gateway's thread.
 #[derive(Default)]
 struct Policies {
-    over: AtomicBool,
-    /// Version and time of each policy that no host has confirmed.
-    under_way: Mutex<VecDeque<(u64, Instant)>>,
-    /// Time from publishing to the other host's confirmation, including the way back \[ms\].
-    ages_ms: Mutex<Vec<f64>>,
+    /// Stops the gateway's thread.
+    stop: AtomicBool,
+    /// Version and publication time of each policy that no host has confirmed.
+    unconfirmed: Mutex<VecDeque<(u64, Instant)>>,
+    /// Time from publication to the receipt of the other host's confirmation \[ms\].
+    latencies_ms: Mutex<Vec<f64>>,
 }
 
 impl Policies {
     fn publish(&self, version: u64) {
-        let mut under_way = self.under_way.lock().unwrap_or_else(PoisonError::into_inner);
-        under_way.push_back((version, Instant::now()));
+        let mut unconfirmed = self.unconfirmed.lock().unwrap_or_else(PoisonError::into_inner);
+        unconfirmed.push_back((version, Instant::now()));
     }
 
     fn has_confirmed(&self) -> bool {
-        !self.ages_ms.lock().unwrap_or_else(PoisonError::into_inner).is_empty()
+        !self.latencies_ms.lock().unwrap_or_else(PoisonError::into_inner).is_empty()
     }
 
-    /// Records a confirmation. It also covers earlier versions, which were replaced on the way.
+    /// Records a confirmation, which also covers earlier versions: newer policies replace them.
     fn confirm(&self, version: u64) {
-        let mut under_way = self.under_way.lock().unwrap_or_else(PoisonError::into_inner);
-        let arrived = under_way.iter().take_while(|(first, _)| *first <= version).count();
-        if let Some((_, since)) = under_way.drain(..arrived).next_back() {
-            let age_ms = since.elapsed().as_secs_f64() * 1e3;
-            self.ages_ms.lock().unwrap_or_else(PoisonError::into_inner).push(age_ms);
+        let mut unconfirmed = self.unconfirmed.lock().unwrap_or_else(PoisonError::into_inner);
+        let confirmed =
+            unconfirmed.iter().take_while(|(published, _)| *published <= version).count();
+        if let Some((_, since)) = unconfirmed.drain(..confirmed).next_back() {
+            let latency_ms = since.elapsed().as_secs_f64() * 1e3;
+            self.latencies_ms.lock().unwrap_or_else(PoisonError::into_inner).push(latency_ms);
         }
     }
 }
 
-/// Takes, checks, settles and acknowledges segments, and publishes policies.
-struct Taker {
+/// Receives, checks, settles and acknowledges segments, and publishes policies.
+struct Ingest {
     end: LearnerEnd,
     inbox: Inbox,
     segment: Segment,
-    told: Instant,
-    published: Option<Instant>,
-    first: Option<Instant>,
+    acknowledged_at: Instant,
+    published_at: Option<Instant>,
+    first_segment: Option<Instant>,
     version: u64,
     taken: u64,
     lost: u64,
@@ -130,15 +135,15 @@ struct Taker {
     refused: u64,
 }
 
-impl Taker {
+impl Ingest {
     fn new(end: LearnerEnd) -> Self {
         Self {
             end,
             inbox: Inbox::new(WORKERS_MAX),
-            segment: Segment::zeroed(BETWEEN_HOSTS.layout),
-            told: Instant::now(),
-            published: None,
-            first: None,
+            segment: Segment::zeroed(SIZE_BETWEEN_HOSTS.layout),
+            acknowledged_at: Instant::now(),
+            published_at: None,
+            first_segment: None,
             version: 0,
             taken: 0,
             lost: 0,
@@ -151,20 +156,20 @@ impl Taker {
         if self.end.segments.try_receive(&mut self.segment)? {
             self.take();
         } else {
-            thread::sleep(IDLE);
+            thread::sleep(IDLE_SLEEP);
         }
-        let due = self.told.elapsed() >= INTERVAL;
+        let due = self.acknowledged_at.elapsed() >= INTERVAL;
         if due || self.inbox.owes_acknowledgement() {
             self.end.acknowledgements.acknowledge(self.inbox.acknowledge()?)?;
         }
         if due {
-            self.told = Instant::now();
+            self.acknowledged_at = Instant::now();
             self.end.segments.maintain()?;
             self.end.parameters.maintain()?;
             self.end.acknowledgements.maintain()?;
         }
-        if self.published.is_none_or(|at| at.elapsed() >= PUBLISH_INTERVAL) {
-            self.published = Some(Instant::now());
+        if self.published_at.is_none_or(|at| at.elapsed() >= PUBLISH_INTERVAL) {
+            self.published_at = Some(Instant::now());
             self.version += 1;
             let version = self.version;
             policies.publish(version);
@@ -178,9 +183,9 @@ impl Taker {
     }
 
     fn take(&mut self) {
-        let since = *self.first.get_or_insert_with(Instant::now);
+        let since = *self.first_segment.get_or_insert_with(Instant::now);
         let Segment { header, block } = &self.segment;
-        if check(header, block, &BETWEEN_HOSTS.expected(WORKERS_MAX as u32)).is_err() {
+        if check(header, block, &SIZE_BETWEEN_HOSTS.expected(WORKERS_MAX as u32)).is_err() {
             self.refused += 1;
             return;
         }
@@ -196,7 +201,8 @@ impl Taker {
 
 fn start_gateway(
     policies: &Arc<Policies>,
-    (endpoint, zenoh_file): (&str, Option<&Path>),
+    endpoint: &str,
+    zenoh_file: Option<&Path>,
     domain: &Path,
 ) -> JoinHandle<anyhow::Result<()>> {
     let policies = Arc::clone(policies);
@@ -217,21 +223,21 @@ fn start_gateway(
             plan: plan(WORKERS_MAX),
             first_worker: 0,
             session: 0,
-            segments_max: KEPT,
+            segments_max: RETAINED_SEGMENTS_MAX,
         };
         let mut gateway = Gateway::open(settings, facts)?;
-        while !policies.over.load(Ordering::Acquire) {
+        while !policies.stop.load(Ordering::Acquire) {
             if !gateway.turn()? {
-                thread::sleep(IDLE);
+                thread::sleep(IDLE_SLEEP);
             }
             gateway.policy_versions().for_each(|version| policies.confirm(version));
             for event in gateway.take_events() {
                 if let GatewayEvent::Notice(notice) = event {
-                    say(&notice);
+                    info!("{notice}");
                 }
             }
         }
-        for _ in 0..GOODBYES {
+        for _ in 0..END_MESSAGES {
             gateway.send_acks(RunState::Complete)?;
             thread::sleep(INTERVAL);
         }

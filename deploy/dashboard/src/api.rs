@@ -1,43 +1,43 @@
-//! Builds the dashboard's JSON answers from the catalogue, independent of HTTP.
+//! Builds the dashboard's JSON responses from the catalogue, independent of HTTP.
 
 use anyhow::Context;
 use dmprl_analysis::plots::{colour, has_colour};
 use serde::Serialize;
 use serde_json::{Value, json};
 
+use super::cached_run::{CachedRun, Curves, Rows, RunInfo, State, TablePosition};
 use super::catalogue::Catalogue;
 use super::table::rounded;
-use super::watched::{Curves, Facts, Rows, State, Watched};
 use super::{configuration, episode, videos};
 
-/// Maximum number of curves in one request; a page has a dozen.
+/// Maximum number of curves in one request; the page needs fewer than 20 per file.
 const CURVES_MAX: usize = 64;
-/// Maximum number of evaluations in a table; the newest are kept.
+/// Maximum number of evaluations in a response; the newest are returned.
 const EVALUATIONS_MAX: usize = 50;
 
-/// Reason for which a request is rejected.
+/// Reason for a failed request.
 #[derive(Debug)]
-pub enum Refusal {
+pub enum ApiError {
     /// The requested item does not exist.
-    Missing(String),
+    NotFound(String),
     /// The request is invalid.
-    Senseless(String),
-    /// A file cannot be read.
-    Failed(anyhow::Error),
+    BadRequest(String),
+    /// The files of the run cannot be read.
+    Internal(anyhow::Error),
 }
 
-impl From<anyhow::Error> for Refusal {
+impl From<anyhow::Error> for ApiError {
     fn from(error: anyhow::Error) -> Self {
-        Self::Failed(error)
+        Self::Internal(error)
     }
 }
 
 /// A run in the list.
 #[derive(Debug, Serialize)]
-struct Listed<'r> {
+struct RunEntry<'r> {
     name: &'r str,
     #[serde(flatten)]
-    facts: &'r Facts,
+    info: &'r RunInfo,
     /// Colour of the method, as `#rrggbb`.
     colour: String,
     state: State,
@@ -53,93 +53,98 @@ struct Listed<'r> {
 /// Lists all runs with their state.
 pub fn runs(catalogue: &mut Catalogue) -> Value {
     refresh(catalogue);
-    let mut others: Vec<&str> = Vec::new();
-    let listed: Vec<_> = catalogue
+    let mut methods: Vec<&str> = Vec::new();
+    let entries: Vec<_> = catalogue
         .runs
         .iter()
-        .map(|(name, watched)| {
-            let method = watched.facts.method.as_str();
-            if !others.contains(&method) {
-                others.push(method);
+        .map(|(name, run)| {
+            let method = run.info.method.as_str();
+            if !methods.contains(&method) {
+                methods.push(method);
             }
-            let index = others.iter().position(|other| *other == method).unwrap_or(0);
-            listed(name, watched, index)
+            let index = methods.iter().position(|other| *other == method).unwrap_or(0);
+            entry(name, run, index)
         })
         .collect();
     json!({
         "root": catalogue.root().display().to_string(),
         "version": env!("CARGO_PKG_VERSION"),
         "left_out": catalogue.left_out,
-        "runs": listed,
+        "runs": entries,
     })
 }
 
-/// Looks for new runs, and refreshes all runs.
+/// Searches for new runs, and refreshes all runs.
 pub fn refresh(catalogue: &mut Catalogue) {
-    catalogue.walk();
-    catalogue.runs.values_mut().for_each(Watched::refresh);
+    catalogue.scan();
+    catalogue.runs.values_mut().for_each(CachedRun::refresh);
 }
 
-fn listed<'r>(name: &'r str, watched: &'r Watched, index: usize) -> Listed<'r> {
-    let number = |key: &str| watched.last[key].as_f64().map(rounded);
-    let newest = watched.evaluations.last();
-    let best = watched.evaluations.iter().map(|row| row.return_mean).max_by(f64::total_cmp);
-    let method = watched.facts.method.as_str();
-    // A preset's runs have the colour of the method's other runs; dashes distinguish them.
+fn entry<'r>(name: &'r str, run: &'r CachedRun, index: usize) -> RunEntry<'r> {
+    let number = |key: &str| run.last_metrics[key].as_f64().map(rounded);
+    let newest = run.evaluations.last();
+    let best = run.evaluations.iter().map(|row| row.return_mean).max_by(f64::total_cmp);
+    let method = run.info.method.as_str();
+    // Runs of a preset, such as "TD3-DMP (paper)", share the method's colour; the page
+    // distinguishes them by dashes.
     let plain = method.split_once(" (").map_or(method, |(plain, _)| plain);
     let colour = colour(index, if has_colour(method) { method } else { plain });
-    Listed {
+    RunEntry {
         name,
-        facts: &watched.facts,
+        info: &run.info,
         colour: format!("#{:02x}{:02x}{:02x}", colour.0, colour.1, colour.2),
-        state: watched.state,
+        state: run.state,
         env_steps: number("env_steps").or(newest.map(|row| row.env_steps as f64)),
         wall_s: number("wall_s"),
         env_steps_per_s: number("env_steps_per_s"),
         return_mean: newest.map(|row| rounded(row.return_mean)),
         best_return: best.map(rounded),
         success_rate: newest.and_then(|row| row.success_rate).map(rounded),
-        fault: watched.fault.as_deref(),
+        fault: run.fault.as_deref(),
     }
 }
 
-/// Returns new points of the curves in `names`, separated by commas.
+/// Returns the points of curves from a position on.
+///
+/// - `file`: `metrics` or `evaluations`.
+/// - `names`: keys of the curves, separated by commas.
 ///
 /// # Errors
-/// The run or the file of rows does not exist, or too many curves are requested.
+/// The run or the file does not exist, or too many curves are requested.
 pub fn curves(
     catalogue: &mut Catalogue,
-    (run, file): (&str, &str),
+    run: &str,
+    file: &str,
     names: &str,
-    since: (u64, usize),
-) -> Result<Curves, Refusal> {
+    from: TablePosition,
+) -> Result<Curves, ApiError> {
     let rows = match file {
         "metrics" => Rows::Metrics,
         "evaluations" => Rows::Evaluations,
         other => {
             let expected = "expected metrics or evaluations";
-            return Err(Refusal::Senseless(format!("file: {expected}, got {other:?}")));
+            return Err(ApiError::BadRequest(format!("file: {expected}, got {other:?}")));
         }
     };
     let names: Vec<&str> = names.split(',').filter(|name| !name.is_empty()).collect();
     if names.len() > CURVES_MAX {
         let count = names.len();
-        return Err(Refusal::Senseless(format!(
+        return Err(ApiError::BadRequest(format!(
             "curves: expected at most {CURVES_MAX} names, got {count}"
         )));
     }
-    Ok(find(catalogue, run)?.curves(rows, &names, since)?)
+    Ok(find(catalogue, run)?.curves(rows, &names, from)?)
 }
 
 /// Returns the newest evaluations of a run, newest first, with the return of each episode.
 ///
 /// # Errors
-/// The run does not exist.
-pub fn evaluations(catalogue: &mut Catalogue, run: &str) -> Result<Value, Refusal> {
-    let watched = find(catalogue, run)?;
-    watched.refresh();
-    let first_seed = watched.directory.config()?.evaluation.first_seed;
-    let newest = watched.evaluations.iter().rev().take(EVALUATIONS_MAX);
+/// The run does not exist, or its configuration cannot be read.
+pub fn evaluations(catalogue: &mut Catalogue, run: &str) -> Result<Value, ApiError> {
+    let run = find(catalogue, run)?;
+    run.refresh();
+    let first_seed = run.directory.config()?.evaluation.first_seed;
+    let newest = run.evaluations.iter().rev().take(EVALUATIONS_MAX);
     let rows: Vec<_> = newest
         .map(|row| {
             json!({
@@ -153,14 +158,14 @@ pub fn evaluations(catalogue: &mut Catalogue, run: &str) -> Result<Value, Refusa
             })
         })
         .collect();
-    Ok(json!({"first_seed": first_seed, "count": watched.evaluations.len(), "rows": rows}))
+    Ok(json!({"first_seed": first_seed, "count": run.evaluations.len(), "rows": rows}))
 }
 
-/// Returns the motion of the run's policy in one episode; null if it was never recorded.
+/// Returns the motion of the run's policy in one episode; null if it has not been recorded.
 ///
 /// # Errors
 /// The run does not exist, or its file cannot be read.
-pub fn motion(catalogue: &mut Catalogue, run: &str) -> Result<Value, Refusal> {
+pub fn motion(catalogue: &mut Catalogue, run: &str) -> Result<Value, ApiError> {
     Ok(episode::read(&find(catalogue, run)?.directory)?)
 }
 
@@ -168,7 +173,7 @@ pub fn motion(catalogue: &mut Catalogue, run: &str) -> Result<Value, Refusal> {
 ///
 /// # Errors
 /// The run does not exist, or its folder cannot be read.
-pub fn videos(catalogue: &mut Catalogue, run: &str) -> Result<Value, Refusal> {
+pub fn videos(catalogue: &mut Catalogue, run: &str) -> Result<Value, ApiError> {
     let found = videos::list(&find(catalogue, run)?.directory)?;
     Ok(json!({ "videos": found }))
 }
@@ -181,41 +186,42 @@ pub fn video(
     catalogue: &mut Catalogue,
     run: &str,
     name: &str,
-) -> Result<std::path::PathBuf, Refusal> {
+) -> Result<std::path::PathBuf, ApiError> {
     let directory = &find(catalogue, run)?.directory;
     let listed = videos::list(directory)?.into_iter().any(|video| video.name == name);
     if !listed {
-        return Err(Refusal::Missing(format!("run {run} has no video {name:?}")));
+        return Err(ApiError::NotFound(format!("run {run} has no video {name:?}")));
     }
     Ok(videos::folder(directory).join(name))
 }
 
-/// Returns the processes of a run's last session; null if its supervisor wrote no file.
+/// Returns the run's state and the processes of its last session; the latter are null if the
+/// supervisor wrote no file.
 ///
 /// # Errors
-/// The run does not exist, or its file is damaged.
-pub fn processes(catalogue: &mut Catalogue, run: &str) -> Result<Value, Refusal> {
-    let watched = find(catalogue, run)?;
-    watched.refresh();
-    let processes = watched.directory.processes()?;
-    Ok(json!({"state": watched.state, "session": processes}))
+/// The run does not exist, or its file is invalid.
+pub fn processes(catalogue: &mut Catalogue, run: &str) -> Result<Value, ApiError> {
+    let run = find(catalogue, run)?;
+    run.refresh();
+    let processes = run.directory.processes()?;
+    Ok(json!({"state": run.state, "session": processes}))
 }
 
 /// Returns every configuration key of a run with its value.
 ///
 /// # Errors
 /// The run does not exist, or its file cannot be read.
-pub fn config(catalogue: &mut Catalogue, run: &str) -> Result<Value, Refusal> {
+pub fn config(catalogue: &mut Catalogue, run: &str) -> Result<Value, ApiError> {
     let config = find(catalogue, run)?.directory.config()?;
-    let keys = configuration::flat(&config).context("cannot write the configuration")?;
+    let keys = configuration::flattened(&config).context("cannot serialize the configuration")?;
     Ok(json!({ "keys": keys }))
 }
 
-fn find<'c>(catalogue: &'c mut Catalogue, run: &str) -> Result<&'c mut Watched, Refusal> {
+fn find<'c>(catalogue: &'c mut Catalogue, run: &str) -> Result<&'c mut CachedRun, ApiError> {
     if !catalogue.runs.contains_key(run) {
-        catalogue.walk();
+        catalogue.scan();
     }
     let root = catalogue.root().display().to_string();
-    let missing = || Refusal::Missing(format!("there is no run {run:?} in {root}"));
+    let missing = || ApiError::NotFound(format!("there is no run {run:?} in {root}"));
     catalogue.runs.get_mut(run).ok_or_else(missing)
 }

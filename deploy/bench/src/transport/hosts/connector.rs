@@ -1,6 +1,6 @@
-//! The workers' end of the benchmark between hosts.
+//! The workers' side of the benchmark between hosts.
 
-use std::path::{Path, PathBuf};
+use std::path::Path;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::thread::{self, JoinHandle};
@@ -19,21 +19,26 @@ use dmprl_shared::transport::delivery::{Acknowledgements, Outbox};
 use dmprl_shared::transport::shared_memory::{Plan, attach};
 use serde_json::{Value, json};
 
-use super::{IDLE, INTERVAL, KEPT, PATIENCE, TOKEN, UNDER_WAY_BYTES_MAX, domain, plan};
+use super::{
+    CONNECT_TIMEOUT, IDLE_SLEEP, IN_FLIGHT_BYTES_MAX, INTERVAL, RETAINED_SEGMENTS_MAX, TOKEN,
+    domain, plan,
+};
 use crate::synthetic_segments::SyntheticSegments;
 
 /// Segments generated between two checks for acknowledgements.
-const TOGETHER: usize = 32;
+const BATCH_SEGMENTS: usize = 32;
 
-/// Sends synthetic segments to the listener at the endpoint until it has enough; returns `None` if
-/// interrupted. `rate` is the total rate of all workers \[segments/s\]; `None` for the maximum.
+/// Sends synthetic segments to the listener at `endpoint` until it ends the measurement. Returns
+/// `None` if the user interrupted it.
+/// - `rate`: segments per second of all workers together; `None` for as many as possible.
 ///
 /// # Errors
-/// No process listens there, or an end fails.
+/// Nothing listens at `endpoint`, or a worker or the relay fails.
 pub fn connect(
     endpoint: &str,
     zenoh_file: Option<&Path>,
-    (workers, rate): (u32, Option<u32>),
+    workers: u32,
+    rate: Option<u32>,
 ) -> anyhow::Result<Option<Value>> {
     let watch = Watch::start()?;
     let join = JoinSettings {
@@ -43,7 +48,7 @@ pub fn connect(
         name: "bench".to_owned(),
         workers,
     };
-    let Some(lease) = welcomed(&join, zenoh_file, &watch)? else { return Ok(None) };
+    let Some(lease) = request_lease(&join, zenoh_file, &watch)? else { return Ok(None) };
     let domain = domain()?;
     let plan = plan(workers as usize);
     let mut relay = Relay::start(RelaySettings {
@@ -52,34 +57,34 @@ pub fn connect(
         zenoh_file,
         domain: domain.path(),
         plan: &plan,
-        segments_max: KEPT,
-        in_flight_bytes_max: UNDER_WAY_BYTES_MAX,
+        segments_max: RETAINED_SEGMENTS_MAX,
+        in_flight_bytes_max: IN_FLIGHT_BYTES_MAX,
     })?;
-    let over = Arc::new(AtomicBool::new(false));
-    let each = rate.map(|rate| f64::from(rate) / f64::from(workers));
+    let stop = Arc::new(AtomicBool::new(false));
+    let worker_rate = rate.map(|rate| f64::from(rate) / f64::from(workers));
     let threads: Vec<JoinHandle<anyhow::Result<()>>> = (0..workers)
         .map(|index| {
-            let (over, path, plan) = (Arc::clone(&over), domain.path().to_owned(), plan.clone());
-            thread::spawn(move || work((index, each), (&path, &plan), &over))
+            let (stop, path, plan) = (Arc::clone(&stop), domain.path().to_owned(), plan.clone());
+            thread::spawn(move || work(index, worker_rate, &path, &plan, &stop))
         })
         .collect();
     let interrupted = loop {
         match relay.turn(&HostCounts::default())? {
             Turn::Complete => break false,
-            Turn::Idle => thread::sleep(IDLE),
+            Turn::Idle => thread::sleep(IDLE_SLEEP),
             Turn::Worked => {}
         }
         if watch.check().is_err() || threads.iter().any(JoinHandle::is_finished) {
             break true;
         }
-        if relay.away().is_some_and(|(since, _)| since.elapsed() >= PATIENCE) {
+        if relay.away().is_some_and(|(since, _)| since.elapsed() >= CONNECT_TIMEOUT) {
             bail!("{endpoint} no longer answers");
         }
     };
-    over.store(true, Ordering::Release);
+    stop.store(true, Ordering::Release);
     for thread in threads {
-        let ended = thread.join().map_err(|_| anyhow!("a worker has panicked"))?;
-        ended.context("a worker failed")?;
+        let result = thread.join().map_err(|_| anyhow!("a worker has panicked"))?;
+        result.context("a worker failed")?;
     }
     let (acknowledged, window_bytes) = (relay.acked(), relay.window_bytes());
     let figures =
@@ -87,18 +92,19 @@ pub fn connect(
     Ok((!interrupted).then_some(figures))
 }
 
-fn welcomed(
+/// Joins the run at the endpoint. Returns `None` if the user interrupted it.
+fn request_lease(
     join: &JoinSettings,
     zenoh_file: Option<&Path>,
     watch: &Watch,
 ) -> anyhow::Result<Option<Lease>> {
-    let (began, endpoint) = (Instant::now(), &join.endpoint);
+    let (start, endpoint) = (Instant::now(), &join.endpoint);
     let link = Link::open(LinkMode::Connect(endpoint), zenoh_file)?;
     loop {
         match request_join(&link, join, None)? {
             JoinOutcome::Welcome(welcome) => return Ok(Some(welcome.lease)),
-            JoinOutcome::Refused(why) => bail!("{endpoint} refuses: {why}"),
-            JoinOutcome::Later(why) if began.elapsed() >= PATIENCE => bail!("{why}"),
+            JoinOutcome::Refused(why) => bail!("{endpoint} refused the join request: {why}"),
+            JoinOutcome::Later(why) if start.elapsed() >= CONNECT_TIMEOUT => bail!("{why}"),
             JoinOutcome::Later(_) if watch.check().is_err() => return Ok(None),
             JoinOutcome::Later(_) => thread::sleep(INTERVAL),
         }
@@ -107,42 +113,44 @@ fn welcomed(
 
 /// A worker that only sends, at `rate` segments per second or as fast as possible.
 fn work(
-    (index, rate): (u32, Option<f64>),
-    (domain, plan): (&PathBuf, &Plan),
-    over: &AtomicBool,
+    index: u32,
+    rate: Option<f64>,
+    domain: &Path,
+    plan: &Plan,
+    stop: &AtomicBool,
 ) -> anyhow::Result<()> {
-    let began = Instant::now();
+    let start = Instant::now();
     let mut end = loop {
         match attach(domain, plan, index as usize) {
             Ok(end) => break end,
-            Err(error) if began.elapsed() >= PATIENCE => return Err(error.into()),
+            Err(error) if start.elapsed() >= CONNECT_TIMEOUT => return Err(error.into()),
             Err(_) => thread::sleep(INTERVAL),
         }
     };
-    let mut outbox = Outbox::new(plan.layout, KEPT, index, 0);
+    let mut outbox = Outbox::new(plan.layout, RETAINED_SEGMENTS_MAX, index, 0);
     let mut synthetic_segments = SyntheticSegments::new(plan.layout, index);
-    let mut heard = Acknowledgements::default();
-    let (began, mut made) = (Instant::now(), 0_usize);
-    while !over.load(Ordering::Acquire) {
-        if end.acknowledgements.newest(&mut heard)? {
-            outbox.acknowledge(&heard);
+    let mut acknowledgements = Acknowledgements::default();
+    let (start, mut generated) = (Instant::now(), 0_usize);
+    while !stop.load(Ordering::Acquire) {
+        if end.acknowledgements.newest(&mut acknowledgements)? {
+            outbox.acknowledge(&acknowledgements);
         }
         let room = outbox.capacity() - outbox.len();
-        let due = rate.map_or(TOGETHER, |rate| {
-            let due = (began.elapsed().as_secs_f64() * rate) as usize;
-            // Segments that could not be sent in time are skipped: a robot cannot catch up either.
-            made = made.max(due.saturating_sub(TOGETHER));
-            due - made
+        let due = rate.map_or(BATCH_SEGMENTS, |rate| {
+            let due = (start.elapsed().as_secs_f64() * rate) as usize;
+            // Skips segments that could not be sent in time: a robot cannot catch up either.
+            generated = generated.max(due.saturating_sub(BATCH_SEGMENTS));
+            due - generated
         });
-        let together = if outbox.unsent() == 0 { room.min(TOGETHER).min(due) } else { 0 };
-        made += together;
-        for _ in 0..together {
+        let batch = if outbox.unsent() == 0 { room.min(BATCH_SEGMENTS).min(due) } else { 0 };
+        generated += batch;
+        for _ in 0..batch {
             let Segment { header, block } = synthetic_segments.next();
             outbox.put(header, block);
         }
         outbox.offer(&mut end.segments)?;
-        if outbox.unsent() > 0 || together == 0 {
-            thread::sleep(IDLE);
+        if outbox.unsent() > 0 || batch == 0 {
+            thread::sleep(IDLE_SLEEP);
         }
     }
     Ok(())

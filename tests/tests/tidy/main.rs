@@ -1,9 +1,13 @@
-//! The project's rules that a machine can check by reading the repository; ARCHITECTURE.md has
-//! them with their reasons. Nothing is built here, so a violation is found within a second.
+//! Rules of the project that can be checked by reading the repository, within a second;
+//! ARCHITECTURE.md lists them with their reasons.
 #![allow(
     clippy::unwrap_used,
     reason = "helpers of tests; clippy.toml covers only the tests themselves"
 )]
+
+mod configuration_keys;
+mod language;
+mod structure;
 
 use std::fs;
 use std::path::Path;
@@ -14,9 +18,9 @@ const FILE_LINES_MAX: usize = 500;
 const FUNCTION_LINES_MAX: usize = 70;
 const COLUMNS_MAX: usize = 100;
 const STAGES: u32 = 8;
-/// Built, downloaded or left by runs: nobody's source.
+/// Folders that are built, downloaded or written by runs.
 const FOREIGN_FOLDERS: [&str; 5] = ["target", "runs", "__pycache__", ".git", ".venv"];
-const MEMBERS: [&str; 15] = [
+const MEMBERS: [&str; 16] = [
     "actors",
     "deploy/analysis",
     "deploy/bench",
@@ -31,6 +35,7 @@ const MEMBERS: [&str; 15] = [
     "learner",
     "shared",
     "tests",
+    "tests/book",
     "tests/manifests",
 ];
 
@@ -51,7 +56,8 @@ impl Source {
         self.path.strip_prefix(folder).is_some_and(|rest| rest.starts_with('/'))
     }
 
-    /// Code that only tests run: a file of its own, a folder `tests`, this member crate.
+    /// Returns true for code that only tests run: a file of its own, a folder `tests`, this member
+    /// crate.
     fn is_test(&self) -> bool {
         let name = Path::new(&self.path).file_stem().and_then(|it| it.to_str()).unwrap_or("");
         self.path.starts_with("tests/")
@@ -61,9 +67,9 @@ impl Source {
             || name == "test_support"
     }
 
-    /// The lines that the program is made of, numbered from 1: no comments, and nothing from the
-    /// test module on, which ends a file. `//` inside a string ends a line too, which hides no
-    /// name that these rules look for.
+    /// Returns the lines of code, numbered from 1, without comments and without the test module at
+    /// the end of a file. `//` inside a string also ends a line, which hides no name that these
+    /// rules search for.
     fn code(&self) -> impl Iterator<Item = (usize, &str)> {
         let lines = self.text.lines().enumerate();
         lines
@@ -90,7 +96,7 @@ fn collect(folder: &Path, found: &mut Vec<Source>) {
         } else if kind.is_file() {
             let path = entry.path();
             let path = path.strip_prefix(project_root()).unwrap().to_str().unwrap().to_owned();
-            // Pictures and the like have no lines.
+            // Pictures and other binary files have no lines.
             if let Ok(text) = fs::read_to_string(entry.path()) {
                 found.push(Source { path, text });
             }
@@ -102,7 +108,7 @@ fn read(path: &str) -> String {
     fs::read_to_string(project_root().join(path)).unwrap_or_else(|error| panic!("{path}: {error}"))
 }
 
-/// Whether `text` holds `word` with no letter, digit or underscore on either side.
+/// Returns true if `text` contains `word` with no letter, digit or underscore on either side.
 fn names(text: &str, word: &str) -> bool {
     let part_of_word = |letter: char| letter.is_alphanumeric() || letter == '_';
     text.match_indices(word).any(|(at, _)| {
@@ -115,7 +121,7 @@ fn none(violations: &[String], rule: &str) {
     assert!(violations.is_empty(), "{rule}\n  {}\n", violations.join("\n  "));
 }
 
-/// Every place outside `allowed` where Rust code or a manifest names `word`.
+/// Returns every place outside `allowed` where Rust code or a manifest names `word`.
 fn named_outside(word: &str, allowed: impl Fn(&Source) -> bool) -> Vec<String> {
     let mut places = Vec::new();
     for source in sources(&["rs"]).iter().filter(|source| !source.is_test() && !allowed(source)) {
@@ -125,7 +131,7 @@ fn named_outside(word: &str, allowed: impl Fn(&Source) -> bool) -> Vec<String> {
     places
 }
 
-/// Names of the members whose manifest asks for a dependency that begins with `prefix`.
+/// Returns the members whose manifest has a dependency that begins with `prefix`.
 fn dependents(prefix: &str) -> Vec<&'static str> {
     let asks = |member: &&str| {
         let manifest = read(&format!("{member}/Cargo.toml"));
@@ -145,10 +151,7 @@ fn actors_and_learner_do_not_know_each_other() {
             places.push(format!("{member}/Cargo.toml depends on actors or learner"));
         }
     }
-    none(
-        &places,
-        "actors and learner share only what lies in `shared`; deploy brings them together",
-    );
+    none(&places, "actors and learner share only `shared`; deploy connects them");
 }
 
 #[test]
@@ -204,9 +207,9 @@ fn shared_is_told_the_time_the_environment_and_randomness() {
     }
     none(&places, "shared gets clock, environment variables and randomness as arguments");
 
-    // Waiting reads no clock, but nothing on the data path may do it. The one exception is the
-    // lock on the parent of all runs' shared-memory directories: it is taken when a run starts and
-    // ends, other starts hold it for microseconds, and the number of attempts is fixed.
+    // Waiting reads no clock, but the data path must not wait. The one exception is the lock on the
+    // parent of all runs' shared-memory directories: it is taken when a run starts and ends, other
+    // starts hold it for microseconds, and the number of attempts is fixed.
     let sleeps = named_outside("sleep", |source| !source.is_within("shared"));
     let allowed = "shared/src/transport/shared_memory/domain.rs:";
     assert!(
@@ -215,8 +218,8 @@ fn shared_is_told_the_time_the_environment_and_randomness() {
     );
 }
 
-/// The clock on the wall may jump, back too. Whatever waits, limits or measures uses a clock that
-/// does not; the other only names and dates what is left behind.
+/// The wall clock may jump, also backwards. Waits, limits and measurements use the monotonic clock;
+/// the wall clock only gives names and dates to files.
 #[test]
 fn the_clock_on_the_wall_is_read_for_names_and_dates_only() {
     const STAMPS: [&str; 5] = [
@@ -228,7 +231,7 @@ fn the_clock_on_the_wall_is_read_for_names_and_dates_only() {
     ];
     let stamps = |source: &Source| STAMPS.contains(&source.path.as_str());
     let mut places = Vec::new();
-    // Of a file, too: its times are the wall's.
+    // Times of files are wall-clock times too.
     for word in ["SystemTime", "UNIX_EPOCH", "modified", "accessed", "CLOCK_REALTIME", "Realtime"] {
         places.extend(named_outside(word, stamps));
     }
@@ -239,7 +242,7 @@ fn the_clock_on_the_wall_is_read_for_names_and_dates_only() {
         }
     }
     none(&places, "limits and waits use Instant, in Python time.monotonic or time.perf_counter");
-    // The exceptions compare no times: they only write them.
+    // The exceptions only write times, and compare none.
     for path in STAMPS {
         let text = read(path);
         let code = text.split("#[cfg(test)]").next().unwrap_or_default();
@@ -281,11 +284,11 @@ fn files_functions_and_lines_are_short() {
             }
         }
     }
-    none(&places, "what does not fit on a screen or two is two things");
+    none(&places, "a file fits on a few screens, a function on one");
 }
 
-/// Line number and length of every function, brace and attributes included. Both languages are
-/// formatted by a tool, so indentation says where a function ends.
+/// Returns line number and length of every function, with brace and attributes. Both languages are
+/// formatted by a tool, so the indentation shows where a function ends.
 fn functions(source: &Source) -> Vec<(usize, usize)> {
     let lines: Vec<&str> = source.text.lines().collect();
     let indent_of = |line: &str| line.len() - line.trim_start().len();
@@ -324,7 +327,7 @@ fn begins_rust_function(line: &str) -> bool {
 
 #[test]
 fn nothing_is_left_undone() {
-    // Spelled in two parts: this file is searched as well.
+    // Split in two parts, because this file is searched as well.
     let marks = [
         concat!("todo", "!"),
         concat!("unimplemented", "!"),
@@ -341,7 +344,7 @@ fn nothing_is_left_undone() {
             places.extend(left.map(|mark| format!("{}:{}: {mark}", source.path, index + 1)));
         }
     }
-    none(&places, "what is not done yet is an issue, not a mark in the code; no test is skipped");
+    none(&places, "unfinished work is an issue, not a mark in the code; no test is ignored");
 }
 
 #[test]
@@ -397,7 +400,7 @@ fn a_files_name_says_what_is_in_it() {
         let empty = stems.filter(|stem| NAMES_OF_NOTHING.contains(stem));
         places.extend(empty.map(|stem| format!("{}: {stem}", source.path)));
     }
-    none(&places, "a name that fits everything says nothing");
+    none(&places, "a file's name describes its content");
 }
 
 #[test]
@@ -411,16 +414,20 @@ fn the_workspace_decides_versions_and_lints_once() {
         let versions = manifest.lines().filter(|line| line.contains("version = \""));
         places.extend(versions.map(|line| format!("{member}/Cargo.toml: {line}")));
     }
-    none(&places, "versions and lints stand in the workspace's Cargo.toml");
+    none(&places, "versions and lints are in the workspace's Cargo.toml");
 }
 
-/// A test run ends with the list of what was skipped: nothing runs after it.
+/// No test runs after the list of skipped tests.
 #[test]
 fn the_list_of_skipped_tests_comes_last() {
     const LAST: &str = "what_was_skipped";
     let mut places = Vec::new();
     for member in MEMBERS {
         let manifest = read(&format!("{member}/Cargo.toml"));
+        // Not part of `cargo test`.
+        if ["tests/book", "tests/manifests"].contains(&member) {
+            continue;
+        }
         if !manifest.contains("[lib]\ndoctest = false") {
             places.push(format!("{member}/Cargo.toml: doc-tests would run after the list"));
         }

@@ -1,51 +1,19 @@
-//! The book in `docs/`: it builds, every link in it leads somewhere, it reads without a network,
-//! and its list of configuration keys is what the types say.
+//! The book builds, its links have targets, and its pages load nothing from a network.
 #![allow(
     clippy::unwrap_used,
     reason = "helpers of tests; clippy.toml covers only the tests themselves"
 )]
 
-mod keys;
 mod pages;
 
 use std::fs;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
-use dmprl_tests::project_root;
-use mdbook_driver::MDBook;
 use pages::{Page, built_pages};
 
-const KEYS: &str = "docs/configuration-keys.md";
-/// Set to write the list of keys anew instead of comparing it.
-const WRITE: &str = "WRITE_CONFIGURATION_KEYS";
-
 #[test]
-fn the_list_of_configuration_keys_is_what_the_types_say() {
-    let path = project_root().join(KEYS);
-    let made = keys::page();
-    if std::env::var_os(WRITE).is_some() {
-        fs::write(&path, made).unwrap();
-        return;
-    }
-    let written = fs::read_to_string(&path).unwrap_or_default();
-    let same = written.lines().zip(made.lines()).take_while(|(a, b)| a == b).count();
-    assert!(
-        written == made,
-        "{KEYS} differs from the types in shared/src/config from line {} on:\n  it says  {:?}\n  \
-         the types {:?}\nwrite it anew: {WRITE}=1 cargo test --release --test book",
-        same + 1,
-        written.lines().nth(same),
-        made.lines().nth(same),
-    );
-}
-
-#[test]
-fn the_book_builds_reads_without_a_network_and_every_link_in_it_leads_somewhere() {
-    let book = MDBook::load(project_root().join("docs")).unwrap();
-    let mathjax = book.config.html_config().is_some_and(|html| html.mathjax_support);
-    assert!(!mathjax, "MathJax comes from the network, the book is read without: write MathML");
-    book.build().unwrap();
-    let pages = built_pages(&book.build_dir_for("html"));
+fn every_link_has_a_target_and_no_page_needs_a_network() {
+    let pages = built_pages(&dmprl_book::build().unwrap());
     assert!(pages.len() > 15, "only {} pages were built", pages.len());
     let mut wrong = Vec::new();
     for page in &pages {
@@ -62,7 +30,11 @@ fn the_book_builds_reads_without_a_network_and_every_link_in_it_leads_somewhere(
     assert!(wrong.is_empty(), "links in the book:\n  {}\n", wrong.join("\n  "));
 }
 
-/// What is wrong with a link, if anything is.
+fn docs() -> PathBuf {
+    Path::new(env!("CARGO_MANIFEST_DIR")).join("../../docs")
+}
+
+/// Returns what is wrong with a link, if anything.
 fn fault(page: &Page, link: &str, pages: &[Page]) -> Option<String> {
     if link.starts_with("data:") {
         return None;
@@ -75,7 +47,7 @@ fn fault(page: &Page, link: &str, pages: &[Page]) -> Option<String> {
     let (path, anchor) = link.split_once('#').unwrap_or((link, ""));
     let folder = page.path.parent().unwrap();
     let target = if path.is_empty() { page.path.clone() } else { folder.join(path) };
-    let Ok(target) = target.canonicalize() else { return Some("there is no such file".into()) };
+    let Ok(target) = target.canonicalize() else { return Some("the file does not exist".into()) };
     if anchor.is_empty() {
         return None;
     }
@@ -86,7 +58,7 @@ fn fault(page: &Page, link: &str, pages: &[Page]) -> Option<String> {
 
 #[test]
 fn every_page_in_docs_is_in_the_table_of_contents() {
-    let docs = project_root().join("docs");
+    let docs = docs();
     let contents = fs::read_to_string(docs.join("SUMMARY.md")).unwrap();
     for folder in ["", "decisions/", "internals/"] {
         for entry in fs::read_dir(docs.join(folder)).unwrap().flatten() {

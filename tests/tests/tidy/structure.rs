@@ -1,9 +1,4 @@
 //! Which crate may use which, and which modules may use each other.
-#![allow(
-    clippy::unwrap_used,
-    reason = "helpers of tests; clippy.toml covers only the tests themselves"
-)]
-
 use std::collections::{BTreeMap, BTreeSet};
 use std::fs;
 use std::path::Path;
@@ -100,8 +95,8 @@ impl Modules {
         Self(texts.iter().map(uses).collect())
     }
 
-    /// Returns true if all modules are in one folder, to which its own file (`mod.rs`) belongs. The
-    /// folders at the crate's root are rooms of their own.
+    /// Returns true if all modules are in one folder, to which its own file (`mod.rs`) belongs.
+    /// Each folder at the crate's root counts separately.
     fn share_a_folder(&self, circle: &[String]) -> bool {
         let parent = |module: &str| module.rsplit_once('/').map(|(folder, _)| folder.to_owned());
         let is_folder = |module: &str| {
@@ -173,7 +168,7 @@ fn collect(folder: &Path, prefix: &str, texts: &mut BTreeMap<String, String>) {
     }
 }
 
-/// Every path within the crate that `text` names, as segments below the crate's root.
+/// Returns every path within the crate that `text` names, as segments below the crate's root.
 fn paths(module: &str, text: &str) -> Vec<Vec<String>> {
     let own: Vec<&str> = module.split('/').filter(|part| !part.is_empty()).collect();
     let mut found = Vec::new();
@@ -201,7 +196,7 @@ fn paths(module: &str, text: &str) -> Vec<Vec<String>> {
     found
 }
 
-/// The paths at the beginning of `text`: one, or all in its braces.
+/// Returns the paths at the beginning of `text`: one, or all within its braces.
 fn items(text: &str) -> Vec<String> {
     let word = |text: &str| -> String {
         let is_part = |letter: &char| letter.is_alphanumeric() || ['_', ':'].contains(letter);
@@ -226,7 +221,7 @@ fn items(text: &str) -> Vec<String> {
     found.iter().map(|item| format!("{head}{}", word(item))).collect()
 }
 
-/// The longest beginning of a path that is a module.
+/// Returns the longest prefix of a path that is a module.
 fn nearest(texts: &BTreeMap<String, String>, path: &[String]) -> Option<String> {
     let path: Vec<&str> = path.iter().map(String::as_str).filter(|part| !part.is_empty()).collect();
     (0..=path.len()).rev().map(|len| path[..len].join("/")).find(|path| texts.contains_key(path))
