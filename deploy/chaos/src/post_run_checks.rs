@@ -157,8 +157,11 @@ fn temporary_files(folder: &Path) -> Vec<PathBuf> {
 
 #[cfg(test)]
 mod tests {
+    use std::process::Command;
+
     use dmprl_shared::config::ExperimentConfig;
     use dmprl_shared::spec::EnvSpec;
+    use dmprl_supervisor::WholeRun;
     use serde_json::{Value, json};
 
     use super::*;
@@ -184,14 +187,16 @@ mod tests {
 
     #[test]
     fn running_processes_of_the_session_are_found() {
-        let session = rustix::process::getsid(None).unwrap();
-        let pipe = std::process::Stdio::piped;
-        let mut child = std::process::Command::new("cat").stdin(pipe()).spawn().unwrap();
-        let id = child.id().to_string();
-        assert!(of_session(session).unwrap().contains(&id));
-        drop(child.stdin.take());
-        child.wait().unwrap();
-        assert!(!of_session(session).unwrap().contains(&id));
+        let folder = tempfile::tempdir().unwrap();
+        let mut command = Command::new("sleep");
+        command.arg("1000");
+        // In its own session. The session of this test can be outside its process namespace.
+        let child = WholeRun::start(command, &folder.path().join("log")).unwrap();
+        let session = child.pid().unwrap();
+        let expected = [session.as_raw_nonzero().to_string()];
+        assert_eq!(of_session(session).unwrap(), expected);
+        drop(child);
+        assert!(of_session(session).unwrap().is_empty());
     }
 
     fn metrics(rows: &[Value]) -> Vec<String> {
