@@ -10,7 +10,7 @@ use dmprl_tests::program::{
     rows, shared_memory_of,
 };
 use rustix::process::Signal;
-use serde_json::Value;
+use serde_json::{Value, json};
 
 use crate::{ENDLESS, train};
 
@@ -32,6 +32,10 @@ fn last_metrics(run: &str) -> Value {
 fn end_without_loss(running: Running, run: &str) {
     running.signal_group(Signal::INT);
     running.wait().with_status(130).saying("checkpoint written");
+    assert_no_loss(run);
+}
+
+fn assert_no_loss(run: &str) {
     let last = last_metrics(run);
     assert_eq!(last["lost"], 0, "{last}");
     for file in ["metrics.jsonl", "evaluations.jsonl"] {
@@ -146,7 +150,8 @@ fn a_learner_killed_in_the_middle_of_a_checkpoint_goes_on_from_the_one_before() 
     let place = Workplace::new();
     let run = place.path("run");
     let often = ["--set", "checkpoint.interval_steps=200", "--steps", ENDLESS];
-    let mut running = place.start(&train("reacher", &run, &[&LOG[..], &often].concat()));
+    let more = [&LOG[..], &often, &["--events", "json"]].concat();
+    let mut running = place.start(&train("reacher", &run, &more));
     let checkpoints = Path::new(&run).join("checkpoints");
     let half_written = || {
         let names = fs::read_dir(&checkpoints).unwrap().flatten().map(|entry| entry.file_name());
@@ -163,13 +168,18 @@ fn a_learner_killed_in_the_middle_of_a_checkpoint_goes_on_from_the_one_before() 
             found
         });
         running.until("the learner's death", |running| {
-            running.said().matches("learner died (signal 9").count() == kill
+            let events = running.events();
+            events.iter().filter(|event| event["event"] == "child_died").count() == kill
         });
         running.until("a new learner", |running| {
-            running.said().matches("the learner is back").count() == kill
+            let events = running.events();
+            events.iter().filter(|event| event["after_restart"] == true).count() == kill
         });
     }
-    end_without_loss(running, &run);
+    running.signal_group(Signal::INT);
+    let end = json!({ "event": "finished", "checkpointed": true });
+    running.wait().with_status(130).with_event(&end);
+    assert_no_loss(&run);
     assert_eq!(half_written(), 0, "partial files are removed");
     assert_eq!(last_metrics(&run)["learner_restarts"], KILLS);
 }

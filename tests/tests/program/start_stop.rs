@@ -2,6 +2,7 @@
 
 use dmprl_tests::program::{Workplace, shared_memory_of};
 use rustix::process::Signal;
+use serde_json::json;
 
 use crate::{ENDLESS, train};
 
@@ -19,13 +20,14 @@ fn starts_and_stops_in_a_row_leave_no_process_and_no_byte() {
     let place = Workplace::new();
     for index in 0..count {
         let run = place.path(&index.to_string());
-        let mut running = place.start(&train("reacher", &run, &["--steps", ENDLESS]));
+        let mut running =
+            place.start(&train("reacher", &run, &["--steps", ENDLESS, "--events", "json"]));
         // Each a little later than the last, from before the first child until well into training.
         match index % 5 {
-            0 => running.until_said("training reacher"),
+            0 => running.until_event(&json!({ "event": "started" })),
             1 => running.until("a worker", |_| has_role(&place, "actor")),
             2 => running.until("a learner", |_| has_role(&place, "learner")),
-            3 => running.until_said("first environment step"),
+            3 => running.until_event(&json!({ "event": "first_step" })),
             _ => running.until_steps(&run, 1_000),
         }
         // Every other one by SIGKILL, after which the next start cleans up.
