@@ -5,6 +5,7 @@ use thiserror::Error;
 
 use crate::algorithms::NoWindow;
 use crate::demonstrations::DemonstrationError;
+use crate::finite::NotFiniteParameter;
 
 /// Why the learner stopped.
 #[derive(Debug, Error)]
@@ -21,7 +22,19 @@ pub enum LearnerError {
     /// The demonstrations do not fit the run.
     #[error(transparent)]
     Demonstrations(#[from] DemonstrationError),
-    /// A loss or parameter is NaN or infinite.
+    /// A parameter of the policy is NaN or infinite.
+    #[error(
+        "update {update}: {source}; the run has diverged. The last checkpoint is valid: lower \
+         algorithm.actor_learning_rate, algorithm.critic_learning_rate or \
+         pacing.updates_per_segment"
+    )]
+    NotFiniteParameter {
+        /// Number of the update.
+        update: u64,
+        /// The parameter.
+        source: NotFiniteParameter,
+    },
+    /// A loss is NaN or infinite.
     #[error(
         "update {update}: {name} is {value}; the run has diverged. The last checkpoint is valid: \
          lower algorithm.critic_learning_rate or pacing.updates_per_segment"

@@ -17,6 +17,7 @@ use serde::{Deserialize, Serialize};
 use crate::algorithms::SampleSource;
 use crate::algorithms::ndp::UpdateContext;
 use crate::demonstrations::Demonstration;
+use crate::finite;
 use crate::metrics::{DeliveryLine, MetricsCollector, MetricsLine, Rejected};
 use crate::normaliser::Normaliser;
 use crate::off_policy::{CloningLosses, UpdateProgress};
@@ -294,7 +295,7 @@ impl Learner {
     /// Makes a snapshot of the policy under the next version.
     ///
     /// # Errors
-    /// If a device operation fails.
+    /// If a device operation fails, or a parameter of the policy is not finite.
     pub fn next_snapshot(&mut self) -> Result<&ParameterSnapshot, LearnerError> {
         self.counters.policy_version += 1;
         self.snapshot.version = self.counters.policy_version;
@@ -303,6 +304,9 @@ impl Learner {
         if let Some(normaliser) = &self.normaliser {
             normaliser.fold(self.policy.shape(), &mut self.snapshot.values);
         }
+        let update = self.counters.updates;
+        finite::check(&self.snapshot.values, || "policy".to_owned())
+            .map_err(|source| LearnerError::NotFiniteParameter { update, source })?;
         self.regime.policy_published(self.snapshot.version);
         Ok(&self.snapshot)
     }

@@ -10,6 +10,7 @@ pub mod algorithms;
 pub mod checkpoint;
 pub mod demonstrations;
 mod error;
+pub mod finite;
 mod graph;
 pub mod learner;
 pub mod metrics;

@@ -20,6 +20,8 @@ use crate::session::{Due, DueError};
 
 /// Interval between two progress reports.
 const PROGRESS_INTERVAL: Duration = Duration::from_millis(500);
+/// Interval between checks whether a checkpoint is written, short compared to writing one.
+const CHECKPOINT_CHECK_INTERVAL: Duration = Duration::from_millis(1);
 
 /// Requests the evaluation of a saved policy.
 pub type Evaluate<'a> = &'a mut dyn FnMut(EvaluationRequest) -> Result<(), DueError>;
@@ -135,7 +137,8 @@ impl<'a> Recorder<'a> {
     /// Writes the record that is due. Calls `evaluate` for an evaluation.
     ///
     /// # Errors
-    /// Errors of `evaluate`. A full disk is only reported; training continues.
+    /// Errors of `evaluate`, and a checkpoint of networks that are not finite. A full disk is only
+    /// reported; training continues.
     pub fn due(
         &mut self,
         due: Due,
@@ -160,10 +163,7 @@ impl<'a> Recorder<'a> {
                     }
                 }
             }
-            Due::Checkpoint => {
-                self.begin_checkpoint(learner);
-                Ok(())
-            }
+            Due::Checkpoint => Ok(self.begin_checkpoint(learner)?),
             Due::Rejection(why) => {
                 self.warn(format!(
                     "a segment was rejected ({why}); further ones of this kind are only counted, \
@@ -261,14 +261,19 @@ impl<'a> Recorder<'a> {
     /// Begins a checkpoint, which is written in the background. A deterministic run waits until it
     /// is written. If the previous checkpoint is still being written, because the disk is too slow
     /// for the interval, this waits for it first.
-    fn begin_checkpoint(&mut self, learner: &mut Learner) {
+    ///
+    /// # Errors
+    /// If a network is not finite. A disk that fails is only reported; training continues.
+    fn begin_checkpoint(&mut self, learner: &mut Learner) -> Result<(), CheckpointError> {
         self.finish_checkpoint(learner);
         self.files.checkpoint_begins(&learner.counters);
-        if let Err(error) = self.checkpoints.begin(learner) {
-            self.report_checkpoint(learner.counters.env_steps, Err(error));
-        } else if learner.config().run.deterministic {
-            self.finish_checkpoint(learner);
+        match self.checkpoints.begin(learner) {
+            Ok(()) if learner.config().run.deterministic => self.finish_checkpoint(learner),
+            Ok(()) => {}
+            Err(error @ CheckpointError::NotFinite { .. }) => return Err(error),
+            Err(error) => self.report_checkpoint(learner.counters.env_steps, Err(error)),
         }
+        Ok(())
     }
 
     /// Reports the checkpoint that was being written, once it is complete or has failed.
@@ -278,16 +283,26 @@ impl<'a> Recorder<'a> {
         }
     }
 
+    /// Waits for the checkpoint that is being written. Progress is reported meanwhile, because a
+    /// learner that is silent counts as hung.
     fn finish_checkpoint(&mut self, learner: &mut Learner) {
+        while self.checkpoints.is_writing() {
+            self.progress(learner);
+            std::thread::sleep(CHECKPOINT_CHECK_INTERVAL);
+        }
         if let Some(WriteOutcome { env_steps, result }) = self.checkpoints.wait(learner) {
             self.report_checkpoint(env_steps, result);
         }
     }
 
     /// Writes the session's last checkpoint and waits for it.
-    pub fn write_checkpoint(&mut self, learner: &mut Learner) {
-        self.begin_checkpoint(learner);
+    ///
+    /// # Errors
+    /// If a network is not finite. A disk that fails is only reported.
+    pub fn write_checkpoint(&mut self, learner: &mut Learner) -> Result<(), CheckpointError> {
+        self.begin_checkpoint(learner)?;
         self.finish_checkpoint(learner);
+        Ok(())
     }
 
     /// Reports a checkpoint. After a failure the previous checkpoint stays, and training continues.

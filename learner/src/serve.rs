@@ -199,8 +199,9 @@ pub fn close<R: SegmentReceiver, P: ParameterPublisher>(
     if recorder.is_unmeasured(&session.learner) {
         recorder.due(Due::Metrics, &mut session.learner, evaluate)?;
     }
-    recorder.write_checkpoint(&mut session.learner);
+    let written = recorder.write_checkpoint(&mut session.learner);
     evaluation?;
+    written.map_err(|error| DueError::from(error))?;
     if supervisor.is_gone() {
         return Err(ServeError::SupervisorGone);
     }

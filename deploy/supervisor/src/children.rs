@@ -162,15 +162,18 @@ impl Children {
         self.each_running().for_each(|running| running.heard = now);
     }
 
-    /// Returns the process whose silence will first exceed `limit`, and when. Only workers, gateway
-    /// and relay send heartbeats, once they are ready.
-    pub(super) fn first_silent(&self, limit: Duration) -> Option<(Instant, Process)> {
-        let watched = self.all_running().filter(|(process, running)| {
-            let beats = !matches!(process, Process::Learner | Process::Evaluator);
-            beats && running.ready && running.killed_for.is_none()
-        });
+    /// Returns the process whose silence will first exceed its limit, and when. `limit` returns
+    /// `None` for a process that may be silent. Only ready processes report regularly.
+    pub(super) fn first_silent(
+        &self,
+        limit: impl Fn(Process) -> Option<Duration>,
+    ) -> Option<(Instant, Process)> {
+        let watched =
+            self.all_running().filter(|(_, running)| running.ready && running.killed_for.is_none());
         watched
-            .filter_map(|(process, running)| Some((running.heard.checked_add(limit)?, process)))
+            .filter_map(|(process, running)| {
+                Some((running.heard.checked_add(limit(process)?)?, process))
+            })
             .min()
     }
 }

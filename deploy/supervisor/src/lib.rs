@@ -42,6 +42,7 @@ mod restart_policy;
 mod session;
 mod shutdown;
 mod signals;
+mod silence;
 #[cfg(test)]
 mod simulation;
 mod state;

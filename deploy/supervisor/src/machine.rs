@@ -11,7 +11,7 @@ use std::path::PathBuf;
 use std::time::{Duration, Instant};
 
 use anyhow::anyhow;
-use dmprl_control::{Activity, Command, EvaluationRow, WorkersNow};
+use dmprl_control::{Command, EvaluationRow, WorkersNow};
 use dmprl_run::format::shown;
 use dmprl_shared::spec::EnvSpec;
 
@@ -420,31 +420,6 @@ impl Machine {
         self.warn(Process::Evaluator, message);
         let death = Death::too_slow("an evaluation took too long".to_owned());
         self.kill(Process::Evaluator, death);
-    }
-
-    fn heartbeat_timeout(&self) -> Option<Duration> {
-        // A limit beyond the range of a clock means no limit.
-        Duration::try_from_secs_f64(self.settings.config.supervision.heartbeat_timeout_s).ok()
-    }
-
-    fn first_silent(&self) -> Option<(Instant, Process)> {
-        let limit = self.heartbeat_timeout().filter(|_| self.phase == Phase::Training)?;
-        self.children.first_silent(limit)
-    }
-
-    /// Kills processes whose heartbeats are missing. A process sends one every second, even while
-    /// it waits for the learner or its environment is slow (`heartbeat.rs` in `dmprl-control`).
-    fn check_heartbeats(&mut self) {
-        while let Some((_, process)) = self.first_silent().filter(|(at, _)| self.now >= *at) {
-            let Some(running) = self.children.running(process) else { return };
-            let cause = format!(
-                "no heartbeat for {:.1} s, supervision.heartbeat_timeout_s = {}; last activity: {}",
-                self.now.duration_since(running.heard).as_secs_f64(),
-                self.settings.config.supervision.heartbeat_timeout_s,
-                running.activity.map_or("ready", Activity::name)
-            );
-            self.kill(process, Death::hung(cause));
-        }
     }
 }
 

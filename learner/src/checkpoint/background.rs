@@ -42,10 +42,16 @@ impl Writer {
         self.in_progress.is_some()
     }
 
+    /// Returns whether the thread that writes a checkpoint is running.
+    #[must_use]
+    pub fn is_writing(&self) -> bool {
+        self.in_progress.as_ref().is_some_and(|it| !it.thread.is_finished())
+    }
+
     /// Captures the learner's state and begins to write it.
     ///
     /// # Errors
-    /// If the networks cannot be copied from the device, or no thread can be started.
+    /// If a network is not finite or cannot be copied from the device, or no thread can be started.
     ///
     /// # Panics
     /// If a checkpoint is being written.

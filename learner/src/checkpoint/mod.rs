@@ -25,6 +25,7 @@ use rand_xoshiro::Xoshiro256PlusPlus;
 use serde::{Deserialize, Serialize};
 use thiserror::Error;
 
+use crate::finite::NotFiniteParameter;
 use crate::learner::{Counters, Learner};
 use crate::normaliser::Normaliser;
 use crate::replay::{Replay, ReplayFileError, Sampler};
@@ -61,6 +62,14 @@ pub enum CheckpointError {
     Device {
         /// The reason.
         cause: candle_core::Error,
+    },
+    /// A network that would be written is not finite.
+    #[error("after update {updates}: {source}; the run has diverged, and no checkpoint is written")]
+    NotFinite {
+        /// Updates so far.
+        updates: u64,
+        /// The value.
+        source: NotFiniteParameter,
     },
     /// The length or checksum of a file differs from `state.json`.
     #[error("{path}: {name} is {got}, expected {expected}")]
@@ -162,10 +171,13 @@ impl CheckpointContents {
     /// Captures the learner's current state.
     ///
     /// # Errors
-    /// If the networks cannot be copied from the device.
+    /// If a network is not finite, or the networks cannot be copied from the device.
     pub fn capture(learner: &mut Learner) -> Result<Self, CheckpointError> {
         let fetched = learner.regime.fetch();
         fetched.map_err(|cause| CheckpointError::Device { cause })?;
+        let updates = learner.counters.updates;
+        networks_file::check_finite(learner)
+            .map_err(|source| CheckpointError::NotFinite { updates, source })?;
         let networks = networks_file::bytes(learner)
             .map_err(|cause| CheckpointError::Format { path: NETWORKS.into(), cause })?;
         let steps = learner.networks().into_iter();

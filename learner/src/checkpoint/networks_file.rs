@@ -4,6 +4,7 @@ use std::borrow::Cow;
 
 use safetensors::tensor::{Dtype, SafeTensors, View};
 
+use crate::finite::{self, NotFiniteParameter};
 use crate::learner::Learner;
 use crate::parameters::Parameters;
 
@@ -29,6 +30,27 @@ impl View for Flat {
     fn data_len(&self) -> usize {
         self.values.len() * size_of::<f32>()
     }
+}
+
+/// Checks the networks, their targets and the moments of their optimisers.
+///
+/// # Errors
+/// The first value that is NaN or infinite.
+pub(super) fn check_finite(learner: &Learner) -> Result<(), NotFiniteParameter> {
+    for (name, network) in learner.networks() {
+        let moments = &network.adam.moments;
+        let target = network.target.as_ref().map(Parameters::values);
+        let parts = [
+            Some(network.parameters.values()),
+            target,
+            Some(&moments.first),
+            Some(&moments.second),
+        ];
+        for (part, values) in PARTS.iter().zip(parts) {
+            finite::check(values.unwrap_or_default(), || format!("{name}.{part}"))?;
+        }
+    }
+    Ok(())
 }
 
 /// Returns the file's contents.
@@ -63,7 +85,9 @@ pub(super) fn restore(bytes: &[u8], learner: &mut Learner) -> Result<(), String>
         }
         // The bytes may not be aligned for f32.
         let chunks = tensor.data().as_chunks::<4>().0;
-        Ok(chunks.iter().map(|bytes| f32::from_le_bytes(*bytes)).collect())
+        let values: Vec<f32> = chunks.iter().map(|bytes| f32::from_le_bytes(*bytes)).collect();
+        finite::check(&values, || name).map_err(|error| error.to_string())?;
+        Ok(values)
     };
     learner.for_each_network(|name, network| {
         let len = network.adam.moments.first.len();

@@ -349,6 +349,61 @@ fn a_damaged_checkpoint_is_refused_with_the_reason_and_the_one_before_is_used() 
 }
 
 #[test]
+fn networks_that_are_not_finite_are_not_written_and_the_error_names_the_parameter() {
+    let folder = tempfile::tempdir().unwrap();
+    let mut learner = fresh().unwrap();
+    train(&mut learner, 0..40);
+    let name = save(folder.path(), &mut learner).unwrap();
+    learner
+        .for_each_network(|name, network| {
+            if name == "critic" {
+                network.adam.moments.second[3] = f32::INFINITY;
+            }
+            Ok::<(), LearnerError>(())
+        })
+        .unwrap();
+    let error = save(folder.path(), &mut learner).unwrap_err();
+    assert!(matches!(error, CheckpointError::NotFinite { .. }));
+    let message = error.to_string();
+    assert!(message.contains("critic.adam_second[3] is inf"), "{message}");
+    assert_eq!(names(folder.path()).unwrap(), [name]);
+}
+
+#[test]
+fn policy_that_is_not_finite_is_not_published() {
+    let mut learner = fresh().unwrap();
+    learner
+        .for_each_network(|name, network| {
+            if name == "actor" {
+                network.parameters.values_mut()[7] = f32::NAN;
+            }
+            Ok::<(), LearnerError>(())
+        })
+        .unwrap();
+    let message = learner.next_snapshot().unwrap_err().to_string();
+    assert!(message.contains("policy[7] is NaN"), "{message}");
+}
+
+#[test]
+fn checkpoint_that_is_not_finite_is_rejected_and_the_one_before_is_used() {
+    let folder = tempfile::tempdir().unwrap();
+    let mut learner = fresh().unwrap();
+    train(&mut learner, 0..40);
+    let finite = save(folder.path(), &mut learner).unwrap();
+    train(&mut learner, 40..60);
+    // As an older version could have written it, with valid checksums.
+    let mut contents = CheckpointContents::capture(&mut learner).unwrap();
+    let end = contents.networks.len();
+    contents.networks[end - 4..].copy_from_slice(&f32::NAN.to_le_bytes());
+    contents.write(folder.path()).unwrap();
+    let (loaded_learner, loaded) = load_newest(folder.path(), &fresh).unwrap();
+    assert_eq!(loaded.name, finite);
+    assert!(loaded_learner.counters.updates < learner.counters.updates);
+    let reason = loaded.rejected[0].to_string();
+    assert!(reason.contains("is NaN, expected a finite number"), "{reason}");
+}
+
+#[test]
 fn a_half_written_checkpoint_is_never_taken_and_is_swept_away() {
     let folder = tempfile::tempdir().unwrap();
     let folder = folder.path();

@@ -331,11 +331,15 @@ pub struct SupervisionConfig {
     pub learner_restarts_max: u32,
     /// Time without a heartbeat after which a worker is killed and restarted \[s\].
     pub heartbeat_timeout_s: f64,
+    /// Time without a report of progress after which the learner is killed and replaced from its
+    /// last checkpoint \[s\]. The learner reports twice a second, also while it waits for workers
+    /// or for a slow disk.
+    pub learner_timeout_s: f64,
 }
 
 impl Default for SupervisionConfig {
     fn default() -> Self {
-        Self { learner_restarts_max: 5, heartbeat_timeout_s: 30.0 }
+        Self { learner_restarts_max: 5, heartbeat_timeout_s: 30.0, learner_timeout_s: 120.0 }
     }
 }
 

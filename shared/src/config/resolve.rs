@@ -181,11 +181,15 @@ impl ExperimentConfig {
         for (key, got, max) in bounded {
             range(key, got, got > 0.0 && got <= max, || format!("above 0, at most {max}"))?;
         }
-        let (key, got) = ("supervision.heartbeat_timeout_s", self.supervision.heartbeat_timeout_s);
-        let limits = HEARTBEAT_S_MIN..=SECONDS_MAX;
-        range(key, got, limits.contains(&got), || {
-            format!("{HEARTBEAT_S_MIN} to {SECONDS_MAX}; workers send a heartbeat every second")
-        })?;
+        let timeouts = [
+            ("supervision.heartbeat_timeout_s", self.supervision.heartbeat_timeout_s),
+            ("supervision.learner_timeout_s", self.supervision.learner_timeout_s),
+        ];
+        for (key, got) in timeouts {
+            range(key, got, (HEARTBEAT_S_MIN..=SECONDS_MAX).contains(&got), || {
+                format!("{HEARTBEAT_S_MIN} to {SECONDS_MAX}; a process reports every second")
+            })?;
+        }
         let goals = [
             ("run.until_return", self.run.until_return),
             ("run.until_success", self.run.until_success),
@@ -429,6 +433,7 @@ mod tests {
             ("actors.send_deadline_s", "1e300"),
             ("run.until_return", "nan"),
             ("supervision.heartbeat_timeout_s", "2.9"),
+            ("supervision.learner_timeout_s", "2.9"),
             ("policy.hidden", "[]"),
             ("algorithm.critic", "first"),
             ("algorithm.target", "literal"),

@@ -172,6 +172,24 @@ fn a_worker_that_somebody_stopped_is_said_to_hang_and_replaced() {
     place.assert_no_process();
 }
 
+#[test]
+fn learner_that_hangs_is_killed_and_replaced_from_its_checkpoint() {
+    let place = Workplace::new();
+    let run = place.path("run");
+    let mut running = training(&place, &run, &["--set", "supervision.learner_timeout_s=5"]);
+    let workers = ids(&place, "actor");
+    signal_role(&place, "learner", Signal::STOP);
+    running.until_event(&death("learner", "hung"));
+    running.until_event(&json!({ "event": "first_step", "after_restart": true }));
+    let steps = env_steps_of(&run).unwrap();
+    running.until_steps(&run, steps + 1_500);
+    assert_eq!(ids(&place, "actor"), workers, "{}", running.said());
+    running.signal_group(Signal::INT);
+    running.wait().with_status(130);
+    assert_eq!(rows(&run, "metrics.jsonl").pop().unwrap()["learner_restarts"], 1);
+    place.assert_no_process();
+}
+
 /// Ctrl-Z or a paused container stops all processes; none is blamed for the silence.
 #[test]
 fn a_run_that_stands_still_as_a_whole_blames_nobody() {

@@ -10,6 +10,7 @@
 //! 4. The totals, and the newest ones sent to the learner, equal what children reported.
 //! 5. The machine and the world have the same children, apart from exits that have not arrived.
 //! 6. Time advances: no deadline remains due after its step.
+//! 7. While the run trains, no ready learner, worker, gateway or relay is silent beyond its limit.
 //!
 //! After a while all faults stop. Then the session must end within a bounded number of steps; after
 //! a stop, within its time limits. A failed test prints its seed. To run only this seed, set

@@ -7,7 +7,7 @@ use std::collections::BTreeMap;
 pub struct Tally(BTreeMap<&'static str, u64>);
 
 /// Names of events that must occur in some session.
-const EXPECTED: [&str; 26] = [
+const EXPECTED: [&str; 27] = [
     "abandoned",
     "answers",
     "completed",
@@ -25,6 +25,7 @@ const EXPECTED: [&str; 26] = [
     "failed",
     "failures while stopping",
     "hangs",
+    "hangs of learners",
     "hosts without a learner",
     "interrupted",
     "joined",

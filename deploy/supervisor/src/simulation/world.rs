@@ -170,6 +170,10 @@ impl World {
         self.now = deadline;
         let all_heard = !self.chance(10);
         self.step(Event::Tick { all_heard });
+        if all_heard {
+            let silent = self.machine.first_silent().filter(|(at, _)| *at <= self.now);
+            assert!(silent.is_none(), "{silent:?} is silent for too long: {:#?}", self.machine);
+        }
         if all_heard && !self.machine.is_over() {
             let next = self.machine.next_deadline(self.now);
             assert!(next > self.now, "a deadline remains due: {:#?}", self.machine);
@@ -383,7 +387,10 @@ impl World {
                     self.tally.count("workers given up");
                 }
                 if death.verb == "hung" {
-                    self.tally.count("hangs");
+                    self.tally.count(match process {
+                        Process::Learner => "hangs of learners",
+                        _ => "hangs",
+                    });
                 }
                 self.tally.count(match process {
                     Process::Learner | Process::Relay => "deaths of learners",
