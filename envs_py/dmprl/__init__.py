@@ -26,6 +26,7 @@ The rollout worker (Rust, ``actors/src/python_env``) embeds Python and calls
 
 from typing import TYPE_CHECKING, Any
 
+from dmprl.hold import Hold, NoHoldError
 from dmprl.policy import Policy
 from dmprl.policy_file import PolicyFileError
 from dmprl.program import ProgramError
@@ -35,7 +36,17 @@ from dmprl.training import TrainingError, train
 if TYPE_CHECKING:
     import gymnasium
 
-__all__ = ["Policy", "PolicyFileError", "ProgramError", "Run", "TrainingError", "make", "train"]
+__all__ = [
+    "Hold",
+    "NoHoldError",
+    "Policy",
+    "PolicyFileError",
+    "ProgramError",
+    "Run",
+    "TrainingError",
+    "make",
+    "train",
+]
 __version__ = "0.1.0"
 
 SHORT_NAMES = {

@@ -18,6 +18,7 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
+from dmprl import python_path
 from dmprl.bench_peers import AbsentError, EnvPoolLoop, GymnasiumLoop, PandaGymLoop
 from dmprl.bench_physics import Ceiling, Physics
 
@@ -61,7 +62,7 @@ def main() -> None:
     lines = os.fdopen(os.dup(1), "w", buffering=1)
     os.dup2(2, 1)
     plan = json.loads(arguments.plan.read_text())
-    sys.path.extend(plan["task"]["python_path"])
+    python_path.extend(plan["task"]["python_path"])
     try:
         peer = KINDS[arguments.kind](plan, plan["seed"] + plan["env_count"] * arguments.index)
     except AbsentError as error:

@@ -8,6 +8,7 @@ own window instead.
 from __future__ import annotations
 
 import argparse
+import html
 import io
 import itertools
 import signal
@@ -21,6 +22,7 @@ from typing import Any
 import gymnasium
 import numpy as np
 
+from dmprl import python_path
 from dmprl.gymnasium_env import GymnasiumSegmentEnv, success_of
 from dmprl.mujoco_batch import MujocoTask
 from dmprl.pictures import name_opengl
@@ -91,7 +93,7 @@ class Handler(BaseHTTPRequestHandler):
         if host not in LOCAL_NAMES:
             self.send_error(403, "this page is available only on this machine")
         elif self.path == "/":
-            page = PAGE.format(title=self.server.show.title).encode()
+            page = PAGE.format(title=html.escape(self.server.show.title)).encode()
             self.send_response(200)
             self.send_header("Content-Type", "text/html; charset=utf-8")
             self.send_header("Content-Length", str(len(page)))
@@ -223,7 +225,7 @@ def main() -> int:
     parser.add_argument("--python-path", action="append", default=[])
     arguments = parser.parse_args()
     signal.signal(signal.SIGTERM, signal.getsignal(signal.SIGINT))
-    sys.path[:0] = arguments.python_path
+    python_path.extend(arguments.python_path)
     policy = Policy.load(arguments.policy)
     seeds = itertools.count(arguments.seed)
     if arguments.episodes > 0:

@@ -12,18 +12,23 @@ O observation, A action.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import time
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from dmprl.hold import Hold, NoHoldError
 from dmprl.numpy_policy import NumpyPolicy
 from dmprl.policy_description import check
 from dmprl.policy_file import PolicyFile, PolicyFileError, read
 
 Actions = NDArray[np.float64]
+
+HOLD_STEPS_MAX = 10_000
+"""Maximum number of control steps from any action to the hold. A lower rate is rejected."""
 
 
 class Policy:
@@ -43,8 +48,12 @@ class Policy:
         self.segment_steps: int = self._network.segment_steps
         """Control steps per decision, K."""
         self._rate: Actions = np.full(self.low.shape, np.inf)
-        self._hold: Actions = np.clip(0.0, self.low, self.high)
+        self._stated_hold: Actions | None = None
+        if file.hold is not None:
+            self._stated_hold = file.hold.action(self.low, self.high)
         self._hold_after = self.segment_steps
+        self._deadline_s = np.inf
+        self._clock: Callable[[], float] = time.monotonic
         self._decided: Actions = np.zeros((self.segment_steps, self.low.size))
         self.reset()
 
@@ -79,45 +88,68 @@ class Policy:
 
     @property
     def is_holding(self) -> bool:
-        """Whether the last action was the hold, for lack of observations or by request."""
+        """Whether the last action was the hold or on the way to it.
+
+        On request, because observations stopped, or because the caller was frozen.
+        """
         return self._holding
 
     def limit(
         self,
         *,
         rate: ArrayLike | None = None,
-        hold: ArrayLike | None = None,
+        hold: Hold | None = None,
         hold_after: int | None = None,
+        deadline_s: float | None = None,
+        clock: Callable[[], float] = time.monotonic,
     ) -> None:
-        """Sets limits; omitted ones do not change.
+        """Sets limits; omitted ones do not change. All need a hold, from here or from the file.
 
         :param rate: maximum change of an action between control steps, (A,) or one number for all,
             in the environment's units; initially infinite.
-        :param hold: action that holds the robot, (A,) within the bounds; initially 0 (no torque, no
-            displacement) or the nearest bound.
+        :param hold: command that holds the robot; initially the one stated at ``dmprl export``.
         :param hold_after: control steps without an observation after which the robot holds;
             initially K. More than K has no effect, because the next segment needs an observation.
+        :param deadline_s: longest time between two calls of :meth:`action` [s]; initially infinite.
+            After a longer one, the caller was frozen and the robot has executed an old action, so
+            the policy holds: its next decision is by the observation of the next call.
+        :param clock: returns the time for ``deadline_s`` [s].
+        :raises dmprl.NoHoldError: if no hold is stated; nothing changes then.
         :raises ValueError: if a limit is invalid; nothing changes then.
         """
-        rates, held, after = self._rate, self._hold, self._hold_after
+        rates, held, after = self._rate, self._stated_hold, self._hold_after
+        if hold is not None:
+            if not isinstance(hold, Hold):
+                raise ValueError(
+                    f"hold is {hold!r}: expected dmprl.Hold.zero_velocity(), "
+                    "dmprl.Hold.zero_torque() or dmprl.Hold.position(values)"
+                )
+            held = hold.action(self.low, self.high)
+        if held is None:
+            raise NoHoldError
         if rate is not None:
             rates = _broadcast("rate", rate, self.low.shape)
-            if not (rates > 0.0).all():
-                raise ValueError(f"rate is {rates}: expected positive numbers")
-        if hold is not None:
-            held = _broadcast("hold", hold, self.low.shape)
-            if not ((held >= self.low) & (held <= self.high)).all():
-                raise ValueError(f"hold is {held}: expected {self.low} to {self.high}")
+            smallest = (self.high - self.low) / (HOLD_STEPS_MAX - 1)  # the last is for rounding
+            if not (rates >= smallest).all():
+                raise ValueError(
+                    f"rate is {rates}: expected {smallest} or more, to reach the hold in "
+                    f"{HOLD_STEPS_MAX} control steps"
+                )
         if hold_after is not None:
             if hold_after < 0:
                 raise ValueError(f"hold_after is {hold_after}: expected 0 or more")
             after = int(hold_after)
-        self._rate, self._hold, self._hold_after = rates, held, after
+        if deadline_s is not None:
+            if not deadline_s > 0.0:
+                raise ValueError(f"deadline_s is {deadline_s}: expected a positive number")
+            self._deadline_s, self._clock, self._called_at_s = float(deadline_s), clock, None
+        self._rate, self._stated_hold, self._hold_after = rates, held, after
 
     def reset(self, y0: Sequence[float] | NDArray | None = None) -> None:
         """Starts an episode. The next action starts a segment.
 
-        A limited rate starts from the hold, as if the robot had executed the hold before.
+        A limited rate starts from the hold, as if the robot had executed the hold before. State the
+        robot's present position before, if it is held by one.
 
         :param y0: start of the DMP, (A,) in units of y, for a policy that carries its state across
             segments (``policy.start = "carry"``). The default is 0, as in training.
@@ -134,6 +166,7 @@ class Policy:
             self._network.carried[0, : self.low.size] = y0
         self._step = self.segment_steps
         self._previous: Actions | None = None
+        self._called_at_s: float | None = None
         self._missed = 0
         self._holding = False
 
@@ -147,6 +180,7 @@ class Policy:
             only available action is then :meth:`hold`; the policy continues at the next valid
             observation.
         """
+        self._called_at_s = None  # the caller returns after K steps
         self._decide(self._checked(observation))
         self._missed, self._holding = 0, False
         return np.stack([self._next_action() for _ in range(self.segment_steps)])
@@ -158,21 +192,29 @@ class Policy:
         executes that decision, and observations only reset the watchdog.
 
         :param observation: (O,); None if there is no new one since the last call. After
-            ``hold_after`` calls without one, or if a decision is due without one, the action is the
-            hold; the next observation then starts a new segment.
+            ``hold_after`` calls without one, if a decision is due without one, or after the
+            deadline, the action is the hold; the next observation then starts a new segment.
         :raises ValueError: as :meth:`segment`, at every step.
+        :raises dmprl.NoHoldError: if there is no observation and no hold is stated.
         """
+        if self._is_late():
+            # The observation may be from before the freeze.
+            self._holding = True
+            if observation is not None:
+                self._checked(observation)
+            return self._limited(self._known_hold())
         if observation is not None:
             seen = self._checked(observation)
             if self._step == self.segment_steps or self._holding:
                 self._decide(seen)
             self._missed, self._holding = 0, False
         else:
+            self._known_hold()
             self._missed += 1
             due = self._step == self.segment_steps
             self._holding = self._holding or due or self._missed > self._hold_after
         if self._holding:
-            return self._limited(self._hold)
+            return self._limited(self._known_hold())
         return self._next_action()
 
     def hold(self) -> Actions:
@@ -180,9 +222,43 @@ class Policy:
 
         Use it after an error, and whenever the policy must not act. The next observation starts a
         new segment.
+
+        :raises dmprl.NoHoldError: if no hold is stated.
         """
+        self._is_late()  # records the call
         self._holding = True
-        return self._limited(self._hold)
+        return self._limited(self._known_hold())
+
+    def hold_until_reached(self, send: Callable[[Actions], object]) -> int:
+        """Sends actions towards the hold until the last one is the hold; returns their number.
+
+        There is one per control step, no faster than the rate limit allows. Call it at the end of
+        every drive, also after an error or a signal.
+
+        :param send: sends the action to the robot and waits for the end of the control step. If it
+            raises an exception, the robot did not get the hold.
+        :raises dmprl.NoHoldError: if no hold is stated.
+        """
+        for sent in range(1, HOLD_STEPS_MAX + 1):
+            action = self.hold()
+            reached = bool((action == self._known_hold()).all())
+            send(action)
+            if reached:
+                return sent
+        raise RuntimeError(f"the hold was not reached in {HOLD_STEPS_MAX} control steps")
+
+    def _known_hold(self) -> Actions:
+        if self._stated_hold is None:
+            raise NoHoldError
+        return self._stated_hold
+
+    def _is_late(self) -> bool:
+        """Records a call. Returns whether it comes too late after the previous one."""
+        if self._deadline_s == np.inf:
+            return False
+        before_s, self._called_at_s = self._called_at_s, self._clock()
+        # A clock that goes backwards or returns NaN measures nothing, so the call counts as late.
+        return before_s is not None and not 0.0 <= self._called_at_s - before_s <= self._deadline_s
 
     def _next_action(self) -> Actions:
         """Returns the segment's next action, limited."""
@@ -192,8 +268,9 @@ class Policy:
         return action
 
     def _limited(self, wanted: Actions) -> Actions:
-        # The first action starts from the hold.
-        previous = self._hold if self._previous is None else self._previous
+        # The first action starts from the hold. Without one, the rate is not limited either.
+        first = wanted if self._stated_hold is None else self._stated_hold
+        previous = first if self._previous is None else self._previous
         near = np.clip(wanted, previous - self._rate, previous + self._rate)
         self._previous = np.clip(near, self.low, self.high)
         return self._previous.copy()

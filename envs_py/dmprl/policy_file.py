@@ -16,7 +16,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from dmprl.hold import Hold
+
 FORMAT = "dmprl-policy-1"
+FORMAT_WITH_HOLD = "dmprl-policy-2"
+"""Format of a file with a hold. Earlier programs would hold the robot with another action."""
 HEADER_BYTES_MAX = 100_000_000
 """Limit of the safetensors library. A file with a longer header is damaged."""
 
@@ -40,6 +44,8 @@ class PolicyFile:
     """Weights, (outputs, inputs), and bias of each layer."""
     segment_map: NDArray[np.float32] | None
     """Map from (y0, yd0, g, w) to the samples of one dimension, (3K, 3+N); None without a DMP."""
+    hold: Hold | None
+    """The command that holds the robot, if the export stated it."""
 
 
 def read(path: Path) -> PolicyFile:
@@ -49,8 +55,9 @@ def read(path: Path) -> PolicyFile:
     :raises PolicyFileError: if it is not a policy file, or is damaged; the message names the field.
     """
     fields, tensors = _contents(path)
-    if (found := fields.get("format")) != FORMAT:
-        raise PolicyFileError(f"{path}: format is {found or 'missing'}, expected {FORMAT}")
+    expected = FORMAT_WITH_HOLD if "hold" in fields else FORMAT
+    if (found := fields.get("format")) != expected:
+        raise PolicyFileError(f"{path}: format is {found or 'missing'}, expected {expected}")
     if "description" not in fields:
         raise PolicyFileError(
             f"{path}: has no description, because an older dmprl wrote it; write it again with "
@@ -70,7 +77,7 @@ def read(path: Path) -> PolicyFile:
         raise PolicyFileError(f"{path}: no tensor actor.0.weight")
     if not all(np.isfinite(tensor).all() for tensor in tensors.values()):
         raise PolicyFileError(f"{path}: a parameter is not finite")
-    found, expected = fields.get("checksum"), checksum(fields["description"], tensors)
+    found, expected = fields.get("checksum"), checksum(fields, tensors)
     if found != expected:
         raise PolicyFileError(f"{path}: checksum is {found or 'missing'}, expected {expected}")
     try:
@@ -82,14 +89,15 @@ def read(path: Path) -> PolicyFile:
             env_steps=int(fields["env_steps"]),
             layers=layers,
             segment_map=tensors.get("segment_map"),
+            hold=Hold.of_file(json.loads(fields["hold"])) if "hold" in fields else None,
         )
     except (KeyError, TypeError, ValueError, RecursionError) as error:
         raise PolicyFileError(f"{path}: damaged: {error!r}") from error
 
 
-def checksum(description: str, tensors: dict[str, NDArray[np.float32]]) -> str:
-    """Computes the CRC-32 of the description and the tensors' bytes, in name order."""
-    crc = zlib.crc32(description.encode())
+def checksum(fields: dict[str, str], tensors: dict[str, NDArray[np.float32]]) -> str:
+    """Computes the CRC-32 of the description, the hold, and the tensors' bytes in name order."""
+    crc = zlib.crc32((fields["description"] + fields.get("hold", "")).encode())
     for name in sorted(tensors):
         crc = zlib.crc32(tensors[name].astype("<f4").tobytes(), crc)
     return f"{crc:08x}"

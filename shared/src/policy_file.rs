@@ -14,10 +14,13 @@ use serde::{Deserialize, Serialize};
 use thiserror::Error;
 
 use crate::parameters::ParameterSnapshot;
-use crate::policy::{Head, Policy, PolicyDescription};
+use crate::policy::{Head, Hold, Policy, PolicyDescription};
 
-/// Version of this format.
+/// Version of the format of a file without a hold.
 const FORMAT: &str = "dmprl-policy-1";
+/// Version of the format of a file with a hold. Earlier programs reject it, because they would hold
+/// the robot with another action.
+const FORMAT_WITH_HOLD: &str = "dmprl-policy-2";
 const FORMAT_KEY: &str = "format";
 const HASH_KEY: &str = "architecture_hash";
 const VERSION_KEY: &str = "policy_version";
@@ -25,6 +28,7 @@ const STEPS_KEY: &str = "env_steps";
 const DESCRIPTION_KEY: &str = "description";
 const CHECKSUM_KEY: &str = "checksum";
 const ORIGIN_KEY: &str = "origin";
+const HOLD_KEY: &str = "hold";
 /// Map from (y0, yd0, g, w) to the samples of one dimension, (3K, 3+N).
 const MAP: &str = "segment_map";
 
@@ -89,6 +93,8 @@ pub struct OpenedPolicy {
     pub snapshot: ParameterSnapshot,
     /// Its origin; `None` in a run's own files.
     pub origin: Option<Origin>,
+    /// The command that holds the robot, if the export stated it.
+    pub hold: Option<Hold>,
 }
 
 /// How well a file must match the policy that it is loaded into.
@@ -103,6 +109,7 @@ pub enum Match {
 /// Encodes a policy file.
 ///
 /// - `origin`: origin of the policy, for files that leave their run's directory.
+/// - `hold`: the command that holds the robot, for files that drive one.
 ///
 /// # Errors
 /// `Format` if the parameters do not fit the policy.
@@ -110,6 +117,7 @@ pub fn encode(
     policy: &Policy,
     snapshot: &ParameterSnapshot,
     origin: Option<&Origin>,
+    hold: Option<&Hold>,
 ) -> Result<Vec<u8>, PolicyFileError> {
     let path = Path::new("policy file");
     let view = |shape, numbers| {
@@ -127,24 +135,31 @@ pub fn encode(
     }
     let json = |value: serde_json::Result<String>| value.map_err(|e| format_error(path, e));
     let description = json(serde_json::to_string(policy.description()))?;
+    let hold = hold.map(|hold| json(serde_json::to_string(hold))).transpose()?;
+    let format = if hold.is_some() { FORMAT_WITH_HOLD } else { FORMAT };
     let mut metadata = HashMap::from([
-        (FORMAT_KEY.to_owned(), FORMAT.to_owned()),
+        (FORMAT_KEY.to_owned(), format.to_owned()),
         (HASH_KEY.to_owned(), format!("{:016x}", snapshot.architecture_hash)),
         (VERSION_KEY.to_owned(), snapshot.version.to_string()),
         (STEPS_KEY.to_owned(), snapshot.env_steps.to_string()),
-        (CHECKSUM_KEY.to_owned(), checksum(&description, &tensors)),
+        (CHECKSUM_KEY.to_owned(), checksum(&description, hold.as_deref(), &tensors)),
         (DESCRIPTION_KEY.to_owned(), description),
     ]);
+    if let Some(hold) = hold {
+        metadata.insert(HOLD_KEY.to_owned(), hold);
+    }
     if let Some(origin) = origin {
         metadata.insert(ORIGIN_KEY.to_owned(), json(serde_json::to_string(origin))?);
     }
     safetensors::serialize(tensors, Some(metadata)).map_err(|e| format_error(path, e))
 }
 
-/// Returns the CRC-32 of the description and of the tensors' bytes, in the order of their names.
-fn checksum(description: &str, tensors: &[(String, TensorView<'_>)]) -> String {
+/// Returns the CRC-32 of the description, of the hold, and of the tensors' bytes in the order of
+/// their names.
+fn checksum(description: &str, hold: Option<&str>, tensors: &[(String, TensorView<'_>)]) -> String {
     let mut hasher = crc32fast::Hasher::new();
     hasher.update(description.as_bytes());
+    hasher.update(hold.unwrap_or_default().as_bytes());
     let mut sorted: Vec<_> = tensors.iter().collect();
     sorted.sort_by(|(a, _), (b, _)| a.cmp(b));
     sorted.iter().for_each(|(_, tensor)| hasher.update(tensor.data()));
@@ -185,8 +200,14 @@ pub fn open(path: &Path) -> Result<OpenedPolicy, PolicyFileError> {
     let origin = contents.fields.get(ORIGIN_KEY).map(|text| serde_json::from_str(text));
     let origin = origin.transpose().map_err(|error| invalid(ORIGIN_KEY, &error))?;
     let snapshot = contents.snapshot(&policy, Match::Architecture)?;
-    contents.expect(CHECKSUM_KEY, checksum(text, &contents.tensors.tensors()))?;
-    Ok(OpenedPolicy { policy, snapshot, origin })
+    let held = contents.fields.get(HOLD_KEY).map(String::as_str);
+    contents.expect(CHECKSUM_KEY, checksum(text, held, &contents.tensors.tensors()))?;
+    let hold: Option<Hold> =
+        held.map(serde_json::from_str).transpose().map_err(|error| invalid(HOLD_KEY, &error))?;
+    if let Some(hold) = &hold {
+        hold.action(&policy.description().spec).map_err(|error| invalid(HOLD_KEY, &error))?;
+    }
+    Ok(OpenedPolicy { policy, snapshot, origin, hold })
 }
 
 fn read(path: &Path) -> Result<Vec<u8>, PolicyFileError> {
@@ -234,7 +255,9 @@ impl<'a> Contents<'a> {
         let fields = metadata.metadata().clone().unwrap_or_default();
         let tensors = SafeTensors::deserialize(bytes).map_err(|error| format_error(path, error))?;
         let contents = Self { path, fields, tensors };
-        contents.expect(FORMAT_KEY, FORMAT.to_owned())?;
+        let has_hold = contents.fields.contains_key(HOLD_KEY);
+        let format = if has_hold { FORMAT_WITH_HOLD } else { FORMAT };
+        contents.expect(FORMAT_KEY, format.to_owned())?;
         Ok(contents)
     }
 
@@ -293,158 +316,4 @@ impl<'a> Contents<'a> {
 }
 
 #[cfg(test)]
-mod tests {
-    use super::*;
-    use crate::config::{ExperimentConfig, Layers};
-    use crate::spec::EnvSpec;
-
-    fn spec() -> EnvSpec {
-        EnvSpec {
-            id: "Test-v0".into(),
-            observation_len: 4,
-            action_len: 2,
-            action_low: vec![-1.0, 0.0],
-            action_high: vec![1.0, 3.0],
-            control_dt_s: 0.1,
-            episode_steps: 50,
-            observation_names: Vec::new(),
-        }
-    }
-
-    fn policy(keys: &[(&str, &str)]) -> Policy {
-        let mut layers = Layers::new();
-        for (key, value) in keys {
-            layers.set("test", key, value).unwrap();
-        }
-        let config: ExperimentConfig = layers.finish().unwrap();
-        Policy::new(&config, &spec()).unwrap()
-    }
-
-    #[test]
-    fn stochastic_policy_keeps_its_standard_deviations() {
-        let folder = tempfile::tempdir().unwrap();
-        let path = folder.path().join("1.safetensors");
-        let own = policy(&[("algorithm.name", "ndp"), ("algorithm.ndp.initial_log_std", "-0.5")]);
-        let mut random = crate::seeds::stream(1, "test", 0);
-        let snapshot = ParameterSnapshot {
-            version: 1,
-            env_steps: 0,
-            architecture_hash: own.architecture_hash(),
-            values: own.initial_parameters(&mut random),
-        };
-        fs::write(&path, encode(&own, &snapshot, None).unwrap()).unwrap();
-        let read = load(&path, &own, Match::Architecture).unwrap();
-        assert_eq!(read, snapshot);
-        assert_eq!(own.learned_std().unwrap().log_std(&read.values), [-0.5; 2]);
-        assert_eq!(read.values.len(), own.shape().parameters_len() + 2);
-    }
-
-    #[test]
-    fn policy_survives_a_round_trip_and_other_or_corrupted_files_are_rejected() {
-        let folder = tempfile::tempdir().unwrap();
-        let path = folder.path().join("7.safetensors");
-        let own = policy(&[]);
-        let mut random = crate::seeds::stream(1, "test", 0);
-        let snapshot = ParameterSnapshot {
-            version: 7,
-            env_steps: 100,
-            architecture_hash: own.architecture_hash(),
-            values: own.initial_parameters(&mut random),
-        };
-        fs::write(&path, encode(&own, &snapshot, None).unwrap()).unwrap();
-        assert_eq!(load(&path, &own, Match::Architecture).unwrap(), snapshot);
-
-        let other = policy(&[("dmp.alpha_y", "8.0")]);
-        let error = load(&path, &other, Match::Architecture).unwrap_err().to_string();
-        assert!(error.contains("architecture_hash"), "{error}");
-        assert_eq!(load(&path, &other, Match::Sizes).unwrap().values, snapshot.values);
-        let wider = policy(&[("policy.hidden", "[256, 128]")]);
-        let error = load(&path, &wider, Match::Sizes).unwrap_err().to_string();
-        assert!(error.contains("actor.1.weight") && error.contains("[128, 256]"), "{error}");
-
-        let bytes = fs::read(&path).unwrap();
-        fs::write(&path, &bytes[..bytes.len() / 2]).unwrap();
-        let error = load(&path, &own, Match::Architecture).unwrap_err().to_string();
-        assert!(error.contains("not a readable safetensors file"), "{error}");
-    }
-
-    fn saved(keys: &[(&str, &str)], path: &Path) -> (Policy, ParameterSnapshot, Origin) {
-        let own = policy(keys);
-        let mut random = crate::seeds::stream(1, "test", 0);
-        let snapshot = ParameterSnapshot {
-            version: 3,
-            env_steps: 100,
-            architecture_hash: own.architecture_hash(),
-            values: own.initial_parameters(&mut random),
-        };
-        let origin = Origin {
-            run_id: "00000000000000ab".into(),
-            task: "test".into(),
-            seed: 1,
-            dmprl_version: "0.1.0".into(),
-            git_commit: None,
-            return_mean: Some(-4.25),
-            success_rate: None,
-        };
-        fs::write(path, encode(&own, &snapshot, Some(&origin)).unwrap()).unwrap();
-        (own, snapshot, origin)
-    }
-
-    #[test]
-    fn policy_is_restored_from_the_file_alone() {
-        let folder = tempfile::tempdir().unwrap();
-        let path = folder.path().join("mine.safetensors");
-        let sources =
-            "[{ cos = 0, sin = 1, velocity = 2 }, { index = 3, velocity = 2, scale = -1.0 }]";
-        for keys in [
-            &[][..],
-            &[("policy.kind", "mlp"), ("algorithm.name", "sac")],
-            &[("algorithm.name", "ndp"), ("policy.controller", "position")],
-            &[("policy.start", "carry"), ("dmp.alpha_y", "12.5"), ("policy.rho", "free")],
-            &[("policy.start", "observed"), ("task.start_sources", sources)],
-        ] {
-            let (own, snapshot, origin) = saved(keys, &path);
-            let opened = open(&path).unwrap();
-            assert_eq!(opened.policy.architecture_hash(), own.architecture_hash(), "{keys:?}");
-            assert_eq!(opened.policy.description(), own.description());
-            assert_eq!((opened.snapshot, opened.origin), (snapshot, Some(origin)));
-        }
-    }
-
-    #[test]
-    fn missing_or_invalid_description_is_rejected() {
-        let folder = tempfile::tempdir().unwrap();
-        let path = folder.path().join("mine.safetensors");
-        let error_after_replacing = |from: &str, to: &str| {
-            saved(&[], &path);
-            let mut bytes = fs::read(&path).unwrap();
-            let at = bytes.windows(from.len()).position(|part| part == from.as_bytes()).unwrap();
-            // The header's length must not change.
-            bytes[at..at + from.len()].copy_from_slice(format!("{to:<0$}", from.len()).as_bytes());
-            fs::write(&path, bytes).unwrap();
-            open(&path).unwrap_err().to_string()
-        };
-        let error = error_after_replacing("\"description\":", "\"descripti--\":");
-        assert!(error.contains("description is missing") && error.contains("dmprl export"));
-        let hidden = "\\\"hidden\\\":[256,256]";
-        let error = error_after_replacing(hidden, &hidden.replace("256,256", "0,99999"));
-        assert!(error.contains("policy.hidden"), "{error}");
-        let error = error_after_replacing(hidden, &hidden.replace("256,256", "256,255"));
-        assert!(error.contains("architecture_hash"), "{error}");
-        // The same parameters, but a different function.
-        let range = "\\\"goal_range\\\":1.0";
-        let error = error_after_replacing(range, &range.replace("1.0", "2.0"));
-        assert!(error.contains("architecture_hash"), "{error}");
-        let dims = "\\\"action_len\\\":2";
-        let error = error_after_replacing(dims, &dims.replace('2', "9"));
-        assert!(error.contains("action_low has 2 entries, expected 9"), "{error}");
-        // A flipped bit that leaves a valid number.
-        saved(&[], &path);
-        let mut bytes = fs::read(&path).unwrap();
-        let last = bytes.len() - 1;
-        bytes[last] ^= 1;
-        fs::write(&path, bytes).unwrap();
-        let error = open(&path).unwrap_err().to_string();
-        assert!(error.contains("checksum"), "{error}");
-    }
-}
+mod tests;

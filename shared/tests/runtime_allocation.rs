@@ -7,7 +7,7 @@ mod counting_allocator;
 
 use counting_allocator::allocations_of;
 use dmprl_shared::config::Layers;
-use dmprl_shared::policy::Policy;
+use dmprl_shared::policy::{Hold, Policy};
 use dmprl_shared::runtime::PolicyRuntime;
 use dmprl_shared::seeds;
 use dmprl_shared::spec::EnvSpec;
@@ -32,13 +32,15 @@ fn decisions_steps_and_holds_allocate_nothing() {
         let parameters = policy.initial_parameters(&mut seeds::stream(1, "test", 0));
         let mut runtime = PolicyRuntime::new(policy, &parameters);
         let observation = [0.1, -0.2, 0.3, -0.4];
+        runtime.safety_mut().set_hold(&Hold::ZeroVelocity).unwrap();
+        runtime.set_deadline(1.0, || 0.0).unwrap();
         // gemm allocates its buffers in the first product.
         runtime.segment(&observation).unwrap();
         let allocated = allocations_of(|| {
             for step in 0..100 {
                 runtime.segment(&observation).unwrap();
                 runtime.action((step % 3 > 0).then_some(&observation[..])).unwrap();
-                runtime.hold();
+                runtime.hold().unwrap();
                 runtime.reset(None).unwrap();
             }
         });

@@ -108,7 +108,7 @@ pub fn policy(task: &str, keys: &[(&str, &str)]) -> OpenedPolicy {
     values.iter_mut().for_each(|value| *value *= 2.0);
     let architecture_hash = policy.architecture_hash();
     let snapshot = ParameterSnapshot { version: 7, env_steps: 100, architecture_hash, values };
-    OpenedPolicy { policy, snapshot, origin: None }
+    OpenedPolicy { policy, snapshot, origin: None, hold: None }
 }
 
 /// Asymmetric bounds: scaling must use both.

@@ -175,7 +175,7 @@ fn an_evaluator_keeps_the_row_of_each_request_and_then_reports_it() {
             values: vec![0.0; policy.parameters_len()],
             ..ParameterSnapshot::default()
         };
-        let bytes = policy_file::encode(policy, &snapshot, None).unwrap();
+        let bytes = policy_file::encode(policy, &snapshot, None, None).unwrap();
         std::fs::write(policy_path(policy_version), bytes).unwrap();
         supervisor.command(Command::Evaluate(EvaluationRequest {
             env_steps: 10 * policy_version,

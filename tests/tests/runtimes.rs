@@ -8,8 +8,12 @@
 
 use std::path::Path;
 use std::process::Command;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicU64, Ordering};
 
-use dmprl_shared::runtime::PolicyRuntime;
+use dmprl_analysis::export;
+use dmprl_shared::policy::Hold;
+use dmprl_shared::runtime::{PolicyRuntime, RuntimeError};
 use dmprl_tests::exported::{self, KINDS, read_numbers, write_numbers};
 use dmprl_tests::{project_root, venv};
 
@@ -67,42 +71,61 @@ fn numpy_limits_and_holds_as_rust_does() {
 import pathlib, dmprl, numpy as np
 for folder in pathlib.Path(sys.argv[1]).iterdir():
     policy = dmprl.Policy.load(folder / 'policy.safetensors')
-    policy.limit(rate=0.3, hold=np.full(policy.low.size, 0.5), hold_after=2)
+    policy.limit(rate=0.3, hold=dmprl.Hold.position([0.5] * policy.low.size), hold_after=2)
+    now = 0.0
+    policy.limit(deadline_s=0.2, clock=lambda: now)
     policy.reset()
     rows = np.fromfile(folder / 'observations.f64').reshape(-1, policy.spec['observation_len'])
     seen = np.fromfile(folder / 'seen.f64')
+    times = np.fromfile(folder / 'times.f64')
     actions = []
-    for row, is_seen in zip(rows, seen):
+    for row, is_seen, now in zip(rows, seen, times):
         actions.append(np.append(policy.action(row if is_seen else None), policy.is_holding))
+    policy.hold_until_reached(lambda action: actions.append(np.append(action, policy.is_holding)))
     np.stack(actions).tofile(folder / 'numpy.f64')
 ";
     // Gaps of every length up to 6 at every step of a segment.
     let seen: Vec<f64> =
         (0..STEPS).map(|step| f64::from(u8::from(step % 17 >= step / 17))).collect();
     assert!(seen.contains(&0.0));
-    let mut held = 0;
+    // The caller is frozen before every 31st call.
+    let times: Vec<f64> =
+        (0..STEPS).map(|step| 0.1 * step as f64 + 0.5 * (step / 31) as f64).collect();
+    let (mut held, mut frozen, mut approaches) = (0, 0, 0);
     for (name, ..) in KINDS {
         write_numbers(&folder.path().join(name).join("seen.f64"), &seen);
+        write_numbers(&folder.path().join(name).join("times.f64"), &times);
     }
     python(script, folder.path());
     for (name, ..) in KINDS {
         let folder = folder.path().join(name);
         let mut policy = PolicyRuntime::load(&folder.join("policy.safetensors")).unwrap();
         let (dims, len) = (policy.spec().action_len, policy.spec().observation_len);
+        policy.safety_mut().set_hold(&Hold::Position { values: vec![0.5; dims] }).unwrap();
         policy.safety_mut().set_rate(&vec![0.3; dims]).unwrap();
-        policy.safety_mut().set_hold(&vec![0.5; dims]).unwrap();
-        policy.safety_mut().set_hold_after(2);
+        policy.safety_mut().set_hold_after(2).unwrap();
+        let now_ms = Arc::new(AtomicU64::new(0));
+        let clock = Arc::clone(&now_ms);
+        policy.set_deadline(0.2, move || clock.load(Ordering::Relaxed) as f64 * 1e-3).unwrap();
         policy.reset(None).unwrap();
         let observations = read_numbers(&folder.join("observations.f64"));
         let mut expected = Vec::new();
-        for (row, &seen) in observations.chunks(len).zip(&seen) {
+        for ((row, &seen), &now) in observations.chunks(len).zip(&seen).zip(&times) {
+            now_ms.store((now * 1e3).round() as u64, Ordering::Relaxed);
             expected.extend_from_slice(policy.action((seen > 0.0).then_some(row)).unwrap());
             expected.push(f64::from(u8::from(policy.is_holding())));
             held += usize::from(policy.is_holding());
+            frozen += usize::from(policy.is_holding() && seen > 0.0);
         }
+        let sent = policy.hold_until_reached(|action| {
+            expected.extend_from_slice(action);
+            expected.push(1.0);
+            Ok::<(), RuntimeError>(())
+        });
+        approaches += usize::from(sent.unwrap() > 1);
         assert_near(&read_numbers(&folder.join("numpy.f64")), &expected, name);
     }
-    assert!(held > 0, "nothing held: this shows nothing");
+    assert!(frozen > 0 && held > frozen && approaches > 0, "nothing held: this shows nothing");
 }
 
 /// Beginning of a script: `refused` checks for an error and its message.
@@ -138,11 +161,25 @@ for name in ('dmp', 'carry', 'mlp'):
         assert (policy.action(now) == calm.action(now)).all()
     big = [policy.segment(np.sin(np.arange(length)) * 10.0**n) for n in range(30)]
     assert all(((b >= policy.low) & (b <= policy.high)).all() for b in big)
-    refused(lambda: policy.limit(rate=0.0), 'rate', 'positive')
-    refused(lambda: policy.limit(hold=np.full(policy.low.size, 9.0)), 'hold', 'expected')
-    refused(lambda: policy.limit(hold_after=-1), 'hold_after')
+    for unheld in (
+        lambda: policy.limit(rate=0.1),
+        lambda: policy.limit(deadline_s=0.1),
+        policy.action,
+        policy.hold,
+        lambda: policy.hold_until_reached(print),
+    ):
+        refused(unheld, 'dmprl export --hold', 'policy.limit(hold=', kind=dmprl.NoHoldError)
+    held = dmprl.Hold.position([0.5] * policy.low.size)
+    refused(lambda: policy.limit(hold=0.5), 'hold', 'dmprl.Hold.position(values)')
+    refused(lambda: policy.limit(hold=dmprl.Hold.position([9.0] * policy.low.size)), 'expected')
+    refused(lambda: policy.limit(hold=dmprl.Hold.position([0.5])), 'hold has 1 values')
+    refused(lambda: policy.limit(hold=held, rate=0.0), 'rate', '10000 control steps')
+    refused(lambda: policy.limit(hold=held, rate=1e-9), 'rate', '10000 control steps')
+    refused(lambda: policy.limit(hold=held, hold_after=-1), 'hold_after')
+    refused(lambda: policy.limit(hold=held, deadline_s=float('nan')), 'deadline_s')
+    refused(policy.hold, kind=dmprl.NoHoldError)  # nothing has changed
     refused(lambda: policy.reset(np.zeros(99)), 'y0')
-    policy.limit(rate=0.05, hold=np.full(policy.low.size, 0.5))
+    policy.limit(rate=0.05, hold=held)
     policy.reset()
     before = np.full(policy.low.size, 0.5)
     for step in range(120):
@@ -154,6 +191,13 @@ for name in ('dmp', 'carry', 'mlp'):
         assert policy.is_holding == bool(step // 20 % 2)
         before = action
     assert (abs(before - 0.5) < 1e-9).all(), before
+    for step in range(20):
+        policy.action(np.sin(step + np.arange(length)))
+    commands = [policy.hold()]
+    assert (commands[0] != 0.5).any(), 'one call is not enough'
+    assert policy.hold_until_reached(commands.append) == len(commands) - 1 > 1
+    assert (commands[-1] == 0.5).all(), commands[-1]
+    assert (abs(np.diff(commands, axis=0)) <= 0.05 + 1e-12).all()
 print('all refused')
 ";
     assert_eq!(python(&format!("{REFUSED}{script}"), folder.path()).trim(), "all refused");
@@ -179,6 +223,9 @@ for damaged, word in [
 ]:
     (folder / 'damaged').write_bytes(damaged)
     refused(lambda: dmprl.Policy.load(folder / 'damaged'), word, kind=dmprl.PolicyFileError)
+for text in ('', '0', 'zero', 'position', 'position=', 'position=a', 'zero-torque=1'):
+    refused(lambda: dmprl.Hold.parse(text), 'zero-velocity')
+    refused(lambda: dmprl.Hold.of_file({'kind': text}), 'hold')
 import dataclasses, json
 from dmprl.policy_file import read
 good = read(folder / 'dmp/policy.safetensors').description
@@ -211,4 +258,37 @@ for _ in range(500):
 print('all refused')
 ";
     assert_eq!(python(&format!("{REFUSED}{script}"), folder.path()).trim(), "all refused");
+}
+
+#[test]
+fn hold_of_a_file_is_the_same_in_numpy() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("policy.safetensors");
+    let mut opened = exported::policy("reacher", &[]);
+    for (hold, action) in [
+        (Hold::ZeroVelocity, [0.0, 0.0]),
+        (Hold::ZeroTorque, [0.0, 0.0]),
+        (Hold::Position { values: vec![0.25, -0.5] }, [0.25, -0.5]),
+    ] {
+        opened.hold = Some(hold.clone());
+        std::fs::write(&path, export::safetensors(&opened).unwrap()).unwrap();
+        let mut runtime = PolicyRuntime::load(&path).unwrap();
+        assert_eq!(runtime.hold().unwrap(), action);
+        let script = "
+policy = dmprl.Policy.load(folder / 'policy.safetensors')
+assert dmprl.Hold.parse(sys.argv[2]) == policy.file.hold, policy.file.hold
+print(policy.hold().tolist())
+whole = (folder / 'policy.safetensors').read_bytes()
+for old, new, word in [
+    (b'\"hold\"', b'\"hald\"', 'format'),
+    (b'dmprl-policy-2', b'dmprl-policy-1', 'format'),
+    (b'zero-velocity', b'zero-velocitz', 'checksum'),
+]:
+    if old in whole:
+        (folder / 'damaged').write_bytes(whole.replace(old, new))
+        refused(lambda: dmprl.Policy.load(folder / 'damaged'), word, kind=dmprl.PolicyFileError)
+";
+        let script = format!("{REFUSED}{script}").replace("sys.argv[2]", &format!("'{hold}'"));
+        assert_eq!(python(&script, folder.path()).trim(), format!("{action:?}"));
+    }
 }

@@ -29,7 +29,6 @@ sys.stdout = sys.stderr
 sys.stdin = open(os.devnull)
 for name in ('OMP_NUM_THREADS', 'OPENBLAS_NUM_THREADS', 'MKL_NUM_THREADS'):
     os.environ.setdefault(name, '1')
-sys.path.extend(python_path)
 base_prefix = os.path.realpath(sys.base_prefix)
 expected = os.path.realpath(expected)
 ";
@@ -42,7 +41,8 @@ static RUNNING: Mutex<Option<InterpreterOptions>> = Mutex::new(None);
 pub struct InterpreterOptions {
     /// The virtual environment; becomes `sys.prefix`.
     pub venv: PathBuf,
-    /// The user's own directories (`--python-path`), appended to `sys.path`.
+    /// The user's own directories (`--python-path`), appended to `sys.path` by
+    /// `dmprl.python_path`.
     pub python_path: Vec<PathBuf>,
 }
 
@@ -62,7 +62,8 @@ impl Interpreter {
     /// # Errors
     /// `NoVenv`; `OtherVersion` or `OtherInstallation` if the loaded libpython or the virtual
     /// environment belongs to another installation; `Initialise`; `AlreadyStarted` with other
-    /// options; `Path` if a Python path is not a directory.
+    /// options; `Path` if a Python path is not a directory; `Exception` if a module in one has the
+    /// name of a standard module.
     pub fn start(options: &InterpreterOptions) -> Result<Self, PythonError> {
         let mut running = RUNNING.lock().unwrap_or_else(PoisonError::into_inner);
         if let Some(running) = &*running {
@@ -132,22 +133,24 @@ fn initialise(executable: &Path) -> Result<(), PythonError> {
     Ok(())
 }
 
-/// Prepares `sys` and compares the installation's prefix with the linked one.
+/// Prepares `sys`, compares the installation's prefix with the linked one, and appends the user's
+/// directories.
 fn prepare(venv: &Path, python_path: Vec<String>) -> Result<(), PythonError> {
     Python::attach(|py| {
         let globals = PyDict::new(py);
         let run = || -> PyResult<(String, String)> {
-            globals.set_item("python_path", python_path)?;
             globals.set_item("expected", LINKED_PYTHON.base_prefix)?;
             py.run(PREPARE, Some(&globals), None)?;
             let value = |name| globals.as_any().get_item(name)?.extract();
             Ok((value("expected")?, value("base_prefix")?))
         };
         let (expected, got) = run().map_err(|error| PythonError::exception(py, &error))?;
-        if expected == got {
-            return Ok(());
+        if expected != got {
+            return Err(PythonError::OtherInstallation { venv: venv.to_owned(), expected, got });
         }
-        Err(PythonError::OtherInstallation { venv: venv.to_owned(), expected, got })
+        let module = py.import("dmprl.python_path");
+        let extended = module.and_then(|module| module.call_method1("extend", (python_path,)));
+        extended.map(drop).map_err(|error| PythonError::exception(py, &error))
     })
 }
 

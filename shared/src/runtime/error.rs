@@ -2,6 +2,8 @@
 
 use thiserror::Error;
 
+use super::safety::HOLD_STEPS_MAX;
+use crate::policy::HoldError;
 use crate::policy_file::PolicyFileError;
 
 /// Why the runtime returns no action.
@@ -39,6 +41,25 @@ pub enum RuntimeError {
     Start {
         /// The reason.
         reason: String,
+    },
+    /// A robot cannot be held, because its hold is not known.
+    #[error(
+        "the policy states no hold, the command that holds the robot: state it with `dmprl export \
+         --hold` or with Safety::set_hold before any limit, as zero-velocity, zero-torque or the \
+         position to keep"
+    )]
+    NoHold,
+    /// The given hold is invalid for this policy.
+    #[error(transparent)]
+    Hold(#[from] HoldError),
+    /// The hold was not reached.
+    #[error("the hold was not reached in {HOLD_STEPS_MAX} control steps")]
+    HoldNotReached,
+    /// An invalid deadline.
+    #[error("the deadline is {got} s: expected a positive number")]
+    Deadline {
+        /// The value \[s\].
+        got: f64,
     },
     /// An invalid limit.
     #[error("{what} of action dimension {dimension} is {got}: expected {expected}")]

@@ -2,14 +2,15 @@
 //!
 //! [`PolicyRuntime`] returns the actions of a segment, or one action per control step. It rejects
 //! invalid observations, limits actions to their bounds and their rate to a maximum, and holds the
-//! robot when observations stop.
+//! robot when observations stop, when its caller was frozen, and at the end.
 //!
 //! ```
-#![doc = include_str!("../../examples/act.rs")]
+#![doc = include_str!("../../../docs/examples/robot/drive_robot.rs")]
 //! ```
 //! `dmprl.Policy` is the same runtime in NumPy (`envs_py/dmprl/policy.py`). A test compares both
 //! and the ONNX graph.
 
+mod deadline;
 mod error;
 mod safety;
 #[cfg(test)]
@@ -17,8 +18,9 @@ mod tests;
 
 use std::path::Path;
 
+use deadline::Deadline;
 pub use error::RuntimeError;
-pub use safety::Safety;
+pub use safety::{HOLD_STEPS_MAX, Safety};
 
 use crate::policy::{Head, Policy, PolicyWorkspace, SmallBatchNetwork};
 use crate::policy_file::{self, OpenedPolicy};
@@ -31,6 +33,7 @@ pub struct PolicyRuntime {
     network: SmallBatchNetwork,
     work: PolicyWorkspace,
     safety: Safety,
+    deadline: Option<Deadline>,
     /// The policy's input, (O,): the environment's observation, then a carried DMP state.
     seen: Vec<f32>,
     /// Start (y, yd) of the next segment's DMP, (2A,); empty if it is not carried.
@@ -41,7 +44,7 @@ pub struct PolicyRuntime {
     given: Vec<f64>,
     /// Executed steps of the segment. At K the next step needs a decision.
     step: usize,
-    /// The previous action, (A,); initially the hold.
+    /// The previous action, (A,).
     previous: Vec<f64>,
     /// Whether any action has been returned since the reset.
     has_acted: bool,
@@ -51,16 +54,21 @@ pub struct PolicyRuntime {
 }
 
 impl PolicyRuntime {
-    /// Loads a policy file, either written by `dmprl export` or from a run's `policies/`.
+    /// Loads a policy file, either written by `dmprl export` or from a run's `policies/`, with the
+    /// hold that it states.
     ///
     /// # Errors
     /// `File` if it cannot be read or is invalid.
     pub fn load(path: &Path) -> Result<Self, RuntimeError> {
-        let OpenedPolicy { policy, snapshot, .. } = policy_file::open(path)?;
-        Ok(Self::new(policy, &snapshot.values))
+        let OpenedPolicy { policy, snapshot, hold, .. } = policy_file::open(path)?;
+        let mut runtime = Self::new(policy, &snapshot.values);
+        if let Some(hold) = hold {
+            runtime.safety.set_hold(&hold)?;
+        }
+        Ok(runtime)
     }
 
-    /// Creates a runtime from a policy and its parameters, (P,).
+    /// Creates a runtime without a hold from a policy and its parameters, (P,).
     ///
     /// # Panics
     /// If the number of parameters is wrong.
@@ -78,7 +86,8 @@ impl PolicyRuntime {
             decided: vec![0.0; layout.actions_len()],
             given: vec![0.0; layout.actions_len()],
             step: layout.segment_steps,
-            previous: safety.hold().to_vec(),
+            previous: vec![0.0; layout.action_len],
+            deadline: None,
             has_acted: false,
             missed: 0,
             holding: false,
@@ -111,7 +120,30 @@ impl PolicyRuntime {
         &mut self.safety
     }
 
-    /// Whether the last action was the hold, either on request or because observations stopped.
+    /// Sets the longest time between two calls of [`PolicyRuntime::action`]. After a longer one,
+    /// the caller was frozen and the robot has executed an old action, so the policy holds: its
+    /// next decision is by the observation of the next call.
+    ///
+    /// - `limit_s`: \[s\].
+    /// - `clock`: returns the time \[s\] since any moment, by a clock that never goes backwards.
+    ///
+    /// # Errors
+    /// `NoHold`; `Deadline` if the limit is not positive.
+    pub fn set_deadline(
+        &mut self,
+        limit_s: f64,
+        clock: impl Fn() -> f64 + Send + 'static,
+    ) -> Result<(), RuntimeError> {
+        self.safety.hold()?;
+        if limit_s.is_nan() || limit_s <= 0.0 {
+            return Err(RuntimeError::Deadline { got: limit_s });
+        }
+        self.deadline = Some(Deadline::new(limit_s, clock));
+        Ok(())
+    }
+
+    /// Whether the last action was on the way to the hold or the hold itself: on request, because
+    /// observations stopped, or because the caller was frozen.
     #[must_use]
     pub fn is_holding(&self) -> bool {
         self.holding
@@ -144,6 +176,7 @@ impl PolicyRuntime {
         self.missed = 0;
         self.holding = false;
         self.has_acted = false;
+        self.restart_deadline();
         Ok(())
     }
 
@@ -156,6 +189,7 @@ impl PolicyRuntime {
     /// If the observation is invalid, or the network's outputs are NaN. Execute
     /// [`PolicyRuntime::hold`] then. The policy continues at the next valid observation.
     pub fn segment(&mut self, observation: &[f64]) -> Result<&[f64], RuntimeError> {
+        self.restart_deadline(); // the caller returns after K steps
         self.decide(observation)?;
         self.missed = 0;
         self.holding = false;
@@ -172,12 +206,18 @@ impl PolicyRuntime {
     ///
     /// - `observation`: (O,) in the environment's units; `None` if there is no new one since the
     ///   last call. After more than [`Safety::hold_after`] calls with `None`, or with `None` at a
-    ///   segment's first step, the action is the hold, and the next observation starts a new
-    ///   segment.
+    ///   segment's first step, or after the deadline, the action is the hold, and the next
+    ///   observation starts a new segment.
     ///
     /// # Errors
-    /// As [`PolicyRuntime::segment`], at every step.
+    /// As [`PolicyRuntime::segment`], at every step; `NoHold` with `None`.
     pub fn action(&mut self, observation: Option<&[f64]>) -> Result<&[f64], RuntimeError> {
+        if self.deadline.as_mut().is_some_and(Deadline::is_late) {
+            // The observation may be from before the freeze.
+            self.holding = true;
+            observation.map_or(Ok(()), |observation| self.check(observation))?;
+            return self.approach_hold();
+        }
         match observation {
             Some(observation) => {
                 if self.step == self.segment_steps() || self.holding {
@@ -189,36 +229,73 @@ impl PolicyRuntime {
                 self.holding = false;
             }
             None => {
+                self.safety.hold()?;
                 self.missed = self.missed.saturating_add(1);
                 self.holding |= self.missed > self.safety.hold_after();
                 self.holding |= self.step == self.segment_steps();
             }
         }
         if self.holding {
-            self.approach_hold();
-        } else {
-            self.give();
+            return self.approach_hold();
         }
+        self.give();
         Ok(&self.previous)
     }
 
     /// Returns an action that moves towards the hold within the rate limit, (A,). Use it after an
     /// error, and whenever the policy must not act. The next observation starts a new segment.
-    pub fn hold(&mut self) -> &[f64] {
+    ///
+    /// # Errors
+    /// `NoHold`.
+    pub fn hold(&mut self) -> Result<&[f64], RuntimeError> {
+        if let Some(deadline) = &mut self.deadline {
+            deadline.is_late(); // records the call
+        }
         self.holding = true;
-        self.approach_hold();
-        &self.previous
+        self.approach_hold()
     }
 
-    fn approach_hold(&mut self) {
+    /// Sends actions that move towards the hold within the rate limit, one per control step, until
+    /// the last one is the hold. Returns their number. Call it at the end of every drive, also
+    /// after an error or a signal.
+    ///
+    /// - `send`: sends the action to the robot and waits for the end of the control step.
+    ///
+    /// # Errors
+    /// `NoHold`, and the first error of `send`. After the latter the robot did not get the hold.
+    pub fn hold_until_reached<E: From<RuntimeError>>(
+        &mut self,
+        mut send: impl FnMut(&[f64]) -> Result<(), E>,
+    ) -> Result<usize, E> {
+        for sent in 1..=HOLD_STEPS_MAX {
+            let action = self.hold()?;
+            send(action)?;
+            if self.previous == self.safety.hold()? {
+                return Ok(sent);
+            }
+        }
+        Err(RuntimeError::HoldNotReached.into())
+    }
+
+    fn restart_deadline(&mut self) {
+        if let Some(deadline) = &mut self.deadline {
+            deadline.restart();
+        }
+    }
+
+    fn approach_hold(&mut self) -> Result<&[f64], RuntimeError> {
         self.begin_at_hold();
-        self.safety.approach_hold(&mut self.previous);
+        self.safety.limit(self.safety.hold()?, &mut self.previous);
+        Ok(&self.previous)
     }
 
-    /// Sets the previous action to the hold if no action has been returned yet.
+    /// Sets the previous action to the hold if no action has been returned yet. Without a hold
+    /// there is no rate limit either, so the previous action does not matter.
     fn begin_at_hold(&mut self) {
-        if !std::mem::replace(&mut self.has_acted, true) {
-            self.previous.copy_from_slice(self.safety.hold());
+        if !std::mem::replace(&mut self.has_acted, true)
+            && let Ok(hold) = self.safety.hold()
+        {
+            self.previous.copy_from_slice(hold);
         }
     }
 

@@ -1,7 +1,11 @@
 //! Tests of the runtime with valid, invalid and missing observations.
 
+use std::sync::Arc;
+use std::sync::atomic::{AtomicU64, Ordering};
+
 use super::*;
 use crate::config::{ExperimentConfig, Layers};
+use crate::policy::Hold;
 use crate::seeds;
 
 const DIMS: usize = 2;
@@ -38,6 +42,10 @@ fn runtime(keys: &[(&str, &str)]) -> PolicyRuntime {
     PolicyRuntime::new(policy, &parameters)
 }
 
+fn position(values: &[f64]) -> Hold {
+    Hold::Position { values: values.to_vec() }
+}
+
 const CARRY: &[(&str, &str)] = &[("policy.start", "carry")];
 
 fn observation(seed: f64) -> [f64; 4] {
@@ -69,6 +77,7 @@ fn segment_equals_the_policys_decision_in_the_environments_units() {
 fn actions_step_by_step_equal_the_segment() {
     for keys in [&[][..], CARRY] {
         let (mut whole, mut stepwise) = (runtime(keys), runtime(keys));
+        stepwise.safety_mut().set_hold(&position(&[0.0, 1.0])).unwrap();
         for decision in 0..3 {
             let first = observation(f64::from(decision));
             let segment = whole.segment(&first).unwrap().to_vec();
@@ -134,12 +143,20 @@ fn actions_stay_within_bounds_for_any_observation() {
 #[test]
 fn actions_obey_the_rate_limit() {
     let mut runtime = runtime(&[]);
-    let error = runtime.safety_mut().set_rate(&[0.1, 0.0]).unwrap_err().to_string();
-    assert_eq!(error, "the rate of action dimension 1 is 0: expected a positive number");
+    runtime.safety_mut().set_hold(&position(&[0.0, 1.0])).unwrap();
+    for (rate, words) in [
+        (&[0.1, 0.0][..], "the rate of action dimension 1 is 0: expected 0.0003"),
+        (&[0.1], "the rate of action dimension 1 is missing"),
+        (&[0.1, 0.1, 0.1], "dimension 2 is 0.1: expected 2 dimensions"),
+        (&[f64::NAN, 0.1], "dimension 0 is NaN"),
+        (&[0.0002, 0.1], "to reach the hold in 10000 control steps"),
+    ] {
+        let error = runtime.safety_mut().set_rate(rate).unwrap_err().to_string();
+        assert!(error.contains(words), "{error}");
+    }
     runtime.safety_mut().set_rate(&[0.1, f64::INFINITY]).unwrap();
     runtime.reset(None).unwrap();
-    let mut before = runtime.safety().hold().to_vec();
-    assert_eq!(before, [0.0, 1.0], "0, or the nearest bound");
+    let mut before = runtime.safety().hold().unwrap().to_vec();
     let mut limited = 0;
     for step in 0..40 {
         let now = observation(f64::from(step / 10));
@@ -155,8 +172,8 @@ fn actions_obey_the_rate_limit() {
 #[test]
 fn robot_holds_when_observations_stop_and_continues_when_they_return() {
     let mut runtime = runtime(&[]);
-    runtime.safety_mut().set_hold(&[0.5, 2.0]).unwrap();
-    runtime.safety_mut().set_hold_after(2);
+    runtime.safety_mut().set_hold(&position(&[0.5, 2.0])).unwrap();
+    runtime.safety_mut().set_hold_after(2).unwrap();
     runtime.safety_mut().set_rate(&[0.4, 10.0]).unwrap();
     let now = observation(0.0);
     runtime.action(Some(&now)).unwrap();
@@ -186,18 +203,123 @@ fn robot_holds_when_observations_stop_and_continues_when_they_return() {
 }
 
 #[test]
-fn hold_out_of_bounds_is_rejected() {
+fn without_a_stated_hold_nothing_is_limited_and_nothing_holds() {
     let mut runtime = runtime(&[]);
-    for (hold, message) in [
-        (&[0.0, 0.5][..], "the hold of action dimension 1 is 0.5: expected 1 to 4"),
-        (&[0.0][..], "the hold of action dimension 1 is missing: expected 1 to 4"),
-        (&[0.0, 2.0, 0.0][..], "dimension 2 is 0: expected 2 dimensions"),
-        (&[f64::NAN, 2.0][..], "dimension 0 is NaN: expected -1 to 1"),
-    ] {
-        let error = runtime.safety_mut().set_hold(hold).unwrap_err().to_string();
-        assert!(error.contains(message), "{error}");
+    let now = observation(0.0);
+    runtime.action(Some(&now)).unwrap();
+    let before = runtime.action(Some(&now)).unwrap().to_vec();
+    let refused = |result: Result<(), RuntimeError>| {
+        let error = result.unwrap_err();
+        assert!(matches!(error, RuntimeError::NoHold), "{error}");
+        assert!(error.to_string().contains("dmprl export --hold"), "{error}");
+    };
+    refused(runtime.safety_mut().set_rate(&[0.1; DIMS]));
+    refused(runtime.safety_mut().set_hold_after(1));
+    refused(runtime.set_deadline(1.0, || 0.0));
+    refused(runtime.hold().map(drop));
+    refused(runtime.hold_until_reached(|_| Ok(())).map(drop));
+    // The segment would have gone on, but the drive must not begin with an unknown hold.
+    refused(runtime.action(None).map(drop));
+    assert_eq!(runtime.previous, before, "no action is made up");
+
+    let error = runtime.safety_mut().set_hold(&Hold::ZeroTorque).unwrap_err().to_string();
+    assert_eq!(error, "the hold of action dimension 1 is 0: expected 1 to 4");
+    refused(runtime.hold().map(drop));
+    runtime.safety_mut().set_hold(&position(&[0.5, 2.0])).unwrap();
+    assert_eq!(runtime.hold().unwrap(), [0.5, 2.0]);
+}
+
+/// One call of `hold` stops short of the hold if the rate is limited.
+#[test]
+fn last_command_is_the_hold_also_with_a_rate_limit() {
+    let mut runtime = runtime(&[]);
+    runtime.safety_mut().set_hold(&position(&[0.123, 3.9])).unwrap();
+    runtime.safety_mut().set_rate(&[0.01, 0.03]).unwrap();
+    runtime.reset(None).unwrap();
+    for step in 0..50 {
+        runtime.action(Some(&observation(f64::from(step)))).unwrap();
     }
-    assert_eq!(runtime.safety().hold(), [0.0, 1.0]);
+    let mut before = runtime.previous.clone();
+    assert_ne!(runtime.hold().unwrap(), [0.123, 3.9], "one call is not enough");
+    let mut commands = vec![runtime.previous.clone()];
+    let sent = runtime.hold_until_reached::<RuntimeError>(|action| {
+        commands.push(action.to_vec());
+        Ok(())
+    });
+    assert_eq!(sent.unwrap(), commands.len() - 1);
+    assert_eq!(commands.last().unwrap(), &[0.123, 3.9], "exactly");
+    for command in commands {
+        let close = |d: usize, rate: f64| (command[d] - before[d]).abs() <= rate + 1e-12;
+        assert!(close(0, 0.01) && close(1, 0.03), "{before:?} {command:?}");
+        before = command;
+    }
+    // At the hold, and before any action, one command is enough; the robot gets it in any case.
+    assert_eq!(runtime.hold_until_reached::<RuntimeError>(|_| Ok(())).unwrap(), 1);
+    runtime.reset(None).unwrap();
+    assert_eq!(runtime.hold_until_reached::<RuntimeError>(|_| Ok(())).unwrap(), 1);
+}
+
+#[test]
+fn hold_is_reached_with_the_smallest_rate_and_a_broken_link_is_reported() {
+    let mut runtime = runtime(&[]);
+    runtime.safety_mut().set_hold(&position(&[-1.0, 1.0])).unwrap();
+    let smallest = [2.0, 3.0].map(|range| range / (HOLD_STEPS_MAX - 1) as f64);
+    runtime.action(Some(&observation(0.0))).unwrap();
+    runtime.previous.copy_from_slice(&[1.0, 4.0]);
+    runtime.safety_mut().set_rate(&smallest).unwrap();
+    let sent = runtime.hold_until_reached::<RuntimeError>(|_| Ok(())).unwrap();
+    assert!((HOLD_STEPS_MAX - 1..=HOLD_STEPS_MAX).contains(&sent), "{sent}");
+
+    runtime.previous.copy_from_slice(&[1.0, 4.0]);
+    let mut sent = 0;
+    let error = runtime.hold_until_reached::<Box<dyn std::error::Error>>(|_| {
+        sent += 1;
+        if sent == 3 { Err("the link is down".into()) } else { Ok(()) }
+    });
+    assert_eq!((error.unwrap_err().to_string().as_str(), sent), ("the link is down", 3));
+}
+
+/// A frozen caller makes no calls, so counting calls does not notice it.
+#[test]
+fn caller_that_was_frozen_gets_the_hold_and_then_a_new_decision() {
+    let now_ms = Arc::new(AtomicU64::new(0));
+    let mut runtime = runtime(&[]);
+    runtime.safety_mut().set_hold(&position(&[0.5, 2.0])).unwrap();
+    let clock = Arc::clone(&now_ms);
+    for limit_s in [0.0, -1.0, f64::NAN] {
+        let error = runtime.set_deadline(limit_s, || 0.0).unwrap_err().to_string();
+        assert!(error.contains("expected a positive number"), "{error}");
+    }
+    runtime.set_deadline(0.2, move || clock.load(Ordering::Relaxed) as f64 * 1e-3).unwrap();
+    runtime.reset(None).unwrap();
+    let now = observation(0.0);
+    let own = self::runtime(&[]).segment(&now).unwrap().to_vec();
+    for action in own.chunks(DIMS).take(2) {
+        now_ms.fetch_add(200, Ordering::Relaxed);
+        assert_eq!(runtime.action(Some(&now)).unwrap(), action, "200 ms are in time");
+        assert!(!runtime.is_holding());
+    }
+    for frozen in [None, Some(&now[..])] {
+        now_ms.fetch_add(201, Ordering::Relaxed);
+        assert_eq!(runtime.action(frozen).unwrap(), [0.5, 2.0], "{frozen:?}");
+        assert!(runtime.is_holding());
+    }
+    now_ms.fetch_add(300, Ordering::Relaxed);
+    assert!(runtime.action(Some(&[f64::NAN; 4])).is_err(), "at every step");
+    assert_eq!(runtime.hold().unwrap(), [0.5, 2.0]);
+    // The next call in time decides anew instead of finishing the old segment.
+    now_ms.fetch_add(1, Ordering::Relaxed);
+    assert_eq!(runtime.action(Some(&now)).unwrap(), &own[..DIMS]);
+    assert!(!runtime.is_holding());
+    // A clock that goes backwards measures nothing.
+    now_ms.fetch_sub(1, Ordering::Relaxed);
+    assert_eq!(runtime.action(Some(&now)).unwrap(), [0.5, 2.0]);
+    // Between episodes, and for whole segments, no time is measured.
+    now_ms.fetch_add(10_000, Ordering::Relaxed);
+    runtime.reset(None).unwrap();
+    assert_eq!(runtime.action(Some(&now)).unwrap(), &own[..DIMS]);
+    now_ms.fetch_add(10_000, Ordering::Relaxed);
+    assert_eq!(runtime.segment(&now).unwrap(), own);
 }
 
 #[test]
@@ -219,11 +341,11 @@ fn only_a_policy_that_carries_its_state_accepts_y0() {
 #[test]
 fn hold_after_errors_obeys_the_rate_limit() {
     let mut runtime = runtime(&[]);
+    runtime.safety_mut().set_hold(&position(&[0.5, 2.0])).unwrap();
     runtime.safety_mut().set_rate(&[0.05, 0.05]).unwrap();
-    runtime.safety_mut().set_hold(&[0.5, 2.0]).unwrap();
     runtime.reset(None).unwrap();
     let invalid = [f64::NAN; 4];
-    let mut before = runtime.safety().hold().to_vec();
+    let mut before = runtime.safety().hold().unwrap().to_vec();
     let (mut held, mut acted) = (0, 0);
     for step in 0..120 {
         // Twenty valid observations, then twenty invalid ones, and so on.
@@ -235,7 +357,7 @@ fn hold_after_errors_obeys_the_rate_limit() {
             }
             Err(_) => {
                 held += 1;
-                runtime.hold().to_vec()
+                runtime.hold().unwrap().to_vec()
             }
         };
         for (now, before) in action.iter().zip(&before) {

@@ -3,7 +3,7 @@
 use std::fs;
 
 use dmprl_shared::parameters::ParameterSnapshot;
-use dmprl_shared::policy::Policy;
+use dmprl_shared::policy::{Hold, Policy};
 use dmprl_shared::policy_file::{self, Match};
 
 use crate::mutate;
@@ -23,10 +23,11 @@ fn one_that_is_accepted_is_finite_and_stays_what_it_is() {
         let values = policy.initial_parameters(&mut dmprl_shared::seeds::stream(version, "p", 0));
         let architecture_hash = policy.architecture_hash();
         let snapshot = ParameterSnapshot { version, env_steps: 10, architecture_hash, values };
-        policy_file::encode(&policy, &snapshot, None).unwrap()
+        let hold = (version == 2).then_some(&Hold::ZeroVelocity);
+        policy_file::encode(&policy, &snapshot, None, hold).unwrap()
     });
     target.fuzz(|random| {
-        let mut bytes = made[0].clone();
+        let mut bytes = random.pick(&made).clone();
         if random.once_in(3) {
             // A number in the tensors at the end of the file.
             let at = bytes.len() - 4 * (1 + random.below(8));
@@ -46,12 +47,14 @@ fn one_that_is_accepted_is_finite_and_stays_what_it_is() {
         let strictness = *random.pick(&[Match::Architecture, Match::Sizes]);
         if let Ok(opened) = policy_file::open(&path) {
             assert_eq!(opened.snapshot.values.len(), opened.policy.parameters_len());
+            let spec = &opened.policy.description().spec;
+            assert!(opened.hold.is_none_or(|hold| hold.action(spec).is_ok()));
         }
         let loaded = policy_file::load(&path, &policy, strictness);
         if let Ok(snapshot) = &loaded {
             assert_eq!(snapshot.values.len(), policy.parameters_len());
             assert!(snapshot.values.iter().all(|value| value.is_finite()));
-            fs::write(&path, policy_file::encode(&policy, snapshot, None).unwrap()).unwrap();
+            fs::write(&path, policy_file::encode(&policy, snapshot, None, None).unwrap()).unwrap();
             let again = policy_file::load(&path, &policy, Match::Architecture).unwrap();
             assert_eq!(again, *snapshot);
         }

@@ -3,6 +3,7 @@
 use std::fs;
 use std::path::Path;
 
+use dmprl_shared::policy::Hold;
 use dmprl_shared::policy_file;
 use dmprl_shared::runtime::PolicyRuntime;
 use dmprl_tests::program::Workplace;
@@ -31,6 +32,27 @@ fn a_runs_policy_leaves_as_one_file() {
         ("reacher", json["return_mean"].as_f64())
     );
 
+    assert_eq!((opened.hold, &json["hold"]), (None, &json!(null)), "none is assumed");
+
+    // For a robot, the export states the hold.
+    let held = place.path("held.safetensors");
+    let export =
+        |hold: &str| place.run(&["export", &run, "--hold", hold, "--output", &held, "--json"]);
+    for hold in [Hold::ZeroTorque, Hold::Position { values: vec![-0.5, 1.0] }] {
+        let json = export(&hold.to_string()).with_status(0).json();
+        assert_eq!(json["hold"], hold.to_string());
+        assert_eq!(policy_file::open(Path::new(&held)).unwrap().hold, Some(hold));
+    }
+    fs::remove_file(&held).unwrap();
+    for (hold, words) in [
+        ("still", "zero-velocity"),
+        ("position=0", "has 1 values, expected 2"),
+        ("position=0,9", "expected -1 to 1"),
+    ] {
+        export(hold).with_status(2).saying(words);
+    }
+    assert!(!Path::new(&held).exists());
+
     // The file moves without the run, and can start another run.
     let moved = place.path("elsewhere.safetensors");
     fs::rename(&own, &moved).unwrap();
@@ -41,10 +63,13 @@ fn a_runs_policy_leaves_as_one_file() {
 
     // As in --help: a name in an existing folder.
     let onnx = place.path("reacher.onnx");
-    let said = place.run(&["export", "run", "--format", "onnx", "--output", "reacher.onnx"]);
-    let said = said.with_status(0);
+    let arguments = ["export", "run", "--format", "onnx", "--output", "reacher.onnx"];
+    let said = place.run(&[&arguments[..], &["--hold", "zero-torque"]].concat()).with_status(0);
     assert!(said.printed.contains("reacher.onnx"), "{}", said.printed);
-    assert!(fs::read(&onnx).unwrap().windows(11).any(|name| name == b"observation"));
+    let bytes = fs::read(&onnx).unwrap();
+    for name in ["observation", "zero-torque"] {
+        assert!(bytes.windows(name.len()).any(|part| part == name.as_bytes()), "no {name}");
+    }
 }
 
 #[test]

@@ -67,6 +67,20 @@ fn an_environment_whose_step_lasts_no_time_is_refused_by_its_worker() {
     place.assert_no_process();
 }
 
+/// It would never be imported, because the standard library comes first.
+#[test]
+fn a_module_with_the_name_of_a_standard_one_is_refused() {
+    let place = Workplace::new();
+    let folder = place.path("modules");
+    fs::create_dir(&folder).unwrap();
+    fs::write(place.path("modules/random.py"), "raise AssertionError").unwrap();
+    let run = place.path("run");
+    let more = ["--workers", "1", "--python-path", &folder];
+    let finished = place.run(&crate::train("reacher", &run, &more)).with_status(1);
+    finished.saying("modules/random").saying("rename yours");
+    place.assert_no_process();
+}
+
 #[test]
 fn a_run_that_is_being_trained_is_not_resumed_beside_itself() {
     let place = Workplace::new();

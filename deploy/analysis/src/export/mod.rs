@@ -15,7 +15,7 @@ pub use onnx::onnx;
 
 use dmprl_run::{ChosenPolicy, RunDirectory, Session};
 
-/// Reads a run's policy and its origin.
+/// Reads a run's policy and its origin. A run knows no robot, so the policy has no hold.
 ///
 /// # Errors
 /// The run has not started an environment yet, or a file cannot be read.
@@ -37,7 +37,7 @@ pub fn read_policy(run: &RunDirectory, chosen: &ChosenPolicy) -> anyhow::Result<
         return_mean: chosen.row.as_ref().map(|row| row.return_mean),
         success_rate: chosen.row.as_ref().and_then(|row| row.success_rate),
     };
-    Ok(OpenedPolicy { policy, snapshot, origin: Some(origin) })
+    Ok(OpenedPolicy { policy, snapshot, origin: Some(origin), hold: None })
 }
 
 /// Encodes a policy in the project's own format.
@@ -45,5 +45,6 @@ pub fn read_policy(run: &RunDirectory, chosen: &ChosenPolicy) -> anyhow::Result<
 /// # Errors
 /// The parameters do not match the policy, which is not expected.
 pub fn safetensors(opened: &OpenedPolicy) -> anyhow::Result<Vec<u8>> {
-    Ok(policy_file::encode(&opened.policy, &opened.snapshot, opened.origin.as_ref())?)
+    let OpenedPolicy { policy, snapshot, origin, hold } = opened;
+    Ok(policy_file::encode(policy, snapshot, origin.as_ref(), hold.as_ref())?)
 }

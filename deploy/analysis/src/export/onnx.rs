@@ -35,6 +35,9 @@ pub fn onnx(opened: &OpenedPolicy) -> anyhow::Result<Vec<u8>> {
     if let Some(origin) = &opened.origin {
         metadata_props.push(entry("origin", serde_json::to_string(origin)?));
     }
+    if let Some(hold) = &opened.hold {
+        metadata_props.push(entry("hold", serde_json::to_string(hold)?));
+    }
     let model = ModelProto {
         ir_version: IR_VERSION,
         producer_name: "dmprl".into(),

@@ -108,5 +108,5 @@ fn opened(args: &PolicyArgs) -> anyhow::Result<OpenedPolicy> {
     let values = policy.initial_parameters(&mut seeds::stream(config.run.seed, "policy", 0));
     let architecture_hash = policy.architecture_hash();
     let snapshot = ParameterSnapshot { version: 0, env_steps: 0, architecture_hash, values };
-    Ok(OpenedPolicy { policy, snapshot, origin: None })
+    Ok(OpenedPolicy { policy, snapshot, origin: None, hold: None })
 }

@@ -7,6 +7,7 @@ use dmprl_analysis::export::{onnx, read_policy, safetensors};
 use dmprl_run::failure::{Outcome, wrong_use};
 use dmprl_run::format::{binary_bytes, shown};
 use dmprl_run::{PolicyChoice, RunDirectory, replace_file};
+use dmprl_shared::policy::Hold;
 
 use super::emit;
 
@@ -16,8 +17,13 @@ controller, start, action bounds, and its origin. safetensors is read by the cra
 (dmprl_shared::runtime), without Python, and in Python by dmprl.Policy, which needs only NumPy. onnx
 is for any ONNX runtime: input `observation` (batch, O), output `actions` (batch, K, A).
 
+For a robot, state with --hold the command that holds it, as in docs/robot.md. Without it, the file
+acts in simulations; on a robot, the program that drives it must state the hold.
+
 EXAMPLES
   dmprl export runs/mine                           # runs/mine/reacher.safetensors
+  dmprl export runs/mine --hold zero-velocity      # for a robot that takes velocities
+  dmprl export runs/mine --hold position=0.1,-0.5  # for a robot that takes positions of two joints
   dmprl export runs/mine --format onnx --output reacher.onnx
   dmprl export runs/mine --policy latest --json";
 
@@ -36,6 +42,10 @@ pub(super) struct ExportArgs {
     /// best, latest, or a policy version.
     #[arg(long, default_value_t = PolicyChoice::Best, value_name = "best|latest|VERSION")]
     policy: PolicyChoice,
+    /// Command that holds the robot: zero-velocity, zero-torque, or position=V,V,… with one value
+    /// per action.
+    #[arg(long, value_name = "HOLD", allow_hyphen_values = true)]
+    hold: Option<Hold>,
     /// Print one JSON object on standard output.
     #[arg(long)]
     json: bool,
@@ -87,7 +97,12 @@ pub(super) fn run(args: &ExportArgs) -> anyhow::Result<Outcome> {
     }
     let run = RunDirectory::open(&args.run)?;
     let chosen = run.choose_policy(args.policy)?;
-    let opened = read_policy(&run, &chosen)?;
+    let mut opened = read_policy(&run, &chosen)?;
+    if let Some(hold) = &args.hold {
+        hold.action(&opened.policy.description().spec)
+            .map_err(|error| wrong_use(format!("--hold {hold}: {error}")))?;
+        opened.hold = Some(hold.clone());
+    }
     let task = run.config()?.task.name;
     let path = args.output.clone().unwrap_or_else(|| {
         let name = dmprl_run::safe_name(&task);
@@ -109,6 +124,7 @@ pub(super) fn run(args: &ExportArgs) -> anyhow::Result<Outcome> {
             "success_rate": row.and_then(|row| row.success_rate),
             "observation_len": opened.policy.env_observation_len(),
             "segment_steps": layout.segment_steps, "action_len": layout.action_len,
+            "hold": args.hold.as_ref().map(Hold::to_string),
         })
         .to_string()
     } else {
@@ -119,12 +135,16 @@ pub(super) fn run(args: &ExportArgs) -> anyhow::Result<Outcome> {
             binary_bytes(bytes),
             chosen.version
         );
+        let held = args.hold.as_ref().map_or_else(
+            || "no hold stated; for a robot, export with --hold".to_owned(),
+            |hold| format!("held by {hold}"),
+        );
         match format {
             Format::Safetensors => format!(
-                "{head}\nin Python: dmprl.Policy.load({:?}).segment(observation)",
+                "{head}\n{held}\nin Python: dmprl.Policy.load({:?}).segment(observation)",
                 path.display().to_string()
             ),
-            Format::Onnx => head,
+            Format::Onnx => format!("{head}\n{held}"),
         }
     })?;
     Ok(Outcome::Done)
