@@ -1,6 +1,7 @@
 //! One run of a sweep: its directory and its process.
 
 use std::collections::BTreeMap;
+use std::ffi::OsString;
 use std::fs::{File, OpenOptions};
 use std::path::{Path, PathBuf};
 use std::process::{ExitStatus, Stdio};
@@ -15,6 +16,9 @@ use dmprl_shared::config::ExperimentConfig;
 use dmprl_shared::supervision::EvaluationRow;
 use rustix::process::{Pid, Signal, kill_process};
 use tokio::process::{Child, Command};
+
+/// The file of a run directory that is written last.
+const MANIFEST: &str = "manifest.json";
 
 /// Output directory of a sweep, and the program that trains its runs.
 #[derive(Debug, Clone)]
@@ -108,6 +112,23 @@ impl Site {
         self.output.join("logs").join(format!("{}.log", name.join("-")))
     }
 
+    /// Returns a shell command that starts a run, or resumes it once its directory exists. A batch
+    /// system may therefore repeat the command.
+    #[must_use]
+    pub fn shell_command(&self, run: &PlannedRun, config: &ExperimentConfig) -> String {
+        let path = self.output.join(&run.directory);
+        let command = |arguments: Vec<OsString>| {
+            let program = [self.program.clone().into_os_string()];
+            shell_words(&program.into_iter().chain(arguments).collect::<Vec<_>>())
+        };
+        format!(
+            "if [ -e {} ]; then {}; else {}; fi",
+            shell_words(&[path.join(MANIFEST).into()]),
+            command(resume_arguments(&path, config)),
+            command(train_arguments(&path, run)),
+        )
+    }
+
     /// Starts or resumes a run that has `env_steps` in its newest checkpoint.
     pub(super) fn start(
         &self,
@@ -120,16 +141,42 @@ impl Site {
         if !is_complete(&path) && path.exists() {
             set_aside(&path)?;
         }
-        if is_complete(&path) {
-            command.arg("resume").arg(&path).args(["--steps", &config.run.steps.to_string()]);
-        } else {
-            command.arg("train").args(&run.arguments).arg("--run-dir").arg(&path);
-        }
-        command.arg("--no-progress").stdin(Stdio::null()).stdout(Stdio::null());
+        command.args(match is_complete(&path) {
+            true => resume_arguments(&path, config),
+            false => train_arguments(&path, run),
+        });
+        command.stdin(Stdio::null()).stdout(Stdio::null());
         command.stderr(open_log(&self.log_path(run))?);
         let child = background_command(command).spawn()?;
         Ok(RunProcess { child, started: Instant::now(), env_steps })
     }
+}
+
+/// Returns the arguments that resume a run.
+fn resume_arguments(path: &Path, config: &ExperimentConfig) -> Vec<OsString> {
+    let steps = config.run.steps.to_string();
+    let flags = ["--steps".into(), steps.into(), "--no-progress".into()];
+    ["resume".into(), path.into()].into_iter().chain(flags).collect()
+}
+
+/// Returns the arguments that start a run.
+fn train_arguments(path: &Path, run: &PlannedRun) -> Vec<OsString> {
+    let planned = run.arguments.iter().map(Into::into);
+    let flags = ["--run-dir".into(), path.into(), "--no-progress".into()];
+    ["train".into()].into_iter().chain(planned).chain(flags).collect()
+}
+
+/// Joins words to a shell command. Words with other than harmless characters are quoted.
+fn shell_words(words: &[OsString]) -> String {
+    let harmless = |c: char| c.is_ascii_alphanumeric() || "-_./=:,+@".contains(c);
+    let quoted = words.iter().map(|word| {
+        let word = word.to_string_lossy();
+        match !word.is_empty() && word.chars().all(harmless) {
+            true => word.into_owned(),
+            false => format!("'{}'", word.replace('\'', r"'\''")),
+        }
+    });
+    quoted.collect::<Vec<_>>().join(" ")
 }
 
 /// Prepares a child that gets no signals from the terminal, and SIGTERM when this process dies.
@@ -173,7 +220,7 @@ impl RunProcess {
 
 /// Returns true if a run directory is complete: the manifest is written last.
 fn is_complete(path: &Path) -> bool {
-    path.join("manifest.json").is_file()
+    path.join(MANIFEST).is_file()
 }
 
 /// Rejects a run with another configuration: one table entry must not mix the results of both.
@@ -222,4 +269,15 @@ pub(super) fn evaluation_text(row: &EvaluationRow) -> String {
     let success =
         row.success_rate.map(|rate| format!(", success {:.0} %", rate * 100.0)).unwrap_or_default();
     format!("return {:.2}{success}", row.return_mean)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn words_of_a_shell_command_are_quoted_where_necessary() {
+        let words = ["train", "a b", "--set", "task.id=x:Y-v0", "it's", ""].map(OsString::from);
+        assert_eq!(shell_words(&words), r"train 'a b' --set task.id=x:Y-v0 'it'\''s' ''");
+    }
 }

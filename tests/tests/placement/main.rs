@@ -8,6 +8,7 @@
 
 mod own_checks;
 mod slurm;
+mod slurm_array;
 
 use std::fs;
 

@@ -27,7 +27,8 @@ fn assert_approved(output: &Output) {
 
 #[test]
 fn bash_and_its_linter_approve_of_the_scripts() {
-    for script in ["deploy/slurm/train.sbatch", ".ci/run", ".ci/installed"] {
+    let slurm = ["deploy/slurm/train.sbatch", "deploy/slurm/sweep.sbatch"];
+    for script in slurm.into_iter().chain([".ci/run", ".ci/installed"]) {
         assert_approved(&asked("bash", &["-n", script]).expect("bash"));
         match asked("shellcheck", &[script]) {
             Some(output) => assert_approved(&output),

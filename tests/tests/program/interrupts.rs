@@ -1,9 +1,10 @@
 //! Ctrl-C, once and twice, in normal and in broken runs.
 
 use std::path::Path;
+use std::process::Command;
 
 use dmprl_tests::program::{
-    Running, Workplace, env_steps, env_steps_of_checkpoint, rows, shared_memory_of,
+    Running, Workplace, env_steps, env_steps_of_checkpoint, executable, rows, shared_memory_of,
 };
 use rustix::process::Signal;
 use serde_json::{Value, json};
@@ -61,6 +62,28 @@ fn sigterm_is_an_interrupt_too() {
     let running = training(&place, &run);
     // To the supervisor alone, as a service manager does.
     running.signal(Signal::TERM);
+    running.wait().with_status(130).with_event(&interrupted());
+    assert_nothing_left(&place, &run);
+}
+
+/// `ssh` and a closed terminal send SIGHUP. `nohup` makes a program ignore it.
+#[test]
+fn loss_of_the_terminal_is_an_interrupt_unless_it_is_ignored() {
+    let place = Workplace::new();
+    let run = place.path("run");
+    let running = training(&place, &run);
+    running.signal_group(Signal::HUP);
+    running.wait().with_status(130).with_event(&interrupted());
+    assert_nothing_left(&place, &run);
+
+    let run = place.path("ignored");
+    let mut command = Command::new("nohup");
+    command.arg(executable()).args(train("reacher", &run, &EVENTS));
+    let mut running = place.start_command(command);
+    running.until_steps(&run, 1_500);
+    running.signal_group(Signal::HUP);
+    running.until_steps(&run, 4_000);
+    running.signal_group(Signal::INT);
     running.wait().with_status(130).with_event(&interrupted());
     assert_nothing_left(&place, &run);
 }

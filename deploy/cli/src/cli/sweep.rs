@@ -62,6 +62,7 @@ can read too: optuna-dashboard sqlite:///OUTPUT/optuna.db
 EXAMPLES
   dmprl sweep mine.toml --dry-run    # list the runs and their progress
   dmprl sweep mine.toml --jobs 4
+  dmprl sweep mine.toml --print-commands > runs.txt    # for a job array: docs/slurm.md
   dmprl sweep deploy/experiments/search-reacher.toml";
 
 /// Arguments of `dmprl sweep`.
@@ -80,6 +81,10 @@ pub(super) struct SweepArgs {
     /// Only list the runs, or a search's space and trials, with their progress.
     #[arg(long)]
     pub(super) dry_run: bool,
+    /// Only print a shell command for each run that is not finished, one per line, for a batch
+    /// system. Afterwards, start the sweep once more: it records the finished runs.
+    #[arg(long, conflicts_with_all = ["dry_run", "json", "jobs"])]
+    pub(super) print_commands: bool,
     /// Print one JSON object on standard output, with the directory and state of each run or trial.
     #[arg(long)]
     pub(super) json: bool,
@@ -90,12 +95,21 @@ pub(super) fn run(args: &SweepArgs) -> anyhow::Result<Outcome> {
     let output = args.output.clone().map_or_else(|| default_output(&args.file), Ok)?;
     let site = Site { program: this_program()?, output, text, checkpointed_steps };
     if let Some(search) = &file.search {
+        if args.print_commands {
+            return Err(wrong_use(
+                "a search has no --print-commands: its trials depend on the results of others"
+                    .to_owned(),
+            ));
+        }
         return search::run(args, &file, search, site);
     }
     let runs = configured(Plan::new(&file)?)?;
     let jobs = jobs(args, runs.iter().map(|(_, config)| config));
     let ledger = Ledger::open(&site.output)?;
     let mut plan = Sweep { site, runs, jobs, ledger };
+    if args.print_commands {
+        return print_commands(plan).map(|()| Outcome::Done);
+    }
     if args.dry_run {
         let states = states(&plan)?;
         return report(&plan, &states, args.json).map(|()| Outcome::Done);
@@ -105,6 +119,17 @@ pub(super) fn run(args: &SweepArgs) -> anyhow::Result<Outcome> {
     // Prepare Python once, before several runs need it at the same time.
     prepare_python()?;
     finish(plan, args)
+}
+
+/// Prints a shell command for each run that is not finished. Their paths are absolute.
+fn print_commands(mut plan: Sweep) -> anyhow::Result<()> {
+    let output = &mut plan.site.output;
+    *output = std::path::absolute(&*output)
+        .with_context(|| format!("cannot resolve {}", output.display()))?;
+    let states = states(&plan)?;
+    let open = plan.runs.iter().zip(&states).filter(|(_, state)| **state != RunState::Finished);
+    let commands = open.map(|((run, config), _)| plan.site.shell_command(run, config));
+    emit(&commands.collect::<Vec<_>>().join("\n"))
 }
 
 /// Environment steps of the newest checkpoint of a run; 0 if there is none.

@@ -56,27 +56,61 @@ pub struct MachineLimits {
 impl MachineLimits {
     /// Reads the current limits.
     pub fn this() -> Self {
-        let group = |file| control_group_min(Path::new(CONTROL_GROUPS), &own_group(), file);
+        let memberships = fs::read_to_string("/proc/self/cgroup").unwrap_or_default();
+        let group = |limit: GroupLimit| limit.least(Path::new(CONTROL_GROUPS), &memberships);
         let least = |limits: [Option<u64>; 2]| limits.into_iter().flatten().min();
         Self {
             shared_memory: Space::of(Place::of_this_user().base()).ok(),
             open_files: getrlimit(Resource::Nofile).current,
             maps: number(Path::new("/proc/sys/vm/max_map_count")),
-            tasks: least([getrlimit(Resource::Nproc).current, group("pids.max")]),
-            memory_bytes: least([Machine::this().memory_bytes, group("memory.max")]),
+            tasks: least([getrlimit(Resource::Nproc).current, group(TASKS)]),
+            memory_bytes: least([Machine::this().memory_bytes, group(MEMORY)]),
         }
     }
 }
 
-/// Returns this process's control group of version 2; empty if there is only version 1.
-fn own_group() -> String {
-    let text = fs::read_to_string("/proc/self/cgroup").unwrap_or_default();
-    let own = text.lines().find_map(|line| line.strip_prefix("0::/"));
-    own.unwrap_or_default().to_owned()
+/// A limit of a control group: the names of its files in versions 2 and 1 of control groups.
+struct GroupLimit {
+    /// Controller of version 1, which is also the name of its mount point.
+    controller: &'static str,
+    /// File of version 2.
+    file: &'static str,
+    /// File of version 1.
+    file_of_version_1: &'static str,
+}
+
+const TASKS: GroupLimit =
+    GroupLimit { controller: "pids", file: "pids.max", file_of_version_1: "pids.max" };
+const MEMORY: GroupLimit = GroupLimit {
+    controller: "memory",
+    file: "memory.max",
+    file_of_version_1: "memory.limit_in_bytes",
+};
+
+/// Limits from here on are none. Version 1 writes "no limit" as the largest multiple of the page
+/// size.
+const UNLIMITED_FROM: u64 = 1 << 62;
+
+impl GroupLimit {
+    /// Returns the smallest limit of this process's control groups, below the mount points in
+    /// `root`. `memberships` is the text of `/proc/self/cgroup`.
+    fn least(&self, root: &Path, memberships: &str) -> Option<u64> {
+        let limits = memberships.lines().filter_map(|line| {
+            let mut fields = line.splitn(3, ':').skip(1);
+            let (controllers, group) = (fields.next()?, fields.next()?.trim_start_matches('/'));
+            if controllers.is_empty() {
+                return control_group_min(root, group, self.file);
+            }
+            let has_it = controllers.split(',').any(|name| name == self.controller);
+            let mount = root.join(self.controller);
+            has_it.then(|| control_group_min(&mount, group, self.file_of_version_1))?
+        });
+        limits.filter(|limit| *limit < UNLIMITED_FROM).min()
+    }
 }
 
 /// Returns the smallest limit in `file` of the group and its ancestors. The value `max` means no
-/// limit. In a container, the process's own group is the root.
+/// limit. In a container, the process's own group is the root, whatever its name outside.
 fn control_group_min(root: &Path, group: &str, file: &str) -> Option<u64> {
     let own = root.join(group);
     let groups = own.ancestors().take_while(|path| path.starts_with(root));
@@ -105,6 +139,30 @@ mod tests {
         fs::write(inner.join("memory.max"), "1000\n").unwrap();
         assert_eq!(limit(), Some(1_000));
         assert_eq!(control_group_min(root.path(), "", "memory.max"), None);
+    }
+
+    #[test]
+    fn limits_of_both_versions_of_control_groups_count() {
+        let root = tempfile::tempdir().unwrap();
+        let write = |path: &str, text: &str| {
+            let path = root.path().join(path);
+            fs::create_dir_all(path.parent().unwrap()).unwrap();
+            fs::write(path, text).unwrap();
+        };
+        let (memory, tasks) = ("5:memory:/slurm/job_7", "3:cpu,pids:/slurm/job_7");
+        let hybrid = format!("{memory}\n{tasks}\n0::/user.slice\n");
+        let limits =
+            |memberships: &str| [MEMORY, TASKS].map(|limit| limit.least(root.path(), memberships));
+        assert_eq!(limits(&hybrid), [None, None]);
+        write("memory/slurm/memory.limit_in_bytes", "9223372036854771712\n");
+        assert_eq!(limits(&hybrid), [None, None], "the value for no limit");
+        write("memory/slurm/job_7/memory.limit_in_bytes", "8000\n");
+        write("pids/slurm/pids.max", "512\n");
+        write("pids/slurm/job_7/pids.max", "max\n");
+        assert_eq!(limits(&hybrid), [Some(8_000), Some(512)]);
+        write("user.slice/memory.max", "7000\n");
+        assert_eq!(limits(&hybrid), [Some(7_000), Some(512)]);
+        assert_eq!(limits("0::/\n"), [None, None], "version 2 alone ignores the others");
     }
 
     #[test]
