@@ -98,3 +98,22 @@ fn compose_approves_of_its_file() {
         None => skipped(REQUIRED_BY, FILE, "pip install check-jsonschema"),
     }
 }
+
+#[test]
+fn apptainer_builds_from_the_images_and_sources_of_the_dockerfile() {
+    let (recipe, dockerfile) = (read("deploy/apptainer.def"), read("deploy/Dockerfile"));
+    let argument = |name: &str| {
+        let line = dockerfile.lines().find_map(|line| line.strip_prefix(&format!("ARG {name}=")));
+        line.unwrap_or_else(|| panic!("no ARG {name}")).to_owned()
+    };
+    let image =
+        |name: &str, version: String| format!("{name}:{version}-slim-{}", argument("DEBIAN"));
+    let (rust, python) = (image("rust", argument("RUST")), image("python", argument("PYTHON")));
+    let used: Vec<_> = recipe.lines().filter_map(|line| line.strip_prefix("From: ")).collect();
+    assert_eq!(used, [&rust, &python, &python]);
+    let ignored = read("deploy/Dockerfile.dockerignore");
+    for source in ignored.lines().filter_map(|line| line.strip_prefix('!')) {
+        let name = source.trim_end_matches('*');
+        assert!(recipe.contains(&format!("    {name}")), "{source} is not copied");
+    }
+}
