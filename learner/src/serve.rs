@@ -201,7 +201,7 @@ pub fn close<R: SegmentReceiver, P: ParameterPublisher>(
     }
     let written = recorder.write_checkpoint(&mut session.learner);
     evaluation?;
-    written.map_err(|error| DueError::from(error))?;
+    written.map_err(DueError::from)?;
     if supervisor.is_gone() {
         return Err(ServeError::SupervisorGone);
     }

@@ -1,4 +1,4 @@
-//! Runs `deploy/slurm/sweep.sbatch` completely, with commands and `scontrol` that record their calls.
+//! Runs `deploy/slurm/sweep.sbatch` completely. Its commands and `scontrol` record their calls.
 
 use std::fs;
 use std::os::unix::fs::PermissionsExt;
