@@ -24,6 +24,7 @@ case $1 in
 esac
 if [ "$1" = train ]; then
     mkdir -p "$run"
+    echo "listen = $(sed 's/.*bridge.listen=\([^ ]*\).*/\1/' <<<"$*")" >"$run/config.toml"
     echo '{}' >"$run/manifest.json"
     echo secret >"$run/bridge.token"
 fi
@@ -61,6 +62,10 @@ impl Job {
 
     /// Starts it as Slurm does on the first of three nodes with eight cores each.
     fn start(&self, arguments: &[&str]) -> Child {
+        self.start_as("7", arguments)
+    }
+
+    fn start_as(&self, job: &str, arguments: &[&str]) -> Child {
         let path = std::env::var("PATH").unwrap();
         Command::new("bash")
             .arg(project_root().join("deploy/slurm/train.sbatch"))
@@ -68,7 +73,8 @@ impl Job {
             .current_dir(self.folder.path())
             .env("PATH", format!("{}:{path}", self.folder.path().display()))
             .env("CALLS", self.path("calls"))
-            .envs([("SLURM_JOB_ID", "7"), ("SLURM_JOB_NODELIST", "node[1-3]")])
+            .env("RUN_DIR", "runs/slurm-7")
+            .envs([("SLURM_JOB_ID", job), ("SLURM_JOB_NODELIST", "node[1-3]")])
             .envs([("SLURM_JOB_NUM_NODES", "3"), ("SLURM_CPUS_PER_TASK", "8")])
             .env("TMPDIR", "/tmp")
             // The signal of Slurm when it ends a job.
@@ -102,13 +108,13 @@ fn learner_is_on_the_first_node_and_workers_are_on_the_others() {
     job.until_called(3);
     job.learner_ends("0");
     assert_eq!(script.wait().unwrap().code(), Some(0));
-    let bridge = "dmprl bridge --connect tcp/first:7447 --token-file runs/slurm-7/bridge.token \
+    let bridge = "dmprl bridge --connect tcp/first:10007 --token-file runs/slurm-7/bridge.token \
                   --workers 8 --run-dir /tmp/dmprl-7-0";
     let calls = job.calls();
     assert_eq!(
         calls[0],
         "dmprl train reacher --steps 5 --run-dir runs/slurm-7 --workers 1 --no-progress \
-         --set bridge.listen=[\"tcp/0.0.0.0:7447\"] --set bridge.workers_max=16"
+         --set bridge.listen=[\"tcp/0.0.0.0:10007\"] --set bridge.workers_max=16"
     );
     assert!(calls[1].starts_with("srun --relative=1 --nodes=2 --ntasks=2 "), "{}", calls[1]);
     assert!(calls[1].ends_with(bridge), "{}", calls[1]);
@@ -126,10 +132,12 @@ fn job_whose_time_is_over_is_stopped_requeued_and_resumed() {
 
     fs::remove_file(job.path("runs/slurm-7/over")).unwrap();
     fs::remove_file(job.path("calls")).unwrap();
-    let mut script = job.start(&["reacher"]);
+    let mut script = job.start_as("123456", &["reacher"]);
     job.until_called(3);
     job.learner_ends("0");
     assert_eq!(script.wait().unwrap().code(), Some(0));
+    let keeps_its_port = |call: &String| call.contains("dmprl bridge --connect tcp/first:10007 ");
+    assert!(job.calls().iter().any(keeps_its_port), "{:?}", job.calls());
     // The token already exists, so the hosts may start first.
     assert!(job.calls().contains(&"dmprl resume runs/slurm-7 --no-progress".to_owned()));
 }
