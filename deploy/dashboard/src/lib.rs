@@ -6,8 +6,10 @@
 //! ```
 //! The dashboard only reads run directories and is independent of the training processes. It caches
 //! the data it has read, so a refresh reads only what was appended, and it sends only the new
-//! points of a curve. A request gives the name of a listed run or video, never a path.
+//! points of a curve. A request needs the dashboard's token, and gives the name of a listed run or
+//! video, never a path.
 
+mod access;
 mod api;
 mod cached_run;
 mod catalogue;

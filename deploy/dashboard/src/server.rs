@@ -1,4 +1,4 @@
-//! The HTTP server on loopback: routes, access checks and shutdown.
+//! The HTTP server on loopback: routes and shutdown.
 
 use std::net::{Ipv4Addr, SocketAddr};
 use std::path::{Path, PathBuf};
@@ -7,7 +7,6 @@ use std::time::Duration;
 
 use anyhow::Context;
 use axum::extract::{Query, Request, State};
-use axum::http::uri::Authority;
 use axum::http::{HeaderName, HeaderValue, StatusCode, header};
 use axum::middleware::{self, Next};
 use axum::response::{IntoResponse, Response};
@@ -22,6 +21,7 @@ use tower_http::compression::CompressionLayer;
 use tower_http::services::ServeFile;
 use tower_http::timeout::TimeoutLayer;
 
+use super::access::{self, Access};
 use super::api::{self, ApiError};
 use super::cached_run::TablePosition;
 use super::catalogue::Catalogue;
@@ -32,9 +32,6 @@ use super::prometheus;
 const REQUEST_TIMEOUT: Duration = Duration::from_secs(30);
 /// Time limit for responses in progress after Ctrl-C.
 const SHUTDOWN_TIMEOUT: Duration = Duration::from_millis(500);
-/// Accepted values of the `Host` header. This protects against DNS rebinding: in requests of a page
-/// whose domain resolves to this machine, the header has that domain.
-const LOCAL_HOSTS: [&str; 3] = ["localhost", "127.0.0.1", "[::1]"];
 /// Forbids inline scripts and resources of other origins.
 const SECURITY_POLICY: &str = "default-src 'none'; script-src 'self'; style-src 'self'; \
                                img-src 'self' data:; media-src 'self'; connect-src 'self'; \
@@ -55,6 +52,8 @@ pub struct Options<'o> {
     pub root: &'o Path,
     /// Port on 127.0.0.1; 0 for any free port.
     pub port: u16,
+    /// Token that each request must have, because every user of a machine can open its ports.
+    pub token: String,
 }
 
 type Shared = Arc<Mutex<Catalogue>>;
@@ -84,15 +83,17 @@ struct VideoQuery {
 /// Serves the page until the user interrupts it, which is the normal end.
 ///
 /// - `interrupts`: called in the runtime; returns a channel with one message per interrupt.
-/// - `on_listening`: called with the address once the server accepts connections.
+/// - `on_listening`: called with the page's URL once the server accepts connections.
 ///
 /// # Errors
-/// Wrong use: the directory does not exist. The port is in use.
+/// Wrong use: the directory does not exist, or the token has characters that URLs do not allow. The
+/// port is in use.
 pub fn serve(
-    options: &Options,
+    options: Options,
     interrupts: fn() -> anyhow::Result<mpsc::Receiver<()>>,
-    on_listening: impl FnOnce(SocketAddr) -> anyhow::Result<()>,
+    on_listening: impl FnOnce(&str) -> anyhow::Result<()>,
 ) -> anyhow::Result<Outcome> {
+    let access = Arc::new(Access::new(options.token)?);
     let mut catalogue = Catalogue::new(options.root)?;
     catalogue.scan();
     let runtime = tokio::runtime::Builder::new_current_thread()
@@ -105,9 +106,10 @@ pub fn serve(
         let listener = TcpListener::bind(address).await.with_context(|| {
             format!("cannot listen on {address}; choose another --port, or 0 for any free one")
         })?;
-        on_listening(listener.local_addr().context("cannot determine the port")?)?;
+        let address = listener.local_addr().context("cannot determine the port")?;
+        on_listening(&format!("http://{address}/{}", access.query()))?;
         let (stop, stopped) = tokio::sync::oneshot::channel::<()>();
-        let server = axum::serve(listener, router(Arc::new(Mutex::new(catalogue))))
+        let server = axum::serve(listener, router(Arc::new(Mutex::new(catalogue)), access))
             .with_graceful_shutdown(async { drop(stopped.await) });
         let mut server = std::pin::pin!(server.into_future());
         tokio::select! {
@@ -124,7 +126,7 @@ pub fn serve(
     served.map(|()| Outcome::Done)
 }
 
-fn router(shared: Shared) -> Router {
+fn router(shared: Shared, access: Arc<Access>) -> Router {
     let mut texts = Router::new()
         .route("/", get(|| async { page_file(&page::FILES[0]) }))
         .route("/api/runs", get(runs))
@@ -143,32 +145,17 @@ fn router(shared: Shared) -> Router {
     let texts = texts.layer(CompressionLayer::new());
     let all = texts.route("/video", get(video)).fallback(not_found);
     let timeout = TimeoutLayer::with_status_code(StatusCode::SERVICE_UNAVAILABLE, REQUEST_TIMEOUT);
-    all.layer(timeout).layer(middleware::from_fn(guard)).with_state(shared)
+    all.layer(timeout)
+        .layer(middleware::from_fn_with_state(access, access::check))
+        .layer(middleware::from_fn(add_headers))
+        .with_state(shared)
 }
 
-/// Rejects requests with a foreign `Host` header, and adds [`HEADERS`] to each response.
-async fn guard(request: Request, next: Next) -> Response {
-    let host = request.headers().get(header::HOST).and_then(|host| host.to_str().ok());
-    let mut response = match host {
-        Some(host) if is_local_host(host) => next.run(request).await,
-        _ => {
-            let host = host.unwrap_or_default();
-            let message = format!(
-                "Host header: expected localhost or 127.0.0.1, got {host:?}; from another \
-                 machine, use ssh -L 8787:127.0.0.1:PORT and open http://127.0.0.1:8787\n"
-            );
-            (StatusCode::FORBIDDEN, message).into_response()
-        }
-    };
+/// Adds [`HEADERS`] to each response.
+async fn add_headers(request: Request, next: Next) -> Response {
+    let mut response = next.run(request).await;
     response.headers_mut().extend(HEADERS);
     response
-}
-
-/// Returns true if a `Host` header names this machine. Any port is accepted, since the port may be
-/// forwarded.
-fn is_local_host(host: &str) -> bool {
-    let host = host.parse::<Authority>();
-    host.is_ok_and(|host| LOCAL_HOSTS.iter().any(|name| host.host().eq_ignore_ascii_case(name)))
 }
 
 fn page_file(file: &PageFile) -> Response {
@@ -265,20 +252,5 @@ impl IntoResponse for ApiError {
             Self::Internal(error) => (StatusCode::INTERNAL_SERVER_ERROR, format!("{error:#}")),
         };
         (status, Json(json!({ "error": message }))).into_response()
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn only_loopback_names_are_accepted_as_host() {
-        for local in ["localhost", "127.0.0.1:8787", "LOCALHOST:1", "[::1]:8787"] {
-            assert!(is_local_host(local), "{local}");
-        }
-        for foreign in ["", "evil.example:8787", "localhost.evil.example", "0.0.0.0", "a b"] {
-            assert!(!is_local_host(foreign), "{foreign}");
-        }
     }
 }

@@ -17,6 +17,7 @@ mod progress;
 pub mod project;
 mod random;
 mod rows;
+pub mod secret_file;
 mod setup;
 pub mod sweep_files;
 pub mod tail;

@@ -10,24 +10,51 @@ use dmprl_tests::program::{Running, Workplace, until};
 use rustix::process::Signal;
 use serde_json::{Value, json};
 
-use crate::http::{get, request};
+use crate::http::{Answer, request};
 use crate::{ENDLESS, train};
 
-/// Starts it on any port; returns host and port from standard output.
-pub fn start(place: &Workplace, directory: &str) -> (Running, String) {
-    let mut running = place.start(&["dashboard", directory, "--port", "0"]);
+/// The dashboard's address, from its URL on standard output.
+pub struct Address {
+    /// Host and port.
+    pub host: String,
+    pub token: String,
+}
+
+impl Address {
+    /// The URL that the dashboard printed.
+    pub fn url(&self) -> String {
+        format!("http://{}/?token={}", self.host, self.token)
+    }
+}
+
+/// Starts it on any port.
+pub fn start(place: &Workplace, directory: &str) -> (Running, Address) {
+    start_with(place, &["dashboard", directory, "--port", "0"])
+}
+
+fn start_with(place: &Workplace, args: &[&str]) -> (Running, Address) {
+    let mut running = place.start(args);
     running.until("an address", |running| running.printed().ends_with('\n'));
-    let address = running.printed().trim().strip_prefix("http://").unwrap().to_owned();
+    let url = running.printed().trim().strip_prefix("http://").unwrap().to_owned();
+    let (host, token) = url.split_once("/?token=").unwrap();
+    let address = Address { host: host.to_owned(), token: token.to_owned() };
     (running, address)
 }
 
+/// Sends GET with the token.
+fn get(address: &Address, path: &str) -> Answer {
+    let Address { host, token } = address;
+    let head = format!("Host: {host}\r\nAuthorization: Bearer {token}\r\n");
+    request(host, &format!("GET {path} HTTP/1.1\r\n{head}"))
+}
+
 /// Returns the entry of a run in the list.
-fn listed(address: &str, run: &str) -> Option<Value> {
+fn listed(address: &Address, run: &str) -> Option<Value> {
     let answer = get(address, "/api/runs").json();
     answer["runs"].as_array().unwrap().iter().find(|one| one["name"] == run).cloned()
 }
 
-fn curves(address: &str, query: &str) -> Value {
+fn curves(address: &Address, query: &str) -> Value {
     get(address, &format!("/api/curves?run=one&file=metrics&names=env_steps_per_s&{query}")).json()
 }
 
@@ -111,7 +138,7 @@ fn a_run_that_begins_later_appears_grows_and_stays_when_it_has_ended() {
 
     dashboard.signal_group(Signal::INT);
     dashboard.wait().with_status(0);
-    assert!(TcpStream::connect(&address).is_err());
+    assert!(TcpStream::connect(&address.host).is_err());
 }
 
 /// Checks the exposition format: each family is announced once, with a type, before its samples.
@@ -160,10 +187,9 @@ fn only_runs_and_their_videos_are_served_and_only_to_this_machine() {
     let names = get(&address, "/api/videos?run=one").json();
     assert_eq!(names["videos"], json!([{"name": "made.mp4", "bytes": video.len()}]));
     assert_eq!(get(&address, "/video?run=one&name=made.mp4").body, video);
-    let lines = format!(
-        "GET /video?run=one&name=made.mp4 HTTP/1.1\r\nHost: {address}\r\nRange: bytes=4-9\r\n"
-    );
-    let part = request(&address, &lines);
+    let head = format!("Host: {}\r\nAuthorization: Bearer {}\r\n", address.host, address.token);
+    let film = "GET /video?run=one&name=made.mp4 HTTP/1.1";
+    let part = request(&address.host, &format!("{film}\r\n{head}Range: bytes=4-9\r\n"));
     assert_eq!((part.status, part.body.as_slice()), (206, &video[4..10]));
 
     for path in [
@@ -188,20 +214,69 @@ fn only_runs_and_their_videos_are_served_and_only_to_this_machine() {
     }
     assert_eq!(status("/api/curves?run=one&file=lock&names=a"), 400);
     assert_eq!(status("/api/curves?run=one"), 400);
-    assert_eq!(
-        request(&address, &format!("POST /api/runs HTTP/1.1\r\nHost: {address}\r\n")).status,
-        405
-    );
+    let post = request(&address.host, &format!("POST /api/runs HTTP/1.1\r\n{head}"));
+    assert_eq!(post.status, 405);
     // A page of another site whose host name resolves to 127.0.0.1.
     for host in ["Host: evil.example\r\n", "Host: evil.example:8787\r\n", "Host: \r\n"] {
-        let answer = request(&address, &format!("GET /api/runs HTTP/1.1\r\n{host}"));
+        let lines = format!("GET /api/runs?token={} HTTP/1.1\r\n{host}", address.token);
+        let answer = request(&address.host, &lines);
         assert_eq!(answer.status, 403, "{host}");
         assert!(!answer.text().contains("reacher"));
     }
-    let port = address.rsplit_once(':').unwrap().1;
+    let port = address.host.rsplit_once(':').unwrap().1;
     let ended = place.run(&["dashboard", "runs", "--port", port]).with_status(1);
     ended.saying("choose another --port");
     place.run(&["dashboard", "nowhere"]).with_status(2).saying("there is no directory nowhere");
+}
+
+#[test]
+fn another_user_of_the_machine_needs_the_token() {
+    let place = Workplace::new();
+    let run = place.path("runs/one");
+    fs::create_dir(place.path("runs")).unwrap();
+    place.run(&train("reacher", &run, &["--steps", "1000"])).with_status(0);
+    let file = place.path("dashboard.token");
+    let args = ["dashboard", &place.path("runs"), "--port", "0", "--token-file", &file];
+    let (dashboard, address) = start_with(&place, &args);
+    let Address { host, token } = &address;
+    let ask = |path: &str, more: &str| {
+        request(host, &format!("GET {path} HTTP/1.1\r\nHost: {host}\r\n{more}"))
+    };
+    for path in ["/", "/api/runs", "/metrics", "/page/main.js", "/video?run=one&name=a.mp4", "/no"]
+    {
+        for more in ["", "Authorization: Bearer 0123456789abcdef\r\n"] {
+            let answer = ask(path, more);
+            assert_eq!(answer.status, 401, "{path}: {}", answer.text());
+            assert!(answer.text().contains("open the address"), "{path}: {}", answer.text());
+            assert!(!answer.text().contains(token.as_str()) && !answer.text().contains("reacher"));
+        }
+    }
+    // The printed URL gives the browser a cookie, and leads to a URL without the token.
+    let first = ask(&format!("/?token={token}"), "");
+    assert_eq!(first.status, 303);
+    let header = |name: &str| {
+        let line = first.head.lines().find_map(|line| line.strip_prefix(name)).unwrap();
+        line.trim().to_owned()
+    };
+    assert_eq!(header("location:"), "/");
+    let cookie = header("set-cookie:");
+    assert!(cookie.contains("httponly") && cookie.contains("samesite=lax"), "{cookie}");
+    let cookie = format!("Cookie: {}\r\n", cookie.split(';').next().unwrap());
+    assert_eq!(ask("/", &cookie).status, 200);
+    assert_eq!(ask("/api/runs", &cookie).status, 200);
+    // As Prometheus gives it.
+    assert_eq!(ask("/metrics", &format!("Authorization: Bearer {token}\r\n")).status, 200);
+    assert_eq!(ask(&format!("/metrics?token={token}"), "").status, 200);
+
+    dashboard.signal_group(Signal::INT);
+    dashboard.wait().with_status(0);
+    let (dashboard, again) = start_with(&place, &args);
+    assert_eq!(again.token, *token, "the token of the file");
+    drop(dashboard);
+    let (_dashboard, other) = start(&place, &place.path("runs"));
+    assert_ne!(other.token, *token);
+    fs::write(&file, "with a space, 16 characters").unwrap();
+    place.run(&args).with_status(2).saying("expected letters, digits");
 }
 
 #[test]

@@ -60,7 +60,7 @@ fn a_browser_watches_a_run_grow_beside_another() {
     let (dashboard, address) = start(&place, &place.path("runs"));
     let browser = Browser::start(program);
     browser.resize(1280, false);
-    browser.open(&format!("http://{address}/"));
+    browser.open(&address.url());
 
     // A run in training is shown without a click, and grows.
     let key = "env_steps_per_s";

@@ -25,11 +25,6 @@ impl Answer {
     }
 }
 
-/// Sends GET `path` to `address` (host and port), with that host as the header.
-pub fn get(address: &str, path: &str) -> Answer {
-    request(address, &format!("GET {path} HTTP/1.1\r\nHost: {address}\r\n"))
-}
-
 /// Sends the first lines of a request, and reads the answer to its end.
 pub fn request(address: &str, lines: &str) -> Answer {
     let mut stream = TcpStream::connect(address).unwrap();
