@@ -169,7 +169,10 @@ fn a_learner_killed_in_the_middle_of_a_checkpoint_goes_on_from_the_one_before() 
         });
         running.until("the learner's death", |running| {
             let events = running.events();
-            events.iter().filter(|event| event["event"] == "child_died").count() == kill
+            // Only the learner's, since an evaluator is killed with the learner that waits for it.
+            let is_death =
+                |event: &&Value| event["event"] == "child_died" && event["process"] == "learner";
+            events.iter().filter(is_death).count() == kill
         });
         running.until("a new learner", |running| {
             let events = running.events();
