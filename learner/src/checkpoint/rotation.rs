@@ -21,12 +21,15 @@ pub(super) fn next_name(folder: &Path) -> Result<String, CheckpointError> {
     Ok(format!("{:06}", newest + 1))
 }
 
-/// Deletes the partial files of a killed writer.
+/// Deletes the partial checkpoints and the partial link of a killed writer. Other processes write
+/// the other temporary files in the folder, such as the evaluator's link to the best policy.
 pub(super) fn remove_temporaries(folder: &Path) -> Result<(), CheckpointError> {
     for entry in fs::read_dir(folder).map_err(io_error(folder))? {
         let path = entry.map_err(io_error(folder))?.path();
         let name = path.file_name().unwrap_or_default().to_string_lossy().into_owned();
-        if name.starts_with('.') && name.ends_with(".tmp") {
+        let stem = name.strip_prefix('.').and_then(|name| name.strip_suffix(".tmp"));
+        let is_ours = |stem: &str| stem == LATEST || stem.parse::<u64>().is_ok();
+        if stem.is_some_and(is_ours) {
             let removed =
                 if path.is_dir() { fs::remove_dir_all(&path) } else { fs::remove_file(&path) };
             removed.map_err(io_error(&path))?;

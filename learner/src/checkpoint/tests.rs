@@ -412,9 +412,12 @@ fn a_half_written_checkpoint_is_never_taken_and_is_swept_away() {
     let torn = folder.join(".000002.tmp");
     fs::create_dir(&torn).unwrap();
     fs::write(torn.join(REPLAY), b"half").unwrap();
+    // The evaluator's: without this file, its link to the best policy could not be replaced.
+    let other = folder.join(".aside-1.tmp");
+    fs::write(&other, b"").unwrap();
     assert_eq!(load_newest(folder, &fresh).unwrap().1.name, name);
     assert_eq!(save(folder, &mut learner).unwrap(), "000002");
-    assert!(!torn.exists());
+    assert!(!torn.exists() && other.exists());
 }
 
 #[test]
