@@ -118,8 +118,10 @@ impl ParameterPublisher for Publisher {
 pub struct Subscriber {
     channel: Channel,
     membership: Membership<ReaderPort<f32, WireHeader>>,
-    parameters_len: usize,
     architecture_hash: u64,
+    /// Values of the snapshot that is being checked. They are copied before they are checked, since
+    /// a faulty peer could change them in shared memory between the check and the copy.
+    copied: Vec<f32>,
 }
 
 impl Subscriber {
@@ -127,8 +129,8 @@ impl Subscriber {
         let channel = channel(plan);
         let membership =
             Membership::new(domain, |node, disconnected| subscribe(&channel, node, disconnected))?;
-        let Plan { parameters_len, architecture_hash, .. } = *plan;
-        Ok(Self { channel, membership, parameters_len, architecture_hash })
+        let copied = vec![0.0; plan.parameters_len];
+        Ok(Self { channel, membership, architecture_hash: plan.architecture_hash, copied })
     }
 }
 
@@ -149,7 +151,7 @@ fn check(header: &WireHeader, values: &[f32], architecture_hash: u64) -> Result<
 
 impl ParameterSubscriber for Subscriber {
     fn newest(&mut self, snapshot: &mut ParameterSnapshot) -> Result<bool, TransportError> {
-        let Self { channel, membership, .. } = self;
+        let Self { channel, membership, copied, .. } = self;
         membership.renew(|node, disconnected| subscribe(channel, node, disconnected))?;
         let Some(port) = membership.port() else { return Ok(false) };
         let mut replaced = false;
@@ -159,19 +161,19 @@ impl ParameterSubscriber for Subscriber {
             let Some(sample) = received else { break };
             // The length comes from the peer, so check it.
             let got = usize::try_from(sample.header().number_of_elements()).unwrap_or(usize::MAX);
-            if got != self.parameters_len {
-                return Err(TransportError::Length { expected: self.parameters_len, got });
+            if got != copied.len() {
+                return Err(TransportError::Length { expected: copied.len(), got });
             }
             let header = *sample.user_header();
             if header.version <= snapshot.version {
                 continue;
             }
-            check(&header, sample.payload(), self.architecture_hash)?;
+            copied.copy_from_slice(sample.payload());
+            check(&header, copied, self.architecture_hash)?;
             snapshot.version = header.version;
             snapshot.env_steps = header.env_steps;
             snapshot.architecture_hash = header.architecture_hash;
-            snapshot.values.resize(self.parameters_len, 0.0);
-            snapshot.values.copy_from_slice(sample.payload());
+            snapshot.values.clone_from(copied);
             replaced = true;
         }
         Ok(replaced)
