@@ -85,6 +85,9 @@ class SegmentBuffers:
       invalid.
     - ``next_observations`` float64 (E, O): the observation for the next action: the first one of
       the new episode if the old one ended, else the last one. ``reset`` writes only this array.
+
+    Write into the arrays only during a call. The worker reads them between calls without a lock, so
+    a thread of your environment that writes at that time corrupts its segments.
     """
 
     def __init__(

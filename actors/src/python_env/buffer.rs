@@ -16,7 +16,9 @@ use super::PythonError;
 ///
 /// While the buffer is held, Python cannot move or resize the memory, so the pointer stays valid.
 /// Python writes only during the calls of [`super::PythonEnvironments`], which take `&mut self`.
-/// Slices borrow from that struct, so no slice exists during a call.
+/// Slices borrow from that struct, so no slice exists during a call. A thread of an environment
+/// that keeps an array and writes into it between calls would break this, which nothing can
+/// prevent; `segment_env.SegmentBuffers` forbids it.
 pub(super) struct SharedBuffer<T> {
     slice: NonNull<[T]>,
     _owner: PyBuffer<T>,

@@ -15,6 +15,7 @@ pub mod layer_norm;
 pub mod network;
 mod packed_weights;
 mod step;
+mod sync;
 pub mod thread_pool;
 
 /// Rows of the batch in one shard.

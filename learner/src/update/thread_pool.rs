@@ -3,13 +3,12 @@
 //! Any thread may compute any part. The result of a part depends only on its index, and no two
 //! parts write the same result, so the number of threads does not change a single bit.
 
-use std::sync::atomic::{AtomicBool, AtomicU32, AtomicUsize, Ordering};
-use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
-use std::thread::{self, JoinHandle};
+use std::sync::PoisonError;
 
-/// Polls for a new job before a thread sleeps. They last about as long as the pauses between the
-/// jobs of an update.
-const SPINS_MAX: u32 = 2_000;
+use super::sync::{
+    Arc, AtomicBool, AtomicU32, AtomicUsize, Condvar, JoinHandle, Mutex, MutexGuard, Ordering,
+    SPINS_MAX, spin_loop, thread,
+};
 
 /// A closure that computes one part, borrowed for the duration of one job.
 type Work = *const (dyn Fn(usize) + Sync);
@@ -123,7 +122,7 @@ impl Drop for WaitForHelpers<'_> {
         while self.0.busy.load(Ordering::Acquire) > 0 {
             spins += 1;
             if spins < SPINS_MAX {
-                std::hint::spin_loop();
+                spin_loop();
             } else {
                 // With more threads than free cores, the helper may need this core.
                 thread::yield_now();
@@ -134,8 +133,12 @@ impl Drop for WaitForHelpers<'_> {
 
 impl Drop for ThreadPool {
     fn drop(&mut self) {
-        self.shared.lock().shutdown = true;
+        let mut job = self.shared.lock();
+        job.shutdown = true;
+        // With the lock, as in `run`: a helper between its check and its wait would miss both this
+        // number and the notification.
         self.shared.jobs_started.fetch_add(1, Ordering::Release);
+        drop(job);
         self.shared.job_available.notify_all();
         for helper in self.helpers.drain(..) {
             // `run` has already reported a panic.
@@ -166,7 +169,7 @@ impl Shared {
             let mut spins = 0;
             while self.jobs_started.load(Ordering::Acquire) == seen && spins < SPINS_MAX {
                 spins += 1;
-                std::hint::spin_loop();
+                spin_loop();
             }
             let mut job = self.lock();
             while self.jobs_started.load(Ordering::Acquire) == seen {
