@@ -21,6 +21,10 @@ pub(super) fn hash(config: &ExperimentConfig, spec: &EnvSpec) -> u64 {
         spec.action_high,
         config.policy.hidden,
     );
+    // The same id with other arguments is another environment.
+    if config.task.has_options() {
+        list.push_str(&format!(" task {:?} {:?}", config.task.kwargs, config.task.wrappers));
+    }
     match config.policy.kind {
         PolicyKind::Mlp => list.push_str(" mlp"),
         PolicyKind::Dmp => list.push_str(&dmp(config, spec)),
@@ -107,6 +111,15 @@ mod tests {
     }
 
     #[test]
+    fn hash_of_a_task_with_arguments_is_unchanged() {
+        let hash = hash_of(&[
+            ("task.kwargs", "{ a = \"text\", b = 1, c = 1.5, d = [true, inf], e = { f = 1 } }"),
+            ("task.wrappers", "[\"module:name\"]"),
+        ]);
+        assert_eq!(format!("{hash:016x}"), "0");
+    }
+
+    #[test]
     fn hash_depends_only_on_values_that_determine_the_actions() {
         let same = hash_of(&[]);
         for (key, value) in [
@@ -117,6 +130,8 @@ mod tests {
             assert_eq!(hash_of(&[(key, value)]), same, "{key}");
         }
         for (key, value) in [
+            ("task.kwargs.reward_type", "dense"),
+            ("task.wrappers", "[\"module:name\"]"),
             ("policy.hidden", "[256]"),
             ("policy.rho_range", "1.0"),
             ("policy.start", "observed"),
