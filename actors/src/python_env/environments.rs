@@ -281,10 +281,7 @@ impl PythonEnvironments {
 }
 
 /// Converts the task's arguments and wrappers to an `EnvOptions` of the package `dmprl`.
-pub(super) fn read_options<'py>(
-    py: Python<'py>,
-    task: &TaskConfig,
-) -> PyResult<Bound<'py, PyAny>> {
+pub(super) fn read_options<'py>(py: Python<'py>, task: &TaskConfig) -> PyResult<Bound<'py, PyAny>> {
     let class = py.import("dmprl.env_options")?.getattr("EnvOptions")?;
     class.call_method1("parse", (task.options_toml(),))
 }

@@ -1,6 +1,10 @@
 //! Hash of a policy's architecture. With equal hashes, equal parameters and observations give equal
 //! actions.
 
+use std::collections::BTreeMap;
+
+use toml::Value;
+
 use crate::config::{AlgorithmName, Controller, ExperimentConfig, PolicyKind, StartSource};
 use crate::seeds;
 use crate::spec::EnvSpec;
@@ -23,7 +27,8 @@ pub(super) fn hash(config: &ExperimentConfig, spec: &EnvSpec) -> u64 {
     );
     // The same id with other arguments is another environment.
     if config.task.has_options() {
-        list.push_str(&format!(" task {:?} {:?}", config.task.kwargs, config.task.wrappers));
+        let kwargs = sorted(&Value::Table(config.task.kwargs.clone()));
+        list.push_str(&format!(" task {kwargs} {:?}", config.task.wrappers));
     }
     match config.policy.kind {
         PolicyKind::Mlp => list.push_str(" mlp"),
@@ -36,6 +41,19 @@ pub(super) fn hash(config: &ExperimentConfig, spec: &EnvSpec) -> u64 {
         list.push_str(" learned std");
     }
     seeds::derive(0, &list, 0)
+}
+
+/// Formats a value with the keys of its tables in order, which a build of `toml` may not have.
+fn sorted(value: &Value) -> String {
+    match value {
+        Value::Table(table) => {
+            let texts: BTreeMap<_, _> =
+                table.iter().map(|(key, value)| (key, sorted(value))).collect();
+            format!("{texts:?}")
+        }
+        Value::Array(values) => format!("{:?}", values.iter().map(sorted).collect::<Vec<_>>()),
+        value => format!("{value:?}"),
+    }
 }
 
 fn dmp(config: &ExperimentConfig, spec: &EnvSpec) -> String {
@@ -113,10 +131,10 @@ mod tests {
     #[test]
     fn hash_of_a_task_with_arguments_is_unchanged() {
         let hash = hash_of(&[
-            ("task.kwargs", "{ a = \"text\", b = 1, c = 1.5, d = [true, inf], e = { f = 1 } }"),
+            ("task.kwargs", "{ b = 1, a = \"x\", c = 1.5, e = { g = 2, f = 1 }, d = [true, inf] }"),
             ("task.wrappers", "[\"module:name\"]"),
         ]);
-        assert_eq!(format!("{hash:016x}"), "0");
+        assert_eq!(format!("{hash:016x}"), "72267294194189d7");
     }
 
     #[test]
