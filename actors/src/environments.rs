@@ -44,7 +44,7 @@ pub fn make(
     on_hang: impl FnOnce(String) + Send + 'static,
 ) -> Result<PythonEnvironments, EnvironmentsError> {
     let steps = config.policy.decision_steps();
-    let environments = PythonEnvironments::start(interpreter, &config.task.id, count, steps)?;
+    let environments = PythonEnvironments::start(interpreter, &config.task, count, steps)?;
     watch(&environments, config, on_hang)?;
     Ok(environments)
 }

@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from dmprl.env_options import EnvOptions
 from dmprl.numpy_policy import Actor
 
 PANDA_GYM_IDS = {
@@ -46,10 +47,12 @@ class RandomActor:
 
 def gymnasium_env(plan: dict) -> Any:
     """Creates the environment with Gymnasium, or raises :class:`AbsentError` with the reason."""
-    task_id = plan["task"]["id"]
+    task_id, options = plan["task"]["id"], EnvOptions.parse(plan["options"])
     module_name, _, name = task_id.rpartition(":")
     try:
         import gymnasium
+
+        from dmprl.gymnasium_env import wrapped
 
         named = getattr(importlib.import_module(module_name), name, None) if module_name else None
         if "gymnasium_robotics" in sys.modules:
@@ -57,17 +60,25 @@ def gymnasium_env(plan: dict) -> Any:
 
             robotics_repair.repair()
         if named is None:
-            return flattened(gymnasium.make(task_id))
+            env = gymnasium.make(task_id, **options.kwargs)
+            return flattened(wrapped(env, options.wrappers))
         if isinstance(named, type) and issubclass(named, gymnasium.Env):
             limit = plan["spec"]["episode_steps"] or None
             spec = gymnasium.envs.registration.EnvSpec(
                 task_id, entry_point=named, max_episode_steps=limit
             )
-            return flattened(gymnasium.make(spec))
+            env = gymnasium.make(spec, **options.kwargs)
+            return flattened(wrapped(env, options.wrappers))
     except Exception as error:  # for any error, the rest of the benchmark continues
         reason = f"{type(error).__name__}: {error}"
         raise AbsentError(f"Gymnasium cannot create {task_id}: {reason}") from None
     raise AbsentError(f"{task_id} is not a Gymnasium environment")
+
+
+def refuse_options(plan: dict, peer: str) -> None:
+    """Raises :class:`AbsentError` if the task has arguments or wrappers, which the peer lacks."""
+    if plan["task"].get("kwargs") or plan["task"].get("wrappers"):
+        raise AbsentError(f"{peer}'s environment has no task.kwargs or task.wrappers")
 
 
 def flattened(env: Any) -> Any:
@@ -133,6 +144,7 @@ class EnvPoolLoop:
     """
 
     def __init__(self, plan: dict, seed: int) -> None:
+        refuse_options(plan, "EnvPool")
         envpool = imported("envpool")
         task_id = envpool_id(plan["task"]["id"], envpool.list_all_envs())
         env_count = plan["env_count"]
@@ -182,6 +194,7 @@ class PandaGymLoop:
         task_id = PANDA_GYM_IDS.get(plan["task"]["id"])
         if task_id is None:
             raise AbsentError(f"panda-gym has no {plan['task']['id']}")
+        refuse_options(plan, "panda-gym")
         panda_gym, gymnasium = imported("panda_gym", "panda-gym"), imported("gymnasium")
         self._envs = [gymnasium.make(task_id) for _ in range(plan["env_count"])]
         self._actor = RandomActor(plan, seed)

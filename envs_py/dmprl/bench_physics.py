@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dmprl.bench_peers import AbsentError, RandomActor, flat, gymnasium_env
+from dmprl.env_options import EnvOptions
 from dmprl.numpy_policy import Actor
 
 CONTROLS_BYTES_MAX = 64 << 20
@@ -114,8 +115,9 @@ def worker_episode(plan: dict, seed: int) -> Episode:
     from dmprl.segment_env import SegmentBuffers, make
 
     task_id, env_count = plan["task"]["id"], plan["env_count"]
+    options = EnvOptions.parse(plan["options"])
     try:
-        env = make(task_id, env_count, 1)
+        env = make(task_id, env_count, 1, options)
     except Exception as error:
         raise AbsentError(f"cannot create {task_id}: {error}") from None
     # Duck typing, because this works for every environment that steps a Batch.
@@ -160,7 +162,12 @@ def gymnasium_episode(plan: dict, seed: int, path: str) -> Episode:
 
 
 def gymnasium_model_path(plan: dict) -> str | None:
-    """Finds the model file of one of Gymnasium's own MuJoCo environments."""
+    """Finds the model file of one of Gymnasium's own MuJoCo environments.
+
+    The policy of an environment with wrappers cannot act on the observations of the physics alone.
+    """
+    if EnvOptions.parse(plan["options"]).wrappers:
+        return None
     try:
         env = gymnasium_env(plan).unwrapped
     except AbsentError:

@@ -13,7 +13,7 @@ import math
 import sys
 import traceback
 from collections import deque
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from types import MappingProxyType
 
 import gymnasium
@@ -23,6 +23,7 @@ from gymnasium.envs import registration
 from numpy.typing import NDArray
 
 from dmprl import robotics_repair
+from dmprl.env_options import NO_OPTIONS, EnvOptions
 from dmprl.hindsight import GymnasiumGoals
 from dmprl.observation_names import names_of
 from dmprl.segment_env import (
@@ -37,6 +38,7 @@ from dmprl.segment_env import (
     SegmentEnv,
     SegmentEnvError,
     UnsupportedSpaceError,
+    named_object,
     seed_after_failure,
 )
 
@@ -58,15 +60,22 @@ class GymnasiumSegmentEnv(SegmentEnv):
     The passive checker and the order enforcer are omitted: they only check the caller, which costs
     time in every step, and :meth:`step_segment` checks the order itself.
 
-    - ``named``: the object that ``task_id`` names if it is ``module:Name``. A ``gymnasium.Env``
-      class is created without arguments; its optional attribute ``max_episode_steps`` limits its
-      episodes.
+    - ``named``: the object that ``task_id`` names if it is ``module:Name``. The optional attribute
+      ``max_episode_steps`` of a class or function limits its episodes.
+    - ``options``: arguments of ``gymnasium.make``, and wrappers, which are applied to its result
+      and thus outside the time limit.
     """
 
     def __init__(
-        self, task_id: str, env_count: int, segment_steps: int, named: object = None
+        self,
+        task_id: str,
+        env_count: int,
+        segment_steps: int,
+        named: object = None,
+        options: EnvOptions = NO_OPTIONS,
     ) -> None:
         self.task_id = task_id
+        self.options = options
         self.env_count = env_count
         self.segment_steps = segment_steps
         self._registered = self._registration(named)
@@ -114,7 +123,7 @@ class GymnasiumSegmentEnv(SegmentEnv):
 
     def _make_unregistered(self) -> gymnasium.Env:
         try:
-            return gymnasium.make(self.task_id)
+            return gymnasium.make(self.task_id, **self.options.kwargs)
         except gymnasium.error.UnregisteredEnv as error:
             module, _, name = self.task_id.rpartition(":")
             if not module:
@@ -124,8 +133,11 @@ class GymnasiumSegmentEnv(SegmentEnv):
                 f"and registers no environment with that name ({error})"
             ) from None
 
-    def _make(self, options: Mapping[str, object] = MappingProxyType({})) -> gymnasium.Env:
-        env = gymnasium.make(self._registered, disable_env_checker=True, **options)
+    def _make(self, more: Mapping[str, object] = MappingProxyType({})) -> gymnasium.Env:
+        """Creates an environment; ``more`` are arguments that take precedence."""
+        kwargs = {**self.options.kwargs, **more}
+        env = gymnasium.make(self._registered, disable_env_checker=True, **kwargs)
+        env = wrapped(env, self.options.wrappers)
         observation, action = env.observation_space, env.action_space
         self._observation_space = observation
         if isinstance(observation, spaces.Dict | spaces.Tuple) and observation.is_np_flattenable:
@@ -314,6 +326,19 @@ class GymnasiumSegmentEnv(SegmentEnv):
         )
         failure.__cause__ = error
         return failure
+
+
+def wrapped(env: gymnasium.Env, names: Sequence[str]) -> gymnasium.Env:
+    """Applies wrappers by name (``module:name``), the innermost first."""
+    for name in names:
+        wrapper = named_object(name)
+        if not callable(wrapper):
+            module, _, word = name.rpartition(":")
+            raise AttributeError(f"the module {module} has no class or function {word}")
+        env = wrapper(env)
+        if not isinstance(env, gymnasium.Env):
+            raise TypeError(f"{name} returned {type(env).__name__}; expected a gymnasium.Env")
+    return env
 
 
 def success_of(info: dict) -> int:

@@ -139,7 +139,8 @@ class BatchSegmentEnv(SegmentEnv):
         self._current = np.zeros((self.env_count, len(self._names)))
         self._actions = np.zeros((self.env_count, segment_steps, len(task.action_low)), np.float32)
         self._rows = np.arange(self.env_count)
-        self._limit = np.iinfo(np.int32).max if episode_steps is None else episode_steps
+        self._episode_steps = episode_steps or 0
+        self._limit = episode_steps or np.iinfo(np.int32).max
         # Number of steps until truncation; 0 before the first reset.
         self._remaining = np.zeros(self.env_count, np.int32)
         self._all_began = False
@@ -180,7 +181,7 @@ class BatchSegmentEnv(SegmentEnv):
             "action_low": task.action_low.astype(np.float64).tolist(),
             "action_high": task.action_high.astype(np.float64).tolist(),
             "control_dt_s": task.model.opt.timestep * task.frame_skip,
-            "episode_steps": task.episode_steps,
+            "episode_steps": self._episode_steps,
         }
 
     def reset(  # noqa: D102 - inherited

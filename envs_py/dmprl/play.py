@@ -23,12 +23,12 @@ import gymnasium
 import numpy as np
 
 from dmprl import python_path
+from dmprl.env_options import NO_OPTIONS, EnvOptions
 from dmprl.gymnasium_env import GymnasiumSegmentEnv, success_of
-from dmprl.mujoco_batch import MujocoTask
 from dmprl.pictures import name_opengl
 from dmprl.policy import Policy
-from dmprl.recording import gymnasium_id, task_maker
 from dmprl.segment_env import SUCCESS_YES, SegmentEnv, named_object
+from dmprl.task_env import gymnasium_maker
 
 INTERRUPTED = 130
 """Exit status after an interrupt."""
@@ -160,14 +160,12 @@ class Painter:
 class Shown(GymnasiumSegmentEnv):
     """One Gymnasium environment with a render mode."""
 
-    def __init__(self, task_id: str, render_mode: str) -> None:
+    def __init__(self, task_id: str, render_mode: str, options: EnvOptions = NO_OPTIONS) -> None:
         named = named_object(task_id)
         if isinstance(named, type) and issubclass(named, SegmentEnv):
             raise SystemExit(f"{task_id} is a SegmentEnv, which cannot be shown")
-        if isinstance(named, type) and issubclass(named, MujocoTask):
-            named = task_maker(task_id, named)
         self._mode = render_mode
-        super().__init__(gymnasium_id(task_id), 1, 1, named)
+        super().__init__(task_id, 1, 1, gymnasium_maker(task_id, named, options), options)
 
     def _make(self) -> gymnasium.Env:
         why = (
@@ -217,6 +215,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(prog="dmprl play")
     parser.add_argument("policy")
     parser.add_argument("--task", required=True)
+    parser.add_argument("--options", type=EnvOptions.parse, default=NO_OPTIONS, help="TOML")
     parser.add_argument("--title", required=True)
     parser.add_argument("--seed", type=int, required=True)
     parser.add_argument("--episodes", type=int, default=0, help="0: until it is interrupted")
@@ -232,11 +231,11 @@ def main() -> int:
         seeds = itertools.islice(seeds, arguments.episodes)
     try:
         if arguments.window:
-            shown = Shown(arguments.task, "human").environment
+            shown = Shown(arguments.task, "human", arguments.options).environment
             play(policy, shown, seeds, lambda text: None)
             return 0
         name_opengl()
-        shown = Shown(arguments.task, "rgb_array").environment
+        shown = Shown(arguments.task, "rgb_array", arguments.options).environment
         painter = Painter(shown)
         show = Show(arguments.title)
         try:

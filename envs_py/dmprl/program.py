@@ -59,7 +59,7 @@ def flags(values: dict[str, Any]) -> list[str]:
 
     ``steps=20_000`` becomes ``--steps 20000``, ``algorithm__batch_size=64`` becomes
     ``--set algorithm.batch_size=64``, and True becomes the flag without a value. None and False are
-    omitted. A list repeats the flag for each entry.
+    omitted. A list repeats the flag for each entry. A dictionary does too, with ``key=value``.
     """
     words: list[str] = []
     for name, value in values.items():
@@ -70,6 +70,9 @@ def flags(values: dict[str, Any]) -> list[str]:
             words += ["--set", f"{name.replace('__', '.')}={_toml(value)}"]
         elif value is True:
             words.append(flag)
+        elif isinstance(value, dict):
+            pairs = (f"{key}={_toml([entry])[1:-1]}" for key, entry in value.items())
+            words += [word for pair in pairs for word in (flag, pair)]
         elif isinstance(value, (list, tuple)):
             words += [word for entry in value for word in (flag, str(entry))]
         else:

@@ -6,9 +6,7 @@ episodes equal those of an evaluation with the same seeds; they run one step at 
 
 from __future__ import annotations
 
-import functools
 import os
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple, TypedDict
 
@@ -27,13 +25,13 @@ except Exception as error:  # raised by the OpenGL that MUJOCO_GL names
         "libosmesa6 for osmesa"
     ) from None
 
+from dmprl import segment_env
+from dmprl.env_options import NO_OPTIONS, EnvOptions
 from dmprl.gymnasium_env import GymnasiumSegmentEnv, success_of
-from dmprl.mujoco_batch import MujocoTask, quieten_mujoco
 from dmprl.pictures import name_opengl
 from dmprl.robot_joints import Joints, robot_joints
 from dmprl.segment_env import EnvSpec, SegmentBuffers, SegmentEnv, named_object
-from dmprl.task_env import TaskEnv
-from dmprl.tasks import registered
+from dmprl.task_env import TaskEnv, gymnasium_maker
 
 RENDER_MODE = "rgb_array"
 DRAWABLE = f"expected a Gymnasium environment with the render mode {RENDER_MODE!r}"
@@ -158,23 +156,23 @@ class RecordingEnv(GymnasiumSegmentEnv):
         segment_steps: int,
         named: object = None,
         pictures: Path | None = None,
+        options: EnvOptions = NO_OPTIONS,
     ) -> None:
         self._log = Log(pictures)
-        self.name = task_id
-        self._options = {} if pictures is None else {"render_mode": RENDER_MODE}
-        super().__init__(gymnasium_id(task_id), 1, segment_steps, named)
+        self._drawing = {} if pictures is None else {"render_mode": RENDER_MODE}
+        super().__init__(task_id, 1, segment_steps, named, options)
         state = self._envs[0].state()
         self._log.joints = None if state is None else robot_joints(state.model)
 
     def _make(self) -> gymnasium.Env:
-        if not self._options:
+        if not self._drawing:
             return Watched(super()._make(), self._log)
         try:
-            env = Watched(super()._make(self._options), self._log)
+            env = Watched(super()._make(self._drawing), self._log)
         except TypeError as error:
-            raise NoPicturesError(f"{self.name} cannot be drawn: {error}; {DRAWABLE}") from error
+            raise NoPicturesError(f"{self.task_id} cannot be drawn: {error}; {DRAWABLE}") from error
         if env.render_mode != RENDER_MODE:
-            raise NoPicturesError(f"{self.name} cannot be drawn; {DRAWABLE}")
+            raise NoPicturesError(f"{self.task_id} cannot be drawn; {DRAWABLE}")
         return env
 
     def goal_in_pictures(self) -> str:
@@ -183,9 +181,11 @@ class RecordingEnv(GymnasiumSegmentEnv):
         return env.task.goal_in_pictures if isinstance(env, TaskEnv) else ""
 
     def spec(self) -> EnvSpec:  # noqa: D102 - inherited
-        spec = {**super().spec(), "id": self.name}
+        spec = super().spec()
         env = self._envs[0].unwrapped
-        if isinstance(env, TaskEnv):
+        if isinstance(env, TaskEnv) and not self.options.wrappers:
+            # As the worker's batch of this task reports them.
+            spec["id"] = env.task.id
             spec["observation_names"] = env.task.observation_names()
         return spec
 
@@ -265,10 +265,15 @@ def steps_per_frame(env: gymnasium.Env) -> int:
     return max(1, round(1.0 / (FRAME_RATE_MAX * dt))) if np.isscalar(dt) and dt > 0 else 1
 
 
-def make(task_id: str, segment_steps: int, pictures: str | None = None) -> RecordingEnv | OpaqueEnv:
+def make(
+    task_id: str,
+    segment_steps: int,
+    pictures: str | None = None,
+    options: EnvOptions = NO_OPTIONS,
+) -> RecordingEnv | OpaqueEnv:
     """Creates one environment of a task.
 
-    - ``task_id``: as for :func:`dmprl.segment_env.make`.
+    - ``task_id``, ``options``: as for :func:`dmprl.segment_env.make`.
     - ``pictures``: folder for pictures; None to make no pictures.
     """
     if pictures is not None:
@@ -277,26 +282,7 @@ def make(task_id: str, segment_steps: int, pictures: str | None = None) -> Recor
     if isinstance(named, type) and issubclass(named, SegmentEnv):
         if pictures is not None:
             raise NoPicturesError(f"{task_id} is a SegmentEnv, which cannot be drawn; {DRAWABLE}")
-        return OpaqueEnv(named(1, segment_steps))
+        return OpaqueEnv(segment_env.make(task_id, 1, segment_steps, options))
     folder = None if pictures is None else Path(pictures)
-    if isinstance(named, type) and issubclass(named, MujocoTask):
-        named = task_maker(task_id, named)
-    elif registered(task_id.removeprefix("dmprl:")) is None:
-        return RecordingEnv(task_id, segment_steps, named, folder)
-    quieten_mujoco()
-    return RecordingEnv(task_id, segment_steps, named, folder)
-
-
-def task_maker(task_id: str, task: type[MujocoTask]) -> Callable[..., TaskEnv]:
-    """Wraps a user's own task for ``gymnasium.make``."""
-    maker = functools.partial(TaskEnv, task_id, task=task)
-    maker.max_episode_steps = task.episode_steps
-    return maker
-
-
-def gymnasium_id(task_id: str) -> str:
-    """Returns the id of dmprl's task in place of an equal one of Gymnasium, as a worker does."""
-    ours = task_id.removeprefix("dmprl:")
-    if registered(ours) is None or ours.startswith("dmprl/"):
-        return ours
-    return f"dmprl/{ours}"
+    maker = gymnasium_maker(task_id, named, options)
+    return RecordingEnv(task_id, segment_steps, maker, folder, options)

@@ -16,6 +16,8 @@ from typing import NotRequired, TypedDict
 import numpy as np
 from numpy.typing import NDArray
 
+from dmprl.env_options import NO_OPTIONS, EnvOptions
+
 SUCCESS_NO, SUCCESS_YES, SUCCESS_NOT_REPORTED = 0, 1, 2
 """Values of :attr:`SegmentBuffers.success`."""
 
@@ -126,9 +128,10 @@ class SegmentEnv(ABC):
     """E environments that step a whole segment in one call.
 
     Subclass this for a simulator that is faster than a loop over Gymnasium environments. Its task
-    id is ``module:Class``, and it is constructed as ``Class(env_count, segment_steps)``. An
-    implementation must not keep a reference to the buffers after a call, and must write every row
-    of every array that the call is documented to write.
+    id is ``module:Class``, and it is constructed as ``Class(env_count, segment_steps, **kwargs)``
+    with the arguments in ``task.kwargs``. An implementation must not keep a reference to the
+    buffers after a call, and must write every row of every array that the call is documented to
+    write.
     """
 
     env_count: int
@@ -211,35 +214,60 @@ def seed_after_failure(first_seed: int, failures: int) -> int:
     return int(np.random.SeedSequence([first_seed, failures]).generate_state(1)[0]) >> 1
 
 
-def make(task_id: str, env_count: int, segment_steps: int) -> SegmentEnv:
+def make(
+    task_id: str, env_count: int, segment_steps: int, options: EnvOptions = NO_OPTIONS
+) -> SegmentEnv:
     """Creates the environments of a task.
 
     - ``task_id``: a Gymnasium id; ``module:Id`` if ``module`` registers the id when it is imported;
       or ``module:name``, where ``name`` is a subclass of :class:`SegmentEnv`,
       ``dmprl.mujoco_batch.MujocoTask`` or ``gymnasium.Env``, or a function that returns a
       ``gymnasium.Env``.
+    - ``options``: arguments and wrappers. Environments with wrappers are Gymnasium environments,
+      stepped one by one, even those of dmprl's own tasks.
+
+    Raises:
+        OptionsError: if they cannot be created with these options; the cause is the original error.
     """
     if env_count < 1 or segment_steps < 1:
         raise ValueError(
             f"{env_count} environments, {segment_steps} steps; expected 1 or more of both"
         )
     candidate = named_object(task_id)
+    with options.explained(task_id):
+        if not options.wrappers:
+            batch = _make_batch(task_id, candidate, env_count, segment_steps, options)
+            if batch is not None:
+                return batch
+
+        if isinstance(candidate, type) and issubclass(candidate, SegmentEnv):
+            raise TypeError("a SegmentEnv cannot be wrapped; expected a gymnasium.Env")
+
+        # A SegmentEnv works without Gymnasium.
+        from dmprl.gymnasium_env import GymnasiumSegmentEnv
+
+        if options.wrappers:
+            from dmprl.task_env import gymnasium_maker
+
+            candidate = gymnasium_maker(task_id, candidate, options)
+        return GymnasiumSegmentEnv(task_id, env_count, segment_steps, candidate, options)
+
+
+def _make_batch(
+    task_id: str, candidate: object, env_count: int, segment_steps: int, options: EnvOptions
+) -> SegmentEnv | None:
+    """Creates environments that are stepped together; None for Gymnasium environments."""
     if isinstance(candidate, type) and issubclass(candidate, SegmentEnv):
-        return candidate(env_count, segment_steps)
+        return candidate(env_count, segment_steps, **options.kwargs)
     batched = sys.modules.get("dmprl.mujoco_batch")  # imported with every subclass of its task
     if batched and isinstance(candidate, type) and issubclass(candidate, batched.MujocoTask):
         batched.quieten_mujoco()
-        return candidate(env_count).batch(segment_steps, candidate.episode_steps)
+        kwargs, episode_steps = options.split_time_limit(candidate.episode_steps)
+        return candidate(env_count, **kwargs).batch(segment_steps, episode_steps)
 
     from dmprl.tasks import make_batch
 
-    batch = make_batch(task_id.removeprefix("dmprl:"), env_count, segment_steps)
-    if batch is not None:
-        return batch
-
-    from dmprl.gymnasium_env import GymnasiumSegmentEnv  # a SegmentEnv works without Gymnasium
-
-    return GymnasiumSegmentEnv(task_id, env_count, segment_steps, candidate)
+    return make_batch(task_id.removeprefix("dmprl:"), env_count, segment_steps, options)
 
 
 def named_object(task_id: str) -> object:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import os
 from collections.abc import Callable
 from typing import Any, ClassVar
@@ -12,9 +13,10 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from dmprl.mujoco_batch import MujocoTask
+from dmprl.env_options import EnvOptions
+from dmprl.mujoco_batch import MujocoTask, quieten_mujoco
 from dmprl.segment_env import SUCCESS_NOT_REPORTED, SegmentBuffers, SegmentEnvError
-from dmprl.tasks import make_task
+from dmprl.tasks import make_task, registered, replaces
 
 # Without a display, GLFW would end the whole process when it opens a window.
 HAS_DISPLAY = any(os.environ.get(name) for name in ("DISPLAY", "WAYLAND_DISPLAY"))
@@ -37,16 +39,18 @@ class TaskEnv(gymnasium.Env[NDArray[np.float64], NDArray[np.float32]]):
         render_mode: str | None = None,
         width: int = 480,
         height: int = 480,
-        task: Callable[[int], MujocoTask] | None = None,
+        task: Callable[..., MujocoTask] | None = None,
+        **kwargs: Any,
     ) -> None:
         """Creates the environment.
 
-        ``task``, if given, creates a user's own task for a number of environments.
+        ``task``, if given, creates a user's own task for a number of environments. ``kwargs`` are
+        the task's arguments.
         """
         if render_mode not in (None, *self.metadata["render_modes"]):
             modes = ", ".join(self.metadata["render_modes"])
             raise ValueError(f"{task_id}: render_mode {render_mode!r}; expected one of {modes}")
-        made = make_task(task_id, 1) if task is None else task(1)
+        made = make_task(task_id, 1, kwargs) if task is None else task(1, **kwargs)
         if made is None:
             raise ValueError(f"{task_id} is not a task of dmprl; `dmprl tasks` lists them")
         self.task = made
@@ -122,3 +126,22 @@ class TaskEnv(gymnasium.Env[NDArray[np.float64], NDArray[np.float32]]):
         if self._close_view is not None:
             self._close_view()
             self._close_view = None
+
+
+def gymnasium_maker(task_id: str, named: object, options: EnvOptions) -> object:
+    """Returns what creates the Gymnasium environments of a task.
+
+    A task on MuJoCo's batch becomes a :class:`TaskEnv`, with the process settings of a worker. For
+    any other task the result is ``named``, the object that ``task_id`` names.
+    """
+    ours = task_id.removeprefix("dmprl:")
+    if isinstance(named, type) and issubclass(named, MujocoTask):
+        maker = functools.partial(TaskEnv, task_id, task=named)
+        maker.max_episode_steps = named.episode_steps
+    elif replaces(ours, options):
+        maker = functools.partial(TaskEnv, ours)
+        maker.max_episode_steps = registered(ours).episode_steps
+    else:
+        return named
+    quieten_mujoco()
+    return maker

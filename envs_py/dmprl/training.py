@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import uuid
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +23,7 @@ def train(
     *,
     run_dir: str | Path | None = None,
     python_path: str | Path | None = None,
+    env_kwargs: Mapping[str, Any] | None = None,
     deterministic: bool = False,
     quiet: bool = False,
     **overrides: Any,
@@ -34,6 +36,7 @@ def train(
     :param deterministic: runs one worker in the learner's process and in lock-step with it, so that
         the same seed gives bit-identical results.
     :param quiet: suppresses progress.
+    :param env_kwargs: arguments of the environment and of ``gymnasium.make``.
     :param overrides: flags of ``dmprl train`` (``steps=20_000``, ``algo="sac"``, ``seed=2``) and
         configuration keys with two underscores for the dot (``algorithm__batch_size=64``). A flag
         that is None is omitted.
@@ -44,6 +47,7 @@ def train(
     """
     directory = Path(run_dir or Path("runs") / f"{_safe(task)}-{uuid.uuid4().hex[:8]}").absolute()
     arguments = [task, "--run-dir", str(directory), *program.flags(overrides)]
+    arguments += program.flags({"env_kwargs": dict(env_kwargs or {})})
     if python_path is not None:
         arguments += ["--python-path", str(python_path)]
     if deterministic:

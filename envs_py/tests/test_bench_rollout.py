@@ -28,6 +28,7 @@ def plan(task_id, action_len=2, **exploration):
     """Returns a plan without a policy, for peers and noise that need none."""
     return {
         "task": {"id": task_id},
+        "options": "wrappers = []\n[kwargs]\n",
         "env_count": 3,
         "decision_steps": 5,
         "controls": "random",

@@ -31,6 +31,8 @@ class Countdown(gymnasium.Env):
     action_space = ACTION
 
     def __init__(self, length=3, fault=None, render_mode=None):
+        if length < 1:
+            raise ValueError(f"length is {length}; expected 1 or more")
         self.length, self.fault = length, fault
 
     def reset(self, *, seed=None, options=None):
@@ -140,6 +142,25 @@ class Limited(Countdown):
 def short_countdown(**kwargs):
     """Creates an environment; an entry point that is a function."""
     return Countdown(length=2, **kwargs)
+
+
+def doubled(env):
+    """Doubles rewards; a wrapper that is a function."""
+    return gymnasium.wrappers.TransformReward(env, lambda reward: 2.0 * reward)
+
+
+def incremented(env):
+    """Adds 1 to rewards."""
+    return gymnasium.wrappers.TransformReward(env, lambda reward: reward + 1.0)
+
+
+class Clocked(gymnasium.wrappers.TimeAwareObservation):
+    """Observes the time too; a wrapper that is a class."""
+
+
+def unwrapping(env):
+    """Returns no environment."""
+    return env.observation_space
 
 
 class StrangeInfo(Countdown):
@@ -324,6 +345,17 @@ class Timed(Batch):
     def step_segment(self, actions, out: SegmentBuffers):
         super().step_segment(actions, out)
         out.truncated[:] = 1
+
+
+class ScaledBatch(Batch):
+    """Takes an argument."""
+
+    def __init__(self, env_count, segment_steps, scale=1.0):
+        super().__init__(env_count, segment_steps)
+        self.scale = scale
+
+    def step_segment(self, actions, out: SegmentBuffers):
+        super().step_segment(self.scale * actions, out)
 
 
 class BatchOfNan(Batch):

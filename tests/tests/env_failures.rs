@@ -11,7 +11,7 @@ use std::sync::atomic::AtomicBool;
 use dmprl_actors::evaluate::{Episodes, Evaluation, Evaluator};
 use dmprl_actors::python_env::{Interpreter, InterpreterOptions, PythonEnvironments};
 use dmprl_actors::rollout::{Identity, Rollout, RolloutError};
-use dmprl_shared::config::{ExperimentConfig, Layers};
+use dmprl_shared::config::{ExperimentConfig, Layers, TaskConfig};
 use dmprl_shared::segment::{SegmentHeader, TRUNCATED};
 use dmprl_tests::{tiny_envs_dir, venv};
 
@@ -36,7 +36,7 @@ fn environments(task_id: &str) -> PythonEnvironments {
         Interpreter::start(&InterpreterOptions { venv, python_path }).unwrap()
     };
     let interpreter = INTERPRETER.get_or_init(start);
-    PythonEnvironments::start(interpreter, task_id, ENVS, 5).unwrap()
+    PythonEnvironments::start(interpreter, &TaskConfig::with_id(task_id), ENVS, 5).unwrap()
 }
 
 /// Returns the headers that a worker delivers in this many calls, and the error that stopped it

@@ -10,7 +10,7 @@ use std::sync::OnceLock;
 
 use dmprl_actors::python_env::{Interpreter, InterpreterOptions, PythonEnvironments};
 use dmprl_actors::rollout::{Identity, Rollout, RolloutError};
-use dmprl_shared::config::{ExperimentConfig, Layers};
+use dmprl_shared::config::{ExperimentConfig, Layers, TaskConfig};
 use dmprl_shared::segment::{
     ActionBounds, Expected, HINDSIGHT, Segment, SegmentLayout, TERMINATED, TRUNCATED, check,
 };
@@ -41,7 +41,7 @@ fn started(task: &str, keys: &[(&str, &str)]) -> Result<Rollout, RolloutError> {
         Interpreter::start(&InterpreterOptions { venv, python_path }).unwrap()
     };
     let interpreter = INTERPRETER.get_or_init(start);
-    let task = format!("tiny_envs:{task}-v0");
+    let task = TaskConfig::with_id(&format!("tiny_envs:{task}-v0"));
     let environments = PythonEnvironments::start(interpreter, &task, ENVS, 5).unwrap();
     let identity = Identity { run_id: 1, worker_id: 0, incarnation: 0, seed_index: 0 };
     Rollout::start(&config(keys), environments, identity)

@@ -11,7 +11,7 @@ use std::{process::Command, sync::OnceLock};
 use dmprl_actors::python_env::{
     Interpreter, InterpreterOptions, PythonEnvironments, PythonError, SUCCESS_NO, SUCCESS_YES,
 };
-use dmprl_shared::config::TASKS;
+use dmprl_shared::config::{TASKS, TaskConfig};
 use dmprl_tests::{tiny_envs_dir, venv};
 
 fn options() -> InterpreterOptions {
@@ -24,11 +24,16 @@ fn interpreter() -> &'static Interpreter {
 }
 
 fn started(task_id: &str, env_count: usize, segment_steps: usize) -> PythonEnvironments {
+    let task = TaskConfig::with_id(task_id);
     let mut envs =
-        PythonEnvironments::start(interpreter(), task_id, env_count, segment_steps).unwrap();
+        PythonEnvironments::start(interpreter(), &task, env_count, segment_steps).unwrap();
     let seeds: Vec<u64> = (7..).take(env_count).collect();
     envs.reset(&vec![true; env_count], &seeds).unwrap();
     envs
+}
+
+fn refused(task: &TaskConfig) -> String {
+    PythonEnvironments::start(interpreter(), task, 1, 5).err().unwrap().to_string()
 }
 
 /// Any sequence of actions works if both sides compute the same; these are exact in f32.
@@ -55,7 +60,8 @@ fn spec_of_reacher_is_gymnasiums() {
 #[test]
 fn what_the_list_of_tasks_says_is_what_the_environments_are() {
     for task in &TASKS {
-        let envs = PythonEnvironments::start(interpreter(), task.id, 1, 5).unwrap();
+        let config = TaskConfig::with_id(task.id);
+        let envs = PythonEnvironments::start(interpreter(), &config, 1, 5).unwrap();
         let spec = envs.spec();
         assert_eq!(spec.id, task.id);
         assert_eq!(
@@ -168,13 +174,45 @@ fn action_that_is_not_finite_is_refused_before_the_physics() {
 
 #[test]
 fn unknown_id_gets_gymnasiums_suggestion() {
-    let start = |id| PythonEnvironments::start(interpreter(), id, 1, 5).err().unwrap().to_string();
+    let start = |id| refused(&TaskConfig::with_id(id));
     let error = start("Reachr-v5");
     assert!(error.contains("`Reachr`") && error.contains("Did you mean: `Reacher`"), "{error}");
     let error = start("nowhere:Task-v0");
     assert!(error.contains("no module 'nowhere'") && error.contains("--python-path"), "{error}");
     let error = start("CartPole-v1");
     assert!(error.contains("action space Discrete(2)") && error.contains("supported"), "{error}");
+}
+
+#[test]
+fn arguments_and_wrappers_reach_the_environment() {
+    let mut task = TaskConfig::with_id("tiny_envs:Countdown");
+    task.kwargs = "length = 9\nmax_episode_steps = 4".parse().unwrap();
+    task.wrappers = vec!["tiny_envs:doubled".into(), "tiny_envs:incremented".into()];
+    let mut envs = PythonEnvironments::start(interpreter(), &task, 1, 5).unwrap();
+    assert_eq!(envs.spec().episode_steps, 4);
+    envs.reset(&[true], &[7]).unwrap();
+    envs.step_segment(&[0.5; 5]).unwrap();
+    assert_eq!((envs.steps(), envs.truncated(), envs.terminated()), (&[4][..], &[1][..], &[0][..]));
+    assert_eq!(envs.rewards(), [2.0, 2.0, 2.0, 2.0, 0.0], "2 * 0.5 + 1");
+}
+
+#[test]
+fn wrong_argument_gets_the_environments_own_message_and_a_remedy() {
+    for (kwargs, message) in [
+        ("lenght = 9", "Countdown.__init__() got an unexpected keyword argument 'lenght'"),
+        ("length = -1", "ValueError: length is -1; expected 1 or more"),
+    ] {
+        let mut task = TaskConfig::with_id("tiny_envs:Countdown-v0");
+        task.kwargs = kwargs.parse().unwrap();
+        let error = refused(&task);
+        assert!(error.contains(message), "{error}");
+        assert!(error.contains("change task.kwargs (--env-kwargs)"), "{error}");
+    }
+    let mut task = TaskConfig::with_id("dmprl/PandaReach-v0");
+    task.kwargs = "reward_type = 'sparse'".parse().unwrap();
+    let error = refused(&task);
+    let words = "dmprl/PandaReach-v0 has no argument reward_type; expected max_episode_steps";
+    assert!(error.contains(words), "{error}");
 }
 
 #[test]

@@ -2,6 +2,7 @@
 
 use std::sync::Arc;
 
+use dmprl_shared::config::TaskConfig;
 use dmprl_shared::spec::EnvSpec;
 use pyo3::{prelude::*, types::PyTuple};
 
@@ -72,21 +73,23 @@ impl Call {
 }
 
 impl PythonEnvironments {
-    /// Creates environments of `task_id` (a Gymnasium id, `module:Id` or `module:Class`). They must
-    /// be reset before the first step.
+    /// Creates environments of a task, with its arguments and wrappers. They must be reset before
+    /// the first step.
     ///
     /// # Errors
-    /// `Exception` with Gymnasium's message for an unknown id or an unsupported space, `Spec` for
-    /// unusable bounds, `Interface` or `Length` if the installed package does not fit.
+    /// `Exception` with Gymnasium's message for an unknown id or an unsupported space, and with the
+    /// environment's own for a wrong argument; `Spec` for unusable bounds, `Interface` or `Length`
+    /// if the installed package does not fit.
     pub fn start(
         _interpreter: &Interpreter,
-        task_id: &str,
+        task: &TaskConfig,
         env_count: usize,
         segment_steps: usize,
     ) -> Result<Self, PythonError> {
         Self::start_with(env_count, segment_steps, |py| {
             let module = py.import("dmprl.segment_env")?;
-            module.getattr("make")?.call1((task_id, env_count, segment_steps))
+            let options = read_options(py, task)?;
+            module.getattr("make")?.call1((&task.id, env_count, segment_steps, options))
         })
     }
 
@@ -275,6 +278,12 @@ impl PythonEnvironments {
         }
         Err(PythonError::Length { task_id: self.spec.id.clone(), name, expected, got })
     }
+}
+
+/// Converts the task's arguments and wrappers to an `EnvOptions` of the package `dmprl`.
+pub(super) fn read_options<'py>(py: Python<'py>, task: &TaskConfig) -> PyResult<Bound<'py, PyAny>> {
+    let class = py.import("dmprl.env_options")?.getattr("EnvOptions")?;
+    class.call_method1("parse", (task.options_toml(),))
 }
 
 fn read_spec(dict: &Bound<'_, PyAny>) -> PyResult<EnvSpec> {

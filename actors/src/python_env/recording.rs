@@ -2,8 +2,10 @@
 
 use std::path::Path;
 
+use dmprl_shared::config::TaskConfig;
 use pyo3::prelude::*;
 
+use super::environments::read_options;
 use super::{Interpreter, PythonEnvironments, PythonError};
 
 /// Kind of a joint.
@@ -42,20 +44,21 @@ pub struct StepRecording {
 }
 
 impl PythonEnvironments {
-    /// Creates an environment of `task_id` that records its steps and, if `pictures` is given,
-    /// draws them into that folder.
+    /// Creates an environment of a task that records its steps and, if `pictures` is given, draws
+    /// them into that folder.
     ///
     /// # Errors
     /// As [`PythonEnvironments::start`]; `Exception` if the environment cannot be drawn.
     pub fn start_recording(
         _interpreter: &Interpreter,
-        task_id: &str,
+        task: &TaskConfig,
         segment_steps: usize,
         pictures: Option<&Path>,
     ) -> Result<Self, PythonError> {
         Self::start_with(1, segment_steps, |py| {
             let module = py.import("dmprl.recording")?;
-            module.getattr("make")?.call1((task_id, segment_steps, pictures))
+            let options = read_options(py, task)?;
+            module.getattr("make")?.call1((&task.id, segment_steps, pictures, options))
         })
     }
 

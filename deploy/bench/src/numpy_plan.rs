@@ -27,6 +27,8 @@ pub enum Controls {
 #[derive(Debug, Serialize)]
 pub struct NumpyPlan<'a> {
     task: &'a TaskConfig,
+    /// The task's arguments and wrappers as TOML, because JSON has no infinity.
+    options: String,
     policy: &'a PolicyConfig,
     dmp: &'a DmpConfig,
     exploration: &'a ExplorationConfig,
@@ -70,6 +72,7 @@ impl<'a> NumpyPlan<'a> {
         let log_std = policy.learned_std().map_or(&[][..], |learned| learned.log_std(parameters));
         let plan = Self {
             task: &config.task,
+            options: config.task.options_toml(),
             policy: &config.policy,
             dmp: &config.dmp,
             exploration: &config.exploration,

@@ -16,6 +16,7 @@ use dmprl_shared::config::ExperimentConfig;
 use dmprl_shared::supervision::EvaluationRow;
 use rustix::process::{Pid, Signal, kill_process};
 use tokio::process::{Child, Command};
+use toml::Value;
 
 /// The file of a run directory that is written last.
 const MANIFEST: &str = "manifest.json";
@@ -232,17 +233,21 @@ fn check_same(
     if expected == found {
         return Ok(());
     }
-    let tables = [expected, found].map(toml::Table::try_from);
-    let [expected, found] = tables.map(|table| table.unwrap_or_default());
-    let found: BTreeMap<_, _> = flatten(&found).into_iter().collect();
-    let differing = flatten(&expected).into_iter().find_map(|(key, value)| {
-        let other = found.get(&key)?;
-        (*other != value).then(|| format!("{key} is {other} there and {value} in the sweep file"))
+    let keys = |config: &ExperimentConfig| -> BTreeMap<_, _> {
+        flatten(&toml::Table::try_from(config).unwrap_or_default()).into_iter().collect()
+    };
+    let (expected, found) = (keys(expected), keys(found));
+    let text = |value: Option<&Value>| value.map_or("not set".to_owned(), Value::to_string);
+    let differing = expected.keys().chain(found.keys()).find_map(|key| {
+        let (there, here) = (found.get(key), expected.get(key));
+        let (there_text, here_text) = (text(there), text(here));
+        (there != here)
+            .then(|| format!("{key} is {there_text} there and {here_text} in the sweep file"))
     });
     anyhow::bail!(
         "{} was trained with another configuration: {}; remove it, or choose another --output",
         shown(path),
-        differing.unwrap_or_else(|| "a key is missing".to_owned())
+        differing.unwrap_or_default()
     )
 }
 
@@ -274,6 +279,20 @@ pub(super) fn evaluation_text(row: &EvaluationRow) -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn a_run_with_other_arguments_of_its_environment_is_rejected() {
+        let mut config = ExperimentConfig::default();
+        let (path, without) = (Path::new("run"), config.clone());
+        check_same(path, &config, &without).unwrap();
+        config.task.kwargs.insert("reward_type".to_owned(), "dense".into());
+        let error = |expected, found| check_same(path, expected, found).unwrap_err().to_string();
+        let key = "task.kwargs.reward_type is";
+        let there = error(&config, &without);
+        assert!(there.contains(&format!("{key} not set there and \"dense\"")), "{there}");
+        let here = error(&without, &config);
+        assert!(here.contains(&format!("{key} \"dense\" there and not set")), "{here}");
+    }
 
     #[test]
     fn words_of_a_shell_command_are_quoted_where_necessary() {

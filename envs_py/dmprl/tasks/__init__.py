@@ -7,7 +7,12 @@ runs one at a time (``gymnasium.make("dmprl/Thrower-v0")`` after ``import dmprl`
 from __future__ import annotations
 
 import importlib
-from typing import TYPE_CHECKING, NamedTuple
+import inspect
+from collections.abc import Mapping
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+from dmprl.env_options import EnvOptions
 
 if TYPE_CHECKING:
     from dmprl.mujoco_batch import BatchSegmentEnv, MujocoTask
@@ -41,24 +46,50 @@ def registered(task_id: str) -> Registered | None:
     return TASKS.get(f"dmprl/{task_id}" if task_id in SAME_AS_GYMNASIUM else task_id)
 
 
-def make_task(task_id: str, env_count: int) -> MujocoTask | None:
-    """Creates a task for ``env_count`` environments; None if dmprl has no task with this id."""
+def replaces(task_id: str, options: EnvOptions) -> bool:
+    """Returns whether dmprl's task is used for this id.
+
+    With arguments, Gymnasium's ids name Gymnasium's environments, because dmprl's have none but the
+    time limit.
+    """
+    if task_id in SAME_AS_GYMNASIUM:
+        return options.kwargs.keys() <= {"max_episode_steps"}
+    return task_id in TASKS
+
+
+def make_task(
+    task_id: str, env_count: int, kwargs: Mapping[str, Any] = MappingProxyType({})
+) -> MujocoTask | None:
+    """Creates a task for ``env_count`` environments; None if dmprl has no task with this id.
+
+    :raises TypeError: if the task does not have one of the arguments ``kwargs``.
+    """
     entry = registered(task_id)
     if entry is None:
         return None
-    return getattr(importlib.import_module(entry.module), entry.name)(env_count)
+    task = getattr(importlib.import_module(entry.module), entry.name)
+    known = list(inspect.signature(task).parameters)[1:]  # after env_count
+    unknown = [name for name in kwargs if name not in known]
+    if unknown:
+        expected = ", ".join([*known, "max_episode_steps"])
+        raise TypeError(f"{task_id} has no argument {', '.join(unknown)}; expected {expected}")
+    return task(env_count, **kwargs)
 
 
-def make_batch(task_id: str, env_count: int, segment_steps: int) -> BatchSegmentEnv | None:
+def make_batch(
+    task_id: str, env_count: int, segment_steps: int, options: EnvOptions
+) -> BatchSegmentEnv | None:
     """Creates a task's environments for a worker; None if dmprl has no task with this id.
 
     This changes settings of the process; see :func:`dmprl.mujoco_batch.quieten_mujoco`.
     """
-    task = make_task(task_id, env_count)
-    if task is None:
+    entry = registered(task_id)
+    if entry is None or not replaces(task_id, options):
         return None
+    kwargs, episode_steps = options.split_time_limit(entry.episode_steps)
+    task = make_task(task_id, env_count, kwargs)
 
     from dmprl.mujoco_batch import quieten_mujoco
 
     quieten_mujoco()
-    return task.batch(segment_steps, task.episode_steps)
+    return task.batch(segment_steps, episode_steps)

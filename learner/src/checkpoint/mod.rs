@@ -325,8 +325,10 @@ fn load(folder: &Path, learner: &mut Learner) -> Result<(), CheckpointError> {
     let own = learner.policy().architecture_hash();
     if state.architecture_hash != own {
         let got = state.architecture_hash;
-        let cause =
-            format!("architecture is {got:016x}, expected {own:016x} from the configuration");
+        let cause = format!(
+            "architecture is {got:016x}, expected {own:016x} from the configuration: \
+             task.id, task.kwargs, task.wrappers, policy and dmp must be as before"
+        );
         return Err(format(&path, cause));
     }
     for name in [NETWORKS, REPLAY] {

@@ -1,9 +1,9 @@
-//! The root of the configuration, and all sections except policy, DMP and algorithm.
+//! The root of the configuration, and all sections except task, policy, DMP and algorithm.
 
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
-use super::{AlgorithmConfig, DmpConfig, ExplorationConfig, PolicyConfig, StartSource};
+use super::{AlgorithmConfig, DmpConfig, ExplorationConfig, PolicyConfig, TaskConfig};
 
 /// Configuration of one experiment.
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize, JsonSchema)]
@@ -85,32 +85,6 @@ impl Default for RunConfig {
             until_return: f64::INFINITY,
             until_success: f64::INFINITY,
             max_minutes: f64::INFINITY,
-        }
-    }
-}
-
-/// The environment.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
-#[serde(deny_unknown_fields, default)]
-pub struct TaskConfig {
-    /// Name of the task on the command line.
-    pub name: String,
-    /// Gymnasium id (`Name-vN` or `module:Name-vN`), or a class (`module:Class`).
-    pub id: String,
-    /// Directories that are searched for your own environment modules.
-    pub python_path: Vec<String>,
-    /// Entries of the observation from which y0 and yd0 are read, one source per action dimension;
-    /// empty: unknown.
-    pub start_sources: Vec<StartSource>,
-}
-
-impl Default for TaskConfig {
-    fn default() -> Self {
-        Self {
-            name: "reacher".into(),
-            id: "Reacher-v5".into(),
-            python_path: Vec::new(),
-            start_sources: Vec::new(),
         }
     }
 }

@@ -8,6 +8,9 @@ use super::ExperimentConfig;
 /// Maximum number of names in a dotted key; real keys have fewer.
 const KEY_NAMES_MAX: usize = 16;
 
+/// A table whose names are not ours: the environment's arguments.
+const OPEN_TABLE: &str = "task.kwargs";
+
 /// Why a configuration was rejected.
 #[derive(Debug, Error, PartialEq)]
 pub enum ConfigError {
@@ -84,13 +87,16 @@ impl Layers {
     /// A value that is not a TOML literal is treated as a string.
     ///
     /// # Errors
-    /// The errors of [`Layers::add`].
+    /// The errors of [`Layers::add`]. `Value` for an environment's argument in Python's notation.
     pub fn set(&mut self, origin: &str, key: &str, text: &str) -> Result<(), ConfigError> {
         if key.split('.').nth(KEY_NAMES_MAX).is_some() {
             // No key is this long. Dropping a tree of this depth would overflow the stack.
             let (origin, hint) = (origin.to_owned(), String::new());
             let key = key.split('.').take(KEY_NAMES_MAX).collect::<Vec<_>>().join(".") + "...";
             return Err(ConfigError::UnknownKey { origin, key, hint });
+        }
+        if key.starts_with(OPEN_TABLE) {
+            check_notation(origin, key, text)?;
         }
         let value = format!("value = {text}")
             .parse::<Table>()
@@ -161,11 +167,25 @@ fn typed(origin: &str, table: Table) -> Result<ExperimentConfig, ConfigError> {
     })
 }
 
+/// Rejects Python's literals, which would become texts: `"False"` is true in Python.
+fn check_notation(origin: &str, key: &str, text: &str) -> Result<(), ConfigError> {
+    let advice = match text {
+        "True" | "False" => format!("such as {}", text.to_ascii_lowercase()),
+        "None" => "but TOML has no None; leave the argument out".to_owned(),
+        _ => return Ok(()),
+    };
+    let message = format!(
+        "`{key}` = {text}: expected a TOML value, {advice}; for the text, quote it: '\"{text}\"'"
+    );
+    Err(ConfigError::Value { origin: origin.to_owned(), message })
+}
+
 fn check_keys(origin: &str, known: &Table, given: &Table, path: &str) -> Result<(), ConfigError> {
     for (name, value) in given {
         let key = if path.is_empty() { name.clone() } else { format!("{path}.{name}") };
         match (known.get(name), value) {
             (None, _) => return Err(unknown(origin, key, name, known, path)),
+            (Some(_), Value::Table(_)) if key == OPEN_TABLE => {}
             (Some(Value::Table(known)), Value::Table(given)) => {
                 check_keys(origin, known, given, &key)?;
             }
@@ -212,7 +232,7 @@ fn collect_keys(table: &Table, path: &str, keys: &mut Vec<String>) {
     for (name, value) in table {
         let key = if path.is_empty() { name.clone() } else { format!("{path}.{name}") };
         match value {
-            Value::Table(inner) => collect_keys(inner, &key, keys),
+            Value::Table(inner) if key != OPEN_TABLE => collect_keys(inner, &key, keys),
             _ => keys.push(key),
         }
     }

@@ -11,6 +11,7 @@ mod experiment;
 mod layers;
 mod presets;
 mod resolve;
+mod task;
 mod tasks;
 
 pub use algorithm::{
@@ -24,9 +25,10 @@ pub use dmp::{
 pub use experiment::{
     ActorsConfig, BridgeConfig, CheckpointConfig, DeliveryConfig, DeliveryLevel,
     DemonstrationsConfig, Device, EvaluationConfig, ExperimentConfig, Hindsight, LearnerConfig,
-    MetricsConfig, PacingConfig, Precision, ReplayConfig, RunConfig, SupervisionConfig, TaskConfig,
+    MetricsConfig, PacingConfig, Precision, ReplayConfig, RunConfig, SupervisionConfig,
 };
 pub use layers::{ConfigError, Layers, nearest};
 pub use presets::{PRESETS, Preset, algorithm_defaults, policy_defaults};
 pub use resolve::Limits;
+pub use task::{TaskConfig, is_python_object};
 pub use tasks::{TASKS, TaskDefaults, task_defaults};

@@ -63,6 +63,7 @@ impl ExperimentConfig {
             let envs = self.actors.workers.saturating_mul(self.actors.envs_per_worker);
             self.algorithm.ndp.rollout_segments = envs.saturating_mul(ROLLOUT_SEGMENTS_PER_ENV);
         }
+        self.task.check()?;
         self.check_counts()?;
         self.check_numbers()?;
         self.check_dmp()?;

@@ -1,6 +1,10 @@
 //! Hash of a policy's architecture. With equal hashes, equal parameters and observations give equal
 //! actions.
 
+use std::collections::BTreeMap;
+
+use toml::Value;
+
 use crate::config::{AlgorithmName, Controller, ExperimentConfig, PolicyKind, StartSource};
 use crate::seeds;
 use crate::spec::EnvSpec;
@@ -21,6 +25,11 @@ pub(super) fn hash(config: &ExperimentConfig, spec: &EnvSpec) -> u64 {
         spec.action_high,
         config.policy.hidden,
     );
+    // The same id with other arguments is another environment.
+    if config.task.has_options() {
+        let kwargs = sorted(&Value::Table(config.task.kwargs.clone()));
+        list.push_str(&format!(" task {kwargs} {:?}", config.task.wrappers));
+    }
     match config.policy.kind {
         PolicyKind::Mlp => list.push_str(" mlp"),
         PolicyKind::Dmp => list.push_str(&dmp(config, spec)),
@@ -32,6 +41,19 @@ pub(super) fn hash(config: &ExperimentConfig, spec: &EnvSpec) -> u64 {
         list.push_str(" learned std");
     }
     seeds::derive(0, &list, 0)
+}
+
+/// Formats a value with the keys of its tables in order, which a build of `toml` may not have.
+fn sorted(value: &Value) -> String {
+    match value {
+        Value::Table(table) => {
+            let texts: BTreeMap<_, _> =
+                table.iter().map(|(key, value)| (key, sorted(value))).collect();
+            format!("{texts:?}")
+        }
+        Value::Array(values) => format!("{:?}", values.iter().map(sorted).collect::<Vec<_>>()),
+        value => format!("{value:?}"),
+    }
 }
 
 fn dmp(config: &ExperimentConfig, spec: &EnvSpec) -> String {
@@ -107,6 +129,15 @@ mod tests {
     }
 
     #[test]
+    fn hash_of_a_task_with_arguments_is_unchanged() {
+        let hash = hash_of(&[
+            ("task.kwargs", "{ b = 1, a = \"x\", c = 1.5, e = { g = 2, f = 1 }, d = [true, inf] }"),
+            ("task.wrappers", "[\"module:name\"]"),
+        ]);
+        assert_eq!(format!("{hash:016x}"), "72267294194189d7");
+    }
+
+    #[test]
     fn hash_depends_only_on_values_that_determine_the_actions() {
         let same = hash_of(&[]);
         for (key, value) in [
@@ -117,6 +148,8 @@ mod tests {
             assert_eq!(hash_of(&[(key, value)]), same, "{key}");
         }
         for (key, value) in [
+            ("task.kwargs.reward_type", "dense"),
+            ("task.wrappers", "[\"module:name\"]"),
             ("policy.hidden", "[256]"),
             ("policy.rho_range", "1.0"),
             ("policy.start", "observed"),

@@ -25,6 +25,7 @@ mod delivery;
 mod determinism;
 mod documents;
 mod endings;
+mod env_kwargs;
 mod environments;
 mod export;
 mod fairness;

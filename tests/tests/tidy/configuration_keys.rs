@@ -6,7 +6,7 @@ use std::fmt::Write;
 use std::fs;
 
 use dmprl_shared::config::{
-    AlgorithmName, ExperimentConfig, PRESETS, PolicyKind, TASKS, algorithm_defaults,
+    AlgorithmName, ExperimentConfig, Layers, PRESETS, PolicyKind, TASKS, algorithm_defaults,
     policy_defaults,
 };
 use dmprl_tests::project_root;
@@ -86,11 +86,16 @@ fn page() -> String {
 /// Returns every key, in the order of the types.
 fn keys_in_order() -> Vec<String> {
     let text = toml::to_string(&ExperimentConfig::default()).unwrap();
+    let known = Layers::new().keys();
     let mut section = String::new();
     let mut keys = Vec::new();
     for line in text.lines() {
         if let Some(name) = line.strip_prefix('[') {
             section = name.trim_end_matches(']').to_owned();
+            // A key whose value is a table with names of the user's.
+            if known.contains(&section) {
+                keys.push(section.clone());
+            }
         } else if let Some((name, _)) = line.split_once(" = ") {
             keys.push(format!("{section}.{name}"));
         }
@@ -138,6 +143,7 @@ fn kind(schema: &Value, property: &Value) -> String {
         "number" => "A number.".into(),
         "boolean" => "`true` or `false`.".into(),
         "string" => "A text.".into(),
+        "object" => "A table of values of any type.".into(),
         "array" => {
             let items = resolved(schema, &part["items"]);
             let each = kind(schema, &items);

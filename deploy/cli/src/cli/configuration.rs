@@ -6,8 +6,8 @@ use std::path::Path;
 use anyhow::Context;
 use dmprl_run::failure::wrong_use;
 use dmprl_shared::config::{
-    ConfigError, ExperimentConfig, Layers, PRESETS, TASKS, algorithm_defaults, nearest,
-    policy_defaults, task_defaults,
+    ConfigError, ExperimentConfig, Layers, PRESETS, TASKS, algorithm_defaults, is_python_object,
+    nearest, policy_defaults, task_defaults,
 };
 use toml::{Table, Value};
 
@@ -36,6 +36,8 @@ pub(super) struct Sources<'a> {
     pub(super) environment: Vec<(String, String)>,
     /// `key=value` pairs of `--set`, in the order given.
     pub(super) set: &'a [String],
+    /// `key=value` pairs of `--env-kwargs`; they override `--set`.
+    pub(super) env_kwargs: &'a [String],
     /// Keys set by flags; they override `--set`.
     pub(super) flags: Vec<Flag>,
 }
@@ -91,6 +93,13 @@ fn merge_with(own: &Own, sources: &Sources<'_>) -> anyhow::Result<ExperimentConf
         })?;
         layers.set("--set", key.trim(), text.trim()).map_err(refuse)?;
     }
+    for pair in sources.env_kwargs {
+        let (name, text) = pair.split_once('=').ok_or_else(|| {
+            wrong_use(format!("--env-kwargs {pair}: expected KEY=VALUE, as in reward_type=dense"))
+        })?;
+        let key = format!("task.kwargs.{}", name.trim());
+        layers.set("--env-kwargs", &key, text.trim()).map_err(refuse)?;
+    }
     for Flag { flag, key, value } in &sources.flags {
         add(&mut layers, flag, nested(key, value.clone()))?;
     }
@@ -118,7 +127,7 @@ fn task_table(name: &str) -> anyhow::Result<Table> {
     if let Some(task) = task_defaults(name) {
         return Ok(task.table());
     }
-    if is_gymnasium_id(name) || is_class(name) {
+    if is_gymnasium_id(name) || is_python_object(name) {
         let mut task = Table::new();
         task.insert("name".into(), name.into());
         task.insert("id".into(), name.into());
@@ -152,16 +161,6 @@ fn is_gymnasium_id(text: &str) -> bool {
         && word(name, ".-")
         && !version.is_empty()
         && version.chars().all(|letter| letter.is_ascii_digit())
-}
-
-/// Matches `[package.]module:Class`, the user's own `dmprl.segment_env.SegmentEnv`.
-fn is_class(text: &str) -> bool {
-    let identifier = |text: &str| {
-        text.starts_with(|letter: char| letter.is_ascii_alphabetic() || letter == '_')
-            && text.chars().all(|letter| letter.is_ascii_alphanumeric() || letter == '_')
-    };
-    text.split_once(':')
-        .is_some_and(|(module, class)| module.split('.').all(identifier) && identifier(class))
 }
 
 fn read_table(path: &Path) -> anyhow::Result<Table> {
@@ -198,6 +197,7 @@ mod tests {
             file: None,
             environment: Vec::new(),
             set: &[],
+            env_kwargs: &[],
             flags: Vec::new(),
         }
     }
@@ -236,6 +236,38 @@ mod tests {
             merged.push(merge(&sources).unwrap().run.steps);
         }
         assert_eq!(merged, [200_000, 3, 4, 5, 6]);
+    }
+
+    /// Each source sets one argument of its own and one that the later ones set too.
+    #[test]
+    fn arguments_of_the_environment_come_from_every_source() {
+        let mut file = tempfile::NamedTempFile::new().unwrap();
+        writeln!(file, "[task.kwargs]\nfile = 1\nlast = 'file'").unwrap();
+        let set = ["task.kwargs.set=3", "task.kwargs.last=set"].map(str::to_owned);
+        let flags = ["flag = dense", "last=\"flag\""].map(str::to_owned);
+        let mut sources = sources("Pendulum-v1");
+        sources.file = Some(file.path());
+        sources.environment = vec![
+            variable("DMPRL_TASK__KWARGS__VARIABLE", "2.0"),
+            variable("DMPRL_TASK__KWARGS__LAST", "variable"),
+        ];
+        (sources.set, sources.env_kwargs) = (&set, &flags);
+        let kwargs = merge(&sources).unwrap().task.kwargs;
+        let expected = "file = 1\nvariable = 2.0\nset = 3\nflag = 'dense'\nlast = 'flag'";
+        assert_eq!(kwargs, expected.parse().unwrap());
+    }
+
+    #[test]
+    fn arguments_of_the_environment_need_an_equals_sign_and_tomls_notation() {
+        for (pair, words) in [
+            ("reward_type", "--env-kwargs reward_type: expected KEY=VALUE"),
+            ("dense=False", "--env-kwargs: `task.kwargs.dense` = False: expected a TOML value"),
+        ] {
+            let pairs = [pair.to_owned()];
+            let mut sources = sources("Pendulum-v1");
+            sources.env_kwargs = &pairs;
+            assert!(refused(sources).contains(words), "{pair}");
+        }
     }
 
     #[test]

@@ -36,6 +36,10 @@ pub(super) struct ConfiguredArgs {
     /// Directory of your own environment modules; repeatable.
     #[arg(long, value_name = "DIR")]
     python_path: Vec<PathBuf>,
+    /// Argument of the environment or of gymnasium.make, such as reward_type=dense; repeatable. The
+    /// value is a TOML value or a bare word.
+    #[arg(long, value_name = "KEY=VALUE")]
+    env_kwargs: Vec<String>,
     /// Configuration file, such as a run's config.toml.
     #[arg(long, value_name = "FILE")]
     config: Option<PathBuf>,
@@ -49,7 +53,8 @@ impl ConfiguredArgs {
     pub(super) fn is_empty(&self) -> bool {
         let words = [&self.algo, &self.policy].into_iter().all(Option::is_none);
         let counts = [self.workers, self.envs_per_worker].into_iter().all(|count| count.is_none());
-        let lists = self.python_path.is_empty() && self.set.is_empty();
+        let pairs = self.env_kwargs.is_empty() && self.set.is_empty();
+        let lists = self.python_path.is_empty() && pairs;
         let seed = self.seed.is_none() && self.config.is_none();
         words && counts && lists && seed && self.preset == PRESETS[0].name
     }
@@ -76,6 +81,7 @@ impl ConfiguredArgs {
             file: self.config.as_deref(),
             environment: environment()?,
             set: &self.set,
+            env_kwargs: &self.env_kwargs,
             flags: flags.into_iter().chain(more).flatten().collect(),
         })
     }

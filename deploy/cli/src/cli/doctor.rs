@@ -48,6 +48,7 @@ fn default_config(task: &TaskDefaults) -> anyhow::Result<ExperimentConfig> {
         file: None,
         environment: Vec::new(),
         set: &[],
+        env_kwargs: &[],
         flags: Vec::new(),
     };
     merge(&sources)?.resolve(Limits { cores: cores() }).map_err(refuse)

@@ -66,7 +66,7 @@ pub(super) fn run(args: &PlayArgs) -> anyhow::Result<Outcome> {
     let window = !args.stream && has_display();
     let mut command = Command::new(python);
     command.args(["-I", "-m", "dmprl.play"]).arg(&file);
-    command.args(["--task", &config.task.id]);
+    command.args(["--task", &config.task.id, "--options", &config.task.options_toml()]);
     let title = format!("{} · policy {}", config.task.name, opened.snapshot.version);
     command.args(["--title", &title, "--port", &args.port.to_string()]);
     let seed = args.seed.unwrap_or(config.evaluation.first_seed);

@@ -41,7 +41,9 @@ EXAMPLES
   dmprl train reacher --config runs/baseline/config.toml --deterministic
   dmprl train reacher --init-from runs/baseline --seed 3
   dmprl train panda-reach --demos demos.npz
-  dmprl train my_module:MyArm-v0 --python-path ./envs";
+  dmprl train my_module:MyArm-v0 --python-path ./envs
+  dmprl train gymnasium_robotics:FetchReach-v4 --env-kwargs reward_type=dense
+  dmprl train my_module:MyArm --python-path ./envs --env-kwargs 'gains=[1.0, 2.5]'";
 
 /// Arguments of `dmprl train`.
 #[derive(Debug, Args)]

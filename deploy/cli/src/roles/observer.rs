@@ -26,7 +26,7 @@ pub fn run(args: &ObserverArgs, control: &ControlPipe) -> anyhow::Result<()> {
     let interpreter = super::actor::start_interpreter(args.venv.as_deref(), &setup.config)?;
     let environment = PythonEnvironments::start_recording(
         &interpreter,
-        &setup.config.task.id,
+        &setup.config.task,
         setup.config.policy.decision_steps(),
         args.pictures.as_deref(),
     )?;

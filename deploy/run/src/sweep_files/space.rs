@@ -134,6 +134,10 @@ pub(super) fn parse(space: &Table) -> Result<Vec<Parameter>, String> {
     let mut parameters = Vec::new();
     for (key, value) in entries(space) {
         let refused = |what: String| format!("search.space.{key}: {what}");
+        let table = key.split('.').next().unwrap_or_default();
+        if NOT_SEARCHED.contains(&table) {
+            return Err(refused(format!("all trials must have the same [{table}]")));
+        }
         let Some((_, default)) = defaults.iter().find(|(known, _)| *known == key) else {
             let unknown = Layers::new().set("search.space", &key, "0").err();
             return Err(unknown.map_or_else(
@@ -141,10 +145,6 @@ pub(super) fn parse(space: &Table) -> Result<Vec<Parameter>, String> {
                 |error| error.to_string(),
             ));
         };
-        let table = key.split('.').next().unwrap_or_default();
-        if NOT_SEARCHED.contains(&table) {
-            return Err(refused(format!("all trials must have the same [{table}]")));
-        }
         let domain = match &value {
             Value::Array(values) => choice(values),
             Value::Table(range) => self::range(range, default),
@@ -290,6 +290,7 @@ mod tests {
             ("algorithm = [1]", "algorithm"),
             ("run.seed = [1, 2]", "search.space.run.seed: all trials"),
             ("evaluation.first_seed = [1]", "search.space.evaluation.first_seed"),
+            ("task.kwargs.reward_type = ['dense']", "search.space.task.kwargs.reward_type: all"),
             ("dmp.alpha_y = { low = 3, high = 1 }", "search.space.dmp.alpha_y: low = 3, high = 1"),
             ("dmp.alpha_y = { low = 3, high = 3 }", "low below high"),
             ("dmp.alpha_y = { low = 0, high = 3, log = true }", "more than 0"),
