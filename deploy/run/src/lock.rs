@@ -223,9 +223,9 @@ impl Search<'_> {
         if !self.announced {
             self.announced = true;
             info!(
-                "{} was the last to train {}; watching its lease on the run for {TIMEOUT:?}, and \
-                 taking the run over unless the lease is renewed. Nothing can shorten this: whether \
-                 a process on another host lives cannot be seen from here",
+                "{} was the last to train {}; watching its lease for {TIMEOUT:?}, and taking the \
+                 run over unless it is renewed. There is no flag to shorten this: from here, only \
+                 the lease tells whether that process lives",
                 named(holder),
                 self.run.display()
             );

@@ -1,6 +1,6 @@
 //! What the lock needs from the machine: file locks, processes and a clock. Tests replace it.
 
-use std::fs::{self, File, TryLockError};
+use std::fs::{self, DirEntry, File, TryLockError};
 use std::io::{self, ErrorKind};
 use std::path::Path;
 use std::thread;
@@ -73,9 +73,13 @@ impl Machine for ThisMachine {
     }
 
     fn is_open_elsewhere(&self, path: &Path) -> bool {
-        let own = std::process::id().to_string();
+        let is_other = |process: &DirEntry| {
+            // Not `self`, either.
+            let id = process.file_name().to_str().and_then(|name| name.parse::<u32>().ok());
+            id.is_some_and(|id| id != std::process::id())
+        };
         let processes = fs::read_dir("/proc").into_iter().flatten().flatten();
-        processes.filter(|process| *process.file_name() != *own).any(|process| {
+        processes.filter(is_other).any(|process| {
             // Processes of other users have no readable descriptors.
             let descriptors = fs::read_dir(process.path().join("fd")).into_iter().flatten();
             descriptors.flatten().any(|it| fs::read_link(it.path()).is_ok_and(|it| it == path))

@@ -257,6 +257,20 @@ fn the_lock_of_an_older_program_is_understood() {
 }
 
 #[test]
+fn another_process_that_has_the_lock_file_open_is_found() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = fs::canonicalize(folder.path()).unwrap().join("lock");
+    let file = File::create(&path).unwrap();
+    let machine = ThisMachine::new();
+    assert!(!machine.is_open_elsewhere(&path), "only here");
+    let mut child = std::process::Command::new("sleep").arg("600").stdin(file).spawn().unwrap();
+    assert!(machine.is_open_elsewhere(&path));
+    child.kill().unwrap();
+    child.wait().unwrap();
+    assert!(!machine.is_open_elsewhere(&path));
+}
+
+#[test]
 fn the_lock_names_this_process_and_is_released_on_drop() {
     let folder = tempfile::tempdir().unwrap();
     let run = folder.path();
