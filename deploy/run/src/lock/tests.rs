@@ -1,6 +1,8 @@
 use std::cell::{Cell, RefCell};
 use std::fs;
 use std::io;
+use std::thread;
+use std::time::Instant;
 
 use super::holder::Origin;
 use super::*;
@@ -87,6 +89,15 @@ fn newest(run: &Path) -> FoundLease {
 fn leases(run: &Path) -> usize {
     let names = fs::read_dir(run).unwrap().map(|entry| entry.unwrap().file_name());
     names.filter(|name| name.to_str().unwrap().starts_with("lease.")).count()
+}
+
+/// Checks a condition until it holds.
+fn until(condition: impl Fn() -> bool) {
+    let deadline = Instant::now() + Duration::from_secs(60);
+    while !condition() {
+        assert!(Instant::now() < deadline, "waited in vain");
+        thread::yield_now();
+    }
 }
 
 #[test]
@@ -242,6 +253,8 @@ fn the_lock_of_an_older_program_is_understood() {
     let run = folder.path();
     let mut child = std::process::Command::new("sleep").arg("600").spawn().unwrap();
     fs::write(run.join("lock"), format!("{}\n", child.id())).unwrap();
+    // A process that has just been started has no command line yet.
+    until(|| last_holder(run).unwrap().is_running());
     for file_lock in [FileLock::Busy, FileLock::Unsupported] {
         let machine = FakeMachine::new("gpu1", 20).with_lock(file_lock);
         let error = take(run, WAIT, &machine).unwrap_err().to_string();
@@ -262,12 +275,13 @@ fn another_process_that_has_the_lock_file_open_is_found() {
     let path = fs::canonicalize(folder.path()).unwrap().join("lock");
     let file = File::create(&path).unwrap();
     let machine = ThisMachine::new();
-    assert!(!machine.is_open_elsewhere(&path), "only here");
+    // A process that another test starts may have it open for a moment.
+    until(|| !machine.is_open_elsewhere(&path));
     let mut child = std::process::Command::new("sleep").arg("600").stdin(file).spawn().unwrap();
     assert!(machine.is_open_elsewhere(&path));
     child.kill().unwrap();
     child.wait().unwrap();
-    assert!(!machine.is_open_elsewhere(&path));
+    until(|| !machine.is_open_elsewhere(&path));
 }
 
 #[test]
