@@ -10,6 +10,9 @@ use super::*;
 /// Wait for the children of a dead supervisor.
 const WAIT: Duration = Duration::from_secs(70);
 
+/// What happens while a process waits.
+type Meanwhile<'a> = Box<dyn FnMut(&FakeMachine<'_>) + 'a>;
+
 /// A machine with its own clock and processes. Its `flock` behaves as on a file system whose locks
 /// are local, unless set otherwise.
 struct FakeMachine<'a> {
@@ -19,7 +22,7 @@ struct FakeMachine<'a> {
     open_elsewhere: Cell<bool>,
     now: Cell<Duration>,
     /// Called after each wait.
-    meanwhile: RefCell<Box<dyn FnMut(&FakeMachine<'_>) + 'a>>,
+    meanwhile: RefCell<Meanwhile<'a>>,
 }
 
 impl<'a> FakeMachine<'a> {
@@ -172,11 +175,13 @@ fn a_crashed_holder_on_this_machine_is_replaced_at_once() {
 
 #[test]
 fn the_children_of_a_crashed_holder_are_waited_for() {
-    let absent = |machine: &FakeMachine<'_>| machine.open_elsewhere.set(false);
-    let released = |machine: &FakeMachine<'_>| machine.file_lock.set(FileLock::Taken);
-    let ways: [(FileLock, &dyn Fn(&FakeMachine<'_>)); 2] =
-        [(FileLock::Busy, &released), (FileLock::Unsupported, &absent)];
-    for (file_lock, end) in ways {
+    let end = |machine: &FakeMachine<'_>| {
+        machine.open_elsewhere.set(false);
+        if machine.file_lock.get() == FileLock::Busy {
+            machine.file_lock.set(FileLock::Taken);
+        }
+    };
+    for file_lock in [FileLock::Busy, FileLock::Unsupported] {
         let folder = tempfile::tempdir().unwrap();
         let run = folder.path();
         take(run, WAIT, &FakeMachine::new("gpu1", 10)).unwrap();
