@@ -90,7 +90,8 @@ class Run:
 
         :param quiet: suppresses progress.
         :param flags: flags of ``dmprl record``: ``episodes=3``, ``seed=7``, ``policy="latest"``,
-            ``compare=...`` another run, ``output=...`` a folder instead of ``videos`` in the run.
+            ``compare=...`` another run, ``output=...`` a folder instead of ``videos`` in the run,
+            ``trust_code=True`` to import the modules of a run that you did not make.
         :raises dmprl.ProgramError: if it cannot be made; the message gives the reason.
         """
         arguments = [str(self.path), "--json", *program.flags(flags)]

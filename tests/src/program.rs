@@ -126,6 +126,10 @@ impl Workplace {
                 command.env_remove(name);
             }
         }
+        // The user's own state directory stays as it is.
+        if !command.get_envs().any(|(name, _)| name == "XDG_STATE_HOME") {
+            command.env("XDG_STATE_HOME", state_folder());
+        }
         command.current_dir(self.folder());
         // A new session, not only a group: when the leader of a group in our session is killed, the
         // kernel wakes the group's stopped members with SIGHUP and SIGCONT, so a learner that the
@@ -177,6 +181,12 @@ impl Drop for Workplace {
             process.signal(Signal::KILL);
         }
     }
+}
+
+/// Folder for the state of the user who runs the tests, beside the test executables.
+fn state_folder() -> PathBuf {
+    let profile = executable().parent().expect("the folder of the executable");
+    profile.join("test-state")
 }
 
 /// A process found in /proc.

@@ -5,9 +5,9 @@ use std::path::Path;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::{Duration, Instant};
 
-use dmprl_run::RunDirectory;
 use dmprl_run::method_label;
 use dmprl_run::tail::Tail;
+use dmprl_run::{Holder, RunDirectory};
 use dmprl_shared::supervision::EvaluationRow;
 use serde::Serialize;
 use serde_json::Value;
@@ -120,8 +120,8 @@ pub struct CachedRun {
     evaluations_stamp: FileStamp,
     /// Time at which the metrics were last seen to grow.
     last_growth: Option<Instant>,
-    /// Process id of the supervisor last seen alive on this machine.
-    local_supervisor: Option<u32>,
+    /// The supervisor last seen alive on this machine.
+    local_supervisor: Option<Holder>,
     tables: [Option<GrowingTable>; 2],
 }
 
@@ -182,7 +182,7 @@ impl CachedRun {
         let holder = self.directory.lock_holder();
         let here = self.directory.is_trained_here();
         if here {
-            self.local_supervisor = holder;
+            self.local_supervisor.clone_from(&holder);
         }
         let reached = self.evaluations.last().is_some_and(|row| {
             row.env_steps >= self.info.steps
@@ -192,7 +192,9 @@ impl CachedRun {
         let grows = self.last_growth.is_some_and(|grown| grown.elapsed() < GROWTH_TIMEOUT);
         // If the last supervisor ran on this machine and is gone, it died: the run is not training
         // elsewhere.
-        let elsewhere = grows && holder != self.local_supervisor && self.may_be_running();
+        let died = holder.as_ref().is_some_and(Holder::is_on_this_machine)
+            || holder == self.local_supervisor;
+        let elsewhere = grows && !died && self.may_be_running();
         match (here, reached) {
             (true, _) => State::Training,
             (false, true) => State::Finished,

@@ -5,10 +5,11 @@
 //! manifest.json      format, versions, machine, command    metrics.jsonl       every scalar
 //! evaluations.jsonl  one row per evaluation                policies/V.safetensors
 //! checkpoints/       written by the learner                logs/PROCESS.log
-//! videos/  plots/                                          lock                held while running
+//! videos/  plots/                                          lock  lease.N       held while running
 //! motion.json        motion of the latest policy, measured on request
 //! processes.json     state of each process, during training
 //! segments.log       segments since the last checkpoint, at delivery level `log`
+//! provenance.json    proof that this user made the run, if it needs code of the user's own
 //! ```
 //! The supervisor creates it; learner and evaluator write into it; `eval` and `resume` read it.
 //! A file is replaced by writing a temporary file, syncing and renaming it, so a crash leaves
@@ -23,7 +24,7 @@ use dmprl_shared::spec::EnvSpec;
 
 use crate::atomic;
 use crate::failure::wrong_use;
-use crate::lock::{self, RunLock};
+use crate::lock::{self, Holder, RunLock};
 use crate::manifest::Manifest;
 
 /// Maximum length of the last component of a run directory's path, which becomes part of file and
@@ -263,16 +264,16 @@ impl RunDirectory {
         self.path.join("logs").join(format!("{process}.log"))
     }
 
-    /// Process id of the supervisor that locked the run last; it may have ended.
+    /// Supervisor that locked the run last; it may have ended.
     #[must_use]
-    pub fn lock_holder(&self) -> Option<u32> {
+    pub fn lock_holder(&self) -> Option<Holder> {
         lock::last_holder(&self.path)
     }
 
     /// Returns true if the run's supervisor is alive, on this machine.
     #[must_use]
     pub fn is_trained_here(&self) -> bool {
-        self.lock_holder().is_some_and(lock::is_trainer)
+        self.lock_holder().is_some_and(|holder| holder.is_trainer_here())
     }
 
     /// Locks the run for this process and those it starts; see [`RunLock`].

@@ -179,7 +179,7 @@ fn config_sha256(config: &ExperimentConfig) -> anyhow::Result<String> {
 }
 
 /// Formats bytes with two digits each.
-fn hexadecimal(bytes: &[u8]) -> String {
+pub(crate) fn hexadecimal(bytes: &[u8]) -> String {
     bytes.iter().map(|byte| format!("{byte:02x}")).collect()
 }
 

@@ -1,11 +1,11 @@
 //! A file with a secret, such as a token, readable only by its owner.
 
-use std::fs::OpenOptions;
-use std::io::Write;
-use std::os::unix::fs::{MetadataExt, OpenOptionsExt};
+use std::io::{ErrorKind, Write};
+use std::os::unix::fs::MetadataExt;
 use std::path::Path;
 
 use anyhow::Context;
+use tempfile::NamedTempFile;
 
 use crate::failure::wrong_use;
 use crate::random::random_u64;
@@ -40,13 +40,21 @@ pub fn random() -> anyhow::Result<String> {
 /// The file can be read by others, contains no valid secret, or cannot be created.
 pub fn ensure(path: &Path, remedy: &str) -> anyhow::Result<String> {
     if !path.exists() {
-        let secret = random()?;
-        let failed = || format!("cannot create {}", path.display());
-        let mut options = OpenOptions::new();
-        let file = options.write(true).create_new(true).mode(0o600).open(path);
-        file.and_then(|mut file| writeln!(file, "{secret}")).with_context(failed)?;
+        create(path).with_context(|| format!("cannot create {}", path.display()))?;
     }
     read(path, remedy)
+}
+
+/// Creates the file with its content, unless another process does at the same time.
+fn create(path: &Path) -> anyhow::Result<()> {
+    let folder = path.parent().filter(|folder| !folder.as_os_str().is_empty());
+    // Readable only by its owner.
+    let mut file = NamedTempFile::new_in(folder.unwrap_or(Path::new(".")))?;
+    writeln!(file, "{}", random()?)?;
+    match file.persist_noclobber(path) {
+        Err(error) if error.error.kind() != ErrorKind::AlreadyExists => Err(error.error.into()),
+        _ => Ok(()),
+    }
 }
 
 /// Reads a secret. `remedy` ends the message of a wrong file.

@@ -3,8 +3,8 @@
 use std::path::PathBuf;
 
 use anyhow::Context;
-use dmprl_run::RunDirectory;
 use dmprl_run::title;
+use dmprl_run::{LockWatch, RunDirectory};
 use dmprl_shared::config::ExperimentConfig;
 
 use super::domain;
@@ -22,6 +22,8 @@ pub struct HostPlan {
     /// This host's directory of the run. The caller holds its lock until the session has ended, and
     /// children inherit it.
     pub run: RunDirectory,
+    /// Tells whether the lock was lost.
+    pub lock: LockWatch,
     /// The run's configuration, adapted to this host.
     pub config: ExperimentConfig,
     /// The Python virtual environment.
@@ -37,7 +39,7 @@ pub struct HostPlan {
 /// # Errors
 /// The session could not start. Later failures are in the report.
 pub fn host(plan: HostPlan, observer: &mut dyn RunObserver) -> anyhow::Result<SessionReport> {
-    let HostPlan { program, run, config, venv, upstream, session } = plan;
+    let HostPlan { program, run, lock, config, venv, upstream, session } = plan;
     let runtime = tokio::runtime::Builder::new_current_thread()
         .enable_all()
         .build()
@@ -65,7 +67,7 @@ pub fn host(plan: HostPlan, observer: &mut dyn RunObserver) -> anyhow::Result<Se
     };
     let limits = TimeLimits::default();
     let earlier = Totals::default();
-    let plan = SupervisorPlan { launcher, config, limits, earlier, interrupts };
+    let plan = SupervisorPlan { launcher, lock, config, limits, earlier, interrupts };
     let report = runtime.block_on(supervise(plan, observer));
     // The runtime kills remaining children, which must not outlive their shared memory.
     drop(runtime);

@@ -48,6 +48,7 @@ mod simulation;
 mod state;
 mod step;
 mod supervisor;
+mod suspension;
 mod totals;
 mod views;
 mod whole_run;

@@ -124,6 +124,7 @@ impl Machine {
                 );
                 return Err(Failure::new(message).advice(self.resume_advice()));
             }
+            Event::LockLost(holder) => self.on_lock_lost(&holder),
             Event::Interrupt => self.on_interrupt(),
             Event::Late => self.children.reset_silence(self.now),
             Event::Suspended(lost) => self.postpone(lost),

@@ -4,8 +4,8 @@ use std::path::PathBuf;
 use std::time::Duration;
 
 use anyhow::Context;
-use dmprl_run::RunDirectory;
 use dmprl_run::title;
+use dmprl_run::{LockWatch, RunDirectory};
 use dmprl_shared::config::ExperimentConfig;
 
 use super::domain;
@@ -25,6 +25,8 @@ pub struct SessionPlan {
     pub program: PathBuf,
     /// The run. The caller holds its lock until the session has ended, and children inherit it.
     pub run: RunDirectory,
+    /// Tells whether the lock was lost.
+    pub lock: LockWatch,
     /// The resolved configuration.
     pub config: ExperimentConfig,
     /// The Python virtual environment.
@@ -51,7 +53,7 @@ pub struct Trial {
 /// # Errors
 /// The session could not start. Later failures are in the report.
 pub fn session(plan: SessionPlan, observer: &mut dyn RunObserver) -> anyhow::Result<SessionReport> {
-    let SessionPlan { program, run, config, venv, resume, earlier, trial } = plan;
+    let SessionPlan { program, run, lock, config, venv, resume, earlier, trial } = plan;
     let manifest = run.manifest()?;
     let resume = resume && can_resume(&run, observer)?;
     let evaluations = run.evaluations()?;
@@ -82,7 +84,7 @@ pub fn session(plan: SessionPlan, observer: &mut dyn RunObserver) -> anyhow::Res
     observer.on_event(RunEvent::Started { title, run: path, learner: None, evaluations });
     let mut limits = TimeLimits::default();
     limits.restart_max = trial.restart_max.unwrap_or(limits.restart_max);
-    let plan = SupervisorPlan { launcher, config, limits, earlier, interrupts };
+    let plan = SupervisorPlan { launcher, lock, config, limits, earlier, interrupts };
     let report = runtime.block_on(supervise(plan, observer));
     // The runtime kills remaining children, which must not outlive their shared memory.
     drop(runtime);

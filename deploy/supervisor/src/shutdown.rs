@@ -4,7 +4,7 @@ use std::process::ExitStatus;
 use std::time::Duration;
 
 use dmprl_control::Command;
-use dmprl_run::describe;
+use dmprl_run::{LEASE_TIMEOUT, describe};
 
 use super::machine::Machine;
 use super::observer::{AfterDeath, NotEvaluated, RunEvent};
@@ -262,6 +262,19 @@ impl Machine {
             2 => self.kill_all("interrupted twice"),
             _ => {}
         }
+    }
+
+    /// Ends the run at once, without a checkpoint: it would be written into another one's run.
+    pub(super) fn on_lock_lost(&mut self, holder: &str) {
+        let message = format!(
+            "{holder} has taken the run over, because this process did not renew its lease for \
+             {} s; was it suspended, or cut off from the file system?",
+            LEASE_TIMEOUT.as_secs()
+        );
+        self.failure.get_or_insert_with(|| Failure::new(message));
+        self.give_up_evaluations(&NotEvaluated::Stopping);
+        self.children.cancel_restarts(|_| true);
+        self.kill_all("the run was taken over");
     }
 
     /// Asks every child to exit within `limit`. If a stop is in progress, this can shorten its

@@ -39,6 +39,8 @@ pub(super) enum Event {
     ActionFailed(Error),
     /// The run's shared-memory directory was removed.
     DomainLost(PathBuf),
+    /// Another process, described here, has taken the run over.
+    LockLost(String),
     /// The user interrupts.
     Interrupt,
     /// The supervisor itself was late, so a child's silence since its last turn does not count.

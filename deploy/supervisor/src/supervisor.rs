@@ -7,7 +7,7 @@ use std::time::{Duration, Instant};
 use anyhow::Error;
 use dmprl_control::{Command, EvaluationRow, JoinAnswer, Progress, Welcome};
 use dmprl_run::format::shown;
-use dmprl_run::{Processes, RunDirectory};
+use dmprl_run::{LockWatch, Processes, RunDirectory};
 use dmprl_shared::config::ExperimentConfig;
 use dmprl_shared::spec::EnvSpec;
 use tokio::sync::mpsc;
@@ -21,12 +21,10 @@ use super::observer::{RunEvent, RunObserver};
 use super::process::Process;
 use super::state::Settings;
 use super::step::{Action, Admission, Event, Failure, ResumeAdvice, Successor};
+use super::suspension::{lateness, suspension};
 use super::totals::Totals;
 use super::{joining, views};
 
-/// If the supervisor wakes this long after its own deadline, it was suspended, by Ctrl-Z and `fg`
-/// or a paused container, and not only late.
-const SUSPENDED: Duration = Duration::from_secs(5);
 /// A supervisor this late cannot distinguish a worker that hangs from one that was suspended too.
 const LATE: Duration = Duration::from_secs(1);
 /// Maximum interval between checks for the shared-memory directory: each is one `stat`.
@@ -41,6 +39,8 @@ const PROCESSES_INTERVAL: Duration = Duration::from_secs(2);
 pub struct SupervisorPlan {
     /// How to start children, and the run.
     pub launcher: Launcher,
+    /// Tells whether the run's lock was lost.
+    pub lock: LockWatch,
     /// The resolved configuration.
     pub config: ExperimentConfig,
     /// Time limits.
@@ -88,6 +88,7 @@ pub struct SessionReport {
 struct Supervisor<'a> {
     machine: Machine,
     launcher: Launcher,
+    lock: LockWatch,
     observer: &'a mut dyn RunObserver,
     events: mpsc::Sender<Incoming>,
     children: BTreeMap<Process, Child>,
@@ -111,7 +112,7 @@ enum Wake {
 
 /// Runs the processes of a session until all have ended.
 pub async fn supervise(plan: SupervisorPlan, observer: &mut dyn RunObserver) -> SessionReport {
-    let SupervisorPlan { launcher, config, limits, earlier, mut interrupts } = plan;
+    let SupervisorPlan { launcher, lock, config, limits, earlier, mut interrupts } = plan;
     let (events, mut incoming) = mpsc::channel(EVENTS_MAX);
     let mut woke = Instant::now();
     let (known, unreadable) = match Known::read(&launcher.run) {
@@ -130,6 +131,7 @@ pub async fn supervise(plan: SupervisorPlan, observer: &mut dyn RunObserver) -> 
     };
     let machine = Machine::new(settings, woke);
     let mut supervisor = Supervisor::new(machine, launcher, observer, events);
+    supervisor.lock = lock;
     supervisor.best_return = known.best_return.unwrap_or(f64::NEG_INFINITY);
     supervisor.step(unreadable.map_or(Event::Begin, Event::ActionFailed));
     while !supervisor.machine.is_over() {
@@ -155,6 +157,7 @@ pub async fn supervise(plan: SupervisorPlan, observer: &mut dyn RunObserver) -> 
             }
         }
         supervisor.check_domain();
+        supervisor.check_lock();
         supervisor.refresh(woke);
         supervisor.write_processes_if_due(woke);
     }
@@ -187,6 +190,7 @@ impl<'a> Supervisor<'a> {
         Self {
             machine,
             launcher,
+            lock: LockWatch::default(),
             observer,
             events,
             children: BTreeMap::new(),
@@ -381,6 +385,17 @@ impl<'a> Supervisor<'a> {
         }
     }
 
+    /// Ends the run if another process has taken it over.
+    fn check_lock(&mut self) {
+        if let Some(holder) = self.lock.lost_to().map(str::to_owned) {
+            // Once: the run cannot get it back.
+            self.lock = LockWatch::default();
+            // The files belong to the other process now.
+            self.processes_due = None;
+            self.step(Event::LockLost(holder));
+        }
+    }
+
     /// Redraws the live display between two reports of progress, so that deaths and restarts are
     /// visible without progress.
     fn refresh(&mut self, now: Instant) {
@@ -462,32 +477,5 @@ impl<'a> Supervisor<'a> {
             learner_restarts: totals.learner_restarts,
             wall: self.started.elapsed(),
         }
-    }
-}
-
-/// Returns how long the supervisor was suspended, or `None` if it was not. It last ran at `looked`,
-/// should have woken at `due` at the latest, and woke at `now`.
-fn suspension(looked: Instant, due: Instant, now: Instant) -> Option<Duration> {
-    (lateness(looked, due, now) >= SUSPENDED).then(|| now.duration_since(looked))
-}
-
-fn lateness(looked: Instant, due: Instant, now: Instant) -> Duration {
-    now.saturating_duration_since(due.max(looked))
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    /// Regression test: Ctrl-Z for an hour was once taken for an hour without progress.
-    #[test]
-    fn a_suspension_is_distinguished_from_a_wait() {
-        let looked = Instant::now();
-        let due = looked + Duration::from_secs(60);
-        assert_eq!(suspension(looked, due, looked), None, "an early report");
-        assert_eq!(suspension(looked, due, due + Duration::from_millis(20)), None, "a timer");
-        let hour = Duration::from_secs(3_600);
-        assert_eq!(suspension(looked, due, looked + hour), Some(hour));
-        assert_eq!(suspension(due, looked, due), None, "overdue and handled at once");
     }
 }

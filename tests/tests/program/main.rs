@@ -48,8 +48,10 @@ mod report;
 mod results;
 mod robot;
 mod search;
+mod shared_directory;
 mod start_stop;
 mod sweep;
+mod trust;
 mod variants;
 
 /// Settings of a cheap run: small networks, few updates, and frequent output of every kind.

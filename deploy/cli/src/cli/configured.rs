@@ -42,7 +42,7 @@ pub(super) struct ConfiguredArgs {
     env_kwargs: Vec<String>,
     /// Configuration file, such as a run's config.toml.
     #[arg(long, value_name = "FILE")]
-    config: Option<PathBuf>,
+    pub(super) config: Option<PathBuf>,
     /// Set any configuration key; repeatable.
     #[arg(long, value_name = "KEY=VALUE")]
     set: Vec<String>,
@@ -57,6 +57,12 @@ impl ConfiguredArgs {
         let lists = self.python_path.is_empty() && pairs;
         let seed = self.seed.is_none() && self.config.is_none();
         words && counts && lists && seed && self.preset == PRESETS[0].name
+    }
+
+    /// Returns true if an argument names folders of modules.
+    pub(super) fn names_python_path(&self) -> bool {
+        let key = "task.python_path";
+        !self.python_path.is_empty() || self.set.iter().any(|pair| pair.trim().starts_with(key))
     }
 
     /// Collects all sources of the configuration of `task`; `more` are the command's own flags.

@@ -9,6 +9,7 @@ use dmprl_run::format::{plus_minus, std_of};
 use dmprl_run::{ChosenPolicy, PolicyChoice, RunDirectory};
 use dmprl_supervisor::{self as launch, EvaluationPlan};
 
+use super::trust::TrustArgs;
 use super::{emit, prepare_python, this_program};
 
 /// Mean returns that differ by at most this much count as equal.
@@ -35,6 +36,8 @@ pub(super) struct EvalArgs {
     /// Number of episodes [default: as in the policy's evaluation during training].
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u64).range(1..=1_000_000))]
     episodes: Option<u64>,
+    #[command(flatten)]
+    trust: TrustArgs,
     /// Print one JSON object on standard output.
     #[arg(long)]
     json: bool,
@@ -44,6 +47,7 @@ pub(super) fn run(args: &EvalArgs) -> anyhow::Result<Outcome> {
     let run = RunDirectory::open(&args.run)?;
     let chosen = run.choose_policy(args.policy)?;
     let config = run.config()?;
+    args.trust.check_for(&run, &config)?;
     let stored = chosen.row.as_ref().map_or(config.evaluation.episodes, |row| row.returns.len());
     let venv = prepare_python()?;
     let plan = EvaluationPlan {

@@ -27,6 +27,7 @@ mod session;
 mod sweep;
 mod tasks;
 mod train;
+mod trust;
 
 use std::io::Write;
 use std::path::{Path, PathBuf};
@@ -47,6 +48,7 @@ use crate::terminal::messages::{self, MessageStyle};
 use crate::terminal::{ProgressStyle, TerminalProgress};
 #[cfg(feature = "python")]
 use dmprl_supervisor::python_setup::{Home, ensure_extra};
+use session::name_limits;
 pub use session::{TrainingPlan, train_session};
 
 const EXAMPLES: &str = "\

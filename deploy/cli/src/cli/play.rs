@@ -13,6 +13,7 @@ use dmprl_run::{PolicyChoice, RunDirectory};
 use rustix::process::{Pid, Signal, kill_process};
 
 use super::prepare_python_with;
+use super::trust::TrustArgs;
 use crate::terminal::say;
 
 /// Interval between checks for exit and interrupt.
@@ -53,11 +54,14 @@ pub(super) struct PlayArgs {
     /// Port of the page; 0: any free port.
     #[arg(long, value_name = "PORT", default_value_t = 8788)]
     port: u16,
+    #[command(flatten)]
+    trust: TrustArgs,
 }
 
 pub(super) fn run(args: &PlayArgs) -> anyhow::Result<Outcome> {
     let run = RunDirectory::open(&args.run)?;
     let config = run.config()?;
+    args.trust.check_for(&run, &config)?;
     let opened = read_policy(&run, &run.choose_policy(args.policy)?)?;
     let (_, python) = prepare_python_with(EXTRA)?;
     let folder = tempfile::tempdir().context("cannot create a folder for the policy")?;

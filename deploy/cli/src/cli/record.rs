@@ -9,6 +9,7 @@ use dmprl_run::format::shown;
 use dmprl_run::{PolicyChoice, RunDirectory};
 use dmprl_sweep::record::{Observer, RecordPlan, Recordings, record};
 
+use super::trust::TrustArgs;
 use super::{emit, prepare_python_with, this_program};
 use crate::terminal::{TerminalProgress, say};
 
@@ -51,6 +52,8 @@ pub(super) struct RecordArgs {
     /// Output directory [default: videos in the run].
     #[arg(long, value_name = "DIR")]
     output: Option<PathBuf>,
+    #[command(flatten)]
+    trust: TrustArgs,
     /// Print one JSON object on standard output.
     #[arg(long)]
     json: bool,
@@ -68,6 +71,7 @@ pub(super) fn run(args: &RecordArgs) -> anyhow::Result<Outcome> {
         };
         sides.push((other, other.choose_policy(choice)?));
     }
+    sides.iter().try_for_each(|(run, _)| args.trust.check(run))?;
     let first_seed = match args.seed {
         Some(seed) => seed,
         None => run.config()?.evaluation.first_seed,

@@ -15,6 +15,7 @@ use dmprl_run::format::shown;
 use dmprl_run::{PolicyChoice, Progress, RunDirectory, rfc3339};
 use dmprl_sweep::record::{Observer, RecordPlan, measure_motion, record};
 
+use super::trust::TrustArgs;
 use super::{emit, prepare_python, prepare_python_with, this_program};
 use crate::terminal::{TerminalProgress, say};
 
@@ -49,6 +50,8 @@ pub(super) struct ReportArgs {
     /// Do not roll policies out; show only motion and frames that exist already.
     #[arg(long)]
     no_motion: bool,
+    #[command(flatten)]
+    trust: TrustArgs,
     /// Also print the tables as one JSON object on standard output.
     #[arg(long)]
     json: bool,
@@ -56,11 +59,11 @@ pub(super) struct ReportArgs {
 
 pub(super) fn run(args: &ReportArgs) -> anyhow::Result<Outcome> {
     let mut results = Results::read(&args.runs)?;
-    if !args.no_motion && measure(&mut results)? == Outcome::Interrupted {
+    if !args.no_motion && measure(&mut results, args.trust)? == Outcome::Interrupted {
         return Ok(Outcome::Interrupted);
     }
     let filmstrips = plan_filmstrips(&results)?;
-    if !args.no_motion && draw(&filmstrips, &mut results)? == Outcome::Interrupted {
+    if !args.no_motion && draw(&filmstrips, &mut results, args.trust)? == Outcome::Interrupted {
         return Ok(Outcome::Interrupted);
     }
     results.undrawn.extend(missing_filmstrips(&filmstrips));
@@ -115,7 +118,7 @@ pub(super) fn run(args: &ReportArgs) -> anyhow::Result<Outcome> {
 }
 
 /// Measures the motion of runs that have no measurement yet. Skips it if Python is unavailable.
-fn measure(results: &mut Results) -> anyhow::Result<Outcome> {
+fn measure(results: &mut Results, trust: TrustArgs) -> anyhow::Result<Outcome> {
     let count = unmeasured(results);
     if count == 0 {
         return Ok(Outcome::Done);
@@ -130,6 +133,7 @@ fn measure(results: &mut Results) -> anyhow::Result<Outcome> {
     let observer = Observer { program: this_program()?, venv };
     let progress = TerminalProgress::default();
     Ok(measure_motions(results, |run| {
+        trust.check(run.directory)?;
         progress.at(run.index, count as u64);
         let (number, name) = (run.index + 1, run.name);
         progress.state(&format!("measuring motion {number} of {count}: {name}"));
@@ -138,7 +142,11 @@ fn measure(results: &mut Results) -> anyhow::Result<Outcome> {
 }
 
 /// Records the frames that do not exist yet. Skips them if Python is unavailable.
-fn draw(filmstrips: &[PlannedFilmstrip], results: &mut Results) -> anyhow::Result<Outcome> {
+fn draw(
+    filmstrips: &[PlannedFilmstrip],
+    results: &mut Results,
+    trust: TrustArgs,
+) -> anyhow::Result<Outcome> {
     if !needs_recording(filmstrips) {
         return Ok(Outcome::Done);
     }
@@ -152,6 +160,7 @@ fn draw(filmstrips: &[PlannedFilmstrip], results: &mut Results) -> anyhow::Resul
     let observer = Observer { program: this_program()?, venv };
     let progress = TerminalProgress::default();
     Ok(record_filmstrips(filmstrips, &mut results.undrawn, |run| {
+        trust.check(run)?;
         let plan = first_episode(run, &observer, &python)?;
         let made = record(&plan, &progress)?;
         Ok(made.map_or(Outcome::Interrupted, |_| Outcome::Done))

@@ -13,7 +13,10 @@ use dmprl_supervisor::{self as launch, Trial};
 use super::configuration::refuse;
 use super::configured::check_build;
 use super::output::OutputArgs;
-use super::{TrainingPlan, cores, prepare_python, this_program, train_session, training_session};
+use super::trust::TrustArgs;
+use super::{
+    TrainingPlan, cores, name_limits, prepare_python, this_program, train_session, training_session,
+};
 
 const HELP: &str = "\
 Resumes from the last checkpoint with the run's own config.toml; environment variables and presets
@@ -32,6 +35,8 @@ pub(super) struct ResumeArgs {
     /// New total length of the run [environment steps].
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(i64).range(1..))]
     steps: Option<i64>,
+    #[command(flatten)]
+    trust: TrustArgs,
     #[command(flatten)]
     pub(super) output: OutputArgs,
 }
@@ -65,10 +70,12 @@ pub(super) fn run(args: &ResumeArgs) -> anyhow::Result<Outcome> {
         }
     }
     check_build(&config)?;
+    args.trust.check_for(&run, &config)?;
     capacity::check(&config, run.spec()?.as_ref())?;
     let venv = prepare_python()?;
     // Before the lock is taken: this starts an interpreter, which would inherit the lock.
     let session = training_session(&config, &venv)?;
+    name_limits(&run);
     let lock = run.lock(launch::RESUME_WAIT)?;
     let mut manifest = run.manifest()?;
     manifest.sessions.push(session);

@@ -9,7 +9,7 @@ use dmprl_learner::checkpoint;
 use dmprl_run::failure::Outcome;
 use dmprl_run::format::shown;
 use dmprl_run::title;
-use dmprl_run::{RunDirectory, RunLock};
+use dmprl_run::{FileSystem, RunDirectory, RunLock};
 use dmprl_shared::config::ExperimentConfig;
 use dmprl_supervisor::{
     self as launch, Ending, RunEvent, RunObserver, SessionPlan, SessionReport, Totals, Trial,
@@ -58,6 +58,15 @@ impl RunObserver for SessionObserver {
     }
 }
 
+/// Names the file system of a run directory, if it cannot promise something that runs need.
+pub(super) fn name_limits(run: &RunDirectory) {
+    // If it cannot be found out, the run works as well.
+    let Ok(file_system) = FileSystem::of(run.path()) else { return };
+    if let Some(concern) = file_system.concern() {
+        say(&format!("the run directory is on {file_system}: {concern}"));
+    }
+}
+
 /// Trains until the run ends, is stopped or fails. Then draws the learning curve and prints a
 /// summary.
 ///
@@ -72,16 +81,28 @@ pub fn train_session(plan: TrainingPlan) -> anyhow::Result<Outcome> {
         mirror: None,
     };
     let earlier = earlier_sessions(&run)?;
-    let plan = SessionPlan { program, run: run.clone(), config, venv, resume, earlier, trial };
+    let plan = SessionPlan {
+        program,
+        run: run.clone(),
+        lock: lock.watch(),
+        config,
+        venv,
+        resume,
+        earlier,
+        trial,
+    };
     let report = launch::session(plan, &mut session_observer)?;
     drop(session_observer);
-    if let Err(error) = run.remove_half_written() {
-        say(&format!("warning: {error:#}"));
-    }
-    drop(lock);
-    if let Err(error) = plots::learning_curve(&run, &title) {
-        // The results are complete without the plot.
-        say(&format!("warning: {error:#}"));
+    // If another process trains the run now, its files are not touched.
+    if lock.watch().lost_to().is_none() {
+        if let Err(error) = run.remove_half_written() {
+            say(&format!("warning: {error:#}"));
+        }
+        drop(lock);
+        if let Err(error) = plots::learning_curve(&run, &title) {
+            // The results are complete without the plot.
+            say(&format!("warning: {error:#}"));
+        }
     }
     match progress {
         ProgressStyle::Events => {

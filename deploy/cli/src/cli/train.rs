@@ -20,7 +20,10 @@ use toml::Value;
 use super::configuration::{Flag, merge, refuse};
 use super::configured::{ConfiguredArgs, check_build, flag, integer, make_absolute, paths};
 use super::output::OutputArgs;
-use super::{TrainingPlan, cores, prepare_python, this_program, train_session, training_session};
+use super::trust::{Said, TrustArgs, mark_as_own};
+use super::{
+    TrainingPlan, cores, name_limits, prepare_python, this_program, train_session, training_session,
+};
 
 /// Runs created within one second get a number; this many mean that the clock is stuck.
 const SAME_SECOND_MAX: usize = 100;
@@ -86,6 +89,8 @@ pub(super) struct TrainArgs {
     #[arg(long, value_name = "M")]
     max_minutes: Option<f64>,
     #[command(flatten)]
+    trust: TrustArgs,
+    #[command(flatten)]
     pub(super) output: OutputArgs,
     /// Folder in which workers and learner log every segment; for `chaos`.
     #[arg(long, value_name = "DIR", hide = true)]
@@ -106,6 +111,12 @@ pub(super) fn configuration(args: &TrainArgs) -> anyhow::Result<ExperimentConfig
 
 pub(super) fn run(args: &TrainArgs) -> anyhow::Result<Outcome> {
     let config = configuration(args)?;
+    let said = Said {
+        task: &args.task,
+        file: args.configured.config.as_deref(),
+        python_path: args.configured.names_python_path(),
+    };
+    said.check(&config, args.trust)?;
     let spec = task_defaults(&args.task).map(TaskDefaults::spec);
     capacity::check(&config, spec.as_ref())?;
     let init_from = args.init_from.as_deref().map(policy_file).transpose()?;
@@ -117,6 +128,8 @@ pub(super) fn run(args: &TrainArgs) -> anyhow::Result<Outcome> {
     let session = training_session(&config, &venv)?;
     let manifest = Manifest::begin(init_from.map(|path| path.display().to_string()), session)?;
     let run = RunDirectory::create(&path, &config, &manifest)?;
+    mark_as_own(&run, &config);
+    name_limits(&run);
     let lock = run.lock(Duration::ZERO)?;
     train_session(TrainingPlan {
         program: this_program()?,

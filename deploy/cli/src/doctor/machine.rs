@@ -1,9 +1,9 @@
 //! Checks of platform, processor, memory, disk and GPU.
 
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
-use dmprl_run::Machine;
 use dmprl_run::format::binary_bytes;
+use dmprl_run::{FileSystem, Machine};
 use dmprl_supervisor::answer;
 use dmprl_supervisor::capacity::{MachineLimits, Space};
 use rustix::fs::{Access, access};
@@ -20,7 +20,7 @@ const MEMORY_BYTES_MIN: u64 = 2 << 30;
 const DISK_BYTES_MIN: u64 = 1 << 30;
 
 pub(super) fn checks() -> Vec<Check> {
-    vec![platform(), cores(), memory(), disk(), gpu()]
+    vec![platform(), cores(), memory(), disk(), file_system(), gpu()]
 }
 
 fn platform() -> Check {
@@ -63,11 +63,32 @@ fn memory() -> Check {
 }
 
 fn disk() -> Check {
+    disk_at(&runs_folder())
+}
+
+/// Folder in which `train` creates runs.
+fn runs_folder() -> PathBuf {
     let here = std::env::current_dir().unwrap_or_default();
     let runs = here.join(RUNS);
     // If it does not exist yet, `train` creates it in the current directory.
-    let path = if runs.is_dir() { runs } else { here };
-    disk_at(&path)
+    if runs.is_dir() { runs } else { here }
+}
+
+fn file_system() -> Check {
+    const NAME: &str = "file system";
+    let path = runs_folder();
+    match FileSystem::of(&path) {
+        Ok(found) => file_system_check(&found, &path),
+        Err(error) => Check::warning(NAME, error.to_string(), "use train --run-dir"),
+    }
+}
+
+fn file_system_check(found: &FileSystem, path: &Path) -> Check {
+    let text = format!("{found}, of {}", path.display());
+    match found.concern() {
+        Some(concern) => Check::warning("file system", text, concern),
+        None => Check::ok("file system", text),
+    }
 }
 
 fn disk_at(path: &Path) -> Check {

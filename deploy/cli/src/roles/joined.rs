@@ -119,7 +119,7 @@ fn connect(run: &RunDirectory) -> anyhow::Result<UnixStream> {
         )
     };
     let supervisor = run.lock_holder().with_context(not_trained)?;
-    let token = dmprl_supervisor::domain_token(&run.manifest()?, supervisor);
+    let token = dmprl_supervisor::domain_token(&run.manifest()?, supervisor.pid);
     let domain: PathBuf = Place::of_this_user().find(&token).with_context(not_trained)?;
     let stream = UnixStream::connect(domain.join(JOIN_SOCKET)).with_context(not_trained)?;
     stream.set_read_timeout(Some(ANSWER_LIMIT)).context("cannot limit the wait for an answer")?;

@@ -8,7 +8,7 @@ use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
 
 use dmprl::terminal::Display;
-use dmprl_run::{Manifest, RunDirectory};
+use dmprl_run::{LockWatch, Manifest, RunDirectory};
 use dmprl_shared::config::ExperimentConfig;
 use dmprl_shared::spec::EnvSpec;
 use dmprl_supervisor::{Launcher, SessionReport, SupervisorPlan, TimeLimits, Totals, supervise};
@@ -163,7 +163,8 @@ pub fn plan(
         upstream: None,
     };
     let (config, earlier) = (config.clone(), Totals::default());
-    SupervisorPlan { launcher, config, limits, earlier, interrupts }
+    let lock = LockWatch::default();
+    SupervisorPlan { launcher, lock, config, limits, earlier, interrupts }
 }
 
 /// Lists the process ids of a run's living fakes, without zombies.

@@ -7,7 +7,7 @@ use std::collections::BTreeMap;
 pub struct Tally(BTreeMap<&'static str, u64>);
 
 /// Names of events that must occur in some session.
-const EXPECTED: [&str; 27] = [
+const EXPECTED: [&str; 28] = [
     "abandoned",
     "answers",
     "completed",
@@ -32,6 +32,7 @@ const EXPECTED: [&str; 27] = [
     "kills",
     "late answers",
     "left",
+    "lock lost",
     "one process",
     "refused",
     "workers given up",

@@ -44,6 +44,8 @@ enum ScheduledEvent {
     /// The supervisor is suspended.
     Suspension,
     DomainLost,
+    /// Another host takes the run over.
+    LockLost,
     /// Faults end.
     Heal,
 }
@@ -137,6 +139,9 @@ impl World {
             at(self, ScheduledEvent::DomainLost);
         }
         if self.chance(40) {
+            at(self, ScheduledEvent::LockLost);
+        }
+        if self.chance(40) {
             let candidates = [Process::Actor(0), Process::Learner, Process::Evaluator];
             self.immortal = Some(candidates[self.random.random_range(0..3)]);
         }
@@ -212,6 +217,10 @@ impl World {
                 self.step(Event::DomainLost("/dev/shm/gone".into()));
             }
             ScheduledEvent::DomainLost => {}
+            ScheduledEvent::LockLost => {
+                self.tally.count("lock lost");
+                self.step(Event::LockLost("process 1 on host other".into()));
+            }
             ScheduledEvent::Heal => {
                 self.mode.faults = false;
                 self.fakes.values_mut().for_each(Fake::heal);
