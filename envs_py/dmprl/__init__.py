@@ -55,6 +55,8 @@ SHORT_NAMES = {
     "thrower": "dmprl/Thrower-v0",
     "panda-reach": "dmprl/PandaReach-v0",
     "panda-reach-joints": "dmprl/PandaReachJoints-v0",
+    "panda-push": "dmprl/PandaPush-v0",
+    "panda-push-dense": "dmprl/PandaPushDense-v0",
     "reacher-v1": "dmprl/Reacher-v1",
     "pusher-v0": "dmprl/Pusher-v0",
     "thrower-v0": "dmprl/Thrower-v0",

@@ -20,6 +20,10 @@ from dmprl.numpy_policy import Actor
 PANDA_GYM_IDS = {
     "dmprl/PandaReach-v0": "PandaReachDense-v3",
     "dmprl/PandaReachJoints-v0": "PandaReachJointsDense-v3",
+} | {
+    f"dmprl/{name}{variant}-v0": f"{name}{variant}-v3"
+    for name in ("PandaPush",)
+    for variant in ("", "Dense", "Joints", "JointsDense")
 }
 """panda-gym's ids of dmprl's Panda tasks."""
 

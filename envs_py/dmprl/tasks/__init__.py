@@ -29,6 +29,10 @@ TASKS = {
     "dmprl/Thrower-v0": Registered("dmprl.tasks.thrower", "Thrower", 100),
     "dmprl/PandaReach-v0": Registered("dmprl.tasks.panda", "PandaReach", 50),
     "dmprl/PandaReachJoints-v0": Registered("dmprl.tasks.panda", "PandaReachJoints", 50),
+} | {
+    f"dmprl/{name}{variant}-v0": Registered("dmprl.tasks.panda_objects", name + variant, steps)
+    for name, steps in (("PandaPush", 50),)
+    for variant in ("", "Dense", "Joints", "JointsDense")
 }
 """Every task by its Gymnasium id."""
 

@@ -106,6 +106,23 @@ const PANDA_REACH_JOINTS: TaskDefaults = TaskDefaults {
     ..PANDA_REACH
 };
 
+const PANDA_PUSH: TaskDefaults = TaskDefaults {
+    name: "panda-push",
+    id: "dmprl/PandaPush-v0",
+    about: "Franka Panda pushes a cube to a goal, sparse reward",
+    observation_len: 24,
+    values: PANDA_PUSH_VALUES,
+    paper: &[],
+    ..PANDA_REACH
+};
+
+const PANDA_PUSH_DENSE: TaskDefaults = TaskDefaults {
+    name: "panda-push-dense",
+    id: "dmprl/PandaPushDense-v0",
+    about: "panda-push with minus the distance as reward",
+    ..PANDA_PUSH
+};
+
 const REACHER_V1: TaskDefaults = TaskDefaults {
     name: "reacher-v1",
     id: "dmprl/Reacher-v1",
@@ -127,9 +144,19 @@ const PUSHER_V0: TaskDefaults = TaskDefaults {
 const THROWER_V0: TaskDefaults =
     TaskDefaults { name: "thrower-v0", about: "alias of thrower", ..THROWER };
 
-/// Every task with a short name: the five tasks, then the paper's older versions.
-pub const TASKS: [TaskDefaults; 8] =
-    [REACHER, PUSHER, THROWER, PANDA_REACH, PANDA_REACH_JOINTS, REACHER_V1, PUSHER_V0, THROWER_V0];
+/// Every task with a short name; the paper's older versions are last.
+pub const TASKS: [TaskDefaults; 10] = [
+    REACHER,
+    PUSHER,
+    THROWER,
+    PANDA_REACH,
+    PANDA_REACH_JOINTS,
+    PANDA_PUSH,
+    PANDA_PUSH_DENSE,
+    REACHER_V1,
+    PUSHER_V0,
+    THROWER_V0,
+];
 
 // Observation: cos (2), sin (2), target (2), angular velocity (2), fingertip - target.
 const REACHER_VALUES: &[&str] = &[r#"
@@ -224,6 +251,31 @@ steps = 30000
 warm_up_steps = 1000
 [pacing]
 updates_per_segment = 4.0
+"#;
+
+// Observation: achieved goal (3), desired goal (3), position of the end effector (3), its velocity
+// (3), position, rotation, velocity and angular velocity of the cube (3 each).
+const PANDA_PUSH_VALUES: &[&str] = &[
+    r#"
+[task]
+start_sources = [
+    { index = 6, velocity = 9 },
+    { index = 7, velocity = 10 },
+    { index = 8, velocity = 11 },
+]
+"#,
+    PANDA_OBJECTS,
+];
+
+// u = 1 moves the end effector by 0.05 m, and the fingers' width by 0.2 m, so a start source scales
+// the width by 1/4.
+const PANDA_OBJECTS: &str = r#"
+[run]
+steps = 200000
+[policy]
+position_scale = 20.0
+[algorithm]
+discount = 0.98
 "#;
 
 // Table 2 of the paper, column of the Panda tasks.

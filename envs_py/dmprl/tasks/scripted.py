@@ -1,0 +1,169 @@
+"""Scripted controllers that solve the Panda's tasks with objects, for demonstrations and tests.
+
+``python -m dmprl.tasks.scripted panda-push demos.npz --episodes 50`` writes a file for
+``dmprl train panda-push --demos demos.npz``.
+
+A controller sees the same observations as a policy. Lengths are in metres.
+"""
+
+from __future__ import annotations
+
+import argparse
+from abc import ABC, abstractmethod
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dmprl import SHORT_NAMES
+from dmprl.segment_env import SegmentBuffers, make
+from dmprl.tasks import make_task
+from dmprl.tasks.panda import DISPLACEMENT
+from dmprl.tasks.panda_objects import OBJECT_ENTRIES, PandaObjects
+
+TRAVEL_HEIGHT = 0.09
+"""Height of the end effector at which it passes over an object."""
+PUSH_HEIGHT = 0.02
+CUBE_DECELERATION = 2.45
+"""Deceleration of a cube that slides over the table [m/s²]."""
+
+
+class State(NamedTuple):
+    """An observation of a task with N objects, split into its parts."""
+
+    hand: NDArray[np.float64]
+    """Position of the end effector (3,)."""
+    width: float
+    """Distance of the fingers; 0 if they do not move."""
+    objects: NDArray[np.float64]
+    """Positions (N, 3)."""
+    velocities: NDArray[np.float64]
+    """Velocities of the objects (N, 3) [m/s]."""
+    goals: NDArray[np.float64]
+    """Positions of the goals (N, 3)."""
+
+
+class Controller(ABC):
+    """Acts in one episode, with displacements of the end effector."""
+
+    @abstractmethod
+    def act(self, state: State) -> NDArray[np.float64]:
+        """Chooses the action (A,) for a state."""
+
+
+class Push(Controller):
+    """Goes behind the cube, as seen from the goal, and pushes it ahead in short strokes.
+
+    A cube that was pushed slides on, so each stroke waits for the end of the last one.
+    """
+
+    reached = 0.03
+    """Distance from the goal at which the cube may stay."""
+    behind = 0.055
+    """Distance behind the cube where a push starts."""
+    aside_max = 0.012
+    """Largest distance from the line through cube and goal at which a stroke starts."""
+
+    def act(self, state: State) -> NDArray[np.float64]:  # noqa: D102 - inherited
+        hand, velocity = state.hand, state.velocities[0, :2]
+        speed = float(np.linalg.norm(velocity))
+        rest = state.objects[0, :2] + velocity * speed / (2.0 * CUBE_DECELERATION)
+        to_goal = state.goals[0, :2] - rest
+        distance = float(np.linalg.norm(to_goal))
+        if distance < self.reached or speed > 0.15:
+            return np.zeros(3)
+        ahead = to_goal / distance
+        offset = hand[:2] - rest
+        along = float(offset @ ahead)
+        aside = offset - along * ahead
+        from_line = float(np.linalg.norm(aside))
+        down = PUSH_HEIGHT - hand[2]
+        if hand[2] < 0.045 and -0.09 < along < 0.0 and from_line < self.aside_max:
+            stroke = min(0.015, 0.006 + 0.15 * distance)
+            return towards(np.append(stroke * ahead - aside, down))
+        start = -offset - self.behind * ahead
+        if -0.12 < along < -0.035 and from_line < 0.05 and hand[2] < TRAVEL_HEIGHT + 0.01:
+            return towards(0.7 * np.append(start, down))
+        up = TRAVEL_HEIGHT - hand[2]
+        if up > 0.02 and np.linalg.norm(offset) < 0.1:
+            start = np.zeros(2)
+        return towards(np.append(start, up))
+
+
+CONTROLLERS: dict[str, type[Controller]] = {
+    "dmprl/PandaPush-v0": Push,
+}
+"""Controllers by Gymnasium id; they also solve the task with a dense reward."""
+
+
+def towards(displacement: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Returns the action (3,) that moves the end effector by this, or as far as one action can."""
+    return np.clip(displacement / DISPLACEMENT, -1.0, 1.0)
+
+
+def split(task: PandaObjects, row: NDArray[np.float64]) -> State:
+    """Splits an observation of a task with displacements of the end effector."""
+    count, width = len(task.scene.objects), task.scene.has_gripper
+    objects = row[-OBJECT_ENTRIES * count :].reshape(count, OBJECT_ENTRIES)
+    hand = row[6 * count :]
+    return State(
+        hand=hand[:3],
+        width=float(hand[6]) if width else 0.0,
+        objects=objects[:, :3],
+        velocities=objects[:, 6:9],
+        goals=row[3 * count : 6 * count].reshape(count, 3),
+    )
+
+
+def record(task_id: str, episodes: int, seed: int) -> dict[str, NDArray]:
+    """Runs episodes; returns the arrays that ``--demos`` reads, and each episode's ``success``.
+
+    - ``seed``: seed of the first episode; the others have the following ones.
+    """
+    task = make_task(task_id, 1)
+    env, controllers = make(task_id, episodes, 1), []
+    for _ in range(episodes):
+        controllers.append(CONTROLLERS[task_id.replace("Dense", "")]())
+    out = SegmentBuffers(episodes, 1, env.spec()["observation_len"], len(task.action_low))
+    env.reset(np.ones(episodes, np.uint8), np.arange(seed, seed + episodes, dtype=np.uint64), out)
+    kept: dict[str, list[NDArray]] = {}
+    while not out.truncated.any():
+        for action, controller, row in zip(
+            out.actions[:, 0], controllers, out.next_observations, strict=True
+        ):
+            action[:] = controller.act(split(task, row))
+        env.step_segment(out.actions, out)
+        step = {
+            "observations": out.observations[:, 0],
+            "actions": out.actions[:, 0],
+            "rewards": out.rewards[:, 0],
+            "next_observations": out.observations[:, 1],
+            "terminated": out.terminated,
+            "truncated": out.truncated,
+        }
+        for name, values in step.items():
+            kept.setdefault(name, []).append(values.copy())
+    # One episode after the other.
+    arrays = {name: np.concatenate(np.swapaxes(rows, 0, 1)) for name, rows in kept.items()}
+    return arrays | {"success": out.success.copy()}
+
+
+def main() -> None:
+    """Records demonstrations, as described in the module's docstring."""
+    parser = argparse.ArgumentParser(prog="dmprl.tasks.scripted", description=main.__doc__)
+    names = {
+        name: id_ for name, id_ in SHORT_NAMES.items() if id_.replace("Dense", "") in CONTROLLERS
+    }
+    parser.add_argument("task", choices=names)
+    parser.add_argument("output", help="the file, NAME.npz")
+    parser.add_argument("--episodes", type=int, default=50)
+    parser.add_argument("--seed", type=int, default=0)
+    arguments = parser.parse_args()
+    arrays = record(names[arguments.task], arguments.episodes, arguments.seed)
+    success = arrays["success"].mean()
+    np.savez(arguments.output, **arrays)
+    print(f"{arguments.episodes} episodes, {len(arrays['rewards'])} steps, success {success:.3f}")
+
+
+if __name__ == "__main__":
+    main()
