@@ -22,18 +22,20 @@ from dmprl.goal_task import GoalTask
 from dmprl.mujoco_batch import Fields, Start
 from dmprl.tasks.panda import DISPLACEMENT, NEUTRAL
 from dmprl.tasks.panda_kinematics import JOINTS, InverseKinematics
-from dmprl.tasks.panda_scene import Scene, cube, scene_model
+from dmprl.tasks.panda_scene import BLUE, PUCK_FRICTION, Scene, cube, puck, scene_model
 
 FINGERS = slice(JOINTS, JOINTS + 2)
 """Entries of the fingers in positions, velocities and controls."""
 WIDTH_CHANGE = 0.2
 """Change of the fingers' width by an action of 1 in one step [m]."""
-HALF_RANGE = 0.15
-"""Half the edge of the square in which objects and goals lie [m]."""
-AIR_SHARE, AIR_HEIGHT = 0.7, 0.2
-"""Share of the goals of pick and place above the table, and their maximum height [m]."""
-OBJECT_ENTRIES = 12
+OBJECT_RANGE = (-0.15, -0.15, 0.0), (0.15, 0.15, 0.0)
+"""Corners of the square in which objects start [m]."""
+ON_TABLE_SHARE = 0.3
+"""Share of the goals of pick and place that are on the table, besides those in its box."""
 POSE_ENTRIES = 7
+"""Entries of a free object in the positions: its position and a quaternion."""
+OBJECT_ENTRIES = 12
+"""Entries of an object in an observation: position, rotation and both velocities."""
 
 
 class PandaObjects(GoalTask):
@@ -52,6 +54,8 @@ class PandaObjects(GoalTask):
     }
     goal_in_pictures = "translucent object"
     scene: Scene
+    goal_range: ClassVar[tuple[tuple[float, ...], ...]] = OBJECT_RANGE
+    """Corners of the box from which goals are drawn [m]; heights are above the table."""
     arm_entries = 0
     """Entries of the arm's joints in an observation."""
     arm_action_len = 3
@@ -64,6 +68,10 @@ class PandaObjects(GoalTask):
         self._clipped = np.zeros((env_count, action_len))
         self._kinematics = InverseKinematics(self.model, env_count)
         self._objects_qpos = JOINTS + 2 * self.scene.has_gripper
+        # Objects start as high as at their goals: each above those before it.
+        self._heights = [
+            (1 + 2 * layer) * moved.start_height for layer, moved in enumerate(self.scene.objects)
+        ]
 
     @property
     def goal_len(self) -> int:  # noqa: D102 - inherited
@@ -98,20 +106,17 @@ class PandaObjects(GoalTask):
         self, rng: np.random.Generator, start: Start
     ) -> None:
         start.qpos[:JOINTS] = NEUTRAL
-        self.draw_goal(rng, start.mocap_pos)
+        # As panda-gym from the same seed: first the goal, then the objects, with heights.
+        start.mocap_pos[:] = self.draw_goal(rng)
+        start.mocap_pos[:, 2] += self._heights
         poses = start.qpos[self._objects_qpos :].reshape(-1, POSE_ENTRIES)
-        for layer, pose in enumerate(poses):
-            pose[:2] = draw_on_table(rng)
-            pose[2] = self.height_of_layer(layer)
+        for pose, height in zip(poses, self._heights, strict=True):
+            pose[:3] = rng.uniform(*OBJECT_RANGE)
+            pose[2] = height
 
-    def draw_goal(self, rng: np.random.Generator, goals: NDArray[np.float64]) -> None:
-        """Writes the objects' goals (N, 3), one above the other."""
-        goals[:, :2] = draw_on_table(rng)
-        goals[:, 2] = [self.height_of_layer(layer) for layer in range(len(goals))]
-
-    def height_of_layer(self, layer: int) -> float:
-        """Returns the height of an object's centre on top of ``layer`` others [m]."""
-        return (1 + 2 * layer) * self.scene.objects[layer].rest_height
+    def draw_goal(self, rng: np.random.Generator) -> NDArray[np.float64]:
+        """Draws the goal (3,) of the lowest object, relative to the origin at its height."""
+        return rng.uniform(*self.goal_range)
 
     def observe(self, fields: Fields, out: NDArray[np.float64]) -> None:  # noqa: D102 - inherited
         length, sensors = self.goal_len, fields["sensordata"]
@@ -201,10 +206,102 @@ class PandaPushJointsDense(PandaPushJoints):
     sparse = False
 
 
-def draw_on_table(rng: np.random.Generator) -> NDArray[np.float64]:
-    """Draws a point (2,) in the square; panda-gym also draws a height, from an empty range."""
-    edge = np.array([HALF_RANGE, HALF_RANGE, 0.0])
-    return rng.uniform(-edge, edge)[:2]
+class PandaSlide(PandaObjects):
+    """Makes a puck slide to a goal out of the arm's reach, with the gripper closed."""
+
+    id = "dmprl/PandaSlide-v0"
+    camera: ClassVar[Mapping[str, Any]] = {
+        "distance": 1.5,
+        "elevation": -25.0,
+        "azimuth": 137.0,
+        "lookat": (0.02, 0.0, 0.1),
+    }
+    scene = Scene((puck(),), table_x=(-0.8, 0.6), finger_friction=2.0 * PUCK_FRICTION)
+    goal_range = ((0.25, -0.15, 0.0), (0.55, 0.15, 0.0))
+
+
+class PandaSlideDense(PandaSlide):
+    """Slide with a dense reward."""
+
+    id = "dmprl/PandaSlideDense-v0"
+    sparse = False
+
+
+class PandaSlideJoints(JointControl, PandaSlide):
+    """Slide with joint displacements."""
+
+    id = "dmprl/PandaSlideJoints-v0"
+
+
+class PandaSlideJointsDense(PandaSlideJoints):
+    """Slide with joint displacements and a dense reward."""
+
+    id = "dmprl/PandaSlideJointsDense-v0"
+    sparse = False
+
+
+class PandaPickAndPlace(PandaObjects):
+    """Brings a cube to a goal on or above the table."""
+
+    id = "dmprl/PandaPickAndPlace-v0"
+    scene = Scene((cube(),), has_gripper=True)
+    goal_range = ((-0.15, -0.15, 0.0), (0.15, 0.15, 0.2))
+
+    def draw_goal(self, rng: np.random.Generator) -> NDArray[np.float64]:  # noqa: D102 - inherited
+        goal = super().draw_goal(rng)
+        if rng.random() < ON_TABLE_SHARE:
+            goal[2] = 0.0
+        return goal
+
+
+class PandaPickAndPlaceDense(PandaPickAndPlace):
+    """Pick and place with a dense reward."""
+
+    id = "dmprl/PandaPickAndPlaceDense-v0"
+    sparse = False
+
+
+class PandaPickAndPlaceJoints(JointControl, PandaPickAndPlace):
+    """Pick and place with joint displacements."""
+
+    id = "dmprl/PandaPickAndPlaceJoints-v0"
+
+
+class PandaPickAndPlaceJointsDense(PandaPickAndPlaceJoints):
+    """Pick and place with joint displacements and a dense reward."""
+
+    id = "dmprl/PandaPickAndPlaceJointsDense-v0"
+    sparse = False
+
+
+class PandaStack(PandaObjects):
+    """Brings a heavy cube to a goal on the table, and a lighter one on top of it."""
+
+    id = "dmprl/PandaStack-v0"
+    episode_steps = 100
+    success_distance = 0.1
+    """Distance of both cubes' positions, taken as one point with six coordinates."""
+    scene = Scene((cube(2.0, BLUE), cube()), has_gripper=True)
+
+
+class PandaStackDense(PandaStack):
+    """Stack with a dense reward."""
+
+    id = "dmprl/PandaStackDense-v0"
+    sparse = False
+
+
+class PandaStackJoints(JointControl, PandaStack):
+    """Stack with joint displacements."""
+
+    id = "dmprl/PandaStackJoints-v0"
+
+
+class PandaStackJointsDense(PandaStackJoints):
+    """Stack with joint displacements and a dense reward."""
+
+    id = "dmprl/PandaStackJointsDense-v0"
+    sparse = False
 
 
 def euler_angles(quaternion: NDArray[np.float64], out: NDArray[np.float64]) -> None:

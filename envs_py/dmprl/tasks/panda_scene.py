@@ -19,8 +19,11 @@ MODEL = Path(__file__).parent / "models" / "panda.xml"
 FINGER_FRICTION, CUBE_FRICTION, PUCK_FRICTION = 0.5, 0.25, 0.022
 FINGER_OPENING = 0.04
 """Largest distance of a finger from the middle of the gripper [m]."""
-FINGER_SERVO = {"kp": 1000.0, "kv": 20.0}
-"""Gains of a finger [N/m, N s/m]. As for the arm, the speed is 50/s times the position error."""
+FINGER_SERVO = {"kp": 5000.0, "kv": 100.0}
+"""Gains of a finger [N/m, N s/m]. As for the arm, the speed is 50/s times the position error. Its
+target is within the finger's range, so the force on a gripped cube is at most 100 N."""
+FINGER_ARMATURE = 0.5
+"""Inertia of a finger's drive [kg]. A lighter finger would sink into what it grips."""
 OBJECT_CONTACT = {"solref": [0.005, 1.0], "solimp": [0.95, 0.99, 0.001, 0.5, 2.0]}
 GREEN, BLUE = (0.1, 0.8, 0.1), (0.15, 0.25, 0.9)
 GOAL_ALPHA = 0.3
@@ -39,8 +42,11 @@ class MovedObject(NamedTuple):
     colour: tuple[float, float, float] = GREEN
 
     @property
-    def rest_height(self) -> float:
-        """Height of the centre at the start and at the goal [m]; panda-gym lets a puck drop."""
+    def start_height(self) -> float:
+        """Height of the centre at the start and at the goal [m].
+
+        As in panda-gym, a puck starts 15 mm too high, and its goal remains there.
+        """
         return max(self.size)
 
 
@@ -117,6 +123,7 @@ def _add_fingers(spec: mujoco.MjSpec) -> None:
             axis=[0.0, side, 0.0],
             range=[0.0, FINGER_OPENING],
             limited=True,
+            armature=FINGER_ARMATURE,
         )
         finger.add_geom(
             spec.find_default("touching"),
@@ -126,7 +133,13 @@ def _add_fingers(spec: mujoco.MjSpec) -> None:
             size=half,
             material="joint",
         )
-        servo = spec.add_actuator(name=name, target=name, trntype=mujoco.mjtTrn.mjTRN_JOINT)
+        servo = spec.add_actuator(
+            name=name,
+            target=name,
+            trntype=mujoco.mjtTrn.mjTRN_JOINT,
+            ctrllimited=True,
+            ctrlrange=[0.0, FINGER_OPENING],
+        )
         servo.set_to_position(**FINGER_SERVO)
 
 

@@ -27,6 +27,16 @@ PUSH_HEIGHT = 0.02
 CUBE_DECELERATION = 2.45
 """Deceleration of a cube that slides over the table [m/s²]."""
 
+GRIP_HEIGHT = 0.07
+"""Height of the end effector over an object before it descends to grip it."""
+OPEN_WIDTH, GRIPPED_WIDTH = 0.06, (0.036, 0.043)
+"""Width of the fingers above which they fit around a cube, and range in which they hold it."""
+CARRY_GAIN, CARRY_MAX = 0.3, 0.025
+"""Share of the way to the goal in one step, and its maximum along each axis. A faster start would
+pull the fingers off the cube."""
+OPEN, CLOSE = 1.0, -1.0
+"""Actions of the fingers."""
+
 
 class State(NamedTuple):
     """An observation of a task with N objects, split into its parts."""
@@ -90,8 +100,16 @@ class Push(Controller):
         return towards(np.append(start, up))
 
 
+class PickAndPlace(Controller):
+    """Grips the cube from above, brings it to the goal and holds it there."""
+
+    def act(self, state: State) -> NDArray[np.float64]:  # noqa: D102 - inherited
+        return carry(state, 0)
+
+
 CONTROLLERS: dict[str, type[Controller]] = {
     "dmprl/PandaPush-v0": Push,
+    "dmprl/PandaPickAndPlace-v0": PickAndPlace,
 }
 """Controllers by Gymnasium id; they also solve the task with a dense reward."""
 
@@ -99,6 +117,25 @@ CONTROLLERS: dict[str, type[Controller]] = {
 def towards(displacement: NDArray[np.float64]) -> NDArray[np.float64]:
     """Returns the action (3,) that moves the end effector by this, or as far as one action can."""
     return np.clip(displacement / DISPLACEMENT, -1.0, 1.0)
+
+
+def carry(state: State, index: int) -> NDArray[np.float64]:
+    """Grips an object from above and brings it to its goal; returns the action (4,)."""
+    cube, hand = state.objects[index], state.hand
+    offset = cube - hand
+    sideways = float(np.linalg.norm(offset[:2]))
+    is_held = GRIPPED_WIDTH[0] < state.width < GRIPPED_WIDTH[1]
+    if is_held and np.linalg.norm(offset) < 0.03:
+        step = CARRY_GAIN * (state.goals[index] - cube)
+        return np.append(towards(np.clip(step, -CARRY_MAX, CARRY_MAX)), CLOSE)
+    if sideways < 0.015 and abs(offset[2]) < (0.02 if state.width < OPEN_WIDTH else 0.008):
+        return np.array([0.0, 0.0, 0.0, CLOSE])
+    if sideways < 0.03 and state.width > OPEN_WIDTH and hand[2] < cube[2] + GRIP_HEIGHT + 0.02:
+        down = offset[2] if sideways < 0.01 or hand[2] < cube[2] + 0.5 * GRIP_HEIGHT else 0.0
+        return np.append(towards(0.6 * np.append(offset[:2], down)), OPEN)
+    up = cube[2] + GRIP_HEIGHT - hand[2]
+    side = offset[:2] if up < 0.02 else np.zeros(2)
+    return np.append(towards(np.append(side, up)), OPEN)
 
 
 def split(task: PandaObjects, row: NDArray[np.float64]) -> State:
