@@ -31,11 +31,14 @@ GRIP_HEIGHT = 0.07
 """Height of the end effector over an object before it descends to grip it."""
 OPEN_WIDTH, GRIPPED_WIDTH = 0.06, (0.036, 0.043)
 """Width of the fingers above which they fit around a cube, and range in which they hold it."""
-CARRY_GAIN, CARRY_MAX = 0.3, 0.025
+CARRY_GAIN, CARRY_MAX = 0.5, 0.03
 """Share of the way to the goal in one step, and its maximum along each axis. A faster start would
 pull the fingers off the cube."""
 OPEN, CLOSE = 1.0, -1.0
 """Actions of the fingers."""
+RELEASE = np.array([0.0, 0.0, 0.0, OPEN])
+CLEAR_HEIGHT = 0.1
+"""Height at which a cube is carried over another one."""
 
 
 class State(NamedTuple):
@@ -104,12 +107,57 @@ class PickAndPlace(Controller):
     """Grips the cube from above, brings it to the goal and holds it there."""
 
     def act(self, state: State) -> NDArray[np.float64]:  # noqa: D102 - inherited
-        return carry(state, 0)
+        return carry(state, 0, state.goals[0])
+
+
+class Stack(Controller):
+    """Brings the lower cube to its goal, then the upper one on top of it.
+
+    An upper cube that is in the way is first brought aside.
+    """
+
+    spots = np.array([[x, y, 0.02] for x in (-0.12, 0.0, 0.12) for y in (-0.12, 0.0, 0.12)])
+    """Places for a cube that is in the way (N, 3)."""
+    clearance = 0.09
+    """Distance of two cubes along some axis at which both can be gripped and put down."""
+
+    def __init__(self) -> None:
+        self.spot: NDArray[np.float64] | None = None
+        self.has_looked = False
+
+    def act(self, state: State) -> NDArray[np.float64]:  # noqa: D102 - inherited
+        lower, upper = state.objects
+        if not self.has_looked:
+            self.has_looked = True
+            self.spot = self.spot_aside(upper, lower, state.goals[0])
+        if self.spot is not None:
+            if not is_at(upper, self.spot):
+                return carry_over(state, 1, self.spot)
+            if state.width < OPEN_WIDTH:
+                return RELEASE
+            self.spot = None
+        for index, cube in enumerate(state.objects):
+            if not is_at(cube, state.goals[index]):
+                return carry_over(state, index, state.goals[index])
+            if state.width < OPEN_WIDTH and np.linalg.norm(cube - state.hand) < 0.03:
+                return RELEASE
+        return np.append(towards(np.array([0.0, 0.0, CLEAR_HEIGHT - state.hand[2]])), OPEN)
+
+    def spot_aside(
+        self, cube: NDArray[np.float64], *others: NDArray[np.float64]
+    ) -> NDArray[np.float64] | None:
+        """Returns the nearest spot clear of other cubes, or None if the cube is already clear."""
+        places = np.vstack([cube, self.spots])
+        distances = [np.abs(places[:, :2] - other[:2]).max(axis=1) for other in others]
+        clear = places[np.min(distances, axis=0) > self.clearance]
+        nearest = clear[np.linalg.norm(clear - cube, axis=1).argmin()]
+        return None if (nearest == cube).all() else nearest
 
 
 CONTROLLERS: dict[str, type[Controller]] = {
     "dmprl/PandaPush-v0": Push,
     "dmprl/PandaPickAndPlace-v0": PickAndPlace,
+    "dmprl/PandaStack-v0": Stack,
 }
 """Controllers by Gymnasium id; they also solve the task with a dense reward."""
 
@@ -119,15 +167,14 @@ def towards(displacement: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.clip(displacement / DISPLACEMENT, -1.0, 1.0)
 
 
-def carry(state: State, index: int) -> NDArray[np.float64]:
-    """Grips an object from above and brings it to its goal; returns the action (4,)."""
+def carry(state: State, index: int, goal: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Grips a cube from above and brings it straight to a goal; returns the action (4,)."""
     cube, hand = state.objects[index], state.hand
     offset = cube - hand
-    sideways = float(np.linalg.norm(offset[:2]))
-    is_held = GRIPPED_WIDTH[0] < state.width < GRIPPED_WIDTH[1]
-    if is_held and np.linalg.norm(offset) < 0.03:
-        step = CARRY_GAIN * (state.goals[index] - cube)
+    if is_held(state, index):
+        step = CARRY_GAIN * (goal - cube)
         return np.append(towards(np.clip(step, -CARRY_MAX, CARRY_MAX)), CLOSE)
+    sideways = float(np.linalg.norm(offset[:2]))
     if sideways < 0.015 and abs(offset[2]) < (0.02 if state.width < OPEN_WIDTH else 0.008):
         return np.array([0.0, 0.0, 0.0, CLOSE])
     if sideways < 0.03 and state.width > OPEN_WIDTH and hand[2] < cube[2] + GRIP_HEIGHT + 0.02:
@@ -136,6 +183,27 @@ def carry(state: State, index: int) -> NDArray[np.float64]:
     up = cube[2] + GRIP_HEIGHT - hand[2]
     side = offset[:2] if up < 0.02 else np.zeros(2)
     return np.append(towards(np.append(side, up)), OPEN)
+
+
+def carry_over(state: State, index: int, goal: NDArray[np.float64]) -> NDArray[np.float64]:
+    """As :func:`carry`, but above other cubes, and down onto the goal at the end."""
+    cube = state.objects[index]
+    if np.linalg.norm(goal[:2] - cube[:2]) < 0.015:
+        return carry(state, index, goal)
+    side = goal[:2] if cube[2] > CLEAR_HEIGHT - 0.035 else cube[:2]
+    return carry(state, index, np.append(side, CLEAR_HEIGHT))
+
+
+def is_held(state: State, index: int) -> bool:
+    """Returns whether the fingers are closed around a cube."""
+    offset = state.objects[index] - state.hand
+    low, high = GRIPPED_WIDTH
+    return bool(low < state.width < high and np.linalg.norm(offset) < 0.03)
+
+
+def is_at(cube: NDArray[np.float64], goal: NDArray[np.float64]) -> bool:
+    """Returns whether a cube is at a goal, where it may be put down."""
+    return bool(np.linalg.norm(cube[:2] - goal[:2]) < 0.02 and abs(cube[2] - goal[2]) < 0.015)
 
 
 def split(task: PandaObjects, row: NDArray[np.float64]) -> State:
