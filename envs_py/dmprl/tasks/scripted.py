@@ -24,6 +24,10 @@ from dmprl.tasks.panda_objects import OBJECT_ENTRIES, PandaObjects
 TRAVEL_HEIGHT = 0.09
 """Height of the end effector at which it passes over an object."""
 PUSH_HEIGHT = 0.02
+BEHIND = 0.055
+"""Distance behind a cube where a push starts."""
+PUSHED_DISTANCE = 0.03
+"""Distance from the goal at which a pushed cube may stay."""
 CUBE_DECELERATION = 2.45
 """Deceleration of a cube that slides over the table [m/s²]."""
 
@@ -31,7 +35,7 @@ GRIP_HEIGHT = 0.07
 """Height of the end effector over an object before it descends to grip it."""
 OPEN_WIDTH, GRIPPED_WIDTH = 0.06, (0.036, 0.043)
 """Width of the fingers above which they fit around a cube, and range in which they hold it."""
-CARRY_GAIN, CARRY_MAX = 0.5, 0.03
+CARRY_GAIN, CARRY_MAX = 0.3, 0.025
 """Share of the way to the goal in one step, and its maximum along each axis. A faster start would
 pull the fingers off the cube."""
 OPEN, CLOSE = 1.0, -1.0
@@ -65,42 +69,10 @@ class Controller(ABC):
 
 
 class Push(Controller):
-    """Goes behind the cube, as seen from the goal, and pushes it ahead in short strokes.
-
-    A cube that was pushed slides on, so each stroke waits for the end of the last one.
-    """
-
-    reached = 0.03
-    """Distance from the goal at which the cube may stay."""
-    behind = 0.055
-    """Distance behind the cube where a push starts."""
-    aside_max = 0.012
-    """Largest distance from the line through cube and goal at which a stroke starts."""
+    """Pushes the cube to the goal."""
 
     def act(self, state: State) -> NDArray[np.float64]:  # noqa: D102 - inherited
-        hand, velocity = state.hand, state.velocities[0, :2]
-        speed = float(np.linalg.norm(velocity))
-        rest = state.objects[0, :2] + velocity * speed / (2.0 * CUBE_DECELERATION)
-        to_goal = state.goals[0, :2] - rest
-        distance = float(np.linalg.norm(to_goal))
-        if distance < self.reached or speed > 0.15:
-            return np.zeros(3)
-        ahead = to_goal / distance
-        offset = hand[:2] - rest
-        along = float(offset @ ahead)
-        aside = offset - along * ahead
-        from_line = float(np.linalg.norm(aside))
-        down = PUSH_HEIGHT - hand[2]
-        if hand[2] < 0.045 and -0.09 < along < 0.0 and from_line < self.aside_max:
-            stroke = min(0.015, 0.006 + 0.15 * distance)
-            return towards(np.append(stroke * ahead - aside, down))
-        start = -offset - self.behind * ahead
-        if -0.12 < along < -0.035 and from_line < 0.05 and hand[2] < TRAVEL_HEIGHT + 0.01:
-            return towards(0.7 * np.append(start, down))
-        up = TRAVEL_HEIGHT - hand[2]
-        if up > 0.02 and np.linalg.norm(offset) < 0.1:
-            start = np.zeros(2)
-        return towards(np.append(start, up))
+        return push(state, 0, state.goals[0])
 
 
 class PickAndPlace(Controller):
@@ -124,10 +96,19 @@ class Stack(Controller):
     def __init__(self) -> None:
         self.spot: NDArray[np.float64] | None = None
         self.has_looked = False
+        self.steps = 0
 
     def act(self, state: State) -> NDArray[np.float64]:  # noqa: D102 - inherited
         lower, upper = state.objects
+        self.steps += 1
+        if self.steps <= 4:
+            return RELEASE  # the upper cube falls at the start
         if not self.has_looked:
+            apart = np.abs(lower - upper)
+            if apart[0] < 0.035 and apart[1] < 0.085 and apart[2] < 0.01:
+                # A finger does not fit between them.
+                away = np.array([np.copysign(0.05, upper[0] - lower[0]), 0.0, 0.0])
+                return np.append(push(state, 1, upper + away), CLOSE)
             self.has_looked = True
             self.spot = self.spot_aside(upper, lower, state.goals[0])
         if self.spot is not None:
@@ -165,6 +146,36 @@ CONTROLLERS: dict[str, type[Controller]] = {
 def towards(displacement: NDArray[np.float64]) -> NDArray[np.float64]:
     """Returns the action (3,) that moves the end effector by this, or as far as one action can."""
     return np.clip(displacement / DISPLACEMENT, -1.0, 1.0)
+
+
+def push(state: State, index: int, goal: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Goes behind a cube, as seen from a goal, and pushes it ahead in short strokes.
+
+    A cube that was pushed slides on, so each stroke waits for the end of the last one.
+    """
+    hand, velocity = state.hand, state.velocities[index, :2]
+    speed = float(np.linalg.norm(velocity))
+    rest = state.objects[index, :2] + velocity * speed / (2.0 * CUBE_DECELERATION)
+    to_goal = goal[:2] - rest
+    distance = float(np.linalg.norm(to_goal))
+    if distance < PUSHED_DISTANCE or speed > 0.15:
+        return np.zeros(3)
+    ahead = to_goal / distance
+    offset = hand[:2] - rest
+    along = float(offset @ ahead)
+    aside = offset - along * ahead
+    from_line = float(np.linalg.norm(aside))
+    down = PUSH_HEIGHT - hand[2]
+    if hand[2] < 0.045 and -0.09 < along < 0.0 and from_line < 0.012:
+        stroke = min(0.015, 0.006 + 0.15 * distance)
+        return towards(np.append(stroke * ahead - aside, down))
+    start = -offset - BEHIND * ahead
+    if -0.12 < along < -0.035 and from_line < 0.05 and hand[2] < TRAVEL_HEIGHT + 0.01:
+        return towards(0.7 * np.append(start, down))
+    up = TRAVEL_HEIGHT - hand[2]
+    if up > 0.02 and np.linalg.norm(offset) < 0.1:
+        start = np.zeros(2)
+    return towards(np.append(start, up))
 
 
 def carry(state: State, index: int, goal: NDArray[np.float64]) -> NDArray[np.float64]:
