@@ -50,7 +50,10 @@ class StartTest(unittest.TestCase):
                 np.testing.assert_allclose(rows[:, length : 2 * length], golden["goal"], atol=1e-6)
 
     def test_starts_and_goals_fill_panda_gyms_ranges(self):
-        ranges = {name: (0.4 * (name == "PandaSlide"), 0.2 * (name == "PandaPickAndPlace")) for name in IDS}
+        ranges = {
+            name: (0.4 * (name == "PandaSlide"), 0.2 * (name == "PandaPickAndPlace"))
+            for name in IDS
+        }
         for name, (goal_x, goal_height) in ranges.items():
             env, out = started(IDS[name], env_count=2000)
             length = env.task.goal_len

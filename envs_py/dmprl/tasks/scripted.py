@@ -101,7 +101,7 @@ class Stack(Controller):
     def act(self, state: State) -> NDArray[np.float64]:  # noqa: D102 - inherited
         lower, upper = state.objects
         self.steps += 1
-        if self.steps <= 4:
+        if self.steps <= 6:
             return RELEASE  # the upper cube falls at the start
         if not self.has_looked:
             apart = np.abs(lower - upper)

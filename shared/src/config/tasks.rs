@@ -123,6 +123,56 @@ const PANDA_PUSH_DENSE: TaskDefaults = TaskDefaults {
     ..PANDA_PUSH
 };
 
+const PANDA_SLIDE: TaskDefaults = TaskDefaults {
+    name: "panda-slide",
+    id: "dmprl/PandaSlide-v0",
+    about: "Franka Panda makes a puck slide to a goal out of reach, sparse reward",
+    ..PANDA_PUSH
+};
+
+const PANDA_SLIDE_DENSE: TaskDefaults = TaskDefaults {
+    name: "panda-slide-dense",
+    id: "dmprl/PandaSlideDense-v0",
+    about: "panda-slide with minus the distance as reward",
+    ..PANDA_SLIDE
+};
+
+const PANDA_PICK_AND_PLACE: TaskDefaults = TaskDefaults {
+    name: "panda-pick-and-place",
+    id: "dmprl/PandaPickAndPlace-v0",
+    about: "Franka Panda brings a cube to a goal on or above the table, sparse reward",
+    control: "gripper displacement, ±1 = 5 cm, and opening, ±1 = 20 cm per step",
+    observation_len: 26,
+    action_low: &[-1.0; 4],
+    action_high: &[1.0; 4],
+    values: PANDA_PICK_AND_PLACE_VALUES,
+    ..PANDA_PUSH
+};
+
+const PANDA_PICK_AND_PLACE_DENSE: TaskDefaults = TaskDefaults {
+    name: "panda-pick-and-place-dense",
+    id: "dmprl/PandaPickAndPlaceDense-v0",
+    about: "panda-pick-and-place with minus the distance as reward",
+    ..PANDA_PICK_AND_PLACE
+};
+
+const PANDA_STACK: TaskDefaults = TaskDefaults {
+    name: "panda-stack",
+    id: "dmprl/PandaStack-v0",
+    about: "Franka Panda stacks two cubes at a goal, sparse reward",
+    observation_len: 44,
+    episode_steps: 100,
+    values: PANDA_STACK_VALUES,
+    ..PANDA_PICK_AND_PLACE
+};
+
+const PANDA_STACK_DENSE: TaskDefaults = TaskDefaults {
+    name: "panda-stack-dense",
+    id: "dmprl/PandaStackDense-v0",
+    about: "panda-stack with minus the distance as reward",
+    ..PANDA_STACK
+};
+
 const REACHER_V1: TaskDefaults = TaskDefaults {
     name: "reacher-v1",
     id: "dmprl/Reacher-v1",
@@ -145,7 +195,7 @@ const THROWER_V0: TaskDefaults =
     TaskDefaults { name: "thrower-v0", about: "alias of thrower", ..THROWER };
 
 /// Every task with a short name; the paper's older versions are last.
-pub const TASKS: [TaskDefaults; 10] = [
+pub const TASKS: [TaskDefaults; 16] = [
     REACHER,
     PUSHER,
     THROWER,
@@ -153,6 +203,12 @@ pub const TASKS: [TaskDefaults; 10] = [
     PANDA_REACH_JOINTS,
     PANDA_PUSH,
     PANDA_PUSH_DENSE,
+    PANDA_SLIDE,
+    PANDA_SLIDE_DENSE,
+    PANDA_PICK_AND_PLACE,
+    PANDA_PICK_AND_PLACE_DENSE,
+    PANDA_STACK,
+    PANDA_STACK_DENSE,
     REACHER_V1,
     PUSHER_V0,
     THROWER_V0,
@@ -267,8 +323,35 @@ start_sources = [
     PANDA_OBJECTS,
 ];
 
-// u = 1 moves the end effector by 0.05 m, and the fingers' width by 0.2 m, so a start source scales
-// the width by 1/4.
+// As above, but the fingers' width and its velocity follow the end effector.
+const PANDA_PICK_AND_PLACE_VALUES: &[&str] = &[
+    r#"
+[task]
+start_sources = [
+    { index = 6, velocity = 9 },
+    { index = 7, velocity = 10 },
+    { index = 8, velocity = 11 },
+    { index = 12, velocity = 13 },
+]
+"#,
+    PANDA_OBJECTS,
+];
+
+// As above, with goals of two cubes (6 each).
+const PANDA_STACK_VALUES: &[&str] = &[
+    r#"
+[task]
+start_sources = [
+    { index = 12, velocity = 15 },
+    { index = 13, velocity = 16 },
+    { index = 14, velocity = 17 },
+    { index = 18, velocity = 19 },
+]
+"#,
+    PANDA_OBJECTS,
+];
+
+// u = 1 moves the end effector by 0.05 m, as in PANDA_REACH_VALUES.
 const PANDA_OBJECTS: &str = r#"
 [run]
 steps = 200000
