@@ -216,7 +216,9 @@ class PandaSlide(PandaObjects):
         "azimuth": 137.0,
         "lookat": (0.02, 0.0, 0.1),
     }
-    scene = Scene((puck(),), table_x=(-0.8, 0.6), finger_friction=2.0 * PUCK_FRICTION)
+    scene = Scene(
+        (puck(),), table_x=(-0.8, 0.6), has_edges=False, finger_friction=2.0 * PUCK_FRICTION
+    )
     goal_range = ((0.25, -0.15, 0.0), (0.55, 0.15, 0.0))
 
 

@@ -56,6 +56,10 @@ class Scene(NamedTuple):
     objects: tuple[MovedObject, ...]
     table_x: tuple[float, float] = (-0.85, 0.25)
     """Edges of the table [m]."""
+    has_edges: bool = True
+    """Whether objects can fall off the table. Without edges it is a plane, on which a cylinder
+    slides without trembling, and MuJoCo's search for several contacts of convex shapes, which
+    gives a cylinder at the corner of a box the normal of a face, is not needed."""
     has_gripper: bool = False
     """Whether the fingers move; otherwise they stay closed."""
     finger_friction: float = FINGER_FRICTION
@@ -89,6 +93,11 @@ def scene_model(scene: Scene, with_decoration: bool) -> mujoco.MjModel:
     if scene.has_gripper:
         _add_fingers(spec)
     _set_table(spec, scene)
+    if not scene.has_edges:
+        option.disableflags |= mujoco.mjtDisableBit.mjDSBL_MULTICCD.value
+        if not with_decoration:
+            table = spec.geom("table")
+            table.type, table.pos[2] = mujoco.mjtGeom.mjGEOM_PLANE, 0.0
     spec.delete(spec.body("goal"))
     for index, moved in enumerate(scene.objects):
         _add_object(spec, f"object{index + 1}" if len(scene.objects) > 1 else "object", moved)
