@@ -16,11 +16,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dmprl import SHORT_NAMES
-from dmprl.segment_env import SegmentBuffers, make
+from dmprl.segment_env import SUCCESS_YES, SegmentBuffers, make
 from dmprl.tasks import make_task
 from dmprl.tasks.panda import DISPLACEMENT
-from dmprl.tasks.panda_objects import OBJECT_ENTRIES, PandaObjects
+from dmprl.tasks.panda_objects import OBJECT_ENTRIES, PandaObjects, PandaSlide
 
+STEP_S = 0.04
+"""Duration of a step [s]."""
 TRAVEL_HEIGHT = 0.09
 """Height of the end effector at which it passes over an object."""
 PUSH_HEIGHT = 0.02
@@ -76,20 +78,31 @@ class Push(Controller):
 
 
 class Slide(Controller):
-    """Strikes the puck once, so that it reaches the goal at the end of the episode.
+    """Strikes the puck once, so that it is at the goal at the end of the episode.
 
-    The closed fingers are a box. Its corner touches the puck in the line to the goal, because the
-    puck leaves along the normal of the contact. A stroke of one step starts at a small gap, from
-    which the puck's speed was measured.
+    The puck leaves along the normal of the contact. So a corner of the closed fingers, which are a
+    box, strikes it on the line to the goal. The stroke takes one step and starts at rest and at a
+    small gap, for which the puck's speed was measured.
     """
 
+    radius = 0.03
+    """Radius of the puck."""
+    corner = (0.009, 0.016)
+    """Position of the fingers' corner, from the end effector."""
+    gap = 0.004
+    """Distance of corner and puck before the stroke."""
+    height = 0.018
+    """Height of the end effector at the stroke."""
+    precision = 0.0008
+    """Maximum distance from the start of the stroke, and motion in one step, to strike."""
     strokes = (0.004, 0.008, 0.012, 0.016, 0.020, 0.025, 0.035)
     """Displacements in one step [m]."""
     speeds = (0.0, 0.115, 0.25, 0.38, 0.53, 0.70, 1.05)
     """Speed of the puck after each [m/s]."""
-    gap = 0.004
     deceleration = 0.216
     """Deceleration of the puck [m/s²]."""
+    flight_steps = PandaSlide.episode_steps + 0.7
+    """Steps from the start of the episode to its end; the stroke itself takes some of a step."""
 
     def __init__(self) -> None:
         self.steps = 0
@@ -102,17 +115,17 @@ class Slide(Controller):
             return np.zeros(3)
         hand, puck = state.hand, state.objects[0]
         to_goal = state.goals[0, :2] - puck[:2]
-        distance = float(np.linalg.norm(to_goal))
+        # A slanted stroke turns the puck a little further aside than the normal.
         angle = 0.94 * float(np.arctan2(to_goal[1], to_goal[0]))
         ahead = np.array([np.cos(angle), np.sin(angle)])
-        corner = np.array([0.009, np.copysign(0.016, ahead[1])])
-        contact = puck[:2] - 0.03 * ahead - corner
-        offset = contact - self.gap * ahead - hand[:2]
-        down = 0.018 - hand[2]
+        corner = np.copysign(self.corner, ahead)
+        offset = puck[:2] - (self.radius + self.gap) * ahead - corner - hand[:2]
+        down = self.height - hand[2]
         moved, self.hand = float(np.linalg.norm(hand - self.hand)), hand.copy()
-        if hand[2] < 0.03 and np.linalg.norm(offset) < 0.0008 and moved < 0.0008:
+        if abs(down) < 0.012 and max(np.linalg.norm(offset), moved) < self.precision:
             self.is_struck = True
-            speed = self.speed(distance, 0.04 * (50 - self.steps + 0.7))
+            seconds = STEP_S * (self.flight_steps - self.steps)
+            speed = self.speed(float(np.linalg.norm(to_goal)), seconds)
             # Measured: the puck is faster after a slanted stroke and towards three of the edges.
             place = 3.5 * puck[0] ** 2 - 0.25 * puck[1]
             speed /= 1.06 + 0.11 * abs(angle) - 0.15 * speed + place
@@ -126,7 +139,7 @@ class Slide(Controller):
         return towards(np.append(start, TRAVEL_HEIGHT - hand[2]))
 
     def speed(self, distance: float, seconds: float) -> float:
-        """Computes the speed with which the puck is at a distance after this time, or stops."""
+        """Computes the speed at which the puck covers a distance in a time, or stops before."""
         moving = distance / seconds + self.deceleration * seconds / 2.0
         if moving > self.deceleration * seconds:
             return moving
@@ -146,6 +159,8 @@ class Stack(Controller):
     An upper cube that is in the way is first brought aside.
     """
 
+    settle_steps = 6
+    """Steps until the upper cube has fallen to the table at the start."""
     spots = np.array([[x, y, 0.02] for x in (-0.12, 0.0, 0.12) for y in (-0.12, 0.0, 0.12)])
     """Places for a cube that is in the way (N, 3)."""
     clearance = 0.09
@@ -159,8 +174,8 @@ class Stack(Controller):
     def act(self, state: State) -> NDArray[np.float64]:  # noqa: D102 - inherited
         lower, upper = state.objects
         self.steps += 1
-        if self.steps <= 6:
-            return RELEASE  # the upper cube falls at the start
+        if self.steps <= self.settle_steps:
+            return RELEASE
         if not self.has_looked:
             apart = np.abs(lower - upper)
             if apart[0] < 0.035 and apart[1] < 0.085 and apart[2] < 0.01:
@@ -290,23 +305,36 @@ def split(task: PandaObjects, row: NDArray[np.float64]) -> State:
     )
 
 
-def record(task_id: str, episodes: int, seed: int) -> dict[str, NDArray]:
-    """Runs episodes; returns the arrays that ``--demos`` reads, and each episode's ``success``.
+class Recording(NamedTuple):
+    """Episodes of a scripted controller."""
 
-    - ``seed``: seed of the first episode; the others have the following ones.
-    """
-    task = make_task(task_id, 1)
-    env, controllers = make(task_id, episodes, 1), []
-    for _ in range(episodes):
-        controllers.append(CONTROLLERS[task_id.replace("Dense", "")]())
+    steps: dict[str, NDArray]
+    """The arrays that ``--demos`` reads, one episode after the other."""
+    success: NDArray[np.bool_]
+    """Whether each episode ended at the goal."""
+
+    def successful(self) -> dict[str, NDArray]:
+        """Returns the steps of the successful episodes."""
+        count = len(self.success)
+        return {
+            name: rows.reshape(count, -1, *rows.shape[1:])[self.success].reshape(
+                -1, *rows.shape[1:]
+            )
+            for name, rows in self.steps.items()
+        }
+
+
+def record(task_id: str, episodes: int, seed: int) -> Recording:
+    """Runs episodes, the first with this seed and each other with the next one."""
+    task, env = make_task(task_id, 1), make(task_id, episodes, 1)
+    controllers = [CONTROLLERS[task_id.replace("Dense", "")]() for _ in range(episodes)]
     out = SegmentBuffers(episodes, 1, env.spec()["observation_len"], len(task.action_low))
     env.reset(np.ones(episodes, np.uint8), np.arange(seed, seed + episodes, dtype=np.uint64), out)
     kept: dict[str, list[NDArray]] = {}
     while not out.truncated.any():
-        for action, controller, row in zip(
-            out.actions[:, 0], controllers, out.next_observations, strict=True
-        ):
-            action[:] = controller.act(split(task, row))
+        for index, controller in enumerate(controllers):
+            state = split(task, out.next_observations[index])
+            out.actions[index, 0] = controller.act(state)
         env.step_segment(out.actions, out)
         step = {
             "observations": out.observations[:, 0],
@@ -318,13 +346,12 @@ def record(task_id: str, episodes: int, seed: int) -> dict[str, NDArray]:
         }
         for name, values in step.items():
             kept.setdefault(name, []).append(values.copy())
-    # One episode after the other.
-    arrays = {name: np.concatenate(np.swapaxes(rows, 0, 1)) for name, rows in kept.items()}
-    return arrays | {"success": out.success.copy()}
+    steps = {name: np.concatenate(np.swapaxes(rows, 0, 1)) for name, rows in kept.items()}
+    return Recording(steps, out.success == SUCCESS_YES)
 
 
 def main() -> None:
-    """Records demonstrations, as described in the module's docstring."""
+    """Writes the successful ones of a number of episodes."""
     parser = argparse.ArgumentParser(prog="dmprl.tasks.scripted", description=main.__doc__)
     names = {
         name: id_ for name, id_ in SHORT_NAMES.items() if id_.replace("Dense", "") in CONTROLLERS
@@ -332,12 +359,13 @@ def main() -> None:
     parser.add_argument("task", choices=names)
     parser.add_argument("output", help="the file, NAME.npz")
     parser.add_argument("--episodes", type=int, default=50)
-    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--seed", type=int, default=0, help="seed of the first episode")
     arguments = parser.parse_args()
-    arrays = record(names[arguments.task], arguments.episodes, arguments.seed)
-    success = arrays["success"].mean()
-    np.savez(arguments.output, **arrays)
-    print(f"{arguments.episodes} episodes, {len(arrays['rewards'])} steps, success {success:.3f}")
+    recording = record(names[arguments.task], arguments.episodes, arguments.seed)
+    steps = recording.successful()
+    np.savez(arguments.output, **steps)
+    count, written = recording.success.sum(), len(steps["rewards"])
+    print(f"{count} of {arguments.episodes} episodes succeeded; {written} steps written")
 
 
 if __name__ == "__main__":
