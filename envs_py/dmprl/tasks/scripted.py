@@ -35,7 +35,7 @@ CUBE_DECELERATION = 2.45
 
 GRIP_HEIGHT = 0.07
 """Height of the end effector over an object before it descends to grip it."""
-OPEN_WIDTH, GRIPPED_WIDTH = 0.06, (0.036, 0.043)
+OPEN_WIDTH, GRIPPED_WIDTH = 0.06, (0.036, 0.058)
 """Width of the fingers above which they fit around a cube, and range in which they hold it."""
 CARRY_GAIN, CARRY_MAX = 0.3, 0.025
 """Share of the way to the goal in one step, and its maximum along each axis. A faster start would
@@ -185,15 +185,16 @@ class Stack(Controller):
             self.has_looked = True
             self.spot = self.spot_aside(upper, lower, state.goals[0])
         if self.spot is not None:
-            if not is_at(upper, self.spot):
+            if not is_put(state, 1, self.spot):
                 return carry_over(state, 1, self.spot)
             if state.width < OPEN_WIDTH:
                 return RELEASE
             self.spot = None
-        for index, cube in enumerate(state.objects):
-            if not is_at(cube, state.goals[index]):
-                return carry_over(state, index, state.goals[index])
-            if state.width < OPEN_WIDTH and np.linalg.norm(cube - state.hand) < 0.03:
+        on_top = np.append(lower[:2], state.goals[1, 2])
+        for index, goal in enumerate((state.goals[0], on_top)):
+            if not is_put(state, index, goal):
+                return carry_over(state, index, goal)
+            if state.width < OPEN_WIDTH and is_near(state, index):
                 return RELEASE
         return np.append(towards(np.array([0.0, 0.0, CLEAR_HEIGHT - state.hand[2]])), OPEN)
 
@@ -279,16 +280,22 @@ def carry_over(state: State, index: int, goal: NDArray[np.float64]) -> NDArray[n
     return carry(state, index, np.append(side, CLEAR_HEIGHT))
 
 
+def is_near(state: State, index: int) -> bool:
+    """Returns whether a cube is between the fingers, or close to them."""
+    return bool(np.linalg.norm(state.objects[index] - state.hand) < 0.04)
+
+
 def is_held(state: State, index: int) -> bool:
     """Returns whether the fingers are closed around a cube."""
-    offset = state.objects[index] - state.hand
     low, high = GRIPPED_WIDTH
-    return bool(low < state.width < high and np.linalg.norm(offset) < 0.03)
+    return low < state.width < high and is_near(state, index)
 
 
-def is_at(cube: NDArray[np.float64], goal: NDArray[np.float64]) -> bool:
-    """Returns whether a cube is at a goal, where it may be put down."""
-    return bool(np.linalg.norm(cube[:2] - goal[:2]) < 0.02 and abs(cube[2] - goal[2]) < 0.015)
+def is_put(state: State, index: int, goal: NDArray[np.float64]) -> bool:
+    """Returns whether a cube is at a goal, precisely enough to release it, or to leave it."""
+    offset = state.objects[index] - goal
+    precision = 0.015 if is_held(state, index) else 0.03
+    return bool(np.linalg.norm(offset[:2]) < precision and abs(offset[2]) < 0.015)
 
 
 def split(task: PandaObjects, row: NDArray[np.float64]) -> State:
