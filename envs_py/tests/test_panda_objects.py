@@ -200,7 +200,8 @@ class PhysicsTest(unittest.TestCase):
         # panda-gym 3.0.7 [m/s²]: a cube that starts with 0.5 m/s, a puck at 0.4 m/s.
         for name, speed, expected in (("PandaPush", 0.5, 2.46), ("PandaSlide", 0.4, 0.22)):
             env, out = started(IDS[name])
-            env.batch.bind("qpos")[0, 7:9] = -0.1, 0.1
+            height = env.task.scene.objects[0].size[1]
+            env.batch.bind("qpos")[0, 7:10] = -0.1, 0.1, height
             env.batch.bind("qvel")[0, 7] = speed
             at = column(env, "velocity_object_x")
             env.step_segment(np.zeros((1, 1, 3)), out)

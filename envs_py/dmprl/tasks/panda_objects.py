@@ -47,10 +47,10 @@ class PandaObjects(GoalTask):
         sorted({"qpos", "qvel", "mocap_pos", "sensordata", *InverseKinematics.recorded})
     )
     camera: ClassVar[Mapping[str, Any]] = {
-        "distance": 1.2,
-        "elevation": -25.0,
-        "azimuth": 137.0,
-        "lookat": (-0.14, 0.0, 0.12),
+        "distance": 1.05,
+        "elevation": -28.0,
+        "azimuth": 155.0,
+        "lookat": (-0.1, 0.0, 0.1),
     }
     goal_in_pictures = "translucent object"
     scene: Scene
@@ -211,10 +211,10 @@ class PandaSlide(PandaObjects):
 
     id = "dmprl/PandaSlide-v0"
     camera: ClassVar[Mapping[str, Any]] = {
-        "distance": 1.5,
-        "elevation": -25.0,
-        "azimuth": 137.0,
-        "lookat": (0.02, 0.0, 0.1),
+        "distance": 1.4,
+        "elevation": -28.0,
+        "azimuth": 145.0,
+        "lookat": (0.02, 0.0, 0.08),
     }
     scene = Scene(
         (puck(),), table_x=(-0.8, 0.6), has_edges=False, finger_friction=2.0 * PUCK_FRICTION

@@ -1,7 +1,7 @@
 """Starts, rewards and successes of panda-gym 3.0.7, for the tasks in ``dmprl.tasks.panda_objects``.
 
-    python -m pip install panda-gym==3.0.7
-    python tests/golden/panda_gym/make_golden.py > tests/golden/panda_gym/golden.json
+python -m pip install panda-gym==3.0.7
+python tests/golden/panda_gym/make_golden.py > tests/golden/panda_gym/golden.json
 """
 
 import json
