@@ -17,10 +17,15 @@ from numpy.typing import NDArray
 
 from dmprl.env_options import EnvOptions
 from dmprl.numpy_policy import Actor
+from dmprl.tasks import PANDA_OBJECTS
 
 PANDA_GYM_IDS = {
     "dmprl/PandaReach-v0": "PandaReachDense-v3",
     "dmprl/PandaReachJoints-v0": "PandaReachJointsDense-v3",
+} | {
+    f"dmprl/{name}{variant}-v0": f"{name}{variant}-v3"
+    for name in PANDA_OBJECTS
+    for variant in ("", "Dense", "Joints", "JointsDense")
 }
 """panda-gym's ids of dmprl's Panda tasks."""
 

@@ -24,6 +24,9 @@ from numpy.typing import NDArray
 from dmprl.segment_env import (
     SUCCESS_NOT_REPORTED,
     EnvSpec,
+    GoalRows,
+    Goals,
+    NotGoalConditionedError,
     SegmentBuffers,
     SegmentEnv,
     SegmentEnvError,
@@ -125,6 +128,23 @@ class MujocoTask(ABC):
     def successes(self, observations: NDArray[np.float64], out: NDArray[np.uint8]) -> None:
         """Writes whether each state (E, O) is a success; by default this is not reported."""
         out[:] = SUCCESS_NOT_REPORTED
+
+    def goals(self) -> Goals:
+        """Returns the positions of the goals in an observation; see :class:`~dmprl.goal_task`.
+
+        Raises:
+            NotGoalConditionedError: if there are none, as by default.
+        """
+        raise NotGoalConditionedError(f"{self.id}: its observation has no goals")
+
+    def goal_rewards(
+        self,
+        achieved: NDArray[np.float64],
+        desired: NDArray[np.float64],
+        out: NDArray[np.float64],
+    ) -> None:
+        """Writes the rewards (…) of steps that achieved goals (…, G), for desired ones (…, G)."""
+        raise NotImplementedError
 
 
 class BatchSegmentEnv(SegmentEnv):
@@ -295,6 +315,15 @@ class BatchSegmentEnv(SegmentEnv):
             observations = np.zeros((indices.size, self._current.shape[1]))
             self.task.observe(began, observations)
             self._current[indices] = observations
+
+    def goals(self) -> Goals:  # noqa: D102 - inherited
+        return self.task.goals()
+
+    def relabel(self, rows: GoalRows) -> None:  # noqa: D102 - inherited
+        count = int(rows.count[0])
+        achieved, desired = rows.achieved[:count], rows.desired[:count]
+        self.task.goal_rewards(achieved, desired, rows.rewards[:count])
+        rows.terminated[:count] = 0  # no task ends an episode before its time limit
 
     def take_failures(self) -> list[str]:  # noqa: D102 - inherited
         messages, self._messages = self._messages, []

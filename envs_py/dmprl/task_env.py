@@ -14,6 +14,7 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from dmprl.env_options import EnvOptions
+from dmprl.goal_task import GoalTask
 from dmprl.mujoco_batch import MujocoTask, quieten_mujoco
 from dmprl.segment_env import SUCCESS_NOT_REPORTED, SegmentBuffers, SegmentEnvError
 from dmprl.tasks import make_task, registered, replaces
@@ -22,8 +23,15 @@ from dmprl.tasks import make_task, registered, replaces
 HAS_DISPLAY = any(os.environ.get(name) for name in ("DISPLAY", "WAYLAND_DISPLAY"))
 
 
-class TaskEnv(gymnasium.Env[NDArray[np.float64], NDArray[np.float32]]):
+Observation = NDArray[np.float64] | dict[str, NDArray[np.float64]]
+GOALS = "achieved_goal", "desired_goal"
+
+
+class TaskEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
     """A batch of one environment with segments of one step, so it behaves as in a worker.
+
+    The observation of a task with goals is a ``Dict`` of ``achieved_goal``, ``desired_goal`` and
+    ``observation``, as in Gymnasium-Robotics; a worker's row is the ``Dict`` flattened.
 
     ``gymnasium.make`` adds Gymnasium's own wrapper for the time limit. The render modes
     ``rgb_array`` and ``depth_array`` need no display (:mod:`dmprl.pictures`).
@@ -61,7 +69,8 @@ class TaskEnv(gymnasium.Env[NDArray[np.float64], NDArray[np.float32]]):
         spec = self._batch.spec()
         self.dt = spec["control_dt_s"]
         self.metadata = {**self.metadata, "render_fps": round(1.0 / self.dt)}
-        self.observation_space = spaces.Box(-np.inf, np.inf, (spec["observation_len"],), np.float64)
+        self._goal_len = made.goal_len if isinstance(made, GoalTask) else 0
+        self.observation_space = self._space(spec["observation_len"])
         self.action_space = spaces.Box(made.action_low, made.action_high, dtype=np.float32)
         self._out = SegmentBuffers(1, 1, spec["observation_len"], spec["action_len"])
         self.render_mode = render_mode
@@ -70,19 +79,47 @@ class TaskEnv(gymnasium.Env[NDArray[np.float64], NDArray[np.float32]]):
         self._view: Callable[[], Any] = lambda: None
         self._close_view: Callable[[], None] | None = None
 
+    def _space(self, observation_len: int) -> spaces.Space:
+        lengths = {"observation": observation_len - 2 * self._goal_len}
+        if self._goal_len:
+            lengths |= dict.fromkeys(GOALS, self._goal_len)
+        boxes = {
+            name: spaces.Box(-np.inf, np.inf, (length,), np.float64)
+            for name, length in lengths.items()
+        }
+        return spaces.Dict(boxes) if self._goal_len else boxes["observation"]
+
+    def _observation(self, row: NDArray[np.float64]) -> Observation:
+        if not self._goal_len:
+            return row.copy()
+        parts = np.split(row, [self._goal_len, 2 * self._goal_len])
+        return dict(zip((*GOALS, "observation"), map(np.copy, parts), strict=True))
+
+    def compute_reward(
+        self,
+        achieved_goal: NDArray[np.float64],
+        desired_goal: NDArray[np.float64],
+        info: Any,
+    ) -> np.float64 | NDArray[np.float64]:
+        """Computes the rewards (…) for having achieved goals (…, G) when others were desired."""
+        achieved, desired = np.asarray(achieved_goal), np.asarray(desired_goal)
+        rewards = np.zeros(achieved.shape[:-1])
+        self.task.goal_rewards(achieved, desired, rewards)
+        return rewards[()]
+
     def reset(  # noqa: D102 - inherited
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[NDArray[np.float64], dict[str, Any]]:
+    ) -> tuple[Observation, dict[str, Any]]:
         super().reset(seed=seed)
         self._batch.seed(0, self.np_random)
         self._batch.begin(np.zeros(1, np.int32), self._out)
         if self.render_mode == "human":
             self.render()
-        return self._out.next_observations[0].copy(), {}
+        return self._observation(self._out.next_observations[0]), {}
 
     def step(  # noqa: D102 - inherited
         self, action: NDArray[np.float32]
-    ) -> tuple[NDArray[np.float64], float, bool, bool, dict[str, Any]]:
+    ) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
         out = self._out
         self._batch.step_segment(np.asarray(action, np.float64).reshape(1, 1, -1), out)
         if out.failed[0]:
@@ -92,7 +129,8 @@ class TaskEnv(gymnasium.Env[NDArray[np.float64], NDArray[np.float32]]):
             info["is_success"] = bool(out.success[0])
         if self.render_mode == "human":
             self.render()
-        return out.observations[0, 1].copy(), float(out.rewards[0, 0]), False, False, info
+        observation = self._observation(out.observations[0, 1])
+        return observation, float(out.rewards[0, 0]), False, False, info
 
     def render(self) -> Any:  # noqa: D102 - inherited
         if self.render_mode is None:

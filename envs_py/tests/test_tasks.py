@@ -172,7 +172,8 @@ class Contract:
     def test_the_gymnasium_environment_equals_the_batch(self):
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # Gymnasium warns that the paper's versions are old
-            plain = gymnasium.make(self.task_id)
+            # A Dict is flattened, as a worker does; another observation remains the same.
+            plain = gymnasium.wrappers.FlattenObservation(gymnasium.make(self.task_id))
         batch, out = started(self.task_id)
         now, _ = plain.reset(seed=7)
         rng = np.random.default_rng(0)

@@ -35,12 +35,12 @@ pub(super) enum PeerKind {
 
 /// Name of [`PeerKind::PandaGym`].
 pub(super) const PANDA_GYM: &str = "panda_gym";
-/// Tasks that panda-gym has too. `dmprl.bench_peers` maps them to panda-gym's names.
-const PANDA_GYM_TASKS: [&str; 2] = ["dmprl/PandaReach-v0", "dmprl/PandaReachJoints-v0"];
+/// Start of the ids of tasks that panda-gym has too. `dmprl.bench_peers` maps them to its names.
+const PANDA_GYM_TASKS: &str = "dmprl/Panda";
 
 /// Returns true if panda-gym has an equivalent of this environment.
 pub(super) fn is_in_panda_gym(env_id: &str) -> bool {
-    PANDA_GYM_TASKS.contains(&env_id)
+    env_id.starts_with(PANDA_GYM_TASKS)
 }
 
 impl PeerKind {

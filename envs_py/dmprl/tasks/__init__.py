@@ -26,6 +26,9 @@ class Registered(NamedTuple):
     episode_steps: int
 
 
+PANDA_OBJECTS = {"PandaPush": 50, "PandaSlide": 50, "PandaPickAndPlace": 50, "PandaStack": 100}
+"""Length of an episode of the Panda's tasks with objects."""
+
 TASKS = {
     "dmprl/Reacher-v5": Registered("dmprl.tasks.reacher", "Reacher", 50),
     "dmprl/Reacher-v1": Registered("dmprl.tasks.reacher", "ReacherV1", 50),
@@ -34,6 +37,10 @@ TASKS = {
     "dmprl/Thrower-v0": Registered("dmprl.tasks.thrower", "Thrower", 100),
     "dmprl/PandaReach-v0": Registered("dmprl.tasks.panda", "PandaReach", 50),
     "dmprl/PandaReachJoints-v0": Registered("dmprl.tasks.panda", "PandaReachJoints", 50),
+} | {
+    f"dmprl/{name}{variant}-v0": Registered("dmprl.tasks.panda_objects", name + variant, steps)
+    for name, steps in PANDA_OBJECTS.items()
+    for variant in ("", "Dense", "Joints", "JointsDense")
 }
 """Every task by its Gymnasium id."""
 

@@ -127,8 +127,4 @@ class PandaReach(PandaReachJoints):
     def targets(  # noqa: D102 - inherited
         self, fields: Fields, actions: NDArray[np.float32], out: NDArray[np.float64]
     ) -> None:
-        target = self.displacement(actions)
-        target += fields["site_xpos"][:, 0]
-        # Keeps the target above the table.
-        np.maximum(target[:, 2], 0.0, out=target[:, 2])
-        self._kinematics.solve(fields, target, out)
+        self._kinematics.displace(fields, self.displacement(actions), out)

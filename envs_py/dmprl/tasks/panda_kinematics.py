@@ -66,14 +66,26 @@ class InverseKinematics:
         self._start = np.zeros((env_count, 3, 4))
         self._damping = DAMPING**2 * np.eye(6)
 
+    def displace(
+        self, fields: Fields, displacement: NDArray[np.float64], out: NDArray[np.float64]
+    ) -> None:
+        """Writes the joint angles that move the end effector, but not below the table.
+
+        As :meth:`solve`, with a ``displacement`` (E, 3) [m] from the current position. It is
+        overwritten.
+        """
+        displacement += fields["site_xpos"][:, 0]
+        np.maximum(displacement[:, 2], 0.0, out=displacement[:, 2])
+        self.solve(fields, displacement, out)
+
     def solve(self, fields: Fields, target: NDArray[np.float64], out: NDArray[np.float64]) -> None:
         """Writes the joint angles that bring the end effector to a point.
 
-        - ``fields``: current qpos and :attr:`recorded`.
+        - ``fields``: current qpos and :attr:`recorded`; the arm's joints are the model's first.
         - ``target`` (E, 3): the point [m].
         - ``out`` (E, 7): angles [rad].
         """
-        qpos, start = fields["qpos"], self._start
+        qpos, start = fields["qpos"][:, :JOINTS], self._start
         start[:, :, :3] = fields["site_xmat"][:, 0].reshape(-1, 3, 3)
         start[:, :, 3] = fields["site_xpos"][:, 0]
         inverse = self._inverse_at(fields)
@@ -118,7 +130,7 @@ class InverseKinematics:
         lever = fields["site_xpos"][:, 0] - fields["subtree_com"][:, self._root]
         shift = (lever[:, None] @ self._skew).reshape(-1, 6, 6)
         shift += _IDENTITY
-        transposed = fields["cdof"] @ shift
+        transposed = fields["cdof"][:, :JOINTS] @ shift
         square = transposed.transpose(0, 2, 1) @ transposed
         square += self._damping
         return transposed @ np.linalg.inv(square)
@@ -148,7 +160,7 @@ def _chain(model: mujoco.MjModel) -> NDArray[np.float64]:
     chain[0, :, 2, 2] = chain[0, :, 3, 3] = 1.0
     chain[1, :, 0, 0] = chain[1, :, 1, 1] = 1.0
     chain[2, :, 1, 0], chain[2, :, 0, 1] = 1.0, -1.0
-    bodies = model.jnt_bodyid
+    bodies = model.jnt_bodyid[:JOINTS]
     links = map(_transform, model.body_pos[bodies], model.body_quat[bodies])
     chain = np.array(list(links)) @ chain
     return np.ascontiguousarray(chain.reshape(3, JOINTS, 16).transpose(1, 0, 2))

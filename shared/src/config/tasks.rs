@@ -106,6 +106,73 @@ const PANDA_REACH_JOINTS: TaskDefaults = TaskDefaults {
     ..PANDA_REACH
 };
 
+const PANDA_PUSH: TaskDefaults = TaskDefaults {
+    name: "panda-push",
+    id: "dmprl/PandaPush-v0",
+    about: "Franka Panda pushes a cube to a goal, sparse reward",
+    observation_len: 24,
+    values: PANDA_PUSH_VALUES,
+    paper: &[],
+    ..PANDA_REACH
+};
+
+const PANDA_PUSH_DENSE: TaskDefaults = TaskDefaults {
+    name: "panda-push-dense",
+    id: "dmprl/PandaPushDense-v0",
+    about: "panda-push with minus the distance as reward",
+    ..PANDA_PUSH
+};
+
+const PANDA_SLIDE: TaskDefaults = TaskDefaults {
+    name: "panda-slide",
+    id: "dmprl/PandaSlide-v0",
+    about: "Franka Panda makes a puck slide to a goal out of reach, sparse reward",
+    ..PANDA_PUSH
+};
+
+const PANDA_SLIDE_DENSE: TaskDefaults = TaskDefaults {
+    name: "panda-slide-dense",
+    id: "dmprl/PandaSlideDense-v0",
+    about: "panda-slide with minus the distance as reward",
+    ..PANDA_SLIDE
+};
+
+const PANDA_PICK_AND_PLACE: TaskDefaults = TaskDefaults {
+    name: "panda-pick-and-place",
+    id: "dmprl/PandaPickAndPlace-v0",
+    about: "Franka Panda brings a cube to a goal on or above the table, sparse reward",
+    control: "gripper displacement, ±1 = 5 cm, and opening, ±1 = 20 cm per step",
+    observation_len: 26,
+    action_low: &[-1.0; 4],
+    action_high: &[1.0; 4],
+    values: PANDA_PICK_AND_PLACE_VALUES,
+    ..PANDA_PUSH
+};
+
+const PANDA_PICK_AND_PLACE_DENSE: TaskDefaults = TaskDefaults {
+    name: "panda-pick-and-place-dense",
+    id: "dmprl/PandaPickAndPlaceDense-v0",
+    about: "panda-pick-and-place with minus the distance as reward",
+    ..PANDA_PICK_AND_PLACE
+};
+
+const PANDA_STACK: TaskDefaults = TaskDefaults {
+    name: "panda-stack",
+    id: "dmprl/PandaStack-v0",
+    about: "Franka Panda stacks two cubes at a goal, sparse reward",
+    observation_len: 44,
+    episode_steps: 100,
+    values: PANDA_STACK_VALUES,
+    ..PANDA_PICK_AND_PLACE
+};
+
+const PANDA_STACK_DENSE: TaskDefaults = TaskDefaults {
+    name: "panda-stack-dense",
+    id: "dmprl/PandaStackDense-v0",
+    about: "panda-stack with minus the distance as reward",
+    ..PANDA_STACK
+};
+
 const REACHER_V1: TaskDefaults = TaskDefaults {
     name: "reacher-v1",
     id: "dmprl/Reacher-v1",
@@ -127,9 +194,25 @@ const PUSHER_V0: TaskDefaults = TaskDefaults {
 const THROWER_V0: TaskDefaults =
     TaskDefaults { name: "thrower-v0", about: "alias of thrower", ..THROWER };
 
-/// Every task with a short name: the five tasks, then the paper's older versions.
-pub const TASKS: [TaskDefaults; 8] =
-    [REACHER, PUSHER, THROWER, PANDA_REACH, PANDA_REACH_JOINTS, REACHER_V1, PUSHER_V0, THROWER_V0];
+/// Every task with a short name; the paper's older versions are last.
+pub const TASKS: [TaskDefaults; 16] = [
+    REACHER,
+    PUSHER,
+    THROWER,
+    PANDA_REACH,
+    PANDA_REACH_JOINTS,
+    PANDA_PUSH,
+    PANDA_PUSH_DENSE,
+    PANDA_SLIDE,
+    PANDA_SLIDE_DENSE,
+    PANDA_PICK_AND_PLACE,
+    PANDA_PICK_AND_PLACE_DENSE,
+    PANDA_STACK,
+    PANDA_STACK_DENSE,
+    REACHER_V1,
+    PUSHER_V0,
+    THROWER_V0,
+];
 
 // Observation: cos (2), sin (2), target (2), angular velocity (2), fingertip - target.
 const REACHER_VALUES: &[&str] = &[r#"
@@ -224,6 +307,58 @@ steps = 30000
 warm_up_steps = 1000
 [pacing]
 updates_per_segment = 4.0
+"#;
+
+// Observation: achieved goal (3), desired goal (3), position of the end effector (3), its velocity
+// (3), position, rotation, velocity and angular velocity of the cube (3 each).
+const PANDA_PUSH_VALUES: &[&str] = &[
+    r#"
+[task]
+start_sources = [
+    { index = 6, velocity = 9 },
+    { index = 7, velocity = 10 },
+    { index = 8, velocity = 11 },
+]
+"#,
+    PANDA_OBJECTS,
+];
+
+// As above, but the fingers' width and its velocity follow the end effector.
+const PANDA_PICK_AND_PLACE_VALUES: &[&str] = &[
+    r#"
+[task]
+start_sources = [
+    { index = 6, velocity = 9 },
+    { index = 7, velocity = 10 },
+    { index = 8, velocity = 11 },
+    { index = 12, velocity = 13 },
+]
+"#,
+    PANDA_OBJECTS,
+];
+
+// As above, with goals of two cubes (6 each).
+const PANDA_STACK_VALUES: &[&str] = &[
+    r#"
+[task]
+start_sources = [
+    { index = 12, velocity = 15 },
+    { index = 13, velocity = 16 },
+    { index = 14, velocity = 17 },
+    { index = 18, velocity = 19 },
+]
+"#,
+    PANDA_OBJECTS,
+];
+
+// u = 1 moves the end effector by 0.05 m, as in PANDA_REACH_VALUES.
+const PANDA_OBJECTS: &str = r#"
+[run]
+steps = 200000
+[policy]
+position_scale = 20.0
+[algorithm]
+discount = 0.98
 "#;
 
 // Table 2 of the paper, column of the Panda tasks.

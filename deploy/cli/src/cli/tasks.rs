@@ -43,8 +43,8 @@ fn description(task: &TaskDefaults) -> String {
     let action_len = action_low.len();
     let seconds = f64::from(*episode_steps) * control_dt_s;
     format!(
-        "{name:19} {about}\n{:19} {id}, from {source}\n{:19} observation {observation_len}, \
-         action {action_len}: {control}\n{:19} episode {episode_steps} steps of {control_dt_s} s, \
+        "{name:27} {about}\n{:27} {id}, from {source}\n{:27} observation {observation_len}, \
+         action {action_len}: {control}\n{:27} episode {episode_steps} steps of {control_dt_s} s, \
          {seconds:.0} s\n",
         "", "", ""
     )
