@@ -9,6 +9,17 @@ pub enum LinkMode<'a> {
     Connect(&'a str),
 }
 
+impl LinkMode<'_> {
+    /// True if all endpoints are `tls/` endpoints.
+    #[must_use]
+    pub fn is_encrypted(&self) -> bool {
+        match self {
+            Self::Listen(at) => at.iter().all(|endpoint| endpoint.starts_with("tls/")),
+            Self::Connect(to) => to.starts_with("tls/"),
+        }
+    }
+}
+
 /// Priority of messages on a full link.
 #[derive(Debug, Clone, Copy)]
 pub enum Urgency {
