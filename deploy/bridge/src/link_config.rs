@@ -192,3 +192,83 @@ fn passwords(
     set(config, "transport/auth/usrpwd", serde_json::json!({"dictionary_file": file.path()}))?;
     Ok(Some(file))
 }
+
+#[cfg(test)]
+mod tests {
+    use std::net::TcpListener;
+    use std::time::{Duration, Instant};
+
+    use super::*;
+    use crate::Link;
+
+    const TOKEN: &str = "a secret of some length";
+
+    /// A file for Zenoh with the certificates of a process of the run, but with this name.
+    fn zenoh_file(common_name: &str) -> NamedTempFile {
+        let identity = TlsIdentity::signed(TOKEN, common_name).unwrap();
+        let mut file = NamedTempFile::with_suffix(".json5").unwrap();
+        let tls = serde_json::json!({
+            "root_ca_certificate_base64": STANDARD.encode(identity.authority),
+            "listen_certificate_base64": STANDARD.encode(identity.certificate),
+            "listen_private_key_base64": STANDARD.encode(identity.private_key),
+            "enable_mtls": true,
+        });
+        let text = serde_json::json!({"transport": {"link": {"tls": tls}}}).to_string();
+        file.write_all(text.as_bytes()).unwrap();
+        file
+    }
+
+    /// Whether a host gets an answer from a listener with a certificate of this name.
+    fn is_answered(common_name: &str) -> bool {
+        let free = TcpListener::bind("127.0.0.1:0").unwrap().local_addr().unwrap();
+        let endpoints = [format!("tls/{free}")];
+        let file = zenoh_file(common_name);
+        let listener = Link::open(LinkMode::Listen(&endpoints), TOKEN, Some(file.path())).unwrap();
+        let requests = listener.requests("dmprl/test").unwrap();
+        let host = Link::open(LinkMode::Connect(&endpoints[0]), TOKEN, None).unwrap();
+        assert!(host.is_authenticated() && !listener.is_authenticated());
+        std::thread::scope(|scope| {
+            let asking = scope.spawn(|| {
+                let (deadline, limit) =
+                    (Instant::now() + Duration::from_secs(3), Duration::from_millis(200));
+                while Instant::now() < deadline {
+                    let answer = host.request("dmprl/test", Vec::new(), limit, |_| Some(()));
+                    if answer.unwrap().is_some() {
+                        return true;
+                    }
+                }
+                false
+            });
+            while !asking.is_finished() {
+                match requests.next().unwrap() {
+                    Some(request) => request.answer(b"here".to_vec()).unwrap(),
+                    None => std::thread::yield_now(),
+                }
+            }
+            asking.join().unwrap()
+        })
+    }
+
+    /// As if a public authority had signed the certificate: the authority is trusted, but the name
+    /// is not the one of the run's processes.
+    #[test]
+    fn host_exchanges_no_message_with_a_learner_of_another_name() {
+        assert!(is_answered(COMMON_NAME));
+        assert!(!is_answered("learner.example.org"));
+    }
+
+    #[test]
+    fn certificates_of_the_users_file_are_kept() {
+        let file = zenoh_file("mine");
+        let endpoints = ["tls/127.0.0.1:7447".to_owned()];
+        let made = LinkConfig::new(LinkMode::Listen(&endpoints), TOKEN, Some(file.path())).unwrap();
+        assert!(!made.is_authenticated);
+        let text = made.config.get_json("transport/link/tls").unwrap();
+        println!("TLS {text}");
+        let only = made.config.get_json("transport/link/tls/listen_certificate_base64");
+        println!("ONE {only:?}");
+        // Ours would not verify names.
+        let verify = made.config.get_json("transport/link/tls/verify_name_on_connect").unwrap();
+        assert_eq!(verify, "null");
+    }
+}

@@ -37,10 +37,11 @@ impl TlsIdentity {
     /// # Errors
     /// The system gives no random numbers.
     pub(crate) fn new(token: &str) -> anyhow::Result<Self> {
-        Self::signed(token).context("cannot make certificates from the token")
+        Self::signed(token, COMMON_NAME).context("cannot make certificates from the token")
     }
 
-    fn signed(token: &str) -> Result<Self, rcgen::Error> {
+    /// Makes a certificate with this common name.
+    pub(crate) fn signed(token: &str, common_name: &str) -> Result<Self, rcgen::Error> {
         let secret = Key::from_token(token, "dmprl bridge 2: certificate authority");
         let mut pkcs8 = [0; ED25519_PKCS8.len() + KEY_BYTES];
         pkcs8[..ED25519_PKCS8.len()].copy_from_slice(&ED25519_PKCS8);
@@ -53,7 +54,7 @@ impl TlsIdentity {
         let authority = params.self_signed(&authority_key)?;
         let issuer = Issuer::new(params, authority_key);
         let key = KeyPair::generate()?;
-        let certificate = named(COMMON_NAME)?.signed_by(&key, &issuer)?;
+        let certificate = named(common_name)?.signed_by(&key, &issuer)?;
         Ok(Self {
             authority: authority.pem(),
             certificate: certificate.pem(),

@@ -200,7 +200,9 @@ fn a_host_imports_only_what_its_own_user_named() {
     let place = Workplace::new();
     let (run, endpoint) = (place.path("run"), endpoint());
     fs::write(place.path("held.py"), HELD).unwrap();
-    let more = ["--python-path", &place.path(""), "--envs-per-worker", "1", "--steps", ENDLESS];
+    // A host that refuses keeps its place for a minute.
+    let more = ["--python-path", &place.path(""), "--set", "bridge.workers_max=4"];
+    let more = [&more[..], &["--envs-per-worker", "1", "--steps", ENDLESS]].concat();
     let _training = learner_of("held:Held-v0", &place, &run, &endpoint, &more);
     let (token, far) = (format!("{run}/bridge.token"), place.path("far"));
     let asks = ["bridge", "--connect", &endpoint, "--token-file", &token, "--workers", "1"];
