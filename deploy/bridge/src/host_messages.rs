@@ -1,5 +1,5 @@
-//! JSON messages between a host and the gateway: joining ([`crate::handshake`] proves them), and the
-//! host's status.
+//! JSON messages between a host and the gateway: joining, which [`crate::handshake`] authenticates,
+//! and the host's status.
 
 use dmprl_control::WorkersNow;
 use dmprl_shared::spec::EnvSpec;

@@ -68,7 +68,7 @@ impl LinkConfig {
             })?,
         };
         connections(&mut config, mode)?;
-        if !is_set(&config, "transport/link/tls")? {
+        if !sets_certificates(&config)? {
             certificates(&mut config, token)?;
         }
         let is_authenticated = zenoh_file.is_none() && mode.is_encrypted();
@@ -111,6 +111,17 @@ fn connections(config: &mut Config, mode: LinkMode<'_>) -> anyhow::Result<()> {
     set(config, "transport/unicast/max_sessions", SESSIONS_MAX)?;
     set(config, "transport/unicast/accept_pending", HANDSHAKES_MAX)?;
     set(config, "transport/unicast/accept_timeout", HANDSHAKE_LIMIT_MS)
+}
+
+/// Returns true if the user's file configures TLS itself.
+fn sets_certificates(config: &Config) -> anyhow::Result<bool> {
+    // These are missing in the text of their section.
+    let secret = |name: &str| {
+        let text = config.get_json(&format!("transport/link/tls/{name}_base64"));
+        text.is_ok_and(|text| text != "null")
+    };
+    let names = ["root_ca_certificate", "listen_certificate", "connect_certificate"];
+    Ok(names.into_iter().any(secret) || is_set(config, "transport/link/tls")?)
 }
 
 /// Returns true if the user's file sets any key of this section, whose keys are null by default.
@@ -211,7 +222,6 @@ mod tests {
             "root_ca_certificate_base64": STANDARD.encode(identity.authority),
             "listen_certificate_base64": STANDARD.encode(identity.certificate),
             "listen_private_key_base64": STANDARD.encode(identity.private_key),
-            "enable_mtls": true,
         });
         let text = serde_json::json!({"transport": {"link": {"tls": tls}}}).to_string();
         file.write_all(text.as_bytes()).unwrap();
@@ -263,10 +273,6 @@ mod tests {
         let endpoints = ["tls/127.0.0.1:7447".to_owned()];
         let made = LinkConfig::new(LinkMode::Listen(&endpoints), TOKEN, Some(file.path())).unwrap();
         assert!(!made.is_authenticated);
-        let text = made.config.get_json("transport/link/tls").unwrap();
-        println!("TLS {text}");
-        let only = made.config.get_json("transport/link/tls/listen_certificate_base64");
-        println!("ONE {only:?}");
         // Ours would not verify names.
         let verify = made.config.get_json("transport/link/tls/verify_name_on_connect").unwrap();
         assert_eq!(verify, "null");
