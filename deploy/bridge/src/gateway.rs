@@ -297,11 +297,12 @@ impl Gateway {
     }
 
     /// Rejected messages and segments: damaged, forged, repeated, of unknown senders, inconsistent,
-    /// or requests that are too large or too many.
+    /// requests that are too large or too many, and connections without the token.
     #[must_use]
     pub fn rejected(&self) -> u64 {
         let segments = self.workers.values().map(|worker| worker.receiver.rejected());
-        self.rejected + self.requests.dropped() + segments.sum::<u64>()
+        let unproven = self.requests.dropped() + self.link.refused();
+        self.rejected + unproven + segments.sum::<u64>()
     }
 
     /// Passes the host's policy version to its policy sender, which sends the next one.

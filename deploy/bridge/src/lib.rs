@@ -35,6 +35,8 @@ pub mod relay;
 pub mod seal;
 #[cfg(feature = "zenoh")]
 mod tls_identity;
+#[cfg(feature = "zenoh")]
+mod tls_tunnel;
 pub mod token;
 pub mod wire;
 

@@ -21,6 +21,7 @@ use zenoh::sample::{Sample, SampleKind};
 use zenoh::{Session, Wait};
 
 use crate::link_config::LinkConfig;
+use crate::tls_tunnel::TlsTunnel;
 use crate::{LinkMode, Urgency};
 
 /// Capacity of a queue of received messages. If it is full, the link is not read and its sender
@@ -36,6 +37,8 @@ const REQUEST_BYTES_MAX: usize = 4_096;
 pub struct Link {
     session: Session,
     is_authenticated: bool,
+    /// Dropped after the session is closed.
+    tunnel: Option<TlsTunnel>,
 }
 
 /// Sends messages under one name.
@@ -83,14 +86,17 @@ impl Link {
         token: &str,
         zenoh_file: Option<&Path>,
     ) -> anyhow::Result<Self> {
-        let what = match mode {
-            LinkMode::Listen(at) => format!("cannot listen at {}", at.join(", ")),
-            LinkMode::Connect(to) => format!("cannot connect to {to}"),
-        };
         let configured = LinkConfig::new(mode, token, zenoh_file)?;
-        let LinkConfig { config, is_authenticated, .. } = &configured;
-        let session = zenoh::open(config.clone()).wait().map_err(failed(what))?;
-        Ok(Self { session, is_authenticated: *is_authenticated })
+        let LinkConfig { config, is_authenticated, tunnel, passwords } = configured;
+        let session = zenoh::open(config).wait().map_err(failed(mode))?;
+        drop(passwords);
+        Ok(Self { session, is_authenticated, tunnel })
+    }
+
+    /// Number of connections that were refused because they did not prove that they know the token.
+    #[must_use]
+    pub fn refused(&self) -> u64 {
+        self.tunnel.as_ref().map_or(0, TlsTunnel::refused)
     }
 
     /// True if every peer of this session has a certificate of the run's authority.

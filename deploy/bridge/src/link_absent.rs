@@ -50,6 +50,12 @@ impl Link {
 
     /// Never called.
     #[must_use]
+    pub fn refused(&self) -> u64 {
+        match self.0 {}
+    }
+
+    /// Never called.
+    #[must_use]
     pub fn is_authenticated(&self) -> bool {
         match self.0 {}
     }

@@ -1,14 +1,16 @@
 //! Zenoh's configuration for a session between hosts of a run.
 //!
 //! Only ends that know the run's token can open a session: on `tls/` endpoints they need a
-//! certificate of the run's authority, and on every endpoint a password that is derived from the
-//! token. So others cannot send the gateway anything, and it stores for them only the handshakes of
-//! [`HANDSHAKES_MAX`] connections.
+//! certificate of the run's authority (`tls_tunnel.rs`), and on every endpoint a password that is
+//! derived from the token. So others cannot send the gateway anything, and it stores for them only
+//! the handshakes of [`HANDSHAKES_MAX`] connections.
 //!
-//! A user's file for Zenoh can configure TLS and access control itself. Such a session, and one
-//! with `tcp/` endpoints, does not count as authenticated, and its messages are sealed.
+//! A user's file for Zenoh can configure TLS itself. Zenoh's TLS then replaces ours. Such a
+//! session, and one with `tcp/` endpoints, does not count as authenticated, and its messages are
+//! sealed.
 
 use std::io::Write;
+use std::net::{SocketAddr, TcpListener};
 use std::path::Path;
 
 use anyhow::{Context, anyhow};
@@ -20,7 +22,8 @@ use zenoh::Config;
 
 use crate::LinkMode;
 use crate::keys::Key;
-use crate::tls_identity::{COMMON_NAME, TlsIdentity};
+use crate::tls_identity::TlsIdentity;
+use crate::tls_tunnel::TlsTunnel;
 
 /// Time without any message after which a peer counts as gone \[ms\]. It sends several keep-alives
 /// within this time.
@@ -48,7 +51,10 @@ pub(crate) struct LinkConfig {
     pub config: Config,
     /// Whether the certificates of the run's authority authenticate every peer.
     pub is_authenticated: bool,
-    _passwords: Option<NamedTempFile>,
+    /// Carries the connections of `tls/` endpoints.
+    pub tunnel: Option<TlsTunnel>,
+    /// The file of passwords, which Zenoh reads when it opens.
+    pub passwords: Option<NamedTempFile>,
 }
 
 impl LinkConfig {
@@ -67,17 +73,47 @@ impl LinkConfig {
                 wrong_use(format!("{}: not a configuration of Zenoh: {error}", path.display()))
             })?,
         };
-        connections(&mut config, mode)?;
-        if !sets_certificates(&config)? {
-            certificates(&mut config, token)?;
-        }
-        let is_authenticated = zenoh_file.is_none() && mode.is_encrypted();
-        if is_authenticated {
-            admit_only_this_run(&mut config)?;
+        let is_own_tls = !sets_certificates(&config)?;
+        let tunnel = if is_own_tls && mode.has_tls() { Some(TlsTunnel::new()?) } else { None };
+        let endpoint = |endpoint: &String| match (&tunnel, endpoint.strip_prefix("tls/")) {
+            (Some(tunnel), Some(address)) => inner_endpoint(tunnel, mode, token, address),
+            _ => Ok(endpoint.clone()),
+        };
+        match mode {
+            LinkMode::Listen(at) => {
+                let at = at.iter().map(endpoint).collect::<anyhow::Result<Vec<_>>>()?;
+                connections(&mut config, &at, &[], BATCH_BYTES_MAX)?;
+            }
+            LinkMode::Connect(to) => {
+                connections(&mut config, &[], &[endpoint(&to.to_owned())?], POLICY_BYTES_MAX)?;
+            }
         }
         let passwords = passwords(&mut config, mode, token)?;
-        Ok(Self { config, is_authenticated, _passwords: passwords })
+        let is_authenticated = is_own_tls && mode.is_encrypted();
+        Ok(Self { config, is_authenticated, tunnel, passwords })
     }
+}
+
+/// Begins to carry an endpoint's connections. Returns the endpoint of Zenoh on loopback.
+fn inner_endpoint(
+    tunnel: &TlsTunnel,
+    mode: LinkMode<'_>,
+    token: &str,
+    address: &str,
+) -> anyhow::Result<String> {
+    let identity = TlsIdentity::new(token)?;
+    let inner = match mode {
+        LinkMode::Connect(_) => tunnel.connect(identity, address),
+        LinkMode::Listen(_) => free_address().and_then(|inner| {
+            tunnel.listen(identity, address, inner)?;
+            Ok(inner)
+        }),
+    };
+    Ok(format!("tcp/{}", inner.with_context(|| mode.to_string())?))
+}
+
+fn free_address() -> anyhow::Result<SocketAddr> {
+    Ok(TcpListener::bind("127.0.0.1:0")?.local_addr()?)
 }
 
 fn set(config: &mut Config, key: &str, value: impl serde::Serialize) -> anyhow::Result<()> {
@@ -87,11 +123,12 @@ fn set(config: &mut Config, key: &str, value: impl serde::Serialize) -> anyhow::
 }
 
 /// Sets endpoints and limits.
-fn connections(config: &mut Config, mode: LinkMode<'_>) -> anyhow::Result<()> {
-    let (listen, connect, bytes_max) = match mode {
-        LinkMode::Listen(at) => (at, &[][..], BATCH_BYTES_MAX),
-        LinkMode::Connect(to) => (&[][..], &[to.to_owned()][..], POLICY_BYTES_MAX),
-    };
+fn connections(
+    config: &mut Config,
+    listen: &[String],
+    connect: &[String],
+    bytes_max: usize,
+) -> anyhow::Result<()> {
     set(config, "mode", "peer")?;
     set(config, "listen/endpoints", listen)?;
     set(config, "connect/endpoints", connect)?;
@@ -131,52 +168,6 @@ fn is_set(config: &Config, section: &str) -> anyhow::Result<bool> {
     Ok(keys.values().any(|value| !value.is_null()))
 }
 
-/// Sets the certificates that are derived from the token.
-fn certificates(config: &mut Config, token: &str) -> anyhow::Result<()> {
-    let identity = TlsIdentity::new(token)?;
-    for (key, pem) in [
-        ("root_ca_certificate_base64", &identity.authority),
-        ("listen_certificate_base64", &identity.certificate),
-        ("listen_private_key_base64", &identity.private_key),
-        ("connect_certificate_base64", &identity.certificate),
-        ("connect_private_key_base64", &identity.private_key),
-    ] {
-        set(config, &format!("transport/link/tls/{key}"), STANDARD.encode(pem))?;
-    }
-    set(config, "transport/link/tls/enable_mtls", true)?;
-    // The authority identifies the run, whatever name or address the user connects to.
-    set(config, "transport/link/tls/verify_name_on_connect", false)
-}
-
-/// Exchanges messages only with peers whose certificate has the name of the run's processes. A
-/// connecting end of Zenoh also trusts all public authorities, but these sign no such name, which
-/// is not one of a host.
-fn admit_only_this_run(config: &mut Config) -> anyhow::Result<()> {
-    let access_control = serde_json::json!({
-        "enabled": true,
-        "default_permission": "deny",
-        "rules": [{
-            "id": "run",
-            "permission": "allow",
-            "flows": ["ingress", "egress"],
-            "messages": [
-                "put",
-                "query",
-                "reply",
-                "declare_subscriber",
-                "declare_queryable",
-                "liveliness_token",
-                "liveliness_query",
-                "declare_liveliness_subscriber",
-            ],
-            "key_exprs": ["dmprl/**"],
-        }],
-        "subjects": [{"id": "processes", "cert_common_names": [COMMON_NAME]}],
-        "policies": [{"rules": ["run"], "subjects": ["processes"]}],
-    });
-    set(config, "access_control", access_control)
-}
-
 /// Sets the password of all hosts, unless the user's file has users of its own. Zenoh reads the
 /// passwords that it accepts from a file.
 fn passwords(
@@ -202,79 +193,4 @@ fn passwords(
     let file = write().context("cannot create a temporary file")?;
     set(config, "transport/auth/usrpwd", serde_json::json!({"dictionary_file": file.path()}))?;
     Ok(Some(file))
-}
-
-#[cfg(test)]
-mod tests {
-    use std::net::TcpListener;
-    use std::time::{Duration, Instant};
-
-    use super::*;
-    use crate::Link;
-
-    const TOKEN: &str = "a secret of some length";
-
-    /// A file for Zenoh with the certificates of a process of the run, but with this name.
-    fn zenoh_file(common_name: &str) -> NamedTempFile {
-        let identity = TlsIdentity::signed(TOKEN, common_name).unwrap();
-        let mut file = NamedTempFile::with_suffix(".json5").unwrap();
-        let tls = serde_json::json!({
-            "root_ca_certificate_base64": STANDARD.encode(identity.authority),
-            "listen_certificate_base64": STANDARD.encode(identity.certificate),
-            "listen_private_key_base64": STANDARD.encode(identity.private_key),
-        });
-        let text = serde_json::json!({"transport": {"link": {"tls": tls}}}).to_string();
-        file.write_all(text.as_bytes()).unwrap();
-        file
-    }
-
-    /// Whether a host gets an answer from a listener with a certificate of this name.
-    fn is_answered(common_name: &str) -> bool {
-        let free = TcpListener::bind("127.0.0.1:0").unwrap().local_addr().unwrap();
-        let endpoints = [format!("tls/{free}")];
-        let file = zenoh_file(common_name);
-        let listener = Link::open(LinkMode::Listen(&endpoints), TOKEN, Some(file.path())).unwrap();
-        let requests = listener.requests("dmprl/test").unwrap();
-        let host = Link::open(LinkMode::Connect(&endpoints[0]), TOKEN, None).unwrap();
-        assert!(host.is_authenticated() && !listener.is_authenticated());
-        std::thread::scope(|scope| {
-            let asking = scope.spawn(|| {
-                let (deadline, limit) =
-                    (Instant::now() + Duration::from_secs(3), Duration::from_millis(200));
-                while Instant::now() < deadline {
-                    let answer = host.request("dmprl/test", Vec::new(), limit, |_| Some(()));
-                    if answer.unwrap().is_some() {
-                        return true;
-                    }
-                }
-                false
-            });
-            while !asking.is_finished() {
-                match requests.next().unwrap() {
-                    Some(request) => request.answer(b"here".to_vec()).unwrap(),
-                    None => std::thread::yield_now(),
-                }
-            }
-            asking.join().unwrap()
-        })
-    }
-
-    /// As if a public authority had signed the certificate: the authority is trusted, but the name
-    /// is not the one of the run's processes.
-    #[test]
-    fn host_exchanges_no_message_with_a_learner_of_another_name() {
-        assert!(is_answered(COMMON_NAME));
-        assert!(!is_answered("learner.example.org"));
-    }
-
-    #[test]
-    fn certificates_of_the_users_file_are_kept() {
-        let file = zenoh_file("mine");
-        let endpoints = ["tls/127.0.0.1:7447".to_owned()];
-        let made = LinkConfig::new(LinkMode::Listen(&endpoints), TOKEN, Some(file.path())).unwrap();
-        assert!(!made.is_authenticated);
-        // Ours would not verify names.
-        let verify = made.config.get_json("transport/link/tls/verify_name_on_connect").unwrap();
-        assert_eq!(verify, "null");
-    }
 }
