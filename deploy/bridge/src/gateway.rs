@@ -19,13 +19,16 @@ use dmprl_shared::transport::shared_memory::{
 };
 use dmprl_shared::transport::{AcknowledgementSubscriber, ParameterSubscriber, TransportError};
 
+use super::handshake::Authenticator;
 use super::host_messages::HostStatus;
 use super::host_registry::{Host, HostRegistry};
 use super::join::JOIN;
-use super::link::{Link, Message, MessageReceiver, MessageSender, Presence, Requests};
+use super::keys::Key;
+use super::link::{Link, Message, MessageReceiver, Presence, Requests};
 use super::link_mode::{LinkMode, Urgency};
 use super::link_receiver::LinkReceiver;
 use super::policy_sender::PolicySender;
+use super::seal::{Opener, SealedSender};
 use super::wire::{self, LinkAck, RunState};
 
 /// Interval between two messages of acknowledgements while segments are acknowledged.
@@ -80,9 +83,13 @@ struct RemoteWorker {
     queue: Option<Sender>,
 }
 
-/// Outgoing messages to a host.
-struct HostSenders {
-    acks: MessageSender,
+/// The messages from and to a host.
+struct HostChannel {
+    /// Key of the handshake that opened this channel; `None` if its messages are not sealed.
+    session: Option<Key>,
+    segments: Opener,
+    status: Opener,
+    acks: SealedSender,
     /// Created when the host first reports its status. Before that it does not listen, and a
     /// policy would be lost.
     policies: Option<PolicySender>,
@@ -116,7 +123,7 @@ pub struct Gateway {
     plan: Plan,
     segments_max: usize,
     registry: HostRegistry,
-    senders: BTreeMap<u64, HostSenders>,
+    channels: BTreeMap<u64, HostChannel>,
     workers: BTreeMap<usize, RemoteWorker>,
     acknowledgements: AcknowledgementReader,
     acknowledged: Acknowledgements,
@@ -129,8 +136,9 @@ pub struct Gateway {
     acks_due: bool,
     acks_sent: Instant,
     attach_tried: Instant,
-    /// Messages that are damaged or come on an unknown channel.
+    /// Messages that are damaged or forged, or come on an unknown channel.
     rejected: u64,
+    authenticator: Authenticator,
     /// Rejected join requests. The first is reported to the user, then each power of two.
     refusals: u64,
     /// Last time that a host received a new channel from this gateway or its predecessor.
@@ -149,7 +157,7 @@ impl Gateway {
         let GatewaySettings { endpoints, domain, plan, first_worker, session, .. } = settings;
         let acknowledgements = hear(domain, &plan)?;
         let policies = subscribe(domain, &plan)?;
-        let link = Link::open(LinkMode::Listen(endpoints), settings.zenoh_file)?;
+        let link = Link::open(LinkMode::Listen(endpoints), &facts.token, settings.zenoh_file)?;
         let all = |what: &str| format!("dmprl/{}/{what}/*", facts.run_id);
         let places = u32::try_from(plan.worker_count - first_worker).context("too many places")?;
         let first_worker = u32::try_from(first_worker).context("too many workers")?;
@@ -165,7 +173,7 @@ impl Gateway {
             plan,
             segments_max: settings.segments_max,
             registry: HostRegistry::new(first_worker, places, session),
-            senders: BTreeMap::new(),
+            channels: BTreeMap::new(),
             workers: BTreeMap::new(),
             acknowledgements,
             acknowledged: Acknowledgements::default(),
@@ -176,6 +184,7 @@ impl Gateway {
             acks_sent: now,
             attach_tried: now,
             rejected: 0,
+            authenticator: Authenticator::new(&facts.token)?,
             refusals: 0,
             channels_changed: now,
             _presence: link.announce(format!("dmprl/{}/gateway/{id:016x}", facts.run_id))?,
@@ -256,16 +265,17 @@ impl Gateway {
     /// The session is closed.
     pub fn send_acks(&mut self, state: RunState) -> anyhow::Result<()> {
         for host in self.registry.hosts() {
-            let Some(senders) = self.senders.get(&host.channel).filter(|_| host.is_present) else {
+            let Some(channel) = self.channels.get_mut(&host.channel) else { continue };
+            if !host.is_present {
                 continue;
-            };
+            }
             let first = host.lease.first as usize;
             let ack = |index: u32| {
                 let worker = self.workers.get(&(first + index as usize));
                 worker.map(|worker| worker.receiver.ack()).unwrap_or_default()
             };
             let acks: Vec<_> = (0..host.workers).map(ack).collect();
-            senders.acks.send(wire::write_acks(state, &acks))?;
+            channel.acks.send(wire::write_acks(state, &acks))?;
         }
         Ok(())
     }
@@ -286,33 +296,36 @@ impl Gateway {
         Ok(())
     }
 
-    /// Rejected messages and segments: damaged, of unknown senders, or inconsistent.
+    /// Rejected messages and segments: damaged, forged, repeated, of unknown senders, inconsistent,
+    /// requests that are too large or too many, and connections without the token.
     #[must_use]
     pub fn rejected(&self) -> u64 {
         let segments = self.workers.values().map(|worker| worker.receiver.rejected());
-        self.rejected + segments.sum::<u64>()
+        let unproven = self.requests.dropped() + self.link.refused();
+        self.rejected + unproven + segments.sum::<u64>()
     }
 
     /// Passes the host's policy version to its policy sender, which sends the next one.
     fn confirm_policy(&mut self, channel: u64, version: u64) -> anyhow::Result<()> {
         let name = format!("dmprl/{}/policies/{channel:016x}", self.facts.run_id);
-        let Some(senders) = self.senders.get_mut(&channel) else { return Ok(()) };
-        let sender = match &senders.policies {
+        let Some(channel) = self.channels.get_mut(&channel) else { return Ok(()) };
+        let sender = match &channel.policies {
             Some(sender) => sender,
             None => {
-                let sender = PolicySender::start(self.link.sender(name, Urgency::Policies)?)?;
+                let sender = self.link.sender(name, Urgency::Policies)?;
+                let sender = SealedSender::new(sender, channel.session.as_ref(), "policies");
+                let sender = PolicySender::start(sender)?;
                 if let Some((version, message)) = &self.policy {
                     sender.offer(*version, message);
                 }
-                senders.policies.insert(sender)
+                channel.policies.insert(sender)
             }
         };
         sender.confirm(version);
         Ok(())
     }
 
-    /// Finds the sender by the channel in the message's name, which only this host and the gateway
-    /// know.
+    /// Finds the host by the channel in the message's name. The message may still be forged.
     fn host(&mut self, message: &Message) -> Option<&mut Host> {
         let channel = u64::from_str_radix(message.last_name(), 16).ok()?;
         self.registry.by_channel(channel)
@@ -334,10 +347,19 @@ impl Gateway {
             self.rejected += u64::from(!is_old);
             return;
         };
-        (host.last_heard, host.is_present) = (now, true);
         let places = host.lease.first as usize..(host.lease.first + host.workers) as usize;
-        let Self { workers, buffer, rejected, .. } = self;
-        let read = wire::read_batch(&message.bytes(), buffer, |range, segment| {
+        let channel = host.channel;
+        let Self { workers, buffer, rejected, channels, registry, .. } = self;
+        let bytes = message.bytes();
+        let opened = channels.get_mut(&channel).and_then(|channel| channel.segments.open(&bytes));
+        let Some(opened) = opened else {
+            *rejected += 1;
+            return;
+        };
+        if let Some(host) = registry.by_channel(channel) {
+            (host.last_heard, host.is_present) = (now, true);
+        }
+        let read = wire::read_batch(opened, buffer, |range, segment| {
             let index = Some(range.worker as usize).filter(|index| places.contains(index));
             match (index.and_then(|index| workers.get_mut(&index)), segment) {
                 (Some(worker), None) => worker.receiver.begin(range),
@@ -349,13 +371,17 @@ impl Gateway {
     }
 
     fn on_status(&mut self, message: &Message, now: Instant) -> anyhow::Result<()> {
-        let Ok(mut status) = serde_json::from_slice::<HostStatus>(&message.bytes()) else {
+        let Some(channel) = self.host(message).map(|host| host.channel) else { return Ok(()) };
+        let bytes = message.bytes();
+        let opener = self.channels.get_mut(&channel).map(|channel| &mut channel.status);
+        let opened = opener.and_then(|opener| opener.open(&bytes));
+        let read = opened.and_then(|bytes| serde_json::from_slice::<HostStatus>(bytes).ok());
+        let (Some(mut status), Some(host)) = (read, self.registry.by_channel(channel)) else {
             self.rejected += 1;
             return Ok(());
         };
-        let Some(host) = self.host(message) else { return Ok(()) };
         host.last_heard = now;
-        let (name, channel) = (host.name.clone(), host.channel);
+        let name = host.name.clone();
         if let Some(before) = &host.status {
             status.no_less_than(before);
         }
@@ -385,9 +411,9 @@ impl Gateway {
     /// Confirms the departure of a host and frees its places.
     fn release(&mut self, channel: u64, now: Instant) -> anyhow::Result<()> {
         let workers = self.registry.remove(channel).map_or(0, |host| host.workers);
-        if let Some(senders) = self.senders.remove(&channel) {
+        if let Some(mut channel) = self.channels.remove(&channel) {
             let none = vec![LinkAck::default(); workers as usize];
-            senders.acks.send(wire::write_acks(RunState::Left, &none))?;
+            channel.acks.send(wire::write_acks(RunState::Left, &none))?;
         }
         self.channels_changed = now;
         Ok(())
@@ -424,8 +450,8 @@ impl Gateway {
             Ok(true) => {
                 let version = self.snapshot.version;
                 let message = Arc::new(wire::write_snapshot(&self.snapshot));
-                let senders = self.senders.values();
-                for sender in senders.filter_map(|senders| senders.policies.as_ref()) {
+                let channels = self.channels.values();
+                for sender in channels.filter_map(|channel| channel.policies.as_ref()) {
                     sender.offer(version, &message);
                 }
                 self.policy = Some((version, message));

@@ -1,6 +1,7 @@
-//! JSON messages between a host and the gateway: joining, and the host's status.
+//! JSON messages between a host and the gateway: joining, which [`crate::handshake`] authenticates,
+//! and the host's status.
 
-use dmprl_control::{Greeting, WorkersNow};
+use dmprl_control::WorkersNow;
 use dmprl_shared::spec::EnvSpec;
 use dmprl_shared::transport::delivery::Sent;
 use serde::{Deserialize, Serialize};
@@ -9,16 +10,14 @@ use serde::{Deserialize, Serialize};
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct HostRequest {
-    /// Program and version of the host.
-    pub speaks: Greeting,
-    /// Token of the run.
-    pub token: String,
     /// Random number that identifies this start of `dmprl bridge`.
     pub host: u64,
     /// Name of the host, for display.
     pub name: String,
     /// Number of workers.
     pub workers: u32,
+    /// True if all messages must be sealed: the host's link is not authenticated itself.
+    pub sealed: bool,
     /// Previous places, if the host returns.
     #[serde(rename = "held")]
     pub lease: Option<Lease>,
@@ -34,10 +33,12 @@ pub struct Lease {
     pub session: u32,
 }
 
-/// Answer to a request to join.
+/// Answer to a message of the handshake.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case", deny_unknown_fields)]
 pub enum HostAnswer {
+    /// The challenge that a request to join must answer.
+    Challenge(String),
     /// The host is admitted.
     Welcome(Box<HostWelcome>),
     /// The host is rejected.
@@ -58,6 +59,8 @@ pub struct HostWelcome {
     pub channel: u64,
     /// Id of the gateway. Its successor does not know the channel.
     pub gateway: u64,
+    /// True if all messages are sealed. False only if both ends have an authenticated link.
+    pub sealed: bool,
     /// Places of the host.
     #[serde(rename = "held")]
     pub lease: Lease,

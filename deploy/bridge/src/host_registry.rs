@@ -250,11 +250,9 @@ impl HostRegistry {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use dmprl_control::Greeting;
 
     fn request(host: u64, workers: u32, lease: Option<Lease>) -> HostRequest {
-        let (speaks, token, name) = (Greeting::this(), String::new(), format!("host{host}"));
-        HostRequest { speaks, token, host, name, workers, lease }
+        HostRequest { host, name: format!("host{host}"), workers, sealed: true, lease }
     }
 
     #[test]

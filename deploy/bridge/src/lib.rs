@@ -10,22 +10,33 @@
 //! the learner has not acknowledged: `link_sender` at the relay, `link_receiver` at the gateway. So
 //! after any process has died, its predecessor in the chain retransmits. [`wire`] and
 //! [`host_messages`] define the messages, `congestion_window` limits the data in flight,
-//! `policy_sender` sends policies, [`join`] requests places, `host_registry` leases them, and
-//! `link` is the only file that names Zenoh; a build without the feature `zenoh` has
-//! `link_absent` in its place.
+//! `policy_sender` sends policies, [`join`] requests places, and `host_registry` leases them.
+//!
+//! `keys` derives keys from the run's token, [`handshake`] authenticates both ends of a host, and
+//! `seal` all their later messages. `link` and `link_config` are the only files that name Zenoh; a
+//! build without the feature `zenoh` has `link_absent` in their place.
 
 mod congestion_window;
 pub mod gateway;
+pub mod handshake;
 pub mod host_messages;
 mod host_registry;
 pub mod join;
+pub mod keys;
 #[cfg_attr(not(feature = "zenoh"), path = "link_absent.rs")]
 mod link;
+#[cfg(feature = "zenoh")]
+mod link_config;
 mod link_mode;
 mod link_receiver;
 mod link_sender;
 mod policy_sender;
 pub mod relay;
+pub mod seal;
+#[cfg(feature = "zenoh")]
+mod tls_identity;
+#[cfg(feature = "zenoh")]
+mod tls_tunnel;
 pub mod token;
 pub mod wire;
 

@@ -1,4 +1,4 @@
-//! The only module that uses Zenoh: a session between hosts and its messages.
+//! A session of Zenoh between hosts, and its messages.
 //!
 //! Endpoints are explicit and scouting is off, so hosts never find each other by accident. A
 //! session reconnects automatically as long as it lives. While both ends are connected, messages
@@ -6,40 +6,40 @@
 //! by sequence numbers.
 
 use std::path::Path;
-use std::time::Duration;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicU64, Ordering};
+use std::sync::mpsc::{Receiver, TryRecvError, sync_channel};
+use std::time::{Duration, Instant};
 
-use anyhow::{Context, anyhow};
-use dmprl_run::failure::wrong_use;
+use anyhow::{Context, anyhow, bail};
 use zenoh::handlers::{FifoChannel, FifoChannelHandler};
 use zenoh::liveliness::LivelinessToken;
 use zenoh::pubsub::{Publisher, Subscriber};
 use zenoh::qos::{CongestionControl, Priority};
-use zenoh::query::{Query, Queryable};
+use zenoh::query::{ConsolidationMode, Query, Queryable};
 use zenoh::sample::{Sample, SampleKind};
-use zenoh::{Config, Session, Wait};
+use zenoh::{Session, Wait};
 
+use crate::link_config::LinkConfig;
+use crate::tls_tunnel::TlsTunnel;
 use crate::{LinkMode, Urgency};
 
 /// Capacity of a queue of received messages. If it is full, the link is not read and its sender
 /// blocks.
 const WAITING_MAX: usize = 256;
-/// Time without any message after which a peer counts as gone \[ms\]. It sends several keep-alives
-/// within this time.
-const LEASE_MS: u64 = 4_000;
-/// Initial and maximum interval between attempts to connect \[ms\].
-const RETRY_FIRST_MS: u64 = 250;
-const RETRY_MAX_MS: u64 = 2_000;
-/// Maximum size of a message to a host, which may be a policy \[bytes\].
-const POLICY_BYTES_MAX: usize = 256 << 20;
-/// Maximum size of a message to the learner's host \[bytes\]: a few hundred KiB of segments, or one
-/// longer segment.
-const BATCH_BYTES_MAX: usize = 16 << 20;
-/// Maximum number of sessions with the learner's host.
-const SESSIONS_MAX: usize = 256;
+/// Maximum number of requests that wait for the gateway, and their maximum size \[bytes\]. Further
+/// and larger ones are dropped and counted: 256 KiB for all.
+const REQUESTS_WAITING_MAX: usize = 64;
+const REQUEST_BYTES_MAX: usize = 4_096;
 
 /// An open session.
 #[derive(Debug)]
-pub struct Link(Session);
+pub struct Link {
+    session: Session,
+    is_authenticated: bool,
+    /// Dropped after the session is closed.
+    tunnel: Option<TlsTunnel>,
+}
 
 /// Sends messages under one name.
 #[derive(Debug)]
@@ -55,7 +55,11 @@ pub struct Message(Sample);
 
 /// Receives requests under a name.
 #[derive(Debug)]
-pub struct Requests(Queryable<FifoChannelHandler<Query>>);
+pub struct Requests {
+    waiting: Receiver<Query>,
+    dropped: Arc<AtomicU64>,
+    _queryable: Queryable<()>,
+}
 
 /// A request that has not been answered yet.
 #[derive(Debug)]
@@ -71,54 +75,34 @@ fn failed(what: impl std::fmt::Display) -> impl FnOnce(zenoh::Error) -> anyhow::
     move |error| anyhow!("{what}: {error}")
 }
 
-fn config(mode: LinkMode<'_>, zenoh_file: Option<&Path>) -> anyhow::Result<Config> {
-    let mut config = match zenoh_file {
-        None => Config::default(),
-        Some(path) => Config::from_file(path).map_err(|error| {
-            wrong_use(format!("{}: not a configuration of Zenoh: {error}", path.display()))
-        })?,
-    };
-    let endpoints = |endpoints: &[String]| serde_json::to_string(endpoints);
-    let (listen, connect, bytes_max) = match mode {
-        LinkMode::Listen(at) => (endpoints(at)?, endpoints(&[])?, BATCH_BYTES_MAX),
-        LinkMode::Connect(to) => (endpoints(&[])?, endpoints(&[to.to_owned()])?, POLICY_BYTES_MAX),
-    };
-    let retry = format!(
-        "{{period_init_ms: {RETRY_FIRST_MS}, period_max_ms: {RETRY_MAX_MS}, \
-         period_increase_factor: 2}}"
-    );
-    for (key, value) in [
-        ("mode", "\"peer\"".to_owned()),
-        ("listen/endpoints", listen),
-        ("connect/endpoints", connect),
-        ("connect/exit_on_failure", "false".to_owned()),
-        // Zenoh retries forever in the background (-1); callers have their own limit.
-        ("connect/timeout_ms", "-1".to_owned()),
-        ("connect/retry", retry),
-        ("scouting/multicast/enabled", "false".to_owned()),
-        ("scouting/gossip/enabled", "false".to_owned()),
-        ("transport/link/tx/lease", LEASE_MS.to_string()),
-        ("transport/link/rx/max_message_size", bytes_max.to_string()),
-        ("transport/unicast/max_sessions", SESSIONS_MAX.to_string()),
-    ] {
-        config
-            .insert_json5(key, &value)
-            .map_err(failed(format!("cannot set {key} of Zenoh to {value}")))?;
-    }
-    Ok(config)
-}
-
 impl Link {
-    /// Opens a session. A connecting end need not reach its peer yet; a listening end must succeed.
+    /// Opens a session with ends that know the same token. A connecting end need not reach its peer
+    /// yet; a listening end must succeed.
     ///
     /// # Errors
     /// Wrong use: the file is no configuration of Zenoh. Cannot listen on an endpoint.
-    pub fn open(mode: LinkMode<'_>, zenoh_file: Option<&Path>) -> anyhow::Result<Self> {
-        let what = match mode {
-            LinkMode::Listen(at) => format!("cannot listen at {}", at.join(", ")),
-            LinkMode::Connect(to) => format!("cannot connect to {to}"),
-        };
-        zenoh::open(config(mode, zenoh_file)?).wait().map(Self).map_err(failed(what))
+    pub fn open(
+        mode: LinkMode<'_>,
+        token: &str,
+        zenoh_file: Option<&Path>,
+    ) -> anyhow::Result<Self> {
+        let configured = LinkConfig::new(mode, token, zenoh_file)?;
+        let LinkConfig { config, is_authenticated, tunnel, passwords } = configured;
+        let session = zenoh::open(config).wait().map_err(failed(mode))?;
+        drop(passwords);
+        Ok(Self { session, is_authenticated, tunnel })
+    }
+
+    /// Number of connections that were refused because they did not prove that they know the token.
+    #[must_use]
+    pub fn refused(&self) -> u64 {
+        self.tunnel.as_ref().map_or(0, TlsTunnel::refused)
+    }
+
+    /// True if every peer of this session has a certificate of the run's authority.
+    #[must_use]
+    pub fn is_authenticated(&self) -> bool {
+        self.is_authenticated
     }
 
     /// Declares that messages of this name will be sent. On a full link the sender blocks.
@@ -133,7 +117,7 @@ impl Link {
         };
         let what = failed(format!("cannot send {name}"));
         let publisher = self
-            .0
+            .session
             .declare_publisher(name)
             .congestion_control(CongestionControl::Block)
             .priority(priority)
@@ -147,36 +131,55 @@ impl Link {
     /// The session is closed.
     pub fn receiver(&self, name: &str) -> anyhow::Result<MessageReceiver> {
         let channel = FifoChannel::new(WAITING_MAX);
-        let subscriber = self.0.declare_subscriber(name.to_owned()).with(channel).wait();
+        let subscriber = self.session.declare_subscriber(name.to_owned()).with(channel).wait();
         subscriber.map(MessageReceiver).map_err(failed(format!("cannot receive {name}")))
     }
 
-    /// Declares that requests of this name will be answered.
+    /// Declares that requests of this name will be answered. Requests that are too large, or too
+    /// many at once, are dropped and counted.
     ///
     /// # Errors
     /// The session is closed.
     pub fn requests(&self, name: &str) -> anyhow::Result<Requests> {
-        let channel = FifoChannel::new(WAITING_MAX);
-        let queryable = self.0.declare_queryable(name.to_owned()).with(channel).wait();
-        queryable.map(Requests).map_err(failed(format!("cannot answer {name}")))
+        let (queue, waiting) = sync_channel(REQUESTS_WAITING_MAX);
+        let dropped = Arc::new(AtomicU64::new(0));
+        let counted = Arc::clone(&dropped);
+        let receive = move |query: Query| {
+            let fits = query.payload().is_none_or(|payload| payload.len() <= REQUEST_BYTES_MAX);
+            if !fits || queue.try_send(query).is_err() {
+                counted.fetch_add(1, Ordering::Relaxed);
+            }
+        };
+        let queryable = self.session.declare_queryable(name.to_owned()).callback(receive).wait();
+        let queryable = queryable.map_err(failed(format!("cannot answer {name}")))?;
+        Ok(Requests { waiting, dropped, _queryable: queryable })
     }
 
-    /// Sends a request and waits for the answer, up to `limit`; `None` if no peer answers.
+    /// Sends a request and passes the answers to `accept` until it takes one, up to `limit`. `None`
+    /// if it takes none.
     ///
     /// # Errors
     /// The session is closed.
-    pub fn request(
+    pub fn request<T>(
         &self,
         name: &str,
         payload: Vec<u8>,
         limit: Duration,
-    ) -> anyhow::Result<Option<Vec<u8>>> {
-        let sent = self.0.get(name).payload(payload).timeout(limit).wait();
+        mut accept: impl FnMut(&[u8]) -> Option<T>,
+    ) -> anyhow::Result<Option<T>> {
+        // Otherwise Zenoh would pass on only one of several answers.
+        let request = self.session.get(name).consolidation(ConsolidationMode::None);
+        let sent = request.payload(payload).timeout(limit).wait();
         let answers = sent.map_err(failed(format!("cannot request {name}")))?;
         // A safeguard: Zenoh normally applies its own limit.
-        let answer = answers.recv_timeout(limit * 2);
-        let Ok(Some(reply)) = answer else { return Ok(None) };
-        Ok(reply.into_result().ok().map(|sample| sample.payload().to_bytes().into_owned()))
+        let deadline = Instant::now() + limit * 2;
+        while let Ok(Some(reply)) = answers.recv_deadline(deadline) {
+            let Ok(sample) = reply.into_result() else { continue };
+            if let Some(taken) = accept(&sample.payload().to_bytes()) {
+                return Ok(Some(taken));
+            }
+        }
+        Ok(None)
     }
 
     /// Announces to the peers that this end is alive.
@@ -185,7 +188,7 @@ impl Link {
     /// The session is closed.
     pub fn announce(&self, name: String) -> anyhow::Result<Presence> {
         let what = failed(format!("cannot announce {name}"));
-        self.0.liveliness().declare_token(name).wait().map(Presence).map_err(what)
+        self.session.liveliness().declare_token(name).wait().map(Presence).map_err(what)
     }
 
     /// Subscribes to the arrival and departure of other ends, including those already present.
@@ -194,7 +197,7 @@ impl Link {
     /// The session is closed.
     pub fn presences(&self, name: &str) -> anyhow::Result<MessageReceiver> {
         let channel = FifoChannel::new(WAITING_MAX);
-        let liveliness = self.0.liveliness();
+        let liveliness = self.session.liveliness();
         let subscriber =
             liveliness.declare_subscriber(name.to_owned()).history(true).with(channel).wait();
         subscriber.map(MessageReceiver).map_err(failed(format!("cannot watch {name}")))
@@ -249,8 +252,17 @@ impl Requests {
     /// # Errors
     /// The session is closed.
     pub fn next(&self) -> anyhow::Result<Option<Request>> {
-        let next = self.0.try_recv().map_err(|error| anyhow!("{error}"));
-        Ok(next.context("cannot receive requests")?.map(Request))
+        match self.waiting.try_recv() {
+            Ok(query) => Ok(Some(Request(query))),
+            Err(TryRecvError::Empty) => Ok(None),
+            Err(TryRecvError::Disconnected) => bail!("cannot receive requests"),
+        }
+    }
+
+    /// Number of requests that were dropped: too large, or too many at once.
+    #[must_use]
+    pub fn dropped(&self) -> u64 {
+        self.dropped.load(Ordering::Relaxed)
     }
 }
 
@@ -274,6 +286,6 @@ impl Request {
 impl Drop for Link {
     fn drop(&mut self) {
         // Flushes pending messages; a broken link does not block it.
-        let _ = self.0.close().wait();
+        let _ = self.session.close().wait();
     }
 }

@@ -40,8 +40,24 @@ impl Link {
     ///
     /// # Errors
     /// Always: [`crate::check_available`].
-    pub fn open(_mode: LinkMode<'_>, _zenoh_file: Option<&Path>) -> anyhow::Result<Self> {
+    pub fn open(
+        _mode: LinkMode<'_>,
+        _token: &str,
+        _zenoh_file: Option<&Path>,
+    ) -> anyhow::Result<Self> {
         Err(crate::check_available().err().unwrap_or_else(|| anyhow::anyhow!("no link")))
+    }
+
+    /// Never called.
+    #[must_use]
+    pub fn refused(&self) -> u64 {
+        match self.0 {}
+    }
+
+    /// Never called.
+    #[must_use]
+    pub fn is_authenticated(&self) -> bool {
+        match self.0 {}
     }
 
     /// Never called.
@@ -72,12 +88,13 @@ impl Link {
     ///
     /// # Errors
     /// Never.
-    pub fn request(
+    pub fn request<T>(
         &self,
         _name: &str,
         _payload: Vec<u8>,
         _limit: Duration,
-    ) -> anyhow::Result<Option<Vec<u8>>> {
+        _accept: impl FnMut(&[u8]) -> Option<T>,
+    ) -> anyhow::Result<Option<T>> {
         match self.0 {}
     }
 
@@ -144,6 +161,12 @@ impl Requests {
     /// # Errors
     /// Never.
     pub fn next(&self) -> anyhow::Result<Option<Request>> {
+        match self.0 {}
+    }
+
+    /// Never called.
+    #[must_use]
+    pub fn dropped(&self) -> u64 {
         match self.0 {}
     }
 }

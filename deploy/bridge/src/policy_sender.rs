@@ -9,7 +9,7 @@ use std::time::{Duration, Instant};
 
 use anyhow::Context;
 
-use super::link::MessageSender;
+use super::seal::SealedSender;
 
 /// Time after which an unconfirmed policy counts as lost with its link, and is sent again.
 const CONFIRMED_WITHIN: Duration = Duration::from_secs(2);
@@ -45,12 +45,12 @@ impl PolicySender {
     ///
     /// # Errors
     /// The system cannot start a thread.
-    pub fn start(sender: MessageSender) -> anyhow::Result<Self> {
+    pub fn start(mut sender: SealedSender) -> anyhow::Result<Self> {
         let shared = Arc::new(Shared::default());
         let of_thread = Arc::clone(&shared);
         let thread = thread::Builder::new().name("policies".into());
         thread
-            .spawn(move || send_policies(&of_thread, &sender))
+            .spawn(move || send_policies(&of_thread, &mut sender))
             .context("cannot start a thread")?;
         Ok(Self(shared))
     }
@@ -75,7 +75,7 @@ impl Drop for PolicySender {
     }
 }
 
-fn send_policies(shared: &Shared, sender: &MessageSender) {
+fn send_policies(shared: &Shared, sender: &mut SealedSender) {
     let mut state = shared.lock();
     while !state.closed {
         match state.due(Instant::now()) {

@@ -4,6 +4,8 @@
 //! workers' queues and cause back-pressure. It retains the segments in flight until the learner has
 //! acknowledged them. A worker receives an acknowledgement only after the learner has given it.
 
+mod channel;
+
 use std::path::Path;
 use std::thread;
 use std::time::{Duration, Instant};
@@ -15,11 +17,12 @@ use dmprl_shared::transport::delivery::{Sent, Watermark};
 use dmprl_shared::transport::shared_memory::{LearnerEnd, Plan, serve};
 use dmprl_shared::transport::{AcknowledgementPublisher, ParameterPublisher, SegmentReceiver};
 
+use self::channel::Channel;
 use super::congestion_window::CongestionWindow;
-use super::host_messages::{HostStatus, HostWelcome, Lease};
+use super::host_messages::{HostStatus, Lease};
 use super::join::{JoinOutcome, JoinSettings, request_join};
-use super::link::{Link, MessageReceiver, MessageSender, Presence};
-use super::link_mode::{LinkMode, Urgency};
+use super::link::Link;
+use super::link_mode::LinkMode;
 use super::link_sender::LinkSender;
 use super::wire::{self, Batch, RunState};
 
@@ -50,43 +53,6 @@ pub struct HostCounts {
     pub env_failures: u64,
     /// State of its workers.
     pub workers: WorkersNow,
-}
-
-/// The messages between this host and the gateway that admitted it.
-struct Channel {
-    segments: MessageSender,
-    status: MessageSender,
-    acks: MessageReceiver,
-    policies: MessageReceiver,
-    /// Arrival and departure of gateways, and the id of the gateway that opened this channel.
-    gateways: MessageReceiver,
-    gateway: u64,
-    _presence: Presence,
-}
-
-impl Channel {
-    fn open(link: &Link, welcome: &HostWelcome) -> anyhow::Result<Self> {
-        let name = |what: &str| format!("dmprl/{}/{what}/{:016x}", welcome.run_id, welcome.channel);
-        Ok(Self {
-            gateways: link.presences(&format!("dmprl/{}/gateway/*", welcome.run_id))?,
-            gateway: welcome.gateway,
-            acks: link.receiver(&name("hearings"))?,
-            policies: link.receiver(&name("policies"))?,
-            segments: link.sender(name("segments"), Urgency::Segments)?,
-            status: link.sender(name("status"), Urgency::First)?,
-            _presence: link.announce(name("hosts"))?,
-        })
-    }
-
-    /// Returns true if the gateway that opened the channel is gone, or another has appeared.
-    fn is_in_doubt(&self) -> anyhow::Result<bool> {
-        let mut doubt = false;
-        while let Some(message) = self.gateways.next()? {
-            let ours = u64::from_str_radix(message.last_name(), 16) == Ok(self.gateway);
-            doubt |= ours != message.is_arrival();
-        }
-        Ok(doubt)
-    }
 }
 
 /// Where a relay connects and which workers it serves.
@@ -154,7 +120,7 @@ pub struct Relay {
     status_due: bool,
     /// Time since which the learner's host does not answer, and the reason.
     away: Option<(Instant, String)>,
-    /// Messages that could not be read.
+    /// Messages that were damaged, forged or repeated.
     damaged: u64,
 }
 
@@ -165,7 +131,7 @@ impl Relay {
     /// The session or the shared memory cannot be opened.
     pub fn start(settings: RelaySettings<'_>) -> anyhow::Result<Self> {
         let RelaySettings { join, lease, zenoh_file, domain, plan, .. } = settings;
-        let link = Link::open(LinkMode::Connect(&join.endpoint), zenoh_file)?;
+        let link = Link::open(LinkMode::Connect(&join.endpoint), &join.token, zenoh_file)?;
         let learner_end = serve(domain, plan)?;
         let workers = lease.first..lease.first + join.workers;
         let senders =
@@ -246,7 +212,7 @@ impl Relay {
         self.away.as_ref()
     }
 
-    /// Number of damaged messages and invalid segments.
+    /// Number of damaged or forged messages and invalid segments.
     #[must_use]
     pub fn damaged(&self) -> u64 {
         self.damaged + self.senders.iter().map(LinkSender::rejected).sum::<u64>()
@@ -317,18 +283,23 @@ impl Relay {
         let outcome = request_join(&self.link, &self.join, Some(self.lease))?;
         self.join_requested = Some(Instant::now());
         match outcome {
-            JoinOutcome::Welcome(welcome) => {
+            JoinOutcome::Welcome(admission) => {
+                let welcome = &admission.welcome;
                 ensure!(
                     welcome.lease == self.lease,
                     "expected the places {:?} of its workers, got {:?}: start the bridge again",
                     self.lease,
                     welcome.lease
                 );
-                self.channel = Some(Channel::open(&self.link, &welcome)?);
+                self.channel = Some(Channel::open(&self.link, &admission)?);
                 self.senders.iter_mut().for_each(LinkSender::begin_retransmit);
                 self.last_heard = Instant::now();
                 // The first status message tells the gateway that this host listens.
                 (self.away, self.in_doubt, self.status_due) = (None, false, true);
+            }
+            JoinOutcome::Silent => {
+                let reason = format!("no learner's host answers at {}", self.join.endpoint);
+                self.set_away(now, reason);
             }
             JoinOutcome::Later(reason) => self.set_away(now, reason),
             JoinOutcome::Refused(reason) => bail!("the learner's host refuses: {reason}"),
@@ -343,11 +314,11 @@ impl Relay {
     }
 
     fn read_acks(&mut self, now: Instant) -> anyhow::Result<RunState> {
-        let Some(channel) = &self.channel else { return Ok(RunState::Running) };
+        let Some(channel) = &mut self.channel else { return Ok(RunState::Running) };
         let mut state = RunState::Running;
-        while let Some(message) = channel.acks.next()? {
-            let (newest, acks) = match wire::read_acks(&message.bytes()) {
-                Ok(read) if read.1.len() == self.senders.len() => read,
+        while let Some(read) = channel.acks.next(|bytes| wire::read_acks(bytes?).ok())? {
+            let (newest, acks) = match read {
+                Some(read) if read.1.len() == self.senders.len() => read,
                 _ => {
                     self.damaged += 1;
                     continue;
@@ -376,11 +347,11 @@ impl Relay {
 
     /// Takes segments from the workers in turn while there is room, and sends them.
     fn send_segments(&mut self, now: Instant) -> anyhow::Result<bool> {
-        let Some(channel) = &self.channel else { return Ok(false) };
         // Allows at least one segment of any size in flight; otherwise the run would stop.
         let window = (self.window.bytes() / self.segment_bytes).max(1);
         let together = (TURN_BYTES / self.segment_bytes).max(1);
         let room = window.saturating_sub(self.in_flight()).min(together);
+        let Some(channel) = &mut self.channel else { return Ok(false) };
         let mut room = usize::try_from(room).unwrap_or(0);
         let count = self.senders.len();
         let mut sent = false;
@@ -411,19 +382,17 @@ impl Relay {
     }
 
     fn take_policy(&mut self) -> anyhow::Result<()> {
-        let Some(channel) = &self.channel else { return Ok(()) };
+        let Some(channel) = &mut self.channel else { return Ok(()) };
         let mut newest = None;
-        while let Some(message) = channel.policies.next()? {
-            newest = Some(message);
-        }
-        let Some(message) = newest else { return Ok(()) };
-        let snapshot = match wire::read_snapshot(&message.bytes()) {
-            Ok(snapshot) if snapshot.architecture_hash == self.architecture_hash => snapshot,
-            _ => {
-                self.damaged += 1;
-                return Ok(());
+        while let Some(read) = channel.policies.next(|bytes| wire::read_snapshot(bytes?).ok())? {
+            match read {
+                Some(snapshot) if snapshot.architecture_hash == self.architecture_hash => {
+                    newest = Some(snapshot);
+                }
+                _ => self.damaged += 1,
             }
-        };
+        }
+        let Some(snapshot) = newest else { return Ok(()) };
         if snapshot.version > self.version {
             self.learner_end.parameters.publish(&snapshot)?;
             (self.version, self.env_steps) = (snapshot.version, snapshot.env_steps);
@@ -440,7 +409,7 @@ impl Relay {
     }
 
     fn send_status(&mut self, counts: &HostCounts, leaves: bool) -> anyhow::Result<()> {
-        let Some(channel) = &self.channel else { return Ok(()) };
+        let Some(channel) = &mut self.channel else { return Ok(()) };
         // After the segments: otherwise some would seem to be missing.
         self.senders.iter().for_each(|sender| sender.report_progress(&mut self.batch));
         if !self.batch.is_empty() {

@@ -1,9 +1,8 @@
-//! The run's token, a secret that other hosts need.
+//! The run's token, a secret that other hosts need. It is never sent: [`crate::keys`].
 
 use std::path::Path;
 
 use dmprl_run::secret_file;
-use subtle::ConstantTimeEq;
 
 const REMEDY: &str = "copy bridge.token of the run's directory from the learner's host";
 
@@ -22,22 +21,4 @@ pub fn ensure(path: &Path) -> anyhow::Result<String> {
 /// long.
 pub fn read(path: &Path) -> anyhow::Result<String> {
     secret_file::read(path, REMEDY)
-}
-
-/// Compares two secrets in constant time, so that the time does not reveal where they differ.
-#[must_use]
-pub fn equal(one: &str, other: &str) -> bool {
-    one.as_bytes().ct_eq(other.as_bytes()).into()
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn only_the_same_token_is_equal() {
-        let token = "0123456789abcdef";
-        assert!(equal(token, token));
-        assert!(!equal(token, &token[1..]) && !equal(token, &token.replace('0', "x")));
-    }
 }

@@ -12,6 +12,8 @@ use dmprl_shared::segment::{Segment, SegmentHeader};
 use dmprl_shared::transport::delivery::Watermark;
 use thiserror::Error;
 
+use crate::seal::SEAL_BYTES;
+
 /// First four bytes of every message, which also reveal a different byte order.
 const MAGIC: u32 = 0x4442_524d;
 const HEADER_BYTES: usize = size_of::<SegmentHeader>();
@@ -175,7 +177,8 @@ impl Batch {
         let count = u32::try_from(self.ranges.len()).unwrap_or(u32::MAX);
         let head = Head { magic: MAGIC, count, checksum: hasher.finalize(), run_state: 0 };
         let table = size_of_val(self.ranges.as_slice());
-        let mut message = Vec::with_capacity(size_of::<Head>() + table + self.body.len());
+        let len = size_of::<Head>() + table + self.body.len();
+        let mut message = Vec::with_capacity(len + SEAL_BYTES);
         message.extend_from_slice(bytemuck::bytes_of(&head));
         message.extend_from_slice(bytemuck::cast_slice(&self.ranges));
         message.extend_from_slice(&self.body);

@@ -40,13 +40,19 @@ struct Provenance {
     tag: String,
 }
 
+/// Argument of an environment that cannot name code.
+const HARMLESS_ARGUMENT: &str = "max_episode_steps";
+
 /// Code that the environments of a configuration import, beyond dmprl and registered Gymnasium ids.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct NamedCode {
-    /// Module of `task.id`.
-    pub module: Option<String>,
+    /// Modules of `task.id` and `task.wrappers`.
+    pub modules: Vec<String>,
     /// `task.python_path`.
     pub folders: Vec<PathBuf>,
+    /// `task.kwargs`, as TOML values by name. Some environments import a module or read a file that
+    /// an argument names.
+    pub arguments: Vec<String>,
 }
 
 impl NamedCode {
@@ -54,11 +60,17 @@ impl NamedCode {
     /// task.
     #[must_use]
     pub fn of(config: &ExperimentConfig) -> Option<Self> {
-        let TaskConfig { id, python_path, .. } = &config.task;
-        let module = id.rsplit_once(':').map(|(module, _)| module.to_owned());
-        let module = module.filter(|module| module != OWN_MODULE);
-        let folders = python_path.iter().map(PathBuf::from).collect::<Vec<_>>();
-        (module.is_some() || !folders.is_empty()).then_some(Self { module, folders })
+        let TaskConfig { python_path, kwargs, .. } = &config.task;
+        let modules = config.task.imports().into_iter().filter(|module| *module != OWN_MODULE);
+        let arguments = kwargs.iter().filter(|(name, _)| *name != HARMLESS_ARGUMENT);
+        let code = Self {
+            modules: modules.map(str::to_owned).collect(),
+            folders: python_path.iter().map(PathBuf::from).collect(),
+            arguments: arguments.map(|(name, value)| format!("{name} = {value}")).collect(),
+        };
+        let is_empty =
+            code.modules.is_empty() && code.folders.is_empty() && code.arguments.is_empty();
+        (!is_empty).then_some(code)
     }
 }
 
@@ -109,7 +121,8 @@ impl RunDirectory {
         let mut hash = Hmac::<Sha256>::new_from_slice(key.as_bytes()).context("unusable key")?;
         let TaskConfig { id, python_path, .. } = &config.task;
         let run_id = self.manifest()?.run_id;
-        let fields = ["dmprl provenance 1", &run_id, id];
+        let options = config.task.options_toml();
+        let fields = ["dmprl provenance 1", &run_id, id, &options];
         // With its length before each field, so that no two lists have the same bytes.
         for field in fields.into_iter().chain(python_path.iter().map(String::as_str)) {
             hash.update(&(field.len() as u64).to_le_bytes());
@@ -149,11 +162,19 @@ mod tests {
             assert_eq!(NamedCode::of(&config(id, &[])), None, "{id}");
         }
         let named = |id: &str, path: &[&str]| NamedCode::of(&config(id, path)).unwrap();
-        assert_eq!(named("os:abort", &[]).module.as_deref(), Some("os"));
-        assert_eq!(named("dmprl.play:main", &[]).module.as_deref(), Some("dmprl.play"));
-        assert_eq!(named("a.b:c/D-v0", &["/x"]).module.as_deref(), Some("a.b"));
+        assert_eq!(named("os:abort", &[]).modules, ["os"]);
+        assert_eq!(named("dmprl.play:main", &[]).modules, ["dmprl.play"]);
+        assert_eq!(named("a.b:c/D-v0", &["/x"]).modules, ["a.b"]);
         // A package may import an optional one that only this folder has.
         assert_eq!(named("Reacher-v5", &["/x"]).folders, [Path::new("/x")]);
+        let mut wrapped = config("Reacher-v5", &[]);
+        wrapped.task.wrappers = vec!["evil:Wrapper".to_owned()];
+        assert_eq!(NamedCode::of(&wrapped).unwrap().modules, ["evil"]);
+        let mut argued = config("GymV26Environment-v0", &[]);
+        argued.task.kwargs.insert("max_episode_steps".to_owned(), 50.into());
+        assert_eq!(NamedCode::of(&argued), None);
+        argued.task.kwargs.insert("env_id".to_owned(), "evil:Env-v0".into());
+        assert_eq!(NamedCode::of(&argued).unwrap().arguments, ["env_id = \"evil:Env-v0\""]);
     }
 
     #[test]
@@ -169,7 +190,10 @@ mod tests {
         assert!(!run.is_marked(&key, &named).unwrap(), "nothing is there yet");
         run.mark(&key, &named).unwrap();
         assert!(run.is_marked(&key, &named).unwrap());
+        let mut wrapped = named.clone();
+        wrapped.task.wrappers = vec!["evil:Wrapper".to_owned()];
         for changed in [
+            wrapped,
             config("evil:Arm-v0", &["/home/me/envs"]),
             config("arm:Arm-v0", &["/tmp/evil"]),
             config("arm:Arm-v0", &["/home/me/envs", "/tmp/evil"]),

@@ -221,16 +221,19 @@ impl ActorsConfig {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct BridgeConfig {
-    /// Zenoh endpoints on which the run accepts other hosts, such as `tcp/0.0.0.0:7447` or
+    /// Zenoh endpoints on which the run accepts other hosts, such as `tls/0.0.0.0:7447` or
     /// `tls/[::]:7447`; empty: the run accepts no other host.
     pub listen: Vec<String>,
+    /// Whether `bridge.listen` may contain `tcp/` endpoints beyond loopback. Their messages are
+    /// authenticated, but others on the network can read them.
+    pub allow_plain: bool,
     /// Maximum number of workers on all other hosts together. Their queues are reserved at the
     /// start of the run.
     pub workers_max: usize,
     /// Maximum amount of unacknowledged data per host \[bytes\]. At the limit, the host's workers
     /// wait. A limit below the link's rate times its round-trip time leaves the link partly idle.
     pub under_way_bytes_max: u64,
-    /// File with the secret that other hosts must present. Only its owner may have access to it.
+    /// File with the secret that other hosts must know. Only its owner may have access to it.
     /// Empty: `bridge.token`, which is created in the run's directory.
     pub token_file: String,
     /// Zenoh configuration file (JSON5), for certificates and access control; empty: none.
@@ -241,6 +244,7 @@ impl Default for BridgeConfig {
     fn default() -> Self {
         Self {
             listen: Vec::new(),
+            allow_plain: false,
             workers_max: 16,
             under_way_bytes_max: 64 << 20,
             token_file: String::new(),

@@ -7,6 +7,7 @@
 
 mod algorithm;
 mod dmp;
+pub mod endpoint;
 mod experiment;
 mod layers;
 mod presets;

@@ -1,5 +1,6 @@
 //! Checks the merged configuration: ranges, combinations and limits.
 
+use super::endpoint::{is_endpoint, is_plain};
 use super::{
     AlgorithmName, ConfigError, Controller, CriticInput, DeliveryLevel, ExperimentConfig,
     PolicyKind, Start, WarmUpKind, Windows,
@@ -87,11 +88,13 @@ impl ExperimentConfig {
 
     fn check_bridge(&self) -> Result<(), ConfigError> {
         for endpoint in &self.bridge.listen {
-            let known = endpoint.split_once('/').is_some_and(|(protocol, address)| {
-                ["tcp", "tls"].contains(&protocol) && address.contains(':')
-            });
-            range("bridge.listen", endpoint, known, || {
-                "tcp/ADDRESS:PORT or tls/ADDRESS:PORT, such as tcp/0.0.0.0:7447".into()
+            range("bridge.listen", endpoint, is_endpoint(endpoint), || {
+                "tls/ADDRESS:PORT or tcp/ADDRESS:PORT, such as tls/0.0.0.0:7447".into()
+            })?;
+            let allowed = self.bridge.allow_plain || !is_plain(endpoint);
+            range("bridge.listen", endpoint, allowed, || {
+                let encrypted = endpoint.replacen("tcp/", "tls/", 1);
+                format!("{encrypted}, which needs no certificates, or bridge.allow_plain = true")
             })?;
         }
         let (key, got) = ("bridge.under_way_bytes_max", self.bridge.under_way_bytes_max);

@@ -108,13 +108,13 @@ fn learner_is_on_the_first_node_and_workers_are_on_the_others() {
     job.until_called(3);
     job.learner_ends("0");
     assert_eq!(script.wait().unwrap().code(), Some(0));
-    let bridge = "dmprl bridge --connect tcp/first:10007 --token-file runs/slurm-7/bridge.token \
+    let bridge = "dmprl bridge --connect tls/first:10007 --token-file runs/slurm-7/bridge.token \
                   --workers 8 --run-dir /tmp/dmprl-7-0";
     let calls = job.calls();
     assert_eq!(
         calls[0],
         "dmprl train reacher --steps 5 --run-dir runs/slurm-7 --workers 1 --no-progress \
-         --set bridge.listen=[\"tcp/0.0.0.0:10007\"] --set bridge.workers_max=16"
+         --set bridge.listen=[\"tls/0.0.0.0:10007\"] --set bridge.workers_max=16"
     );
     assert!(calls[1].starts_with("srun --relative=1 --nodes=2 --ntasks=2 "), "{}", calls[1]);
     assert!(calls[1].ends_with(bridge), "{}", calls[1]);
@@ -136,7 +136,7 @@ fn job_whose_time_is_over_is_stopped_requeued_and_resumed() {
     job.until_called(3);
     job.learner_ends("0");
     assert_eq!(script.wait().unwrap().code(), Some(0));
-    let keeps_its_port = |call: &String| call.contains("dmprl bridge --connect tcp/first:10007 ");
+    let keeps_its_port = |call: &String| call.contains("dmprl bridge --connect tls/first:10007 ");
     assert!(job.calls().iter().any(keeps_its_port), "{:?}", job.calls());
     // The token already exists, so the hosts may start first.
     assert!(job.calls().contains(&"dmprl resume runs/slurm-7 --no-progress".to_owned()));

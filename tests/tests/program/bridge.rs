@@ -15,7 +15,7 @@ use crate::{ENDLESS, train};
 /// Returns an unused endpoint on loopback.
 fn endpoint() -> String {
     let free = TcpListener::bind("127.0.0.1:0").unwrap();
-    format!("tcp/{}", free.local_addr().unwrap())
+    format!("tls/{}", free.local_addr().unwrap())
 }
 
 /// Starts a run that accepts workers of other hosts.
@@ -36,10 +36,14 @@ fn learner_of(task: &str, place: &Workplace, run: &str, endpoint: &str, more: &[
 }
 
 fn bridge(place: &Workplace, run: &str, endpoint: &str, name: &str) -> Running {
+    bridge_with(place, run, endpoint, name, &[])
+}
+
+fn bridge_with(place: &Workplace, run: &str, endpoint: &str, name: &str, more: &[&str]) -> Running {
     let token = format!("{run}/bridge.token");
     let (host, connect) = (place.path(name), ["--connect", endpoint, "--token-file", &token]);
     let own = ["--workers", "1", "--name", name, "--run-dir", &host];
-    place.start(&[&["bridge"], &connect[..], &own].concat())
+    place.start(&[&["bridge"], &connect[..], &own, more].concat())
 }
 
 fn strike(run: &str, role: &str, signal: Signal) {
@@ -160,18 +164,57 @@ fn a_host_with_a_wrong_token_or_too_many_workers_is_told_what_to_do() {
     };
     with(&wrong, "1").saying("chmod 600");
     fs::set_permissions(&wrong, fs::Permissions::from_mode(0o600)).unwrap();
-    with(&wrong, "1").saying("its token is not the run's: copy bridge.token");
+    let connect = ["bridge", "--connect", &endpoint, "--token-file", &wrong];
+    place.start(&connect).until_said("no learner's host with this token answers");
     with(&format!("{run}/bridge.token"), "3").saying("bridge.workers_max");
     with(&place.path("none"), "1").saying("copy bridge.token of the run's directory");
-    let odd = place.run(&["bridge", "--connect", "10.0.0.1", "--token-file", &wrong]);
-    odd.with_status(2).saying("expected tcp/ADDRESS:PORT");
     drop(training);
     // An address in use is reported at once, and ends the run.
     let taken = TcpListener::bind("127.0.0.1:0").unwrap();
-    let listen = format!("bridge.listen=[\"tcp/{}\"]", taken.local_addr().unwrap());
+    let listen = format!("bridge.listen=[\"tls/{}\"]", taken.local_addr().unwrap());
     let second = place.path("second");
     let more = ["--workers", "1", "--set", &listen, "--steps", ENDLESS];
     place.run(&train("reacher", &second, &more)).with_status(1).saying("cannot listen at");
+}
+
+#[test]
+fn an_endpoint_that_others_could_read_needs_a_flag() {
+    let place = Workplace::new();
+    let token = place.path("token");
+    fs::write(&token, "a secret of some length\n").unwrap();
+    fs::set_permissions(&token, fs::Permissions::from_mode(0o600)).unwrap();
+    let connect = |endpoint: &str| {
+        place.run(&["bridge", "--connect", endpoint, "--token-file", &token]).with_status(2)
+    };
+    connect("10.0.0.1").saying("expected tls/ADDRESS:PORT");
+    connect("tcp/10.0.0.1:7447").saying("--allow-plain").saying("tls/10.0.0.1:7447");
+    let (run, listen) = (place.path("run"), "bridge.listen=[\"tcp/0.0.0.0:7447\"]");
+    let refused = place.run(&train("reacher", &run, &["--set", listen])).with_status(2);
+    refused.saying("bridge.allow_plain").saying("tls/0.0.0.0:7447");
+    assert!(!Path::new(&run).exists());
+}
+
+/// The module's directory exists on both hosts, and the learner's configuration names it.
+#[test]
+fn a_host_imports_only_what_its_own_user_named() {
+    let place = Workplace::new();
+    let (run, endpoint) = (place.path("run"), endpoint());
+    fs::write(place.path("held.py"), HELD).unwrap();
+    // A host that refuses keeps its place for a minute.
+    let more = ["--python-path", &place.path(""), "--set", "bridge.workers_max=4"];
+    let more = [&more[..], &["--envs-per-worker", "1", "--steps", ENDLESS]].concat();
+    let _training = learner_of("held:Held-v0", &place, &run, &endpoint, &more);
+    let (token, far) = (format!("{run}/bridge.token"), place.path("far"));
+    let asks = ["bridge", "--connect", &endpoint, "--token-file", &token, "--workers", "1"];
+    place.run(&asks).with_status(2).saying("--task 'held:Held-v0'");
+    let other = [&asks[..], &["--task", "other:Other-v0"]].concat();
+    place.run(&other).with_status(2).saying("held:Held-v0");
+    // Named, but without its directory: its worker does not find it.
+    let mut host = bridge_with(&place, &run, &endpoint, "far", &["--task", "held:Held-v0"]);
+    host.until_said("no module 'held'");
+    let config = fs::read_to_string(format!("{far}/config.toml")).unwrap();
+    let config: toml::Table = config.parse().unwrap();
+    assert_eq!(config["task"]["python_path"], toml::Value::Array(Vec::new()));
 }
 
 /// Each step blocks while `hold` exists, and reports its number within its process.
@@ -220,7 +263,8 @@ fn a_host_that_leaves_hands_over_the_segment_that_its_worker_was_in() {
     fs::write(place.path("held.py"), HELD).unwrap();
     let more = ["--python-path", &place.path(""), "--envs-per-worker", "1", "--steps", ENDLESS];
     let mut training = learner_of("held:Held-v0", &place, &run, &endpoint, &more);
-    let mut host = bridge(&place, &run, &endpoint, "far");
+    let named = ["--task", "held:Held-v0", "--python-path", &place.path("")];
+    let mut host = bridge_with(&place, &run, &endpoint, "far", &named);
     training.until_said("host far takes part: 1 worker");
     let far = place.path("far");
     let worker = |process: &dmprl_tests::program::Process| process.role == "actor";

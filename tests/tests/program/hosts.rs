@@ -79,7 +79,7 @@ fn three_hosts_lose_nothing_on_a_long_lossy_wire_that_is_cut_while_processes_die
     let Some(hosts) = three_hosts(1) else { return };
     let place = Workplace::new();
     let (run, far) = (place.path("run"), ["near", "far"].map(|name| place.path(name)));
-    let endpoint = format!("tcp/{}:{PORT}", hosts.address(0));
+    let endpoint = format!("tls/{}:{PORT}", hosts.address(0));
     let listen = format!("bridge.listen=[\"{endpoint}\"]");
     let open = ["--workers", "1", "--set", &listen, "--set", "delivery.level=log"];
     let more = [&open[..], &["--steps", ENDLESS]].concat();
@@ -176,7 +176,7 @@ fn with_mutual_tls_a_host_takes_part_whose_certificate_is_named_and_no_other() {
     let bridge = start(&place, &hosts, 1, &named);
     until_more(&mut training, &run, &[0], "segments of the host that is named");
     for stranger in &mut strangers {
-        stranger.until_said("no learner's host answers");
+        stranger.until_said("no learner's host with this token answers");
     }
     assert!(!training.said().contains("host c") && !training.said().contains("host d"));
     training.signal_group(Signal::INT);

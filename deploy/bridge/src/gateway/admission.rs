@@ -2,17 +2,18 @@
 
 use std::time::Instant;
 
-use anyhow::Context;
 use dmprl_control::Greeting;
 use dmprl_run::random_u64;
 
-use super::{Gateway, GatewayEvent, HostSenders, RemoteWorker, RunFacts};
+use super::{Gateway, GatewayEvent, HostChannel, RemoteWorker, RunFacts};
+use crate::handshake::HostMessage;
 use crate::host_messages::{HostAnswer, HostRequest, HostWelcome, Lease};
 use crate::host_registry::Refusal;
+use crate::keys::Key;
 use crate::link::Request;
 use crate::link_mode::Urgency;
 use crate::link_receiver::LinkReceiver;
-use crate::token;
+use crate::seal::{Opener, SealedSender};
 
 /// Maximum length of a host's name in characters.
 const NAME_MAX: usize = 64;
@@ -23,15 +24,34 @@ fn never(reason: String) -> Refusal {
 
 impl Gateway {
     pub(super) fn answer(&mut self, request: &Request, now: Instant) -> anyhow::Result<()> {
-        let answer = match self.admit(&request.bytes(), now) {
-            Ok(welcome) => HostAnswer::Welcome(Box::new(welcome)),
-            Err(Refusal { reason, later }) => HostAnswer::Refused { reason, later },
-        };
-        request.answer(serde_json::to_vec(&answer).context("cannot write an answer")?)
+        let message = request.bytes();
+        let answer = self.respond(&message, now).unwrap_or_else(|refusal| {
+            let Refusal { reason, later } = refusal;
+            HostAnswer::Refused { reason, later }
+        });
+        let (bytes, session) = self.authenticator.answer(&message, &answer)?;
+        if let HostAnswer::Welcome(welcome) = &answer {
+            self.open_channel(welcome.channel, welcome.sealed.then_some(session))?;
+        }
+        request.answer(bytes)
     }
 
-    fn admit(&mut self, bytes: &[u8], now: Instant) -> Result<HostWelcome, Refusal> {
-        let request = self.authenticate(bytes)?;
+    /// Answers a message of the handshake. A host that has not proven that it knows the token gets
+    /// only the challenge.
+    fn respond(&mut self, bytes: &[u8], now: Instant) -> Result<HostAnswer, Refusal> {
+        let message = self.parse(bytes)?;
+        let Some(join) = &message.join else {
+            return Ok(HostAnswer::Challenge(self.authenticator.challenge().to_owned()));
+        };
+        let request = self.authenticator.verify(&message.nonce, join);
+        let request = request.inspect_err(|refusal| {
+            let reason = refusal.reason.clone();
+            self.report_refusal(|| format!("rejected a host: {reason}"));
+        })?;
+        Ok(HostAnswer::Welcome(Box::new(self.admit(&request, now)?)))
+    }
+
+    fn admit(&mut self, request: &HostRequest, now: Instant) -> Result<HostWelcome, Refusal> {
         if request.name.chars().count() > NAME_MAX {
             return Err(never(format!("its name has more than {NAME_MAX} characters (--name)")));
         }
@@ -41,17 +61,15 @@ impl Gateway {
         }
         let channel = random_u64().map_err(|error| never(format!("{error:#}")))?;
         let known = self.registry.hosts().iter().find(|host| host.host == request.host);
-        let before = known.map(|host| host.channel);
         // `dmprl bridge` has joined already, and its relay joins again: that is no news to the
         // user.
         let was_present = request.lease.is_some() && known.is_some_and(|host| host.is_present);
-        let lease = self.registry.admit(&request, channel, &self.acknowledged.marks, now)?;
-        if let Some(before) = before {
-            self.senders.remove(&before);
+        let lease = self.registry.admit(request, channel, &self.acknowledged.marks, now)?;
+        let (hosts, before) = (self.registry.hosts(), self.channels.len());
+        self.channels.retain(|channel, _| hosts.iter().any(|host| host.channel == *channel));
+        if self.channels.len() < before {
             self.channels_changed = now;
         }
-        let senders = self.host_senders(channel).map_err(|error| never(format!("{error:#}")))?;
-        self.senders.insert(channel, senders);
         self.add_workers(lease, request.workers);
         if !was_present {
             let again = if request.lease.is_some() { "is back" } else { "takes part" };
@@ -61,11 +79,12 @@ impl Gateway {
             self.events.push(GatewayEvent::Notice(format!("host {name} {again}: {counted}")));
         }
         let RunFacts { run_id, config, spec, .. } = self.facts.clone();
-        Ok(HostWelcome { channel, gateway: self.id, lease, run_id, config, spec })
+        let sealed = request.sealed || !self.link.is_authenticated();
+        Ok(HostWelcome { channel, gateway: self.id, sealed, lease, run_id, config, spec })
     }
 
-    /// Parses a request and checks its version and its token.
-    fn authenticate(&mut self, bytes: &[u8]) -> Result<HostRequest, Refusal> {
+    /// Parses a message of the handshake and checks its version.
+    fn parse(&mut self, bytes: &[u8]) -> Result<HostMessage, Refusal> {
         // Parse the greeting first: another version's remaining fields may not parse.
         #[derive(serde::Deserialize)]
         struct Speaks {
@@ -79,17 +98,8 @@ impl Gateway {
             self.report_refusal(|| format!("rejected a host with {speaks}"));
             return Err(never(reason));
         }
-        let request: HostRequest = serde_json::from_slice(bytes)
-            .map_err(|error| never(format!("expected a request, got another: {error}")))?;
-        if !token::equal(&request.token, &self.facts.token) {
-            self.report_refusal(|| {
-                let name = request.name.escape_debug().take(NAME_MAX).collect::<String>();
-                format!("rejected host {name}: its token is wrong")
-            });
-            let reason = "its token is not the run's: copy bridge.token of the run's directory";
-            return Err(never(reason.to_owned()));
-        }
-        Ok(request)
+        serde_json::from_slice(bytes)
+            .map_err(|error| never(format!("expected a request, got another: {error}")))
     }
 
     /// Reports a rejected request, less and less often: repeated requests must not fill the log.
@@ -100,10 +110,20 @@ impl Gateway {
         }
     }
 
-    fn host_senders(&self, channel: u64) -> anyhow::Result<HostSenders> {
+    /// Opens the channel of a host that has joined.
+    fn open_channel(&mut self, channel: u64, session: Option<Key>) -> anyhow::Result<()> {
         let name = format!("dmprl/{}/hearings/{channel:016x}", self.facts.run_id);
         let acks = self.link.sender(name, Urgency::First)?;
-        Ok(HostSenders { acks, policies: None })
+        let key = session.as_ref();
+        let opened = HostChannel {
+            segments: Opener::new(key, "segments"),
+            status: Opener::new(key, "status"),
+            acks: SealedSender::new(acks, key, "acks"),
+            policies: None,
+            session,
+        };
+        self.channels.insert(channel, opened);
+        Ok(())
     }
 
     /// Adds the host's workers. Workers that are known keep their retained segments.

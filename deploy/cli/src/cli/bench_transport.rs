@@ -37,9 +37,9 @@ EXAMPLES
   dmprl bench transport
   dmprl bench transport --workers 2 --rounds 9 --json
   dmprl bench transport --level log        # the cost of this level
-  dmprl bench transport --listen tcp/0.0.0.0:7448 --seconds 10
-  dmprl bench transport --connect tcp/10.0.0.1:7448 --workers 4
-  dmprl bench transport --connect tcp/10.0.0.1:7448 --workers 4 --rate 20000
+  dmprl bench transport --listen tls/0.0.0.0:7448 --seconds 10
+  dmprl bench transport --connect tls/10.0.0.1:7448 --workers 4
+  dmprl bench transport --connect tls/10.0.0.1:7448 --workers 4 --rate 20000
   dmprl bench transport --peer-python /opt/zeromq/bin/python";
 
 /// Delivery level, as in `delivery.level`.

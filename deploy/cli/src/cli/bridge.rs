@@ -6,7 +6,7 @@ use std::time::{Duration, Instant};
 use anyhow::{Context, bail};
 use clap::Args;
 use dmprl_bridge::host_messages::HostWelcome;
-use dmprl_bridge::join::{JoinOutcome, JoinSettings, request_join};
+use dmprl_bridge::join::{JoinOutcome, JoinSettings, explain_silence, request_join};
 use dmprl_bridge::{Link, LinkMode, token};
 use dmprl_run::Watch;
 use dmprl_run::failure::{Outcome, wrong_use};
@@ -14,11 +14,13 @@ use dmprl_run::format::grouped;
 use dmprl_run::{
     Manifest, RunDirectory, RunLock, Session, compact_now, random_u64, replace_file, safe_name,
 };
-use dmprl_shared::config::{ExperimentConfig, Limits};
+use dmprl_shared::config::endpoint::{is_endpoint, is_plain};
+use dmprl_shared::config::{BridgeConfig, ExperimentConfig, Layers, Limits, TASKS, TaskConfig};
 use dmprl_supervisor::capacity;
 use dmprl_supervisor::{self as launch, Ending, HostPlan, SessionReport, Upstream};
+use toml::Table;
 
-use super::configuration::refuse;
+use super::configuration::{add_env_kwargs, refuse};
 use super::output::{OutputArgs, host_observer};
 use super::{cores, prepare_python, this_program};
 use crate::terminal::{ProgressStyle, events, say, write_line};
@@ -36,25 +38,32 @@ const HELP: &str = "\
 Both hosts need a program that was built with: cargo build --release --features hosts
 On the learner's host, start the run with bridge.listen. Copy its token, bridge.token in the run's
 directory, to the other hosts; only its owner may have access to the file:
-  dmprl train reacher --set 'bridge.listen=[\"tcp/0.0.0.0:7447\"]' --run-dir runs/mine
-This host needs the same version of dmprl, and the run's environments. It receives configuration and
-policies from the learner's host, waits while it is unreachable, and exits when the run ends. On
-Ctrl-C the workers' last segments are delivered, and the other hosts continue; a second Ctrl-C exits
-at once. Exit status: 0 the run has ended, 130 interrupted, 2 rejected, 1 failed or waited longer
-than --patience.
+  dmprl train reacher --set 'bridge.listen=[\"tls/0.0.0.0:7447\"]' --run-dir runs/mine
+Both ends prove that they know the token without sending it, and make the certificates of tls/ from
+it. This host receives configuration and policies from the learner's host, but only your own command
+line decides which Python code it imports: a task other than dmprl's own needs --task.
+It needs the same version of dmprl, waits while the learner's host is unreachable, and exits when
+the run ends. On Ctrl-C the workers' last segments are delivered, and the other hosts continue; a
+second Ctrl-C exits at once. Exit status: 0 the run has ended, 130 interrupted, 2 rejected, 1 failed
+or waited longer than --patience.
 
 EXAMPLES
-  dmprl bridge --connect tcp/10.0.0.1:7447 --token-file bridge.token
-  dmprl bridge --connect tcp/10.0.0.1:7447 --token-file bridge.token --workers 16 --name gpu3
-  dmprl bridge --connect tls/learner.lab:7447 --token-file bridge.token --zenoh-config tls.json5";
+  dmprl bridge --connect tls/10.0.0.1:7447 --token-file bridge.token
+  dmprl bridge --connect tls/10.0.0.1:7447 --token-file bridge.token --workers 16 --name gpu3
+  dmprl bridge --connect tls/10.0.0.1:7447 --token-file bridge.token --task lift:Lift \\
+      --python-path envs";
 
 /// Arguments of `dmprl bridge`.
 #[derive(Debug, Args)]
 #[command(after_help = HELP)]
 pub(super) struct BridgeArgs {
-    /// Zenoh endpoint of the learner's host: tcp/ADDRESS:PORT or tls/ADDRESS:PORT.
+    /// Zenoh endpoint of the learner's host: tls/ADDRESS:PORT, or tcp/ADDRESS:PORT on loopback.
     #[arg(long, value_name = "ENDPOINT")]
     connect: String,
+    /// Connect also to tcp/ endpoints beyond loopback. Others on the network can then read the
+    /// messages, but not forge them.
+    #[arg(long)]
+    allow_plain: bool,
     /// File with the run's token, mode 0600.
     #[arg(long, value_name = "FILE")]
     token_file: PathBuf,
@@ -68,6 +77,18 @@ pub(super) struct BridgeArgs {
     /// runs/bridge-NAME-TIME].
     #[arg(long, value_name = "DIR")]
     run_dir: Option<PathBuf>,
+    /// Gymnasium id or class of the run's environment, if it is not one of dmprl's own tasks
+    /// (dmprl tasks). The host rejects a run with another one.
+    #[arg(long, value_name = "ID")]
+    task: Option<String>,
+    /// Argument of the run's environment, as given to dmprl train; repeatable. The host rejects a
+    /// run with others.
+    #[arg(long, value_name = "KEY=VALUE")]
+    env_kwargs: Vec<String>,
+    /// Wrapper of the run's environment (task.wrappers); repeatable. The host rejects a run with
+    /// others.
+    #[arg(long, value_name = "MODULE:NAME")]
+    wrapper: Vec<String>,
     /// Directory of your own environment modules on this host; repeatable.
     #[arg(long, value_name = "DIR")]
     python_path: Vec<PathBuf>,
@@ -92,7 +113,7 @@ pub(super) fn run(args: &BridgeArgs) -> anyhow::Result<Outcome> {
     let workers = args.workers.map_or_else(cores, usize::from);
     let earlier = earlier(args)?;
     let join = JoinSettings {
-        endpoint: endpoint(&args.connect)?,
+        endpoint: endpoint(args)?,
         token: token::read(&token_file)?,
         host: earlier.as_ref().map_or_else(random_u64, |(_, host)| Ok(*host))?,
         name: args.name.clone().unwrap_or_else(host_name),
@@ -102,7 +123,7 @@ pub(super) fn run(args: &BridgeArgs) -> anyhow::Result<Outcome> {
     let venv = prepare_python()?;
     let welcome = wait_for_welcome(&join, zenoh_file.as_deref(), patience)?;
     let Some(welcome) = welcome else { return Ok(Outcome::Interrupted) };
-    let config = host_config(&welcome, workers, &args.python_path)?;
+    let config = host_config(&welcome, workers, args)?;
     capacity::check(&config, Some(&welcome.spec))?;
     let run = run_directory(args, &join.name, &welcome, &config)?;
     let lock = match earlier {
@@ -157,17 +178,22 @@ fn earlier(args: &BridgeArgs) -> anyhow::Result<Option<(RunLock, u64)>> {
     Ok(Some((lock, u64::from_str_radix(text.trim(), 16).with_context(read)?)))
 }
 
-fn endpoint(text: &str) -> anyhow::Result<String> {
-    let known = text.split_once('/').is_some_and(|(protocol, address)| {
-        ["tcp", "tls"].contains(&protocol) && address.contains(':')
-    });
-    if known {
-        return Ok(text.to_owned());
+fn endpoint(args: &BridgeArgs) -> anyhow::Result<String> {
+    let text = &args.connect;
+    if !is_endpoint(text) {
+        return Err(wrong_use(format!(
+            "--connect {text}: expected tls/ADDRESS:PORT or tcp/ADDRESS:PORT, such as \
+             tls/10.0.0.1:7447"
+        )));
     }
-    Err(wrong_use(format!(
-        "--connect {text}: expected tcp/ADDRESS:PORT or tls/ADDRESS:PORT, such as \
-         tcp/10.0.0.1:7447"
-    )))
+    if is_plain(text) && !args.allow_plain {
+        return Err(wrong_use(format!(
+            "--connect {text}: others on the network could read the messages; use {}, with which \
+             the run listens on tls/ too, or add --allow-plain",
+            text.replacen("tcp/", "tls/", 1)
+        )));
+    }
+    Ok(text.clone())
 }
 
 fn host_name() -> String {
@@ -182,66 +208,110 @@ fn wait_for_welcome(
     patience: Duration,
 ) -> anyhow::Result<Option<HostWelcome>> {
     let watch = Watch::start()?;
-    let link = Link::open(LinkMode::Connect(&join.endpoint), zenoh_file)?;
+    let link = Link::open(LinkMode::Connect(&join.endpoint), &join.token, zenoh_file)?;
     let (began, mut last_reason) = (Instant::now(), String::new());
     loop {
         if watch.check().is_err() {
             return Ok(None);
         }
-        match request_join(&link, join, None)? {
-            JoinOutcome::Welcome(welcome) => return Ok(Some(*welcome)),
+        let reason = match request_join(&link, join, None)? {
+            JoinOutcome::Welcome(admission) => return Ok(Some(admission.welcome)),
             JoinOutcome::Refused(reason) => {
                 return Err(wrong_use(format!(
                     "the learner's host at {} rejects this host: {reason}",
                     join.endpoint
                 )));
             }
-            JoinOutcome::Later(reason) if began.elapsed() >= patience => {
-                bail!("waited {} min: {reason}", patience.as_secs() / 60)
-            }
-            JoinOutcome::Later(reason) => {
-                if reason != last_reason {
-                    let minutes = patience.as_secs() / 60;
-                    say(&format!("{reason}; waiting for at most {minutes} min"));
-                    last_reason = reason;
-                }
-            }
+            JoinOutcome::Silent => explain_silence(&join.endpoint),
+            JoinOutcome::Later(reason) => reason,
+        };
+        let minutes = patience.as_secs() / 60;
+        if began.elapsed() >= patience {
+            bail!("waited {minutes} min: {reason}");
+        }
+        if reason != last_reason {
+            say(&format!("{reason}; waiting for at most {minutes} min"));
+            last_reason = reason;
         }
         std::thread::sleep(JOIN_INTERVAL);
     }
 }
 
-/// Adapts the run's configuration to this host.
+/// Adapts the run's configuration to this host. What this host imports and which files it reads
+/// comes from its own command line.
 fn host_config(
     welcome: &HostWelcome,
     workers: usize,
-    python_path: &[PathBuf],
+    args: &BridgeArgs,
 ) -> anyhow::Result<ExperimentConfig> {
     let mut config: ExperimentConfig = toml::from_str(&welcome.config)
         .context("the learner's host sent an unreadable configuration")?;
     config.actors.workers = workers;
     config.actors.joined_max = 0;
-    config.bridge.listen.clear();
+    config.bridge = BridgeConfig {
+        under_way_bytes_max: config.bridge.under_way_bytes_max,
+        ..BridgeConfig::default()
+    };
     config.demonstrations.files.clear();
     // This host has no replay.
     config.replay.capacity_steps = 1_000;
     config.run.max_minutes = f64::INFINITY;
-    if !python_path.is_empty() {
-        let absolute = |path: &PathBuf| {
-            let path = std::fs::canonicalize(path)
-                .map_err(|error| wrong_use(format!("--python-path {}: {error}", path.display())))?;
-            Ok(path.display().to_string())
-        };
-        config.task.python_path =
-            python_path.iter().map(absolute).collect::<anyhow::Result<_>>()?;
-    }
-    if let Some(gone) = config.task.python_path.iter().find(|path| !Path::new(path).is_dir()) {
-        return Err(wrong_use(format!(
-            "the run's environments are in {gone} on the learner's host, and this host has no such \
-             directory: pass their directory on this host with --python-path"
-        )));
-    }
+    // Names every field, so that a new one is not taken from the network by accident.
+    let TaskConfig { name, id, python_path: _, start_sources, wrappers, kwargs } = config.task;
+    check_task(&id, args)?;
+    check_options(&kwargs, &wrappers, args)?;
+    let absolute = |path: &PathBuf| {
+        let path = std::fs::canonicalize(path)
+            .map_err(|error| wrong_use(format!("--python-path {}: {error}", path.display())))?;
+        Ok(path.display().to_string())
+    };
+    let python_path = args.python_path.iter().map(absolute).collect::<anyhow::Result<_>>()?;
+    config.task = TaskConfig { name, id, python_path, start_sources, wrappers, kwargs };
     config.resolve(Limits { cores: cores() }).map_err(refuse)
+}
+
+/// Checks that the user named the arguments and wrappers of the run's environment on this host: a
+/// wrapper is code, and an argument can name code or a file. A time limit needs no name.
+fn check_options(kwargs: &Table, wrappers: &[String], args: &BridgeArgs) -> anyhow::Result<()> {
+    let mut named = Layers::new();
+    add_env_kwargs(&mut named, &args.env_kwargs)?;
+    let named = named.finish().map_err(refuse)?.task.kwargs;
+    let is_time_limit = |name: &str| name == "max_episode_steps" && !named.contains_key(name);
+    let asked = || kwargs.iter().filter(|(name, _)| !is_time_limit(name));
+    if named.iter().eq(asked()) && args.wrapper == wrappers {
+        return Ok(());
+    }
+    let arguments =
+        asked().map(|(name, value)| format!(" --env-kwargs {:?}", format!("{name}={value}")));
+    let wrappers = wrappers.iter().map(|wrapper| format!(" --wrapper {wrapper:?}"));
+    let flags: String = arguments.chain(wrappers).collect();
+    let expected = if flags.is_empty() { " no --env-kwargs and no --wrapper" } else { &flags };
+    Err(wrong_use(format!(
+        "the run's environment has other arguments or wrappers than this command line names; to run \
+         it on this host, expected:{expected}"
+    )))
+}
+
+/// Checks that this host may import the run's environment: a task of dmprl, or one that the user
+/// named. Any other id can import a module: as its part before a colon, or by the registration of
+/// an installed package.
+fn check_task(id: &str, args: &BridgeArgs) -> anyhow::Result<()> {
+    let is_own = TASKS.iter().any(|task| task.id == id);
+    let shown = id.escape_debug();
+    match &args.task {
+        Some(named) if named == id => Ok(()),
+        Some(named) => Err(wrong_use(format!(
+            "--task {named}: the run's environment is {shown}; pass that to run it on this host"
+        ))),
+        None if is_own => Ok(()),
+        None => Err(wrong_use(format!(
+            "the run's environment {shown} is not one of dmprl's own, so this host runs it only if \
+             you name it, with --python-path if it is your own code: dmprl bridge --connect {} \
+             --token-file {} --task '{shown}'",
+            args.connect,
+            args.token_file.display()
+        ))),
+    }
 }
 
 /// Creates this bridge's run directory, or opens that of an earlier bridge of the same run.

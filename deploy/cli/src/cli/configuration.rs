@@ -66,6 +66,18 @@ struct Own {
     algorithm: Option<Table>,
 }
 
+/// Adds the pairs of `--env-kwargs`.
+pub(super) fn add_env_kwargs(layers: &mut Layers, pairs: &[String]) -> anyhow::Result<()> {
+    for pair in pairs {
+        let (name, text) = pair.split_once('=').ok_or_else(|| {
+            wrong_use(format!("--env-kwargs {pair}: expected KEY=VALUE, as in reward_type=dense"))
+        })?;
+        let key = format!("task.kwargs.{}", name.trim());
+        layers.set("--env-kwargs", &key, text.trim()).map_err(refuse)?;
+    }
+    Ok(())
+}
+
 fn merge_with(own: &Own, sources: &Sources<'_>) -> anyhow::Result<ExperimentConfig> {
     let mut layers = Layers::new();
     add(&mut layers, sources.task, task_table(sources.task)?)?;
@@ -93,13 +105,7 @@ fn merge_with(own: &Own, sources: &Sources<'_>) -> anyhow::Result<ExperimentConf
         })?;
         layers.set("--set", key.trim(), text.trim()).map_err(refuse)?;
     }
-    for pair in sources.env_kwargs {
-        let (name, text) = pair.split_once('=').ok_or_else(|| {
-            wrong_use(format!("--env-kwargs {pair}: expected KEY=VALUE, as in reward_type=dense"))
-        })?;
-        let key = format!("task.kwargs.{}", name.trim());
-        layers.set("--env-kwargs", &key, text.trim()).map_err(refuse)?;
-    }
+    add_env_kwargs(&mut layers, sources.env_kwargs)?;
     for Flag { flag, key, value } in &sources.flags {
         add(&mut layers, flag, nested(key, value.clone()))?;
     }

@@ -57,7 +57,7 @@ EXAMPLES
   dmprl eval runs/reacher-td3-dmp-s1-…    evaluate its best policy
   dmprl resume runs/reacher-td3-dmp-s1-…  continue from the last checkpoint
   dmprl actor --join runs/reacher-td3-…   add a worker to a run that is training
-  dmprl bridge --connect tcp/10.0.0.1:7447 --token-file bridge.token   add another host's workers
+  dmprl bridge --connect tls/10.0.0.1:7447 --token-file bridge.token   add another host's workers
   dmprl record runs/reacher-td3-dmp-s1-…  record a video of its best policy
   dmprl dashboard                          watch all runs in a browser
   dmprl tasks                              list the built-in tasks

@@ -63,18 +63,21 @@ pub(super) fn mark_as_own(run: &RunDirectory, config: &ExperimentConfig) {
     }
 }
 
-/// Lists the module and the folders, each on its own line.
+/// Lists modules, folders and arguments, each on its own line.
 fn described(code: &NamedCode, run: &Path) -> String {
     let mut lines = Vec::new();
-    let mut folder_of_module = None;
-    if let Some(module) = &code.module {
-        folder_of_module = code.folders.iter().find(|folder| has_module(folder, module));
-        let place = folder_of_module
+    let mut named = Vec::new();
+    for module in &code.modules {
+        let folder = code.folders.iter().find(|folder| has_module(folder, module));
+        let place = folder
             .map_or_else(|| "the installed packages".to_owned(), |folder| located(folder, run));
         lines.push(format!("  module {module} from {place}"));
+        named.extend(folder);
     }
-    let others = code.folders.iter().filter(|folder| Some(*folder) != folder_of_module);
+    let others = code.folders.iter().filter(|folder| !named.contains(folder));
     lines.extend(others.map(|folder| format!("  modules from {}", located(folder, run))));
+    let arguments = code.arguments.iter();
+    lines.extend(arguments.map(|argument| format!("  whatever the argument {argument} names")));
     lines.join("\n")
 }
 
@@ -108,9 +111,10 @@ impl Said<'_> {
     pub(super) fn check(self, config: &ExperimentConfig, trust: TrustArgs) -> anyhow::Result<()> {
         let own_module = config.task.id == self.task || !config.task.id.contains(':');
         let own_folders = self.python_path || config.task.python_path.is_empty();
+        let has_options = config.task.has_options();
         let run = self.file.and_then(Path::parent);
         match run.filter(|run| run.join("manifest.json").is_file()) {
-            Some(run) if !(own_module && own_folders) => {
+            Some(run) if has_options || !(own_module && own_folders) => {
                 trust.check_for(&RunDirectory::open(run)?, config)
             }
             _ => Ok(()),

@@ -37,7 +37,7 @@ Exchanges JSON lines with the supervisor on standard input and output; logs to s
 Acts as the learner for the workers of its host. Exits when its standard input ends.
 
 EXAMPLES
-  dmprl bridge --connect tcp/10.0.0.1:7447 --token-file bridge.token --workers 4   # starts one";
+  dmprl bridge --connect tls/10.0.0.1:7447 --token-file bridge.token --workers 4   # starts one";
 
 const EVALUATOR_HELP: &str = "\
 Exchanges JSON lines with the supervisor on standard input and output; logs to standard error.

@@ -35,7 +35,7 @@ pub fn settings(random: &mut Stream, run: &RunDirectory) -> Settings {
         config.run.max_minutes = random.random_range(0.1..3.0);
     }
     if random.random_range(0..3) == 0 && !host {
-        config.bridge.listen = vec!["tcp/0.0.0.0:7447".to_owned()];
+        config.bridge.listen = vec!["tls/0.0.0.0:7447".to_owned()];
     }
     Settings {
         config,

@@ -87,11 +87,11 @@ fn workers_look_for_the_learner_by_the_name_that_its_pod_has() {
     assert_eq!(network["enableDNSHostnames"], true);
     let [set_name, subdomain] =
         [&set["metadata"]["name"], &network["subdomain"]].map(|it| it.as_str().unwrap());
-    let connect = format!("--connect=tcp/{set_name}-learner-0-0.{subdomain}:7447");
+    let connect = format!("--connect=tls/{set_name}-learner-0-0.{subdomain}:7447");
     for (name, pod) in pods() {
         let arguments = &pod["containers"][0]["args"];
         let wanted = match name.as_str() {
-            "learner" => "--set=bridge.listen=[\"tcp/0.0.0.0:7447\"]",
+            "learner" => "--set=bridge.listen=[\"tls/0.0.0.0:7447\"]",
             _ => connect.as_str(),
         };
         assert!(arguments.as_array().unwrap().iter().any(|it| it == wanted), "{arguments}");

@@ -99,14 +99,19 @@ fn request_lease(
     watch: &Watch,
 ) -> anyhow::Result<Option<Lease>> {
     let (start, endpoint) = (Instant::now(), &join.endpoint);
-    let link = Link::open(LinkMode::Connect(endpoint), zenoh_file)?;
+    let link = Link::open(LinkMode::Connect(endpoint), &join.token, zenoh_file)?;
     loop {
         match request_join(&link, join, None)? {
-            JoinOutcome::Welcome(welcome) => return Ok(Some(welcome.lease)),
+            JoinOutcome::Welcome(admission) => return Ok(Some(admission.welcome.lease)),
             JoinOutcome::Refused(why) => bail!("{endpoint} refused the join request: {why}"),
+            JoinOutcome::Later(_) | JoinOutcome::Silent if watch.check().is_err() => {
+                return Ok(None);
+            }
             JoinOutcome::Later(why) if start.elapsed() >= CONNECT_TIMEOUT => bail!("{why}"),
-            JoinOutcome::Later(_) if watch.check().is_err() => return Ok(None),
-            JoinOutcome::Later(_) => thread::sleep(INTERVAL),
+            JoinOutcome::Silent if start.elapsed() >= CONNECT_TIMEOUT => {
+                bail!("no listener of the benchmark answers at {endpoint}")
+            }
+            JoinOutcome::Later(_) | JoinOutcome::Silent => thread::sleep(INTERVAL),
         }
     }
 }

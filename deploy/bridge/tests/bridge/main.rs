@@ -3,19 +3,20 @@
 #![cfg(feature = "zenoh")]
 #![allow(clippy::unwrap_used)] // a helper that panics fails its test
 
+mod attacks;
+
 use std::net::TcpListener;
 use std::path::{Path, PathBuf};
+use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
-use std::sync::{Arc, Mutex};
 use std::thread;
 use std::time::{Duration, Instant};
 
 use dmprl_bridge::gateway::{Gateway, GatewaySettings, RunFacts};
 use dmprl_bridge::host_messages::Lease;
-use dmprl_bridge::join::{JoinOutcome, JoinSettings, request_join};
+use dmprl_bridge::join::JoinSettings;
 use dmprl_bridge::relay::{HostCounts, Relay, RelaySettings};
 use dmprl_bridge::wire::RunState;
-use dmprl_bridge::{Link, LinkMode};
 use dmprl_shared::config::task_defaults;
 use dmprl_shared::parameters::ParameterSnapshot;
 use dmprl_shared::segment::{
@@ -42,9 +43,9 @@ const LAYOUT: SegmentLayout =
 const KEPT: usize = 512;
 
 /// An unused endpoint on loopback.
-fn endpoint() -> String {
+fn endpoint(protocol: &str) -> String {
     let free = TcpListener::bind("127.0.0.1:0").unwrap();
-    format!("tcp/{}", free.local_addr().unwrap())
+    format!("{protocol}/{}", free.local_addr().unwrap())
 }
 
 fn facts() -> RunFacts {
@@ -277,7 +278,7 @@ type Replaced = [thread::JoinHandle<()>; 3];
 
 fn start(stage: &Arc<Stage>, domains: &[Domain; 2]) -> (Replaced, Vec<thread::JoinHandle<u64>>) {
     let [here, there] = domains.each_ref().map(|domain| domain.path().to_owned());
-    let endpoint = endpoint();
+    let endpoint = endpoint("tls");
     let spawn = |work: fn(&Stage, PathBuf, String), domain: &PathBuf| {
         let (stage, domain, endpoint) = (Arc::clone(stage), domain.clone(), endpoint.clone());
         thread::spawn(move || work(&stage, domain, endpoint))
@@ -340,70 +341,4 @@ fn segments_arrive_once_and_in_order_while_processes_are_replaced() {
     assert_eq!(stage.settled.load(Ordering::Acquire), total);
     assert_eq!(stage.gaps.load(Ordering::Acquire), 0);
     assert!(versions.iter().all(|version| *version > 10), "{versions:?}");
-}
-
-/// Sends messages on a channel that was not given to any host; the gateway counts them.
-fn speak_nonsense(link: &Link, stage: &Stage) {
-    let name = "dmprl/0000000000000007/segments/00000000000000aa".to_owned();
-    let stranger = link.sender(name, dmprl_bridge::Urgency::Segments).unwrap();
-    stage.until("the stranger's messages counted", || {
-        stranger.send(b"nonsense".to_vec()).unwrap();
-        stage.refused.load(Ordering::Acquire) > 0
-    });
-}
-
-#[test]
-fn hosts_with_another_token_or_version_and_nonsense_are_rejected() {
-    let folder = tempfile::tempdir().unwrap();
-    let domain = Domain::create(&folder.path().join("p"), "a").unwrap();
-    let path = domain.path().to_owned();
-    let endpoint = endpoint();
-    let stage = Stage::new(LAYOUT, WORKERS, SEGMENTS);
-    let learning = Arc::clone(&stage);
-    let serving = path.clone();
-    let learner = thread::spawn(move || learner(&learning, serving));
-    let news = Arc::new(Mutex::new(Vec::new()));
-    let gateway = {
-        let (stage, news, endpoint) = (Arc::clone(&stage), Arc::clone(&news), endpoint.clone());
-        thread::spawn(move || {
-            let mut gateway = open_gateway(&stage, &path, &[endpoint]);
-            while !stage.is_over() {
-                gateway.turn().unwrap();
-                news.lock().unwrap().extend(gateway.take_events());
-                stage.refused.store(gateway.rejected(), Ordering::Release);
-                thread::sleep(POLL);
-            }
-        })
-    };
-    let link = Link::open(LinkMode::Connect(&endpoint), None).unwrap();
-    let answered = |settings: &JoinSettings, lease| {
-        let deadline = Instant::now() + PATIENCE;
-        loop {
-            match request_join(&link, settings, lease).unwrap() {
-                JoinOutcome::Later(why) => assert!(Instant::now() < deadline, "{why}"),
-                answer => return answer,
-            }
-        }
-    };
-    let refused = |settings: &JoinSettings, lease| match answered(settings, lease) {
-        JoinOutcome::Refused(reason) => reason,
-        other => panic!("{other:?}"),
-    };
-    let right = join_settings(&endpoint, WORKERS);
-    let wrong = JoinSettings { token: "another secret of some length".into(), ..right.clone() };
-    assert!(refused(&wrong, None).contains("token"));
-    let many = JoinSettings { workers: 99, ..right.clone() };
-    assert!(refused(&many, None).contains("bridge.workers_max"));
-    assert!(matches!(answered(&right, None), JoinOutcome::Welcome(_)));
-    let other = serde_json::json!({"speaks": {"version": "9.9.9", "control": 77}, "new": 1});
-    let answer = link.request("dmprl/join", other.to_string().into(), PATIENCE).unwrap().unwrap();
-    let answer = String::from_utf8(answer).unwrap();
-    assert!(answer.contains("9.9.9") && answer.contains("\"later\":false"), "{answer}");
-    speak_nonsense(&link, &stage);
-    stage.over.store(true, Ordering::Release);
-    learner.join().unwrap();
-    gateway.join().unwrap();
-    assert_eq!(stage.settled.load(Ordering::Acquire), 0);
-    let news = format!("{:?}", news.lock().unwrap());
-    assert!(news.contains("its token is wrong") && news.contains("9.9.9"), "{news}");
 }
