@@ -7,6 +7,7 @@
 
 use std::borrow::Cow;
 
+use dmprl_shared::goal_rule::GoalRule;
 use dmprl_shared::policy::MlpShape;
 use serde::{Deserialize, Serialize};
 
@@ -70,14 +71,31 @@ impl Normaliser {
     /// Adds observations, (rows, O), to the statistics.
     pub fn observe(&mut self, observations: &[f32]) {
         for row in observations.chunks_exact(self.mean.len()) {
-            self.count += 1;
-            let share = 1.0 / self.count as f64;
-            let seen = self.seen_mean.iter_mut().zip(&mut self.seen_squares);
-            for ((mean, squares), value) in seen.zip(row) {
-                let before = f64::from(*value) - *mean;
-                *mean += before * share;
-                *squares += before * (f64::from(*value) - *mean);
-            }
+            self.observe_row(|index| row[index]);
+        }
+    }
+
+    /// Adds observations, (rows, O), with the achieved goals in place of the desired ones.
+    pub fn observe_relabelled(&mut self, observations: &[f32], rule: &GoalRule) {
+        let desired = rule.desired..rule.desired + rule.goal_len;
+        for row in observations.chunks_exact(self.mean.len()) {
+            let achieved = rule.achieved(row);
+            self.observe_row(|index| match desired.contains(&index) {
+                true => achieved[index - desired.start],
+                false => row[index],
+            });
+        }
+    }
+
+    fn observe_row(&mut self, value: impl Fn(usize) -> f32) {
+        self.count += 1;
+        let share = 1.0 / self.count as f64;
+        let seen = self.seen_mean.iter_mut().zip(&mut self.seen_squares);
+        for (index, (mean, squares)) in seen.enumerate() {
+            let value = f64::from(value(index));
+            let before = value - *mean;
+            *mean += before * share;
+            *squares += before * (value - *mean);
         }
     }
 

@@ -27,6 +27,6 @@ pub use experiment::{
     MetricsConfig, PacingConfig, Precision, ReplayConfig, RunConfig, SupervisionConfig, TaskConfig,
 };
 pub use layers::{ConfigError, Layers, nearest};
-pub use presets::{PRESETS, Preset, algorithm_defaults, policy_defaults};
+pub use presets::{PRESETS, Preset, algorithm_defaults, policy_defaults, suitable_preset};
 pub use resolve::Limits;
 pub use tasks::{TASKS, TaskDefaults, task_defaults};

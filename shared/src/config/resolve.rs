@@ -205,6 +205,13 @@ impl ExperimentConfig {
         for (key, got) in unit {
             range(key, got, got > 0.0 && got <= 1.0, || "above 0, at most 1".into())?;
         }
+        let shares = [
+            ("replay.hindsight_share", self.replay.hindsight_share),
+            ("exploration.random_segments", self.exploration.random_segments),
+        ];
+        for (key, got) in shares {
+            range(key, got, (0.0..=1.0).contains(&got), || "from 0 to 1".into())?;
+        }
         for (key, std) in [
             ("exploration.std", self.exploration.std),
             ("algorithm.td3.target_noise_std", self.algorithm.td3.target_noise_std),
@@ -267,6 +274,10 @@ impl ExperimentConfig {
             "dmp_parameters with policy.start = \"carry\", because uniform actions leave y \
              undefined during the warm-up"
                 .into()
+        })?;
+        let random = self.exploration.random_segments;
+        range("exploration.random_segments", random, !carry || random == 0.0, || {
+            "0 with policy.start = \"carry\", because random actions leave y undefined".into()
         })?;
         let demonstrated = !self.demonstrations.files.is_empty();
         range("policy.start", "carry", !(carry && demonstrated), || {
@@ -338,6 +349,11 @@ impl ExperimentConfig {
         let layer_norm = self.algorithm.critic_layer_norm;
         range("algorithm.critic_layer_norm", "true", !on_policy || !layer_norm, || {
             "false with algorithm.name = \"ndp\"; only ddpg, td3 and sac support it".into()
+        })?;
+        let random = self.exploration.random_segments;
+        range("exploration.random_segments", random, !on_policy || random == 0.0, || {
+            "0 with algorithm.name = \"ndp\", which learns only from actions of its own policy"
+                .into()
         })?;
         let penalty = self.algorithm.action_rate_penalty;
         range("algorithm.action_rate_penalty", penalty, !on_policy || penalty == 0.0, || {

@@ -21,6 +21,7 @@ use super::configuration::{Flag, merge, refuse};
 use super::configured::{ConfiguredArgs, check_build, flag, integer, make_absolute, paths};
 use super::output::OutputArgs;
 use super::{TrainingPlan, cores, prepare_python, this_program, train_session, training_session};
+use crate::terminal::say;
 
 /// Runs created within one second get a number; this many mean that the clock is stuck.
 const SAME_SECOND_MAX: usize = 100;
@@ -116,6 +117,11 @@ pub(super) fn run(args: &TrainArgs) -> anyhow::Result<Outcome> {
     let manifest = Manifest::begin(init_from.map(|path| path.display().to_string()), session)?;
     let run = RunDirectory::create(&path, &config, &manifest)?;
     let lock = run.lock(Duration::ZERO)?;
+    if let Some(preset) = args.configured.automatic_preset(&args.task) {
+        say(&format!(
+            "preset {preset}, for goals with a sparse reward (--preset default: without it)"
+        ));
+    }
     train_session(TrainingPlan {
         program: this_program()?,
         run,
