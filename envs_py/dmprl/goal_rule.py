@@ -83,7 +83,7 @@ def proven(env: SegmentEnv) -> GoalRule:
         prove(rule, probe, length)
     except NoGoalRuleError:
         raise
-    except Exception as error:  # noqa: BLE001 - the user's code; without a rule, copies are made
+    except Exception as error:  # the user's code; without a rule, workers make copies
         raise NoGoalRuleError(f"{type(error).__name__}: {error}") from error
     return rule
 
@@ -100,7 +100,7 @@ def fit(env: SegmentEnv) -> GoalRule:
 
 def probe_of(env: SegmentEnv, length: int) -> Probe:
     """Returns a function that computes the outcomes of goals with ``env``."""
-    from dmprl.segment_env import GoalRows  # noqa: PLC0415 - that module imports this one
+    from dmprl.segment_env import GoalRows  # that module imports this one
 
     def probe(achieved: NDArray[np.float64], desired: NDArray[np.float64]) -> Outcomes:
         rows = GoalRows(len(achieved), length)

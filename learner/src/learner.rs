@@ -115,6 +115,9 @@ impl Learner {
         let layout = policy.layout();
         let regime = Regime::new(&config, &policy)?;
         let random = seeds::stream(config.run.seed, "replay", 0);
+        let replay_config = &config.replay;
+        let (strategy, share) = (replay_config.hindsight, replay_config.hindsight_share);
+        let hindsight = GoalSampler::new(spec.goal_rule.as_ref(), strategy, share);
         let replay_steps = regime.replay_steps(&config, layout.segment_steps);
         Ok(Self {
             expected: Expected {
@@ -127,15 +130,13 @@ impl Learner {
             },
             replay: Replay::new(layout, replay_steps, workers, envs),
             sampler: Sampler::new(config.algorithm.windows, random),
-            hindsight: GoalSampler::new(
-                spec.goal_rule.as_ref(),
-                config.replay.hindsight,
-                config.replay.hindsight_share,
-            ),
             normaliser: config.policy.normalise_observations.then(|| {
                 // The first update follows the warm-up; then each doubling of the observations.
-                Normaliser::new(layout.observation_len, config.exploration.warm_up_steps)
+                let first = config.exploration.warm_up_steps;
+                let normaliser = Normaliser::new(layout.observation_len, first);
+                if hindsight.is_some() { normaliser.bounded() } else { normaliser }
             }),
+            hindsight,
             counters: Counters::default(),
             collector: MetricsCollector::new(layout, workers, envs),
             snapshot: ParameterSnapshot {
