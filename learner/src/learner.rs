@@ -132,9 +132,7 @@ impl Learner {
             sampler: Sampler::new(config.algorithm.windows, random),
             normaliser: config.policy.normalise_observations.then(|| {
                 // The first update follows the warm-up; then each doubling of the observations.
-                let first = config.exploration.warm_up_steps;
-                let normaliser = Normaliser::new(layout.observation_len, first);
-                if hindsight.is_some() { normaliser.bounded() } else { normaliser }
+                Normaliser::new(layout.observation_len, config.exploration.warm_up_steps)
             }),
             hindsight,
             counters: Counters::default(),

@@ -17,9 +17,6 @@ use crate::update::network::TrainableNetwork;
 /// magnify the first deviation.
 const SCALE_MIN: f64 = 1e-4;
 
-/// Largest normalised deviation of a bounded normaliser.
-const DEVIATION_MAX: f64 = 10.0;
-
 /// Current mean and scale, with the running statistics of each dimension.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
@@ -32,9 +29,6 @@ pub struct Normaliser {
     seen_mean: Vec<f64>,
     /// Sum of squared differences from the mean (Welford 1962).
     seen_squares: Vec<f64>,
-    /// Smallest and largest value of each dimension so far; empty if deviations are not bounded.
-    #[serde(default)]
-    seen_ranges: Vec<[f32; 2]>,
     /// Number of observations at which mean and scale are updated.
     refresh_at: u64,
 }
@@ -49,19 +43,8 @@ impl Normaliser {
             count: 0,
             seen_mean: vec![0.0; observation_len],
             seen_squares: vec![0.0; observation_len],
-            seen_ranges: Vec::new(),
             refresh_at: first.max(1),
         }
-    }
-
-    /// Also scales so that no observation so far is more than `DEVIATION_MAX` from the mean.
-    ///
-    /// An object that is rarely touched has velocities and heights of 30 to 50 standard deviations.
-    /// Published hindsight clips these; a scale, unlike a clip, can be folded into the first layer.
-    #[must_use]
-    pub fn bounded(mut self) -> Self {
-        self.seen_ranges = vec![[0.0; 2]; self.mean.len()];
-        self
     }
 
     /// Returns the length O of the observations.
@@ -78,8 +61,6 @@ impl Normaliser {
         let seen = [&self.seen_mean, &self.seen_squares];
         self.scale.len() == len
             && seen.iter().all(|part| part.len() == len)
-            && [0, len].contains(&self.seen_ranges.len())
-            && self.seen_ranges.iter().flatten().all(|value| value.is_finite())
             && seen.into_iter().flatten().all(|value| value.is_finite())
             && self.seen_squares.iter().all(|&squares| squares >= 0.0)
             && self.mean.iter().all(|mean| mean.is_finite())
@@ -111,14 +92,7 @@ impl Normaliser {
         let share = 1.0 / self.count as f64;
         let seen = self.seen_mean.iter_mut().zip(&mut self.seen_squares);
         for (index, (mean, squares)) in seen.enumerate() {
-            let value = value(index);
-            if let Some([low, high]) = self.seen_ranges.get_mut(index) {
-                (*low, *high) = match self.count {
-                    1 => (value, value),
-                    _ => (low.min(value), high.max(value)),
-                };
-            }
-            let value = f64::from(value);
+            let value = f64::from(value(index));
             let before = value - *mean;
             *mean += before * share;
             *squares += before * (value - *mean);
@@ -152,12 +126,7 @@ impl Normaliser {
         self.refresh_at = 2 * self.count.max(1);
         let before = self.mean_and_scale();
         for (index, squares) in self.seen_squares.iter().enumerate() {
-            let mut scale = (squares / self.count.max(1) as f64).sqrt();
-            if let Some([low, high]) = self.seen_ranges.get(index).map(|range| range.map(f64::from))
-            {
-                let mean = self.seen_mean[index];
-                scale = scale.max((high - mean).max(mean - low) / DEVIATION_MAX);
-            }
+            let scale = (squares / self.count.max(1) as f64).sqrt();
             self.mean[index] = self.seen_mean[index] as f32;
             self.scale[index] = if scale < SCALE_MIN { 1.0 } else { scale as f32 };
         }
@@ -272,20 +241,6 @@ mod tests {
         // Mean 4, standard deviation sqrt(5); the second dimension is constant.
         let unit = 5.0_f32.sqrt();
         assert_close(&out, &[-3.0 / unit, 0.0, -1.0 / unit, 0.0, 1.0 / unit, 0.0, 3.0 / unit, 0.0]);
-    }
-
-    #[test]
-    fn a_bounded_normaliser_keeps_rare_values_within_its_limit() {
-        let seen: Vec<f32> = (0..1_000).map(|i| if i == 500 { 1.0 } else { 0.0 }).collect();
-        let largest = |mut normaliser: Normaliser| {
-            normaliser.observe(&seen);
-            normaliser.update();
-            let mut out = [0.0];
-            normaliser.apply_row(&[1.0], &mut out);
-            out[0]
-        };
-        assert!(largest(Normaliser::new(1, 1)) > 31.0);
-        assert!((largest(Normaliser::new(1, 1).bounded()) - 10.0).abs() < 1e-4);
     }
 
     #[test]

@@ -8,7 +8,7 @@ use thiserror::Error;
 
 use super::sample::{Sample, target_range};
 use crate::normaliser::Normaliser;
-use crate::replay::{GoalSampler, Replay, Sampler};
+use crate::replay::{Goal, GoalSampler, Replay, Sampler};
 
 /// The replay has no window to learn from.
 #[derive(Debug, Error)]
@@ -245,12 +245,11 @@ impl Batch {
         self.next_observations[rows.clone()].copy_from_slice(next);
         self.rewards[row] = match goal {
             None => replay.discounted_reward(window, rewards_discount),
-            Some((hindsight, goal)) => {
-                let rule = &hindsight.rule;
-                rule.set_desired(&mut self.observations[rows.clone()], goal);
-                rule.set_desired(&mut self.next_observations[rows], goal);
-                let goal = (rule, *goal);
-                replay.discounted_goal_reward(window, outcome.steps, goal, rewards_discount)
+            Some(goal) => {
+                let Goal { rule, values } = *goal;
+                rule.set_desired(&mut self.observations[rows.clone()], values);
+                rule.set_desired(&mut self.next_observations[rows], values);
+                replay.discounted_goal_reward(window, outcome.steps, *goal, rewards_discount)
             }
         };
         self.bootstrap[row] = if outcome.terminated { 0.0 } else { factor };

@@ -2,14 +2,14 @@
 
 use dmprl_shared::config::{AlgorithmConfig, AlgorithmName, Target};
 
-use crate::replay::{GoalSampler, Outcome, Replay, Sampler, Window};
+use crate::replay::{Goal, GoalSampler, Outcome, Replay, Sampler, Window};
 
 /// A window with the goal and the outcome that the batch takes.
 pub(super) struct Sample<'a> {
     pub(super) window: Window,
     pub(super) outcome: Outcome,
-    /// Another goal, (G,), with its rule, or `None` for the window's own.
-    pub(super) goal: Option<(&'a GoalSampler, &'a [f32])>,
+    /// Another goal, or `None` for the window's own.
+    pub(super) goal: Option<Goal<'a>>,
 }
 
 impl<'a> Sample<'a> {
@@ -23,8 +23,8 @@ impl<'a> Sample<'a> {
         let drawn = hindsight.and_then(|hindsight| {
             let row = hindsight.draw(replay, &window, sampler.random_mut())?;
             let goal = replay.achieved_goal(&hindsight.rule, row);
-            let outcome = replay.outcome(&window, &hindsight.rule, goal)?;
-            Some(Self { window, outcome, goal: Some((hindsight, goal)) })
+            let outcome = replay.outcome(&window, goal)?;
+            Some(Self { window, outcome, goal: Some(goal) })
         });
         drawn.unwrap_or_else(|| {
             let outcome = Outcome { steps: window.len(), terminated: window.terminated };

@@ -32,6 +32,15 @@ pub struct GoalRow {
     row: usize,
 }
 
+/// A goal in place of a window's own.
+#[derive(Debug, Clone, Copy)]
+pub struct Goal<'a> {
+    /// The environment's rule.
+    pub rule: &'a GoalRule,
+    /// The goal, (G,).
+    pub values: &'a [f32],
+}
+
 /// The part of a window that is a sample.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Outcome {
@@ -81,16 +90,17 @@ impl GoalSampler {
 }
 
 impl Replay {
-    /// Returns the goal that was achieved in a row, (G,).
+    /// Returns the goal that was achieved in a row.
     #[must_use]
-    pub fn achieved_goal(&self, rule: &GoalRule, row: GoalRow) -> &[f32] {
-        rule.achieved(self.observation_row(row.slot, row.row))
+    pub fn achieved_goal<'a>(&'a self, rule: &'a GoalRule, row: GoalRow) -> Goal<'a> {
+        Goal { rule, values: rule.achieved(self.observation_row(row.slot, row.row)) }
     }
 
     /// Returns the outcome of a window with another goal, or `None` if the window cannot have it.
     #[must_use]
-    pub fn outcome(&self, window: &Window, rule: &GoalRule, goal: &[f32]) -> Option<Outcome> {
-        let reaches = |steps: &usize| rule.ends(self.goal_distance(window, *steps, rule, goal));
+    pub fn outcome(&self, window: &Window, goal: Goal<'_>) -> Option<Outcome> {
+        let rule = goal.rule;
+        let reaches = |steps: &usize| rule.ends(self.goal_distance(window, *steps, goal));
         if let Some(steps) = (1..=window.len()).find(reaches) {
             return Some(Outcome { steps, terminated: true });
         }
@@ -109,17 +119,17 @@ impl Replay {
         &self,
         window: &Window,
         steps: usize,
-        goal: (&GoalRule, &[f32]),
+        goal: Goal<'_>,
         discount: f32,
     ) -> f32 {
-        let (rule, goal) = goal;
-        let reward = |step| rule.reward(self.goal_distance(window, step, rule, goal));
+        let reward = |step| goal.rule.reward(self.goal_distance(window, step, goal));
         (1..=steps).rev().fold(0.0, |sum, step| reward(step) + discount * sum)
     }
 
-    /// Returns the distance to `goal` after `steps` steps of the window.
-    fn goal_distance(&self, window: &Window, steps: usize, rule: &GoalRule, goal: &[f32]) -> f64 {
-        rule.distance(rule.achieved(self.observation_after(window, steps)), goal)
+    /// Returns the distance to the goal after `steps` steps of the window.
+    fn goal_distance(&self, window: &Window, steps: usize, goal: Goal<'_>) -> f64 {
+        let Goal { rule, values } = goal;
+        rule.distance(rule.achieved(self.observation_after(window, steps)), values)
     }
 }
 
@@ -184,7 +194,7 @@ mod tests {
         let mut random = dmprl_shared::seeds::stream(1, "test", 0);
         let rows = (0..400).filter_map(|_| goals.draw(replay, &window, &mut random));
         let set: BTreeSet<u32> =
-            rows.map(|row| replay.achieved_goal(&goals.rule, row)[0] as u32).collect();
+            rows.map(|row| replay.achieved_goal(&goals.rule, row).values[0] as u32).collect();
         set.into_iter().map(|goal| goal as f32).collect()
     }
 
@@ -244,10 +254,11 @@ mod tests {
         episode(&mut replay, 10.0, 6, TRUNCATED);
         let window = replay.window(0, 1).unwrap(); // achieves 12, 13 and 14
         let rule = rule(None);
-        let outcome = replay.outcome(&window, &rule, &[13.0]).unwrap();
+        let goal = Goal { rule: &rule, values: &[13.0] };
+        let outcome = replay.outcome(&window, goal).unwrap();
         assert_eq!(outcome, Outcome { steps: 3, terminated: false });
         // -1 + 0.5 * 0 - 0.25
-        assert_eq!(replay.discounted_goal_reward(&window, 3, (&rule, &[13.0]), 0.5), -1.25);
+        assert_eq!(replay.discounted_goal_reward(&window, 3, goal, 0.5), -1.25);
     }
 
     #[test]
@@ -256,7 +267,8 @@ mod tests {
         episode(&mut replay, 86.0, 4, TERMINATED); // at its own goal, 90
         let rule = rule(Some(0.5));
         let outcome = |slot, offset, goal: f32| {
-            replay.outcome(&replay.window(slot, offset).unwrap(), &rule, &[goal])
+            let goal = Goal { rule: &rule, values: &[goal] };
+            replay.outcome(&replay.window(slot, offset).unwrap(), goal)
         };
         assert_eq!(outcome(0, 0, 88.0), Some(Outcome { steps: 2, terminated: true }));
         // With another goal the episode would have gone on after its last step.
@@ -270,8 +282,8 @@ mod tests {
     fn an_end_for_another_reason_than_the_goal_remains() {
         let mut replay = Replay::new(LAYOUT, 300, 1, 1);
         episode(&mut replay, 10.0, 4, TERMINATED); // far from its own goal
-        let outcome =
-            replay.outcome(&replay.window(0, 2).unwrap(), &rule(Some(0.5)), &[50.0]).unwrap();
+        let goal = Goal { rule: &rule(Some(0.5)), values: &[50.0] };
+        let outcome = replay.outcome(&replay.window(0, 2).unwrap(), goal).unwrap();
         assert_eq!(outcome, Outcome { steps: 2, terminated: true });
     }
 

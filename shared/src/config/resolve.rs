@@ -65,6 +65,7 @@ impl ExperimentConfig {
         }
         self.check_counts()?;
         self.check_numbers()?;
+        self.check_goals()?;
         self.check_dmp()?;
         self.check_combinations()?;
         self.check_ndp()?;
@@ -205,13 +206,6 @@ impl ExperimentConfig {
         for (key, got) in unit {
             range(key, got, got > 0.0 && got <= 1.0, || "above 0, at most 1".into())?;
         }
-        let shares = [
-            ("replay.hindsight_share", self.replay.hindsight_share),
-            ("exploration.random_segments", self.exploration.random_segments),
-        ];
-        for (key, got) in shares {
-            range(key, got, (0.0..=1.0).contains(&got), || "from 0 to 1".into())?;
-        }
         for (key, std) in [
             ("exploration.std", self.exploration.std),
             ("algorithm.td3.target_noise_std", self.algorithm.td3.target_noise_std),
@@ -226,6 +220,26 @@ impl ExperimentConfig {
         range(key, entropy, entropy.is_finite(), || "a finite number".into())?;
         let minutes = self.run.max_minutes;
         range("run.max_minutes", minutes, minutes > 0.0, || "above 0 (inf: no limit)".into())
+    }
+
+    fn check_goals(&self) -> Result<(), ConfigError> {
+        let random = self.exploration.random_segments;
+        let shares = [
+            ("replay.hindsight_share", self.replay.hindsight_share),
+            ("exploration.random_segments", random),
+        ];
+        for (key, got) in shares {
+            range(key, got, (0.0..=1.0).contains(&got), || "from 0 to 1".into())?;
+        }
+        let carry = self.policy.kind == PolicyKind::Dmp && self.policy.start == Start::Carry;
+        range("exploration.random_segments", random, !carry || random == 0.0, || {
+            "0 with policy.start = \"carry\", because random actions leave y undefined".into()
+        })?;
+        let on_policy = self.algorithm.name == AlgorithmName::Ndp;
+        range("exploration.random_segments", random, !on_policy || random == 0.0, || {
+            "0 with algorithm.name = \"ndp\", which learns only from actions of its own policy"
+                .into()
+        })
     }
 
     fn check_dmp(&self) -> Result<(), ConfigError> {
@@ -274,10 +288,6 @@ impl ExperimentConfig {
             "dmp_parameters with policy.start = \"carry\", because uniform actions leave y \
              undefined during the warm-up"
                 .into()
-        })?;
-        let random = self.exploration.random_segments;
-        range("exploration.random_segments", random, !carry || random == 0.0, || {
-            "0 with policy.start = \"carry\", because random actions leave y undefined".into()
         })?;
         let demonstrated = !self.demonstrations.files.is_empty();
         range("policy.start", "carry", !(carry && demonstrated), || {
@@ -349,11 +359,6 @@ impl ExperimentConfig {
         let layer_norm = self.algorithm.critic_layer_norm;
         range("algorithm.critic_layer_norm", "true", !on_policy || !layer_norm, || {
             "false with algorithm.name = \"ndp\"; only ddpg, td3 and sac support it".into()
-        })?;
-        let random = self.exploration.random_segments;
-        range("exploration.random_segments", random, !on_policy || random == 0.0, || {
-            "0 with algorithm.name = \"ndp\", which learns only from actions of its own policy"
-                .into()
         })?;
         let penalty = self.algorithm.action_rate_penalty;
         range("algorithm.action_rate_penalty", penalty, !on_policy || penalty == 0.0, || {
@@ -443,6 +448,8 @@ mod tests {
             ("algorithm.discount", "1.5"),
             ("algorithm.polyak", "nan"),
             ("algorithm.action_rate_penalty", "-0.1"),
+            ("replay.hindsight_share", "1.1"),
+            ("exploration.random_segments", "-0.1"),
             ("actors.workers", "1000000"),
             ("actors.env_call_timeout_s", "0"),
             ("actors.env_call_timeout_s", "inf"),
