@@ -157,7 +157,7 @@ fn describe_hindsight(
     supervisor: &dyn Supervisor,
 ) {
     let is_off = config.replay.hindsight == Hindsight::None;
-    let message = match (&environments.spec().goal_rule, environments.missing_rule()) {
+    let message = match (environments.spec().goal_rule.as_deref(), environments.missing_rule()) {
         (Some(GoalRule { reward: GoalReward::Sparse { threshold, .. }, .. }), _) => format!(
             "hindsight draws goals for each batch; a goal is reached within {threshold} of it"
         ),

@@ -117,7 +117,7 @@ impl Learner {
         let random = seeds::stream(config.run.seed, "replay", 0);
         let replay_config = &config.replay;
         let (strategy, share) = (replay_config.hindsight, replay_config.hindsight_share);
-        let hindsight = GoalSampler::new(spec.goal_rule.as_ref(), strategy, share);
+        let hindsight = GoalSampler::new(spec.goal_rule.as_deref(), strategy, share);
         let replay_steps = regime.replay_steps(&config, layout.segment_steps);
         Ok(Self {
             expected: Expected {

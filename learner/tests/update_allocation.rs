@@ -29,7 +29,7 @@ fn spec() -> EnvSpec {
         control_dt_s: 0.05,
         episode_steps: 50,
         observation_names: Vec::new(),
-        goal_rule: Some(GoalRule {
+        goal_rule: Some(Box::new(GoalRule {
             achieved: 0,
             desired: 3,
             goal_len: 3,
@@ -37,7 +37,7 @@ fn spec() -> EnvSpec {
             norm: Norm::Euclidean,
             reward: GoalReward::Sparse { threshold: 0.05, reached: 0.0, missed: -1.0 },
             ends_within: None,
-        }),
+        })),
     }
 }
 

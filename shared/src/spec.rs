@@ -29,7 +29,7 @@ pub struct EnvSpec {
     pub observation_names: Vec<String>,
     /// Rewards for other goals, if the run uses hindsight and the environment follows a rule.
     #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub goal_rule: Option<GoalRule>,
+    pub goal_rule: Option<Box<GoalRule>>,
 }
 
 /// Why an environment cannot be used.

@@ -90,7 +90,7 @@ impl PythonEnvironments {
         });
         drop(call);
         match found {
-            Ok(rule) => self.spec.goal_rule = Some(rule),
+            Ok(rule) => self.spec.goal_rule = Some(Box::new(rule)),
             Err(error) => {
                 let error = Python::attach(|py| PythonError::exception(py, &error));
                 match error {
