@@ -5,7 +5,7 @@ use std::io;
 use std::path::Path;
 use std::time::Duration;
 
-use dmprl_shared::config::ExperimentConfig;
+use dmprl_shared::config::{ExperimentConfig, Hindsight};
 use dmprl_shared::supervision::{Report, Supervisor};
 use thiserror::Error;
 use tracing::info;
@@ -33,10 +33,12 @@ pub fn interpreter(venv: &Path, config: &ExperimentConfig) -> Result<Interpreter
     Interpreter::start(&InterpreterOptions { venv: venv.to_owned(), python_path })
 }
 
-/// Creates `count` environments of the run's task and watches every call into them.
+/// Creates `count` environments of the run's task and watches every call into them. With hindsight,
+/// it also looks for their goal rule.
 ///
 /// # Errors
-/// If the environments cannot be created or the watchdog cannot be started.
+/// If the environments cannot be created, the watchdog cannot be started, or hindsight is
+/// configured and they have no goals.
 pub fn make(
     interpreter: &Interpreter,
     config: &ExperimentConfig,
@@ -44,8 +46,11 @@ pub fn make(
     on_hang: impl FnOnce(String) + Send + 'static,
 ) -> Result<PythonEnvironments, EnvironmentsError> {
     let steps = config.policy.decision_steps();
-    let environments = PythonEnvironments::start(interpreter, &config.task, count, steps)?;
+    let mut environments = PythonEnvironments::start(interpreter, &config.task, count, steps)?;
     watch(&environments, config, on_hang)?;
+    if config.replay.hindsight != Hindsight::None {
+        environments.find_goal_rule()?;
+    }
     Ok(environments)
 }
 

@@ -41,13 +41,43 @@ impl Exploration {
     /// Draws random actions `u` for a segment, without the policy.
     pub fn warm_up(&mut self, runner: &mut PolicyRunner) {
         let range = self.config.warm_up_range as f32;
+        if self.config.warm_up_kind == WarmUpKind::Segment {
+            let segment = runner.policy.layout().actions_len();
+            runner.u.chunks_exact_mut(segment).for_each(|u| self.hold_random(u, range));
+            return;
+        }
         let random = &mut self.random;
         let mut draw = |values: &mut [f32]| {
             values.iter_mut().for_each(|value| *value = random.random_range(-range..=range));
         };
         match self.config.warm_up_kind {
-            WarmUpKind::Uniform => draw(&mut runner.u),
             WarmUpKind::DmpParameters => runner.decode_drawn(&mut draw),
+            _ => draw(&mut runner.u),
+        }
+    }
+
+    /// Fills a segment's actions, (K, A), with one uniform action.
+    fn hold_random(&mut self, u: &mut [f32], range: f32) {
+        let dims = self.held.len();
+        for d in 0..dims {
+            let action = self.random.random_range(-range..=range);
+            u.iter_mut().skip(d).step_by(dims).for_each(|u| *u = action);
+        }
+    }
+
+    /// Converts the network's outputs to `u` with noise, within [-1, 1], and replaces the share
+    /// `exploration.random_segments` of the segments by random ones.
+    pub fn explore(&mut self, runner: &mut PolicyRunner) {
+        self.perturb(runner);
+        let share = self.config.random_segments;
+        if share == 0.0 {
+            return;
+        }
+        let segment = runner.policy.layout().actions_len();
+        for u in runner.u.chunks_exact_mut(segment) {
+            if self.random.random_bool(share) {
+                self.hold_random(u, 1.0);
+            }
         }
     }
 
@@ -55,7 +85,7 @@ impl Exploration {
     ///
     /// A Gaussian policy draws from its own distribution; the configured noise then has no effect.
     /// If its standard deviations are learned parameters, its actions are not bounded.
-    pub fn explore(&mut self, runner: &mut PolicyRunner) {
+    fn perturb(&mut self, runner: &mut PolicyRunner) {
         if !runner.std.is_empty() {
             runner.decode();
             self.draw_unbounded(runner);
@@ -196,6 +226,7 @@ mod tests {
             id: "Test-v0".into(),
             observation_len: 4,
             observation_names: Vec::new(),
+            goal_rule: None,
             action_len: DIMS,
             action_low: vec![-1.0; DIMS],
             action_high: vec![1.0; DIMS],
@@ -285,6 +316,46 @@ mod tests {
             assert!(largest <= range && largest > 0.95 * range, "{kind}: {largest} of {range}");
             assert!(runner.u.windows(2).all(|pair| pair[0] != pair[1]));
         }
+    }
+
+    /// Returns which segments hold one action over all steps.
+    fn held(runner: &PolicyRunner) -> Vec<bool> {
+        let segments = runner.u.chunks_exact(K * DIMS);
+        segments.map(|u| (DIMS..K * DIMS).all(|i| u[i] == u[i - DIMS])).collect()
+    }
+
+    #[test]
+    fn a_share_of_the_segments_is_random_and_held_over_the_full_range() {
+        let keys = [("exploration.random_segments", "0.3"), ("exploration.std", "0.0")];
+        let (mut runner, mut exploration) = scene(&keys);
+        runner.decode();
+        let clean = runner.u.clone();
+        let (mut count, mut largest) = (0, 0.0_f32);
+        for _ in 0..20 {
+            exploration.explore(&mut runner);
+            for (env, held) in held(&runner).into_iter().enumerate() {
+                let segment = env * K * DIMS..(env + 1) * K * DIMS;
+                assert!(held || runner.u[segment.clone()] == clean[segment.clone()]);
+                if held {
+                    count += 1;
+                    let u = &runner.u[segment];
+                    assert!(u[0] != u[1], "one draw for all dimensions");
+                    largest = u.iter().fold(largest, |largest, u| largest.max(u.abs()));
+                }
+            }
+        }
+        // Binomial(4000, 0.3) has standard deviation 29; five of them are allowed.
+        assert!(1200_usize.abs_diff(count) < 145, "{count}");
+        assert!((0.95..=1.0).contains(&largest), "{largest}");
+    }
+
+    #[test]
+    fn warm_up_by_segments_holds_each_action_within_its_range() {
+        let keys = [("exploration.warm_up_kind", "segment"), ("exploration.warm_up_range", "0.5")];
+        let (mut runner, mut exploration) = scene(&keys);
+        exploration.warm_up(&mut runner);
+        assert_eq!(held(&runner), [true; ENVS]);
+        assert!(runner.u.iter().all(|u| u.abs() <= 0.5) && runner.u[0] != runner.u[K * DIMS]);
     }
 
     #[test]

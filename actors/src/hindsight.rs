@@ -1,9 +1,11 @@
 //! Stage 3 of 8, hindsight: copies an episode's segments with goals that the episode reached
-//! (Andrychowicz et al. 2017, strategy `future`).
+//! (Andrychowicz et al. 2017).
 //!
-//! Called by the rollout at the end of each episode. Only the environment can compute the rewards
-//! for another goal, so the worker creates the copies, with one call into Python. A copy is one
-//! decision: up to K steps with one goal, which the episode reached in or after these steps.
+//! Called by the rollout at the end of each episode, for environments whose rewards follow no goal
+//! rule (`dmprl_shared::goal_rule`). Only such an environment itself can compute the rewards for
+//! another goal, so the worker creates the copies, with one call into Python. A copy is one
+//! decision: up to K steps with one goal, which the episode reached in or after these steps. With a
+//! rule, the learner draws goals itself.
 //!
 //! Differences from Andrychowicz et al., Algorithm 1:
 //! 1. A goal is drawn for a segment of K steps, not for a step; K = 1 is the published algorithm.
@@ -25,6 +27,7 @@ use crate::rollout::SegmentMeta;
 pub(crate) struct Hindsight {
     layout: SegmentLayout,
     goals: Goals,
+    strategy: Strategy,
     copies: usize,
     sliding: bool,
     random: Stream,
@@ -82,7 +85,8 @@ pub(crate) struct EpisodeSegment<'a> {
 }
 
 impl Hindsight {
-    /// Creates the records; returns `None` if the configuration disables hindsight.
+    /// Creates the records; returns `None` if the configuration disables hindsight or the learner
+    /// draws the goals.
     ///
     /// # Errors
     /// `NoGoals` if the environments have no goals, or their episodes have no time limit.
@@ -92,7 +96,8 @@ impl Hindsight {
         layout: SegmentLayout,
         worker: u64,
     ) -> Result<Option<Self>, PythonError> {
-        if config.replay.hindsight == Strategy::None {
+        let has_rule = environments.spec().goal_rule.is_some();
+        if config.replay.hindsight == Strategy::None || has_rule {
             return Ok(None);
         }
         let goals = environments.goals()?;
@@ -115,6 +120,7 @@ impl Hindsight {
         Ok(Some(Self {
             layout,
             goals,
+            strategy: config.replay.hindsight,
             copies: config.replay.hindsight_copies,
             sliding: config.algorithm.windows == Windows::Sliding,
             random: seeds::stream(config.run.seed, "hindsight", worker),
@@ -198,7 +204,12 @@ impl Hindsight {
                     first = first.min(episode.steps.saturating_sub(steps_max));
                 }
                 let len = (episode.steps - first).min(steps_max);
-                let goal = self.random.random_range(first + 1..=episode.steps);
+                let earliest = match self.strategy {
+                    Strategy::Final => episode.steps,
+                    Strategy::Episode => 1,
+                    _ => first + 1,
+                };
+                let goal = self.random.random_range(earliest..=episode.steps);
                 let policy_version = segment.policy_version;
                 self.drawn.push(Draw { first, len, goal, policy_version, row });
                 row += len;

@@ -9,6 +9,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
 use dmprl_shared::config::{ExperimentConfig, Hindsight};
+use dmprl_shared::goal_rule::{GoalReward, GoalRule};
 use dmprl_shared::seeds;
 use dmprl_shared::supervision::{Activity, Report, ReportError, Supervisor};
 use dmprl_shared::transport::delivery::{Outbox, Sent};
@@ -99,7 +100,7 @@ pub fn run<T: WorkerTransport>(
     let Worker { config, identity, environments, observer, joined } = worker;
     supervisor.report(&Report::EnvironmentReady { spec: environments.spec().clone() })?;
     if identity.seed_index == 0 && identity.incarnation == 0 {
-        suggest_hindsight(config, &environments, supervisor);
+        describe_hindsight(config, &environments, supervisor);
     }
     let mut rollout = Rollout::start(config, environments, identity)?;
     let plan = Plan::new(config, identity.run_id, rollout.policy());
@@ -148,19 +149,31 @@ fn work<T: WorkerTransport>(
     Ok(())
 }
 
-/// Suggests hindsight if the reward is sparse, because random exploration rarely reaches the goal.
-fn suggest_hindsight(
+/// Tells the user where hindsight takes its rewards from. Without hindsight, suggests it if the
+/// reward is sparse, because random exploration rarely reaches the goal.
+fn describe_hindsight(
     config: &ExperimentConfig,
     environments: &PythonEnvironments,
     supervisor: &dyn Supervisor,
 ) {
     let is_off = config.replay.hindsight == Hindsight::None;
-    if is_off && environments.goals().is_ok_and(|goals| goals.is_sparse) {
-        let message = "the reward is sparse: it only depends on whether the goal is reached. With \
-                       --set replay.hindsight=future the run also learns from goals reached by \
-                       chance";
-        supervisor.warn(message.to_owned());
-    }
+    let message = match (environments.spec().goal_rule.as_deref(), environments.missing_rule()) {
+        (Some(GoalRule { reward: GoalReward::Sparse { threshold, .. }, .. }), _) => format!(
+            "hindsight draws goals for each batch; a goal is reached within {threshold} of it"
+        ),
+        (Some(_), _) => "hindsight draws goals for each batch, with rewards by distance".to_owned(),
+        (None, Some(reason)) => format!(
+            "hindsight: workers make copies, because the reward follows no known rule: {reason}"
+        ),
+        (None, None) if is_off && environments.goals().is_ok_and(|goals| goals.is_sparse) => {
+            "the reward is sparse: it only depends on whether the goal is reached. With --preset \
+             goal (or --set replay.hindsight=future) the run also learns from goals reached by \
+             chance"
+                .to_owned()
+        }
+        _ => return,
+    };
+    supervisor.warn(message);
 }
 
 fn await_first_policy<T: WorkerTransport>(

@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 
 from dmprl import robotics_repair
 from dmprl.env_options import NO_OPTIONS, EnvOptions
+from dmprl.goal_rule import GoalRule
 from dmprl.hindsight import GymnasiumGoals
 from dmprl.observation_names import names_of
 from dmprl.segment_env import (
@@ -232,6 +233,14 @@ class GymnasiumSegmentEnv(SegmentEnv):
 
     def relabel(self, rows: GoalRows) -> None:  # noqa: D102 - inherited
         self._goals.relabel(self._envs[0], rows)
+
+    def goal_rule(self) -> GoalRule | None:
+        """Returns the environment's own ``goal_rule``, an attribute or a method, or finds one."""
+        env = self._envs[0]
+        if not env.has_wrapper_attr("goal_rule"):
+            return super().goal_rule()
+        declared = env.get_wrapper_attr("goal_rule")
+        return declared() if callable(declared) else declared
 
     def close(self) -> None:  # noqa: D102 - inherited
         for env in self._envs:

@@ -16,7 +16,9 @@ from typing import NotRequired, TypedDict
 import numpy as np
 from numpy.typing import NDArray
 
+from dmprl import goal_rule
 from dmprl.env_options import NO_OPTIONS, EnvOptions
+from dmprl.goal_rule import GoalRule
 
 SUCCESS_NO, SUCCESS_YES, SUCCESS_NOT_REPORTED = 0, 1, 2
 """Values of :attr:`SegmentBuffers.success`."""
@@ -196,6 +198,17 @@ class SegmentEnv(ABC):
         does not raise an exception.
         """
         raise NotImplementedError
+
+    def goal_rule(self) -> GoalRule | None:
+        """Returns the rule by which goals are rewarded, so that the learner needs no copies.
+
+        The default finds one by probing :meth:`relabel`. Override it to declare a rule, or to
+        return None: rewards then always come from :meth:`relabel`. A rule is proven before use.
+
+        Raises:
+            NoGoalRuleError: if none is found.
+        """
+        return goal_rule.fit(self)
 
     def close(self) -> None:  # noqa: B027 - nothing to release is the usual case
         """Releases the environments' resources."""

@@ -288,6 +288,41 @@ class ReachFar(Reach):
         return -np.abs(achieved_goal - desired_goal)[..., 0]
 
 
+class ReachByHand(Reach):
+    """Like :class:`Reach`, but declares ``goal_rule``."""
+
+    def __init__(self, declared=None, **kwargs):
+        super().__init__(**kwargs)
+        self.goal_rule = declared
+
+
+class ReachInBox(gymnasium.Env):
+    """Three-dimensional goals, of which the third does not count, rewarded by the largest entry."""
+
+    action_space = ACTION
+    observation_space = spaces.Dict(
+        {
+            name: spaces.Box(-np.inf, np.inf, (3,), np.float32)
+            for name in ("achieved_goal", "desired_goal")
+        }
+    )
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        return self.observation_space.sample(), {}
+
+    def compute_reward(self, achieved_goal, desired_goal, info):
+        far = np.abs(achieved_goal - desired_goal)[..., :2].max(axis=-1) > 0.25
+        return np.where(far, 0.0, 10.0)
+
+
+class ReachTwisted(ReachInBox):
+    """Rewards by the distance of the goals' squares, which follows no known rule."""
+
+    def compute_reward(self, achieved_goal, desired_goal, info):
+        return -np.abs(achieved_goal**2 - desired_goal**2).sum(axis=-1)
+
+
 class FaultyReach(Reach):
     """Fails in its 12th step, and is then recreated."""
 
@@ -413,6 +448,15 @@ register("ReachNan", Reach, kwargs={"fault": True}, max_episode_steps=12)
 register("ReachTimeless", Reach)
 register("ReachFar", ReachFar, max_episode_steps=12)
 register("FaultyReach", FaultyReach, max_episode_steps=20)
+SPARSE = {"norm": "euclidean", "threshold": 0.5, "reached": 0.0, "missed": -1.0}
+for name, declared in (
+    ("Declared", SPARSE),
+    ("Wrong", {**SPARSE, "threshold": 0.51}),
+    ("Undeclared", None),
+):
+    register(f"Reach{name}", ReachByHand, kwargs={"declared": declared}, max_episode_steps=12)
+register("ReachInBox", ReachInBox, max_episode_steps=12)
+register("ReachTwisted", ReachTwisted, max_episode_steps=12)
 register("Discrete", Spaces, kwargs={"action": spaces.Discrete(3)})
 register("Unbounded", Spaces, kwargs={"action": spaces.Box(-np.inf, np.inf, (2,))})
 register("Image", Spaces, kwargs={"observation": spaces.Box(0, 255, (8, 8, 3), np.uint8)})

@@ -6,6 +6,7 @@ import gymnasium
 import numpy as np
 import panda_gym  # noqa: F401 - registers its tasks
 
+from dmprl.goal_rule import proven
 from dmprl.segment_env import GoalRows, SegmentBuffers, make
 
 REACH = ("PandaReach-v3", "PandaReachDense-v3", "PandaReachJoints-v3", "PandaReachJointsDense-v3")
@@ -72,6 +73,17 @@ class PandaGymTest(unittest.TestCase):
             steps = np.where(out.terminated, 0, steps + 1)
             self.assertLess(steps.max(), 10)
         env.close()
+
+    def test_rules_of_panda_gym_are_proven_with_their_end(self):
+        euclidean = {"norm": "euclidean", "components": [0, 1, 2], "ends_within": 0.05}
+        sparse = {**euclidean, "threshold": 0.05, "reached": 0.0, "missed": -1.0}
+        for task_id, rule in (
+            ("PandaReach-v3", sparse),
+            ("PandaReachDense-v3", {**euclidean, "factor": -1.0}),
+        ):
+            env, _ = started(task_id, 1, 5)
+            self.assertEqual(proven(env), rule)
+            env.close()
 
     def test_relabelling_with_the_same_goals_does_not_change_an_episode(self):
         env, out = started("PandaReach-v3", 2, 5)

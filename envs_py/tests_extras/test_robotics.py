@@ -6,6 +6,7 @@ import unittest
 
 import numpy as np
 
+from dmprl.goal_rule import proven
 from dmprl.segment_env import GoalRows, SegmentBuffers, make
 
 
@@ -56,6 +57,14 @@ class FetchTest(unittest.TestCase):
             [sys.executable, "-W", "ignore", "-c", code], capture_output=True, text=True, check=True
         )
         self.assertEqual(result.stdout.strip(), "16")
+
+    def test_rules_of_fetch_are_proven(self):
+        euclidean = {"norm": "euclidean", "components": [0, 1, 2], "ends_within": None}
+        sparse = {**euclidean, "threshold": 0.05, "reached": 0.0, "missed": -1.0}
+        self.assertEqual(proven(started("FetchPush-v4", 1, 5)[0]), sparse)
+        self.assertEqual(
+            proven(started("FetchPickAndPlaceDense-v4", 1, 5)[0]), {**euclidean, "factor": -1.0}
+        )
 
     def test_relabelling_with_the_same_goals_does_not_change_an_episode(self):
         env, out = started("FetchReach-v4", 2, 5)

@@ -25,6 +25,7 @@ fn learner(gigabytes: f64) -> Learner {
         control_dt_s: 0.05,
         episode_steps: 100,
         observation_names: Vec::new(),
+        goal_rule: None,
     };
     let sizes = Learner::new(Layers::new().finish().expect("defaults"), &spec, 1);
     let layout = sizes.expect("a learner").policy().layout();

@@ -99,6 +99,7 @@ fn config(threads: &str, precision: &str, norm: &str) -> (ExperimentConfig, EnvS
         control_dt_s: 0.05,
         episode_steps: 100,
         observation_names: Vec::new(),
+        goal_rule: None,
     };
     (layers.finish().expect("a valid configuration"), spec)
 }

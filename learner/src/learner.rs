@@ -22,7 +22,7 @@ use crate::metrics::{DeliveryLine, MetricsCollector, MetricsLine, Rejected};
 use crate::normaliser::Normaliser;
 use crate::off_policy::{CloningLosses, UpdateProgress};
 use crate::regime::Regime;
-use crate::replay::{Replay, Sampler};
+use crate::replay::{GoalSampler, Replay, Sampler};
 use crate::update::network::TrainableNetwork;
 
 pub use crate::error::LearnerError;
@@ -86,6 +86,8 @@ pub struct Learner {
     pub replay: Replay,
     /// Draws windows from the replay. Its random stream also serves on-policy algorithms.
     pub sampler: Sampler,
+    /// Draws goals for windows, if hindsight is configured and the environment has a goal rule.
+    pub hindsight: Option<GoalSampler>,
     /// Observation normalisation, if it is configured.
     pub normaliser: Option<Normaliser>,
     /// Progress of the run.
@@ -113,6 +115,9 @@ impl Learner {
         let layout = policy.layout();
         let regime = Regime::new(&config, &policy)?;
         let random = seeds::stream(config.run.seed, "replay", 0);
+        let replay_config = &config.replay;
+        let (strategy, share) = (replay_config.hindsight, replay_config.hindsight_share);
+        let hindsight = GoalSampler::new(spec.goal_rule.as_deref(), strategy, share);
         let replay_steps = regime.replay_steps(&config, layout.segment_steps);
         Ok(Self {
             expected: Expected {
@@ -129,6 +134,7 @@ impl Learner {
                 // The first update follows the warm-up; then each doubling of the observations.
                 Normaliser::new(layout.observation_len, config.exploration.warm_up_steps)
             }),
+            hindsight,
             counters: Counters::default(),
             collector: MetricsCollector::new(layout, workers, envs),
             snapshot: ParameterSnapshot {
@@ -188,11 +194,11 @@ impl Learner {
         if self.normaliser.as_ref().is_some_and(Normaliser::is_due) {
             self.update_normaliser()?;
         }
-        let Self { config, policy, regime, replay, sampler, counters, .. } = self;
-        let normaliser = self.normaliser.as_ref();
+        let Self { config, policy, regime, replay, sampler, hindsight, counters, .. } = self;
+        let (normaliser, hindsight) = (self.normaliser.as_ref(), hindsight.as_ref());
         match regime {
             Regime::OffPolicy(off_policy) => {
-                let source = SampleSource { replay, sampler, normaliser };
+                let source = SampleSource { replay, sampler, hindsight, normaliser };
                 let (update, env_steps) = (counters.updates + 1, counters.env_steps);
                 let progress = UpdateProgress { update, env_steps };
                 let losses = off_policy.update(config, policy, source, progress)?;
@@ -260,12 +266,15 @@ impl Learner {
             demonstration.insert_into(&mut self.replay)?;
             if let Some(normaliser) = &mut self.normaliser {
                 normaliser.observe(&demonstration.observations);
+                if let Some(goals) = &self.hindsight {
+                    normaliser.observe_relabelled(&demonstration.observations, &goals.rule);
+                }
             }
         }
         self.update_normaliser()?;
         let Self { config, policy, regime, replay, sampler, .. } = self;
         let normaliser = self.normaliser.as_ref();
-        let source = SampleSource { replay, sampler, normaliser };
+        let source = SampleSource { replay, sampler, hindsight: None, normaliser };
         match regime {
             Regime::OffPolicy(off_policy) => {
                 let updates = config.demonstrations.cloning_updates;
@@ -397,6 +406,7 @@ pub(crate) mod tests {
             control_dt_s: 0.02,
             episode_steps: 10,
             observation_names: Vec::new(),
+            goal_rule: None,
         }
     }
 }

@@ -7,6 +7,7 @@
 
 use std::borrow::Cow;
 
+use dmprl_shared::goal_rule::GoalRule;
 use dmprl_shared::policy::MlpShape;
 use serde::{Deserialize, Serialize};
 
@@ -70,14 +71,31 @@ impl Normaliser {
     /// Adds observations, (rows, O), to the statistics.
     pub fn observe(&mut self, observations: &[f32]) {
         for row in observations.chunks_exact(self.mean.len()) {
-            self.count += 1;
-            let share = 1.0 / self.count as f64;
-            let seen = self.seen_mean.iter_mut().zip(&mut self.seen_squares);
-            for ((mean, squares), value) in seen.zip(row) {
-                let before = f64::from(*value) - *mean;
-                *mean += before * share;
-                *squares += before * (f64::from(*value) - *mean);
-            }
+            self.observe_row(|index| row[index]);
+        }
+    }
+
+    /// Adds observations, (rows, O), with the achieved goals in place of the desired ones.
+    pub fn observe_relabelled(&mut self, observations: &[f32], rule: &GoalRule) {
+        let desired = rule.desired..rule.desired + rule.goal_len;
+        for row in observations.chunks_exact(self.mean.len()) {
+            let achieved = rule.achieved(row);
+            self.observe_row(|index| match desired.contains(&index) {
+                true => achieved[index - desired.start],
+                false => row[index],
+            });
+        }
+    }
+
+    fn observe_row(&mut self, value: impl Fn(usize) -> f32) {
+        self.count += 1;
+        let share = 1.0 / self.count as f64;
+        let seen = self.seen_mean.iter_mut().zip(&mut self.seen_squares);
+        for (index, (mean, squares)) in seen.enumerate() {
+            let value = f64::from(value(index));
+            let before = value - *mean;
+            *mean += before * share;
+            *squares += before * (value - *mean);
         }
     }
 
@@ -192,6 +210,7 @@ impl NormalisationChange<'_> {
 #[cfg(test)]
 mod tests {
     use dmprl_shared::config::Precision;
+    use dmprl_shared::goal_rule::{GoalReward, Norm};
     use dmprl_shared::policy::{Activations, forward, initial_parameters};
     use rand::RngExt;
 
@@ -222,6 +241,27 @@ mod tests {
         // Mean 4, standard deviation sqrt(5); the second dimension is constant.
         let unit = 5.0_f32.sqrt();
         assert_close(&out, &[-3.0 / unit, 0.0, -1.0 / unit, 0.0, 1.0 / unit, 0.0, 3.0 / unit, 0.0]);
+    }
+
+    #[test]
+    fn statistics_see_achieved_goals_in_place_of_the_desired_ones() {
+        let rule = GoalRule {
+            achieved: 0,
+            desired: 1,
+            goal_len: 1,
+            components: vec![0],
+            norm: Norm::Euclidean,
+            reward: GoalReward::Dense { factor: -1.0 },
+            ends_within: None,
+        };
+        let mut normaliser = Normaliser::new(2, 1);
+        normaliser.observe(&[1.0, 9.0]);
+        normaliser.observe_relabelled(&[1.0, 9.0], &rule);
+        normaliser.update();
+        // The desired goals were 9 and 1.
+        let mut out = [0.0; 2];
+        normaliser.apply_row(&[1.0, 9.0], &mut out);
+        assert_eq!(out, [0.0, 1.0]);
     }
 
     #[test]

@@ -62,6 +62,7 @@ fn fresh() -> Result<Learner, LearnerError> {
         control_dt_s: 0.02,
         episode_steps: 10,
         observation_names: Vec::new(),
+        goal_rule: None,
     };
     Learner::new(layers.finish().unwrap(), &spec, RUN_ID)
 }

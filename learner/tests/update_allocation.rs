@@ -13,6 +13,7 @@ use dmprl_learner::demonstrations::Demonstration;
 use dmprl_learner::learner::Learner;
 use dmprl_learner::update::kernels::bf16::Bf16;
 use dmprl_shared::config::{Layers, Limits};
+use dmprl_shared::goal_rule::{GoalReward, GoalRule, Norm};
 use dmprl_shared::policy::Policy;
 use dmprl_shared::segment::{LAYOUT_VERSION, Segment, SegmentHeader, block_checksum};
 use dmprl_shared::spec::EnvSpec;
@@ -28,6 +29,15 @@ fn spec() -> EnvSpec {
         control_dt_s: 0.05,
         episode_steps: 50,
         observation_names: Vec::new(),
+        goal_rule: Some(Box::new(GoalRule {
+            achieved: 0,
+            desired: 3,
+            goal_len: 3,
+            components: vec![0, 1, 2],
+            norm: Norm::Euclidean,
+            reward: GoalReward::Sparse { threshold: 0.05, reached: 0.0, missed: -1.0 },
+            ends_within: None,
+        })),
     }
 }
 
@@ -72,13 +82,14 @@ fn allocations(case: Case, precision: &str, threads: &str) -> u64 {
 
 /// Returns the allocations of twenty segments and the updates owed for them, including sampling and
 /// normalisation, after enough segments that all buffers exist.
-fn allocations_of_a_learner(algorithm: &str) -> u64 {
+fn allocations_of_a_learner(algorithm: &str, hindsight: &str) -> u64 {
     let mut layers = Layers::new();
     // On-policy algorithms have no penalty on action changes.
     let penalty = if algorithm == "ndp" { "0.0" } else { "0.2" };
     let keys = [
         ("algorithm.name", algorithm),
         ("algorithm.action_rate_penalty", penalty),
+        ("replay.hindsight", hindsight),
         ("policy.start", "zero"),
         ("policy.normalise_observations", "true"),
         ("exploration.warm_up_steps", "0"),
@@ -91,6 +102,7 @@ fn allocations_of_a_learner(algorithm: &str) -> u64 {
     }
     let config = layers.finish().unwrap().resolve(Limits { cores: 1 }).unwrap();
     let mut learner = Learner::new(config, &spec(), 1).unwrap();
+    assert_eq!(learner.hindsight.is_some(), hindsight != "none");
     let layout = learner.policy().layout();
     let mut segment = Segment { block: vec![0.1; layout.block_len()], ..Segment::default() };
     segment.header = SegmentHeader {
@@ -151,8 +163,9 @@ fn no_update_allocates_once_its_buffers_are_made() {
     let has_bf16 = Bf16::detect().is_some();
     assert_eq!(allocations_of_imitation(), 0, "imitation");
     for algorithm in ["ddpg", "td3", "sac", "ndp"] {
-        assert_eq!(allocations_of_a_learner(algorithm), 0, "a learner of {algorithm}");
+        assert_eq!(allocations_of_a_learner(algorithm, "none"), 0, "a learner of {algorithm}");
     }
+    assert_eq!(allocations_of_a_learner("td3", "future"), 0, "a learner with hindsight");
     for algorithm in ["ddpg", "td3", "sac"] {
         for (policy, layer_norm) in [("dmp", "false"), ("mlp", "false"), ("mlp", "true")] {
             let what = Case { algorithm, policy, layer_norm };

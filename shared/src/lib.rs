@@ -8,6 +8,7 @@
 pub mod checkpoint;
 pub mod config;
 pub mod dmp;
+pub mod goal_rule;
 pub mod parameters;
 pub mod policy;
 pub mod policy_file;

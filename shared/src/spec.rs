@@ -3,6 +3,8 @@
 use serde::{Deserialize, Serialize};
 use thiserror::Error;
 
+use crate::goal_rule::{GoalRule, GoalRuleError};
+
 /// Sizes, bounds and timing of one environment.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
@@ -25,6 +27,9 @@ pub struct EnvSpec {
     /// no names, as in files of older versions.
     #[serde(default)]
     pub observation_names: Vec<String>,
+    /// Rewards for other goals, if the run uses hindsight and the environment follows a rule.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub goal_rule: Option<Box<GoalRule>>,
 }
 
 /// Why an environment cannot be used.
@@ -69,13 +74,22 @@ pub enum SpecError {
         /// Reported duration \[s\].
         got: f64,
     },
+    /// A goal rule that does not fit the observation.
+    #[error("{id}: {cause}")]
+    GoalRule {
+        /// Gymnasium id.
+        id: String,
+        /// The reason.
+        #[source]
+        cause: GoalRuleError,
+    },
 }
 
 impl EnvSpec {
     /// Checks lengths, bounds and the duration of a step.
     ///
     /// # Errors
-    /// `Length`, `Bounds` or `Duration`, naming the field or dimension.
+    /// `Length`, `Bounds`, `Duration` or `GoalRule`, naming the field or dimension.
     pub fn check(&self) -> Result<(), SpecError> {
         let names_len = match self.observation_names.len() {
             0 => self.observation_len,
@@ -102,19 +116,24 @@ impl EnvSpec {
         if !(self.control_dt_s.is_finite() && self.control_dt_s >= 0.0) {
             return Err(SpecError::Duration { id: self.id.clone(), got: self.control_dt_s });
         }
+        if let Some(rule) = &self.goal_rule {
+            rule.check(self.observation_len)
+                .map_err(|cause| SpecError::GoalRule { id: self.id.clone(), cause })?;
+        }
         Ok(())
     }
 
     /// Whether both describe the same environment. Names of observation entries are ignored if only
-    /// one side has them.
+    /// one side has them. Goal rules are ignored, because only runs with hindsight look for one.
     #[must_use]
     pub fn is_same(&self, other: &Self) -> bool {
         let named = !self.observation_names.is_empty() && !other.observation_names.is_empty();
         if named && self.observation_names != other.observation_names {
             return false;
         }
-        let nameless = |spec: &Self| Self { observation_names: Vec::new(), ..spec.clone() };
-        nameless(self) == nameless(other)
+        let plain =
+            |spec: &Self| Self { observation_names: Vec::new(), goal_rule: None, ..spec.clone() };
+        plain(self) == plain(other)
     }
 
     /// Returns the name of entry `index` of an observation, `observation[index]` if it has none.

@@ -132,6 +132,7 @@ fn policy(hold: Option<&Hold>) -> Vec<u8> {
         control_dt_s: STEP_S,
         episode_steps: 50,
         observation_names: Vec::new(),
+        goal_rule: None,
     };
     let policy = Policy::new(&Layers::new().finish().unwrap(), &spec).unwrap();
     let mut values = policy.initial_parameters(&mut seeds::stream(1, "test", 0));

@@ -24,6 +24,7 @@ fn decisions_steps_and_holds_allocate_nothing() {
         control_dt_s: 0.05,
         episode_steps: 50,
         observation_names: Vec::new(),
+        goal_rule: None,
     };
     for keys in [&[][..], &[("policy.kind", "mlp")], &[("policy.start", "carry")]] {
         let mut layers = Layers::new();

@@ -11,6 +11,7 @@ use std::sync::OnceLock;
 use dmprl_actors::python_env::{Interpreter, InterpreterOptions, PythonEnvironments};
 use dmprl_actors::rollout::{Identity, Rollout, RolloutError};
 use dmprl_shared::config::{ExperimentConfig, Layers, TaskConfig};
+use dmprl_shared::goal_rule::GoalReward;
 use dmprl_shared::segment::{
     ActionBounds, Expected, HINDSIGHT, Segment, SegmentLayout, TERMINATED, TRUNCATED, check,
 };
@@ -34,7 +35,13 @@ fn config(keys: &[(&str, &str)]) -> ExperimentConfig {
     layers.finish().unwrap()
 }
 
+const IDENTITY: Identity = Identity { run_id: 1, worker_id: 0, incarnation: 0, seed_index: 0 };
+
 fn started(task: &str, keys: &[(&str, &str)]) -> Result<Rollout, RolloutError> {
+    Rollout::start(&config(keys), environments(task), IDENTITY)
+}
+
+fn environments(task: &str) -> PythonEnvironments {
     static INTERPRETER: OnceLock<Interpreter> = OnceLock::new();
     let start = || {
         let (venv, python_path) = (venv().venv.clone(), vec![tiny_envs_dir()]);
@@ -42,9 +49,7 @@ fn started(task: &str, keys: &[(&str, &str)]) -> Result<Rollout, RolloutError> {
     };
     let interpreter = INTERPRETER.get_or_init(start);
     let task = TaskConfig::with_id(&format!("tiny_envs:{task}-v0"));
-    let environments = PythonEnvironments::start(interpreter, &task, ENVS, 5).unwrap();
-    let identity = Identity { run_id: 1, worker_id: 0, incarnation: 0, seed_index: 0 };
-    Rollout::start(&config(keys), environments, identity)
+    PythonEnvironments::start(interpreter, &task, ENVS, 5).unwrap()
 }
 
 fn delivered(rollout: &mut Rollout, calls: usize) -> Vec<Segment> {
@@ -126,6 +131,24 @@ fn copies_of_an_episode_have_goals_that_it_reached_and_their_rewards() {
         .map(|segment| segment.header.episode_step)
         .collect();
     assert!(firsts.iter().all(|&first| first <= 7) && firsts.len() == 8, "{firsts:?}");
+}
+
+/// With a proven rule the learner draws the goals, so the worker sends each step once.
+#[test]
+fn a_worker_makes_no_copies_if_the_reward_follows_a_rule() {
+    for (task, has_rule) in [("Reach", true), ("ReachUndeclared", false)] {
+        let mut environments = environments(task);
+        environments.find_goal_rule().unwrap();
+        let rule = environments.spec().goal_rule.clone();
+        assert_eq!((rule.is_some(), environments.missing_rule().is_none()), (has_rule, has_rule));
+        if let Some(rule) = rule {
+            let reward = GoalReward::Sparse { threshold: 0.5, reached: 0.0, missed: -1.0 };
+            assert_eq!((rule.achieved, rule.desired, rule.reward), (0, 1, reward));
+        }
+        let mut rollout = Rollout::start(&config(&[]), environments, IDENTITY).unwrap();
+        let segments = delivered(&mut rollout, 6);
+        assert_eq!(segments.iter().any(is_copy), !has_rule, "{task}");
+    }
 }
 
 #[test]

@@ -52,6 +52,7 @@ fn spec(task: &str) -> EnvSpec {
         id: "Test-v0".into(),
         observation_len,
         observation_names: Vec::new(),
+        goal_rule: None,
         action_len,
         action_low: vec![-1.0; action_len],
         action_high: vec![3.0; action_len],

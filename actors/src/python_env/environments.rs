@@ -22,7 +22,9 @@ pub const SUCCESS_NOT_REPORTED: u8 = 2;
 /// the last call and are valid until the next call, which the borrow checker enforces. After an
 /// error the state of the environments is undefined: reset all of them or end the process.
 pub struct PythonEnvironments {
-    spec: EnvSpec,
+    pub(super) spec: EnvSpec,
+    /// Why the environments have no goal rule.
+    pub(super) missing_rule: Option<String>,
     segment_steps: usize,
     reset: Call,
     step_segment: Call,
@@ -143,6 +145,7 @@ impl PythonEnvironments {
             failed: SharedBuffer::new(buffers, "failed", e, id)?,
             next_observations: SharedBuffer::new(buffers, "next_observations", e * o, id)?,
             segment_steps: k,
+            missing_rule: None,
             spec,
         })
     }
@@ -297,5 +300,6 @@ fn read_spec(dict: &Bound<'_, PyAny>) -> PyResult<EnvSpec> {
         control_dt_s: dict.get_item("control_dt_s")?.extract()?,
         episode_steps: dict.get_item("episode_steps")?.extract()?,
         observation_names: if names.is_none() { Vec::new() } else { names.extract()? },
+        goal_rule: None,
     })
 }

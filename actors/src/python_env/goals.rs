@@ -2,6 +2,7 @@
 
 use std::sync::Arc;
 
+use dmprl_shared::goal_rule::{GoalReward, GoalRule, Norm};
 use pyo3::prelude::*;
 
 use super::{PythonEnvironments, PythonError, buffer::SharedBuffer, environments::Call};
@@ -66,6 +67,47 @@ impl PythonEnvironments {
                 spec.observation_len
             ),
         })
+    }
+
+    /// Looks for the rule by which the environment rewards goals, and adds it to the spec if it is
+    /// proven. [`PythonEnvironments::missing_rule`] has the reason if not. Resets an environment,
+    /// because rewards may depend on what a reset creates.
+    ///
+    /// # Errors
+    /// `NoGoals` as [`PythonEnvironments::goals`]; `Exception` if the reset fails; `Spec` if the
+    /// installed package does not fit.
+    pub fn find_goal_rule(&mut self) -> Result<(), PythonError> {
+        let envs = self.failed().len();
+        let first: Vec<bool> = (0..envs).map(|env| env == 0).collect();
+        self.reset(&first, &vec![0; envs])?;
+        let goals = self.goals()?;
+        let calls = Arc::clone(self.calls());
+        let call = calls.enter(CallKind::Relabel);
+        let found = Python::attach(|py| {
+            let module = py.import("dmprl.goal_rule")?;
+            let proven = module.getattr("proven")?.call1((self.env.bind(py),))?;
+            read_rule(&proven, goals)
+        });
+        drop(call);
+        match found {
+            Ok(rule) => self.spec.goal_rule = Some(Box::new(rule)),
+            Err(error) => {
+                let error = Python::attach(|py| PythonError::exception(py, &error));
+                match error {
+                    PythonError::Exception { kind, message, .. } if kind == "NoGoalRuleError" => {
+                        self.missing_rule = Some(message);
+                    }
+                    other => return Err(other),
+                }
+            }
+        }
+        Ok(self.spec.check()?)
+    }
+
+    /// Returns why [`PythonEnvironments::find_goal_rule`] found no rule.
+    #[must_use]
+    pub fn missing_rule(&self) -> Option<&str> {
+        self.missing_rule.as_deref()
     }
 
     /// Creates the buffers for up to `rows_max` steps with goals of `goal_len` entries.
@@ -146,5 +188,30 @@ fn read_goals(dict: &Bound<'_, PyAny>) -> PyResult<Goals> {
         desired: dict.get_item("desired")?.extract()?,
         len: dict.get_item("length")?.extract()?,
         is_sparse: dict.get_item("sparse")?.extract()?,
+    })
+}
+
+fn read_rule(dict: &Bound<'_, PyAny>, goals: Goals) -> PyResult<GoalRule> {
+    let number = |name: &str| dict.get_item(name)?.extract::<f64>();
+    let is_sparse = dict.contains("threshold")?;
+    Ok(GoalRule {
+        achieved: goals.achieved,
+        desired: goals.desired,
+        goal_len: goals.len,
+        components: dict.get_item("components")?.extract()?,
+        norm: match dict.get_item("norm")?.extract::<String>()?.as_str() {
+            "max" => Norm::Max,
+            _ => Norm::Euclidean,
+        },
+        reward: if is_sparse {
+            GoalReward::Sparse {
+                threshold: number("threshold")?,
+                reached: number("reached")?,
+                missed: number("missed")?,
+            }
+        } else {
+            GoalReward::Dense { factor: number("factor")? }
+        },
+        ends_within: dict.get_item("ends_within")?.extract()?,
     })
 }

@@ -228,6 +228,7 @@ mod tests {
             control_dt_s: 0.02,
             episode_steps: 50,
             observation_names: Vec::new(),
+            goal_rule: None,
         };
         config.replay.capacity_steps = 1_000;
         let mut learner = Learner::new(config, &spec, 1).unwrap();

@@ -127,6 +127,11 @@ impl Machine {
                     json(&spec)
                 )));
             }
+            // A run of an older version that is resumed has no goal rule yet.
+            Some(known) if known.goal_rule.is_none() && spec.goal_rule.is_some() => {
+                self.actions.push(Action::WriteSpec(spec.clone()));
+                self.spec = Some(spec);
+            }
             Some(_) => {}
         }
         let hub = self.settings.hub;

@@ -6,8 +6,9 @@ use rand::RngExt;
 use rand_distr::StandardNormal;
 use thiserror::Error;
 
+use super::sample::{Sample, target_range};
 use crate::normaliser::Normaliser;
-use crate::replay::{Replay, Sampler};
+use crate::replay::{Goal, GoalSampler, Replay, Sampler};
 
 /// The replay has no window to learn from.
 #[derive(Debug, Error)]
@@ -96,6 +97,8 @@ pub struct Batch {
     pub previous_actions: Vec<f32>,
     /// 1 if u_{t-1} exists, 0 if the episode began or the replay no longer has it, (B,).
     pub has_previous: Vec<f32>,
+    /// Smallest and largest target that the rewards allow; infinite if unknown.
+    pub target_range: [f32; 2],
     actions: Vec<f32>,
 }
 
@@ -115,6 +118,8 @@ pub struct SampleSource<'a> {
     pub replay: &'a Replay,
     /// Draws the windows.
     pub sampler: &'a mut Sampler,
+    /// Draws other goals for windows, if configured.
+    pub hindsight: Option<&'a GoalSampler>,
     /// Normalises network inputs, if configured.
     pub normaliser: Option<&'a Normaliser>,
 }
@@ -122,8 +127,8 @@ pub struct SampleSource<'a> {
 impl SampleSource<'_> {
     /// Borrows the source again, for one of several samples.
     pub fn reborrow(&mut self) -> SampleSource<'_> {
-        let Self { replay, sampler, normaliser } = self;
-        SampleSource { replay, sampler, normaliser: *normaliser }
+        let Self { replay, sampler, hindsight, normaliser } = self;
+        SampleSource { replay, sampler, hindsight: *hindsight, normaliser: *normaliser }
     }
 }
 
@@ -157,6 +162,7 @@ impl Batch {
             noise: noise(shape.noise),
             previous_actions: vec![0.0; shape.rows * shape.action_len],
             has_previous: vec![0.0; shape.rows],
+            target_range: [f32::NEG_INFINITY, f32::INFINITY],
             actions: vec![0.0; shape.segment_actions_len],
         }
     }
@@ -177,54 +183,29 @@ impl Batch {
         omega: f32,
         source: &mut SampleSource<'_>,
     ) -> Result<(), NoWindow> {
-        let SampleSource { replay, sampler, normaliser } = source;
-        let (replay, normaliser) = (*replay, *normaliser);
-        let discount = config.discount as f32;
-        let o = shape.observation_len;
+        let SampleSource { replay, sampler, hindsight, normaliser } = source;
+        let (replay, hindsight, normaliser) = (*replay, *hindsight, *normaliser);
         for row in 0..shape.rows {
             let window = sampler
                 .draw(replay)
                 .ok_or(NoWindow { segments: replay.len(), steps: replay.layout().segment_steps })?;
-            let (reward, factor, next) = match config.target {
-                Target::NStep => (
-                    replay.discounted_reward(&window, discount),
-                    discount.powi(window.len() as i32),
-                    replay.last_observation(&window),
-                ),
-                Target::Literal => (
-                    replay.discounted_reward(&window, 1.0),
-                    discount,
-                    replay.second_observation(&window),
-                ),
-            };
-            self.rewards[row] = reward;
-            self.bootstrap[row] = if window.terminated { 0.0 } else { factor };
-            self.next_observations[row * o..(row + 1) * o].copy_from_slice(next);
-            let observation = replay.observation(&window);
-            self.observations[row * o..(row + 1) * o].copy_from_slice(observation);
-            let width = shape.critic_inputs();
+            let sample = Sample::draw(window, replay, hindsight, sampler);
+            self.write_states(shape, row, replay, &sample, config);
+            let (o, width) = (shape.observation_len, shape.critic_inputs());
+            let observation = &self.observations[row * o..(row + 1) * o];
             let input = &mut self.critic_inputs[row * width..(row + 1) * width];
             match normaliser {
                 Some(normaliser) => normaliser.apply_row(observation, &mut input[..o]),
                 None => input[..o].copy_from_slice(observation),
             }
             self.inputs[row * o..(row + 1) * o].copy_from_slice(&input[..o]);
-            replay.actions(&window, &mut self.actions);
-            input[o..o + shape.actions_len].copy_from_slice(&self.actions[..shape.actions_len]);
-            if config.action_rate_penalty > 0.0 {
-                let previous = replay.previous_action(&window);
-                self.has_previous[row] = f32::from(u8::from(previous.is_some()));
-                if let Some(previous) = previous {
-                    let a = shape.action_len;
-                    self.previous_actions[row * a..(row + 1) * a].copy_from_slice(previous);
-                }
-            }
+            self.write_actions(shape, row, replay, &sample, config);
             if shape.end_state_len > 0 {
                 // The carried state is the end of the observation after the window.
                 let dims = shape.end_state_len / 2;
-                let state = &replay.last_observation(&window)[o - 2 * dims..];
-                let end = &mut input[o + shape.actions_len..];
-                end.copy_from_slice(state);
+                let last = replay.observation_after(&window, sample.outcome.steps);
+                let end = &mut self.critic_inputs[row * width..][o + shape.actions_len..width];
+                end.copy_from_slice(&last[o - 2 * dims..]);
                 end[dims..].iter_mut().for_each(|velocity| *velocity /= omega);
             }
         }
@@ -235,7 +216,68 @@ impl Batch {
         for value in self.next_noise.iter_mut().chain(&mut self.noise) {
             *value = sampler.random_mut().sample(StandardNormal);
         }
+        self.target_range = target_range(hindsight, config);
         Ok(())
+    }
+
+    /// Writes reward, bootstrap and both observations of a row.
+    fn write_states(
+        &mut self,
+        shape: BatchShape,
+        row: usize,
+        replay: &Replay,
+        sample: &Sample<'_>,
+        config: &AlgorithmConfig,
+    ) {
+        let Sample { window, outcome, goal } = sample;
+        let discount = config.discount as f32;
+        let (rewards_discount, factor, next) = match config.target {
+            Target::NStep => (
+                discount,
+                discount.powi(outcome.steps as i32),
+                replay.observation_after(window, outcome.steps),
+            ),
+            Target::Literal => (1.0, discount, replay.second_observation(window)),
+        };
+        let o = shape.observation_len;
+        let rows = row * o..(row + 1) * o;
+        self.observations[rows.clone()].copy_from_slice(replay.observation(window));
+        self.next_observations[rows.clone()].copy_from_slice(next);
+        self.rewards[row] = match goal {
+            None => replay.discounted_reward(window, rewards_discount),
+            Some(goal) => {
+                let Goal { rule, values } = *goal;
+                rule.set_desired(&mut self.observations[rows.clone()], values);
+                rule.set_desired(&mut self.next_observations[rows], values);
+                replay.discounted_goal_reward(window, outcome.steps, *goal, rewards_discount)
+            }
+        };
+        self.bootstrap[row] = if outcome.terminated { 0.0 } else { factor };
+    }
+
+    /// Writes the actions of a row, and the action before them.
+    fn write_actions(
+        &mut self,
+        shape: BatchShape,
+        row: usize,
+        replay: &Replay,
+        sample: &Sample<'_>,
+        config: &AlgorithmConfig,
+    ) {
+        let Sample { window, outcome, .. } = sample;
+        replay.actions(window, &mut self.actions);
+        self.actions[outcome.steps * shape.action_len..].fill(0.0);
+        let first = row * shape.critic_inputs() + shape.observation_len;
+        self.critic_inputs[first..first + shape.actions_len]
+            .copy_from_slice(&self.actions[..shape.actions_len]);
+        if config.action_rate_penalty > 0.0 {
+            let previous = replay.previous_action(window);
+            self.has_previous[row] = f32::from(u8::from(previous.is_some()));
+            if let Some(previous) = previous {
+                let a = shape.action_len;
+                self.previous_actions[row * a..(row + 1) * a].copy_from_slice(previous);
+            }
+        }
     }
 }
 
@@ -284,7 +326,8 @@ mod tests {
         let config = AlgorithmConfig { target, discount: 0.5, ..AlgorithmConfig::default() };
         let mut sampler = Sampler::new(windows, dmprl_shared::seeds::stream(1, "test", 0));
         let mut batch = Batch::new(SHAPE);
-        let mut source = SampleSource { replay, sampler: &mut sampler, normaliser: None };
+        let mut source =
+            SampleSource { replay, sampler: &mut sampler, hindsight: None, normaliser: None };
         batch.sample(SHAPE, &config, 1.0, &mut source).unwrap();
         let mut rows: Vec<Row> = (0..SHAPE.rows)
             .map(|row| {
@@ -352,7 +395,12 @@ mod tests {
         let replay = replay(9, &[(0, TERMINATED)]);
         let mut sampler = Sampler::new(Windows::Sliding, dmprl_shared::seeds::stream(1, "test", 0));
         let mut batch = Batch::new(SHAPE);
-        let mut source = SampleSource { replay: &replay, sampler: &mut sampler, normaliser: None };
+        let mut source = SampleSource {
+            replay: &replay,
+            sampler: &mut sampler,
+            hindsight: None,
+            normaliser: None,
+        };
         batch.sample(SHAPE, &config, 1.0, &mut source).unwrap();
         let mut seen = [false; 3];
         for row in 0..SHAPE.rows {
@@ -375,7 +423,8 @@ mod tests {
         let mut batch = Batch::new(SHAPE);
         let config = AlgorithmConfig::default();
         let normaliser = Some(&normaliser);
-        let mut source = SampleSource { replay: &replay, sampler: &mut sampler, normaliser };
+        let mut source =
+            SampleSource { replay: &replay, sampler: &mut sampler, hindsight: None, normaliser };
         batch.sample(SHAPE, &config, 1.0, &mut source).unwrap();
         assert!(batch.observations.contains(&0.0) && batch.observations.contains(&2.0));
         for row in 0..SHAPE.rows {
@@ -407,7 +456,12 @@ mod tests {
         let mut sampler = Sampler::new(Windows::Sliding, random);
         let mut batch = Batch::new(shape);
         let config = AlgorithmConfig::default();
-        let mut source = SampleSource { replay: &replay, sampler: &mut sampler, normaliser: None };
+        let mut source = SampleSource {
+            replay: &replay,
+            sampler: &mut sampler,
+            hindsight: None,
+            normaliser: None,
+        };
         batch.sample(shape, &config, 2.0, &mut source).unwrap();
         let mut ends = [None; 3];
         for input in batch.critic_inputs.chunks_exact(7) {

@@ -157,11 +157,13 @@ impl BatchShard {
         self.critics[index].activations.output(&self.critic_shape, self.rows_len())
     }
 
-    /// Sets targets = reward + bootstrap * value.
+    /// Sets targets = reward + bootstrap * value, clipped to the batch's range.
     pub fn set_targets(&mut self, batch: &Batch, value: impl Fn(&Self, usize) -> f32) {
+        let [low, high] = batch.target_range;
         for row in 0..self.rows_len() {
             let at = self.rows.start + row;
-            self.targets[row] = batch.rewards[at] + batch.bootstrap[at] * value(self, row);
+            let target = batch.rewards[at] + batch.bootstrap[at] * value(self, row);
+            self.targets[row] = target.clamp(low, high);
         }
     }
 

@@ -67,7 +67,7 @@ impl Cloning {
     /// # Errors
     /// [`NoWindow`] if no whole window is found.
     pub fn sample(&mut self, source: SampleSource<'_>) -> std::result::Result<(), NoWindow> {
-        let SampleSource { replay, sampler, normaliser } = source;
+        let SampleSource { replay, sampler, normaliser, .. } = source;
         let steps = replay.layout().segment_steps;
         let rows = self.observations.chunks_exact_mut(self.shape.observation_len);
         let rows = rows.zip(self.actions.chunks_exact_mut(self.shape.segment_actions_len));

@@ -12,6 +12,7 @@ mod minibatch_shard;
 pub mod ndp;
 mod ppo;
 pub mod sac;
+mod sample;
 pub mod td3;
 
 use candle_core::{Device, Result};
@@ -272,5 +273,7 @@ fn new_critic(
 
 #[cfg(test)]
 mod golden_tests;
+#[cfg(test)]
+mod hindsight_tests;
 #[cfg(test)]
 mod tests;

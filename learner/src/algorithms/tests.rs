@@ -8,14 +8,14 @@ use super::*;
 use crate::learner::tests::spec;
 use crate::parameters::Parameters;
 
-struct Case {
+pub(super) struct Case {
     config: ExperimentConfig,
-    policy: Policy,
-    algorithm: Algorithm,
-    batch: Batch,
+    pub(super) policy: Policy,
+    pub(super) algorithm: Algorithm,
+    pub(super) batch: Batch,
 }
 
-fn case(keys: &[(&str, &str)]) -> Case {
+pub(super) fn case(keys: &[(&str, &str)]) -> Case {
     let mut layers = Layers::new();
     let common = [
         ("policy.hidden", "[24, 16]"),
@@ -63,7 +63,7 @@ fn case(keys: &[(&str, &str)]) -> Case {
 
 impl Case {
     /// Compares one update by our kernels with one by candle's graph from the same state.
-    fn check(&mut self, what: &str) {
+    pub(super) fn check(&mut self, what: &str) {
         let (shape, networks) = (self.algorithm.batch_shape(), self.algorithm.networks());
         let device = &Device::Cpu;
         let mut graph = Graph::new(&self.config, &self.policy, shape, device, &networks).unwrap();

@@ -243,7 +243,9 @@ impl Graph {
         }
         let (rewards, bootstrap) =
             (self.on_device(&batch.rewards)?, self.on_device(&batch.bootstrap)?);
-        Ok((rewards + bootstrap.mul(&value)?)?.detach())
+        let [low, high] = batch.target_range;
+        let targets = (rewards + bootstrap.mul(&value)?)?;
+        Ok(targets.clamp(low, high)?.detach())
     }
 
     fn critics_step(

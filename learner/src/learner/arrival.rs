@@ -71,6 +71,9 @@ impl Learner {
             let (observations, _, _) = self.expected.layout.split(&segment.block);
             let len = segment.header.steps_len as usize * normaliser.observation_len();
             normaliser.observe(&observations[..len]);
+            if let Some(goals) = &self.hindsight {
+                normaliser.observe_relabelled(&observations[..len], &goals.rule);
+            }
         }
         if segment.header.flags & HINDSIGHT != 0 {
             // A hindsight copy is experience, but no step of an environment.

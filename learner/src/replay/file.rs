@@ -17,7 +17,7 @@ use std::io::{self, Read, Write};
 use dmprl_shared::segment::SegmentLayout;
 use thiserror::Error;
 
-use super::{NONE, Replay, Slot, Tail};
+use super::{NONE, Place, Replay, Slot, Tail};
 
 const MAGIC: &[u8; 8] = b"DMPRLRP2";
 const MAGIC_WITHOUT_KEPT: &[u8; 8] = b"DMPRLRP1";
@@ -141,6 +141,7 @@ impl Replay {
                 self.slots[next as usize].previous = index as u32;
             }
         }
+        self.rebuild_episodes();
         // The number of workers may have changed. Tails of workers that no longer exist are
         // ignored, because their episodes do not continue.
         for index in 0..tail_count as usize {
@@ -176,7 +177,8 @@ impl Replay {
             return Err(ReplayFileError::Inconsistent { name: "slot", index });
         }
         let [terminated, truncated, hindsight] = flags.map(|flag| flag == 1);
-        Ok(Slot { next, previous: NONE, steps_len, terminated, truncated, hindsight })
+        let place = Place::default();
+        Ok(Slot { next, previous: NONE, steps_len, terminated, truncated, hindsight, place })
     }
 
     fn read_tail(

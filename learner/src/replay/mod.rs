@@ -6,13 +6,17 @@
 //! full, the oldest slot is replaced.
 
 mod block_store;
+mod episodes;
 mod file;
+mod hindsight;
 mod window;
 
 use dmprl_shared::segment::{HINDSIGHT, SegmentHeader, SegmentLayout, TERMINATED, TRUNCATED};
 
 use block_store::BlockStore;
+use episodes::{Episodes, Place};
 pub use file::ReplayFileError;
+pub use hindsight::{Goal, GoalRow, GoalSampler, Outcome};
 pub use window::{Sampler, Window};
 
 /// Marks the end of a chain of slots.
@@ -32,6 +36,8 @@ struct Slot {
     truncated: bool,
     /// Whether this is a hindsight copy, which belongs to no episode.
     hindsight: bool,
+    /// Its place in its episode.
+    place: Place,
 }
 
 /// The newest segment of one environment.
@@ -52,6 +58,7 @@ pub struct Replay {
     layout: SegmentLayout,
     slots: Vec<Slot>,
     blocks: BlockStore,
+    episodes: Episodes,
     /// Slot of the next segment.
     head: usize,
     /// Number of filled slots.
@@ -84,6 +91,7 @@ impl Replay {
             layout,
             slots: vec![Slot { next: NONE, previous: NONE, ..Slot::default() }; count],
             blocks: BlockStore::new(count, layout.block_len()),
+            episodes: Episodes::new(count),
             head: 0,
             filled: 0,
             demonstrations: 0,
@@ -148,6 +156,9 @@ impl Replay {
     fn store(&mut self, header: &SegmentHeader, block: &[f32]) -> usize {
         let at = self.head;
         self.blocks.get_mut(at).copy_from_slice(block);
+        if at < self.filled {
+            self.episodes.release(self.slots[at].place);
+        }
         self.slots[at] = Slot {
             next: NONE,
             previous: NONE,
@@ -155,6 +166,7 @@ impl Replay {
             terminated: header.flags & TERMINATED != 0,
             truncated: header.flags & TRUNCATED != 0,
             hindsight: header.flags & HINDSIGHT != 0,
+            place: self.episodes.begin(at as u32),
         };
         self.head = if at + 1 == self.slots.len() { self.demonstrations } else { at + 1 };
         self.filled = (self.filled + 1).min(self.slots.len());
@@ -187,6 +199,7 @@ impl Replay {
     fn chain(&mut self, slot: u32, next: u32) {
         self.slots[slot as usize].next = next;
         self.slots[next as usize].previous = slot;
+        self.join_episode(slot, next);
     }
 
     fn block(&self, slot: usize) -> &[f32] {

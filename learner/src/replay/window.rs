@@ -12,8 +12,8 @@ use super::{NONE, Replay};
 /// short are no window, because a missing action is not a zero action.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Window {
-    slot: u32,
-    offset: u8,
+    pub(super) slot: u32,
+    pub(super) offset: u8,
     /// Steps taken from the first slot.
     first_len: u8,
     /// Steps taken from the next slot.
@@ -88,14 +88,19 @@ impl Replay {
     /// Returns the observation after the window's last step, (O,).
     #[must_use]
     pub fn last_observation(&self, window: &Window) -> &[f32] {
-        if window.second_len > 0 {
-            self.observation_row(window.next, usize::from(window.second_len))
-        } else {
-            self.observation_row(window.slot, usize::from(window.offset + window.first_len))
+        self.observation_after(window, window.len())
+    }
+
+    /// Returns the observation after the window's first `steps` steps, (O,).
+    #[must_use]
+    pub fn observation_after(&self, window: &Window, steps: usize) -> &[f32] {
+        match steps.checked_sub(usize::from(window.first_len)) {
+            Some(row) if row > 0 => self.observation_row(window.next, row),
+            _ => self.observation_row(window.slot, usize::from(window.offset) + steps),
         }
     }
 
-    fn observation_row(&self, slot: u32, row: usize) -> &[f32] {
+    pub(super) fn observation_row(&self, slot: u32, row: usize) -> &[f32] {
         let len = self.layout.observation_len;
         let (observations, _, _) = self.layout.split(self.block(slot as usize));
         &observations[row * len..(row + 1) * len]

@@ -228,6 +228,8 @@ pub enum WarmUpKind {
     /// Uniform DMP parameters within `warm_up_range` of their ranges. Unlike with `uniform`, the
     /// DMP's motion y is defined during the warm-up.
     DmpParameters,
+    /// One uniform action for each segment, held over its steps.
+    Segment,
 }
 
 /// Exploration noise of the rollout. `kind` and `std` have no effect on policies that explore by
@@ -239,6 +241,10 @@ pub struct ExplorationConfig {
     pub kind: ExplorationKind,
     /// Standard deviation, in units of u (actions scaled to [-1, 1]).
     pub std: f64,
+    /// Share of the segments after the warm-up that ignore the policy: one uniform action over the
+    /// full range, held over all steps of the segment. It moves objects that noise around the
+    /// policy's actions does not.
+    pub random_segments: f64,
     /// Length of the warm-up, in which actions are random: environment steps of all workers
     /// together.
     pub warm_up_steps: u64,
@@ -253,6 +259,7 @@ impl Default for ExplorationConfig {
         Self {
             kind: ExplorationKind::Gaussian,
             std: 0.1,
+            random_segments: 0.0,
             warm_up_steps: 3_000,
             warm_up_kind: WarmUpKind::Uniform,
             warm_up_range: 0.3,

@@ -89,14 +89,18 @@ impl Default for RunConfig {
     }
 }
 
-/// Goals of hindsight copies.
+/// Goals that experience is relabelled with.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "snake_case")]
 pub enum Hindsight {
-    /// No copies.
+    /// No hindsight.
     None,
     /// Goals reached later in the episode (Andrychowicz et al. 2017, section 4.5).
     Future,
+    /// The goal reached at the end of the episode.
+    Final,
+    /// Goals reached at any step of the episode.
+    Episode,
 }
 
 /// The replay.
@@ -106,16 +110,25 @@ pub struct ReplayConfig {
     /// Capacity in environment steps, including hindsight copies. A full replay overwrites its
     /// oldest steps.
     pub capacity_steps: usize,
-    /// Goals of the hindsight copies that workers make of their segments. Needs a goal-conditioned
-    /// environment.
+    /// Goals of hindsight experience replay. Needs a goal-conditioned environment. If its rewards
+    /// follow a rule, goals are drawn anew whenever a batch is sampled; otherwise workers make
+    /// copies of their segments.
     pub hindsight: Hindsight,
-    /// Hindsight copies per segment, each with its own goal.
+    /// Share of a batch's windows that get another goal, if goals are drawn when a batch is
+    /// sampled.
+    pub hindsight_share: f64,
+    /// Hindsight copies per segment, each with its own goal, if workers make copies.
     pub hindsight_copies: usize,
 }
 
 impl Default for ReplayConfig {
     fn default() -> Self {
-        Self { capacity_steps: 1_000_000, hindsight: Hindsight::None, hindsight_copies: 4 }
+        Self {
+            capacity_steps: 1_000_000,
+            hindsight: Hindsight::None,
+            hindsight_share: 0.8,
+            hindsight_copies: 4,
+        }
     }
 }
 

@@ -29,7 +29,7 @@ pub use experiment::{
     MetricsConfig, PacingConfig, Precision, ReplayConfig, RunConfig, SupervisionConfig,
 };
 pub use layers::{ConfigError, Layers, nearest};
-pub use presets::{PRESETS, Preset, algorithm_defaults, policy_defaults};
+pub use presets::{PRESETS, Preset, algorithm_defaults, policy_defaults, suitable_preset};
 pub use resolve::Limits;
 pub use task::{TaskConfig, is_python_object};
 pub use tasks::{TASKS, TaskDefaults, task_defaults};

@@ -2,7 +2,7 @@
 
 use toml::Table;
 
-use super::{AlgorithmName, PolicyKind};
+use super::{AlgorithmName, PolicyKind, task_defaults};
 
 /// A preset: its name, a one-line description, and its values as TOML.
 #[derive(Debug)]
@@ -15,7 +15,7 @@ pub struct Preset {
 }
 
 /// All presets, in the order of `--help`.
-pub const PRESETS: [Preset; 3] = [
+pub const PRESETS: [Preset; 4] = [
     Preset {
         name: "default",
         about: "segment critic, sliding windows, n-step target: best in our measurements",
@@ -32,6 +32,11 @@ pub const PRESETS: [Preset; 3] = [
                 --until-return and --until-success stop the run early",
         text: FAST,
     },
+    Preset {
+        name: "goal",
+        about: "goals with a sparse reward, such as pushing: hindsight and random segments",
+        text: GOAL,
+    },
 ];
 
 // Methods that save time on GPUs do not help on a CPU, where matrix products dominate an update's
@@ -42,6 +47,24 @@ const FAST: &str = r#"
 threads = 2
 [evaluation]
 interval_steps = 1000
+"#;
+
+// Without random segments FetchPush stays at chance: noise around a policy that does not touch the
+// object does not move it (docs/decisions/0091-preset-goal.md).
+const GOAL: &str = r#"
+[algorithm]
+discount = 0.98
+action_rate_penalty = 0.0
+[exploration]
+kind = "segment"
+std = 0.2
+random_segments = 0.3
+warm_up_kind = "segment"
+warm_up_range = 1.0
+[replay]
+hindsight = "future"
+[pacing]
+updates_per_segment = 5.0
 "#;
 
 // Table 2 of the paper and section 4 of the specification. Every value is written out, so that
@@ -93,12 +116,14 @@ temperature_learning_rate = 0.0003
 [exploration]
 kind = "gaussian"
 std = 0.1
+random_segments = 0.0
 warm_up_steps = 10000
 warm_up_kind = "uniform"
 warm_up_range = 1.0
 [replay]
 capacity_steps = 1000000
 hindsight = "none"
+hindsight_share = 0.8
 hindsight_copies = 4
 [pacing]
 updates_per_segment = 1.0
@@ -110,6 +135,37 @@ queue_segments = 1
 [learner]
 publish_every_updates = 1
 "#;
+
+/// Tasks with goals and a sparse reward, ours and those of other packages: the start of a Gymnasium
+/// id without its module.
+const GOAL_TASKS: [&str; 10] = [
+    "FetchReach",
+    "FetchPush",
+    "FetchSlide",
+    "FetchPickAndPlace",
+    "PandaReach",
+    "PandaPush",
+    "PandaSlide",
+    "PandaPickAndPlace",
+    "PandaStack",
+    "PandaFlip",
+];
+
+/// Returns the preset that a task gets if the user chooses none. An environment is known only once
+/// Python has started, so tasks of other packages are recognised by their ids.
+#[must_use]
+pub fn suitable_preset(task: &str) -> &'static str {
+    let id = task_defaults(task).map_or(task, |defaults| defaults.id);
+    let id = id.rsplit_once(':').map_or(id, |(_, id)| id);
+    let own = id.strip_prefix("dmprl/");
+    let name = own.unwrap_or(id);
+    // Our own has no goals in its observation and a dense reward.
+    let is_own_reach = own.is_some_and(|name| name.starts_with("PandaReach"));
+    let is_sparse_goal = GOAL_TASKS.iter().any(|start| name.starts_with(start))
+        && !name.contains("Dense")
+        && !is_own_reach;
+    if is_sparse_goal { "goal" } else { PRESETS[0].name }
+}
 
 /// Returns the values that a kind of policy changes, which are merged over those of the task.
 ///
@@ -167,7 +223,10 @@ critic_learning_rate = 0.0003
 critic_hidden = [256, 256]
 action_rate_penalty = 0.0
 [exploration]
+random_segments = 0.0
 warm_up_steps = 0
+[replay]
+hindsight = "none"
 "#;
 
 impl Preset {
@@ -204,6 +263,24 @@ mod tests {
             };
             let missing: Vec<_> = missing.into_iter().filter(is_from_paper).collect();
             assert!(missing.is_empty(), "{section}: {missing:?}");
+        }
+    }
+
+    #[test]
+    fn preset_goal_is_chosen_for_sparse_goals_of_known_packages_only() {
+        for (task, preset) in [
+            ("gymnasium_robotics:FetchPush-v4", "goal"),
+            ("panda_gym:PandaPickAndPlaceJoints-v3", "goal"),
+            ("FetchPickAndPlace-v4", "goal"),
+            ("gymnasium_robotics:FetchPushDense-v4", "default"),
+            ("dmprl/PandaReach-v0", "default"),
+            ("panda-reach", "default"),
+            ("panda-push", "goal"),
+            ("panda-stack-dense", "default"),
+            ("dmprl/PandaPickAndPlaceJoints-v0", "goal"),
+            ("reacher", "default"),
+        ] {
+            assert_eq!(suitable_preset(task), preset, "{task}");
         }
     }
 

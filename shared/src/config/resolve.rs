@@ -67,6 +67,7 @@ impl ExperimentConfig {
         self.task.check()?;
         self.check_counts()?;
         self.check_numbers()?;
+        self.check_goals()?;
         self.check_dmp()?;
         self.check_combinations()?;
         self.check_ndp()?;
@@ -223,6 +224,26 @@ impl ExperimentConfig {
         range(key, entropy, entropy.is_finite(), || "a finite number".into())?;
         let minutes = self.run.max_minutes;
         range("run.max_minutes", minutes, minutes > 0.0, || "above 0 (inf: no limit)".into())
+    }
+
+    fn check_goals(&self) -> Result<(), ConfigError> {
+        let random = self.exploration.random_segments;
+        let shares = [
+            ("replay.hindsight_share", self.replay.hindsight_share),
+            ("exploration.random_segments", random),
+        ];
+        for (key, got) in shares {
+            range(key, got, (0.0..=1.0).contains(&got), || "from 0 to 1".into())?;
+        }
+        let carry = self.policy.kind == PolicyKind::Dmp && self.policy.start == Start::Carry;
+        range("exploration.random_segments", random, !carry || random == 0.0, || {
+            "0 with policy.start = \"carry\", because random actions leave y undefined".into()
+        })?;
+        let on_policy = self.algorithm.name == AlgorithmName::Ndp;
+        range("exploration.random_segments", random, !on_policy || random == 0.0, || {
+            "0 with algorithm.name = \"ndp\", which learns only from actions of its own policy"
+                .into()
+        })
     }
 
     fn check_dmp(&self) -> Result<(), ConfigError> {
@@ -431,6 +452,8 @@ mod tests {
             ("algorithm.discount", "1.5"),
             ("algorithm.polyak", "nan"),
             ("algorithm.action_rate_penalty", "-0.1"),
+            ("replay.hindsight_share", "1.1"),
+            ("exploration.random_segments", "-0.1"),
             ("actors.workers", "1000000"),
             ("actors.env_call_timeout_s", "0"),
             ("actors.env_call_timeout_s", "inf"),

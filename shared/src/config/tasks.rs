@@ -385,6 +385,7 @@ impl TaskDefaults {
             control_dt_s: self.control_dt_s,
             episode_steps: self.episode_steps,
             observation_names: Vec::new(),
+            goal_rule: None,
         }
     }
 

@@ -58,6 +58,7 @@ mod tests {
             control_dt_s: 0.0,
             episode_steps: 0,
             observation_names: Vec::new(),
+            goal_rule: None,
         };
         let mut actions = [0.0; 8];
         let u = [-1.0, -1.0, 0.0, 0.0, 1.0, 1.0, -7.0, 1.5];

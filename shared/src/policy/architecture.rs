@@ -110,6 +110,7 @@ mod tests {
             control_dt_s: 0.02,
             episode_steps: 50,
             observation_names: Vec::new(),
+            goal_rule: None,
         }
     }
 

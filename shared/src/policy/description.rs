@@ -31,7 +31,8 @@ impl PolicyDescription {
     #[must_use]
     pub fn new(config: &ExperimentConfig, spec: &EnvSpec) -> Self {
         Self {
-            spec: spec.clone(),
+            // A policy acts without knowing rewards.
+            spec: EnvSpec { goal_rule: None, ..spec.clone() },
             algorithm: config.algorithm.name,
             policy: config.policy.clone(),
             dmp: config.dmp.clone(),

@@ -129,6 +129,7 @@ mod tests {
             control_dt_s: 0.05,
             episode_steps: 50,
             observation_names: Vec::new(),
+            goal_rule: None,
         }
     }
 

@@ -14,6 +14,7 @@ fn spec() -> EnvSpec {
         control_dt_s: 0.1,
         episode_steps: 50,
         observation_names: Vec::new(),
+        goal_rule: None,
     }
 }
 

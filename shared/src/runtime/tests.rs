@@ -21,6 +21,7 @@ fn spec() -> EnvSpec {
         control_dt_s: 0.05,
         episode_steps: 50,
         observation_names: ["cos", "sin", "speed", "force"].map(str::to_owned).to_vec(),
+        goal_rule: None,
     }
 }
 

@@ -25,6 +25,7 @@ pub fn spec() -> EnvSpec {
         control_dt_s: 0.02,
         episode_steps: 10,
         observation_names: Vec::new(),
+        goal_rule: None,
     }
 }
 

@@ -6,6 +6,7 @@ use std::path::Path;
 
 use dmprl_learner::metrics::TIME_KEYS;
 use dmprl_tests::program::{Workplace, rows};
+use dmprl_tests::tiny_envs_dir;
 use serde_json::Value;
 
 use crate::train;
@@ -19,9 +20,13 @@ struct Result {
 }
 
 fn trained(place: &Workplace, name: &str, seed: &str, more: &[&str]) -> Result {
+    trained_on("reacher", place, name, &[&["--seed", seed], more].concat())
+}
+
+fn trained_on(task: &str, place: &Workplace, name: &str, more: &[&str]) -> Result {
     let run = place.path(name);
-    let more = [&["--deterministic", "--seed", seed, "--steps", "2500"], more].concat();
-    place.run(&train("reacher", &run, &more)).with_status(0);
+    let more = [&["--deterministic", "--steps", "2500"], more].concat();
+    place.run(&train(task, &run, &more)).with_status(0);
     let timeless = |file| {
         let mut rows = rows(&run, file);
         for row in &mut rows {
@@ -66,4 +71,17 @@ fn on_policy_the_same_seed_gives_the_same_bytes_too() {
     let last = first.metrics.last().unwrap();
     assert!(last["updates"].as_u64() > Some(0), "{last}");
     assert!(first == trained(&place, "second", "7", &ndp));
+}
+
+/// Its rewards follow a rule, so the learner draws goals from the random stream of its windows.
+#[test]
+fn with_goals_the_same_seed_gives_the_same_bytes_too() {
+    let place = Workplace::new();
+    let folder = tiny_envs_dir();
+    let more = ["--preset", "goal", "--set", "exploration.warm_up_steps=500"];
+    let more = [&more[..], &["--python-path", folder.to_str().unwrap()]].concat();
+    let first = trained_on("tiny_envs:Reach-v0", &place, "first", &more);
+    let last = first.metrics.last().unwrap();
+    assert!(last["updates"].as_u64() > Some(0), "{last}");
+    assert!(first == trained_on("tiny_envs:Reach-v0", &place, "second", &more));
 }

@@ -1,5 +1,8 @@
 //! Every policy, start and preset trains on every kind of environment.
 
+use std::fs;
+use std::path::Path;
+
 use dmprl_tests::program::{Workplace, env_steps, rows};
 use dmprl_tests::tiny_envs_dir;
 
@@ -115,15 +118,26 @@ fn a_segment_env_of_ones_own_trains() {
 fn a_goal_trains_with_hindsight_in_several_processes_and_in_one() {
     let path = tiny_envs_dir();
     let hindsight = ["--set", "replay.hindsight=future", "--python-path", path.to_str().unwrap()];
-    for more in [&[][..], &["--deterministic"]] {
+    for (task, more) in [
+        ("ReachUndeclared", &[][..]),
+        ("ReachUndeclared", &["--deterministic"]),
+        ("Reach", &[]),
+        ("Reach", &["--deterministic"]),
+    ] {
         let place = Workplace::new();
         let run = place.path("run");
         let more = [&["--steps", "1200"], &hindsight[..], more].concat();
-        place.run(&train("tiny_envs:Reach-v0", &run, &more)).with_status(0);
+        place.run(&train(&format!("tiny_envs:{task}-v0"), &run, &more)).with_status(0);
         let last = rows(&run, "metrics.jsonl").pop().unwrap();
         let count = |key: &str| last[key].as_u64().unwrap();
-        // Episodes of twelve steps are three segments with four copies each.
-        assert!(count("hindsight_segments") >= 12 * (1200 / 12 - 16), "{last}");
+        let spec = fs::read_to_string(Path::new(&run).join("spec.json")).unwrap();
+        assert_eq!(spec.contains("goal_rule"), task == "Reach", "{spec}");
+        // Episodes of twelve steps are three segments with four copies each, unless the learner
+        // draws goals by the environment's rule.
+        match task {
+            "Reach" => assert_eq!(count("hindsight_segments"), 0, "{last}"),
+            _ => assert!(count("hindsight_segments") >= 12 * (1200 / 12 - 16), "{last}"),
+        }
         assert!(count("env_steps") <= 1300 && count("segments") <= 400, "{last}");
         assert_eq!((count("lost"), last["rejected"]["duplicate"].as_u64()), (0, Some(0)));
         assert!(last["rejected"].as_object().unwrap().values().all(|count| count == 0), "{last}");

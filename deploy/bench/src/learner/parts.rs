@@ -112,9 +112,9 @@ impl SampleWork {
         let config = learner.config().algorithm.clone();
         let Self { batch, shape, omega } = self;
         timed(duration, || {
-            let Learner { replay, sampler, normaliser, .. } = &mut *learner;
-            let normaliser = normaliser.as_ref();
-            let mut source = SampleSource { replay, sampler, normaliser };
+            let Learner { replay, sampler, hindsight, normaliser, .. } = &mut *learner;
+            let (hindsight, normaliser) = (hindsight.as_ref(), normaliser.as_ref());
+            let mut source = SampleSource { replay, sampler, hindsight, normaliser };
             Ok(batch.sample(*shape, &config, *omega, &mut source)?)
         })
     }

@@ -68,6 +68,7 @@ pub(super) mod tests {
             control_dt_s: 0.02,
             episode_steps: 10,
             observation_names: Vec::new(),
+            goal_rule: None,
         }
     }
 }

@@ -232,6 +232,7 @@ fn spec_of(size: Size) -> EnvSpec {
         control_dt_s: 0.02,
         episode_steps: 50,
         observation_names: Vec::new(),
+        goal_rule: None,
     }
 }
 

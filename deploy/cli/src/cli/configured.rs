@@ -6,7 +6,7 @@ use anyhow::Context;
 use clap::Args;
 use clap::builder::{PossibleValuesParser, RangedI64ValueParser};
 use dmprl_run::failure::wrong_use;
-use dmprl_shared::config::{Device, ExperimentConfig, PRESETS};
+use dmprl_shared::config::{Device, ExperimentConfig, PRESETS, suitable_preset};
 use toml::Value;
 
 use super::configuration::{Flag, Sources};
@@ -20,10 +20,11 @@ pub(super) struct ConfiguredArgs {
     /// Policy type: one DMP per segment, or an action of the network at every step.
     #[arg(long, value_parser = PossibleValuesParser::new(["dmp", "mlp"]))]
     policy: Option<String>,
-    /// Named set of configuration values.
-    #[arg(long, default_value = "default",
+    /// Named set of configuration values [default: `goal` for tasks of Gymnasium-Robotics and
+    /// panda-gym with goals and a sparse reward, else `default`].
+    #[arg(long,
           value_parser = PossibleValuesParser::new(PRESETS.iter().map(|preset| preset.name)))]
-    preset: String,
+    preset: Option<String>,
     /// Number of worker processes [default: cores - 1].
     #[arg(long, value_name = "N")]
     pub(super) workers: Option<u32>,
@@ -56,7 +57,16 @@ impl ConfiguredArgs {
         let pairs = self.env_kwargs.is_empty() && self.set.is_empty();
         let lists = self.python_path.is_empty() && pairs;
         let seed = self.seed.is_none() && self.config.is_none();
-        words && counts && lists && seed && self.preset == PRESETS[0].name
+        words && counts && lists && seed && self.preset.is_none()
+    }
+
+    /// Returns the preset that is used for `task` because the user chose none, unless that is
+    /// `default`. A configuration file is complete without it.
+    pub(super) fn automatic_preset(&self, task: &str) -> Option<&'static str> {
+        let is_dense = |pair: &String| pair.split('=').map(str::trim).eq(["reward_type", "dense"]);
+        let is_open = self.preset.is_none() && self.config.is_none();
+        let is_open = is_open && !self.env_kwargs.iter().any(is_dense);
+        Some(suitable_preset(task)).filter(|preset| is_open && *preset != PRESETS[0].name)
     }
 
     /// Returns true if an argument names folders of modules.
@@ -83,7 +93,11 @@ impl ConfiguredArgs {
         ];
         Ok(Sources {
             task,
-            preset: &self.preset,
+            preset: self
+                .preset
+                .as_deref()
+                .or(self.automatic_preset(task))
+                .unwrap_or(PRESETS[0].name),
             file: self.config.as_deref(),
             environment: environment()?,
             set: &self.set,

@@ -24,6 +24,7 @@ use super::trust::{Said, TrustArgs, mark_as_own};
 use super::{
     TrainingPlan, cores, name_limits, prepare_python, this_program, train_session, training_session,
 };
+use crate::terminal::say;
 
 /// Runs created within one second get a number; this many mean that the clock is stuck.
 const SAME_SECOND_MAX: usize = 100;
@@ -131,6 +132,11 @@ pub(super) fn run(args: &TrainArgs) -> anyhow::Result<Outcome> {
     mark_as_own(&run, &config);
     name_limits(&run);
     let lock = run.lock(Duration::ZERO)?;
+    if let Some(preset) = args.configured.automatic_preset(&args.task) {
+        say(&format!(
+            "preset {preset}, for goals with a sparse reward (--preset default: without it)"
+        ));
+    }
     train_session(TrainingPlan {
         program: this_program()?,
         run,

@@ -80,6 +80,7 @@ impl Fixture {
             control_dt_s: 0.02,
             episode_steps: 50,
             observation_names: Vec::new(),
+            goal_rule: None,
         }
     }
 

@@ -70,6 +70,7 @@ pub fn spec() -> EnvSpec {
         control_dt_s: 0.02,
         episode_steps: 50,
         observation_names: Vec::new(),
+        goal_rule: None,
     }
 }
 

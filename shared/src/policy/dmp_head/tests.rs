@@ -24,6 +24,7 @@ fn head(keys: &[(&str, &str)]) -> DmpHead {
         control_dt_s: 0.02,
         episode_steps: 10,
         observation_names: Vec::new(),
+        goal_rule: None,
     };
     DmpHead::new(&layers.finish().unwrap(), &spec).unwrap()
 }

@@ -1,0 +1,144 @@
+//! Batches with other goals, and targets within what a sparse reward allows, worked by hand.
+
+use dmprl_shared::config::{AlgorithmConfig, AlgorithmName, Hindsight, Target, Windows};
+use dmprl_shared::goal_rule::{GoalReward, GoalRule, Norm};
+use dmprl_shared::segment::{SegmentHeader, SegmentLayout, TERMINATED, TRUNCATED};
+
+use super::tests::case;
+use super::*;
+use crate::replay::{GoalSampler, Replay, Sampler};
+
+/// Observations are (achieved goal, desired goal).
+const LAYOUT: SegmentLayout = SegmentLayout { segment_steps: 2, observation_len: 2, action_len: 1 };
+const SHAPE: BatchShape = BatchShape {
+    rows: 64,
+    observation_len: 2,
+    actions_len: 2,
+    end_state_len: 0,
+    segment_actions_len: 2,
+    action_len: 1,
+    next_noise: false,
+    noise: false,
+};
+
+fn rule(ends_within: Option<f64>) -> GoalRule {
+    GoalRule {
+        achieved: 0,
+        desired: 1,
+        goal_len: 1,
+        components: vec![0],
+        norm: Norm::Euclidean,
+        reward: GoalReward::Sparse { threshold: 0.5, reached: 0.0, missed: -1.0 },
+        ends_within,
+    }
+}
+
+/// An episode of three steps that achieves 1, 2 and 3, with the goal 9: r = -1, u = 0.1, 0.2, 0.3.
+fn replay(flag: u32) -> Replay {
+    let mut replay = Replay::new(LAYOUT, 20, 1, 1);
+    let whole = [0.0, 9.0, 1.0, 9.0, 2.0, 9.0, 0.1, 0.2, -1.0, -1.0];
+    let rest = [2.0, 9.0, 3.0, 9.0, 0.0, 0.0, 0.3, 0.0, -1.0, 0.0];
+    for (block, episode_step, steps_len, flags) in [(whole, 0, 2, 0), (rest, 2, 1, flag)] {
+        let header = SegmentHeader { episode_step, steps_len, flags, ..Default::default() };
+        replay.insert(&header, &block);
+    }
+    replay
+}
+
+/// (s_t with its goal, actions, reward, bootstrap, state with its goal to bootstrap from).
+type Row = ([f32; 2], [f32; 2], f32, f32, [f32; 2]);
+
+/// Returns the distinct rows of a batch whose windows all get another goal, and the target range.
+fn rows(replay: &Replay, config: &AlgorithmConfig, rule: &GoalRule) -> (Vec<Row>, [f32; 2]) {
+    let random = dmprl_shared::seeds::stream(1, "test", 0);
+    let mut sampler = Sampler::new(Windows::Sliding, random);
+    let hindsight = GoalSampler::new(Some(rule), Hindsight::Final, 1.0);
+    let mut batch = Batch::new(SHAPE);
+    let mut source = SampleSource {
+        replay,
+        sampler: &mut sampler,
+        hindsight: hindsight.as_ref(),
+        normaliser: None,
+    };
+    batch.sample(SHAPE, config, 1.0, &mut source).unwrap();
+    let mut rows: Vec<Row> = (0..SHAPE.rows)
+        .map(|row| {
+            let pair = |values: &[f32]| [values[2 * row], values[2 * row + 1]];
+            let input = &batch.critic_inputs[4 * row..4 * row + 4];
+            assert_eq!(input[..2], batch.observations[2 * row..2 * row + 2]);
+            assert_eq!(batch.inputs, batch.observations);
+            let (reward, factor) = (batch.rewards[row], batch.bootstrap[row]);
+            let actions = [input[2], input[3]];
+            (pair(&batch.observations), actions, reward, factor, pair(&batch.next_observations))
+        })
+        .collect();
+    rows.sort_by(|a, b| a.0[0].total_cmp(&b.0[0]));
+    rows.dedup();
+    (rows, batch.target_range)
+}
+
+fn config() -> AlgorithmConfig {
+    AlgorithmConfig { discount: 0.5, ..AlgorithmConfig::default() }
+}
+
+#[test]
+fn a_batch_with_other_goals_is_that_worked_by_hand() {
+    let (rows, range) = rows(&replay(TRUNCATED), &config(), &rule(None));
+    // The final goal is 3. -1 - 0.5; then -1 + 0.5 * 0, because step 2 reaches it.
+    let expected = [
+        ([0.0, 3.0], [0.1, 0.2], -1.5, 0.25, [2.0, 3.0]),
+        ([1.0, 3.0], [0.2, 0.3], -1.0, 0.25, [3.0, 3.0]),
+    ];
+    assert_eq!(rows, expected);
+    assert_eq!(range, [-2.0, 0.0]);
+}
+
+#[test]
+fn literal_targets_get_other_goals_too_and_have_no_range() {
+    let config = AlgorithmConfig { target: Target::Literal, ..config() };
+    let (rows, range) = rows(&replay(TRUNCATED), &config, &rule(None));
+    let expected = [
+        ([0.0, 3.0], [0.1, 0.2], -2.0, 0.5, [1.0, 3.0]),
+        ([1.0, 3.0], [0.2, 0.3], -1.0, 0.5, [2.0, 3.0]),
+    ];
+    assert_eq!(rows, expected);
+    assert_eq!(range, [f32::NEG_INFINITY, f32::INFINITY]);
+    let sac = AlgorithmConfig { name: AlgorithmName::Sac, ..self::config() };
+    let (_, range) = self::rows(&replay(TRUNCATED), &sac, &rule(None));
+    assert_eq!(range, [f32::NEG_INFINITY, f32::INFINITY]);
+}
+
+#[test]
+fn a_window_that_reaches_its_new_goal_early_terminates_and_has_no_later_actions() {
+    // Reached within 1.5, so already by step 1, which achieves 2.
+    let rule = GoalRule {
+        reward: GoalReward::Sparse { threshold: 1.5, reached: 0.0, missed: -1.0 },
+        ..rule(Some(1.5))
+    };
+    let (rows, _) = rows(&replay(TERMINATED), &config(), &rule);
+    let expected = [
+        ([0.0, 3.0], [0.1, 0.2], -1.0, 0.0, [2.0, 3.0]),
+        ([1.0, 3.0], [0.2, 0.0], 0.0, 0.0, [2.0, 3.0]),
+        ([2.0, 3.0], [0.3, 0.0], 0.0, 0.0, [3.0, 3.0]),
+    ];
+    assert_eq!(rows, expected);
+}
+
+#[test]
+fn targets_beyond_the_range_are_those_at_its_end() {
+    for name in ["ddpg", "td3"] {
+        let keys = [("algorithm.name", name)];
+        let (mut clipped, mut plain) = (case(&keys), case(&keys));
+        clipped.batch.target_range = [-0.4, 0.1];
+        clipped.check(&format!("{name}, clipped"));
+        let mut clipped = case(&keys);
+        clipped.batch.target_range = [-0.4, 0.1];
+        clipped.batch.rewards.fill(5.0);
+        plain.batch.rewards.fill(0.1);
+        let loss = |case: &mut super::tests::Case| {
+            case.batch.bootstrap.fill(0.0);
+            case.algorithm.update(&case.policy, &case.batch, 1).unwrap().critic_loss
+        };
+        assert_eq!(loss(&mut clipped), loss(&mut plain), "{name}");
+    }
+}

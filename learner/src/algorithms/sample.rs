@@ -1,0 +1,44 @@
+//! A sample of a batch: a window, with another goal if hindsight draws one.
+
+use dmprl_shared::config::{AlgorithmConfig, AlgorithmName, Target};
+
+use crate::replay::{Goal, GoalSampler, Outcome, Replay, Sampler, Window};
+
+/// A window with the goal and the outcome that the batch takes.
+pub(super) struct Sample<'a> {
+    pub(super) window: Window,
+    pub(super) outcome: Outcome,
+    /// Another goal, or `None` for the window's own.
+    pub(super) goal: Option<Goal<'a>>,
+}
+
+impl<'a> Sample<'a> {
+    /// Draws a goal for a window, if hindsight is configured.
+    pub(super) fn draw(
+        window: Window,
+        replay: &'a Replay,
+        hindsight: Option<&'a GoalSampler>,
+        sampler: &mut Sampler,
+    ) -> Self {
+        let drawn = hindsight.and_then(|hindsight| {
+            let row = hindsight.draw(replay, &window, sampler.random_mut())?;
+            let goal = replay.achieved_goal(&hindsight.rule, row);
+            let outcome = replay.outcome(&window, goal)?;
+            Some(Self { window, outcome, goal: Some(goal) })
+        });
+        drawn.unwrap_or_else(|| {
+            let outcome = Outcome { steps: window.len(), terminated: window.terminated };
+            Self { window, outcome, goal: None }
+        })
+    }
+}
+
+/// Returns the range of the targets: that of the returns that a sparse goal rule allows. The soft
+/// values of SAC and the undiscounted sums of `literal` have no such range.
+pub(super) fn target_range(hindsight: Option<&GoalSampler>, config: &AlgorithmConfig) -> [f32; 2] {
+    let is_return = config.target == Target::NStep && config.name != AlgorithmName::Sac;
+    hindsight
+        .filter(|_| is_return)
+        .and_then(|hindsight| hindsight.rule.return_range(config.discount))
+        .unwrap_or([f32::NEG_INFINITY, f32::INFINITY])
+}

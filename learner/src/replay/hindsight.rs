@@ -1,0 +1,312 @@
+//! Hindsight when a batch is sampled: a window gets another goal, which its episode reached
+//! (Andrychowicz et al. 2017), and the rewards for that goal, from the environment's goal rule.
+//!
+//! Differences from Andrychowicz et al., Algorithm 1:
+//! 1. Goals are drawn anew for each sample, as in their code; the replay keeps each step once.
+//! 2. A goal is drawn for a window of K steps; K = 1 is the published algorithm.
+//! 3. If the task ends episodes at the goal, a window ends at its first step that reaches the new
+//!    goal. A window that is short only because the episode's own goal ended it keeps that goal,
+//!    because a missing action is not a zero action.
+
+use dmprl_shared::config::Hindsight;
+use dmprl_shared::goal_rule::GoalRule;
+use rand::RngExt;
+use rand_xoshiro::Xoshiro256PlusPlus;
+
+use super::{Replay, Window};
+
+/// Draws goals for windows.
+#[derive(Debug, Clone)]
+pub struct GoalSampler {
+    /// The environment's rule.
+    pub rule: GoalRule,
+    strategy: Hindsight,
+    /// Share of the windows that get another goal.
+    share: f64,
+}
+
+/// An observation row of the replay, whose achieved goal a window gets.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct GoalRow {
+    slot: u32,
+    row: usize,
+}
+
+/// A goal in place of a window's own.
+#[derive(Debug, Clone, Copy)]
+pub struct Goal<'a> {
+    /// The environment's rule.
+    pub rule: &'a GoalRule,
+    /// The goal, (G,).
+    pub values: &'a [f32],
+}
+
+/// The part of a window that is a sample.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Outcome {
+    /// Number of steps n, 1 to K.
+    pub steps: usize,
+    /// Whether the episode ends at the last of them.
+    pub terminated: bool,
+}
+
+impl GoalSampler {
+    /// Makes a sampler, or returns `None` without hindsight.
+    #[must_use]
+    pub fn new(rule: Option<&GoalRule>, strategy: Hindsight, share: f64) -> Option<Self> {
+        let rule = rule.filter(|_| strategy != Hindsight::None)?;
+        Some(Self { rule: rule.clone(), strategy, share })
+    }
+
+    /// Draws a goal for a window. Returns `None` if the window keeps its own.
+    ///
+    /// Steps of the episode that have not arrived, or have been replaced, are not drawn.
+    pub fn draw(
+        &self,
+        replay: &Replay,
+        window: &Window,
+        random: &mut Xoshiro256PlusPlus,
+    ) -> Option<GoalRow> {
+        if !random.random_bool(self.share) || replay.slots[window.slot as usize].hindsight {
+            return None;
+        }
+        let steps_max = replay.layout.segment_steps;
+        let live = replay.live(window.slot);
+        // Steps of the episode, counted from the oldest live segment. All segments but the last
+        // have K steps.
+        let first = (replay.rank(window.slot) - live.first_rank) as usize * steps_max
+            + usize::from(window.offset);
+        let end = (live.last_rank - live.first_rank) as usize * steps_max
+            + usize::from(replay.slots[live.newest as usize].steps_len);
+        let step = match self.strategy {
+            Hindsight::Final => end,
+            Hindsight::Episode => random.random_range(1..=end),
+            _ => random.random_range(first + 1..=end.max(first + 1)),
+        };
+        let rank = live.first_rank + ((step - 1) / steps_max) as u32;
+        let slot = replay.slot_at(live.newest, rank)?;
+        Some(GoalRow { slot, row: (step - 1) % steps_max + 1 })
+    }
+}
+
+impl Replay {
+    /// Returns the goal that was achieved in a row.
+    #[must_use]
+    pub fn achieved_goal<'a>(&'a self, rule: &'a GoalRule, row: GoalRow) -> Goal<'a> {
+        Goal { rule, values: rule.achieved(self.observation_row(row.slot, row.row)) }
+    }
+
+    /// Returns the outcome of a window with another goal, or `None` if the window cannot have it.
+    #[must_use]
+    pub fn outcome(&self, window: &Window, goal: Goal<'_>) -> Option<Outcome> {
+        let rule = goal.rule;
+        let reaches = |steps: &usize| rule.ends(self.goal_distance(window, *steps, goal));
+        if let Some(steps) = (1..=window.len()).find(reaches) {
+            return Some(Outcome { steps, terminated: true });
+        }
+        let steps = window.len();
+        let last = self.observation_after(window, steps);
+        // An end that is not due to the episode's own goal remains.
+        let by_goal = rule.ends(rule.distance(rule.achieved(last), rule.desired(last)));
+        let terminated = window.terminated && !by_goal;
+        let is_whole = steps == self.layout.segment_steps;
+        (is_whole || terminated).then_some(Outcome { steps, terminated })
+    }
+
+    /// Returns the sum of discount^i r_i over the first `steps` steps with another goal.
+    #[must_use]
+    pub fn discounted_goal_reward(
+        &self,
+        window: &Window,
+        steps: usize,
+        goal: Goal<'_>,
+        discount: f32,
+    ) -> f32 {
+        let reward = |step| goal.rule.reward(self.goal_distance(window, step, goal));
+        (1..=steps).rev().fold(0.0, |sum, step| reward(step) + discount * sum)
+    }
+
+    /// Returns the distance to the goal after `steps` steps of the window.
+    fn goal_distance(&self, window: &Window, steps: usize, goal: Goal<'_>) -> f64 {
+        let Goal { rule, values } = goal;
+        rule.distance(rule.achieved(self.observation_after(window, steps)), values)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::collections::BTreeSet;
+
+    use dmprl_shared::config::Windows;
+    use dmprl_shared::goal_rule::{GoalReward, Norm};
+    use dmprl_shared::segment::{HINDSIGHT, SegmentHeader, SegmentLayout, TERMINATED, TRUNCATED};
+
+    use super::super::Sampler;
+    use super::*;
+
+    /// Observations are (achieved goal, desired goal).
+    const LAYOUT: SegmentLayout =
+        SegmentLayout { segment_steps: 3, observation_len: 2, action_len: 1 };
+    const GOAL: f32 = 90.0;
+
+    fn rule(ends_within: Option<f64>) -> GoalRule {
+        GoalRule {
+            achieved: 0,
+            desired: 1,
+            goal_len: 1,
+            components: vec![0],
+            norm: Norm::Euclidean,
+            reward: GoalReward::Sparse { threshold: 0.5, reached: 0.0, missed: -1.0 },
+            ends_within,
+        }
+    }
+
+    fn sampler(strategy: Hindsight, share: f64, ends_within: Option<f64>) -> GoalSampler {
+        GoalSampler::new(Some(&rule(ends_within)), strategy, share).unwrap()
+    }
+
+    /// Inserts an episode that achieves `start + t` in step t, in segments of environment `env`.
+    fn episode(replay: &mut Replay, start: f32, steps: u32, flag: u32) {
+        for first in (0..steps).step_by(3) {
+            let len = (steps - first).min(3);
+            let mut block = vec![0.0; LAYOUT.block_len()];
+            let (observations, actions, rewards) = LAYOUT.split_mut(&mut block);
+            for k in 0..=len {
+                let row = &mut observations[2 * k as usize..2 * k as usize + 2];
+                row.copy_from_slice(&[start + (first + k) as f32, GOAL]);
+            }
+            actions[..len as usize].fill(0.5);
+            rewards[..len as usize].fill(-1.0);
+            let header = SegmentHeader {
+                episode: start as u32,
+                episode_step: first,
+                steps_len: len,
+                flags: if first + len == steps { flag } else { 0 },
+                ..SegmentHeader::default()
+            };
+            replay.insert(&header, &block);
+        }
+    }
+
+    /// Returns the goals that are drawn for the window at step `offset` of `slot`.
+    fn drawn(replay: &Replay, goals: &GoalSampler, slot: usize, offset: usize) -> Vec<f32> {
+        let window = replay.window(slot, offset).unwrap();
+        let mut random = dmprl_shared::seeds::stream(1, "test", 0);
+        let rows = (0..400).filter_map(|_| goals.draw(replay, &window, &mut random));
+        let set: BTreeSet<u32> =
+            rows.map(|row| replay.achieved_goal(&goals.rule, row).values[0] as u32).collect();
+        set.into_iter().map(|goal| goal as f32).collect()
+    }
+
+    fn goals_from(first: u32, last: u32) -> Vec<f32> {
+        (first..=last).map(|goal| goal as f32).collect()
+    }
+
+    #[test]
+    fn each_strategy_draws_from_its_steps_of_the_episode_and_only_of_it() {
+        let mut replay = Replay::new(LAYOUT, 300, 1, 1);
+        episode(&mut replay, 10.0, 8, TRUNCATED);
+        episode(&mut replay, 30.0, 7, TRUNCATED);
+        let goals = |strategy| drawn(&replay, &sampler(strategy, 1.0, None), 1, 1);
+        // The window at step 4 achieves 15 first; the episode ends at 18.
+        assert_eq!(goals(Hindsight::Future), goals_from(15, 18));
+        assert_eq!(goals(Hindsight::Final), [18.0]);
+        assert_eq!(goals(Hindsight::Episode), goals_from(11, 18));
+    }
+
+    #[test]
+    fn an_unfinished_episode_gives_the_goals_that_have_arrived() {
+        let mut replay = Replay::new(LAYOUT, 300, 1, 1);
+        episode(&mut replay, 10.0, 6, 0);
+        let goals = sampler(Hindsight::Future, 1.0, None);
+        assert_eq!(drawn(&replay, &goals, 0, 0), goals_from(11, 16));
+    }
+
+    #[test]
+    fn replaced_steps_are_not_drawn() {
+        let mut replay = Replay::new(LAYOUT, 12, 1, 1); // 4 slots
+        episode(&mut replay, 10.0, 9, TRUNCATED);
+        episode(&mut replay, 30.0, 9, TRUNCATED); // replaces the first two slots of the former
+        let goals = sampler(Hindsight::Episode, 1.0, None);
+        assert_eq!(drawn(&replay, &goals, 2, 0), goals_from(17, 19));
+        assert_eq!(drawn(&replay, &goals, 0, 1), goals_from(31, 39));
+    }
+
+    #[test]
+    fn share_and_copies_of_workers_are_respected() {
+        let mut replay = Replay::new(LAYOUT, 300, 1, 1);
+        episode(&mut replay, 10.0, 6, TRUNCATED);
+        let window = replay.window(0, 1).unwrap();
+        let goals = sampler(Hindsight::Future, 0.8, None);
+        let mut random = dmprl_shared::seeds::stream(1, "test", 0);
+        let count =
+            (0..10_000).filter(|_| goals.draw(&replay, &window, &mut random).is_some()).count();
+        // Binomial(10000, 0.8) has standard deviation 40; five of them are allowed.
+        assert!(count.abs_diff(8_000) < 200, "{count}");
+        let header = SegmentHeader { flags: HINDSIGHT, steps_len: 3, ..Default::default() };
+        replay.insert(&header, &vec![0.0; LAYOUT.block_len()]);
+        assert!(drawn(&replay, &sampler(Hindsight::Final, 1.0, None), 2, 0).is_empty());
+    }
+
+    #[test]
+    fn rewards_are_those_of_the_new_goal() {
+        let mut replay = Replay::new(LAYOUT, 300, 1, 1);
+        episode(&mut replay, 10.0, 6, TRUNCATED);
+        let window = replay.window(0, 1).unwrap(); // achieves 12, 13 and 14
+        let rule = rule(None);
+        let goal = Goal { rule: &rule, values: &[13.0] };
+        let outcome = replay.outcome(&window, goal).unwrap();
+        assert_eq!(outcome, Outcome { steps: 3, terminated: false });
+        // -1 + 0.5 * 0 - 0.25
+        assert_eq!(replay.discounted_goal_reward(&window, 3, goal, 0.5), -1.25);
+    }
+
+    #[test]
+    fn a_window_ends_where_the_task_would_have_ended_the_episode() {
+        let mut replay = Replay::new(LAYOUT, 300, 1, 1);
+        episode(&mut replay, 86.0, 4, TERMINATED); // at its own goal, 90
+        let rule = rule(Some(0.5));
+        let outcome = |slot, offset, goal: f32| {
+            let goal = Goal { rule: &rule, values: &[goal] };
+            replay.outcome(&replay.window(slot, offset).unwrap(), goal)
+        };
+        assert_eq!(outcome(0, 0, 88.0), Some(Outcome { steps: 2, terminated: true }));
+        // With another goal the episode would have gone on after its last step.
+        assert_eq!(outcome(0, 1, 50.0), Some(Outcome { steps: 3, terminated: false }));
+        // A short window cannot go on, because its further actions are unknown.
+        assert_eq!(outcome(0, 2, 50.0), None);
+        assert_eq!(outcome(0, 2, 89.0), Some(Outcome { steps: 1, terminated: true }));
+    }
+
+    #[test]
+    fn an_end_for_another_reason_than_the_goal_remains() {
+        let mut replay = Replay::new(LAYOUT, 300, 1, 1);
+        episode(&mut replay, 10.0, 4, TERMINATED); // far from its own goal
+        let goal = Goal { rule: &rule(Some(0.5)), values: &[50.0] };
+        let outcome = replay.outcome(&replay.window(0, 2).unwrap(), goal).unwrap();
+        assert_eq!(outcome, Outcome { steps: 2, terminated: true });
+    }
+
+    #[test]
+    fn the_same_seed_draws_the_same_goals_from_a_replay_read_from_a_file() {
+        let mut replay = Replay::new(LAYOUT, 60, 1, 1);
+        for index in 0..9 {
+            episode(&mut replay, 10.0 * index as f32, 8, TRUNCATED);
+        }
+        let mut bytes = Vec::new();
+        replay.write(&mut bytes).unwrap();
+        let mut read = Replay::new(LAYOUT, 60, 1, 1);
+        read.read(&mut bytes.as_slice()).unwrap();
+        let goals = sampler(Hindsight::Future, 0.8, None);
+        let draws = |replay: &Replay| {
+            let random = dmprl_shared::seeds::stream(1, "test", 0);
+            let mut sampler = Sampler::new(Windows::Sliding, random);
+            let draw = |_| {
+                let window = sampler.draw(replay).unwrap();
+                (window, goals.draw(replay, &window, sampler.random_mut()))
+            };
+            (0..200).map(draw).collect::<Vec<_>>()
+        };
+        assert_eq!(draws(&read), draws(&replay));
+    }
+}
