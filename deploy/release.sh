@@ -12,7 +12,8 @@ export PYO3_PYTHON=${PYO3_PYTHON:-$(command -v python3)}
 
 tools=target/release-tools
 "$PYO3_PYTHON" -m venv "$tools"
-"$tools/bin/pip" install --quiet --disable-pip-version-check "maturin>=1.9,<2"
+"$tools/bin/pip" install --quiet --disable-pip-version-check \
+    --require-hashes --requirement deploy/release-tools.txt
 # Without auditwheel, which would add a second libpython to the wheel.
 "$tools/bin/maturin" build --release --locked --interpreter "$PYO3_PYTHON" \
     --compatibility linux --auditwheel skip --out "$output"

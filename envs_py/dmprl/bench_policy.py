@@ -39,7 +39,7 @@ def onnx_policy(path: Path) -> tuple[str, Callable[[np.ndarray], object], int]:
     try:
         import onnxruntime
     except ImportError as error:
-        raise AbsentError(f"{error}; pip install onnxruntime") from error
+        raise AbsentError(f"{error}; dmprl env add onnxruntime") from error
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = options.inter_op_num_threads = 1
     session = onnxruntime.InferenceSession(path, options)

@@ -118,7 +118,7 @@ def _frame(rows: list[dict[str, Any]], library: str) -> Any:
         # From all rows, because a key's first values may be null.
         return polars.from_dicts(flat, infer_schema_length=None) if flat else polars.DataFrame()
     except ModuleNotFoundError as error:
-        raise ImportError(f"{error}; pip install {library}") from error
+        raise ImportError(f"{error}; dmprl env add {library}") from error
 
 
 def _flat(row: dict[str, Any], prefix: str = "") -> dict[str, Any]:

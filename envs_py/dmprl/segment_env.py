@@ -299,10 +299,6 @@ def _import(task_id: str, module_name: str) -> ModuleType:
         raise ModuleNotFoundError(
             f"{task_id}: no module {error.name!r} among the installed packages or in the "
             "directories given with --python-path"
-            + (
-                f"; install it with: .venv/bin/python -m pip install './envs_py[{extra}]'"
-                if extra
-                else ""
-            ),
+            + (f"; install it with: dmprl env add 'dmprl[{extra}]'" if extra else ""),
             name=error.name,
         ) from None

@@ -53,7 +53,7 @@ fn help(arguments: &[&str]) -> String {
 
 /// Lists the handwritten documents. Pages that `report` has written in `docs/results` are excluded.
 fn documents() -> Vec<String> {
-    let beside = ["README.md", "ARCHITECTURE.md", "CHANGELOG.md", "tests/FAULTS.md"];
+    let beside = ["README.md", "ARCHITECTURE.md", "CHANGELOG.md", "SECURITY.md", "tests/FAULTS.md"];
     let mut documents: Vec<String> = beside.map(str::to_owned).into();
     for folder in ["docs", "docs/decisions", "docs/internals"] {
         for entry in std::fs::read_dir(root().join(folder)).unwrap() {
@@ -211,6 +211,8 @@ fn every_flag_that_is_shown_exists() {
         "bridge",
         "chaos",
         "tasks",
+        "env add",
+        "env remove",
         "doctor",
         "clean",
         "completions",
@@ -390,4 +392,20 @@ fn continuous_integration_runs_the_readmes_test_command() {
     assert!(blocks(&read("README.md"), "sh").iter().any(|block| block == command));
     assert!(read(".ci/run").lines().any(|line| line == command), ".ci/run lacks `{command}`");
     assert!(read(".github/workflows/ci.yml").contains("- run: .ci/run"));
+}
+
+// A tag can be moved to other code.
+#[test]
+fn actions_are_named_by_commits() {
+    for entry in std::fs::read_dir(root().join(".github/workflows")).unwrap() {
+        let path = entry.unwrap().path();
+        let text = std::fs::read_to_string(&path).unwrap();
+        let used = text.lines().filter_map(|line| line.split_once("uses: "));
+        for (_, action) in used {
+            let (_, commit) = action.split_once('@').unwrap();
+            let commit = commit.split(' ').next().unwrap();
+            let is_commit = commit.len() == 40 && commit.bytes().all(|it| it.is_ascii_hexdigit());
+            assert!(is_commit, "{}: {action}", path.display());
+        }
+    }
 }

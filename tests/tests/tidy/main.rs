@@ -20,6 +20,8 @@ const COLUMNS_MAX: usize = 100;
 const STAGES: u32 = 8;
 /// Folders that are built, downloaded or written by runs.
 const FOREIGN_FOLDERS: [&str; 5] = ["target", "runs", "__pycache__", ".git", ".venv"];
+/// Start of the names of environments that were replaced.
+const OLD_ENVIRONMENT: &str = ".venv.old-";
 const MEMBERS: [&str; 16] = [
     "actors",
     "deploy/analysis",
@@ -91,7 +93,7 @@ fn collect(folder: &Path, found: &mut Vec<Source>) {
         let entry = entry.unwrap();
         let name = entry.file_name().into_string().unwrap();
         let kind = entry.file_type().unwrap();
-        if kind.is_dir() && !FOREIGN_FOLDERS.contains(&name.as_str()) {
+        if kind.is_dir() && !is_foreign(&name) {
             collect(&entry.path(), found);
         } else if kind.is_file() {
             let path = entry.path();
@@ -102,6 +104,10 @@ fn collect(folder: &Path, found: &mut Vec<Source>) {
             }
         }
     }
+}
+
+fn is_foreign(folder: &str) -> bool {
+    FOREIGN_FOLDERS.contains(&folder) || folder.starts_with(OLD_ENVIRONMENT)
 }
 
 fn read(path: &str) -> String {

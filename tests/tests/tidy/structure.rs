@@ -218,6 +218,8 @@ fn items(text: &str) -> Vec<String> {
         }
     }
     found.push(item);
+    // After a comma at the end.
+    found.retain(|item| !item.trim().is_empty());
     found.iter().map(|item| format!("{head}{}", word(item))).collect()
 }
 
@@ -229,7 +231,7 @@ fn nearest(texts: &BTreeMap<String, String>, path: &[String]) -> Option<String> 
 
 #[test]
 fn paths_are_found_in_every_form_of_import() {
-    let text = "use super::{a, b::C};\nuse crate::d::e::{self, F};\nfn f() { self::g::h() }";
+    let text = "use super::{a, b::C,};\nuse crate::d::e::{self, F};\nfn f() { self::g::h() }";
     let mut found: Vec<String> =
         paths("x/y", text).iter().map(|path| path.join("/").replace("//", "/")).collect();
     found.sort();

@@ -15,6 +15,7 @@ mod configuration;
 mod configured;
 mod dashboard;
 mod doctor;
+mod env;
 mod eval;
 mod export;
 mod output;
@@ -113,6 +114,8 @@ enum Command {
     Bridge(bridge::BridgeArgs),
     /// List the built-in tasks.
     Tasks(tasks::TasksArgs),
+    /// Show the Python environment, and add or remove packages.
+    Env(env::EnvArgs),
     /// Check this machine and suggest remedies.
     Doctor(doctor::DoctorArgs),
     /// Remove the shared memory of dead runs.
@@ -210,6 +213,7 @@ fn run(command: Command) -> anyhow::Result<Outcome> {
         Command::Chaos(args) => chaos::run(&args),
         Command::Bridge(args) => bridge::run(&args),
         Command::Tasks(args) => tasks::run(&args),
+        Command::Env(args) => env::run(&args),
         Command::Doctor(args) => doctor::run(&args),
         Command::Clean(args) => clean::run(&args),
         Command::Completions(args) => completions::completions(&args),

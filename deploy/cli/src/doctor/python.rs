@@ -146,7 +146,7 @@ fn packages(venv: &Path) -> Check {
         // Importing may print; the versions come last.
         Ok(text) => Check::ok(NAME, text.lines().last().unwrap_or_default()),
         Err(error) => {
-            let advice = format!("remove {}; the next train creates it again", venv.display());
+            let advice = format!("rename {}; the next train creates it again", venv.display());
             Check::problem(NAME, format!("cannot be imported: {error}"), advice)
         }
     }

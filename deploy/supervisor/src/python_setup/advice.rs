@@ -3,7 +3,7 @@
 use dmprl_actors::python_env::LINKED_PYTHON;
 
 /// Phrases in the output and their causes. The first match counts.
-const CAUSES: [(&str, Cause); 14] = [
+const CAUSES: [(&str, Cause); 17] = [
     ("ensurepip is not available", Cause::NoVenv),
     ("No module named venv", Cause::NoVenv),
     ("No module named 'venv'", Cause::NoVenv),
@@ -17,6 +17,9 @@ const CAUSES: [(&str, Cause); 14] = [
     ("Connection refused", Cause::NoNetwork),
     ("ProxyError", Cause::NoNetwork),
     ("timed out", Cause::NoNetwork),
+    ("DO NOT MATCH THE HASHES", Cause::OtherFile),
+    ("conflicting dependencies", Cause::Conflict),
+    ("ResolutionImpossible", Cause::Conflict),
     ("No matching distribution found", Cause::NoPackage),
 ];
 
@@ -26,6 +29,8 @@ enum Cause {
     NoPip,
     DiskFull,
     NoNetwork,
+    OtherFile,
+    Conflict,
     NoPackage,
 }
 
@@ -46,10 +51,21 @@ pub(super) fn advice(output: &str) -> String {
         Cause::NoNetwork => "The package index cannot be reached. The first start downloads \
              gymnasium, mujoco and numpy, the first search Optuna, and the first video PyAV; later \
              starts need no network. Behind a proxy, set HTTPS_PROXY. Without a network, set \
-             PIP_FIND_LINKS to a directory of wheels and PIP_NO_INDEX=1\n"
+             PIP_FIND_LINKS to a directory of the wheels in envs_py/locks and PIP_NO_INDEX=1\n"
             .to_owned(),
+        Cause::OtherFile => {
+            "The package index has a file with another hash than the locked one in \
+             envs_py/locks. If it is a mirror that builds its own files, lock its files: set \
+             UV_INDEX_URL and run deploy/lock.sh\n"
+                .to_owned()
+        }
+        Cause::Conflict => {
+            "These packages do not go with each other, or with what dmprl needs. Ask \
+             for another version, or remove one that you added: dmprl env remove PACKAGE\n"
+                .to_owned()
+        }
         Cause::NoPackage => format!(
-            "A package is not available for Python {} on this processor.\n",
+            "A package, or this version of it, is not available for Python {} on this processor.\n",
             LINKED_PYTHON.version_number()
         ),
     }
@@ -79,6 +95,23 @@ mod tests {
                       resolution')': /simple/flit-core/\n\
                       ERROR: No matching distribution found for flit_core<5,>=3.9";
         assert!(advice(output).contains("cannot be reached"));
+    }
+
+    #[test]
+    fn conflicts_and_other_files_have_a_remedy() {
+        for (output, remedy) in [
+            (
+                "ERROR: Cannot install one because these package versions have conflicting \
+              dependencies.",
+                "dmprl env remove",
+            ),
+            (
+                "ERROR: THESE PACKAGES DO NOT MATCH THE HASHES FROM THE REQUIREMENTS FILE.",
+                "lock.sh",
+            ),
+        ] {
+            assert!(advice(output).contains(remedy), "{output}");
+        }
     }
 
     #[test]

@@ -15,7 +15,7 @@ use std::{
 use anyhow::{Context, Result, bail};
 use dmprl_actors::python_env::LINKED_PYTHON;
 
-use super::{advice::advice, environment::PythonEnvironment, stamp};
+use super::{advice::advice, environment::PythonEnvironment, locks, requirement::EDITABLE, stamp};
 
 /// Maximum number of lines of a failed command in its error.
 const LAST_LINES_MAX: usize = 20;
@@ -45,33 +45,59 @@ impl Setup<'_> {
         self.run(&phase, command)
     }
 
-    /// Installs the package and its requirements.
+    /// Installs the package: the locked versions of its requirements, and then the package itself.
     ///
     /// The installation is editable: it refers to `envs_py`, so changed tasks need no installation.
+    /// The build tool is one of the locked packages, so that pip does not fetch another version.
     pub fn install(&self, package: &Path) -> Result<()> {
-        let package: [&OsStr; 2] = ["--editable".as_ref(), package.as_ref()];
-        self.pip("installing packages", &package)
+        self.install_locked("installing packages", &locks::base(package))?;
+        let package: [&OsStr; 3] =
+            ["--no-build-isolation".as_ref(), "--editable".as_ref(), package.as_ref()];
+        self.pip_install("installing dmprl", &package)
     }
 
-    /// Installs the requirements of an optional part of the package, in pip's syntax. Installing
-    /// `dmprl[extra]` instead would build the package again, which needs its build tool from the
-    /// network even if all requirements are met.
-    pub fn install_extra(&self, requirements: &[String]) -> Result<()> {
-        let arguments: Vec<&OsStr> = requirements.iter().map(AsRef::as_ref).collect();
-        self.pip(&format!("installing {}", requirements.join(" ")), &arguments)
+    /// Installs the packages of a lock. pip refuses files with other hashes.
+    pub fn install_locked(&self, phase: &str, lock: &Path) -> Result<()> {
+        let arguments: [&OsStr; 3] =
+            ["--require-hashes".as_ref(), "--requirement".as_ref(), lock.as_ref()];
+        self.pip_install(phase, &arguments)
     }
 
-    fn pip(&self, phase: &str, arguments: &[&OsStr]) -> Result<()> {
+    /// Installs these requirements, in pip's syntax, in versions that go with each other. Otherwise
+    /// pip fails without a change. It keeps installed versions that are good enough.
+    pub fn install_together(&self, requirements: &[String]) -> Result<()> {
+        let mut arguments: Vec<&OsStr> = Vec::new();
+        for requirement in requirements {
+            match requirement.strip_prefix(EDITABLE) {
+                Some(path) => arguments.extend([OsStr::new("--editable"), path.as_ref()]),
+                None => arguments.push(requirement.as_ref()),
+            }
+        }
+        self.pip_install(&format!("installing {}", requirements.join(" ")), &arguments)
+    }
+
+    /// Uninstalls these packages.
+    pub fn uninstall(&self, names: &[String]) -> Result<()> {
+        let mut command = self.pip("uninstall");
+        command.arg("--yes").args(names);
+        self.run(&format!("removing {}", names.join(" ")), command)
+    }
+
+    fn pip_install(&self, phase: &str, arguments: &[&OsStr]) -> Result<()> {
+        let mut command = self.pip("install");
+        command.args(["--progress-bar", "off"]).args(arguments);
+        self.run(phase, command)
+    }
+
+    fn pip(&self, subcommand: &str) -> Command {
         let mut command = Command::new(&self.environment.executable);
         command
-            .args(["-I", "-m", "pip", "install", "--disable-pip-version-check", "--no-input"])
-            .args(["--progress-bar", "off"])
-            .args(arguments)
+            .args(["-I", "-m", "pip", subcommand, "--disable-pip-version-check", "--no-input"])
             // Settings of a user's pip.conf that fail in a virtual environment or bypass it.
             .env("PIP_USER", "0")
             .env_remove("PIP_TARGET")
             .env_remove("PIP_PREFIX");
-        self.run(phase, command)
+        command
     }
 
     fn run(&self, phase: &str, mut command: Command) -> Result<()> {

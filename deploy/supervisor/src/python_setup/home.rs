@@ -6,15 +6,19 @@ use anyhow::{Context, Result};
 use dmprl_actors::python_env::LINKED_PYTHON;
 use dmprl_run::project;
 
-use super::{LOCK, PACKAGE, PythonEnvironment, State, VENV, ensure, state};
+use super::{
+    ensure::{State, ensure, state},
+    environment::PythonEnvironment,
+    paths::{LOCK, PACKAGE, USER_PACKAGES, VENV},
+};
 
 /// Location of the package `dmprl` and of an environment that can import it.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum Home {
     /// The project's directory, with `envs_py` and `.venv`, which is created on demand.
     Clone(PathBuf),
-    /// The environment into which pip installed program and package. Only requirements of optional
-    /// parts are installed there.
+    /// The environment into which pip installed program and package. It belongs to its user: dmprl
+    /// never recreates it, and installs there only what a command needs or its user adds.
     Installed(PythonEnvironment),
 }
 
@@ -75,6 +79,14 @@ impl Home {
         match self {
             Self::Clone(root) => root.join(LOCK),
             Self::Installed(environment) => environment.venv.join(LOCK),
+        }
+    }
+
+    /// Path of the list of packages that a user added.
+    pub(super) fn user_packages(&self) -> PathBuf {
+        match self {
+            Self::Clone(root) => root.join(USER_PACKAGES),
+            Self::Installed(environment) => environment.venv.join(USER_PACKAGES),
         }
     }
 

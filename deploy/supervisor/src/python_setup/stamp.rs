@@ -15,12 +15,27 @@ const FILE: &str = "dmprl-stamp.txt";
 /// File that is written first. It marks a `.venv` whose creation was interrupted.
 pub(super) const MAKING: &str = "dmprl-making.txt";
 const MANIFEST_BEGINS: &str = "--- envs_py/pyproject.toml ---";
+const LOCK_BEGINS: &str = "--- envs_py/locks/base.txt ---";
+const USER_PACKAGES_BEGIN: &str = "--- added packages ---";
 
 /// Everything on which `.venv` depends, as readable text.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(super) struct Stamp {
     python: String,
-    manifest: String,
+    packages: String,
+    user_packages: String,
+}
+
+/// What `.venv` is created from, besides the interpreter.
+pub(super) struct Inputs<'a> {
+    /// The project's directory; packages and scripts in `.venv` contain absolute paths.
+    pub root: &'a Path,
+    /// Content of `envs_py/pyproject.toml`.
+    pub manifest: &'a str,
+    /// Content of the lock.
+    pub lock: &'a str,
+    /// The packages that a user added, one a line.
+    pub user_packages: &'a str,
 }
 
 /// Result of comparing `.venv` with the wanted stamp.
@@ -28,8 +43,10 @@ pub(super) struct Stamp {
 pub(super) enum Fit {
     /// It can be used.
     Ready,
-    /// The right Python, but the package's requirements have changed.
+    /// The right Python, but the package's requirements or their lock have changed.
     OtherPackages,
+    /// Complete except for the packages that a user added.
+    OtherUserPackages,
     /// It does not exist.
     Absent,
     /// It must be recreated, for this reason.
@@ -38,22 +55,26 @@ pub(super) enum Fit {
 
 impl Stamp {
     /// A stamp for these inputs.
-    ///
-    /// - `root`: the project's directory; packages and scripts in `.venv` contain absolute paths.
-    /// - `manifest`: content of `envs_py/pyproject.toml`.
-    pub(super) fn new(linked: &LinkedPython, root: &Path, manifest: &str) -> Self {
+    pub(super) fn new(linked: &LinkedPython, inputs: &Inputs<'_>) -> Self {
         let python = format!(
             "format {FORMAT}\nversion {}\ninstallation {}\ninterpreter {}\nproject {}",
             linked.version,
             linked.base_prefix,
             linked.executable,
-            root.display()
+            inputs.root.display()
         );
-        Self { python, manifest: manifest.to_owned() }
+        let packages = format!("{}\n{LOCK_BEGINS}\n{}", inputs.manifest, inputs.lock);
+        Self { python, packages, user_packages: inputs.user_packages.to_owned() }
+    }
+
+    /// Returns the stamp of the same environment without the packages that a user added.
+    pub(super) fn without_user_packages(&self) -> Self {
+        Self { user_packages: String::new(), ..self.clone() }
     }
 
     fn text(&self) -> String {
-        format!("{}\n{MANIFEST_BEGINS}\n{}", self.python, self.manifest)
+        let Self { python, packages, user_packages } = self;
+        format!("{python}\n{MANIFEST_BEGINS}\n{packages}\n{USER_PACKAGES_BEGIN}\n{user_packages}")
     }
 
     /// Compares a virtual environment, without running anything.
@@ -78,7 +99,8 @@ impl Stamp {
         }
         let python = found.split(MANIFEST_BEGINS).next().unwrap_or_default().trim_end();
         if python == self.python {
-            return Fit::OtherPackages;
+            let rest = found.strip_prefix(&self.without_user_packages().text());
+            return if rest.is_some() { Fit::OtherUserPackages } else { Fit::OtherPackages };
         }
         let was = python.lines().zip(self.python.lines()).find(|(was, wanted)| was != wanted);
         let (was, wanted) = was.unwrap_or(("nothing", "something"));
@@ -93,6 +115,11 @@ impl Stamp {
             .and_then(|()| remove_if_present(&venv.join(MAKING)))
             .with_context(|| format!("cannot write {}", venv.join(FILE).display()))
     }
+}
+
+/// Returns true if dmprl created this virtual environment, completely or not.
+pub(super) fn is_marked(venv: &Path) -> bool {
+    venv.join(FILE).exists() || venv.join(MAKING).exists()
 }
 
 /// Creates the directory, marked as incomplete.
@@ -128,13 +155,18 @@ mod tests {
         library_dir: "/opt/a/lib",
     };
 
+    fn inputs(root: &Path) -> Inputs<'_> {
+        let manifest = "[project]\nname = 'dmprl'\n";
+        Inputs { root, manifest, lock: "numpy==2.5.0\n", user_packages: "torch\n" }
+    }
+
     fn unfinished_venv() -> (tempfile::TempDir, PathBuf, Stamp) {
         let directory = tempfile::tempdir().unwrap();
         let venv = directory.path().join(".venv");
         begin(&venv).unwrap();
         fs::create_dir(venv.join("bin")).unwrap();
         fs::write(venv.join("bin/python"), "").unwrap();
-        let stamp = Stamp::new(&LINKED, directory.path(), "[project]\nname = 'dmprl'\n");
+        let stamp = Stamp::new(&LINKED, &inputs(directory.path()));
         (directory, venv, stamp)
     }
 
@@ -165,8 +197,27 @@ mod tests {
     fn changed_requirements_need_no_new_environment() {
         let (directory, venv, stamp) = unfinished_venv();
         stamp.write(&venv).unwrap();
-        let changed = Stamp::new(&LINKED, directory.path(), "[project]\nname = 'other'\n");
-        assert_eq!(changed.compare(&venv), Fit::OtherPackages);
+        let same = inputs(directory.path());
+        for changed in [
+            Inputs { manifest: "[project]\nname = 'other'\n", ..same },
+            Inputs { lock: "numpy==2.5.1\n", ..inputs(directory.path()) },
+        ] {
+            assert_eq!(Stamp::new(&LINKED, &changed).compare(&venv), Fit::OtherPackages);
+        }
+    }
+
+    #[test]
+    fn changed_list_of_added_packages_needs_only_their_installation() {
+        let (directory, venv, stamp) = unfinished_venv();
+        for list in ["", "torch\npandas\n"] {
+            stamp.write(&venv).unwrap();
+            let changed = Inputs { user_packages: list, ..inputs(directory.path()) };
+            let changed = Stamp::new(&LINKED, &changed);
+            assert_eq!(changed.compare(&venv), Fit::OtherUserPackages);
+            changed.without_user_packages().write(&venv).unwrap();
+            let is_empty = list.is_empty();
+            assert_eq!(changed.compare(&venv) == Fit::Ready, is_empty);
+        }
     }
 
     #[test]
@@ -174,7 +225,7 @@ mod tests {
         let (directory, venv, stamp) = unfinished_venv();
         stamp.write(&venv).unwrap();
         let other = LinkedPython { base_prefix: "/usr", ..LINKED };
-        let other = Stamp::new(&other, directory.path(), &stamp.manifest);
+        let other = Stamp::new(&other, &inputs(directory.path()));
         assert_eq!(
             why(other.compare(&venv)),
             "created for installation /opt/a, expected installation /usr"
@@ -185,7 +236,7 @@ mod tests {
     fn moved_project_is_unusable() {
         let (_directory, venv, stamp) = unfinished_venv();
         stamp.write(&venv).unwrap();
-        let moved = Stamp::new(&LINKED, Path::new("/elsewhere"), &stamp.manifest);
+        let moved = Stamp::new(&LINKED, &inputs(Path::new("/elsewhere")));
         assert!(why(moved.compare(&venv)).ends_with("expected project /elsewhere"));
     }
 

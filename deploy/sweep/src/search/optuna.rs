@@ -80,7 +80,7 @@ impl Optuna {
         let mut optuna = Self { _child: child, input, lines, log };
         let greeting = optuna.read_line(START_WAIT).await?;
         if let Some(why) = greeting.get("absent") {
-            bail!("Optuna is not installed in .venv ({why}); remove .venv and start again");
+            bail!("Optuna is not installed in .venv ({why}); rename .venv and start again");
         }
         Ok(optuna)
     }
