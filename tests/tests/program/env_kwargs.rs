@@ -76,7 +76,10 @@ fn arguments_and_wrappers_are_those_of_training_evaluation_and_resume() {
     let text = fs::read_to_string(&file).unwrap();
     assert!(text.contains("gain = 1.5"), "{text}");
     fs::write(&file, text.replace("gain = 1.5", "gain = 2.5")).unwrap();
-    let refused = place.run(&["resume", &run, "--steps", "3000"]).with_status(1);
+    // The arguments are no longer those that the user gave.
+    let resume = ["resume", &run, "--steps", "3000"];
+    place.run(&resume).with_status(2).saying("gain = 2.5").saying("--trust-code");
+    let refused = place.run(&[&resume[..], &["--trust-code"]].concat()).with_status(1);
     refused.saying("expected").saying("from the configuration").saying("task.kwargs");
     place.run(&["eval", &run]).with_status(1).saying("architecture");
     place.assert_no_process();
