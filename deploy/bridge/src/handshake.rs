@@ -8,7 +8,7 @@
 //! ```
 //! Neither end uses anything that the other has not proven, and the token is never sent. The
 //! gateway stores nothing for a host before the host's proof: all hosts get the same challenge
-//! until it has been answered [`ANSWERS_MAX`] times.
+//! until it has been answered 1,024 times.
 
 use std::collections::BTreeSet;
 
