@@ -287,8 +287,8 @@ fn check_options(kwargs: &Table, wrappers: &[String], args: &BridgeArgs) -> anyh
     let flags: String = arguments.chain(wrappers).collect();
     let expected = if flags.is_empty() { " no --env-kwargs and no --wrapper" } else { &flags };
     Err(wrong_use(format!(
-        "the run's environment has other arguments or wrappers than this command line names; to run \
-         it on this host, expected:{expected}"
+        "the run's environment has other arguments or wrappers than this command line names; to \
+         run it on this host, expected:{expected}"
     )))
 }
 
