@@ -4,7 +4,7 @@
 //! invalid observations, limits actions to their bounds and their rate to a maximum, and holds the
 //! robot when observations stop, when its caller was frozen, and at the end.
 //!
-//! ```
+//! ```no_run
 #![doc = include_str!("../../../docs/examples/robot/drive_robot.rs")]
 //! ```
 //! `dmprl.Policy` is the same runtime in NumPy (`envs_py/dmprl/policy.py`). A test compares both
