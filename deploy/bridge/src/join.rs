@@ -47,7 +47,7 @@ pub enum JoinOutcome {
     Refused(String),
 }
 
-/// What a host gets that has joined.
+/// The answer to a host that has joined, with its session key.
 #[derive(Debug)]
 pub struct Admission {
     /// The gateway's answer.

@@ -1,4 +1,4 @@
-//! The file system of a run directory, and what it cannot promise.
+//! The file system of a run directory, and its limits.
 
 use std::fmt::{self, Display, Formatter};
 use std::io;

@@ -26,7 +26,7 @@ const ANOTHER_TOKEN: &str = "another secret of some length";
 /// Time limit for one answer.
 const ANSWER: Duration = Duration::from_secs(3);
 
-/// A gateway in operation, and what it reports.
+/// A running gateway and its reports.
 struct Attacked {
     stage: Arc<Stage>,
     endpoint: String,
@@ -172,7 +172,7 @@ fn hosts_of_another_version_and_too_many_workers_are_told_what_to_do() {
     assert!(attacked.end().contains("9.9.9"));
 }
 
-/// What a rogue learner would like a host to run.
+/// The code that a rogue learner wants a host to run.
 fn rogue_welcome() -> HostAnswer {
     HostAnswer::Welcome(Box::new(HostWelcome {
         channel: 1,

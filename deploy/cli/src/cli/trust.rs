@@ -9,7 +9,7 @@ use dmprl_run::{NamedCode, RunDirectory};
 use dmprl_shared::config::ExperimentConfig;
 use tracing::warn;
 
-/// The flag of commands that import what a run's configuration names.
+/// The flag of commands that import the modules in a run's configuration.
 #[derive(Debug, Clone, Copy, Args)]
 pub(super) struct TrustArgs {
     /// Import the modules that the run's configuration names, although you did not make the run on
@@ -94,7 +94,7 @@ fn has_module(folder: &Path, module: &str) -> bool {
     folder.join(first).is_dir() || folder.join(format!("{first}.py")).is_file()
 }
 
-/// What the command line of `train` itself says about code.
+/// The code that the command line of `train` itself names.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Said<'a> {
     /// The task.
