@@ -20,8 +20,8 @@ pub(super) struct ConfiguredArgs {
     /// Policy type: one DMP per segment, or an action of the network at every step.
     #[arg(long, value_parser = PossibleValuesParser::new(["dmp", "mlp"]))]
     policy: Option<String>,
-    /// Named set of configuration values [default: `goal` for tasks of Gymnasium-Robotics and
-    /// panda-gym with goals and a sparse reward, else `default`].
+    /// Named set of configuration values [default: `goal` for tasks with goals and a sparse reward,
+    /// ours and those of Gymnasium-Robotics and panda-gym, else `default`].
     #[arg(long,
           value_parser = PossibleValuesParser::new(PRESETS.iter().map(|preset| preset.name)))]
     preset: Option<String>,
