@@ -34,12 +34,6 @@ impl Key {
         &self.0
     }
 
-    /// Begins a keyed hash.
-    #[must_use]
-    pub fn hasher(&self) -> Hmac<Sha256> {
-        hasher(&self.0)
-    }
-
     /// Computes the keyed hash of these parts, as text.
     #[must_use]
     pub fn prove(&self, parts: &[&[u8]]) -> String {
@@ -61,12 +55,8 @@ impl std::fmt::Debug for Key {
     }
 }
 
-fn hasher(key: &[u8]) -> Hmac<Sha256> {
-    Hmac::new_from_slice(key).expect("HMAC takes keys of any length")
-}
-
 fn hash(key: &[u8], parts: &[&[u8]]) -> Hmac<Sha256> {
-    let mut hasher = hasher(key);
+    let mut hasher = Hmac::<Sha256>::new_from_slice(key).expect("HMAC takes keys of any length");
     for part in parts {
         hasher.update(&(part.len() as u64).to_le_bytes());
         hasher.update(part);

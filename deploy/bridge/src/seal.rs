@@ -1,13 +1,13 @@
 //! Keyed hashes on all messages of a host that has joined, unless the link is authenticated itself:
 //! a `tls/` link with the certificates that are derived from the run's token.
 //!
-//! A sealed message is the message, its number and a keyed hash over both (HMAC-SHA256, truncated
-//! to 128 bits). Each kind of message has its own key, so that no message can be taken for one of
+//! A sealed message is the message, its number and a keyed hash over both (BLAKE3, truncated to
+//! 128 bits). Each kind of message has its own key, so that no message can be taken for one of
 //! another host, kind or session. Numbers increase, so that none is taken twice; lost messages
 //! leave gaps.
 
-use hmac::{Hmac, Mac};
-use sha2::Sha256;
+use blake3::Hasher;
+use subtle::ConstantTimeEq;
 
 use crate::keys::Key;
 use crate::link::{MessageReceiver, MessageSender};
@@ -20,20 +20,26 @@ pub const SEAL_BYTES: usize = NUMBER_BYTES + TAG_BYTES;
 /// Seals messages of one kind.
 #[derive(Debug)]
 pub struct Sealer {
-    keyed: Option<Hmac<Sha256>>,
+    keyed: Option<Hasher>,
     number: u64,
 }
 
 /// Verifies messages of one kind.
 #[derive(Debug)]
 pub struct Opener {
-    keyed: Option<Hmac<Sha256>>,
+    keyed: Option<Hasher>,
     /// Number of the last message, from 1.
     last: u64,
 }
 
-fn keyed(session: Option<&Key>, kind: &str) -> Option<Hmac<Sha256>> {
-    session.map(|session| session.derive(&[b"kind", kind.as_bytes()]).hasher())
+fn keyed(session: Option<&Key>, kind: &str) -> Option<Hasher> {
+    session.map(|session| Hasher::new_keyed(session.derive(&[b"kind", kind.as_bytes()]).bytes()))
+}
+
+fn tag(keyed: &Hasher, signed: &[u8]) -> [u8; TAG_BYTES] {
+    let mut tag = [0; TAG_BYTES];
+    keyed.clone().update(signed).finalize_xof().fill(&mut tag);
+    tag
 }
 
 impl Sealer {
@@ -49,8 +55,8 @@ impl Sealer {
         let Some(keyed) = &self.keyed else { return message };
         self.number += 1;
         message.extend_from_slice(&self.number.to_le_bytes());
-        let tag = keyed.clone().chain_update(&message).finalize().into_bytes();
-        message.extend_from_slice(&tag[..TAG_BYTES]);
+        let tag = tag(keyed, &message);
+        message.extend_from_slice(&tag);
         message
     }
 }
@@ -65,11 +71,11 @@ impl Opener {
     /// Returns the message; `None` if it was forged, changed or repeated.
     pub fn open<'a>(&mut self, sealed: &'a [u8]) -> Option<&'a [u8]> {
         let Some(keyed) = &self.keyed else { return Some(sealed) };
-        let (signed, tag) = sealed.split_at_checked(sealed.len().checked_sub(TAG_BYTES)?)?;
+        let (signed, claimed) = sealed.split_last_chunk::<TAG_BYTES>()?;
         let (message, number) = signed.split_last_chunk::<NUMBER_BYTES>()?;
         let number = u64::from_le_bytes(*number);
-        keyed.clone().chain_update(signed).verify_truncated_left(tag).ok()?;
-        if number <= self.last {
+        let is_genuine = bool::from(tag(keyed, signed).ct_eq(claimed));
+        if !is_genuine || number <= self.last {
             return None;
         }
         self.last = number;

@@ -11,7 +11,7 @@ use std::time::Duration;
 
 use anyhow::Context;
 use rustls::pki_types::ServerName;
-use tokio::io::{AsyncRead, AsyncWrite, copy_bidirectional_with_sizes};
+use tokio::io::{AsyncRead, AsyncWrite, BufReader, copy_bidirectional_with_sizes};
 use tokio::net::{TcpListener, TcpStream};
 use tokio::runtime::{Builder, Runtime};
 use tokio::sync::Semaphore;
@@ -29,7 +29,7 @@ const HANDSHAKE_LIMIT: Duration = Duration::from_secs(10);
 const CONNECTIONS_MAX: u32 = 256;
 const CONNECT_LIMIT: Duration = Duration::from_secs(5);
 /// Buffer for each direction of a connection \[bytes\].
-const BUFFER_BYTES: usize = 65_536;
+const BUFFER_BYTES: usize = 262_144;
 /// Wait after the system could not accept a connection, such as for lack of open files.
 const ACCEPT_PAUSE: Duration = Duration::from_millis(100);
 /// Time limit to deliver the last messages of a closed session.
@@ -143,7 +143,7 @@ async fn accept_hosts(
         tokio::spawn(async move {
             // Without a delay for small messages, as on Zenoh's own connections.
             let _ = outer.set_nodelay(true);
-            let accepted = timeout(HANDSHAKE_LIMIT, acceptor.accept(outer)).await;
+            let accepted = timeout(HANDSHAKE_LIMIT, acceptor.accept(buffered(outer))).await;
             drop(handshake);
             let Ok(Ok(outer)) = accepted else {
                 shared.refused.fetch_add(1, Ordering::Relaxed);
@@ -171,12 +171,17 @@ async fn accept_local(
             let Ok(Ok(outer)) = connected else { return };
             let _ = outer.set_nodelay(true);
             let name = ServerName::try_from(NAME).expect("the name is valid");
-            let accepted = timeout(HANDSHAKE_LIMIT, connector.connect(name, outer)).await;
+            let accepted = timeout(HANDSHAKE_LIMIT, connector.connect(name, buffered(outer))).await;
             if let Ok(Ok(outer)) = accepted {
                 forward(inner, outer, &shared).await;
             }
         });
     }
+}
+
+/// Rustls would read 4 KiB at a time.
+fn buffered(outer: TcpStream) -> BufReader<TcpStream> {
+    BufReader::with_capacity(BUFFER_BYTES, outer)
 }
 
 /// Copies in both directions until both ends are closed or one fails.
