@@ -14,6 +14,9 @@ use crate::rollout::RolloutError;
 /// Steps after which an episode of an environment without a time limit is cut off.
 const EPISODE_STEPS_MAX: u32 = 10_000;
 
+/// Size of an action u from which it counts as at a bound.
+const AT_BOUND: f32 = 0.99;
+
 /// Maximum number of repeats of an episode, with the same seed, after a failure of its environment.
 const EPISODE_REPEATS_MAX: u32 = 1;
 
@@ -42,6 +45,8 @@ pub struct Evaluation {
     pub success_rate: Option<f64>,
     /// Mean |u_t - u_{t-1}| over all steps and action dimensions.
     pub smoothness: f64,
+    /// Share of the actions u that are within 1 % of a bound, over all steps and dimensions.
+    pub at_bounds: f64,
 }
 
 impl Evaluation {
@@ -85,6 +90,9 @@ struct Wave {
     /// Sum and number of the differences |u_t - u_{t-1}|.
     jumps: Vec<f64>,
     jump_count: Vec<u64>,
+    /// Number of actions, per dimension, and of those at a bound.
+    actions: Vec<u64>,
+    at_bounds: Vec<u64>,
 }
 
 impl Evaluator {
@@ -168,6 +176,7 @@ impl Evaluator {
         let mut returns = Vec::with_capacity(episodes.count);
         let mut success = Vec::with_capacity(episodes.count);
         let (mut jumps, mut jump_count) = (0.0, 0);
+        let (mut actions, mut at_bounds) = (0, 0);
         while returns.len() < episodes.count {
             let count = (episodes.count - returns.len()).min(self.envs);
             let first_seed = episodes.first_seed + returns.len() as u64;
@@ -178,12 +187,15 @@ impl Evaluator {
             success.extend(&wave.success[..count]);
             jumps += wave.jumps.iter().sum::<f64>();
             jump_count += wave.jump_count.iter().sum::<u64>();
+            actions += wave.actions.iter().sum::<u64>();
+            at_bounds += wave.at_bounds.iter().sum::<u64>();
         }
         let reported = success.iter().all(|&flag: &u8| flag != SUCCESS_NOT_REPORTED);
         let successes = success.iter().filter(|&&flag| flag == SUCCESS_YES).count();
         Ok(Some(Evaluation {
             success_rate: reported.then(|| successes as f64 / success.len() as f64),
             smoothness: jumps / (jump_count.max(1) as f64),
+            at_bounds: at_bounds as f64 / actions.max(1) as f64,
             returns,
         }))
     }
@@ -206,6 +218,8 @@ impl Evaluator {
             last_u: vec![f32::NAN; self.envs * dims],
             jumps: vec![0.0; self.envs],
             jump_count: vec![0; self.envs],
+            actions: vec![0; self.envs],
+            at_bounds: vec![0; self.envs],
         };
         drop(self.take_trace());
         let all = vec![true; self.envs];
@@ -251,6 +265,7 @@ impl Evaluator {
             }
             (wave.returns[env], wave.steps[env]) = (0.0, 0);
             (wave.jumps[env], wave.jump_count[env]) = (0.0, 0);
+            (wave.actions[env], wave.at_bounds[env]) = (0, 0);
             wave.last_u[env * dims..(env + 1) * dims].fill(f32::NAN);
             drop(self.take_trace());
         }
@@ -271,6 +286,8 @@ impl Evaluator {
             trace.rewards.extend(rewards);
             (self.on_steps)(trace.rewards.len());
         }
+        wave.actions[env] += u.len() as u64;
+        wave.at_bounds[env] += u.iter().filter(|u| u.abs() >= AT_BOUND).count() as u64;
         let last = &mut wave.last_u[env * dims..(env + 1) * dims];
         for step in u.chunks_exact(dims) {
             for (u, last) in step.iter().zip(last.iter_mut()) {

@@ -18,6 +18,7 @@ use thiserror::Error;
 
 use crate::environments::{self, EnvironmentsError};
 use crate::evaluate::{ENVIRONMENTS_MAX, Episodes, Evaluator};
+use crate::policy_health::PolicyHealth;
 use crate::python_env::Interpreter;
 use crate::rollout::RolloutError;
 
@@ -100,6 +101,7 @@ pub fn run(
 ) -> Result<(), EvaluationError> {
     let spec = evaluator.environments().spec().clone();
     supervisor.report(&Report::EnvironmentReady { spec })?;
+    let mut health = PolicyHealth::default();
     while !supervisor.stop_requested() {
         let command = supervisor.next_command(COMMAND_WAIT);
         let Some(Command::Evaluate(request)) = command else { continue };
@@ -108,6 +110,9 @@ pub fn run(
         match answer? {
             Answer::Row(row) => {
                 keep(&row).map_err(EvaluationError::Row)?;
+                for message in health.check(&row) {
+                    supervisor.report(&Report::Warning { message })?;
+                }
                 supervisor.report(&Report::Evaluated(row))?;
             }
             Answer::Failed(reason) => {
@@ -152,5 +157,6 @@ pub fn evaluate(
         returns: evaluation.returns,
         success_rate: evaluation.success_rate,
         smoothness: evaluation.smoothness,
+        at_bounds: Some(evaluation.at_bounds),
     }))
 }

@@ -23,6 +23,8 @@ mod faults;
 #[cfg(feature = "python")]
 mod hindsight;
 #[cfg(feature = "python")]
+pub mod policy_health;
+#[cfg(feature = "python")]
 mod policy_runner;
 #[cfg(feature = "python")]
 pub mod python_env;

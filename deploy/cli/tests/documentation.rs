@@ -333,6 +333,7 @@ fn the_keys_of_both_kinds_of_lines_are_documented() {
         return_mean: 0.0,
         success_rate: None,
         smoothness: 0.0,
+        at_bounds: None,
     };
     let page = read("docs/metrics.md");
     let lines = [

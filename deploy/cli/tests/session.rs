@@ -35,6 +35,7 @@ fn row(policy_version: u64) -> EvaluationRow {
         return_mean: -2.5,
         success_rate: None,
         smoothness: 0.0,
+        at_bounds: None,
     }
 }
 

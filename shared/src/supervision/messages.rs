@@ -241,6 +241,10 @@ pub struct EvaluationRow {
     pub success_rate: Option<f64>,
     /// Mean |u_t - u_{t-1}| over all steps and action dimensions.
     pub smoothness: f64,
+    /// Share of the actions that are within 1 % of a bound, over all steps and dimensions. `None`
+    /// in rows of earlier versions.
+    #[serde(default)]
+    pub at_bounds: Option<f64>,
 }
 
 /// An evaluation contains a number that JSON cannot represent.
@@ -260,7 +264,8 @@ impl EvaluationRow {
     /// If a number is NaN or infinite.
     pub fn check_finite(&self) -> Result<(), EvaluationNotFinite> {
         let numbers = [self.wall_s, self.return_mean, self.smoothness];
-        let mut numbers = numbers.iter().chain(&self.returns).chain(&self.success_rate);
+        let mut numbers =
+            numbers.iter().chain(&self.returns).chain(&self.success_rate).chain(&self.at_bounds);
         let policy_version = self.policy_version;
         match numbers.find(|number| !number.is_finite()) {
             Some(&number) => Err(EvaluationNotFinite { policy_version, number }),

@@ -91,6 +91,7 @@ mod tests {
             return_mean: returns.iter().sum::<f64>() / returns.len() as f64,
             success_rate: None,
             smoothness: 0.0,
+            at_bounds: None,
         }
     }
 

@@ -68,6 +68,7 @@ fn row(task: &str, value: f64, index: u64) -> EvaluationRow {
         return_mean: value,
         success_rate: panda.then_some(value),
         smoothness: 0.1,
+        at_bounds: None,
     }
 }
 

@@ -153,6 +153,7 @@ impl RunRecord {
             return_mean: self.return_mean[index],
             success_rate: self.success_rate.as_ref().map(|rates| rates[index]),
             smoothness: self.smoothness[index],
+            at_bounds: None,
         };
         let rows = (0..self.env_steps.len()).map(row).collect();
         let Self {

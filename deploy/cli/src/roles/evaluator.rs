@@ -93,6 +93,7 @@ mod tests {
         return_mean: -1.0,
         success_rate: None,
         smoothness: 0.0,
+        at_bounds: None,
     };
 
     fn setup(parent: &tempfile::TempDir) -> Setup {

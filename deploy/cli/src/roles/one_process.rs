@@ -10,6 +10,7 @@ use std::cell::Cell;
 use dmprl_actors::environments::report_failures;
 use dmprl_actors::evaluate::Evaluator;
 use dmprl_actors::evaluator::{self, Answer, Evaluations};
+use dmprl_actors::policy_health::PolicyHealth;
 use dmprl_actors::rollout::{Identity, Rollout, RolloutError};
 use dmprl_actors::worker;
 use dmprl_control::{EvaluationRequest, Report};
@@ -65,7 +66,9 @@ pub fn run(args: &LearnerArgs, control: &ControlPipe) -> anyhow::Result<()> {
         (&Cell::new(false), &Cell::new(session.learner.counters.env_failures));
     let stop = control.stop_flag();
     let evaluations = Evaluations { config, policy_path: &policy_path, stop };
-    let mut inline = InlineEvaluator { evaluator, evaluations, setup, control, reached, failures };
+    let health = PolicyHealth::default();
+    let mut inline =
+        InlineEvaluator { evaluator, evaluations, health, setup, control, reached, failures };
     let mut evaluate = |request: EvaluationRequest| inline.evaluate(&request).map_err(Into::into);
     request_missed_evaluation(&mut session, &mut recorder, &mut evaluate)?;
     let mut first = true;
@@ -108,6 +111,7 @@ pub fn run(args: &LearnerArgs, control: &ControlPipe) -> anyhow::Result<()> {
 struct InlineEvaluator<'a> {
     evaluator: Evaluator,
     evaluations: Evaluations<'a>,
+    health: PolicyHealth,
     setup: &'a Setup,
     control: &'a ControlPipe,
     /// Set after an evaluation has reached the run's goal.
@@ -133,6 +137,9 @@ impl InlineEvaluator<'_> {
         let success = row.success_rate.is_some_and(|rate| rate >= until_success);
         self.reached.set(self.reached.get() || success || row.return_mean >= until_return);
         // If the supervisor is gone, the loop notices it as a stop.
+        for message in self.health.check(&row) {
+            let _ = self.control.send(&Report::Warning { message });
+        }
         let _ = self.control.send(&Report::Evaluated(row));
         Ok(())
     }

@@ -215,6 +215,7 @@ mod tests {
             return_mean,
             success_rate,
             smoothness: 0.0,
+            at_bounds: None,
         }
     }
 

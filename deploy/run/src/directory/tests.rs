@@ -27,6 +27,7 @@ fn row(policy_version: u64, return_mean: f64) -> EvaluationRow {
         return_mean,
         success_rate: None,
         smoothness: 0.5,
+        at_bounds: None,
     }
 }
 

@@ -361,6 +361,7 @@ mod tests {
             return_mean: 0.0,
             success_rate: None,
             smoothness: 0.0,
+            at_bounds: None,
         }
     }
 

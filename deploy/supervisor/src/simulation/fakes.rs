@@ -274,6 +274,7 @@ fn row(policy_version: u64) -> EvaluationRow {
         return_mean: policy_version as f64,
         success_rate: None,
         smoothness: 0.0,
+        at_bounds: None,
     }
 }
 
