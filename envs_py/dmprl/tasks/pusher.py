@@ -105,6 +105,10 @@ class PusherV0(Pusher):
         include_armature(model)
         return model
 
+    def derive_constants(self, model: mujoco.MjModel) -> None:  # noqa: D102 - inherited
+        super().derive_constants(model)
+        include_armature(model)
+
     def rewarded(self, observations: NDArray[np.float64]) -> NDArray[np.float64]:
         """Returns the states before the steps."""
         return observations[:, :-1]
