@@ -68,9 +68,7 @@ class DelayedEnv(SegmentEnv):
         for index, (_, delay) in enumerate(self._delays.tolist()):
             self._delay_observations(index, delay, bool(ended[index]), out)
 
-    def _delay_observations(
-        self, index: int, delay: int, ended: bool, out: SegmentBuffers
-    ) -> None:
+    def _delay_observations(self, index: int, delay: int, ended: bool, out: SegmentBuffers) -> None:
         past, rows = self._most_observation, int(out.steps[index]) + 1
         if not out.failed[index]:
             delayed = self._seen[index, past - delay : past - delay + rows]

@@ -139,7 +139,7 @@ class GymnasiumSegmentEnv(SegmentEnv):
         kwargs = {**self.options.kwargs, **more}
         env = gymnasium.make(self._registered, disable_env_checker=True, **kwargs)
         if self.options.randomise.of_model():
-            from dmprl.randomise import randomised_env  # imports MuJoCo
+            from dmprl.randomised_env import randomised_env  # imports MuJoCo
 
             env = randomised_env(env, self.options.randomise)
         env = wrapped(env, self.options.wrappers)

@@ -23,7 +23,7 @@ from mujoco.batch import Batch
 from numpy.typing import NDArray
 
 from dmprl.env_options import Randomise
-from dmprl.randomise import ModelRandomiser, derive_constants
+from dmprl.randomise import ModelRandomiser
 from dmprl.segment_env import (
     SUCCESS_NOT_REPORTED,
     EnvSpec,
@@ -84,9 +84,12 @@ class MujocoTask(ABC):
     def load_model(self) -> mujoco.MjModel:
         """Compiles the model."""
 
-    def derive_constants(self, model: mujoco.MjModel) -> None:
-        """Recomputes what depends on masses and sizes, after these were changed in ``model``."""
-        derive_constants(model)
+    def derive_constants(self, model: mujoco.MjModel, data: mujoco.MjData) -> None:
+        """Recomputes what depends on the masses, after these were changed in ``model``.
+
+        ``data`` is a work area, created once because that takes longer than all the rest.
+        """
+        mujoco.mj_setConst(model, data)
 
     def picture_model(self) -> mujoco.MjModel:
         """Returns the model for pictures, with the same states as :attr:`model`."""
@@ -192,8 +195,7 @@ class BatchSegmentEnv(SegmentEnv):
         task = self.task
         self._models = [copy.copy(task.model) for _ in range(self.env_count)]
         self._randomisers = [
-            ModelRandomiser(task.id, ranges, model, task.derive_constants)
-            for model in self._models
+            ModelRandomiser(task.id, ranges, model, task.derive_constants) for model in self._models
         ]
 
     def _prepare(self) -> None:

@@ -8,9 +8,7 @@ them.
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
 
-import gymnasium
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
@@ -40,16 +38,12 @@ CHANGED = (
 """Fields that a :class:`ModelRandomiser` writes."""
 
 
-def derive_constants(model: mujoco.MjModel) -> None:
-    """Recomputes what MuJoCo derives from masses, such as inverse weights."""
-    mujoco.mj_setConst(model, mujoco.MjData(model))
-
-
 class ModelRandomiser:
     """Changes one environment's model at the start of each episode.
 
     - ``name``: the environment, for errors.
-    - ``derive``: recomputes the constants of the model after a change.
+    - ``derive``: recomputes the constants of the model after a change, such as inverse weights; it
+      may overwrite its second argument.
 
     Raises:
         RandomiseError: if the model has nothing that a key of ``ranges`` could change.
@@ -60,9 +54,10 @@ class ModelRandomiser:
         name: str,
         ranges: Randomise,
         model: mujoco.MjModel,
-        derive: Callable[[mujoco.MjModel], None] = derive_constants,
+        derive: Callable[[mujoco.MjModel, mujoco.MjData], None] = mujoco.mj_setConst,
     ) -> None:
         self._name, self._ranges, self._model, self._derive = name, ranges, model, derive
+        self._data = mujoco.MjData(model)
         self._rng = np.random.default_rng()
         self._objects = objects_of(model)
         # Bodies and geoms of each object.
@@ -113,7 +108,7 @@ class ModelRandomiser:
         model.actuator_biasprm[servos, 2] = nominal["actuator_biasprm"][servos, 2] * servo_factors
         for index, size in enumerate(sizes):
             self._resize(index, size)
-        self._derive(model)
+        self._derive(model, self._data)
 
     def _resize(self, index: int, size: float) -> None:
         """Scales an object about the origin of its body."""
@@ -181,47 +176,6 @@ def position_servos(model: mujoco.MjModel) -> NDArray[np.intp]:
     affine = model.actuator_biastype == mujoco.mjtBias.mjBIAS_AFFINE.value
     gains = (model.actuator_biasprm[:, 1:3] != 0.0).all(axis=1)
     return np.flatnonzero(on_joint & affine & gains)
-
-
-class RandomisedEnv(gymnasium.Wrapper):
-    """Draws the model of a Gymnasium environment on MuJoCo at each reset."""
-
-    def __init__(self, env: gymnasium.Env, ranges: Randomise) -> None:
-        super().__init__(env)
-        name, inner = env.spec.id, env.unwrapped
-        model, data = getattr(inner, "model", None), getattr(inner, "data", None)
-        if not (isinstance(model, mujoco.MjModel) and isinstance(data, mujoco.MjData)):
-            raise RandomiseError.of(ranges.of_model(), name, "it has no MuJoCo model")
-        self._randomiser = ModelRandomiser(name, ranges, model)
-        same_space = env.observation_space is inner.observation_space
-        if self._randomiser.moves_objects and not (same_space and hasattr(inner, "_get_obs")):
-            key = "object_size" if ranges.changes("object_size") else "start_pose"
-            reason = "its observation cannot be computed again, because it has no `_get_obs`"
-            raise RandomiseError.of(key, name, reason)
-
-    def reset(  # noqa: D102 - inherited
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[Any, dict[str, Any]]:
-        if seed is not None:
-            self._randomiser.seed(seed)
-        self._randomiser.draw()
-        observation, info = self.env.reset(seed=seed, options=options)
-        if self._randomiser.moves_objects:
-            inner = self.unwrapped
-            self._randomiser.place(inner.data.qpos)
-            mujoco.mj_forward(inner.model, inner.data)
-            observation = inner._get_obs()
-        return observation, info
-
-
-def randomised_env(env: gymnasium.Env, ranges: Randomise) -> gymnasium.Env:
-    """Randomises a Gymnasium environment; one of dmprl's tasks like a worker's batch of it."""
-    from dmprl.task_env import TaskEnv
-
-    if isinstance(env.unwrapped, TaskEnv):
-        env.unwrapped.randomise(ranges)
-        return env
-    return RandomisedEnv(env, ranges)
 
 
 def randomise_batch(env: object, ranges: Randomise) -> None:
