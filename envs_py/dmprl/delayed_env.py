@@ -61,7 +61,7 @@ class DelayedEnv(SegmentEnv):
         for index, (delay, _) in enumerate(self._delays.tolist()):
             self._sent[index] = self._given[index, past - delay : past - delay + steps]
         self._env.step_segment(self._sent, out)
-        # An episode that goes on has run all steps of the segment.
+        # An episode that has not ended has run all steps of the segment.
         self._given[:, :past] = self._given[:, steps:].copy()
         self._seen[:, self._most_observation :] = out.observations
         ended = (out.terminated | out.truncated | out.failed).tolist()

@@ -14,7 +14,7 @@ class OptionsError(TypeError):
 
 
 class RandomiseError(ValueError):
-    """Raised if an environment lacks what ``task.randomise`` would change."""
+    """Raised if ``task.randomise`` cannot be applied to an environment."""
 
     @classmethod
     def of(cls, key: str, name: str, reason: str) -> RandomiseError:
@@ -38,7 +38,7 @@ class Randomise(NamedTuple):
         return tuple(getattr(self, key)) != self._field_defaults[key]
 
     def of_model(self) -> str | None:
-        """Returns the first key that changes the model or its start; None if no one does."""
+        """Returns the first key that changes the model or its start; None without such a key."""
         keys = (key for key in self._fields if not key.endswith("_delay_steps"))
         return next(filter(self.changes, keys), None)
 
@@ -55,7 +55,7 @@ class EnvOptions(NamedTuple):
     wrappers: tuple[str, ...] = ()
     """Names ``module:name`` of classes or functions, the innermost wrapper first."""
     randomise: Randomise = Randomise()
-    """What each episode draws anew."""
+    """Physics and delays that each episode draws anew."""
 
     @classmethod
     def parse(cls, text: str) -> EnvOptions:

@@ -190,7 +190,7 @@ class BatchSegmentEnv(SegmentEnv):
         """Gives each environment a model of its own, drawn for each episode.
 
         Raises:
-            RandomiseError: if the task lacks what is to be randomised.
+            RandomiseError: if a key cannot be applied to the task.
         """
         task = self.task
         self._models = [copy.copy(task.model) for _ in range(self.env_count)]

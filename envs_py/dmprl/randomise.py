@@ -46,7 +46,7 @@ class ModelRandomiser:
       may overwrite its second argument.
 
     Raises:
-        RandomiseError: if the model has nothing that a key of ``ranges`` could change.
+        RandomiseError: if a key of ``ranges`` cannot be applied to the model.
     """
 
     def __init__(
@@ -182,7 +182,7 @@ def randomise_batch(env: object, ranges: Randomise) -> None:
     """Randomises the environments of a batch.
 
     Raises:
-        RandomiseError: if it is a user's own ``SegmentEnv``, or lacks what is to be randomised.
+        RandomiseError: if a key cannot be applied, as to a user's own ``SegmentEnv``.
     """
     from dmprl.mujoco_batch import BatchSegmentEnv  # that module imports this one
 

@@ -241,7 +241,7 @@ def make(
 
     Raises:
         OptionsError: if they cannot be created with these options; the cause is the original error.
-        RandomiseError: if they lack what is to be randomised.
+        RandomiseError: if a key of ``task.randomise`` cannot be applied to them.
     """
     if env_count < 1 or segment_steps < 1:
         raise ValueError(

@@ -14,17 +14,19 @@ const OFFSET_M_MAX: f64 = 10.0;
 const DELAY_STEPS_MAX: u32 = 100;
 
 /// Ranges `[low, high]` from which each episode draws its own physics and delays, uniformly. With
-/// the defaults, nothing is drawn (docs/randomisation.md).
+/// the defaults, nothing is drawn (docs/environments.md).
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct RandomiseConfig {
-    /// Factors of each body's mass and inertia.
+    /// Factors of each body's mass and inertia, one for each body.
     pub mass: [f64; 2],
-    /// One factor of all friction coefficients.
+    /// Factor of all friction coefficients.
     pub friction: [f64; 2],
-    /// Factors of each joint's damping.
+    /// Factors of each joint's damping, including the velocity gain of a position servo, one for
+    /// each joint.
     pub damping: [f64; 2],
-    /// Factors of each object's size; its mass is unchanged.
+    /// Factors of each object's size, one for each object; its mass is unchanged. Objects are
+    /// bodies with a free joint as their only joint.
     pub object_size: [f64; 2],
     /// Offsets of each object's start position along x and y \[m\].
     pub start_pose: [f64; 2],
@@ -55,7 +57,7 @@ impl RandomiseConfig {
         *self == Self::default()
     }
 
-    /// Checks every range; only the environment knows what it has.
+    /// Checks every range; only the environment knows which keys it supports.
     pub(super) fn check(&self) -> Result<(), ConfigError> {
         for (key, range) in [
             ("task.randomise.mass", self.mass),
