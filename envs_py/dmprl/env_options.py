@@ -13,6 +13,40 @@ class OptionsError(TypeError):
     """Raised if an environment cannot be created with its arguments and wrappers."""
 
 
+class RandomiseError(ValueError):
+    """Raised if ``task.randomise`` cannot be applied to an environment."""
+
+    @classmethod
+    def of(cls, key: str, name: str, reason: str) -> RandomiseError:
+        """Creates the error of a key and an environment."""
+        return cls(f"task.randomise.{key} cannot be applied to {name}: {reason}; remove the key")
+
+
+class Randomise(NamedTuple):
+    """Ranges from which each episode draws, as in ``RandomiseConfig`` in Rust."""
+
+    mass: tuple[float, float] = (1.0, 1.0)
+    friction: tuple[float, float] = (1.0, 1.0)
+    damping: tuple[float, float] = (1.0, 1.0)
+    object_size: tuple[float, float] = (1.0, 1.0)
+    start_pose: tuple[float, float] = (0.0, 0.0)
+    action_delay_steps: tuple[int, int] = (0, 0)
+    observation_delay_steps: tuple[int, int] = (0, 0)
+
+    def changes(self, key: str) -> bool:
+        """Returns whether a key has another value than its default."""
+        return tuple(getattr(self, key)) != self._field_defaults[key]
+
+    def of_model(self) -> str | None:
+        """Returns the first key that changes the model or its start; None without such a key."""
+        keys = (key for key in self._fields if not key.endswith("_delay_steps"))
+        return next(filter(self.changes, keys), None)
+
+    def delays(self) -> bool:
+        """Returns whether actions or observations are delayed."""
+        return self.changes("action_delay_steps") or self.changes("observation_delay_steps")
+
+
 class EnvOptions(NamedTuple):
     """How to create an environment, apart from its id."""
 
@@ -20,12 +54,15 @@ class EnvOptions(NamedTuple):
     """Arguments of ``gymnasium.make`` and of the environment."""
     wrappers: tuple[str, ...] = ()
     """Names ``module:name`` of classes or functions, the innermost wrapper first."""
+    randomise: Randomise = Randomise()
+    """Physics and delays that each episode draws anew."""
 
     @classmethod
     def parse(cls, text: str) -> EnvOptions:
         """Reads the TOML text of the program (``TaskConfig::options_toml`` in Rust)."""
         table = tomllib.loads(text)
-        return cls(table["kwargs"], tuple(table["wrappers"]))
+        randomise = Randomise(**table.get("randomise", {}))
+        return cls(table["kwargs"], tuple(table["wrappers"]), randomise)
 
     def __bool__(self) -> bool:
         """Returns whether there are arguments or wrappers."""
@@ -50,6 +87,8 @@ class EnvOptions(NamedTuple):
         """Adds the arguments, the wrappers and a remedy to the message of any exception."""
         try:
             yield
+        except RandomiseError:
+            raise
         except Exception as error:
             if not self:
                 raise

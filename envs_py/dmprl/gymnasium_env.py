@@ -64,7 +64,7 @@ class GymnasiumSegmentEnv(SegmentEnv):
     - ``named``: the object that ``task_id`` names if it is ``module:Name``. The optional attribute
       ``max_episode_steps`` of a class or function limits its episodes.
     - ``options``: arguments of ``gymnasium.make``, and wrappers, which are applied to its result
-      and thus outside the time limit.
+      and thus outside the time limit, and what each episode draws anew, except delays.
     """
 
     def __init__(
@@ -138,6 +138,10 @@ class GymnasiumSegmentEnv(SegmentEnv):
         """Creates an environment; ``more`` are arguments that take precedence."""
         kwargs = {**self.options.kwargs, **more}
         env = gymnasium.make(self._registered, disable_env_checker=True, **kwargs)
+        if self.options.randomise.of_model():
+            from dmprl.randomised_env import randomised_env  # imports MuJoCo
+
+            env = randomised_env(env, self.options.randomise)
         env = wrapped(env, self.options.wrappers)
         observation, action = env.observation_space, env.action_space
         self._observation_space = observation

@@ -10,6 +10,7 @@ Shapes: E environments, K steps of a segment, O observation, A action.
 
 from __future__ import annotations
 
+import copy
 import ctypes
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
@@ -21,6 +22,8 @@ import numpy as np
 from mujoco.batch import Batch
 from numpy.typing import NDArray
 
+from dmprl.env_options import Randomise
+from dmprl.randomise import ModelRandomiser
 from dmprl.segment_env import (
     SUCCESS_NOT_REPORTED,
     EnvSpec,
@@ -80,6 +83,13 @@ class MujocoTask(ABC):
     @abstractmethod
     def load_model(self) -> mujoco.MjModel:
         """Compiles the model."""
+
+    def derive_constants(self, model: mujoco.MjModel, data: mujoco.MjData) -> None:
+        """Recomputes what depends on the masses, after these were changed in ``model``.
+
+        ``data`` is a work area, created once because that takes longer than all the rest.
+        """
+        mujoco.mj_setConst(model, data)
 
     def picture_model(self) -> mujoco.MjModel:
         """Returns the model for pictures, with the same states as :attr:`model`."""
@@ -168,12 +178,25 @@ class BatchSegmentEnv(SegmentEnv):
         self._seeds = [0] * self.env_count
         self._failures = [0] * self.env_count
         self._messages: list[str] = []
+        self._randomisers: list[ModelRandomiser] = []
         self._starts = Start(*(self.batch.bind(name) for name in Start._fields))
         self._fields = {name: self.batch.bind(name) for name in task.recorded}
         # The state after mj_resetData. Copying it is cheaper than that call, and the forward pass
         # recomputes everything else that mj_resetData clears.
         self._new_state = self.batch.state[0].copy()
         self._prepare()
+
+    def randomise(self, ranges: Randomise) -> None:
+        """Gives each environment a model of its own, drawn for each episode.
+
+        Raises:
+            RandomiseError: if a key cannot be applied to the task.
+        """
+        task = self.task
+        self._models = [copy.copy(task.model) for _ in range(self.env_count)]
+        self._randomisers = [
+            ModelRandomiser(task.id, ranges, model, task.derive_constants) for model in self._models
+        ]
 
     def _prepare(self) -> None:
         """Allocates the arrays of a segment, for each possible number of steps."""
@@ -210,7 +233,7 @@ class BatchSegmentEnv(SegmentEnv):
         indices = np.flatnonzero(mask).astype(np.int32)
         for index in indices.tolist():
             self._seeds[index], self._failures[index] = int(seeds[index]), 0
-            self.seed(index, generator(self._seeds[index]))
+            self._seed_all(index, self._seeds[index])
         self.begin(indices, out)
 
     def begin(self, indices: NDArray[np.int32], out: SegmentBuffers) -> None:
@@ -221,6 +244,15 @@ class BatchSegmentEnv(SegmentEnv):
     def seed(self, index: int, rng: np.random.Generator) -> None:
         """Sets the generator of an environment's start states."""
         self._generators[index] = rng
+
+    def seed_model(self, index: int, seed: int) -> None:
+        """Seeds the draws of an environment's model."""
+        if self._randomisers:
+            self._randomisers[index].seed(seed)
+
+    def _seed_all(self, index: int, seed: int) -> None:
+        self.seed(index, generator(seed))
+        self.seed_model(index, seed)
 
     def step_segment(  # noqa: D102 - inherited
         self, actions: NDArray[np.float64], out: SegmentBuffers
@@ -292,7 +324,7 @@ class BatchSegmentEnv(SegmentEnv):
             for index in failed.tolist():
                 self._failures[index] += 1
                 seed = seed_after_failure(self._seeds[index], self._failures[index])
-                self.seed(index, generator(seed))
+                self._seed_all(index, seed)
         ended = np.flatnonzero(out.truncated | out.failed).astype(np.int32)
         if ended.size:
             self._begin(ended)
@@ -303,6 +335,11 @@ class BatchSegmentEnv(SegmentEnv):
         for index in indices.tolist():
             start = Start(*(states[index] for states in self._starts))
             self.task.draw_start(self._generators[index], start)
+            if self._randomisers:
+                self._randomisers[index].draw()
+                self._randomisers[index].place(start.qpos)
+        if self._randomisers:
+            self.batch.set_models(self._models)  # which have changed
         self.batch.forward(indices)
         self.batch.warning[indices] = 0
         self.task.episodes_began(indices)

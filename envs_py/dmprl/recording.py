@@ -26,6 +26,7 @@ except Exception as error:  # raised by the OpenGL that MUJOCO_GL names
     ) from None
 
 from dmprl import segment_env
+from dmprl.delayed_env import DelayedEnv
 from dmprl.env_options import NO_OPTIONS, EnvOptions
 from dmprl.gymnasium_env import GymnasiumSegmentEnv, success_of
 from dmprl.pictures import name_opengl
@@ -270,7 +271,7 @@ def make(
     segment_steps: int,
     pictures: str | None = None,
     options: EnvOptions = NO_OPTIONS,
-) -> RecordingEnv | OpaqueEnv:
+) -> RecordingEnv | OpaqueEnv | DelayedEnv:
     """Creates one environment of a task.
 
     - ``task_id``, ``options``: as for :func:`dmprl.segment_env.make`.
@@ -285,4 +286,5 @@ def make(
         return OpaqueEnv(segment_env.make(task_id, 1, segment_steps, options))
     folder = None if pictures is None else Path(pictures)
     maker = gymnasium_maker(task_id, named, options)
-    return RecordingEnv(task_id, segment_steps, maker, folder, options)
+    env = RecordingEnv(task_id, segment_steps, maker, folder, options)
+    return segment_env.delayed(env, options)

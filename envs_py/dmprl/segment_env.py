@@ -241,16 +241,35 @@ def make(
 
     Raises:
         OptionsError: if they cannot be created with these options; the cause is the original error.
+        RandomiseError: if a key of ``task.randomise`` cannot be applied to them.
     """
     if env_count < 1 or segment_steps < 1:
         raise ValueError(
             f"{env_count} environments, {segment_steps} steps; expected 1 or more of both"
         )
+    env = _make(task_id, env_count, segment_steps, options)
+    return delayed(env, options)
+
+
+def delayed(env: SegmentEnv, options: EnvOptions) -> SegmentEnv:
+    """Adds the delays that ``options`` demand."""
+    if not options.randomise.delays():
+        return env
+    from dmprl.delayed_env import DelayedEnv  # that module imports this one
+
+    return DelayedEnv(env, options.randomise)
+
+
+def _make(task_id: str, env_count: int, segment_steps: int, options: EnvOptions) -> SegmentEnv:
     candidate = named_object(task_id)
     with options.explained(task_id):
         if not options.wrappers:
             batch = _make_batch(task_id, candidate, env_count, segment_steps, options)
             if batch is not None:
+                if options.randomise.of_model():
+                    from dmprl.randomise import randomise_batch  # imports MuJoCo
+
+                    randomise_batch(batch, options.randomise)
                 return batch
 
         if isinstance(candidate, type) and issubclass(candidate, SegmentEnv):

@@ -13,7 +13,7 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from dmprl.env_options import EnvOptions
+from dmprl.env_options import EnvOptions, Randomise
 from dmprl.goal_task import GoalTask
 from dmprl.mujoco_batch import MujocoTask, quieten_mujoco
 from dmprl.segment_env import SUCCESS_NOT_REPORTED, SegmentBuffers, SegmentEnvError
@@ -79,6 +79,10 @@ class TaskEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         self._view: Callable[[], Any] = lambda: None
         self._close_view: Callable[[], None] | None = None
 
+    def randomise(self, ranges: Randomise) -> None:
+        """Draws the model for each episode; pictures show the model's own sizes."""
+        self._batch.randomise(ranges)
+
     def _space(self, observation_len: int) -> spaces.Space:
         lengths = {"observation": observation_len - 2 * self._goal_len}
         if self._goal_len:
@@ -111,6 +115,8 @@ class TaskEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Observation, dict[str, Any]]:
         super().reset(seed=seed)
+        if seed is not None:
+            self._batch.seed_model(0, seed)
         self._batch.seed(0, self.np_random)
         self._batch.begin(np.zeros(1, np.int32), self._out)
         if self.render_mode == "human":

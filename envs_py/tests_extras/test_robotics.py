@@ -6,12 +6,13 @@ import unittest
 
 import numpy as np
 
+from dmprl.env_options import NO_OPTIONS, EnvOptions, Randomise
 from dmprl.goal_rule import proven
 from dmprl.segment_env import GoalRows, SegmentBuffers, make
 
 
-def started(task_id, env_count, segment_steps):
-    env = make(f"gymnasium_robotics:{task_id}", env_count, segment_steps)
+def started(task_id, env_count, segment_steps, options=NO_OPTIONS):
+    env = make(f"gymnasium_robotics:{task_id}", env_count, segment_steps, options)
     spec = env.spec()
     out = SegmentBuffers(env_count, segment_steps, spec["observation_len"], spec["action_len"])
     env.reset(np.ones(env_count, np.uint8), np.arange(env_count, dtype=np.uint64), out)
@@ -34,6 +35,17 @@ class FetchTest(unittest.TestCase):
         row = out.next_observations
         np.testing.assert_array_equal(row[:, 0:3], row[:, 6:9])
         self.assertEqual(len({goal.tobytes() for goal in row[:, 3:6]}), 4)
+
+    def test_its_block_is_resized_and_moved_and_the_goal_is_not(self):
+        ranges = Randomise(mass=(2.0, 3.0), object_size=(1.2, 1.2), start_pose=(0.01, 0.01))
+        env, out = started("FetchPush-v4", 2, 5, EnvOptions(randomise=ranges))
+        _, plain = started("FetchPush-v4", 2, 5)
+        moved = out.next_observations - plain.next_observations
+        # The block is 5 cm high.
+        np.testing.assert_allclose(moved[:, :3], [[0.01, 0.01, 0.2 * 0.025]] * 2, atol=1e-9)
+        np.testing.assert_array_equal(moved[:, 3:6], 0.0)
+        env.step_segment(np.zeros((2, 5, 4)), out)
+        self.assertFalse(out.failed.any())
 
     def test_straight_to_the_goal_succeeds(self):
         env, out = started("FetchReachDense-v4", 4, 5)

@@ -23,6 +23,8 @@ pub struct EvaluationPlan<'a> {
     pub request: EvaluationRequest,
     /// Number of episodes.
     pub episodes: u64,
+    /// Another `task.randomise` than the run's, as TOML.
+    pub randomise: Option<String>,
 }
 
 /// Evaluates a saved policy; returns `None` if the user interrupts.
@@ -33,6 +35,9 @@ pub fn evaluate(plan: EvaluationPlan<'_>) -> anyhow::Result<Option<EvaluationRow
     let mut command = Command::new(&plan.program);
     command.args(["evaluator", "--print-only", "--episodes", &plan.episodes.to_string()]);
     command.arg("--run").arg(plan.run.path());
+    if let Some(randomise) = &plan.randomise {
+        command.arg("--randomise").arg(randomise);
+    }
     if let Some(venv) = &plan.venv {
         command.arg("--venv").arg(venv);
     }

@@ -102,15 +102,21 @@ class PusherV0(Pusher):
 
     def load_model(self) -> mujoco.MjModel:  # noqa: D102 - inherited
         model = super().load_model()
-        include_armature(model)
+        include_armature(model, mujoco.MjData(model))
         return model
+
+    def derive_constants(  # noqa: D102 - inherited
+        self, model: mujoco.MjModel, data: mujoco.MjData
+    ) -> None:
+        super().derive_constants(model, data)
+        include_armature(model, data)
 
     def rewarded(self, observations: NDArray[np.float64]) -> NDArray[np.float64]:
         """Returns the states before the steps."""
         return observations[:, :-1]
 
 
-def include_armature(model: mujoco.MjModel) -> None:
+def include_armature(model: mujoco.MjModel, data: mujoco.MjData) -> None:
     """Makes contacts as stiff as in MuJoCo 1 and 2, for which Gym's versions were made.
 
     A contact's softness is scaled by the inverse inertia of both bodies. Since MuJoCo 3, the value
@@ -118,8 +124,10 @@ def include_armature(model: mujoco.MjModel) -> None:
     then a millionth of the effective one, and the arm passes through it. MuJoCo 2 used, for each
     joint, its entry in the diagonal of the inverse inertia matrix, and for each body the mean over
     the axes of the inverse inertia at its centre of mass (sliding bodies do not rotate).
+
+    ``data`` is a work area.
     """
-    data = mujoco.MjData(model)
+    mujoco.mj_resetData(model, data)
     mujoco.mj_forward(model, data)
     inverse = np.zeros((model.nv, model.nv))
     mujoco.mj_solveM(model, data, inverse, np.eye(model.nv))

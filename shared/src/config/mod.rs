@@ -11,6 +11,7 @@ pub mod endpoint;
 mod experiment;
 mod layers;
 mod presets;
+mod randomise;
 mod resolve;
 mod task;
 mod tasks;
@@ -30,6 +31,7 @@ pub use experiment::{
 };
 pub use layers::{ConfigError, Layers, nearest};
 pub use presets::{PRESETS, Preset, algorithm_defaults, policy_defaults, suitable_preset};
+pub use randomise::RandomiseConfig;
 pub use resolve::Limits;
 pub use task::{TaskConfig, is_python_object};
 pub use tasks::{TASKS, TaskDefaults, task_defaults};

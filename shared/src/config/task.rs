@@ -6,7 +6,7 @@ use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use toml::{Table, Value};
 
-use super::{ConfigError, StartSource};
+use super::{ConfigError, RandomiseConfig, StartSource};
 
 /// The environment.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
@@ -29,6 +29,8 @@ pub struct TaskConfig {
     /// `--env-kwargs` sets one. The environment decides which names and values are valid.
     #[schemars(with = "BTreeMap<String, serde_json::Value>")]
     pub kwargs: Table,
+    /// Physics and delays drawn for each episode.
+    pub randomise: RandomiseConfig,
 }
 
 impl Default for TaskConfig {
@@ -40,6 +42,7 @@ impl Default for TaskConfig {
             start_sources: Vec::new(),
             wrappers: Vec::new(),
             kwargs: Table::new(),
+            randomise: RandomiseConfig::default(),
         }
     }
 }
@@ -49,6 +52,8 @@ impl Default for TaskConfig {
 struct Options<'a> {
     wrappers: &'a [String],
     kwargs: &'a Table,
+    #[serde(skip_serializing_if = "RandomiseConfig::is_nominal")]
+    randomise: &'a RandomiseConfig,
 }
 
 impl TaskConfig {
@@ -68,24 +73,26 @@ impl TaskConfig {
         names.filter_map(|name| Some(name.rsplit_once(':')?.0)).collect()
     }
 
-    /// Whether the environment has arguments or wrappers.
+    /// Whether the environment has arguments or wrappers, which make it another environment.
     #[must_use]
     pub fn has_options(&self) -> bool {
         !self.kwargs.is_empty() || !self.wrappers.is_empty()
     }
 
-    /// Returns `wrappers` and `kwargs` as TOML, for `dmprl.env_options` in Python. Unlike JSON, it
-    /// has infinity and keeps integers and floats apart.
+    /// Returns `wrappers`, `kwargs` and, unless it is nominal, `randomise` as TOML, for
+    /// `dmprl.env_options` in Python. Unlike JSON, it has infinity and keeps integers and floats
+    /// apart.
     ///
     /// # Panics
     /// Never: every TOML table can be written.
     #[must_use]
     pub fn options_toml(&self) -> String {
-        let options = Options { wrappers: &self.wrappers, kwargs: &self.kwargs };
+        let Self { wrappers, kwargs, randomise, .. } = self;
+        let options = Options { wrappers, kwargs, randomise };
         toml::to_string(&options).expect("a table of TOML values can be written as TOML")
     }
 
-    /// Checks names; only the environment knows which arguments are valid.
+    /// Checks names and ranges; only the environment knows which arguments are valid.
     pub(super) fn check(&self) -> Result<(), ConfigError> {
         let range = |key, expected: &str, got: &str| {
             let expected = format!("expected {expected}");
@@ -102,7 +109,7 @@ impl TaskConfig {
                 return range("task.kwargs", "no NaN", &format!("{name} = {value}"));
             }
         }
-        Ok(())
+        self.randomise.check()
     }
 }
 
@@ -191,6 +198,10 @@ mod tests {
         let read: Table = task.options_toml().parse().unwrap();
         assert_eq!(read["kwargs"], Value::Table(task.kwargs.clone()));
         assert_eq!(read["wrappers"][0].as_str(), Some("tools:slow"));
+        assert!(!read.contains_key("randomise"));
+        task.randomise.mass = [0.5, 2.0];
+        let read: Table = task.options_toml().parse().unwrap();
+        assert_eq!(read["randomise"]["mass"], Value::Array(vec![0.5.into(), 2.0.into()]));
     }
 
     #[test]

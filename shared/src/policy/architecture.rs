@@ -145,6 +145,8 @@ mod tests {
             ("algorithm.batch_size", "8"),
             ("task.python_path", "[\"x\"]"),
             ("policy.position_scale", "2.0"),
+            // A policy trained without randomisation can be evaluated with it.
+            ("task.randomise.mass", "[0.5, 2.0]"),
         ] {
             assert_eq!(hash_of(&[(key, value)]), same, "{key}");
         }

@@ -73,6 +73,17 @@ fn on_policy_the_same_seed_gives_the_same_bytes_too() {
     assert!(first == trained(&place, "second", "7", &ndp));
 }
 
+#[test]
+fn with_randomised_physics_and_delays_the_same_seed_gives_the_same_bytes_too() {
+    let place = Workplace::new();
+    let more = ["mass=[0.5, 2.0]", "action_delay_steps=[0, 2]", "observation_delay_steps=[0, 2]"]
+        .map(|pair| format!("task.randomise.{pair}"));
+    let more: Vec<_> = more.iter().flat_map(|pair| ["--set", pair]).collect();
+    let first = trained(&place, "first", "7", &more);
+    assert!(first == trained(&place, "second", "7", &more));
+    assert_ne!(first.evaluations, trained(&place, "nominal", "7", &[]).evaluations);
+}
+
 /// Its rewards follow a rule, so the learner draws goals from the random stream of its windows.
 #[test]
 fn with_goals_the_same_seed_gives_the_same_bytes_too() {

@@ -42,6 +42,7 @@ mod machine;
 mod motion;
 mod play;
 mod python_front;
+mod randomise;
 mod record;
 mod refusals;
 mod report;

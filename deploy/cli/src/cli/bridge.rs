@@ -257,7 +257,8 @@ fn host_config(
     config.replay.capacity_steps = 1_000;
     config.run.max_minutes = f64::INFINITY;
     // Names every field, so that a new one is not taken from the network by accident.
-    let TaskConfig { name, id, python_path: _, start_sources, wrappers, kwargs } = config.task;
+    let TaskConfig { name, id, python_path: _, start_sources, wrappers, kwargs, randomise } =
+        config.task;
     check_task(&id, args)?;
     check_options(&kwargs, &wrappers, args)?;
     let absolute = |path: &PathBuf| {
@@ -266,7 +267,7 @@ fn host_config(
         Ok(path.display().to_string())
     };
     let python_path = args.python_path.iter().map(absolute).collect::<anyhow::Result<_>>()?;
-    config.task = TaskConfig { name, id, python_path, start_sources, wrappers, kwargs };
+    config.task = TaskConfig { name, id, python_path, start_sources, wrappers, kwargs, randomise };
     config.resolve(Limits { cores: cores() }).map_err(refuse)
 }
 

@@ -2,27 +2,37 @@
 
 use std::path::PathBuf;
 
+use anyhow::Context;
 use clap::Args;
 use dmprl_control::{EvaluationRequest, EvaluationRow};
-use dmprl_run::failure::Outcome;
+use dmprl_run::failure::{Outcome, wrong_use};
 use dmprl_run::format::{plus_minus, std_of};
 use dmprl_run::{ChosenPolicy, PolicyChoice, RunDirectory};
+use dmprl_shared::config::{ExperimentConfig, Layers, Limits, RandomiseConfig};
 use dmprl_supervisor::{self as launch, EvaluationPlan};
+use toml::Table;
 
+use super::configuration::refuse;
 use super::trust::TrustArgs;
 use super::{emit, prepare_python, this_program};
 
 /// Mean returns that differ by at most this much count as equal.
 const SAME_RETURN: f64 = 1e-6;
 
+/// Prefix of the keys that an evaluation may set.
+const RANDOMISE: &str = "task.randomise.";
+
 const HELP: &str = "\
 Uses the evaluation episodes and seeds of training, so it reproduces the stored figures. Writes only
 a log into the run directory.
 
+--set tests the policy with other ranges of task.randomise than it was trained with.
+
 EXAMPLES
   dmprl eval runs/mine
   dmprl eval runs/mine --policy latest --episodes 100
-  dmprl eval runs/mine --policy 4120 --json";
+  dmprl eval runs/mine --policy 4120 --json
+  dmprl eval runs/mine --set 'task.randomise.mass=[0.5, 2.0]' --episodes 100";
 
 /// Arguments of `dmprl eval`.
 #[derive(Debug, Args)]
@@ -36,6 +46,9 @@ pub(super) struct EvalArgs {
     /// Number of episodes [default: as in the policy's evaluation during training].
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u64).range(1..=1_000_000))]
     episodes: Option<u64>,
+    /// Set a key of task.randomise for these episodes; repeatable.
+    #[arg(long, value_name = "KEY=VALUE")]
+    set: Vec<String>,
     #[command(flatten)]
     trust: TrustArgs,
     /// Print one JSON object on standard output.
@@ -49,6 +62,8 @@ pub(super) fn run(args: &EvalArgs) -> anyhow::Result<Outcome> {
     let config = run.config()?;
     args.trust.check_for(&run, &config)?;
     let stored = chosen.row.as_ref().map_or(config.evaluation.episodes, |row| row.returns.len());
+    let randomise = randomise(config, &args.set)?;
+    let text = randomise.as_ref().map(toml::to_string).transpose().context("task.randomise")?;
     let venv = prepare_python()?;
     let plan = EvaluationPlan {
         program: this_program()?,
@@ -56,10 +71,42 @@ pub(super) fn run(args: &EvalArgs) -> anyhow::Result<Outcome> {
         venv: Some(venv),
         request: request(&chosen),
         episodes: args.episodes.unwrap_or(stored as u64),
+        randomise: text,
     };
     let Some(row) = launch::evaluate(plan)? else { return Ok(Outcome::Interrupted) };
-    emit(&if args.json { json(&run, &row, &chosen) } else { text(&row, &chosen) })?;
+    let result = Evaluated { row, chosen, randomise };
+    emit(&if args.json { result.json(&run) } else { result.text() })?;
     Ok(Outcome::Done)
+}
+
+/// Applies the pairs of `--set` to the run's `task.randomise`; `None` without any. Everything else
+/// stays as in training.
+fn randomise(
+    config: ExperimentConfig,
+    pairs: &[String],
+) -> anyhow::Result<Option<RandomiseConfig>> {
+    if pairs.is_empty() {
+        return Ok(None);
+    }
+    let mut layers = Layers::new();
+    layers.add("config.toml", Table::try_from(config)?)?;
+    for pair in pairs {
+        let named = pair.split_once('=').filter(|(key, _)| key.starts_with(RANDOMISE));
+        let (key, text) = named.ok_or_else(|| {
+            wrong_use(format!("--set {pair}: expected {RANDOMISE}KEY=[LOW, HIGH]"))
+        })?;
+        layers.set("--set", key.trim(), text.trim()).map_err(refuse)?;
+    }
+    let config = layers.finish().and_then(|config| config.resolve(Limits { cores: 1 }));
+    Ok(Some(config.map_err(refuse)?.task.randomise))
+}
+
+/// An evaluation, for display.
+struct Evaluated {
+    row: EvaluationRow,
+    chosen: ChosenPolicy,
+    /// The ranges of `task.randomise`, if they are not the run's.
+    randomise: Option<RandomiseConfig>,
 }
 
 fn request(chosen: &ChosenPolicy) -> EvaluationRequest {
@@ -79,37 +126,49 @@ fn request(chosen: &ChosenPolicy) -> EvaluationRequest {
     })
 }
 
-fn json(run: &RunDirectory, row: &EvaluationRow, chosen: &ChosenPolicy) -> String {
-    let mut object = serde_json::json!(row);
-    if chosen.row.is_none() {
-        // The policy was not evaluated in training: these are the request's placeholder zeros.
-        for name in ["env_steps", "updates", "segments", "wall_s"] {
-            object[name] = serde_json::Value::Null;
+impl Evaluated {
+    fn json(&self, run: &RunDirectory) -> String {
+        let Self { row, chosen, randomise } = self;
+        let mut object = serde_json::json!(row);
+        if chosen.row.is_none() {
+            // The policy was not evaluated in training: these are the request's placeholder zeros.
+            for name in ["env_steps", "updates", "segments", "wall_s"] {
+                object[name] = serde_json::Value::Null;
+            }
         }
+        if let Some(randomise) = randomise {
+            object["randomise"] = serde_json::json!(randomise);
+        }
+        object["run"] = run.path().display().to_string().into();
+        object["return_std"] = std_of(&row.returns).into();
+        object["episodes"] = row.returns.len().into();
+        object.to_string()
     }
-    object["run"] = run.path().display().to_string().into();
-    object["return_std"] = std_of(&row.returns).into();
-    object["episodes"] = row.returns.len().into();
-    object.to_string()
-}
 
-fn text(row: &EvaluationRow, chosen: &ChosenPolicy) -> String {
-    let mut lines = vec![format!(
-        "return      {} over {} episodes",
-        plus_minus(&row.returns),
-        row.returns.len()
-    )];
-    if let Some(rate) = row.success_rate {
-        lines.push(format!("success     {:.0} %", rate * 100.0));
+    fn text(&self) -> String {
+        let Self { row, chosen, randomise } = self;
+        let mut lines = vec![format!(
+            "return      {} over {} episodes",
+            plus_minus(&row.returns),
+            row.returns.len()
+        )];
+        if let Some(rate) = row.success_rate {
+            lines.push(format!("success     {:.0} %", rate * 100.0));
+        }
+        lines
+            .push(format!("smoothness  {:.4}  (mean |change of action| per step)", row.smoothness));
+        lines.push(format!("policy      {}", chosen.version));
+        if let Some(stored) = &chosen.row
+            && stored.returns.len() == row.returns.len()
+        {
+            let difference = (stored.return_mean - row.return_mean).abs();
+            let verdict = match randomise {
+                Some(_) => "without --set",
+                None if difference <= SAME_RETURN => "the same",
+                None => "DIFFERENT",
+            };
+            lines.push(format!("in training {:.6} ({verdict})", stored.return_mean));
+        }
+        lines.join("\n")
     }
-    lines.push(format!("smoothness  {:.4}  (mean |change of action| per step)", row.smoothness));
-    lines.push(format!("policy      {}", chosen.version));
-    if let Some(stored) = &chosen.row
-        && stored.returns.len() == row.returns.len()
-    {
-        let difference = (stored.return_mean - row.return_mean).abs();
-        let verdict = if difference <= SAME_RETURN { "the same" } else { "DIFFERENT" };
-        lines.push(format!("in training {:.6} ({verdict})", stored.return_mean));
-    }
-    lines.join("\n")
 }

@@ -175,6 +175,9 @@ pub struct EvaluatorArgs {
     /// Number of episodes per evaluation, instead of `evaluation.episodes`.
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u64).range(1..=1_000_000))]
     pub episodes: Option<u64>,
+    /// Table instead of `task.randomise`.
+    #[arg(long, value_name = "TOML")]
+    pub randomise: Option<String>,
     /// Python virtual environment.
     #[arg(long, value_name = "DIR")]
     pub venv: Option<PathBuf>,

@@ -1,6 +1,7 @@
 //! The evaluator's process: prepares environments for the loop in `dmprl_actors::evaluator` and
 //! writes the rows of `evaluations.jsonl`.
 
+use anyhow::Context;
 use dmprl_actors::evaluator::{self, Evaluations};
 use dmprl_control::{EvaluationRow, Report};
 use dmprl_learner::checkpoint;
@@ -18,6 +19,9 @@ pub fn run(args: &EvaluatorArgs, control: &ControlPipe) -> anyhow::Result<()> {
     if let Some(episodes) = args.episodes {
         config.evaluation.episodes = usize::try_from(episodes)?;
         config.evaluation.final_episodes = 0;
+    }
+    if let Some(text) = &args.randomise {
+        config.task.randomise = toml::from_str(text).context("--randomise")?;
     }
     let interpreter = super::actor::start_interpreter(args.venv.as_deref(), &config)?;
     let mut evaluator = evaluator::evaluator(&interpreter, &config, on_hang(control))?;
