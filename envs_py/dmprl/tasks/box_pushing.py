@@ -18,8 +18,9 @@ from dmprl.stepwise_batch import StepwiseTask
 from dmprl.tasks.box_pushing_scene import TORQUE_MAX, box_pushing_model
 from dmprl.tasks.panda_kinematics import JOINTS, ForwardKinematics
 
-START_ANGLES = (0.0, 0.0, 0.0, -1.5, 0.0, 1.5, 0.0)
-"""Joint angles at the start [rad], with the rod upright inside the box."""
+START_ANGLES = (0.38707, 0.17621, 0.24989, -2.39914, -0.07987, 2.56857, 1.47952)
+"""Joint angles at the start [rad], with the rod upright inside the box: fancy-gym's inverse
+kinematics, which it computes at each start, give these for the box's only start."""
 BOX_START = (0.4, 0.3, -0.01, 0.0, 0.0, 0.0, 1.0)
 """Position [m] and quaternion of the box at the start."""
 GOAL_RANGE = (0.3, -0.45, -0.01), (0.6, 0.45, -0.01)
