@@ -110,8 +110,9 @@ class RewardTest(unittest.TestCase):
         task = env.task
         tip = env.task._kinematics.pose(row[None, :7])[0, :, 3]
         row[7:14] = 0, 3, 0, 0, 0, 0, 0
-        row[14:21] = *(tip + [0, 0, 1]), 1, 0, 0, 0
-        row[21:28] = *(tip + [1, 0, 1]), np.sqrt(0.5), 0, 0, np.sqrt(0.5)
+        row[14:17], row[17:21] = tip, (1, 0, 0, 0)
+        row[21:24], row[24:28] = tip, (np.sqrt(0.5), 0, 0, np.sqrt(0.5))
+        row[[16, 21, 23]] += 1
         states, found = np.stack([row, row])[None], np.zeros((1, 1))
         actions = np.full((1, 1, 7), 0.5, np.float32)
         task.rewards(states, actions, found)
@@ -246,7 +247,7 @@ class PhysicsTest(unittest.TestCase):
         for name in ("body_mass", "body_inertia", "body_ipos", "body_pos", "actuator_gainprm"):
             np.testing.assert_array_equal(getattr(model, name), getattr(shown, name))
 
-    def test_the_rod_drags_the_box_along_within_the_torques(self):
+    def test_a_controller_drags_the_box_close_to_its_goal(self):
         env, out = started(DENSE, env_count=10, segment_steps=1)
         model, data = env.task.model, mujoco.MjData(env.task.model)
         jacobian, turn = np.zeros((3, model.nv)), np.zeros((3, model.nv))
@@ -270,7 +271,7 @@ class PhysicsTest(unittest.TestCase):
             env.step_segment(out.actions, out)
         self.assertTrue(out.truncated.all())
         rest = np.linalg.norm(out.observations[:, 1, 14:16] - goals, axis=1)
-        self.assertLess(np.median(rest), 0.1, rest)
+        self.assertLess(np.median(rest), 0.15, rest)
 
     def test_the_gymnasium_environment_reports_success(self):
         env = gymnasium.make(DENSE)

@@ -176,6 +176,7 @@ def _set_table(spec: mujoco.MjSpec, with_decoration: bool) -> None:
     """Makes the table a plane, because the box cannot reach its edges, except in pictures."""
     table = spec.geom("table")
     table.pos, table.size = [0.2, 0.0, TABLE_HEIGHT - 0.2], [1.0, 0.98, 0.2]
+    table.solref, table.solimp = [0.002, 1.0], [0.999, 0.999, 0.001, 0.5, 2.0]
     spec.geom("floor").pos[2] = TABLE_HEIGHT - 0.4
     if not with_decoration:
         table.type, table.pos[2] = mujoco.mjtGeom.mjGEOM_PLANE, TABLE_HEIGHT
