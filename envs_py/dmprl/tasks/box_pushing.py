@@ -54,7 +54,7 @@ class BoxPushing(StepwiseTask):
     episode_steps = 100
     recorded = ("qpos", "qvel", "mocap_pos", "mocap_quat", "qfrc_bias")
     camera: ClassVar[Mapping[str, Any]] = {
-        "distance": 1.7,
+        "distance": 1.5,
         "elevation": -32.0,
         "azimuth": 150.0,
         "lookat": (0.3, 0.0, 0.2),
