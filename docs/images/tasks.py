@@ -1,4 +1,4 @@
-"""Draws ``tasks.png`` and ``panda-objects.png``: ``.venv/bin/python docs/images/tasks.py``."""
+"""Draws the tasks' pictures in this folder: ``.venv/bin/python docs/images/tasks.py``."""
 
 from pathlib import Path
 
@@ -63,3 +63,4 @@ def save(name: str, pictures: list[np.ndarray]) -> None:
 if __name__ == "__main__":
     save("tasks.png", [random_moment(task) for task in TASKS])
     save("panda-objects.png", [scripted_moment(*moment) for moment in OBJECT_TASKS.items()])
+    save("box-pushing.png", [picture(made("BoxPushingDense-v0"))])

@@ -63,6 +63,8 @@ SHORT_NAMES = {
     "panda-pick-and-place-dense": "dmprl/PandaPickAndPlaceDense-v0",
     "panda-stack": "dmprl/PandaStack-v0",
     "panda-stack-dense": "dmprl/PandaStackDense-v0",
+    "box-pushing": "dmprl/BoxPushingDense-v0",
+    "box-pushing-sparse": "dmprl/BoxPushingTemporalSparse-v0",
     "reacher-v1": "dmprl/Reacher-v1",
     "pusher-v0": "dmprl/Pusher-v0",
     "thrower-v0": "dmprl/Thrower-v0",

@@ -46,6 +46,7 @@ class Start(NamedTuple):
     qpos: NDArray[np.float64]
     qvel: NDArray[np.float64]
     mocap_pos: NDArray[np.float64]
+    mocap_quat: NDArray[np.float64]
 
 
 class MujocoTask(ABC):

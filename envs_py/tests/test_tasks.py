@@ -119,10 +119,12 @@ class Contract:
     def test_random_actions_give_finite_observations_and_no_positive_rewards(self):
         env, out = started(self.task_id, env_count=4)
         rng, truncated, steps = np.random.default_rng(0), np.zeros(4), np.zeros(4)
+        # Nothing damps the joints of box pushing, and speeds cost.
+        reward_min = -10_000.0 if "BoxPushing" in self.task_id else -100.0
         while not (truncated == 2).all():
             env.step_segment(random_actions(rng, env.spec(), 4, 5), out)
             self.assertTrue(np.isfinite(out.observations).all())
-            self.assertTrue((out.rewards <= 0).all() and (out.rewards > -100).all())
+            self.assertTrue((out.rewards <= 0).all() and (out.rewards > reward_min).all())
             self.assertFalse(out.failed.any() or out.terminated.any())
             self.assertTrue(np.isin(out.success, (0, 1, SUCCESS_NOT_REPORTED)).all())
             truncated += out.truncated

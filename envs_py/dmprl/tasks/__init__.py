@@ -37,6 +37,10 @@ TASKS = {
     "dmprl/Thrower-v0": Registered("dmprl.tasks.thrower", "Thrower", 100),
     "dmprl/PandaReach-v0": Registered("dmprl.tasks.panda", "PandaReach", 50),
     "dmprl/PandaReachJoints-v0": Registered("dmprl.tasks.panda", "PandaReachJoints", 50),
+    "dmprl/BoxPushingDense-v0": Registered("dmprl.tasks.box_pushing", "BoxPushingDense", 100),
+    "dmprl/BoxPushingTemporalSparse-v0": Registered(
+        "dmprl.tasks.box_pushing", "BoxPushingTemporalSparse", 100
+    ),
 } | {
     f"dmprl/{name}{variant}-v0": Registered("dmprl.tasks.panda_objects", name + variant, steps)
     for name, steps in PANDA_OBJECTS.items()

@@ -46,6 +46,29 @@ TINY = 1e-30
 _IDENTITY = np.eye(6)
 
 
+class ForwardKinematics:
+    """Computes the pose of the end effector, the model's first site."""
+
+    def __init__(self, model: mujoco.MjModel, env_count: int) -> None:
+        """Reads the chain from ``model``: its joints, each the parent of the next, then a site."""
+        self._chain = _chain(model)
+        # For each joint: 1, and the cosine and sine of its angle.
+        self._turns = np.ones((env_count, JOINTS, 1, 3))
+        # The transform of each joint's link, and of the end effector on the last link.
+        self._links = np.zeros((env_count, JOINTS + 1, 1, 16))
+        self._links[:, -1, 0] = _transform(model.site_pos[0], model.site_quat[0]).ravel()
+
+    def pose(self, angles: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Computes the end effector's pose (E, 3, 4) at ``angles`` (E, 7) [rad]."""
+        np.cos(angles, out=self._turns[:, :, 0, 1])
+        np.sin(angles, out=self._turns[:, :, 0, 2])
+        np.matmul(self._turns, self._chain, out=self._links[:, :JOINTS])
+        transforms = self._links.reshape(-1, JOINTS + 1, 4, 4)
+        while transforms.shape[1] > 1:
+            transforms = transforms[:, 0::2] @ transforms[:, 1::2]
+        return transforms[:, 0, :3]
+
+
 class InverseKinematics:
     """Computes joint angles that bring the end effector to a point, with the gripper down."""
 
@@ -54,15 +77,10 @@ class InverseKinematics:
 
     def __init__(self, model: mujoco.MjModel, env_count: int) -> None:
         """Reads the chain from ``model``: its joints, each the parent of the next, then a site."""
-        self._chain = _chain(model)
+        self._forward = ForwardKinematics(model, env_count)
         self._error_of_pose = _error_of_pose()
         self._skew = _skew()
         self._root = model.body_rootid[model.jnt_bodyid[0]]
-        # For each joint: 1, and the cosine and sine of its angle.
-        self._turns = np.ones((env_count, JOINTS, 1, 3))
-        # The transform of each joint's link, and of the end effector on the last link.
-        self._links = np.zeros((env_count, JOINTS + 1, 1, 16))
-        self._links[:, -1, 0] = _transform(model.site_pos[0], model.site_quat[0]).ravel()
         self._start = np.zeros((env_count, 3, 4))
         self._damping = DAMPING**2 * np.eye(6)
 
@@ -93,22 +111,12 @@ class InverseKinematics:
         turn, steps = step.copy(), []
         for _ in range(CORRECTIONS):
             steps.append((step, np.vecdot(step, step) + TINY))
-            step = _corrected(self._step(inverse, self.pose(qpos + turn), target), steps)
+            step = _corrected(self._step(inverse, self._forward.pose(qpos + turn), target), steps)
             turn += step
         largest = np.abs(turn).max(axis=1, keepdims=True)
         # Scales all joints, so that the end effector still moves towards the target.
         turn *= TURN_MAX / np.maximum(largest, TURN_MAX)
         np.add(qpos, turn, out=out)
-
-    def pose(self, angles: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Computes the end effector's pose (E, 3, 4) at ``angles`` (E, 7) [rad]."""
-        np.cos(angles, out=self._turns[:, :, 0, 1])
-        np.sin(angles, out=self._turns[:, :, 0, 2])
-        np.matmul(self._turns, self._chain, out=self._links[:, :JOINTS])
-        transforms = self._links.reshape(-1, JOINTS + 1, 4, 4)
-        while transforms.shape[1] > 1:
-            transforms = transforms[:, 0::2] @ transforms[:, 1::2]
-        return transforms[:, 0, :3]
 
     def _step(
         self,

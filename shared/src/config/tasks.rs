@@ -173,6 +173,28 @@ const PANDA_STACK_DENSE: TaskDefaults = TaskDefaults {
     ..PANDA_STACK
 };
 
+const BOX_PUSHING: TaskDefaults = TaskDefaults {
+    name: "box-pushing",
+    id: "dmprl/BoxPushingDense-v0",
+    about: "Franka Panda with a rod pushes and turns a box, reward in each step",
+    control: "torque, ±1 = 10 N m, gravity compensated",
+    source: "fancy-gym's task, rebuilt",
+    observation_len: 28,
+    action_low: &[-1.0; 7],
+    action_high: &[1.0; 7],
+    episode_steps: 100,
+    control_dt_s: 0.02,
+    values: BOX_PUSHING_VALUES,
+    paper: &[],
+};
+
+const BOX_PUSHING_SPARSE: TaskDefaults = TaskDefaults {
+    name: "box-pushing-sparse",
+    id: "dmprl/BoxPushingTemporalSparse-v0",
+    about: "box-pushing, rewarded for the goal at the last step only",
+    ..BOX_PUSHING
+};
+
 const REACHER_V1: TaskDefaults = TaskDefaults {
     name: "reacher-v1",
     id: "dmprl/Reacher-v1",
@@ -195,7 +217,7 @@ const THROWER_V0: TaskDefaults =
     TaskDefaults { name: "thrower-v0", about: "alias of thrower", ..THROWER };
 
 /// Every task with a short name; the paper's older versions are last.
-pub const TASKS: [TaskDefaults; 16] = [
+pub const TASKS: [TaskDefaults; 18] = [
     REACHER,
     PUSHER,
     THROWER,
@@ -209,6 +231,8 @@ pub const TASKS: [TaskDefaults; 16] = [
     PANDA_PICK_AND_PLACE_DENSE,
     PANDA_STACK,
     PANDA_STACK_DENSE,
+    BOX_PUSHING,
+    BOX_PUSHING_SPARSE,
     REACHER_V1,
     PUSHER_V0,
     THROWER_V0,
@@ -296,6 +320,9 @@ discount = 0.95
 critic_hidden = [128, 128]
 "#,
 ];
+
+// Observation: joint angles (7), joint velocities (7), pose of the box (7), pose of the goal (7).
+const BOX_PUSHING_VALUES: &[&str] = &[JOINTS, "[run]\nsteps = 200000"];
 
 // u = 1 moves the gripper or joint by 0.05 m or rad, so with `position_scale = 20` the robot
 // follows the DMP's y. These tasks are solved in few steps, which leaves time for more updates per
