@@ -131,17 +131,19 @@ class Contract:
             steps += out.steps
         self.assertEqual(steps.tolist(), [2 * TASKS[self.task_id].episode_steps] * 4)
 
-    def test_a_segment_leaks_no_memory_and_needs_little(self):
+    def test_segments_leak_no_memory_and_need_little(self):
         env, out = started(self.task_id, env_count=16)
         actions = np.zeros((16, 5, len(env.spec()["action_low"])))
         tracemalloc.start()
         env.step_segment(actions, out)
         before, _ = tracemalloc.get_traced_memory()
         tracemalloc.reset_peak()
-        env.step_segment(actions, out)
+        for _ in range(20):
+            env.step_segment(actions, out)
         after, peak = tracemalloc.get_traced_memory()
         tracemalloc.stop()
-        self.assertLess(after - before, 1000)
+        # Python and NumPy keep up to 2 kB that they need only once.
+        self.assertLess(after - before, 5000)
         # NumPy's temporary buffers and, for end-effector actions, those of the inverse kinematics.
         self.assertLess(peak - before, 30_000)
 
