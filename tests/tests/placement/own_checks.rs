@@ -104,13 +104,15 @@ fn compose_approves_of_its_file() {
 #[test]
 fn apptainer_builds_from_the_images_and_sources_of_the_dockerfile() {
     let (recipe, dockerfile) = (read("deploy/apptainer.def"), read("deploy/Dockerfile"));
-    let argument = |name: &str| {
-        let line = dockerfile.lines().find_map(|line| line.strip_prefix(&format!("ARG {name}=")));
-        line.unwrap_or_else(|| panic!("no ARG {name}")).to_owned()
+    // `rust:1.98-slim-trixie@sha256:…` there is `rust@sha256:…` here.
+    let image = |argument: &str| {
+        let prefix = format!("ARG {argument}=");
+        let image = dockerfile.lines().find_map(|line| line.strip_prefix(&prefix)).unwrap();
+        let (tagged, digest) = image.split_once("@sha256:").expect("an image has a digest");
+        assert!(digest.len() == 64 && digest.bytes().all(|byte| byte.is_ascii_hexdigit()));
+        format!("{}@sha256:{digest}", tagged.split_once(':').unwrap().0)
     };
-    let image =
-        |name: &str, version: String| format!("{name}:{version}-slim-{}", argument("DEBIAN"));
-    let (rust, python) = (image("rust", argument("RUST")), image("python", argument("PYTHON")));
+    let (rust, python) = (image("RUST_IMAGE"), image("PYTHON_IMAGE"));
     let used: Vec<_> = recipe.lines().filter_map(|line| line.strip_prefix("From: ")).collect();
     assert_eq!(used, [&rust, &python, &python]);
     let ignored = read("deploy/Dockerfile.dockerignore");
