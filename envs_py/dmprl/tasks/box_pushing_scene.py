@@ -200,7 +200,7 @@ def _add_box(
         **shared,
         size=BOTTOM_SIZE,
         mass=BOTTOM_MASS,
-        # With priority, the bottom's friction counts, not that of what it touches.
+        # Because of its priority, the bottom's friction holds for all of its contacts.
         friction=[BOTTOM_FRICTION, 0.001, 0.0001],
         priority=1,
         rgba=[*colour, alpha],
