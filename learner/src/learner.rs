@@ -19,7 +19,7 @@ use crate::algorithms::ndp::UpdateContext;
 use crate::demonstrations::Demonstration;
 use crate::finite;
 use crate::metrics::{DeliveryLine, MetricsCollector, MetricsLine, Rejected};
-use crate::normaliser::Normaliser;
+use crate::normaliser::{Normaliser, RelativeGoal};
 use crate::off_policy::{CloningLosses, UpdateProgress};
 use crate::regime::Regime;
 use crate::replay::{GoalSampler, Replay, Sampler};
@@ -115,9 +115,7 @@ impl Learner {
         let layout = policy.layout();
         let regime = Regime::new(&config, &policy)?;
         let random = seeds::stream(config.run.seed, "replay", 0);
-        let replay_config = &config.replay;
-        let (strategy, share) = (replay_config.hindsight, replay_config.hindsight_share);
-        let hindsight = GoalSampler::new(spec.goal_rule.as_deref(), strategy, share);
+        let hindsight = GoalSampler::from_config(spec.goal_rule.as_deref(), &config);
         let replay_steps = regime.replay_steps(&config, layout.segment_steps);
         Ok(Self {
             expected: Expected {
@@ -132,7 +130,9 @@ impl Learner {
             sampler: Sampler::new(config.algorithm.windows, random),
             normaliser: config.policy.normalise_observations.then(|| {
                 // The first update follows the warm-up; then each doubling of the observations.
-                Normaliser::new(layout.observation_len, config.exploration.warm_up_steps)
+                let relative = hindsight.as_ref().map(|goals| RelativeGoal::new(&goals.rule));
+                let first = config.exploration.warm_up_steps;
+                Normaliser::new(layout.observation_len, first, relative)
             }),
             hindsight,
             counters: Counters::default(),
@@ -195,6 +195,9 @@ impl Learner {
             self.update_normaliser()?;
         }
         let Self { config, policy, regime, replay, sampler, hindsight, counters, .. } = self;
+        if let Some(hindsight) = hindsight {
+            hindsight.count_motion(replay);
+        }
         let (normaliser, hindsight) = (self.normaliser.as_ref(), hindsight.as_ref());
         match regime {
             Regime::OffPolicy(off_policy) => {
@@ -331,7 +334,12 @@ impl Learner {
     /// # Errors
     /// If the lengths differ.
     pub fn warm_start(&mut self, parameters: &[f32]) -> Result<(), LearnerError> {
-        Ok(self.regime.set_policy(parameters)?)
+        let mut parameters = parameters.to_vec();
+        let fits = parameters.len() == self.policy.parameters_len();
+        if let Some(normaliser) = self.normaliser.as_ref().filter(|_| fits) {
+            normaliser.unfold(self.policy.shape(), &mut parameters);
+        }
+        Ok(self.regime.set_policy(&parameters)?)
     }
 
     /// Returns updates * samples per update / env_steps.

@@ -1,6 +1,9 @@
 //! Observation normalisation (`policy.normalise_observations`): networks in training get
 //! (x - mean) / scale, which is folded into the first layer of published policies.
 //!
+//! With hindsight, x has the difference between desired and achieved goal in place of the desired
+//! goal ([`RelativeGoal`]). This is linear, too, and is folded with the rest.
+//!
 //! A published policy therefore takes plain observations. When mean and scale are updated, the
 //! first layers are rewritten so that every network remains the same function of plain
 //! observations. Normalisation changes the steps of the optimiser, never the policy.
@@ -17,10 +20,40 @@ use crate::update::network::TrainableNetwork;
 /// magnify the first deviation.
 const SCALE_MIN: f64 = 1e-4;
 
+/// The place of the goals in an observation. Networks get the desired goal minus the achieved one
+/// instead of the desired goal: whether a goal is reached depends on a difference that is small
+/// compared to the range of either.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct RelativeGoal {
+    /// First entry of the achieved goal.
+    achieved: usize,
+    /// First entry of the desired goal.
+    desired: usize,
+    /// Number of entries of each goal, G.
+    goal_len: usize,
+}
+
+impl RelativeGoal {
+    /// Returns the place of the goals of a rule.
+    #[must_use]
+    pub fn new(rule: &GoalRule) -> Self {
+        Self { achieved: rule.achieved, desired: rule.desired, goal_len: rule.goal_len }
+    }
+
+    /// Returns (achieved, desired) entries of an observation.
+    fn pairs(self) -> impl Iterator<Item = (usize, usize)> {
+        (0..self.goal_len).map(move |index| (self.achieved + index, self.desired + index))
+    }
+}
+
 /// Current mean and scale, with the running statistics of each dimension.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Normaliser {
+    /// Absent in checkpoints of before 2026-11-25.
+    #[serde(default)]
+    relative: Option<RelativeGoal>,
     mean: Vec<f32>,
     scale: Vec<f32>,
     /// Observations so far.
@@ -36,8 +69,9 @@ pub struct Normaliser {
 impl Normaliser {
     /// Makes a normaliser that is the identity until its first update, after `first` observations.
     #[must_use]
-    pub fn new(observation_len: usize, first: u64) -> Self {
+    pub fn new(observation_len: usize, first: u64, relative: Option<RelativeGoal>) -> Self {
         Self {
+            relative,
             mean: vec![0.0; observation_len],
             scale: vec![1.0; observation_len],
             count: 0,
@@ -58,6 +92,8 @@ impl Normaliser {
     #[must_use]
     pub fn is_valid(&self) -> bool {
         let len = self.mean.len();
+        let fits =
+            |first: usize, goal: usize| first.checked_add(goal).is_some_and(|end| end <= len);
         let seen = [&self.seen_mean, &self.seen_squares];
         self.scale.len() == len
             && seen.iter().all(|part| part.len() == len)
@@ -66,36 +102,47 @@ impl Normaliser {
             && self.mean.iter().all(|mean| mean.is_finite())
             && self.scale.iter().all(|&scale| scale.is_finite() && scale > 0.0)
             && self.count.checked_mul(4).is_some()
+            && self.relative.is_none_or(|goal| {
+                fits(goal.achieved, goal.goal_len) && fits(goal.desired, goal.goal_len)
+            })
     }
 
     /// Adds observations, (rows, O), to the statistics.
     pub fn observe(&mut self, observations: &[f32]) {
-        for row in observations.chunks_exact(self.mean.len()) {
-            self.observe_row(|index| row[index]);
+        let mut row = vec![0.0; self.mean.len()];
+        for observation in observations.chunks_exact(self.mean.len()) {
+            row.copy_from_slice(observation);
+            self.observe_row(&mut row);
         }
     }
 
     /// Adds observations, (rows, O), with the achieved goals in place of the desired ones.
     pub fn observe_relabelled(&mut self, observations: &[f32], rule: &GoalRule) {
-        let desired = rule.desired..rule.desired + rule.goal_len;
-        for row in observations.chunks_exact(self.mean.len()) {
-            let achieved = rule.achieved(row);
-            self.observe_row(|index| match desired.contains(&index) {
-                true => achieved[index - desired.start],
-                false => row[index],
-            });
+        let mut row = vec![0.0; self.mean.len()];
+        for observation in observations.chunks_exact(self.mean.len()) {
+            row.copy_from_slice(observation);
+            rule.set_desired(&mut row, rule.achieved(observation));
+            self.observe_row(&mut row);
         }
     }
 
-    fn observe_row(&mut self, value: impl Fn(usize) -> f32) {
+    /// Adds an observation, (O,), and makes its goal relative.
+    fn observe_row(&mut self, row: &mut [f32]) {
+        self.make_relative(row);
         self.count += 1;
         let share = 1.0 / self.count as f64;
         let seen = self.seen_mean.iter_mut().zip(&mut self.seen_squares);
-        for (index, (mean, squares)) in seen.enumerate() {
-            let value = f64::from(value(index));
+        for ((mean, squares), &value) in seen.zip(&*row) {
+            let value = f64::from(value);
             let before = value - *mean;
             *mean += before * share;
             *squares += before * (value - *mean);
+        }
+    }
+
+    fn make_relative(&self, row: &mut [f32]) {
+        for (achieved, desired) in self.relative.into_iter().flat_map(RelativeGoal::pairs) {
+            row[desired] -= row[achieved];
         }
     }
 
@@ -109,8 +156,10 @@ impl Normaliser {
 
     /// Computes (x - mean) / scale of one observation, (O,), into `out`.
     pub fn apply_row(&self, observation: &[f32], out: &mut [f32]) {
-        for (index, out) in out.iter_mut().enumerate() {
-            *out = (observation[index] - self.mean[index]) / self.scale[index];
+        out.copy_from_slice(observation);
+        self.make_relative(out);
+        for (out, (mean, scale)) in out.iter_mut().zip(self.mean.iter().zip(&self.scale)) {
+            *out = (*out - mean) / scale;
         }
     }
 
@@ -142,6 +191,29 @@ impl Normaliser {
     pub fn fold(&self, shape: &MlpShape, parameters: &mut [f32]) {
         let before = [&self.mean, &self.scale].map(|values| Cow::Borrowed(values.as_slice()));
         NormalisationChange { before, after: None }.rewrite(shape, parameters);
+        // w (g - a) = w g - w a.
+        self.add_to_achieved(shape, parameters, -1.0);
+    }
+
+    /// Reverses [`Normaliser::fold`].
+    pub fn unfold(&self, shape: &MlpShape, parameters: &mut [f32]) {
+        self.add_to_achieved(shape, parameters, 1.0);
+        let len = self.mean.len();
+        let before = [vec![0.0; len], vec![1.0; len]].map(Cow::Owned);
+        let after = Some(self.mean_and_scale());
+        NormalisationChange { before, after }.rewrite(shape, parameters);
+    }
+
+    /// Adds `factor` times the weight of each entry of the desired goal to that of the same entry
+    /// of the achieved goal.
+    fn add_to_achieved(&self, shape: &MlpShape, parameters: &mut [f32], factor: f32) {
+        let layer = &shape.layers()[0];
+        for output in 0..layer.outputs {
+            let from = layer.weights.start + output * layer.inputs;
+            for (achieved, desired) in self.relative.into_iter().flat_map(RelativeGoal::pairs) {
+                parameters[from + achieved] += factor * parameters[from + desired];
+            }
+        }
     }
 }
 
@@ -229,7 +301,7 @@ mod tests {
 
     #[test]
     fn seen_observations_become_zero_mean_and_unit_scale() {
-        let mut normaliser = Normaliser::new(2, 4);
+        let mut normaliser = Normaliser::new(2, 4, None);
         let seen = [1.0, 7.0, 3.0, 7.0, 5.0, 7.0, 7.0, 7.0];
         assert!(!normaliser.is_due());
         normaliser.observe(&seen);
@@ -243,9 +315,8 @@ mod tests {
         assert_close(&out, &[-3.0 / unit, 0.0, -1.0 / unit, 0.0, 1.0 / unit, 0.0, 3.0 / unit, 0.0]);
     }
 
-    #[test]
-    fn statistics_see_achieved_goals_in_place_of_the_desired_ones() {
-        let rule = GoalRule {
+    fn rule() -> GoalRule {
+        GoalRule {
             achieved: 0,
             desired: 1,
             goal_len: 1,
@@ -253,8 +324,25 @@ mod tests {
             norm: Norm::Euclidean,
             reward: GoalReward::Dense { factor: -1.0 },
             ends_within: None,
-        };
-        let mut normaliser = Normaliser::new(2, 1);
+        }
+    }
+
+    #[test]
+    fn relative_goals_are_normalised_like_other_entries() {
+        let mut normaliser = Normaliser::new(2, 1, Some(RelativeGoal::new(&rule())));
+        let mut out = [0.0; 2];
+        normaliser.apply_row(&[1.0, 9.0], &mut out);
+        assert_eq!(out, [1.0, 8.0]);
+        normaliser.observe(&[1.0, 9.0, 3.0, 7.0]); // differences 8 and 4
+        normaliser.update();
+        normaliser.apply_row(&[1.0, 9.0], &mut out);
+        assert_eq!(out, [-1.0, 1.0]);
+    }
+
+    #[test]
+    fn statistics_see_achieved_goals_in_place_of_the_desired_ones() {
+        let rule = rule();
+        let mut normaliser = Normaliser::new(2, 1, None);
         normaliser.observe(&[1.0, 9.0]);
         normaliser.observe_relabelled(&[1.0, 9.0], &rule);
         normaliser.update();
@@ -266,6 +354,15 @@ mod tests {
 
     #[test]
     fn neither_a_refresh_nor_folding_changes_the_function() {
+        function_remains(None);
+    }
+
+    #[test]
+    fn relative_goals_do_not_change_the_function_of_plain_observations() {
+        function_remains(Some(RelativeGoal::new(&rule())));
+    }
+
+    fn function_remains(relative: Option<RelativeGoal>) {
         let shape = MlpShape::new(vec![5, 16, 2]);
         let mut random = dmprl_shared::seeds::stream(1, "test", 0);
         let initial = initial_parameters(&shape, &mut random);
@@ -280,8 +377,8 @@ mod tests {
         };
         let mut network =
             TrainableNetwork::new(shape.clone(), initial, 1e-3, true, Precision::F32).unwrap();
-        let plain = output(&shape, network.parameters.values(), &rows);
-        let mut normaliser = Normaliser::new(3, 1);
+        let mut normaliser = Normaliser::new(3, 1, relative);
+        let plain = output(&shape, network.parameters.values(), &with(&normaliser));
         for _ in 0..3 {
             let seen: Vec<f32> = (0..30).map(|_| random.random_range(-2.0..10.0)).collect();
             normaliser.observe(&seen);
@@ -294,6 +391,8 @@ mod tests {
             let mut folded = network.parameters.values().to_vec();
             normaliser.fold(&shape, &mut folded);
             assert_close(&output(&shape, &folded, &rows), &plain);
+            normaliser.unfold(&shape, &mut folded);
+            assert_close(&folded, network.parameters.values());
         }
     }
 }

@@ -186,11 +186,22 @@ impl Batch {
         let SampleSource { replay, sampler, hindsight, normaliser } = source;
         let (replay, hindsight, normaliser) = (*replay, *hindsight, *normaliser);
         for row in 0..shape.rows {
-            let window = sampler
-                .draw(replay)
+            let window = match hindsight {
+                Some(hindsight) => hindsight.draw_window(replay, sampler),
+                None => sampler.draw(replay),
+            };
+            let window = window
                 .ok_or(NoWindow { segments: replay.len(), steps: replay.layout().segment_steps })?;
             let sample = Sample::draw(window, replay, hindsight, sampler);
             self.write_states(shape, row, replay, &sample, config);
+            if let Some(hindsight) = hindsight {
+                let discount = match config.target {
+                    Target::NStep => config.discount as f32,
+                    Target::Literal => 1.0,
+                };
+                let steps = sample.outcome.steps;
+                self.rewards[row] += hindsight.discounted_bonus(replay, &window, steps, discount);
+            }
             let (o, width) = (shape.observation_len, shape.critic_inputs());
             let observation = &self.observations[row * o..(row + 1) * o];
             let input = &mut self.critic_inputs[row * width..(row + 1) * width];
@@ -415,7 +426,7 @@ mod tests {
 
     #[test]
     fn networks_see_normalised_observations_and_the_dmp_plain_ones() {
-        let mut normaliser = Normaliser::new(1, 1);
+        let mut normaliser = Normaliser::new(1, 1, None);
         normaliser.observe(&[-1.0, 3.0]); // mean 1, standard deviation 2
         normaliser.update();
         let replay = replay(9, &[(0, TERMINATED)]);

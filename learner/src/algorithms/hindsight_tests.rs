@@ -1,6 +1,8 @@
 //! Batches with other goals, and targets within what a sparse reward allows, worked by hand.
 
-use dmprl_shared::config::{AlgorithmConfig, AlgorithmName, Hindsight, Target, Windows};
+use dmprl_shared::config::{
+    AlgorithmConfig, AlgorithmName, ExperimentConfig, Hindsight, Target, Windows,
+};
 use dmprl_shared::goal_rule::{GoalReward, GoalRule, Norm};
 use dmprl_shared::segment::{SegmentHeader, SegmentLayout, TERMINATED, TRUNCATED};
 
@@ -35,7 +37,7 @@ fn rule(ends_within: Option<f64>) -> GoalRule {
 
 /// An episode of three steps that achieves 1, 2 and 3, with the goal 9: r = -1, u = 0.1, 0.2, 0.3.
 fn replay(flag: u32) -> Replay {
-    let mut replay = Replay::new(LAYOUT, 20, 1, 1);
+    let mut replay = Replay::new(LAYOUT, 400, 1, 1);
     let whole = [0.0, 9.0, 1.0, 9.0, 2.0, 9.0, 0.1, 0.2, -1.0, -1.0];
     let rest = [2.0, 9.0, 3.0, 9.0, 0.0, 0.0, 0.3, 0.0, -1.0, 0.0];
     for (block, episode_step, steps_len, flags) in [(whole, 0, 2, 0), (rest, 2, 1, flag)] {
@@ -50,9 +52,16 @@ type Row = ([f32; 2], [f32; 2], f32, f32, [f32; 2]);
 
 /// Returns the distinct rows of a batch whose windows all get another goal, and the target range.
 fn rows(replay: &Replay, config: &AlgorithmConfig, rule: &GoalRule) -> (Vec<Row>, [f32; 2]) {
+    rows_of(replay, config, GoalSampler::new(Some(rule), Hindsight::Final, 1.0))
+}
+
+fn rows_of(
+    replay: &Replay,
+    config: &AlgorithmConfig,
+    hindsight: Option<GoalSampler>,
+) -> (Vec<Row>, [f32; 2]) {
     let random = dmprl_shared::seeds::stream(1, "test", 0);
     let mut sampler = Sampler::new(Windows::Sliding, random);
-    let hindsight = GoalSampler::new(Some(rule), Hindsight::Final, 1.0);
     let mut batch = Batch::new(SHAPE);
     let mut source = SampleSource {
         replay,
@@ -91,6 +100,34 @@ fn a_batch_with_other_goals_is_that_worked_by_hand() {
     ];
     assert_eq!(rows, expected);
     assert_eq!(range, [-2.0, 0.0]);
+}
+
+#[test]
+fn a_step_that_moves_the_achieved_goal_gets_a_bonus_while_few_episodes_do() {
+    let mut replay = replay(TRUNCATED);
+    // Episodes are counted after 100 segments.
+    let still = [5.0, 9.0, 5.0, 9.0, 5.0, 9.0, 0.4, 0.5, -1.0, -1.0];
+    for episode in 1..=98 {
+        let header =
+            SegmentHeader { episode, steps_len: 2, flags: TRUNCATED, ..Default::default() };
+        replay.insert(&header, &still);
+    }
+    let mut config = ExperimentConfig { algorithm: config(), ..ExperimentConfig::default() };
+    config.replay.hindsight = Hindsight::Final;
+    config.replay.hindsight_share = 0.0;
+    config.replay.moved_share = 1.0;
+    config.algorithm.motion_bonus = 0.5;
+    let mut hindsight = GoalSampler::from_config(Some(&rule(None)), &config);
+    hindsight.as_mut().unwrap().count_motion(&replay);
+    let (rows, range) = rows_of(&replay, &config.algorithm, hindsight);
+    // -1 - 0.5, and 0.5 + 0.25 for two steps that move it.
+    let expected = [
+        ([0.0, 9.0], [0.1, 0.2], -0.75, 0.25, [2.0, 9.0]),
+        ([1.0, 9.0], [0.2, 0.3], -0.75, 0.25, [3.0, 9.0]),
+        ([5.0, 9.0], [0.4, 0.5], -1.5, 0.25, [5.0, 9.0]),
+    ];
+    assert_eq!(rows, expected);
+    assert_eq!(range, [-2.0, 1.0]);
 }
 
 #[test]

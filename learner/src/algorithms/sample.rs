@@ -39,6 +39,6 @@ pub(super) fn target_range(hindsight: Option<&GoalSampler>, config: &AlgorithmCo
     let is_return = config.target == Target::NStep && config.name != AlgorithmName::Sac;
     hindsight
         .filter(|_| is_return)
-        .and_then(|hindsight| hindsight.rule.return_range(config.discount))
+        .and_then(|hindsight| hindsight.return_range(config.discount))
         .unwrap_or([f32::NEG_INFINITY, f32::INFINITY])
 }

@@ -8,12 +8,13 @@
 //!    goal. A window that is short only because the episode's own goal ended it keeps that goal,
 //!    because a missing action is not a zero action.
 
-use dmprl_shared::config::Hindsight;
+use dmprl_shared::config::{ExperimentConfig, Hindsight};
 use dmprl_shared::goal_rule::GoalRule;
 use rand::RngExt;
 use rand_xoshiro::Xoshiro256PlusPlus;
 
-use super::{Replay, Window};
+use super::motion::Motion;
+use super::{Replay, Sampler, Window};
 
 /// Draws goals for windows.
 #[derive(Debug, Clone)]
@@ -23,6 +24,7 @@ pub struct GoalSampler {
     strategy: Hindsight,
     /// Share of the windows that get another goal.
     share: f64,
+    motion: Option<Motion>,
 }
 
 /// An observation row of the replay, whose achieved goal a window gets.
@@ -51,11 +53,62 @@ pub struct Outcome {
 }
 
 impl GoalSampler {
-    /// Makes a sampler, or returns `None` without hindsight.
+    /// Makes the configured sampler, or returns `None` without hindsight.
+    #[must_use]
+    pub fn from_config(rule: Option<&GoalRule>, config: &ExperimentConfig) -> Option<Self> {
+        let replay = &config.replay;
+        let sampler = Self::new(rule, replay.hindsight, replay.hindsight_share)?;
+        let bonus = config.algorithm.motion_bonus;
+        Some(Self { motion: Motion::new(&sampler.rule, replay.moved_share, bonus), ..sampler })
+    }
+
+    /// Makes a sampler that does not care for motion, or returns `None` without hindsight.
     #[must_use]
     pub fn new(rule: Option<&GoalRule>, strategy: Hindsight, share: f64) -> Option<Self> {
         let rule = rule.filter(|_| strategy != Hindsight::None)?;
-        Some(Self { rule: rule.clone(), strategy, share })
+        Some(Self { rule: rule.clone(), strategy, share, motion: None })
+    }
+
+    /// Notes whether recent episodes moved the achieved goal. Call it before a batch is sampled.
+    pub fn count_motion(&mut self, replay: &Replay) {
+        if let Some(motion) = &mut self.motion {
+            motion.count(&self.rule, replay);
+        }
+    }
+
+    /// Draws a window, preferably from an episode that moved the achieved goal, as configured.
+    pub fn draw_window(&self, replay: &Replay, sampler: &mut Sampler) -> Option<Window> {
+        match &self.motion {
+            Some(motion) => motion.draw(&self.rule, replay, sampler),
+            None => sampler.draw(replay),
+        }
+    }
+
+    /// Returns the sum of discount^i b_i over the first `steps` steps of a window, where b_i is the
+    /// bonus of step i.
+    #[must_use]
+    pub fn discounted_bonus(
+        &self,
+        replay: &Replay,
+        window: &Window,
+        steps: usize,
+        discount: f32,
+    ) -> f32 {
+        let Some(motion) = self.motion.as_ref().filter(|motion| motion.bonus() > 0.0) else {
+            return 0.0;
+        };
+        (1..=steps).rev().fold(0.0, |sum, step| {
+            let moves = motion.step_moves(&self.rule, replay, window, step);
+            discount * sum + if moves { motion.bonus() } else { 0.0 }
+        })
+    }
+
+    /// Returns the range of the returns that the rewards allow, or `None` if it is unbounded.
+    #[must_use]
+    pub fn return_range(&self, discount: f64) -> Option<[f32; 2]> {
+        let [low, high] = self.rule.return_range(discount)?;
+        let bonus = self.motion.as_ref().map_or(0.0, Motion::bonus);
+        Some([low, high + (f64::from(bonus) / (1.0 - discount)) as f32])
     }
 
     /// Draws a goal for a window. Returns `None` if the window keeps its own.
@@ -127,7 +180,7 @@ impl Replay {
     }
 
     /// Returns the distance to the goal after `steps` steps of the window.
-    fn goal_distance(&self, window: &Window, steps: usize, goal: Goal<'_>) -> f64 {
+    pub(super) fn goal_distance(&self, window: &Window, steps: usize, goal: Goal<'_>) -> f64 {
         let Goal { rule, values } = goal;
         rule.distance(rule.achieved(self.observation_after(window, steps)), values)
     }

@@ -9,6 +9,7 @@ mod block_store;
 mod episodes;
 mod file;
 mod hindsight;
+mod motion;
 mod window;
 
 use dmprl_shared::segment::{HINDSIGHT, SegmentHeader, SegmentLayout, TERMINATED, TRUNCATED};

@@ -188,6 +188,11 @@ impl Sampler {
         &mut self.random
     }
 
+    /// Returns true with the given probability.
+    pub(super) fn flip(&mut self, probability: f64) -> bool {
+        probability > 0.0 && self.random.random_bool(probability)
+    }
+
     /// Draws one window, or returns `None` after `TRIES_MAX` draws without one.
     ///
     /// Steps that start no window are drawn again, so every window of an episode is equally likely.

@@ -81,6 +81,10 @@ pub struct AlgorithmConfig {
     /// rewards. The action before the first one is read from the replay. Larger values give
     /// smoother motion.
     pub action_rate_penalty: f64,
+    /// Reward of a step that moves the achieved goal, in units of the reward of reaching a goal.
+    /// It is added while less than half of the recent episodes move it, if goals are drawn when a
+    /// batch is sampled and the reward is sparse.
+    pub motion_bonus: f64,
     /// Settings of TD3.
     pub td3: Td3Config,
     /// Settings of SAC.
@@ -145,6 +149,7 @@ impl Default for AlgorithmConfig {
             critic_hidden: vec![256, 256],
             critic_layer_norm: false,
             action_rate_penalty: 0.2,
+            motion_bonus: 0.0,
             td3: Td3Config::default(),
             sac: SacConfig::default(),
             ndp: NdpConfig::default(),

@@ -117,6 +117,10 @@ pub struct ReplayConfig {
     /// Share of a batch's windows that get another goal, if goals are drawn when a batch is
     /// sampled.
     pub hindsight_share: f64,
+    /// Share of a batch's windows that come from episodes in which the achieved goal moved, if
+    /// goals are drawn when a batch is sampled and the reward is sparse. Where few episodes did,
+    /// the share may be smaller.
+    pub moved_share: f64,
     /// Hindsight copies per segment, each with its own goal, if workers make copies.
     pub hindsight_copies: usize,
 }
@@ -127,6 +131,7 @@ impl Default for ReplayConfig {
             capacity_steps: 1_000_000,
             hindsight: Hindsight::None,
             hindsight_share: 0.8,
+            moved_share: 0.0,
             hindsight_copies: 4,
         }
     }

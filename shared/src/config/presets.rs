@@ -55,6 +55,7 @@ const GOAL: &str = r#"
 [algorithm]
 discount = 0.98
 action_rate_penalty = 0.0
+motion_bonus = 1.0
 [exploration]
 kind = "segment"
 std = 0.2
@@ -63,6 +64,7 @@ warm_up_kind = "segment"
 warm_up_range = 1.0
 [replay]
 hindsight = "future"
+moved_share = 0.5
 [pacing]
 updates_per_segment = 5.0
 "#;
@@ -106,6 +108,7 @@ batch_size = 256
 critic_hidden = [256, 256]
 critic_layer_norm = false
 action_rate_penalty = 0.0
+motion_bonus = 0.0
 [algorithm.td3]
 target_noise_std = 0.2
 target_noise_clip = 0.5
@@ -124,6 +127,7 @@ warm_up_range = 1.0
 capacity_steps = 1000000
 hindsight = "none"
 hindsight_share = 0.8
+moved_share = 0.0
 hindsight_copies = 4
 [pacing]
 updates_per_segment = 1.0

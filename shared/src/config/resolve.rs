@@ -230,11 +230,16 @@ impl ExperimentConfig {
         let random = self.exploration.random_segments;
         let shares = [
             ("replay.hindsight_share", self.replay.hindsight_share),
+            ("replay.moved_share", self.replay.moved_share),
             ("exploration.random_segments", random),
         ];
         for (key, got) in shares {
             range(key, got, (0.0..=1.0).contains(&got), || "from 0 to 1".into())?;
         }
+        let bonus = self.algorithm.motion_bonus;
+        range("algorithm.motion_bonus", bonus, bonus.is_finite() && bonus >= 0.0, || {
+            "0 or more".into()
+        })?;
         let carry = self.policy.kind == PolicyKind::Dmp && self.policy.start == Start::Carry;
         range("exploration.random_segments", random, !carry || random == 0.0, || {
             "0 with policy.start = \"carry\", because random actions leave y undefined".into()
@@ -453,6 +458,8 @@ mod tests {
             ("algorithm.polyak", "nan"),
             ("algorithm.action_rate_penalty", "-0.1"),
             ("replay.hindsight_share", "1.1"),
+            ("replay.moved_share", "-0.1"),
+            ("algorithm.motion_bonus", "-1"),
             ("exploration.random_segments", "-0.1"),
             ("actors.workers", "1000000"),
             ("actors.env_call_timeout_s", "0"),
