@@ -402,6 +402,9 @@ impl Learner {
 
 #[cfg(test)]
 pub(crate) mod tests {
+    use dmprl_shared::config::Hindsight;
+    use dmprl_shared::goal_rule::{GoalReward, GoalRule, Norm};
+
     use super::*;
 
     pub(crate) fn spec() -> EnvSpec {
@@ -416,5 +419,30 @@ pub(crate) mod tests {
             observation_names: Vec::new(),
             goal_rule: None,
         }
+    }
+
+    #[test]
+    fn a_warm_start_of_plain_observations_remains_the_same_policy_with_relative_goals() {
+        let rule = GoalRule {
+            achieved: 0,
+            desired: 1,
+            goal_len: 1,
+            components: vec![0],
+            norm: Norm::Euclidean,
+            reward: GoalReward::Sparse { threshold: 0.5, reached: 0.0, missed: -1.0 },
+            ends_within: None,
+        };
+        let spec = EnvSpec { goal_rule: Some(rule.into()), ..spec() };
+        let mut config = ExperimentConfig::default();
+        config.replay.hindsight = Hindsight::Future;
+        let mut learner = Learner::new(config, &spec, 1).unwrap();
+        let start: Vec<f32> = learner.next_snapshot().unwrap().values.clone();
+        learner.warm_start(&start).unwrap();
+        let published = &learner.next_snapshot().unwrap().values;
+        // The weights of the achieved goal are computed, so they are rounded.
+        assert!(start.iter().zip(published).all(|(a, b)| (a - b).abs() < 1e-6));
+        let mut actor = vec![0.0; start.len()];
+        learner.regime.read_policy(&mut actor).unwrap();
+        assert!(start.iter().zip(&actor).any(|(a, b)| (a - b).abs() > 1e-3));
     }
 }

@@ -1,4 +1,4 @@
-//! Motion of what a goal is about, such as an object that is to be pushed.
+//! Motion of the achieved goal, such as that of an object to push.
 //!
 //! Where random actions rarely touch the object, most windows are from episodes in which nothing
 //! moved, and teach nothing about moving it. Two remedies, our own:
