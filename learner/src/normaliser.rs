@@ -41,6 +41,12 @@ impl RelativeGoal {
         Self { achieved: rule.achieved, desired: rule.desired, goal_len: rule.goal_len }
     }
 
+    /// Returns the achieved entry that belongs to `index`, if that is an entry of the desired goal.
+    fn achieved_for(self, index: usize) -> Option<usize> {
+        let entry = index.checked_sub(self.desired).filter(|&entry| entry < self.goal_len)?;
+        Some(self.achieved + entry)
+    }
+
     /// Returns (achieved, desired) entries of an observation.
     fn pairs(self) -> impl Iterator<Item = (usize, usize)> {
         (0..self.goal_len).map(move |index| (self.achieved + index, self.desired + index))
@@ -109,30 +115,33 @@ impl Normaliser {
 
     /// Adds observations, (rows, O), to the statistics.
     pub fn observe(&mut self, observations: &[f32]) {
-        let mut row = vec![0.0; self.mean.len()];
-        for observation in observations.chunks_exact(self.mean.len()) {
-            row.copy_from_slice(observation);
-            self.observe_row(&mut row);
+        for row in observations.chunks_exact(self.mean.len()) {
+            self.observe_row(|index| row[index]);
         }
     }
 
     /// Adds observations, (rows, O), with the achieved goals in place of the desired ones.
     pub fn observe_relabelled(&mut self, observations: &[f32], rule: &GoalRule) {
-        let mut row = vec![0.0; self.mean.len()];
-        for observation in observations.chunks_exact(self.mean.len()) {
-            row.copy_from_slice(observation);
-            rule.set_desired(&mut row, rule.achieved(observation));
-            self.observe_row(&mut row);
+        let desired = rule.desired..rule.desired + rule.goal_len;
+        for row in observations.chunks_exact(self.mean.len()) {
+            let achieved = rule.achieved(row);
+            self.observe_row(|index| match desired.contains(&index) {
+                true => achieved[index - desired.start],
+                false => row[index],
+            });
         }
     }
 
-    /// Adds an observation, (O,), and makes its goal relative.
-    fn observe_row(&mut self, row: &mut [f32]) {
-        self.make_relative(row);
+    /// Adds an observation, given by its entries.
+    fn observe_row(&mut self, value: impl Fn(usize) -> f32) {
         self.count += 1;
         let share = 1.0 / self.count as f64;
         let seen = self.seen_mean.iter_mut().zip(&mut self.seen_squares);
-        for ((mean, squares), &value) in seen.zip(&*row) {
+        for (index, (mean, squares)) in seen.enumerate() {
+            let value = match self.relative.and_then(|goal| goal.achieved_for(index)) {
+                Some(achieved) => value(index) - value(achieved),
+                None => value(index),
+            };
             let value = f64::from(value);
             let before = value - *mean;
             *mean += before * share;
