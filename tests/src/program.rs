@@ -133,10 +133,14 @@ impl Workplace {
         command.current_dir(self.folder());
         // A new session, not only a group: when the leader of a group in our session is killed, the
         // kernel wakes the group's stopped members with SIGHUP and SIGCONT, so a learner that the
-        // test had stopped would run again.
-        // SAFETY: `setsid` is async-signal-safe, allocates nothing and touches no lock.
+        // test had stopped would run again. SIGHUP has its default effect, also in tests that run
+        // under nohup.
+        // SAFETY: `setsid` and `signal` are async-signal-safe, allocate nothing and touch no lock.
         unsafe {
-            command.pre_exec(|| rustix::process::setsid().map(drop).map_err(Into::into));
+            command.pre_exec(|| {
+                libc::signal(libc::SIGHUP, libc::SIG_DFL);
+                rustix::process::setsid().map(drop).map_err(Into::into)
+            });
         }
         command.stdin(Stdio::null()).stdout(file("out")).stderr(file("err"));
         let child = command.spawn().expect("dmprl starts");
