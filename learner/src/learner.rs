@@ -421,9 +421,10 @@ pub(crate) mod tests {
         }
     }
 
-    #[test]
-    fn a_warm_start_of_plain_observations_remains_the_same_policy_with_relative_goals() {
-        let rule = GoalRule {
+    /// Returns the rule of observations (achieved goal, desired goal, ...) with goals of one entry,
+    /// which are reached within 0.5.
+    pub(crate) fn goal_rule() -> GoalRule {
+        GoalRule {
             achieved: 0,
             desired: 1,
             goal_len: 1,
@@ -431,8 +432,12 @@ pub(crate) mod tests {
             norm: Norm::Euclidean,
             reward: GoalReward::Sparse { threshold: 0.5, reached: 0.0, missed: -1.0 },
             ends_within: None,
-        };
-        let spec = EnvSpec { goal_rule: Some(rule.into()), ..spec() };
+        }
+    }
+
+    #[test]
+    fn a_warm_start_of_plain_observations_remains_the_same_policy_with_relative_goals() {
+        let spec = EnvSpec { goal_rule: Some(goal_rule().into()), ..spec() };
         let mut config = ExperimentConfig::default();
         config.replay.hindsight = Hindsight::Future;
         let mut learner = Learner::new(config, &spec, 1).unwrap();

@@ -57,7 +57,7 @@ impl RelativeGoal {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Normaliser {
-    /// Absent in checkpoints of before 2026-11-25.
+    /// Absent in checkpoints from before 2026-11-25.
     #[serde(default)]
     relative: Option<RelativeGoal>,
     mean: Vec<f32>,
@@ -291,11 +291,11 @@ impl NormalisationChange<'_> {
 #[cfg(test)]
 mod tests {
     use dmprl_shared::config::Precision;
-    use dmprl_shared::goal_rule::{GoalReward, Norm};
     use dmprl_shared::policy::{Activations, forward, initial_parameters};
     use rand::RngExt;
 
     use super::*;
+    use crate::learner::tests::goal_rule;
 
     fn output(shape: &MlpShape, parameters: &[f32], inputs: &[f32]) -> Vec<f32> {
         let rows = inputs.len() / shape.inputs();
@@ -324,21 +324,9 @@ mod tests {
         assert_close(&out, &[-3.0 / unit, 0.0, -1.0 / unit, 0.0, 1.0 / unit, 0.0, 3.0 / unit, 0.0]);
     }
 
-    fn rule() -> GoalRule {
-        GoalRule {
-            achieved: 0,
-            desired: 1,
-            goal_len: 1,
-            components: vec![0],
-            norm: Norm::Euclidean,
-            reward: GoalReward::Dense { factor: -1.0 },
-            ends_within: None,
-        }
-    }
-
     #[test]
     fn relative_goals_are_normalised_like_other_entries() {
-        let mut normaliser = Normaliser::new(2, 1, Some(RelativeGoal::new(&rule())));
+        let mut normaliser = Normaliser::new(2, 1, Some(RelativeGoal::new(&goal_rule())));
         let mut out = [0.0; 2];
         normaliser.apply_row(&[1.0, 9.0], &mut out);
         assert_eq!(out, [1.0, 8.0]);
@@ -350,10 +338,9 @@ mod tests {
 
     #[test]
     fn statistics_see_achieved_goals_in_place_of_the_desired_ones() {
-        let rule = rule();
         let mut normaliser = Normaliser::new(2, 1, None);
         normaliser.observe(&[1.0, 9.0]);
-        normaliser.observe_relabelled(&[1.0, 9.0], &rule);
+        normaliser.observe_relabelled(&[1.0, 9.0], &goal_rule());
         normaliser.update();
         // The desired goals were 9 and 1.
         let mut out = [0.0; 2];
@@ -368,7 +355,7 @@ mod tests {
 
     #[test]
     fn relative_goals_do_not_change_the_function_of_plain_observations() {
-        function_remains(Some(RelativeGoal::new(&rule())));
+        function_remains(Some(RelativeGoal::new(&goal_rule())));
     }
 
     fn function_remains(relative: Option<RelativeGoal>) {

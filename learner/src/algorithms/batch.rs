@@ -186,22 +186,9 @@ impl Batch {
         let SampleSource { replay, sampler, hindsight, normaliser } = source;
         let (replay, hindsight, normaliser) = (*replay, *hindsight, *normaliser);
         for row in 0..shape.rows {
-            let window = match hindsight {
-                Some(hindsight) => hindsight.draw_window(replay, sampler),
-                None => sampler.draw(replay),
-            };
-            let window = window
+            let sample = Sample::draw(replay, hindsight, sampler)
                 .ok_or(NoWindow { segments: replay.len(), steps: replay.layout().segment_steps })?;
-            let sample = Sample::draw(window, replay, hindsight, sampler);
             self.write_states(shape, row, replay, &sample, config);
-            if let Some(hindsight) = hindsight {
-                let discount = match config.target {
-                    Target::NStep => config.discount as f32,
-                    Target::Literal => 1.0,
-                };
-                let steps = sample.outcome.steps;
-                self.rewards[row] += hindsight.discounted_bonus(replay, &window, steps, discount);
-            }
             let (o, width) = (shape.observation_len, shape.critic_inputs());
             let observation = &self.observations[row * o..(row + 1) * o];
             let input = &mut self.critic_inputs[row * width..(row + 1) * width];
@@ -214,7 +201,7 @@ impl Batch {
             if shape.end_state_len > 0 {
                 // The carried state is the end of the observation after the window.
                 let dims = shape.end_state_len / 2;
-                let last = replay.observation_after(&window, sample.outcome.steps);
+                let last = replay.observation_after(&sample.window, sample.outcome.steps);
                 let end = &mut self.critic_inputs[row * width..][o + shape.actions_len..width];
                 end.copy_from_slice(&last[o - 2 * dims..]);
                 end[dims..].iter_mut().for_each(|velocity| *velocity /= omega);
@@ -240,7 +227,7 @@ impl Batch {
         sample: &Sample<'_>,
         config: &AlgorithmConfig,
     ) {
-        let Sample { window, outcome, goal } = sample;
+        let Sample { window, outcome, goal, hindsight } = sample;
         let discount = config.discount as f32;
         let (rewards_discount, factor, next) = match config.target {
             Target::NStep => (
@@ -263,6 +250,11 @@ impl Batch {
                 replay.discounted_goal_reward(window, outcome.steps, *goal, rewards_discount)
             }
         };
+        if let Some(hindsight) = hindsight {
+            let steps = outcome.steps;
+            self.rewards[row] +=
+                hindsight.discounted_bonus(replay, window, steps, rewards_discount);
+        }
         self.bootstrap[row] = if outcome.terminated { 0.0 } else { factor };
     }
 

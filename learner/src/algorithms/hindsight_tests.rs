@@ -3,11 +3,12 @@
 use dmprl_shared::config::{
     AlgorithmConfig, AlgorithmName, ExperimentConfig, Hindsight, Target, Windows,
 };
-use dmprl_shared::goal_rule::{GoalReward, GoalRule, Norm};
+use dmprl_shared::goal_rule::{GoalReward, GoalRule};
 use dmprl_shared::segment::{SegmentHeader, SegmentLayout, TERMINATED, TRUNCATED};
 
 use super::tests::case;
 use super::*;
+use crate::learner::tests::goal_rule;
 use crate::replay::{GoalSampler, Replay, Sampler};
 
 /// Observations are (achieved goal, desired goal).
@@ -24,15 +25,7 @@ const SHAPE: BatchShape = BatchShape {
 };
 
 fn rule(ends_within: Option<f64>) -> GoalRule {
-    GoalRule {
-        achieved: 0,
-        desired: 1,
-        goal_len: 1,
-        components: vec![0],
-        norm: Norm::Euclidean,
-        reward: GoalReward::Sparse { threshold: 0.5, reached: 0.0, missed: -1.0 },
-        ends_within,
-    }
+    GoalRule { ends_within, ..goal_rule() }
 }
 
 /// An episode of three steps that achieves 1, 2 and 3, with the goal 9: r = -1, u = 0.1, 0.2, 0.3.

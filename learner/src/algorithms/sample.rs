@@ -10,26 +10,32 @@ pub(super) struct Sample<'a> {
     pub(super) outcome: Outcome,
     /// Another goal, or `None` for the window's own.
     pub(super) goal: Option<Goal<'a>>,
+    /// Adds a bonus to the reward, if configured.
+    pub(super) hindsight: Option<&'a GoalSampler>,
 }
 
 impl<'a> Sample<'a> {
-    /// Draws a goal for a window, if hindsight is configured.
+    /// Draws a window, and a goal for it, if hindsight is configured. Returns `None` if the replay
+    /// has no window.
     pub(super) fn draw(
-        window: Window,
         replay: &'a Replay,
         hindsight: Option<&'a GoalSampler>,
         sampler: &mut Sampler,
-    ) -> Self {
+    ) -> Option<Self> {
+        let window = match hindsight {
+            Some(hindsight) => hindsight.draw_window(replay, sampler)?,
+            None => sampler.draw(replay)?,
+        };
         let drawn = hindsight.and_then(|hindsight| {
             let row = hindsight.draw(replay, &window, sampler.random_mut())?;
             let goal = replay.achieved_goal(&hindsight.rule, row);
             let outcome = replay.outcome(&window, goal)?;
-            Some(Self { window, outcome, goal: Some(goal) })
+            Some(Self { window, outcome, goal: Some(goal), hindsight: Some(hindsight) })
         });
-        drawn.unwrap_or_else(|| {
+        Some(drawn.unwrap_or_else(|| {
             let outcome = Outcome { steps: window.len(), terminated: window.terminated };
-            Self { window, outcome, goal: None }
-        })
+            Self { window, outcome, goal: None, hindsight }
+        }))
     }
 }
 

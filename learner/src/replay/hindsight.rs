@@ -62,14 +62,15 @@ impl GoalSampler {
         Some(Self { motion: Motion::new(&sampler.rule, replay.moved_share, bonus), ..sampler })
     }
 
-    /// Makes a sampler that does not care for motion, or returns `None` without hindsight.
+    /// Makes a sampler of goals only, without regard to motion, or returns `None` without
+    /// hindsight.
     #[must_use]
     pub fn new(rule: Option<&GoalRule>, strategy: Hindsight, share: f64) -> Option<Self> {
         let rule = rule.filter(|_| strategy != Hindsight::None)?;
         Some(Self { rule: rule.clone(), strategy, share, motion: None })
     }
 
-    /// Notes whether recent episodes moved the achieved goal. Call it before a batch is sampled.
+    /// Counts the recent episodes that moved the achieved goal. Call it before a batch is sampled.
     pub fn count_motion(&mut self, replay: &Replay) {
         if let Some(motion) = &mut self.motion {
             motion.count(&self.rule, replay);
@@ -191,11 +192,11 @@ mod tests {
     use std::collections::BTreeSet;
 
     use dmprl_shared::config::Windows;
-    use dmprl_shared::goal_rule::{GoalReward, Norm};
     use dmprl_shared::segment::{HINDSIGHT, SegmentHeader, SegmentLayout, TERMINATED, TRUNCATED};
 
     use super::super::Sampler;
     use super::*;
+    use crate::learner::tests::goal_rule;
 
     /// Observations are (achieved goal, desired goal).
     const LAYOUT: SegmentLayout =
@@ -203,15 +204,7 @@ mod tests {
     const GOAL: f32 = 90.0;
 
     fn rule(ends_within: Option<f64>) -> GoalRule {
-        GoalRule {
-            achieved: 0,
-            desired: 1,
-            goal_len: 1,
-            components: vec![0],
-            norm: Norm::Euclidean,
-            reward: GoalReward::Sparse { threshold: 0.5, reached: 0.0, missed: -1.0 },
-            ends_within,
-        }
+        GoalRule { ends_within, ..goal_rule() }
     }
 
     fn sampler(strategy: Hindsight, share: f64, ends_within: Option<f64>) -> GoalSampler {

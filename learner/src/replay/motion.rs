@@ -1,10 +1,10 @@
 //! Motion of the achieved goal, such as that of an object to push.
 //!
-//! Where random actions rarely touch the object, most windows are from episodes in which nothing
-//! moved, and teach nothing about moving it. Two remedies, our own:
+//! Random actions rarely touch an object, so most windows come from episodes in which it did not
+//! move, and the learner cannot learn from them how to move it. Two remedies, which are our own:
 //! 1. A share of the windows comes from episodes that moved the achieved goal.
-//! 2. While few episodes do, a step that moves it gets a bonus. It ends, for all windows at once,
-//!    as soon as half of the recent episodes move it.
+//! 2. A step that moves it gets a bonus while fewer than half of the recent episodes moved it. The
+//!    bonus is added when a batch is sampled, so it starts and ends for all windows at once.
 
 use dmprl_shared::goal_rule::{GoalReward, GoalRule};
 
@@ -25,8 +25,7 @@ const RARE: f64 = 0.5;
 /// Draws after which a window is taken from any episode.
 const DRAWS_MAX: usize = 30;
 
-/// Prefers and rewards motion. Only for sparse rewards, whose threshold says what a large distance
-/// is.
+/// Prefers and rewards motion, with a sparse reward. Its threshold is the unit of distances.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) struct Motion {
     threshold: f64,
@@ -40,8 +39,9 @@ pub(super) struct Motion {
 }
 
 impl Motion {
-    /// Makes the remedies for a rule. `factor` is the bonus in units of the reward of reaching a
-    /// goal. Returns `None` without a remedy or with a dense reward.
+    /// Makes the remedies for a rule. `factor` is the bonus, in units of the difference between a
+    /// reached goal's reward and a missed one's. Returns `None` if both are off or the reward is
+    /// dense.
     pub(super) fn new(rule: &GoalRule, share: f64, factor: f64) -> Option<Self> {
         let GoalReward::Sparse { threshold, reached, missed } = rule.reward else { return None };
         let bonus = (factor * (reached - missed)) as f32;
@@ -54,8 +54,8 @@ impl Motion {
         })
     }
 
-    /// Counts the recent episodes, if that is due. The result depends only on what the replay
-    /// received, so a resumed run has the same.
+    /// Counts the recent episodes, if a count is due. It covers segments that a replay still has
+    /// when the next count is due, so a resumed run gets the same result.
     pub(super) fn count(&mut self, rule: &GoalRule, replay: &Replay) {
         let inserted = replay.inserted - replay.inserted % COUNT_EVERY;
         if self.bonus == 0.0 || inserted < self.due {
@@ -65,7 +65,8 @@ impl Motion {
         let newest = replay.inserted - inserted;
         let ring = (replay.slots.len() - replay.demonstrations) as u64;
         let (mut ended, mut moved) = (0_u32, 0_u32);
-        for back in newest..(newest + RECENT_SEGMENTS).min(ring).min(replay.inserted) {
+        let recent = RECENT_SEGMENTS.min(ring.saturating_sub(COUNT_EVERY)).min(inserted);
+        for back in newest..newest + recent {
             let Some(slot) = replay.slot_before(back) else { break };
             let segment = &replay.slots[slot as usize];
             if segment.terminated || segment.truncated {
@@ -139,25 +140,18 @@ impl Replay {
 #[cfg(test)]
 mod tests {
     use dmprl_shared::config::Windows;
-    use dmprl_shared::goal_rule::Norm;
     use dmprl_shared::segment::{SegmentHeader, SegmentLayout, TRUNCATED};
 
     use super::*;
+    use crate::learner::tests::goal_rule;
 
     /// Observations are (achieved goal, desired goal).
     const LAYOUT: SegmentLayout =
         SegmentLayout { segment_steps: 2, observation_len: 2, action_len: 1 };
 
     fn rule() -> GoalRule {
-        GoalRule {
-            achieved: 0,
-            desired: 1,
-            goal_len: 1,
-            components: vec![0],
-            norm: Norm::Euclidean,
-            reward: GoalReward::Sparse { threshold: 1.0, reached: 0.0, missed: -2.0 },
-            ends_within: None,
-        }
+        let reward = GoalReward::Sparse { threshold: 1.0, reached: 0.0, missed: -2.0 };
+        GoalRule { reward, ..goal_rule() }
     }
 
     /// Inserts an episode of two segments that achieves 0, 0, `step`, `step`, `step`.
@@ -203,24 +197,33 @@ mod tests {
 
     #[test]
     fn a_count_that_is_made_later_is_the_same() {
-        let mut replay = Replay::new(LAYOUT, 2_000, 1, 1);
-        (0..50).for_each(|number| episode(&mut replay, number, 0.3));
-        let mut first = motion(0.0);
-        first.count(&rule(), &replay);
-        (50..90).for_each(|number| episode(&mut replay, number, 0.5));
-        let mut resumed = motion(0.0);
-        resumed.count(&rule(), &replay);
-        assert_eq!(resumed, first);
+        // In the smaller ring the later episodes replace some of the first ones.
+        for capacity in [2_000, 400] {
+            let mut replay = Replay::new(LAYOUT, capacity, 1, 1);
+            (0..70).for_each(|number| episode(&mut replay, number, 0.5));
+            (70..100).for_each(|number| episode(&mut replay, number, 0.3));
+            let mut first = motion(0.0);
+            first.count(&rule(), &replay);
+            (100..149).for_each(|number| episode(&mut replay, number, 0.5));
+            let mut resumed = motion(0.0);
+            resumed.count(&rule(), &replay);
+            assert_eq!(resumed, first);
+            assert_eq!(
+                first.bonus() > 0.0,
+                capacity == 400,
+                "70 of 100 moved it, or 20 of the newest 50"
+            );
+        }
     }
 
     #[test]
     fn the_newest_segments_are_counted_when_the_ring_is_full() {
-        let mut replay = Replay::new(LAYOUT, 200, 1, 1); // 100 slots
-        (0..50).for_each(|number| episode(&mut replay, number, 0.5));
+        let mut replay = Replay::new(LAYOUT, 400, 1, 1); // 200 slots
+        (0..100).for_each(|number| episode(&mut replay, number, 0.5));
         let mut motion = motion(0.0);
         motion.count(&rule(), &replay);
         assert_eq!(motion.bonus(), 0.0);
-        (50..100).for_each(|number| episode(&mut replay, number, 0.3));
+        (100..150).for_each(|number| episode(&mut replay, number, 0.3));
         motion.count(&rule(), &replay);
         assert_eq!(motion.bonus(), 2.0);
     }
